@@ -1,0 +1,44 @@
+# Needs Python >= 3.11 and make. Everything else goes into .venv, in the versions of requirements.lock.
+PYTHON ?= python3
+BIN := .venv/bin
+STAMP := .venv/stamp
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test check bench docs clean
+
+help:
+	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' Makefile
+
+setup: $(STAMP) ## make .venv with the project and everything it needs (done once)
+
+$(STAMP): pyproject.toml requirements.lock
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "$(PYTHON) is older than Python 3.11; name a newer one: make PYTHON=python3.12 setup" >&2; exit 2; }
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --requirement requirements.lock
+	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
+	@touch $@
+
+demo: $(STAMP) ## simulate, filter and report into demo/
+	$(BIN)/rbpf demo --out demo
+
+test: $(STAMP) ## all tests
+	$(BIN)/python -m pytest -n 2
+
+check: $(STAMP) ## format, lint, types, import rules and the fast tests
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/python -m pytest -n 2 -m "not slow and not real_data"
+
+bench: $(STAMP) ## run the benchmarks against their baselines
+	$(BIN)/python -m benchmarks
+
+docs: $(STAMP) ## build the documentation into docs/_build
+	$(BIN)/sphinx-build -W -b html docs docs/_build/html
+
+clean: ## remove everything that make made, .venv included
+	rm -rf .venv demo build dist *.egg-info docs/_build .mypy_cache .pytest_cache .ruff_cache \
+	  .hypothesis .import_linter_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

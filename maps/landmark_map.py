@@ -1,0 +1,200 @@
+"""A growing map of landmarks, each an independent Gaussian given the trajectory (E06 (1), S05 (3))."""
+
+from collections.abc import Sequence
+from typing import Any, final
+
+import numpy as np
+
+from rbpf.errors import InputError
+from rbpf.genealogy import Lineage
+from rbpf.lie import LieGroup
+from rbpf.maps.layout import Layout
+from rbpf.maps.plan import Plan, make_plan
+from rbpf.maps.point import Point
+from rbpf.maps.rows import RowEngine
+from rbpf.maps.shared import SharedStore
+from rbpf.models import (
+    Births,
+    Conditional,
+    Landmark,
+    LogDensities,
+    Observations,
+    Part,
+    Records,
+)
+from rbpf.proposals import Prior, Terms
+
+
+@final
+class LandmarkMap(Conditional):
+    """Landmarks of any parametrisation, shared between particles and copied only when written.
+
+    Args:
+        space: the group of the sampled state.
+        evidence: keep per particle the log-odds that each landmark exists (unknown association needs it); a
+            landmark may then be present in some particles only.
+        compiled: use the models' fused kernels where they have one.
+    """
+
+    supplies = Part.LANDMARK
+
+    def __init__(self, space: LieGroup, evidence: bool = False, compiled: bool = True) -> None:
+        self.space = space
+        self.evidence = evidence
+        self.compiled = compiled
+        self.layouts: list[Layout] = []
+        self.kinds = np.zeros(0, dtype=np.int64)
+        self.catalogue: dict[int, Any] = {}
+
+    def begin(self, n: int, lineage: Lineage) -> None:
+        """An empty map."""
+        self.n = n
+        self.store = SharedStore(n, lineage)
+        self._engine = RowEngine(self.space, self.store, self._layout_of, self.compiled)
+
+    @property
+    def ids(self) -> np.ndarray:
+        """Landmarks held, ascending (M,)."""
+        return self.store.ids
+
+    def add(self, births: Births, state: np.ndarray) -> np.ndarray:
+        """Starts landmarks from first sightings at the states (N, E); returns their ids (K,)."""
+        records = births.model.initialise(state, births.z, births.cov)
+        log_odds = None
+        if births.mask is not None:
+            log_odds = np.where(births.mask, 0.0, -np.inf)
+        ids = self.add_records(records, births.landmark, log_odds)
+        for landmark, fact in zip(ids.tolist(), births.facts, strict=False):
+            self.catalogue[landmark] = fact
+        return ids
+
+    def add_records(self, records: Records, landmark: Landmark, log_odds: np.ndarray | None = None) -> np.ndarray:
+        """Adds landmarks whose estimates (N, K, …) are known; returns their ids (K,)."""
+        if log_odds is not None and not self.evidence:
+            raise InputError("landmarks of some particles only need a map with evidence=True")
+        kind = self._kind(landmark)
+        columns = self.layouts[kind].pack(records, log_odds)
+        ids = np.array([self.store.add(column) for column in columns], dtype=np.int64)
+        if ids.size and ids[-1] >= self.kinds.size:
+            grown = np.full(max(64, 2 * int(ids[-1])), -1)
+            grown[: self.kinds.size] = self.kinds
+            self.kinds = grown
+        self.kinds[ids] = kind
+        return ids
+
+    def remove(self, ids: np.ndarray) -> None:
+        """Drops landmarks from all particles."""
+        self._known(ids)
+        self.store.remove(ids)
+        self.kinds[ids] = -1
+        for landmark in ids.tolist():
+            self.catalogue.pop(landmark, None)
+
+    def read(self, ids: np.ndarray) -> Records:
+        """Estimates (N, K, …) of landmarks that share one parametrisation."""
+        self._known(ids)
+        if ids.size == 0:
+            raise InputError("no landmark was named")
+        kinds = np.unique(self.kinds[ids])
+        if kinds.size > 1:
+            raise InputError("read() takes landmarks of one parametrisation at a time; `landmark_of` tells which")
+        return self.layouts[kinds[0]].unpack(np.array([self.store.read(int(i)) for i in ids]))
+
+    def landmark_of(self, landmark_id: int) -> Landmark:
+        """The parametrisation of a landmark."""
+        self._known(np.array([landmark_id]))
+        return self._layout_of(landmark_id).landmark
+
+    def promote(self, ids: np.ndarray, to: Landmark | None = None) -> None:
+        """Turns landmarks into single Gaussian points in all particles at once, by their own `promote`."""
+        for landmark_id in ids:
+            layout = self._layout_of(landmark_id)
+            column = self.store.read(int(landmark_id))
+            records = layout.landmark.promote(layout.unpack(column[None]))
+            kind = self._kind(to or Point(records.mean.shape[-1]))
+            log_odds = column[-1][:, None] if self.evidence else None
+            self.store.replace(int(landmark_id), self.layouts[kind].pack(records, log_odds)[0])
+            self.kinds[landmark_id] = kind
+
+    def ready(self, weights: np.ndarray, share: float = 0.95) -> np.ndarray:
+        """Landmarks of several components or with constants that are ready in `share` of the weight (N,)."""
+        waiting = [i for i in self.ids if not isinstance(self.landmark_of(int(i)), Point)]
+        ready = [i for i in waiting if (weights * self._is_ready(int(i))).sum() >= share]
+        return np.array(ready, dtype=np.int64)
+
+    def log_odds(self, ids: np.ndarray) -> np.ndarray:
+        """(N, K) log-odds that the landmarks exist; −inf where a particle does not hold one."""
+        if not self.evidence:
+            return np.zeros((self.n, ids.size))
+        return np.array([self.store.read(int(i))[-1] for i in ids]).reshape(ids.size, self.n).T
+
+    def set_log_odds(self, ids: np.ndarray, log_odds: np.ndarray) -> None:
+        """Overwrites log-odds (N, K); a landmark at −inf in every particle is removed."""
+        for landmark_id, column in zip(ids.tolist(), log_odds.T, strict=True):
+            record = self.store.read(landmark_id)
+            if np.array_equal(record[-1], column):
+                continue
+            record[-1] = column
+            self.store.replace(landmark_id, record)
+        gone = ids[np.isneginf(log_odds).all(axis=0)]
+        self.remove(gone)
+
+    def terms(self, state: np.ndarray, groups: Sequence[Observations], prior: Prior) -> Terms:
+        """Information of single-Gaussian landmarks; those of several components enter after sampling."""
+        return self._engine.terms(self._plan(groups), state, groups, prior)
+
+    def correct(self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]) -> LogDensities:
+        """log p(z | x) and the landmarks' Kalman updates at the sampled states."""
+        return self._engine.correct(self._plan(groups), state, groups)
+
+    def resample(self, ancestors: np.ndarray) -> None:
+        """Nothing is copied: the lineage has advanced. Compacts what has lost its descendants."""
+        self.store.compact()
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Columns and kinds; the catalogue's facts must be numbers or text to be saved."""
+        ids = self.ids
+        facts = [(i, self.catalogue[i]) for i in ids.tolist() if i in self.catalogue]
+        return self.store.arrays() | {
+            "map/kinds": self.kinds[ids],
+            "map/fact_ids": np.array([i for i, _ in facts], dtype=np.int64),
+            "map/facts": np.array([fact for _, fact in facts]),
+        }
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """The inverse of `arrays`; the parametrisations must have been registered in the same order."""
+        self.store.restore(arrays)
+        ids = self.ids
+        self.kinds = np.full(max(64, 2 * int(ids.max(initial=0)) + 2), -1)
+        self.kinds[ids] = arrays["map/kinds"]
+        facts = zip(arrays["map/fact_ids"].tolist(), arrays["map/facts"].tolist(), strict=True)
+        self.catalogue = dict(facts)
+
+    def register(self, landmark: Landmark) -> None:
+        """Names a parametrisation before it is first used, so that a checkpoint can be read back."""
+        self._kind(landmark)
+
+    def _kind(self, landmark: Landmark) -> int:
+        key = (type(landmark), landmark.dim, landmark.constants, landmark.components)
+        for number, layout in enumerate(self.layouts):
+            held = layout.landmark
+            if (type(held), held.dim, held.constants, held.components) == key:
+                return number
+        self.layouts.append(Layout(landmark, self.evidence))
+        return len(self.layouts) - 1
+
+    def _plan(self, groups: Sequence[Observations]) -> Plan:
+        plain = np.array([layout.landmark.components == 1 for layout in self.layouts], dtype=bool)
+        return make_plan(groups, self.n, self.kinds, plain)
+
+    def _layout_of(self, landmark_id: int) -> Layout:
+        return self.layouts[self.kinds[landmark_id]]
+
+    def _known(self, ids: np.ndarray) -> None:
+        for landmark_id in ids:
+            if landmark_id not in self.store:
+                raise InputError(f"the map holds no landmark {landmark_id}")
+
+    def _is_ready(self, landmark_id: int) -> np.ndarray:
+        layout = self._layout_of(landmark_id)
+        return layout.landmark.ready(self.read(np.array([landmark_id])))[:, 0]

@@ -1,0 +1,143 @@
+"""Which landmark each measurement speaks of, and which measurements must be taken together.
+
+Rows that speak of different landmarks are independent given the state; rows of one landmark that a particle sees
+twice in a step (two cameras, two groups) are correlated through it and have to be stacked.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from rbpf.errors import InputError
+from rbpf.models import NEW, NULL, Observations
+
+
+@dataclass(frozen=True)
+class Row:
+    """Measurement k of a group speaks of a landmark, in the particles of `mask` (N,); None is all."""
+
+    group: int
+    k: int
+    landmark: int
+    mask: np.ndarray | None
+
+
+@dataclass
+class Batch:
+    """Independent rows of one group: measurements `ks` (K,) of landmarks `ids` (K,), in `mask` (N, K) or all."""
+
+    group: int
+    ks: np.ndarray
+    ids: np.ndarray
+    mask: np.ndarray | None = None
+
+
+@dataclass
+class Plan:
+    """All rows of a step.
+
+    Attributes:
+        batches: independent rows of single-Gaussian landmarks.
+        joint: rows that share a landmark.
+        late: rows of landmarks with several components.
+        log_factor: (N,) what new and clutter observations cost.
+    """
+
+    log_factor: np.ndarray
+    batches: list[Batch] = field(default_factory=list)
+    joint: list[list[Row]] = field(default_factory=list)
+    late: list[Row] = field(default_factory=list)
+
+
+def make_plan(groups: Sequence[Observations], n: int, kinds: np.ndarray, plain: np.ndarray) -> Plan:
+    """Sorts the rows of all groups.
+
+    Args:
+        groups: observations that read a landmark.
+        n: particles.
+        kinds: (ids,) number of each landmark's parametrisation, -1 where the map holds none.
+        plain: (kinds,) whether that parametrisation has a single component.
+
+    Raises:
+        InputError: ids are missing, have a wrong shape, or name a landmark that the map does not hold.
+    """
+    plan = Plan(np.zeros(n))
+    rows: dict[int, list[Row]] = {}
+    for number, group in enumerate(groups):
+        ids = _checked_ids(group, n, kinds)
+        for outcome, log_density in ((NEW, group.log_new), (NULL, group.log_clutter)):
+            if log_density != 0.0:
+                plan.log_factor += log_density * (ids == outcome).sum(axis=-1)
+        if len(groups) == 1 and _is_simple(ids, kinds, plain):
+            ks = np.flatnonzero(ids >= 0)
+            plan.batches = [Batch(number, ks, ids[ks])] if ks.size else []
+            return plan
+        for row in _rows(number, ids):
+            rows.setdefault(row.landmark, []).append(row)
+    batches: dict[tuple[int, int], list[Row]] = {}
+    for landmark, sightings in rows.items():
+        kind = int(kinds[landmark])
+        if not plain[kind]:
+            plan.late.extend(sightings)
+        elif _overlap(sightings):
+            plan.joint.append(sightings)
+        else:
+            for row in sightings:
+                batches.setdefault((row.group, kind), []).append(row)
+    plan.batches = [_batch(sightings, n) for sightings in batches.values()]
+    return plan
+
+
+def _is_simple(ids: np.ndarray, kinds: np.ndarray, plain: np.ndarray) -> bool:
+    """Whether all particles agree, no landmark is seen twice and all have one plain parametrisation."""
+    if ids.ndim != 1:
+        return False
+    seen = ids[ids >= 0]
+    of = kinds[seen]
+    return seen.size == 0 or bool(len(set(seen.tolist())) == seen.size and (of == of[0]).all() and plain[of[0]])
+
+
+def _checked_ids(group: Observations, n: int, kinds: np.ndarray) -> np.ndarray:
+    ids, count = group.ids, group.z.shape[0]
+    if ids is None:
+        raise InputError(f"{type(group.model).__name__} reads a landmark: its observations need ids")
+    if ids.shape not in ((count,), (n, count)):
+        raise InputError(f"ids of {count} measurements must be ({count},) or ({n}, {count}), got {ids.shape}")
+    unknown = ids >= 0
+    unknown[unknown] = (ids[unknown] >= kinds.size) | (kinds[np.minimum(ids[unknown], kinds.size - 1)] < 0)
+    if unknown.any():
+        raise InputError(f"a measurement names landmark {ids[unknown][0]}, which the map does not hold")
+    return ids
+
+
+def _rows(number: int, ids: np.ndarray) -> list[Row]:
+    if ids.ndim == 1:
+        return [Row(number, k, landmark, None) for k, landmark in enumerate(ids.tolist()) if landmark >= 0]
+    rows = []
+    for k in range(ids.shape[1]):
+        column = ids[:, k]
+        first = int(column[0])
+        if (column == first).all():
+            if first >= 0:
+                rows.append(Row(number, k, first, None))
+            continue
+        rows.extend(Row(number, k, int(landmark), column == landmark) for landmark in np.unique(column) if landmark >= 0)
+    return rows
+
+
+def _overlap(rows: list[Row]) -> bool:
+    if len(rows) == 1:
+        return False
+    if any(row.mask is None for row in rows):
+        return True
+    return bool((np.sum([row.mask for row in rows], axis=0) > 1).any())
+
+
+def _batch(rows: list[Row], n: int) -> Batch:
+    ks = np.array([row.k for row in rows])
+    ids = np.array([row.landmark for row in rows])
+    if all(row.mask is None for row in rows):
+        return Batch(rows[0].group, ks, ids)
+    mask = np.array([np.ones(n, dtype=bool) if row.mask is None else row.mask for row in rows])
+    return Batch(rows[0].group, ks, ids, np.ascontiguousarray(mask.T))

@@ -1,0 +1,227 @@
+"""Runs the rows of a plan: compiled where the model has a kernel, NumPy elsewhere, stacked where rows share a landmark."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from rbpf import gaussian, reference
+from rbpf.kernels.refine import refine
+from rbpf.kernels.update import update
+from rbpf.lie import LieGroup
+from rbpf.likelihoods import Gaussian
+from rbpf.maps.layout import Layout
+from rbpf.maps.plan import Batch, Plan, Row
+from rbpf.maps.shared import SharedStore
+from rbpf.models import FusedKernel, LogDensities, Observations, Records
+from rbpf.numeric import linearise
+from rbpf.proposals import Prior, Terms
+
+GAUSSIAN = Gaussian()
+_NO_MASK = np.zeros((0, 0), dtype=np.bool_)
+
+
+class RowEngine:
+    """Linearises and updates the columns of a store."""
+
+    def __init__(
+        self, space: LieGroup, store: SharedStore, layout_of: Callable[[int], Layout], compiled: bool
+    ) -> None:
+        self.space = space
+        self.store = store
+        self.layout_of = layout_of
+        self.compiled = compiled
+
+    def terms(self, plan: Plan, state: np.ndarray, groups: Sequence[Observations], prior: Prior) -> Terms:
+        """Information of all rows but the late ones, about a right perturbation of the states (N, E)."""
+        total = Terms.zeros(state.shape[0], self.space.dim)
+        total.log_factor += plan.log_factor
+        for batch in plan.batches:
+            group = groups[batch.group]
+            kernel = self._kernel(group)
+            if kernel is None:
+                total.add(self._terms_numpy(batch, group, state, prior))
+            else:
+                self._terms_compiled(kernel, batch, group, state, prior, total)
+        for rows in plan.joint:
+            nu, jac, records, noise, log_factor = self._joint(rows, groups, state, prior)
+            jac_map = jac[..., self.space.dim :]
+            cov = gaussian.symmetrise(jac_map @ records.cov[:, 0] @ np.swapaxes(jac_map, -1, -2)) + noise
+            jac_state = jac[..., : self.space.dim]
+            total.add(reference.information(nu[:, None], jac_state[:, None], cov[:, None], GAUSSIAN, prior))
+            total.log_factor += log_factor
+        return total
+
+    def correct(self, plan: Plan, state: np.ndarray, groups: Sequence[Observations]) -> LogDensities:
+        """log p(z | x) of all rows, and the updates."""
+        log_density = plan.log_factor.copy()
+        for batch in plan.batches:
+            group = groups[batch.group]
+            kernel = self._kernel(group)
+            if kernel is None:
+                self._correct_numpy(batch, group, state, log_density)
+            else:
+                self._correct_compiled(kernel, batch, group, state, log_density)
+        for rows in plan.joint:
+            self._correct_joint(rows, groups, state, log_density)
+        late = np.zeros(state.shape[0])
+        for row in plan.late:
+            late += self._correct_mixture(row, groups[row.group], state)
+        return LogDensities(log_density + late, late)
+
+    def _kernel(self, group: Observations) -> FusedKernel | None:
+        if not self.compiled or (group.likelihood is not None and group.likelihood.form < 0):
+            return None
+        return group.model.kernel()
+
+    def _sizes(self, column: int) -> np.ndarray:
+        landmark = self.layout_of(column).landmark
+        return np.array([self.space.dim, landmark.dim, landmark.constants])
+
+    def _terms_compiled(
+        self, kernel: FusedKernel, batch: Batch, group: Observations, state: np.ndarray, prior: Prior, total: Terms
+    ) -> None:
+        access = self.store.access(batch.ids)
+        likelihood = group.likelihood or GAUSSIAN
+        mask = _NO_MASK if batch.mask is None else np.ascontiguousarray(batch.mask.T)
+        refine(
+            kernel.function,
+            kernel.params,
+            np.ascontiguousarray(state),
+            access.pool,
+            access.slabs,
+            access.which,
+            access.maps,
+            group.z[batch.ks],
+            group.cov[batch.ks],
+            mask,
+            likelihood.form,
+            likelihood.params,
+            np.ascontiguousarray(prior.factor),
+            self._sizes(int(batch.ids[0])),
+            total.info,
+            total.vector,
+            total.quad,
+            total.log_det,
+        )
+        total.rows += batch.ks.size * group.model.dim
+
+    def _correct_compiled(
+        self, kernel: FusedKernel, batch: Batch, group: Observations, state: np.ndarray, log_density: np.ndarray
+    ) -> None:
+        access, targets = self.store.rewrite(batch.ids)
+        likelihood = group.likelihood or GAUSSIAN
+        update(
+            kernel.function,
+            kernel.params,
+            np.ascontiguousarray(state),
+            access.pool,
+            access.slabs,
+            access.which,
+            access.maps,
+            targets,
+            group.z[batch.ks],
+            group.cov[batch.ks],
+            _NO_MASK if batch.mask is None else np.ascontiguousarray(batch.mask.T),
+            likelihood.form,
+            likelihood.params,
+            self._sizes(int(batch.ids[0])),
+            log_density,
+        )
+
+    def _read(self, ids: np.ndarray) -> tuple[np.ndarray, Records]:
+        columns = np.array([self.store.read(int(i)) for i in ids])
+        return columns, self.layout_of(int(ids[0])).unpack(columns)
+
+    def _write(self, ids: np.ndarray, columns: np.ndarray, mean: np.ndarray, cov: np.ndarray) -> None:
+        """Writes new Gaussians (N, K, …) into columns (K, fields, N); their other fields stay."""
+        fields = np.concatenate([mean, gaussian.pack(cov)], axis=-1)
+        fields = np.moveaxis(fields.reshape(*fields.shape[:2], -1), 0, -1)
+        columns[:, : fields.shape[1]] = fields
+        for column, records in zip(ids.tolist(), columns, strict=True):
+            self.store.replace(column, records)
+
+    def _terms_numpy(self, batch: Batch, group: Observations, state: np.ndarray, prior: Prior) -> Terms:
+        _, records = self._read(batch.ids)
+        z, noise = group.z[batch.ks], group.cov[batch.ks]
+        nu, jac = linearise(group.model, self.space, z, state[:, None, :], records.mean, records.const)
+        assert jac.state is not None and jac.landmark is not None
+        cov = reference.innovation_covariance(jac.landmark, records.cov, noise)
+        return reference.information(nu, jac.state, cov, group.likelihood or GAUSSIAN, prior, batch.mask)
+
+    def _correct_numpy(self, batch: Batch, group: Observations, state: np.ndarray, log_density: np.ndarray) -> None:
+        pending = np.arange(batch.ids.size)
+        while pending.size:
+            _, first = np.unique(batch.ids[pending], return_index=True)
+            self._correct_once(batch, pending[first], group, state, log_density)
+            pending = np.delete(pending, first)
+
+    def _correct_once(
+        self, batch: Batch, rows: np.ndarray, group: Observations, state: np.ndarray, log_density: np.ndarray
+    ) -> None:
+        ids, ks = batch.ids[rows], batch.ks[rows]
+        columns, records = self._read(ids)
+        nu, jac = linearise(group.model, self.space, group.z[ks], state[:, None, :], records.mean, records.const)
+        assert jac.landmark is not None
+        mask = None if batch.mask is None else batch.mask[:, rows]
+        likelihood = group.likelihood or GAUSSIAN
+        mean, cov, log_terms = reference.updated(
+            nu, jac.landmark, records.mean, records.cov, group.cov[ks], likelihood, mask
+        )
+        log_density += log_terms.sum(axis=1)
+        self._write(ids, columns, mean, cov)
+
+    def _joint(
+        self, rows: list[Row], groups: Sequence[Observations], state: np.ndarray, prior: Prior | None = None
+    ) -> tuple[np.ndarray, np.ndarray, Records, np.ndarray, np.ndarray]:
+        """Stacked ν (N, Σp), [H J], the landmark's records, R and the log-density of rows taken as outliers."""
+        _, records = self._read(np.array([rows[0].landmark]))
+        nus, jacs, noises, masks = [], [], [], []
+        log_factor = np.zeros(state.shape[0])
+        for row in rows:
+            group = groups[row.group]
+            z = group.z[row.k : row.k + 1]
+            nu, jac = linearise(group.model, self.space, z, state[:, None, :], records.mean, records.const)
+            assert jac.state is not None and jac.landmark is not None
+            mask = row.mask
+            if group.likelihood is not None and group.likelihood.form != 0:
+                cov = reference.innovation_covariance(jac.landmark, records.cov, group.cov[row.k])
+                mask, log_row = reference.gated(nu, jac.state, cov, group.likelihood, prior, mask)
+                log_factor += log_row
+            nus.append(nu[:, 0].copy())
+            jacs.append(np.concatenate([jac.state[:, 0], jac.landmark[:, 0]], axis=-1))
+            noises.append(group.cov[row.k])
+            masks.append(mask)
+        nu, jac_all, noise = reference.stacked(nus, jacs, noises, masks)
+        return nu, jac_all, records, noise, log_factor
+
+    def _correct_joint(
+        self, rows: list[Row], groups: Sequence[Observations], state: np.ndarray, log_density: np.ndarray
+    ) -> None:
+        nu, jac, records, noise, log_factor = self._joint(rows, groups, state)
+        jac_map = jac[:, None, :, self.space.dim :]
+        mean, cov, log_terms = reference.updated(
+            nu[:, None], jac_map, records.mean, records.cov, noise[:, None], GAUSSIAN
+        )
+        log_density += log_terms[:, 0] + log_factor
+        ids = np.array([rows[0].landmark])
+        self._write(ids, self._read(ids)[0], mean, cov)
+
+    def _correct_mixture(self, row: Row, group: Observations, state: np.ndarray) -> np.ndarray:
+        """p(z | x) = Σ_c w_c p(z | x, c); every component is updated, and its weight by its own density."""
+        ids = np.array([row.landmark])
+        columns, records = self._read(ids)
+        assert records.log_weights is not None
+        mean, cov = records.mean[:, 0], records.cov[:, 0]
+        nu, jac = linearise(group.model, self.space, group.z[row.k], state[:, None, :], mean, records.const)
+        assert jac.landmark is not None
+        mask = None if row.mask is None else np.repeat(row.mask[:, None], mean.shape[1], axis=1)
+        likelihood = group.likelihood or GAUSSIAN
+        new_mean, new_cov, log_terms = reference.updated(
+            nu, jac.landmark, mean, cov, group.cov[row.k], likelihood, mask
+        )
+        joint = records.log_weights[:, 0] + log_terms
+        total = np.logaddexp.reduce(joint, axis=1)
+        end = self.layout_of(row.landmark).gaussian_fields * mean.shape[1]
+        columns[0, end : end + mean.shape[1]] = (joint - total[:, None]).T
+        self._write(ids, columns, new_mean[:, None], new_cov[:, None])
+        return total

@@ -1,0 +1,131 @@
+"""Parts side by side: observations of the state alone, and the union of what is marginalised."""
+
+from collections.abc import Sequence
+from typing import final
+
+import numpy as np
+
+from rbpf.errors import InputError
+from rbpf.genealogy import Lineage
+from rbpf.lie import LieGroup
+from rbpf.likelihoods import Gaussian
+from rbpf.models import Conditional, LogDensities, Observations, Part, Transition
+from rbpf.numeric import linearise
+from rbpf.proposals import Prior, Terms
+from rbpf.reference import information
+
+GAUSSIAN = Gaussian()
+
+
+@final
+class StateOnly(Conditional):
+    """Observations that read the sampled state and nothing else, as a position fix."""
+
+    supplies = Part.STATE
+
+    def __init__(self, space: LieGroup) -> None:
+        self.space = space
+
+    def begin(self, n: int, lineage: Lineage) -> None:
+        """Nothing is stored."""
+
+    def terms(self, state: np.ndarray, groups: Sequence[Observations], prior: Prior) -> Terms:
+        """S = R."""
+        total = Terms.zeros(state.shape[0], self.space.dim)
+        for group in groups:
+            nu, jacobians = linearise(group.model, self.space, group.z, state[:, None, :])
+            assert jacobians.state is not None
+            cov = np.broadcast_to(group.cov, (*nu.shape, nu.shape[-1]))
+            total.add(information(nu, jacobians.state, cov, group.likelihood or GAUSSIAN, prior))
+        return total
+
+    def correct(self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]) -> LogDensities:
+        """Σ log p(z | x); there is nothing to update."""
+        total = np.zeros(state.shape[0])
+        for group in groups:
+            nu = group.model.residual(group.z, group.model.predict(state[:, None, :]))
+            cov = np.broadcast_to(group.cov, (*nu.shape, nu.shape[-1]))
+            total += (group.likelihood or GAUSSIAN).log_density(nu, cov).sum(axis=1)
+        return LogDensities(total, np.zeros_like(total))
+
+    def resample(self, ancestors: np.ndarray) -> None:
+        """Nothing is stored."""
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Nothing is stored."""
+        return {}
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """Nothing is stored."""
+
+
+@final
+class Marginals(Conditional):
+    """Several marginalised parts side by side; each observation goes to the part that it reads.
+
+    A substate and a map together are exact only if no observation reads both.
+    """
+
+    supplies = Part.STATE
+
+    def __init__(self, space: LieGroup, parts: Sequence[Conditional]) -> None:
+        self.space = space
+        self.parts = {part.supplies: part for part in (StateOnly(space), *parts)}
+        if len(self.parts) != len(parts) + 1:
+            raise InputError("the filter takes at most one landmark map and one Kalman substate")
+
+    def begin(self, n: int, lineage: Lineage) -> None:
+        """Begins every part."""
+        for part in self.parts.values():
+            part.begin(n, lineage)
+
+    def predict(self, transition: Transition, space: LieGroup) -> Prior:
+        """The substate's law where there is one."""
+        driver = self.parts.get(Part.SUBSTATE, self.parts[Part.STATE])
+        return driver.predict(transition, space)
+
+    def terms(self, state: np.ndarray, groups: Sequence[Observations], prior: Prior) -> Terms:
+        """Sum over the parts that were observed."""
+        total = Terms.zeros(state.shape[0], self.space.dim)
+        for supplies, routed in self._routed(groups).items():
+            if routed:
+                total.add(self.parts[supplies].terms(state, routed, prior))
+        return total
+
+    def correct(self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]) -> LogDensities:
+        """Corrects every part."""
+        total, late = np.zeros(state.shape[0]), np.zeros(state.shape[0])
+        for supplies, routed in self._routed(groups).items():
+            densities = self.parts[supplies].correct(state, increment, routed)
+            total += densities.all
+            late += densities.late
+        return LogDensities(total, late)
+
+    def resample(self, ancestors: np.ndarray) -> None:
+        """Resamples every part."""
+        for part in self.parts.values():
+            part.resample(ancestors)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Of all parts."""
+        return {name: array for part in self.parts.values() for name, array in part.arrays().items()}
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """Of all parts."""
+        for part in self.parts.values():
+            part.restore(arrays)
+
+    def _routed(self, groups: Sequence[Observations]) -> dict[Part, list[Observations]]:
+        routed: dict[Part, list[Observations]] = {supplies: [] for supplies in self.parts}
+        for group in groups:
+            reads = group.model.reads - {Part.STATE}
+            if len(reads) > 1:
+                raise InputError(
+                    f"{type(group.model).__name__} reads a landmark and the substate, which couples them: "
+                    "sample that part of the substate instead"
+                )
+            supplies = next(iter(reads), Part.STATE)
+            if supplies not in self.parts:
+                raise InputError(f"{type(group.model).__name__} reads a {supplies.value}, which this filter does not hold")
+            routed[supplies].append(group)
+        return routed

@@ -1,0 +1,270 @@
+"""The Rao-Blackwellised particle filter: one step, for every variant.
+
+    p(x_0:t, m | z_1:t, u_1:t) ≈ Σ_i w_i δ(x_0:t − x_0:t^i) p(m | x_0:t^i, z_1:t)
+
+The bootstrap filter, FastSLAM 2.0 and the exact importance ratio differ in the proposal alone.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rbpf.belief import Belief
+from rbpf.checkpoint import read_checkpoint, write_checkpoint
+from rbpf.conditional import Marginals
+from rbpf.errors import InputError
+from rbpf.estimate import Estimate, mixture_estimate
+from rbpf.genealogy import History, Lineage
+from rbpf.models import (
+    Conditional,
+    LineariseAt,
+    MotionModel,
+    Observations,
+    Proposal,
+    Resampler,
+    Sensor,
+)
+from rbpf.particles import Particles, effective_sample_size, reweight, uniform_log_weights
+from rbpf.proposals import EkfProposal, Prior, Proposed, Terms
+from rbpf.resampling import EssTriggered, Systematic
+
+
+@dataclass(frozen=True)
+class StepReport:
+    """What one step did.
+
+    Attributes:
+        stamp_ns: time of the step.
+        estimate: mean and covariance of the state.
+        ess: effective sample size before resampling.
+        resampled: whether the particles were resampled.
+        log_evidence: log p(z_t | z_1:t−1); NaN where a likelihood is not a density.
+        nis: weighted mean squared Mahalanobis distance of the joint innovation, NaN without a linearised one.
+        rows: its degrees of freedom.
+        groups: the observations that were used.
+        births: ids of the landmarks started.
+    """
+
+    stamp_ns: int
+    estimate: Estimate
+    ess: float
+    resampled: bool
+    log_evidence: float
+    nis: float
+    rows: int
+    groups: Sequence[Observations]
+    births: np.ndarray
+
+
+class Filter:
+    """N weighted trajectories, each with its own marginalised part.
+
+    Args:
+        motion: p(x_t | x_{t−1}, u_t).
+        sensors: what measures; a single Sensor or several.
+        conditional: what is marginalised: a LandmarkMap, a KalmanSubstate, both in a list, or nothing.
+        proposal: where the particles are sampled; by default EKF-refined with the exact ratio.
+        resampler: by default systematic when the effective sample size falls below N/2.
+        n: number of particles.
+        rng: source of all randomness.
+        start: (E,) or (N, E) initial state; by default the identity.
+        lag: steps of trajectory kept, None keeps all.
+        clouds: keep whole clouds, for backward simulation.
+    """
+
+    def __init__(
+        self,
+        motion: MotionModel,
+        sensors: Sensor | Sequence[Sensor],
+        conditional: Conditional | Sequence[Conditional] = (),
+        proposal: Proposal | None = None,
+        resampler: Resampler | None = None,
+        n: int = 100,
+        rng: np.random.Generator | None = None,
+        start: np.ndarray | None = None,
+        lag: int | None = None,
+        clouds: bool = False,
+    ) -> None:
+        if n < 1:
+            raise InputError(f"a filter needs at least one particle, got {n}")
+        self.motion = motion
+        self.space = motion.space
+        self.sensors = [sensors] if isinstance(sensors, Sensor) else list(sensors)
+        parts = [conditional] if isinstance(conditional, Conditional) else list(conditional)
+        self.marginals = Marginals(self.space, parts)
+        self.proposal = proposal or EkfProposal()
+        self.resampler = resampler or EssTriggered(Systematic())
+        self.rng = rng or np.random.default_rng()
+        origin = self.space.identity() if start is None else np.asarray(start, dtype=float)
+        state = np.array(np.broadcast_to(origin, (n, self.space.size)))
+        self.particles = Particles(state, uniform_log_weights(n))
+        self.lineage = Lineage(n)
+        self.marginals.begin(n, self.lineage)
+        self.history = History(self.lineage, lag, clouds)
+        self.log_evidence = 0.0
+        self.stamp_ns: int | None = None
+        self.steps = 0
+
+    @property
+    def n(self) -> int:
+        """Number of particles."""
+        return self.particles.n
+
+    def step(self, frame: Any, control: Any = None, stamp_ns: int | None = None) -> StepReport:
+        """Predicts, observes, refines, weighs, resamples, samples, corrects and updates; then starts landmarks.
+
+        Args:
+            frame: what the sensors observe.
+            control: what the motion model moves by.
+            stamp_ns: time of the frame; by default the previous one plus one second.
+
+        Raises:
+            InputError: time runs backwards, shapes do not fit, or no particle explains the observations.
+        """
+        stamp_ns, dt = self._clock(stamp_ns)
+        prior = self._predict(control, dt)
+        groups = self._observe(frame, Belief(self.particles.log_weights, prior, self.marginals))
+        proposed = self.proposal.propose(prior, _LineariseGroups(self.marginals, prior, groups))
+        log_weights, look_ahead = reweight(self.particles.log_weights, proposed.log_w1, f"step {self.steps}")
+        refined = mixture_estimate(prior, proposed, log_weights) if proposed.nis is not None else None
+
+        weights = np.exp(log_weights)
+        ancestors = self.resampler.ancestors(weights, self.rng)
+        if ancestors is not None:
+            log_weights = uniform_log_weights(self.n)
+            prior, groups = self._descend(ancestors, prior, groups)
+
+        state, log_w2 = self._sample_and_update(prior, proposed, groups, ancestors)
+        log_weights, correction = reweight(log_weights, log_w2, f"step {self.steps}")
+        self.particles = Particles(state, log_weights)
+        births = self._start_landmarks(frame, groups)
+
+        normalised = all(group.likelihood is None or group.likelihood.normalised for group in groups)
+        evidence = look_ahead + correction if normalised else float("nan")
+        self.log_evidence += evidence
+        self.steps += 1
+        self.history.record(stamp_ns, state, log_weights)
+        return StepReport(
+            stamp_ns=stamp_ns,
+            estimate=refined or mixture_estimate(Prior.exactly(self.space, state), None, log_weights),
+            ess=effective_sample_size(weights),
+            resampled=ancestors is not None,
+            log_evidence=evidence,
+            nis=float("nan") if proposed.nis is None else float((weights * proposed.nis).sum()),
+            rows=proposed.rows,
+            groups=groups,
+            births=births,
+        )
+
+    def estimate(self) -> Estimate:
+        """Mean and covariance of the particles as they are."""
+        return mixture_estimate(Prior.exactly(self.space, self.particles.state), None, self.particles.log_weights)
+
+    def belief(self) -> Belief:
+        """The particles as they are, for reading the map."""
+        return Belief(self.particles.log_weights, Prior.exactly(self.space, self.particles.state), self.marginals)
+
+    def save(self, path: Path | str, extra: dict[str, np.ndarray] | None = None) -> None:
+        """Writes a checkpoint from which `load` goes on as if nothing had happened, with arrays of the caller's."""
+        write_checkpoint(self, Path(path), extra or {})
+
+    def load(self, path: Path | str) -> dict[str, np.ndarray]:
+        """Continues from a checkpoint; this filter must have been built with the same models and options.
+
+        Returns:
+            The `extra` arrays that were saved.
+
+        Raises:
+            InputError: the file is missing, damaged, or belongs to another filter.
+        """
+        return read_checkpoint(self, Path(path))
+
+    def _clock(self, stamp_ns: int | None) -> tuple[int, float]:
+        previous = self.stamp_ns
+        if stamp_ns is None:
+            stamp_ns = 0 if previous is None else previous + 1_000_000_000
+        if previous is not None and stamp_ns < previous:
+            raise InputError(f"time runs backwards: step {self.steps} has stamp {stamp_ns} ns after {previous} ns")
+        self.stamp_ns = int(stamp_ns)
+        return self.stamp_ns, 0.0 if previous is None else (stamp_ns - previous) * 1e-9
+
+    def _predict(self, control: Any, dt: float) -> Prior:
+        transition = self.motion.transition(self.particles.state, control, dt)
+        if transition.mean.shape != self.particles.state.shape or transition.noise_factor.ndim != 3:
+            raise InputError(
+                f"{type(self.motion).__name__}.transition returned mean {transition.mean.shape} and noise_factor "
+                f"{transition.noise_factor.shape}: expected {self.particles.state.shape} and (N or 1, d+m, r)"
+            )
+        return self.marginals.predict(transition, self.space)
+
+    def _observe(self, frame: Any, belief: Belief) -> list[Observations]:
+        observed = [[_checked(group) for group in sensor.observe(frame, belief)] for sensor in self.sensors]
+        self._ends = np.cumsum([len(groups) for groups in observed])
+        return [group for groups in observed for group in groups]
+
+    def _descend(
+        self, ancestors: np.ndarray, prior: Prior, groups: list[Observations]
+    ) -> tuple[Prior, list[Observations]]:
+        self.lineage.advance(ancestors)
+        self.marginals.resample(ancestors)
+        groups = [
+            replace(group, ids=group.ids[ancestors]) if group.ids is not None and group.ids.ndim == 2 else group
+            for group in groups
+        ]
+        return prior.take(ancestors), groups
+
+    def _sample_and_update(
+        self, prior: Prior, proposed: Proposed, groups: list[Observations], ancestors: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """One state for each descendant, and log w₂ = log p(z|x) + log p(x|x⁻) − log q(x) − log w₁."""
+        parents = np.arange(self.n) if ancestors is None else ancestors
+        whitened, log_ratio = proposed.sample(parents, self.rng)
+        increment = prior.mean + np.einsum("nar,nr->na", prior.factor, whitened)
+        state = prior.at(increment)
+        densities = self.marginals.correct(state, increment, groups)
+        if not self.proposal.exact:
+            return state, densities.late
+        return state, densities.all + log_ratio - proposed.log_w1[parents]
+
+    def _start_landmarks(self, frame: Any, groups: list[Observations]) -> np.ndarray:
+        belief = self.belief()
+        ids, first = [np.zeros(0, dtype=np.int64)], 0
+        for sensor, end in zip(self.sensors, self._ends, strict=True):
+            for births in sensor.births(frame, belief, groups[first:end]):
+                ids.append(belief.map.add(births, self.particles.state))
+            first = end
+        return np.concatenate(ids)
+
+
+class _LineariseGroups(LineariseAt):
+    """Terms of all groups, relative to the prior's mean, linearised anywhere in its chart."""
+
+    def __init__(self, marginals: Marginals, prior: Prior, groups: Sequence[Observations]) -> None:
+        self._marginals = marginals
+        self._prior = prior
+        self._groups = groups
+
+    def __call__(self, increment: np.ndarray) -> Terms:
+        prior = self._prior
+        if increment is prior.mean:
+            terms = self._marginals.terms(prior.predicted(), self._groups, prior)
+            return terms if prior.centred else terms.charted(prior.space.right_jacobian(increment))
+        terms = self._marginals.terms(prior.at(increment), self._groups, prior)
+        return terms.charted(prior.space.right_jacobian(increment)).shifted(increment - prior.mean)
+
+
+def _checked(group: Observations) -> Observations:
+    """Shapes and finite numbers of a group, before they can reach a kernel."""
+    name, count = type(group.model).__name__, group.z.shape[0]
+    p = group.model.dim
+    if group.z.shape != (count, p) or group.cov.shape != (count, p, p):
+        raise InputError(
+            f"{name} measures {p} numbers: expected z (K, {p}) and cov (K, {p}, {p}), "
+            f"got {group.z.shape} and {group.cov.shape}"
+        )
+    if not (np.isfinite(group.z).all() and np.isfinite(group.cov).all()):
+        raise InputError(f"a measurement of {name} or its covariance is not finite")
+    return group

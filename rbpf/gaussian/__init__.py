@@ -1,0 +1,42 @@
+"""Batched small Gaussians: factors, log-densities, sampling, conditioning, unscented transform.
+
+Every function broadcasts over leading axes and is meant for n up to about twelve. Covariances are
+full symmetric matrices (..., n, n); a chol_* is lower triangular, a factor L is any matrix with
+L L^T = covariance.
+"""
+
+from rbpf.gaussian.factors import (
+    cholesky,
+    inverse,
+    log_det,
+    psd_factor,
+    solve_lower,
+    solve_lower_matrix,
+)
+from rbpf.gaussian.laws import (
+    Gaussian,
+    Transformed,
+    condition,
+    log_density,
+    sample,
+    unscented_transform,
+)
+from rbpf.gaussian.storage import pack, symmetrise, unpack
+
+__all__ = [
+    "Gaussian",
+    "Transformed",
+    "cholesky",
+    "condition",
+    "inverse",
+    "log_density",
+    "log_det",
+    "pack",
+    "psd_factor",
+    "sample",
+    "solve_lower",
+    "solve_lower_matrix",
+    "symmetrise",
+    "unpack",
+    "unscented_transform",
+]

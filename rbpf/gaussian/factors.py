@@ -1,0 +1,203 @@
+"""Factors of covariances: Cholesky, semi-definite square root, triangular solves, inverses.
+
+Up to n = 8 the loops run over the entries of a matrix and the arithmetic along the batch, which
+LAPACK, called once per matrix, cannot do. Sums use no BLAS: equal input gives equal bytes.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rbpf.errors import InputError
+from rbpf.gaussian.storage import Array, entries_first, entries_last, gram, symmetrise
+
+_UNROLLED = 8
+_ASYMMETRY = 1e-9
+_NEGATIVE = 1e-9
+_SINGULAR = 1e-12
+_NO_SCALE = 1e-100
+
+
+def cholesky(cov: ArrayLike) -> Array:
+    """Lower Cholesky factor of positive definite matrices; the upper triangle is not read.
+
+    Args:
+        cov: (..., n, n).
+
+    Returns:
+        (..., n, n), lower triangular with a positive diagonal.
+
+    Raises:
+        InputError: A matrix is not positive definite or holds NaN.
+    """
+    cov = np.asarray(cov, dtype=float)
+    with np.errstate(invalid="ignore"):  # from entries that are infinite, which the complaint covers
+        large = cov.shape[-1] > _UNROLLED
+        chol, definite = _cholesky_lapack(cov) if large else _cholesky_batch(cov, 0.0)
+    _require(definite, "is not positive definite: hand in one of full rank, or use psd_factor")
+    return chol
+
+
+def psd_factor(cov: ArrayLike) -> Array:
+    """Square factor L with L L^T = cov of positive semi-definite, possibly singular matrices.
+
+    A definite matrix gets its lower Cholesky factor, any other one its scaled eigenvectors; each
+    matrix is treated alike whatever else is in the batch.
+
+    Args:
+        cov: (..., n, n).
+
+    Returns:
+        (..., n, n).
+
+    Raises:
+        InputError: A matrix holds NaN, is not symmetric, or has an eigenvalue below
+            -1e-9 times its largest.
+    """
+    cov = np.asarray(cov, dtype=float)
+    _require_symmetric(cov)
+    factor, definite = _cholesky_batch(cov, _SINGULAR)
+    if not definite.all():
+        singular = ~definite
+        negative = np.zeros_like(singular)
+        factor[singular], negative[singular] = _eigen_factor(cov[singular])
+        _require(~negative, "has a negative eigenvalue: check how it was computed")
+    return factor
+
+
+def solve_lower(chol: ArrayLike, b: ArrayLike) -> Array:
+    """Solve chol x = b by forward substitution.
+
+    Args:
+        chol: (..., n, n), lower triangular.
+        b: (..., n).
+
+    Returns:
+        (..., n).
+    """
+    return solve_lower_matrix(chol, np.asarray(b, dtype=float)[..., None])[..., 0]
+
+
+def solve_lower_matrix(chol: ArrayLike, b: ArrayLike) -> Array:
+    """Solve chol X = B by forward substitution.
+
+    Args:
+        chol: (..., n, n), lower triangular.
+        b: (..., n, k).
+
+    Returns:
+        (..., n, k).
+    """
+    chol, b = np.asarray(chol, dtype=float), np.asarray(b, dtype=float)
+    ndim = max(chol.ndim, b.ndim)
+    lower, right = entries_first(chol, ndim), entries_first(b, ndim)
+    n, k = right.shape[:2]
+    out = np.empty((n, k, *np.broadcast_shapes(lower.shape[2:], right.shape[2:])))
+    for i in range(n):
+        row = right[i] - np.einsum("j...,jk...->k...", lower[i, :i], out[:i]) if i else right[0]
+        out[i] = row / lower[i, i]
+    return entries_last(out)
+
+
+def inverse(cov: ArrayLike) -> Array:
+    """Inverse of positive definite matrices, exactly symmetric.
+
+    Args:
+        cov: (..., n, n).
+
+    Returns:
+        (..., n, n).
+
+    Raises:
+        InputError: A matrix is not positive definite.
+    """
+    chol = cholesky(cov)
+    half = solve_lower_matrix(chol, np.eye(chol.shape[-1]))
+    return gram(np.swapaxes(half, -1, -2))
+
+
+def log_det(chol: ArrayLike) -> Array:
+    """Logarithm of the determinant, log |chol chol^T|, (..., n, n) -> (...)."""
+    diagonal = np.diagonal(np.asarray(chol, dtype=float), axis1=-2, axis2=-1)
+    return 2.0 * np.log(diagonal).sum(-1)
+
+
+def generalised_inverse(cov: Array) -> Array:
+    """Symmetric G with cov G cov = cov of semi-definite matrices, null directions left out.
+
+    Args:
+        cov: (..., n, n).
+
+    Returns:
+        (..., n, n); the inverse where cov is definite.
+    """
+    scale, vectors, values = _scaled_eigen(cov)
+    kept = values > _SINGULAR * cov.shape[-1]
+    roots = np.divide(1.0, np.sqrt(np.abs(values)), out=np.zeros_like(values), where=kept)
+    return gram(_reciprocal(scale)[..., :, None] * vectors * roots[..., None, :])
+
+
+def _cholesky_batch(cov: Array, floor: float) -> tuple[Array, NDArray[np.bool_]]:
+    # A pivot that is not above floor times its variance, be it infinite or NaN, means: not definite.
+    entries = entries_first(cov)
+    chol = np.zeros(entries.shape)
+    definite = np.ones(cov.shape[:-2], dtype=bool)
+    for j in range(len(entries)):
+        column = entries[j:, j]
+        if j:
+            column = column - np.einsum("ik...,k...->i...", chol[j:, :j], chol[j, :j])
+        pivot = column[0]
+        positive = pivot > floor * entries[j, j]
+        definite &= positive
+        chol[j:, j] = column / np.sqrt(np.where(positive, pivot, np.inf))
+    return entries_last(chol), definite
+
+
+def _cholesky_lapack(cov: Array) -> tuple[Array, NDArray[np.bool_]]:
+    try:
+        chol = np.asarray(np.linalg.cholesky(cov), dtype=float)
+    except np.linalg.LinAlgError:
+        # LAPACK does not say which matrix of the batch failed.
+        return _cholesky_batch(cov, 0.0)
+    return chol, np.asarray(np.isfinite(chol).all((-1, -2)))
+
+
+def _eigen_factor(cov: Array) -> tuple[Array, NDArray[np.bool_]]:
+    # The factor, and whether the matrix is not semi-definite.
+    plain_values, plain_vectors = np.linalg.eigh(cov)
+    negative = plain_values[..., 0] < -_NEGATIVE * np.abs(plain_values).max(-1)
+    plain = plain_vectors * np.sqrt(np.maximum(plain_values, 0.0))[..., None, :]
+    scale, vectors, values = _scaled_eigen(cov)
+    scaled = scale[..., :, None] * vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
+    # Beside a variance that is rounding itself, correlations exceed one: there the plain one is nearer.
+    sound = values[..., :1, None] >= -_NEGATIVE * values[..., -1:, None]
+    return np.where(sound, scaled, plain), negative
+
+
+def _scaled_eigen(cov: Array) -> tuple[Array, Array, Array]:
+    # Of the correlation matrix, so that radians beside metres keep all their digits.
+    scale = np.sqrt(np.maximum(np.diagonal(cov, axis1=-2, axis2=-1), 0.0))
+    reciprocal = _reciprocal(scale)
+    correlation = symmetrise(cov) * reciprocal[..., :, None] * reciprocal[..., None, :]
+    values, vectors = np.linalg.eigh(correlation)
+    return scale, vectors, values
+
+
+def _reciprocal(scale: Array) -> Array:
+    return np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > _NO_SCALE)
+
+
+def _require_symmetric(cov: Array) -> None:
+    finite, swapped = np.isfinite(cov), np.swapaxes(cov, -1, -2)
+    # The reductions of every matrix by itself cost more than the factor, so only a doubt pays for them.
+    if finite.all() and (cov == swapped).all():
+        return
+    _require(finite.all((-1, -2)), "has an entry that is not finite: check the input it came from")
+    skewed = np.abs(cov - swapped).max((-1, -2)) > _ASYMMETRY * np.abs(cov).max((-1, -2))
+    _require(~skewed, "is not symmetric: pass it through symmetrise if it is rounding")
+
+
+def _require(good: NDArray[np.bool_] | np.bool_, complaint: str) -> None:
+    if not np.all(good):
+        first = tuple(int(i) for i in np.argwhere(~np.asarray(good))[0])
+        place = f"Covariance {first} of the batch" if first else "The covariance"
+        raise InputError(f"{place} {complaint}.")

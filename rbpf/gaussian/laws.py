@@ -1,0 +1,158 @@
+"""Gaussian laws: log-density, sampling, conditioning, and the image under a function."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rbpf.errors import InputError
+from rbpf.gaussian.factors import cholesky, generalised_inverse, log_det, psd_factor, solve_lower
+from rbpf.gaussian.storage import Array, gram, product
+
+_LOG_2PI = float(np.log(2.0 * np.pi))
+
+
+class Gaussian(NamedTuple):
+    """Mean (..., n) and covariance (..., n, n)."""
+
+    mean: Array
+    cov: Array
+
+
+class Transformed(NamedTuple):
+    """Mean (..., m) and covariance (..., m, m) of y, and cov_xy = cov(x, y) (..., n, m)."""
+
+    mean: Array
+    cov: Array
+    cov_xy: Array
+
+
+def log_density(residual: ArrayLike, cov: ArrayLike) -> Array:
+    """Logarithm of the density N(residual; 0, cov).
+
+    Args:
+        residual: (..., n).
+        cov: (..., n, n), positive definite.
+
+    Returns:
+        (...).
+
+    Raises:
+        InputError: A covariance is not positive definite.
+    """
+    chol = cholesky(cov)
+    white = solve_lower(chol, residual)
+    return -0.5 * (np.square(white).sum(-1) + log_det(chol) + white.shape[-1] * _LOG_2PI)
+
+
+def sample(
+    mean: ArrayLike, factor: ArrayLike, rng: np.random.Generator, shape: tuple[int, ...] = ()
+) -> Array:
+    """Draws of mean + factor e with e ~ N(0, I).
+
+    Args:
+        mean: (..., n).
+        factor: (..., n, r); the covariance is factor factor^T.
+        rng: Source of randomness.
+        shape: Leading axes of independent draws, in front of the batch.
+
+    Returns:
+        (*shape, ..., n).
+    """
+    mean, factor = np.asarray(mean, dtype=float), np.asarray(factor, dtype=float)
+    batch = np.broadcast_shapes(mean.shape[:-1], factor.shape[:-2])
+    noise = rng.standard_normal((*shape, *batch, factor.shape[-1]))
+    return mean + np.einsum("...nr,...r->...n", factor, noise)
+
+
+def condition(
+    mean_a: ArrayLike,
+    mean_b: ArrayLike,
+    cov_aa: ArrayLike,
+    cov_ab: ArrayLike,
+    cov_bb: ArrayLike,
+    b: ArrayLike,
+) -> Gaussian:
+    """Law of a given b, where (a, b) are jointly Gaussian.
+
+    With the gain K = cov_ab cov_bb^- and a factor [F_a; F_b] of the joint covariance, the result is
+    mean_a + K (b - mean_b) and (F_a - K F_b)(F_a - K F_b)^T, which cannot lose definiteness.
+    Where cov_bb is singular, the generalised inverse leaves its null directions out.
+
+    Args:
+        mean_a: (..., n).
+        mean_b: (..., m).
+        cov_aa: (..., n, n).
+        cov_ab: (..., n, m).
+        cov_bb: (..., m, m).
+        b: (..., m), the value observed.
+
+    Returns:
+        Mean (..., n) and covariance (..., n, n).
+
+    Raises:
+        InputError: The joint covariance holds NaN, is not symmetric or not positive semi-definite.
+    """
+    aa, ab, bb = (np.asarray(part, dtype=float) for part in (cov_aa, cov_ab, cov_bb))
+    n = aa.shape[-1]
+    factor = psd_factor(_joint(aa, ab, bb))
+    gain = product(ab, generalised_inverse(bb))
+    innovation = np.asarray(b, dtype=float) - np.asarray(mean_b, dtype=float)
+    mean = np.asarray(mean_a, dtype=float) + np.einsum("...ij,...j->...i", gain, innovation)
+    return Gaussian(mean, gram(factor[..., :n, :] - product(gain, factor[..., n:, :])))
+
+
+def unscented_transform(
+    function: Callable[[Array], Array], mean: ArrayLike, cov: ArrayLike, kappa: float | None = None
+) -> Transformed:
+    """Gaussian of y = function(x) from the 2n + 1 symmetric sigma points.
+
+    x_0 = mean with the weight kappa / (n + kappa), and mean +- sqrt(n + kappa) times each column of
+    a factor of cov with the weights 1 / (2 (n + kappa)); Julier and Uhlmann, "Unscented Filtering
+    and Nonlinear Estimation" (2004). No weight is negative, so the covariance is semi-definite.
+
+    Args:
+        function: (2n + 1, ..., n) -> (2n + 1, ..., m); the sigma points are the first axis, so that
+            arguments of its own which differ along the batch broadcast.
+        mean: (..., n).
+        cov: (..., n, n), may be singular.
+        kappa: At least 0; by default max(0, 3 - n), which matches the fourth moment for n <= 3.
+
+    Returns:
+        Mean and covariance of y, covariance of x with y.
+
+    Raises:
+        InputError: kappa is negative, or cov is not a covariance.
+    """
+    mean = np.asarray(mean, dtype=float)
+    n = mean.shape[-1]
+    kappa = max(0.0, 3.0 - n) if kappa is None else kappa
+    if kappa < 0.0:
+        raise InputError(f"unscented_transform needs kappa >= 0, got {kappa}.")
+    weights = np.full(2 * n + 1, 0.5 / (n + kappa))
+    weights[0] = kappa / (n + kappa)
+    offsets = _sigma_offsets(psd_factor(cov), np.sqrt(n + kappa))
+    values = function(mean + offsets)
+    roots = np.sqrt(weights)
+    mean_y = np.einsum("s,s...->...", weights, values)
+    weighted_y = np.moveaxis(values - mean_y, 0, -1) * roots
+    weighted_x = np.moveaxis(offsets, 0, -1) * roots
+    return Transformed(mean_y, gram(weighted_y), product(weighted_x, np.swapaxes(weighted_y, -1, -2)))
+
+
+def _sigma_offsets(factor: Array, spread: float) -> Array:
+    # (..., n, n) -> (2n + 1, ..., n): zero, then plus and minus the columns.
+    columns = spread * np.moveaxis(factor, -1, 0)
+    return np.concatenate([np.zeros_like(columns[:1]), columns, -columns])
+
+
+def _joint(cov_aa: Array, cov_ab: Array, cov_bb: Array) -> Array:
+    batch = np.broadcast_shapes(cov_aa.shape[:-2], cov_ab.shape[:-2], cov_bb.shape[:-2])
+    n, m = cov_ab.shape[-2:]
+    out = np.empty((*batch, n + m, n + m))
+    out[..., :n, :n] = cov_aa
+    out[..., :n, n:] = cov_ab
+    out[..., n:, :n] = np.swapaxes(cov_ab, -1, -2)
+    out[..., n:, n:] = cov_bb
+    return out

@@ -1,0 +1,97 @@
+"""Likelihoods inside the kernels: which lanes take an observation as an inlier, and at what log-density.
+
+Forms: 0 Gaussian, 1 truncated Mahalanobis (parameter 0: T_l), 2 Gaussian with outliers (parameter 0: log(1−ε),
+parameter 1: log ε/V). `weight` is 1 where the lane uses the observation and 0 where it is left out.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from rbpf.kernels.block import add_squares, cholesky, whiten_vector
+from rbpf.kernels.signature import BLOCK
+
+
+@njit(cache=True, error_model="numpy")
+def accept_predicted(form, params, nu, jac_state, total, factor, start, count, weight, quad):
+    """Gates with the predictive covariance S + H Q Hᵀ; a rejected lane gets the outlier's density and weight 0."""
+    if form == 0:
+        return
+    p, dim, rank = nu.shape[0], jac_state.shape[1], factor.shape[2]
+    spread = np.empty((p, p, BLOCK))
+    white = np.empty((p, BLOCK))
+    column = np.empty((p, BLOCK))
+    squared = np.zeros(BLOCK)
+    scale = np.ones(BLOCK)
+    spread[:, :, :count] = total[:, :, :count]
+    white[:, :count] = nu[:, :count]
+    shared = factor.shape[0] == 1
+    for r in range(rank):
+        for a in range(p):
+            for i in range(count):
+                column[a, i] = 0.0
+                for e in range(dim):
+                    column[a, i] += jac_state[a, e, i] * factor[0 if shared else start + i, e, r]
+        for a in range(p):
+            for b in range(a + 1):
+                for i in range(count):
+                    spread[a, b, i] += column[a, i] * column[b, i]
+    cholesky(spread, count, scale)
+    whiten_vector(spread, count, white)
+    add_squares(white, count, squared)
+    for i in range(count):
+        if weight[i] == 0.0:
+            continue
+        if is_inlier(form, params, squared[i], scale[i], p):
+            if form == 2:
+                quad[i] -= 2.0 * params[0]
+        else:
+            weight[i] = 0.0
+            quad[i] -= 2.0 * outlier_log_density(form, params)
+
+
+@njit(cache=True, error_model="numpy")
+def outlier_log_density(form, params):
+    """Log-density that an observation gets where it is taken as an outlier."""
+    return -0.5 * params[0] if form == 1 else params[1]
+
+
+@njit(cache=True, error_model="numpy")
+def gaussian_log_density(squared, scale, p):
+    """log N from the squared Mahalanobis distance and the product of inverted Cholesky pivots."""
+    return -0.5 * squared + math.log(scale) - 0.5 * p * math.log(2.0 * math.pi)
+
+
+@njit(cache=True, error_model="numpy")
+def is_inlier(form, params, squared, scale, p):
+    """Whether the inlier's term is at least the outlier's."""
+    if form == 1:
+        return squared <= params[0]
+    return form == 0 or gaussian_log_density(squared, scale, p) + params[0] >= params[1]
+
+
+@njit(cache=True, error_model="numpy")
+def log_likelihood(form, params, squared, scale, p):
+    """Log-density of an innovation under the likelihood `form`."""
+    if form == 1:
+        return -0.5 * min(squared, params[0])
+    density = gaussian_log_density(squared, scale, p)
+    if form == 0:
+        return density
+    high = max(density + params[0], params[1])
+    return high + math.log1p(math.exp(min(density + params[0], params[1]) - high))
+
+
+@njit(cache=True, error_model="numpy")
+def leave_out(weight, count, nu, jac, total):
+    """Lanes of weight 0 contribute nothing: ν = 0, J = 0, S = I."""
+    p = nu.shape[0]
+    for i in range(count):
+        if weight[i] == 0.0:
+            for a in range(p):
+                nu[a, i] = 0.0
+                for e in range(jac.shape[1]):
+                    jac[a, e, i] = 0.0
+                for b in range(a + 1):
+                    total[a, b, i] = 1.0 if a == b else 0.0

@@ -1,0 +1,31 @@
+"""The type of a fused observation kernel, and the decorator that makes one."""
+
+from collections.abc import Callable
+from typing import Any
+
+from numba import float64, int64, njit, types, void
+
+BLOCK = 32
+"""Particles per block: wide enough to fill vector registers, small enough for the scratch to stay in the L1 cache."""
+
+VECTOR = types.Array(float64, 1, "C")
+MATRIX = types.Array(float64, 2, "C")
+CUBE = types.Array(float64, 3, "C")
+INDICES = types.Array(int64, 1, "C")
+INDEX_MATRIX = types.Array(int64, 2, "C")
+MASK = types.Array(types.boolean, 2, "C")
+
+_SIGNATURE = void(MATRIX, MATRIX, MATRIX, VECTOR, VECTOR, int64, MATRIX, CUBE, CUBE)
+KERNEL_TYPE = types.FunctionType(_SIGNATURE)
+"""First-class function type: the drivers call a kernel through a pointer, so they compile once for all models."""
+
+
+def observation_kernel(function: Callable[..., None]) -> Any:
+    """Compiles `function(state, mean, const, z, params, n, nu, jac_state, jac_landmark)` into a fused kernel.
+
+    Given one measurement `z` (p,) of one landmark, the kernel fills for the lanes 0..n-1
+    the innovation `nu` (p, BLOCK) and the Jacobians `jac_state` (p, d, BLOCK), in the right chart at the state,
+    and `jac_landmark` (p, D, BLOCK), from `state` (E, BLOCK), `mean` (D, BLOCK), `const` (A, BLOCK) and the
+    model's `params` (P,). Write the body as a loop over lanes; it must not raise.
+    """
+    return njit(_SIGNATURE, cache=True, error_model="numpy")(function)

@@ -1,0 +1,144 @@
+"""Driver: likelihood of the observations at the sampled states, and the landmarks' Kalman updates."""
+
+import numpy as np
+from numba import int64, njit, prange, void
+
+from rbpf.kernels.block import (
+    add_gram,
+    add_squares,
+    add_transposed_product,
+    cholesky,
+    innovation_covariance,
+    load_record,
+    whiten_matrix,
+    whiten_vector,
+)
+from rbpf.kernels.gate import is_inlier, leave_out, log_likelihood
+from rbpf.kernels.signature import (
+    BLOCK,
+    CUBE,
+    INDEX_MATRIX,
+    INDICES,
+    KERNEL_TYPE,
+    MASK,
+    MATRIX,
+    VECTOR,
+)
+
+
+@njit(cache=True, error_model="numpy")
+def _store_record(pool, slab, source, rows, start, count, mean, cov):
+    """Writes a record; the fields behind mean and covariance follow their particle."""
+    dim, size_cov = mean.shape[0], cov.shape[0]
+    for f in range(dim):
+        for i in range(count):
+            pool[slab, f, start + i] = mean[f, i]
+    for f in range(size_cov):
+        for i in range(count):
+            pool[slab, dim + f, start + i] = cov[f, i]
+    if slab != source:
+        for f in range(dim + size_cov, pool.shape[1]):
+            for i in range(count):
+                pool[slab, f, start + i] = pool[source, f, rows[start + i]]
+
+
+@njit(
+    void(
+        KERNEL_TYPE,
+        VECTOR,
+        MATRIX,
+        CUBE,
+        INDICES,
+        INDICES,
+        INDEX_MATRIX,
+        INDICES,
+        MATRIX,
+        CUBE,
+        MASK,
+        int64,
+        VECTOR,
+        INDICES,
+        VECTOR,
+    ),
+    parallel=True,
+    cache=True,
+    error_model="numpy",
+)
+def update(
+    kernel,
+    params,
+    state,
+    pool,
+    slabs,
+    which,
+    maps,
+    targets,
+    z,
+    noise,
+    mask,
+    form,
+    form_params,
+    sizes,
+    log_density,
+):
+    """Adds Σ log p(z | x) to `log_density` (N,) and writes the updated landmarks to the slabs `targets`.
+
+    Given the sampled pose, each landmark is an independent EKF: with S = J P Jᵀ + R = L Lᵀ, A = L⁻¹ J P and
+    y = L⁻¹ν the update is m += Aᵀy, P −= AᵀA. Arguments as in `refine`; particle i reads row `maps[...][i]` of the
+    slab it inherits and writes row i of the target, so that descendants of one parent never share what they write.
+    """
+    n_particles, size = state.shape
+    n_obs, p = noise.shape[0], noise.shape[1]
+    dim, dim_map, size_const = sizes[0], sizes[1], sizes[2]
+    size_cov = dim_map * (dim_map + 1) // 2
+    for block in prange((n_particles + BLOCK - 1) // BLOCK):
+        start = block * BLOCK
+        count = min(BLOCK, n_particles - start)
+        x = np.empty((size, BLOCK))
+        mean = np.empty((dim_map, BLOCK))
+        cov = np.empty((size_cov, BLOCK))
+        const = np.empty((size_const, BLOCK))
+        nu = np.empty((p, BLOCK))
+        jac_state = np.empty((p, dim, BLOCK))
+        jac_map = np.empty((p, dim_map, BLOCK))
+        cross = np.empty((p, dim_map, BLOCK))
+        total = np.empty((p, p, BLOCK))
+        weight = np.ones(BLOCK)
+        scale = np.empty(BLOCK)
+        squared = np.empty(BLOCK)
+        sum_log = np.zeros(BLOCK)
+        for e in range(size):
+            for i in range(count):
+                x[e, i] = state[start + i, e]
+        for k in range(n_obs):
+            rows = maps[which[k]]
+            load_record(pool, slabs[k], rows, start, count, mean, cov, const)
+            kernel(x, mean, const, z[k], params, count, nu, jac_state, jac_map)
+            innovation_covariance(jac_map, cov, noise[k], count, cross, total)
+            if mask.shape[0] > 0:
+                for i in range(count):
+                    weight[i] = 1.0 if mask[k, start + i] else 0.0
+                leave_out(weight, count, nu, cross, total)
+            for i in range(count):
+                squared[i] = 0.0
+                scale[i] = 1.0
+            cholesky(total, count, scale)
+            whiten_vector(total, count, nu)
+            add_squares(nu, count, squared)
+            rejected = False
+            for i in range(count):
+                if weight[i] != 0.0:
+                    sum_log[i] += log_likelihood(form, form_params, squared[i], scale[i], p)
+                    if form != 0:
+                        weight[i] = 1.0 if is_inlier(form, form_params, squared[i], scale[i], p) else 0.0
+                        rejected = rejected or weight[i] == 0.0
+            whiten_matrix(total, count, cross)
+            if rejected:
+                leave_out(weight, count, nu, cross, total)
+            add_transposed_product(cross, nu, count, mean)
+            add_gram(cross, -1.0, count, cov)
+            _store_record(pool, targets[k], slabs[k], rows, start, count, mean, cov)
+            if form != 0 and mask.shape[0] == 0:
+                weight[:] = 1.0
+        for i in range(count):
+            log_density[start + i] += sum_log[i]

@@ -1,0 +1,174 @@
+"""Manifold and LieGroup: what a state space must offer, and what it gets from that."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+_MEAN_ITERATIONS = 50
+_MEAN_TOLERANCE = 1e-14
+
+
+def join(parts: Sequence[Array]) -> Array:
+    """Concatenation along the last axis, where the leading axes broadcast."""
+    batch = parts[0].shape[:-1]
+    if any(part.shape[:-1] != batch for part in parts):
+        batch = np.broadcast_shapes(*(part.shape[:-1] for part in parts))
+        parts = [np.broadcast_to(part, (*batch, part.shape[-1])) for part in parts]
+    return np.concatenate(parts, axis=-1)
+
+
+class Manifold(ABC):
+    """A space of states with a vector chart around every point.
+
+    Attributes:
+        size: Numbers stored per state, E.
+        dim: Dimension of the tangent space, d.
+    """
+
+    size: int
+    dim: int
+
+    @abstractmethod
+    def identity(self, shape: tuple[int, ...] = ()) -> Array:
+        """Origin of the space, repeated.
+
+        Args:
+            shape: Leading axes.
+
+        Returns:
+            (*shape, E).
+        """
+
+    @abstractmethod
+    def retract(self, x: ArrayLike, xi: ArrayLike) -> Array:
+        """Point reached from x along xi.
+
+        Args:
+            x: (..., E).
+            xi: (..., d), in the chart at x.
+
+        Returns:
+            (..., E).
+        """
+
+    @abstractmethod
+    def local(self, x: ArrayLike, y: ArrayLike) -> Array:
+        """Coordinates of y in the chart at x; the inverse of `retract`.
+
+        Args:
+            x: (..., E).
+            y: (..., E).
+
+        Returns:
+            (..., d).
+        """
+
+    @abstractmethod
+    def normalise(self, x: ArrayLike) -> Array:
+        """Nearest valid storage: unit quaternion, wrapped angle.
+
+        Args:
+            x: (..., E).
+
+        Returns:
+            (..., E).
+        """
+
+    @final
+    def interpolate(self, a: ArrayLike, b: ArrayLike, s: ArrayLike) -> Array:
+        """Point at the fraction s of the geodesic from a to b.
+
+        Args:
+            a: (..., E), reached at s = 0.
+            b: (..., E), reached at s = 1.
+            s: (...), also outside [0, 1].
+
+        Returns:
+            (..., E).
+        """
+        return self.retract(a, np.asarray(s, dtype=float)[..., None] * self.local(a, b))
+
+    @final
+    def mean(self, x: ArrayLike, weights: ArrayLike) -> Array:
+        """Weighted Fréchet mean: the m with sum_i w_i local(m, x_i) = 0.
+
+        Gauss-Newton from the heaviest point. It is unique where the points lie within a quarter
+        turn of one another; a wider cloud gives the stationary point next to its heaviest member.
+        The sum runs in the order of the rows, so equal input gives equal bytes.
+
+        Args:
+            x: (N, E).
+            weights: (N,), summing to one.
+
+        Returns:
+            (E,).
+        """
+        points = np.asarray(x, dtype=float)
+        column = np.asarray(weights, dtype=float)[:, None]
+        mean = points[np.argmax(column)]
+        for _ in range(_MEAN_ITERATIONS):
+            step = (column * self.local(mean, points)).sum(0)
+            mean = self.retract(mean, step)
+            if np.abs(step).max(initial=0.0) <= _MEAN_TOLERANCE:
+                break
+        return mean
+
+
+class LieGroup(Manifold):
+    """A manifold with a smooth group operation; the chart at x is xi -> x Exp(xi)."""
+
+    @abstractmethod
+    def exp(self, xi: ArrayLike) -> Array:
+        """Exponential map, (..., d) -> (..., E)."""
+
+    @abstractmethod
+    def log(self, x: ArrayLike) -> Array:
+        """Logarithm, (..., E) -> (..., d), with the rotation angle in [0, pi]."""
+
+    @abstractmethod
+    def compose(self, a: ArrayLike, b: ArrayLike) -> Array:
+        """Group product a b, (..., E) and (..., E) -> (..., E)."""
+
+    @abstractmethod
+    def inverse(self, a: ArrayLike) -> Array:
+        """Group inverse, (..., E) -> (..., E)."""
+
+    @abstractmethod
+    def adjoint(self, a: ArrayLike) -> Array:
+        """Ad_a with a Exp(xi) = Exp(Ad_a xi) a, (..., E) -> (..., d, d)."""
+
+    @abstractmethod
+    def left_jacobian(self, xi: ArrayLike) -> Array:
+        """J_l with Exp(xi + delta) = Exp(J_l delta) Exp(xi) to first order, (..., d) -> (..., d, d)."""
+
+    @abstractmethod
+    def left_jacobian_inverse(self, xi: ArrayLike) -> Array:
+        """Inverse of `left_jacobian`, (..., d) -> (..., d, d); singular at an angle of 2 pi."""
+
+    @final
+    def right_jacobian(self, xi: ArrayLike) -> Array:
+        """J_r with Exp(xi + delta) = Exp(xi) Exp(J_r delta) to first order, (..., d) -> (..., d, d)."""
+        return self.left_jacobian(-np.asarray(xi, dtype=float))
+
+    @final
+    def right_jacobian_inverse(self, xi: ArrayLike) -> Array:
+        """Inverse of `right_jacobian`, (..., d) -> (..., d, d); singular at an angle of 2 pi."""
+        return self.left_jacobian_inverse(-np.asarray(xi, dtype=float))
+
+    @final
+    def between(self, a: ArrayLike, b: ArrayLike) -> Array:
+        """Product a^-1 b, (..., E) and (..., E) -> (..., E)."""
+        return self.compose(self.inverse(a), b)
+
+    def retract(self, x: ArrayLike, xi: ArrayLike) -> Array:
+        """Product x Exp(xi); see `Manifold.retract`. A group may fuse the two steps for speed."""
+        return self.compose(x, self.exp(xi))
+
+    def local(self, x: ArrayLike, y: ArrayLike) -> Array:
+        """Log(x^-1 y); see `Manifold.local`. A group may fuse the two steps for speed."""
+        return self.log(self.between(x, y))

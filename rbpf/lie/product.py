@@ -1,0 +1,104 @@
+"""Direct product of Lie groups."""
+
+from collections.abc import Callable, Sequence
+from itertools import accumulate, pairwise
+from typing import final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rbpf.errors import InputError
+from rbpf.lie.base import Array, LieGroup, join
+
+
+@final
+class Product(LieGroup):
+    """G_1 x G_2 x ...: storages and tangents follow one another in the order of the factors.
+
+    Attributes:
+        groups: The factors.
+    """
+
+    def __init__(self, *groups: LieGroup) -> None:
+        """Product of the given groups.
+
+        Args:
+            *groups: At least one.
+
+        Raises:
+            InputError: No group is given.
+        """
+        if not groups:
+            raise InputError("Product(*groups) needs at least one group, got none.")
+        self.groups = groups
+        self.size = sum(group.size for group in groups)
+        self.dim = sum(group.dim for group in groups)
+        self._storage = _slices([group.size for group in groups])
+        self._tangent = _slices([group.dim for group in groups])
+
+    def __repr__(self) -> str:
+        return f"Product({', '.join(map(repr, self.groups))})"
+
+    def split(self, x: ArrayLike) -> list[Array]:
+        """Views of the factors' storages: (..., E) -> one (..., E_i) per factor."""
+        array = np.asarray(x, dtype=float)
+        return [array[..., part] for part in self._storage]
+
+    def split_tangent(self, xi: ArrayLike) -> list[Array]:
+        """Views of the factors' tangents: (..., d) -> one (..., d_i) per factor."""
+        array = np.asarray(xi, dtype=float)
+        return [array[..., part] for part in self._tangent]
+
+    def join(self, parts: Sequence[ArrayLike]) -> Array:
+        """One array from storages or tangents of all factors; their leading axes broadcast."""
+        return join([np.asarray(part, dtype=float) for part in parts])
+
+    def identity(self, shape: tuple[int, ...] = ()) -> Array:
+        return join([group.identity(shape) for group in self.groups])
+
+    def exp(self, xi: ArrayLike) -> Array:
+        parts = zip(self.groups, self.split_tangent(xi), strict=True)
+        return join([group.exp(part) for group, part in parts])
+
+    def log(self, x: ArrayLike) -> Array:
+        return join([group.log(part) for group, part in zip(self.groups, self.split(x), strict=True)])
+
+    def compose(self, a: ArrayLike, b: ArrayLike) -> Array:
+        parts = zip(self.groups, self.split(a), self.split(b), strict=True)
+        return join([group.compose(left, right) for group, left, right in parts])
+
+    def inverse(self, a: ArrayLike) -> Array:
+        parts = zip(self.groups, self.split(a), strict=True)
+        return join([group.inverse(part) for group, part in parts])
+
+    def retract(self, x: ArrayLike, xi: ArrayLike) -> Array:
+        parts = zip(self.groups, self.split(x), self.split_tangent(xi), strict=True)
+        return join([group.retract(point, step) for group, point, step in parts])
+
+    def local(self, x: ArrayLike, y: ArrayLike) -> Array:
+        parts = zip(self.groups, self.split(x), self.split(y), strict=True)
+        return join([group.local(origin, point) for group, origin, point in parts])
+
+    def normalise(self, x: ArrayLike) -> Array:
+        parts = zip(self.groups, self.split(x), strict=True)
+        return join([group.normalise(part) for group, part in parts])
+
+    def adjoint(self, a: ArrayLike) -> Array:
+        return self._block_diagonal(self.split(a), [group.adjoint for group in self.groups])
+
+    def left_jacobian(self, xi: ArrayLike) -> Array:
+        return self._block_diagonal(self.split_tangent(xi), [group.left_jacobian for group in self.groups])
+
+    def left_jacobian_inverse(self, xi: ArrayLike) -> Array:
+        functions = [group.left_jacobian_inverse for group in self.groups]
+        return self._block_diagonal(self.split_tangent(xi), functions)
+
+    def _block_diagonal(self, parts: list[Array], functions: Sequence[Callable[[Array], Array]]) -> Array:
+        out = np.zeros((*parts[0].shape[:-1], self.dim, self.dim))
+        for block, part, function in zip(self._tangent, parts, functions, strict=True):
+            out[..., block, block] = function(part)
+        return out
+
+
+def _slices(lengths: list[int]) -> list[slice]:
+    return [slice(start, stop) for start, stop in pairwise(accumulate(lengths, initial=0))]

@@ -1,0 +1,183 @@
+"""SE(2), rigid motions of the plane; storage [theta, x, y], tangent [omega, vx, vy].
+
+The plane is treated as the complex numbers: a rotation is the factor exp(i theta), and
+Exp([omega, v]) has the translation V v with V = sin(h) / h exp(i h), h = omega / 2.
+"""
+
+from typing import final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rbpf.lie.base import Array, LieGroup
+from rbpf.lie.series import coefficient_b, coefficient_c
+
+Complex = NDArray[np.complex128]
+
+_TURN = 2.0 * np.pi
+
+
+@final
+class SE2Group(LieGroup):
+    """SE(2); element world_from_body = [theta, x, y], theta in (-pi, pi]."""
+
+    size = 3
+    dim = 3
+
+    def __repr__(self) -> str:
+        return "SE2"
+
+    def identity(self, shape: tuple[int, ...] = ()) -> Array:
+        return np.zeros((*shape, 3))
+
+    def exp(self, xi: ArrayLike) -> Array:
+        xi = _contiguous(xi)
+        half = 0.5 * xi[..., 0]
+        return _pack(_wrap(xi[..., 0]), _sinc(half) * _phasor(half) * _planar(xi))
+
+    def log(self, x: ArrayLike) -> Array:
+        x = _contiguous(x)
+        angle = _wrap(x[..., 0])
+        half = 0.5 * angle
+        return _pack(angle, _phasor(-half) * _planar(x) / _sinc(half))
+
+    def compose(self, a: ArrayLike, b: ArrayLike) -> Array:
+        a, b = _contiguous(a), _contiguous(b)
+        return _pack(_wrap(a[..., 0] + b[..., 0]), _planar(a) + _phasor(a[..., 0]) * _planar(b))
+
+    def inverse(self, a: ArrayLike) -> Array:
+        a = _contiguous(a)
+        return _pack(_wrap(-a[..., 0]), -_phasor(-a[..., 0]) * _planar(a))
+
+    def retract(self, x: ArrayLike, xi: ArrayLike) -> Array:
+        # The rotations exp(i theta) and exp(i omega / 2) of the increment are one.
+        x, xi = _contiguous(x), _contiguous(xi)
+        half = 0.5 * xi[..., 0]
+        step = _sinc(half) * _phasor(x[..., 0] + half) * _planar(xi)
+        return _pack(_wrap(x[..., 0] + xi[..., 0]), _planar(x) + step)
+
+    def local(self, x: ArrayLike, y: ArrayLike) -> Array:
+        x, y = _contiguous(x), _contiguous(y)
+        angle = _wrap(y[..., 0] - x[..., 0])
+        half = 0.5 * angle
+        return _pack(angle, _phasor(-x[..., 0] - half) * (_planar(y) - _planar(x)) / _sinc(half))
+
+    def normalise(self, x: ArrayLike) -> Array:
+        x = _contiguous(x)
+        return _pack(_wrap(x[..., 0]), _planar(x))
+
+    def adjoint(self, a: ArrayLike) -> Array:
+        a = _contiguous(a)
+        return _block(_phasor(a[..., 0]), -1j * _planar(a))
+
+    def left_jacobian(self, xi: ArrayLike) -> Array:
+        xi = _contiguous(xi)
+        half = 0.5 * xi[..., 0]
+        return _block(_sinc(half) * _phasor(half), _coupling(xi))
+
+    def left_jacobian_inverse(self, xi: ArrayLike) -> Array:
+        xi = _contiguous(xi)
+        half = 0.5 * xi[..., 0]
+        inverse = _phasor(-half) / _sinc(half)
+        return _block(inverse, -inverse * _coupling(xi))
+
+    def transform(self, a: ArrayLike, p: ArrayLike) -> Array:
+        """World points of body points.
+
+        Args:
+            a: (..., 3), world_from_body.
+            p: (..., 2), in the body's frame [m].
+
+        Returns:
+            (..., 2), in the world [m].
+        """
+        a, p = _contiguous(a), np.asarray(p, dtype=float)
+        return _pair(_planar(a) + _phasor(a[..., 0]) * (p[..., 0] + 1j * p[..., 1]))
+
+    def inverse_transform(self, a: ArrayLike, p: ArrayLike) -> Array:
+        """Body points of world points; arguments as in `transform`, the frames of p exchanged."""
+        a, p = _contiguous(a), np.asarray(p, dtype=float)
+        return _pair(_phasor(-a[..., 0]) * (p[..., 0] + 1j * p[..., 1] - _planar(a)))
+
+    def translation(self, a: ArrayLike) -> Array:
+        """View of the translation, (..., 3) -> (..., 2)."""
+        return np.asarray(a, dtype=float)[..., 1:]
+
+    def rotation(self, a: ArrayLike) -> Array:
+        """Rotation matrix, (..., 3) -> (..., 2, 2)."""
+        return _matrix(_phasor(_contiguous(a)[..., 0]))
+
+    def matrix(self, a: ArrayLike) -> Array:
+        """Homogeneous matrix, (..., 3) -> (..., 3, 3)."""
+        a = _contiguous(a)
+        out = np.zeros((*a.shape[:-1], 3, 3))
+        out[..., :2, :2] = self.rotation(a)
+        out[..., :2, 2] = a[..., 1:]
+        out[..., 2, 2] = 1.0
+        return out
+
+    def from_matrix(self, m: ArrayLike) -> Array:
+        """Element of a homogeneous matrix, (..., 3, 3) -> (..., 3)."""
+        m = np.asarray(m, dtype=float)
+        angle = np.arctan2(m[..., 1, 0] - m[..., 0, 1], m[..., 0, 0] + m[..., 1, 1])
+        return np.concatenate([_wrap(angle)[..., None], m[..., :2, 2]], axis=-1)
+
+
+def _wrap(angle: Array) -> Array:
+    # An angle that is in (-pi, pi] already must come back unrounded; the minimum catches pi + 1 ulp.
+    return np.minimum(angle - _TURN * np.ceil(angle / _TURN - 0.5), np.pi)
+
+
+def _sinc(angle: Array) -> Array:
+    positive = np.maximum(np.abs(angle), 1e-300)
+    return np.sin(positive) / positive
+
+
+def _phasor(angle: Array) -> Complex:
+    out = np.empty(np.shape(angle), dtype=complex)
+    out.real = np.cos(angle)
+    out.imag = np.sin(angle)
+    return out
+
+
+def _contiguous(x: ArrayLike) -> Array:
+    return np.ascontiguousarray(x, dtype=float)
+
+
+def _planar(x: Array) -> Complex:
+    return x[..., 1:].view(complex)[..., 0]
+
+
+def _pair(z: Complex) -> Array:
+    return np.stack([z.real, z.imag], axis=-1)
+
+
+def _pack(angle: Array, z: Complex) -> Array:
+    out = np.empty((*np.shape(z), 3))
+    out[..., 0] = angle
+    _planar(out)[...] = z
+    return out
+
+
+def _matrix(z: Complex) -> Array:
+    out = np.empty((*np.shape(z), 2, 2))
+    out[..., 0, 0] = out[..., 1, 1] = z.real
+    out[..., 1, 0] = z.imag
+    out[..., 0, 1] = -z.imag
+    return out
+
+
+def _block(linear: Complex, column: Complex) -> Array:
+    # [[1, 0], [column, linear]] in the order [omega, v].
+    out = np.zeros((*np.shape(linear), 3, 3))
+    out[..., 0, 0] = 1.0
+    out[..., 1, 0] = column.real
+    out[..., 2, 0] = column.imag
+    out[..., 1:, 1:] = _matrix(linear)
+    return out
+
+
+def _coupling(xi: Array) -> Complex:
+    # d(translation)/d(omega) of the left Jacobian: v (theta c - i b).
+    squared = np.square(xi[..., 0])
+    return _planar(xi) * (xi[..., 0] * coefficient_c(squared) - 1j * coefficient_b(squared))

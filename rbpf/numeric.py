@@ -1,0 +1,103 @@
+"""Numeric defaults of the models: Jacobians on the manifold, first estimates, promotion to points."""
+
+import numpy as np
+
+from rbpf import gaussian
+from rbpf.errors import InputError
+from rbpf.lie import LieGroup
+from rbpf.models import Jacobians, Landmark, ObservationModel, Part, Records
+
+STEP = float(np.finfo(float).eps) ** (1 / 3)
+"""Step of the central differences, where truncation and rounding errors balance."""
+
+
+def numeric_jacobians(
+    model: ObservationModel,
+    space: LieGroup,
+    state: np.ndarray,
+    landmark: np.ndarray | None = None,
+    const: np.ndarray | None = None,
+    substate: np.ndarray | None = None,
+) -> Jacobians:
+    """Central differences of `model.predict`, in the right chart at the state; wrapped by `model.residual`."""
+    plus_minus = np.array([STEP, -STEP])
+
+    def differences(values: np.ndarray) -> np.ndarray:
+        return np.moveaxis(model.residual(values[0], values[1]), 0, -1) / (2 * STEP)
+
+    def perturbed(x: np.ndarray) -> np.ndarray:
+        steps = plus_minus[:, None, None] * np.eye(x.shape[-1])
+        return x + steps.reshape(2, x.shape[-1], *(1,) * (x.ndim - 1), x.shape[-1])
+
+    state_part = landmark_part = substate_part = None
+    if Part.STATE in model.reads:
+        steps = plus_minus[:, None, None] * np.eye(space.dim)
+        moved = space.retract(state, steps.reshape(2, space.dim, *(1,) * (state.ndim - 1), space.dim))
+        state_part = differences(model.predict(moved, landmark, const, substate))
+    if landmark is not None and Part.LANDMARK in model.reads:
+        landmark_part = differences(model.predict(state, perturbed(landmark), const, substate))
+    if substate is not None and Part.SUBSTATE in model.reads:
+        substate_part = differences(model.predict(state, landmark, const, perturbed(substate)))
+    return Jacobians(state_part, landmark_part, substate_part)
+
+
+def linearise(
+    model: ObservationModel,
+    space: LieGroup,
+    z: np.ndarray,
+    state: np.ndarray,
+    landmark: np.ndarray | None = None,
+    const: np.ndarray | None = None,
+    substate: np.ndarray | None = None,
+) -> tuple[np.ndarray, Jacobians]:
+    """Innovation (N, K, p) and Jacobians at states (N, 1, E), landmarks (N, K, D), substates (N, 1, m).
+
+    Raises:
+        InputError: a prediction or a Jacobian has the wrong shape.
+    """
+    predicted = model.predict(state, landmark, const, substate)
+    if predicted.shape[-1:] != (model.dim,):
+        raise InputError(
+            f"{type(model).__name__}.predict returned shape {predicted.shape}: its last axis must be dim = {model.dim}"
+        )
+    jacobians = model.jacobians(state, landmark, const, substate)
+    if jacobians is None:
+        jacobians = numeric_jacobians(model, space, state, landmark, const, substate)
+    return model.residual(z, predicted), jacobians
+
+
+def invert_with_covariance(model: ObservationModel, state: np.ndarray, z: np.ndarray, cov: np.ndarray) -> Records:
+    """Landmarks from `model.invert`, with the covariance J R Jᵀ of a numeric derivative by the measurement."""
+    at = state[:, None, :]
+    mean = model.invert(at, z)
+    p = z.shape[-1]
+    columns = [
+        (model.invert(at, z + STEP * np.eye(p)[j]) - model.invert(at, z - STEP * np.eye(p)[j])) / (2 * STEP)
+        for j in range(p)
+    ]
+    jac = np.stack(columns, axis=-1)
+    return Records(mean, gaussian.symmetrise(jac @ cov @ np.swapaxes(jac, -1, -2)))
+
+
+def promote_to_points(landmark: Landmark, records: Records) -> Records:
+    """Single Gaussians of the world points: unscented transform of each component, then moment matching.
+
+    S. Julier and J. Uhlmann, "A new extension of the Kalman filter to nonlinear systems" (1997).
+    """
+
+    const = records.const
+    if const is not None and landmark.components > 1:
+        const = const[:, :, None, :]
+
+    def point(mean: np.ndarray) -> np.ndarray:
+        world = landmark.homogeneous(mean, const)
+        return world[..., :-1] / world[..., -1:]
+
+    mean, cov, _ = gaussian.unscented_transform(point, records.mean, records.cov)
+    if records.log_weights is None:
+        return Records(mean, cov)
+    weights = np.exp(records.log_weights)[..., None]
+    centre = (weights * mean).sum(axis=2)
+    spread = mean - centre[:, :, None]
+    total = (weights[..., None] * (cov + spread[..., :, None] * spread[..., None, :])).sum(axis=2)
+    return Records(centre, total)

@@ -1,0 +1,132 @@
+"""A Kalman-filtered substate: the second thing that can be marginalised, beside or without a landmark map."""
+
+from collections.abc import Sequence
+from typing import final
+
+import numpy as np
+
+from rbpf import gaussian
+from rbpf.conditional import GAUSSIAN
+from rbpf.errors import InputError
+from rbpf.genealogy import Lineage
+from rbpf.lie import LieGroup
+from rbpf.models import Conditional, LogDensities, Observations, Part, Transition
+from rbpf.numeric import linearise
+from rbpf.proposals import Prior, Terms
+from rbpf.reference import information, stacked
+
+
+@final
+class KalmanSubstate(Conditional):
+    """A linear substate s ~ N(ŝ, P) in every particle, given the sampled states.
+
+    The motion model says how it drives the increment and how it moves (`Transition`): the increment is then itself a
+    measurement of it, and is conditioned on exactly. Observations may read it, with the state but not with a landmark.
+
+    Args:
+        space: the group of the sampled state.
+        mean: (m,) initial mean.
+        cov: (m, m) initial covariance, may be singular.
+    """
+
+    supplies = Part.SUBSTATE
+
+    def __init__(self, space: LieGroup, mean: np.ndarray, cov: np.ndarray) -> None:
+        self.space = space
+        self._mean = np.asarray(mean, dtype=float)
+        self._cov = np.asarray(cov, dtype=float)
+        if self._cov.shape != (self._mean.size, self._mean.size):
+            raise InputError(f"a substate with mean {self._mean.shape} needs a square cov of that size, got {self._cov.shape}")
+        gaussian.psd_factor(self._cov)
+
+    def begin(self, n: int, lineage: Lineage) -> None:
+        """Every particle starts with the initial law."""
+        self.mean = np.repeat(self._mean[None], n, axis=0)
+        self.cov = np.repeat(self._cov[None], n, axis=0)
+
+    def predict(self, transition: Transition, space: LieGroup) -> Prior:
+        """Joint law of (ε, s_t): ε = B s + w₁, s_t = A s + b + w₂, kept as s_t | ε."""
+        if transition.coupling is None or transition.dynamics is None or transition.drift is None:
+            raise InputError("the motion model must give coupling, dynamics and drift: the filter has a Kalman substate")
+        d = space.dim
+        noise = transition.noise_factor @ np.swapaxes(transition.noise_factor, -1, -2)
+        stack = np.concatenate([np.broadcast_to(transition.coupling, (self.mean.shape[0], d, self.mean.shape[1])),
+                                np.broadcast_to(transition.dynamics, self.cov.shape)], axis=1)
+        joint = gaussian.symmetrise(stack @ self.cov @ np.swapaxes(stack, -1, -2)) + noise
+        means = np.einsum("nij,nj->ni", stack, self.mean)
+        self._increment_mean = means[:, :d]
+        self._predicted = means[:, d:] + transition.drift
+        cov_ee, cov_se = joint[:, :d, :d], joint[:, d:, :d]
+        self._gain = cov_se @ np.linalg.pinv(cov_ee, hermitian=True) if d else np.zeros(cov_se.shape)
+        closed = np.concatenate([-self._gain, np.broadcast_to(np.eye(self._mean.size), self.cov.shape)], axis=2)
+        self._rest = gaussian.symmetrise(closed @ joint @ np.swapaxes(closed, -1, -2))
+        return Prior(space, transition.mean, self._increment_mean, gaussian.psd_factor(cov_ee), centred=False)
+
+    def given(self, increment: np.ndarray) -> np.ndarray:
+        """Mean (N, m) of s_t given increments (N, d)."""
+        return self._predicted + np.einsum("nij,nj->ni", self._gain, increment - self._increment_mean)
+
+    def terms(self, state: np.ndarray, groups: Sequence[Observations], prior: Prior) -> Terms:
+        """All rows that read the substate are stacked: they are correlated through it."""
+        increment = self.space.local(prior.base, state)
+        nu, jac, noise = self._rows(state, self.given(increment), groups)
+        slope = self.space.right_jacobian_inverse(increment)
+        jac_state = jac[..., : self.space.dim] + jac[..., self.space.dim :] @ self._gain @ slope
+        jac_sub = jac[..., self.space.dim :]
+        cov = gaussian.symmetrise(jac_sub @ self._rest @ np.swapaxes(jac_sub, -1, -2)) + noise
+        return information(nu[:, None], jac_state[:, None], cov[:, None], GAUSSIAN, prior)
+
+    def correct(self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]) -> LogDensities:
+        """Conditions on the increment, then on the observations."""
+        self.mean, self.cov = self.given(increment), self._rest
+        total = np.zeros(state.shape[0])
+        if groups:
+            nu, jac, noise = self._rows(state, self.mean, groups)
+            jac = jac[..., self.space.dim :]
+            cov = gaussian.symmetrise(jac @ self.cov @ np.swapaxes(jac, -1, -2)) + noise
+            total = gaussian.log_density(nu, cov)
+            gain = self.cov @ np.swapaxes(jac, -1, -2) @ gaussian.inverse(cov)
+            self.mean = self.mean + np.einsum("nij,nj->ni", gain, nu)
+            closed = np.eye(self._mean.size) - gain @ jac
+            self.cov = gaussian.symmetrise(
+                closed @ self.cov @ np.swapaxes(closed, -1, -2) + gain @ noise @ np.swapaxes(gain, -1, -2)
+            )
+        return LogDensities(total, np.zeros_like(total))
+
+    def resample(self, ancestors: np.ndarray) -> None:
+        """Copies small arrays."""
+        self._increment_mean = self._increment_mean[ancestors]
+        self._predicted = self._predicted[ancestors]
+        self._gain = self._gain[ancestors]
+        self._rest = self._rest[ancestors]
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Means and covariances."""
+        return {"substate/mean": self.mean, "substate/cov": self.cov}
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """The inverse of `arrays`."""
+        self.mean, self.cov = arrays["substate/mean"].copy(), arrays["substate/cov"].copy()
+
+    def _rows(
+        self, state: np.ndarray, substate: np.ndarray, groups: Sequence[Observations]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        n, m = substate.shape
+        nus, jacs, noises = [], [], []
+        for group in groups:
+            if group.likelihood is not None and group.likelihood.form != 0:
+                raise InputError(
+                    f"{type(group.model).__name__} reads the substate: its likelihood must be Gaussian, "
+                    f"not {type(group.likelihood).__name__}"
+                )
+            nu, jacobians = linearise(
+                group.model, self.space, group.z, state[:, None, :], substate=substate[:, None, :]
+            )
+            zero = np.zeros((*nu.shape, self.space.dim))
+            jac = np.concatenate([zero if jacobians.state is None else jacobians.state,
+                                  np.broadcast_to(jacobians.substate, (*nu.shape, m))], axis=-1)
+            for k in range(group.z.shape[0]):
+                nus.append(np.broadcast_to(nu[:, k], (n, nu.shape[2])).copy())
+                jacs.append(np.broadcast_to(jac[:, k], (n, *jac.shape[2:])).copy())
+                noises.append(group.cov[k])
+        return stacked(nus, jacs, noises, [None] * len(nus))

@@ -1,0 +1,121 @@
+"""Sensors of landmarks: with names that the recording gives, or without, by maximum likelihood in each particle."""
+
+from collections.abc import Sequence
+from typing import Any, Protocol, final
+
+import numpy as np
+
+from rbpf.association import ExistenceModel, Gates, associate
+from rbpf.belief import Belief
+from rbpf.models import NEW, Births, Landmark, Likelihood, ObservationModel, Observations, Sensor
+
+
+class Sightings(Protocol):
+    """What these sensors need of a frame: `landmarks` (K,) names, `z` (K, p), `cov_z` (K, p, p)."""
+
+    landmarks: np.ndarray
+    z: np.ndarray
+    cov_z: np.ndarray
+
+
+@final
+class NamedLandmarkSensor(Sensor):
+    """Known association: each sighting carries the landmark's name; a name never seen before starts one.
+
+    Args:
+        model: how a landmark is measured.
+        landmark: its parametrisation.
+        likelihood: of the innovation, None is Gaussian.
+    """
+
+    def __init__(self, model: ObservationModel, landmark: Landmark, likelihood: Likelihood | None = None) -> None:
+        self.model = model
+        self.landmark = landmark
+        self.likelihood = likelihood
+        self._ids: dict[Any, int] = {}
+
+    def observe(self, frame: Sightings, belief: Belief) -> Sequence[Observations]:
+        """The sightings of landmarks that the map holds."""
+        if len(self._ids) != len(belief.catalogue):
+            self._ids = {name: landmark_id for landmark_id, name in belief.catalogue.items()}
+        ids = np.array([self._ids.get(name, NEW) for name in frame.landmarks.tolist()], dtype=np.int64)
+        known = ids != NEW
+        if not known.any():
+            return []
+        return [Observations(frame.z[known], frame.cov_z[known], self.model, self.likelihood, ids[known])]
+
+    def births(self, frame: Sightings, belief: Belief, observed: Sequence[Observations]) -> Sequence[Births]:
+        """The first sighting of each new name; a second one in the same frame is left to the next frame."""
+        names = frame.landmarks.tolist()
+        new = [k for k, name in enumerate(names) if name not in self._ids and name not in names[:k]]
+        if not new:
+            return []
+        return [Births(frame.z[new], frame.cov_z[new], self.model, self.landmark, facts=[names[k] for k in new])]
+
+
+@final
+class AnonymousLandmarkSensor(Sensor):
+    """Unknown association: maximum likelihood per particle with mutual exclusion; spurious landmarks are deleted.
+
+    The map must keep evidence (`LandmarkMap(space, evidence=True)`).
+
+    Args:
+        model: how a landmark is measured; its `visible` says which ones should have been seen.
+        landmark: its parametrisation.
+        gates: candidates and the cost of first sightings and clutter.
+        existence: counts sightings and misses.
+        likelihood: of the innovation, None is Gaussian.
+    """
+
+    def __init__(
+        self,
+        model: ObservationModel,
+        landmark: Landmark,
+        gates: Gates,
+        existence: ExistenceModel | None = None,
+        likelihood: Likelihood | None = None,
+    ) -> None:
+        self.model = model
+        self.landmark = landmark
+        self.gates = gates
+        self.existence = existence or ExistenceModel()
+        self.likelihood = likelihood
+
+    def observe(self, frame: Sightings, belief: Belief) -> Sequence[Observations]:
+        """Every sighting, with each particle's own association."""
+        if not frame.z.shape[0]:
+            return []
+        ids = belief.map.ids
+        if ids.size:
+            present = ~np.isneginf(belief.map.log_odds(ids))
+            nu, cov = belief.predictions(self.model, frame.z, frame.cov_z, ids)
+            chosen = associate(nu, cov, present, self.gates)
+            chosen = np.where(chosen >= 0, ids[chosen], chosen)
+        else:
+            chosen = np.full((belief.log_weights.size, frame.z.shape[0]), NEW)
+        gates = self.gates
+        return [
+            Observations(
+                frame.z, frame.cov_z, self.model, self.likelihood, chosen, gates.log_new, gates.log_clutter
+            )
+        ]
+
+    def births(self, frame: Sightings, belief: Belief, observed: Sequence[Observations]) -> Sequence[Births]:
+        """Updates the evidence of what should have been seen; starts what some particle takes as new."""
+        if not observed or observed[0].ids is None:
+            return []
+        chosen = observed[0].ids
+        self._count_evidence(belief, chosen)
+        new = (chosen == NEW).any(axis=0)
+        if not new.any():
+            return []
+        return [Births(frame.z[new], frame.cov_z[new], self.model, self.landmark, chosen[:, new] == NEW)]
+
+    def _count_evidence(self, belief: Belief, chosen: np.ndarray) -> None:
+        ids = belief.map.ids
+        if not ids.size:
+            return
+        records = belief.read(ids)
+        expected = self.model.visible(belief.state[:, None, :], records.mean, records.const)
+        seen = (chosen[:, :, None] == ids).any(axis=1)
+        belief.map.set_log_odds(ids, self.existence.updated(belief.map.log_odds(ids), seen, expected))

@@ -1,0 +1,118 @@
+"""Planar graphs of odometry and landmark positions, as the Victoria Park data set is distributed with GTSAM.
+
+A text file of blank-separated lines:
+
+    ODOMETRY from to dx dy dtheta cxx cxy cxt cyy cyt ctt
+    LANDMARK pose landmark x y cxx cxy cyy
+
+The motion is that from pose `from` to pose `to` in the frame of `from`, in metres and radians, with the
+upper triangle of its covariance; the lines follow one another without gap or loop. A landmark's position is
+given in the robot's frame, x forward and y left, in metres, with the upper triangle of its covariance. Poses
+and landmarks share one space of numbers. Association is known, the truth is not.
+
+Every pose is a frame, whose stamp is its index; the names of landmarks are their numbers.
+E. Nebot, J. Guivant, Victoria Park data set, Sydney.
+"""
+
+import re
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rbpf.errors import InputError
+from rbpf.lie import SE2
+from rbpf.sensors.readers.assembly import assemble, diagonal, require_distinct
+from rbpf.sensors.readers.covariance import planar_to_chart, read_covariances
+from rbpf.sensors.readers.log import RobotLog
+from rbpf.sensors.readers.noise import LogNoise
+from rbpf.sensors.readers.table import Table, parse_table
+from rbpf.sensors.readers.text import line_error, quoted, read_bytes, read_lines
+
+KIND = "a graph (a text file with lines ODOMETRY and LANDMARK, or a folder with one such .txt)"
+
+_COLUMNS = {
+    "ODOMETRY": ("from", "to", "dx", "dy", "dtheta", "cxx", "cxy", "cxt", "cyy", "cyt", "ctt"),
+    "LANDMARK": ("pose", "landmark", "x", "y", "cxx", "cxy", "cyy"),
+}
+_KEYWORD = re.compile(rb"^(ODOMETRY|LANDMARK)\b", re.MULTILINE)
+
+
+def recognises(path: Path) -> bool:
+    """Whether the path is a graph, or a folder with at least one."""
+    return bool(_graphs(path))
+
+
+def read(path: Path, noise: LogNoise) -> RobotLog:
+    """Read a graph.
+
+    Args:
+        path: the file, or a folder with exactly one.
+        noise: landmark positions take the standard deviation given here, if any.
+
+    Raises:
+        InputError: a line is not as described above, or the folder holds several graphs.
+    """
+    noise.require_only({"std_position_m", "scale_odometry"}, path, "a graph of landmark positions")
+    graphs = _graphs(path)
+    if len(graphs) != 1:
+        raise InputError(f"{path}: expected {KIND}; found {len(graphs)}; name one, such as {graphs[0]}.")
+    odometry, sightings = _read_tables(graphs[0])
+    poses = _require_chain(odometry)
+    frame, landmarks = _require_known(sightings, poses)
+    z, cov_z = sightings.block("x", "y"), read_covariances(sightings, "cxx", "cyy")
+    if noise.std_position_m is not None:
+        cov_z = diagonal([np.full(len(z), noise.std_position_m)] * 2)
+    delta = SE2.normalise(np.roll(odometry.block("dx", "dtheta"), 1, axis=1))
+    cov = planar_to_chart(delta, read_covariances(odometry, "cxx", "ctt")) * noise.odometry_variance_factor()
+    order = np.argsort(frame, kind="stable")
+    stamps = np.arange(len(poses))
+    return RobotLog(
+        name=graphs[0].stem,
+        space=SE2,
+        measurement="position",
+        robot_from_sensor=SE2.identity(),
+        frames=assemble(stamps, delta, cov, frame[order], landmarks[order], z[order], cov_z[order]),
+    )
+
+
+def _graphs(path: Path) -> list[Path]:
+    files = sorted(path.glob("*.txt")) if path.is_dir() else [path]
+    return [file for file in files if file.is_file() and _KEYWORD.search(read_bytes(file))]
+
+
+def _read_tables(path: Path) -> tuple[Table, Table]:
+    lines: dict[str, list[tuple[int, str]]] = {keyword: [] for keyword in _COLUMNS}
+    for number, line in enumerate(read_lines(path), 1):
+        keyword, *rest = line.split(None, 1) or [""]
+        if keyword in lines:
+            if not rest:
+                raise line_error(path, number, f"expected numbers after {keyword}, found none")
+            lines[keyword].append((number, rest[0]))
+        elif keyword:
+            raise line_error(path, number, f"expected ODOMETRY or LANDMARK, found {quoted(keyword)}")
+    odometry, sightings = (parse_table(path, columns, lines[name]) for name, columns in _COLUMNS.items())
+    return odometry, sightings
+
+
+def _require_chain(odometry: Table) -> NDArray[np.int64]:
+    start, stop = odometry.integers("from"), odometry.integers("to")
+    for row, (before, now) in enumerate(pairwise(zip(start, stop, strict=True)), 1):
+        if before[1] != now[0]:
+            problem = f"expected odometry from pose {before[1]}, where the one before ends, found {now[0]}"
+            raise odometry.error(row, problem)
+    if start[0] in odometry.names("to"):
+        row = int(np.argmax(stop == start[0]))
+        raise odometry.error(row, f"expected a path without loops, found a return to pose {start[0]}")
+    return np.concatenate([start[:1], stop])
+
+
+def _require_known(sightings: Table, poses: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    pose, landmarks = sightings.integers("pose"), sightings.integers("landmark")
+    sightings.require(np.isin(pose, poses), "pose", "a pose of the odometry")
+    sightings.require(~np.isin(landmarks, poses), "landmark", "a landmark's number, not a pose's")
+    by_number = np.argsort(poses)
+    frame = by_number[np.searchsorted(poses, pose, sorter=by_number)]
+    require_distinct(sightings, pose, landmarks, "pose")
+    return frame, landmarks

@@ -1,0 +1,154 @@
+"""SE(2) and SE(3) against matrix exponentials, SciPy and GTSAM, at every angle."""
+
+import gtsam
+import numpy as np
+import pytest
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+
+from rbpf.lie import SE2, SE3, LieGroup
+
+ANGLES = [0.0, 1e-160, 1e-12, 1e-7, 1e-4, 1e-2, 0.5, 1.0, 1.0 + 1e-9, 3.0, np.pi - 1e-4, np.pi - 1e-9, np.pi]
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(20061)
+
+
+def hat(xi: np.ndarray) -> np.ndarray:
+    """Matrix of the Lie algebra of SE(2) or SE(3)."""
+    if xi.size == 3:
+        return np.array([[0.0, -xi[0], xi[1]], [xi[0], 0.0, xi[2]], [0.0, 0.0, 0.0]])
+    out = np.zeros((4, 4))
+    out[:3, :3] = np.cross(np.eye(3), xi[:3])
+    out[:3, 3] = xi[3:]
+    return out
+
+
+def ad(group: LieGroup, xi: np.ndarray) -> np.ndarray:
+    """Derivative of the adjoint, from the brackets of the basis."""
+    basis = [hat(unit) for unit in np.eye(group.dim)]
+    columns = [hat(xi) @ generator - generator @ hat(xi) for generator in basis]
+    flat = np.stack([generator.ravel() for generator in basis], axis=1)
+    return np.linalg.lstsq(flat, np.stack([c.ravel() for c in columns], axis=1))[0]
+
+
+def test_log_at_exactly_half_a_turn():
+    quarter = SE3.log([0.0, 0.6, 0.8, 0.0, 1.0, 2.0, 3.0])
+    np.testing.assert_allclose(np.linalg.norm(quarter[:3]), np.pi, rtol=1e-15)
+    np.testing.assert_allclose(SE3.exp(quarter), [0.0, 0.6, 0.8, 0.0, 1.0, 2.0, 3.0], atol=1e-15)
+    np.testing.assert_array_equal(SE3.log([0.0, 0.6, 0.8, -0.0, 1.0, 2.0, 3.0]), quarter)
+    flat = SE2.log([np.pi, 1.0, 2.0])
+    np.testing.assert_allclose(SE2.exp(flat), [np.pi, 1.0, 2.0], rtol=1e-15)
+
+
+def test_log_takes_the_shorter_way_for_both_signs_of_the_quaternion(rng):
+    x = SE3.exp(rng.normal(size=(50, 6)))
+    negative = x * np.array([-1.0, -1.0, -1.0, -1.0, 1.0, 1.0, 1.0])
+    np.testing.assert_array_equal(SE3.log(negative), SE3.log(x))
+    assert np.linalg.norm(SE3.log(x)[:, :3], axis=-1).max() <= np.pi
+
+
+@pytest.mark.parametrize(
+    "angle", [np.pi, -np.pi, 3 * np.pi, np.nextafter(np.pi, 4.0), np.nextafter(-np.pi, 0.0), 100.0, -1e-300]
+)
+def test_plane_angles_stay_in_the_half_open_turn(angle):
+    theta = SE2.normalise([angle, 1.0, 2.0])[0]
+    assert -np.pi < theta <= np.pi
+    np.testing.assert_allclose(np.exp(1j * theta), np.exp(1j * angle), atol=1e-14)
+
+
+@pytest.mark.parametrize("group", [SE2, SE3], ids=repr)
+@pytest.mark.parametrize("angle", ANGLES)
+def test_closed_forms_equal_matrix_exponentials(group, angle, rng):
+    n = group.dim
+    turning = 1 if group is SE2 else 3
+    for xi in rng.normal(size=(5, n)):
+        xi[:turning] *= angle / np.linalg.norm(xi[:turning])
+        np.testing.assert_allclose(group.matrix(group.exp(xi)), expm(hat(xi)), atol=5e-15)
+        np.testing.assert_allclose(group.adjoint(group.exp(xi)), expm(ad(group, xi)), atol=1e-14)
+        # The upper right block of exp [[ad, 1], [0, 0]] is the integral of exp(s ad): J_l.
+        augmented = np.block([[ad(group, xi), np.eye(n)], [np.zeros((n, 2 * n))]])
+        np.testing.assert_allclose(group.left_jacobian(xi), expm(augmented)[:n, n:], atol=1e-14)
+
+
+def test_mean_survives_the_seam_of_the_angle():
+    mean = SE2.mean([[3.0, 0.0, 0.0], [-3.0, 0.0, 0.0]], [0.5, 0.5])
+    assert abs(mean[0]) == pytest.approx(np.pi, abs=1e-14)
+
+
+def test_products_of_many_increments_keep_the_quaternion_unit(rng):
+    x = SE3.identity()
+    for xi in 0.1 * rng.normal(size=(2000, 6)):
+        x = SE3.retract(x, xi)
+    assert np.linalg.norm(x[:4]) == pytest.approx(1.0, abs=4e-16)
+
+
+@pytest.mark.parametrize(("group", "n"), [(SE2, 2), (SE3, 3)], ids=["SE2", "SE3"])
+def test_points_and_matrices(group, n, rng):
+    a = group.exp(rng.normal(size=(6, 1, group.dim)))
+    points = rng.normal(size=(4, n))
+    world = group.transform(a, points)
+    assert world.shape == (6, 4, n)
+    rotation, translation = group.rotation(a), group.translation(a)
+    np.testing.assert_allclose(world, np.einsum("nlij,lj->nli", rotation, points) + translation, atol=1e-14)
+    np.testing.assert_allclose(
+        group.inverse_transform(a, world), np.broadcast_to(points, world.shape), atol=1e-14
+    )
+    np.testing.assert_allclose(
+        group.matrix(group.inverse(a)) @ group.matrix(a), group.matrix(group.identity((6, 1))), atol=1e-14
+    )
+    np.testing.assert_allclose(
+        group.local(a, group.from_matrix(group.matrix(a))), np.zeros((6, 1, group.dim)), atol=1e-14
+    )
+
+
+@pytest.mark.parametrize("axis", [*np.eye(3), -np.eye(3)[1], np.array([0.6, 0.0, -0.8])])
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 2.0, np.pi - 1e-9, np.pi])
+def test_quaternions_from_matrices_at_every_largest_component(axis, angle):
+    x = SE3.exp(np.r_[angle * axis, 1.0, 2.0, 3.0])
+    back = SE3.from_matrix(SE3.matrix(x))
+    np.testing.assert_allclose(SE3.local(x, back), np.zeros(6), atol=1e-15)
+    assert back[3] >= 0.0
+
+
+def test_rotations_agree_with_scipy(rng):
+    x = SE3.exp(rng.normal(size=(40, 6)))
+    reference = Rotation.from_quat(x[:, :4])
+    np.testing.assert_allclose(SE3.rotation(x), reference.as_matrix(), atol=1e-15)
+    np.testing.assert_allclose(SE3.log(x)[:, :3], reference.as_rotvec(), atol=1e-14)
+    yaw, pitch, roll = rng.uniform(-1.5, 1.5, (3, 40))
+    angles = np.stack([yaw, pitch, roll], axis=-1)
+    built = SE3.from_ypr(x[:, 4:], yaw, pitch, roll)
+    np.testing.assert_allclose(
+        SE3.rotation(built), Rotation.from_euler("ZYX", angles).as_matrix(), atol=1e-15
+    )
+    np.testing.assert_array_equal(SE3.translation(built), x[:, 4:])
+    np.testing.assert_allclose(np.stack(SE3.ypr(built), axis=-1), angles, atol=1e-14)
+    assert SE3.from_ypr([1.0, 2.0, 3.0], yaw, 0.1, 0.2).shape == (40, 7)
+
+
+def test_space_agrees_with_gtsam(rng):
+    for xi, eta in rng.normal(size=(20, 2, 6)):
+        pose, other = gtsam.Pose3.Expmap(xi), gtsam.Pose3.Expmap(eta)
+        x, y = SE3.exp(xi), SE3.exp(eta)
+        np.testing.assert_allclose(SE3.matrix(x), pose.matrix(), atol=1e-14)
+        np.testing.assert_allclose(SE3.log(x), gtsam.Pose3.Logmap(pose), atol=1e-14)
+        np.testing.assert_allclose(SE3.matrix(SE3.between(x, y)), pose.between(other).matrix(), atol=1e-14)
+        np.testing.assert_allclose(SE3.adjoint(x), pose.AdjointMap(), atol=1e-14)
+        np.testing.assert_allclose(SE3.right_jacobian(xi), gtsam.Pose3.ExpmapDerivative(xi), atol=1e-14)
+        np.testing.assert_allclose(
+            SE3.right_jacobian_inverse(xi), gtsam.Pose3.LogmapDerivative(pose), atol=1e-13
+        )
+
+
+def test_plane_agrees_with_gtsam(rng):
+    # GTSAM's planar tangent is [vx, vy, omega].
+    order = [1, 2, 0]
+    for xi in rng.normal(size=(20, 3)):
+        pose = gtsam.Pose2.Expmap(xi[order])
+        x = SE2.exp(xi)
+        np.testing.assert_allclose(SE2.matrix(x), pose.matrix(), atol=1e-14)
+        np.testing.assert_allclose(SE2.log(x)[order], gtsam.Pose2.Logmap(pose), atol=1e-14)
+        np.testing.assert_allclose(SE2.adjoint(x)[np.ix_(order, order)], pose.AdjointMap(), atol=1e-14)

@@ -1,0 +1,162 @@
+"""Errors of trajectories and maps against evo, published numbers and closed forms."""
+
+import numpy as np
+import pytest
+from evo.core import metrics
+from evo.core.trajectory import PoseTrajectory3D
+from scipy.spatial.transform import Rotation
+
+from rbpf.errors import InputError
+from rbpf.lie import SE3
+from rbpf.validation.accuracy import ate, landmark_errors, rpe
+from rbpf.validation.alignment import Similarity
+from rbpf.validation.trajectory import Trajectory, associate
+from rbpf.validation.trajectory_files import read_kitti, read_tum
+
+FRAMES, METRES = metrics.Unit.frames, metrics.Unit.meters
+TRANSLATION = metrics.PoseRelation.translation_part
+ANGLE_DEG = metrics.PoseRelation.rotation_angle_deg
+
+
+def disturbed(truth: Trajectory, seed: int) -> Trajectory:
+    """An estimate with noise, in another world of another scale."""
+    rng = np.random.default_rng(seed)
+    noisy = SE3.retract(truth.world_from_body, rng.normal(scale=0.05, size=(len(truth), 6)))
+    world = Similarity(0.8, Rotation.random(random_state=rng).as_matrix(), rng.normal(scale=20.0, size=3))
+    return Trajectory(truth.stamps_ns, world.transform_poses(noisy))
+
+
+def in_evo(trajectory: Trajectory) -> PoseTrajectory3D:
+    quat_wxyz = trajectory.world_from_body[:, [3, 0, 1, 2]]
+    return PoseTrajectory3D(trajectory.positions.copy(), quat_wxyz, trajectory.stamps_ns * 1e-9)
+
+
+def aligned_in_evo(
+    estimate: Trajectory, truth: Trajectory, alignment: str
+) -> tuple[PoseTrajectory3D, PoseTrajectory3D]:
+    theirs, reference = in_evo(estimate), in_evo(truth)
+    if alignment != "none":
+        theirs.align(reference, correct_scale=alignment == "similarity")
+    return reference, theirs
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("alignment", ["none", "rigid", "similarity"])
+def test_absolute_error_is_that_of_evo(wander, seed, alignment):
+    truth = wander(150, seed)
+    estimate = disturbed(truth, seed)
+    evo_ape = metrics.APE(TRANSLATION)
+    evo_ape.process_data(aligned_in_evo(estimate, truth, alignment))
+    found = ate(estimate, truth, alignment)
+    np.testing.assert_allclose(found.distances, evo_ape.error, rtol=1e-9, atol=1e-10)
+    for statistic in ("rmse", "mean", "median", "max"):
+        theirs = evo_ape.get_statistic(metrics.StatisticsType[statistic])
+        assert getattr(found, statistic) == pytest.approx(theirs, rel=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("alignment", ["none", "similarity"])
+@pytest.mark.parametrize(
+    ("delta", "unit", "evo_unit"), [(1, "frames", FRAMES), (7, "frames", FRAMES), (2.5, "metres", METRES)]
+)
+def test_relative_error_is_that_of_evo(wander, seed, alignment, delta, unit, evo_unit):
+    truth = wander(150, seed)
+    estimate = disturbed(truth, seed)
+    found = rpe(estimate, truth, delta, unit, alignment)
+    for relation, ours in ((TRANSLATION, found.translations), (ANGLE_DEG, found.rotations_deg)):
+        evo_rpe = metrics.RPE(relation, delta, evo_unit)
+        evo_rpe.process_data(aligned_in_evo(estimate, truth, alignment))
+        np.testing.assert_allclose(ours, evo_rpe.error, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.real_data
+def test_kitti_00_has_the_published_errors(data_dir):
+    folder = data_dir / "evo_reference"
+    truth, estimate = (read_kitti(folder / f"KITTI_00_{name}.txt") for name in ("gt", "ORB"))
+    errors = {alignment: ate(estimate, truth, alignment) for alignment in ("none", "rigid", "similarity")}
+    assert errors["none"].rmse == pytest.approx(7.790289, abs=1e-5)
+    assert errors["rigid"].rmse == pytest.approx(1.303450, abs=1e-5)
+    assert errors["similarity"].rmse == pytest.approx(0.937709, abs=1e-5)
+    assert errors["similarity"].alignment.scale == pytest.approx(1.004698, abs=1e-6)
+    by_frame = rpe(estimate, truth, 1, "frames", "rigid")
+    assert by_frame.translation_rmse == pytest.approx(0.028120, abs=2e-6)
+    assert by_frame.rotation_rmse_deg == pytest.approx(0.114974, abs=2e-6)
+    by_path = rpe(estimate, truth, 100, "metres")
+    assert len(by_path) == 36
+    assert by_path.translation_rmse == pytest.approx(1.193976, abs=1e-5)
+
+
+@pytest.mark.real_data
+@pytest.mark.parametrize(("name", "rotation_deg"), [("rgbdslam", 0.353613), ("rgbdslam_drift", 0.353614)])
+def test_freiburg1_xyz_has_the_published_errors(data_dir, name, rotation_deg):
+    folder = data_dir / "evo_reference"
+    estimate, truth = associate(
+        read_tum(folder / f"freiburg1_xyz-{name}.txt"), read_tum(folder / "freiburg1_xyz-groundtruth.txt")
+    )
+    assert len(estimate) == 785
+    assert ate(estimate, truth, "rigid").rmse == pytest.approx(0.013470, abs=1e-6)
+    with_scale = ate(estimate, truth, "similarity")
+    assert with_scale.rmse == pytest.approx(0.013389, abs=1e-6)
+    assert with_scale.alignment.scale == pytest.approx(1.008001, abs=1e-6)
+    by_frame = rpe(estimate, truth, 1, "frames")
+    assert by_frame.translation_rmse == pytest.approx(0.005764, abs=1e-6)
+    assert by_frame.rotation_rmse_deg == pytest.approx(rotation_deg, abs=1e-6)
+
+
+def test_a_constant_offset_and_a_constant_drift_have_their_own_errors(wander):
+    truth = wander(40, 7)
+    offset = truth.transformed(Similarity(1.0, np.eye(3), np.array([3.0, 4.0, 0.0])))
+    absolute = ate(offset, truth)
+    np.testing.assert_allclose(absolute.distances, 5.0)
+    np.testing.assert_array_equal(absolute.keys, truth.stamps_ns)
+    assert rpe(offset, truth).translation_rmse == pytest.approx(0.0, abs=1e-12)
+    steps = np.arange(40.0)[:, None] * [0.0, 0.0, 0.01, 0.02, 0.0, 0.0]
+    still = Trajectory(truth.stamps_ns, SE3.identity((40,)))
+    drifting = Trajectory(truth.stamps_ns, SE3.exp(steps))
+    relative = rpe(drifting, still, delta=3)
+    assert relative.pairs[:2].tolist() == [[0, 3], [3, 6]]
+    assert relative.rotation_rmse_deg == pytest.approx(np.degrees(0.03))
+    assert relative.translation_rmse == pytest.approx(0.06 * np.sinc(0.015 / np.pi))  # the chord of an arc
+
+
+def test_a_pair_by_path_ends_where_its_length_is_reached():
+    along = SE3.identity((9,))
+    along[:, 4] = np.arange(9.0)
+    straight = Trajectory(np.arange(9), along)
+    assert rpe(straight, straight, 2.0, "metres").pairs.tolist() == [[0, 2], [2, 4], [4, 6], [6, 8]]
+    assert rpe(straight, straight, 2.5, "metres").pairs.tolist() == [[0, 3], [3, 6]]
+
+
+def test_landmarks_that_both_maps_have_are_compared():
+    truth = {1: np.array([0.0, 0.0]), 2: np.array([4.0, 0.0]), 3: np.array([0.0, 3.0]), 9: np.ones(2)}
+    quarter_turn = Similarity(1.0, np.array([[0.0, -1.0], [1.0, 0.0]]), np.array([1.0, 2.0]))
+    estimate = {name: quarter_turn.transform(truth[name]) for name in (3, 2, 1)} | {7: np.zeros(2)}
+    as_they_are = landmark_errors(estimate, truth)
+    np.testing.assert_array_equal(as_they_are.keys, [1, 2, 3])
+    np.testing.assert_allclose(as_they_are.distances, np.sqrt([5.0, 9.0 + 36.0, 4.0 + 1.0]))
+    aligned = landmark_errors(estimate, truth, "rigid")
+    assert aligned.max == pytest.approx(0.0, abs=1e-12)
+    assert landmark_errors(truth, estimate, quarter_turn).max == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"delta": 0}, "whole number of frames"),
+        ({"delta": 1.5}, "found 1.5"),
+        ({"delta": 40}, "longer than 40 frames"),
+        ({"delta": -1.0, "unit": "metres"}, "positive number of metres"),
+        ({"delta": 1e4, "unit": "metres"}, "longer than 10000 metres"),
+        ({"unit": "m"}, "frames or metres, found 'm'"),
+    ],
+)
+def test_a_delta_that_makes_no_pair_is_refused(wander, arguments, words):
+    with pytest.raises(InputError, match=words):
+        rpe(wander(40, 1), wander(40, 2), **arguments)
+
+
+def test_unpaired_trajectories_and_foreign_maps_are_refused(wander):
+    with pytest.raises(InputError, match="found 5 and 6; pair them with associate"):
+        ate(wander(5, 1), wander(6, 1))
+    with pytest.raises(InputError, match="None of the 1 estimated landmarks"):
+        landmark_errors({1: np.zeros(3)}, {2: np.zeros(3), 3: np.zeros(3)})
