@@ -130,6 +130,8 @@ class LandmarkMap(Conditional):
 
     def set_log_odds(self, ids: np.ndarray, log_odds: np.ndarray) -> None:
         """Overwrites log-odds (N, K); a landmark at −inf in every particle is removed."""
+        if not self.evidence:
+            raise InputError("this map keeps no log-odds: build it with evidence=True")
         for landmark_id, column in zip(ids.tolist(), log_odds.T, strict=True):
             record = self.store.read(landmark_id)
             if np.array_equal(record[-1], column):

@@ -104,10 +104,12 @@ def _checked_ids(group: Observations, n: int, kinds: np.ndarray) -> np.ndarray:
         raise InputError(f"{type(group.model).__name__} reads a landmark: its observations need ids")
     if ids.shape not in ((count,), (n, count)):
         raise InputError(f"ids of {count} measurements must be ({count},) or ({n}, {count}), got {ids.shape}")
-    unknown = ids >= 0
-    unknown[unknown] = (ids[unknown] >= kinds.size) | (kinds[np.minimum(ids[unknown], kinds.size - 1)] < 0)
-    if unknown.any():
-        raise InputError(f"a measurement names landmark {ids[unknown][0]}, which the map does not hold")
+    if ids.dtype.kind != "i" or (ids < NEW).any():
+        raise InputError(f"ids of {type(group.model).__name__} must be integers: landmarks, NULL = -1 or NEW = -2")
+    named = ids[ids >= 0]
+    held = np.append(kinds, -1)[np.minimum(named, kinds.size)] >= 0
+    if not held.all():
+        raise InputError(f"a measurement names landmark {named[~held][0]}, which the map does not hold")
     return ids
 
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from rbpf import gaussian, reference
 from rbpf.kernels.refine import refine
+from rbpf.kernels.threads import threads_for
 from rbpf.kernels.update import update
 from rbpf.lie import LieGroup
 from rbpf.likelihoods import Gaussian
@@ -78,55 +79,68 @@ class RowEngine:
         return np.array([self.space.dim, landmark.dim, landmark.constants])
 
     def _terms_compiled(
-        self, kernel: FusedKernel, batch: Batch, group: Observations, state: np.ndarray, prior: Prior, total: Terms
+        self,
+        kernel: FusedKernel,
+        batch: Batch,
+        group: Observations,
+        state: np.ndarray,
+        prior: Prior,
+        total: Terms,
     ) -> None:
         access = self.store.access(batch.ids)
         likelihood = group.likelihood or GAUSSIAN
         mask = _NO_MASK if batch.mask is None else np.ascontiguousarray(batch.mask.T)
-        refine(
-            kernel.function,
-            kernel.params,
-            np.ascontiguousarray(state),
-            access.pool,
-            access.slabs,
-            access.which,
-            access.maps,
-            group.z[batch.ks],
-            group.cov[batch.ks],
-            mask,
-            likelihood.form,
-            likelihood.params,
-            np.ascontiguousarray(prior.factor),
-            self._sizes(int(batch.ids[0])),
-            total.info,
-            total.vector,
-            total.quad,
-            total.log_det,
-        )
+        with threads_for(state.shape[0] * batch.ks.size):
+            refine(
+                kernel.function,
+                kernel.params,
+                np.ascontiguousarray(state),
+                access.pool,
+                access.slabs,
+                access.which,
+                access.maps,
+                group.z[batch.ks],
+                group.cov[batch.ks],
+                mask,
+                likelihood.form,
+                likelihood.params,
+                np.ascontiguousarray(prior.factor),
+                self._sizes(int(batch.ids[0])),
+                total.info,
+                total.vector,
+                total.quad,
+                total.log_det,
+            )
         total.rows += batch.ks.size * group.model.dim
 
     def _correct_compiled(
-        self, kernel: FusedKernel, batch: Batch, group: Observations, state: np.ndarray, log_density: np.ndarray
+        self,
+        kernel: FusedKernel,
+        batch: Batch,
+        group: Observations,
+        state: np.ndarray,
+        log_density: np.ndarray,
     ) -> None:
         access, targets = self.store.rewrite(batch.ids)
         likelihood = group.likelihood or GAUSSIAN
-        update(
-            kernel.function,
-            kernel.params,
-            np.ascontiguousarray(state),
-            access.pool,
-            access.slabs,
-            access.which,
-            access.maps,
-            targets,
-            group.z[batch.ks],
-            group.cov[batch.ks],
-            _NO_MASK if batch.mask is None else np.ascontiguousarray(batch.mask.T),
-            likelihood.form,
-            likelihood.params,
-            self._sizes(int(batch.ids[0])),
-            log_density,
-        )
+        with threads_for(state.shape[0] * batch.ks.size):
+            update(
+                kernel.function,
+                kernel.params,
+                np.ascontiguousarray(state),
+                access.pool,
+                access.slabs,
+                access.which,
+                access.maps,
+                targets,
+                group.z[batch.ks],
+                group.cov[batch.ks],
+                _NO_MASK if batch.mask is None else np.ascontiguousarray(batch.mask.T),
+                likelihood.form,
+                likelihood.params,
+                self._sizes(int(batch.ids[0])),
+                log_density,
+            )
 
     def _read(self, ids: np.ndarray) -> tuple[np.ndarray, Records]:
         columns = np.array([self.store.read(int(i)) for i in ids])
@@ -148,7 +162,9 @@ class RowEngine:
         cov = reference.innovation_covariance(jac.landmark, records.cov, noise)
         return reference.information(nu, jac.state, cov, group.likelihood or GAUSSIAN, prior, batch.mask)
 
-    def _correct_numpy(self, batch: Batch, group: Observations, state: np.ndarray, log_density: np.ndarray) -> None:
+    def _correct_numpy(
+        self, batch: Batch, group: Observations, state: np.ndarray, log_density: np.ndarray
+    ) -> None:
         pending = np.arange(batch.ids.size)
         while pending.size:
             _, first = np.unique(batch.ids[pending], return_index=True)
@@ -160,7 +176,9 @@ class RowEngine:
     ) -> None:
         ids, ks = batch.ids[rows], batch.ks[rows]
         columns, records = self._read(ids)
-        nu, jac = linearise(group.model, self.space, group.z[ks], state[:, None, :], records.mean, records.const)
+        nu, jac = linearise(
+            group.model, self.space, group.z[ks], state[:, None, :], records.mean, records.const
+        )
         assert jac.landmark is not None
         mask = None if batch.mask is None else batch.mask[:, rows]
         likelihood = group.likelihood or GAUSSIAN

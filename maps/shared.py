@@ -97,6 +97,7 @@ class SharedStore:
 
     def add(self, records: np.ndarray) -> int:
         """Stores a new column (fields, N) and returns its id; ids are never used again."""
+        self._checked(records)
         column = self._size
         if column == self._fields.size:
             self._fields = np.concatenate([self._fields, np.zeros_like(self._fields)])
@@ -108,12 +109,13 @@ class SharedStore:
 
     def remove(self, columns: np.ndarray) -> None:
         """Drops columns from all particles."""
-        for column in columns:
+        for column in np.unique(columns):
             self._vacate(int(column))
             self._fields[column] = 0
 
     def replace(self, column: int, records: np.ndarray) -> None:
         """Overwrites a column in all particles (fields, N); the record size may change."""
+        self._checked(records)
         self._vacate(column)
         self._occupy(column, records)
 
@@ -229,9 +231,11 @@ class SharedStore:
             self.pools[fields] = Pool(fields, self.n)
         return self.pools[fields]
 
-    def _occupy(self, column: int, records: np.ndarray) -> None:
-        if records.ndim != 2 or records.shape[1] != self.n:
+    def _checked(self, records: np.ndarray) -> None:
+        if records.ndim != 2 or records.shape[0] == 0 or records.shape[1] != self.n:
             raise InputError(f"landmark records must be (fields, {self.n}), got {records.shape}")
+
+    def _occupy(self, column: int, records: np.ndarray) -> None:
         self._fields[column] = records.shape[0]
         self._fill(column, records)
         self._join(column, self.lineage.generation)

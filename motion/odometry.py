@@ -40,4 +40,10 @@ class OdometryMotion(MotionModel):
                 f"odometry needs delta ({self.space.size},) and cov ({d}, {d}), "
                 f"got {control.delta.shape} and {control.cov.shape}"
             )
-        return Transition(self.space.compose(state, control.delta), gaussian.psd_factor(control.cov)[None])
+        if not np.isfinite(control.delta).all():
+            raise InputError(f"the odometry increment {control.delta} holds NaN or infinity")
+        try:
+            factor = gaussian.psd_factor(control.cov)
+        except InputError as error:
+            raise InputError(f"the covariance of the odometry is not one: {error}") from error
+        return Transition(self.space.compose(state, control.delta), factor[None])

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from rbpf import gaussian
 from rbpf.belief import Belief
 from rbpf.checkpoint import read_checkpoint, write_checkpoint
 from rbpf.conditional import Marginals
@@ -90,6 +91,8 @@ class Filter:
     ) -> None:
         if n < 1:
             raise InputError(f"a filter needs at least one particle, got {n}")
+        if lag is not None and lag < 1:
+            raise InputError(f"a fixed lag keeps at least one step, got {lag}")
         self.motion = motion
         self.space = motion.space
         self.sensors = [sensors] if isinstance(sensors, Sensor) else list(sensors)
@@ -99,7 +102,10 @@ class Filter:
         self.resampler = resampler or EssTriggered(Systematic())
         self.rng = rng or np.random.default_rng()
         origin = self.space.identity() if start is None else np.asarray(start, dtype=float)
-        state = np.array(np.broadcast_to(origin, (n, self.space.size)))
+        size = self.space.size
+        if origin.shape not in ((size,), (n, size)) or not np.isfinite(origin).all():
+            raise InputError(f"start must be ({size},) or ({n}, {size}) finite numbers, got {origin.shape}: {origin}")
+        state = np.array(np.broadcast_to(origin, (n, size)))
         self.particles = Particles(state, uniform_log_weights(n))
         self.lineage = Lineage(n)
         self.marginals.begin(n, self.lineage)
@@ -122,7 +128,9 @@ class Filter:
             stamp_ns: time of the frame; by default the previous one plus one second.
 
         Raises:
-            InputError: time runs backwards, shapes do not fit, or no particle explains the observations.
+            InputError: time runs backwards, shapes do not fit, or no particle explains the observations. If the
+                error is about what came in before the particles are weighed (time, control, measurements), the
+                filter is as it was before the step; otherwise it stands between two steps: `load` a checkpoint.
         """
         stamp_ns, dt = self._clock(stamp_ns)
         prior = self._predict(control, dt)
@@ -146,6 +154,7 @@ class Filter:
         evidence = look_ahead + correction if normalised else float("nan")
         self.log_evidence += evidence
         self.steps += 1
+        self.stamp_ns = stamp_ns
         self.history.record(stamp_ns, state, log_weights)
         return StepReport(
             stamp_ns=stamp_ns,
@@ -188,16 +197,20 @@ class Filter:
             stamp_ns = 0 if previous is None else previous + 1_000_000_000
         if previous is not None and stamp_ns < previous:
             raise InputError(f"time runs backwards: step {self.steps} has stamp {stamp_ns} ns after {previous} ns")
-        self.stamp_ns = int(stamp_ns)
-        return self.stamp_ns, 0.0 if previous is None else (stamp_ns - previous) * 1e-9
+        return int(stamp_ns), 0.0 if previous is None else (stamp_ns - previous) * 1e-9
 
     def _predict(self, control: Any, dt: float) -> Prior:
         transition = self.motion.transition(self.particles.state, control, dt)
-        if transition.mean.shape != self.particles.state.shape or transition.noise_factor.ndim != 3:
+        mean, factor, name = transition.mean, transition.noise_factor, f"{type(self.motion).__name__}.transition"
+        rows = self.space.dim + (0 if transition.coupling is None else transition.coupling.shape[-1])
+        fits = factor.ndim == 3 and factor.shape[0] in (1, self.n) and factor.shape[1] == rows
+        if mean.shape != self.particles.state.shape or not fits:
             raise InputError(
-                f"{type(self.motion).__name__}.transition returned mean {transition.mean.shape} and noise_factor "
-                f"{transition.noise_factor.shape}: expected {self.particles.state.shape} and (N or 1, d+m, r)"
+                f"{name} returned mean {mean.shape} and noise_factor {factor.shape}: "
+                f"expected {self.particles.state.shape} and ({self.n} or 1, {rows}, r)"
             )
+        if not (np.isfinite(mean).all() and np.isfinite(factor).all()):
+            raise InputError(f"{name} returned NaN or infinity in step {self.steps}: check the control")
         return self.marginals.predict(transition, self.space)
 
     def _observe(self, frame: Any, belief: Belief) -> list[Observations]:
@@ -208,6 +221,9 @@ class Filter:
     def _descend(
         self, ancestors: np.ndarray, prior: Prior, groups: list[Observations]
     ) -> tuple[Prior, list[Observations]]:
+        if ancestors.shape != (self.n,) or ancestors.min() < 0 or ancestors.max() >= self.n:
+            name = type(self.resampler).__name__
+            raise InputError(f"{name} must return {self.n} ancestors in 0..{self.n - 1}, got {ancestors}")
         self.lineage.advance(ancestors)
         self.marginals.resample(ancestors)
         groups = [
@@ -267,4 +283,8 @@ def _checked(group: Observations) -> Observations:
         )
     if not (np.isfinite(group.z).all() and np.isfinite(group.cov).all()):
         raise InputError(f"a measurement of {name} or its covariance is not finite")
+    try:
+        gaussian.psd_factor(group.cov)
+    except InputError as error:
+        raise InputError(f"the noise of {name} has no covariance: {error}") from error
     return group

@@ -238,6 +238,10 @@ class History:
         """Number of states held, of T·N without sharing."""
         return sum(len(block.states) * block.kept.size for block in self.blocks)
 
+    def distinct_first(self) -> int:
+        """How many particles of the first generation kept still have descendants."""
+        return self.lineage.distinct(self.blocks[0].generation) if self.blocks else self.lineage.n
+
     def paths(self) -> np.ndarray:
         """(T, N, E): the trajectory of each current particle, along its ancestors."""
         parts = []

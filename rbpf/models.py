@@ -103,7 +103,10 @@ class ObservationModel(ABC):
         const: np.ndarray | None = None,
         substate: np.ndarray | None = None,
     ) -> Jacobians | None:
-        """Analytic derivatives, in the right chart at the state; None asks for numeric ones."""
+        """Analytic derivatives, in the right chart at the state; None asks for numeric ones.
+
+        A block that is constant may come without the leading axes.
+        """
         return None
 
     def residual(self, z: np.ndarray, predicted: np.ndarray) -> np.ndarray:

@@ -56,14 +56,25 @@ def linearise(
         InputError: a prediction or a Jacobian has the wrong shape.
     """
     predicted = model.predict(state, landmark, const, substate)
-    if predicted.shape[-1:] != (model.dim,):
-        raise InputError(
-            f"{type(model).__name__}.predict returned shape {predicted.shape}: its last axis must be dim = {model.dim}"
-        )
+    parts = (state, landmark, substate)
+    expected = (*np.broadcast_shapes(*(part.shape[:-1] for part in parts if part is not None)), model.dim)
+    if predicted.shape != expected:
+        raise InputError(f"{type(model).__name__}.predict returned shape {predicted.shape}, expected {expected}")
     jacobians = model.jacobians(state, landmark, const, substate)
     if jacobians is None:
         jacobians = numeric_jacobians(model, space, state, landmark, const, substate)
-    return model.residual(z, predicted), jacobians
+    sizes = (space.dim, *(0 if part is None else part.shape[-1] for part in parts[1:]))
+    blocks = [_full(model, block, (*expected, size)) for block, size in zip(jacobians, sizes, strict=True)]
+    return model.residual(z, predicted), Jacobians(*blocks)
+
+
+def _full(model: ObservationModel, block: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray | None:
+    """A Jacobian with all its leading axes; a constant one may come without them."""
+    try:
+        return None if block is None else np.broadcast_to(block, shape)
+    except ValueError as error:
+        name = f"{type(model).__name__}.jacobians"
+        raise InputError(f"{name} returned a block of shape {block.shape}, expected {shape}") from error  # type: ignore[union-attr]
 
 
 def invert_with_covariance(model: ObservationModel, state: np.ndarray, z: np.ndarray, cov: np.ndarray) -> Records:

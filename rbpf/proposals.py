@@ -42,7 +42,13 @@ class Prior:
 
     @classmethod
     def of_transition(cls, transition: Transition, space: LieGroup) -> "Prior":
-        """The law without a substate."""
+        """The law without a substate.
+
+        Raises:
+            InputError: the motion model has one.
+        """
+        if transition.coupling is not None and transition.coupling.shape[-1]:
+            raise InputError("the motion model drives a substate: give the filter a KalmanSubstate to hold it")
         return cls(space, transition.mean, np.zeros((1, space.dim)), transition.noise_factor)
 
     @classmethod
@@ -61,7 +67,10 @@ class Prior:
     def take(self, ancestors: np.ndarray) -> "Prior":
         """The laws of the ancestors."""
         return replace(
-            self, base=self.base[ancestors], mean=take(self.mean, ancestors), factor=take(self.factor, ancestors)
+            self,
+            base=self.base[ancestors],
+            mean=take(self.mean, ancestors),
+            factor=take(self.factor, ancestors),
         )
 
 
@@ -173,11 +182,13 @@ class EkfProposal(Proposal):
 def refined(prior: Prior, terms: "Terms") -> Proposed:
     """The refined Gaussian and the joint marginal weight of each particle."""
     from rbpf.kernels.posterior import posterior
+    from rbpf.kernels.threads import threads_for
 
     n, rank = prior.base.shape[0], prior.factor.shape[2]
     mean, root = np.empty((n, rank)), np.empty((n, rank, rank))
     log_w1, nis = np.empty(n), np.empty(n)
     factor = np.ascontiguousarray(prior.factor)
-    posterior(terms.info, terms.vector, terms.quad, terms.log_det, factor, mean, root, log_w1, nis)
+    with threads_for(n):
+        posterior(terms.info, terms.vector, terms.quad, terms.log_det, factor, mean, root, log_w1, nis)
     log_w1 += terms.log_factor
     return Proposed(mean, root, log_w1, nis, terms.rows)

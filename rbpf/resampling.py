@@ -12,6 +12,9 @@ from rbpf.errors import InputError
 from rbpf.models import Resampler
 from rbpf.particles import effective_sample_size
 
+_ROUNDING = 1e-12
+"""Relative error within which weights count as equal, and N W as whole."""
+
 
 def _inverse_cdf(weights: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Index of the weight that each point of [0, 1), ascending, falls on; never one of weight zero."""
@@ -56,10 +59,10 @@ class Residual(Resampler):
     def ancestors(self, weights: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """(N,) → (N,)."""
         n = weights.size
-        counts = np.floor(n * weights).astype(np.int64)
+        counts = np.floor(n * weights * (1.0 + _ROUNDING)).astype(np.int64)
         rest = n - int(counts.sum())
         if rest > 0:
-            remainders = n * weights - counts
+            remainders = np.maximum(n * weights - counts, 0.0)
             draws = _inverse_cdf(remainders / remainders.sum(), np.sort(rng.random(rest)))
             counts += np.bincount(draws, minlength=n)
         return np.repeat(np.arange(n), counts)
@@ -82,6 +85,6 @@ class EssTriggered(Resampler):
 
     def ancestors(self, weights: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
         """(N,) → (N,) or None."""
-        if effective_sample_size(weights) >= self.threshold * weights.size:
+        if effective_sample_size(weights) >= self.threshold * weights.size * (1.0 - _ROUNDING):
             return None
         return self.scheme.ancestors(weights, rng)

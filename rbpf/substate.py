@@ -48,7 +48,13 @@ class KalmanSubstate(Conditional):
         """Joint law of (ε, s_t): ε = B s + w₁, s_t = A s + b + w₂, kept as s_t | ε."""
         if transition.coupling is None or transition.dynamics is None or transition.drift is None:
             raise InputError("the motion model must give coupling, dynamics and drift: the filter has a Kalman substate")
-        d = space.dim
+        d, m = space.dim, self._mean.size
+        sizes = (transition.coupling.shape[1:], transition.dynamics.shape[1:], transition.drift.shape[1:])
+        if sizes != ((d, m), (m, m), (m,)):
+            raise InputError(
+                f"the substate has {m} numbers: expected coupling (·, {d}, {m}), dynamics (·, {m}, {m}) and "
+                f"drift (·, {m}), the motion model gives (·, …) {sizes}"
+            )
         noise = transition.noise_factor @ np.swapaxes(transition.noise_factor, -1, -2)
         stack = np.concatenate([np.broadcast_to(transition.coupling, (self.mean.shape[0], d, self.mean.shape[1])),
                                 np.broadcast_to(transition.dynamics, self.cov.shape)], axis=1)

@@ -33,11 +33,11 @@ class NamedLandmarkSensor(Sensor):
         self.landmark = landmark
         self.likelihood = likelihood
         self._ids: dict[Any, int] = {}
+        self._read: tuple[dict[int, Any] | None, int, int] = (None, 0, -1)
 
     def observe(self, frame: Sightings, belief: Belief) -> Sequence[Observations]:
         """The sightings of landmarks that the map holds."""
-        if len(self._ids) != len(belief.catalogue):
-            self._ids = {name: landmark_id for landmark_id, name in belief.catalogue.items()}
+        self._look_up(belief.catalogue)
         ids = np.array([self._ids.get(name, NEW) for name in frame.landmarks.tolist()], dtype=np.int64)
         known = ids != NEW
         if not known.any():
@@ -51,6 +51,13 @@ class NamedLandmarkSensor(Sensor):
         if not new:
             return []
         return [Births(frame.z[new], frame.cov_z[new], self.model, self.landmark, facts=[names[k] for k in new])]
+
+    def _look_up(self, catalogue: dict[int, Any]) -> None:
+        """Inverts the catalogue where it has changed; ids only grow, so size and last id tell."""
+        last = next(reversed(catalogue), -1)
+        if self._read[0] is not catalogue or self._read[1:] != (len(catalogue), last):
+            self._ids = {name: landmark_id for landmark_id, name in catalogue.items()}
+            self._read = (catalogue, len(catalogue), last)
 
 
 @final
@@ -90,7 +97,7 @@ class AnonymousLandmarkSensor(Sensor):
             present = ~np.isneginf(belief.map.log_odds(ids))
             nu, cov = belief.predictions(self.model, frame.z, frame.cov_z, ids)
             chosen = associate(nu, cov, present, self.gates)
-            chosen = np.where(chosen >= 0, ids[chosen], chosen)
+            chosen = np.where(chosen >= 0, ids[np.maximum(chosen, 0)], chosen)
         else:
             chosen = np.full((belief.log_weights.size, frame.z.shape[0]), NEW)
         gates = self.gates
@@ -102,9 +109,9 @@ class AnonymousLandmarkSensor(Sensor):
 
     def births(self, frame: Sightings, belief: Belief, observed: Sequence[Observations]) -> Sequence[Births]:
         """Updates the evidence of what should have been seen; starts what some particle takes as new."""
-        if not observed or observed[0].ids is None:
-            return []
-        chosen = observed[0].ids
+        chosen = np.zeros((belief.log_weights.size, 0), dtype=np.int64)
+        if observed and observed[0].ids is not None:
+            chosen = observed[0].ids
         self._count_evidence(belief, chosen)
         new = (chosen == NEW).any(axis=0)
         if not new.any():

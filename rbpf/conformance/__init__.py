@@ -1,0 +1,93 @@
+"""Says in words what is wrong with a user's model, before a filter is built on it.
+
+Every check calls the model as the filter does, on random arguments or on those of an `Example`, and compares
+the answer with what `rbpf.models` promises: shapes, numeric derivatives, the compiled twin, round trips.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from rbpf.conformance.arguments import Example, Scene
+from rbpf.conformance.calls import Check, run
+from rbpf.conformance.landmark import landmark_checks
+from rbpf.conformance.likelihood import likelihood_checks
+from rbpf.conformance.motion import motion_checks
+from rbpf.conformance.observation import observation_checks
+from rbpf.conformance.sensor import observe, sensor_checks
+from rbpf.errors import InputError
+from rbpf.lie import LieGroup
+from rbpf.models import Landmark, Likelihood, MotionModel, ObservationModel, Sensor
+
+__all__ = ["Example", "check_model", "require_sound"]
+
+
+def check_model(
+    model: Any,
+    space: LieGroup | None = None,
+    rng: np.random.Generator | None = None,
+    example: Example | None = None,
+) -> list[str]:
+    """What is wrong with a MotionModel, ObservationModel, Landmark, Likelihood or Sensor.
+
+    Args:
+        model: an object of a class derived from one of these.
+        space: group of the state; by default `model.space`.
+        rng: draws the arguments; by default always the same ones.
+        example: arguments that replace random ones; a Sensor needs its frame and belief.
+
+    Returns:
+        One sentence per finding: class, method, what was expected and found. Empty for a sound model.
+
+    Raises:
+        InputError: the object is no model, or cannot be tried without more than was given.
+    """
+    rng, example = rng or np.random.default_rng(0), example or Example()
+    space = space or getattr(model, "space", None)
+    if isinstance(model, Sensor):
+        findings = run(sensor_checks(model, example))
+        return findings or _of_observed_models(model, example, rng)
+    with np.errstate(all="ignore"):
+        return run(_checks(model, space, rng, example))
+
+
+def require_sound(
+    model: Any,
+    space: LieGroup | None = None,
+    rng: np.random.Generator | None = None,
+    example: Example | None = None,
+) -> None:
+    """As `check_model`, but raises.
+
+    Raises:
+        InputError: something is wrong; the message holds all findings.
+    """
+    findings = check_model(model, space, rng, example)
+    if findings:
+        raise InputError("; ".join(findings))
+
+
+def _checks(model: Any, space: LieGroup | None, rng: np.random.Generator, example: Example) -> list[Check]:
+    name = type(model).__name__
+    if isinstance(model, Likelihood):
+        return likelihood_checks(model, rng)
+    if isinstance(model, Landmark):
+        return landmark_checks(model, space, rng, example)
+    if not isinstance(model, MotionModel | ObservationModel):
+        raise InputError(f"check_model takes a model of rbpf.models, not a {name}")
+    if space is None:
+        raise InputError(f"{name} has no attribute space: tell check_model the group of the state")
+    if isinstance(model, MotionModel):
+        return motion_checks(model, space, rng, example)
+    return observation_checks(model, Scene.draw(model, space, rng, example), example)
+
+
+def _of_observed_models(sensor: Sensor, example: Example, rng: np.random.Generator) -> list[str]:
+    """Findings about the models and likelihoods of what the sensor observes."""
+    findings: dict[str, None] = {}
+    for group in observe(sensor, example):
+        for part in (group.model, group.likelihood):
+            if part is not None:
+                found = check_model(part, example.belief.prior.space, rng, example)
+                findings.update(dict.fromkeys(found))
+    return list(findings)

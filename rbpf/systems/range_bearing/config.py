@@ -1,0 +1,159 @@
+"""Every setting of a range-bearing run, with its default, its unit and what it does."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from rbpf.association import ExistenceModel, Gates
+from rbpf.errors import InputError
+from rbpf.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobis
+from rbpf.models import Likelihood, Proposal, Resampler
+from rbpf.proposals import EkfProposal, PriorProposal
+from rbpf.resampling import EssTriggered, Multinomial, Residual, Stratified, Systematic
+from rbpf.sensors.readers import LogNoise
+
+
+@dataclass(frozen=True)
+class AssociationConfig:
+    """Unknown association.
+
+    Attributes:
+        accept_probability: of the χ² gate within which a landmark may explain a sighting.
+        isolate_probability: of the χ² gate beyond which a sighting may start a landmark.
+        new_density: of first sightings, in inverse measurement units (1/(m·rad), 1/(m·rad²) or 1/mᵈ).
+        clutter_density: of clutter, same units.
+        max_range_m: beyond it a landmark is not expected to be seen; None is unlimited.
+        half_field_of_view_deg: likewise in yaw.
+        hit: added to a landmark's log-odds by a sighting.
+        miss: subtracted where it was expected and not seen.
+        drop: log-odds below which a landmark is deleted.
+    """
+
+    accept_probability: float = 0.999
+    isolate_probability: float = 0.999999
+    new_density: float = 1e-2
+    clutter_density: float = 1e-3
+    max_range_m: float | None = None
+    half_field_of_view_deg: float = 180.0
+    hit: float = 1.0
+    miss: float = 0.0
+    drop: float = -2.0
+
+    def gates(self, dim: int) -> Gates:
+        """χ² thresholds for measurements of `dim` numbers."""
+        from scipy.stats import chi2
+
+        accept, isolate = chi2.ppf([self.accept_probability, self.isolate_probability], dim)
+        return Gates(float(accept), float(isolate), np.log(self.new_density), np.log(self.clutter_density))
+
+    def existence(self) -> ExistenceModel:
+        """Evidence counters."""
+        return ExistenceModel(hit=self.hit, miss=self.miss, drop=self.drop)
+
+
+@dataclass(frozen=True)
+class LikelihoodConfig:
+    """Likelihood of an innovation.
+
+    Attributes:
+        kind: Gaussian, truncated Mahalanobis (S05 (6)), or Gaussian with outliers.
+        truncation: T_l of the truncated form.
+        outlier_rate: ε.
+        outlier_volume: V, of the measurement space, in its units.
+    """
+
+    kind: Literal["gaussian", "truncated", "outliers"] = "gaussian"
+    truncation: float = 4.0
+    outlier_rate: float = 0.02
+    outlier_volume: float = 60.0
+
+    def build(self) -> Likelihood:
+        """The likelihood."""
+        if self.kind == "truncated":
+            return TruncatedMahalanobis(self.truncation)
+        if self.kind == "outliers":
+            return GaussianWithOutliers(self.outlier_rate, self.outlier_volume)
+        return Gaussian()
+
+
+@dataclass(frozen=True)
+class ProposalConfig:
+    """Where particles are sampled and how they are weighted.
+
+    Attributes:
+        kind: the motion prior (bootstrap), or the EKF-refined Gaussian (FastSLAM 2.0).
+        iterations: linearisations of the refined proposal; 1 is E06.
+        weights: the exact importance ratio, or E06's linearised joint marginal.
+    """
+
+    kind: Literal["ekf", "prior"] = "ekf"
+    iterations: int = 3
+    weights: Literal["exact", "linearised"] = "exact"
+
+    def build(self) -> Proposal:
+        """The proposal."""
+        if self.kind == "prior":
+            return PriorProposal()
+        return EkfProposal(self.weights == "exact", self.iterations)
+
+
+@dataclass(frozen=True)
+class ResamplingConfig:
+    """When and how particles are resampled.
+
+    Attributes:
+        scheme: how.
+        ess_threshold: resample when the effective sample size falls below this share of the particles.
+    """
+
+    scheme: Literal["systematic", "stratified", "residual", "multinomial"] = "systematic"
+    ess_threshold: float = 0.5
+
+    def build(self) -> Resampler:
+        """The resampler."""
+        schemes: dict[str, Resampler] = {
+            "systematic": Systematic(),
+            "stratified": Stratified(),
+            "residual": Residual(),
+            "multinomial": Multinomial(),
+        }
+        return EssTriggered(schemes[self.scheme], self.ess_threshold)
+
+
+@dataclass(frozen=True)
+class RangeBearingConfig:
+    """A run of range-bearing SLAM.
+
+    Attributes:
+        particles: number of particles.
+        seed: of the only random generator.
+        association: landmarks named by the log, or by maximum likelihood in each particle.
+        compiled: run the fused kernels; false runs their NumPy twins.
+        lag: steps of trajectory kept for smoothing, None keeps all.
+        checkpoint_every: steps between checkpoints.
+        noise: standard deviations that replace the log's own.
+        proposal: where particles are sampled.
+        resampling: when and how.
+        likelihood: of an innovation.
+        unknown: settings of unknown association.
+    """
+
+    particles: int = 100
+    seed: int = 0
+    association: Literal["known", "ml"] = "known"
+    compiled: bool = True
+    lag: int | None = None
+    checkpoint_every: int = 500
+    noise: LogNoise = field(default_factory=LogNoise)
+    proposal: ProposalConfig = field(default_factory=ProposalConfig)
+    resampling: ResamplingConfig = field(default_factory=ResamplingConfig)
+    likelihood: LikelihoodConfig = field(default_factory=LikelihoodConfig)
+    unknown: AssociationConfig = field(default_factory=AssociationConfig)
+
+    def __post_init__(self) -> None:
+        """Checks what no part checks itself."""
+        if self.particles < 1:
+            raise InputError(f"particles must be at least 1, got {self.particles}")
+        if self.checkpoint_every < 1:
+            raise InputError(f"checkpoint_every must be at least 1, got {self.checkpoint_every}")

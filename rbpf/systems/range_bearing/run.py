@@ -1,0 +1,133 @@
+"""Runs the filter over a log, with checkpoints, and gathers what the run is judged by."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from rbpf.errors import InputError
+from rbpf.filter import Filter, StepReport
+from rbpf.sensors.readers.log import RobotLog
+from rbpf.systems.range_bearing.associations import Associations, named_associations
+from rbpf.systems.range_bearing.config import RangeBearingConfig
+from rbpf.systems.range_bearing.system import build_filter, control_of
+
+CHECKPOINT = "checkpoint.npz"
+
+
+@dataclass
+class Progress:
+    """One row per step done: what a checkpoint must hold besides the filter.
+
+    Attributes:
+        mean: (T, E) online filtered mean.
+        cov: (T, d, d) in the right chart at the mean.
+        ess: (T,) effective sample size before resampling.
+        resampled: (T,) bool.
+        log_evidence: (T,) increments.
+        nis: (T,) normalised innovation squared.
+        rows: (T,) its degrees of freedom.
+        seconds: (T,) time of the step.
+    """
+
+    mean: np.ndarray
+    cov: np.ndarray
+    ess: np.ndarray
+    resampled: np.ndarray
+    log_evidence: np.ndarray
+    nis: np.ndarray
+    rows: np.ndarray
+    seconds: np.ndarray
+
+    @classmethod
+    def empty(cls, steps: int, size: int, dim: int) -> "Progress":
+        """Room for a run."""
+        numbers = [np.zeros(steps) for _ in range(6)]
+        return cls(np.zeros((steps, size)), np.zeros((steps, dim, dim)), *numbers)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """For a checkpoint."""
+        return {f"progress/{item.name}": getattr(self, item.name) for item in fields(self)}
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """The inverse of `arrays`, for a log of the same length.
+
+        Raises:
+            InputError: the checkpoint belongs to another log.
+        """
+        for item in fields(self):
+            stored = arrays.get(f"progress/{item.name}")
+            if stored is None or stored.shape != getattr(self, item.name).shape:
+                raise InputError("the checkpoint belongs to a run over another log: start without --resume")
+            getattr(self, item.name)[...] = stored
+
+    def put(self, t: int, report: StepReport, seconds: float) -> None:
+        """Row t."""
+        self.mean[t], self.cov[t] = report.estimate.mean, report.estimate.cov
+        self.ess[t], self.resampled[t], self.log_evidence[t] = report.ess, report.resampled, report.log_evidence
+        self.nis[t], self.rows[t], self.seconds[t] = report.nis, report.rows, seconds
+
+
+@dataclass
+class Run:
+    """A finished run.
+
+    Attributes:
+        log: what was filtered.
+        config: with what settings.
+        filter: in its final state.
+        progress: one row per step.
+        associations: per step, the landmark of each sighting, −1 where it was not used: the log's name where the
+            association is known, else the map's id along the ancestors of the best particle.
+    """
+
+    log: RobotLog
+    config: RangeBearingConfig
+    filter: Filter
+    progress: Progress
+    associations: list[np.ndarray]
+
+
+def run(
+    log: RobotLog,
+    config: RangeBearingConfig,
+    out: Path | None = None,
+    resume: bool = False,
+    on_step: Callable[[int, int], None] | None = None,
+) -> Run:
+    """Filters a whole log.
+
+    Args:
+        log: the recording.
+        config: all settings.
+        out: folder for checkpoints; None writes none.
+        resume: go on from the checkpoint in `out`, if there is one.
+        on_step: called with the steps done and their number.
+
+    Raises:
+        InputError: the log or a setting does not fit, or no particle explains the observations.
+    """
+    filter_ = build_filter(log, config)
+    total = len(log.frames)
+    progress = Progress.empty(total, log.space.size, log.space.dim)
+    associations = Associations(filter_)
+    checkpoint = None if out is None else out / CHECKPOINT
+    if resume and checkpoint is not None and checkpoint.exists():
+        extra = filter_.load(checkpoint)
+        progress.restore(extra)
+        associations.restore(extra)
+    for t in range(filter_.steps, total):
+        frame = log.frames[t]
+        started = time.perf_counter()
+        report = filter_.step(frame, control_of(frame), frame.stamp_ns)
+        progress.put(t, report, time.perf_counter() - started)
+        associations.record(report, frame.z.shape[0])
+        if checkpoint is not None and filter_.steps % config.checkpoint_every == 0:
+            filter_.save(checkpoint, progress.arrays() | associations.arrays())
+        if on_step is not None:
+            on_step(t + 1, total)
+    if config.association == "known":
+        return Run(log, config, filter_, progress, named_associations(log))
+    return Run(log, config, filter_, progress, associations.of(filter_.belief().mode))

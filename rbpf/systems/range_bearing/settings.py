@@ -1,0 +1,74 @@
+"""Settings from a YAML file, from key=value pairs and from the command line, in this order."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import yaml
+
+from rbpf.errors import InputError
+from rbpf.systems.range_bearing.config import RangeBearingConfig
+
+_HEADER = ("rbpf", "system", "recording")
+
+
+def load_settings(path: Path | None, pairs: Sequence[str], given: Mapping[str, Any]) -> RangeBearingConfig:
+    """A configuration; later sources override earlier ones.
+
+    Args:
+        path: YAML file, such as the config.yaml of a former run.
+        pairs: settings as key=value, nested keys with dots.
+        given: settings by name.
+
+    Raises:
+        InputError: the file is unreadable, a key does not exist or a value has the wrong type.
+    """
+    values = {} if path is None else _read(path)
+    for pair in pairs:
+        _put(values, pair)
+    values.update(given)
+    _refuse_unknown(values, RangeBearingConfig, "")
+    try:
+        return msgspec.convert(values, RangeBearingConfig, strict=False)
+    except msgspec.ValidationError as error:
+        raise InputError(f"settings: {error}") from error
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} cannot be read: {error}") from error
+    except yaml.YAMLError as error:
+        raise InputError(f"{path} is not YAML: {' '.join(str(error).split())}") from error
+    if not isinstance(values, dict):
+        raise InputError(f"{path} must hold settings as `name: value`, one per line")
+    system = values.get("system", "range-bearing")
+    if system != "range-bearing":
+        raise InputError(f"{path} holds settings of the system {system!r}, not of range-bearing")
+    return {name: value for name, value in values.items() if name not in _HEADER}
+
+
+def _put(values: dict[str, Any], pair: str) -> None:
+    key, equals, text = pair.partition("=")
+    if not equals or not key:
+        raise InputError(f"--set takes key=value, got {pair!r}")
+    *outer, last = key.split(".")
+    for name in outer:
+        inner = values.setdefault(name, {})
+        if not isinstance(inner, dict):
+            raise InputError(f"--set {pair}: {name} is no group of settings")
+        values = inner
+    values[last] = None if text in ("", "null", "none") else text
+
+
+def _refuse_unknown(values: Mapping[str, Any], kind: Any, prefix: str) -> None:
+    known = {item.name: item for item in fields(kind)}
+    for name, value in values.items():
+        if name not in known:
+            raise InputError(f"there is no setting {prefix}{name}; known here: {', '.join(sorted(known))}")
+        inner = known[name].default_factory
+        if isinstance(value, dict) and is_dataclass(inner):
+            _refuse_unknown(value, inner, f"{prefix}{name}.")

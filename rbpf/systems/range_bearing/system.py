@@ -1,0 +1,60 @@
+"""Range-bearing SLAM in the plane and in space: odometry motion, a mounted sensor, point landmarks."""
+
+import numpy as np
+
+from rbpf.filter import Filter
+from rbpf.lie import SE2Group
+from rbpf.maps.landmark_map import LandmarkMap
+from rbpf.maps.point import Point
+from rbpf.models import Sensor
+from rbpf.motion.odometry import Odometry, OdometryMotion
+from rbpf.sensors.landmark_sensor import AnonymousLandmarkSensor, NamedLandmarkSensor
+from rbpf.sensors.range_bearing import RangeBearing, RelativePosition
+from rbpf.sensors.readers.log import Frame, RobotLog
+from rbpf.sensors.rigid_point import RigidPointModel
+from rbpf.systems.range_bearing.config import RangeBearingConfig
+
+
+def build_filter(log: RobotLog, config: RangeBearingConfig) -> Filter:
+    """The filter for a log; the robot starts at the origin of the world."""
+    landmark_map = LandmarkMap(log.space, evidence=config.association == "ml", compiled=config.compiled)
+    landmark_map.register(_point(log))
+    return Filter(
+        OdometryMotion(log.space),
+        build_sensor(log, config),
+        landmark_map,
+        config.proposal.build(),
+        config.resampling.build(),
+        config.particles,
+        np.random.default_rng(config.seed),
+        lag=config.lag,
+    )
+
+
+def build_model(log: RobotLog, config: RangeBearingConfig) -> RigidPointModel:
+    """How this log's sensor measures a point."""
+    max_range = np.inf if config.unknown.max_range_m is None else config.unknown.max_range_m
+    if log.measurement == "position":
+        return RelativePosition(log.space, log.robot_from_sensor, max_range)
+    view = np.deg2rad(config.unknown.half_field_of_view_deg)
+    return RangeBearing(log.space, log.robot_from_sensor, log.pitch_sign, max_range, view)
+
+
+def build_sensor(log: RobotLog, config: RangeBearingConfig) -> Sensor:
+    """The sensor, with the log's names or without."""
+    model, point, likelihood = build_model(log, config), _point(log), config.likelihood.build()
+    if config.association == "known":
+        return NamedLandmarkSensor(model, point, likelihood)
+    unknown = config.unknown
+    return AnonymousLandmarkSensor(model, point, unknown.gates(model.dim), unknown.existence(), likelihood)
+
+
+def control_of(frame: Frame) -> Odometry | None:
+    """The odometry that led to a frame; none leads to the first."""
+    if frame.delta is None or frame.cov_delta is None:
+        return None
+    return Odometry(frame.delta, frame.cov_delta)
+
+
+def _point(log: RobotLog) -> Point:
+    return Point(2 if isinstance(log.space, SE2Group) else 3)

@@ -1,0 +1,126 @@
+"""With everything marginalised the filter is a Kalman filter; with a trajectory given, so is each particle."""
+
+import numpy as np
+import pytest
+
+from rbpf.filter import Filter
+from rbpf.lie import Euclidean
+from rbpf.models import Transition
+from rbpf.proposals import EkfProposal, PriorProposal
+from rbpf.resampling import EssTriggered, Systematic
+from rbpf.substate import KalmanSubstate
+from tests.exactness.models import Frame, Kalman, LinearMotion, LinearObservation, Scripted, single
+
+TOLERANCE = 1e-9
+PROPOSALS = [PriorProposal(), EkfProposal(), EkfProposal(exact=False), EkfProposal(iterations=3)]
+every_proposal = pytest.mark.parametrize("proposal", PROPOSALS, ids=["prior", "ekf", "linearised", "iterated"])
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(1960)
+
+
+def random_motion(rng: np.random.Generator, d: int, m: int, rank: int) -> LinearMotion:
+    return LinearMotion(
+        0.6 * rng.normal(size=(d, d)),
+        0.5 * rng.normal(size=(d + m, rank)),
+        rng.normal(size=(d, m)),
+        0.5 * rng.normal(size=(m, m)),
+        rng.normal(size=m),
+    )
+
+
+@every_proposal
+@pytest.mark.parametrize("rank", [3, 1], ids=["regular", "singular"])
+def test_everything_marginalised_is_a_kalman_filter(proposal, rank, rng):
+    motion = random_motion(rng, 0, 3, rank)
+    kalman = Kalman(rng.normal(size=3), np.diag([0.5, 1.0, 2.0]))
+    models = [LinearObservation(by_substate=rng.normal(size=(p, 3))) for p in (2, 1)]
+    filter_ = Filter(
+        motion,
+        Scripted(),
+        KalmanSubstate(motion.space, kalman.mean, kalman.cov),
+        proposal,
+        Systematic(),
+        n=5,
+        rng=rng,
+    )
+    F, Q, drift = motion.joint()
+    for _ in range(12):
+        groups = [single(rng.normal(size=model.dim), 0.3 * np.eye(model.dim), model) for model in models]
+        before = kalman.log_evidence
+        kalman.predict(F, Q, drift)
+        for group, model in zip(groups, models, strict=True):
+            kalman.update(group.z[0], next(iter(model.matrices.values())), group.cov[0])
+        report = filter_.step(Frame(groups))
+        substate = filter_.marginals.parts[KalmanSubstate.supplies]
+        assert isinstance(substate, KalmanSubstate)
+        np.testing.assert_allclose(substate.mean, np.tile(kalman.mean, (5, 1)), atol=TOLERANCE)
+        np.testing.assert_allclose(substate.cov, np.tile(kalman.cov, (5, 1, 1)), atol=TOLERANCE)
+        assert report.log_evidence == pytest.approx(kalman.log_evidence - before, abs=TOLERANCE)
+    assert filter_.log_evidence == pytest.approx(kalman.log_evidence, abs=TOLERANCE)
+    np.testing.assert_allclose(filter_.particles.weights, 0.2, rtol=1e-14)
+
+
+@every_proposal
+def test_a_state_without_noise_leaves_a_kalman_filter_of_the_substate(proposal, rng):
+    motion = LinearMotion(np.eye(1), np.vstack([np.zeros((1, 2)), 0.4 * np.eye(2)]), np.zeros((1, 2)), 0.9 * np.eye(2), np.ones(2))
+    G, C = rng.normal(size=(2, 1)), rng.normal(size=(2, 2))
+    model, fix = LinearObservation(G, C), LinearObservation(by_state=np.eye(1))
+    kalman = Kalman(np.zeros(2), np.eye(2))
+    start = np.array([1.5])
+    substate = KalmanSubstate(motion.space, kalman.mean, kalman.cov)
+    filter_ = Filter(motion, Scripted(), substate, proposal, n=4, rng=rng, start=start)
+    for _ in range(8):
+        z, at = rng.normal(size=2), rng.normal(size=1)
+        kalman.predict(motion.A, 0.16 * np.eye(2), motion.b)
+        kalman.update(z - G @ start, C, 0.2 * np.eye(2))
+        kalman.log_evidence -= 0.5 * float((at - start) @ (at - start) / 0.7 + np.log(2 * np.pi * 0.7))
+        filter_.step(Frame([single(z, 0.2 * np.eye(2), model), single(at, 0.7, fix)]))
+    np.testing.assert_allclose(substate.mean, np.tile(kalman.mean, (4, 1)), atol=TOLERANCE)
+    np.testing.assert_allclose(substate.cov, np.tile(kalman.cov, (4, 1, 1)), atol=TOLERANCE)
+    assert filter_.log_evidence == pytest.approx(kalman.log_evidence, abs=TOLERANCE)
+
+
+@every_proposal
+@pytest.mark.parametrize("rank", [4, 3, 1], ids=["regular", "as many", "fewer"])
+def test_a_sampled_trajectory_is_an_exact_measurement_of_the_substate(proposal, rank, rng):
+    """Noise of rank 1 makes the increment a function of the substate."""
+    motion = random_motion(rng, 2, 2, rank)
+    fix = LinearObservation(np.eye(2), 0.3 * np.ones((2, 2)))
+    substate = KalmanSubstate(motion.space, np.ones(2), np.eye(2))
+    filter_ = Filter(motion, Scripted(), substate, proposal, EssTriggered(Systematic(), 0.0), n=3, rng=rng)
+    kalmans = [Kalman(np.ones(2), np.eye(2)) for _ in range(3)]
+    before = filter_.particles.state
+    noise = motion.L @ motion.L.T
+    for _ in range(6):
+        z = rng.normal(size=2)
+        filter_.step(Frame([single(z, 0.5 * np.eye(2), fix)]))
+        after = filter_.particles.state
+        for i, kalman in enumerate(kalmans):
+            joint = np.vstack([motion.B, motion.A])
+            pair = Kalman(np.concatenate([motion.F @ before[i], np.zeros(2)]) + joint @ kalman.mean, joint @ kalman.cov @ joint.T + noise)
+            pair.mean[2:] += motion.b
+            gain = pair.cov[2:, :2] @ np.linalg.pinv(pair.cov[:2, :2])
+            kalman.mean = pair.mean[2:] + gain @ (after[i] - pair.mean[:2])
+            kalman.cov = pair.cov[2:, 2:] - gain @ pair.cov[:2, 2:]
+            kalman.update(z - after[i], 0.3 * np.ones((2, 2)), 0.5 * np.eye(2))
+            np.testing.assert_allclose(substate.mean[i], kalman.mean, atol=TOLERANCE)
+            np.testing.assert_allclose(substate.cov[i], kalman.cov, atol=TOLERANCE)
+        before = after
+
+
+def test_the_marginal_prior_of_the_increment_has_the_substates_covariance(rng):
+    motion = random_motion(rng, 2, 2, 4)
+    substate = KalmanSubstate(Euclidean(2), np.ones(2), np.diag([0.5, 2.0]))
+    filter_ = Filter(motion, Scripted(), substate, n=3, rng=rng)
+    transition = motion.transition(filter_.particles.state, None, 0.0)
+    assert isinstance(transition, Transition)
+    prior = substate.predict(transition, motion.space)
+    F, Q, drift = motion.joint()
+    kalman = Kalman(np.array([0.0, 0.0, 1.0, 1.0]), np.diag([0.0, 0.0, 0.5, 2.0]))
+    kalman.predict(F, Q, drift)
+    np.testing.assert_allclose(prior.mean, np.tile(kalman.mean[:2], (3, 1)), atol=TOLERANCE)
+    cov = prior.factor @ np.swapaxes(prior.factor, -1, -2)
+    np.testing.assert_allclose(cov, np.tile(kalman.cov[:2, :2], (3, 1, 1)), atol=TOLERANCE)

@@ -1,0 +1,194 @@
+"""The measurements that one run used: what a batch optimiser needs to solve the same problem."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rbpf.errors import InputError
+from rbpf.lie import Array, SE2Group, SE3Group
+from rbpf.sensors.range_bearing import RangeBearing, RelativePosition
+from rbpf.sensors.readers import Frame, RobotLog
+from rbpf.sensors.readers.table import LARGEST
+
+Kind = Literal["range_bearing", "position"]
+KINDS: dict[str, Kind] = {"range_bearing": "range_bearing", "position": "position"}
+
+_NEGATIVE = 1e-9
+_UNIT = 1e-6
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Measurements:
+    """Odometry, and sightings of landmarks whose association is settled; T steps, K sightings.
+
+    Attributes:
+        recording: short name of the recording, one line.
+        space: SE2 or SE3, the group of the robot's pose.
+        measurement: "range_bearing" (range, yaw[, pitch]) or "position" (point in the sensor's frame).
+        pitch_sign: +1 where positive pitch points up, -1 where it points down.
+        robot_from_sensor: (E,) mounting pose.
+        start: (E,) world_from_robot of step 0, which is known.
+        stamps_ns: (T,) time of each step, integer nanoseconds.
+        deltas: (T - 1, E) odometry, previous_robot_from_robot of the steps from 1 on.
+        covs: (T - 1, d, d) their covariance in the right chart at the delta, order [omega, v]; may be singular.
+        steps: (K,) the step of each sighting.
+        landmarks: (K,) the map's name of the landmark seen.
+        z: (K, p) what was measured.
+        cov_z: (K, p, p) covariance of its noise.
+
+    Raises:
+        InputError: shapes do not fit together, or a number is not as described.
+    """
+
+    recording: str
+    space: SE2Group | SE3Group
+    measurement: Kind
+    pitch_sign: float
+    robot_from_sensor: Array
+    start: Array
+    stamps_ns: NDArray[np.int64]
+    deltas: Array
+    covs: Array
+    steps: NDArray[np.int64]
+    landmarks: NDArray[np.int64]
+    z: Array
+    cov_z: Array
+
+    def __post_init__(self) -> None:
+        if self.recording.splitlines() != [self.recording.strip()]:
+            raise InputError(
+                f"Expected a recording's name on one line without blanks around it, found {self.recording!r}."
+            )
+        if self.measurement not in KINDS or self.pitch_sign not in (-1.0, 1.0):
+            found = f"{self.measurement!r} and {self.pitch_sign!r}"
+            raise InputError(f"Expected a measurement {' or '.join(KINDS)} and a pitch sign 1 or -1, found {found}.")
+        self._require_shapes()
+        if ((self.steps < 0) | (self.steps >= len(self.stamps_ns))).any():
+            raise InputError(f"Expected the steps of sightings from 0 to {len(self.stamps_ns) - 1}.")
+        if (np.diff(self.stamps_ns) < 0).any():
+            raise InputError("Expected the stamps of the steps in order of time.")
+        for name in ("robot_from_sensor", "start", "deltas", "covs", "z", "cov_z"):
+            if not (np.abs(getattr(self, name)) <= LARGEST).all():
+                raise InputError(f"Expected finite numbers of at most {LARGEST:.0e} in {name}.")
+        if not are_poses(self.space, np.vstack([self.robot_from_sensor, self.start, self.deltas])).all():
+            raise InputError("Expected quaternions of length 1 in robot_from_sensor, start and deltas.")
+        for name in ("covs", "cov_z"):
+            valid = are_covariances(getattr(self, name))
+            if not valid.all():
+                raise InputError(f"Expected covariances in {name}, row {int(np.argmin(valid))} (from 0) is none.")
+
+    def _require_shapes(self) -> None:
+        size, dim, point = self.space.size, self.space.dim, point_dim(self.space)
+        moves, count = max(len(self.stamps_ns) - 1, 0), len(self.steps)
+        expected = {
+            "robot_from_sensor": (size,),
+            "start": (size,),
+            "stamps_ns": (moves + 1,),
+            "deltas": (moves, size),
+            "covs": (moves, dim, dim),
+            "steps": (count,),
+            "landmarks": (count,),
+            "z": (count, point),
+            "cov_z": (count, point, point),
+        }
+        for name, shape in expected.items():
+            found = getattr(self, name).shape
+            if found != shape:
+                raise InputError(f"Expected {name} of shape {shape}, found {found}.")
+
+    def model(self) -> RangeBearing | RelativePosition:
+        """The observation model, the same one that the filter uses."""
+        if self.measurement == "position":
+            return RelativePosition(self.space, self.robot_from_sensor)
+        return RangeBearing(self.space, self.robot_from_sensor, self.pitch_sign)
+
+
+class InitialEstimate(NamedTuple):
+    """Where an optimiser starts: world_from_robot (T, E), and name of each landmark to its (D,) position."""
+
+    world_from_robot: Array
+    landmarks: Mapping[int, Array]
+
+
+def from_log(log: RobotLog, start: Array | None = None) -> Measurements:
+    """All measurements of a log whose association is known; landmarks keep the log's names.
+
+    Args:
+        log: the recording.
+        start: (E,) known world_from_robot of the first frame; by default the origin.
+
+    Raises:
+        InputError: the log is empty, of another group, or lacks odometry.
+    """
+    if not isinstance(log.space, SE2Group | SE3Group) or log.measurement not in KINDS or not log.frames:
+        raise InputError(f"{log.name}: expected frames of range_bearing or position measurements in SE2 or SE3.")
+    space = log.space
+    moves = [_odometry(log, step) for step in range(1, len(log.frames))]
+    point = point_dim(space)
+    return Measurements(
+        recording=log.name,
+        space=space,
+        measurement=KINDS[log.measurement],
+        pitch_sign=log.pitch_sign,
+        robot_from_sensor=log.robot_from_sensor,
+        start=space.identity() if start is None else start,
+        stamps_ns=np.array([frame.stamp_ns for frame in log.frames], dtype=np.int64),
+        deltas=np.array([delta for delta, _ in moves]).reshape(-1, space.size),
+        covs=np.array([cov for _, cov in moves]).reshape(-1, space.dim, space.dim),
+        steps=np.repeat(np.arange(len(log.frames)), [len(frame.z) for frame in log.frames]),
+        landmarks=_stacked(log.frames, "landmarks", ()).astype(np.int64),
+        z=_stacked(log.frames, "z", (point,)),
+        cov_z=_stacked(log.frames, "cov_z", (point, point)),
+    )
+
+
+def dead_reckoning(m: Measurements) -> Array:
+    """(T, E) world_from_robot by odometry alone."""
+    path = [m.start]
+    for delta in m.deltas:
+        path.append(m.space.compose(path[-1], delta))
+    return np.array(path)
+
+
+def initial_estimate(m: Measurements) -> InitialEstimate:
+    """Dead reckoning, and every landmark where its first sighting from there puts it."""
+    path, model = dead_reckoning(m), m.model()
+    by_step = np.argsort(m.steps, kind="stable")
+    names, first = np.unique(m.landmarks[by_step], return_index=True)
+    rows = by_step[first]
+    points = model.invert(path[m.steps[rows]], m.z[rows])
+    return InitialEstimate(path, dict(zip(names.tolist(), points, strict=True)))
+
+
+def point_dim(space: SE2Group | SE3Group) -> int:
+    """Coordinates of a landmark, D, which is also how many numbers one measurement has, p."""
+    return 2 if isinstance(space, SE2Group) else 3
+
+
+def are_covariances(cov: Array) -> NDArray[np.bool_]:
+    """Which of (K, n, n) finite matrices are symmetric and positive semi-definite up to rounding, (K,)."""
+    largest = np.abs(cov).max((-1, -2), initial=0.0)
+    symmetric = np.abs(cov - cov.mT).max((-1, -2), initial=0.0) <= _NEGATIVE * largest
+    return symmetric & (np.linalg.eigvalsh(cov)[:, 0] >= -_NEGATIVE * largest)
+
+
+def are_poses(space: SE2Group | SE3Group, poses: Array) -> NDArray[np.bool_]:
+    """Which of (K, E) elements have a quaternion of length 1, (K,); all of them in the plane."""
+    if isinstance(space, SE2Group):
+        return np.ones(len(poses), dtype=bool)
+    return np.abs(np.linalg.norm(poses[:, :4], axis=1) - 1.0) <= _UNIT
+
+
+def _odometry(log: RobotLog, step: int) -> tuple[Array, Array]:
+    frame = log.frames[step]
+    if frame.delta is None or frame.cov_delta is None:
+        raise InputError(f"{log.name}: expected odometry in every frame after the first, frame {step} has none.")
+    return frame.delta, frame.cov_delta
+
+
+def _stacked(frames: list[Frame], field: str, shape: tuple[int, ...]) -> Array:
+    return np.concatenate([np.reshape(getattr(frame, field), (-1, *shape)) for frame in frames])

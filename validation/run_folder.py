@@ -1,0 +1,177 @@
+"""Everything that a run leaves in its folder. Each file is written under a temporary name, then renamed.
+
+trajectory.tum           online filtered mean at every step
+map.npz, map.csv         landmarks: id, mean, covariance (within + between particles)
+observations.csv, observations_odometry.csv   the measurements used; see `rbpf.validation.measurement_files`
+timings.csv              milliseconds per step
+diagnostics.csv          effective sample size, resampling, log-evidence, NIS per step
+config.yaml              everything needed to repeat the run
+summary.json             the figures
+*.png, report.html       pictures, and one page with all of them
+"""
+
+import csv
+import json
+import os
+import resource
+import sys
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from rbpf import __version__, gaussian
+from rbpf.checkpoint import save_arrays
+from rbpf.lie import SE2Group
+from rbpf.systems.range_bearing.run import Run
+from rbpf.validation.map_summary import MapSummary, summarise_map
+from rbpf.validation.measurement_files import write_measurements
+from rbpf.validation.measurements import Measurements
+from rbpf.validation.scores import Scores, as_trajectory, score
+from rbpf.validation.trajectory_files import write_tum
+
+
+def write_text(path: Path, text: str) -> None:
+    """Writes a whole file or none."""
+    temporary = path.with_name(path.name + ".partial")
+    temporary.write_text(text, encoding="utf-8")
+    os.replace(temporary, path)
+
+
+def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """A comma-separated table with a header line."""
+    buffer = StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(rows)
+    write_text(path, buffer.getvalue())
+
+
+def write_run(run: Run, out: Path, recording: Path, extra: dict[str, Any] | None = None) -> dict[str, Any]:
+    """Writes all data files of a run.
+
+    Args:
+        run: what was filtered.
+        out: the run's folder.
+        recording: where the log lies, for config.yaml.
+        extra: further entries of summary.json.
+
+    Returns:
+        The entries of summary.json.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    log, progress = run.log, run.progress
+    stamps = np.array([frame.stamp_ns for frame in log.frames], dtype=np.int64)
+    write_tum(out / "trajectory.tum", as_trajectory(log, stamps, progress.mean))
+    summary_map = summarise_map(run.filter)
+    write_map(out, summary_map)
+    write_measurements(out, used_measurements(run))
+    write_csv(out / "timings.csv", ["step", "milliseconds"], enumerate(np.round(progress.seconds * 1e3, 4)))
+    columns = (progress.ess, progress.resampled.astype(int), progress.log_evidence, progress.nis, progress.rows)
+    write_csv(
+        out / "diagnostics.csv",
+        ["step", "stamp_ns", "ess", "resampled", "log_evidence", "nis", "nis_dof"],
+        zip(range(stamps.size), stamps, *(column.tolist() for column in columns), strict=True),
+    )
+    config = {"rbpf": __version__, "system": "range-bearing", "recording": str(recording), **asdict(run.config)}
+    write_text(out / "config.yaml", yaml.safe_dump(config, sort_keys=False))
+    entries = summarise(run, summary_map) | (extra or {})
+    write_text(out / "summary.json", json.dumps(entries, indent=2, allow_nan=False) + "\n")
+    return entries
+
+
+def write_map(out: Path, summary: MapSummary) -> None:
+    """map.npz and map.csv."""
+    save_arrays(out / "map.npz", {"id": summary.ids, "mean": summary.mean, "cov": summary.cov})
+    dim = summary.mean.shape[1]
+    axes = "xyz"[:dim]
+    cov_names = [f"c{axes[a]}{axes[b]}" for a in range(dim) for b in range(a + 1)]
+    packed = gaussian.pack(summary.cov)
+    rows = ([name, *mean, *cov] for name, mean, cov in zip(summary.ids, summary.mean.tolist(), packed.tolist(), strict=True))
+    write_csv(out / "map.csv", ["id", *(f"{axis}_m" for axis in axes), *cov_names], rows)
+
+
+def used_measurements(run: Run) -> Measurements:
+    """The odometry, and every sighting that the filter used or started a landmark from."""
+    log = run.log
+    keep = [np.flatnonzero(ids >= 0) for ids in run.associations]
+    steps = np.repeat(np.arange(len(keep)), [rows.size for rows in keep])
+
+    def gathered(name: str, shape: tuple[int, ...]) -> np.ndarray:
+        parts = [getattr(frame, name)[rows] for frame, rows in zip(log.frames, keep, strict=True)]
+        return np.concatenate([np.zeros((0, *shape)), *parts])
+
+    p = 2 if isinstance(log.space, SE2Group) else 3
+    d, moves = log.space.dim, log.frames[1:]
+    return Measurements(
+        recording=log.name,
+        space=log.space,  # type: ignore[arg-type]
+        measurement=log.measurement,  # type: ignore[arg-type]
+        pitch_sign=log.pitch_sign,
+        robot_from_sensor=log.robot_from_sensor,
+        start=log.space.identity(),
+        stamps_ns=np.array([frame.stamp_ns for frame in log.frames], dtype=np.int64),
+        deltas=np.array([frame.delta for frame in moves], dtype=float).reshape(-1, log.space.size),
+        covs=np.array([frame.cov_delta for frame in moves], dtype=float).reshape(-1, d, d),
+        steps=steps,
+        landmarks=np.concatenate([np.zeros(0, dtype=np.int64), *(i[i >= 0] for i in run.associations)]),
+        z=gathered("z", (p,)),
+        cov_z=gathered("cov_z", (p, p)),
+    )
+
+
+def summarise(run: Run, summary_map: MapSummary) -> dict[str, Any]:
+    """The entries of summary.json."""
+    progress, config = run.progress, run.config
+    milliseconds = progress.seconds * 1e3
+    truth = {} if run.log.truth is None else run.log.truth.landmarks
+    scores = score(run.log, progress.mean, summary_map.named(truth, config.association == "ml"))
+    evidence = run.filter.log_evidence
+    return {
+        "system": "range-bearing",
+        "recording": run.log.name,
+        "frames": len(run.log.frames),
+        "particles": config.particles,
+        "seed": config.seed,
+        "ms_per_frame": {
+            "median": round(float(np.median(milliseconds)), 3),
+            "p95": round(float(np.percentile(milliseconds, 95)), 3),
+        },
+        "landmarks": int(summary_map.ids.size),
+        "observations": int(sum((ids >= 0).sum() for ids in run.associations)),
+        "resamplings": int(progress.resampled.sum()),
+        "ess_mean": float(progress.ess.mean()),
+        "log_evidence": evidence if np.isfinite(evidence) else None,
+        "nis_per_dof": _ratio(progress.nis, progress.rows),
+        "ancestors_of_first_generation": run.filter.history.distinct_first(),
+        "map_share_of_dense": _map_share(run),
+        "peak_memory_mb": round(peak_memory_mb(), 1),
+        **reported(scores),
+    }
+
+
+def reported(scores: Scores, prefix: str = "") -> dict[str, Any]:
+    """Scores that exist, as entries of summary.json."""
+    return {prefix + name: value for name, value in asdict(scores).items() if value is not None}
+
+
+def peak_memory_mb() -> float:
+    """Largest resident size of this process so far."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (2**20 if sys.platform == "darwin" else 2**10)
+
+
+def _ratio(nis: np.ndarray, rows: np.ndarray) -> float | None:
+    used = np.isfinite(nis) & (rows > 0)
+    return float(nis[used].sum() / rows[used].sum()) if used.any() else None
+
+
+def _map_share(run: Run) -> float:
+    store = run.filter.belief().map.store
+    return round(store.stored_bytes / max(store.dense_bytes, 1), 4)
+
+

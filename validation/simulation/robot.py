@@ -1,0 +1,139 @@
+"""Simulates a robot among landmarks and writes the log that `rbpf run range-bearing` reads.
+
+The folder has the layout of `rbpf.sensors.readers.mrpt`: odometry, observations, sensor and both ground truths.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from rbpf.errors import InputError
+from rbpf.lie import SE3
+from rbpf.validation.run_folder import write_csv, write_text
+
+
+@dataclass(frozen=True)
+class RobotWorld:
+    """A robot that drives in a circle (planar) or along a tilted, waving loop (in space) among random landmarks.
+
+    Attributes:
+        steps: number of steps.
+        landmarks: number of landmarks.
+        spatial: six degrees of freedom instead of three.
+        radius_m: of the circle.
+        laps: how many times round.
+        extent_m: landmarks lie within this of the circle's centre.
+        max_range_m: of the sensor.
+        half_field_of_view_deg: in yaw (and pitch).
+        std_range_m: noise of the range.
+        std_angle_deg: noise of yaw and pitch.
+        std_translation_m: noise of the odometry per step and axis.
+        std_rotation_deg: likewise.
+    """
+
+    steps: int = 200
+    landmarks: int = 60
+    spatial: bool = False
+    radius_m: float = 5.0
+    laps: float = 2.0
+    extent_m: float = 9.0
+    max_range_m: float = 6.0
+    half_field_of_view_deg: float = 60.0
+    std_range_m: float = 0.02
+    std_angle_deg: float = 0.3
+    std_translation_m: float = 0.03
+    std_rotation_deg: float = 0.3
+
+    def __post_init__(self) -> None:
+        """Checks that there is something to simulate."""
+        if self.steps < 2 or self.landmarks < 1:
+            raise InputError(f"a simulation needs at least 2 steps and 1 landmark, got {self.steps}, {self.landmarks}")
+        for name in ("radius_m", "extent_m", "max_range_m", "std_range_m", "std_angle_deg"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"{name} must be positive, got {getattr(self, name)}")
+
+
+def simulate_robot(world: RobotWorld, folder: Path, seed: int) -> None:
+    """Writes a log.
+
+    Args:
+        world: what to simulate.
+        folder: created where it does not exist; files of that name are replaced.
+        seed: of the only random generator.
+    """
+    rng = np.random.default_rng(seed)
+    folder.mkdir(parents=True, exist_ok=True)
+    truth = _path(world)
+    points = _landmarks(world, rng)
+    _write_truth(folder, truth, points)
+    _write_odometry(world, folder, truth, rng)
+    _write_observations(world, folder, truth, points, rng)
+    text = (
+        "robot_from_sensor: {x_m: 0, y_m: 0, z_m: 0, yaw_deg: 0, pitch_deg: 0, roll_deg: 0}\n"
+        f"std: {{range_m: {world.std_range_m}, yaw_deg: {world.std_angle_deg}, pitch_deg: {world.std_angle_deg}}}\n"
+        "positive_pitch: up\n"
+    )
+    write_text(folder / "sensor.yaml", text)
+
+
+def _path(world: RobotWorld) -> np.ndarray:
+    """(T, 7) true poses, starting at the origin; all lie in the plane z = 0 unless spatial."""
+    phase = 2 * np.pi * world.laps * np.arange(world.steps) / (world.steps - 1)
+    wave = np.sin(3 * phase) if world.spatial else np.zeros_like(phase)
+    position = np.stack([world.radius_m * np.sin(phase), world.radius_m * (1 - np.cos(phase)), 0.5 * wave], axis=-1)
+    return SE3.from_ypr(position, phase, 0.1 * wave, 0.2 * wave)
+
+
+def _landmarks(world: RobotWorld, rng: np.random.Generator) -> np.ndarray:
+    """(M, 3) uniform in a box around the circle's centre, flat unless spatial."""
+    size = np.array([world.extent_m, world.extent_m, 2.0 if world.spatial else 0.0])
+    centre = np.array([0.0, world.radius_m, 0.0])
+    return centre + rng.uniform(-1, 1, (world.landmarks, 3)) * size
+
+
+def _write_truth(folder: Path, truth: np.ndarray, points: np.ndarray) -> None:
+    yaw, pitch, roll = SE3.ypr(truth)
+    rows = np.column_stack([SE3.translation(truth), yaw, pitch, roll]).tolist()
+    header = ["step", "x_m", "y_m", "z_m", "yaw_rad", "pitch_rad", "roll_rad"]
+    write_csv(folder / "robot_path_groundtruth.csv", header, ([t, *row] for t, row in enumerate(rows)))
+    header = ["id", "x_m", "y_m", "z_m"]
+    write_csv(folder / "landmarks_groundtruth.csv", header, ([i, *p] for i, p in enumerate(points.tolist(), 1)))
+
+
+def _write_odometry(world: RobotWorld, folder: Path, truth: np.ndarray, rng: np.random.Generator) -> None:
+    """Noise is added to the increment's coordinates, as the log's covariance says."""
+    delta = SE3.between(truth[:-1], truth[1:])
+    yaw, pitch, roll = SE3.ypr(delta)
+    turn = np.deg2rad(world.std_rotation_deg)
+    if world.spatial:
+        std = np.array([world.std_translation_m] * 3 + [turn] * 3)
+        exact = np.column_stack([SE3.translation(delta), yaw, pitch, roll])
+        header = ["step", "dx_m", "dy_m", "dz_m", "yaw_rad", "pitch_rad", "roll_rad"]
+        header += [f"cov{a}{b}" for a in range(6) for b in range(a, 6)]
+    else:
+        std = np.array([world.std_translation_m] * 2 + [turn])
+        exact = np.column_stack([SE3.translation(delta)[:, :2], yaw])
+        header = ["step", "dx_m", "dy_m", "dphi_rad", "cxx", "cxy", "cxp", "cyy", "cyp", "cpp"]
+    noisy = exact + std * rng.standard_normal(exact.shape)
+    cov = np.diag(std**2)[np.triu_indices(std.size)].tolist()
+    rows = ([t, *row, *cov] for t, row in enumerate(noisy.tolist(), 1))
+    write_csv(folder / "odometry.csv", header, rows)
+
+
+def _write_observations(
+    world: RobotWorld, folder: Path, truth: np.ndarray, points: np.ndarray, rng: np.random.Generator
+) -> None:
+    turn = np.deg2rad(world.std_angle_deg)
+    std = np.array([world.std_range_m, turn, turn if world.spatial else 0.0])
+    view = np.deg2rad(world.half_field_of_view_deg)
+    rows = []
+    for t, pose in enumerate(truth):
+        x, y, h = SE3.inverse_transform(pose, points).T
+        z = np.stack([np.sqrt(x * x + y * y + h * h), np.arctan2(y, x), np.arctan2(h, np.hypot(x, y))], axis=-1)
+        seen = (z[:, 0] <= world.max_range_m) & (np.abs(z[:, 1]) <= view) & (np.abs(z[:, 2]) <= view) & (z[:, 0] > 0.2)
+        noisy = z[seen] + std * rng.standard_normal((int(seen.sum()), 3))
+        rows.extend([t, i + 1, *row, *std] for i, row in zip(np.flatnonzero(seen).tolist(), noisy.tolist(), strict=True))
+    header = ["step", "landmark_id", "range_m", "yaw_rad", "pitch_rad", "std_range_m", "std_yaw_rad", "std_pitch_rad"]
+    write_csv(folder / "observations.csv", header, rows)
+
