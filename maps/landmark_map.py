@@ -156,12 +156,24 @@ class LandmarkMap(Conditional):
     def arrays(self) -> dict[str, np.ndarray]:
         """Columns and kinds; the catalogue's facts must be numbers or text to be saved."""
         ids = self.ids
-        facts = [(i, self.catalogue[i]) for i in ids.tolist() if i in self.catalogue]
+        fact_ids = [i for i in ids.tolist() if i in self.catalogue]
+        facts = [self.catalogue[i] for i in fact_ids]
+        plain = all(isinstance(fact, str | int | float | np.generic) for fact in facts)
+        if not plain or len({type(fact) for fact in facts}) > 1:
+            raise InputError("facts in the catalogue can be saved if all are numbers or all are text")
         return self.store.arrays() | {
             "map/kinds": self.kinds[ids],
-            "map/fact_ids": np.array([i for i, _ in facts], dtype=np.int64),
-            "map/facts": np.array([fact for _, fact in facts]),
+            "map/fact_ids": np.array(fact_ids, dtype=np.int64),
+            "map/facts": np.array(facts),
         }
+
+    def options(self) -> dict[str, Any]:
+        """Whether there are log-odds, and the parametrisations in the order of their numbers."""
+        kinds = {
+            f"landmark kind {number}": f"{type(kind).__name__} {kind.dim, kind.constants, kind.components}"
+            for number, kind in enumerate(layout.landmark for layout in self.layouts)
+        }
+        return {"evidence": self.evidence, **kinds}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """The inverse of `arrays`; the parametrisations must have been registered in the same order."""

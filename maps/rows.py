@@ -6,7 +6,7 @@ import numpy as np
 
 from rbpf import gaussian, reference
 from rbpf.kernels.refine import refine
-from rbpf.kernels.threads import threads_for
+from rbpf.kernels.threads import run_driver
 from rbpf.kernels.update import update
 from rbpf.lie import LieGroup
 from rbpf.likelihoods import Gaussian
@@ -90,27 +90,28 @@ class RowEngine:
         access = self.store.access(batch.ids)
         likelihood = group.likelihood or GAUSSIAN
         mask = _NO_MASK if batch.mask is None else np.ascontiguousarray(batch.mask.T)
-        with threads_for(state.shape[0] * batch.ks.size):
-            refine(
-                kernel.function,
-                kernel.params,
-                np.ascontiguousarray(state),
-                access.pool,
-                access.slabs,
-                access.which,
-                access.maps,
-                group.z[batch.ks],
-                group.cov[batch.ks],
-                mask,
-                likelihood.form,
-                likelihood.params,
-                np.ascontiguousarray(prior.factor),
-                self._sizes(int(batch.ids[0])),
-                total.info,
-                total.vector,
-                total.quad,
-                total.log_det,
-            )
+        run_driver(
+            refine,
+            state.shape[0] * batch.ks.size,
+            kernel.function,
+            kernel.params,
+            np.ascontiguousarray(state),
+            access.pool,
+            access.slabs,
+            access.which,
+            access.maps,
+            group.z[batch.ks],
+            group.cov[batch.ks],
+            mask,
+            likelihood.form,
+            likelihood.params,
+            np.ascontiguousarray(prior.factor),
+            self._sizes(int(batch.ids[0])),
+            total.info,
+            total.vector,
+            total.quad,
+            total.log_det,
+        )
         total.rows += batch.ks.size * group.model.dim
 
     def _correct_compiled(
@@ -123,24 +124,25 @@ class RowEngine:
     ) -> None:
         access, targets = self.store.rewrite(batch.ids)
         likelihood = group.likelihood or GAUSSIAN
-        with threads_for(state.shape[0] * batch.ks.size):
-            update(
-                kernel.function,
-                kernel.params,
-                np.ascontiguousarray(state),
-                access.pool,
-                access.slabs,
-                access.which,
-                access.maps,
-                targets,
-                group.z[batch.ks],
-                group.cov[batch.ks],
-                _NO_MASK if batch.mask is None else np.ascontiguousarray(batch.mask.T),
-                likelihood.form,
-                likelihood.params,
-                self._sizes(int(batch.ids[0])),
-                log_density,
-            )
+        run_driver(
+            update,
+            state.shape[0] * batch.ks.size,
+            kernel.function,
+            kernel.params,
+            np.ascontiguousarray(state),
+            access.pool,
+            access.slabs,
+            access.which,
+            access.maps,
+            targets,
+            group.z[batch.ks],
+            group.cov[batch.ks],
+            _NO_MASK if batch.mask is None else np.ascontiguousarray(batch.mask.T),
+            likelihood.form,
+            likelihood.params,
+            self._sizes(int(batch.ids[0])),
+            log_density,
+        )
 
     def _read(self, ids: np.ndarray) -> tuple[np.ndarray, Records]:
         columns = np.array([self.store.read(int(i)) for i in ids])

@@ -130,14 +130,17 @@ class SharedStore:
         return slab.copy() if generation == self.lineage.generation else slab[:, rows]
 
     def access(self, columns: np.ndarray) -> Access:
-        """Lets a kernel read columns (K,) of one record size; cold ones are warmed up first."""
+        """Lets a kernel read columns (K,), at least one, of one record size; cold ones are warmed up first."""
         for column in columns[self._slab[columns] < 0]:
             if int(column) in self._cold:
                 self.replace(int(column), self.read(int(column)))
-        generations, which = np.unique(self._generation[columns], return_inverse=True)
-        maps = np.array([self.lineage.rows(int(g)) for g in generations]).reshape(-1, self.n)
-        pool = self._pool(int(columns[0])).data if columns.size else np.zeros((0, 0, self.n))
-        return Access(pool, self._slab[columns], which.astype(np.int64), maps)
+        generations = self._generation[columns]
+        if (generations == generations[0]).all():
+            maps, which = self.lineage.rows(int(generations[0]))[None], np.zeros(columns.size, dtype=np.int64)
+        else:
+            distinct, which = np.unique(generations, return_inverse=True)
+            maps = np.array([self.lineage.rows(int(g)) for g in distinct])
+        return Access(self._pool(int(columns[0])).data, self._slab[columns], which, maps)
 
     def rewrite(self, columns: np.ndarray) -> tuple[Access, np.ndarray]:
         """Lets a kernel overwrite columns (K,) in every particle: what to read, and the slabs to write.
@@ -156,6 +159,8 @@ class SharedStore:
         for column in stale:
             self._move(int(column), now)
         targets = self._slab[columns]
+        if np.unique(columns).size == columns.size:
+            return Access(pool.data, access.slabs, access.which, access.maps), targets
         _, first = np.unique(columns, return_index=True)
         again = np.ones(columns.size, dtype=bool)
         again[first] = False

@@ -54,7 +54,7 @@ def associate(nu: np.ndarray, cov: np.ndarray, present: np.ndarray, gates: Gates
     isolated = squared.min(axis=2, initial=np.inf) > gates.isolate
     alternative = np.where(isolated, max(gates.log_new, gates.log_clutter), gates.log_clutter)
     fallback = np.where(isolated & (gates.log_new >= gates.log_clutter), NEW, NULL)
-    return _assign(cost, -alternative, fallback)
+    return _assign(cost, np.minimum(-alternative, 0.1 * _FORBIDDEN), fallback)
 
 
 def _assign(cost: np.ndarray, alternative: np.ndarray, fallback: np.ndarray) -> np.ndarray:

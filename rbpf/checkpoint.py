@@ -55,7 +55,8 @@ def read_checkpoint(filter_: "Filter", path: Path) -> dict[str, np.ndarray]:
     arrays = load_arrays(path)
     try:
         header = json.loads(str(arrays.pop("header")))
-        version, digest, expected = header["version"], header["digest"], header["fingerprint"]
+        version, digest, rng = header["version"], header["digest"], header["rng"]
+        expected = dict(header["fingerprint"])
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path} is not a checkpoint of rbpf: its header is missing or unreadable") from error
     if version != VERSION:
@@ -67,9 +68,9 @@ def read_checkpoint(filter_: "Filter", path: Path) -> dict[str, np.ndarray]:
         if found.get(name) != value:
             raise InputError(
                 f"{path} belongs to a filter with {name} = {value}, this one has {found.get(name)}: "
-                "build the filter with the options of the saved run"
+                "build the filter with the options of the saved run, and register its landmarks"
             )
-    _restore(filter_, arrays, header["rng"])
+    _restore(filter_, arrays, rng)
     return {name.removeprefix("extra/"): array for name, array in arrays.items() if name.startswith("extra/")}
 
 
@@ -83,16 +84,26 @@ def fingerprint(filter_: "Filter") -> dict[str, Any]:
         "resampler": type(filter_.resampler).__name__,
         "conditional": [type(part).__name__ for part in filter_.marginals.parts.values()],
         "lag": filter_.history.lag,
+        "clouds": filter_.history.clouds,
+        **filter_.marginals.options(),
         "random generator": type(filter_.rng.bit_generator).__name__,
     }
 
 
 def save_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Writes an `.npz` under a temporary name, then renames it."""
+    """Writes an `.npz` under a temporary name, then renames it.
+
+    Raises:
+        InputError: the place cannot be written to, or an array holds Python objects.
+    """
     temporary = path.with_name(path.name + ".partial")
-    with open(temporary, "wb") as file:
-        np.savez(file, **arrays)  # type: ignore[arg-type]
-    os.replace(temporary, path)
+    try:
+        with open(temporary, "wb") as file:
+            np.savez(file, allow_pickle=False, **arrays)  # type: ignore[arg-type]
+        os.replace(temporary, path)
+    except (OSError, ValueError) as error:
+        temporary.unlink(missing_ok=True)
+        raise InputError(f"{path} cannot be written: {error}") from error
 
 
 def load_arrays(path: Path) -> dict[str, np.ndarray]:
@@ -102,7 +113,7 @@ def load_arrays(path: Path) -> dict[str, np.ndarray]:
         InputError: the file is missing, cut off or not an archive of plain arrays.
     """
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
     except FileNotFoundError as error:
         raise InputError(f"{path} does not exist") from error

@@ -1,7 +1,7 @@
 """Parts side by side: observations of the state alone, and the union of what is marginalised."""
 
 from collections.abc import Sequence
-from typing import final
+from typing import Any, final
 
 import numpy as np
 
@@ -114,6 +114,10 @@ class Marginals(Conditional):
         """Of all parts."""
         for part in self.parts.values():
             part.restore(arrays)
+
+    def options(self) -> dict[str, Any]:
+        """Of all parts."""
+        return {name: value for part in self.parts.values() for name, value in part.options().items()}
 
     def _routed(self, groups: Sequence[Observations]) -> dict[Part, list[Observations]]:
         routed: dict[Part, list[Observations]] = {supplies: [] for supplies in self.parts}

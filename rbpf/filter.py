@@ -7,6 +7,7 @@ The bootstrap filter, FastSLAM 2.0 and the exact importance ratio differ in the 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from rbpf.errors import InputError
 from rbpf.estimate import Estimate, mixture_estimate
 from rbpf.genealogy import History, Lineage
 from rbpf.models import (
+    Births,
     Conditional,
     LineariseAt,
     MotionModel,
@@ -33,31 +35,39 @@ from rbpf.proposals import EkfProposal, Prior, Proposed, Terms
 from rbpf.resampling import EssTriggered, Systematic
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class StepReport:
     """What one step did.
 
     Attributes:
         stamp_ns: time of the step.
-        estimate: mean and covariance of the state.
+        mixture: what the estimate summarises: the refined mixture before sampling, with its log-weights; after a
+            proposal that did not look at the observations, the weighted samples.
         ess: effective sample size before resampling.
         resampled: whether the particles were resampled.
         log_evidence: log p(z_t | z_1:t−1); NaN where a likelihood is not a density.
         nis: weighted mean squared Mahalanobis distance of the joint innovation, NaN without a linearised one.
         rows: its degrees of freedom.
         groups: the observations that were used.
-        births: ids of the landmarks started.
+        first_sightings: what landmarks were started from.
+        births: their ids, in that order.
     """
 
     stamp_ns: int
-    estimate: Estimate
+    mixture: tuple[Prior, Proposed | None, np.ndarray]
     ess: float
     resampled: bool
     log_evidence: float
     nis: float
     rows: int
     groups: Sequence[Observations]
+    first_sightings: Sequence[Births]
     births: np.ndarray
+
+    @cached_property
+    def estimate(self) -> Estimate:
+        """Mean and covariance of the state."""
+        return mixture_estimate(*self.mixture)
 
 
 class Filter:
@@ -104,7 +114,9 @@ class Filter:
         origin = self.space.identity() if start is None else np.asarray(start, dtype=float)
         size = self.space.size
         if origin.shape not in ((size,), (n, size)) or not np.isfinite(origin).all():
-            raise InputError(f"start must be ({size},) or ({n}, {size}) finite numbers, got {origin.shape}: {origin}")
+            raise InputError(
+                f"start must be ({size},) or ({n}, {size}) finite numbers, got {origin.shape}: {origin}"
+            )
         state = np.array(np.broadcast_to(origin, (n, size)))
         self.particles = Particles(state, uniform_log_weights(n))
         self.lineage = Lineage(n)
@@ -137,7 +149,7 @@ class Filter:
         groups = self._observe(frame, Belief(self.particles.log_weights, prior, self.marginals))
         proposed = self.proposal.propose(prior, _LineariseGroups(self.marginals, prior, groups))
         log_weights, look_ahead = reweight(self.particles.log_weights, proposed.log_w1, f"step {self.steps}")
-        refined = mixture_estimate(prior, proposed, log_weights) if proposed.nis is not None else None
+        mixture: tuple[Prior, Proposed | None, np.ndarray] = (prior, proposed, log_weights)
 
         weights = np.exp(log_weights)
         ancestors = self.resampler.ancestors(weights, self.rng)
@@ -148,7 +160,9 @@ class Filter:
         state, log_w2 = self._sample_and_update(prior, proposed, groups, ancestors)
         log_weights, correction = reweight(log_weights, log_w2, f"step {self.steps}")
         self.particles = Particles(state, log_weights)
-        births = self._start_landmarks(frame, groups)
+        if proposed.nis is None:
+            mixture = (Prior.exactly(self.space, state), None, log_weights)
+        first_sightings, births = self._start_landmarks(frame, groups)
 
         normalised = all(group.likelihood is None or group.likelihood.normalised for group in groups)
         evidence = look_ahead + correction if normalised else float("nan")
@@ -158,23 +172,28 @@ class Filter:
         self.history.record(stamp_ns, state, log_weights)
         return StepReport(
             stamp_ns=stamp_ns,
-            estimate=refined or mixture_estimate(Prior.exactly(self.space, state), None, log_weights),
+            mixture=mixture,
             ess=effective_sample_size(weights),
             resampled=ancestors is not None,
             log_evidence=evidence,
             nis=float("nan") if proposed.nis is None else float((weights * proposed.nis).sum()),
             rows=proposed.rows,
             groups=groups,
+            first_sightings=first_sightings,
             births=births,
         )
 
     def estimate(self) -> Estimate:
         """Mean and covariance of the particles as they are."""
-        return mixture_estimate(Prior.exactly(self.space, self.particles.state), None, self.particles.log_weights)
+        return mixture_estimate(
+            Prior.exactly(self.space, self.particles.state), None, self.particles.log_weights
+        )
 
     def belief(self) -> Belief:
         """The particles as they are, for reading the map."""
-        return Belief(self.particles.log_weights, Prior.exactly(self.space, self.particles.state), self.marginals)
+        return Belief(
+            self.particles.log_weights, Prior.exactly(self.space, self.particles.state), self.marginals
+        )
 
     def save(self, path: Path | str, extra: dict[str, np.ndarray] | None = None) -> None:
         """Writes a checkpoint from which `load` goes on as if nothing had happened, with arrays of the caller's."""
@@ -196,12 +215,18 @@ class Filter:
         if stamp_ns is None:
             stamp_ns = 0 if previous is None else previous + 1_000_000_000
         if previous is not None and stamp_ns < previous:
-            raise InputError(f"time runs backwards: step {self.steps} has stamp {stamp_ns} ns after {previous} ns")
+            raise InputError(
+                f"time runs backwards: step {self.steps} has stamp {stamp_ns} ns after {previous} ns"
+            )
         return int(stamp_ns), 0.0 if previous is None else (stamp_ns - previous) * 1e-9
 
     def _predict(self, control: Any, dt: float) -> Prior:
         transition = self.motion.transition(self.particles.state, control, dt)
-        mean, factor, name = transition.mean, transition.noise_factor, f"{type(self.motion).__name__}.transition"
+        mean, factor, name = (
+            transition.mean,
+            transition.noise_factor,
+            f"{type(self.motion).__name__}.transition",
+        )
         rows = self.space.dim + (0 if transition.coupling is None else transition.coupling.shape[-1])
         fits = factor.ndim == 3 and factor.shape[0] in (1, self.n) and factor.shape[1] == rows
         if mean.shape != self.particles.state.shape or not fits:
@@ -227,7 +252,9 @@ class Filter:
         self.lineage.advance(ancestors)
         self.marginals.resample(ancestors)
         groups = [
-            replace(group, ids=group.ids[ancestors]) if group.ids is not None and group.ids.ndim == 2 else group
+            replace(group, ids=group.ids[ancestors])
+            if group.ids is not None and group.ids.ndim == 2
+            else group
             for group in groups
         ]
         return prior.take(ancestors), groups
@@ -243,16 +270,19 @@ class Filter:
         densities = self.marginals.correct(state, increment, groups)
         if not self.proposal.exact:
             return state, densities.late
-        return state, densities.all + log_ratio - proposed.log_w1[parents]
+        log_w1 = proposed.log_w1[parents]
+        # A parent of weight zero that was not resampled keeps it, whatever its second factor is.
+        return state, densities.all + log_ratio - np.where(np.isneginf(log_w1), 0.0, log_w1)
 
-    def _start_landmarks(self, frame: Any, groups: list[Observations]) -> np.ndarray:
+    def _start_landmarks(self, frame: Any, groups: list[Observations]) -> tuple[list[Births], np.ndarray]:
         belief = self.belief()
-        ids, first = [np.zeros(0, dtype=np.int64)], 0
+        born, ids, first = list[Births](), [np.zeros(0, dtype=np.int64)], 0
         for sensor, end in zip(self.sensors, self._ends, strict=True):
             for births in sensor.births(frame, belief, groups[first:end]):
                 ids.append(belief.map.add(births, self.particles.state))
+                born.append(births)
             first = end
-        return np.concatenate(ids)
+        return born, np.concatenate(ids)
 
 
 class _LineariseGroups(LineariseAt):

@@ -308,6 +308,10 @@ class Conditional(ABC):
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """The inverse of `arrays`, after `begin`."""
 
+    def options(self) -> dict[str, Any]:
+        """What must agree between who saves a checkpoint and who loads it; plain values by name."""
+        return {}
+
 
 class LogDensities(NamedTuple):
     """log p(z | x) (N,) of all observations, and of those that took no part in the refinement."""

@@ -70,11 +70,13 @@ def linearise(
 
 def _full(model: ObservationModel, block: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray | None:
     """A Jacobian with all its leading axes; a constant one may come without them."""
+    if block is None:
+        return None
     try:
-        return None if block is None else np.broadcast_to(block, shape)
+        return np.broadcast_to(block, shape)
     except ValueError as error:
         name = f"{type(model).__name__}.jacobians"
-        raise InputError(f"{name} returned a block of shape {block.shape}, expected {shape}") from error  # type: ignore[union-attr]
+        raise InputError(f"{name} returned a block of shape {block.shape}, expected {shape}") from error
 
 
 def invert_with_covariance(model: ObservationModel, state: np.ndarray, z: np.ndarray, cov: np.ndarray) -> Records:

@@ -48,7 +48,9 @@ class Prior:
             InputError: the motion model has one.
         """
         if transition.coupling is not None and transition.coupling.shape[-1]:
-            raise InputError("the motion model drives a substate: give the filter a KalmanSubstate to hold it")
+            raise InputError(
+                "the motion model drives a substate: give the filter a KalmanSubstate to hold it"
+            )
         return cls(space, transition.mean, np.zeros((1, space.dim)), transition.noise_factor)
 
     @classmethod
@@ -182,13 +184,14 @@ class EkfProposal(Proposal):
 def refined(prior: Prior, terms: "Terms") -> Proposed:
     """The refined Gaussian and the joint marginal weight of each particle."""
     from rbpf.kernels.posterior import posterior
-    from rbpf.kernels.threads import threads_for
+    from rbpf.kernels.threads import run_driver
 
     n, rank = prior.base.shape[0], prior.factor.shape[2]
     mean, root = np.empty((n, rank)), np.empty((n, rank, rank))
     log_w1, nis = np.empty(n), np.empty(n)
     factor = np.ascontiguousarray(prior.factor)
-    with threads_for(n):
-        posterior(terms.info, terms.vector, terms.quad, terms.log_det, factor, mean, root, log_w1, nis)
+    run_driver(
+        posterior, n, terms.info, terms.vector, terms.quad, terms.log_det, factor, mean, root, log_w1, nis
+    )
     log_w1 += terms.log_factor
     return Proposed(mean, root, log_w1, nis, terms.rows)

@@ -1,7 +1,7 @@
 """A Kalman-filtered substate: the second thing that can be marginalised, beside or without a landmark map."""
 
 from collections.abc import Sequence
-from typing import final
+from typing import Any, final
 
 import numpy as np
 
@@ -109,6 +109,10 @@ class KalmanSubstate(Conditional):
     def arrays(self) -> dict[str, np.ndarray]:
         """Means and covariances."""
         return {"substate/mean": self.mean, "substate/cov": self.cov}
+
+    def options(self) -> dict[str, Any]:
+        """Its size."""
+        return {"substate size": int(self._mean.size)}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """The inverse of `arrays`."""

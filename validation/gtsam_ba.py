@@ -1,7 +1,8 @@
 """Batch solution of a run's measurements by GTSAM: the trajectory and map that explain all of them best.
 
 The same measurements, the same models and the same noise as the filter had, without its samples and without
-its order in time: what the filter approximates. F. Dellaert and M. Kaess, "Factor graphs for robot perception" (2017).
+its order in time: what the filter approximates.
+F. Dellaert and M. Kaess, "Factor graphs for robot perception" (2017).
 """
 
 from dataclasses import dataclass
@@ -14,14 +15,16 @@ from rbpf.validation.measurements import InitialEstimate, Measurements, initial_
 @final
 @dataclass(frozen=True, eq=False)
 class BatchSolution:
-    """Maximum a posteriori estimate, and its covariance from the Gauss-Newton approximation of the Hessian there.
+    """Most probable trajectory and map, with covariances from the Gauss-Newton Hessian there.
 
     Attributes:
         world_from_robot: (T, E) poses.
         landmarks: name of each landmark to its (D,) position.
-        cov_poses: (T, d, d) marginal covariances in the right chart, order [omega, v]; None where not asked for.
-        cov_landmarks: name of each landmark to its (D, D) marginal covariance; empty where not asked for.
-        error: half the sum of squared whitened residuals, or of their robust loss.
+        cov_poses: (T, d, d) marginal covariances in the right chart, order [omega, v]; None if not asked for.
+        cov_landmarks: name of each landmark to its (D, D) marginal covariance; empty if not asked for.
+        error: half the sum of squared whitened residuals, or the sum of their robust losses. Where the noise
+            is right it is about half the number of measured scalars less half that of the landmarks'
+            coordinates; far more tells of a wrong optimum, noise or association.
         iterations: of the optimiser.
     """
 
@@ -51,8 +54,8 @@ def solve(
         incremental: start from ISAM2 instead, for recordings whose dead reckoning is far off.
 
     Raises:
-        InputError: a sighting has no noise, the measurements do not determine a variable, or the optimiser does
-            not converge.
+        InputError: a sighting has no noise, the measurements do not determine a variable, or the optimiser
+            does not converge.
     """
     from rbpf.validation import gtsam_ba_optimise as optimiser
     from rbpf.validation.gtsam_ba_graph import Problem
@@ -60,7 +63,10 @@ def solve(
     problem = Problem(m, robust)
     graph = problem.graph()
     try:
-        start = optimiser.incremental(problem) if incremental else problem.values(initial or initial_estimate(m))
+        if incremental:
+            start = optimiser.incremental(problem)
+        else:
+            start = problem.values(initial or initial_estimate(m))
         values, iterations = optimiser.optimise(problem, graph, start)
         cov_poses, cov_landmarks = optimiser.covariances(problem, graph, values) if marginals else (None, {})
     except RuntimeError as error:

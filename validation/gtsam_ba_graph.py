@@ -6,15 +6,10 @@
 
 A singular Q_t (a robot that cannot slip sideways) is kept exactly: the residual is turned into Q_t's
 eigenvectors, and those without variance become hard constraints. A solver that starts far away would have to
-follow these constraints along a curve, therefore `whole(soft=True)` first gives them a tenth of the largest
+follow these constraints along a curve, therefore `graph(soft=True)` first gives them a tenth of the largest
 standard deviation of the same step.
-
-GTSAM's charts, checked in the tests: Pose2 has the tangent [v, ω], Pose3 [ω, v]; both retract by the exponential map
-on the right, so that only the order differs from ours.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, final
 
 import gtsam
@@ -23,6 +18,7 @@ from numpy.typing import NDArray
 
 from rbpf.errors import InputError
 from rbpf.lie import Array, SE2Group
+from rbpf.validation.gtsam_ba_chart import PLANAR, SPATIAL
 from rbpf.validation.measurements import InitialEstimate, Measurements
 
 SINGULAR = 1e-12
@@ -30,55 +26,7 @@ SINGULAR = 1e-12
 SOFT = 0.1
 """Standard deviation of a softened constraint as a fraction of the step's largest."""
 
-
-@final
-@dataclass(frozen=True)
-class Chart:
-    """How GTSAM holds the poses of a group.
-
-    Attributes:
-        order: (d,) GTSAM's tangent is ours[order].
-        pose: our storage (E,) to GTSAM's object.
-        storage: values and key to our storage (E,).
-        point: values and key to a landmark (D,).
-        between: class of the native odometry factor.
-        prior: class of the factor that holds the start.
-    """
-
-    order: NDArray[np.intp]
-    pose: Callable[[Array], Any]
-    storage: Callable[[Any, int], Array]
-    point: Callable[[Any, int], Array]
-    between: type
-    prior: type
-
-    def covariance(self, cov: Array) -> Array:
-        """Ours of GTSAM's (d, d)."""
-        out = np.empty_like(cov)
-        out[np.ix_(self.order, self.order)] = cov
-        return out
-
-
-def _pose2(x: Array) -> Any:
-    return gtsam.Pose2(x[1], x[2], x[0])
-
-
-def _storage2(values: Any, key: int) -> Array:
-    pose = values.atPose2(key)
-    return np.array([pose.theta(), pose.x(), pose.y()])
-
-
-def _pose3(x: Array) -> Any:
-    return gtsam.Pose3(gtsam.Rot3.Quaternion(x[3], x[0], x[1], x[2]), x[4:])
-
-
-def _storage3(values: Any, key: int) -> Array:
-    pose = values.atPose3(key)
-    return np.concatenate([pose.rotation().toQuaternion().coeffs(), pose.translation()])
-
-
-PLANAR = Chart(np.array([1, 2, 0]), _pose2, _storage2, gtsam.Values.atPoint2, gtsam.BetweenFactorPose2, gtsam.PriorFactorPose2)
-SPATIAL = Chart(np.arange(6), _pose3, _storage3, gtsam.Values.atPoint3, gtsam.BetweenFactorPose3, gtsam.PriorFactorPose3)
+_PENALTY = 1000.0  # GTSAM's default; it counts in errors far from the optimum, where constraints are violated
 
 
 @final
@@ -193,7 +141,7 @@ class Problem:
                 jacobians[1] = (axes.T @ space.right_jacobian_inverse(e))[:, chart.order]
             return axes.T @ e
 
-        noise = gtsam.noiseModel.Constrained.MixedSigmas(np.sqrt(variances))
+        noise = gtsam.noiseModel.Constrained.MixedSigmas(_PENALTY, np.sqrt(variances))
         return gtsam.CustomFactor(noise, list(keys), error)
 
     def _sighting(self, row: int) -> Any:
@@ -210,7 +158,8 @@ class Problem:
 
         noise = gtsam.noiseModel.Gaussian.Covariance(self.m.cov_z[row])
         if self.robust is not None:
-            noise = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(self.robust), noise)
+            huber = gtsam.noiseModel.mEstimator.Huber.Create(self.robust)
+            noise = gtsam.noiseModel.Robust.Create(huber, noise)
         return gtsam.CustomFactor(noise, [pose_key, landmark_key], error)
 
     def _require_noise(self) -> None:
@@ -221,4 +170,6 @@ class Problem:
         if singular.any():
             row = int(np.argmax(singular))
             place = f"landmark {self.m.landmarks[row]} at step {self.m.steps[row]}"
-            raise InputError(f"The sighting of {place} has a singular covariance; a batch solution needs noise in it.")
+            raise InputError(
+                f"The sighting of {place} has a singular covariance, expected noise in all of it."
+            )

@@ -1,4 +1,4 @@
-"""Optimisation of a `Problem` in GTSAM, from afar and to the last digit, and the covariances at the optimum."""
+"""Optimisation of a `Problem` in GTSAM, from afar and then to the last digit; covariances at the optimum."""
 
 import re
 from typing import Any
@@ -16,12 +16,16 @@ CHUNK = 50
 _ROUGH = 1e-6
 _EXACT = 1e-11
 _ITERATIONS = 100
-_SOLVER = "MULTIFRONTAL_QR"  # Cholesky refuses variables whose accuracies differ by more than 4096
+_DAMPING = 1e-5
+_MAX_DAMPING = 1e8
 _SYMBOL = re.compile(r"\(Symbol: ([xl])(\d+)\)")
 
 
 def optimise(problem: Problem, graph: Any, values: Any) -> tuple[Any, int]:
-    """Levenberg-Marquardt with soft constraints, then Gauss-Newton with the hard ones until the error stands still.
+    """Levenberg-Marquardt with soft constraints, then Gauss-Newton with hard ones until the error stands.
+
+    The loops are here because GTSAM's own optimisers copy all values at every call of a factor written in
+    Python, a hundred times the cost; linearisation, elimination and retraction are GTSAM's.
 
     Args:
         problem: what is solved.
@@ -35,25 +39,20 @@ def optimise(problem: Problem, graph: Any, values: Any) -> tuple[Any, int]:
         InputError: it did not converge.
     """
     soft = problem.graph(soft=True) if problem.singular else graph
-    params = gtsam.LevenbergMarquardtParams()
-    params.setLinearSolverType(_SOLVER)
-    params.setRelativeErrorTol(_ROUGH)
-    params.setAbsoluteErrorTol(0.0)
-    params.setMaxIterations(_ITERATIONS)
-    near = gtsam.LevenbergMarquardtOptimizer(soft, values, params)
-    start = near.optimize()
-    exact, count = _gauss_newton(graph, start)
-    return exact, near.iterations() + count
+    near, rough = _levenberg_marquardt(soft, values)
+    optimum, exact = _gauss_newton(graph, near)
+    return optimum, rough + exact
 
 
 def incremental(problem: Problem) -> Any:
     """Values from ISAM2, `CHUNK` steps at a time, so that every loop is closed from near by.
 
-    A new pose starts by odometry from the last estimate of the one before, a new landmark by its first sighting.
+    A new pose starts by odometry from the estimate of the one before, a new landmark by its first sighting.
     """
     params = gtsam.ISAM2Params()
     params.setFactorization("QR")
     isam, m = gtsam.ISAM2(params), problem.m
+    held = isam.getLinearizationPoint()  # while Python knows this object, no call of a factor copies it
     pose, seen = m.start, set[int]()
     for first in range(0, len(m.stamps_ns), CHUNK):
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -68,6 +67,7 @@ def incremental(problem: Problem) -> Any:
                     values.insert(problem.landmark_key(landmark), problem.model.invert(pose, m.z[row]))
         isam.update(graph, values)
         pose = problem.chart.storage(isam.calculateEstimate(), problem.pose_key(step))
+    del held
     return isam.calculateEstimate()
 
 
@@ -103,19 +103,45 @@ def explain(problem: Problem, error: RuntimeError) -> InputError:
     )
 
 
-def _gauss_newton(graph: Any, values: Any) -> tuple[Any, int]:
-    params = gtsam.GaussNewtonParams()
-    params.setLinearSolverType(_SOLVER)
-    solver = gtsam.GaussNewtonOptimizer(graph, values, params)
+def _levenberg_marquardt(graph: Any, values: Any) -> tuple[Any, int]:
+    error, damping = graph.error(values), _DAMPING
     for count in range(1, _ITERATIONS + 1):
-        before = solver.error()
-        solver.iterate()
-        if not np.isfinite(solver.error()):
+        linear = graph.linearize(values)
+        while not (moved_error := graph.error(moved := _damped_step(linear, values, damping))) <= error:
+            damping *= 10
+            if damping > _MAX_DAMPING:
+                return values, count
+        decrease, values, error = error - moved_error, moved, moved_error
+        if decrease <= _ROUGH * error:
             break
-        if abs(before - solver.error()) <= _EXACT * max(1.0, before):
-            # The optimiser owns what values() refers to.
-            return gtsam.Values(solver.values()), count
+        damping /= 10
+    return values, count
+
+
+def _damped_step(linear: Any, values: Any, damping: float) -> Any:
+    damped, zero = gtsam.GaussianFactorGraph(), values.zeroVectors()
+    damped.push_back(linear)
+    for key in values.keys():  # noqa: SIM118, no mapping
+        dim = len(zero.at(key))
+        unit = gtsam.noiseModel.Unit.Create(dim)
+        damped.push_back(gtsam.JacobianFactor(key, np.sqrt(damping) * np.eye(dim), np.zeros(dim), unit))
+    return _step(damped, values)
+
+
+def _gauss_newton(graph: Any, values: Any) -> tuple[Any, int]:
+    error = graph.error(values)
+    for count in range(1, _ITERATIONS + 1):
+        before, values = error, _step(graph.linearize(values), values)
+        error = graph.error(values)
+        if abs(before - error) <= _EXACT * max(1.0, before):
+            return values, count
     raise InputError(
-        f"The batch optimisation did not converge in {count} iterations (error {solver.error():.6g}); "
+        f"The batch optimisation did not converge in {_ITERATIONS} iterations (error {error:.6g}); "
         "start it incrementally, or from the filter's estimate."
     )
+
+
+def _step(linear: Any, values: Any) -> Any:
+    # By QR: GTSAM's Cholesky refuses neighbours whose standard deviations differ by a factor above 4096.
+    ordering = gtsam.Ordering.ColamdGaussianFactorGraph(linear)
+    return values.retract(linear.optimize(ordering, gtsam.EliminateQR))

@@ -1,11 +1,15 @@
 """The map of a finished filter as one Gaussian per landmark, within + between particles."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from rbpf import gaussian
+from rbpf.anchoring import Anchored
 from rbpf.filter import Filter
+from rbpf.models import Records
+from rbpf.sensors.range_bearing import RelativePosition
 from rbpf.validation.matching import match_points
 
 
@@ -30,8 +34,13 @@ class MapSummary:
         return match_points(self.mean, truth)
 
 
-def summarise_map(filter_: Filter) -> MapSummary:
-    """Mixture moments of every landmark that exists in most of the weight."""
+def summarise_map(filter_: Filter, anchored: Anchored | None = None) -> MapSummary:
+    """Mixture moments of every landmark that exists in most of the weight.
+
+    Args:
+        filter_: holds a map of point landmarks.
+        anchored: the start in each particle's world; the map is then told relative to it.
+    """
     belief = filter_.belief()
     landmark_map, weights = belief.map, belief.weights
     names, means, covs = [], [], []
@@ -43,10 +52,13 @@ def summarise_map(filter_: Filter) -> MapSummary:
         if share <= 0.5:
             continue
         records = landmark_map.read(np.array([landmark_id]))
+        points, within = records.mean[:, 0], records.cov[:, 0]
+        if anchored is not None:
+            points, within = _relative(filter_.space, anchored, records)
         own = weights * held / share
-        mean = (own[:, None] * records.mean[:, 0]).sum(axis=0)
-        spread = records.mean[:, 0] - mean
-        cov = (own[:, None, None] * (records.cov[:, 0] + spread[:, :, None] * spread[:, None, :])).sum(axis=0)
+        mean = (own[:, None] * points).sum(axis=0)
+        spread = points - mean
+        cov = (own[:, None, None] * (within + spread[:, :, None] * spread[:, None, :])).sum(axis=0)
         names.append(landmark_map.catalogue.get(int(landmark_id), int(landmark_id)))
         means.append(mean)
         covs.append(gaussian.symmetrise(cov))
@@ -54,3 +66,15 @@ def summarise_map(filter_: Filter) -> MapSummary:
     return MapSummary(
         np.array(names, dtype=np.int64), np.array(means).reshape(-1, dim), np.array(covs).reshape(-1, dim, dim)
     )
+
+
+def _relative(space: Any, anchored: Anchored, records: Records) -> tuple[np.ndarray, np.ndarray]:
+    """Landmark positions (N, D) relative to the start, and their covariance with the start's."""
+    model = RelativePosition(space)
+    start = anchored.mean[:, None]
+    jac = model.jacobians(start, records.mean)
+    assert jac.state is not None and jac.landmark is not None
+    moved = jac.state[:, 0] @ anchored.factor
+    turned = jac.landmark[:, 0]
+    cov = turned @ records.cov[:, 0] @ np.swapaxes(turned, -1, -2) + moved @ np.swapaxes(moved, -1, -2)
+    return model.predict(start, records.mean)[:, 0], cov

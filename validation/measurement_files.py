@@ -114,22 +114,22 @@ def _observations_text(m: Measurements) -> str:
         "start_stamp_ns": str(int(m.stamps_ns[0])),
     }
     integers = np.stack([m.steps, m.stamps_ns[m.steps], m.landmarks], axis=1)
-    return _text(OBSERVATIONS, header, _observation_columns(m.space), integers, m.z, m.cov_z)
+    numbers = np.concatenate([m.z, _lower(m.cov_z)], axis=1)
+    return _text(_TITLES[OBSERVATIONS], header, _observation_columns(m.space), integers, numbers)
 
 
 def _odometry_text(m: Measurements) -> str:
     header = {"recording": m.recording, "space": repr(m.space)}
     integers = np.stack([np.arange(1, len(m.stamps_ns)), m.stamps_ns[1:]], axis=1)
-    return _text(ODOMETRY, header, _odometry_columns(m.space), integers, m.deltas, m.covs)
+    numbers = np.concatenate([m.deltas, _lower(m.covs)], axis=1)
+    return _text(_TITLES[ODOMETRY], header, _odometry_columns(m.space), integers, numbers)
 
 
 def _text(
-    name: str, header: dict[str, str], columns: list[str], integers: NDArray[np.int64], values: Array, cov: Array
+    title: str, header: dict[str, str], columns: list[str], integers: NDArray[np.int64], numbers: Array
 ) -> str:
-    lines = [f"# {_TITLES[name]}", *(f"# {key}: {value}" for key, value in header.items())]
+    lines = [f"# {title}", *(f"# {key}: {value}" for key, value in header.items())]
     lines += [f"# rows: {len(integers)}", ",".join(columns)]
-    row, column = np.tril_indices(cov.shape[-1])
-    numbers = np.concatenate([values, cov[:, row, column]], axis=1)
     lines += [f"{_joined(i, ',')},{_joined(x, ',')}" for i, x in zip(integers, numbers, strict=True)]
     return "\n".join([*lines, ""])
 
@@ -187,6 +187,11 @@ def _read_pose(table: HeadedTable, key: str, space: SE2Group | SE3Group) -> Arra
     if not are_poses(space, pose[None])[0]:
         raise table.header_error(key, f"expected {key} to begin with a quaternion of length 1")
     return pose
+
+
+def _lower(cov: Array) -> Array:
+    row, column = np.tril_indices(cov.shape[-1])
+    return cov[:, row, column]
 
 
 def _symmetric(triangle: Array, dim: int) -> Array:

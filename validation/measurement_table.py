@@ -84,12 +84,13 @@ class HeadedTable:
         if count != len(self.rows):
             problem = f"expected {count} rows as the header says, found {len(self.rows)}; copy the file again"
             raise self.row_error(len(self.rows) - 1, problem)
-        fields = [self._split(row, names) for row in range(count)]
-        first = [[self._whole(self._line(i), *item) for item in zip(names, row[:whole], strict=False)]
-                 for i, row in enumerate(fields)]
-        rest = [[parse_number(self.path, self._line(i), *item) for item in zip(names[whole:], row[whole:], strict=True)]
-                for i, row in enumerate(fields)]
-        return np.array(first, dtype=np.int64).reshape(count, whole), np.array(rest).reshape(count, len(names) - whole)
+        integers = np.empty((count, whole), dtype=np.int64)
+        numbers = np.empty((count, len(names) - whole))
+        for row in range(count):
+            fields = list(zip(names, self._split(row, names), strict=True))
+            integers[row] = [self._whole(self._line(row), *field) for field in fields[:whole]]
+            numbers[row] = [parse_number(self.path, self._line(row), *field) for field in fields[whole:]]
+        return integers, numbers
 
     def require(self, valid: NDArray[np.bool_], expected: str) -> None:
         """Refuse the first row where `valid` (n,) is False."""
@@ -106,7 +107,8 @@ class HeadedTable:
 
     def _entry(self, key: str) -> tuple[int, str]:
         if key not in self.header:
-            raise line_error(self.path, self.columns_line, f"expected a line '# {key}: ...' above this one, found none")
+            problem = f"expected a line '# {key}: ...' above this one, found none"
+            raise line_error(self.path, self.columns_line, problem)
         return self.header[key]
 
     def _line(self, row: int) -> int:
@@ -115,7 +117,8 @@ class HeadedTable:
     def _split(self, row: int, names: Sequence[str]) -> list[str]:
         fields = self.rows[row].split(",")
         if len(fields) != len(names):
-            raise self.row_error(row, f"expected {len(names)} columns ({', '.join(names)}), found {len(fields)}")
+            problem = f"expected {len(names)} columns ({', '.join(names)}), found {len(fields)}"
+            raise self.row_error(row, problem)
         return fields
 
     def _whole(self, line: int, name: str, text: str) -> int:

@@ -34,7 +34,7 @@ class Measurements:
         start: (E,) world_from_robot of step 0, which is known.
         stamps_ns: (T,) time of each step, integer nanoseconds.
         deltas: (T - 1, E) odometry, previous_robot_from_robot of the steps from 1 on.
-        covs: (T - 1, d, d) their covariance in the right chart at the delta, order [omega, v]; may be singular.
+        covs: (T - 1, d, d) their covariance in the right chart there, order [omega, v]; may be singular.
         steps: (K,) the step of each sighting.
         landmarks: (K,) the map's name of the landmark seen.
         z: (K, p) what was measured.
@@ -64,8 +64,8 @@ class Measurements:
                 f"Expected a recording's name on one line without blanks around it, found {self.recording!r}."
             )
         if self.measurement not in KINDS or self.pitch_sign not in (-1.0, 1.0):
-            found = f"{self.measurement!r} and {self.pitch_sign!r}"
-            raise InputError(f"Expected a measurement {' or '.join(KINDS)} and a pitch sign 1 or -1, found {found}.")
+            expected = f"a measurement {' or '.join(KINDS)} and a pitch sign 1 or -1"
+            raise InputError(f"Expected {expected}, found {self.measurement!r} and {self.pitch_sign!r}.")
         self._require_shapes()
         if ((self.steps < 0) | (self.steps >= len(self.stamps_ns))).any():
             raise InputError(f"Expected the steps of sightings from 0 to {len(self.stamps_ns) - 1}.")
@@ -79,7 +79,10 @@ class Measurements:
         for name in ("covs", "cov_z"):
             valid = are_covariances(getattr(self, name))
             if not valid.all():
-                raise InputError(f"Expected covariances in {name}, row {int(np.argmin(valid))} (from 0) is none.")
+                row = int(np.argmin(valid))
+                raise InputError(
+                    f"Expected covariances in {name}, found another matrix in row {row} (from 0)."
+                )
 
     def _require_shapes(self) -> None:
         size, dim, point = self.space.size, self.space.dim, point_dim(self.space)
@@ -125,7 +128,7 @@ def from_log(log: RobotLog, start: Array | None = None) -> Measurements:
         InputError: the log is empty, of another group, or lacks odometry.
     """
     if not isinstance(log.space, SE2Group | SE3Group) or log.measurement not in KINDS or not log.frames:
-        raise InputError(f"{log.name}: expected frames of range_bearing or position measurements in SE2 or SE3.")
+        raise InputError(f"{log.name}: expected frames with sightings of {' or '.join(KINDS)} in SE2 or SE3.")
     space = log.space
     moves = [_odometry(log, step) for step in range(1, len(log.frames))]
     point = point_dim(space)
@@ -186,7 +189,7 @@ def are_poses(space: SE2Group | SE3Group, poses: Array) -> NDArray[np.bool_]:
 def _odometry(log: RobotLog, step: int) -> tuple[Array, Array]:
     frame = log.frames[step]
     if frame.delta is None or frame.cov_delta is None:
-        raise InputError(f"{log.name}: expected odometry in every frame after the first, frame {step} has none.")
+        raise InputError(f"{log.name}: frame {step} has no odometry, expected it in all after the first.")
     return frame.delta, frame.cov_delta
 
 

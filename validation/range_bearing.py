@@ -66,7 +66,7 @@ def finish_run(finished: Run, recording: Path, out: Path, batch: bool = True) ->
         stamps = np.array([frame.stamp_ns for frame in log.frames], dtype=np.int64)
         write_tum(out / "batch.tum", as_trajectory(log, stamps, path))
     entries = write_run(finished, out, recording, extra)
-    pictures = plot_run(finished, summarise_map(finished.filter), out, paths)
+    pictures = plot_run(finished, summarise_map(finished.filter, finished.anchored), out, paths)
     write_report(out, entries, pictures)
     return entries
 

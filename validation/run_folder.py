@@ -67,7 +67,7 @@ def write_run(run: Run, out: Path, recording: Path, extra: dict[str, Any] | None
     log, progress = run.log, run.progress
     stamps = np.array([frame.stamp_ns for frame in log.frames], dtype=np.int64)
     write_tum(out / "trajectory.tum", as_trajectory(log, stamps, progress.mean))
-    summary_map = summarise_map(run.filter)
+    summary_map = summarise_map(run.filter, run.anchored)
     write_map(out, summary_map)
     write_measurements(out, used_measurements(run))
     write_csv(out / "timings.csv", ["step", "milliseconds"], enumerate(np.round(progress.seconds * 1e3, 4)))

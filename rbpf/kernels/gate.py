@@ -14,8 +14,11 @@ from rbpf.kernels.signature import BLOCK
 
 
 @njit(cache=True, error_model="numpy")
-def accept_predicted(form, params, nu, jac_state, total, factor, start, count, weight, quad):
-    """Gates with the predictive covariance S + H Q Hᵀ; a rejected lane gets the outlier's density and weight 0."""
+def accept_predicted(form, params, nu, jac_state, total, factor, start, count, weight, penalty):
+    """Gates with the predictive covariance S + H Q Hᵀ; a rejected lane gets the outlier's density and weight 0.
+
+    Densities that are no part of a Mahalanobis distance go, times −2, into `penalty`.
+    """
     if form == 0:
         return
     p, dim, rank = nu.shape[0], jac_state.shape[1], factor.shape[2]
@@ -45,10 +48,10 @@ def accept_predicted(form, params, nu, jac_state, total, factor, start, count, w
             continue
         if is_inlier(form, params, squared[i], scale[i], p):
             if form == 2:
-                quad[i] -= 2.0 * params[0]
+                penalty[i] -= 2.0 * params[0]
         else:
             weight[i] = 0.0
-            quad[i] -= 2.0 * outlier_log_density(form, params)
+            penalty[i] -= 2.0 * outlier_log_density(form, params)
 
 
 @njit(cache=True, error_model="numpy")

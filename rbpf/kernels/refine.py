@@ -105,6 +105,7 @@ def refine(
         sum_vector = np.zeros((dim, BLOCK))
         sum_quad = np.zeros(BLOCK)
         sum_log = np.zeros(BLOCK)
+        penalty = np.zeros(BLOCK)
         used = np.zeros(BLOCK)
         pivots = 0
         for e in range(size):
@@ -118,7 +119,7 @@ def refine(
             if partial:
                 for i in range(count):
                     weight[i] = 1.0 if mask.shape[0] == 0 or mask[k, start + i] else 0.0
-                accept_predicted(form, form_params, nu, jac_state, total, factor, start, count, weight, sum_quad)
+                accept_predicted(form, form_params, nu, jac_state, total, factor, start, count, weight, penalty)
                 leave_out(weight, count, nu, jac_state, total)
             cholesky(total, count, scale)
             whiten_vector(total, count, nu)
@@ -136,6 +137,7 @@ def refine(
                 pivots = 0
         for i in range(count):
             quad[start + i] += sum_quad[i]
+            log_det[start + i] += penalty[i]
             if form != 1:
                 log_det[start + i] += sum_log[i] + used[i] * p * math.log(2.0 * math.pi)
             for a in range(dim):

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
-from numba import float64, int64, njit, types, void
+from numba import cfunc, float64, int64, types, void
 
 BLOCK = 32
 """Particles per block: wide enough to fill vector registers, small enough for the scratch to stay in the L1 cache."""
@@ -28,4 +28,4 @@ def observation_kernel(function: Callable[..., None]) -> Any:
     and `jac_landmark` (p, D, BLOCK), from `state` (E, BLOCK), `mean` (D, BLOCK), `const` (A, BLOCK) and the
     model's `params` (P,). Write the body as a loop over lanes; it must not raise.
     """
-    return njit(_SIGNATURE, cache=True, error_model="numpy")(function)
+    return cfunc(_SIGNATURE, cache=True, error_model="numpy")(function)

@@ -132,6 +132,7 @@ class RangeBearingConfig:
         compiled: run the fused kernels; false runs their NumPy twins.
         lag: steps of trajectory kept for smoothing, None keeps all.
         checkpoint_every: steps between checkpoints.
+        anchor_every: steps between re-estimations of where the known start lies in each particle's world; 0 never.
         noise: standard deviations that replace the log's own.
         proposal: where particles are sampled.
         resampling: when and how.
@@ -145,6 +146,7 @@ class RangeBearingConfig:
     compiled: bool = True
     lag: int | None = None
     checkpoint_every: int = 500
+    anchor_every: int = 10
     noise: LogNoise = field(default_factory=LogNoise)
     proposal: ProposalConfig = field(default_factory=ProposalConfig)
     resampling: ResamplingConfig = field(default_factory=ResamplingConfig)
@@ -157,3 +159,5 @@ class RangeBearingConfig:
             raise InputError(f"particles must be at least 1, got {self.particles}")
         if self.checkpoint_every < 1:
             raise InputError(f"checkpoint_every must be at least 1, got {self.checkpoint_every}")
+        if self.anchor_every < 0:
+            raise InputError(f"anchor_every must not be negative, got {self.anchor_every}")

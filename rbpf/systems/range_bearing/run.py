@@ -7,12 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
+from rbpf.anchoring import Anchored, StartAnchor
 from rbpf.errors import InputError
+from rbpf.estimate import Estimate
 from rbpf.filter import Filter, StepReport
 from rbpf.sensors.readers.log import RobotLog
 from rbpf.systems.range_bearing.associations import Associations, named_associations
 from rbpf.systems.range_bearing.config import RangeBearingConfig
-from rbpf.systems.range_bearing.system import build_filter, control_of
+from rbpf.systems.range_bearing.system import build_filter, build_model, build_point, control_of
 
 CHECKPOINT = "checkpoint.npz"
 
@@ -63,9 +65,9 @@ class Progress:
                 raise InputError("the checkpoint belongs to a run over another log: start without --resume")
             getattr(self, item.name)[...] = stored
 
-    def put(self, t: int, report: StepReport, seconds: float) -> None:
+    def put(self, t: int, report: StepReport, estimate: Estimate, seconds: float) -> None:
         """Row t."""
-        self.mean[t], self.cov[t] = report.estimate.mean, report.estimate.cov
+        self.mean[t], self.cov[t] = estimate.mean, estimate.cov
         self.ess[t], self.resampled[t], self.log_evidence[t] = report.ess, report.resampled, report.log_evidence
         self.nis[t], self.rows[t], self.seconds[t] = report.nis, report.rows, seconds
 
@@ -81,6 +83,7 @@ class Run:
         progress: one row per step.
         associations: per step, the landmark of each sighting, −1 where it was not used: the log's name where the
             association is known, else the map's id along the ancestors of the best particle.
+        anchored: the start in each particle's world, which the map is relative to; None where it is not re-estimated.
     """
 
     log: RobotLog
@@ -88,6 +91,7 @@ class Run:
     filter: Filter
     progress: Progress
     associations: list[np.ndarray]
+    anchored: Anchored | None
 
 
 def run(
@@ -113,21 +117,30 @@ def run(
     total = len(log.frames)
     progress = Progress.empty(total, log.space.size, log.space.dim)
     associations = Associations(filter_)
+    anchor = StartAnchor(filter_, config.anchor_every) if config.anchor_every else None
     checkpoint = None if out is None else out / CHECKPOINT
     if resume and checkpoint is not None and checkpoint.exists():
         extra = filter_.load(checkpoint)
         progress.restore(extra)
         associations.restore(extra)
+        if anchor is not None:
+            anchor.restore(extra, build_model(log, config), build_point(log))
     for t in range(filter_.steps, total):
         frame = log.frames[t]
         started = time.perf_counter()
-        report = filter_.step(frame, control_of(frame), frame.stamp_ns)
-        progress.put(t, report, time.perf_counter() - started)
+        control = control_of(frame)
+        report = filter_.step(frame, control, frame.stamp_ns)
+        estimate = report.estimate
+        if anchor is not None:
+            estimate = anchor.state_estimate(anchor.after_step(report, control))
+        progress.put(t, report, estimate, time.perf_counter() - started)
         associations.record(report, frame.z.shape[0])
         if checkpoint is not None and filter_.steps % config.checkpoint_every == 0:
-            filter_.save(checkpoint, progress.arrays() | associations.arrays())
+            kept = {} if anchor is None else anchor.arrays()
+            filter_.save(checkpoint, progress.arrays() | associations.arrays() | kept)
         if on_step is not None:
             on_step(t + 1, total)
-    if config.association == "known":
-        return Run(log, config, filter_, progress, named_associations(log))
-    return Run(log, config, filter_, progress, associations.of(filter_.belief().mode))
+    used = named_associations(log)
+    if config.association == "ml":
+        used = associations.of(filter_.belief().mode)
+    return Run(log, config, filter_, progress, used, None if anchor is None else anchor.estimate())

@@ -18,7 +18,7 @@ from rbpf.systems.range_bearing.config import RangeBearingConfig
 def build_filter(log: RobotLog, config: RangeBearingConfig) -> Filter:
     """The filter for a log; the robot starts at the origin of the world."""
     landmark_map = LandmarkMap(log.space, evidence=config.association == "ml", compiled=config.compiled)
-    landmark_map.register(_point(log))
+    landmark_map.register(build_point(log))
     return Filter(
         OdometryMotion(log.space),
         build_sensor(log, config),
@@ -42,7 +42,7 @@ def build_model(log: RobotLog, config: RangeBearingConfig) -> RigidPointModel:
 
 def build_sensor(log: RobotLog, config: RangeBearingConfig) -> Sensor:
     """The sensor, with the log's names or without."""
-    model, point, likelihood = build_model(log, config), _point(log), config.likelihood.build()
+    model, point, likelihood = build_model(log, config), build_point(log), config.likelihood.build()
     if config.association == "known":
         return NamedLandmarkSensor(model, point, likelihood)
     unknown = config.unknown
@@ -56,5 +56,6 @@ def control_of(frame: Frame) -> Odometry | None:
     return Odometry(frame.delta, frame.cov_delta)
 
 
-def _point(log: RobotLog) -> Point:
+def build_point(log: RobotLog) -> Point:
+    """The landmarks' parametrisation."""
     return Point(2 if isinstance(log.space, SE2Group) else 3)

@@ -1,0 +1,228 @@
+"""Files that are no checkpoints, not whole, or not of this filter: one sentence, and the filter as it was."""
+
+import json
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rbpf.errors import InputError
+from rbpf.filter import Filter
+from rbpf.lie import SE2, SE3
+from rbpf.maps.landmark_map import LandmarkMap
+from rbpf.maps.mixture import MixturePoint
+from rbpf.maps.point import Point
+from rbpf.motion.odometry import OdometryMotion
+from rbpf.proposals import PriorProposal
+from rbpf.resampling import Systematic
+from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
+from rbpf.sensors.range_bearing import RangeBearing
+from rbpf.substate import KalmanSubstate
+from tests.core.worlds import Recipe, content, drive, planar_world, same
+
+RECIPE = Recipe(n=4)
+STEPS = 6
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory) -> Path:
+    """A checkpoint after six steps."""
+    path = tmp_path_factory.mktemp("saved") / "run.npz"
+    filter_ = RECIPE.build()
+    drive(filter_, planar_world(STEPS, seed=4))
+    filter_.save(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def target() -> Filter:
+    """A filter that is one step on its way."""
+    filter_ = RECIPE.build()
+    drive(filter_, planar_world(1, seed=5))
+    return filter_
+
+
+def refused(filter_: Filter, path: Path, match: str) -> None:
+    """Loading fails with one sentence that names the file, and changes nothing."""
+    before, generator = content(filter_), filter_.rng.bit_generator.state
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a damaged array header can look like one of Python 2
+        with pytest.raises(InputError, match=match) as caught:
+            filter_.load(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert same(content(filter_), before)
+    np.testing.assert_equal(filter_.rng.bit_generator.state, generator)
+
+
+@given(share=st.floats(0.0, 1.0, exclude_max=True))
+def test_cut_off_anywhere(file, target, tmp_path_factory, share):
+    whole = file.read_bytes()
+    cut = tmp_path_factory.getbasetemp() / "cut.npz"
+    cut.write_bytes(whole[: int(share * len(whole))])
+    refused(target, cut, "is damaged or cut off|is not a checkpoint")
+
+
+@pytest.mark.parametrize("missing", range(1, 40))
+def test_the_last_bytes_are_missing(file, target, tmp_path, missing):
+    cut = tmp_path / "cut.npz"
+    cut.write_bytes(file.read_bytes()[:-missing])
+    refused(target, cut, "is damaged or cut off")
+
+
+@given(data=st.data())
+def test_flipped_bits(file, target, tmp_path_factory, data):
+    """A flip is refused, or hits what a ZIP archive does not read (dates, attributes) and changes nothing."""
+    whole = bytearray(file.read_bytes())
+    for _ in range(data.draw(st.integers(1, 3))):
+        whole[data.draw(st.integers(0, len(whole) - 1))] ^= 1 << data.draw(st.integers(0, 7))
+    flipped = tmp_path_factory.getbasetemp() / "flipped.npz"
+    flipped.write_bytes(whole)
+    try:
+        refused(target, flipped, "is damaged|is not a checkpoint")
+    except pytest.fail.Exception:
+        reference, other = RECIPE.build(), RECIPE.build()
+        reference.load(file)
+        other.load(flipped)
+        assert same(content(reference), content(other))
+        assert reference.rng.bit_generator.state == other.rng.bit_generator.state
+
+
+def test_flips_of_array_data_are_always_seen(file, target, tmp_path):
+    whole = file.read_bytes()
+    state = np.load(file)["particles/state"].tobytes()
+    start = whole.index(state)
+    for byte in range(0, len(state), 7):
+        damaged = bytearray(whole)
+        damaged[start + byte] ^= 16
+        (tmp_path / "flipped.npz").write_bytes(damaged)
+        refused(target, tmp_path / "flipped.npz", "is damaged")
+
+
+@pytest.mark.parametrize(
+    ("content_of_file", "match"),
+    [
+        (b"", "is damaged or cut off"),
+        (b"timestamp x y theta\n0 0 0 0\n", "is damaged or cut off"),
+        (b"\x80\x04N.", "is damaged or cut off"),
+        (b"PK\x03\x04", "is damaged or cut off"),
+        (bytes(range(256)) * 8, "is damaged or cut off"),
+    ],
+    ids=["empty", "text", "pickle", "start of an archive", "noise"],
+)
+def test_no_archive(target, tmp_path, content_of_file, match):
+    (tmp_path / "run.npz").write_bytes(content_of_file)
+    refused(target, tmp_path / "run.npz", match)
+
+
+def test_missing_file_and_folder(target, tmp_path):
+    refused(target, tmp_path / "run.npz", "does not exist")
+    refused(target, tmp_path, "is damaged or cut off")
+
+
+@pytest.mark.parametrize(
+    "arrays",
+    [
+        {"a": np.zeros(3)},
+        {"header": np.zeros(3)},
+        {"header": np.array("{}")},
+        {"header": np.array("[1]")},
+        {"header": np.array("7")},
+        {"header": np.array(json.dumps({"version": 1, "digest": "", "rng": {}, "fingerprint": 3}))},
+        {"header": np.array(json.dumps({"version": 1, "digest": "", "fingerprint": {}}))},
+    ],
+)
+def test_archive_of_something_else(target, tmp_path, arrays):
+    np.savez(tmp_path / "other.npz", **arrays)
+    refused(target, tmp_path / "other.npz", "is not a checkpoint of rbpf")
+
+
+def test_single_array(target, tmp_path):
+    np.save(tmp_path / "array.npy", np.zeros(3))
+    refused(target, tmp_path / "array.npy", "is damaged or cut off")
+
+
+def test_archive_with_objects(target, tmp_path):
+    np.savez(tmp_path / "objects.npz", header=np.array([{"version": 1}], dtype=object))
+    refused(target, tmp_path / "objects.npz", "is damaged or cut off")
+
+
+def changed(file: Path, path: Path, **fields: object) -> Path:
+    """A copy with other entries in the header, or `name=None` for arrays that are left out."""
+    with np.load(file) as archive:
+        arrays = {name: archive[name] for name in archive.files if fields.get(name, 0) is not None}
+    header = json.loads(str(arrays["header"]))
+    header.update({name: value for name, value in fields.items() if value is not None})
+    np.savez(path, **{**arrays, "header": np.array(json.dumps(header))})
+    return path
+
+
+def test_another_version(file, target, tmp_path):
+    refused(
+        target, changed(file, tmp_path / "new.npz", version=2), "has checkpoint version 2, this program reads"
+    )
+
+
+def test_an_array_is_missing_or_too_many(file, target, tmp_path):
+    fewer = changed(file, tmp_path / "fewer.npz", **{"particles/state": None})
+    refused(target, fewer, "does not match its digest; use an earlier checkpoint")
+    with np.load(file) as archive:
+        np.savez(tmp_path / "more.npz", **dict(archive), more=np.zeros(2))
+    refused(target, tmp_path / "more.npz", "does not match its digest")
+
+
+def other(**options) -> Filter:
+    """A filter that differs from the saved one in the options given."""
+    space = options.pop("space", SE2)
+    landmark_map = options.pop("conditional", None) or LandmarkMap(space)
+    for part in landmark_map if isinstance(landmark_map, list) else [landmark_map]:
+        if isinstance(part, LandmarkMap):
+            part.register(options.pop("landmark", Point(2)))
+    sensor = NamedLandmarkSensor(RangeBearing(space), Point(2))
+    return Filter(OdometryMotion(space), sensor, landmark_map, n=options.pop("n", 4), **options)
+
+
+@pytest.mark.parametrize(
+    ("filter_", "match"),
+    [
+        (lambda: other(n=5), "particles = 4, this one has 5"),
+        (lambda: other(space=SE3), "state size = 3, this one has 7"),
+        (lambda: other(proposal=PriorProposal()), "proposal = EkfProposal, this one has PriorProposal"),
+        (lambda: other(resampler=Systematic()), "resampler = EssTriggered, this one has Systematic"),
+        (lambda: other(lag=5), "lag = None, this one has 5"),
+        (lambda: other(clouds=True), "clouds = False, this one has True"),
+        (lambda: other(conditional=LandmarkMap(SE2, evidence=True)), "evidence = False, this one has True"),
+        (
+            lambda: other(landmark=Point(3)),
+            r"landmark kind 0 = Point \(2, 0, 1\), this one has Point \(3, 0, 1\)",
+        ),
+        (lambda: other(landmark=MixturePoint(4)), r"this one has MixturePoint \(2, 0, 4\)"),
+        (
+            lambda: other(conditional=[LandmarkMap(SE2), KalmanSubstate(SE2, np.zeros(1), np.eye(1))]),
+            "conditional = .*this one has .*KalmanSubstate",
+        ),
+        (
+            lambda: other(rng=np.random.Generator(np.random.MT19937(0))),
+            "random generator = PCG64, this one has MT",
+        ),
+    ],
+)
+def test_another_filter(file, filter_, match):
+    refused(filter_(), file, match)
+
+
+def test_landmarks_that_were_not_registered(file):
+    filter_ = Filter(
+        OdometryMotion(SE2), NamedLandmarkSensor(RangeBearing(SE2), Point(2)), LandmarkMap(SE2), n=4
+    )
+    refused(filter_, file, "landmark kind 0 = .*this one has None.*register its landmarks")
+
+
+def test_more_landmark_kinds_may_be_registered(file):
+    filter_ = other()
+    filter_.belief().map.register(MixturePoint(4))
+    filter_.load(file)
+    assert filter_.steps == STEPS

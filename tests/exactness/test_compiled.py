@@ -1,0 +1,125 @@
+"""The compiled path equals plain NumPy: four kernels, masks, likelihoods, refinement, update and whole runs."""
+
+import numpy as np
+import pytest
+
+from rbpf.filter import Filter
+from rbpf.lie import SE2, SE3
+from rbpf.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobis
+from rbpf.maps.landmark_map import LandmarkMap
+from rbpf.maps.point import Point
+from rbpf.models import NEW, NULL, Births, Observations
+from rbpf.motion.odometry import Odometry, OdometryMotion
+from rbpf.proposals import EkfProposal, PriorProposal, refined
+from tests.exactness.models import Frame, Scripted
+from tests.exactness.scenes import Scene, random_covs, sensors
+
+TOLERANCE = 1e-9
+PARTICLES = 45
+"""More than one block of the kernels, and not a multiple of it."""
+every_sensor = pytest.mark.parametrize(
+    ("space", "which"), [(space, which) for space in (SE2, SE3) for which in (0, 1)], ids=str
+)
+every_likelihood = pytest.mark.parametrize(
+    "likelihood", [Gaussian(), TruncatedMahalanobis(4.0), GaussianWithOutliers(0.05, 300.0)], ids=lambda x: type(x).__name__
+)
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(64)
+
+
+def with_outliers(group: Observations) -> Observations:
+    """The second measurement far off, the third at the edge of the gate."""
+    z = group.z.copy()
+    z[1] += 0.9
+    z[2] += 0.25
+    return Observations(z, group.cov, group.model, group.likelihood, group.ids, group.log_new, group.log_clutter)
+
+
+def associations(kind: str, rng: np.random.Generator) -> np.ndarray:
+    """Of five measurements: the same in all particles; disjoint sightings; clutter and births in some."""
+    same = np.array([3, 0, 2, 5, 1])
+    if kind == "shared":
+        return same
+    ids = np.tile(same, (PARTICLES, 1))
+    swapped = rng.random(PARTICLES) < 0.5
+    ids[swapped, 0], ids[swapped, 1] = 0, 3
+    ids[rng.random(PARTICLES) < 0.3, 2] = NULL
+    ids[rng.random(PARTICLES) < 0.3, 3] = NEW
+    return ids
+
+
+@pytest.mark.parametrize("kind", ["shared", "per particle"])
+@every_likelihood
+@every_sensor
+def test_refinement_and_update(space, which, likelihood, kind, rng):
+    scene = Scene.random(space, rng, n=PARTICLES, k=6)
+    model = sensors(space, rng)[which]
+    costs = {"log_new": -3.0, "log_clutter": -5.0}
+    group = with_outliers(scene.observe(model, associations(kind, rng), likelihood=likelihood, **costs))
+    prior = scene.prior(space.dim, shared=kind == "shared")
+    maps = [scene.map(compiled) for compiled in (True, False)]
+
+    one, other = (refined(prior, held.terms(scene.state, [group], prior)) for held in maps)
+    for name in ("mean", "root", "log_w1", "nis"):
+        np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=TOLERANCE, atol=TOLERANCE)
+    assert one.rows == other.rows
+
+    zero = np.zeros((PARTICLES, space.dim))
+    one_density, other_density = (held.correct(scene.state, zero, [group]) for held in maps)
+    np.testing.assert_allclose(one_density.all, other_density.all, rtol=TOLERANCE, atol=TOLERANCE)
+    one_map, other_map = (held.read(held.ids) for held in maps)
+    np.testing.assert_allclose(one_map.mean, other_map.mean, rtol=TOLERANCE, atol=TOLERANCE)
+    np.testing.assert_allclose(one_map.cov, other_map.cov, rtol=TOLERANCE, atol=TOLERANCE)
+    assert np.abs(one_map.mean - scene.records.mean).max() > 0.01
+    if not isinstance(likelihood, Gaussian):
+        inlier = likelihood.inlier(*_innovations(scene, group))
+        assert 0.05 < inlier.mean() < 0.95
+
+
+def _innovations(scene: Scene, group: Observations) -> tuple[np.ndarray, np.ndarray]:
+    ids = np.abs(group.ids if group.ids.ndim == 1 else group.ids[0])
+    state, mean = scene.state[:, None], scene.records.mean[:, ids]
+    jac = group.model.jacobians(state, mean).landmark
+    cov = jac @ scene.records.cov[:, ids] @ np.swapaxes(jac, -1, -2) + group.cov
+    return group.model.residual(group.z, group.model.predict(state, mean)), cov
+
+
+def drive(space, which: int, likelihood, proposal, compiled: bool) -> Filter:
+    """Ten steps of a robot among eight landmarks; the last one appears late, one sighting is an outlier."""
+    rng = np.random.default_rng(99)
+    dim = 2 if space is SE2 else 3
+    model = sensors(space, rng)[which]
+    landmarks = rng.normal(scale=4.0, size=(8, dim)) + 6.0
+    noise, cov = random_covs(rng, (8,), dim, 0.05), 0.003 * np.eye(space.dim)
+    delta = space.exp(np.array([0.1, 0.4, 0.0]) if space is SE2 else np.array([0.05, 0.0, 0.1, 0.4, 0.0, 0.0]))
+    held = LandmarkMap(space, compiled=compiled)
+    filter_ = Filter(OdometryMotion(space), Scripted(), held, proposal, n=PARTICLES, rng=np.random.default_rng(7))
+    truth = space.identity()
+    for step in range(10):
+        truth = space.compose(truth, delta)
+        z = model.predict(truth, landmarks) + rng.multivariate_normal(np.zeros(dim), noise[0], size=8)
+        z[1, 0] += 2.0 * (step == 4)
+        seen = np.arange(7) if step < 5 else np.arange(2, 8)
+        old = seen[np.isin(seen, held.ids)]
+        new = np.setdiff1d(seen, old)
+        groups = [Observations(z[old], noise[old], model, likelihood, old)] if old.size else []
+        births = [Births(z[new], noise[new], model, Point(dim))] if new.size else []
+        filter_.step(Frame(groups, births), Odometry(delta, cov))
+    return filter_
+
+
+@pytest.mark.parametrize("proposal", [PriorProposal(), EkfProposal(), EkfProposal(iterations=2)], ids=["prior", "ekf", "iekf"])
+@every_likelihood
+@every_sensor
+def test_whole_runs(space, which, likelihood, proposal):
+    one, other = (drive(space, which, likelihood, proposal, compiled) for compiled in (True, False))
+    assert one.lineage.generation == other.lineage.generation > 0
+    np.testing.assert_allclose(one.particles.state, other.particles.state, atol=TOLERANCE)
+    np.testing.assert_allclose(one.particles.log_weights, other.particles.log_weights, atol=1e-7)
+    np.testing.assert_allclose(one.log_evidence, other.log_evidence, rtol=TOLERANCE)
+    for field in ("mean", "cov"):
+        compiled, plain = (getattr(f.belief().read(f.belief().map.ids), field) for f in (one, other))
+        np.testing.assert_allclose(compiled, plain, atol=TOLERANCE)

@@ -1,0 +1,117 @@
+"""The forest of ancestors against plain composition of ancestor indices."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rbpf.genealogy import Lineage
+
+
+def drawn(rng: np.random.Generator, n: int, concentration: float) -> np.ndarray:
+    """Ascending ancestors of a multinomial resampling with random weights."""
+    weights = rng.dirichlet(np.full(n, concentration))
+    return np.sort(rng.choice(n, size=n, p=weights))
+
+
+class Composed:
+    """Rows of retained generations, by composing ancestors."""
+
+    def __init__(self, n: int) -> None:
+        self.now = 0
+        self.rows = {0: np.arange(n)}
+
+    def advance(self, ancestors: np.ndarray) -> None:
+        self.now += 1
+        self.rows = {generation: rows[ancestors] for generation, rows in self.rows.items()}
+        self.rows[self.now] = np.arange(ancestors.size)
+
+
+@given(
+    n=st.integers(1, 9),
+    seed=st.integers(0, 2**32 - 1),
+    generations=st.integers(1, 60),
+    concentration=st.sampled_from([0.05, 0.5, 5.0]),
+    keep=st.floats(0.0, 1.0),
+    restore=st.booleans(),
+)
+def test_rows_are_composed_ancestors(n, seed, generations, concentration, keep, restore):
+    rng = np.random.default_rng(seed)
+    lineage, oracle = Lineage(n), Composed(n)
+    kept: set[int] = set()
+    for _ in range(generations):
+        if rng.random() < keep:
+            lineage.retain(lineage.generation)
+            kept.add(lineage.generation)
+        if kept and rng.random() < 0.3:
+            dropped = int(rng.choice(sorted(kept)))
+            lineage.release(dropped)
+            kept.remove(dropped)
+        ancestors = drawn(rng, n, concentration)
+        lineage.advance(ancestors)
+        oracle.advance(ancestors)
+        if restore and rng.random() < 0.2:
+            arrays, lineage = lineage.arrays(), Lineage(n)
+            lineage.restore(arrays)
+            for generation in kept:
+                lineage.retain(generation)
+        for generation in kept:
+            np.testing.assert_array_equal(lineage.rows(generation), oracle.rows[generation])
+            assert lineage.distinct(generation) == np.unique(oracle.rows[generation]).size
+    np.testing.assert_array_equal(lineage.rows(lineage.generation), np.arange(n))
+
+
+@given(n=st.integers(1, 9), seed=st.integers(0, 2**32 - 1))
+def test_a_generation_may_be_retained_twice(n, seed):
+    rng = np.random.default_rng(seed)
+    lineage, oracle = Lineage(n), Composed(n)
+    lineage.retain(0)
+    lineage.retain(0)
+    lineage.release(0)
+    for _ in range(12):
+        ancestors = drawn(rng, n, 0.5)
+        lineage.advance(ancestors)
+        oracle.advance(ancestors)
+    assert lineage.is_retained(0)
+    np.testing.assert_array_equal(lineage.rows(0), oracle.rows[0])
+    lineage.release(0)
+    assert not lineage.is_retained(0)
+
+
+def test_only_the_present_generation_needs_no_keeping():
+    lineage = Lineage(3)
+    lineage.advance(np.array([0, 0, 2]))
+    assert lineage.is_retained(1)
+    assert not lineage.is_retained(0)
+    assert not lineage.is_retained(-1)
+
+
+@pytest.mark.parametrize("n", [16, 64, 256])
+def test_size_of_the_forest(n):
+    """Every generation kept: T + C N log N nodes (P. Jacob, L. Murray, S. Rubenthaler, 2015), here with C < 4.
+
+    With equal weights two lineages meet with probability 1/N per generation, so Σ 2N/age gives C of about 2.
+    """
+    rng = np.random.default_rng(5)
+    lineage = Lineage(n)
+    excess = []
+    for t in range(600):
+        lineage.retain(t)
+        lineage.advance(np.sort(rng.integers(0, n, n)))
+        excess.append((lineage.nodes - t) / (n * np.log(n)))
+    assert max(excess) < 4.0
+    assert 1.0 < np.mean(excess[100:]) < 3.0
+
+
+def test_what_nobody_keeps_is_spliced_out():
+    rng = np.random.default_rng(6)
+    n = 32
+    lineage = Lineage(n)
+    most = 0
+    lineage.retain(0)
+    for _ in range(3000):
+        lineage.advance(drawn(rng, n, 1.0))
+        most = max(most, lineage.nodes)
+    # Each kept node is a leaf, a fork or the root; between two rounds of splicing the forest fills its arrays.
+    assert most <= 8 * n
+    assert lineage.distinct(0) == 1

@@ -1,0 +1,201 @@
+"""The copy-on-write store against separate deep copies for every particle, under any sequence of operations."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+
+from rbpf.errors import InputError
+from rbpf.genealogy import Lineage
+from rbpf.maps.shared import SharedStore
+
+
+@dataclass
+class Copies:
+    """One array (fields, N) per column, gathered at every resampling."""
+
+    columns: dict[int, np.ndarray] = field(default_factory=dict)
+
+    def resample(self, ancestors: np.ndarray) -> None:
+        self.columns = {column: records[:, ancestors] for column, records in self.columns.items()}
+
+
+def kernel_like(store: SharedStore, columns: np.ndarray, increments: np.ndarray) -> None:
+    """What the compiled drivers do: observation after observation, read an inherited record, write one's own."""
+    access, targets = store.rewrite(columns)
+    for k in range(columns.size):
+        rows = access.maps[access.which[k]]
+        access.pool[targets[k]] = access.pool[access.slabs[k]][:, rows] + increments[k]
+
+
+class StoreMachine(RuleBasedStateMachine):
+    """Random operations on the store and on the copies; after each one they must read the same."""
+
+    @initialize(n=st.integers(1, 7), seed=st.integers(0, 2**32 - 1))
+    def start(self, n, seed):
+        self.n, self.rng = n, np.random.default_rng(seed)
+        self.lineage = Lineage(n)
+        self.store = SharedStore(n, self.lineage)
+        self.copies = Copies()
+        self.given: list[int] = []
+
+    def random(self, fields: int) -> np.ndarray:
+        return self.rng.normal(size=(fields, self.n))
+
+    def some(self, count: int) -> tuple[np.ndarray, int]:
+        """Columns of one record size, some of them named several times, and the size."""
+        fields = len(self.copies.columns[int(self.rng.choice(list(self.copies.columns)))])
+        alike = [column for column, records in self.copies.columns.items() if len(records) == fields]
+        return self.rng.choice(alike, size=count), fields
+
+    @rule(fields=st.integers(1, 3), count=st.integers(1, 40))
+    def add(self, fields, count):
+        for _ in range(count):
+            records = self.random(fields)
+            column = self.store.add(records)
+            assert column not in self.given
+            self.given.append(column)
+            self.copies.columns[column] = records.copy()
+            records[:] = np.nan
+
+    @precondition(lambda self: self.copies.columns)
+    @rule(count=st.integers(1, 5))
+    def remove(self, count):
+        columns, _ = self.some(count)
+        self.store.remove(columns)
+        for column in set(columns.tolist()):
+            del self.copies.columns[column]
+
+    @precondition(lambda self: self.copies.columns)
+    @rule(fields=st.integers(1, 3))
+    def replace(self, fields):
+        column = int(self.rng.choice(list(self.copies.columns)))
+        self.copies.columns[column] = self.random(fields)
+        self.store.replace(column, self.copies.columns[column].copy())
+
+    @precondition(lambda self: self.copies.columns)
+    @rule(count=st.integers(1, 6))
+    def rewrite(self, count):
+        columns, fields = self.some(count)
+        increments = self.rng.normal(size=(columns.size, fields, self.n))
+        kernel_like(self.store, columns, increments)
+        for column, increment in zip(columns.tolist(), increments, strict=True):
+            self.copies.columns[column] = self.copies.columns[column] + increment
+
+    @precondition(lambda self: self.copies.columns)
+    @rule(count=st.integers(1, 6))
+    def access(self, count):
+        columns, _ = self.some(count)
+        access = self.store.access(columns)
+        for k, column in enumerate(columns.tolist()):
+            read = access.pool[access.slabs[k]][:, access.maps[access.which[k]]]
+            np.testing.assert_array_equal(read, self.copies.columns[column])
+
+    @rule(times=st.integers(1, 12), concentration=st.sampled_from([0.05, 1.0, 20.0]))
+    def resample(self, times, concentration):
+        for _ in range(times):
+            weights = self.rng.dirichlet(np.full(self.n, concentration))
+            ancestors = np.sort(self.rng.choice(self.n, size=self.n, p=weights))
+            self.lineage.advance(ancestors)
+            self.store.compact()
+            self.copies.resample(ancestors)
+
+    @rule()
+    def save_and_restore(self):
+        arrays = self.lineage.arrays() | self.store.arrays()
+        self.lineage = Lineage(self.n)
+        self.lineage.restore(arrays)
+        bytes_before = self.store.stored_bytes
+        self.store = SharedStore(self.n, self.lineage)
+        self.store.restore(arrays)
+        assert self.store.stored_bytes == bytes_before
+        again = self.store.arrays()
+        for name in again:
+            np.testing.assert_array_equal(again[name], arrays[name])
+
+    @invariant()
+    def reads_like_copies(self):
+        np.testing.assert_array_equal(self.store.ids, sorted(self.copies.columns))
+        for column, records in self.copies.columns.items():
+            np.testing.assert_array_equal(self.store.read(column), records)
+
+    @invariant()
+    def books_balance(self):
+        sizes = [records.size for records in self.copies.columns.values()]
+        assert self.store.dense_bytes == 8 * sum(sizes)
+        # A compacted column holds at most half of the rows, and for each an index beside the fields.
+        assert self.store.stored_bytes <= 2 * self.store.dense_bytes
+
+
+TestStore = StoreMachine.TestCase
+TestStore.settings = settings(max_examples=40, stateful_step_count=30)
+
+
+def test_reading_returns_what_may_be_written_to():
+    store = SharedStore(3, Lineage(3))
+    column = store.add(np.ones((2, 3)))
+    store.read(column)[:] = 5.0
+    np.testing.assert_array_equal(store.read(column), np.ones((2, 3)))
+
+
+def test_memory_shrinks_as_lineages_coalesce():
+    rng = np.random.default_rng(2)
+    n, columns = 200, 50
+    lineage = Lineage(n)
+    store = SharedStore(n, lineage)
+    for _ in range(columns):
+        store.add(rng.normal(size=(5, n)))
+    before = store.stored_bytes
+    assert before == store.dense_bytes == columns * 5 * n * 8
+    taken = {}
+    for age in range(1, 2001):
+        lineage.advance(np.sort(rng.integers(0, n, n)))
+        store.compact()
+        taken[age] = store.stored_bytes / before
+    # About 2/age of the rows have descendants; they are looked at when the age has doubled, and kept with an index.
+    assert taken[16] < 0.5
+    assert taken[256] < 0.05
+    # Long after all lineages have met, one row and its index are left.
+    assert taken[2000] == (5 + 1) / (5 * n)
+    assert lineage.nodes < 8 * n
+
+
+def test_rewriting_one_landmark_leaves_the_others_shared():
+    rng = np.random.default_rng(3)
+    n = 64
+    lineage = Lineage(n)
+    store = SharedStore(n, lineage)
+    columns = np.array([store.add(rng.normal(size=(5, n))) for _ in range(20)])
+    for _ in range(200):
+        lineage.advance(np.sort(rng.integers(0, n, n)))
+        store.compact()
+        kernel_like(store, columns[:1], np.zeros((1, 5, n)))
+    dense = 5 * n * 8
+    assert dense <= store.stored_bytes <= dense + 19 * 0.2 * dense
+
+
+@pytest.mark.parametrize("shape", [(5,), (5, 2), (0, 3), (2, 5, 3)])
+def test_records_of_wrong_shape_change_nothing(shape):
+    store = SharedStore(3, Lineage(3))
+    column = store.add(np.ones((2, 3)))
+    for change in (lambda: store.add(np.zeros(shape)), lambda: store.replace(column, np.zeros(shape))):
+        with pytest.raises(InputError, match=r"landmark records must be \(fields, 3\)"):
+            change()
+        np.testing.assert_array_equal(store.read(column), np.ones((2, 3)))
+        assert store.ids.tolist() == [column]
+
+
+def test_membership():
+    store = SharedStore(2, Lineage(2))
+    first, second = store.add(np.zeros((1, 2))), store.add(np.zeros((1, 2)))
+    store.remove(np.array([first, first]))
+    assert second in store
+    assert np.int64(second) in store
+    assert first not in store
+    assert second + 1 not in store
+    assert -1 not in store
+    assert "landmark" not in store
+    assert store.add(np.zeros((1, 2))) > second

@@ -1,0 +1,310 @@
+"""The batch solution: GTSAM's charts, the factors, and the optimum against SciPy, an EKF and published results."""
+
+import re
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from rbpf.errors import InputError
+from rbpf.lie import SE2, SE3
+from rbpf.sensors.readers import open_log
+from rbpf.validation.accuracy import landmark_errors
+from rbpf.validation.alignment import align
+from rbpf.validation.gtsam_ba import solve
+from rbpf.validation.gtsam_ba_chart import PLANAR, SPATIAL
+from rbpf.validation.gtsam_ba_graph import Problem
+from rbpf.validation.measurements import InitialEstimate, dead_reckoning, from_log, initial_estimate
+from tests.validation.joint_ekf import joint_ekf
+from tests.validation.worlds import seen, solve_by_scipy, world
+
+CHARTS = [(SE2, PLANAR), (SE3, SPATIAL)]
+WORLDS = [
+    (2, "range_bearing", False),
+    (2, "position", False),
+    (2, "range_bearing", True),
+    (3, "range_bearing", False),
+    (3, "position", True),
+]
+
+
+def held(chart, *poses):
+    values = gtsam.Values()
+    for key, pose in enumerate(poses):
+        values.insert(key, chart.pose(pose))
+    return values
+
+
+@pytest.mark.parametrize(("space", "chart"), CHARTS)
+def test_gtsam_retracts_by_the_exponential_map_in_another_order(space, chart):
+    rng = np.random.default_rng(1)
+    for scale in (1e-9, 0.1, 1.0):
+        x, xi = space.exp(rng.normal(size=space.dim)), scale * rng.normal(size=space.dim)
+        moved = chart.pose(x).retract(xi[chart.order])
+        values = gtsam.Values()
+        values.insert(0, moved)
+        assert np.abs(space.local(space.retract(x, xi), chart.storage(values, 0))).max() < 1e-14
+        np.testing.assert_allclose(chart.pose(x).localCoordinates(moved), xi[chart.order], atol=1e-14)
+
+
+@pytest.mark.parametrize(("space", "chart"), CHARTS)
+def test_gtsams_odometry_residual_is_ours(space, chart):
+    x, delta, y = space.exp(np.random.default_rng(2).normal(size=(3, space.dim)))
+    unit = gtsam.noiseModel.Unit.Create(space.dim)
+    residual = chart.between(0, 1, chart.pose(delta), unit).unwhitenedError(held(chart, x, y))
+    np.testing.assert_allclose(residual, space.local(space.compose(x, delta), y)[chart.order], atol=1e-14)
+
+
+@pytest.mark.parametrize(("space", "chart"), CHARTS)
+def test_covariances_are_brought_into_our_order(space, chart):
+    factor = np.random.default_rng(3).normal(size=(space.dim, space.dim))
+    cov = factor @ factor.T
+    np.testing.assert_array_equal(chart.covariance(cov[np.ix_(chart.order, chart.order)]), cov)
+
+
+@pytest.mark.parametrize("soft", [False, True])
+@pytest.mark.parametrize(("dim", "kind", "singular"), WORLDS)
+def test_derivatives_of_every_factor_are_those_of_its_residual(dim, kind, singular, soft):
+    m = world(dim, kind, singular)
+    problem = Problem(m)
+    graph, values = problem.graph(soft), problem.values(initial_estimate(m))
+    step = 1e-6
+    for i in range(graph.size()):
+        factor = graph.at(i)
+        slope, offset = factor.linearize(values).jacobian()
+        np.testing.assert_allclose(-offset, factor.whitenedError(values), atol=1e-9)
+        zero, columns = values.zeroVectors(), []
+        for key in factor.keys():
+            for axis in step * np.eye(len(zero.at(key))):
+                errors = []
+                for sign in (1, -1):
+                    moved = gtsam.VectorValues(zero)
+                    moved.update(_single(key, sign * axis))
+                    errors.append(factor.whitenedError(values.retract(moved)))
+                columns.append((errors[0] - errors[1]) / (2 * step))
+        np.testing.assert_allclose(
+            slope, np.stack(columns, axis=1), rtol=1e-6, atol=1e-6 * np.abs(slope).max()
+        )
+
+
+def _single(key, vector):
+    values = gtsam.VectorValues()
+    values.insert(key, vector)
+    return values
+
+
+@pytest.mark.parametrize(("dim", "kind", "singular"), WORLDS)
+def test_the_optimum_and_its_covariance_are_scipys(dim, kind, singular):
+    m = world(dim, kind, singular)
+    found, expected = solve(m), solve_by_scipy(m)
+    assert found.error == pytest.approx(expected.error, rel=1e-9)
+    assert np.abs(m.space.local(expected.world_from_robot, found.world_from_robot)).max() < 1e-6
+    names = sorted(found.landmarks)
+    assert names == np.unique(m.landmarks).tolist()
+    np.testing.assert_allclose([found.landmarks[name] for name in names], expected.landmarks, atol=1e-6)
+    assert_same_covariances(found.cov_poses, expected.cov_poses)
+    assert_same_covariances([found.cov_landmarks[name] for name in names], expected.cov_landmarks)
+
+
+def assert_same_covariances(found, expected):
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-5 * np.abs(other).max())
+
+
+def test_the_start_is_known_and_a_robot_that_cannot_slip_does_not():
+    m = world(2, "range_bearing", singular=True)
+    found = solve(m)
+    np.testing.assert_array_equal(found.cov_poses[0], np.zeros((3, 3)))
+    np.testing.assert_allclose(found.world_from_robot[0], m.start, atol=1e-12)
+    predicted = m.space.compose(found.world_from_robot[:-1], m.deltas)
+    slip = np.linalg.eigh(m.covs[0])[1][:, 0]
+    slipped = m.space.local(predicted, found.world_from_robot[1:]) @ slip
+    assert np.abs(slipped).max() < 1e-9
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_the_joint_ekf_ends_where_the_batch_does_if_the_noise_is_small(dim):
+    m = world(dim, "position", noise=0.003)
+    found, filtered = solve(m), joint_ekf(m)
+    error = m.space.local(found.world_from_robot[-1], filtered.world_from_robot[-1])
+    assert error @ np.linalg.solve(found.cov_poses[-1], error) < 1e-4
+    scale = np.sqrt(np.diag(found.cov_poses[-1]))
+    correlated = (filtered.cov_poses[-1] - found.cov_poses[-1]) / scale / scale[:, None]
+    assert np.abs(correlated).max() < 1e-2
+    for name, point in found.landmarks.items():
+        np.testing.assert_allclose(filtered.landmarks[name], point, atol=1e-2 * scale[-1])
+    assert filtered.log_evidence == pytest.approx(solve_by_scipy(m).log_evidence, abs=0.05)
+
+
+def test_a_robust_loss_is_opt_in_and_is_hubers():
+    m = world(2, "range_bearing")
+    z = m.z.copy()
+    z[5] += [3.0, 0.5]
+    bad = replace(m, z=z)
+    plain, robust, clean = solve(bad), solve(bad, robust=1.345), solve(m)
+    expected = solve_by_scipy(bad, robust=1.345)
+    assert robust.error == pytest.approx(expected.error, rel=1e-8)
+    assert np.abs(SE2.local(expected.world_from_robot, robust.world_from_robot)).max() < 1e-5
+    off = [
+        np.linalg.norm(s.landmarks[int(m.landmarks[5])] - clean.landmarks[int(m.landmarks[5])])
+        for s in (plain, robust)
+    ]
+    assert off[0] > 5 * off[1]
+
+
+def test_any_start_near_by_leads_to_the_same_optimum():
+    m = world(3, "range_bearing", steps=120)
+    expected = solve(m)
+    rng = np.random.default_rng(4)
+    moved = SE3.retract(expected.world_from_robot, 0.05 * rng.normal(size=(120, 6)))
+    points = {name: point + 0.05 * rng.normal(size=3) for name, point in expected.landmarks.items()}
+    for found in (solve(m, initial=InitialEstimate(moved, points)), solve(m, incremental=True)):
+        assert found.error == pytest.approx(expected.error, rel=1e-9)
+        assert np.abs(SE3.local(expected.world_from_robot, found.world_from_robot)).max() < 1e-6
+
+
+def test_the_order_of_the_sightings_does_not_matter():
+    m = world(2, "position")
+    order = np.random.default_rng(5).permutation(len(m.steps))
+    mixed = seen(m, m.steps[order], m.landmarks[order], m.z[order], m.cov_z[order])
+    for found in (solve(mixed), solve(mixed, incremental=True)):
+        np.testing.assert_allclose(found.world_from_robot, solve(m).world_from_robot, atol=1e-9)
+
+
+@pytest.mark.parametrize("singular", [False, True])
+def test_without_sightings_dead_reckoning_comes_back(singular):
+    m = world(2, "position", singular)
+    blind = seen(m, m.steps[:0], m.landmarks[:0], m.z[:0], m.cov_z[:0])
+    found = solve(blind)
+    np.testing.assert_allclose(found.world_from_robot, dead_reckoning(m), atol=1e-12)
+    assert found.landmarks == {}
+    assert found.cov_landmarks == {}
+    first = m.covs[0]
+    np.testing.assert_allclose(found.cov_poses[1], first, atol=1e-12)
+    back = SE2.adjoint(SE2.inverse(m.deltas[1]))
+    np.testing.assert_allclose(found.cov_poses[2], back @ first @ back.T + m.covs[1], atol=1e-12)
+
+
+def test_exact_odometry_leaves_only_the_map_to_solve_for():
+    m = world(2, "position")
+    exact = replace(m, covs=np.zeros_like(m.covs))
+    found = solve(exact)
+    np.testing.assert_allclose(found.world_from_robot, dead_reckoning(m), atol=1e-9)
+    name = int(m.landmarks[0])
+    rows = m.landmarks == name
+    turn = SE2.rotation(SE2.compose(dead_reckoning(m)[m.steps[rows]], m.robot_from_sensor))
+    info = np.linalg.inv(turn @ m.cov_z[rows] @ turn.mT)
+    points = m.model().invert(dead_reckoning(m)[m.steps[rows]], m.z[rows])
+    cov = np.linalg.inv(info.sum(0))
+    np.testing.assert_allclose(found.landmarks[name], cov @ np.einsum("kij,kj->i", info, points), atol=1e-9)
+    np.testing.assert_allclose(found.cov_landmarks[name], cov, atol=1e-12)
+
+
+def test_without_marginals_there_are_none():
+    found = solve(world(2, "position"), marginals=False)
+    assert found.cov_poses is None
+    assert found.cov_landmarks == {}
+
+
+def test_bad_input_is_refused_in_words():
+    m = world(2, "range_bearing")
+    cov_z = m.cov_z.copy()
+    cov_z[3] = np.diag([0.01, 0.0])
+    place = f"landmark {m.landmarks[3]} at step {m.steps[3]} "
+    with pytest.raises(InputError, match=place + "has a singular covariance"):
+        solve(replace(m, cov_z=cov_z))
+    with pytest.raises(InputError, match="threshold above 0"):
+        solve(m, robust=0.0)
+    start = initial_estimate(m)
+    with pytest.raises(InputError, match=re.escape("every landmark seen, landmark 7 is missing")):
+        solve(
+            m,
+            initial=InitialEstimate(
+                start.world_from_robot, {k: v for k, v in start.landmarks.items() if k != 7}
+            ),
+        )
+    with pytest.raises(InputError, match=re.escape("found poses of shape (3, 3)")):
+        solve(m, initial=InitialEstimate(start.world_from_robot[:3], start.landmarks))
+
+
+def test_a_variable_that_is_not_determined_is_named():
+    m = world(2, "range_bearing")
+    start = initial_estimate(m)
+    sensor = SE2.compose(m.start, m.robot_from_sensor)[1:]
+    name = int(m.landmarks[m.steps == 0][0])
+    with np.errstate(all="ignore"), pytest.raises(InputError, match=f"do not determine landmark {name}"):
+        solve(m, initial=InitialEstimate(start.world_from_robot, {**start.landmarks, name: sensor}))
+
+
+def planar_errors(m, log, path, landmarks):
+    """Root mean square of the path after rigid alignment, and mean of the landmarks after their own."""
+    truth = log.truth
+    true_x, true_y = truth.world_from_robot[:, 1:].T
+    true = np.stack([np.interp(m.stamps_ns, truth.stamps_ns, x) for x in (true_x, true_y)], axis=1)
+    off = align(path[:, 1:], true).transform(path[:, 1:]) - true
+    return np.sqrt(np.square(off).sum(1).mean()), landmark_errors(landmarks, truth.landmarks, "rigid").mean
+
+
+def exact_errors(m, log, path, landmarks):
+    """Root mean square of the path and mean of the landmarks, without alignment."""
+    off = m.space.translation(path) - m.space.translation(log.truth.world_from_robot)
+    return np.sqrt(np.square(off).sum(1).mean()), landmark_errors(landmarks, log.truth.landmarks).mean
+
+
+@pytest.mark.real_data
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("folder", "batch", "filtered"),
+    [
+        ("mrpt_kf_slam_2d", (0.0040, 0.0026), (0.0049, 0.0030)),
+        ("mrpt_kf_slam_6d", (0.0102, 0.0042), (0.0123, 0.0043)),
+    ],
+)
+def test_simulated_recordings_give_the_published_errors(data_dir, folder, batch, filtered):
+    log = open_log(data_dir / folder)
+    m = from_log(log, start=log.truth.world_from_robot[0])
+    found = solve(m)
+    assert exact_errors(m, log, found.world_from_robot, found.landmarks) == pytest.approx(batch, abs=6e-5)
+    expected = 0.5 * m.z.shape[1] * (len(m.z) - len(found.landmarks))
+    assert found.error == pytest.approx(expected, abs=4 * np.sqrt(expected))
+    ekf = joint_ekf(m)
+    assert exact_errors(m, log, ekf.world_from_robot, ekf.landmarks) == pytest.approx(filtered, abs=6e-5)
+    misses = [found.landmarks[name] - log.truth.landmarks[name] for name in found.landmarks]
+    nees = [
+        miss @ np.linalg.solve(found.cov_landmarks[name], miss)
+        for name, miss in zip(found.landmarks, misses, strict=True)
+    ]
+    assert np.mean(nees) == pytest.approx(len(misses[0]), rel=0.5)
+
+
+@pytest.mark.real_data
+@pytest.mark.slow
+def test_mrclam_is_solved_from_dead_reckoning_and_incrementally(data_dir):
+    log = open_log(data_dir / "mrclam6_robot1")
+    m = from_log(log)
+    assert Problem(m).singular
+    found, again, ekf = solve(m), solve(m, marginals=False, incremental=True), joint_ekf(m)
+    assert found.error == pytest.approx(again.error, rel=1e-8)
+    assert np.abs(SE2.local(found.world_from_robot, again.world_from_robot)).max() < 1e-5
+    assert planar_errors(m, log, found.world_from_robot, found.landmarks) == pytest.approx(
+        (0.144, 0.089), abs=0.03
+    )
+    assert planar_errors(m, log, ekf.world_from_robot, ekf.landmarks) == pytest.approx(
+        (0.326, 0.081), abs=0.03
+    )
+    robust = solve(m, robust=1.345, marginals=False, incremental=True)
+    errors = planar_errors(m, log, found.world_from_robot, found.landmarks)
+    assert all(np.less(planar_errors(m, log, robust.world_from_robot, robust.landmarks), errors))
+
+
+@pytest.mark.real_data
+@pytest.mark.slow
+def test_victoria_park_needs_the_incremental_start(data_dir):
+    m = from_log(open_log(data_dir / "victoria_park"))
+    found = solve(m, incremental=True)
+    redundancy = m.z.size - 2 * len(found.landmarks)
+    assert 0.3 * redundancy < found.error < 0.7 * redundancy
+    problem = Problem(m)
+    lost = problem.graph().error(problem.values(initial_estimate(m)))
+    assert lost > 1000 * found.error

@@ -1,0 +1,131 @@
+"""Small worlds with a tilted sensor, and the batch solution of them by SciPy, through another parametrisation."""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from rbpf import gaussian
+from rbpf.lie import SE2, SE3, Array
+from rbpf.validation.measurements import Kind, Measurements
+
+NAMES = np.array([41, 7, 1000, 12, 3, 26])
+
+
+def world(
+    dim: int, kind: Kind, singular: bool = False, steps: int = 9, noise: float = 1.0, seed: int = 0
+) -> Measurements:
+    """A drive of half a metre per step among six landmarks, seen by a sensor that looks back and down.
+
+    Bearings cross ±π. With `singular` one direction of motion, not along an axis, is without noise; `noise`
+    multiplies all standard deviations.
+    """
+    rng = np.random.default_rng(seed)
+    space, d = (SE2, 3) if dim == 2 else (SE3, 6)
+    std = np.full(d, 0.03 * noise)
+    std[-1] = 0.0 if singular else 0.02 * noise
+    mount = np.array([2.4, 0.3, -0.2]) if dim == 2 else SE3.exp(np.array([0.2, 0.5, 2.4, 0.3, -0.2, 0.4]))
+    motion = np.zeros(d)
+    motion[[dim - 2 if dim == 3 else 0, d - dim]] = [0.25, 0.5]
+    turned = space.adjoint(space.exp(0.5 * motion))
+    cov = gaussian.symmetrise(turned @ np.diag(std**2) @ turned.T)
+    noises = rng.normal(size=(steps - 1, d)) * std @ turned.T
+    path, deltas = [space.exp(np.linspace(-0.4, 0.9, d))], []
+    for noise in noises:
+        deltas.append(space.exp(motion * rng.uniform(0.6, 1.4)))
+        path.append(space.retract(space.compose(path[-1], deltas[-1]), noise))
+    points = space.translation(np.array(path)).mean(0) + rng.normal(scale=3.0, size=(len(NAMES), dim))
+    at, which = (x.ravel() for x in np.indices((steps, len(NAMES))))
+    kept = rng.permutation(len(at))[: 4 * len(at) // 5]
+    empty = np.zeros((0, dim))
+    frame = Measurements(
+        "small world", space, kind, -1.0, mount, path[0], 100 * np.arange(steps), np.array(deltas),
+        np.broadcast_to(cov, (steps - 1, d, d)), np.zeros(0, int), np.zeros(0, int), empty, np.zeros((0, dim, dim)),
+    )  # fmt: skip
+    factor = noise * (np.tril(rng.normal(scale=0.02, size=(len(kept), dim, dim))) + 0.03 * np.eye(dim))
+    z = frame.model().predict(np.array(path)[at[kept]], points[which[kept]])
+    z = z + np.einsum("kij,kj->ki", factor, rng.normal(size=z.shape))
+    return seen(frame, at[kept], NAMES[which[kept]], z, factor @ factor.mT)
+
+
+def seen(m: Measurements, steps: Array, landmarks: Array, z: Array, cov_z: Array) -> Measurements:
+    """The same drive with other sightings."""
+    drive = (m.recording, m.space, m.measurement, m.pitch_sign, m.robot_from_sensor, m.start, m.stamps_ns)
+    return Measurements(*drive, m.deltas, m.covs, steps, landmarks, z, cov_z)
+
+
+class Reference(NamedTuple):
+    """Optimum and covariances as in a `BatchSolution`, landmarks in the order of their names.
+
+    The log-evidence is Laplace's, with a flat prior of the landmarks.
+    """
+
+    world_from_robot: Array
+    landmarks: Array
+    cov_poses: Array
+    cov_landmarks: Array
+    error: float
+    log_evidence: float
+
+
+def solve_by_scipy(m: Measurements, robust: float | None = None) -> Reference:
+    """Least squares over the odometry's own noises w, x_t = x_{t-1} δ Exp(L w): singular ones need no care."""
+    names = np.unique(m.landmarks)
+    place = np.searchsorted(names, m.landmarks)
+    factors = np.array([_thin_factor(cov) for cov in m.covs])
+    split = len(factors) * factors.shape[-1]
+    model, whiten = m.model(), np.linalg.inv(np.linalg.cholesky(m.cov_z))
+
+    def path_of(x: Array) -> Array:
+        path = [m.start]
+        for delta, factor, noise in zip(m.deltas, factors, x[:split].reshape(len(factors), -1), strict=True):
+            path.append(m.space.retract(m.space.compose(path[-1], delta), factor @ noise))
+        return np.array(path)
+
+    def sightings(x: Array) -> Array:
+        points = x[split:].reshape(len(names), -1)
+        nu = model.residual(m.z, model.predict(path_of(x)[m.steps], points[place]))
+        return np.einsum("kij,kj->ki", whiten, nu)
+
+    def residuals(x: Array) -> Array:
+        return np.concatenate([x[:split], _shrunk(sightings(x), robust).ravel()])
+
+    first = [np.flatnonzero(m.landmarks == name)[0] for name in names]
+    start = path_of(np.zeros(split))
+    x0 = np.concatenate([np.zeros(split), model.invert(start[m.steps[first]], m.z[first]).ravel()])
+    found = least_squares(residuals, x0, jac="3-point", xtol=1e-15, ftol=1e-15, gtol=1e-15, max_nfev=300)
+    optimum, path = found.x, path_of(found.x)
+    slope = _slope(residuals, optimum) if robust is None else found.jac
+    cov = np.linalg.inv(slope.T @ slope)
+    spread = _slope(lambda x: m.space.local(path, path_of(x)).ravel(), optimum).reshape(
+        len(path), m.space.dim, -1
+    )
+    blocks = cov[split:, split:].reshape(len(names), m.z.shape[1], len(names), -1)
+    cov_landmarks = np.array([blocks[i, :, i] for i in range(len(names))])
+    points = optimum[split:].reshape(len(names), -1)
+    log_evidence = -found.cost + 0.5 * (np.linalg.slogdet(cov)[1] + points.size * np.log(2 * np.pi))
+    log_evidence -= 0.5 * np.linalg.slogdet(2 * np.pi * m.cov_z)[1].sum()
+    cost = float(found.cost)
+    return Reference(path, points, spread @ cov @ spread.mT, cov_landmarks, cost, float(log_evidence))
+
+
+def _thin_factor(cov: Array) -> Array:
+    values, vectors = np.linalg.eigh(cov)
+    kept = values > 1e-12 * values[-1]
+    return vectors[:, kept] * np.sqrt(values[kept])
+
+
+def _shrunk(whitened: Array, robust: float | None) -> Array:
+    if robust is None:
+        return whitened
+    norm = np.linalg.norm(whitened, axis=-1, keepdims=True)
+    loss = np.where(norm <= robust, 0.5 * norm**2, robust * (norm - 0.5 * robust))
+    return whitened * np.sqrt(2 * loss) / norm
+
+
+def _slope(function, x):
+    step = 1e-5
+    columns = [
+        (function(x + step * axis) - function(x - step * axis)) / (2 * step) for axis in np.eye(len(x))
+    ]
+    return np.stack(columns, axis=-1)
