@@ -40,7 +40,7 @@ def simulate(
     rng: np.random.Generator, steps: int = 200
 ) -> tuple[list[SimpleNamespace], np.ndarray, np.ndarray]:
     """Frames of a robot that drives twice round a circle, its true poses (T, 3), and the lamps (M, 2)."""
-    lamps = rng.uniform(-8.0, 8.0, (40, 2)) + [0.0, 4.0]
+    lamps = rng.uniform([-8.0, -4.0], [8.0, 12.0], (40, 2))
     increment = SE2.exp(4 * np.pi / (steps - 1) * np.array([1.0, 4.0, 0.0]))
     model, pose, frames, poses = LampSensor(), SE2.identity(), [], []
     for t in range(steps):
@@ -83,11 +83,9 @@ def main() -> dict[str, float]:
         "map": float(np.linalg.norm(points - lamps[names], axis=1).mean()),
         "nis_per_dof": sum(report.nis for report in used) / sum(report.rows for report in used),
     }
-    print(
-        f"mean position error: {figures['odometry']:.3f} m by odometry, {figures['filter']:.3f} m by the filter"
-    )
+    print(f"mean position error: odometry {figures['odometry']:.3f} m, filter {figures['filter']:.3f} m")
     print(f"{len(names)} lamps mapped, mean error {figures['map']:.3f} m")
-    print(f"innovations are {figures['nis_per_dof']:.2f} times as large as the model expects (1 is honest)")
+    print(f"squared innovations are {figures['nis_per_dof']:.2f} times what the model expects (1 is honest)")
     return figures
 
 

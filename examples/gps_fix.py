@@ -1,7 +1,8 @@
 """A sensor that sees no landmark: position fixes, now and then, correct dead reckoning in the plane.
 
-The robot does not know which way it faces when it starts. Every particle has its own guess, and the fixes tell
-which guesses lead along the path that was driven. Nothing is marginalised here, so the filter needs no map.
+The robot does not know which way it faces when it starts. Every particle has its own guess, and the fixes
+tell which guesses lead along the path that was driven. Nothing is marginalised here, so the filter needs no
+map.
 """
 
 import numpy as np
@@ -26,15 +27,16 @@ class Position(ObservationModel):
 
 
 class PositionReceiver(Sensor):
-    """A frame is one fix (2,), or None where there is none."""
+    """A frame is one fix (2,), or None where there is none; `std` is that of each coordinate [m]."""
 
-    def __init__(self):
+    def __init__(self, std):
         self.model = Position()
+        self.cov = std**2 * np.eye(2)[None]
 
     def observe(self, frame, belief):
         if frame is None:
             return []
-        return [Observations(z=frame[None], cov=STD_FIX**2 * np.eye(2)[None], model=self.model)]
+        return [Observations(z=frame[None], cov=self.cov, model=self.model)]
 
 
 def simulate(
@@ -59,7 +61,11 @@ def main() -> dict[str, float]:
     guesses = np.zeros((PARTICLES, 3))
     guesses[:, 0] = np.linspace(-np.pi, np.pi, PARTICLES, endpoint=False)
     filter_ = Filter(
-        OdometryMotion(SE2), PositionReceiver(), n=PARTICLES, rng=np.random.default_rng(0), start=guesses
+        OdometryMotion(SE2),
+        PositionReceiver(STD_FIX),
+        n=PARTICLES,
+        rng=np.random.default_rng(0),
+        start=guesses,
     )
     errors, sigmas = [], []
     for t, (true_pose, control, fix) in enumerate(simulate(np.random.default_rng(1))):
@@ -69,9 +75,8 @@ def main() -> dict[str, float]:
         sigmas.append(np.sqrt(np.diag(estimate.cov)))
         if t in (9, 10, 30, 100, 199):
             heading, sigma = np.degrees([error[0], sigmas[-1][0]])
-            print(
-                f"step {t:3d}: heading error {heading:7.1f}° (σ {sigma:5.1f}°), position error {np.hypot(*error[1:]):.2f} m"
-            )
+            away = np.hypot(*error[1:])
+            print(f"step {t:3d}: heading {heading:6.1f}° off (σ {sigma:5.1f}°), position {away:.2f} m off")
     late = np.array(errors)[100:]
     figures = {
         "sigma_heading_start": float(sigmas[0][0]),
@@ -80,9 +85,7 @@ def main() -> dict[str, float]:
         "position_rmse": float(np.sqrt(np.square(late[:, 1:]).sum(axis=1).mean())),
         "share_within_3_sigma": float((np.abs(late) < 3 * np.array(sigmas)[100:]).mean()),
     }
-    print(
-        f"second half: position {figures['position_rmse']:.2f} m RMS, from fixes of {STD_FIX * 2**0.5:.2f} m RMS"
-    )
+    print(f"second half: {figures['position_rmse']:.2f} m RMS, from fixes of {STD_FIX * 2**0.5:.2f} m RMS")
     return figures
 
 

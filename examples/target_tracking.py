@@ -1,8 +1,8 @@
 """Tracking without a map: sample what is nonlinear, marginalise what is linear.
 
-A vessel is watched by a radar that measures range and bearing. Its pose is sampled. Its turn rate and speed drive
-the pose linearly, in the chart of the pose, and are kept as a Gaussian in every particle. The same number of
-particles then goes further than in a bootstrap filter that samples all five numbers.
+A vessel is watched by a radar that measures range and bearing. Its pose is sampled. Its turn rate and speed
+drive the pose linearly, in the chart of the pose, and are kept as a Gaussian in every particle. The same
+number of particles then goes further than in a bootstrap filter that samples all five numbers.
 """
 
 import numpy as np
@@ -23,10 +23,8 @@ from rbpf import (
     Transition,
 )
 
-PARTICLES, STEPS, VESSELS, REPEATS = 100, 40, 3, 8
-STD_POSE = np.array(
-    [0.005, 0.05, 0.05]
-)  # disturbance per step of 1 s: turn [rad], forward [m], to the left [m]
+PARTICLES, STEPS, VESSELS, REPEATS = 100, 40, 3, 6
+STD_POSE = np.array([0.02, 0.2, 0.2])  # disturbance per step: turn [rad], forward [m], to the left [m]
 STD_RATES = np.array([0.01, 0.15])  # change per step of turn rate [rad/s] and speed [m/s]
 STD_RADAR = np.array([5.0, 0.03])  # range [m], bearing [rad]
 MEAN_RATES, COV_RATES = np.array([0.0, 4.0]), np.diag([0.05, 1.0]) ** 2

@@ -42,7 +42,8 @@ class Layout:
         """
         n, k = records.mean.shape[:2]
         self._check(records, n, k)
-        body = np.concatenate([records.mean, gaussian.pack(records.cov)], axis=-1).reshape(n, k, -1)
+        body = np.concatenate([records.mean, gaussian.pack(records.cov)], axis=-1)
+        body = body.reshape(n, k, self.landmark.components * self.gaussian_fields)
         parts = [body]
         if records.log_weights is not None:
             parts.append(records.log_weights)

@@ -13,7 +13,7 @@ from rbpf.likelihoods import Gaussian
 from rbpf.maps.layout import Layout
 from rbpf.maps.plan import Batch, Plan, Row
 from rbpf.maps.shared import SharedStore
-from rbpf.models import FusedKernel, LogDensities, Observations, Records
+from rbpf.models import FusedKernel, Likelihood, LogDensities, Observations, Records
 from rbpf.numeric import linearise
 from rbpf.proposals import Prior, Terms
 
@@ -50,6 +50,11 @@ class RowEngine:
             jac_state = jac[..., : self.space.dim]
             total.add(reference.information(nu[:, None], jac_state[:, None], cov[:, None], GAUSSIAN, prior))
             total.log_factor += log_factor
+            literal = np.repeat(
+                [not _likelihood(groups[row.group]).normalised for row in rows],
+                [groups[row.group].model.dim for row in rows],
+            )
+            total.log_factor += reference.log_normaliser(cov, literal)
         return total
 
     def correct(self, plan: Plan, state: np.ndarray, groups: Sequence[Observations]) -> LogDensities:
@@ -193,7 +198,10 @@ class RowEngine:
     def _joint(
         self, rows: list[Row], groups: Sequence[Observations], state: np.ndarray, prior: Prior | None = None
     ) -> tuple[np.ndarray, np.ndarray, Records, np.ndarray, np.ndarray]:
-        """Stacked ν (N, Σp), [H J], the landmark's records, R and the log-density of rows taken as outliers."""
+        """Stacked ν (N, Σp), [H J], the landmark's records, R and the log-density of rows taken as outliers.
+
+        With a prior, rows whose likelihood is not Gaussian pass its gate or take no part.
+        """
         _, records = self._read(np.array([rows[0].landmark]))
         nus, jacs, noises, masks = [], [], [], []
         log_factor = np.zeros(state.shape[0])
@@ -203,9 +211,10 @@ class RowEngine:
             nu, jac = linearise(group.model, self.space, z, state[:, None, :], records.mean, records.const)
             assert jac.state is not None and jac.landmark is not None
             mask = row.mask
-            if group.likelihood is not None and group.likelihood.form != 0:
+            likelihood = _likelihood(group)
+            if prior is not None and likelihood.form != 0:
                 cov = reference.innovation_covariance(jac.landmark, records.cov, group.cov[row.k])
-                mask, log_row = reference.gated(nu, jac.state, cov, group.likelihood, prior, mask)
+                mask, log_row = reference.gated(nu, jac.state, cov, likelihood, prior, mask)
                 log_factor += log_row
             nus.append(nu[:, 0].copy())
             jacs.append(np.concatenate([jac.state[:, 0], jac.landmark[:, 0]], axis=-1))
@@ -217,12 +226,22 @@ class RowEngine:
     def _correct_joint(
         self, rows: list[Row], groups: Sequence[Observations], state: np.ndarray, log_density: np.ndarray
     ) -> None:
-        nu, jac, records, noise, log_factor = self._joint(rows, groups, state)
+        """Stacked where all rows are Gaussian; else one after the other, each with its own likelihood's density.
+
+        They are sorted by what was measured, so that the order within a frame does not matter.
+        """
+        if any(_likelihood(groups[row.group]).form != 0 for row in rows):
+            for row in sorted(rows, key=lambda row: groups[row.group].z[row.k].tolist()):
+                mask = None if row.mask is None else row.mask[:, None]
+                batch = Batch(row.group, np.array([row.k]), np.array([row.landmark]), mask)
+                self._correct_once(batch, np.zeros(1, dtype=np.int64), groups[row.group], state, log_density)
+            return
+        nu, jac, records, noise, _ = self._joint(rows, groups, state)
         jac_map = jac[:, None, :, self.space.dim :]
         mean, cov, log_terms = reference.updated(
             nu[:, None], jac_map, records.mean, records.cov, noise[:, None], GAUSSIAN
         )
-        log_density += log_terms[:, 0] + log_factor
+        log_density += log_terms[:, 0]
         ids = np.array([rows[0].landmark])
         self._write(ids, self._read(ids)[0], mean, cov)
 
@@ -245,3 +264,7 @@ class RowEngine:
         columns[0, end : end + mean.shape[1]] = (joint - total[:, None]).T
         self._write(ids, columns, new_mean[:, None], new_cov[:, None])
         return total
+
+
+def _likelihood(group: Observations) -> Likelihood:
+    return group.likelihood or GAUSSIAN

@@ -97,6 +97,6 @@ class Belief:
         return mode + mean, (weights[..., None] * (within + between)).sum(axis=0)
 
     def _covariance(self, jac_state: np.ndarray, jac_map: np.ndarray, cov: np.ndarray) -> np.ndarray:
-        moved = jac_state @ self.prior.factor[:, None]
+        moved = jac_state @ self.prior.spread(self.prior.mean)[:, None]
         total = jac_map @ cov @ np.swapaxes(jac_map, -1, -2) + moved @ np.swapaxes(moved, -1, -2)
         return gaussian.symmetrise(total)

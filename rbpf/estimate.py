@@ -29,7 +29,7 @@ def mixture_estimate(prior: Prior, proposed: Proposed | None, log_weights: np.nd
     if proposed is not None:
         increment = prior.mean + np.einsum("nar,nr->na", factor, proposed.mean)
         centres = prior.at(increment)
-        factor = factor @ proposed.root
+        factor = prior.spread(increment) @ proposed.root
     mean = prior.space.mean(centres, weights)
     spread = prior.space.local(mean, centres)
     between = np.einsum("n,na,nb->ab", weights, spread, spread)

@@ -66,6 +66,10 @@ class Prior:
         """States (N, E) at the mean."""
         return self.base if self.centred else self.at(self.mean)
 
+    def spread(self, increment: np.ndarray) -> np.ndarray:
+        """The factor (N, d, r) in the charts at the states at increments (N or 1, d), to first order."""
+        return self.factor if self.centred else self.space.right_jacobian(increment) @ self.factor
+
     def take(self, ancestors: np.ndarray) -> "Prior":
         """The laws of the ancestors."""
         return replace(

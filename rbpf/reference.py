@@ -49,21 +49,26 @@ def information(
     return Terms(info, vector, np.square(white_nu).sum(axis=(1, 2)), log_det, log_factor, k * p)
 
 
+def log_normaliser(cov: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """½ log|2πS| of some of the stacked rows, (N, p, p) and (p,) bool → (N,)."""
+    chol = gaussian.cholesky(2.0 * np.pi * cov[:, rows][:, :, rows])
+    return 0.5 * gaussian.log_det(chol)
+
+
 def gated(
     nu: np.ndarray,
     jac_state: np.ndarray,
     cov: np.ndarray,
     likelihood: Likelihood,
-    prior: Prior | None,
+    prior: Prior,
     mask: np.ndarray | None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Which particles take an observation as an inlier (N, K), and the log-density (N,) that this adds.
 
-    With a prior, the gate is at the prediction: its covariance is S + H Q Hᵀ.
+    The gate is at the prediction: its covariance is S + H Q Hᵀ.
     """
-    if prior is not None:
-        spread = jac_state @ prior.factor[:, None]
-        cov = cov + spread @ np.swapaxes(spread, -1, -2)
+    spread = jac_state @ prior.factor[:, None]
+    cov = cov + spread @ np.swapaxes(spread, -1, -2)
     inlier = likelihood.inlier(nu, cov)
     seen = np.ones_like(inlier) if mask is None else mask.reshape(inlier.shape)
     used = seen & inlier

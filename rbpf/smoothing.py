@@ -71,9 +71,9 @@ def _transition_log_density(
         raise InputError("backward simulation takes motion models without a substate")
     factor = transition.noise_factor
     cov = factor @ np.swapaxes(factor, -1, -2)
-    sign, log_det = np.linalg.slogdet(cov)
-    if (sign <= 0).any():
+    if (np.linalg.matrix_rank(factor) < motion.space.dim).any():
         raise InputError("backward simulation needs a motion model with regular noise")
+    log_det = np.linalg.slogdet(cov)[1]
     increment = motion.space.local(transition.mean[None], after[:, None])
     solved = np.einsum("nab,jnb->jna", np.broadcast_to(np.linalg.inv(cov), (before.shape[0], *cov.shape[1:])), increment)
     jacobian = motion.space.right_jacobian_inverse(increment)

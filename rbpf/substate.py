@@ -132,9 +132,10 @@ class KalmanSubstate(Conditional):
             nu, jacobians = linearise(
                 group.model, self.space, group.z, state[:, None, :], substate=substate[:, None, :]
             )
-            zero = np.zeros((*nu.shape, self.space.dim))
-            jac = np.concatenate([zero if jacobians.state is None else jacobians.state,
-                                  np.broadcast_to(jacobians.substate, (*nu.shape, m))], axis=-1)
+            assert jacobians.substate is not None
+            by_state = np.zeros((1, 1, 1, 1)) if jacobians.state is None else jacobians.state
+            blocks = ((by_state, self.space.dim), (jacobians.substate, m))
+            jac = np.concatenate([np.broadcast_to(block, (*nu.shape, size)) for block, size in blocks], axis=-1)
             for k in range(group.z.shape[0]):
                 nus.append(np.broadcast_to(nu[:, k], (n, nu.shape[2])).copy())
                 jacs.append(np.broadcast_to(jac[:, k], (n, *jac.shape[2:])).copy())

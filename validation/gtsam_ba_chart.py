@@ -1,7 +1,7 @@
 """Poses and tangents of GTSAM in ours.
 
 Pose2 has the tangent [v, ω], Pose3 [ω, v]. In GTSAM 4.3 both retract by the exponential map on the right, so
-that only the order differs from ours and a BetweenFactor's residual is Log(δ⁻¹ x⁻¹ y), with exact derivatives.
+only the order differs from ours, and a BetweenFactor's residual is Log(δ⁻¹ x⁻¹ y) with exact derivatives.
 The tests check this of the installed build.
 """
 

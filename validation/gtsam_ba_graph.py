@@ -125,7 +125,7 @@ class Problem:
             return self._turned_odometry(keys, self.m.deltas[step - 1], np.where(null, 0.0, variances), axes)
         order = self.chart.order
         cov = ((axes * variances) @ axes.T)[np.ix_(order, order)]
-        noise = gtsam.noiseModel.Gaussian.Covariance(cov)
+        noise = _noise(cov)
         return self.chart.between(*keys, self.chart.pose(self.m.deltas[step - 1]), noise)
 
     def _turned_odometry(self, keys: tuple[int, int], delta: Array, variances: Array, axes: Array) -> Any:
@@ -156,7 +156,7 @@ class Problem:
                 jacobians[0], jacobians[1] = by_state[:, chart.order], by_landmark
             return -model.residual(z, model.predict(state, landmark))
 
-        noise = gtsam.noiseModel.Gaussian.Covariance(self.m.cov_z[row])
+        noise = _noise(self.m.cov_z[row])
         if self.robust is not None:
             huber = gtsam.noiseModel.mEstimator.Huber.Create(self.robust)
             noise = gtsam.noiseModel.Robust.Create(huber, noise)
@@ -173,3 +173,8 @@ class Problem:
             raise InputError(
                 f"The sighting of {place} has a singular covariance, expected noise in all of it."
             )
+
+
+def _noise(cov: Array) -> Any:
+    # False, because GTSAM's search for diagonal matrices drops every covariance below 1e-8.
+    return gtsam.noiseModel.Gaussian.Covariance(cov, False)

@@ -15,14 +15,14 @@ CHUNK = 50
 
 _ROUGH = 1e-6
 _EXACT = 1e-11
-_ITERATIONS = 100
+_ITERATIONS = 200
 _DAMPING = 1e-5
-_MAX_DAMPING = 1e8
+_MAX_DAMPING = 1e10
 _SYMBOL = re.compile(r"\(Symbol: ([xl])(\d+)\)")
 
 
 def optimise(problem: Problem, graph: Any, values: Any) -> tuple[Any, int]:
-    """Levenberg-Marquardt with soft constraints, then Gauss-Newton with hard ones until the error stands.
+    """Levenberg-Marquardt until the error stands; singular odometry is softened first, then Gauss-Newton's.
 
     The loops are here because GTSAM's own optimisers copy all values at every call of a factor written in
     Python, a hundred times the cost; linearisation, elimination and retraction are GTSAM's.
@@ -33,15 +33,23 @@ def optimise(problem: Problem, graph: Any, values: Any) -> tuple[Any, int]:
         values: where to start.
 
     Returns:
-        The optimum and the number of iterations of both.
+        The optimum and the number of iterations.
 
     Raises:
         InputError: it did not converge.
     """
-    soft = problem.graph(soft=True) if problem.singular else graph
-    near, rough = _levenberg_marquardt(soft, values)
-    optimum, exact = _gauss_newton(graph, near)
-    return optimum, rough + exact
+    softened = 0
+    if problem.singular:
+        near, softened, _ = _levenberg_marquardt(problem.graph(soft=True), values, _ROUGH)
+        optimum, count, converged = _gauss_newton(graph, near)
+    else:
+        optimum, count, converged = _levenberg_marquardt(graph, values, _EXACT)
+    if not converged:
+        raise InputError(
+            f"The batch optimisation of {problem.m.recording} did not converge in {count} iterations; "
+            "start it incrementally or from the filter's estimate, or ask for the robust loss."
+        )
+    return optimum, softened + count
 
 
 def incremental(problem: Problem) -> Any:
@@ -98,24 +106,39 @@ def explain(problem: Problem, error: RuntimeError) -> InputError:
     index = int(symbol[2])
     place = f"the pose of step {index}" if symbol[1] == "x" else f"landmark {problem.names[index]}"
     return InputError(
-        f"GTSAM could not solve {problem.m.recording}: the measurements do not determine {place}; "
-        "check the covariances around it."
+        f"GTSAM could not solve {problem.m.recording}: "
+        f"the measurements do not determine everything near {place}; check the covariances there."
     )
 
 
-def _levenberg_marquardt(graph: Any, values: Any) -> tuple[Any, int]:
+def _levenberg_marquardt(graph: Any, values: Any, tolerance: float) -> tuple[Any, int, bool]:
     error, damping = graph.error(values), _DAMPING
     for count in range(1, _ITERATIONS + 1):
-        linear = graph.linearize(values)
-        while not (moved_error := graph.error(moved := _damped_step(linear, values, damping))) <= error:
+        linear, slack = graph.linearize(values), tolerance * max(1.0, error)
+        while damping <= _MAX_DAMPING:
+            moved = _damped_step(linear, values, damping)
+            before, after = error, graph.error(moved)
+            if after <= before + slack:
+                break
             damping *= 10
-            if damping > _MAX_DAMPING:
-                return values, count
-        decrease, values, error = error - moved_error, moved, moved_error
-        if decrease <= _ROUGH * error:
-            break
+        else:
+            return values, count, False
+        values, error = moved, after
+        if before - after <= slack:
+            return values, count, True
         damping /= 10
-    return values, count
+    return values, _ITERATIONS, False
+
+
+def _gauss_newton(graph: Any, values: Any) -> tuple[Any, int, bool]:
+    # Steps are not refused: on the way to the constraints the error may rise.
+    error = graph.error(values)
+    for count in range(1, _ITERATIONS + 1):
+        before, values = error, _step(graph.linearize(values), values)
+        error = graph.error(values)
+        if abs(before - error) <= _EXACT * max(1.0, before):
+            return values, count, True
+    return values, _ITERATIONS, False
 
 
 def _damped_step(linear: Any, values: Any, damping: float) -> Any:
@@ -126,19 +149,6 @@ def _damped_step(linear: Any, values: Any, damping: float) -> Any:
         unit = gtsam.noiseModel.Unit.Create(dim)
         damped.push_back(gtsam.JacobianFactor(key, np.sqrt(damping) * np.eye(dim), np.zeros(dim), unit))
     return _step(damped, values)
-
-
-def _gauss_newton(graph: Any, values: Any) -> tuple[Any, int]:
-    error = graph.error(values)
-    for count in range(1, _ITERATIONS + 1):
-        before, values = error, _step(graph.linearize(values), values)
-        error = graph.error(values)
-        if abs(before - error) <= _EXACT * max(1.0, before):
-            return values, count
-    raise InputError(
-        f"The batch optimisation did not converge in {_ITERATIONS} iterations (error {error:.6g}); "
-        "start it incrementally, or from the filter's estimate."
-    )
 
 
 def _step(linear: Any, values: Any) -> Any:

@@ -10,7 +10,6 @@ from rbpf.anchoring import Anchored
 from rbpf.filter import Filter
 from rbpf.models import Records
 from rbpf.sensors.range_bearing import RelativePosition
-from rbpf.validation.matching import match_points
 
 
 @dataclass(frozen=True)
@@ -27,11 +26,9 @@ class MapSummary:
     mean: np.ndarray
     cov: np.ndarray
 
-    def named(self, truth: dict[int, np.ndarray], anonymous: bool) -> dict[int, np.ndarray]:
-        """Positions by the truth's names; anonymous landmarks get the name of the nearest true one, one to one."""
-        if not anonymous:
-            return dict(zip(self.ids.tolist(), self.mean, strict=True))
-        return match_points(self.mean, truth)
+    def named(self) -> dict[int, np.ndarray]:
+        """Positions by name."""
+        return dict(zip(self.ids.tolist(), self.mean, strict=True))
 
 
 def summarise_map(filter_: Filter, anchored: Anchored | None = None) -> MapSummary:

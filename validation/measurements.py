@@ -7,6 +7,7 @@ from typing import Literal, NamedTuple, final
 import numpy as np
 from numpy.typing import NDArray
 
+from rbpf import gaussian
 from rbpf.errors import InputError
 from rbpf.lie import Array, SE2Group, SE3Group
 from rbpf.sensors.range_bearing import RangeBearing, RelativePosition
@@ -141,11 +142,11 @@ def from_log(log: RobotLog, start: Array | None = None) -> Measurements:
         start=space.identity() if start is None else start,
         stamps_ns=np.array([frame.stamp_ns for frame in log.frames], dtype=np.int64),
         deltas=np.array([delta for delta, _ in moves]).reshape(-1, space.size),
-        covs=np.array([cov for _, cov in moves]).reshape(-1, space.dim, space.dim),
+        covs=gaussian.symmetrise(np.array([cov for _, cov in moves]).reshape(-1, space.dim, space.dim)),
         steps=np.repeat(np.arange(len(log.frames)), [len(frame.z) for frame in log.frames]),
         landmarks=_stacked(log.frames, "landmarks", ()).astype(np.int64),
         z=_stacked(log.frames, "z", (point,)),
-        cov_z=_stacked(log.frames, "cov_z", (point, point)),
+        cov_z=gaussian.symmetrise(_stacked(log.frames, "cov_z", (point, point))),
     )
 
 

@@ -79,12 +79,8 @@ def _solve_batch(finished: Run) -> tuple[np.ndarray, dict[str, Any]]:
     measurements = used_measurements(finished)
     long = len(measurements.stamps_ns) > 2000
     solution = solve(measurements, marginals=False, incremental=long)
-    names = solution.landmarks
-    if finished.config.association == "ml" and log.truth is not None:
-        from rbpf.validation.matching import match_points
-
-        names = match_points(np.array(list(names.values())), log.truth.landmarks)
-    entries = reported(score(log, solution.world_from_robot, names), "batch_")
+    anonymous = finished.config.association == "ml"
+    entries = reported(score(log, solution.world_from_robot, solution.landmarks, anonymous), "batch_")
     at = as_trajectory(log, measurements.stamps_ns, solution.world_from_robot).positions
     ours = as_trajectory(log, measurements.stamps_ns, finished.progress.mean).positions
     entries["batch_error"] = float(solution.error)

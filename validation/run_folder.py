@@ -128,8 +128,7 @@ def summarise(run: Run, summary_map: MapSummary) -> dict[str, Any]:
     """The entries of summary.json."""
     progress, config = run.progress, run.config
     milliseconds = progress.seconds * 1e3
-    truth = {} if run.log.truth is None else run.log.truth.landmarks
-    scores = score(run.log, progress.mean, summary_map.named(truth, config.association == "ml"))
+    scores = score(run.log, progress.mean, summary_map.named(), config.association == "ml")
     evidence = run.filter.log_evidence
     return {
         "system": "range-bearing",

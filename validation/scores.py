@@ -8,6 +8,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE2Group, SE3Group
 from rbpf.sensors.readers.log import RobotLog, Truth
 from rbpf.validation.accuracy import ate, landmark_errors, rpe
+from rbpf.validation.matching import match_points
 from rbpf.validation.trajectory import Trajectory
 
 LONGEST_GAP_NS = 500_000_000
@@ -62,25 +63,35 @@ def truth_at(space: SE2Group | SE3Group, truth: Truth, stamps_ns: np.ndarray) ->
     return rows, poses
 
 
-def score(log: RobotLog, world_from_robot: np.ndarray, landmarks: dict[int, np.ndarray] | None = None) -> Scores:
+def score(
+    log: RobotLog,
+    world_from_robot: np.ndarray,
+    landmarks: dict[int, np.ndarray] | None = None,
+    anonymous: bool = False,
+) -> Scores:
     """Scores poses (T, E) at the log's frames, and landmarks by the log's names.
 
     Args:
         log: the recording, with its truth.
         world_from_robot: (T, E) estimated poses.
         landmarks: name to (D,) position; None scores the path alone.
+        anonymous: the names are the map's own; each landmark is scored as the true one nearest to it once the path
+            is aligned, one to one.
     """
     if log.truth is None:
         return Scores()
     stamps = np.array([frame.stamp_ns for frame in log.frames])
     rows, true_poses = truth_at(log.space, log.truth, stamps)
     values: dict[str, float | int | None] = {"scored_instants": int(rows.size)}
+    alignment = None
     if rows.size > 2:
         estimate = as_trajectory(log, stamps[rows], world_from_robot[rows])
         reference = as_trajectory(log, stamps[rows], true_poses)
         relative = rpe(estimate, reference)
+        aligned = ate(estimate, reference, "rigid")
+        alignment = aligned.alignment
         values |= {
-            "ate_rmse_m": ate(estimate, reference, "rigid").rmse,
+            "ate_rmse_m": aligned.rmse,
             "path_rmse_m": ate(estimate, reference).rmse,
             "rpe_translation_rmse_m": relative.translation_rmse,
             "rpe_rotation_rmse_deg": relative.rotation_rmse_deg,
@@ -88,6 +99,8 @@ def score(log: RobotLog, world_from_robot: np.ndarray, landmarks: dict[int, np.n
     if landmarks and log.truth.landmarks:
         dim = 2 if isinstance(log.space, SE2Group) else 3
         truth = {name: point[:dim] for name, point in log.truth.landmarks.items()}
+        if anonymous:
+            landmarks = match_points(np.array(list(landmarks.values())), truth, alignment)
         try:
             values["landmark_error_mean_m"] = landmark_errors(landmarks, truth).mean
             values["landmark_error_aligned_mean_m"] = landmark_errors(landmarks, truth, "rigid").mean

@@ -7,6 +7,7 @@ import numpy as np
 from rbpf.conformance.arguments import Scene
 from rbpf.conformance.calls import FindingError, named, require, require_close, require_type
 from rbpf.kernels.signature import BLOCK
+from rbpf.kernels.single import call_kernel
 from rbpf.models import FusedKernel, Jacobians, ObservationModel
 from rbpf.numeric import numeric_jacobians
 
@@ -14,6 +15,7 @@ KERNEL_TOLERANCE = 1e-9
 GUARD = 64 * BLOCK
 """Numbers in front of and behind each output, which the kernel must leave alone."""
 _MARK = 1.5e300
+_OUTPUTS = ("nu", "jac_state", "jac_landmark")
 
 
 def check_kernel(model: ObservationModel, scene: Scene, numeric_tolerance: float) -> None:
@@ -22,8 +24,6 @@ def check_kernel(model: ObservationModel, scene: Scene, numeric_tolerance: float
     require_type(name, fused, FusedKernel, type(None))
     if fused is None or scene.landmark is None:
         return
-    compiled = hasattr(fused.function, "py_func")
-    require(compiled, f"{name} gives a plain function: decorate it with @observation_kernel")
     plain = isinstance(fused.params, np.ndarray) and fused.params.dtype == float and fused.params.ndim == 1
     require(plain, f"{name} gives params that are not one axis of float64 numbers")
     lanes = scene.lanes()
@@ -49,11 +49,13 @@ def _run(
     outputs = [_Guarded(shape) for shape in shapes]
     inputs = [_block(part) for part in (lanes.state, lanes.landmark, lanes.const)]
     try:
-        fused.function(*inputs, np.array(z), fused.params, count, *(output.array for output in outputs))
+        arrays = [output.array for output in outputs]
+        call_kernel(fused.function, *inputs, np.array(z), fused.params, count, *arrays)
     except TypeError as error:
-        raise FindingError(f"{name} has the wrong signature: decorate it with @observation_kernel") from error
-    for what, output in zip(("nu", "jac_state", "jac_landmark"), outputs, strict=True):
+        raise FindingError(f"{name} gives no fused kernel: decorate it with @observation_kernel") from error
+    for what, output in zip(_OUTPUTS, outputs, strict=True):
         require(output.intact, f"{name} writes outside {what}, which has shape {output.array.shape}")
+    for what, output in zip(_OUTPUTS, outputs, strict=True):
         filled = np.isfinite(output.array[..., :count]).all()
         require(filled, f"{name} leaves entries of {what} unfilled, or fills them with NaN")
     nu, by_state, by_landmark = (np.moveaxis(output.array[..., :count], -1, 0) for output in outputs)

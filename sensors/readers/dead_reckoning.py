@@ -1,15 +1,15 @@
 """Motion and its covariance from readings of speed and turn rate.
 
 A reading holds until the next one, so that the motion over a piece of length dt is exactly
-Exp(dt [turn rate, speed, 0]). The noise is one error of the turn rate and one of the speed for a whole
-interval between two instants, independent between intervals:
+Exp(dt [turn rate, speed, 0]). Both carry white noise, whose standard deviations are therefore densities, per
+root second: over a time T the heading drifts by std_turn_rate * sqrt(T), and the noise of a piece is independent
+of that of the others,
 
-    delta = prod_k Exp(dt_k [omega_k + e_omega, v_k + e_v, 0]),
-    e_omega ~ N(0, std_turn_rate^2),  e_v ~ N(0, std_speed^2)
+    delta = prod_k Exp(dt_k [omega_k, v_k, 0] + sqrt(dt_k) [e_omega, e_v, 0]),
+    e_omega ~ N(0, std_turn_rate^2),  e_v ~ N(0, std_speed^2).
 
-Its covariance is G diag(std_turn_rate^2, std_speed^2) G^T with G = d delta / d e in the right chart. It has
-rank two: a wheeled robot does not slip sideways in this model. Errors that are independent from reading to
-reading would average out within a step, which gives far too small a covariance.
+Its covariance is sum_k G_k diag(std_turn_rate^2, std_speed^2) G_k^T dt_k with G_k the derivative in the right
+chart. No piece slips sideways, so that the covariance of a single piece is singular.
 """
 
 import numpy as np
@@ -30,11 +30,11 @@ def integrate(
         instants_ns: (T,) times in strict order.
 
     Returns:
-        delta (T - 1, 3), elements of SE(2), and their derivative G (T - 1, 3, 2) by a constant error of
-        (turn rate, speed), in the right chart at delta.
+        delta (T - 1, 3), elements of SE(2), and their covariance (T - 1, 2, 3, 3) by unit noise of the turn rate
+        and by unit noise of the speed, in the right chart at delta.
     """
     if len(instants_ns) == 1:
-        return np.empty((0, 3)), np.empty((0, 3, 2))
+        return np.empty((0, 3)), np.empty((0, 2, 3, 3))
     within = readings_ns[(readings_ns > instants_ns[0]) & (readings_ns < instants_ns[-1])]
     edges = np.union1d(instants_ns, within)
     dt = np.diff(edges) / 1e9
@@ -45,10 +45,11 @@ def integrate(
     start, end = bounds[:-1], bounds[1:]
     chain = _chain(xi)
     delta = SE2.between(chain[start], chain[end])
-    # An error at the end of a piece is carried through the rest of its interval.
+    # The noise of a piece of a piece is carried through the rest of its interval.
     end_from_piece = SE2.between(chain[np.repeat(end, end - start)], chain[1:])
-    gain = SE2.adjoint(end_from_piece) @ SE2.right_jacobian(xi)[:, :, :2] * dt[:, None, None]
-    return delta, np.add.reduceat(gain, start, axis=0)
+    gain = np.moveaxis(SE2.adjoint(end_from_piece) @ SE2.right_jacobian(xi)[:, :, :2], 2, 1)
+    gain *= np.sqrt(dt)[:, None, None]
+    return delta, np.add.reduceat(gain[..., :, None] * gain[..., None, :], start, axis=0)
 
 
 def _chain(xi: Array) -> Array:

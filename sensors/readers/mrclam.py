@@ -116,10 +116,9 @@ def _read_motion(path: Path, stamps_ns: NDArray[np.int64], noise: LogNoise) -> t
     table = read_columns(path, ("time", "forward speed", "turn rate"), KIND)
     readings_ns = table.stamps_ns()
     _require_odometry_until(table, readings_ns, int(stamps_ns[-1]))
-    delta, jacobian = integrate(readings_ns, table["turn rate"], table["forward speed"], stamps_ns)
-    std = np.array([noise.std_turn_rate_radps, noise.std_speed_mps], dtype=float)
-    factor = jacobian * std
-    return delta, noise.odometry_variance_factor() * factor @ factor.mT
+    delta, cov = integrate(readings_ns, table["turn rate"], table["forward speed"], stamps_ns)
+    variance = np.square(np.array([noise.std_turn_rate_radps, noise.std_speed_mps], dtype=float))
+    return delta, noise.odometry_variance_factor() * np.einsum("tsab,s->tab", cov, variance)
 
 
 def _require_odometry_until(table: Table, readings_ns: NDArray[np.int64], last_ns: int) -> None:

@@ -22,8 +22,8 @@ class LogNoise:
         std_range_m: of a measured range [m].
         std_bearing_rad: of a measured bearing (yaw) [rad].
         std_pitch_rad: of a measured pitch [rad].
-        std_speed_mps: of the forward speed, one error for a whole step [m/s].
-        std_turn_rate_radps: of the turn rate, one error for a whole step [rad/s].
+        std_speed_mps: of the forward speed, white noise: its density [m/s per root hertz].
+        std_turn_rate_radps: of the turn rate, white noise: its density [rad/s per root hertz].
         std_position_m: of each coordinate of a measured position [m].
         scale_odometry: multiplies the odometry's standard deviations.
     """

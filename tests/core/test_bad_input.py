@@ -13,6 +13,7 @@ from rbpf.models import (
     NEW,
     NULL,
     Jacobians,
+    Likelihood,
     MotionModel,
     ObservationModel,
     Part,
@@ -25,6 +26,7 @@ from rbpf.resampling import EssTriggered, Systematic
 from rbpf.sensors.range_bearing import RangeBearing
 from rbpf.substate import KalmanSubstate
 from tests.core.scripted import Scripted, fails, seen
+from tests.core.worlds import Recipe, content, drive, planar_world, same
 
 N = 6
 LINE = Euclidean(1)
@@ -266,3 +268,29 @@ def test_particles_of_weight_zero_do_no_harm():
     assert np.isfinite(report.log_evidence)
     assert np.isfinite(report.estimate.cov).all()
     assert filter_.particles.weights[2] == 0.0
+
+
+class Impossible(Likelihood):
+    """Zero everywhere, which only the correction finds out."""
+
+    def log_density(self, nu, cov):
+        return np.full(nu.shape[:-1], -np.inf)
+
+
+def test_a_failed_correction_is_undone_by_loading(tmp_path):
+    recipe, world = Recipe(n=N), planar_world(6, seed=2)
+    filter_ = recipe.build()
+    drive(filter_, world, 0, 4)
+    filter_.save(tmp_path / "run.npz")
+    before = content(filter_)
+    likelihood = filter_.sensors[0].likelihood
+    filter_.sensors[0].likelihood = Impossible()
+    with pytest.raises(InputError, match="step 4: all particle weights are zero"):
+        drive(filter_, world, 4)
+    filter_.sensors[0].likelihood = likelihood
+    filter_.load(tmp_path / "run.npz")
+    assert same(content(filter_), before)
+    drive(filter_, world, 4)
+    uninterrupted = recipe.build()
+    drive(uninterrupted, world)
+    assert same(content(filter_), content(uninterrupted))

@@ -93,7 +93,7 @@ class TestLandmarks:
 
     def test_a_map_that_is_not_there(self):
         with pytest.raises(InputError, match="needs a landmark map: give the filter a LandmarkMap"):
-            _ = on_a_line().belief().map
+            _ = Filter(OdometryMotion(SE2), Scripted(), n=N).belief().map
 
     def test_landmarks_of_some_particles_in_a_map_without_evidence(self, filter_):
         births = Births(

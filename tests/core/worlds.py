@@ -112,8 +112,8 @@ def drive(
 
 
 def content(filter_: Filter) -> dict[str, np.ndarray]:
-    """Everything that a filter holds, but its random generator."""
-    return {
+    """A copy of everything that a filter holds, but its random generator."""
+    arrays = {
         "state": filter_.particles.state,
         "log_weights": filter_.particles.log_weights,
         "log_evidence": np.array(filter_.log_evidence),
@@ -122,6 +122,7 @@ def content(filter_: Filter) -> dict[str, np.ndarray]:
         **filter_.history.arrays(),
         **filter_.marginals.arrays(),
     }
+    return {name: array.copy() for name, array in arrays.items()}
 
 
 def same(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> bool:

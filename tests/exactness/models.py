@@ -8,7 +8,16 @@ import numpy as np
 
 from rbpf.filter import Filter
 from rbpf.lie import Euclidean
-from rbpf.models import Births, Jacobians, MotionModel, ObservationModel, Observations, Part, Sensor, Transition
+from rbpf.models import (
+    Births,
+    Jacobians,
+    MotionModel,
+    ObservationModel,
+    Observations,
+    Part,
+    Sensor,
+    Transition,
+)
 
 SEEDS = 500
 
@@ -41,7 +50,9 @@ class LinearObservation(ObservationModel):
 
     def __init__(self, by_state=None, by_substate=None):
         matrices = {Part.STATE: by_state, Part.SUBSTATE: by_substate}
-        self.matrices = {part: np.atleast_2d(matrix) for part, matrix in matrices.items() if matrix is not None}
+        self.matrices = {
+            part: np.atleast_2d(matrix) for part, matrix in matrices.items() if matrix is not None
+        }
         self.reads = frozenset(self.matrices)
         self.dim = next(iter(self.matrices.values())).shape[0]
 
@@ -52,11 +63,15 @@ class LinearObservation(ObservationModel):
     def joint_matrix(self, motion: LinearMotion) -> np.ndarray:
         """H of (x, s) together."""
         sizes = {Part.STATE: motion.space.dim, Part.SUBSTATE: len(motion.joint()[0]) - motion.space.dim}
-        return np.hstack([self.matrices.get(part, np.zeros((self.dim, size))) for part, size in sizes.items()])
+        return np.hstack(
+            [self.matrices.get(part, np.zeros((self.dim, size))) for part, size in sizes.items()]
+        )
 
     def jacobians(self, state, landmark=None, const=None, substate=None):
         batch = np.broadcast_shapes(*(x.shape[:-1] for x in (state, substate) if x is not None))
-        full = {part: np.broadcast_to(matrix, (*batch, *matrix.shape)) for part, matrix in self.matrices.items()}
+        full = {
+            part: np.broadcast_to(matrix, (*batch, *matrix.shape)) for part, matrix in self.matrices.items()
+        }
         return Jacobians(state=full.get(Part.STATE), substate=full.get(Part.SUBSTATE))
 
 
@@ -143,7 +158,11 @@ def smooth(path: Sequence[Moments], F: np.ndarray, Q: np.ndarray, inputs: np.nda
 
 
 def log_ratios(
-    build: Callable[[np.random.Generator], Filter], frames: Sequence[Any], exact: float, stream: int, seeds: int = SEEDS
+    build: Callable[[np.random.Generator], Filter],
+    frames: Sequence[Any],
+    exact: float,
+    stream: int,
+    seeds: int = SEEDS,
 ) -> np.ndarray:
     """Log-evidence of one run per seed over the exact one; tests that differ in `stream` share no random numbers."""
 

@@ -68,7 +68,9 @@ class LinearSlam:
         still = len(kalman.mean) - moving
         padding = np.zeros(still)
         kalman.predict(
-            block_diag(self.F, np.eye(still)), block_diag(self.Q, np.zeros((still, still))), np.append(self.drift, padding)
+            block_diag(self.F, np.eye(still)),
+            block_diag(self.Q, np.zeros((still, still))),
+            np.append(self.drift, padding),
         )
         for landmark, measured in zip(seen, z, strict=True):
             at = moving + 2 * landmark
@@ -116,5 +118,3 @@ def unnormalised_errors(
         first.append(ratio * error)
         second.append(ratio * (cov + np.outer(error, error) - exact.cov))
     return np.array(logs), np.array(first), np.array(second)
-
-

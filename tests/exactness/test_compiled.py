@@ -21,7 +21,9 @@ every_sensor = pytest.mark.parametrize(
     ("space", "which"), [(space, which) for space in (SE2, SE3) for which in (0, 1)], ids=str
 )
 every_likelihood = pytest.mark.parametrize(
-    "likelihood", [Gaussian(), TruncatedMahalanobis(4.0), GaussianWithOutliers(0.05, 300.0)], ids=lambda x: type(x).__name__
+    "likelihood",
+    [Gaussian(), TruncatedMahalanobis(4.0), GaussianWithOutliers(0.05, 300.0)],
+    ids=lambda x: type(x).__name__,
 )
 
 
@@ -35,7 +37,9 @@ def with_outliers(group: Observations) -> Observations:
     z = group.z.copy()
     z[1] += 0.9
     z[2] += 0.25
-    return Observations(z, group.cov, group.model, group.likelihood, group.ids, group.log_new, group.log_clutter)
+    return Observations(
+        z, group.cov, group.model, group.likelihood, group.ids, group.log_new, group.log_clutter
+    )
 
 
 def associations(kind: str, rng: np.random.Generator) -> np.ndarray:
@@ -94,9 +98,13 @@ def drive(space, which: int, likelihood, proposal, compiled: bool) -> Filter:
     model = sensors(space, rng)[which]
     landmarks = rng.normal(scale=4.0, size=(8, dim)) + 6.0
     noise, cov = random_covs(rng, (8,), dim, 0.05), 0.003 * np.eye(space.dim)
-    delta = space.exp(np.array([0.1, 0.4, 0.0]) if space is SE2 else np.array([0.05, 0.0, 0.1, 0.4, 0.0, 0.0]))
+    delta = space.exp(
+        np.array([0.1, 0.4, 0.0]) if space is SE2 else np.array([0.05, 0.0, 0.1, 0.4, 0.0, 0.0])
+    )
     held = LandmarkMap(space, compiled=compiled)
-    filter_ = Filter(OdometryMotion(space), Scripted(), held, proposal, n=PARTICLES, rng=np.random.default_rng(7))
+    filter_ = Filter(
+        OdometryMotion(space), Scripted(), held, proposal, n=PARTICLES, rng=np.random.default_rng(7)
+    )
     truth = space.identity()
     for step in range(10):
         truth = space.compose(truth, delta)
@@ -111,7 +119,9 @@ def drive(space, which: int, likelihood, proposal, compiled: bool) -> Filter:
     return filter_
 
 
-@pytest.mark.parametrize("proposal", [PriorProposal(), EkfProposal(), EkfProposal(iterations=2)], ids=["prior", "ekf", "iekf"])
+@pytest.mark.parametrize(
+    "proposal", [PriorProposal(), EkfProposal(), EkfProposal(iterations=2)], ids=["prior", "ekf", "iekf"]
+)
 @every_likelihood
 @every_sensor
 def test_whole_runs(space, which, likelihood, proposal):

@@ -13,7 +13,9 @@ from tests.exactness.models import Frame, Kalman, LinearMotion, LinearObservatio
 
 TOLERANCE = 1e-9
 PROPOSALS = [PriorProposal(), EkfProposal(), EkfProposal(exact=False), EkfProposal(iterations=3)]
-every_proposal = pytest.mark.parametrize("proposal", PROPOSALS, ids=["prior", "ekf", "linearised", "iterated"])
+every_proposal = pytest.mark.parametrize(
+    "proposal", PROPOSALS, ids=["prior", "ekf", "linearised", "iterated"]
+)
 
 
 @pytest.fixture
@@ -65,7 +67,13 @@ def test_everything_marginalised_is_a_kalman_filter(proposal, rank, rng):
 
 @every_proposal
 def test_a_state_without_noise_leaves_a_kalman_filter_of_the_substate(proposal, rng):
-    motion = LinearMotion(np.eye(1), np.vstack([np.zeros((1, 2)), 0.4 * np.eye(2)]), np.zeros((1, 2)), 0.9 * np.eye(2), np.ones(2))
+    motion = LinearMotion(
+        np.eye(1),
+        np.vstack([np.zeros((1, 2)), 0.4 * np.eye(2)]),
+        np.zeros((1, 2)),
+        0.9 * np.eye(2),
+        np.ones(2),
+    )
     G, C = rng.normal(size=(2, 1)), rng.normal(size=(2, 2))
     model, fix = LinearObservation(G, C), LinearObservation(by_state=np.eye(1))
     kalman = Kalman(np.zeros(2), np.eye(2))
@@ -100,7 +108,10 @@ def test_a_sampled_trajectory_is_an_exact_measurement_of_the_substate(proposal, 
         after = filter_.particles.state
         for i, kalman in enumerate(kalmans):
             joint = np.vstack([motion.B, motion.A])
-            pair = Kalman(np.concatenate([motion.F @ before[i], np.zeros(2)]) + joint @ kalman.mean, joint @ kalman.cov @ joint.T + noise)
+            pair = Kalman(
+                np.concatenate([motion.F @ before[i], np.zeros(2)]) + joint @ kalman.mean,
+                joint @ kalman.cov @ joint.T + noise,
+            )
             pair.mean[2:] += motion.b
             gain = pair.cov[2:, :2] @ np.linalg.pinv(pair.cov[:2, :2])
             kalman.mean = pair.mean[2:] + gain @ (after[i] - pair.mean[:2])

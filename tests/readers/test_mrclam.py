@@ -44,20 +44,30 @@ def opened(folder, files, noise=None):
     return open_log(write(folder, files), noise)
 
 
-def moved(turn_rate_error=0.0, speed_error=0.0):
-    """The motion of the log from 100.1 s to 101.9 s, piece by piece."""
+PIECES = [(0.2, 0.5, 0), (0.6, 0.2, 1), (0.5, 0, -2), (0.5, 0.4, 0.5)]
+
+
+def moved(noisy_piece=None, noise=(0.0, 0.0)):
+    """The motion of the log from 100.1 s to 101.9 s, piece by piece; one piece with white noise."""
     out = SE2.identity()
-    for dt, speed, turn_rate in [(0.2, 0.5, 0), (0.6, 0.2, 1), (0.5, 0, -2), (0.5, 0.4, 0.5)]:
-        out = SE2.retract(out, dt * np.array([turn_rate + turn_rate_error, speed + speed_error, 0]))
+    for number, (dt, speed, turn_rate) in enumerate(PIECES):
+        xi = dt * np.array([turn_rate, speed, 0.0])
+        if number == noisy_piece:
+            xi[:2] += np.sqrt(dt) * np.asarray(noise)
+        out = SE2.retract(out, xi)
     return out
 
 
-def moved_derivative():
-    step = 1e-6
-    columns = [
-        SE2.local(moved(), moved(*error)) - SE2.local(moved(), moved(*-error)) for error in step * np.eye(2)
-    ]
-    return np.stack(columns, axis=1) / (2 * step)
+def moved_covariance(std):
+    """Sum over pieces of numeric derivatives by their noise."""
+    step, cov = 1e-6, np.zeros((3, 3))
+    for number in range(len(PIECES)):
+        for source in range(2):
+            noise = step * np.eye(2)[source]
+            plus, minus = moved(number, noise), moved(number, -noise)
+            column = (SE2.local(moved(), plus) - SE2.local(moved(), minus)) / (2 * step) * std[source]
+            cov += np.outer(column, column)
+    return cov
 
 
 def test_frames_are_the_instants_with_a_landmark(tmp_path, caplog):
@@ -76,11 +86,10 @@ def test_odometry_is_integrated_exactly(tmp_path):
     np.testing.assert_allclose(frame.delta, moved(), atol=1e-14)
 
 
-def test_covariance_is_that_of_one_error_per_step(tmp_path):
+def test_covariance_is_that_of_white_noise(tmp_path):
     noise = LogNoise(std_turn_rate_radps=0.3, std_speed_mps=0.2, scale_odometry=2.0)
     frame = opened(tmp_path, log_files(), noise).frames[1]
-    factor = moved_derivative() * [0.3, 0.2] * 2.0
-    np.testing.assert_allclose(frame.cov_delta, factor @ factor.T, rtol=1e-7, atol=1e-10)
+    np.testing.assert_allclose(frame.cov_delta, 4 * moved_covariance([0.3, 0.2]), rtol=1e-7, atol=1e-10)
 
 
 def test_no_error_of_the_speeds_leaves_no_covariance(tmp_path):
@@ -88,15 +97,16 @@ def test_no_error_of_the_speeds_leaves_no_covariance(tmp_path):
     np.testing.assert_array_equal(opened(tmp_path, log_files(), noise).frames[1].cov_delta, 0)
 
 
-def test_straight_motion_has_no_lateral_translation_and_rank_two():
+def test_variance_of_a_straight_motion_grows_with_time_and_the_lever_with_its_cube():
     second = 10**9
-    delta, jacobian = integrate(
-        np.array([0]), np.array([0.0]), np.array([0.5]), np.array([second, 2 * second, 4 * second])
-    )
-    np.testing.assert_allclose(delta, [[0.0, 0.5, 0.0], [0.0, 1.0, 0.0]])
-    np.testing.assert_allclose(
-        jacobian, [[[1.0, 0.0], [0.0, 1.0], [0.25, 0.0]], [[2.0, 0.0], [0.0, 2.0], [1.0, 0.0]]], atol=1e-15
-    )
+    instants = np.array([second, 2 * second, 4 * second])
+    readings = np.arange(0, 4 * second, second // 100)
+    delta, cov = integrate(readings, np.zeros(400), np.full(400, 0.5), instants)
+    np.testing.assert_allclose(delta, [[0.0, 0.5, 0.0], [0.0, 1.0, 0.0]], atol=1e-12)
+    turning, driving = cov[:, 0], cov[:, 1]
+    np.testing.assert_allclose(turning[:, 0, 0], [1.0, 2.0])
+    np.testing.assert_allclose(turning[:, 2, 2], 0.25 * np.array([1.0, 8.0]) / 3, rtol=1e-4)
+    np.testing.assert_allclose(driving, [np.diag([0, 1.0, 0]), np.diag([0, 2.0, 0])], atol=1e-12)
 
 
 def test_the_robot_stands_still_before_the_first_reading():

@@ -9,7 +9,7 @@ from rbpf.validation.measurements import Measurements
 
 
 class Filtered(NamedTuple):
-    """Filtered means (T, E), their covariances (T, d, d), last map with its covariances, and the log-evidence."""
+    """Filtered means (T, E), covariances (T, d, d), the last map with its covariances, the log-evidence."""
 
     world_from_robot: Array
     cov_poses: Array
@@ -19,7 +19,7 @@ class Filtered(NamedTuple):
 
 
 def joint_ekf(m: Measurements) -> Filtered:
-    """Predict, update with all known landmarks at once, then append the new ones; the pose in the right chart."""
+    """Predict, update with all known landmarks at once, append new ones; the pose in the right chart."""
     space, model, dim = m.space, m.model(), m.space.dim
     pose, points, cov, places = m.start, np.empty((0, m.z.shape[1])), np.zeros((dim, dim)), dict[int, int]()
     path, pose_covs, log_evidence = [], [], 0.0

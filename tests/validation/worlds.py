@@ -1,5 +1,6 @@
-"""Small worlds with a tilted sensor, and the batch solution of them by SciPy, through another parametrisation."""
+"""Small worlds with a tilted sensor, and their batch solution by SciPy in another parametrisation."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -10,6 +11,8 @@ from rbpf.lie import SE2, SE3, Array
 from rbpf.validation.measurements import Kind, Measurements
 
 NAMES = np.array([41, 7, 1000, 12, 3, 26])
+MOTION = {2: np.array([0.25, 0.5, 0.0]), 3: np.array([0.05, 0.1, 0.25, 0.5, 0.0, 0.0])}
+MOUNT = {2: np.array([2.4, 0.3, -0.2]), 3: SE3.exp(np.array([0.2, 0.5, 2.4, 0.3, -0.2, 0.4]))}
 
 
 def world(
@@ -21,37 +24,49 @@ def world(
     multiplies all standard deviations.
     """
     rng = np.random.default_rng(seed)
+    m, path = _drive(dim, kind, singular, steps, noise, rng)
+    points = m.space.translation(path).mean(0) + rng.normal(scale=3.0, size=(len(NAMES), dim))
+    at, which = (x.ravel() for x in np.indices((steps, len(NAMES))))
+    kept = np.sort(rng.permutation(len(at))[: 4 * len(at) // 5])
+    factor = noise * (np.tril(rng.normal(scale=0.02, size=(len(kept), dim, dim))) + 0.03 * np.eye(dim))
+    errors = np.einsum("kij,kj->ki", factor, rng.normal(size=(len(kept), dim)))
+    z = m.model().predict(path[at[kept]], points[which[kept]]) + errors
+    return seen(m, at[kept], NAMES[which[kept]], z, factor @ factor.mT)
+
+
+def _drive(
+    dim: int, kind: Kind, singular: bool, steps: int, noise: float, rng: np.random.Generator
+) -> tuple[Measurements, Array]:
     space, d = (SE2, 3) if dim == 2 else (SE3, 6)
     std = np.full(d, 0.03 * noise)
     std[-1] = 0.0 if singular else 0.02 * noise
-    mount = np.array([2.4, 0.3, -0.2]) if dim == 2 else SE3.exp(np.array([0.2, 0.5, 2.4, 0.3, -0.2, 0.4]))
-    motion = np.zeros(d)
-    motion[[dim - 2 if dim == 3 else 0, d - dim]] = [0.25, 0.5]
-    turned = space.adjoint(space.exp(0.5 * motion))
-    cov = gaussian.symmetrise(turned @ np.diag(std**2) @ turned.T)
-    noises = rng.normal(size=(steps - 1, d)) * std @ turned.T
+    turned = space.adjoint(space.exp(0.5 * MOTION[dim]))
     path, deltas = [space.exp(np.linspace(-0.4, 0.9, d))], []
-    for noise in noises:
-        deltas.append(space.exp(motion * rng.uniform(0.6, 1.4)))
-        path.append(space.retract(space.compose(path[-1], deltas[-1]), noise))
-    points = space.translation(np.array(path)).mean(0) + rng.normal(scale=3.0, size=(len(NAMES), dim))
-    at, which = (x.ravel() for x in np.indices((steps, len(NAMES))))
-    kept = rng.permutation(len(at))[: 4 * len(at) // 5]
-    empty = np.zeros((0, dim))
-    frame = Measurements(
-        "small world", space, kind, -1.0, mount, path[0], 100 * np.arange(steps), np.array(deltas),
-        np.broadcast_to(cov, (steps - 1, d, d)), np.zeros(0, int), np.zeros(0, int), empty, np.zeros((0, dim, dim)),
-    )  # fmt: skip
-    factor = noise * (np.tril(rng.normal(scale=0.02, size=(len(kept), dim, dim))) + 0.03 * np.eye(dim))
-    z = frame.model().predict(np.array(path)[at[kept]], points[which[kept]])
-    z = z + np.einsum("kij,kj->ki", factor, rng.normal(size=z.shape))
-    return seen(frame, at[kept], NAMES[which[kept]], z, factor @ factor.mT)
+    for slip in rng.normal(size=(steps - 1, d)) * std @ turned.T:
+        deltas.append(space.exp(MOTION[dim] * rng.uniform(0.6, 1.4)))
+        path.append(space.retract(space.compose(path[-1], deltas[-1]), slip))
+    cov = gaussian.symmetrise(turned @ np.diag(std**2) @ turned.T)
+    m = Measurements(
+        recording="small world",
+        space=space,
+        measurement=kind,
+        pitch_sign=-1.0,
+        robot_from_sensor=MOUNT[dim],
+        start=path[0],
+        stamps_ns=1_700_000_000_123_456_789 + 100_000_000 * np.arange(steps),
+        deltas=np.array(deltas),
+        covs=np.broadcast_to(cov, (steps - 1, d, d)),
+        steps=np.empty(0, dtype=int),
+        landmarks=np.empty(0, dtype=int),
+        z=np.empty((0, dim)),
+        cov_z=np.empty((0, dim, dim)),
+    )
+    return m, np.array(path)
 
 
 def seen(m: Measurements, steps: Array, landmarks: Array, z: Array, cov_z: Array) -> Measurements:
     """The same drive with other sightings."""
-    drive = (m.recording, m.space, m.measurement, m.pitch_sign, m.robot_from_sensor, m.start, m.stamps_ns)
-    return Measurements(*drive, m.deltas, m.covs, steps, landmarks, z, cov_z)
+    return replace(m, steps=steps, landmarks=landmarks, z=z, cov_z=cov_z)
 
 
 class Reference(NamedTuple):
@@ -69,7 +84,7 @@ class Reference(NamedTuple):
 
 
 def solve_by_scipy(m: Measurements, robust: float | None = None) -> Reference:
-    """Least squares over the odometry's own noises w, x_t = x_{t-1} δ Exp(L w): singular ones need no care."""
+    """Least squares over the odometry's noises w, x_t = x_{t-1} δ Exp(L w): singular ones need no care."""
     names = np.unique(m.landmarks)
     place = np.searchsorted(names, m.landmarks)
     factors = np.array([_thin_factor(cov) for cov in m.covs])
@@ -119,8 +134,8 @@ def _shrunk(whitened: Array, robust: float | None) -> Array:
     if robust is None:
         return whitened
     norm = np.linalg.norm(whitened, axis=-1, keepdims=True)
-    loss = np.where(norm <= robust, 0.5 * norm**2, robust * (norm - 0.5 * robust))
-    return whitened * np.sqrt(2 * loss) / norm
+    beyond = np.maximum(norm, robust)
+    return whitened * np.sqrt(robust * (2 * beyond - robust)) / beyond
 
 
 def _slope(function, x):

@@ -1,0 +1,77 @@
+"""python -m benchmarks [names] [--quick] [--gate] [--record]."""
+
+import argparse
+import json
+import sys
+import time
+from importlib import import_module
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.gate import regressions, write_baseline
+from benchmarks.machine import description
+from benchmarks.rows import Row, Settings
+
+FOLDER = Path(__file__).parent
+BASELINE = FOLDER / "baseline.json"
+NAMES = (
+    "small_update",
+    "many_particles",
+    "map_size",
+    "sharing",
+    "genealogy_growth",
+    "user_model",
+    "bootstrap_peers",
+    "mrpt_peer",
+)
+
+
+def main() -> int:
+    """Runs, prints, writes results.json; 1 where the gate finds a regression."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    parser.add_argument("names", nargs="*", metavar="name", help=f"any of: {', '.join(NAMES)}; by default all")
+    parser.add_argument("--quick", action="store_true", help="fewer repetitions")
+    parser.add_argument("--gate", action="store_true", help="compare with baseline.json, exit 1 on a regression")
+    parser.add_argument("--record", action="store_true", help="write baseline.json from this run")
+    arguments = parser.parse_args()
+    unknown = sorted(set(arguments.names) - set(NAMES))
+    if unknown:
+        parser.error(f"no benchmark is called {unknown[0]}: choose from {', '.join(NAMES)}")
+
+    machine, rows = description(), []
+    for name in arguments.names or NAMES:
+        start = time.perf_counter()
+        rows += import_module(f"benchmarks.{name}").run(Settings(arguments.quick))
+        print(f"{name}: {time.perf_counter() - start:.1f} s", file=sys.stderr)
+    show(rows, machine)
+    results = {"machine": machine, "quick": arguments.quick, "rows": [row.plain() for row in rows]}
+    (FOLDER / "results.json").write_text(json.dumps(results, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    if arguments.record:
+        write_baseline(BASELINE, rows)
+    if not arguments.gate:
+        return 0
+    sentences = regressions(BASELINE, rows, partial=bool(arguments.names))
+    for sentence in sentences:
+        print(sentence)
+    return 1 if sentences else 0
+
+
+def show(rows: list[Row], machine: dict[str, object]) -> None:
+    """The table, then the notes."""
+    console = Console(width=150 if not sys.stdout.isatty() else None)
+    table = Table(title=", ".join(f"{key} {value}" for key, value in machine.items()))
+    for heading in ("benchmark", "figure", "baseline", "ratio", "aim", ""):
+        table.add_column(heading)
+    for row in rows:
+        met = {True: "met", False: "MISSED", None: ""}[row.met]
+        against = f"{row.baseline_figure:.4g} {row.unit}: {row.baseline}"
+        table.add_row(row.name, f"{row.figure:.4g} {row.unit}", against, f"{row.ratio:.3g}", row.aim, met)
+    console.print(table)
+    for row in rows:
+        console.print(f"{row.name}: {row.notes}", highlight=False, markup=False)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

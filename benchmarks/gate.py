@@ -1,0 +1,34 @@
+"""Compares a run's ratios with committed ones."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from benchmarks.rows import Row
+
+
+def write_baseline(path: Path, rows: Sequence[Row]) -> None:
+    """Ratios and tolerances, by name."""
+    figures = {
+        row.name: {"ratio": round(row.ratio, 4), "higher": row.higher, "tolerance": row.tolerance} for row in rows
+    }
+    path.write_text(json.dumps(figures, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def regressions(path: Path, rows: Sequence[Row], partial: bool) -> list[str]:
+    """What got worse by more than its tolerance, and, unless only some were run, what is missing; in sentences."""
+    baseline = json.loads(path.read_text(encoding="utf-8"))
+    measured = {row.name: row.ratio for row in rows}
+    sentences = []
+    for name, entry in baseline.items():
+        if name not in measured:
+            if not partial:
+                sentences.append(f"{name}: no figure in this run")
+            continue
+        change = measured[name] / entry["ratio"] - 1.0
+        if (-change if entry["higher"] else change) > entry["tolerance"]:
+            sentences.append(
+                f"{name}: ratio {measured[name]:.3g} against {entry['ratio']:.3g}, "
+                f"a change of {change:+.0%} where {entry['tolerance']:.0%} is allowed"
+            )
+    return sentences

@@ -1,0 +1,133 @@
+"""What a benchmark returns, and how contestants are timed side by side."""
+
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from rbpf.filter import Filter
+
+GENERATIONS_BACK = 20
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How much time a run may take; `quick` lowers repetitions, never sizes."""
+
+    quick: bool = False
+
+    def repetitions(self, full: int) -> int:
+        """A third of the repetitions, at least 3, where the run is quick."""
+        return max(3, full // 3) if self.quick else full
+
+
+@dataclass(frozen=True)
+class Row:
+    """One figure beside the baseline measured in the same run.
+
+    Attributes:
+        name: unique, the key in the committed baseline.
+        figure: the measured value, in `unit`.
+        baseline: what it is compared with, in words;  baseline_figure: its value, in the same unit.
+        ratio: what the gate compares: it does not depend on how fast the machine is.
+        higher: whether a higher ratio is better.
+        aim: what is asked for, in words;  met: whether it is, None where nothing is asked for.
+        tolerance: relative change of the ratio that the gate lets pass.
+    """
+
+    name: str
+    figure: float
+    unit: str
+    baseline: str
+    baseline_figure: float
+    ratio: float
+    higher: bool = True
+    aim: str = ""
+    met: bool | None = None
+    notes: str = ""
+    tolerance: float = 0.35
+
+    def plain(self) -> dict[str, Any]:
+        """For a JSON file."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Seconds of each call."""
+
+    seconds: np.ndarray
+
+    @property
+    def median(self) -> float:
+        return float(np.median(self.seconds))
+
+    @property
+    def spread(self) -> str:
+        """Quartiles and the worst call, in milliseconds."""
+        low, high = np.percentile(self.seconds, (25, 75)) * 1e3
+        return f"quartiles {low:.3g}-{high:.3g} ms, worst {self.seconds.max() * 1e3:.3g} ms"
+
+
+def interleaved(
+    contestants: dict[str, Callable[[], Any]],
+    repetitions: int,
+    calls: dict[str, int] | None = None,
+    warm_up: int = 2,
+) -> dict[str, Timing]:
+    """Times the contestants in turn, so that a change of the machine's load falls on all of them alike.
+
+    Args:
+        contestants: what to call, by name.
+        repetitions: turns.
+        calls: calls that a contestant makes in each turn, timed one by one; by default 1.
+        warm_up: turns that are not timed.
+    """
+    seconds: dict[str, list[float]] = {name: [] for name in contestants}
+    for repetition in range(-warm_up, repetitions):
+        for name, run in contestants.items():
+            for _ in range((calls or {}).get(name, 1)):
+                start = time.perf_counter()
+                run()
+                if repetition >= 0:
+                    seconds[name].append(time.perf_counter() - start)
+    return {name: Timing(np.array(values)) for name, values in seconds.items()}
+
+
+class Diversity:
+    """Keeps the last generations of a filter, to count how many of their particles still have descendants."""
+
+    def __init__(self, filter_: Filter, back: int = GENERATIONS_BACK) -> None:
+        self.filter = filter_
+        self.back = back
+        self.resampled = 0
+        self.steps = 0
+        self._kept: deque[int] = deque()
+        self._retain()
+
+    def after(self, resampled: bool) -> None:
+        """Counts a step."""
+        self.steps += 1
+        if resampled:
+            self.resampled += 1
+            self._retain()
+
+    def text(self) -> str:
+        """Rate of resampling, distinct ancestors and the share of the map that is stored."""
+        lineage = self.filter.lineage
+        age = lineage.generation - self._kept[0]
+        store = self.filter.belief().map.store
+        return (
+            f"resampled {self.resampled}/{self.steps} steps, {lineage.distinct(self._kept[0])} distinct ancestors "
+            f"{age} generations back, map stored/dense {store.stored_bytes / store.dense_bytes:.3f}"
+        )
+
+    def _retain(self) -> None:
+        lineage = self.filter.lineage
+        lineage.retain(lineage.generation)
+        self._kept.append(lineage.generation)
+        if len(self._kept) > self.back + 1:
+            lineage.release(self._kept.popleft())

@@ -1,0 +1,158 @@
+"""What a sensor is told before it measures, against Monte Carlo over the whole mixture."""
+
+import numpy as np
+import pytest
+
+from rbpf.belief import Belief
+from rbpf.conditional import Marginals
+from rbpf.errors import InputError
+from rbpf.estimate import mixture_estimate
+from rbpf.genealogy import Lineage
+from rbpf.lie import SE2, SE3, LieGroup
+from rbpf.maps.landmark_map import LandmarkMap
+from rbpf.maps.point import Point
+from rbpf.models import Records
+from rbpf.proposals import Prior, Proposed
+from rbpf.sensors.range_bearing import RangeBearing, RelativePosition
+
+N, K, DRAWS = 12, 3, 400_000
+STD = 0.01
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(11)
+
+
+def prior_of(space: LieGroup, rng: np.random.Generator, centred: bool, scale: float = STD) -> Prior:
+    """Bases around the origin; the factor has one column too few: singular, as in a plane."""
+    base = space.retract(space.identity((N,)), 0.02 * rng.normal(size=(N, space.dim)))
+    mean = np.zeros((1, space.dim)) if centred else 0.5 * rng.normal(size=(1, space.dim))
+    factor = scale * rng.normal(size=(N, space.dim, space.dim - 1))
+    return Prior(space, base, mean, factor, centred)
+
+
+def belief_of(prior: Prior, dim: int, rng: np.random.Generator, ahead: np.ndarray) -> tuple[Belief, Records]:
+    """Landmarks around points `ahead` (K, D) of the robot, different in every particle, with correlated errors."""
+    landmark_map = LandmarkMap(prior.space)
+    marginals = Marginals(prior.space, [landmark_map])
+    marginals.begin(N, Lineage(N))
+    world = prior.space.transform(prior.predicted()[0], ahead)
+    factor = STD * rng.normal(size=(N, K, dim, dim))
+    mean = world + 0.02 * rng.normal(size=(N, K, dim))
+    records = Records(mean, factor @ np.swapaxes(factor, -1, -2))
+    landmark_map.add_records(records, Point(dim))
+    return Belief(np.log(rng.dirichlet(np.ones(N))), prior, marginals), records
+
+
+def draw(belief: Belief, records: Records, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """States (DRAWS, E) and landmarks (DRAWS, K, D) of the mixture."""
+    prior = belief.prior
+    i = rng.choice(N, size=DRAWS, p=belief.weights)
+    noise = rng.normal(size=(DRAWS, prior.factor.shape[2]))
+    increment = prior.mean + np.einsum("nar,nr->na", prior.factor[i], noise)
+    chol = np.linalg.cholesky(records.cov)[i]
+    landmark = records.mean[i] + np.einsum("nkab,nkb->nka", chol, rng.normal(size=(DRAWS, K, chol.shape[-1])))
+    return prior.space.retract(prior.base[i], increment), landmark
+
+
+# In the second one the bearings lie on both sides of the cut.
+AHEAD_2D = {"ahead": [[3.0, 1.0], [2.0, -2.0], [4.0, 0.0]], "behind": [[-3.0, 0.0], [-2.0, 0.01], [-4.0, -0.01]]}
+AHEAD_3D = np.array([[3.0, 1.0, 0.5], [2.0, -2.0, -1.0], [4.0, 0.0, 0.3]])
+
+
+@pytest.mark.parametrize("centred", [True, False], ids=["centred", "driven"])
+@pytest.mark.parametrize("ahead", AHEAD_2D.values(), ids=AHEAD_2D.keys())
+@pytest.mark.parametrize("model", [RangeBearing(SE2), RelativePosition(SE2)], ids=["range-bearing", "position"])
+def test_projection_in_the_plane(model, ahead, centred, rng):
+    belief, records = belief_of(prior_of(SE2, rng, centred), 2, rng, np.array(ahead))
+    check_projection(model, belief, records, rng)
+
+
+@pytest.mark.parametrize("centred", [True, False], ids=["centred", "driven"])
+def test_projection_in_space(centred, rng):
+    belief, records = belief_of(prior_of(SE3, rng, centred), 3, rng, AHEAD_3D)
+    check_projection(RangeBearing(SE3), belief, records, rng)
+
+
+def check_projection(model, belief: Belief, records: Records, rng: np.random.Generator) -> None:
+    mean, cov = belief.project(model, np.arange(K))
+    state, landmark = draw(belief, records, rng)
+    offset = model.residual(model.predict(state[:, None], landmark), mean)
+    expected = np.einsum("nka,nkb->kab", offset, offset) / DRAWS
+    std = np.sqrt(np.einsum("kaa->ka", expected))
+    # The linearisation errs by about the variance over the distance; Monte Carlo by 1/√DRAWS.
+    assert (np.abs(offset.mean(axis=0)) < 0.03 * std).all()
+    scale = std[:, :, None] * std[:, None, :]
+    assert (np.abs(cov - expected) < 0.02 * scale).all()
+
+
+def test_the_pose_uncertainty_counts(rng):
+    """Without it the covariance would be far too small: H Q Hᵀ is the larger part here."""
+    prior = prior_of(SE2, rng, centred=True, scale=0.1)
+    belief, _ = belief_of(prior, 2, rng, np.array(AHEAD_2D["ahead"]))
+    certain = Belief(belief.log_weights, Prior.exactly(SE2, prior.base), belief.marginals)
+    with_pose = belief.project(RangeBearing(SE2), np.arange(K))[1]
+    without = certain.project(RangeBearing(SE2), np.arange(K))[1]
+    assert (np.linalg.eigvalsh(with_pose - without) > 0).all()
+
+
+def test_innovations_of_every_pair(rng):
+    belief, records = belief_of(prior_of(SE2, rng, centred=True), 2, rng, np.array(AHEAD_2D["behind"]))
+    model = RangeBearing(SE2)
+    z = np.array([[3.0, 3.1], [2.0, -3.1]])
+    noise = np.stack([np.diag([0.1, 0.2]), np.diag([0.3, 0.4])])
+    nu, cov = belief.predictions(model, z, noise, np.array([2, 0]))
+    assert nu.shape == (N, 2, 2, 2)
+    assert cov.shape == (N, 2, 2, 2, 2)
+    for i, k, m in np.ndindex(N, 2, 2):
+        landmark = records.mean[i, (2, 0)[m]]
+        expected = model.residual(z[k], model.predict(belief.state[i], landmark))
+        np.testing.assert_allclose(nu[i, k, m], expected, atol=1e-12)
+        jac = model.jacobians(belief.state[i], landmark)
+        moved = jac.state @ belief.prior.factor[i]
+        within = jac.landmark @ records.cov[i, (2, 0)[m]] @ jac.landmark.T
+        np.testing.assert_allclose(cov[i, k, m], within + moved @ moved.T + noise[k], atol=1e-12)
+
+
+def test_weights_mode_and_catalogue(rng):
+    belief, records = belief_of(prior_of(SE2, rng, centred=True), 2, rng, np.array(AHEAD_2D["ahead"]))
+    assert belief.weights.sum() == pytest.approx(1.0)
+    assert belief.weights[belief.mode] == belief.weights.max()
+    belief.map.catalogue[1] = "oak"
+    assert belief.catalogue == {1: "oak"}
+    np.testing.assert_array_equal(belief.read([1, 2]).mean, records.mean[:, 1:])
+
+
+def test_a_landmark_that_is_not_there(rng):
+    belief, _ = belief_of(prior_of(SE2, rng, centred=True), 2, rng, np.array(AHEAD_2D["ahead"]))
+    with pytest.raises(InputError, match="the map holds no landmark 7"):
+        belief.project(RangeBearing(SE2), np.array([7]))
+
+
+@pytest.mark.parametrize("centred", [True, False], ids=["centred", "driven"])
+@pytest.mark.parametrize("space", [SE2, SE3], ids=repr)
+def test_estimate_is_the_moments_of_the_refined_mixture(space, centred, rng):
+    prior = prior_of(space, rng, centred)
+    rank = space.dim - 1
+    root = np.triu(rng.normal(size=(N, rank, rank)))
+    proposed = Proposed(rng.normal(size=(N, rank)), root, np.zeros(N))
+    log_weights = np.log(rng.dirichlet(np.ones(N)))
+    estimate = mixture_estimate(prior, proposed, log_weights)
+    i = rng.choice(N, size=DRAWS, p=np.exp(log_weights))
+    u = proposed.mean[i] + np.einsum("nab,nb->na", root[i], rng.normal(size=(DRAWS, rank)))
+    state = space.retract(prior.base[i], prior.mean + np.einsum("nar,nr->na", prior.factor[i], u))
+    offset = space.local(estimate.mean, state)
+    expected = offset.T @ offset / DRAWS
+    std = np.sqrt(np.diag(expected))
+    assert (np.abs(offset.mean(axis=0)) < 0.05 * std).all()
+    assert (np.abs(estimate.cov - expected) < 0.04 * np.outer(std, std)).all()
+
+
+def test_estimate_of_exact_states(rng):
+    state = SE2.retract(SE2.identity((N,)), 0.1 * rng.normal(size=(N, 3)))
+    weights = rng.dirichlet(np.ones(N))
+    estimate = mixture_estimate(Prior.exactly(SE2, state), None, np.log(weights))
+    offset = SE2.local(estimate.mean, state)
+    np.testing.assert_allclose(weights @ offset, 0.0, atol=1e-14)
+    np.testing.assert_allclose(estimate.cov, np.einsum("n,na,nb->ab", weights, offset, offset), atol=1e-14)

@@ -1,0 +1,104 @@
+"""Consistency figures of a filter that is honest, and of one that is not."""
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from rbpf.diagnostics import ancestor_diversity, chi_square_band, effective_sample_size, nees
+from rbpf.estimate import Estimate
+from rbpf.filter import Filter
+from rbpf.genealogy import Lineage
+from rbpf.lie import SE2, SE3, Euclidean
+from rbpf.models import MotionModel, ObservationModel, Part, Transition
+from tests.core.scripted import Scripted, seen
+
+PLANE = Euclidean(2)
+STD_STEP, STD_FIX = 0.3, 0.5
+RUNS, STEPS = 60, 15
+
+
+class Walk(MotionModel):
+    """A random walk in the plane."""
+
+    space = PLANE
+
+    def transition(self, state, control, dt):
+        return Transition(state, STD_STEP * np.eye(2)[None])
+
+
+class Fix(ObservationModel):
+    """A position fix."""
+
+    dim = 2
+    reads = frozenset({Part.STATE})
+
+    def predict(self, state, landmark=None, const=None, substate=None):
+        return state.copy()
+
+
+def mean_nees(claimed: float) -> float:
+    """Over independent runs, of the last step; the filter takes the fixes to have the standard deviation claimed."""
+    rng = np.random.default_rng(12)
+    cov = claimed**2 * np.eye(2)[None]
+    total = 0.0
+    for run in range(RUNS):
+        truth = np.zeros(2)
+        filter_ = Filter(Walk(), Scripted(), n=200, rng=np.random.default_rng(run))
+        for _ in range(STEPS):
+            truth = truth + STD_STEP * rng.normal(size=2)
+            report = filter_.step(seen(Fix(), [truth + STD_FIX * rng.normal(size=2)], cov))
+        total += nees(PLANE, report.estimate, truth)
+    return total / RUNS
+
+
+def test_an_honest_filter_stays_in_the_band():
+    band = chi_square_band(dof=2, runs=RUNS)
+    assert band.low < mean_nees(STD_FIX) < band.high
+
+
+@pytest.mark.parametrize(("claimed", "side"), [(0.5 * STD_FIX, "high"), (2.5 * STD_FIX, "low")])
+def test_a_dishonest_filter_leaves_it(claimed, side):
+    band = chi_square_band(dof=2, runs=RUNS)
+    value = mean_nees(claimed)
+    assert value > band.high if side == "high" else value < band.low
+
+
+def test_band_holds_as_much_as_it_says():
+    band = chi_square_band(dof=3, runs=20, probability=0.9)
+    means = np.random.default_rng(0).chisquare(3, size=(20_000, 20)).mean(axis=1)
+    assert np.mean((means > band.low) & (means < band.high)) == pytest.approx(0.9, abs=0.01)
+    assert band.expected == 3.0
+    assert chi_square_band(dof=2).high == pytest.approx(chi2.ppf(0.975, 2))
+
+
+@pytest.mark.parametrize("space", [SE2, SE3], ids=repr)
+def test_nees_is_measured_in_the_chart_at_the_mean(space):
+    rng = np.random.default_rng(1)
+    mean = space.exp(rng.normal(size=space.dim))
+    factor = rng.normal(size=(space.dim, space.dim))
+    u = rng.normal(size=space.dim)
+    truth = space.retract(mean, 0.01 * factor @ u)
+    value = nees(space, Estimate(mean, 1e-4 * factor @ factor.T), truth)
+    assert value == pytest.approx(u @ u, rel=1e-6)
+
+
+def test_nees_leaves_out_what_is_known_exactly():
+    cov = np.diag([0.0, 4.0])
+    assert nees(PLANE, Estimate(np.zeros(2), cov), np.array([0.0, 2.0])) == pytest.approx(1.0)
+
+
+def test_effective_sample_size():
+    assert effective_sample_size(np.full(8, 1 / 8)) == pytest.approx(8.0)
+    assert effective_sample_size(np.eye(8)[3]) == 1.0
+    assert effective_sample_size(np.array([0.5, 0.5, 0.0])) == pytest.approx(2.0)
+
+
+def test_ancestor_diversity():
+    lineage = Lineage(4)
+    lineage.retain(0)
+    lineage.advance(np.array([0, 0, 1, 3]))
+    lineage.advance(np.array([0, 1, 1, 2]))
+    lineage.retain(2)
+    lineage.advance(np.array([3, 3, 3, 0]))
+    # Generation 1 was not kept, and there is none before the first.
+    assert ancestor_diversity(lineage, [0, 1, 2, 3, 4]) == {0: 4, 1: 2, 3: 2}

@@ -1,0 +1,154 @@
+"""A small world without names, with and without clutter, against the run that knows the names."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rbpf.filter import Filter
+from rbpf.lie import SE2
+from rbpf.maps.landmark_map import LandmarkMap
+from rbpf.maps.point import Point
+from rbpf.models import NEW, NULL
+from rbpf.motion.odometry import OdometryMotion
+from rbpf.resampling import EssTriggered, Systematic
+from rbpf.sensors.range_bearing import RangeBearing
+from tests.core.worlds import MAX_RANGE, Recipe, Sightings, World, anonymous, drive, planar_world
+
+STEPS, LANDMARKS = 120, 12
+NOTHING = Sightings(np.zeros(0, dtype=int), np.zeros((0, 2)), np.zeros((0, 2, 2)))
+
+
+def position_error(world: World, reports) -> float:
+    means = np.array([report.estimate.mean for report in reports])
+    return float(np.sqrt(np.square(means[:, 1:] - world.truth[:, 1:]).sum(axis=1).mean()))
+
+
+def held(filter_: Filter) -> dict[int, float]:
+    """Share of the weight in which each landmark more probably exists than not."""
+    landmark_map = filter_.belief().map
+    present = landmark_map.log_odds(landmark_map.ids) > 0
+    return dict(zip(landmark_map.ids.tolist(), filter_.particles.weights @ present, strict=True))
+
+
+def nearest(filter_: Filter, world: World, ids: list[int]) -> np.ndarray:
+    """Distance of each landmark's mean to the nearest true one."""
+    records = filter_.belief().map.read(np.array(ids))
+    mean = np.einsum("n,nkd->kd", filter_.particles.weights, records.mean)
+    return np.linalg.norm(mean[:, None] - world.landmarks, axis=-1).min(axis=1)
+
+
+@pytest.mark.parametrize("clutter", [0.0, 1.0])
+@pytest.mark.parametrize("seed", [3, 4])
+def test_map_and_accuracy(seed, clutter):
+    world = planar_world(STEPS, LANDMARKS, seed, clutter)
+    named = replace(world, frames=[without_clutter(frame) for frame in world.frames])
+    filter_, reference = Recipe(n=60, known=False).build(), Recipe(n=60).build()
+    error = position_error(world, drive(filter_, world))
+    assert error < 1.5 * position_error(world, drive(reference, named)) + 0.01
+    seen = {name for frame in named.frames for name in frame.landmarks.tolist()}
+    accepted = [landmark for landmark, share in held(filter_).items() if share > 0.5]
+    assert len(accepted) == len(seen)
+    assert nearest(filter_, world, accepted).max() < 0.3
+
+
+def without_clutter(frame: Sightings) -> Sightings:
+    true = frame.landmarks >= 0
+    return Sightings(frame.landmarks[true], frame.z[true], frame.cov_z[true])
+
+
+def test_spurious_landmarks_leave_the_map():
+    world = planar_world(STEPS, LANDMARKS, 3, clutter=1.0)
+    filter_ = Recipe(n=60, known=False).build()
+    born: set[int] = set()
+    sizes: list[int] = []
+
+    def count(t, report):
+        born.update(report.births.tolist())
+        sizes.append(filter_.belief().map.ids.size)
+
+    drive(filter_, world, after=count)
+    # About one false landmark a frame; each lives for as many frames as it is in view, and four misses.
+    assert len(born) > 100
+    assert max(sizes) < 3 * LANDMARKS
+    assert np.mean(sizes[-20:]) < 1.1 * np.mean(sizes[40:60])
+
+
+def single(landmark_map: LandmarkMap) -> Filter:
+    """Five particles that are never resampled."""
+    sensor = anonymous(RangeBearing(SE2, max_range=MAX_RANGE - 0.5))
+    never = EssTriggered(Systematic(), 0.0)
+    return Filter(OdometryMotion(SE2), sensor, landmark_map, resampler=never, n=5, rng=np.random.default_rng(0))
+
+
+def one_sighting(distance: float = 3.0, bearing: float = 0.2) -> Sightings:
+    return Sightings(np.zeros(1, dtype=int), np.array([[distance, bearing]]), np.diag([0.01, 0.001])[None])
+
+
+def test_life_of_a_landmark():
+    filter_ = single(LandmarkMap(SE2, evidence=True))
+    landmark_map = filter_.belief().map
+    report = filter_.step(one_sighting())
+    assert report.births.tolist() == [0]
+    assert (report.groups[0].ids == NEW).all()
+    np.testing.assert_array_equal(landmark_map.log_odds(np.array([0])), 0.0)
+    report = filter_.step(one_sighting())
+    assert (report.groups[0].ids == 0).all()
+    np.testing.assert_array_equal(landmark_map.log_odds(np.array([0])), 1.0)
+    # Beside it: neither near enough to be it nor far enough to be another one.
+    report = filter_.step(one_sighting(distance=3.65))
+    assert (report.groups[0].ids == NULL).all()
+    assert landmark_map.ids.tolist() == [0]
+
+
+def test_a_frame_without_sightings_counts_as_a_miss():
+    filter_ = single(LandmarkMap(SE2, evidence=True))
+    landmark_map = filter_.belief().map
+    filter_.step(one_sighting())
+    for misses in (1, 2, 3):
+        filter_.step(NOTHING)
+        np.testing.assert_array_equal(landmark_map.log_odds(np.array([0])), -0.5 * misses)
+    filter_.step(NOTHING)
+    assert landmark_map.ids.size == 0
+
+
+def test_what_is_out_of_sight_is_not_missed():
+    filter_ = single(LandmarkMap(SE2, evidence=True))
+    landmark_map = filter_.belief().map
+    filter_.step(one_sighting(distance=MAX_RANGE - 0.3))
+    for _ in range(5):
+        filter_.step(NOTHING)
+    np.testing.assert_array_equal(landmark_map.log_odds(np.array([0])), 0.0)
+
+
+def test_an_empty_map_and_an_empty_frame():
+    filter_ = single(LandmarkMap(SE2, evidence=True))
+    report = filter_.step(NOTHING)
+    assert report.births.size == 0
+    assert report.log_evidence == pytest.approx(0.0)
+
+
+def test_particles_with_different_maps_weigh_their_explanations():
+    """Half of the particles hold the landmark: they pay its predictive density, the others that of a new one."""
+    filter_ = single(LandmarkMap(SE2, evidence=True))
+    landmark_map = filter_.belief().map
+    sensor = filter_.sensors[0]
+    records = sensor.model.initialise(filter_.particles.state, *sighting_and_cov())
+    log_odds = np.array([[0.0], [0.0], [-np.inf], [-np.inf], [-np.inf]])
+    landmark_map.add_records(records, Point(2), log_odds)
+    report = filter_.step(one_sighting())
+    assert report.groups[0].ids[:, 0].tolist() == [0, 0, NEW, NEW, NEW]
+    innovation = 2 * sighting_and_cov()[1][0]
+    density = -0.5 * np.log(np.linalg.det(2 * np.pi * innovation))
+    expected = np.array([density, density, *[sensor.gates.log_new] * 3])
+    expected -= np.logaddexp.reduce(expected)
+    np.testing.assert_allclose(filter_.particles.log_weights, expected, atol=1e-6)
+    assert landmark_map.ids.tolist() == [0, 1]
+    np.testing.assert_array_equal(
+        np.isneginf(landmark_map.log_odds(landmark_map.ids)), [[0, 1], [0, 1], [1, 0], [1, 0], [1, 0]]
+    )
+
+
+def sighting_and_cov() -> tuple[np.ndarray, np.ndarray]:
+    frame = one_sighting()
+    return frame.z, frame.cov_z

@@ -1,0 +1,177 @@
+"""The order of observations and of particles changes nothing but rounding."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rbpf.filter import Filter
+from rbpf.lie import SE2, SE3, Euclidean
+from rbpf.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobis
+from rbpf.maps.landmark_map import LandmarkMap
+from rbpf.maps.point import Point
+from rbpf.models import NEW, NULL, Births, Observations
+from rbpf.motion.odometry import Odometry, OdometryMotion
+from rbpf.proposals import EkfProposal, PriorProposal
+from rbpf.resampling import EssTriggered, Systematic
+from rbpf.substate import KalmanSubstate
+from tests.exactness.models import Frame, LinearMotion, LinearObservation, Relative, Scripted, single
+from tests.exactness.scenes import random_covs, sensors
+
+PARTICLES = 40
+TOLERANCE = 1e-9
+LIKELIHOODS = [Gaussian(), TruncatedMahalanobis(), GaussianWithOutliers(0.1, 100.0)]
+every_likelihood = pytest.mark.parametrize("likelihood", LIKELIHOODS, ids=lambda x: type(x).__name__)
+compiled_or_not = pytest.mark.parametrize("compiled", [True, False], ids=["compiled", "numpy"])
+
+
+class Reordered(np.random.Generator):
+    """Gives row i of each normal draw to the particle that stands at order[i] in the other run."""
+
+    order: np.ndarray
+
+    def standard_normal(self, size: Any = None, *args: Any, **kwargs: Any) -> Any:
+        return super().standard_normal(size, *args, **kwargs)[self.order]
+
+
+def generator(order: np.ndarray) -> Reordered:
+    rng = Reordered(np.random.PCG64(21))
+    rng.order = order
+    return rng
+
+
+def run(space, likelihood, compiled: bool, orders: np.random.Generator | None) -> Filter:
+    """Six steps with two sensors in one frame, some landmarks seen by both; `orders` shuffles all of it."""
+    rng = np.random.default_rng(55)
+    dim = 2 if space is SE2 else 3
+    landmarks = rng.normal(scale=4.0, size=(7, dim)) + 5.0
+    models, noise = sensors(space, rng), random_covs(rng, (7,), dim, 0.08)
+    increment, cov = space.exp(0.15 * np.ones(space.dim)), 0.004 * np.eye(space.dim)
+    held = LandmarkMap(space, compiled=compiled)
+    filter_ = Filter(
+        OdometryMotion(space),
+        Scripted(),
+        held,
+        None,
+        EssTriggered(Systematic(), 0.7),
+        PARTICLES,
+        np.random.default_rng(4),
+    )
+    truth = space.identity()
+    for step in range(6):
+        truth = space.compose(truth, increment)
+        groups = []
+        for model, seen in zip(models, (np.arange(5), np.arange(3, 7)), strict=True):
+            z = model.predict(truth, landmarks[seen]) + rng.multivariate_normal(
+                np.zeros(dim), noise[0], seen.size
+            )
+            z[1] += 0.8 * (step == 3)
+            order = np.arange(seen.size) if orders is None else orders.permutation(seen.size)
+            groups.append(Observations(z[order], noise[seen][order], model, likelihood, seen[order]))
+        if step == 0:
+            z = models[1].predict(truth, landmarks) + rng.multivariate_normal(np.zeros(dim), noise[0], 7)
+            filter_.step(Frame((), [Births(z, noise, models[1], Point(dim))]), Odometry(increment, cov))
+            continue
+        filter_.step(Frame(groups if orders is None else groups[::-1]), Odometry(increment, cov))
+    return filter_
+
+
+@compiled_or_not
+@every_likelihood
+@pytest.mark.parametrize("space", [SE2, SE3], ids=repr)
+def test_the_order_of_observations_does_not_matter(space, likelihood, compiled):
+    plain = run(space, likelihood, compiled, None)
+    shuffled = run(space, likelihood, compiled, np.random.default_rng(2))
+    assert plain.lineage.generation == shuffled.lineage.generation > 0
+    np.testing.assert_allclose(shuffled.particles.state, plain.particles.state, atol=TOLERANCE)
+    np.testing.assert_allclose(shuffled.particles.log_weights, plain.particles.log_weights, atol=1e-7)
+    np.testing.assert_allclose(shuffled.log_evidence, plain.log_evidence, rtol=TOLERANCE)
+    for field in ("mean", "cov"):
+        one, other = (getattr(f.belief().read(np.arange(7)), field) for f in (plain, shuffled))
+        np.testing.assert_allclose(other, one, atol=TOLERANCE)
+
+
+def test_the_order_of_measurements_that_read_a_substate_does_not_matter():
+    motion = LinearMotion(np.eye(1), 0.4 * np.eye(2), np.eye(1), np.eye(1), np.zeros(1))
+    model = LinearObservation([[1.0], [0.2]], [[0.3], [1.0]])
+    rng = np.random.default_rng(3)
+    z, cov = rng.normal(size=(5, 4, 2)), random_covs(rng, (4,), 2, 0.5)
+    ends = []
+    for order in (np.arange(4), np.array([2, 0, 3, 1])):
+        substate = KalmanSubstate(motion.space, np.zeros(1), np.eye(1))
+        filter_ = Filter(motion, Scripted(), substate, n=PARTICLES, rng=np.random.default_rng(1))
+        for measured in z:
+            filter_.step(Frame([Observations(measured[order], cov[order], model)]))
+        ends.append((filter_.particles.state, filter_.particles.log_weights, substate.mean, substate.cov))
+    for one, other in zip(*ends, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-8)
+
+
+@compiled_or_not
+@pytest.mark.parametrize("proposal", [PriorProposal(), EkfProposal()], ids=["prior", "ekf"])
+def test_the_order_of_particles_does_not_matter(proposal, compiled):
+    """Each with its own start, noise and associations; the weights follow, the summaries stay."""
+    rng = np.random.default_rng(12)
+    order = rng.permutation(PARTICLES)
+    start = rng.normal(scale=0.1, size=(PARTICLES, 3))
+    landmarks, model = rng.normal(scale=4.0, size=(4, 2)) + 5.0, sensors(SE2, rng)[0]
+    R, cov = np.tile(0.01 * np.eye(2), (4, 1, 1)), 0.01 * np.eye(3)
+    z = model.predict(SE2.identity(), landmarks) + rng.normal(scale=0.1, size=(5, 4, 2))
+    ids = np.where(
+        rng.random((5, PARTICLES, 4)) < 0.8, np.arange(4), rng.choice([NEW, NULL], (5, PARTICLES, 4))
+    )
+    filters = []
+    for place in (np.arange(PARTICLES), order):
+        held = LandmarkMap(SE2, compiled=compiled)
+        filter_ = Filter(
+            OdometryMotion(SE2),
+            Scripted(),
+            held,
+            proposal,
+            EssTriggered(Systematic(), 0.0),
+            PARTICLES,
+            generator(place),
+            start[place],
+        )
+        filter_.step(Frame((), [Births(z[0], R, model, Point(2))]), Odometry(SE2.identity(), cov))
+        reports = [
+            filter_.step(
+                Frame([Observations(z[t], R, model, None, ids[t][place], -3.0, -4.0)]),
+                Odometry(SE2.identity(), cov),
+            )
+            for t in range(1, 5)
+        ]
+        filters.append((filter_, reports))
+    (one, reports), (other, others) = filters
+    np.testing.assert_allclose(other.particles.state, one.particles.state[order], atol=TOLERANCE)
+    np.testing.assert_allclose(other.particles.log_weights, one.particles.log_weights[order], atol=TOLERANCE)
+    assert np.ptp(one.particles.log_weights) > 1.0
+    for ours, theirs in zip(reports, others, strict=True):
+        assert theirs.log_evidence == pytest.approx(ours.log_evidence, abs=TOLERANCE)
+        assert theirs.ess == pytest.approx(ours.ess, rel=TOLERANCE)
+        np.testing.assert_allclose(theirs.estimate.mean, ours.estimate.mean, atol=TOLERANCE)
+        np.testing.assert_allclose(theirs.estimate.cov, ours.estimate.cov, atol=TOLERANCE)
+
+
+def test_the_order_of_groups_does_not_matter():
+    """A position fix, a landmark and another fix, in any order."""
+    space = Euclidean(2)
+    fix = LinearObservation(np.eye(2))
+    ends = []
+    for order in ((0, 1, 2), (2, 0, 1), (1, 2, 0)):
+        held = LandmarkMap(space)
+        motion = LinearMotion(np.eye(2), 0.3 * np.eye(2))
+        filter_ = Filter(motion, Scripted(), held, n=PARTICLES, rng=np.random.default_rng(8))
+        R = 0.2 * np.eye(2)
+        filter_.step(Frame((), [Births(np.array([[2.0, 1.0]]), R[None], Relative(), Point(2))]))
+        for z in np.random.default_rng(9).normal(scale=0.4, size=(4, 3, 2)):
+            groups = [
+                single(z[0], R, fix),
+                single(z[1] + [2.0, 1.0], R, Relative(), ids=held.ids),
+                single(z[2], 3 * R, fix),
+            ]
+            filter_.step(Frame([groups[i] for i in order]))
+        ends.append((filter_.particles.state, filter_.particles.log_weights, held.read(held.ids).mean))
+    for other in ends[1:]:
+        for value, expected in zip(other, ends[0], strict=True):
+            np.testing.assert_allclose(value, expected, atol=TOLERANCE)

@@ -1,0 +1,180 @@
+"""The truncated Mahalanobis form is S05's, to the letter; the one with outliers is a density."""
+
+import numpy as np
+import pytest
+
+from rbpf.filter import Filter
+from rbpf.lie import Euclidean
+from rbpf.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobis
+from rbpf.maps.landmark_map import LandmarkMap
+from rbpf.maps.point import Point
+from rbpf.models import NULL, Births, ObservationModel, Observations, Records
+from rbpf.proposals import EkfProposal, PriorProposal, refined
+from tests.exactness.models import Frame, LinearMotion, LinearObservation, Relative, Scripted, single
+from tests.exactness.scenes import random_covs
+
+TRUNCATED = TruncatedMahalanobis()
+PLANE = Euclidean(2)
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(2005)
+
+
+@pytest.mark.parametrize("p", [1, 2, 3])
+def test_truncated_mahalanobis_is_s05_equation_6(p, rng):
+    """−½ min(T_l, νᵀS⁻¹ν) with T_l = 4.0, in no units."""
+    nu, cov = rng.normal(scale=2.0, size=(300, p)), random_covs(rng, (300,), p, 1.0)
+    squared = np.array([v @ np.linalg.solve(S, v) for v, S in zip(nu, cov, strict=True)])
+    expected = np.where(squared < 4.0, -0.5 * squared, -2.0)
+    assert 0.1 < (squared < 4.0).mean() < 0.9
+    np.testing.assert_allclose(TRUNCATED.log_density(nu, cov), expected, rtol=1e-12)
+    np.testing.assert_array_equal(TRUNCATED.inlier(nu, cov), squared < 4.0)
+    assert TRUNCATED.log_outlier() == -2.0
+    np.testing.assert_allclose(TRUNCATED.log_density(1000.0 * nu, 1e6 * cov), expected, rtol=1e-9)
+
+
+def test_four_clips_a_quarter_of_the_inliers_in_space(rng):
+    """χ² with three degrees of freedom exceeds 4.0 with a probability of 0.26."""
+    nu = rng.normal(size=(200_000, 3))
+    assert 1.0 - TRUNCATED.inlier(nu, np.eye(3)[None]).mean() == pytest.approx(0.2615, abs=0.003)
+
+
+@pytest.mark.parametrize("p", [1, 2])
+@pytest.mark.parametrize(
+    "likelihood", [GaussianWithOutliers(0.2, 1.0), Gaussian()], ids=["outliers", "gaussian"]
+)
+def test_densities_integrate_to_one_over_the_measurement_space(likelihood, p, rng):
+    """Outliers are uniform over a volume that the sensor can return: here a cube of side 30 about the prediction."""
+    side, points = 30.0, 601
+    if isinstance(likelihood, GaussianWithOutliers):
+        likelihood = GaussianWithOutliers(0.2, side**p)
+    axis, step = np.linspace(-side / 2, side / 2, points, retstep=True)
+    midpoints = axis[:-1] + step / 2
+    nu = np.stack(np.meshgrid(*[midpoints] * p, indexing="ij"), axis=-1)
+    for cov in random_covs(rng, (3,), p, 0.8):
+        assert np.exp(likelihood.log_density(nu, cov)).sum() * step**p == pytest.approx(1.0, abs=1e-5)
+    truncated = np.exp(TRUNCATED.log_density(nu, cov)).sum() * step**p
+    assert abs(truncated - 1.0) > 1.0
+
+
+def test_outliers_take_over_far_from_the_prediction():
+    likelihood = GaussianWithOutliers(0.1, 50.0)
+    far = likelihood.log_density(np.array([40.0]), np.eye(1))
+    assert far == pytest.approx(np.log(0.1 / 50.0), abs=1e-12)
+    near = likelihood.log_density(np.array([0.0]), np.eye(1))
+    assert near == pytest.approx(np.log(0.9 / np.sqrt(2 * np.pi) + 0.1 / 50.0), abs=1e-12)
+
+
+@pytest.mark.parametrize("proposal", [PriorProposal(), EkfProposal()], ids=["prior", "ekf"])
+def test_without_a_density_there_is_no_evidence(proposal):
+    """Null, not a number that a comparison of models could mistake for one; the weights are still right."""
+    motion = LinearMotion(np.eye(1), np.eye(1))
+    model, z = LinearObservation(by_state=[[1.0]]), np.array([0.4])
+    filter_ = Filter(motion, Scripted(), (), proposal, n=20, rng=np.random.default_rng(3))
+    plain = filter_.step(Frame([single(z, 0.3, model)]))
+    assert np.isfinite(plain.log_evidence)
+    before = filter_.particles.log_weights
+    report = filter_.step(Frame([single(z, 0.3, model, likelihood=TRUNCATED)]))
+    assert np.isnan(report.log_evidence)
+    assert np.isnan(filter_.log_evidence)
+    if isinstance(proposal, PriorProposal) and not report.resampled:
+        gained = before - 0.5 * np.minimum(4.0, (0.4 - filter_.particles.state[:, 0]) ** 2 / 0.3)
+        np.testing.assert_allclose(
+            filter_.particles.log_weights, gained - np.log(np.exp(gained).sum()), atol=1e-12
+        )
+
+
+def held_landmarks(cov: np.ndarray, n: int = 8) -> LandmarkMap:
+    """Two landmarks that every particle believes at (3, 1) and (−2, 4)."""
+    from rbpf.genealogy import Lineage
+
+    held = LandmarkMap(PLANE)
+    held.begin(n, Lineage(n))
+    mean = np.tile(np.array([[3.0, 1.0], [-2.0, 4.0]]), (n, 1, 1))
+    held.add_records(Records(mean, np.tile(cov, (n, 2, 1, 1))), Point(2))
+    return held
+
+
+def test_a_null_match_costs_half_the_limit(rng):
+    state = rng.normal(scale=0.1, size=(8, 2))
+    z, R = np.array([[3.0, 1.0], [5.0, 5.0]]), np.tile(0.1 * np.eye(2), (2, 1, 1))
+    ids = np.array([0, NULL])
+    group = Observations(z, R, Relative(), TRUNCATED, ids, log_clutter=TRUNCATED.log_outlier())
+    alone = Observations(z[:1], R[:1], Relative(), TRUNCATED, ids[:1])
+    zero = np.zeros((8, 2))
+    with_null, without = (
+        held_landmarks(0.1 * np.eye(2)).correct(state, zero, [g]).all for g in (group, alone)
+    )
+    np.testing.assert_allclose(with_null, without - 2.0, atol=1e-12)
+
+
+LIKELIHOODS = {"gaussian": None, "truncated": TRUNCATED, "outliers": GaussianWithOutliers(0.1, 30.0)}
+
+
+@pytest.mark.parametrize("likelihood", LIKELIHOODS.values(), ids=LIKELIHOODS)
+def test_two_sightings_of_a_certain_landmark_weigh_like_two_landmarks(likelihood, rng):
+    """Where the landmark is known there is no correlation: stacking its rows must not change what each one says."""
+    state = rng.normal(scale=0.3, size=(8, 2))
+    certain = 1e-14 * np.eye(2)
+    z = np.array([[3.2, 0.8], [2.9, 1.3]])
+    R = np.array([np.diag([0.1, 0.2]), np.diag([0.05, 0.1])])
+    twice = [Observations(z, R, Relative(), likelihood, np.array([0, 0]))]
+    moved = z + np.array([[0.0, 0.0], [-5.0, 3.0]])
+    once = [Observations(moved, R, Relative(), likelihood, np.array([0, 1]))]
+    motion = LinearMotion(np.eye(2), 0.2 * np.eye(2))
+    prior = held_landmarks(certain).predict(motion.transition(state, None, 1.0), PLANE)
+    zero = np.zeros((8, 2))
+    densities = [held_landmarks(certain).correct(state, zero, groups).all for groups in (twice, once)]
+    np.testing.assert_allclose(densities[0], densities[1], atol=1e-9)
+    proposals = [
+        refined(prior, held_landmarks(certain).terms(state, groups, prior)) for groups in (twice, once)
+    ]
+    np.testing.assert_allclose(proposals[0].mean, proposals[1].mean, atol=1e-9)
+    np.testing.assert_allclose(proposals[0].log_w1, proposals[1].log_w1, atol=1e-9)
+
+
+class Along(ObservationModel):
+    """The landmark's first coordinate seen from one of the state's coordinates."""
+
+    dim = 1
+
+    def __init__(self, axis: int):
+        self.axis = axis
+
+    def predict(self, state, landmark=None, const=None, substate=None):
+        return landmark[..., :1] - state[..., self.axis : self.axis + 1]
+
+
+@pytest.mark.parametrize("likelihood", [None, GaussianWithOutliers(0.2, 24.0)], ids=["gaussian", "outliers"])
+def test_the_density_of_two_sightings_of_an_uncertain_landmark_integrates_to_one(likelihood):
+    """Particles on a grid span the innovations of both; each may be an outlier without the other."""
+    side, points = 24.0, 121
+    axis, step = np.linspace(-side / 2, side / 2, points, retstep=True)
+    state = np.stack(np.meshgrid(axis + 3.0, axis + 3.0, indexing="ij"), axis=-1).reshape(-1, 2)
+    held = held_landmarks(0.8 * np.eye(2), n=points**2)
+    zero, R, ids = np.zeros((1, 1)), np.full((1, 1, 1), 0.4), np.array([0])
+    groups = [Observations(zero, R, Along(axis), likelihood, ids) for axis in (0, 1)]
+    densities = held.correct(state, np.zeros_like(state), groups)
+    assert np.exp(densities.all).sum() * step**2 == pytest.approx(1.0, abs=0.02)
+
+
+def test_an_outlier_moves_no_landmark(rng):
+    """Particles that reject a sighting keep their landmark; those that accept it move it."""
+    n = 40
+    held = LandmarkMap(PLANE)
+    motion = LinearMotion(np.eye(2), 0.5 * np.eye(2))
+    filter_ = Filter(motion, Scripted(), held, PriorProposal(), n=n, rng=rng)
+    R = 0.1 * np.eye(2)
+    born = Births(np.array([[3.0, 1.0]]), R[None], Relative(), Point(2))
+    filter_.step(Frame((), [born]))
+    before = held.read(held.ids).mean
+    seen = Observations(np.array([[3.4, 1.0]]), R[None], Relative(), TRUNCATED, held.ids)
+    state = filter_.particles.state + np.array([0.3, 0.0]) * (np.arange(n) % 2)[:, None] * 5.0
+    held.correct(state, np.zeros((n, 2)), [seen])
+    stayed = (held.read(held.ids).mean == before).all(axis=(1, 2))
+    nu = 3.4 - (before[:, 0] - state)[:, 0], 1.0 - (before[:, 0] - state)[:, 1]
+    rejected = (nu[0] ** 2 + nu[1] ** 2) / 0.2 > 4.0
+    np.testing.assert_array_equal(stayed, rejected)
+    assert 0 < rejected.sum() < n

@@ -1,0 +1,241 @@
+"""Landmarks of several components enter through w₂; evidence and posteriors against enumeration of the components."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+from scipy.linalg import block_diag
+
+from rbpf.filter import Filter
+from rbpf.genealogy import Lineage
+from rbpf.lie import Euclidean
+from rbpf.maps.landmark_map import LandmarkMap
+from rbpf.maps.mixture import MixturePoint, ring
+from rbpf.maps.point import Point
+from rbpf.models import ObservationModel, Observations, Records
+from rbpf.proposals import EkfProposal, PriorProposal
+from rbpf.resampling import EssTriggered, Systematic
+from tests.exactness.models import (
+    SEEDS,
+    Frame,
+    Kalman,
+    LinearMotion,
+    Relative,
+    Scripted,
+    assert_unbiased,
+    deviation,
+)
+
+PLANE = Euclidean(2)
+R = np.array([[0.3, 0.05], [0.05, 0.25]])
+Q = np.array([[0.2, 0.05], [0.05, 0.1]])
+MEANS = np.array([[[3.0, 1.0], [3.8, 0.2]], [[-2.0, 4.0], [-1.5, 5.0]]])
+"""Of two landmarks of two components; a third landmark is a point."""
+COVS = np.array([[0.3 * np.eye(2), 0.5 * np.eye(2)], [[[0.4, 0.1], [0.1, 0.3]], [[0.2, 0.0], [0.0, 0.6]]]])
+WEIGHTS = np.array([[0.7, 0.3], [0.4, 0.6]])
+POINT_MEAN, POINT_COV = np.array([1.0, -3.0]), 0.4 * np.eye(2)
+SEEN = [(0, 2), (0, 1, 2), (1, 1), (0, 1, 2)]
+"""Landmarks seen in each step; in the third, one is seen twice."""
+
+
+def mixture_map(n_particles: int) -> tuple[MixturePoint, list[tuple[Records, MixturePoint | Point]]]:
+    """Records of the three landmarks."""
+    kind = MixturePoint(2)
+    mixtures = Records(
+        np.tile(MEANS, (n_particles, 1, 1, 1)),
+        np.tile(COVS, (n_particles, 1, 1, 1, 1)),
+        None,
+        np.log(np.tile(WEIGHTS, (n_particles, 1, 1))),
+    )
+    point = Records(np.tile(POINT_MEAN, (n_particles, 1, 1)), np.tile(POINT_COV, (n_particles, 1, 1, 1)))
+    return kind, [(mixtures, kind), (point, Point(2))]
+
+
+@pytest.fixture(scope="module")
+def frames() -> list[Frame]:
+    rng = np.random.default_rng(41)
+    landmarks = np.array([[3.6, 0.4], [-1.7, 4.6], [1.3, -3.2]])
+    position, out = np.zeros(2), []
+    for seen in SEEN:
+        position = position + rng.multivariate_normal(np.zeros(2), Q)
+        z = landmarks[list(seen)] - position + rng.multivariate_normal(np.zeros(2), R, size=len(seen))
+        out.append(Frame([Observations(z, np.tile(R, (len(seen), 1, 1)), Relative(), ids=np.array(seen))]))
+    return out
+
+
+def enumerate_components(frames: list[Frame], noise: np.ndarray) -> dict[tuple[int, int], Kalman]:
+    """A joint Kalman filter of position and three landmarks for each choice of components."""
+    out = {}
+    for choice in product(range(2), repeat=2):
+        means = [MEANS[i, c] for i, c in enumerate(choice)]
+        covs = [COVS[i, c] for i, c in enumerate(choice)]
+        kalman = Kalman(
+            np.concatenate([np.zeros(2), *means, POINT_MEAN]), block_diag(np.zeros((2, 2)), *covs, POINT_COV)
+        )
+        kalman.log_evidence = float(np.log(WEIGHTS[0, choice[0]] * WEIGHTS[1, choice[1]]))
+        pick = np.eye(8)
+        for frame in frames:
+            kalman.predict(pick, block_diag(noise, np.zeros((6, 6))))
+            for z, landmark in zip(frame.groups[0].z, frame.groups[0].ids, strict=True):
+                kalman.update(z, pick[2 + 2 * landmark : 4 + 2 * landmark] - pick[:2], R)
+        out[choice] = kalman
+    return out
+
+
+def build(proposal, resampler, n, noise_factor, rng) -> Filter:
+    held = LandmarkMap(PLANE)
+    filter_ = Filter(LinearMotion(np.eye(2), noise_factor), Scripted(), held, proposal, resampler, n, rng)
+    for records, landmark in mixture_map(n)[1]:
+        held.add_records(records, landmark)
+    return filter_
+
+
+def test_on_a_known_path_the_components_are_enumerated_exactly(frames):
+    exact = enumerate_components(frames, np.zeros((2, 2)))
+    total = np.logaddexp.reduce([kalman.log_evidence for kalman in exact.values()])
+    filter_ = build(EkfProposal(), Systematic(), 3, np.zeros((2, 0)), np.random.default_rng(0))
+    for frame in frames:
+        filter_.step(frame)
+    assert filter_.log_evidence == pytest.approx(total, abs=1e-9)
+    records = filter_.belief().read([0, 1])
+    assert records.log_weights is not None
+    for choice, kalman in exact.items():
+        joint = records.log_weights[0, 0, choice[0]] + records.log_weights[0, 1, choice[1]]
+        assert joint == pytest.approx(kalman.log_evidence - total, abs=1e-9)
+        for i, c in enumerate(choice):
+            at = slice(2 + 2 * i, 4 + 2 * i)
+            np.testing.assert_allclose(records.mean[:, i, c], np.tile(kalman.mean[at], (3, 1)), atol=1e-9)
+            np.testing.assert_allclose(
+                records.cov[:, i, c], np.tile(kalman.cov[at, at], (3, 1, 1)), atol=1e-9
+            )
+
+
+@pytest.mark.parametrize(
+    ("proposal", "resampler"),
+    [
+        (PriorProposal(), Systematic()),
+        (EkfProposal(), EssTriggered(Systematic(), 0.8)),
+        (EkfProposal(exact=False), Systematic()),
+    ],
+    ids=["prior", "ekf", "linearised"],
+)
+def test_evidence_and_component_weights_are_unbiased(frames, proposal, resampler, stream):
+    """In a linear model E06's weight w₂ := p(late observations | x) is exact as well."""
+    exact = enumerate_components(frames, Q)
+    total = np.logaddexp.reduce([kalman.log_evidence for kalman in exact.values()])
+    posterior = np.array(
+        [[sum(np.exp(k.log_evidence - total) for c, k in exact.items() if c[i] == 0)] for i in (0, 1)]
+    )
+    log_ratio, components = [], []
+    for seed in range(SEEDS):
+        filter_ = build(proposal, resampler, 80, np.linalg.cholesky(Q), np.random.default_rng([stream, seed]))
+        for frame in frames:
+            filter_.step(frame)
+        log_ratio.append(filter_.log_evidence - total)
+        log_weights = filter_.belief().read([0, 1]).log_weights
+        first = filter_.particles.weights @ np.exp(log_weights[..., 0])
+        components.append(np.exp(log_ratio[-1]) * (first - posterior[:, 0]))
+    assert_unbiased(np.array(log_ratio))
+    assert deviation(np.array(components), 0.0) <= 3.5
+
+
+def test_mixtures_take_no_part_in_the_refinement(frames):
+    filter_ = build(EkfProposal(), Systematic(), 5, np.linalg.cholesky(Q), np.random.default_rng(1))
+    state = filter_.particles.state
+    group = frames[1].groups[0]
+    prior = filter_.marginals.predict(filter_.motion.transition(state, None, 0.0), PLANE)
+    mixtures, all_of_them, points = (
+        filter_.marginals.terms(
+            state, [Observations(group.z[rows], group.cov[rows], group.model, ids=group.ids[rows])], prior
+        )
+        for rows in ([0, 1], [0, 1, 2], [2])
+    )
+    np.testing.assert_array_equal(mixtures.info, 0.0)
+    np.testing.assert_array_equal(mixtures.quad, 0.0)
+    np.testing.assert_array_equal(all_of_them.info, points.info)
+    assert (np.abs(points.info) > 0.1).any()
+    densities = filter_.marginals.correct(state, np.zeros((5, 2)), [group])
+    assert (densities.late != 0.0).all()
+    assert (densities.all != densities.late).all()
+
+
+def test_promotion_keeps_the_mixtures_moments(frames):
+    filter_ = build(EkfProposal(), Systematic(), 4, np.linalg.cholesky(Q), np.random.default_rng(2))
+    for frame in frames[:2]:
+        filter_.step(frame)
+    held = filter_.belief().map
+    before = held.read(np.array([1]))
+    weights = np.exp(before.log_weights)[:, 0, :, None]
+    mean = (weights * before.mean[:, 0]).sum(axis=1)
+    spread = before.mean[:, 0] - mean[:, None]
+    cov = (weights[..., None] * (before.cov[:, 0] + spread[..., :, None] * spread[..., None, :])).sum(axis=1)
+    held.promote(np.array([1]))
+    after = held.read(np.array([1, 2]))
+    assert isinstance(held.landmark_of(1), Point)
+    assert after.log_weights is None
+    np.testing.assert_allclose(after.mean[:, 0], mean, atol=1e-12)
+    np.testing.assert_allclose(after.cov[:, 0], cov, atol=1e-12)
+    assert np.isfinite(filter_.step(frames[3]).log_evidence)
+
+
+class Range(ObservationModel):
+    """z = distance to a beacon + v."""
+
+    dim = 1
+
+    def predict(self, state, landmark=None, const=None, substate=None):
+        return np.linalg.norm(landmark - state, axis=-1, keepdims=True)
+
+
+def test_a_ring_has_the_moments_of_a_circle():
+    records = ring(np.array([[1.0, 2.0]]), np.array([4.0]), 0.1, 32)
+    assert records.log_weights is not None
+    assert np.exp(records.log_weights).sum() == pytest.approx(1.0)
+    offset = records.mean[0, 0] - np.array([1.0, 2.0])
+    np.testing.assert_allclose(np.hypot(*offset.T), 4.0, rtol=1e-12)
+    for direction, cov in zip(offset / 4.0, records.cov[0, 0], strict=True):
+        assert direction @ cov @ direction == pytest.approx(0.01)
+        assert np.sqrt(np.linalg.eigvalsh(cov)[1]) == pytest.approx(4.0 * np.sin(np.pi / 32))
+
+
+def test_a_range_only_beacon_becomes_a_point():
+    """Along a bend one component of the ring remains; until then the filter is a bank of EKFs, one per component."""
+    rng = np.random.default_rng(17)
+    beacon, variance, components = np.array([4.0, 3.0]), np.array([[0.01]]), 12
+    path = np.array([[0.8 * t, 1.5 * np.sin(0.5 * t)] for t in range(14)])
+    ranges = np.linalg.norm(beacon - path, axis=1) + 0.1 * rng.normal(size=14)
+    held = LandmarkMap(PLANE)
+    n = 3
+    held.begin(n, Lineage(n))
+    records = ring(np.tile(path[0], (n, 1)), ranges[:1], 0.1, components)
+    held.add_records(records, MixturePoint(components))
+    bank = [Kalman(m, c) for m, c in zip(records.mean[0, 0], records.cov[0, 0], strict=True)]
+    promoted_at = None
+    for t in range(1, 14):
+        state = np.tile(path[t], (n, 1))
+        group = Observations(ranges[t : t + 1, None], variance[None], Range(), ids=np.array([0]))
+        density = held.correct(state, np.zeros((n, 2)), [group])
+        if promoted_at is not None:
+            np.testing.assert_array_equal(density.late, 0.0)
+            continue
+        before = (
+            np.logaddexp.reduce([kalman.log_evidence for kalman in bank]) if t > 1 else np.log(components)
+        )
+        for kalman in bank:
+            offset = kalman.mean - path[t]
+            H = (offset / np.linalg.norm(offset))[None]
+            kalman.update(ranges[t] - np.linalg.norm(offset) + H @ kalman.mean, H, variance)
+        after = np.logaddexp.reduce([kalman.log_evidence for kalman in bank])
+        np.testing.assert_allclose(density.late, after - before, atol=1e-6)
+        np.testing.assert_array_equal(density.all, density.late)
+        ready = held.ready(np.full(n, 1.0 / n))
+        assert (ready.size == 1) == (max(k.log_evidence for k in bank) - after >= np.log(0.99))
+        held.promote(ready)
+        promoted_at = t if ready.size else None
+    assert promoted_at is not None
+    assert 2 < promoted_at < 12
+    assert isinstance(held.landmark_of(0), Point)
+    final = held.read(np.array([0]))
+    error = final.mean[0, 0] - beacon
+    assert error @ np.linalg.solve(final.cov[0, 0], error) < 9.0
+    assert np.sqrt(np.trace(final.cov[0, 0])) < 0.3

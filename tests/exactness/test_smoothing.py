@@ -1,0 +1,155 @@
+"""Smoothed trajectories of a linear-Gaussian model against the Rauch-Tung-Striebel smoother."""
+
+import numpy as np
+import pytest
+
+from rbpf.errors import InputError
+from rbpf.filter import Filter
+from rbpf.lie import SE2
+from rbpf.motion.odometry import Odometry, OdometryMotion
+from rbpf.proposals import EkfProposal, PriorProposal
+from rbpf.resampling import EssTriggered, Systematic
+from rbpf.smoothing import _transition_log_density, ancestral_smoothing, backward_simulation
+from rbpf.substate import KalmanSubstate
+from tests.exactness.models import (
+    SEEDS,
+    Frame,
+    Kalman,
+    LinearMotion,
+    LinearObservation,
+    Scripted,
+    assert_unbiased,
+    deviation,
+    single,
+    smooth,
+)
+
+STEPS = 7
+F = np.array([[1.0, 0.7], [0.0, 0.9]])
+L = np.array([[0.35, 0.0], [0.15, 0.3]])
+H, R = np.array([[1.0, 0.0]]), np.array([[0.3]])
+MODEL = LinearObservation(by_state=H)
+INPUTS = np.array([[0.5 * np.sin(t), 0.3 * (-1) ** t] for t in range(STEPS)])
+"""Known, and different in each step: an input taken from the wrong step would show."""
+
+
+@pytest.fixture(scope="module")
+def measured() -> tuple[list[Frame], Kalman, list[tuple[np.ndarray, np.ndarray]]]:
+    """Frames, the Kalman filter at the end, and the exact smoothed moments."""
+    rng = np.random.default_rng(51)
+    truth, frames = np.zeros(2), []
+    kalman = Kalman(np.zeros(2), np.zeros((2, 2)))
+    for u in INPUTS:
+        truth = F @ truth + u + L @ rng.normal(size=2)
+        z = H @ truth + np.sqrt(R[0]) * rng.normal(size=1)
+        frames.append(Frame([single(z, R, MODEL)]))
+        kalman.predict(F, L @ L.T, u)
+        kalman.update(z, H, R)
+        kalman.record()
+    return frames, kalman, smooth(kalman.path, F, L @ L.T, INPUTS)
+
+
+def run(frames: list[Frame], n: int, rng: np.random.Generator, **options) -> Filter:
+    motion = LinearMotion(F, L)
+    filter_ = Filter(motion, Scripted(), n=n, rng=rng, **options)
+    for frame, u in zip(frames, INPUTS, strict=True):
+        filter_.step(frame, u)
+    return filter_
+
+
+def test_the_smoother_and_the_filter_differ(measured):
+    """By more than what the tests below could overlook."""
+    _, kalman, exact = measured
+    moved = [
+        abs(mean - filtered)[0] / np.sqrt(cov[0, 0])
+        for (mean, cov), (filtered, _) in zip(exact, kalman.path, strict=True)
+    ]
+    assert max(moved[:-1]) > 0.3
+    assert exact[-1] == kalman.path[-1]
+
+
+@pytest.mark.parametrize("proposal", [PriorProposal(), EkfProposal()], ids=["prior", "ekf"])
+def test_ancestral_paths_are_unbiased(measured, proposal, stream):
+    """Ẑ Σ W f(x_t) is unbiased for Z E[f(x_t) | z_1:T] along ancestors: first and second moments of every step."""
+    frames, kalman, exact = measured
+    means, covs = (np.array(part) for part in zip(*exact, strict=True))
+    logs, first, second = [], [], []
+    for seed in range(SEEDS):
+        rng = np.random.default_rng([stream, seed])
+        filter_ = run(frames, 60, rng, proposal=proposal, resampler=EssTriggered(Systematic(), 0.6))
+        smoothed = ancestral_smoothing(filter_.space, filter_.history, filter_.particles.weights)
+        logs.append(filter_.log_evidence - kalman.log_evidence)
+        error = smoothed.mean - means
+        first.append(np.exp(logs[-1]) * error)
+        second.append(np.exp(logs[-1]) * (smoothed.cov + error[:, :, None] * error[:, None, :] - covs))
+    assert_unbiased(np.array(logs))
+    assert deviation(np.array(first), 0.0) <= 4.0
+    rows, columns = np.triu_indices(2)
+    assert deviation(np.array(second)[:, :, rows, columns], 0.0) <= 4.0
+
+
+@pytest.mark.parametrize("lag", [1, 3, STEPS])
+def test_a_fixed_lag_keeps_the_last_steps_of_the_same_paths(measured, lag):
+    whole, short = (
+        run(measured[0], 50, np.random.default_rng(3), lag=kept, resampler=Systematic())
+        for kept in (None, lag)
+    )
+    assert whole.lineage.generation > 1
+    full, part = (ancestral_smoothing(f.space, f.history, f.particles.weights) for f in (whole, short))
+    np.testing.assert_array_equal(part.stamps_ns, full.stamps_ns[-lag:])
+    np.testing.assert_array_equal(part.mean, full.mean[-lag:])
+    np.testing.assert_array_equal(part.cov, full.cov[-lag:])
+
+
+def test_backward_simulation_agrees_with_the_exact_smoother(measured, stream):
+    """Consistent, not unbiased: its error falls like 1/N; and it spreads less than ancestry, whose lineages coalesce."""
+    frames, _, exact = measured
+    means, covs = (np.array(part) for part in zip(*exact, strict=True))
+    runs, ancestral = [], []
+    for seed in range(30):
+        rng = np.random.default_rng([stream, seed])
+        filter_ = run(frames, 200, rng, clouds=True, proposal=PriorProposal(), resampler=Systematic())
+        runs.append(backward_simulation(filter_.motion, filter_.history, 400, rng, list(INPUTS)))
+        ancestral.append(ancestral_smoothing(filter_.space, filter_.history, filter_.particles.weights))
+    std = np.sqrt(np.array([np.diag(cov) for cov in covs]))
+    error, worse = ((np.array([smoothed.mean for smoothed in of]) - means) / std for of in (runs, ancestral))
+    assert deviation(error, 0.0) <= 4.0
+    assert np.abs(error.mean(axis=0)).max() < 0.08
+    assert (error.std(axis=0)[0] < 0.8 * worse.std(axis=0)[0]).all()
+    spread = np.mean([smoothed.cov for smoothed in runs], axis=0)
+    np.testing.assert_allclose(spread, covs, atol=0.06 * covs.max())
+    np.testing.assert_array_equal(runs[0].stamps_ns, ancestral[0].stamps_ns)
+
+
+def test_backward_simulation_says_what_it_cannot_do(measured):
+    rng = np.random.default_rng(0)
+    plain = run(measured[0], 10, rng)
+    with pytest.raises(InputError, match="clouds=True and no lag"):
+        backward_simulation(plain.motion, plain.history, 5, rng)
+    lagged = run(measured[0], 10, rng, clouds=True, lag=3)
+    with pytest.raises(InputError, match="clouds=True and no lag"):
+        backward_simulation(lagged.motion, lagged.history, 5, rng)
+    kept = run(measured[0], 10, rng, clouds=True)
+    singular = LinearMotion(F, np.array([[0.3], [0.1]]))
+    with pytest.raises(InputError, match="regular noise"):
+        backward_simulation(singular, kept.history, 5, rng, list(INPUTS))
+    driven = LinearMotion(F, np.eye(4), np.eye(2), np.eye(2), np.zeros(2))
+    substate = KalmanSubstate(driven.space, np.zeros(2), np.eye(2))
+    filter_ = Filter(driven, Scripted(), substate, n=10, rng=rng, clouds=True)
+    for frame in measured[0]:
+        filter_.step(frame)
+    with pytest.raises(InputError, match="without a substate"):
+        backward_simulation(filter_.motion, filter_.history, 5, rng)
+
+
+def test_the_transition_density_on_poses_integrates_to_one():
+    """A right perturbation of a pose has the volume dθ dx dy: the chart's Jacobian belongs to the backward weight."""
+    factor = np.array([[0.5, 0.0, 0.0], [0.1, 0.3, 0.0], [0.0, 0.1, 0.2]])
+    before, delta = np.array([[0.7, 1.0, -2.0]]), np.array([0.4, 1.0, 0.0])
+    axes = [np.linspace(-3.0, 3.0, points) for points in (61, 49, 49)]
+    offsets = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3) * np.array([1.0, 0.8, 0.8])
+    after = SE2.compose(before, delta) + offsets
+    motion, control = OdometryMotion(SE2), Odometry(delta, factor @ factor.T)
+    log_density = _transition_log_density(motion, before, SE2.normalise(after), control, 1.0)
+    cell = 0.1**3
+    assert np.exp(log_density).sum() * cell / (2 * np.pi) ** 1.5 == pytest.approx(1.0, abs=1e-3)

@@ -1,0 +1,131 @@
+"""Every example runs, prints something, and shows what its page in the documentation says that it shows."""
+
+import ast
+import importlib
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
+
+ROOT = Path(__file__).resolve().parents[2]
+EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+LONGEST_SENSOR = 40
+
+
+def batch_check(figures: dict[str, float]) -> None:
+    assert figures["filter"] < 0.5 * figures["odometry alone"]
+    assert figures["from_batch"] < 0.1
+
+
+def checkpoint(figures: dict[str, bool]) -> None:
+    assert figures["same"]
+    assert figures["refused"]
+
+
+def custom_sensor(figures: dict[str, float]) -> None:
+    assert figures["findings"] == 0
+    assert figures["filter"] < 0.25 * figures["odometry"]
+    assert 0.8 < figures["nis_per_dof"] < 1.25
+
+
+def evidence(figures: dict[float, float]) -> None:
+    low, right, high = figures.values()
+    assert right > max(low, high) + 3.0
+
+
+def fused_kernel(figures: dict[str, float]) -> None:
+    assert figures["findings"] == 0
+    assert figures["difference"] < 1e-6
+    assert figures["speedup"] > 1.0
+
+
+def gps_fix(figures: dict[str, float]) -> None:
+    assert figures["sigma_heading_end"] < 0.1 * figures["sigma_heading_start"]
+    assert figures["position_rmse"] < 0.5 * 2**0.5
+    assert figures["share_within_3_sigma"] > 0.95
+
+
+def own_landmark(figures: dict[str, float]) -> None:
+    assert figures["findings"] == 0
+    assert figures["located"] >= 25
+    assert figures["map"] < 0.5
+    assert figures["path"] < 0.2
+
+
+def own_proposal(figures: dict[float, tuple[float, float]]) -> None:
+    errors, sizes = zip(*figures.values(), strict=True)
+    assert max(errors) < 0.15
+    assert sizes[0] > sizes[1] > sizes[2]
+
+
+def range_only_beacons(figures: dict[str, float]) -> None:
+    assert figures["promoted"] >= 4
+    assert figures["map"] < 0.5
+    assert figures["path"] < 0.3
+
+
+def smoothing(figures: dict[str, float]) -> None:
+    assert figures["ancestral paths"] < 0.5 * figures["filter"]
+    assert figures["backward"] < 0.5 * figures["filter"]
+
+
+def target_tracking(figures: dict[str, dict[str, float]]) -> None:
+    bootstrap, marginalised, refined = figures.values()
+    for better in (marginalised, refined):
+        assert better["position_rmse"] < bootstrap["position_rmse"]
+        assert better["spread"] < 0.7 * bootstrap["spread"]
+
+
+CLAIMS: dict[str, Callable[[Any], None]] = {
+    claim.__name__: claim
+    for claim in (
+        batch_check,
+        checkpoint,
+        custom_sensor,
+        evidence,
+        fused_kernel,
+        gps_fix,
+        own_landmark,
+        own_proposal,
+        range_only_beacons,
+        smoothing,
+        target_tracking,
+    )
+}
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_example_shows_what_it_promises(path, capsys, monkeypatch):
+    monkeypatch.syspath_prepend(path.parent)
+    figures = importlib.import_module(path.stem).main()
+    assert capsys.readouterr().out.count("\n") >= 2
+    CLAIMS[path.stem](figures)
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_example_uses_the_public_interface(path):
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    imports = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
+    names = [f"{node.module}.{alias.name}" for node in imports for alias in node.names]
+    assert [name for name in names if name.startswith("rbpf")]
+    assert not [name for name in names if re.search(r"\._", name)]
+    assert ast.get_docstring(tree)
+
+
+def test_a_new_sensor_takes_few_lines():
+    tree = ast.parse((ROOT / "examples" / "custom_sensor.py").read_text(encoding="utf-8"))
+    (sensor,) = [node for node in tree.body if isinstance(node, ast.ClassDef)]
+    assert sensor.end_lineno is not None
+    assert sensor.end_lineno - sensor.lineno + 1 < LONGEST_SENSOR
+
+
+def test_the_readme_s_program_runs(tmp_path, monkeypatch, capsys):
+    (program,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+    simulate_robot(RobotWorld(steps=20, landmarks=20), tmp_path / "demo" / "log", seed=0)
+    monkeypatch.chdir(tmp_path)
+    exec(compile(program, "README.md", "exec"), {})
+    assert "log-evidence" in capsys.readouterr().out

@@ -1,0 +1,172 @@
+"""A map by itself: kinds side by side, promotion, readiness, log-odds, rings."""
+
+import numpy as np
+import pytest
+
+from rbpf.errors import InputError
+from rbpf.genealogy import Lineage
+from rbpf.lie import SE2, SE3
+from rbpf.maps.landmark_map import LandmarkMap
+from rbpf.maps.mixture import MixturePoint, ring
+from rbpf.maps.point import AnchoredPoint, Point
+from rbpf.models import Births, Records
+from rbpf.sensors.range_bearing import RangeBearing
+
+N = 40
+
+
+def filled(evidence: bool = False) -> tuple[LandmarkMap, Lineage]:
+    lineage, landmark_map = Lineage(N), LandmarkMap(SE2, evidence=evidence)
+    landmark_map.begin(N, lineage)
+    return landmark_map, lineage
+
+
+def points(rng: np.random.Generator, k: int, dim: int = 2) -> Records:
+    return Records(rng.normal(size=(N, k, dim)), np.broadcast_to(0.1 * np.eye(dim), (N, k, dim, dim)).copy())
+
+
+def resample(landmark_map: LandmarkMap, lineage: Lineage, rng: np.random.Generator) -> np.ndarray:
+    ancestors = np.sort(rng.integers(0, N, N))
+    lineage.advance(ancestors)
+    landmark_map.resample(ancestors)
+    return ancestors
+
+
+def test_kinds_side_by_side_follow_their_particles():
+    rng = np.random.default_rng(0)
+    landmark_map, lineage = filled()
+    plane, mixture = points(rng, 2), ring(rng.normal(size=(N, 2)), np.array([4.0]), 0.1, 5)
+    anchors = Records(*vars(points(rng, 1)).values())
+    anchors = Records(anchors.mean, anchors.cov, SE2.exp(rng.normal(size=(N, 1, 3))))
+    ids = [
+        landmark_map.add_records(plane, Point(2)),
+        landmark_map.add_records(mixture, MixturePoint(5)),
+        landmark_map.add_records(anchors, AnchoredPoint(SE2)),
+    ]
+    assert np.concatenate(ids).tolist() == [0, 1, 2, 3]
+    row = np.arange(N)
+    for _ in range(30):
+        row = row[resample(landmark_map, lineage, rng)]
+    for which, expected in zip(ids, (plane, mixture, anchors), strict=True):
+        found = landmark_map.read(which)
+        np.testing.assert_array_equal(found.mean, expected.mean[row])
+        np.testing.assert_array_equal(found.cov, expected.cov[row])
+    np.testing.assert_array_equal(landmark_map.read(ids[1]).log_weights, mixture.log_weights[row])
+    np.testing.assert_array_equal(landmark_map.read(ids[2]).const, anchors.const[row])
+    assert isinstance(landmark_map.landmark_of(2), MixturePoint)
+    with pytest.raises(InputError, match="one parametrisation at a time"):
+        landmark_map.read(np.array([0, 2]))
+
+
+def test_more_landmarks_than_first_reserved():
+    rng = np.random.default_rng(1)
+    landmark_map, _ = filled()
+    records = points(rng, 150)
+    assert landmark_map.add_records(records, Point(2)).tolist() == list(range(150))
+    landmark_map.remove(np.arange(0, 150, 2))
+    assert landmark_map.ids.tolist() == list(range(1, 150, 2))
+    assert landmark_map.add_records(points(rng, 1), Point(2)).tolist() == [150]
+    np.testing.assert_array_equal(landmark_map.read(np.array([149])).mean[:, 0], records.mean[:, 149])
+
+
+def test_a_removed_landmark_leaves_the_catalogue():
+    landmark_map, _ = filled()
+    births = Births(np.ones((2, 2)), np.repeat(np.eye(2)[None], 2, 0), RangeBearing(SE2), Point(2), facts=["a", "b"])
+    landmark_map.add(births, SE2.identity((N,)))
+    landmark_map.remove(np.array([0]))
+    assert landmark_map.catalogue == {1: "b"}
+
+
+def test_a_ring_promotes_to_its_moments():
+    rng = np.random.default_rng(2)
+    landmark_map, _ = filled()
+    centre = rng.normal(size=(N, 2))
+    mixture = ring(centre, np.array([4.0]), 0.1, 9)
+    ids = landmark_map.add_records(mixture, MixturePoint(9))
+    landmark_map.promote(ids)
+    assert isinstance(landmark_map.landmark_of(0), Point)
+    found = landmark_map.read(ids)
+    # Equal weights: the centre, and half of the squared radius on each axis beside the components' own share.
+    np.testing.assert_allclose(found.mean[:, 0], centre, atol=1e-12)
+    own = mixture.cov[0, 0].mean(axis=0)
+    np.testing.assert_allclose(found.cov[:, 0], np.broadcast_to(8.0 * np.eye(2) + own, (N, 2, 2)), atol=1e-10)
+
+
+def test_an_anchored_point_promotes_to_the_world():
+    """The transform is linear, so mean and covariance are exact."""
+    rng = np.random.default_rng(3)
+    lineage, landmark_map = Lineage(N), LandmarkMap(SE3)
+    landmark_map.begin(N, lineage)
+    anchor = SE3.exp(rng.normal(size=(N, 1, 6)))
+    free = points(rng, 1, 3)
+    ids = landmark_map.add_records(Records(free.mean, free.cov, anchor), AnchoredPoint(SE3))
+    landmark_map.promote(ids)
+    found, rotation = landmark_map.read(ids), SE3.rotation(anchor)
+    np.testing.assert_allclose(found.mean, SE3.transform(anchor, free.mean), atol=1e-12)
+    np.testing.assert_allclose(found.cov, rotation @ free.cov @ np.swapaxes(rotation, -1, -2), atol=1e-12)
+
+
+def test_promotion_keeps_the_log_odds():
+    landmark_map, _ = filled(evidence=True)
+    log_odds = np.linspace(-1.0, 2.0, N)[:, None]
+    ids = landmark_map.add_records(ring(np.zeros((N, 2)), np.array([4.0]), 0.1, 4), MixturePoint(4), log_odds)
+    landmark_map.promote(ids)
+    np.testing.assert_array_equal(landmark_map.log_odds(ids), log_odds)
+
+
+def test_ready_when_enough_of_the_weight_says_so():
+    landmark_map, _ = filled()
+    mixture = ring(np.zeros((N, 2)), np.array([4.0]), 0.1, 4)
+    dominant = np.log(np.array([0.997, 0.001, 0.001, 0.001]))
+    log_weights = np.where(np.arange(N)[:, None, None] < N // 2, dominant, mixture.log_weights)
+    landmark_map.add_records(points(np.random.default_rng(0), 1), Point(2))
+    ids = landmark_map.add_records(Records(mixture.mean, mixture.cov, None, log_weights), MixturePoint(4))
+    weights = np.where(np.arange(N) < N // 2, 0.96, 0.04) / (N // 2)
+    assert landmark_map.ready(weights).tolist() == ids.tolist()
+    assert landmark_map.ready(weights, share=0.97).size == 0
+    assert landmark_map.ready(np.full(N, 1 / N)).size == 0
+
+
+class TestLogOdds:
+    def test_read_and_written_per_particle(self):
+        rng = np.random.default_rng(4)
+        landmark_map, lineage = filled(evidence=True)
+        ids = landmark_map.add_records(points(rng, 3), Point(2))
+        log_odds = rng.normal(size=(N, 3))
+        before = landmark_map.read(ids)
+        landmark_map.set_log_odds(ids, log_odds)
+        np.testing.assert_array_equal(landmark_map.log_odds(ids), log_odds)
+        ancestors = resample(landmark_map, lineage, rng)
+        np.testing.assert_array_equal(landmark_map.log_odds(ids), log_odds[ancestors])
+        np.testing.assert_array_equal(landmark_map.read(ids).mean, before.mean[ancestors])
+        np.testing.assert_array_equal(landmark_map.read(ids).cov, before.cov[ancestors])
+
+    def test_what_no_particle_holds_is_removed(self):
+        landmark_map, _ = filled(evidence=True)
+        ids = landmark_map.add_records(points(np.random.default_rng(5), 2), Point(2))
+        log_odds = np.zeros((N, 2))
+        log_odds[:, 0] = -np.inf
+        log_odds[1:, 1] = -np.inf
+        landmark_map.set_log_odds(ids, log_odds)
+        assert landmark_map.ids.tolist() == [1]
+
+    def test_a_map_without_evidence_holds_everything_in_all(self):
+        landmark_map, _ = filled()
+        ids = landmark_map.add_records(points(np.random.default_rng(5), 2), Point(2))
+        np.testing.assert_array_equal(landmark_map.log_odds(ids), np.zeros((N, 2)))
+
+
+def test_ring_covers_the_circle():
+    """Each component has σ_r along the radius and half a step across it; neighbours meet at one sigma."""
+    mixture = ring(np.array([[1.0, 2.0]]), np.array([3.0, 5.0]), 0.2, 8)
+    assert mixture.mean.shape == (1, 2, 8, 2)
+    offset = mixture.mean[0] - np.array([1.0, 2.0])
+    np.testing.assert_allclose(np.linalg.norm(offset, axis=-1), [[3.0] * 8, [5.0] * 8])
+    np.testing.assert_allclose(np.exp(mixture.log_weights).sum(axis=-1), 1.0)
+    for k, radius in enumerate((3.0, 5.0)):
+        along = offset[k] / radius
+        variance = np.einsum("ca,cab,cb->c", along, mixture.cov[0, k], along)
+        np.testing.assert_allclose(variance, 0.04)
+        chord = np.linalg.norm(offset[k, 1] - offset[k, 0])
+        values = np.linalg.eigvalsh(mixture.cov[0, k])
+        np.testing.assert_allclose(values[:, 1], (0.5 * chord) ** 2)

@@ -1,0 +1,119 @@
+"""Which rows are independent and which belong together."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rbpf.errors import InputError
+from rbpf.maps.plan import Plan, Row, make_plan
+from rbpf.models import NEW, NULL, ObservationModel, Observations
+
+N = 4
+KINDS = np.array([0, 0, 0, 1, 1, 2, -1])
+PLAIN = np.array([True, True, False])
+HELD = [0, 1, 2, 3, 4, 5]
+
+
+class Anything(ObservationModel):
+    """A model that is not called."""
+
+    dim = 1
+
+    def predict(self, state, landmark=None, const=None, substate=None):
+        raise AssertionError
+
+
+def group(ids, **options) -> Observations:
+    ids = np.array(ids)
+    return Observations(np.zeros((ids.shape[-1], 1)), np.ones((ids.shape[-1], 1, 1)), Anything(), ids=ids, **options)
+
+
+def rows_of(plan: Plan) -> list[Row]:
+    """Every row of a plan, batches taken apart."""
+    rows = [row for rows in plan.joint for row in rows] + list(plan.late)
+    for batch in plan.batches:
+        for j, (k, landmark) in enumerate(zip(batch.ks.tolist(), batch.ids.tolist(), strict=True)):
+            mask = None if batch.mask is None else batch.mask[:, j]
+            rows.append(Row(batch.group, k, landmark, mask))
+    return rows
+
+
+def matrix(rows: list[Row], count: int, groups: int) -> np.ndarray:
+    """Ids (groups, N, count) that rows speak of, −1 elsewhere."""
+    out = np.full((groups, N, count), NULL)
+    for row in rows:
+        mask = np.ones(N, dtype=bool) if row.mask is None else row.mask
+        assert (out[row.group, mask, row.k] == NULL).all()
+        out[row.group, mask, row.k] = row.landmark
+    return out
+
+
+@st.composite
+def id_arrays(draw):
+    """Ids (K,) or (N, K); a landmark may be named several times."""
+    count = draw(st.integers(1, 4))
+    one = st.sampled_from([NULL, NEW, *HELD])
+    per_particle = draw(st.booleans())
+    shape = (N, count) if per_particle else (count,)
+    flat = draw(st.lists(one, min_size=int(np.prod(shape)), max_size=int(np.prod(shape))))
+    return np.array(flat).reshape(shape)
+
+
+@given(st.lists(id_arrays(), min_size=1, max_size=3))
+def test_every_row_appears_once_and_overlaps_are_stacked(all_ids):
+    plan = make_plan([group(ids) for ids in all_ids], N, KINDS, PLAIN)
+    count = max(ids.shape[-1] for ids in all_ids)
+    found = matrix(rows_of(plan), count, len(all_ids))
+    for g, ids in enumerate(all_ids):
+        expected = np.broadcast_to(np.where(ids >= 0, ids, NULL), (N, ids.shape[-1]))
+        np.testing.assert_array_equal(found[g, :, : ids.shape[-1]], expected)
+    for batch in plan.batches:
+        assert np.unique(KINDS[batch.ids]).size == 1
+        assert PLAIN[KINDS[batch.ids[0]]]
+    assert all(not PLAIN[KINDS[row.landmark]] for row in plan.late)
+    together = {rows[0].landmark for rows in plan.joint}
+    assert all(len({row.landmark for row in rows}) == 1 for rows in plan.joint)
+    for landmark in HELD[:5]:
+        per_particle = (found == landmark).sum(axis=(0, 2))
+        assert (landmark in together) == bool((per_particle > 1).any())
+
+
+@given(st.lists(id_arrays(), min_size=1, max_size=3), st.floats(-9.0, 2.0), st.floats(-9.0, 2.0))
+def test_clutter_and_first_sightings_cost_their_density(all_ids, log_new, log_clutter):
+    groups = [group(ids, log_new=log_new, log_clutter=log_clutter) for ids in all_ids]
+    plan = make_plan(groups, N, KINDS, PLAIN)
+    expected = np.zeros(N)
+    for ids in all_ids:
+        full = np.broadcast_to(ids, (N, ids.shape[-1]))
+        expected += log_new * (full == NEW).sum(axis=1) + log_clutter * (full == NULL).sum(axis=1)
+    np.testing.assert_allclose(plan.log_factor, expected, atol=1e-12)
+
+
+def test_impossible_clutter_only_counts_where_there_is_some():
+    plan = make_plan([group([[NULL], [0], [0], [0]], log_clutter=-np.inf)], N, KINDS, PLAIN)
+    assert plan.log_factor.tolist() == [-np.inf, 0.0, 0.0, 0.0]
+
+
+def test_the_common_case_is_one_batch_without_masks():
+    plan = make_plan([group([2, NULL, 0, 1])], N, KINDS, PLAIN)
+    assert len(plan.batches) == 1
+    assert plan.batches[0].ids.tolist() == [2, 0, 1]
+    assert plan.batches[0].ks.tolist() == [0, 2, 3]
+    assert plan.batches[0].mask is None
+
+
+def test_agreement_of_all_particles_needs_no_mask():
+    plan = make_plan([group([[2, 0]] * N)], N, KINDS, PLAIN)
+    assert [batch.mask for batch in plan.batches] == [None]
+
+
+def test_nothing_seen():
+    plan = make_plan([group(np.zeros(0, dtype=int))], N, KINDS, PLAIN)
+    assert (plan.batches, plan.joint, plan.late) == ([], [], [])
+
+
+@pytest.mark.parametrize("ids", [[6], [7], [[0]] * (N - 1) + [[6]]])
+def test_landmarks_that_are_not_held(ids):
+    with pytest.raises(InputError, match="names landmark [67], which the map does not hold"):
+        make_plan([group(ids)], N, KINDS, PLAIN)

@@ -1,0 +1,157 @@
+"""Range-bearing and position sensors: round trips, derivatives, angles near the cut, visibility."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from rbpf.lie import SE2, SE3
+from rbpf.numeric import numeric_jacobians
+from rbpf.sensors.range_bearing import RangeBearing, RelativePosition, wrap_angle
+from rbpf.sensors.rigid_point import RigidPointModel
+
+MOUNTED_2D = np.array([0.4, 0.3, -0.2])
+MOUNTED_3D = SE3.retract(SE3.identity(), np.array([0.3, -0.2, 0.5, 0.1, 0.2, -0.3]))
+MODELS = {
+    "planar": RangeBearing(SE2),
+    "planar mounted": RangeBearing(SE2, MOUNTED_2D),
+    "spatial": RangeBearing(SE3),
+    "spatial mounted": RangeBearing(SE3, MOUNTED_3D),
+    "pitch down": RangeBearing(SE3, MOUNTED_3D, pitch_sign=-1.0),
+    "position": RelativePosition(SE2, MOUNTED_2D),
+    "position in space": RelativePosition(SE3, MOUNTED_3D),
+}
+every_model = pytest.mark.parametrize("model", MODELS.values(), ids=MODELS.keys())
+
+
+@st.composite
+def scenes(draw):
+    """A tangent (6,) of the pose and a point (3,) in the sensor's frame; each model takes what it needs."""
+    tangent = draw(arrays(float, 6, elements=st.floats(-3.0, 3.0)))
+    distance, yaw, pitch = draw(st.floats(0.2, 50.0)), draw(st.floats(-3.2, 3.2)), draw(st.floats(-1.3, 1.3))
+    flat = distance * np.cos(pitch)
+    return tangent, np.array([flat * np.cos(yaw), flat * np.sin(yaw), distance * np.sin(pitch)])
+
+
+def placed(model: RigidPointModel, scene) -> tuple[np.ndarray, np.ndarray]:
+    """The pose, and the point in the world."""
+    tangent, point = scene
+    pose = model.space.exp(tangent[: model.space.dim])
+    in_robot = model.space.transform(model.robot_from_sensor, point[: model.dim])
+    return pose, model.space.transform(pose, in_robot)
+
+
+@every_model
+@given(scene=scenes())
+def test_invert_undoes_predict(model, scene):
+    pose, landmark = placed(model, scene)
+    again = model.invert(pose, model.predict(pose, landmark))
+    np.testing.assert_allclose(again, landmark, atol=1e-11)
+
+
+@every_model
+@given(scene=scenes())
+def test_jacobians_are_the_numeric_ones(model, scene):
+    pose, landmark = placed(model, scene)
+    analytic = model.jacobians(pose, landmark)
+    numeric = numeric_jacobians(model, model.space, pose, landmark)
+    # Numeric derivatives of an angle lose digits where the point is near the sensor or its vertical axis.
+    near = 1.0 + 1.0 / np.hypot(*scene[1][:2]) ** 3
+    np.testing.assert_allclose(analytic.state, numeric.state, rtol=1e-6, atol=1e-8 * near)
+    np.testing.assert_allclose(analytic.landmark, numeric.landmark, rtol=1e-6, atol=1e-8 * near)
+
+
+@every_model
+def test_broadcasting(model):
+    rng = np.random.default_rng(0)
+    states = model.space.exp(rng.normal(size=(5, 1, model.space.dim)))
+    landmarks = 4.0 * rng.normal(size=(5, 7, model.dim))
+    whole = model.predict(states, landmarks)
+    jacobians = model.jacobians(states, landmarks)
+    assert whole.shape == (5, 7, model.dim)
+    for i, k in np.ndindex(5, 7):
+        np.testing.assert_allclose(model.predict(states[i, 0], landmarks[i, k]), whole[i, k], atol=1e-13)
+        one = model.jacobians(states[i, 0], landmarks[i, k])
+        np.testing.assert_allclose(jacobians.state[i, k], one.state, atol=1e-12)
+        np.testing.assert_allclose(jacobians.landmark[i, k], one.landmark, atol=1e-12)
+
+
+def test_planar_measurement_by_hand():
+    # Robot at (1, 2) looking along +y; the point is 3 m ahead and 4 m to the left.
+    pose = np.array([np.pi / 2, 1.0, 2.0])
+    z = RangeBearing(SE2).predict(pose, np.array([-3.0, 5.0]))
+    np.testing.assert_allclose(z, [5.0, np.arctan2(4.0, 3.0)])
+
+
+@pytest.mark.parametrize(("sign", "pitch"), [(1.0, np.pi / 4), (-1.0, -np.pi / 4)])
+def test_spatial_measurement_by_hand(sign, pitch):
+    z = RangeBearing(SE3, pitch_sign=sign).predict(SE3.identity(), np.array([1.0, 1.0, np.sqrt(2.0)]))
+    np.testing.assert_allclose(z, [2.0, np.pi / 4, pitch])
+
+
+def test_mounting_pose_by_hand():
+    # The sensor is 1 m ahead of the robot and looks back.
+    model = RangeBearing(SE2, np.array([np.pi, 1.0, 0.0]))
+    np.testing.assert_allclose(model.predict(np.zeros(3), np.array([-1.0, 0.0])), [2.0, 0.0], atol=1e-15)
+    np.testing.assert_allclose(model.predict(np.zeros(3), np.array([1.0, 1.0])), [1.0, -np.pi / 2])
+
+
+def test_covariance_of_a_first_estimate():
+    """Across the line of sight r·σ_yaw, along it σ_r."""
+    cov = np.diag([0.1, 0.02]) ** 2
+    records = RangeBearing(SE2).initialise(np.zeros((1, 3)), np.array([[10.0, np.pi / 2]]), cov[None])
+    np.testing.assert_allclose(records.mean[0, 0], [0.0, 10.0], atol=1e-12)
+    np.testing.assert_allclose(records.cov[0, 0], np.diag([0.2, 0.1]) ** 2, atol=1e-9)
+
+
+@given(st.floats(-50.0, 50.0))
+def test_wrapped_angles(angle):
+    wrapped = wrap_angle(np.array(angle))
+    assert -np.pi <= wrapped < np.pi
+    assert np.abs(np.exp(1j * wrapped) - np.exp(1j * angle)) < 1e-13
+
+
+@pytest.mark.parametrize("model", [RangeBearing(SE2), RangeBearing(SE3)], ids=["planar", "spatial"])
+@given(near=st.floats(-0.01, 0.01), step=st.floats(-0.01, 0.01))
+def test_residual_across_the_cut(model, near, step):
+    before, after = np.zeros(model.dim), np.zeros(model.dim)
+    before[1], after[1] = wrap_angle(np.array([np.pi + near, np.pi + near + step]))
+    np.testing.assert_allclose(model.residual(after, before)[1], step, atol=1e-14)
+
+
+def test_jacobians_behind_the_sensor():
+    pose, landmark = np.array([0.0, 0.0, 0.0]), np.array([-5.0, 0.0])
+    model = RangeBearing(SE2)
+    analytic, numeric = model.jacobians(pose, landmark), numeric_jacobians(model, SE2, pose, landmark)
+    np.testing.assert_allclose(analytic.state, numeric.state, atol=1e-9)
+    np.testing.assert_allclose(analytic.landmark, numeric.landmark, atol=1e-9)
+
+
+def test_residual_leaves_its_arguments_alone():
+    z, predicted = np.array([[1.0, 3.1]]), np.array([[1.0, -3.1]])
+    RangeBearing(SE2).residual(z, predicted)
+    assert z.tolist() == [[1.0, 3.1]]
+    assert predicted.tolist() == [[1.0, -3.1]]
+
+
+def test_visible():
+    model = RangeBearing(SE2, max_range=5.0, half_field_of_view=np.pi / 4)
+    points = np.array([[4.0, 0.0], [6.0, 0.0], [2.0, 1.9], [2.0, 2.1], [-4.0, 0.0]])
+    assert model.visible(np.zeros(3), points).tolist() == [True, False, True, False, False]
+    turned = np.array([np.pi, 0.0, 0.0])
+    assert model.visible(turned, points).tolist() == [False, False, False, False, True]
+    states = np.stack([np.zeros(3), turned])[:, None]
+    assert model.visible(states, points[None].repeat(2, axis=0)).shape == (2, 5)
+
+
+def test_visible_positions():
+    model = RelativePosition(SE2, np.array([0.0, 1.0, 0.0]), max_range=2.0)
+    assert model.visible(np.zeros(3), np.array([[2.9, 0.0], [3.1, 0.0], [-1.1, 0.0]])).tolist() == [True, False, False]
+
+
+def test_everything_is_visible_by_default():
+    rng = np.random.default_rng(0)
+    for model in MODELS.values():
+        states = model.space.exp(rng.normal(size=(3, 1, model.space.dim)))
+        assert model.visible(states, 1e3 * rng.normal(size=(3, 4, model.dim))).all()

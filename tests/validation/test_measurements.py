@@ -1,0 +1,235 @@
+"""Measurements: checks, files that come back bit by bit, files that are refused, conversion of a log."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rbpf.errors import InputError
+from rbpf.lie import SE2
+from rbpf.sensors.range_bearing import RangeBearing, RelativePosition
+from rbpf.sensors.readers import Frame, RobotLog, open_log
+from rbpf.validation.measurement_files import OBSERVATIONS, ODOMETRY, read_measurements, write_measurements
+from rbpf.validation.measurements import Measurements, dead_reckoning, from_log, initial_estimate
+from tests.validation.worlds import seen, world
+
+FIELDS = [field for field in Measurements.__dataclass_fields__ if field != "space"]
+
+
+def assert_same(found, expected):
+    assert found.space is expected.space
+    for field in FIELDS:
+        np.testing.assert_array_equal(getattr(found, field), getattr(expected, field), strict=True)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("kind", ["range_bearing", "position"])
+def test_files_give_back_the_same_bits(tmp_path, dim, kind):
+    m = world(dim, kind)
+    write_measurements(tmp_path, m)
+    assert_same(read_measurements(tmp_path), m)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [OBSERVATIONS, ODOMETRY]
+
+
+def test_extreme_numbers_come_back(tmp_path):
+    m = world(2, "position")
+    z, covs = m.z.copy(), m.covs.copy()
+    z[0] = [5e-324, -1e12]
+    covs[0] = np.diag([0.0, 1e-300, np.nextafter(1.0, 2.0)])
+    m = replace(m, z=z, covs=covs, landmarks=m.landmarks - 2**62, recording="zurich, 2nd: été")
+    write_measurements(tmp_path, m)
+    assert_same(read_measurements(tmp_path), m)
+
+
+def test_a_run_without_sightings_and_one_of_a_single_step_come_back(tmp_path):
+    m = world(3, "position")
+    blind = seen(m, m.steps[:0], m.landmarks[:0], m.z[:0], m.cov_z[:0])
+    first = m.steps == 0
+    single = seen(m, m.steps[first], m.landmarks[first], m.z[first], m.cov_z[first])
+    single = replace(single, stamps_ns=m.stamps_ns[:1], deltas=m.deltas[:0], covs=m.covs[:0])
+    for short in (blind, single):
+        write_measurements(tmp_path, short)
+        assert_same(read_measurements(tmp_path), short)
+
+
+def test_the_files_are_as_documented(tmp_path):
+    m = world(2, "range_bearing")
+    write_measurements(tmp_path, m)
+    lines = (tmp_path / OBSERVATIONS).read_text().splitlines()
+    assert lines[0] == "# rbpf observations 1"
+    assert lines[4:6] == ["# pitch_sign: -1", "# robot_from_sensor: 2.4 0.3 -0.2"]
+    assert lines[9] == "step,stamp_ns,landmark,z0,z1,c00,c10,c11"
+    row = lines[10].split(",")
+    assert row[:3] == [str(m.steps[0]), str(m.stamps_ns[m.steps[0]]), str(m.landmarks[0])]
+    assert [float(x) for x in row[5:]] == [m.cov_z[0, 0, 0], m.cov_z[0, 1, 0], m.cov_z[0, 1, 1]]
+    lines = (tmp_path / ODOMETRY).read_text().splitlines()
+    assert lines[4] == "step,stamp_ns,d0,d1,d2,c00,c10,c11,c20,c21,c22"
+    assert lines[5].split(",")[:3] == ["1", str(m.stamps_ns[1]), repr(float(m.deltas[0, 0]))]
+
+
+@pytest.mark.parametrize("name", [OBSERVATIONS, ODOMETRY])
+def test_missing_and_cut_files_are_refused(tmp_path, name):
+    write_measurements(tmp_path, world(2, "position"))
+    path = tmp_path / name
+    text = path.read_text()
+    for cut in (text[:-3], text[: text.rindex("\n", 0, -1) + 1], text[:20], text[: text.index("step")], ""):
+        path.write_text(cut)
+        with pytest.raises(InputError, match=re.escape(str(path))):
+            read_measurements(tmp_path)
+    path.unlink()
+    with pytest.raises(InputError, match="no such file; expected a file that every filter run writes"):
+        read_measurements(tmp_path)
+
+
+BAD_SIGHTINGS = [
+    ("0,1700000000123456789,41,", "0,1700000000123456789,41,1,", "line 11: expected 8 columns .* found 9"),
+    ("0,1700000000123456789,41,", "0,1700000000123456789,", "line 11: expected 8 columns .* found 7"),
+    ("0,1700000000123456789,41,", "9,1700000000123456789,41,", "line 11: expected a step from 0 to 8"),
+    ("0,1700000000123456789,41,", "-1,1700000000123456789,41,", "line 11: expected a step from 0 to 8"),
+    ("0,1700000000123456789,41,", "0,1700000000123456788,41,", "line 11: expected the stamp that"),
+    ("0,1700000000123456789,41,", "0,1700000000123456789,4.1,", "expected landmark to be a whole number"),
+    ("0,1700000000123456789,41,", "0,99999999999999999999,41,", "expected stamp_ns to be a whole number"),
+    ("# rbpf observations 1", "# rbpf observations 2", "line 1: expected '# rbpf obs"),
+    ("# space: SE2", "# space: SO3", "line 3: expected space to be SE2 or SE3, found 'SO3'"),
+    ("# measurement: position", "# measurement: range", "expected measurement to be range_bearing"),
+    ("# pitch_sign: -1", "# pitch_sign: 2", "expected pitch_sign to be 1 or -1"),
+    ("# robot_from_sensor: 2.4", "# robot_from_sensor:", "line 6: expected 3 numbers .* found 2"),
+    ("# robot_from_sensor: 2.4", "# robot_from_sensor: nan", "expected robot_from_sensor to be a finite"),
+    ("# start: ", "# begin: ", "expected a line '# start: ...' above this one"),
+    ("# recording: small world", "# recording: other", "expected recording other .* from one run"),
+    ("# rows: 43", "# rows: 44", "expected 44 rows as the header says, found 43"),
+    ("# rows: 43", "# rows: many", "line 9: expected rows to be a whole number"),
+    ("step,stamp_ns,landmark,z0", "step,stamp_ns,landmark,y0", "line 10: expected the columns step,"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("old", "new", "complaint"), BAD_SIGHTINGS)
+def test_malformed_sightings_are_refused_by_line(tmp_path, old, new, complaint):
+    write_measurements(tmp_path, world(2, "position"))
+    path = tmp_path / OBSERVATIONS
+    text = path.read_text()
+    assert text.count(old) >= 1
+    path.write_text(text.replace(old, new, 1))
+    with pytest.raises(InputError, match=complaint):
+        read_measurements(tmp_path)
+
+
+def spoiled(path, line, column, value):
+    lines = path.read_text().splitlines()
+    fields = lines[line - 1].split(",")
+    fields[column] = value
+    lines[line - 1] = ",".join(fields)
+    path.write_text("\n".join([*lines, ""]))
+
+
+@pytest.mark.parametrize(
+    ("name", "line", "column", "value", "complaint"),
+    [
+        (OBSERVATIONS, 13, 4, "nan", "line 13: expected z1 to be a finite number, found 'nan'"),
+        (OBSERVATIONS, 13, 3, "", "line 13: expected z0 to be a finite number, found ''"),
+        (OBSERVATIONS, 13, 5, "-0.1", "line 13: expected a positive semi-definite covariance"),
+        (OBSERVATIONS, 13, 6, "9.0", "line 13: expected a positive semi-definite covariance"),
+        (ODOMETRY, 8, 0, "4", "line 8: expected one row per step, from step 1 in order"),
+        (ODOMETRY, 8, 1, "17", "line 8: expected stamps in order of time"),
+        (ODOMETRY, 8, 2, "inf", "line 8: expected d0 to be a finite number"),
+        (ODOMETRY, 8, -1, "-0.1", "line 8: expected a positive semi-definite covariance"),
+    ],
+)
+def test_malformed_numbers_are_refused_by_line(tmp_path, name, line, column, value, complaint):
+    write_measurements(tmp_path, world(2, "position"))
+    spoiled(tmp_path / name, line, column, value)
+    with pytest.raises(InputError, match=re.escape(str(tmp_path / name)) + ", " + complaint):
+        read_measurements(tmp_path)
+
+
+def test_quaternions_that_are_none_are_refused_by_line(tmp_path):
+    write_measurements(tmp_path, world(3, "position"))
+    spoiled(tmp_path / ODOMETRY, 7, 5, "3.0")
+    with pytest.raises(InputError, match="line 7: expected an increment that begins with a quaternion"):
+        read_measurements(tmp_path)
+
+
+def test_a_failed_write_leaves_no_half_file(tmp_path, monkeypatch):
+    write_measurements(tmp_path, world(2, "position"))
+    before = (tmp_path / OBSERVATIONS).read_bytes()
+
+    def fail(source, target):
+        raise OSError("disk full")
+
+    monkeypatch.setattr("os.replace", fail)
+    with pytest.raises(OSError, match="disk full"):
+        write_measurements(tmp_path, world(2, "position", seed=1))
+    assert (tmp_path / OBSERVATIONS).read_bytes() == before
+    assert sorted(path.name for path in tmp_path.iterdir()) == [OBSERVATIONS, ODOMETRY]
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        ({"recording": "two\nlines"}, "name on one line"),
+        ({"recording": ""}, "name on one line"),
+        ({"measurement": "bearing"}, "a measurement range_bearing or position"),
+        ({"pitch_sign": 0.5}, "a pitch sign 1 or -1"),
+        ({"start": np.zeros(7)}, re.escape("start of shape (3,), found (7,)")),
+        ({"start": np.array([0.0, np.inf, 0.0])}, "finite numbers .* in start"),
+        ({"stamps_ns": np.arange(9)[::-1]}, "order of time"),
+        ({"steps": np.full(43, 9)}, "from 0 to 8"),
+        ({"covs": np.tile(np.diag([1.0, -1.0, 1.0]), (8, 1, 1))}, "covariances in covs, .* row 0"),
+    ],
+)
+def test_what_does_not_fit_together_is_refused(change, complaint):
+    with pytest.raises(InputError, match=complaint):
+        replace(world(2, "position"), **change)
+
+
+def test_a_quaternion_that_is_none_is_refused():
+    with pytest.raises(InputError, match="quaternions of length 1"):
+        replace(world(3, "position"), start=np.zeros(7))
+
+
+def test_the_model_is_the_filters():
+    planar, spatial = world(2, "position"), world(3, "range_bearing")
+    assert isinstance(planar.model(), RelativePosition)
+    model = spatial.model()
+    assert isinstance(model, RangeBearing)
+    assert model.pitch_sign == -1.0
+    np.testing.assert_array_equal(model.robot_from_sensor, spatial.robot_from_sensor)
+
+
+def small_log(**change):
+    values = {"landmarks": np.array([5]), "z": np.array([[2.0, 0.5]]), "cov_z": np.diag([0.01, 0.02])[None]}
+    empty = {"landmarks": np.empty(0, int), "z": np.empty((0, 2)), "cov_z": np.empty((0, 2, 2))}
+    move = {"delta": np.array([0.5, 1.0, 0.0]), "cov_delta": np.diag([0.01, 0.02, 0.03])}
+    frames = [
+        Frame(7, None, None, **empty),
+        Frame(9, **move, **values),
+        Frame(12, **{**move, **change}, **empty),
+    ]
+    return RobotLog("small", SE2, "range_bearing", np.array([0.0, 0.1, 0.2]), frames)
+
+
+def test_a_log_becomes_measurements():
+    m = from_log(small_log(), start=np.array([1.0, 2.0, 3.0]))
+    np.testing.assert_array_equal(m.stamps_ns, [7, 9, 12])
+    np.testing.assert_array_equal(m.steps, [1])
+    np.testing.assert_array_equal(m.landmarks, [5])
+    np.testing.assert_array_equal(m.start, [1.0, 2.0, 3.0])
+    first = SE2.compose(m.start, m.deltas[0])
+    np.testing.assert_allclose(dead_reckoning(m), [m.start, first, SE2.compose(first, m.deltas[1])])
+    np.testing.assert_allclose(m.model().predict(first, initial_estimate(m).landmarks[5]), [2.0, 0.5])
+
+
+def test_a_log_without_odometry_or_frames_is_refused():
+    with pytest.raises(InputError, match="small: frame 2 has no odometry"):
+        from_log(small_log(delta=None))
+    with pytest.raises(InputError, match="small: expected frames"):
+        from_log(replace(small_log(), frames=[]))
+
+
+@pytest.mark.real_data
+@pytest.mark.parametrize("folder", ["mrclam6_robot1", "mrpt_kf_slam_6d"])
+def test_recordings_come_back_from_files(data_dir, tmp_path, folder):
+    m = from_log(open_log(data_dir / folder))
+    write_measurements(tmp_path, m)
+    assert_same(read_measurements(tmp_path), m)
