@@ -12,7 +12,7 @@ from rich.table import Table
 
 from benchmarks.gate import regressions, write_baseline
 from benchmarks.machine import description
-from benchmarks.rows import Row, Settings
+from benchmarks.rows import Row, Settings, Skipped
 
 FOLDER = Path(__file__).parent
 BASELINE = FOLDER / "baseline.json"
@@ -43,8 +43,11 @@ def main() -> int:
     machine, rows = description(), []
     for name in arguments.names or NAMES:
         start = time.perf_counter()
-        rows += import_module(f"benchmarks.{name}").run(Settings(arguments.quick))
-        print(f"{name}: {time.perf_counter() - start:.1f} s", file=sys.stderr)
+        try:
+            rows += import_module(f"benchmarks.{name}").run(Settings(arguments.quick))
+            print(f"{name}: {time.perf_counter() - start:.1f} s", file=sys.stderr)
+        except Skipped as reason:
+            print(f"{name}: skipped, {reason}", file=sys.stderr)
     show(rows, machine)
     results = {"machine": machine, "quick": arguments.quick, "rows": [row.plain() for row in rows]}
     (FOLDER / "results.json").write_text(json.dumps(results, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")

@@ -10,7 +10,13 @@ from benchmarks.rows import Row
 def write_baseline(path: Path, rows: Sequence[Row]) -> None:
     """Ratios and tolerances, by name."""
     figures = {
-        row.name: {"ratio": round(row.ratio, 4), "higher": row.higher, "tolerance": row.tolerance} for row in rows
+        row.name: {
+            "ratio": round(row.ratio, 4),
+            "higher": row.higher,
+            "tolerance": row.tolerance,
+            "optional": row.optional,
+        }
+        for row in rows
     }
     path.write_text(json.dumps(figures, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
@@ -22,7 +28,7 @@ def regressions(path: Path, rows: Sequence[Row], partial: bool) -> list[str]:
     sentences = []
     for name, entry in baseline.items():
         if name not in measured:
-            if not partial:
+            if not partial and not entry["optional"]:
                 sentences.append(f"{name}: no figure in this run")
             continue
         change = measured[name] / entry["ratio"] - 1.0

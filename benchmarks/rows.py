@@ -13,6 +13,10 @@ from rbpf.filter import Filter
 GENERATIONS_BACK = 20
 
 
+class Skipped(Exception):
+    """A benchmark cannot run here; the message says why."""
+
+
 @dataclass(frozen=True)
 class Settings:
     """How much time a run may take; `quick` lowers repetitions, never sizes."""
@@ -36,6 +40,7 @@ class Row:
         higher: whether a higher ratio is better.
         aim: what is asked for, in words;  met: whether it is, None where nothing is asked for.
         tolerance: relative change of the ratio that the gate lets pass.
+        optional: whether a machine without the peer may leave it out.
     """
 
     name: str
@@ -49,6 +54,7 @@ class Row:
     met: bool | None = None
     notes: str = ""
     tolerance: float = 0.35
+    optional: bool = False
 
     def plain(self) -> dict[str, Any]:
         """For a JSON file."""

@@ -8,6 +8,8 @@ F. Dellaert and M. Kaess, "Factor graphs for robot perception" (2017).
 from dataclasses import dataclass
 from typing import final
 
+import numpy as np
+
 from rbpf.lie import Array
 from rbpf.validation.measurements import InitialEstimate, Measurements, initial_estimate
 
@@ -20,7 +22,8 @@ class BatchSolution:
     Attributes:
         world_from_robot: (T, E) poses.
         landmarks: name of each landmark to its (D,) position.
-        cov_poses: (T, d, d) marginal covariances in the right chart, order [omega, v]; None if not asked for.
+        cov_poses: (T, d, d) marginal covariances in the right chart, order [omega, v]; no rows if not asked
+            for.
         cov_landmarks: name of each landmark to its (D, D) marginal covariance; empty if not asked for.
         error: half the sum of squared whitened residuals, or the sum of their robust losses. Where the noise
             is right it is about half the number of measured scalars less half that of the landmarks'
@@ -30,7 +33,7 @@ class BatchSolution:
 
     world_from_robot: Array
     landmarks: dict[int, Array]
-    cov_poses: Array | None
+    cov_poses: Array
     cov_landmarks: dict[int, Array]
     error: float
     iterations: int
@@ -68,7 +71,9 @@ def solve(
         else:
             start = problem.values(initial or initial_estimate(m))
         values, iterations = optimiser.optimise(problem, graph, start)
-        cov_poses, cov_landmarks = optimiser.covariances(problem, graph, values) if marginals else (None, {})
+        cov_poses, cov_landmarks = np.empty((0, m.space.dim, m.space.dim)), dict[int, Array]()
+        if marginals:
+            cov_poses, cov_landmarks = optimiser.covariances(problem, graph, values)
     except RuntimeError as error:
         raise optimiser.explain(problem, error) from error
     path, landmarks = problem.estimate(values)

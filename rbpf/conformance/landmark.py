@@ -1,7 +1,5 @@
 """Checks of a landmark's parametrisation."""
 
-from functools import partial
-
 import numpy as np
 
 from rbpf.conformance.arguments import LANDMARKS, PARTICLES, Example, random_constants
@@ -30,9 +28,12 @@ def landmark_checks(
     def records() -> Records:
         return example.records or _random_records(landmark, space, rng)
 
+    def world_points() -> None:
+        _check_sizes(landmark)
+        _check_homogeneous(landmark, records())
+
     return [
-        partial(_check_sizes, landmark),
-        lambda: _check_homogeneous(landmark, records()),
+        world_points,
         lambda: _check_ready(landmark, records()),
         lambda: _check_promote(landmark, records()),
     ]

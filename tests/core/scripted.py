@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from rbpf.errors import InputError
-from rbpf.filter import Filter
+from rbpf.filter import Filter, StepReport
+from rbpf.lie import SE2
 from rbpf.models import ObservationModel, Observations, Sensor
+from rbpf.sensors.range_bearing import wrap_angle
 from tests.core.worlds import content, same
 
 
@@ -25,6 +27,13 @@ def seen(model: ObservationModel, z, cov=None, **options) -> list[Observations]:
     return [Observations(z, cov, model, **options)]
 
 
+def ids_of(report: StepReport) -> np.ndarray:
+    """Ids of the first group."""
+    ids = report.groups[0].ids
+    assert ids is not None
+    return ids
+
+
 def fails(filter_: Filter, match: str, *step: object) -> None:
     """A step raises one sentence, and nothing has changed."""
     before, generator = content(filter_), filter_.rng.bit_generator.state
@@ -33,3 +42,30 @@ def fails(filter_: Filter, match: str, *step: object) -> None:
     assert "\n" not in str(caught.value)
     assert same(content(filter_), before)
     assert filter_.rng.bit_generator.state == generator
+
+
+def says(findings: list[str], sentence: str) -> None:
+    """The sentence is among the findings."""
+    with pytest.raises(AssertionError, match=sentence):
+        raise AssertionError("\n".join(findings))
+
+
+class Polar(ObservationModel):
+    """A sound model in plain NumPy: range and bearing in the plane."""
+
+    dim = 2
+    space = SE2
+
+    def predict(self, state, landmark=None, const=None, substate=None):
+        point = SE2.inverse_transform(state, landmark)
+        return np.stack(
+            [np.hypot(point[..., 0], point[..., 1]), np.arctan2(point[..., 1], point[..., 0])], axis=-1
+        )
+
+    def residual(self, z, predicted):
+        difference = z - predicted
+        return np.stack([difference[..., 0], wrap_angle(difference[..., 1])], axis=-1)
+
+    def invert(self, state, z):
+        point = np.stack([z[..., 0] * np.cos(z[..., 1]), z[..., 0] * np.sin(z[..., 1])], axis=-1)
+        return SE2.transform(state, point)

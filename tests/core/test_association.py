@@ -73,7 +73,9 @@ def test_no_landmark_explains_two(seed, m, k):
 
 
 @pytest.mark.parametrize(
-    ("distance", "expected"), [(2.9, 0), (3.1, NULL), (4.9, NULL), (5.1, NEW)], ids=["in", "out", "near", "far"]
+    ("distance", "expected"),
+    [(2.9, 0), (3.1, NULL), (4.9, NULL), (5.1, NEW)],
+    ids=["in", "out", "near", "far"],
 )
 def test_gates(distance, expected):
     nu = np.array([distance, 0.0]).reshape(1, 1, 1, 2)
@@ -110,7 +112,9 @@ class TestExistence:
     model = ExistenceModel(hit=1.0, miss=0.5, limit=3.0, drop=-1.0)
 
     def after(self, log_odds, seen, expected) -> float:
-        return float(self.model.updated(np.array([[log_odds]]), np.array([[seen]]), np.array([[expected]]))[0, 0])
+        return float(
+            self.model.updated(np.array([[log_odds]]), np.array([[seen]]), np.array([[expected]]))[0, 0]
+        )
 
     def test_counting(self):
         assert self.after(0.0, seen=True, expected=True) == 1.0

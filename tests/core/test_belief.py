@@ -8,7 +8,7 @@ from rbpf.conditional import Marginals
 from rbpf.errors import InputError
 from rbpf.estimate import mixture_estimate
 from rbpf.genealogy import Lineage
-from rbpf.lie import SE2, SE3, LieGroup
+from rbpf.lie import SE2, SE3, LieGroup, SE2Group, SE3Group
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
 from rbpf.models import Records
@@ -33,7 +33,8 @@ def prior_of(space: LieGroup, rng: np.random.Generator, centred: bool, scale: fl
 
 
 def belief_of(prior: Prior, dim: int, rng: np.random.Generator, ahead: np.ndarray) -> tuple[Belief, Records]:
-    """Landmarks around points `ahead` (K, D) of the robot, different in every particle, with correlated errors."""
+    """Landmarks around points `ahead` (K, D) of the robot, different in every particle."""
+    assert isinstance(prior.space, SE2Group | SE3Group)
     landmark_map = LandmarkMap(prior.space)
     marginals = Marginals(prior.space, [landmark_map])
     marginals.begin(N, Lineage(N))
@@ -57,13 +58,18 @@ def draw(belief: Belief, records: Records, rng: np.random.Generator) -> tuple[np
 
 
 # In the second one the bearings lie on both sides of the cut.
-AHEAD_2D = {"ahead": [[3.0, 1.0], [2.0, -2.0], [4.0, 0.0]], "behind": [[-3.0, 0.0], [-2.0, 0.01], [-4.0, -0.01]]}
+AHEAD_2D = {
+    "ahead": [[3.0, 1.0], [2.0, -2.0], [4.0, 0.0]],
+    "behind": [[-3.0, 0.0], [-2.0, 0.01], [-4.0, -0.01]],
+}
 AHEAD_3D = np.array([[3.0, 1.0, 0.5], [2.0, -2.0, -1.0], [4.0, 0.0, 0.3]])
 
 
 @pytest.mark.parametrize("centred", [True, False], ids=["centred", "driven"])
 @pytest.mark.parametrize("ahead", AHEAD_2D.values(), ids=AHEAD_2D.keys())
-@pytest.mark.parametrize("model", [RangeBearing(SE2), RelativePosition(SE2)], ids=["range-bearing", "position"])
+@pytest.mark.parametrize(
+    "model", [RangeBearing(SE2), RelativePosition(SE2)], ids=["range-bearing", "position"]
+)
 def test_projection_in_the_plane(model, ahead, centred, rng):
     belief, records = belief_of(prior_of(SE2, rng, centred), 2, rng, np.array(ahead))
     check_projection(model, belief, records, rng)
@@ -109,9 +115,9 @@ def test_innovations_of_every_pair(rng):
         landmark = records.mean[i, (2, 0)[m]]
         expected = model.residual(z[k], model.predict(belief.state[i], landmark))
         np.testing.assert_allclose(nu[i, k, m], expected, atol=1e-12)
-        jac = model.jacobians(belief.state[i], landmark)
-        moved = jac.state @ belief.prior.factor[i]
-        within = jac.landmark @ records.cov[i, (2, 0)[m]] @ jac.landmark.T
+        by_state, by_landmark, _ = (np.asarray(block) for block in model.jacobians(belief.state[i], landmark))
+        moved = by_state @ belief.prior.factor[i]
+        within = by_landmark @ records.cov[i, (2, 0)[m]] @ by_landmark.T
         np.testing.assert_allclose(cov[i, k, m], within + moved @ moved.T + noise[k], atol=1e-12)
 
 

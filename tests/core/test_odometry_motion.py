@@ -34,7 +34,7 @@ def test_without_a_control_the_robot_stands_still():
 
 @pytest.mark.parametrize("rank", [0, 1, 2])
 def test_singular_covariances(rank):
-    """A planar robot in space, or a wheel that cannot slip: particles spread in the range of the covariance only."""
+    """As of a planar robot in space: particles spread in the range of the covariance only."""
     rng = np.random.default_rng(rank)
     basis = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     values = np.array([0.04, 0.01, 0.0]) * (np.arange(3) < rank)

@@ -12,7 +12,9 @@ from rbpf.maps.point import Point
 from rbpf.models import NEW, NULL
 from rbpf.motion.odometry import OdometryMotion
 from rbpf.resampling import EssTriggered, Systematic
+from rbpf.sensors.landmark_sensor import AnonymousLandmarkSensor
 from rbpf.sensors.range_bearing import RangeBearing
+from tests.core.scripted import ids_of
 from tests.core.worlds import MAX_RANGE, Recipe, Sightings, World, anonymous, drive, planar_world
 
 STEPS, LANDMARKS = 120, 12
@@ -78,7 +80,9 @@ def single(landmark_map: LandmarkMap) -> Filter:
     """Five particles that are never resampled."""
     sensor = anonymous(RangeBearing(SE2, max_range=MAX_RANGE - 0.5))
     never = EssTriggered(Systematic(), 0.0)
-    return Filter(OdometryMotion(SE2), sensor, landmark_map, resampler=never, n=5, rng=np.random.default_rng(0))
+    return Filter(
+        OdometryMotion(SE2), sensor, landmark_map, resampler=never, n=5, rng=np.random.default_rng(0)
+    )
 
 
 def one_sighting(distance: float = 3.0, bearing: float = 0.2) -> Sightings:
@@ -90,14 +94,14 @@ def test_life_of_a_landmark():
     landmark_map = filter_.belief().map
     report = filter_.step(one_sighting())
     assert report.births.tolist() == [0]
-    assert (report.groups[0].ids == NEW).all()
+    assert (ids_of(report) == NEW).all()
     np.testing.assert_array_equal(landmark_map.log_odds(np.array([0])), 0.0)
     report = filter_.step(one_sighting())
-    assert (report.groups[0].ids == 0).all()
+    assert (ids_of(report) == 0).all()
     np.testing.assert_array_equal(landmark_map.log_odds(np.array([0])), 1.0)
     # Beside it: neither near enough to be it nor far enough to be another one.
     report = filter_.step(one_sighting(distance=3.65))
-    assert (report.groups[0].ids == NULL).all()
+    assert (ids_of(report) == NULL).all()
     assert landmark_map.ids.tolist() == [0]
 
 
@@ -129,15 +133,16 @@ def test_an_empty_map_and_an_empty_frame():
 
 
 def test_particles_with_different_maps_weigh_their_explanations():
-    """Half of the particles hold the landmark: they pay its predictive density, the others that of a new one."""
+    """Who holds the landmark pays its predictive density, the others that of a new one."""
     filter_ = single(LandmarkMap(SE2, evidence=True))
     landmark_map = filter_.belief().map
-    sensor = filter_.sensors[0]
+    (sensor,) = filter_.sensors
+    assert isinstance(sensor, AnonymousLandmarkSensor)
     records = sensor.model.initialise(filter_.particles.state, *sighting_and_cov())
     log_odds = np.array([[0.0], [0.0], [-np.inf], [-np.inf], [-np.inf]])
     landmark_map.add_records(records, Point(2), log_odds)
     report = filter_.step(one_sighting())
-    assert report.groups[0].ids[:, 0].tolist() == [0, 0, NEW, NEW, NEW]
+    assert ids_of(report)[:, 0].tolist() == [0, 0, NEW, NEW, NEW]
     innovation = 2 * sighting_and_cov()[1][0]
     density = -0.5 * np.log(np.linalg.det(2 * np.pi * innovation))
     expected = np.array([density, density, *[sensor.gates.log_new] * 3])

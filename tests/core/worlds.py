@@ -40,7 +40,7 @@ class World:
 
 
 def planar_world(steps: int, landmarks: int = 12, seed: int = 0, clutter: float = 0.0) -> World:
-    """A robot on a circle of 4 m radius among landmarks; `clutter` is the mean number of false sightings a frame."""
+    """A robot on a circle of 4 m radius; `clutter` is the mean number of false sightings in a frame."""
     rng = np.random.default_rng(seed)
     points = rng.uniform([-7.0, -3.0], [7.0, 11.0], size=(landmarks, 2))
     delta = SE2.exp(np.array([0.1, 0.4, 0.0]))

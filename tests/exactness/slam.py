@@ -1,4 +1,4 @@
-"""A linear SLAM world: known orientation, landmarks measured relative to the position; its joint Kalman filter."""
+"""A linear SLAM world (known orientation, landmarks relative to the position) and its joint Kalman filter."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -14,14 +14,15 @@ from rbpf.substate import KalmanSubstate
 from tests.exactness.models import SEEDS, Frame, Kalman
 
 NOISE = np.array([[0.25, 0.08], [0.08, 0.2]])
-VISIBLE = [(0, 1), (0, 1), (1, 2), (0, 2), (0, 1, 2)]
+VISIBLE = [(0, 1), (0, 1), (1, 2), (0, 1, 2)]
 """Landmarks seen in each step; the first sighting of one starts it."""
 
 
 @dataclass
 class LinearSlam:
-    """The world p' = F p + w of the position, and of a velocity behind it where F is larger; what a robot turned by
-    `rotation` sees of a landmark is rotationᵀ (landmark − position) + v.
+    """p' = F p + drift + w of the position, and of a velocity behind it where F is larger.
+
+    What a robot turned by `rotation` sees of a landmark is z = rotationᵀ (landmark − position) + v.
 
     Attributes:
         kalman: of (position[, velocity], landmarks), at the end; its log-evidence leaves first sightings out.
@@ -82,7 +83,7 @@ class LinearSlam:
 
 
 def moments(filter_: Filter) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and covariance of (position[, velocity], landmarks), within and between particles, cross terms included."""
+    """Mean and covariance, within and between particles, of (position[, velocity], landmarks)."""
     weights = filter_.particles.weights
     means, within = [filter_.particles.state[:, -2:]], [np.zeros((2, 2))]
     for part in filter_.marginals.parts.values():
@@ -104,7 +105,7 @@ def unnormalised_errors(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Per seed: log Ẑ/Z, and Ẑ/Z times the errors of first and second moments about the exact mean.
 
-    All three have the expectation zero (the first after exponentiation, one): Ẑ Σ W f(x) is unbiased for Z E[f | z].
+    The errors have the expectation zero: Ẑ Σ W f(x) is unbiased for Z E[f | z], as Ẑ is for Z.
     """
     logs, first, second = [], [], []
     for seed in range(SEEDS):

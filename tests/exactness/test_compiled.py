@@ -1,4 +1,4 @@
-"""The compiled path equals plain NumPy: four kernels, masks, likelihoods, refinement, update and whole runs."""
+"""The compiled path equals plain NumPy: four kernels, masks, likelihoods, both passes and whole runs."""
 
 import numpy as np
 import pytest
@@ -10,8 +10,9 @@ from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
 from rbpf.models import NEW, NULL, Births, Observations
 from rbpf.motion.odometry import Odometry, OdometryMotion
+from rbpf.numeric import linearise
 from rbpf.proposals import EkfProposal, PriorProposal, refined
-from tests.exactness.models import Frame, Scripted
+from tests.exactness.models import Frame, Scripted, known
 from tests.exactness.scenes import Scene, random_covs, sensors
 
 TOLERANCE = 1e-9
@@ -84,9 +85,9 @@ def test_refinement_and_update(space, which, likelihood, kind, rng):
 
 
 def _innovations(scene: Scene, group: Observations) -> tuple[np.ndarray, np.ndarray]:
-    ids = np.abs(group.ids if group.ids.ndim == 1 else group.ids[0])
+    ids = np.abs(np.atleast_2d(known(group.ids))[0])
     state, mean = scene.state[:, None], scene.records.mean[:, ids]
-    jac = group.model.jacobians(state, mean).landmark
+    jac = known(linearise(group.model, scene.space, group.z, state, mean)[1].landmark)
     cov = jac @ scene.records.cov[:, ids] @ np.swapaxes(jac, -1, -2) + group.cov
     return group.model.residual(group.z, group.model.predict(state, mean)), cov
 

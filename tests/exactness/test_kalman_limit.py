@@ -1,4 +1,4 @@
-"""With everything marginalised the filter is a Kalman filter; with a trajectory given, so is each particle."""
+"""With everything marginalised the filter is a Kalman filter; given its trajectory, so is each particle."""
 
 import numpy as np
 import pytest

@@ -46,7 +46,7 @@ def test_four_clips_a_quarter_of_the_inliers_in_space(rng):
     "likelihood", [GaussianWithOutliers(0.2, 1.0), Gaussian()], ids=["outliers", "gaussian"]
 )
 def test_densities_integrate_to_one_over_the_measurement_space(likelihood, p, rng):
-    """Outliers are uniform over a volume that the sensor can return: here a cube of side 30 about the prediction."""
+    """Outliers are uniform over what the sensor can return: here a cube of side 30 about the prediction."""
     side, points = 30.0, 601
     if isinstance(likelihood, GaussianWithOutliers):
         likelihood = GaussianWithOutliers(0.2, side**p)
@@ -115,7 +115,7 @@ LIKELIHOODS = {"gaussian": None, "truncated": TRUNCATED, "outliers": GaussianWit
 
 @pytest.mark.parametrize("likelihood", LIKELIHOODS.values(), ids=LIKELIHOODS)
 def test_two_sightings_of_a_certain_landmark_weigh_like_two_landmarks(likelihood, rng):
-    """Where the landmark is known there is no correlation: stacking its rows must not change what each one says."""
+    """A known landmark correlates nothing: stacking its rows must not change what each one says."""
     state = rng.normal(scale=0.3, size=(8, 2))
     certain = 1e-14 * np.eye(2)
     z = np.array([[3.2, 0.8], [2.9, 1.3]])

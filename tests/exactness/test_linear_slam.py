@@ -1,4 +1,4 @@
-"""FastSLAM on a linear world against the joint Kalman filter: evidence, means and all covariances are unbiased."""
+"""FastSLAM on a linear world against the joint Kalman filter: evidence and moments are unbiased."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ Q = np.array([[0.2, 0.05], [0.05, 0.1]])
 
 
 def agree(logs: np.ndarray, first: np.ndarray, second: np.ndarray) -> None:
-    """Some forty moments are compared at once: the largest of so many errors may reach four standard errors."""
+    """The largest errors of some forty moments at once may reach four standard errors."""
     assert_unbiased(logs)
     assert deviation(first, 0.0) <= 4.0
     upper = np.triu_indices(first.shape[1])
@@ -126,7 +126,8 @@ def test_an_observation_of_a_landmark_and_the_substate_is_refused(drifting):
             return landmark - state + substate
 
     velocity = Kalman(np.zeros(4), np.eye(4))
-    world = LinearSlam(*drifting.joint(), velocity, np.eye(2), seed=34)
+    F, noise, drift = drifting.joint()
+    world = LinearSlam(F, noise, drift, velocity, np.eye(2), seed=34)
     parts = [KalmanSubstate(drifting.space, np.zeros(2), np.eye(2)), LandmarkMap(drifting.space)]
     filter_ = Filter(drifting, Scripted(), parts, n=10, rng=np.random.default_rng(0))
     born = world.frames(Relative())[0]

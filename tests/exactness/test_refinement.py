@@ -1,4 +1,4 @@
-"""The refinement is a sequence of EKF updates of pose and landmarks with fixed linearisation, in any order."""
+"""The refinement equals EKF updates of pose and landmarks with fixed linearisation, in any order."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from rbpf.lie import SE2, SE3
 from rbpf.models import NEW, NULL, Observations
 from rbpf.numeric import linearise
 from rbpf.proposals import Prior, Proposed, Terms, refined
-from tests.exactness.models import Kalman
+from tests.exactness.models import Kalman, known
 from tests.exactness.scenes import Scene, random_covs, sensors
 
 TOLERANCE = 1e-9
@@ -28,11 +28,11 @@ def rng() -> np.random.Generator:
 def rows_of(
     scene: Scene, groups: list[Observations], particle: int
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """ν, [H J] over (pose, all landmarks) and R of each measurement that a particle takes as a known landmark."""
+    """ν, [H J] over (pose, all landmarks) and R of each measurement that a particle takes as known."""
     d, (_, k, dim) = scene.space.dim, scene.records.mean.shape
     rows = []
     for group in groups:
-        ids = np.broadcast_to(group.ids, (scene.n, len(group.z)))[particle]
+        ids = np.broadcast_to(known(group.ids), (scene.n, len(group.z)))[particle]
         for z, cov, landmark in zip(group.z, group.cov, ids, strict=True):
             if landmark < 0:
                 continue
@@ -130,7 +130,7 @@ def test_the_landmarks_of_two_sensors_are_updated_jointly(space, compiled, rng):
 @compiled_or_not
 @every_space
 def test_each_particle_uses_its_own_associations(space, compiled, rng):
-    """Two measurements of one landmark in some particles; clutter and first sightings cost their densities."""
+    """Some particles see one landmark twice; clutter and first sightings cost their densities."""
     scene = Scene.random(space, rng)
     prior = scene.prior(3, shared=False)
     ids = np.array([[0, 1, 2], [1, 0, NULL], [NEW, 1, 1], [NULL, NEW, 3], [0, 0, 0], [3, 2, 1]])
@@ -155,11 +155,8 @@ def test_the_compiled_refinement_equals_its_numpy_twin(space, rng):
     for rank in (0, 1, d, d + 2):
         for shared in (True, False):
             prior = scene.prior(rank, shared)
-            terms = Terms(
-                random_covs(rng, (40,), d, 3.0),
-                *(rng.normal(size=shape) for shape in ((40, d), 40, 40, 40)),
-                rows=7,
-            )
+            scalars = rng.normal(size=(3, 40))
+            terms = Terms(random_covs(rng, (40,), d, 3.0), rng.normal(size=(40, d)), *scalars, 7)
             ours, twin = refined(prior, terms), reference.refined(prior, terms)
             for name in ("mean", "root", "log_w1", "nis"):
                 np.testing.assert_allclose(
@@ -170,7 +167,7 @@ def test_the_compiled_refinement_equals_its_numpy_twin(space, rng):
 
 @every_space
 def test_terms_linearised_elsewhere_stay_in_the_priors_chart(space, rng):
-    """At any increment: ν = z − g(ε₀) + G (ε₀ − μ), with g the measurement as a function of the chart's coordinates."""
+    """At any increment ε₀: ν = z − g(ε₀) + G (ε₀ − μ), with g the measurement by the chart's coordinates."""
     scene = Scene.random(space, rng, n=3)
     d, model = space.dim, sensors(space, rng)[0]
     group = scene.observe(model, np.array([0, 2]))
@@ -202,7 +199,8 @@ def _chart_ekf(scene, group, factor, base, mean, at, particle) -> Kalman:
         G = model.residual(plus, minus).T / 2e-6
         state = scene.space.retract(base, at)
         nu, jac = linearise(model, scene.space, z, state, point)
-        spread = jac.landmark @ records.cov[particle, landmark] @ jac.landmark.T
+        slope = known(jac.landmark)
+        spread = slope @ records.cov[particle, landmark] @ slope.T
         kalman.update(nu + G @ (at - mean), G, R + spread)
     return kalman
 

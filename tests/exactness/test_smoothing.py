@@ -70,7 +70,7 @@ def test_the_smoother_and_the_filter_differ(measured):
 
 @pytest.mark.parametrize("proposal", [PriorProposal(), EkfProposal()], ids=["prior", "ekf"])
 def test_ancestral_paths_are_unbiased(measured, proposal, stream):
-    """Ẑ Σ W f(x_t) is unbiased for Z E[f(x_t) | z_1:T] along ancestors: first and second moments of every step."""
+    """Ẑ Σ W f(x_t) is unbiased for Z E[f(x_t) | z_1:T] along ancestors: two moments of every step."""
     frames, kalman, exact = measured
     means, covs = (np.array(part) for part in zip(*exact, strict=True))
     logs, first, second = [], [], []
@@ -102,7 +102,7 @@ def test_a_fixed_lag_keeps_the_last_steps_of_the_same_paths(measured, lag):
 
 
 def test_backward_simulation_agrees_with_the_exact_smoother(measured, stream):
-    """Consistent, not unbiased: its error falls like 1/N; and it spreads less than ancestry, whose lineages coalesce."""
+    """Consistent, not unbiased: its error falls like 1/N. It spreads less than coalescing ancestry."""
     frames, _, exact = measured
     means, covs = (np.array(part) for part in zip(*exact, strict=True))
     runs, ancestral = [], []
@@ -143,7 +143,7 @@ def test_backward_simulation_says_what_it_cannot_do(measured):
 
 
 def test_the_transition_density_on_poses_integrates_to_one():
-    """A right perturbation of a pose has the volume dθ dx dy: the chart's Jacobian belongs to the backward weight."""
+    """The volume of right perturbations is dθ dx dy: the backward weight holds the chart's Jacobian."""
     factor = np.array([[0.5, 0.0, 0.0], [0.1, 0.3, 0.0], [0.0, 0.1, 0.2]])
     before, delta = np.array([[0.7, 1.0, -2.0]]), np.array([0.4, 1.0, 0.0])
     axes = [np.linspace(-3.0, 3.0, points) for points in (61, 49, 49)]

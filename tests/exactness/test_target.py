@@ -1,4 +1,4 @@
-"""A target without a map: heading and position sampled, the speed marginalised beside them, against sampling it too."""
+"""A target without a map: heading and position sampled, the speed marginalised, against sampling it too."""
 
 import numpy as np
 import pytest
@@ -116,7 +116,7 @@ def exact() -> float:
 
 @pytest.fixture(scope="module")
 def runs(exact) -> dict[str, np.ndarray]:
-    """Log-evidence over the exact one: the speed sampled, marginalised, and marginalised with a refined proposal."""
+    """Log-evidence over the exact one; the last also refines its proposal."""
     return {
         "sampled": log_ratios(lambda rng: sampled(PriorProposal(), rng), frames(Part.STATE), exact, 1),
         "marginalised": log_ratios(

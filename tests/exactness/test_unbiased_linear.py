@@ -1,4 +1,4 @@
-"""The evidence of partly sampled linear-Gaussian models is unbiased, whatever the proposal, resampler and trigger."""
+"""The evidence of partly sampled linear models is unbiased, whatever the proposal, resampler and trigger."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -92,7 +92,7 @@ def position_alone() -> World:
 
 @pytest.fixture(scope="module")
 def driven_by_acceleration() -> World:
-    """The same with a marginalised acceleration, whose noise is correlated with the velocity's; it is measured too."""
+    """The same with a marginalised acceleration whose noise is correlated; it is measured too."""
     factor = np.array([[0.2, 0.0, 0.0], [0.0, 0.5, 0.0], [0.0, 0.1, 0.2]])
     F, B, A = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([[0.0], [1.0]]), np.array([[0.9]])
     motion = LinearMotion(F, factor, B, A, np.array([0.1]))

@@ -45,7 +45,7 @@ class Curved(ObservationModel):
 
 @dataclass(frozen=True)
 class Scalar:
-    """A model on the line, five measurements drawn from it, and their log-evidence by integration on a grid."""
+    """A model on the line, five measurements drawn from it, and their log-evidence on a grid."""
 
     f: Function
     std: float

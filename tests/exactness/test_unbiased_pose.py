@@ -1,4 +1,4 @@
-"""On SE(2) the proposal and the prior are densities in one chart: evidence against quadrature and a large bootstrap filter."""
+"""On SE(2) proposal and prior are densities in one chart: evidence against quadrature and many particles."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ FIX = np.array([3.2, 0.6])
 
 
 class Antenna(ObservationModel):
-    """The position of an antenna away from the robot's origin; with a substate, a drift of it that is linear."""
+    """The position of an antenna away from the robot's origin; a substate is its drift."""
 
     dim = 2
 
@@ -116,7 +116,7 @@ def test_one_step_against_quadrature(after_one_step, proposal, stream):
 
 
 def test_the_linearised_weight_is_biased(after_one_step):
-    """By more than fifty standard errors of the test above; in a first step E06's weight has no Monte-Carlo error."""
+    """By over fifty standard errors of the test above; a first step has no Monte-Carlo error of its own."""
     filter_ = Filter(OdometryMotion(SE2), Scripted(), (), EkfProposal(exact=False), n=100, start=START)
     report = filter_.step(Frame([single(FIX, R, Antenna())]), Odometry(DELTA, COV))
     assert abs(report.log_evidence - after_one_step) > 0.05

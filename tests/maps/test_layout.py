@@ -80,9 +80,10 @@ def test_log_odds_start_at_zero():
 
 def test_constants_may_be_shared_by_all_particles():
     records = random_records(Free(2), 3, 2, np.random.default_rng(0))
-    shared = Records(records.mean, records.cov, np.arange(8.0).reshape(1, 2, 4))
-    unpacked = Layout(Free(2, 4)).unpack(Layout(Free(2, 4)).pack(shared))
-    np.testing.assert_array_equal(unpacked.const, np.repeat(shared.const, 3, axis=0))
+    const = np.arange(8.0).reshape(1, 2, 4)
+    columns = Layout(Free(2, 4)).pack(Records(records.mean, records.cov, const))
+    unpacked = Layout(Free(2, 4)).unpack(columns)
+    np.testing.assert_array_equal(np.asarray(unpacked.const), np.repeat(const, 3, axis=0))
 
 
 GOOD = random_records(Free(2), 3, 2, np.random.default_rng(0))
@@ -98,8 +99,16 @@ WEIGHTS = np.zeros((3, 2, 2))
         (Free(2, constants=4), GOOD, "Free has 4 constants per landmark: give them in Records.const"),
         (Free(2), Records(GOOD.mean, GOOD.cov, np.zeros((3, 2, 1))), "Free has 0 constants per landmark"),
         (Free(2), Records(GOOD.mean, GOOD.cov, None, WEIGHTS), "needs log_weights exactly if it has several"),
-        (Free(2), Records(GOOD.mean * np.nan, GOOD.cov), "a new Free has a mean or covariance that is not finite"),
-        (Free(2), Records(GOOD.mean, GOOD.cov * np.inf), "a new Free has a mean or covariance that is not finite"),
+        (
+            Free(2),
+            Records(GOOD.mean * np.nan, GOOD.cov),
+            "a new Free has a mean or covariance that is not finite",
+        ),
+        (
+            Free(2),
+            Records(GOOD.mean, GOOD.cov * np.inf),
+            "a new Free has a mean or covariance that is not finite",
+        ),
     ],
 )
 def test_records_that_do_not_fit(landmark, records, match):

@@ -26,7 +26,9 @@ class Anything(ObservationModel):
 
 def group(ids, **options) -> Observations:
     ids = np.array(ids)
-    return Observations(np.zeros((ids.shape[-1], 1)), np.ones((ids.shape[-1], 1, 1)), Anything(), ids=ids, **options)
+    return Observations(
+        np.zeros((ids.shape[-1], 1)), np.ones((ids.shape[-1], 1, 1)), Anything(), ids=ids, **options
+    )
 
 
 def rows_of(plan: Plan) -> list[Row]:
@@ -115,5 +117,5 @@ def test_nothing_seen():
 
 @pytest.mark.parametrize("ids", [[6], [7], [[0]] * (N - 1) + [[6]]])
 def test_landmarks_that_are_not_held(ids):
-    with pytest.raises(InputError, match="names landmark [67], which the map does not hold"):
+    with pytest.raises(InputError, match=r"names landmark [67], which the map does not hold"):
         make_plan([group(ids)], N, KINDS, PLAIN)

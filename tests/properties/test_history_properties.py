@@ -117,6 +117,6 @@ def test_sharing_stores_few_states():
     for t in range(steps):
         lineage.advance(np.sort(rng.integers(0, n, n)))
         history.record(t, np.zeros((n, 1)), np.zeros(n))
-    # Blocks are looked through at doubling ages, which costs a factor of up to 4 over the nodes that are alive.
+    # Blocks are looked through at doubling ages: up to four times as many as have descendants.
     assert history.stored_states <= 4 * (steps + n * np.log(n) * 2)
     assert history.paths().shape == (steps, n, 1)

@@ -88,7 +88,7 @@ def test_only_the_present_generation_needs_no_keeping():
 
 @pytest.mark.parametrize("n", [16, 64, 256])
 def test_size_of_the_forest(n):
-    """Every generation kept: T + C N log N nodes (P. Jacob, L. Murray, S. Rubenthaler, 2015), here with C < 4.
+    """Every generation kept: T + C N log N nodes (P. Jacob, L. Murray, S. Rubenthaler, 2015) with C < 4.
 
     With equal weights two lineages meet with probability 1/N per generation, so Σ 2N/age gives C of about 2.
     """
@@ -112,6 +112,6 @@ def test_what_nobody_keeps_is_spliced_out():
     for _ in range(3000):
         lineage.advance(drawn(rng, n, 1.0))
         most = max(most, lineage.nodes)
-    # Each kept node is a leaf, a fork or the root; between two rounds of splicing the forest fills its arrays.
+    # What is needed are leaves, forks and the root; between two rounds of splicing the arrays fill.
     assert most <= 8 * n
     assert lineage.distinct(0) == 1

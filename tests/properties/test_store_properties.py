@@ -1,4 +1,4 @@
-"""The copy-on-write store against separate deep copies for every particle, under any sequence of operations."""
+"""The copy-on-write store against deep copies for every particle, under any sequence of operations."""
 
 from dataclasses import dataclass, field
 
@@ -24,7 +24,7 @@ class Copies:
 
 
 def kernel_like(store: SharedStore, columns: np.ndarray, increments: np.ndarray) -> None:
-    """What the compiled drivers do: observation after observation, read an inherited record, write one's own."""
+    """What the compiled drivers do, row after row: read an inherited record, write one's own."""
     access, targets = store.rewrite(columns)
     for k in range(columns.size):
         rows = access.maps[access.which[k]]
@@ -155,7 +155,7 @@ def test_memory_shrinks_as_lineages_coalesce():
         lineage.advance(np.sort(rng.integers(0, n, n)))
         store.compact()
         taken[age] = store.stored_bytes / before
-    # About 2/age of the rows have descendants; they are looked at when the age has doubled, and kept with an index.
+    # About 2/age of the rows have descendants; they are looked at whenever the age has doubled.
     assert taken[16] < 0.5
     assert taken[256] < 0.05
     # Long after all lineages have met, one row and its index are left.

@@ -44,13 +44,13 @@ def opened(folder, files, noise=None):
     return open_log(write(folder, files), noise)
 
 
-PIECES = [(0.2, 0.5, 0), (0.6, 0.2, 1), (0.5, 0, -2), (0.5, 0.4, 0.5)]
+DRIVEN = [(0.2, 0.5, 0), (0.6, 0.2, 1), (0.5, 0, -2), (0.5, 0.4, 0.5)]
 
 
 def moved(noisy_piece=None, noise=(0.0, 0.0)):
     """The motion of the log from 100.1 s to 101.9 s, piece by piece; one piece with white noise."""
     out = SE2.identity()
-    for number, (dt, speed, turn_rate) in enumerate(PIECES):
+    for number, (dt, speed, turn_rate) in enumerate(DRIVEN):
         xi = dt * np.array([turn_rate, speed, 0.0])
         if number == noisy_piece:
             xi[:2] += np.sqrt(dt) * np.asarray(noise)
@@ -61,7 +61,7 @@ def moved(noisy_piece=None, noise=(0.0, 0.0)):
 def moved_covariance(std):
     """Sum over pieces of numeric derivatives by their noise."""
     step, cov = 1e-6, np.zeros((3, 3))
-    for number in range(len(PIECES)):
+    for number in range(len(DRIVEN)):
         for source in range(2):
             noise = step * np.eye(2)[source]
             plus, minus = moved(number, noise), moved(number, -noise)

@@ -4,11 +4,14 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from rbpf import gaussian
 from rbpf.lie import SE2, SE3, Array
 from rbpf.validation.measurements import Kind, Measurements
+
+Index = NDArray[np.int64]
 
 NAMES = np.array([41, 7, 1000, 12, 3, 26])
 MOTION = {2: np.array([0.25, 0.5, 0.0]), 3: np.array([0.05, 0.1, 0.25, 0.5, 0.0, 0.0])}
@@ -16,7 +19,7 @@ MOUNT = {2: np.array([2.4, 0.3, -0.2]), 3: SE3.exp(np.array([0.2, 0.5, 2.4, 0.3,
 
 
 def world(
-    dim: int, kind: Kind, singular: bool = False, steps: int = 9, noise: float = 1.0, seed: int = 0
+    dim: int, kind: Kind, singular: bool = False, steps: int = 7, noise: float = 1.0, seed: int = 0
 ) -> Measurements:
     """A drive of half a metre per step among six landmarks, seen by a sensor that looks back and down.
 
@@ -64,7 +67,7 @@ def _drive(
     return m, np.array(path)
 
 
-def seen(m: Measurements, steps: Array, landmarks: Array, z: Array, cov_z: Array) -> Measurements:
+def seen(m: Measurements, steps: Index, landmarks: Index, z: Array, cov_z: Array) -> Measurements:
     """The same drive with other sightings."""
     return replace(m, steps=steps, landmarks=landmarks, z=z, cov_z=cov_z)
 

@@ -32,8 +32,8 @@ class AssociationConfig:
 
     accept_probability: float = 0.999
     isolate_probability: float = 0.999999
-    new_density: float = 1e-2
-    clutter_density: float = 1e-3
+    new_density: float = 1e-3
+    clutter_density: float = 1e-4
     max_range_m: float | None = None
     half_field_of_view_deg: float = 180.0
     hit: float = 1.0
