@@ -1,0 +1,10 @@
+"""Figures against stated baselines: `python -m benchmarks`.
+
+BLAS works on one thread, here and in the peers: products of 2 x 2 matrices gain nothing from more, and threads that
+wait for one another make a shared machine's figures meaningless. It has to be said before NumPy is imported.
+"""
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")

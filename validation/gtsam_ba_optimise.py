@@ -13,7 +13,7 @@ from rbpf.validation.gtsam_ba_graph import Problem
 CHUNK = 50
 """Steps that `incremental` adds at once."""
 
-_ROUGH = 1e-6
+_ROUGH = 1e-4
 _EXACT = 1e-11
 _ITERATIONS = 200
 _DAMPING = 1e-5

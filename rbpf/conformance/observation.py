@@ -66,7 +66,7 @@ def _check_residual(model: ObservationModel, scene: Scene) -> None:
 
 
 def _check_cut(model: ObservationModel, scene: Scene) -> None:
-    """While the state turns once around an axis of its chart, no residual may jump by 2π between two steps."""
+    """While the state turns around an axis of its chart, no residual may jump by 2π from step to step."""
     if Part.STATE not in model.reads:
         return
     angles = np.linspace(0.0, 2 * np.pi, TURN_STEPS)[:, None, None, None]

@@ -37,7 +37,7 @@ class Fix(ObservationModel):
 
 
 def mean_nees(claimed: float) -> float:
-    """Of the last step, over independent runs; `claimed` is the standard deviation that the filter is told."""
+    """Of the last step, over independent runs; `claimed` is the standard deviation it is told."""
     rng = np.random.default_rng(12)
     cov = claimed**2 * np.eye(2)[None]
     total = 0.0

@@ -113,8 +113,7 @@ def test_the_landmarks_of_two_sensors_are_updated_jointly(space, compiled, rng):
     groups = [scene.observe(first, np.array([1, 2, 0, 2])), scene.observe(second, np.array([3, 1]))]
     held = scene.map(compiled)
     densities = held.correct(scene.state, np.zeros((scene.n, space.dim)), groups)
-    known = Prior.exactly(space, scene.state)
-    kalmans = sequential(scene, groups, known, rng)
+    kalmans = sequential(scene, groups, Prior.exactly(space, scene.state), rng)
     d, dim = space.dim, scene.records.mean.shape[-1]
     records = held.read(held.ids)
     np.testing.assert_allclose(densities.all, [kalman.log_evidence for kalman in kalmans], atol=TOLERANCE)
@@ -142,10 +141,10 @@ def test_each_particle_uses_its_own_associations(space, compiled, rng):
     assert_equal(prior, proposed, sequential(scene, groups, prior, rng), log_factor)
 
     densities = scene.map(compiled).correct(scene.state, np.zeros((scene.n, space.dim)), groups)
-    known = [
+    expected = [
         kalman.log_evidence for kalman in sequential(scene, groups, Prior.exactly(space, scene.state), rng)
     ]
-    np.testing.assert_allclose(densities.all, np.array(known) + log_factor, atol=TOLERANCE)
+    np.testing.assert_allclose(densities.all, np.array(expected) + log_factor, atol=TOLERANCE)
 
 
 @every_space
@@ -155,8 +154,9 @@ def test_the_compiled_refinement_equals_its_numpy_twin(space, rng):
     for rank in (0, 1, d, d + 2):
         for shared in (True, False):
             prior = scene.prior(rank, shared)
-            scalars = rng.normal(size=(3, 40))
-            terms = Terms(random_covs(rng, (40,), d, 3.0), rng.normal(size=(40, d)), *scalars, 7)
+            quad, log_det, log_factor = rng.normal(size=(3, 40))
+            info, vector = random_covs(rng, (40,), d, 3.0), rng.normal(size=(40, d))
+            terms = Terms(info, vector, quad, log_det, log_factor, rows=7)
             ours, twin = refined(prior, terms), reference.refined(prior, terms)
             for name in ("mean", "root", "log_w1", "nis"):
                 np.testing.assert_allclose(

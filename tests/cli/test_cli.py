@@ -1,0 +1,175 @@
+"""The command line from end to end, on small simulated logs."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from rbpf.cli import main
+
+FILES = {
+    "trajectory.tum",
+    "map.npz",
+    "map.csv",
+    "observations.csv",
+    "observations_odometry.csv",
+    "timings.csv",
+    "diagnostics.csv",
+    "config.yaml",
+    "summary.json",
+    "report.html",
+    "path.png",
+    "map.png",
+    "particles.png",
+    "ess.png",
+}
+TIMINGS = ("ms_per_frame", "peak_memory_mb")
+REQUIRED = {
+    "system", "recording", "frames", "particles", "seed", "ms_per_frame", "landmarks", "resamplings", "ess_mean",
+    "log_evidence", "peak_memory_mb", "ate_rmse_m", "path_rmse_m", "landmark_error_mean_m",
+    "landmark_error_aligned_mean_m",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("simulated") / "log"
+    assert main(["simulate", "range-bearing", "--out", str(folder), "--steps", "40", "--landmarks", "30"]) == 0
+    return folder
+
+
+def run(log, out, *arguments):
+    return main(["run", "range-bearing", str(log), "--out", str(out), "--particles", "30", "--no-batch", *arguments])
+
+
+def outputs(folder: Path) -> dict[str, bytes]:
+    """All files but timings; summary.json without its timings."""
+    kept = {}
+    for path in sorted(folder.iterdir()):
+        if path.name in ("timings.csv", "report.html", "checkpoint.npz"):
+            continue
+        content = path.read_bytes()
+        if path.name == "summary.json":
+            entries = {k: v for k, v in json.loads(content).items() if k not in TIMINGS}
+            content = json.dumps(entries).encode()
+        kept[path.name] = content
+    return kept
+
+
+def test_a_run_leaves_everything(log, tmp_path):
+    assert run(log, tmp_path / "run", "--seed", "3") == 0
+    assert {path.name for path in (tmp_path / "run").iterdir()} == FILES
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert REQUIRED <= summary.keys()
+    assert summary["frames"] == 40
+    assert summary["particles"] == 30
+    assert summary["seed"] == 3
+    assert summary["path_rmse_m"] < summary["odometry_path_rmse_m"]
+    assert set(summary["ms_per_frame"]) == {"median", "p95"}
+    with np.load(tmp_path / "run" / "map.npz") as archive:
+        assert archive["mean"].shape == (summary["landmarks"], 2)
+        assert (np.linalg.eigvalsh(archive["cov"]) > 0).all()
+
+
+def test_the_batch_optimum_stands_beside(log, tmp_path):
+    assert main(["run", "range-bearing", str(log), "--out", str(tmp_path), "--particles", "30"]) == 0
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert (tmp_path / "batch.tum").exists()
+    assert summary["batch_ate_rmse_m"] < summary["odometry_ate_rmse_m"]
+
+
+def test_config_repeats_the_run(log, tmp_path):
+    assert run(log, tmp_path / "a", "--set", "proposal.iterations=1", "--set", "resampling.scheme=residual") == 0
+    config = tmp_path / "a" / "config.yaml"
+    assert yaml.safe_load(config.read_text())["resampling"]["scheme"] == "residual"
+    assert main(["run", "range-bearing", str(log), "--out", str(tmp_path / "b"), "--no-batch", "--config", str(config)]) == 0
+    assert outputs(tmp_path / "a") == outputs(tmp_path / "b")
+
+
+@pytest.mark.parametrize("association", ["known", "ml"])
+def test_a_resumed_run_is_identical(log, tmp_path, association, monkeypatch):
+    arguments = ("--association", association, "--set", "checkpoint_every=15")
+    assert run(log, tmp_path / "whole", *arguments) == 0
+    from rbpf.filter import Filter
+
+    step = Filter.step
+
+    def interrupted(self, *args, **kwargs):
+        if self.steps == 33:
+            raise KeyboardInterrupt
+        return step(self, *args, **kwargs)
+
+    monkeypatch.setattr(Filter, "step", interrupted)
+    assert run(log, tmp_path / "cut", *arguments) == 130
+    monkeypatch.setattr(Filter, "step", step)
+    assert not (tmp_path / "cut" / "summary.json").exists()
+    assert run(log, tmp_path / "cut", *arguments, "--resume") == 0
+    assert outputs(tmp_path / "whole") == outputs(tmp_path / "cut")
+
+
+@pytest.mark.slow
+def test_threads_change_no_byte(log, tmp_path):
+    for threads in ("1", "2"):
+        command = [sys.executable, "-m", "rbpf.cli", "run", "range-bearing", str(log), "--no-batch"]
+        command += ["--particles", "3000", "--threads", threads, "--out", str(tmp_path / threads)]
+        environment = {**os.environ, "NUMBA_NUM_THREADS": "2"}
+        subprocess.run(command, check=True, env=environment, capture_output=True)
+    assert outputs(tmp_path / "1") == outputs(tmp_path / "2")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--set", "proposal.kind=ukf"], "proposal.kind"),
+        (["--set", "nothing=1"], "no setting nothing"),
+        (["--set", "particles"], "key=value"),
+        (["--set", "resampling.ess_threshold=2"], "threshold"),
+        (["--set", "noise.std_range_m=-1"], "std_range_m"),
+        (["--set", "proposal.iterations=0"], "iteration"),
+        (["--particles", "0"], "particles"),
+        (["--threads", "0"], "--threads"),
+        (["--config", "missing.yaml"], "missing.yaml"),
+    ],
+)
+def test_bad_settings_are_one_sentence(log, tmp_path, capsys, arguments, message):
+    assert run(log, tmp_path / "run", *arguments) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    sentence = error[error.index("rbpf: ") :]
+    assert sentence.count("\n") == 1
+    assert not list((tmp_path / "run").glob("*")) if (tmp_path / "run").exists() else True
+
+
+def test_a_damaged_log_names_file_and_line(log, tmp_path, capsys):
+    broken = tmp_path / "log"
+    broken.mkdir()
+    for path in log.iterdir():
+        (broken / path.name).write_text(path.read_text())
+    lines = (broken / "observations.csv").read_text().splitlines()
+    lines[5] = lines[5].replace(lines[5].split(",")[2], "-3")
+    (broken / "observations.csv").write_text("\n".join(lines) + "\n")
+    assert run(broken, tmp_path / "run") == 2
+    error = capsys.readouterr().err
+    assert "observations.csv" in error
+    assert "6" in error
+
+
+def test_a_cut_checkpoint_is_said(log, tmp_path, capsys):
+    assert run(log, tmp_path, "--set", "checkpoint_every=10") == 0
+    checkpoint = tmp_path / "checkpoint.npz"
+    checkpoint.write_bytes(checkpoint.read_bytes()[:-500])
+    before = outputs(tmp_path)
+    assert run(log, tmp_path, "--set", "checkpoint_every=10", "--resume") == 2
+    assert "checkpoint.npz" in capsys.readouterr().err
+    assert outputs(tmp_path) == before
+
+
+def test_a_checkpoint_of_other_settings_is_refused(log, tmp_path, capsys):
+    assert run(log, tmp_path, "--set", "checkpoint_every=10") == 0
+    assert run(log, tmp_path, "--set", "checkpoint_every=10", "--resume", "--particles", "31") == 2
+    assert "particles" in capsys.readouterr().err

@@ -1,0 +1,139 @@
+"""The start re-estimated in each particle's world."""
+
+import numpy as np
+import pytest
+
+from rbpf.anchoring import StartAnchor
+from rbpf.errors import InputError
+from rbpf.filter import Filter
+from rbpf.lie import SE2
+from rbpf.maps.landmark_map import LandmarkMap
+from rbpf.maps.point import Point
+from rbpf.motion.odometry import Odometry, OdometryMotion
+from rbpf.proposals import EkfProposal
+from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
+from rbpf.sensors.range_bearing import RelativePosition
+from rbpf.sensors.readers.log import Frame
+
+COV_Z = np.diag([0.04, 0.09])
+LANDMARKS = np.array([[4.0, 1.0], [3.0, -2.0], [6.0, 0.5], [5.0, 3.0]])
+
+
+def frame(rng, pose, stamp_ns):
+    z = SE2.inverse_transform(pose, LANDMARKS) + rng.multivariate_normal(np.zeros(2), COV_Z, len(LANDMARKS))
+    names = np.arange(len(LANDMARKS))
+    return Frame(stamp_ns, None, None, names, z, np.repeat(COV_Z[None], len(LANDMARKS), axis=0))
+
+
+def started(n, seed, every=1):
+    sensor = NamedLandmarkSensor(RelativePosition(SE2), Point(2))
+    filter_ = Filter(
+        OdometryMotion(SE2), sensor, LandmarkMap(SE2), EkfProposal(), n=n, rng=np.random.default_rng(seed)
+    )
+    return filter_, StartAnchor(filter_, every)
+
+
+CONTROL = Odometry(np.array([0.1, 0.5, 0.0]), np.diag([0.02, 0.1, 0.1]) ** 2)
+
+
+def drive(steps, n=50, seed=0, every=1):
+    rng = np.random.default_rng(100 + seed)
+    filter_, anchor = started(n, seed, every)
+    pose = SE2.identity()
+    for t in range(steps):
+        control = None
+        if t:
+            pose = SE2.retract(SE2.compose(pose, CONTROL.delta), np.sqrt(np.diag(CONTROL.cov)) * rng.standard_normal(3))
+            control = CONTROL
+        report = filter_.step(frame(rng, pose, t * 10**9), control, t * 10**9)
+        anchored = anchor.after_step(report, control)
+    return filter_, anchor, anchored, pose
+
+
+def test_before_any_motion_the_start_is_known():
+    _, _, anchored, _ = drive(1)
+    np.testing.assert_array_equal(anchored.mean, np.zeros((50, 3)))
+    np.testing.assert_array_equal(anchored.factor, np.zeros((50, 3, 3)))
+
+
+def test_law_of_the_start_equals_the_joint_gaussian():
+    """Against a plain information-form solution: odometry from x_0 to x_1, first frame against the rest of the map."""
+    filter_, anchor, _, _ = drive(4)
+    anchored = anchor.estimate()
+    records = filter_.belief().read(np.arange(len(LANDMARKS)))
+    second = anchor._second
+    x1 = second.state[filter_.lineage.rows(second.generation)]
+    z0 = anchor._seen[0][1].z
+    model = RelativePosition(SE2)
+    for i in (0, 17, 49):
+        start = SE2.compose(x1[i], SE2.inverse(CONTROL.delta))
+        adjoint = SE2.adjoint(CONTROL.delta)
+        prior_info = np.linalg.inv(adjoint @ CONTROL.cov @ adjoint.T)
+        x, origin = start, start
+        for _ in range(2):
+            offset = SE2.local(origin, x)
+            info, vector = prior_info.copy(), -prior_info @ offset
+            for k in range(len(LANDMARKS)):
+                info_map = np.linalg.inv(records.cov[i, k])
+                j0 = model.jacobians(np.zeros(3), records.mean[i, k]).landmark
+                without = np.linalg.inv(info_map - j0.T @ np.linalg.inv(COV_Z) @ j0)
+                gap = z0[k] - model.predict(np.zeros(3), records.mean[i, k])
+                mean = records.mean[i, k] - without @ j0.T @ np.linalg.inv(COV_Z) @ gap
+                jac = model.jacobians(x, mean)
+                h = jac.state @ SE2.right_jacobian(offset)
+                s = np.linalg.inv(jac.landmark @ without @ jac.landmark.T + COV_Z)
+                info += h.T @ s @ h
+                vector += h.T @ s @ (z0[k] - model.predict(x, mean))
+            step = np.linalg.solve(info, vector)
+            x = SE2.retract(origin, offset + step)
+        np.testing.assert_allclose(anchored.mean[i], x, atol=1e-9)
+        factor = anchored.factor[i]
+        np.testing.assert_allclose(factor @ factor.T, np.linalg.inv(info), atol=1e-9)
+
+
+def test_it_lowers_the_error_of_the_pose():
+    raw, moved = [], []
+    for seed in range(12):
+        filter_, anchor, anchored, pose = drive(30, n=20, seed=seed)
+        raw.append(np.linalg.norm(filter_.estimate().mean[1:] - pose[1:]))
+        moved.append(np.linalg.norm(anchor.state_estimate(anchored).mean[1:] - pose[1:]))
+    assert np.mean(moved) < np.mean(raw)
+
+
+def test_in_between_descendants_inherit():
+    filter_, anchor, anchored, _ = drive(27, every=10)
+    assert filter_.steps == 27
+    generation, kept = anchor._latest
+    np.testing.assert_array_equal(anchored.mean, kept.mean[filter_.lineage.rows(generation)])
+
+
+def test_landmarks_seen_only_at_the_start_say_nothing_about_it():
+    filter_, anchor = started(5, 0)
+    rng = np.random.default_rng(0)
+    first = frame(rng, SE2.identity(), 0)
+    anchor.after_step(filter_.step(first, None, 0))
+    nothing = Frame(1, None, None, np.zeros(0, dtype=int), np.zeros((0, 2)), np.zeros((0, 2, 2)))
+    anchored = anchor.after_step(filter_.step(nothing, CONTROL, 10**9), CONTROL)
+    expected = SE2.compose(filter_.particles.state, SE2.inverse(CONTROL.delta))
+    np.testing.assert_allclose(anchored.mean, expected, atol=1e-12)
+
+
+def test_singular_odometry_is_met():
+    rng = np.random.default_rng(3)
+    filter_, anchor = started(8, 0)
+    anchor.after_step(filter_.step(frame(rng, SE2.identity(), 0), None, 0))
+    exact = Odometry(CONTROL.delta, np.diag([0.0, 0.01, 0.0]))
+    for t in (1, 2, 3):
+        pose = SE2.exp(np.zeros(3))
+        report = filter_.step(frame(rng, pose, t), exact, t * 10**9)
+        anchored = anchor.after_step(report, exact)
+    assert np.isfinite(anchored.mean).all()
+    assert np.isfinite(anchored.factor).all()
+
+
+def test_zero_period_is_refused():
+    filter_, _ = started(2, 0)
+    with pytest.raises(InputError, match="every 1, 2"):
+        StartAnchor(filter_, 0)
+
+
