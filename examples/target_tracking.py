@@ -23,7 +23,7 @@ from rbpf import (
     Transition,
 )
 
-PARTICLES, STEPS, VESSELS, REPEATS = 100, 40, 3, 6
+PARTICLES, STEPS, VESSELS, REPEATS = 100, 40, 3, 4
 STD_POSE = np.array([0.02, 0.2, 0.2])  # disturbance per step: turn [rad], forward [m], to the left [m]
 STD_RATES = np.array([0.01, 0.15])  # change per step of turn rate [rad/s] and speed [m/s]
 STD_RADAR = np.array([5.0, 0.03])  # range [m], bearing [rad]

@@ -185,6 +185,5 @@ def deviation(samples: np.ndarray, expected: np.ndarray | float) -> float:
 
 def assert_unbiased(log_ratio: np.ndarray) -> None:
     """The mean of Ẑ/Z is one within three standard errors; a spread of log Ẑ ≤ 0.5 gives that a meaning."""
-    print("UNB", np.exp(log_ratio).mean(), deviation(np.exp(log_ratio), 1.0), log_ratio.std(ddof=1))
     assert 1e-4 < log_ratio.std(ddof=1) <= 0.5
     assert deviation(np.exp(log_ratio), 1.0) <= 3.0

@@ -1,0 +1,71 @@
+"""The range-bearing system on recorded logs, against the figures of independent reference filters."""
+
+import numpy as np
+import pytest
+
+from rbpf.sensors.readers import open_log
+from rbpf.systems.range_bearing.run import run
+from rbpf.systems.range_bearing.settings import load_settings
+from rbpf.validation.map_summary import summarise_map
+from rbpf.validation.scores import score
+
+pytestmark = [pytest.mark.real_data, pytest.mark.slow]
+
+
+def mean_scores(path, seeds, *settings):
+    """Mean over seeds of path rmse, ate, landmark error without and with alignment."""
+    rows = []
+    for seed in range(seeds):
+        config = load_settings(None, settings, {"seed": seed})
+        log = open_log(path, config.noise)
+        finished = run(log, config)
+        landmarks = summarise_map(finished.filter, finished.anchored).named()
+        found = score(log, finished.progress.mean, landmarks, config.association == "ml")
+        rows.append(
+            (
+                found.path_rmse_m,
+                found.ate_rmse_m,
+                found.landmark_error_mean_m,
+                found.landmark_error_aligned_mean_m,
+            )
+        )
+    return np.mean(rows, axis=0)
+
+
+def test_planar_simulated_log(data_dir):
+    path, _, landmarks, _ = mean_scores(data_dir / "mrpt_kf_slam_2d", 6)
+    assert path <= 0.0060
+    assert landmarks <= 0.0045
+
+
+def test_the_refined_proposal_beats_the_bootstrap_one(data_dir):
+    folder = data_dir / "mrpt_kf_slam_2d"
+    refined = mean_scores(folder, 4, "anchor_every=0")[2]
+    bootstrap = mean_scores(folder, 4, "anchor_every=0", "proposal.kind=prior")[2]
+    assert bootstrap >= 2.5 * refined
+
+
+def test_spatial_simulated_log(data_dir):
+    path, _, landmarks, _ = mean_scores(data_dir / "mrpt_kf_slam_6d", 4)
+    assert landmarks <= 0.010
+    assert path <= 0.020
+
+
+def test_the_start_re_estimated_halves_the_spatial_error(data_dir):
+    folder = data_dir / "mrpt_kf_slam_6d"
+    assert mean_scores(folder, 3)[2] < 0.65 * mean_scores(folder, 3, "anchor_every=0")[2]
+
+
+def test_robot_with_motion_capture(data_dir):
+    known = mean_scores(data_dir / "mrclam6_robot1", 5)
+    assert known[1] <= 0.37
+    assert known[3] <= 0.09
+    unknown = mean_scores(data_dir / "mrclam6_robot1", 3, "association=ml")
+    assert unknown[1] <= 2 * known[1]
+
+
+def test_victoria_park_runs_through(data_dir):
+    log = open_log(data_dir / "victoria_park")
+    finished = run(log, load_settings(None, ["particles=20"], {}))
+    assert np.isfinite(finished.progress.mean).all()
+    assert len(finished.filter.belief().map.ids) == 151
