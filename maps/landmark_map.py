@@ -68,7 +68,9 @@ class LandmarkMap(Conditional):
             self.catalogue[landmark] = fact
         return ids
 
-    def add_records(self, records: Records, landmark: Landmark, log_odds: np.ndarray | None = None) -> np.ndarray:
+    def add_records(
+        self, records: Records, landmark: Landmark, log_odds: np.ndarray | None = None
+    ) -> np.ndarray:
         """Adds landmarks whose estimates (N, K, …) are known; returns their ids (K,)."""
         if log_odds is not None and not self.evidence:
             raise InputError("landmarks of some particles only need a map with evidence=True")
@@ -97,7 +99,9 @@ class LandmarkMap(Conditional):
             raise InputError("no landmark was named")
         kinds = np.unique(self.kinds[ids])
         if kinds.size > 1:
-            raise InputError("read() takes landmarks of one parametrisation at a time; `landmark_of` tells which")
+            raise InputError(
+                "read() takes landmarks of one parametrisation at a time; `landmark_of` tells which"
+            )
         return self.layouts[kinds[0]].unpack(np.array([self.store.read(int(i)) for i in ids]))
 
     def landmark_of(self, landmark_id: int) -> Landmark:
@@ -145,8 +149,10 @@ class LandmarkMap(Conditional):
         """Information of single-Gaussian landmarks; those of several components enter after sampling."""
         return self._engine.terms(self._plan(groups), state, groups, prior)
 
-    def correct(self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]) -> LogDensities:
-        """log p(z | x) and the landmarks' Kalman updates at the sampled states."""
+    def correct(
+        self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]
+    ) -> LogDensities:
+        """Log p(z | x) and the landmarks' Kalman updates at the sampled states."""
         return self._engine.correct(self._plan(groups), state, groups)
 
     def resample(self, ancestors: np.ndarray) -> None:

@@ -53,7 +53,9 @@ class Layout:
             parts.append(np.zeros((n, k, 1)) if log_odds is None else log_odds[..., None])
         columns = np.concatenate(parts, axis=-1)
         if not np.isfinite(body).all():
-            raise InputError(f"a new {type(self.landmark).__name__} has a mean or covariance that is not finite")
+            raise InputError(
+                f"a new {type(self.landmark).__name__} has a mean or covariance that is not finite"
+            )
         return np.ascontiguousarray(np.moveaxis(columns, 0, -1))
 
     def unpack(self, columns: np.ndarray) -> Records:
@@ -84,4 +86,6 @@ class Layout:
         if (records.log_weights is None) != (components == 1):
             raise InputError(f"{name} needs log_weights exactly if it has several components")
         if (records.const is None) != (self.landmark.constants == 0):
-            raise InputError(f"{name} has {self.landmark.constants} constants per landmark: give them in Records.const")
+            raise InputError(
+                f"{name} has {self.landmark.constants} constants per landmark: give them in Records.const"
+            )

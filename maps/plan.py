@@ -96,7 +96,9 @@ def _is_simple(ids: np.ndarray, kinds: np.ndarray, plain: np.ndarray) -> bool:
         return False
     seen = ids[ids >= 0]
     of = kinds[seen]
-    return seen.size == 0 or bool(len(set(seen.tolist())) == seen.size and (of == of[0]).all() and plain[of[0]])
+    return seen.size == 0 or bool(
+        len(set(seen.tolist())) == seen.size and (of == of[0]).all() and plain[of[0]]
+    )
 
 
 def _checked_ids(group: Observations, n: int, kinds: np.ndarray) -> np.ndarray:
@@ -106,7 +108,9 @@ def _checked_ids(group: Observations, n: int, kinds: np.ndarray) -> np.ndarray:
     if ids.shape not in ((count,), (n, count)):
         raise InputError(f"ids of {count} measurements must be ({count},) or ({n}, {count}), got {ids.shape}")
     if ids.dtype.kind != "i" or (ids < NEW).any():
-        raise InputError(f"ids of {type(group.model).__name__} must be integers: landmarks, NULL = -1 or NEW = -2")
+        raise InputError(
+            f"ids of {type(group.model).__name__} must be integers: landmarks, NULL = -1 or NEW = -2"
+        )
     named = ids[ids >= 0]
     held = np.append(kinds, -1)[np.minimum(named, kinds.size)] >= 0
     if not held.all():
@@ -125,7 +129,11 @@ def _rows(number: int, ids: np.ndarray) -> list[Row]:
             if first >= 0:
                 rows.append(Row(number, k, first, None))
             continue
-        rows.extend(Row(number, k, int(landmark), column == landmark) for landmark in np.unique(column) if landmark >= 0)
+        rows.extend(
+            Row(number, k, int(landmark), column == landmark)
+            for landmark in np.unique(column)
+            if landmark >= 0
+        )
     return rows
 
 
@@ -134,7 +142,7 @@ def _overlap(rows: list[Row]) -> bool:
         return False
     if any(row.mask is None for row in rows):
         return True
-    return bool((np.sum([row.mask for row in rows], axis=0) > 1).any())
+    return bool((np.sum([row.mask for row in rows if row.mask is not None], axis=0) > 1).any())
 
 
 def _batch(rows: list[Row], n: int) -> Batch:

@@ -39,5 +39,6 @@ class AnchoredPoint(Landmark):
 
     def homogeneous(self, mean: np.ndarray, const: np.ndarray | None = None) -> np.ndarray:
         """(…, D) in the anchor's frame → (…, D+1) in the world."""
+        assert const is not None
         world = self.space.transform(const, mean)
         return np.concatenate([world, np.ones((*world.shape[:-1], 1))], axis=-1)

@@ -1,4 +1,4 @@
-"""Runs the rows of a plan: compiled where the model has a kernel, NumPy elsewhere, stacked where rows share a landmark."""
+"""Runs the rows of a plan: compiled where the model has a kernel, else in NumPy; stacked where they share one."""
 
 from collections.abc import Callable, Sequence
 
@@ -58,7 +58,7 @@ class RowEngine:
         return total
 
     def correct(self, plan: Plan, state: np.ndarray, groups: Sequence[Observations]) -> LogDensities:
-        """log p(z | x) of all rows, and the updates."""
+        """Log p(z | x) of all rows, and the updates."""
         log_density = plan.log_factor.copy()
         for batch in plan.batches:
             group = groups[batch.group]

@@ -93,7 +93,9 @@ class SharedStore:
 
     def __contains__(self, column: object) -> bool:
         """Whether a column is alive."""
-        return isinstance(column, int | np.integer) and 0 <= column < self._size and self._fields[column] > 0
+        return isinstance(column, int | np.integer) and bool(
+            0 <= column < self._size and self._fields[column] > 0
+        )
 
     def add(self, records: np.ndarray) -> int:
         """Stores a new column (fields, N) and returns its id; ids are never used again."""

@@ -13,7 +13,7 @@ from rbpf.models import MotionModel, Transition
 
 @dataclass(frozen=True)
 class Odometry:
-    """An increment previous_robot_from_robot (E,), and its covariance (d, d) in the right chart there; may be singular."""
+    """An increment previous_robot_from_robot (E,), and its covariance (d, d) in the right chart there."""
 
     delta: np.ndarray
     cov: np.ndarray

@@ -104,14 +104,20 @@ class StartAnchor:
         space, particles = self._filter.space, self._filter.particles
         relative = space.between(anchored.mean, particles.state)
         adjoint = space.adjoint(space.inverse(relative))
-        law = Prior(space, space.compose(self._start, relative), np.zeros((1, space.dim)), adjoint @ anchored.factor)
+        law = Prior(
+            space, space.compose(self._start, relative), np.zeros((1, space.dim)), adjoint @ anchored.factor
+        )
         return mixture_estimate(law, None, particles.log_weights)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """For a checkpoint."""
         out = {"anchor/groups": np.array(len(self._seen))}
         for number, (ids, births) in enumerate(self._seen):
-            out |= {f"anchor/{number}/ids": ids, f"anchor/{number}/z": births.z, f"anchor/{number}/cov": births.cov}
+            out |= {
+                f"anchor/{number}/ids": ids,
+                f"anchor/{number}/z": births.z,
+                f"anchor/{number}/cov": births.cov,
+            }
         if self._second is not None:
             second = self._second
             out |= {
@@ -159,7 +165,9 @@ class StartAnchor:
         delta = filter_.space.between(self._start, transition.mean[0])
         generation = filter_.lineage.generation
         filter_.lineage.retain(generation)
-        self._second = _FirstMotion(generation, filter_.particles.state.copy(), delta, transition.noise_factor[0])
+        self._second = _FirstMotion(
+            generation, filter_.particles.state.copy(), delta, transition.noise_factor[0]
+        )
 
     def _remember(self, anchored: Anchored) -> None:
         lineage = self._filter.lineage
@@ -186,7 +194,9 @@ class StartAnchor:
                 continue
             records = landmark_map.read(ids[held])
             present = ~np.isneginf(landmark_map.log_odds(ids[held]))
-            group = self._without_first_frame(records, births.model, births.z[held], births.cov[held], present)
+            group = self._without_first_frame(
+                records, births.model, births.z[held], births.cov[held], present
+            )
             groups.append(group)
         return groups
 
@@ -201,7 +211,9 @@ class StartAnchor:
         explained = innovation_covariance(jac.landmark, records.cov, np.zeros_like(cov_z))
         chol = np.broadcast_to(gaussian.cholesky(cov_z), explained.shape)
         half = gaussian.solve_lower_matrix(chol, explained)
-        share = np.linalg.eigvalsh(gaussian.symmetrise(gaussian.solve_lower_matrix(chol, np.swapaxes(half, -1, -2))))
+        share = np.linalg.eigvalsh(
+            gaussian.symmetrise(gaussian.solve_lower_matrix(chol, np.swapaxes(half, -1, -2)))
+        )
         use = present & (share[..., -1] < _MOST_OF_ALL)
         left = np.where(use[..., None, None], cov_z - explained, np.eye(z.shape[1]))
         gain = records.cov @ np.swapaxes(jac.landmark, -1, -2) @ gaussian.inverse(left)

@@ -59,7 +59,7 @@ def associate(nu: np.ndarray, cov: np.ndarray, present: np.ndarray, gates: Gates
 
 def _assign(cost: np.ndarray, alternative: np.ndarray, fallback: np.ndarray) -> np.ndarray:
     """Independent minima where they do not collide, the Hungarian method where they do."""
-    n, k, m = cost.shape
+    _, k, m = cost.shape
     if m == 0:
         return fallback
     best = cost.argmin(axis=2)

@@ -58,11 +58,15 @@ def read_checkpoint(filter_: "Filter", path: Path) -> dict[str, np.ndarray]:
         version, digest, rng = header["version"], header["digest"], header["rng"]
         expected = dict(header["fingerprint"])
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path} is not a checkpoint of rbpf: its header is missing or unreadable") from error
+        raise InputError(
+            f"{path} is not a checkpoint of rbpf: its header is missing or unreadable"
+        ) from error
     if version != VERSION:
         raise InputError(f"{path} has checkpoint version {version}, this program reads version {VERSION}")
     if digest != _digest(arrays):
-        raise InputError(f"{path} is damaged: its content does not match its digest; use an earlier checkpoint")
+        raise InputError(
+            f"{path} is damaged: its content does not match its digest; use an earlier checkpoint"
+        )
     found = fingerprint(filter_)
     for name, value in expected.items():
         if found.get(name) != value:
@@ -99,7 +103,7 @@ def save_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
     temporary = path.with_name(path.name + ".partial")
     try:
         with open(temporary, "wb") as file:
-            np.savez(file, allow_pickle=False, **arrays)  # type: ignore[arg-type]
+            np.savez(file, allow_pickle=False, **arrays)
         os.replace(temporary, path)
     except (OSError, ValueError) as error:
         temporary.unlink(missing_ok=True)
@@ -117,8 +121,21 @@ def load_arrays(path: Path) -> dict[str, np.ndarray]:
             return {name: archive[name] for name in archive.files}
     except FileNotFoundError as error:
         raise InputError(f"{path} does not exist") from error
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error, NotImplementedError,
-            AttributeError, TypeError, RuntimeError, MemoryError, SyntaxError, OverflowError) as error:
+    except (
+        OSError,
+        ValueError,
+        EOFError,
+        KeyError,
+        zipfile.BadZipFile,
+        zlib.error,
+        NotImplementedError,
+        AttributeError,
+        TypeError,
+        RuntimeError,
+        MemoryError,
+        SyntaxError,
+        OverflowError,
+    ) as error:
         raise InputError(f"{path} is damaged or cut off: it is not a complete archive of arrays") from error
 
 

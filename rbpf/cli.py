@@ -58,7 +58,9 @@ def run_range_bearing(options: Annotated[RangeBearingOptions, tyro.conf.arg(name
     config = load_settings(options.config, options.set, {k: v for k, v in given.items() if v is not None})
     if options.threads is not None:
         if not 1 <= options.threads <= numba.config.NUMBA_NUM_THREADS:
-            raise InputError(f"--threads must lie in 1..{numba.config.NUMBA_NUM_THREADS}, got {options.threads}")
+            raise InputError(
+                f"--threads must lie in 1..{numba.config.NUMBA_NUM_THREADS}, got {options.threads}"
+            )
         numba.set_num_threads(options.threads)
     compile_once(lambda: CONSOLE.print("compiling the kernels, which takes a minute and is done once …"))
     with _progress() as bar:
@@ -78,7 +80,11 @@ def run_range_bearing(options: Annotated[RangeBearingOptions, tyro.conf.arg(name
 
 @SIMULATE.command(name="range-bearing")
 def simulate_range_bearing(
-    out: Path, seed: int = 0, spatial: tyro.conf.FlagCreatePairsOff[bool] = False, steps: int = 200, landmarks: int = 60
+    out: Path,
+    seed: int = 0,
+    spatial: tyro.conf.FlagCreatePairsOff[bool] = False,
+    steps: int = 200,
+    landmarks: int = 60,
 ) -> None:
     """A log of a robot among landmarks, with ground truth.
 

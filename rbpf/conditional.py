@@ -39,7 +39,9 @@ class StateOnly(Conditional):
             total.add(information(nu, jacobians.state, cov, group.likelihood or GAUSSIAN, prior))
         return total
 
-    def correct(self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]) -> LogDensities:
+    def correct(
+        self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]
+    ) -> LogDensities:
         """Σ log p(z | x); there is nothing to update."""
         total = np.zeros(state.shape[0])
         for group in groups:
@@ -92,7 +94,9 @@ class Marginals(Conditional):
                 total.add(self.parts[supplies].terms(state, routed, prior))
         return total
 
-    def correct(self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]) -> LogDensities:
+    def correct(
+        self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]
+    ) -> LogDensities:
         """Corrects every part."""
         total, late = np.zeros(state.shape[0]), np.zeros(state.shape[0])
         for supplies, routed in self._routed(groups).items():
@@ -130,6 +134,8 @@ class Marginals(Conditional):
                 )
             supplies = next(iter(reads), Part.STATE)
             if supplies not in self.parts:
-                raise InputError(f"{type(group.model).__name__} reads a {supplies.value}, which this filter does not hold")
+                raise InputError(
+                    f"{type(group.model).__name__} reads a {supplies.value}, which this filter does not hold"
+                )
             routed[supplies].append(group)
         return routed

@@ -146,7 +146,14 @@ class Lineage:
 
     def _grow(self) -> None:
         old = self._parent.size
-        for name, value in (("parent", -1), ("children", 0), ("generation", -1), ("row", 0), ("found", 0), ("stamp", 0)):
+        for name, value in (
+            ("parent", -1),
+            ("children", 0),
+            ("generation", -1),
+            ("row", 0),
+            ("found", 0),
+            ("stamp", 0),
+        ):
             extra = np.full(old, value, dtype=np.int64)
             setattr(self, f"_{name}", np.concatenate([getattr(self, f"_{name}"), extra]))
         free = np.zeros(2 * old + self.n, dtype=np.int64)
@@ -185,7 +192,7 @@ class Schedule:
 
 @dataclass
 class PathBlock:
-    """Poses of one generation: `states` (T, n, E) at the rows `kept` (n,), with their stamps; log-weights where clouds are kept."""
+    """Poses of one generation: `states` (T, n, E) at the rows `kept` (n,); log-weights where clouds are kept."""
 
     generation: int
     kept: np.ndarray
@@ -244,7 +251,7 @@ class History:
 
     def paths(self) -> np.ndarray:
         """(T, N, E): the trajectory of each current particle, along its ancestors."""
-        parts = []
+        parts: list[np.ndarray] = []
         for block in self.blocks:
             rows = np.searchsorted(block.kept, self.lineage.rows(block.generation))
             parts.extend(states[rows] for states in block.states)
@@ -252,7 +259,9 @@ class History:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Everything that a checkpoint must hold."""
-        out: dict[str, np.ndarray] = {"history/generations": np.array([b.generation for b in self.blocks], dtype=np.int64)}
+        out: dict[str, np.ndarray] = {
+            "history/generations": np.array([b.generation for b in self.blocks], dtype=np.int64)
+        }
         for number, block in enumerate(self.blocks):
             out[f"history/{number}/kept"] = block.kept
             out[f"history/{number}/stamps_ns"] = np.array(block.stamps_ns, dtype=np.int64)
@@ -266,7 +275,10 @@ class History:
         self.blocks, self._by_generation = [], {}
         self._schedule = Schedule.of(arrays["history/due"])
         for number, generation in enumerate(arrays["history/generations"]):
-            part = {name: arrays[f"history/{number}/{name}"] for name in ("kept", "stamps_ns", "states", "log_weights")}
+            part = {
+                name: arrays[f"history/{number}/{name}"]
+                for name in ("kept", "stamps_ns", "states", "log_weights")
+            }
             block = PathBlock(
                 int(generation),
                 part["kept"].copy(),

@@ -39,7 +39,9 @@ class TruncatedMahalanobis(Likelihood):
 
     def __init__(self, limit: float = 4.0) -> None:
         if not limit > 0:
-            raise InputError(f"the limit T_l of a truncated Mahalanobis likelihood must be positive, got {limit}")
+            raise InputError(
+                f"the limit T_l of a truncated Mahalanobis likelihood must be positive, got {limit}"
+            )
         self.params = np.array([float(limit)])
 
     def log_density(self, nu: np.ndarray, cov: np.ndarray) -> np.ndarray:
@@ -84,7 +86,7 @@ class GaussianWithOutliers(Likelihood):
         return float(self.params[0])
 
     def log_outlier(self) -> float:
-        """log ε/V."""
+        """Log ε/V."""
         return float(self.params[1])
 
 

@@ -110,7 +110,7 @@ class ObservationModel(ABC):
         return None
 
     def residual(self, z: np.ndarray, predicted: np.ndarray) -> np.ndarray:
-        """z − h (…, p); override to wrap angles."""
+        """Z − h (…, p); override to wrap angles."""
         return z - predicted
 
     def visible(self, state: np.ndarray, landmark: np.ndarray, const: np.ndarray | None = None) -> np.ndarray:
@@ -287,8 +287,10 @@ class Conditional(ABC):
         """The information of the groups about a right perturbation of the states (N, E)."""
 
     @abstractmethod
-    def correct(self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]) -> "LogDensities":
-        """log p(z | x) at the sampled states, and the update by the same observations."""
+    def correct(
+        self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]
+    ) -> "LogDensities":
+        """Log p(z | x) at the sampled states, and the update by the same observations."""
 
     @abstractmethod
     def resample(self, ancestors: np.ndarray) -> None:

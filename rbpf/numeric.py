@@ -59,7 +59,9 @@ def linearise(
     parts = (state, landmark, substate)
     expected = (*np.broadcast_shapes(*(part.shape[:-1] for part in parts if part is not None)), model.dim)
     if predicted.shape != expected:
-        raise InputError(f"{type(model).__name__}.predict returned shape {predicted.shape}, expected {expected}")
+        raise InputError(
+            f"{type(model).__name__}.predict returned shape {predicted.shape}, expected {expected}"
+        )
     jacobians = model.jacobians(state, landmark, const, substate)
     if jacobians is None:
         jacobians = numeric_jacobians(model, space, state, landmark, const, substate)
@@ -79,7 +81,9 @@ def _full(model: ObservationModel, block: np.ndarray | None, shape: tuple[int, .
         raise InputError(f"{name} returned a block of shape {block.shape}, expected {shape}") from error
 
 
-def invert_with_covariance(model: ObservationModel, state: np.ndarray, z: np.ndarray, cov: np.ndarray) -> Records:
+def invert_with_covariance(
+    model: ObservationModel, state: np.ndarray, z: np.ndarray, cov: np.ndarray
+) -> Records:
     """Landmarks from `model.invert`, with the covariance J R Jᵀ of a numeric derivative by the measurement."""
     at = state[:, None, :]
     mean = model.invert(at, z)
@@ -97,7 +101,6 @@ def promote_to_points(landmark: Landmark, records: Records) -> Records:
 
     S. Julier and J. Uhlmann, "A new extension of the Kalman filter to nonlinear systems" (1997).
     """
-
     const = records.const
     if const is not None and landmark.components > 1:
         const = const[:, :, None, :]

@@ -31,7 +31,11 @@ def ancestral_smoothing(space: LieGroup, history: History, weights: np.ndarray) 
 
 
 def backward_simulation(
-    motion: MotionModel, history: History, count: int, rng: np.random.Generator, controls: list[object] | None = None
+    motion: MotionModel,
+    history: History,
+    count: int,
+    rng: np.random.Generator,
+    controls: list[object] | None = None,
 ) -> Smoothed:
     """p(x_t | z_1:T) from `count` trajectories drawn backwards through stored clouds.
 
@@ -49,7 +53,9 @@ def backward_simulation(
         InputError: the history holds no clouds, or the motion has a substate or singular noise.
     """
     if not history.clouds or history.lag is not None:
-        raise InputError("backward simulation needs whole clouds: build the filter with clouds=True and no lag")
+        raise InputError(
+            "backward simulation needs whole clouds: build the filter with clouds=True and no lag"
+        )
     clouds = [states for block in history.blocks for states in block.states]
     log_weights = [weights for block in history.blocks for weights in block.log_weights]
     stamps = history.stamps_ns
@@ -57,7 +63,9 @@ def backward_simulation(
     paths = [clouds[-1][chosen]]
     for t in range(len(clouds) - 2, -1, -1):
         control = None if controls is None else controls[t + 1]
-        log_density = _transition_log_density(motion, clouds[t], paths[0], control, (stamps[t + 1] - stamps[t]) * 1e-9)
+        log_density = _transition_log_density(
+            motion, clouds[t], paths[0], control, (stamps[t + 1] - stamps[t]) * 1e-9
+        )
         paths.insert(0, clouds[t][_draw(log_weights[t] + log_density, rng)])
     return _summary(motion.space, stamps, np.array(paths), np.full(count, 1.0 / count))
 
@@ -65,7 +73,7 @@ def backward_simulation(
 def _transition_log_density(
     motion: MotionModel, before: np.ndarray, after: np.ndarray, control: object, dt: float
 ) -> np.ndarray:
-    """log p(after_j | before_i) up to what does not depend on i, (J, N)."""
+    """Log p(after_j | before_i) up to what does not depend on i, (J, N)."""
     transition = motion.transition(before, control, dt)
     if transition.coupling is not None and transition.coupling.shape[-1]:
         raise InputError("backward simulation takes motion models without a substate")
@@ -75,7 +83,9 @@ def _transition_log_density(
         raise InputError("backward simulation needs a motion model with regular noise")
     log_det = np.linalg.slogdet(cov)[1]
     increment = motion.space.local(transition.mean[None], after[:, None])
-    solved = np.einsum("nab,jnb->jna", np.broadcast_to(np.linalg.inv(cov), (before.shape[0], *cov.shape[1:])), increment)
+    solved = np.einsum(
+        "nab,jnb->jna", np.broadcast_to(np.linalg.inv(cov), (before.shape[0], *cov.shape[1:])), increment
+    )
     jacobian = motion.space.right_jacobian_inverse(increment)
     chart = np.linalg.slogdet(jacobian)[1]
     return -0.5 * ((increment * solved).sum(-1) + log_det) + chart

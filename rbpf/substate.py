@@ -36,7 +36,9 @@ class KalmanSubstate(Conditional):
         self._mean = np.asarray(mean, dtype=float)
         self._cov = np.asarray(cov, dtype=float)
         if self._cov.shape != (self._mean.size, self._mean.size):
-            raise InputError(f"a substate with mean {self._mean.shape} needs a square cov of that size, got {self._cov.shape}")
+            raise InputError(
+                f"a substate with mean {self._mean.shape} needs a square cov of that size, got {self._cov.shape}"
+            )
         gaussian.psd_factor(self._cov)
 
     def begin(self, n: int, lineage: Lineage) -> None:
@@ -47,7 +49,9 @@ class KalmanSubstate(Conditional):
     def predict(self, transition: Transition, space: LieGroup) -> Prior:
         """Joint law of (ε, s_t): ε = B s + w₁, s_t = A s + b + w₂, kept as s_t | ε."""
         if transition.coupling is None or transition.dynamics is None or transition.drift is None:
-            raise InputError("the motion model must give coupling, dynamics and drift: the filter has a Kalman substate")
+            raise InputError(
+                "the motion model must give coupling, dynamics and drift: the filter has a Kalman substate"
+            )
         d, m = space.dim, self._mean.size
         sizes = (transition.coupling.shape[1:], transition.dynamics.shape[1:], transition.drift.shape[1:])
         if sizes != ((d, m), (m, m), (m,)):
@@ -56,15 +60,22 @@ class KalmanSubstate(Conditional):
                 f"drift (·, {m}), the motion model gives (·, …) {sizes}"
             )
         noise = transition.noise_factor @ np.swapaxes(transition.noise_factor, -1, -2)
-        stack = np.concatenate([np.broadcast_to(transition.coupling, (self.mean.shape[0], d, self.mean.shape[1])),
-                                np.broadcast_to(transition.dynamics, self.cov.shape)], axis=1)
+        stack = np.concatenate(
+            [
+                np.broadcast_to(transition.coupling, (self.mean.shape[0], d, self.mean.shape[1])),
+                np.broadcast_to(transition.dynamics, self.cov.shape),
+            ],
+            axis=1,
+        )
         joint = gaussian.symmetrise(stack @ self.cov @ np.swapaxes(stack, -1, -2)) + noise
         means = np.einsum("nij,nj->ni", stack, self.mean)
         self._increment_mean = means[:, :d]
         self._predicted = means[:, d:] + transition.drift
         cov_ee, cov_se = joint[:, :d, :d], joint[:, d:, :d]
         self._gain = cov_se @ np.linalg.pinv(cov_ee, hermitian=True) if d else np.zeros(cov_se.shape)
-        closed = np.concatenate([-self._gain, np.broadcast_to(np.eye(self._mean.size), self.cov.shape)], axis=2)
+        closed = np.concatenate(
+            [-self._gain, np.broadcast_to(np.eye(self._mean.size), self.cov.shape)], axis=2
+        )
         self._rest = gaussian.symmetrise(closed @ joint @ np.swapaxes(closed, -1, -2))
         return Prior(space, transition.mean, self._increment_mean, gaussian.psd_factor(cov_ee), centred=False)
 
@@ -82,7 +93,9 @@ class KalmanSubstate(Conditional):
         cov = gaussian.symmetrise(jac_sub @ self._rest @ np.swapaxes(jac_sub, -1, -2)) + noise
         return information(nu[:, None], jac_state[:, None], cov[:, None], GAUSSIAN, prior)
 
-    def correct(self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]) -> LogDensities:
+    def correct(
+        self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]
+    ) -> LogDensities:
         """Conditions on the increment, then on the observations."""
         self.mean, self.cov = self.given(increment), self._rest
         total = np.zeros(state.shape[0])
@@ -135,7 +148,9 @@ class KalmanSubstate(Conditional):
             assert jacobians.substate is not None
             by_state = np.zeros((1, 1, 1, 1)) if jacobians.state is None else jacobians.state
             blocks = ((by_state, self.space.dim), (jacobians.substate, m))
-            jac = np.concatenate([np.broadcast_to(block, (*nu.shape, size)) for block, size in blocks], axis=-1)
+            jac = np.concatenate(
+                [np.broadcast_to(block, (*nu.shape, size)) for block, size in blocks], axis=-1
+            )
             for k in range(group.z.shape[0]):
                 nus.append(np.broadcast_to(nu[:, k], (n, nu.shape[2])).copy())
                 jacs.append(np.broadcast_to(jac[:, k], (n, *jac.shape[2:])).copy())

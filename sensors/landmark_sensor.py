@@ -28,7 +28,9 @@ class NamedLandmarkSensor(Sensor):
         likelihood: of the innovation, None is Gaussian.
     """
 
-    def __init__(self, model: ObservationModel, landmark: Landmark, likelihood: Likelihood | None = None) -> None:
+    def __init__(
+        self, model: ObservationModel, landmark: Landmark, likelihood: Likelihood | None = None
+    ) -> None:
         self.model = model
         self.landmark = landmark
         self.likelihood = likelihood
@@ -50,7 +52,9 @@ class NamedLandmarkSensor(Sensor):
         new = [k for k, name in enumerate(names) if name not in self._ids and name not in names[:k]]
         if not new:
             return []
-        return [Births(frame.z[new], frame.cov_z[new], self.model, self.landmark, facts=[names[k] for k in new])]
+        return [
+            Births(frame.z[new], frame.cov_z[new], self.model, self.landmark, facts=[names[k] for k in new])
+        ]
 
     def _look_up(self, catalogue: dict[int, Any]) -> None:
         """Inverts the catalogue where it has changed; ids only grow, so size and last id tell."""

@@ -114,7 +114,9 @@ def range_bearing_spatial(state, mean, const, z, params, n, nu, jac_state, jac_l
         distance = math.sqrt(distance2)
         nu[0, i] = z[0] - distance
         nu[1, i] = math.atan2(sin_yaw * x - cos_yaw * y, cos_yaw * x + sin_yaw * y)
-        nu[2, i] = math.atan2(sin_pitch * flat - cos_pitch * sign * h, cos_pitch * flat + sin_pitch * sign * h)
+        nu[2, i] = math.atan2(
+            sin_pitch * flat - cos_pitch * sign * h, cos_pitch * flat + sin_pitch * sign * h
+        )
         tilt = sign * h / (flat * distance2)
         _store_spatial(
             0, x / distance, y / distance, h / distance, params, p, rotation, jac_state, jac_landmark, i

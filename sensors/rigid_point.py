@@ -23,11 +23,13 @@ class RigidPointModel(ObservationModel):
 
     def __init__(self, space: SE2Group | SE3Group, robot_from_sensor: np.ndarray | None = None) -> None:
         self.space = space
-        self.robot_from_sensor = space.identity() if robot_from_sensor is None else np.asarray(robot_from_sensor, float)
+        self.robot_from_sensor = (
+            space.identity() if robot_from_sensor is None else np.asarray(robot_from_sensor, float)
+        )
 
     @abstractmethod
     def measure(self, point: np.ndarray) -> np.ndarray:
-        """z (…, p) of points (…, D) in the sensor's frame."""
+        """Z (…, p) of points (…, D) in the sensor's frame."""
 
     @abstractmethod
     def slope(self, point: np.ndarray) -> np.ndarray:
@@ -45,6 +47,7 @@ class RigidPointModel(ObservationModel):
         substate: np.ndarray | None = None,
     ) -> np.ndarray:
         """The chain above."""
+        assert landmark is not None
         in_robot = self.space.inverse_transform(state, landmark)
         return self.measure(self.space.inverse_transform(self.robot_from_sensor, in_robot))
 
@@ -56,6 +59,7 @@ class RigidPointModel(ObservationModel):
         substate: np.ndarray | None = None,
     ) -> Jacobians:
         """∂z/∂ξ = D [−ω × p | −I] and ∂z/∂landmark = D Rᵀ, with D taken to the robot's frame."""
+        assert landmark is not None
         in_robot = self.space.inverse_transform(state, landmark)
         slope = self.slope(self.space.inverse_transform(self.robot_from_sensor, in_robot))
         slope = slope @ np.swapaxes(self.space.rotation(self.robot_from_sensor), -1, -2)

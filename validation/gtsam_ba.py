@@ -66,10 +66,8 @@ def solve(
     problem = Problem(m, robust)
     graph = problem.graph()
     try:
-        if incremental:
-            start = optimiser.incremental(problem)
-        else:
-            start = problem.values(initial or initial_estimate(m))
+        given = None if incremental else problem.values(initial or initial_estimate(m))
+        start = optimiser.incremental(problem) if given is None else given
         values, iterations = optimiser.optimise(problem, graph, start)
         cov_poses, cov_landmarks = np.empty((0, m.space.dim, m.space.dim)), dict[int, Array]()
         if marginals:

@@ -153,6 +153,7 @@ class Problem:
             state, landmark = chart.storage(values, pose_key), chart.point(values, landmark_key)
             if jacobians is not None:
                 by_state, by_landmark, _ = model.jacobians(state, landmark)
+                assert by_state is not None and by_landmark is not None
                 jacobians[0], jacobians[1] = by_state[:, chart.order], by_landmark
             return -model.residual(z, model.predict(state, landmark))
 

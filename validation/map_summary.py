@@ -61,7 +61,9 @@ def summarise_map(filter_: Filter, anchored: Anchored | None = None) -> MapSumma
         covs.append(gaussian.symmetrise(cov))
     dim = landmark_map.layouts[0].landmark.dim
     return MapSummary(
-        np.array(names, dtype=np.int64), np.array(means).reshape(-1, dim), np.array(covs).reshape(-1, dim, dim)
+        np.array(names, dtype=np.int64),
+        np.array(means).reshape(-1, dim),
+        np.array(covs).reshape(-1, dim, dim),
     )
 
 

@@ -10,7 +10,13 @@ from rbpf.validation.map_summary import MapSummary
 from rbpf.validation.scores import as_trajectory, truth_at
 
 SIGMAS = 3.0
-_COLOURS = {"filter": "tab:blue", "truth": "black", "batch": "tab:orange", "odometry": "tab:grey", "map": "tab:red"}
+_COLOURS = {
+    "filter": "tab:blue",
+    "truth": "black",
+    "batch": "tab:orange",
+    "odometry": "tab:grey",
+    "map": "tab:red",
+}
 
 
 def plot_run(run: Run, summary: MapSummary, out: Path, others: dict[str, np.ndarray]) -> list[str]:
@@ -60,7 +66,7 @@ def _truth(run: Run) -> np.ndarray | None:
     if log.truth is None:
         return None
     stamps = np.array([frame.stamp_ns for frame in log.frames])
-    rows, poses = truth_at(log.space, log.truth, stamps)  # type: ignore[arg-type]
+    rows, poses = truth_at(log.space, log.truth, stamps)
     if not rows.size:
         return None
     here = log.space.compose(run.progress.mean[rows[0]], log.space.inverse(poses[0]))
@@ -74,7 +80,14 @@ def _draw_path(run: Run, summary: MapSummary, others: dict[str, np.ndarray]) -> 
         axes.plot(at[:, 0], at[:, 1], color=_COLOURS[name], lw=1, label=name)
     truth = _truth(run)
     if truth is not None:
-        axes.plot(truth[:, 0], truth[:, 1], color=_COLOURS["truth"], lw=1.2, ls="--", label="truth, from the first pose")
+        axes.plot(
+            truth[:, 0],
+            truth[:, 1],
+            color=_COLOURS["truth"],
+            lw=1.2,
+            ls="--",
+            label="truth, from the first pose",
+        )
     at = _positions(run, run.progress.mean)
     axes.plot(at[:, 0], at[:, 1], color=_COLOURS["filter"], lw=1.2, label="filter")
     axes.legend(loc="best", fontsize="small")
@@ -88,12 +101,21 @@ def _draw_map(run: Run, summary: MapSummary, others: dict[str, np.ndarray]) -> A
     truth = {} if run.log.truth is None else run.log.truth.landmarks
     if truth:
         true = np.array(list(truth.values()))
-        axes.plot(true[:, 0], true[:, 1], "+", color=_COLOURS["truth"], ms=7, label="true landmarks, their own frame")
+        axes.plot(
+            true[:, 0],
+            true[:, 1],
+            "+",
+            color=_COLOURS["truth"],
+            ms=7,
+            label="true landmarks, their own frame",
+        )
     axes.plot(summary.mean[:, 0], summary.mean[:, 1], ".", color=_COLOURS["map"], ms=3, label="landmarks")
     circle = np.linspace(0, 2 * np.pi, 40)
     for mean, cov in zip(summary.mean, summary.cov, strict=True):
         values, vectors = np.linalg.eigh(cov[:2, :2])
-        edge = vectors @ (SIGMAS * np.sqrt(np.maximum(values, 0))[:, None] * np.stack([np.cos(circle), np.sin(circle)]))
+        edge = vectors @ (
+            SIGMAS * np.sqrt(np.maximum(values, 0))[:, None] * np.stack([np.cos(circle), np.sin(circle)])
+        )
         axes.plot(mean[0] + edge[0], mean[1] + edge[1], color=_COLOURS["map"], lw=0.8)
     axes.legend(loc="best", fontsize="small")
     return figure

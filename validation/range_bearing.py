@@ -19,6 +19,10 @@ from rbpf.validation.scores import as_trajectory, score
 from rbpf.validation.trajectory_files import write_tum
 
 
+_SHORT = 300
+"""Steps up to which dead reckoning is a good enough start for the batch problem."""
+
+
 def start_run(
     recording: Path,
     config: RangeBearingConfig,
@@ -77,8 +81,7 @@ def _solve_batch(finished: Run) -> tuple[np.ndarray, dict[str, Any]]:
 
     log = finished.log
     measurements = used_measurements(finished)
-    long = len(measurements.stamps_ns) > 2000
-    solution = solve(measurements, marginals=False, incremental=long)
+    solution = solve(measurements, marginals=False, incremental=len(measurements.stamps_ns) > _SHORT)
     anonymous = finished.config.association == "ml"
     entries = reported(score(log, solution.world_from_robot, solution.landmarks, anonymous), "batch_")
     at = as_trajectory(log, measurements.stamps_ns, solution.world_from_robot).positions

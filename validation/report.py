@@ -11,16 +11,20 @@ from rbpf.validation.run_folder import write_text
 
 def write_report(out: Path, entries: dict[str, Any], pictures: list[str]) -> Path:
     """Writes `report.html` into a run's folder and returns its path."""
-    environment = Environment(loader=PackageLoader("rbpf.validation", "templates"), autoescape=select_autoescape())
+    environment = Environment(
+        loader=PackageLoader("rbpf.validation", "templates"), autoescape=select_autoescape()
+    )
     images = [(Path(name).stem, base64.b64encode((out / name).read_bytes()).decode()) for name in pictures]
-    page = environment.get_template("report.html").render(entries=_flat(entries), images=images, title=entries["recording"])
+    page = environment.get_template("report.html").render(
+        entries=_flat(entries), images=images, title=entries["recording"]
+    )
     path = out / "report.html"
     write_text(path, page)
     return path
 
 
 def _flat(entries: dict[str, Any]) -> list[tuple[str, str]]:
-    rows = []
+    rows: list[tuple[str, str]] = []
     for name, value in entries.items():
         if isinstance(value, dict):
             rows.extend((f"{name}.{inner}", _shown(item)) for inner, item in value.items())

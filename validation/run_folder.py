@@ -71,13 +71,24 @@ def write_run(run: Run, out: Path, recording: Path, extra: dict[str, Any] | None
     write_map(out, summary_map)
     write_measurements(out, used_measurements(run))
     write_csv(out / "timings.csv", ["step", "milliseconds"], enumerate(np.round(progress.seconds * 1e3, 4)))
-    columns = (progress.ess, progress.resampled.astype(int), progress.log_evidence, progress.nis, progress.rows)
+    columns = (
+        progress.ess,
+        progress.resampled.astype(int),
+        progress.log_evidence,
+        progress.nis,
+        progress.rows,
+    )
     write_csv(
         out / "diagnostics.csv",
         ["step", "stamp_ns", "ess", "resampled", "log_evidence", "nis", "nis_dof"],
         zip(range(stamps.size), stamps, *(column.tolist() for column in columns), strict=True),
     )
-    config = {"rbpf": __version__, "system": "range-bearing", "recording": str(recording), **asdict(run.config)}
+    config = {
+        "rbpf": __version__,
+        "system": "range-bearing",
+        "recording": str(recording),
+        **asdict(run.config),
+    }
     write_text(out / "config.yaml", yaml.safe_dump(config, sort_keys=False))
     entries = summarise(run, summary_map) | (extra or {})
     write_text(out / "summary.json", json.dumps(entries, indent=2, allow_nan=False) + "\n")
@@ -91,7 +102,10 @@ def write_map(out: Path, summary: MapSummary) -> None:
     axes = "xyz"[:dim]
     cov_names = [f"c{axes[a]}{axes[b]}" for a in range(dim) for b in range(a + 1)]
     packed = gaussian.pack(summary.cov)
-    rows = ([name, *mean, *cov] for name, mean, cov in zip(summary.ids, summary.mean.tolist(), packed.tolist(), strict=True))
+    rows = (
+        [name, *mean, *cov]
+        for name, mean, cov in zip(summary.ids, summary.mean.tolist(), packed.tolist(), strict=True)
+    )
     write_csv(out / "map.csv", ["id", *(f"{axis}_m" for axis in axes), *cov_names], rows)
 
 
@@ -109,7 +123,7 @@ def used_measurements(run: Run) -> Measurements:
     d, moves = log.space.dim, log.frames[1:]
     return Measurements(
         recording=log.name,
-        space=log.space,  # type: ignore[arg-type]
+        space=log.space,
         measurement=log.measurement,  # type: ignore[arg-type]
         pitch_sign=log.pitch_sign,
         robot_from_sensor=log.robot_from_sensor,
@@ -172,5 +186,3 @@ def _ratio(nis: np.ndarray, rows: np.ndarray) -> float | None:
 def _map_share(run: Run) -> float:
     store = run.filter.belief().map.store
     return round(store.stored_bytes / max(store.dense_bytes, 1), 4)
-
-

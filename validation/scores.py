@@ -45,7 +45,9 @@ def as_trajectory(log: RobotLog, stamps_ns: np.ndarray, world_from_robot: np.nda
     return Trajectory(stamps_ns, world_from_robot)
 
 
-def truth_at(space: SE2Group | SE3Group, truth: Truth, stamps_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def truth_at(
+    space: SE2Group | SE3Group, truth: Truth, stamps_ns: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Rows of `stamps_ns` that lie inside the truth, and the interpolated true poses there.
 
     Stamps that count steps are met exactly; between poses the geodesic is followed.
@@ -59,7 +61,9 @@ def truth_at(space: SE2Group | SE3Group, truth: Truth, stamps_ns: np.ndarray) ->
     inside = (truth.stamps_ns[before] <= stamps_ns) & (stamps_ns <= truth.stamps_ns[after])
     rows = np.flatnonzero(met | (inside & (gap <= LONGEST_GAP_NS)))
     share = (stamps_ns[rows] - truth.stamps_ns[before[rows]]) / np.maximum(gap[rows], 1)
-    poses = space.interpolate(truth.world_from_robot[before[rows]], truth.world_from_robot[after[rows]], share)
+    poses = space.interpolate(
+        truth.world_from_robot[before[rows]], truth.world_from_robot[after[rows]], share
+    )
     return rows, poses
 
 

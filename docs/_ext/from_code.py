@@ -1,12 +1,12 @@
 """Directives whose content is taken from the program when the documentation is built, so that it stays true.
 
-    ```{settings}                        every setting of a range-bearing run
-    ```{command-help} run range-bearing  what `rbpf run range-bearing --help` prints
-    ```{modules} rbpf.maps               the modules of a package, each under a heading
+```{settings}                        every setting of a range-bearing run
+```{command-help} run range-bearing  what `rbpf run range-bearing --help` prints
+```{modules} rbpf.maps               the modules of a package, each under a heading
 """
 
 import os
-from contextlib import redirect_stdout
+from contextlib import redirect_stdout, suppress
 from dataclasses import fields, is_dataclass
 from importlib import import_module
 from inspect import cleandoc, getdoc
@@ -47,11 +47,8 @@ class CommandHelp(SphinxDirective):
         os.environ.update(COLUMNS=WIDTH, NO_COLOR="1")
         command = self.arguments[0].split() if self.arguments else []
         text = StringIO()
-        with redirect_stdout(text):
-            try:
-                main([*command, "--help"])
-            except SystemExit:
-                pass
+        with redirect_stdout(text), suppress(SystemExit):
+            main([*command, "--help"])
         return [nodes.literal_block(text=text.getvalue(), language="text")]
 
 
@@ -74,13 +71,17 @@ class Modules(SphinxDirective):
 
 def _groups(name: str, config: Any) -> list[tuple[str, Any]]:
     inner = [(item.name, getattr(config, item.name)) for item in fields(config)]
-    nested = [group for key, value in inner if is_dataclass(value) for group in _groups(f"{name}{key}.", value)]
+    nested = [
+        group for key, value in inner if is_dataclass(value) for group in _groups(f"{name}{key}.", value)
+    ]
     return [(name, config), *nested]
 
 
 def _table(name: str, config: Any) -> list[nodes.Node]:
     meanings = _attributes(type(config))
-    rows = [(f"{name}{item.name}", getattr(config, item.name), meanings[item.name]) for item in fields(config)]
+    rows = [
+        (f"{name}{item.name}", getattr(config, item.name), meanings[item.name]) for item in fields(config)
+    ]
     table = nodes.table(classes=["settings"])
     group = nodes.tgroup(cols=3)
     table += group

@@ -1,7 +1,7 @@
-"""Docstrings are plain text with `code`, lists and Google sections: formulas such as |S| or v* need no escapes there.
+"""Docstrings are plain text with `code`, lists and Google sections: |S| or v* need no escapes there.
 
-Before Napoleon reads a docstring, characters that mean something to reStructuredText alone are escaped outside of
-`code`, and paragraphs that are indented or aligned in columns become literal blocks.
+Before Napoleon reads a docstring, characters that mean something to reStructuredText alone are escaped
+outside of `code`, and paragraphs that are indented or aligned in columns become literal blocks.
 """
 
 import re
@@ -49,7 +49,7 @@ def _escaped(line: str) -> str:
 
 
 class _Hooks:
-    """Before Napoleon, and after it: it takes what precedes a colon in the text of an attribute for its type."""
+    """Before Napoleon and after it, as it takes what precedes a colon in the text of an attribute for a type."""
 
     def __init__(self) -> None:
         self._texts: dict[str, list[str]] = {}

@@ -31,7 +31,7 @@ def load_record(pool, slab, rows, start, count, mean, cov, const):
 
 @njit(cache=True, error_model="numpy")
 def innovation_covariance(jac, cov, noise, count, cross, total):
-    """cross = J P and the lower triangle of total = J P Jᵀ + R."""
+    """Cross = J P and the lower triangle of total = J P Jᵀ + R."""
     p, dim = jac.shape[0], jac.shape[1]
     for a in range(p):
         for c in range(dim):
@@ -96,7 +96,7 @@ def whiten_matrix(factor, count, matrix):
 
 @njit(cache=True, error_model="numpy")
 def add_squares(vector, count, total):
-    """total += vectorᵀ vector."""
+    """Total += vectorᵀ vector."""
     for a in range(vector.shape[0]):
         for i in range(count):
             total[i] += vector[a, i] * vector[a, i]
@@ -104,14 +104,16 @@ def add_squares(vector, count, total):
 
 @njit(cache=True, error_model="numpy")
 def add_gram(matrix, sign, count, total):
-    """total += sign · matrixᵀ matrix, packed; two and three rows, the usual sizes, in one pass."""
+    """Total += sign · matrixᵀ matrix, packed; two and three rows, the usual sizes, in one pass."""
     p = matrix.shape[0]
     for e in range(matrix.shape[1]):
         for f in range(e + 1):
             m = packed(e, f)
             if p == 2:
                 for i in range(count):
-                    total[m, i] += sign * (matrix[0, e, i] * matrix[0, f, i] + matrix[1, e, i] * matrix[1, f, i])
+                    total[m, i] += sign * (
+                        matrix[0, e, i] * matrix[0, f, i] + matrix[1, e, i] * matrix[1, f, i]
+                    )
             elif p == 3:
                 for i in range(count):
                     total[m, i] += sign * (
@@ -127,7 +129,7 @@ def add_gram(matrix, sign, count, total):
 
 @njit(cache=True, error_model="numpy")
 def add_transposed_product(matrix, vector, count, total):
-    """total += matrixᵀ vector."""
+    """Total += matrixᵀ vector."""
     for e in range(matrix.shape[1]):
         for a in range(matrix.shape[0]):
             for i in range(count):

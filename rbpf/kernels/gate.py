@@ -62,7 +62,7 @@ def outlier_log_density(form, params):
 
 @njit(cache=True, error_model="numpy")
 def gaussian_log_density(squared, scale, p):
-    """log N from the squared Mahalanobis distance and the product of inverted Cholesky pivots."""
+    """Log N from the squared Mahalanobis distance and the product of inverted Cholesky pivots."""
     return -0.5 * squared + math.log(scale) - 0.5 * p * math.log(2.0 * math.pi)
 
 

@@ -10,7 +10,7 @@ from rbpf.kernels.signature import BLOCK, CUBE, MATRIX, VECTOR
 
 @njit(cache=True, error_model="numpy")
 def _whitened_information(info, vector, factor, matrix, linear):
-    """matrix = I + LᵀΛL and linear = Lᵀη for one particle."""
+    """Matrix = I + LᵀΛL and linear = Lᵀη for one particle."""
     dim, rank = factor.shape
     for a in range(rank):
         linear[a] = 0.0
@@ -45,7 +45,7 @@ def _cholesky_in_place(matrix):
 
 @njit(cache=True, error_model="numpy")
 def _inverse_transposed(factor, root):
-    """root = L⁻ᵀ, upper triangular."""
+    """Root = L⁻ᵀ, upper triangular."""
     rank = factor.shape[0]
     for a in range(rank):
         for b in range(rank):
@@ -97,6 +97,8 @@ def posterior(info, vector, quad, log_det, factor, mean, root, log_w1, nis):
         matrix = np.empty((rank, rank))
         linear = np.empty(rank)
         for i in range(block * BLOCK, min((block + 1) * BLOCK, n_particles)):
-            gain, log_m = _refine_one(info[i], vector[i], factor[i * stride], matrix, linear, mean[i], root[i])
+            gain, log_m = _refine_one(
+                info[i], vector[i], factor[i * stride], matrix, linear, mean[i], root[i]
+            )
             nis[i] = quad[i] - gain
             log_w1[i] = -0.5 * (nis[i] + log_det[i] + log_m)

@@ -3,7 +3,7 @@
 import math
 
 import numpy as np
-from numba import float64, int64, njit, prange, void
+from numba import int64, njit, prange, void
 
 from rbpf.kernels.block import (
     add_gram,
@@ -119,7 +119,9 @@ def refine(
             if partial:
                 for i in range(count):
                     weight[i] = 1.0 if mask.shape[0] == 0 or mask[k, start + i] else 0.0
-                accept_predicted(form, form_params, nu, jac_state, total, factor, start, count, weight, penalty)
+                accept_predicted(
+                    form, form_params, nu, jac_state, total, factor, start, count, weight, penalty
+                )
                 leave_out(weight, count, nu, jac_state, total)
             cholesky(total, count, scale)
             whiten_vector(total, count, nu)

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from rbpf.lie import LieGroup
+from rbpf.lie import SE2Group, SE3Group
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class RobotLog:
     """
 
     name: str
-    space: LieGroup
+    space: SE2Group | SE3Group
     measurement: str
     robot_from_sensor: np.ndarray
     frames: list[Frame]

@@ -97,7 +97,7 @@ def _normal(x: np.ndarray, variance: float) -> np.ndarray:
 
 WORLDS = {
     "square": Scalar(lambda x: 0.8 * x + 1.5 * np.sin(x) + 0.3, 0.8, lambda x: x * x / 5.0, 0.5, 1.0),
-    "arctan": Scalar(lambda x: 0.9 * x + 0.3 * np.cos(x), 1.0, np.arctan, 0.15, 0.5),
+    "arctan": Scalar(lambda x: 0.9 * x + 0.3 * np.cos(x), 0.8, lambda x: 2.0 * np.arctan(x), 1.5, 0.5),
 }
 every_world = pytest.mark.parametrize("world", WORLDS.values(), ids=WORLDS)
 

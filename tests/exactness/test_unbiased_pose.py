@@ -174,7 +174,7 @@ def run_fixes(fixes, proposal, stream) -> np.ndarray:
 
     def run(seed: int) -> float:
         rng = np.random.default_rng([stream, seed])
-        filter_ = Filter(OdometryMotion(SE2), Scripted(), (), proposal, Systematic(), 80, rng, START)
+        filter_ = Filter(OdometryMotion(SE2), Scripted(), (), proposal, Systematic(), 40, rng, START)
         for z, delta in zip(zs, deltas, strict=True):
             filter_.step(Frame([single(z, R, Antenna())]), Odometry(delta, COV))
         return filter_.log_evidence - float(np.log(np.exp(exact).mean()))

@@ -124,7 +124,9 @@ def test_a_new_sensor_takes_few_lines():
 
 
 def test_the_readme_s_program_runs(tmp_path, monkeypatch, capsys):
-    (program,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+    (program,) = re.findall(
+        r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL
+    )
     simulate_robot(RobotWorld(steps=20, landmarks=20), tmp_path / "demo" / "log", seed=0)
     monkeypatch.chdir(tmp_path)
     exec(compile(program, "README.md", "exec"), {})

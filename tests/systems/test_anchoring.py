@@ -43,7 +43,9 @@ def drive(steps, n=50, seed=0, every=1):
     for t in range(steps):
         control = None
         if t:
-            pose = SE2.retract(SE2.compose(pose, CONTROL.delta), np.sqrt(np.diag(CONTROL.cov)) * rng.standard_normal(3))
+            pose = SE2.retract(
+                SE2.compose(pose, CONTROL.delta), np.sqrt(np.diag(CONTROL.cov)) * rng.standard_normal(3)
+            )
             control = CONTROL
         report = filter_.step(frame(rng, pose, t * 10**9), control, t * 10**9)
         anchored = anchor.after_step(report, control)
@@ -135,5 +137,3 @@ def test_zero_period_is_refused():
     filter_, _ = started(2, 0)
     with pytest.raises(InputError, match="every 1, 2"):
         StartAnchor(filter_, 0)
-
-

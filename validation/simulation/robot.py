@@ -48,7 +48,9 @@ class RobotWorld:
     def __post_init__(self) -> None:
         """Checks that there is something to simulate."""
         if self.steps < 2 or self.landmarks < 1:
-            raise InputError(f"a simulation needs at least 2 steps and 1 landmark, got {self.steps}, {self.landmarks}")
+            raise InputError(
+                f"a simulation needs at least 2 steps and 1 landmark, got {self.steps}, {self.landmarks}"
+            )
         for name in ("radius_m", "extent_m", "max_range_m", "std_range_m", "std_angle_deg"):
             if not getattr(self, name) > 0:
                 raise InputError(f"{name} must be positive, got {getattr(self, name)}")
@@ -81,7 +83,9 @@ def _path(world: RobotWorld) -> np.ndarray:
     """(T, 7) true poses, starting at the origin; all lie in the plane z = 0 unless spatial."""
     phase = 2 * np.pi * world.laps * np.arange(world.steps) / (world.steps - 1)
     wave = np.sin(3 * phase) if world.spatial else np.zeros_like(phase)
-    position = np.stack([world.radius_m * np.sin(phase), world.radius_m * (1 - np.cos(phase)), 0.5 * wave], axis=-1)
+    position = np.stack(
+        [world.radius_m * np.sin(phase), world.radius_m * (1 - np.cos(phase)), 0.5 * wave], axis=-1
+    )
     return SE3.from_ypr(position, phase, 0.1 * wave, 0.2 * wave)
 
 
@@ -98,7 +102,9 @@ def _write_truth(folder: Path, truth: np.ndarray, points: np.ndarray) -> None:
     header = ["step", "x_m", "y_m", "z_m", "yaw_rad", "pitch_rad", "roll_rad"]
     write_csv(folder / "robot_path_groundtruth.csv", header, ([t, *row] for t, row in enumerate(rows)))
     header = ["id", "x_m", "y_m", "z_m"]
-    write_csv(folder / "landmarks_groundtruth.csv", header, ([i, *p] for i, p in enumerate(points.tolist(), 1)))
+    write_csv(
+        folder / "landmarks_groundtruth.csv", header, ([i, *p] for i, p in enumerate(points.tolist(), 1))
+    )
 
 
 def _write_odometry(world: RobotWorld, folder: Path, truth: np.ndarray, rng: np.random.Generator) -> None:
@@ -127,13 +133,31 @@ def _write_observations(
     turn = np.deg2rad(world.std_angle_deg)
     std = np.array([world.std_range_m, turn, turn if world.spatial else 0.0])
     view = np.deg2rad(world.half_field_of_view_deg)
-    rows = []
+    rows: list[list[float]] = []
     for t, pose in enumerate(truth):
         x, y, h = SE3.inverse_transform(pose, points).T
-        z = np.stack([np.sqrt(x * x + y * y + h * h), np.arctan2(y, x), np.arctan2(h, np.hypot(x, y))], axis=-1)
-        seen = (z[:, 0] <= world.max_range_m) & (np.abs(z[:, 1]) <= view) & (np.abs(z[:, 2]) <= view) & (z[:, 0] > 0.2)
+        z = np.stack(
+            [np.sqrt(x * x + y * y + h * h), np.arctan2(y, x), np.arctan2(h, np.hypot(x, y))], axis=-1
+        )
+        seen = (
+            (z[:, 0] <= world.max_range_m)
+            & (np.abs(z[:, 1]) <= view)
+            & (np.abs(z[:, 2]) <= view)
+            & (z[:, 0] > 0.2)
+        )
         noisy = z[seen] + std * rng.standard_normal((int(seen.sum()), 3))
-        rows.extend([t, i + 1, *row, *std] for i, row in zip(np.flatnonzero(seen).tolist(), noisy.tolist(), strict=True))
-    header = ["step", "landmark_id", "range_m", "yaw_rad", "pitch_rad", "std_range_m", "std_yaw_rad", "std_pitch_rad"]
+        rows.extend(
+            [t, i + 1, *row, *std]
+            for i, row in zip(np.flatnonzero(seen).tolist(), noisy.tolist(), strict=True)
+        )
+    header = [
+        "step",
+        "landmark_id",
+        "range_m",
+        "yaw_rad",
+        "pitch_rad",
+        "std_range_m",
+        "std_yaw_rad",
+        "std_pitch_rad",
+    ]
     write_csv(folder / "observations.csv", header, rows)
-

@@ -68,7 +68,11 @@ class Progress:
     def put(self, t: int, report: StepReport, estimate: Estimate, seconds: float) -> None:
         """Row t."""
         self.mean[t], self.cov[t] = estimate.mean, estimate.cov
-        self.ess[t], self.resampled[t], self.log_evidence[t] = report.ess, report.resampled, report.log_evidence
+        self.ess[t], self.resampled[t], self.log_evidence[t] = (
+            report.ess,
+            report.resampled,
+            report.log_evidence,
+        )
         self.nis[t], self.rows[t], self.seconds[t] = report.nis, report.rows, seconds
 
 

@@ -57,7 +57,7 @@ def _put(values: dict[str, Any], pair: str) -> None:
         raise InputError(f"--set takes key=value, got {pair!r}")
     *outer, last = key.split(".")
     for name in outer:
-        inner = values.setdefault(name, {})
+        inner: Any = values.setdefault(name, {})
         if not isinstance(inner, dict):
             raise InputError(f"--set {pair}: {name} is no group of settings")
         values = inner
