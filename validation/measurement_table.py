@@ -43,7 +43,7 @@ class HeadedTable:
         lines = read_lines(path, hint)
         if lines[0] != f"# {title}":
             raise line_error(path, 1, f"expected '# {title}', found {quoted(lines[0])}")
-        header: dict[str, str] = {}
+        header: dict[str, tuple[int, str]] = {}
         for number, line in enumerate(lines[1:], 2):
             if not line.startswith("#"):
                 return cls(path, header, line, number, lines[number:])

@@ -18,7 +18,6 @@ from rbpf.validation.run_folder import reported, used_measurements, write_run
 from rbpf.validation.scores import as_trajectory, score
 from rbpf.validation.trajectory_files import write_tum
 
-
 _SHORT = 300
 """Steps up to which dead reckoning is a good enough start for the batch problem."""
 

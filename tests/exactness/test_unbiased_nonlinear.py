@@ -127,6 +127,6 @@ def test_the_linearised_weight_is_biased(world, iterations, stream):
 @pytest.mark.parametrize("proposal", PROPOSALS[:2], ids=["prior", "ekf"])
 def test_evidence_with_outliers_is_unbiased(proposal, stream):
     """The gate decides who moves the proposal, the density of both decides the weight."""
-    world = Scalar(lambda x: 0.9 * x, 0.6, lambda x: x, 0.3, 0.5, GaussianWithOutliers(0.1, 20.0))
-    zs = world.measurements(4, outlier=4.0)
+    world = Scalar(lambda x: 0.9 * x, 0.6, lambda x: x, 0.6, 0.5, GaussianWithOutliers(0.1, 20.0))
+    zs = world.measurements(4, outlier=5.0)
     assert_unbiased(world.log_ratios(zs, proposal, stream, 500))

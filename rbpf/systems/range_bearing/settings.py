@@ -56,12 +56,12 @@ def _put(values: dict[str, Any], pair: str) -> None:
     if not equals or not key:
         raise InputError(f"--set takes key=value, got {pair!r}")
     *outer, last = key.split(".")
+    group: Any = values
     for name in outer:
-        inner: Any = values.setdefault(name, {})
-        if not isinstance(inner, dict):
+        group = group.setdefault(name, {})
+        if not isinstance(group, dict):
             raise InputError(f"--set {pair}: {name} is no group of settings")
-        values = inner
-    values[last] = None if text in ("", "null", "none") else text
+    group[last] = None if text in ("", "null", "none") else text
 
 
 def _refuse_unknown(values: Mapping[str, Any], kind: Any, prefix: str) -> None:
