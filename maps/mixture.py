@@ -4,6 +4,7 @@ from typing import final
 
 import numpy as np
 
+from rbpf import gaussian
 from rbpf.models import Landmark, Records
 
 
@@ -14,22 +15,32 @@ class MixturePoint(Landmark):
     Args:
         components: C, at least 2.
         dim: 2 or 3.
-        dominant: it is ready to become a single Gaussian when one component has this weight.
+        dominant: it is ready to become a single Gaussian when the components within reach of the heaviest one have
+            this weight together.
+        reach: distance from the heaviest component, in its standard deviations, within which another one says the same.
     """
 
-    def __init__(self, components: int, dim: int = 2, dominant: float = 0.99) -> None:
+    def __init__(self, components: int, dim: int = 2, dominant: float = 0.99, reach: float = 3.0) -> None:
         self.components = components
         self.dim = dim
         self.dominant = dominant
+        self.reach = reach
 
     def homogeneous(self, mean: np.ndarray, const: np.ndarray | None = None) -> np.ndarray:
         """(…, D) → (…, D+1)."""
         return np.concatenate([mean, np.ones((*mean.shape[:-1], 1))], axis=-1)
 
     def ready(self, records: Records) -> np.ndarray:
-        """Whether one component dominates, (N, K)."""
+        """Whether one component dominates, with those that have come to the same place, (N, K)."""
         assert records.log_weights is not None
-        return records.log_weights.max(axis=-1) >= np.log(self.dominant)
+        heaviest = records.log_weights.argmax(axis=-1)[..., None, None]
+        mean = np.take_along_axis(records.mean, heaviest, axis=2)
+        cov = np.take_along_axis(records.cov, heaviest[..., None], axis=2)
+        offset = gaussian.solve_lower(
+            gaussian.cholesky(np.broadcast_to(cov, records.cov.shape)), records.mean - mean
+        )
+        near = np.square(offset).sum(axis=-1) <= self.reach**2
+        return (np.exp(records.log_weights) * near).sum(axis=-1) >= self.dominant
 
 
 def ring(centre: np.ndarray, radius: np.ndarray, std_radius: float, components: int) -> Records:

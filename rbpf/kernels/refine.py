@@ -77,7 +77,7 @@ def refine(
     quad,
     log_det,
 ):
-    """Adds Σ HᵀS⁻¹H, Σ HᵀS⁻¹ν, Σ νᵀS⁻¹ν and Σ log|2πS| over the observations, S = J P Jᵀ + R (DESIGN §4).
+    """Adds Σ HᵀS⁻¹H, Σ HᵀS⁻¹ν, Σ νᵀS⁻¹ν and Σ log|2πS| over the observations, S = J P Jᵀ + R; see docs/mathematics.md.
 
     `state` (N, E) holds the linearisation points; observation k reads slab `slabs[k]` of `pool` (slabs, fields, N)
     at the rows `maps[which[k]]`; `mask` (K, N) or (0, 0) says which particles saw it; `form` and `form_params`

@@ -13,7 +13,7 @@ from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.mixture import MixturePoint, ring
 from rbpf.maps.point import Point
 from rbpf.models import ObservationModel, Observations, Records
-from rbpf.proposals import EkfProposal, PriorProposal
+from rbpf.proposals import EkfProposal
 from rbpf.resampling import EssTriggered, Systematic
 from tests.exactness.models import (
     SEEDS,
@@ -109,12 +109,8 @@ def test_on_a_known_path_the_components_are_enumerated_exactly(frames):
 
 @pytest.mark.parametrize(
     ("proposal", "resampler"),
-    [
-        (PriorProposal(), Systematic()),
-        (EkfProposal(), EssTriggered(Systematic(), 0.8)),
-        (EkfProposal(exact=False), Systematic()),
-    ],
-    ids=["prior", "ekf", "linearised"],
+    [(EkfProposal(), EssTriggered(Systematic(), 0.8)), (EkfProposal(exact=False), Systematic())],
+    ids=["ekf", "linearised"],
 )
 def test_evidence_and_component_weights_are_unbiased(frames, proposal, resampler, stream):
     """In a linear model E06's weight w₂ := p(late observations | x) is exact as well."""

@@ -118,11 +118,13 @@ def exact() -> float:
 def runs(exact) -> dict[str, np.ndarray]:
     """Log-evidence over the exact one; the last also refines its proposal."""
     return {
-        "sampled": log_ratios(lambda rng: sampled(PriorProposal(), rng), frames(Part.STATE), exact, 1),
+        "sampled": log_ratios(lambda rng: sampled(PriorProposal(), rng), frames(Part.STATE), exact, 1, 300),
         "marginalised": log_ratios(
             lambda rng: marginalised(PriorProposal(), rng), frames(Part.SUBSTATE), exact, 2
         ),
-        "refined": log_ratios(lambda rng: marginalised(EkfProposal(), rng), frames(Part.SUBSTATE), exact, 3),
+        "refined": log_ratios(
+            lambda rng: marginalised(EkfProposal(), rng), frames(Part.SUBSTATE), exact, 3, 300
+        ),
     }
 
 

@@ -182,6 +182,6 @@ def run_fixes(fixes, proposal, stream) -> np.ndarray:
     return np.array([run(seed) for seed in range(SEEDS)])
 
 
-@every_proposal
+@pytest.mark.parametrize("proposal", [EkfProposal(), EkfProposal(iterations=3)], ids=["ekf", "iterated"])
 def test_position_fixes_against_a_large_bootstrap_filter(fixes, proposal, stream):
     assert_unbiased(run_fixes(fixes, proposal, stream))
