@@ -95,6 +95,7 @@ class LandmarkMap(Conditional):
     def read(self, ids: np.ndarray) -> Records:
         """Estimates (N, K, …) of landmarks that share one parametrisation."""
         self._known(ids)
+        ids = np.asarray(ids)
         if ids.size == 0:
             raise InputError("no landmark was named")
         kinds = np.unique(self.kinds[ids])
@@ -195,10 +196,9 @@ class LandmarkMap(Conditional):
         self._kind(landmark)
 
     def _kind(self, landmark: Landmark) -> int:
-        key = (type(landmark), landmark.dim, landmark.constants, landmark.components)
         for number, layout in enumerate(self.layouts):
             held = layout.landmark
-            if (type(held), held.dim, held.constants, held.components) == key:
+            if type(held) is type(landmark) and vars(held) == vars(landmark):
                 return number
         self.layouts.append(Layout(landmark, self.evidence))
         return len(self.layouts) - 1
@@ -210,8 +210,8 @@ class LandmarkMap(Conditional):
     def _layout_of(self, landmark_id: int) -> Layout:
         return self.layouts[self.kinds[landmark_id]]
 
-    def _known(self, ids: np.ndarray) -> None:
-        for landmark_id in ids:
+    def _known(self, ids: np.ndarray | Sequence[int]) -> None:
+        for landmark_id in np.asarray(ids).tolist():
             if landmark_id not in self.store:
                 raise InputError(f"the map holds no landmark {landmark_id}")
 

@@ -16,6 +16,8 @@ from rbpf.models import Jacobians, ObservationModel
 class RigidPointModel(ObservationModel):
     """A sensor mounted on a robot that measures points; a subclass says what is measured in the sensor's frame.
 
+    A landmark's mean is taken as a world point and its constants are not read: anchored ones need a model of their own.
+
     Args:
         space: SE2 or SE3, of world_from_robot.
         robot_from_sensor: (E,) mounting pose; by default the robot's origin.

@@ -86,7 +86,7 @@ def _refine_one(info, vector, factor, matrix, linear, mean, root):
     error_model="numpy",
 )
 def posterior(info, vector, quad, log_det, factor, mean, root, log_w1, nis):
-    """Whitened refined Gaussian: u ~ N(M⁻¹Lᵀη, M⁻¹), M = I + LᵀΛL, and the joint marginal log w₁; see docs/mathematics.md.
+    """Whitened refined Gaussian: u ~ N(M⁻¹Lᵀη, M⁻¹), M = I + LᵀΛL, and the joint marginal log w₁.
 
     Fills `mean` (N, r), `root` (N, r, r) with root rootᵀ = M⁻¹ (the transposed inverse Cholesky factor of M, upper
     triangular), `log_w1` (N,) and `nis` (N,), the innovation's squared Mahalanobis distance.

@@ -16,6 +16,8 @@ from rbpf.substate import KalmanSubstate
 from tests.exactness.models import Frame, Kalman, LinearMotion, Relative, Scripted, assert_unbiased, deviation
 from tests.exactness.slam import LinearSlam, moments, unnormalised_errors
 
+pytestmark = pytest.mark.slow
+
 STEP = np.array([0.8, 0.3])
 Q = np.array([[0.2, 0.05], [0.05, 0.1]])
 

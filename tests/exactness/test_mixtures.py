@@ -27,6 +27,8 @@ from tests.exactness.models import (
     known,
 )
 
+pytestmark = pytest.mark.slow
+
 PLANE = Euclidean(2)
 R = np.array([[0.3, 0.05], [0.05, 0.25]])
 Q = np.array([[0.2, 0.05], [0.05, 0.1]])

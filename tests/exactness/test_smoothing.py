@@ -24,6 +24,8 @@ from tests.exactness.models import (
     smooth,
 )
 
+pytestmark = pytest.mark.slow
+
 STEPS = 7
 F = np.array([[1.0, 0.7], [0.0, 0.9]])
 L = np.array([[0.35, 0.0], [0.15, 0.3]])

@@ -11,6 +11,8 @@ from rbpf.resampling import Systematic
 from rbpf.substate import KalmanSubstate
 from tests.exactness.models import Frame, Scripted, assert_unbiased, deviation, log_ratios, single
 
+pytestmark = pytest.mark.slow
+
 PARTICLES = 100
 STEPS = 4
 TURN, JITTER = 0.25, 0.15

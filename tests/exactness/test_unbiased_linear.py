@@ -24,6 +24,8 @@ from tests.exactness.models import (
     single,
 )
 
+pytestmark = pytest.mark.slow
+
 PROPOSALS = {"prior": PriorProposal(), "ekf": EkfProposal(), "iterated": EkfProposal(iterations=3)}
 RESAMPLERS = {
     "systematic": Systematic(),

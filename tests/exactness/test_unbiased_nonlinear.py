@@ -14,6 +14,8 @@ from rbpf.proposals import EkfProposal, PriorProposal
 from rbpf.resampling import EssTriggered, Systematic
 from tests.exactness.models import Frame, Scripted, assert_unbiased, deviation, log_ratios, single
 
+pytestmark = pytest.mark.slow
+
 Function = Callable[[np.ndarray], np.ndarray]
 PROPOSALS = [PriorProposal(), EkfProposal(), EkfProposal(iterations=3)]
 every_proposal = pytest.mark.parametrize("proposal", PROPOSALS, ids=["prior", "ekf", "iterated"])

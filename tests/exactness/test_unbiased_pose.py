@@ -12,6 +12,8 @@ from rbpf.resampling import Systematic
 from rbpf.substate import KalmanSubstate
 from tests.exactness.models import SEEDS, Frame, Scripted, assert_unbiased, single
 
+pytestmark = pytest.mark.slow
+
 R = np.array([[0.3, 0.1], [0.1, 0.2]])
 COV = np.array([[0.25, 0.08, 0.05], [0.08, 0.3, 0.0], [0.05, 0.0, 0.1]])
 PROPOSALS = {"prior": PriorProposal(), "ekf": EkfProposal(), "iterated": EkfProposal(iterations=3)}

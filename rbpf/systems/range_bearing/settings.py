@@ -69,6 +69,6 @@ def _refuse_unknown(values: Mapping[str, Any], kind: Any, prefix: str) -> None:
     for name, value in values.items():
         if name not in known:
             raise InputError(f"there is no setting {prefix}{name}; known here: {', '.join(sorted(known))}")
-        inner = known[name].default_factory
+        inner: Any = known[name].default_factory
         if isinstance(value, dict) and is_dataclass(inner):
             _refuse_unknown(value, inner, f"{prefix}{name}.")

@@ -1,0 +1,8 @@
+"""Compiles all kernels into the cache: `python -m rbpf.kernels`, once after installation."""
+
+from importlib import import_module
+
+from rbpf.kernels import compile_once
+
+compile_once(lambda: print("compiling the kernels, which takes a minute and is done once …"))
+import_module("rbpf.sensors.range_bearing_kernels")
