@@ -20,6 +20,7 @@ from rbpf.kernels.gate import accept_predicted, leave_out
 from rbpf.kernels.signature import (
     BLOCK,
     CUBE,
+    FACTORS_PER_LOG,
     INDEX_MATRIX,
     INDICES,
     KERNEL_TYPE,
@@ -27,9 +28,6 @@ from rbpf.kernels.signature import (
     MATRIX,
     VECTOR,
 )
-
-FACTORS_PER_LOG = 18
-"""Pivots multiplied before one logarithm is taken: 18 factors within 1e±16 stay inside the range of a double."""
 
 
 @njit(

@@ -8,6 +8,9 @@ from numba import cfunc, float64, int64, types, void
 BLOCK = 32
 """Particles per block: wide enough to fill vector registers, small enough for the scratch to stay in the L1 cache."""
 
+FACTORS_PER_LOG = 18
+"""Pivots multiplied before one logarithm is taken: 18 factors within 1e±16 stay inside the range of a double."""
+
 VECTOR = types.Array(float64, 1, "C")
 MATRIX = types.Array(float64, 2, "C")
 CUBE = types.Array(float64, 3, "C")

@@ -1,5 +1,7 @@
 """Driver: likelihood of the observations at the sampled states, and the landmarks' Kalman updates."""
 
+import math
+
 import numpy as np
 from numba import int64, njit, prange, void
 
@@ -17,6 +19,7 @@ from rbpf.kernels.gate import is_inlier, leave_out, log_likelihood
 from rbpf.kernels.signature import (
     BLOCK,
     CUBE,
+    FACTORS_PER_LOG,
     INDEX_MATRIX,
     INDICES,
     KERNEL_TYPE,
@@ -104,8 +107,10 @@ def update(
         cross = np.empty((p, dim_map, BLOCK))
         total = np.empty((p, p, BLOCK))
         weight = np.ones(BLOCK)
-        scale = np.empty(BLOCK)
-        squared = np.empty(BLOCK)
+        scale = np.ones(BLOCK)
+        squared = np.zeros(BLOCK)
+        used = np.zeros(BLOCK)
+        pivots = 0
         sum_log = np.zeros(BLOCK)
         for e in range(size):
             for i in range(count):
@@ -119,17 +124,27 @@ def update(
                 for i in range(count):
                     weight[i] = 1.0 if mask[k, start + i] else 0.0
                 leave_out(weight, count, nu, cross, total)
-            for i in range(count):
-                squared[i] = 0.0
-                scale[i] = 1.0
+            if form != 0:
+                for i in range(count):
+                    squared[i] = 0.0
+                    scale[i] = 1.0
             cholesky(total, count, scale)
             whiten_vector(total, count, nu)
             add_squares(nu, count, squared)
             rejected = False
-            for i in range(count):
-                if weight[i] != 0.0:
-                    sum_log[i] += log_likelihood(form, form_params, squared[i], scale[i], p)
-                    if form != 0:
+            if form == 0:
+                pivots += p
+                for i in range(count):
+                    used[i] += weight[i]
+                if pivots + p > FACTORS_PER_LOG or k == n_obs - 1:
+                    for i in range(count):
+                        sum_log[i] += math.log(scale[i])
+                        scale[i] = 1.0
+                    pivots = 0
+            else:
+                for i in range(count):
+                    if weight[i] != 0.0:
+                        sum_log[i] += log_likelihood(form, form_params, squared[i], scale[i], p)
                         weight[i] = 1.0 if is_inlier(form, form_params, squared[i], scale[i], p) else 0.0
                         rejected = rejected or weight[i] == 0.0
             whiten_matrix(total, count, cross)
@@ -141,4 +156,6 @@ def update(
             if form != 0 and mask.shape[0] == 0:
                 weight[:] = 1.0
         for i in range(count):
+            if form == 0:
+                sum_log[i] -= 0.5 * (squared[i] + used[i] * p * math.log(2.0 * math.pi))
             log_density[start + i] += sum_log[i]

@@ -25,17 +25,10 @@ class Copied:
         self.stamps = [*self.stamps, stamp][-keep:]
 
 
-@given(
-    n=st.integers(1, 8),
-    seed=st.integers(0, 2**32 - 1),
-    steps=st.integers(1, 70),
-    rate=st.sampled_from([0.1, 0.6, 1.0]),
-    lag=st.sampled_from([None, 1, 2, 7, 30]),
-    clouds=st.booleans(),
-    restore=st.booleans(),
-)
-def test_paths_are_those_of_a_full_history(n, seed, steps, rate, lag, clouds, restore):
+def recorded(seed: int, lag: int | None, clouds: bool) -> tuple[History, Copied]:
+    """A history of random length, size and rate of resampling, saved and restored on its way."""
     rng = np.random.default_rng(seed)
+    n, steps, rate = rng.integers(1, 9), rng.integers(1, 80), rng.choice([0.1, 0.6, 1.0])
     lineage = Lineage(n)
     history, oracle = History(lineage, lag, clouds), Copied(n, lag)
     for t in range(steps):
@@ -46,10 +39,24 @@ def test_paths_are_those_of_a_full_history(n, seed, steps, rate, lag, clouds, re
         state = rng.normal(size=(n, 2))
         history.record(10 * t, state, np.full(n, -np.log(n)))
         oracle.record(10 * t, state)
-        if restore and rng.random() < 0.1:
+        if rng.random() < 0.05:
             lineage, history = restored(lineage, history)
+    return history, oracle
+
+
+@given(seed=st.integers(0, 2**32 - 1), lag=st.sampled_from([None, 1, 2, 7, 30]), clouds=st.booleans())
+def test_paths_are_those_of_a_full_history(seed, lag, clouds):
+    history, oracle = recorded(seed, lag, clouds)
     np.testing.assert_array_equal(history.paths(), oracle.paths)
     np.testing.assert_array_equal(history.stamps_ns, oracle.stamps)
+
+
+@pytest.mark.parametrize("lag", [None, 30])
+def test_random_histories_are_shared(lag):
+    """Most of them hold far fewer states than paths, so that the test above speaks of compacted blocks."""
+    pairs = [recorded(seed, lag, clouds=False) for seed in range(30)]
+    shares = [history.stored_states / max(1, oracle.paths[..., 0].size) for history, oracle in pairs]
+    assert np.median(shares) < 0.8
 
 
 def restored(lineage: Lineage, history: History) -> tuple[Lineage, History]:
