@@ -12,7 +12,7 @@ from rich.table import Table
 
 from benchmarks.gate import regressions, write_baseline
 from benchmarks.machine import description
-from benchmarks.rows import Row, Settings, Skipped
+from benchmarks.rows import Row, Settings, SkippedError
 
 FOLDER = Path(__file__).parent
 BASELINE = FOLDER / "baseline.json"
@@ -31,9 +31,13 @@ NAMES = (
 def main() -> int:
     """Runs, prints, writes results.json; 1 where the gate finds a regression."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
-    parser.add_argument("names", nargs="*", metavar="name", help=f"any of: {', '.join(NAMES)}; by default all")
+    parser.add_argument(
+        "names", nargs="*", metavar="name", help=f"any of: {', '.join(NAMES)}; by default all"
+    )
     parser.add_argument("--quick", action="store_true", help="fewer repetitions")
-    parser.add_argument("--gate", action="store_true", help="compare with baseline.json, exit 1 on a regression")
+    parser.add_argument(
+        "--gate", action="store_true", help="compare with baseline.json, exit 1 on a regression"
+    )
     parser.add_argument("--record", action="store_true", help="write baseline.json from this run")
     arguments = parser.parse_args()
     unknown = sorted(set(arguments.names) - set(NAMES))
@@ -46,11 +50,13 @@ def main() -> int:
         try:
             rows += import_module(f"benchmarks.{name}").run(Settings(arguments.quick))
             print(f"{name}: {time.perf_counter() - start:.1f} s", file=sys.stderr)
-        except Skipped as reason:
+        except SkippedError as reason:
             print(f"{name}: skipped, {reason}", file=sys.stderr)
     show(rows, machine)
     results = {"machine": machine, "quick": arguments.quick, "rows": [row.plain() for row in rows]}
-    (FOLDER / "results.json").write_text(json.dumps(results, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    (FOLDER / "results.json").write_text(
+        json.dumps(results, indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
+    )
     if arguments.record:
         write_baseline(BASELINE, rows)
     if not arguments.gate:

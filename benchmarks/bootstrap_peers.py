@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.rows import Row, Settings, Skipped, Timing, interleaved
+from benchmarks.rows import Row, Settings, SkippedError, Timing, interleaved
 from rbpf.belief import Belief
 from rbpf.filter import Filter
 from rbpf.lie import Euclidean
@@ -170,20 +170,25 @@ def run(settings: Settings) -> list[Row]:
     """Time per step of each at each N, and whether they agree."""
     present = {name: kind for name, kind in PEERS.items() if find_spec(name) is not None}
     if not present:
-        raise Skipped("neither particles nor stonesoup is installed")
+        raise SkippedError("neither particles nor stonesoup is installed")
     data = simulate(np.random.default_rng(0))
-    agreement = evidence_agreement(data, settings.repetitions(30)) if "particles" in present else "no peer's evidence"
+    agreement = (
+        evidence_agreement(data, settings.repetitions(30)) if "particles" in present else "no peer's evidence"
+    )
     return [row for n in SIZES for row in figures(n, data, present, settings, agreement)]
 
 
 def evidence_agreement(data: np.ndarray, runs: int, n: int = 1_000) -> str:
     """Mean log-evidence of ours and of `particles` over some seeds."""
-    logs = np.array([[evidence(kind, n, data, seed) for seed in range(runs)] for kind in (OurRun, ParticlesRun)])
+    logs = np.array(
+        [[evidence(kind, n, data, seed) for seed in range(runs)] for kind in (OurRun, ParticlesRun)]
+    )
     error = np.sqrt(logs.var(axis=1, ddof=1).sum() / runs)
     gap = logs[0].mean() - logs[1].mean()
     if abs(gap) > 4.0 * error:
         raise RuntimeError(f"log-evidence differs from that of particles by {gap:.3f} ± {error:.3f}")
-    return f"log-evidence at N={n}: {logs[0].mean():.3f}, particles {logs[1].mean():.3f}, ± {error:.3f} on the difference"
+    ours, theirs = logs[0].mean(), logs[1].mean()
+    return f"log-evidence at N={n}: {ours:.3f}, particles {theirs:.3f}, ± {error:.3f} on the difference"
 
 
 def evidence(kind: Callable[..., Any], n: int, data: np.ndarray, seed: int) -> float:

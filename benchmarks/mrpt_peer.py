@@ -13,7 +13,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from benchmarks.rows import Row, Settings, Skipped, Timing, interleaved
+from benchmarks.rows import Row, Settings, SkippedError, Timing, interleaved
 from rbpf.filter import Filter
 from rbpf.lie import SE2
 from rbpf.maps.landmark_map import LandmarkMap
@@ -83,13 +83,22 @@ def run(settings: Settings) -> list[Row]:
     """Time per step of both, and the mean error of both maps."""
     missing = [name for name in PROGRAMS if shutil.which(name) is None]
     if missing:
-        raise Skipped(f"{missing[0]} is not installed (Debian's mrpt-apps has it)")
+        raise SkippedError(f"{missing[0]} is not installed (Debian's mrpt-apps has it)")
     with TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "simulation.ini").write_text(SIMULATION)
         (folder / "ekf_slam.ini").write_text(EKF_SLAM)
         call(folder, "simul-landmarks", "simulation.ini")
-        call(folder, "rawlog-edit", "-w", "--list-range-bearing", "-i", "log.rawlog", "--text-file-output", "z.txt")
+        call(
+            folder,
+            "rawlog-edit",
+            "-w",
+            "--list-range-bearing",
+            "-i",
+            "log.rawlog",
+            "--text-file-output",
+            "z.txt",
+        )
         turns = settings.repetitions(6)
         frames, landmarks = read(folder)
         output: list[str] = []

@@ -13,7 +13,7 @@ from rbpf.filter import Filter
 GENERATIONS_BACK = 20
 
 
-class Skipped(Exception):
+class SkippedError(Exception):
     """A benchmark cannot run here; the message says why."""
 
 
@@ -58,7 +58,10 @@ class Row:
 
     def plain(self) -> dict[str, Any]:
         """For a JSON file."""
-        return {key: value.item() if isinstance(value, np.generic) else value for key, value in asdict(self).items()}
+        return {
+            key: value.item() if isinstance(value, np.generic) else value
+            for key, value in asdict(self).items()
+        }
 
 
 @dataclass(frozen=True)

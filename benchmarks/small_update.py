@@ -47,9 +47,7 @@ def run(settings: Settings) -> list[Row]:
     turns = settings.repetitions(30)
     ours = Run(planar(K, M), N, CALLS["rbpf"] * (turns + 2))
     twin = Run(planar(K, M), N, CALLS["twin"] * (turns + 2), compiled=False)
-    times = interleaved(
-        {"rbpf": ours.step, "twin": twin.step, "loop": LoopRun(turns + 2).step}, turns, CALLS
-    )
+    times = interleaved({"rbpf": ours.step, "twin": twin.step, "loop": LoopRun(turns + 2).step}, turns, CALLS)
     spent = times["rbpf"].median * 1e3
     same = f"same result within {difference:.0e}; "
     notes = f"{times['rbpf'].spread}; {ours.diversity.text()}"
