@@ -1,11 +1,13 @@
 """Pictures of a run, as PNG files drawn without a screen."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rbpf.systems.range_bearing.run import Run
+from rbpf.validation.alignment import align
 from rbpf.validation.map_summary import MapSummary
 from rbpf.validation.scores import as_trajectory, truth_at
 
@@ -60,17 +62,27 @@ def _positions(run: Run, poses: np.ndarray) -> np.ndarray:
     return as_trajectory(run.log, np.arange(poses.shape[0]), poses).positions
 
 
-def _truth(run: Run) -> np.ndarray | None:
-    """True positions at the run's instants, moved by the first pair so that both start at the origin."""
+@dataclass(frozen=True)
+class _TrueWorld:
+    """The truth in the filter's frame: positions (T, 3) at the run's instants, landmarks (M, 3)."""
+
+    path: np.ndarray
+    landmarks: np.ndarray
+
+
+def _truth(run: Run) -> _TrueWorld | None:
+    """The truth moved by the rigid alignment of its path to the filter's."""
     log = run.log
     if log.truth is None:
         return None
     stamps = np.array([frame.stamp_ns for frame in log.frames])
     rows, poses = truth_at(log.space, log.truth, stamps)
-    if not rows.size:
+    if rows.size < 3:
         return None
-    here = log.space.compose(run.progress.mean[rows[0]], log.space.inverse(poses[0]))
-    return _positions(run, log.space.compose(here, poses))
+    true, ours = _positions(run, poses), _positions(run, run.progress.mean[rows])
+    alignment = align(true, ours)
+    points = np.array([np.append(p, 0.0)[:3] for p in log.truth.landmarks.values()]).reshape(-1, 3)
+    return _TrueWorld(alignment.transform(true), alignment.transform(points))
 
 
 def _draw_path(run: Run, summary: MapSummary, others: dict[str, np.ndarray]) -> Any:
@@ -81,12 +93,12 @@ def _draw_path(run: Run, summary: MapSummary, others: dict[str, np.ndarray]) -> 
     truth = _truth(run)
     if truth is not None:
         axes.plot(
-            truth[:, 0],
-            truth[:, 1],
+            truth.path[:, 0],
+            truth.path[:, 1],
             color=_COLOURS["truth"],
             lw=1.2,
             ls="--",
-            label="truth, from the first pose",
+            label="truth, rigidly aligned",
         )
     at = _positions(run, run.progress.mean)
     axes.plot(at[:, 0], at[:, 1], color=_COLOURS["filter"], lw=1.2, label="filter")
@@ -98,17 +110,10 @@ def _draw_map(run: Run, summary: MapSummary, others: dict[str, np.ndarray]) -> A
     figure, axes = _axes(f"{run.log.name}: map with {SIGMAS:g}σ ellipses, seen from above")
     at = _positions(run, run.progress.mean)
     axes.plot(at[:, 0], at[:, 1], color=_COLOURS["filter"], lw=0.6, alpha=0.5, label="filter")
-    truth = {} if run.log.truth is None else run.log.truth.landmarks
-    if truth:
-        true = np.array(list(truth.values()))
-        axes.plot(
-            true[:, 0],
-            true[:, 1],
-            "+",
-            color=_COLOURS["truth"],
-            ms=7,
-            label="true landmarks, their own frame",
-        )
+    truth = _truth(run)
+    if truth is not None and truth.landmarks.size:
+        at = truth.landmarks
+        axes.plot(at[:, 0], at[:, 1], "+", color=_COLOURS["truth"], ms=7, label="truth, aligned by the path")
     axes.plot(summary.mean[:, 0], summary.mean[:, 1], ".", color=_COLOURS["map"], ms=3, label="landmarks")
     circle = np.linspace(0, 2 * np.pi, 40)
     for mean, cov in zip(summary.mean, summary.cov, strict=True):

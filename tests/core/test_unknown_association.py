@@ -9,12 +9,12 @@ from rbpf.filter import Filter
 from rbpf.lie import SE2
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
-from rbpf.models import NEW, NULL
+from rbpf.models import NEW, NULL, Records, Resampler
 from rbpf.motion.odometry import OdometryMotion
 from rbpf.resampling import EssTriggered, Systematic
 from rbpf.sensors.landmark_sensor import AnonymousLandmarkSensor
 from rbpf.sensors.range_bearing import RangeBearing
-from tests.core.scripted import ids_of
+from tests.core.scripted import Scripted, ids_of, seen
 from tests.core.worlds import MAX_RANGE, Recipe, Sightings, World, anonymous, drive, planar_world
 
 STEPS, LANDMARKS = 120, 12
@@ -157,3 +157,27 @@ def test_particles_with_different_maps_weigh_their_explanations():
 def sighting_and_cov() -> tuple[np.ndarray, np.ndarray]:
     frame = one_sighting()
     return frame.z, frame.cov_z
+
+
+class Fixed(Resampler):
+    """Always the same ancestors."""
+
+    def __init__(self, ancestors: list[int]) -> None:
+        self.chosen = np.array(ancestors)
+
+    def ancestors(self, weights, rng):
+        return self.chosen
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_descendants_inherit_the_association_of_their_parent(compiled):
+    landmark_map = LandmarkMap(SE2, compiled=compiled)
+    resampler = Fixed([3, 3, 4, 4, 5, 5])
+    filter_ = Filter(OdometryMotion(SE2), Scripted(), landmark_map, resampler=resampler, n=6)
+    mean = np.broadcast_to([[3.0, 0.6], [3.0, 0.7]], (6, 2, 2))
+    landmark_map.add_records(Records(mean, np.broadcast_to(np.eye(2), (6, 2, 2, 2))), Point(2))
+    ids = np.array([[0], [0], [0], [1], [1], [0]])
+    report = filter_.step(seen(RangeBearing(SE2), *sighting_and_cov(), ids=ids))
+    assert ids_of(report).tolist() == [[1], [1], [1], [1], [0], [0]]
+    trace = np.trace(landmark_map.read(np.array([0, 1])).cov, axis1=2, axis2=3)
+    assert (trace < 0.1).tolist() == [[False, True]] * 4 + [[True, False]] * 2
