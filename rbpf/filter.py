@@ -222,34 +222,19 @@ class Filter:
 
     def _predict(self, control: Any, dt: float) -> Prior:
         transition = self.motion.transition(self.particles.state, control, dt)
-        mean, factor, name = (
-            transition.mean,
-            transition.noise_factor,
-            f"{type(self.motion).__name__}.transition",
-        )
-        rows = self.space.dim + (0 if transition.coupling is None else transition.coupling.shape[-1])
-        fits = factor.ndim == 3 and factor.shape[0] in (1, self.n) and factor.shape[1] == rows
-        if mean.shape != self.particles.state.shape or not fits:
-            raise InputError(
-                f"{name} returned mean {mean.shape} and noise_factor {factor.shape}: "
-                f"expected {self.particles.state.shape} and ({self.n} or 1, {rows}, r)"
-            )
-        if not (np.isfinite(mean).all() and np.isfinite(factor).all()):
-            raise InputError(f"{name} returned NaN or infinity in step {self.steps}: check the control")
+        what = f"step {self.steps}: {type(self.motion).__name__}.transition"
+        checked_transition(transition, self.particles.state, self.space, what)
         return self.marginals.predict(transition, self.space)
 
     def _observe(self, frame: Any, belief: Belief) -> list[Observations]:
-        observed = [[_checked(group) for group in sensor.observe(frame, belief)] for sensor in self.sensors]
+        observed = [[checked_observations(group) for group in sensor.observe(frame, belief)] for sensor in self.sensors]
         self._ends = np.cumsum([len(groups) for groups in observed])
         return [group for groups in observed for group in groups]
 
     def _descend(
         self, ancestors: np.ndarray, prior: Prior, groups: list[Observations]
     ) -> tuple[Prior, list[Observations]]:
-        if ancestors.shape != (self.n,) or ancestors.min() < 0 or ancestors.max() >= self.n:
-            name = type(self.resampler).__name__
-            raise InputError(f"{name} must return {self.n} ancestors in 0..{self.n - 1}, got {ancestors}")
-        self.lineage.advance(ancestors)
+        self.lineage.advance(checked_ancestors(ancestors, self.n, self.resampler))
         self.marginals.resample(ancestors)
         groups = [
             replace(group, ids=group.ids[ancestors])
@@ -300,21 +285,3 @@ class _LineariseGroups(LineariseAt):
             return terms if prior.centred else terms.charted(prior.space.right_jacobian(increment))
         terms = self._marginals.terms(prior.at(increment), self._groups, prior)
         return terms.charted(prior.space.right_jacobian(increment)).shifted(increment - prior.mean)
-
-
-def _checked(group: Observations) -> Observations:
-    """Shapes and finite numbers of a group, before they can reach a kernel."""
-    name, count = type(group.model).__name__, group.z.shape[0]
-    p = group.model.dim
-    if group.z.shape != (count, p) or group.cov.shape != (count, p, p):
-        raise InputError(
-            f"{name} measures {p} numbers: expected z (K, {p}) and cov (K, {p}, {p}), "
-            f"got {group.z.shape} and {group.cov.shape}"
-        )
-    if not (np.isfinite(group.z).all() and np.isfinite(group.cov).all()):
-        raise InputError(f"a measurement of {name} or its covariance is not finite")
-    try:
-        gaussian.psd_factor(group.cov)
-    except InputError as error:
-        raise InputError(f"the noise of {name} has no covariance: {error}") from error
-    return group
