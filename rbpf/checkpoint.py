@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rbpf.errors import InputError
-from rbpf.genealogy import History, Lineage
+from rbpf.genealogy import Lineage
+from rbpf.history import History
 from rbpf.particles import Particles
 
 if TYPE_CHECKING:

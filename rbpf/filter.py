@@ -13,13 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from rbpf import gaussian
 from rbpf.belief import Belief
 from rbpf.checkpoint import read_checkpoint, write_checkpoint
+from rbpf.checks import checked_ancestors, checked_observations, checked_start, checked_transition
 from rbpf.conditional import Marginals
 from rbpf.errors import InputError
 from rbpf.estimate import Estimate, mixture_estimate
-from rbpf.genealogy import History, Lineage
+from rbpf.genealogy import Lineage
+from rbpf.history import History
 from rbpf.models import (
     Births,
     Conditional,
@@ -112,12 +113,7 @@ class Filter:
         self.resampler = resampler or EssTriggered(Systematic())
         self.rng = rng or np.random.default_rng()
         origin = self.space.identity() if start is None else np.asarray(start, dtype=float)
-        size = self.space.size
-        if origin.shape not in ((size,), (n, size)) or not np.isfinite(origin).all():
-            raise InputError(
-                f"start must be ({size},) or ({n}, {size}) finite numbers, got {origin.shape}: {origin}"
-            )
-        state = np.array(np.broadcast_to(origin, (n, size)))
+        state = checked_start(origin, n, self.space)
         self.particles = Particles(state, uniform_log_weights(n))
         self.lineage = Lineage(n)
         self.marginals.begin(n, self.lineage)
@@ -227,7 +223,10 @@ class Filter:
         return self.marginals.predict(transition, self.space)
 
     def _observe(self, frame: Any, belief: Belief) -> list[Observations]:
-        observed = [[checked_observations(group) for group in sensor.observe(frame, belief)] for sensor in self.sensors]
+        observed = [
+            [checked_observations(group) for group in sensor.observe(frame, belief)]
+            for sensor in self.sensors
+        ]
         self._ends = np.cumsum([len(groups) for groups in observed])
         return [group for groups in observed for group in groups]
 

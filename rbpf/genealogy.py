@@ -38,7 +38,6 @@ class Lineage:
         self._free = np.arange(4 * n - 1, n - 1, -1)
         self._n_free = self._free.size
         self._free = np.concatenate([self._free, np.zeros(n, dtype=np.int64)])
-        self._splice_at = 4 * n
         self._identity = np.arange(n)
         self._cache: dict[int, np.ndarray] = {}
 
@@ -105,7 +104,7 @@ class Lineage:
         """Everything that a checkpoint must hold."""
         names = ("parent", "children", "generation", "row", "leaves", "free")
         arrays = {f"lineage/{name}": getattr(self, f"_{name}") for name in names}
-        arrays["lineage/now"] = np.array([self.generation, self._n_free, self._splice_at])
+        arrays["lineage/now"] = np.array([self.generation, self._n_free])
         return arrays
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
@@ -113,7 +112,7 @@ class Lineage:
         self._allocate(arrays["lineage/parent"].size)
         for name in ("parent", "children", "generation", "row", "leaves", "free"):
             setattr(self, f"_{name}", arrays[f"lineage/{name}"].copy())
-        self.generation, self._n_free, self._splice_at = (int(v) for v in arrays["lineage/now"])
+        self.generation, self._n_free = (int(v) for v in arrays["lineage/now"])
         self._retained.clear()
         self._cache.clear()
 
@@ -188,134 +187,3 @@ class Schedule:
         for when, generation in pairs:
             schedule.due.setdefault(int(when), set()).add(int(generation))
         return schedule
-
-
-@dataclass
-class PathBlock:
-    """Poses of one generation: `states` (T, n, E) at the rows `kept` (n,); log-weights where clouds are kept."""
-
-    generation: int
-    kept: np.ndarray
-    stamps_ns: list[int]
-    states: list[np.ndarray]
-    log_weights: list[np.ndarray]
-
-
-class History:
-    """Posterior trajectories: the sampled states of all surviving lineages.
-
-    Args:
-        lineage: the ancestry of the particles.
-        lag: number of steps kept; None keeps all. A fixed lag holds a run of any length in constant memory.
-        clouds: also keep each step's whole cloud and log-weights, which backward simulation needs.
-    """
-
-    def __init__(self, lineage: Lineage, lag: int | None = None, clouds: bool = False) -> None:
-        self.lineage = lineage
-        self.lag = lag
-        self.clouds = clouds
-        self.blocks: list[PathBlock] = []
-        self._by_generation: dict[int, PathBlock] = {}
-        self._schedule = Schedule()
-        self._steps = 0
-
-    def record(self, stamp_ns: int, state: np.ndarray, log_weights: np.ndarray) -> None:
-        """Stores the states (N, E) after a step."""
-        now = self.lineage.generation
-        block = self._by_generation.get(now)
-        if block is None:
-            block = PathBlock(now, np.arange(state.shape[0]), [], [], [])
-            self._append(block)
-            self._compact(now)
-        block.stamps_ns.append(stamp_ns)
-        block.states.append(state.copy())
-        if self.clouds:
-            block.log_weights.append(log_weights.copy())
-        self._steps += 1
-        if self.lag is not None and self._steps > self.lag:
-            self._drop_first()
-
-    @property
-    def stamps_ns(self) -> np.ndarray:
-        """(T,) stamps of the steps kept."""
-        return np.array([stamp for block in self.blocks for stamp in block.stamps_ns], dtype=np.int64)
-
-    @property
-    def stored_states(self) -> int:
-        """Number of states held, of T·N without sharing."""
-        return sum(len(block.states) * block.kept.size for block in self.blocks)
-
-    def distinct_first(self) -> int:
-        """How many particles of the first generation kept still have descendants."""
-        return self.lineage.distinct(self.blocks[0].generation) if self.blocks else self.lineage.n
-
-    def paths(self) -> np.ndarray:
-        """(T, N, E): the trajectory of each current particle, along its ancestors."""
-        parts: list[np.ndarray] = []
-        for block in self.blocks:
-            rows = np.searchsorted(block.kept, self.lineage.rows(block.generation))
-            parts.extend(states[rows] for states in block.states)
-        return np.array(parts)
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """Everything that a checkpoint must hold."""
-        out: dict[str, np.ndarray] = {
-            "history/generations": np.array([b.generation for b in self.blocks], dtype=np.int64)
-        }
-        for number, block in enumerate(self.blocks):
-            out[f"history/{number}/kept"] = block.kept
-            out[f"history/{number}/stamps_ns"] = np.array(block.stamps_ns, dtype=np.int64)
-            out[f"history/{number}/states"] = np.array(block.states)
-            out[f"history/{number}/log_weights"] = np.array(block.log_weights)
-        out["history/due"] = self._schedule.array()
-        return out
-
-    def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """The inverse of `arrays`."""
-        self.blocks, self._by_generation = [], {}
-        self._schedule = Schedule.of(arrays["history/due"])
-        for number, generation in enumerate(arrays["history/generations"]):
-            part = {
-                name: arrays[f"history/{number}/{name}"]
-                for name in ("kept", "stamps_ns", "states", "log_weights")
-            }
-            block = PathBlock(
-                int(generation),
-                part["kept"].copy(),
-                [int(stamp) for stamp in part["stamps_ns"]],
-                list(part["states"].copy()),
-                list(part["log_weights"].copy()),
-            )
-            self.blocks.append(block)
-            self._by_generation[block.generation] = block
-            self.lineage.retain(block.generation)
-        self._steps = self.stamps_ns.size
-
-    def _append(self, block: PathBlock) -> None:
-        self.blocks.append(block)
-        self._by_generation[block.generation] = block
-        self.lineage.retain(block.generation)
-        if not self.clouds:
-            self._schedule.add(block.generation, block.generation)
-
-    def _compact(self, now: int) -> None:
-        for generation in self._schedule.pop(now):
-            block = self._by_generation.get(generation)
-            if block is None:
-                continue
-            alive = np.unique(self.lineage.rows(generation))
-            if 2 * alive.size <= block.kept.size:
-                rows = np.searchsorted(block.kept, alive)
-                block.states = [states[rows] for states in block.states]
-                block.kept = alive
-            if alive.size > 1:
-                self._schedule.add(generation, now)
-
-    def _drop_first(self) -> None:
-        block = self.blocks[0]
-        del block.stamps_ns[0], block.states[0], block.log_weights[:1]
-        self._steps -= 1
-        if not block.states:
-            self.blocks.pop(0)
-            del self._by_generation[block.generation]
-            self.lineage.release(block.generation)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rbpf.errors import InputError
-from rbpf.genealogy import History
+from rbpf.history import History
 from rbpf.lie import LieGroup
 from rbpf.models import MotionModel
 

@@ -218,9 +218,9 @@ class TestModels:
             ({"noise_factor": np.ones((N - 1, 1, 1))}, r"noise_factor \(5, 1, 1\)"),
             (
                 {"noise_factor": np.full((1, 1, 1), np.nan)},
-                "returned NaN or infinity in step 0: check the control",
+                "returned NaN or infinity: check the control",
             ),
-            ({"mean": np.full((N, 1), np.inf)}, "returned NaN or infinity in step 0: check the control"),
+            ({"mean": np.full((N, 1), np.inf)}, "returned NaN or infinity: check the control"),
         ],
     )
     def test_transitions_of_wrong_shape(self, given, match):

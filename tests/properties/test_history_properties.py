@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rbpf.genealogy import History, Lineage
+from rbpf.genealogy import Lineage
+from rbpf.history import History
 
 
 class Copied:
