@@ -95,7 +95,7 @@ class ParticlesRun:
         import particles
         from particles import distributions, state_space_models
 
-        class Model(state_space_models.StateSpaceModel):  # type: ignore[misc]
+        class Model(state_space_models.StateSpaceModel):
             def PX0(self) -> Any:  # noqa: N802 - the library's name
                 return distributions.MvNormal(cov=(STD_START**2 + STD_WALK**2) * np.eye(2))
 
@@ -131,7 +131,7 @@ class StoneSoupRun:
         from stonesoup.types.state import ParticleState
         from stonesoup.updater.particle import ParticleUpdater
 
-        class Model(NonLinearGaussianMeasurement):  # type: ignore[misc]
+        class Model(NonLinearGaussianMeasurement):
             @property
             def ndim_meas(self) -> int:
                 return 2

@@ -94,7 +94,7 @@ def rate(name: str, timing: Timing, floor: float, aim_hz: float, aim: str, notes
         name,
         hertz,
         "Hz",
-        "bytes of the records moved once / copy bandwidth",
+        "the records alone, at copy bandwidth",
         1.0 / floor,
         hertz * floor,
         aim=aim,

@@ -136,5 +136,6 @@ def updated(particle: Particle, frame: Frame) -> float:
         gain = np.linalg.solve(cov, cross).T
         particle.means[landmark] = particle.means[landmark] + gain @ nu
         particle.covs[landmark] = particle.covs[landmark] - gain @ cross
-        total -= 0.5 * (nu @ np.linalg.solve(cov, nu) + math.log(np.linalg.det(2.0 * math.pi * cov)))
+        squared = float(nu @ np.linalg.solve(cov, nu))
+        total -= 0.5 * (squared + math.log(np.linalg.det(2.0 * math.pi * cov)))
     return total

@@ -14,8 +14,10 @@ from rbpf.errors import InputError
 from rbpf.genealogy import Lineage, Schedule
 
 _FIRST_SLABS = 32
-HOT_SHARE = 0.5
+HOT_SHARE = 0.75
 """A column with fewer surviving rows than this share of the particles gives its dense slab back."""
+COLD_SHARE = 0.9
+"""A compacted column is compacted again when no more than this share of its rows survives."""
 
 
 class Pool:
@@ -261,7 +263,7 @@ class SharedStore:
     def _shrink(self, column: int, alive: np.ndarray) -> None:
         cold = self._cold.get(column)
         if cold is not None:
-            if 2 * alive.size <= cold.kept.size:
+            if alive.size <= COLD_SHARE * cold.kept.size:
                 rows = np.searchsorted(cold.kept, alive)
                 self._cold[column] = Cold(alive, np.ascontiguousarray(cold.data[:, rows]))
         elif alive.size <= HOT_SHARE * self.n:

@@ -13,7 +13,7 @@ import numpy as np
 from rbpf.kernels import forest
 
 _FIRST_CHECK = 4
-"""Age in generations at which a block is first looked through for dead rows; the age then doubles."""
+"""Age in generations at which a block is first looked through for dead rows; it then grows by a quarter each time."""
 
 
 class Lineage:
@@ -163,13 +163,13 @@ class Lineage:
 
 @dataclass
 class Schedule:
-    """When each generation's rows are next worth compacting: at ages 4, 8, 16, …, as lineages coalesce like 1/age."""
+    """When each generation's rows are next worth compacting: at ages growing by a quarter, as lineages coalesce like 1/age."""
 
     due: dict[int, set[int]] = field(default_factory=dict)
 
     def add(self, generation: int, now: int) -> None:
-        """Looks again when the generation has twice its present age."""
-        self.due.setdefault(now + max(_FIRST_CHECK, now - generation), set()).add(generation)
+        """Looks again when the generation is older by a quarter."""
+        self.due.setdefault(now + max(_FIRST_CHECK, (now - generation) // 4), set()).add(generation)
 
     def pop(self, now: int) -> list[int]:
         """Generations to look through now."""
