@@ -87,6 +87,7 @@ class SharedStore:
         self._cold: dict[int, Cold] = {}
         self._members: dict[int, set[int]] = {}
         self._schedule = Schedule()
+        self._survivors: dict[int, int] = {}
 
     @property
     def ids(self) -> np.ndarray:
@@ -181,9 +182,12 @@ class SharedStore:
             if not members:
                 continue
             alive = np.unique(self.lineage.rows(generation))
-            for column in members:
-                self._shrink(column, alive)
-            self._schedule.add(generation, now)
+            if alive.size <= COLD_SHARE * self._survivors.get(generation, self.n):
+                self._survivors[generation] = alive.size
+                for column in members:
+                    self._shrink(column, alive)
+            if alive.size > 1:
+                self._schedule.add(generation, now)
 
     @property
     def stored_bytes(self) -> int:
@@ -292,4 +296,5 @@ class SharedStore:
         members.remove(column)
         if not members:
             del self._members[generation]
+            self._survivors.pop(generation, None)
             self.lineage.release(generation)
