@@ -19,7 +19,11 @@ FIGURES = Path(__file__).parent / "out"
 
 @dataclass(frozen=True)
 class Curve:
-    """Nodes (T,) and generations (T,) after every step, and the mean variance of the number of descendants."""
+    """Nodes (T,) and generations (T,) after every step, and the mean variance of N W where it resampled.
+
+    Systematic resampling lays descendants side by side, so that the rounding of their numbers cancels within a family:
+    families grow and shrink by the variance of the weights alone.
+    """
 
     n: int
     nodes: np.ndarray
@@ -52,7 +56,7 @@ def grow(n: int, steps: int, threshold: float, rng: np.random.Generator) -> Curv
             ancestors = Systematic().ancestors(weights, rng)
             lineage.advance(ancestors)
             lineage.retain(lineage.generation)
-            variances.append(np.bincount(ancestors, minlength=n).var())
+            variances.append(float((n * weights).var()))
             log_weights[:] = 0.0
         nodes[t], generations[t] = lineage.nodes, lineage.generation
     return Curve(n, nodes, generations, float(np.mean(variances)))

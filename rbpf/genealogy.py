@@ -163,7 +163,7 @@ class Lineage:
 
 @dataclass
 class Schedule:
-    """When each generation's rows are next worth compacting: at ages growing by a quarter, as lineages coalesce like 1/age."""
+    """When each generation's rows are next worth compacting: at ages growing by a quarter, as lineages coalesce."""
 
     due: dict[int, set[int]] = field(default_factory=dict)
 
