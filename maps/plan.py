@@ -112,7 +112,8 @@ def _checked_ids(group: Observations, n: int, kinds: np.ndarray) -> np.ndarray:
             f"ids of {type(group.model).__name__} must be integers: landmarks, NULL = -1 or NEW = -2"
         )
     named = ids[ids >= 0]
-    held = np.append(kinds, -1)[np.minimum(named, kinds.size)] >= 0
+    held = named < kinds.size
+    held[held] = kinds[named[held]] >= 0
     if not held.all():
         raise InputError(f"a measurement names landmark {named[~held][0]}, which the map does not hold")
     return ids
