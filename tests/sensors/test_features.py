@@ -1,0 +1,150 @@
+"""Feature logs: what is refused, and with which sentence."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rbpf.errors import InputError
+from rbpf.sensors.features import CameraTruth, FeatureFrame, FeatureLog, KnownPoints
+from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+
+CAMERA = Pinhole(640, 480, 500.0, 500.0, 320.0, 240.0)
+STEREO = RectifiedStereo(CAMERA, 0.1)
+
+
+def frame(stamp_ns: int, count: int, dim: int = 2) -> FeatureFrame:
+    z = 100.0 + np.arange(count * dim, dtype=float).reshape(count, dim)
+    return FeatureFrame(stamp_ns, np.arange(10, 10 + count), z, np.tile(0.25 * np.eye(dim), (count, 1, 1)))
+
+
+def log(*frames: FeatureFrame, camera: Pinhole | RectifiedStereo = CAMERA) -> FeatureLog:
+    return FeatureLog("walk", camera, list(frames))
+
+
+def refused(message: str):
+    return pytest.raises(InputError, match=f"^{re.escape(message)}")
+
+
+class TestFeatureLog:
+    def test_holds_what_it_was_given(self):
+        frames = [frame(0, 2), frame(5, 0), frame(5, 3), frame(9, 1)]
+        recording = log(*frames)
+        assert recording.frames == frames
+        assert recording.known is None
+        assert recording.truth is None
+
+    def test_stereo_measures_three_numbers(self):
+        assert log(frame(0, 4, dim=3), camera=STEREO).camera.dim == 3
+        with refused("frame 0 of walk: z must be (4, 3) float64, got (4, 2) float64"):
+            log(frame(0, 4), camera=STEREO)
+
+    def test_a_covariance_may_be_singular(self):
+        good = frame(0, 2)
+        exact = replace(good, cov_z=np.stack([np.zeros((2, 2)), np.ones((2, 2))]))
+        assert log(exact).frames == [exact]
+
+    def test_no_frame(self):
+        with refused("walk holds no frame, expected at least one image"):
+            log()
+
+    def test_out_of_order(self):
+        with refused(
+            "frame 2 of walk at 4 ns is before the frame it follows (5 ns): sort the frames by time"
+        ):
+            log(frame(0, 1), frame(5, 1), frame(4, 1))
+
+    @pytest.mark.parametrize(
+        ("wrong", "message"),
+        [
+            ({"stamp_ns": 1.5}, "stamp_ns must be a whole number of nanoseconds, got 1.5"),
+            ({"landmarks": np.array([1.0, 2.0])}, "landmarks must be (K,) int64, got (2,) float64"),
+            ({"landmarks": np.array([[1, 2]])}, "landmarks must be (K,) int64, got (1, 2) int64"),
+            ({"landmarks": [1, 2]}, "landmarks must be (K,) int64, got a list"),
+            ({"landmarks": np.array([7, 7])}, "landmark 7 comes twice, keep one of the two"),
+            ({"landmarks": np.array([1, 2, 3])}, "z must be (3, 2) float64, got (2, 2) float64"),
+            ({"z": np.zeros((2, 2), dtype=int)}, "z must be (2, 2) float64, got (2, 2) int64"),
+            ({"z": np.array([[1.0, 2.0], [np.nan, 4.0]])}, "z must be finite, entry (1, 0) is nan"),
+            ({"cov_z": np.eye(2)}, "cov_z must be (2, 2, 2) float64, got (2, 2) float64"),
+            ({"cov_z": np.full((2, 2, 2), np.inf)}, "cov_z must be finite, entry (0, 0, 0) is inf"),
+            ({"cov_z": np.stack([np.eye(2), np.diag([1.0, -1.0])])}, "cov_z is no covariance: "),
+            (
+                {"cov_z": np.stack([np.eye(2), np.array([[1.0, 0.5], [0.0, 1.0]])])},
+                "cov_z is no covariance: ",
+            ),
+        ],
+    )
+    def test_a_wrong_frame_is_named(self, wrong, message):
+        with refused(f"frame 1 of walk: {message}"):
+            log(frame(0, 2), replace(frame(3, 2), **wrong), frame(4, 2))
+
+
+class TestOutside:
+    def test_rows_of_frames(self):
+        z = np.array([[-0.6, 10.0], [320.0, 240.0], [639.6, 10.0], [10.0, 479.4], [-40.0, 900.0]])
+        spread = FeatureFrame(2, np.arange(5), z, np.tile(np.eye(2), (5, 1, 1)))
+        recording = log(frame(0, 3), spread, frame(3, 0))
+        np.testing.assert_array_equal(recording.outside(), [[1, 0], [1, 2], [1, 4]])
+        np.testing.assert_array_equal(recording.outside(margin_px=5.0), [[1, 0], [1, 2], [1, 3], [1, 4]])
+
+    def test_none(self):
+        found = log(frame(0, 3)).outside()
+        assert found.shape == (0, 2)
+        assert found.dtype == np.int64
+
+    def test_both_images_of_a_stereo_pair(self):
+        z = np.array([[20.0, 100.0, 10.0], [5.0, 100.0, -3.0], [645.0, 100.0, 630.0], [20.0, 485.0, 10.0]])
+        pairs = FeatureFrame(0, np.arange(4), z, np.tile(np.eye(3), (4, 1, 1)))
+        np.testing.assert_array_equal(log(pairs, camera=STEREO).outside(), [[0, 1], [0, 2], [0, 3]])
+
+
+class TestKnownPoints:
+    good = KnownPoints(np.array([4, 2]), np.zeros((2, 3)), np.zeros((2, 3, 3)))
+
+    def test_none_at_all(self):
+        assert len(KnownPoints(np.empty(0, int), np.empty((0, 3)), np.empty((0, 3, 3))).names) == 0
+
+    @pytest.mark.parametrize(
+        ("wrong", "message"),
+        [
+            ({"names": np.array([4, 4])}, "landmark 4 comes twice, keep one of the two"),
+            ({"names": np.array([4.0, 2.0])}, "names must be (M,) int64, got (2,) float64"),
+            ({"positions": np.zeros((2, 2))}, "positions must be (2, 3) float64, got (2, 2) float64"),
+            ({"positions": np.full((2, 3), np.inf)}, "positions must be finite, entry (0, 0) is inf"),
+            ({"cov": np.zeros((3, 3))}, "cov must be (2, 3, 3) float64, got (3, 3) float64"),
+            ({"cov": np.tile(-np.eye(3), (2, 1, 1))}, "cov is no covariance: "),
+        ],
+    )
+    def test_a_wrong_point_is_refused(self, wrong, message):
+        with refused(f"the known points: {message}"):
+            replace(self.good, **wrong)
+
+
+class TestCameraTruth:
+    poses = np.tile([0.0, 0.0, 0.0, 1.0, 1.0, 2.0, 3.0], (3, 1))
+    good = CameraTruth(np.array([0, 5, 5]), poses, {3: np.zeros(3)})
+
+    def test_landmarks_are_optional(self):
+        assert CameraTruth(np.array([0, 5, 5]), self.poses).landmarks == {}
+
+    @pytest.mark.parametrize(
+        ("wrong", "message"),
+        [
+            ({"stamps_ns": np.array([0.0, 1.0, 2.0])}, "stamps_ns must be (T,) int64, got (3,) float64"),
+            ({"stamps_ns": np.array([0, 1])}, "world_from_camera must be (2, 7) float64, got (3, 7) float64"),
+            (
+                {"stamps_ns": np.array([0, 5, 4])},
+                "stamp 2 is before the one it follows, sort the poses by time",
+            ),
+            ({"world_from_camera": poses * np.nan}, "world_from_camera must be finite, entry (0, 0) is nan"),
+            (
+                {"world_from_camera": poses * [1, 1, 1, 2, 1, 1, 1]},
+                "pose 0 has a quaternion of length 2, expected [qx, qy, qz, qw, x, y, z] with a unit quaternion",
+            ),
+            ({"landmarks": {8: np.zeros(2)}}, "landmark 8 must be (3,) float64, got (2,) float64"),
+        ],
+    )
+    def test_a_wrong_truth_is_refused(self, wrong, message):
+        with refused(f"the ground truth: {message}"):
+            replace(self.good, **wrong)

@@ -1,0 +1,257 @@
+"""Pinhole camera: OpenCV, numeric derivatives, round trips, visibility, refusals."""
+
+import pickle
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rbpf.errors import InputError
+from rbpf.sensors.pinhole import Pinhole
+
+EUROC = (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05, 0.0)
+CAMERAS = {
+    "undistorted": Pinhole(640, 480, 525.0, 520.0, 319.5, 239.5),
+    "euroc": Pinhole(752, 480, 458.654, 457.296, 367.215, 248.375, EUROC),
+    "wide": Pinhole(640, 480, 360.0, 358.0, 322.0, 236.0, (-0.28, 0.08, 0.002, -0.001, -0.0085)),
+    "pincushion": Pinhole(1280, 720, 700.0, 710.0, 640.0, 355.0, (0.25, 0.12, -0.003, 0.004, 0.05)),
+    "folding": Pinhole(640, 480, 320.0, 320.0, 320.0, 240.0, (-0.25, 0.0, 0.0, 0.0, 0.0)),
+}
+every_camera = pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
+FOLDING = CAMERAS["folding"]
+
+
+def matrix(camera: Pinhole) -> np.ndarray:
+    return np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
+
+
+def seen_points(camera: Pinhole) -> np.ndarray:
+    """Points at depths from 0.3 m to 30 m all over the image, its border and the axis among them."""
+    rng = np.random.default_rng(0)
+    grid = np.stack(np.meshgrid(np.linspace(-1.5, 1.5, 41), np.linspace(-1.2, 1.2, 31)), axis=-1)
+    uv = np.concatenate([grid.reshape(-1, 2), rng.normal(0.0, 1e-7, (20, 2)), np.zeros((1, 2))])
+    rays = np.concatenate([uv, np.ones((len(uv), 1))], axis=1)
+    rays = rays[camera.visible(rays)]
+    return rays * rng.uniform(0.3, 30.0, (len(rays), 1))
+
+
+def border(camera: Pinhole) -> np.ndarray:
+    """Pixels along the four edges of the image."""
+    along, down = np.linspace(-0.5, camera.width - 0.5, 30), np.linspace(-0.5, camera.height - 0.5, 30)
+    edges = [(along, -0.5), (along, camera.height - 0.5), (-0.5, down), (camera.width - 0.5, down)]
+    return np.concatenate([np.stack(np.broadcast_arrays(*edge), axis=-1) for edge in edges])
+
+
+def numeric_slope(function, at: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """Central differences of fourth order (…, p, D), with a step (…,) per point."""
+    columns = []
+    for direction in np.eye(at.shape[-1]):
+        h = step[..., None] * direction
+        near = function(at + h) - function(at - h)
+        far = function(at + 2.0 * h) - function(at - 2.0 * h)
+        columns.append((8.0 * near - far) / (12.0 * step[..., None]))
+    return np.stack(columns, axis=-1)
+
+
+class TestPinholeAgainstOpenCV:
+    @every_camera
+    def test_projects_as_opencv(self, camera):
+        cv2 = pytest.importorskip("cv2")
+        points = seen_points(camera)
+        expected, _ = cv2.projectPoints(
+            points[:, None], np.zeros(3), np.zeros(3), matrix(camera), np.array(camera.distortion)
+        )
+        assert len(points) > 100
+        np.testing.assert_allclose(camera.project(points), expected[:, 0], rtol=0, atol=1e-9)
+
+    @every_camera
+    def test_slope_is_opencvs_derivative_by_the_translation(self, camera):
+        cv2 = pytest.importorskip("cv2")
+        points = seen_points(camera)
+        _, jac = cv2.projectPoints(
+            points[:, None], np.zeros(3), np.zeros(3), matrix(camera), np.array(camera.distortion)
+        )
+        expected = jac[:, 3:6].reshape(-1, 2, 3)
+        np.testing.assert_allclose(camera.slope(points), expected, rtol=1e-9, atol=1e-9)
+
+    @every_camera
+    def test_unprojects_as_opencv(self, camera):
+        cv2 = pytest.importorskip("cv2")
+        px = camera.project(seen_points(camera))
+        # OpenCV's fixed-point iteration diverges towards a fold.
+        px = px[np.hypot(*(camera.unproject(px).T)) < 0.6]
+        expected = cv2.undistortPoints(
+            px[:, None],
+            matrix(camera),
+            np.array(camera.distortion),
+            criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 500, 1e-14),
+        )
+        assert len(px) > 100
+        np.testing.assert_allclose(camera.unproject(px), expected[:, 0], rtol=0, atol=1e-9)
+
+
+class TestPinhole:
+    @every_camera
+    def test_slope_is_the_derivative(self, camera):
+        points = seen_points(camera)
+        numeric = numeric_slope(camera.project, points, 1e-3 * points[:, 2])
+        scale = camera.fx / points[:, 2, None, None]
+        np.testing.assert_allclose(camera.slope(points) / scale, numeric / scale, rtol=0, atol=1e-8)
+
+    @every_camera
+    def test_slope_at_the_border(self, camera):
+        uv = camera.unproject(border(camera))
+        uv = uv[np.isfinite(uv[:, 0])]
+        rays = np.concatenate([uv, np.ones((len(uv), 1))], axis=1)
+        numeric = numeric_slope(camera.project, rays, np.full(len(rays), 1e-3))
+        np.testing.assert_allclose(camera.slope(rays) / camera.fx, numeric / camera.fx, rtol=0, atol=1e-8)
+
+    @every_camera
+    def test_on_the_axis(self, camera):
+        point = np.array([0.0, 0.0, 4.0])
+        np.testing.assert_array_equal(camera.project(point), [camera.cx, camera.cy])
+        expected = [[camera.fx / 4.0, 0.0, 0.0], [0.0, camera.fy / 4.0, 0.0]]
+        np.testing.assert_allclose(camera.slope(point), expected, rtol=1e-15)
+        np.testing.assert_array_equal(camera.unproject(np.array([camera.cx, camera.cy])), [0.0, 0.0])
+
+    @every_camera
+    @given(scale=st.floats(1e-6, 1e6))
+    def test_only_the_direction_counts(self, camera, scale):
+        points = seen_points(camera)
+        np.testing.assert_allclose(camera.project(scale * points), camera.project(points), rtol=0, atol=1e-9)
+        along = (camera.slope(points) @ points[..., None])[..., 0]
+        np.testing.assert_allclose(along / camera.fx, 0.0, atol=1e-13)
+        np.testing.assert_allclose(
+            camera.slope(scale * points) * scale, camera.slope(points), rtol=1e-9, atol=1e-9
+        )
+        np.testing.assert_array_equal(camera.visible(scale * points), camera.visible(points))
+
+    @every_camera
+    def test_a_point_at_infinity_is_its_direction(self, camera):
+        direction = np.array([0.2, -0.1, 1.0])
+        far = np.array([5.0, -3.0, 2.0]) + 1e12 * direction
+        np.testing.assert_allclose(camera.project(direction), camera.project(far), rtol=0, atol=1e-8)
+
+    @every_camera
+    def test_round_trip_of_points(self, camera):
+        points = seen_points(camera)
+        uv = points[:, :2] / points[:, 2:]
+        # Close to a fold pixels hardly tell directions apart; the pixels of the next test do come back.
+        uv = uv[np.hypot(*uv.T) < 0.95 * camera.monotonic_radius]
+        rays = np.concatenate([uv, np.ones((len(uv), 1))], axis=1)
+        np.testing.assert_allclose(camera.unproject(camera.project(rays)), uv, rtol=0, atol=1e-12)
+
+    @every_camera
+    def test_round_trip_of_pixels(self, camera):
+        axes = np.linspace(-0.5, camera.width - 0.5, 53), np.linspace(-0.5, camera.height - 0.5, 41)
+        px = np.stack(np.meshgrid(*axes), axis=-1)
+        uv = camera.unproject(px)
+        rays = np.concatenate([uv, np.ones((*uv.shape[:-1], 1))], axis=-1)
+        solved = np.isfinite(uv).all(axis=-1)
+        assert uv.shape == px.shape
+        assert solved.all() == (camera is not FOLDING)
+        np.testing.assert_allclose(camera.project(rays)[solved], px[solved], rtol=0, atol=1e-9)
+
+    @every_camera
+    def test_unproject_slope_is_the_derivative_and_the_inverse(self, camera):
+        px = camera.project(seen_points(camera))
+        uv = camera.unproject(px)
+        inner = np.hypot(*uv.T) < 0.8 * camera.monotonic_radius
+        px, uv = px[inner], uv[inner]
+        slope = camera.unproject_slope(px)
+        numeric = numeric_slope(camera.unproject, px, np.full(len(px), 0.05))
+        np.testing.assert_allclose(slope * camera.fx, numeric * camera.fx, rtol=1e-7, atol=1e-7)
+        rays = np.concatenate([uv, np.ones((len(uv), 1))], axis=1)
+        both = camera.slope(rays)[..., :2] @ slope
+        np.testing.assert_allclose(both, np.broadcast_to(np.eye(2), both.shape), rtol=0, atol=1e-9)
+
+    def test_batch_and_single_agree(self):
+        camera, points = CAMERAS["wide"], seen_points(CAMERAS["wide"])[:24].reshape(2, 3, 4, 3)
+        single = points[1, 2, 3]
+        for function in (camera.project, camera.slope, camera.visible):
+            np.testing.assert_array_equal(function(points)[1, 2, 3], function(single))
+        px = camera.project(points)
+        for function in (camera.unproject, camera.unproject_slope, camera.inside):
+            np.testing.assert_array_equal(function(px)[1, 2, 3], function(px[1, 2, 3]))
+        assert camera.unproject(np.empty((0, 2))).shape == (0, 2)
+        assert camera.visible(np.empty((0, 3))).shape == (0,)
+
+    def test_params(self):
+        expected = [458.654, 457.296, 367.215, 248.375, *EUROC]
+        np.testing.assert_array_equal(CAMERAS["euroc"].params, expected)
+        assert CAMERAS["euroc"].params.dtype == np.float64
+        assert CAMERAS["euroc"].dim == 2
+
+    def test_a_list_of_distortion_makes_an_equal_camera(self):
+        camera = Pinhole(752, 480, 458.654, 457.296, 367.215, 248.375, list(EUROC))
+        assert camera == CAMERAS["euroc"]
+        assert hash(camera) == hash(CAMERAS["euroc"])
+        assert pickle.loads(pickle.dumps(camera)) == camera
+
+    def test_the_import_is_light(self):
+        heavy = "{'cv2', 'numba', 'scipy', 'matplotlib', 'gtsam', 'pycolmap'}"
+        program = f"import sys, rbpf.sensors.pinhole; print(sorted({heavy} & set(sys.modules)))"
+        done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+        assert done.stdout.strip() == "[]"
+
+
+class TestVisible:
+    @every_camera
+    def test_behind_and_beside_the_camera(self, camera):
+        behind = np.array(
+            [[0.0, 0.0, -1.0], [0.1, -0.2, -3.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -0.0]]
+        )
+        assert not camera.visible(behind).any()
+        assert not camera.visible(np.array([np.nan, 0.0, 1.0]))
+        assert camera.visible(np.array([0.0, 0.0, 1e-9]))
+
+    def test_the_edges_of_the_image(self):
+        camera = CAMERAS["undistorted"]
+        corners = np.array([[-0.5, -0.5], [639.5, 479.5]])
+        assert camera.inside(corners).all()
+        assert not camera.inside(corners + np.array([[-1e-9, 0.0], [0.0, 1e-9]])).any()
+        assert camera.inside(np.array([[9.5, 9.5], [629.5, 469.5]]), margin_px=10.0).all()
+        assert not camera.inside(np.array([[9.4, 100.0], [100.0, 469.6]]), margin_px=10.0).any()
+        assert camera.inside(np.array([-5.0, 10.0]), margin_px=-5.0)
+        assert not camera.inside(np.array([np.nan, 10.0]))
+
+    @every_camera
+    def test_margin(self, camera):
+        points = seen_points(camera)
+        near = ~camera.inside(camera.project(points), 25.0)
+        np.testing.assert_array_equal(camera.visible(points, margin_px=25.0), ~near)
+        assert near.any()
+
+
+GOOD = {"width": 640, "height": 480, "fx": 500.0, "fy": 500.0, "cx": 320.0, "cy": 240.0}
+FIVE = "the camera's distortion must be the 5 numbers k1, k2, p1, p2, k3 (k3 = 0 if there are four), got "
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"width": 0}, "the camera's width must be a positive whole number of pixels, got 0"),
+        ({"height": -480}, "the camera's height must be a positive whole number of pixels, got -480"),
+        ({"width": 640.0}, "the camera's width must be a positive whole number of pixels, got 640.0"),
+        ({"height": True}, "the camera's height must be a positive whole number of pixels, got True"),
+        ({"fx": 0.0}, "the camera's fx and fy must be positive, got 0.0 and 500.0 px"),
+        ({"fy": -1.0}, "the camera's fx and fy must be positive, got 500.0 and -1.0 px"),
+        ({"fx": float("inf")}, "the camera's fx must be a finite number, got inf"),
+        ({"cy": float("nan")}, "the camera's cy must be a finite number, got nan"),
+        ({"cx": "320"}, "the camera's cx must be a finite number, got '320'"),
+        ({"distortion": (0.1, 0.0, 0.0, 0.0)}, f"{FIVE}(0.1, 0.0, 0.0, 0.0)"),
+        ({"distortion": None}, f"{FIVE}None"),
+        (
+            {"distortion": (0.0, 0.0, 0.0, 0.0, float("inf"))},
+            "the camera's k3 must be a finite number, got inf",
+        ),
+        ({"distortion": (0.0, 0.0, "x", 0.0, 0.0)}, "the camera's p1 must be a finite number, got 'x'"),
+    ],
+)
+def test_a_wrong_camera_is_refused(wrong, message):
+    with pytest.raises(InputError, match=f"^{re.escape(message)}$"):
+        Pinhole(**(GOOD | wrong))
