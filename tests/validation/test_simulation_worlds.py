@@ -1,0 +1,272 @@
+"""Simulated cameras in a hand: their paths, and what their worlds hold."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from rbpf.errors import InputError
+from rbpf.lie import SE3
+from rbpf.sensors.features import FeatureLog
+from rbpf.validation.simulation.camera_paths import Wave, eased, looking, slowed, speeds
+from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
+from rbpf.validation.simulation.point_worlds import DeskWorld, PlanarTargetWorld
+from rbpf.validation.simulation.scene import PointWorld, Scene, hidden, inside, on_faces, populated
+from rbpf.validation.simulation.walked_worlds import CorridorWorld, LoopWorld
+
+HANDS = [DeskWorld(), LoopWorld(), CorridorWorld()]
+SEEDS = range(4)
+
+
+def built(world: PointWorld, seed: int) -> Scene:
+    return world.build(np.random.default_rng(seed))
+
+
+@cache
+def measured(world: PointWorld) -> FeatureLog:
+    return simulate_features(world, Measuring(), MONO, seed=0)
+
+
+def derivatives(world: DeskWorld | LoopWorld | CorridorWorld, seed: int) -> list[np.ndarray]:
+    """Speed, acceleration and jerk of the camera's centre, from differences."""
+    values, out = built(world, seed).world_from_camera[:, 4:], []
+    for _ in range(3):
+        values = np.diff(values, axis=0) * world.rate_hz
+        out.append(np.linalg.norm(values, axis=1))
+    return out
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("world", HANDS)
+def test_paths_are_those_of_a_hand(world: DeskWorld | LoopWorld | CorridorWorld, seed: int) -> None:
+    scene = built(world, seed)
+    turn, speed = speeds(scene.world_from_camera, scene.stamps_ns * 1e-9)
+    assert 0.1 < turn.max() < 0.9
+    assert 0.5 * world.speed_m_s < speed.max() < world.speed_m_s + 0.4
+    _, acceleration, jerk = derivatives(world, seed)
+    assert acceleration.max() < 4.0
+    assert jerk.max() < 30.0
+
+
+@pytest.mark.parametrize("world", HANDS)
+def test_paths_are_smooth(world: DeskWorld | LoopWorld | CorridorWorld) -> None:
+    """A jump in speed or acceleration would make the differences ten times as large at ten times the rate."""
+    slow = replace(world, frames=600)
+    fast = replace(slow, frames=6000, rate_hz=300.0)
+    for coarse, fine in zip(derivatives(slow, 0), derivatives(fast, 0), strict=True):
+        assert fine.max() < 1.3 * coarse.max() + 0.05
+
+
+@pytest.mark.parametrize("world", HANDS)
+def test_the_camera_is_held_still_at_first(world: DeskWorld | LoopWorld | CorridorWorld) -> None:
+    scene = built(world, 0)
+    turn, speed = speeds(scene.world_from_camera, scene.stamps_ns * 1e-9)
+    assert speed[0] < 0.001 and turn[0] < 0.001
+    assert speed[60:].max() > 0.1
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_desk_is_seen_from_its_distance(seed: int) -> None:
+    world = DeskWorld(wander=0.0, wrist_deg=0.0, tremor_m=0.0, tremor_deg=0.0)
+    scene = built(world, seed)
+    middle = SE3.inverse_transform(scene.world_from_camera, [0.0, 0.0, 0.5])
+    assert (middle[:, 2] > 1.0).all() and (middle[:, 2] < 1.5).all()
+    np.testing.assert_allclose(middle[:, :2], 0.0, atol=1e-12)
+    turn, speed = speeds(scene.world_from_camera, scene.stamps_ns * 1e-9)
+    # The limits are kept between the images of the path before it is slowed down.
+    assert turn.max() < 1.01 * world.turn_rad_s and speed.max() < 1.01 * world.speed_m_s
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_desk_is_swept(seed: int) -> None:
+    world = DeskWorld()
+    scene = built(world, seed)
+    assert (np.ptp(scene.world_from_camera[:, 4:], axis=0) > 0.2).all()
+    assert np.linalg.norm(np.ptp(scene.world_from_camera[:, 4:], axis=0)) > 0.6
+    forward = SE3.rotation(scene.world_from_camera)[:, :, 2]
+    assert np.degrees(np.arccos((forward @ forward[0]).min())) > 20.0
+    assert (np.abs(scene.points - [0.0, 0.0, 0.5]) <= [1.0, 1.0, 0.5]).all()
+    assert scene.points.shape == (300, 3)
+
+
+def test_the_desk_stays_in_view() -> None:
+    log = measured(HANDS[0])
+    assert min(len(frame.landmarks) for frame in log.frames) >= 15
+    depth = [SE3.inverse_transform(pose, [0.0, 0.0, 0.5])[2] for pose in log.truth.world_from_camera]
+    assert 0.9 < np.median(depth) < 1.6
+
+
+def test_a_loop_sees_its_first_landmarks_again() -> None:
+    world = HANDS[1]
+    log = measured(world)
+    names = [set(frame.landmarks.tolist()) for frame in log.frames]
+    lap = int(world.rate_hz * 2.0 * np.pi * world.radius_m / world.speed_m_s)
+    assert world.laps == pytest.approx((world.frames - 1 - 0.5 * world.rate_hz) / lap, rel=1e-3)
+    first = set.union(*names[:60])
+    assert len(first & set.union(*names[lap:])) > 0.5 * len(first)
+    assert not first & set.union(*names[lap // 2 - 60 : lap // 2])
+    # Whence those that come back were lost for most of the lap.
+    assert np.linalg.norm(np.diff(log.truth.world_from_camera[[15, 15 + lap], 4:], axis=0)) < 0.3
+
+
+def test_a_corridor_leaves_its_landmarks_behind() -> None:
+    log = measured(HANDS[2])
+    names = [set(frame.landmarks.tolist()) for frame in log.frames]
+    start, middle, end = (set.union(*names[i : i + 100]) for i in (0, 450, 900))
+    assert not start & middle and not middle & end
+    assert len(set.union(*names)) > 300
+    x = log.truth.world_from_camera[:, 4]
+    assert x[0] == pytest.approx(1.0, abs=0.1) and 26.0 < x[-1] < 29.0
+    assert (np.diff(x[60:]) > 0.0).all()
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("world", HANDS)
+def test_neither_camera_nor_points_are_in_a_block(world: PointWorld, seed: int) -> None:
+    scene = built(world, seed)
+    assert len(scene.blocks) > 2
+    assert (scene.blocks[:, 0] < scene.blocks[:, 1]).all()
+    assert not inside(scene.world_from_camera[:, 4:], scene.blocks).any()
+    assert not inside(scene.points, scene.blocks).any()
+
+
+def test_points_of_a_loop_are_on_its_walls_floor_and_ceiling() -> None:
+    world = HANDS[1]
+    points = built(world, 0).points
+    far = np.abs(points[:, :2]).max(axis=1)
+    core = (3.0 - 1.2) / np.sqrt(2.0)
+    level = np.isclose(points[:, 2], 0.0) | np.isclose(points[:, 2], 2.5)
+    assert (level | np.isclose(far, 4.2) | np.isclose(far, core)).all()
+    assert np.isclose(far, core).sum() > 50
+    assert level.sum() > 200
+
+
+def test_a_target_is_seen_from_rest() -> None:
+    world = PlanarTargetWorld()
+    log = measured(world)
+    assert log.known is not None and log.truth is not None
+    assert (log.truth.world_from_camera == log.truth.world_from_camera[0]).all()
+    corners = np.array([log.truth.landmarks[name] for name in log.known.names.tolist()])
+    side = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1)
+    np.testing.assert_allclose(side, 0.3)
+    np.testing.assert_allclose(corners.mean(axis=0), [3.0, 0.0, 0.0], atol=1e-12)
+    extent = np.linalg.svd(corners - corners.mean(axis=0), compute_uv=False)
+    assert extent[2] < 1e-12 < 0.1 < extent[1]
+    turned = np.degrees(
+        np.arccos(np.abs(np.cross(corners[1] - corners[0], corners[3] - corners[0])[0]) / 0.09)
+    )
+    assert turned == pytest.approx(20.0)
+    depth = [log.truth.landmarks[name][0] for name in range(4, 20)]
+    assert 1.0 <= min(depth) < 2.0 and 3.0 < max(depth) <= 6.0
+    assert len(log.frames[0].landmarks) == 20
+
+
+def test_frames_are_stamped_at_their_rate() -> None:
+    stamps = built(DeskWorld(frames=61), 0).stamps_ns
+    assert stamps.dtype == np.int64
+    assert stamps[[0, 1, 30, 60]].tolist() == [0, 33_333_333, 1_000_000_000, 2_000_000_000]
+
+
+def test_a_wave_stays_within_its_bound() -> None:
+    wave = Wave.random(np.array([0.5, 0.0]), (0.2, 1.0), np.random.default_rng(0))
+    signal = wave(np.linspace(0.0, 500.0, 20_000))
+    assert 0.4 < np.abs(signal[:, 0]).max() <= 0.5
+    assert not signal[:, 1].any()
+
+
+def test_the_start_is_eased() -> None:
+    seconds = np.linspace(0.0, 4.0, 4001)
+    time = eased(seconds, 2.0)
+    pace = np.diff(time) / 0.001
+    assert pace[0] < 1e-6 and (np.diff(pace) > -1e-9).all()
+    np.testing.assert_allclose(pace[2000:], 1.0)
+    assert time[-1] == pytest.approx(3.0)
+    np.testing.assert_array_equal(eased(seconds, 0.0), seconds)
+
+
+def test_a_camera_looks_at_what_it_should() -> None:
+    eye, target = np.array([[1.0, -2.0, 0.5]]), np.array([-0.3, 1.0, 0.2])
+    pose = looking(eye, target - eye)
+    np.testing.assert_allclose(SE3.inverse_transform(pose, target)[0, :2], 0.0, atol=1e-12)
+    above = SE3.inverse_transform(pose, target + np.array([0.0, 0.0, 0.1]))[0]
+    assert abs(above[0]) < 1e-12 and above[1] < 0.0 < above[2]
+
+
+@pytest.mark.parametrize(("limits", "pace"), [((0.5, 9.0), 0.25), ((9.0, 0.5), 0.5), ((9.0, 9.0), 1.0)])
+def test_a_path_is_slowed_down_and_never_sped_up(limits: tuple[float, float], pace: float) -> None:
+    def path(time: np.ndarray) -> np.ndarray:
+        return SE3.exp(time[:, None] * np.array([0.0, 0.0, 1.0, 0.0, 0.0, 2.0]))
+
+    seconds = np.linspace(0.0, 2.0, 50)
+    np.testing.assert_allclose(slowed(path, seconds, *limits)(seconds), path(pace * seconds), atol=1e-12)
+
+
+def test_blocks_hide_from_behind_and_show_their_faces() -> None:
+    block = np.array([[[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]])
+    eye = np.array([-1.0, 0.5, 0.4])
+    behind, before, beside, front, back = (
+        [2, 0.5, 0.5],
+        [-0.1, 0.5, 0.5],
+        [2, 3, 0.5],
+        [0, 0.7, 0.3],
+        [1, 0.7, 0.3],
+    )
+    points = np.array([behind, before, beside, front, back, [-3.0, 0.5, 0.4]])
+    assert hidden(eye, points, block).tolist() == [True, False, False, False, True, False]
+
+
+def test_points_on_faces_are_uniform_by_area() -> None:
+    box = np.array([[0.0, 0.0, 0.0], [4.0, 1.0, 2.0]])
+    points = on_faces(box, [(1, 0), (0, 1)], 4000, np.random.default_rng(0))
+    front, end = points[:, 1] == 0.0, points[:, 0] == 4.0
+    assert (front | end).all()
+    assert abs(front.sum() - 3200) < 4.0 * np.sqrt(4000 * 0.8 * 0.2)
+    assert abs(points[front, 0].mean() - 2.0) < 4.0 * np.sqrt(16.0 / 12.0 / 3200)
+
+
+def test_points_without_renewal_stay() -> None:
+    rng = np.random.default_rng(0)
+    points, present = populated(lambda count: rng.random((count, 3)), 5, 40, 0.0, rng)
+    assert points.shape == (5, 3)
+    assert present.tolist() == [[0, 40]] * 5
+
+
+@pytest.mark.parametrize(
+    ("world", "options", "message"),
+    [
+        (DeskWorld, {"frames": 1}, "frames must be a whole number, at least 2, got 1"),
+        (DeskWorld, {"points": 0}, "points must be a whole number, at least 1, got 0"),
+        (DeskWorld, {"blocks": -1}, "blocks must be a whole number, at least 0"),
+        (DeskWorld, {"rate_hz": 0.0}, "rate_hz must be a positive number, got 0.0"),
+        (DeskWorld, {"speed_m_s": -1.0}, "speed_m_s must be a positive number"),
+        (DeskWorld, {"turn_rad_s": float("inf")}, "turn_rad_s must be a positive number"),
+        (DeskWorld, {"size_m": (1.0, 0.0, 1.0)}, "size_m must be three positive numbers"),
+        (DeskWorld, {"size_m": (1.0, float("nan"), 1.0)}, "size_m must be three positive numbers"),
+        (DeskWorld, {"nearest_m": 2.0}, "nearest_m = 2.0 must be less than farthest_m = 1.5"),
+        (DeskWorld, {"wander": -0.1}, "wander must be zero or a positive number"),
+        (DeskWorld, {"elevation_deg": 85.0}, "elevation_deg = 85.0 .* vertical"),
+        (DeskWorld, {"renewal": 1.0}, "renewal must be a probability"),
+        (LoopWorld, {"frames": 0}, "frames must be a whole number"),
+        (LoopWorld, {"radius_m": 0.0}, "radius_m must be a positive number"),
+        (LoopWorld, {"aisle_m": 1.0}, "aisle_m must be more than 1 m, so that one can walk, got 1.0"),
+        (LoopWorld, {"aisle_m": 6.0}, "aisle_m = 6.0 must be less than twice radius_m = 3.0"),
+        (LoopWorld, {"eye_m": 3.0}, "eye_m = 3.0 must be between the floor and height_m = 2.5"),
+        (LoopWorld, {"shake_m": -0.1}, "shake_m must be zero"),
+        (CorridorWorld, {"points": 0}, "points must be a whole number"),
+        (CorridorWorld, {"width_m": 0.9}, "width_m must be more than 1 m"),
+        (CorridorWorld, {"glance_deg": -1.0}, "glance_deg must be zero"),
+        (
+            CorridorWorld,
+            {"length_m": 20.0},
+            "would walk to 27.2 m, but must stop 1 m before the end .* 20.0 m",
+        ),
+        (PlanarTargetWorld, {"frames": 0}, "frames must be a whole number, at least 1"),
+        (PlanarTargetWorld, {"distance_m": 0.0}, "distance_m must be a positive number"),
+        (PlanarTargetWorld, {"tilt_deg": 90.0}, "tilt_deg = 90.0 .* must be below 90"),
+        (PlanarTargetWorld, {"nearest_m": 7.0}, "nearest_m = 7.0 must be less than farthest_m"),
+    ],
+)
+def test_refused_options(world: type, options: dict[str, object], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        world(**options)

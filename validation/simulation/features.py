@@ -1,0 +1,219 @@
+"""Simulates what a camera measures of a world of points, feature by feature, as a `FeatureLog` with ground truth.
+
+A measurement is the true point's projection plus Gaussian noise, or an outlier. Points are hidden by opaque blocks, by
+distance and by the image's border.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rbpf.errors import InputError
+from rbpf.lie import SE3
+from rbpf.sensors.features import CameraTruth, FeatureFrame, FeatureLog, KnownPoints
+from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+from rbpf.validation.simulation.feature_tracks import Tracker
+from rbpf.validation.simulation.limits import (
+    check_counts,
+    check_not_negative,
+    check_order,
+    check_positive,
+    check_shares,
+)
+from rbpf.validation.simulation.scene import PointWorld, Scene, hidden
+
+MONO = Pinhole(640, 480, 400.0, 400.0, 319.5, 239.5)
+STEREO = RectifiedStereo(MONO, 0.12)
+
+CERTAIN = 5.0
+"""Points nearer to the border than this many standard deviations of the noise are not measured: the noise would have
+to be cut off at the border."""
+
+RADIUS = 0.35
+"""Of the ellipse near which the known points are chosen, as a share of the image's size: in its middle half."""
+
+LEAST_SPREAD = 0.05
+"""Known points are on a line if they extend, in the image, less than this share of their length to the side."""
+
+
+@dataclass(frozen=True)
+class Measuring:
+    """How the visible points are measured.
+
+    Attributes:
+        noise_px: standard deviation per coordinate.
+        measurements: most of them per frame.
+        known: number of points known beforehand, around the middle of the first image; a world with a target of its
+            own ignores it. They are measured whenever they are visible, and never disappear.
+        known_std_m: standard deviation per axis of their given positions.
+        new_per_frame: most points that enter the map per frame; the first frame takes as many as fit.
+        outlier_rate: probability that a measurement lies anywhere in the image; never that which begins a landmark.
+        dropout: probability per frame that a tracked point is missed and its track goes on.
+        turnover: probability per frame that a tracked point is lost and its place given to another.
+        rest_frames: a lost point is not looked for during these.
+        border_px: no patch fits into the image's border of this width.
+        nearest_m: points nearer than this are not recognised.
+        farthest_m: nor those farther away.
+        occlusion: whether blocks hide what is behind them.
+    """
+
+    noise_px: float = 1.0
+    measurements: int = 25
+    known: int = 4
+    known_std_m: float = 0.001
+    new_per_frame: int = 3
+    outlier_rate: float = 0.0
+    dropout: float = 0.02
+    turnover: float = 0.005
+    rest_frames: int = 15
+    border_px: float = 8.0
+    nearest_m: float = 0.2
+    farthest_m: float = 8.0
+    occlusion: bool = True
+
+    def __post_init__(self) -> None:
+        """Checks that the numbers make sense."""
+        check_counts(self, {"measurements": 1, "known": 0, "new_per_frame": 0, "rest_frames": 0})
+        check_positive(self, "noise_px", "farthest_m")
+        check_not_negative(self, "known_std_m", "border_px", "nearest_m")
+        check_shares(self, "outlier_rate", "dropout", "turnover")
+        check_order(self, "nearest_m", "farthest_m")
+
+
+def simulate_features(
+    world: PointWorld, measuring: Measuring, camera: Pinhole | RectifiedStereo, seed: int
+) -> FeatureLog:
+    """Simulates a recording; the same arguments give the same bytes.
+
+    Args:
+        world: where the camera goes and what is there.
+        measuring: which points are measured, and how well.
+        camera: that measures.
+        seed: of the only random generator.
+
+    Returns:
+        The log; landmarks are named by their rows among the world's points. The truth has every point that was ever
+        there.
+
+    Raises:
+        InputError: too few points are visible in the first frame, or those known lie on a line in it.
+    """
+    rng = np.random.default_rng(seed)
+    scene = world.build(rng)
+    known = _known(scene, measuring, camera)
+    scene.present[known, 1] = len(scene.stamps_ns)
+    frames = _measure(scene, measuring, camera, known, rng)
+    landmarks = dict(enumerate(scene.points))
+    truth = CameraTruth(scene.stamps_ns, scene.world_from_camera, landmarks)
+    given = _given(scene, measuring, known, rng) if known.size else None
+    return FeatureLog(f"simulated {scene.name}, seed {seed}", camera, frames, given, truth)
+
+
+def _known(scene: Scene, measuring: Measuring, camera: Pinhole | RectifiedStereo) -> np.ndarray:
+    """(M,) rows of the points known beforehand: the world's target, or points visible in the first frame."""
+    visible, z = _view(scene, measuring, camera, 0)
+    wanted = measuring.known if scene.target is None else len(scene.target)
+    if wanted > measuring.measurements:
+        raise InputError(
+            f"{wanted} known points do not fit into {measuring.measurements} measurements per frame"
+        )
+    seen = np.flatnonzero(visible) if scene.target is None else scene.target[visible[scene.target]]
+    if len(seen) < wanted:
+        raise InputError(
+            f"the first frame of the {scene.name} sees {len(seen)} points that can be known, expected {wanted}: "
+            "simulate more points, fewer known ones or another place of the camera"
+        )
+    known = seen[_spread(z[seen, :2], wanted, _image_size(camera))] if scene.target is None else seen
+    if wanted > 2 and _flatness(z[known, :2]) < LEAST_SPREAD:
+        raise InputError(
+            f"the known points of the {scene.name} lie on a line in the first frame: use another seed or more points"
+        )
+    return known
+
+
+def _spread(px: np.ndarray, count: int, size: np.ndarray) -> np.ndarray:
+    """(M,) rows of pixels (K, 2) nearest to places on an ellipse about the middle of the image."""
+    angle = 2.0 * np.pi * (np.arange(count) + 0.5) / max(count, 1)
+    places = size * (0.5 + RADIUS * np.stack([np.cos(angle), np.sin(angle)], axis=-1))
+    free = np.ones(len(px), dtype=bool)
+    rows = np.zeros(count, dtype=np.int64)
+    for k, place in enumerate(places):
+        rows[k] = np.argmin(np.where(free, np.linalg.norm(px - place, axis=1), np.inf))
+        free[rows[k]] = False
+    return rows
+
+
+def _flatness(px: np.ndarray) -> float:
+    """Least over greatest extent of pixels (M, 2)."""
+    extent = np.linalg.svd(px - px.mean(axis=0), compute_uv=False)
+    return float(extent[1] / extent[0])
+
+
+def _given(scene: Scene, measuring: Measuring, known: np.ndarray, rng: np.random.Generator) -> KnownPoints:
+    error = measuring.known_std_m * rng.standard_normal((known.size, 3))
+    cov = np.tile(measuring.known_std_m**2 * np.eye(3), (known.size, 1, 1))
+    return KnownPoints(known, scene.points[known] + error, cov)
+
+
+def _measure(
+    scene: Scene,
+    measuring: Measuring,
+    camera: Pinhole | RectifiedStereo,
+    known: np.ndarray,
+    rng: np.random.Generator,
+) -> list[FeatureFrame]:
+    width, height = _image_size(camera)
+    tracker = Tracker(
+        known,
+        count=len(scene.points),
+        places=measuring.measurements,
+        new_per_frame=measuring.new_per_frame,
+        turnover=measuring.turnover,
+        dropout=measuring.dropout,
+        rest_frames=measuring.rest_frames,
+        image_px=(int(width), int(height)),
+        rng=rng,
+    )
+    seen = np.zeros(len(scene.points), dtype=bool)
+    frames = []
+    for frame, stamp in enumerate(scene.stamps_ns.tolist()):
+        visible, z = _view(scene, measuring, camera, frame)
+        rows = tracker.step(visible, z[:, :2])
+        noisy = z[rows] + measuring.noise_px * rng.standard_normal((rows.size, camera.dim))
+        wrong = seen[rows] & (rng.random(rows.size) < measuring.outlier_rate)
+        noisy[wrong] = _anywhere(camera, int(wrong.sum()), rng)
+        seen[rows] = True
+        keep = camera.inside(noisy)
+        cov = np.tile(measuring.noise_px**2 * np.eye(camera.dim), (int(keep.sum()), 1, 1))
+        frames.append(FeatureFrame(stamp, rows[keep], noisy[keep], cov))
+    return frames
+
+
+def _view(
+    scene: Scene, measuring: Measuring, camera: Pinhole | RectifiedStereo, frame: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Which points (Q,) the camera sees in a frame, and where (Q, p); pixels of the others mean nothing."""
+    pose = scene.world_from_camera[frame]
+    local = SE3.inverse_transform(pose, scene.points)
+    distance = np.linalg.norm(local, axis=1)
+    there = (scene.present[:, 0] <= frame) & (frame < scene.present[:, 1])
+    near = (distance >= measuring.nearest_m) & (distance <= measuring.farthest_m)
+    visible = there & near & camera.visible(local, measuring.border_px + CERTAIN * measuring.noise_px)
+    if measuring.occlusion and len(scene.blocks):
+        rows = np.flatnonzero(visible)
+        visible[rows] = ~hidden(SE3.translation(pose), scene.points[rows], scene.blocks)
+    return visible, camera.project(local)
+
+
+def _anywhere(camera: Pinhole | RectifiedStereo, count: int, rng: np.random.Generator) -> np.ndarray:
+    """(K, p) pixels uniform in the image; a stereo pair's disparity is positive."""
+    px = rng.uniform(0.0, _image_size(camera) - 1.0, (count, 2))
+    if isinstance(camera, Pinhole):
+        return px
+    return np.column_stack([px, rng.uniform(0.0, px[:, 0])])
+
+
+def _image_size(camera: Pinhole | RectifiedStereo) -> np.ndarray:
+    """Width and height, px."""
+    image = camera if isinstance(camera, Pinhole) else camera.camera
+    return np.array([image.width, image.height], dtype=float)

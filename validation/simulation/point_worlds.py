@@ -1,0 +1,197 @@
+"""A desk seen by a camera in a hand, and a flat target seen by a camera at rest.
+
+The world's z axis points up.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from rbpf.errors import InputError
+from rbpf.validation.simulation.camera_paths import Wave, eased, frame_seconds, looking, shaken, slowed
+from rbpf.validation.simulation.limits import (
+    check_counts,
+    check_not_negative,
+    check_order,
+    check_positive,
+    check_shares,
+)
+from rbpf.validation.simulation.scene import Scene, frame_stamps, outside, populated
+
+ARM_HZ = 0.2, 0.8
+WRIST_HZ = 0.8, 2.0
+"""Before the path is slowed down to the speed of a hand, to about a third."""
+
+TREMOR_HZ = 1.0, 3.0
+
+RISE = 0.25
+"""How far the camera goes up and down about the point looked at, as a share of how far it goes to the side."""
+
+
+@dataclass(frozen=True)
+class DeskWorld:
+    """A camera in a hand moves over a desk and looks at the things on it; it is held still at first.
+
+    The point looked at, the middle of the box at first, wanders over the desk, and the camera about that point. The
+    path is slowed down until neither `speed_m_s` nor `turn_rad_s` is passed; the hand's tremor comes on top.
+
+    Attributes:
+        frames: number of images.
+        rate_hz: images per second.
+        points: number of points at any time, uniform in a box with its base on z = 0 and its middle over the origin.
+        size_m: of the box along x, y, z.
+        nearest_m: least distance of the camera from the point that it looks at.
+        farthest_m: greatest distance.
+        elevation_deg: the camera looks down at this angle, on the average.
+        sweep_deg: greatest turn about the point looked at to either side; a quarter as much up and down.
+        wander: greatest shift of the point looked at, as a share of the box's size.
+        wrist_deg: greatest rotation by the wrist, per axis.
+        speed_m_s: highest speed.
+        turn_rad_s: highest rate of turn.
+        tremor_m: greatest displacement by the hand's tremor, per axis.
+        tremor_deg: greatest rotation by it, per axis.
+        start_s: the camera reaches its pace after this time.
+        blocks: number of opaque things on the desk.
+        renewal: share of the points that disappear for good per second; others appear elsewhere.
+    """
+
+    frames: int = 1000
+    rate_hz: float = 30.0
+    points: int = 300
+    size_m: tuple[float, float, float] = (2.0, 2.0, 1.0)
+    nearest_m: float = 1.0
+    farthest_m: float = 1.5
+    elevation_deg: float = 55.0
+    sweep_deg: float = 40.0
+    wander: float = 0.3
+    wrist_deg: float = 10.0
+    speed_m_s: float = 0.3
+    turn_rad_s: float = 0.5
+    tremor_m: float = 0.002
+    tremor_deg: float = 0.3
+    start_s: float = 1.0
+    blocks: int = 3
+    renewal: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Checks that there is something to simulate."""
+        check_counts(self, {"frames": 2, "points": 1, "blocks": 0})
+        check_positive(self, "rate_hz", "nearest_m", "farthest_m", "speed_m_s", "turn_rad_s")
+        check_not_negative(self, "sweep_deg", "wander", "wrist_deg", "tremor_m", "tremor_deg", "start_s")
+        check_shares(self, "renewal")
+        if not all(0.0 < size < np.inf for size in self.size_m):
+            raise InputError(f"size_m must be three positive numbers, got {self.size_m}")
+        check_order(self, "nearest_m", "farthest_m")
+        steepest = abs(self.elevation_deg) + RISE * self.sweep_deg
+        if not steepest < 90.0:
+            raise InputError(
+                f"elevation_deg = {self.elevation_deg} and sweep_deg = {self.sweep_deg} let the camera look along the "
+                "vertical, where it has no upright pose: lessen one of them"
+            )
+
+    def build(self, rng: np.random.Generator) -> Scene:
+        """Draws the points, the blocks and the path."""
+        blocks = self._blocks(rng)
+        half = np.array(self.size_m) / 2
+        draw = outside(lambda count: half * [0, 0, 1] + rng.uniform(-half, half, (count, 3)), blocks)
+        points, present = populated(draw, self.points, self.frames, self.renewal / self.rate_hz, rng)
+        path = self._path(rng)
+        return Scene("desk", frame_stamps(self.frames, self.rate_hz), path, points, present, blocks)
+
+    def _blocks(self, rng: np.random.Generator) -> np.ndarray:
+        """(B, 2, 3) blocks that stand on the desk."""
+        size = np.array(self.size_m)
+        half = size * rng.uniform([0.04, 0.04, 0.1], [0.08, 0.08, 0.25], (self.blocks, 3))
+        middle = size * rng.uniform(-0.4, 0.4, (self.blocks, 3))
+        middle[:, 2] = half[:, 2]
+        return np.stack([middle - half, middle + half], axis=1)
+
+    def _path(self, rng: np.random.Generator) -> np.ndarray:
+        """(T, 7) poses."""
+        seconds = frame_seconds(self.frames, self.rate_hz)
+        sweep = self._sweep(rng)
+        bound = [np.deg2rad(self.tremor_deg)] * 3 + [self.tremor_m] * 3
+        tremor = Wave.random(np.array(bound), TREMOR_HZ, rng)
+        time = eased(seconds, self.start_s)
+        return shaken(slowed(sweep, seconds, self.speed_m_s, self.turn_rad_s)(time), tremor, time)
+
+    def _sweep(self, rng: np.random.Generator) -> Callable[[np.ndarray], np.ndarray]:
+        """Poses (T, 7) at times (T,), faster than a hand."""
+        turn = np.deg2rad(self.sweep_deg) * np.array([1.0, RISE])
+        reach = 0.5 * (self.farthest_m - self.nearest_m)
+        arm = Wave.random(np.array([*(0.5 * self.wander * np.array(self.size_m)), *turn, reach]), ARM_HZ, rng)
+        start = arm(np.zeros(1))[:, :3] - [0.0, 0.0, 0.5 * self.size_m[2]]
+        wrist = Wave.random(np.deg2rad([self.wrist_deg] * 3 + [0.0] * 3), WRIST_HZ, rng)
+
+        def sweep(time: np.ndarray) -> np.ndarray:
+            wave = arm(time)
+            side, rise = wave[:, 3], np.deg2rad(self.elevation_deg) + wave[:, 4]
+            away = np.stack(
+                [np.sin(side) * np.cos(rise), -np.cos(side) * np.cos(rise), np.sin(rise)], axis=-1
+            )
+            distance = 0.5 * (self.nearest_m + self.farthest_m) + wave[:, 5:]
+            target = wave[:, :3] - start
+            return shaken(looking(target + distance * away, -away), wrist, time)
+
+        return sweep
+
+
+@dataclass(frozen=True)
+class PlanarTargetWorld:
+    """A camera at rest sees four known points on a plane far away, and other points of unknown depth (E06, figure 9).
+
+    The camera is at the origin and looks along x; the target is a square before it.
+
+    Attributes:
+        frames: number of images.
+        rate_hz: images per second.
+        points: number of other points.
+        distance_m: of the target's middle.
+        size_m: side of the target.
+        tilt_deg: the target is turned by this about the vertical; 0 faces the camera.
+        nearest_m: least depth of the other points.
+        farthest_m: greatest depth; inverse depth is uniform between.
+        half_view_deg: the other points are within this of the optical axis, to each side and up and down.
+    """
+
+    frames: int = 60
+    rate_hz: float = 30.0
+    points: int = 16
+    distance_m: float = 3.0
+    size_m: float = 0.3
+    tilt_deg: float = 20.0
+    nearest_m: float = 1.0
+    farthest_m: float = 6.0
+    half_view_deg: float = 25.0
+
+    def __post_init__(self) -> None:
+        """Checks that there is something to simulate."""
+        check_counts(self, {"frames": 1, "points": 0})
+        check_positive(self, "rate_hz", "distance_m", "size_m", "nearest_m", "farthest_m", "half_view_deg")
+        check_order(self, "nearest_m", "farthest_m")
+        if not (abs(self.tilt_deg) < 90.0 and self.half_view_deg < 90.0):
+            raise InputError(
+                f"tilt_deg = {self.tilt_deg} and half_view_deg = {self.half_view_deg} must be below 90"
+            )
+
+    def build(self, rng: np.random.Generator) -> Scene:
+        """Draws the points."""
+        points = np.concatenate([self._target(), self._others(rng)])
+        present = np.tile([0, self.frames], (len(points), 1))
+        path = looking(np.zeros((self.frames, 3)), np.tile([1.0, 0.0, 0.0], (self.frames, 1)))
+        stamps = frame_stamps(self.frames, self.rate_hz)
+        return Scene("target", stamps, path, points, present, np.zeros((0, 2, 3)), np.arange(4))
+
+    def _target(self) -> np.ndarray:
+        """(4, 3) corners."""
+        across, up = 0.5 * self.size_m * np.array([[-1.0, 1.0, 1.0, -1.0], [-1.0, -1.0, 1.0, 1.0]])
+        tilt = np.deg2rad(self.tilt_deg)
+        return np.stack([self.distance_m + np.sin(tilt) * across, np.cos(tilt) * across, up], axis=-1)
+
+    def _others(self, rng: np.random.Generator) -> np.ndarray:
+        """(P, 3) points in view."""
+        depth = 1.0 / rng.uniform(1.0 / self.farthest_m, 1.0 / self.nearest_m, (self.points, 1))
+        widest = np.tan(np.deg2rad(self.half_view_deg))
+        side = rng.uniform(-widest, widest, (self.points, 2))
+        return depth * np.concatenate([np.ones_like(depth), side], axis=-1)
