@@ -24,6 +24,10 @@ from rbpf.models import (
 )
 from rbpf.proposals import Prior, Terms
 
+_STATE = frozenset({Part.STATE})
+_MAP = frozenset({Part.LANDMARK})
+_BOTH = _STATE | _MAP
+
 
 @final
 class LandmarkMap(Conditional):
@@ -148,13 +152,31 @@ class LandmarkMap(Conditional):
 
     def terms(self, state: np.ndarray, groups: Sequence[Observations], prior: Prior) -> Terms:
         """Information of single-Gaussian landmarks; those of several components enter after sampling."""
-        return self._engine.terms(self._plan(groups), state, groups, prior)
+        for_state = [group for group in groups if Part.STATE in group.informs]
+        return self._engine.terms(self._plan(for_state), state, for_state, prior)
 
     def correct(
         self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]
     ) -> LogDensities:
         """Log p(z | x) and the landmarks' Kalman updates at the sampled states."""
-        return self._engine.correct(self._plan(groups), state, groups)
+        by_use = _by_use(groups)
+        log_density, late = np.zeros(self.n), np.zeros(self.n)
+        if by_use[_STATE]:
+            log_density += self._density(state, by_use[_STATE])
+        if by_use[_BOTH]:
+            both = self._engine.correct(self._plan(by_use[_BOTH]), state, by_use[_BOTH])
+            log_density, late = log_density + both.all, both.late
+        if by_use[_MAP]:
+            self._engine.correct(self._plan(by_use[_MAP]), state, by_use[_MAP])
+        return LogDensities(log_density, late)
+
+    def _density(self, state: np.ndarray, groups: Sequence[Observations]) -> np.ndarray:
+        """Log p(z | x) (N,) of observations that leave the landmarks as they are."""
+        plan = self._plan(groups)
+        if plan.late:
+            raise InputError("a landmark of several components cannot be observed without being updated")
+        terms = self._engine.terms(plan, state, groups, Prior.exactly(self.space, state))
+        return terms.log_factor - 0.5 * (terms.quad + terms.log_det)
 
     def resample(self, ancestors: np.ndarray) -> None:
         """Nothing is copied: the lineage has advanced. Compacts what has lost its descendants."""
@@ -218,3 +240,11 @@ class LandmarkMap(Conditional):
     def _is_ready(self, landmark_id: int) -> np.ndarray:
         layout = self._layout_of(landmark_id)
         return layout.landmark.ready(self.read(np.array([landmark_id])))[:, 0]
+
+
+def _by_use(groups: Sequence[Observations]) -> dict[frozenset[Part], list[Observations]]:
+    """The groups by what they inform."""
+    by_use: dict[frozenset[Part], list[Observations]] = {_STATE: [], _BOTH: [], _MAP: []}
+    for group in groups:
+        by_use[group.informs].append(group)
+    return by_use

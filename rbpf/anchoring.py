@@ -22,6 +22,7 @@ from rbpf import gaussian
 from rbpf.errors import InputError
 from rbpf.estimate import Estimate, mixture_estimate
 from rbpf.filter import Filter, StepReport
+from rbpf.lie import LieGroup
 from rbpf.likelihoods import Gaussian
 from rbpf.models import Births, Landmark, LineariseAt, ObservationModel, Records
 from rbpf.numeric import linearise
@@ -43,6 +44,28 @@ class Anchored:
 
     mean: np.ndarray
     factor: np.ndarray
+
+
+def relative_estimate(
+    space: LieGroup,
+    anchored: Anchored,
+    state: np.ndarray,
+    log_weights: np.ndarray,
+    origin: np.ndarray | None = None,
+) -> Estimate:
+    """Mean and covariance of states (N, E) relative to the anchored frame, origin · x_0⁻¹ · x.
+
+    Args:
+        space: the group of the states.
+        anchored: the frame x_0 in each particle's own world.
+        state: (N, E) sampled states.
+        log_weights: (N,) normalised.
+        origin: (E,) what the frame is called in the result; by default the identity.
+    """
+    relative = space.between(anchored.mean, state)
+    factor = space.adjoint(space.inverse(relative)) @ anchored.factor
+    base = relative if origin is None else space.compose(origin, relative)
+    return mixture_estimate(Prior(space, base, np.zeros((1, space.dim)), factor), None, log_weights)
 
 
 @final
@@ -102,12 +125,7 @@ class StartAnchor:
     def state_estimate(self, anchored: Anchored) -> Estimate:
         """Mean and covariance of the present state relative to the start, start · x_0⁻¹ · x."""
         space, particles = self._filter.space, self._filter.particles
-        relative = space.between(anchored.mean, particles.state)
-        adjoint = space.adjoint(space.inverse(relative))
-        law = Prior(
-            space, space.compose(self._start, relative), np.zeros((1, space.dim)), adjoint @ anchored.factor
-        )
-        return mixture_estimate(law, None, particles.log_weights)
+        return relative_estimate(space, anchored, particles.state, particles.log_weights, self._start)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """For a checkpoint."""

@@ -5,7 +5,7 @@ import numpy as np
 from rbpf import gaussian
 from rbpf.errors import InputError
 from rbpf.lie import LieGroup
-from rbpf.models import Observations, Transition
+from rbpf.models import Observations, Part, Transition
 
 
 def checked_transition(transition: Transition, state: np.ndarray, space: LieGroup, what: str) -> Transition:
@@ -38,6 +38,10 @@ def checked_observations(group: Observations) -> Observations:
         raise InputError(
             f"{name} measures {p} numbers: expected z (K, {p}) and cov (K, {p}, {p}), "
             f"got {group.z.shape} and {group.cov.shape}"
+        )
+    if not group.informs or not group.informs <= {Part.STATE, Part.LANDMARK}:
+        raise InputError(
+            f"observations of {name} inform Part.STATE, Part.LANDMARK or both, got {group.informs}"
         )
     if not (np.isfinite(group.z).all() and np.isfinite(group.cov).all()):
         raise InputError(f"a measurement of {name} or its covariance is not finite")

@@ -45,7 +45,7 @@ class StateOnly(Conditional):
         """Σ log p(z | x); there is nothing to update."""
         total = np.zeros(state.shape[0])
         for group in groups:
-            nu = group.model.residual(group.z, group.model.predict(state[:, None, :]))
+            nu = group.model.innovation(group.z, state[:, None, :])
             cov = np.broadcast_to(group.cov, (*nu.shape, nu.shape[-1]))
             total += (group.likelihood or GAUSSIAN).log_density(nu, cov).sum(axis=1)
         return LogDensities(total, np.zeros_like(total))

@@ -113,6 +113,17 @@ class ObservationModel(ABC):
         """Z − h (…, p); override to wrap angles."""
         return z - predicted
 
+    def innovation(
+        self,
+        z: np.ndarray,
+        state: np.ndarray,
+        landmark: np.ndarray | None = None,
+        const: np.ndarray | None = None,
+        substate: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """ν (…, p): residual(z, predict(…)); override, with `jacobians`, for a constraint g(z, x, l) = 0 on z."""
+        return self.residual(z, self.predict(state, landmark, const, substate))
+
     def visible(self, state: np.ndarray, landmark: np.ndarray, const: np.ndarray | None = None) -> np.ndarray:
         """Whether the sensor could see the landmark (…), bool; by default always."""
         return np.ones(np.broadcast_shapes(state.shape[:-1], landmark.shape[:-1]), dtype=bool)
@@ -211,6 +222,8 @@ class Observations:
             None where the model reads no landmark.
         log_new: log-density, in inverse measurement units, that a particle pays for a NEW observation.
         log_clutter: the same for a NULL one.
+        informs: STATE: it refines and weighs the particles; LANDMARK: it updates the landmark. Two groups may share
+            a measurement, one for each (E06 §5.2: the epipolar part for the state, all of it for the depth).
     """
 
     z: np.ndarray
@@ -220,6 +233,7 @@ class Observations:
     ids: np.ndarray | None = None
     log_new: float = 0.0
     log_clutter: float = 0.0
+    informs: frozenset[Part] = frozenset({Part.STATE, Part.LANDMARK})
 
 
 @dataclass(frozen=True)

@@ -55,19 +55,17 @@ def linearise(
     Raises:
         InputError: a prediction or a Jacobian has the wrong shape.
     """
-    predicted = model.predict(state, landmark, const, substate)
+    nu = model.innovation(z, state, landmark, const, substate)
     parts = (state, landmark, substate)
     expected = (*np.broadcast_shapes(*(part.shape[:-1] for part in parts if part is not None)), model.dim)
-    if predicted.shape != expected:
-        raise InputError(
-            f"{type(model).__name__}.predict returned shape {predicted.shape}, expected {expected}"
-        )
+    if nu.shape != np.broadcast_shapes(expected, z.shape):
+        raise InputError(f"{type(model).__name__}.predict returned shape {nu.shape}, expected {expected}")
     jacobians = model.jacobians(state, landmark, const, substate)
     if jacobians is None:
         jacobians = numeric_jacobians(model, space, state, landmark, const, substate)
     sizes = (space.dim, *(0 if part is None else part.shape[-1] for part in parts[1:]))
     blocks = [_full(model, block, (*expected, size)) for block, size in zip(jacobians, sizes, strict=True)]
-    return model.residual(z, predicted), Jacobians(*blocks)
+    return nu, Jacobians(*blocks)
 
 
 def _full(model: ObservationModel, block: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray | None:

@@ -12,7 +12,7 @@ from rbpf.genealogy import Lineage
 from rbpf.lie import LieGroup
 from rbpf.models import Conditional, LogDensities, Observations, Part, Transition
 from rbpf.numeric import linearise
-from rbpf.proposals import Prior, Terms
+from rbpf.proposals import Prior, Terms, take
 from rbpf.reference import information, stacked
 
 
@@ -27,6 +27,10 @@ class KalmanSubstate(Conditional):
         space: the group of the sampled state.
         mean: (m,) initial mean.
         cov: (m, m) initial covariance, may be singular.
+
+    Attributes:
+        mean: (N, m) of each particle.
+        cov: (N, m, m), or (1, m, m) as long as it does not differ between particles.
     """
 
     supplies = Part.SUBSTATE
@@ -44,7 +48,7 @@ class KalmanSubstate(Conditional):
     def begin(self, n: int, lineage: Lineage) -> None:
         """Every particle starts with the initial law."""
         self.mean = np.repeat(self._mean[None], n, axis=0)
-        self.cov = np.repeat(self._cov[None], n, axis=0)
+        self.cov = self._cov[None]
 
     def predict(self, transition: Transition, space: LieGroup) -> Prior:
         """Joint law of (ε, s_t): ε = B s + w₁, s_t = A s + b + w₂, kept as s_t | ε."""
@@ -60,28 +64,24 @@ class KalmanSubstate(Conditional):
                 f"drift (·, {m}), the motion model gives (·, …) {sizes}"
             )
         noise = transition.noise_factor @ np.swapaxes(transition.noise_factor, -1, -2)
-        stack = np.concatenate(
-            [
-                np.broadcast_to(transition.coupling, (self.mean.shape[0], d, self.mean.shape[1])),
-                np.broadcast_to(transition.dynamics, self.cov.shape),
-            ],
-            axis=1,
-        )
+        shared = np.broadcast_shapes(transition.coupling.shape[:1], transition.dynamics.shape[:1])
+        blocks = (transition.coupling, transition.dynamics)
+        stack = np.concatenate([np.broadcast_to(b, (*shared, *b.shape[1:])) for b in blocks], axis=1)
         joint = gaussian.symmetrise(stack @ self.cov @ np.swapaxes(stack, -1, -2)) + noise
-        means = np.einsum("nij,nj->ni", stack, self.mean)
+        means = (stack @ self.mean[..., None])[..., 0]
         self._increment_mean = means[:, :d]
         self._predicted = means[:, d:] + transition.drift
         cov_ee, cov_se = joint[:, :d, :d], joint[:, d:, :d]
         self._gain = cov_se @ np.linalg.pinv(cov_ee, hermitian=True) if d else np.zeros(cov_se.shape)
-        closed = np.concatenate(
-            [-self._gain, np.broadcast_to(np.eye(self._mean.size), self.cov.shape)], axis=2
-        )
+        unit = np.broadcast_to(np.eye(m), (self._gain.shape[0], m, m))
+        closed = np.concatenate([-self._gain, unit], axis=2)
         self._rest = gaussian.symmetrise(closed @ joint @ np.swapaxes(closed, -1, -2))
         return Prior(space, transition.mean, self._increment_mean, gaussian.psd_factor(cov_ee), centred=False)
 
     def given(self, increment: np.ndarray) -> np.ndarray:
         """Mean (N, m) of s_t given increments (N, d)."""
-        return self._predicted + np.einsum("nij,nj->ni", self._gain, increment - self._increment_mean)
+        offset = increment - self._increment_mean
+        return self._predicted + (self._gain @ offset[..., None])[..., 0]
 
     def terms(self, state: np.ndarray, groups: Sequence[Observations], prior: Prior) -> Terms:
         """All rows that read the substate are stacked: they are correlated through it."""
@@ -113,11 +113,11 @@ class KalmanSubstate(Conditional):
         return LogDensities(total, np.zeros_like(total))
 
     def resample(self, ancestors: np.ndarray) -> None:
-        """Copies small arrays."""
+        """Copies small arrays; what all particles share stays."""
         self._increment_mean = self._increment_mean[ancestors]
         self._predicted = self._predicted[ancestors]
-        self._gain = self._gain[ancestors]
-        self._rest = self._rest[ancestors]
+        self._gain = take(self._gain, ancestors)
+        self._rest = take(self._rest, ancestors)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Means and covariances."""

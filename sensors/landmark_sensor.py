@@ -1,13 +1,14 @@
 """Sensors of landmarks: with names that the recording gives, or without, by maximum likelihood in each particle."""
 
 from collections.abc import Sequence
-from typing import Any, Protocol, final
+from typing import Protocol, final
 
 import numpy as np
 
 from rbpf.association import ExistenceModel, Gates, associate
 from rbpf.belief import Belief
 from rbpf.models import NEW, Births, Landmark, Likelihood, ObservationModel, Observations, Sensor
+from rbpf.sensors.names import Names
 
 
 class Sightings(Protocol):
@@ -34,13 +35,12 @@ class NamedLandmarkSensor(Sensor):
         self.model = model
         self.landmark = landmark
         self.likelihood = likelihood
-        self._ids: dict[Any, int] = {}
-        self._read: tuple[dict[int, Any] | None, int, int] = (None, 0, -1)
+        self._names = Names()
 
     def observe(self, frame: Sightings, belief: Belief) -> Sequence[Observations]:
         """The sightings of landmarks that the map holds."""
-        self._look_up(belief.catalogue)
-        ids = np.array([self._ids.get(name, NEW) for name in frame.landmarks.tolist()], dtype=np.int64)
+        known_ids = self._names.ids(belief.catalogue)
+        ids = np.array([known_ids.get(name, NEW) for name in frame.landmarks.tolist()], dtype=np.int64)
         known = ids != NEW
         if not known.any():
             return []
@@ -48,20 +48,13 @@ class NamedLandmarkSensor(Sensor):
 
     def births(self, frame: Sightings, belief: Belief, observed: Sequence[Observations]) -> Sequence[Births]:
         """The first sighting of each new name; a second one in the same frame is left to the next frame."""
-        names = frame.landmarks.tolist()
-        new = [k for k, name in enumerate(names) if name not in self._ids and name not in names[:k]]
+        names, known = frame.landmarks.tolist(), self._names.ids(belief.catalogue)
+        new = [k for k, name in enumerate(names) if name not in known and name not in names[:k]]
         if not new:
             return []
         return [
             Births(frame.z[new], frame.cov_z[new], self.model, self.landmark, facts=[names[k] for k in new])
         ]
-
-    def _look_up(self, catalogue: dict[int, Any]) -> None:
-        """Inverts the catalogue where it has changed; ids only grow, so size and last id tell."""
-        last = next(reversed(catalogue), -1)
-        if self._read[0] is not catalogue or self._read[1:] != (len(catalogue), last):
-            self._ids = {name: landmark_id for landmark_id, name in catalogue.items()}
-            self._read = (catalogue, len(catalogue), last)
 
 
 @final

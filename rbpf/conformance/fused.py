@@ -33,8 +33,8 @@ def check_kernel(model: ObservationModel, scene: Scene, numeric_tolerance: float
     predicted = model.predict(*lanes.args)
     for lane, count in ((0, min(BLOCK, predicted.shape[0])), (1, 3)):
         nu, found = _run(name, fused, lanes, predicted[lane], count)
-        residual = model.residual(predicted[lane], predicted[:count])
-        require_close(f"{name}: nu differs from residual(z, predict)", nu, residual, KERNEL_TOLERANCE)
+        expected_nu = model.innovation(predicted[lane], *lanes.args)[:count]
+        require_close(f"{name}: nu differs from residual(z, predict)", nu, expected_nu, KERNEL_TOLERANCE)
         for block in ("state", "landmark"):
             what, expected = f"{name}: jac_{block} differs from NumPy's", getattr(twin, block)[:count]
             require_close(what, getattr(found, block), expected, tolerance)

@@ -102,7 +102,7 @@ def update(
         cov = np.empty((size_cov, BLOCK))
         const = np.empty((size_const, BLOCK))
         nu = np.empty((p, BLOCK))
-        jac_state = np.empty((p, dim, BLOCK))
+        jac_state = np.zeros((p, dim, BLOCK))  # a kernel fills the leading columns, those of what it reads
         jac_map = np.empty((p, dim_map, BLOCK))
         cross = np.empty((p, dim_map, BLOCK))
         total = np.empty((p, p, BLOCK))

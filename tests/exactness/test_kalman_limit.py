@@ -134,4 +134,4 @@ def test_the_marginal_prior_of_the_increment_has_the_substates_covariance(rng):
     kalman.predict(F, Q, drift)
     np.testing.assert_allclose(prior.mean, np.tile(kalman.mean[:2], (3, 1)), atol=TOLERANCE)
     cov = prior.factor @ np.swapaxes(prior.factor, -1, -2)
-    np.testing.assert_allclose(cov, np.tile(kalman.cov[:2, :2], (3, 1, 1)), atol=TOLERANCE)
+    np.testing.assert_allclose(cov, kalman.cov[None, :2, :2], atol=TOLERANCE)

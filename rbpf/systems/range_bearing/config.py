@@ -7,11 +7,8 @@ import numpy as np
 
 from rbpf.association import ExistenceModel, Gates
 from rbpf.errors import InputError
-from rbpf.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobis
-from rbpf.models import Likelihood, Proposal, Resampler
-from rbpf.proposals import EkfProposal, PriorProposal
-from rbpf.resampling import EssTriggered, Multinomial, Residual, Stratified, Systematic
 from rbpf.sensors.readers import LogNoise
+from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig, ResamplingConfig
 
 
 @dataclass(frozen=True)
@@ -50,75 +47,6 @@ class AssociationConfig:
     def existence(self) -> ExistenceModel:
         """Evidence counters."""
         return ExistenceModel(hit=self.hit, miss=self.miss, drop=self.drop)
-
-
-@dataclass(frozen=True)
-class LikelihoodConfig:
-    """Likelihood of an innovation.
-
-    Attributes:
-        kind: Gaussian, truncated Mahalanobis (S05 (6)), or Gaussian with outliers.
-        truncation: T_l of the truncated form.
-        outlier_rate: ε.
-        outlier_volume: V, of the measurement space, in its units.
-    """
-
-    kind: Literal["gaussian", "truncated", "outliers"] = "gaussian"
-    truncation: float = 4.0
-    outlier_rate: float = 0.02
-    outlier_volume: float = 60.0
-
-    def build(self) -> Likelihood:
-        """The likelihood."""
-        if self.kind == "truncated":
-            return TruncatedMahalanobis(self.truncation)
-        if self.kind == "outliers":
-            return GaussianWithOutliers(self.outlier_rate, self.outlier_volume)
-        return Gaussian()
-
-
-@dataclass(frozen=True)
-class ProposalConfig:
-    """Where particles are sampled and how they are weighted.
-
-    Attributes:
-        kind: the motion prior (bootstrap), or the EKF-refined Gaussian (FastSLAM 2.0).
-        iterations: linearisations of the refined proposal; 1 is E06.
-        weights: the exact importance ratio, or E06's linearised joint marginal.
-    """
-
-    kind: Literal["ekf", "prior"] = "ekf"
-    iterations: int = 3
-    weights: Literal["exact", "linearised"] = "exact"
-
-    def build(self) -> Proposal:
-        """The proposal."""
-        if self.kind == "prior":
-            return PriorProposal()
-        return EkfProposal(self.weights == "exact", self.iterations)
-
-
-@dataclass(frozen=True)
-class ResamplingConfig:
-    """When and how particles are resampled.
-
-    Attributes:
-        scheme: how.
-        ess_threshold: resample when the effective sample size falls below this share of the particles.
-    """
-
-    scheme: Literal["systematic", "stratified", "residual", "multinomial"] = "systematic"
-    ess_threshold: float = 0.5
-
-    def build(self) -> Resampler:
-        """The resampler."""
-        schemes: dict[str, Resampler] = {
-            "systematic": Systematic(),
-            "stratified": Stratified(),
-            "residual": Residual(),
-            "multinomial": Multinomial(),
-        }
-        return EssTriggered(schemes[self.scheme], self.ess_threshold)
 
 
 @dataclass(frozen=True)

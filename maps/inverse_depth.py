@@ -1,0 +1,42 @@
+"""A point on a ray: inverse depth in the frame of the first sighting (E06 §5.1)."""
+
+from typing import final
+
+import numpy as np
+
+from rbpf.errors import InputError
+from rbpf.lie import SE3
+from rbpf.models import Landmark, Records
+
+
+@final
+class InverseDepth(Landmark):
+    """b = (u, v, q): the point (u, v, 1)/q in the frame of the first sighting, E06 §5.1.
+
+    The record's constant is that frame, world_from_anchor (7,): the particle's own pose at the first sighting, which
+    its descendants inherit. u and v are normalised image coordinates, q = 1/z in 1/m; q = 0 is at infinity.
+
+    Args:
+        ready_ratio: it is ready to become a point when the standard deviation of q is below this share of q.
+    """
+
+    dim = 3
+    constants = 7
+
+    def __init__(self, ready_ratio: float = 0.1) -> None:
+        if not ready_ratio > 0.0:
+            raise InputError(f"ready_ratio must be positive, got {ready_ratio}")
+        self.ready_ratio = ready_ratio
+
+    def homogeneous(self, mean: np.ndarray, const: np.ndarray | None = None) -> np.ndarray:
+        """(…, 3), (…, 7) → (…, 4): (R (u, v, 1) + q t, q); no division, so that q may be 0."""
+        assert const is not None
+        ray = np.concatenate([mean[..., :2], np.ones((*mean.shape[:-1], 1))], axis=-1)
+        turned = SE3.transform(const, ray) - SE3.translation(const)
+        rho = mean[..., 2:]
+        return np.concatenate([turned + rho * SE3.translation(const), rho], axis=-1)
+
+    def ready(self, records: Records) -> np.ndarray:
+        """Whether q is positive and well known, (N, K): then depth is nearly Gaussian too (Fig. 2)."""
+        rho, std = records.mean[..., 2], np.sqrt(records.cov[..., 2, 2])
+        return (rho > 0.0) & (std <= self.ready_ratio * rho)

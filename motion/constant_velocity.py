@@ -1,0 +1,133 @@
+"""Constant velocity on SE(3), driven by white-noise acceleration (E06 §3.1).
+
+    T_t = T_{t−1} Exp(δ v_{t−1} + w₁),   v_t = v_{t−1} + w₂,   cov(w₁, w₂) = Q of E06 (5)
+
+The velocity v = [ω, v] is that of the body in its own frame. E06 writes camera_from_world with the exponential on the
+left: the same motion, with the sign of v reversed.
+"""
+
+from dataclasses import dataclass
+from typing import Literal, final
+
+import numpy as np
+
+from rbpf import gaussian
+from rbpf.errors import InputError
+from rbpf.lie import SE3, Euclidean, Product
+from rbpf.models import MotionModel, Transition
+
+POSE_AND_VELOCITY = Product(SE3, Euclidean(6))
+"""State (N, 13) of `SampledVelocity`: world_from_body, then its velocity."""
+
+
+@dataclass(frozen=True)
+class PoseLaw:
+    """Given as control: the body is where this law says, however it came there. The start of a run, or a kidnapping.
+
+    Attributes:
+        mean: (7,) world_from_body.
+        cov: (6, 6) in the right chart at the mean, order [ω, v].
+    """
+
+    mean: np.ndarray
+    cov: np.ndarray
+
+
+def velocity_walk(std_walk: np.ndarray, dt: float) -> np.ndarray:
+    """Factor L (12, 12) of E06 (5), Q = L Lᵀ, in closed form; its first six columns are what moves the pose.
+
+    The last six columns carry the variance δΣ/4 that the velocity keeps once the pose is given.
+
+    Args:
+        std_walk: (6,) σ of E06 (4): the velocity's random walk in one second, (rad/s, m/s)/√s.
+        dt: δ, seconds.
+    """
+    sigma = np.diag(std_walk)
+    factor = np.zeros((12, 12))
+    factor[:6, :6] = np.sqrt(dt**3 / 3.0) * sigma
+    factor[6:, :6] = np.sqrt(0.75 * dt) * sigma
+    factor[6:, 6:] = 0.5 * np.sqrt(dt) * sigma
+    return factor
+
+
+@final
+class MarginalVelocity(MotionModel):
+    """The velocity as a Kalman substate: the filter needs `KalmanSubstate(SE3, mean, cov)` with six numbers.
+
+    Exact: Log(T_{t−1}⁻¹ T_t) = δ v_{t−1} + w₁ is a linear measurement of the velocity.
+
+    Args:
+        std_walk: (6,) or a number, see `velocity_walk`.
+    """
+
+    space = SE3
+
+    def __init__(self, std_walk: np.ndarray) -> None:
+        self.std_walk = _checked(std_walk)
+
+    def transition(self, state: np.ndarray, control: PoseLaw | None, dt: float) -> Transition:
+        """Chart at the previous pose: ε = δ v + w₁."""
+        coupling, factor = dt * np.eye(6)[None], velocity_walk(self.std_walk, dt)
+        if control is not None:
+            state, factor = _placed(state, control), _with_law(factor, control)
+            coupling = np.zeros((1, 6, 6))
+        return Transition(state, factor[None], coupling, np.eye(6)[None], np.zeros((1, 6)))
+
+
+@final
+class SampledVelocity(MotionModel):
+    """The velocity sampled with the pose, states (N, 13) of `POSE_AND_VELOCITY`.
+
+    Args:
+        std_walk: (6,) or a number, see `velocity_walk`.
+        mode: "joint" samples all twelve dimensions; "paper" moves the velocity to its conditional mean given the
+            sampled pose, v ← v + (3/2δ) w₁ (E06 §3.1), and drops the variance δΣ/4 around it.
+        std_start: (6,) or a number, standard deviation of the velocity where a `PoseLaw` places the body, rad/s, m/s.
+    """
+
+    space = POSE_AND_VELOCITY
+
+    def __init__(
+        self,
+        std_walk: np.ndarray,
+        mode: Literal["paper", "joint"] = "joint",
+        std_start: np.ndarray | float = 0.0,
+    ) -> None:
+        self.std_walk = _checked(std_walk)
+        self.std_start = _checked(std_start)
+        self.columns = 6 if mode == "paper" else 12
+
+    def transition(self, state: np.ndarray, control: PoseLaw | None, dt: float) -> Transition:
+        """Chart at (T Exp(δv), v): T Exp(δv + w₁) = T Exp(δv) Exp(J_r(δv) w₁) to first order."""
+        placed, velocity = state[:, :7], state[:, 7:]
+        if control is not None:
+            factor = _with_law(np.zeros((12, 12)), control)
+            factor[6:, 6:] = np.diag(self.std_start)
+            return Transition(np.concatenate([_placed(placed, control), velocity], axis=1), factor[None])
+        step = dt * velocity
+        factor = np.repeat(velocity_walk(self.std_walk, dt)[None, :, : self.columns], state.shape[0], axis=0)
+        factor[:, :6] = SE3.right_jacobian(step) @ factor[:, :6]
+        return Transition(np.concatenate([SE3.retract(placed, step), velocity], axis=1), factor)
+
+
+def _placed(state: np.ndarray, law: PoseLaw) -> np.ndarray:
+    if law.mean.shape != (7,) or law.cov.shape != (6, 6) or not np.isfinite(law.mean).all():
+        raise InputError(
+            f"a PoseLaw needs a finite mean (7,) and cov (6, 6), got {law.mean} and {law.cov.shape}"
+        )
+    return np.broadcast_to(SE3.normalise(law.mean), state.shape).copy()
+
+
+def _with_law(factor: np.ndarray, law: PoseLaw) -> np.ndarray:
+    """The pose's noise is the law's, independent of the velocity's."""
+    placed = factor.copy()
+    placed[:, :6] = 0.0
+    placed[:6, :6] = gaussian.psd_factor(law.cov)
+    return placed
+
+
+def _checked(std: np.ndarray | float) -> np.ndarray:
+    array = np.broadcast_to(np.asarray(std, dtype=float), (6,)).copy()
+    if not (np.isfinite(array).all() and (array >= 0.0).all()):
+        raise InputError(f"standard deviations of a velocity must be finite and not negative, got {std}")
+    return array

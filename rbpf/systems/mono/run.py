@@ -1,0 +1,104 @@
+"""Runs the filter over a log of features, and tells the results in the known points' world."""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rbpf.anchoring import relative_estimate
+from rbpf.estimate import Estimate
+from rbpf.filter import Filter, StepReport
+from rbpf.lie import SE3
+from rbpf.sensors.features import FeatureLog
+from rbpf.systems.mono.config import MonoConfig
+from rbpf.systems.mono.system import build_filter, start_law, world_of
+
+
+@dataclass
+class MonoRun:
+    """A finished run; T frames.
+
+    Attributes:
+        log: what was filtered.
+        config: with what settings.
+        filter: in its final state.
+        stamps_ns: (T,).
+        world_from_camera: (T, 7) online filtered mean, in the world of the known points, else of the first camera.
+        cov: (T, 6, 6) of it in the right chart at the mean, order [ω, v].
+        ess: (T,) effective sample size before resampling.
+        resampled: (T,) bool.
+        log_evidence: (T,) increments.
+        nis: (T,) normalised innovation squared.
+        rows: (T,) its degrees of freedom.
+        seconds: (T,) time of the filter's step.
+    """
+
+    log: FeatureLog
+    config: MonoConfig
+    filter: Filter
+    stamps_ns: np.ndarray
+    world_from_camera: np.ndarray
+    cov: np.ndarray
+    ess: np.ndarray
+    resampled: np.ndarray
+    log_evidence: np.ndarray
+    nis: np.ndarray
+    rows: np.ndarray
+    seconds: np.ndarray
+
+
+def run(
+    log: FeatureLog, config: MonoConfig, on_step: Callable[[int, Filter, StepReport], None] | None = None
+) -> MonoRun:
+    """Filters a whole log.
+
+    Args:
+        log: of one camera.
+        config: all settings.
+        on_step: called after each frame with its number, the filter and what the step did.
+
+    Raises:
+        InputError: the log or a setting does not fit, or no particle explains the observations.
+    """
+    filter_ = build_filter(log, config)
+    control = start_law(log, config)
+    total = len(log.frames)
+    numbers = [np.zeros(total) for _ in range(6)]
+    stamps = np.array([frame.stamp_ns for frame in log.frames], dtype=np.int64)
+    done = MonoRun(log, config, filter_, stamps, np.zeros((total, 7)), np.zeros((total, 6, 6)), *numbers)
+    for t, frame in enumerate(log.frames):
+        started = time.perf_counter()
+        report = filter_.step(frame, control if t == 0 else None, frame.stamp_ns)
+        done.seconds[t] = time.perf_counter() - started
+        estimate = pose_estimate(filter_, report)
+        done.world_from_camera[t], done.cov[t] = estimate.mean, estimate.cov
+        done.ess[t], done.resampled[t], done.log_evidence[t] = (
+            report.ess,
+            report.resampled,
+            report.log_evidence,
+        )
+        done.nis[t], done.rows[t] = report.nis, report.rows
+        if on_step is not None:
+            on_step(t, filter_, report)
+    return done
+
+
+def pose_estimate(filter_: Filter, report: StepReport) -> Estimate:
+    """Mean and covariance of world_from_camera after a step.
+
+    With known points it is that of the samples, each with its own uncertain world: the pose and the world's place are
+    correlated before sampling. Without them it is that of the refined mixture.
+    """
+    world = world_of(filter_)
+    if world is None:
+        return Estimate(report.estimate.mean[:7], report.estimate.cov[:6, :6])
+    particles = filter_.particles
+    return relative_estimate(SE3, world, particles.state[:, :7], particles.log_weights)
+
+
+def landmark_cloud(filter_: Filter, ids: Sequence[int]) -> np.ndarray:
+    """Each particle's own mean of point landmarks (N, K, 3), in the world of the known points."""
+    points = filter_.belief().read(np.asarray(ids)).mean
+    world = world_of(filter_)
+    return points if world is None else SE3.inverse_transform(world.mean[:, None], points)
