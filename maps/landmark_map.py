@@ -1,6 +1,7 @@
 """A growing map of landmarks, each an independent Gaussian given the trajectory (E06 (1), S05 (3))."""
 
 from collections.abc import Sequence
+from operator import is_
 from typing import Any, final
 
 import numpy as np
@@ -45,6 +46,7 @@ class LandmarkMap(Conditional):
         self.layouts: list[Layout] = []
         self.kinds = np.zeros(0, dtype=np.int64)
         self.catalogue: dict[int, Any] = {}
+        self._planned: tuple[Sequence[Observations], Plan] | None = None
 
     def begin(self, n: int, lineage: Lineage) -> None:
         """An empty map."""
@@ -87,6 +89,7 @@ class LandmarkMap(Conditional):
     def remove(self, ids: np.ndarray) -> None:
         """Drops landmarks from all particles."""
         self._known(ids)
+        self._planned = None
         self.store.remove(ids)
         self.kinds[ids] = -1
         for landmark in ids.tolist():
@@ -112,6 +115,7 @@ class LandmarkMap(Conditional):
 
     def promote(self, ids: np.ndarray, to: Landmark | None = None) -> None:
         """Turns landmarks into single Gaussian points in all particles at once, by their own `promote`."""
+        self._planned = None
         for landmark_id in ids:
             layout = self._layout_of(landmark_id)
             column = self.store.read(int(landmark_id))
@@ -148,13 +152,15 @@ class LandmarkMap(Conditional):
 
     def terms(self, state: np.ndarray, groups: Sequence[Observations], prior: Prior) -> Terms:
         """Information of single-Gaussian landmarks; those of several components enter after sampling."""
-        return self._engine.terms(self._plan(groups), state, groups, prior)
+        plan = self._plan(groups)
+        self._planned = (groups, plan)
+        return self._engine.terms(plan, state, groups, prior)
 
     def correct(
         self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]
     ) -> LogDensities:
         """Log p(z | x) and the landmarks' Kalman updates at the sampled states."""
-        return self._engine.correct(self._plan(groups), state, groups)
+        return self._engine.correct(self._plan_again(groups), state, groups)
 
     def resample(self, ancestors: np.ndarray) -> None:
         """Nothing is copied: the lineage has advanced. Compacts what has lost its descendants."""
@@ -206,6 +212,13 @@ class LandmarkMap(Conditional):
     def _plan(self, groups: Sequence[Observations]) -> Plan:
         plain = np.array([layout.landmark.components == 1 for layout in self.layouts], dtype=bool)
         return make_plan(groups, self.n, self.kinds, plain)
+
+    def _plan_again(self, groups: Sequence[Observations]) -> Plan:
+        """The plan of `terms` where these are the same groups; a resampling may have replaced some."""
+        planned, self._planned = self._planned, None
+        if planned is not None and len(planned[0]) == len(groups) and all(map(is_, planned[0], groups)):
+            return planned[1]
+        return self._plan(groups)
 
     def _layout_of(self, landmark_id: int) -> Layout:
         return self.layouts[self.kinds[landmark_id]]

@@ -154,9 +154,10 @@ class SharedStore:
         """
         access = self.access(columns)
         now = self.lineage.generation
-        stale = np.unique(columns[self._generation[columns] != now])
-        if stale.size == 0:
+        moved = self._generation[columns] != now
+        if not moved.any():
             return access, access.slabs
+        stale = np.unique(columns[moved])
         pool = self._pool(int(columns[0]))
         old = self._slab[stale].copy()
         self._slab[stale] = pool.take(stale.size)
@@ -181,7 +182,7 @@ class SharedStore:
             members = self._members.get(generation)
             if not members:
                 continue
-            alive = np.unique(self.lineage.rows(generation))
+            alive = self.lineage.survivors(generation)
             if alive.size <= COLD_SHARE * self._survivors.get(generation, self.n):
                 self._survivors[generation] = alive.size
                 for column in members:
@@ -268,12 +269,11 @@ class SharedStore:
         cold = self._cold.get(column)
         if cold is not None:
             if alive.size <= COLD_SHARE * cold.kept.size:
-                rows = np.searchsorted(cold.kept, alive)
-                self._cold[column] = Cold(alive, np.ascontiguousarray(cold.data[:, rows]))
+                self._cold[column] = Cold(alive, cold.data.take(np.searchsorted(cold.kept, alive), axis=1))
         elif alive.size <= HOT_SHARE * self.n:
             pool = self._pool(column)
             slab = self._slab[column : column + 1]
-            self._cold[column] = Cold(alive, np.ascontiguousarray(pool.data[slab[0]][:, alive]))
+            self._cold[column] = Cold(alive, pool.data[slab[0]].take(alive, axis=1))
             pool.give(slab)
             self._slab[column] = -1
 

@@ -82,9 +82,15 @@ class Lineage:
             )
         return self._cache[generation]
 
+    def survivors(self, generation: int) -> np.ndarray:
+        """Particles of a retained generation that still have descendants, ascending."""
+        alive = np.zeros(self.n, dtype=np.bool_)
+        alive[self.rows(generation)] = True
+        return np.flatnonzero(alive)
+
     def distinct(self, generation: int) -> int:
         """Number of particles of a retained generation that still have descendants."""
-        return int(np.unique(self.rows(generation)).size)
+        return self.survivors(generation).size
 
     def retain(self, generation: int) -> None:
         """Keeps the nodes of a generation."""

@@ -1,9 +1,10 @@
 """The type of a fused observation kernel, and the decorator that makes one."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, final
 
 from numba import cfunc, float64, int64, types, void
+from numba.core.types.function_type import WrapperAddressProtocol
 
 BLOCK = 128
 """Particles per block: long enough that what a loop costs to start is small beside its work; in the L2 cache."""
@@ -23,7 +24,26 @@ KERNEL_TYPE = types.FunctionType(_SIGNATURE)
 """First-class function type: the drivers call a kernel through a pointer, so they compile once for all models."""
 
 
-def observation_kernel(function: Callable[..., None]) -> Any:
+@final
+class ObservationKernel(WrapperAddressProtocol):
+    """A compiled kernel as the drivers take it: its type is looked up, not worked out anew at every call."""
+
+    _numba_type_ = KERNEL_TYPE
+
+    def __init__(self, compiled: Any) -> None:
+        self.compiled = compiled
+        """Numba's object, which owns the machine code."""
+
+    def __wrapper_address__(self) -> int:
+        """Where the machine code starts."""
+        return int(self.compiled.address)
+
+    def signature(self) -> Any:
+        """The kernel's signature."""
+        return _SIGNATURE
+
+
+def observation_kernel(function: Callable[..., None]) -> ObservationKernel:
     """Compiles `function(state, mean, const, z, params, n, nu, jac_state, jac_landmark)` into a fused kernel.
 
     Given one measurement `z` (p,) of one landmark, the kernel fills for the lanes 0..n-1
@@ -31,4 +51,4 @@ def observation_kernel(function: Callable[..., None]) -> Any:
     and `jac_landmark` (p, D, BLOCK), from `state` (E, BLOCK), `mean` (D, BLOCK), `const` (A, BLOCK) and the
     model's `params` (P,). Write the body as a loop over lanes; it must not raise.
     """
-    return cfunc(_SIGNATURE, cache=True, error_model="numpy")(function)
+    return ObservationKernel(cfunc(_SIGNATURE, cache=True, error_model="numpy")(function))
