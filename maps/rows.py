@@ -13,12 +13,14 @@ from rbpf.likelihoods import Gaussian
 from rbpf.maps.layout import Layout
 from rbpf.maps.plan import Batch, Plan, Row
 from rbpf.maps.shared import SharedStore
-from rbpf.models import FusedKernel, Likelihood, LogDensities, Observations, Records
+from rbpf.models import FusedKernel, Likelihood, LogDensities, Observations, Part, Records
 from rbpf.numeric import linearise
 from rbpf.proposals import Prior, Terms
 
 GAUSSIAN = Gaussian()
 _NO_MASK = np.zeros((0, 0), dtype=np.bool_)
+_BY_LANDMARK = frozenset({Part.LANDMARK})
+"""All that an update differentiates by: the state has been sampled."""
 
 
 class RowEngine:
@@ -183,8 +185,9 @@ class RowEngine:
     ) -> None:
         ids, ks = batch.ids[rows], batch.ks[rows]
         columns, records = self._read(ids)
+        at = state[:, None, :]
         nu, jac = linearise(
-            group.model, self.space, group.z[ks], state[:, None, :], records.mean, records.const
+            group.model, self.space, group.z[ks], at, records.mean, records.const, by=_BY_LANDMARK
         )
         assert jac.landmark is not None
         mask = None if batch.mask is None else batch.mask[:, rows]
@@ -251,7 +254,8 @@ class RowEngine:
         columns, records = self._read(ids)
         assert records.log_weights is not None
         mean, cov = records.mean[:, 0], records.cov[:, 0]
-        nu, jac = linearise(group.model, self.space, group.z[row.k], state[:, None, :], mean, records.const)
+        at = state[:, None, :]
+        nu, jac = linearise(group.model, self.space, group.z[row.k], at, mean, records.const, by=_BY_LANDMARK)
         assert jac.landmark is not None
         mask = None if row.mask is None else np.repeat(row.mask[:, None], mean.shape[1], axis=1)
         likelihood = group.likelihood or GAUSSIAN

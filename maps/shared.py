@@ -143,8 +143,9 @@ class SharedStore:
         if (generations == generations[0]).all():
             maps, which = self.lineage.rows(int(generations[0]))[None], np.zeros(columns.size, dtype=np.int64)
         else:
-            distinct, which = np.unique(generations, return_inverse=True)
-            maps = np.array([self.lineage.rows(int(g)) for g in distinct])
+            number: dict[int, int] = {}
+            which = np.array([number.setdefault(g, len(number)) for g in generations.tolist()])
+            maps = np.array([self.lineage.rows(g) for g in number])
         return Access(self._pool(int(columns[0])).data, self._slab[columns], which, maps)
 
     def rewrite(self, columns: np.ndarray) -> tuple[Access, np.ndarray]:
@@ -272,9 +273,8 @@ class SharedStore:
                 self._cold[column] = Cold(alive, cold.data.take(np.searchsorted(cold.kept, alive), axis=1))
         elif alive.size <= HOT_SHARE * self.n:
             pool = self._pool(column)
-            slab = self._slab[column : column + 1]
-            self._cold[column] = Cold(alive, pool.data[slab[0]].take(alive, axis=1))
-            pool.give(slab)
+            self._cold[column] = Cold(alive, pool.data[self._slab[column]].take(alive, axis=1))
+            pool.give(self._slab[column : column + 1])
             self._slab[column] = -1
 
     def _move(self, column: int, generation: int) -> None:

@@ -147,7 +147,7 @@ class Proposed:
         root = take(self.root, ancestors)
         u = take(self.mean, ancestors) + np.einsum("nab,nb->na", root, noise)
         log_root = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
-        return u, 0.5 * ((noise * noise).sum(axis=1) - (u * u).sum(axis=1)) + log_root
+        return u, 0.5 * (noise * noise - u * u).sum(axis=1) + log_root
 
 
 @final
