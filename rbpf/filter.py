@@ -8,6 +8,7 @@ The bootstrap filter, FastSLAM 2.0 and the exact importance ratio differ in the 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -227,7 +228,7 @@ class Filter:
             [checked_observations(group) for group in sensor.observe(frame, belief)]
             for sensor in self.sensors
         ]
-        self._ends = np.cumsum([len(groups) for groups in observed])
+        self._ends = list(accumulate(len(groups) for groups in observed))
         return [group for groups in observed for group in groups]
 
     def _descend(
