@@ -257,7 +257,7 @@ class Filter:
             return state, densities.late
         log_w1 = proposed.log_w1[parents]
         # A parent of weight zero that was not resampled keeps it, whatever its second factor is.
-        return state, densities.all + log_ratio - np.where(np.isneginf(log_w1), 0.0, log_w1)
+        return state, densities.all + log_ratio - np.where(log_w1 == -np.inf, 0.0, log_w1)
 
     def _start_landmarks(self, frame: Any, groups: list[Observations]) -> tuple[list[Births], np.ndarray]:
         belief = self.belief()

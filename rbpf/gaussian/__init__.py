@@ -22,7 +22,7 @@ from rbpf.gaussian.laws import (
     sample,
     unscented_transform,
 )
-from rbpf.gaussian.storage import pack, symmetrise, unpack
+from rbpf.gaussian.storage import pack, product, symmetrise, unpack
 
 __all__ = [
     "Gaussian",
@@ -33,6 +33,7 @@ __all__ = [
     "log_density",
     "log_det",
     "pack",
+    "product",
     "psd_factor",
     "sample",
     "solve_lower",
