@@ -39,7 +39,7 @@ class Constellation(Landmark):
             )
         self.points = points.tolist()
         self.dim = 6 if exact else 6 + 3 * points.shape[0]
-        self._cov_points = cov_points
+        self._cov_points = cov_points.tolist()
 
     def homogeneous(self, mean: np.ndarray, const: np.ndarray | None = None) -> np.ndarray:
         """The origin of the group's frame, (…, dim), (…, 7) → (…, 4)."""

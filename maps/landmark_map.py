@@ -1,6 +1,7 @@
 """A growing map of landmarks, each an independent Gaussian given the trajectory (E06 (1), S05 (3))."""
 
 from collections.abc import Sequence
+from operator import is_
 from typing import Any, final
 
 import numpy as np
@@ -49,6 +50,7 @@ class LandmarkMap(Conditional):
         self.layouts: list[Layout] = []
         self.kinds = np.zeros(0, dtype=np.int64)
         self.catalogue: dict[int, Any] = {}
+        self._planned: tuple[Sequence[Observations], Plan] | None = None
 
     def begin(self, n: int, lineage: Lineage) -> None:
         """An empty map."""
@@ -91,6 +93,7 @@ class LandmarkMap(Conditional):
     def remove(self, ids: np.ndarray) -> None:
         """Drops landmarks from all particles."""
         self._known(ids)
+        self._planned = None
         self.store.remove(ids)
         self.kinds[ids] = -1
         for landmark in ids.tolist():
@@ -116,6 +119,7 @@ class LandmarkMap(Conditional):
 
     def promote(self, ids: np.ndarray, to: Landmark | None = None) -> None:
         """Turns landmarks into single Gaussian points in all particles at once, by their own `promote`."""
+        self._planned = None
         for landmark_id in ids:
             layout = self._layout_of(landmark_id)
             column = self.store.read(int(landmark_id))
@@ -168,6 +172,7 @@ class LandmarkMap(Conditional):
             log_density, late = log_density + both.all, both.late
         if by_use[_MAP]:
             self._engine.correct(self._plan(by_use[_MAP]), state, by_use[_MAP])
+        self._planned = None
         return LogDensities(log_density, late)
 
     def _density(self, state: np.ndarray, groups: Sequence[Observations]) -> np.ndarray:
@@ -226,8 +231,14 @@ class LandmarkMap(Conditional):
         return len(self.layouts) - 1
 
     def _plan(self, groups: Sequence[Observations]) -> Plan:
+        """A step asks for the plan of the same groups again and again; a resampling may have replaced some."""
+        planned = self._planned
+        if planned is not None and len(planned[0]) == len(groups) and all(map(is_, planned[0], groups)):
+            return planned[1]
         plain = np.array([layout.landmark.components == 1 for layout in self.layouts], dtype=bool)
-        return make_plan(groups, self.n, self.kinds, plain)
+        plan = make_plan(groups, self.n, self.kinds, plain)
+        self._planned = (groups, plan)
+        return plan
 
     def _layout_of(self, landmark_id: int) -> Layout:
         return self.layouts[self.kinds[landmark_id]]

@@ -67,8 +67,8 @@ def make_plan(groups: Sequence[Observations], n: int, kinds: np.ndarray, plain: 
     for number, group in enumerate(groups):
         ids = _checked_ids(group, n, kinds)
         for outcome, log_density in ((NEW, group.log_new), (NULL, group.log_clutter)):
-            count = (ids == outcome).sum(axis=-1)
-            if log_density != 0.0 and count.any():
+            if log_density != 0.0:
+                count = (ids == outcome).sum(axis=-1)
                 plan.log_factor += np.where(count > 0, log_density, 0.0) * count
         if len(groups) == 1 and _is_simple(ids, kinds, plain):
             ks = np.flatnonzero(ids >= 0)

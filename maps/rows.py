@@ -13,12 +13,16 @@ from rbpf.likelihoods import Gaussian
 from rbpf.maps.layout import Layout
 from rbpf.maps.plan import Batch, Plan, Row
 from rbpf.maps.shared import SharedStore
-from rbpf.models import FusedKernel, Likelihood, LogDensities, Observations, Records
+from rbpf.models import FusedKernel, Likelihood, LogDensities, Observations, Part, Records
 from rbpf.numeric import linearise
 from rbpf.proposals import Prior, Terms
 
 GAUSSIAN = Gaussian()
 _NO_MASK = np.zeros((0, 0), dtype=np.bool_)
+_BY_LANDMARK = frozenset({Part.LANDMARK})
+"""All that an update differentiates by: the state has been sampled."""
+PAIRS_AT_ONCE = 8192
+"""Particle-observation pairs that NumPy takes at once, so that what it works on stays in the second-level cache."""
 
 
 class RowEngine:
@@ -164,10 +168,16 @@ class RowEngine:
     def _terms_numpy(self, batch: Batch, group: Observations, state: np.ndarray, prior: Prior) -> Terms:
         _, records = self._read(batch.ids)
         z, noise = group.z[batch.ks], group.cov[batch.ks]
-        nu, jac = linearise(group.model, self.space, z, state[:, None, :], records.mean, records.const)
-        assert jac.state is not None and jac.landmark is not None
-        cov = reference.innovation_covariance(jac.landmark, records.cov, noise)
-        return reference.information(nu, jac.state, cov, group.likelihood or GAUSSIAN, prior, batch.mask)
+        parts = []
+        for part in _spans(state.shape[0], batch.ks.size):
+            mean, cov_map, const = _taken(records, part)
+            nu, jac = linearise(group.model, self.space, z, state[part, None], mean, const)
+            assert jac.state is not None and jac.landmark is not None
+            cov = reference.innovation_covariance(jac.landmark, cov_map, noise)
+            mask = None if batch.mask is None else batch.mask[part]
+            likelihood = _likelihood(group)
+            parts.append(reference.information(nu, jac.state, cov, likelihood, prior.take(part), mask))
+        return Terms.of_parts(parts)
 
     def _correct_numpy(
         self, batch: Batch, group: Observations, state: np.ndarray, log_density: np.ndarray
@@ -183,17 +193,21 @@ class RowEngine:
     ) -> None:
         ids, ks = batch.ids[rows], batch.ks[rows]
         columns, records = self._read(ids)
-        nu, jac = linearise(
-            group.model, self.space, group.z[ks], state[:, None, :], records.mean, records.const
-        )
-        assert jac.landmark is not None
-        mask = None if batch.mask is None else batch.mask[:, rows]
-        likelihood = group.likelihood or GAUSSIAN
-        mean, cov, log_terms = reference.updated(
-            nu, jac.landmark, records.mean, records.cov, group.cov[ks], likelihood, mask
-        )
-        log_density += log_terms.sum(axis=1)
-        self._write(ids, columns, mean, cov)
+        means, covs = [], []
+        for part in _spans(state.shape[0], ks.size):
+            mean, cov, const = _taken(records, part)
+            nu, jac = linearise(
+                group.model, self.space, group.z[ks], state[part, None], mean, const, by=_BY_LANDMARK
+            )
+            assert jac.landmark is not None
+            mask = None if batch.mask is None else batch.mask[part][:, rows]
+            mean, cov, log_terms = reference.updated(
+                nu, jac.landmark, mean, cov, group.cov[ks], _likelihood(group), mask
+            )
+            log_density[part] += log_terms.sum(axis=1)
+            means.append(mean)
+            covs.append(cov)
+        self._write(ids, columns, np.concatenate(means), np.concatenate(covs))
 
     def _joint(
         self, rows: list[Row], groups: Sequence[Observations], state: np.ndarray, prior: Prior | None = None
@@ -251,7 +265,8 @@ class RowEngine:
         columns, records = self._read(ids)
         assert records.log_weights is not None
         mean, cov = records.mean[:, 0], records.cov[:, 0]
-        nu, jac = linearise(group.model, self.space, group.z[row.k], state[:, None, :], mean, records.const)
+        at = state[:, None, :]
+        nu, jac = linearise(group.model, self.space, group.z[row.k], at, mean, records.const, by=_BY_LANDMARK)
         assert jac.landmark is not None
         mask = None if row.mask is None else np.repeat(row.mask[:, None], mean.shape[1], axis=1)
         likelihood = group.likelihood or GAUSSIAN
@@ -264,6 +279,17 @@ class RowEngine:
         columns[0, end : end + mean.shape[1]] = (joint - total[:, None]).T
         self._write(ids, columns, new_mean[:, None], new_cov[:, None])
         return total
+
+
+def _spans(n: int, k: int) -> list[slice]:
+    """The particles in runs of as many as see `PAIRS_AT_ONCE` observations."""
+    size = max(1, PAIRS_AT_ONCE // max(1, k))
+    return [slice(first, first + size) for first in range(0, n, size)]
+
+
+def _taken(records: Records, part: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Mean, covariance and constants of some of the particles."""
+    return records.mean[part], records.cov[part], None if records.const is None else records.const[part]
 
 
 def _likelihood(group: Observations) -> Likelihood:

@@ -143,8 +143,9 @@ class SharedStore:
         if (generations == generations[0]).all():
             maps, which = self.lineage.rows(int(generations[0]))[None], np.zeros(columns.size, dtype=np.int64)
         else:
-            distinct, which = np.unique(generations, return_inverse=True)
-            maps = np.array([self.lineage.rows(int(g)) for g in distinct])
+            number: dict[int, int] = {}
+            which = np.array([number.setdefault(g, len(number)) for g in generations.tolist()])
+            maps = np.array([self.lineage.rows(g) for g in number])
         return Access(self._pool(int(columns[0])).data, self._slab[columns], which, maps)
 
     def rewrite(self, columns: np.ndarray) -> tuple[Access, np.ndarray]:
@@ -154,9 +155,10 @@ class SharedStore:
         """
         access = self.access(columns)
         now = self.lineage.generation
-        stale = np.unique(columns[self._generation[columns] != now])
-        if stale.size == 0:
+        moved = self._generation[columns] != now
+        if not moved.any():
             return access, access.slabs
+        stale = np.unique(columns[moved])
         pool = self._pool(int(columns[0]))
         old = self._slab[stale].copy()
         self._slab[stale] = pool.take(stale.size)
@@ -181,7 +183,7 @@ class SharedStore:
             members = self._members.get(generation)
             if not members:
                 continue
-            alive = np.unique(self.lineage.rows(generation))
+            alive = self.lineage.survivors(generation)
             if alive.size <= COLD_SHARE * self._survivors.get(generation, self.n):
                 self._survivors[generation] = alive.size
                 for column in members:
@@ -268,13 +270,11 @@ class SharedStore:
         cold = self._cold.get(column)
         if cold is not None:
             if alive.size <= COLD_SHARE * cold.kept.size:
-                rows = np.searchsorted(cold.kept, alive)
-                self._cold[column] = Cold(alive, np.ascontiguousarray(cold.data[:, rows]))
+                self._cold[column] = Cold(alive, cold.data.take(np.searchsorted(cold.kept, alive), axis=1))
         elif alive.size <= HOT_SHARE * self.n:
             pool = self._pool(column)
-            slab = self._slab[column : column + 1]
-            self._cold[column] = Cold(alive, np.ascontiguousarray(pool.data[slab[0]][:, alive]))
-            pool.give(slab)
+            self._cold[column] = Cold(alive, pool.data[self._slab[column]].take(alive, axis=1))
+            pool.give(self._slab[column : column + 1])
             self._slab[column] = -1
 
     def _move(self, column: int, generation: int) -> None:

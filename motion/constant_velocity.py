@@ -101,9 +101,10 @@ class SampledVelocity(MotionModel):
         """Chart at (T Exp(δv), v): T Exp(δv + w₁) = T Exp(δv) Exp(J_r(δv) w₁) to first order."""
         placed, velocity = state[:, :7], state[:, 7:]
         if control is not None:
+            mean = np.concatenate([_placed(placed, control), velocity], axis=1)
             factor = _with_law(np.zeros((12, 12)), control)
             factor[6:, 6:] = np.diag(self.std_start)
-            return Transition(np.concatenate([_placed(placed, control), velocity], axis=1), factor[None])
+            return Transition(mean, factor[None])
         step = dt * velocity
         factor = np.repeat(velocity_walk(self.std_walk, dt)[None, :, : self.columns], state.shape[0], axis=0)
         factor[:, :6] = SE3.right_jacobian(step) @ factor[:, :6]
@@ -120,14 +121,15 @@ def _placed(state: np.ndarray, law: PoseLaw) -> np.ndarray:
 
 def _with_law(factor: np.ndarray, law: PoseLaw) -> np.ndarray:
     """The pose's noise is the law's, independent of the velocity's."""
-    placed = factor.copy()
-    placed[:, :6] = 0.0
+    placed = np.zeros((12, 12))
     placed[:6, :6] = gaussian.psd_factor(law.cov)
+    placed[6:, 6:] = np.diag(np.linalg.norm(factor[6:], axis=1))
     return placed
 
 
 def _checked(std: np.ndarray | float) -> np.ndarray:
-    array = np.broadcast_to(np.asarray(std, dtype=float), (6,)).copy()
-    if not (np.isfinite(array).all() and (array >= 0.0).all()):
-        raise InputError(f"standard deviations of a velocity must be finite and not negative, got {std}")
-    return array
+    array = np.asarray(std, dtype=float)
+    if array.shape not in ((), (6,)) or not (np.isfinite(array).all() and (array >= 0.0).all()):
+        what = "standard deviations of a velocity must be one number or six, finite and not negative"
+        raise InputError(f"{what}, got {std}")
+    return np.broadcast_to(array, (6,)).copy()

@@ -39,9 +39,10 @@ def checked_observations(group: Observations) -> Observations:
             f"{name} measures {p} numbers: expected z (K, {p}) and cov (K, {p}, {p}), "
             f"got {group.z.shape} and {group.cov.shape}"
         )
-    if not group.informs or not group.informs <= {Part.STATE, Part.LANDMARK}:
+    informs = group.informs
+    if not (isinstance(informs, frozenset) and informs and informs <= {Part.STATE, Part.LANDMARK}):
         raise InputError(
-            f"observations of {name} inform Part.STATE, Part.LANDMARK or both, got {group.informs}"
+            f"observations of {name} inform a frozenset of Part.STATE, Part.LANDMARK or both, got {informs}"
         )
     if not (np.isfinite(group.z).all() and np.isfinite(group.cov).all()):
         raise InputError(f"a measurement of {name} or its covariance is not finite")

@@ -88,11 +88,15 @@ class Marginals(Conditional):
 
     def terms(self, state: np.ndarray, groups: Sequence[Observations], prior: Prior) -> Terms:
         """Sum over the parts that were observed."""
-        total = Terms.zeros(state.shape[0], self.space.dim)
+        total: Terms | None = None
         for supplies, routed in self._routed(groups).items():
             if routed:
-                total.add(self.parts[supplies].terms(state, routed, prior))
-        return total
+                part = self.parts[supplies].terms(state, routed, prior)
+                if total is None:
+                    total = part
+                else:
+                    total.add(part)
+        return Terms.zeros(state.shape[0], self.space.dim) if total is None else total
 
     def correct(
         self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]

@@ -8,6 +8,7 @@ The bootstrap filter, FastSLAM 2.0 and the exact importance ratio differ in the 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -227,7 +228,7 @@ class Filter:
             [checked_observations(group) for group in sensor.observe(frame, belief)]
             for sensor in self.sensors
         ]
-        self._ends = np.cumsum([len(groups) for groups in observed])
+        self._ends = list(accumulate(len(groups) for groups in observed))
         return [group for groups in observed for group in groups]
 
     def _descend(
@@ -256,7 +257,7 @@ class Filter:
             return state, densities.late
         log_w1 = proposed.log_w1[parents]
         # A parent of weight zero that was not resampled keeps it, whatever its second factor is.
-        return state, densities.all + log_ratio - np.where(np.isneginf(log_w1), 0.0, log_w1)
+        return state, densities.all + log_ratio - np.where(log_w1 == -np.inf, 0.0, log_w1)
 
     def _start_landmarks(self, frame: Any, groups: list[Observations]) -> tuple[list[Births], np.ndarray]:
         belief = self.belief()

@@ -40,6 +40,7 @@ class Lineage:
         self._free = np.concatenate([self._free, np.zeros(n, dtype=np.int64)])
         self._identity = np.arange(n)
         self._cache: dict[int, np.ndarray] = {}
+        self._survivors: dict[int, np.ndarray] = {}
 
     @property
     def nodes(self) -> int:
@@ -63,6 +64,7 @@ class Lineage:
             self.generation,
         )
         self._cache.clear()
+        self._survivors.clear()
 
     def rows(self, generation: int) -> np.ndarray:
         """Row in a retained generation of each particle's ancestor, (N,) int."""
@@ -82,9 +84,17 @@ class Lineage:
             )
         return self._cache[generation]
 
+    def survivors(self, generation: int) -> np.ndarray:
+        """Particles of a retained generation that still have descendants, ascending."""
+        if generation not in self._survivors:
+            alive = np.zeros(self.n, dtype=np.bool_)
+            alive[self.rows(generation)] = True
+            self._survivors[generation] = np.flatnonzero(alive)
+        return self._survivors[generation]
+
     def distinct(self, generation: int) -> int:
         """Number of particles of a retained generation that still have descendants."""
-        return int(np.unique(self.rows(generation)).size)
+        return self.survivors(generation).size
 
     def retain(self, generation: int) -> None:
         """Keeps the nodes of a generation."""
@@ -115,6 +125,7 @@ class Lineage:
         self.generation, self._n_free = (int(v) for v in arrays["lineage/now"])
         self._retained.clear()
         self._cache.clear()
+        self._survivors.clear()
 
     def _allocate(self, size: int) -> None:
         self._parent = np.full(size, -1)

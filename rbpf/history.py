@@ -120,7 +120,7 @@ class History:
             block = self._by_generation.get(generation)
             if block is None:
                 continue
-            alive = np.unique(self.lineage.rows(generation))
+            alive = self.lineage.survivors(generation)
             if 2 * alive.size <= block.kept.size:
                 rows = np.searchsorted(block.kept, alive)
                 block.states = [states[rows] for states in block.states]

@@ -1,4 +1,4 @@
-"""Every abstract class that a user subclasses, on one page.
+"""Every abstract class that a user subclasses, on one page; what they hand over stands in `rbpf.exchange`.
 
 Shapes: N particles, K observations, E state storage, d its tangent, m linear substate, D landmark, A its constants,
 C components, p measurement, r noise rank. A method that is not abstract is a hook with a default.
@@ -6,53 +6,27 @@ C components, p measurement, r noise rank. A method that is not abstract is a ho
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from enum import Enum
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rbpf.errors import InputError
+from rbpf.exchange import NEW as NEW
+from rbpf.exchange import NULL as NULL
+from rbpf.exchange import Births as Births
+from rbpf.exchange import FusedKernel as FusedKernel
+from rbpf.exchange import Jacobians as Jacobians
+from rbpf.exchange import LogDensities as LogDensities
+from rbpf.exchange import Observations as Observations
+from rbpf.exchange import Part as Part
+from rbpf.exchange import Records as Records
+from rbpf.exchange import Transition as Transition
 from rbpf.lie import LieGroup
 
 if TYPE_CHECKING:
     from rbpf.belief import Belief
     from rbpf.genealogy import Lineage
     from rbpf.proposals import Prior, Proposed, Terms
-
-NULL = -1
-"""An observation that a particle takes as clutter."""
-NEW = -2
-"""An observation that a particle takes as the first sighting of a landmark."""
-
-
-class Part(Enum):
-    """What an observation can depend on."""
-
-    STATE = "sampled state"
-    LANDMARK = "landmark"
-    SUBSTATE = "linear substate"
-
-
-@dataclass(frozen=True)
-class Transition:
-    """p(x_t, s_t | x_{t-1}, s_{t-1}, u_t): ε = B s + w₁ in the right chart at `mean`; s_t = A s + b + w₂.
-
-    Arrays may have a first axis of length 1 where they do not differ between particles.
-
-    Attributes:
-        mean: (N, E) chart's origin, x_t = mean · Exp(ε).
-        noise_factor: (N or 1, d+m, r) L with cov(w₁, w₂) = L Lᵀ; may be singular.
-        coupling: B, (N or 1, d, m); None where there is no substate.
-        dynamics: A, (N or 1, m, m).
-        drift: b, (N or 1, m).
-    """
-
-    mean: np.ndarray
-    noise_factor: np.ndarray
-    coupling: np.ndarray | None = None
-    dynamics: np.ndarray | None = None
-    drift: np.ndarray | None = None
 
 
 class MotionModel(ABC):
@@ -63,21 +37,6 @@ class MotionModel(ABC):
     @abstractmethod
     def transition(self, state: np.ndarray, control: Any, dt: float) -> Transition:
         """Law of the next state. Given states (N, E), a control and a time step in seconds."""
-
-
-class Jacobians(NamedTuple):
-    """Derivatives of a predicted measurement: (…, p, d), (…, p, D), (…, p, m); None where it is not read."""
-
-    state: np.ndarray | None = None
-    landmark: np.ndarray | None = None
-    substate: np.ndarray | None = None
-
-
-class FusedKernel(NamedTuple):
-    """A compiled `rbpf.kernels.signature.observation_kernel` and the constants (P,) it is called with."""
-
-    function: Any
-    params: np.ndarray
 
 
 class ObservationModel(ABC):
@@ -134,7 +93,7 @@ class ObservationModel(ABC):
             f"{type(self).__name__} cannot start landmarks: override invert(state, z) or initialise(state, z, cov)"
         )
 
-    def initialise(self, state: np.ndarray, z: np.ndarray, cov: np.ndarray) -> "Records":
+    def initialise(self, state: np.ndarray, z: np.ndarray, cov: np.ndarray) -> Records:
         """First estimate of landmarks from (N, E), (K, p), (K, p, p); by default `invert` and its numeric Jacobian."""
         from rbpf.numeric import invert_with_covariance
 
@@ -143,23 +102,6 @@ class ObservationModel(ABC):
     def kernel(self) -> FusedKernel | None:
         """A compiled twin of residual(z, predict) and jacobians; None runs them in NumPy."""
         return None
-
-
-@dataclass(frozen=True)
-class Records:
-    """Estimates of K landmarks in N particles, or of their components.
-
-    Attributes:
-        mean: (N, K, D), or (N, K, C, D) where the parametrisation has C > 1 components.
-        cov: (N, K, D, D) or (N, K, C, D, D).
-        const: (N, K, A), what stays fixed, as an anchor pose; None where A = 0.
-        log_weights: (N, K, C) log-weights of the components; None where C = 1.
-    """
-
-    mean: np.ndarray
-    cov: np.ndarray
-    const: np.ndarray | None = None
-    log_weights: np.ndarray | None = None
 
 
 class Landmark(ABC):
@@ -209,53 +151,6 @@ class Likelihood(ABC):
         return 0.0
 
 
-@dataclass(frozen=True)
-class Observations:
-    """A group of measurements of one kind taken in one frame.
-
-    Attributes:
-        z: (K, p) measurements.
-        cov: (K, p, p) covariance of their noise.
-        model: how they arise.
-        likelihood: of the innovation; None is Gaussian.
-        ids: landmark of each, (K,) for all particles or (N, K) per particle; NULL and NEW are allowed.
-            None where the model reads no landmark.
-        log_new: log-density, in inverse measurement units, that a particle pays for a NEW observation.
-        log_clutter: the same for a NULL one.
-        informs: STATE: it refines and weighs the particles; LANDMARK: it updates the landmark. Two groups may share
-            a measurement, one for each (E06 §5.2: the epipolar part for the state, all of it for the depth).
-    """
-
-    z: np.ndarray
-    cov: np.ndarray
-    model: ObservationModel
-    likelihood: Likelihood | None = None
-    ids: np.ndarray | None = None
-    log_new: float = 0.0
-    log_clutter: float = 0.0
-    informs: frozenset[Part] = frozenset({Part.STATE, Part.LANDMARK})
-
-
-@dataclass(frozen=True)
-class Births:
-    """First sightings that start landmarks, after the update.
-
-    Attributes:
-        z: (K, p) measurements;  cov: (K, p, p) their covariance.
-        model: whose `initialise` gives the records.
-        landmark: the parametrisation.
-        mask: (N, K) which particles take them as new; None is all.
-        facts: per landmark, what the catalogue remembers of it (a descriptor, the log's own name).
-    """
-
-    z: np.ndarray
-    cov: np.ndarray
-    model: ObservationModel
-    landmark: Landmark
-    mask: np.ndarray | None = None
-    facts: Sequence[Any] = field(default_factory=tuple)
-
-
 class Sensor(ABC):
     """Raw data → observations, given the predicted belief; then new landmarks."""
 
@@ -303,7 +198,7 @@ class Conditional(ABC):
     @abstractmethod
     def correct(
         self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]
-    ) -> "LogDensities":
+    ) -> LogDensities:
         """Log p(z | x) at the sampled states, and the update by the same observations."""
 
     @abstractmethod
@@ -327,13 +222,6 @@ class Conditional(ABC):
     def options(self) -> dict[str, Any]:
         """What must agree between who saves a checkpoint and who loads it; plain values by name."""
         return {}
-
-
-class LogDensities(NamedTuple):
-    """log p(z | x) (N,) of all observations, and of those that took no part in the refinement."""
-
-    all: np.ndarray
-    late: np.ndarray
 
 
 class Resampler(ABC):

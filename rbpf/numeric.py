@@ -11,6 +11,9 @@ STEP = float(np.finfo(float).eps) ** (1 / 3)
 """Step of the central differences, where truncation and rounding errors balance."""
 
 
+EVERYTHING = frozenset(Part)
+
+
 def numeric_jacobians(
     model: ObservationModel,
     space: LieGroup,
@@ -18,8 +21,12 @@ def numeric_jacobians(
     landmark: np.ndarray | None = None,
     const: np.ndarray | None = None,
     substate: np.ndarray | None = None,
+    by: frozenset[Part] = EVERYTHING,
 ) -> Jacobians:
-    """Central differences of `model.predict`, in the right chart at the state; wrapped by `model.residual`."""
+    """Central differences of `model.predict`, in the right chart at the state; wrapped by `model.residual`.
+
+    Those by a part that `by` does not name are left out: each costs two predictions per coordinate.
+    """
     plus_minus = np.array([STEP, -STEP])
 
     def differences(values: np.ndarray) -> np.ndarray:
@@ -30,13 +37,14 @@ def numeric_jacobians(
         return x + steps.reshape(2, x.shape[-1], *(1,) * (x.ndim - 1), x.shape[-1])
 
     state_part = landmark_part = substate_part = None
-    if Part.STATE in model.reads:
+    wanted = model.reads & by
+    if Part.STATE in wanted:
         steps = plus_minus[:, None, None] * np.eye(space.dim)
         moved = space.retract(state, steps.reshape(2, space.dim, *(1,) * (state.ndim - 1), space.dim))
         state_part = differences(model.predict(moved, landmark, const, substate))
-    if landmark is not None and Part.LANDMARK in model.reads:
+    if landmark is not None and Part.LANDMARK in wanted:
         landmark_part = differences(model.predict(state, perturbed(landmark), const, substate))
-    if substate is not None and Part.SUBSTATE in model.reads:
+    if substate is not None and Part.SUBSTATE in wanted:
         substate_part = differences(model.predict(state, landmark, const, perturbed(substate)))
     return Jacobians(state_part, landmark_part, substate_part)
 
@@ -49,8 +57,11 @@ def linearise(
     landmark: np.ndarray | None = None,
     const: np.ndarray | None = None,
     substate: np.ndarray | None = None,
+    by: frozenset[Part] = EVERYTHING,
 ) -> tuple[np.ndarray, Jacobians]:
     """Innovation (N, K, p) and Jacobians at states (N, 1, E), landmarks (N, K, D), substates (N, 1, m).
+
+    Numeric Jacobians by a part that `by` does not name are left out.
 
     Raises:
         InputError: a prediction or a Jacobian has the wrong shape.
@@ -62,7 +73,7 @@ def linearise(
         raise InputError(f"{type(model).__name__}.predict returned shape {nu.shape}, expected {expected}")
     jacobians = model.jacobians(state, landmark, const, substate)
     if jacobians is None:
-        jacobians = numeric_jacobians(model, space, state, landmark, const, substate)
+        jacobians = numeric_jacobians(model, space, state, landmark, const, substate, by)
     sizes = (space.dim, *(0 if part is None else part.shape[-1] for part in parts[1:]))
     blocks = [_full(model, block, (*expected, size)) for block, size in zip(jacobians, sizes, strict=True)]
     return nu, Jacobians(*blocks)

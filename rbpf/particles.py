@@ -1,5 +1,6 @@
 """The weighted particles, and the arithmetic of log-weights (S05 (8)–(12))."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,17 +42,22 @@ def reweight(log_weights: np.ndarray, log_factors: np.ndarray, what: str) -> tup
     Raises:
         InputError: a factor is NaN or +∞, or all products are zero.
     """
-    if np.isnan(log_factors).any() or np.isposinf(log_factors).any():
-        bad = int(np.flatnonzero(np.isnan(log_factors) | np.isposinf(log_factors))[0])
-        raise InputError(
-            f"{what}: the weight of particle {bad} is {log_factors[bad]}; check the models with rbpf.check_model"
-        )
-    joint = log_weights + log_factors
+    with np.errstate(invalid="ignore"):  # from a weight of zero times an infinite factor, which is refused
+        joint = log_weights + log_factors
     high = joint.max()
-    if np.isneginf(high):
-        raise InputError(f"{what}: all particle weights are zero, no particle explains the observations")
+    if not math.isfinite(high):
+        raise _unusable(log_factors, what)
     total = float(high + np.log(np.exp(joint - high).sum()))
     return joint - total, total
+
+
+def _unusable(log_factors: np.ndarray, what: str) -> InputError:
+    bad = np.flatnonzero(np.isnan(log_factors) | np.isposinf(log_factors))
+    if bad.size == 0:
+        return InputError(f"{what}: all particle weights are zero, no particle explains the observations")
+    return InputError(
+        f"{what}: the weight of particle {bad[0]} is {log_factors[bad[0]]}; check the models with rbpf.check_model"
+    )
 
 
 def effective_sample_size(weights: np.ndarray) -> float:

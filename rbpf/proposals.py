@@ -17,7 +17,7 @@ from rbpf.lie import LieGroup
 from rbpf.models import LineariseAt, Proposal, Transition
 
 
-def take(array: np.ndarray, ancestors: np.ndarray) -> np.ndarray:
+def take(array: np.ndarray, ancestors: np.ndarray | slice) -> np.ndarray:
     """Rows of the ancestors; an array shared by all particles (first axis 1) stays as it is."""
     return array if array.shape[0] == 1 else array[ancestors]
 
@@ -70,7 +70,7 @@ class Prior:
         """The factor (N, d, r) in the charts at the states at increments (N or 1, d), to first order."""
         return self.factor if self.centred else self.space.right_jacobian(increment) @ self.factor
 
-    def take(self, ancestors: np.ndarray) -> "Prior":
+    def take(self, ancestors: np.ndarray | slice) -> "Prior":
         """The laws of the ancestors."""
         return replace(
             self,
@@ -104,6 +104,20 @@ class Terms:
     def zeros(cls, n: int, dim: int) -> "Terms":
         """No observations."""
         return cls(np.zeros((n, dim, dim)), np.zeros((n, dim)), np.zeros(n), np.zeros(n), np.zeros(n))
+
+    @classmethod
+    def of_parts(cls, parts: list["Terms"]) -> "Terms":
+        """The same observations, of particles that were taken in several parts."""
+        if len(parts) == 1:
+            return parts[0]
+        return cls(
+            np.concatenate([part.info for part in parts]),
+            np.concatenate([part.vector for part in parts]),
+            np.concatenate([part.quad for part in parts]),
+            np.concatenate([part.log_det for part in parts]),
+            np.concatenate([part.log_factor for part in parts]),
+            parts[0].rows,
+        )
 
     def add(self, other: "Terms") -> None:
         """Adds independent observations, in place."""
@@ -147,7 +161,7 @@ class Proposed:
         root = take(self.root, ancestors)
         u = take(self.mean, ancestors) + np.einsum("nab,nb->na", root, noise)
         log_root = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
-        return u, 0.5 * ((noise * noise).sum(axis=1) - (u * u).sum(axis=1)) + log_root
+        return u, 0.5 * (noise * noise - u * u).sum(axis=1) + log_root
 
 
 @final

@@ -16,7 +16,8 @@ _UNIT_NORMAL = 1.0 / (2.0 * np.pi)
 
 def innovation_covariance(jac: np.ndarray, cov: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """S = J P Jᵀ + R, (N, K, p, p)."""
-    return gaussian.symmetrise(jac @ cov @ np.swapaxes(jac, -1, -2)) + noise
+    cross = gaussian.product(jac, cov)
+    return gaussian.symmetrise(gaussian.product(cross, np.swapaxes(jac, -1, -2))) + noise
 
 
 def information(
@@ -98,9 +99,9 @@ def updated(
         use = use & mask
         log_density = np.where(mask, log_density, 0.0)
     chol = gaussian.cholesky(cov)
-    white = gaussian.solve_lower_matrix(chol, jac @ cov_map) * use[..., None, None]
+    white = gaussian.solve_lower_matrix(chol, gaussian.product(jac, cov_map)) * use[..., None, None]
     new_mean = mean + np.einsum("nkpd,nkp->nkd", white, gaussian.solve_lower(chol, nu))
-    new_cov = gaussian.symmetrise(cov_map - np.swapaxes(white, -1, -2) @ white)
+    new_cov = gaussian.symmetrise(cov_map - gaussian.product(np.swapaxes(white, -1, -2), white))
     return new_mean, new_cov, log_density
 
 

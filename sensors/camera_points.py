@@ -194,6 +194,8 @@ class EpipolarRay(CameraRay):
         margin_px: float = 0.0,
     ) -> None:
         super().__init__(camera, rho, margin_px)
+        if not least_px > 0.0:
+            raise InputError(f"least_px must be positive, got {least_px}")
         self.least_px = least_px
 
     def jacobians(

@@ -4,54 +4,74 @@ import math
 
 from numba import njit
 
-from rbpf.kernels.signature import observation_kernel
+from rbpf.kernels.angles import arctan2, cos_sin
+from rbpf.kernels.block import flat
+from rbpf.kernels.signature import BLOCK, observation_kernel
 
 
-@njit(cache=True, error_model="numpy")
-def _store_planar(row, d0, d1, x, y, c, s, jac_state, jac_landmark, i):
-    """One row D = (d0, d1) in the robot's frame at the point (x, y): ∂/∂ξ and, with the heading, ∂/∂landmark."""
-    jac_state[row, 0, i] = d0 * y - d1 * x
-    jac_state[row, 1, i] = -d0
-    jac_state[row, 2, i] = -d1
-    jac_landmark[row, 0, i] = d0 * c - d1 * s
-    jac_landmark[row, 1, i] = d0 * s + d1 * c
+@njit(cache=True, error_model="numpy", inline="always")
+def _face_planar(state, mean, n, point, heading):
+    """The landmark in the robot's frame, and cosine and sine of the heading, into the first two rows of each."""
+    for i in range(n):
+        c, s = cos_sin(state[i])
+        dx, dy = mean[i] - state[BLOCK + i], mean[BLOCK + i] - state[2 * BLOCK + i]
+        point[i], point[BLOCK + i] = c * dx + s * dy, c * dy - s * dx
+        heading[i], heading[BLOCK + i] = c, s
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _in_sensor(params, x, y):
+    """A point of the robot's frame in the sensor's, in the plane."""
+    a, b = x - params[4], y - params[5]
+    return params[0] * a + params[2] * b, params[1] * a + params[3] * b
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _store_planar(row, a0, a1, params, c, s, x, y, jac_state, jac_landmark, i):
+    """One row (a0, a1) in the sensor's frame: taken to the robot's frame, then ∂/∂ξ and ∂/∂landmark."""
+    d0, d1 = params[0] * a0 + params[1] * a1, params[2] * a0 + params[3] * a1
+    jac_state[3 * row * BLOCK + i] = d0 * y - d1 * x
+    jac_state[(3 * row + 1) * BLOCK + i] = -d0
+    jac_state[(3 * row + 2) * BLOCK + i] = -d1
+    jac_landmark[2 * row * BLOCK + i] = d0 * c - d1 * s
+    jac_landmark[(2 * row + 1) * BLOCK + i] = d0 * s + d1 * c
 
 
 @observation_kernel
 def range_bearing_planar(state, mean, const, z, params, n, nu, jac_state, jac_landmark):
     """(range, yaw) in the plane; params: rotation by rows (4), translation (2) of the mounting."""
-    m00, m01, m10, m11, tx, ty = params[0], params[1], params[2], params[3], params[4], params[5]
-    cos_z, sin_z = math.cos(z[1]), math.sin(z[1])
+    out, by_state, by_landmark = flat(nu), flat(jac_state), flat(jac_landmark)
+    cos_z, sin_z, range_z = math.cos(z[1]), math.sin(z[1]), z[0]
+    _face_planar(flat(state), flat(mean), n, out, by_landmark)
     for i in range(n):
-        c, s = math.cos(state[0, i]), math.sin(state[0, i])
-        dx, dy = mean[0, i] - state[1, i], mean[1, i] - state[2, i]
-        x, y = c * dx + s * dy, c * dy - s * dx
-        u, v = m00 * (x - tx) + m10 * (y - ty), m01 * (x - tx) + m11 * (y - ty)
-        flat2 = u * u + v * v
-        distance = math.sqrt(flat2)
-        nu[0, i] = z[0] - distance
-        nu[1, i] = math.atan2(sin_z * u - cos_z * v, cos_z * u + sin_z * v)
-        a0, a1 = u / distance, v / distance
-        b0, b1 = -v / flat2, u / flat2
-        _store_planar(0, m00 * a0 + m01 * a1, m10 * a0 + m11 * a1, x, y, c, s, jac_state, jac_landmark, i)
-        _store_planar(1, m00 * b0 + m01 * b1, m10 * b0 + m11 * b1, x, y, c, s, jac_state, jac_landmark, i)
+        x, y, c, s = out[i], out[BLOCK + i], by_landmark[i], by_landmark[BLOCK + i]
+        u, v = _in_sensor(params, x, y)
+        inverse = 1.0 / math.sqrt(u * u + v * v)
+        a0, a1 = u * inverse, v * inverse
+        _store_planar(0, a0, a1, params, c, s, x, y, by_state, by_landmark, i)
+        _store_planar(1, -a1 * inverse, a0 * inverse, params, c, s, x, y, by_state, by_landmark, i)
+    for i in range(n):
+        u, v = _in_sensor(params, out[i], out[BLOCK + i])
+        out[i] = range_z - math.sqrt(u * u + v * v)
+        out[BLOCK + i] = arctan2(sin_z * u - cos_z * v, cos_z * u + sin_z * v)
 
 
 @observation_kernel
 def position_planar(state, mean, const, z, params, n, nu, jac_state, jac_landmark):
     """The point in the sensor's frame, in the plane."""
-    m00, m01, m10, m11, tx, ty = params[0], params[1], params[2], params[3], params[4], params[5]
+    out, by_state, by_landmark = flat(nu), flat(jac_state), flat(jac_landmark)
+    z0, z1 = z[0], z[1]
+    _face_planar(flat(state), flat(mean), n, out, by_landmark)
     for i in range(n):
-        c, s = math.cos(state[0, i]), math.sin(state[0, i])
-        dx, dy = mean[0, i] - state[1, i], mean[1, i] - state[2, i]
-        x, y = c * dx + s * dy, c * dy - s * dx
-        nu[0, i] = z[0] - (m00 * (x - tx) + m10 * (y - ty))
-        nu[1, i] = z[1] - (m01 * (x - tx) + m11 * (y - ty))
-        _store_planar(0, m00, m10, x, y, c, s, jac_state, jac_landmark, i)
-        _store_planar(1, m01, m11, x, y, c, s, jac_state, jac_landmark, i)
+        x, y, c, s = out[i], out[BLOCK + i], by_landmark[i], by_landmark[BLOCK + i]
+        _store_planar(0, 1.0, 0.0, params, c, s, x, y, by_state, by_landmark, i)
+        _store_planar(1, 0.0, 1.0, params, c, s, x, y, by_state, by_landmark, i)
+    for i in range(n):
+        u, v = _in_sensor(params, out[i], out[BLOCK + i])
+        out[i], out[BLOCK + i] = z0 - u, z1 - v
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", inline="always")
 def _rotation(qx, qy, qz, qw):
     """Rotation matrix by rows of a unit quaternion."""
     return (
@@ -67,74 +87,98 @@ def _rotation(qx, qy, qz, qw):
     )
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", inline="always")
 def _store_spatial(row, a0, a1, a2, params, p, rotation, jac_state, jac_landmark, i):
     """One row (a0, a1, a2) in the sensor's frame: taken to the robot's frame, then ∂/∂ξ and ∂/∂landmark."""
     d0 = params[0] * a0 + params[1] * a1 + params[2] * a2
     d1 = params[3] * a0 + params[4] * a1 + params[5] * a2
     d2 = params[6] * a0 + params[7] * a1 + params[8] * a2
-    jac_state[row, 0, i] = d1 * p[2] - d2 * p[1]
-    jac_state[row, 1, i] = d2 * p[0] - d0 * p[2]
-    jac_state[row, 2, i] = d0 * p[1] - d1 * p[0]
-    jac_state[row, 3, i] = -d0
-    jac_state[row, 4, i] = -d1
-    jac_state[row, 5, i] = -d2
-    jac_landmark[row, 0, i] = d0 * rotation[0] + d1 * rotation[1] + d2 * rotation[2]
-    jac_landmark[row, 1, i] = d0 * rotation[3] + d1 * rotation[4] + d2 * rotation[5]
-    jac_landmark[row, 2, i] = d0 * rotation[6] + d1 * rotation[7] + d2 * rotation[8]
+    start = 6 * row * BLOCK + i
+    jac_state[start] = d1 * p[2] - d2 * p[1]
+    jac_state[start + BLOCK] = d2 * p[0] - d0 * p[2]
+    jac_state[start + 2 * BLOCK] = d0 * p[1] - d1 * p[0]
+    jac_state[start + 3 * BLOCK] = -d0
+    jac_state[start + 4 * BLOCK] = -d1
+    jac_state[start + 5 * BLOCK] = -d2
+    start = 3 * row * BLOCK + i
+    jac_landmark[start] = d0 * rotation[0] + d1 * rotation[1] + d2 * rotation[2]
+    jac_landmark[start + BLOCK] = d0 * rotation[3] + d1 * rotation[4] + d2 * rotation[5]
+    jac_landmark[start + 2 * BLOCK] = d0 * rotation[6] + d1 * rotation[7] + d2 * rotation[8]
 
 
-@njit(cache=True, error_model="numpy")
-def _points_spatial(state, mean, params, i):
-    """Rotation of the robot, and the landmark in the robot's and in the sensor's frame."""
-    r = _rotation(state[0, i], state[1, i], state[2, i], state[3, i])
-    a, b, c = mean[0, i] - state[4, i], mean[1, i] - state[5, i], mean[2, i] - state[6, i]
-    p = (r[0] * a + r[3] * b + r[6] * c, r[1] * a + r[4] * b + r[7] * c, r[2] * a + r[5] * b + r[8] * c)
-    a, b, c = p[0] - params[9], p[1] - params[10], p[2] - params[11]
-    s = (
-        params[0] * a + params[3] * b + params[6] * c,
-        params[1] * a + params[4] * b + params[7] * c,
-        params[2] * a + params[5] * b + params[8] * c,
+@njit(cache=True, error_model="numpy", inline="always")
+def _rotation_at(state, i):
+    """Rotation of the robot in lane i."""
+    return _rotation(state[i], state[BLOCK + i], state[2 * BLOCK + i], state[3 * BLOCK + i])
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _locate(state, mean, params, n, point):
+    """The landmark in the sensor's frame, into the rows of `point`."""
+    for i in range(n):
+        r = _rotation_at(state, i)
+        a, b = mean[i] - state[4 * BLOCK + i], mean[BLOCK + i] - state[5 * BLOCK + i]
+        c = mean[2 * BLOCK + i] - state[6 * BLOCK + i]
+        x, y = r[0] * a + r[3] * b + r[6] * c - params[9], r[1] * a + r[4] * b + r[7] * c - params[10]
+        z = r[2] * a + r[5] * b + r[8] * c - params[11]
+        point[i] = params[0] * x + params[3] * y + params[6] * z
+        point[BLOCK + i] = params[1] * x + params[4] * y + params[7] * z
+        point[2 * BLOCK + i] = params[2] * x + params[5] * y + params[8] * z
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _in_robot(params, a, b, c):
+    """A point of the sensor's frame in the robot's."""
+    return (
+        params[0] * a + params[1] * b + params[2] * c + params[9],
+        params[3] * a + params[4] * b + params[5] * c + params[10],
+        params[6] * a + params[7] * b + params[8] * c + params[11],
     )
-    return r, p, s
 
 
 @observation_kernel
 def range_bearing_spatial(state, mean, const, z, params, n, nu, jac_state, jac_landmark):
     """(range, yaw, pitch) in space; params: rotation by rows (9), translation (3), sign of pitch."""
-    sign = params[12]
+    pose, out, by_state, by_landmark = flat(state), flat(nu), flat(jac_state), flat(jac_landmark)
+    sign, range_z = params[12], z[0]
     cos_yaw, sin_yaw = math.cos(z[1]), math.sin(z[1])
     cos_pitch, sin_pitch = math.cos(z[2]), math.sin(z[2])
+    _locate(pose, flat(mean), params, n, out)
     for i in range(n):
-        rotation, p, s = _points_spatial(state, mean, params, i)
-        x, y, h = s
+        x, y, h = out[i], out[BLOCK + i], out[2 * BLOCK + i]
+        rotation, p = _rotation_at(pose, i), _in_robot(params, x, y, h)
         flat2 = x * x + y * y
-        flat = math.sqrt(flat2)
         distance2 = flat2 + h * h
-        distance = math.sqrt(distance2)
-        nu[0, i] = z[0] - distance
-        nu[1, i] = math.atan2(sin_yaw * x - cos_yaw * y, cos_yaw * x + sin_yaw * y)
-        nu[2, i] = math.atan2(
-            sin_pitch * flat - cos_pitch * sign * h, cos_pitch * flat + sin_pitch * sign * h
-        )
-        tilt = sign * h / (flat * distance2)
-        _store_spatial(
-            0, x / distance, y / distance, h / distance, params, p, rotation, jac_state, jac_landmark, i
-        )
-        _store_spatial(1, -y / flat2, x / flat2, 0.0, params, p, rotation, jac_state, jac_landmark, i)
-        _store_spatial(
-            2, -x * tilt, -y * tilt, sign * flat / distance2, params, p, rotation, jac_state, jac_landmark, i
-        )
+        per_flat, per_distance = 1.0 / math.sqrt(flat2), 1.0 / math.sqrt(distance2)
+        per_flat2, per_distance2 = per_flat * per_flat, per_distance * per_distance
+        tilt = sign * h * per_flat * per_distance2
+        rise = sign * flat2 * per_flat * per_distance2
+        a, b, c = x * per_distance, y * per_distance, h * per_distance
+        _store_spatial(0, a, b, c, params, p, rotation, by_state, by_landmark, i)
+        _store_spatial(1, -y * per_flat2, x * per_flat2, 0.0, params, p, rotation, by_state, by_landmark, i)
+        _store_spatial(2, -x * tilt, -y * tilt, rise, params, p, rotation, by_state, by_landmark, i)
+    for i in range(n):
+        x, y, h = out[i], out[BLOCK + i], sign * out[2 * BLOCK + i]
+        flat2 = x * x + y * y
+        across = math.sqrt(flat2)
+        out[i] = range_z - math.sqrt(flat2 + h * h)
+        out[BLOCK + i] = arctan2(sin_yaw * x - cos_yaw * y, cos_yaw * x + sin_yaw * y)
+        out[2 * BLOCK + i] = arctan2(sin_pitch * across - cos_pitch * h, cos_pitch * across + sin_pitch * h)
 
 
 @observation_kernel
 def position_spatial(state, mean, const, z, params, n, nu, jac_state, jac_landmark):
     """The point in the sensor's frame, in space."""
+    pose, out, by_state, by_landmark = flat(state), flat(nu), flat(jac_state), flat(jac_landmark)
+    z0, z1, z2 = z[0], z[1], z[2]
+    _locate(pose, flat(mean), params, n, out)
     for i in range(n):
-        rotation, p, s = _points_spatial(state, mean, params, i)
-        nu[0, i] = z[0] - s[0]
-        nu[1, i] = z[1] - s[1]
-        nu[2, i] = z[2] - s[2]
-        _store_spatial(0, 1.0, 0.0, 0.0, params, p, rotation, jac_state, jac_landmark, i)
-        _store_spatial(1, 0.0, 1.0, 0.0, params, p, rotation, jac_state, jac_landmark, i)
-        _store_spatial(2, 0.0, 0.0, 1.0, params, p, rotation, jac_state, jac_landmark, i)
+        p = _in_robot(params, out[i], out[BLOCK + i], out[2 * BLOCK + i])
+        rotation = _rotation_at(pose, i)
+        _store_spatial(0, 1.0, 0.0, 0.0, params, p, rotation, by_state, by_landmark, i)
+        _store_spatial(1, 0.0, 1.0, 0.0, params, p, rotation, by_state, by_landmark, i)
+        _store_spatial(2, 0.0, 0.0, 1.0, params, p, rotation, by_state, by_landmark, i)
+    for i in range(n):
+        out[i] = z0 - out[i]
+        out[BLOCK + i] = z1 - out[BLOCK + i]
+        out[2 * BLOCK + i] = z2 - out[2 * BLOCK + i]

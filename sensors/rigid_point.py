@@ -20,14 +20,16 @@ class RigidPointModel(ObservationModel):
 
     Args:
         space: SE2 or SE3, of world_from_robot.
-        robot_from_sensor: (E,) mounting pose; by default the robot's origin.
+        robot_from_sensor: (E,) mounting pose, fixed from then on; by default the robot's origin.
     """
 
     def __init__(self, space: SE2Group | SE3Group, robot_from_sensor: np.ndarray | None = None) -> None:
         self.space = space
-        self.robot_from_sensor = (
-            space.identity() if robot_from_sensor is None else np.asarray(robot_from_sensor, float)
-        )
+        mounting = space.identity() if robot_from_sensor is None else robot_from_sensor
+        self.robot_from_sensor = np.array(mounting, dtype=float)
+        self.robot_from_sensor.flags.writeable = False
+        rotation = space.rotation(self.robot_from_sensor)
+        self._mounting = np.concatenate([rotation.ravel(), space.translation(self.robot_from_sensor)])
 
     @abstractmethod
     def measure(self, point: np.ndarray) -> np.ndarray:
@@ -75,8 +77,7 @@ class RigidPointModel(ObservationModel):
 
     def mounting(self) -> np.ndarray:
         """Parameters of the fused kernels: rotation of the mounting pose by rows, then its translation."""
-        rotation = self.space.rotation(self.robot_from_sensor)
-        return np.concatenate([rotation.ravel(), self.space.translation(self.robot_from_sensor)])
+        return self._mounting
 
 
 def _by_rotation(slope: np.ndarray, point: np.ndarray) -> np.ndarray:

@@ -2,7 +2,8 @@
 
 Every function broadcasts over leading axes and is meant for n up to about twelve. Covariances are
 full symmetric matrices (..., n, n); a chol_* is lower triangular, a factor L is any matrix with
-L L^T = covariance.
+L L^T = covariance. A result may lie in memory entry by entry, so that what is computed from it runs
+along the batch: code that insists on C order takes its `numpy.ascontiguousarray`.
 """
 
 from rbpf.gaussian.factors import (
@@ -21,7 +22,7 @@ from rbpf.gaussian.laws import (
     sample,
     unscented_transform,
 )
-from rbpf.gaussian.storage import pack, symmetrise, unpack
+from rbpf.gaussian.storage import pack, product, symmetrise, unpack
 
 __all__ = [
     "Gaussian",
@@ -32,6 +33,7 @@ __all__ = [
     "log_density",
     "log_det",
     "pack",
+    "product",
     "psd_factor",
     "sample",
     "solve_lower",

@@ -4,6 +4,8 @@ Up to n = 8 the loops run over the entries of a matrix and the arithmetic along 
 LAPACK, called once per matrix, cannot do. Sums use no BLAS: equal input gives equal bytes.
 """
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -55,7 +57,7 @@ def psd_factor(cov: ArrayLike) -> Array:
     """
     cov = np.asarray(cov, dtype=float)
     _require_symmetric(cov)
-    factor, definite = _cholesky_batch(cov, _SINGULAR)
+    factor, definite = _cholesky_one(cov, _SINGULAR) if cov.ndim == 2 else _cholesky_batch(cov, _SINGULAR)
     if not definite.all():
         singular = ~definite
         negative = np.zeros_like(singular)
@@ -150,6 +152,20 @@ def _cholesky_batch(cov: Array, floor: float) -> tuple[Array, NDArray[np.bool_]]
         definite &= positive
         chol[j:, j] = column / np.sqrt(np.where(positive, pivot, np.inf))
     return entries_last(chol), definite
+
+
+def _cholesky_one(cov: Array, floor: float) -> tuple[Array, NDArray[np.bool_]]:
+    # The same for a single matrix: plain numbers cost a fifth of arrays that hold one each.
+    entries, chol = cov.tolist(), [[0.0] * len(cov) for _ in cov]
+    for j, row in enumerate(chol):
+        pivot = entries[j][j] - sum(x * x for x in row[:j])
+        if not pivot > floor * entries[j][j]:
+            return np.zeros_like(cov), np.array(False)
+        root = math.sqrt(pivot)
+        for i in range(j, len(chol)):
+            rest = sum(x * y for x, y in zip(chol[i][:j], row, strict=False))
+            chol[i][j] = (entries[i][j] - rest) / root
+    return np.array(chol).reshape(cov.shape), np.array(True)
 
 
 def _cholesky_lapack(cov: Array) -> tuple[Array, NDArray[np.bool_]]:

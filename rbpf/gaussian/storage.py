@@ -48,8 +48,8 @@ def entries_first(matrix: Array, ndim: int = 0) -> Array:
 
 
 def entries_last(entries: Array) -> Array:
-    """Inverse of `entries_first`, (n, m, ...) -> contiguous (..., n, m)."""
-    return np.ascontiguousarray(entries.transpose(*range(2, entries.ndim), 0, 1))
+    """Inverse of `entries_first`, (n, m, ...) -> (..., n, m): a view, so that the way back copies nothing either."""
+    return entries.transpose(*range(2, entries.ndim), 0, 1)
 
 
 def product(a: Array, b: Array) -> Array:

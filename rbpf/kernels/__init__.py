@@ -9,6 +9,8 @@ from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 
+from rbpf.kernels.stale import discard_stale
+
 _DRIVERS = ("refine", "update", "posterior", "forest")
 
 
@@ -19,3 +21,6 @@ def compile_once(announce: Callable[[], None]) -> None:
         announce()
     for name in _DRIVERS:
         import_module(f"rbpf.kernels.{name}")
+
+
+discard_stale(Path(__file__).parent)

@@ -5,4 +5,5 @@ from importlib import import_module
 from rbpf.kernels import compile_once
 
 compile_once(lambda: print("compiling the kernels, which takes a minute and is done once …"))
-import_module("rbpf.sensors.range_bearing_kernels")
+for name in ("range_bearing_kernels", "camera_kernels", "constellation_kernel"):
+    import_module(f"rbpf.sensors.{name}")

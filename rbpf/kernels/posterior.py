@@ -5,78 +5,75 @@ import math
 import numpy as np
 from numba import njit, prange, void
 
+from rbpf.kernels.block import add_squares, cholesky, packed, whiten_vector
 from rbpf.kernels.signature import BLOCK, CUBE, MATRIX, VECTOR
 
 
 @njit(cache=True, error_model="numpy")
-def _whitened_information(info, vector, factor, matrix, linear):
-    """Matrix = I + LᵀΛL and linear = Lᵀη for one particle."""
-    dim, rank = factor.shape
-    for a in range(rank):
-        linear[a] = 0.0
+def _load(info, vector, factor, start, count, info_block, vector_block, factor_block):
+    """Particles from `start` on, field by field; a factor that all share is repeated."""
+    dim, rank = factor.shape[1], factor.shape[2]
+    shared = factor.shape[0] == 1
+    for i in range(count):
         for e in range(dim):
-            linear[a] += factor[e, a] * vector[e]
+            vector_block[e, i] = vector[start + i, e]
+            for f in range(e + 1):
+                info_block[packed(e, f), i] = info[start + i, e, f]
+            for r in range(rank):
+                factor_block[e, r, i] = factor[0 if shared else start + i, e, r]
+
+
+@njit(cache=True, error_model="numpy")
+def _whitened_information(info, vector, factor, count, moved, matrix, linear):
+    """Moved = ΛL, the lower triangle of matrix = I + LᵀΛL, and linear = Lᵀη."""
+    dim, rank = factor.shape[0], factor.shape[1]
+    moved[:], linear[:] = 0.0, 0.0
+    for r in range(rank):
+        for e in range(dim):
+            for i in range(count):
+                linear[r, i] += factor[e, r, i] * vector[e, i]
+            for f in range(dim):
+                m = packed(e, f)
+                for i in range(count):
+                    moved[e, r, i] += info[m, i] * factor[f, r, i]
+    for a in range(rank):
         for b in range(a + 1):
-            total = 1.0 if a == b else 0.0
+            for i in range(count):
+                matrix[a, b, i] = 1.0 if a == b else 0.0
             for e in range(dim):
-                row = 0.0
-                for f in range(dim):
-                    row += info[e, f] * factor[f, b]
-                total += factor[e, a] * row
-            matrix[a, b] = total
+                for i in range(count):
+                    matrix[a, b, i] += factor[e, a, i] * moved[e, b, i]
 
 
 @njit(cache=True, error_model="numpy")
-def _cholesky_in_place(matrix):
-    """Lower Cholesky factor in place; returns log|matrix|."""
-    log_det = 0.0
-    for a in range(matrix.shape[0]):
-        for b in range(a + 1):
-            total = matrix[a, b]
-            for c in range(b):
-                total -= matrix[a, c] * matrix[b, c]
-            if a == b:
-                matrix[a, a] = math.sqrt(total)
-                log_det += 2.0 * math.log(matrix[a, a])
-            else:
-                matrix[a, b] = total / matrix[b, b]
-    return log_det
-
-
-@njit(cache=True, error_model="numpy")
-def _inverse_transposed(factor, root):
-    """Root = L⁻ᵀ, upper triangular."""
-    rank = factor.shape[0]
-    for a in range(rank):
-        for b in range(rank):
-            root[a, b] = 0.0
-    for b in range(rank):
-        root[b, b] = 1.0 / factor[b, b]
-        for a in range(b + 1, rank):
-            total = 0.0
+def _invert(factor, count, inverse):
+    """Lower triangle of L⁻¹, for a factor made by `cholesky`."""
+    for b in range(factor.shape[0]):
+        for i in range(count):
+            inverse[b, b, i] = factor[b, b, i]
+        for a in range(b + 1, factor.shape[0]):
+            for i in range(count):
+                inverse[a, b, i] = 0.0
             for c in range(b, a):
-                total -= factor[a, c] * root[b, c]
-            root[b, a] = total / factor[a, a]
+                for i in range(count):
+                    inverse[a, b, i] -= factor[a, c, i] * inverse[c, b, i]
+            for i in range(count):
+                inverse[a, b, i] *= factor[a, a, i]
 
 
 @njit(cache=True, error_model="numpy")
-def _refine_one(info, vector, factor, matrix, linear, mean, root):
-    """Mean and root of one particle; returns (Lᵀη)ᵀM⁻¹(Lᵀη) and log|M|."""
-    rank = mean.size
-    _whitened_information(info, vector, factor, matrix, linear)
-    log_m = _cholesky_in_place(matrix)
-    _inverse_transposed(matrix, root)
-    gain = 0.0
-    for a in range(rank):
-        for b in range(a):
-            linear[a] -= matrix[a, b] * linear[b]
-        linear[a] /= matrix[a, a]
-        gain += linear[a] * linear[a]
-    for a in range(rank):
-        mean[a] = 0.0
-        for b in range(a, rank):
-            mean[a] += root[a, b] * linear[b]
-    return gain, log_m
+def _store(inverse, linear, start, count, mean, root):
+    """Mean = L⁻ᵀ linear and root = L⁻ᵀ of the particles from `start` on."""
+    rank = linear.shape[0]
+    for i in range(count):
+        for a in range(rank):
+            total = 0.0
+            for b in range(a, rank):
+                total += inverse[b, a, i] * linear[b, i]
+                root[start + i, a, b] = inverse[b, a, i]
+            for b in range(a):
+                root[start + i, a, b] = 0.0
+            mean[start + i, a] = total
 
 
 @njit(
@@ -92,13 +89,26 @@ def posterior(info, vector, quad, log_det, factor, mean, root, log_w1, nis):
     triangular), `log_w1` (N,) and `nis` (N,), the innovation's squared Mahalanobis distance.
     """
     n_particles, rank = mean.shape
-    stride = 0 if factor.shape[0] == 1 else 1
+    dim = factor.shape[1]
     for block in prange((n_particles + BLOCK - 1) // BLOCK):
-        matrix = np.empty((rank, rank))
-        linear = np.empty(rank)
-        for i in range(block * BLOCK, min((block + 1) * BLOCK, n_particles)):
-            gain, log_m = _refine_one(
-                info[i], vector[i], factor[i * stride], matrix, linear, mean[i], root[i]
-            )
-            nis[i] = quad[i] - gain
-            log_w1[i] = -0.5 * (nis[i] + log_det[i] + log_m)
+        start = block * BLOCK
+        count = min(BLOCK, n_particles - start)
+        info_block = np.empty((dim * (dim + 1) // 2, BLOCK))
+        vector_block = np.empty((dim, BLOCK))
+        factor_block = np.empty((dim, rank, BLOCK))
+        moved = np.empty((dim, rank, BLOCK))
+        matrix = np.empty((rank, rank, BLOCK))
+        inverse = np.empty((rank, rank, BLOCK))
+        linear = np.empty((rank, BLOCK))
+        gain = np.zeros(BLOCK)
+        scale = np.ones(BLOCK)
+        _load(info, vector, factor, start, count, info_block, vector_block, factor_block)
+        _whitened_information(info_block, vector_block, factor_block, count, moved, matrix, linear)
+        cholesky(matrix, count, scale)
+        whiten_vector(matrix, count, linear)
+        add_squares(linear, count, gain)
+        _invert(matrix, count, inverse)
+        _store(inverse, linear, start, count, mean, root)
+        for i in range(count):
+            nis[start + i] = quad[start + i] - gain[i]
+            log_w1[start + i] = -0.5 * (nis[start + i] + log_det[start + i]) + math.log(scale[i])

@@ -1,12 +1,16 @@
 """The type of a fused observation kernel, and the decorator that makes one."""
 
 from collections.abc import Callable
-from typing import Any
+from pathlib import Path
+from typing import Any, final
 
 from numba import cfunc, float64, int64, types, void
+from numba.core.types.function_type import WrapperAddressProtocol
 
-BLOCK = 32
-"""Particles per block: wide enough to fill vector registers, small enough for the scratch to stay in the L1 cache."""
+from rbpf.kernels.stale import discard_stale
+
+BLOCK = 128
+"""Particles per block: long enough that what a loop costs to start is small beside its work; in the L2 cache."""
 
 FACTORS_PER_LOG = 18
 """Pivots multiplied before one logarithm is taken: 18 factors within 1e±16 stay inside the range of a double."""
@@ -23,7 +27,26 @@ KERNEL_TYPE = types.FunctionType(_SIGNATURE)
 """First-class function type: the drivers call a kernel through a pointer, so they compile once for all models."""
 
 
-def observation_kernel(function: Callable[..., None]) -> Any:
+@final
+class ObservationKernel(WrapperAddressProtocol):
+    """A compiled kernel as the drivers take it: its type is looked up, not worked out anew at every call."""
+
+    _numba_type_ = KERNEL_TYPE
+
+    def __init__(self, compiled: Any) -> None:
+        self.compiled = compiled
+        """Numba's object, which owns the machine code."""
+
+    def __wrapper_address__(self) -> int:
+        """Where the machine code starts."""
+        return int(self.compiled.address)
+
+    def signature(self) -> Any:
+        """The kernel's signature."""
+        return _SIGNATURE
+
+
+def observation_kernel(function: Callable[..., None]) -> ObservationKernel:
     """Compiles `function(state, mean, const, z, params, n, nu, jac_state, jac_landmark)` into a fused kernel.
 
     Given one measurement `z` (p,) of one landmark, the kernel fills for the lanes 0..n-1
@@ -31,4 +54,5 @@ def observation_kernel(function: Callable[..., None]) -> Any:
     and `jac_landmark` (p, D, BLOCK), from `state` (E, BLOCK), `mean` (D, BLOCK), `const` (A, BLOCK) and the
     model's `params` (P,). Write the body as a loop over lanes; it must not raise.
     """
-    return cfunc(_SIGNATURE, cache=True, error_model="numpy")(function)
+    discard_stale(Path(function.__code__.co_filename).parent)
+    return ObservationKernel(cfunc(_SIGNATURE, cache=True, error_model="numpy")(function))

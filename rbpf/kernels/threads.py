@@ -6,7 +6,7 @@ from typing import Any
 import numba
 
 PAIRS_PER_THREAD = 8192
-"""Particle-observation pairs worth a thread: about half a millisecond of work, far above a wake-up."""
+"""Particle-observation pairs worth a thread: a quarter of a millisecond of work, far above a wake-up."""
 
 
 def run_driver(driver: Callable[..., None], pairs: int, *arguments: Any) -> None:

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from rbpf.filter import Filter
+from rbpf.kernels.signature import BLOCK
 from rbpf.lie import SE2, SE3
 from rbpf.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobis
+from rbpf.maps import rows
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
 from rbpf.models import NEW, NULL, Births, Observations
@@ -16,7 +18,7 @@ from tests.exactness.models import Frame, Scripted, known
 from tests.exactness.scenes import Scene, random_covs, sensors
 
 TOLERANCE = 1e-9
-PARTICLES = 45
+PARTICLES = BLOCK + 45
 """More than one block of the kernels, and not a multiple of it."""
 every_sensor = pytest.mark.parametrize(
     ("space", "which"), [(space, which) for space in (SE2, SE3) for which in (0, 1)], ids=str
@@ -82,6 +84,28 @@ def test_refinement_and_update(space, which, likelihood, kind, rng):
     if not isinstance(likelihood, Gaussian):
         inlier = likelihood.inlier(*_innovations(scene, group))
         assert 0.05 < inlier.mean() < 0.95
+
+
+@pytest.mark.parametrize("kind", ["shared", "per particle"])
+@every_sensor
+def test_particles_taken_in_parts_are_those_taken_together(space, which, kind, rng, monkeypatch):
+    scene = Scene.random(space, rng, n=PARTICLES, k=6)
+    group = with_outliers(
+        scene.observe(
+            sensors(space, rng)[which], associations(kind, rng), likelihood=GaussianWithOutliers(0.05, 300.0)
+        )
+    )
+    prior = scene.prior(space.dim, shared=kind == "shared")
+    found = []
+    for pairs in (10**9, 64):
+        monkeypatch.setattr(rows, "PAIRS_AT_ONCE", pairs)
+        held = scene.map(compiled=False)
+        terms = held.terms(scene.state, [group], prior)
+        densities = held.correct(scene.state, np.zeros((PARTICLES, space.dim)), [group])
+        records = held.read(held.ids)
+        found.append((terms.info, terms.log_factor, terms.rows, densities.all, records.mean, records.cov))
+    for together, in_parts in zip(*found, strict=True):
+        np.testing.assert_allclose(in_parts, together, rtol=1e-12, atol=1e-12)
 
 
 def _innovations(scene: Scene, group: Observations) -> tuple[np.ndarray, np.ndarray]:

@@ -9,7 +9,8 @@ from rbpf.lie import SE2, SE3
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.mixture import MixturePoint, ring
 from rbpf.maps.point import AnchoredPoint, Point
-from rbpf.models import Births, Records
+from rbpf.models import Births, Observations, Records
+from rbpf.proposals import Prior
 from rbpf.sensors.range_bearing import RangeBearing
 
 N = 40
@@ -174,3 +175,31 @@ def test_ring_covers_the_circle():
         chord = np.linalg.norm(offset[k, 1] - offset[k, 0])
         values = np.linalg.eigvalsh(mixture.cov[0, k])
         np.testing.assert_allclose(values[:, 1], (0.5 * chord) ** 2)
+
+
+def sighting(landmark_id: int) -> list[Observations]:
+    z, cov = np.array([[5.0, 0.1]]), 0.01 * np.eye(2)[None]
+    return [Observations(z, cov, RangeBearing(SE2), ids=np.array([landmark_id]))]
+
+
+def test_an_update_by_other_groups_than_the_refinement_is_by_the_groups_it_is_given():
+    state, increment = np.zeros((N, 3)), np.zeros((N, 3))
+    found = []
+    for refined_by in (sighting(0), sighting(1)):
+        landmark_map, _ = filled()
+        landmark_map.add_records(points(np.random.default_rng(1), 2), Point(2))
+        landmark_map.terms(state, refined_by, Prior.exactly(SE2, state))
+        densities = landmark_map.correct(state, increment, sighting(1))
+        found.append((densities.all, landmark_map.read(np.arange(2)).mean))
+    np.testing.assert_array_equal(found[0][0], found[1][0])
+    np.testing.assert_array_equal(found[0][1], found[1][1])
+
+
+def test_a_landmark_removed_after_the_refinement_is_missed_by_the_update():
+    state, groups = np.zeros((N, 3)), sighting(1)
+    landmark_map, _ = filled()
+    landmark_map.add_records(points(np.random.default_rng(1), 2), Point(2))
+    landmark_map.terms(state, groups, Prior.exactly(SE2, state))
+    landmark_map.remove(np.array([1]))
+    with pytest.raises(InputError, match="names landmark 1, which the map does not hold"):
+        landmark_map.correct(state, np.zeros((N, 3)), groups)

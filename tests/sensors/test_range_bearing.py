@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from rbpf.lie import SE2, SE3
+from rbpf.models import Part
 from rbpf.numeric import numeric_jacobians
 from rbpf.sensors.range_bearing import RangeBearing, RelativePosition, wrap_angle
 from rbpf.sensors.rigid_point import RigidPointModel
@@ -64,6 +65,15 @@ def check_jacobians(model: RigidPointModel, pose: np.ndarray, landmark: np.ndarr
     numeric = numeric_jacobians(model, model.space, pose, landmark)
     for found, expected in zip(analytic[:2], numeric[:2], strict=True):
         np.testing.assert_allclose(np.asarray(found), np.asarray(expected), rtol=1e-6, atol=atol)
+
+
+@every_model
+def test_numeric_jacobians_by_one_part_only(model):
+    pose, landmark = model.space.identity()[None, None], 2.0 * np.ones((1, 1, model.dim))
+    whole = numeric_jacobians(model, model.space, pose, landmark)
+    part = numeric_jacobians(model, model.space, pose, landmark, by=frozenset({Part.LANDMARK}))
+    assert part.state is None
+    np.testing.assert_array_equal(np.asarray(part.landmark), np.asarray(whole.landmark))
 
 
 @every_model

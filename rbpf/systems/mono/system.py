@@ -88,17 +88,15 @@ def world_of(filter_: Filter) -> Anchored | None:
     return None
 
 
-def start_law(log: FeatureLog, config: MonoConfig) -> PoseLaw | None:
-    """Where the camera is at first, before the known points are measured; None is the origin, exactly.
+def start_law(log: FeatureLog, config: MonoConfig) -> PoseLaw:
+    """Where the camera is at first, before the known points are measured: at the origin, exactly, unless they say it.
 
     The law is wide: the measurements of the first frame, not the resection, say where in it the camera is.
 
     Raises:
         InputError: fewer than four known points are seen in the first frame, or they do not determine the camera.
     """
-    if log.known is None:
-        return None
-    if config.known == "frame":
+    if log.known is None or config.known == "frame":
         return PoseLaw(SE3.identity(), np.zeros((6, 6)))
     return PoseLaw(_resected(log), _start_cov(config))
 
@@ -107,8 +105,10 @@ def _resected(log: FeatureLog) -> np.ndarray:
     """world_from_camera of the first frame, from the known points."""
     assert isinstance(log.camera, Pinhole) and log.known is not None
     first = log.frames[0]
-    _, in_known, in_frame = np.intersect1d(log.known.names, first.landmarks, return_indices=True)
-    return resect(log.camera, log.known.positions[in_known], first.z[in_frame])
+    inside = log.camera.inside(first.z)
+    names, z = first.landmarks[inside], first.z[inside]
+    _, in_known, in_frame = np.intersect1d(log.known.names, names, return_indices=True)
+    return resect(log.camera, log.known.positions[in_known], z[in_frame])
 
 
 def _start_cov(config: MonoConfig) -> np.ndarray:

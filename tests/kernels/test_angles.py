@@ -1,0 +1,115 @@
+"""The kernels' angle functions against NumPy's, over their whole range; bounds are absolute errors."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+from numba import njit
+
+from rbpf.kernels.angles import arctan2, cos_sin
+
+HALF_ULP_OF_ONE = 2.0**-53
+ULP_OF_PI = np.spacing(np.pi)
+MANY = 200_000
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(0)
+
+
+@njit(error_model="numpy")
+def cos_sin_of(angles):
+    cosine, sine = np.empty_like(angles), np.empty_like(angles)
+    for i in range(angles.size):
+        cosine[i], sine[i] = cos_sin(angles[i])
+    return cosine, sine
+
+
+@njit(error_model="numpy")
+def arctan2_of(y, x):
+    angle = np.empty_like(y)
+    for i in range(y.size):
+        angle[i] = arctan2(y[i], x[i])
+    return angle
+
+
+@pytest.mark.parametrize("reach", [1e-8, np.pi, 4 * np.pi, 1e3, 1e6])
+def test_cosine_and_sine_are_within_an_ulp_of_one(reach, rng):
+    angles = rng.uniform(-reach, reach, MANY)
+    cosine, sine = cos_sin_of(angles)
+    assert np.abs(cosine - np.cos(angles)).max() <= 2 * HALF_ULP_OF_ONE
+    assert np.abs(sine - np.sin(angles)).max() <= 2 * HALF_ULP_OF_ONE
+
+
+def test_cosine_and_sine_at_and_beside_the_octants():
+    octants = np.arange(-16, 17) * (np.pi / 4)
+    angles = np.concatenate([octants, np.nextafter(octants, np.inf), np.nextafter(octants, -np.inf)])
+    cosine, sine = cos_sin_of(angles)
+    assert np.abs(cosine - np.cos(angles)).max() <= 2 * HALF_ULP_OF_ONE
+    assert np.abs(sine - np.sin(angles)).max() <= 2 * HALF_ULP_OF_ONE
+
+
+def test_a_small_angle_keeps_its_digits_and_its_sign():
+    angles = np.array([0.0, -0.0, 5e-324, -5e-324, 1e-300, -1e-20, 1e-9])
+    cosine, sine = cos_sin_of(angles)
+    np.testing.assert_array_equal(cosine, 1.0)
+    np.testing.assert_array_equal(sine, angles)
+    np.testing.assert_array_equal(np.signbit(sine), np.signbit(angles))
+
+
+def test_a_huge_angle_is_as_good_as_its_rounding(rng):
+    angles = rng.uniform(1e6, 1e12, MANY)
+    cosine, sine = cos_sin_of(angles)
+    bound = 2 * HALF_ULP_OF_ONE + np.spacing(angles)
+    assert (np.abs(cosine - np.cos(angles)) <= bound).all()
+    assert (np.abs(sine - np.sin(angles)) <= bound).all()
+
+
+def test_no_angle_hides_what_is_not_finite():
+    cosine, sine = cos_sin_of(np.array([np.nan, np.inf, -np.inf]))
+    assert not np.isfinite(cosine).any()
+    assert not np.isfinite(sine).any()
+
+
+def test_arctan2_is_within_an_ulp_of_pi_at_all_magnitudes(rng):
+    y, x = rng.normal(size=(2, MANY)) * 10.0 ** rng.uniform(-150, 150, (2, MANY))
+    assert np.abs(arctan2_of(y, x) - np.arctan2(y, x)).max() <= ULP_OF_PI
+
+
+def test_arctan2_is_within_an_ulp_of_pi_all_the_way_round():
+    angle = np.linspace(-np.pi, np.pi, MANY + 1)
+    y, x = np.sin(angle), np.cos(angle)
+    assert np.abs(arctan2_of(y, x) - np.arctan2(y, x)).max() <= ULP_OF_PI
+
+
+def test_arctan2_of_a_small_angle_keeps_its_digits(rng):
+    y, x = rng.normal(size=MANY) * 1e-9, rng.uniform(0.1, 10.0, MANY)
+    expected = np.arctan2(y, x)
+    assert (np.abs(arctan2_of(y, x) - expected) <= 3 * np.spacing(np.abs(expected))).all()
+
+
+def test_arctan2_on_the_axes_the_diagonals_and_at_the_limits():
+    values = (0.0, -0.0, 1.0, -1.0, 5e-324, -5e-324, 8e307, -8e307, np.inf, -np.inf)
+    cases = [
+        (y, x)
+        for y, x in product(values, values)
+        if not (np.isinf(y) and np.isinf(x)) and not (y == 0.0 and x == 0.0)
+    ]
+    y, x = np.array(cases).T
+    found, expected = arctan2_of(y, x), np.arctan2(y, x)
+    assert np.abs(found - expected).max() <= ULP_OF_PI
+    np.testing.assert_array_equal(np.signbit(found), np.signbit(expected))
+
+
+def test_arctan2_at_the_origin_is_zero_of_the_sign_of_y():
+    found = arctan2_of(np.array([0.0, -0.0, 0.0, -0.0]), np.array([0.0, 0.0, -0.0, -0.0]))
+    np.testing.assert_array_equal(found, 0.0)
+    np.testing.assert_array_equal(np.signbit(found), [False, True, False, True])
+
+
+def test_arctan2_loses_no_nan():
+    others = (0.0, -0.0, 1.0, -1e300, np.inf, np.nan)
+    cases = [(np.nan, other) for other in others] + [(other, np.nan) for other in others]
+    y, x = np.array(cases).T
+    assert np.isnan(arctan2_of(y, x)).all()

@@ -1,0 +1,29 @@
+import os
+
+from rbpf.kernels.stale import discard_stale
+
+
+def test_compiled_copies_older_than_a_kernel_source_are_deleted(tmp_path, monkeypatch):
+    monkeypatch.setattr("rbpf.kernels.stale.config.CACHE_DIR", "")
+    cache = tmp_path / "__pycache__"
+    cache.mkdir()
+    old, new, other = (cache / name for name in ("a.f-1.py311.nbi", "a.g-9.py311.nbi", "a.pyc"))
+    for path in (old, new, other):
+        path.touch()
+    os.utime(old, (0, 0))
+    os.utime(other, (0, 0))
+    os.utime(new, (4e9, 4e9))
+    discard_stale(tmp_path)
+    assert not old.exists()
+    assert new.exists()
+    assert other.exists()
+
+
+def test_a_cache_folder_of_its_own_is_looked_at(tmp_path, monkeypatch):
+    monkeypatch.setattr("rbpf.kernels.stale.config.CACHE_DIR", str(tmp_path))
+    (tmp_path / "module").mkdir()
+    old = tmp_path / "module" / "a.f-1.py311.nbi"
+    old.touch()
+    os.utime(old, (0, 0))
+    discard_stale(tmp_path / "elsewhere")
+    assert not old.exists()

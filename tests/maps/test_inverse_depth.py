@@ -1,0 +1,117 @@
+"""Points on rays: inverse depth in the frame of the first sighting, and their promotion."""
+
+import numpy as np
+import pytest
+
+from rbpf.conformance import check_model
+from rbpf.errors import InputError
+from rbpf.genealogy import Lineage
+from rbpf.lie import SE3
+from rbpf.maps.inverse_depth import InverseDepth
+from rbpf.maps.landmark_map import LandmarkMap
+from rbpf.maps.point import Point
+from rbpf.models import Records
+
+LANDMARK = InverseDepth()
+ANCHOR = SE3.exp(np.array([0.4, -0.8, 1.2, 2.0, -1.0, 0.5]))
+B = np.array([0.3, -0.2, 0.5])
+
+
+def scattered(n: int, k: int, std_q: float, seed: int = 0) -> Records:
+    """Rays of n particles with an anchor each; u, v and q are correlated."""
+    rng = np.random.default_rng(seed)
+    mean = B + rng.normal(scale=[0.1, 0.1, 0.05], size=(n, k, 3))
+    half = rng.normal(size=(n, k, 3, 4)) * np.array([0.01, 0.01, std_q])[:, None] / 2.0
+    const = SE3.retract(ANCHOR, rng.normal(scale=0.3, size=(n, k, 6)))
+    return Records(mean, half @ np.swapaxes(half, -1, -2), const)
+
+
+def euclidean(mean: np.ndarray, const: np.ndarray) -> np.ndarray:
+    """The point (u, v, 1)/q in the anchor's frame, told in the world."""
+    ray = np.concatenate([mean[..., :2], np.ones((*mean.shape[:-1], 1))], axis=-1)
+    return SE3.transform(const, ray / mean[..., 2:])
+
+
+def test_sound_parametrisation():
+    assert check_model(LANDMARK, SE3) == []
+
+
+def test_homogeneous_is_the_point():
+    records = scattered(4, 3, 0.01)
+    world = LANDMARK.homogeneous(records.mean, records.const)
+    np.testing.assert_array_equal(world[..., 3], records.mean[..., 2])
+    np.testing.assert_allclose(
+        world[..., :3] / world[..., 3:], euclidean(records.mean, records.const), atol=1e-12
+    )
+
+
+def test_at_infinity_only_the_direction_is_left():
+    direction = LANDMARK.homogeneous(np.array([0.3, -0.2, 0.0]), ANCHOR)
+    np.testing.assert_allclose(direction, [*SE3.rotation(ANCHOR) @ [0.3, -0.2, 1.0], 0.0], atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("q", "std", "expected"),
+    [(0.5, 0.049, True), (0.5, 0.051, False), (0.0, 0.0, False), (-0.5, 0.001, False), (1e-3, 1e-3, False)],
+)
+def test_ready(q, std, expected):
+    mean = np.tile(np.array([0.3, -0.2, q]), (2, 1, 1))
+    cov = np.tile(np.diag([1.0, 1.0, std**2]), (2, 1, 1, 1))
+    ready = LANDMARK.ready(Records(mean, cov, np.tile(ANCHOR, (2, 1, 1))))
+    assert ready.tolist() == [[expected], [expected]]
+
+
+@pytest.mark.parametrize("ratio", [0.0, -1.0, np.nan])
+def test_bad_ratio(ratio):
+    with pytest.raises(InputError, match="ready_ratio must be positive"):
+        InverseDepth(ratio)
+
+
+@pytest.mark.parametrize("share", [0.02, 0.05, 0.1])
+def test_promotion_is_the_law_of_the_point(share):
+    """Against samples; transforming the mean alone would miss the bias E[1/q] − 1/E[q] ≈ σ²/q³ (E06 §5.1)."""
+    std, n = share * B[2], 400_000
+    cov = np.diag([0.004, 0.003, std]) ** 2
+    cov[0, 2] = cov[2, 0] = 0.5 * 0.004 * std
+    records = Records(B[None, None], cov[None, None], ANCHOR[None, None])
+    found = LANDMARK.promote(records)
+    assert found.const is None
+    rng = np.random.default_rng(2)
+    normal = rng.standard_normal((n, 3)) @ np.linalg.cholesky(cov).T
+    points = euclidean(B + np.concatenate([normal, -normal]), ANCHOR)
+    mean, error = points.mean(axis=0), 3.0 * share**3 / B[2]
+    np.testing.assert_allclose(found.mean[0, 0], mean, atol=error + 4.0 * share**2 / np.sqrt(n))
+    expected = np.cov(points.T)
+    np.testing.assert_allclose(found.cov[0, 0], expected, atol=expected.max() * (8.0 * share**2 + 0.01))
+    naive = np.linalg.norm(euclidean(B, ANCHOR) - mean)
+    np.testing.assert_allclose(naive, np.sqrt(1.0 + B[0] ** 2 + B[1] ** 2) * share**2 / B[2], rtol=0.15)
+    assert np.linalg.norm(found.mean[0, 0] - mean) < 0.1 * naive
+
+
+def test_all_particles_are_promoted_at_once():
+    """Each by its own transform; other landmarks and the number of the landmark stay."""
+    n, records = 5, scattered(5, 3, 0.02)
+    held = LandmarkMap(SE3)
+    held.begin(n, Lineage(n))
+    ids = held.add_records(records, LANDMARK)
+    held.promote(ids[1:2], Point(3))
+    assert isinstance(held.landmark_of(int(ids[1])), Point)
+    point, expected = held.read(ids[1:2]), LANDMARK.promote(records)
+    assert point.const is None
+    np.testing.assert_allclose(point.mean[:, 0], expected.mean[:, 1], rtol=1e-14)
+    np.testing.assert_allclose(point.cov[:, 0], expected.cov[:, 1], rtol=1e-12, atol=1e-16)
+    assert np.ptp(point.mean, axis=0).max() > 0.1
+    for landmark in (0, 2):
+        np.testing.assert_array_equal(held.read(ids[[landmark]]).mean[:, 0], records.mean[:, landmark])
+        np.testing.assert_array_equal(held.read(ids[[landmark]]).const[:, 0], records.const[:, landmark])
+
+
+def test_readiness_of_a_share_of_the_weight():
+    n, records = 4, scattered(4, 1, 0.01)
+    cov = records.cov.copy()
+    cov[0, 0] = np.diag([1e-4, 1e-4, 0.1])
+    held = LandmarkMap(SE3)
+    held.begin(n, Lineage(n))
+    ids = held.add_records(Records(records.mean, cov, records.const), LANDMARK)
+    assert held.ready(np.array([0.04, 0.32, 0.32, 0.32])).tolist() == ids.tolist()
+    assert held.ready(np.array([0.06, 0.30, 0.32, 0.32])).tolist() == []
