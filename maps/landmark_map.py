@@ -117,6 +117,10 @@ class LandmarkMap(Conditional):
         self._known(np.array([landmark_id]))
         return self._layout_of(landmark_id).landmark
 
+    def are(self, ids: np.ndarray, landmark: Landmark) -> np.ndarray:
+        """Which landmarks (K,) of the map have this parametrisation, (K,) bool."""
+        return np.asarray(self.kinds[ids] == self._kind(landmark))
+
     def promote(self, ids: np.ndarray, to: Landmark | None = None) -> None:
         """Turns landmarks into single Gaussian points in all particles at once, by their own `promote`."""
         self._planned = None

@@ -127,8 +127,9 @@ class Terms:
 
     def charted(self, jacobian: np.ndarray) -> "Terms":
         """The same for a perturbation δ of the chart's coordinates, where the state moves by J δ; J (N, d, d)."""
-        info = np.einsum("nba,nbc,ncd->nad", jacobian, self.info, jacobian)
-        return replace(self, info=info, vector=np.einsum("nba,nb->na", jacobian, self.vector))
+        turned = np.swapaxes(jacobian, -1, -2)
+        vector = (turned @ self.vector[..., None])[..., 0]
+        return replace(self, info=turned @ self.info @ jacobian, vector=vector)
 
     def shifted(self, offset: np.ndarray) -> "Terms":
         """The same relative to a point `offset` (N, d) before the one linearised at: ν + H·offset."""

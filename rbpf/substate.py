@@ -72,11 +72,12 @@ class KalmanSubstate(Conditional):
         self._increment_mean = means[:, :d]
         self._predicted = means[:, d:] + transition.drift
         cov_ee, cov_se = joint[:, :d, :d], joint[:, d:, :d]
-        self._gain = cov_se @ np.linalg.pinv(cov_ee, hermitian=True) if d else np.zeros(cov_se.shape)
+        factor = gaussian.psd_factor(cov_ee)
+        self._gain = _gain(cov_se, cov_ee, factor)
         unit = np.broadcast_to(np.eye(m), (self._gain.shape[0], m, m))
         closed = np.concatenate([-self._gain, unit], axis=2)
         self._rest = gaussian.symmetrise(closed @ joint @ np.swapaxes(closed, -1, -2))
-        return Prior(space, transition.mean, self._increment_mean, gaussian.psd_factor(cov_ee), centred=False)
+        return Prior(space, transition.mean, self._increment_mean, factor, centred=False)
 
     def given(self, increment: np.ndarray) -> np.ndarray:
         """Mean (N, m) of s_t given increments (N, d)."""
@@ -156,3 +157,12 @@ class KalmanSubstate(Conditional):
                 jacs.append(np.broadcast_to(jac[:, k], (n, *jac.shape[2:])).copy())
                 noises.append(group.cov[k])
         return stacked(nus, jacs, noises, [None] * len(nus))
+
+
+def _gain(cov_se: np.ndarray, cov_ee: np.ndarray, factor: np.ndarray) -> np.ndarray:
+    """Cov(s, ε) cov(ε)⁺; `factor` of cov(ε) is triangular with a positive diagonal where that is definite."""
+    if not np.triu(factor, 1).any() and (np.diagonal(factor, axis1=-2, axis2=-1) > 0.0).all():
+        half = gaussian.solve_lower_matrix(factor, np.swapaxes(cov_se, -1, -2))
+        upper = gaussian.solve_lower_matrix(factor, np.eye(factor.shape[-1]))
+        return np.swapaxes(half, -1, -2) @ upper
+    return cov_se @ np.linalg.pinv(cov_ee, hermitian=True)

@@ -74,18 +74,19 @@ def coupling(omega: Array, v: Array) -> Array:
     """Block Q of the left Jacobian of SE(3), (..., 3) and (..., 3) -> (..., 3, 3).
 
     Q = V/2 + c (WV + VW + WVW) + d (WWV + VWW - 3 WVW) + e (WVWW + WWVW), Barfoot (2017) (7.86);
-    W and V are the skew matrices of omega and v.
+    W and V are the skew matrices of omega and v. With s = omega . v their products are WVW = -s W,
+    WV + VW = omega v^T + v omega^T - 2 s I and WWV + VWW = -theta^2 V - s W, which leaves no matrix product.
     """
     squared = np.square(omega).sum(-1)
     c, d, e = (
         coefficient(squared)[..., None, None] for coefficient in (coefficient_c, coefficient_d, coefficient_e)
     )
-    w_hat, v_hat = skew(omega), skew(v)
-    wv, vw = product(w_hat, v_hat), product(v_hat, w_hat)
-    wvw = product(wv, w_hat)
-    even = product(w_hat, wv) + product(vw, w_hat) - 3.0 * wvw
-    odd = product(wvw, w_hat) + product(w_hat, wvw)
-    return 0.5 * v_hat + c * (wv + vw + wvw) + d * even + e * odd
+    s = (omega * v).sum(-1)[..., None, None]
+    theta_squared = squared[..., None, None]
+    mixed = omega[..., :, None] * (c * v[..., None, :] - (2.0 * e * s) * omega[..., None, :])
+    mixed = mixed + c * (v[..., :, None] * omega[..., None, :])
+    turned = skew(omega) * (s * (2.0 * d - c)) + skew(v) * (0.5 - d * theta_squared)
+    return mixed + turned + (2.0 * s * (e * theta_squared - c)) * np.eye(3)
 
 
 def lower_blocks(diagonal: Array, coupling_block: Array) -> Array:

@@ -76,7 +76,7 @@ class MonoConfig:
     births_per_frame: int = 1000
     velocity: VelocityConfig = field(default_factory=VelocityConfig)
     ray: RayConfig = field(default_factory=RayConfig)
-    proposal: ProposalConfig = field(default_factory=ProposalConfig)
+    proposal: ProposalConfig = field(default_factory=lambda: ProposalConfig(iterations=1))
     resampling: ResamplingConfig = field(default_factory=ResamplingConfig)
 
     def __post_init__(self) -> None:

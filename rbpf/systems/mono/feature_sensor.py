@@ -55,9 +55,7 @@ class FeatureSensor(Sensor):
         usable = (ids >= 0) & self.camera.inside(frame.z)
         rows = np.flatnonzero(usable)
         groups = self._constellation_group(frame, belief)
-        is_ray = np.array(
-            [isinstance(belief.map.landmark_of(i), InverseDepth) for i in ids[rows]], dtype=bool
-        )
+        is_ray = belief.map.are(ids[rows], self.inverse_depth)
         if (~is_ray).any():
             k = rows[~is_ray]
             groups.append(Observations(frame.z[k], frame.cov_z[k], self.point, ids=ids[k]))
