@@ -23,6 +23,7 @@ NAMES = (
     "sharing",
     "genealogy_growth",
     "user_model",
+    "mono_step",
     "bootstrap_peers",
     "mrpt_peer",
 )
