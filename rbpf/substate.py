@@ -162,7 +162,5 @@ class KalmanSubstate(Conditional):
 def _gain(cov_se: np.ndarray, cov_ee: np.ndarray, factor: np.ndarray) -> np.ndarray:
     """Cov(s, ε) cov(ε)⁺; `factor` of cov(ε) is triangular with a positive diagonal where that is definite."""
     if not np.triu(factor, 1).any() and (np.diagonal(factor, axis1=-2, axis2=-1) > 0.0).all():
-        half = gaussian.solve_lower_matrix(factor, np.swapaxes(cov_se, -1, -2))
-        upper = gaussian.solve_lower_matrix(factor, np.eye(factor.shape[-1]))
-        return np.swapaxes(half, -1, -2) @ upper
+        return np.swapaxes(np.linalg.solve(cov_ee, np.swapaxes(cov_se, -1, -2)), -1, -2)
     return cov_se @ np.linalg.pinv(cov_ee, hermitian=True)

@@ -7,7 +7,7 @@ from numba import njit
 from rbpf.kernels.signature import observation_kernel
 from rbpf.sensors.pinhole_kernels import project
 
-GRAZING = 1e-2
+GRAZING = 0.2
 """The same as `rbpf.sensors.camera_points.GRAZING`; the tests compare them."""
 
 

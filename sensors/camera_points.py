@@ -15,7 +15,7 @@ from rbpf.lie import SE3
 from rbpf.models import FusedKernel, Jacobians, ObservationModel, Records
 from rbpf.sensors.pinhole import Pinhole
 
-GRAZING = 1e-2
+GRAZING = 0.2
 """Least share of its length by which a direction points forward: what is behind the camera projects far outside."""
 
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from rbpf.errors import InputError
 from rbpf.lie import Array, SE2Group
 from rbpf.validation.gtsam_ba_chart import PLANAR, SPATIAL
+from rbpf.validation.gtsam_ba_solvers import huber, noise
 from rbpf.validation.measurements import InitialEstimate, Measurements
 
 SINGULAR = 1e-12
@@ -125,8 +126,7 @@ class Problem:
             return self._turned_odometry(keys, self.m.deltas[step - 1], np.where(null, 0.0, variances), axes)
         order = self.chart.order
         cov = ((axes * variances) @ axes.T)[np.ix_(order, order)]
-        noise = _noise(cov)
-        return self.chart.between(*keys, self.chart.pose(self.m.deltas[step - 1]), noise)
+        return self.chart.between(*keys, self.chart.pose(self.m.deltas[step - 1]), noise(cov))
 
     def _turned_odometry(self, keys: tuple[int, int], delta: Array, variances: Array, axes: Array) -> Any:
         # e = U^T Log((x delta)^-1 y):  de/dy = U^T J_r^-1,  de/dx = -U^T J_l^-1 Ad(delta^-1).
@@ -141,8 +141,8 @@ class Problem:
                 jacobians[1] = (axes.T @ space.right_jacobian_inverse(e))[:, chart.order]
             return axes.T @ e
 
-        noise = gtsam.noiseModel.Constrained.MixedSigmas(_PENALTY, np.sqrt(variances))
-        return gtsam.CustomFactor(noise, list(keys), error)
+        mixed = gtsam.noiseModel.Constrained.MixedSigmas(_PENALTY, np.sqrt(variances))
+        return gtsam.CustomFactor(mixed, list(keys), error)
 
     def _sighting(self, row: int) -> Any:
         model, chart, z = self.model, self.chart, self.m.z[row]
@@ -157,11 +157,8 @@ class Problem:
                 jacobians[0], jacobians[1] = by_state[:, chart.order], by_landmark
             return -model.residual(z, model.predict(state, landmark))
 
-        noise = _noise(self.m.cov_z[row])
-        if self.robust is not None:
-            huber = gtsam.noiseModel.mEstimator.Huber.Create(self.robust)
-            noise = gtsam.noiseModel.Robust.Create(huber, noise)
-        return gtsam.CustomFactor(noise, [pose_key, landmark_key], error)
+        loss = huber(noise(self.m.cov_z[row]), self.robust)
+        return gtsam.CustomFactor(loss, [pose_key, landmark_key], error)
 
     def _require_noise(self) -> None:
         if self.robust is not None and not self.robust > 0:
@@ -174,8 +171,3 @@ class Problem:
             raise InputError(
                 f"The sighting of {place} has a singular covariance, expected noise in all of it."
             )
-
-
-def _noise(cov: Array) -> Any:
-    # False, because GTSAM's search for diagonal matrices drops every covariance below 1e-8.
-    return gtsam.noiseModel.Gaussian.Covariance(cov, False)

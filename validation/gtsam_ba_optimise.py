@@ -9,23 +9,16 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.lie import Array
 from rbpf.validation.gtsam_ba_graph import Problem
+from rbpf.validation.gtsam_ba_solvers import EXACT, ROUGH, gauss_newton, levenberg_marquardt, marginals
 
 CHUNK = 50
 """Steps that `incremental` adds at once."""
 
-_ROUGH = 1e-4
-_EXACT = 1e-11
-_ITERATIONS = 200
-_DAMPING = 1e-5
-_MAX_DAMPING = 1e10
 _SYMBOL = re.compile(r"\(Symbol: ([xl])(\d+)\)")
 
 
 def optimise(problem: Problem, graph: Any, values: Any) -> tuple[Any, int]:
     """Levenberg-Marquardt until the error stands; singular odometry is softened first, then Gauss-Newton's.
-
-    The loops are here because GTSAM's own optimisers copy all values at every call of a factor written in
-    Python, a hundred times the cost; linearisation, elimination and retraction are GTSAM's.
 
     Args:
         problem: what is solved.
@@ -40,10 +33,10 @@ def optimise(problem: Problem, graph: Any, values: Any) -> tuple[Any, int]:
     """
     softened = 0
     if problem.singular:
-        near, softened, _ = _levenberg_marquardt(problem.graph(soft=True), values, _ROUGH)
-        optimum, count, converged = _gauss_newton(graph, near)
+        near, softened, _ = levenberg_marquardt(problem.graph(soft=True), values, ROUGH)
+        optimum, count, converged = gauss_newton(graph, near)
     else:
-        optimum, count, converged = _levenberg_marquardt(graph, values, _EXACT)
+        optimum, count, converged = levenberg_marquardt(graph, values, EXACT)
     if not converged:
         raise InputError(
             f"The batch optimisation of {problem.m.recording} did not converge in {count} iterations; "
@@ -80,22 +73,12 @@ def incremental(problem: Problem) -> Any:
 
 
 def covariances(problem: Problem, graph: Any, values: Any) -> tuple[Array, dict[int, Array]]:
-    """Marginal covariances of all poses (T, d, d), in our chart, and of all landmarks, each (D, D).
-
-    The conditionals' own square roots are used, because a constrained pose has no information matrix.
-    """
-    linear = graph.linearize(values)
-    tree = linear.eliminateMultifrontal(gtsam.Ordering.ColamdGaussianFactorGraph(linear), gtsam.EliminateQR)
-
-    def marginal(key: int) -> Array:
-        conditional = tree.marginalFactor(key, gtsam.EliminateQR)
-        factor = np.linalg.inv(conditional.R()) * conditional.get_model().sigmas()
-        return np.asarray(factor @ factor.T)
-
-    steps = range(len(problem.m.stamps_ns))
-    poses = np.array([problem.chart.covariance(marginal(problem.pose_key(step))) for step in steps])
-    names = enumerate(problem.names.tolist())
-    return poses, {name: marginal(problem.landmark_key(index)) for index, name in names}
+    """Marginal covariances of all poses (T, d, d), in our chart, and of all landmarks, each (D, D)."""
+    poses = [problem.pose_key(step) for step in range(len(problem.m.stamps_ns))]
+    points = [problem.landmark_key(index) for index in range(len(problem.names))]
+    found = marginals(graph, values, poses + points)
+    covs = np.array([problem.chart.covariance(cov) for cov in found[: len(poses)]])
+    return covs, dict(zip(problem.names.tolist(), found[len(poses) :], strict=True))
 
 
 def explain(problem: Problem, error: RuntimeError) -> InputError:
@@ -109,49 +92,3 @@ def explain(problem: Problem, error: RuntimeError) -> InputError:
         f"GTSAM could not solve {problem.m.recording}: "
         f"the measurements do not determine everything near {place}; check the covariances there."
     )
-
-
-def _levenberg_marquardt(graph: Any, values: Any, tolerance: float) -> tuple[Any, int, bool]:
-    error, damping = graph.error(values), _DAMPING
-    for count in range(1, _ITERATIONS + 1):
-        linear, slack = graph.linearize(values), tolerance * max(1.0, error)
-        while damping <= _MAX_DAMPING:
-            moved = _damped_step(linear, values, damping)
-            before, after = error, graph.error(moved)
-            if after <= before + slack:
-                break
-            damping *= 10
-        else:
-            return values, count, False
-        values, error = moved, after
-        if before - after <= slack:
-            return values, count, True
-        damping /= 10
-    return values, _ITERATIONS, False
-
-
-def _gauss_newton(graph: Any, values: Any) -> tuple[Any, int, bool]:
-    # Steps are not refused: on the way to the constraints the error may rise.
-    error = graph.error(values)
-    for count in range(1, _ITERATIONS + 1):
-        before, values = error, _step(graph.linearize(values), values)
-        error = graph.error(values)
-        if abs(before - error) <= _EXACT * max(1.0, before):
-            return values, count, True
-    return values, _ITERATIONS, False
-
-
-def _damped_step(linear: Any, values: Any, damping: float) -> Any:
-    damped, zero = gtsam.GaussianFactorGraph(), values.zeroVectors()
-    damped.push_back(linear)
-    for key in values.keys():  # noqa: SIM118, no mapping
-        dim = len(zero.at(key))
-        unit = gtsam.noiseModel.Unit.Create(dim)
-        damped.push_back(gtsam.JacobianFactor(key, np.sqrt(damping) * np.eye(dim), np.zeros(dim), unit))
-    return _step(damped, values)
-
-
-def _step(linear: Any, values: Any) -> Any:
-    # By QR: GTSAM's Cholesky refuses neighbours whose standard deviations differ by a factor above 4096.
-    ordering = gtsam.Ordering.ColamdGaussianFactorGraph(linear)
-    return values.retract(linear.optimize(ordering, gtsam.EliminateQR))
