@@ -1,0 +1,158 @@
+"""Small scenes before a camera, and their batch solution by SciPy in another parametrisation."""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from rbpf.lie import SE3, Array
+from rbpf.sensors.features import CameraTruth, FeatureFrame, FeatureLog, KnownPoints
+from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+
+PLAIN = Pinhole(640, 480, 400.0, 390.0, 321.0, 243.0)
+BENT = replace(PLAIN, distortion=(-0.25, 0.06, 1e-3, -5e-4, 0.0))
+WHOLE = replace(PLAIN, distortion=(-0.25, 0.06, 1e-3, -5e-4, 0.02))
+STEREO = RectifiedStereo(PLAIN, 0.15)
+FIRST = SE3.exp(np.array([0.3, -0.2, 1.1, 0.5, -0.7, 0.2]))
+ACCELERATION = np.array([0.2, 0.3, 0.1, 0.5, 0.4, 0.3])
+
+
+def scene(
+    camera: Pinhole | RectifiedStereo = PLAIN,
+    frames: int = 6,
+    points: int = 14,
+    known: int = 4,
+    seed: int = 0,
+    noise_px: float = 1.0,
+    drive: bool = False,
+) -> FeatureLog:
+    """A camera moves by a tenth of a metre per frame before points three metres away, of which it sees most.
+
+    With `drive` it moves as E06 (4)-(5) says, by `ACCELERATION`, every 0.1 s. Pixels are correlated; the first
+    landmarks are known to a centimetre, in correlated axes.
+    """
+    rng = np.random.default_rng(seed)
+    path = _drive(frames, rng) if drive else _walk(frames, rng)
+    low, high = [-1.2, -0.9, 2.4], [1.2, 0.9, 4.0]
+    places = SE3.transform(path[len(path) // 2], rng.uniform(low, high, (points, 3)))
+    names = rng.permutation(np.arange(100, 100 + 3 * points))[:points]
+    images = []
+    for step, pose in enumerate(path):
+        seen = np.flatnonzero((rng.random(points) < 0.9) | (np.arange(points) < known))
+        local = SE3.inverse_transform(pose, places[seen])
+        factor = noise_px * (
+            np.eye(camera.dim) + np.tril(rng.normal(scale=0.3, size=(len(seen), *2 * (camera.dim,))), -1)
+        )
+        z = camera.project(local) + np.einsum("kij,kj->ki", factor, rng.normal(size=(len(seen), camera.dim)))
+        images.append(FeatureFrame(100_000_000 * step, names[seen], z, factor @ factor.mT))
+    truth = CameraTruth(
+        np.array([f.stamp_ns for f in images]), path, dict(zip(names.tolist(), places, strict=True))
+    )
+    return FeatureLog("small scene", camera, images, _known(names[:known], places[:known], rng), truth)
+
+
+def _walk(frames: int, rng: np.random.Generator) -> Array:
+    path = [FIRST]
+    for turn, shift in zip(
+        rng.normal(scale=0.03, size=(frames - 1, 3)), rng.normal(size=(frames - 1, 3)), strict=True
+    ):
+        step = np.array([0.1, 0.02, 0.03]) + 0.02 * shift
+        path.append(SE3.retract(path[-1], np.concatenate([turn, step])))
+    return np.array(path)
+
+
+def _drive(frames: int, rng: np.random.Generator) -> Array:
+    dt, path, velocity = 0.1, [FIRST], np.array([0.05, -0.1, 0.0, 1.2, 0.1, 0.1])
+    factor = np.linalg.cholesky([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
+    for noise in rng.normal(size=(frames - 1, 2, 6)):
+        w = factor @ noise * ACCELERATION
+        path.append(SE3.retract(path[-1], dt * velocity + w[0]))
+        velocity = velocity + w[1]
+    return np.array(path)
+
+
+def _known(names: Array, places: Array, rng: np.random.Generator) -> KnownPoints | None:
+    if not len(names):
+        return None
+    factor = 0.01 * (np.eye(3) + np.tril(rng.normal(scale=0.3, size=(len(names), 3, 3)), -1))
+    errors = np.einsum("kij,kj->ki", factor, rng.normal(size=(len(names), 3)))
+    return KnownPoints(names, places + errors, factor @ factor.mT)
+
+
+class Reference(NamedTuple):
+    """Optimum and covariances as in a `CameraSolution`, landmarks in the order of their names."""
+
+    world_from_camera: Array
+    landmarks: Array
+    velocities: Array
+    cov_poses: Array
+    cov_landmarks: Array
+    error: float
+
+
+def solve_by_scipy(log: FeatureLog, velocity: Array | None = None, robust: float | None = None) -> Reference:
+    """Least squares over tangents at the truth; every term is written down once more."""
+    names = np.unique(np.concatenate([frame.landmarks for frame in log.frames]))
+    steps = np.repeat(np.arange(len(log.frames)), [len(frame.landmarks) for frame in log.frames])
+    place = np.searchsorted(names, np.concatenate([frame.landmarks for frame in log.frames]))
+    z = np.concatenate([frame.z for frame in log.frames])
+    whiten = np.linalg.inv(np.linalg.cholesky(np.concatenate([frame.cov_z for frame in log.frames])))
+    fixed, whiten_fixed = (
+        np.searchsorted(names, log.known.names),
+        np.linalg.inv(np.linalg.cholesky(log.known.cov)),
+    )
+    count, split = len(log.frames), 6 * len(log.frames)
+    dt = 1e-9 * np.diff([frame.stamp_ns for frame in log.frames])
+    around = np.array([log.truth.landmarks[name] for name in names.tolist()])
+
+    def parts(x: Array) -> tuple[Array, Array, Array]:
+        path = SE3.retract(log.truth.world_from_camera, x[:split].reshape(-1, 6))
+        end = split + around.size
+        return path, around + x[split:end].reshape(-1, 3), x[end:].reshape(-1, 6)
+
+    def residuals(x: Array) -> Array:
+        path, points, speeds = parts(x)
+        e = log.camera.project(SE3.inverse_transform(path[steps], points[place])) - z
+        e = _shrunk(np.einsum("kij,kj->ki", whiten, e), robust)
+        prior = np.einsum("kij,kj->ki", whiten_fixed, points[fixed] - log.known.positions)
+        moved = [] if velocity is None else [_motion(path, speeds, dt, velocity)]
+        return np.concatenate([e.ravel(), prior.ravel(), *moved])
+
+    speeds = np.zeros(0 if velocity is None else split)
+    x0 = np.concatenate([np.zeros(split + around.size), speeds])
+    found = least_squares(residuals, x0, jac="3-point", x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    slope = _slope(residuals, found.x)
+    cov = np.linalg.inv(slope.T @ slope)
+    path, points, speeds = parts(found.x)
+    spread = _slope(lambda x: SE3.local(path, parts(x)[0]).ravel(), found.x).reshape(count, 6, -1)
+    blocks = cov[split : split + around.size, split : split + around.size].reshape(
+        len(names), 3, len(names), 3
+    )
+    cov_landmarks = np.array([blocks[i, :, i] for i in range(len(names))])
+    return Reference(path, points, speeds, spread @ cov @ spread.mT, cov_landmarks, float(found.cost))
+
+
+def _motion(path: Array, speeds: Array, dt: Array, std: Array) -> Array:
+    w1 = SE3.local(path[:-1], path[1:]) - dt[:, None] * speeds[:-1]
+    out = []
+    for step, first, second in zip(dt, w1, np.diff(speeds, axis=0), strict=True):
+        cov = np.kron([[step**3 / 3, step**2 / 2], [step**2 / 2, step]], np.diag(std**2))
+        out.append(np.linalg.solve(np.linalg.cholesky(cov), np.concatenate([first, second])))
+    return np.concatenate(out)
+
+
+def _shrunk(whitened: Array, robust: float | None) -> Array:
+    if robust is None:
+        return whitened
+    norm = np.linalg.norm(whitened, axis=-1, keepdims=True)
+    beyond = np.maximum(norm, robust)
+    return whitened * np.sqrt(robust * (2 * beyond - robust)) / beyond
+
+
+def _slope(function, x):
+    step = 1e-5
+    columns = [
+        (function(x + step * axis) - function(x - step * axis)) / (2 * step) for axis in np.eye(len(x))
+    ]
+    return np.stack(columns, axis=-1)

@@ -1,0 +1,249 @@
+"""The batch adjustment of camera features: factors, optimum and covariance against SciPy, gauge, and consistency."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from rbpf.lie import SE3
+from rbpf.sensors.features import KnownPoints
+from rbpf.validation.gtsam_ba_camera import CameraEstimate, solve_features
+from rbpf.validation.gtsam_ba_camera_adjust import explain
+from rbpf.validation.gtsam_ba_camera_data import known_by_name, sightings_of
+from rbpf.validation.gtsam_ba_camera_factors import evaluate_sightings
+from rbpf.validation.gtsam_ba_camera_graph import CameraProblem, CameraState
+from tests.validation.camera_scenes import ACCELERATION, BENT, PLAIN, STEREO, WHOLE, scene, solve_by_scipy
+
+CAMERAS = [PLAIN, BENT, WHOLE, STEREO]
+
+
+def estimate(log, seed=5, scale=0.02):
+    """The truth, disturbed."""
+    rng = np.random.default_rng(seed)
+    path = log.truth.world_from_camera
+    moved = SE3.retract(path, scale * rng.normal(size=(len(path), 6)))
+    return CameraEstimate(moved, {n: p + scale * rng.normal(size=3) for n, p in log.truth.landmarks.items()})
+
+
+def problem_and_state(log, velocity=None):
+    table = sightings_of(log)
+    stamps = np.array([frame.stamp_ns for frame in log.frames])
+    problem = CameraProblem("scene", stamps, table, known_by_name(log.known, table.names), None, velocity)
+    start = estimate(log)
+    points = np.array([start.landmarks[name] for name in table.names.tolist()])
+    speeds = np.random.default_rng(6).normal(size=(len(stamps), 6))
+    return problem, CameraState(start.world_from_camera, points, speeds)
+
+
+@pytest.mark.parametrize("velocity", [None, ACCELERATION])
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_derivatives_of_every_factor_are_those_of_its_residual(camera, velocity):
+    problem, state = problem_and_state(scene(camera, frames=3, points=6, known=0), velocity)
+    loose = np.arange(6) < 2
+    graph, values, step = problem.graph(state, loose, state.path), problem.values(state), 1e-6
+    for i in range(graph.size()):
+        factor = graph.at(i)
+        slope, offset = factor.linearize(values).jacobian()
+        np.testing.assert_allclose(-offset, factor.whitenedError(values), atol=1e-9)
+        zero, columns = values.zeroVectors(), []
+        for key in factor.keys():  # noqa: SIM118, no mapping
+            for axis in step * np.eye(len(zero.at(key))):
+                errors = []
+                for sign in (1, -1):
+                    moved = gtsam.VectorValues(zero)
+                    moved.update(_single(key, sign * axis))
+                    errors.append(factor.whitenedError(values.retract(moved)))
+                columns.append((errors[0] - errors[1]) / (2 * step))
+        np.testing.assert_allclose(
+            slope, np.stack(columns, axis=1), rtol=1e-5, atol=1e-6 * np.abs(slope).max()
+        )
+
+
+def _single(key, vector):
+    values = gtsam.VectorValues()
+    values.insert(key, vector)
+    return values
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_gtsams_factors_are_our_camera(camera):
+    problem, state = problem_and_state(scene(camera, known=0))
+    graph, values = problem.graph(state, np.zeros(14, dtype=bool), state.path), problem.values(state)
+    residuals, (by_pose, by_point) = evaluate_sightings(problem.table, state.path, state.points)
+    order = [0, 2, 1] if camera is STEREO else [0, 1]
+    for row, residual in enumerate(residuals):
+        factor = graph.at(row)
+        np.testing.assert_allclose(factor.unwhitenedError(values), residual[order], atol=1e-9)
+        slope, offset = factor.linearize(values).jacobian()
+        whiten = np.linalg.inv(np.linalg.cholesky(problem.table.cov_z[row]))
+        assert offset @ offset == pytest.approx(np.square(whiten @ residual).sum())
+        ours = whiten @ np.concatenate([by_pose[row], by_point[row]], axis=1)
+        np.testing.assert_allclose(slope.T @ slope, ours.T @ ours, rtol=1e-9, atol=1e-6)
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_the_optimum_and_its_covariance_are_scipys(camera):
+    log = scene(camera)
+    assert_same(solve_features(log, estimate(log)), solve_by_scipy(log))
+
+
+def test_with_a_velocity_the_optimum_and_its_covariance_are_scipys():
+    log = scene(drive=True)
+    found, expected = (
+        solve_features(log, estimate(log), velocity=ACCELERATION),
+        solve_by_scipy(log, ACCELERATION),
+    )
+    assert_same(found, expected)
+    np.testing.assert_allclose(found.velocities, expected.velocities, atol=1e-5)
+    free = solve_features(log, estimate(log))
+    assert np.linalg.det(found.cov_poses[2]) < 0.8 * np.linalg.det(free.cov_poses[2])
+
+
+def assert_same(found, expected):
+    assert found.error == pytest.approx(expected.error, rel=1e-8)
+    assert np.abs(SE3.local(expected.world_from_camera, found.world_from_camera)).max() < 1e-6
+    names = sorted(found.landmarks)
+    np.testing.assert_allclose([found.landmarks[name] for name in names], expected.landmarks, atol=2e-6)
+    assert_same_covariances(found.cov_poses, expected.cov_poses)
+    assert_same_covariances([found.cov_landmarks[name] for name in names], expected.cov_landmarks)
+    assert found.undetermined == []
+
+
+def assert_same_covariances(found, expected):
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-4 * np.abs(other).max())
+
+
+@pytest.mark.parametrize("drive", [False, True])
+def test_errors_of_the_batch_are_as_large_as_it_says(drive):
+    squares = []
+    for seed in range(40):
+        log = scene(BENT, seed=seed, drive=drive, noise_px=0.7)
+        found = solve_features(log, estimate(log), velocity=ACCELERATION if drive else None)
+        errors = SE3.local(found.world_from_camera, log.truth.world_from_camera)
+        name = max(found.landmarks)
+        off = found.landmarks[name] - log.truth.landmarks[name]
+        squares.append(
+            [e @ np.linalg.solve(cov, e) for e, cov in zip(errors, found.cov_poses, strict=True)]
+            + [off @ np.linalg.solve(found.cov_landmarks[name], off)]
+        )
+    totals, dofs = np.sum(squares, axis=0), len(squares) * np.array([6] * len(log.frames) + [3])
+    low, high = chi2.ppf([0.001, 0.999], dofs[:, None]).T
+    assert ((low < totals) & (totals < high)).all(), totals / dofs
+
+
+@pytest.mark.parametrize("camera", [PLAIN, STEREO])
+def test_without_known_points_the_first_pose_and_the_scale_are_held(camera):
+    log = scene(camera, known=0)
+    start = estimate(log)
+    found = solve_features(log, start)
+    np.testing.assert_allclose(
+        SE3.local(start.world_from_camera[0], found.world_from_camera[0]), 0, atol=1e-9
+    )
+    np.testing.assert_array_equal(found.cov_poses[0], np.zeros((6, 6)))
+    far = int(np.argmax(_distances(start.world_from_camera)))
+    held, kept = _distances(found.world_from_camera)[far], _distances(start.world_from_camera)[far]
+    other = solve_features(log, estimate(log, seed=9))
+    assert other.error == pytest.approx(found.error, rel=1e-9)
+    scale = _distances(other.world_from_camera)[1:] / _distances(found.world_from_camera)[1:]
+    np.testing.assert_allclose(scale, scale[0], rtol=1e-5)
+    if camera is STEREO:
+        assert scale[0] == pytest.approx(1.0, abs=1e-5)
+    else:
+        assert held == pytest.approx(kept, rel=1e-7)
+        along = found.world_from_camera[far, 4:] - found.world_from_camera[0, 4:]
+        cov = SE3.rotation(found.world_from_camera[far]) @ found.cov_poses[far, 3:, 3:]
+        cov = cov @ SE3.rotation(found.world_from_camera[far]).T
+        assert along @ cov @ along < 1e-9 * np.trace(cov) * along @ along
+
+
+def _distances(path):
+    return np.linalg.norm(path[:, 4:] - path[0, 4:], axis=1)
+
+
+def test_points_known_exactly_stay_where_they_are():
+    log = scene()
+    exact = replace(
+        log, known=KnownPoints(log.known.names, log.known.positions, np.zeros_like(log.known.cov))
+    )
+    found = solve_features(exact, CameraEstimate(log.truth.world_from_camera, {}))
+    tight = replace(log, known=KnownPoints(log.known.names, log.known.positions, 1e-6 * log.known.cov))
+    near = solve_features(tight, estimate(log))
+    for name, position in zip(log.known.names.tolist(), log.known.positions, strict=True):
+        np.testing.assert_allclose(found.landmarks[name], position, atol=1e-12)
+        assert np.abs(found.cov_landmarks[name]).max() < 1e-20
+    assert np.abs(SE3.local(near.world_from_camera, found.world_from_camera)).max() < 1e-4
+
+
+def test_frames_of_one_time_share_pose_and_velocity():
+    log = scene(drive=True)
+    frame = log.frames[2]
+    halves = [
+        replace(frame, landmarks=frame.landmarks[rows], z=frame.z[rows], cov_z=frame.cov_z[rows])
+        for rows in (slice(0, 6), slice(6, None))
+    ]
+    split = replace(log, frames=[*log.frames[:2], *halves, *log.frames[3:]])
+    whole = solve_features(log, estimate(log), velocity=ACCELERATION)
+    path = estimate(log).world_from_camera[[0, 1, 2, 2, 3, 4, 5]]
+    found = solve_features(split, CameraEstimate(path, {}), velocity=ACCELERATION)
+    np.testing.assert_array_equal(found.world_from_camera[2], found.world_from_camera[3])
+    np.testing.assert_array_equal(found.velocities[2], found.velocities[3])
+    np.testing.assert_array_equal(found.cov_poses[2], found.cov_poses[3])
+    kept = [0, 1, 2, 4, 5, 6]
+    assert np.abs(SE3.local(whole.world_from_camera, found.world_from_camera[kept])).max() < 1e-6
+    np.testing.assert_allclose(found.cov_poses[kept], whole.cov_poses, rtol=1e-3, atol=1e-9)
+
+
+def test_a_frame_without_sightings_follows_the_velocity():
+    log = scene(drive=True)
+    none = np.empty(0, dtype=np.int64), np.empty((0, 2)), np.empty((0, 2, 2))
+    blind = replace(log, frames=[*log.frames, replace(log.frames[-1], stamp_ns=600_000_000)])
+    blind.frames[-1] = replace(blind.frames[-1], landmarks=none[0], z=none[1], cov_z=none[2])
+    path = estimate(log).world_from_camera
+    found = solve_features(blind, CameraEstimate(path[[0, 1, 2, 3, 4, 5, 5]], {}), velocity=ACCELERATION)
+    expected = SE3.retract(found.world_from_camera[5], 0.1 * found.velocities[5])
+    assert np.abs(SE3.local(expected, found.world_from_camera[6])).max() < 1e-8
+    np.testing.assert_allclose(found.velocities[6], found.velocities[5], atol=1e-8)
+    assert np.linalg.det(found.cov_poses[6]) > np.linalg.det(found.cov_poses[5])
+
+
+def test_a_robust_loss_is_opt_in_and_is_hubers():
+    log = scene(points=20)
+    bad = replace(log, frames=list(log.frames))
+    for step in (1, 3, 4):
+        z = log.frames[step].z.copy()
+        z[-step] += [60.0, -40.0]
+        bad.frames[step] = replace(log.frames[step], z=z)
+    plain, robust, clean = (
+        solve_features(one, estimate(log), robust=loss, marginals=False)
+        for one, loss in ((bad, None), (bad, 1.345), (log, None))
+    )
+    expected = solve_by_scipy(bad, robust=1.345)
+    assert robust.error == pytest.approx(expected.error, rel=1e-6)
+    off = [np.abs(SE3.local(clean.world_from_camera, s.world_from_camera)).max() for s in (plain, robust)]
+    assert off[0] > 3 * off[1]
+    assert np.abs(SE3.local(expected.world_from_camera, robust.world_from_camera)).max() < 1e-3
+
+
+def test_what_gtsam_cannot_solve_is_named():
+    problem, _ = problem_and_state(scene())
+    # The distance between two landmarks holds neither of them.
+    singular, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    unit = gtsam.noiseModel.Unit.Create(3)
+    singular.push_back(gtsam.BetweenFactorPoint3(*problem.point_keys[3:5], np.ones(3), unit))
+    for key in problem.point_keys[3:5]:
+        values.insert(key, np.zeros(3))
+    with pytest.raises(RuntimeError) as raised:
+        gtsam.GaussNewtonOptimizer(singular, values).optimize()
+    message = str(explain(problem, raised.value))
+    assert any(f"everything near landmark {name};" in message for name in problem.table.names[3:5])
+
+
+def test_without_marginals_there_are_none():
+    log = scene()
+    found = solve_features(log, estimate(log), marginals=False)
+    assert found.cov_poses.shape == (0, 6, 6)
+    assert found.cov_landmarks == {}
+    assert found.velocities.shape == (0, 6)

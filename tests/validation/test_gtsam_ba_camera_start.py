@@ -1,0 +1,232 @@
+"""The batch adjustment of camera features: what is done without an estimate, and with too few measurements."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rbpf.errors import InputError
+from rbpf.lie import SE3
+from rbpf.sensors.features import FeatureFrame, KnownPoints
+from rbpf.sensors.pinhole import Pinhole
+from rbpf.validation.gtsam_ba_camera import CameraEstimate, solve_features
+from rbpf.validation.gtsam_ba_camera_data import Sightings
+from rbpf.validation.gtsam_ba_camera_resection import locate
+from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
+from rbpf.validation.simulation.features import STEREO as PAIR
+from rbpf.validation.simulation.point_worlds import DeskWorld
+from tests.validation.camera_scenes import ACCELERATION, BENT, PLAIN, STEREO, WHOLE, scene
+
+SQUARE = np.array([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.2, 0.3, 0.0], [0.0, 0.3, 0.0]])
+
+
+def true_start(log):
+    return CameraEstimate(log.truth.world_from_camera, {})
+
+
+def shown(log, step, names, z):
+    """The log with another sighting in a frame."""
+    frame = log.frames[step]
+    cov = np.broadcast_to(np.eye(log.camera.dim), (len(names), log.camera.dim, log.camera.dim))
+    more = FeatureFrame(
+        frame.stamp_ns,
+        np.concatenate([frame.landmarks, names]),
+        np.concatenate([frame.z, z]),
+        np.concatenate([frame.cov_z, cov]),
+    )
+    return replace(log, frames=[*log.frames[:step], more, *log.frames[step + 1 :]])
+
+
+@pytest.mark.parametrize("camera", [BENT, WHOLE, STEREO])
+def test_the_same_optimum_is_found_from_scratch(camera):
+    log = scene(camera, frames=12, points=25, noise_px=0.5)
+    found, expected = (solve_features(log, start, marginals=False) for start in (None, true_start(log)))
+    assert found.error == pytest.approx(expected.error, rel=1e-6)
+    assert np.abs(SE3.local(expected.world_from_camera, found.world_from_camera)).max() < 1e-4
+
+
+@pytest.mark.parametrize(("camera", "known", "outliers"), [(MONO, 4, 0.0), (MONO, 6, 0.1), (PAIR, 0, 0.0)])
+def test_a_camera_that_rests_at_first_is_followed(camera, known, outliers):
+    measuring = Measuring(known=known, outlier_rate=outliers)
+    log = simulate_features(DeskWorld(frames=90), measuring, camera, seed=1)
+    found = solve_features(log, robust=1.345 if outliers else None, marginals=False)
+    path = log.truth.world_from_camera
+    if not known:
+        path = SE3.compose(SE3.inverse(path[0]), path)
+    errors = np.sqrt(np.square(SE3.local(path, found.world_from_camera)).mean(0))
+    assert errors.max() < 0.015
+
+
+@pytest.mark.parametrize("turn", [0.0, 1.0, 2.0, 3.0])
+def test_a_camera_is_located_from_four_points_of_a_plane(turn):
+    rng = np.random.default_rng(int(turn))
+    for side in rng.normal(scale=0.4, size=(4, 2)):
+        away = SE3.exp(np.array([*side, turn, 0.0, 0.0, 0.0]))
+        pose = SE3.compose(away, np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, -0.8]))
+        z = PLAIN.project(SE3.inverse_transform(pose, SQUARE)) + 0.1 * rng.normal(size=(4, 2))
+        places = np.arange(4)
+        table = Sightings(
+            PLAIN, np.zeros(4, dtype=int), places, places, z, np.tile(0.01 * np.eye(2), (4, 1, 1))
+        )
+        assert np.abs(SE3.local(pose, locate(table, SQUARE).pose)).max() < 0.02
+
+
+def test_a_landmark_that_an_outlier_draws_into_its_camera_is_left_out():
+    log = simulate_features(DeskWorld(frames=40), Measuring(known=6, outlier_rate=0.1), MONO, seed=0)
+    found = solve_features(log, true_start(log), robust=1.345, marginals=False)
+    names, counts = np.unique(np.concatenate([frame.landmarks for frame in log.frames]), return_counts=True)
+    left_out = set(names[counts > 1].tolist()) - set(found.landmarks)
+    assert left_out
+    assert left_out <= set(found.undetermined)
+    assert np.abs(SE3.local(log.truth.world_from_camera, found.world_from_camera)).max() < 0.03
+
+
+def test_a_landmark_seen_once_changes_nothing_and_is_reported():
+    log = scene()
+    once = shown(log, 2, np.array([7]), np.array([[100.0, 200.0]]))
+    found, expected = (solve_features(one, true_start(log)) for one in (once, log))
+    assert found.undetermined == [7]
+    assert sorted(found.landmarks) == sorted(expected.landmarks)
+    np.testing.assert_allclose(found.world_from_camera, expected.world_from_camera, atol=1e-9)
+    np.testing.assert_allclose(found.cov_poses, expected.cov_poses, rtol=1e-6, atol=1e-12)
+
+
+def test_a_stereo_pair_places_a_landmark_seen_once():
+    log = scene(STEREO)
+    point = np.array([0.3, -0.1, 2.5])
+    once = shown(log, 2, np.array([7]), STEREO.project(point)[None])
+    found = solve_features(once, true_start(log))
+    assert found.undetermined == []
+    np.testing.assert_allclose(
+        SE3.inverse_transform(found.world_from_camera[2], found.landmarks[7]), point, atol=1e-6
+    )
+
+
+def test_a_star_keeps_its_direction_and_helps_the_rotation():
+    log = scene(noise_px=0.3)
+    path = log.truth.world_from_camera
+    stars = np.array([[0.2, 0.3, 1.0], [-0.5, -0.2, 1.0]])
+    starry = log
+    for step in range(len(path)):
+        turned = np.einsum("ij,kj->ki", (SE3.rotation(path[step]).T @ SE3.rotation(path[2])), stars)
+        starry = shown(starry, step, np.array([7, 8]), PLAIN.project(turned))
+    found, without = (solve_features(one, true_start(log)) for one in (starry, log))
+    assert found.undetermined == [7, 8]
+    for name, star in zip((7, 8), stars, strict=True):
+        seen = SE3.inverse_transform(found.world_from_camera[2], found.landmarks[name])
+        assert seen[2] > 0
+        np.testing.assert_allclose(PLAIN.project(seen), PLAIN.project(star), atol=1.5)
+    for one, other in zip(found.cov_poses[1:], without.cov_poses[1:], strict=True):
+        assert np.trace(one[:3, :3]) < np.trace(other[:3, :3])
+
+
+def test_too_few_known_points_are_refused():
+    log = scene(known=3)
+    with pytest.raises(InputError, match="Frame 0 of small scene sees 3 known points, expected 4 or more"):
+        solve_features(log)
+    with pytest.raises(InputError, match=r"sees 0 known points, expected 4 .* or give an initial estimate"):
+        solve_features(scene(known=0))
+    with pytest.raises(InputError, match="sees 2 known points, expected 3 or more, or none at all"):
+        solve_features(scene(known=2), true_start(log))
+
+
+def test_known_points_on_a_line_are_refused():
+    log = scene()
+    line = log.known.positions[0] + np.outer(np.arange(4.0), [0.1, 0.2, 0.3])
+    with pytest.raises(InputError, match="lie on a line; add one beside it"):
+        solve_features(replace(log, known=KnownPoints(log.known.names, line, log.known.cov)))
+
+
+def test_singular_noise_is_refused():
+    log = scene()
+    cov = log.known.cov.copy()
+    cov[1] = np.diag([1e-4, 1e-4, 0.0])
+    flat = replace(log, known=KnownPoints(log.known.names, log.known.positions, cov))
+    with pytest.raises(InputError, match=f"covariance of known point {log.known.names[1]} is singular"):
+        solve_features(flat, true_start(log))
+    cov_z = log.frames[1].cov_z.copy()
+    cov_z[2] = np.diag([1.0, 0.0])
+    frames = [log.frames[0], replace(log.frames[1], cov_z=cov_z), *log.frames[2:]]
+    with pytest.raises(
+        InputError, match=f"landmark {log.frames[1].landmarks[2]} in frame 1 of small scene is not"
+    ):
+        solve_features(replace(log, frames=frames), true_start(log))
+
+
+def test_a_frame_with_too_few_landmarks_is_refused():
+    log = scene()
+    frame = log.frames[3]
+    few = replace(frame, landmarks=frame.landmarks[:2], z=frame.z[:2], cov_z=frame.cov_z[:2])
+    blind = replace(log, frames=[*log.frames[:3], few, *log.frames[4:]])
+    with pytest.raises(InputError, match=re.escape("Frame 3 of small scene sees 2 landmarks")):
+        solve_features(blind, true_start(log))
+    assert solve_features(blind, true_start(log), velocity=ACCELERATION).error > 0
+
+
+@pytest.mark.parametrize(("known", "whom"), [(4, "the known points"), (0, "frame 0")])
+def test_frames_apart_are_refused(known, whom):
+    log = scene(known=known)
+    frames = [
+        replace(frame, landmarks=frame.landmarks + 1000 * (step > 2)) for step, frame in enumerate(log.frames)
+    ]
+    with pytest.raises(InputError, match=f"Frame 3 of small scene shares no landmark, .* with {whom}"):
+        solve_features(replace(log, frames=frames), true_start(log))
+
+
+def test_a_path_that_breaks_is_refused():
+    log = scene(frames=24)
+    lost = []
+    for step, frame in enumerate(log.frames):
+        names = frame.landmarks if step < 12 else frame.landmarks + 1000 * (step // 2)
+        lost.append(replace(frame, landmarks=names))
+    with pytest.raises(InputError, match=r"Frames 12 to 21 of small scene see fewer than 3 landmarks"):
+        solve_features(replace(log, frames=lost), velocity=ACCELERATION)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"robust": 0.0}, "threshold above 0"),
+        ({"velocity": np.zeros(6)}, "six positive standard deviations"),
+        ({"velocity": [1.0]}, "six positive standard deviations"),
+    ],
+)
+def test_numbers_that_make_no_sense_are_refused(options, message):
+    log = scene()
+    with pytest.raises(InputError, match=message):
+        solve_features(log, true_start(log), **options)
+
+
+def test_an_unusable_estimate_is_refused():
+    log = scene(known=0)
+    path, points = log.truth.world_from_camera, log.truth.landmarks
+    with pytest.raises(
+        InputError, match=re.escape("shape (6, 7), one for each frame of small scene, found (3, 7)")
+    ):
+        solve_features(log, CameraEstimate(path[:3], points))
+    with pytest.raises(InputError, match="All initial poses of small scene are at one place"):
+        solve_features(log, CameraEstimate(np.tile(path[:1], (6, 1)), points))
+    turned = path.copy()
+    turned[3] = SE3.retract(path[3], np.array([0.0, np.pi, 0.0, 0.0, 0.0, 0.0]))
+    with pytest.raises(InputError, match=r"Landmark \d+ lies behind the camera in frame \d of small scene"):
+        solve_features(log, CameraEstimate(turned, points))
+
+
+def test_one_time_has_no_velocity():
+    log = scene()
+    with pytest.raises(InputError, match="frames of one time only"):
+        solve_features(
+            replace(log, frames=log.frames[:1]),
+            CameraEstimate(log.truth.world_from_camera[:1], {}),
+            velocity=ACCELERATION,
+        )
+
+
+def test_a_start_needs_no_estimate_of_the_landmarks():
+    log = scene(Pinhole(640, 480, 400.0, 400.0, 320.0, 240.0), known=0)
+    found, expected = (
+        solve_features(log, CameraEstimate(log.truth.world_from_camera, points), marginals=False)
+        for points in ({}, log.truth.landmarks)
+    )
+    assert found.error == pytest.approx(expected.error, rel=1e-8)
