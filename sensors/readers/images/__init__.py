@@ -1,0 +1,7 @@
+"""Readers of image sequences: TUM RGB-D, EuRoC ASL, KITTI odometry, 7-Scenes, folders of images, photos, videos."""
+
+from rbpf.sensors.readers.images.known_points import KnownPixels, read_known_points
+from rbpf.sensors.readers.images.opening import open_images
+from rbpf.sensors.readers.images.sequence import ImageFrame, ImageSequence
+
+__all__ = ["ImageFrame", "ImageSequence", "KnownPixels", "open_images", "read_known_points"]

@@ -1,0 +1,72 @@
+"""`known_points.csv`: landmarks of known position and where they are in the first image.
+
+    id,u_px,v_px,x_m,y_m,z_m,sigma_m
+    1,517.426,320.498,-0.25433,0.12486,1.60044,0.0365
+
+The columns may come in any order, and others beside them are passed over. Pixel centres are at whole numbers.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from rbpf.sensors.readers.table import Table, parse_table
+from rbpf.sensors.readers.text import line_error, quoted, read_lines
+
+COLUMNS = ("id", "u_px", "v_px", "x_m", "y_m", "z_m", "sigma_m")
+
+
+@dataclass(frozen=True)
+class KnownPixels:
+    """Landmarks of known position and where they are in the first image.
+
+    Attributes:
+        names: (M,) int64, each once.
+        px: (M, 2) pixels in the first image as it is stored (distorted).
+        positions: (M, 3) in the world, m.
+        std_m: (M,) standard deviation of each position, m.
+    """
+
+    names: np.ndarray
+    px: np.ndarray
+    positions: np.ndarray
+    std_m: np.ndarray
+
+
+def read_known_points(path: str | Path) -> KnownPixels:
+    """Read a table of known points.
+
+    Raises:
+        InputError: the file is missing, a column is, or a line is not as described above.
+    """
+    table = _read_table(Path(path))
+    table.require(table["sigma_m"] >= 0.0, "sigma_m", "zero or positive")
+    return KnownPixels(
+        names=table.names("id"),
+        px=table.block("u_px", "v_px"),
+        positions=table.block("x_m", "z_m"),
+        std_m=table["sigma_m"],
+    )
+
+
+def _read_table(path: Path) -> Table:
+    numbered = enumerate(read_lines(path, f"a table with the columns {', '.join(COLUMNS)}"), 1)
+    rows = [(i, line) for i, line in numbered if line.strip() and not line.lstrip().startswith("#")]
+    line, header = rows[0] if rows else (1, "")
+    names = [name.strip() for name in header.split(",")]
+    for column in COLUMNS:
+        if names.count(column) != 1:
+            expected = f"expected a header with the columns {','.join(COLUMNS)}, each once"
+            raise line_error(path, line, f"{expected}, found {quoted(header)}")
+    places = [names.index(column) for column in COLUMNS]
+    picked = [(i, ",".join(_pick(path, i, row, names, places))) for i, row in rows[1:]]
+    return parse_table(path, COLUMNS, picked, ",")
+
+
+def _pick(path: Path, line: int, row: str, names: list[str], places: list[int]) -> list[str]:
+    fields = row.split(",")
+    if len(fields) != len(names):
+        problem = f"expected {len(names)} columns as in the header, found {len(fields)}"
+        raise line_error(path, line, problem)
+    return [fields[place] for place in places]

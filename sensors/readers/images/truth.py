@@ -1,0 +1,62 @@
+"""Poses of the ground truth."""
+
+from pathlib import Path
+
+import numpy as np
+
+from rbpf.errors import InputError
+from rbpf.lie import SE3, Array
+from rbpf.sensors.features import CameraTruth
+from rbpf.sensors.readers.images.stamped import read_stamped
+from rbpf.sensors.readers.table import Table
+
+LONGEST = 0.01
+"""How far a quaternion's length may be from 1 in a file; it is then scaled to 1."""
+
+
+def normalised(table: Table, world_from_body: Array) -> Array:
+    """Poses (T, 7) of a table with their quaternions scaled to length 1.
+
+    Raises:
+        InputError: a quaternion's length is not 1 up to rounding.
+    """
+    length = np.linalg.norm(world_from_body[:, :4], axis=1)
+    if (wrong := np.flatnonzero(np.abs(length - 1.0) > LONGEST)).size:
+        problem = f"expected a quaternion of length 1, found one of length {length[wrong[0]]:.6g}"
+        raise table.error(int(wrong[0]), problem)
+    return SE3.normalise(world_from_body)
+
+
+def truth_between(
+    path: Path, stamps_ns: np.ndarray, world_from_camera: Array, images_ns: np.ndarray
+) -> CameraTruth:
+    """Ground truth that lies, at least in part, in the time of the images.
+
+    Args:
+        path: the truth's file, for the message.
+        stamps_ns: (P,) times of the poses.
+        world_from_camera: (P, 7) the poses.
+        images_ns: (T,) times of the images.
+
+    Raises:
+        InputError: no pose lies between the first and the last image.
+    """
+    if stamps_ns[-1] < images_ns[0] or stamps_ns[0] > images_ns[-1]:
+        poses, images = (f"{span[0] / 1e9:.3f} to {span[-1] / 1e9:.3f} s" for span in (stamps_ns, images_ns))
+        problem = f"the poses are at {poses} and the images at {images}, which is another clock"
+        raise InputError(f"{path}: {problem}; shift the poses to the images' clock, or take the file away.")
+    return CameraTruth(stamps_ns, world_from_camera)
+
+
+def read_tum_truth(path: Path, images_ns: np.ndarray) -> CameraTruth | None:
+    """`timestamp tx ty tz qx qy qz qw` [s, m], world_from_camera; None where there is no such file.
+
+    Raises:
+        InputError: a line is not so, or the times are of another clock.
+    """
+    if not path.exists():
+        return None
+    rows = read_stamped(path, "poses")
+    table = rows.table(("tx", "ty", "tz", "qx", "qy", "qz", "qw"))
+    poses = normalised(table, np.roll(table.values, 4, axis=1))
+    return truth_between(path, rows.stamps_ns, poses, images_ns)

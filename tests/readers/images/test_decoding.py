@@ -1,0 +1,175 @@
+"""Images one after the other: lazily, in grey, and around those that cannot be read."""
+
+import time
+from unittest import mock
+
+import cv2
+import numpy as np
+import pytest
+
+from rbpf.errors import InputError
+from rbpf.sensors.readers.images import decoding, files, open_images
+from tests.readers.images.folders import (
+    HEIGHT,
+    SIZE,
+    WIDTH,
+    grey,
+    levels,
+    write_image,
+    write_images,
+    write_plain,
+)
+
+
+def only_frame(folder):
+    (frame,) = open_images(folder).frames()
+    return frame
+
+
+def test_colour_becomes_grey(tmp_path):
+    write_plain(tmp_path, [])
+    blue, green, red = 200, 100, 50
+    write_image(tmp_path / "0.png", np.full((*SIZE, 3), (blue, green, red), np.uint8))
+    image = only_frame(tmp_path).image
+    assert image.dtype == np.uint8 and image.shape == SIZE
+    assert abs(int(image[3, 4]) - (0.114 * blue + 0.587 * green + 0.299 * red)) <= 1
+
+
+def test_sixteen_bits_are_scaled_to_eight(tmp_path):
+    write_plain(tmp_path, [])
+    deep = np.zeros(SIZE, np.uint16)
+    deep[0, :4] = [0, 257, 32896, 65535]
+    write_image(tmp_path / "0.png", deep)
+    assert only_frame(tmp_path).image[0, :4].tolist() == [0, 1, 128, 255]
+
+
+def test_transparency_is_passed_over(tmp_path):
+    write_plain(tmp_path, [])
+    write_image(tmp_path / "0.png", np.full((*SIZE, 4), (90, 90, 90, 10), np.uint8))
+    assert only_frame(tmp_path).image[0, 0] == 90
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp", ".tiff", ".webp", ".pgm"])
+def test_an_image_that_ends_too_early_is_not_half_of_one(tmp_path, suffix):
+    noise = np.random.default_rng(1).integers(0, 255, SIZE, dtype=np.uint8)
+    write_plain(tmp_path, [])
+    for name in ("0", "1", "2"):
+        write_image(tmp_path / f"{name}{suffix}", noise)
+    cut = tmp_path / f"1{suffix}"
+    cut.write_bytes(cut.read_bytes()[:-150])
+    frames = list(open_images(tmp_path).frames())
+    assert [frame.image is None for frame in frames] == [False, True, False]
+    assert frames[1].problem == f"{cut}: the file is damaged, incomplete or no image."
+    assert frames[0].problem is None and frames[2].problem is None
+
+
+@pytest.mark.parametrize(
+    ("content", "problem"),
+    [
+        (None, "no such image"),
+        (b"", "the file is empty, expected an image"),
+        (b"\x89PNG\r\n\x1a\n", "the file is damaged, incomplete or no image"),
+        (b"some text", "the file is damaged, incomplete or no image"),
+    ],
+)
+def test_a_run_survives_an_image_that_is_missing_or_none(tmp_path, content, problem):
+    write_plain(tmp_path)
+    sequence = open_images(tmp_path)
+    (tmp_path / "1.png").unlink() if content is None else (tmp_path / "1.png").write_bytes(content)
+    lost = list(sequence.frames())[1]
+    assert levels(sequence) == [10, None, 30]
+    assert lost.problem == f"{tmp_path / '1.png'}: {problem}."
+    assert lost.stamp_ns == sequence.stamps_ns[1]
+
+
+def test_an_image_that_is_a_folder(tmp_path):
+    write_plain(tmp_path)
+    (tmp_path / "1.png").unlink()
+    (tmp_path / "1.png").mkdir()
+    assert "cannot be read" in list(open_images(tmp_path).frames())[1].problem
+
+
+def test_an_image_of_another_size_is_lost(tmp_path):
+    write_plain(tmp_path)
+    write_image(tmp_path / "1.png", grey(20, (HEIGHT, WIDTH + 2)))
+    frames = list(open_images(tmp_path).frames())
+    assert [frame.image is None for frame in frames] == [False, True, False]
+    assert "expected 24x16 px as in the camera file, found 26x16 px" in frames[1].problem
+
+
+def test_floating_point_images_are_refused(tmp_path):
+    write_plain(tmp_path, ["0.png"])
+    write_image(tmp_path / "1.tiff", np.ones(SIZE, np.float32))
+    assert (
+        "expected 8 or 16 bits per channel, found float32" in list(open_images(tmp_path).frames())[1].problem
+    )
+
+
+def test_the_first_image_that_can_be_read_tells_the_size(tmp_path):
+    write_plain(tmp_path)
+    (tmp_path / "0.png").write_bytes(b"none")
+    assert levels(open_images(tmp_path)) == [None, 20, 30]
+
+
+def test_no_image_can_be_read(tmp_path):
+    write_plain(tmp_path)
+    for name in ("0.png", "1.png", "2.png"):
+        (tmp_path / name).write_bytes(b"none")
+    with pytest.raises(
+        InputError, match=r"none of 3 images can be read; the first is .*0.png: the file is damaged"
+    ):
+        open_images(tmp_path)
+
+
+def test_from_any_image_on_and_more_than_once(tmp_path):
+    sequence = open_images(write_plain(tmp_path, [f"{i}.png" for i in range(12)]))
+    everything = [10 * i + 10 for i in range(12)]
+    assert levels(sequence) == everything == levels(sequence)
+    assert levels(sequence, 7) == everything[7:]
+    assert [frame.stamp_ns for frame in sequence.frames(11)] == [sequence.stamps_ns[11]]
+
+
+@pytest.mark.parametrize("start", [-1, 3])
+def test_a_start_beyond_the_images(tmp_path, start):
+    with pytest.raises(InputError, match=f"expected a start from 0 to 2, got {start}"):
+        open_images(write_plain(tmp_path)).frames(start)
+
+
+def test_nothing_but_what_is_needed_is_decoded(tmp_path):
+    write_plain(tmp_path, [f"{i:05d}.png" for i in range(1)])
+    data = (tmp_path / "00000.png").read_bytes()
+    for i in range(1, 10_000):
+        (tmp_path / f"{i:05d}.png").write_bytes(data)
+    with mock.patch.object(cv2, "imdecode", wraps=cv2.imdecode) as decoded:
+        sequence = open_images(tmp_path)
+        assert len(sequence) == 10_000
+        assert decoded.call_count == 1
+        frames = sequence.frames()
+        next(frames)
+        frames.close()
+        assert decoded.call_count <= 1 + 1 + files.AHEAD
+
+
+def test_images_are_decoded_while_the_caller_is_busy():
+    begun = []
+
+    def load(index):
+        begun.append(index)
+        return index
+
+    frames = files.decode_ahead(load, range(20))
+    assert next(frames) == 0
+    deadline = time.monotonic() + 10.0
+    while len(begun) < files.AHEAD and time.monotonic() < deadline:
+        time.sleep(0.001)
+    assert files.AHEAD <= len(begun) <= files.AHEAD + 1
+    assert list(frames) == list(range(1, 20))
+
+
+def test_a_failure_of_the_decoder_is_a_lost_frame(tmp_path):
+    write_images(tmp_path, ["0.png"])
+    with (
+        mock.patch.object(cv2, "imdecode", side_effect=cv2.error("too many pixels")),
+        pytest.raises(decoding.UnreadableImageError, match=r"0.png: the image cannot be decoded"),
+    ):
+        decoding.read_grey(tmp_path / "0.png")
