@@ -24,6 +24,7 @@ NAMES = (
     "genealogy_growth",
     "user_model",
     "mono_step",
+    "patch_search",
     "bootstrap_peers",
     "mrpt_peer",
 )

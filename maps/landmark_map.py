@@ -9,6 +9,7 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.genealogy import Lineage
 from rbpf.lie import LieGroup
+from rbpf.likelihoods import Gaussian
 from rbpf.maps.layout import Layout
 from rbpf.maps.plan import Plan, make_plan
 from rbpf.maps.point import Point
@@ -23,7 +24,9 @@ from rbpf.models import (
     Part,
     Records,
 )
+from rbpf.numeric import linearise
 from rbpf.proposals import Prior, Terms
+from rbpf.reference import innovation_covariance
 
 _STATE = frozenset({Part.STATE})
 _MAP = frozenset({Part.LANDMARK})
@@ -168,6 +171,7 @@ class LandmarkMap(Conditional):
     ) -> LogDensities:
         """Log p(z | x) and the landmarks' Kalman updates at the sampled states."""
         by_use = _by_use(groups)
+        _require_apart(by_use[_STATE], by_use[_BOTH])
         log_density, late = np.zeros(self.n), np.zeros(self.n)
         if by_use[_STATE]:
             log_density += self._density(state, by_use[_STATE])
@@ -184,8 +188,23 @@ class LandmarkMap(Conditional):
         plan = self._plan(groups)
         if plan.late:
             raise InputError("a landmark of several components cannot be observed without being updated")
-        terms = self._engine.terms(plan, state, groups, Prior.exactly(self.space, state))
-        return terms.log_factor - 0.5 * (terms.quad + terms.log_det)
+        if all(group.likelihood is None or group.likelihood.form == 0 for group in groups):
+            terms = self._engine.terms(plan, state, groups, Prior.exactly(self.space, state))
+            return terms.log_factor - 0.5 * (terms.quad + terms.log_det)
+        if plan.joint:
+            raise InputError(
+                "a landmark seen twice in a step needs a Gaussian likelihood to be left as it is"
+            )
+        total = plan.log_factor.copy()
+        for batch in plan.batches:
+            group, records = groups[batch.group], self.read(batch.ids)
+            at, z = state[:, None, :], group.z[batch.ks]
+            nu, jac = linearise(group.model, self.space, z, at, records.mean, records.const)
+            assert jac.landmark is not None
+            cov = innovation_covariance(jac.landmark, records.cov, group.cov[batch.ks])
+            log_density = (group.likelihood or Gaussian()).log_density(nu, cov)
+            total += (log_density * (1.0 if batch.mask is None else batch.mask)).sum(axis=1)
+        return total
 
     def resample(self, ancestors: np.ndarray) -> None:
         """Nothing is copied: the lineage has advanced. Compacts what has lost its descendants."""
@@ -263,3 +282,19 @@ def _by_use(groups: Sequence[Observations]) -> dict[frozenset[Part], list[Observ
     for group in groups:
         by_use[group.informs].append(group)
     return by_use
+
+
+def _require_apart(weigh: Sequence[Observations], both: Sequence[Observations]) -> None:
+    """Rows of one landmark are correlated through it; those that do not update it cannot be stacked with others."""
+    if not weigh or not both:
+        return
+    seen = [
+        np.concatenate([np.ravel(group.ids) for group in part if group.ids is not None])
+        for part in (weigh, both)
+    ]
+    shared = np.intersect1d(seen[0][seen[0] >= 0], seen[1])
+    if shared.size:
+        raise InputError(
+            f"landmark {shared[0]} is observed by a group that informs the state alone and by one that informs both: "
+            "split the second into one for each"
+        )

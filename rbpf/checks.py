@@ -44,6 +44,8 @@ def checked_observations(group: Observations) -> Observations:
         raise InputError(
             f"observations of {name} inform a frozenset of Part.STATE, Part.LANDMARK or both, got {informs}"
         )
+    if Part.STATE not in informs and Part.LANDMARK not in group.model.reads:
+        raise InputError(f"{name} reads no landmark: its observations must inform Part.STATE")
     if not (np.isfinite(group.z).all() and np.isfinite(group.cov).all()):
         raise InputError(f"a measurement of {name} or its covariance is not finite")
     if not _regular(group.cov):

@@ -23,14 +23,16 @@ def numeric_jacobians(
     substate: np.ndarray | None = None,
     by: frozenset[Part] = EVERYTHING,
 ) -> Jacobians:
-    """Central differences of `model.predict`, in the right chart at the state; wrapped by `model.residual`.
+    """Central differences of −ν for z = h, in the right chart at the state; `model.residual` wraps.
 
     Those by a part that `by` does not name are left out: each costs two predictions per coordinate.
     """
     plus_minus = np.array([STEP, -STEP])
 
-    def differences(values: np.ndarray) -> np.ndarray:
-        return np.moveaxis(model.residual(values[0], values[1]), 0, -1) / (2 * STEP)
+    z = model.predict(state, landmark, const, substate)
+
+    def differences(nu: np.ndarray) -> np.ndarray:
+        return np.moveaxis(nu[1] - nu[0], 0, -1) / (2 * STEP)
 
     def perturbed(x: np.ndarray) -> np.ndarray:
         steps = plus_minus[:, None, None] * np.eye(x.shape[-1])
@@ -41,11 +43,11 @@ def numeric_jacobians(
     if Part.STATE in wanted:
         steps = plus_minus[:, None, None] * np.eye(space.dim)
         moved = space.retract(state, steps.reshape(2, space.dim, *(1,) * (state.ndim - 1), space.dim))
-        state_part = differences(model.predict(moved, landmark, const, substate))
+        state_part = differences(model.innovation(z, moved, landmark, const, substate))
     if landmark is not None and Part.LANDMARK in wanted:
-        landmark_part = differences(model.predict(state, perturbed(landmark), const, substate))
+        landmark_part = differences(model.innovation(z, state, perturbed(landmark), const, substate))
     if substate is not None and Part.SUBSTATE in wanted:
-        substate_part = differences(model.predict(state, landmark, const, perturbed(substate)))
+        substate_part = differences(model.innovation(z, state, landmark, const, perturbed(substate)))
     return Jacobians(state_part, landmark_part, substate_part)
 
 

@@ -75,6 +75,12 @@ class ConstellationView(ObservationModel):
         assert const is not None
         return np.asarray(self.camera.visible(self._chain(state, landmark, const)[2]).all(axis=-1))
 
+    def in_world(self, landmark: np.ndarray, const: np.ndarray | None) -> np.ndarray:
+        """The points (…, m, 3) in the world."""
+        assert const is not None
+        frame = SE3.retract(const, landmark[..., :6])
+        return SE3.transform(frame[..., None, :], self._in_group(landmark))
+
     def kernel(self) -> FusedKernel | None:
         """Compiled."""
         from rbpf.sensors.constellation_kernel import constellation_view
@@ -88,9 +94,13 @@ class ConstellationView(ObservationModel):
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """world_from_group (…, 7), and the points (…, m, 3) in the group's and in the camera's frame."""
         frame = SE3.retract(const, landmark[..., :6])
-        in_group = self.points
-        if self.places is not None:
-            errors = landmark[..., 6:].reshape(*landmark.shape[:-1], -1, 3)
-            in_group = self.points + errors[..., self.places, :]
+        in_group = self._in_group(landmark)
         world = SE3.transform(frame[..., None, :], in_group)
         return frame, in_group, SE3.inverse_transform(state[..., None, :7], world)
+
+    def _in_group(self, landmark: np.ndarray) -> np.ndarray:
+        """The points (…, m, 3) with their errors."""
+        if self.places is None:
+            return self.points
+        errors = landmark[..., 6:].reshape(*landmark.shape[:-1], -1, 3)
+        return np.asarray(self.points + errors[..., self.places, :])

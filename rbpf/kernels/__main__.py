@@ -5,5 +5,14 @@ from importlib import import_module
 from rbpf.kernels import compile_once
 
 compile_once(lambda: print("compiling the kernels, which takes a minute and is done once …"))
-for name in ("range_bearing_kernels", "camera_kernels", "constellation_kernel"):
+for name in (
+    "range_bearing_kernels",
+    "camera_kernels",
+    "constellation_kernel",
+    "patch_kernels",
+    "patch_correlation_kernels",
+    "patch_refinement_kernels",
+    "patch_warp_kernels",
+    "corner_kernels",
+):
     import_module(f"rbpf.sensors.{name}")

@@ -49,6 +49,93 @@ class RayConfig:
 
 
 @dataclass(frozen=True)
+class SearchConfig:
+    """Active search in images, E06 §4.1.
+
+    Attributes:
+        measurements: landmarks looked for in a frame at most.
+        noise_px: standard deviation of a found place, per axis.
+        template_px: side of the patch that is compared, odd.
+        accept: least normalised cross-correlation of a match.
+        sigmas: size of the ellipse that is searched, in standard deviations.
+        largest_px: an ellipse is not searched further than this from its centre.
+        in_view: features are started while fewer than this are in view.
+        new_per_frame: features started in a frame at most; in the first one, as many as are measured.
+        gate: squared Mahalanobis distance from the motion that most matches agree on, beyond which one is dropped.
+        spacing_px: new features keep this distance from others.
+        margin_px: features this near to the border are left alone.
+        turn_deg: a feature is not looked for once its line of sight has turned by this.
+        scale: nor once it is this many times nearer or farther than at first.
+        trial: a feature is judged after having been looked for this often.
+        failure_ratio: it is dropped from all particles when it was not found in more than this share.
+        lost_share: the camera is lost when fewer than this share of what was looked for is found …
+        lost_frames: … in this many frames in a row.
+        regained_share: it is not lost any more when at least this share is found …
+        regained: … and so many features.
+    """
+
+    measurements: int = 25
+    noise_px: float = 1.0
+    template_px: int = 11
+    accept: float = 0.8
+    sigmas: float = 3.0
+    largest_px: float = 40.0
+    in_view: int = 35
+    new_per_frame: int = 3
+    gate: float = 9.2
+    spacing_px: float = 20.0
+    margin_px: float = 8.0
+    turn_deg: float = 50.0
+    scale: float = 2.0
+    trial: int = 10
+    failure_ratio: float = 0.5
+    lost_share: float = 0.25
+    lost_frames: int = 3
+    regained_share: float = 0.5
+    regained: int = 6
+
+
+@dataclass(frozen=True)
+class RecoveryConfig:
+    """What happens when the camera is lost.
+
+    Attributes:
+        drift_rad_s: while lost it stays at its last trusted pose, with a standard deviation that grows by this.
+        drift_m_s: likewise of its position.
+        reach_rad: around the trusted pose landmarks are looked for with this standard deviation; further away the
+            camera is found by what landmarks look like.
+        reach_m: likewise of its position.
+        corners: places of a lost image that are compared with the map's features at most.
+        spacing_px: their least distance.
+        ratio: a feature's distance from the place most like it is below this share of that from the next.
+        depth_share: features take part whose depth is known to this share of it.
+        around_px: the features are looked for this near to where a pose says that they are.
+        within_px: a feature agrees with a pose when it is seen as near to its projection.
+        triples: of features from which poses are computed.
+        inliers: features that must agree with a pose.
+        inlier_share: share of the matches that must agree.
+        spread: standard deviation of the inliers' places in their narrowest direction, in widths of the image.
+        inflation: of the pose's standard deviations: the map's errors are common to neighbours.
+    """
+
+    drift_rad_s: float = 0.25
+    drift_m_s: float = 0.25
+    reach_rad: float = 0.05
+    reach_m: float = 0.05
+    corners: int = 500
+    spacing_px: float = 6.0
+    ratio: float = 0.9
+    depth_share: float = 0.3
+    around_px: float = 15.0
+    within_px: float = 4.0
+    triples: int = 300
+    inliers: int = 8
+    inlier_share: float = 0.25
+    spread: float = 0.03
+    inflation: float = 3.0
+
+
+@dataclass(frozen=True)
 class MonoConfig:
     """A run of monocular SLAM on features.
 
@@ -61,8 +148,11 @@ class MonoConfig:
         known: the known points as one rigid group whose frame is marginalised, or as separate landmarks in a world
             whose place each particle samples in the first frame (E06).
         births_per_frame: landmarks started in one frame at most.
+        checkpoint_every: frames between checkpoints.
         velocity: how the camera moves.
         ray: landmarks of unknown depth.
+        search: of landmarks in images.
+        recovery: when the camera is lost.
         proposal: where particles are sampled.
         resampling: when and how.
     """
@@ -74,8 +164,11 @@ class MonoConfig:
     start_std_rad: float = 0.5
     known: Literal["frame", "points"] = "frame"
     births_per_frame: int = 1000
+    checkpoint_every: int = 500
     velocity: VelocityConfig = field(default_factory=VelocityConfig)
     ray: RayConfig = field(default_factory=RayConfig)
+    search: SearchConfig = field(default_factory=SearchConfig)
+    recovery: RecoveryConfig = field(default_factory=RecoveryConfig)
     proposal: ProposalConfig = field(default_factory=lambda: ProposalConfig(iterations=1))
     resampling: ResamplingConfig = field(default_factory=ResamplingConfig)
 
@@ -83,3 +176,5 @@ class MonoConfig:
         """Checks what no part checks itself."""
         if self.particles < 1:
             raise InputError(f"particles must be at least 1, got {self.particles}")
+        if self.checkpoint_every < 1:
+            raise InputError(f"checkpoint_every must be at least 1, got {self.checkpoint_every}")

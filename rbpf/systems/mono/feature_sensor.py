@@ -9,8 +9,9 @@ from rbpf.belief import Belief
 from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.maps.point import Point
 from rbpf.models import Births, Observations, Part, Sensor
+from rbpf.numeric import linearise
 from rbpf.sensors.camera_constellation import ConstellationView
-from rbpf.sensors.camera_points import CameraPoint, CameraRay, EpipolarRay
+from rbpf.sensors.camera_points import CameraModel, CameraPoint, CameraRay, EpipolarRay
 from rbpf.sensors.features import FeatureFrame, KnownPoints
 from rbpf.sensors.names import Names
 from rbpf.sensors.pinhole import Pinhole
@@ -71,11 +72,111 @@ class FeatureSensor(Sensor):
         known = self._names.ids(belief.catalogue)
         names = frame.landmarks.tolist()
         new = [k for k, name in enumerate(names) if name not in known and name not in self._place]
-        new = [k for k in new if self.camera.inside(frame.z[k])][: self.births_per_frame]
+        has_ray = self.camera.inside(frame.z) & np.isfinite(self.camera.unproject(frame.z)).all(axis=-1)
+        new = [k for k in new if has_ray[k]][: self.births_per_frame]
         if not new:
             return []
         names = frame.landmarks[new].tolist()
         return [Births(frame.z[new], frame.cov_z[new], self.ray, self.inverse_depth, facts=names)]
+
+    def project(
+        self, belief: Belief, names: np.ndarray, members: np.ndarray
+    ) -> list[tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]]:
+        """Where features (K,) should be seen: which of them, their means (k, 2) and covariances (k, 2, 2), by kind."""
+        out = []
+        for model, chosen, ids in self._by_kind(belief, names, members):
+            mean, cov = belief.project(model, ids)
+            if isinstance(model, ConstellationView):
+                mean = mean.reshape(-1, 2)
+            cov = _diagonal_blocks(cov, chosen.size)
+            out.append((chosen, (mean, cov)))
+        return out
+
+    def innovations(
+        self, belief: Belief, names: np.ndarray, members: np.ndarray, px: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Of features (K,) found at px (K, 2), in the heaviest particle at its predicted pose.
+
+        Returns:
+            Which features, ν (k, 2), H (k, 2, d) and J P Jᵀ (k, 2, 2).
+        """
+        mode = belief.mode
+        which, nus, jacs, covs = [], [], [], []
+        for model, chosen, ids in self._by_kind(belief, names, members):
+            records = belief.read(ids)
+            const = None if records.const is None else records.const[mode]
+            z = px[chosen].reshape(1, -1) if isinstance(model, ConstellationView) else px[chosen]
+            nu, jac = linearise(
+                model, belief.prior.space, z, belief.state[mode][None], records.mean[mode], const
+            )
+            assert jac.state is not None and jac.landmark is not None
+            cov = jac.landmark @ records.cov[mode] @ np.swapaxes(jac.landmark, -1, -2)
+            which.append(chosen)
+            nus.append(nu.reshape(-1, 2))
+            jacs.append(jac.state.reshape(chosen.size, 2, -1))
+            covs.append(_diagonal_blocks(cov, chosen.size))
+        return np.concatenate(which), np.concatenate(nus), np.concatenate(jacs), np.concatenate(covs)
+
+    def places(
+        self, belief: Belief, names: np.ndarray, members: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Where features (K,) are in the world of the heaviest particle: which of them, homogeneous points (k, 4)."""
+        mode, which, out = belief.mode, [np.zeros(0, dtype=np.int64)], [np.zeros((0, 4))]
+        for model, chosen, ids in self._by_kind(belief, names, members):
+            records = belief.read(ids)
+            const = None if records.const is None else records.const[mode]
+            which.append(chosen)
+            if isinstance(model, ConstellationView):
+                out.append(np.pad(model.in_world(records.mean[mode], const)[0], ((0, 0), (0, 1)), constant_values=1.0))
+            else:
+                x, w = model.place(records.mean[mode], const)
+                out.append(np.concatenate([x, w], axis=-1))
+        return np.concatenate(which), np.concatenate(out)
+
+    def deep(self, belief: Belief, names: np.ndarray, members: np.ndarray, share: float) -> np.ndarray:
+        """Whether the heaviest particle knows the depth of features (K,) to this share of it, (K,) bool."""
+        out = np.zeros(names.size, dtype=bool)
+        for model, chosen, ids in self._by_kind(belief, names, members):
+            out[chosen] = True
+            if model is self.ray:
+                records, mode = belief.read(ids), belief.mode
+                rho, variance = records.mean[mode, :, 2], records.cov[mode, :, 2, 2]
+                out[chosen] = (rho > 0.0) & (np.sqrt(variance) <= share * rho)
+        return out
+
+    def first_places(self, world_from_camera: np.ndarray, px: np.ndarray) -> np.ndarray:
+        """Homogeneous points (k, 4) of rays that start at px (k, 2) from a camera (7,)."""
+        records = self.ray.initialise(world_from_camera[None], px, np.zeros((px.shape[0], 2, 2)))
+        x, w = self.ray.place(records.mean[0], records.const[0] if records.const is not None else None)
+        return np.concatenate([x, w], axis=-1)
+
+    def forget(self, belief: Belief, names: np.ndarray) -> None:
+        """Drops features from all particles."""
+        known = self._names.ids(belief.catalogue)
+        belief.map.remove(np.array([known[name] for name in names.tolist() if name in known], dtype=np.int64))
+
+    def _by_kind(
+        self, belief: Belief, names: np.ndarray, members: np.ndarray
+    ) -> list[tuple[CameraModel | ConstellationView, np.ndarray, np.ndarray]]:
+        """Features (K,) by their model: the model, which of them, and the landmarks' ids."""
+        known = self._names.ids(belief.catalogue)
+        ids = np.array([known.get(name, -1) for name in names.tolist()], dtype=np.int64)
+        own = np.flatnonzero((members < 0) & (ids >= 0))
+        is_ray = belief.map.are(ids[own], self.inverse_depth)
+        out: list[tuple[CameraModel | ConstellationView, np.ndarray, np.ndarray]] = []
+        for model, chosen in ((self.point, own[~is_ray]), (self.ray, own[is_ray])):
+            if chosen.size:
+                out.append((model, chosen, ids[chosen]))
+        of_group = np.flatnonzero(members >= 0)
+        if of_group.size:
+            out.append((self._view(belief, members[of_group]), of_group, np.array([known[CONSTELLATION]])))
+        return out
+
+    def _view(self, belief: Belief, places: np.ndarray) -> ConstellationView:
+        assert self._known is not None
+        landmark = self._names.ids(belief.catalogue)[CONSTELLATION]
+        own = None if belief.map.landmark_of(landmark).dim == 6 else places
+        return ConstellationView(self.camera, self._known.positions[places], own)
 
     def _constellation_group(self, frame: FeatureFrame, belief: Belief) -> list[Observations]:
         """All known points that are seen, as one measurement of their frame."""
@@ -83,11 +184,8 @@ class FeatureSensor(Sensor):
         rows = [k for k in rows if self.camera.inside(frame.z[k])]
         if not rows:
             return []
-        assert self._known is not None
         landmark = self._names.ids(belief.catalogue)[CONSTELLATION]
-        places = np.array([self._place[name] for name in frame.landmarks[rows].tolist()])
-        own = None if belief.map.landmark_of(landmark).dim == 6 else places
-        view = ConstellationView(self.camera, self._known.positions[places], own)
+        view = self._view(belief, np.array([self._place[name] for name in frame.landmarks[rows].tolist()]))
         z, cov = frame.z[rows].reshape(1, -1), np.zeros((1, view.dim, view.dim))
         for k, row in enumerate(rows):
             cov[0, 2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = frame.cov_z[row]
@@ -129,3 +227,11 @@ class FeatureSensor(Sensor):
         ids = np.concatenate([i for i in updated if i is not None])
         ready = belief.weights @ self.inverse_depth.ready(belief.read(ids))
         belief.map.promote(ids[ready >= self.rays.ready_weight], Point(3))
+
+
+def _diagonal_blocks(cov: np.ndarray, count: int) -> np.ndarray:
+    """Covariances (count, 2, 2) of single points from (count, 2, 2) itself or from (1, 2 count, 2 count)."""
+    if cov.shape[0] == count and cov.shape[1] == 2:
+        return cov
+    blocks = cov[0].reshape(count, 2, count, 2)
+    return np.array([blocks[k, :, k] for k in range(count)])

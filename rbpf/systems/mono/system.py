@@ -1,5 +1,7 @@
 """Monocular SLAM on features (E06): constant velocity, a camera, points and rays."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from rbpf.anchoring import Anchored
@@ -9,7 +11,7 @@ from rbpf.lie import SE3
 from rbpf.maps.constellation import Constellation
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
-from rbpf.models import Conditional, MotionModel, Records
+from rbpf.models import Conditional, MotionModel, Records, Sensor
 from rbpf.motion.constant_velocity import MarginalVelocity, PoseLaw, SampledVelocity
 from rbpf.sensors.features import FeatureLog, KnownPoints
 from rbpf.sensors.pinhole import Pinhole
@@ -27,28 +29,57 @@ def build_filter(log: FeatureLog, config: MonoConfig) -> Filter:
     """
     if not isinstance(log.camera, Pinhole):
         raise InputError(f"{log.name}: monocular SLAM needs a log of one camera, this is a stereo log")
+    if any((frame.landmarks < 0).any() for frame in log.frames):
+        raise InputError(f"{log.name}: a landmark has a negative name, number the landmarks from 0 on")
+    start = None if log.known is None else KnownStart(log.known, _resected(log))
+    return assemble(config, build_features(log.camera, config, log.known), start)
+
+
+@dataclass(frozen=True)
+class KnownStart:
+    """Known points, and the world_from_camera (7,) of the first frame that they imply."""
+
+    points: KnownPoints
+    world_from_camera: np.ndarray
+
+
+def build_features(camera: Pinhole, config: MonoConfig, known: KnownPoints | None) -> FeatureSensor:
+    """What turns found features into observations."""
+    group = known if config.known == "frame" else None
+    return FeatureSensor(camera, config.ray, config.births_per_frame, group)
+
+
+def assemble(
+    config: MonoConfig, features: FeatureSensor, start: KnownStart | None, sensor: Sensor | None = None
+) -> Filter:
+    """The filter, with the known points in its map.
+
+    Args:
+        config: all settings.
+        features: what turns found features into observations.
+        start: known points, if there are any.
+        sensor: what finds features and hands them to `features`; by default the features come as they are.
+    """
     motion = build_motion(config.velocity)
     landmark_map = LandmarkMap(motion.space, compiled=config.compiled)
-    as_frame = log.known is not None and config.known == "frame"
-    sensor = FeatureSensor(log.camera, config.ray, config.births_per_frame, log.known if as_frame else None)
     landmark_map.register(Point(3))
-    landmark_map.register(sensor.inverse_depth)
+    landmark_map.register(features.inverse_depth)
     parts: list[Conditional] = [landmark_map]
     if config.velocity.mode == "marginal":
         parts.append(KalmanSubstate(SE3, np.zeros(6), np.diag(_start_std(config.velocity) ** 2)))
     filter_ = Filter(
         motion,
-        sensor,
+        sensor or features,
         parts,
         config.proposal.build(),
         config.resampling.build(),
         config.particles,
         np.random.default_rng(config.seed),
     )
-    if as_frame:
-        add_constellation(landmark_map, log, config)
-    elif log.known is not None:
-        add_known_points(landmark_map, log.known, config.particles)
+    if start is not None and config.known == "frame":
+        add_constellation(landmark_map, start, config)
+    elif start is not None:
+        add_known_points(landmark_map, start.points, config.particles)
     return filter_
 
 
@@ -68,11 +99,10 @@ def add_known_points(landmark_map: LandmarkMap, known: KnownPoints, n: int) -> N
     landmark_map.catalogue.update(zip(ids.tolist(), known.names.tolist(), strict=True))
 
 
-def add_constellation(landmark_map: LandmarkMap, log: FeatureLog, config: MonoConfig) -> None:
+def add_constellation(landmark_map: LandmarkMap, start: KnownStart, config: MonoConfig) -> None:
     """The known points as one landmark: their frame, as seen from the first camera."""
-    assert log.known is not None
-    group = Constellation(log.known.positions, log.known.cov)
-    records = group.started(config.particles, SE3.inverse(_resected(log)), _start_cov(config))
+    group = Constellation(start.points.positions, start.points.cov)
+    records = group.started(config.particles, SE3.inverse(start.world_from_camera), start_cov(config))
     ids = landmark_map.add_records(records, group)
     landmark_map.catalogue[int(ids[0])] = CONSTELLATION
 
@@ -98,7 +128,7 @@ def start_law(log: FeatureLog, config: MonoConfig) -> PoseLaw:
     """
     if log.known is None or config.known == "frame":
         return PoseLaw(SE3.identity(), np.zeros((6, 6)))
-    return PoseLaw(_resected(log), _start_cov(config))
+    return PoseLaw(_resected(log), start_cov(config))
 
 
 def _resected(log: FeatureLog) -> np.ndarray:
@@ -111,7 +141,8 @@ def _resected(log: FeatureLog) -> np.ndarray:
     return resect(log.camera, log.known.positions[in_known], z[in_frame])
 
 
-def _start_cov(config: MonoConfig) -> np.ndarray:
+def start_cov(config: MonoConfig) -> np.ndarray:
+    """Covariance (6, 6) of the wide law of the start."""
     return np.diag(np.repeat([config.start_std_rad**2, config.start_std_m**2], 3))
 
 

@@ -1,0 +1,120 @@
+"""The frame of known points, marginalised: the joint EKF of frame and errors on a path that is known."""
+
+import numpy as np
+import pytest
+
+from rbpf.genealogy import Lineage
+from rbpf.lie import SE3
+from rbpf.maps.constellation import Constellation
+from rbpf.maps.landmark_map import LandmarkMap
+from rbpf.models import Observations
+from rbpf.proposals import Prior
+from rbpf.sensors.camera_constellation import ConstellationView
+from tests.exactness.models import Kalman
+from tests.sensors.camera_scenes import DISTORTED
+
+POINTS = np.random.default_rng(0).uniform([-0.5, -0.4, -0.3], [0.5, 0.4, 0.3], size=(4, 3))
+STD = 0.02
+COVS = np.tile(STD**2 * np.eye(3), (4, 1, 1))
+COV_FRAME = np.diag(np.repeat([0.02**2, 0.04**2], 3))
+NOISE_PX = 1.5
+SEEN = [np.array([0, 1, 2, 3]), np.array([3, 1]), np.array([2, 0, 1]), np.array([0])]
+every_group = pytest.mark.parametrize("errors", [True, False], ids=["errors", "exact"])
+every_path = pytest.mark.parametrize("compiled", [True, False], ids=["compiled", "numpy"])
+
+
+class World:
+    """A camera moves past a group whose frame and points were drawn from their prior."""
+
+    def __init__(self, errors: bool, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        self.errors = errors
+        self.group = Constellation(POINTS, COVS if errors else 0.0 * COVS)
+        self.given = SE3.exp(np.array([0.3, -0.2, 0.1, 0.5, 0.2, 3.0]))
+        true = np.sqrt(np.diag(self.group.started(1, self.given, COV_FRAME).cov[0, 0]))
+        self.true = true * rng.standard_normal(true.size)
+        steps = rng.normal(scale=[0.05, 0.05, 0.05, 0.2, 0.2, 0.2], size=(len(SEEN), 6))
+        self.path = SE3.exp(steps)
+        self.views = [ConstellationView(DISTORTED, POINTS[seen], seen if errors else None) for seen in SEEN]
+        self.z = [
+            view.predict(pose, self.true, self.given) + NOISE_PX * rng.standard_normal(view.dim)
+            for view, pose in zip(self.views, self.path, strict=True)
+        ]
+
+    def map(self, n: int, compiled: bool) -> LandmarkMap:
+        held = LandmarkMap(SE3, compiled=compiled)
+        held.begin(n, Lineage(n))
+        held.add_records(self.group.started(n, self.given, COV_FRAME), self.group)
+        return held
+
+    def observed(self, t: int) -> Observations:
+        cov = NOISE_PX**2 * np.eye(self.views[t].dim)[None]
+        return Observations(self.z[t][None], cov, self.views[t], ids=np.array([0]))
+
+
+def slope(view: ConstellationView, pose: np.ndarray, mean: np.ndarray, const: np.ndarray) -> np.ndarray:
+    """Numeric ∂h/∂(ξ, e)."""
+    step = 1e-6
+    columns = [
+        view.predict(pose, mean + step * axis, const) - view.predict(pose, mean - step * axis, const)
+        for axis in np.eye(mean.size)
+    ]
+    return np.stack(columns, axis=-1) / (2 * step)
+
+
+@every_path
+@every_group
+def test_joint_ekf(errors, compiled):
+    """Means, covariances and densities after every frame, all particles on the path."""
+    world = World(errors, seed=3)
+    held = world.map(3, compiled)
+    ekf = Kalman(np.zeros(world.group.dim), held.read(held.ids).cov[0, 0])
+    for t, (view, pose) in enumerate(zip(world.views, world.path, strict=True)):
+        before = ekf.log_evidence
+        H = slope(view, pose, ekf.mean, world.given)
+        residual = world.z[t] - view.predict(pose, ekf.mean, world.given)
+        ekf.update(residual + H @ ekf.mean, H, NOISE_PX**2 * np.eye(view.dim))
+        density = held.correct(np.tile(pose, (3, 1)), np.zeros((3, 6)), [world.observed(t)]).all
+        np.testing.assert_allclose(density, ekf.log_evidence - before, rtol=1e-5)
+        records = held.read(held.ids)
+        scale = np.sqrt(np.diag(ekf.cov))
+        np.testing.assert_allclose((records.mean[:, 0] - ekf.mean) / scale, 0.0, atol=1e-4)
+        np.testing.assert_allclose((records.cov[:, 0] - ekf.cov) / np.outer(scale, scale), 0.0, atol=1e-5)
+    correlation = ekf.cov / np.outer(scale, scale)
+    if errors:
+        assert np.abs(correlation[:6, 6:]).max() > 0.1
+
+
+@every_group
+def test_information_of_a_frame_has_the_frames_uncertainty(errors):
+    """Λ = Hᵀ(J P Jᵀ + R)⁻¹H about the pose; a frame that is known says more."""
+    world = World(errors, seed=4)
+    pose, prior = world.path[:1], Prior.exactly(SE3, world.path[:1])
+    held = world.map(1, True)
+    found = held.terms(pose, [world.observed(0)], prior).info[0]
+    mean, cov = held.read(held.ids).mean[0, 0], held.read(held.ids).cov[0, 0]
+    J = slope(world.views[0], pose[0], mean, world.given)
+    moves = np.stack([SE3.retract(pose[0], sign * 1e-6 * np.eye(6)) for sign in (1.0, -1.0)])
+    ahead, back = world.views[0].predict(moves, mean, world.given)
+    H = (ahead - back).T / 2e-6
+    R = NOISE_PX**2 * np.eye(len(J))
+    expected = H.T @ np.linalg.solve(J @ cov @ J.T + R, H)
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5 * np.abs(expected).max())
+    known = H.T @ np.linalg.solve(R, H)
+    assert np.linalg.eigvalsh(known - found).min() > 0.0
+
+
+@every_group
+def test_errors_are_as_large_as_stated(errors):
+    """NEES of (ξ, e) over drawn worlds, within four standard errors of its dimension."""
+    scores = []
+    for seed in range(200):
+        world = World(errors, seed)
+        held = world.map(1, True)
+        for t, pose in enumerate(world.path):
+            held.correct(pose[None], np.zeros((1, 6)), [world.observed(t)])
+        records = held.read(held.ids)
+        error = world.true - records.mean[0, 0]
+        scores.append(error @ np.linalg.solve(records.cov[0, 0], error))
+    dim = world.group.dim
+    assert abs(np.mean(scores) - dim) < 4.0 * np.sqrt(2.0 * dim / len(scores))

@@ -1,0 +1,205 @@
+"""What a group of observations informs: the particles, the landmarks, or both."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rbpf.errors import InputError
+from rbpf.filter import Filter, StepReport
+from rbpf.genealogy import Lineage
+from rbpf.lie import SE2, SE3
+from rbpf.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobis
+from rbpf.maps.landmark_map import LandmarkMap
+from rbpf.maps.mixture import MixturePoint
+from rbpf.models import Observations, Part, Records
+from rbpf.motion.odometry import Odometry, OdometryMotion
+from rbpf.proposals import EkfProposal, PriorProposal
+from rbpf.resampling import EssTriggered, Systematic
+from tests.exactness.models import Frame, Scripted
+from tests.exactness.scenes import Scene, sensors
+
+STATE, MAP = frozenset({Part.STATE}), frozenset({Part.LANDMARK})
+PARTICLES = 40
+every_space = pytest.mark.parametrize("space", [SE2, SE3], ids=repr)
+every_path = pytest.mark.parametrize("compiled", [True, False], ids=["compiled", "numpy"])
+every_proposal = pytest.mark.parametrize(
+    "proposal", [EkfProposal(), EkfProposal(exact=False), PriorProposal()], ids=["ekf", "linearised", "prior"]
+)
+
+
+def split(group: Observations) -> list[Observations]:
+    """The same measurement twice: once for the state, once for the landmarks."""
+    return [replace(group, informs=STATE), replace(group, informs=MAP)]
+
+
+def scene(space, seed: int = 0) -> tuple[Scene, list[list[Observations]]]:
+    """Four frames; three landmarks are measured in each."""
+    rng = np.random.default_rng(seed)
+    scene = Scene.random(space, rng, n=PARTICLES)
+    model = sensors(space, rng)[0]
+    return scene, [[scene.observe(model, rng.permutation(4)[:3])] for _ in range(4)]
+
+
+def run(
+    scene: Scene,
+    frames: Sequence[Sequence[Observations]],
+    compiled: bool = True,
+    proposal=None,
+    threshold: float = 0.6,
+) -> tuple[Filter, list[StepReport]]:
+    held = LandmarkMap(scene.space, compiled=compiled)
+    filter_ = Filter(
+        OdometryMotion(scene.space),
+        Scripted(),
+        held,
+        proposal,
+        EssTriggered(Systematic(), threshold),
+        PARTICLES,
+        np.random.default_rng(5),
+        scene.state,
+    )
+    held.add_records(scene.records, scene.map().landmark_of(0))
+    noise = Odometry(scene.space.identity(), 2e-4 * np.eye(scene.space.dim))
+    return filter_, [filter_.step(Frame(groups), noise) for groups in frames]
+
+
+def landmarks(filter_: Filter) -> Records:
+    held = filter_.belief().map
+    return held.read(held.ids)
+
+
+@every_path
+@every_proposal
+@every_space
+def test_one_group_for_each_is_one_group_for_both(space, proposal, compiled):
+    """E06 §5.2 with the same model in both: whole runs with resampling agree."""
+    world, frames = scene(space)
+    both, reports = run(world, frames, compiled, proposal)
+    parted, others = run(world, [split(*groups) for groups in frames], compiled, proposal)
+    assert both.lineage.generation == parted.lineage.generation > 0
+    np.testing.assert_allclose(parted.particles.state, both.particles.state, atol=1e-9)
+    np.testing.assert_allclose(parted.particles.log_weights, both.particles.log_weights, atol=1e-7)
+    for one, other in zip(reports, others, strict=True):
+        assert other.log_evidence == pytest.approx(one.log_evidence, abs=1e-7)
+        assert other.rows == one.rows
+    np.testing.assert_allclose(landmarks(parted).mean, landmarks(both).mean, atol=1e-9)
+    np.testing.assert_allclose(landmarks(parted).cov, landmarks(both).cov, atol=1e-11)
+
+
+@every_path
+@every_proposal
+@every_space
+def test_for_the_state_alone(space, proposal, compiled):
+    """Weights and evidence of the first step are those of a group for both; no landmark changes by a bit."""
+    world, (groups, *_) = scene(space)
+    both, (report,) = run(world, [groups], compiled, proposal)
+    alone, (other,) = run(world, [split(*groups)[:1]], compiled, proposal)
+    assert np.ptp(alone.particles.log_weights) > 0.0 or alone.lineage.generation > 0
+    np.testing.assert_allclose(alone.particles.log_weights, both.particles.log_weights, atol=1e-9)
+    np.testing.assert_allclose(alone.particles.state, both.particles.state, atol=1e-12)
+    assert other.log_evidence == pytest.approx(report.log_evidence, abs=1e-9)
+    ancestors = np.arange(PARTICLES) if alone.lineage.generation == 0 else None
+    if ancestors is not None:
+        np.testing.assert_array_equal(landmarks(alone).mean, world.records.mean)
+    means = {row.tobytes() for row in world.records.mean.reshape(PARTICLES, -1)}
+    assert all(row.tobytes() in means for row in landmarks(alone).mean.reshape(PARTICLES, -1))
+    assert np.abs(landmarks(both).mean - landmarks(alone).mean).max() > 1e-3
+
+
+@every_path
+@every_proposal
+@every_space
+def test_for_the_landmarks_alone(space, proposal, compiled):
+    """Particles move and weigh as without a measurement, to the bit; landmarks as with one for both there."""
+    world, (groups, *_) = scene(space)
+    alone, (report,) = run(world, [split(*groups)[1:]], compiled, proposal)
+    nothing, (empty,) = run(world, [[]], compiled, proposal)
+    assert alone.particles.state.tobytes() == nothing.particles.state.tobytes()
+    assert alone.particles.log_weights.tobytes() == nothing.particles.log_weights.tobytes()
+    assert report.log_evidence == empty.log_evidence == pytest.approx(0.0, abs=1e-12)
+    assert report.rows == 0
+    expected = world.map(compiled)
+    expected.correct(alone.particles.state, np.zeros((PARTICLES, space.dim)), groups)
+    np.testing.assert_array_equal(landmarks(alone).mean, expected.read(expected.ids).mean)
+    np.testing.assert_array_equal(landmarks(alone).cov, expected.read(expected.ids).cov)
+    assert np.abs(landmarks(alone).mean - world.records.mean).max() > 1e-3
+
+
+@every_space
+def test_compiled_equals_numpy(space):
+    world, frames = scene(space, seed=2)
+    mixed = [
+        [replace(groups[0], informs=use)]
+        for groups, use in zip(frames, (STATE, MAP, STATE, MAP), strict=True)
+    ]
+    one, other = (run(world, mixed, compiled)[0] for compiled in (True, False))
+    np.testing.assert_allclose(one.particles.state, other.particles.state, atol=1e-9)
+    np.testing.assert_allclose(one.particles.log_weights, other.particles.log_weights, atol=1e-7)
+    assert one.log_evidence == pytest.approx(other.log_evidence, abs=1e-7)
+    np.testing.assert_allclose(landmarks(one).mean, landmarks(other).mean, atol=1e-9)
+
+
+@every_path
+@pytest.mark.parametrize(
+    "likelihood",
+    [Gaussian(), TruncatedMahalanobis(4.0), GaussianWithOutliers(0.05, 30.0)],
+    ids=lambda x: type(x).__name__,
+)
+def test_density_does_not_depend_on_what_is_updated(likelihood, compiled):
+    """log p(z | x), with one measurement far off."""
+    world, (groups, *_) = scene(SE2)
+    group = replace(groups[0], likelihood=likelihood)
+    group.z[1] += 1.0
+    zero = np.zeros((PARTICLES, SE2.dim))
+    both = world.map(compiled).correct(world.state, zero, [group]).all
+    alone = world.map(compiled).correct(world.state, zero, [replace(group, informs=STATE)]).all
+    np.testing.assert_allclose(alone, both, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize(
+    "informs", [frozenset(), frozenset({Part.SUBSTATE}), STATE | {Part.SUBSTATE}, {Part.STATE}, Part.STATE]
+)
+def test_what_cannot_be_informed(informs):
+    world, (groups, *_) = scene(SE2)
+    with pytest.raises(
+        InputError, match=r"of RangeBearing inform a frozenset of Part\.STATE, Part\.LANDMARK or both"
+    ):
+        run(world, [[replace(groups[0], informs=informs)]])
+
+
+def mixture(world: Scene) -> LandmarkMap:
+    held = LandmarkMap(SE2)
+    held.begin(PARTICLES, Lineage(PARTICLES))
+    mean, cov = (np.stack([part, part], axis=2) for part in (world.records.mean, world.records.cov))
+    log_weights = np.full(mean.shape[:3], np.log(0.5))
+    held.add_records(Records(mean, cov, None, log_weights), MixturePoint(2, 2))
+    return held
+
+
+def test_several_components_cannot_be_left_as_they_are():
+    world, (groups, *_) = scene(SE2)
+    zero = np.zeros((PARTICLES, SE2.dim))
+    with pytest.raises(InputError, match="several components cannot be observed without being updated"):
+        mixture(world).correct(world.state, zero, split(*groups)[:1])
+
+
+def test_several_components_without_weighing():
+    """The landmark's components are updated, the particles' weights are not."""
+    world, (groups, *_) = scene(SE2)
+    zero = np.zeros((PARTICLES, SE2.dim))
+    held, other = mixture(world), mixture(world)
+    densities = held.correct(world.state, zero, split(*groups)[1:])
+    expected = other.correct(world.state, zero, groups)
+    np.testing.assert_array_equal(densities.all, 0.0)
+    np.testing.assert_array_equal(densities.late, 0.0)
+    assert np.ptp(expected.all) > 0.0
+    np.testing.assert_array_equal(held.read(held.ids).mean, other.read(other.ids).mean)
+
+
+def test_a_landmark_that_is_weighed_apart_and_updated_together_is_refused():
+    world, (groups, *_) = scene(SE2)
+    twice = [groups[0], replace(groups[0], informs=STATE)]
+    with pytest.raises(InputError, match="informs the state alone and by one that informs both"):
+        run(world, [twice])

@@ -1,0 +1,245 @@
+"""A velocity that is marginalised: the joint Kalman filter where that is exact, and the sampled velocity's law."""
+
+import numpy as np
+import pytest
+
+from rbpf.filter import Filter
+from rbpf.genealogy import Lineage
+from rbpf.lie import SE3
+from rbpf.models import Jacobians, ObservationModel, Part
+from rbpf.motion.constant_velocity import MarginalVelocity, SampledVelocity
+from rbpf.proposals import PriorProposal
+from rbpf.resampling import EssTriggered, Systematic
+from rbpf.substate import KalmanSubstate
+from tests.exactness.models import Frame, Kalman, Scripted, deviation, single
+
+WALK = np.array([0.0, 0.0, 0.0, 0.6, 0.9, 0.4])
+"""Without rotation SE(3) is a vector space, and the joint Kalman filter is exact."""
+HALF = np.random.default_rng(1).normal(size=(3, 4))
+P0 = HALF @ HALF.T
+V0 = np.array([0.4, -0.3, 0.2])
+R = np.array([[0.05, 0.01, 0.0], [0.01, 0.04, 0.0], [0.0, 0.0, 0.06]])
+STAMPS_S = [0.0, 0.1, 0.4, 0.4, 1.1, 1.3]
+"""Steps of different lengths, one of no time."""
+
+
+class Position(ObservationModel):
+    """z = position + v; what rotates does not exist here."""
+
+    dim = 3
+    reads = frozenset({Part.STATE})
+
+    def predict(self, state, landmark=None, const=None, substate=None):
+        return state[..., 4:7]
+
+    def jacobians(self, state, landmark=None, const=None, substate=None):
+        rotation = SE3.rotation(state[..., :7])
+        by_state = np.zeros((*rotation.shape[:-1], 6 + state.shape[-1] - 7))
+        by_state[..., 3:6] = rotation
+        return Jacobians(state=by_state)
+
+
+def substate(rotating: float = 0.0) -> KalmanSubstate:
+    cov = np.zeros((6, 6))
+    cov[:3, :3], cov[3:, 3:] = rotating**2 * np.eye(3), P0
+    return KalmanSubstate(SE3, np.append(np.zeros(3), V0), cov)
+
+
+def build(
+    part: KalmanSubstate, n: int, seed: int, walk: np.ndarray = WALK, proposal=None, threshold: float = 0.5
+) -> Filter:
+    return Filter(
+        MarginalVelocity(walk),
+        Scripted(),
+        part,
+        proposal,
+        EssTriggered(Systematic(), threshold),
+        n,
+        np.random.default_rng(seed),
+    )
+
+
+def measurements(seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return np.outer(STAMPS_S, [0.5, 0.1, -0.2]) + 0.2 * rng.normal(size=(len(STAMPS_S), 3))
+
+
+def kalman_path(z: np.ndarray) -> Kalman:
+    """Filter of (position, velocity) from the origin, over the same frames."""
+    kalman = Kalman(np.append(np.zeros(3), V0), np.block([[np.zeros((3, 6))], [np.zeros((3, 3)), P0]]))
+    sigma, eye, zero = np.diag(WALK[3:] ** 2), np.eye(3), np.zeros((3, 3))
+    for t, stamp in enumerate(STAMPS_S):
+        dt = stamp - STAMPS_S[max(t - 1, 0)]
+        Q = np.block([[dt**3 / 3 * sigma, dt**2 / 2 * sigma], [dt**2 / 2 * sigma, dt * sigma]])
+        kalman.predict(np.block([[eye, dt * eye], [zero, eye]]), Q)
+        kalman.update(z[t], np.hstack([eye, zero]), R)
+        kalman.record()
+    return kalman
+
+
+def test_the_exact_velocity_given_the_path():
+    """Step by step: s | x_0:t of each particle is the Kalman filter's that is told its positions exactly."""
+    part = substate()
+    filter_ = build(part, 7, 3, threshold=0.0)
+    z = measurements(0)
+    kalman, places = Kalman(V0, P0), np.zeros((7, 3))
+    means = np.repeat(V0[None], 7, axis=0)
+    sigma = np.diag(WALK[3:] ** 2)
+    for t, stamp in enumerate(STAMPS_S):
+        filter_.step(Frame([single(z[t], R, Position())]), None, round(stamp * 1e9))
+        dt = stamp - STAMPS_S[max(t - 1, 0)]
+        after = filter_.particles.state[:, 4:7]
+        if dt > 0.0:
+            cov = kalman.cov
+            S = dt**2 * cov + dt**3 / 3 * sigma
+            gain = (dt * cov + dt**2 / 2 * sigma) @ np.linalg.inv(S)
+            means = means + (after - places - dt * means) @ gain.T
+            kalman.cov = cov + dt * sigma - gain @ S @ gain.T
+        places = after.copy()
+        np.testing.assert_allclose(part.mean[:, 3:], means, rtol=1e-8, atol=1e-9)
+        np.testing.assert_allclose(part.mean[:, :3], 0.0, atol=1e-12)
+        assert part.cov.shape == (1, 6, 6)
+        np.testing.assert_allclose(part.cov[0, 3:, 3:], kalman.cov, rtol=1e-7, atol=1e-9)
+    assert filter_.lineage.generation == 0
+
+
+def test_evidence_and_moments_are_the_joint_kalman_filters():
+    """Before sampling they are exact in the first moving step; later ones in the mean over runs."""
+    z = measurements(1)
+    kalman = kalman_path(z)
+    ratios, errors = [], []
+    for seed in range(120):
+        part = substate()
+        filter_ = build(part, 500, seed)
+        for t, stamp in enumerate(STAMPS_S):
+            report = filter_.step(Frame([single(z[t], R, Position())]), None, round(stamp * 1e9))
+            if t == 1:
+                mean, cov = kalman.path[1]
+                np.testing.assert_allclose(report.estimate.mean[4:7], mean[:3], atol=1e-9)
+                np.testing.assert_allclose(report.estimate.cov[3:, 3:], cov[:3, :3], atol=1e-9)
+        ratio = np.exp(filter_.log_evidence - kalman.log_evidence)
+        weights = filter_.particles.weights
+        state = np.concatenate([filter_.particles.state[:, 4:7], part.mean[:, 3:]], axis=1)
+        error = state - kalman.mean
+        second = np.einsum("n,na,nb->ab", weights, error, error)
+        second[3:, 3:] += part.cov[0, 3:, 3:]
+        ratios.append(ratio)
+        errors.append(ratio * np.concatenate([weights @ error, (second - kalman.cov).ravel()]))
+    assert np.std(np.log(ratios)) <= 0.5
+    assert deviation(np.array(ratios), 1.0) <= 3.0
+    assert deviation(np.array(errors), 0.0) <= 4.0
+
+
+def test_a_shared_covariance_is_the_one_of_each_particle():
+    """Told per particle, the same filter gives the same numbers."""
+    shared, own = substate(0.2), substate(0.2)
+    results = []
+    for part in (shared, own):
+        filter_ = build(part, 20, 9, np.full(6, 0.5))
+        if part is own:
+            part.cov = np.repeat(part.cov, 20, axis=0)
+        for t, stamp in enumerate(STAMPS_S):
+            filter_.step(Frame([single(measurements(2)[t], R, Position())]), None, round(stamp * 1e9))
+        results.append(filter_)
+    assert shared.cov.shape == (1, 6, 6)
+    assert own.cov.shape == (20, 6, 6)
+    one, other = results
+    assert one.lineage.generation > 0
+    np.testing.assert_allclose(one.particles.state, other.particles.state, atol=1e-9)
+    np.testing.assert_allclose(one.particles.log_weights, other.particles.log_weights, atol=1e-9)
+    np.testing.assert_allclose(shared.mean, own.mean, atol=1e-9)
+    np.testing.assert_allclose(np.broadcast_to(shared.cov, own.cov.shape), own.cov, atol=1e-10)
+
+
+def test_descendants_inherit_what_their_ancestor_knows():
+    """Resampled between prediction and update, or permuted before both: the same laws."""
+    rng, n, ancestors = np.random.default_rng(4), 5, np.array([3, 3, 0, 4, 1])
+    half = rng.normal(size=(n, 6, 8))
+    mean, cov = rng.normal(size=(n, 6)), half @ np.swapaxes(half, -1, -2)
+    state, increment = SE3.exp(rng.normal(size=(n, 6))), rng.normal(size=(n, 6))
+    results = []
+    for first, later in ((np.arange(n), ancestors), (ancestors, np.arange(n))):
+        part = substate()
+        part.begin(n, Lineage(n))
+        part.mean, part.cov = mean[first], cov[first]
+        part.predict(MarginalVelocity(0.5).transition(state[first], None, 0.3), SE3)
+        part.resample(later)
+        part.correct(SE3.retract(state[ancestors], increment), increment, [])
+        results.append(part)
+    np.testing.assert_array_equal(results[0].mean, results[1].mean)
+    np.testing.assert_array_equal(results[0].cov, results[1].cov)
+    assert np.abs(np.diff(results[0].mean[:2], axis=0)).max() > 1e-3
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_an_observation_of_the_velocity_makes_it_the_particles_own(shared):
+    """Where H depends on the state every particle has its covariance; else it could be shared, and is equal."""
+
+    class Speed(ObservationModel):
+        dim = 3
+        reads = frozenset({Part.STATE, Part.SUBSTATE})
+
+        def predict(self, state, landmark=None, const=None, substate=None):
+            scale = 1.0 if shared else 1.0 + state[..., 4:5]
+            return scale * substate[..., 3:]
+
+    part = substate()
+    filter_ = build(part, 8, 1)
+    for stamp in (0, 100_000_000, 300_000_000):
+        filter_.step(Frame([single(np.array([0.3, 0.1, 0.0]), R, Speed())]), None, stamp)
+    spread = np.abs(part.cov - part.cov[:1]).max()
+    assert (spread < 1e-10) == shared
+
+
+def moments(filter_: Filter) -> np.ndarray:
+    """Mean of the pose about a fixed place, and its second moments."""
+    place = SE3.exp(np.array([0.1, -0.1, 0.2, 0.3, 0.1, -0.1]))
+    error = SE3.local(place, filter_.particles.state[:, :7])
+    weights = filter_.particles.weights
+    return np.concatenate(
+        [weights @ error, np.einsum("n,na,nb->ab", weights, error, error)[np.triu_indices(6)]]
+    )
+
+
+def test_sampled_and_marginal_velocity_have_one_law():
+    """Three steps without measurements, rotation included: first and second moments of the pose agree."""
+    n, walk = 40_000, np.array([0.5, 0.4, 0.6, 0.6, 0.9, 0.4])
+    std = np.array([0.3, 0.3, 0.3, 0.5, 0.5, 0.5])
+    part = KalmanSubstate(SE3, np.array([0.2, -0.1, 0.4, *V0]), np.diag(std**2))
+    marginal = build(part, n, 11, walk, PriorProposal())
+    rng = np.random.default_rng(12)
+    velocity = part._mean + std * rng.standard_normal((n, 6))
+    start = np.concatenate([SE3.identity((n,)), velocity], axis=1)
+    joint = Filter(
+        SampledVelocity(walk),
+        Scripted(),
+        (),
+        PriorProposal(),
+        n=n,
+        rng=np.random.default_rng(13),
+        start=start,
+    )
+    for stamp in (0, 200_000_000, 500_000_000, 600_000_000):
+        for filter_ in (marginal, joint):
+            filter_.step(Frame(), None, stamp)
+    one, other = moments(marginal), moments(joint)
+    scale = np.sqrt(np.concatenate([np.diag(_square(one)), _spread(one)]) / n)
+    assert (np.abs(one - other) / scale).max() < 6.0
+    assert np.abs(one[:6]).max() > 50.0 * scale[:6].max()
+    velocities = joint.particles.state[:, 7:]
+    np.testing.assert_allclose(part.mean.mean(axis=0), velocities.mean(axis=0), atol=6.0 / np.sqrt(n))
+    total = np.cov(part.mean.T) + part.cov[0]
+    np.testing.assert_allclose(total, np.cov(velocities.T), atol=10.0 * total.max() / np.sqrt(n))
+
+
+def _square(moment: np.ndarray) -> np.ndarray:
+    full = np.zeros((6, 6))
+    full[np.triu_indices(6)] = moment[6:]
+    return full + np.triu(full, 1).T
+
+
+def _spread(moment: np.ndarray) -> np.ndarray:
+    """Rough variance of a product of two Gaussians: E[a²]E[b²] + E[ab]²."""
+    full = _square(moment)
+    variances = np.outer(np.diag(full), np.diag(full)) + full**2
+    return variances[np.triu_indices(6)]

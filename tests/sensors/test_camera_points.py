@@ -1,0 +1,162 @@
+"""Points and rays seen by a camera whose pose is the state."""
+
+import numpy as np
+import pytest
+
+from rbpf.conformance import Example, check_model
+from rbpf.errors import InputError
+from rbpf.lie import SE3, Euclidean, Product
+from rbpf.maps.inverse_depth import InverseDepth
+from rbpf.numeric import numeric_jacobians
+from rbpf.sensors.camera_points import GRAZING, CameraPoint, CameraRay, EpipolarRay, forward
+from rbpf.sensors.pinhole import RectifiedStereo
+from tests.exactness.models import known
+from tests.sensors.camera_scenes import DISTORTED, PLAIN, Rays, with_velocity
+
+CAMERAS = [PLAIN, DISTORTED]
+STEREO = RectifiedStereo(PLAIN, 0.12)
+WITH_VELOCITY = Product(SE3, Euclidean(6))
+every_camera = pytest.mark.parametrize("camera", CAMERAS, ids=["plain", "distorted"])
+
+
+@every_camera
+def test_sound_models(camera):
+    """The compiled twin is among what is checked."""
+    assert check_model(CameraPoint(camera), SE3) == []
+    assert check_model(CameraRay(camera), SE3, example=Example(landmark=InverseDepth())) == []
+
+
+@pytest.mark.parametrize("camera", [*CAMERAS, STEREO], ids=["plain", "distorted", "stereo"])
+@pytest.mark.parametrize("velocity", [False, True], ids=["pose", "pose and velocity"])
+def test_jacobians_are_the_numeric_ones(camera, velocity):
+    rays = Rays.random(seed=1)
+    state = with_velocity(rays.state) if velocity else rays.state
+    space = WITH_VELOCITY if velocity else SE3
+    cases = [(CameraPoint(camera), rays.points, None)]
+    if camera is not STEREO:
+        cases.append((CameraRay(camera), rays.mean, rays.const))
+    for model, landmark, const in cases:
+        found = known(model.jacobians(state[:, None], landmark, const))
+        expected = numeric_jacobians(model, space, state[:, None], landmark, const)
+        assert known(found.state).shape == known(expected.state).shape
+        np.testing.assert_allclose(known(found.state), known(expected.state), rtol=1e-6, atol=1e-4)
+        np.testing.assert_allclose(known(found.landmark), known(expected.landmark), rtol=1e-6, atol=1e-4)
+        if velocity:
+            np.testing.assert_array_equal(known(found.state)[..., 6:], 0.0)
+
+
+@every_camera
+def test_a_ray_is_seen_where_its_point_is(camera):
+    rays = Rays.random(seed=2)
+    point = CameraPoint(camera).predict(rays.state[:, None], rays.points)
+    ray = CameraRay(camera).predict(rays.state[:, None], rays.mean, rays.const)
+    np.testing.assert_allclose(ray, point, rtol=1e-12)
+    np.testing.assert_allclose(
+        point, camera.project(SE3.inverse_transform(rays.state[:, None], rays.points)), rtol=1e-13
+    )
+
+
+def test_without_rotation_it_is_the_papers_model():
+    """E06 (17): h = (u + t_x q, v + t_y q)/(1 + t_z q), with x_camera = x + t; and (18) its slope at t_z = 0."""
+    t, b = np.array([0.1, -0.07, 0.05]), np.array([0.2, -0.3, 0.6])
+    model, anchor = CameraRay(PLAIN), SE3.identity()
+    camera = np.concatenate([[0.0, 0.0, 0.0, 1.0], -t])
+    expected = (b[:2] + t[:2] * b[2]) / (1.0 + t[2] * b[2])
+    np.testing.assert_allclose(PLAIN.unproject(model.predict(camera, b, anchor)), expected, atol=1e-13)
+    sideways = np.concatenate([[0.0, 0.0, 0.0, 1.0], -t * [1.0, 1.0, 0.0]])
+    slope = known(known(model.jacobians(sideways, b, anchor)).landmark) / np.array([[400.0], [410.0]])
+    np.testing.assert_allclose(slope, [[1.0, 0.0, t[0]], [0.0, 1.0, t[1]]], atol=1e-13)
+
+
+@every_camera
+def test_at_infinity_only_rotation_counts(camera):
+    rays = Rays.random(seed=3)
+    far = rays.mean * [1.0, 1.0, 0.0]
+    model = CameraRay(camera)
+    seen = model.predict(rays.state[:, None], far, rays.const)
+    shifted = rays.state + np.array([0.0, 0.0, 0.0, 0.0, 5.0, -3.0, 9.0])
+    np.testing.assert_allclose(model.predict(shifted[:, None], far, rays.const), seen, rtol=1e-9)
+    jacobians = known(model.jacobians(rays.state[:, None], far, rays.const))
+    np.testing.assert_array_equal(known(jacobians.state)[..., 3:6], 0.0)
+    assert np.isfinite(known(jacobians.landmark)).all()
+
+
+@every_camera
+def test_on_the_optical_axis(camera):
+    model, identity = CameraPoint(camera), SE3.identity()
+    np.testing.assert_allclose(model.predict(identity, np.array([0.0, 0.0, 2.0])), [319.5, 239.5])
+    jacobians = known(model.jacobians(identity, np.array([0.0, 0.0, 2.0])))
+    expected = [[200.0, 0.0, 0.0], [0.0, 205.0, 0.0]]
+    np.testing.assert_allclose(known(jacobians.landmark), expected, atol=1e-11)
+
+
+@every_camera
+@pytest.mark.parametrize(
+    "point", [[0.1, 0.2, -1.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [-3.0, 2.0, 1e-9], [1e-9, 0.0, -1e-9]]
+)
+def test_behind_the_camera_is_finite_and_far_outside(camera, point):
+    identity, point = SE3.identity(), np.array(point)
+    ray, anchor = np.array([0.1, -0.1, 0.5]), SE3.exp(np.array([0.0, np.pi, 0.0, *point]))
+    for model, landmark, const in ((CameraPoint(camera), point, None), (CameraRay(camera), ray, anchor)):
+        jacobians = known(model.jacobians(identity, landmark, const))
+        for part in (model.predict(identity, landmark, const), jacobians.state, jacobians.landmark):
+            assert np.isfinite(known(part)).all()
+        assert not model.visible(identity, landmark, const)
+    side = np.linalg.norm(point[:2]) / np.linalg.norm(point)
+    px = CameraPoint(PLAIN).predict(identity, point) - [319.5, 239.5]
+    assert np.linalg.norm(px) >= 0.99 * 400.0 * side / GRAZING
+
+
+def test_forward_leaves_what_is_in_front():
+    direction = np.random.default_rng(4).normal(size=(50, 3)) * [1.0, 1.0, 0.3] + [0.0, 0.0, 2.0]
+    np.testing.assert_array_equal(forward(direction), direction)
+    behind = forward(-direction)
+    np.testing.assert_array_equal(behind[:, :2], -direction[:, :2])
+    np.testing.assert_allclose(behind[:, 2], GRAZING * np.linalg.norm(direction, axis=1))
+
+
+def test_visible_keeps_a_margin():
+    model = CameraPoint(PLAIN, margin_px=10.0)
+    at = [PLAIN.unproject(np.array(px)) for px in ([8.0, 200.0], [12.0, 200.0], [320.0, 476.0])]
+    points = np.array([[*uv, 1.0] for uv in at])
+    assert model.visible(SE3.identity(), points).tolist() == [False, True, False]
+
+
+@every_camera
+@pytest.mark.parametrize("kind", [CameraRay, EpipolarRay])
+def test_a_ray_starts_through_its_first_sighting(camera, kind):
+    """In every particle's own frame, with the noise carried to (u, v) and the prior of q beside it."""
+    model, state = kind(camera, rho=(0.7, 0.3)), with_velocity(Rays.random(seed=5).state)
+    z = np.array([[100.0, 50.0], [400.0, 300.0]])
+    cov = np.array([[[1.0, 0.3], [0.3, 2.0]], [[0.5, 0.0], [0.0, 0.5]]])
+    records = model.initialise(state, z, cov)
+    assert records.mean.shape == (4, 2, 3)
+    np.testing.assert_array_equal(records.const, np.repeat(state[:, None, :7], 2, axis=1))
+    np.testing.assert_allclose(
+        CameraRay(camera).predict(state[:, None], records.mean, records.const), np.broadcast_to(z, (4, 2, 2))
+    )
+    np.testing.assert_array_equal(records.mean[..., 2], 0.7)
+    np.testing.assert_allclose(records.cov[..., 2, 2], 0.09)
+    np.testing.assert_array_equal(records.cov[..., 2, :2], 0.0)
+    by_landmark = known(
+        known(CameraRay(camera).jacobians(state[0], records.mean[0], records.const[0])).landmark
+    )
+    carried = by_landmark @ records.cov[0] @ np.swapaxes(by_landmark, -1, -2)
+    np.testing.assert_allclose(carried, cov, rtol=1e-8, atol=1e-9)
+
+
+def test_a_camera_without_a_twin_has_no_kernel():
+    assert CameraPoint(STEREO).kernel() is None
+    assert CameraPoint(PLAIN).kernel() is not None
+
+
+@pytest.mark.parametrize("rho", [(0.0, 0.5), (1.0, 0.0), (-1.0, 0.5), (np.nan, 0.5), (1.0, np.inf)])
+def test_bad_prior(rho):
+    with pytest.raises(InputError, match="prior of the inverse depth needs a positive mean and deviation"):
+        CameraRay(PLAIN, rho)
+
+
+@pytest.mark.parametrize("least_px", [0.0, -1.0, np.nan])
+def test_bad_threshold(least_px):
+    with pytest.raises(InputError, match="least_px must be positive"):
+        EpipolarRay(PLAIN, least_px=least_px)

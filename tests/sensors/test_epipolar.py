@@ -1,0 +1,206 @@
+"""The part of a ray's measurement that does not depend on its depth (E06 §5.2)."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rbpf.filter import Filter
+from rbpf.genealogy import Lineage
+from rbpf.lie import SE3
+from rbpf.likelihoods import Gaussian
+from rbpf.maps.inverse_depth import InverseDepth
+from rbpf.maps.landmark_map import LandmarkMap
+from rbpf.maps.point import Point
+from rbpf.models import Observations, Part, Records
+from rbpf.motion.odometry import Odometry, OdometryMotion
+from rbpf.numeric import linearise
+from rbpf.proposals import Prior, PriorProposal, Terms
+from rbpf.reference import information, innovation_covariance
+from rbpf.sensors.camera_points import CameraPoint, CameraRay, EpipolarRay
+from tests.exactness.models import Frame, Scripted, known
+from tests.sensors.camera_scenes import DISTORTED, PLAIN, Rays
+
+every_camera = pytest.mark.parametrize("camera", [PLAIN, DISTORTED], ids=["plain", "distorted"])
+R = np.diag([1.7, 1.7])
+
+
+def measured(rays: Rays, camera, seed: int = 1) -> np.ndarray:
+    """(K, 2) as the first particle sees the rays, with noise."""
+    px = CameraRay(camera).predict(rays.state[0], rays.mean[0], rays.const[0])
+    return px + np.random.default_rng(seed).normal(scale=3.0, size=px.shape)
+
+
+def covariances(rays: Rays, var_q: float) -> np.ndarray:
+    half = np.random.default_rng(2).normal(scale=2e-3, size=(*rays.mean.shape[:2], 2, 3))
+    cov = np.zeros((*rays.mean.shape[:2], 3, 3))
+    cov[..., :2, :2] = half @ np.swapaxes(half, -1, -2)
+    cov[..., 2, 2] = var_q
+    return cov
+
+
+def terms(model: CameraRay, rays: Rays, z: np.ndarray, var_q: float) -> Terms:
+    nu, jac = linearise(model, SE3, z, rays.state[:, None], rays.mean, rays.const)
+    cov = innovation_covariance(known(jac.landmark), covariances(rays, var_q), np.broadcast_to(R, (5, 2, 2)))
+    prior = Prior.exactly(SE3, rays.state)
+    return information(nu, known(jac.state), cov, Gaussian(), prior)
+
+
+@every_camera
+def test_depth_along_the_line_does_not_matter(camera):
+    """To first order in q, in every ray, while the full residual moves by pixels."""
+    rays = Rays.random(seed=3)
+    model, full, z = EpipolarRay(camera), CameraRay(camera), measured(rays, camera)
+    before = model.innovation(z, rays.state[:, None], rays.mean, rays.const)
+    by_rho = known(known(full.jacobians(rays.state[:, None], rays.mean, rays.const)).landmark)[..., 2]
+    assert (np.linalg.norm(by_rho, axis=-1) * model.rho[1] > model.least_px).all()
+    direction = by_rho / np.linalg.norm(by_rho, axis=-1, keepdims=True)
+    np.testing.assert_allclose((before * direction).sum(axis=-1), 0.0, atol=1e-10)
+    change, moved = {}, {}
+    for step in (1e-3, 1e-4):
+        nearer = rays.mean + np.array([0.0, 0.0, step])
+        after = full.innovation(z, rays.state[:, None], nearer, rays.const)
+        across = after - (after * direction).sum(axis=-1, keepdims=True) * direction
+        change[step] = np.abs(across - before).max()
+        moved[step] = np.abs(after - full.innovation(z, rays.state[:, None], rays.mean, rays.const)).max()
+    assert moved[1e-3] > 0.05
+    assert change[1e-3] < 0.02 * moved[1e-3]
+    assert change[1e-4] < 0.02 * change[1e-3] + 1e-11
+
+
+@every_camera
+def test_what_is_left_is_the_distance_from_the_line(camera):
+    """Its length is that of the residual's component across ∂h/∂q, and its Jacobians see no depth."""
+    rays = Rays.random(seed=4)
+    z, at = measured(rays, camera), (rays.state[:, None], rays.mean, rays.const)
+    full = known(CameraRay(camera).jacobians(*at))
+    along = known(full.landmark)[..., 2]
+    normal = np.stack([-along[..., 1], along[..., 0]], axis=-1) / np.linalg.norm(along, axis=-1)[..., None]
+    y = (normal * CameraRay(camera).innovation(z, *at)).sum(axis=-1)
+    found = EpipolarRay(camera).innovation(z, *at)
+    np.testing.assert_allclose(found, y[..., None] * normal, atol=1e-9)
+    projected = known(EpipolarRay(camera).jacobians(*at))
+    np.testing.assert_allclose(known(projected.landmark)[..., 2], 0.0, atol=1e-9)
+    row = (normal[..., None, :] @ known(full.state))[..., 0, :]
+    np.testing.assert_allclose(known(projected.state), normal[..., None] * row[..., None, :], atol=1e-8)
+
+
+@every_camera
+def test_limit_of_the_marginal_with_unknown_depth(camera):
+    """Λ and η tend to the epipolar constraint's as P_qq → ∞, with an error that falls as 1/P_qq."""
+    rays = Rays.random(seed=5)
+    z = measured(rays, camera)
+    limit = terms(EpipolarRay(camera), rays, z, 0.25)
+    scale_info, scale_vector = np.abs(limit.info).max(), np.abs(limit.vector).max()
+    errors = []
+    for var_q in (1.0, 1e2, 1e4):
+        marginal = terms(CameraRay(camera), rays, z, var_q)
+        by_info = np.abs(marginal.info - limit.info).max() / scale_info
+        errors.append([by_info, np.abs(marginal.vector - limit.vector).max() / scale_vector])
+    assert min(errors[0]) > 1e-5
+    np.testing.assert_allclose(errors[1], 1e-2 * np.array(errors[0]), rtol=0.05)
+    np.testing.assert_allclose(errors[2], 1e-4 * np.array(errors[0]), rtol=0.3)
+    again = terms(EpipolarRay(camera), rays, z, 1e6)
+    np.testing.assert_allclose(again.info, limit.info, rtol=1e-7, atol=1e-9 * scale_info)
+
+
+def test_quadratic_form_of_the_limit():
+    """νᵀS⁻¹ν: along the line nothing is added, so that weights compare particles rightly."""
+    rays = Rays.random(seed=6)
+    z = measured(rays, PLAIN)
+    one = terms(EpipolarRay(PLAIN), rays, z, 0.25)
+    limit, finite = (terms(CameraRay(PLAIN), rays, z, var_q) for var_q in (1e5, 0.1))
+    np.testing.assert_allclose(one.quad, limit.quad, rtol=1e-4)
+    assert np.abs(finite.quad - limit.quad).max() > 1.0
+
+
+def test_without_baseline_it_is_the_full_residual():
+    rays = Rays.random(seed=7, moved=0.0)
+    turned = replace(rays, const=np.repeat(rays.state[:, None], 5, axis=1))
+    z = measured(turned, PLAIN)
+    at = (SE3.retract(turned.state, 0.05 * np.eye(6)[1])[:, None], turned.mean, turned.const)
+    model, full = EpipolarRay(PLAIN), CameraRay(PLAIN)
+    np.testing.assert_allclose(model.innovation(z, *at), full.innovation(z, *at), rtol=1e-14)
+    for found, expected in zip(model.jacobians(*at)[:2], full.jacobians(*at)[:2], strict=True):
+        np.testing.assert_allclose(known(found), known(expected), rtol=1e-14)
+
+
+@pytest.mark.parametrize(("least_px", "has_line"), [(3.9, True), (4.1, False)])
+def test_threshold(least_px, has_line):
+    """0.02 m to the side, f = 400 px, σ_q = 0.5 /m: a change of 4 px."""
+    model = EpipolarRay(PLAIN, rho=(1.0, 0.5), least_px=least_px)
+    state = SE3.exp(np.array([0.0, 0.0, 0.0, 0.02, 0.0, 0.0]))
+    landmark = np.array([0.0, 0.0, 0.4])
+    z = CameraRay(PLAIN).predict(state, landmark, SE3.identity()) + np.array([2.0, 3.0])
+    found = model.innovation(z, state, landmark, SE3.identity())
+    np.testing.assert_allclose(found, [0.0 if has_line else 2.0, 3.0], atol=1e-9)
+
+
+def far_off(camera, model, compiled: bool) -> np.ndarray:
+    """Weights of three particles after a frame: one where the camera is, one that looks back, one at a point."""
+    points = SE3.transform(
+        SE3.identity(), np.array([[0.2, 0.1, 2.0], [-0.3, 0.2, 3.0], [0.1, -0.4, 2.5], [0, 0, 4.0]])
+    )
+    z = CameraPoint(camera).predict(SE3.identity(), points)
+    start = np.stack([SE3.identity(), SE3.exp(np.array([0.0, np.pi, 0.0, 0.0, 0.0, 0.0])), SE3.identity()])
+    start[2, 6] = 2.0
+    held = LandmarkMap(SE3, compiled=compiled)
+    filter_ = Filter(
+        OdometryMotion(SE3), Scripted(), held, PriorProposal(), n=3, rng=np.random.default_rng(0), start=start
+    )
+    if isinstance(model, CameraPoint):
+        mean, landmark = np.broadcast_to(points, (3, 4, 3)), Point(3)
+        records = Records(mean, np.broadcast_to(1e-4 * np.eye(3), (3, 4, 3, 3)))
+    else:
+        anchor = np.broadcast_to(SE3.exp(np.array([0.0, 0.0, 0.0, 0.1, 0.0, 0.0])), (3, 4, 7))
+        local = points - [0.1, 0.0, 0.0]
+        mean = np.concatenate([local[:, :2] / local[:, 2:], 1.0 / local[:, 2:]], axis=1)
+        mean[3, 2] = 0.0
+        cov = np.diag([1e-5, 1e-5, 1e-2])
+        records = Records(np.broadcast_to(mean, (3, 4, 3)), np.broadcast_to(cov, (3, 4, 3, 3)), anchor)
+        landmark = InverseDepth()
+    ids = held.add_records(records, landmark)
+    groups = [Observations(z, np.tile(np.eye(2), (4, 1, 1)), model, ids=ids)]
+    filter_.resampler.threshold = 0.0
+    filter_.step(Frame(groups), Odometry(SE3.identity(), 1e-12 * np.eye(6)))
+    records = held.read(ids)
+    assert np.isfinite(records.mean).all() and np.isfinite(records.cov).all()
+    return filter_.particles.weights
+
+
+@every_camera
+@pytest.mark.parametrize("compiled", [True, False], ids=["compiled", "numpy"])
+@pytest.mark.parametrize("kind", [CameraPoint, CameraRay, EpipolarRay])
+def test_a_particle_that_looks_elsewhere_loses_its_weight(kind, compiled, camera):
+    weights = far_off(camera, kind(camera), compiled)
+    little = 1e-4 if kind is EpipolarRay else 1e-12
+    assert weights[0] > 1.0 - little
+    assert 0.0 <= weights[1] < little and 0.0 <= weights[2] < little
+
+
+def test_only_the_state_learns_from_the_constraint():
+    """Handed to the filter as in §5.2: the epipolar part for the state, all of it for the depth."""
+    rays = Rays.random(n=6, seed=8)
+    z, cov = measured(rays, PLAIN), np.tile(R, (5, 1, 1))
+    records = Records(rays.mean, covariances(rays, 0.04), rays.const)
+    results = []
+    for parts in (("across",), ("depth",), ("across", "depth")):
+        held = LandmarkMap(SE3)
+        held.begin(6, Lineage(6))
+        ids = held.add_records(records, InverseDepth())
+        groups = {
+            "across": Observations(z, cov, EpipolarRay(PLAIN), ids=ids, informs=frozenset({Part.STATE})),
+            "depth": Observations(z, cov, CameraRay(PLAIN), ids=ids, informs=frozenset({Part.LANDMARK})),
+        }
+        chosen = [groups[name] for name in parts]
+        prior = Prior.exactly(SE3, rays.state)
+        found = held.terms(rays.state, chosen, prior)
+        density = held.correct(rays.state, np.zeros((6, 6)), chosen).all
+        results.append((found.info, density, held.read(ids).mean))
+    (info, density, untouched), (nothing, none, depth), both = results
+    np.testing.assert_array_equal(untouched, records.mean)
+    np.testing.assert_array_equal(nothing, 0.0)
+    np.testing.assert_array_equal(none, 0.0)
+    assert np.ptp(density) > 0.1 and np.abs(depth - records.mean).max() > 1e-3
+    for one, other in zip(both, (info, density, depth), strict=True):
+        np.testing.assert_array_equal(one, other)

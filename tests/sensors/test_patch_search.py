@@ -1,0 +1,262 @@
+"""The search of patches against plain NumPy, and what it does at its limits."""
+
+import numpy as np
+import pytest
+
+from rbpf.errors import InputError
+from rbpf.sensors.patch_correlation_kernels import normalised, score_ellipse
+from rbpf.sensors.patch_kernels import APART_PX, OUTSIDE, interval
+from rbpf.sensors.patches import search
+from tests.sensors.patch_scenes import Waves, inside_ellipse, interpolated, score_map, unit, window
+
+SHAPE = (90, 110)
+ROUND = 9.0 * np.eye(2)
+
+
+@pytest.fixture(scope="module")
+def image():
+    return Waves(1).image(SHAPE)
+
+
+def one(image, template, centre, cov=ROUND, **options):
+    """The match of a single template."""
+    matches = search(
+        image, np.asarray(template)[None], np.array([centre], float), np.array([cov], float), **options
+    )
+    return matches.px[0], matches.score[0], matches.second[0], matches.cov[0]
+
+
+def kernel_map(image, template, centre, cov, sigmas, most_px):
+    """(H, W) scores of the kernel."""
+    size, scores = template.shape[0], np.full(image.shape, float(OUTSIDE))
+    centre, cov = np.array(centre, float), np.array(cov, float)
+    columns, rows = interval(centre, cov, (sigmas, most_px, 0.0), image.shape, size)
+    part = np.full((max(rows[1] - rows[0] + 1, 0), max(columns[1] - columns[0] + 1, 0)), OUTSIDE)
+    if part.size:
+        units = normalised(template.astype(np.float32), 0.0)
+        score_ellipse(image, units, size, centre, cov, sigmas, columns, rows, part)
+        scores[rows[0] : rows[1] + 1, columns[0] : columns[1] + 1] = part
+    return scores
+
+
+@pytest.mark.parametrize("size", [3, 5, 11, 13, 21])
+@pytest.mark.parametrize(
+    ("centre", "cov", "sigmas", "most_px"),
+    [
+        ((50.3, 40.8), [[9.0, 4.0], [4.0, 5.0]], 3.0, 40.0),
+        ((50.5, 40.5), [[0.0, 0.0], [0.0, 0.0]], 3.0, 40.0),
+        ((50.5, 40.5), [[16.0, 0.0], [0.0, 0.0]], 2.0, 40.0),
+        ((50.2, 40.1), [[25.0, 20.0], [20.0, 16.0]], 1.5, 40.0),
+        ((2.0, 3.0), [[9.0, -4.0], [-4.0, 5.0]], 3.0, 40.0),
+        ((-4.0, 95.0), [[25.0, 0.0], [0.0, 25.0]], 3.0, 40.0),
+        ((55.0, 45.0), [[400.0, 0.0], [0.0, 400.0]], 3.0, 7.5),
+        ((55.0, 45.0), [[1e8, 0.0], [0.0, 1e8]], 3.0, np.inf),
+    ],
+)
+def test_scores_of_an_ellipse_equal_numpys(image, size, centre, cov, sigmas, most_px):
+    template = window(image, (54, 47), size)
+    tried = inside_ellipse(image.shape, centre, cov, sigmas, most_px, size)
+    assert tried.any() or centre[0] < 5
+    expected = score_map(image, template, tried)
+    np.testing.assert_allclose(kernel_map(image, template, centre, cov, sigmas, most_px), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("low_high", [(0, 255), (0, 1), (254, 255)])
+def test_scores_of_extreme_grey_levels_equal_numpys(low_high):
+    image = np.random.default_rng(0).choice(np.array(low_high, np.uint8), SHAPE)
+    image[30:60, 30:60] = low_high[1]
+    template = window(image, (70, 50), 11)
+    tried = inside_ellipse(SHAPE, (55.0, 45.0), 1e6 * np.eye(2), 3.0, np.inf, 11)
+    expected = score_map(image, template, tried)
+    assert (expected == -1.0).sum() == 20 * 20
+    found = kernel_map(image, template, (55.0, 45.0), 1e6 * np.eye(2), 3.0, np.inf)
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+def test_place_is_the_maximum_between_pixels(image):
+    """No place a little aside correlates better with the window that NumPy interpolates."""
+    template = interpolated(Waves(1).image(SHAPE, shift=(0.37, -0.21)), (60, 45), 11)
+    px, score, _, _ = one(image, template, (61.0, 44.0))
+
+    def rho(place):
+        return (unit(interpolated(image, place, 11)) * unit(template)).sum()
+
+    assert score == pytest.approx(rho(px), abs=1e-4)
+    for aside in ((0.05, 0.0), (-0.05, 0.0), (0.0, 0.05), (0.0, -0.05)):
+        assert rho(px + aside) < rho(px)
+
+
+def test_covariance_is_the_residual_over_the_slopes(image):
+    noisy = Waves(1).image(SHAPE, noise=5.0, rng=np.random.default_rng(2))
+    template = window(noisy, (60, 45), 11)
+    px, score, _, cov = one(image, template, (60.0, 45.0))
+    around = interpolated(image, px, 13)
+    w = unit(around[1:-1, 1:-1])
+    norm = np.linalg.norm(around[1:-1, 1:-1] - around[1:-1, 1:-1].mean())
+    slopes = [(around[1:-1, 2:] - around[1:-1, :-2]) / 2, (around[2:, 1:-1] - around[:-2, 1:-1]) / 2]
+    jac = np.stack([(s - s.mean() - ((s - s.mean()) * w).sum() * w).ravel() / norm for s in slopes], axis=1)
+    residual = 1.0 - score**2
+    expected = residual / (121 - 4) * np.linalg.inv(
+        jac.T @ jac - 0.25 * residual * np.eye(2)
+    ) + 0.02**2 * np.eye(2)
+    np.testing.assert_allclose(cov, expected, rtol=0.02, atol=1e-6)
+
+
+def test_second_is_the_next_peak():
+    image = Waves(3).image(SHAPE)
+    image[60:81, 60:81] = image[20:41, 20:41]
+    template = window(image, (30, 30), 11)
+    px, score, second, _ = one(image, template, (50.0, 50.0), 400.0 * np.eye(2))
+    np.testing.assert_allclose(px, (30, 30), atol=1e-3)
+    assert score == pytest.approx(1.0, abs=1e-6) and second == pytest.approx(1.0, abs=1e-6)
+    _, _, alone, _ = one(image, template, (30.0, 30.0), ROUND)
+    tried = inside_ellipse(SHAPE, (30.0, 30.0), ROUND, 3.0, 40.0, 11)
+    expected = score_map(image, template, tried)
+    peaks = [expected[v, u] for v, u in np.argwhere(tried) if is_peak(expected, v, u, (30, 30))]
+    assert max(peaks) - 1e-5 <= alone < max(peaks) + 0.1
+
+
+def is_peak(scores, v, u, best):
+    apart = max(abs(u - best[0]), abs(v - best[1])) >= APART_PX
+    return apart and scores[v, u] == scores[v - 1 : v + 2, u - 1 : u + 2].max()
+
+
+def test_of_equal_scores_the_first_row_wins():
+    tile = Waves(3).image((30, 30))
+    image = np.tile(tile, (3, 3))
+    px, _, second, _ = one(image, window(image, (45, 45), 11), (45.0, 45.0), 1e6 * np.eye(2), most_px=np.inf)
+    np.testing.assert_allclose(px, (15, 15), atol=1e-3)
+    assert second == pytest.approx(1.0, abs=1e-6)
+
+
+def test_brightness_and_contrast_do_not_matter():
+    waves = Waves(4, contrast=25.0)
+    template = window(waves.image(SHAPE), (50, 40), 11)
+    for mean, gain in ((128.0, 1.0), (70.0, 0.5), (180.0, 1.6)):
+        px, score, _, _ = one(
+            waves.image(SHAPE, shift=(0.3, 0.4), mean=mean, gain=gain), template, (50.0, 40.0)
+        )
+        np.testing.assert_allclose(px, (49.7, 39.6), atol=0.05)
+        assert score > 0.97
+    image = waves.image(SHAPE)
+    same = one(image, 0.1 * template + 300.0, (50.0, 40.0), least_std=0.0)
+    np.testing.assert_allclose(same[0], (50.0, 40.0), atol=1e-3)
+
+
+def test_a_template_without_contrast_is_not_searched(image):
+    faint = 100.0 + 2.0 * unit(window(image, (50, 40), 11)) * 11.0
+    for template in (np.full((11, 11), 80.0), faint, np.full((11, 11), np.nan), np.full((11, 11), np.inf)):
+        assert_nothing(one(image, template, (50.0, 40.0), least_std=2.1))
+    assert one(image, faint, (50.0, 40.0), least_std=1.9)[1] > 0.99
+
+
+def test_nothing_is_found_in_a_flat_image(image):
+    assert_nothing(one(np.full(SHAPE, 255, np.uint8), window(image, (50, 40), 11), (50.0, 40.0)))
+
+
+@pytest.mark.parametrize(
+    ("centre", "cov"),
+    [
+        ((np.nan, 40.0), ROUND),
+        ((50.0, np.inf), ROUND),
+        ((1e300, 40.0), ROUND),
+        ((50.0, -30.0), ROUND),
+        ((50.0, 40.0), [[np.nan, 0.0], [0.0, 1.0]]),
+        ((50.0, 40.0), [[1.0, np.nan], [np.nan, 1.0]]),
+        ((50.0, 40.0), [[np.inf, 0.0], [0.0, 1.0]]),
+        ((50.0, 40.0), [[-1.0, 0.0], [0.0, 1.0]]),
+        ((50.0, 40.0), [[4.0, 9.0], [9.0, 4.0]]),
+    ],
+)
+def test_nothing_is_found_without_a_place_to_look(image, centre, cov):
+    assert_nothing(one(image, window(image, (50, 40), 11), centre, cov))
+
+
+@pytest.mark.parametrize("variance", [1e6, 1e100, 1e300])
+def test_a_huge_covariance_searches_the_whole_image(image, variance):
+    px, score, _, _ = one(
+        image, window(image, (8, 80), 11), (90.0, 10.0), variance * np.eye(2), most_px=np.inf
+    )
+    np.testing.assert_allclose(px, (8, 80), atol=1e-3)
+    assert score > 0.9999
+
+
+def test_the_nearest_pixel_is_tried_without_uncertainty(image):
+    template = window(image, (50, 40), 11)
+    px, score, second, _ = one(image, template, (50.4, 39.6), np.zeros((2, 2)))
+    np.testing.assert_allclose(px, (50, 40), atol=1e-3)
+    assert score > 0.9999 and second == -1.0
+
+
+@pytest.mark.parametrize("px", [(5, 5), (104, 5), (5, 84), (104, 84)])
+def test_the_outermost_place_is_found(px):
+    waves, shift = Waves(6), np.array([0.3, -0.2])
+    template = interpolated(waves.image((150, 170)), np.array(px) + 30 + shift, 11)
+    found, score, _, _ = one(waves.image((150, 170))[30:120, 30:140], template, px)
+    np.testing.assert_allclose(found, px + shift, atol=0.15)
+    assert score > 0.97
+
+
+def test_a_place_on_a_slope_has_no_covariance():
+    """The best score lies at the edge of the ellipse and rises beyond it."""
+    image = Waves(1, blur_px=2.0).image(SHAPE)
+    px, score, _, cov = one(image, window(image, (50, 40), 11), (47.0, 40.0), np.zeros((2, 2)))
+    assert 0.0 < score < 0.95 and np.isnan(cov).all()
+    assert np.array_equal(px, np.rint(px)) and abs(px[0] - 47.0) <= 1.0
+
+
+def test_many_at_once_equal_one_by_one(image):
+    rng = np.random.default_rng(5)
+    places = rng.integers(12, 78, (40, 2))
+    templates = np.stack([window(image, place, 11) for place in places]).astype(np.float32)
+    centres, covs = places + rng.normal(size=(40, 2)), np.tile(ROUND, (40, 1, 1))
+    together = search(image, templates, centres, covs)
+    for k in range(40):
+        single = one(image, templates[k], centres[k])
+        expected = (together.px[k], together.score[k], together.second[k], together.cov[k])
+        assert all(np.array_equal(a, b, equal_nan=True) for a, b in zip(single, expected, strict=True))
+
+
+def test_a_view_of_an_image_and_none_to_look_for(image):
+    wide = np.repeat(image, 2, axis=1)
+    template = window(image, (50, 40), 11)
+    assert np.array_equal(one(wide[:, ::2], template, (50.0, 40.0))[0], one(image, template, (50.0, 40.0))[0])
+    nothing = search(image, np.zeros((0, 11, 11)), np.zeros((0, 2)), np.zeros((0, 2, 2)))
+    assert nothing.px.shape == (0, 2) and nothing.cov.shape == (0, 2, 2) and nothing.ratio.shape == (0,)
+
+
+def test_ratio(image):
+    templates = np.stack([window(image, (50, 40), 11), np.zeros((11, 11))])
+    matches = search(image, templates, np.full((2, 2), 45.0), np.tile(ROUND, (2, 1, 1)))
+    np.testing.assert_allclose(matches.ratio, [max(matches.second[0], 0.0) / matches.score[0], 1.0])
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"image": np.zeros(SHAPE)}, "must be grey"),
+        ({"image": np.zeros((*SHAPE, 3), np.uint8)}, "must be grey"),
+        ({"image": None}, "must be grey"),
+        ({"templates": np.zeros((1, 10, 10))}, "odd size"),
+        ({"templates": np.zeros((1, 103, 103))}, "odd size"),
+        ({"templates": np.zeros((11, 11))}, "templates must be"),
+        ({"centres": np.zeros((2, 2))}, "one for each template"),
+        ({"covs": np.zeros((1, 2))}, "one for each template"),
+        ({"sigmas": 0.0}, "sigmas must be positive"),
+        ({"most_px": np.nan}, "most_px not negative"),
+    ],
+)
+def test_wrong_arguments(image, change, sentence):
+    arguments = {
+        "image": image,
+        "templates": np.zeros((1, 11, 11)),
+        "centres": np.zeros((1, 2)),
+        "covs": np.zeros((1, 2, 2)),
+    }
+    with pytest.raises(InputError, match=sentence):
+        search(**arguments | change)
+
+
+def assert_nothing(match):
+    px, score, second, cov = match
+    assert np.isnan(px).all() and np.isnan(cov).all() and score == -1.0 and second == -1.0

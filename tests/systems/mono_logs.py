@@ -1,0 +1,48 @@
+"""Small simulated recordings of one camera, and parts of them."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from rbpf.lie import SE3
+from rbpf.sensors.features import FeatureFrame, FeatureLog
+from rbpf.systems.mono.config import MonoConfig
+from rbpf.systems.mono.run import MonoRun
+from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
+from rbpf.validation.simulation.point_worlds import DeskWorld
+
+SMALL = MonoConfig(particles=20)
+
+
+def desk(seed: int = 0, frames: int = 8, measurements: int = 12, **options: float) -> FeatureLog:
+    """A hand-held camera over a desk, ten images a second."""
+    world = DeskWorld(frames=frames, rate_hz=10.0, points=60, blocks=0, start_s=0.1)
+    measuring = Measuring(measurements=measurements, new_per_frame=2, **options)
+    return simulate_features(world, measuring, MONO, seed)
+
+
+def without_known(log: FeatureLog) -> FeatureLog:
+    return replace(log, known=None)
+
+
+def changed(log: FeatureLog, frame: int, change: Callable[[FeatureFrame], FeatureFrame]) -> FeatureLog:
+    frames = [change(f) if t == frame else f for t, f in enumerate(log.frames)]
+    return replace(log, frames=frames)
+
+
+def rows(frame: FeatureFrame, keep: np.ndarray) -> FeatureFrame:
+    """Some of a frame's measurements."""
+    return replace(frame, landmarks=frame.landmarks[keep], z=frame.z[keep], cov_z=frame.cov_z[keep])
+
+
+def errors(run: MonoRun) -> np.ndarray:
+    """(T, 6) of the online estimates in the charts at them."""
+    assert run.log.truth is not None
+    return SE3.local(run.world_from_camera, run.log.truth.world_from_camera)
+
+
+def nees(run: MonoRun) -> np.ndarray:
+    """(T,) normalised squared errors."""
+    pairs = zip(errors(run), run.cov, strict=True)
+    return np.array([error @ np.linalg.solve(cov, error) for error, cov in pairs])

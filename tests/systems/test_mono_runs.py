@@ -1,0 +1,237 @@
+"""Monocular runs on small recordings: what a frame may hold, equal bytes, compiled and plain, rays and points."""
+
+import hashlib
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rbpf.filter import Filter
+from rbpf.maps.inverse_depth import InverseDepth
+from rbpf.maps.point import Point
+from rbpf.models import Part
+from rbpf.sensors.camera_points import CameraRay, EpipolarRay
+from rbpf.systems.mono.config import MonoConfig, RayConfig, VelocityConfig
+from rbpf.systems.mono.run import MonoRun, run
+from rbpf.systems.mono.system import build_filter, start_law
+from tests.core.worlds import content, same
+from tests.exactness.models import known
+from tests.systems.mono_logs import SMALL, changed, desk, errors, nees, rows, without_known
+
+ROOT = Path(__file__).resolve().parents[2]
+LOG = desk(2, frames=10)
+every_mode = pytest.mark.parametrize("mode", ["frame", "points"])
+every_constraint = pytest.mark.parametrize("constrain", ["epipolar", "marginal", "off"])
+SETTINGS = [
+    SMALL,
+    replace(SMALL, known="points"),
+    replace(SMALL, velocity=VelocityConfig("joint"), ray=RayConfig("epipolar")),
+    replace(SMALL, velocity=VelocityConfig("paper"), ray=RayConfig("off")),
+]
+every_setting = pytest.mark.parametrize("config", SETTINGS, ids=["default", "points", "joint", "paper"])
+
+
+def kinds(filter_: Filter) -> dict[int, type]:
+    """Parametrisation of each landmark, by its name."""
+    held = filter_.belief().map
+    return {held.catalogue[i]: type(held.landmark_of(i)) for i in held.ids.tolist()}
+
+
+@every_setting
+def test_compiled_equals_numpy(config):
+    log = replace(LOG, frames=LOG.frames[:6])
+    one, other = (run(log, replace(config, compiled=compiled)) for compiled in (True, False))
+    np.testing.assert_allclose(one.log_evidence, other.log_evidence, atol=1e-5)
+    np.testing.assert_allclose(one.world_from_camera, other.world_from_camera, atol=1e-7)
+    np.testing.assert_allclose(one.filter.particles.state, other.filter.particles.state, atol=1e-6)
+    np.testing.assert_array_equal(one.resampled, other.resampled)
+    assert kinds(one.filter) == kinds(other.filter)
+
+
+@every_setting
+def test_equal_seeds_give_equal_bytes(config):
+    first, second, other = (run(LOG, replace(config, seed=seed)) for seed in (1, 1, 2))
+    assert same(content(first.filter), content(second.filter))
+    assert not same(content(first.filter), content(other.filter))
+
+
+THREADS = """
+import hashlib
+import numba
+from dataclasses import replace
+from rbpf.kernels.threads import PAIRS_PER_THREAD
+from rbpf.systems.mono.run import run
+from tests.core.worlds import content
+from tests.systems.mono_logs import SMALL, desk
+
+numba.set_num_threads({threads})
+log = desk(2, frames=4, measurements=20)
+rows = []
+config = replace(SMALL, particles=1500, known="points")
+done = run(log, config, lambda t, filter_, report: rows.append(max(len(g.z) for g in report.groups)))
+digest = hashlib.sha256()
+for name, array in sorted(content(done.filter).items()):
+    digest.update(name.encode() + array.tobytes())
+print(max(rows) * 1500 >= 2 * PAIRS_PER_THREAD, digest.hexdigest())
+"""
+
+
+@pytest.mark.slow
+def test_threads_do_not_change_a_byte():
+    environment = {**os.environ, "NUMBA_NUM_THREADS": "2", "PYTHONPATH": str(ROOT)}
+    outputs = []
+    for threads in (1, 2):
+        command = [sys.executable, "-c", THREADS.format(threads=threads)]
+        done = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        outputs.append(done.stdout.split())
+    assert outputs[0] == outputs[1]
+    assert outputs[0][0] == "True" and len(outputs[0][1]) == 2 * hashlib.sha256().digest_size
+
+
+@every_mode
+def test_rays_become_points(mode):
+    """All at once in all particles, when enough of the weight is ready; none in a first frame."""
+    log, seen = desk(1, frames=25), []
+    done = run(log, replace(SMALL, known=mode), lambda t, filter_, report: seen.append(kinds(filter_)))
+    given = set(known(log.known).names.tolist())
+    assert not any(kind is Point for name, kind in seen[0].items() if name not in given)
+    promoted = [name for name, kind in seen[-1].items() if kind is Point and name not in given]
+    assert len(promoted) >= 3
+    for name in promoted:
+        of = [kinds_[name] for kinds_ in seen if name in kinds_]
+        turn = of.index(Point)
+        assert turn > 0 and set(of[:turn]) == {InverseDepth} and set(of[turn:]) == {Point}
+    assert InverseDepth in seen[-1].values()
+    assert np.abs(errors(done)[-1]).max() < 0.2
+
+
+def groups_of(constrain, log=LOG) -> list[set[tuple[type, frozenset[Part]]]]:
+    """Models of rays in each frame, with what they inform."""
+    found = []
+
+    def record(t, filter_, report):
+        found.append({(type(g.model), g.informs) for g in report.groups if isinstance(g.model, CameraRay)})
+
+    run(log, replace(SMALL, ray=RayConfig(constrain)), record)
+    return found
+
+
+def test_how_rays_are_used():
+    """E06 §5.1: without parallax a measurement of a ray says nothing about its depth."""
+    state, landmark = frozenset({Part.STATE}), frozenset({Part.LANDMARK})
+    epipolar, marginal, off = (groups_of(constrain) for constrain in ("epipolar", "marginal", "off"))
+    assert set().union(*epipolar) == {(EpipolarRay, state), (CameraRay, landmark)}
+    assert set().union(*marginal) == {(CameraRay, state), (CameraRay, state | landmark)}
+    assert set().union(*off) == {(CameraRay, landmark)}
+    assert marginal[1] == {(CameraRay, state)} and epipolar[1] == {(EpipolarRay, state)} and off[1] == set()
+
+
+@every_constraint
+def test_a_camera_at_rest_learns_no_depth(constrain):
+    """The same image again and again."""
+    frames = [replace(LOG.frames[0], stamp_ns=LOG.frames[0].stamp_ns + t * 10**8) for t in range(8)]
+    still = VelocityConfig(walk_rad_s=1e-3, walk_m_s=1e-3, start_rad_s=1e-3, start_m_s=1e-3)
+    config = replace(SMALL, ray=RayConfig(constrain), velocity=still)
+    done = run(replace(LOG, frames=frames, truth=None), config)
+    held = done.filter.belief().map
+    rays = [i for i in held.ids.tolist() if isinstance(held.landmark_of(i), InverseDepth)]
+    assert len(rays) == len(LOG.frames[0].landmarks) - 4
+    np.testing.assert_array_equal(held.read(np.array(rays)).cov[..., 2, 2], RayConfig().std_rho_per_m ** 2)
+
+
+@every_setting
+def test_two_frames_at_the_same_time(config):
+    """No time, no motion: the second frame is a second look from one place."""
+    again = replace(LOG.frames[3], stamp_ns=LOG.frames[2].stamp_ns)
+    log = replace(LOG, frames=[*LOG.frames[:3], again, *LOG.frames[4:6]], truth=None)
+    states = []
+    done = run(log, config, lambda t, filter_, report: states.append(filter_.particles.state.copy()))
+    assert np.isfinite(done.log_evidence).all() and np.isfinite(done.cov).all()
+    before = {state.tobytes() for state in np.round(states[2], 9) + 0.0}
+    assert {state.tobytes() for state in np.round(states[3], 9) + 0.0} <= before
+
+
+@every_setting
+def test_an_empty_frame(config):
+    """Nothing is seen: the camera goes on and grows uncertain; afterwards it is found again."""
+    nothing = np.zeros(0, dtype=np.int64)
+    done = run(changed(LOG, 5, lambda f: rows(f, nothing)), config)
+    volume = np.linalg.det(done.cov)
+    assert volume[5] > 10.0 * volume[4] and volume[6] < 0.1 * volume[5]
+    assert done.rows[5] == 0 and done.log_evidence[5] == pytest.approx(0.0, abs=1e-9)
+    assert np.abs(errors(done)[-1]).max() < 0.1
+
+
+def test_an_empty_first_frame_without_known_points():
+    nothing = np.zeros(0, dtype=np.int64)
+    log = changed(without_known(LOG), 0, lambda f: rows(f, nothing))
+    done = run(replace(log, frames=log.frames[:3]), SMALL)
+    assert np.isfinite(done.cov).all()
+    assert len(done.filter.belief().map.ids) > 0
+
+
+@every_mode
+def test_a_measurement_outside_the_image_is_ignored(mode):
+    """Of a known point, of a ray and of a new landmark: as if they had not been there."""
+    config, outside = replace(SMALL, known=mode), np.array([700.0, -50.0])
+    given = known(LOG.known).names
+    frame = LOG.frames[4]
+    before = {name for f in LOG.frames[:4] for name in f.landmarks.tolist()}
+    ray = next(name for name in frame.landmarks.tolist() if name in before and name not in given)
+    of_known = next(name for name in frame.landmarks.tolist() if name in given)
+    there = ~np.isin(frame.landmarks, [ray, of_known])
+
+    def beside(f):
+        z = f.z.copy()
+        z[~there] = outside
+        extra = replace(rows(f, np.array([0])), landmarks=np.array([10**6]), z=outside[None])
+        parts = zip(("landmarks", "z", "cov_z"), (f.landmarks, z, f.cov_z), strict=True)
+        joined = {name: np.concatenate([part, getattr(extra, name)]) for name, part in parts}
+        return replace(f, **joined)
+
+    done, expected = (run(changed(LOG, 4, change), config) for change in (beside, lambda f: rows(f, there)))
+    assert same(content(done.filter), content(expected.filter))
+    np.testing.assert_array_equal(done.world_from_camera, expected.world_from_camera)
+    untouched = run(LOG, config)
+    assert not np.array_equal(done.world_from_camera[4], untouched.world_from_camera[4])
+
+
+@every_mode
+def test_a_checkpoint_goes_on_with_the_same_bytes(mode, tmp_path):
+    config = replace(SMALL, known=mode)
+    whole = run(LOG, config)
+    first, second = build_filter(LOG, config), build_filter(LOG, config)
+    for t, frame in enumerate(LOG.frames[:5]):
+        first.step(frame, start_law(LOG, config) if t == 0 else None, frame.stamp_ns)
+    first.save(tmp_path / "checkpoint.npz")
+    second.load(tmp_path / "checkpoint.npz")
+    for frame in LOG.frames[5:]:
+        second.step(frame, None, frame.stamp_ns)
+    np.testing.assert_array_equal(second.particles.state, whole.filter.particles.state)
+    assert second.log_evidence == whole.filter.log_evidence
+    assert kinds(second) == kinds(whole.filter)
+
+
+def scores(known_as: str, seeds: range) -> np.ndarray:
+    """NEES (runs, frames)."""
+
+    def one(seed: int) -> MonoRun:
+        config = MonoConfig(particles=30, seed=seed, known=known_as)
+        return run(desk(100 + seed, frames=12), config)
+
+    return np.array([nees(one(seed)) for seed in seeds])
+
+
+def test_the_stated_uncertainty():
+    """Mean NEES, 6 if consistent: near it as a frame; separate landmarks lose what the frame keeps together."""
+    frame, points = (scores(mode, range(24)) for mode in ("frame", "points"))
+    std = np.sqrt(2.0 * 6.0 / 24)
+    late = slice(6, 12)
+    assert abs(frame[:, 0].mean() - 6.0) < 4.0 * std and abs(points[:, 0].mean() - 6.0) < 4.0 * std
+    assert abs(frame[:, late].mean() - 6.0) < 4.0 * std
+    assert points[:, late].mean() > 6.0 + 4.0 * std
