@@ -27,10 +27,12 @@ class PoseLaw:
     Attributes:
         mean: (7,) world_from_body.
         cov: (6, 6) in the right chart at the mean, order [ω, v].
+        std_velocity: (6,) of its velocity about zero, rad/s, m/s; None where the velocity goes on as it was.
     """
 
     mean: np.ndarray
     cov: np.ndarray
+    std_velocity: np.ndarray | None = None
 
 
 def velocity_walk(std_walk: np.ndarray, dt: float) -> np.ndarray:
@@ -68,10 +70,12 @@ class MarginalVelocity(MotionModel):
     def transition(self, state: np.ndarray, control: PoseLaw | None, dt: float) -> Transition:
         """Chart at the previous pose: ε = δ v + w₁."""
         coupling, factor = dt * np.eye(6)[None], velocity_walk(self.std_walk, dt)
+        keeps = np.eye(6)[None]
         if control is not None:
             state, factor = _placed(state, control), _with_law(factor, control)
             coupling = np.zeros((1, 6, 6))
-        return Transition(state, factor[None], coupling, np.eye(6)[None], np.zeros((1, 6)))
+            keeps = keeps if control.std_velocity is None else np.zeros((1, 6, 6))
+        return Transition(state, factor[None], coupling, keeps, np.zeros((1, 6)))
 
 
 @final
@@ -101,9 +105,11 @@ class SampledVelocity(MotionModel):
         """Chart at (T Exp(δv), v): T Exp(δv + w₁) = T Exp(δv) Exp(J_r(δv) w₁) to first order."""
         placed, velocity = state[:, :7], state[:, 7:]
         if control is not None:
-            mean = np.concatenate([_placed(placed, control), velocity], axis=1)
+            stopped = control.std_velocity is not None
+            mean = np.concatenate([_placed(placed, control), 0.0 * velocity if stopped else velocity], axis=1)
             factor = _with_law(np.zeros((12, 12)), control)
-            factor[6:, 6:] = np.diag(self.std_start)
+            if not stopped:
+                factor[6:, 6:] = np.diag(self.std_start)
             return Transition(mean, factor[None])
         step = dt * velocity
         factor = np.repeat(velocity_walk(self.std_walk, dt)[None, :, : self.columns], state.shape[0], axis=0)
@@ -121,9 +127,10 @@ def _placed(state: np.ndarray, law: PoseLaw) -> np.ndarray:
 
 def _with_law(factor: np.ndarray, law: PoseLaw) -> np.ndarray:
     """The pose's noise is the law's, independent of the velocity's."""
+    walk = np.linalg.norm(factor[6:], axis=1)
     placed = np.zeros((12, 12))
     placed[:6, :6] = gaussian.psd_factor(law.cov)
-    placed[6:, 6:] = np.diag(np.linalg.norm(factor[6:], axis=1))
+    placed[6:, 6:] = np.diag(walk if law.std_velocity is None else _checked(law.std_velocity))
     return placed
 
 

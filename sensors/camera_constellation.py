@@ -81,6 +81,11 @@ class ConstellationView(ObservationModel):
         frame = SE3.retract(const, landmark[..., :6])
         return SE3.transform(frame[..., None, :], self._in_group(landmark))
 
+    def in_camera(self, state: np.ndarray, landmark: np.ndarray, const: np.ndarray | None) -> np.ndarray:
+        """The points (…, m, 3) in the camera's frame."""
+        assert const is not None
+        return self._chain(state, landmark, const)[2]
+
     def kernel(self) -> FusedKernel | None:
         """Compiled."""
         from rbpf.sensors.constellation_kernel import constellation_view

@@ -81,7 +81,7 @@ def levels(part, padding):
 
     Their mean is taken off: a template without mean does not feel it, and rounding comes down.
     """
-    total = 0
+    total = np.int64(0)
     for y in range(part.shape[0]):
         for x in range(part.shape[1]):
             total += np.int64(part[y, x])

@@ -4,10 +4,9 @@
     known points:  l ~ N(m, P), exact ones a hard constraint
     undetermined:  l ~ N(start, (d/4)² I) with d its distance, far wider than the pixels are across it
     velocity:      E06 (4)–(5); frames of one time then share one pose and one velocity
-    gauge:         without known points the first pose is held where it started, and for a single camera the distance
-                   from it to the camera farthest from it at the start
+    gauge:         without known points the first pose is held where it started; for one camera, a distance too
 
-The gauge only says which of many equal solutions is meant: it costs nothing at the optimum.
+The distance is that from the first camera to the one farthest from it at the start. The gauge only says which of many equal solutions is meant: it costs nothing at the optimum.
 """
 
 from dataclasses import dataclass

@@ -51,14 +51,12 @@ def summarise_map(filter_: Filter, anchored: Anchored | None = None) -> MapSumma
         records = landmark_map.read(np.array([landmark_id]))
         points, within = records.mean[:, 0], records.cov[:, 0]
         if anchored is not None:
-            points, within = _relative(filter_.space, anchored, records)
+            points, within = relative_points(filter_.space, anchored, records)
         own = weights * held / share
-        mean = (own[:, None] * points).sum(axis=0)
-        spread = points - mean
-        cov = (own[:, None, None] * (within + spread[:, :, None] * spread[:, None, :])).sum(axis=0)
+        mean, cov = mixture_moments(own, points, within)
         names.append(landmark_map.catalogue.get(int(landmark_id), int(landmark_id)))
         means.append(mean)
-        covs.append(gaussian.symmetrise(cov))
+        covs.append(cov)
     dim = landmark_map.layouts[0].landmark.dim
     return MapSummary(
         np.array(names, dtype=np.int64),
@@ -67,7 +65,17 @@ def summarise_map(filter_: Filter, anchored: Anchored | None = None) -> MapSumma
     )
 
 
-def _relative(space: Any, anchored: Anchored, records: Records) -> tuple[np.ndarray, np.ndarray]:
+def mixture_moments(
+    weights: np.ndarray, points: np.ndarray, within: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean (D,) and covariance (D, D) of Gaussians (N, D), (N, D, D) of weights (N,): within + between."""
+    mean = (weights[:, None] * points).sum(axis=0)
+    spread = points - mean
+    between = spread[:, :, None] * spread[:, None, :]
+    return mean, gaussian.symmetrise((weights[:, None, None] * (within + between)).sum(axis=0))
+
+
+def relative_points(space: Any, anchored: Anchored, records: Records) -> tuple[np.ndarray, np.ndarray]:
     """Landmark positions (N, D) relative to the start, and their covariance with the start's."""
     model = RelativePosition(space)
     start = anchored.mean[:, None]

@@ -8,17 +8,9 @@ import numpy as np
 
 from rbpf.systems.range_bearing.run import Run
 from rbpf.validation.alignment import align
+from rbpf.validation.figures import COLOURS, SIGMAS, new_axes, outline, save_figures
 from rbpf.validation.map_summary import MapSummary
 from rbpf.validation.scores import as_trajectory, truth_at
-
-SIGMAS = 3.0
-_COLOURS = {
-    "filter": "tab:blue",
-    "truth": "black",
-    "batch": "tab:orange",
-    "odometry": "tab:grey",
-    "map": "tab:red",
-}
 
 
 def plot_run(run: Run, summary: MapSummary, out: Path, others: dict[str, np.ndarray]) -> list[str]:
@@ -30,32 +22,13 @@ def plot_run(run: Run, summary: MapSummary, out: Path, others: dict[str, np.ndar
         out: the run's folder.
         others: further paths (T, E) to draw, by name ("odometry", "batch").
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
     pictures = {
         "path.png": _draw_path,
         "map.png": _draw_map,
         "particles.png": _draw_particles,
         "ess.png": _draw_diagnostics,
     }
-    for name, draw in pictures.items():
-        figure = draw(run, summary, others)
-        figure.savefig(out / f"{name}.partial", format="png", dpi=110, bbox_inches="tight")
-        (out / f"{name}.partial").replace(out / name)
-    return list(pictures)
-
-
-def _axes(title: str, ylabel: str = "y [m]", xlabel: str = "x [m]", equal: bool = True) -> tuple[Any, Any]:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7.0, 6.0))
-    axes = figure.subplots()
-    axes.set(title=title, xlabel=xlabel, ylabel=ylabel)
-    if equal:
-        axes.set_aspect("equal", adjustable="datalim")
-    axes.grid(alpha=0.3)
-    return figure, axes
+    return save_figures({name: draw(run, summary, others) for name, draw in pictures.items()}, out)
 
 
 def _positions(run: Run, poses: np.ndarray) -> np.ndarray:
@@ -86,53 +59,48 @@ def _truth(run: Run) -> _TrueWorld | None:
 
 
 def _draw_path(run: Run, summary: MapSummary, others: dict[str, np.ndarray]) -> Any:
-    figure, axes = _axes(f"{run.log.name}: path, seen from above")
+    figure, axes = new_axes(f"{run.log.name}: path, seen from above")
     for name, poses in others.items():
         at = _positions(run, poses)
-        axes.plot(at[:, 0], at[:, 1], color=_COLOURS[name], lw=1, label=name)
+        axes.plot(at[:, 0], at[:, 1], color=COLOURS[name], lw=1, label=name)
     truth = _truth(run)
     if truth is not None:
         axes.plot(
             truth.path[:, 0],
             truth.path[:, 1],
-            color=_COLOURS["truth"],
+            color=COLOURS["truth"],
             lw=1.2,
             ls="--",
             label="truth, rigidly aligned",
         )
     at = _positions(run, run.progress.mean)
-    axes.plot(at[:, 0], at[:, 1], color=_COLOURS["filter"], lw=1.2, label="filter")
+    axes.plot(at[:, 0], at[:, 1], color=COLOURS["filter"], lw=1.2, label="filter")
     axes.legend(loc="best", fontsize="small")
     return figure
 
 
 def _draw_map(run: Run, summary: MapSummary, others: dict[str, np.ndarray]) -> Any:
-    figure, axes = _axes(f"{run.log.name}: map with {SIGMAS:g}σ ellipses, seen from above")
+    figure, axes = new_axes(f"{run.log.name}: map with {SIGMAS:g}σ ellipses, seen from above")
     at = _positions(run, run.progress.mean)
-    axes.plot(at[:, 0], at[:, 1], color=_COLOURS["filter"], lw=0.6, alpha=0.5, label="filter")
+    axes.plot(at[:, 0], at[:, 1], color=COLOURS["filter"], lw=0.6, alpha=0.5, label="filter")
     truth = _truth(run)
     if truth is not None and truth.landmarks.size:
         at = truth.landmarks
-        axes.plot(at[:, 0], at[:, 1], "+", color=_COLOURS["truth"], ms=7, label="truth, aligned by the path")
-    axes.plot(summary.mean[:, 0], summary.mean[:, 1], ".", color=_COLOURS["map"], ms=3, label="landmarks")
-    circle = np.linspace(0, 2 * np.pi, 40)
-    for mean, cov in zip(summary.mean, summary.cov, strict=True):
-        values, vectors = np.linalg.eigh(cov[:2, :2])
-        edge = vectors @ (
-            SIGMAS * np.sqrt(np.maximum(values, 0))[:, None] * np.stack([np.cos(circle), np.sin(circle)])
-        )
-        axes.plot(mean[0] + edge[0], mean[1] + edge[1], color=_COLOURS["map"], lw=0.8)
+        axes.plot(at[:, 0], at[:, 1], "+", color=COLOURS["truth"], ms=7, label="truth, aligned by the path")
+    axes.plot(summary.mean[:, 0], summary.mean[:, 1], ".", color=COLOURS["map"], ms=3, label="landmarks")
+    for ellipse in outline(summary.mean[:, :2], summary.cov[:, :2, :2]):
+        axes.plot(*ellipse.T, color=COLOURS["map"], lw=0.8)
     axes.legend(loc="best", fontsize="small")
     return figure
 
 
 def _draw_particles(run: Run, summary: MapSummary, others: dict[str, np.ndarray]) -> Any:
     particles = run.filter.particles
-    figure, axes = _axes(f"{run.log.name}: {particles.n} particles at the last step; area is weight")
+    figure, axes = new_axes(f"{run.log.name}: {particles.n} particles at the last step; area is weight")
     at = _positions(run, particles.state)
-    axes.scatter(at[:, 0], at[:, 1], s=400 * particles.weights, color=_COLOURS["filter"], alpha=0.5)
+    axes.scatter(at[:, 0], at[:, 1], s=400 * particles.weights, color=COLOURS["filter"], alpha=0.5)
     mean = _positions(run, run.progress.mean[-1:])[0]
-    axes.plot(mean[0], mean[1], "x", color=_COLOURS["map"], label="mean")
+    axes.plot(mean[0], mean[1], "x", color=COLOURS["map"], label="mean")
     axes.legend(loc="best", fontsize="small")
     return figure
 
@@ -143,15 +111,15 @@ def _draw_diagnostics(run: Run, summary: MapSummary, others: dict[str, np.ndarra
     progress, steps = run.progress, np.arange(run.progress.ess.size)
     figure = Figure(figsize=(8.0, 6.0))
     upper, lower = figure.subplots(2, 1, sharex=True)
-    upper.plot(steps, progress.ess, lw=0.8, color=_COLOURS["filter"], label="effective sample size")
+    upper.plot(steps, progress.ess, lw=0.8, color=COLOURS["filter"], label="effective sample size")
     limit = run.config.resampling.ess_threshold * run.config.particles
-    upper.axhline(limit, color=_COLOURS["map"], lw=0.8, ls="--", label="resampling below")
+    upper.axhline(limit, color=COLOURS["map"], lw=0.8, ls="--", label="resampling below")
     upper.set(title=f"{run.log.name}: effective sample size and innovations", ylabel="particles")
     upper.legend(loc="best", fontsize="small")
     seen = progress.rows > 0
     ratio = progress.nis[seen] / progress.rows[seen]
-    lower.plot(steps[seen], ratio, ".", ms=2, color=_COLOURS["filter"], label="NIS / degrees of freedom")
-    lower.axhline(1.0, color=_COLOURS["truth"], lw=0.8, label="honest filter's mean")
+    lower.plot(steps[seen], ratio, ".", ms=2, color=COLOURS["filter"], label="NIS / degrees of freedom")
+    lower.axhline(1.0, color=COLOURS["truth"], lw=0.8, label="honest filter's mean")
     lower.set(xlabel="step", ylabel="ratio", yscale="log")
     lower.legend(loc="best", fontsize="small")
     return figure

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from rbpf.errors import InputError
 from rbpf.sensors.readers import open_log
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.range_bearing.run import Run, run
+from rbpf.validation.files import prepare_folder
 from rbpf.validation.map_summary import summarise_map
 from rbpf.validation.measurements import dead_reckoning
 from rbpf.validation.plots import plot_run
@@ -43,9 +43,7 @@ def start_run(
     """
     log = open_log(recording, config.noise)
     if out is not None:
-        if out.exists() and not out.is_dir():
-            raise InputError(f"{out} is a file: name a folder for the results")
-        out.mkdir(parents=True, exist_ok=True)
+        prepare_folder(out)
     return run(log, config, out, resume, on_step)
 
 

@@ -1,4 +1,4 @@
-"""One self-contained page per run: the figures of summary.json and all pictures."""
+"""One page per run: the figures of summary.json and all pictures; a video stays a file beside it."""
 
 import base64
 from pathlib import Path
@@ -6,17 +6,17 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, select_autoescape
 
-from rbpf.validation.run_folder import write_text
+from rbpf.validation.files import write_text
 
 
-def write_report(out: Path, entries: dict[str, Any], pictures: list[str]) -> Path:
+def write_report(out: Path, entries: dict[str, Any], pictures: list[str], video: str | None = None) -> Path:
     """Writes `report.html` into a run's folder and returns its path."""
     environment = Environment(
         loader=PackageLoader("rbpf.validation", "templates"), autoescape=select_autoescape()
     )
     images = [(Path(name).stem, base64.b64encode((out / name).read_bytes()).decode()) for name in pictures]
     page = environment.get_template("report.html").render(
-        entries=_flat(entries), images=images, title=entries["recording"]
+        entries=_flat(entries), images=images, title=entries["recording"], video=video
     )
     path = out / "report.html"
     write_text(path, page)

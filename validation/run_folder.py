@@ -10,45 +10,31 @@ summary.json             the figures
 *.png, report.html       pictures, and one page with all of them
 """
 
-import csv
 import json
-import os
-import resource
-import sys
-from collections.abc import Iterable, Sequence
 from dataclasses import asdict
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 
-from rbpf import __version__, gaussian
-from rbpf.checkpoint import save_arrays
+from rbpf import __version__
 from rbpf.lie import SE2Group
 from rbpf.systems.range_bearing.run import Run
+from rbpf.validation.files import (
+    milliseconds_per_frame,
+    nis_ratio,
+    peak_memory_mb,
+    prepare_folder,
+    write_csv,
+    write_map,
+    write_text,
+)
 from rbpf.validation.map_summary import MapSummary, summarise_map
 from rbpf.validation.measurement_files import write_measurements
 from rbpf.validation.measurements import Measurements
 from rbpf.validation.scores import Scores, as_trajectory, score
 from rbpf.validation.trajectory_files import write_tum
-
-
-def write_text(path: Path, text: str) -> None:
-    """Writes a whole file or none."""
-    temporary = path.with_name(path.name + ".partial")
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, path)
-
-
-def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """A comma-separated table with a header line."""
-    buffer = StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(header)
-    writer.writerows(rows)
-    write_text(path, buffer.getvalue())
 
 
 def write_run(run: Run, out: Path, recording: Path, extra: dict[str, Any] | None = None) -> dict[str, Any]:
@@ -63,7 +49,7 @@ def write_run(run: Run, out: Path, recording: Path, extra: dict[str, Any] | None
     Returns:
         The entries of summary.json.
     """
-    out.mkdir(parents=True, exist_ok=True)
+    prepare_folder(out)
     log, progress = run.log, run.progress
     stamps = np.array([frame.stamp_ns for frame in log.frames], dtype=np.int64)
     write_tum(out / "trajectory.tum", as_trajectory(log, stamps, progress.mean))
@@ -93,20 +79,6 @@ def write_run(run: Run, out: Path, recording: Path, extra: dict[str, Any] | None
     entries = summarise(run, summary_map) | (extra or {})
     write_text(out / "summary.json", json.dumps(entries, indent=2, allow_nan=False) + "\n")
     return entries
-
-
-def write_map(out: Path, summary: MapSummary) -> None:
-    """map.npz and map.csv."""
-    save_arrays(out / "map.npz", {"id": summary.ids, "mean": summary.mean, "cov": summary.cov})
-    dim = summary.mean.shape[1]
-    axes = "xyz"[:dim]
-    cov_names = [f"c{axes[a]}{axes[b]}" for a in range(dim) for b in range(a + 1)]
-    packed = gaussian.pack(summary.cov)
-    rows = (
-        [name, *mean, *cov]
-        for name, mean, cov in zip(summary.ids, summary.mean.tolist(), packed.tolist(), strict=True)
-    )
-    write_csv(out / "map.csv", ["id", *(f"{axis}_m" for axis in axes), *cov_names], rows)
 
 
 def used_measurements(run: Run) -> Measurements:
@@ -141,7 +113,6 @@ def used_measurements(run: Run) -> Measurements:
 def summarise(run: Run, summary_map: MapSummary) -> dict[str, Any]:
     """The entries of summary.json."""
     progress, config = run.progress, run.config
-    milliseconds = progress.seconds * 1e3
     scores = score(run.log, progress.mean, summary_map.named(), config.association == "ml")
     evidence = run.filter.log_evidence
     return {
@@ -150,19 +121,16 @@ def summarise(run: Run, summary_map: MapSummary) -> dict[str, Any]:
         "frames": len(run.log.frames),
         "particles": config.particles,
         "seed": config.seed,
-        "ms_per_frame": {
-            "median": round(float(np.median(milliseconds)), 3),
-            "p95": round(float(np.percentile(milliseconds, 95)), 3),
-        },
+        "ms_per_frame": milliseconds_per_frame(progress.seconds),
         "landmarks": int(summary_map.ids.size),
         "observations": int(sum((ids >= 0).sum() for ids in run.associations)),
         "resamplings": int(progress.resampled.sum()),
         "ess_mean": float(progress.ess.mean()),
         "log_evidence": evidence if np.isfinite(evidence) else None,
-        "nis_per_dof": _ratio(progress.nis, progress.rows),
+        "nis_per_dof": nis_ratio(progress.nis, progress.rows),
         "ancestors_of_first_generation": run.filter.history.distinct_first(),
         "map_share_of_dense": _map_share(run),
-        "peak_memory_mb": round(peak_memory_mb(), 1),
+        "peak_memory_mb": peak_memory_mb(),
         **reported(scores),
     }
 
@@ -170,17 +138,6 @@ def summarise(run: Run, summary_map: MapSummary) -> dict[str, Any]:
 def reported(scores: Scores, prefix: str = "") -> dict[str, Any]:
     """Scores that exist, as entries of summary.json."""
     return {prefix + name: value for name, value in asdict(scores).items() if value is not None}
-
-
-def peak_memory_mb() -> float:
-    """Largest resident size of this process so far."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (2**20 if sys.platform == "darwin" else 2**10)
-
-
-def _ratio(nis: np.ndarray, rows: np.ndarray) -> float | None:
-    used = np.isfinite(nis) & (rows > 0)
-    return float(nis[used].sum() / rows[used].sum()) if used.any() else None
 
 
 def _map_share(run: Run) -> float:

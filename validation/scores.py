@@ -48,23 +48,28 @@ def as_trajectory(log: RobotLog, stamps_ns: np.ndarray, world_from_robot: np.nda
 def truth_at(
     space: SE2Group | SE3Group, truth: Truth, stamps_ns: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of `stamps_ns` that lie inside the truth, and the interpolated true poses there.
+    """Rows of `stamps_ns` that lie inside the truth, and the interpolated true poses there."""
+    return poses_at(space, truth.stamps_ns, truth.world_from_robot, stamps_ns)
+
+
+def poses_at(
+    space: SE2Group | SE3Group, true_ns: np.ndarray, poses: np.ndarray, stamps_ns: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of `stamps_ns` that lie inside true stamps (T,), and the interpolated true poses (T, E) there.
 
     Stamps that count steps are met exactly; between poses the geodesic is followed.
     """
-    after = np.searchsorted(truth.stamps_ns, stamps_ns, side="left")
-    exact = np.minimum(after, truth.stamps_ns.size - 1)
-    met = truth.stamps_ns[exact] == stamps_ns
-    before = np.clip(np.where(met, exact, after - 1), 0, truth.stamps_ns.size - 1)
-    after = np.clip(np.where(met, exact, after), 0, truth.stamps_ns.size - 1)
-    gap = truth.stamps_ns[after] - truth.stamps_ns[before]
-    inside = (truth.stamps_ns[before] <= stamps_ns) & (stamps_ns <= truth.stamps_ns[after])
+    last = true_ns.size - 1
+    after = np.searchsorted(true_ns, stamps_ns, side="left")
+    exact = np.minimum(after, last)
+    met = true_ns[exact] == stamps_ns
+    before = np.clip(np.where(met, exact, after - 1), 0, last)
+    after = np.clip(np.where(met, exact, after), 0, last)
+    gap = true_ns[after] - true_ns[before]
+    inside = (true_ns[before] <= stamps_ns) & (stamps_ns <= true_ns[after])
     rows = np.flatnonzero(met | (inside & (gap <= LONGEST_GAP_NS)))
-    share = (stamps_ns[rows] - truth.stamps_ns[before[rows]]) / np.maximum(gap[rows], 1)
-    poses = space.interpolate(
-        truth.world_from_robot[before[rows]], truth.world_from_robot[after[rows]], share
-    )
-    return rows, poses
+    share = (stamps_ns[rows] - true_ns[before[rows]]) / np.maximum(gap[rows], 1)
+    return rows, space.interpolate(poses[before[rows]], poses[after[rows]], share)
 
 
 def score(

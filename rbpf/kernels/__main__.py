@@ -16,3 +16,4 @@ for name in (
     "corner_kernels",
 ):
     import_module(f"rbpf.sensors.{name}")
+import_module("rbpf.validation.simulation.raster_kernel")

@@ -2,6 +2,7 @@
 
 import ast
 import importlib
+import inspect
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -49,6 +50,46 @@ def gps_fix(figures: dict[str, float]) -> None:
     assert figures["share_within_3_sigma"] > 0.95
 
 
+def mono_blackouts(figures: dict[str, float]) -> None:
+    assert figures["blackouts"] >= 2
+    assert figures["recovered"] == 1.0
+    assert figures["median error a second later [m]"] < 0.03
+
+
+def mono_depth(figures: dict[str, float]) -> None:
+    assert figures["kl_depth"] > 10.0 * figures["kl_inverse"]
+    assert figures["kl_depth_end"] < 0.01
+
+
+def mono_desk(figures: dict[str, float]) -> None:
+    assert 1.0 < figures["ratio"] < 2.5
+    assert 3.0 < figures["nees"] < 15.0
+
+
+def mono_eigenvalues(figures: dict[str, float]) -> None:
+    assert figures["dominant"] < 45
+    assert figures["thirtieth"] < 0.05
+
+
+def mono_loop(figures: dict[str, float]) -> None:
+    assert figures["loop / room's prior"] < 0.5 * figures["loop / desk's prior"]
+
+
+def mono_overconfidence(figures: dict[str, float]) -> None:
+    assert figures["default / points"] > 3.0 * figures["default / frame"]
+
+
+def mono_still_camera(figures: dict[str, float]) -> None:
+    assert figures["epipolar / points / stay rays"] < 0.1
+    assert figures["epipolar / frame / stay rays"] < 0.5
+    assert figures["off / frame / become points"] < 0.5
+
+
+def mono_video(figures: dict[str, float]) -> None:
+    assert figures["frames_tracked"] == 20
+    assert figures["ate_rmse_m"] < 0.02
+
+
 def own_landmark(figures: dict[str, float]) -> None:
     assert figures["findings"] == 0
     assert figures["located"] >= 25
@@ -89,6 +130,14 @@ CLAIMS: dict[str, Callable[[Any], None]] = {
         evidence,
         fused_kernel,
         gps_fix,
+        mono_blackouts,
+        mono_depth,
+        mono_desk,
+        mono_eigenvalues,
+        mono_loop,
+        mono_overconfidence,
+        mono_still_camera,
+        mono_video,
         own_landmark,
         own_proposal,
         range_only_beacons,
@@ -99,9 +148,12 @@ CLAIMS: dict[str, Callable[[Any], None]] = {
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
-def test_example_shows_what_it_promises(path, capsys, monkeypatch):
+def test_example_shows_what_it_promises(path, capsys, monkeypatch, tmp_path):
     monkeypatch.syspath_prepend(path.parent)
-    figures = importlib.import_module(path.stem).main()
+    main = importlib.import_module(path.stem).main
+    draws = "quick" in inspect.signature(main).parameters
+    figures = main(quick=True, out=tmp_path) if draws else main()
+    assert {".png", ".csv"} <= {file.suffix for file in tmp_path.iterdir()} or not draws
     assert capsys.readouterr().out.count("\n") >= 2
     CLAIMS[path.stem](figures)
 

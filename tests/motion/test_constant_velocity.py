@@ -148,7 +148,23 @@ def test_a_law_places_the_body(mode, dt):
     )
 
 
-@pytest.mark.parametrize("control", [None, LAW])
+@pytest.mark.parametrize("mode", ["marginal", "joint", "paper"])
+def test_a_law_with_a_velocity_forgets_the_old_one(mode):
+    law, state = PoseLaw(LAW.mean, LAW.cov, 0.3 * WALK), states(3)
+    if mode == "marginal":
+        transition = MarginalVelocity(WALK).transition(state[:, :7], law, 0.2)
+        np.testing.assert_array_equal(transition.dynamics, np.zeros((1, 6, 6)))
+    else:
+        transition = SampledVelocity(WALK, mode, WALK).transition(state, law, 0.2)
+        np.testing.assert_array_equal(transition.mean[:, 7:], np.zeros((3, 6)))
+    factor = transition.noise_factor[0]
+    np.testing.assert_allclose((factor @ factor.T)[6:, 6:], np.diag((0.3 * WALK) ** 2), rtol=1e-13)
+
+
+FORGETTING = PoseLaw(LAW.mean, LAW.cov, WALK)
+
+
+@pytest.mark.parametrize("control", [None, LAW, FORGETTING])
 @pytest.mark.parametrize(
     "motion", [MarginalVelocity(WALK), SampledVelocity(WALK), SampledVelocity(0.1, "paper")]
 )

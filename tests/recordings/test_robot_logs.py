@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from rbpf.sensors.readers import open_log
+from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.range_bearing.run import run
-from rbpf.systems.range_bearing.settings import load_settings
+from rbpf.systems.settings import load_settings
 from rbpf.validation.map_summary import summarise_map
 from rbpf.validation.scores import score
 
@@ -16,7 +17,7 @@ def mean_scores(path, seeds, *settings):
     """Mean over seeds of path rmse, ate, landmark error without and with alignment."""
     rows = []
     for seed in range(seeds):
-        config = load_settings(None, settings, {"seed": seed})
+        config = load_settings(RangeBearingConfig, "range-bearing", None, settings, {"seed": seed})
         log = open_log(path, config.noise)
         finished = run(log, config)
         landmarks = summarise_map(finished.filter, finished.anchored).named()
@@ -66,6 +67,6 @@ def test_robot_with_motion_capture(data_dir):
 
 def test_victoria_park_runs_through(data_dir):
     log = open_log(data_dir / "victoria_park")
-    finished = run(log, load_settings(None, ["particles=20"], {}))
+    finished = run(log, load_settings(RangeBearingConfig, "range-bearing", None, ["particles=20"], {}))
     assert np.isfinite(finished.progress.mean).all()
     assert len(finished.filter.belief().map.ids) == 151

@@ -35,6 +35,8 @@ class RayConfig:
             depth variance, or not at all.
         rho_per_m: mean inverse depth of a new landmark, 1/m; without known points it sets the scale.
         std_rho_per_m: its standard deviation.
+        adapt: a new ray starts at the median inverse depth of the points just seen, with the same relative deviation at
+            least, where four or more were seen.
         ready_ratio: a ray becomes a point when the standard deviation of its inverse depth is below this share of it.
         ready_weight: share of the particles' weight in which it must be.
         least_px: depth is measured once a change of ρ by its first standard deviation moves the image by this.
@@ -42,7 +44,8 @@ class RayConfig:
 
     constrain: Literal["epipolar", "marginal", "off"] = "marginal"
     rho_per_m: float = 0.8
-    std_rho_per_m: float = 0.4
+    std_rho_per_m: float = 0.6
+    adapt: bool = True
     ready_ratio: float = 0.1
     ready_weight: float = 0.95
     least_px: float = 1.0

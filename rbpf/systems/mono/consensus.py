@@ -14,9 +14,7 @@ SCALE = 2.0
 """Of the loss: a match this many standard deviations off keeps half of its weight."""
 
 
-def agreeing(
-    nu: np.ndarray, jac: np.ndarray, cov: np.ndarray, factor: np.ndarray, gate: float
-) -> np.ndarray:
+def agreeing(nu: np.ndarray, jac: np.ndarray, cov: np.ndarray, factor: np.ndarray, gate: float) -> np.ndarray:
     """Which of K matches agree, (K,) bool.
 
     Args:

@@ -20,6 +20,9 @@ from rbpf.systems.mono.config import RayConfig
 CONSTELLATION = -1
 """Name of the known points' frame in the catalogue; features have names from 0 on."""
 
+ENOUGH = 4
+"""Points that must have been seen for new rays to start at their depth."""
+
 _STATE, _MAP = frozenset({Part.STATE}), frozenset({Part.LANDMARK})
 _BOTH = _STATE | _MAP
 
@@ -77,7 +80,31 @@ class FeatureSensor(Sensor):
         if not new:
             return []
         names = frame.landmarks[new].tolist()
-        return [Births(frame.z[new], frame.cov_z[new], self.ray, self.inverse_depth, facts=names)]
+        ray = self.new_ray(belief, observed)
+        return [Births(frame.z[new], frame.cov_z[new], ray, self.inverse_depth, facts=names)]
+
+    def new_ray(self, belief: Belief, observed: Sequence[Observations]) -> CameraRay:
+        """What starts rays: at the inverse depths of the points that were just seen, where there are enough of them.
+
+        Rays that all start too near or too far agree with one another on a wrong scale: the prior takes them as
+        independent, the scene's depth is common to them.
+        """
+        mode, seen = belief.mode, [np.zeros(0)]
+        for group in observed if self.rays.adapt else ():
+            if group.ids is None or not isinstance(group.model, CameraPoint | ConstellationView):
+                continue
+            records = belief.read(group.ids)
+            const = None if records.const is None else records.const[mode]
+            point = group.model.in_camera(belief.state[mode][None], records.mean[mode], const)
+            seen.append(np.ravel(point[..., 2]))
+        depth = np.concatenate(seen)
+        depth = depth[depth > 0.0]
+        if depth.size < ENOUGH:
+            return self.ray
+        rho = 1.0 / depth
+        middle = float(np.median(rho))
+        share = self.rays.std_rho_per_m / self.rays.rho_per_m
+        return CameraRay(self.camera, (middle, max(share * middle, float(rho.std()))))
 
     def project(
         self, belief: Belief, names: np.ndarray, members: np.ndarray
@@ -117,9 +144,7 @@ class FeatureSensor(Sensor):
             covs.append(_diagonal_blocks(cov, chosen.size))
         return np.concatenate(which), np.concatenate(nus), np.concatenate(jacs), np.concatenate(covs)
 
-    def places(
-        self, belief: Belief, names: np.ndarray, members: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def places(self, belief: Belief, names: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where features (K,) are in the world of the heaviest particle: which of them, homogeneous points (k, 4)."""
         mode, which, out = belief.mode, [np.zeros(0, dtype=np.int64)], [np.zeros((0, 4))]
         for model, chosen, ids in self._by_kind(belief, names, members):
@@ -127,7 +152,11 @@ class FeatureSensor(Sensor):
             const = None if records.const is None else records.const[mode]
             which.append(chosen)
             if isinstance(model, ConstellationView):
-                out.append(np.pad(model.in_world(records.mean[mode], const)[0], ((0, 0), (0, 1)), constant_values=1.0))
+                out.append(
+                    np.pad(
+                        model.in_world(records.mean[mode], const)[0], ((0, 0), (0, 1)), constant_values=1.0
+                    )
+                )
             else:
                 x, w = model.place(records.mean[mode], const)
                 out.append(np.concatenate([x, w], axis=-1))
@@ -144,9 +173,9 @@ class FeatureSensor(Sensor):
                 out[chosen] = (rho > 0.0) & (np.sqrt(variance) <= share * rho)
         return out
 
-    def first_places(self, world_from_camera: np.ndarray, px: np.ndarray) -> np.ndarray:
+    def first_places(self, world_from_camera: np.ndarray, px: np.ndarray, ray: CameraRay) -> np.ndarray:
         """Homogeneous points (k, 4) of rays that start at px (k, 2) from a camera (7,)."""
-        records = self.ray.initialise(world_from_camera[None], px, np.zeros((px.shape[0], 2, 2)))
+        records = ray.initialise(world_from_camera[None], px, np.zeros((px.shape[0], 2, 2)))
         x, w = self.ray.place(records.mean[0], records.const[0] if records.const is not None else None)
         return np.concatenate([x, w], axis=-1)
 

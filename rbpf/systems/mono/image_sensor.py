@@ -120,7 +120,7 @@ class ImageSensor(Sensor):
         self._place(belief, self.measured.landmarks)
         sightings = self.measured
         if frame.image is not None and not self.bad_frames:
-            sightings = self._with_corners(frame, belief)
+            sightings = self._with_corners(frame, belief, observed)
         births = self.features.births(sightings, belief, observed)
         self.features.forget(belief, failing)
         return births
@@ -144,7 +144,9 @@ class ImageSensor(Sensor):
         cov = cov + self.config.noise_px**2 * np.eye(2)
         turn = affines(self.camera, self.table.place[rows], self.table.first_pose[rows], pose)
         templates = warp(self.table.source[rows], turn, self.config.template_px)
-        matches = search(image, templates, mean, cov, sigmas=self.config.sigmas, most_px=self.config.largest_px)
+        matches = search(
+            image, templates, mean, cov, sigmas=self.config.sigmas, most_px=self.config.largest_px
+        )
         found = (matches.score >= self.config.accept) & self.camera.inside(matches.px)
         return Searched(rows, mean, cov, matches.px, matches.score, found)
 
@@ -223,7 +225,9 @@ class ImageSensor(Sensor):
             chosen, place = self.features.places(belief, rows, self.table.member[rows])
             self.table.place[rows[chosen]] = place
 
-    def _with_corners(self, frame: ImageFrame, belief: Belief) -> FeatureFrame:
+    def _with_corners(
+        self, frame: ImageFrame, belief: Belief, observed: Sequence[Observations]
+    ) -> FeatureFrame:
         assert frame.image is not None
         config, measured = self.config, self.measured
         room = config.measurements - measured.landmarks.size
@@ -239,7 +243,7 @@ class ImageSensor(Sensor):
         source = np.array([self._window(frame.image, place) for place in px])
         pose = belief.state[belief.mode][:7]
         rows = self.table.add(source, px, pose)
-        self.table.place[rows] = self.features.first_places(pose, px)
+        self.table.place[rows] = self.features.first_places(pose, px, self.features.new_ray(belief, observed))
         return self._features(
             frame.stamp_ns, np.append(measured.landmarks, rows), np.concatenate([measured.z, px])
         )

@@ -66,7 +66,7 @@ def assemble(
     landmark_map.register(features.inverse_depth)
     parts: list[Conditional] = [landmark_map]
     if config.velocity.mode == "marginal":
-        parts.append(KalmanSubstate(SE3, np.zeros(6), np.diag(_start_std(config.velocity) ** 2)))
+        parts.append(KalmanSubstate(SE3, np.zeros(6), np.diag(start_std(config.velocity) ** 2)))
     filter_ = Filter(
         motion,
         sensor or features,
@@ -88,7 +88,7 @@ def build_motion(config: VelocityConfig) -> MotionModel:
     walk = np.repeat([config.walk_rad_s, config.walk_m_s], 3)
     if config.mode == "marginal":
         return MarginalVelocity(walk)
-    return SampledVelocity(walk, config.mode, _start_std(config))
+    return SampledVelocity(walk, config.mode, start_std(config))
 
 
 def add_known_points(landmark_map: LandmarkMap, known: KnownPoints, n: int) -> None:
@@ -146,5 +146,6 @@ def start_cov(config: MonoConfig) -> np.ndarray:
     return np.diag(np.repeat([config.start_std_rad**2, config.start_std_m**2], 3))
 
 
-def _start_std(config: VelocityConfig) -> np.ndarray:
+def start_std(config: VelocityConfig) -> np.ndarray:
+    """Standard deviation (6,) of a velocity of which nothing is known."""
     return np.repeat([config.start_rad_s, config.start_m_s], 3)

@@ -38,7 +38,9 @@ def affines(
     position = SE3.translation(world_from_camera)
     world_rays = SE3.transform(world_from_camera, rays) - position
     with np.errstate(divide="ignore", invalid="ignore"):
-        along = (normal * (point - position)).sum(axis=-1)[:, None] / (normal[:, None] * world_rays).sum(axis=-1)
+        along = (normal * (point - position)).sum(axis=-1)[:, None] / (normal[:, None] * world_rays).sum(
+            axis=-1
+        )
     on_patch = position + along[..., None] * world_rays
     first = camera.project(SE3.inverse_transform(first_pose[:, None], on_patch))
     return np.stack([first[:, 0] - first[:, 1], first[:, 2] - first[:, 3]], axis=-1) / 2.0

@@ -3,21 +3,27 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import yaml
 
 from rbpf.errors import InputError
-from rbpf.systems.range_bearing.config import RangeBearingConfig
 
-_HEADER = ("rbpf", "system", "recording")
+_HEADER = ("rbpf", "system", "recording", "known_points", "calibration")
+"""What a config.yaml says about the run besides its settings."""
+
+Config = TypeVar("Config")
 
 
-def load_settings(path: Path | None, pairs: Sequence[str], given: Mapping[str, Any]) -> RangeBearingConfig:
+def load_settings(
+    kind: type[Config], system: str, path: Path | None, pairs: Sequence[str], given: Mapping[str, Any]
+) -> Config:
     """A configuration; later sources override earlier ones.
 
     Args:
+        kind: dataclass of the system's settings.
+        system: its name, as a former run's config.yaml has it.
         path: YAML file, such as the config.yaml of a former run.
         pairs: settings as key=value, nested keys with dots.
         given: settings by name.
@@ -25,18 +31,18 @@ def load_settings(path: Path | None, pairs: Sequence[str], given: Mapping[str, A
     Raises:
         InputError: the file is unreadable, a key does not exist or a value has the wrong type.
     """
-    values = {} if path is None else _read(path)
+    values = {} if path is None else _read(path, system)
     for pair in pairs:
         _put(values, pair)
     values.update(given)
-    _refuse_unknown(values, RangeBearingConfig, "")
+    _refuse_unknown(values, kind, "")
     try:
-        return msgspec.convert(values, RangeBearingConfig, strict=False)
+        return msgspec.convert(values, kind, strict=False)
     except msgspec.ValidationError as error:
         raise InputError(f"settings: {error}") from error
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _read(path: Path, expected: str) -> dict[str, Any]:
     try:
         values = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
@@ -45,9 +51,9 @@ def _read(path: Path) -> dict[str, Any]:
         raise InputError(f"{path} is not YAML: {' '.join(str(error).split())}") from error
     if not isinstance(values, dict):
         raise InputError(f"{path} must hold settings as `name: value`, one per line")
-    system = values.get("system", "range-bearing")
-    if system != "range-bearing":
-        raise InputError(f"{path} holds settings of the system {system!r}, not of range-bearing")
+    system = values.get("system", expected)
+    if system != expected:
+        raise InputError(f"{path} holds settings of the system {system!r}, not of {expected}")
     return {name: value for name, value in values.items() if name not in _HEADER}
 
 

@@ -1,0 +1,112 @@
+"""The options of the commands; their docstrings are the help texts."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+
+@dataclass(frozen=True)
+class RangeBearingOptions:
+    """Options of `rbpf run range-bearing`.
+
+    Attributes:
+        log: recording: a folder of an MRCLAM or MRPT log, or a Victoria Park graph.
+        out: folder for the results.
+        particles: number of particles; by default as in the configuration.
+        seed: of the random generator; by default as in the configuration.
+        association: landmarks named by the log, or by maximum likelihood; by default as in the configuration.
+        config: YAML file of settings, such as a former run's config.yaml.
+        set: a setting as key=value, such as proposal.iterations=1 or noise.std_range_m=0.1.
+        resume: go on from the checkpoint in the results' folder.
+        batch: also solve for the batch optimum with GTSAM.
+        threads: threads of the kernels; by default all.
+    """
+
+    log: tyro.conf.Positional[Path]
+    out: Path = Path("run")
+    particles: int | None = None
+    seed: int | None = None
+    association: Literal["known", "ml"] | None = None
+    config: Path | None = None
+    set: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    resume: tyro.conf.FlagCreatePairsOff[bool] = False
+    batch: bool = True
+    threads: int | None = None
+
+
+@dataclass(frozen=True)
+class MonoOptions:
+    """Options of `rbpf run mono`.
+
+    Attributes:
+        sequence: images: a folder of a known kind (EuRoC, TUM RGB-D, KITTI, 7-Scenes, images with a camera.yaml) or
+            a video with a camera.yaml beside it.
+        known_points: table of points of known position that are seen in the first image; without it the world is
+            the first camera's and its scale is arbitrary.
+        calibration: camera.yaml in place of the sequence's own.
+        out: folder for the results.
+        particles: number of particles; by default as in the configuration.
+        seed: of the random generator; by default as in the configuration.
+        config: YAML file of settings, such as a former run's config.yaml.
+        set: a setting as key=value, such as search.measurements=30 or ray.constrain=epipolar.
+        resume: go on from the checkpoint in the results' folder.
+        rerun: also write a recording (.rrd) for the Rerun viewer.
+        video: write the annotated video.
+        threads: threads of the kernels; by default all.
+    """
+
+    sequence: tyro.conf.Positional[Path]
+    known_points: Path | None = None
+    calibration: Path | None = None
+    out: Path = Path("run")
+    particles: int | None = None
+    seed: int | None = None
+    config: Path | None = None
+    set: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    resume: tyro.conf.FlagCreatePairsOff[bool] = False
+    rerun: Path | None = None
+    video: bool = True
+    threads: int | None = None
+
+
+@dataclass(frozen=True)
+class ImagesOptions:
+    """Options of `rbpf simulate desk` and `rbpf simulate room`.
+
+    Attributes:
+        out: folder for the sequence (EuRoC ASL, with camera.yaml and known_points.csv); must not exist, or be empty.
+        seed: of the random generator.
+        frames: number of images, 30 per second.
+        width: of the images, px.
+        height: of the images, px.
+        focal_px: focal length; by default 0.8 of the width.
+        distortion: k1, k2, p1, p2, k3 of the lens.
+        baseline_m: of a second camera to the right; by default there is none.
+        known: corners in the first image whose positions are given, at least 4; 0 for none.
+        noise_std: of the sensor, grey levels.
+        blur_s: the shutter is open this long.
+        exposure_drift: greatest change of the exposure, as a share.
+        vignetting: share of the light that is missing in the corners.
+        contrast: of all textures; 1 is rich, 0.1 poor.
+        blackout: first frame in the dark and number of frames.
+        depth: also write depth images.
+    """
+
+    out: Path
+    seed: int = 0
+    frames: int = 300
+    width: int = 640
+    height: int = 480
+    focal_px: float | None = None
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    baseline_m: float | None = None
+    known: int = 6
+    noise_std: float = 2.0
+    blur_s: float = 0.0
+    exposure_drift: float = 0.0
+    vignetting: float = 0.0
+    contrast: float = 1.0
+    blackout: tuple[int, int] | None = None
+    depth: tyro.conf.FlagCreatePairsOff[bool] = False

@@ -1,0 +1,116 @@
+"""What the filter is told about the pose when the camera is lost, and when it is found again."""
+
+from dataclasses import replace
+from typing import final
+
+import numpy as np
+
+from rbpf.estimate import mixture_estimate
+from rbpf.filter import Filter
+from rbpf.lie import SE3
+from rbpf.motion.constant_velocity import PoseLaw
+from rbpf.particles import Particles
+from rbpf.proposals import Prior
+from rbpf.sensors.readers.images import ImageFrame
+from rbpf.systems.mono.config import RecoveryConfig
+from rbpf.systems.mono.image_sensor import ImageSensor
+from rbpf.systems.mono.relocalise import Relocaliser
+
+LEAST_CONTRAST = 10
+"""Grey levels that are all nearer to each other are those of a lens cap."""
+
+FROZEN = 5
+"""Times that an image has to come again: drivers repeat single images when the camera is late."""
+
+
+@final
+class Recovery:
+    """Watches a run: `law` before each step of the filter, `note` after it.
+
+    Args:
+        sensor: of the run; it says whether the camera is lost.
+        config: settings.
+        std_velocity: (6,) standard deviation of the velocity of a camera that is found again, rad/s, m/s.
+    """
+
+    def __init__(self, sensor: ImageSensor, config: RecoveryConfig, std_velocity: np.ndarray) -> None:
+        self.sensor = sensor
+        self.config = config
+        self.std_velocity = std_velocity
+        self.relocaliser = Relocaliser(sensor, config)
+        self.stamp_ns = 0
+        """When the pose was trusted last."""
+        self._trusted = SE3.identity(), np.zeros((6, 6))
+        self._cloud: Particles | None = None
+        self._last: np.ndarray | None = None
+        self._repeats = 0
+        self._blank = False
+
+    def checked(self, frame: ImageFrame) -> ImageFrame:
+        """The frame, without its image if that shows nothing, or the same as the one before: it tells nothing new.
+
+        The first of such frames in a row has the reason as its problem.
+        """
+        if frame.image is None:
+            return frame
+        last, self._last = self._last, frame.image
+        self._repeats = self._repeats + 1 if last is not None and np.array_equal(frame.image, last) else 0
+        problem = None
+        if int(frame.image.max()) - int(frame.image.min()) < LEAST_CONTRAST:
+            problem = "the image shows nothing, its grey levels are all alike: it is not used"
+        elif self._repeats >= FROZEN:
+            problem = (
+                f"the image is the same for the {FROZEN + 1}th time, the camera may be frozen: it is not used"
+            )
+        was_blank, self._blank = self._blank, problem is not None
+        if problem is None:
+            return frame
+        return replace(frame, image=None, problem=None if was_blank else problem)
+
+    def law(self, frame: ImageFrame, filter_: Filter) -> PoseLaw | None:
+        """Nothing while the camera is tracked; where it was seen; else near the last trusted pose.
+
+        A camera that moved on with its last velocity for a second would be further off than one that stayed: hands
+        turn back.
+        """
+        if not self.sensor.lost:
+            return None
+        pose, cov = self.trusted
+        if frame.image is not None:
+            found = self.relocaliser.find(filter_.belief(), frame.image, pose)
+            if found is not None:
+                return PoseLaw(found.mean, found.cov + cov, self.std_velocity)
+        reach = np.repeat([self.config.reach_rad, self.config.reach_m], 3)
+        return PoseLaw(pose, cov + np.diag(reach**2), self.std_velocity)
+
+    def drift(self, frame: ImageFrame) -> np.ndarray:
+        """Covariance (6, 6) of how far the camera may have gone while it was lost, [ω, v]."""
+        if not self.sensor.lost:
+            return np.zeros((6, 6))
+        seconds = (frame.stamp_ns - self.stamp_ns) * 1e-9
+        return np.diag((np.repeat([self.config.drift_rad_s, self.config.drift_m_s], 3) * seconds) ** 2)
+
+    def note(self, frame: ImageFrame, filter_: Filter) -> None:
+        """Remembers the particles after a step, if they can be trusted."""
+        if not self.sensor.bad_frames:
+            self._cloud, self.stamp_ns = filter_.particles, frame.stamp_ns
+
+    @property
+    def trusted(self) -> tuple[np.ndarray, np.ndarray]:
+        """The last trusted pose world_from_camera (7,) in the particles' world, and its covariance (6, 6)."""
+        if self._cloud is not None:
+            # Averaged only when it is needed: tracking has no time for it.
+            poses, log_weights = self._cloud.state[:, :7], self._cloud.log_weights
+            estimate = mixture_estimate(Prior.exactly(SE3, poses), None, log_weights)
+            self._trusted, self._cloud = (estimate.mean, estimate.cov), None
+        return self._trusted
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """For a checkpoint."""
+        pose, cov = self.trusted
+        return {"recovery/pose": pose, "recovery/cov": cov, "recovery/stamp_ns": np.array(self.stamp_ns)}
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """The inverse of `arrays`."""
+        self._trusted, self._cloud = (arrays["recovery/pose"], arrays["recovery/cov"]), None
+        self.stamp_ns = int(arrays["recovery/stamp_ns"])

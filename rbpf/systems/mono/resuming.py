@@ -1,0 +1,53 @@
+"""Checkpoints of a run over images: the filter, the sensor, and what was gathered frame by frame."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rbpf.errors import InputError
+
+if TYPE_CHECKING:
+    from rbpf.systems.mono.video import VideoRun
+
+
+_PER_FRAME = (
+    "world_from_camera", "cov", "searched", "found", "lost", "ess", "log_evidence", "resampled", "nis", "nis_dof",
+    "seconds", "seconds_search", "seconds_waiting",
+)  # fmt: skip
+
+
+def save(run: "VideoRun", path: Path) -> None:
+    """Writes a checkpoint of the filter, the sensor and everything gathered so far."""
+    done = run.filter.steps
+    arrays = {f"progress/{name}": getattr(run, name)[:done] for name in _PER_FRAME}
+    arrays["progress/stamps_ns"] = run.stamps_ns
+    arrays["progress/problems"] = np.array(run.problems, dtype=np.str_)
+    arrays["progress/relocalisations"] = np.array(run.relocalisations, dtype=np.int64)
+    run.filter.save(path, arrays | run.sensor.arrays() | run.sightings.arrays() | run.recovery.arrays())
+
+
+def restore(run: "VideoRun", path: Path) -> None:
+    """The inverse of `save`.
+
+    Raises:
+        InputError: the file is damaged, or belongs to a run over another sequence or with other settings.
+    """
+    arrays = run.filter.load(path)
+    if not np.array_equal(arrays.get("progress/stamps_ns", ()), run.stamps_ns):
+        raise InputError(f"{path} belongs to a run over another sequence: start without --resume")
+    for name in _PER_FRAME:
+        getattr(run, name)[: run.filter.steps] = arrays[f"progress/{name}"]
+    run.problems = arrays["progress/problems"].tolist()
+    run.relocalisations = arrays["progress/relocalisations"].tolist()
+    run.sensor.restore(arrays)
+    run.sightings.restore(arrays)
+    run.recovery.restore(arrays)
+
+
+def cut(run: "VideoRun") -> None:
+    """Leaves the frames that were filtered: a video may end before its last announced image."""
+    done = run.filter.steps
+    run.stamps_ns = run.stamps_ns[:done]
+    for name in _PER_FRAME:
+        setattr(run, name, getattr(run, name)[:done])

@@ -1,0 +1,189 @@
+"""Runs monocular SLAM over a sequence of images: search, filter, loss and recovery."""
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from rbpf.errors import InputError
+from rbpf.filter import Filter
+from rbpf.lie import SE3
+from rbpf.motion.constant_velocity import PoseLaw
+from rbpf.sensors.features import KnownPoints
+from rbpf.sensors.readers.images import ImageFrame, ImageSequence, KnownPixels
+from rbpf.systems.mono.config import MonoConfig
+from rbpf.systems.mono.image_sensor import ImageSensor
+from rbpf.systems.mono.known_start import resect_known
+from rbpf.systems.mono.recovery import Recovery
+from rbpf.systems.mono.resuming import cut, restore, save
+from rbpf.systems.mono.run import pose_estimate
+from rbpf.systems.mono.sightings import Sightings
+from rbpf.systems.mono.system import KnownStart, assemble, build_features, start_cov, start_std
+
+
+@dataclass
+class VideoRun:
+    """A run over T images.
+
+    Attributes:
+        sequence: what was filtered.
+        config: with what settings.
+        known: the known points, None where it started without any.
+        filter: in its final state.
+        sensor: its image sensor.
+        stamps_ns: (T,).
+        world_from_camera: (T, 7) online filtered mean, in the world of the known points, else of the first camera.
+        cov: (T, 6, 6) of it in the right chart at the mean, order [ω, v].
+        searched: (T,) landmarks looked for.
+        found: (T,) landmarks found.
+        lost: (T,) whether the camera was lost after the frame.
+        ess: (T,) effective sample size before resampling.
+        log_evidence: (T,) increments.
+        resampled: (T,) whether the particles were resampled.
+        nis: (T,) normalised innovation squared;  nis_dof: (T,) its degrees of freedom.
+        seconds: (T,) time of the whole frame without decoding;  seconds_search: (T,) of the search in the image.
+        seconds_waiting: (T,) until the decoded image was there.
+        sightings: what was looked for, frame by frame.
+        problems: what was wrong with single frames, in words.
+        relocalisations: numbers of the frames in which it was found again.
+        failure: why it ended before the last frame, in words; None where it did not.
+        recovery: what finds the camera again.
+    """
+
+    sequence: ImageSequence
+    config: MonoConfig
+    known: KnownPixels | None
+    filter: Filter
+    sensor: ImageSensor
+    stamps_ns: np.ndarray
+    world_from_camera: np.ndarray
+    cov: np.ndarray
+    searched: np.ndarray
+    found: np.ndarray
+    lost: np.ndarray
+    ess: np.ndarray
+    log_evidence: np.ndarray
+    resampled: np.ndarray
+    nis: np.ndarray
+    nis_dof: np.ndarray
+    seconds: np.ndarray
+    seconds_search: np.ndarray
+    seconds_waiting: np.ndarray
+    sightings: Sightings = field(default_factory=Sightings)
+    problems: list[str] = field(default_factory=list)
+    relocalisations: list[int] = field(default_factory=list)
+    failure: str | None = None
+    recovery: Recovery = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Watches over the sensor from the start."""
+        self.recovery = Recovery(self.sensor, self.config.recovery, start_std(self.config.velocity))
+
+
+def run_images(
+    sequence: ImageSequence,
+    config: MonoConfig,
+    known: KnownPixels | None = None,
+    on_frame: Callable[[int, ImageFrame, VideoRun], None] | None = None,
+    checkpoint: Path | None = None,
+    resume: bool = False,
+) -> VideoRun:
+    """Filters a whole sequence.
+
+    What was computed before a frame that cannot be filtered is kept: the run is then shorter and has a `failure`.
+
+    Args:
+        sequence: of images.
+        config: all settings.
+        known: points of known position that are seen in the first image; without them the scale is arbitrary.
+        on_frame: called after each frame.
+        checkpoint: file of checkpoints; None writes none.
+        resume: go on from the checkpoint, if there is one.
+
+    Raises:
+        InputError: the first image cannot be read, the known points do not determine the camera, or the checkpoint
+            is of another run.
+    """
+    first = next(sequence.frames(), None)
+    if first is None or first.image is None:
+        reason = "it has no image" if first is None else first.problem
+        raise InputError(f"{sequence.name}: the first image is needed to start: {reason}")
+    run = _begin(sequence, config, known, first.image)
+    if resume and checkpoint is not None and checkpoint.exists():
+        restore(run, checkpoint)
+    waited = time.perf_counter()
+    for t, frame in enumerate(_frames_from(sequence, run.filter.steps), run.filter.steps):
+        run.seconds_waiting[t] = time.perf_counter() - waited
+        try:
+            _frame(run, t, frame, _law(sequence, config, known) if t == 0 else None)
+        except InputError as error:
+            if t == 0:
+                raise
+            run.failure = f"frame {t} of {sequence.name}: {error}"
+            break
+        if checkpoint is not None and (t + 1) % config.checkpoint_every == 0:
+            save(run, checkpoint)
+        if on_frame is not None:
+            on_frame(t, frame, run)
+        waited = time.perf_counter()
+    cut(run)
+    return run
+
+
+def _frames_from(sequence: ImageSequence, start: int) -> Iterator[ImageFrame]:
+    return sequence.frames(start) if start < len(sequence) else iter(())
+
+
+def _law(sequence: ImageSequence, config: MonoConfig, known: KnownPixels | None) -> PoseLaw:
+    """Where the camera is at first: at the origin, unless the known points are landmarks of their own."""
+    if known is not None and config.known == "points":
+        return PoseLaw(resect_known(sequence.camera, known, config.search.noise_px), start_cov(config))
+    return PoseLaw(SE3.identity(), np.zeros((6, 6)))
+
+
+def _begin(
+    sequence: ImageSequence, config: MonoConfig, known: KnownPixels | None, image: np.ndarray
+) -> VideoRun:
+    start = None
+    if known is not None:
+        count = known.names.size
+        cov = known.std_m[:, None, None] ** 2 * np.eye(3)
+        points = KnownPoints(np.arange(count), known.positions, cov)
+        start = KnownStart(points, resect_known(sequence.camera, known, config.search.noise_px))
+    features = build_features(sequence.camera, config, None if start is None else start.points)
+    sensor = ImageSensor(features, config.search)
+    if known is not None:
+        sensor.begin(image, known.px, config.known == "frame")
+    total = len(sequence)
+    numbers = np.zeros((11, total))
+    poses, covs = np.zeros((total, 7)), np.zeros((total, 6, 6))
+    filter_ = assemble(config, features, start, sensor)
+    stamps = np.asarray(sequence.stamps_ns, dtype=np.int64)
+    return VideoRun(sequence, config, known, filter_, sensor, stamps, poses, covs, *numbers)
+
+
+def _frame(run: VideoRun, t: int, frame: ImageFrame, law: PoseLaw | None) -> None:
+    started = time.perf_counter()
+    frame, was_lost = run.recovery.checked(frame), run.sensor.lost
+    law = law or run.recovery.law(frame, run.filter)
+    report = run.filter.step(frame, law, frame.stamp_ns)
+    run.recovery.note(frame, run.filter)
+    run.seconds[t] = time.perf_counter() - started
+    estimate = pose_estimate(run.filter, report)
+    run.world_from_camera[t], run.cov[t] = estimate.mean, estimate.cov + run.recovery.drift(frame)
+    searched = run.sensor.searched
+    run.searched[t], run.found[t] = searched.rows.size, run.sensor.measured.landmarks.size
+    run.lost[t] = run.sensor.lost
+    run.ess[t], run.log_evidence[t] = report.ess, report.log_evidence
+    run.resampled[t], run.nis[t], run.nis_dof[t] = report.resampled, report.nis, report.rows
+    run.seconds_search[t] = run.sensor.seconds
+    run.sightings.record(run.sensor, run.filter)
+    if frame.problem is not None:
+        run.problems.append(f"frame {t}: {frame.problem}")
+    if run.sensor.lost and not was_lost:
+        run.problems.append(f"frame {t}: the camera is lost, its pose is held until the map is seen again")
+    if was_lost and not run.sensor.lost:
+        run.problems.append(f"frame {t}: the camera is found again")
+        run.relocalisations.append(t)

@@ -1,0 +1,216 @@
+"""`rbpf run mono` from end to end, on a few small rendered frames."""
+
+import importlib
+import json
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from rbpf.cli import main
+from rbpf.filter import Filter
+from rbpf.validation.trajectory_files import read_tum
+from tests.cli.mono_sequences import CAMERA, FRAMES, as_folder, render_desk
+
+FILES = {
+    "trajectory.tum", "map.npz", "map.csv", "timings.csv", "diagnostics.csv", "config.yaml", "summary.json",
+    "report.html", "path.png", "map.png", "particles.png", "error.png", "tracking.png", "timings.png",
+}  # fmt: skip
+REQUIRED = {
+    "system", "recording", "frames", "particles", "seed", "ms_per_frame", "frames_tracked", "lost_frames",
+    "relocalisations", "landmarks_full", "landmarks_partial", "observations_per_frame", "ate_rmse_m",
+    "ate_sim3_rmse_m", "rpe_translation_rmse_m", "rpe_rotation_rmse_deg", "peak_memory_mb",
+}  # fmt: skip
+TIMED = ("ms_per_frame", "peak_memory_mb")
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory):
+    return render_desk(tmp_path_factory.mktemp("rendered") / "desk")
+
+
+@pytest.fixture
+def folder(desk, tmp_path):
+    return as_folder(desk, tmp_path / "folder")
+
+
+@pytest.fixture(scope="module")
+def finished(desk, tmp_path_factory):
+    out = tmp_path_factory.mktemp("finished") / "run"
+    assert run(desk, out, "--video") == 0
+    return out
+
+
+def run(sequence, out, *arguments, known=True, video=False):
+    points = Path(sequence) / "known_points.csv"
+    given = ["--known-points", str(points)] if known and points.exists() else []
+    shown = [] if "--video" in arguments else ["--no-video"]
+    return main(
+        ["run", "mono", str(sequence), *given, "--out", str(out), "--particles", "8", *shown, *arguments]
+    )
+
+
+def summary(out):
+    return json.loads((out / "summary.json").read_text())
+
+
+def sentence(capsys):
+    """What was said last, which must be one line."""
+    error = capsys.readouterr().err
+    said = error[error.index("rbpf: ") :]
+    assert said.count("\n") == 1
+    return said
+
+
+def outputs(folder: Path) -> dict[str, bytes]:
+    """All files that hold no times; summary.json without its times."""
+    timed = {"timings.csv", "timings.png", "report.html", "checkpoint.npz"}
+    kept = {path.name: path.read_bytes() for path in folder.iterdir() if path.name not in timed}
+    entries = {name: value for name, value in summary(folder).items() if name not in TIMED}
+    return kept | {"summary.json": json.dumps(entries).encode()}
+
+
+def test_a_run_leaves_all_files_and_figures(finished):
+    assert {path.name for path in finished.iterdir()} == FILES | {"annotated.mp4"}
+    entries = summary(finished)
+    assert entries.keys() >= REQUIRED
+    assert entries["frames"] == entries["frames_tracked"] == FRAMES
+    assert entries["lost_frames"] == 0
+    assert entries["ate_rmse_m"] < 0.01
+    assert 10 <= entries["observations_per_frame"] <= 25
+    assert "annotated.mp4" in (finished / "report.html").read_text()
+
+
+def test_the_path_is_in_the_known_points_world(desk, finished):
+    found = read_tum(finished / "trajectory.tum")
+    truth = np.loadtxt(desk / "mav0" / "state_groundtruth_estimate0" / "data.csv", delimiter=",")
+    assert np.linalg.norm(found.positions - truth[:, 1:4], axis=1).max() < 0.03
+
+
+def test_the_map_is_in_that_world_and_flags_rays(desk, finished):
+    with np.load(finished / "map.npz") as archive:
+        mapped = dict(archive)
+    entries = summary(finished)
+    assert int(mapped["ray"].sum()) == entries["landmarks_partial"]
+    assert int((1 - mapped["ray"]).sum()) == entries["landmarks_full"]
+    known = np.loadtxt(desk / "known_points.csv", delimiter=",", skiprows=1)
+    rows = mapped["known"] == 1
+    assert rows.sum() == len(known)
+    assert np.abs(mapped["mean"][rows] - known[:, 3:6]).max() < 0.01
+    assert (np.linalg.eigvalsh(mapped["cov"]) > 0.0).all()
+    rays = mapped["ray"] == 1
+    largest = np.sqrt(np.linalg.eigvalsh(mapped["cov"]).max(axis=1))
+    assert rays.any() and largest[rays].min() > largest[rows].max()
+
+
+def test_times_are_told_by_stage(finished):
+    table = np.genfromtxt(finished / "timings.csv", delimiter=",", names=True)
+    assert table.size == FRAMES
+    assert np.allclose(table["search_ms"] + table["filter_ms"], table["milliseconds"], atol=1e-3)
+    assert (table["waiting_for_image_ms"] >= 0.0).all()
+
+
+def test_the_video_has_every_frame(finished):
+    capture = cv2.VideoCapture(str(finished / "annotated.mp4"))
+    frames = []
+    while (read := capture.read())[0]:
+        frames.append(read[1])
+    assert len(frames) == FRAMES
+    assert frames[0].shape[1] == 2 * CAMERA.width
+    green = (frames[8][..., 1].astype(int) - frames[8][..., 2] > 60).sum()
+    assert green > 200
+
+
+def test_config_repeats_the_run(desk, finished, tmp_path):
+    config = yaml.safe_load((finished / "config.yaml").read_text())
+    assert config["system"] == "mono" and config["known_points"].endswith("known_points.csv")
+    assert run(desk, tmp_path, "--video", "--config", str(finished / "config.yaml")) == 0
+    assert outputs(tmp_path) == outputs(finished)
+
+
+def test_a_resumed_run_is_identical(desk, finished, tmp_path, monkeypatch):
+    step = Filter.step
+
+    def interrupted(self, *args, **kwargs):
+        if self.steps == 11:
+            raise KeyboardInterrupt
+        return step(self, *args, **kwargs)
+
+    often = ("--video", "--set", "checkpoint_every=5")
+    monkeypatch.setattr(Filter, "step", interrupted)
+    assert run(desk, tmp_path, *often) == 130
+    monkeypatch.setattr(Filter, "step", step)
+    assert {path.name for path in tmp_path.iterdir()} == {"checkpoint.npz"}
+    assert run(desk, tmp_path, *often, "--resume") == 0
+    again, whole = outputs(tmp_path), outputs(finished)
+    again.pop("config.yaml"), whole.pop("config.yaml")
+    assert again == whole
+
+
+def test_a_checkpoint_of_another_sequence_is_refused(desk, folder, tmp_path, capsys):
+    assert run(desk, tmp_path / "run", "--set", "checkpoint_every=5", known=False) == 0
+    assert run(folder, tmp_path / "run", "--resume", known=False) == 2
+    assert "another sequence" in sentence(capsys)
+
+
+def test_it_starts_without_known_points(desk, tmp_path):
+    assert run(desk, tmp_path, known=False) == 0
+    entries = summary(tmp_path)
+    assert entries["known_points"] == 0 and "path_rmse_m" not in entries
+    first = read_tum(tmp_path / "trajectory.tum").world_from_body[0]
+    assert np.allclose(first, [0, 0, 0, 1, 0, 0, 0], atol=1e-9)
+
+
+def test_what_was_computed_before_a_failure_is_kept(desk, tmp_path, monkeypatch, capsys):
+    from rbpf.errors import InputError
+
+    step = Filter.step
+
+    def failing(self, *args, **kwargs):
+        if self.steps == 9:
+            raise InputError("no particle explains the observations")
+        return step(self, *args, **kwargs)
+
+    monkeypatch.setattr(Filter, "step", failing)
+    assert run(desk, tmp_path, "--video") == 2
+    assert "frame 9" in sentence(capsys)
+    assert summary(tmp_path)["frames"] == 9
+    assert len(read_tum(tmp_path / "trajectory.tum")) == 9
+    assert (tmp_path / "annotated.mp4").stat().st_size > 0
+
+
+def test_a_rerun_recording_is_written(desk, tmp_path):
+    pytest.importorskip("rerun")
+    recording = tmp_path / "run.rrd"
+    assert run(desk, tmp_path / "run", "--rerun", str(recording)) == 0
+    assert recording.read_bytes()[:4] == b"RRF2"
+    assert recording.stat().st_size > 20_000
+
+
+def test_a_missing_rerun_is_said_before_the_run(desk, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    assert run(desk, tmp_path / "run", "--rerun", str(tmp_path / "run.rrd")) == 2
+    assert "rerun-sdk" in sentence(capsys)
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_program_starts_without_rerun_and_encoder(monkeypatch):
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    for name in ("mono", "mono_rerun", "mono_video"):
+        assert importlib.reload(importlib.import_module(f"rbpf.validation.{name}"))
+
+
+def test_rendered_sequences_can_be_opened(tmp_path):
+    from rbpf.sensors.readers.images import open_images, read_known_points
+
+    arguments = ["--frames", "2", "--width", "96", "--height", "72", "--noise-std", "0"]
+    for world in ("desk", "room"):
+        out = tmp_path / world
+        assert main(["simulate", world, "--out", str(out), *arguments]) == 0
+        sequence = open_images(out)
+        assert len(sequence) == 2 and sequence.camera.width == 96
+        assert read_known_points(out / "known_points.csv").names.size == 6

@@ -1,0 +1,153 @@
+"""Bad images, calibrations and tables: one clear sentence where the run stops, a note where it goes on."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from rbpf.cli import main
+from tests.cli.mono_sequences import FRAMES, as_folder, render_desk
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory):
+    return render_desk(tmp_path_factory.mktemp("rendered") / "desk")
+
+
+@pytest.fixture
+def folder(desk, tmp_path):
+    return as_folder(desk, tmp_path / "folder")
+
+
+def run(folder, out, *arguments):
+    return main(
+        [
+            "run",
+            "mono",
+            str(folder),
+            "--out",
+            str(out),
+            "--particles",
+            "8",
+            "--no-video",
+            *map(str, arguments),
+        ]
+    )
+
+
+def refused(capsys, folder, out, *arguments):
+    """The one sentence with which a run is refused."""
+    assert run(folder, out, *arguments) == 2
+    error = capsys.readouterr().err
+    said = error[error.index("rbpf: ") :]
+    assert said.count("\n") == 1
+    assert not (out / "summary.json").exists()
+    return said
+
+
+def survived(folder, out, *arguments):
+    """The summary of a run that went on to the last frame."""
+    assert run(folder, out, *arguments) == 0
+    entries = json.loads((out / "summary.json").read_text())
+    assert entries["frames"] == FRAMES
+    return entries
+
+
+def image_path(folder, number):
+    return folder / "images" / f"{number:06d}.png"
+
+
+def known_points(desk, path, edit):
+    """The desk's known points with their lines edited."""
+    header, *lines = (desk / "known_points.csv").read_text().splitlines()
+    path.write_text("\n".join([header, *edit([line.split(",") for line in lines])]) + "\n")
+    return path
+
+
+@pytest.mark.parametrize("spoil", ["missing", "cut", "other size"])
+def test_one_bad_image_is_noted_and_survived(folder, tmp_path, spoil):
+    path = image_path(folder, 8)
+    if spoil == "missing":
+        (folder / "rgb.txt").write_text("".join(f"{k / 30:.6f} images/{k:06d}.png\n" for k in range(FRAMES)))
+        path.unlink()
+    elif spoil == "cut":
+        path.write_bytes(path.read_bytes()[:200])
+    else:
+        cv2.imwrite(str(path), np.zeros((90, 120), dtype=np.uint8))
+    entries = survived(folder, tmp_path / "run")
+    assert any("frame 8" in note and path.name in note for note in entries["problems"])
+    assert entries["frames_tracked"] == FRAMES
+
+
+@pytest.mark.parametrize("frozen", [False, True])
+def test_darkness_and_a_frozen_camera_are_survived(folder, tmp_path, frozen):
+    still = cv2.imread(str(image_path(folder, 4)), cv2.IMREAD_GRAYSCALE)
+    for number in range(5, 13):
+        cv2.imwrite(str(image_path(folder, number)), still if frozen else np.zeros_like(still))
+    assert survived(folder, tmp_path / "run")["problems"]
+
+
+def test_equal_stamps_are_survived(folder, tmp_path):
+    times = (folder / "times.txt").read_text().splitlines()
+    times[5] = times[4]
+    (folder / "times.txt").write_text("\n".join(times) + "\n")
+    assert survived(folder, tmp_path / "run")["frames_tracked"] == FRAMES
+
+
+def test_backward_stamps_name_the_line(folder, tmp_path, capsys):
+    times = (folder / "times.txt").read_text().splitlines()
+    times[5] = "0.0"
+    (folder / "times.txt").write_text("\n".join(times) + "\n")
+    said = refused(capsys, folder, tmp_path / "run")
+    assert "times.txt" in said and "6" in said and "backwards" in said
+
+
+def test_a_calibration_of_another_size_is_refused(folder, tmp_path, capsys):
+    camera = tmp_path / "camera.yaml"
+    camera.write_text("fx: 100\nfy: 100\ncx: 50\ncy: 40\nwidth: 100\nheight: 80\n")
+    said = refused(capsys, folder, tmp_path / "run", "--calibration", camera)
+    assert "100x80" in said and "240x180" in said
+
+
+def test_an_empty_folder_is_refused(tmp_path, capsys):
+    (tmp_path / "empty").mkdir()
+    assert "empty folder" in refused(capsys, tmp_path / "empty", tmp_path / "run")
+
+
+def test_a_missing_sequence_is_refused(tmp_path, capsys):
+    assert "nowhere" in refused(capsys, tmp_path / "nowhere", tmp_path / "run")
+
+
+def test_a_first_image_that_is_damaged_is_refused(folder, tmp_path, capsys):
+    image_path(folder, 0).write_bytes(b"no image")
+    assert "first image" in refused(capsys, folder, tmp_path / "run")
+
+
+def test_fewer_than_four_known_points_are_refused(desk, folder, tmp_path, capsys):
+    points = known_points(desk, tmp_path / "three.csv", lambda rows: [",".join(row) for row in rows[:3]])
+    assert "four" in refused(capsys, folder, tmp_path / "run", "--known-points", points)
+
+
+def test_known_points_that_are_mixed_up_are_refused(desk, folder, tmp_path, capsys):
+    def mixed(rows):
+        return [",".join([*row[:3], *rows[k - 1][3:]]) for k, row in enumerate(rows)]
+
+    points = known_points(desk, tmp_path / "mixed.csv", mixed)
+    said = refused(capsys, folder, tmp_path / "run", "--known-points", points)
+    assert "known point" in said and "which point is which" in said
+
+
+def test_known_points_outside_the_image_are_refused(desk, folder, tmp_path, capsys):
+    def outside(rows):
+        return [",".join([row[0], str(float(row[1]) + 500.0), *row[2:]]) for row in rows]
+
+    points = known_points(desk, tmp_path / "outside.csv", outside)
+    said = refused(capsys, folder, tmp_path / "run", "--known-points", points)
+    assert "known point 1" in said and "outside the first image" in said
+
+
+def test_results_cannot_replace_a_file(folder, tmp_path, capsys):
+    (tmp_path / "taken").write_text("mine")
+    assert "is a file" in refused(capsys, folder, tmp_path / "taken")
+    assert (tmp_path / "taken").read_text() == "mine"

@@ -1,0 +1,177 @@
+"""A camera that is lost says so, finds itself in its map, and does not claim to where it cannot know."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from rbpf.lie import SE3
+from rbpf.sensors.consensus_resection import Resected
+from rbpf.systems.mono.config import MonoConfig, RecoveryConfig
+from rbpf.systems.mono.relocalise import Relocaliser, convincing, unmistakable
+from rbpf.systems.mono.video import VideoRun, run_images
+from tests.systems.plane_sequences import CAMERA, Pictures, known_points, path, sequence, texture, view
+
+START, DARK, FRAMES = 40, 20, 90
+CONFIG = MonoConfig(particles=10, checkpoint_every=START)
+
+
+class Tracked(NamedTuple):
+    """A run, its checkpoint after the first `START` frames, and which features lived then."""
+
+    run: VideoRun
+    checkpoint: Path
+    alive: np.ndarray
+
+
+@pytest.fixture(scope="module")
+def tracked(tmp_path_factory):
+    """A run of all frames."""
+    folder, alive = tmp_path_factory.mktemp("plane"), []
+
+    def keep(t, frame, run):
+        if t + 1 == START:
+            (folder / "latest.npz").rename(folder / "start.npz")
+            alive.append(run.sensor.table.alive.copy())
+
+    run = run_images(sequence(FRAMES), CONFIG, known_points(), keep, folder / "latest.npz")
+    return Tracked(run, folder / "start.npz", alive[0])
+
+
+def resumed(tracked, tmp_path, change, frames=FRAMES):
+    """From the checkpoint on, with other images."""
+    copy = tmp_path / "start.npz"
+    copy.write_bytes(tracked.checkpoint.read_bytes())
+    config = replace(CONFIG, checkpoint_every=10 * FRAMES)
+    return run_images(sequence(frames, change), config, known_points(), None, copy, resume=True)
+
+
+def blackout(t, image):
+    """Black for a while after the start."""
+    return np.zeros_like(image) if START <= t < START + DARK else image
+
+
+def errors(run):
+    """Distances from the true positions (T,)."""
+    truth = SE3.translation(path(FRAMES))[: len(run.world_from_camera)]
+    return np.linalg.norm(SE3.translation(run.world_from_camera) - truth, axis=1)
+
+
+def test_tracking_is_not_disturbed(tracked):
+    run = tracked.run
+    assert not run.lost.any()
+    assert not run.relocalisations
+    assert not run.problems
+    assert errors(run).max() < 0.05
+
+
+def test_recovers_after_a_blackout(tracked, tmp_path):
+    run = resumed(tracked, tmp_path, blackout)
+    assert run.lost[START + 3 : START + DARK].all()
+    assert not run.lost[START + DARK + 3 :].any()
+    assert len(run.relocalisations) == 1
+    assert any("lost" in problem for problem in run.problems)
+    assert sum("shows nothing" in problem for problem in run.problems) == 1
+    assert errors(run)[-10:].max() < 0.03
+    assert np.trace(run.cov[START + DARK - 1][3:, 3:]) > np.trace(run.cov[START][3:, 3:])
+
+
+def test_missing_images_are_a_blackout_too(tracked, tmp_path):
+    run = resumed(tracked, tmp_path, lambda t, image: None if START <= t < START + DARK else image)
+    assert run.lost[START + DARK - 1]
+    assert not run.lost[-20:].any()
+    assert errors(run)[-10:].max() < 0.03
+
+
+def test_the_map_survives_the_dark(tracked, tmp_path):
+    held = resumed(tracked, tmp_path, lambda t, image: np.zeros_like(image) if t >= START else image)
+    assert np.array_equal(held.sensor.table.alive, tracked.alive)
+    assert held.lost[-1]
+    assert np.ptp(errors(held)[START:]) < 0.5
+
+
+def test_an_unknown_place_is_not_recognised(tracked, tmp_path):
+    other = Pictures(texture(seed=7), path(FRAMES), lambda t, image: image)
+    images = {t: frame.image for t, frame in enumerate(other.frames(0))}
+    run = resumed(tracked, tmp_path, lambda t, image: images[t] if t >= START else image)
+    assert run.lost[START + 3 :].all()
+    assert not run.relocalisations
+    last = SE3.translation(run.world_from_camera[START - 1])
+    assert np.linalg.norm(SE3.translation(run.world_from_camera[-1]) - last) < 0.1
+
+
+def test_a_frozen_camera_is_noticed(tracked, tmp_path):
+    still = view(texture(), path(FRAMES)[START])
+    run = resumed(tracked, tmp_path, lambda t, image: still if START <= t < START + DARK else image)
+    assert any("frozen" in problem for problem in run.problems)
+    assert run.lost[START + DARK - 1]
+    assert not run.lost[-20:].any()
+
+
+@pytest.fixture
+def relocaliser(tracked):
+    """Of the tracked run, and its belief."""
+    run = tracked.run
+    return Relocaliser(run.sensor, CONFIG.recovery), run.filter.belief(), run
+
+
+def test_the_pose_found_is_right_and_its_covariance_fair(relocaliser):
+    finder, belief, run = relocaliser
+    truth = SE3.retract(path(FRAMES)[60], np.array([0.05, -0.1, 0.2, 0.1, -0.1, 0.15]))
+    law = finder.find(belief, view(texture(), truth), run.recovery.trusted[0])
+    assert law is not None
+    start = SE3.compose(belief.state[belief.mode][:7], SE3.inverse(run.world_from_camera[-1]))
+    error = SE3.log(SE3.between(SE3.compose(start, truth), law.mean))
+    assert np.abs(error).max() < 0.03
+    assert (np.abs(error) < 4.0 * np.sqrt(np.diag(law.cov)) + 0.01).all()
+
+
+def test_two_copies_of_the_map_are_not_taken_for_it(relocaliser):
+    finder, belief, run = relocaliser
+    half = view(texture(), path(FRAMES)[-1])[:, :160]
+    assert finder.find(belief, np.hstack([half, half]), run.recovery.trusted[0]) is None
+
+
+def test_nothing_is_found_in_noise_or_in_grey(relocaliser):
+    finder, belief, run = relocaliser
+    noise = np.random.default_rng(0).integers(0, 255, (240, 320)).astype(np.uint8)
+    for image in (noise, np.full((240, 320), 90, dtype=np.uint8)):
+        assert finder.find(belief, image, run.recovery.trusted[0]) is None
+
+
+def test_too_few_landmarks_find_nothing(relocaliser):
+    _, belief, run = relocaliser
+    image, near = view(texture(), path(FRAMES)[-1]), run.recovery.trusted[0]
+    assert Relocaliser(run.sensor, RecoveryConfig()).find(belief, image, near) is not None
+    assert Relocaliser(run.sensor, RecoveryConfig(inliers=1000)).find(belief, image, near) is None
+
+
+def test_inliers_on_a_line_do_not_convince():
+    rng, along = np.random.default_rng(0), np.linspace(30.0, 290.0, 20)
+    line = np.stack([along, 0.5 * along + rng.normal(size=20)], axis=-1)
+    found = Resected(SE3.identity(), np.eye(6), np.ones(20, dtype=bool), 1.0)
+    assert not convincing(found, line, CAMERA.width, RecoveryConfig())
+    assert convincing(found, rng.uniform(0, 240, (20, 2)), CAMERA.width, RecoveryConfig())
+
+
+def test_likeness_must_be_unmistakable():
+    away = np.array([[0.1, 0.5, 0.6], [0.5, 0.2, 0.19], [0.6, 0.5, 0.5]])
+    points, px = np.eye(3), np.array([[0.0, 0.0], [50.0, 0.0], [100.0, 0.0]])
+    landmark, place = unmistakable(away, points, px, 0.8)
+    assert (landmark.tolist(), place.tolist()) == ([0], [0])
+    # Two names for one landmark, and two corners at one place, are no rivals.
+    landmark, place = unmistakable(away, points, px * [0.01, 1.0], 0.8)
+    assert 1 in landmark
+    landmark, place = unmistakable(np.array([[0.1, 0.5], [0.1, 0.6]]), np.zeros((2, 3)), px[:2], 0.8)
+    assert (landmark.size, place.tolist()) == (1, [0])
+
+
+def test_the_recovery_is_in_the_checkpoint(tracked, tmp_path):
+    run = resumed(tracked, tmp_path, lambda t, image: image)
+    again = tracked.run
+    assert run.world_from_camera == pytest.approx(again.world_from_camera, abs=1e-9)
+    arrays = run.recovery.arrays()
+    assert arrays["recovery/pose"] == pytest.approx(again.recovery.trusted[0])
+    assert int(arrays["recovery/stamp_ns"]) == again.stamps_ns[-1]

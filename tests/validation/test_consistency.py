@@ -1,0 +1,79 @@
+import csv
+
+import numpy as np
+import pytest
+
+from rbpf.errors import InputError
+from rbpf.lie import SE3
+from rbpf.systems.mono.config import MonoConfig
+from rbpf.systems.mono.run import run
+from rbpf.validation.camera_map import summarise_points
+from rbpf.validation.consistency import offdiagonal_eigenvalues, pose_errors
+from rbpf.validation.parallel import in_parallel
+from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
+from rbpf.validation.simulation.point_worlds import DeskWorld
+from rbpf.validation.tables import write_table
+
+
+def test_nees_of_errors_drawn_from_the_covariance_is_six():
+    rng = np.random.default_rng(0)
+    factor = 0.1 * rng.normal(size=(4000, 6, 6))
+    truth = SE3.exp(rng.normal(size=(4000, 6)))
+    cov = factor @ np.swapaxes(factor, 1, 2)
+    drawn = np.einsum("tab,tb->ta", factor, rng.normal(size=(4000, 6)))
+    inverse = SE3.retract(SE3.identity(), drawn)
+    estimate = SE3.compose(truth, SE3.inverse(inverse))
+    errors = pose_errors(estimate, cov, truth)
+    assert errors.nees.mean() == pytest.approx(6.0, abs=0.25)
+    distances = np.linalg.norm(estimate[:, 4:] - truth[:, 4:], axis=1)
+    np.testing.assert_allclose(errors.rmse, np.sqrt((distances**2).mean()))
+
+
+def test_pose_errors_refuses_paths_of_different_lengths():
+    path = np.tile(SE3.identity(), (3, 1))
+    with pytest.raises(InputError, match="3 poses, 2 covariances and 3 true poses"):
+        pose_errors(path, np.tile(np.eye(6), (2, 1, 1)), path)
+
+
+def test_landmarks_that_err_together_have_one_eigenvalue_off_the_diagonal():
+    shift = np.random.default_rng(1).normal(size=200)
+    points = np.zeros((200, 4, 3))
+    points[..., 0] = shift[:, None]
+    values = offdiagonal_eigenvalues(points, np.full(200, -np.log(200.0)))
+    variance = shift.var()
+    np.testing.assert_allclose(values, variance * np.array([3.0, 1.0, 1.0, 1.0, *[0.0] * 8]), atol=1e-12)
+
+
+def test_offdiagonal_eigenvalues_use_the_weights():
+    points = np.random.default_rng(2).normal(size=(3, 2, 3))
+    twice = np.concatenate([points, points[:1]])
+    log_weights = np.log([0.5, 0.25, 0.25])
+    np.testing.assert_allclose(
+        offdiagonal_eigenvalues(points, log_weights),
+        offdiagonal_eigenvalues(twice, np.full(4, np.log(0.25))),
+        atol=1e-12,
+    )
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_results_keep_the_order_of_the_jobs(workers):
+    assert in_parallel(abs, [-3, 1, -2], workers) == [3, 1, 2]
+
+
+def test_a_table_is_printed_in_columns_and_kept(tmp_path, capsys):
+    write_table(tmp_path / "new" / "table.csv", ["name", "error"], [["a", 1.23456789], ["long", 12]])
+    assert capsys.readouterr().out.splitlines() == ["name  error", "a      1.23", "long     12"]
+    with (tmp_path / "new" / "table.csv").open(encoding="utf-8", newline="") as file:
+        assert list(csv.reader(file)) == [["name", "error"], ["a", "1.23457"], ["long", "12"]]
+
+
+def test_a_camera_s_map_is_told_in_the_world_of_the_known_points():
+    log = simulate_features(DeskWorld(frames=60), Measuring(), MONO, seed=0)
+    filter_ = run(log, MonoConfig(particles=20)).filter
+    summary = summarise_points(filter_)
+    truth = np.array([log.truth.landmarks[name] for name in summary.ids.tolist()])
+    error = summary.mean - truth
+    squared = np.einsum("kd,kde,ke->k", error, np.linalg.inv(summary.cov), error)
+    assert summary.ids.size > 10
+    assert np.linalg.norm(error, axis=1).max() < 0.15
+    assert 0.3 < np.median(squared) / 3.0 < 3.0

@@ -1,0 +1,113 @@
+"""Views, annotated frames and sightings of runs over images."""
+
+import numpy as np
+import pytest
+
+from rbpf.lie import SE3
+from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.readers.images import open_images, read_known_points
+from rbpf.systems.mono.config import MonoConfig
+from rbpf.systems.mono.sightings import Sighting, Sightings
+from rbpf.systems.mono.video import run_images
+from rbpf.validation.mono_frames import FOUND, MISSED, RAY, Caption, draw_frame, drawn_size
+from rbpf.validation.mono_map import summarise_mono_map
+from rbpf.validation.mono_video import frame_rate
+from rbpf.validation.mono_views import best_views
+from rbpf.validation.simulation.exposure import Imaging
+from rbpf.validation.simulation.images import simulate_images
+from rbpf.validation.simulation.textured_desk import TexturedDesk
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("rendered") / "desk"
+    camera = Pinhole(240, 180, 190.0, 190.0, 119.5, 89.5)
+    world = TexturedDesk(frames=40, texel_m=0.003, speed_m_s=0.6, start_s=0.2)
+    simulate_images(world, Imaging(noise_std=1.0), camera, folder, seed=1)
+    return run_images(
+        open_images(folder), MonoConfig(particles=8), read_known_points(folder / "known_points.csv")
+    )
+
+
+def test_rays_are_found_on_their_epipolar_lines(run):
+    last = [sighting for sighting in run.sightings.frames[20:] if (sighting.is_ray & sighting.found).any()]
+    distances = []
+    for sighting in last:
+        rows = sighting.is_ray & sighting.found
+        start, end = np.moveaxis(sighting.line[rows], 1, 0)
+        along = (end - start) / np.linalg.norm(end - start, axis=1, keepdims=True)
+        offset = sighting.px[rows] - start
+        distances += np.abs(offset[:, 0] * along[:, 1] - offset[:, 1] * along[:, 0]).tolist()
+    assert len(distances) > 20
+    assert np.median(distances) < 1.0
+
+
+def test_places_that_were_seen_lie_in_the_known_points_world(run):
+    sighting = run.sightings.frames[-1]
+    members = sighting.found & (sighting.rows < run.known.names.size)
+    assert members.any()
+    place = sighting.place[members, :3] / sighting.place[members, 3:]
+    assert np.abs(place - run.known.positions[sighting.rows[members]]).max() < 0.02
+
+
+def test_sightings_come_back_from_arrays(run):
+    restored = Sightings()
+    restored.restore(run.sightings.arrays())
+    assert len(restored.frames) == len(run.sightings.frames)
+    for ours, theirs in zip(restored.frames, run.sightings.frames, strict=True):
+        assert all(
+            np.array_equal(getattr(ours, n), value, equal_nan=True) for n, value in vars(theirs).items()
+        )
+
+
+def test_the_map_covers_the_desk_within_its_own_uncertainty(run):
+    mapped = summarise_mono_map(run.filter)
+    new = ~mapped.is_ray & (mapped.landmarks.ids >= run.known.names.size)
+    height, std = mapped.landmarks.mean[new, 2], np.sqrt(mapped.landmarks.cov[new, 2, 2])
+    assert new.sum() >= 5
+    assert (height + 4.0 * std > -0.005).all()  # nothing on the desk lies below its top
+    assert (height - 4.0 * std < 0.255).all()  # nor above its highest thing
+
+
+@pytest.mark.parametrize(
+    ("vertical", "down", "tilt_deg"), [(2, False, 50.0), (2, False, 0.0), (1, True, 10.0), (0, False, 30.0)]
+)
+def test_views_find_the_vertical(vertical, down, tilt_deg):
+    up = np.eye(3)[vertical] * (-1.0 if down else 1.0)
+    first = np.eye(3)[(vertical + 1) % 3]
+    poses = []
+    for heading in np.deg2rad(np.linspace(-25.0, 25.0, 9)):
+        ahead = np.cos(heading) * first + np.sin(heading) * np.cross(up, first)
+        right = np.cross(ahead, up)
+        tilt = np.deg2rad(tilt_deg)
+        forward = np.cos(tilt) * ahead - np.sin(tilt) * up
+        poses.append(np.column_stack([right, np.cross(forward, right), forward, np.zeros(3)]))
+    views = best_views(SE3.from_matrix(np.array(poses)))
+    assert views.side[1] == vertical and views.down == down
+    a, b = np.eye(3)[list(views.top)]
+    assert np.allclose(np.cross(a, b), up)
+
+
+def test_a_frame_shows_hits_misses_and_lines():
+    sighting = Sighting(
+        rows=np.array([0, 1]),
+        mean=np.array([[40.0, 30.0], [80.0, 40.0]]),
+        cov=np.tile(4.0 * np.eye(2), (2, 1, 1)),
+        px=np.array([[41.0, 30.0], [np.nan, np.nan]]),
+        line=np.array([[[np.nan] * 2] * 2, [[-1e9, 40.0], [1e9, 40.0]]]),
+        place=np.full((2, 4), np.nan),
+        started=np.zeros((0, 2)),
+        held=np.array([[1, 1]]),
+    )
+    image = np.full((90, 120), 128, dtype=np.uint8)
+    picture = draw_frame(image, sighting, Caption("frame 0", ""), 120, 90)
+    assert picture.shape[:2] == drawn_size(120, 90)[::-1]
+    below = picture[30:]
+    counts = [int((below == colour).all(axis=-1).sum()) for colour in (FOUND, MISSED, RAY)]
+    assert min(counts[:2]) > 30 and counts[2] > 200
+
+
+def test_equal_stamps_still_have_a_rate():
+    assert frame_rate(np.arange(5) * 33_333_333) == pytest.approx(30.0, abs=0.01)
+    assert frame_rate(np.zeros(5, dtype=np.int64)) == 1.0
+    assert frame_rate(np.array([0])) == 1.0

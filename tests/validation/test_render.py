@@ -1,0 +1,224 @@
+"""Rendered pictures: geometry to a part of a pixel, depth, occlusion, filtering, consistency between views."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rbpf.errors import InputError
+from rbpf.lie import SE3
+from rbpf.sensors.pinhole import Pinhole
+from rbpf.validation.simulation.render import Renderer, rotated_grid
+from rbpf.validation.simulation.textured_desk import TexturedDesk
+from rbpf.validation.simulation.textured_room import TexturedRoom
+from rbpf.validation.simulation.textured_scene import Chessboard, ImageWorld, Rectangle, TexturedScene, cast
+from rbpf.validation.simulation.textures import clouds, grey_levels
+
+CAMERA = Pinhole(160, 120, 110.0, 108.0, 78.0, 61.5)
+DISTORTED = replace(CAMERA, distortion=(-0.28, 0.07, 1e-3, -5e-4, 0.01))
+AXES = np.eye(3)
+DESK = TexturedDesk(frames=12, texel_m=0.008, board=(7, 5), square_m=0.1)
+ROOM = TexturedRoom(frames=12, texel_m=0.02)
+
+
+def drawn(world: ImageWorld) -> TexturedScene:
+    return world.build(np.random.default_rng(5))
+
+
+def facing(distance: float, size: float, texture: np.ndarray) -> Rectangle:
+    """A square that faces a camera at the origin."""
+    corner = np.array([-0.5 * size, -0.5 * size, distance])
+    return Rectangle(corner, size * AXES[0], size * AXES[1], texture)
+
+
+def noise(side: int, seed: int = 0) -> np.ndarray:
+    return grey_levels(128.0 + 30.0 * clouds((side, side), np.random.default_rng(seed)))
+
+
+def squares(board: Chessboard, camera: Pinhole, pose: np.ndarray, px: np.ndarray) -> np.ndarray:
+    """Grey levels (…) of a chessboard at pixels (…, 2), from the board's definition alone."""
+    ray = np.concatenate([camera.unproject(px), np.ones((*px.shape[:-1], 1))], axis=-1)
+    board_from_camera = SE3.compose(SE3.inverse(board.world_from_board), pose)
+    eye = board_from_camera[4:]
+    turned = SE3.transform(board_from_camera, ray) - eye
+    place = eye - eye[2] / turned[..., 2:] * turned
+    cell = np.floor(place[..., :2] / board.square_m).sum(axis=-1) % 2
+    return np.where(cell == 0, 20.0, 235.0)
+
+
+@pytest.mark.parametrize("camera", [CAMERA, DISTORTED])
+def test_corners_are_seen_where_opencv_projects_them(camera: Pinhole) -> None:
+    """A window about each corner is registered (least squares) to the mean of 9 × 9 exact rays per pixel."""
+    cv2 = pytest.importorskip("cv2")
+    scene = drawn(DESK)
+    board = scene.boards[0]
+    renderer = Renderer(scene.rectangles, camera)
+    around = np.stack(np.meshgrid(np.arange(-5.0, 6.0), np.arange(-5.0, 6.0)), axis=-1)
+    within = np.stack(np.meshgrid(*[(np.arange(9) - 4.0) / 9.0] * 2), axis=-1)
+    matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
+    for pose in scene.world_from_camera[[0, -1]]:
+        image = renderer.image(pose)
+        points = SE3.inverse_transform(pose, board.corners)
+        seen, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, np.array(camera.distortion))
+        for corner in seen[:, 0]:
+            px = np.round(corner) + around
+            exact = squares(board, camera, pose, px[:, :, None, None] + within).mean(axis=(2, 3))
+            down, across = np.gradient(exact)
+            slope = np.stack([across, down], axis=-1)[1:-1, 1:-1].reshape(-1, 2)
+            column, row = np.moveaxis(px.astype(int)[1:-1, 1:-1], -1, 0)
+            shift, *_ = np.linalg.lstsq(slope, (exact[1:-1, 1:-1] - image[row, column]).ravel(), rcond=None)
+            assert np.abs(shift).max() < 0.05
+
+
+@pytest.mark.parametrize("camera", [CAMERA, DISTORTED])
+def test_depth_is_that_of_the_plane(camera: Pinhole) -> None:
+    sides = np.array([[40.0, 0.0, 9.0], [0.0, 40.0, -8.0]])
+    tilted = Rectangle(np.array([-20.0, -20.0, 6.0]), sides[0], sides[1], noise(64))
+    pose = SE3.exp([0.1, -0.2, 0.3, 0.2, 0.1, -0.4])
+    depth, rows = Renderer([tilted], camera).depth(pose)
+    px = np.stack(np.meshgrid(np.arange(160.0), np.arange(120.0)), axis=-1)
+    ray = np.concatenate([camera.unproject(px), np.ones((120, 160, 1))], axis=-1)
+    normal = np.cross(tilted.across, tilted.down)
+    turned = ray @ SE3.matrix(pose)[:3, :3].T
+    expected = normal @ (tilted.corner - pose[4:]) / (turned @ normal)
+    assert (rows == 0).all()
+    np.testing.assert_allclose(depth, expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("camera", [CAMERA, DISTORTED])
+@pytest.mark.parametrize("size", [0.1, 1.0])
+@pytest.mark.parametrize("seed", range(2))
+def test_the_nearest_of_many_rectangles_is_seen(camera: Pinhole, seed: int, size: float) -> None:
+    """Also of those that reach behind the camera; the reference casts each ray at each rectangle."""
+    rng = np.random.default_rng(seed)
+    reach = size * np.array([[4.0], [1.5], [1.5]])
+    places = reach * rng.uniform(-1.0, 1.0, (150, 3, 3))
+    sheets = [Rectangle(corner, across, down, noise(8)) for corner, across, down in places]
+    pose = SE3.exp(rng.normal(size=6) * [1.0, 1.0, 1.0, size, size, size])
+    depth, rows = Renderer(sheets, camera).depth(pose)
+    px = np.stack(np.meshgrid(np.arange(160.0), np.arange(120.0)), axis=-1)
+    expected, expected_rows = cast(sheets, pose, camera.unproject(px).reshape(-1, 2))
+    assert len(set(rows.ravel().tolist())) > 8
+    np.testing.assert_array_equal(rows.ravel(), expected_rows)
+    np.testing.assert_allclose(depth.ravel(), expected, rtol=1e-9)
+
+
+def test_a_sheet_that_passes_under_the_camera_is_seen_to_the_border() -> None:
+    under = Rectangle(np.array([-0.2, 0.1, -1.0]), 0.4 * AXES[0], 1.4 * AXES[2], noise(64))
+    depth, rows = Renderer([under], CAMERA).depth(SE3.identity())
+    px = np.stack([np.full(50, 78.0), np.arange(70.0, 120.0)], axis=-1)
+    v = CAMERA.unproject(px)[:, 1]
+    np.testing.assert_array_equal(rows[70:, 78], np.where(v >= 0.25, 0, -1))
+    np.testing.assert_allclose(depth[119], 0.1 / v[-1])
+
+
+def test_pixels_without_a_ray_and_rays_without_a_rectangle_are_black() -> None:
+    folded = replace(CAMERA, fx=40.0, fy=40.0, distortion=(-0.3, 0.0, 0.0, 0.0, 0.0))
+    white = np.full((4, 4), 255, dtype=np.uint8)
+    nowhere = np.isnan(folded.unproject(np.array([0.0, 0.0]))).any()
+    image = Renderer([facing(1.0, 50.0, white)], folded).image(SE3.identity())
+    assert nowhere and image[0, 0] == 0.0 and image[60, 80] == 255.0
+    image = Renderer([facing(1.0, 0.5, white)], CAMERA).image(SE3.identity())
+    assert image[0, 0] == 0.0 and image[60, 80] == 255.0
+
+
+def test_disparity_is_focal_length_times_baseline_over_depth() -> None:
+    camera = replace(CAMERA, fx=120.0, fy=120.0)
+    wall = facing(2.0, 8.0, noise(400))
+    renderer = Renderer([wall], camera)
+    right = SE3.exp([0.0, 0.0, 0.0, 0.15, 0.0, 0.0])
+    disparity = round(camera.fx * 0.15 / 2.0)
+    left_image, right_image = renderer.image(SE3.identity()), renderer.image(right)
+    assert left_image.std() > 5.0
+    np.testing.assert_allclose(right_image[:, :-disparity], left_image[:, disparity:], atol=1e-3)
+
+
+@pytest.mark.parametrize("world", [DESK, ROOM])
+def test_two_views_show_the_same_grey_levels(world: ImageWorld) -> None:
+    """The second picture, read where the first one's points are in it, is the first one."""
+    from scipy.ndimage import map_coordinates
+
+    scene = drawn(world)
+    renderer = Renderer(scene.rectangles, DISTORTED)
+    first, second = scene.world_from_camera[[0, -1]]
+    depth, _ = renderer.depth(first)
+    px = np.stack(np.meshgrid(np.arange(160.0), np.arange(120.0)), axis=-1)
+    ray = np.concatenate([DISTORTED.unproject(px), np.ones((120, 160, 1))], axis=-1)
+    point = SE3.inverse_transform(second, SE3.transform(first, depth[..., None] * ray))
+    other = DISTORTED.project(point)
+    far = map_coordinates(
+        renderer.depth(second)[0], np.moveaxis(other[..., ::-1], -1, 0), order=1, mode="nearest"
+    )
+    same = DISTORTED.visible(point, 2.0) & (np.abs(far / point[..., 2] - 1.0) < 0.01)
+    there = map_coordinates(renderer.image(second), np.moveaxis(other[..., ::-1], -1, 0), order=3)
+    here = renderer.image(first)
+    assert same.mean() > 0.5
+    assert np.linalg.norm(other - px, axis=-1)[same].mean() > 0.5
+    assert np.corrcoef(here[same], there[same])[0, 1] > 0.95
+    assert abs((here - there)[same].mean()) < 0.5
+
+
+def test_a_distant_texture_is_averaged() -> None:
+    """Texels of 0 and 255 in turn, seven to a pixel: without filtering the picture would be full of moiré."""
+    checker = (255 * (np.indices((1024, 1024)).sum(axis=0) % 2)).astype(np.uint8)
+    inner = Renderer([facing(2.0, 4.0, checker)], CAMERA).image(SE3.identity())[30:90, 40:120]
+    np.testing.assert_allclose(inner, 127.5, atol=1.5)
+
+
+def test_a_near_texture_is_interpolated() -> None:
+    """Between two texels' centres the grey level rises evenly."""
+    step = np.array([[50, 150], [50, 150]], dtype=np.uint8)
+    camera = replace(CAMERA, fx=100.0, fy=100.0)
+    row = Renderer([facing(1.0, 1.6, step)], camera).image(SE3.identity())[60]
+    inside = np.arange(40, 117)
+    expected = 50.0 + 100.0 * ((inside - camera.cx) / 160.0 + 0.25) * 2.0
+    np.testing.assert_allclose(row[inside], np.clip(expected, 50.0, 150.0), atol=0.7)
+
+
+@pytest.mark.parametrize("grid", [1, 2, 3])
+def test_an_edge_covers_its_share_of_the_pixel(grid: int) -> None:
+    white = np.full((4, 4), 200, dtype=np.uint8)
+    shares, rays = np.linspace(0.05, 0.95, 10), grid * grid
+    for share in shares:
+        edge = (80.0 - 0.5 + share - CAMERA.cx) / CAMERA.fx
+        sheet = Rectangle(np.array([edge - 2.0, -2.0, 1.0]), 2.0 * AXES[0], 4.0 * AXES[1], white)
+        row = Renderer([sheet], CAMERA, grid).image(SE3.identity())[60]
+        assert row[79] == 200.0 and row[81] == 0.0
+        assert abs(row[80] / 200.0 - share) <= 0.5 / rays + 1e-6
+
+
+@pytest.mark.parametrize("side", [1, 2, 3, 8])
+def test_rays_are_spread_over_the_pixel(side: int) -> None:
+    """Each of the n² columns and rows of the pixel has one ray, and no two are near each other."""
+    place = rotated_grid(side) + 0.5
+    cells = np.sort((place * side * side).astype(int), axis=0)
+    np.testing.assert_array_equal(cells, np.tile(np.arange(side * side)[:, None], 2))
+    np.testing.assert_allclose(place.mean(axis=0), 0.5)
+    apart = np.linalg.norm(place[:, None] - place, axis=-1)
+    assert (apart[~np.eye(side * side, dtype=bool)] > 1.0 / side).all()
+
+
+def test_a_moving_camera_sees_the_mean_of_what_it_sees() -> None:
+    renderer = Renderer([facing(1.0, 8.0, noise(400))], CAMERA, grid=2)
+    path = SE3.exp(np.linspace(-0.02, 0.02, 25)[:, None] * np.array([0.0, 1.0, 0.0, 0.0, 1.0, 0.0]))
+    mean = np.mean([renderer.image(pose) for pose in path], axis=0)
+    np.testing.assert_allclose(renderer.image(path[np.random.default_rng(0).permutation(25)]), mean, atol=3.0)
+    assert np.abs(renderer.image(SE3.identity()) - mean).max() > 10.0
+
+
+SQUARE = {"corner": np.zeros(3), "across": AXES[0], "down": AXES[1], "texture": noise(8)}
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"down": 2.0 * AXES[0]}, "span an area"),
+        ({"corner": np.array([0.0, np.nan, 0.0])}, "finite"),
+        ({"texture": noise(8).astype(float)}, "uint8"),
+        ({"texture": noise(8)[:1]}, "at least 2 x 2"),
+        ({"gain": -1.0}, "gain"),
+    ],
+)
+def test_impossible_rectangles_are_refused(wrong: dict, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        Rectangle(**{**SQUARE, **wrong})

@@ -1,0 +1,211 @@
+"""Image sequences on disk: files, reproducibility, known points, interruption."""
+
+import csv
+import doctest
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from rbpf.errors import InputError
+from rbpf.lie import SE3
+from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+from rbpf.validation.simulation import images, textured_scene
+from rbpf.validation.simulation.exposure import Imaging
+from rbpf.validation.simulation.images import simulate_images
+from rbpf.validation.simulation.textured_desk import TexturedDesk
+from rbpf.validation.simulation.textured_room import TexturedRoom
+from rbpf.validation.simulation.textured_scene import ImageWorld, stamps_ns
+
+cv2 = pytest.importorskip("cv2")
+
+CAMERA = Pinhole(160, 120, 110.0, 110.0, 79.5, 59.5, (-0.1, 0.02, 1e-3, 0.0, 0.0))
+STEREO = RectifiedStereo(replace(CAMERA, distortion=(0.0,) * 5), 0.1)
+DESK = TexturedDesk(frames=4, texel_m=0.008)
+ROOM = TexturedRoom(frames=4, texel_m=0.02)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def pictures(folder: Path, sensor: str = "cam0") -> np.ndarray:
+    paths = sorted((folder / "mav0" / sensor / "data").iterdir())
+    return np.array([cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in paths])
+
+
+def states(folder: Path) -> np.ndarray:
+    """(T, 17) strings."""
+    with open(folder / "mav0" / "state_groundtruth_estimate0" / "data.csv", encoding="utf-8") as file:
+        return np.array(list(csv.reader(file))[1:])
+
+
+def truth(folder: Path) -> np.ndarray:
+    """(T, 7) poses."""
+    return states(folder)[:, [5, 6, 7, 4, 1, 2, 3]].astype(float)
+
+
+@pytest.mark.parametrize("world", [DESK, ROOM])
+def test_a_seed_gives_the_same_bytes(world: ImageWorld, tmp_path: Path) -> None:
+    imaging = Imaging(exposure_drift=0.2, blur_s=0.05, vignetting=0.3, known=4)
+    for name, seed in {"first": 3, "again": 3, "other": 4}.items():
+        simulate_images(world, imaging, STEREO, tmp_path / name, seed)
+    first, again, other = (contents(tmp_path / name) for name in ("first", "again", "other"))
+    assert first == again
+    assert first.keys() == other.keys()
+    different = {name for name in first if first[name] != other[name]}
+    assert {name for name in first if name.endswith(".png")} | {"known_points.csv"} <= different
+
+
+def test_the_folder_is_as_euroc_has_it(tmp_path: Path) -> None:
+    told: list[tuple[int, int]] = []
+    folder = tmp_path / "deep" / "desk"
+    simulate_images(DESK, Imaging(depth=True), STEREO, folder, 0, lambda *args: told.append(args))
+    assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    stamps = stamps_ns(4, 30.0).tolist()
+    for sensor, offset in {"cam0": 0.0, "cam1": 0.1, "depth0": 0.0}.items():
+        place = folder / "mav0" / sensor
+        with open(place / "data.csv", encoding="utf-8") as file:
+            header, *rows = csv.reader(file)
+        assert header == ["#timestamp [ns]", "filename"]
+        assert rows == [[str(stamp), f"{stamp}.png"] for stamp in stamps]
+        assert sorted(path.name for path in (place / "data").iterdir()) == [row[1] for row in rows]
+        about = yaml.safe_load((place / "sensor.yaml").read_text())
+        body_from_sensor = np.array(about["T_BS"]["data"]).reshape(4, 4)
+        np.testing.assert_array_equal(body_from_sensor, np.eye(4) + offset * np.eye(4, k=3))
+        assert about["resolution"] == [160, 120] and about["rate_hz"] == pytest.approx(30.0)
+        assert about["intrinsics"] == [110.0, 110.0, 79.5, 59.5]
+        assert about["distortion_coefficients"] == [0.0] * 4
+    poses = DESK.build(np.random.default_rng(0)).world_from_camera
+    np.testing.assert_allclose(truth(folder), poses, atol=1e-11)
+    table = states(folder)
+    assert table.shape == (4, 17) and table[:, 0].tolist() == [str(stamp) for stamp in stamps]
+    velocity = (poses[2, 4:] - poses[0, 4:]) / (stamps[2] - stamps[0]) * 1e9
+    np.testing.assert_allclose(table[1, 8:11].astype(float), velocity, atol=1e-9)
+    about = yaml.safe_load((folder / "camera.yaml").read_text())
+    assert about == {
+        "model": "pinhole", "fx": 110.0, "fy": 110.0, "cx": 79.5, "cy": 59.5, "width": 160, "height": 120,
+        "distortion": [0.0] * 5, "baseline_m": 0.1,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("exact", [True, False])
+@pytest.mark.parametrize("world", [DESK, ROOM])
+def test_known_points_are_corners_seen_in_the_first_image(
+    world: ImageWorld, exact: bool, tmp_path: Path
+) -> None:
+    imaging = Imaging(known=8, known_std_m=0.02, known_exact=exact, noise_std=1.0, depth=True)
+    simulate_images(world, imaging, CAMERA, tmp_path / "run", 1)
+    table = np.genfromtxt(tmp_path / "run" / "known_points.csv", delimiter=",", names=True)
+    px = np.stack([table["u_px"], table["v_px"]], axis=-1)
+    position = np.stack([table["x_m"], table["y_m"], table["z_m"]], axis=-1)
+    first, *_, last = truth(tmp_path / "run")
+    local = SE3.inverse_transform(first, position)
+    error = CAMERA.project(local) - px
+    assert table["id"].tolist() == list(range(1, 9)) and (table["sigma_m"] == 0.02).all()
+    if exact:
+        assert np.abs(error).max() < 1e-3
+        depth = pictures(tmp_path / "run", "depth0")[0] / 5000.0
+        for (column, row), point in zip(px.astype(int), local, strict=True):
+            assert abs(depth[row, column] - point[2]) < 2e-4
+            window = depth[row - 3 : row + 4, column - 3 : column + 4]
+            assert window.max() < 1.15 * window.min()
+    else:
+        score = error / (0.02 * CAMERA.fx / local[:, 2:])
+        assert 0.3 < score.std() < 2.0
+    image = pictures(tmp_path / "run")[0].astype(np.float32)
+    quality = cv2.cornerMinEigenVal(image, 5)
+    u, v = np.round(px).astype(int).T
+    assert (quality[v, u] > np.median(quality)).all()
+    assert (np.ptp(px[:4], axis=0) > [50.0, 35.0]).all()
+    apart = np.linalg.norm(px[:, None] - px, axis=-1)
+    assert (apart[~np.eye(8, dtype=bool)] > 10.0).all()
+    assert CAMERA.visible(SE3.inverse_transform(last, position), margin_px=5.0).all()
+
+
+def test_a_chessboard_is_found_where_its_file_says(tmp_path: Path) -> None:
+    world = replace(DESK, board=(7, 5), square_m=0.08)
+    simulate_images(world, Imaging(), CAMERA, tmp_path / "run", 2)
+    (about,) = yaml.safe_load((tmp_path / "run" / "chessboard.yaml").read_text())
+    size = about["columns"], about["rows"]
+    assert size == (6, 4)
+    found, corners = cv2.findChessboardCornersSB(
+        cv2.resize(pictures(tmp_path / "run")[0], None, fx=4, fy=4), size
+    )
+    assert found
+    y, x = np.divmod(np.arange(24), 6)
+    local = about["square_m"] * np.stack([x, y, 0 * x], axis=-1)
+    world_point = SE3.transform(np.array(about["world_from_board"]), local)
+    expected = CAMERA.project(SE3.inverse_transform(truth(tmp_path / "run")[0], world_point))
+    seen = (corners.reshape(-1, 2) + 0.5) / 4.0 - 0.5
+    # The board looks the same turned by half a turn.
+    nearest = np.linalg.norm(seen[:, None] - expected, axis=-1).min(axis=1)
+    assert nearest.max() < 0.3
+
+
+def test_an_interrupted_run_leaves_nothing(tmp_path: Path) -> None:
+    def stop(done: int, total: int) -> None:
+        if done == 2:
+            raise KeyboardInterrupt
+
+    (tmp_path / "run").mkdir()
+    with pytest.raises(KeyboardInterrupt):
+        simulate_images(DESK, Imaging(), CAMERA, tmp_path / "run", 0, stop)
+    assert list(tmp_path.rglob("*")) == [tmp_path / "run"]
+    simulate_images(DESK, Imaging(), CAMERA, tmp_path / "run", 0)
+    assert len(pictures(tmp_path / "run")) == 4
+    assert not (tmp_path / "run.partial").exists()
+
+
+def test_a_folder_with_files_is_not_touched(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match="exists already"):
+        simulate_images(DESK, Imaging(), CAMERA, tmp_path, 0)
+    assert contents(tmp_path) == {"notes.txt": b"mine"}
+
+
+def test_a_poor_world_has_less_contrast() -> None:
+    rng = np.random.default_rng
+    rich, poor = (replace(DESK, contrast=contrast).build(rng(0)).rectangles for contrast in (1.0, 0.1))
+    ratio = [b.texture.std() / a.texture.std() for a, b in zip(rich, poor, strict=True)]
+    assert 0.07 < np.median(ratio) < 0.13
+
+
+def test_the_path_depends_on_the_seed_and_not_on_what_is_there() -> None:
+    paths = [
+        world.build(np.random.default_rng(0)).world_from_camera
+        for world in (DESK, replace(DESK, papers=3, board=(5, 4)), replace(DESK, contrast=0.2))
+    ]
+    np.testing.assert_array_equal(paths[0], paths[1])
+    np.testing.assert_array_equal(paths[0], paths[2])
+
+
+@pytest.mark.parametrize("module", [images, textured_scene])
+def test_examples_in_the_docstrings_run(module: object) -> None:
+    result = doctest.testmod(module)  # type: ignore[arg-type]
+    assert result.attempted > 0 and result.failed == 0
+
+
+@pytest.mark.parametrize(
+    ("world", "options", "name"),
+    [
+        (TexturedDesk, {"frames": 1}, "frames"),
+        (TexturedDesk, {"texel_m": 0.0}, "texel_m"),
+        (TexturedDesk, {"board": (2, 5)}, "board"),
+        (TexturedDesk, {"nearest_m": 2.0, "farthest_m": 1.0}, "nearest_m"),
+        (TexturedDesk, {"things": -1}, "things"),
+        (TexturedRoom, {"size_m": (3.0, 3.0, 2.5)}, "size_m"),
+        (TexturedRoom, {"eye_m": 3.0}, "eye_m"),
+        (TexturedRoom, {"drop_deg": 90.0}, "drop_deg"),
+        (TexturedRoom, {"contrast": -1.0}, "contrast"),
+    ],
+)
+def test_bad_worlds_are_refused(world: type, options: dict, name: str) -> None:
+    with pytest.raises(InputError, match=name):
+        world(**options)

@@ -1,0 +1,131 @@
+"""Everything that a run over images leaves in its folder. Each file is written under a temporary name, then renamed.
+
+trajectory.tum           online filtered mean at every frame, in the world of the known points, else of the first camera
+map.npz, map.csv         landmarks: id, mean, covariance (within + between particles); whether it is a ray, was known
+timings.csv              milliseconds per frame: whole, search, filter; and waiting for the decoded image
+diagnostics.csv          what was looked for and found, whether the camera was lost; sample size, evidence, NIS
+config.yaml              everything needed to repeat the run
+summary.json             the figures
+*.png, annotated.mp4     pictures; every frame with what was looked for in it
+report.html              one page with all figures and pictures
+"""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from rbpf import __version__
+from rbpf.systems.mono.video import VideoRun
+from rbpf.validation.files import (
+    milliseconds_per_frame,
+    nis_ratio,
+    peak_memory_mb,
+    prepare_folder,
+    write_csv,
+    write_map,
+    write_text,
+)
+from rbpf.validation.mono_map import MonoMap
+from rbpf.validation.mono_scores import score_camera
+from rbpf.validation.trajectory import Trajectory
+from rbpf.validation.trajectory_files import write_tum
+
+
+def write_mono_run(run: VideoRun, mapped: MonoMap, out: Path, sources: dict[str, str]) -> dict[str, Any]:
+    """Writes all data files of a run.
+
+    Args:
+        run: what was filtered.
+        mapped: its map.
+        out: the run's folder.
+        sources: what it was filtered from, for config.yaml: recording, known_points, calibration.
+
+    Returns:
+        The entries of summary.json.
+    """
+    prepare_folder(out)
+    write_tum(out / "trajectory.tum", Trajectory(run.stamps_ns, run.world_from_camera))
+    table = run.sensor.table
+    rows = mapped.landmarks.ids
+    given = 0 if run.known is None else run.known.names.size
+    facts = {
+        "ray": mapped.is_ray.astype(int),
+        "known": (rows < given).astype(int),
+        "attempts": table.attempts[rows],
+        "found": table.found[rows],
+    }
+    write_map(out, mapped.landmarks, facts)
+    _write_tables(run, out)
+    config = {"rbpf": __version__, "system": "mono", **sources, **asdict(run.config)}
+    write_text(out / "config.yaml", yaml.safe_dump(config, sort_keys=False))
+    entries = summarise_camera(run, mapped)
+    write_text(out / "summary.json", json.dumps(entries, indent=2, allow_nan=False) + "\n")
+    return entries
+
+
+def summarise_camera(run: VideoRun, mapped: MonoMap) -> dict[str, Any]:
+    """The entries of summary.json."""
+    lost = run.lost.astype(bool)
+    looked = run.searched > 0
+    hits = float(run.found[looked].sum() / run.searched[looked].sum()) if looked.any() else 0.0
+    problems = {"problems": run.problems} if run.problems else {}
+    failure = {} if run.failure is None else {"failure": run.failure}
+    return {
+        "system": "mono",
+        "recording": run.sequence.name,
+        "frames": int(run.stamps_ns.size),
+        "frames_tracked": int((~lost).sum()),
+        "lost_frames": int(lost.sum()),
+        "relocalisations": len(run.relocalisations),
+        "known_points": 0 if run.known is None else int(run.known.names.size),
+        "particles": run.config.particles,
+        "seed": run.config.seed,
+        "ms_per_frame": milliseconds_per_frame(run.seconds),
+        "landmarks_full": int((~mapped.is_ray).sum()),
+        "landmarks_partial": int(mapped.is_ray.sum()),
+        "observations_per_frame": float(run.found.mean()),
+        "share_found": hits,
+        "resamplings": int(run.resampled.sum()),
+        "ess_mean": float(run.ess.mean()),
+        "log_evidence": float(np.sum(run.log_evidence)) if np.isfinite(run.log_evidence).all() else None,
+        "nis_per_dof": nis_ratio(run.nis, run.nis_dof),
+        "peak_memory_mb": peak_memory_mb(),
+        **score_camera(run),
+        **problems,
+        **failure,
+    }
+
+
+def _write_tables(run: VideoRun, out: Path) -> None:
+    """timings.csv and diagnostics.csv."""
+    frames = range(run.stamps_ns.size)
+    seconds = (run.seconds, run.seconds_search, run.seconds - run.seconds_search, run.seconds_waiting)
+    write_csv(
+        out / "timings.csv",
+        ["step", "milliseconds", "search_ms", "filter_ms", "waiting_for_image_ms"],
+        zip(frames, *((1e3 * column).round(4).tolist() for column in seconds), strict=True),
+    )
+    counts = (run.searched, run.found, run.lost, run.resampled)
+    searched, found, lost, resampled = (column.astype(int).tolist() for column in counts)
+    ess, evidence, nis, dof = (
+        column.tolist() for column in (run.ess, run.log_evidence, run.nis, run.nis_dof.astype(int))
+    )
+    names = [
+        "step",
+        "stamp_ns",
+        "searched",
+        "found",
+        "lost",
+        "ess",
+        "resampled",
+        "log_evidence",
+        "nis",
+        "nis_dof",
+    ]
+    stamps = run.stamps_ns.tolist()
+    rows = zip(frames, stamps, searched, found, lost, ess, resampled, evidence, nis, dof, strict=True)
+    write_csv(out / "diagnostics.csv", names, rows)

@@ -1,0 +1,152 @@
+"""Renders pictures of textured rectangles by casting rays: exact geometry, filtered textures."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from rbpf.lie import SE3
+from rbpf.sensors.pinhole import Pinhole
+from rbpf.validation.simulation.textured_scene import Rectangle, rays_to_sides
+
+NEAR_M = 1e-3
+"""What is nearer to the camera's plane is not seen."""
+
+
+class Renderer:
+    """Takes pictures of rectangles with one camera.
+
+    Grey levels are proportional to light. A pixel is the mean of grid² rays on a rotated grid within it; each reads
+    its texture at the level of detail of its share of the pixel, between the two nearest levels.
+    """
+
+    def __init__(self, rectangles: Sequence[Rectangle], camera: Pinhole, grid: int = 2) -> None:
+        """Prepares what does not change from picture to picture.
+
+        Args:
+            rectangles: what there is to see.
+            camera: the camera, distorted or not.
+            grid: rays per pixel along each side.
+        """
+        from rbpf.validation.simulation import raster_kernel
+
+        self._kernel = raster_kernel
+        self._rectangles, self._camera, self._grid = rectangles, camera, grid
+        rows, columns = np.mgrid[: camera.height, : camera.width].astype(float)
+        px = np.stack([columns, rows], axis=-1)
+        self._uv = camera.unproject(px)
+        self._slope = np.ascontiguousarray(camera.unproject_slope(px)).reshape(*px.shape[:2], 4)
+        self._tiles = _tile_bounds(self._uv, self._slope, raster_kernel.TILE)
+        sheets = {id(r.texture): r.texture for r in rectangles}
+        place = {key: k for k, key in enumerate(sheets)}
+        self._sheet = np.array([place[id(r.texture)] for r in rectangles], dtype=np.int64)
+        self._gain = np.array([r.gain for r in rectangles])
+        self._levels, self._texels = _packed([_pyramid(texture) for texture in sheets.values()])
+        self._corners = np.array([_corners(r) for r in rectangles])
+
+    def image(self, world_from_camera: np.ndarray) -> np.ndarray:
+        """Grey levels (H, W) float32 of a picture taken at poses (7,), or (K, 7) of a moving camera.
+
+        With K poses that is the mean over them: the rays of a pixel are dealt out, so that K has to be the square of a
+        whole number, at least grid².
+        """
+        poses = np.atleast_2d(world_from_camera)
+        shifts = rotated_grid(max(self._grid, math.isqrt(len(poses))))
+        light = np.empty(self._uv.shape[:2], dtype=np.float32)
+        self._kernel.expose(
+            np.array([rays_to_sides(self._rectangles, pose) for pose in poses]),
+            np.array([self._bounds(pose) for pose in poses]),
+            np.arange(len(shifts)) % len(poses),
+            self._sheet,
+            self._gain,
+            self._uv,
+            self._slope,
+            self._tiles,
+            shifts,
+            1.0 / self._grid,
+            self._levels,
+            self._texels,
+            light,
+        )
+        return light
+
+    def depth(self, world_from_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Depth z (H, W) [m] at the pixels' centres, infinite where there is nothing; rectangles (H, W), then -1."""
+        inverse = np.empty(self._uv.shape[:2])
+        rows = np.empty(inverse.shape, dtype=np.int64)
+        h, bounds = rays_to_sides(self._rectangles, world_from_camera), self._bounds(world_from_camera)
+        self._kernel.trace(h, bounds, self._uv, self._slope, self._tiles, inverse, rows)
+        with np.errstate(divide="ignore"):
+            return 1.0 / inverse, rows
+
+    def _bounds(self, world_from_camera: np.ndarray) -> np.ndarray:
+        """(R, 4) least and greatest u and v of the rectangles' parts before the camera; empty where there is none."""
+        local = SE3.inverse_transform(world_from_camera, self._corners.reshape(-1, 3)).reshape(-1, 4, 3)
+        following = np.roll(local, -1, axis=1)
+        with np.errstate(all="ignore"):
+            share = (NEAR_M - local[..., 2:]) / (following[..., 2:] - local[..., 2:])
+            cut = local + share * (following - local)
+            outline = np.concatenate([local, cut], axis=1)
+            seen = np.concatenate(
+                [local[..., 2] >= NEAR_M, (share[..., 0] >= 0.0) & (share[..., 0] <= 1.0)], axis=1
+            )
+            depth = np.where(seen, np.maximum(outline[..., 2], NEAR_M), np.nan)[..., None]
+            uv = outline[..., :2] / depth
+        return _extent(uv.reshape(len(uv), -1, 2))
+
+
+def rotated_grid(side: int) -> np.ndarray:
+    """(n², 2) places in a pixel [px], n = side: i/n² in one direction, n i mod (n² + 1) in the other, around 0."""
+    i = np.arange(1, side * side + 1)
+    return (np.stack([i, side * i % (side * side + 1)], axis=-1) - 0.5) / (side * side) - 0.5
+
+
+def _extent(uv: np.ndarray) -> np.ndarray:
+    """(R, 4) least and greatest of (R, K, 2), NaN left out."""
+    low = np.where(np.isnan(uv), np.inf, uv).min(axis=1)
+    high = np.where(np.isnan(uv), -np.inf, uv).max(axis=1)
+    return np.stack([low[:, 0], high[:, 0], low[:, 1], high[:, 1]], axis=-1)
+
+
+def _tile_bounds(uv: np.ndarray, slope: np.ndarray, side: int) -> np.ndarray:
+    """(J, I, 4) least and greatest u and v of the pixels in each tile, out to their borders."""
+    reach = 0.5 * np.abs(slope).reshape(*uv.shape[:2], 2, 2).sum(axis=-1)
+    around = np.concatenate([uv - reach, uv + reach], axis=-1)
+    rows, columns = range(0, uv.shape[0], side), range(0, uv.shape[1], side)
+    tiles = [_extent(around[y : y + side, x : x + side].reshape(1, -1, 2))[0] for y in rows for x in columns]
+    return np.array(tiles).reshape(len(rows), len(columns), 4)
+
+
+def _corners(rectangle: Rectangle) -> np.ndarray:
+    """(4, 3) in order round the rectangle."""
+    corner, across, down = rectangle.corner, rectangle.across, rectangle.down
+    return np.array([corner, corner + across, corner + across + down, corner + down])
+
+
+def _pyramid(texture: np.ndarray) -> list[np.ndarray]:
+    """The texture and its means over 2 × 2 texels, again and again until a side is one texel.
+
+    An odd side is resampled to half of it, rounded down, so that all levels cover the same sheet.
+    """
+    import cv2
+
+    levels = [texture]
+    while min(levels[-1].shape) > 1:
+        height, width = levels[-1].shape
+        levels.append(
+            np.asarray(cv2.resize(levels[-1], (width // 2, height // 2), interpolation=cv2.INTER_AREA))
+        )
+    return levels
+
+
+def _packed(pyramids: list[list[np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """Start, height and width (S, L, 3) of every level, the last one repeated, and all texels end to end."""
+    depth = max(len(pyramid) for pyramid in pyramids)
+    levels = np.empty((len(pyramids), depth, 3), dtype=np.int64)
+    start, texels = 0, []
+    for k, pyramid in enumerate(pyramids):
+        for level, texture in enumerate(pyramid):
+            levels[k, level:] = start, *texture.shape
+            texels.append(texture.ravel())
+            start += texture.size
+    return levels, np.concatenate(texels)

@@ -1,0 +1,166 @@
+"""A textured desk with things on it, to take pictures of. The world's z axis points up."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rbpf.errors import InputError
+from rbpf.validation.simulation import textures
+from rbpf.validation.simulation.furniture import Furniture, apart
+from rbpf.validation.simulation.limits import check_counts, check_not_negative, check_positive
+from rbpf.validation.simulation.point_worlds import DeskWorld
+from rbpf.validation.simulation.textured_scene import Chessboard, TexturedScene, stamps_ns
+
+SHEET_M = 0.0001
+"""Sheets of paper lie this much above each other."""
+
+PAPERS = [
+    ((0.21, 0.297), textures.page),
+    ((0.30, 0.21), textures.picture),
+    ((0.12, 0.17), textures.picture),
+    ((0.08, 0.08), textures.carton),
+    ((0.09, 0.055), textures.carton),
+    ((0.15, 0.014), textures.carton),
+]
+"""Size and print of what lies flat on a desk: pages, magazines, postcards, notes, cards, pencils."""
+
+DESK_M, HIGHEST_M = 0.75, 0.25
+"""Height of a desk, and of the highest thing on it."""
+
+BOOKS = 0.4
+"""Share of books among the things; the others are boxes."""
+
+COARSE = 4.0
+"""Texels of the walls round a desk are larger by this: they are farther away."""
+
+BOARD_CLEAR_M = 0.15
+"""Nothing stands nearer to a chessboard's corners than this: it is seen whole from where the camera starts."""
+
+
+@dataclass(frozen=True)
+class TexturedDesk:
+    """A desk at a wall, with papers, books and boxes on it, seen by a camera in a hand that is held still at first.
+
+    The middle of the desk's top is the origin; the wall is beyond its edge at the greatest y. The path is the
+    `DeskWorld`'s: the camera moves about a point that wanders over the desk from the middle.
+
+    Attributes:
+        frames: number of images.
+        rate_hz: images per second.
+        size_m: of the desk's top along x and y.
+        papers: number of flat things.
+        things: most books and boxes; as many as find a place.
+        board: squares (columns, rows) of a chessboard that lies in the middle; None for none.
+        square_m: side of its squares.
+        nearest_m: least distance of the camera from the point that it looks at.
+        farthest_m: greatest distance.
+        elevation_deg: the camera looks down at this angle, on the average.
+        sweep_deg: greatest turn about the point looked at to either side; a quarter as much up and down.
+        wander: greatest shift of the point looked at, as a share of the desk's size.
+        speed_m_s: highest speed.
+        turn_rad_s: highest rate of turn.
+        start_s: the camera reaches its pace after this time.
+        texel_m: side of a texel.
+        contrast: of all textures but the chessboard's; 1 is rich, 0.1 poor.
+    """
+
+    frames: int = 300
+    rate_hz: float = 30.0
+    size_m: tuple[float, float] = (2.0, 2.0)
+    papers: int = 42
+    things: int = 16
+    board: tuple[int, int] | None = None
+    square_m: float = 0.03
+    nearest_m: float = 0.8
+    farthest_m: float = 1.3
+    elevation_deg: float = 50.0
+    sweep_deg: float = 40.0
+    wander: float = 0.25
+    speed_m_s: float = 0.3
+    turn_rad_s: float = 0.5
+    start_s: float = 1.0
+    texel_m: float = 0.001
+    contrast: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Checks that there is something to see; the path's numbers are checked where it is built."""
+        check_counts(self, {"frames": 2, "papers": 0, "things": 0})
+        check_positive(self, "square_m", "texel_m")
+        check_not_negative(self, "contrast")
+        if self.board is not None and not (len(self.board) == 2 and min(self.board) >= 3):
+            raise InputError(
+                f"board must be two numbers of squares, at least 3 each, or None, got {self.board}"
+            )
+        self._walk()
+
+    def build(self, rng: np.random.Generator) -> TexturedScene:
+        """Draws the textures, the things and the path."""
+        path = self._walk().build(rng).world_from_camera
+        desk = Furniture(rng, self.texel_m, self.contrast)
+        room = self._room(rng)
+        board = self._lay(desk, rng)
+        self._stand(desk, rng)
+        rectangles = room.rectangles + desk.rectangles
+        return TexturedScene("desk", stamps_ns(self.frames, self.rate_hz), path, rectangles, board)
+
+    def _walk(self) -> DeskWorld:
+        """Whose path it is."""
+        return DeskWorld(
+            frames=self.frames,
+            rate_hz=self.rate_hz,
+            points=1,
+            blocks=0,
+            size_m=(*self.size_m, HIGHEST_M),
+            nearest_m=self.nearest_m,
+            farthest_m=self.farthest_m,
+            elevation_deg=self.elevation_deg,
+            sweep_deg=self.sweep_deg,
+            wander=self.wander,
+            speed_m_s=self.speed_m_s,
+            turn_rad_s=self.turn_rad_s,
+            start_s=self.start_s,
+        )
+
+    def _room(self, rng: np.random.Generator) -> Furniture:
+        """What is round the desk's top."""
+        x, y = 0.5 * np.array(self.size_m)
+        room = np.array([[-x - 2.0, -y - 2.5, -DESK_M], [x + 2.0, y + 0.01, 2.6 - DESK_M]])
+        furniture = Furniture(rng, COARSE * self.texel_m, self.contrast)
+        furniture.shell(room, textures.wallpaper, textures.carpet, textures.plaster)
+        block = (*self.size_m, DESK_M - SHEET_M)
+        furniture.box(np.array([0.0, 0.0, -DESK_M]), 0.0, block, textures.wood, textures.wood)
+        middle = (0.5 + (np.arange(4) - 1.5) * 0.35 * x / (x + 2.0)).tolist()
+        for share in middle:
+            size = (rng.uniform(0.25, 0.5, 2) * x).tolist()
+            furniture.hang(room, 0, (share, rng.uniform(0.45, 0.55)), size, textures.picture)
+        return furniture
+
+    def _lay(self, desk: Furniture, rng: np.random.Generator) -> list[Chessboard]:
+        """The top, papers, and the chessboard on top of them."""
+        desk.flat(np.zeros(3), 0.0, self.size_m, textures.wood)
+        for k in range(self.papers):
+            size, paint = PAPERS[k % len(PAPERS)]
+            middle = rng.uniform(-0.45, 0.45, 2) * self.size_m
+            desk.flat(np.array([*middle, (k + 1) * SHEET_M]), rng.uniform(-np.pi, np.pi), size, paint)
+        if self.board is None:
+            return []
+        return [desk.board(np.array([0.0, 0.0, (self.papers + 1) * SHEET_M]), self.board, self.square_m)]
+
+    def _stand(self, desk: Furniture, rng: np.random.Generator) -> None:
+        """Books and boxes."""
+        taken = []
+        if self.board is not None:
+            reach = 0.5 * self.square_m * float(np.hypot(*self.board)) + BOARD_CLEAR_M
+            taken.append((np.zeros(2), reach))
+
+        def draw() -> tuple[np.ndarray, float]:
+            return rng.uniform(-0.42, 0.42, 2) * self.size_m, rng.uniform(0.06, 0.16)
+
+        for middle, radius in apart(draw, self.things, taken):
+            foot, yaw = np.array([*middle, 0.0]), rng.uniform(-np.pi, np.pi)
+            turn = rng.uniform(0.6, 1.0)
+            is_book = rng.random() < BOOKS
+            height = rng.uniform(0.02, 0.06) if is_book else rng.uniform(0.06, HIGHEST_M)
+            size = (2.0 * radius * np.cos(turn), 2.0 * radius * np.sin(turn), height)
+            prints = (textures.picture, textures.edges_of_pages) if is_book else (textures.carton,) * 2
+            desk.box(foot, yaw, size, *prints)

@@ -1,0 +1,166 @@
+"""What a simulated camera takes pictures of: flat textured rectangles in space, and the camera's path.
+
+A world is anything with `build(rng) -> TexturedScene`. One of our own, a picture on a wall that a camera passes:
+
+    >>> import numpy as np
+    >>> from rbpf.lie import SE3
+    >>> from rbpf.validation.simulation.textures import picture
+    >>> class Gallery:
+    ...     def build(self, rng):
+    ...         paint = picture((400, 800), rng)
+    ...         wall = Rectangle(np.array([-2.0, -1.0, 3.0]), np.array([4.0, 0, 0]), np.array([0, 2.0, 0]), paint)
+    ...         path = np.tile(SE3.identity(), (60, 1))
+    ...         path[:, 4] = np.linspace(-0.5, 0.5, 60)
+    ...         stamps = stamps_ns(60, 30.0)
+    ...         return TexturedScene("gallery", stamps, path, [wall])
+    >>> len(Gallery().build(np.random.default_rng(0)).rectangles)
+    1
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from rbpf.errors import InputError
+from rbpf.lie import SE3
+from rbpf.validation.simulation.scene import frame_stamps
+
+EPOCH_NS = 1_400_000_000_000_000_000
+"""Stamp of the first image: all stamps have as many digits, so that file names sort by time."""
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """A flat textured sheet, seen from both sides; seen from the front its texture reads as it is stored.
+
+    The centre of texel (row i, column j) of a texture (H, W) lies at corner + (j + ½)/W across + (i + ½)/H down.
+
+    Attributes:
+        corner: (3,) position of the texture's top left corner in the world, m.
+        across: (3,) from there to the top right corner, m.
+        down: (3,) from there to the bottom left corner, m; not parallel to `across`, nor need it be perpendicular.
+        texture: (H, W) uint8 grey levels, at least 2 × 2.
+        gain: brightness of the light on it, a factor on the grey levels.
+
+    Raises:
+        InputError: the sides span no area, the texture is no grey image, or the gain is negative.
+    """
+
+    corner: np.ndarray
+    across: np.ndarray
+    down: np.ndarray
+    texture: np.ndarray
+    gain: float = 1.0
+
+    def __post_init__(self) -> None:
+        sides = np.array([self.corner, self.across, self.down], dtype=float)
+        if sides.shape != (3, 3) or not np.isfinite(sides).all() or not np.cross(*sides[1:]).any():
+            raise InputError(
+                "a rectangle needs a corner and two sides of three finite numbers each that span an area, got "
+                f"corner {self.corner}, across {self.across}, down {self.down}"
+            )
+        texture = self.texture
+        if texture.dtype != np.uint8 or texture.ndim != 2 or min(texture.shape) < 2:
+            raise InputError(
+                "a rectangle's texture must be a grey image of uint8, at least 2 x 2, got shape "
+                f"{texture.shape} of {texture.dtype}"
+            )
+        if not 0.0 <= self.gain < np.inf:
+            raise InputError(f"a rectangle's gain must be zero or a positive number, got {self.gain!r}")
+
+
+@dataclass(frozen=True)
+class TexturedScene:
+    """A world with everything random about it drawn.
+
+    Attributes:
+        name: of the world.
+        stamps_ns: (T,) int64 times of the frames, rising.
+        world_from_camera: (T, 7) true poses at these times, the middles of the exposures.
+        rectangles: what there is to see.
+        boards: chessboards among it.
+    """
+
+    name: str
+    stamps_ns: np.ndarray
+    world_from_camera: np.ndarray
+    rectangles: Sequence[Rectangle]
+    boards: Sequence["Chessboard"] = ()
+
+
+@dataclass(frozen=True)
+class Chessboard:
+    """A printed chessboard, as OpenCV counts its corners.
+
+    Attributes:
+        columns: inner corners along the board's x axis.
+        rows: inner corners along its y axis.
+        square_m: side of a square.
+        world_from_board: (7,) pose; the first inner corner is the origin, x runs across, y down, z into the sheet.
+    """
+
+    columns: int
+    rows: int
+    square_m: float
+    world_from_board: np.ndarray
+
+    @property
+    def corners(self) -> np.ndarray:
+        """(rows · columns, 3) inner corners in the world, row by row, m."""
+        y, x = np.divmod(np.arange(self.rows * self.columns), self.columns)
+        local = self.square_m * np.stack([x, y, np.zeros_like(x)], axis=-1)
+        return SE3.transform(self.world_from_board, local)
+
+
+class ImageWorld(Protocol):
+    """What pictures can be taken of."""
+
+    def build(self, rng: np.random.Generator) -> TexturedScene:
+        """Draws everything random about the world."""
+        ...
+
+
+def stamps_ns(frames: int, rate_hz: float) -> np.ndarray:
+    """(T,) int64 nanoseconds of the frames."""
+    return EPOCH_NS + frame_stamps(frames, rate_hz)
+
+
+def rays_to_sides(rectangles: Sequence[Rectangle], world_from_camera: np.ndarray) -> np.ndarray:
+    """H (R, 3, 3): a ray (u, v, 1) meets a rectangle at (s, t, 1)/z = H (u, v, 1); 0 if the camera is in its plane.
+
+    Args:
+        rectangles: R of them.
+        world_from_camera: (7,) pose.
+    """
+    rotation = SE3.matrix(world_from_camera)[:3, :3]
+    sides = np.array([[r.across, r.down, r.corner - world_from_camera[4:]] for r in rectangles])
+    m = np.swapaxes(sides @ rotation, 1, 2)
+    flat = np.abs(np.linalg.det(m)) < np.finfo(float).tiny
+    m[flat] = np.eye(3)
+    return np.where(flat[:, None, None], 0.0, np.linalg.inv(m))
+
+
+def cast(
+    rectangles: Sequence[Rectangle], world_from_camera: np.ndarray, uv: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """What single rays meet first: the same as a whole picture's depth, for a few pixels.
+
+    Args:
+        rectangles: R of them.
+        world_from_camera: (7,) pose.
+        uv: (K, 2) normalised coordinates, `Pinhole.unproject` of pixels.
+
+    Returns:
+        Depth z (K,) in the camera's frame [m], infinite where there is nothing; row (K,) of the rectangle, then -1.
+    """
+    ray = np.concatenate([uv, np.ones((len(uv), 1))], axis=1)
+    s, t, w = np.moveaxis(rays_to_sides(rectangles, world_from_camera) @ ray.T, 1, 0)
+    with np.errstate(invalid="ignore"):
+        hit = (w > 0.0) & (s >= 0.0) & (s <= w) & (t >= 0.0) & (t <= w)
+    nearest = np.where(hit, w, 0.0)
+    row = nearest.argmax(axis=0)
+    inverse = nearest[row, np.arange(len(uv))]
+    with np.errstate(divide="ignore"):
+        return 1.0 / inverse, np.where(inverse > 0.0, row, -1)
