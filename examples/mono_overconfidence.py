@@ -58,6 +58,7 @@ def variants(particles: int) -> dict[str, MonoConfig]:
         "epipolar constraint": replace(base, ray=replace(ray, constrain="epipolar")),
         "rays do not constrain": replace(base, ray=replace(ray, constrain="off")),
         "twice the σ of inverse depth": replace(base, ray=RayConfig(std_rho_per_m=2.0 * ray.std_rho_per_m)),
+        "inverse depth 0.8 ± 0.4": replace(base, ray=RayConfig(std_rho_per_m=0.4, adapt=False)),
         "resampling below 0.1 N": replace(base, resampling=ResamplingConfig(ess_threshold=0.1)),
         "resampling below 0.7 N": replace(base, resampling=ResamplingConfig(ess_threshold=0.7)),
         "velocity sampled": replace(base, velocity=VelocityConfig(mode="joint")),

@@ -74,7 +74,7 @@ def test_recovers_after_a_blackout(tracked, tmp_path):
     assert len(run.relocalisations) == 1
     assert any("lost" in problem for problem in run.problems)
     assert sum("shows nothing" in problem for problem in run.problems) == 1
-    assert errors(run)[-10:].max() < 0.03
+    assert errors(run)[-10:].max() < 0.05
     assert np.trace(run.cov[START + DARK - 1][3:, 3:]) > np.trace(run.cov[START][3:, 3:])
 
 
@@ -82,7 +82,7 @@ def test_missing_images_are_a_blackout_too(tracked, tmp_path):
     run = resumed(tracked, tmp_path, lambda t, image: None if START <= t < START + DARK else image)
     assert run.lost[START + DARK - 1]
     assert not run.lost[-20:].any()
-    assert errors(run)[-10:].max() < 0.03
+    assert errors(run)[-10:].max() < 0.05
 
 
 def test_the_map_survives_the_dark(tracked, tmp_path):
