@@ -179,7 +179,7 @@ def test_the_readme_s_program_runs(tmp_path, monkeypatch, capsys):
     (program,) = re.findall(
         r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL
     )
-    simulate_robot(RobotWorld(steps=20, landmarks=20), tmp_path / "demo" / "log", seed=0)
+    simulate_robot(RobotWorld(steps=20, landmarks=20), tmp_path / "log", seed=0)
     monkeypatch.chdir(tmp_path)
     exec(compile(program, "README.md", "exec"), {})
     assert "log-evidence" in capsys.readouterr().out

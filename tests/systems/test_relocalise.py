@@ -124,7 +124,7 @@ def test_the_pose_found_is_right_and_its_covariance_fair(relocaliser):
     assert law is not None
     start = SE3.compose(belief.state[belief.mode][:7], SE3.inverse(run.world_from_camera[-1]))
     error = SE3.log(SE3.between(SE3.compose(start, truth), law.mean))
-    assert np.abs(error).max() < 0.03
+    assert np.abs(error).max() < 0.05
     assert (np.abs(error) < 4.0 * np.sqrt(np.diag(law.cov)) + 0.01).all()
 
 

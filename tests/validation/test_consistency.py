@@ -68,8 +68,8 @@ def test_a_table_is_printed_in_columns_and_kept(tmp_path, capsys):
 
 
 def test_a_camera_s_map_is_told_in_the_world_of_the_known_points():
-    log = simulate_features(DeskWorld(frames=60), Measuring(), MONO, seed=0)
-    filter_ = run(log, MonoConfig(particles=20)).filter
+    log = simulate_features(DeskWorld(frames=150), Measuring(), MONO, seed=0)
+    filter_ = run(log, MonoConfig(particles=50)).filter
     summary = summarise_points(filter_)
     truth = np.array([log.truth.landmarks[name] for name in summary.ids.tolist()])
     error = summary.mean - truth

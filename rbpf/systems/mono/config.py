@@ -39,7 +39,9 @@ class RayConfig:
             least, where four or more were seen.
         ready_ratio: a ray becomes a point when the standard deviation of its inverse depth is below this share of it.
         ready_weight: share of the particles' weight in which it must be.
-        least_px: depth is measured once a change of ρ by its first standard deviation moves the image by this.
+        least_px: depth is measured once a change of ρ by its first standard deviation moves the image by this. Before,
+            the parallax is no larger than what the error of the sampled pose makes, and depth would follow it.
+        line_px: likewise, from where on there is an epipolar line.
     """
 
     constrain: Literal["epipolar", "marginal", "off"] = "marginal"
@@ -48,7 +50,8 @@ class RayConfig:
     adapt: bool = True
     ready_ratio: float = 0.1
     ready_weight: float = 0.95
-    least_px: float = 1.0
+    least_px: float = 10.0
+    line_px: float = 1.0
 
 
 @dataclass(frozen=True)

@@ -46,7 +46,7 @@ class FeatureSensor(Sensor):
         self.births_per_frame = births_per_frame
         self.point = CameraPoint(camera)
         self.ray = CameraRay(camera, rho)
-        self.epipolar = EpipolarRay(camera, rho, rays.least_px)
+        self.epipolar = EpipolarRay(camera, rho, rays.line_px)
         self.inverse_depth = InverseDepth(rays.ready_ratio)
         self._names = Names()
         self._known = known
