@@ -6,7 +6,8 @@
     velocity:      E06 (4)–(5); frames of one time then share one pose and one velocity
     gauge:         without known points the first pose is held where it started; for one camera, a distance too
 
-The distance is that from the first camera to the one farthest from it at the start. The gauge only says which of many equal solutions is meant: it costs nothing at the optimum.
+The distance is that from the first camera to the one farthest from it at the start. The gauge only says which of many
+equal solutions is meant: it costs nothing at the optimum.
 """
 
 from dataclasses import dataclass
