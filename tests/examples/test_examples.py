@@ -13,6 +13,7 @@ import pytest
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 
 ROOT = Path(__file__).resolve().parents[2]
+SECONDS_LONG = {"mono_blackouts", "mono_loop", "mono_overconfidence", "mono_still_camera", "mono_video"}
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 LONGEST_SENSOR = 40
 
@@ -147,7 +148,13 @@ CLAIMS: dict[str, Callable[[Any], None]] = {
 }
 
 
-@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path",
+    [
+        pytest.param(path, id=path.stem, marks=[pytest.mark.slow] * (path.stem in SECONDS_LONG))
+        for path in EXAMPLES
+    ],
+)
 def test_example_shows_what_it_promises(path, capsys, monkeypatch, tmp_path):
     monkeypatch.syspath_prepend(path.parent)
     main = importlib.import_module(path.stem).main
