@@ -1,4 +1,4 @@
-"""Points whose places are known in a frame of their own: one landmark, the frame's pose, that they all move with."""
+"""Points whose places are known in a frame of their own: one landmark, because what is known correlates them."""
 
 from typing import final
 
@@ -7,65 +7,167 @@ import numpy as np
 from rbpf import gaussian
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.lie.matrices import skew
 from rbpf.models import Landmark, Records
 
 MOST = 12
 """Points that may each have an error of their own; a record's covariance grows with the square of their number."""
+ROUNDS = 20
+"""Gauss-Newton steps to the frame at most; it starts from the closed solution for equal errors."""
+SETTLED = 1e-10
+"""Length of the last step, radians and metres."""
+LEAST = 1e-12
+"""Variance, m², that keeps the fit defined where some of the points are exact and others are not."""
 
 
 @final
 class Constellation(Landmark):
-    """A rigid group of M points, given in a frame of their own up to Gaussian errors; that frame is estimated.
+    """A rigid group of M exactly known points; the frame that they are given in is estimated.
 
-    The record's mean is (ξ, e_1, …, e_M): the group's frame is world_from_group = G Exp(ξ), with G the record's
-    constant (7,), and point m lies there at p_m + e_m. The correlation that the points have through ξ is kept, which
-    separate landmarks would lose. Without errors of the points the mean is ξ alone.
+    The record's mean is ξ (6,): the frame is world_from_group = G Exp(ξ), with G the record's constant (7,).
 
     Args:
-        points: (M, 3) p_m in the group's frame, metres.
-        cov_points: (M, 3, 3) covariances of the e_m; all zero where the points are exact.
-
-    Raises:
-        InputError: too many points have errors of their own.
+        points: (M, 3) in the group's frame, metres.
     """
 
     constants = 7
+    dim = 6
+
+    def __init__(self, points: np.ndarray) -> None:
+        self.points = points.tolist()
+
+    def homogeneous(self, mean: np.ndarray, const: np.ndarray | None = None) -> np.ndarray:
+        """The origin of the group's frame, (…, 6), (…, 7) → (…, 4)."""
+        assert const is not None
+        origin = SE3.translation(SE3.retract(const, mean))
+        return np.concatenate([origin, np.ones((*origin.shape[:-1], 1))], axis=-1)
+
+    def started(self, n: int, world_from_group: np.ndarray, cov: np.ndarray) -> Records:
+        """First records (n, 1, …): the frame at world_from_group (7,), covariance (6, 6) in the right chart there."""
+        return Records(
+            np.zeros((n, 1, 6)),
+            np.broadcast_to(cov, (n, 1, 6, 6)),
+            np.broadcast_to(world_from_group, (n, 1, 7)),
+        )
+
+    def frame(self, records: Records) -> tuple[np.ndarray, np.ndarray]:
+        """world_from_group (N, 7), a factor (N, 6, 6) of its covariance in the right chart there; of one landmark."""
+        assert records.const is not None
+        mean = records.mean[:, 0]
+        chart = SE3.right_jacobian(mean)
+        return SE3.retract(records.const[:, 0], mean), chart @ gaussian.psd_factor(records.cov[:, 0])
+
+    def in_world(self, records: Records) -> np.ndarray:
+        """The points (N, M, 3) of one landmark."""
+        return SE3.transform(self.frame(records)[0][:, None], np.asarray(self.points))
+
+    def in_group(self, records: Records) -> tuple[np.ndarray, np.ndarray]:
+        """The points in their own frame: means (N, M, 3) and covariances (N, M, 3, 3)."""
+        shape = (records.mean.shape[0], len(self.points), 3)
+        return np.broadcast_to(np.asarray(self.points), shape), np.zeros((*shape, 3))
+
+
+@final
+class UncertainConstellation(Landmark):
+    """M points, given in a frame of their own up to Gaussian errors; where they are in the world is estimated.
+
+    The record's mean is (p_1, …, p_M), where the points are in the world, with their joint covariance: the shape that
+    is given correlates them. A camera sees where the points are, and what it tells is nearly linear in that, however
+    uncertain the frame; told as the frame and an error of each point it is not, and the error of second order is
+    larger than a pixel. The frame follows from the points: p_m = T (k_m + e_m), so that given the points T is the fit
+    of the shape to them.
+
+    Args:
+        points: (M, 3) where the points are given, k_m, in the group's frame, metres.
+        cov_points: (M, 3, 3) covariances of their errors e_m.
+
+    Raises:
+        InputError: there are too many points.
+    """
 
     def __init__(self, points: np.ndarray, cov_points: np.ndarray) -> None:
-        exact = not cov_points.any()
-        if not exact and points.shape[0] > MOST:
+        if points.shape[0] > MOST:
             raise InputError(
                 f"{points.shape[0]} known points have errors of their own: give at most {MOST}, or exact ones (σ = 0)"
             )
         self.points = points.tolist()
-        self.dim = 6 if exact else 6 + 3 * points.shape[0]
-        self._cov_points = cov_points.tolist()
+        self.dim = 3 * points.shape[0]
+        self._info_points = np.linalg.inv(cov_points + LEAST * np.eye(3)).tolist()
 
     def homogeneous(self, mean: np.ndarray, const: np.ndarray | None = None) -> np.ndarray:
-        """The origin of the group's frame, (…, dim), (…, 7) → (…, 4)."""
-        origin = SE3.translation(self.frame(mean, const))
-        return np.concatenate([origin, np.ones((*origin.shape[:-1], 1))], axis=-1)
+        """The points' centre (…, 3M) → (…, 4)."""
+        centre = self._points_of(mean).mean(axis=-2)
+        return np.concatenate([centre, np.ones((*centre.shape[:-1], 1))], axis=-1)
 
-    def frame(self, mean: np.ndarray, const: np.ndarray | None) -> np.ndarray:
-        """world_from_group (…, 7)."""
-        assert const is not None
-        return SE3.retract(const, mean[..., :6])
+    def started(self, n: int, points: np.ndarray, cov: np.ndarray) -> Records:
+        """First records (n, 1, …): the points (M, 3) in the world, covariance (3M, 3M)."""
+        shape = (n, 1, self.dim)
+        return Records(np.broadcast_to(points.ravel(), shape), np.broadcast_to(cov, (*shape, self.dim)))
 
-    def started(self, n: int, world_from_group: np.ndarray, cov: np.ndarray) -> Records:
-        """First records (n, 1, …): the frame at world_from_group (7,), covariance (6, 6) in the right chart there."""
-        full = np.zeros((self.dim, self.dim))
-        full[:6, :6] = cov
-        if self.dim > 6:
-            for m, block in enumerate(self._cov_points):
-                rows = slice(6 + 3 * m, 9 + 3 * m)
-                full[rows, rows] = block
-        return Records(
-            np.zeros((n, 1, self.dim)),
-            np.broadcast_to(full, (n, 1, self.dim, self.dim)),
-            np.broadcast_to(world_from_group, (n, 1, 7)),
-        )
+    def frame(self, records: Records) -> tuple[np.ndarray, np.ndarray]:
+        """world_from_group (N, 7), a factor (N, 6, 6) of its covariance in the right chart there; of one landmark."""
+        frame, _, slope, info = self._fit(records)
+        moved = slope @ records.cov[:, 0] @ np.swapaxes(slope, -1, -2)
+        return frame, gaussian.psd_factor(gaussian.symmetrise(moved + np.linalg.inv(info)))
 
-    def frame_factor(self, records: Records) -> np.ndarray:
-        """Factor (N, 6, 6) of the frame's covariance, in the right chart at `frame`, of records of one landmark."""
-        chart = SE3.right_jacobian(records.mean[:, 0, :6])
-        return chart @ gaussian.psd_factor(records.cov[:, 0, :6, :6])
+    def in_world(self, records: Records) -> np.ndarray:
+        """The points (N, M, 3) of one landmark."""
+        return self._points_of(records.mean[:, 0])
+
+    def in_group(self, records: Records) -> tuple[np.ndarray, np.ndarray]:
+        """The points in their own frame: means (N, M, 3) and covariances (N, M, 3, 3)."""
+        frame, local, slope, info = self._fit(records)
+        by_frame = _by_frame(local)
+        by_points = by_frame @ slope[:, None]
+        back = np.swapaxes(SE3.rotation(frame), -1, -2)
+        for m in range(len(self.points)):
+            by_points[:, m, :, 3 * m : 3 * m + 3] += back
+        covs = by_points @ records.cov[:, :1, :, :] @ np.swapaxes(by_points, -1, -2)
+        of_fit = by_frame @ np.linalg.inv(info)[:, None] @ np.swapaxes(by_frame, -1, -2)
+        return local, gaussian.symmetrise(covs + of_fit)
+
+    def _points_of(self, mean: np.ndarray) -> np.ndarray:
+        return mean.reshape(*mean.shape[:-1], -1, 3)
+
+    def _fit(self, records: Records) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """The frame (N, 7) that fits the shape to the points: Gauss-Newton on r_m = T⁻¹ p_m − k_m, weighed as e_m.
+
+        Returns:
+            The frame; the points (N, M, 3) in it; the frame's derivative by all points (N, 6, 3M); the information
+            (N, 6, 6) about the frame that the shape leaves when the points are known.
+        """
+        world, given = self.in_world(records), np.asarray(self.points)
+        weight = np.asarray(self._info_points)
+        frame = _closed_fit(given, world)
+        for _ in range(ROUNDS):
+            local = SE3.inverse_transform(frame[:, None], world)
+            by_frame = _by_frame(local)
+            weighed = np.swapaxes(by_frame, -1, -2) @ weight
+            info = (weighed @ by_frame).sum(axis=1)
+            vector = (weighed @ (local - given)[..., None]).sum(axis=1)
+            step = -np.linalg.solve(info, vector)[..., 0]
+            frame = SE3.retract(frame, step)
+            if np.abs(step).max() <= SETTLED:
+                break
+        back = np.swapaxes(SE3.rotation(frame), -1, -2)
+        by_point = -np.linalg.solve(info[:, None], weighed @ back[:, None])
+        slope = np.moveaxis(by_point, 1, 2).reshape(len(frame), 6, self.dim)
+        return frame, SE3.inverse_transform(frame[:, None], world), slope, info
+
+
+def _by_frame(local: np.ndarray) -> np.ndarray:
+    """∂(T⁻¹p)/∂ξ = [[q]× | −I] (…, 3, 6) at q = T⁻¹p."""
+    return np.concatenate([skew(local), np.broadcast_to(-np.eye(3), (*local.shape, 3))], axis=-1)
+
+
+def _closed_fit(given: np.ndarray, world: np.ndarray) -> np.ndarray:
+    """Poses (N, 7) that fit points (M, 3) to points (N, M, 3) by least squares (S. Umeyama, 1991)."""
+    centre, middle = given.mean(axis=0), world.mean(axis=1)
+    u, _, vt = np.linalg.svd(np.swapaxes(world - middle[:, None], -1, -2) @ (given - centre))
+    sign = np.ones((len(world), 3))
+    sign[:, 2] = np.sign(np.linalg.det(u @ vt))
+    rotation = (u * sign[:, None]) @ vt
+    matrix = np.zeros((len(world), 4, 4))
+    matrix[:, :3, :3], matrix[:, 3, 3] = rotation, 1.0
+    matrix[:, :3, 3] = middle - rotation @ centre
+    return SE3.from_matrix(matrix)

@@ -1,4 +1,4 @@
-"""Compiled twin of `rbpf.sensors.camera_constellation.ConstellationView`."""
+"""Compiled twins of `rbpf.sensors.camera_constellation`."""
 
 import math
 
@@ -10,8 +10,6 @@ from rbpf.sensors.pinhole_kernels import project
 
 HEADER = 9
 """Parameters before the points: the camera's."""
-PER_POINT = 4
-"""Parameters of a point: its place in the group's frame, and the number of its error in the landmark or −1."""
 _SMALL = 1e-2
 """θ² below which the series of the coefficients are exact to rounding with the terms kept."""
 
@@ -70,8 +68,8 @@ def _by_turn(g, k1, k2, d1, d2, w, x):
 
 @observation_kernel
 def constellation_view(state, mean, const, z, params, n, nu, jac_state, jac_landmark):
-    """Pixels of several points of one group; params: the camera's, then for each point (x, y, z, place)."""
-    count, size = z.shape[0] // 2, mean.shape[0]
+    """Pixels of several exact points of one group; params: the camera's, then the points in the group's frame."""
+    count = z.shape[0] // 2
     for i in range(n):
         r = rotation(state[0, i], state[1, i], state[2, i], state[3, i])
         s = rotation(const[0, i], const[1, i], const[2, i], const[3, i])
@@ -80,14 +78,8 @@ def constellation_view(state, mean, const, z, params, n, nu, jac_state, jac_land
         a, b, c, da, db, dc = _coefficients(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
         moved = _turned(b, c, w, shift)
         for k in range(count):
-            first = HEADER + PER_POINT * k
-            place = int(params[first + 3])
-            x0, x1, x2 = params[first], params[first + 1], params[first + 2]
-            if place >= 0:
-                x0 += mean[6 + 3 * place, i]
-                x1 += mean[7 + 3 * place, i]
-                x2 += mean[8 + 3 * place, i]
-            x = (x0, x1, x2)
+            first = HEADER + 3 * k
+            x = (params[first], params[first + 1], params[first + 2])
             t = _turned(a, b, w, x)
             p0, p1, p2 = t[0] + moved[0], t[1] + moved[1], t[2] + moved[2]
             u0 = s[0] * p0 + s[1] * p1 + s[2] * p2 + const[4, i] - state[4, i]
@@ -111,8 +103,6 @@ def constellation_view(state, mean, const, z, params, n, nu, jac_state, jac_land
                     e0 * s[1] + e1 * s[4] + e2 * s[7],
                     e0 * s[2] + e1 * s[5] + e2 * s[8],
                 )
-                for f in range(6, size):
-                    jac_landmark[out, f, i] = 0.0
                 turned = _by_turn(g, a, b, da, db, w, x)
                 carried = _by_turn(g, b, c, db, dc, w, shift)
                 back = (-w[0], -w[1], -w[2])
@@ -120,7 +110,31 @@ def constellation_view(state, mean, const, z, params, n, nu, jac_state, jac_land
                 for f in range(3):
                     jac_landmark[out, f, i] = turned[f] + carried[f]
                     jac_landmark[out, 3 + f, i] = by_shift[f]
-                if place >= 0:
-                    by_error = _turned(a, b, back, g)
-                    for f in range(3):
-                        jac_landmark[out, 6 + 3 * place + f, i] = by_error[f]
+
+
+@observation_kernel
+def members_view(state, mean, const, z, params, n, nu, jac_state, jac_landmark):
+    """Pixels of several points of one record (p_1, p_2, …); params: the camera's, then which points they are."""
+    count, size = z.shape[0] // 2, mean.shape[0]
+    for i in range(n):
+        r = rotation(state[0, i], state[1, i], state[2, i], state[3, i])
+        for k in range(count):
+            own = 3 * int(params[HEADER + k])
+            a = mean[own, i] - state[4, i]
+            b = mean[own + 1, i] - state[5, i]
+            c = mean[own + 2, i] - state[6, i]
+            x = r[0] * a + r[3] * b + r[6] * c
+            y = r[1] * a + r[4] * b + r[7] * c
+            depth = forward_depth(x, y, r[2] * a + r[5] * b + r[8] * c)
+            px, py, d00, d01, d02, d10, d11, d12 = project(x, y, depth, params)
+            nu[2 * k, i] = z[2 * k] - px
+            nu[2 * k + 1, i] = z[2 * k + 1] - py
+            for row in range(2):
+                d = (d00, d01, d02) if row == 0 else (d10, d11, d12)
+                out = 2 * k + row
+                store_by_state(out, d[0], d[1], d[2], x, y, depth, 1.0, jac_state, i)
+                for f in range(size):
+                    jac_landmark[out, f, i] = 0.0
+                for f in range(3):
+                    along = d[0] * r[3 * f] + d[1] * r[3 * f + 1] + d[2] * r[3 * f + 2]
+                    jac_landmark[out, own + f, i] = along

@@ -8,7 +8,7 @@ from rbpf import gaussian
 from rbpf.anchoring import Anchored
 from rbpf.filter import Filter
 from rbpf.lie import SE3
-from rbpf.maps.constellation import Constellation
+from rbpf.maps.constellation import Constellation, UncertainConstellation
 from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.models import Records
 from rbpf.systems.mono.system import world_of
@@ -63,9 +63,11 @@ def summarise_mono_map(filter_: Filter) -> MonoMap:
     for landmark_id in landmark_map.ids.tolist():
         landmark = landmark_map.landmark_of(landmark_id)
         records = landmark_map.read(np.array([landmark_id]))
-        if isinstance(landmark, Constellation):
-            for member, (points, within) in enumerate(_members(landmark, records)):
-                rows.add(member, mixture_moments(weights, points, within), nowhere)
+        if isinstance(landmark, Constellation | UncertainConstellation):
+            points, within = landmark.in_group(records)
+            for member in range(points.shape[1]):
+                moments = mixture_moments(weights, points[:, member], within[:, member])
+                rows.add(member, moments, nowhere)
             continue
         ends = nowhere
         if isinstance(landmark, InverseDepth):
@@ -85,18 +87,6 @@ def _gathered(rows: _Rows) -> MonoMap:
     )
     ends = np.array(rows.ends).reshape(-1, 2, 3)[order]
     return MonoMap(summary, np.isfinite(ends).all(axis=(1, 2)), ends)
-
-
-def _members(group: Constellation, records: Records) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Means (N, 3) and covariances (N, 3, 3) of the points of a constellation, in its own frame."""
-    n, out = records.mean.shape[0], []
-    for member, point in enumerate(group.points):
-        error, within = np.zeros((n, 3)), np.zeros((n, 3, 3))
-        if group.dim > 6:
-            own = slice(6 + 3 * member, 9 + 3 * member)
-            error, within = records.mean[:, 0, own], records.cov[:, 0, own, own]
-        out.append((np.asarray(point) + error, within))
-    return out
 
 
 def _linearised(landmark: InverseDepth, records: Records) -> Records:

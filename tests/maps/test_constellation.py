@@ -1,14 +1,15 @@
-"""Known points as one landmark: their frame, and the errors of each."""
+"""Known points as one landmark: exact ones through their frame, uncertain ones together."""
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 
 from rbpf import gaussian
 from rbpf.conformance import check_model
 from rbpf.errors import InputError
 from rbpf.genealogy import Lineage
 from rbpf.lie import SE3
-from rbpf.maps.constellation import MOST, Constellation
+from rbpf.maps.constellation import MOST, Constellation, UncertainConstellation
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.models import Records
 
@@ -19,70 +20,114 @@ FRAME = SE3.exp(np.array([0.4, -0.8, 1.2, 2.0, -1.0, 0.5]))
 COV_FRAME = np.diag([0.01, 0.02, 0.03, 0.1, 0.2, 0.3]) ** 2
 
 
-def exact(count: int) -> Constellation:
-    return Constellation(np.zeros((count, 3)), np.zeros((count, 3, 3)))
+def shape_and_records(n: int, seed: int, scale: float = 0.01) -> tuple[UncertainConstellation, Records]:
+    """Points of n particles, each near the given shape in a frame of its own, with a joint covariance."""
+    rng = np.random.default_rng(seed)
+    frames = SE3.retract(FRAME, rng.normal(scale=0.5, size=(n, 6)))
+    points = SE3.transform(frames[:, None], POINTS + rng.normal(scale=scale, size=(n, 4, 3)))
+    half = rng.normal(scale=0.003, size=(12, 14))
+    cov = np.broadcast_to(half @ half.T, (n, 1, 12, 12))
+    return UncertainConstellation(POINTS, COVS), Records(points.reshape(n, 1, 12), cov)
 
 
-@pytest.mark.parametrize("group", [Constellation(POINTS, COVS), exact(4)])
+@pytest.mark.parametrize("group", [Constellation(POINTS), UncertainConstellation(POINTS, COVS)])
 def test_sound_parametrisation(group):
     assert check_model(group, SE3) == []
 
 
-def test_sizes():
-    assert Constellation(POINTS, COVS).dim == 6 + 3 * 4
-    assert exact(4).dim == 6
-    assert exact(100).dim == 6
-    some = COVS * np.array([0.0, 0.0, 1.0, 0.0])[:, None, None]
-    assert Constellation(POINTS, some).dim == 6 + 3 * 4
-
-
-def test_too_many_points_with_errors():
+def test_only_so_many_points_have_errors():
     covs = np.tile(np.eye(3), (MOST + 1, 1, 1))
-    assert Constellation(np.zeros((MOST, 3)), covs[:MOST]).dim == 6 + 3 * MOST
-    with pytest.raises(InputError, match=f"{MOST + 1} known points have errors of their own: give at most"):
-        Constellation(np.zeros((MOST + 1, 3)), covs)
+    assert UncertainConstellation(np.zeros((MOST, 3)), covs[:MOST]).dim == 3 * MOST
+    with pytest.raises(InputError, match="at most 12, or exact ones"):
+        UncertainConstellation(np.zeros((MOST + 1, 3)), covs)
+    assert Constellation(np.zeros((100, 3))).dim == 6
 
 
-def test_first_records():
-    group = Constellation(POINTS, COVS)
-    records = group.started(3, FRAME, COV_FRAME)
-    assert records.mean.shape == (3, 1, 18)
-    np.testing.assert_array_equal(records.mean, 0.0)
-    np.testing.assert_array_equal(records.const, np.tile(FRAME, (3, 1, 1)))
-    expected = np.zeros((18, 18))
-    expected[:6, :6] = COV_FRAME
-    for m in range(4):
-        expected[6 + 3 * m : 9 + 3 * m, 6 + 3 * m : 9 + 3 * m] = COVS[m]
-    for cov in records.cov[:, 0]:
-        np.testing.assert_array_equal(cov, expected)
-    alone = exact(4).started(2, FRAME, COV_FRAME)
-    np.testing.assert_array_equal(alone.cov, np.tile(COV_FRAME, (2, 1, 1, 1)))
+def test_exact_points_start_where_their_frame_is():
+    records = Constellation(POINTS).started(2, FRAME, COV_FRAME)
+    np.testing.assert_array_equal(records.mean, np.zeros((2, 1, 6)))
+    np.testing.assert_array_equal(records.const, np.tile(FRAME, (2, 1, 1)))
+    np.testing.assert_array_equal(records.cov, np.tile(COV_FRAME, (2, 1, 1, 1)))
 
 
-def test_frame_is_moved_from_the_constant():
-    group, xi = Constellation(POINTS, COVS), np.array([0.3, 0.1, -0.2, 1.0, 2.0, 3.0])
-    mean = np.concatenate([xi, np.ones(12)])
-    np.testing.assert_allclose(group.frame(mean, FRAME), SE3.compose(FRAME, SE3.exp(xi)), atol=1e-14)
-    np.testing.assert_allclose(
-        group.homogeneous(mean, FRAME), [*SE3.compose(FRAME, SE3.exp(xi))[4:], 1.0], atol=1e-14
-    )
+def test_exact_points_move_with_their_frame():
+    group, xi = Constellation(POINTS), np.array([0.3, 0.1, -0.2, 1.0, 2.0, 3.0])
+    moved = SE3.compose(FRAME, SE3.exp(xi))
+    records = Records(xi[None, None], COV_FRAME[None, None], FRAME[None, None])
+    np.testing.assert_allclose(group.frame(records)[0][0], moved, atol=1e-14)
+    np.testing.assert_allclose(group.homogeneous(xi, FRAME), [*moved[4:], 1.0], atol=1e-14)
+    np.testing.assert_allclose(group.in_world(records)[0], SE3.transform(moved, POINTS), atol=1e-14)
+    mean, cov = group.in_group(records)
+    np.testing.assert_array_equal(mean[0], POINTS)
+    assert not cov.any()
 
 
-def test_factor_of_the_frame_is_in_the_chart_at_the_frame():
-    """Samples of ξ, told as Log(frame⁻¹ G Exp(ξ)); the correlation with the errors does not matter."""
-    group, n = Constellation(POINTS, COVS), 200_000
+def test_factor_of_an_exact_groups_frame_is_in_the_chart_at_the_frame():
+    """Samples of ξ, told as Log(frame⁻¹ G Exp(ξ))."""
+    group, n = Constellation(POINTS), 200_000
     rng = np.random.default_rng(5)
-    half = rng.normal(scale=0.003, size=(18, 20))
+    half = rng.normal(scale=0.003, size=(6, 8))
     cov = half @ half.T
-    mean = np.concatenate([[0.9, -0.7, 1.1, 2.0, 1.0, -3.0], np.zeros(12)])
-    records = Records(mean[None, None], cov[None, None], FRAME[None, None])
-    factor = group.frame_factor(records)[0]
-    xi = mean[:6] + rng.standard_normal((n, 6)) @ gaussian.cholesky(cov[:6, :6]).T
-    moved = SE3.local(group.frame(mean, FRAME), SE3.retract(FRAME, xi))
-    expected = factor @ factor.T
+    mean = np.array([0.9, -0.7, 1.1, 2.0, 1.0, -3.0])
+    frame, factor = group.frame(Records(mean[None, None], cov[None, None], FRAME[None, None]))
+    xi = mean + rng.standard_normal((n, 6)) @ gaussian.cholesky(cov).T
+    moved = SE3.local(frame[0], SE3.retract(FRAME, xi))
+    expected = factor[0] @ factor[0].T
     scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
     assert (np.abs(moved.T @ moved / n - expected) / scale).max() < 0.02
-    assert (np.abs(cov[:6, :6] - expected) / scale).max() > 0.2
+    assert (np.abs(cov - expected) / scale).max() > 0.2
+
+
+def test_frame_of_uncertain_points_is_the_best_fit():
+    """SciPy finds the same from another start."""
+    group, records = shape_and_records(5, seed=2, scale=0.05)
+    whiten = np.linalg.inv(gaussian.cholesky(COVS))
+    found, _ = group.frame(records)
+    for frame, points in zip(found, group.in_world(records), strict=True):
+
+        def misfit(xi: np.ndarray, frame=frame, points=points) -> np.ndarray:
+            local = SE3.inverse_transform(SE3.retract(frame, xi), points)
+            return (whiten @ (local - POINTS)[..., None]).ravel()
+
+        best = least_squares(misfit, np.full(6, 0.05), xtol=1e-15, ftol=1e-15, gtol=1e-15).x
+        np.testing.assert_allclose(best, 0.0, atol=1e-7)
+
+
+def test_covariance_of_the_frame_of_uncertain_points():
+    """Drawn points and drawn errors of the shape, fitted one by one: the frame varies by as much as is told."""
+    group, records = shape_and_records(1, seed=3, scale=0.0)
+    frame, factor = group.frame(records)
+    rng, n = np.random.default_rng(4), 20_000
+    drawn = records.mean[0] + rng.standard_normal((n, 12)) @ gaussian.psd_factor(records.cov[0, 0]).T
+    errors = (gaussian.cholesky(COVS) @ rng.standard_normal((n, 4, 3, 1)))[..., 0]
+    drawn = drawn + (SE3.rotation(frame[0]) @ errors[..., None])[..., 0].reshape(n, 12)
+    fits, _ = group.frame(Records(drawn[:, None], np.broadcast_to(records.cov, (n, 1, 12, 12))))
+    moved = SE3.local(frame[0], fits)
+    expected = factor[0] @ factor[0].T
+    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    assert (np.abs(moved.T @ moved / n - expected) / scale).max() < 0.04
+
+
+def test_uncertain_points_told_in_their_own_frame():
+    """Turning the world changes nothing; the covariance is that of a numeric derivative, and of what the fit leaves."""
+    group, records = shape_and_records(3, seed=6, scale=0.001)
+    local, covs = group.in_group(records)
+    turn = SE3.exp(np.array([0.2, -1.1, 0.6, 3.0, 1.0, -2.0]))
+    rotation = np.kron(np.eye(4), SE3.rotation(turn))
+    turned = SE3.transform(turn, group.in_world(records)).reshape(3, 1, 12)
+    again = group.in_group(Records(turned, rotation @ records.cov @ rotation.T))
+    np.testing.assert_allclose(again[0], local, atol=1e-9)
+    np.testing.assert_allclose(again[1], covs, atol=1e-9)
+    step, bare = 1e-6, np.zeros((3, 1, 12, 12))
+
+    def told(mean: np.ndarray) -> np.ndarray:
+        return group.in_group(Records(mean, bare))[0]
+
+    axes = [(told(records.mean + d) - told(records.mean - d)) / (2 * step) for d in step * np.eye(12)]
+    slope = np.stack(axes, axis=-1)
+    left = group.in_group(Records(records.mean, bare))[1]
+    expected = slope @ records.cov[:, :1] @ np.swapaxes(slope, -1, -2) + left
+    np.testing.assert_allclose(covs, expected, rtol=0.02, atol=1e-8)
 
 
 def test_two_groups_in_one_map():
@@ -90,7 +135,7 @@ def test_two_groups_in_one_map():
     held = LandmarkMap(SE3)
     held.begin(2, Lineage(2))
     for points in (POINTS, POINTS.copy(), POINTS + 1.0):
-        group = Constellation(points, COVS.copy())
-        held.add_records(group.started(2, FRAME, COV_FRAME), group)
+        group = UncertainConstellation(points, COVS.copy())
+        held.add_records(group.started(2, points, 1e-4 * np.eye(12)), group)
     assert len(held.layouts) == 2
     assert held.kinds[:3].tolist() == [0, 0, 1]

@@ -5,10 +5,10 @@ import pytest
 
 from rbpf.conformance import Example, check_model
 from rbpf.lie import SE3, Euclidean, Product
-from rbpf.maps.constellation import Constellation
+from rbpf.maps.constellation import Constellation, UncertainConstellation
 from rbpf.models import Records
 from rbpf.numeric import numeric_jacobians
-from rbpf.sensors.camera_constellation import ConstellationView
+from rbpf.sensors.camera_constellation import ConstellationView, MembersView
 from rbpf.sensors.camera_points import CameraPoint
 from tests.exactness.models import known
 from tests.sensors.camera_scenes import DISTORTED, PLAIN, with_velocity
@@ -25,21 +25,30 @@ def scene(errors: bool, turn: float = 0.7, seed: int = 0):
     rng = np.random.default_rng(seed)
     const = SE3.exp(rng.normal(size=(5, 1, 6)))
     xi = rng.normal(scale=turn, size=(5, 1, 6))
-    state = SE3.retract(SE3.retract(const, xi), np.array([0.0, 0.0, 0.0, 0.0, 0.0, -2.5]))
+    frame = SE3.retract(const, xi)
+    state = SE3.retract(frame, np.array([0.0, 0.0, 0.0, 0.0, 0.0, -2.5]))
     state = SE3.retract(state, rng.normal(scale=0.1, size=(5, 1, 6)))
-    mean = np.concatenate([xi, rng.normal(scale=0.02, size=(5, 1, 12 if errors else 0))], axis=-1)
-    return state, mean, const
+    if not errors:
+        return state, xi, const
+    points = SE3.transform(frame[..., None, :], POINTS + rng.normal(scale=0.02, size=(5, 1, 4, 3)))
+    return state, points.reshape(5, 1, 12), None
 
 
-def view(camera, errors: bool) -> ConstellationView:
-    return ConstellationView(camera, POINTS[SEEN], SEEN if errors else None)
+def view(camera, errors: bool) -> ConstellationView | MembersView:
+    return MembersView(camera, SEEN) if errors else ConstellationView(camera, POINTS[SEEN])
+
+
+def seen_in_world(errors: bool, mean, const) -> np.ndarray:
+    if errors:
+        return mean.reshape(5, 1, 4, 3)[:, :, SEEN]
+    return SE3.transform(SE3.retract(const, mean)[..., None, :], POINTS[SEEN])
 
 
 @every_group
 @every_camera
 def test_sound_model(camera, errors):
     state, mean, const = scene(errors)
-    group = Constellation(POINTS, COVS if errors else 0.0 * COVS)
+    group = UncertainConstellation(POINTS, COVS) if errors else Constellation(POINTS)
     cov = np.tile(np.eye(group.dim), (5, 1, 1, 1))
     example = Example(state=state[:, 0], landmark=group, records=Records(mean, cov, const))
     assert check_model(view(camera, errors), SE3, example=example) == []
@@ -63,23 +72,20 @@ def test_the_points_are_seen_one_after_the_other(camera, errors):
     state, mean, const = scene(errors)
     px = view(camera, errors).predict(state, mean, const)
     assert px.shape == (5, 1, 6)
-    errors_of = mean[:, 0, 6:].reshape(5, -1, 3)
-    for k, m in enumerate(SEEN):
-        place = POINTS[m] + (errors_of[:, m] if errors else 0.0)
-        world = SE3.transform(SE3.compose(const, SE3.exp(mean[..., :6]))[:, 0], place)
-        expected = CameraPoint(camera).predict(state[:, 0], world)
-        np.testing.assert_allclose(px[:, 0, 2 * k : 2 * k + 2], expected, rtol=1e-12)
+    world = seen_in_world(errors, mean, const)
+    for k in range(3):
+        expected = CameraPoint(camera).predict(state, world[:, :, k])
+        np.testing.assert_allclose(px[..., 2 * k : 2 * k + 2], expected, rtol=1e-12)
 
 
-def test_visible_where_all_points_are():
+@every_group
+def test_visible_where_all_points_are(errors):
     """While the camera turns away the points leave the image one after the other."""
-    state, mean, const = scene(False, seed=1)
+    state, mean, const = scene(errors, seed=1)
     turned = SE3.retract(state, np.linspace(0.0, 1.0, 30)[:, None, None, None] * np.eye(6)[1])
-    in_camera = SE3.inverse_transform(
-        turned[..., None, :], SE3.transform(SE3.retract(const, mean)[..., None, :], POINTS[SEEN])
-    )
+    in_camera = SE3.inverse_transform(turned[..., None, :], seen_in_world(errors, mean, const))
     expected = PLAIN.visible(in_camera)
     assert (expected.any(axis=-1) & ~expected.all(axis=-1)).any()
-    seen = view(PLAIN, False).visible(turned, mean, const)
+    seen = view(PLAIN, errors).visible(turned, mean, const)
     assert seen.dtype == bool and seen[0].all()
     np.testing.assert_array_equal(seen, expected.all(axis=-1))

@@ -7,7 +7,7 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.maps.constellation import Constellation
+from rbpf.maps.constellation import Constellation, UncertainConstellation
 from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.maps.point import Point
 from rbpf.sensors.features import FeatureFrame, FeatureLog, KnownPoints
@@ -56,7 +56,10 @@ def test_known_points_in_the_map():
     given = known(LOG.known)
     frame = build_filter(LOG, replace(SMALL, known="frame"))
     (landmark,) = frame.belief().map.ids.tolist()
-    assert isinstance(frame.belief().map.landmark_of(landmark), Constellation)
+    assert isinstance(frame.belief().map.landmark_of(landmark), UncertainConstellation)
+    exact = replace(LOG, known=replace(given, cov=np.zeros((4, 3, 3))))
+    rigid = build_filter(exact, replace(SMALL, known="frame")).belief().map
+    assert isinstance(rigid.landmark_of(int(rigid.ids[0])), Constellation)
     assert world_of(frame) is not None
     points = build_filter(LOG, replace(SMALL, known="points"))
     held = points.belief().map

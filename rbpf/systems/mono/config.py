@@ -31,8 +31,8 @@ class RayConfig:
     """Landmarks whose depth is not known yet, E06 §5.
 
     Attributes:
-        constrain: how they constrain the pose: by their epipolar line (the paper's), by the 2-D marginal with finite
-            depth variance, or not at all.
+        constrain: how they constrain the pose: by their epipolar line (the paper's); by the 2-D marginal with finite
+            depth variance from where on depth is measured, and by the line before; or not at all.
         rho_per_m: mean inverse depth of a new landmark, 1/m; without known points it sets the scale.
         std_rho_per_m: its standard deviation.
         adapt: a new ray starts at the median inverse depth of the points just seen, with the same relative deviation at
@@ -40,7 +40,8 @@ class RayConfig:
         ready_ratio: a ray becomes a point when the standard deviation of its inverse depth is below this share of it.
         ready_weight: share of the particles' weight in which it must be.
         least_px: depth is measured once a change of ρ by its first standard deviation moves the image by this. Before,
-            the parallax is no larger than what the error of the sampled pose makes, and depth would follow it.
+            the parallax tells more of the error of the sampled pose than of depth, and the prior of ρ, which does not
+            change as long as depth is not measured, would count anew in every frame.
         line_px: likewise, from where on there is an epipolar line.
     """
 
@@ -50,7 +51,7 @@ class RayConfig:
     adapt: bool = True
     ready_ratio: float = 0.1
     ready_weight: float = 0.95
-    least_px: float = 10.0
+    least_px: float = 3.0
     line_px: float = 1.0
 
 

@@ -6,22 +6,28 @@ from typing import final
 import numpy as np
 
 from rbpf.belief import Belief
+from rbpf.lie import SE3
+from rbpf.maps.constellation import Constellation
 from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.maps.point import Point
 from rbpf.models import Births, Observations, Part, Sensor
 from rbpf.numeric import linearise
-from rbpf.sensors.camera_constellation import ConstellationView
+from rbpf.sensors.camera_constellation import ConstellationView, MembersView
 from rbpf.sensors.camera_points import CameraModel, CameraPoint, CameraRay, EpipolarRay
-from rbpf.sensors.features import FeatureFrame, KnownPoints
+from rbpf.sensors.features import FeatureFrame
 from rbpf.sensors.names import Names
 from rbpf.sensors.pinhole import Pinhole
 from rbpf.systems.mono.config import RayConfig
+from rbpf.systems.mono.known_start import KnownStart
 
 CONSTELLATION = -1
 """Name of the known points' frame in the catalogue; features have names from 0 on."""
 
 ENOUGH = 4
 """Points that must have been seen for new rays to start at their depth."""
+
+GroupView = ConstellationView | MembersView
+"""Measurements of several known points at once."""
 
 _STATE, _MAP = frozenset({Part.STATE}), frozenset({Part.LANDMARK})
 _BOTH = _STATE | _MAP
@@ -35,10 +41,11 @@ class FeatureSensor(Sensor):
         camera: of the images.
         rays: settings of landmarks without depth.
         births_per_frame: landmarks started in one frame at most.
+        start: known points that are one landmark, a `Constellation`.
     """
 
     def __init__(
-        self, camera: Pinhole, rays: RayConfig, births_per_frame: int, known: KnownPoints | None = None
+        self, camera: Pinhole, rays: RayConfig, births_per_frame: int, start: KnownStart | None = None
     ) -> None:
         rho = (rays.rho_per_m, rays.std_rho_per_m)
         self.camera = camera
@@ -49,8 +56,8 @@ class FeatureSensor(Sensor):
         self.epipolar = EpipolarRay(camera, rho, rays.line_px)
         self.inverse_depth = InverseDepth(rays.ready_ratio)
         self._names = Names()
-        self._known = known
-        self._place = {} if known is None else {name: m for m, name in enumerate(known.names.tolist())}
+        self._start = start
+        self._place = {} if start is None else {name: m for m, name in enumerate(start.points.names.tolist())}
 
     def observe(self, frame: FeatureFrame, belief: Belief) -> Sequence[Observations]:
         """Groups for points and for rays."""
@@ -89,22 +96,27 @@ class FeatureSensor(Sensor):
         Rays that all start too near or too far agree with one another on a wrong scale: the prior takes them as
         independent, the scene's depth is common to them.
         """
-        mode, seen = belief.mode, [np.zeros(0)]
-        for group in observed if self.rays.adapt else ():
-            if group.ids is None or not isinstance(group.model, CameraPoint | ConstellationView):
-                continue
-            records = belief.read(group.ids)
-            const = None if records.const is None else records.const[mode]
-            point = group.model.in_camera(belief.state[mode][None], records.mean[mode], const)
-            seen.append(np.ravel(point[..., 2]))
-        depth = np.concatenate(seen)
-        depth = depth[depth > 0.0]
+        depth = self._depths(belief, observed) if self.rays.adapt else np.zeros(0)
         if depth.size < ENOUGH:
             return self.ray
         rho = 1.0 / depth
         middle = float(np.median(rho))
         share = self.rays.std_rho_per_m / self.rays.rho_per_m
         return CameraRay(self.camera, (middle, max(share * middle, float(rho.std()))))
+
+    def _depths(self, belief: Belief, observed: Sequence[Observations]) -> np.ndarray:
+        """Of the points that were just seen, and of the known points in view, in the heaviest particle."""
+        mode, pose = belief.mode, belief.state[belief.mode][:7]
+        seen = [np.zeros((0, 3))]
+        for group in observed:
+            if group.ids is not None and isinstance(group.model, CameraPoint):
+                seen.append(SE3.inverse_transform(pose, belief.read(group.ids).mean[mode]))
+        if self._start is not None:
+            landmark = self._names.ids(belief.catalogue)[CONSTELLATION]
+            points = belief.map.landmark_of(landmark).in_world(belief.read([landmark]))[mode]
+            seen.append(SE3.inverse_transform(pose, points))
+        point = np.concatenate(seen)
+        return np.asarray(point[self.camera.visible(point), 2])
 
     def project(
         self, belief: Belief, names: np.ndarray, members: np.ndarray
@@ -113,7 +125,7 @@ class FeatureSensor(Sensor):
         out = []
         for model, chosen, ids in self._by_kind(belief, names, members):
             mean, cov = belief.project(model, ids)
-            if isinstance(model, ConstellationView):
+            if isinstance(model, GroupView):
                 mean = mean.reshape(-1, 2)
             cov = _diagonal_blocks(cov, chosen.size)
             out.append((chosen, (mean, cov)))
@@ -132,7 +144,7 @@ class FeatureSensor(Sensor):
         for model, chosen, ids in self._by_kind(belief, names, members):
             records = belief.read(ids)
             const = None if records.const is None else records.const[mode]
-            z = px[chosen].reshape(1, -1) if isinstance(model, ConstellationView) else px[chosen]
+            z = px[chosen].reshape(1, -1) if isinstance(model, GroupView) else px[chosen]
             nu, jac = linearise(
                 model, belief.prior.space, z, belief.state[mode][None], records.mean[mode], const
             )
@@ -151,7 +163,7 @@ class FeatureSensor(Sensor):
             records = belief.read(ids)
             const = None if records.const is None else records.const[mode]
             which.append(chosen)
-            if isinstance(model, ConstellationView):
+            if isinstance(model, GroupView):
                 out.append(
                     np.pad(
                         model.in_world(records.mean[mode], const)[0], ((0, 0), (0, 1)), constant_values=1.0
@@ -186,13 +198,13 @@ class FeatureSensor(Sensor):
 
     def _by_kind(
         self, belief: Belief, names: np.ndarray, members: np.ndarray
-    ) -> list[tuple[CameraModel | ConstellationView, np.ndarray, np.ndarray]]:
+    ) -> list[tuple[CameraModel | GroupView, np.ndarray, np.ndarray]]:
         """Features (K,) by their model: the model, which of them, and the landmarks' ids."""
         known = self._names.ids(belief.catalogue)
         ids = np.array([known.get(name, -1) for name in names.tolist()], dtype=np.int64)
         own = np.flatnonzero((members < 0) & (ids >= 0))
         is_ray = belief.map.are(ids[own], self.inverse_depth)
-        out: list[tuple[CameraModel | ConstellationView, np.ndarray, np.ndarray]] = []
+        out: list[tuple[CameraModel | GroupView, np.ndarray, np.ndarray]] = []
         for model, chosen in ((self.point, own[~is_ray]), (self.ray, own[is_ray])):
             if chosen.size:
                 out.append((model, chosen, ids[chosen]))
@@ -201,17 +213,18 @@ class FeatureSensor(Sensor):
             out.append((self._view(belief, members[of_group]), of_group, np.array([known[CONSTELLATION]])))
         return out
 
-    def _view(self, belief: Belief, places: np.ndarray) -> ConstellationView:
-        assert self._known is not None
-        landmark = self._names.ids(belief.catalogue)[CONSTELLATION]
-        own = None if belief.map.landmark_of(landmark).dim == 6 else places
-        return ConstellationView(self.camera, self._known.positions[places], own)
+    def _view(self, belief: Belief, places: np.ndarray) -> GroupView:
+        assert self._start is not None
+        group = belief.map.landmark_of(self._names.ids(belief.catalogue)[CONSTELLATION])
+        if isinstance(group, Constellation):
+            return ConstellationView(self.camera, self._start.points.positions[places])
+        return MembersView(self.camera, places)
 
     def _constellation_group(self, frame: FeatureFrame, belief: Belief) -> list[Observations]:
-        """All known points that are seen, as one measurement of their frame."""
+        """All known points that are seen, as one measurement; the first sight of them is in the map already."""
         rows = [k for k, name in enumerate(frame.landmarks.tolist()) if name in self._place]
         rows = [k for k in rows if self.camera.inside(frame.z[k])]
-        if not rows:
+        if not rows or self._has_entered(frame, rows):
             return []
         landmark = self._names.ids(belief.catalogue)[CONSTELLATION]
         view = self._view(belief, np.array([self._place[name] for name in frame.landmarks[rows].tolist()]))
@@ -219,6 +232,12 @@ class FeatureSensor(Sensor):
         for k, row in enumerate(rows):
             cov[0, 2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = frame.cov_z[row]
         return [Observations(z, cov, view, ids=np.array([landmark]))]
+
+    def _has_entered(self, frame: FeatureFrame, rows: list[int]) -> bool:
+        assert self._start is not None
+        first = self._start.sight
+        order = np.argsort(first.landmarks), np.argsort(frame.landmarks[rows])
+        return frame.stamp_ns == first.stamp_ns and np.array_equal(first.z[order[0]], frame.z[rows][order[1]])
 
     def _ray_groups(
         self, frame: FeatureFrame, belief: Belief, rows: np.ndarray, ids: np.ndarray
@@ -234,7 +253,7 @@ class FeatureSensor(Sensor):
             return [Observations(z[chosen], cov[chosen], model, ids=ids[chosen], informs=informs)]
 
         if self.rays.constrain == "marginal":
-            return group(self.ray, deep) + group(self.ray, ~deep, informs=_STATE)
+            return group(self.ray, deep) + group(self.epipolar, ~deep, informs=_STATE)
         updates = group(self.ray, deep, informs=_MAP)
         if self.rays.constrain == "off":
             return updates

@@ -1,9 +1,19 @@
-"""The first camera, from points of known position that are seen in its image."""
+"""The first camera, and what its image says of the points of known position that it shows."""
+
+from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import block_diag
+from scipy.optimize import least_squares
 
+from rbpf import gaussian
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.lie.matrices import skew
+from rbpf.maps.constellation import LEAST, Constellation, UncertainConstellation
+from rbpf.models import Records
+from rbpf.sensors.camera_points import CameraPoint
+from rbpf.sensors.features import FeatureFrame, KnownPoints
 from rbpf.sensors.pinhole import Pinhole
 from rbpf.sensors.readers.images import KnownPixels
 from rbpf.sensors.resection import resect
@@ -42,3 +52,91 @@ def resect_known(camera: Pinhole, known: KnownPixels, noise_px: float) -> np.nda
             f"{error[worst]:.1f} px away; check the positions, their axes and which point is which"
         )
     return world_from_camera
+
+
+@dataclass(frozen=True)
+class KnownStart:
+    """Known points, and the first image's sight of them.
+
+    Attributes:
+        points: M of them.
+        world_from_camera: (7,) of the first image, as resected from them.
+        rows: (K,) which of the points it shows.
+        sight: where, K features with the names of these points.
+    """
+
+    points: KnownPoints
+    world_from_camera: np.ndarray
+    rows: np.ndarray
+    sight: FeatureFrame
+
+
+def first_records(
+    camera: Pinhole, start: KnownStart, n: int, cov_frame: np.ndarray
+) -> tuple[Records, Constellation | UncertainConstellation]:
+    """Known points after the first image, whose camera is the world: records (n, 1, …) and their parametrisation.
+
+    The frame is hardly known before: an update linearised there would leave errors of the second order, larger than a
+    pixel, in everything that is mapped afterwards. So the optimum of both, what is given and what is seen, is found
+    first, and the covariance is taken there.
+
+    Args:
+        camera: of the image.
+        start: what the image shows of the points.
+        n: number of particles.
+        cov_frame: (6, 6) of the points' frame around where the resection puts it.
+    """
+    points = start.points
+    exact = not points.cov.any()
+    fit = _FirstImage(camera, start, cov_frame, exact)
+    x = least_squares(fit.residual, np.zeros(fit.size), fit.slope, method="lm").x
+    pose, local = fit.split(x)
+    half = np.linalg.pinv(fit.slope(x))
+    frame = SE3.inverse(pose)
+    half[:6] = -SE3.adjoint(pose) @ SE3.right_jacobian(x[:6]) @ half[:6]  # in the frame's own right chart
+    if exact:
+        group = Constellation(points.positions)
+        return group.started(n, frame, gaussian.symmetrise(half @ half.T)), group
+    shape = UncertainConstellation(points.positions, points.cov)
+    by_frame = np.concatenate([-skew(local), np.broadcast_to(np.eye(3), (*local.shape, 3))], axis=-1)
+    moved = by_frame @ half[:6] + half[6:].reshape(*local.shape, -1)
+    turned = (SE3.rotation(frame) @ moved).reshape(-1, half.shape[1])
+    world = SE3.transform(frame, local)
+    return shape.started(n, world, gaussian.symmetrise(turned @ turned.T)), shape
+
+
+class _FirstImage:
+    """Whitened residuals by x = (ξ, e_1, …, e_M): group_from_camera = T Exp(ξ), point m at k_m + e_m in the group."""
+
+    def __init__(self, camera: Pinhole, start: KnownStart, cov_frame: np.ndarray, exact: bool) -> None:
+        self.start = start
+        self.model = CameraPoint(camera)
+        self.exact = exact
+        self.size = 6 if exact else 6 + start.points.positions.size
+        self._chol_px = gaussian.cholesky(start.sight.cov_z)
+        prior = [cov_frame] if exact else [cov_frame, *(start.points.cov + LEAST * np.eye(3))]
+        self._chol_prior = gaussian.cholesky(block_diag(*prior))
+
+    def split(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """group_from_camera (7,) and the points (M, 3) in the group's frame."""
+        errors = np.zeros(self.start.points.positions.shape) if self.exact else x[6:].reshape(-1, 3)
+        return SE3.retract(self.start.world_from_camera, x[:6]), self.start.points.positions + errors
+
+    def residual(self, x: np.ndarray) -> np.ndarray:
+        """Of what is seen, then of what was given."""
+        pose, local = self.split(x)
+        nu = self.start.sight.z - self.model.predict(pose, local[self.start.rows])
+        seen = gaussian.solve_lower(self._chol_px, nu).ravel()
+        return np.concatenate([seen, gaussian.solve_lower(self._chol_prior, -x)])
+
+    def slope(self, x: np.ndarray) -> np.ndarray:
+        """Its derivative by x."""
+        pose, local = self.split(x)
+        by_pose, by_point, _ = self.model.jacobians(pose, local[self.start.rows])
+        assert by_pose is not None and by_point is not None
+        rows = np.zeros((*self.start.sight.z.shape, self.size))
+        rows[..., :6] = by_pose @ SE3.right_jacobian(x[:6])
+        for k, m in enumerate(() if self.exact else self.start.rows.tolist()):
+            rows[k, :, 6 + 3 * m : 9 + 3 * m] = by_point[k]
+        seen = gaussian.solve_lower_matrix(self._chol_px, rows).reshape(-1, self.size)
+        return -np.concatenate([seen, gaussian.solve_lower_matrix(self._chol_prior, np.eye(self.size))])

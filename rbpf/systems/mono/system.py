@@ -1,24 +1,22 @@
 """Monocular SLAM on features (E06): constant velocity, a camera, points and rays."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from rbpf.anchoring import Anchored
 from rbpf.errors import InputError
 from rbpf.filter import Filter
 from rbpf.lie import SE3
-from rbpf.maps.constellation import Constellation
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
 from rbpf.models import Conditional, MotionModel, Records, Sensor
 from rbpf.motion.constant_velocity import MarginalVelocity, PoseLaw, SampledVelocity
-from rbpf.sensors.features import FeatureLog, KnownPoints
+from rbpf.sensors.features import FeatureFrame, FeatureLog, KnownPoints
 from rbpf.sensors.pinhole import Pinhole
 from rbpf.sensors.resection import resect
 from rbpf.substate import KalmanSubstate
 from rbpf.systems.mono.config import MonoConfig, VelocityConfig
 from rbpf.systems.mono.feature_sensor import CONSTELLATION, FeatureSensor
+from rbpf.systems.mono.known_start import KnownStart, first_records
 
 
 def build_filter(log: FeatureLog, config: MonoConfig) -> Filter:
@@ -31,21 +29,13 @@ def build_filter(log: FeatureLog, config: MonoConfig) -> Filter:
         raise InputError(f"{log.name}: monocular SLAM needs a log of one camera, this is a stereo log")
     if any((frame.landmarks < 0).any() for frame in log.frames):
         raise InputError(f"{log.name}: a landmark has a negative name, number the landmarks from 0 on")
-    start = None if log.known is None else KnownStart(log.known, _resected(log))
-    return assemble(config, build_features(log.camera, config, log.known), start)
+    start = None if log.known is None else _known_start(log)
+    return assemble(config, build_features(log.camera, config, start), start)
 
 
-@dataclass(frozen=True)
-class KnownStart:
-    """Known points, and the world_from_camera (7,) of the first frame that they imply."""
-
-    points: KnownPoints
-    world_from_camera: np.ndarray
-
-
-def build_features(camera: Pinhole, config: MonoConfig, known: KnownPoints | None) -> FeatureSensor:
+def build_features(camera: Pinhole, config: MonoConfig, start: KnownStart | None) -> FeatureSensor:
     """What turns found features into observations."""
-    group = known if config.known == "frame" else None
+    group = start if config.known == "frame" else None
     return FeatureSensor(camera, config.ray, config.births_per_frame, group)
 
 
@@ -77,7 +67,7 @@ def assemble(
         np.random.default_rng(config.seed),
     )
     if start is not None and config.known == "frame":
-        add_constellation(landmark_map, start, config)
+        add_constellation(landmark_map, features.camera, start, config)
     elif start is not None:
         add_known_points(landmark_map, start.points, config.particles)
     return filter_
@@ -99,10 +89,11 @@ def add_known_points(landmark_map: LandmarkMap, known: KnownPoints, n: int) -> N
     landmark_map.catalogue.update(zip(ids.tolist(), known.names.tolist(), strict=True))
 
 
-def add_constellation(landmark_map: LandmarkMap, start: KnownStart, config: MonoConfig) -> None:
-    """The known points as one landmark: their frame, as seen from the first camera."""
-    group = Constellation(start.points.positions, start.points.cov)
-    records = group.started(config.particles, SE3.inverse(start.world_from_camera), start_cov(config))
+def add_constellation(
+    landmark_map: LandmarkMap, camera: Pinhole, start: KnownStart, config: MonoConfig
+) -> None:
+    """The known points as one landmark, as seen from the first camera."""
+    records, group = first_records(camera, start, config.particles, start_cov(config))
     ids = landmark_map.add_records(records, group)
     landmark_map.catalogue[int(ids[0])] = CONSTELLATION
 
@@ -114,7 +105,7 @@ def world_of(filter_: Filter) -> Anchored | None:
         if name == CONSTELLATION:
             group = landmark_map.landmark_of(landmark)
             records = landmark_map.read(np.array([landmark]))
-            return Anchored(group.frame(records.mean[:, 0], records.const[:, 0]), group.frame_factor(records))
+            return Anchored(*group.frame(records))
     return None
 
 
@@ -128,17 +119,18 @@ def start_law(log: FeatureLog, config: MonoConfig) -> PoseLaw:
     """
     if log.known is None or config.known == "frame":
         return PoseLaw(SE3.identity(), np.zeros((6, 6)))
-    return PoseLaw(_resected(log), start_cov(config))
+    return PoseLaw(_known_start(log).world_from_camera, start_cov(config))
 
 
-def _resected(log: FeatureLog) -> np.ndarray:
-    """world_from_camera of the first frame, from the known points."""
+def _known_start(log: FeatureLog) -> KnownStart:
+    """What the first frame shows of the known points, and where its camera is."""
     assert isinstance(log.camera, Pinhole) and log.known is not None
     first = log.frames[0]
-    inside = log.camera.inside(first.z)
-    names, z = first.landmarks[inside], first.z[inside]
-    _, in_known, in_frame = np.intersect1d(log.known.names, names, return_indices=True)
-    return resect(log.camera, log.known.positions[in_known], z[in_frame])
+    inside = np.flatnonzero(log.camera.inside(first.z))
+    _, rows, which = np.intersect1d(log.known.names, first.landmarks[inside], return_indices=True)
+    k = inside[which]
+    sight = FeatureFrame(first.stamp_ns, first.landmarks[k], first.z[k], first.cov_z[k])
+    return KnownStart(log.known, resect(log.camera, log.known.positions[rows], sight.z), rows, sight)
 
 
 def start_cov(config: MonoConfig) -> np.ndarray:

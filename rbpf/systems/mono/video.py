@@ -11,16 +11,16 @@ from rbpf.errors import InputError
 from rbpf.filter import Filter
 from rbpf.lie import SE3
 from rbpf.motion.constant_velocity import PoseLaw
-from rbpf.sensors.features import KnownPoints
+from rbpf.sensors.features import FeatureFrame, KnownPoints
 from rbpf.sensors.readers.images import ImageFrame, ImageSequence, KnownPixels
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.image_sensor import ImageSensor
-from rbpf.systems.mono.known_start import resect_known
+from rbpf.systems.mono.known_start import KnownStart, resect_known
 from rbpf.systems.mono.recovery import Recovery
 from rbpf.systems.mono.resuming import cut, restore, save
 from rbpf.systems.mono.run import pose_estimate
 from rbpf.systems.mono.sightings import Sightings
-from rbpf.systems.mono.system import KnownStart, assemble, build_features, start_cov, start_std
+from rbpf.systems.mono.system import assemble, build_features, start_cov, start_std
 
 
 @dataclass
@@ -151,8 +151,11 @@ def _begin(
         count = known.names.size
         cov = known.std_m[:, None, None] ** 2 * np.eye(3)
         points = KnownPoints(np.arange(count), known.positions, cov)
-        start = KnownStart(points, resect_known(sequence.camera, known, config.search.noise_px))
-    features = build_features(sequence.camera, config, None if start is None else start.points)
+        noise = np.tile(config.search.noise_px**2 * np.eye(2), (count, 1, 1))
+        sight = FeatureFrame(int(sequence.stamps_ns[0]), points.names, known.px, noise)
+        pose = resect_known(sequence.camera, known, config.search.noise_px)
+        start = KnownStart(points, pose, points.names, sight)
+    features = build_features(sequence.camera, config, start)
     sensor = ImageSensor(features, config.search)
     if known is not None:
         sensor.begin(image, known.px, config.known == "frame")
