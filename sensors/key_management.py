@@ -1,8 +1,8 @@
 """Which keys enter a map, which stay, and which become landmarks (S05 §IV–V).
 
-S05 adds 10 to 15 keys per frame that are sufficiently distinct from those held, drops a key that is not seen again within
-three frames, and calls it a landmark once it has been seen three times. Here keys that are no landmarks yet are 60 at
-most, and new ones are spread over the image. Keys go by names, whole numbers that are never used again.
+S05 adds 10 to 15 keys per frame that are sufficiently distinct from those held, drops a key that is not seen again
+within three frames, and calls it a landmark once it has been seen three times. Here keys that are no landmarks yet are
+60 at most, and new ones are spread over the image. Keys go by names, whole numbers that are never used again.
 """
 
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ class KeyConfig:
     Attributes:
         per_frame: new keys in a frame at most.
         distinct: least distance of a new key from those held and from other new ones; None for `DISTINCT`.
-        spacing_px: least distance of a new key's place from those of features matched in this frame and of other new keys.
+        spacing_px: least distance of a new key's place from those of matched features and of other new keys.
         cells: the image is divided into so many columns and rows, which fill evenly.
         patience: a key that is no landmark and has not been seen in so many frames is dropped.
         sightings: a key that was seen so often is a landmark, the first time included.

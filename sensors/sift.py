@@ -74,7 +74,7 @@ class KeyPoints:
     Attributes:
         px: (K, 2) place.
         scale: (K,) standard deviation of the Gaussian at which each was found, px.
-        orientation: (K,) direction of the strongest slope, radians in [0, 2π), from the columns' axis towards the rows'.
+        orientation: (K,) direction of the strongest slope, [0, 2π), from the columns' axis towards the rows'.
         contrast: (K,) of the extremum.
         keys: (K, d) float32 of length 1.
     """

@@ -9,7 +9,8 @@ from typing import final
 import numpy as np
 
 from rbpf import gaussian
-from rbpf.sensors.key_matching import KeyMatches, MatchLimits, gate_pairs, match_all, match_pairs
+from rbpf.sensors.candidates import gate_pairs
+from rbpf.sensors.key_matching import KeyMatches, MatchLimits, match_all, match_pairs
 from rbpf.sensors.pinhole import RectifiedStereo
 
 

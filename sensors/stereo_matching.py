@@ -19,8 +19,9 @@ from typing import final
 import numpy as np
 
 from rbpf.errors import InputError
+from rbpf.sensors.candidates import band_pairs
 from rbpf.sensors.disparity import refine
-from rbpf.sensors.key_matching import KeyMatches, MatchLimits, band_pairs, match_pairs
+from rbpf.sensors.key_matching import KeyMatches, MatchLimits, match_pairs
 from rbpf.sensors.patches import checked_image
 from rbpf.sensors.pinhole import RectifiedStereo
 from rbpf.sensors.sift import KeyPoints, Sift, SiftConfig
