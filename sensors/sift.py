@@ -45,7 +45,7 @@ class SiftConfig:
     """
 
     features: int = 1000
-    working_scale: float = 1.0
+    working_scale: float = 0.5
     contrast: float = 0.04
     edge: float = 10.0
     layers: int = 3

@@ -5,8 +5,8 @@ that a depth beyond the nearest has, at a like scale and orientation. Of these c
 (`key_matching`), and the place in the right image is refined on grey values (`disparity`).
 
 The noise of z = (u_left, v, u_right): what a keypoint's place means on the object changes from view to view, with
-standard deviation σ_p per axis that grows with the keypoint's scale. The refinement looks for what lies at the left
-place, whatever that is: u_right shares the error of u_left and adds that of the disparity, σ_d,
+standard deviation σ_p per axis. The refinement looks for what lies at the left place, whatever that is: u_right shares
+the error of u_left and adds that of the disparity, σ_d. Both grow with the keypoint's scale,
 
     cov = [[σ_p², 0, σ_p²], [0, σ_p², 0], [σ_p², 0, σ_p² + σ_d²]].
 
@@ -49,7 +49,8 @@ class StereoConfig:
         shift_px: nor may the refinement move it further than this.
         place_px: σ_p of a keypoint of scale 0 …
         place_per_scale: … and what is added to it in quadrature, as a share of the scale.
-        disparity_px: σ_d.
+        disparity_px: σ_d of a keypoint of scale 0 …
+        disparity_per_scale: … and what is added to it in quadrature.
 
     Raises:
         InputError: a number is out of its range.
@@ -66,9 +67,10 @@ class StereoConfig:
     half_px: int = 5
     least_correlation: float = 0.8
     shift_px: float = 2.0
-    place_px: float = 0.5
-    place_per_scale: float = 0.1
-    disparity_px: float = 0.15
+    place_px: float = 0.25
+    place_per_scale: float = 0.02
+    disparity_px: float = 0.1
+    disparity_per_scale: float = 0.025
 
     def __post_init__(self) -> None:
         positive = (
@@ -83,7 +85,7 @@ class StereoConfig:
         for name in positive:
             if not getattr(self, name) > 0.0:
                 raise InputError(f"{name} must be positive, got {getattr(self, name)}")
-        for name in ("row_px", "row_per_scale", "place_per_scale"):
+        for name in ("row_px", "row_per_scale", "place_per_scale", "disparity_per_scale"):
             if not getattr(self, name) >= 0.0:
                 raise InputError(f"{name} must not be negative, got {getattr(self, name)}")
         if not (self.scale_ratio >= 1.0 and self.least_correlation <= 1.0):
@@ -144,8 +146,9 @@ class StereoSift:
         place = config.place_px**2 + (config.place_per_scale * scale) ** 2
         if not config.refine:
             return place[:, None, None] * np.eye(3)
+        disparity = config.disparity_px**2 + (config.disparity_per_scale * scale) ** 2
         shared = np.array([[1.0, 0.0, 1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 1.0]])
-        return place[:, None, None] * shared + np.diag([0.0, 0.0, config.disparity_px**2])
+        return place[:, None, None] * shared + disparity[:, None, None] * np.diag([0.0, 0.0, 1.0])
 
     def _features(self, keypoints: KeyPoints, z: np.ndarray) -> StereoFeatures:
         return StereoFeatures.measured(

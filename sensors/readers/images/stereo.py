@@ -1,8 +1,8 @@
 """Recordings of two cameras side by side: EuRoC ASL with `cam0` and `cam1`, KITTI with `image_0` and `image_1`.
 
-EuRoC's images are paired by their times; what has no partner is left out, which `StereoSequence.notes` says. Images that
-are not rectified become so by the two `sensor.yaml`; the truth is then that of the rectified left camera. KITTI's images
-are rectified and have numbers: one that is missing on either side is a pair with a problem.
+EuRoC's images are paired by their times; what has no partner is left out, which `StereoSequence.notes` says. Images
+that are not rectified become so by the two `sensor.yaml`; the truth is then that of the rectified left camera. KITTI's
+images are rectified and have numbers: one that is missing on either side is a pair with a problem.
 """
 
 import logging
