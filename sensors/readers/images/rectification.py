@@ -58,7 +58,7 @@ class Rectification:
             *_opencv(right),
             size,
             SE3.rotation(right_from_left),
-            SE3.translation(right_from_left),
+            SE3.translation(right_from_left)[:, None],
             flags=cv2.CALIB_ZERO_DISPARITY,
             alpha=0,
         )[:4]
