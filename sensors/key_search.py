@@ -9,6 +9,9 @@ from rbpf.errors import InputError
 from rbpf.sensors.key_matching import KeyMatches, MatchLimits, decide, match_all, two_best
 from rbpf.sensors.key_store import KeyStore
 
+NEAR = 3
+"""Keys asked for: the two nearest, and one in case that one of them has gone."""
+
 
 class KeySearch(ABC):
     """Finds the keys of a store that are nearest to others."""
@@ -39,7 +42,7 @@ class TreeSearch(KeySearch):
         least: so many may come or go in any case.
     """
 
-    def __init__(self, slack: float = 2.0, tail: float = 0.1, least: int = 500) -> None:
+    def __init__(self, slack: float = 3.0, tail: float = 0.1, least: int = 500) -> None:
         if not (slack >= 0.0 and tail > 0.0 and least >= 0):
             expected = "a slack and a least of at least 0 and a positive tail"
             raise InputError(f"a tree search needs {expected}, got {slack}, {least} and {tail}")
@@ -59,21 +62,28 @@ class TreeSearch(KeySearch):
             rows, held, young = np.arange(len(store)), np.ones(len(store), dtype=bool), 0
         first = len(store) - young
         best, next_best, where = two_best(query, store.keys[first:])
-        old = self._ask(query, store, rows, held)
+        old = self._ask(query, limits, rows, held)
         merged = np.maximum(np.maximum(next_best, old[1]), np.minimum(best, old[0]))
         where = np.where(best > old[0], first + where, old[2])
         return decide(query, store.keys, (np.maximum(best, old[0]), merged, where), limits)
 
     def _ask(
-        self, query: np.ndarray, store: KeyStore, rows: np.ndarray, held: np.ndarray
+        self, query: np.ndarray, limits: MatchLimits, rows: np.ndarray, held: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Products (K,) with the nearest and the next key in the tree that are held still, and the nearest's row."""
         none = np.full(query.shape[0], -np.inf, dtype=np.float32)
         if not held.any():
             return none, none, np.zeros(query.shape[0], dtype=np.int64)
-        near = min(4, self._ids.size)
-        distance, found = self._tree.query(query, k=np.arange(1, near + 1), eps=self.slack)
-        product = np.where(held[found], 1.0 - 0.5 * distance**2, -np.inf).astype(np.float32)
+        near = min(NEAR, self._ids.size)
+        # A key further away is neither taken, nor does its distance forbid another.
+        most = limits.largest(query.shape[1]) / limits.ratio * (1.0 + 1e-6)
+        distance, found = self._tree.query(
+            query, k=np.arange(1, near + 1), eps=self.slack, distance_upper_bound=most
+        )
+        there = np.isfinite(distance)
+        found = np.where(there, found, 0)
+        product = np.where(there & held[found], 1.0 - 0.5 * np.minimum(distance, 2.0) ** 2, -np.inf)
+        product = product.astype(np.float32)
         order = np.argsort(-product, axis=1, kind="stable")
         product, found = np.take_along_axis(product, order, 1), np.take_along_axis(found, order, 1)
         return product[:, 0], product[:, 1] if near > 1 else none, rows[found[:, 0]]
@@ -82,4 +92,4 @@ class TreeSearch(KeySearch):
         from scipy.spatial import cKDTree
 
         self._ids, self._built = store.ids.copy(), (store, store.restored)
-        self._tree = cKDTree(store.keys, leafsize=32, balanced_tree=False, compact_nodes=False)
+        self._tree = cKDTree(store.keys, leafsize=32)
