@@ -18,9 +18,9 @@ AIM_SEARCH_MS, AIM_WHOLE_MS, AIM_CORNERS_MS = 1.0, 5.0, 3.0
 COV = (RADIUS_PX / SIGMAS) ** 2 * np.eye(2)
 
 
-def picture(height: int, width: int, blur_px: float) -> np.ndarray:
+def picture(height: int, width: int, blur_px: float, seed: int = 0) -> np.ndarray:
     """Smoothed noise over the whole range of grey levels."""
-    noise = np.random.default_rng(0).normal(size=(height, width)).astype(np.float32)
+    noise = np.random.default_rng(seed).normal(size=(height, width)).astype(np.float32)
     return cv2.normalize(cv2.GaussianBlur(noise, (0, 0), blur_px), None, 0, 255, cv2.NORM_MINMAX, cv2.CV_8U)
 
 

@@ -3,5 +3,14 @@
 from rbpf.sensors.readers.images.known_points import KnownPixels, read_known_points
 from rbpf.sensors.readers.images.opening import open_images
 from rbpf.sensors.readers.images.sequence import ImageFrame, ImageSequence
+from rbpf.sensors.readers.images.stereo import StereoSequence, open_stereo
 
-__all__ = ["ImageFrame", "ImageSequence", "KnownPixels", "open_images", "read_known_points"]
+__all__ = [
+    "ImageFrame",
+    "ImageSequence",
+    "KnownPixels",
+    "StereoSequence",
+    "open_images",
+    "open_stereo",
+    "read_known_points",
+]

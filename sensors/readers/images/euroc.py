@@ -13,6 +13,7 @@ M. Burri, J. Nikolic, P. Gohl, T. Schneider, J. Rehder, S. Omari, M. W. Achtelik
 vehicle datasets", IJRR 35(10), 2016.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ from rbpf.sensors.readers.images.calibration import read_calibration
 from rbpf.sensors.readers.images.euroc_camera import AslCamera, read_camera, read_mount
 from rbpf.sensors.readers.images.euroc_stereo import read_right
 from rbpf.sensors.readers.images.files import FileImages, first_shape
-from rbpf.sensors.readers.images.sequence import ImageSequence
+from rbpf.sensors.readers.images.sequence import ImageSequence, Source
 from rbpf.sensors.readers.images.stamped import read_stamped
 from rbpf.sensors.readers.images.truth import normalised, truth_between
 
@@ -57,13 +58,29 @@ def read(path: Path, calibration: Path | None) -> ImageSequence:
     shape = first_shape(files, rows.path)
     used.require_shape(shape, str(mav / "cam0"))
     right, baseline_m = read_right(mav / "cam1", camera, used.camera, rows)
+    opened = sequence(mav, camera, rows.stamps_ns, FileImages(rows.stamps_ns, shape, files, right))
+    return replace(opened, camera=used.camera, baseline_m=baseline_m and (used.baseline_m or baseline_m))
+
+
+def sequence(mav: Path, camera: AslCamera, stamps_ns: np.ndarray, source: Source) -> ImageSequence:
+    """Images of one camera, with its truth where there is one.
+
+    Args:
+        mav: the folder with the cameras.
+        camera: whose pose on the body says where the truth is.
+        stamps_ns: (T,) times of the images.
+        source: of the images.
+
+    Raises:
+        InputError: the truth's file is malformed, or of another time.
+    """
     return ImageSequence(
         name=_name(mav),
-        camera=used.camera,
-        stamps_ns=rows.stamps_ns,
-        truth=_read_truth(mav, camera, rows.stamps_ns),
-        baseline_m=baseline_m and (used.baseline_m or baseline_m),
-        source=FileImages(rows.stamps_ns, shape, files, right),
+        camera=camera.calibration.camera,
+        stamps_ns=stamps_ns,
+        truth=_read_truth(mav, camera, stamps_ns),
+        baseline_m=None,
+        source=source,
     )
 
 

@@ -45,7 +45,7 @@ def read_right(
     if not folder.is_dir():
         return None, None
     right = read_camera(folder / "sensor.yaml", "the second camera")
-    baseline_m = _baseline(left, right)
+    baseline_m = rectified_baseline(left, right)
     if baseline_m is None or any(used.distortion):
         _log.info("%s: left out, as the two cameras are not rectified", folder)
         return None, None
@@ -54,7 +54,8 @@ def read_right(
     return [by_stamp.get(stamp) for stamp in rows.stamps_ns.tolist()], baseline_m
 
 
-def _baseline(left: AslCamera, right: AslCamera) -> float | None:
+def rectified_baseline(left: AslCamera, right: AslCamera) -> float | None:
+    """Distance [m] of the cameras of a rectified pair, None where they are not one."""
     first, second = left.calibration.camera, right.calibration.camera
     if (first.width, first.height) != (second.width, second.height):
         return None

@@ -17,7 +17,7 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
 from rbpf.sensors.features import CameraTruth
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
 from rbpf.sensors.readers.images.calibration import Calibration, read_calibration
 from rbpf.sensors.readers.images.decoding import SUFFIXES
 from rbpf.sensors.readers.images.files import FileImages, first_shape
@@ -28,6 +28,8 @@ from rbpf.sensors.readers.images.stamped import read_stamped
 from rbpf.sensors.readers.table import read_columns
 
 KIND = "a KITTI odometry sequence (image_0 or image_2, calib.txt, times.txt)"
+
+PAIR_KIND = "a KITTI odometry sequence of two cameras (image_0 and image_1, calib.txt, times.txt)"
 
 _PAIRS = ((0, 1), (2, 3))
 _POSE = tuple(f"m{row}{column}" for row in range(3) for column in range(4))
@@ -66,6 +68,31 @@ def read(path: Path, calibration: Path | None) -> ImageSequence:
         source=FileImages(
             rows.stamps_ns, shape, files, _files(path / f"image_{right}", len(files)) if stereo else None
         ),
+    )
+
+
+def read_pair(path: Path, calibration: Path | None) -> tuple[ImageSequence, RectifiedStereo, tuple[str, ...]]:
+    """The sequence, its two cameras, and what has to be said about them; as `open_stereo`."""
+    left, right = next(pair for pair in _PAIRS if (path / f"image_{pair[0]}").is_dir())
+    folders = path / f"image_{left}", path / f"image_{right}"
+    if not folders[1].is_dir():
+        raise InputError(f"{folders[1]}: no such folder, expected the images of the right camera.")
+    sequence = read(path, calibration)
+    shape = first_shape(_files(folders[1], len(sequence)), folders[1])
+    if shape != (sequence.camera.height, sequence.camera.width):
+        sizes = f"{sequence.camera.width}x{sequence.camera.height} and {shape[1]}x{shape[0]} px"
+        raise InputError(f"{path}: the left and right images have {sizes}, expected one size.")
+    assert sequence.baseline_m is not None
+    return sequence, RectifiedStereo(sequence.camera, sequence.baseline_m), _missing(folders, len(sequence))
+
+
+def _missing(folders: tuple[Path, Path], count: int) -> tuple[str, ...]:
+    """A sentence about each folder that does not hold an image for every time."""
+    held = [sum(file.exists() for file in _files(folder, count)) for folder in folders]
+    return tuple(
+        f"{folder}: {number} images for {count} times; the other pairs come without."
+        for folder, number in zip(folders, held, strict=True)
+        if number < count
     )
 
 

@@ -61,6 +61,9 @@ class Projections:
         """
         differ = np.subtract(self.intrinsics(left), self.intrinsics(right))
         along = float((self.first_from_camera(right) - self.first_from_camera(left))[4])
+        if along == 0.0:
+            problem = f"P{right} is at the place of P{left}, a baseline of zero; give the projections of two cameras"
+            raise line_error(self.path, self.lines[right], problem)
         if np.abs(differ).max() > ALIGNED_PX or along <= 0.0:
             problem = f"expected P{right} to be P{left} shifted to the right, as of a rectified pair"
             raise line_error(self.path, self.lines[right], problem)

@@ -1,0 +1,187 @@
+"""How many matches of stereo SIFT features are right: python -m benchmarks.stereo_keys FOLDER_OF_RECORDINGS.
+
+Right is what the motion says on which most features agree (`plain_odometry`): a point, carried by it, falls where the
+feature is that it was matched with, up to noise (99.9 % of a Gaussian) and 2 px. The recordings' own truth is not exact
+enough: KITTI's rotations move all features by up to 2 px from frame to frame. Features are matched left to right by
+keys of 128; keys of 36 are formed of the same histograms. Prints the tables of the documentation.
+"""
+
+import argparse
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from benchmarks.plain_odometry import path
+from rbpf.exchange import NULL
+from rbpf.lie import SE3
+from rbpf.sensors.key_index import Gate, KeyIndex
+from rbpf.sensors.key_management import KeyConfig, KeyManager
+from rbpf.sensors.key_matching import MatchLimits
+from rbpf.sensors.key_search import ExactSearch, KeySearch, TreeSearch
+from rbpf.sensors.pinhole import RectifiedStereo
+from rbpf.sensors.readers.images import open_stereo
+from rbpf.sensors.sift import SiftConfig, keys_of
+from rbpf.sensors.stereo_features import StereoFeatures, match_frames
+from rbpf.sensors.stereo_matching import StereoSift
+
+NAMES = {"stereo_zed_room1": (1, 5, 10), "stereo_kitti_seq1": (1, 2, 3)}
+SLACK_PX, RIGHT = 2.0, 16.3
+REACH_PX = 5.0
+"""Standard deviation of the prediction that gates a map."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Features of every pair, and where the camera was, (T, 7) from the first camera's place."""
+
+    rig: RectifiedStereo
+    features: list[StereoFeatures]
+    poses: np.ndarray
+
+    def predicted(self, points: np.ndarray, cov: np.ndarray, frame: int) -> tuple[np.ndarray, np.ndarray]:
+        """Mean (M, 3) and covariance (M, 3, 3) in the image of points in the world; NaN where they are not seen."""
+        pose = self.poses[frame]
+        local = SE3.inverse_transform(pose, points)
+        seen = self.rig.visible(local)
+        local = np.where(seen[:, None], local, np.nan)
+        slope = self.rig.slope(local) @ SE3.rotation(pose).T
+        return self.rig.project(local), slope @ cov @ slope.swapaxes(1, 2)
+
+    def in_world(self, frame: int, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Points (k, 3) and covariances (k, 3, 3) of features."""
+        chosen, turn = self.features[frame].take(rows), SE3.rotation(self.poses[frame])
+        return SE3.transform(self.poses[frame], chosen.points), turn @ chosen.cov_points @ turn.T
+
+
+def read(folder: Path, config: SiftConfig) -> Recording:
+    """All of a recording."""
+    sequence = open_stereo(folder)
+    sensor = StereoSift(sequence.rig, config)
+    features = [sensor.measure(frame.image, frame.right) for frame in sequence.frames()]
+    return Recording(sequence.rig, features, path(sequence.rig, features)[0])
+
+
+def shortened(recording: Recording, length: int) -> Recording:
+    """The same with keys of another length, of the same histograms: squares of "root" keys are their shares."""
+    return replace(
+        recording, features=[replace(f, keys=keys_of(f.keys**2, length)) for f in recording.features]
+    )
+
+
+def agree(mean: np.ndarray, cov: np.ndarray, z: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Whether predictions (P, 3) and measurements (P, 3) are of one point."""
+    total = cov + noise + SLACK_PX**2 * np.eye(3)
+    nu = z - mean
+    return np.einsum("pi,pi->p", nu, np.linalg.solve(total, nu[..., None])[..., 0]) <= RIGHT
+
+
+def frame_to_frame(recording: Recording, gap: int) -> tuple[int, int]:
+    """Matches between pairs `gap` apart, and how many are right."""
+    found = right = 0
+    for frame in range(0, len(recording.features) - gap, 2):
+        before, after = recording.features[frame], recording.features[frame + gap]
+        matches = match_frames(before, after, MatchLimits())
+        mean, cov = recording.predicted(*recording.in_world(frame, matches.first), frame + gap)
+        found += len(matches)
+        right += int(agree(mean, cov, after.z[matches.second], after.cov[matches.second]).sum())
+    return found, right
+
+
+@dataclass
+class Tally:
+    """Matches with a map: how many, how many right, and the seconds that they took."""
+
+    found: int = 0
+    right: int = 0
+    frames: int = 0
+    seconds: float = 0.0
+
+    def text(self) -> str:
+        return (
+            f"{self.found / self.frames:5.1f} {self.right / max(self.found, 1):6.3f} "
+            f"{1e3 * self.seconds / self.frames:7.2f} ms"
+        )
+
+
+def with_map(recording: Recording, search: KeySearch, gated: bool, others: np.ndarray) -> Tally:
+    """Goes through a recording with a map that grows as S05 has it, beside keys (D, d) of elsewhere."""
+    length, tally = recording.features[0].keys.shape[1], Tally()
+    index = KeyIndex(length, search=search)
+    index.store.add(np.arange(len(others)), others)
+    camera = recording.rig.camera
+    manager = KeyManager(KeyConfig(), (camera.width, camera.height))
+    points, covs = np.zeros((0, 3)), np.zeros((0, 3, 3))
+    for frame, features in enumerate(recording.features):
+        mean, cov = recording.predicted(points, covs, frame)
+        seen = manager.names[np.isfinite(mean[manager.names]).all(axis=1)]
+        reach = cov[seen] + REACH_PX**2 * np.eye(3)
+        gate = Gate(features.z, features.cov, seen + len(others), mean[seen], reach) if gated else None
+        start = time.thread_time()
+        ids = index.match(features.keys, gate).ids
+        tally.seconds += time.thread_time() - start
+        rows = np.flatnonzero(ids >= len(others))
+        names = ids[rows] - len(others)
+        tally.frames += 1
+        tally.found += int((ids != NULL).sum())
+        tally.right += int(agree(mean[names], cov[names], features.z[rows], features.cov[rows]).sum())
+        index.store.remove(manager.note(names) + len(others))
+        free = np.flatnonzero(ids == NULL)
+        new = manager.choose(
+            features.z[free, :2],
+            features.keys[free],
+            index.nearest(features.keys[free]),
+            features.z[rows, :2],
+        )
+        index.store.add(manager.add(new.size) + len(others), features.keys[free[new]])
+        added = recording.in_world(frame, free[new])
+        points, covs = np.concatenate([points, added[0]]), np.concatenate([covs, added[1]])
+    return tally
+
+
+def tables(folder: Path, config: SiftConfig) -> Iterator[str]:
+    """Lines of the report."""
+    whole = {name: read(folder / name, config) for name in NAMES}
+    yield "recording           key  frames apart: matches per pair, share that is right"
+    for name, gaps in NAMES.items():
+        for length in (36, 128):
+            recording, cells = shortened(whole[name], length), []
+            for gap in gaps:
+                found, right = frame_to_frame(recording, gap)
+                pairs = len(range(0, len(recording.features) - gap, 2))
+                cells.append(f"{gap}: {found / pairs:5.1f} {right / max(found, 1):.3f}")
+            yield f"{name:18}  {length:3}  {'   '.join(cells)}"
+    yield "recording           key  other keys  search: matches per frame, share right, time"
+    for name, other in (tuple(NAMES), tuple(NAMES)[::-1]):
+        for length in (36, 128):
+            recording = shortened(whole[name], length)
+            foreign = np.concatenate([f.keys for f in shortened(whole[other], length).features])
+            for count in (0, 1000, 10000):
+                others = foreign[:: max(len(foreign) // max(count, 1), 1)][:count]
+                cells = [
+                    f"{title} {with_map(recording, search, gated, others).text()}"
+                    for title, search, gated in (
+                        ("exact", ExactSearch(), False),
+                        ("tree", TreeSearch(), False),
+                        ("gated", ExactSearch(), True),
+                    )
+                ]
+                yield f"{name:18}  {length:3}  {len(others):6}      {'   '.join(cells)}"
+
+
+def main() -> None:
+    """Prints the tables."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.stereo_keys", description=__doc__)
+    parser.add_argument("folder", type=Path, help="holds stereo_zed_room1 and stereo_kitti_seq1")
+    parser.add_argument("--scale", type=float, default=0.5, help="of the images that SIFT looks at")
+    arguments = parser.parse_args()
+    cv2.setNumThreads(1)
+    for line in tables(arguments.folder, SiftConfig(working_scale=arguments.scale, length=128)):
+        print(line, flush=True)
+
+
+if __name__ == "__main__":
+    main()

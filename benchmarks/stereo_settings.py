@@ -1,0 +1,92 @@
+"""What settings of stereo SIFT cost and lose: python -m benchmarks.stereo_settings FOLDER_OF_RECORDINGS.
+
+For each setting: processor time per pair of images on one thread, features, features that agree with the motion between
+consecutive pairs, and the error of the path that a plain odometry makes of them (`plain_odometry`; no filter, no map).
+"""
+
+import argparse
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from benchmarks.plain_odometry import path
+from rbpf.lie import SE3
+from rbpf.sensors.pinhole import RectifiedStereo
+from rbpf.sensors.readers.images import StereoSequence, open_stereo
+from rbpf.sensors.sift import SiftConfig
+from rbpf.sensors.stereo_features import StereoFeatures
+from rbpf.sensors.stereo_matching import StereoConfig, StereoSift
+from rbpf.validation.alignment import align
+
+NAMES = "stereo_zed_room1", "stereo_kitti_seq1"
+SEEDS = 3
+
+SETTINGS = {
+    "whole image": (SiftConfig(features=0, working_scale=1.0), StereoConfig()),
+    "half": (SiftConfig(features=0), StereoConfig()),
+    "half, not refined": (SiftConfig(features=0), StereoConfig(refine=False)),
+    "half, keys of 128": (SiftConfig(features=0, length=128), StereoConfig()),
+    "half, contrast 0.02": (SiftConfig(features=0, contrast=0.02), StereoConfig()),
+    "half, 300 keypoints": (SiftConfig(features=300), StereoConfig()),
+    "0.35": (SiftConfig(features=0, working_scale=0.35), StereoConfig()),
+}
+
+
+def measured(sequence: StereoSequence, sensor: StereoSift) -> tuple[list[StereoFeatures], np.ndarray]:
+    """Features of all pairs, and mean milliseconds of SIFT and of the matching."""
+    features, seconds = [], np.zeros(2)
+    for frame in sequence.frames():
+        start = time.process_time()
+        keypoints = sensor.sift.detect(frame.image), sensor.sift.detect(frame.right)
+        middle = time.process_time()
+        features.append(sensor.match((frame.image, frame.right), *keypoints))
+        seconds += middle - start, time.process_time() - middle
+    return features, 1e3 * seconds / len(sequence)
+
+
+def errors(rig: RectifiedStereo, features: list[StereoFeatures], truth: np.ndarray) -> tuple[float, ...]:
+    """Medians over seeds: ATE after rigid and after similarity alignment [m], scale, features that agree."""
+    rows = []
+    for seed in range(SEEDS):
+        poses, agreeing = path(rig, features, seed)
+        place, reference, row = SE3.translation(poses), SE3.translation(truth), []
+        for with_scale in (False, True):
+            fitted = align(place, reference, with_scale)
+            miss = fitted.transform(place) - reference
+            row.append(float(np.sqrt(np.square(miss).sum(axis=1).mean())))
+        rows.append((*row, fitted.scale, agreeing))
+    return tuple(np.median(rows, axis=0))
+
+
+def lines(folder: Path, names: list[str]) -> Iterator[str]:
+    """Of the report."""
+    yield "recording           setting                      SIFT   match ms  features  agree  ATE rigid   sim3  scale"
+    for name in names:
+        sequence = open_stereo(folder / name)
+        truth = sequence.truth
+        assert truth is not None
+        rows = np.abs(truth.stamps_ns[None] - sequence.stamps_ns[:, None]).argmin(axis=1)
+        for title, (sift, stereo) in SETTINGS.items():
+            features, ms = measured(sequence, StereoSift(sequence.rig, sift, stereo))
+            rigid, similar, scale, agreeing = errors(sequence.rig, features, truth.world_from_camera[rows])
+            count = np.mean([len(each) for each in features])
+            cells = f"{ms[0]:7.1f} {ms[1]:7.1f}  {count:8.0f} {agreeing:6.0f}     {rigid:.4f} {similar:.4f} {scale:.4f}"
+            yield f"{name:18}  {title:26} {cells}"
+
+
+def main() -> None:
+    """Prints the table."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.stereo_settings", description=__doc__)
+    parser.add_argument("folder", type=Path, help="holds the recordings")
+    parser.add_argument("names", nargs="*", default=list(NAMES), help=f"by default {' '.join(NAMES)}")
+    arguments = parser.parse_args()
+    cv2.setNumThreads(1)
+    for line in lines(arguments.folder, arguments.names):
+        print(line, flush=True)
+
+
+if __name__ == "__main__":
+    main()

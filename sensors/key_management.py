@@ -1,0 +1,191 @@
+"""Which keys enter a map, which stay, and which become landmarks (S05 §IV–V).
+
+S05 adds 10 to 15 keys per frame that are sufficiently distinct from those held, drops a key that is not seen again
+within three frames, and calls it a landmark once it has been seen three times. Here keys that are no landmarks yet are
+60 at most, and new ones are spread over the image. Keys go by names, whole numbers that are never used again.
+"""
+
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from rbpf.errors import InputError
+from rbpf.sensors.key_matching import distances
+
+DISTINCT = {36: 0.12, 128: 0.3}
+"""Least distance of a new key from others, by its length: keys of one place are mostly nearer."""
+
+
+@dataclass(frozen=True)
+class KeyConfig:
+    """Settings of the management.
+
+    Attributes:
+        per_frame: new keys in a frame at most.
+        distinct: least distance of a new key from those held and from other new ones; None for `DISTINCT`.
+        spacing_px: least distance of a new key's place from those of matched features and of other new keys.
+        cells: the image is divided into so many columns and rows, which fill evenly.
+        patience: a key that is no landmark and has not been seen in so many frames is dropped.
+        sightings: a key that was seen so often is a landmark, the first time included.
+        waiting: keys that are no landmarks at most.
+
+    Raises:
+        InputError: a number is out of its range.
+    """
+
+    per_frame: int = 15
+    distinct: float | None = None
+    spacing_px: float = 10.0
+    cells: int = 6
+    patience: int = 3
+    sightings: int = 3
+    waiting: int = 60
+
+    def __post_init__(self) -> None:
+        for name in ("cells", "patience", "sightings"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name} must be at least 1, got {getattr(self, name)}")
+        for name in ("per_frame", "spacing_px", "waiting"):
+            if not getattr(self, name) >= 0:
+                raise InputError(f"{name} must not be negative, got {getattr(self, name)}")
+        if self.distinct is not None and not 0.0 <= self.distinct <= 2.0:
+            raise InputError(f"distinct must be a distance from 0 to 2, got {self.distinct}")
+
+
+@final
+class KeyManager:
+    """Counts sightings of keys, frame by frame. Call `note`, then `choose`, then `add`.
+
+    Args:
+        config: settings.
+        size: width and height of the image, px.
+    """
+
+    def __init__(self, config: KeyConfig, size: tuple[int, int]) -> None:
+        self.config = config
+        self.size = size
+        self.frame = 0
+        """Frames noted so far."""
+        self.next_name = 0
+        self._table = np.zeros((0, 3), dtype=np.int64)
+
+    @property
+    def names(self) -> np.ndarray:
+        """(M,) of the keys held, ascending."""
+        return self._table[:, 0]
+
+    @property
+    def sightings(self) -> np.ndarray:
+        """(M,) how often each was seen."""
+        return self._table[:, 1]
+
+    @property
+    def last_seen(self) -> np.ndarray:
+        """(M,) frame in which each was seen last."""
+        return self._table[:, 2]
+
+    @property
+    def promoted(self) -> np.ndarray:
+        """(M,) whether each is a landmark."""
+        return self.sightings >= self.config.sightings
+
+    def note(self, names: np.ndarray) -> np.ndarray:
+        """Begins a frame in which keys (k,), each once, were seen again.
+
+        Returns:
+            Names (j,) of keys that are dropped.
+
+        Raises:
+            InputError: a key is not held.
+        """
+        rows = self._rows(names)
+        self.frame += 1
+        self._table[rows, 1] += 1
+        self._table[rows, 2] = self.frame
+        overdue = ~self.promoted & (self.frame - self.last_seen >= self.config.patience)
+        dropped = self.names[overdue].copy()
+        self._table = self._table[~overdue]
+        return dropped
+
+    def choose(self, px: np.ndarray, keys: np.ndarray, nearest: np.ndarray, taken: np.ndarray) -> np.ndarray:
+        """Rows (k,) of those features of a frame that are worth a new key, in their order.
+
+        Args:
+            px: (K, 2) places of features that matched no key, best first.
+            keys: (K, d) float32 of length 1.
+            nearest: (K,) distances of these from the nearest key held, infinite where there is none.
+            taken: (L, 2) places of the features that did match.
+        """
+        room = min(self.config.per_frame, self.config.waiting - int((~self.promoted).sum()))
+        chosen: list[int] = []
+        for row in self._order(px, taken).tolist():
+            if len(chosen) >= room:
+                break
+            if nearest[row] >= self._distinct(keys) and self._apart(row, chosen, px, keys, taken):
+                chosen.append(row)
+        return np.array(sorted(chosen), dtype=np.int64)
+
+    def add(self, count: int) -> np.ndarray:
+        """Takes in new keys, seen for the first time in this frame; returns their names (count,)."""
+        names = np.arange(self.next_name, self.next_name + count)
+        self.next_name += count
+        new = np.column_stack([names, np.ones(count, dtype=np.int64), np.full(count, self.frame)])
+        self._table = np.concatenate([self._table, new])
+        return names
+
+    def remove(self, names: np.ndarray) -> None:
+        """Drops keys (k,), landmarks or not.
+
+        Raises:
+            InputError: a key is not held.
+        """
+        self._table = np.delete(self._table, self._rows(names), axis=0)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """For a checkpoint."""
+        return {
+            "key_manager/table": self._table.copy(),
+            "key_manager/counters": np.array([self.frame, self.next_name]),
+        }
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """The inverse of `arrays`."""
+        self._table = arrays["key_manager/table"].copy()
+        self.frame, self.next_name = (int(x) for x in arrays["key_manager/counters"])
+
+    def _order(self, px: np.ndarray, taken: np.ndarray) -> np.ndarray:
+        """Rows of features, those of the emptiest cells first, in each cell in their order."""
+        cell = self._cell(px)
+        rank = np.zeros(cell.size, dtype=np.int64)
+        count = np.bincount(self._cell(taken), minlength=self.config.cells**2)
+        for row, place in enumerate(cell.tolist()):
+            rank[row] = count[place]
+            count[place] += 1
+        return np.argsort(rank, kind="stable")
+
+    def _cell(self, px: np.ndarray) -> np.ndarray:
+        column, line = np.clip(px * self.config.cells / np.array(self.size), 0, self.config.cells - 1).T
+        return column.astype(np.int64) + self.config.cells * line.astype(np.int64)
+
+    def _apart(
+        self, row: int, chosen: list[int], px: np.ndarray, keys: np.ndarray, taken: np.ndarray
+    ) -> bool:
+        """Whether a feature is far enough from others of the frame, in the image and in its key."""
+        others = np.concatenate([taken, px[chosen]])
+        if (np.square(others - px[row]).sum(axis=1) < self.config.spacing_px**2).any():
+            return False
+        return not (distances(keys[chosen] @ keys[row]) < self._distinct(keys)).any()
+
+    def _distinct(self, keys: np.ndarray) -> float:
+        given = self.config.distinct
+        return DISTINCT.get(keys.shape[1], 0.0) if given is None else given
+
+    def _rows(self, names: np.ndarray) -> np.ndarray:
+        names = np.asarray(names, dtype=np.int64)
+        rows = np.searchsorted(self.names, names)
+        known = rows < self.names.size
+        known[known] = self.names[rows[known]] == names[known]
+        if not known.all():
+            raise InputError(f"there is no key named {names[~known][0]}")
+        return rows

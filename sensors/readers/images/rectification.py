@@ -1,0 +1,111 @@
+"""Images of two cameras that see alike, made into those of a rectified pair (OpenCV's `stereoRectify`)."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any, Self, final
+
+import numpy as np
+
+from rbpf.errors import InputError
+from rbpf.lie import SE3, Array
+from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+from rbpf.sensors.readers.images.sequence import ImageFrame, Source
+
+BESIDE = 0.7
+"""The baseline lies along the rows by this share of its length at least; beyond, most of the view is lost."""
+
+
+@final
+@dataclass(frozen=True)
+class Rectification:
+    """How images are made into those of a rectified pair.
+
+    Attributes:
+        rig: the rectified pair.
+        left_from_rectified: (7,) a turn.
+        maps: for each camera, columns and rows (H, W) float32 of the given image that the rectified one shows.
+    """
+
+    rig: RectifiedStereo
+    left_from_rectified: Array
+    maps: tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+    @classmethod
+    def between(cls, left: Pinhole, right: Pinhole, left_from_right: Array, where: str) -> Self:
+        """Rectification of two cameras of one image size.
+
+        Args:
+            left: the first camera.
+            right: the second one.
+            left_from_right: (7,) its pose in the frame of the first.
+            where: the calibration, for messages.
+
+        Raises:
+            InputError: the second camera is not to the right of the first.
+        """
+        import cv2
+
+        shift = SE3.translation(left_from_right)
+        if shift[0] < BESIDE * np.linalg.norm(shift):
+            x, y, z = (f"{component:.4g}" for component in shift)
+            raise InputError(
+                f"{where}: the right camera is at ({x}, {y}, {z}) m from the left one, expected it to the right, "
+                "along the rows; exchange the two, or correct T_BS."
+            )
+        right_from_left, size = SE3.inverse(left_from_right), (left.width, left.height)
+        turns = cv2.stereoRectify(
+            *_opencv(left),
+            *_opencv(right),
+            size,
+            SE3.rotation(right_from_left),
+            SE3.translation(right_from_left)[:, None],
+            flags=cv2.CALIB_ZERO_DISPARITY,
+            alpha=0,
+        )[:4]
+        projection, beside = turns[2], turns[3]
+        fx, fy, cx, cy = projection[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+        camera = Pinhole(left.width, left.height, fx, fy, cx, cy)
+        back = np.eye(4)
+        back[:3, :3] = turns[0].T
+        maps = tuple(
+            cv2.initUndistortRectifyMap(*_opencv(given), turn, target, size, cv2.CV_32FC1)
+            for given, turn, target in ((left, turns[0], projection), (right, turns[1], beside))
+        )
+        rig = RectifiedStereo(camera, -float(beside[0, 3]) / fx)
+        return cls(rig, SE3.from_matrix(back), (maps[0], maps[1]))
+
+    def frame(self, frame: ImageFrame) -> ImageFrame:
+        """The frame with its images rectified."""
+        left, right = (
+            None if image is None else _moved(image, maps)
+            for image, maps in zip((frame.image, frame.right), self.maps, strict=True)
+        )
+        return replace(frame, image=left, right=right)
+
+
+@final
+@dataclass(frozen=True)
+class RectifiedImages(Source):
+    """Images of another source, rectified.
+
+    Attributes:
+        source: of the images as they were taken.
+        rectification: how they are changed.
+    """
+
+    source: Source
+    rectification: Rectification
+
+    def frames(self, start: int) -> Iterator[ImageFrame]:
+        return map(self.rectification.frame, self.source.frames(start))
+
+
+def _opencv(camera: Pinhole) -> tuple[Any, Any]:
+    fx, fy, cx, cy = camera.params[:4]
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), np.array(camera.distortion)
+
+
+def _moved(image: np.ndarray, maps: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    import cv2
+
+    return np.asarray(cv2.remap(image, *maps, cv2.INTER_LINEAR))

@@ -1,0 +1,177 @@
+"""Keypoints of the difference of Gaussians with SIFT keys (D. Lowe, IJCV 60(2), 2004), the features of S05 §III-A.
+
+OpenCV detects and describes. Pixels are (column, row), with the centre of the top-left one at (0, 0).
+
+A key has 128 entries: 4 × 4 spatial windows of 8 orientations each; or 36, as S05 has it: 3 × 3 windows of 4
+orientations. S05 does not say how its keys were formed. Here windows are added two by two in both directions,
+overlapping, so that 4 become 3; and with h_o the histogram's entry at o · 45°, the entry at o · 90° becomes
+h_2o + (h_2o−1 + h_2o+1) / 2, so that every one of the 8 counts once and none is preferred to its mirror image.
+
+Entries are then scaled to length 1 ("sift"), or to sum 1 and their roots taken ("root"), which makes the product of
+two keys the Bhattacharyya coefficient of two histograms (R. Arandjelović, A. Zisserman, CVPR 2012). Either way
+|a − b|² = 2 − 2 aᵀb.
+"""
+
+from dataclasses import dataclass
+from typing import Any, Literal, final
+
+import numpy as np
+
+from rbpf.errors import InputError
+from rbpf.sensors.patches import checked_image
+
+LENGTHS = (36, 128)
+
+_SIGMA = 1.6
+"""Blur of the first image of an octave; OpenCV's default, which is Lowe's."""
+
+
+@dataclass(frozen=True)
+class SiftConfig:
+    """Settings of the detector and of the keys.
+
+    Attributes:
+        features: the most keypoints of an image, those of highest contrast; 0 for all.
+        working_scale: the image is reduced by this before it is looked at, 0.5 for half of each side; places and
+            scales stay in pixels of the image that was given.
+        contrast: least contrast of an extremum; OpenCV's unit, Lowe's 0.03 is 0.09 with three layers.
+        edge: largest ratio of principal curvatures.
+        layers: scales per octave.
+        length: of a key, 36 or 128.
+        norm: "root" or "sift", see the module.
+
+    Raises:
+        InputError: a number is out of its range.
+    """
+
+    features: int = 1000
+    working_scale: float = 0.5
+    contrast: float = 0.04
+    edge: float = 10.0
+    layers: int = 3
+    length: Literal[36, 128] = 36
+    norm: Literal["root", "sift"] = "root"
+
+    def __post_init__(self) -> None:
+        if self.features < 0:
+            raise InputError(f"features must be a number of keypoints, or 0 for all, got {self.features}")
+        if not 0.0 < self.working_scale <= 1.0:
+            raise InputError(f"working_scale must be above 0 and at most 1, got {self.working_scale}")
+        if not (self.contrast >= 0.0 and self.edge > 1.0 and self.layers >= 1):
+            expected = "contrast of at least 0, edge above 1 and at least one layer"
+            raise InputError(f"expected {expected}, got {self.contrast}, {self.edge} and {self.layers}")
+        if self.length not in LENGTHS:
+            raise InputError(f"a key has 36 or 128 entries, got length {self.length}")
+        if self.norm not in ("root", "sift"):
+            raise InputError(f'norm must be "root" or "sift", got {self.norm!r}')
+
+
+@final
+@dataclass(frozen=True)
+class KeyPoints:
+    """Keypoints of an image, of highest contrast first.
+
+    Attributes:
+        px: (K, 2) place.
+        scale: (K,) standard deviation of the Gaussian at which each was found, px.
+        orientation: (K,) direction of the strongest slope, [0, 2π), from the columns' axis towards the rows'.
+        contrast: (K,) of the extremum.
+        keys: (K, d) float32 of length 1.
+    """
+
+    px: np.ndarray
+    scale: np.ndarray
+    orientation: np.ndarray
+    contrast: np.ndarray
+    keys: np.ndarray
+
+    def __len__(self) -> int:
+        return self.px.shape[0]
+
+    def take(self, rows: np.ndarray) -> "KeyPoints":
+        """Some of them, by number or by mask."""
+        return KeyPoints(
+            self.px[rows], self.scale[rows], self.orientation[rows], self.contrast[rows], self.keys[rows]
+        )
+
+
+@final
+class Sift:
+    """Finds and describes keypoints.
+
+    Args:
+        config: settings.
+    """
+
+    def __init__(self, config: SiftConfig | None = None) -> None:
+        self.config = config or SiftConfig()
+        self._detector: Any = None
+
+    def detect(self, image: np.ndarray) -> KeyPoints:
+        """Keypoints of an image (H, W) uint8; none where there is no texture.
+
+        A place with two strong directions is two keypoints.
+
+        Raises:
+            InputError: the image is not (H, W) uint8.
+        """
+        image = _reduced(checked_image(image), self.config.working_scale)
+        found, histograms = self._opencv().detectAndCompute(image, None)
+        if not found:
+            return self._none()
+        table = np.array([(*p.pt, p.size, p.angle, p.response) for p in found])
+        ratio = self.config.working_scale
+        points = KeyPoints(
+            px=(table[:, :2] + 0.5) / ratio - 0.5,
+            scale=0.5 * table[:, 2] / ratio,
+            orientation=np.deg2rad(table[:, 3]) % (2.0 * np.pi),
+            contrast=table[:, 4],
+            keys=keys_of(histograms, self.config.length, self.config.norm),
+        )
+        # OpenCV keeps the strongest, and ties, in no particular order.
+        order = np.lexsort((points.orientation, points.px[:, 0], points.px[:, 1], -points.contrast))
+        return points.take(order[: self.config.features or None])
+
+    def _opencv(self) -> Any:
+        if self._detector is None:
+            import cv2
+
+            config = self.config
+            # Without the precise scaling every place is a quarter of a pixel off.
+            self._detector = cv2.SIFT.create(
+                config.features, config.layers, config.contrast, config.edge, _SIGMA, True
+            )
+        return self._detector
+
+    def _none(self) -> KeyPoints:
+        none = np.zeros(0)
+        return KeyPoints(
+            np.zeros((0, 2)), none, none, none, np.zeros((0, self.config.length), dtype=np.float32)
+        )
+
+
+def keys_of(histograms: np.ndarray, length: int, norm: str = "root") -> np.ndarray:
+    """Keys (K, length) float32 of length 1, of SIFT histograms (K, 128) ordered by row, column and orientation."""
+    keys = histograms.astype(np.float32)
+    if length == 36:
+        keys = pooled(keys)
+    if norm == "root":
+        keys = np.sqrt(keys)
+    return keys / np.maximum(np.linalg.norm(keys, axis=1, keepdims=True), np.float32(1e-9))
+
+
+def pooled(histograms: np.ndarray) -> np.ndarray:
+    """Histograms (K, 36) of 3 × 3 × 4 from (K, 128) of 4 × 4 × 8, as the module describes."""
+    cells = histograms.reshape(-1, 4, 4, 8)
+    beside = 0.5 * (np.roll(cells, 1, axis=3) + np.roll(cells, -1, axis=3))
+    turns = (cells + beside)[..., ::2]
+    lines = turns[:, :-1] + turns[:, 1:]
+    return (lines[:, :, :-1] + lines[:, :, 1:]).reshape(-1, 36)
+
+
+def _reduced(image: np.ndarray, ratio: float) -> np.ndarray:
+    if ratio == 1.0:
+        return image
+    import cv2
+
+    return cv2.resize(image, None, fx=ratio, fy=ratio, interpolation=cv2.INTER_AREA)

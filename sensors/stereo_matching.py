@@ -1,0 +1,199 @@
+"""SIFT features of a rectified stereo pair (S05 §III-B): keypoints of both images, matched along the rows.
+
+A keypoint of the left image may match those of the right one that lie on its row, to the left of it by a disparity
+that a depth beyond the nearest has, at a like scale and orientation. Of these candidates the nearest key is taken
+(`key_matching`), and the place in the right image is refined on grey values (`disparity`).
+
+The noise of z = (u_left, v, u_right): what a keypoint's place means on the object changes from view to view, with
+standard deviation σ_p per axis. The refinement looks for what lies at the left place, whatever that is: u_right shares
+the error of u_left and adds that of the disparity, σ_d. Both grow with the keypoint's scale,
+
+    cov = [[σ_p², 0, σ_p²], [0, σ_p², 0], [σ_p², 0, σ_p² + σ_d²]].
+
+Without the refinement both places have their own error, and cov = σ_p² I.
+"""
+
+from dataclasses import dataclass, field
+from typing import final
+
+import numpy as np
+
+from rbpf.errors import InputError
+from rbpf.sensors.candidates import band_pairs
+from rbpf.sensors.disparity import refine
+from rbpf.sensors.key_matching import KeyMatches, MatchLimits, match_pairs
+from rbpf.sensors.patches import checked_image
+from rbpf.sensors.pinhole import RectifiedStereo
+from rbpf.sensors.sift import KeyPoints, Sift, SiftConfig
+from rbpf.sensors.stereo_features import StereoFeatures
+
+SWAPPED, FEWER = 20, 4
+"""So many matches the wrong way round, and so many times fewer the right way, are no accident."""
+
+
+@dataclass(frozen=True)
+class StereoConfig:
+    """How the two images are matched, and how exact the result is.
+
+    Attributes:
+        row_px: rows of a match differ by at most this …
+        row_per_scale: … and this share of the keypoint's scale.
+        nearest_m: least depth; disparities above that of this depth are left out.
+        least_disparity_px: nor does a smaller disparity than this tell a depth.
+        scale_ratio: largest ratio of the two scales.
+        turn_rad: largest difference of the two orientations.
+        limits: of the keys.
+        refine: whether the disparity is refined on grey values.
+        half_px: of the refinement's window.
+        least_correlation: of the refined windows, else the match is dropped.
+        shift_px: nor may the refinement move it further than this.
+        place_px: σ_p of a keypoint of scale 0 …
+        place_per_scale: … and what is added to it in quadrature, as a share of the scale.
+        disparity_px: σ_d of a keypoint of scale 0 …
+        disparity_per_scale: … and what is added to it in quadrature.
+
+    Raises:
+        InputError: a number is out of its range.
+    """
+
+    row_px: float = 1.0
+    row_per_scale: float = 0.25
+    nearest_m: float = 0.3
+    least_disparity_px: float = 1.0
+    scale_ratio: float = 1.5
+    turn_rad: float = 0.35
+    limits: MatchLimits = field(default_factory=MatchLimits)
+    refine: bool = True
+    half_px: int = 5
+    least_correlation: float = 0.8
+    shift_px: float = 2.0
+    place_px: float = 0.25
+    place_per_scale: float = 0.02
+    disparity_px: float = 0.1
+    disparity_per_scale: float = 0.025
+
+    def __post_init__(self) -> None:
+        positive = (
+            "nearest_m",
+            "least_disparity_px",
+            "turn_rad",
+            "half_px",
+            "shift_px",
+            "place_px",
+            "disparity_px",
+        )
+        for name in positive:
+            if not getattr(self, name) > 0.0:
+                raise InputError(f"{name} must be positive, got {getattr(self, name)}")
+        for name in ("row_px", "row_per_scale", "place_per_scale", "disparity_per_scale"):
+            if not getattr(self, name) >= 0.0:
+                raise InputError(f"{name} must not be negative, got {getattr(self, name)}")
+        if not (self.scale_ratio >= 1.0 and self.least_correlation <= 1.0):
+            found = f"{self.scale_ratio} and {self.least_correlation}"
+            raise InputError(f"scale_ratio must be at least 1 and least_correlation at most 1, got {found}")
+
+
+@final
+class StereoSift:
+    """Measures pairs of images.
+
+    Args:
+        rig: the two cameras.
+        sift: settings of the keypoints.
+        stereo: settings of the matching.
+    """
+
+    def __init__(
+        self, rig: RectifiedStereo, sift: SiftConfig | None = None, stereo: StereoConfig | None = None
+    ) -> None:
+        self.rig = rig
+        self.sift = Sift(sift)
+        self.config = stereo or StereoConfig()
+
+    def measure(self, left: np.ndarray, right: np.ndarray) -> StereoFeatures:
+        """Features of a pair of images (H, W) uint8; none where there is no texture.
+
+        Raises:
+            InputError: the images are not of the camera's size, or they are swapped.
+        """
+        self._check(left, right)
+        return self.match((left, right), self.sift.detect(left), self.sift.detect(right))
+
+    def match(
+        self, images: tuple[np.ndarray, np.ndarray], left: KeyPoints, right: KeyPoints
+    ) -> StereoFeatures:
+        """Features of a pair of images whose keypoints are known.
+
+        Raises:
+            InputError: the images are swapped.
+        """
+        matches = self._along_rows(left, right)
+        self._check_order(left, right, len(matches))
+        z = np.column_stack([left.px[matches.first], right.px[matches.second, 0]])
+        if self.config.refine:
+            refined = refine(*images, z[:, :2], z[:, 2], self.config.half_px)
+            good = (np.abs(refined.u - z[:, 2]) <= self.config.shift_px) & (
+                refined.correlation >= self.config.least_correlation
+            )
+            z[:, 2] = refined.u
+            matches, z = matches.take(good), z[good]
+        far = z[:, 0] - z[:, 2] >= self.config.least_disparity_px
+        return self._features(left.take(matches.first[far]), z[far])
+
+    def noise(self, scale: np.ndarray) -> np.ndarray:
+        """Covariances (K, 3, 3) of (u_left, v, u_right) of keypoints of scales (K,), px²."""
+        config = self.config
+        place = config.place_px**2 + (config.place_per_scale * scale) ** 2
+        if not config.refine:
+            return place[:, None, None] * np.eye(3)
+        disparity = config.disparity_px**2 + (config.disparity_per_scale * scale) ** 2
+        shared = np.array([[1.0, 0.0, 1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 1.0]])
+        return place[:, None, None] * shared + disparity[:, None, None] * np.diag([0.0, 0.0, 1.0])
+
+    def _features(self, keypoints: KeyPoints, z: np.ndarray) -> StereoFeatures:
+        return StereoFeatures.measured(
+            self.rig, z, self.noise(keypoints.scale), keypoints.scale, keypoints.orientation, keypoints.keys
+        )
+
+    def _along_rows(self, left: KeyPoints, right: KeyPoints) -> KeyMatches:
+        """Matches of one keypoint of each image at most; a place that has two orientations counts once."""
+        config = self.config
+        reach = config.row_px + config.row_per_scale * left.scale
+        k, m = band_pairs(left.px[:, 1], right.px[:, 1], reach)
+        disparity = left.px[k, 0] - right.px[m, 0]
+        most = self.rig.camera.fx * self.rig.baseline_m / config.nearest_m
+        near = (disparity >= config.least_disparity_px) & (disparity <= most)
+        near &= np.abs(np.log(left.scale[k] / right.scale[m])) <= np.log(config.scale_ratio)
+        near &= np.cos(left.orientation[k] - right.orientation[m]) >= np.cos(config.turn_rad)
+        return one_per_place(
+            match_pairs(left.keys, right.keys, (k[near], m[near]), config.limits), left, right
+        )
+
+    def _check(self, left: np.ndarray, right: np.ndarray) -> None:
+        left, right, camera = checked_image(left), checked_image(right), self.rig.camera
+        if left.shape != right.shape:
+            sizes = " and ".join(f"{image.shape[1]}x{image.shape[0]} px" for image in (left, right))
+            raise InputError(f"left and right image must be of one size, got {sizes}: give a rectified pair")
+        if left.shape != (camera.height, camera.width):
+            size = f"{left.shape[1]}x{left.shape[0]}"
+            raise InputError(f"the camera takes {camera.width}x{camera.height} px, the images have {size} px")
+
+    def _check_order(self, left: KeyPoints, right: KeyPoints, found: int) -> None:
+        """Refuses a pair whose keypoints match far better the other way round."""
+        if FEWER * found >= min(len(left), len(right)):
+            return
+        swapped = len(self._along_rows(right, left))
+        if swapped >= SWAPPED and swapped > FEWER * found:
+            raise InputError(
+                f"left and right image seem to be swapped: {swapped} matches have a negative disparity and {found} "
+                "a positive one; exchange the two cameras"
+            )
+
+
+def one_per_place(matches: KeyMatches, left: KeyPoints, right: KeyPoints) -> KeyMatches:
+    """Of matches whose keypoints share their place in an image those of the nearest keys, in the order of the first."""
+    order = np.argsort(matches.distance, kind="stable")
+    for keypoints, rows in ((left, matches.first), (right, matches.second)):
+        _, first = np.unique(keypoints.px[rows[order]], axis=0, return_index=True)
+        order = order[np.sort(first)]
+    return matches.take(np.sort(order))

@@ -1,0 +1,262 @@
+"""Recordings of two cameras."""
+
+import logging
+
+import cv2
+import numpy as np
+import pytest
+
+from rbpf.errors import InputError
+from rbpf.lie import SE3
+from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.readers.images import open_images, open_stereo
+from rbpf.sensors.readers.images.pairing import pair_stamps
+from rbpf.sensors.readers.images.rectification import Rectification
+from tests.readers.images.folders import (
+    CAM0,
+    EUROC_NS,
+    P0,
+    sensor_yaml,
+    write_asl_camera,
+    write_asl_truth,
+    write_camera,
+    write_euroc,
+    write_image,
+    write_images,
+    write_kitti,
+    write_plain,
+    write_rectified,
+)
+
+STRAIGHT = {"distortion_coefficients": [0.0, 0.0, 0.0, 0.0]}
+
+
+def levels(sequence):
+    return [
+        tuple(None if image is None else int(image[0, 0]) for image in (frame.image, frame.right))
+        for frame in sequence.frames()
+    ]
+
+
+def problems(sequence):
+    return [frame.problem for frame in sequence.frames()]
+
+
+def test_a_euroc_pair(tmp_path):
+    poses = SE3.from_ypr(np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 1]]), [0, 0.1, 0.2], 0.0, 0.0)
+    write_rectified(tmp_path)
+    write_asl_truth(tmp_path / "mav0" / "state_groundtruth_estimate0", poses, EUROC_NS)
+    sequence = open_stereo(tmp_path)
+    assert len(sequence) == 3 and sequence.notes == () and sequence.name == tmp_path.name
+    assert sequence.rig.baseline_m == pytest.approx(0.11) and sequence.rig.camera.fx == 20.0
+    assert sequence.stamps_ns.tolist() == list(EUROC_NS)
+    assert levels(sequence) == [(10, 100), (20, 110), (30, 120)]
+    assert problems(sequence) == [None] * 3
+    expected = SE3.compose(poses, CAM0)
+    np.testing.assert_allclose(SE3.local(sequence.truth.world_from_camera, expected), 0.0, atol=1e-9)
+    assert [frame.stamp_ns for frame in sequence.frames(1)] == list(EUROC_NS[1:])
+
+
+def test_a_kitti_pair(tmp_path):
+    sequence = open_stereo(write_kitti(tmp_path))
+    assert len(sequence) == 3 and sequence.notes == ()
+    assert sequence.rig.baseline_m == pytest.approx(0.54)
+    assert levels(sequence) == [(10, 100), (20, 110), (30, 120)]
+
+
+def test_images_without_a_partner_are_left_out_and_named(tmp_path, caplog):
+    late = (EUROC_NS[0] + 3_000_000, EUROC_NS[2] - 1_000_000, EUROC_NS[2] + 40_000_000)
+    write_rectified(tmp_path, right=late)
+    with caplog.at_level(logging.WARNING):
+        sequence = open_stereo(tmp_path)
+    assert sequence.stamps_ns.tolist() == [EUROC_NS[0], EUROC_NS[2]]
+    assert levels(sequence) == [(10, 100), (30, 110)]
+    assert [
+        "1 of 3 left images have no partner" in sequence.notes[0],
+        "1 of 3 right" in sequence.notes[1],
+    ] == [
+        True,
+        True,
+    ]
+    assert "1 of 3 left images have no partner within 0.005 s and are left out" in caplog.text
+    assert len(open_stereo(tmp_path, tolerance_s=0.002)) == 1
+
+
+def test_two_clocks_are_refused(tmp_path):
+    write_rectified(tmp_path, right=tuple(stamp + 10_000_000 for stamp in EUROC_NS))
+    with pytest.raises(InputError, match=r"within 0.005 s, the nearest two are 0.010000 s apart"):
+        open_stereo(tmp_path)
+    assert len(open_stereo(tmp_path, tolerance_s=0.011)) == 3
+
+
+def test_each_image_has_one_partner():
+    left, right = np.array([0, 10, 20, 30]), np.array([9, 11, 19, 33, 50])
+    pairs = pair_stamps(left, right, 5e-9, "here")
+    assert pairs[0].tolist() == [1, 2, 3] and pairs[1].tolist() == [0, 2, 3]
+    assert pairs[2] == (
+        "here: 1 of 4 left images have no partner within 5e-09 s and are left out.",
+        "here: 2 of 5 right images have no partner within 5e-09 s and are left out.",
+    )
+
+
+@pytest.mark.parametrize("damage", ["missing", "empty", "size"])
+@pytest.mark.parametrize("camera", ["cam0", "cam1"])
+def test_a_pair_of_which_one_image_cannot_be_read_is_survived(tmp_path, camera, damage):
+    write_rectified(tmp_path)
+    file = tmp_path / "mav0" / camera / "data" / f"{EUROC_NS[1]}.png"
+    if damage == "missing":
+        file.unlink()
+    elif damage == "empty":
+        file.write_bytes(b"")
+    else:
+        write_image(file, np.zeros((16, 30), np.uint8))
+    sequence = open_stereo(tmp_path)
+    frames = list(sequence.frames())
+    assert len(frames) == 3 and frames[0].problem is None and frames[2].problem is None
+    assert camera in frames[1].problem
+    assert (frames[1].image is None) == (camera == "cam0")
+    assert (frames[1].right is None) == (camera == "cam1")
+
+
+def test_kitti_folders_of_different_length(tmp_path):
+    write_kitti(tmp_path)
+    (tmp_path / "image_1" / "000002.png").unlink()
+    sequence = open_stereo(tmp_path)
+    assert levels(sequence) == [(10, 100), (20, 110), (30, None)]
+    assert len(sequence.notes) == 1 and "image_1: 2 images for 3 times" in sequence.notes[0]
+
+
+def test_kitti_images_of_different_size(tmp_path):
+    write_kitti(tmp_path)
+    write_images(tmp_path / "image_1", ["000000.png", "000001.png", "000002.png"], 100, (16, 30))
+    with pytest.raises(InputError, match="left and right images have 24x16 and 30x16 px"):
+        open_stereo(tmp_path)
+
+
+def test_kitti_without_a_right_camera(tmp_path):
+    with pytest.raises(InputError, match="image_1: no such folder"):
+        open_stereo(write_kitti(tmp_path, right=False, calib=P0))
+
+
+@pytest.mark.parametrize(("tx", "words"), [(0.0, "a baseline of zero"), (10.8, "shifted to the right")])
+def test_kitti_with_an_impossible_baseline(tmp_path, tx, words):
+    calib = P0 + f"P1: 20 0 11.5 {tx} 0 21 7.5 0 0 0 1 0\n"
+    with pytest.raises(InputError, match=rf"calib.txt.*2.*{words}"):
+        open_stereo(write_kitti(tmp_path, calib=calib))
+
+
+def test_kitti_without_calibration(tmp_path):
+    write_kitti(tmp_path)
+    (tmp_path / "calib.txt").unlink()
+    with pytest.raises(InputError, match=r"calib\.txt"):
+        open_stereo(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["cam0/sensor.yaml", "cam1/sensor.yaml", "cam1/data.csv"])
+def test_euroc_without_a_file(tmp_path, name):
+    write_rectified(tmp_path)
+    (tmp_path / "mav0" / name).unlink()
+    with pytest.raises(InputError, match=name):
+        open_stereo(tmp_path)
+
+
+def test_euroc_with_one_camera(tmp_path):
+    with pytest.raises(InputError, match=r"cam1/sensor\.yaml"):
+        open_stereo(write_euroc(tmp_path))
+
+
+def test_euroc_with_a_baseline_of_zero(tmp_path):
+    with pytest.raises(InputError, match="puts cam1 where cam0 is, a baseline of zero"):
+        open_stereo(write_rectified(tmp_path, baseline=0.0))
+
+
+def test_euroc_with_the_right_camera_on_the_left(tmp_path):
+    with pytest.raises(InputError, match=r"is at \(-0.11, .* expected it to the right"):
+        open_stereo(write_rectified(tmp_path, baseline=-0.11))
+
+
+def test_euroc_cameras_of_different_size(tmp_path):
+    with pytest.raises(InputError, match="cam0 has 24x16 and cam1 26x16 px"):
+        open_stereo(write_rectified(tmp_path, resolution=[26, 16]))
+
+
+def test_euroc_images_that_do_not_fit_the_calibration(tmp_path):
+    write_rectified(tmp_path)
+    write_images(tmp_path / "mav0" / "cam1" / "data", [f"{s}.png" for s in EUROC_NS], 100, (16, 30))
+    with pytest.raises(InputError, match=r"cam1 have 30x16 px"):
+        open_stereo(tmp_path)
+
+
+def test_a_given_calibration(tmp_path):
+    write_rectified(tmp_path / "a")
+    sequence = open_stereo(tmp_path / "a", write_camera(tmp_path, fx=22.0))
+    assert sequence.rig.camera.fx == 22.0 and sequence.rig.baseline_m == pytest.approx(0.11)
+    assert open_stereo(tmp_path / "a", write_camera(tmp_path, fx=22.0, baseline_m=0.2)).rig.baseline_m == 0.2
+    write_kitti(tmp_path / "b")
+    assert open_stereo(tmp_path / "b", write_camera(tmp_path, baseline_m=0.2)).rig.baseline_m == 0.2
+    bent = write_camera(tmp_path, distortion=[0.1, 0, 0, 0])
+    with pytest.raises(InputError, match="rectify the images"):
+        open_stereo(tmp_path / "a", bent)
+
+
+def test_what_is_no_stereo_sequence(tmp_path):
+    with pytest.raises(InputError, match=r"expected an EuRoC sequence .* cam0 and cam1.*; or a KITTI"):
+        open_stereo(write_plain(tmp_path / "a"))
+    with pytest.raises(InputError, match="no such folder"):
+        open_stereo(tmp_path / "b")
+
+
+LEFT = Pinhole(160, 120, 110.0, 112.0, 80.0, 58.0, (-0.2, 0.05, 1e-3, -5e-4, 0.0))
+RIGHT = Pinhole(160, 120, 108.0, 111.0, 78.0, 61.0, (-0.18, 0.04, 0.0, 1e-3, 0.0))
+APART = SE3.from_ypr(np.array([0.12, 0.005, -0.004]), 0.02, -0.03, 0.015)
+
+
+def test_rectified_cameras_see_a_point_on_one_row():
+    done = Rectification.between(LEFT, RIGHT, APART, "here")
+    assert done.rig.baseline_m == pytest.approx(np.linalg.norm(SE3.translation(APART)), rel=1e-9)
+    points = np.random.default_rng(0).uniform([-0.4, -0.3, 1.5], [0.4, 0.3, 4.0], (200, 3))
+    rectified = done.rig.project(SE3.inverse_transform(done.left_from_rectified, points))
+    inside = done.rig.inside(rectified, 2.0)
+    assert inside.sum() > 100
+    for camera, maps, where, column in (
+        (LEFT, done.maps[0], points, 0),
+        (RIGHT, done.maps[1], SE3.inverse_transform(APART, points), 2),
+    ):
+        # The map at the rectified place names the place in the image as it was taken.
+        place = rectified[inside][:, [column, 1]].astype(np.float32)
+        given = np.column_stack(
+            [cv2.remap(part, place[:, :1], place[:, 1:], cv2.INTER_LINEAR)[:, 0] for part in maps]
+        )
+        np.testing.assert_allclose(given, camera.project(where[inside]), atol=0.1)
+
+
+def test_a_pair_that_is_not_rectified_is_rectified(tmp_path):
+    straight = {"distortion_coefficients": [0.1, 0.0, 0.0, 0.0]}
+    write_asl_camera(tmp_path / "mav0" / "cam0", CAM0, **straight)
+    mount = SE3.compose(CAM0, SE3.from_ypr(np.array([0.11, 0.002, 0.0]), 0.0, 0.02, 0.0))
+    write_asl_camera(tmp_path / "mav0" / "cam1", mount, EUROC_NS, 100, **straight)
+    poses = SE3.from_ypr(np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 1]]), [0, 0.1, 0.2], 0.0, 0.0)
+    write_asl_truth(tmp_path / "mav0" / "state_groundtruth_estimate0", poses, EUROC_NS)
+    assert open_images(tmp_path).baseline_m is None
+    sequence = open_stereo(tmp_path)
+    assert "not rectified; their images are" in sequence.notes[0]
+    assert sequence.rig.baseline_m == pytest.approx(np.hypot(0.11, 0.002))
+    assert not any(sequence.rig.camera.distortion)
+    assert sequence.pair.camera == sequence.rig.camera
+    frame = next(sequence.frames())
+    assert frame.image.shape == frame.right.shape == (16, 24)
+    # A rectified camera keeps its place and turns towards the baseline.
+    turned = SE3.between(SE3.compose(poses, CAM0), sequence.truth.world_from_camera)
+    np.testing.assert_allclose(SE3.translation(turned), 0.0, atol=1e-9)
+    direction = SE3.rotation(turned[0])[:, 0]
+    np.testing.assert_allclose(direction, np.array([0.11, 0.002, 0.0]) / np.hypot(0.11, 0.002), atol=1e-6)
+
+
+def test_a_missing_image_of_a_pair_that_is_rectified(tmp_path):
+    write_rectified(tmp_path)
+    mount = SE3.compose(CAM0, SE3.from_ypr(np.array([0.11, 0.0, 0.0]), 0.0, 0.02, 0.0))
+    (tmp_path / "mav0" / "cam1" / "sensor.yaml").write_text(sensor_yaml(mount, **STRAIGHT))
+    (tmp_path / "mav0" / "cam1" / "data" / f"{EUROC_NS[1]}.png").unlink()
+    frames = list(open_stereo(tmp_path).frames())
+    assert [frame.right is None for frame in frames] == [False, True, False]
+    assert "no such image" in frames[1].problem

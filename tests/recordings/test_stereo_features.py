@@ -1,0 +1,132 @@
+"""Stereo SIFT features on the stereo recordings, against their ground truth."""
+
+import numpy as np
+import pytest
+
+from rbpf.errors import InputError
+from rbpf.lie import SE3
+from rbpf.sensors.key_index import Gate, KeyIndex
+from rbpf.sensors.key_matching import MatchLimits, distances
+from rbpf.sensors.readers.images import open_stereo
+from rbpf.sensors.sift import SiftConfig
+from rbpf.sensors.stereo_features import match_frames
+from rbpf.sensors.stereo_matching import StereoConfig, StereoSift
+
+pytestmark = pytest.mark.real_data
+
+PAIRS = 8
+START = {"stereo_zed_room1": 0, "stereo_kitti_seq1": 12}
+"""In the first frames of KITTI's the true rotations put all features off by 1 to 2 px per frame."""
+
+
+@pytest.fixture(scope="module", params=START)
+def recording(request, data_dir):
+    """A rig, its name, and pairs of images with their true poses."""
+    sequence = open_stereo(data_dir / request.param)
+    frames = [frame for frame, _ in zip(sequence.frames(START[request.param]), range(PAIRS), strict=False)]
+    rows = [int(np.abs(sequence.truth.stamps_ns - frame.stamp_ns).argmin()) for frame in frames]
+    poses = sequence.truth.world_from_camera[rows]
+    return sequence.name, sequence.rig, [(frame.image, frame.right) for frame in frames], poses
+
+
+def features_of(recording, sift=None, stereo=None):
+    _, rig, pairs, _ = recording
+    sensor = StereoSift(rig, sift, stereo)
+    return [sensor.measure(*pair) for pair in pairs]
+
+
+@pytest.fixture(scope="module")
+def features(recording):
+    return features_of(recording)
+
+
+def expected(recording, first, second, points):
+    """(u_left, v, u_right) in pair `second` of points in the left camera of pair `first`."""
+    _, rig, _, poses = recording
+    return rig.project(SE3.transform(SE3.between(poses[second], poses[first]), points))
+
+
+def test_there_are_enough_features(recording, features):
+    least = {"stereo_zed_room1": 60, "stereo_kitti_seq1": 180}[recording[0]]
+    assert min(map(len, features)) >= least
+    assert max(map(len, features)) <= 1000
+
+
+def test_they_lie_on_the_same_row_of_both_images(recording):
+    _, rig, pairs, _ = recording
+    sensor = StereoSift(rig)
+    gaps = []
+    for left, right in pairs[::4]:
+        found, there = sensor.measure(left, right), sensor.sift.detect(right)
+        near = np.abs(found.z[:, 2, None] - there.px[None, :, 0]) <= 2.0
+        near &= np.abs(found.z[:, 1, None] - there.px[None, :, 1]) <= 4.0
+        distance = np.where(near, distances(found.keys @ there.keys.T), np.inf)
+        partner = distance.argmin(axis=1)
+        sure = np.isfinite(distance.min(axis=1))
+        gaps.append((found.z[:, 1] - there.px[partner, 1])[sure])
+    gap = np.concatenate(gaps)
+    assert abs(np.median(gap)) < 0.3
+    assert np.percentile(np.abs(gap), 80) < 1.0
+
+
+@pytest.mark.parametrize(("apart", "share"), [(1, 0.85), (3, 0.65)])
+def test_they_move_as_the_truth_says(recording, features, apart, share):
+    errors = []
+    for first in range(PAIRS - apart):
+        before, after = features[first], features[first + apart]
+        matches = match_frames(before, after, MatchLimits())
+        there = expected(recording, first, first + apart, before.points[matches.first])
+        errors.append(np.abs(after.z[matches.second] - there).max(axis=1))
+    error = np.concatenate(errors)
+    assert len(error) > 30 * (PAIRS - apart)
+    assert np.median(error) < 1.5
+    assert np.mean(error < 4.0) > share
+
+
+def test_the_refinement_brings_disparities_closer_to_each_other(recording, features):
+    """Of one point in two pairs, less what the true motion changes."""
+
+    def spread(measured):
+        out = []
+        for first in range(PAIRS - 1):
+            matches = match_frames(measured[first], measured[first + 1], MatchLimits())
+            there = expected(recording, first, first + 1, measured[first].points[matches.first])
+            gap = (measured[first + 1].z[matches.second] - there) @ np.array([1.0, 0.0, -1.0])
+            out.append(gap[np.abs(gap) < 3.0])
+        gap = np.concatenate(out)
+        return np.median(np.abs(gap - np.median(gap)))
+
+    assert spread(features) < 0.75 * spread(features_of(recording, stereo=StereoConfig(refine=False)))
+
+
+def test_longer_keys_err_less(recording, features):
+    def right(measured):
+        matches = match_frames(measured[0], measured[3], MatchLimits())
+        there = expected(recording, 0, 3, measured[0].points[matches.first])
+        error = np.abs(measured[3].z[matches.second] - there).max(axis=1)
+        return np.mean(error < 4.0)
+
+    assert right(features_of(recording, SiftConfig(length=128))) >= right(features) - 0.02
+
+
+def test_a_prediction_finds_landmarks_more_surely(recording, features):
+    rig = recording[1]
+    index = KeyIndex(36)
+    before, after = features[0], features[2]
+    index.store.add(np.arange(len(before)), before.keys)
+    mean = expected(recording, 0, 2, before.points)
+    seen = np.flatnonzero(rig.inside(mean))
+    gate = Gate(after.z, after.cov, seen, mean[seen], np.tile(9.0 * np.eye(3), (seen.size, 1, 1)))
+    shares = []
+    for found in (index.match(after.keys), index.match(after.keys, gate)):
+        rows = np.flatnonzero(found.ids >= 0)
+        error = np.abs(after.z[rows] - mean[found.ids[rows]]).max(axis=1)
+        shares.append(((error < 4.0).sum(), np.mean(error < 4.0)))
+    (free, free_share), (gated, gated_share) = shares
+    assert gated >= free and gated_share > free_share and gated_share > 0.85
+
+
+def test_swapped_images_are_noticed(recording):
+    _, rig, pairs, _ = recording
+    with pytest.raises(InputError, match="seem to be swapped"):
+        StereoSift(rig).measure(*pairs[0][::-1])

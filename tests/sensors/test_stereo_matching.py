@@ -1,0 +1,199 @@
+"""Features of rendered stereo pairs, beside the true depths."""
+
+import numpy as np
+import pytest
+
+from rbpf.errors import InputError
+from rbpf.lie import SE3
+from rbpf.sensors.key_matching import KeyMatches, MatchLimits
+from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+from rbpf.sensors.sift import KeyPoints, SiftConfig
+from rbpf.sensors.stereo_features import locate_slope, match_frames
+from rbpf.sensors.stereo_matching import StereoConfig, StereoSift, one_per_place
+from tests.sensors.stereo_scenes import RIG, room, true_disparity
+
+FULL = SiftConfig(features=0, working_scale=1.0)
+
+
+def measured(index=0, sift=FULL, **changes):
+    return StereoSift(RIG, sift, StereoConfig(**changes)).measure(*room()[0][index])
+
+
+def disparity_error(features, index=0):
+    """(K,) px, NaN near the edges of things."""
+    return features.z[:, 0] - features.z[:, 2] - true_disparity(room()[1][index], features.z[:, :2])
+
+
+def test_disparities_of_a_rendered_pair():
+    features = measured()
+    error = disparity_error(features)
+    error = error[np.isfinite(error)]
+    assert len(error) > 100
+    assert np.mean(np.abs(error) > 1.0) < 0.01
+    assert abs(np.median(error)) < 0.02
+    assert np.median(np.abs(error)) < 0.06
+
+
+def test_the_refinement_makes_them_better():
+    plain, refined = (disparity_error(measured(refine=refine)) for refine in (False, True))
+    assert np.nanmedian(np.abs(refined)) < 0.8 * np.nanmedian(np.abs(plain))
+    assert np.nanmean(np.abs(refined) > 1.0) <= np.nanmean(np.abs(plain) > 1.0)
+
+
+def test_half_the_image_loses_no_accuracy():
+    error = disparity_error(measured(sift=SiftConfig(features=0, working_scale=0.5)))
+    error = error[np.isfinite(error)]
+    assert len(error) > 25
+    assert np.median(np.abs(error)) < 0.08
+
+
+def test_the_stated_noise_covers_the_error():
+    features = measured()
+    error = disparity_error(features)
+    across = np.array([1.0, 0.0, -1.0])
+    normalised = error / np.sqrt(across @ features.cov @ across)
+    # Rendered images are cleaner than those for which the noise was set.
+    assert 0.15 < 1.4826 * np.nanmedian(np.abs(normalised)) < 1.0
+
+
+def test_points_and_covariances_follow_from_the_pixels():
+    features = measured()
+    np.testing.assert_array_equal(features.points, RIG.locate(features.z))
+    jac = locate_slope(RIG, features.z)
+    np.testing.assert_allclose(
+        features.cov_points, jac @ features.cov @ jac.swapaxes(1, 2), rtol=1e-9, atol=1e-15
+    )
+    depth = features.points[:, 2]
+    near, far = np.argmin(depth), np.argmax(depth)
+    assert features.cov_points[far, 2, 2] > 4.0 * features.cov_points[near, 2, 2]
+
+
+def test_the_jacobian_of_the_triangulation():
+    rig = RectifiedStereo(Pinhole(640, 480, 400.0, 420.0, 310.0, 250.0), 0.2)
+    z = np.array([[320.0, 100.0, 300.0], [50.0, 470.0, 47.0], [600.0, 10.0, 500.0]])
+    step = 1e-4
+    numeric = np.stack(
+        [(rig.locate(z + step * e) - rig.locate(z - step * e)) / (2 * step) for e in np.eye(3)], axis=-1
+    )
+    np.testing.assert_allclose(locate_slope(rig, z), numeric, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(
+        locate_slope(rig, z) @ rig.slope(rig.locate(z)), np.tile(np.eye(3), (3, 1, 1)), atol=1e-9
+    )
+
+
+def test_the_noise_of_a_keypoint():
+    config = StereoConfig(place_px=0.3, place_per_scale=0.1, disparity_px=0.2, disparity_per_scale=0.05)
+    noise = StereoSift(RIG, stereo=config).noise(np.array([0.0, 4.0]))
+    np.testing.assert_allclose(noise[0], [[0.09, 0, 0.09], [0, 0.09, 0], [0.09, 0, 0.13]])
+    place, disparity = 0.09 + 0.16, 0.04 + 0.04
+    across = np.array([1.0, 0.0, -1.0])
+    assert noise[1, 0, 0] == pytest.approx(place) and across @ noise[1] @ across == pytest.approx(disparity)
+    apart = StereoSift(RIG, stereo=StereoConfig(place_px=0.3, place_per_scale=0.0, refine=False))
+    np.testing.assert_allclose(apart.noise(np.array([5.0]))[0], 0.09 * np.eye(3))
+
+
+def test_a_feature_is_seen_again_where_the_motion_takes_it():
+    _, _, poses = room()
+    first, second = measured(0), measured(1)
+    second_from_first = SE3.between(poses[1], poses[0])
+    expected = RIG.project(SE3.transform(second_from_first, first.points))
+    matches = match_frames(first, second, MatchLimits())
+    error = second.z[matches.second] - expected[matches.first]
+    assert len(matches) > 80
+    assert np.mean(np.abs(error).max(axis=1) < 1.0) > 0.9
+
+
+def test_a_prediction_lets_only_near_ones_compete():
+    _, _, poses = room()
+    first, second = measured(0), measured(1)
+    mean = RIG.project(SE3.transform(SE3.between(poses[1], poses[0]), first.points))
+    cov = np.tile(4.0 * np.eye(3), (len(first), 1, 1))
+    loose = MatchLimits(ratio=0.9)
+    gated = match_frames(first, second, loose, (mean, cov))
+    free = match_frames(first, second, loose)
+    nu = second.z[gated.second] - mean[gated.first]
+    spread = cov[gated.first] + second.cov[gated.second]
+    assert (np.einsum("ki,kij,kj->k", nu, np.linalg.inv(spread), nu) <= 11.3 + 1e-9).all()
+    wrong = np.abs(second.z[free.second] - mean[free.first]).max(axis=1) > 10.0
+    assert len(gated) > (~wrong).sum()
+    mean[:] = np.nan
+    assert len(match_frames(first, second, loose, (mean, cov))) == 0
+
+
+def test_a_place_counts_once():
+    px = np.array([[10.0, 5.0], [10.0, 5.0], [30.0, 5.0], [40.0, 5.0]])
+    zeros = np.zeros(4)
+    left = KeyPoints(px, zeros + 1.0, zeros, zeros, np.zeros((4, 36), dtype=np.float32))
+    right = KeyPoints(px[[0, 3, 2, 2]], zeros + 1.0, zeros, zeros, left.keys)
+    matches = KeyMatches(np.arange(4), np.arange(4), np.array([0.2, 0.1, 0.4, 0.3]))
+    kept = one_per_place(matches, left, right)
+    assert kept.first.tolist() == [1, 3] and kept.second.tolist() == [1, 3]
+
+
+def test_every_feature_has_a_place_of_its_own():
+    features = measured()
+    for places in (features.z[:, :2], features.z[:, 1:]):
+        assert len(np.unique(places, axis=0)) == len(features)
+
+
+def test_limits_of_the_disparity():
+    features = measured(least_disparity_px=12.0, nearest_m=2.0)
+    disparity = features.z[:, 0] - features.z[:, 2]
+    assert len(features) > 20
+    assert disparity.min() >= 12.0
+    assert disparity.max() <= 260.0 * 0.12 / 2.0 + 2.0
+
+
+def test_swapped_images_are_noticed():
+    left, right = room()[0][0]
+    with pytest.raises(InputError, match=r"seem to be swapped: \d+ matches have a negative disparity"):
+        StereoSift(RIG, FULL).measure(right, left)
+
+
+@pytest.mark.parametrize("level", [0, 120])
+def test_a_pair_without_texture(level):
+    flat = np.full((240, 320), level, dtype=np.uint8)
+    features = StereoSift(RIG, FULL).measure(flat, flat)
+    assert len(features) == 0
+    assert features.z.shape == (0, 3) and features.cov_points.shape == (0, 3, 3)
+    assert len(match_frames(features, measured(), MatchLimits())) == 0
+    assert len(match_frames(measured(), features, MatchLimits())) == 0
+
+
+def test_one_dark_image():
+    left, right = room()[0][0]
+    assert len(StereoSift(RIG, FULL).measure(left, np.zeros_like(right))) == 0
+
+
+def test_noise_alone_gives_hardly_a_match():
+    rng = np.random.default_rng(0)
+    pair = rng.integers(0, 256, (2, 240, 320)).astype(np.uint8)
+    assert len(StereoSift(RIG, FULL).measure(*pair)) < 10
+
+
+def test_sizes_that_differ():
+    left, right = room()[0][0]
+    with pytest.raises(InputError, match="of one size, got 320x240 px and 300x240 px"):
+        StereoSift(RIG, FULL).measure(left, right[:, :300])
+    with pytest.raises(InputError, match="the camera takes 320x240 px, the images have 300x240 px"):
+        StereoSift(RIG, FULL).measure(left[:, :300], right[:, :300])
+
+
+def test_the_same_pair_gives_the_same_bytes():
+    first, again = measured(), measured()
+    assert first.z.tobytes() == again.z.tobytes() and first.keys.tobytes() == again.keys.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"nearest_m": 0.0}, "nearest_m"),
+        ({"row_px": -1.0}, "row_px"),
+        ({"disparity_px": 0.0}, "disparity_px"),
+        ({"scale_ratio": 0.9}, "scale_ratio"),
+        ({"least_correlation": 1.1}, "least_correlation"),
+    ],
+)
+def test_settings_out_of_range(changes, message):
+    with pytest.raises(InputError, match=message):
+        StereoConfig(**changes)
