@@ -164,7 +164,9 @@ def along_corners(corners: Sequence[Sequence[float]], bend_m: float) -> tuple[np
     bends = np.where(turn != 0.0, bend_m, 0.0)
     straight = length - np.append(0.0, bends) - np.append(bends, 0.0)
     if (straight < 0.0).any() or (np.abs(turn) > 0.9 * np.pi).any():
-        raise InputError(f"the corners {corners} are too near to each other or too sharp for bends of {bend_m} m")
+        raise InputError(
+            f"the corners {corners} are too near to each other or too sharp for bends of {bend_m} m"
+        )
     moves = [Move(straight[0])]
     for k, angle in enumerate(turn.tolist()):
         moves += [Move(bend_m / _tangent(angle), angle)] if angle else []

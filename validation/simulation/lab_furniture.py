@@ -126,7 +126,9 @@ def shell() -> list[tuple[Surface, float]]:
     along = np.array([0.0, -width, 0.0])
     for (x0, x1), paint in {(0.0, middle): textures.wood, (middle, length): textures.carpet}.items():
         found.append((Surface(np.array([x0, width, 0.0]), np.array([x1 - x0, 0.0, 0.0]), along, paint), 2.0))
-    ceiling = Surface(np.array([length, width, height]), np.array([-length, 0.0, 0.0]), along, textures.plaster)
+    ceiling = Surface(
+        np.array([length, width, height]), np.array([-length, 0.0, 0.0]), along, textures.plaster
+    )
     return [*found, (ceiling, 4.0)]
 
 
@@ -193,7 +195,8 @@ def _table(lab: Furnishing, wall: Wall, start: float, end: float) -> None:
         left = lab.uniform(start + 0.1, end - 0.6)
         box = wall.box((left, left + 0.45), (0.05, 0.45), (0.0, lab.uniform(0.25, 0.45)))
         lab.add(box, textures.carton, textures.carton)
-    _poster(lab, wall, 0.5 * (start + end), 0.9 * (end - start), lab.uniform(1.5, 1.8))
+    for left, right in ((start, 0.5 * (start + end)), (0.5 * (start + end), end)):
+        _poster(lab, wall, left, right, lab.uniform(1.45, 1.75))
 
 
 def _desk(
@@ -240,13 +243,15 @@ def _cartons(lab: Furnishing, wall: Wall, start: float, end: float) -> None:
         low, deep = high, 0.9 * deep
         if end - start < 0.35 or lab.rng.random() < 0.35:
             break
-    _poster(lab, wall, 0.5 * (start + end), 0.8, max(low + 0.5, lab.uniform(1.4, 1.9)))
+    _poster(lab, wall, start, end, max(low + 0.5, lab.uniform(1.4, 1.7)))
 
 
-def _poster(lab: Furnishing, wall: Wall, middle: float, widest: float, high: float) -> None:
-    """A print on a wall."""
-    size = lab.uniform(0.3, max(widest, 0.4)), lab.uniform(0.35, 0.8)
-    lab.hang(wall, middle, min(high, SIZE_M[2] - 0.5 * size[1] - 0.05), size, _print(lab))
+def _poster(lab: Furnishing, wall: Wall, start: float, end: float, high: float) -> None:
+    """A print on a wall, somewhere between two places, and a smaller one above it."""
+    wide = lab.uniform(0.6, 0.95) * (end - start)
+    middle = lab.uniform(start + 0.5 * wide, end - 0.5 * wide)
+    lab.hang(wall, middle, high, (wide, lab.uniform(0.35, 0.7)), _print(lab))
+    lab.hang(wall, middle, high + 0.65, (0.7 * wide, lab.uniform(0.15, 0.4)), _print(lab))
 
 
 def _print(lab: Furnishing) -> Paint:

@@ -127,4 +127,3 @@ def turn_back() -> Drive:
     for turn in (away, -away):
         moves += [Move(turn_rad=turn), Move(turn_rad=-turn, rest_s=AWAY_S), Move(0.75)]
     return Drive(np.array([0.0, 1.6, 2.1]), moves, (TURN_BACK_FRAMES - 1) / RATE_HZ, ARM_M, RAMP_S)
-

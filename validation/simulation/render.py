@@ -84,7 +84,7 @@ class Renderer:
             return 1.0 / inverse, np.append(seen, -1)[rows]
 
     def _in_view(self, poses: np.ndarray) -> np.ndarray:
-        """(S,) rows of the rectangles of which some pose (K, 7) may see something: no plane of its view excludes them."""
+        """(S,) rows of the rectangles of which some pose (K, 7) may see something."""
         local = SE3.inverse_transform(poses[:, None], self._corners.reshape(-1, 3))
         x, y, z = np.moveaxis(local.reshape(len(poses), -1, 4, 3), -1, 0)
         left, right, top, bottom = self._view

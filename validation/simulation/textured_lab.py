@@ -1,6 +1,6 @@
 """A laboratory of two rooms, to take pictures of from a robot with a stereo camera (S05 §V). Z points up."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -8,11 +8,12 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.validation.simulation import lab_plan
-from rbpf.validation.simulation.driven_paths import Drive, Travelled
+from rbpf.validation.simulation.driven_paths import Travelled
 from rbpf.validation.simulation.furniture import Furniture
 from rbpf.validation.simulation.lab_furniture import furnished, shell
 from rbpf.validation.simulation.limits import check_counts, check_not_negative, check_positive
 from rbpf.validation.simulation.textured_scene import TexturedScene, stamps_ns
+from rbpf.validation.simulation.wheel_odometer import WheelOdometer
 
 Trajectory = Literal["tour", "turn_back"]
 
@@ -45,20 +46,27 @@ class LabDrive:
         check_counts(self, {"every": 1})
         if self.trajectory not in DRIVES:
             raise InputError(f"trajectory must be one of {', '.join(DRIVES)}, got {self.trajectory!r}")
-        most = -(-DRIVES[self.trajectory][1] // self.every)
         if self.frames is not None:
             check_counts(self, {"frames": 2})
-        if not 2 <= (most if self.frames is None else self.frames) <= most:
+        if not 2 <= self._count <= self._most:
             raise InputError(
-                f"the {self.trajectory} has {most} images with every = {self.every}, at least 2 are needed, got frames = "
-                f"{self.frames}"
+                f"with every = {self.every} the {self.trajectory} has {self._most} images, of which at least 2 are "
+                f"needed, got frames = {self.frames}"
             )
 
     @property
     def images(self) -> np.ndarray:
         """(T,) the frames of the trajectory that become images."""
-        most = -(-DRIVES[self.trajectory][1] // self.every)
-        return np.arange(most if self.frames is None else self.frames) * self.every
+        return np.arange(self._count) * self.every
+
+    @property
+    def _most(self) -> int:
+        """Images of the whole trajectory."""
+        return -(-DRIVES[self.trajectory][1] // self.every)
+
+    @property
+    def _count(self) -> int:
+        return self._most if self.frames is None else self.frames
 
     def travelled(self) -> Travelled:
         """The robot in every frame of the trajectory up to the last image."""
@@ -86,11 +94,13 @@ class TexturedLab:
 
     Attributes:
         drive: of the robot that carries the camera.
+        odometer: of the same robot; it is read in every frame of the trajectory, whether that becomes an image or not.
         texel_m: side of a texel; of floors twice, of the ceiling four times as much.
         contrast: of all textures; 1 is rich, 0.1 poor.
     """
 
     drive: LabDrive = LabDrive()
+    odometer: WheelOdometer = field(default_factory=WheelOdometer)
     texel_m: float = 0.003
     contrast: float = 1.0
 
@@ -99,14 +109,19 @@ class TexturedLab:
         check_not_negative(self, "contrast")
 
     def build(self, rng: np.random.Generator) -> TexturedScene:
-        """Draws the furniture and the textures; the drive is always the same."""
+        """Draws the furniture, the textures and the odometer's slip; the drive is always the same.
+
+        A shorter drive leaves all that is drawn as it is.
+        """
+        slip = rng.spawn(1)[0]
         lab = furnished(rng)
         rectangles = []
         for surface, coarse in [*shell(), *((surface, 1.0) for surface in lab.surfaces)]:
             furniture = Furniture(rng, coarse * self.texel_m, self.contrast)
             furniture.sheet(surface.corner, surface.across, surface.down, surface.paint)
             rectangles += furniture.rectangles
-        images = self.drive.images
-        path = world_from_camera(self.drive.travelled().world_from_robot)[images]
-        stamps = stamps_ns(int(images[-1]) + 1, lab_plan.RATE_HZ)[images]
-        return TexturedScene("lab", stamps, path, rectangles)
+        images, travelled = self.drive.images, self.drive.travelled()
+        path = world_from_camera(travelled.world_from_robot)[images]
+        stamps = stamps_ns(int(images[-1]) + 1, lab_plan.RATE_HZ)
+        odometry = self.odometer.measure(travelled, stamps, ROBOT_FROM_CAMERA, slip)
+        return TexturedScene("lab", stamps[images], path, rectangles, odometry=odometry)

@@ -25,6 +25,7 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.sensors.readers.wheel_odometry import WheelOdometry
 from rbpf.validation.simulation.scene import frame_stamps
 
 EPOCH_NS = 1_400_000_000_000_000_000
@@ -81,6 +82,7 @@ class TexturedScene:
         world_from_camera: (T, 7) true poses at these times, the middles of the exposures.
         rectangles: what there is to see.
         boards: chessboards among it.
+        odometry: what the wheels say, if the camera stands on a robot.
     """
 
     name: str
@@ -88,6 +90,7 @@ class TexturedScene:
     world_from_camera: np.ndarray
     rectangles: Sequence[Rectangle]
     boards: Sequence["Chessboard"] = ()
+    odometry: WheelOdometry | None = None
 
 
 @dataclass(frozen=True)
