@@ -10,7 +10,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from rbpf.errors import InputError
-from rbpf.models import NEW, NULL, Observations
+from rbpf.models import NEW, NULL, Observations, Part
+
+STATE = frozenset({Part.STATE})
+MAP = frozenset({Part.LANDMARK})
+BOTH = STATE | MAP
+"""What observations inform."""
 
 
 @dataclass(frozen=True)
@@ -153,3 +158,27 @@ def _batch(rows: list[Row], n: int) -> Batch:
         return Batch(rows[0].group, ks, ids)
     mask = np.array([np.ones(n, dtype=bool) if row.mask is None else row.mask for row in rows])
     return Batch(rows[0].group, ks, ids, np.ascontiguousarray(mask.T))
+
+
+def by_use(groups: Sequence[Observations]) -> dict[frozenset[Part], list[Observations]]:
+    """The groups by what they inform."""
+    uses: dict[frozenset[Part], list[Observations]] = {STATE: [], BOTH: [], MAP: []}
+    for group in groups:
+        uses[group.informs].append(group)
+    return uses
+
+
+def require_apart(weigh: Sequence[Observations], both: Sequence[Observations]) -> None:
+    """Rows of one landmark are correlated through it; those that do not update it cannot be stacked with others."""
+    if not weigh or not both:
+        return
+    seen = [
+        np.concatenate([np.ravel(group.ids) for group in part if group.ids is not None])
+        for part in (weigh, both)
+    ]
+    shared = np.intersect1d(seen[0][seen[0] >= 0], seen[1])
+    if shared.size:
+        raise InputError(
+            f"landmark {shared[0]} is observed by a group that informs the state alone and by one that informs both: "
+            "split the second into one for each"
+        )

@@ -134,6 +134,10 @@ class SharedStore:
         slab = self._pool(column).data[self._slab[column]]
         return slab.copy() if generation == self.lineage.generation else slab[:, rows]
 
+    def is_warm(self, columns: np.ndarray) -> bool:
+        """Whether `access` may read columns (K,) as they are."""
+        return bool((self._slab[columns] >= 0).all())
+
     def access(self, columns: np.ndarray) -> Access:
         """Lets a kernel read columns (K,), at least one, of one record size; cold ones are warmed up first."""
         for column in columns[self._slab[columns] < 0]:
