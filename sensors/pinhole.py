@@ -71,10 +71,19 @@ class Pinhole:
         # A list from a file would make the camera unhashable.
         object.__setattr__(self, "distortion", tuple(self.distortion))
 
-    @property
+    @cached_property
     def params(self) -> np.ndarray:
         """(9,) fx, fy, cx, cy, k1, k2, p1, p2, k3: what the compiled twin reads."""
         return np.array([self.fx, self.fy, self.cx, self.cy, *self.distortion], dtype=np.float64)
+
+    @cached_property
+    def _is_plain(self) -> bool:
+        """Whether nothing is distorted."""
+        return not any(self.distortion)
+
+    @cached_property
+    def _size(self) -> np.ndarray:
+        return np.array([self.width, self.height])
 
     @cached_property
     def monotonic_radius(self) -> float:
@@ -126,8 +135,9 @@ class Pinhole:
         The image reaches half a pixel beyond the centres of its outermost pixels.
         """
         px = np.asarray(px, float)
-        past = np.array([self.width, self.height]) - 0.5 - margin_px
-        return np.all((px >= margin_px - 0.5) & (px <= past), axis=-1)
+        past = self._size - 0.5 - margin_px
+        within = (px >= margin_px - 0.5) & (px <= past)
+        return within[..., 0] & within[..., 1]
 
     def visible(self, point: np.ndarray, margin_px: float = 0.0) -> np.ndarray:
         """Whether points (…, 3) are seen (…): in front of the camera, not folded back, and inside the image."""
@@ -137,6 +147,8 @@ class Pinhole:
 
     def _distort(self, uv: np.ndarray) -> np.ndarray:
         """Distorted coordinates (…, 2) of normalised ones."""
+        if self._is_plain:
+            return uv
         k1, k2, p1, p2, k3 = self.distortion
         u, v = uv[..., 0], uv[..., 1]
         s = u * u + v * v
@@ -163,6 +175,8 @@ class Pinhole:
         Within the monotonic radius radial distortion is; with tangential distortion its derivative must be positive
         definite besides, which a weak one is anywhere near the image.
         """
+        if self._is_plain:
+            return np.isfinite(uv[..., 0]) & np.isfinite(uv[..., 1])
         slope = self._distort_slope(uv)
         trace = slope[..., 0, 0] + slope[..., 1, 1]
         within = np.hypot(uv[..., 0], uv[..., 1]) < self.monotonic_radius
@@ -170,6 +184,8 @@ class Pinhole:
 
     def _undistort(self, target: np.ndarray) -> np.ndarray:
         """Normalised coordinates (K, 2) of distorted ones, NaN where there are none."""
+        if self._is_plain:
+            return np.where(self._unique(target)[:, None], target, np.nan)
         # Half of the radius is clear of the fold, where the derivative has no inverse.
         length = np.maximum(np.linalg.norm(target, axis=1, keepdims=True), np.finfo(float).tiny)
         uv = target * np.minimum(1.0, 0.5 * self.monotonic_radius / length)
