@@ -19,7 +19,7 @@ from rbpf.systems.mono.appearance import SOURCE_HALF_PX, Appearances
 from rbpf.systems.mono.config import SearchConfig
 from rbpf.systems.mono.consensus import agreeing
 from rbpf.systems.mono.feature_sensor import FeatureSensor
-from rbpf.systems.mono.viewing import affines, directions, view_changes
+from rbpf.systems.mono.viewing import affines
 
 _CELLS = 6
 """The image is divided into so many columns and rows, from which features are chosen in turn."""
@@ -168,14 +168,15 @@ class ImageSensor(Sensor):
 
     def _choose(self, pose: np.ndarray) -> np.ndarray:
         """Rows of the features worth looking for, spread over the image (E06 §4.1)."""
-        table = self.table
-        rows = np.flatnonzero(table.alive)
-        seen = directions(table.place[rows], pose)
-        cosine, scale = view_changes(table.place[rows], table.first_pose[rows], pose)
-        near = (scale <= self.config.scale) & (scale >= 1.0 / self.config.scale)
-        wanted = self.camera.visible(seen, self.config.margin_px) & near
-        wanted &= cosine >= np.cos(np.deg2rad(self.config.turn_deg))
-        rows, px = rows[wanted], self.camera.project(seen[wanted])
+        from rbpf.sensors.view_kernels import in_view
+
+        table, camera, config = self.table, self.camera, self.config
+        limits = (camera.width, camera.height, config.margin_px, camera.monotonic_radius)
+        limits = np.array([*limits, np.cos(np.deg2rad(config.turn_deg)), config.scale], dtype=float)
+        rows, px = np.empty(table.count, dtype=np.int64), np.empty((table.count, 2))
+        columns = (table.place, table.first_pose, table.alive)
+        count = in_view(*columns, np.ascontiguousarray(pose), camera.params, limits, rows, px)
+        rows, px = rows[:count], px[:count]
         size = np.array([self.camera.width, self.camera.height])
         column, line = np.clip(px * _CELLS / size, 0, _CELLS - 1).astype(np.int64).T
         cell = column + _CELLS * line

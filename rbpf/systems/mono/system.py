@@ -1,6 +1,7 @@
 """Monocular SLAM on features (E06): constant velocity, a camera, points and rays."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -109,13 +110,29 @@ def add_constellation(landmark_map: LandmarkMap, start: KnownStart, config: Mono
 
 def world_of(filter_: Filter) -> Anchored | None:
     """The known points' frame in each particle's own world, which starts at its first camera; None without one."""
+    held = _constellation(filter_)
+    if held is None:
+        return None
+    group, records = held
+    return Anchored(group.frame(records.mean[:, 0], records.const[:, 0]), group.frame_factor(records))
+
+
+def frame_of(filter_: Filter, particle: int) -> np.ndarray | None:
+    """The same frame (7,) in one particle's world."""
+    held = _constellation(filter_)
+    if held is None:
+        return None
+    group, records = held
+    return np.asarray(group.frame(records.mean[particle, 0], records.const[particle, 0]))
+
+
+def _constellation(filter_: Filter) -> tuple[Any, Any] | None:
+    """The known points' landmark and its records. It was the first one: no other one has to be asked."""
     landmark_map = filter_.belief().map
-    for landmark, name in landmark_map.catalogue.items():
-        if name == CONSTELLATION:
-            group = landmark_map.landmark_of(landmark)
-            records = landmark_map.read(np.array([landmark]))
-            return Anchored(group.frame(records.mean[:, 0], records.const[:, 0]), group.frame_factor(records))
-    return None
+    first = next(iter(landmark_map.catalogue), None)
+    if first is None or landmark_map.catalogue[first] != CONSTELLATION:
+        return None
+    return landmark_map.landmark_of(first), landmark_map.read(np.array([first]))
 
 
 def start_law(log: FeatureLog, config: MonoConfig) -> PoseLaw:
