@@ -1,5 +1,6 @@
 """A camera's view of a constellation: several known points at once, which share the pose of their frame."""
 
+from functools import cached_property
 from typing import final
 
 import numpy as np
@@ -90,9 +91,13 @@ class ConstellationView(ObservationModel):
         """Compiled."""
         from rbpf.sensors.constellation_kernel import constellation_view
 
+        return FusedKernel(constellation_view, self._params)
+
+    @cached_property
+    def _params(self) -> np.ndarray:
+        """The camera's, then (x, y, z, place) of each point: asked for several times in a step."""
         places = -np.ones(len(self.points)) if self.places is None else self.places
-        rows = np.column_stack([self.points, places])
-        return FusedKernel(constellation_view, np.concatenate([self.camera.params, rows.ravel()]))
+        return np.concatenate([self.camera.params, np.column_stack([self.points, places]).ravel()])
 
     def _chain(
         self, state: np.ndarray, landmark: np.ndarray, const: np.ndarray

@@ -8,12 +8,12 @@ With s = u² + v² and ρ(s) = 1 + k1 s + k2 s² + k3 s³, the normalised coordi
 
 from dataclasses import dataclass
 from functools import cached_property
-from numbers import Integral, Real
 from typing import final
 
 import numpy as np
 
 from rbpf.errors import InputError
+from rbpf.sensors.camera_checks import check_finite, check_size
 
 SETTLED, SOLVED = 1e-14, 1e-12
 """Errors of `unproject`, relative to 1 + the distance from the axis: the iteration ends, the result is accepted."""
@@ -58,16 +58,16 @@ class Pinhole:
 
     def __post_init__(self) -> None:
         for name in ("width", "height"):
-            _check_size(name, getattr(self, name))
+            check_size(name, getattr(self, name))
         for name in ("fx", "fy", "cx", "cy"):
-            _check_finite(f"the camera's {name}", getattr(self, name))
+            check_finite(f"the camera's {name}", getattr(self, name))
         if not (self.fx > 0.0 and self.fy > 0.0):
             raise InputError(f"the camera's fx and fy must be positive, got {self.fx!r} and {self.fy!r} px")
         if np.shape(self.distortion) != (5,):
             expected = "the 5 numbers k1, k2, p1, p2, k3 (k3 = 0 if there are four)"
             raise InputError(f"the camera's distortion must be {expected}, got {self.distortion!r}")
         for name, number in zip(("k1", "k2", "p1", "p2", "k3"), self.distortion, strict=True):
-            _check_finite(f"the camera's {name}", number)
+            check_finite(f"the camera's {name}", number)
         # A list from a file would make the camera unhashable.
         object.__setattr__(self, "distortion", tuple(self.distortion))
 
@@ -238,7 +238,7 @@ class RectifiedStereo:
     dim = 3
 
     def __post_init__(self) -> None:
-        _check_finite("the stereo baseline", self.baseline_m)
+        check_finite("the stereo baseline", self.baseline_m)
         if self.baseline_m <= 0.0:
             raise InputError(f"the stereo baseline must be positive, got {self.baseline_m!r} m")
         if any(self.camera.distortion):
@@ -277,16 +277,6 @@ class RectifiedStereo:
     def _from_right(self, point: np.ndarray) -> np.ndarray:
         """Points in the right camera's frame."""
         return np.asarray(point, float) - np.array([self.baseline_m, 0.0, 0.0])
-
-
-def _check_size(name: str, value: object) -> None:
-    if isinstance(value, bool) or not isinstance(value, Integral) or int(value) <= 0:
-        raise InputError(f"the camera's {name} must be a positive whole number of pixels, got {value!r}")
-
-
-def _check_finite(what: str, value: object) -> None:
-    if not isinstance(value, Real) or not np.isfinite(float(value)):
-        raise InputError(f"{what} must be a finite number, got {value!r}")
 
 
 def _normalise(point: np.ndarray) -> np.ndarray:

@@ -23,7 +23,7 @@ def _is_unique(u, v, z, params, radius, slope):
 def _is_alike(place, first_pose, pose, i, least_cosine, most_scale):
     """Whether the line of sight and the distance are nearly those of the first sighting."""
     w = place[i, 3]
-    a, b, c, along = 0.0, 0.0, 0.0, 0.0
+    a, b, along = 0.0, 0.0, 0.0
     for k in range(3):
         then, now = place[i, k] - w * first_pose[i, 4 + k], place[i, k] - w * pose[4 + k]
         a += then * then
@@ -34,9 +34,7 @@ def _is_alike(place, first_pose, pose, i, least_cosine, most_scale):
     return along >= least_cosine * max(a * b, 1e-300) and 1.0 / most_scale <= scale <= most_scale
 
 
-@njit(
-    int64(MATRIX, MATRIX, _FLAGS, VECTOR, VECTOR, VECTOR, INDICES, MATRIX), cache=True, error_model="numpy"
-)
+@njit(int64(MATRIX, MATRIX, _FLAGS, VECTOR, VECTOR, VECTOR, INDICES, MATRIX), cache=True, error_model="numpy")
 def in_view(place, first_pose, alive, pose, params, limits, rows, px):
     """Fills `rows` and their pixels `px` (rows, 2); returns how many there are.
 

@@ -35,9 +35,9 @@ def _add_skew(out, scale, w):
 
 @njit(cache=True, error_model="numpy")
 def _fill_coupling(w, v, out):
-    """The block Q of the left Jacobian, Barfoot (2017) (7.86), of skew matrices W and V:
+    """The block Q of the left Jacobian, Barfoot (2017) (7.86).
 
-    Q = V/2 + c (WV + VW + WVW) + d (WWV + VWW − 3 WVW) + e (WVWW + WWVW). With s = ω · v the products are
+    With the skew matrices W and V, Q = V/2 + c (WV + VW + WVW) + d (WWV + VWW − 3 WVW) + e (WVWW + WWVW). With s = ω · v the products are
     WVW = −s W, WV + VW = ω vᵀ + v ωᵀ − 2 s I and WWV + VWW = −θ² V − s W, which leaves no matrix product.
     """
     squared = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
