@@ -37,8 +37,8 @@ def _add_skew(out, scale, w):
 def _fill_coupling(w, v, out):
     """The block Q of the left Jacobian, Barfoot (2017) (7.86).
 
-    With the skew matrices W and V, Q = V/2 + c (WV + VW + WVW) + d (WWV + VWW − 3 WVW) + e (WVWW + WWVW). With s = ω · v the products are
-    WVW = −s W, WV + VW = ω vᵀ + v ωᵀ − 2 s I and WWV + VWW = −θ² V − s W, which leaves no matrix product.
+    With the skew matrices W and V, Q = V/2 + c (WV + VW + WVW) + d (WWV + VWW − 3 WVW) + e (WVWW + WWVW), and with
+    s = ω · v the products are WVW = −s W, WV + VW = ω vᵀ + v ωᵀ − 2 s I, WWV + VWW = −θ² V − s W: none is left.
     """
     squared = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
     s = w[0] * v[0] + w[1] * v[1] + w[2] * v[2]

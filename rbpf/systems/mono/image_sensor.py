@@ -71,8 +71,8 @@ class ImageSensor(Sensor):
         self.bad_frames = 0
         self._given: np.ndarray | None = None
         self._in_view = np.zeros((0, 2))
-        self.seconds = 0.0
-        """Time of the last search."""
+        self.seconds, self.seconds_births = 0.0, 0.0
+        """Times of the last search, and of the last births."""
 
     @property
     def lost(self) -> bool:
@@ -116,6 +116,7 @@ class ImageSensor(Sensor):
 
     def births(self, frame: ImageFrame, belief: Belief, observed: Sequence[Observations]) -> Sequence[Births]:
         """Notes what was found, drops what fails, and starts features at corners where there is room."""
+        started = time.perf_counter()
         failing = self._judge()
         self._place(belief, self.measured.landmarks)
         sightings = self.measured
@@ -123,6 +124,7 @@ class ImageSensor(Sensor):
             sightings = self._with_corners(frame, belief, observed)
         births = self.features.births(sightings, belief, observed)
         self.features.forget(belief, failing)
+        self.seconds_births = time.perf_counter() - started
         return births
 
     def arrays(self) -> dict[str, np.ndarray]:
@@ -171,8 +173,8 @@ class ImageSensor(Sensor):
         from rbpf.sensors.view_kernels import in_view
 
         table, camera, config = self.table, self.camera, self.config
-        limits = (camera.width, camera.height, config.margin_px, camera.monotonic_radius)
-        limits = np.array([*limits, np.cos(np.deg2rad(config.turn_deg)), config.scale], dtype=float)
+        of_image = (camera.width, camera.height, config.margin_px, camera.monotonic_radius)
+        limits = np.array([*of_image, np.cos(np.deg2rad(config.turn_deg)), config.scale], dtype=float)
         rows, px = np.empty(table.count, dtype=np.int64), np.empty((table.count, 2))
         columns = (table.place, table.first_pose, table.alive)
         count = in_view(*columns, np.ascontiguousarray(pose), camera.params, limits, rows, px)
