@@ -24,6 +24,8 @@ NAMES = (
     "genealogy_growth",
     "user_model",
     "mono_step",
+    "mono_frames",
+    "mono_map_size",
     "patch_search",
     "key_search",
     "bootstrap_peers",

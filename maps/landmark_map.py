@@ -11,8 +11,9 @@ from rbpf.genealogy import Lineage
 from rbpf.lie import LieGroup
 from rbpf.likelihoods import Gaussian
 from rbpf.maps.layout import Layout
-from rbpf.maps.plan import Plan, make_plan
+from rbpf.maps.plan import BOTH, MAP, STATE, Plan, by_use, make_plan, require_apart
 from rbpf.maps.point import Point
+from rbpf.maps.reading import project_compiled, read_records
 from rbpf.maps.rows import RowEngine
 from rbpf.maps.shared import SharedStore
 from rbpf.models import (
@@ -20,6 +21,7 @@ from rbpf.models import (
     Conditional,
     Landmark,
     LogDensities,
+    ObservationModel,
     Observations,
     Part,
     Records,
@@ -27,10 +29,6 @@ from rbpf.models import (
 from rbpf.numeric import linearise
 from rbpf.proposals import Prior, Terms
 from rbpf.reference import innovation_covariance
-
-_STATE = frozenset({Part.STATE})
-_MAP = frozenset({Part.LANDMARK})
-_BOTH = _STATE | _MAP
 
 
 @final
@@ -108,12 +106,27 @@ class LandmarkMap(Conditional):
         ids = np.asarray(ids)
         if ids.size == 0:
             raise InputError("no landmark was named")
-        kinds = np.unique(self.kinds[ids])
-        if kinds.size > 1:
+        kinds = self.kinds[ids]
+        if (kinds != kinds[0]).any():
             raise InputError(
                 "read() takes landmarks of one parametrisation at a time; `landmark_of` tells which"
             )
-        return self.layouts[kinds[0]].unpack(np.array([self.store.read(int(i)) for i in ids]))
+        return read_records(self.store, self.layouts[kinds[0]], ids)
+
+    def is_compiled(self, model: ObservationModel, ids: np.ndarray) -> bool:
+        """Whether `project` can tell what the model measures of landmarks (K,)."""
+        if not self.compiled or type(model).innovation is not ObservationModel.innovation:
+            return False
+        plain = self._layout_of(int(ids[0])).landmark.components == 1
+        return plain and self.store.is_warm(ids) and model.kernel() is not None
+
+    def project(
+        self, model: ObservationModel, ids: np.ndarray, anchor: np.ndarray, weights: np.ndarray, prior: Prior
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """What `Belief.project` gives, relative to the anchors (K, p)."""
+        kernel = model.kernel()
+        assert kernel is not None
+        return project_compiled(self.store, self._layout_of(int(ids[0])), kernel, ids, anchor, weights, prior)
 
     def landmark_of(self, landmark_id: int) -> Landmark:
         """The parametrisation of a landmark."""
@@ -170,16 +183,16 @@ class LandmarkMap(Conditional):
         self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]
     ) -> LogDensities:
         """Log p(z | x) and the landmarks' Kalman updates at the sampled states."""
-        by_use = _by_use(groups)
-        _require_apart(by_use[_STATE], by_use[_BOTH])
+        uses = by_use(groups)
+        require_apart(uses[STATE], uses[BOTH])
         log_density, late = np.zeros(self.n), np.zeros(self.n)
-        if by_use[_STATE]:
-            log_density += self._density(state, by_use[_STATE])
-        if by_use[_BOTH]:
-            both = self._engine.correct(self._plan(by_use[_BOTH]), state, by_use[_BOTH])
+        if uses[STATE]:
+            log_density += self._density(state, uses[STATE])
+        if uses[BOTH]:
+            both = self._engine.correct(self._plan(uses[BOTH]), state, uses[BOTH])
             log_density, late = log_density + both.all, both.late
-        if by_use[_MAP]:
-            self._engine.correct(self._plan(by_use[_MAP]), state, by_use[_MAP])
+        if uses[MAP]:
+            self._engine.correct(self._plan(uses[MAP]), state, uses[MAP])
         self._planned = None
         return LogDensities(log_density, late)
 
@@ -267,34 +280,12 @@ class LandmarkMap(Conditional):
         return self.layouts[self.kinds[landmark_id]]
 
     def _known(self, ids: np.ndarray | Sequence[int]) -> None:
-        for landmark_id in np.asarray(ids).tolist():
-            if landmark_id not in self.store:
-                raise InputError(f"the map holds no landmark {landmark_id}")
+        named = np.asarray(ids)
+        held = (named >= 0) & (named < self.kinds.size)
+        if not (held.all() and (self.kinds[named] >= 0).all()):
+            unknown = next(i for i in named.tolist() if i not in self.store)
+            raise InputError(f"the map holds no landmark {unknown}")
 
     def _is_ready(self, landmark_id: int) -> np.ndarray:
         layout = self._layout_of(landmark_id)
         return layout.landmark.ready(self.read(np.array([landmark_id])))[:, 0]
-
-
-def _by_use(groups: Sequence[Observations]) -> dict[frozenset[Part], list[Observations]]:
-    """The groups by what they inform."""
-    by_use: dict[frozenset[Part], list[Observations]] = {_STATE: [], _BOTH: [], _MAP: []}
-    for group in groups:
-        by_use[group.informs].append(group)
-    return by_use
-
-
-def _require_apart(weigh: Sequence[Observations], both: Sequence[Observations]) -> None:
-    """Rows of one landmark are correlated through it; those that do not update it cannot be stacked with others."""
-    if not weigh or not both:
-        return
-    seen = [
-        np.concatenate([np.ravel(group.ids) for group in part if group.ids is not None])
-        for part in (weigh, both)
-    ]
-    shared = np.intersect1d(seen[0][seen[0] >= 0], seen[1])
-    if shared.size:
-        raise InputError(
-            f"landmark {shared[0]} is observed by a group that informs the state alone and by one that informs both: "
-            "split the second into one for each"
-        )

@@ -10,7 +10,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from rbpf.errors import InputError
-from rbpf.models import NEW, NULL, Observations
+from rbpf.models import NEW, NULL, Observations, Part
+
+STATE = frozenset({Part.STATE})
+MAP = frozenset({Part.LANDMARK})
+BOTH = STATE | MAP
+"""What observations inform."""
 
 
 @dataclass(frozen=True)
@@ -63,17 +68,18 @@ def make_plan(groups: Sequence[Observations], n: int, kinds: np.ndarray, plain: 
         InputError: ids are missing, have a wrong shape, or name a landmark that the map does not hold.
     """
     plan = Plan(np.zeros(n))
-    rows: dict[int, list[Row]] = {}
-    for number, group in enumerate(groups):
-        ids = _checked_ids(group, n, kinds)
+    named = [_checked_ids(group, n, kinds) for group in groups]
+    for group, ids in zip(groups, named, strict=True):
         for outcome, log_density in ((NEW, group.log_new), (NULL, group.log_clutter)):
             if log_density != 0.0:
                 count = (ids == outcome).sum(axis=-1)
                 plan.log_factor += np.where(count > 0, log_density, 0.0) * count
-        if len(groups) == 1 and _is_simple(ids, kinds, plain):
-            ks = np.flatnonzero(ids >= 0)
-            plan.batches = [Batch(number, ks, ids[ks])] if ks.size else []
-            return plan
+    if _are_simple(named, kinds, plain):
+        chosen = [np.flatnonzero(ids >= 0) for ids in named]
+        plan.batches = [Batch(number, ks, named[number][ks]) for number, ks in enumerate(chosen) if ks.size]
+        return plan
+    rows: dict[int, list[Row]] = {}
+    for number, ids in enumerate(named):
         for row in _rows(number, ids):
             rows.setdefault(row.landmark, []).append(row)
     batches: dict[tuple[int, int], list[Row]] = {}
@@ -90,15 +96,21 @@ def make_plan(groups: Sequence[Observations], n: int, kinds: np.ndarray, plain: 
     return plan
 
 
-def _is_simple(ids: np.ndarray, kinds: np.ndarray, plain: np.ndarray) -> bool:
-    """Whether all particles agree, no landmark is seen twice and all have one plain parametrisation."""
-    if ids.ndim != 1:
-        return False
-    seen = ids[ids >= 0]
-    of = kinds[seen]
-    return seen.size == 0 or bool(
-        len(set(seen.tolist())) == seen.size and (of == of[0]).all() and plain[of[0]]
-    )
+def _are_simple(named: Sequence[np.ndarray], kinds: np.ndarray, plain: np.ndarray) -> bool:
+    """Whether all particles agree, no landmark is seen twice and each group's have one plain parametrisation."""
+    seen = set[int]()
+    for ids in named:
+        if ids.ndim != 1:
+            return False
+        landmarks = [landmark for landmark in ids.tolist() if landmark >= 0]
+        before = len(seen)
+        seen.update(landmarks)
+        if len(seen) < before + len(landmarks):
+            return False
+        of = kinds[landmarks] if landmarks else kinds[:0]
+        if of.size and not (plain[of[0]] and (of == of[0]).all()):
+            return False
+    return True
 
 
 def _checked_ids(group: Observations, n: int, kinds: np.ndarray) -> np.ndarray:
@@ -107,11 +119,13 @@ def _checked_ids(group: Observations, n: int, kinds: np.ndarray) -> np.ndarray:
         raise InputError(f"{type(group.model).__name__} reads a landmark: its observations need ids")
     if ids.shape not in ((count,), (n, count)):
         raise InputError(f"ids of {count} measurements must be ({count},) or ({n}, {count}), got {ids.shape}")
-    if ids.dtype.kind != "i" or (ids < NEW).any():
+    if ids.dtype.kind != "i" or (ids.size and ids.min() < NEW):
         raise InputError(
             f"ids of {type(group.model).__name__} must be integers: landmarks, NULL = -1 or NEW = -2"
         )
     named = ids[ids >= 0]
+    if named.size == 0 or (named.max() < kinds.size and kinds[named].min() >= 0):
+        return ids
     held = named < kinds.size
     held[held] = kinds[named[held]] >= 0
     if not held.all():
@@ -153,3 +167,27 @@ def _batch(rows: list[Row], n: int) -> Batch:
         return Batch(rows[0].group, ks, ids)
     mask = np.array([np.ones(n, dtype=bool) if row.mask is None else row.mask for row in rows])
     return Batch(rows[0].group, ks, ids, np.ascontiguousarray(mask.T))
+
+
+def by_use(groups: Sequence[Observations]) -> dict[frozenset[Part], list[Observations]]:
+    """The groups by what they inform."""
+    uses: dict[frozenset[Part], list[Observations]] = {STATE: [], BOTH: [], MAP: []}
+    for group in groups:
+        uses[group.informs].append(group)
+    return uses
+
+
+def require_apart(weigh: Sequence[Observations], both: Sequence[Observations]) -> None:
+    """Rows of one landmark are correlated through it; those that do not update it cannot be stacked with others."""
+    if not weigh or not both:
+        return
+    seen = [
+        np.concatenate([np.ravel(group.ids) for group in part if group.ids is not None])
+        for part in (weigh, both)
+    ]
+    shared = np.intersect1d(seen[0][seen[0] >= 0], seen[1])
+    if shared.size:
+        raise InputError(
+            f"landmark {shared[0]} is observed by a group that informs the state alone and by one that informs both: "
+            "split the second into one for each"
+        )

@@ -12,42 +12,12 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.genealogy import Lineage, Schedule
+from rbpf.maps.pool import Pool
 
-_FIRST_SLABS = 32
 HOT_SHARE = 0.75
 """A column with fewer surviving rows than this share of the particles gives its dense slab back."""
 COLD_SHARE = 0.9
 """A compacted column is compacted again when no more than this share of its rows survives."""
-
-
-class Pool:
-    """Dense slabs (slabs, fields, N) of equal record size, recycled through a free list.
-
-    Args:
-        fields: numbers per record.
-        n: particles.
-    """
-
-    def __init__(self, fields: int, n: int) -> None:
-        self.data = np.zeros((_FIRST_SLABS, fields, n))
-        self._free = list(range(_FIRST_SLABS - 1, -1, -1))
-
-    @property
-    def used(self) -> int:
-        """Number of slabs in use."""
-        return self.data.shape[0] - len(self._free)
-
-    def take(self, count: int) -> np.ndarray:
-        """Free slabs, (count,) int; the pool doubles where there are too few."""
-        while len(self._free) < count:
-            old = self.data.shape[0]
-            self.data = np.concatenate([self.data, np.zeros_like(self.data)])
-            self._free = list(range(2 * old - 1, old - 1, -1)) + self._free
-        return np.array([self._free.pop() for _ in range(count)], dtype=np.int64)
-
-    def give(self, slabs: np.ndarray) -> None:
-        """Returns slabs."""
-        self._free.extend(int(slab) for slab in slabs)
 
 
 @dataclass
@@ -134,6 +104,10 @@ class SharedStore:
         slab = self._pool(column).data[self._slab[column]]
         return slab.copy() if generation == self.lineage.generation else slab[:, rows]
 
+    def is_warm(self, columns: np.ndarray) -> bool:
+        """Whether `access` may read columns (K,) as they are."""
+        return bool((self._slab[columns] >= 0).all())
+
     def access(self, columns: np.ndarray) -> Access:
         """Lets a kernel read columns (K,), at least one, of one record size; cold ones are warmed up first."""
         for column in columns[self._slab[columns] < 0]:
@@ -155,18 +129,17 @@ class SharedStore:
         """
         access = self.access(columns)
         now = self.lineage.generation
-        moved = self._generation[columns] != now
-        if not moved.any():
+        generations = self._generation[columns]
+        if (generations == now).all():
             return access, access.slabs
-        stale = np.unique(columns[moved])
+        stale = np.unique(columns[generations != now])
         pool = self._pool(int(columns[0]))
         old = self._slab[stale].copy()
         self._slab[stale] = pool.take(stale.size)
         pool.give(old)
-        for column in stale:
-            self._move(int(column), now)
+        self._move(stale, now)
         targets = self._slab[columns]
-        if np.unique(columns).size == columns.size:
+        if len(set(columns.tolist())) == columns.size:
             return Access(pool.data, access.slabs, access.which, access.maps), targets
         _, first = np.unique(columns, return_index=True)
         again = np.ones(columns.size, dtype=bool)
@@ -253,7 +226,8 @@ class SharedStore:
     def _occupy(self, column: int, records: np.ndarray) -> None:
         self._fields[column] = records.shape[0]
         self._fill(column, records)
-        self._join(column, self.lineage.generation)
+        self._generation[column] = self.lineage.generation
+        self._join([column], self.lineage.generation)
 
     def _fill(self, column: int, records: np.ndarray) -> None:
         pool = self._pool(column)
@@ -261,7 +235,7 @@ class SharedStore:
         pool.data[self._slab[column]] = records
 
     def _vacate(self, column: int) -> None:
-        self._leave(column)
+        self._leave(int(self._generation[column]), [column])
         if self._cold.pop(column, None) is None:
             self._pool(column).give(self._slab[column : column + 1])
         self._slab[column] = -1
@@ -277,23 +251,25 @@ class SharedStore:
             pool.give(self._slab[column : column + 1])
             self._slab[column] = -1
 
-    def _move(self, column: int, generation: int) -> None:
-        self._leave(column)
-        self._join(column, generation)
+    def _move(self, columns: np.ndarray, now: int) -> None:
+        """To the present generation: all of one past generation together, as a resampling leaves them."""
+        past = self._generation[columns]
+        for generation in np.unique(past).tolist():
+            self._leave(generation, columns[past == generation].tolist())
+        self._generation[columns] = now
+        self._join(columns.tolist(), now)
 
-    def _join(self, column: int, generation: int) -> None:
-        self._generation[column] = generation
+    def _join(self, columns: list[int], generation: int) -> None:
         members = self._members.get(generation)
         if members is None:
             members = self._members[generation] = set()
             self.lineage.retain(generation)
             self._schedule.add(generation, generation)
-        members.add(column)
+        members.update(columns)
 
-    def _leave(self, column: int) -> None:
-        generation = int(self._generation[column])
+    def _leave(self, generation: int, columns: list[int]) -> None:
         members = self._members[generation]
-        members.remove(column)
+        members.difference_update(columns)
         if not members:
             del self._members[generation]
             self._survivors.pop(generation, None)

@@ -83,6 +83,11 @@ class Belief:
         The covariance is within + between particles, H Q Hᵀ included, without the measurement's own noise.
         """
         records = self.read(ids)
+        if self.map.is_compiled(model, ids):
+            const = None if records.const is None else records.const[self.mode]
+            anchor = model.predict(self.state[self.mode][None], records.mean[self.mode], const)
+            mean, cov = self.map.project(model, ids, anchor, self.weights, self.prior)
+            return anchor + mean, cov
         state = self.state[:, None, :]
         predicted = model.predict(state, records.mean, records.const)
         mode = predicted[self.mode]

@@ -46,13 +46,14 @@ def checked_observations(group: Observations) -> Observations:
         )
     if Part.STATE not in informs and Part.LANDMARK not in group.model.reads:
         raise InputError(f"{name} reads no landmark: its observations must inform Part.STATE")
+    if _are_sound(group.z, group.cov):
+        return group
     if not (np.isfinite(group.z).all() and np.isfinite(group.cov).all()):
         raise InputError(f"a measurement of {name} or its covariance is not finite")
-    if not _regular(group.cov):
-        try:
-            gaussian.psd_factor(group.cov)
-        except InputError as error:
-            raise InputError(f"the noise of {name} has no covariance: {error}") from error
+    try:
+        gaussian.psd_factor(group.cov)
+    except InputError as error:
+        raise InputError(f"the noise of {name} has no covariance: {error}") from error
     return group
 
 
@@ -81,10 +82,8 @@ def checked_start(start: np.ndarray, n: int, space: LieGroup) -> np.ndarray:
     return np.array(np.broadcast_to(start, (n, size)))
 
 
-def _regular(cov: np.ndarray) -> bool:
-    """Whether all matrices (K, p, p) are symmetric to the bit and positive definite: the usual case, told quickly."""
-    try:
-        np.linalg.cholesky(cov)
-    except np.linalg.LinAlgError:
-        return False
-    return bool((cov == np.swapaxes(cov, 1, 2)).all())
+def _are_sound(z: np.ndarray, cov: np.ndarray) -> bool:
+    """Whether all is finite and the covariances are positive definite: the usual case, told quickly."""
+    from rbpf.kernels.soundness import are_sound
+
+    return bool(are_sound(np.ascontiguousarray(z, dtype=float), np.ascontiguousarray(cov, dtype=float)))

@@ -63,21 +63,30 @@ class KalmanSubstate(Conditional):
                 f"the substate has {m} numbers: expected coupling (·, {d}, {m}), dynamics (·, {m}, {m}) and "
                 f"drift (·, {m}), the motion model gives (·, …) {sizes}"
             )
-        noise = transition.noise_factor @ np.swapaxes(transition.noise_factor, -1, -2)
-        shared = np.broadcast_shapes(transition.coupling.shape[:1], transition.dynamics.shape[:1])
         blocks = (transition.coupling, transition.dynamics)
+        shared = np.broadcast_shapes(*(block.shape[:1] for block in blocks))
         stack = np.concatenate([np.broadcast_to(b, (*shared, *b.shape[1:])) for b in blocks], axis=1)
-        joint = gaussian.symmetrise(stack @ self.cov @ np.swapaxes(stack, -1, -2)) + noise
         means = (stack @ self.mean[..., None])[..., 0]
         self._increment_mean = means[:, :d]
         self._predicted = means[:, d:] + transition.drift
-        cov_ee, cov_se = joint[:, :d, :d], joint[:, d:, :d]
-        factor = gaussian.psd_factor(cov_ee)
-        self._gain = _gain(cov_se, cov_ee, factor)
-        unit = np.broadcast_to(np.eye(m), (self._gain.shape[0], m, m))
-        closed = np.concatenate([-self._gain, unit], axis=2)
-        self._rest = gaussian.symmetrise(closed @ joint @ np.swapaxes(closed, -1, -2))
+        factor = self._condition(stack, transition.noise_factor)
         return Prior(space, transition.mean, self._increment_mean, factor, centred=False)
+
+    def _condition(self, stack: np.ndarray, noise_factor: np.ndarray) -> np.ndarray:
+        """Keeps the law of s_t | ε; returns the factor of cov(ε)."""
+        from rbpf.kernels.substate import conditioned
+
+        m, parts = self._mean.size, (stack, self.cov, np.ascontiguousarray(noise_factor, dtype=float))
+        laws, d = max(part.shape[0] for part in parts), stack.shape[1] - m
+        joint, factor = np.empty((laws, d + m, d + m)), np.empty((laws, d, d))
+        self._gain, self._rest = np.empty((laws, m, d)), np.empty((laws, m, m))
+        if conditioned(*map(np.ascontiguousarray, parts), joint, factor, self._gain, self._rest):
+            return factor
+        factor = gaussian.psd_factor(joint[:, :d, :d])
+        self._gain = joint[:, d:, :d] @ np.linalg.pinv(joint[:, :d, :d], hermitian=True)
+        closed = np.concatenate([-self._gain, np.broadcast_to(np.eye(m), (laws, m, m))], axis=2)
+        self._rest = gaussian.symmetrise(closed @ joint @ np.swapaxes(closed, -1, -2))
+        return factor
 
     def given(self, increment: np.ndarray) -> np.ndarray:
         """Mean (N, m) of s_t given increments (N, d)."""
@@ -157,10 +166,3 @@ class KalmanSubstate(Conditional):
                 jacs.append(np.broadcast_to(jac[:, k], (n, *jac.shape[2:])).copy())
                 noises.append(group.cov[k])
         return stacked(nus, jacs, noises, [None] * len(nus))
-
-
-def _gain(cov_se: np.ndarray, cov_ee: np.ndarray, factor: np.ndarray) -> np.ndarray:
-    """Cov(s, ε) cov(ε)⁺; `factor` of cov(ε) is triangular with a positive diagonal where that is definite."""
-    if not np.triu(factor, 1).any() and (np.diagonal(factor, axis1=-2, axis2=-1) > 0.0).all():
-        return np.swapaxes(np.linalg.solve(cov_ee, np.swapaxes(cov_se, -1, -2)), -1, -2)
-    return cov_se @ np.linalg.pinv(cov_ee, hermitian=True)

@@ -1,5 +1,6 @@
 """A camera's view of known points that one landmark holds together, see `rbpf.maps.constellation`."""
 
+from functools import cached_property
 from typing import final
 
 import numpy as np
@@ -73,7 +74,12 @@ class MembersView(ObservationModel):
         """Compiled."""
         from rbpf.sensors.constellation_kernel import members_view
 
-        return FusedKernel(members_view, np.concatenate([self.camera.params, self.places]))
+        return FusedKernel(members_view, self._params)
+
+    @cached_property
+    def _params(self) -> np.ndarray:
+        """The camera's, then which points: asked for several times in a step."""
+        return np.concatenate([self.camera.params, self.places])
 
 
 @final
@@ -148,7 +154,12 @@ class ConstellationView(ObservationModel):
         """Compiled."""
         from rbpf.sensors.constellation_kernel import constellation_view
 
-        return FusedKernel(constellation_view, np.concatenate([self.camera.params, self.points.ravel()]))
+        return FusedKernel(constellation_view, self._params)
+
+    @cached_property
+    def _params(self) -> np.ndarray:
+        """The camera's, then (x, y, z) of each point: asked for several times in a step."""
+        return np.concatenate([self.camera.params, self.points.ravel()])
 
     def _chain(
         self, state: np.ndarray, landmark: np.ndarray, const: np.ndarray

@@ -4,27 +4,12 @@ import math
 
 from numba import njit
 
+from rbpf.kernels.quaternion import rotation
 from rbpf.kernels.signature import observation_kernel
 from rbpf.sensors.pinhole_kernels import project
 
 GRAZING = 0.2
 """The same as `rbpf.sensors.camera_points.GRAZING`; the tests compare them."""
-
-
-@njit(cache=True, error_model="numpy", inline="always")
-def rotation(q0, q1, q2, q3):
-    """Rotation matrix by rows of a unit quaternion (x, y, z, w)."""
-    return (
-        1.0 - 2.0 * (q1 * q1 + q2 * q2),
-        2.0 * (q0 * q1 - q3 * q2),
-        2.0 * (q0 * q2 + q3 * q1),
-        2.0 * (q0 * q1 + q3 * q2),
-        1.0 - 2.0 * (q0 * q0 + q2 * q2),
-        2.0 * (q1 * q2 - q3 * q0),
-        2.0 * (q0 * q2 - q3 * q1),
-        2.0 * (q1 * q2 + q3 * q0),
-        1.0 - 2.0 * (q0 * q0 + q1 * q1),
-    )
 
 
 @njit(cache=True, error_model="numpy", inline="always")

@@ -4,8 +4,9 @@ import math
 
 from numba import njit
 
+from rbpf.kernels.quaternion import rotation
 from rbpf.kernels.signature import observation_kernel
-from rbpf.sensors.camera_kernels import forward_depth, rotation, store_by_state
+from rbpf.sensors.camera_kernels import forward_depth, store_by_state
 from rbpf.sensors.pinhole_kernels import project
 
 HEADER = 9

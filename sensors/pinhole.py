@@ -8,12 +8,12 @@ With s = u² + v² and ρ(s) = 1 + k1 s + k2 s² + k3 s³, the normalised coordi
 
 from dataclasses import dataclass
 from functools import cached_property
-from numbers import Integral, Real
 from typing import final
 
 import numpy as np
 
 from rbpf.errors import InputError
+from rbpf.sensors.camera_checks import check_finite, check_size
 
 SETTLED, SOLVED = 1e-14, 1e-12
 """Errors of `unproject`, relative to 1 + the distance from the axis: the iteration ends, the result is accepted."""
@@ -58,23 +58,32 @@ class Pinhole:
 
     def __post_init__(self) -> None:
         for name in ("width", "height"):
-            _check_size(name, getattr(self, name))
+            check_size(name, getattr(self, name))
         for name in ("fx", "fy", "cx", "cy"):
-            _check_finite(f"the camera's {name}", getattr(self, name))
+            check_finite(f"the camera's {name}", getattr(self, name))
         if not (self.fx > 0.0 and self.fy > 0.0):
             raise InputError(f"the camera's fx and fy must be positive, got {self.fx!r} and {self.fy!r} px")
         if np.shape(self.distortion) != (5,):
             expected = "the 5 numbers k1, k2, p1, p2, k3 (k3 = 0 if there are four)"
             raise InputError(f"the camera's distortion must be {expected}, got {self.distortion!r}")
         for name, number in zip(("k1", "k2", "p1", "p2", "k3"), self.distortion, strict=True):
-            _check_finite(f"the camera's {name}", number)
+            check_finite(f"the camera's {name}", number)
         # A list from a file would make the camera unhashable.
         object.__setattr__(self, "distortion", tuple(self.distortion))
 
-    @property
+    @cached_property
     def params(self) -> np.ndarray:
         """(9,) fx, fy, cx, cy, k1, k2, p1, p2, k3: what the compiled twin reads."""
         return np.array([self.fx, self.fy, self.cx, self.cy, *self.distortion], dtype=np.float64)
+
+    @cached_property
+    def _is_plain(self) -> bool:
+        """Whether nothing is distorted."""
+        return not any(self.distortion)
+
+    @cached_property
+    def _size(self) -> np.ndarray:
+        return np.array([self.width, self.height])
 
     @cached_property
     def monotonic_radius(self) -> float:
@@ -126,8 +135,9 @@ class Pinhole:
         The image reaches half a pixel beyond the centres of its outermost pixels.
         """
         px = np.asarray(px, float)
-        past = np.array([self.width, self.height]) - 0.5 - margin_px
-        return np.all((px >= margin_px - 0.5) & (px <= past), axis=-1)
+        past = self._size - 0.5 - margin_px
+        within = (px >= margin_px - 0.5) & (px <= past)
+        return within[..., 0] & within[..., 1]
 
     def visible(self, point: np.ndarray, margin_px: float = 0.0) -> np.ndarray:
         """Whether points (…, 3) are seen (…): in front of the camera, not folded back, and inside the image."""
@@ -137,6 +147,8 @@ class Pinhole:
 
     def _distort(self, uv: np.ndarray) -> np.ndarray:
         """Distorted coordinates (…, 2) of normalised ones."""
+        if self._is_plain:
+            return uv
         k1, k2, p1, p2, k3 = self.distortion
         u, v = uv[..., 0], uv[..., 1]
         s = u * u + v * v
@@ -163,6 +175,8 @@ class Pinhole:
         Within the monotonic radius radial distortion is; with tangential distortion its derivative must be positive
         definite besides, which a weak one is anywhere near the image.
         """
+        if self._is_plain:
+            return np.isfinite(uv[..., 0]) & np.isfinite(uv[..., 1])
         slope = self._distort_slope(uv)
         trace = slope[..., 0, 0] + slope[..., 1, 1]
         within = np.hypot(uv[..., 0], uv[..., 1]) < self.monotonic_radius
@@ -170,6 +184,8 @@ class Pinhole:
 
     def _undistort(self, target: np.ndarray) -> np.ndarray:
         """Normalised coordinates (K, 2) of distorted ones, NaN where there are none."""
+        if self._is_plain:
+            return np.where(self._unique(target)[:, None], target, np.nan)
         # Half of the radius is clear of the fold, where the derivative has no inverse.
         length = np.maximum(np.linalg.norm(target, axis=1, keepdims=True), np.finfo(float).tiny)
         uv = target * np.minimum(1.0, 0.5 * self.monotonic_radius / length)
@@ -222,7 +238,7 @@ class RectifiedStereo:
     dim = 3
 
     def __post_init__(self) -> None:
-        _check_finite("the stereo baseline", self.baseline_m)
+        check_finite("the stereo baseline", self.baseline_m)
         if self.baseline_m <= 0.0:
             raise InputError(f"the stereo baseline must be positive, got {self.baseline_m!r} m")
         if any(self.camera.distortion):
@@ -261,16 +277,6 @@ class RectifiedStereo:
     def _from_right(self, point: np.ndarray) -> np.ndarray:
         """Points in the right camera's frame."""
         return np.asarray(point, float) - np.array([self.baseline_m, 0.0, 0.0])
-
-
-def _check_size(name: str, value: object) -> None:
-    if isinstance(value, bool) or not isinstance(value, Integral) or int(value) <= 0:
-        raise InputError(f"the camera's {name} must be a positive whole number of pixels, got {value!r}")
-
-
-def _check_finite(what: str, value: object) -> None:
-    if not isinstance(value, Real) or not np.isfinite(float(value)):
-        raise InputError(f"{what} must be a finite number, got {value!r}")
 
 
 def _normalise(point: np.ndarray) -> np.ndarray:

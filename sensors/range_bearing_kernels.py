@@ -6,6 +6,7 @@ from numba import njit
 
 from rbpf.kernels.angles import arctan2, cos_sin
 from rbpf.kernels.block import flat
+from rbpf.kernels.quaternion import rotation
 from rbpf.kernels.signature import BLOCK, observation_kernel
 
 
@@ -72,22 +73,6 @@ def position_planar(state, mean, const, z, params, n, nu, jac_state, jac_landmar
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _rotation(qx, qy, qz, qw):
-    """Rotation matrix by rows of a unit quaternion."""
-    return (
-        1.0 - 2.0 * (qy * qy + qz * qz),
-        2.0 * (qx * qy - qw * qz),
-        2.0 * (qx * qz + qw * qy),
-        2.0 * (qx * qy + qw * qz),
-        1.0 - 2.0 * (qx * qx + qz * qz),
-        2.0 * (qy * qz - qw * qx),
-        2.0 * (qx * qz - qw * qy),
-        2.0 * (qy * qz + qw * qx),
-        1.0 - 2.0 * (qx * qx + qy * qy),
-    )
-
-
-@njit(cache=True, error_model="numpy", inline="always")
 def _store_spatial(row, a0, a1, a2, params, p, rotation, jac_state, jac_landmark, i):
     """One row (a0, a1, a2) in the sensor's frame: taken to the robot's frame, then ∂/∂ξ and ∂/∂landmark."""
     d0 = params[0] * a0 + params[1] * a1 + params[2] * a2
@@ -109,7 +94,7 @@ def _store_spatial(row, a0, a1, a2, params, p, rotation, jac_state, jac_landmark
 @njit(cache=True, error_model="numpy", inline="always")
 def _rotation_at(state, i):
     """Rotation of the robot in lane i."""
-    return _rotation(state[i], state[BLOCK + i], state[2 * BLOCK + i], state[3 * BLOCK + i])
+    return rotation(state[i], state[BLOCK + i], state[2 * BLOCK + i], state[3 * BLOCK + i])
 
 
 @njit(cache=True, error_model="numpy", inline="always")

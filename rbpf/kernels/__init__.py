@@ -11,7 +11,19 @@ from pathlib import Path
 
 from rbpf.kernels.stale import discard_stale
 
-_DRIVERS = ("refine", "update", "posterior", "forest")
+_DRIVERS = (
+    "refine",
+    "update",
+    "posterior",
+    "forest",
+    "rigid",
+    "rigid_matrices",
+    "gather",
+    "project",
+    "substate",
+    "soundness",
+    "robust_fit",
+)
 
 
 def compile_once(announce: Callable[[], None]) -> None:

@@ -14,6 +14,7 @@ for name in (
     "patch_refinement_kernels",
     "patch_warp_kernels",
     "corner_kernels",
+    "view_kernels",
 ):
     import_module(f"rbpf.sensors.{name}")
 import_module("rbpf.validation.simulation.raster_kernel")

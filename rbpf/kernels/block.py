@@ -85,21 +85,32 @@ def _innovation_in_space(jac, cov, noise, count, cross, total):
 
 @njit(cache=True, error_model="numpy")
 def _innovation(jac, cov, noise, count, cross, total):
+    """Three terms at a time: a sum is loaded and stored once for them."""
     p, dim = jac.shape[0], jac.shape[1]
     for a in range(p):
         for c in range(dim):
             for i in range(count):
                 cross[a, c, i] = 0.0
-            for b in range(dim):
-                m = packed(b, c)
+            for b in range(0, dim - 2, 3):
+                k, m, n = packed(b, c), packed(b + 1, c), packed(b + 2, c)
                 for i in range(count):
-                    cross[a, c, i] += jac[a, b, i] * cov[m, i]
+                    first = cross[a, c, i] + jac[a, b, i] * cov[k, i]
+                    cross[a, c, i] = first + jac[a, b + 1, i] * cov[m, i] + jac[a, b + 2, i] * cov[n, i]
+            for b in range(dim - dim % 3, dim):
+                k = packed(b, c)
+                for i in range(count):
+                    cross[a, c, i] += jac[a, b, i] * cov[k, i]
     for a in range(p):
         for b in range(a + 1):
             r = noise[a, b]
             for i in range(count):
                 total[a, b, i] = r
-            for c in range(dim):
+            for c in range(0, dim - 2, 3):
+                for i in range(count):
+                    first = total[a, b, i] + cross[a, c, i] * jac[b, c, i]
+                    first = first + cross[a, c + 1, i] * jac[b, c + 1, i]
+                    total[a, b, i] = first + cross[a, c + 2, i] * jac[b, c + 2, i]
+            for c in range(dim - dim % 3, dim):
                 for i in range(count):
                     total[a, b, i] += cross[a, c, i] * jac[b, c, i]
 
@@ -173,8 +184,26 @@ def whiten_matrix(factor, count, matrix):
     elif p == 3:
         _whiten_three_rows(flat(factor), count, matrix[0], matrix[1], matrix[2])
     else:
-        for e in range(matrix.shape[1]):
-            whiten_vector(factor, count, matrix[:, e])
+        _whiten_rows(p, matrix.shape[1], flat(factor), count, flat(matrix))
+
+
+@njit(cache=True, error_model="numpy")
+def _whiten_rows(p, size, chol, count, matrix):
+    for e in range(size):
+        for a in range(p):
+            o, odd = (a * size + e) * BLOCK, a % 2
+            for c in range(0, a - odd, 2):
+                j, k, m = (a * p + c) * BLOCK, (c * size + e) * BLOCK, ((c + 1) * size + e) * BLOCK
+                for i in range(count):
+                    first = matrix[o + i] - chol[j + i] * matrix[k + i]
+                    matrix[o + i] = first - chol[j + BLOCK + i] * matrix[m + i]
+            j, k = (a * p + a - 1) * BLOCK, ((a - 1) * size + e) * BLOCK
+            if odd:
+                for i in range(count):
+                    matrix[o + i] -= chol[j + i] * matrix[k + i]
+            j = (a * p + a) * BLOCK
+            for i in range(count):
+                matrix[o + i] *= chol[j + i]
 
 
 @njit(cache=True, error_model="numpy")
@@ -225,9 +254,13 @@ def add_gram(matrix, sign, count, total):
                         + matrix[2, e, i] * matrix[2, f, i]
                     )
             else:
-                for a in range(p):
+                for a in range(0, p - 1, 2):
                     for i in range(count):
-                        total[m, i] += sign * matrix[a, e, i] * matrix[a, f, i]
+                        first = total[m, i] + sign * matrix[a, e, i] * matrix[a, f, i]
+                        total[m, i] = first + sign * matrix[a + 1, e, i] * matrix[a + 1, f, i]
+                if p % 2:
+                    for i in range(count):
+                        total[m, i] += sign * matrix[p - 1, e, i] * matrix[p - 1, f, i]
 
 
 @njit(cache=True, error_model="numpy")

@@ -18,6 +18,8 @@ FACTORS_PER_LOG = 18
 VECTOR = types.Array(float64, 1, "C")
 MATRIX = types.Array(float64, 2, "C")
 CUBE = types.Array(float64, 3, "C")
+READ_ONLY = types.Array(float64, 2, "C", readonly=True)
+"""A matrix that is not written: the caller's may be locked."""
 INDICES = types.Array(int64, 1, "C")
 INDEX_MATRIX = types.Array(int64, 2, "C")
 MASK = types.Array(types.boolean, 2, "C")

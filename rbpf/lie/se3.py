@@ -1,32 +1,16 @@
 """SE(3), rigid motions of space; storage [qx, qy, qz, qw, tx, ty, tz], tangent [omega, v]."""
 
+from collections.abc import Callable
+from functools import cache
+from types import ModuleType
 from typing import final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rbpf.errors import InputError
 from rbpf.lie.base import Array, LieGroup, join
-from rbpf.lie.matrices import (
-    coupling,
-    lower_blocks,
-    matrix_from_quat,
-    product,
-    quat_from_matrix,
-    rotation_jacobian,
-    rotation_jacobian_inverse,
-    skew,
-)
-from rbpf.lie.rows import (
-    aligned_rows,
-    conjugate,
-    exp_rows,
-    from_rows,
-    log_rows,
-    multiply,
-    rotate,
-    to_rows,
-    unit,
-)
+from rbpf.lie.matrices import quat_from_matrix
 
 
 @final
@@ -45,55 +29,36 @@ class SE3Group(LieGroup):
         return out
 
     def exp(self, xi: ArrayLike) -> Array:
-        rows = to_rows(xi)
-        return from_rows(*exp_rows(rows[:3], rows[3:]))
+        return _one(_compiled().exp, xi, 6, (7,))
 
     def log(self, x: ArrayLike) -> Array:
-        rows = to_rows(x)
-        return from_rows(*log_rows(rows[:4], rows[4:]))
+        return _one(_compiled().log, x, 7, (6,))
 
     def compose(self, a: ArrayLike, b: ArrayLike) -> Array:
-        left, right = aligned_rows(a, b)
-        quat = left[:4]
-        return from_rows(multiply(quat, right[:4]), left[4:] + rotate(quat, right[4:]))
+        return _two(_compiled().compose, a, b, 7, 7)
 
     def inverse(self, a: ArrayLike) -> Array:
-        rows = to_rows(a)
-        quat = conjugate(rows[:4])
-        return from_rows(quat, -rotate(quat, rows[4:]))
+        return _one(_compiled().inverse, a, 7, (7,))
 
     def retract(self, x: ArrayLike, xi: ArrayLike) -> Array:
-        left, step = aligned_rows(x, xi)
-        quat = left[:4]
-        turn, shift = exp_rows(step[:3], step[3:])
-        return from_rows(multiply(quat, turn), left[4:] + rotate(quat, shift))
+        return _two(_compiled().retract, x, xi, 6, 7)
 
     def local(self, x: ArrayLike, y: ArrayLike) -> Array:
-        # The difference of the translations is taken before the rotation, so that near points far
-        # from the origin lose no digits.
-        left, right = aligned_rows(x, y)
-        quat = conjugate(left[:4])
-        return from_rows(*log_rows(multiply(quat, right[:4]), rotate(quat, right[4:] - left[4:])))
+        return _two(_compiled().local, x, y, 7, 6)
 
     def normalise(self, x: ArrayLike) -> Array:
-        rows = to_rows(x)
-        return from_rows(unit(rows[:4]), rows[4:])
+        out = np.array(x, dtype=float)
+        out[..., :4] /= np.sqrt(np.square(out[..., :4]).sum(axis=-1, keepdims=True))
+        return out
 
     def adjoint(self, a: ArrayLike) -> Array:
-        a = np.asarray(a, dtype=float)
-        rotation = matrix_from_quat(a[..., :4])
-        return lower_blocks(rotation, product(skew(a[..., 4:]), rotation))
+        return _one(_matrices().adjoint, a, 7, (6, 6))
 
     def left_jacobian(self, xi: ArrayLike) -> Array:
-        xi = np.asarray(xi, dtype=float)
-        omega, v = xi[..., :3], xi[..., 3:]
-        return lower_blocks(rotation_jacobian(omega), coupling(omega, v))
+        return _one(_matrices().left_jacobian, xi, 6, (6, 6))
 
     def left_jacobian_inverse(self, xi: ArrayLike) -> Array:
-        xi = np.asarray(xi, dtype=float)
-        omega, v = xi[..., :3], xi[..., 3:]
-        inverse = rotation_jacobian_inverse(omega)
-        return lower_blocks(inverse, -product(product(inverse, coupling(omega, v)), inverse))
+        return _one(_matrices().left_jacobian_inverse, xi, 6, (6, 6))
 
     def transform(self, a: ArrayLike, p: ArrayLike) -> Array:
         """World points of body points.
@@ -105,13 +70,11 @@ class SE3Group(LieGroup):
         Returns:
             (..., 3), in the world [m].
         """
-        rows, points = aligned_rows(a, p)
-        return from_rows(rows[4:] + rotate(rows[:4], points))
+        return _two(_compiled().transform, a, p, 3, 3)
 
     def inverse_transform(self, a: ArrayLike, p: ArrayLike) -> Array:
         """Body points of world points; arguments as in `transform`, the frames of p exchanged."""
-        rows, points = aligned_rows(a, p)
-        return from_rows(rotate(conjugate(rows[:4]), points - rows[4:]))
+        return _two(_compiled().inverse_transform, a, p, 3, 3)
 
     def translation(self, a: ArrayLike) -> Array:
         """View of the translation, (..., 7) -> (..., 3)."""
@@ -119,13 +82,13 @@ class SE3Group(LieGroup):
 
     def rotation(self, a: ArrayLike) -> Array:
         """Rotation matrix, (..., 7) -> (..., 3, 3)."""
-        return matrix_from_quat(np.asarray(a, dtype=float)[..., :4])
+        return _one(_matrices().rotations, a, 7, (3, 3))
 
     def matrix(self, a: ArrayLike) -> Array:
         """Homogeneous matrix, (..., 7) -> (..., 4, 4)."""
         a = np.asarray(a, dtype=float)
         out = np.zeros((*a.shape[:-1], 4, 4))
-        out[..., :3, :3] = matrix_from_quat(a[..., :4])
+        out[..., :3, :3] = self.rotation(a)
         out[..., :3, 3] = a[..., 4:]
         out[..., 3, 3] = 1.0
         return out
@@ -167,3 +130,57 @@ class SE3Group(LieGroup):
 def _half_angle(angle: ArrayLike) -> tuple[Array, Array]:
     half = 0.5 * np.asarray(angle, dtype=float)
     return np.asarray(np.cos(half)), np.asarray(np.sin(half))
+
+
+@cache
+def _compiled() -> ModuleType:
+    """Imported when it is first needed: Numba takes longer to import than all the rest."""
+    from rbpf.kernels import rigid
+
+    return rigid
+
+
+@cache
+def _matrices() -> ModuleType:
+    """Likewise."""
+    from rbpf.kernels import rigid_matrices
+
+    return rigid_matrices
+
+
+def _one(
+    function: Callable[[Array, Array], None], x: ArrayLike, size: int, out_shape: tuple[int, ...]
+) -> Array:
+    """A function of rows, (..., size) -> (..., *out_shape)."""
+    x = np.asarray(x, dtype=float)
+    _require_size(x, size)
+    out = np.empty((x.size // size, *out_shape))
+    function(np.ascontiguousarray(x).reshape(-1, size), out)
+    return out.reshape(*x.shape[:-1], *out_shape)
+
+
+def _two(
+    function: Callable[[Array, Array, Array], None], x: ArrayLike, y: ArrayLike, size: int, out_size: int
+) -> Array:
+    """A function of rows of elements (..., 7) and others (..., size), whose leading axes broadcast."""
+    x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
+    _require_size(x, 7)
+    _require_size(y, size)
+    shape = x.shape[:-1]
+    if y.shape[:-1] != shape:
+        shape = np.broadcast_shapes(shape, y.shape[:-1])
+        x, y = _spread(x, shape), _spread(y, shape)
+    out = np.empty((*shape, out_size))
+    left, right = np.ascontiguousarray(x).reshape(-1, 7), np.ascontiguousarray(y).reshape(-1, size)
+    function(left, right, out.reshape(-1, out_size))
+    return out
+
+
+def _spread(x: Array, shape: tuple[int, ...]) -> Array:
+    """With the leading axes `shape`; a single row stays one, the kernels repeat it."""
+    return x if x.size == x.shape[-1] else np.broadcast_to(x, (*shape, x.shape[-1]))
+
+
+def _require_size(x: Array, size: int) -> None:
+    if x.ndim == 0 or x.shape[-1] != size:
+        raise InputError(f"SE3 expected an array (..., {size}), got {x.shape}")

@@ -1,12 +1,9 @@
-"""Trigonometric coefficients of the closed-form Jacobians, exact down to angle zero.
+"""Trigonometric coefficients of the closed-form Jacobians of the plane, exact down to angle zero.
 
-With x = theta^2, and series below x = 1 where the closed forms cancel:
+With x = theta^2, and a series below x = 1 where the closed form cancels; `rbpf.kernels.series` has those of space:
 
     b = (1 - cos theta) / theta^2                       = sum_k (-x)^k / (2k + 2)!
     c = (theta - sin theta) / theta^3                   = sum_k (-x)^k / (2k + 3)!
-    d = (theta^2 / 2 + cos theta - 1) / theta^4         = sum_k (-x)^k / (2k + 4)!
-    e = (2 theta - 3 sin theta + theta cos theta) / (2 theta^5)
-                                                        = sum_k (-x)^k (k + 1) / (2k + 5)!
 """
 
 from math import factorial
@@ -20,8 +17,6 @@ TINY = 1e-300
 
 _TERMS = 10
 _C_SERIES = [(-1) ** k / factorial(2 * k + 3) for k in range(_TERMS)]
-_D_SERIES = [(-1) ** k / factorial(2 * k + 4) for k in range(_TERMS)]
-_E_SERIES = [(-1) ** k * (k + 1) / factorial(2 * k + 5) for k in range(_TERMS)]
 
 
 def _horner(coefficients: list[float], x: Array) -> Array:
@@ -47,28 +42,3 @@ def coefficient_c(theta_squared: Array) -> Array:
     x = np.maximum(theta_squared, 1.0)
     theta = np.sqrt(x)
     return _blend(_C_SERIES, theta_squared, (theta - np.sin(theta)) / (x * theta))
-
-
-def coefficient_d(theta_squared: Array) -> Array:
-    """(theta^2 / 2 + cos theta - 1) / theta^4."""
-    x = np.maximum(theta_squared, 1.0)
-    closed = (0.5 * x + np.cos(np.sqrt(x)) - 1.0) / np.square(x)
-    return _blend(_D_SERIES, theta_squared, closed)
-
-
-def coefficient_e(theta_squared: Array) -> Array:
-    """(2 theta - 3 sin theta + theta cos theta) / (2 theta^5)."""
-    x = np.maximum(theta_squared, 1.0)
-    theta = np.sqrt(x)
-    closed = (2.0 * theta - 3.0 * np.sin(theta) + theta * np.cos(theta)) / (2.0 * np.square(x) * theta)
-    return _blend(_E_SERIES, theta_squared, closed)
-
-
-def inverse_coefficient(theta_squared: Array) -> Array:
-    """(1 - (theta / 2) cot(theta / 2)) / theta^2, singular at 2 pi.
-
-    Its rounding error is that of 1 / theta^2, and every use multiplies it by theta^2.
-    """
-    x = theta_squared + TINY
-    half = 0.5 * np.sqrt(x)
-    return (1.0 - half * np.cos(half) / np.sin(half)) / x

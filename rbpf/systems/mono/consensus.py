@@ -7,8 +7,6 @@ distances (iteratively reweighted least squares); matches that stay far off take
 
 import numpy as np
 
-from rbpf import gaussian
-
 ROUNDS = 10
 SCALE = 2.0
 """Of the loss: a match this many standard deviations off keeps half of its weight."""
@@ -24,13 +22,9 @@ def agreeing(nu: np.ndarray, jac: np.ndarray, cov: np.ndarray, factor: np.ndarra
         factor: (d, r) of the prior's covariance, Q = L Lᵀ.
         gate: on the squared Mahalanobis distance that is left, χ² with p degrees of freedom.
     """
-    chol = gaussian.cholesky(cov)
-    white_nu = gaussian.solve_lower(chol, nu)
-    white_jac = gaussian.solve_lower_matrix(chol, jac @ factor)
-    squared = np.square(white_nu).sum(axis=-1)
-    for _ in range(ROUNDS):
-        weight = 1.0 / (1.0 + squared / SCALE**2)
-        info = np.eye(factor.shape[1]) + np.einsum("k,kpa,kpb->ab", weight, white_jac, white_jac)
-        u = np.linalg.solve(info, np.einsum("k,kpa,kp->a", weight, white_jac, white_nu))
-        squared = np.square(white_nu - white_jac @ u).sum(axis=-1)
+    from rbpf.kernels.robust_fit import robust_fit
+
+    squared = np.empty(nu.shape[0])
+    arrays = (np.ascontiguousarray(array, dtype=float) for array in (nu, jac, cov, factor))
+    robust_fit(*arrays, ROUNDS, SCALE, squared)
     return np.asarray(squared <= gate)

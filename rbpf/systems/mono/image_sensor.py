@@ -19,7 +19,7 @@ from rbpf.systems.mono.appearance import SOURCE_HALF_PX, Appearances
 from rbpf.systems.mono.config import SearchConfig
 from rbpf.systems.mono.consensus import agreeing
 from rbpf.systems.mono.feature_sensor import FeatureSensor
-from rbpf.systems.mono.viewing import affines, directions, view_changes
+from rbpf.systems.mono.viewing import affines
 
 _CELLS = 6
 """The image is divided into so many columns and rows, from which features are chosen in turn."""
@@ -71,8 +71,8 @@ class ImageSensor(Sensor):
         self.bad_frames = 0
         self._given: np.ndarray | None = None
         self._in_view = np.zeros((0, 2))
-        self.seconds = 0.0
-        """Time of the last search."""
+        self.seconds, self.seconds_births = 0.0, 0.0
+        """Times of the last search, and of the last births."""
 
     @property
     def lost(self) -> bool:
@@ -116,6 +116,7 @@ class ImageSensor(Sensor):
 
     def births(self, frame: ImageFrame, belief: Belief, observed: Sequence[Observations]) -> Sequence[Births]:
         """Notes what was found, drops what fails, and starts features at corners where there is room."""
+        started = time.perf_counter()
         failing = self._judge()
         self._place(belief, self.measured.landmarks)
         sightings = self.measured
@@ -123,6 +124,7 @@ class ImageSensor(Sensor):
             sightings = self._with_corners(frame, belief, observed)
         births = self.features.births(sightings, belief, observed)
         self.features.forget(belief, failing)
+        self.seconds_births = time.perf_counter() - started
         return births
 
     def arrays(self) -> dict[str, np.ndarray]:
@@ -168,14 +170,15 @@ class ImageSensor(Sensor):
 
     def _choose(self, pose: np.ndarray) -> np.ndarray:
         """Rows of the features worth looking for, spread over the image (E06 §4.1)."""
-        table = self.table
-        rows = np.flatnonzero(table.alive)
-        seen = directions(table.place[rows], pose)
-        cosine, scale = view_changes(table.place[rows], table.first_pose[rows], pose)
-        near = (scale <= self.config.scale) & (scale >= 1.0 / self.config.scale)
-        wanted = self.camera.visible(seen, self.config.margin_px) & near
-        wanted &= cosine >= np.cos(np.deg2rad(self.config.turn_deg))
-        rows, px = rows[wanted], self.camera.project(seen[wanted])
+        from rbpf.sensors.view_kernels import in_view
+
+        table, camera, config = self.table, self.camera, self.config
+        of_image = (camera.width, camera.height, config.margin_px, camera.monotonic_radius)
+        limits = np.array([*of_image, np.cos(np.deg2rad(config.turn_deg)), config.scale], dtype=float)
+        rows, px = np.empty(table.count, dtype=np.int64), np.empty((table.count, 2))
+        columns = (table.place, table.first_pose, table.alive)
+        count = in_view(*columns, np.ascontiguousarray(pose), camera.params, limits, rows, px)
+        rows, px = rows[:count], px[:count]
         size = np.array([self.camera.width, self.camera.height])
         column, line = np.clip(px * _CELLS / size, 0, _CELLS - 1).astype(np.int64).T
         cell = column + _CELLS * line

@@ -10,7 +10,7 @@ from rbpf.filter import Filter
 from rbpf.sensors.names import Names
 from rbpf.systems.mono.feature_sensor import FeatureSensor
 from rbpf.systems.mono.image_sensor import ImageSensor
-from rbpf.systems.mono.system import world_of
+from rbpf.systems.mono.system import frame_of
 from rbpf.systems.mono.viewing import directions
 
 _SIGMAS = 3.0
@@ -125,7 +125,7 @@ def ray_ends(features: FeatureSensor, belief: Belief, ids: np.ndarray, sigmas: f
 
 def _in_reported_world(place: np.ndarray, filter_: Filter, mode: int) -> np.ndarray:
     """Homogeneous points (K, 4) of the heaviest particle's world in the world that poses are told in."""
-    world = world_of(filter_)
-    if world is None:
+    frame = frame_of(filter_, mode)
+    if frame is None:
         return place.copy()
-    return np.concatenate([directions(place, world.mean[mode]), place[:, 3:]], axis=1)
+    return np.concatenate([directions(place, frame), place[:, 3:]], axis=1)

@@ -6,6 +6,7 @@ from rbpf.anchoring import Anchored
 from rbpf.errors import InputError
 from rbpf.filter import Filter
 from rbpf.lie import SE3
+from rbpf.maps.constellation import Constellation, UncertainConstellation
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
 from rbpf.models import Conditional, MotionModel, Records, Sensor
@@ -100,13 +101,31 @@ def add_constellation(
 
 def world_of(filter_: Filter) -> Anchored | None:
     """The known points' frame in each particle's own world, which starts at its first camera; None without one."""
+    held = _constellation(filter_)
+    if held is None:
+        return None
+    group, records = held
+    return Anchored(*group.frame(records))
+
+
+def frame_of(filter_: Filter, particle: int) -> np.ndarray | None:
+    """The same frame (7,) in one particle's world."""
+    held = _constellation(filter_)
+    if held is None:
+        return None
+    group, records = held
+    one = slice(particle, particle + 1)
+    const = None if records.const is None else records.const[one]
+    return np.asarray(group.frame(Records(records.mean[one], records.cov[one], const))[0][0])
+
+
+def _constellation(filter_: Filter) -> tuple[Constellation | UncertainConstellation, Records] | None:
+    """The known points' landmark and its records. It was the first one: no other one has to be asked."""
     landmark_map = filter_.belief().map
-    for landmark, name in landmark_map.catalogue.items():
-        if name == CONSTELLATION:
-            group = landmark_map.landmark_of(landmark)
-            records = landmark_map.read(np.array([landmark]))
-            return Anchored(*group.frame(records))
-    return None
+    first = next(iter(landmark_map.catalogue), None)
+    if first is None or landmark_map.catalogue[first] != CONSTELLATION:
+        return None
+    return landmark_map.landmark_of(first), landmark_map.read(np.array([first]))
 
 
 def start_law(log: FeatureLog, config: MonoConfig) -> PoseLaw:

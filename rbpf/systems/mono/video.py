@@ -45,6 +45,8 @@ class VideoRun:
         nis: (T,) normalised innovation squared;  nis_dof: (T,) its degrees of freedom.
         seconds: (T,) time of the whole frame without decoding;  seconds_search: (T,) of the search in the image.
         seconds_waiting: (T,) until the decoded image was there.
+        seconds_births: (T,) of judging what was looked for and starting landmarks at corners, part of the frame's.
+        seconds_telling: (T,) of the estimate and of taking notes, after the frame's time.
         sightings: what was looked for, frame by frame.
         problems: what was wrong with single frames, in words.
         relocalisations: numbers of the frames in which it was found again.
@@ -71,6 +73,8 @@ class VideoRun:
     seconds: np.ndarray
     seconds_search: np.ndarray
     seconds_waiting: np.ndarray
+    seconds_births: np.ndarray
+    seconds_telling: np.ndarray
     sightings: Sightings = field(default_factory=Sightings)
     problems: list[str] = field(default_factory=list)
     relocalisations: list[int] = field(default_factory=list)
@@ -160,7 +164,7 @@ def _begin(
     if known is not None:
         sensor.begin(image, known.px, config.known == "frame")
     total = len(sequence)
-    numbers = np.zeros((11, total))
+    numbers = np.zeros((13, total))
     poses, covs = np.zeros((total, 7)), np.zeros((total, 6, 6))
     filter_ = assemble(config, features, start, sensor)
     stamps = np.asarray(sequence.stamps_ns, dtype=np.int64)
@@ -181,8 +185,9 @@ def _frame(run: VideoRun, t: int, frame: ImageFrame, law: PoseLaw | None) -> Non
     run.lost[t] = run.sensor.lost
     run.ess[t], run.log_evidence[t] = report.ess, report.log_evidence
     run.resampled[t], run.nis[t], run.nis_dof[t] = report.resampled, report.nis, report.rows
-    run.seconds_search[t] = run.sensor.seconds
+    run.seconds_search[t], run.seconds_births[t] = run.sensor.seconds, run.sensor.seconds_births
     run.sightings.record(run.sensor, run.filter)
+    run.seconds_telling[t] = time.perf_counter() - started - run.seconds[t]
     if frame.problem is not None:
         run.problems.append(f"frame {t}: {frame.problem}")
     if run.sensor.lost and not was_lost:

@@ -44,15 +44,3 @@ def affines(
     on_patch = position + along[..., None] * world_rays
     first = camera.project(SE3.inverse_transform(first_pose[:, None], on_patch))
     return np.stack([first[:, 0] - first[:, 1], first[:, 2] - first[:, 3]], axis=-1) / 2.0
-
-
-def view_changes(
-    place: np.ndarray, first_pose: np.ndarray, world_from_camera: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Cosine (K,) of the angle between the first line of sight and that of now, and distance now / distance then."""
-    point = place[:, :3]
-    then = point - place[:, 3:] * SE3.translation(first_pose)
-    now = point - place[:, 3:] * SE3.translation(world_from_camera)
-    lengths = np.linalg.norm(then, axis=-1), np.linalg.norm(now, axis=-1)
-    cosine = (then * now).sum(axis=-1) / np.maximum(lengths[0] * lengths[1], 1e-300)
-    return cosine, lengths[1] / np.maximum(lengths[0], 1e-300)

@@ -1,0 +1,102 @@
+"""Frames per second of the whole monocular system on images rendered on the fly, decoding apart."""
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import cv2
+import numpy as np
+
+from benchmarks.rows import Row, Settings
+from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.readers.images import ImageFrame, ImageSequence, KnownPixels, open_images, read_known_points
+from rbpf.sensors.readers.images.sequence import Source
+from rbpf.systems.mono.config import MonoConfig
+from rbpf.systems.mono.video import VideoRun, run_images
+from rbpf.validation.simulation.exposure import Imaging
+from rbpf.validation.simulation.images import simulate_images
+from rbpf.validation.simulation.textured_desk import TexturedDesk
+
+SETTLING, TIMED, MEASUREMENTS = 30, 90, 25
+AIM_HZ = {320: 100.0, 640: 60.0}
+SHARE_OF_WIDTH = 0.625
+"""Focal length over the image's width, the desk world's 400 px at 640."""
+
+
+@dataclass(frozen=True)
+class Decoded(Source):
+    """Images that are in memory: what reading them costs is not the system's."""
+
+    held: list[ImageFrame]
+
+    def frames(self, start: int) -> Iterator[ImageFrame]:
+        return iter(self.held[start:])
+
+
+def rendered(width: int, frames: int) -> tuple[ImageSequence, KnownPixels]:
+    """A desk in images 4 : 3 of this width."""
+    height, focal = width * 3 // 4, SHARE_OF_WIDTH * width
+    camera = Pinhole(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+    with TemporaryDirectory() as folder:
+        desk = Path(folder) / "desk"
+        simulate_images(TexturedDesk(frames=frames), Imaging(), camera, desk, seed=0)
+        sequence = open_images(desk)
+        known = read_known_points(desk / "known_points.csv")
+        return replace(sequence, source=Decoded(list(sequence.frames()))), known
+
+
+def run(settings: Settings) -> list[Row]:
+    """A row for each size, beside OpenCV's tracking of as many corners from frame to frame, without map or filter."""
+    timed = settings.repetitions(TIMED)
+    return [figure(width, timed) for width in AIM_HZ]
+
+
+def figure(width: int, timed: int) -> Row:
+    sequence, known = rendered(width, SETTLING + timed)
+    done = run_images(sequence, MonoConfig(particles=50), known)
+    stages = {name: float(np.median(part[SETTLING:])) * 1e3 for name, part in by_stage(done).items()}
+    peer = optical_flow(sequence)
+    whole = (done.seconds + done.seconds_telling)[SETTLING:]
+    hz, mean_hz = 1.0 / float(np.median(whole)), 1.0 / float(whole.mean())
+    text = ", ".join(f"{name} {spent:.3g} ms" for name, spent in stages.items())
+    return Row(
+        f"mono frames {width}x{width * 3 // 4}",
+        hz,
+        "frames/s",
+        "OpenCV's optical flow of 25 corners",
+        1.0 / peer,
+        peer * hz,
+        higher=True,
+        aim=f">= {AIM_HZ[width]:g} frames/s",
+        met=hz >= AIM_HZ[width],
+        notes=(
+            f"medians: {text}; {mean_hz:.3g} frames/s on the average, fastest frame {whole.min() * 1e3:.3g} ms; "
+            f"{done.found[SETTLING:].mean():.3g} of {done.searched[SETTLING:].mean():.3g} measurements found"
+        ),
+        tolerance=0.5,
+    )
+
+
+def optical_flow(sequence: ImageSequence) -> float:
+    """Median seconds that the pyramidal tracker of Lucas and Kanade takes from frame to frame."""
+    images = [frame.image for frame in sequence.frames() if frame.image is not None]
+    seconds = []
+    for before, now in pairwise(images[SETTLING:]):
+        corners = cv2.goodFeaturesToTrack(before, MEASUREMENTS, 0.01, 20.0)
+        start = time.perf_counter()
+        cv2.calcOpticalFlowPyrLK(before, now, corners, None)
+        seconds.append(time.perf_counter() - start)
+    return float(np.median(seconds))
+
+
+def by_stage(run: VideoRun) -> dict[str, np.ndarray]:
+    """Seconds of each frame (T,) by what they were spent on."""
+    return {
+        "search": run.seconds_search,
+        "filter": run.seconds - run.seconds_search - run.seconds_births,
+        "births": run.seconds_births,
+        "telling": run.seconds_telling,
+    }

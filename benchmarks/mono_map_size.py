@@ -1,0 +1,75 @@
+"""A whole monocular frame against the number of landmarks in the map (E06 Fig. 3): the choice of them is O(M)."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from benchmarks.mono_frames import SETTLING, Decoded, rendered
+from benchmarks.rows import Row, Settings
+from rbpf.lie import SE3
+from rbpf.maps.point import Point
+from rbpf.models import Records
+from rbpf.sensors.readers.images import ImageFrame
+from rbpf.systems.mono.config import MonoConfig
+from rbpf.systems.mono.video import VideoRun, run_images
+
+WIDTH, TIMED = 320, 60
+LANDMARKS = 10_000
+AIM = 0.10
+BEHIND_M = 5.0
+"""The landmarks of elsewhere lie this far behind the first camera: none comes into view, all have to be looked at."""
+
+
+def run(settings: Settings) -> list[Row]:
+    """One desk twice: with its own landmarks alone, and with ten thousand of elsewhere in the map from frame one on."""
+    frames = SETTLING + settings.repetitions(TIMED)
+    sequence, known = rendered(WIDTH, frames)
+    held = sequence.source
+    assert isinstance(held, Decoded)
+    seconds = {}
+    for more in (0, LANDMARKS):
+        spent = np.zeros(frames)
+
+        def fill(
+            t: int, _frame: ImageFrame, run: VideoRun, more: int = more, spent: np.ndarray = spent
+        ) -> None:
+            if t == 0 and more:
+                add_elsewhere(run, more)
+            spent[t] = run.seconds[t] + run.seconds_telling[t]
+
+        done = run_images(replace(sequence), MonoConfig(particles=50), known, fill)
+        assert not done.lost.any()
+        seconds[more] = spent[SETTLING:]
+    few, many = (float(np.median(part)) for part in seconds.values())
+    return [
+        Row(
+            f"mono frame, {LANDMARKS} landmarks",
+            many * 1e3,
+            "ms",
+            "the desk's own landmarks",
+            few * 1e3,
+            many / few,
+            higher=False,
+            aim="<= 10 % more",
+            met=many / few - 1.0 <= AIM,
+            notes=f"fastest {seconds[LANDMARKS].min() * 1e3:.3g} against {seconds[0].min() * 1e3:.3g} ms",
+            tolerance=0.15,
+        )
+    ]
+
+
+def add_elsewhere(run: VideoRun, count: int) -> None:
+    """Landmarks of which nothing is seen; the table of appearances has a row for each, as if they had been left."""
+    rng, filter_, table = np.random.default_rng(0), run.filter, run.sensor.table
+    pose = filter_.particles.state[0, :7]
+    behind = rng.uniform([-3.0, -3.0, -BEHIND_M - 2.0], [3.0, 3.0, -BEHIND_M], (count, 3))
+    points = SE3.transform(pose, behind)
+    n, landmark_map = filter_.n, filter_.belief().map
+    mean = np.broadcast_to(points, (n, count, 3))
+    ids = landmark_map.add_records(
+        Records(mean, np.broadcast_to(1e-4 * np.eye(3), (n, count, 3, 3))), Point(3)
+    )
+    source = np.zeros((count, *table.source.shape[1:]), dtype=np.uint8)
+    rows = table.add(source, np.zeros((count, 2)), pose)
+    table.place[rows] = np.concatenate([points, np.ones((count, 1))], axis=1)
+    landmark_map.catalogue.update(zip(ids.tolist(), rows.tolist(), strict=True))

@@ -1,0 +1,85 @@
+"""Drivers of single steps against NumPy's and SciPy's ways to the same numbers."""
+
+import numpy as np
+import pytest
+
+from rbpf.kernels.robust_fit import robust_fit
+from rbpf.kernels.soundness import are_sound
+from rbpf.kernels.substate import conditioned
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(4)
+
+
+def covariances(rng, count, size):
+    root = rng.normal(size=(count, size, size))
+    return root @ np.swapaxes(root, -1, -2) + 0.1 * np.eye(size)
+
+
+@pytest.mark.parametrize("laws", [1, 5])
+def test_a_substate_given_the_increment_is_the_schur_complement(laws, rng):
+    d, m = 4, 3
+    stack, noise = rng.normal(size=(1, d + m, m)), rng.normal(size=(1, d + m, d + m))
+    cov = covariances(rng, laws, m)
+    joint, factor = np.empty((laws, d + m, d + m)), np.empty((laws, d, d))
+    gain, rest = np.empty((laws, m, d)), np.empty((laws, m, m))
+    assert conditioned(stack, cov, noise, joint, factor, gain, rest)
+    expected = stack @ cov @ np.swapaxes(stack, -1, -2) + noise @ np.swapaxes(noise, -1, -2)
+    ee, se, ss = expected[:, :d, :d], expected[:, d:, :d], expected[:, d:, d:]
+    np.testing.assert_allclose(joint, expected, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(factor, np.linalg.cholesky(ee), rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(gain, se @ np.linalg.inv(ee), rtol=1e-9, atol=1e-9)
+    schur = ss - se @ np.linalg.inv(ee) @ np.swapaxes(se, -1, -2)
+    np.testing.assert_allclose(rest, schur, rtol=1e-9, atol=1e-9)
+    np.testing.assert_array_equal(rest, np.swapaxes(rest, -1, -2))
+
+
+@pytest.mark.parametrize("worst", [0.0, np.nan])
+def test_an_increment_without_noise_is_told(worst):
+    stack, cov = np.zeros((1, 3, 1)), np.ones((1, 1, 1))
+    noise = np.diag([1.0, worst, 1.0])[None]
+    arrays = np.empty((1, 3, 3)), np.empty((1, 2, 2)), np.empty((1, 1, 2)), np.empty((1, 1, 1))
+    assert not conditioned(stack, cov, noise, *arrays)
+
+
+def iterated(nu, jac, cov, factor, rounds, scale):
+    """The same fit, written with NumPy's solver and inverse."""
+    chol = np.linalg.cholesky(cov)
+    white_nu = np.linalg.solve(chol, nu[..., None])[..., 0]
+    white_jac = np.linalg.solve(chol, jac @ factor)
+    squared = np.square(white_nu).sum(axis=-1)
+    for _ in range(rounds):
+        weight = 1.0 / (1.0 + squared / scale**2)
+        info = np.eye(factor.shape[1]) + np.einsum("k,kpa,kpb->ab", weight, white_jac, white_jac)
+        u = np.linalg.solve(info, np.einsum("k,kpa,kp->a", weight, white_jac, white_nu))
+        squared = np.square(white_nu - white_jac @ u).sum(axis=-1)
+    return squared
+
+
+def test_robust_fit_equals_numpys_and_leaves_the_outliers_far_off(rng):
+    count, d = 20, 6
+    jac, cov = rng.normal(size=(count, 2, d)), covariances(rng, count, 2)
+    factor, truth = np.tril(rng.normal(size=(d, d))), rng.normal(size=d)
+    nu = (jac @ factor) @ truth + 0.01 * rng.normal(size=(count, 2))
+    nu[:4] += 30.0
+    squared = np.empty(count)
+    robust_fit(nu, jac, cov, factor, 10, 2.0, squared)
+    np.testing.assert_allclose(squared, iterated(nu, jac, cov, factor, 10, 2.0), rtol=1e-9, atol=1e-12)
+    assert squared[:4].min() > 9.2 > squared[4:].max()
+
+
+def test_soundness(rng):
+    z, cov = rng.normal(size=(5, 3)), covariances(rng, 5, 3)
+    cov = 0.5 * (cov + np.swapaxes(cov, -1, -2))
+    assert are_sound(z, cov)
+    assert are_sound(z[:0], cov[:0])
+    for spoil in (np.nan, np.inf):
+        bad = z.copy()
+        bad[4, 2] = spoil
+        assert not are_sound(bad, cov)
+    for place, value in (((2, 0, 1), 9.0), ((2, 1, 1), -1.0), ((2, 2, 2), np.nan), ((0, 0, 0), 0.0)):
+        bad = cov.copy()
+        bad[place] = value
+        assert not are_sound(z, bad)
