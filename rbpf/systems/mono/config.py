@@ -32,7 +32,8 @@ class RayConfig:
 
     Attributes:
         constrain: how they constrain the pose: by their epipolar line (the paper's); by the 2-D marginal with finite
-            depth variance from where on depth is measured, and by the line before; or not at all.
+            depth variance from where on depth is measured, and by the line before, if points are seen that hold the
+            scale; or not at all.
         rho_per_m: mean inverse depth of a new landmark, 1/m; without known points it sets the scale.
         std_rho_per_m: its standard deviation.
         adapt: a new ray starts at the median inverse depth of the points just seen, with the same relative deviation at

@@ -24,7 +24,7 @@ CONSTELLATION = -1
 """Name of the known points' frame in the catalogue; features have names from 0 on."""
 
 ENOUGH = 4
-"""Points that must have been seen for new rays to start at their depth."""
+"""Points that must be seen for new rays to start at their depth, and for the scale to be theirs."""
 
 GroupView = ConstellationView | MembersView
 """Measurements of several known points at once."""
@@ -71,7 +71,8 @@ class FeatureSensor(Sensor):
             k = rows[~is_ray]
             groups.append(Observations(frame.z[k], frame.cov_z[k], self.point, ids=ids[k]))
         if is_ray.any():
-            groups += self._ray_groups(frame, belief, rows[is_ray], ids[rows[is_ray]])
+            scaled = sum(group.z.size for group in groups) >= 2 * ENOUGH
+            groups += self._ray_groups(frame, belief, rows[is_ray], ids[rows[is_ray]], scaled)
         return groups
 
     def births(
@@ -240,8 +241,9 @@ class FeatureSensor(Sensor):
         return frame.stamp_ns == first.stamp_ns and np.array_equal(first.z[order[0]], frame.z[rows][order[1]])
 
     def _ray_groups(
-        self, frame: FeatureFrame, belief: Belief, rows: np.ndarray, ids: np.ndarray
+        self, frame: FeatureFrame, belief: Belief, rows: np.ndarray, ids: np.ndarray, scaled: bool
     ) -> list[Observations]:
+        """Of rays; `scaled` says whether points are seen that hold the scale, which else the prior of depth does."""
         deep = self._has_parallax(belief, ids)
         z, cov = frame.z[rows], frame.cov_z[rows]
 
@@ -253,7 +255,8 @@ class FeatureSensor(Sensor):
             return [Observations(z[chosen], cov[chosen], model, ids=ids[chosen], informs=informs)]
 
         if self.rays.constrain == "marginal":
-            return group(self.ray, deep) + group(self.epipolar, ~deep, informs=_STATE)
+            young = self.epipolar if scaled else self.ray
+            return group(self.ray, deep) + group(young, ~deep, informs=_STATE)
         updates = group(self.ray, deep, informs=_MAP)
         if self.rays.constrain == "off":
             return updates
