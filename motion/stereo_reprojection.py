@@ -1,0 +1,88 @@
+"""The reprojection error of matched points as a function of the motion between two stereo frames (S05 (14)).
+
+Both measurements are noisy, z⁻ = m + v⁻ and z = g(T, m) + v ({py:mod}`rbpf.motion.stereo_geometry`). About any m̂,
+eliminating m leaves
+
+    ν = z − g(T, m̂) − A (z⁻ − m̂),    A = ∂g/∂m,    cov ν = S = R + A R⁻ Aᵀ.
+
+A R⁻ Aᵀ is J_P C J_Pᵀ with the covariance C of the earlier point in space. `Points` says which m̂.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from rbpf import gaussian
+from rbpf.lie import Array
+from rbpf.motion.stereo_geometry import Matches, Seen, see
+
+Points = Literal["adjusted", "propagated", "exact"]
+"""What the earlier frame's points are taken for.
+
+adjusted: unknown as well: m̂ minimises ‖z⁻ − m‖² + ‖z − g(T, m)‖², each under its covariance. The minimum over T then is
+    that of the bundle adjustment of both frames, and JᵀS⁻¹J the Schur complement of its information.
+propagated: where they were measured, m̂ = z⁻, with their covariance in S.
+exact: where they were measured, without error: S = R, the paper's.
+"""
+
+SWEEPS, SWEPT_PX = 10, 1e-4
+"""Of the adjustment of m̂: most of them, and the last one's change. g is nearly linear: two or three do."""
+
+
+@dataclass(frozen=True)
+class Innovation:
+    """ν and what goes with it.
+
+    Attributes:
+        nu: (K, 3), infinite where a point would be behind the camera.
+        cov: (K, 3, 3) S.
+        pixels: (K, 3) m̂.
+        seen: g at m̂, and its derivatives.
+    """
+
+    nu: Array
+    cov: Array
+    pixels: Array
+    seen: Seen
+
+    def squared(self) -> Array:
+        """Squared Mahalanobis distances (K,), infinite behind the camera."""
+        nu = np.where(self.seen.front[:, None], self.nu, 0.0)
+        whitened = gaussian.solve_lower(gaussian.cholesky(self.cov), nu)
+        return np.where(self.seen.front, np.square(whitened).sum(axis=-1), np.inf)
+
+    def whitened(self) -> tuple[Array, Array]:
+        """Residuals L⁻¹ν (3K,) and their derivative (3K, 6) by the motion, S = L Lᵀ; infinite if one point is behind."""
+        if not self.seen.front.all():
+            return np.full(self.nu.size, np.inf), np.zeros((self.nu.size, 6))
+        both = np.concatenate([self.nu[..., None], -self.seen.by_motion], axis=-1)
+        white = gaussian.solve_lower_matrix(gaussian.cholesky(self.cov), both)
+        rows = np.ascontiguousarray(white).reshape(-1, 7)
+        return rows[:, 0], rows[:, 1:]
+
+
+def innovation(matches: Matches, delta: Array, points: Points) -> Innovation:
+    """ν at a motion T = `delta` (7,), with m̂ as `points` says."""
+    found = _linearised(matches, delta, matches.z_prev, points)
+    for _ in range(SWEEPS if points == "adjusted" else 0):
+        # m̂ = z⁻ + R⁻ Aᵀ S⁻¹ ν: the linearised problem's minimum.
+        nu = np.where(found.seen.front[:, None], found.nu, 0.0)
+        gained = found.seen.by_pixels.mT @ np.linalg.solve(found.cov, nu[..., None])
+        pixels = matches.z_prev + (matches.cov_prev @ gained)[..., 0]
+        change = np.abs(pixels - found.pixels).max(initial=0.0)
+        found = _linearised(matches, delta, pixels, points)
+        if change <= SWEPT_PX:
+            break
+    return found
+
+
+def _linearised(matches: Matches, delta: Array, pixels: Array, points: Points) -> Innovation:
+    """ν about m̂ = `pixels` (K, 3)."""
+    seen = see(matches.camera, delta, pixels)
+    off = (seen.by_pixels @ (matches.z_prev - pixels)[..., None])[..., 0]
+    nu = np.where(seen.front[:, None], matches.z_now - seen.pixels - off, np.inf)
+    cov = matches.cov_now
+    if points != "exact":
+        cov = cov + seen.by_pixels @ matches.cov_prev @ seen.by_pixels.mT
+    return Innovation(nu, cov, pixels, seen)
