@@ -18,7 +18,7 @@ from rbpf.errors import InputError
 from rbpf.lie import Array
 
 Evaluate = Callable[[Array], tuple[Array, Array]]
-"""x (E,) → whitened residuals (m,), and their derivative (m, d) in the chart at x; not finite where x makes no sense."""
+"""x (E,) → whitened residuals (m,), and their derivative (m, d) in the chart at x; infinite where x is senseless."""
 
 Retract = Callable[[Array, Array], Array]
 """x (E,) moved by ξ (d,)."""

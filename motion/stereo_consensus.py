@@ -1,8 +1,8 @@
 """The motion that most matches of two stereo frames agree with, from triples of them (RANSAC).
 
-M. Fischler and R. Bolles (1981); the truncated score is that of P. Torr and A. Zisserman (2000). The points of a triple
-are aligned, which gives a motion of any size, and this is refined on their pixels: far points are too uncertain in space
-for the alignment alone.
+M. Fischler and R. Bolles (1981); the truncated score is that of P. Torr and A. Zisserman (2000). The points of a
+triple are aligned, which gives a motion of any size, and this is refined on their pixels: far points are too uncertain
+in space for the alignment alone.
 """
 
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ import numpy as np
 
 from rbpf import gaussian
 from rbpf.lie import SE3, Array
-from rbpf.motion.stereo_geometry import Matches, homography, pixels_from_points, raise_pixels, see
+from rbpf.motion.stereo_geometry import Matches, homography, points_from_pixels, raise_pixels, see
 
 REFINEMENTS = 3
 """Gauss-Newton steps on the nine pixels of a triple."""
@@ -69,11 +69,10 @@ def consensus(
             break
         found = search.candidates(triples(len(matches), draws.batch, rng))
         motions = np.concatenate([motions, found]) if tried == 0 else found
-        squared = search.squared(motions)
-        scores = np.minimum(squared, gate).sum(axis=1)
+        scores, shares = search.scores(motions, gate)
         if scores.min() < lowest:
             first = scores.argmin()
-            best, lowest, share = motions[first], scores[first], float((squared[first] <= gate).mean())
+            best, lowest, share = motions[first], scores[first], float(shares[first])
     return best
 
 
@@ -127,17 +126,23 @@ class _Search:
             motions = self._step(motions, rows)
         return motions
 
-    def squared(self, motions: Array, rows: np.ndarray | None = None) -> Array:
-        """Squared distances (…, K) of all matches, or of rows (…, k), at motions (…, 7); infinite behind the camera."""
-        chosen = slice(None) if rows is None else rows
-        matrix = homography(self.matches.camera, motions)
-        raised = raise_pixels(matrix, self.matches.z_prev[chosen])
-        front = raised[..., 3] > 0.0
-        seen = raised[..., :3] / np.where(front, raised[..., 3], 1.0)[..., None]
-        distance = np.square(self._white_miss(seen, chosen)).sum(axis=-1)
-        return np.where(front & np.isfinite(distance), distance, np.inf)
+    def scores(self, motions: Array, gate: float) -> tuple[Array, Array]:
+        """Σ min(d², gate) (C,) of motions (C, 7) over all matches, and the shares (C,) that agree (compiled)."""
+        from rbpf.motion import stereo_kernels
 
-    def _white_miss(self, seen: Array, rows: np.ndarray | slice) -> Array:
+        matches = self.matches
+        score, agreeing = np.empty(len(motions)), np.empty(len(motions))
+        matrices = homography(matches.camera, motions)
+        stereo_kernels.scores(matrices, matches.z_prev, matches.z_now, self.white, gate, score, agreeing)
+        return score, agreeing / len(matches)
+
+    def squared(self, motions: Array, rows: np.ndarray) -> Array:
+        """Squared distances (…, k) of some rows (…, k) at motions (…, 7); infinite behind the camera."""
+        seen = see(self.matches.camera, motions, self.matches.z_prev[rows])
+        distance = np.square(self._white_miss(seen.pixels, rows)).sum(axis=-1)
+        return np.where(seen.front, distance, np.inf)
+
+    def _white_miss(self, seen: Array, rows: np.ndarray) -> Array:
         return np.einsum("...ij,...j->...i", self.white[rows], self.matches.z_now[rows] - seen)
 
     def _step(self, motions: Array, rows: np.ndarray) -> Array:
@@ -153,6 +158,6 @@ class _Search:
 
 def _points(matches: Matches, pixels: Array) -> Array:
     """Points (K, 3) of pixels (K, 3), those at infinity and beyond put far away."""
-    raised = raise_pixels(np.linalg.inv(pixels_from_points(matches.camera)), pixels)
+    raised = raise_pixels(points_from_pixels(matches.camera), pixels)
     least = 1.0 / (FARTHEST * matches.camera.baseline_m)
     return raised[:, :3] / np.maximum(raised[:, 3:], least)

@@ -1,7 +1,7 @@
 """Pixels and points of a rectified stereo pair, as matrices.
 
-A homogeneous point X = (x, y, z, ρ) in the left camera's frame, at (x, y, z) / ρ, and its pixels m = (u_left, v, u_right)
-are related by (m, 1) ~ Q X. A point seen at m is seen after a motion T = previous_camera_from_camera at g with
+A homogeneous point X = (x, y, z, ρ) in the left camera's frame, at (x, y, z) / ρ, and its pixels m = (u_left, v,
+u_right) are related by (m, 1) ~ Q X. A point seen at m is seen after a motion T = previous_camera_from_camera at g with
 
     (g, 1) ~ H (m, 1),    H = Q T⁻¹ Q⁻¹,
 
@@ -38,7 +38,7 @@ class PinholeCamera(Protocol):
 
 
 class StereoCamera(Protocol):
-    """Two equal undistorted pinholes side by side, the left one the reference: `rbpf.sensors.pinhole.RectifiedStereo`."""
+    """Two equal undistorted pinholes side by side, the left one the reference, as a `RectifiedStereo`."""
 
     @property
     def camera(self) -> PinholeCamera:
@@ -115,10 +115,23 @@ def pixels_from_points(camera: StereoCamera) -> Array:
     )
 
 
+def points_from_pixels(camera: StereoCamera) -> Array:
+    """Q⁻¹ (4, 4)."""
+    one, shift = camera.camera, camera.camera.fx * camera.baseline_m
+    return np.array(
+        [
+            [1.0 / one.fx, 0.0, 0.0, -one.cx / one.fx],
+            [0.0, 1.0 / one.fy, 0.0, -one.cy / one.fy],
+            [0.0, 0.0, 0.0, 1.0],
+            [1.0 / shift, 0.0, -1.0 / shift, 0.0],
+        ]
+    )
+
+
 def homography(camera: StereoCamera, delta: Array) -> Array:
     """H (…, 4, 4) of motions T (…, 7)."""
-    q = pixels_from_points(camera)
-    return q @ SE3.matrix(SE3.inverse(delta)) @ np.linalg.inv(q)
+    moved = SE3.matrix(SE3.inverse(delta))
+    return np.asarray(pixels_from_points(camera) @ moved @ points_from_pixels(camera), dtype=float)
 
 
 def raise_pixels(matrix: Array, pixels: Array) -> Array:
@@ -136,7 +149,9 @@ def see(camera: StereoCamera, delta: Array, pixels: Array) -> Seen:
     depth = raised[..., 3, None]
     seen = raised[..., :3] / depth
     # (m, 1) ~ Q X has z as its last entry, here and after the motion.
-    point = raised @ np.linalg.inv(q).T
+    point = raised @ points_from_pixels(camera).T
     slope = (q[:3, :3] - seen[..., None] * np.array([0.0, 0.0, 1.0])) / depth[..., None]
-    by_pixels = (matrix[..., None, :3, :3] - seen[..., None] * matrix[..., None, None, 3, :3]) / depth[..., None]
+    by_pixels = (matrix[..., None, :3, :3] - seen[..., None] * matrix[..., None, None, 3, :3]) / depth[
+        ..., None
+    ]
     return Seen(seen, front, by_pixels, slope @ skew(point[..., :3]), -slope, point[..., 3])

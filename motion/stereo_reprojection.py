@@ -15,7 +15,7 @@ import numpy as np
 
 from rbpf import gaussian
 from rbpf.lie import Array
-from rbpf.motion.stereo_geometry import Matches, Seen, see
+from rbpf.motion.stereo_geometry import Matches, Seen, homography, see
 
 Points = Literal["adjusted", "propagated", "exact"]
 """What the earlier frame's points are taken for.
@@ -46,20 +46,48 @@ class Innovation:
     pixels: Array
     seen: Seen
 
-    def squared(self) -> Array:
-        """Squared Mahalanobis distances (K,), infinite behind the camera."""
-        nu = np.where(self.seen.front[:, None], self.nu, 0.0)
-        whitened = gaussian.solve_lower(gaussian.cholesky(self.cov), nu)
-        return np.where(self.seen.front, np.square(whitened).sum(axis=-1), np.inf)
-
-    def whitened(self) -> tuple[Array, Array]:
-        """Residuals L⁻¹ν (3K,) and their derivative (3K, 6) by the motion, S = L Lᵀ; infinite if one point is behind."""
-        if not self.seen.front.all():
-            return np.full(self.nu.size, np.inf), np.zeros((self.nu.size, 6))
+    def white_rows(self) -> Array:
+        """L⁻¹ [ν, −∂g/∂ξ] (K, 3, 7) with S = L Lᵀ; zeros for a point behind the camera."""
         both = np.concatenate([self.nu[..., None], -self.seen.by_motion], axis=-1)
-        white = gaussian.solve_lower_matrix(gaussian.cholesky(self.cov), both)
-        rows = np.ascontiguousarray(white).reshape(-1, 7)
-        return rows[:, 0], rows[:, 1:]
+        both = np.where(self.seen.front[:, None, None], both, 0.0)
+        return np.asarray(gaussian.solve_lower_matrix(gaussian.cholesky(self.cov), both))
+
+
+def residuals(matches: Matches, delta: Array, points: Points) -> tuple[Array, Array]:
+    """Whitened residuals (3K,) and their derivative (3K, 6) by the motion, for least squares (compiled).
+
+    Infinite where a point would be behind the camera.
+    """
+    rows, front = white_rows(matches, delta, points)
+    if not front.all():
+        return np.full(3 * len(matches), np.inf), np.zeros((3 * len(matches), 6))
+    flat = rows.reshape(-1, 7)
+    return flat[:, 0].copy(), flat[:, 1:].copy()
+
+
+def squared_distances(matches: Matches, delta: Array, points: Points) -> Array:
+    """Squared Mahalanobis distances (K,) from a motion, infinite for points behind the camera (compiled)."""
+    rows, front = white_rows(matches, delta, points)
+    return np.where(front, np.square(rows[..., 0]).sum(axis=-1), np.inf)
+
+
+def white_rows(matches: Matches, delta: Array, points: Points) -> tuple[Array, np.ndarray]:
+    """`Innovation.white_rows` and `Seen.front` of `innovation`, compiled."""
+    from rbpf.motion import stereo_kernels
+
+    one, shift = matches.camera.camera, matches.camera.camera.fx * matches.camera.baseline_m
+    rows, front = np.empty((len(matches), 3, 7)), np.empty(len(matches), dtype=bool)
+    stereo_kernels.white_rows(
+        homography(matches.camera, delta),
+        np.array([one.fx, one.fy, one.cx, one.cy, shift]),
+        *(matches.z_prev, matches.z_now, matches.cov_prev, matches.cov_now),
+        points != "exact",
+        SWEEPS if points == "adjusted" else 0,
+        SWEPT_PX,
+        rows,
+        front,
+    )
+    return rows, front
 
 
 def innovation(matches: Matches, delta: Array, points: Points) -> Innovation:
@@ -70,7 +98,7 @@ def innovation(matches: Matches, delta: Array, points: Points) -> Innovation:
         nu = np.where(found.seen.front[:, None], found.nu, 0.0)
         gained = found.seen.by_pixels.mT @ np.linalg.solve(found.cov, nu[..., None])
         pixels = matches.z_prev + (matches.cov_prev @ gained)[..., 0]
-        change = np.abs(pixels - found.pixels).max(initial=0.0)
+        change = np.abs(pixels - found.pixels)[found.seen.front].max(initial=0.0)
         found = _linearised(matches, delta, pixels, points)
         if change <= SWEPT_PX:
             break
