@@ -25,6 +25,7 @@ NAMES = (
     "user_model",
     "mono_step",
     "patch_search",
+    "motion_estimate",
     "bootstrap_peers",
     "mrpt_peer",
 )
