@@ -7,8 +7,8 @@ is I − D while the score itself has the covariance I, because ν is independen
 
     cov = (I − D)⁻¹ I (I − D)⁻¹.
 
-Leaving out what lies beyond a gate costs true matches, and the farthest, which speak most: the rest determines the motion
-less well than as many that were not chosen would.
+Leaving out what lies beyond a gate costs true matches, and the farthest, which speak most: the rest determines the
+motion less well than as many that were not chosen would.
 """
 
 import math

@@ -19,7 +19,14 @@ from rbpf.motion.stereo_consensus import Draws, consensus
 from rbpf.motion.stereo_covariance import honest_covariance, trimming
 from rbpf.motion.stereo_geometry import Matches, StereoCamera
 from rbpf.motion.stereo_matches import checked_matches, possible
-from rbpf.motion.stereo_reprojection import Points, innovation, residuals, squared_distances
+from rbpf.motion.stereo_reprojection import (
+    Points,
+    innovation,
+    linearised,
+    residuals,
+    squared_distances,
+    white_rows,
+)
 
 ROUNDS = 5
 """Of optimising and choosing anew which matches agree; it ends when they stay the same."""
@@ -180,7 +187,8 @@ def _covariance(matches: Matches, found: Minimum, config: VoConfig) -> Array:
         return found.cov
     if config.points == "propagated":
         return trimming(config.gate) * found.cov
-    adjusted = innovation(matches, found.x, "adjusted")
+    pixels = white_rows(matches, found.x, "adjusted").pixels
+    adjusted = linearised(matches, found.x, pixels, "adjusted")
     return trimming(config.gate) * honest_covariance(matches, adjusted, found.factor)
 
 

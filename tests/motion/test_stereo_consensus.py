@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from rbpf.lie import SE3
-from rbpf.motion.stereo_consensus import Draws, align, consensus, triples
+from rbpf.motion.stereo_consensus import Draws, _Search, align, consensus, triples
 from rbpf.motion.stereo_geometry import see
-from tests.motion.stereo_pairs import LEAP, ROAD, ROOM, World, mistaken, simulate
+from tests.motion.stereo_pairs import LEAP, ROAD, ROOM, World, correlated, mistaken, simulate
 
 GATE = 11.345
 
@@ -86,3 +86,17 @@ def test_how_many_triples_it_takes(share, needed):
     assert Draws().needed(share) == pytest.approx(needed, rel=1e-3)
     assert Draws().needed(1.0) <= 1.0
     assert Draws().needed(0.0) == np.inf
+
+
+def test_compiled_scores():
+    """Beside the distances of each match by NumPy, also where some are behind the camera."""
+    rng = np.random.default_rng(10)
+    matches = correlated(LEAP, 50, rng).matches
+    search = _Search(matches, SE3.identity())
+    motions = SE3.exp(rng.normal(scale=[0.1] * 3 + [0.5, 0.5, 2.0], size=(20, 6)))
+    motions[0] = SE3.exp(np.array(LEAP.xi))
+    squared = search.squared(motions, np.arange(50))
+    score, share = search.scores(motions, GATE)
+    assert np.isinf(squared).any() and (squared <= GATE).any()
+    np.testing.assert_allclose(score, np.minimum(squared, GATE).sum(axis=1), rtol=1e-9)
+    np.testing.assert_array_equal(share, (squared <= GATE).mean(axis=1))

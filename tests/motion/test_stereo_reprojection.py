@@ -18,8 +18,9 @@ every_kind = pytest.mark.parametrize("points", ["adjusted", "propagated", "exact
 @pytest.mark.parametrize("world", [ROAD, LEAP, FAR_ROAD], ids=["road", "leap", "far"])
 def test_the_compiled_twin(world, points):
     matches, delta = correlated(world, 40, np.random.default_rng(0))
-    rows, front = white_rows(matches, delta, points)
+    rows, front, pixels = white_rows(matches, delta, points)
     found = innovation(matches, delta, points)
+    np.testing.assert_allclose(pixels, found.pixels, atol=1e-4)
     assert front.all() and found.seen.front.all()
     # The twins end their sweeps for each match, and for all.
     np.testing.assert_allclose(rows, found.white_rows(), rtol=1e-6, atol=1e-6)
@@ -31,7 +32,7 @@ def test_points_behind_the_camera(points):
     matches, _ = correlated(LEAP, 30, np.random.default_rng(1))
     past = SE3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 3.0]))
     behind = LEAP.camera.locate(matches.z_prev)[:, 2] < 2.9
-    rows, front = white_rows(matches, past, points)
+    rows, front, _ = white_rows(matches, past, points)
     distances = squared_distances(matches, past, points)
     assert behind.any() and not front[behind].any()
     np.testing.assert_array_equal(rows[~front], 0.0)
