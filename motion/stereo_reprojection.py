@@ -20,10 +20,10 @@ from rbpf.motion.stereo_geometry import Matches, Seen, homography, see
 Points = Literal["adjusted", "propagated", "exact"]
 """What the earlier frame's points are taken for.
 
-adjusted: unknown as well: m̂ minimises ‖z⁻ − m‖² + ‖z − g(T, m)‖², each under its covariance. The minimum over T then is
-    that of the bundle adjustment of both frames, and JᵀS⁻¹J the Schur complement of its information.
-propagated: where they were measured, m̂ = z⁻, with their covariance in S.
-exact: where they were measured, without error: S = R, the paper's.
+- adjusted: unknown as well, m̂ minimises ‖z⁻ − m‖² + ‖z − g(T, m)‖², each under its covariance. The minimum over T then
+  is that of the bundle adjustment of both frames, and JᵀS⁻¹J the Schur complement of its information.
+- propagated: where they were measured, m̂ = z⁻, with their covariance in S.
+- exact: where they were measured, without error, S = R: the paper's.
 """
 
 SWEEPS, SWEPT_PX = 10, 1e-4
