@@ -28,6 +28,7 @@ NAMES = (
     "mono_map_size",
     "patch_search",
     "key_search",
+    "motion_estimate",
     "bootstrap_peers",
     "mrpt_peer",
 )

@@ -17,4 +17,5 @@ for name in (
     "view_kernels",
 ):
     import_module(f"rbpf.sensors.{name}")
+import_module("rbpf.motion.stereo_kernels")
 import_module("rbpf.validation.simulation.raster_kernel")
