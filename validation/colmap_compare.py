@@ -1,0 +1,160 @@
+"""How far a path and a map are from COLMAP's reconstruction: camera centres, and distances between the clouds.
+
+COLMAP's world and scale are its own: its cameras are brought onto the reference's by the best similarity, or by the best
+rigid motion where a stereo pair gave the scale. Then one metre is the reference's.
+"""
+
+from dataclasses import dataclass
+from typing import Any, final
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from rbpf.errors import InputError
+from rbpf.lie import SE3, Array
+from rbpf.sensors.features import CameraTruth
+from rbpf.validation.accuracy import AbsoluteError, ate
+from rbpf.validation.alignment import Similarity
+from rbpf.validation.colmap_reconstruct import LEAST_FRAMES, Reconstruction
+from rbpf.validation.scores import poses_at
+from rbpf.validation.trajectory import Trajectory, associate
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class CloudDistance:
+    """Distances from landmarks to the nearest point of a cloud.
+
+    Attributes:
+        distances_m: (M,) of each landmark.
+        sigmas: (M,) each divided by the landmark's standard deviation in that direction; NaN without covariances.
+        spacing_m: median distance from those nearest points to their own nearest neighbour: what no distance can be
+            much below.
+    """
+
+    distances_m: Array
+    sigmas: Array
+    spacing_m: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """Figures for JSON: quantiles, which single wrong points do not move."""
+        median, p75, p90 = np.quantile(self.distances_m, [0.5, 0.75, 0.9]).tolist()
+        figures = {
+            "landmarks": len(self.distances_m),
+            "nearest_median_m": median,
+            "nearest_p75_m": p75,
+            "nearest_p90_m": p90,
+            "cloud_spacing_median_m": self.spacing_m,
+        }
+        known = self.sigmas[np.isfinite(self.sigmas)]
+        if known.size:
+            figures["nearest_median_sigmas"] = float(np.median(known))
+            figures["share_within_3_sigmas"] = float((known < 3.0).mean())
+        return figures
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class ColmapComparison:
+    """COLMAP beside a reference: the filter, or the truth.
+
+    Attributes:
+        reconstruction: what COLMAP found.
+        path: distances of the camera centres.
+        cloud: distances of the reference's landmarks; None without.
+        extent_m: diagonal of the box that holds the reference's camera centres.
+    """
+
+    reconstruction: Reconstruction
+    path: AbsoluteError
+    cloud: CloudDistance | None
+    extent_m: float
+
+    @property
+    def reference_from_colmap(self) -> Similarity:
+        """What was applied to COLMAP's world."""
+        return self.path.alignment
+
+    def as_dict(self) -> dict[str, Any]:
+        """Figures for JSON."""
+        return {
+            **self.reconstruction.as_dict(),
+            "alignment": "rigid" if self.reconstruction.metric else "similarity",
+            "scale": self.path.alignment.scale,
+            "compared_frames": len(self.path.keys),
+            "ate_rmse_m": self.path.rmse,
+            "ate_median_m": self.path.median,
+            "ate_max_m": self.path.max,
+            "extent_m": self.extent_m,
+            **({} if self.cloud is None else self.cloud.as_dict()),
+        }
+
+
+def compare_with_path(
+    found: Reconstruction,
+    reference: Trajectory,
+    landmarks: Array | None = None,
+    cov_landmarks: Array | None = None,
+) -> ColmapComparison:
+    """COLMAP beside a filter's path and, if given, its map.
+
+    Args:
+        found: the reconstruction.
+        reference: poses of the camera; those at the key frames' times are compared.
+        landmarks: (M, 3) in the reference's world.
+        cov_landmarks: (M, 3, 3) of them.
+
+    Raises:
+        InputError: the two share too few instants.
+    """
+    ours, theirs = associate(found.path, reference)
+    if len(ours) < LEAST_FRAMES:
+        raise InputError(
+            f"COLMAP's key frames of {found.name} and the path share {len(ours)} instants, expected {LEAST_FRAMES} or more "
+            "for an alignment."
+        )
+    errors = ate(ours, theirs, "rigid" if found.metric else "similarity")
+    cloud = None
+    if landmarks is not None and len(landmarks):
+        cloud = cloud_distance(errors.alignment.transform(found.points), landmarks, cov_landmarks)
+    return ColmapComparison(found, errors, cloud, float(np.linalg.norm(np.ptp(theirs.positions, axis=0))))
+
+
+def compare_with_truth(found: Reconstruction, truth: CameraTruth | None) -> ColmapComparison:
+    """COLMAP beside the truth, interpolated at the key frames.
+
+    Raises:
+        InputError: there is no truth, or too little of it.
+    """
+    if truth is None:
+        raise InputError(f"{found.name} has no ground truth to compare with; compare with a run's path instead.")
+    rows, poses = poses_at(SE3, truth.stamps_ns, truth.world_from_camera, found.stamps_ns)
+    if len(rows) < LEAST_FRAMES:
+        raise InputError(
+            f"The ground truth of {found.name} covers {len(rows)} of {len(found.frames)} key frames, expected "
+            f"{LEAST_FRAMES} or more; its stamps must be those of the images' clock."
+        )
+    return compare_with_path(found, Trajectory(found.stamps_ns[rows], poses))
+
+
+def cloud_distance(cloud: Array, landmarks: Array, cov_landmarks: Array | None = None) -> CloudDistance:
+    """Distance of each landmark to the nearest point of a cloud in the same world.
+
+    Args:
+        cloud: (P, 3), P >= 2.
+        landmarks: (M, 3), M >= 1.
+        cov_landmarks: (M, 3, 3).
+
+    Raises:
+        InputError: the cloud or the map is too small.
+    """
+    if len(cloud) < 2 or not len(landmarks):
+        raise InputError(f"Expected two or more points and a landmark, found {len(cloud)} and {len(landmarks)}.")
+    tree = cKDTree(cloud)
+    distances, nearest = tree.query(landmarks)
+    spacing = tree.query(cloud[nearest], k=2)[0][:, 1]
+    sigmas = np.full(len(landmarks), np.nan)
+    if cov_landmarks is not None:
+        away = (cloud[nearest] - landmarks) / np.maximum(distances, np.finfo(float).tiny)[:, None]
+        sigmas = distances / np.sqrt(np.einsum("ki,kij,kj->k", away, cov_landmarks, away))
+    return CloudDistance(distances, sigmas, float(np.median(spacing)))

@@ -1,0 +1,283 @@
+"""A reconstruction by COLMAP from key frames of a sequence: its own features, no knowledge of the filter.
+
+SIFT, sequential matching, incremental mapping; the calibration is held fixed. What it finds shares the images and the
+calibration with the filter and nothing else. Of a stereo sequence both images take part as if two cameras had been
+there, and the known baseline gives the scale.
+J. L. Schönberger and J.-M. Frahm, "Structure-from-motion revisited" (2016).
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rbpf.errors import InputError
+from rbpf.lie import Array
+from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.readers.images.sequence import ImageSequence
+from rbpf.validation.colmap_frames import camera_model, from_colmap_pose
+from rbpf.validation.trajectory import Trajectory
+
+LEAST_FRAMES = 3
+"""Key frames; two have no third view that tells a wrong match."""
+
+
+@final
+@dataclass(frozen=True)
+class ReconstructionOptions:
+    """How images are reconstructed.
+
+    Attributes:
+        every: every so many frames is a key frame, from the first on.
+        features: most of them per image.
+        overlap: each key frame is matched with so many that follow, and with those 2^i further on.
+        stereo: of a stereo sequence take both images, and the scale from the baseline.
+        least_angle_deg: between the rays of the two images that it begins with.
+        threads: of extraction and matching; mapping takes one, so that the same seed gives the same model.
+        seed: of RANSAC.
+    """
+
+    every: int = 5
+    features: int = 4096
+    overlap: int = 10
+    stereo: bool = True
+    least_angle_deg: float = 16.0
+    threads: int = 1
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Checks that the numbers make sense."""
+        for name in ("every", "features", "overlap", "threads"):
+            if getattr(self, name) < 1:
+                raise InputError(f"Expected {name} to be at least 1, found {getattr(self, name)}.")
+        if self.seed < 0:
+            raise InputError(f"Expected a seed of at least 0, found {self.seed}.")
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Reconstruction:
+    """What COLMAP found, in a world of its own; in metres if a baseline told the scale.
+
+    Attributes:
+        name: of the sequence.
+        camera: of the images.
+        chosen: (C,) frames that were handed to it.
+        frames: (R,) those of which it found the pose, ascending.
+        stamps_ns: (R,) their times.
+        world_from_camera: (R, 7).
+        points: (M, 3).
+        errors_px: (M,) mean reprojection error of each.
+        track_lengths: (M,) images that show it.
+        metric: whether the scale is that of a stereo pair's baseline; otherwise it is arbitrary.
+        model: the `pycolmap.Reconstruction`, in the same scale.
+    """
+
+    name: str
+    camera: Pinhole
+    chosen: NDArray[np.int64]
+    frames: NDArray[np.int64]
+    stamps_ns: NDArray[np.int64]
+    world_from_camera: Array
+    points: Array
+    errors_px: Array
+    track_lengths: NDArray[np.int64]
+    metric: bool
+    model: Any
+
+    @property
+    def share(self) -> float:
+        """Share of the key frames whose pose was found."""
+        return len(self.frames) / len(self.chosen)
+
+    @property
+    def path(self) -> Trajectory:
+        """The poses with their times."""
+        return Trajectory(self.stamps_ns, self.world_from_camera)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Figures for JSON."""
+        return {
+            "sequence": self.name,
+            "key_frames": len(self.chosen),
+            "registered": len(self.frames),
+            "share_registered": self.share,
+            "points": len(self.points),
+            "reprojection_error_mean_px": float(self.errors_px.mean()),
+            "track_length_mean": float(self.track_lengths.mean()),
+        }
+
+
+def reconstruct(
+    sequence: ImageSequence,
+    options: ReconstructionOptions | None = None,
+    folder: Path | None = None,
+) -> Reconstruction:
+    """Reconstructs a sequence of images from scratch.
+
+    Args:
+        sequence: of any reader.
+        options: how.
+        folder: for images, features and model, which stay there; by default a temporary one.
+
+    Raises:
+        InputError: too few key frames can be read, or COLMAP finds no model.
+    """
+    options = options or ReconstructionOptions()
+    if folder is not None:
+        return _reconstruct(sequence, options, folder)
+    with TemporaryDirectory(prefix="colmap-") as temporary:
+        return _reconstruct(sequence, options, Path(temporary))
+
+
+def _reconstruct(sequence: ImageSequence, options: ReconstructionOptions, folder: Path) -> Reconstruction:
+    images, database = folder / "images", folder / "database.db"
+    images.mkdir(parents=True, exist_ok=True)
+    database.unlink(missing_ok=True)
+    chosen = _write_key_frames(sequence, options, images)
+    with _quiet():
+        _extract_and_match(sequence.camera, options, images, database, 1 + _is_stereo(sequence, options))
+        model = _largest(_map(options, images, database, folder))
+    if model is None:
+        raise InputError(
+            f"COLMAP found no reconstruction of {sequence.name} from {len(chosen)} key frames: the images share too few "
+            "features or the camera hardly moves between them; choose key frames closer together or farther apart."
+        )
+    return _result(sequence, chosen, model)
+
+
+def _write_key_frames(
+    sequence: ImageSequence, options: ReconstructionOptions, images: Path
+) -> NDArray[np.int64]:
+    import pycolmap
+
+    chosen = []
+    for number, frame in enumerate(sequence.frames()):
+        if number % options.every or frame.image is None:
+            continue
+        sides = [frame.image]
+        if _is_stereo(sequence, options) and frame.right is not None:
+            sides.append(frame.right)
+        for side, image in enumerate(sides):
+            pycolmap.Bitmap.from_array(image).write(images / f"{number:06d}_{side}.png")
+        chosen.append(number)
+    if len(chosen) < LEAST_FRAMES:
+        raise InputError(
+            f"{sequence.name} has {len(chosen)} readable key frames of {len(sequence)} images, expected {LEAST_FRAMES} or "
+            f"more; choose a smaller step than every {options.every}."
+        )
+    return np.array(chosen, dtype=np.int64)
+
+
+def _is_stereo(sequence: ImageSequence, options: ReconstructionOptions) -> bool:
+    return options.stereo and sequence.baseline_m is not None
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keeps COLMAP's progress off the terminal."""
+    import pycolmap
+
+    before = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = before
+
+
+def _extract_and_match(
+    camera: Pinhole, options: ReconstructionOptions, images: Path, database: Path, images_per_frame: int
+) -> None:
+    import pycolmap
+
+    name, params = camera_model(camera)
+    reading = pycolmap.ImageReaderOptions()
+    reading.camera_model, reading.camera_params = name, ",".join(map(repr, params))
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.sift.max_num_features, extraction.num_threads = options.features, options.threads
+    pycolmap.extract_features(
+        database,
+        images,
+        camera_mode=pycolmap.CameraMode.SINGLE,
+        reader_options=reading,
+        extraction_options=extraction,
+        device=pycolmap.Device.cpu,
+    )
+    matching, pairing = pycolmap.FeatureMatchingOptions(), pycolmap.SequentialPairingOptions()
+    matching.num_threads = pairing.num_threads = options.threads
+    pairing.overlap = options.overlap * images_per_frame
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = options.seed
+    pycolmap.match_sequential(
+        database,
+        matching_options=matching,
+        pairing_options=pairing,
+        verification_options=verification,
+        device=pycolmap.Device.cpu,
+    )
+
+
+def _map(options: ReconstructionOptions, images: Path, database: Path, folder: Path) -> dict[int, Any]:
+    import pycolmap
+
+    pycolmap.set_random_seed(options.seed)
+    how = pycolmap.IncrementalPipelineOptions()
+    how.num_threads, how.random_seed = 1, options.seed
+    how.ba_refine_focal_length = how.ba_refine_principal_point = how.ba_refine_extra_params = False
+    how.mapper.abs_pose_refine_focal_length = how.mapper.abs_pose_refine_extra_params = False
+    how.mapper.init_min_tri_angle = options.least_angle_deg
+    how.min_model_size, how.extract_colors = LEAST_FRAMES, False
+    models = folder / "models"
+    models.mkdir(exist_ok=True)
+    return dict(pycolmap.incremental_mapping(database, images, models, how))
+
+
+def _largest(models: dict[int, Any]) -> Any:
+    fitting = [model for model in models.values() if len(_side(model, 0)) >= LEAST_FRAMES]
+    return max(fitting, key=lambda model: (len(_side(model, 0)), model.num_points3D()), default=None)
+
+
+def _side(model: Any, side: int) -> dict[int, Array]:
+    """Poses (7,) by frame, of the left (0) or right (1) images."""
+    found = [image for image in model.images.values() if image.has_pose and image.name.endswith(f"_{side}.png")]
+    return {int(image.name.split("_")[0]): from_colmap_pose(image.cam_from_world()) for image in found}
+
+
+def _scale_by_baseline(sequence: ImageSequence, model: Any) -> bool:
+    """Brings the model to metres; False where no pair was found."""
+    import pycolmap
+
+    left, right = _side(model, 0), _side(model, 1)
+    both = sorted(left.keys() & right.keys())
+    if sequence.baseline_m is None or not both:
+        return False
+    lengths = [np.linalg.norm(right[frame][4:] - left[frame][4:]) for frame in both]
+    scale = sequence.baseline_m / float(np.median(lengths))
+    model.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(), np.zeros(3)))
+    return True
+
+
+def _result(sequence: ImageSequence, chosen: NDArray[np.int64], model: Any) -> Reconstruction:
+    metric = _scale_by_baseline(sequence, model)
+    found, by_id = _side(model, 0), dict(model.points3D)
+    frames = np.array(sorted(found), dtype=np.int64)
+    points = [by_id[index] for index in sorted(by_id)]
+    return Reconstruction(
+        name=sequence.name,
+        camera=sequence.camera,
+        chosen=chosen,
+        frames=frames,
+        stamps_ns=np.asarray(sequence.stamps_ns, dtype=np.int64)[frames],
+        world_from_camera=np.array([found[frame] for frame in frames.tolist()]),
+        points=np.array([point.xyz for point in points]).reshape(-1, 3),
+        errors_px=np.array([point.error for point in points]),
+        track_lengths=np.array([point.track.length() for point in points], dtype=np.int64),
+        metric=metric,
+        model=model,
+    )
