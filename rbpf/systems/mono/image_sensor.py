@@ -74,6 +74,8 @@ class ImageSensor(Sensor):
         self._in_view = np.zeros((0, 2))
         self.seconds = 0.0
         """Time of the last search."""
+        self.seconds_births = 0.0
+        """Time of the last `births`."""
 
     @property
     def lost(self) -> bool:
@@ -117,6 +119,7 @@ class ImageSensor(Sensor):
 
     def births(self, frame: ImageFrame, belief: Belief, observed: Sequence[Observations]) -> Sequence[Births]:
         """Notes what was found, drops what fails, and starts features at corners where there is room."""
+        started = time.perf_counter()
         failing = self._judge()
         self._place(belief, self.measured.landmarks)
         sightings = self.measured
@@ -125,6 +128,7 @@ class ImageSensor(Sensor):
         births = self.features.births(sightings, belief, observed)
         self._place_rays(belief, births)
         self.features.forget(belief, failing)
+        self.seconds_births = time.perf_counter() - started
         return births
 
     def arrays(self) -> dict[str, np.ndarray]:

@@ -44,6 +44,7 @@ class VideoRun:
         resampled: (T,) whether the particles were resampled.
         nis: (T,) normalised innovation squared;  nis_dof: (T,) its degrees of freedom.
         seconds: (T,) time of the whole frame without decoding;  seconds_search: (T,) of the search in the image.
+        seconds_births: (T,) of what follows the filter's update: judging features, starting new ones.
         seconds_waiting: (T,) until the decoded image was there.
         sightings: what was looked for, frame by frame.
         problems: what was wrong with single frames, in words.
@@ -70,6 +71,7 @@ class VideoRun:
     nis_dof: np.ndarray
     seconds: np.ndarray
     seconds_search: np.ndarray
+    seconds_births: np.ndarray
     seconds_waiting: np.ndarray
     sightings: Sightings = field(default_factory=Sightings)
     problems: list[str] = field(default_factory=list)
@@ -129,6 +131,8 @@ def run_images(
             on_frame(t, frame, run)
         waited = time.perf_counter()
     cut(run)
+    if checkpoint is not None and run.failure is None:
+        save(run, checkpoint)
     return run
 
 
@@ -153,7 +157,7 @@ def _begin(
     if known is not None:
         sensor.begin(image, known.px, config.known == "frame")
     total = len(sequence)
-    numbers = np.zeros((11, total))
+    numbers = np.zeros((12, total))
     poses, covs = np.zeros((total, 7)), np.zeros((total, 6, 6))
     filter_ = assemble(config, features, start, sensor)
     stamps = np.asarray(sequence.stamps_ns, dtype=np.int64)
@@ -175,7 +179,7 @@ def _frame(run: VideoRun, t: int, frame: ImageFrame, law: PoseLaw | None) -> Non
     run.lost[t] = run.sensor.lost
     run.ess[t], run.log_evidence[t] = report.ess, report.log_evidence
     run.resampled[t], run.nis[t], run.nis_dof[t] = report.resampled, report.nis, report.rows
-    run.seconds_search[t] = run.sensor.seconds
+    run.seconds_search[t], run.seconds_births[t] = run.sensor.seconds, run.sensor.seconds_births
     run.sightings.record(run.sensor, run.filter)
     if frame.problem is not None:
         run.problems.append(f"frame {t}: {frame.problem}")
