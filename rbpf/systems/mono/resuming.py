@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 _PER_FRAME = (
     "world_from_camera", "cov", "searched", "found", "lost", "ess", "log_evidence", "resampled", "nis", "nis_dof",
-    "seconds", "seconds_search", "seconds_waiting",
+    "seconds", "seconds_search", "seconds_births", "seconds_waiting",
 )  # fmt: skip
 
 

@@ -44,6 +44,7 @@ class VideoRun:
         resampled: (T,) whether the particles were resampled.
         nis: (T,) normalised innovation squared;  nis_dof: (T,) its degrees of freedom.
         seconds: (T,) time of the whole frame without decoding;  seconds_search: (T,) of the search in the image.
+        seconds_births: (T,) of what follows the filter's update: judging features, starting new ones.
         seconds_waiting: (T,) until the decoded image was there.
         sightings: what was looked for, frame by frame.
         problems: what was wrong with single frames, in words.
@@ -70,6 +71,7 @@ class VideoRun:
     nis_dof: np.ndarray
     seconds: np.ndarray
     seconds_search: np.ndarray
+    seconds_births: np.ndarray
     seconds_waiting: np.ndarray
     sightings: Sightings = field(default_factory=Sightings)
     problems: list[str] = field(default_factory=list)
@@ -110,14 +112,14 @@ def run_images(
     if first is None or first.image is None:
         reason = "it has no image" if first is None else first.problem
         raise InputError(f"{sequence.name}: the first image is needed to start: {reason}")
-    run = _begin(sequence, config, known, first.image)
+    run, law = _begin(sequence, config, known, first.image)
     if resume and checkpoint is not None and checkpoint.exists():
         restore(run, checkpoint)
     waited = time.perf_counter()
     for t, frame in enumerate(_frames_from(sequence, run.filter.steps), run.filter.steps):
         run.seconds_waiting[t] = time.perf_counter() - waited
         try:
-            _frame(run, t, frame, _law(sequence, config, known) if t == 0 else None)
+            _frame(run, t, frame, law if t == 0 else None)
         except InputError as error:
             if t == 0:
                 raise
@@ -129,6 +131,8 @@ def run_images(
             on_frame(t, frame, run)
         waited = time.perf_counter()
     cut(run)
+    if checkpoint is not None and run.failure is None:
+        save(run, checkpoint)
     return run
 
 
@@ -136,32 +140,29 @@ def _frames_from(sequence: ImageSequence, start: int) -> Iterator[ImageFrame]:
     return sequence.frames(start) if start < len(sequence) else iter(())
 
 
-def _law(sequence: ImageSequence, config: MonoConfig, known: KnownPixels | None) -> PoseLaw:
-    """Where the camera is at first: at the origin, unless the known points are landmarks of their own."""
-    if known is not None and config.known == "points":
-        return PoseLaw(resect_known(sequence.camera, known, config.search.noise_px), start_cov(config))
-    return PoseLaw(SE3.identity(), np.zeros((6, 6)))
-
-
 def _begin(
     sequence: ImageSequence, config: MonoConfig, known: KnownPixels | None, image: np.ndarray
-) -> VideoRun:
-    start = None
+) -> tuple[VideoRun, PoseLaw]:
+    """A run before its first frame, and where the camera is in it: at the origin, unless the known points tell."""
+    start, law = None, PoseLaw(SE3.identity(), np.zeros((6, 6)))
     if known is not None:
         count = known.names.size
         cov = known.std_m[:, None, None] ** 2 * np.eye(3)
         points = KnownPoints(np.arange(count), known.positions, cov)
         start = KnownStart(points, resect_known(sequence.camera, known, config.search.noise_px))
+        if config.known == "points":
+            law = PoseLaw(start.world_from_camera, start_cov(config))
     features = build_features(sequence.camera, config, None if start is None else start.points)
     sensor = ImageSensor(features, config.search)
     if known is not None:
         sensor.begin(image, known.px, config.known == "frame")
     total = len(sequence)
-    numbers = np.zeros((11, total))
+    numbers = np.zeros((12, total))
     poses, covs = np.zeros((total, 7)), np.zeros((total, 6, 6))
     filter_ = assemble(config, features, start, sensor)
     stamps = np.asarray(sequence.stamps_ns, dtype=np.int64)
-    return VideoRun(sequence, config, known, filter_, sensor, stamps, poses, covs, *numbers)
+    run = VideoRun(sequence, config, known, filter_, sensor, stamps, poses, covs, *numbers)
+    return run, law
 
 
 def _frame(run: VideoRun, t: int, frame: ImageFrame, law: PoseLaw | None) -> None:
@@ -178,7 +179,7 @@ def _frame(run: VideoRun, t: int, frame: ImageFrame, law: PoseLaw | None) -> Non
     run.lost[t] = run.sensor.lost
     run.ess[t], run.log_evidence[t] = report.ess, report.log_evidence
     run.resampled[t], run.nis[t], run.nis_dof[t] = report.resampled, report.nis, report.rows
-    run.seconds_search[t] = run.sensor.seconds
+    run.seconds_search[t], run.seconds_births[t] = run.sensor.seconds, run.sensor.seconds_births
     run.sightings.record(run.sensor, run.filter)
     if frame.problem is not None:
         run.problems.append(f"frame {t}: {frame.problem}")
