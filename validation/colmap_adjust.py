@@ -85,7 +85,9 @@ def adjust_by_colmap(log: FeatureLog, initial: CameraEstimate) -> ColmapAdjustme
     fixed = np.isin(table.names, list(held))
     adjuster = _adjuster(model, np.flatnonzero(fixed) + 1)
     _solve(adjuster, log.name)
-    path = np.array([from_colmap_pose(model.image(image_id(t)).cam_from_world()) for t in range(len(log.frames))])
+    path = np.array(
+        [from_colmap_pose(model.image(image_id(t)).cam_from_world()) for t in range(len(log.frames))]
+    )
     found = np.array([model.point3D(index + 1).xyz for index in range(len(points))])
     cov_poses, cov_points = _covariances(model, adjuster, table, path, found, fixed, std)
     residuals = evaluate_sightings(table, path, found)[0] / std
@@ -114,7 +116,9 @@ def _checked(log: FeatureLog, initial: CameraEstimate) -> tuple[Sightings, float
     table = full.rows(np.isin(full.names, [*initial.landmarks, *known])[full.index])
     std = float(np.sqrt(table.cov_z[0, 0, 0]))
     if np.abs(table.cov_z - std**2 * np.eye(2)).max() > _SAME * std**2:
-        raise InputError(f"{log.name}: COLMAP takes all pixels as equally certain, found different covariances.")
+        raise InputError(
+            f"{log.name}: COLMAP takes all pixels as equally certain, found different covariances."
+        )
     return table, std
 
 
@@ -142,7 +146,9 @@ def _solve(adjuster: Any, name: str) -> None:
 
     summary = adjuster.solve()
     if summary.termination_type != pycolmap.BundleAdjustmentTerminationType.CONVERGENCE:
-        raise InputError(f"COLMAP's bundle adjustment of {name} did not converge; start it from a better estimate.")
+        raise InputError(
+            f"COLMAP's bundle adjustment of {name} did not converge; start it from a better estimate."
+        )
 
 
 def _covariances(
@@ -188,9 +194,7 @@ def _in_our_chart(joint: Array, path: Array) -> Array:
     return slope[:, None] @ joint @ np.swapaxes(slope, -1, -2)[None]
 
 
-def _marginal(
-    table: Sightings, path: Array, points: Array, within: Array, joint: Array, std: float
-) -> Array:
+def _marginal(table: Sightings, path: Array, points: Array, within: Array, joint: Array, std: float) -> Array:
     """P + Σ_ij G_i Σ_ij G_jᵀ of each point, where G_i = −P H_li says how it follows pose i."""
     by_pose, by_point = evaluate_sightings(table, path, points)[1]
     out = np.empty_like(within)

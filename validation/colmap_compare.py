@@ -127,7 +127,9 @@ def compare_with_truth(found: Reconstruction, truth: CameraTruth | None) -> Colm
         InputError: there is no truth, or too little of it.
     """
     if truth is None:
-        raise InputError(f"{found.name} has no ground truth to compare with; compare with a run's path instead.")
+        raise InputError(
+            f"{found.name} has no ground truth to compare with; compare with a run's path instead."
+        )
     rows, poses = poses_at(SE3, truth.stamps_ns, truth.world_from_camera, found.stamps_ns)
     if len(rows) < LEAST_FRAMES:
         raise InputError(
@@ -149,7 +151,9 @@ def cloud_distance(cloud: Array, landmarks: Array, cov_landmarks: Array | None =
         InputError: the cloud or the map is too small.
     """
     if len(cloud) < 2 or not len(landmarks):
-        raise InputError(f"Expected two or more points and a landmark, found {len(cloud)} and {len(landmarks)}.")
+        raise InputError(
+            f"Expected two or more points and a landmark, found {len(cloud)} and {len(landmarks)}."
+        )
     tree = cKDTree(cloud)
     distances, nearest = tree.query(landmarks)
     spacing = tree.query(cloud[nearest], k=2)[0][:, 1]

@@ -130,5 +130,3 @@ def _sensor(camera_id: int) -> Any:
     import pycolmap
 
     return pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera_id)
-
-
