@@ -128,26 +128,25 @@ def first_steps(problem: Problem, count: int) -> Problem:
     )
 
 
-def solve_problem(problem: Problem, start: Array, robust: float | None = None) -> Optimum:
-    """GTSAM's optimum with marginal covariances.
+def solve_problem(
+    problem: Problem, start: Array, robust: float | None = None, marginals: bool = True
+) -> Optimum:
+    """GTSAM's optimum.
 
     Args:
         problem: T steps.
         start: (T, E) poses of the filter, where a camera's adjustment begins; a robot's begins with its odometry.
         robust: Huber's threshold in standard deviations; None takes all as Gaussian, as the filter does.
+        marginals: compute covariances; without them the optimum has no poses' and NaN as landmarks'.
 
     Raises:
         InputError: the measurements do not determine everything, or the optimiser does not converge.
     """
     if isinstance(problem, FeatureLog):
-        return _solve_camera(problem, start, robust)
-    found = gtsam_ba.solve(problem, robust, incremental=len(problem.stamps_ns) > AFAR)
-    names = np.array(list(found.landmarks), dtype=np.int64)
-    size = problem.z.shape[1]
-    means = np.array(list(found.landmarks.values())).reshape(-1, size)
-    covs = np.array([found.cov_landmarks[name] for name in names.tolist()]).reshape(-1, size, size)
-    summary = MapSummary(names, means, covs)
-    estimate = PathAndMap(problem.stamps_ns, found.world_from_robot, found.cov_poses, summary)
+        return _solve_camera(problem, start, robust, marginals)
+    found = gtsam_ba.solve(problem, robust, marginals, incremental=len(problem.stamps_ns) > AFAR)
+    points = _summary(list(found.landmarks), found.landmarks, found.cov_landmarks, problem.z.shape[1])
+    estimate = PathAndMap(problem.stamps_ns, found.world_from_robot, found.cov_poses, points)
     return Optimum(problem, estimate, np.arange(len(problem.stamps_ns)), found.error)
 
 
@@ -177,16 +176,23 @@ def fit_of(problem: Problem, estimate: PathAndMap, names: NDArray[np.int64]) -> 
     return Fit(float(-0.5 * (square + log_norm).sum()), rms, len(residuals))
 
 
-def _solve_camera(log: FeatureLog, start: Array, robust: float | None) -> Optimum:
+def _solve_camera(log: FeatureLog, start: Array, robust: float | None, marginals: bool) -> Optimum:
     steps = connected_frames(log)
     if len(steps) < 2:
         raise InputError(f"{log.name}: no two frames share enough landmarks for a batch adjustment.")
     part = replace(log, frames=[log.frames[step] for step in steps.tolist()])
-    found = gtsam_ba_camera.solve_features(part, CameraEstimate(start[steps], {}), robust=robust)
-    names = np.array(sorted(found.landmarks.keys() - set(found.undetermined)), dtype=np.int64)
-    means = np.array([found.landmarks[name] for name in names.tolist()]).reshape(-1, 3)
-    covs = np.array([found.cov_landmarks[name] for name in names.tolist()]).reshape(-1, 3, 3)
-    estimate = PathAndMap(
-        stamps_of(part), found.world_from_camera, found.cov_poses, MapSummary(names, means, covs)
-    )
+    begin = CameraEstimate(start[steps], {})
+    found = gtsam_ba_camera.solve_features(part, begin, robust=robust, marginals=marginals)
+    names = sorted(found.landmarks.keys() - set(found.undetermined))
+    points = _summary(names, found.landmarks, found.cov_landmarks, 3)
+    estimate = PathAndMap(stamps_of(part), found.world_from_camera, found.cov_poses, points)
     return Optimum(part, estimate, steps, found.error)
+
+
+def _summary(names: list[int], means: dict[int, Array], covs: dict[int, Array], dim: int) -> MapSummary:
+    unknown = np.full((dim, dim), np.nan)
+    return MapSummary(
+        np.array(names, dtype=np.int64),
+        np.array([means[name] for name in names]).reshape(-1, dim),
+        np.array([covs.get(name, unknown) for name in names]).reshape(-1, dim, dim),
+    )
