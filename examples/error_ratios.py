@@ -1,4 +1,4 @@
-"""How far is the filter from the best that its measurements allow? A table of filter error, batch error, and their ratio.
+"""How far is the filter from the best that its measurements allow? A table of filter and batch errors.
 
 Each recording is filtered with several seeds; GTSAM adjusts the very measurements that each run used. A ratio of 1 is
 perfect, up to 1.5 is the goal. Where recordings lie is told by the environment variable RBPF_DATA; those that are not
@@ -27,39 +27,38 @@ CAMERAS = "mono_redkitchen_a", "stereo_zed_room1"
 GOAL = 1.5
 
 
-def main(quick: bool = False, out: Path = Path("out")) -> dict[str, float]:
+def main(quick: bool = False, out: Path = Path("out"), seeds: int = 5) -> dict[str, float]:
     """Prints the table, and writes it and its picture to a folder; `quick` takes the simulated worlds, made small."""
     out.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory() as folder:
-        found = list(simulated(Path(folder), quick))
+        found = list(simulated(Path(folder), quick, 1 if quick else seeds))
     if not quick:
-        found += recorded(Path(os.environ.get("RBPF_DATA", "../shared/data")))
+        found += recorded(Path(os.environ.get("RBPF_DATA", "../shared/data")), seeds)
     write_table(out / "error_ratios.csv", HEADER, [ratio.row() for ratio in found])
     save_figures({"error_ratios.png": picture(found)}, out)
     return {ratio.recording: ratio.ratio for ratio in found}
 
 
-def simulated(folder: Path, quick: bool) -> Iterator[ErrorRatio]:
+def simulated(folder: Path, quick: bool, seeds: int) -> Iterator[ErrorRatio]:
     """A robot's log and a rendered desk, of which everything is known."""
-    seeds = range(1 if quick else 5)
     simulate_robot(RobotWorld(steps=60 if quick else 200, landmarks=25), folder / "simulated_robot", seed=0)
-    yield robot_ratio(folder / "simulated_robot", RangeBearingConfig(), seeds)
+    yield robot_ratio(folder / "simulated_robot", RangeBearingConfig(), range(seeds))
     width, frames = (320, 30) if quick else (640, 300)
     camera = Pinhole(width, 3 * width // 4, 0.8 * width, 0.8 * width, width / 2 - 0.5, 3 * width / 8 - 0.5)
     desk = folder / "rendered_desk"
     simulate_images(TexturedDesk(frames=frames), Imaging(known=6), camera, desk, seed=0)
-    yield camera_ratio(Recording(desk, desk / "known_points.csv"), MonoConfig(), seeds)
+    yield camera_ratio(Recording(desk, desk / "known_points.csv"), MonoConfig(), range(seeds))
 
 
-def recorded(data: Path) -> Iterator[ErrorRatio]:
+def recorded(data: Path, seeds: int) -> Iterator[ErrorRatio]:
     """The recordings that are there."""
     for name in ROBOTS:
         if (data / name).is_dir():
-            yield robot_ratio(data / name, RangeBearingConfig(), range(5))
+            yield robot_ratio(data / name, RangeBearingConfig(), range(seeds))
     for name in CAMERAS:
         if (data / name).is_dir():
             yield camera_ratio(
-                Recording(data / name, data / name / "known_points.csv"), MonoConfig(), range(5)
+                Recording(data / name, data / name / "known_points.csv"), MonoConfig(), range(seeds)
             )
 
 

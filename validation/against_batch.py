@@ -1,14 +1,14 @@
 """A run beside the batch optimum of the same measurements: path, map, covariances, likelihood.
 
-Frame and chart. Both are told in the run's own world. A pose's covariance is carried from the chart at the filter's pose
-to that at the optimum's: with δ = Log(T_b⁻¹ T_f), P ← J_r⁻¹(δ) P J_r⁻ᵀ(δ).
+Frame and chart. Both are told in the run's own world. A pose's covariance is carried from the chart at the filter's
+pose to that at the optimum's: with δ = Log(T_b⁻¹ T_f), P ← J_r⁻¹(δ) P J_r⁻ᵀ(δ).
 
-What is conditioned on what. The map, and the last pose, know the same measurements in filter and batch. An earlier
-online pose knows its past only, the optimum's also its future: poses are therefore compared, at a few instants, with the
+What is conditioned on what. The map and the last pose know the same measurements in filter and batch. An earlier online
+pose knows its past only, the optimum's also its future: poses are therefore compared, at a few instants, with the
 optimum of what had been measured until then.
 
-Gauge. One camera without known points does not measure the scale: the filter's comes from its prior, the batch holds a
-distance. Both begin at the same first pose; the filter is scaled about it, so that its path fits the optimum's best, and
+Gauge. One camera without known points does not measure the scale: the filter's is its prior's, the batch's is held.
+Both begin at the same first pose; the filter is scaled about it, so that its path fits the optimum's best, and
 densities are compared in the directions that a change of scale does not move: across the line from the first camera
 (two of a landmark's three, five of a pose's six).
 """

@@ -59,8 +59,8 @@ def with_held(log: FeatureLog, held: dict[int, Array]) -> FeatureLog:
     positions = np.array(list(held.values()), dtype=float).reshape(-1, 3)
     if len(positions) < LEAST_HELD or np.linalg.matrix_rank(positions[1:] - positions[0], tol=1e-6) < 2:
         raise InputError(
-            f"The gauge of {log.name} is not observable: expected {LEAST_HELD} or more held landmarks that are not on a "
-            f"line, found {len(positions)}; hold others."
+            f"The gauge of {log.name} is not observable: expected {LEAST_HELD} or more held landmarks that are not "
+            f"on a line, found {len(positions)}; hold others."
         )
     known = KnownPoints(np.array(list(held), dtype=np.int64), positions, np.zeros((len(held), 3, 3)))
     return FeatureLog(log.name, log.camera, log.frames, known, log.truth)
@@ -74,8 +74,8 @@ def adjust_by_colmap(log: FeatureLog, initial: CameraEstimate) -> ColmapAdjustme
         initial: where to start; landmarks that it lacks are left out.
 
     Raises:
-        InputError: the log is a stereo one (its shared row would count twice), its noise is of another form, the gauge is
-            not observable, or COLMAP does not converge.
+        InputError: the log is a stereo one (its shared row would count twice), its noise is of another form, the
+            gauge is not observable, or COLMAP does not converge.
     """
     table, std = _checked(log, initial)
     held = dict(zip(log.known.names.tolist(), log.known.positions, strict=True)) if log.known else {}

@@ -1,7 +1,7 @@
 """How far a path and a map are from COLMAP's reconstruction: camera centres, and distances between the clouds.
 
-COLMAP's world and scale are its own: its cameras are brought onto the reference's by the best similarity, or by the best
-rigid motion where a stereo pair gave the scale. Then one metre is the reference's.
+COLMAP's world and scale are its own: its cameras are brought onto the reference's by the best similarity, or by the
+best rigid motion where a stereo pair gave the scale. Then one metre is the reference's.
 """
 
 from dataclasses import dataclass
@@ -15,7 +15,8 @@ from rbpf.lie import SE3, Array
 from rbpf.sensors.features import CameraTruth
 from rbpf.validation.accuracy import AbsoluteError, ate
 from rbpf.validation.alignment import Similarity
-from rbpf.validation.colmap_reconstruct import LEAST_FRAMES, Reconstruction
+from rbpf.validation.colmap_pipeline import LEAST_FRAMES
+from rbpf.validation.colmap_reconstruct import Reconstruction
 from rbpf.validation.scores import poses_at
 from rbpf.validation.trajectory import Trajectory, associate
 
@@ -110,8 +111,8 @@ def compare_with_path(
     ours, theirs = associate(found.path, reference)
     if len(ours) < LEAST_FRAMES:
         raise InputError(
-            f"COLMAP's key frames of {found.name} and the path share {len(ours)} instants, expected {LEAST_FRAMES} or more "
-            "for an alignment."
+            f"COLMAP's key frames of {found.name} and the path share {len(ours)} instants, expected "
+            f"{LEAST_FRAMES} or more for an alignment."
         )
     errors = ate(ours, theirs, "rigid" if found.metric else "similarity")
     cloud = None

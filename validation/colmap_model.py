@@ -37,7 +37,7 @@ def build_model(
 
     model = pycolmap.Reconstruction()
     stereo = isinstance(table.camera, RectifiedStereo)
-    if stereo:
+    if isinstance(table.camera, RectifiedStereo):
         _add_rig(model, table.camera)
     else:
         model.add_camera_with_trivial_rig(to_colmap_camera(table.camera, LEFT))

@@ -6,8 +6,6 @@ there, and the known baseline gives the scale.
 J. L. Schönberger and J.-M. Frahm, "Structure-from-motion revisited" (2016).
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -20,43 +18,17 @@ from rbpf.errors import InputError
 from rbpf.lie import Array
 from rbpf.sensors.pinhole import Pinhole
 from rbpf.sensors.readers.images.sequence import ImageSequence
-from rbpf.validation.colmap_frames import camera_model, from_colmap_pose
+from rbpf.validation.colmap_frames import from_colmap_pose
+from rbpf.validation.colmap_pipeline import (
+    LEAST_FRAMES,
+    ReconstructionOptions,
+    extract_and_match,
+    is_stereo,
+    map_images,
+    quiet,
+    write_key_frames,
+)
 from rbpf.validation.trajectory import Trajectory
-
-LEAST_FRAMES = 3
-"""Key frames; two have no third view that tells a wrong match."""
-
-
-@final
-@dataclass(frozen=True)
-class ReconstructionOptions:
-    """How images are reconstructed.
-
-    Attributes:
-        every: every so many frames is a key frame, from the first on.
-        features: most of them per image.
-        overlap: each key frame is matched with so many that follow, and with those 2^i further on.
-        stereo: of a stereo sequence take both images, and the scale from the baseline.
-        least_angle_deg: between the rays of the two images that it begins with.
-        threads: of extraction and matching; mapping takes one, so that the same seed gives the same model.
-        seed: of RANSAC.
-    """
-
-    every: int = 5
-    features: int = 4096
-    overlap: int = 10
-    stereo: bool = True
-    least_angle_deg: float = 16.0
-    threads: int = 1
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        """Checks that the numbers make sense."""
-        for name in ("every", "features", "overlap", "threads"):
-            if getattr(self, name) < 1:
-                raise InputError(f"Expected {name} to be at least 1, found {getattr(self, name)}.")
-        if self.seed < 0:
-            raise InputError(f"Expected a seed of at least 0, found {self.seed}.")
 
 
 @final
@@ -139,103 +111,16 @@ def _reconstruct(sequence: ImageSequence, options: ReconstructionOptions, folder
     images, database = folder / "images", folder / "database.db"
     images.mkdir(parents=True, exist_ok=True)
     database.unlink(missing_ok=True)
-    chosen = _write_key_frames(sequence, options, images)
-    with _quiet():
-        _extract_and_match(sequence.camera, options, images, database, 1 + _is_stereo(sequence, options))
-        model = _largest(_map(options, images, database, folder))
+    chosen = write_key_frames(sequence, options, images)
+    with quiet():
+        extract_and_match(sequence.camera, options, images, database, 1 + is_stereo(sequence, options))
+        model = _largest(map_images(options, images, database, folder))
     if model is None:
         raise InputError(
-            f"COLMAP found no reconstruction of {sequence.name} from {len(chosen)} key frames: the images share too few "
-            "features or the camera hardly moves between them; choose key frames closer together or farther apart."
+            f"COLMAP found no reconstruction of {sequence.name} from {len(chosen)} key frames: the images share too "
+            "few features or the camera hardly moves between them; choose key frames closer together or farther apart."
         )
     return _result(sequence, chosen, model)
-
-
-def _write_key_frames(
-    sequence: ImageSequence, options: ReconstructionOptions, images: Path
-) -> NDArray[np.int64]:
-    import pycolmap
-
-    chosen = []
-    for number, frame in enumerate(sequence.frames()):
-        if number % options.every or frame.image is None:
-            continue
-        sides = [frame.image]
-        if _is_stereo(sequence, options) and frame.right is not None:
-            sides.append(frame.right)
-        for side, image in enumerate(sides):
-            pycolmap.Bitmap.from_array(image).write(images / f"{number:06d}_{side}.png")
-        chosen.append(number)
-    if len(chosen) < LEAST_FRAMES:
-        raise InputError(
-            f"{sequence.name} has {len(chosen)} readable key frames of {len(sequence)} images, expected {LEAST_FRAMES} or "
-            f"more; choose a smaller step than every {options.every}."
-        )
-    return np.array(chosen, dtype=np.int64)
-
-
-def _is_stereo(sequence: ImageSequence, options: ReconstructionOptions) -> bool:
-    return options.stereo and sequence.baseline_m is not None
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Keeps COLMAP's progress off the terminal."""
-    import pycolmap
-
-    before = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
-    try:
-        yield
-    finally:
-        pycolmap.logging.minloglevel = before
-
-
-def _extract_and_match(
-    camera: Pinhole, options: ReconstructionOptions, images: Path, database: Path, images_per_frame: int
-) -> None:
-    import pycolmap
-
-    name, params = camera_model(camera)
-    reading = pycolmap.ImageReaderOptions()
-    reading.camera_model, reading.camera_params = name, ",".join(map(repr, params))
-    extraction = pycolmap.FeatureExtractionOptions()
-    extraction.sift.max_num_features, extraction.num_threads = options.features, options.threads
-    pycolmap.extract_features(
-        database,
-        images,
-        camera_mode=pycolmap.CameraMode.SINGLE,
-        reader_options=reading,
-        extraction_options=extraction,
-        device=pycolmap.Device.cpu,
-    )
-    matching, pairing = pycolmap.FeatureMatchingOptions(), pycolmap.SequentialPairingOptions()
-    matching.num_threads = pairing.num_threads = options.threads
-    pairing.overlap = options.overlap * images_per_frame
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = options.seed
-    pycolmap.match_sequential(
-        database,
-        matching_options=matching,
-        pairing_options=pairing,
-        verification_options=verification,
-        device=pycolmap.Device.cpu,
-    )
-
-
-def _map(options: ReconstructionOptions, images: Path, database: Path, folder: Path) -> dict[int, Any]:
-    import pycolmap
-
-    pycolmap.set_random_seed(options.seed)
-    how = pycolmap.IncrementalPipelineOptions()
-    how.num_threads, how.random_seed = 1, options.seed
-    how.ba_refine_focal_length = how.ba_refine_principal_point = how.ba_refine_extra_params = False
-    how.mapper.abs_pose_refine_focal_length = how.mapper.abs_pose_refine_extra_params = False
-    how.mapper.init_min_tri_angle = options.least_angle_deg
-    how.min_model_size, how.extract_colors = LEAST_FRAMES, False
-    models = folder / "models"
-    models.mkdir(exist_ok=True)
-    return dict(pycolmap.incremental_mapping(database, images, models, how))
 
 
 def _largest(models: dict[int, Any]) -> Any:

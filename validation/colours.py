@@ -1,4 +1,4 @@
-"""Colours for points by how certain they are: from dark blue (certain) to yellow (uncertain), on a logarithmic scale."""
+"""Colours for points by how certain they are: dark blue (certain) to yellow (uncertain), on a logarithmic scale."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -18,7 +18,7 @@ def kullback_leibler(delta: Array, cov_p: Array, cov_q: Array) -> Array:
     """KL(p ‖ q) of Gaussians whose means differ by δ (…, n), with covariances (…, n, n) [nats]: (…)."""
     trace = np.trace(np.linalg.solve(cov_q, cov_p), axis1=-2, axis2=-1)
     shift = np.einsum("...i,...i->...", delta, _solve(cov_q, delta))
-    return 0.5 * (trace + shift - delta.shape[-1] + _log_det(cov_q) - _log_det(cov_p))
+    return np.asarray(0.5 * (trace + shift - delta.shape[-1] + _log_det(cov_q) - _log_det(cov_p)))
 
 
 def bhattacharyya(delta: Array, cov_p: Array, cov_q: Array) -> Array:
@@ -30,7 +30,7 @@ def bhattacharyya(delta: Array, cov_p: Array, cov_q: Array) -> Array:
 
 def sigma_ratio(cov_p: Array, cov_q: Array) -> Array:
     """Mean standard deviation of p over that of q, (|P| / |Q|)^(1/2n): below 1 where p is the more certain: (…)."""
-    return np.exp(0.5 * (_log_det(cov_p) - _log_det(cov_q)) / cov_p.shape[-1])
+    return np.asarray(np.exp(0.5 * (_log_det(cov_p) - _log_det(cov_q)) / cov_p.shape[-1]), dtype=np.float64)
 
 
 def _solve(cov: Array, delta: Array) -> Array:
@@ -38,4 +38,4 @@ def _solve(cov: Array, delta: Array) -> Array:
 
 
 def _log_det(cov: Array) -> Array:
-    return np.linalg.slogdet(cov)[1]
+    return np.asarray(np.linalg.slogdet(cov)[1], dtype=np.float64)

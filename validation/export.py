@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rbpf.errors import InputError
-from rbpf.lie import SE3, Array
+from rbpf.lie import SE3
 from rbpf.sensors.features import FeatureLog
 from rbpf.sensors.pinhole import Pinhole
 from rbpf.validation.batch_problem import Problem
@@ -96,7 +97,7 @@ def _raised(landmarks: MapSummary) -> MapSummary:
     return replace(landmarks, mean=np.pad(landmarks.mean, ((0, 0), (0, rise))))
 
 
-def _on_map(table: Sightings, ids: Array) -> Sightings:
+def _on_map(table: Sightings, ids: NDArray[np.int64]) -> Sightings:
     """The sightings of the map's landmarks, with the places of these in the map."""
     order = np.argsort(ids, kind="stable")
     kept = np.isin(table.names, ids)[table.index]
@@ -104,6 +105,6 @@ def _on_map(table: Sightings, ids: Array) -> Sightings:
     return Sightings(table.camera, table.steps[kept], place, ids, table.z[kept], table.cov_z[kept])
 
 
-def _no_sightings(camera: Pinhole, ids: Array) -> Sightings:
+def _no_sightings(camera: Pinhole, ids: NDArray[np.int64]) -> Sightings:
     none = np.zeros(0, dtype=np.intp)
     return Sightings(camera, none, none, ids, np.zeros((0, 2)), np.zeros((0, 2, 2)))
