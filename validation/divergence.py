@@ -34,7 +34,7 @@ def sigma_ratio(cov_p: Array, cov_q: Array) -> Array:
 
 
 def _solve(cov: Array, delta: Array) -> Array:
-    return np.linalg.solve(cov, delta[..., None])[..., 0]
+    return np.asarray(np.linalg.solve(cov, delta[..., None])[..., 0], dtype=np.float64)
 
 
 def _log_det(cov: Array) -> Array:
