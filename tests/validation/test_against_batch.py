@@ -56,7 +56,9 @@ def test_in_a_linear_world_the_filter_is_the_batch_within_monte_carlo_error(line
 def test_monte_carlo_error_falls_with_the_particles():
     def spread(particles):
         ratios = [
-            compare_run(run(linear_log(), RangeBearingConfig(particles=particles, seed=seed, anchor_every=0)), 0)
+            compare_run(
+                run(linear_log(), RangeBearingConfig(particles=particles, seed=seed, anchor_every=0)), 0
+            )
             for seed in range(3)
         ]
         return np.mean([np.abs(np.log(found.landmarks.sigma_ratio)).mean() for found in ratios])
@@ -146,7 +148,9 @@ def test_without_known_points_neither_the_scale_nor_its_uncertainty_matters(std_
     log, estimate = camera_problem()
     first = estimate.world_from_body[0, 4:]
     out = estimate.landmarks.mean - first
-    points = replace(estimate.landmarks, cov=estimate.landmarks.cov + std_scale**2 * out[:, :, None] * out[:, None])
+    points = replace(
+        estimate.landmarks, cov=estimate.landmarks.cov + std_scale**2 * out[:, :, None] * out[:, None]
+    )
     along = SE3.rotation(estimate.world_from_body).mT @ (estimate.world_from_body[:, 4:] - first)[..., None]
     covs = estimate.cov_poses.copy()
     covs[:, 3:, 3:] += std_scale**2 * along @ along.mT
@@ -225,7 +229,10 @@ def _version():
     [
         (lambda f: shutil.rmtree(f), "holds no config.yaml"),
         (lambda f: (f / "config.yaml").write_text("a: 1"), "expected the settings of a run"),
-        (lambda f: (f / "config.yaml").write_text("rbpf: 99.1.0\nsystem: mono"), "was written by rbpf 99.1.0"),
+        (
+            lambda f: (f / "config.yaml").write_text("rbpf: 99.1.0\nsystem: mono"),
+            "was written by rbpf 99.1.0",
+        ),
         (lambda f: (f / "config.yaml").write_text("{"), "cannot be read"),
         (lambda f: (f / "observations.csv").unlink(), "holds no observations.csv"),
         (lambda f: (f / "map.npz").unlink(), "holds no map.npz"),

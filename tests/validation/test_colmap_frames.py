@@ -37,7 +37,7 @@ def test_a_pose_survives_both_ways_and_means_the_same():
 
 
 def plus(world_from_camera, delta):
-    """COLMAP's perturbation of the inverse, written down once more: half-angle quaternion on the left, t by addition."""
+    """COLMAP's perturbation of the inverse, written down once more: quaternion by half the angle, t by addition."""
     inverse = SE3.inverse(world_from_camera)
     turn = pycolmap.Rotation3d(2.0 * delta[:3]) * pycolmap.Rotation3d(inverse[:4])
     return from_colmap_pose(pycolmap.Rigid3d(turn, inverse[4:] + delta[3:]))
@@ -46,13 +46,14 @@ def plus(world_from_camera, delta):
 def test_the_slope_between_the_tangents_is_that_of_numeric_derivatives():
     pose, step = SE3.exp(np.array([0.4, -1.2, 0.7, 3.0, -2.0, 0.5])), 1e-5
     columns = [
-        (SE3.local(pose, plus(pose, step * e)) - SE3.local(pose, plus(pose, -step * e))) / (2 * step) for e in np.eye(6)
+        (SE3.local(pose, plus(pose, step * e)) - SE3.local(pose, plus(pose, -step * e))) / (2 * step)
+        for e in np.eye(6)
     ]
     assert tangent_slope(pose) == pytest.approx(np.stack(columns, axis=-1), abs=1e-8)
 
 
 def test_covariances_of_the_installed_build_have_that_tangent():
-    """The inverse of a numeric Hessian over our own tangents, beside what COLMAP returns, and beside a wrong reading."""
+    """The inverse of a numeric Hessian over our own tangents, beside what COLMAP returns."""
     log = scene(frames=3, points=12, known=5, camera=PLAIN)
     frames = [replace(f, cov_z=np.tile(np.eye(2), (len(f.z), 1, 1))) for f in log.frames]
     names = log.known.names.tolist()
@@ -71,7 +72,9 @@ def test_covariances_of_the_installed_build_have_that_tangent():
         return (log.camera.project(local) - table.z).ravel()
 
     size, step = 18 + 3 * len(free), 1e-5
-    slope = np.stack([(residuals(step * e) - residuals(-step * e)) / (2 * step) for e in np.eye(size)], axis=-1)
+    slope = np.stack(
+        [(residuals(step * e) - residuals(-step * e)) / (2 * step) for e in np.eye(size)], axis=-1
+    )
     assert np.abs(slope.T @ residuals(np.zeros(size))).max() < 1e-3, "not an optimum"
     cov = np.linalg.inv(slope.T @ slope)
     for frame in range(3):
