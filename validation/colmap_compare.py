@@ -8,50 +8,17 @@ from dataclasses import dataclass
 from typing import Any, final
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
 from rbpf.sensors.features import CameraTruth
 from rbpf.validation.accuracy import AbsoluteError, ate
 from rbpf.validation.alignment import Similarity
+from rbpf.validation.cloud_distance import CloudDistance, cloud_distance
 from rbpf.validation.colmap_pipeline import LEAST_FRAMES
 from rbpf.validation.colmap_reconstruct import Reconstruction
 from rbpf.validation.scores import poses_at
 from rbpf.validation.trajectory import Trajectory, associate
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class CloudDistance:
-    """Distances from landmarks to the nearest point of a cloud.
-
-    Attributes:
-        distances_m: (M,) of each landmark.
-        sigmas: (M,) each divided by the landmark's standard deviation in that direction; NaN without covariances.
-        spacing_m: median distance from those nearest points to their own nearest neighbour: what no distance can be
-            much below.
-    """
-
-    distances_m: Array
-    sigmas: Array
-    spacing_m: float
-
-    def as_dict(self) -> dict[str, Any]:
-        """Figures for JSON: quantiles, which single wrong points do not move."""
-        median, p75, p90 = np.quantile(self.distances_m, [0.5, 0.75, 0.9]).tolist()
-        figures = {
-            "landmarks": len(self.distances_m),
-            "nearest_median_m": median,
-            "nearest_p75_m": p75,
-            "nearest_p90_m": p90,
-            "cloud_spacing_median_m": self.spacing_m,
-        }
-        known = self.sigmas[np.isfinite(self.sigmas)]
-        if known.size:
-            figures["nearest_median_sigmas"] = float(np.median(known))
-            figures["share_within_3_sigmas"] = float((known < 3.0).mean())
-        return figures
 
 
 @final
@@ -138,28 +105,3 @@ def compare_with_truth(found: Reconstruction, truth: CameraTruth | None) -> Colm
             f"{LEAST_FRAMES} or more; its stamps must be those of the images' clock."
         )
     return compare_with_path(found, Trajectory(found.stamps_ns[rows], poses))
-
-
-def cloud_distance(cloud: Array, landmarks: Array, cov_landmarks: Array | None = None) -> CloudDistance:
-    """Distance of each landmark to the nearest point of a cloud in the same world.
-
-    Args:
-        cloud: (P, 3), P >= 2.
-        landmarks: (M, 3), M >= 1.
-        cov_landmarks: (M, 3, 3).
-
-    Raises:
-        InputError: the cloud or the map is too small.
-    """
-    if len(cloud) < 2 or not len(landmarks):
-        raise InputError(
-            f"Expected two or more points and a landmark, found {len(cloud)} and {len(landmarks)}."
-        )
-    tree = cKDTree(cloud)
-    distances, nearest = tree.query(landmarks)
-    spacing = tree.query(cloud[nearest], k=2)[0][:, 1]
-    sigmas = np.full(len(landmarks), np.nan)
-    if cov_landmarks is not None:
-        away = (cloud[nearest] - landmarks) / np.maximum(distances, np.finfo(float).tiny)[:, None]
-        sigmas = distances / np.sqrt(np.einsum("ki,kij,kj->k", away, cov_landmarks, away))
-    return CloudDistance(distances, sigmas, float(np.median(spacing)))

@@ -11,7 +11,8 @@ from rbpf.sensors.features import CameraTruth
 from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
 from rbpf.sensors.readers.images import open_images
 from rbpf.validation.against_colmap import compare_folder_with_colmap, compare_with_colmap
-from rbpf.validation.colmap_compare import cloud_distance, compare_with_path, compare_with_truth
+from rbpf.validation.cloud_distance import cloud_distance
+from rbpf.validation.colmap_compare import compare_with_path, compare_with_truth
 from rbpf.validation.colmap_pipeline import ReconstructionOptions
 from rbpf.validation.colmap_reconstruct import Reconstruction, reconstruct
 from rbpf.validation.map_summary import MapSummary
@@ -98,30 +99,36 @@ def test_paths_are_compared_after_the_alignment_that_the_scale_asks_for():
     assert rigid.as_dict()["scale"] == 1.0
 
 
-def test_landmarks_are_brought_to_the_cloud_and_their_sigmas_tell_how_far_is_far():
+def test_landmarks_are_brought_to_the_cloud():
     ours = made()
     landmarks = ours.points[::4] + np.array([0.01, 0.0, 0.0])
-    covs = np.repeat(np.diag([0.02, 1.0, 1.0])[None] ** 2, len(landmarks), axis=0)
     reference = Trajectory(ours.stamps_ns, ours.world_from_camera)
-    cloud = compare_with_path(made(scale=5.0), reference, landmarks, covs).cloud
-    assert cloud.distances_m == pytest.approx(np.full(50, 0.01), rel=1e-6)
-    assert cloud.sigmas == pytest.approx(np.full(50, 0.5), rel=1e-6)
-    figures = cloud.as_dict()
-    assert figures["nearest_median_m"] == pytest.approx(0.01)
-    assert figures["share_within_3_sigmas"] == 1.0
-    tree = np.linalg.norm(ours.points[:, None] - ours.points, axis=-1) + 1e9 * np.eye(200)
-    assert figures["cloud_spacing_median_m"] == pytest.approx(np.median(tree[::4].min(axis=1)))
+    cloud = compare_with_path(made(scale=5.0), reference, landmarks).cloud
+    assert cloud.nearest_m == pytest.approx(np.full(50, 0.01), rel=1e-6)
+    gaps = np.linalg.norm(ours.points[:, None] - ours.points, axis=-1) + 1e9 * np.eye(200)
+    assert cloud.as_dict()["cloud_spacing_median_m"] == pytest.approx(np.median(gaps[::4].min(axis=1)))
+    assert "surface_median_sigmas" not in cloud.as_dict()
+
+
+def test_the_distance_from_a_surface_does_not_depend_on_how_sparse_the_cloud_is():
+    rng, turn = np.random.default_rng(1), SE3.rotation(SE3.exp(np.array([0.3, 0.5, -0.2, 0.0, 0.0, 0.0])))
+    wall = np.column_stack([rng.uniform(-1, 1, (300, 2)), np.zeros(300)])
+    landmarks = np.column_stack([rng.uniform(-0.8, 0.8, (40, 2)), np.full(40, 0.01)])
+    cov = turn @ np.diag([1.0, 1.0, 0.02]) ** 2 @ turn.T
+    found = cloud_distance(wall @ turn.T, landmarks @ turn.T, np.repeat(cov[None], 40, axis=0))
+    assert found.surface_m == pytest.approx(np.full(40, 0.01), rel=1e-6)
+    assert found.sigmas == pytest.approx(np.full(40, 0.5), rel=1e-6)
+    assert np.median(found.nearest_m) > 0.02
+    assert found.as_dict()["share_within_3_sigmas"] == 1.0
 
 
 def test_one_wild_landmark_does_not_move_the_summary():
     ours = made()
     landmarks = ours.points[:40] + 1e-3
-    calm, wild = (
-        cloud_distance(ours.points, points).as_dict()
-        for points in (landmarks, np.vstack([landmarks, [[99.0] * 3]]))
-    )
-    assert wild["nearest_median_m"] == pytest.approx(calm["nearest_median_m"])
-    assert wild["nearest_p90_m"] == pytest.approx(calm["nearest_p90_m"])
+    wild = np.vstack([landmarks, [[99.0] * 3]])
+    calm, moved = (cloud_distance(ours.points, points).as_dict() for points in (landmarks, wild))
+    assert moved["nearest_median_m"] == pytest.approx(calm["nearest_median_m"])
+    assert moved["surface_p90_m"] < 2.0 * calm["surface_p90_m"]
 
 
 def test_what_cannot_be_compared_is_refused():
@@ -135,8 +142,8 @@ def test_what_cannot_be_compared_is_refused():
         compare_with_path(ours, Trajectory(ours.stamps_ns + 10**12, ours.world_from_camera))
     with pytest.raises(InputError, match="share 2 instants"):
         compare_with_path(ours, Trajectory(ours.stamps_ns[:2], ours.world_from_camera[:2]))
-    with pytest.raises(InputError, match="two or more points"):
-        cloud_distance(ours.points[:1], ours.points)
+    with pytest.raises(InputError, match="3 or more points"):
+        cloud_distance(ours.points[:2], ours.points)
 
 
 def test_too_few_key_frames_are_refused():
