@@ -28,20 +28,17 @@ class ColmapComparison:
 
     Attributes:
         reconstruction: what COLMAP found.
-        path: distances of the camera centres.
+        path: distances of the camera centres, after the alignment that fits these best.
+        reference_from_colmap: brings COLMAP's world onto the reference's, by the cameras' orientations and centres.
         cloud: distances of the reference's landmarks; None without.
         extent_m: diagonal of the box that holds the reference's camera centres.
     """
 
     reconstruction: Reconstruction
     path: AbsoluteError
+    reference_from_colmap: Similarity
     cloud: CloudDistance | None
     extent_m: float
-
-    @property
-    def reference_from_colmap(self) -> Similarity:
-        """What was applied to COLMAP's world."""
-        return self.path.alignment
 
     def as_dict(self) -> dict[str, Any]:
         """Figures for JSON."""
@@ -82,10 +79,28 @@ def compare_with_path(
             f"{LEAST_FRAMES} or more for an alignment."
         )
     errors = ate(ours, theirs, "rigid" if found.metric else "similarity")
-    cloud = None
+    move, cloud = align_cameras(ours, theirs, not found.metric), None
     if landmarks is not None and len(landmarks):
-        cloud = cloud_distance(errors.alignment.transform(found.points), landmarks, cov_landmarks)
-    return ColmapComparison(found, errors, cloud, float(np.linalg.norm(np.ptp(theirs.positions, axis=0))))
+        cloud = cloud_distance(move.transform(found.points), landmarks, cov_landmarks)
+    return ColmapComparison(
+        found, errors, move, cloud, float(np.linalg.norm(np.ptp(theirs.positions, axis=0)))
+    )
+
+
+def align_cameras(estimate: Trajectory, reference: Trajectory, with_scale: bool) -> Similarity:
+    """The similarity of the mean rotation between the cameras, and of the scale and shift that then fit the centres.
+
+    Centres on a short or straight path leave the rotation open, and points far from it would be far off.
+    """
+    mine, theirs = estimate.world_from_body, reference.world_from_body
+    turns = SE3.compose(theirs, SE3.inverse(mine))
+    turns[:, 4:] = 0.0
+    rotation = SE3.rotation(SE3.mean(turns, np.full(len(turns), 1.0 / len(turns))))
+    x, y = mine[:, 4:] @ rotation.T, theirs[:, 4:]
+    dx, dy = x - x.mean(axis=0), y - y.mean(axis=0)
+    square = float(np.square(dx).sum())
+    scale = float((dx * dy).sum() / square) if with_scale and square > 0.0 else 1.0
+    return Similarity(scale, rotation, y.mean(axis=0) - scale * x.mean(axis=0))
 
 
 def compare_with_truth(found: Reconstruction, truth: CameraTruth | None) -> ColmapComparison:

@@ -122,6 +122,26 @@ def test_the_distance_from_a_surface_does_not_depend_on_how_sparse_the_cloud_is(
     assert found.as_dict()["share_within_3_sigmas"] == 1.0
 
 
+def test_a_straight_path_does_not_let_the_cloud_roll_about_it():
+    rng, ours = np.random.default_rng(2), made()
+    poses = ours.world_from_camera.copy()
+    poses[:, 4:] = np.linspace(0.0, 0.3, 8)[:, None] * [1.0, 0.5, 0.2]
+    reference = Trajectory(ours.stamps_ns, poses)
+    shaken = poses + np.pad(rng.normal(scale=1e-3, size=(8, 3)), ((0, 0), (4, 0)))
+    turn = SE3.exp(np.array([0.5, -1.0, 0.3, 1.0, 2.0, 3.0]))
+    world = replace(
+        ours, world_from_camera=SE3.compose(turn, shaken), points=SE3.transform(turn, ours.points)
+    )
+    moved = compare_with_path(world, reference, ours.points)
+    by_cameras, by_centres = (
+        np.linalg.norm(move.transform(world.points) - ours.points, axis=1).max()
+        for move in (moved.reference_from_colmap, moved.path.alignment)
+    )
+    assert by_cameras < 0.03
+    assert by_centres > 3.0 * by_cameras, "the centres alone leave the roll open"
+    assert moved.reference_from_colmap.scale == pytest.approx(1.0, abs=0.03)
+
+
 def test_one_wild_landmark_does_not_move_the_summary():
     ours = made()
     landmarks = ours.points[:40] + 1e-3
