@@ -5,6 +5,7 @@ B. Triggs et al., "Bundle adjustment: a modern synthesis" (2000);
 F. Dellaert and M. Kaess, "Factor graphs for robot perception" (2017).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import final
 
@@ -53,6 +54,7 @@ def solve_features(
     robust: float | None = None,
     velocity: ArrayLike | None = None,
     marginals: bool = True,
+    on_iteration: Callable[[float], None] | None = None,
 ) -> CameraSolution:
     """Solve for all poses and landmarks at once.
 
@@ -70,6 +72,7 @@ def solve_features(
             that keeps its velocity, E06 (4)-(5); frames of one time then share pose and velocity. None leaves the
             motion free.
         marginals: compute covariances.
+        on_iteration: told the error before each iteration from the initial estimate on; what it raises ends it all.
 
     Raises:
         InputError: a number makes no sense, the first frame sees too few known points and there is no initial
@@ -89,7 +92,7 @@ def solve_features(
     problem = CameraProblem(log.name, stamps_ns, table, known, robust, acceleration(velocity))
     check_problem(problem)
     start = adjuster.begin(problem, initial or from_scratch(log.name, stamps_ns, table, known))
-    found = adjuster.adjust(problem, start)
+    found = adjuster.adjust(problem, start, on_iteration=on_iteration)
     adjuster.require_converged(found)
     cov_poses, cov_landmarks = adjuster.covariances(found) if marginals else (np.empty((0, 6, 6)), {})
     state, names = found.state, found.problem.table.names

@@ -12,7 +12,13 @@ from rbpf.lie import SE3, Array
 from rbpf.validation.gtsam_ba_camera_data import CameraEstimate, in_camera
 from rbpf.validation.gtsam_ba_camera_graph import SCALE, CameraProblem, CameraState
 from rbpf.validation.gtsam_ba_camera_points import collapsed, in_front, is_open, place, triangulate
-from rbpf.validation.gtsam_ba_solvers import ITERATIONS, ROUGH, levenberg_marquardt, marginals
+from rbpf.validation.gtsam_ba_solvers import (
+    ITERATIONS,
+    ROUGH,
+    OnIteration,
+    levenberg_marquardt,
+    marginals,
+)
 
 FINE = 1e-9
 """A gain of this fraction of the error is none; landmarks without much parallax would creep on for ever."""
@@ -72,7 +78,12 @@ def begin(problem: CameraProblem, start: CameraEstimate) -> CameraState:
     return CameraState(path, points, _velocities(problem, path))
 
 
-def adjust(problem: CameraProblem, start: CameraState, tolerance: float = FINE) -> Adjusted:
+def adjust(
+    problem: CameraProblem,
+    start: CameraState,
+    tolerance: float = FINE,
+    on_iteration: OnIteration | None = None,
+) -> Adjusted:
     """Levenberg-Marquardt; a few rough steps at a time, until it is clear which landmarks are undetermined.
 
     Those whose distance is open get a weak prior. One that an outlier has drawn into its camera is left out: there
@@ -94,26 +105,36 @@ def adjust(problem: CameraProblem, start: CameraState, tolerance: float = FINE) 
             weak = replace(state, points=place(problem.table, state.path, state.points, now))
             state, loose = weak, now
         graph = problem.graph(weak, loose, start.path)
-        values, count, converged = _run(problem, graph, state, tolerance if settled else ROUGH)
+        values, count, converged = _run(problem, graph, state, tolerance if settled else ROUGH, on_iteration)
         state, total = problem.state(values), total + count
         if settled and converged:
             break
     found = Adjusted(problem, values, graph, loose, total, bool(settled and converged))
-    return _scaled(found, weak, start.path, tolerance) if problem.scaled else found
+    if problem.scaled:
+        found = _scaled(found, weak, start.path, tolerance, on_iteration)
+    return found
 
 
-def _scaled(found: Adjusted, weak: CameraState, held: Array, tolerance: float) -> Adjusted:
+def _scaled(
+    found: Adjusted, weak: CameraState, held: Array, tolerance: float, on_iteration: OnIteration | None
+) -> Adjusted:
     # The same with the scale held as tightly as the covariances need it.
     graph = found.problem.graph(weak, found.loose, held, SCALE)
-    values, count, converged = _run(found.problem, graph, found.state, tolerance)
+    values, count, converged = _run(found.problem, graph, found.state, tolerance, on_iteration)
     total = found.iterations + count
     return Adjusted(found.problem, values, graph, found.loose, total, found.converged and converged)
 
 
-def _run(problem: CameraProblem, graph: Any, state: CameraState, tolerance: float) -> tuple[Any, int, bool]:
+def _run(
+    problem: CameraProblem,
+    graph: Any,
+    state: CameraState,
+    tolerance: float,
+    on_iteration: OnIteration | None,
+) -> tuple[Any, int, bool]:
     try:
         most = _FEW if tolerance == ROUGH else ITERATIONS
-        return levenberg_marquardt(graph, problem.values(state), tolerance, most)
+        return levenberg_marquardt(graph, problem.values(state), tolerance, most, on_iteration)
     except RuntimeError as error:
         raise explain(problem, error) from error
 

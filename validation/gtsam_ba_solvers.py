@@ -4,7 +4,7 @@ The loops are here because GTSAM's own optimisers copy all values at every call 
 Python, a hundred times the cost; linearisation, elimination and retraction are GTSAM's.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import gtsam
@@ -18,6 +18,8 @@ EXACT = 1e-11
 """The same near by."""
 ITERATIONS = 200
 """Most of them."""
+
+OnIteration = Callable[[float], None]
 
 _DAMPING = 1e-5
 _MIN_DAMPING = 1e-10
@@ -38,7 +40,11 @@ def huber(base: Any, threshold: float | None) -> Any:
 
 
 def levenberg_marquardt(
-    graph: Any, values: Any, tolerance: float, iterations: int = ITERATIONS
+    graph: Any,
+    values: Any,
+    tolerance: float,
+    iterations: int = ITERATIONS,
+    on_iteration: OnIteration | None = None,
 ) -> tuple[Any, int, bool]:
     """Damped Gauss-Newton.
 
@@ -47,12 +53,15 @@ def levenberg_marquardt(
         values: where to start.
         tolerance: it ends when a step gains less than this fraction of the error.
         iterations: most of them.
+        on_iteration: told the error before each iteration; what it raises ends the optimisation.
 
     Returns:
         The values, the number of iterations, and whether it converged.
     """
     error, damping = graph.error(values), _DAMPING
     for count in range(1, iterations + 1):
+        if on_iteration is not None:
+            on_iteration(error)
         linear, slack = graph.linearize(values), tolerance * max(1.0, error)
         while damping <= _MAX_DAMPING:
             moved = _damped_step(linear, values, damping)

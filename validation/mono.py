@@ -1,25 +1,45 @@
-"""A run over images from recording to report: filter, scores, files, pictures, video."""
+"""A run over images from recording to report: filter, batch optimum, scores, files, pictures, video."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rbpf.errors import InputError
 from rbpf.sensors.readers.images import KnownPixels, open_images, read_known_points
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.video import VideoRun, run_images
 from rbpf.validation.files import prepare_folder
-from rbpf.validation.mono_folder import write_mono_run
+from rbpf.validation.mono_batch import Batch, adjust_run, score_batch
+from rbpf.validation.mono_folder import write_mono_run, write_summary
 from rbpf.validation.mono_map import summarise_mono_map
 from rbpf.validation.mono_pictures import plot_mono_run
 from rbpf.validation.mono_rerun import write_rerun
 from rbpf.validation.mono_video import write_annotated
 from rbpf.validation.report import write_report
+from rbpf.validation.trajectory_files import write_tum
 
 CHECKPOINT = "checkpoint.npz"
 VIDEO = "annotated.mp4"
 
+BATCH = "batch.tum"
+
 Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Telling:
+    """Who is told how far the work after the filter is.
+
+    Attributes:
+        on_frame: called with the frames drawn and their number.
+        on_iteration: called with the number of an iteration of the batch adjustment and the error before it.
+        batch_s: time after which the batch adjustment is given up; None waits.
+    """
+
+    on_frame: Progress | None = None
+    on_iteration: Callable[[int, float], None] | None = None
+    batch_s: float | None = None
 
 
 @dataclass(frozen=True)
@@ -84,9 +104,12 @@ def finish_mono(
     out: Path,
     video: bool = True,
     rerun: Path | None = None,
-    on_frame: Progress | None = None,
+    batch: bool = True,
+    telling: Telling | None = None,
 ) -> dict[str, Any]:
     """Writes all files, pictures, the annotated video and the report of a run; returns the entries of summary.json.
+
+    The filter's own files are complete before the batch adjustment begins.
 
     Args:
         run: what was filtered.
@@ -94,14 +117,32 @@ def finish_mono(
         out: the run's folder.
         video: also write the annotated video.
         rerun: file of a recording for the Rerun viewer; None writes none.
-        on_frame: called with the frames drawn and their number.
+        batch: also adjust the same measurements in batch, and score the optimum.
+        telling: whom to tell how far it is, and the time that the batch adjustment may take.
     """
+    telling = telling or Telling()
     mapped = summarise_mono_map(run.filter)
     entries = write_mono_run(run, mapped, out, recording.sources())
-    pictures = plot_mono_run(run, mapped, out)
+    optimum = _adjusted(run, out, entries, telling) if batch else None
+    pictures = plot_mono_run(run, mapped, out, optimum)
     if video:
-        write_annotated(run, out / VIDEO, on_frame)
+        write_annotated(run, out / VIDEO, telling.on_frame)
     if rerun is not None:
         write_rerun(run, mapped, rerun)
     write_report(out, entries, pictures, VIDEO if video else None)
     return entries
+
+
+def _adjusted(run: VideoRun, out: Path, entries: dict[str, Any], telling: Telling) -> Batch | None:
+    """The batch optimum, its path and its figures; or the reason why there is none among the figures."""
+    (out / BATCH).unlink(missing_ok=True)
+    optimum = None
+    try:
+        optimum = adjust_run(run, telling.batch_s, telling.on_iteration)
+    except InputError as error:
+        entries["batch_problem"] = str(error)
+    if optimum is not None:
+        write_tum(out / BATCH, optimum.trajectory)
+        entries |= score_batch(run, optimum)
+    write_summary(out, entries)
+    return optimum

@@ -7,27 +7,32 @@ import numpy as np
 from rbpf.lie import SE3
 from rbpf.systems.mono.video import VideoRun
 from rbpf.validation.accuracy import ate
+from rbpf.validation.alignment import Alignment
 from rbpf.validation.figures import COLOURS, SIGMAS
+from rbpf.validation.mono_batch import Batch
 from rbpf.validation.mono_scores import TruePath
 from rbpf.validation.trajectory import Trajectory
 
 CAMERA_HZ = 30.0
 
 
-def error_figure(run: VideoRun, truth: TruePath) -> Any:
-    """Error of the position along the truth's axes, beside what the filter itself believes (3σ).
+def error_figure(run: VideoRun, truth: TruePath, batch: Batch | None = None) -> Any:
+    """Error of the position along the truth's axes, beside what the filter itself believes (3σ), and the batch's.
 
-    With known points nothing is aligned; without them the path is first brought onto the truth, and its 3σ with it.
+    With known points nothing is aligned; without them each path is first brought onto the truth, and its 3σ with it.
     """
     poses, stamps = run.world_from_camera[truth.rows], run.stamps_ns[truth.rows]
     estimate, reference = Trajectory(stamps, poses), Trajectory(stamps, truth.world_from_camera)
-    moved = ate(estimate, reference, "none" if run.known is not None else "similarity").alignment
+    how: Alignment = "none" if run.known is not None else "similarity"
+    moved = ate(estimate, reference, how).alignment
     error = moved.transform(estimate.positions) - reference.positions
     turn = moved.scale * moved.rotation @ SE3.matrix(poses)[:, :3, :3]
     cov = turn @ run.cov[truth.rows][:, 3:, 3:] @ np.swapaxes(turn, -1, -2)
     band = SIGMAS * np.sqrt(np.maximum(np.einsum("taa->ta", cov), 0.0))
-    how = "no alignment" if run.known is not None else "after the similarity alignment"
-    figure, rows = _rows(3, f"{run.sequence.name}: error of the position, {how}")
+    name = "no alignment" if how == "none" else "after the similarity alignment"
+    figure, rows = _rows(3, f"{run.sequence.name}: error of the position, {name}")
+    if batch is not None:
+        _batch_error(rows, truth, batch, how)
     for axis, axes in enumerate(rows):
         axes.fill_between(
             truth.rows, -1e3 * band[:, axis], 1e3 * band[:, axis], color=COLOURS["filter"], alpha=0.2, lw=0,
@@ -40,6 +45,16 @@ def error_figure(run: VideoRun, truth: TruePath) -> Any:
     rows[0].legend(loc="best", fontsize="small")
     rows[-1].set_xlabel("frame")
     return figure
+
+
+def _batch_error(rows: list[Any], truth: TruePath, batch: Batch, how: Alignment) -> None:
+    frames, ours, theirs = np.intersect1d(batch.frames, truth.rows, return_indices=True)
+    stamps = batch.trajectory.stamps_ns[ours]
+    reference = Trajectory(stamps, truth.world_from_camera[theirs])
+    estimate = Trajectory(stamps, batch.world_from_camera[ours])
+    moved = ate(estimate, reference, how).alignment.transform(estimate.positions)
+    for axes, error in zip(rows, 1e3 * (moved - reference.positions).T, strict=True):
+        axes.plot(frames, error, color=COLOURS["batch"], lw=1.0, label="error of the batch")
 
 
 def tracking_figure(run: VideoRun) -> Any:
@@ -68,12 +83,14 @@ def timings_figure(run: VideoRun) -> Any:
     """Time per frame by stage; decoding apart."""
     figure, (axes,) = _rows(1, f"{run.sequence.name}: time per frame")
     frames = np.arange(run.seconds.size)
-    search, rest = 1e3 * run.seconds_search, 1e3 * (run.seconds - run.seconds_search)
-    axes.stackplot(frames, search, rest, labels=["search in the image", "filter"], alpha=0.7, lw=0)
+    search, births = 1e3 * run.seconds_search, 1e3 * run.seconds_births
+    rest = 1e3 * run.seconds - search - births
+    names = ["search in the image", "filter", "new features"]
+    axes.stackplot(frames, search, rest, births, labels=names, alpha=0.7, lw=0)
     axes.plot(frames, 1e3 * run.seconds_waiting, color="black", lw=0.6, label="waiting for the decoded image")
     axes.axhline(1e3 / CAMERA_HZ, color=COLOURS["map"], lw=0.8, ls="--", label=f"{CAMERA_HZ:g} Hz")
     high = max(
-        1e3 / CAMERA_HZ, 2.5 * float(np.median(search + rest))
+        1e3 / CAMERA_HZ, 2.5 * float(np.median(1e3 * run.seconds))
     )  # frames that compile run out of the picture
     axes.set(xlabel="frame", ylabel="ms", ylim=(0.0, 1.3 * high))
     axes.legend(loc="best", fontsize="small")

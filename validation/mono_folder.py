@@ -1,10 +1,15 @@
 """Everything that a run over images leaves in its folder. Each file is written under a temporary name, then renamed.
 
 trajectory.tum           online filtered mean at every frame, in the world of the known points, else of the first camera
+posterior.tum            mean over the last frame's particles of their whole paths, which later frames have sharpened
+posterior.npz            these paths (T, N, 7) and the particles' log-weights
+batch.tum                batch optimum of the same measurements, of the frames that took part
+observations*.csv        the measurements used, and the known points
 map.npz, map.csv         landmarks: id, mean, covariance (within + between particles); whether it is a ray, was known
-timings.csv              milliseconds per frame: whole, search, filter; and waiting for the decoded image
+timings.csv              milliseconds per frame and stage; and waiting for the decoded image
 diagnostics.csv          what was looked for and found, whether the camera was lost; sample size, evidence, NIS
 config.yaml              everything needed to repeat the run
+checkpoint.npz           what --resume goes on from
 summary.json             the figures
 *.png, annotated.mp4     pictures; every frame with what was looked for in it
 report.html              one page with all figures and pictures
@@ -20,6 +25,7 @@ import yaml
 
 from rbpf import __version__
 from rbpf.systems.mono.video import VideoRun
+from rbpf.validation.camera_files import write_features
 from rbpf.validation.files import (
     milliseconds_per_frame,
     nis_ratio,
@@ -29,7 +35,9 @@ from rbpf.validation.files import (
     write_map,
     write_text,
 )
+from rbpf.validation.mono_log import feature_log
 from rbpf.validation.mono_map import MonoMap
+from rbpf.validation.mono_posterior import write_posterior
 from rbpf.validation.mono_scores import score_camera
 from rbpf.validation.trajectory import Trajectory
 from rbpf.validation.trajectory_files import write_tum
@@ -59,12 +67,19 @@ def write_mono_run(run: VideoRun, mapped: MonoMap, out: Path, sources: dict[str,
         "found": table.found[rows],
     }
     write_map(out, mapped.landmarks, facts)
+    write_posterior(run, out)
+    write_features(out, feature_log(run))
     _write_tables(run, out)
     config = {"rbpf": __version__, "system": "mono", **sources, **asdict(run.config)}
     write_text(out / "config.yaml", yaml.safe_dump(config, sort_keys=False))
     entries = summarise_camera(run, mapped)
-    write_text(out / "summary.json", json.dumps(entries, indent=2, allow_nan=False) + "\n")
+    write_summary(out, entries)
     return entries
+
+
+def write_summary(out: Path, entries: dict[str, Any]) -> None:
+    """summary.json."""
+    write_text(out / "summary.json", json.dumps(entries, indent=2, allow_nan=False) + "\n")
 
 
 def summarise_camera(run: VideoRun, mapped: MonoMap) -> dict[str, Any]:
@@ -103,10 +118,11 @@ def summarise_camera(run: VideoRun, mapped: MonoMap) -> dict[str, Any]:
 def _write_tables(run: VideoRun, out: Path) -> None:
     """timings.csv and diagnostics.csv."""
     frames = range(run.stamps_ns.size)
-    seconds = (run.seconds, run.seconds_search, run.seconds - run.seconds_search, run.seconds_waiting)
+    rest = run.seconds - run.seconds_search - run.seconds_births
+    seconds = (run.seconds, run.seconds_search, rest, run.seconds_births, run.seconds_waiting)
     write_csv(
         out / "timings.csv",
-        ["step", "milliseconds", "search_ms", "filter_ms", "waiting_for_image_ms"],
+        ["step", "milliseconds", "search_ms", "filter_ms", "new_features_ms", "waiting_for_image_ms"],
         zip(frames, *((1e3 * column).round(4).tolist() for column in seconds), strict=True),
     )
     counts = (run.searched, run.found, run.lost, run.resampled)

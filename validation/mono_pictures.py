@@ -10,6 +10,7 @@ from rbpf.systems.mono.system import world_of
 from rbpf.systems.mono.video import VideoRun
 from rbpf.validation.alignment import Similarity, align
 from rbpf.validation.figures import COLOURS, SIGMAS, outline, save_figures
+from rbpf.validation.mono_batch import Batch
 from rbpf.validation.mono_curves import error_figure, timings_figure, tracking_figure
 from rbpf.validation.mono_map import MonoMap
 from rbpf.validation.mono_scores import TruePath, true_path
@@ -19,18 +20,18 @@ MAP_SHARE = 0.9
 """The map's picture holds the path and this share of the points; single points far off do not make it small."""
 
 
-def plot_mono_run(run: VideoRun, mapped: MonoMap, out: Path) -> list[str]:
+def plot_mono_run(run: VideoRun, mapped: MonoMap, out: Path, batch: Batch | None = None) -> list[str]:
     """Draws path, map, particles, error, tracking and times; returns the file names."""
     views, truth = best_views(run.world_from_camera), true_path(run.sequence.truth, run.stamps_ns)
     figures = {
-        "path.png": _path(run, views, truth),
+        "path.png": _path(run, views, truth, batch),
         "map.png": _map(run, mapped, views),
         "particles.png": _particles(run, views),
         "tracking.png": tracking_figure(run),
         "timings.png": timings_figure(run),
     }
     if truth is not None:
-        figures["error.png"] = error_figure(run, truth)
+        figures["error.png"] = error_figure(run, truth, batch)
     return save_figures(figures, out)
 
 
@@ -42,7 +43,7 @@ def true_into_run(run: VideoRun, truth: TruePath) -> tuple[Similarity, str]:
     return align(true, ours), "truth, moved onto the filter"
 
 
-def _path(run: VideoRun, views: Views, truth: TruePath | None) -> Any:
+def _path(run: VideoRun, views: Views, truth: TruePath | None, batch: Batch | None) -> Any:
     figure, shown = views.axes(f"{run.sequence.name}: path")
     at, lost = SE3.translation(run.world_from_camera), run.lost.astype(bool)
     for axes, (right, up) in shown:
@@ -50,6 +51,9 @@ def _path(run: VideoRun, views: Views, truth: TruePath | None) -> Any:
             moved, name = true_into_run(run, truth)
             true = moved.transform(SE3.translation(truth.world_from_camera))
             axes.plot(true[:, right], true[:, up], color=COLOURS["truth"], lw=1.2, ls="--", label=name)
+        if batch is not None:
+            best = SE3.translation(batch.world_from_camera)
+            axes.plot(best[:, right], best[:, up], color=COLOURS["batch"], lw=1.2, label="batch optimum")
         axes.plot(at[:, right], at[:, up], color=COLOURS["filter"], lw=1.2, label="filter")
         axes.plot(at[0, right], at[0, up], "o", color=COLOURS["filter"], ms=5, label="first frame")
         if lost.any():

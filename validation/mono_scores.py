@@ -37,19 +37,29 @@ def true_path(truth: CameraTruth | None, stamps_ns: np.ndarray) -> TruePath | No
 
 
 def score_camera(run: VideoRun) -> dict[str, float | int]:
-    """Entries of summary.json: metres and degrees; none without ground truth.
+    """Entries of summary.json for the filter's path; none without ground truth."""
+    path = Trajectory(run.stamps_ns, run.world_from_camera)
+    return score_path(run.sequence.truth, path, run.known is not None)
 
-    Without known points the scale is arbitrary, so the relative error is told after the similarity alignment.
+
+def score_path(true: CameraTruth | None, path: Trajectory, metric: bool) -> dict[str, float | int]:
+    """Errors of a path: metres and degrees; none without ground truth.
+
+    Args:
+        true: ground truth.
+        path: of the camera.
+        metric: whether it has a scale and a world, from known points. Else the scale is arbitrary, and the relative
+            error is told after the similarity alignment.
     """
-    truth = true_path(run.sequence.truth, run.stamps_ns)
+    truth = true_path(true, path.stamps_ns)
     if truth is None:
         return {}
-    stamps = run.stamps_ns[truth.rows]
-    estimate = Trajectory(stamps, run.world_from_camera[truth.rows])
+    stamps = path.stamps_ns[truth.rows]
+    estimate = Trajectory(stamps, path.world_from_body[truth.rows])
     reference = Trajectory(stamps, truth.world_from_camera)
     similar = ate(estimate, reference, "similarity")
-    relative = rpe(estimate, reference, alignment="rigid" if run.known is not None else "similarity")
-    own = {} if run.known is None else {"path_rmse_m": ate(estimate, reference).rmse}
+    relative = rpe(estimate, reference, alignment="rigid" if metric else "similarity")
+    own = {"path_rmse_m": ate(estimate, reference).rmse} if metric else {}
     return {
         "ate_rmse_m": ate(estimate, reference, "rigid").rmse,
         "ate_sim3_rmse_m": similar.rmse,

@@ -53,7 +53,7 @@ def run_mono(options: Annotated[MonoOptions, tyro.conf.arg(name="")]) -> None:
     """Monocular SLAM over a sequence of images or a video (E06: active search, inverse depth, FastSLAM 2.0)."""
     from rbpf.systems.mono.config import MonoConfig
     from rbpf.systems.settings import load_settings
-    from rbpf.validation.mono import Recording, finish_mono, start_mono
+    from rbpf.validation.mono import Recording, Telling, finish_mono, start_mono
     from rbpf.validation.mono_rerun import require_rerun
 
     if options.rerun is not None:
@@ -72,14 +72,15 @@ def run_mono(options: Annotated[MonoOptions, tyro.conf.arg(name="")]) -> None:
             options.resume,
             _told(bar, task),
         )
-        drawing = bar.add_task("drawing", total=None)
+        solving = bar.add_task("batch", total=None, visible=options.batch)
+        drawing = bar.add_task("drawing", total=None, visible=options.video)
+        telling = Telling(
+            on_frame=_told(bar, drawing),
+            on_iteration=lambda count, _error: bar.update(solving, completed=count),
+            batch_s=options.batch_limit,
+        )
         entries = finish_mono(
-            run,
-            recording,
-            options.out,
-            options.video,
-            options.rerun,
-            _told(bar, drawing),
+            run, recording, options.out, options.video, options.rerun, options.batch, telling
         )
     _print_summary(entries, options.out)
     if run.failure is not None:

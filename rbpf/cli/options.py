@@ -54,6 +54,8 @@ class MonoOptions:
         resume: go on from the checkpoint in the results' folder.
         rerun: also write a recording (.rrd) for the Rerun viewer.
         video: write the annotated video.
+        batch: also adjust the same measurements in batch with GTSAM.
+        batch_limit: seconds after which the batch adjustment is given up; the run's results stay.
         threads: threads of the kernels; by default all.
     """
 
@@ -68,6 +70,8 @@ class MonoOptions:
     resume: tyro.conf.FlagCreatePairsOff[bool] = False
     rerun: Path | None = None
     video: bool = True
+    batch: bool = True
+    batch_limit: float = 300.0
     threads: int | None = None
 
 

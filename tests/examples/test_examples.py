@@ -13,9 +13,30 @@ import pytest
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 
 ROOT = Path(__file__).resolve().parents[2]
-SECONDS_LONG = {"mono_blackouts", "mono_loop", "mono_overconfidence", "mono_still_camera", "mono_video"}
+SECONDS_LONG = {
+    "against_colmap",
+    "error_ratios",
+    "mono_blackouts",
+    "mono_loop",
+    "mono_overconfidence",
+    "mono_still_camera",
+    "mono_video",
+}
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 LONGEST_SENSOR = 40
+
+
+def against_batch(figures: dict[str, float]) -> None:
+    assert figures["300 particles"] < figures["10 particles"]
+
+
+def against_colmap(figures: dict[str, float]) -> None:
+    assert figures["run: share_registered"] >= 0.9
+    assert figures["run: ate_rmse_m"] < 0.02
+    assert figures["COLMAP's own error [m]"] < 0.01
+    assert figures["run: surface_median_m"] < 0.1
+    assert figures["both: pose_difference_max"] < 1e-4
+    assert figures["both: pose_covariance_error_max"] < 0.05
 
 
 def batch_check(figures: dict[str, float]) -> None:
@@ -32,6 +53,11 @@ def custom_sensor(figures: dict[str, float]) -> None:
     assert figures["findings"] == 0
     assert figures["filter"] < 0.25 * figures["odometry"]
     assert 0.8 < figures["nis_per_dof"] < 1.25
+
+
+def error_ratios(figures: dict[str, float]) -> None:
+    assert figures.keys() == {"simulated_robot", "rendered_desk"}
+    assert all(0.8 < ratio < 6.0 for ratio in figures.values())
 
 
 def evidence(figures: dict[float, float]) -> None:
@@ -133,9 +159,12 @@ def target_tracking(figures: dict[str, dict[str, float]]) -> None:
 CLAIMS: dict[str, Callable[[Any], None]] = {
     claim.__name__: claim
     for claim in (
+        against_batch,
+        against_colmap,
         batch_check,
         checkpoint,
         custom_sensor,
+        error_ratios,
         evidence,
         fused_kernel,
         gps_fix,

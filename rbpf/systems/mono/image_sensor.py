@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
@@ -11,6 +11,7 @@ from rbpf.belief import Belief
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.models import Births, Observations, Sensor
+from rbpf.sensors.camera_points import CameraRay
 from rbpf.sensors.corners import corners
 from rbpf.sensors.features import FeatureFrame
 from rbpf.sensors.patches import cut, search, warp
@@ -121,8 +122,9 @@ class ImageSensor(Sensor):
         self._place(belief, self.measured.landmarks)
         sightings = self.measured
         if frame.image is not None and not self.bad_frames:
-            sightings = self._with_corners(frame, belief, observed)
+            sightings = self._with_corners(frame, belief)
         births = self.features.births(sightings, belief, observed)
+        self._place_rays(belief, births)
         self.features.forget(belief, failing)
         self.seconds_births = time.perf_counter() - started
         return births
@@ -164,8 +166,9 @@ class ImageSensor(Sensor):
         own = factor[belief.mode if factor.shape[0] > 1 else 0]
         cov = cov + self.config.noise_px**2 * np.eye(2)
         good = which[agreeing(nu, jac, cov, own, self.config.gate)]
-        searched.found[:] = False
-        searched.found[hits[good]] = True
+        found = np.zeros_like(searched.found)
+        found[hits[good]] = True
+        self.searched = replace(searched, found=found)
         return rows[good], px[good]
 
     def _choose(self, pose: np.ndarray) -> np.ndarray:
@@ -228,14 +231,20 @@ class ImageSensor(Sensor):
             chosen, place = self.features.places(belief, rows, self.table.member[rows])
             self.table.place[rows[chosen]] = place
 
-    def _with_corners(
-        self, frame: ImageFrame, belief: Belief, observed: Sequence[Observations]
-    ) -> FeatureFrame:
+    def _place_rays(self, belief: Belief, births: Sequence[Births]) -> None:
+        """Remembers where in the mode's world features start."""
+        for group in births:
+            assert isinstance(group.model, CameraRay) and group.facts is not None
+            pose = belief.state[belief.mode][:7]
+            self.table.place[list(group.facts)] = self.features.first_places(pose, group.z, group.model)
+
+    def _with_corners(self, frame: ImageFrame, belief: Belief) -> FeatureFrame:
         assert frame.image is not None
         config, measured = self.config, self.measured
         room = config.measurements - measured.landmarks.size
         if self.table.count > measured.landmarks.size:
             room = min(config.in_view - self._in_view.shape[0], config.new_per_frame)
+        room = min(room, self.features.births_per_frame)
         if room <= 0:
             return measured
         occupied = np.concatenate([measured.z, self._in_view])
@@ -244,9 +253,7 @@ class ImageSensor(Sensor):
         if not px.shape[0]:
             return measured
         source = np.array([self._window(frame.image, place) for place in px])
-        pose = belief.state[belief.mode][:7]
-        rows = self.table.add(source, px, pose)
-        self.table.place[rows] = self.features.first_places(pose, px, self.features.new_ray(belief, observed))
+        rows = self.table.add(source, px, belief.state[belief.mode][:7])
         return self._features(
             frame.stamp_ns, np.append(measured.landmarks, rows), np.concatenate([measured.z, px])
         )

@@ -114,14 +114,14 @@ def run_images(
     if first is None or first.image is None:
         reason = "it has no image" if first is None else first.problem
         raise InputError(f"{sequence.name}: the first image is needed to start: {reason}")
-    run = _begin(sequence, config, known, first.image)
+    run, law = _begin(sequence, config, known, first.image)
     if resume and checkpoint is not None and checkpoint.exists():
         restore(run, checkpoint)
     waited = time.perf_counter()
     for t, frame in enumerate(_frames_from(sequence, run.filter.steps), run.filter.steps):
         run.seconds_waiting[t] = time.perf_counter() - waited
         try:
-            _frame(run, t, frame, _law(sequence, config, known) if t == 0 else None)
+            _frame(run, t, frame, law if t == 0 else None)
         except InputError as error:
             if t == 0:
                 raise
@@ -133,6 +133,8 @@ def run_images(
             on_frame(t, frame, run)
         waited = time.perf_counter()
     cut(run)
+    if checkpoint is not None and run.failure is None:
+        save(run, checkpoint)
     return run
 
 
@@ -140,17 +142,11 @@ def _frames_from(sequence: ImageSequence, start: int) -> Iterator[ImageFrame]:
     return sequence.frames(start) if start < len(sequence) else iter(())
 
 
-def _law(sequence: ImageSequence, config: MonoConfig, known: KnownPixels | None) -> PoseLaw:
-    """Where the camera is at first: at the origin, unless the known points are landmarks of their own."""
-    if known is not None and config.known == "points":
-        return PoseLaw(resect_known(sequence.camera, known, config.search.noise_px), start_cov(config))
-    return PoseLaw(SE3.identity(), np.zeros((6, 6)))
-
-
 def _begin(
     sequence: ImageSequence, config: MonoConfig, known: KnownPixels | None, image: np.ndarray
-) -> VideoRun:
-    start = None
+) -> tuple[VideoRun, PoseLaw]:
+    """A run before its first frame, and where the camera is in it: at the origin, unless the known points tell."""
+    start, law = None, PoseLaw(SE3.identity(), np.zeros((6, 6)))
     if known is not None:
         count = known.names.size
         cov = known.std_m[:, None, None] ** 2 * np.eye(3)
@@ -159,6 +155,8 @@ def _begin(
         sight = FeatureFrame(int(sequence.stamps_ns[0]), points.names, known.px, noise)
         pose = resect_known(sequence.camera, known, config.search.noise_px)
         start = KnownStart(points, pose, points.names, sight)
+        if config.known == "points":
+            law = PoseLaw(pose, start_cov(config))
     features = build_features(sequence.camera, config, start)
     sensor = ImageSensor(features, config.search)
     if known is not None:
@@ -168,7 +166,8 @@ def _begin(
     poses, covs = np.zeros((total, 7)), np.zeros((total, 6, 6))
     filter_ = assemble(config, features, start, sensor)
     stamps = np.asarray(sequence.stamps_ns, dtype=np.int64)
-    return VideoRun(sequence, config, known, filter_, sensor, stamps, poses, covs, *numbers)
+    run = VideoRun(sequence, config, known, filter_, sensor, stamps, poses, covs, *numbers)
+    return run, law
 
 
 def _frame(run: VideoRun, t: int, frame: ImageFrame, law: PoseLaw | None) -> None:

@@ -1,0 +1,37 @@
+"""A run beside the batch optimum of its own measurements: where they differ, by how many sigma, and who is too sure.
+
+Works for a run in memory (`compare_run`) and for a folder that `rbpf run` left (`compare_folder`), of any system.
+"""
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from rbpf.systems.range_bearing.config import RangeBearingConfig
+from rbpf.validation.against_batch import compare_run
+from rbpf.validation.offline_pictures import plot_against_batch
+from rbpf.validation.range_bearing import start_run
+from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
+from rbpf.validation.tables import write_table
+
+
+def main(quick: bool = False, out: Path = Path("out")) -> dict[str, float]:
+    """Prints how far the filter is from the optimum for few and many particles; `quick` takes a short log."""
+    out.mkdir(parents=True, exist_ok=True)
+    rows, figures = [], {}
+    with TemporaryDirectory() as folder:
+        simulate_robot(RobotWorld(steps=60 if quick else 200, landmarks=30), Path(folder), seed=0)
+        for particles in (10, 300):
+            run = start_run(Path(folder), RangeBearingConfig(particles=particles))
+            found = compare_run(run, instants=1)
+            told = found.landmarks.as_dict()
+            names = "distances_m", "sigmas", "kullback_leibler", "sigma_ratio"
+            rows.append((particles, found.path.rmse, *(told[f"{name}_median"] for name in names)))
+            figures[f"{particles} particles"] = told["kullback_leibler_median"]
+    header = ("particles", "path_rmse_m", "landmark_m", "landmark_sigmas", "kl_nats", "sigma_ratio")
+    write_table(out / "against_batch.csv", header, rows)
+    plot_against_batch(found, out)
+    return figures
+
+
+if __name__ == "__main__":
+    main()

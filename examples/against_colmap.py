@@ -1,0 +1,50 @@
+"""An independent opinion: COLMAP reconstructs the images of a run from scratch, and adjusts the run's own sightings.
+
+The reconstruction shares the images and the calibration with the filter and nothing else. The adjustment is the same
+problem for GTSAM and for COLMAP's Ceres: two programs that have to give one answer.
+"""
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from rbpf.sensors.pinhole import Pinhole
+from rbpf.systems.mono.config import MonoConfig
+from rbpf.validation.against_colmap import compare_with_colmap
+from rbpf.validation.batch_problem import problem_of
+from rbpf.validation.colmap_pipeline import ReconstructionOptions
+from rbpf.validation.export import export_colmap, export_ply
+from rbpf.validation.mono import Recording, start_mono
+from rbpf.validation.offline_pictures import plot_against_colmap
+from rbpf.validation.path_and_map import of_run
+from rbpf.validation.simulation.exposure import Imaging
+from rbpf.validation.simulation.images import simulate_images
+from rbpf.validation.simulation.textured_desk import TexturedDesk
+from rbpf.validation.tables import write_table
+from rbpf.validation.two_optimisers import adjust_by_both
+
+
+def main(quick: bool = False, out: Path = Path("out")) -> dict[str, float]:
+    """Renders a desk, filters it, and compares; leaves the run as a COLMAP model and PLY files in `out`."""
+    width, frames, every = (320, 150, 15) if quick else (640, 300, 5)
+    camera = Pinhole(width, 3 * width // 4, 0.8 * width, 0.8 * width, width / 2 - 0.5, 3 * width / 8 - 0.5)
+    with TemporaryDirectory() as folder:
+        desk = Path(folder) / "desk"
+        simulate_images(TexturedDesk(frames=frames), Imaging(known=6), camera, desk, seed=0)
+        run = start_mono(Recording(desk, desk / "known_points.csv"), MonoConfig())
+        estimate = of_run(run)
+        options = ReconstructionOptions(every=every, features=800 if quick else 4096)
+        found = compare_with_colmap(estimate, run.sequence, options)
+    both = adjust_by_both(problem_of(run), run.world_from_camera).as_dict()
+    told = {f"run: {name}": value for name, value in found.run.as_dict().items() if isinstance(value, float)}
+    if found.truth is not None:
+        told["COLMAP's own error [m]"] = found.truth.path.rmse
+    told |= {f"both: {name}": value for name, value in both.items() if isinstance(value, float)}
+    write_table(out / "against_colmap.csv", ("figure", "value"), list(told.items()))
+    plot_against_colmap(found.run, estimate, out)
+    export_colmap(estimate, problem_of(run), out / "colmap")
+    export_ply(estimate, out)
+    return told
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,254 @@
+"""A run beside its batch optimum: where both must agree, the gauge, and what a folder must hold."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+
+from rbpf.checkpoint import save_arrays
+from rbpf.errors import InputError
+from rbpf.lie import SE3
+from rbpf.systems.mono.config import MonoConfig
+from rbpf.systems.mono.run import run as run_features
+from rbpf.systems.range_bearing.config import RangeBearingConfig
+from rbpf.systems.range_bearing.run import run
+from rbpf.validation.against_batch import SAME, SCALED, compare, compare_folder, compare_run
+from rbpf.validation.batch_problem import first_steps, fit_of, problem_of, read_problem, solve_problem
+from rbpf.validation.camera_files import write_features
+from rbpf.validation.files import write_map
+from rbpf.validation.gaussian_differences import compare_last_pose, rescaled, scale_onto
+from rbpf.validation.map_summary import MapSummary
+from rbpf.validation.path_and_map import PathAndMap, of_run, read_path_and_map
+from rbpf.validation.run_folder import write_run
+from rbpf.validation.trajectory import Trajectory
+from rbpf.validation.trajectory_files import write_tum
+from tests.validation.camera_scenes import scene
+from tests.validation.linear_worlds import linear_log
+
+
+@pytest.fixture(scope="module")
+def linear_run():
+    return run(linear_log(), RangeBearingConfig(particles=2000, anchor_every=0))
+
+
+@pytest.fixture
+def folder(linear_run, tmp_path):
+    write_run(linear_run, tmp_path / "run", tmp_path / "log")
+    return tmp_path / "run"
+
+
+def test_in_a_linear_world_the_filter_is_the_batch_within_monte_carlo_error(linear_run):
+    found = compare_run(linear_run)
+    for gaussians, count in ((found.landmarks, 5), (found.poses, 3)):
+        assert len(gaussians) == count
+        assert gaussians.sigmas.max() < 0.25
+        assert gaussians.sigma_ratio == pytest.approx(np.ones(count), abs=0.06)
+        assert gaussians.kullback_leibler.max() < 0.05
+        assert gaussians.bhattacharyya.max() < 0.0125
+    assert found.poses.keys.tolist() == [3, 7, 11]
+    assert found.scale == 1.0 and found.gauge == SAME
+    assert found.fit_batch.sightings == found.fit_filter.sightings == len(found.optimum.problem.z)
+
+
+def test_monte_carlo_error_falls_with_the_particles():
+    def spread(particles):
+        ratios = [
+            compare_run(
+                run(linear_log(), RangeBearingConfig(particles=particles, seed=seed, anchor_every=0)), 0
+            )
+            for seed in range(3)
+        ]
+        return np.mean([np.abs(np.log(found.landmarks.sigma_ratio)).mean() for found in ratios])
+
+    assert spread(1000) < 0.6 * spread(30)
+
+
+def test_the_optimum_explains_sightings_and_odometry_best(linear_run):
+    problem, filtered = problem_of(linear_run), of_run(linear_run)
+    optimum = solve_problem(problem, filtered.world_from_body)
+    best = fit_of(problem, optimum.estimate, optimum.estimate.landmarks.ids)
+    pull = problem.space.local(problem.deltas, problem.space.between(*_pairs(optimum.estimate)))
+    moved = 0.5 * np.einsum("ti,tij,tj->", pull, np.linalg.inv(problem.covs), pull)
+    size = problem.z.size
+    sighted = 0.5 * best.rms_sigmas**2 * size
+    assert sighted + moved == pytest.approx(optimum.error, rel=1e-6)
+    log_norm = 0.5 * np.linalg.slogdet(2 * np.pi * problem.cov_z)[1].sum()
+    assert best.log_likelihood == pytest.approx(-sighted - log_norm)
+
+
+def _pairs(estimate):
+    return estimate.world_from_body[:-1], estimate.world_from_body[1:]
+
+
+def test_a_pose_is_compared_with_what_was_known_then(linear_run):
+    problem = problem_of(linear_run)
+    part = first_steps(problem, 4)
+    assert len(part.stamps_ns) == 4 and len(part.deltas) == 3 and part.steps.max() == 3
+    then = solve_problem(part, of_run(linear_run).world_from_body[:4])
+    later = solve_problem(problem, of_run(linear_run).world_from_body)
+    spread = [np.trace(one.estimate.cov_poses[3]) for one in (then, later)]
+    assert spread[0] > 1.1 * spread[1]
+
+
+def test_a_folder_tells_the_same_as_the_run(linear_run, folder):
+    direct, stored = compare_run(linear_run, instants=0), compare_folder(folder, instants=0)
+    assert stored.path.rmse == pytest.approx(direct.path.rmse)
+    for name in ("keys", "sigmas", "kullback_leibler"):
+        assert getattr(stored.landmarks, name) == pytest.approx(getattr(direct.landmarks, name))
+    progress = linear_run.progress
+    stamps = np.array([frame.stamp_ns for frame in linear_run.log.frames])
+    save_arrays(folder / "trajectory.npz", {"stamps_ns": stamps, "mean": progress.mean, "cov": progress.cov})
+    with_poses = compare_folder(folder)
+    assert with_poses.poses.sigmas == pytest.approx(compare_run(linear_run).poses.sigmas)
+    text = json.dumps(with_poses.as_dict(), allow_nan=False)
+    assert json.loads(text)["landmarks"]["count"] == 5
+
+
+def test_a_folder_with_poses_alone_has_no_covariances_to_compare(folder):
+    (folder / "trajectory.npz").unlink(missing_ok=True)
+    estimate = read_path_and_map(folder)
+    assert estimate.cov_poses.shape == (0, 3, 3)
+    assert len(compare_folder(folder).poses) == 0
+
+
+def test_known_points_make_one_world_of_filter_and_batch():
+    log = scene(frames=8, points=20, known=6, noise_px=1.0)
+    isotropic = [replace(f, cov_z=np.tile(np.eye(2), (len(f.z), 1, 1))) for f in log.frames]
+    done = run_features(replace(log, frames=isotropic), MonoConfig(particles=200))
+    found = compare_run(done, instants=1)
+    assert found.gauge == SAME and found.scale == 1.0
+    assert found.poses.dims == 6 and found.landmarks.dims == 3
+    assert len(found.poses) == 1
+    assert found.poses.sigmas.max() < 5.0
+    assert found.path.rmse < 0.1
+
+
+def camera_problem():
+    """A log without known points, and its optimum as if a filter had found it, in another scale."""
+    log = replace(scene(frames=7, points=18, known=0, seed=3), known=None)
+    optimum = solve_problem(log, log.truth.world_from_camera)
+    return log, optimum.estimate
+
+
+def scaled_by(estimate, scale):
+    first = estimate.world_from_body[0, 4:]
+    poses = estimate.world_from_body.copy()
+    poses[:, 4:] = first + scale * (poses[:, 4:] - first)
+    by = np.repeat([1.0, scale], 3)
+    points = estimate.landmarks
+    moved = MapSummary(points.ids, first + scale * (points.mean - first), scale**2 * points.cov)
+    return PathAndMap(estimate.stamps_ns, poses, estimate.cov_poses * np.outer(by, by), moved)
+
+
+@pytest.mark.parametrize("std_scale", [0.0, 0.3])
+def test_without_known_points_neither_the_scale_nor_its_uncertainty_matters(std_scale):
+    log, estimate = camera_problem()
+    first = estimate.world_from_body[0, 4:]
+    out = estimate.landmarks.mean - first
+    points = replace(
+        estimate.landmarks, cov=estimate.landmarks.cov + std_scale**2 * out[:, :, None] * out[:, None]
+    )
+    along = SE3.rotation(estimate.world_from_body).mT @ (estimate.world_from_body[:, 4:] - first)[..., None]
+    covs = estimate.cov_poses.copy()
+    covs[:, 3:, 3:] += std_scale**2 * along @ along.mT
+    ours = scaled_by(replace(estimate, landmarks=points, cov_poses=covs), 2.5)
+    found = compare(ours, log)
+    assert found.gauge == SCALED
+    assert found.scale == pytest.approx(1.0, rel=1e-4)
+    assert found.path.rmse < 1e-4
+    size = [np.ptp(one.world_from_body[:, 4:], axis=0).max() for one in (found.optimum.estimate, estimate)]
+    assert size[0] == pytest.approx(2.5 * size[1], rel=1e-3)
+    assert (found.landmarks.dims, found.poses.dims) == (2, 5)
+    assert found.landmarks.sigmas.max() < 1e-2
+    assert found.poses.sigmas[-1] < 1e-2
+    assert found.landmarks.sigma_ratio == pytest.approx(np.ones(len(found.landmarks)), rel=1e-3)
+    assert found.poses.sigma_ratio[-1] == pytest.approx(1.0, rel=1e-3)
+
+
+def test_the_scale_of_a_path_is_found_and_applied():
+    _, estimate = camera_problem()
+    ours = scaled_by(estimate, 2.5)
+    assert scale_onto(ours, estimate, "here") == pytest.approx(0.4)
+    back = rescaled(ours, 0.4)
+    for name in ("world_from_body", "cov_poses"):
+        assert getattr(back, name) == pytest.approx(getattr(estimate, name))
+    for name in ("mean", "cov"):
+        assert getattr(back.landmarks, name) == pytest.approx(getattr(estimate.landmarks, name))
+
+
+def test_a_covariance_is_carried_to_the_chart_at_the_other_pose():
+    _, estimate = camera_problem()
+    far = np.array([0.4, -0.3, 0.5, 0.2, 0.1, -0.3])
+    there = SE3.retract(estimate.world_from_body[-1:], far)
+    cov = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]) + 0.5
+    estimate = replace(estimate, cov_poses=np.repeat(cov[None], 7, axis=0))
+    other = replace(estimate, world_from_body=np.concatenate([estimate.world_from_body[:-1], there]))
+    found = compare_last_pose(estimate, other, 6, across=False)
+    rng, mean = np.random.default_rng(0), estimate.world_from_body[-1]
+    factor = 1e-3 * np.linalg.cholesky(cov)
+    samples = SE3.local(there[0], SE3.retract(mean, rng.normal(size=(20_000, 6)) @ factor.T))
+    delta = SE3.local(there[0], mean)
+    spread = 1e6 * np.einsum("ki,kj->ij", samples - delta, samples - delta) / len(samples)
+    assert np.abs(spread - cov).max() > 0.3, "the two charts must differ for this to be a test"
+    assert found.sigmas[0] == pytest.approx(np.sqrt(delta @ np.linalg.solve(spread, delta)), rel=0.03)
+    assert found.distances_m[0] == pytest.approx(np.linalg.norm(there[0, 4:] - mean[4:]))
+
+
+def test_a_camera_that_stays_has_no_scale():
+    log, estimate = camera_problem()
+    still = np.repeat(estimate.world_from_body[:1], len(estimate.stamps_ns), axis=0)
+    with pytest.raises(InputError, match=r"gauge|one place"):
+        compare(replace(estimate, world_from_body=still), log)
+
+
+def test_a_run_over_images_is_read_from_its_folder(tmp_path):
+    log, estimate = camera_problem()
+    write_features(tmp_path, log)
+    write_tum(tmp_path / "trajectory.tum", Trajectory(estimate.stamps_ns, estimate.world_from_body))
+    rays = np.arange(len(estimate.landmarks.ids)) < 2
+    write_map(tmp_path, estimate.landmarks, {"ray": rays.astype(int)})
+    config = {"rbpf": _version(), "system": "mono", "recording": "somewhere"}
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(config))
+    assert len(read_problem(tmp_path).frames) == len(log.frames)
+    found = compare_folder(tmp_path)
+    assert found.path.rmse < 1e-4
+    assert len(found.landmarks) == len(rays) - 2
+
+
+def _version():
+    from rbpf import __version__
+
+    return __version__
+
+
+@pytest.mark.parametrize(
+    ("spoil", "says"),
+    [
+        (lambda f: shutil.rmtree(f), "holds no config.yaml"),
+        (lambda f: (f / "config.yaml").write_text("a: 1"), "expected the settings of a run"),
+        (
+            lambda f: (f / "config.yaml").write_text("rbpf: 99.1.0\nsystem: mono"),
+            "was written by rbpf 99.1.0",
+        ),
+        (lambda f: (f / "config.yaml").write_text("{"), "cannot be read"),
+        (lambda f: (f / "observations.csv").unlink(), "holds no observations.csv"),
+        (lambda f: (f / "map.npz").unlink(), "holds no map.npz"),
+        (lambda f: save_arrays(f / "map.npz", {"id": np.arange(2)}), "found no mean"),
+    ],
+)
+def test_a_folder_that_is_no_finished_run_is_refused(folder, spoil, says):
+    spoil(folder)
+    with pytest.raises(InputError, match=says):
+        compare_folder(folder)
+
+
+def test_path_and_measurements_of_different_runs_are_refused(linear_run):
+    filtered, problem = of_run(linear_run), problem_of(linear_run)
+    later = replace(filtered, stamps_ns=filtered.stamps_ns + 1)
+    with pytest.raises(InputError, match="do not share their time stamps"):
+        compare(later, problem)
+    with pytest.raises(InputError, match="2 steps, expected 3"):
+        compare(filtered.at(np.arange(2)), first_steps(problem, 2))

@@ -1,0 +1,221 @@
+"""Reconstructions from scratch: rendered worlds, photos with measured poses, a kitchen; and those that must fail."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rbpf.errors import InputError
+from rbpf.lie import SE3
+from rbpf.sensors.features import CameraTruth
+from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+from rbpf.sensors.readers.images import open_images
+from rbpf.validation.against_colmap import compare_folder_with_colmap, compare_with_colmap
+from rbpf.validation.cloud_distance import cloud_distance
+from rbpf.validation.colmap_compare import compare_with_path, compare_with_truth
+from rbpf.validation.colmap_pipeline import ReconstructionOptions
+from rbpf.validation.colmap_reconstruct import Reconstruction, reconstruct
+from rbpf.validation.map_summary import MapSummary
+from rbpf.validation.path_and_map import PathAndMap
+from rbpf.validation.simulation.exposure import Imaging
+from rbpf.validation.simulation.images import simulate_images
+from rbpf.validation.simulation.textured_desk import TexturedDesk
+from rbpf.validation.trajectory import Trajectory
+from tests.systems import plane_sequences
+
+CAMERA = Pinhole(320, 240, 260.0, 260.0, 159.5, 119.5)
+FEW = ReconstructionOptions(every=1, features=800)
+
+
+def rendered(folder, frames, camera=CAMERA, every=15):
+    """Frames of a desk, far enough apart to be key frames."""
+    simulate_images(
+        TexturedDesk(frames=frames, texel_m=0.004), Imaging(known=0, noise_std=1.0), camera, folder, seed=2
+    )
+    return open_images(folder), replace(FEW, every=every)
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory):
+    return rendered(tmp_path_factory.mktemp("colmap") / "desk", 150)
+
+
+@pytest.fixture(scope="module")
+def found(desk):
+    return reconstruct(*desk)
+
+
+def made(points=None, metric=False, scale=1.0):
+    """A reconstruction of a known path, by hand."""
+    rng = np.random.default_rng(0)
+    poses = SE3.exp(np.cumsum(rng.normal(scale=0.1, size=(8, 6)), axis=0))
+    poses[:, 4:] *= scale
+    cloud = rng.uniform(-1, 1, (200, 3)) * scale if points is None else points
+    count = np.arange(8)
+    zeros = np.zeros(len(cloud))
+    return Reconstruction(
+        "by hand", CAMERA, count, count, 1_000 * count, poses, cloud, zeros, zeros.astype(int), metric, None
+    )
+
+
+@pytest.mark.slow
+def test_a_rendered_desk_is_reconstructed_and_is_right(desk, found):
+    sequence, _ = desk
+    assert found.share >= 0.9
+    compared = compare_with_truth(found, sequence.truth)
+    assert compared.path.rmse < 0.01 * compared.extent_m
+    assert len(found.points) > 100
+    assert found.as_dict()["reprojection_error_mean_px"] < 1.0
+
+
+@pytest.mark.slow
+def test_the_same_seed_gives_the_same_reconstruction(desk, found):
+    again = reconstruct(*desk)
+    assert (again.world_from_camera == found.world_from_camera).all()
+    assert (again.points == found.points).all()
+
+
+@pytest.mark.slow
+def test_a_stereo_pair_tells_the_scale(tmp_path):
+    sequence, options = rendered(tmp_path / "pair", 90, RectifiedStereo(CAMERA, 0.12))
+    found = reconstruct(sequence, options, tmp_path / "work")
+    compared = compare_with_truth(found, sequence.truth)
+    assert found.metric and compared.as_dict()["alignment"] == "rigid"
+    assert compared.path.rmse < 0.02 * compared.extent_m
+    free = compare_with_truth(replace(found, metric=False), sequence.truth)
+    assert free.path.alignment.scale == pytest.approx(1.0, abs=0.02)
+    assert (tmp_path / "work" / "images" / "000000_1.png").exists()
+
+
+def test_paths_are_compared_after_the_alignment_that_the_scale_asks_for():
+    truth = made()
+    moved = made(scale=3.0)
+    reference = Trajectory(truth.stamps_ns, truth.world_from_camera)
+    similar = compare_with_path(moved, reference)
+    assert similar.path.rmse < 1e-12
+    assert similar.reference_from_colmap.scale == pytest.approx(1 / 3)
+    rigid = compare_with_path(replace(moved, metric=True), reference)
+    assert rigid.path.rmse > 0.1
+    assert rigid.as_dict()["scale"] == 1.0
+
+
+def test_landmarks_are_brought_to_the_cloud():
+    ours = made()
+    landmarks = ours.points[::4] + np.array([0.01, 0.0, 0.0])
+    reference = Trajectory(ours.stamps_ns, ours.world_from_camera)
+    cloud = compare_with_path(made(scale=5.0), reference, landmarks).cloud
+    assert cloud.nearest_m == pytest.approx(np.full(50, 0.01), rel=1e-6)
+    gaps = np.linalg.norm(ours.points[:, None] - ours.points, axis=-1) + 1e9 * np.eye(200)
+    assert cloud.as_dict()["cloud_spacing_median_m"] == pytest.approx(np.median(gaps[::4].min(axis=1)))
+    assert "surface_median_sigmas" not in cloud.as_dict()
+
+
+def test_the_distance_from_a_surface_does_not_depend_on_how_sparse_the_cloud_is():
+    rng, turn = np.random.default_rng(1), SE3.rotation(SE3.exp(np.array([0.3, 0.5, -0.2, 0.0, 0.0, 0.0])))
+    wall = np.column_stack([rng.uniform(-1, 1, (300, 2)), np.zeros(300)])
+    landmarks = np.column_stack([rng.uniform(-0.8, 0.8, (40, 2)), np.full(40, 0.01)])
+    cov = turn @ np.diag([1.0, 1.0, 0.02]) ** 2 @ turn.T
+    found = cloud_distance(wall @ turn.T, landmarks @ turn.T, np.repeat(cov[None], 40, axis=0))
+    assert found.surface_m == pytest.approx(np.full(40, 0.01), rel=1e-6)
+    assert found.sigmas == pytest.approx(np.full(40, 0.5), rel=1e-6)
+    assert np.median(found.nearest_m) > 0.02
+    assert found.as_dict()["share_within_3_sigmas"] == 1.0
+
+
+def test_a_straight_path_does_not_let_the_cloud_roll_about_it():
+    rng, ours = np.random.default_rng(2), made()
+    poses = ours.world_from_camera.copy()
+    poses[:, 4:] = np.linspace(0.0, 0.3, 8)[:, None] * [1.0, 0.5, 0.2]
+    reference = Trajectory(ours.stamps_ns, poses)
+    shaken = poses + np.pad(rng.normal(scale=1e-3, size=(8, 3)), ((0, 0), (4, 0)))
+    turn = SE3.exp(np.array([0.5, -1.0, 0.3, 1.0, 2.0, 3.0]))
+    world = replace(
+        ours, world_from_camera=SE3.compose(turn, shaken), points=SE3.transform(turn, ours.points)
+    )
+    moved = compare_with_path(world, reference, ours.points)
+    by_cameras, by_centres = (
+        np.linalg.norm(move.transform(world.points) - ours.points, axis=1).max()
+        for move in (moved.reference_from_colmap, moved.path.alignment)
+    )
+    assert by_cameras < 0.03
+    assert by_centres > 3.0 * by_cameras, "the centres alone leave the roll open"
+    assert moved.reference_from_colmap.scale == pytest.approx(1.0, abs=0.03)
+
+
+def test_one_wild_landmark_does_not_move_the_summary():
+    ours = made()
+    landmarks = ours.points[:40] + 1e-3
+    wild = np.vstack([landmarks, [[99.0] * 3]])
+    calm, moved = (cloud_distance(ours.points, points).as_dict() for points in (landmarks, wild))
+    assert moved["nearest_median_m"] == pytest.approx(calm["nearest_median_m"])
+    assert moved["surface_p90_m"] < 2.0 * calm["surface_p90_m"]
+
+
+def test_what_cannot_be_compared_is_refused():
+    ours = made()
+    with pytest.raises(InputError, match="has no ground truth"):
+        compare_with_truth(ours, None)
+    late = CameraTruth(ours.stamps_ns + 10**12, ours.world_from_camera)
+    with pytest.raises(InputError, match="covers 0 of 8 key frames"):
+        compare_with_truth(ours, late)
+    with pytest.raises(InputError, match="same clock"):
+        compare_with_path(ours, Trajectory(ours.stamps_ns + 10**12, ours.world_from_camera))
+    with pytest.raises(InputError, match="share 2 instants"):
+        compare_with_path(ours, Trajectory(ours.stamps_ns[:2], ours.world_from_camera[:2]))
+    with pytest.raises(InputError, match="3 or more points"):
+        cloud_distance(ours.points[:2], ours.points)
+
+
+def test_too_few_key_frames_are_refused():
+    sequence = plane_sequences.sequence(5)
+    with pytest.raises(InputError, match="has 1 readable key frames of 5 images, expected 3"):
+        reconstruct(sequence, ReconstructionOptions(every=10))
+    dark = plane_sequences.sequence(4, lambda t, image: None if t % 2 else image)
+    with pytest.raises(InputError, match="has 2 readable key frames"):
+        reconstruct(dark, FEW)
+
+
+def test_images_without_features_cannot_be_reconstructed():
+    dark = plane_sequences.sequence(3, lambda t, image: np.zeros_like(image))
+    with pytest.raises(InputError, match=r"found no reconstruction of plane from 3 key frames"):
+        reconstruct(dark, FEW)
+
+
+@pytest.mark.parametrize(
+    "change", [{"every": 0}, {"features": 0}, {"overlap": 0}, {"threads": 0}, {"seed": -1}]
+)
+def test_options_that_make_no_sense_are_refused(change):
+    with pytest.raises(InputError, match=next(iter(change))):
+        ReconstructionOptions(**change)
+
+
+def test_a_run_without_images_is_refused(tmp_path):
+    from rbpf import __version__
+
+    (tmp_path / "config.yaml").write_text(f"rbpf: {__version__}\nsystem: range-bearing\n")
+    with pytest.raises(InputError, match="sees no images"):
+        compare_folder_with_colmap(tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.real_data
+def test_photos_with_measured_poses_are_met_within_one_per_cent(data_dir):
+    sequence = open_images(data_dir / "photos_fountain_p11")
+    found = reconstruct(sequence, ReconstructionOptions(every=1, features=2000))
+    compared = compare_with_truth(found, sequence.truth)
+    assert found.share == 1.0
+    assert compared.path.max < 0.01 * compared.extent_m
+    assert compared.path.rmse < 0.01, "a laser scanner's truth is good to a centimetre"
+
+
+@pytest.mark.slow
+@pytest.mark.real_data
+def test_the_kitchen_is_reconstructed_as_well_as_by_the_reference(data_dir):
+    sequence = open_images(data_dir / "mono_redkitchen_a")
+    truth = sequence.truth
+    points = MapSummary(np.arange(2), np.zeros((2, 3)), np.repeat(np.eye(3)[None], 2, axis=0))
+    estimate = PathAndMap(truth.stamps_ns, truth.world_from_camera, np.empty((0, 6, 6)), points)
+    compared = compare_with_colmap(estimate, sequence, ReconstructionOptions(every=5, features=2048))
+    assert compared.run.reconstruction.share >= 0.9
+    assert compared.truth.path.rmse < 0.05, "the reference reconstruction is 0.038 m from this truth"
+    assert compared.run.path.rmse == pytest.approx(compared.truth.path.rmse, rel=0.05)

@@ -1,0 +1,143 @@
+"""Runs as COLMAP models and PLY files, read back by COLMAP and by hand."""
+
+from dataclasses import replace
+
+import numpy as np
+import pycolmap
+import pytest
+
+from rbpf.errors import InputError
+from rbpf.lie import SE3
+from rbpf.systems.range_bearing.config import RangeBearingConfig
+from rbpf.systems.range_bearing.run import run
+from rbpf.validation.batch_problem import problem_of
+from rbpf.validation.colmap_frames import from_colmap_pose
+from rbpf.validation.colmap_model import LEFT, RIGHT, build_model, image_id, image_name
+from rbpf.validation.colours import colours_by_sigma, standard_deviations
+from rbpf.validation.export import MAP, PATH, colmap_model, export_colmap, export_ply
+from rbpf.validation.gtsam_ba_camera_data import sightings_of
+from rbpf.validation.gtsam_ba_camera_factors import evaluate_sightings
+from rbpf.validation.map_summary import MapSummary
+from rbpf.validation.path_and_map import PathAndMap, of_run
+from rbpf.validation.ply import read_ply, write_ply
+from tests.validation.camera_scenes import BENT, STEREO, scene
+from tests.validation.linear_worlds import linear_log
+
+
+def estimate_of(log, names=None):
+    """The truth as an estimate; landmarks in another order than their names'."""
+    names = list(log.truth.landmarks) if names is None else names
+    stamps = np.array([frame.stamp_ns for frame in log.frames])
+    std = np.linspace(0.01, 0.2, len(names))
+    points = np.array([log.truth.landmarks[name] for name in names])
+    summary = MapSummary(np.array(names), points, std[:, None, None] ** 2 * np.eye(3))
+    return PathAndMap(stamps, log.truth.world_from_camera, np.empty((0, 6, 6)), summary)
+
+
+def reprojection_errors(model):
+    """Distances (px) by image and landmark, from COLMAP's own projection."""
+    found = {}
+    for image in model.images.values():
+        for point2 in image.points2D:
+            if point2.has_point3D():
+                projected = image.project_point(model.point3D(point2.point3D_id).xyz)
+                found[image.name, point2.point3D_id] = np.linalg.norm(projected - point2.xy)
+    return found
+
+
+@pytest.mark.parametrize("kind", ["binary", "text"])
+def test_a_model_read_back_by_colmap_has_our_poses_points_tracks_and_residuals(tmp_path, kind):
+    log = scene(camera=BENT, frames=5, points=12, known=3)
+    estimate = estimate_of(log)
+    export_colmap(estimate, log, tmp_path / "model", kind)
+    model = pycolmap.Reconstruction(tmp_path / "model")
+    assert model.num_images() == 5 and model.num_points3D() == 12
+    for t, pose in enumerate(log.truth.world_from_camera):
+        image = model.find_image_with_name(image_name(t))
+        assert SE3.local(pose, from_colmap_pose(image.cam_from_world())) == pytest.approx(
+            np.zeros(6), abs=1e-12
+        )
+    table = sightings_of(log)
+    points = np.array([log.truth.landmarks[name] for name in table.names.tolist()])
+    ours = np.linalg.norm(evaluate_sightings(table, log.truth.world_from_camera, points)[0], axis=1)
+    theirs = reprojection_errors(model)
+    assert len(theirs) == len(ours)
+    ids = estimate.landmarks.ids.tolist()
+    for row, (step, index) in enumerate(zip(table.steps.tolist(), table.index.tolist(), strict=True)):
+        key = image_name(step), ids.index(int(table.names[index])) + 1
+        assert theirs[key] == pytest.approx(ours[row], abs=1e-9)
+
+
+def test_landmarks_that_the_map_lacks_are_left_out():
+    log = scene(frames=4, points=12)
+    some = sorted(log.truth.landmarks)[::2]
+    model = colmap_model(estimate_of(log, some), log)
+    assert model.num_points3D() == len(some)
+    seen = sum(int(np.isin(frame.landmarks, some).sum()) for frame in log.frames)
+    assert model.compute_num_observations() == seen
+
+
+def test_a_stereo_pair_is_a_rig_whose_right_camera_sees_what_was_measured():
+    log = scene(camera=STEREO, frames=3, points=8, noise_px=1e-7)
+    table = sightings_of(log)
+    points = np.array([log.truth.landmarks[name] for name in table.names.tolist()])
+    model = build_model(table, log.truth.world_from_camera, points)
+    assert model.num_rigs() == 1 and model.num_frames() == 3 and model.num_images() == 6
+    assert max(reprojection_errors(model).values()) < 1e-5
+    left, right = (model.image(image_id(1, side, True)) for side in (LEFT, RIGHT))
+    gap = from_colmap_pose(right.cam_from_world())[4:] - from_colmap_pose(left.cam_from_world())[4:]
+    assert np.linalg.norm(gap) == pytest.approx(STEREO.baseline_m)
+
+
+def test_a_robot_gets_a_nominal_camera_that_looks_ahead(tmp_path):
+    done = run(linear_log(steps=5), RangeBearingConfig(particles=10))
+    estimate = of_run(done)
+    model = export_colmap(estimate, problem_of(done), tmp_path / "model")
+    image = model.image(image_id(2))
+    assert image.projection_center() == pytest.approx([*estimate.world_from_body[2, 1:], 0.0])
+    heading = estimate.world_from_body[2, 0]
+    assert image.viewing_direction() == pytest.approx([np.cos(heading), np.sin(heading), 0.0], abs=1e-9)
+    assert export_ply(estimate, tmp_path) == [MAP, PATH]
+    assert read_ply(tmp_path / MAP)["vertex"]["z"] == pytest.approx(np.zeros(5))
+
+
+def test_maps_and_paths_are_whole_ply_files(tmp_path):
+    log = scene(frames=4, points=10)
+    estimate = estimate_of(log)
+    export_ply(estimate, tmp_path)
+    vertices = read_ply(tmp_path / MAP)["vertex"]
+    places = np.stack([vertices[axis] for axis in "xyz"], axis=1)
+    assert places == pytest.approx(estimate.landmarks.mean, abs=1e-6)
+    assert vertices["sigma_m"] == pytest.approx(np.linspace(0.01, 0.2, 10), rel=1e-6)
+    path = read_ply(tmp_path / PATH)
+    assert len(path["vertex"]) == 4
+    assert [tuple(edge) for edge in path["edge"].tolist()] == [(0, 1), (1, 2), (2, 3)]
+    reread = pycolmap.Reconstruction()
+    reread.import_PLY(tmp_path / MAP)
+    assert reread.num_points3D() == 10
+
+
+def test_colours_tell_the_certain_from_the_uncertain():
+    colours = colours_by_sigma(np.geomspace(1e-3, 1.0, 9)).astype(int)
+    assert (np.diff(colours.sum(axis=1)) > 0).all()
+    assert (colours[0], colours[-1]) == (pytest.approx([13, 8, 135]), pytest.approx([240, 249, 33]))
+    assert colours_by_sigma(np.full(3, 0.1)).shape == (3, 3)
+    assert colours_by_sigma(np.zeros(0)).shape == (0, 3)
+    assert standard_deviations(np.diag([1.0, 4.0, 4.0])) == pytest.approx(np.sqrt(3.0))
+
+
+def test_bad_input_is_refused(tmp_path):
+    log = scene(frames=4, points=8)
+    shorter = replace(log, frames=log.frames[:3])
+    with pytest.raises(InputError, match="4 poses and 3 frames"):
+        colmap_model(estimate_of(log), shorter)
+    with pytest.raises(InputError, match="row 1"):
+        write_ply(
+            tmp_path / "a.ply", np.array([[0, 0, 0], [0, np.nan, 0.0]]), np.zeros((2, 3), dtype=np.uint8)
+        )
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "b.ply").write_text("ply\nformat ascii 1.0\nend_header\n")
+    with pytest.raises(InputError, match="binary little-endian"):
+        read_ply(tmp_path / "b.ply")
+    with pytest.raises(InputError, match="cannot be read"):
+        read_ply(tmp_path / "c.ply")

@@ -1,0 +1,154 @@
+"""How much worse than the batch optimum of the same measurements the filter is, recording by recording.
+
+The filter's error is that of its online means over all instants with a true pose, the batch's that of the optimum over
+those that took part. Both after a rigid alignment, by a similarity where nothing measures the scale.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+
+from rbpf.errors import InputError
+from rbpf.sensors.readers import open_log
+from rbpf.systems.mono.config import MonoConfig
+from rbpf.systems.range_bearing.config import RangeBearingConfig
+from rbpf.systems.range_bearing.run import Run, run
+from rbpf.validation.accuracy import ate
+from rbpf.validation.alignment import Alignment
+from rbpf.validation.batch_problem import Optimum, floats_in_scale, problem_of, solve_problem
+from rbpf.validation.mono import Recording, start_mono
+from rbpf.validation.mono_scores import true_path
+from rbpf.validation.path_and_map import AnyRun, PathAndMap, of_run
+from rbpf.validation.scores import as_trajectory, truth_at
+from rbpf.validation.trajectory import Trajectory, associate
+
+HEADER = ("recording", "particles", "seeds", "filter_m", "least_m", "most_m", "batch_m", "ratio")
+"""Of a table of `ErrorRatio.row`."""
+
+ROBUST = 1.345
+"""Huber's threshold for a camera's batch, which no wrong match may spoil, in standard deviations."""
+
+LEAST = 3
+"""Instants with a true pose that an alignment needs."""
+
+
+@final
+@dataclass(frozen=True)
+class ErrorRatio:
+    """Errors of filter and batch on one recording.
+
+    Attributes:
+        recording: its name.
+        particles: of the filter.
+        filter_errors_m: root mean square position error of each seed.
+        batch_errors_m: of the optimum of each seed's measurements.
+        alignment: before both.
+    """
+
+    recording: str
+    particles: int
+    filter_errors_m: tuple[float, ...]
+    batch_errors_m: tuple[float, ...]
+    alignment: Alignment
+
+    @property
+    def ratio(self) -> float:
+        """Median over the seeds of the filter's error over the batch's."""
+        return float(np.median(np.divide(self.filter_errors_m, self.batch_errors_m)))
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return asdict(self) | {"ratio": self.ratio}
+
+    def row(self) -> tuple[str, int, int, float, float, float, float, float]:
+        """For a table with `HEADER`."""
+        ours = self.filter_errors_m
+        middle, batch = float(np.median(ours)), float(np.median(self.batch_errors_m))
+        return self.recording, self.particles, len(ours), middle, min(ours), max(ours), batch, self.ratio
+
+
+def robot_ratio(recording: Path, config: RangeBearingConfig, seeds: Sequence[int] = (0,)) -> ErrorRatio:
+    """Filters a robot's log with each seed, and solves its batch problem.
+
+    Raises:
+        InputError: the recording is wrong, or has too little ground truth.
+    """
+    log = open_log(recording, config.noise)
+    errors = _over_seeds(lambda seed: run(log, _seeded(config, seed)), _robot_truth, seeds)
+    return ErrorRatio(log.name, config.particles, *errors, "rigid")
+
+
+def camera_ratio(recording: Recording, config: MonoConfig, seeds: Sequence[int] = (0,)) -> ErrorRatio:
+    """Filters a sequence of images with each seed, and adjusts what each measured in batch.
+
+    Raises:
+        InputError: the recording is wrong, or has too little ground truth.
+    """
+    name, known = recording.images.resolve().name, recording.known_points is not None
+
+    def truth(found: AnyRun) -> Trajectory:
+        assert not isinstance(found, Run) and hasattr(found, "sequence")
+        at = true_path(found.sequence.truth, found.stamps_ns)
+        if at is None:
+            raise InputError(
+                f"{name} has no ground truth to tell the errors by, or less than {LEAST} poses of it."
+            )
+        return Trajectory(found.stamps_ns[at.rows], at.world_from_camera)
+
+    errors = _over_seeds(lambda seed: start_mono(recording, _seeded(config, seed)), truth, seeds)
+    return ErrorRatio(name, config.particles, *errors, "rigid" if known else "similarity")
+
+
+def error_of(estimate: PathAndMap, truth: Trajectory, alignment: Alignment) -> float:
+    """Root mean square distance from the truth, at the instants that both have.
+
+    Raises:
+        InputError: they share none, or too few to align them.
+    """
+    ours, theirs = associate(estimate.trajectory, truth, 0)
+    if len(ours) < LEAST:
+        raise InputError(
+            f"path and truth share {len(ours)} time stamps, expected {LEAST} or more to align them."
+        )
+    return ate(ours, theirs, alignment).rmse
+
+
+def _over_seeds(
+    filtered: Callable[[int], AnyRun], truth_of: Callable[[AnyRun], Trajectory], seeds: Sequence[int]
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    ours, batch, optimum = [], [], None
+    for seed in seeds:
+        found = filtered(seed)
+        estimate, problem, truth = of_run(found), problem_of(found), truth_of(found)
+        alignment: Alignment = "similarity" if floats_in_scale(problem) else "rigid"
+        if optimum is None or not isinstance(found, Run):
+            optimum = _optimum(found, estimate)
+        ours.append(error_of(estimate, truth, alignment))
+        batch.append(error_of(optimum.estimate, truth, alignment))
+    return tuple(ours), tuple(batch)
+
+
+def _optimum(found: AnyRun, estimate: PathAndMap) -> Optimum:
+    robust = None if isinstance(found, Run) else ROBUST
+    return solve_problem(problem_of(found), estimate.world_from_body, robust, marginals=False)
+
+
+def _robot_truth(found: AnyRun) -> Trajectory:
+    assert isinstance(found, Run)
+    log = found.log
+    if log.truth is None:
+        raise InputError(f"{log.name} has no ground truth to tell the errors by.")
+    stamps = np.array([frame.stamp_ns for frame in log.frames], dtype=np.int64)
+    rows, poses = truth_at(log.space, log.truth, stamps)
+    if len(rows) < LEAST:
+        raise InputError(
+            f"The ground truth of {log.name} covers {len(rows)} of its steps, expected {LEAST} or more."
+        )
+    return as_trajectory(log, stamps[rows], poses)
+
+
+def _seeded(config: Any, seed: int) -> Any:
+    return replace(config, seed=seed)
