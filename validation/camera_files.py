@@ -63,7 +63,9 @@ def write_features(folder: Path, log: FeatureLog) -> None:
     assert isinstance(log.camera, Pinhole)
     stamps = np.array([frame.stamp_ns for frame in log.frames], dtype=np.int64)
     steps = np.repeat(np.arange(stamps.size), [frame.landmarks.size for frame in log.frames])
-    names, z, cov = (np.concatenate([getattr(f, part) for f in log.frames]) for part in ("landmarks", "z", "cov_z"))
+    names, z, cov = (
+        np.concatenate([getattr(f, part) for f in log.frames]) for part in ("landmarks", "z", "cov_z")
+    )
     camera = log.camera
     header = {
         "space": "SE3",
@@ -73,7 +75,14 @@ def write_features(folder: Path, log: FeatureLog) -> None:
     }
     numbers = np.concatenate([z, gaussian.pack(cov)], axis=1)
     _write(folder, OBSERVATIONS, log.name, header, np.stack([steps, stamps[steps], names], axis=1), numbers)
-    _write(folder, FRAMES, log.name, {}, np.stack([np.arange(stamps.size), stamps], axis=1), np.empty((stamps.size, 0)))
+    _write(
+        folder,
+        FRAMES,
+        log.name,
+        {},
+        np.stack([np.arange(stamps.size), stamps], axis=1),
+        np.empty((stamps.size, 0)),
+    )
     (folder / KNOWN).unlink(missing_ok=True)
     if log.known is not None:
         numbers = np.concatenate([log.known.positions, gaussian.pack(log.known.cov)], axis=1)
@@ -92,7 +101,9 @@ def read_features(folder: Path) -> FeatureLog:
     stamps = _read_frames(folder, seen.text("recording"))
     integers, numbers = seen.body(_COLUMNS[OBSERVATIONS], 3)
     steps = integers[:, 0]
-    seen.require((steps >= 0) & (steps < stamps.size), f"a step from 0 to {stamps.size - 1}, the last in {FRAMES}")
+    seen.require(
+        (steps >= 0) & (steps < stamps.size), f"a step from 0 to {stamps.size - 1}, the last in {FRAMES}"
+    )
     seen.require(integers[:, 1] == stamps[steps], f"the stamp that {FRAMES} gives this step")
     seen.require(np.diff(steps, prepend=0) >= 0, "steps in order")
     cuts = np.searchsorted(steps, np.arange(1, stamps.size))
@@ -120,7 +131,9 @@ def _write(
 def _read_frames(folder: Path, recording: str) -> np.ndarray:
     table = HeadedTable.read(folder / FRAMES, TITLES[FRAMES], _HINT)
     if table.text("recording") != recording:
-        problem = f"expected recording {recording} as in {OBSERVATIONS}, found {quoted(table.text('recording'))}"
+        problem = (
+            f"expected recording {recording} as in {OBSERVATIONS}, found {quoted(table.text('recording'))}"
+        )
         raise table.header_error("recording", f"{problem}; take both files from one run")
     integers, _ = table.body(_COLUMNS[FRAMES], 2)
     table.require(integers[:, 0] == np.arange(len(integers)), "one row per frame, from step 0 in order")

@@ -14,9 +14,10 @@ from rbpf.errors import InputError
 from rbpf.sensors.features import FeatureLog
 from rbpf.systems.mono.video import VideoRun
 from rbpf.validation.accuracy import ate
+from rbpf.validation.alignment import Alignment
 from rbpf.validation.gtsam_ba_camera import CameraEstimate, CameraSolution, solve_features
 from rbpf.validation.mono_log import feature_log
-from rbpf.validation.mono_scores import score_path
+from rbpf.validation.mono_scores import score_path, usual_alignment
 from rbpf.validation.trajectory import Trajectory
 
 ROBUST = 1.345
@@ -97,9 +98,9 @@ def score_batch(run: VideoRun, batch: Batch) -> dict[str, Any]:
     Without known points scale and place are the filter's own, so that it is compared after a similarity alignment.
     """
     trajectory = batch.trajectory
-    scores = score_path(run.sequence.truth, trajectory, run.known is not None)
+    scores = score_path(run.sequence.truth, trajectory, usual_alignment(run))
     ours = Trajectory(trajectory.stamps_ns, run.world_from_camera[batch.frames])
-    how = "none" if run.known is not None else "similarity"
+    how: Alignment = "none" if run.known is not None else "similarity"
     return {
         "batch_frames": int(batch.frames.size),
         "batch_observations": int(sum(frame.landmarks.size for frame in batch.log.frames)),

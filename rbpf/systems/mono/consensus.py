@@ -2,8 +2,12 @@
 
 A false match inside its search ellipse is not seen to be false before the pose is known, and then it is too late. The
 increment ε ~ N(0, Q) of the heaviest particle's pose is fitted to all matches with a Cauchy loss on their Mahalanobis
-distances (iteratively reweighted least squares); matches that stay far off take no part in the filter's step.
+distances (iteratively reweighted least squares); matches that stay far off take no part in the filter's step. The fit
+also tells where what was not found should be seen: among things that look alike (the corners of a chessboard, a row of
+windows) the right one is then nearest.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,15 +18,28 @@ SCALE = 2.0
 """Of the loss: a match this many standard deviations off keeps half of its weight."""
 
 
-def agreeing(nu: np.ndarray, jac: np.ndarray, cov: np.ndarray, factor: np.ndarray, gate: float) -> np.ndarray:
-    """Which of K matches agree, (K,) bool.
+class Fit(NamedTuple):
+    """A motion that most of K matches agree on, ε = L u.
+
+    Attributes:
+        squared: (K,) squared Mahalanobis distance of each match from it.
+        increment: (d,) ε.
+        cov: (d, d) of ε.
+    """
+
+    squared: np.ndarray
+    increment: np.ndarray
+    cov: np.ndarray
+
+
+def fit_motion(nu: np.ndarray, jac: np.ndarray, cov: np.ndarray, factor: np.ndarray) -> Fit:
+    """The motion that K matches agree on.
 
     Args:
         nu: (K, p) innovations at the predicted pose.
         jac: (K, p, d) by the pose, H.
         cov: (K, p, p) of the innovations given the pose, S = J P Jᵀ + R.
         factor: (d, r) of the prior's covariance, Q = L Lᵀ.
-        gate: on the squared Mahalanobis distance that is left, χ² with p degrees of freedom.
     """
     chol = gaussian.cholesky(cov)
     white_nu = gaussian.solve_lower(chol, nu)
@@ -33,4 +50,4 @@ def agreeing(nu: np.ndarray, jac: np.ndarray, cov: np.ndarray, factor: np.ndarra
         info = np.eye(factor.shape[1]) + np.einsum("k,kpa,kpb->ab", weight, white_jac, white_jac)
         u = np.linalg.solve(info, np.einsum("k,kpa,kp->a", weight, white_jac, white_nu))
         squared = np.square(white_nu - white_jac @ u).sum(axis=-1)
-    return np.asarray(squared <= gate)
+    return Fit(squared, factor @ u, factor @ np.linalg.solve(info, factor.T))

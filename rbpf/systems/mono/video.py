@@ -15,7 +15,7 @@ from rbpf.sensors.features import KnownPoints
 from rbpf.sensors.readers.images import ImageFrame, ImageSequence, KnownPixels
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.image_sensor import ImageSensor
-from rbpf.systems.mono.known_start import resect_known
+from rbpf.systems.mono.known_start import require_texture, resect_known
 from rbpf.systems.mono.recovery import Recovery
 from rbpf.systems.mono.resuming import cut, restore, save
 from rbpf.systems.mono.run import pose_estimate
@@ -108,11 +108,7 @@ def run_images(
         InputError: the first image cannot be read, the known points do not determine the camera, or the checkpoint
             is of another run.
     """
-    first = next(sequence.frames(), None)
-    if first is None or first.image is None:
-        reason = "it has no image" if first is None else first.problem
-        raise InputError(f"{sequence.name}: the first image is needed to start: {reason}")
-    run, law = _begin(sequence, config, known, first.image)
+    run, law = _begin(sequence, config, known, first_image(sequence))
     if resume and checkpoint is not None and checkpoint.exists():
         restore(run, checkpoint)
     waited = time.perf_counter()
@@ -136,6 +132,19 @@ def run_images(
     return run
 
 
+def first_image(sequence: ImageSequence) -> np.ndarray:
+    """The image (H, W) that a run starts from.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    first = next(sequence.frames(), None)
+    if first is None or first.image is None:
+        reason = "it has no image" if first is None else first.problem
+        raise InputError(f"{sequence.name}: the first image is needed to start: {reason}")
+    return first.image
+
+
 def _frames_from(sequence: ImageSequence, start: int) -> Iterator[ImageFrame]:
     return sequence.frames(start) if start < len(sequence) else iter(())
 
@@ -150,6 +159,7 @@ def _begin(
         cov = known.std_m[:, None, None] ** 2 * np.eye(3)
         points = KnownPoints(np.arange(count), known.positions, cov)
         start = KnownStart(points, resect_known(sequence.camera, known, config.search.noise_px))
+        require_texture(image, known)
         if config.known == "points":
             law = PoseLaw(start.world_from_camera, start_cov(config))
     features = build_features(sequence.camera, config, None if start is None else start.points)
