@@ -16,6 +16,9 @@ from rbpf.systems.mono.viewing import affines, directions, view_changes
 _CELLS = 6
 """The image is divided into so many columns and rows, from which features are chosen in turn."""
 
+ALIKE = 0.9
+"""Of two places one may be mistaken for the other when their scores differ by less than this share."""
+
 ENOUGH = 4
 """Matches that must agree on a motion for it to say where the others are."""
 
@@ -31,6 +34,7 @@ class Searched:
         px: (K, 2) where each was found; NaN where not.
         score: (K,) normalised cross-correlation of the best match.
         found: (K,) whether it was accepted.
+        alike: (K,) whether another place in the ellipse looks about as much like it.
     """
 
     rows: np.ndarray
@@ -39,12 +43,13 @@ class Searched:
     px: np.ndarray
     score: np.ndarray
     found: np.ndarray
+    alike: np.ndarray
 
     @classmethod
     def nothing(cls) -> "Searched":
         """No feature."""
-        none, places = np.zeros(0), np.zeros((0, 2))
-        return cls(np.zeros(0, dtype=np.int64), places, np.zeros((0, 2, 2)), places, none, none.astype(bool))
+        none, places, false = np.zeros(0), np.zeros((0, 2)), np.zeros(0, dtype=bool)
+        return cls(np.zeros(0, dtype=np.int64), places, np.zeros((0, 2, 2)), places, none, false, false)
 
 
 @final
@@ -73,23 +78,22 @@ class ActiveSearch:
         cov = cov + self.config.noise_px**2 * np.eye(2)
         turn = affines(self.camera, self.table.place[rows], self.table.first_pose[rows], pose)
         templates = warp(self.table.source[rows], turn, self.config.template_px)
-        first = self._looked_for(image, templates, mean, cov)
-        searched = Searched(rows, mean, cov, *first)
+        searched = Searched(rows, mean, cov, *self._looked_for(image, templates, mean, cov))
         return self._agreeing(image, belief, templates, searched) if searched.found.any() else searched
 
     def _looked_for(
         self, image: np.ndarray, templates: np.ndarray, mean: np.ndarray, cov: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Place (K, 2), score (K,), and whether that is a match (K,)."""
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Place (K, 2), score (K,), whether that is a match (K,), and whether another place is much alike (K,)."""
         sigmas, most = self.config.sigmas, self.config.largest_px
         matches = search(image, templates, mean, cov, sigmas=sigmas, most_px=most)
         accepted = (matches.score >= self.config.accept) & self.camera.inside(matches.px)
-        return matches.px, matches.score, accepted
+        return matches.px, matches.score, accepted, matches.ratio >= ALIKE
 
     def _agreeing(
         self, image: np.ndarray, belief: Belief, templates: np.ndarray, searched: Searched
     ) -> Searched:
-        """Only matches that agree with one motion of the camera; what has none is looked for again where that says."""
+        """Only matches that agree with one motion; what was mistaken is looked for again where the motion puts it."""
         hits = np.flatnonzero(searched.found)
         which, nu, jac, cov = self._innovations(belief, searched.rows[hits], searched.px[hits])
         fit = fit_motion(nu, jac, cov, self._prior_factor(belief))
@@ -103,8 +107,8 @@ class ActiveSearch:
     def _again(
         self, image: np.ndarray, belief: Belief, templates: np.ndarray, searched: Searched, fit: Fit
     ) -> Searched:
-        """Looks for what was not found, near to where the motion that the others agree on puts it."""
-        missed = np.flatnonzero(~searched.found)
+        """Looks again for what was mistaken for its like, near to where the motion of the others puts it."""
+        missed = np.flatnonzero(searched.alike & ~searched.found)
         if not missed.size:
             return searched
         which, nu, jac, cov = self._innovations(belief, searched.rows[missed], searched.mean[missed])
@@ -112,7 +116,7 @@ class ActiveSearch:
         mean = searched.mean[missed] - nu + jac @ fit.increment
         cov = cov + jac @ fit.cov @ np.swapaxes(jac, -1, -2)
         px, score, found = searched.px.copy(), searched.score.copy(), searched.found.copy()
-        px[missed], score[missed], found[missed] = self._looked_for(image, templates[missed], mean, cov)
+        px[missed], score[missed], found[missed], _ = self._looked_for(image, templates[missed], mean, cov)
         return replace(searched, px=px, score=score, found=found)
 
     def _innovations(
