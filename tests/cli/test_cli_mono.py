@@ -12,17 +12,26 @@ import yaml
 
 from rbpf.cli import main
 from rbpf.filter import Filter
+from rbpf.lie import SE3
+from rbpf.systems.mono.config import MonoConfig
+from rbpf.systems.mono.run import run as filter_log
+from rbpf.validation.camera_files import read_features
+from rbpf.validation.gtsam_ba_camera import solve_features
+from rbpf.validation.mono_batch import ROBUST
 from rbpf.validation.trajectory_files import read_tum
 from tests.cli.mono_sequences import CAMERA, FRAMES, as_folder, render_desk
 
 FILES = {
     "trajectory.tum", "map.npz", "map.csv", "timings.csv", "diagnostics.csv", "config.yaml", "summary.json",
     "report.html", "path.png", "map.png", "particles.png", "error.png", "tracking.png", "timings.png",
+    "batch.tum", "posterior.tum", "posterior.npz", "checkpoint.npz",
+    "observations.csv", "observations_frames.csv", "observations_known_points.csv",
 }  # fmt: skip
 REQUIRED = {
     "system", "recording", "frames", "particles", "seed", "ms_per_frame", "frames_tracked", "lost_frames",
     "relocalisations", "landmarks_full", "landmarks_partial", "observations_per_frame", "ate_rmse_m",
     "ate_sim3_rmse_m", "rpe_translation_rmse_m", "rpe_rotation_rmse_deg", "peak_memory_mb",
+    "batch_frames", "batch_ate_rmse_m", "batch_ate_sim3_rmse_m", "filter_minus_batch_rmse_m",
 }  # fmt: skip
 TIMED = ("ms_per_frame", "peak_memory_mb")
 
@@ -48,6 +57,7 @@ def run(sequence, out, *arguments, known=True, video=False):
     points = Path(sequence) / "known_points.csv"
     given = ["--known-points", str(points)] if known and points.exists() else []
     shown = [] if "--video" in arguments else ["--no-video"]
+    shown += [] if {"--video", "--batch"} & set(arguments) else ["--no-batch"]
     return main(
         ["run", "mono", str(sequence), *given, "--out", str(out), "--particles", "8", *shown, *arguments]
     )
@@ -106,10 +116,48 @@ def test_the_map_is_in_that_world_and_flags_rays(desk, finished):
     assert rays.any() and largest[rays].min() > largest[rows].max()
 
 
+def test_the_measurements_are_those_that_the_filter_used(finished):
+    """Filtered again without the images, they give the same path to the last bit."""
+    log, config = read_features(finished), MonoConfig(particles=8)
+    again = filter_log(log, config)
+    told = read_tum(finished / "trajectory.tum")
+    np.testing.assert_array_equal(again.stamps_ns, told.stamps_ns)
+    np.testing.assert_allclose(again.world_from_camera, told.world_from_body, atol=1e-9)
+
+
+def test_the_batch_optimum_of_them_lies_beside(finished):
+    log, told = read_features(finished), read_tum(finished / "batch.tum")
+    plain = solve_features(log, robust=ROBUST, marginals=False)
+    np.testing.assert_allclose(told.positions, plain.world_from_camera[:, 4:], atol=1e-3)
+    entries = summary(finished)
+    assert entries["batch_frames"] == FRAMES
+    assert entries["batch_ate_sim3_rmse_m"] < 0.005
+    assert "batch_ate_rmse_m" in (finished / "report.html").read_text()
+
+
+def test_the_posterior_over_paths(finished):
+    with np.load(finished / "posterior.npz") as archive:
+        paths, log_weights, stamps = (archive[n] for n in ("world_from_camera", "log_weights", "stamps_ns"))
+    assert paths.shape == (FRAMES, 8, 7) and stamps.size == FRAMES
+    assert np.exp(log_weights).sum() == pytest.approx(1.0)
+    told, filtered = read_tum(finished / "posterior.tum"), read_tum(finished / "trajectory.tum")
+    np.testing.assert_allclose(told.positions, np.exp(log_weights) @ paths[..., 4:], atol=1e-6)
+    # At the end there is nothing later to learn from: only the frame's own sampling lies between the two.
+    assert np.linalg.norm(told.positions[-1] - filtered.positions[-1]) < 0.005
+
+
+def test_a_batch_that_takes_too_long_is_given_up_and_all_else_is_there(desk, tmp_path):
+    assert run(desk, tmp_path, "--batch", "--batch-limit", "0") == 0
+    assert "given up after 0 s" in summary(tmp_path)["batch_problem"]
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == FILES - {"batch.tum"}
+
+
 def test_times_are_told_by_stage(finished):
     table = np.genfromtxt(finished / "timings.csv", delimiter=",", names=True)
     assert table.size == FRAMES
-    assert np.allclose(table["search_ms"] + table["filter_ms"], table["milliseconds"], atol=1e-3)
+    stages = table["search_ms"] + table["filter_ms"] + table["new_features_ms"]
+    assert np.allclose(stages, table["milliseconds"], atol=1e-3)
     assert (table["waiting_for_image_ms"] >= 0.0).all()
 
 
@@ -202,6 +250,48 @@ def test_the_program_starts_without_rerun_and_encoder(monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     for name in ("mono", "mono_rerun", "mono_video"):
         assert importlib.reload(importlib.import_module(f"rbpf.validation.{name}"))
+
+
+def test_a_rendered_board_is_what_a_run_starts_from(tmp_path, capsys):
+    size = ["--frames", "8", "--width", "320", "--height", "240", "--board", "6x4", "--square", "0.04"]
+    assert main(["simulate", "desk", "--out", str(tmp_path / "desk"), *size]) == 0
+    board = ("--board", "6x4", "--square", "0.04")
+    assert run(tmp_path / "desk", tmp_path / "run", *board, known=False) == 0
+    entries = summary(tmp_path / "run")
+    assert entries["known_points"] == 12 and entries["frames_tracked"] == 8
+    assert "path_rmse_m" not in entries and entries["ate_rmse_m"] < 0.01
+    config = yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())
+    assert (config["board"], config["square_m"]) == ("6x4", 0.04)
+    first = read_tum(tmp_path / "run" / "trajectory.tum").world_from_body[0]
+    entry = yaml.safe_load((tmp_path / "desk" / "chessboard.yaml").read_text())[0]
+    truth = np.loadtxt(tmp_path / "desk" / "mav0" / "state_groundtruth_estimate0" / "data.csv", delimiter=",")
+    where = SE3.inverse_transform(np.array(entry["world_from_board"]), truth[0, 1:4])
+    assert np.linalg.norm(first[4:] - where) < 0.01 * np.linalg.norm(where)
+    assert run(tmp_path / "desk", tmp_path / "run", "--board", "9x6", "--square", "0.04", known=False) == 2
+    assert "no chessboard of 9x6 inner corners" in sentence(capsys)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--board", "9x6"), "both its inner corners and the side of its squares"),
+        (("--square", "0.02"), "both its inner corners and the side of its squares"),
+        (("--board", "nine", "--square", "0.02"), "inner corners as 9x6"),
+        (("--board", "9x6", "--square", "-1"), "must be positive"),
+        (("--board", "9x6", "--square", "0.02", "--known-points", "here.csv"), "give one of the two"),
+    ],
+)
+def test_a_board_that_makes_no_sense_is_refused(desk, tmp_path, capsys, arguments, words):
+    assert run(desk, tmp_path / "run", *arguments, known=False) == 2
+    assert words in sentence(capsys)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_room_has_no_board(tmp_path, capsys):
+    assert (
+        main(["simulate", "room", "--out", str(tmp_path / "room"), "--board", "9x6", "--square", "0.02"]) == 2
+    )
+    assert "a room has no chessboard" in sentence(capsys)
 
 
 def test_rendered_sequences_can_be_opened(tmp_path):

@@ -19,7 +19,9 @@ def printed(columns: int, rows: int) -> np.ndarray:
     return np.pad(sheet, MARGIN, constant_values=235)
 
 
-def seen(board: Board, homography: np.ndarray, size: tuple[int, int] = (640, 480)) -> tuple[np.ndarray, np.ndarray]:
+def seen(
+    board: Board, homography: np.ndarray, size: tuple[int, int] = (640, 480)
+) -> tuple[np.ndarray, np.ndarray]:
     """The image, and where the inner corners (rows · columns, 2) are in it."""
     sheet, fine = printed(board.columns, board.rows), np.array([[4.0, 0, 1.5], [0, 4, 1.5], [0, 0, 1]])
     large = cv2.warpPerspective(sheet, fine @ homography, (4 * size[0], 4 * size[1]), borderValue=120)

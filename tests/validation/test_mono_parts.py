@@ -85,7 +85,9 @@ def test_landmarks_start_at_the_given_depths(log, batch):
 
 def test_a_wrong_focal_length_and_distortion_are_mended(log, batch):
     camera = log.camera
-    wrong = replace(camera, fx=1.015 * camera.fx, fy=1.015 * camera.fy, distortion=(-0.02, 0.0, 0.0, 0.0, 0.0))
+    wrong = replace(
+        camera, fx=1.015 * camera.fx, fy=1.015 * camera.fy, distortion=(-0.02, 0.0, 0.0, 0.0, 0.0)
+    )
     spoilt = replace(log, camera=wrong)
     start = adjust_log(spoilt, batch.world_from_camera)
     refined = refine_calibration(spoilt, start)

@@ -82,6 +82,8 @@ class ImageSensor(Sensor):
             self.bad_frames = self.bad_frames + 1 if self._fails() else 0
             if self.bad_frames:
                 rows, px = rows[:0], px[:0]
+        else:
+            self.bad_frames = 0 if frame.image is not None else self.bad_frames + 1
         self.measured = self._features(frame.stamp_ns, rows, px)
         self.seconds = time.perf_counter() - started
         return self.features.observe(self.measured, belief)

@@ -115,7 +115,7 @@ def run_images(
     for t, frame in enumerate(_frames_from(sequence, run.filter.steps), run.filter.steps):
         run.seconds_waiting[t] = time.perf_counter() - waited
         try:
-            _frame(run, t, frame, law if t == 0 else None)
+            _frame(run, t, frame, law if t == 0 else _waiting(run))
         except InputError as error:
             if t == 0:
                 raise
@@ -172,7 +172,15 @@ def _begin(
     filter_ = assemble(config, features, start, sensor)
     stamps = np.asarray(sequence.stamps_ns, dtype=np.int64)
     run = VideoRun(sequence, config, known, filter_, sensor, stamps, poses, covs, *numbers)
+    run.recovery.stamp_ns = int(stamps[0])
     return run, law
+
+
+def _waiting(run: VideoRun) -> PoseLaw | None:
+    """The camera stays at the origin until an image shows something; nothing once there are features."""
+    if run.sensor.table.count:
+        return None
+    return PoseLaw(SE3.identity(), np.zeros((6, 6)), start_std(run.config.velocity))
 
 
 def _frame(run: VideoRun, t: int, frame: ImageFrame, law: PoseLaw | None) -> None:
