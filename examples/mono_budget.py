@@ -1,9 +1,9 @@
 """Which part of monocular SLAM carries the error? The filter with perfect parts in turn, on the same measurements.
 
-A sequence is filtered, and what was measured is adjusted in batch. Then the same measurements are filtered again: without
-the matches that the batch shows to be wrong, with landmarks that start at the batch's depths, with ten times as many
-particles, with the focal length and distortion that the batch prefers. The table has the error that remains; what a
-perfect part takes away is what the filter's own part put in.
+A sequence is filtered, and what was measured is adjusted in batch. Then the same measurements are filtered again:
+without the matches that the batch shows to be wrong, with landmarks that start at the batch's depths, with ten times as
+many particles, with the focal length and distortion that the batch prefers. The table has the error that remains; what
+a perfect part takes away is what the filter's own part put in.
 """
 
 from pathlib import Path
@@ -12,6 +12,7 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
+from rbpf.lie import SE3
 from rbpf.sensors.pinhole import Pinhole
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.video import run_images
@@ -53,12 +54,21 @@ def draw(budget: Budget, title: str, path: Path) -> None:
 
 
 def print_place(budget: Budget, frame: int, place: np.ndarray) -> None:
-    """How far the camera is from where it should be in one frame, for a recording of which only that is known."""
+    """How far the camera is from where it should be in one frame, for a recording of which only that is known.
+
+    Also from where the first frame is found: where the known points are uncertain, so is the place of their world.
+    """
     for line in budget.lines:
-        found = line.world_from_camera[line.frames == frame, 4:]
-        for position in found:
-            share = np.linalg.norm(position - place) / np.linalg.norm(place)
-            print(f"{line.name:>24}: frame {frame} at {position.round(3)}, {share:.1%} off")
+        rows = np.flatnonzero(line.frames == frame)
+        if not rows.size:
+            continue
+        pose = line.world_from_camera[rows[0]]
+        from_first = SE3.between(line.world_from_camera[0], pose)
+        share, own = (np.linalg.norm(at - place) / np.linalg.norm(place) for at in (pose[4:], from_first[4:]))
+        print(
+            f"{line.name:>24}: frame {frame} at {pose[4:].round(3)}, {share:.1%} off; "
+            f"seen from the first frame {from_first[4:].round(3)}, {own:.1%} off"
+        )
 
 
 def main(

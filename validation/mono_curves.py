@@ -38,7 +38,9 @@ def error_figure(run: VideoRun, truth: TruePath, batch: Batch | None = None) -> 
             truth.rows, -1e3 * band[:, axis], 1e3 * band[:, axis], color=COLOURS["filter"], alpha=0.2, lw=0,
             label=f"{SIGMAS:g}σ of the filter",
         )  # fmt: skip
-        axes.plot(truth.rows, 1e3 * error[:, axis], color=COLOURS["filter"], lw=1.0, label="error")
+        axes.plot(
+            truth.rows, 1e3 * error[:, axis], color=COLOURS["filter"], lw=1.0, label="error of the filter"
+        )
         axes.axhline(0.0, color="black", lw=0.5)
         axes.set_ylabel(f"{'xyz'[axis]} [mm]")
         _shade_lost(axes, run)

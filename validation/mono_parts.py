@@ -21,7 +21,10 @@ WRONG_PX = 3.0
 DEPTH_SHARE = 0.01
 """Standard deviation of a depth that is given, as a share of it."""
 
-_STEPS = (0.01, 0.02), (0.003, 0.006)
+_GRID = np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1)], dtype=float)
+"""Where the error is looked at for a quadratic of two variables."""
+
+_STEPS = np.array([[0.01, 0.02], [0.003, 0.006]])
 """Of focal length, as a share, and of k1: in a first round and a second."""
 
 
@@ -107,16 +110,11 @@ def refine_calibration(log: FeatureLog, batch: Batch) -> Calibrated:
     """
     best = batch
     for size in _STEPS:
-        grid = np.array(
-            [(a, b) for a in (-1.0, 0.0, 1.0) for b in (-1.0, 0.0, 1.0) if abs(a) + abs(b) < 2 or a == b]
-        )
-        errors = [
-            _with_camera(log, best, _changed(_camera(best.log), *(size * step))).solution.error
-            for step in grid
-        ]
-        lowest = _lowest(grid, np.array(errors))
-        tried = _with_camera(log, best, _changed(_camera(best.log), *(size * lowest)))
-        best = tried if tried.solution.error < best.solution.error else best
+        camera = _camera(best.log)
+        solved = [_with_camera(log, best, _changed(camera, *(size * step))) for step in _GRID]
+        lowest = _lowest(_GRID, np.array([one.solution.error for one in solved]))
+        solved.append(_with_camera(log, best, _changed(camera, *(size * lowest))))
+        best = min([best, *solved], key=lambda one: one.solution.error)
     return Calibrated(_camera(best.log), best)
 
 

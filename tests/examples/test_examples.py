@@ -13,7 +13,14 @@ import pytest
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 
 ROOT = Path(__file__).resolve().parents[2]
-SECONDS_LONG = {"mono_blackouts", "mono_loop", "mono_overconfidence", "mono_still_camera", "mono_video"}
+SECONDS_LONG = {
+    "mono_blackouts",
+    "mono_budget",
+    "mono_loop",
+    "mono_overconfidence",
+    "mono_still_camera",
+    "mono_video",
+}
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 LONGEST_SENSOR = 40
 
@@ -55,6 +62,12 @@ def mono_blackouts(figures: dict[str, float]) -> None:
     assert figures["blackouts"] >= 2
     assert figures["recovered"] == 1.0
     assert figures["median error a second later [m]"] < 0.03
+
+
+def mono_budget(figures: dict[str, float]) -> None:
+    assert figures["same measurements"] == pytest.approx(figures["as it is"], rel=1e-3)
+    assert figures["batch"] < 0.5 * figures["as it is"]
+    assert figures["depths"] < figures["as it is"]
 
 
 def mono_depth(figures: dict[str, float]) -> None:
@@ -132,6 +145,7 @@ CLAIMS: dict[str, Callable[[Any], None]] = {
         fused_kernel,
         gps_fix,
         mono_blackouts,
+        mono_budget,
         mono_depth,
         mono_desk,
         mono_eigenvalues,
