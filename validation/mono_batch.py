@@ -1,7 +1,7 @@
 """The batch adjustment of the measurements that a run over images used: what the filter could have known at best."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, final
 
@@ -66,16 +66,19 @@ def adjust_log(
     world_from_camera: np.ndarray,
     limit_s: float | None = None,
     on_iteration: Told | None = None,
+    twice: bool = True,
 ) -> Batch:
     """Adjusts all frames that the first one is connected with through landmarks.
 
-    Without known points the first pose, and the scale of the start, are held.
+    Known points allow a second start, from them alone, frame by frame: the better optimum counts, so that it does not
+    hang on where the filter went. Without known points the first pose, and the scale of the start, are held.
 
     Args:
         log: T frames of one camera.
         world_from_camera: (T, 7) poses to start from.
         limit_s: time after which it is given up; None waits.
         on_iteration: told how far it is.
+        twice: also start from the known points alone; not needed near the optimum.
 
     Raises:
         InputError: too few frames are connected, it takes too long, or it does not converge.
@@ -88,8 +91,23 @@ def adjust_log(
     part = replace(log, frames=[log.frames[t] for t in frames])
     watch = _Watch(limit_s, on_iteration)
     start = CameraEstimate(world_from_camera[frames], {})
-    solution = solve_features(part, start, robust=ROBUST, marginals=False, on_iteration=watch)
+    solution = _best(part, [start, None] if twice and log.known is not None else [start], watch)
     return Batch(part, frames, solution)
+
+
+def _best(log: FeatureLog, starts: Sequence[CameraEstimate | None], watch: "_Watch") -> CameraSolution:
+    """The solution of least error; a start that leads nowhere is passed over, if another one does not."""
+    found: list[CameraSolution] = []
+    problem: InputError | None = None
+    for start in starts:
+        try:
+            found.append(solve_features(log, start, robust=ROBUST, marginals=False, on_iteration=watch))
+        except InputError as error:
+            problem = error
+    if not found:
+        assert problem is not None
+        raise problem
+    return min(found, key=lambda solution: solution.error)
 
 
 def score_batch(run: VideoRun, batch: Batch) -> dict[str, Any]:

@@ -26,11 +26,12 @@ from rbpf.systems.mono.run import run as filter_log
 from rbpf.systems.mono.video import VideoRun
 from rbpf.validation.accuracy import ate
 from rbpf.validation.alignment import Alignment
-from rbpf.validation.mono_batch import Batch, adjust_log, adjust_run
+from rbpf.validation.mono_batch import Batch, adjust_run
 from rbpf.validation.mono_log import feature_log
 from rbpf.validation.mono_parts import (
     WRONG_PX,
     GivenDepths,
+    adjust_near,
     agreeing_matches,
     batch_depths,
     refine_calibration,
@@ -127,7 +128,7 @@ def error_budget(run: VideoRun, told: Callable[[str], None] | None = None) -> Bu
         if told is not None:
             told(name)
         lines.append(reference.line(name, whole, work().world_from_camera))
-    clean = adjust_log(agreeing_matches(log, batch), run.world_from_camera)
+    clean = adjust_near(agreeing_matches(log, batch), batch)
     lines.append(reference.line("batch, associations", clean.frames, clean.world_from_camera))
     lines.append(reference.line("batch, calibration", better.batch.frames, better.batch.world_from_camera))
     errors = np.concatenate(reprojection_errors(batch))

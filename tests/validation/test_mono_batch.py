@@ -49,6 +49,14 @@ def test_a_whole_log_is_the_plain_solution(log):
     assert np.sqrt(np.square(error).sum(axis=1).mean()) < 0.02
 
 
+def test_it_does_not_hang_on_where_the_filter_went(log):
+    """A path that turns away after a while: from there alone another optimum is found."""
+    path = rough(log)
+    path[8:, 4:] += np.linspace(0.0, 0.6, FRAMES - 8)[:, None] * [1.0, -0.5, 0.8]
+    good = adjust_log(log, rough(log))
+    assert adjust_log(log, path).solution.error == pytest.approx(good.solution.error, rel=1e-4)
+
+
 def test_blind_frames_are_left_out(log):
     blind = {4: kept(log.frames[4], np.arange(0)), 9: kept(log.frames[9], np.arange(3))}
     batch = adjust_log(changed(log, blind), rough(log))
