@@ -11,7 +11,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from rbpf.errors import InputError
-from rbpf.sensors.features import FeatureLog
+from rbpf.sensors.features import FeatureLog, KnownPoints
 from rbpf.systems.mono.video import VideoRun
 from rbpf.validation.accuracy import ate
 from rbpf.validation.alignment import Alignment
@@ -25,6 +25,9 @@ ROBUST = 1.345
 
 LEAST = 4
 """Landmarks known, or seen in other frames too, that a frame needs to take part: three leave several poses."""
+
+EXACT = 1e-4
+"""Known points without errors get one of this share of their extent: constraints take GTSAM many times as long."""
 
 Told = Callable[[int, float], None]
 """Told the number of an iteration and the error before it."""
@@ -88,11 +91,18 @@ def adjust_log(
         raise InputError(
             f"{log.name}: no two frames share the {LEAST} landmarks that a batch adjustment needs of each"
         )
-    part = replace(log, frames=[log.frames[t] for t in frames])
+    part = replace(log, frames=[log.frames[t] for t in frames], known=_softened(log.known))
     watch = _Watch(limit_s, on_iteration)
     start = CameraEstimate(world_from_camera[frames], {})
     solution = _best(part, [start, None] if twice and log.known is not None else [start], watch)
-    return Batch(part, frames, solution)
+    return Batch(replace(part, known=log.known), frames, solution)
+
+
+def _softened(known: KnownPoints | None) -> KnownPoints | None:
+    if known is None or known.cov.any():
+        return known
+    extent = float(np.ptp(known.positions, axis=0).max())
+    return replace(known, cov=np.tile((EXACT * extent) ** 2 * np.eye(3), (known.names.size, 1, 1)))
 
 
 def _best(log: FeatureLog, starts: Sequence[CameraEstimate | None], watch: "_Watch") -> CameraSolution:

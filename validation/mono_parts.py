@@ -131,12 +131,12 @@ def _camera(log: FeatureLog) -> Pinhole:
 
 
 def _changed(camera: Pinhole, focal: float, k1: float) -> Pinhole:
-    first, *others = camera.distortion
+    k1_now, k2, p1, p2, k3 = camera.distortion
     return replace(
         camera,
         fx=camera.fx * (1.0 + focal),
         fy=camera.fy * (1.0 + focal),
-        distortion=(first + k1, *others),
+        distortion=(k1_now + k1, k2, p1, p2, k3),
     )
 
 
