@@ -64,6 +64,12 @@ def corners(
     return places[chosen].astype(float), found[chosen]
 
 
+def texture(image: np.ndarray, px: np.ndarray) -> np.ndarray:
+    """The score of `corners` at places (K, 2) inside the image, rounded to whole pixels: (K,) grey levels per pixel."""
+    column, row = np.rint(px).astype(int).T
+    return np.sqrt(np.maximum(_least_eigenvalues(checked_image(image))[row, column], 0.0)).astype(float)
+
+
 def _least_eigenvalues(image: np.ndarray) -> np.ndarray:
     """Of the mean of ∇I ∇Iᵀ over the window around each pixel, with Sobel's slopes: (H, W) float32."""
     import cv2

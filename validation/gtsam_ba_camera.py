@@ -72,7 +72,8 @@ def solve_features(
             that keeps its velocity, E06 (4)-(5); frames of one time then share pose and velocity. None leaves the
             motion free.
         marginals: compute covariances.
-        on_iteration: told the error before each iteration from the initial estimate on; what it raises ends it all.
+        on_iteration: told the error before each iteration, also of adjustments on the way to an initial estimate; what
+            it raises ends it all.
 
     Raises:
         InputError: a number makes no sense, the first frame sees too few known points and there is no initial
@@ -91,7 +92,7 @@ def solve_features(
     stamps_ns = np.array([frame.stamp_ns for frame in log.frames], dtype=np.int64)
     problem = CameraProblem(log.name, stamps_ns, table, known, robust, acceleration(velocity))
     check_problem(problem)
-    start = adjuster.begin(problem, initial or from_scratch(log.name, stamps_ns, table, known))
+    start = adjuster.begin(problem, initial or from_scratch(log.name, stamps_ns, table, known, on_iteration))
     found = adjuster.adjust(problem, start, on_iteration=on_iteration)
     adjuster.require_converged(found)
     cov_poses, cov_landmarks = adjuster.covariances(found) if marginals else (np.empty((0, 6, 6)), {})

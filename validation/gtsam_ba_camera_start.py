@@ -26,7 +26,7 @@ from rbpf.validation.gtsam_ba_camera_points import (
     triangulate,
 )
 from rbpf.validation.gtsam_ba_camera_resection import Resected, locate, resect
-from rbpf.validation.gtsam_ba_solvers import ROUGH
+from rbpf.validation.gtsam_ba_solvers import ROUGH, OnIteration
 
 KNOWN = 4
 """Known points that the first frame has to see."""
@@ -48,7 +48,11 @@ _MOTION = 0.1  # of a frame: rad, and metres per metre of distance to what is se
 
 
 def from_scratch(
-    name: str, stamps_ns: NDArray[np.int64], table: Sightings, known: dict[int, tuple[Array, Array]]
+    name: str,
+    stamps_ns: NDArray[np.int64],
+    table: Sightings,
+    known: dict[int, tuple[Array, Array]],
+    on_iteration: OnIteration | None = None,
 ) -> CameraEstimate:
     """Path and landmarks from the known points, or for a stereo pair without any, from the first frame.
 
@@ -57,11 +61,12 @@ def from_scratch(
         stamps_ns: (T,) of the frames.
         table: its sightings.
         known: position and covariance of known points by name.
+        on_iteration: told the error before each iteration of an adjustment on the way; what it raises ends it.
 
     Raises:
         InputError: the first frame sees fewer than four known points, a single camera has none, or the path breaks.
     """
-    growth = _Growth(name, stamps_ns, table, known)
+    growth = _Growth(name, stamps_ns, table, known, on_iteration)
     growth.begin()
     for step in range(1, len(stamps_ns)):
         growth.add(step)
@@ -73,8 +78,14 @@ class _Growth:
     """A path that grows frame by frame, and the landmarks placed so far."""
 
     def __init__(
-        self, name: str, stamps_ns: NDArray[np.int64], table: Sightings, known: dict[int, tuple[Array, Array]]
+        self,
+        name: str,
+        stamps_ns: NDArray[np.int64],
+        table: Sightings,
+        known: dict[int, tuple[Array, Array]],
+        on_iteration: OnIteration | None,
     ) -> None:
+        self.on_iteration = on_iteration
         self.name, self.stamps_ns, self.table, self.known = name, stamps_ns, table, known
         self.path = np.tile(SE3.identity(), (len(stamps_ns), 1))
         self.blur = np.zeros(len(stamps_ns))
@@ -179,7 +190,7 @@ class _Growth:
         before = np.searchsorted(self.table.names, part.names)
         problem = CameraProblem(self.name, self.stamps_ns[: step + 1], part, self.known, HUBER)
         start = CameraState(self.path[: step + 1], self.points[before], np.empty((0, 6)))
-        found = adjust(problem, start, ROUGH)
+        found = adjust(problem, start, ROUGH, self.on_iteration)
         state, part = found.state, found.problem.table
         index = np.searchsorted(self.table.names, part.names)
         self.placed[before] = False

@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from rbpf.errors import InputError
-from rbpf.sensors.readers.images import KnownPixels, open_images, read_known_points
+from rbpf.sensors.chessboard import Board, find_board
+from rbpf.sensors.readers.images import ImageSequence, KnownPixels, open_images, read_known_points
 from rbpf.systems.mono.config import MonoConfig
-from rbpf.systems.mono.video import VideoRun, run_images
+from rbpf.systems.mono.video import VideoRun, first_image, run_images
 from rbpf.validation.files import prepare_folder
 from rbpf.validation.mono_batch import Batch, adjust_run, score_batch
 from rbpf.validation.mono_folder import write_mono_run, write_summary
@@ -50,24 +51,45 @@ class Recording:
         images: a sequence of any kind that `open_images` knows.
         known_points: table of known points; None starts without any.
         calibration: camera.yaml in place of the sequence's own camera.
+        board: chessboard that is seen in the first image; its corners are the known points, in its frame.
+
+    Raises:
+        InputError: both known points and a board are given.
     """
 
     images: Path
     known_points: Path | None = None
     calibration: Path | None = None
+    board: Board | None = None
 
-    def sources(self) -> dict[str, str]:
+    def __post_init__(self) -> None:
+        if self.known_points is not None and self.board is not None:
+            raise InputError("a run starts from known points or from a chessboard: give one of the two")
+
+    def sources(self) -> dict[str, str | float]:
         """For config.yaml."""
         named = {
             "recording": self.images,
             "known_points": self.known_points,
             "calibration": self.calibration,
         }
-        return {name: str(path) for name, path in named.items() if path is not None}
+        board: dict[str, str | float] = {}
+        if self.board is not None:
+            size = f"{self.board.columns}x{self.board.rows}"
+            board = {"board": size, "square_m": self.board.square_m}
+        return {name: str(path) for name, path in named.items() if path is not None} | board
 
-    def read_known(self) -> KnownPixels | None:
-        """The known points, if there are any."""
-        return None if self.known_points is None else read_known_points(self.known_points)
+    def open(self) -> tuple[ImageSequence, KnownPixels | None]:
+        """The images, and the known points if there are any.
+
+        Raises:
+            InputError: a file is wrong, or the board is not found in the first image.
+        """
+        known = None if self.known_points is None else read_known_points(self.known_points)
+        sequence = open_images(self.images, self.calibration)
+        if self.board is not None:
+            known = find_board(first_image(sequence), self.board)
+        return sequence, known
 
 
 def start_mono(
@@ -89,8 +111,7 @@ def start_mono(
     Raises:
         InputError: the recording or a setting is wrong.
     """
-    known = recording.read_known()
-    sequence = open_images(recording.images, recording.calibration)
+    sequence, known = recording.open()
     if out is not None:
         prepare_folder(out)
     total = len(sequence)

@@ -1,7 +1,7 @@
 """The batch adjustment of the measurements that a run over images used: what the filter could have known at best."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, final
 
@@ -11,12 +11,13 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from rbpf.errors import InputError
-from rbpf.sensors.features import FeatureLog
+from rbpf.sensors.features import FeatureLog, KnownPoints
 from rbpf.systems.mono.video import VideoRun
 from rbpf.validation.accuracy import ate
+from rbpf.validation.alignment import Alignment
 from rbpf.validation.gtsam_ba_camera import CameraEstimate, CameraSolution, solve_features
 from rbpf.validation.mono_log import feature_log
-from rbpf.validation.mono_scores import score_path
+from rbpf.validation.mono_scores import score_path, usual_alignment
 from rbpf.validation.trajectory import Trajectory
 
 ROBUST = 1.345
@@ -24,6 +25,9 @@ ROBUST = 1.345
 
 LEAST = 4
 """Landmarks known, or seen in other frames too, that a frame needs to take part: three leave several poses."""
+
+EXACT = 1e-4
+"""Known points without errors get one of this share of their extent: constraints take GTSAM many times as long."""
 
 Told = Callable[[int, float], None]
 """Told the number of an iteration and the error before it."""
@@ -65,16 +69,19 @@ def adjust_log(
     world_from_camera: np.ndarray,
     limit_s: float | None = None,
     on_iteration: Told | None = None,
+    twice: bool = True,
 ) -> Batch:
     """Adjusts all frames that the first one is connected with through landmarks.
 
-    Without known points the first pose, and the scale of the start, are held.
+    Known points allow a second start, from them alone, frame by frame: the better optimum counts, so that it does not
+    hang on where the filter went. Without known points the first pose, and the scale of the start, are held.
 
     Args:
         log: T frames of one camera.
         world_from_camera: (T, 7) poses to start from.
         limit_s: time after which it is given up; None waits.
         on_iteration: told how far it is.
+        twice: also start from the known points alone; not needed near the optimum.
 
     Raises:
         InputError: too few frames are connected, it takes too long, or it does not converge.
@@ -84,11 +91,33 @@ def adjust_log(
         raise InputError(
             f"{log.name}: no two frames share the {LEAST} landmarks that a batch adjustment needs of each"
         )
-    part = replace(log, frames=[log.frames[t] for t in frames])
+    part = replace(log, frames=[log.frames[t] for t in frames], known=_softened(log.known))
     watch = _Watch(limit_s, on_iteration)
     start = CameraEstimate(world_from_camera[frames], {})
-    solution = solve_features(part, start, robust=ROBUST, marginals=False, on_iteration=watch)
-    return Batch(part, frames, solution)
+    solution = _best(part, [start, None] if twice and log.known is not None else [start], watch)
+    return Batch(replace(part, known=log.known), frames, solution)
+
+
+def _softened(known: KnownPoints | None) -> KnownPoints | None:
+    if known is None or known.cov.any():
+        return known
+    extent = float(np.ptp(known.positions, axis=0).max())
+    return replace(known, cov=np.tile((EXACT * extent) ** 2 * np.eye(3), (known.names.size, 1, 1)))
+
+
+def _best(log: FeatureLog, starts: Sequence[CameraEstimate | None], watch: "_Watch") -> CameraSolution:
+    """The solution of least error; a start that leads nowhere is passed over, if another one does not."""
+    found: list[CameraSolution] = []
+    problem: InputError | None = None
+    for start in starts:
+        try:
+            found.append(solve_features(log, start, robust=ROBUST, marginals=False, on_iteration=watch))
+        except InputError as error:
+            problem = error
+    if not found:
+        assert problem is not None
+        raise problem
+    return min(found, key=lambda solution: solution.error)
 
 
 def score_batch(run: VideoRun, batch: Batch) -> dict[str, Any]:
@@ -97,9 +126,9 @@ def score_batch(run: VideoRun, batch: Batch) -> dict[str, Any]:
     Without known points scale and place are the filter's own, so that it is compared after a similarity alignment.
     """
     trajectory = batch.trajectory
-    scores = score_path(run.sequence.truth, trajectory, run.known is not None)
+    scores = score_path(run.sequence.truth, trajectory, usual_alignment(run))
     ours = Trajectory(trajectory.stamps_ns, run.world_from_camera[batch.frames])
-    how = "none" if run.known is not None else "similarity"
+    how: Alignment = "none" if run.known is not None else "similarity"
     return {
         "batch_frames": int(batch.frames.size),
         "batch_observations": int(sum(frame.landmarks.size for frame in batch.log.frames)),

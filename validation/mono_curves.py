@@ -10,7 +10,7 @@ from rbpf.validation.accuracy import ate
 from rbpf.validation.alignment import Alignment
 from rbpf.validation.figures import COLOURS, SIGMAS
 from rbpf.validation.mono_batch import Batch
-from rbpf.validation.mono_scores import TruePath
+from rbpf.validation.mono_scores import TruePath, usual_alignment
 from rbpf.validation.trajectory import Trajectory
 
 CAMERA_HZ = 30.0
@@ -19,17 +19,17 @@ CAMERA_HZ = 30.0
 def error_figure(run: VideoRun, truth: TruePath, batch: Batch | None = None) -> Any:
     """Error of the position along the truth's axes, beside what the filter itself believes (3σ), and the batch's.
 
-    With known points nothing is aligned; without them each path is first brought onto the truth, and its 3σ with it.
+    With known points nothing is aligned; else each path is first brought onto the truth, and its 3σ with it.
     """
     poses, stamps = run.world_from_camera[truth.rows], run.stamps_ns[truth.rows]
     estimate, reference = Trajectory(stamps, poses), Trajectory(stamps, truth.world_from_camera)
-    how: Alignment = "none" if run.known is not None else "similarity"
+    how = usual_alignment(run)
     moved = ate(estimate, reference, how).alignment
     error = moved.transform(estimate.positions) - reference.positions
     turn = moved.scale * moved.rotation @ SE3.matrix(poses)[:, :3, :3]
     cov = turn @ run.cov[truth.rows][:, 3:, 3:] @ np.swapaxes(turn, -1, -2)
     band = SIGMAS * np.sqrt(np.maximum(np.einsum("taa->ta", cov), 0.0))
-    name = "no alignment" if how == "none" else "after the similarity alignment"
+    name = "no alignment" if how == "none" else f"after the {how} alignment"
     figure, rows = _rows(3, f"{run.sequence.name}: error of the position, {name}")
     if batch is not None:
         _batch_error(rows, truth, batch, how)
@@ -38,7 +38,9 @@ def error_figure(run: VideoRun, truth: TruePath, batch: Batch | None = None) -> 
             truth.rows, -1e3 * band[:, axis], 1e3 * band[:, axis], color=COLOURS["filter"], alpha=0.2, lw=0,
             label=f"{SIGMAS:g}σ of the filter",
         )  # fmt: skip
-        axes.plot(truth.rows, 1e3 * error[:, axis], color=COLOURS["filter"], lw=1.0, label="error")
+        axes.plot(
+            truth.rows, 1e3 * error[:, axis], color=COLOURS["filter"], lw=1.0, label="error of the filter"
+        )
         axes.axhline(0.0, color="black", lw=0.5)
         axes.set_ylabel(f"{'xyz'[axis]} [mm]")
         _shade_lost(axes, run)

@@ -43,14 +43,16 @@ from rbpf.validation.trajectory import Trajectory
 from rbpf.validation.trajectory_files import write_tum
 
 
-def write_mono_run(run: VideoRun, mapped: MonoMap, out: Path, sources: dict[str, str]) -> dict[str, Any]:
+def write_mono_run(
+    run: VideoRun, mapped: MonoMap, out: Path, sources: dict[str, str | float]
+) -> dict[str, Any]:
     """Writes all data files of a run.
 
     Args:
         run: what was filtered.
         mapped: its map.
         out: the run's folder.
-        sources: what it was filtered from, for config.yaml: recording, known_points, calibration.
+        sources: what it was filtered from, for config.yaml: recording, known_points, board, calibration.
 
     Returns:
         The entries of summary.json.

@@ -8,6 +8,7 @@ from rbpf.lie import SE3
 from rbpf.sensors.features import CameraTruth
 from rbpf.systems.mono.video import VideoRun
 from rbpf.validation.accuracy import ate, rpe
+from rbpf.validation.alignment import Alignment
 from rbpf.validation.scores import poses_at
 from rbpf.validation.trajectory import Trajectory
 
@@ -36,20 +37,31 @@ def true_path(truth: CameraTruth | None, stamps_ns: np.ndarray) -> TruePath | No
     return TruePath(rows, poses) if rows.size >= LEAST else None
 
 
+def usual_alignment(run: VideoRun) -> Alignment:
+    """How a run's path is brought onto the truth where nothing else is said.
+
+    Not at all with known points in the truth's world; rigidly with known points in a frame of their own, such as a
+    chessboard's; with its scale without any.
+    """
+    if run.known is None:
+        return "similarity"
+    return "rigid" if run.known.own_frame else "none"
+
+
 def score_camera(run: VideoRun) -> dict[str, float | int]:
     """Entries of summary.json for the filter's path; none without ground truth."""
     path = Trajectory(run.stamps_ns, run.world_from_camera)
-    return score_path(run.sequence.truth, path, run.known is not None)
+    return score_path(run.sequence.truth, path, usual_alignment(run))
 
 
-def score_path(true: CameraTruth | None, path: Trajectory, metric: bool) -> dict[str, float | int]:
+def score_path(true: CameraTruth | None, path: Trajectory, how: Alignment) -> dict[str, float | int]:
     """Errors of a path: metres and degrees; none without ground truth.
 
     Args:
         true: ground truth.
         path: of the camera.
-        metric: whether it has a scale and a world, from known points. Else the scale is arbitrary, and the relative
-            error is told after the similarity alignment.
+        how: what its world has in common with the truth's; without a common scale the relative error is told after
+            the similarity alignment.
     """
     truth = true_path(true, path.stamps_ns)
     if truth is None:
@@ -58,8 +70,8 @@ def score_path(true: CameraTruth | None, path: Trajectory, metric: bool) -> dict
     estimate = Trajectory(stamps, path.world_from_body[truth.rows])
     reference = Trajectory(stamps, truth.world_from_camera)
     similar = ate(estimate, reference, "similarity")
-    relative = rpe(estimate, reference, alignment="rigid" if metric else "similarity")
-    own = {"path_rmse_m": ate(estimate, reference).rmse} if metric else {}
+    relative = rpe(estimate, reference, alignment="similarity" if how == "similarity" else "rigid")
+    own = {"path_rmse_m": ate(estimate, reference).rmse} if how == "none" else {}
     return {
         "ate_rmse_m": ate(estimate, reference, "rigid").rmse,
         "ate_sim3_rmse_m": similar.rmse,

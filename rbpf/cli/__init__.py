@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,7 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from tyro.extras import SubcommandApp
 
-from rbpf.cli.options import ImagesOptions, LabOptions, MonoOptions, RangeBearingOptions
+from rbpf.cli.options import ImagesOptions, LabOptions, MonoOptions, RangeBearingOptions, given_board
 from rbpf.errors import InputError
 
 if TYPE_CHECKING:
@@ -61,7 +62,8 @@ def run_mono(options: Annotated[MonoOptions, tyro.conf.arg(name="")]) -> None:
     config = load_settings(
         MonoConfig, "mono", options.config, options.set, _given(options, "particles", "seed")
     )
-    recording = Recording(options.sequence, options.known_points, options.calibration)
+    board = given_board(options.board, options.square)
+    recording = Recording(options.sequence, options.known_points, options.calibration, board)
     _prepare(options.threads)
     with _progress() as bar:
         task = bar.add_task("filtering", total=None)
@@ -115,7 +117,12 @@ def simulate_desk(options: Annotated[ImagesOptions, tyro.conf.arg(name="")]) -> 
     """Images of a textured desk with papers, books and boxes on it, taken by a hand-held camera, with ground truth."""
     from rbpf.validation.simulation.textured_desk import TexturedDesk
 
-    _render(TexturedDesk(frames=options.frames, contrast=options.contrast), options)
+    lies = TexturedDesk(frames=options.frames, contrast=options.contrast)
+    board = given_board(options.board, options.square)
+    if board is not None:
+        squares = board.columns + 1, board.rows + 1
+        lies = replace(lies, board=squares, square_m=board.square_m)
+    _render(lies, options)
 
 
 @SIMULATE.command(name="room")
@@ -123,6 +130,8 @@ def simulate_room(options: Annotated[ImagesOptions, tyro.conf.arg(name="")]) -> 
     """Images of a room with pictures on its walls, carried in a circle, with ground truth."""
     from rbpf.validation.simulation.textured_room import TexturedRoom
 
+    if options.board is not None or options.square is not None:
+        raise InputError("a room has no chessboard: leave out --board and --square, or simulate a desk")
     _render(TexturedRoom(frames=options.frames, contrast=options.contrast), options)
 
 

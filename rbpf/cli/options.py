@@ -6,6 +6,9 @@ from typing import Literal
 
 import tyro
 
+from rbpf.errors import InputError
+from rbpf.sensors.chessboard import Board
+
 
 @dataclass(frozen=True)
 class RangeBearingOptions:
@@ -45,6 +48,9 @@ class MonoOptions:
             a video with a camera.yaml beside it.
         known_points: table of points of known position that are seen in the first image; without it the world is
             the first camera's and its scale is arbitrary.
+        board: in place of known points, inner corners of a chessboard that is seen whole in the first image, as 9x6;
+            the world is then the board's.
+        square: side of its squares, m.
         calibration: camera.yaml in place of the sequence's own.
         out: folder for the results.
         particles: number of particles; by default as in the configuration.
@@ -61,6 +67,8 @@ class MonoOptions:
 
     sequence: tyro.conf.Positional[Path]
     known_points: Path | None = None
+    board: str | None = None
+    square: float | None = None
     calibration: Path | None = None
     out: Path = Path("run")
     particles: int | None = None
@@ -97,6 +105,8 @@ class ImagesOptions:
         blackout: first frame in the dark and number of frames.
         depth: also write depth images.
         jpeg: quality of JPEG files, 1 to 100; 0 writes PNG, which loses nothing.
+        board: a chessboard of so many inner corners lies on the desk, as 9x6.
+        square: side of its squares, m.
     """
 
     out: Path
@@ -116,6 +126,8 @@ class ImagesOptions:
     blackout: tuple[int, int] | None = None
     depth: tyro.conf.FlagCreatePairsOff[bool] = False
     jpeg: int = 0
+    board: str | None = None
+    square: float | None = None
 
 
 @dataclass(frozen=True)
@@ -167,3 +179,18 @@ class LabOptions:
     depth: tyro.conf.FlagCreatePairsOff[bool] = False
     jpeg: int = 0
     texel_m: float = 0.003
+
+
+def given_board(size: str | None, square_m: float | None) -> Board | None:
+    """The chessboard of `--board` and `--square`.
+
+    Raises:
+        InputError: one of the two is missing or makes no sense.
+    """
+    if size is None and square_m is None:
+        return None
+    if size is None or square_m is None:
+        raise InputError(
+            "a chessboard needs both its inner corners and the side of its squares: --board 9x6 --square 0.024"
+        )
+    return Board.parse(size, square_m)

@@ -84,16 +84,20 @@ def _distances(white_nu, white_jac, u, squared):
             squared[k] += left * left
 
 
-@njit(void(MATRIX, CUBE, CUBE, MATRIX, int64, float64, VECTOR), cache=True, error_model="numpy")
-def robust_fit(nu, jac, cov, factor, rounds, scale, squared):
-    """Fills `squared` (K,) with the Mahalanobis distances that a robust fit leaves.
+@njit(
+    void(MATRIX, CUBE, CUBE, MATRIX, int64, float64, VECTOR, VECTOR, MATRIX), cache=True, error_model="numpy"
+)
+def robust_fit(nu, jac, cov, factor, rounds, scale, squared, u, info):
+    """Fills `squared` (K,) with the Mahalanobis distances that a robust fit leaves, `u` (r,) with the fit.
 
     Cauchy's loss by iteratively reweighted least squares, for innovations `nu` (K, p) = `jac` (K, p, d) `factor` (d, r)
     u + noise of covariance `cov` (K, p, p), with u ~ N(0, I). Measurements `scale` deviations off keep half a weight.
+    The lower triangle of `info` (r, r) becomes the Cholesky factor of the last round's information.
     """
     count, p, rank = nu.shape[0], nu.shape[1], factor.shape[1]
     white_nu, white_jac = np.empty((count, p)), np.empty((count, p, rank))
-    weight, info, u = np.empty(count), np.empty((rank, rank)), np.zeros(rank)
+    weight = np.empty(count)
+    u[:] = 0.0
     for k in range(count):
         _whiten(nu[k], jac[k], cov[k], factor, white_nu[k], white_jac[k])
     _distances(white_nu, white_jac, u, squared)

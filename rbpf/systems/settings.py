@@ -10,7 +10,7 @@ import yaml
 
 from rbpf.errors import InputError
 
-_HEADER = ("rbpf", "system", "recording", "known_points", "calibration")
+_HEADER = ("rbpf", "system", "recording", "known_points", "board", "square_m", "calibration")
 """What a config.yaml says about the run besides its settings."""
 
 Config = TypeVar("Config")

@@ -1,8 +1,10 @@
 """Short image sequences for the tests of `rbpf run mono`."""
 
+import json
 import shutil
 from pathlib import Path
 
+from rbpf.cli import main
 from rbpf.sensors.pinhole import Pinhole
 from rbpf.validation.simulation.exposure import Imaging
 from rbpf.validation.simulation.images import simulate_images
@@ -29,3 +31,25 @@ def as_folder(desk: Path, folder: Path) -> Path:
     shutil.copy(desk / "camera.yaml", folder / "camera.yaml")
     (folder / "times.txt").write_text("".join(f"{number / 30:.6f}\n" for number in range(len(images))))
     return folder
+
+
+def run(sequence, out, *arguments, known=True, video=False):
+    points = Path(sequence) / "known_points.csv"
+    given = ["--known-points", str(points)] if known and points.exists() else []
+    shown = [] if "--video" in arguments else ["--no-video"]
+    shown += [] if {"--video", "--batch"} & set(arguments) else ["--no-batch"]
+    return main(
+        ["run", "mono", str(sequence), *given, "--out", str(out), "--particles", "8", *shown, *arguments]
+    )
+
+
+def summary(out):
+    return json.loads((out / "summary.json").read_text())
+
+
+def sentence(capsys):
+    """What was said last, which must be one line."""
+    error = capsys.readouterr().err
+    said = error[error.index("rbpf: ") :]
+    assert said.count("\n") == 1
+    return said

@@ -12,17 +12,25 @@ import yaml
 
 from rbpf.cli import main
 from rbpf.filter import Filter
+from rbpf.systems.mono.config import MonoConfig
+from rbpf.systems.mono.run import run as filter_log
+from rbpf.validation.camera_files import read_features
+from rbpf.validation.gtsam_ba_camera import CameraEstimate, solve_features
+from rbpf.validation.mono_batch import ROBUST
 from rbpf.validation.trajectory_files import read_tum
-from tests.cli.mono_sequences import CAMERA, FRAMES, as_folder, render_desk
+from tests.cli.mono_sequences import CAMERA, FRAMES, as_folder, render_desk, run, sentence, summary
 
 FILES = {
     "trajectory.tum", "map.npz", "map.csv", "timings.csv", "diagnostics.csv", "config.yaml", "summary.json",
     "report.html", "path.png", "map.png", "particles.png", "error.png", "tracking.png", "timings.png",
+    "batch.tum", "posterior.tum", "posterior.npz", "checkpoint.npz",
+    "observations.csv", "observations_frames.csv", "observations_known_points.csv",
 }  # fmt: skip
 REQUIRED = {
     "system", "recording", "frames", "particles", "seed", "ms_per_frame", "frames_tracked", "lost_frames",
     "relocalisations", "landmarks_full", "landmarks_partial", "observations_per_frame", "ate_rmse_m",
     "ate_sim3_rmse_m", "rpe_translation_rmse_m", "rpe_rotation_rmse_deg", "peak_memory_mb",
+    "batch_frames", "batch_ate_rmse_m", "batch_ate_sim3_rmse_m", "filter_minus_batch_rmse_m",
 }  # fmt: skip
 TIMED = ("ms_per_frame", "peak_memory_mb")
 
@@ -42,27 +50,6 @@ def finished(desk, tmp_path_factory):
     out = tmp_path_factory.mktemp("finished") / "run"
     assert run(desk, out, "--video") == 0
     return out
-
-
-def run(sequence, out, *arguments, known=True, video=False):
-    points = Path(sequence) / "known_points.csv"
-    given = ["--known-points", str(points)] if known and points.exists() else []
-    shown = [] if "--video" in arguments else ["--no-video"]
-    return main(
-        ["run", "mono", str(sequence), *given, "--out", str(out), "--particles", "8", *shown, *arguments]
-    )
-
-
-def summary(out):
-    return json.loads((out / "summary.json").read_text())
-
-
-def sentence(capsys):
-    """What was said last, which must be one line."""
-    error = capsys.readouterr().err
-    said = error[error.index("rbpf: ") :]
-    assert said.count("\n") == 1
-    return said
 
 
 def outputs(folder: Path) -> dict[str, bytes]:
@@ -106,10 +93,51 @@ def test_the_map_is_in_that_world_and_flags_rays(desk, finished):
     assert rays.any() and largest[rays].min() > largest[rows].max()
 
 
+def test_the_measurements_are_those_that_the_filter_used(finished):
+    """Filtered again without the images, they give the same path to the last bit."""
+    log, config = read_features(finished), MonoConfig(particles=8)
+    again = filter_log(log, config)
+    told = read_tum(finished / "trajectory.tum")
+    np.testing.assert_array_equal(again.stamps_ns, told.stamps_ns)
+    np.testing.assert_allclose(again.world_from_camera, told.world_from_body, atol=1e-9)
+
+
+def test_the_batch_optimum_of_them_lies_beside(finished):
+    log, told = read_features(finished), read_tum(finished / "batch.tum")
+    start = CameraEstimate(read_tum(finished / "trajectory.tum").world_from_body, {})
+    both = [solve_features(log, one, robust=ROBUST, marginals=False) for one in (start, None)]
+    plain = min(both, key=lambda solution: solution.error)
+    np.testing.assert_allclose(told.positions, plain.world_from_camera[:, 4:], atol=1e-6)
+    entries = summary(finished)
+    assert entries["batch_frames"] == FRAMES
+    assert entries["batch_ate_sim3_rmse_m"] < 0.005
+    assert "batch_ate_rmse_m" in (finished / "report.html").read_text()
+
+
+def test_the_posterior_over_paths(finished):
+    with np.load(finished / "posterior.npz") as archive:
+        paths, log_weights, stamps = (archive[n] for n in ("world_from_camera", "log_weights", "stamps_ns"))
+    assert paths.shape == (FRAMES, 8, 7) and stamps.size == FRAMES
+    assert np.exp(log_weights).sum() == pytest.approx(1.0)
+    told, filtered = read_tum(finished / "posterior.tum"), read_tum(finished / "trajectory.tum")
+    # The mean on the group is not quite that of the coordinates.
+    np.testing.assert_allclose(told.positions, np.exp(log_weights) @ paths[..., 4:], atol=1e-4)
+    # At the end there is nothing later to learn from: only the frame's own sampling lies between the two.
+    assert np.linalg.norm(told.positions[-1] - filtered.positions[-1]) < 0.005
+
+
+def test_a_batch_that_takes_too_long_is_given_up_and_all_else_is_there(desk, tmp_path):
+    assert run(desk, tmp_path, "--batch", "--batch-limit", "0") == 0
+    assert "given up after 0 s" in summary(tmp_path)["batch_problem"]
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == FILES - {"batch.tum"}
+
+
 def test_times_are_told_by_stage(finished):
     table = np.genfromtxt(finished / "timings.csv", delimiter=",", names=True)
     assert table.size == FRAMES
-    assert np.allclose(table["search_ms"] + table["filter_ms"], table["milliseconds"], atol=1e-3)
+    stages = table["search_ms"] + table["filter_ms"] + table["new_features_ms"]
+    assert np.allclose(stages, table["milliseconds"], atol=1e-3)
     assert (table["waiting_for_image_ms"] >= 0.0).all()
 
 

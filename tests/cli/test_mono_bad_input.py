@@ -31,6 +31,7 @@ def run(folder, out, *arguments):
             "--particles",
             "8",
             "--no-video",
+            "--no-batch",
             *map(str, arguments),
         ]
     )
@@ -88,6 +89,32 @@ def test_darkness_and_a_frozen_camera_are_survived(folder, tmp_path, frozen):
     assert survived(folder, tmp_path / "run")["problems"]
 
 
+def test_darkness_from_the_start_is_said_and_no_frame_of_it_counts_as_tracked(folder, tmp_path):
+    for number in range(FRAMES):
+        if number < 9:
+            path = image_path(folder, number)
+            cv2.imwrite(str(path), np.zeros_like(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)))
+    entries = survived(folder, tmp_path / "run")
+    assert "shows nothing" in entries["problems"][0]
+    assert 4 <= entries["frames_tracked"] <= FRAMES - 7
+    assert entries["observations_per_frame"] > 2.0
+
+
+def test_a_video_that_ends_in_mid_frame_keeps_what_it_showed(desk, tmp_path):
+    images = sorted((desk / "mav0" / "cam0" / "data").iterdir())
+    video, whole = tmp_path / "cut.avi", tmp_path / "whole.avi"
+    writer = cv2.VideoWriter(str(whole), cv2.VideoWriter_fourcc(*"MJPG"), 30.0, (240, 180))
+    for path in images:
+        writer.write(cv2.imread(str(path)))
+    writer.release()
+    video.write_bytes(whole.read_bytes()[: int(0.7 * whole.stat().st_size)])
+    (tmp_path / "camera.yaml").write_text((desk / "camera.yaml").read_text())
+    assert run(video, tmp_path / "run") == 0
+    entries = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert 5 <= entries["frames"] < FRAMES
+    assert any("the video ends after" in note for note in entries["problems"])
+
+
 def test_equal_stamps_are_survived(folder, tmp_path):
     times = (folder / "times.txt").read_text().splitlines()
     times[5] = times[4]
@@ -136,6 +163,37 @@ def test_known_points_that_are_mixed_up_are_refused(desk, folder, tmp_path, caps
     points = known_points(desk, tmp_path / "mixed.csv", mixed)
     said = refused(capsys, folder, tmp_path / "run", "--known-points", points)
     assert "known point" in said and "which point is which" in said
+
+
+def test_known_points_on_a_line_are_refused(desk, folder, tmp_path, capsys):
+    def in_line(rows):
+        return [",".join([*row[:3], str(0.1 * k), str(0.2 * k), "0.0", row[6]]) for k, row in enumerate(rows)]
+
+    points = known_points(desk, tmp_path / "line.csv", in_line)
+    assert "lie on a line" in refused(capsys, folder, tmp_path / "run", "--known-points", points)
+
+
+@pytest.mark.parametrize(("column", "what"), [(1, "pixel"), (3, "position")])
+def test_a_known_point_that_is_given_twice_is_refused(desk, folder, tmp_path, capsys, column, what):
+    def twice(rows):
+        width = 2 if what == "pixel" else 3
+        rows[4][column : column + width] = rows[1][column : column + width]
+        return [",".join(row) for row in rows]
+
+    points = known_points(desk, tmp_path / "twice.csv", twice)
+    said = refused(capsys, folder, tmp_path / "run", "--known-points", points)
+    assert f"known points 2 and 5 have the same {what}" in said
+
+
+def test_known_points_that_the_image_does_not_show_are_refused(desk, folder, tmp_path, capsys):
+    image = cv2.imread(str(image_path(folder, 0)), cv2.IMREAD_GRAYSCALE)
+    row = (desk / "known_points.csv").read_text().splitlines()[2].split(",")
+    u, v = round(float(row[1])), round(float(row[2]))
+    image[v - 12 : v + 13, u - 12 : u + 13] = 128
+    cv2.imwrite(str(image_path(folder, 0)), image)
+    points = known_points(desk, tmp_path / "same.csv", lambda rows: [",".join(row) for row in rows])
+    said = refused(capsys, folder, tmp_path / "run", "--known-points", points)
+    assert "known point 2" in said and "shows no corner there" in said
 
 
 def test_known_points_outside_the_image_are_refused(desk, folder, tmp_path, capsys):

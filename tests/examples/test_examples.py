@@ -17,6 +17,7 @@ SECONDS_LONG = {
     "against_colmap",
     "error_ratios",
     "mono_blackouts",
+    "mono_budget",
     "mono_loop",
     "mono_overconfidence",
     "mono_still_camera",
@@ -89,6 +90,12 @@ def mono_blackouts(figures: dict[str, float]) -> None:
     assert figures["blackouts"] >= 2
     assert figures["recovered"] == 1.0
     assert figures["median error a second later [m]"] < 0.03
+
+
+def mono_budget(figures: dict[str, float]) -> None:
+    assert figures["same measurements"] == pytest.approx(figures["as it is"], rel=1e-3)
+    assert figures["batch"] < 0.5 * figures["as it is"]
+    assert figures["depths"] < figures["as it is"]
 
 
 def mono_depth(figures: dict[str, float]) -> None:
@@ -170,6 +177,7 @@ CLAIMS: dict[str, Callable[[Any], None]] = {
         gps_fix,
         lab_images,
         mono_blackouts,
+        mono_budget,
         mono_depth,
         mono_desk,
         mono_eigenvalues,

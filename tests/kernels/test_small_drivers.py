@@ -55,7 +55,7 @@ def iterated(nu, jac, cov, factor, rounds, scale):
         info = np.eye(factor.shape[1]) + np.einsum("k,kpa,kpb->ab", weight, white_jac, white_jac)
         u = np.linalg.solve(info, np.einsum("k,kpa,kp->a", weight, white_jac, white_nu))
         squared = np.square(white_nu - white_jac @ u).sum(axis=-1)
-    return squared
+    return squared, u, info
 
 
 def test_robust_fit_equals_numpys_and_leaves_the_outliers_far_off(rng):
@@ -64,9 +64,12 @@ def test_robust_fit_equals_numpys_and_leaves_the_outliers_far_off(rng):
     factor, truth = np.tril(rng.normal(size=(d, d))), rng.normal(size=d)
     nu = (jac @ factor) @ truth + 0.01 * rng.normal(size=(count, 2))
     nu[:4] += 30.0
-    squared = np.empty(count)
-    robust_fit(nu, jac, cov, factor, 10, 2.0, squared)
-    np.testing.assert_allclose(squared, iterated(nu, jac, cov, factor, 10, 2.0), rtol=1e-9, atol=1e-12)
+    squared, u, chol = np.empty(count), np.empty(d), np.empty((d, d))
+    robust_fit(nu, jac, cov, factor, 10, 2.0, squared, u, chol)
+    expected, fit, info = iterated(nu, jac, cov, factor, 10, 2.0)
+    np.testing.assert_allclose(squared, expected, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(u, fit, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(np.tril(chol) @ np.tril(chol).T, info, rtol=1e-9, atol=1e-9)
     assert squared[:4].min() > 9.2 > squared[4:].max()
 
 

@@ -52,7 +52,7 @@ class RayConfig:
     adapt: bool = True
     ready_ratio: float = 0.1
     ready_weight: float = 0.95
-    least_px: float = 3.0
+    least_px: float = 10.0
     line_px: float = 1.0
 
 

@@ -2,29 +2,50 @@
 
 A false match inside its search ellipse is not seen to be false before the pose is known, and then it is too late. The
 increment ε ~ N(0, Q) of the heaviest particle's pose is fitted to all matches with a Cauchy loss on their Mahalanobis
-distances (iteratively reweighted least squares); matches that stay far off take no part in the filter's step.
+distances (iteratively reweighted least squares); matches that stay far off take no part in the filter's step. The fit
+also tells where what was not found should be seen: among things that look alike (the corners of a chessboard, a row of
+windows) the right one is then nearest.
 """
 
+from typing import NamedTuple
+
 import numpy as np
+
+from rbpf import gaussian
 
 ROUNDS = 10
 SCALE = 2.0
 """Of the loss: a match this many standard deviations off keeps half of its weight."""
 
 
-def agreeing(nu: np.ndarray, jac: np.ndarray, cov: np.ndarray, factor: np.ndarray, gate: float) -> np.ndarray:
-    """Which of K matches agree, (K,) bool.
+class Fit(NamedTuple):
+    """A motion that most of K matches agree on, ε = L u.
+
+    Attributes:
+        squared: (K,) squared Mahalanobis distance of each match from it.
+        increment: (d,) ε.
+        cov: (d, d) of ε.
+    """
+
+    squared: np.ndarray
+    increment: np.ndarray
+    cov: np.ndarray
+
+
+def fit_motion(nu: np.ndarray, jac: np.ndarray, cov: np.ndarray, factor: np.ndarray) -> Fit:
+    """The motion that K matches agree on.
 
     Args:
         nu: (K, p) innovations at the predicted pose.
         jac: (K, p, d) by the pose, H.
         cov: (K, p, p) of the innovations given the pose, S = J P Jᵀ + R.
         factor: (d, r) of the prior's covariance, Q = L Lᵀ.
-        gate: on the squared Mahalanobis distance that is left, χ² with p degrees of freedom.
     """
     from rbpf.kernels.robust_fit import robust_fit
 
-    squared = np.empty(nu.shape[0])
+    rank = factor.shape[1]
+    squared, u, chol_info = np.empty(nu.shape[0]), np.empty(rank), np.empty((rank, rank))
     arrays = (np.ascontiguousarray(array, dtype=float) for array in (nu, jac, cov, factor))
-    robust_fit(*arrays, ROUNDS, SCALE, squared)
-    return np.asarray(squared <= gate)
+    robust_fit(*arrays, ROUNDS, SCALE, squared, u, chol_info)
+    half = gaussian.solve_lower_matrix(chol_info, factor.T)
+    return Fit(squared, factor @ u, half.T @ half)

@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
@@ -14,43 +13,12 @@ from rbpf.models import Births, Observations, Sensor
 from rbpf.sensors.camera_points import CameraRay
 from rbpf.sensors.corners import corners
 from rbpf.sensors.features import FeatureFrame
-from rbpf.sensors.patches import cut, search, warp
+from rbpf.sensors.patches import cut
 from rbpf.sensors.readers.images import ImageFrame
+from rbpf.systems.mono.active_search import ActiveSearch, Searched
 from rbpf.systems.mono.appearance import SOURCE_HALF_PX, Appearances
 from rbpf.systems.mono.config import SearchConfig
-from rbpf.systems.mono.consensus import agreeing
 from rbpf.systems.mono.feature_sensor import FeatureSensor
-from rbpf.systems.mono.viewing import affines
-
-_CELLS = 6
-"""The image is divided into so many columns and rows, from which features are chosen in turn."""
-
-
-@dataclass(frozen=True)
-class Searched:
-    """What was looked for in a frame, K features.
-
-    Attributes:
-        rows: (K,) of the table.
-        mean: (K, 2) predicted places, px.
-        cov: (K, 2, 2) with the noise of the measurement.
-        px: (K, 2) where each was found; NaN where not.
-        score: (K,) normalised cross-correlation of the best match.
-        found: (K,) whether it was accepted.
-    """
-
-    rows: np.ndarray
-    mean: np.ndarray
-    cov: np.ndarray
-    px: np.ndarray
-    score: np.ndarray
-    found: np.ndarray
-
-    @classmethod
-    def nothing(cls) -> "Searched":
-        """No feature."""
-        none, places = np.zeros(0), np.zeros((0, 2))
-        return cls(np.zeros(0, dtype=np.int64), places, np.zeros((0, 2, 2)), places, none, none.astype(bool))
 
 
 @final
@@ -67,13 +35,15 @@ class ImageSensor(Sensor):
         self.camera = features.camera
         self.config = config
         self.table = Appearances()
+        self.search = ActiveSearch(features, self.table, config)
         self.searched = Searched.nothing()
         self.measured = self._features(0, np.zeros(0, dtype=np.int64), np.zeros((0, 2)))
         self.bad_frames = 0
         self._given: np.ndarray | None = None
-        self._in_view = np.zeros((0, 2))
-        self.seconds, self.seconds_births = 0.0, 0.0
-        """Times of the last search, and of the last births."""
+        self.seconds = 0.0
+        """Time of the last search."""
+        self.seconds_births = 0.0
+        """Time of the last `births`."""
 
     @property
     def lost(self) -> bool:
@@ -106,11 +76,14 @@ class ImageSensor(Sensor):
             rows, px, self._given = np.arange(self._given.shape[0]), self._given, None
         elif self.table.alive.any():
             if frame.image is not None:
-                self.searched = self._search(frame.image, belief)
-                rows, px = self._agreeing(belief)
+                self.searched = self.search.run(frame.image, belief)
+                found = self.searched.found
+                rows, px = self.searched.rows[found], self.searched.px[found]
             self.bad_frames = self.bad_frames + 1 if self._fails() else 0
             if self.bad_frames:
                 rows, px = rows[:0], px[:0]
+        else:
+            self.bad_frames = 0 if frame.image is not None else self.bad_frames + 1
         self.measured = self._features(frame.stamp_ns, rows, px)
         self.seconds = time.perf_counter() - started
         return self.features.observe(self.measured, belief)
@@ -138,69 +111,6 @@ class ImageSensor(Sensor):
         self.table.restore(arrays)
         self.bad_frames = int(arrays["search/bad_frames"])
         self._given = None
-
-    def _search(self, image: np.ndarray, belief: Belief) -> Searched:
-        pose = belief.state[belief.mode][:7]
-        rows = self._choose(pose)
-        if not rows.size:
-            return Searched.nothing()
-        rows, mean, cov = self._predict(rows, belief)
-        cov = cov + self.config.noise_px**2 * np.eye(2)
-        turn = affines(self.camera, self.table.place[rows], self.table.first_pose[rows], pose)
-        templates = warp(self.table.source[rows], turn, self.config.template_px)
-        matches = search(
-            image, templates, mean, cov, sigmas=self.config.sigmas, most_px=self.config.largest_px
-        )
-        found = (matches.score >= self.config.accept) & self.camera.inside(matches.px)
-        return Searched(rows, mean, cov, matches.px, matches.score, found)
-
-    def _agreeing(self, belief: Belief) -> tuple[np.ndarray, np.ndarray]:
-        """The found features that agree with one motion of the camera; the others count as not found."""
-        searched = self.searched
-        hits = np.flatnonzero(searched.found)
-        if not hits.size:
-            return searched.rows[hits], searched.px[hits]
-        rows, px = searched.rows[hits], searched.px[hits]
-        which, nu, jac, cov = self.features.innovations(belief, rows, self.table.member[rows], px)
-        factor = belief.prior.spread(belief.prior.mean)
-        own = factor[belief.mode if factor.shape[0] > 1 else 0]
-        cov = cov + self.config.noise_px**2 * np.eye(2)
-        good = which[agreeing(nu, jac, cov, own, self.config.gate)]
-        found = np.zeros_like(searched.found)
-        found[hits[good]] = True
-        self.searched = replace(searched, found=found)
-        return rows[good], px[good]
-
-    def _choose(self, pose: np.ndarray) -> np.ndarray:
-        """Rows of the features worth looking for, spread over the image (E06 §4.1)."""
-        from rbpf.sensors.view_kernels import in_view
-
-        table, camera, config = self.table, self.camera, self.config
-        of_image = (camera.width, camera.height, config.margin_px, camera.monotonic_radius)
-        limits = np.array([*of_image, np.cos(np.deg2rad(config.turn_deg)), config.scale], dtype=float)
-        rows, px = np.empty(table.count, dtype=np.int64), np.empty((table.count, 2))
-        columns = (table.place, table.first_pose, table.alive)
-        count = in_view(*columns, np.ascontiguousarray(pose), camera.params, limits, rows, px)
-        rows, px = rows[:count], px[:count]
-        size = np.array([self.camera.width, self.camera.height])
-        column, line = np.clip(px * _CELLS / size, 0, _CELLS - 1).astype(np.int64).T
-        cell = column + _CELLS * line
-        self._in_view = px
-        worth = (table.found[rows] + 1.0) / (table.attempts[rows] + 2.0) - 0.2 * table.missed[rows]
-        order = np.lexsort((-worth, cell))
-        _, first = np.unique(cell[order], return_index=True)
-        rank = np.arange(order.size) - np.repeat(first, np.diff(np.append(first, order.size)))
-        best_first = order[np.lexsort((-worth[order], rank))]
-        return np.asarray(rows[best_first[: self.config.measurements]])
-
-    def _predict(self, rows: np.ndarray, belief: Belief) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Rows again, mean (K, 2) and covariance (K, 2, 2) of where they are under all particles, by kind."""
-        done = [
-            (chosen, *predicted)
-            for chosen, predicted in self.features.project(belief, rows, self.table.member[rows])
-        ]
-        chosen, mean, cov = (np.concatenate(parts) for parts in zip(*done, strict=True))
-        return rows[chosen], mean, cov
 
     def _fails(self) -> bool:
         """Whether so little agrees that it may be chance. Once lost, more has to agree: the camera may be anywhere."""
@@ -243,11 +153,11 @@ class ImageSensor(Sensor):
         config, measured = self.config, self.measured
         room = config.measurements - measured.landmarks.size
         if self.table.count > measured.landmarks.size:
-            room = min(config.in_view - self._in_view.shape[0], config.new_per_frame)
+            room = min(config.in_view - self.search.in_view.shape[0], config.new_per_frame)
         room = min(room, self.features.births_per_frame)
         if room <= 0:
             return measured
-        occupied = np.concatenate([measured.z, self._in_view])
+        occupied = np.concatenate([measured.z, self.search.in_view])
         px, _ = corners(frame.image, occupied, room, config.spacing_px, SOURCE_HALF_PX + 1.0)
         px = px[np.isfinite(self.camera.unproject(px)).all(axis=1)]
         if not px.shape[0]:

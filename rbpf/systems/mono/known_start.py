@@ -13,6 +13,7 @@ from rbpf.lie.matrices import skew
 from rbpf.maps.constellation import LEAST, Constellation, UncertainConstellation
 from rbpf.models import Records
 from rbpf.sensors.camera_points import CameraPoint
+from rbpf.sensors.corners import texture
 from rbpf.sensors.features import FeatureFrame, KnownPoints
 from rbpf.sensors.pinhole import Pinhole
 from rbpf.sensors.readers.images import KnownPixels
@@ -20,6 +21,12 @@ from rbpf.sensors.resection import resect
 
 MOST_SIGMAS, MOST_PX = 6.0, 4.0
 """A known point may be seen this far from where the resected camera sees it: so many σ, and so many pixels more."""
+
+SAME_PX = 1.0
+"""Known points nearer to each other in the image are one."""
+
+LEAST_TEXTURE = 2.0
+"""Slope that a known point's surroundings must have in every direction, grey levels per pixel: noise has as much."""
 
 
 def resect_known(camera: Pinhole, known: KnownPixels, noise_px: float) -> np.ndarray:
@@ -31,7 +38,8 @@ def resect_known(camera: Pinhole, known: KnownPixels, noise_px: float) -> np.nda
         noise_px: standard deviation of where they are seen.
 
     Raises:
-        InputError: a point lies outside the image, the points do not determine the camera, or no pose explains them.
+        InputError: a point lies outside the image, two are at one place, the points do not determine the camera, or no
+            pose explains them.
     """
     inside = camera.inside(known.px)
     if not inside.all():
@@ -41,6 +49,7 @@ def resect_known(camera: Pinhole, known: KnownPixels, noise_px: float) -> np.nda
             f"known point {known.names[worst]} at ({u:.1f}, {v:.1f}) px lies outside the first image of "
             f"{camera.width}x{camera.height} px: give points that are seen in it"
         )
+    _require_different(known)
     world_from_camera = resect(camera, known.positions, known.px)
     local = SE3.inverse_transform(world_from_camera, known.positions)
     error = np.linalg.norm(camera.project(local) - known.px, axis=1)
@@ -140,3 +149,32 @@ class _FirstImage:
             rows[k, :, 6 + 3 * m : 9 + 3 * m] = by_point[k]
         seen = gaussian.solve_lower_matrix(self._chol_px, rows).reshape(-1, self.size)
         return -np.concatenate([seen, gaussian.solve_lower_matrix(self._chol_prior, np.eye(self.size))])
+
+
+def require_texture(image: np.ndarray, known: KnownPixels) -> None:
+    """Refuses known points that could not be found again.
+
+    Args:
+        image: the first one, (H, W) uint8.
+        known: M points that are seen in it.
+
+    Raises:
+        InputError: there is nothing to recognise at a point.
+    """
+    score = texture(image, known.px)
+    worst = int(np.argmin(score))
+    if score[worst] < LEAST_TEXTURE:
+        u, v = known.px[worst]
+        raise InputError(
+            f"known point {known.names[worst]} at ({u:.1f}, {v:.1f}) px cannot be found again, the first image shows "
+            "no corner there: check the pixel, or leave the point out"
+        )
+
+
+def _require_different(known: KnownPixels) -> None:
+    for what, places, least in (("pixel", known.px, SAME_PX), ("position", known.positions, 0.0)):
+        first, second = np.triu_indices(known.names.size, 1)
+        near = np.flatnonzero(np.linalg.norm(places[first] - places[second], axis=1) <= least)
+        if near.size:
+            one, other = known.names[first[near[0]]], known.names[second[near[0]]]
+            raise InputError(f"known points {one} and {other} have the same {what}: keep one of the two")

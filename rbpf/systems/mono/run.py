@@ -10,8 +10,10 @@ from rbpf.anchoring import relative_estimate
 from rbpf.estimate import Estimate
 from rbpf.filter import Filter, StepReport
 from rbpf.lie import SE3
+from rbpf.models import Sensor
 from rbpf.sensors.features import FeatureLog
 from rbpf.systems.mono.config import MonoConfig
+from rbpf.systems.mono.feature_sensor import FeatureSensor
 from rbpf.systems.mono.system import build_filter, start_law, world_of
 
 
@@ -49,7 +51,10 @@ class MonoRun:
 
 
 def run(
-    log: FeatureLog, config: MonoConfig, on_step: Callable[[int, Filter, StepReport], None] | None = None
+    log: FeatureLog,
+    config: MonoConfig,
+    on_step: Callable[[int, Filter, StepReport], None] | None = None,
+    wrapped: Callable[[FeatureSensor], Sensor] | None = None,
 ) -> MonoRun:
     """Filters a whole log.
 
@@ -57,11 +62,12 @@ def run(
         log: of one camera.
         config: all settings.
         on_step: called after each frame with its number, the filter and what the step did.
+        wrapped: puts a sensor around the usual one, see `build_filter`.
 
     Raises:
         InputError: the log or a setting does not fit, or no particle explains the observations.
     """
-    filter_ = build_filter(log, config)
+    filter_ = build_filter(log, config, wrapped)
     control = start_law(log, config)
     total = len(log.frames)
     numbers = [np.zeros(total) for _ in range(6)]

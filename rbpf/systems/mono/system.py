@@ -1,5 +1,7 @@
 """Monocular SLAM on features (E06): constant velocity, a camera, points and rays."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from rbpf.anchoring import Anchored
@@ -20,8 +22,15 @@ from rbpf.systems.mono.feature_sensor import CONSTELLATION, FeatureSensor
 from rbpf.systems.mono.known_start import KnownStart, first_records
 
 
-def build_filter(log: FeatureLog, config: MonoConfig) -> Filter:
+def build_filter(
+    log: FeatureLog, config: MonoConfig, wrapped: Callable[[FeatureSensor], Sensor] | None = None
+) -> Filter:
     """The filter for a log, with its known points in the map; `start_law` says where it starts.
+
+    Args:
+        log: of one camera.
+        config: all settings.
+        wrapped: puts a sensor around the usual one, to change what it observes or starts.
 
     Raises:
         InputError: the log is not a monocular one.
@@ -31,7 +40,8 @@ def build_filter(log: FeatureLog, config: MonoConfig) -> Filter:
     if any((frame.landmarks < 0).any() for frame in log.frames):
         raise InputError(f"{log.name}: a landmark has a negative name, number the landmarks from 0 on")
     start = None if log.known is None else _known_start(log)
-    return assemble(config, build_features(log.camera, config, start), start)
+    features = build_features(log.camera, config, start)
+    return assemble(config, features, start, None if wrapped is None else wrapped(features))
 
 
 def build_features(camera: Pinhole, config: MonoConfig, start: KnownStart | None) -> FeatureSensor:

@@ -15,7 +15,7 @@ from rbpf.sensors.features import FeatureFrame, KnownPoints
 from rbpf.sensors.readers.images import ImageFrame, ImageSequence, KnownPixels
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.image_sensor import ImageSensor
-from rbpf.systems.mono.known_start import KnownStart, resect_known
+from rbpf.systems.mono.known_start import KnownStart, require_texture, resect_known
 from rbpf.systems.mono.recovery import Recovery
 from rbpf.systems.mono.resuming import cut, restore, save
 from rbpf.systems.mono.run import pose_estimate
@@ -110,18 +110,14 @@ def run_images(
         InputError: the first image cannot be read, the known points do not determine the camera, or the checkpoint
             is of another run.
     """
-    first = next(sequence.frames(), None)
-    if first is None or first.image is None:
-        reason = "it has no image" if first is None else first.problem
-        raise InputError(f"{sequence.name}: the first image is needed to start: {reason}")
-    run, law = _begin(sequence, config, known, first.image)
+    run, law = _begin(sequence, config, known, first_image(sequence))
     if resume and checkpoint is not None and checkpoint.exists():
         restore(run, checkpoint)
     waited = time.perf_counter()
     for t, frame in enumerate(_frames_from(sequence, run.filter.steps), run.filter.steps):
         run.seconds_waiting[t] = time.perf_counter() - waited
         try:
-            _frame(run, t, frame, law if t == 0 else None)
+            _frame(run, t, frame, law if t == 0 else _waiting(run))
         except InputError as error:
             if t == 0:
                 raise
@@ -136,6 +132,19 @@ def run_images(
     if checkpoint is not None and run.failure is None:
         save(run, checkpoint)
     return run
+
+
+def first_image(sequence: ImageSequence) -> np.ndarray:
+    """The image (H, W) that a run starts from.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    first = next(sequence.frames(), None)
+    if first is None or first.image is None:
+        reason = "it has no image" if first is None else first.problem
+        raise InputError(f"{sequence.name}: the first image is needed to start: {reason}")
+    return first.image
 
 
 def _frames_from(sequence: ImageSequence, start: int) -> Iterator[ImageFrame]:
@@ -155,6 +164,7 @@ def _begin(
         sight = FeatureFrame(int(sequence.stamps_ns[0]), points.names, known.px, noise)
         pose = resect_known(sequence.camera, known, config.search.noise_px)
         start = KnownStart(points, pose, points.names, sight)
+        require_texture(image, known)
         if config.known == "points":
             law = PoseLaw(pose, start_cov(config))
     features = build_features(sequence.camera, config, start)
@@ -167,7 +177,15 @@ def _begin(
     filter_ = assemble(config, features, start, sensor)
     stamps = np.asarray(sequence.stamps_ns, dtype=np.int64)
     run = VideoRun(sequence, config, known, filter_, sensor, stamps, poses, covs, *numbers)
+    run.recovery.stamp_ns = int(stamps[0])
     return run, law
+
+
+def _waiting(run: VideoRun) -> PoseLaw | None:
+    """The camera stays at the origin until an image shows something; nothing once there are features."""
+    if run.sensor.table.count:
+        return None
+    return PoseLaw(SE3.identity(), np.zeros((6, 6)), start_std(run.config.velocity))
 
 
 def _frame(run: VideoRun, t: int, frame: ImageFrame, law: PoseLaw | None) -> None:

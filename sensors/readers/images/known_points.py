@@ -26,12 +26,15 @@ class KnownPixels:
         px: (M, 2) pixels in the first image as it is stored (distorted).
         positions: (M, 3) in the world, m.
         std_m: (M,) standard deviation of each position, m.
+        own_frame: the positions are in a frame of the points' own, as a chessboard's, of which the recording's ground
+            truth knows nothing.
     """
 
     names: np.ndarray
     px: np.ndarray
     positions: np.ndarray
     std_m: np.ndarray
+    own_frame: bool = False
 
 
 def read_known_points(path: str | Path) -> KnownPixels:

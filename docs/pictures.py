@@ -1,0 +1,75 @@
+"""Makes the README's pictures: `python docs/pictures.py`, from a desk that is rendered first.
+
+docs/pictures/desk.webp   the annotated frames, as an animation
+docs/pictures/map.png     the map at the end, with 3σ ellipses
+"""
+
+from itertools import islice
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import tyro
+from PIL import Image
+
+from rbpf.sensors.pinhole import Pinhole
+from rbpf.systems.mono.config import MonoConfig
+from rbpf.systems.mono.video import VideoRun
+from rbpf.validation.mono import Recording, start_mono
+from rbpf.validation.mono_map import summarise_mono_map
+from rbpf.validation.mono_pictures import plot_mono_run
+from rbpf.validation.mono_video import annotated_frames
+from rbpf.validation.simulation.exposure import Imaging
+from rbpf.validation.simulation.images import simulate_images
+from rbpf.validation.simulation.textured_desk import TexturedDesk
+
+EVERY = 4
+"""Frames of the recording from one of the animation to the next."""
+
+FRAMES, WIDTH, QUALITY = 45, 560, 45
+"""Of the animation; its width in px, the quality in per cent."""
+
+COLOURS = 64
+"""Of the map's picture: lines and letters need no more."""
+
+
+def animate(run: VideoRun, path: Path) -> None:
+    """Some of the annotated frames, smaller."""
+    chosen = islice(annotated_frames(run), 1, 1 + EVERY * FRAMES, EVERY)
+    pictures = [Image.fromarray(frame) for frame in chosen]
+    size = WIDTH, round(WIDTH * pictures[0].height / pictures[0].width)
+    small = [picture.resize(size, Image.Resampling.LANCZOS) for picture in pictures]
+    small[0].save(
+        path, save_all=True, append_images=small[1:], duration=EVERY * 33, loop=0, quality=QUALITY, method=6
+    )
+
+
+def shrink(source: Path, path: Path) -> None:
+    """A picture with few colours."""
+    with Image.open(source) as picture:
+        picture.convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE).save(path, optimize=True)
+
+
+def main(images: Path | None = None, out: Path = Path(__file__).parent / "pictures") -> None:
+    """Renders, filters, draws.
+
+    Args:
+        images: a sequence with its known_points.csv; by default a desk is rendered.
+        out: folder for the pictures.
+    """
+    out.mkdir(exist_ok=True)
+    with TemporaryDirectory() as temporary:
+        scratch = Path(temporary)
+        if images is None:
+            images = scratch / "desk"
+            camera = Pinhole(640, 480, 512.0, 512.0, 319.5, 239.5)
+            simulate_images(TexturedDesk(frames=300), Imaging(), camera, images, seed=0)
+        run = start_mono(Recording(images, images / "known_points.csv"), MonoConfig())
+        animate(run, out / "desk.webp")
+        plot_mono_run(run, summarise_mono_map(run.filter), scratch)
+        shrink(scratch / "map.png", out / "map.png")
+    for path in (out / "desk.webp", out / "map.png"):
+        print(f"{path}: {path.stat().st_size / 1000:.0f} kB")
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

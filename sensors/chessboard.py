@@ -1,0 +1,146 @@
+"""A printed chessboard of known size in an image: known points to start from.
+
+Its frame: the first inner corner is the origin, x runs along the rows, y across them, z into the sheet. Where columns
+and rows are not both even or both odd, the first corner is the one whose square towards the board's middle is black;
+else the board looks the same upside down, and either of two corners is the first.
+"""
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+
+from rbpf.errors import InputError
+from rbpf.sensors.patches import checked_image
+from rbpf.sensors.readers.images.known_points import KnownPixels
+
+MOST = 12
+"""Corners that a run starts from, spread over the board: more are nearer to each other than a search reaches."""
+
+LEAST_SQUARE_PX = 5.0
+"""Corners nearer to each other than this cannot be told apart."""
+
+_SIZE = re.compile(r"(\d{1,3})[xX×](\d{1,3})", re.ASCII)
+_SEARCHES = (0, "CALIB_CB_NORMALIZE_IMAGE", "CALIB_CB_EXHAUSTIVE")
+
+
+@dataclass(frozen=True)
+class Board:
+    """What is printed.
+
+    Attributes:
+        columns: inner corners in a row.
+        rows: inner corners in a column.
+        square_m: side of a square.
+
+    Raises:
+        InputError: there are fewer than three of either, or the squares have no size.
+    """
+
+    columns: int
+    rows: int
+    square_m: float
+
+    def __post_init__(self) -> None:
+        if min(self.columns, self.rows) < 3:
+            raise InputError(
+                f"a chessboard needs at least 3x3 inner corners, got {self.columns}x{self.rows}: count the places "
+                "where four squares meet"
+            )
+        if not 0.0 < self.square_m < np.inf:
+            raise InputError(f"the side of a chessboard's square must be positive, got {self.square_m} m")
+
+    @classmethod
+    def parse(cls, size: str, square_m: float) -> "Board":
+        """A board whose inner corners are written as 9x6.
+
+        Raises:
+            InputError: they are not.
+        """
+        found = _SIZE.fullmatch(size.strip())
+        if found is None:
+            raise InputError(f"the size of a chessboard is its inner corners as 9x6, got {size!r}")
+        return cls(int(found[1]), int(found[2]), square_m)
+
+    @property
+    def corners(self) -> np.ndarray:
+        """(rows · columns, 3) inner corners in the board's frame, row by row, m."""
+        y, x = np.divmod(np.arange(self.rows * self.columns), self.columns)
+        return self.square_m * np.stack([x, y, np.zeros_like(x)], axis=-1).astype(float)
+
+
+def find_board(image: np.ndarray, board: Board) -> KnownPixels:
+    """Well-spread corners of a board in an image, as exact known points; the names are their numbers, row by row.
+
+    Args:
+        image: (H, W) uint8.
+        board: what is printed.
+
+    Raises:
+        InputError: the board is not seen whole, or it is too small in the image.
+    """
+    image = checked_image(image)
+    px = _ordered(image, _detected(image, board), board)
+    grid = px.reshape(board.rows, board.columns, 2)
+    side = min(np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min() for axis in (0, 1))
+    if side < LEAST_SQUARE_PX:
+        raise InputError(
+            f"the chessboard's squares are only {side:.1f} px wide in the first image: start nearer to it"
+        )
+    chosen = spread_rows(board.corners, MOST)
+    return KnownPixels(chosen, px[chosen], board.corners[chosen], np.zeros(chosen.size), own_frame=True)
+
+
+def spread_rows(points: np.ndarray, count: int) -> np.ndarray:
+    """Rows, ascending, of at most `count` points (M, D), each in turn the farthest from those chosen before it."""
+    middle = points.mean(axis=0)
+    chosen = [int(np.argmax(np.linalg.norm(points - middle, axis=1)))]
+    nearest = np.linalg.norm(points - points[chosen[0]], axis=1)
+    while len(chosen) < min(count, points.shape[0]):
+        chosen.append(int(np.argmax(nearest)))
+        nearest = np.minimum(nearest, np.linalg.norm(points - points[chosen[-1]], axis=1))
+    return np.sort(np.array(chosen, dtype=np.int64))
+
+
+def _detected(image: np.ndarray, board: Board) -> np.ndarray:
+    """Corners (rows · columns, 2) in one of the orders in which a detector may give them."""
+    import cv2
+
+    for search in _SEARCHES:
+        flags = getattr(cv2, search) if isinstance(search, str) else search
+        found, px = cv2.findChessboardCornersSB(image, (board.columns, board.rows), flags=flags)
+        if found:
+            return _refined(image, np.asarray(px, dtype=np.float32).reshape(-1, 2), board)
+    raise InputError(
+        f"no chessboard of {board.columns}x{board.rows} inner corners is seen in the first image: it has to be seen "
+        "whole, with its white border, sharp and evenly lit"
+    )
+
+
+def _refined(image: np.ndarray, px: np.ndarray, board: Board) -> np.ndarray:
+    """Corners to a fraction of a pixel: where the slopes of the image all point past them (saddle points)."""
+    import cv2
+
+    grid = px.reshape(board.rows, board.columns, 2)
+    side = min(float(np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min()) for axis in (0, 1))
+    half = int(np.clip(0.4 * side, 2, 11))
+    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
+    refined = cv2.cornerSubPix(image, px.reshape(-1, 1, 2).copy(), (half, half), (-1, -1), criteria)
+    return np.asarray(refined, dtype=float).reshape(-1, 2)
+
+
+def _ordered(image: np.ndarray, px: np.ndarray, board: Board) -> np.ndarray:
+    """The same corners in the order of the board's frame."""
+    grid = px.reshape(board.rows, board.columns, 2)
+    across, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
+    if across[0] * down[1] - across[1] * down[0] < 0.0:
+        grid = grid[:, ::-1]  # seen from the front, x, y and z into the sheet are right-handed
+    if _grey(image, grid, 0) > _grey(image, grid, 1):
+        grid = grid[::-1, ::-1]
+    return grid.reshape(-1, 2)
+
+
+def _grey(image: np.ndarray, grid: np.ndarray, column: int) -> int:
+    """Grey level in the middle of a square of the first row between inner corners."""
+    x, y = np.rint(grid[:2, column : column + 2].mean(axis=(0, 1))).astype(int)
+    return int(image[y, x])

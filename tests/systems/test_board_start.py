@@ -1,0 +1,59 @@
+"""A run that starts from a rendered chessboard: its corners look alike, and are told apart all the same."""
+
+import numpy as np
+import pytest
+import yaml
+
+from rbpf.lie import SE3
+from rbpf.sensors.chessboard import Board
+from rbpf.sensors.pinhole import Pinhole
+from rbpf.systems.mono.config import MonoConfig
+from rbpf.systems.mono.video import run_images
+from rbpf.validation.mono import Recording
+from rbpf.validation.mono_batch import adjust_run, score_batch
+from rbpf.validation.simulation.exposure import Imaging
+from rbpf.validation.simulation.images import simulate_images
+from rbpf.validation.simulation.textured_desk import TexturedDesk
+
+CAMERA = Pinhole(320, 240, 256.0, 256.0, 159.5, 119.5)
+BOARD = Board(7, 4, 0.06)
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def started(tmp_path_factory):
+    """The run, and the true poses in the board's frame."""
+    folder = tmp_path_factory.mktemp("board") / "desk"
+    world = TexturedDesk(frames=60, board=(8, 5), square_m=0.06, speed_m_s=0.6, turn_rad_s=1.0, start_s=0.3)
+    simulate_images(world, Imaging(noise_std=1.0, known=0), CAMERA, folder, seed=0)
+    sequence, known = Recording(folder, board=BOARD).open()
+    entry = yaml.safe_load((folder / "chessboard.yaml").read_text())[0]
+    assert sequence.truth is not None
+    board_from_world = SE3.inverse(np.array(entry["world_from_board"]))
+    truth = SE3.compose(board_from_world, sequence.truth.world_from_camera)
+    return run_images(sequence, MonoConfig(), known), truth
+
+
+def test_every_corner_is_found_at_its_own_place(started):
+    run, truth = started
+    count = 0
+    for sighting, pose in zip(run.sightings.frames, truth, strict=True):
+        mine = sighting.found & (sighting.rows < run.known.names.size)
+        places = run.known.positions[sighting.rows[mine]]
+        px = run.sequence.camera.project(SE3.inverse_transform(pose, places))
+        assert (np.linalg.norm(px - sighting.px[mine], axis=1) < 2.0).all()
+        count += int(mine.sum())
+    assert count > 4 * truth.shape[0]
+    assert not run.lost.any()
+
+
+def test_the_first_camera_is_right_to_one_per_cent(started):
+    run, truth = started
+    distance = np.linalg.norm(truth[0, 4:])
+    assert np.linalg.norm(run.world_from_camera[0, 4:] - truth[0, 4:]) < 0.01 * distance
+
+
+def test_the_measurements_have_the_board_s_scale_to_one_per_cent(started):
+    run, _ = started
+    assert abs(score_batch(run, adjust_run(run))["batch_sim3_scale"] - 1.0) < 0.01

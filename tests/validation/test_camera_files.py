@@ -1,0 +1,79 @@
+"""Measurements of a camera survive a round trip to the last bit, and damaged files are named."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rbpf.errors import InputError
+from rbpf.sensors.features import FeatureFrame, FeatureLog, KnownPoints
+from rbpf.sensors.pinhole import Pinhole
+from rbpf.validation.camera_files import FRAMES, KNOWN, OBSERVATIONS, read_features, write_features
+
+CAMERA = Pinhole(640, 480, 512.1, 511.9, 319.4, 239.6, (0.1, -0.05, 1e-3, -2e-3, 0.01))
+
+
+def log(known: bool = True) -> FeatureLog:
+    """Four frames, of which the second saw nothing."""
+    rng, frames = np.random.default_rng(0), []
+    for t, count in enumerate((5, 0, 3, 4)):
+        root = rng.standard_normal((count, 2, 2))
+        cov = root @ np.swapaxes(root, -1, -2) + np.eye(2)
+        cov = 0.5 * (cov + np.swapaxes(cov, -1, -2))
+        z = rng.uniform(0.0, 480.0, (count, 2))
+        frames.append(FeatureFrame(1_400_000_000_000_000_000 + t * 33_333_333, np.arange(count) + t, z, cov))
+    points = KnownPoints(np.arange(4), rng.standard_normal((4, 3)), np.tile(1e-4 * np.eye(3), (4, 1, 1)))
+    return FeatureLog("a desk", CAMERA, frames, points if known else None)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_reading_gives_back_the_same_bits(tmp_path, known):
+    write_features(tmp_path, log())
+    write_features(tmp_path, log(known))
+    again, original = read_features(tmp_path), log(known)
+    assert again.name == original.name and again.camera == original.camera
+    for one, other in zip(again.frames, original.frames, strict=True):
+        assert one.stamp_ns == other.stamp_ns
+        for name in ("landmarks", "z", "cov_z"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+    assert (again.known is None) == (original.known is None)
+    if again.known is not None and original.known is not None:
+        for name in ("names", "positions", "cov"):
+            np.testing.assert_array_equal(getattr(again.known, name), getattr(original.known, name))
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "words"),
+    [
+        (OBSERVATIONS, "# rbpf observations 1", "# rbpf observations 9", "expected '# rbpf observations 1'"),
+        (
+            OBSERVATIONS,
+            "# measurement: pinhole",
+            "# measurement: range_bearing",
+            "expected measurement to be pinhole",
+        ),
+        (OBSERVATIONS, "# size: 640 480", "# size: 640", "expected 2 numbers for size"),
+        (OBSERVATIONS, "\n3,", "\n4,", "expected a step from 0 to 3"),
+        (OBSERVATIONS, "# rows: 12", "# rows: 13", "expected 13 rows"),
+        (FRAMES, "# recording: a desk", "# recording: a room", "take both files from one run"),
+        (FRAMES, "\n2,", "\n5,", "one row per frame"),
+        (KNOWN, "# rows: 4", "# rows: four", "expected rows to be a whole number"),
+    ],
+)
+def test_a_damaged_file_is_named(tmp_path, name, old, new, words):
+    write_features(tmp_path, log())
+    text = (tmp_path / name).read_text()
+    assert old in text
+    (tmp_path / name).write_text(text.replace(old, new, 1))
+    with pytest.raises(InputError, match=words) as error:
+        read_features(tmp_path)
+    assert name in str(error.value)
+
+
+def test_a_stamp_that_belongs_to_another_frame_is_refused(tmp_path):
+    write_features(tmp_path, log())
+    write_features(tmp_path / ".", replace(log(), frames=log().frames))
+    text = (tmp_path / OBSERVATIONS).read_text()
+    (tmp_path / OBSERVATIONS).write_text(text.replace("1400000000066666666", "1400000000066666667"))
+    with pytest.raises(InputError, match="gives this step"):
+        read_features(tmp_path)

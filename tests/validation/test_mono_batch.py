@@ -1,0 +1,91 @@
+"""The batch adjustment beside a run over images: which frames take part, what it finds, when it gives up."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rbpf.errors import InputError
+from rbpf.lie import SE3
+from rbpf.sensors.features import FeatureFrame, FeatureLog
+from rbpf.validation.gtsam_ba_camera import solve_features
+from rbpf.validation.mono_batch import ROBUST, adjust_log, connected_frames
+from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
+from rbpf.validation.simulation.point_worlds import DeskWorld
+from tests.exactness.models import known
+
+FRAMES = 30
+
+
+@pytest.fixture(scope="module")
+def log() -> FeatureLog:
+    return simulate_features(DeskWorld(frames=FRAMES), Measuring(), MONO, 3)
+
+
+def rough(log: FeatureLog) -> np.ndarray:
+    """Poses somewhere near the truth."""
+    rng = np.random.default_rng(0)
+    return SE3.retract(known(log.truth).world_from_camera, 0.01 * rng.standard_normal((len(log.frames), 6)))
+
+
+def kept(frame: FeatureFrame, rows: np.ndarray) -> FeatureFrame:
+    return FeatureFrame(frame.stamp_ns, frame.landmarks[rows], frame.z[rows], frame.cov_z[rows])
+
+
+def changed(log: FeatureLog, frames: dict[int, FeatureFrame]) -> FeatureLog:
+    return replace(log, frames=[frames.get(t, frame) for t, frame in enumerate(log.frames)])
+
+
+def renamed(frame: FeatureFrame, offset: int) -> FeatureFrame:
+    return replace(frame, landmarks=frame.landmarks + offset)
+
+
+def test_a_whole_log_is_the_plain_solution(log):
+    batch = adjust_log(log, rough(log))
+    np.testing.assert_array_equal(batch.frames, np.arange(FRAMES))
+    plain = solve_features(log, robust=ROBUST, marginals=False)
+    assert np.abs(SE3.local(plain.world_from_camera, batch.world_from_camera)).max() < 1e-4
+    error = batch.trajectory.positions - SE3.translation(known(log.truth).world_from_camera)
+    assert np.sqrt(np.square(error).sum(axis=1).mean()) < 0.02
+
+
+def test_it_does_not_hang_on_where_the_filter_went(log):
+    """A path that turns away after a while: from there alone another optimum is found."""
+    path = rough(log)
+    path[8:, 4:] += np.linspace(0.0, 0.6, FRAMES - 8)[:, None] * [1.0, -0.5, 0.8]
+    good = adjust_log(log, rough(log))
+    assert adjust_log(log, path).solution.error == pytest.approx(good.solution.error, rel=1e-4)
+
+
+def test_blind_frames_are_left_out(log):
+    blind = {4: kept(log.frames[4], np.arange(0)), 9: kept(log.frames[9], np.arange(3))}
+    batch = adjust_log(changed(log, blind), rough(log))
+    assert set(range(FRAMES)) - set(batch.frames.tolist()) == {4, 9}
+    assert batch.trajectory.stamps_ns.tolist() == [log.frames[t].stamp_ns for t in batch.frames]
+
+
+def test_frames_that_share_nothing_with_the_known_points_are_left_out(log):
+    away = {t: renamed(log.frames[t], 10_000) for t in range(20, FRAMES)}
+    assert connected_frames(changed(log, away)).tolist() == list(range(20))
+
+
+def test_without_known_points_the_first_frame_counts(log):
+    away = {t: renamed(log.frames[t], 10_000) for t in range(20, FRAMES)}
+    assert connected_frames(replace(changed(log, away), known=None)).tolist() == list(range(20))
+
+
+def test_a_landmark_of_one_frame_connects_nothing(log):
+    single = {t: renamed(log.frames[t], 1000 * (t + 1)) for t in range(FRAMES)}
+    lonely = replace(changed(log, single), known=None)
+    assert connected_frames(lonely).size == 0
+    with pytest.raises(InputError, match="no two frames share the 4 landmarks"):
+        adjust_log(lonely, rough(log))
+
+
+def test_it_tells_how_far_it_is_and_gives_up_in_time(log):
+    told = []
+    adjust_log(log, rough(log), on_iteration=lambda count, error: told.append((count, error)))
+    counts, errors = zip(*told, strict=True)
+    assert counts == tuple(range(1, len(told) + 1)) and errors[0] > 2.0 * errors[-1]
+    with pytest.raises(InputError, match="given up after 0 s: allow more with --batch-limit"):
+        adjust_log(log, rough(log), limit_s=0.0)

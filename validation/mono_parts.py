@@ -1,0 +1,155 @@
+"""Perfect parts for a monocular filter: matches, depths and a calibration that a batch adjustment vouches for."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple, final
+
+import numpy as np
+
+from rbpf.belief import Belief
+from rbpf.lie import SE3
+from rbpf.models import Births, Observations, Sensor
+from rbpf.sensors.camera_points import CameraRay
+from rbpf.sensors.features import FeatureFrame, FeatureLog
+from rbpf.sensors.pinhole import Pinhole
+from rbpf.systems.mono.feature_sensor import FeatureSensor
+from rbpf.validation.mono_batch import Batch, adjust_log
+
+WRONG_PX = 3.0
+"""A match farther than this from the reprojection by the batch is a wrong one."""
+
+DEPTH_SHARE = 0.01
+"""Standard deviation of a depth that is given, as a share of it."""
+
+_GRID = np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1)], dtype=float)
+"""Where the error is looked at for a quadratic of two variables."""
+
+_STEPS = np.array([[0.01, 0.02], [0.003, 0.006]])
+"""Of focal length, as a share, and of k1: in a first round and a second."""
+
+
+def reprojection_errors(batch: Batch) -> list[np.ndarray]:
+    """Distance of each match from the reprojection of its landmark, by frame (K,), px; NaN without a landmark."""
+    camera, points, out = batch.log.camera, batch.solution.landmarks, []
+    nowhere = np.full(3, np.nan)
+    for frame, pose in zip(batch.log.frames, batch.world_from_camera, strict=True):
+        world = np.array([points.get(name, nowhere) for name in frame.landmarks.tolist()]).reshape(-1, 3)
+        seen = camera.project(SE3.inverse_transform(pose, world))
+        out.append(np.linalg.norm(seen - frame.z, axis=1))
+    return out
+
+
+def agreeing_matches(log: FeatureLog, batch: Batch) -> FeatureLog:
+    """The log without the matches that the batch shows to be wrong."""
+    frames = list(log.frames)
+    for t, error in zip(batch.frames.tolist(), reprojection_errors(batch), strict=True):
+        frame, kept = frames[t], ~(error > WRONG_PX)
+        frames[t] = FeatureFrame(frame.stamp_ns, frame.landmarks[kept], frame.z[kept], frame.cov_z[kept])
+    return replace(log, frames=frames)
+
+
+def adjust_near(log: FeatureLog, batch: Batch) -> Batch:
+    """The optimum of a log that is nearly the batch's, from the batch's."""
+    path = np.tile(SE3.identity(), (len(log.frames), 1))
+    path[batch.frames] = batch.world_from_camera
+    return adjust_log(log, path, twice=False)
+
+
+def batch_depths(batch: Batch) -> dict[int, float]:
+    """Depth of each landmark in the camera that saw it first, by name, m; without those that the batch leaves open."""
+    open_ = set(batch.solution.undetermined)
+    depths: dict[int, float] = {}
+    for frame, pose in zip(batch.log.frames, batch.world_from_camera, strict=True):
+        for name in frame.landmarks.tolist():
+            if name not in depths and name not in open_ and name in batch.solution.landmarks:
+                depth = SE3.inverse_transform(pose, batch.solution.landmarks[name])[2]
+                depths[name] = float(depth)
+    return {name: depth for name, depth in depths.items() if depth > 0.0}
+
+
+@final
+class GivenDepths(Sensor):
+    """A sensor whose landmarks start at depths that are known beforehand.
+
+    Args:
+        features: the sensor.
+        depths: by name, m; others start as usual.
+    """
+
+    def __init__(self, features: FeatureSensor, depths: Mapping[int, float]) -> None:
+        self.features, self.depths = features, depths
+
+    def observe(self, frame: FeatureFrame, belief: Belief) -> Sequence[Observations]:
+        """As the sensor does."""
+        return self.features.observe(frame, belief)
+
+    def births(
+        self, frame: FeatureFrame, belief: Belief, observed: Sequence[Observations]
+    ) -> Sequence[Births]:
+        """As the sensor does, but each landmark at its own depth."""
+        groups = self.features.births(frame, belief, observed)
+        return [single for group in groups for single in self._singles(group)]
+
+    def _singles(self, group: Births) -> list[Births]:
+        out = []
+        for k, name in enumerate(group.facts):
+            model = group.model
+            if name in self.depths:
+                rho = 1.0 / self.depths[name]
+                model = CameraRay(self.features.camera, (rho, DEPTH_SHARE * rho))
+            out.append(Births(group.z[k : k + 1], group.cov[k : k + 1], model, group.landmark, facts=[name]))
+        return out
+
+
+class Calibrated(NamedTuple):
+    """A camera whose focal length and k1 explain the measurements best, and the batch with it."""
+
+    camera: Pinhole
+    batch: Batch
+
+
+def refine_calibration(log: FeatureLog, batch: Batch) -> Calibrated:
+    """Focal length and k1 of the least error of the batch: the lowest point of a quadratic, fitted twice.
+
+    Args:
+        log: the measurements.
+        batch: their optimum with the given camera.
+    """
+    best = batch
+    for size in _STEPS:
+        camera = _camera(best.log)
+        solved = [_with_camera(log, best, _changed(camera, *(size * step))) for step in _GRID]
+        lowest = _lowest(_GRID, np.array([one.solution.error for one in solved]))
+        solved.append(_with_camera(log, best, _changed(camera, *(size * lowest))))
+        best = min([best, *solved], key=lambda one: one.solution.error)
+    return Calibrated(_camera(best.log), best)
+
+
+def _camera(log: FeatureLog) -> Pinhole:
+    assert isinstance(log.camera, Pinhole)
+    return log.camera
+
+
+def _changed(camera: Pinhole, focal: float, k1: float) -> Pinhole:
+    k1_now, k2, p1, p2, k3 = camera.distortion
+    return replace(
+        camera,
+        fx=camera.fx * (1.0 + focal),
+        fy=camera.fy * (1.0 + focal),
+        distortion=(k1_now + k1, k2, p1, p2, k3),
+    )
+
+
+def _with_camera(log: FeatureLog, batch: Batch, camera: Pinhole) -> Batch:
+    return adjust_near(replace(log, camera=camera), batch)
+
+
+def _lowest(grid: np.ndarray, errors: np.ndarray) -> np.ndarray:
+    """Where the quadratic through errors (7,) at places (7, 2) is lowest, no farther out than twice the grid."""
+    a, b = grid.T
+    terms = np.stack([np.ones_like(a), a, b, 0.5 * a * a, a * b, 0.5 * b * b], axis=1)
+    _, ga, gb, haa, hab, hbb = np.linalg.lstsq(terms, errors, rcond=None)[0]
+    hessian = np.array([[haa, hab], [hab, hbb]])
+    if np.linalg.eigvalsh(hessian)[0] <= 0.0:
+        return np.asarray(grid[np.argmin(errors)])
+    return np.clip(-np.linalg.solve(hessian, [ga, gb]), -2.0, 2.0)
