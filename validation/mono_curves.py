@@ -4,42 +4,10 @@ from typing import Any
 
 import numpy as np
 
-from rbpf.lie import SE3
 from rbpf.systems.mono.video import VideoRun
-from rbpf.validation.accuracy import ate
-from rbpf.validation.figures import COLOURS, SIGMAS
-from rbpf.validation.mono_scores import TruePath
-from rbpf.validation.trajectory import Trajectory
+from rbpf.validation.figures import COLOURS
 
 CAMERA_HZ = 30.0
-
-
-def error_figure(run: VideoRun, truth: TruePath) -> Any:
-    """Error of the position along the truth's axes, beside what the filter itself believes (3σ).
-
-    With known points nothing is aligned; without them the path is first brought onto the truth, and its 3σ with it.
-    """
-    poses, stamps = run.world_from_camera[truth.rows], run.stamps_ns[truth.rows]
-    estimate, reference = Trajectory(stamps, poses), Trajectory(stamps, truth.world_from_camera)
-    moved = ate(estimate, reference, "none" if run.known is not None else "similarity").alignment
-    error = moved.transform(estimate.positions) - reference.positions
-    turn = moved.scale * moved.rotation @ SE3.matrix(poses)[:, :3, :3]
-    cov = turn @ run.cov[truth.rows][:, 3:, 3:] @ np.swapaxes(turn, -1, -2)
-    band = SIGMAS * np.sqrt(np.maximum(np.einsum("taa->ta", cov), 0.0))
-    how = "no alignment" if run.known is not None else "after the similarity alignment"
-    figure, rows = _rows(3, f"{run.sequence.name}: error of the position, {how}")
-    for axis, axes in enumerate(rows):
-        axes.fill_between(
-            truth.rows, -1e3 * band[:, axis], 1e3 * band[:, axis], color=COLOURS["filter"], alpha=0.2, lw=0,
-            label=f"{SIGMAS:g}σ of the filter",
-        )  # fmt: skip
-        axes.plot(truth.rows, 1e3 * error[:, axis], color=COLOURS["filter"], lw=1.0, label="error")
-        axes.axhline(0.0, color="black", lw=0.5)
-        axes.set_ylabel(f"{'xyz'[axis]} [mm]")
-        _shade_lost(axes, run)
-    rows[0].legend(loc="best", fontsize="small")
-    rows[-1].set_xlabel("frame")
-    return figure
 
 
 def tracking_figure(run: VideoRun) -> Any:

@@ -1,6 +1,8 @@
 """Everything that a run over images leaves in its folder. Each file is written under a temporary name, then renamed.
 
 trajectory.tum           online filtered mean at every frame, in the world of the known points, else of the first camera
+trajectory.npz           the same with its covariance; truth.npz: the ground truth at these frames; see
+                         `rbpf.validation.run_files`
 map.npz, map.csv         landmarks: id, mean, covariance (within + between particles); whether it is a ray, was known
 timings.csv              milliseconds per frame: whole, search, filter; and waiting for the decoded image
 diagnostics.csv          what was looked for and found, whether the camera was lost; sample size, evidence, NIS
@@ -30,7 +32,8 @@ from rbpf.validation.files import (
     write_text,
 )
 from rbpf.validation.mono_map import MonoMap
-from rbpf.validation.mono_scores import score_camera
+from rbpf.validation.mono_scores import camera_truth, score_camera
+from rbpf.validation.run_files import write_path, write_truth
 from rbpf.validation.trajectory import Trajectory
 from rbpf.validation.trajectory_files import write_tum
 
@@ -49,6 +52,8 @@ def write_mono_run(run: VideoRun, mapped: MonoMap, out: Path, sources: dict[str,
     """
     prepare_folder(out)
     write_tum(out / "trajectory.tum", Trajectory(run.stamps_ns, run.world_from_camera))
+    write_path(out, run.stamps_ns, run.world_from_camera, run.cov)
+    write_truth(out, camera_truth(run))
     table = run.sensor.table
     rows = mapped.landmarks.ids
     given = 0 if run.known is None else run.known.names.size

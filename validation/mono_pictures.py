@@ -10,7 +10,7 @@ from rbpf.systems.mono.system import world_of
 from rbpf.systems.mono.video import VideoRun
 from rbpf.validation.alignment import Similarity, align
 from rbpf.validation.figures import COLOURS, SIGMAS, outline, save_figures
-from rbpf.validation.mono_curves import error_figure, timings_figure, tracking_figure
+from rbpf.validation.mono_curves import timings_figure, tracking_figure
 from rbpf.validation.mono_map import MonoMap
 from rbpf.validation.mono_scores import TruePath, true_path
 from rbpf.validation.mono_views import Views, best_views, close_up
@@ -20,7 +20,7 @@ MAP_SHARE = 0.9
 
 
 def plot_mono_run(run: VideoRun, mapped: MonoMap, out: Path) -> list[str]:
-    """Draws path, map, particles, error, tracking and times; returns the file names."""
+    """Draws path, map, particles, tracking and times; returns the file names."""
     views, truth = best_views(run.world_from_camera), true_path(run.sequence.truth, run.stamps_ns)
     figures = {
         "path.png": _path(run, views, truth),
@@ -29,8 +29,6 @@ def plot_mono_run(run: VideoRun, mapped: MonoMap, out: Path) -> list[str]:
         "tracking.png": tracking_figure(run),
         "timings.png": timings_figure(run),
     }
-    if truth is not None:
-        figures["error.png"] = error_figure(run, truth)
     return save_figures(figures, out)
 
 

@@ -8,6 +8,8 @@ from rbpf.lie import SE3
 from rbpf.sensors.features import CameraTruth
 from rbpf.systems.mono.video import VideoRun
 from rbpf.validation.accuracy import ate, rpe
+from rbpf.validation.alignment import Alignment
+from rbpf.validation.run_files import RunTruth
 from rbpf.validation.scores import poses_at
 from rbpf.validation.trajectory import Trajectory
 
@@ -34,6 +36,15 @@ def true_path(truth: CameraTruth | None, stamps_ns: np.ndarray) -> TruePath | No
         return None
     rows, poses = poses_at(SE3, truth.stamps_ns, truth.world_from_camera, stamps_ns)
     return TruePath(rows, poses) if rows.size >= LEAST else None
+
+
+def camera_truth(run: VideoRun) -> RunTruth | None:
+    """The truth at a run's frames: in the same world with known points, else to be moved and scaled."""
+    truth = true_path(run.sequence.truth, run.stamps_ns)
+    if truth is None:
+        return None
+    alignment: Alignment = "none" if run.known is not None else "similarity"
+    return RunTruth(truth.rows, truth.world_from_camera, {}, alignment)
 
 
 def score_camera(run: VideoRun) -> dict[str, float | int]:

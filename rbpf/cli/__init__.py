@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from tyro.extras import SubcommandApp
 
+from rbpf.cli import judging
 from rbpf.cli.options import ImagesOptions, MonoOptions, RangeBearingOptions
 from rbpf.errors import InputError
 
@@ -163,6 +164,8 @@ def demo(out: Path = Path("demo"), frames: int = 240) -> None:
 
 APP.command(RUN, name="run")
 APP.command(SIMULATE, name="simulate")
+APP.command(judging.validate, name="validate")
+APP.command(judging.report, name="report")
 
 
 def main(arguments: list[str] | None = None) -> int:
