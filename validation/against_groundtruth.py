@@ -92,22 +92,16 @@ def truth_errors(record: RunRecord, std_m: float = 0.0, std_rad: float = 0.0) ->
     return TruthErrors(path, truth, positions, whitened, landmarks)
 
 
-def truth_statistics(errors: TruthErrors) -> list[Statistic]:
-    """NEES of the poses and coverage of their credible regions; none where the worlds are not the same."""
-    if errors.whitened is None:
-        return []
-    known = errors.whitened.ranks > 0
+def pose_statistics(errors: WhitenedErrors) -> list[Statistic]:
+    """NEES of the poses and coverage of their credible regions; none where all poses are held to be exact."""
+    known = errors.ranks > 0
     if not known.any():
         return []
-    white, ranks = errors.whitened.errors[known], errors.whitened.ranks[known]
-    dof = degrees_of_freedom(white)
-    nees = np.square(white).sum(axis=1)
-    ratio = variance_ratio(NEES, float(nees.sum() / ranks.sum()), dof, STATE_FACTOR)
-    full = ranks == errors.path.space.dim
-    if not full.any():
-        return [ratio]
-    samples = max(dof / errors.path.space.dim, 1.0)
-    return [ratio, *coverage(nees[full], errors.path.space.dim, samples)]
+    dim = errors.errors.shape[1]
+    dof, nees = degrees_of_freedom(errors.errors[known]), errors.nees[known]
+    ratio = variance_ratio(NEES, float(nees.sum() / errors.ranks[known].sum()), dof, STATE_FACTOR)
+    full = errors.ranks[known] == dim
+    return [ratio, *(coverage(nees[full], dim, max(dof / dim, 1.0)) if full.any() else [])]
 
 
 def compare_with_truth(record: RunRecord, std_m: float = 0.0, std_rad: float = 0.0) -> Comparison:
@@ -118,7 +112,8 @@ def compare_with_truth(record: RunRecord, std_m: float = 0.0, std_rad: float = 0
     batch = _batch_error(record, errors)
     accuracy = _accuracy(errors, batch)
     figures = _figures(errors) | ({} if batch is None else {"batch_position_rmse_m": batch})
-    return Comparison(NAME, accuracy, figures, truth_statistics(errors), draw_truth(record, errors))
+    statistics = [] if errors.whitened is None else pose_statistics(errors.whitened)
+    return Comparison(NAME, accuracy, figures, statistics, draw_truth(record, errors))
 
 
 def _landmark_errors(found: MapSummary, truth: RunTruth) -> LandmarkErrors | None:

@@ -3,9 +3,9 @@
 The second follows from the statistics of `rbpf.validation.statistic` alone:
 
 - do not trust: one of them contradicts the filter;
-- trust: none contradicts, and one that compares poses with something else (truth, batch optimum) supports it; without
-  such a comparison, its own innovations support it;
-- cannot tell: otherwise, because the run is too short or too much alike from step to step.
+- trust: none contradicts, and one that compares its poses with something else (truth, batch optimum) supports it;
+- cannot tell: otherwise. The run is too short or too much alike from step to step, or there is nothing to compare it
+  with: good innovations alone do not show that the particles follow the right path.
 """
 
 from collections.abc import Sequence
@@ -55,25 +55,26 @@ def judge(accuracy: str, statistics: Sequence[Statistic], independent: Sequence[
     """
     against = [s for s in statistics if s.outcome == "contradicts"]
     if against:
-        worst = max(against, key=_distance)
         more = (
-            f"; so do {len(against) - 1} more"
-            if len(against) > 2
-            else "; so does one more"
-            if len(against) == 2
+            f" ({len(against) - 1} more of {len(statistics)} statistics contradict it)"
+            if len(against) > 1
             else ""
         )
-        return Verdict(accuracy, "do not trust", f"{described(worst)}{more}")
-    judging = [s for s in statistics if s.name in independent] or list(statistics[:1])
+        return Verdict(accuracy, "do not trust", described(max(against, key=_distance)) + more)
+    judging = [s for s in statistics if s.name in independent]
     support = [s for s in judging if s.outcome == "supports"]
     if support:
         return Verdict(accuracy, "trust", described(support[0]))
-    if not judging:
-        return Verdict(
-            accuracy, "cannot tell", "nothing in the run says how large its errors are beside what it claims"
+    if judging:
+        reason = f"{described(judging[0])}; {_why_open(judging[0])}"
+    elif statistics:
+        reason = (
+            "nothing contradicts it, but a filter that agrees with itself can still be on a wrong path; compare it "
+            "with the truth or a batch optimum"
         )
-    widest = max(judging, key=lambda s: s.samples)
-    return Verdict(accuracy, "cannot tell", f"{described(widest)}; {_why_open(widest)}")
+    else:
+        reason = "nothing in the run says how large its errors are beside what it claims"
+    return Verdict(accuracy, "cannot tell", reason)
 
 
 def described(statistic: Statistic) -> str:
