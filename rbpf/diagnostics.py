@@ -85,28 +85,29 @@ def coalescence_steps(history: History) -> int | None:
 class Correction:
     """What the observations of one step say about the motion into it, beside what an honest filter expects of them.
 
-    With the increment written as μ + L u, u ~ N(0, I) before the observations, the refined mean û of an honest filter
-    is N(0, I − M⁻¹) and independent from step to step: an odometer with a bias of b standard deviations moves it to
-    (I − M⁻¹) b, and one with wrong noise makes it too large or too small.
+    The increment is μ + L u with u ~ N(0, I) before the observations. Given them, u has mean û and covariance C, within
+    + between particles. By the law of total variance û has covariance I − C, and it is independent from step to step:
+    an odometer with a bias of b standard deviations moves it to (I − C) b, and wrong noise makes it too large or small.
 
     Attributes:
-        mean: (r,) û, weighted over the particles.
-        cov: (r, r) I − M⁻¹, likewise.
+        mean: (r,) û.
+        cov: (r, r) I − C.
     """
 
     mean: np.ndarray
     cov: np.ndarray
 
 
-def motion_correction(
-    mixture: tuple[Prior, Proposed | None, np.ndarray],
-) -> Correction | None:
+def motion_correction(mixture: tuple[Prior, Proposed | None, np.ndarray]) -> Correction | None:
     """The correction of a step's motion, from `StepReport.mixture`; None after a proposal that did not linearise."""
     _, proposed, log_weights = mixture
     if proposed is None:
         return None
+    n = log_weights.size
     weights = np.exp(log_weights)
-    mean = (weights if proposed.mean.shape[0] > 1 else np.ones(1)) @ proposed.mean
-    share = weights if proposed.root.shape[0] > 1 else np.ones(1)
-    left = np.einsum("n,nab,ncb->ac", share, proposed.root, proposed.root)
-    return Correction(mean, np.eye(mean.size) - left)
+    centres = np.broadcast_to(proposed.mean, (n, proposed.mean.shape[1]))
+    roots = np.broadcast_to(proposed.root, (n, *proposed.root.shape[1:]))
+    mean = weights @ centres
+    spread = np.sqrt(weights)[:, None] * (centres - mean)
+    within = np.einsum("n,nab,ncb->ac", weights, roots, roots)
+    return Correction(mean, np.eye(mean.size) - within - spread.T @ spread)

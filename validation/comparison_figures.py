@@ -46,10 +46,10 @@ def error_figure(title: str, rows: np.ndarray, errors: np.ndarray, std: np.ndarr
     """
     from matplotlib.figure import Figure
 
-    used = [axis for axis in range(3) if np.abs(errors[:, axis]).max(initial=0.0) > 0.0 or std[:, axis].any()]
+    used = [axis for axis in range(3) if errors[:, axis].any() or std[:, axis].any()] or [0]
     figure = Figure(figsize=(9.0, 1.5 + 1.7 * len(used)), layout="constrained")
     unit, name = (1e3, "mm") if np.abs(errors).max(initial=0.0) < 1.0 else (1.0, "m")
-    panels = figure.subplots(len(used), 1, sharex=True, squeeze=False)[:, 0] if used else []
+    panels = list(figure.subplots(len(used), 1, sharex=True, squeeze=False)[:, 0])
     for axes, axis in zip(panels, used, strict=True):
         band = SIGMAS * unit * std[:, axis]
         axes.fill_between(
@@ -64,10 +64,9 @@ def error_figure(title: str, rows: np.ndarray, errors: np.ndarray, std: np.ndarr
                 rows, 0, 1, where=lost, transform=axes.get_xaxis_transform(), color=COLOURS["map"], alpha=0.15,
                 lw=0, label="lost",
             )  # fmt: skip
-    if used:
-        panels[0].set_title(title)
-        panels[0].legend(loc="best", fontsize="small", ncols=3)
-        panels[-1].set_xlabel("step")
+    panels[0].set_title(title)
+    panels[0].legend(loc="best", fontsize="small", ncols=3)
+    panels[-1].set_xlabel("step")
     return figure
 
 
@@ -125,7 +124,7 @@ def map_figure(
     axes.plot(*mean[:, chosen].T, ".", color=COLOURS["map"], ms=3, label=f"landmarks: filter, {SIGMAS:g}σ")
     for ellipse in outline(mean[:, chosen], cov[:, chosen][:, :, chosen]):
         axes.plot(*ellipse.T, color=COLOURS["map"], lw=0.7)
-    label(axes, title, *(f"{'xyz'[axis]} [m]" for axis in chosen), equal=True)
+    label(axes, title, f"{'xyz'[chosen[0]]} [m]", f"{'xyz'[chosen[1]]} [m]", equal=True)
     shown = np.concatenate(
         [path[:, chosen], *(points[:, chosen] for points in other.values()), mean[:, chosen]]
     )

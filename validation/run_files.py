@@ -104,12 +104,12 @@ def write_truth(out: Path, truth: RunTruth | None) -> None:
     if truth is None:
         (out / TRUTH).unlink(missing_ok=True)
         return
-    points = list(truth.landmarks.values())
+    points = np.array(list(truth.landmarks.values()), dtype=float)
     arrays = {
         "rows": truth.rows,
         "poses": truth.poses,
         "ids": np.array(list(truth.landmarks), dtype=np.int64),
-        "landmarks": np.array(points, dtype=float).reshape(len(points), -1),
+        "landmarks": points.reshape(len(truth.landmarks), points.shape[-1]),
         "alignment": np.array(truth.alignment),
     }
     save_arrays(out / TRUTH, arrays)

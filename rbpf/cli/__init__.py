@@ -161,10 +161,10 @@ def demo(out: Path = Path("demo"), frames: int = 240) -> None:
 
 APP.command(RUN, name="run")
 APP.command(SIMULATE, name="simulate")
-APP.command(judging.validate, name="validate")
-APP.command(judging.report, name="report")
-APP.command(judging.sweep, name="sweep")
-APP.command(judging.compare, name="compare")
+APP.command(name="validate")(judging.validate)
+APP.command(name="report")(judging.report)
+APP.command(name="sweep")(judging.sweep)
+APP.command(name="compare")(judging.compare)
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -52,9 +52,11 @@ class Progress:
     @classmethod
     def empty(cls, steps: int, size: int, dim: int) -> "Progress":
         """Room for a run."""
-        numbers = [np.zeros(steps) for _ in range(6)]
-        unknown = np.full((steps, dim), np.nan), np.full((steps, dim, dim), np.nan)
-        return cls(np.zeros((steps, size)), np.zeros((steps, dim, dim)), *numbers, *unknown)
+        names = ("ess", "resampled", "log_evidence", "nis", "rows", "seconds")
+        numbers = {name: np.zeros(steps) for name in names}
+        poses, covs = np.zeros((steps, size)), np.zeros((steps, dim, dim))
+        unknown, none = np.full((steps, dim), np.nan), np.full((steps, dim, dim), np.nan)
+        return cls(mean=poses, cov=covs, correction=unknown, cov_correction=none, **numbers)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """For a checkpoint."""
