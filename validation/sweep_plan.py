@@ -12,7 +12,7 @@ settings: {anchor_every: 10}           # of all runs
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
@@ -25,7 +25,7 @@ from rbpf import __version__
 from rbpf.errors import InputError
 from rbpf.validation.sweep_systems import system_named
 
-MOST_RUNS = 1_000_000
+MOST_RUNS = 100_000
 
 Value = str | int | float | bool | None
 
@@ -107,7 +107,9 @@ def plan(file: SweepFile, folder: Path, where: str = "the sweep") -> list[Job]:
     """All runs of a sweep; paths are taken from a folder. Errors as `read_plan`."""
     system = system_named(file.system)
     sequences = [_sequence(given, system.fields, folder, where) for given in file.sequences]
-    seeds = list(range(file.seeds)) if isinstance(file.seeds, int) else file.seeds
+    seeds: Sequence[int] = (
+        range(file.seeds) if isinstance(file.seeds, int) else file.seeds
+    )  # a range takes no room
     for what, values in (("sequences", sequences), ("seeds", seeds), ("options", list(file.options))):
         if not values:
             raise InputError(f"{where}: {what} is empty, name at least one")
