@@ -5,6 +5,9 @@ Moral, A. Doucet, "A lognormal central limit theorem for particle approximations
 that from S seeds with mean m and variance s² of log Ẑ
 
     log Z ≈ m + s²/2,   with variance  s²/S + s⁴ / (2 (S − 1))
+
+That law is of no use where s is large: then log Z is taken as the logarithm of the mean of Ẑ, which a single seed may
+carry, with s for its error.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,7 +27,7 @@ from rbpf.systems.settings import load_settings
 from rbpf.validation.run_record import RunRecord, open_run
 
 NOISY = 3.0
-"""Spread of log Ẑ over the seeds from which on its law is not known well enough to correct its mean."""
+"""Spread s of log Ẑ over the seeds beyond which its law is not used."""
 
 CLEAR = 2.0
 """A difference of this many of its errors is one."""
@@ -75,9 +78,11 @@ class EvidenceDifference:
         better, worse = (name_a, name_b) if difference > 0.0 else (name_b, name_a)
         both = f"log-evidence {self.log_evidence_a:.1f} against {self.log_evidence_b:.1f}"
         found = f"{both}, difference {difference:.1f} ± {error:.1f}"
-        if self.spread > NOISY and abs(difference) <= CLEAR * error + self.spread**2:
-            return f"Too random to tell ({found}, {self.spread:.1f} from seed to seed): use more particles."
         if abs(difference) <= CLEAR * error:
+            if self.spread > NOISY:
+                return (
+                    f"Too random to tell ({found}, {self.spread:.1f} from seed to seed): use more particles."
+                )
             return f"{name_a} and {name_b} explain the recording equally well ({found})."
         return f"{better} explains the recording better than {worse} ({found})."
 
@@ -167,6 +172,8 @@ def compare_runs(
 def _log_evidence(logs: np.ndarray) -> tuple[float, float]:
     """Estimate and its standard error."""
     variance = float(logs.var(ddof=1))
+    if variance > NOISY**2:
+        return float(np.logaddexp.reduce(logs)) - float(np.log(logs.size)), float(np.sqrt(variance))
     error = np.sqrt(variance / logs.size + variance**2 / (2.0 * (logs.size - 1)))
     return float(logs.mean()) + 0.5 * variance, float(error)
 

@@ -17,7 +17,8 @@ from tests.cli.mono_sequences import CAMERA, FRAMES, as_folder, render_desk
 
 FILES = {
     "trajectory.tum", "map.npz", "map.csv", "timings.csv", "diagnostics.csv", "config.yaml", "summary.json",
-    "report.html", "path.png", "map.png", "particles.png", "error.png", "tracking.png", "timings.png",
+    "report.html", "path.png", "map.png", "particles.png", "tracking.png", "timings.png", "trajectory.npz",
+    "truth.npz", "validation_groundtruth.json", "groundtruth_path.png", "groundtruth_error.png", "groundtruth_nees.png",
 }  # fmt: skip
 REQUIRED = {
     "system", "recording", "frames", "particles", "seed", "ms_per_frame", "frames_tracked", "lost_frames",
