@@ -1,8 +1,8 @@
 """How many particles, and how many linearisations? A sweep over both, in parallel, to one table.
 
-The same as `rbpf sweep CONFIG.yaml`: particles × seeds × sequences × options. Finished runs are kept in `rows.jsonl`, so
-that a sweep that was stopped goes on where it was. The picture has the error of the path by number of particles, the
-median over the seeds and all of them.
+The same as `rbpf sweep CONFIG.yaml`: particles × seeds × sequences × options. Finished runs are kept in `rows.jsonl`,
+so that a sweep that was stopped goes on where it was. The picture has the error of the path by number of particles,
+the median over the seeds and all of them.
 """
 
 from pathlib import Path
