@@ -11,6 +11,9 @@ from rbpf.validation.figures import COLOURS, SIGMAS, label, outline
 CLOSE = 0.95
 """A map's picture holds this share of its landmarks; single ones far off do not make it small."""
 
+_LOWEST = 0.01
+"""NEES below this share of the band are drawn there."""
+
 
 def wide_axes(positions: np.ndarray) -> tuple[int, int]:
     """The two axes, in their order, along which positions (T, 3) extend most."""
@@ -80,10 +83,11 @@ def nees_figure(title: str, rows: np.ndarray, nees: np.ndarray, dim: int) -> Any
         band.low, band.high, color="tab:green", alpha=0.2, label="95 % band of an honest filter, each step"
     )
     axes.axhline(band.expected, color="tab:green", lw=0.8, label=f"its mean, {dim}")
-    axes.plot(rows, np.maximum(nees, 1e-3), color=COLOURS["filter"], lw=1.0, label="NEES of the pose")
+    shown = np.maximum(nees, _LOWEST * band.low)
+    axes.plot(rows, shown, color=COLOURS["filter"], lw=1.0, label="NEES of the pose")
     label(axes, title, "step", "NEES", equal=False)
     axes.set_yscale("log")
-    axes.set_ylim(bottom=0.3 * band.low)
+    axes.set_ylim(bottom=0.8 * min(float(shown.min(initial=band.low)), 0.5 * band.low))
     axes.legend(fontsize="small")
     return figure
 
