@@ -11,6 +11,7 @@ from rbpf.validation import sweep as sweeping
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 from rbpf.validation.sweep import ROWS, TABLE, read_rows, sweep
 from rbpf.validation.sweep_plan import SweepFile, plan, read_plan
+from tests.cli.mono_sequences import FRAMES, render_desk
 
 PLAN = {
     "system": "range-bearing",
@@ -178,3 +179,16 @@ def test_rows_are_plain_lines_of_json(config, tmp_path):
     sweep(read_plan(config)[:1], tmp_path, workers=1)
     (line,) = (tmp_path / ROWS).read_text().splitlines()
     assert set(json.loads(line)) == {"key", "figures"}
+
+
+@pytest.mark.slow
+def test_images_are_swept_with_their_known_points(tmp_path):
+    render_desk(tmp_path / "desk")
+    sequence = {"recording": "desk", "known_points": "desk/known_points.csv"}
+    file = SweepFile("mono", [sequence, {"recording": "desk"}], [8], settings={"search.measurements": 15})
+    known, alone = sweep(plan(file, tmp_path), tmp_path / "out", workers=1)
+    assert known["known_points"] == 6
+    assert known["pose_nees_mean"] > 0.0
+    assert alone["known_points"] == 0
+    assert "pose_nees_mean" not in alone
+    assert alone["frames_tracked"] == known["frames_tracked"] == FRAMES
