@@ -5,7 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from rbpf.errors import InputError
-from rbpf.lie import SE3
+from rbpf.lie import SE3, LieGroup
+
+_NOTHING = 1e-12
+"""Variances below this share of the largest, or of one, are none."""
 
 
 @dataclass(frozen=True)
@@ -68,3 +71,33 @@ def offdiagonal_eigenvalues(points: np.ndarray, log_weights: np.ndarray) -> np.n
     blocks = cov.reshape(k, 3, k, 3)
     blocks[np.arange(k), :, np.arange(k)] = 0.0
     return np.sort(np.abs(np.linalg.eigvalsh(cov)))[::-1]
+
+
+@dataclass(frozen=True)
+class WhitenedErrors:
+    """Errors of T poses in units of what the filter believes, e = cov^(−1/2) Log(mean⁻¹ truth).
+
+    Attributes:
+        errors: (T, d); zero along directions that the filter holds to be known exactly.
+        ranks: (T,) how many directions are not.
+    """
+
+    errors: np.ndarray
+    ranks: np.ndarray
+
+    @property
+    def nees(self) -> np.ndarray:
+        """(T,) normalised errors squared; the mean of an honest filter's is the rank."""
+        return np.square(self.errors).sum(axis=1)
+
+
+def whitened_errors(space: LieGroup, mean: np.ndarray, cov: np.ndarray, truth: np.ndarray) -> WhitenedErrors:
+    """Errors of estimates (T, E) with covariances (T, d, d) in the right chart, from the truth (T, E).
+
+    The symmetric root is taken, so that the axes are the chart's own at all times.
+    """
+    values, vectors = np.linalg.eigh(cov)
+    used = values > _NOTHING * np.maximum(values[:, -1:], _NOTHING)
+    scale = np.where(used, 1.0 / np.sqrt(np.where(used, values, 1.0)), 0.0)
+    along = np.einsum("tab,ta->tb", vectors, space.local(mean, truth))
+    return WhitenedErrors(np.einsum("tab,tb->ta", vectors, scale * along), used.sum(axis=1))

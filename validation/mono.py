@@ -17,11 +17,11 @@ from rbpf.validation.mono_map import summarise_mono_map
 from rbpf.validation.mono_pictures import plot_mono_run
 from rbpf.validation.mono_rerun import write_rerun
 from rbpf.validation.mono_video import write_annotated
-from rbpf.validation.report import write_report
+from rbpf.validation.report import VIDEO
 from rbpf.validation.trajectory_files import write_tum
+from rbpf.validation.validate import report_run
 
 CHECKPOINT = "checkpoint.npz"
-VIDEO = "annotated.mp4"
 
 BATCH = "batch.tum"
 
@@ -145,13 +145,15 @@ def finish_mono(
     mapped = summarise_mono_map(run.filter)
     entries = write_mono_run(run, mapped, out, recording.sources())
     optimum = _adjusted(run, out, entries, telling) if batch else None
-    pictures = plot_mono_run(run, mapped, out, optimum)
+    plot_mono_run(run, mapped, out, optimum)
     if video:
         write_annotated(run, out / VIDEO, telling.on_frame)
+    else:
+        (out / VIDEO).unlink(missing_ok=True)
     if rerun is not None:
         write_rerun(run, mapped, rerun)
-    write_report(out, entries, pictures, VIDEO if video else None)
-    return entries
+    verdict = report_run(out)
+    return entries | {"verdict": verdict.trust}
 
 
 def _adjusted(run: VideoRun, out: Path, entries: dict[str, Any], telling: Telling) -> Batch | None:

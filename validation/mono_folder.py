@@ -5,6 +5,8 @@ posterior.tum            mean over the last frame's particles of their whole pat
 posterior.npz            these paths (T, N, 7) and the particles' log-weights
 batch.tum                batch optimum of the same measurements, of the frames that took part
 observations*.csv        the measurements used, and the known points
+trajectory.npz           the same with its covariance; truth.npz: the ground truth at these frames; see
+                         `rbpf.validation.run_files`
 map.npz, map.csv         landmarks: id, mean, covariance (within + between particles); whether it is a ray, was known
 timings.csv              milliseconds per frame and stage; and waiting for the decoded image
 diagnostics.csv          what was looked for and found, whether the camera was lost; sample size, evidence, NIS
@@ -38,7 +40,8 @@ from rbpf.validation.files import (
 from rbpf.validation.mono_log import feature_log
 from rbpf.validation.mono_map import MonoMap
 from rbpf.validation.mono_posterior import write_posterior
-from rbpf.validation.mono_scores import score_camera
+from rbpf.validation.mono_scores import camera_truth, score_camera
+from rbpf.validation.run_files import write_path, write_truth
 from rbpf.validation.trajectory import Trajectory
 from rbpf.validation.trajectory_files import write_tum
 
@@ -59,6 +62,8 @@ def write_mono_run(
     """
     prepare_folder(out)
     write_tum(out / "trajectory.tum", Trajectory(run.stamps_ns, run.world_from_camera))
+    write_path(out, run.stamps_ns, run.world_from_camera, run.cov)
+    write_truth(out, camera_truth(run))
     table = run.sensor.table
     rows = mapped.landmarks.ids
     given = 0 if run.known is None else run.known.names.size

@@ -9,6 +9,7 @@ from rbpf.sensors.features import CameraTruth
 from rbpf.systems.mono.video import VideoRun
 from rbpf.validation.accuracy import ate, rpe
 from rbpf.validation.alignment import Alignment
+from rbpf.validation.run_files import RunTruth
 from rbpf.validation.scores import poses_at
 from rbpf.validation.trajectory import Trajectory
 
@@ -46,6 +47,14 @@ def usual_alignment(run: VideoRun) -> Alignment:
     if run.known is None:
         return "similarity"
     return "rigid" if run.known.own_frame else "none"
+
+
+def camera_truth(run: VideoRun) -> RunTruth | None:
+    """The truth at a run's frames, and how the path is brought onto it."""
+    truth = true_path(run.sequence.truth, run.stamps_ns)
+    if truth is None:
+        return None
+    return RunTruth(truth.rows, truth.world_from_camera, {}, usual_alignment(run))
 
 
 def score_camera(run: VideoRun) -> dict[str, float | int]:

@@ -13,10 +13,10 @@ from rbpf.validation.files import prepare_folder
 from rbpf.validation.map_summary import summarise_map
 from rbpf.validation.measurements import dead_reckoning
 from rbpf.validation.plots import plot_run
-from rbpf.validation.report import write_report
 from rbpf.validation.run_folder import reported, used_measurements, write_run
 from rbpf.validation.scores import as_trajectory, score
 from rbpf.validation.trajectory_files import write_tum
+from rbpf.validation.validate import report_run
 
 _SHORT = 300
 """Steps up to which dead reckoning is a good enough start for the batch problem."""
@@ -67,9 +67,9 @@ def finish_run(finished: Run, recording: Path, out: Path, batch: bool = True) ->
         stamps = np.array([frame.stamp_ns for frame in log.frames], dtype=np.int64)
         write_tum(out / "batch.tum", as_trajectory(log, stamps, path))
     entries = write_run(finished, out, recording, extra)
-    pictures = plot_run(finished, summarise_map(finished.filter, finished.anchored), out, paths)
-    write_report(out, entries, pictures)
-    return entries
+    plot_run(finished, summarise_map(finished.filter, finished.anchored), out, paths)
+    verdict = report_run(out)
+    return entries | {"verdict": verdict.trust}
 
 
 def _solve_batch(finished: Run) -> tuple[np.ndarray, dict[str, Any]]:

@@ -1,6 +1,8 @@
 """Everything that a run leaves in its folder. Each file is written under a temporary name, then renamed.
 
 trajectory.tum           online filtered mean at every step
+trajectory.npz           the same with its covariance; truth.npz: the ground truth at these steps; see
+                         `rbpf.validation.run_files`
 map.npz, map.csv         landmarks: id, mean, covariance (within + between particles)
 observations.csv, observations_odometry.csv   the measurements used; see `rbpf.validation.measurement_files`
 timings.csv              milliseconds per step
@@ -33,6 +35,8 @@ from rbpf.validation.files import (
 from rbpf.validation.map_summary import MapSummary, summarise_map
 from rbpf.validation.measurement_files import write_measurements
 from rbpf.validation.measurements import Measurements
+from rbpf.validation.run_files import write_path, write_truth
+from rbpf.validation.run_truth import robot_truth
 from rbpf.validation.scores import Scores, as_trajectory, score
 from rbpf.validation.trajectory_files import write_tum
 
@@ -53,6 +57,8 @@ def write_run(run: Run, out: Path, recording: Path, extra: dict[str, Any] | None
     log, progress = run.log, run.progress
     stamps = np.array([frame.stamp_ns for frame in log.frames], dtype=np.int64)
     write_tum(out / "trajectory.tum", as_trajectory(log, stamps, progress.mean))
+    write_path(out, stamps, progress.mean, progress.cov, progress.correction, progress.cov_correction)
+    write_truth(out, robot_truth(log))
     summary_map = summarise_map(run.filter, run.anchored)
     write_map(out, summary_map)
     write_measurements(out, used_measurements(run))

@@ -1,23 +1,21 @@
 """The command line: thin, one function per command."""
 
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from tyro.extras import SubcommandApp
 
+from rbpf.cli import judging
 from rbpf.cli.options import ImagesOptions, LabOptions, MonoOptions, RangeBearingOptions, given_board
+from rbpf.cli.showing import CONSOLE, progress, told
 from rbpf.errors import InputError
 
 if TYPE_CHECKING:
     from rbpf.validation.simulation.textured_scene import ImageWorld
 
-CONSOLE = Console(stderr=True)
 FOCAL_SHARE = {ImagesOptions: 0.8, LabOptions: 0.78125}
 """Focal length by default, as a share of the images' width."""
 
@@ -34,14 +32,14 @@ def run_range_bearing(options: Annotated[RangeBearingOptions, tyro.conf.arg(name
     given = _given(options, "particles", "seed", "association")
     config = load_settings(RangeBearingConfig, "range-bearing", options.config, options.set, given)
     _prepare(options.threads)
-    with _progress() as bar:
+    with progress() as bar:
         task = bar.add_task("filtering", total=None)
         run = start_run(
             options.log,
             config,
             options.out,
             options.resume,
-            _told(bar, task),
+            told(bar, task),
         )
     if options.batch:
         CONSOLE.print("solving the batch problem with the same measurements …")
@@ -65,19 +63,19 @@ def run_mono(options: Annotated[MonoOptions, tyro.conf.arg(name="")]) -> None:
     board = given_board(options.board, options.square)
     recording = Recording(options.sequence, options.known_points, options.calibration, board)
     _prepare(options.threads)
-    with _progress() as bar:
+    with progress() as bar:
         task = bar.add_task("filtering", total=None)
         run = start_mono(
             recording,
             config,
             options.out,
             options.resume,
-            _told(bar, task),
+            told(bar, task),
         )
         solving = bar.add_task("batch", total=None, visible=options.batch)
         drawing = bar.add_task("drawing", total=None, visible=options.video)
         telling = Telling(
-            on_frame=_told(bar, drawing),
+            on_frame=told(bar, drawing),
             on_iteration=lambda count, _error: bar.update(solving, completed=count),
             batch_s=options.batch_limit,
         )
@@ -164,9 +162,9 @@ def _render(world: "ImageWorld", options: ImagesOptions | LabOptions) -> None:
     middle = 0.5 * (options.width - 1), 0.5 * (options.height - 1)
     camera = Pinhole(options.width, options.height, focal, focal, *middle, options.distortion)
     lens = camera if options.baseline_m is None else RectifiedStereo(camera, options.baseline_m)
-    with _progress() as bar:
+    with progress() as bar:
         task = bar.add_task("rendering", total=options.frames)
-        simulate_images(world, imaging, lens, options.out, options.seed, _told(bar, task))
+        simulate_images(world, imaging, lens, options.out, options.seed, told(bar, task))
     CONSOLE.print(f"wrote {options.out}, {_megabytes(options.out):.0f} MB")
 
 
@@ -186,6 +184,10 @@ def demo(out: Path = Path("demo"), frames: int = 240) -> None:
 
 APP.command(RUN, name="run")
 APP.command(SIMULATE, name="simulate")
+APP.command(name="validate")(judging.validate)
+APP.command(name="report")(judging.report)
+APP.command(name="sweep")(judging.sweep)
+APP.command(name="compare")(judging.compare)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -218,16 +220,6 @@ def _prepare(threads: int | None) -> None:
             raise InputError(f"--threads must lie in 1..{numba.config.NUMBA_NUM_THREADS}, got {threads}")
         numba.set_num_threads(threads)
     compile_once(lambda: CONSOLE.print("compiling the kernels, which takes a minute and is done once …"))
-
-
-def _told(bar: Progress, task: TaskID) -> Callable[[int, int], None]:
-    """Something that is told how many are done, and of how many."""
-    return lambda done, total: bar.update(task, completed=done, total=total)
-
-
-def _progress() -> Progress:
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    return Progress(*columns, console=CONSOLE)
 
 
 def _megabytes(folder: Path) -> float:

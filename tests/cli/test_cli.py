@@ -27,6 +27,15 @@ FILES = {
     "map.png",
     "particles.png",
     "ess.png",
+    "timings.png",
+    "trajectory.npz",
+    "truth.npz",
+    "validation_groundtruth.json",
+    "groundtruth_path.png",
+    "groundtruth_error.png",
+    "groundtruth_nees.png",
+    "groundtruth_landmarks.png",
+    "groundtruth_map.png",
 }
 TIMINGS = ("ms_per_frame", "peak_memory_mb")
 REQUIRED = {
@@ -55,7 +64,7 @@ def outputs(folder: Path) -> dict[str, bytes]:
     """All files but timings; summary.json without its timings."""
     kept = {}
     for path in sorted(folder.iterdir()):
-        if path.name in ("timings.csv", "report.html", "checkpoint.npz"):
+        if path.name in ("timings.csv", "timings.png", "report.html", "checkpoint.npz"):
             continue
         content = path.read_bytes()
         if path.name == "summary.json":

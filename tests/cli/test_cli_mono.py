@@ -25,6 +25,8 @@ FILES = {
     "report.html", "path.png", "map.png", "particles.png", "error.png", "tracking.png", "timings.png",
     "batch.tum", "posterior.tum", "posterior.npz", "checkpoint.npz",
     "observations.csv", "observations_frames.csv", "observations_known_points.csv",
+    "trajectory.npz",
+    "truth.npz", "validation_groundtruth.json", "groundtruth_path.png", "groundtruth_error.png", "groundtruth_nees.png",
 }  # fmt: skip
 REQUIRED = {
     "system", "recording", "frames", "particles", "seed", "ms_per_frame", "frames_tracked", "lost_frames",

@@ -4,12 +4,19 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from rbpf.diagnostics import ancestor_diversity, chi_square_band, effective_sample_size, nees
+from rbpf.diagnostics import (
+    ancestor_diversity,
+    chi_square_band,
+    effective_sample_size,
+    motion_correction,
+    nees,
+)
 from rbpf.estimate import Estimate
 from rbpf.filter import Filter
 from rbpf.genealogy import Lineage
 from rbpf.lie import SE2, SE3, Euclidean
 from rbpf.models import MotionModel, ObservationModel, Part, Transition
+from rbpf.proposals import PriorProposal
 from tests.core.scripted import Scripted, seen
 
 PLANE = Euclidean(2)
@@ -102,3 +109,36 @@ def test_ancestor_diversity():
     lineage.advance(np.array([3, 3, 3, 0]))
     # Generation 1 was not kept, and there is none before the first.
     assert ancestor_diversity(lineage, [0, 1, 2, 3, 4]) == {0: 4, 1: 2, 3: 2}
+
+
+class Slanted(MotionModel):
+    """A random walk whose axes are correlated."""
+
+    space = PLANE
+    factor = np.array([[0.8, 0.0], [0.3, 0.5]])
+
+    def transition(self, state, control, dt):
+        return Transition(state, self.factor[None])
+
+
+def test_the_correction_of_a_motion_is_the_kalman_smoother_s():
+    """E[w_t | z_1:t] = L⁻¹ Q S⁻¹ ν, whose covariance is Lᵀ S⁻¹ L: with S of all that is unknown, not of a particle."""
+    rng = np.random.default_rng(5)
+    filter_ = Filter(Slanted(), Scripted(), n=20_000, rng=rng)
+    factor, noise = Slanted.factor, 0.7 * np.eye(2)
+    mean, cov = np.zeros(2), np.zeros((2, 2))
+    for fix in np.cumsum(rng.normal(size=(6, 2)), axis=0):
+        found = motion_correction(filter_.step(seen(Fix(), [fix], noise[None])).mixture)
+        predicted = cov + factor @ factor.T
+        innovation = predicted + noise
+        assert found is not None
+        np.testing.assert_allclose(found.mean, factor.T @ np.linalg.solve(innovation, fix - mean), atol=0.03)
+        np.testing.assert_allclose(found.cov, factor.T @ np.linalg.solve(innovation, factor), atol=0.03)
+        gain = predicted @ np.linalg.inv(innovation)
+        mean, cov = mean + gain @ (fix - mean), predicted - gain @ predicted
+
+
+def test_a_bootstrap_step_has_no_correction():
+    filter_ = Filter(Walk(), Scripted(), proposal=PriorProposal(), n=10, rng=np.random.default_rng(0))
+    step = filter_.step(seen(Fix(), [np.zeros(2)]))
+    assert motion_correction(step.mixture) is None

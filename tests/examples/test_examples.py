@@ -22,6 +22,8 @@ SECONDS_LONG = {
     "mono_overconfidence",
     "mono_still_camera",
     "mono_video",
+    "consistency_runs",
+    "verdict",
 }
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 LONGEST_SENSOR = 40
@@ -48,6 +50,14 @@ def batch_check(figures: dict[str, float]) -> None:
 def checkpoint(figures: dict[str, bool]) -> None:
     assert figures["same"]
     assert figures["refused"]
+
+
+def consistency_runs(figures: dict[str, float]) -> None:
+    sampled = "monocular, 20 particles, start sampled (known points as landmarks)"
+    assert figures[sampled] > 2.0 * figures["monocular, 20 particles, as it is"]
+    assert figures["range-bearing, 10 particles"] > figures["range-bearing, 40 particles"]
+    fixed = "range-bearing, 20 particles, start never re-estimated"
+    assert figures[fixed] > 2.0 * figures["range-bearing, 20 particles, as it is"]
 
 
 def custom_sensor(figures: dict[str, float]) -> None:
@@ -156,6 +166,22 @@ def smoothing(figures: dict[str, float]) -> None:
     assert figures["backward"] < 0.5 * figures["filter"]
 
 
+def sweep(figures: dict[str, float]) -> None:
+    assert figures["refined three times, 40"] < figures["bootstrap, 10"]
+
+
+def validate_run(figures: dict[str, str]) -> None:
+    assert set(figures) == {"groundtruth", "gtsam"}
+    assert set(figures.values()) <= {"trust", "cannot tell"}
+
+
+def verdict(figures: dict[str, float]) -> None:
+    assert figures["nothing, innovations, do not trust"] == 0.0
+    assert figures["nothing, truth, do not trust"] == 0.0
+    for name, share in figures.items():
+        assert name.startswith("nothing") or not name.endswith(", do not trust") or share == 1.0
+
+
 def target_tracking(figures: dict[str, dict[str, float]]) -> None:
     bootstrap, marginalised, refined = figures.values()
     for better in (marginalised, refined):
@@ -170,6 +196,7 @@ CLAIMS: dict[str, Callable[[Any], None]] = {
         against_colmap,
         batch_check,
         checkpoint,
+        consistency_runs,
         custom_sensor,
         error_ratios,
         evidence,
@@ -189,7 +216,10 @@ CLAIMS: dict[str, Callable[[Any], None]] = {
         own_proposal,
         range_only_beacons,
         smoothing,
+        sweep,
         target_tracking,
+        validate_run,
+        verdict,
     )
 }
 

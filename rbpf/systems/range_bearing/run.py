@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from rbpf.anchoring import Anchored, StartAnchor
+from rbpf.diagnostics import motion_correction
 from rbpf.errors import InputError
 from rbpf.estimate import Estimate
 from rbpf.filter import Filter, StepReport
@@ -32,6 +33,9 @@ class Progress:
         nis: (T,) normalised innovation squared.
         rows: (T,) its degrees of freedom.
         seconds: (T,) time of the step.
+        correction: (T, d) what the observations say about the motion, in its own whitened coordinates; NaN where the
+            proposal did not ask them.
+        cov_correction: (T, d, d) what an honest filter expects of it; see `rbpf.diagnostics.Correction`.
     """
 
     mean: np.ndarray
@@ -42,12 +46,17 @@ class Progress:
     nis: np.ndarray
     rows: np.ndarray
     seconds: np.ndarray
+    correction: np.ndarray
+    cov_correction: np.ndarray
 
     @classmethod
     def empty(cls, steps: int, size: int, dim: int) -> "Progress":
         """Room for a run."""
-        numbers = [np.zeros(steps) for _ in range(6)]
-        return cls(np.zeros((steps, size)), np.zeros((steps, dim, dim)), *numbers)
+        names = ("ess", "resampled", "log_evidence", "nis", "rows", "seconds")
+        numbers = {name: np.zeros(steps) for name in names}
+        poses, covs = np.zeros((steps, size)), np.zeros((steps, dim, dim))
+        unknown, none = np.full((steps, dim), np.nan), np.full((steps, dim, dim), np.nan)
+        return cls(mean=poses, cov=covs, correction=unknown, cov_correction=none, **numbers)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """For a checkpoint."""
@@ -74,6 +83,9 @@ class Progress:
             report.log_evidence,
         )
         self.nis[t], self.rows[t], self.seconds[t] = report.nis, report.rows, seconds
+        correction = motion_correction(report.mixture)
+        if correction is not None:
+            self.correction[t], self.cov_correction[t] = correction.mean, correction.cov
 
 
 @dataclass

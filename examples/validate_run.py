@@ -1,0 +1,52 @@
+"""Is this run good, and does it know how good? A run's folder against the truth and against its batch optimum.
+
+The same as `rbpf validate RUN --against groundtruth` and `--against gtsam`: each comparison leaves a JSON file, its
+pictures, and two sentences on top of RUN/report.html.
+"""
+
+from pathlib import Path
+
+import tyro
+
+from rbpf.systems.range_bearing.config import RangeBearingConfig
+from rbpf.validation.comparison import read_comparisons
+from rbpf.validation.range_bearing import finish_run, start_run
+from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
+from rbpf.validation.tables import write_table
+from rbpf.validation.validate import validate
+
+
+def main(
+    steps: int = 200,
+    particles: int = 500,
+    seed: int = 1,
+    out: Path = Path("demo/validate_run"),
+    quick: bool = False,
+) -> dict[str, str]:
+    """Simulates, filters, compares and prints what was found.
+
+    Args:
+        steps: of the recording.
+        particles: of the filter.
+        seed: of the world and of the filter.
+        out: folder for recording and run.
+        quick: a short run.
+    """
+    steps, particles = (40, 50) if quick else (steps, particles)
+    log, run = out / "log", out
+    simulate_robot(RobotWorld(steps=steps, landmarks=80), log, seed)
+    finish_run(start_run(log, RangeBearingConfig(particles=particles, seed=seed), run), log, run)
+    verdicts = {against: validate(run, against) for against in ("groundtruth", "gtsam")}
+    rows = [
+        [comparison.against, s.name, s.value, s.low, s.high, s.outcome]
+        for comparison in read_comparisons(run)
+        for s in comparison.statistics
+    ]
+    write_table(out / "statistics.csv", ["against", "statistic", "value", "from", "to", "says"], rows)
+    for sentence in verdicts["gtsam"].sentences:
+        print(sentence)
+    return {against: verdict.trust for against, verdict in verdicts.items()}
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

@@ -1,0 +1,112 @@
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rbpf.cli import main
+from rbpf.errors import InputError
+from rbpf.sensors.readers.noise import LogNoise
+from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig
+from rbpf.systems.mono.config import MonoConfig
+from rbpf.systems.range_bearing.config import RangeBearingConfig
+from rbpf.validation.model_comparison import compare_evidence, evidence_difference
+from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
+from rbpf.validation.simulation.point_worlds import DeskWorld
+from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
+from rbpf.validation.trials import simulated_log
+
+CONFIG = RangeBearingConfig(particles=400)
+
+
+def test_the_log_normal_law_is_inverted_and_its_error_right():
+    """log Ẑ ~ N(log Z − σ²/2, σ²): the estimates scatter about log Z as much as they say."""
+    rng = np.random.default_rng(0)
+    offs = []
+    for _ in range(2000):
+        logs = 10.0 - 0.5 * 0.8**2 + 0.8 * rng.normal(size=40)
+        found = evidence_difference(logs, np.full(2, 4.0))
+        offs.append((found.difference - 6.0) / found.error)
+    assert np.mean(offs) == pytest.approx(0.0, abs=0.15)
+    assert np.std(offs) == pytest.approx(1.0, abs=0.1)
+
+
+def test_the_right_noise_explains_a_recording_better(tmp_path):
+    simulate_robot(RobotWorld(steps=30), tmp_path / "log", seed=0)
+    wrong = replace(CONFIG, noise=LogNoise(std_range_m=0.05))
+    found = compare_evidence(CONFIG, wrong, tmp_path / "log", range(3))
+    assert found.difference > 5.0 * found.error
+    assert found.sentence("A", "B").startswith("A explains the recording better than B")
+    back = compare_evidence(wrong, CONFIG, tmp_path / "log", range(3))
+    assert back.difference == pytest.approx(-found.difference)
+
+
+def test_two_ways_of_computing_the_same_model_are_equal_within_the_error():
+    log = simulated_log(RobotWorld(steps=10), 1)
+    once = replace(CONFIG, proposal=ProposalConfig(iterations=1))
+    found = compare_evidence(CONFIG, once, log, range(8))
+    assert abs(found.difference) < 4.0 * found.error
+    assert 0.0 < found.error < 2.0
+
+
+def test_a_likelihood_that_is_no_density_is_refused_with_the_reason():
+    log = simulated_log(RobotWorld(steps=12), 0)
+    truncated = replace(CONFIG, likelihood=LikelihoodConfig(kind="truncated"))
+    for pair, name in (((truncated, CONFIG), "first"), ((CONFIG, truncated), "second")):
+        with pytest.raises(InputError, match=f"the {name} configuration has no evidence.*not a density"):
+            compare_evidence(*pair, log, range(2))
+    with pytest.raises(InputError, match="not a density"):
+        evidence_difference([1.0, np.nan], [1.0, 2.0])
+
+
+def test_monocular_configurations_are_compared_on_features():
+    log = simulate_features(DeskWorld(frames=25), Measuring(), MONO, 0)
+    slow = replace(MonoConfig(), velocity=replace(MonoConfig().velocity, walk_m_s=0.001, walk_rad_s=0.001))
+    found = compare_evidence(MonoConfig(), slow, log, range(2))
+    assert found.difference > 0.0
+
+
+def test_what_does_not_belong_together_is_refused():
+    log = simulated_log(RobotWorld(steps=12), 0)
+    with pytest.raises(InputError, match="different systems"):
+        compare_evidence(CONFIG, MonoConfig(), log, range(2))
+    with pytest.raises(InputError, match="does not filter"):
+        compare_evidence(MonoConfig(), MonoConfig(), log, range(2))
+    with pytest.raises(InputError, match="2 seeds"):
+        compare_evidence(CONFIG, CONFIG, log, [1])
+    with pytest.raises(InputError, match="recording's path"):
+        compare_evidence(replace(CONFIG, noise=LogNoise(std_range_m=0.1)), CONFIG, log, range(2))
+
+
+def test_a_filter_too_random_to_tell_says_so():
+    rng = np.random.default_rng(1)
+    found = evidence_difference(100.0 + 8.0 * rng.normal(size=5), 95.0 + 8.0 * rng.normal(size=5))
+    far = evidence_difference(100.0 + 8.0 * rng.normal(size=5), 8.0 * rng.normal(size=5))
+    assert "explains the recording better" in far.sentence("A", "B")
+    assert "more particles" in found.sentence("A", "B")
+    assert "equally well" in evidence_difference([1.0, 1.5, 0.5], [1.1, 0.4, 1.6]).sentence("A", "B")
+
+
+@pytest.mark.slow
+def test_runs_are_compared_by_their_folders(tmp_path, capsys):
+    simulate_robot(RobotWorld(steps=20), tmp_path / "log", seed=0)
+    for name, setting in (
+        ("a", "anchor_every=0"),
+        ("b", "noise.std_range_m=0.2"),
+        ("c", "likelihood.kind=truncated"),
+    ):
+        arguments = ["--out", str(tmp_path / name), "--particles", "50", "--no-batch", "--set", setting]
+        assert main(["run", "range-bearing", str(tmp_path / "log"), *arguments]) == 0
+    capsys.readouterr()
+    assert main(["compare", str(tmp_path / "a"), str(tmp_path / "b"), "--seeds", "2", "--workers", "1"]) == 0
+    assert "explains the recording better than" in capsys.readouterr().err.replace("\n", " ")
+    assert main(["compare", str(tmp_path / "a"), str(tmp_path / "c"), "--seeds", "2"]) == 2
+    assert "not a density" in capsys.readouterr().err
+    shutil.copytree(tmp_path / "b", tmp_path / "d")
+    config = tmp_path / "d" / "config.yaml"
+    config.write_text(config.read_text().replace("/log", "/other"))
+    assert main(["compare", str(tmp_path / "a"), str(tmp_path / "d")]) == 2
+    assert "different recordings" in capsys.readouterr().err
+    config.write_text(config.read_text().replace("range-bearing", "mono"))
+    assert main(["compare", str(tmp_path / "a"), str(tmp_path / "d")]) == 2
+    assert "depends on where the filter looks" in capsys.readouterr().err

@@ -1,0 +1,115 @@
+import json
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from rbpf.validation.statistic import (
+    Statistic,
+    coverage,
+    motion_statistics,
+    step_ratio,
+    variance_ratio,
+)
+
+
+def test_the_interval_of_a_ratio_holds_the_true_one_in_95_of_100_cases():
+    rng = np.random.default_rng(0)
+    hits = 0
+    for value in 2.5 * rng.chisquare(12, size=2000) / 12:
+        found = variance_ratio("", float(value), 12.0, 2.0)
+        hits += found.low <= 2.5 <= found.high
+    assert hits / 2000 == pytest.approx(0.95, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("value", "dof", "outcome"),
+    [
+        (1.0, 40, "supports"),
+        (9.0, 40, "contradicts"),
+        (1 / 9, 40, "contradicts"),
+        (1.0, 2, "leaves open"),
+        (4.0, 9, "leaves open"),
+    ],
+)
+def test_what_a_ratio_says_depends_on_how_much_it_rests_on(value, dof, outcome):
+    assert variance_ratio("", value, dof, 2.0).outcome == outcome
+
+
+def test_innovations_of_an_honest_filter_are_supported_whatever_their_number_per_step():
+    rng = np.random.default_rng(1)
+    dofs = rng.integers(0, 12, size=1500).astype(float)
+    squares = np.where(dofs > 0, rng.chisquare(np.maximum(dofs, 1)), np.nan)
+    found = step_ratio("innovations", squares, dofs)
+    assert found is not None
+    assert found.outcome == "supports"
+    assert found.samples == pytest.approx(dofs.sum(), rel=0.2)
+    wide = step_ratio("innovations", 1.5 * squares, dofs)
+    assert wide is not None
+    assert wide.outcome == "contradicts"
+
+
+def test_steps_that_scatter_more_than_chi_squared_count_for_less():
+    rng = np.random.default_rng(2)
+    dofs = np.full(400, 4.0)
+    heavy = rng.chisquare(4, size=400) * rng.gamma(0.5, 2.0, size=400)
+    plain, scattered = step_ratio("", rng.chisquare(4, size=400), dofs), step_ratio("", heavy, dofs)
+    assert plain is not None
+    assert scattered is not None
+    assert scattered.samples < 0.3 * plain.samples
+
+
+def test_without_innovations_there_is_no_statistic():
+    assert step_ratio("", np.full(5, np.nan), np.ones(5)) is None
+    assert motion_statistics(np.full((4, 2), np.nan), np.full((4, 2, 2), np.nan)) == []
+
+
+def corrections(
+    steps: int, bias: np.ndarray, scale: float, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """û = K (b + s w) + noise of the measurements, of a filter that expects N(0, K), K = I − M⁻¹."""
+    info = rng.uniform(0.2, 5.0, size=(steps, 3, 1)) * np.eye(3)
+    gain = info / (1.0 + info + 1e-300)
+    gain = np.where(np.eye(3, dtype=bool), gain, 0.0)
+    motion = bias + scale * rng.normal(size=(steps, 3))
+    measured = motion + rng.normal(size=(steps, 3)) / np.sqrt(np.einsum("taa->ta", info))
+    return np.einsum("tab,tb->ta", gain, measured), gain
+
+
+def test_corrections_of_an_honest_motion_are_supported():
+    size, bias = motion_statistics(*corrections(600, np.zeros(3), 1.0, np.random.default_rng(3)))
+    assert size.outcome == "supports"
+    assert bias.outcome != "contradicts"
+    assert bias.low < 0.1
+
+
+def test_a_bias_of_the_motion_is_found_and_measured():
+    true = np.array([0.0, 0.8, 0.0])
+    _, bias = motion_statistics(*corrections(300, true, 1.0, np.random.default_rng(4)))
+    assert bias.outcome == "contradicts"
+    assert bias.low < 0.8 < bias.high
+    assert bias.value == pytest.approx(0.8, abs=0.15)
+
+
+@pytest.mark.parametrize("scale", [3.0, 1.0 / 3.0])
+def test_motion_noise_that_is_three_times_wrong_is_found(scale):
+    size = motion_statistics(*corrections(300, np.zeros(3), scale, np.random.default_rng(5)))[0]
+    assert size.outcome == "contradicts"
+    assert (size.value > 1.0) == (scale > 1.0)
+
+
+def test_coverage_of_an_honest_filter_and_of_a_confident_one():
+    nees = np.random.default_rng(6).chisquare(3, size=4000)
+    honest = coverage(nees, 3, 400.0)
+    assert [s.value for s in honest] == pytest.approx([0.5, 0.9, 0.95], abs=0.03)
+    assert {s.outcome for s in honest} == {"supports"}
+    confident = coverage(9.0 * nees, 3, 400.0)
+    expected = chi2.cdf(chi2.ppf([0.5, 0.9, 0.95], 3) / 9.0, 3)
+    assert [s.value for s in confident] == pytest.approx(expected, abs=0.03)
+    assert {s.outcome for s in confident} == {"contradicts"}
+
+
+def test_a_statistic_survives_json():
+    bias = Statistic("bias", 0.3, 0.0, np.inf, (-np.inf, 0.25), 20.0, "bias")
+    for statistic in (bias, variance_ratio("ratio", 1.2, 7.5, 2.0)):
+        assert Statistic.of_entries(json.loads(json.dumps(statistic.entries(), allow_nan=False))) == statistic

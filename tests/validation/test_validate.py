@@ -1,0 +1,229 @@
+"""Run folders: what a comparison and a report make of them, whole or spoilt."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import yaml
+
+from rbpf.checkpoint import load_arrays, save_arrays
+from rbpf.cli import main
+from rbpf.errors import InputError
+from rbpf.sensors.readers.log import Truth
+from rbpf.systems.range_bearing.config import RangeBearingConfig
+from rbpf.systems.range_bearing.run import run
+from rbpf.validation.against_groundtruth import truth_errors
+from rbpf.validation.report import write_report
+from rbpf.validation.run_files import RunTruth, read_path, read_truth, write_path, write_truth
+from rbpf.validation.run_record import open_run
+from rbpf.validation.run_truth import robot_truth
+from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
+from rbpf.validation.trials import simulated_log
+from rbpf.validation.validate import COMPARISONS, validate
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A finished run."""
+    folder = tmp_path_factory.mktemp("validated")
+    simulate_robot(RobotWorld(steps=40, landmarks=30), folder / "log", seed=0)
+    arguments = [
+        "run",
+        "range-bearing",
+        str(folder / "log"),
+        "--out",
+        str(folder / "run"),
+        "--particles",
+        "60",
+    ]
+    assert main(arguments) == 0
+    return folder / "run"
+
+
+@pytest.fixture
+def run_folder(finished, tmp_path):
+    """A copy that may be spoilt."""
+    return shutil.copytree(finished, tmp_path / "run")
+
+
+def page(folder) -> str:
+    return (folder / "report.html").read_text(encoding="utf-8")
+
+
+def test_a_finished_run_has_its_verdict_on_top(finished):
+    text = page(finished)
+    top = text[text.index('class="verdict') : text.index("<h2>")]
+    assert "from the truth" in top
+    assert "uncertainty" in top
+    assert text.count("data:image/png;base64,") >= 9
+    assert "http" not in text.replace("http-equiv", "")
+    entries = json.loads((finished / "validation_groundtruth.json").read_text())
+    assert entries["figures"]["steps_compared"] == 40
+
+
+def test_errors_are_those_of_the_run_itself(finished):
+    record = open_run(finished)
+    errors = truth_errors(record)
+    summary = record.summary
+    assert errors.positions.rmse == pytest.approx(summary["path_rmse_m"])
+    landmark = np.linalg.norm(errors.landmarks.errors, axis=1).mean()
+    assert landmark == pytest.approx(summary["landmark_error_mean_m"])
+    path, truth = record.path(), record.truth()
+    last = path.space.local(path.mean[-1], truth.poses[-1])
+    assert errors.whitened.nees[-1] == pytest.approx(last @ np.linalg.solve(path.cov[-1], last))
+
+
+def test_gtsam_stands_beside(run_folder, tmp_path, capsys):
+    assert main(["validate", str(run_folder), "--against", "gtsam", "--out", str(tmp_path / "json")]) == 0
+    entries = json.loads((tmp_path / "json" / "validation_gtsam.json").read_text())
+    assert entries == json.loads((run_folder / "validation_gtsam.json").read_text())
+    apart = json.loads((run_folder / "summary.json").read_text())["filter_minus_batch_rmse_m"]
+    assert entries["figures"]["filter_minus_batch_rmse_m"] == pytest.approx(apart, rel=1e-3)
+    residuals = next(s for s in entries["statistics"] if s["name"].startswith("residuals"))
+    assert 0.7 < residuals["value"] < 1.3
+    assert "Against gtsam" in page(run_folder)
+    assert "Against the ground truth" in page(run_folder)
+    assert "uncertainty" in capsys.readouterr().err.replace("\n", " ")
+
+
+def test_the_report_is_built_again_from_the_files(run_folder):
+    (run_folder / "report.html").unlink()
+    assert main(["report", str(run_folder)]) == 0
+    assert "from the truth" in page(run_folder)
+
+
+def spoil_version(folder):
+    arrays = load_arrays(folder / "trajectory.npz")
+    save_arrays(folder / "trajectory.npz", arrays | {"version": np.array(99)})
+
+
+def spoil_truth_of_another_run(folder):
+    path = read_path(folder)
+    write_truth(folder, RunTruth(np.array([500]), path.mean[:1]))
+
+
+def spoil_truth_without_steps(folder):
+    path = read_path(folder)
+    write_truth(folder, RunTruth(np.zeros(0, dtype=np.int64), path.mean[:0]))
+
+
+def spoil_measurements(folder):
+    path = folder / "observations_odometry.csv"
+    lines = path.read_text().splitlines()
+    rows = next(k for k, line in enumerate(lines) if line.startswith("# rows"))
+    lines[rows] = f"# rows: {int(lines[rows].split(':')[1]) - 1}"
+    path.write_text("\n".join(lines[:-1]) + "\n")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "against", "message"),
+    [
+        (lambda folder: (folder / "trajectory.npz").unlink(), "groundtruth", "another version"),
+        (spoil_version, "groundtruth", "version 99"),
+        (lambda folder: (folder / "truth.npz").unlink(), "groundtruth", "no ground truth"),
+        (spoil_truth_of_another_run, "groundtruth", "another run"),
+        (spoil_truth_without_steps, "groundtruth", "no step of the run"),
+        (lambda folder: (folder / "truth.npz").write_bytes(b"PK"), "groundtruth", "damaged"),
+        (lambda folder: (folder / "map.npz").unlink(), "groundtruth", "map.npz"),
+        (lambda folder: (folder / "observations.csv").unlink(), "gtsam", "observations.csv"),
+        (spoil_measurements, "gtsam", "observations"),
+        (lambda folder: None, "colmap", "cannot be compared with colmap"),
+    ],
+)
+def test_what_cannot_be_compared_is_one_sentence_and_the_report_is_written(
+    run_folder, spoil, against, message, capsys
+):
+    (run_folder / "validation_groundtruth.json").unlink()
+    spoil(run_folder)
+    (run_folder / "report.html").unlink()
+    assert main(["validate", str(run_folder), "--against", against]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("rbpf: ")
+    assert message in error
+    assert error.count("\n") == 1
+    assert f"Not compared with {against}" in page(run_folder)
+    assert "ess_mean" in page(run_folder)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda folder: shutil.rmtree(folder), "no such folder"),
+        (lambda folder: (folder / "summary.json").unlink(), "summary.json"),
+        (lambda folder: (folder / "summary.json").write_text("{"), "damaged"),
+        (lambda folder: (folder / "config.yaml").write_text("[1, 2]"), "config.yaml is damaged"),
+    ],
+)
+def test_a_folder_that_is_no_run_is_refused(run_folder, spoil, message, capsys):
+    spoil(run_folder)
+    assert main(["report", str(run_folder)]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+
+
+def test_a_damaged_comparison_is_said_on_the_page(run_folder):
+    (run_folder / "validation_groundtruth.json").write_text("{}")
+    (run_folder / "diagnostics.csv").write_text("a,b\n1\n")
+    verdict = write_report(run_folder)
+    assert verdict.trust == "cannot tell"
+    assert page(run_folder).count('class="problem"') == 2
+
+
+def test_a_run_without_truth_is_compared_with_nothing(run_folder):
+    (run_folder / "truth.npz").unlink()
+    (run_folder / "validation_groundtruth.json").unlink()
+    verdict = write_report(run_folder)
+    assert "compared with nothing" in verdict.accuracy
+    assert verdict.trust in ("cannot tell", "do not trust")
+
+
+def test_a_further_comparison_is_one_function(run_folder, monkeypatch):
+    from rbpf.validation.comparison import Comparison
+
+    def reconstruction(record):
+        return Comparison("colmap", f"{record.name} is good.", {"ate_m": 0.01})
+
+    monkeypatch.setitem(COMPARISONS["colmap"], "range-bearing", reconstruction)
+    validate(run_folder, "colmap")
+    assert "Against colmap" in page(run_folder)
+    assert json.loads((run_folder / "validation_colmap.json").read_text())["figures"] == {"ate_m": 0.01}
+
+
+def test_the_truth_is_told_from_the_first_pose():
+    log = simulated_log(RobotWorld(steps=20), 0)
+    moved = log.space.retract(log.space.identity(), np.array([0.5, 3.0, -2.0]))
+    truth = Truth(
+        log.truth.stamps_ns,
+        log.space.compose(moved, log.truth.world_from_robot),
+        {k: log.space.transform(moved, p[:2]) for k, p in log.truth.landmarks.items()},
+    )
+    from dataclasses import replace
+
+    here, there = robot_truth(log), robot_truth(replace(log, truth=truth))
+    np.testing.assert_allclose(there.poses, here.poses, atol=1e-12)
+    for name, point in here.landmarks.items():
+        np.testing.assert_allclose(there.landmarks[name], point, atol=1e-12)
+    late = replace(truth, stamps_ns=truth.stamps_ns[5:], world_from_robot=truth.world_from_robot[5:])
+    assert robot_truth(replace(log, truth=late)).alignment == "rigid"
+    assert robot_truth(replace(log, truth=None)) is None
+
+
+def test_path_and_truth_survive_the_files(tmp_path):
+    log = simulated_log(RobotWorld(steps=15), 0)
+    progress = run(log, RangeBearingConfig(particles=10)).progress
+    stamps = np.arange(15)
+    write_path(tmp_path, stamps, progress.mean, progress.cov)
+    write_truth(tmp_path, robot_truth(log))
+    path = read_path(tmp_path)
+    np.testing.assert_array_equal(path.cov, progress.cov)
+    truth = read_truth(tmp_path, path)
+    np.testing.assert_array_equal(truth.poses, robot_truth(log).poses)
+    write_truth(tmp_path, None)
+    with pytest.raises(InputError, match="no ground truth"):
+        read_truth(tmp_path, path)
+
+
+def test_settings_of_the_run_are_still_readable(finished):
+    assert yaml.safe_load((finished / "config.yaml").read_text())["system"] == "range-bearing"

@@ -1,0 +1,158 @@
+"""The verdict on simulated runs: trusted where nothing is wrong, and not where something is, one fault at a time."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rbpf.diagnostics import motion_correction
+from rbpf.exchange import Observations, Part, Transition
+from rbpf.filter import Filter
+from rbpf.lie import Euclidean
+from rbpf.models import MotionModel, ObservationModel, Sensor
+from rbpf.sensors.range_bearing import RangeBearing
+from rbpf.systems.range_bearing.config import RangeBearingConfig
+from rbpf.systems.range_bearing.run import run
+from rbpf.validation.against_groundtruth import pose_statistics
+from rbpf.validation.consistency import whitened_errors
+from rbpf.validation.faults import bias_odometry, scale_odometry_noise, scale_sensor_noise, swap_names
+from rbpf.validation.own_statistics import innovation_statistics
+from rbpf.validation.run_truth import robot_truth
+from rbpf.validation.simulation.robot import RobotWorld
+from rbpf.validation.statistic import variance_ratio
+from rbpf.validation.trials import simulated_log
+from rbpf.validation.verdict import Verdict, judge
+
+LONG, SHORT = RobotWorld(steps=200, landmarks=80), RobotWorld(steps=120, landmarks=80)
+CONFIG = RangeBearingConfig(particles=300)
+
+
+def verdicts(log, given, config=CONFIG) -> tuple[Verdict, Verdict]:
+    """Without the truth, and with it."""
+    progress = run(given, config).progress
+    own = innovation_statistics(progress.nis, progress.rows, progress.correction, progress.cov_correction)
+    poses = pose_statistics(whitened_errors(log.space, progress.mean, progress.cov, robot_truth(log).poses))
+    return judge("", own), judge("", [*poses, *own], [statistic.name for statistic in poses])
+
+
+def test_a_good_range_bearing_run_is_trusted():
+    log = simulated_log(LONG, 1)
+    alone, beside = verdicts(log, log)
+    assert beside.trust == "trust"
+    assert alone.trust == "cannot tell"
+    assert "compare it" in alone.sentences[1]
+
+
+@pytest.mark.slow
+def test_good_range_bearing_runs_are_hardly_ever_too_short_and_never_distrusted():
+    logs = [simulated_log(LONG, seed) for seed in range(6)]
+    found = [verdicts(log, log)[1].trust for log in logs]
+    assert found.count("do not trust") == 0
+    assert found.count("trust") >= 4
+
+
+FAULTS = {
+    "sensor noise times 3": lambda log: scale_sensor_noise(log, 3.0),
+    "sensor noise over 3": lambda log: scale_sensor_noise(log, 1 / 3),
+    "odometry noise times 3": lambda log: scale_odometry_noise(log, 3.0),
+    "odometry noise over 3": lambda log: scale_odometry_noise(log, 1 / 3),
+    "odometer bias": lambda log: bias_odometry(log, 1.0),
+    "wrong names": lambda log: swap_names(log, 0.2, np.random.default_rng(7)),
+}
+
+
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_is_not_trusted_with_or_without_truth(fault, seed):
+    log = simulated_log(SHORT, seed)
+    for verdict in verdicts(log, FAULTS[fault](log), replace(CONFIG, particles=100)):
+        assert verdict.trust == "do not trust"
+        assert verdict.sentences[1].startswith("Do not trust its uncertainty: ")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("part", ["landmark", "state"])
+def test_a_wrong_jacobian_is_not_trusted(part, monkeypatch):
+    """The derivative of the angle has the wrong sign."""
+    log = simulated_log(SHORT, 0)
+    right = RangeBearing.jacobians
+
+    def wrong(self, *args, **named):
+        jacobians = right(self, *args, **named)
+        block = getattr(jacobians, part).copy()
+        block[..., 1:, :] *= -1.0
+        return jacobians._replace(**{part: block})
+
+    monkeypatch.setattr(RangeBearing, "jacobians", wrong)
+    for verdict in verdicts(log, log, replace(CONFIG, particles=100, compiled=False)):
+        assert verdict.trust == "do not trust"
+
+
+class Walk(MotionModel):
+    """A random walk of 1 m per step."""
+
+    space = Euclidean(2)
+
+    def transition(self, state, control, dt):
+        return Transition(state, np.eye(2)[None])
+
+
+class Position(ObservationModel):
+    """A position fix."""
+
+    dim, reads = 2, frozenset({Part.STATE})
+
+    def predict(self, state, landmark=None, const=None, substate=None):
+        return state
+
+
+class Receiver(Sensor):
+    """Fixes with a claimed standard deviation."""
+
+    def __init__(self, std):
+        self.std = std
+
+    def observe(self, frame, belief):
+        return [Observations(frame[None], self.std**2 * np.eye(2)[None], Position())]
+
+
+def linear_gaussian(claimed: float, seed: int = 0, steps: int = 300) -> Verdict:
+    """Fixes of 1 m, and what the filter is told of them."""
+    rng = np.random.default_rng(seed)
+    truth = np.cumsum(rng.normal(size=(steps, 2)), axis=0)
+    filter_ = Filter(Walk(), Receiver(claimed), n=300, rng=rng)
+    reports = [filter_.step(fix) for fix in truth + rng.normal(size=(steps, 2))]
+    found = [motion_correction(report.mixture) for report in reports]
+    own = innovation_statistics(
+        np.array([report.nis for report in reports]),
+        np.array([report.rows for report in reports], dtype=float),
+        np.array([correction.mean for correction in found]),
+        np.array([correction.cov for correction in found]),
+    )
+    mean, cov = (np.array([getattr(r.estimate, name) for r in reports]) for name in ("mean", "cov"))
+    poses = pose_statistics(whitened_errors(Walk.space, mean, cov, truth))
+    return judge("", [*poses, *own], [statistic.name for statistic in poses])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_linear_gaussian_run_is_trusted(seed):
+    assert linear_gaussian(1.0, seed).trust == "trust"
+
+
+@pytest.mark.parametrize("claimed", [3.0, 1 / 3])
+def test_a_linear_gaussian_run_with_wrong_noise_is_not(claimed):
+    verdict = linear_gaussian(claimed)
+    assert verdict.trust == "do not trust"
+    assert ("too large" if claimed > 1.0 else "too small") in verdict.reason
+
+
+def test_a_run_of_few_independent_samples_cannot_be_told():
+    statistic = variance_ratio("poses", 1.0, 2.0, 2.0)
+    verdict = judge("The path is good.", [statistic], ["poses"])
+    assert verdict.trust == "cannot tell"
+    assert verdict.sentences[0] == "The path is good."
+    assert "2 independent samples" in verdict.sentences[1]
+
+
+def test_without_any_statistic_nothing_is_claimed():
+    assert judge("", []).trust == "cannot tell"

@@ -1,0 +1,218 @@
+"""Which of two configurations explains the same data better: the difference of their log-evidences, with its error.
+
+A particle filter's evidence Ẑ is random. With many particles log Ẑ is nearly N(log Z − σ²/2, σ²) (J. Bérard, P. Del
+Moral, A. Doucet, "A lognormal central limit theorem for particle approximations of normalizing constants", 2014), so
+that from S seeds with mean m and variance s² of log Ẑ
+
+    log Z ≈ m + s²/2,   with variance  s²/S + s⁴ / (2 (S − 1))
+
+That law is of no use where s is large: then log Z is taken as the logarithm of the mean of Ẑ, which a single seed may
+carry, with s for its error.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rbpf.errors import InputError
+from rbpf.sensors.features import FeatureLog
+from rbpf.sensors.readers import open_log
+from rbpf.sensors.readers.log import RobotLog
+from rbpf.systems.mono.config import MonoConfig
+from rbpf.systems.range_bearing.config import RangeBearingConfig
+from rbpf.systems.settings import load_settings
+from rbpf.validation.run_record import RunRecord, open_run
+
+NOISY = 3.0
+"""Spread s of log Ẑ over the seeds beyond which its law is not used."""
+
+CLEAR = 2.0
+"""A difference of this many of its errors is one."""
+
+Config = RangeBearingConfig | MonoConfig
+Data = Path | RobotLog | FeatureLog
+
+
+@dataclass(frozen=True)
+class EvidenceDifference:
+    """Log-evidences of two configurations on the same data, in nats.
+
+    Attributes:
+        logs_a: (S,) log Ẑ of the first by seed;  logs_b: (S',) of the second.
+    """
+
+    logs_a: np.ndarray
+    logs_b: np.ndarray
+
+    @property
+    def log_evidence_a(self) -> float:
+        """Of the first."""
+        return _log_evidence(self.logs_a)[0]
+
+    @property
+    def log_evidence_b(self) -> float:
+        """Of the second."""
+        return _log_evidence(self.logs_b)[0]
+
+    @property
+    def difference(self) -> float:
+        """First minus second: log of the Bayes factor."""
+        return self.log_evidence_a - self.log_evidence_b
+
+    @property
+    def error(self) -> float:
+        """Standard error of the difference by the filters' randomness."""
+        return float(np.hypot(_log_evidence(self.logs_a)[1], _log_evidence(self.logs_b)[1]))
+
+    @property
+    def spread(self) -> float:
+        """Larger standard deviation of log Ẑ over the seeds; beyond `NOISY` more particles are needed."""
+        return float(max(self.logs_a.std(ddof=1), self.logs_b.std(ddof=1)))
+
+    def sentence(self, name_a: str, name_b: str) -> str:
+        """What was found, in words."""
+        difference, error = self.difference, self.error
+        better, worse = (name_a, name_b) if difference > 0.0 else (name_b, name_a)
+        both = f"log-evidence {self.log_evidence_a:.1f} against {self.log_evidence_b:.1f}"
+        found = f"{both}, difference {difference:.1f} ± {error:.1f}"
+        if abs(difference) <= CLEAR * error:
+            if self.spread > NOISY:
+                return (
+                    f"Too random to tell ({found}, {self.spread:.1f} from seed to seed): use more particles."
+                )
+            return f"{name_a} and {name_b} explain the recording equally well ({found})."
+        return f"{better} explains the recording better than {worse} ({found})."
+
+
+def evidence_difference(logs_a: Sequence[float], logs_b: Sequence[float]) -> EvidenceDifference:
+    """From log-evidences of any filters, one per seed.
+
+    Raises:
+        InputError: there are fewer than two of either, or one is no number: the likelihood is not a density.
+    """
+    pair = np.asarray(logs_a, dtype=float), np.asarray(logs_b, dtype=float)
+    for name, logs in zip(("first", "second"), pair, strict=True):
+        if logs.size < 2:
+            raise InputError("log-evidences are compared over 2 seeds or more, which tell their error")
+        if not np.isfinite(logs).all():
+            raise InputError(f"the {name} filter has no evidence: one of its likelihoods is not a density")
+    return EvidenceDifference(*pair)
+
+
+def compare_evidence(
+    config_a: Config,
+    config_b: Config,
+    data: Data,
+    seeds: Sequence[int],
+    workers: int = 1,
+    on_run: Callable[[int, int], None] | None = None,
+) -> EvidenceDifference:
+    """Filters the same data with two configurations of one system, once per seed.
+
+    Args:
+        config_a: the first; its own seed is not used.
+        config_b: the second.
+        data: a log, or where one lies.
+        seeds: two or more.
+        workers: processes; −1 for one per core.
+        on_run: called with the runs done and their number.
+
+    Raises:
+        InputError: the configurations are of different systems, do not fit the data, or one has no evidence because
+            its likelihood is not a density.
+    """
+    if type(config_a) is not type(config_b):
+        raise InputError(
+            "two configurations of different systems do not explain the same data: compare two of one"
+        )
+    if len(seeds) < 2:
+        raise InputError(f"log-evidences are compared over 2 seeds or more, got {len(seeds)}")
+    for name, config in (("first", config_a), ("second", config_b)):
+        _require_density(config, name)
+    jobs = [(replace(config, seed=seed), data) for config in (config_a, config_b) for seed in seeds]
+    logs = _in_order(jobs, workers, on_run or (lambda _done, _total: None))
+    return evidence_difference(logs[: len(seeds)], logs[len(seeds) :])
+
+
+def compare_runs(
+    run_a: Path,
+    run_b: Path,
+    seeds: int = 5,
+    workers: int = 1,
+    on_run: Callable[[int, int], None] | None = None,
+) -> EvidenceDifference:
+    """The same for the settings of two finished runs over one recording, which are repeated with several seeds.
+
+    Raises:
+        InputError: they are runs of different systems or recordings, or of images, or have no evidence.
+    """
+    records = open_run(run_a), open_run(run_b)
+    for record in records:
+        if record.system == "mono":
+            raise InputError(
+                f"{record.folder}: what is measured in images depends on where the filter looks for it, so that two "
+                "settings do not explain the same data; compare them on a FeatureLog by compare_evidence"
+            )
+        if record.system != "range-bearing":
+            raise InputError(
+                f"{record.folder}: runs of the system {record.system!r} cannot be compared by evidence"
+            )
+    if len({record.config.get("recording") for record in records}) > 1:
+        raise InputError(
+            f"{run_a} and {run_b} are runs over different recordings: evidences say nothing about them"
+        )
+    configs = [_config_of(record) for record in records]
+    recording = Path(str(records[0].config["recording"]))
+    return compare_evidence(configs[0], configs[1], recording, range(seeds), workers, on_run)
+
+
+def _log_evidence(logs: np.ndarray) -> tuple[float, float]:
+    """Estimate and its standard error."""
+    variance = float(logs.var(ddof=1))
+    if variance > NOISY**2:
+        return float(np.logaddexp.reduce(logs)) - float(np.log(logs.size)), float(np.sqrt(variance))
+    error = np.sqrt(variance / logs.size + variance**2 / (2.0 * (logs.size - 1)))
+    return float(logs.mean()) + 0.5 * variance, float(error)
+
+
+def _require_density(config: Config, name: str) -> None:
+    if isinstance(config, RangeBearingConfig) and not config.likelihood.build().normalised:
+        raise InputError(
+            f"the {name} configuration has no evidence: its likelihood {config.likelihood.kind!r} is not a density "
+            "(it does not integrate to one); use gaussian, or outliers for sightings that may be wrong"
+        )
+
+
+def _config_of(record: RunRecord) -> RangeBearingConfig:
+    return load_settings(RangeBearingConfig, "range-bearing", record.folder / "config.yaml", (), {})
+
+
+def _in_order(jobs: list[tuple[Any, Data]], workers: int, told: Callable[[int, int], None]) -> list[float]:
+    from joblib import Parallel, delayed
+
+    found = []
+    for value in Parallel(n_jobs=workers, return_as="generator")(delayed(_evidence)(*job) for job in jobs):
+        found.append(value)
+        told(len(found), len(jobs))
+    return found
+
+
+def _evidence(config: Config, data: Data) -> float:
+    from rbpf.systems.mono.run import run as run_mono
+    from rbpf.systems.range_bearing.run import run as run_robot
+
+    if isinstance(config, RangeBearingConfig):
+        if isinstance(data, Path):
+            data = open_log(data, config.noise)
+        elif config.noise.given():
+            raise InputError(
+                "a log that was read already has its noise: give the recording's path to change it"
+            )
+        if isinstance(data, RobotLog):
+            return float(run_robot(data, config).filter.log_evidence)
+    elif isinstance(data, FeatureLog):
+        return float(run_mono(data, config).filter.log_evidence)
+    raise InputError(f"a {type(config).__name__} does not filter a {type(data).__name__}")

@@ -1,0 +1,123 @@
+"""A run folder of any system, read back: what a comparison and a report are made of.
+
+Each part is read when it is asked for, so that a folder that lacks one still has the others.
+"""
+
+import csv
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from rbpf.checkpoint import load_arrays
+from rbpf.errors import InputError
+from rbpf.validation.map_summary import MapSummary
+from rbpf.validation.run_files import FilteredPath, RunTruth, read_path, read_truth
+
+MOST_BYTES = 1 << 30
+"""No file of a run folder is larger."""
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """A run folder.
+
+    Attributes:
+        folder: where it lies.
+        config: the entries of config.yaml.
+        summary: the entries of summary.json.
+    """
+
+    folder: Path
+    config: dict[str, Any]
+    summary: dict[str, Any]
+
+    @property
+    def system(self) -> str:
+        """Which system made it."""
+        return str(self.config.get("system", ""))
+
+    @property
+    def name(self) -> str:
+        """Of the recording."""
+        return str(self.summary.get("recording", self.folder.name))
+
+    def path(self) -> FilteredPath:
+        """The filtered poses; errors as `read_path`."""
+        return read_path(self.folder)
+
+    def truth(self) -> RunTruth:
+        """The ground truth at the run's steps; errors as `read_truth`."""
+        return read_truth(self.folder, self.path())
+
+    def map(self) -> MapSummary:
+        """The landmarks that are points; those whose depth is not known are left out.
+
+        Raises:
+            InputError: map.npz is missing or damaged.
+        """
+        arrays = load_arrays(self.folder / "map.npz")
+        if not {"id", "mean", "cov"} <= arrays.keys():
+            raise InputError(f"{self.folder / 'map.npz'} does not hold a map")
+        known = arrays["ray"] == 0 if "ray" in arrays else np.ones(len(arrays["id"]), dtype=bool)
+        return MapSummary(arrays["id"][known], arrays["mean"][known], arrays["cov"][known])
+
+    def table(self, name: str) -> dict[str, np.ndarray]:
+        """A table of numbers by its columns' names: diagnostics.csv, timings.csv.
+
+        Raises:
+            InputError: it is missing, or holds something else.
+        """
+        path = self.folder / name
+        with _opened(path) as file:
+            rows = list(csv.reader(file))
+        if not rows or any(len(row) != len(rows[0]) for row in rows):
+            raise InputError(f"{path}: expected a table whose rows have as many cells as its header")
+        try:
+            values = np.array(rows[1:], dtype=float).reshape(len(rows) - 1, len(rows[0]))
+        except ValueError as error:
+            raise InputError(f"{path}: expected numbers below the header: {error}") from error
+        return dict(zip(rows[0], values.T, strict=True))
+
+
+def open_run(folder: Path) -> RunRecord:
+    """Opens a run folder.
+
+    Raises:
+        InputError: it is not one, or its config.yaml or summary.json is damaged.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: expected the folder of a run, there is no such folder")
+    for name in ("config.yaml", "summary.json"):
+        if not (folder / name).is_file():
+            raise InputError(f"{folder} has no {name}: expected the folder that a finished `rbpf run` left")
+    with _opened(folder / "config.yaml") as file:
+        config = _mapping(folder / "config.yaml", yaml.safe_load, file.read())
+    with _opened(folder / "summary.json") as file:
+        summary = _mapping(folder / "summary.json", json.loads, file.read())
+    return RunRecord(folder, config, summary)
+
+
+def _mapping(path: Path, load: Any, text: str) -> dict[str, Any]:
+    try:
+        found = load(text)
+    except (ValueError, yaml.YAMLError, RecursionError) as error:
+        raise InputError(f"{path} is damaged: {' '.join(str(error).split())}") from error
+    if not isinstance(found, dict):
+        raise InputError(f"{path} is damaged: expected names with values")
+    return {str(name): value for name, value in found.items()}
+
+
+def _opened(path: Path) -> Any:
+    try:
+        if path.stat().st_size > MOST_BYTES:
+            raise InputError(f"{path} is larger than any file of a run")
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} cannot be read: {error}") from error
+    from io import StringIO
+
+    return StringIO(text)
