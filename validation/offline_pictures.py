@@ -18,9 +18,9 @@ _BINS = 20
 def plot_against_batch(found: AgainstBatch, out: Path) -> list[str]:
     """Map of both, distance of the paths over time, and the landmarks' Gaussians; returns the file names."""
     figures = {
-        "batch_map.png": _batch_map(found),
-        "batch_path.png": _batch_path(found),
-        "batch_landmarks.png": _batch_landmarks(found),
+        "gtsam_map.png": _batch_map(found),
+        "gtsam_path.png": _batch_path(found),
+        "gtsam_landmarks.png": _batch_landmarks(found),
     }
     return save_figures(figures, out)
 

@@ -29,11 +29,23 @@ def _range_bearing_gtsam(record: RunRecord) -> Comparison:
     return compare_with_batch(record)
 
 
+def _camera_gtsam(record: RunRecord) -> Comparison:
+    from rbpf.validation.offline_comparisons import compare_camera_with_batch
+
+    return compare_camera_with_batch(record)
+
+
+def _camera_colmap(record: RunRecord) -> Comparison:
+    from rbpf.validation.offline_comparisons import compare_camera_with_colmap
+
+    return compare_camera_with_colmap(record)
+
+
 ANY = "*"
 COMPARISONS: dict[str, dict[str, Compare]] = {
     "groundtruth": {ANY: _groundtruth},
-    "gtsam": {"range-bearing": _range_bearing_gtsam},
-    "colmap": {},
+    "gtsam": {"range-bearing": _range_bearing_gtsam, "mono": _camera_gtsam},
+    "colmap": {"mono": _camera_colmap},
 }
 """By what a run is compared with, then by the run's system."""
 

@@ -4,6 +4,7 @@ Numba's cache notices when a function's own file changes, not when a function or
 copy would go on with another block size and write outside its arrays.
 """
 
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
@@ -19,11 +20,12 @@ def discard_stale(folder: Path) -> None:
         places = [place for place in Path(config.CACHE_DIR).glob("*") if place.is_dir()]
     for place in places:
         for index in place.glob("*.nbi"):
-            if index.stat().st_mtime < _newest_source():
-                index.unlink(missing_ok=True)
+            with suppress(FileNotFoundError):  # another process may be doing the same
+                if index.stat().st_mtime < _newest_source():
+                    index.unlink()
 
 
 @cache
 def _newest_source() -> float:
-    sources = [*_PACKAGE.glob("kernels/*.py"), *_PACKAGE.glob("sensors/*kernel*.py")]
+    sources = [*_PACKAGE.glob("kernels/*.py"), *_PACKAGE.glob("*/*kernel*.py")]
     return max(source.stat().st_mtime for source in sources)

@@ -27,3 +27,10 @@ def test_a_cache_folder_of_its_own_is_looked_at(tmp_path, monkeypatch):
     os.utime(old, (0, 0))
     discard_stale(tmp_path / "elsewhere")
     assert not old.exists()
+
+
+def test_a_copy_that_another_process_has_just_deleted(tmp_path, monkeypatch):
+    monkeypatch.setattr("rbpf.kernels.stale.config.CACHE_DIR", "")
+    (tmp_path / "__pycache__").mkdir()
+    (tmp_path / "__pycache__" / "a.f-1.py311.nbi").symlink_to(tmp_path / "gone")
+    discard_stale(tmp_path)

@@ -1,0 +1,64 @@
+"""A run over images on its page: beside the batch optimum of its measurements, and beside COLMAP's reconstruction."""
+
+from dataclasses import asdict
+
+import numpy as np
+
+from rbpf.validation.against_batch import AgainstBatch, compare_folder
+from rbpf.validation.against_colmap import compare_folder_with_colmap
+from rbpf.validation.comparison import Comparison
+from rbpf.validation.gaussian_differences import Differences
+from rbpf.validation.offline_pictures import plot_against_batch, plot_against_colmap
+from rbpf.validation.path_and_map import read_path_and_map
+from rbpf.validation.run_record import RunRecord
+from rbpf.validation.statistic import STATE_FACTOR, Statistic
+
+HUBER = 1.345
+"""Threshold of the batch's loss: matches in images hold false ones."""
+
+
+def compare_camera_with_batch(record: RunRecord) -> Comparison:
+    """The batch optimum, with pictures in the run's folder; errors as `compare_folder`."""
+    found = compare_folder(record.folder, robust=HUBER)
+    apart = 1e3 * found.path.rmse
+    accuracy = f"The path is {apart:.3g} mm (rms) from the batch optimum of the same measurements."
+    named = (("landmarks", found.landmarks), ("poses", found.poses))
+    statistics = [_apart(name, differences) for name, differences in named if len(differences)]
+    return Comparison(
+        "gtsam", accuracy, _figures(found), statistics, plot_against_batch(found, record.folder)
+    )
+
+
+def compare_camera_with_colmap(record: RunRecord) -> Comparison:
+    """COLMAP's reconstruction of every n-th image; errors as `compare_folder_with_colmap`."""
+    found = compare_folder_with_colmap(record.folder)
+    figures = {f"run_{name}": value for name, value in found.run.as_dict().items()}
+    if found.truth is not None:
+        figures |= {f"truth_{name}": value for name, value in found.truth.as_dict().items()}
+    accuracy = f"The path is {1e3 * found.run.path.rmse:.3g} mm (rms) from COLMAP's reconstruction of the same images."
+    pictures = plot_against_colmap(found.run, read_path_and_map(record.folder), record.folder)
+    return Comparison("colmap", accuracy, figures, [], pictures)
+
+
+def _figures(found: AgainstBatch) -> dict[str, object]:
+    """Single numbers for the page; the rows behind them are `AgainstBatch.as_dict`'s."""
+    figures: dict[str, object] = {
+        "gauge": found.gauge,
+        "scale": found.scale,
+        "filter_minus_batch_rmse_m": found.path.rmse,
+        "filter_minus_batch_max_m": found.path.max,
+        "batch_error": found.optimum.error,
+    }
+    for name, differences in (("landmarks", found.landmarks), ("poses", found.poses)):
+        rows = differences.as_dict().items()
+        figures |= {f"{name}_{key}": value for key, value in rows if not isinstance(value, list)}
+    for name, fit in (("filter", found.fit_filter), ("batch", found.fit_batch)):
+        figures |= {f"{name}_{key}": value for key, value in asdict(fit).items()}
+    return figures
+
+
+def _apart(name: str, differences: Differences) -> Statistic:
+    """Squared distance from the optimum in the filter's own deviations; a filter that lost nothing stays below one."""
+    value = float(np.square(differences.sigmas).mean() / differences.dims)
+    title = f"{name} against the batch optimum"
+    return Statistic(title, value, value, value, (0.0, STATE_FACTOR**2), float(len(differences)))
