@@ -175,3 +175,39 @@ def test_the_recovery_is_in_the_checkpoint(tracked, tmp_path):
     arrays = run.recovery.arrays()
     assert arrays["recovery/pose"] == pytest.approx(again.recovery.trusted[0])
     assert int(arrays["recovery/stamp_ns"]) == again.stamps_ns[-1]
+
+
+BLINK = 8
+"""Frames of darkness in the test of an interruption."""
+
+
+def blinking(t, image):
+    """Frozen first, then dark."""
+    if t < 2:
+        return image
+    return view(texture(), path(FRAMES)[1]) if t < 2 + BLINK else np.zeros_like(image)
+
+
+@pytest.mark.parametrize("stop", [4, 2 + BLINK - 1, 2 + BLINK + 2], ids=["repeats", "frozen", "dark"])
+def test_an_interruption_while_nothing_is_seen_changes_no_byte(tmp_path, stop):
+    frames, config = 2 + 2 * BLINK, replace(CONFIG, particles=10, checkpoint_every=1)
+
+    def interrupt(t, frame, run):
+        if t + 1 == stop:
+            raise KeyboardInterrupt
+
+    def go(name, on_frame=None):
+        return run_images(
+            sequence(frames, blinking), config, known_points(), on_frame, tmp_path / name, resume=True
+        )
+
+    whole = go("whole.npz")
+    with pytest.raises(KeyboardInterrupt):
+        go("cut.npz", interrupt)
+    again = go("cut.npz")
+    assert again.problems == whole.problems
+    assert sum("frozen" in problem for problem in whole.problems) == 1
+    kept, fresh = again.recovery.arrays(), whole.recovery.arrays()
+    assert all(kept[name].tobytes() == fresh[name].tobytes() for name in fresh)
+    for name in ("world_from_camera", "cov", "lost", "found", "ess", "log_evidence"):
+        assert getattr(again, name).tobytes() == getattr(whole, name).tobytes()

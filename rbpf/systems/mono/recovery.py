@@ -108,9 +108,20 @@ class Recovery:
     def arrays(self) -> dict[str, np.ndarray]:
         """For a checkpoint."""
         pose, cov = self.trusted
-        return {"recovery/pose": pose, "recovery/cov": cov, "recovery/stamp_ns": np.array(self.stamp_ns)}
+        last = np.zeros((0, 0), dtype=np.uint8) if self._last is None else self._last
+        return {
+            "recovery/pose": pose,
+            "recovery/cov": cov,
+            "recovery/stamp_ns": np.array(self.stamp_ns),
+            "recovery/last": last,
+            "recovery/repeats": np.array(self._repeats),
+            "recovery/blank": np.array(self._blank),
+        }
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """The inverse of `arrays`."""
         self._trusted, self._cloud = (arrays["recovery/pose"], arrays["recovery/cov"]), None
         self.stamp_ns = int(arrays["recovery/stamp_ns"])
+        last = arrays["recovery/last"]
+        self._last = last if last.size else None
+        self._repeats, self._blank = int(arrays["recovery/repeats"]), bool(arrays["recovery/blank"])

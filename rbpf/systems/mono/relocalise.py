@@ -41,7 +41,7 @@ class Relocaliser:
     def __init__(self, sensor: ImageSensor, config: RecoveryConfig) -> None:
         self.sensor = sensor
         self.config = config
-        self._seen_from: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+        self._seen_from: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None = None
 
     def find(self, belief: Belief, image: np.ndarray, near: np.ndarray) -> PoseLaw | None:
         """Where the camera must be, if enough of the map's landmarks with known depth are seen.
@@ -83,9 +83,9 @@ class Relocaliser:
 
     def _looks(self, rows: np.ndarray, points: np.ndarray, near: np.ndarray) -> np.ndarray:
         """Descriptors (K, 128) of features, turned and scaled as they would be seen from a pose near by."""
-        known = self._seen_from
-        if known is not None and np.array_equal(known[0], rows) and np.array_equal(known[1], near):
-            return known[2]
+        known, asked = self._seen_from, (rows, points, near)
+        if known is not None and all(map(np.array_equal, known, asked)):
+            return known[3]
         table = self.sensor.table
         homogeneous = np.concatenate([points, np.ones((rows.size, 1))], axis=-1)
         turn = affines(self.sensor.camera, homogeneous, table.first_pose[rows], near)
@@ -95,7 +95,7 @@ class Relocaliser:
         sane = np.isfinite(turn).all(axis=(1, 2)) & (scale > 0.25) & (scale < 4.0)
         scale, angle = np.where(sane, scale, 1.0), np.where(sane, angle, 0.0)
         looks = describe_windows(table.source[rows], np.clip(scale, LEAST_SCALE, LARGEST_SCALE), angle)
-        self._seen_from = rows, near, looks
+        self._seen_from = *asked, looks
         return looks
 
 
