@@ -122,6 +122,8 @@ def test_the_pose_found_is_right_and_its_covariance_fair(relocaliser):
     truth = SE3.retract(path(FRAMES)[60], np.array([0.05, -0.1, 0.2, 0.1, -0.1, 0.15]))
     law = finder.find(belief, view(texture(), truth), run.recovery.trusted[0])
     assert law is not None
+    assert finder.attempt is not None and finder.attempt.accepted
+    assert CONFIG.recovery.inliers <= finder.attempt.agreeing <= finder.attempt.landmarks
     start = SE3.compose(belief.state[belief.mode][:7], SE3.inverse(run.world_from_camera[-1]))
     error = SE3.log(SE3.between(SE3.compose(start, truth), law.mean))
     assert np.abs(error).max() < 0.03
@@ -139,6 +141,8 @@ def test_nothing_is_found_in_noise_or_in_grey(relocaliser):
     noise = np.random.default_rng(0).integers(0, 255, (240, 320)).astype(np.uint8)
     for image in (noise, np.full((240, 320), 90, dtype=np.uint8)):
         assert finder.find(belief, image, run.recovery.trusted[0]) is None
+        assert finder.attempt is not None and not finder.attempt.accepted
+    assert (finder.attempt.places, finder.attempt.pairs) == (0, 0)
 
 
 def test_too_few_landmarks_find_nothing(relocaliser):

@@ -73,6 +73,8 @@ class ImageSensor(Sensor):
         self._in_view = np.zeros((0, 2))
         self.seconds = 0.0
         """Time of the last search."""
+        self.seconds_choosing = 0.0
+        """Part of it that went into the choice of what to look for: all that grows with the map."""
 
     @property
     def lost(self) -> bool:
@@ -137,7 +139,9 @@ class ImageSensor(Sensor):
 
     def _search(self, image: np.ndarray, belief: Belief) -> Searched:
         pose = belief.state[belief.mode][:7]
+        started = time.perf_counter()
         rows = self._choose(pose)
+        self.seconds_choosing = time.perf_counter() - started
         if not rows.size:
             return Searched.nothing()
         rows, mean, cov = self._predict(rows, belief)

@@ -1,5 +1,6 @@
 """Finds a lost camera in the map by what its landmarks look like, without a prediction."""
 
+from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
@@ -29,6 +30,25 @@ LEAST_SCALE, LARGEST_SCALE = 0.4, 1.2
 """A window that was kept is described at these sizes."""
 
 
+@dataclass(frozen=True)
+class Attempt:
+    """How far the recognition of one image came.
+
+    Attributes:
+        landmarks: of known depth in the map.
+        places: corners of the image.
+        pairs: of a landmark and a place that are like each other and like nothing else.
+        agreeing: pairs that a pose explains, after the search around it; 0 where no pose was computed.
+        accepted: whether that was convincing.
+    """
+
+    landmarks: int
+    places: int = 0
+    pairs: int = 0
+    agreeing: int = 0
+    accepted: bool = False
+
+
 @final
 class Relocaliser:
     """Finds the camera in the map.
@@ -41,6 +61,8 @@ class Relocaliser:
     def __init__(self, sensor: ImageSensor, config: RecoveryConfig) -> None:
         self.sensor = sensor
         self.config = config
+        self.attempt: Attempt | None = None
+        """The last one."""
         self._seen_from: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None = None
 
     def find(self, belief: Belief, image: np.ndarray, near: np.ndarray) -> PoseLaw | None:
@@ -56,14 +78,17 @@ class Relocaliser:
         """
         config, camera = self.config, self.sensor.camera
         rows, points = known_places(self.sensor, belief, config.depth_share)
+        self.attempt = Attempt(rows.size)
         if rows.size < config.inliers:
             return None
         px, _ = corners(image, np.zeros((0, 2)), config.corners, config.spacing_px, BORDER_PX)
+        self.attempt = replace(self.attempt, places=px.shape[0])
         if px.shape[0] < config.inliers:
             return None
         away = distances(self._looks(rows, points, near), image, px)
         size = np.linalg.norm(points - SE3.translation(near), axis=-1).mean()
         pairs = unmistakable(away, points / size, px / config.spacing_px, config.ratio)
+        self.attempt = replace(self.attempt, pairs=pairs[0].size)
         # Drawn anew for each image: a run that is resumed draws the same.
         rng = np.random.default_rng(px.shape[0])
         rough = resect_consensus(
@@ -74,7 +99,11 @@ class Relocaliser:
         pairs = expected(camera, rough.world_from_camera, points, px, away, config.around_px)
         at, places = points[pairs[0]], px[pairs[1]]
         found = refined(camera, rough.world_from_camera, at, places, config.within_px)
-        if found is None or not convincing(found, places, camera.width, config):
+        if found is None:
+            return None
+        accepted = convincing(found, places, camera.width, config)
+        self.attempt = replace(self.attempt, agreeing=int(found.inliers.sum()), accepted=accepted)
+        if not accepted:
             return None
         noise = config.inflation * max(found.rms_px, self.sensor.config.noise_px)
         return PoseLaw(
