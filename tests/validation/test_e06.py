@@ -8,17 +8,19 @@ import pytest
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.pinhole import Pinhole
-from rbpf.systems.mono.config import MonoConfig
+from rbpf.systems.mono.config import MonoConfig, SearchConfig
 from rbpf.systems.mono.sightings import Sighting
 from rbpf.systems.mono.video import run_images
 from rbpf.validation.e06.depth_curves import Passing, shape_of
+from rbpf.validation.e06.depth_from_images import follow
 from rbpf.validation.e06.loop import AWAY, find_closure, started_until
 from rbpf.validation.e06.many_landmarks import fill
 from rbpf.validation.e06.new_landmarks import line_distances, line_lengths
 from rbpf.validation.e06.plane import fit_plane
-from rbpf.validation.e06.setting import Row
+from rbpf.validation.e06.setting import Row, Setting
 from rbpf.validation.e06.worlds import LoopOverDesk, SidewaysDesk, StillTarget
 from rbpf.validation.simulation.render import Renderer
+from rbpf.validation.simulation.textured_scene import cast
 from tests.systems.plane_sequences import known_points, sequence
 
 cv2 = pytest.importorskip("cv2")
@@ -149,3 +151,20 @@ def test_the_loop_comes_back_and_the_sideways_camera_goes_straight():
 def test_a_row_says_where_it_falls_short():
     row = Row("Fig. 0", "what", "1", "2", 2.0, met=False)
     assert [replace(row, met=met).verdict for met in (False, True, None)] == ["FALLS SHORT", "yes", ""]
+
+
+def test_features_are_followed_to_where_they_truly_are(tmp_path):
+    world = SidewaysDesk(frames=4, texel_m=0.002)
+    setting = Setting(tmp_path, quick=True)
+    sequence, _ = setting.sequence("sideways", world)
+    px, track = follow(sequence, 12, SearchConfig())
+    scene = world.build(np.random.default_rng(setting.seed))
+    uv = setting.camera.unproject(px)
+    depth, _ = cast(scene.rectangles, scene.world_from_camera[0], uv)
+    points = SE3.transform(
+        scene.world_from_camera[0], depth[:, None] * np.column_stack([uv, np.ones(len(uv))])
+    )
+    seen = setting.camera.project(SE3.inverse_transform(scene.world_from_camera[1:, None], points))
+    away = np.linalg.norm(np.moveaxis(seen, 0, 1) - track, axis=-1)
+    assert np.isfinite(away).mean() > 0.7
+    assert np.nanmedian(away) < 0.5

@@ -68,8 +68,8 @@ def _draw(run: VideoRun, mapped: MonoMap, truth: np.ndarray, cpu: np.ndarray) ->
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(14.0, 6.5), layout="constrained")
-    left, right = figure.subfigures(1, 2, width_ratios=(1.0, 1.1))
-    above, rows = left.subplots(), right.subplots(3, 1, sharex=True)
+    panels: Any = figure.subfigures(1, 2, width_ratios=(1.0, 1.1))
+    above, rows = panels[0].subplots(), panels[1].subplots(3, 1, sharex=True)
     _draw_map(above, run, mapped, truth)
     frames = np.arange(run.seconds.size)
     held = np.array([sighting.held[0] for sighting in run.sightings.frames])

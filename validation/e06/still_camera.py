@@ -75,12 +75,17 @@ def _draw(found: dict[str, Posterior], truth: np.ndarray) -> Any:
 
     figure = Figure(figsize=(13.0, 4.5), layout="constrained")
     panels = figure.subplots(1, len(found), sharex=True, sharey=True)
+    half = 1.05 * max(float(np.abs(one.cloud - truth)[:, :2].max()) for one in found.values())
     for axes, (treatment, one) in zip(panels, found.items(), strict=True):
         axes.plot(*(one.cloud - truth)[:, :2].T, ".", ms=4, alpha=0.5)
         axes.plot(0.0, 0.0, "x", color="black", ms=10, mew=2)
         axes.set(
-            title=f"{TREATMENTS[treatment]} (Fig. 9)", xlabel="x [m], towards the poster", aspect="equal"
+            title=f"{TREATMENTS[treatment]} (Fig. 9)",
+            xlabel="x [m], towards the poster",
+            xlim=(-half, half),
+            ylim=(-half, half),
+            aspect="equal",
         )
         axes.grid(alpha=0.3)
-    panels[0].set_ylabel("y [m]")
+    panels[0].set_ylabel("y [m], to the left")
     return figure
