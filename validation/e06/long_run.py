@@ -10,13 +10,16 @@ from rbpf.lie import SE3
 from rbpf.sensors.readers.images import ImageFrame
 from rbpf.systems.mono.video import VideoRun, run_images
 from rbpf.validation.e06.setting import Row, Setting, true_poses
-from rbpf.validation.e06.worlds import long_room
+from rbpf.validation.e06.worlds import LoopOverDesk
 from rbpf.validation.figures import COLOURS, SIGMAS, label, outline, save_figures
 from rbpf.validation.mono_map import MonoMap, summarise_mono_map
 
 FRAME_S = 1.0 / 30.0
 WARM_UP = 5
 """First frames, which are not counted: kernels are loaded."""
+
+LAP = 430
+"""Frames of one round."""
 
 WIDTH = 320
 """Of the images: three thousand of them take long to render."""
@@ -29,7 +32,8 @@ def reproduce(setting: Setting) -> list[Row]:
     """Filters the sequence."""
     frames = 60 if setting.quick else 3000
     setting = replace(setting, width=WIDTH)
-    sequence, known = setting.sequence("long_room", long_room(frames, 0.005 if setting.quick else 0.0025))
+    world = LoopOverDesk(frames=frames, laps=frames / LAP, texel_m=0.002)
+    sequence, known = setting.sequence("long_loop", world)
     clock: list[float] = []
 
     def note(t: int, frame: ImageFrame, run: VideoRun) -> None:
@@ -86,7 +90,7 @@ def _draw(run: VideoRun, mapped: MonoMap, truth: np.ndarray, cpu: np.ndarray) ->
     rows[2].set(xlabel="frame", ylabel="ms", ylim=(0.0, max(40.0, 1.2 * high)))
     for axes in rows:
         axes.grid(alpha=0.3)
-        axes.legend(fontsize="small", loc="lower right")
+        axes.legend(fontsize="small", loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return figure
 
 

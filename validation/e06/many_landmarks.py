@@ -16,7 +16,10 @@ from rbpf.validation.e06.worlds import flat_desk
 from rbpf.validation.figures import label, save_figures
 
 SIZES = 100, 300, 1000, 3000, 10_000
-BEHIND_M = 2.0, 20.0
+AWAY_M = 2.0, 20.0
+ASIDE = float(np.cos(np.deg2rad(75.0)))
+"""Added landmarks are at least so far from the optical axis: they do not come into view."""
+
 WARM_UP, FRAMES, SETTLE = 20, 20, 3
 """Frames before the first figure is taken, frames with each size, and how many of these are not counted."""
 STD_M = 0.01
@@ -49,7 +52,7 @@ class _Watch:
 
 
 def fill(run: VideoRun, size: int, rng: np.random.Generator) -> None:
-    """Adds points behind the camera, known alike to all particles, until the map holds `size` landmarks."""
+    """Adds points all around but out of view, known alike to all particles, until the map holds `size` landmarks."""
     belief, table = run.filter.belief(), run.sensor.table
     count = size - belief.map.ids.size
     if count <= 0:
@@ -58,8 +61,10 @@ def fill(run: VideoRun, size: int, rng: np.random.Generator) -> None:
     window = 2 * SOURCE_HALF_PX + 1
     source = rng.integers(0, 256, (count, window, window)).astype(np.uint8)
     rows = table.add(source, np.zeros((count, 2)), pose)
-    direction = np.concatenate([rng.uniform(-1.0, 1.0, (count, 2)), -np.ones((count, 1))], axis=1)
-    points = SE3.transform(pose, rng.uniform(*BEHIND_M, (count, 1)) * direction)
+    along, turn = rng.uniform(-1.0, ASIDE, count), rng.uniform(0.0, 2.0 * np.pi, count)
+    side = np.sqrt(1.0 - along**2)
+    direction = np.stack([side * np.cos(turn), side * np.sin(turn), along], axis=-1)
+    points = SE3.transform(pose, rng.uniform(*AWAY_M, (count, 1)) * direction)
     table.place[rows] = np.concatenate([points, np.ones((count, 1))], axis=1)
     n = run.filter.n
     records = Records(

@@ -10,7 +10,6 @@ from rbpf.sensors.readers.images import KnownPixels
 from rbpf.validation.simulation import textures
 from rbpf.validation.simulation.camera_paths import UP, Wave, eased, frame_seconds, looking, shaken
 from rbpf.validation.simulation.textured_desk import TexturedDesk
-from rbpf.validation.simulation.textured_room import TexturedRoom
 from rbpf.validation.simulation.textured_scene import Rectangle, TexturedScene, stamps_ns
 
 RATE_HZ = 30.0
@@ -32,11 +31,6 @@ def flat_desk(frames: int, texel_m: float) -> TexturedDesk:
         elevation_deg=55.0,
         texel_m=texel_m,
     )
-
-
-def long_room(frames: int, texel_m: float) -> TexturedRoom:
-    """A room that is walked round again and again."""
-    return TexturedRoom(frames=frames, radius_m=1.0, size_m=(6.0, 5.0, 2.6), texel_m=texel_m)
 
 
 @dataclass(frozen=True)
@@ -61,10 +55,11 @@ class LoopOverDesk:
 
     def build(self, rng: np.random.Generator) -> TexturedScene:
         """Draws desk and path."""
-        desk = TexturedDesk(
-            frames=self.frames, size_m=(3.5, 3.5), papers=120, things=24, texel_m=self.texel_m
-        ).build(rng)
-        return replace(desk, name="loop", world_from_camera=self._path(rng))
+        desk = TexturedDesk(frames=2, size_m=(3.5, 3.5), papers=120, things=24, texel_m=self.texel_m).build(
+            rng
+        )
+        stamps = stamps_ns(self.frames, RATE_HZ)
+        return replace(desk, name="loop", stamps_ns=stamps, world_from_camera=self._path(rng))
 
     def _path(self, rng: np.random.Generator) -> np.ndarray:
         seconds = frame_seconds(self.frames, RATE_HZ)

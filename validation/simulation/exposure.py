@@ -46,7 +46,7 @@ class Imaging:
 
     noise_std: float = 3.0
     exposure_drift: float = 0.15
-    lens_px: float = 0.7
+    lens_px: float = 0.5
     blur_s: float = 0.01
     vignetting: float = 0.2
     blackout: Sequence[int] = ()

@@ -175,9 +175,12 @@ class ImageSensor(Sensor):
         table = self.table
         rows = np.flatnonzero(table.alive)
         seen = directions(table.place[rows], pose)
+        # Most of a large map is out of view: all else is asked of the rest alone.
+        visible = seen[:, 2] > 0.0
+        visible[visible] = self.camera.visible(seen[visible], self.config.margin_px)
+        rows, seen = rows[visible], seen[visible]
         cosine, scale = view_changes(table.place[rows], table.first_pose[rows], pose)
-        near = (scale <= self.config.scale) & (scale >= 1.0 / self.config.scale)
-        wanted = self.camera.visible(seen, self.config.margin_px) & near
+        wanted = (scale <= self.config.scale) & (scale >= 1.0 / self.config.scale)
         wanted &= cosine >= np.cos(np.deg2rad(self.config.turn_deg))
         rows, px = rows[wanted], self.camera.project(seen[wanted])
         size = np.array([self.camera.width, self.camera.height])
