@@ -73,12 +73,15 @@ class Recovery:
         A camera that moved on with its last velocity for a second would be further off than one that stayed: hands
         turn back.
         """
+        self.sensor.recognised = False
         if not self.sensor.lost:
             return None
         pose, cov = self.trusted
         if frame.image is not None:
             found = self.relocaliser.find(filter_.belief(), frame.image, pose)
             if found is not None:
+                attempt = self.relocaliser.attempt
+                self.sensor.recognised = attempt is not None and attempt.agreeing >= self.config.sure
                 return PoseLaw(found.mean, found.cov + cov, self.std_velocity)
         reach = np.repeat([self.config.reach_rad, self.config.reach_m], 3)
         return PoseLaw(pose, cov + np.diag(reach**2), self.std_velocity)

@@ -26,6 +26,8 @@ RIVAL = 1.5
 """Places this near to each other, in least distances of corners, may show one thing."""
 LARGEST_DISTANCE = 0.65
 """Of the descriptors of one thing, seen from places that are not too different: half of all others are further."""
+MOST_ROUNDS = 10
+"""Of a pose's refinement on what is seen around it."""
 LEAST_SCALE, LARGEST_SCALE = 0.4, 1.2
 """A window that was kept is described at these sizes."""
 
@@ -96,11 +98,10 @@ class Relocaliser:
         )
         if rough is None:
             return None
-        pairs = expected(camera, rough.world_from_camera, points, px, away, config.around_px)
-        at, places = points[pairs[0]], px[pairs[1]]
-        found = refined(camera, rough.world_from_camera, at, places, config.within_px)
-        if found is None:
+        grown = self._grown(rough.world_from_camera, points, px, away)
+        if grown is None:
             return None
+        found, places = grown
         accepted = convincing(found, places, camera.width, config)
         self.attempt = replace(self.attempt, agreeing=int(found.inliers.sum()), accepted=accepted)
         if not accepted:
@@ -109,6 +110,23 @@ class Relocaliser:
         return PoseLaw(
             found.world_from_camera, gaussian.symmetrise(noise**2 * np.linalg.inv(found.information))
         )
+
+    def _grown(
+        self, rough: np.ndarray, points: np.ndarray, px: np.ndarray, away: np.ndarray
+    ) -> tuple[Resected, np.ndarray] | None:
+        """The pose (7,) refined on all that is found around it, again and again while it explains more of it.
+
+        Few landmarks in one part of the image determine a pose that is right for them alone; from there it has to reach
+        their neighbours first. With the places (M, 2) that were taken into account; None where nothing agrees.
+        """
+        best = None
+        for _ in range(MOST_ROUNDS):
+            pairs = expected(self.sensor.camera, rough, points, px, away, self.config.around_px)
+            found = refined(self.sensor.camera, rough, points[pairs[0]], px[pairs[1]], self.config.within_px)
+            if found is None or (best is not None and found.inliers.sum() <= best[0].inliers.sum()):
+                break
+            best, rough = (found, px[pairs[1]]), found.world_from_camera
+        return best
 
     def _looks(self, rows: np.ndarray, points: np.ndarray, near: np.ndarray) -> np.ndarray:
         """Descriptors (K, 128) of features, turned and scaled as they would be seen from a pose near by."""
