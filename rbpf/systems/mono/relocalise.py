@@ -12,6 +12,7 @@ from rbpf.motion.constant_velocity import PoseLaw
 from rbpf.sensors.consensus_resection import Resected, refined, resect_consensus
 from rbpf.sensors.corners import corners
 from rbpf.sensors.keypoints import describe, describe_windows
+from rbpf.sensors.patches import search, warp
 from rbpf.sensors.pinhole import Pinhole
 from rbpf.systems.mono.config import RecoveryConfig
 from rbpf.systems.mono.image_sensor import ImageSensor
@@ -26,6 +27,8 @@ RIVAL = 1.5
 """Places this near to each other, in least distances of corners, may show one thing."""
 LARGEST_DISTANCE = 0.65
 """Of the descriptors of one thing, seen from places that are not too different: half of all others are further."""
+CORNER_PX, LEAST_ALIKE = 2.0, 0.5
+"""How well a corner is found again, per axis; the least correlation of a patch that says it better."""
 MOST_ROUNDS = 10
 """Of a pose's refinement on what is seen around it."""
 LEAST_SCALE, LARGEST_SCALE = 0.4, 1.2
@@ -49,6 +52,16 @@ class Attempt:
     pairs: int = 0
     agreeing: int = 0
     accepted: bool = False
+
+
+@dataclass(frozen=True)
+class _Looks:
+    """What is compared: an image and its corners (K, 2), and landmarks with their rows (L,) and points (L, 3)."""
+
+    image: np.ndarray
+    rows: np.ndarray
+    points: np.ndarray
+    px: np.ndarray
 
 
 @final
@@ -93,12 +106,12 @@ class Relocaliser:
         self.attempt = replace(self.attempt, pairs=pairs[0].size)
         # Drawn anew for each image: a run that is resumed draws the same.
         rng = np.random.default_rng(px.shape[0])
-        rough = resect_consensus(
-            camera, points[pairs[0]], px[pairs[1]], config.within_px, config.triples, rng
-        )
+        looks = _Looks(image, rows, points, px)
+        places = self._sharp(looks, pairs, near)
+        rough = resect_consensus(camera, points[pairs[0]], places, config.within_px, config.triples, rng)
         if rough is None:
             return None
-        grown = self._grown(rough.world_from_camera, points, px, away)
+        grown = self._grown(looks, rough.world_from_camera, away)
         if grown is None:
             return None
         found, places = grown
@@ -111,8 +124,24 @@ class Relocaliser:
             found.world_from_camera, gaussian.symmetrise(noise**2 * np.linalg.inv(found.information))
         )
 
+    def _sharp(
+        self, looks: "_Looks", pairs: tuple[np.ndarray, np.ndarray], world_from_camera: np.ndarray
+    ) -> np.ndarray:
+        """Where in the image the landmarks of pairs are (M, 2): where their patches, seen from a pose, fit best.
+
+        A corner is found again within a few pixels only. Where the patch is too unlike to say better, it stays.
+        """
+        rows, at = looks.rows[pairs[0]], looks.px[pairs[1]]
+        table, config = self.sensor.table, self.sensor.config
+        homogeneous = np.concatenate([looks.points[pairs[0]], np.ones((rows.size, 1))], axis=-1)
+        turn = affines(self.sensor.camera, homogeneous, table.first_pose[rows], world_from_camera)
+        templates = warp(table.source[rows], turn, config.template_px)
+        cov = np.tile(CORNER_PX**2 * np.eye(2), (rows.size, 1, 1))
+        matches = search(looks.image, templates, at, cov, sigmas=config.sigmas, most_px=config.largest_px)
+        return np.where((matches.score >= LEAST_ALIKE)[:, None], matches.px, at)
+
     def _grown(
-        self, rough: np.ndarray, points: np.ndarray, px: np.ndarray, away: np.ndarray
+        self, looks: "_Looks", rough: np.ndarray, away: np.ndarray
     ) -> tuple[Resected, np.ndarray] | None:
         """The pose (7,) refined on all that is found around it, again and again while it explains more of it.
 
@@ -121,11 +150,12 @@ class Relocaliser:
         """
         best = None
         for _ in range(MOST_ROUNDS):
-            pairs = expected(self.sensor.camera, rough, points, px, away, self.config.around_px)
-            found = refined(self.sensor.camera, rough, points[pairs[0]], px[pairs[1]], self.config.within_px)
+            pairs = expected(self.sensor.camera, rough, looks.points, looks.px, away, self.config.around_px)
+            places = self._sharp(looks, pairs, rough)
+            found = refined(self.sensor.camera, rough, looks.points[pairs[0]], places, self.config.within_px)
             if found is None or (best is not None and found.inliers.sum() <= best[0].inliers.sum()):
                 break
-            best, rough = (found, px[pairs[1]]), found.world_from_camera
+            best, rough = (found, places), found.world_from_camera
         return best
 
     def _looks(self, rows: np.ndarray, points: np.ndarray, near: np.ndarray) -> np.ndarray:
