@@ -27,13 +27,11 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
-from rbpf.filter import Filter
-from rbpf.lie import SE3
 from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.systems.mono.config import MonoConfig, RayConfig
 from rbpf.systems.mono.run import run
-from rbpf.systems.mono.system import world_of
 from rbpf.validation.consistency import pose_errors
+from rbpf.validation.e06.still_camera import camera_cloud
 from rbpf.validation.parallel import in_parallel
 from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
 from rbpf.validation.simulation.point_worlds import PlanarTargetWorld
@@ -77,19 +75,8 @@ def filtered(job: Job) -> Posterior:
     landmark_map = done.filter.belief().map
     rays = int(landmark_map.are(landmark_map.ids, InverseDepth(ray.ready_ratio)).sum())
     return Posterior(
-        *volumes, float(errors.nees[0]), rays, cloud(done.filter, np.random.default_rng(job.seed))
+        *volumes, float(errors.nees[0]), rays, camera_cloud(done.filter, np.random.default_rng(job.seed))
     )
-
-
-def cloud(filter_: Filter, rng: np.random.Generator) -> np.ndarray:
-    """Camera positions (N, 3) in the world of the known points, drawn from the posterior."""
-    particles, world = filter_.particles, world_of(filter_)
-    rows = rng.choice(filter_.n, filter_.n, p=particles.weights)
-    poses = particles.state[rows, :7]
-    if world is not None:
-        noise = np.einsum("nab,nb->na", world.factor[rows], rng.normal(size=(filter_.n, 6)))
-        poses = SE3.between(SE3.retract(world.mean[rows], noise), poses)
-    return SE3.translation(poses)
 
 
 def draw(clouds: dict[tuple[str, str], np.ndarray], path: Path) -> None:

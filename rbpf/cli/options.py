@@ -118,10 +118,10 @@ class ImagesOptions:
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
     baseline_m: float | None = None
     known: int = 6
-    noise_std: float = 2.0
-    blur_s: float = 0.0
-    exposure_drift: float = 0.0
-    vignetting: float = 0.0
+    noise_std: float = 3.0
+    blur_s: float = 0.01
+    exposure_drift: float = 0.15
+    vignetting: float = 0.2
     contrast: float = 1.0
     blackout: tuple[int, int] | None = None
     depth: tyro.conf.FlagCreatePairsOff[bool] = False

@@ -24,6 +24,8 @@ SECONDS_LONG = {
     "mono_video",
     "consistency_runs",
     "verdict",
+    "mono_realism",
+    "reproduce_e06",
 }
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 LONGEST_SENSOR = 40
@@ -99,6 +101,7 @@ def lab_images(figures: dict[str, dict[str, float]]) -> None:
 def mono_blackouts(figures: dict[str, float]) -> None:
     assert figures["blackouts"] >= 2
     assert figures["recovered"] == 1.0
+    assert figures["wrong"] == 0.0
     assert figures["median error a second later [m]"] < 0.03
 
 
@@ -131,6 +134,11 @@ def mono_overconfidence(figures: dict[str, float]) -> None:
     assert figures["default / points"] > 3.0 * figures["default / frame"]
 
 
+def mono_realism(figures: dict[str, float]) -> None:
+    assert 0.8 < figures["rendered desk"] <= 1.0
+    assert figures["rendered desk"] <= figures["rendered desk, perfect pictures"] + 0.05
+
+
 def mono_still_camera(figures: dict[str, float]) -> None:
     assert figures["epipolar / points / stay rays"] < 0.1
     assert figures["epipolar / frame / stay rays"] < 0.5
@@ -159,6 +167,24 @@ def range_only_beacons(figures: dict[str, float]) -> None:
     assert figures["promoted"] >= 4
     assert figures["map"] < 0.5
     assert figures["path"] < 0.3
+
+
+def reproduce_e06(figures: dict[str, float]) -> None:
+    assert {name.split(":")[0] for name in figures} == {f"Fig. {k}" for k in range(2, 10)}
+
+    def of(text: str) -> float:
+        (value,) = [value for name, value in figures.items() if text in name]
+        return value
+
+    assert of("processor time per frame") < 1.5
+    assert of("choice of what to look for") < 0.2
+    assert of("landmarks of a flat desk") < 0.03
+    assert of("observations per frame") > 20
+    assert of("frames in which the camera was lost") == 0
+    assert of("epipolar lines longer than 2 px") >= 3
+    assert of("distance of what is found from its epipolar line") < 3.0
+    assert of("epipolar constraint against none") < 0.5
+    assert of("first sighting: divergence") > 10.0
 
 
 def smoothing(figures: dict[str, float]) -> None:
@@ -210,11 +236,13 @@ CLAIMS: dict[str, Callable[[Any], None]] = {
         mono_eigenvalues,
         mono_loop,
         mono_overconfidence,
+        mono_realism,
         mono_still_camera,
         mono_video,
         own_landmark,
         own_proposal,
         range_only_beacons,
+        reproduce_e06,
         smoothing,
         sweep,
         target_tracking,

@@ -122,6 +122,8 @@ def test_the_pose_found_is_right_and_its_covariance_fair(relocaliser):
     truth = SE3.retract(path(FRAMES)[60], np.array([0.05, -0.1, 0.2, 0.1, -0.1, 0.15]))
     law = finder.find(belief, view(texture(), truth), run.recovery.trusted[0])
     assert law is not None
+    assert finder.attempt is not None and finder.attempt.accepted
+    assert CONFIG.recovery.inliers <= finder.attempt.agreeing <= finder.attempt.landmarks
     start = SE3.compose(belief.state[belief.mode][:7], SE3.inverse(run.world_from_camera[-1]))
     error = SE3.log(SE3.between(SE3.compose(start, truth), law.mean))
     assert np.abs(error).max() < 0.03
@@ -139,6 +141,8 @@ def test_nothing_is_found_in_noise_or_in_grey(relocaliser):
     noise = np.random.default_rng(0).integers(0, 255, (240, 320)).astype(np.uint8)
     for image in (noise, np.full((240, 320), 90, dtype=np.uint8)):
         assert finder.find(belief, image, run.recovery.trusted[0]) is None
+        assert finder.attempt is not None and not finder.attempt.accepted
+    assert (finder.attempt.places, finder.attempt.pairs) == (0, 0)
 
 
 def test_too_few_landmarks_find_nothing(relocaliser):
@@ -175,3 +179,39 @@ def test_the_recovery_is_in_the_checkpoint(tracked, tmp_path):
     arrays = run.recovery.arrays()
     assert arrays["recovery/pose"] == pytest.approx(again.recovery.trusted[0])
     assert int(arrays["recovery/stamp_ns"]) == again.stamps_ns[-1]
+
+
+BLINK = 8
+"""Frames of darkness in the test of an interruption."""
+
+
+def blinking(t, image):
+    """Frozen first, then dark."""
+    if t < 2:
+        return image
+    return view(texture(), path(FRAMES)[1]) if t < 2 + BLINK else np.zeros_like(image)
+
+
+@pytest.mark.parametrize("stop", [4, 2 + BLINK - 1, 2 + BLINK + 2], ids=["repeats", "frozen", "dark"])
+def test_an_interruption_while_nothing_is_seen_changes_no_byte(tmp_path, stop):
+    frames, config = 2 + 2 * BLINK, replace(CONFIG, particles=10, checkpoint_every=1)
+
+    def interrupt(t, frame, run):
+        if t + 1 == stop:
+            raise KeyboardInterrupt
+
+    def go(name, on_frame=None):
+        return run_images(
+            sequence(frames, blinking), config, known_points(), on_frame, tmp_path / name, resume=True
+        )
+
+    whole = go("whole.npz")
+    with pytest.raises(KeyboardInterrupt):
+        go("cut.npz", interrupt)
+    again = go("cut.npz")
+    assert again.problems == whole.problems
+    assert sum("frozen" in problem for problem in whole.problems) == 1
+    kept, fresh = again.recovery.arrays(), whole.recovery.arrays()
+    assert all(kept[name].tobytes() == fresh[name].tobytes() for name in fresh)
+    for name in ("world_from_camera", "cov", "lost", "found", "ess", "log_evidence"):
+        assert getattr(again, name).tobytes() == getattr(whole, name).tobytes()

@@ -18,7 +18,7 @@ cv2 = pytest.importorskip("cv2")
 
 CAMERA = Pinhole(160, 120, 110.0, 110.0, 79.5, 59.5)
 STEREO = RectifiedStereo(CAMERA, 0.1)
-CLEAN = Imaging(noise_std=0.0, lens_px=0.0, known=0)
+CLEAN = Imaging(noise_std=0.0, exposure_drift=0.0, lens_px=0.0, blur_s=0.0, vignetting=0.0, known=0)
 
 
 class GreyWall:

@@ -1,5 +1,6 @@
 """Active search (E06 §4.1): which features are worth a look, where they should be, and what is there."""
 
+import time
 from dataclasses import dataclass, replace
 from typing import final
 
@@ -67,11 +68,15 @@ class ActiveSearch:
         self.table, self.config = table, config
         self.in_view = np.zeros((0, 2))
         """Places (V, 2) of all features that were worth a look, chosen or not, px."""
+        self.seconds_choosing = 0.0
+        """Time of the last choice of what to look for: all that grows with the map."""
 
     def run(self, image: np.ndarray, belief: Belief) -> Searched:
         """Looks for features in an image; what is found agrees with one motion of the camera."""
         pose = belief.state[belief.mode][:7]
+        started = time.perf_counter()
         rows = self._choose(pose)
+        self.seconds_choosing = time.perf_counter() - started
         if not rows.size:
             return Searched.nothing()
         rows, mean, cov = self._predict(rows, belief)

@@ -40,6 +40,8 @@ class ImageSensor(Sensor):
         self.measured = self._features(0, np.zeros(0, dtype=np.int64), np.zeros((0, 2)))
         self.bad_frames = 0
         self._given: np.ndarray | None = None
+        self.recognised = False
+        """Whether the prediction of a lost camera is a place that was recognised beyond doubt."""
         self.seconds = 0.0
         """Time of the last search."""
         self.seconds_births = 0.0
@@ -113,14 +115,22 @@ class ImageSensor(Sensor):
         self._given = None
 
     def _fails(self) -> bool:
-        """Whether so little agrees that it may be chance. Once lost, more has to agree: the camera may be anywhere."""
+        """Whether so little agrees that it may be chance. Once lost, more has to agree: the camera may be anywhere.
+
+        Only features whose whole ellipse was searched tell something then: in a larger one something alike is found by
+        chance, or what is there is missed. Of a place that was recognised beyond doubt it is enough that it can be
+        tracked: patches look different from there.
+        """
         found, config = self.searched.found, self.config
         if not found.size:
             return True
         if not self.lost:
             return bool(found.mean() < config.lost_share)
         least = min(config.regained, int(self.table.alive.sum()))
-        return bool(found.sum() < least or found.mean() < config.regained_share)
+        reach = config.sigmas * np.sqrt(np.einsum("kii->ki", self.searched.cov).max(axis=1))
+        found = found[reach <= config.largest_px]
+        share = config.lost_share if self.recognised else config.regained_share
+        return bool(found.sum() < max(least, share * found.size))
 
     def _judge(self) -> np.ndarray:
         """Counts hits and misses; rows of what is missed too often."""

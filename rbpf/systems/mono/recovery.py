@@ -73,12 +73,15 @@ class Recovery:
         A camera that moved on with its last velocity for a second would be further off than one that stayed: hands
         turn back.
         """
+        self.sensor.recognised = False
         if not self.sensor.lost:
             return None
         pose, cov = self.trusted
         if frame.image is not None:
             found = self.relocaliser.find(filter_.belief(), frame.image, pose)
             if found is not None:
+                attempt = self.relocaliser.attempt
+                self.sensor.recognised = attempt is not None and attempt.agreeing >= self.config.sure
                 return PoseLaw(found.mean, found.cov + cov, self.std_velocity)
         reach = np.repeat([self.config.reach_rad, self.config.reach_m], 3)
         return PoseLaw(pose, cov + np.diag(reach**2), self.std_velocity)
@@ -108,9 +111,20 @@ class Recovery:
     def arrays(self) -> dict[str, np.ndarray]:
         """For a checkpoint."""
         pose, cov = self.trusted
-        return {"recovery/pose": pose, "recovery/cov": cov, "recovery/stamp_ns": np.array(self.stamp_ns)}
+        last = np.zeros((0, 0), dtype=np.uint8) if self._last is None else self._last
+        return {
+            "recovery/pose": pose,
+            "recovery/cov": cov,
+            "recovery/stamp_ns": np.array(self.stamp_ns),
+            "recovery/last": last,
+            "recovery/repeats": np.array(self._repeats),
+            "recovery/blank": np.array(self._blank),
+        }
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """The inverse of `arrays`."""
         self._trusted, self._cloud = (arrays["recovery/pose"], arrays["recovery/cov"]), None
         self.stamp_ns = int(arrays["recovery/stamp_ns"])
+        last = arrays["recovery/last"]
+        self._last = last if last.size else None
+        self._repeats, self._blank = int(arrays["recovery/repeats"]), bool(arrays["recovery/blank"])

@@ -1,5 +1,6 @@
 """Finds a lost camera in the map by what its landmarks look like, without a prediction."""
 
+from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
@@ -11,6 +12,7 @@ from rbpf.motion.constant_velocity import PoseLaw
 from rbpf.sensors.consensus_resection import Resected, refined, resect_consensus
 from rbpf.sensors.corners import corners
 from rbpf.sensors.keypoints import describe, describe_windows
+from rbpf.sensors.patches import search, warp
 from rbpf.sensors.pinhole import Pinhole
 from rbpf.systems.mono.config import RecoveryConfig
 from rbpf.systems.mono.image_sensor import ImageSensor
@@ -25,8 +27,41 @@ RIVAL = 1.5
 """Places this near to each other, in least distances of corners, may show one thing."""
 LARGEST_DISTANCE = 0.65
 """Of the descriptors of one thing, seen from places that are not too different: half of all others are further."""
+CORNER_PX, LEAST_ALIKE = 2.0, 0.5
+"""How well a corner is found again, per axis; the least correlation of a patch that says it better."""
+MOST_ROUNDS = 10
+"""Of a pose's refinement on what is seen around it."""
 LEAST_SCALE, LARGEST_SCALE = 0.4, 1.2
 """A window that was kept is described at these sizes."""
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """How far the recognition of one image came.
+
+    Attributes:
+        landmarks: of known depth in the map.
+        places: corners of the image.
+        pairs: of a landmark and a place that are like each other and like nothing else.
+        agreeing: pairs that a pose explains, after the search around it; 0 where no pose was computed.
+        accepted: whether that was convincing.
+    """
+
+    landmarks: int
+    places: int = 0
+    pairs: int = 0
+    agreeing: int = 0
+    accepted: bool = False
+
+
+@dataclass(frozen=True)
+class _Looks:
+    """What is compared: an image and its corners (K, 2), and landmarks with their rows (L,) and points (L, 3)."""
+
+    image: np.ndarray
+    rows: np.ndarray
+    points: np.ndarray
+    px: np.ndarray
 
 
 @final
@@ -41,7 +76,9 @@ class Relocaliser:
     def __init__(self, sensor: ImageSensor, config: RecoveryConfig) -> None:
         self.sensor = sensor
         self.config = config
-        self._seen_from: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+        self.attempt: Attempt | None = None
+        """The last one."""
+        self._seen_from: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None = None
 
     def find(self, belief: Belief, image: np.ndarray, near: np.ndarray) -> PoseLaw | None:
         """Where the camera must be, if enough of the map's landmarks with known depth are seen.
@@ -56,36 +93,76 @@ class Relocaliser:
         """
         config, camera = self.config, self.sensor.camera
         rows, points = known_places(self.sensor, belief, config.depth_share)
+        self.attempt = Attempt(rows.size)
         if rows.size < config.inliers:
             return None
         px, _ = corners(image, np.zeros((0, 2)), config.corners, config.spacing_px, BORDER_PX)
+        self.attempt = replace(self.attempt, places=px.shape[0])
         if px.shape[0] < config.inliers:
             return None
         away = distances(self._looks(rows, points, near), image, px)
         size = np.linalg.norm(points - SE3.translation(near), axis=-1).mean()
         pairs = unmistakable(away, points / size, px / config.spacing_px, config.ratio)
+        self.attempt = replace(self.attempt, pairs=pairs[0].size)
         # Drawn anew for each image: a run that is resumed draws the same.
         rng = np.random.default_rng(px.shape[0])
-        rough = resect_consensus(
-            camera, points[pairs[0]], px[pairs[1]], config.within_px, config.triples, rng
-        )
+        looks = _Looks(image, rows, points, px)
+        places = self._sharp(looks, pairs, near)
+        rough = resect_consensus(camera, points[pairs[0]], places, config.within_px, config.triples, rng)
         if rough is None:
             return None
-        pairs = expected(camera, rough.world_from_camera, points, px, away, config.around_px)
-        at, places = points[pairs[0]], px[pairs[1]]
-        found = refined(camera, rough.world_from_camera, at, places, config.within_px)
-        if found is None or not convincing(found, places, camera.width, config):
+        grown = self._grown(looks, rough.world_from_camera, away)
+        if grown is None:
+            return None
+        found, places = grown
+        accepted = convincing(found, places, camera.width, config)
+        self.attempt = replace(self.attempt, agreeing=int(found.inliers.sum()), accepted=accepted)
+        if not accepted:
             return None
         noise = config.inflation * max(found.rms_px, self.sensor.config.noise_px)
         return PoseLaw(
             found.world_from_camera, gaussian.symmetrise(noise**2 * np.linalg.inv(found.information))
         )
 
+    def _sharp(
+        self, looks: "_Looks", pairs: tuple[np.ndarray, np.ndarray], world_from_camera: np.ndarray
+    ) -> np.ndarray:
+        """Where in the image the landmarks of pairs are (M, 2): where their patches, seen from a pose, fit best.
+
+        A corner is found again within a few pixels only. Where the patch is too unlike to say better, it stays.
+        """
+        rows, at = looks.rows[pairs[0]], looks.px[pairs[1]]
+        table, config = self.sensor.table, self.sensor.config
+        homogeneous = np.concatenate([looks.points[pairs[0]], np.ones((rows.size, 1))], axis=-1)
+        turn = affines(self.sensor.camera, homogeneous, table.first_pose[rows], world_from_camera)
+        templates = warp(table.source[rows], turn, config.template_px)
+        cov = np.tile(CORNER_PX**2 * np.eye(2), (rows.size, 1, 1))
+        matches = search(looks.image, templates, at, cov, sigmas=config.sigmas, most_px=config.largest_px)
+        return np.where((matches.score >= LEAST_ALIKE)[:, None], matches.px, at)
+
+    def _grown(
+        self, looks: "_Looks", rough: np.ndarray, away: np.ndarray
+    ) -> tuple[Resected, np.ndarray] | None:
+        """The pose (7,) refined on all that is found around it, again and again while it explains more of it.
+
+        Few landmarks in one part of the image determine a pose that is right for them alone; from there it has to reach
+        their neighbours first. With the places (M, 2) that were taken into account; None where nothing agrees.
+        """
+        best = None
+        for _ in range(MOST_ROUNDS):
+            pairs = expected(self.sensor.camera, rough, looks.points, looks.px, away, self.config.around_px)
+            places = self._sharp(looks, pairs, rough)
+            found = refined(self.sensor.camera, rough, looks.points[pairs[0]], places, self.config.within_px)
+            if found is None or (best is not None and found.inliers.sum() <= best[0].inliers.sum()):
+                break
+            best, rough = (found, places), found.world_from_camera
+        return best
+
     def _looks(self, rows: np.ndarray, points: np.ndarray, near: np.ndarray) -> np.ndarray:
         """Descriptors (K, 128) of features, turned and scaled as they would be seen from a pose near by."""
-        known = self._seen_from
-        if known is not None and np.array_equal(known[0], rows) and np.array_equal(known[1], near):
-            return known[2]
+        known, asked = self._seen_from, (rows, points, near)
+        if known is not None and all(map(np.array_equal, known, asked)):
+            return known[3]
         table = self.sensor.table
         homogeneous = np.concatenate([points, np.ones((rows.size, 1))], axis=-1)
         turn = affines(self.sensor.camera, homogeneous, table.first_pose[rows], near)
@@ -95,7 +172,7 @@ class Relocaliser:
         sane = np.isfinite(turn).all(axis=(1, 2)) & (scale > 0.25) & (scale < 4.0)
         scale, angle = np.where(sane, scale, 1.0), np.where(sane, angle, 0.0)
         looks = describe_windows(table.source[rows], np.clip(scale, LEAST_SCALE, LARGEST_SCALE), angle)
-        self._seen_from = rows, near, looks
+        self._seen_from = *asked, looks
         return looks
 
 

@@ -1,0 +1,100 @@
+"""What the figures share: sizes, rendered sequences, and rows of the table."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.readers.images import ImageSequence, KnownPixels, open_images, read_known_points
+from rbpf.systems.mono.config import MonoConfig, RayConfig
+from rbpf.validation.simulation.exposure import Imaging
+from rbpf.validation.simulation.images import simulate_images
+from rbpf.validation.simulation.textured_scene import ImageWorld
+
+QUICK_WIDTH = 320
+FOCAL_WIDTHS = 0.82
+"""Focal length as a share of the image's width: 63 degrees are seen."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A line of the table.
+
+    Attributes:
+        figure: of the paper.
+        what: is compared.
+        paper: its figure, in words.
+        ours: likewise.
+        value: ours as a number.
+        met: whether it is as good as asked for; None where nothing is asked.
+    """
+
+    figure: str
+    what: str
+    paper: str
+    ours: str
+    value: float
+    met: bool | None = None
+
+    @property
+    def verdict(self) -> str:
+        """In words."""
+        return "" if self.met is None else "yes" if self.met else "FALLS SHORT"
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Where the figures are made, and how large.
+
+    Attributes:
+        out: folder for pictures; rendered sequences lie in its `sequences`.
+        width: of the images, px.
+        particles: of the filter.
+        seed: of worlds, noise and filter.
+        quick: few small frames, for a test.
+    """
+
+    out: Path
+    width: int = 640
+    particles: int = 50
+    seed: int = 0
+    quick: bool = False
+
+    @property
+    def camera(self) -> Pinhole:
+        """Without distortion."""
+        width = QUICK_WIDTH if self.quick else self.width
+        height, focal = 3 * width // 4, FOCAL_WIDTHS * width
+        return Pinhole(width, height, focal, focal, 0.5 * width - 0.5, 0.5 * height - 0.5)
+
+    def config(self, ray: RayConfig | None = None) -> MonoConfig:
+        """Of a run: the defaults."""
+        config = MonoConfig(particles=self.particles, seed=self.seed)
+        return config if ray is None else replace(config, ray=ray)
+
+    def sequence(
+        self, name: str, world: ImageWorld, imaging: Imaging | None = None
+    ) -> tuple[ImageSequence, KnownPixels | None]:
+        """A world's images and the points that are known of it; rendered unless they have been before."""
+        imaging = imaging or Imaging()
+        folder = self.out / "sequences" / f"{name}_{self.camera.width}"
+        if not folder.exists():
+            simulate_images(
+                world, replace(imaging, grid=1) if self.quick else imaging, self.camera, folder, self.seed
+            )
+        points = folder / "known_points.csv"
+        return open_images(folder), read_known_points(points) if points.exists() else None
+
+
+def true_poses(sequence: ImageSequence) -> np.ndarray:
+    """(T, 7) world_from_camera of a sequence's images, of those whose truth is at the same instants or near."""
+    assert sequence.truth is not None
+    after = np.searchsorted(sequence.truth.stamps_ns, sequence.stamps_ns).clip(
+        1, sequence.truth.stamps_ns.size - 1
+    )
+    stamps = sequence.truth.stamps_ns
+    nearer = np.where(
+        sequence.stamps_ns - stamps[after - 1] < stamps[after] - sequence.stamps_ns, after - 1, after
+    )
+    return np.asarray(sequence.truth.world_from_camera[nearer])
