@@ -99,6 +99,8 @@ class SampledVelocity(MotionModel):
     ) -> None:
         self.std_walk = _checked(std_walk)
         self.std_start = _checked(std_start)
+        if mode not in ("paper", "joint"):
+            raise InputError(f"a sampled velocity has the mode 'paper' or 'joint', got {mode!r}")
         self.columns = 6 if mode == "paper" else 12
 
     def transition(self, state: np.ndarray, control: PoseLaw | None, dt: float) -> Transition:

@@ -55,11 +55,19 @@ def _run(
         raise FindingError(f"{name} gives no fused kernel: decorate it with @observation_kernel") from error
     for what, output in zip(_OUTPUTS, outputs, strict=True):
         require(output.intact, f"{name} writes outside {what}, which has shape {output.array.shape}")
+    _zero_what_is_not_read(outputs[1].array[..., :count])
     for what, output in zip(_OUTPUTS, outputs, strict=True):
         filled = np.isfinite(output.array[..., :count]).all()
         require(filled, f"{name} leaves entries of {what} unfilled, or fills them with NaN")
     nu, by_state, by_landmark = (np.moveaxis(output.array[..., :count], -1, 0) for output in outputs)
     return nu, Jacobians(by_state, by_landmark)
+
+
+def _zero_what_is_not_read(jac_state: np.ndarray) -> None:
+    """The drivers hand over zeros: a kernel need not fill the last columns, of a part of the state that it ignores."""
+    untouched = np.isnan(jac_state).all(axis=(0, 2))
+    read = int(np.max(np.flatnonzero(~untouched), initial=-1)) + 1
+    jac_state[:, read:] = 0.0
 
 
 class _Guarded:

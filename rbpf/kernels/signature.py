@@ -54,7 +54,8 @@ def observation_kernel(function: Callable[..., None]) -> ObservationKernel:
     Given one measurement `z` (p,) of one landmark, the kernel fills for the lanes 0..n-1
     the innovation `nu` (p, BLOCK) and the Jacobians `jac_state` (p, d, BLOCK), in the right chart at the state,
     and `jac_landmark` (p, D, BLOCK), from `state` (E, BLOCK), `mean` (D, BLOCK), `const` (A, BLOCK) and the
-    model's `params` (P,). Write the body as a loop over lanes; it must not raise.
+    model's `params` (P,). The last columns of `jac_state`, of a part of the state that is not read, may be left
+    alone: they are zero. Write the body as a loop over lanes; it must not raise.
     """
     discard_stale(Path(function.__code__.co_filename).parent)
     return ObservationKernel(cfunc(_SIGNATURE, cache=True, error_model="numpy")(function))

@@ -199,3 +199,8 @@ def test_bad_laws(law, sentence):
     for motion, state in ((MarginalVelocity(1.0), states(2)[:, :7]), (SampledVelocity(1.0), states(2))):
         with pytest.raises(InputError, match=sentence):
             motion.transition(state, law, 0.0)
+
+
+def test_an_unknown_mode_of_a_sampled_velocity():
+    with pytest.raises(InputError, match="'paper' or 'joint', got 'marginal'"):
+        SampledVelocity(0.1, "marginal")

@@ -7,6 +7,8 @@ from rbpf.conformance import Example, check_model
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Euclidean, Product
 from rbpf.maps.inverse_depth import InverseDepth
+from rbpf.maps.point import Point
+from rbpf.models import Records
 from rbpf.numeric import numeric_jacobians
 from rbpf.sensors.camera_points import GRAZING, CameraPoint, CameraRay, EpipolarRay, forward
 from rbpf.sensors.pinhole import RectifiedStereo
@@ -24,6 +26,19 @@ def test_sound_models(camera):
     """The compiled twin is among what is checked."""
     assert check_model(CameraPoint(camera), SE3) == []
     assert check_model(CameraRay(camera), SE3, example=Example(landmark=InverseDepth())) == []
+    assert check_model(EpipolarRay(camera), SE3, example=Example(landmark=InverseDepth())) == []
+
+
+@every_camera
+@pytest.mark.parametrize("seed", range(3))
+def test_sound_where_the_state_holds_a_velocity_too(camera, seed):
+    """The kernels leave its columns alone, and a landmark that rushes past is no angle that wraps."""
+    rng = np.random.default_rng(seed)
+    state = with_velocity(SE3.exp(rng.normal(scale=0.2, size=(5, 6))))
+    mean = rng.normal(size=(5, 3, 3)) + np.array([0.0, 0.0, 4.0])
+    cov = np.tile(0.01 * np.eye(3), (5, 3, 1, 1))
+    example = Example(state=state, landmark=Point(3), records=Records(mean, cov))
+    assert check_model(CameraPoint(camera), WITH_VELOCITY, example=example) == []
 
 
 @pytest.mark.parametrize("camera", [*CAMERAS, STEREO], ids=["plain", "distorted", "stereo"])
