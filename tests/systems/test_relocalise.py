@@ -9,8 +9,11 @@ import pytest
 
 from rbpf.lie import SE3
 from rbpf.sensors.consensus_resection import Resected
+from rbpf.sensors.corners import corners
 from rbpf.systems.mono.config import MonoConfig, RecoveryConfig
-from rbpf.systems.mono.relocalise import Relocaliser, convincing, unmistakable
+from rbpf.systems.mono.image_sensor import ImageSensor, Searched
+from rbpf.systems.mono.relocalise import Looks, Relocaliser, convincing, known_places, unmistakable
+from rbpf.systems.mono.system import build_features
 from rbpf.systems.mono.video import VideoRun, run_images
 from tests.systems.plane_sequences import CAMERA, Pictures, known_points, path, sequence, texture, view
 
@@ -215,3 +218,57 @@ def test_an_interruption_while_nothing_is_seen_changes_no_byte(tmp_path, stop):
     assert all(kept[name].tobytes() == fresh[name].tobytes() for name in fresh)
     for name in ("world_from_camera", "cov", "lost", "found", "ess", "log_evidence"):
         assert getattr(again, name).tobytes() == getattr(whole, name).tobytes()
+
+
+def test_patches_say_more_exactly_than_corners_where_landmarks_are(relocaliser):
+    finder, belief, run = relocaliser
+    truth = SE3.retract(path(FRAMES)[60], np.array([0.05, -0.1, 0.2, 0.1, -0.1, 0.15]))
+    image = view(texture(), truth)
+    start = SE3.compose(belief.state[belief.mode][:7], SE3.inverse(run.world_from_camera[-1]))
+    rows, points = known_places(run.sensor, belief, CONFIG.recovery.depth_share)
+    seen = CAMERA.project(SE3.inverse_transform(SE3.compose(start, truth), points))
+    px, _ = corners(image, np.zeros((0, 2)), 500, 6.0, 16.0)
+    away = np.linalg.norm(seen[:, None] - px, axis=-1)
+    near = np.flatnonzero(away.min(axis=1) < 6.0)
+    pairs = near, away[near].argmin(axis=1)
+    assert near.size >= 15
+    sharp = finder._sharp(Looks(image, rows, points, px), pairs, run.recovery.trusted[0])
+    before, after = (np.linalg.norm(places - seen[near], axis=1) for places in (px[pairs[1]], sharp))
+    assert np.median(after) < 0.7 * np.median(before)
+    assert np.median(after) < 1.5
+
+
+def lost_sensor(found, reach_px):
+    """A lost sensor that looked for features in ellipses of these half axes, and found some of them."""
+    sensor = ImageSensor(build_features(CAMERA, CONFIG, None), CONFIG.search)
+    k = len(found)
+    sensor.table.add(np.zeros((k, 31, 31), np.uint8), np.zeros((k, 2)), SE3.identity())
+    cov = (np.array(reach_px) / CONFIG.search.sigmas)[:, None, None] ** 2 * np.eye(2)
+    hits, px = np.array(found, dtype=bool), np.zeros((k, 2))
+    sensor.searched = Searched(np.arange(k), px, cov, px, np.ones(k), hits)
+    sensor.bad_frames = CONFIG.search.lost_frames
+    return sensor
+
+
+def test_only_ellipses_searched_whole_confirm_a_place():
+    narrow, wide = 20.0, 3.0 * CONFIG.search.largest_px
+    assert still_lost(lost_sensor([True] * 5 + [False] * 5, [narrow] * 10))  # too few
+    assert still_lost(lost_sensor([True] * 8 + [False] * 10, [narrow] * 18))  # too small a share
+    assert not still_lost(lost_sensor([True] * 8 + [False] * 8, [narrow] * 16))
+    assert not still_lost(lost_sensor([True] * 8 + [False] * 20, [narrow] * 16 + [wide] * 12))
+    assert still_lost(lost_sensor([True] * 16, [wide] * 16))
+
+
+def test_a_place_recognised_beyond_doubt_needs_less():
+    sensor = lost_sensor([True] * 8 + [False] * 16, [20.0] * 24)
+    assert still_lost(sensor)
+    sensor.recognised = True
+    assert not still_lost(sensor)
+    few = lost_sensor([True] * 5 + [False] * 2, [20.0] * 7)
+    few.recognised = True
+    assert still_lost(few)
+
+
+def still_lost(sensor):
+    """What the sensor says of its last search."""
+    return sensor._fails()

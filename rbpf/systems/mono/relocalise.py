@@ -55,7 +55,7 @@ class Attempt:
 
 
 @dataclass(frozen=True)
-class _Looks:
+class Looks:
     """What is compared: an image and its corners (K, 2), and landmarks with their rows (L,) and points (L, 3)."""
 
     image: np.ndarray
@@ -106,7 +106,7 @@ class Relocaliser:
         self.attempt = replace(self.attempt, pairs=pairs[0].size)
         # Drawn anew for each image: a run that is resumed draws the same.
         rng = np.random.default_rng(px.shape[0])
-        looks = _Looks(image, rows, points, px)
+        looks = Looks(image, rows, points, px)
         places = self._sharp(looks, pairs, near)
         rough = resect_consensus(camera, points[pairs[0]], places, config.within_px, config.triples, rng)
         if rough is None:
@@ -125,7 +125,7 @@ class Relocaliser:
         )
 
     def _sharp(
-        self, looks: "_Looks", pairs: tuple[np.ndarray, np.ndarray], world_from_camera: np.ndarray
+        self, looks: Looks, pairs: tuple[np.ndarray, np.ndarray], world_from_camera: np.ndarray
     ) -> np.ndarray:
         """Where in the image the landmarks of pairs are (M, 2): where their patches, seen from a pose, fit best.
 
@@ -140,9 +140,7 @@ class Relocaliser:
         matches = search(looks.image, templates, at, cov, sigmas=config.sigmas, most_px=config.largest_px)
         return np.where((matches.score >= LEAST_ALIKE)[:, None], matches.px, at)
 
-    def _grown(
-        self, looks: "_Looks", rough: np.ndarray, away: np.ndarray
-    ) -> tuple[Resected, np.ndarray] | None:
+    def _grown(self, looks: Looks, rough: np.ndarray, away: np.ndarray) -> tuple[Resected, np.ndarray] | None:
         """The pose (7,) refined on all that is found around it, again and again while it explains more of it.
 
         Few landmarks in one part of the image determine a pose that is right for them alone; from there it has to reach
@@ -167,7 +165,9 @@ class Relocaliser:
         homogeneous = np.concatenate([points, np.ones((rows.size, 1))], axis=-1)
         turn = affines(self.sensor.camera, homogeneous, table.first_pose[rows], near)
         # Features behind the camera or at a grazing angle are described as they were seen at first.
-        scale = np.sqrt(np.abs(np.linalg.det(turn)))
+        with np.errstate(all="ignore"):
+            area = turn[:, 0, 0] * turn[:, 1, 1] - turn[:, 0, 1] * turn[:, 1, 0]
+        scale = np.sqrt(np.abs(area))
         angle = np.arctan2(turn[:, 1, 0] - turn[:, 0, 1], turn[:, 0, 0] + turn[:, 1, 1])
         sane = np.isfinite(turn).all(axis=(1, 2)) & (scale > 0.25) & (scale < 4.0)
         scale, angle = np.where(sane, scale, 1.0), np.where(sane, angle, 0.0)
