@@ -16,4 +16,5 @@ for name in (
     "corner_kernels",
 ):
     import_module(f"rbpf.sensors.{name}")
+import_module("rbpf.motion.stereo_kernels")
 import_module("rbpf.validation.simulation.raster_kernel")

@@ -1,0 +1,177 @@
+"""Least squares on a manifold after K. Levenberg (1944) and D. Marquardt (1963), by singular values (S05 §III-C).
+
+Minimises ½‖ε(x)‖² with the correction x ⊕ (−χ), where χ solves S05 (15)–(16) with d = 0 in the least-squares sense,
+
+    [J; λI] χ = [ε; 0],    J = ∂ε/∂ξ of ε(x ⊕ ξ).
+
+With J = U S Vᵀ that is χ = V diag(s / (s² + λ²)) Uᵀε for every λ, so that a step that is tried again with more damping
+costs no decomposition. λ follows the ratio of the decrease found to the decrease promised (H. B. Nielsen 1999).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from rbpf.errors import InputError
+from rbpf.lie import Array
+
+Evaluate = Callable[[Array], tuple[Array, Array]]
+"""x (E,) → whitened residuals (m,), and their derivative (m, d) in the chart at x; infinite where x is senseless."""
+
+Retract = Callable[[Array, Array], Array]
+"""x (E,) moved by ξ (d,)."""
+
+SINGULAR = 1e-12
+"""A singular value below this share of the largest counts as this share: its direction is not determined."""
+
+ROUNDING = 1e-12
+"""A decrease below this share of the squared residuals is not worth a step, nor certain to be found."""
+
+STUCK = 1e8
+"""Damping at this multiple of the largest singular value leaves no step."""
+
+
+@dataclass(frozen=True)
+class Rule:
+    """When to stop, and how to begin.
+
+    Attributes:
+        offset: what is left to go to the linearised problem's minimum, in standard deviations of the solution
+            (D. Bates and D. Watts 1981): the iteration has converged below it.
+        iterations: most of them.
+        damping: the first λ, as a share of the largest singular value.
+    """
+
+    offset: float = 1e-6
+    iterations: int = 50
+    damping: float = 1e-4
+
+
+@dataclass(frozen=True)
+class Minimum:
+    """Where the iteration ended.
+
+    Attributes:
+        x: (E,).
+        residual: (m,) ε there.
+        jacobian: (m, d) J there.
+        iterations: steps that were tried.
+        converged: whether the remaining offset is below the rule's.
+    """
+
+    x: Array
+    residual: Array
+    jacobian: Array
+    iterations: int
+    converged: bool
+
+    @property
+    def squared(self) -> float:
+        """‖ε‖²."""
+        return float(self.residual @ self.residual)
+
+    @cached_property
+    def factor(self) -> Array:
+        """V S⁻¹ (d, d), a square root of `cov`."""
+        _, s, vt = np.linalg.svd(self.jacobian, full_matrices=False)
+        return vt.T / np.maximum(s, SINGULAR * s[0])
+
+    @property
+    def cov(self) -> Array:
+        """(JᵀJ)⁻¹ = V S⁻² Vᵀ (d, d): the covariance of the solution if the whitened residuals have variance one.
+
+        A direction that the residuals do not determine has a variance that is finite, and enormous.
+        """
+        return self.factor @ self.factor.T
+
+
+@dataclass(frozen=True)
+class _Local:
+    """The linearised problem in the axes of J = U S Vᵀ.
+
+    Attributes:
+        squared: ‖ε‖².
+        along: (d,) Uᵀε.
+        s: (d,).
+        vt: (d, d).
+    """
+
+    squared: float
+    along: Array
+    s: Array
+    vt: Array
+
+    @property
+    def offset(self) -> float:
+        """Length of the step that is left, in standard deviations of the solution."""
+        return float(np.linalg.norm(self.along))
+
+    def step(self, damping: float) -> Array:
+        """χ (d,)."""
+        return self.vt.T @ (self.s / (self.s**2 + damping**2) * self.along)
+
+    def promised(self, damping: float) -> float:
+        """Decrease of ‖ε‖² by the damped step in the linearised problem."""
+        squares = self.s**2
+        shares = squares * (squares + 2.0 * damping**2) / (squares + damping**2) ** 2
+        return float(shares @ self.along**2)
+
+
+def minimise(evaluate: Evaluate, x: Array, retract: Retract, rule: Rule | None = None) -> Minimum:
+    """The minimum of ½‖ε(x)‖² that is reached from x.
+
+    Args:
+        evaluate: whitened residuals and their derivative.
+        x: (E,) where to start.
+        retract: moves x along a tangent vector; `np.add` in a vector space.
+        rule: when to stop.
+
+    Raises:
+        InputError: there are fewer residuals than unknowns, or at the start they or their derivative are not finite
+            or the derivative is zero.
+    """
+    rule = rule or Rule()
+    residual, jac = evaluate(x)
+    _require_start(residual, jac)
+    local = _linearised(residual, jac)
+    damping, growth = rule.damping * float(local.s[0]), 2.0
+    for iterations in range(rule.iterations):
+        if _settled(local, rule):
+            return Minimum(x, residual, jac, iterations, True)
+        tried = retract(x, -local.step(damping))
+        found, slope = evaluate(tried)
+        decrease = local.squared - float(found @ found)
+        gain = decrease / local.promised(damping)
+        if not (gain > 0.0 and np.isfinite(slope).all()):
+            damping, growth = growth * max(damping, SINGULAR * float(local.s[0])), 2.0 * growth
+            if damping > STUCK * float(local.s[0]):
+                break
+            continue
+        x, residual, jac, local = tried, found, slope, _linearised(found, slope)
+        damping, growth = damping * np.sqrt(max(1.0 / 9.0, 1.0 - (2.0 * gain - 1.0) ** 3)), 2.0
+    return Minimum(x, residual, jac, iterations, _settled(local, rule))
+
+
+def _linearised(residual: Array, jac: Array) -> _Local:
+    u, s, vt = np.linalg.svd(jac, full_matrices=False)
+    # Along a direction that is not determined there is nowhere to go.
+    along = np.where(s > SINGULAR * s[0], u.T @ residual, 0.0)
+    return _Local(float(residual @ residual), along, s, vt)
+
+
+def _settled(local: _Local, rule: Rule) -> bool:
+    return local.offset <= max(rule.offset, np.sqrt(ROUNDING * local.squared))
+
+
+def _require_start(residual: Array, jac: Array) -> None:
+    rows, unknowns = jac.shape
+    if rows < unknowns:
+        raise InputError(
+            f"least squares needs at least as many residuals as unknowns, got {rows} and {unknowns}"
+        )
+    if not (np.isfinite(residual).all() and np.isfinite(jac).all()):
+        raise InputError("the residuals or their derivative are not finite at the start of least squares")
+    if not jac.any():
+        raise InputError("the residuals of least squares do not depend on the unknowns at the start")

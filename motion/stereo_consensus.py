@@ -1,0 +1,163 @@
+"""The motion that most matches of two stereo frames agree with, from triples of them (RANSAC).
+
+M. Fischler and R. Bolles (1981); the truncated score is that of P. Torr and A. Zisserman (2000). The points of a
+triple are aligned, which gives a motion of any size, and this is refined on their pixels: far points are too uncertain
+in space for the alignment alone.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rbpf import gaussian
+from rbpf.lie import SE3, Array
+from rbpf.motion.stereo_geometry import Matches, homography, points_from_pixels, raise_pixels, see
+
+REFINEMENTS = 3
+"""Gauss-Newton steps on the nine pixels of a triple."""
+
+STIFFNESS = 1e-9
+"""Added to the information of a triple, as a share of its trace: three points on a line leave a turn open."""
+
+FARTHEST = 1e4
+"""Baselines away at most is a point put for the alignment."""
+
+FLAT = 1e-12
+"""Shortest length that is divided by: points that coincide have no direction."""
+
+
+@dataclass(frozen=True)
+class Draws:
+    """How many triples are tried.
+
+    Attributes:
+        batch: tried at a time.
+        most: of all batches.
+        certainty: with this probability one triple without a false match is among them, given the share of matches
+            that agree with the best motion so far.
+    """
+
+    batch: int = 32
+    most: int = 512
+    certainty: float = 0.9999
+
+    def needed(self, share: float) -> float:
+        """Triples that it takes where this share of the matches is right."""
+        spoilt = 1.0 - min(share, 1.0 - 1e-9) ** 3
+        return float(np.log1p(-self.certainty) / np.log(spoilt)) if spoilt < 1.0 else np.inf
+
+
+def consensus(
+    matches: Matches, start: Array, gate: float, rng: np.random.Generator, draws: Draws | None = None
+) -> Array:
+    """The motion (7,) of the lowest truncated score Σ min(d², gate).
+
+    The distances d are Mahalanobis', under the sum of both frames' covariances: enough to tell motions apart.
+
+    Args:
+        matches: three or more.
+        start: (7,) a guess of the motion; it takes part, and so does standing still.
+        gate: squared distance beyond which a match does not agree.
+        rng: draws the triples.
+        draws: how many.
+    """
+    draws, search = draws or Draws(), _Search(matches, start)
+    best, lowest, share = start, np.inf, 0.0
+    motions = np.stack([start, SE3.identity()])
+    for tried in range(0, draws.most, draws.batch):
+        if tried > draws.needed(share):
+            break
+        found = search.candidates(triples(len(matches), draws.batch, rng))
+        motions = np.concatenate([motions, found]) if tried == 0 else found
+        scores, shares = search.scores(motions, gate)
+        if scores.min() < lowest:
+            first = scores.argmin()
+            best, lowest, share = motions[first], scores[first], float(shares[first])
+    return best
+
+
+def triples(count: int, n: int, rng: np.random.Generator) -> np.ndarray:
+    """Triples (n, 3) of different numbers below `count`, all equally likely."""
+    first, second, third = rng.integers([count, count - 1, count - 2], size=(n, 3)).T
+    second = second + (second >= first)
+    low, high = np.minimum(first, second), np.maximum(first, second)
+    third = third + (third >= low)
+    return np.stack([first, second, third + (third >= high)], axis=1)
+
+
+def align(before: Array, now: Array) -> Array:
+    """Motions T (…, 7) with T now = before, for triples of points (…, 3, 3); exact where the triangles are congruent.
+
+    The triangles' planes are laid on one another, with their centres and the directions of their first edges.
+    """
+    turn = _frame(before) @ _frame(now).mT
+    shift = before.mean(axis=-2) - (turn @ now.mean(axis=-2)[..., None])[..., 0]
+    return SE3.from_matrix(np.concatenate([turn, shift[..., None]], axis=-1))
+
+
+def _frame(points: Array) -> Array:
+    """Rotations (…, 3, 3): the triangle's first edge, the direction across it in its plane, and the plane's normal."""
+    edge = _unit(points[..., 1, :] - points[..., 0, :])
+    normal = _unit(np.cross(edge, points[..., 2, :] - points[..., 0, :]))
+    return np.stack([edge, np.cross(normal, edge), normal], axis=-1)
+
+
+def _unit(v: Array) -> Array:
+    return v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), FLAT)
+
+
+class _Search:
+    """What stays the same for all motions."""
+
+    def __init__(self, matches: Matches, start: Array) -> None:
+        self.matches, self.start = matches, start
+        self.before, self.now = (_points(matches, z) for z in (matches.z_prev, matches.z_now))
+        # Wᵀ W = (R⁻ + R)⁻¹.
+        info = gaussian.inverse(matches.cov_prev + matches.cov_now)
+        self.white = np.ascontiguousarray(gaussian.cholesky(info).mT)
+
+    def candidates(self, rows: np.ndarray) -> Array:
+        """Motions (C, 7) of triples (C, 3)."""
+        aligned = align(self.before[rows], self.now[rows])
+        guesses = np.stack([aligned, np.broadcast_to(self.start, aligned.shape)])
+        nearer = self.squared(guesses, rows).sum(axis=-1).argmin(axis=0)
+        motions = guesses[nearer, np.arange(len(rows))]
+        for _ in range(REFINEMENTS):
+            motions = self._step(motions, rows)
+        return motions
+
+    def scores(self, motions: Array, gate: float) -> tuple[Array, Array]:
+        """Σ min(d², gate) (C,) of motions (C, 7) over all matches, and the shares (C,) that agree (compiled)."""
+        from rbpf.motion import stereo_kernels
+
+        matches = self.matches
+        score, agreeing = np.empty(len(motions)), np.empty(len(motions))
+        matrices = homography(matches.camera, motions)
+        stereo_kernels.scores(matrices, matches.z_prev, matches.z_now, self.white, gate, score, agreeing)
+        return score, agreeing / len(matches)
+
+    def squared(self, motions: Array, rows: np.ndarray) -> Array:
+        """Squared distances (…, k) of some rows (…, k) at motions (…, 7); infinite behind the camera."""
+        seen = see(self.matches.camera, motions, self.matches.z_prev[rows])
+        distance = np.square(self._white_miss(seen.pixels, rows)).sum(axis=-1)
+        return np.where(seen.front, distance, np.inf)
+
+    def _white_miss(self, seen: Array, rows: np.ndarray) -> Array:
+        return np.einsum("...ij,...j->...i", self.white[rows], self.matches.z_now[rows] - seen)
+
+    def _step(self, motions: Array, rows: np.ndarray) -> Array:
+        """A Gauss-Newton step of each motion (C, 7) on its triple (C, 3)."""
+        seen = see(self.matches.camera, motions, self.matches.z_prev[rows])
+        miss = self._white_miss(seen.pixels, rows).reshape(len(rows), -1, 1)
+        jac = (self.white[rows] @ seen.by_motion).reshape(len(rows), -1, 6)
+        info = jac.mT @ jac
+        stiff = STIFFNESS * np.trace(info, axis1=1, axis2=2) + np.finfo(float).tiny
+        step = np.linalg.solve(info + stiff[:, None, None] * np.eye(6), jac.mT @ miss)
+        return SE3.retract(motions, step[..., 0])
+
+
+def _points(matches: Matches, pixels: Array) -> Array:
+    """Points (K, 3) of pixels (K, 3), those at infinity and beyond put far away."""
+    raised = raise_pixels(points_from_pixels(matches.camera), pixels)
+    least = 1.0 / (FARTHEST * matches.camera.baseline_m)
+    return raised[:, :3] / np.maximum(raised[:, 3:], least)

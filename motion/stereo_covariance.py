@@ -1,0 +1,46 @@
+"""How certain a motion is that was found from two stereo frames.
+
+(JᵀS⁻¹J)⁻¹ at the solution is the usual answer, and too small where points are far: the translation's derivative is
+proportional to the inverse depth ρ̂, and the square of a noisy ρ̂ is larger than that of the true one by var ρ̂, on
+average. With the information I = Σ JᵀS⁻¹J as found and D = Σ var ρ̂ (∂J/∂ρ)ᵀS⁻¹(∂J/∂ρ), the derivative of the score
+is I − D while the score itself has the covariance I, because ν is independent of m̂. Hence (W. Fuller 1987, §3.2)
+
+    cov = (I − D)⁻¹ I (I − D)⁻¹.
+"""
+
+import numpy as np
+
+from rbpf.lie import Array
+from rbpf.motion.stereo_geometry import Matches
+from rbpf.motion.stereo_reprojection import Innovation
+
+LEAST_KEPT = 0.05
+"""No direction keeps less of I than this in I − D: where nearly all is noise, what is left cannot be told from it."""
+
+
+def honest_covariance(matches: Matches, found: Innovation, factor: Array) -> Array:
+    """Covariance (6, 6) of the motion, in the right chart there.
+
+    Args:
+        matches: that it was found from.
+        found: their innovation at the solution, points adjusted.
+        factor: (6, 6) F with F Fᵀ = I⁻¹.
+    """
+    noise = factor.T @ _noise(matches, found) @ factor
+    lost, axes = np.linalg.eigh(0.5 * (noise + noise.T))
+    half = factor @ axes / np.maximum(1.0 - lost, LEAST_KEPT)
+    return half @ half.T
+
+
+def _noise(matches: Matches, found: Innovation) -> Array:
+    """D (6, 6)."""
+    seen, info = found.seen, np.linalg.inv(found.cov)
+    gain = matches.cov_prev @ seen.by_pixels.mT
+    cov_pixels = matches.cov_prev - gain @ info @ gain.mT
+    # ρ = (u_left − u_right) / (f b).
+    shift = matches.camera.camera.fx * matches.camera.baseline_m
+    disparity = np.array([1.0, 0.0, -1.0]) / shift
+    variance = np.einsum("i,kij,j->k", disparity, cov_pixels, disparity)
+    noise = np.zeros((6, 6))
+    noise[3:, 3:] = np.einsum("k,kpi,kpq,kqj->ij", variance, seen.by_nearness, info, seen.by_nearness)
+    return noise
