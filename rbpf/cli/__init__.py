@@ -10,13 +10,16 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from tyro.extras import SubcommandApp
 
-from rbpf.cli.options import ImagesOptions, MonoOptions, RangeBearingOptions
+from rbpf.cli.options import ImagesOptions, LabOptions, MonoOptions, RangeBearingOptions
 from rbpf.errors import InputError
 
 if TYPE_CHECKING:
     from rbpf.validation.simulation.textured_scene import ImageWorld
 
 CONSOLE = Console(stderr=True)
+FOCAL_SHARE = {ImagesOptions: 0.8, LabOptions: 0.78125}
+"""Focal length by default, as a share of the images' width."""
+
 APP, RUN, SIMULATE = SubcommandApp(), SubcommandApp(), SubcommandApp()
 
 
@@ -122,7 +125,16 @@ def simulate_room(options: Annotated[ImagesOptions, tyro.conf.arg(name="")]) -> 
     _render(TexturedRoom(frames=options.frames, contrast=options.contrast), options)
 
 
-def _render(world: "ImageWorld", options: ImagesOptions) -> None:
+@SIMULATE.command(name="lab")
+def simulate_lab(options: Annotated[LabOptions, tyro.conf.arg(name="")]) -> None:
+    """Stereo images of a laboratory of two rooms, taken from a robot, with ground truth and the wheels' odometry."""
+    from rbpf.validation.simulation.textured_lab import LabDrive, TexturedLab
+
+    drive = LabDrive(options.trajectory, options.frames, options.every)
+    _render(TexturedLab(drive, texel_m=options.texel_m, contrast=options.contrast), options)
+
+
+def _render(world: "ImageWorld", options: ImagesOptions | LabOptions) -> None:
     from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
     from rbpf.validation.simulation.exposure import Imaging
     from rbpf.validation.simulation.images import simulate_images
@@ -136,15 +148,16 @@ def _render(world: "ImageWorld", options: ImagesOptions) -> None:
         blackout=range(first, first + count),
         depth=options.depth,
         known=options.known,
+        jpeg=options.jpeg,
     )
-    focal = options.focal_px or 0.8 * options.width
+    focal = options.focal_px or FOCAL_SHARE[type(options)] * options.width
     middle = 0.5 * (options.width - 1), 0.5 * (options.height - 1)
     camera = Pinhole(options.width, options.height, focal, focal, *middle, options.distortion)
     lens = camera if options.baseline_m is None else RectifiedStereo(camera, options.baseline_m)
     with _progress() as bar:
         task = bar.add_task("rendering", total=options.frames)
         simulate_images(world, imaging, lens, options.out, options.seed, _told(bar, task))
-    CONSOLE.print(f"wrote {options.out}")
+    CONSOLE.print(f"wrote {options.out}, {_megabytes(options.out):.0f} MB")
 
 
 @APP.command(name="demo")
@@ -205,6 +218,11 @@ def _told(bar: Progress, task: TaskID) -> Callable[[int, int], None]:
 def _progress() -> Progress:
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     return Progress(*columns, console=CONSOLE)
+
+
+def _megabytes(folder: Path) -> float:
+    """Size of all files in a folder."""
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) / 1e6
 
 
 def _print_summary(entries: dict[str, object], out: Path) -> None:

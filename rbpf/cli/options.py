@@ -92,6 +92,7 @@ class ImagesOptions:
         contrast: of all textures; 1 is rich, 0.1 poor.
         blackout: first frame in the dark and number of frames.
         depth: also write depth images.
+        jpeg: quality of JPEG files, 1 to 100; 0 writes PNG, which loses nothing.
     """
 
     out: Path
@@ -110,3 +111,55 @@ class ImagesOptions:
     contrast: float = 1.0
     blackout: tuple[int, int] | None = None
     depth: tyro.conf.FlagCreatePairsOff[bool] = False
+    jpeg: int = 0
+
+
+@dataclass(frozen=True)
+class LabOptions:
+    """Options of `rbpf simulate lab`.
+
+    Attributes:
+        out: folder for the sequence (EuRoC ASL, with camera.yaml, known_points.csv and odometry.csv); must not exist,
+            or be empty.
+        seed: of the random generator.
+        trajectory: a tour of 4,000 images over 68 m through both rooms and back, or 600 images on which the robot twice
+            looks away for 5 s and back.
+        frames: only so many images, the first; by default all.
+        every: only each so many-th frame becomes an image.
+        width: of the images, px.
+        height: of the images, px.
+        focal_px: focal length; by default 0.78125 of the width, 500 px at 640.
+        distortion: k1, k2, p1, p2, k3 of the lens; none where there are two cameras.
+        baseline_m: of the second camera, to the right; None for none.
+        known: corners in the first image whose positions are given, at least 4; 0 for none.
+        noise_std: of the sensor, grey levels; by default as in dim light.
+        blur_s: the shutter is open this long.
+        exposure_drift: greatest change of the exposure, as a share.
+        vignetting: share of the light that is missing in the corners.
+        contrast: of all textures; 1 is rich, 0.1 poor.
+        blackout: first frame in the dark and number of frames.
+        depth: also write depth images.
+        jpeg: quality of JPEG files, 1 to 100; 0 writes PNG, which loses nothing.
+        texel_m: side of a texel; larger ones are drawn sooner.
+    """
+
+    out: Path
+    seed: int = 0
+    trajectory: Literal["tour", "turn_back"] = "tour"
+    frames: int | None = None
+    every: int = 1
+    width: int = 640
+    height: int = 480
+    focal_px: float | None = None
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    baseline_m: float | None = 0.12
+    known: int = 6
+    noise_std: float = 8.0
+    blur_s: float = 0.0
+    exposure_drift: float = 0.0
+    vignetting: float = 0.0
+    contrast: float = 1.0
+    blackout: tuple[int, int] | None = None
+    depth: tyro.conf.FlagCreatePairsOff[bool] = False
+    jpeg: int = 0
+    texel_m: float = 0.003

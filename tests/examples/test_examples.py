@@ -51,6 +51,14 @@ def gps_fix(figures: dict[str, float]) -> None:
     assert figures["share_within_3_sigma"] > 0.95
 
 
+def lab_images(figures: dict[str, dict[str, float]]) -> None:
+    clear, dim = figures.values()
+    assert dim["share matched, left to right"] < 0.9 * clear["share matched, left to right"]
+    assert dim["disparity against the truth, px"] > 1.3 * clear["disparity against the truth, px"]
+    assert 0.3 < dim["share matched, frame to frame"] + dim["share matched, left to right"] < 1.4
+    assert dim["stereo matches"] > 50.0
+
+
 def mono_blackouts(figures: dict[str, float]) -> None:
     assert figures["blackouts"] >= 2
     assert figures["recovered"] == 1.0
@@ -131,6 +139,7 @@ CLAIMS: dict[str, Callable[[Any], None]] = {
         evidence,
         fused_kernel,
         gps_fix,
+        lab_images,
         mono_blackouts,
         mono_depth,
         mono_desk,

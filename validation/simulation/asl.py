@@ -1,6 +1,6 @@
 """Writes image sequences as EuRoC ASL folders (M. Burri et al., The EuRoC micro aerial vehicle datasets, 2016).
 
-mav0/cam0, mav0/cam1       data/<stamp>.png, data.csv, sensor.yaml; the body is the left camera
+mav0/cam0, mav0/cam1       data/<stamp>.png or .jpg, data.csv, sensor.yaml; the body is the left camera
 mav0/depth0                the left camera's depth, 16 bits, 1/5000 m, 0 where there is none or too much
 mav0/state_groundtruth_estimate0/data.csv
 camera.yaml                the left camera, and the baseline of a stereo pair
@@ -56,16 +56,28 @@ def whole_folder(folder: Path) -> Iterator[Path]:
         raise
 
 
-def image_path(folder: Path, sensor: str, stamp_ns: int) -> Path:
+def image_path(folder: Path, sensor: str, stamp_ns: int, suffix: str = ".png") -> Path:
     """Where an image of a sensor (cam0, cam1, depth0) belongs."""
-    return folder / "mav0" / sensor / "data" / f"{stamp_ns}.png"
+    return folder / "mav0" / sensor / "data" / f"{stamp_ns}{suffix}"
 
 
-def write_image(path: Path, image: np.ndarray) -> None:
-    """A PNG of an image (H, W) uint8 or uint16; its folder has to be there."""
+def write_image(path: Path, image: np.ndarray, quality: int = 0) -> None:
+    """A file of an image (H, W) uint8 or uint16; its folder has to be there.
+
+    Args:
+        path: with the suffix .png or .jpg.
+        image: grey levels.
+        quality: of a JPEG file, 1 to 100.
+    """
     import cv2
 
-    _, encoded = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, COMPRESSION])
+    how = [cv2.IMWRITE_JPEG_QUALITY, quality]
+    if path.suffix == ".png":
+        how = [cv2.IMWRITE_PNG_COMPRESSION, COMPRESSION]
+        if image.dtype == np.uint8:
+            # What noise leaves to compress is found by Huffman's code alone, in less time.
+            how += [cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY]
+    _, encoded = cv2.imencode(path.suffix, image, how)
     path.write_bytes(encoded.tobytes())
 
 
@@ -76,7 +88,13 @@ def coded_depth(depth: np.ndarray) -> np.ndarray:
 
 
 def write_sensor(
-    folder: Path, sensor: str, camera: Pinhole, offset_m: float, stamps_ns: np.ndarray, comment: str
+    folder: Path,
+    sensor: str,
+    camera: Pinhole,
+    offset_m: float,
+    stamps_ns: np.ndarray,
+    comment: str,
+    suffix: str = ".png",
 ) -> None:
     """A sensor's folder with its calibration and its index; the images are written by others.
 
@@ -87,10 +105,11 @@ def write_sensor(
         offset_m: of the sensor from the body along the body's x axis.
         stamps_ns: (T,) of the images.
         comment: what it is, one line.
+        suffix: of the images' files.
     """
     place = folder / "mav0" / sensor
     (place / "data").mkdir(parents=True)
-    rows = "".join(f"{stamp},{stamp}.png\n" for stamp in stamps_ns.tolist())
+    rows = "".join(f"{stamp},{stamp}{suffix}\n" for stamp in stamps_ns.tolist())
     (place / "data.csv").write_text("#timestamp [ns],filename\n" + rows, encoding="utf-8")
     seconds = 1e-9 * float(stamps_ns[-1] - stamps_ns[0])
     rate = (len(stamps_ns) - 1) / seconds if seconds else 0.0

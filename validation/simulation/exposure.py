@@ -35,6 +35,7 @@ class Imaging:
         blackout: frames in which the light is out, counted from 0.
         grid: rays per pixel along each side.
         depth: whether depth images are written.
+        jpeg: quality of JPEG files, 1 to 100; 0 writes PNG, which loses nothing.
         known: number of corners in the first image whose positions are given, at least 4; 0 for none.
         known_std_m: standard deviation per axis of these positions.
         known_exact: leave the positions without their error.
@@ -48,13 +49,16 @@ class Imaging:
     blackout: Sequence[int] = ()
     grid: int = 2
     depth: bool = False
+    jpeg: int = 0
     known: int = 6
     known_std_m: float = 0.001
     known_exact: bool = False
 
     def __post_init__(self) -> None:
         """Checks that the numbers make sense."""
-        check_counts(self, {"grid": 1, "known": 0})
+        check_counts(self, {"grid": 1, "known": 0, "jpeg": 0})
+        if self.jpeg > 100:
+            raise InputError(f"jpeg must be a quality of 1 to 100, or 0 for PNG, got {self.jpeg}")
         check_not_negative(self, "noise_std", "lens_px", "blur_s")
         check_shares(self, "exposure_drift", "vignetting")
         check_positive(self, "known_std_m")
@@ -64,6 +68,11 @@ class Imaging:
             raise InputError(
                 "blackout names frame 0, in which the known points are seen: leave it out or set known = 0"
             )
+
+    @property
+    def suffix(self) -> str:
+        """Of the images' files."""
+        return ".jpg" if self.jpeg else ".png"
 
     def check_frames(self, frames: int) -> None:
         """Refuses a blackout of frames that there are not."""

@@ -21,6 +21,7 @@ from rbpf.validation.simulation.exposure import Imaging, Shutter
 from rbpf.validation.simulation.known_corners import known_corners
 from rbpf.validation.simulation.render import Renderer
 from rbpf.validation.simulation.textured_scene import ImageWorld, TexturedScene
+from rbpf.validation.simulation.wheel_odometer import write_wheel_odometry
 
 OnFrame = Callable[[int, int], None]
 """Told how many images are done, and how many there will be."""
@@ -36,7 +37,8 @@ def simulate_images(
 ) -> None:
     """Takes pictures of a world and writes them as an EuRoC ASL folder; the same arguments give the same bytes.
 
-    Beside mav0 there are camera.yaml; known_points.csv, if points are known; and chessboard.yaml, if there is a board.
+    Beside mav0 there are camera.yaml; known_points.csv, if points are known; chessboard.yaml, if there is a board; and
+    odometry.csv with odometry.yaml, if the camera stands on a robot.
     The folder appears when it is complete: an interrupted run leaves nothing there.
 
     Args:
@@ -73,11 +75,13 @@ def simulate_images(
             _write_known(partial, scene, imaging, left, renderer, rng)
         if scene.boards:
             _write_boards(partial, scene)
+        if scene.odometry is not None:
+            write_wheel_odometry(partial, scene.odometry)
 
         def take(frame: int) -> None:
             stamp = int(scene.stamps_ns[frame])
             for sensor, image in zip(("cam0", "cam1"), shutter.images(frame, baseline_m), strict=False):
-                write_image(image_path(partial, sensor, stamp), image)
+                write_image(image_path(partial, sensor, stamp, imaging.suffix), image, imaging.jpeg)
             if imaging.depth:
                 depth, _ = renderer.depth(scene.world_from_camera[frame])
                 write_image(image_path(partial, "depth0", stamp), coded_depth(depth))
@@ -108,7 +112,9 @@ def _write_sensors(
     if imaging.depth:
         sensors["depth0"] = 0.0
     for sensor, offset_m in sensors.items():
-        write_sensor(folder, sensor, camera, offset_m, scene.stamps_ns, f"simulated {scene.name}, {sensor}")
+        about = f"simulated {scene.name}, {sensor}"
+        suffix = ".png" if sensor == "depth0" else imaging.suffix
+        write_sensor(folder, sensor, camera, offset_m, scene.stamps_ns, about, suffix)
 
 
 def _write_known(

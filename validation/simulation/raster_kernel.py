@@ -28,15 +28,69 @@ _GAINS = types.Array(float64, 1, "C")
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _candidates(bounds: np.ndarray, tile: np.ndarray, chosen: np.ndarray) -> int:
-    """Rectangles whose bounds (umin, umax, vmin, vmax) meet a tile's; how many."""
-    count = 0
+def _span(a: float, b: float, c: float, tile: np.ndarray) -> tuple[float, float]:
+    """Least and greatest of a u + b v + c over a tile (umin, umax, vmin, vmax)."""
+    p, q, r, s = a * tile[0], a * tile[1], b * tile[2], b * tile[3]
+    return min(p, q) + min(r, s) + c, max(p, q) + max(r, s) + c
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _cover(m: np.ndarray, tile: np.ndarray) -> tuple[float, float]:
+    """Greatest 1/z of a rectangle within a tile, 0 if it is not hit there; least 1/z if it fills the tile, else 0.
+
+    A ray hits where s, t, w - s and w - t are not negative. All are linear in (u, v), so that their least and greatest
+    values lie at the tile's corners.
+    """
+    low, high = _span(m[2, 0], m[2, 1], m[2, 2], tile)
+    if high <= 0.0:
+        return 0.0, 0.0
+    fills = low > 0.0
+    for side in range(2):
+        a, b, c = m[side, 0], m[side, 1], m[side, 2]
+        least, greatest = _span(a, b, c, tile)
+        under, over = _span(m[2, 0] - a, m[2, 1] - b, m[2, 2] - c, tile)
+        if greatest < 0.0 or over < 0.0:
+            return 0.0, 0.0
+        fills = fills and least >= 0.0 and under >= 0.0
+    return high, low if fills else 0.0
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _strip(bounds: np.ndarray, tiles: np.ndarray, found: np.ndarray) -> int:
+    """Rectangles whose bounds (umin, umax, vmin, vmax) meet a row of tiles between top and bottom; how many."""
+    low, high, count = tiles[:, 2].min(), tiles[:, 3].max(), 0
     for r in range(bounds.shape[0]):
-        box = bounds[r]
-        if box[0] <= tile[1] and tile[0] <= box[1] and box[2] <= tile[3] and tile[2] <= box[3]:
-            chosen[count] = r
+        if bounds[r, 2] <= high and low <= bounds[r, 3]:
+            found[count] = r
             count += 1
     return count
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _candidates(
+    h: np.ndarray,
+    bounds: np.ndarray,
+    strip: np.ndarray,
+    tile: np.ndarray,
+    chosen: np.ndarray,
+    nearest: np.ndarray,
+) -> int:
+    """Rectangles of a strip that may be seen in a tile; how many. One behind another that fills the tile is not."""
+    count, front = 0, 0.0
+    u0, u1, v0, v1 = tile[0], tile[1], tile[2], tile[3]
+    for r in strip:
+        if bounds[r, 0] <= u1 and u0 <= bounds[r, 1] and bounds[r, 2] <= v1 and v0 <= bounds[r, 3]:
+            near, filled = _cover(h[r], tile)
+            if near > 0.0:
+                chosen[count], nearest[count] = r, near
+                count += 1
+                front = max(front, filled)
+    kept = 0
+    for k in range(count):
+        if nearest[k] >= front:
+            chosen[kept] = chosen[k]
+            kept += 1
+    return kept
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -71,19 +125,15 @@ def _nearest(
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _bilinear(texels: np.ndarray, level: np.ndarray, s: float, t: float) -> float:
-    """A level of a texture at the shares (s, t); beyond its outermost texels' centres they go on."""
-    start, height, width = level[0], level[1], level[2]
-    x = min(max(s * width - 0.5, 0.0), width - 1.0)
-    y = min(max(t * height - 0.5, 0.0), height - 1.0)
+def _bilinear(texels: np.ndarray, start: int, height: int, width: int, s: float, t: float) -> float:
+    """A level of a texture at the shares (s, t); round it lies a border of one texel, equal to its outermost texels."""
+    x, y = s * width + 0.5, t * height + 0.5
     i, j = int(x), int(y)
     a, b = x - i, y - j
-    right = 1 if i < width - 1 else 0
-    below = width if j < height - 1 else 0
-    k = start + j * width + i
-    top = texels[k] + a * (float(texels[k + right]) - texels[k])
-    k += below
-    bottom = texels[k] + a * (float(texels[k + right]) - texels[k])
+    k = start + j * (width + 2) + i
+    top = texels[k] + a * (float(texels[k + 1]) - texels[k])
+    k += width + 2
+    bottom = texels[k] + a * (float(texels[k + 1]) - texels[k])
     return top + b * (bottom - top)
 
 
@@ -102,16 +152,29 @@ def _footprint(
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _filtered(texels: np.ndarray, levels: np.ndarray, s: float, t: float, footprint: float) -> float:
-    """Between the two levels whose texels are nearest in size to the footprint."""
-    k, last = 0, levels.shape[0] - 1
+def _detail(footprint: float, last: int) -> float:
+    """Level of detail: that whose texels are nearest in size to the footprint, and the way to the next as its fraction.
+
+    From one level to the next the texels double in size, and the fraction rises evenly with the footprint.
+    """
+    k = 0
     while footprint >= 2.0 and k < last:
         footprint *= 0.5
         k += 1
-    fine = _bilinear(texels, levels[k], s, t)
-    if footprint <= 1.0 or k == last:
+    return k + (footprint - 1.0 if footprint > 1.0 and k < last else 0.0)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _filtered(texels: np.ndarray, levels: np.ndarray, sheet: int, s: float, t: float, detail: float) -> float:
+    """A texture between two of its levels."""
+    k = int(detail)
+    between = detail - k
+    fine = _bilinear(texels, levels[sheet, k, 0], levels[sheet, k, 1], levels[sheet, k, 2], s, t)
+    if between == 0.0:
         return fine
-    return fine + (footprint - 1.0) * (_bilinear(texels, levels[k + 1], s, t) - fine)
+    k += 1
+    coarse = _bilinear(texels, levels[sheet, k, 0], levels[sheet, k, 1], levels[sheet, k, 2], s, t)
+    return fine + between * (coarse - fine)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -119,12 +182,11 @@ def _rays(
     uv: np.ndarray, slope: np.ndarray, y0: int, x0: int, shift: np.ndarray, u: np.ndarray, v: np.ndarray
 ) -> int:
     """Rays of a tile's pixels, shifted by a part of a pixel; how many."""
-    n = 0
+    n, a, b = 0, shift[0], shift[1]
     for y in range(y0, min(y0 + TILE, uv.shape[0])):
         for x in range(x0, min(x0 + TILE, uv.shape[1])):
-            d = slope[y, x]
-            u[n] = uv[y, x, 0] + d[0] * shift[0] + d[1] * shift[1]
-            v[n] = uv[y, x, 1] + d[2] * shift[0] + d[3] * shift[1]
+            u[n] = uv[y, x, 0] + slope[y, x, 0] * a + slope[y, x, 1] * b
+            v[n] = uv[y, x, 1] + slope[y, x, 2] * a + slope[y, x, 3] * b
             n += 1
     return n
 
@@ -160,30 +222,37 @@ def expose(
         np.empty(side, np.int64),
         np.empty(side, np.int64),
     )
-    u, v, near, size, total = np.empty(side), np.empty(side), np.empty(side), np.empty(side), np.empty(side)
+    u, v, near, detail, total = np.empty(side), np.empty(side), np.empty(side), np.empty(side), np.empty(side)
+    nearest, strips = np.empty(bounds.shape[1]), np.empty(bounds.shape[:2], np.int64)
+    met = np.empty(bounds.shape[0], np.int64)
     for j in range(tiles.shape[0]):
+        for pose in range(bounds.shape[0]):
+            met[pose] = _strip(bounds[pose], tiles[j], strips[pose])
         for i in range(tiles.shape[1]):
             columns = min(TILE, uv.shape[1] - i * TILE)
             total[:] = 0.0
             sized[:] = -1
-            n = 0
+            n, count = 0, 0
             for k in range(shifts.shape[0]):
-                pose = h[moment[k]]
-                count = _candidates(bounds[moment[k]], tiles[j, i], chosen)
+                now = moment[k]
+                pose = h[now]
+                if k == 0 or now != moment[k - 1]:
+                    strip = strips[now, : met[now]]
+                    count = _candidates(pose, bounds[now], strip, tiles[j, i], chosen, nearest)
                 n = _rays(uv, slope, j * TILE, i * TILE, shifts[k], u, v)
                 _nearest(pose, chosen, count, u, v, n, near, row)
                 for p in range(n):
                     r = row[p]
                     if r < 0:
                         continue
-                    m, level, w = pose[r], levels[sheet[r]], near[p]
-                    s = (m[0, 0] * u[p] + m[0, 1] * v[p] + m[0, 2]) / w
-                    t = (m[1, 0] * u[p] + m[1, 1] * v[p] + m[1, 2]) / w
+                    z = 1.0 / near[p]
+                    s = z * (h[now, r, 0, 0] * u[p] + h[now, r, 0, 1] * v[p] + h[now, r, 0, 2])
+                    t = z * (h[now, r, 1, 0] * u[p] + h[now, r, 1, 1] * v[p] + h[now, r, 1, 2])
                     if sized[p] != r:
-                        d = slope[j * TILE + p // columns, i * TILE + p % columns]
-                        size[p] = spacing * _footprint(m, s, t, w, d, level[0, 2], level[0, 1])
-                        sized[p] = r
-                    total[p] += gain[r] * _filtered(texels, level, s, t, size[p])
+                        d, level = slope[j * TILE + p // columns, i * TILE + p % columns], levels[sheet[r], 0]
+                        size = spacing * _footprint(pose[r], s, t, near[p], d, level[2], level[1])
+                        detail[p], sized[p] = _detail(size, levels.shape[1] - 1), r
+                    total[p] += gain[r] * _filtered(texels, levels, sheet[r], s, t, detail[p])
             for p in range(n):
                 light[j * TILE + p // columns, i * TILE + p % columns] = total[p] / shifts.shape[0]
 
@@ -206,10 +275,12 @@ def trace(
     """Inverse depth and rectangle (H, W) at the pixels' centres; 0 and -1 where the ray leaves the world."""
     side, centre = TILE * TILE, np.zeros(2)
     chosen, row = np.empty(bounds.shape[0], np.int64), np.empty(side, np.int64)
-    u, v, near = np.empty(side), np.empty(side), np.empty(side)
+    u, v, near, nearest = np.empty(side), np.empty(side), np.empty(side), np.empty(bounds.shape[0])
+    strip = np.empty(bounds.shape[0], np.int64)
     for j in range(tiles.shape[0]):
+        met = _strip(bounds, tiles[j], strip)
         for i in range(tiles.shape[1]):
-            count = _candidates(bounds, tiles[j, i], chosen)
+            count = _candidates(h, bounds, strip[:met], tiles[j, i], chosen, nearest)
             n = _rays(uv, slope, j * TILE, i * TILE, centre, u, v)
             _nearest(h, chosen, count, u, v, n, near, row)
             columns = min(TILE, uv.shape[1] - i * TILE)

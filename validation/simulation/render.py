@@ -7,7 +7,7 @@ import numpy as np
 
 from rbpf.lie import SE3
 from rbpf.sensors.pinhole import Pinhole
-from rbpf.validation.simulation.textured_scene import Rectangle, rays_to_sides
+from rbpf.validation.simulation.textured_scene import Rectangle, rays_to_sides, sides
 
 NEAR_M = 1e-3
 """What is nearer to the camera's plane is not seen."""
@@ -31,12 +31,14 @@ class Renderer:
         from rbpf.validation.simulation import raster_kernel
 
         self._kernel = raster_kernel
-        self._rectangles, self._camera, self._grid = rectangles, camera, grid
+        self._camera, self._grid = camera, grid
         rows, columns = np.mgrid[: camera.height, : camera.width].astype(float)
         px = np.stack([columns, rows], axis=-1)
         self._uv = camera.unproject(px)
         self._slope = np.ascontiguousarray(camera.unproject_slope(px)).reshape(*px.shape[:2], 4)
         self._tiles = _tile_bounds(self._uv, self._slope, raster_kernel.TILE)
+        self._view = _extent(self._tiles.reshape(1, -1, 2, 2).swapaxes(2, 3).reshape(1, -1, 2))[0]
+        self._sides = sides(rectangles)
         sheets = {id(r.texture): r.texture for r in rectangles}
         place = {key: k for k, key in enumerate(sheets)}
         self._sheet = np.array([place[id(r.texture)] for r in rectangles], dtype=np.int64)
@@ -51,14 +53,15 @@ class Renderer:
         whole number, at least grid².
         """
         poses = np.atleast_2d(world_from_camera)
+        seen = self._in_view(poses)
         shifts = rotated_grid(max(self._grid, math.isqrt(len(poses))))
         light = np.empty(self._uv.shape[:2], dtype=np.float32)
         self._kernel.expose(
-            np.array([rays_to_sides(self._rectangles, pose) for pose in poses]),
-            np.array([self._bounds(pose) for pose in poses]),
+            np.array([rays_to_sides(self._sides[seen], pose) for pose in poses]),
+            np.array([self._bounds(pose, seen) for pose in poses]),
             np.arange(len(shifts)) % len(poses),
-            self._sheet,
-            self._gain,
+            self._sheet[seen],
+            self._gain[seen],
             self._uv,
             self._slope,
             self._tiles,
@@ -74,14 +77,25 @@ class Renderer:
         """Depth z (H, W) [m] at the pixels' centres, infinite where there is nothing; rectangles (H, W), then -1."""
         inverse = np.empty(self._uv.shape[:2])
         rows = np.empty(inverse.shape, dtype=np.int64)
-        h, bounds = rays_to_sides(self._rectangles, world_from_camera), self._bounds(world_from_camera)
+        seen = self._in_view(world_from_camera[None])
+        h, bounds = rays_to_sides(self._sides[seen], world_from_camera), self._bounds(world_from_camera, seen)
         self._kernel.trace(h, bounds, self._uv, self._slope, self._tiles, inverse, rows)
         with np.errstate(divide="ignore"):
-            return 1.0 / inverse, rows
+            return 1.0 / inverse, np.append(seen, -1)[rows]
 
-    def _bounds(self, world_from_camera: np.ndarray) -> np.ndarray:
-        """(R, 4) least and greatest u and v of the rectangles' parts before the camera; empty where there is none."""
-        local = SE3.inverse_transform(world_from_camera, self._corners.reshape(-1, 3)).reshape(-1, 4, 3)
+    def _in_view(self, poses: np.ndarray) -> np.ndarray:
+        """(S,) rows of the rectangles of which some pose (K, 7) may see something."""
+        local = SE3.inverse_transform(poses[:, None], self._corners.reshape(-1, 3))
+        x, y, z = np.moveaxis(local.reshape(len(poses), -1, 4, 3), -1, 0)
+        left, right, top, bottom = self._view
+        beyond = x < left * z, x > right * z, y < top * z, y > bottom * z, z < 0.0
+        out = np.logical_or.reduce([side.all(axis=-1) for side in beyond])
+        return np.flatnonzero(~out.all(axis=0))
+
+    def _bounds(self, world_from_camera: np.ndarray, seen: np.ndarray) -> np.ndarray:
+        """(S, 4) least and greatest u and v of rectangles' parts before the camera; empty where there is none."""
+        corners = self._corners[seen].reshape(-1, 3)
+        local = SE3.inverse_transform(world_from_camera, corners).reshape(-1, 4, 3)
         following = np.roll(local, -1, axis=1)
         with np.errstate(all="ignore"):
             share = (NEAR_M - local[..., 2:]) / (following[..., 2:] - local[..., 2:])
@@ -140,13 +154,16 @@ def _pyramid(texture: np.ndarray) -> list[np.ndarray]:
 
 
 def _packed(pyramids: list[list[np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    """Start, height and width (S, L, 3) of every level, the last one repeated, and all texels end to end."""
+    """Start, height and width (S, L, 3) of every level, the last one repeated, and all texels end to end.
+
+    Each level lies in a border of one texel that repeats the outermost: interpolation needs no case for the edge.
+    """
     depth = max(len(pyramid) for pyramid in pyramids)
     levels = np.empty((len(pyramids), depth, 3), dtype=np.int64)
     start, texels = 0, []
     for k, pyramid in enumerate(pyramids):
         for level, texture in enumerate(pyramid):
             levels[k, level:] = start, *texture.shape
-            texels.append(texture.ravel())
-            start += texture.size
+            texels.append(np.pad(texture, 1, mode="edge").ravel())
+            start += texels[-1].size
     return levels, np.concatenate(texels)

@@ -51,11 +51,17 @@ def frame_stamps(frames: int, rate_hz: float) -> np.ndarray:
 
 def hidden(eye: np.ndarray, points: np.ndarray, blocks: np.ndarray) -> np.ndarray:
     """Whether a block stands between the eye (3,) and points (P, 3), by the slab method; (P,) bool."""
-    ray = (points - eye)[:, None]
+    around = np.concatenate([eye[None], points])
+    near = (blocks[:, 0] <= around.max(axis=0)) & (blocks[:, 1] >= around.min(axis=0))
+    low, high = np.moveaxis(blocks[near.all(axis=1)] - eye, 1, 0)
+    enters, leaves = np.full((2, len(points), len(low)), [[[-np.inf]], [[np.inf]]])
     with np.errstate(divide="ignore", invalid="ignore"):
-        ends = (blocks[:, 0] - eye) / ray, (blocks[:, 1] - eye) / ray
-    enters, leaves = np.minimum(*ends).max(axis=-1), np.maximum(*ends).min(axis=-1)
-    return ((enters < leaves) & (leaves > 0.0) & (enters < 1.0 - SURFACE)).any(axis=-1)
+        for axis in range(3):
+            ray = (points[:, axis] - eye[axis])[:, None]
+            ends = low[:, axis] / ray, high[:, axis] / ray
+            np.maximum(enters, np.minimum(*ends), out=enters)
+            np.minimum(leaves, np.maximum(*ends), out=leaves)
+    return np.asarray(((enters < leaves) & (leaves > 0.0) & (enters < 1.0 - SURFACE)).any(axis=-1))
 
 
 def inside(points: np.ndarray, blocks: np.ndarray) -> np.ndarray:

@@ -25,6 +25,7 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.sensors.readers.wheel_odometry import WheelOdometry
 from rbpf.validation.simulation.scene import frame_stamps
 
 EPOCH_NS = 1_400_000_000_000_000_000
@@ -81,6 +82,7 @@ class TexturedScene:
         world_from_camera: (T, 7) true poses at these times, the middles of the exposures.
         rectangles: what there is to see.
         boards: chessboards among it.
+        odometry: what the wheels say, if the camera stands on a robot.
     """
 
     name: str
@@ -88,6 +90,7 @@ class TexturedScene:
     world_from_camera: np.ndarray
     rectangles: Sequence[Rectangle]
     boards: Sequence["Chessboard"] = ()
+    odometry: WheelOdometry | None = None
 
 
 @dataclass(frozen=True)
@@ -127,16 +130,22 @@ def stamps_ns(frames: int, rate_hz: float) -> np.ndarray:
     return EPOCH_NS + frame_stamps(frames, rate_hz)
 
 
-def rays_to_sides(rectangles: Sequence[Rectangle], world_from_camera: np.ndarray) -> np.ndarray:
+def sides(rectangles: Sequence[Rectangle]) -> np.ndarray:
+    """(R, 3, 3) across, down and corner of rectangles, in the world."""
+    return np.array([[r.across, r.down, r.corner] for r in rectangles], dtype=float).reshape(-1, 3, 3)
+
+
+def rays_to_sides(sides: np.ndarray, world_from_camera: np.ndarray) -> np.ndarray:
     """H (R, 3, 3): a ray (u, v, 1) meets a rectangle at (s, t, 1)/z = H (u, v, 1); 0 if the camera is in its plane.
 
     Args:
-        rectangles: R of them.
+        sides: (R, 3, 3) of the rectangles.
         world_from_camera: (7,) pose.
     """
     rotation = SE3.matrix(world_from_camera)[:3, :3]
-    sides = np.array([[r.across, r.down, r.corner - world_from_camera[4:]] for r in rectangles])
-    m = np.swapaxes(sides @ rotation, 1, 2)
+    seen_from = np.zeros((3, 3))
+    seen_from[2] = world_from_camera[4:]
+    m = np.swapaxes((sides - seen_from) @ rotation, 1, 2)
     flat = np.abs(np.linalg.det(m)) < np.finfo(float).tiny
     m[flat] = np.eye(3)
     return np.where(flat[:, None, None], 0.0, np.linalg.inv(m))
@@ -156,7 +165,7 @@ def cast(
         Depth z (K,) in the camera's frame [m], infinite where there is nothing; row (K,) of the rectangle, then -1.
     """
     ray = np.concatenate([uv, np.ones((len(uv), 1))], axis=1)
-    s, t, w = np.moveaxis(rays_to_sides(rectangles, world_from_camera) @ ray.T, 1, 0)
+    s, t, w = np.moveaxis(rays_to_sides(sides(rectangles), world_from_camera) @ ray.T, 1, 0)
     with np.errstate(invalid="ignore"):
         hit = (w > 0.0) & (s >= 0.0) & (s <= w) & (t >= 0.0) & (t <= w)
     nearest = np.where(hit, w, 0.0)

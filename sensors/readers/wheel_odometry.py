@@ -1,0 +1,102 @@
+"""`odometry.csv` and `odometry.yaml`: what a robot's wheels say about its motion, beside a sequence of images.
+
+odometry.csv, one line per reading in order of time, comma-separated, lines that start with # are comments:
+
+    #stamp_ns,dx_m,dy_m,dyaw_rad,sigma_x_m,sigma_y_m,sigma_yaw_rad
+    1400000000000000000,0,0,0,0,0,0
+    1400000000066666667,0.0179,0.0001,0.0052,0.0005,0.0001,0.0019
+
+`dx_m`, `dy_m`, `dyaw_rad` are the motion since the line before, seen from the robot's frame there: x forwards, y to the
+left, yaw to the left; on the first line they are zero. The sigmas are the standard deviations of what is random in
+it; wrong diameters of the wheels, which err the same way all the time, are not in them.
+
+odometry.yaml says where the camera stands on the robot:
+
+    robot_from_camera: [qx, qy, qz, qw, x, y, z]   # unit quaternion; m
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from rbpf.lie import SE2, SE3
+from rbpf.sensors.readers.images.mapping import read_yaml
+from rbpf.sensors.readers.images.stamped import read_stamped
+
+NAME, MOUNT = "odometry.csv", "odometry.yaml"
+KIND = "the readings of a robot's wheels"
+
+MOTION = ("dx_m", "dy_m", "dyaw_rad")
+SIGMA = ("sigma_x_m", "sigma_y_m", "sigma_yaw_rad")
+
+UNIT = 1e-6
+"""How far a quaternion's length may be from 1."""
+
+
+@dataclass(frozen=True)
+class WheelOdometry:
+    """Readings of a robot's wheels.
+
+    Attributes:
+        stamps_ns: (T,) int64 times, strictly rising.
+        delta: (T - 1, 3) motion from each time to the next, elements of SE(2): [theta, x, y] in the robot's frame.
+        std: (T - 1, 3) standard deviations of theta [rad], x and y [m].
+        robot_from_camera: (7,) pose of the left camera on the robot.
+    """
+
+    stamps_ns: np.ndarray
+    delta: np.ndarray
+    std: np.ndarray
+    robot_from_camera: np.ndarray
+
+    def world_from_robot(self) -> np.ndarray:
+        """(T, 3) dead reckoning: elements of SE(2), the first the identity."""
+        poses = np.zeros((len(self.stamps_ns), 3))
+        for k, step in enumerate(self.delta):
+            poses[k + 1] = SE2.compose(poses[k], step)
+        return poses
+
+    def world_from_camera(self, start: np.ndarray) -> np.ndarray:
+        """(T, 7) dead reckoning of the camera in space, from its first pose (7,)."""
+        theta, x, y = self.world_from_robot().T
+        still = np.zeros_like(theta)
+        first_from_robot = SE3.from_ypr(np.stack([x, y, still], axis=-1), theta, still, still)
+        world_from_first = SE3.compose(start, SE3.inverse(self.robot_from_camera))
+        return SE3.compose(world_from_first, SE3.compose(first_from_robot, self.robot_from_camera))
+
+
+def read_wheel_odometry(folder: str | Path) -> WheelOdometry:
+    """Reads `odometry.csv` and `odometry.yaml`.
+
+    Args:
+        folder: that holds both.
+
+    Raises:
+        InputError: a file is missing or not as described above.
+    """
+    path = Path(folder) / NAME
+    rows = read_stamped(path, KIND, ",", nanoseconds=True)
+    table = rows.table(MOTION + SIGMA, ",")
+    later = np.diff(rows.stamps_ns) > 0
+    if not later.all():
+        raise table.error(int(np.argmin(later)) + 1, "expected a later time than on the line before")
+    for name in SIGMA:
+        table.require(table[name] >= 0.0, name, "zero or positive")
+    motion = table.block(MOTION[0], MOTION[-1])
+    if motion[0].any():
+        raise table.error(0, "expected no motion on the first line, before which there is none")
+    delta = SE2.normalise(np.roll(motion[1:], 1, axis=1))
+    std = np.roll(table.block(SIGMA[0], SIGMA[-1])[1:], 1, axis=1)
+    return WheelOdometry(rows.stamps_ns, delta, std, _read_mount(Path(folder) / MOUNT))
+
+
+def _read_mount(path: Path) -> np.ndarray:
+    whole = read_yaml(path, "where the camera stands on the robot")
+    entries = whole.entries()
+    whole.require_keys(entries, ("robot_from_camera",))
+    mount = entries["robot_from_camera"]
+    pose = np.array([item.number() for item in mount.items(7)])
+    if abs(np.linalg.norm(pose[:4]) - 1.0) > UNIT:
+        raise mount.error("expected robot_from_camera to begin with a unit quaternion")
+    return np.asarray(SE3.normalise(pose))

@@ -1,0 +1,110 @@
+"""Drives of a robot on two wheels: where they lead, that they are smooth, and that wheels do not slip sideways."""
+
+import numpy as np
+import pytest
+from scipy.integrate import cumulative_trapezoid
+
+from rbpf.errors import InputError
+from rbpf.lie import SE2
+from rbpf.validation.simulation import lab_plan
+from rbpf.validation.simulation.driven_paths import Drive, Move, along_corners
+
+CORNERS = [(0.0, 0.0), (4.0, 0.0), (4.0, 3.0), (1.0, 5.0)]
+
+
+def driven(moves: list[Move], seconds: float = 40.0, start: tuple[float, ...] = (0.0, 0.0, 0.0)) -> Drive:
+    return Drive(np.array(start), moves, seconds, arm_m=0.5, ramp_s=1.0)
+
+
+def test_a_polyline_is_followed_but_for_its_corners() -> None:
+    start, moves = along_corners(CORNERS, 0.8)
+    drive = Drive(start, moves, 40.0, 0.5, 1.0)
+    x, y = drive.waypoints[:, 1:].T
+    ends = [(0, 0), (3.2, 0), (4, 0.8), (4, 2.2)]
+    np.testing.assert_allclose(np.stack([x, y], axis=-1)[:4], ends, atol=1e-12)
+    side = np.array([-3.0, 2.0]) / np.hypot(3.0, 2.0)
+    np.testing.assert_allclose([x[4], y[4]], np.array([4.0, 3.0]) + 0.8 * side, atol=1e-12)
+    np.testing.assert_allclose([x[5], y[5]], [1.0, 5.0], atol=1e-12)
+    np.testing.assert_allclose(drive.waypoints[-1, 0], np.arctan2(2.0, -3.0), atol=1e-12)
+    end = drive(np.array([40.0]))
+    np.testing.assert_allclose(end.world_from_robot[0], drive.waypoints[-1], atol=1e-9)
+    np.testing.assert_allclose(end.way_m, sum(move.length_m for move in moves), atol=1e-9)
+
+
+@pytest.mark.parametrize("drive", [lab_plan.tour(), lab_plan.turn_back()], ids=["tour", "turn_back"])
+def test_it_goes_where_it_faces(drive: Drive) -> None:
+    """The position is the integral of its speed along its heading; here by the trapezoidal rule."""
+    seconds = np.linspace(0.0, 39.0, 40001)
+    path = drive(seconds)
+    theta = path.world_from_robot[0, 0] + path.heading_rad
+    wrapped = np.exp(1j * theta) / np.exp(1j * path.world_from_robot[:, 0])
+    np.testing.assert_allclose(wrapped, 1.0, atol=1e-9)
+    for axis, part in enumerate((np.cos(theta), np.sin(theta)), start=1):
+        gone = cumulative_trapezoid(part, path.way_m, initial=0.0)
+        np.testing.assert_allclose(
+            path.world_from_robot[:, axis] - path.world_from_robot[0, axis], gone, atol=1e-6
+        )
+    assert (np.diff(path.way_m) >= -1e-12).all()
+
+
+def derivatives(drive: Drive, seconds: float, rate_hz: float) -> list[float]:
+    """Greatest speed, acceleration, rate of turn and its derivative, from differences."""
+    path = drive(np.arange(0.0, seconds, 1.0 / rate_hz))
+    out = []
+    for value in (path.way_m, path.heading_rad):
+        for order in (1, 2):
+            out.append(float(np.abs(np.diff(value, order)).max()) * rate_hz**order)
+    return out
+
+
+@pytest.mark.parametrize("drive", [lab_plan.tour(), lab_plan.turn_back()], ids=["tour", "turn_back"])
+def test_speed_and_acceleration_have_no_jumps(drive: Drive) -> None:
+    """A jump in either would make the differences ten times as large at ten times the rate."""
+    slow, fast = derivatives(drive, 39.0, 15.0), derivatives(drive, 39.0, 150.0)
+    assert all(b < 1.25 * a + 0.01 for a, b in zip(slow, fast, strict=True))
+    speed, acceleration, turn, spin = fast
+    assert 0.05 < speed < 0.6 and acceleration < 1.2 and turn < 1.2 and spin < 2.5
+
+
+def test_a_turn_on_the_spot_and_a_rest_leave_the_place() -> None:
+    drive = driven([Move(1.0), Move(turn_rad=2.0), Move(turn_rad=-2.0, rest_s=5.0), Move(1.0)], seconds=30.0)
+    path = drive(np.linspace(0.0, 30.0, 3001))
+    turned = np.abs(path.heading_rad) > 1e-9
+    np.testing.assert_allclose(path.world_from_robot[turned, 1:], [[1.0, 0.0]] * turned.sum(), atol=1e-12)
+    away = path.heading_rad > 2.0 - 1e-9
+    assert 5.0 <= 0.01 * away.sum() < 5.5
+    np.testing.assert_allclose(path.world_from_robot[-1], [0.0, 2.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(path.world_from_robot[0], 0.0, atol=1e-12)
+
+
+def test_bends_are_slower_than_straights() -> None:
+    drive = driven([Move(3.0), Move(1.0, np.pi / 2), Move(3.0)])
+    path = drive(np.linspace(0.0, 40.0, 4001))
+    speed, turn = np.diff(path.way_m) / 0.01, np.diff(path.heading_rad) / 0.01
+    pace = np.hypot(speed, 0.5 * turn)[200:-200]
+    np.testing.assert_allclose(pace, pace.mean(), rtol=1e-3)
+    assert speed[200:-200].min() < 0.8 * speed.max()
+
+
+def test_heading_and_chord_agree_with_a_fine_sum() -> None:
+    bend = Move(1.7, 1.9)
+    drive = driven([bend], start=(0.3, 1.0, -2.0))
+    path = drive(np.linspace(0.0, 40.0, 20001))
+    steps = SE2.local(path.world_from_robot[:-1], path.world_from_robot[1:])
+    assert np.abs(steps[:, 2]).max() < 1e-9
+    np.testing.assert_allclose(steps[:, 0].sum(), 1.9, atol=1e-9)
+    np.testing.assert_allclose(steps[:, 1].sum(), 1.7, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("corners", "bend_m"), [(CORNERS, 1.6), ([(0.0, 0.0), (1.0, 0.0), (0.0, 0.0)], 0.1)], ids=["near", "back"]
+)
+def test_impossible_ways_are_refused(corners: list[tuple[float, float]], bend_m: float) -> None:
+    with pytest.raises(InputError, match="too near"):
+        along_corners(corners, bend_m)
+
+
+@pytest.mark.parametrize("seconds", [0.5, 1.9, 6.0])
+def test_too_little_time_is_refused(seconds: float) -> None:
+    with pytest.raises(InputError, match="more time"):
+        driven([Move(1.0), Move(turn_rad=0.1), Move(1.0, rest_s=1.0)], seconds)

@@ -1,0 +1,264 @@
+"""The simulated laboratory: plan, drives, furniture, its twin in points, and its images."""
+
+import doctest
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rbpf.errors import InputError
+from rbpf.lie import SE2, SE3
+from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+from rbpf.sensors.readers.images import open_images
+from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
+from rbpf.validation.simulation import lab_points
+from rbpf.validation.simulation.exposure import Imaging
+from rbpf.validation.simulation.features import Measuring, simulate_features
+from rbpf.validation.simulation.images import simulate_images
+from rbpf.validation.simulation.lab_furniture import furnished
+from rbpf.validation.simulation.lab_plan import DOOR_M, LINTEL_M, PARTITION_M, RATE_HZ, SIZE_M
+from rbpf.validation.simulation.lab_points import LabWorld
+from rbpf.validation.simulation.render import Renderer
+from rbpf.validation.simulation.textured_lab import (
+    ROBOT_FROM_CAMERA,
+    LabDrive,
+    TexturedLab,
+    world_from_camera,
+)
+from rbpf.validation.simulation.textured_scene import TexturedScene, cast
+
+cv2 = pytest.importorskip("cv2")
+
+CAMERA = Pinhole(320, 240, 250.0, 250.0, 159.5, 119.5)
+STEREO = RectifiedStereo(CAMERA, 0.12)
+CLEAN = Imaging(noise_std=0.0, lens_px=0.0, known=0)
+TOUR = LabDrive().travelled()
+SEEDS = range(3)
+
+
+@cache
+def drawn(seed: int = 0, texel_m: float = 0.05, every: int = 400) -> TexturedScene:
+    return TexturedLab(LabDrive(every=every), texel_m=texel_m).build(np.random.default_rng(seed))
+
+
+def test_the_tour_is_as_long_as_that_of_the_paper() -> None:
+    assert len(TOUR.way_m) == 4000
+    assert 67.0 < TOUR.way_m[-1] < 68.5
+    step = SE2.local(TOUR.world_from_robot[:-1], TOUR.world_from_robot[1:])
+    assert np.abs(step[:, 2]).max() < 1e-4
+    assert np.diff(TOUR.way_m).max() < 0.02 and np.abs(step[:, 0]).max() < np.deg2rad(1.5)
+
+
+def test_the_tour_comes_back_to_places_in_the_same_and_the_opposite_direction() -> None:
+    theta, x, y = TOUR.world_from_robot[::10].T
+    near = np.hypot(x[:, None] - x, y[:, None] - y) < 0.05
+    later = np.subtract.outer(np.arange(len(x)), np.arange(len(x))) > 60
+    turned = np.cos(theta[:, None] - theta)
+    again, back = (
+        (near & later & (turned > 0.99)).sum(axis=1) > 0,
+        (near & later & (turned < -0.99)).sum(axis=1) > 0,
+    )
+    # Metres of the tour where the robot has been before, facing the same way and the opposite one.
+    way = 10.0 * TOUR.way_m[-1] / 4000.0
+    assert again.sum() * way > 8.0 and back.sum() * way > 8.0
+    assert (x < PARTITION_M[0]).any() and (x > PARTITION_M[1]).mean() > 0.25
+
+
+@pytest.mark.parametrize("trajectory", ["tour", "turn_back"])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_robot_touches_nothing(trajectory: str, seed: int) -> None:
+    place = LabDrive(trajectory).travelled().world_from_robot[::5, 1:]  # type: ignore[arg-type]
+    blocks = np.array(furnished(np.random.default_rng(seed)).blocks)
+    low = blocks[blocks[:, 0, 2] < 1.5]
+    gap = np.maximum(low[:, 0, :2] - place[:, None], place[:, None] - low[:, 1, :2]).clip(min=0.0)
+    assert np.hypot(*np.moveaxis(gap, -1, 0)).min() > 0.6
+    assert (place.min(axis=0) > 1.5).all() and (place.max(axis=0) < np.array(SIZE_M[:2]) - 1.5).all()
+    in_the_wall = (place[:, 0] > PARTITION_M[0]) & (place[:, 0] < PARTITION_M[1])
+    assert in_the_wall.any() == (trajectory == "tour")
+    assert ((place[in_the_wall, 1] > DOOR_M[0] + 0.5) & (place[in_the_wall, 1] < DOOR_M[1] - 0.5)).all()
+    assert LINTEL_M > 1.5
+
+
+def test_turning_back_shows_what_was_seen_before() -> None:
+    theta = LabDrive("turn_back").travelled().world_from_robot[:, 0]
+    away = np.abs(theta) > np.deg2rad(139.9)
+    edges = np.flatnonzero(np.diff(away.astype(int)))
+    lasting = np.diff(edges)[::2] / RATE_HZ
+    assert len(lasting) == 2 and (lasting >= 5.0).all() and (lasting < 6.0).all()
+    assert (np.abs(theta[[0, 200, 330, 599]]) < 1e-9)[[0, 3]].all()
+    # The view of 65 degrees has nothing in common with that before.
+    assert np.rad2deg(np.abs(theta[away])).min() > 65.0
+
+
+def test_the_camera_looks_ahead_from_the_height_of_the_robot() -> None:
+    pose = world_from_camera(np.array([[0.5 * np.pi, 3.0, 4.0]]))[0]
+    np.testing.assert_allclose(pose[4:], [3.0 - 0.06, 4.0 + 0.1, 1.0], atol=1e-12)
+    ahead, right = SE3.transform(pose, [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]) - pose[4:]
+    np.testing.assert_allclose(ahead, [0.0, 1.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(right, [1.0, 0.0, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_renderer_sees_what_single_rays_see(seed: int) -> None:
+    """Thousands of rectangles, most of them hidden: no tile may drop one that is seen."""
+    scene = drawn(seed)
+    renderer = Renderer(scene.rectangles, CAMERA, grid=1)
+    px = np.random.default_rng(seed).uniform(0.0, 1.0, (400, 2)) * [319, 239]
+    px = np.round(px)
+    column, row = px.astype(int).T
+    assert len(scene.rectangles) > 1500
+    for pose in scene.world_from_camera[seed::3]:
+        depth, seen = renderer.depth(pose)
+        expected, rows = cast(scene.rectangles, pose, CAMERA.unproject(px))
+        np.testing.assert_allclose(depth[row, column], expected, rtol=1e-12)
+        # Where two boxes touch, two faces are at the same place.
+        assert (seen[row, column] == rows).mean() > 0.99 and np.isfinite(expected).all()
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_twin_in_points_is_seen_as_the_images_are(seed: int) -> None:
+    """A point measured in the world of points is what a ray hits in that of images; posters hang 1 cm before walls."""
+    scene = drawn(seed)
+    world = LabWorld(LabDrive(every=400), points=4000)
+    measuring = Measuring(noise_px=1e-6, measurements=150, new_per_frame=150, known=0, dropout=0.0)
+    log = simulate_features(world, measuring, STEREO, seed)
+    assert log.truth is not None
+    np.testing.assert_array_equal(log.truth.world_from_camera, scene.world_from_camera)
+    for frame, pose in zip(log.frames, scene.world_from_camera, strict=True):
+        points = np.array([log.truth.landmarks[name] for name in frame.landmarks.tolist()])
+        local = SE3.inverse_transform(pose, points)
+        depth, _ = cast(scene.rectangles, pose, CAMERA.unproject(frame.z[:, :2]))
+        assert (np.abs(depth - local[:, 2]) < 0.03).mean() > 0.97
+        np.testing.assert_allclose(STEREO.project(local), frame.z, atol=1e-4)
+        assert len(points) > 15
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("lab") / "lab"
+    world = TexturedLab(LabDrive(frames=9, every=6), texel_m=0.015)
+    simulate_images(world, CLEAN, STEREO, folder, 0)
+    return folder
+
+
+def found_by_flow(first: np.ndarray, second: np.ndarray, px: np.ndarray, guess: np.ndarray) -> np.ndarray:
+    """Where pixels (K, 2) of one image are in another, by OpenCV's registration of windows from a guess (K, 2)."""
+    start, expected = (np.asarray(x, np.float32).reshape(-1, 1, 2).copy() for x in (px, guess))
+    ends = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-4)
+    found, _, _ = cv2.calcOpticalFlowPyrLK(
+        first,
+        second,
+        start,
+        expected,
+        winSize=(11, 11),
+        maxLevel=0,
+        criteria=ends,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+    )
+    return np.asarray(found, float).reshape(-1, 2)
+
+
+def test_texture_is_in_both_images_where_the_truth_says(rendered: Path) -> None:
+    """Corners are followed to the right image, and to a later one, whose poses are read from the files."""
+    scene = TexturedLab(LabDrive(frames=9, every=6), texel_m=0.015).build(np.random.default_rng(0))
+    sequence = open_images(rendered)
+    assert sequence.baseline_m == 0.12 and sequence.truth is not None
+    left, right, later = (
+        cv2.imread(str(sorted((rendered / "mav0" / camera / "data").iterdir())[k]), cv2.IMREAD_GRAYSCALE)
+        for camera, k in (("cam0", 0), ("cam1", 0), ("cam0", 8))
+    )
+    seen = Renderer(scene.rectangles, CAMERA).depth(sequence.truth.world_from_camera[0])[1].astype(np.float32)
+    window = np.ones((15, 15), np.uint8)
+    flat = (cv2.erode(seen, window) == cv2.dilate(seen, window)).astype(np.uint8)
+    px = cv2.goodFeaturesToTrack(left, 300, 0.01, 6, mask=flat).reshape(-1, 2).astype(float)
+    uv = CAMERA.unproject(px)
+    depth, _ = cast(scene.rectangles, sequence.truth.world_from_camera[0], uv)
+    local = depth[:, None] * np.column_stack([uv, np.ones(len(uv))])
+    world = SE3.transform(sequence.truth.world_from_camera[0], local)
+    then = SE3.inverse_transform(sequence.truth.world_from_camera[8], world)
+    for image, expected in (
+        (right, STEREO.project(local)[:, [2, 1]]),
+        (later, CAMERA.project(then)),
+    ):
+        within = CAMERA.inside(expected, 8.0)
+        error = found_by_flow(left, image, px[within], expected[within]) - expected[within]
+        assert within.sum() > 60
+        assert np.abs(np.median(error, axis=0)).max() < 0.03
+        assert np.median(np.linalg.norm(error, axis=1)) < 0.12
+        assert np.linalg.norm(expected - px, axis=1)[within].mean() > 2.0
+
+
+def test_the_folder_holds_what_the_wheels_say(rendered: Path) -> None:
+    odometry = read_wheel_odometry(rendered)
+    sequence = open_images(rendered)
+    assert sequence.truth is not None
+    assert len(odometry.stamps_ns) == 49
+    np.testing.assert_array_equal(odometry.stamps_ns[::6], sequence.stamps_ns)
+    np.testing.assert_allclose(odometry.robot_from_camera, ROBOT_FROM_CAMERA)
+    reckoned = odometry.world_from_camera(sequence.truth.world_from_camera[0])[::6]
+    apart = np.linalg.norm(reckoned[:, 4:] - sequence.truth.world_from_camera[:, 4:], axis=1)
+    assert 0.0 < apart[-1] < 0.08 * TOUR.way_m[48]
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def test_a_seed_gives_the_same_bytes_and_fewer_frames_their_beginning(tmp_path: Path) -> None:
+    small = RectifiedStereo(Pinhole(96, 72, 75.0, 75.0, 47.5, 35.5), 0.12)
+    for name, frames, seed in (("first", 4, 3), ("again", 4, 3), ("short", 3, 3), ("other", 4, 4)):
+        world = TexturedLab(LabDrive("turn_back", frames, every=30), texel_m=0.1)
+        simulate_images(world, Imaging(jpeg=90, known=0), small, tmp_path / name, seed)
+    first, again, short, other = (contents(tmp_path / name) for name in ("first", "again", "short", "other"))
+    assert first == again
+    images = [name for name in short if name.endswith(".jpg")]
+    assert len(images) == 6 and all(short[name] == first[name] for name in images)
+    assert not any(first[name] == other[name] for name in [*images, "odometry.csv"])
+
+
+def test_images_can_be_jpeg(tmp_path: Path) -> None:
+    camera = Pinhole(96, 72, 75.0, 75.0, 47.5, 35.5)
+    world = TexturedLab(LabDrive(frames=2, every=100), texel_m=0.05)
+    read = {}
+    for quality in (0, 50, 95):
+        simulate_images(world, Imaging(jpeg=quality, known=0, depth=True), camera, tmp_path / str(quality), 0)
+        folder = tmp_path / str(quality) / "mav0"
+        suffix = ".jpg" if quality else ".png"
+        assert {path.suffix for path in (folder / "cam0" / "data").iterdir()} == {suffix}
+        assert {path.suffix for path in (folder / "depth0" / "data").iterdir()} == {".png"}
+        read[quality] = open_images(tmp_path / str(quality))
+    exact, poor, good = (next(read[quality].frames()).image.astype(float) for quality in (0, 50, 95))
+    assert 0.0 < np.abs(good - exact).mean() < 0.5 * np.abs(poor - exact).mean() < 5.0
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"trajectory": "walk"}, "one of tour, turn_back"),
+        ({"frames": 1}, "frames must be a whole number, at least 2"),
+        ({"frames": 4001}, "has 4000 images"),
+        ({"every": 0}, "every must be a whole number, at least 1"),
+        ({"every": 4000}, "has 1 images"),
+        ({"every": 100, "frames": 41}, "has 40 images"),
+    ],
+)
+def test_bad_drives_are_refused(options: dict, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        LabDrive(**options)
+
+
+def test_bad_worlds_and_files_are_refused() -> None:
+    for options in ({"texel_m": 0.0}, {"contrast": -1.0}):
+        with pytest.raises(InputError, match=next(iter(options))):
+            TexturedLab(**options)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="points"):
+        LabWorld(points=0)
+    for quality in (-1, 101):
+        with pytest.raises(InputError, match="jpeg"):
+            Imaging(jpeg=quality)
+
+
+def test_the_example_in_the_docstring_runs() -> None:
+    result = doctest.testmod(lab_points)
+    assert result.attempted > 0 and result.failed == 0
