@@ -14,7 +14,7 @@ from rbpf.maps.layout import Layout
 from rbpf.maps.plan import Plan, make_plan
 from rbpf.maps.point import Point
 from rbpf.maps.rows import RowEngine
-from rbpf.maps.shared import SharedStore
+from rbpf.maps.shared import ALL, SharedStore
 from rbpf.models import (
     Births,
     Conditional,
@@ -102,8 +102,8 @@ class LandmarkMap(Conditional):
         for landmark in ids.tolist():
             self.catalogue.pop(landmark, None)
 
-    def read(self, ids: np.ndarray) -> Records:
-        """Estimates (N, K, …) of landmarks that share one parametrisation."""
+    def read(self, ids: np.ndarray, particles: np.ndarray | slice = ALL) -> Records:
+        """Estimates (N, K, …) of landmarks that share one parametrisation, in all or some particles."""
         self._known(ids)
         ids = np.asarray(ids)
         if ids.size == 0:
@@ -113,7 +113,7 @@ class LandmarkMap(Conditional):
             raise InputError(
                 "read() takes landmarks of one parametrisation at a time; `landmark_of` tells which"
             )
-        return self.layouts[kinds[0]].unpack(np.array([self.store.read(int(i)) for i in ids]))
+        return self.layouts[kinds[0]].unpack(np.array([self.store.read(int(i), particles) for i in ids]))
 
     def landmark_of(self, landmark_id: int) -> Landmark:
         """The parametrisation of a landmark."""

@@ -13,7 +13,7 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.genealogy import Lineage, Schedule
 
-_FIRST_SLABS = 32
+_FIRST_SLABS, ALL = 32, slice(None)
 HOT_SHARE = 0.75
 """A column with fewer surviving rows than this share of the particles gives its dense slab back."""
 COLD_SHARE = 0.9
@@ -124,15 +124,15 @@ class SharedStore:
         self._vacate(column)
         self._occupy(column, records)
 
-    def read(self, column: int) -> np.ndarray:
-        """Records of all particles, (fields, N)."""
+    def read(self, column: int, particles: np.ndarray | slice = ALL) -> np.ndarray:
+        """Records of all or some particles, (fields, N)."""
         generation = int(self._generation[column])
-        rows = self.lineage.rows(generation)
+        rows = self.lineage.rows(generation)[particles]
         cold = self._cold.get(column)
         if cold is not None:
             return cold.data[:, np.searchsorted(cold.kept, rows)]
         slab = self._pool(column).data[self._slab[column]]
-        return slab.copy() if generation == self.lineage.generation else slab[:, rows]
+        return slab[:, particles].copy() if generation == self.lineage.generation else slab[:, rows]
 
     def access(self, columns: np.ndarray) -> Access:
         """Lets a kernel read columns (K,), at least one, of one record size; cold ones are warmed up first."""

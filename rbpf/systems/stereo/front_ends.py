@@ -58,10 +58,11 @@ class FrontEnd(ABC):
         """Time that the sensor took to find landmarks in its last pair."""
         return 0.0
 
+    @abstractmethod
     def arrays(self) -> dict[str, np.ndarray]:
         """For a checkpoint: the pair kept, and the sensor."""
-        return {}
 
+    @abstractmethod
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """The inverse of `arrays`."""
 

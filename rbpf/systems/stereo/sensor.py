@@ -129,10 +129,12 @@ class StereoSensor(Sensor):
         return Observations(features.z, features.cov, self.model, self.likelihood, ids, informs=informs)
 
     def _weighing(self) -> np.ndarray:
-        """Features (K,) whose landmarks weigh the particles."""
+        """Features (K,) whose keys are landmarks, this sighting included, and weigh the particles."""
         if self.config.weigh == "all":
             return self.names >= 0
-        return np.isin(self.names, self.manager.names[self.manager.promoted])
+        manager = self.manager
+        often = manager.sightings + 1 >= manager.config.sightings
+        return np.isin(self.names, manager.names[often])
 
     def _matched(self, frame: StereoFrame, belief: Belief) -> np.ndarray:
         """Name of each feature's landmark (K,)."""
@@ -164,8 +166,8 @@ class StereoSensor(Sensor):
     def _expected(self, ids: np.ndarray, belief: Belief) -> tuple[np.ndarray, np.ndarray]:
         """Pixels (k, 3) where some of the particles expect landmarks (k,), and their covariance (k, 3, 3)."""
         few = self._evenly(belief.weights)
-        records, prior = belief.read(ids), belief.prior.take(few)
-        mean, cov = records.mean[few], records.cov[few]
+        records, prior = belief.read(ids, few), belief.prior.take(few)
+        mean, cov = records.mean, records.cov
         state = prior.predicted()[:, None]
         px = self.model.predict(state, mean)
         jac = self.model.jacobians(state, mean)
@@ -194,7 +196,8 @@ class StereoSensor(Sensor):
         if names.size:
             known = self._ids.ids(belief.catalogue)
             ids = np.array([known[name] for name in names.tolist()], dtype=np.int64)
-            self.places.put(names, belief.read(ids).mean[belief.mode], belief.state[belief.mode])
+            mode = belief.mode
+            self.places.put(names, belief.read(ids, np.array([mode])).mean[0], belief.state[mode])
 
     def _worth_a_key(self, frame: StereoFrame, seen: np.ndarray) -> np.ndarray:
         """Rows of features that start landmarks."""
