@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from tyro.extras import SubcommandApp
 
-from rbpf.cli.options import ImagesOptions, LabOptions, MonoOptions, RangeBearingOptions
+from rbpf.cli.options import ImagesOptions, LabOptions, MonoOptions, RangeBearingOptions, StereoOptions
 from rbpf.errors import InputError
 
 if TYPE_CHECKING:
@@ -81,6 +81,29 @@ def run_mono(options: Annotated[MonoOptions, tyro.conf.arg(name="")]) -> None:
             options.rerun,
             _told(bar, drawing),
         )
+    _print_summary(entries, options.out)
+    if run.failure is not None:
+        raise InputError(f"{run.failure}; what was computed before it is in {options.out}")
+
+
+@RUN.command(name="stereo")
+def run_stereo(options: Annotated[StereoOptions, tyro.conf.arg(name="")]) -> None:
+    """Stereo SLAM over a sequence of pairs of images (S05: SIFT landmarks, visual odometry, 400 particles)."""
+    from rbpf.systems.settings import load_settings
+    from rbpf.systems.stereo.config import StereoConfig
+    from rbpf.validation.mono_rerun import require_rerun
+    from rbpf.validation.stereo import StereoRecording, finish_stereo, start_stereo
+
+    if options.rerun is not None:
+        require_rerun()
+    given = _given(options, "particles", "seed", "dof")
+    config = load_settings(StereoConfig, "stereo", options.config, options.set, given)
+    recording = StereoRecording(options.sequence, options.calibration)
+    _prepare(options.threads)
+    with _progress() as bar:
+        task = bar.add_task("filtering", total=None)
+        run = start_stereo(recording, config, options.out, options.resume, _told(bar, task))
+    entries = finish_stereo(run, recording, options.out, options.rerun)
     _print_summary(entries, options.out)
     if run.failure is not None:
         raise InputError(f"{run.failure}; what was computed before it is in {options.out}")

@@ -164,20 +164,21 @@ class StereoSensor(Sensor):
         return np.asarray(names[near])
 
     def _expected(self, ids: np.ndarray, belief: Belief) -> tuple[np.ndarray, np.ndarray]:
-        """Pixels (k, 3) where some of the particles expect landmarks (k,), and their covariance (k, 3, 3)."""
-        few = self._evenly(belief.weights)
+        """Pixels (k, 3) where some of the particles expect landmarks (k,), and their covariance (k, 3, 3).
+
+        What is uncertain within a particle, given its path, hardly differs between them: the heaviest one's is taken.
+        """
+        few = np.append(self._evenly(belief.weights), belief.mode)
         records, prior = belief.read(ids, few), belief.prior.take(few)
-        mean, cov = records.mean, records.cov
-        state = prior.predicted()[:, None]
-        px = self.model.predict(state, mean)
-        jac = self.model.jacobians(state, mean)
+        state = prior.predicted()
+        px = self.model.predict(state[:-1, None], records.mean[:-1])
+        jac = self.model.jacobians(state[-1], records.mean[-1])
         assert jac.state is not None and jac.landmark is not None
-        moved = jac.state @ prior.spread(prior.mean)[:, None]
-        within = jac.landmark @ cov @ np.swapaxes(jac.landmark, -1, -2) + moved @ np.swapaxes(moved, -1, -2)
-        middle = px.mean(axis=0)
-        off = px - middle
-        total = within.mean(axis=0) + np.einsum("nka,nkb->kab", off, off) / few.size
-        return middle, symmetrise(total) + self.config.slack_px**2 * np.eye(3)
+        moved = jac.state @ prior.spread(prior.mean)[-1]
+        within = jac.landmark @ records.cov[-1] @ jac.landmark.mT + moved @ moved.mT
+        off = px - px.mean(axis=0)
+        between = np.einsum("nka,nkb->kab", off, off) / px.shape[0]
+        return px.mean(axis=0), symmetrise(within + between) + self.config.slack_px**2 * np.eye(3)
 
     def _evenly(self, weights: np.ndarray) -> np.ndarray:
         """Rows of particles, each for an equal share of the weight."""
