@@ -13,7 +13,7 @@ from rbpf import gaussian
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.models import FusedKernel, Jacobians, ObservationModel, Records
-from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+from rbpf.sensors.pinhole import Pinhole
 
 GRAZING = 0.2
 """Least share of its length by which a direction points forward: what is behind the camera projects far outside."""
@@ -111,35 +111,13 @@ class CameraPoint(CameraModel):
         """Identity and zero."""
         return np.eye(3), np.zeros((1, 3))
 
-    def invert(self, state: np.ndarray, z: np.ndarray) -> np.ndarray:
-        """The world point of a stereo pair's pixels, S05 (4).
-
-        Raises:
-            InputError: the camera is not a stereo pair, one image tells no depth.
-        """
-        if not isinstance(self.camera, RectifiedStereo):
-            return super().invert(state, z)
-        return SE3.transform(state[..., :7], self.camera.locate(z))
-
-    def initialise(self, state: np.ndarray, z: np.ndarray, cov: np.ndarray) -> Records:
-        """Points (N, K, 3) of a stereo pair with R C^L Rᵀ, S05 (4) and (7)."""
-        if not isinstance(self.camera, RectifiedStereo):
-            return super().initialise(state, z, cov)
-        local = self.camera.locate(z)
-        by_pixel = np.linalg.inv(self.camera.slope(local))
-        turned = SE3.rotation(state[:, None, :7]) @ by_pixel
-        mean = SE3.transform(state[:, None, :7], local)
-        return Records(mean, gaussian.symmetrise(turned @ cov @ np.swapaxes(turned, -1, -2)))
-
     def kernel(self) -> FusedKernel | None:
-        """Compiled for a pinhole camera and for a rectified pair."""
-        from rbpf.sensors.camera_kernels import camera_point, stereo_point
+        """Compiled for a pinhole camera."""
+        from rbpf.sensors.camera_kernels import camera_point
 
-        if isinstance(self.camera, Pinhole):
-            return FusedKernel(camera_point, self.camera.params)
-        if isinstance(self.camera, RectifiedStereo):
-            return FusedKernel(stereo_point, np.append(self.camera.camera.params[:4], self.camera.baseline_m))
-        return None
+        if not isinstance(self.camera, Pinhole):
+            return None
+        return FusedKernel(camera_point, self.camera.params)
 
 
 class CameraRay(CameraModel):

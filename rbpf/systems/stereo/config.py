@@ -23,7 +23,9 @@ class OdometryConfig:
         limits: of the keys of two pairs.
         std_added_rad: injected per update (S05 §V), standard deviation of the turn about each axis.
         std_added_m: likewise of the shift along each axis.
-        apart: whether no feature of a pair is used both for the odometry and for the map. S05 uses each twice.
+        split: S05 uses each feature twice, for the odometry and for the map ("none"). To measure what that does, the
+            features can be divided by lot into two halves: one for the odometry and the other for the map ("apart"),
+            or one of them for both ("same").
     """
 
     estimate: VoConfig = field(default_factory=VoConfig)
@@ -31,7 +33,7 @@ class OdometryConfig:
     limits: MatchLimits = field(default_factory=MatchLimits)
     std_added_rad: float = 0.0
     std_added_m: float = 0.0
-    apart: bool = False
+    split: Literal["none", "apart", "same"] = "none"
 
 
 @dataclass(frozen=True)

@@ -10,13 +10,13 @@ from rbpf.filter import StepReport
 from rbpf.maps.point import Point
 from rbpf.models import Part, Sensor
 from rbpf.motion.stereo_odometer import match_names
-from rbpf.sensors.camera_points import CameraPoint
 from rbpf.sensors.features import FeatureFrame, FeatureLog
 from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
 from rbpf.sensors.pinhole import RectifiedStereo
 from rbpf.sensors.readers.images import ImageFrame
 from rbpf.sensors.stereo_features import StereoFeatures, match_frames
 from rbpf.sensors.stereo_matching import StereoSift
+from rbpf.sensors.stereo_points import StereoPoint
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.dead_reckoning import Pixels
 from rbpf.systems.stereo.sensor import StereoFrame, StereoSensor
@@ -87,7 +87,6 @@ class ImageFrontEnd(FrontEnd):
             rig, *nothing, np.zeros((0, config.sift.length), dtype=np.float32)
         )
         self._now = self._kept = self._none
-        self._spent = self._map_has = np.zeros(0, dtype=bool)
 
     def look(self, frame: ImageFrame) -> tuple[int, str]:
         """SIFT in both images, matched along the rows."""
@@ -95,31 +94,26 @@ class ImageFrontEnd(FrontEnd):
         if frame.image is None or frame.right is None:
             return 0, frame.problem or "an image is missing"
         self._now = self.sift.measure(frame.image, frame.right)
-        self._spent = np.zeros(len(self._now), dtype=bool)
         return len(self._now), ""
 
     def matches(self) -> Pixels:
-        """By their keys. Where odometry and map share no features, those of the map's last sighting are left out."""
+        """By their keys."""
         found = match_frames(self._kept, self._now, self.config.odometry.limits)
-        if self.config.odometry.apart:
-            found = found.take(~self._map_has[found.first])
+        if self.config.odometry.split != "none":
+            found = found.take(half_of(self._kept.keys)[found.first] & half_of(self._now.keys)[found.second])
         before, now = self._kept.take(found.first), self._now.take(found.second)
-        self._spent = np.isin(np.arange(len(self._now)), found.second)
         return Pixels(before.z, now.z, before.cov, now.cov)
 
     def keep(self) -> None:
-        """With what the map has of it."""
         self._kept = self._now
-        self._map_has = np.zeros(len(self._now), dtype=bool)
 
     def for_filter(self) -> StereoFrame:
-        """All features, or those that the odometry has not used."""
-        return StereoFrame(self._now, ~self._spent if self.config.odometry.apart else None)
-
-    def observed(self, report: StepReport) -> int:
-        """Also notes which features the map has now."""
-        self._map_has = self.sensor.names >= 0
-        return super().observed(report)
+        """All features, or the half that is the map's."""
+        split = self.config.odometry.split
+        if split == "none":
+            return StereoFrame(self._now)
+        half = half_of(self._now.keys)
+        return StereoFrame(self._now, ~half if split == "apart" else half)
 
     def seconds(self) -> float:
         return self.sensor.seconds
@@ -127,13 +121,11 @@ class ImageFrontEnd(FrontEnd):
     def arrays(self) -> dict[str, np.ndarray]:
         kept = self._kept
         names = ("z", "cov", "scale", "orientation", "keys")
-        pair = {f"pair/{name}": getattr(kept, name) for name in names}
-        return pair | {"pair/map_has": self._map_has} | self.sensor.arrays()
+        return {f"pair/{name}": getattr(kept, name) for name in names} | self.sensor.arrays()
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         names = ("z", "cov", "scale", "orientation", "keys")
         self._kept = StereoFeatures.measured(self.rig, *(arrays[f"pair/{name}"].copy() for name in names))
-        self._map_has = arrays["pair/map_has"].copy()
         self.sensor.restore(arrays)
 
 
@@ -156,7 +148,7 @@ class NameFrontEnd(FrontEnd):
             )
         self.rig = log.camera
         self.config = config
-        self.sensor = NamedLandmarkSensor(CameraPoint(log.camera), Point(3), config.likelihood.build())
+        self.sensor = NamedLandmarkSensor(StereoPoint(log.camera), Point(3), config.likelihood.build())
         self._now = self._kept = FeatureFrame(
             0, np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3))
         )
@@ -167,9 +159,9 @@ class NameFrontEnd(FrontEnd):
         return frame.landmarks.size, ""
 
     def matches(self) -> Pixels:
-        """By their names; of landmarks of even names alone where odometry and map share none."""
+        """By their names."""
         before, now = match_names(self._kept.landmarks, self._now.landmarks)
-        if self.config.odometry.apart:
+        if self.config.odometry.split != "none":
             even = self._kept.landmarks[before] % 2 == 0
             before, now = before[even], now[even]
         kept, seen = self._kept, self._now
@@ -179,11 +171,11 @@ class NameFrontEnd(FrontEnd):
         self._kept = self._now
 
     def for_filter(self) -> FeatureFrame:
-        """All of them, those of odd names, or none."""
+        """All of them, those of odd or even names, or none."""
         config, frame = self.config, self._now
         chosen = np.full(frame.landmarks.size, config.map.used)
-        if config.odometry.apart:
-            chosen &= frame.landmarks % 2 == 1
+        if config.odometry.split != "none":
+            chosen &= frame.landmarks % 2 == (1 if config.odometry.split == "apart" else 0)
         chosen &= frame.z[:, 0] > frame.z[:, 2]
         return FeatureFrame(frame.stamp_ns, frame.landmarks[chosen], frame.z[chosen], frame.cov_z[chosen])
 
@@ -194,3 +186,9 @@ class NameFrontEnd(FrontEnd):
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         names, z, cov = (arrays[f"pair/{name}"].copy() for name in ("names", "z", "cov"))
         self._kept = FeatureFrame(0, names, z, cov)
+
+
+def half_of(keys: np.ndarray) -> np.ndarray:
+    """A lot (K,) that falls alike whenever a feature is seen: whether the key's first rows outweigh its last ones."""
+    side = keys.shape[1] // 3
+    return np.asarray(keys[:, :side].sum(axis=1) > keys[:, -side:].sum(axis=1))

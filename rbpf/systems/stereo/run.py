@@ -47,6 +47,7 @@ class StereoRun:
         seconds_matching: (T,) of finding landmarks;  seconds_filter: (T,) of the rest of the update.
         notes: what was wrong with single pairs, in words.
         failure: why it ended before the last pair, in words; None where it did not.
+        per_stamp: nanoseconds per unit of `stamps_ns`: 1, or 10⁹ where stamps count pairs of unknown time.
         frames_done: pairs so far.
         last_update: pair at which the filter was updated last.
         at_update: its estimate then.
@@ -78,6 +79,7 @@ class StereoRun:
     seconds_filter: np.ndarray
     notes: list[str] = field(default_factory=list)
     failure: str | None = None
+    per_stamp: int = 1
     frames_done: int = 0
     last_update: int = 0
     at_update: Estimate = field(default_factory=lambda: Estimate(SE3.identity(), np.zeros((6, 6))))
@@ -130,6 +132,8 @@ def run_features(
     """
     stamps = np.array([frame.stamp_ns for frame in log.frames], dtype=np.int64)
     run = _begin(log.name, log.truth, config, NameFrontEnd(log, config), stamps)
+    if np.array_equal(stamps, np.arange(stamps.size)):
+        run.per_stamp = 1_000_000_000
     if resume and checkpoint is not None and checkpoint.exists():
         restore(run, checkpoint)
     return _all(run, iter(log.frames[run.frames_done :]), on_frame, checkpoint)
@@ -188,7 +192,7 @@ def _frame(run: StereoRun, t: int, frame: Any) -> None:
 
 def _reckon(run: StereoRun, t: int, problem: str) -> tuple[Reckoned, bool]:
     """The motion up to pair t, and whether the pair could be measured."""
-    stamp, reckoning = int(run.stamps_ns[t]), run.reckoning
+    stamp, reckoning = run.per_stamp * int(run.stamps_ns[t]), run.reckoning
     least, count = run.config.odometry.estimate.least_matches, int(run.features[t])
     if count < least:
         what = problem or f"it shows {count} features, {least} are needed"

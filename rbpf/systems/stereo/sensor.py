@@ -18,12 +18,12 @@ from rbpf.exchange import NULL
 from rbpf.gaussian import symmetrise
 from rbpf.maps.point import Point
 from rbpf.models import Births, Likelihood, Observations, Part, Sensor
-from rbpf.sensors.camera_points import CameraPoint
 from rbpf.sensors.key_index import Gate, KeyIndex
 from rbpf.sensors.key_management import KeyConfig, KeyManager
 from rbpf.sensors.names import Names
 from rbpf.sensors.pinhole import RectifiedStereo
 from rbpf.sensors.stereo_features import StereoFeatures
+from rbpf.sensors.stereo_points import StereoPoint
 from rbpf.systems.stereo.config import MapConfig
 from rbpf.systems.stereo.landmarks import Places
 
@@ -60,7 +60,7 @@ class StereoSensor(Sensor):
     ) -> None:
         self.config = config
         self.likelihood = likelihood
-        self.model = CameraPoint(rig)
+        self.model = StereoPoint(rig)
         self.point = Point(3)
         self.index = KeyIndex(length, config.limits)
         self.manager = KeyManager(keys, (rig.camera.width, rig.camera.height))
