@@ -26,6 +26,7 @@ NAMES = (
     "mono_step",
     "patch_search",
     "key_search",
+    "motion_estimate",
     "bootstrap_peers",
     "mrpt_peer",
 )

@@ -23,7 +23,7 @@ Evaluate = Callable[[Array], tuple[Array, Array]]
 Retract = Callable[[Array, Array], Array]
 """x (E,) moved by ξ (d,)."""
 
-SINGULAR = 1e-12
+SINGULAR = 1e-7
 """A singular value below this share of the largest counts as this share: its direction is not determined."""
 
 ROUNDING = 1e-12
@@ -137,17 +137,15 @@ def minimise(evaluate: Evaluate, x: Array, retract: Retract, rule: Rule | None =
     _require_start(residual, jac)
     local = _linearised(residual, jac)
     damping, growth = rule.damping * float(local.s[0]), 2.0
-    for iterations in range(rule.iterations):
-        if _settled(local, rule):
-            return Minimum(x, residual, jac, iterations, True)
+    iterations = 0
+    while iterations < rule.iterations and damping <= STUCK * local.s[0] and not _settled(local, rule):
+        iterations += 1
         tried = retract(x, -local.step(damping))
         found, slope = evaluate(tried)
         decrease = local.squared - float(found @ found)
         gain = decrease / local.promised(damping)
         if not (gain > 0.0 and np.isfinite(slope).all()):
             damping, growth = growth * max(damping, SINGULAR * float(local.s[0])), 2.0 * growth
-            if damping > STUCK * float(local.s[0]):
-                break
             continue
         x, residual, jac, local = tried, found, slope, _linearised(found, slope)
         damping, growth = damping * np.sqrt(max(1.0 / 9.0, 1.0 - (2.0 * gain - 1.0) ** 3)), 2.0

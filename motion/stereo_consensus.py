@@ -13,7 +13,7 @@ from rbpf import gaussian
 from rbpf.lie import SE3, Array
 from rbpf.motion.stereo_geometry import Matches, homography, points_from_pixels, raise_pixels, see
 
-REFINEMENTS = 3
+REFINEMENTS = 2
 """Gauss-Newton steps on the nine pixels of a triple."""
 
 STIFFNESS = 1e-9
@@ -138,9 +138,10 @@ class _Search:
 
     def squared(self, motions: Array, rows: np.ndarray) -> Array:
         """Squared distances (…, k) of some rows (…, k) at motions (…, 7); infinite behind the camera."""
-        seen = see(self.matches.camera, motions, self.matches.z_prev[rows])
-        distance = np.square(self._white_miss(seen.pixels, rows)).sum(axis=-1)
-        return np.where(seen.front, distance, np.inf)
+        raised = raise_pixels(homography(self.matches.camera, motions), self.matches.z_prev[rows])
+        front = raised[..., 3] > 0.0
+        seen = raised[..., :3] / np.where(front, raised[..., 3], 1.0)[..., None]
+        return np.where(front, np.square(self._white_miss(seen, rows)).sum(axis=-1), np.inf)
 
     def _white_miss(self, seen: Array, rows: np.ndarray) -> Array:
         return np.einsum("...ij,...j->...i", self.white[rows], self.matches.z_now[rows] - seen)

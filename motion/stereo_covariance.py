@@ -6,7 +6,12 @@ average. With the information I = Σ JᵀS⁻¹J as found and D = Σ var ρ̂ (�
 is I − D while the score itself has the covariance I, because ν is independent of m̂. Hence (W. Fuller 1987, §3.2)
 
     cov = (I − D)⁻¹ I (I − D)⁻¹.
+
+Leaving out what lies beyond a gate costs true matches, and the farthest, which speak most: the rest determines the
+motion less well than as many that were not chosen would.
 """
+
+import math
 
 import numpy as np
 
@@ -44,3 +49,20 @@ def _noise(matches: Matches, found: Innovation) -> Array:
     noise = np.zeros((6, 6))
     noise[3:, 3:] = np.einsum("k,kpi,kpq,kqj->ij", variance, seen.by_nearness, info, seen.by_nearness)
     return noise
+
+
+def trimming(gate: float) -> float:
+    """Variance of a motion from the matches within a gate, beside that from as many that were not chosen.
+
+    F₃ / F₅, the distributions of χ² with three and five degrees of freedom at the gate: rejection by ν has the
+    influence function ν within the gate, the covariance E[νᵀν] / 3 = F₅ and the slope F₅ (P. Huber 1981, §4.5), for
+    each match; the share F₃ of them is within. It is also 3 / E[ν² | within].
+
+    Args:
+        gate: squared Mahalanobis distance; infinite for none.
+    """
+    if math.isinf(gate):
+        return 1.0
+    three = math.erf(math.sqrt(0.5 * gate)) - math.sqrt(2.0 * gate / math.pi) * math.exp(-0.5 * gate)
+    five = three - math.sqrt(2.0 * gate**3 / math.pi) * math.exp(-0.5 * gate) / 3.0
+    return three / five

@@ -5,8 +5,8 @@ from numba import njit
 
 
 @njit(cache=True, error_model="numpy")
-def white_rows(matrix, camera, z_prev, z_now, cov_prev, cov_now, noisy, sweeps, swept, rows, front):
-    """Fills rows (K, 3, 7) with L⁻¹ [ν, −∂g/∂ξ] and front (K,); zeros for a point behind the camera.
+def white_rows(matrix, camera, z_prev, z_now, cov_prev, cov_now, noisy, sweeps, swept, rows, front, best):
+    """Fills rows (K, 3, 7) with L⁻¹ [ν, −∂g/∂ξ], front (K,) and best (K, 3) with m̂; zeros for a point behind.
 
     Args:
         matrix: (4, 4) H.
@@ -20,6 +20,7 @@ def white_rows(matrix, camera, z_prev, z_now, cov_prev, cov_now, noisy, sweeps, 
         swept: change of m̂ that ends them.
         rows: to fill.
         front: to fill.
+        best: to fill.
     """
     pixels, seen, slope = np.empty(3), np.empty(3), np.empty((3, 3))
     chol, gain, gained = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
@@ -42,6 +43,7 @@ def white_rows(matrix, camera, z_prev, z_now, cov_prev, cov_now, noisy, sweeps, 
                     moved += gain[i, j] * gained[j]
                 change = max(change, abs(moved - pixels[i]))
                 pixels[i] = moved
+        best[k] = pixels
         if front[k]:
             _derive(camera, pixels, seen, depth, rows[k])
             _whiten(chol, rows[k])

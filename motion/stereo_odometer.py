@@ -7,12 +7,14 @@ from typing import NamedTuple, Protocol, final
 
 import numpy as np
 
-from rbpf import gaussian
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
 from rbpf.motion.odometry import Odometry
 from rbpf.motion.stereo_geometry import StereoCamera
 from rbpf.motion.stereo_vo import MotionEstimate, VoConfig, estimate_motion
+
+ROUNDING = 1e-14
+"""Variances below this share of the largest are rounding."""
 
 
 @final
@@ -160,15 +162,15 @@ def chain(increments: Sequence[Array]) -> Array:
 def _joined(found: MotionEstimate, expected: Odometry) -> tuple[Odometry, str]:
     """The estimate, or in case it is the weaker one anywhere, the product of its Gaussian and the expected one."""
     measured = Odometry(found.previous_camera_from_camera, found.cov)
+    # In units of the expected standard deviations the expected covariance is I.
     std = np.sqrt(np.diagonal(expected.cov))
-    ratio = np.linalg.eigvalsh(found.cov / np.outer(std, std))[-1]
-    if ratio <= 1.0:
+    values, axes = np.linalg.eigh(found.cov / np.outer(std, std))
+    if values[-1] <= 1.0:
         return measured, ""
-    # K = P (P + C)⁻¹ with the expected covariance P, in the chart at the expected increment.
-    off = SE3.local(expected.delta, measured.delta)
-    total = expected.cov + found.cov
-    gain = np.linalg.solve(total, expected.cov).T
-    cov = gaussian.symmetrise(expected.cov - gain @ expected.cov)
-    worst = f"a standard deviation {np.sqrt(ratio):.1f} times the expected one"
-    joined = Odometry(SE3.retract(expected.delta, gain @ off), cov)
-    return joined, f"the matches leave the motion open ({worst}); it is joined with the expected one"
+    values = np.maximum(values, ROUNDING * values[-1])
+    off = axes.T @ (SE3.local(expected.delta, measured.delta) / std)
+    half = std[:, None] * axes * np.sqrt(values / (1.0 + values))
+    joined = SE3.retract(expected.delta, std * (axes @ (off / (1.0 + values))))
+    worst = f"a standard deviation {np.sqrt(values[-1]):.1f} times the expected one"
+    note = f"the matches leave the motion open ({worst}); it is joined with the expected one"
+    return Odometry(joined, half @ half.T), note

@@ -16,10 +16,17 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
 from rbpf.motion.levenberg_marquardt import Minimum, Rule, minimise
 from rbpf.motion.stereo_consensus import Draws, consensus
-from rbpf.motion.stereo_covariance import honest_covariance
+from rbpf.motion.stereo_covariance import honest_covariance, trimming
 from rbpf.motion.stereo_geometry import Matches, StereoCamera
 from rbpf.motion.stereo_matches import checked_matches, possible
-from rbpf.motion.stereo_reprojection import Points, innovation, residuals, squared_distances
+from rbpf.motion.stereo_reprojection import (
+    Points,
+    innovation,
+    linearised,
+    residuals,
+    squared_distances,
+    white_rows,
+)
 
 ROUNDS = 5
 """Of optimising and choosing anew which matches agree; it ends when they stay the same."""
@@ -70,7 +77,8 @@ class MotionEstimate:
         previous_camera_from_camera: (7,) increment; the start where none was found.
         cov: (6, 6) in the right chart there, order [ω, v]; NaN where none was found.
         inliers: (K,) bool, matches that agree with it.
-        rms: root mean square of the inliers' whitened residuals, with their degrees of freedom: 1 is expected.
+        rms: root mean square of the inliers' whitened residuals, 1 expected: with their degrees of freedom, and with
+            what the gate cuts off made up for.
         iterations: of the optimiser.
         failure: why no motion was found, in words; empty where one was.
     """
@@ -164,7 +172,7 @@ def _refined(
             break
     if not found.converged:
         return _failed(start, matches, f"the optimiser did not converge in {iterations} iterations")
-    rms = np.sqrt(found.squared / max(len(found.residual) - 6, 1))
+    rms = np.sqrt(trimming(config.gate) * found.squared / max(len(found.residual) - 6, 1))
     return MotionEstimate(motion, _covariance(part, found, config), inliers, float(rms), iterations)
 
 
@@ -175,9 +183,13 @@ def _squared(matches: Matches, motion: Array, config: VoConfig) -> Array:
 
 
 def _covariance(matches: Matches, found: Minimum, config: VoConfig) -> Array:
-    if config.points != "adjusted":
+    if config.points == "exact":
         return found.cov
-    return honest_covariance(matches, innovation(matches, found.x, "adjusted"), found.factor)
+    if config.points == "propagated":
+        return trimming(config.gate) * found.cov
+    pixels = white_rows(matches, found.x, "adjusted").pixels
+    adjusted = linearised(matches, found.x, pixels, "adjusted")
+    return trimming(config.gate) * honest_covariance(matches, adjusted, found.factor)
 
 
 def _failed(start: Array, matches: Matches, why: str) -> MotionEstimate:

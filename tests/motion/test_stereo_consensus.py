@@ -1,0 +1,102 @@
+"""The consensus of triples: draws, alignment, false matches, motions of any size, equal bytes."""
+
+import numpy as np
+import pytest
+
+from rbpf.lie import SE3
+from rbpf.motion.stereo_consensus import Draws, _Search, align, consensus, triples
+from rbpf.motion.stereo_geometry import see
+from tests.motion.stereo_pairs import LEAP, ROAD, ROOM, World, correlated, mistaken, simulate
+
+GATE = 11.345
+
+
+def test_triples_are_three_and_equally_likely():
+    drawn = triples(5, 60_000, np.random.default_rng(0))
+    assert (np.diff(np.sort(drawn, axis=1), axis=1) > 0).all()
+    code = drawn @ [25, 5, 1]
+    counts = np.unique(code, return_counts=True)[1]
+    assert len(counts) == 60
+    assert np.square(counts - 1000.0).sum() / 1000.0 < 105.0  # χ² with 59 degrees of freedom, 99.98 %
+
+
+def test_triples_of_three():
+    np.testing.assert_array_equal(
+        np.sort(triples(3, 20, np.random.default_rng(1)), axis=1), np.tile([0, 1, 2], (20, 1))
+    )
+
+
+def test_alignment():
+    rng = np.random.default_rng(2)
+    motions, now = SE3.exp(rng.normal(size=(30, 6))), rng.normal(size=(30, 3, 3))
+    found = align(SE3.transform(motions[:, None], now), now)
+    np.testing.assert_allclose(SE3.local(motions, found), 0.0, atol=1e-9)
+
+
+def test_points_that_coincide_or_lie_on_a_line_align_to_something():
+    line = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 2.0], [0.0, 0.0, 3.0]])
+    assert np.isfinite(align(np.stack([line, 0.0 * line]), np.stack([line, line]))).all()
+
+
+@pytest.mark.parametrize("world", [ROAD, ROOM, LEAP], ids=["road", "room", "leap"])
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.6])
+def test_false_matches_do_not_move_it(world, share):
+    rng = np.random.default_rng(3)
+    pair = simulate(world, 200, rng)
+    matches, wrong = mistaken(pair, share, rng)
+    found = consensus(matches, SE3.identity(), GATE, rng)
+    seen = see(matches.camera, found, matches.z_prev)
+    off = np.linalg.norm(seen.pixels - matches.z_now, axis=1)
+    assert np.median(off[~wrong]) < 3.0
+    assert not wrong.any() or np.median(off[wrong]) > 20.0
+
+
+def test_a_motion_of_any_size():
+    """Half a turn about the optical axis and a metre, which no iteration from rest would find."""
+    world = World(ROOM.camera, 2.0, 6.0, (0.0, 0.0, 3.0, 0.3, -0.2, 0.5))
+    rng = np.random.default_rng(4)
+    pair = simulate(world, 150, rng)
+    matches, _ = mistaken(pair, 0.3, rng)
+    found = consensus(matches, SE3.identity(), GATE, rng)
+    assert np.abs(SE3.local(pair.delta, found)).max() < 0.1
+
+
+def test_the_same_seed_gives_the_same_bytes():
+    matches, _ = mistaken(simulate(ROOM, 100, np.random.default_rng(5)), 0.4, np.random.default_rng(6))
+    found = [consensus(matches, SE3.identity(), GATE, np.random.default_rng(7)) for _ in range(2)]
+    assert found[0].tobytes() == found[1].tobytes()
+
+
+def test_a_good_guess_takes_part():
+    """So few matches are true that no triple of the first batch is."""
+    rng = np.random.default_rng(8)
+    pair = simulate(ROOM, 300, rng)
+    matches, _ = mistaken(pair, 0.97, rng)
+    blind, guided = (
+        consensus(matches, start, GATE, np.random.default_rng(9), Draws(most=32))
+        for start in (SE3.identity(), SE3.retract(pair.delta, 1e-3 * np.ones(6)))
+    )
+    assert np.abs(SE3.local(pair.delta, blind)).max() > 0.05
+    assert np.abs(SE3.local(pair.delta, guided)).max() < 0.05
+
+
+@pytest.mark.parametrize(("share", "needed"), [(0.5, 68.98), (0.3, 336.4)])
+def test_how_many_triples_it_takes(share, needed):
+    """log(1 − p) / log(1 − w³), Fischler and Bolles (1981)."""
+    assert Draws().needed(share) == pytest.approx(needed, rel=1e-3)
+    assert Draws().needed(1.0) <= 1.0
+    assert Draws().needed(0.0) == np.inf
+
+
+def test_compiled_scores():
+    """Beside the distances of each match by NumPy, also where some are behind the camera."""
+    rng = np.random.default_rng(10)
+    matches = correlated(LEAP, 50, rng).matches
+    search = _Search(matches, SE3.identity())
+    motions = SE3.exp(rng.normal(scale=[0.1] * 3 + [0.5, 0.5, 2.0], size=(20, 6)))
+    motions[0] = SE3.exp(np.array(LEAP.xi))
+    squared = search.squared(motions, np.arange(50))
+    score, share = search.scores(motions, GATE)
+    assert np.isinf(squared).any() and (squared <= GATE).any()
+    np.testing.assert_allclose(score, np.minimum(squared, GATE).sum(axis=1), rtol=1e-9)
+    np.testing.assert_array_equal(share, (squared <= GATE).mean(axis=1))

@@ -1,0 +1,99 @@
+"""The innovation of matches: its compiled twin, the earlier point's noise, the adjusted points."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from rbpf.lie import SE3
+from rbpf.motion.stereo_geometry import see
+from rbpf.motion.stereo_reprojection import innovation, residuals, squared_distances, white_rows
+from tests.motion.stereo_pairs import FAR_ROAD, LEAP, ROAD, correlated
+
+every_kind = pytest.mark.parametrize("points", ["adjusted", "propagated", "exact"])
+
+
+@every_kind
+@pytest.mark.parametrize("world", [ROAD, LEAP, FAR_ROAD], ids=["road", "leap", "far"])
+def test_the_compiled_twin(world, points):
+    matches, delta = correlated(world, 40, np.random.default_rng(0))
+    rows, front, pixels = white_rows(matches, delta, points)
+    found = innovation(matches, delta, points)
+    np.testing.assert_allclose(pixels, found.pixels, atol=1e-4)
+    assert front.all() and found.seen.front.all()
+    # The twins end their sweeps for each match, and for all.
+    np.testing.assert_allclose(rows, found.white_rows(), rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(squared_distances(matches, delta, points), np.square(rows[..., 0]).sum(axis=1))
+
+
+@every_kind
+def test_points_behind_the_camera(points):
+    matches, _ = correlated(LEAP, 30, np.random.default_rng(1))
+    past = SE3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 3.0]))
+    behind = LEAP.camera.locate(matches.z_prev)[:, 2] < 2.9
+    rows, front, _ = white_rows(matches, past, points)
+    distances = squared_distances(matches, past, points)
+    assert behind.any() and not front[behind].any()
+    np.testing.assert_array_equal(rows[~front], 0.0)
+    np.testing.assert_array_equal(innovation(matches, past, points).seen.front, front)
+    np.testing.assert_array_equal(np.isinf(distances), ~front)
+    assert np.isinf(residuals(matches, past, points)[0]).all()
+
+
+def test_the_earlier_points_covariance_in_space():
+    """A R⁻ Aᵀ = J_P C J_Pᵀ, with the derivatives of the camera itself."""
+    matches, delta = correlated(ROAD, 20, np.random.default_rng(2))
+    camera = matches.camera
+    before = camera.locate(matches.z_prev)
+    by_z = np.linalg.inv(camera.slope(before))
+    cov_points = by_z @ matches.cov_prev @ by_z.mT
+    by_point = camera.slope(SE3.inverse_transform(delta, before)) @ SE3.rotation(delta).T
+    expected = matches.cov_now + by_point @ cov_points @ by_point.mT
+    np.testing.assert_allclose(innovation(matches, delta, "propagated").cov, expected, rtol=1e-8)
+    np.testing.assert_array_equal(innovation(matches, delta, "exact").cov, matches.cov_now)
+
+
+@pytest.mark.parametrize("world", [ROAD, LEAP, FAR_ROAD], ids=["road", "leap", "far"])
+def test_adjusted_distances_are_the_minimum_over_the_point(world):
+    matches, delta = correlated(world, 6, np.random.default_rng(3))
+    off = SE3.retract(delta, 0.01 * np.ones(6))
+    ours = squared_distances(matches, off, "adjusted")
+    for row in range(len(matches)):
+        one = matches.rows(np.array([row]))
+        whites = [np.linalg.inv(np.linalg.cholesky(cov[0])) for cov in (one.cov_prev, one.cov_now)]
+
+        def misses(pixels, one=one, whites=whites):
+            seen = see(one.camera, off, pixels[None]).pixels[0]
+            return np.concatenate([whites[0] @ (one.z_prev[0] - pixels), whites[1] @ (one.z_now[0] - seen)])
+
+        theirs = least_squares(misses, one.z_prev[0], xtol=1e-15, ftol=1e-15, gtol=1e-12)
+        np.testing.assert_allclose(ours[row], 2.0 * theirs.cost, rtol=1e-6)
+
+
+@pytest.mark.parametrize("world", [ROAD, LEAP, FAR_ROAD], ids=["road", "leap", "far"])
+def test_the_derivative_of_what_is_minimised(world):
+    """Jᵀε is the gradient of ½‖ε‖² after the points are eliminated, also away from the minimum."""
+    matches, delta = correlated(world, 30, np.random.default_rng(4))
+    off = SE3.retract(delta, np.array([2e-3, -1e-3, 1e-3, 0.02, 0.01, -0.02]))
+    residual, jac = residuals(matches, off, "adjusted")
+
+    def half(xi):
+        return 0.5 * squared_distances(matches, SE3.retract(off, xi), "adjusted").sum()
+
+    steps = 1e-4 * np.repeat([0.1, 1.0], 3)
+    numeric = [(half(s * e) - half(-s * e)) / (2 * s) for s, e in zip(steps, np.eye(6), strict=True)]
+    np.testing.assert_allclose(jac.T @ residual, numeric, rtol=2e-4)
+
+
+def test_exact_derivative():
+    matches, delta = correlated(LEAP, 10, np.random.default_rng(5))
+    matches = replace(matches, z_now=matches.z_now + 1.0)
+    jac = residuals(matches, delta, "exact")[1]
+    step = 1e-6
+    numeric = [
+        residuals(matches, SE3.retract(delta, step * e), "exact")[0]
+        - residuals(matches, SE3.retract(delta, -step * e), "exact")[0]
+        for e in np.eye(6)
+    ]
+    np.testing.assert_allclose(jac, np.stack(numeric, axis=1) / (2 * step), atol=1e-4 * np.abs(jac).max())
