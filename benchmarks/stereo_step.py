@@ -23,12 +23,13 @@ AIM_MS, AIM_GROWTH = 30.0, 1.5
 NOISE = np.diag([0.1, 0.1, 0.12]) + 0.05 * np.array([[1, 0, 1], [0, 0, 0], [1, 0, 1]])
 STD = np.repeat([5e-4, 2e-3], 3)
 PLACE_M, KEY = 0.01, 0.012
+SETTLING = 8
 
 
 class Drive:
     """A robot that turns on the spot among landmarks on all sides."""
 
-    def __init__(self, landmarks: int) -> None:
+    def __init__(self, landmarks: int, turns: int) -> None:
         rng, config = np.random.default_rng(0), StereoConfig()
         self.rng, self.config, self.turn = rng, config, 0
         likelihood = config.likelihood.build()
@@ -40,16 +41,14 @@ class Drive:
         keys = np.abs(rng.standard_normal((landmarks, config.sift.length)))
         self.keys = (keys / np.linalg.norm(keys, axis=1, keepdims=True)).astype(np.float32)
         self._fill(landmarks)
-        for _ in range(8):
+        self.frames = [self._features(turned(turn)) for turn in range(1, turns + SETTLING + 1)]
+        for _ in range(SETTLING):
             self()
 
     def __call__(self) -> None:
         """One update."""
+        self.filter.step(StereoFrame(self.frames[self.turn]), Odometry(turned(1), np.diag(STD**2)))
         self.turn += 1
-        delta = SE3.exp(np.array([0.0, 0.02, 0.0, 0.0, 0.0, 0.0]))
-        pose = SE3.exp(np.array([0.0, 0.02 * self.turn, 0.0, 0.0, 0.0, 0.0]))
-        control = Odometry(delta, np.diag(STD**2))
-        self.filter.step(StereoFrame(self._features(pose)), control)
 
     def _fill(self, landmarks: int) -> None:
         """Every landmark in every particle's map, with counters of one often seen."""
@@ -84,10 +83,16 @@ class Drive:
         return StereoFeatures.measured(RIG, z, cov, zero + 2.0, zero, keys)
 
 
+def turned(times: int) -> np.ndarray:
+    """World_from_camera (7,) after so many updates."""
+    return SE3.exp(np.array([0.0, 0.02 * times, 0.0, 0.0, 0.0, 0.0]))
+
+
 def run(settings: Settings) -> list[Row]:
     """The large map beside the small one."""
-    contestants = {"large": Drive(LARGE), "small": Drive(SMALL)}
-    times = interleaved(contestants, settings.repetitions(40))
+    turns = settings.repetitions(40)
+    contestants = {name: Drive(size, turns + 3) for name, size in (("large", LARGE), ("small", SMALL))}
+    times = interleaved(contestants, turns)
     large, small = times["large"].median * 1e3, times["small"].median * 1e3
     seen = int((contestants["large"].sensor.names >= 0).sum())
     return [

@@ -45,9 +45,8 @@ class Places:
 
     def in_view(self, names: np.ndarray, world_from_camera: np.ndarray) -> np.ndarray:
         """Those of landmarks (M,) that a camera (7,) may see and know again."""
+        names = names[self._in_image(SE3.inverse_transform(world_from_camera, self._rows.place[names]))]
         place = self._rows.place[names]
-        near = self.rig.visible(SE3.inverse_transform(world_from_camera, place), -self.config.margin_px)
-        names, place = names[near], place[near]
         then = place - self._rows.seen_from[names]
         now = place - SE3.translation(world_from_camera)
         lengths = np.linalg.norm(then, axis=1), np.linalg.norm(now, axis=1)
@@ -55,6 +54,15 @@ class Places:
         ratio = np.abs(np.log(lengths[1] / np.maximum(lengths[0], 1e-300)))
         alike = (cosine >= np.cos(np.deg2rad(self.config.turn_deg))) & (ratio <= np.log(self.config.scale))
         return np.asarray(names[alike])
+
+    def _in_image(self, local: np.ndarray) -> np.ndarray:
+        """Rows of points (M, 3) in the camera's frame that are in both images, or nearly; most are far from it."""
+        camera, margin = self.rig.camera, self.config.margin_px
+        across = (max(camera.cx, camera.width - camera.cx) + margin) / camera.fx
+        down = (max(camera.cy, camera.height - camera.cy) + margin) / camera.fy
+        x, y, z = local.T
+        rows = np.flatnonzero((z > 0.0) & (np.abs(x) <= across * z) & (np.abs(y) <= down * z))
+        return rows[self.rig.visible(local[rows], -margin)]
 
     def arrays(self) -> dict[str, np.ndarray]:
         """For a checkpoint."""

@@ -20,7 +20,6 @@ from rbpf.maps.point import Point
 from rbpf.models import Births, Likelihood, Observations, Part, Sensor
 from rbpf.sensors.key_index import Gate, KeyIndex
 from rbpf.sensors.key_management import KeyConfig, KeyManager
-from rbpf.sensors.names import Names
 from rbpf.sensors.pinhole import RectifiedStereo
 from rbpf.sensors.stereo_features import StereoFeatures
 from rbpf.sensors.stereo_points import StereoPoint
@@ -69,7 +68,8 @@ class StereoSensor(Sensor):
         """(K,) of the last pair's features, NULL where they are no landmark's."""
         self.seconds = 0.0
         """Time that matching the last pair took."""
-        self._ids = Names()
+        self._ids = np.full(64, NULL, dtype=np.int64)
+        self._told = -1
 
     def observe(self, frame: StereoFrame, belief: Belief) -> Sequence[Observations]:
         """The features that are landmarks, and those that are keys on trial."""
@@ -79,9 +79,8 @@ class StereoSensor(Sensor):
         if self.config.used:
             self.names = self._matched(frame, belief)
         seen = self.names >= 0
-        known = self._ids.ids(belief.catalogue)
         ids = np.full(seen.size, NULL, dtype=np.int64)
-        ids[seen] = [known[name] for name in self.names[seen].tolist()]
+        ids[seen] = self._ids_of(self.names[seen], belief)
         weighing = self._weighing()
         groups = []
         for chosen, informs in ((weighing | ~seen, None), (seen & ~weighing, _MAP)):
@@ -143,9 +142,7 @@ class StereoSensor(Sensor):
         rows = np.arange(len(features)) if frame.free is None else np.flatnonzero(frame.free)
         names = self._alike(features.keys[rows], belief)
         if names.size and rows.size:
-            known = self._ids.ids(belief.catalogue)
-            ids = np.array([known[name] for name in names.tolist()], dtype=np.int64)
-            mean, cov = self._expected(ids, belief)
+            mean, cov = self._expected(self._ids_of(names, belief), belief)
             gate = Gate(features.z[rows], features.cov[rows], names, mean, cov, self.config.gate)
             out[rows] = self.index.match(features.keys[rows], gate).ids
         return out
@@ -180,6 +177,17 @@ class StereoSensor(Sensor):
         between = np.einsum("nka,nkb->kab", off, off) / px.shape[0]
         return px.mean(axis=0), symmetrise(within + between) + self.config.slack_px**2 * np.eye(3)
 
+    def _ids_of(self, names: np.ndarray, belief: Belief) -> np.ndarray:
+        """Ids (k,) that the map has given to names (k,); what is new in the catalogue is noted, from its end on."""
+        if self.manager.next_name > self._ids.size:
+            self._ids = np.concatenate([self._ids, np.full(self.manager.next_name, NULL, dtype=np.int64)])
+        last = self._told
+        for landmark, name in reversed(belief.catalogue.items()):
+            if landmark <= last:
+                break
+            self._ids[name], self._told = landmark, max(self._told, landmark)
+        return self._ids[names]
+
     def _evenly(self, weights: np.ndarray) -> np.ndarray:
         """Rows of particles, each for an equal share of the weight."""
         count = min(self.config.cloud, weights.size)
@@ -188,15 +196,13 @@ class StereoSensor(Sensor):
 
     def _forget(self, belief: Belief, names: np.ndarray) -> None:
         if names.size:
-            known = self._ids.ids(belief.catalogue)
-            belief.map.remove(np.array([known[name] for name in names.tolist()], dtype=np.int64))
+            belief.map.remove(self._ids_of(names, belief))
             self.index.store.remove(names)
 
     def _place(self, belief: Belief, names: np.ndarray) -> None:
         """Notes where the heaviest particle has landmarks now."""
         if names.size:
-            known = self._ids.ids(belief.catalogue)
-            ids = np.array([known[name] for name in names.tolist()], dtype=np.int64)
+            ids = self._ids_of(names, belief)
             mode = belief.mode
             self.places.put(names, belief.read(ids, np.array([mode])).mean[0], belief.state[mode])
 
