@@ -29,6 +29,7 @@ NAMES = (
     "patch_search",
     "key_search",
     "motion_estimate",
+    "stereo_step",
     "bootstrap_peers",
     "mrpt_peer",
 )

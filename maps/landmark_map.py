@@ -15,7 +15,7 @@ from rbpf.maps.plan import BOTH, MAP, STATE, Plan, by_use, make_plan, require_ap
 from rbpf.maps.point import Point
 from rbpf.maps.reading import project_compiled, read_records
 from rbpf.maps.rows import RowEngine
-from rbpf.maps.shared import SharedStore
+from rbpf.maps.shared import ALL, SharedStore
 from rbpf.models import (
     Births,
     Conditional,
@@ -100,8 +100,8 @@ class LandmarkMap(Conditional):
         for landmark in ids.tolist():
             self.catalogue.pop(landmark, None)
 
-    def read(self, ids: np.ndarray) -> Records:
-        """Estimates (N, K, …) of landmarks that share one parametrisation."""
+    def read(self, ids: np.ndarray, particles: np.ndarray | slice = ALL) -> Records:
+        """Estimates (N, K, …) of landmarks that share one parametrisation, in all or some particles."""
         self._known(ids)
         ids = np.asarray(ids)
         if ids.size == 0:
@@ -111,7 +111,7 @@ class LandmarkMap(Conditional):
             raise InputError(
                 "read() takes landmarks of one parametrisation at a time; `landmark_of` tells which"
             )
-        return read_records(self.store, self.layouts[kinds[0]], ids)
+        return read_records(self.store, self.layouts[kinds[0]], ids, particles)
 
     def is_compiled(self, model: ObservationModel, ids: np.ndarray) -> bool:
         """Whether `project` can tell what the model measures of landmarks (K,)."""

@@ -5,16 +5,18 @@ import numpy as np
 from rbpf.kernels.gather import gather
 from rbpf.kernels.project import project
 from rbpf.maps.layout import Layout
-from rbpf.maps.shared import SharedStore
+from rbpf.maps.shared import ALL, SharedStore
 from rbpf.models import FusedKernel, Records
 from rbpf.proposals import Prior
 
 
-def read_records(store: SharedStore, layout: Layout, ids: np.ndarray) -> Records:
-    """Estimates (N, K, …) of landmarks (K,) of one parametrisation. Cold columns stay cold."""
+def read_records(
+    store: SharedStore, layout: Layout, ids: np.ndarray, particles: np.ndarray | slice = ALL
+) -> Records:
+    """Estimates (N, K, …) of landmarks (K,) of one parametrisation, in all or some particles; cold ones stay cold."""
     landmark = layout.landmark
-    if landmark.components > 1 or not store.is_warm(ids):
-        return layout.unpack(np.array([store.read(int(i)) for i in ids]))
+    if particles is not ALL or landmark.components > 1 or not store.is_warm(ids):
+        return layout.unpack(np.array([store.read(int(i), particles) for i in ids]))
     n, k, dim = store.n, ids.size, landmark.dim
     access = store.access(ids)
     mean, cov, const = np.empty((n, k, dim)), np.empty((n, k, dim, dim)), np.empty((n, k, landmark.constants))

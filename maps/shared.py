@@ -14,6 +14,7 @@ from rbpf.errors import InputError
 from rbpf.genealogy import Lineage, Schedule
 from rbpf.maps.pool import Pool
 
+ALL = slice(None)
 HOT_SHARE = 0.75
 """A column with fewer surviving rows than this share of the particles gives its dense slab back."""
 COLD_SHARE = 0.9
@@ -94,15 +95,15 @@ class SharedStore:
         self._vacate(column)
         self._occupy(column, records)
 
-    def read(self, column: int) -> np.ndarray:
-        """Records of all particles, (fields, N)."""
+    def read(self, column: int, particles: np.ndarray | slice = ALL) -> np.ndarray:
+        """Records of all or some particles, (fields, N)."""
         generation = int(self._generation[column])
-        rows = self.lineage.rows(generation)
+        rows = self.lineage.rows(generation)[particles]
         cold = self._cold.get(column)
         if cold is not None:
             return cold.data[:, np.searchsorted(cold.kept, rows)]
         slab = self._pool(column).data[self._slab[column]]
-        return slab.copy() if generation == self.lineage.generation else slab[:, rows]
+        return slab[:, particles].copy() if generation == self.lineage.generation else slab[:, rows]
 
     def is_warm(self, columns: np.ndarray) -> bool:
         """Whether `access` may read columns (K,) as they are."""

@@ -59,9 +59,9 @@ class Belief:
         """Facts about landmarks that do not differ between particles: names, patches, descriptors, counters."""
         return self.map.catalogue
 
-    def read(self, ids: Sequence[int] | np.ndarray) -> Records:
-        """Estimates (N, K, …) of landmarks of one parametrisation."""
-        return self.map.read(np.asarray(ids, dtype=np.int64))
+    def read(self, ids: Sequence[int] | np.ndarray, particles: np.ndarray | slice = slice(None)) -> Records:
+        """Estimates (N, K, …) of landmarks of one parametrisation, in all particles or in the rows named."""
+        return self.map.read(np.asarray(ids, dtype=np.int64), particles)
 
     def predictions(
         self, model: ObservationModel, z: np.ndarray, cov: np.ndarray, ids: np.ndarray

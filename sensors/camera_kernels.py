@@ -48,6 +48,31 @@ def camera_point(state, mean, const, z, params, n, nu, jac_state, jac_landmark):
             jac_landmark[1, k, i] = d10 * r[3 * k] + d11 * r[3 * k + 1] + d12 * r[3 * k + 2]
 
 
+@observation_kernel
+def stereo_point(state, mean, const, z, params, n, nu, jac_state, jac_landmark):
+    """A world point in a rectified pair, z = (u_left, v, u_right); params are fx, fy, cx, cy and the baseline."""
+    fx, fy, cx, cy, baseline = params[0], params[1], params[2], params[3], params[4]
+    for i in range(n):
+        r = rotation(state[0, i], state[1, i], state[2, i], state[3, i])
+        a, b, c = mean[0, i] - state[4, i], mean[1, i] - state[5, i], mean[2, i] - state[6, i]
+        x = r[0] * a + r[3] * b + r[6] * c
+        y = r[1] * a + r[4] * b + r[7] * c
+        depth = forward_depth(x, y, r[2] * a + r[5] * b + r[8] * c)
+        gx, gy = fx / depth, fy / depth
+        left, down, right = gx * x, gy * y, gx * (x - baseline)
+        nu[0, i] = z[0] - left - cx
+        nu[1, i] = z[1] - down - cy
+        nu[2, i] = z[2] - right - cx
+        e, f, g = -left / depth, -down / depth, -right / depth
+        store_by_state(0, gx, 0.0, e, x, y, depth, 1.0, jac_state, i)
+        store_by_state(1, 0.0, gy, f, x, y, depth, 1.0, jac_state, i)
+        store_by_state(2, gx, 0.0, g, x, y, depth, 1.0, jac_state, i)
+        for k in range(3):
+            jac_landmark[0, k, i] = gx * r[3 * k] + e * r[3 * k + 2]
+            jac_landmark[1, k, i] = gy * r[3 * k + 1] + f * r[3 * k + 2]
+            jac_landmark[2, k, i] = gx * r[3 * k] + g * r[3 * k + 2]
+
+
 @njit(cache=True, error_model="numpy", inline="always")
 def _ray(state, mean, const, z, params, nu, jac_state, jac_landmark, i):
     """Residual and derivatives of the full 2-D measurement of lane i."""

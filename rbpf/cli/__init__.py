@@ -9,7 +9,14 @@ import tyro
 from tyro.extras import SubcommandApp
 
 from rbpf.cli import judging
-from rbpf.cli.options import ImagesOptions, LabOptions, MonoOptions, RangeBearingOptions, given_board
+from rbpf.cli.options import (
+    ImagesOptions,
+    LabOptions,
+    MonoOptions,
+    RangeBearingOptions,
+    StereoOptions,
+    given_board,
+)
 from rbpf.cli.showing import CONSOLE, progress, told
 from rbpf.errors import InputError
 
@@ -82,6 +89,29 @@ def run_mono(options: Annotated[MonoOptions, tyro.conf.arg(name="")]) -> None:
         entries = finish_mono(
             run, recording, options.out, options.video, options.rerun, options.batch, telling
         )
+    _print_summary(entries, options.out)
+    if run.failure is not None:
+        raise InputError(f"{run.failure}; what was computed before it is in {options.out}")
+
+
+@RUN.command(name="stereo")
+def run_stereo(options: Annotated[StereoOptions, tyro.conf.arg(name="")]) -> None:
+    """Stereo SLAM over a sequence of pairs of images (S05: SIFT landmarks, visual odometry, 400 particles)."""
+    from rbpf.systems.settings import load_settings
+    from rbpf.systems.stereo.config import StereoConfig
+    from rbpf.validation.mono_rerun import require_rerun
+    from rbpf.validation.stereo import StereoRecording, finish_stereo, start_stereo
+
+    if options.rerun is not None:
+        require_rerun()
+    given = _given(options, "particles", "seed", "dof")
+    config = load_settings(StereoConfig, "stereo", options.config, options.set, given)
+    recording = StereoRecording(options.sequence, options.calibration)
+    _prepare(options.threads)
+    with progress() as bar:
+        task = bar.add_task("filtering", total=None)
+        run = start_stereo(recording, config, options.out, options.resume, told(bar, task))
+    entries = finish_stereo(run, recording, options.out, options.rerun)
     _print_summary(entries, options.out)
     if run.failure is not None:
         raise InputError(f"{run.failure}; what was computed before it is in {options.out}")

@@ -84,6 +84,38 @@ class MonoOptions:
 
 
 @dataclass(frozen=True)
+class StereoOptions:
+    """Options of `rbpf run stereo`.
+
+    Attributes:
+        sequence: images of a rectified pair, or of one that its calibration rectifies: a folder of EuRoC ASL with cam0
+            and cam1, or of KITTI odometry with image_0 and image_1.
+        calibration: camera.yaml in place of the sequence's own.
+        out: folder for the results.
+        particles: number of particles; by default as in the configuration.
+        dof: degrees of freedom of the camera: 6, or 3 in its x-z plane; by default as in the configuration.
+        seed: of the random generators; by default as in the configuration.
+        config: YAML file of settings, such as a former run's config.yaml.
+        set: a setting as key=value, such as proposal.kind=ekf or sift.length=128.
+        resume: go on from the checkpoint in the results' folder.
+        rerun: also write a recording (.rrd) for the Rerun viewer.
+        threads: threads of the kernels; by default all.
+    """
+
+    sequence: tyro.conf.Positional[Path]
+    calibration: Path | None = None
+    out: Path = Path("run")
+    particles: int | None = None
+    dof: Literal[3, 6] | None = None
+    seed: int | None = None
+    config: Path | None = None
+    set: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    resume: tyro.conf.FlagCreatePairsOff[bool] = False
+    rerun: Path | None = None
+    threads: int | None = None
+
+
+@dataclass(frozen=True)
 class ImagesOptions:
     """Options of `rbpf simulate desk` and `rbpf simulate room`.
 

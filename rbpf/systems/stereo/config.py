@@ -1,0 +1,140 @@
+"""Every setting of stereo SLAM, with its default, its unit and what it does."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from rbpf.errors import InputError
+from rbpf.motion.stereo_odometer import Prediction
+from rbpf.motion.stereo_vo import VoConfig
+from rbpf.sensors.key_management import KeyConfig
+from rbpf.sensors.key_matching import MatchLimits
+from rbpf.sensors.sift import SiftConfig
+from rbpf.sensors.stereo_matching import StereoConfig as PairConfig
+from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig, ResamplingConfig
+
+
+@dataclass(frozen=True)
+class OdometryConfig:
+    """Motion from pair to pair (S05 §III-C), and its noise as the filter takes it.
+
+    Attributes:
+        estimate: how a motion is estimated from matches.
+        prediction: what is expected before anything is seen, and assumed where nothing is.
+        limits: of the keys of two pairs.
+        std_added_rad: injected per update (S05 §V), standard deviation of the turn about each axis.
+        std_added_m: likewise of the shift along each axis.
+        split: S05 uses each feature twice, for the odometry and for the map ("none"). To measure what that does, the
+            features can be divided by lot into two halves: one for the odometry and the other for the map ("apart"),
+            or one of them for both ("same").
+    """
+
+    estimate: VoConfig = field(default_factory=VoConfig)
+    prediction: Prediction = field(default_factory=Prediction)
+    limits: MatchLimits = field(default_factory=MatchLimits)
+    std_added_rad: float = 0.0
+    std_added_m: float = 0.0
+    split: Literal["none", "apart", "same"] = "none"
+
+
+@dataclass(frozen=True)
+class MapConfig:
+    """Which features of a pair are landmarks of the map.
+
+    Attributes:
+        used: whether there is a map; without one the filter is the odometry and its noise.
+        weigh: whether keys that are no landmarks yet weigh the particles, too; in the map they are in any case.
+        limits: of the keys of a feature and a landmark.
+        gate: largest squared Mahalanobis distance from where the particles expect the landmark; 11.3 holds 99 %.
+        slack_px: added to that expectation, standard deviation per axis.
+        cloud: particles, drawn evenly from the weight, that say where a landmark is expected.
+        margin_px: landmarks so far outside the image, as the heaviest particle sees it, may be in it.
+        turn_deg: a landmark is not looked for once its line of sight has turned by this since it was seen last.
+        scale: nor once it is so many times nearer or farther.
+        depth_share: a feature starts a landmark if the standard deviation of its depth is below this share of it.
+    """
+
+    used: bool = True
+    weigh: Literal["landmarks", "all"] = "landmarks"
+    limits: MatchLimits = field(default_factory=MatchLimits)
+    gate: float = 11.3
+    slack_px: float = 1.0
+    cloud: int = 32
+    margin_px: float = 20.0
+    turn_deg: float = 45.0
+    scale: float = 2.0
+    depth_share: float = 0.1
+
+    def __post_init__(self) -> None:
+        """Checks what no part checks itself."""
+        if self.cloud < 1:
+            raise InputError(f"cloud must be at least one particle, got {self.cloud}")
+        if not (self.gate > 0.0 and self.slack_px >= 0.0 and self.scale >= 1.0 and self.depth_share > 0.0):
+            found = f"{self.gate}, {self.slack_px}, {self.scale} and {self.depth_share}"
+            raise InputError(
+                f"expected gate and depth_share above 0, slack_px from 0 up and scale from 1 up, got {found}"
+            )
+
+
+@dataclass(frozen=True)
+class TriggerConfig:
+    """The filter is updated only when the camera has moved enough since the last update (S05 §IV).
+
+    Attributes:
+        moved_m: by so much …
+        turned_rad: … or turned by so much …
+        frames: … or, having moved at all or not, after so many pairs; 0 for never.
+    """
+
+    moved_m: float = 0.02
+    turned_rad: float = 0.02
+    frames: int = 0
+
+    def __post_init__(self) -> None:
+        """Checks what no part checks itself."""
+        if not (self.moved_m >= 0.0 and self.turned_rad >= 0.0 and self.frames >= 0):
+            found = f"{self.moved_m}, {self.turned_rad} and {self.frames}"
+            raise InputError(f"moved_m, turned_rad and frames must not be negative, got {found}")
+
+
+@dataclass(frozen=True)
+class StereoConfig:
+    """A run of stereo SLAM.
+
+    Attributes:
+        particles: number of particles.
+        seed: of all random generators.
+        dof: degrees of freedom of the camera: 6, or 3 for one that moves in its x–z plane and turns about y.
+        compiled: run the fused kernels; false runs their NumPy twins.
+        checkpoint_every: pairs between checkpoints.
+        sift: keypoints of the images.
+        pair: matching of the two images of a pair.
+        odometry: motion from pair to pair.
+        trigger: when the filter is updated.
+        map: which features are landmarks.
+        keys: which features become landmarks, and how long they stay.
+        likelihood: of a landmark's innovation, S05 (6) by default.
+        proposal: where particles are sampled.
+        resampling: when and how.
+    """
+
+    particles: int = 400
+    seed: int = 0
+    dof: Literal[3, 6] = 6
+    compiled: bool = True
+    checkpoint_every: int = 500
+    sift: SiftConfig = field(default_factory=SiftConfig)
+    pair: PairConfig = field(default_factory=PairConfig)
+    odometry: OdometryConfig = field(default_factory=OdometryConfig)
+    trigger: TriggerConfig = field(default_factory=TriggerConfig)
+    map: MapConfig = field(default_factory=MapConfig)
+    keys: KeyConfig = field(default_factory=KeyConfig)
+    likelihood: LikelihoodConfig = field(default_factory=lambda: LikelihoodConfig("truncated"))
+    proposal: ProposalConfig = field(default_factory=lambda: ProposalConfig("prior"))
+    resampling: ResamplingConfig = field(default_factory=ResamplingConfig)
+
+    def __post_init__(self) -> None:
+        """Checks what no part checks itself."""
+        if self.particles < 1:
+            raise InputError(f"particles must be at least 1, got {self.particles}")
+        if self.checkpoint_every < 1:
+            raise InputError(f"checkpoint_every must be at least 1, got {self.checkpoint_every}")

@@ -1,0 +1,125 @@
+"""Where the camera has come since the filter was updated, and by odometry alone: pair after pair, over missing ones."""
+
+from dataclasses import dataclass
+from typing import NamedTuple, final
+
+import numpy as np
+
+from rbpf import gaussian
+from rbpf.lie import SE3
+from rbpf.motion.odometry import Odometry
+from rbpf.motion.stereo_odometer import StereoOdometer
+from rbpf.motion.stereo_odometry import StereoOdometry
+
+
+class Pixels(NamedTuple):
+    """Matches of two pairs: z (K, 3) and cov (K, 3, 3) in the earlier one, and in the later one."""
+
+    z_prev: np.ndarray
+    z_now: np.ndarray
+    cov_prev: np.ndarray
+    cov_now: np.ndarray
+
+
+@dataclass(frozen=True)
+class Reckoned:
+    """What is known of a pair's pose before the filter sees it.
+
+    Attributes:
+        since_update: motion since the filter's last update.
+        world_from_camera: (7,) by odometry alone; the first camera is the world.
+        agreeing: matches that agree with the motion.
+        note: what had to be assumed, in words; empty where nothing had.
+    """
+
+    since_update: Odometry
+    world_from_camera: np.ndarray
+    agreeing: int = 0
+    note: str = ""
+
+
+@final
+class DeadReckoning:
+    """Chains the increments of visual odometry from the last pair that could be measured.
+
+    Args:
+        odometer: estimates increments.
+        dof: 3 keeps the camera in its x–z plane.
+    """
+
+    def __init__(self, odometer: StereoOdometer, dof: int) -> None:
+        self.odometer = odometer
+        self._plane = StereoOdometry(3 if dof == 3 else 6)
+        self._stamp_ns: int | None = None
+        self._at = Reckoned(standstill(), SE3.identity())
+
+    @property
+    def begun(self) -> bool:
+        """Whether there is a pair to measure from."""
+        return self._stamp_ns is not None
+
+    def begin(self, stamp_ns: int) -> Reckoned:
+        """The first pair that can be measured from."""
+        self._stamp_ns = stamp_ns
+        return self._at
+
+    def measured(self, stamp_ns: int, matches: Pixels, rng: np.random.Generator) -> Reckoned:
+        """A pair that is matched with the last measured one; the next one is measured from it."""
+        self.odometer.rng = rng
+        step = self.odometer.step(*matches, self._seconds(stamp_ns))
+        self._stamp_ns = stamp_ns
+        self._at = self._moved(step.odometry, int(step.estimate.inliers.sum()), step.note)
+        return self._at
+
+    def assumed(self, stamp_ns: int) -> Reckoned:
+        """A pair that cannot be measured: the last velocity is expected to go on."""
+        if not self.begun:
+            return self._at
+        expected = self.odometer.prediction.law(self.odometer.velocity, self._seconds(stamp_ns))
+        return self._moved(expected, 0, "")
+
+    def updated(self) -> None:
+        """The filter has taken the motion up to the last measured pair."""
+        self._at = Reckoned(standstill(), self._at.world_from_camera)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """For a checkpoint."""
+        at = self._at
+        return {
+            "reckoning/stamp_ns": np.array(
+                [] if self._stamp_ns is None else [self._stamp_ns], dtype=np.int64
+            ),
+            "reckoning/velocity": self.odometer.velocity,
+            "reckoning/delta": at.since_update.delta,
+            "reckoning/cov": at.since_update.cov,
+            "reckoning/world_from_camera": at.world_from_camera,
+        }
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """The inverse of `arrays`."""
+        stamps = arrays["reckoning/stamp_ns"]
+        self._stamp_ns = int(stamps[0]) if stamps.size else None
+        self.odometer.velocity = arrays["reckoning/velocity"].copy()
+        motion = Odometry(arrays["reckoning/delta"].copy(), arrays["reckoning/cov"].copy())
+        self._at = Reckoned(motion, arrays["reckoning/world_from_camera"].copy())
+
+    def _seconds(self, stamp_ns: int) -> float:
+        assert self._stamp_ns is not None
+        return 1e-9 * (stamp_ns - self._stamp_ns)
+
+    def _moved(self, step: Odometry, agreeing: int, note: str) -> Reckoned:
+        step = self._plane.law(step)
+        world = SE3.compose(self._at.world_from_camera, step.delta)
+        return Reckoned(chained(self._at.since_update, step), world, agreeing, note)
+
+
+def standstill() -> Odometry:
+    """No motion, for certain."""
+    return Odometry(SE3.identity(), np.zeros((6, 6)))
+
+
+def chained(first: Odometry, second: Odometry) -> Odometry:
+    """One motion after another, with independent errors: C = Ad⁻¹ C₁ Ad⁻ᵀ + C₂ with Ad of the second."""
+    back = SE3.adjoint(SE3.inverse(second.delta))
+    cov = gaussian.symmetrise(back @ first.cov @ back.T + second.cov)
+    return Odometry(SE3.compose(first.delta, second.delta), cov)

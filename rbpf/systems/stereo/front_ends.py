@@ -1,0 +1,194 @@
+"""What a recording shows, pair by pair: features of images, or the named pixels of a log."""
+
+from abc import ABC, abstractmethod
+from typing import Any, final
+
+import numpy as np
+
+from rbpf.errors import InputError
+from rbpf.filter import StepReport
+from rbpf.maps.point import Point
+from rbpf.models import Part, Sensor
+from rbpf.motion.stereo_odometer import match_names
+from rbpf.sensors.features import FeatureFrame, FeatureLog
+from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
+from rbpf.sensors.pinhole import RectifiedStereo
+from rbpf.sensors.readers.images import ImageFrame
+from rbpf.sensors.stereo_features import StereoFeatures, match_frames
+from rbpf.sensors.stereo_matching import StereoSift
+from rbpf.sensors.stereo_points import StereoPoint
+from rbpf.systems.stereo.config import StereoConfig
+from rbpf.systems.stereo.dead_reckoning import Pixels
+from rbpf.systems.stereo.sensor import StereoFrame, StereoSensor
+
+
+class FrontEnd(ABC):
+    """Measures pairs; what it has measured last is what the next pair is matched with.
+
+    Attributes:
+        rig: the cameras.
+        sensor: what the filter takes.
+    """
+
+    rig: RectifiedStereo
+    sensor: Sensor
+
+    @abstractmethod
+    def look(self, frame: Any) -> tuple[int, str]:
+        """Measures a pair: how many features there are, and what is wrong with it, in words."""
+
+    @abstractmethod
+    def matches(self) -> Pixels:
+        """The pair looked at, matched with the one kept."""
+
+    @abstractmethod
+    def keep(self) -> None:
+        """The pair looked at is what the next one is matched with."""
+
+    @abstractmethod
+    def for_filter(self) -> Any:
+        """The pair looked at, as the sensor takes it."""
+
+    def observed(self, report: StepReport) -> int:
+        """Landmarks that weighed the particles in the filter's last step."""
+        weighed = (group.ids for group in report.groups if Part.STATE in group.informs)
+        return sum(int((ids >= 0).sum()) for ids in weighed if ids is not None)
+
+    def seconds(self) -> float:
+        """Time that the sensor took to find landmarks in its last pair."""
+        return 0.0
+
+    @abstractmethod
+    def arrays(self) -> dict[str, np.ndarray]:
+        """For a checkpoint: the pair kept, and the sensor."""
+
+    @abstractmethod
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """The inverse of `arrays`."""
+
+
+@final
+class ImageFrontEnd(FrontEnd):
+    """SIFT features of images.
+
+    Args:
+        rig: the cameras.
+        config: all settings.
+    """
+
+    def __init__(self, rig: RectifiedStereo, config: StereoConfig) -> None:
+        self.rig = rig
+        self.config = config
+        self.sift = StereoSift(rig, config.sift, config.pair)
+        likelihood = config.likelihood.build()
+        self.sensor: StereoSensor = StereoSensor(rig, config.map, config.keys, config.sift.length, likelihood)
+        nothing = np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0), np.zeros(0)
+        self._none = StereoFeatures.measured(
+            rig, *nothing, np.zeros((0, config.sift.length), dtype=np.float32)
+        )
+        self._now = self._kept = self._none
+
+    def look(self, frame: ImageFrame) -> tuple[int, str]:
+        """SIFT in both images, matched along the rows."""
+        self._now = self._none
+        if frame.image is None or frame.right is None:
+            return 0, frame.problem or "an image is missing"
+        self._now = self.sift.measure(frame.image, frame.right)
+        return len(self._now), ""
+
+    def matches(self) -> Pixels:
+        """By their keys."""
+        found = match_frames(self._kept, self._now, self.config.odometry.limits)
+        if self.config.odometry.split != "none":
+            found = found.take(half_of(self._kept.keys)[found.first] & half_of(self._now.keys)[found.second])
+        before, now = self._kept.take(found.first), self._now.take(found.second)
+        return Pixels(before.z, now.z, before.cov, now.cov)
+
+    def keep(self) -> None:
+        self._kept = self._now
+
+    def for_filter(self) -> StereoFrame:
+        """All features, or the half that is the map's."""
+        split = self.config.odometry.split
+        if split == "none":
+            return StereoFrame(self._now)
+        half = half_of(self._now.keys)
+        return StereoFrame(self._now, ~half if split == "apart" else half)
+
+    def seconds(self) -> float:
+        return self.sensor.seconds
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        kept = self._kept
+        names = ("z", "cov", "scale", "orientation", "keys")
+        return {f"pair/{name}": getattr(kept, name) for name in names} | self.sensor.arrays()
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        names = ("z", "cov", "scale", "orientation", "keys")
+        self._kept = StereoFeatures.measured(self.rig, *(arrays[f"pair/{name}"].copy() for name in names))
+        self.sensor.restore(arrays)
+
+
+@final
+class NameFrontEnd(FrontEnd):
+    """The named pixels of a log, known association.
+
+    Args:
+        log: of a stereo pair.
+        config: all settings.
+
+    Raises:
+        InputError: the log is of one camera.
+    """
+
+    def __init__(self, log: FeatureLog, config: StereoConfig) -> None:
+        if not isinstance(log.camera, RectifiedStereo):
+            raise InputError(
+                f"{log.name}: stereo SLAM needs a log of a rectified pair, this one is of one camera"
+            )
+        self.rig = log.camera
+        self.config = config
+        self.sensor = NamedLandmarkSensor(StereoPoint(log.camera), Point(3), config.likelihood.build())
+        self._now = self._kept = FeatureFrame(
+            0, np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3))
+        )
+
+    def look(self, frame: FeatureFrame) -> tuple[int, str]:
+        """Nothing is to be done."""
+        self._now = frame
+        return frame.landmarks.size, ""
+
+    def matches(self) -> Pixels:
+        """By their names."""
+        before, now = match_names(self._kept.landmarks, self._now.landmarks)
+        if self.config.odometry.split != "none":
+            even = self._kept.landmarks[before] % 2 == 0
+            before, now = before[even], now[even]
+        kept, seen = self._kept, self._now
+        return Pixels(kept.z[before], seen.z[now], kept.cov_z[before], seen.cov_z[now])
+
+    def keep(self) -> None:
+        self._kept = self._now
+
+    def for_filter(self) -> FeatureFrame:
+        """All of them, those of odd or even names, or none."""
+        config, frame = self.config, self._now
+        chosen = np.full(frame.landmarks.size, config.map.used)
+        if config.odometry.split != "none":
+            chosen &= frame.landmarks % 2 == (1 if config.odometry.split == "apart" else 0)
+        chosen &= frame.z[:, 0] > frame.z[:, 2]
+        return FeatureFrame(frame.stamp_ns, frame.landmarks[chosen], frame.z[chosen], frame.cov_z[chosen])
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        kept = self._kept
+        return {"pair/names": kept.landmarks, "pair/z": kept.z, "pair/cov": kept.cov_z}
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        names, z, cov = (arrays[f"pair/{name}"].copy() for name in ("names", "z", "cov"))
+        self._kept = FeatureFrame(0, names, z, cov)
+
+
+def half_of(keys: np.ndarray) -> np.ndarray:
+    """A lot (K,) that falls alike whenever a feature is seen: whether the key's first rows outweigh its last ones."""
+    side = keys.shape[1] // 3
+    return np.asarray(keys[:, :side].sum(axis=1) > keys[:, -side:].sum(axis=1))

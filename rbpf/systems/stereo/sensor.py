@@ -1,0 +1,224 @@
+"""The map's landmarks in the features of a stereo pair, and new ones (S05 §III-B, §V).
+
+A landmark competes for a feature if it may be in view, its key is like the feature's, and the particles expect it
+there. Each feature is then one landmark's, the same for all particles, or has none: a null correspondence, which costs
+all particles the same. Keys that have not been seen often enough to be landmarks are in the map, where they follow
+each particle's path, without a say in the particles' weights.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from rbpf.belief import Belief
+from rbpf.exchange import NULL
+from rbpf.gaussian import symmetrise
+from rbpf.maps.point import Point
+from rbpf.models import Births, Likelihood, Observations, Part, Sensor
+from rbpf.sensors.key_index import Gate, KeyIndex
+from rbpf.sensors.key_management import KeyConfig, KeyManager
+from rbpf.sensors.pinhole import RectifiedStereo
+from rbpf.sensors.stereo_features import StereoFeatures
+from rbpf.sensors.stereo_points import StereoPoint
+from rbpf.systems.stereo.config import MapConfig
+from rbpf.systems.stereo.landmarks import Places
+
+_MAP = frozenset({Part.LANDMARK})
+
+
+@dataclass(frozen=True)
+class StereoFrame:
+    """What the filter is updated by.
+
+    Attributes:
+        features: of the pair.
+        free: (K,) which of them the map may use; None is all.
+    """
+
+    features: StereoFeatures
+    free: np.ndarray | None = None
+
+
+@final
+class StereoSensor(Sensor):
+    """Finds landmarks by their keys, and manages which keys there are.
+
+    Args:
+        rig: the cameras.
+        config: how landmarks are matched.
+        keys: which features become landmarks.
+        length: of a key.
+        likelihood: of an innovation.
+    """
+
+    def __init__(
+        self, rig: RectifiedStereo, config: MapConfig, keys: KeyConfig, length: int, likelihood: Likelihood
+    ) -> None:
+        self.config = config
+        self.likelihood = likelihood
+        self.model = StereoPoint(rig)
+        self.point = Point(3)
+        self.index = KeyIndex(length, config.limits)
+        self.manager = KeyManager(keys, (rig.camera.width, rig.camera.height))
+        self.places = Places(rig, config)
+        self.names = np.zeros(0, dtype=np.int64)
+        """(K,) of the last pair's features, NULL where they are no landmark's."""
+        self.seconds = 0.0
+        """Time that matching the last pair took."""
+        self._ids = np.full(64, NULL, dtype=np.int64)
+        self._told = -1
+
+    def observe(self, frame: StereoFrame, belief: Belief) -> Sequence[Observations]:
+        """The features that are landmarks, and those that are keys on trial."""
+        started = time.perf_counter()
+        features = frame.features
+        self.names = np.full(len(features), NULL, dtype=np.int64)
+        if self.config.used:
+            self.names = self._matched(frame, belief)
+        seen = self.names >= 0
+        ids = np.full(seen.size, NULL, dtype=np.int64)
+        ids[seen] = self._ids_of(self.names[seen], belief)
+        weighing = self._weighing()
+        groups = []
+        for chosen, informs in ((weighing | ~seen, None), (seen & ~weighing, _MAP)):
+            if (ids[chosen] >= 0).any():
+                groups.append(self._group(features.take(chosen), ids[chosen], informs))
+        self.seconds = time.perf_counter() - started
+        return groups
+
+    def births(
+        self, frame: StereoFrame, belief: Belief, observed: Sequence[Observations]
+    ) -> Sequence[Births]:
+        """Counts what was seen, drops keys that were not seen again, starts new ones."""
+        if not self.config.used:
+            return []
+        seen = self.names >= 0
+        self._forget(belief, self.manager.note(self.names[seen]))
+        self._place(belief, self.names[seen])
+        rows = self._worth_a_key(frame, seen)
+        if not rows.size:
+            return []
+        features = frame.features.take(rows)
+        names = self.manager.add(rows.size)
+        self.index.store.add(names, features.keys)
+        pose = belief.state[belief.mode]
+        self.places.put(names, self.model.invert(pose, features.z), pose)
+        self.names[rows] = names
+        return [Births(features.z, features.cov, self.model, self.point, facts=names.tolist())]
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """For a checkpoint."""
+        return self.index.store.arrays() | self.manager.arrays() | self.places.arrays()
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """The inverse of `arrays`."""
+        self.index.store.restore(arrays)
+        self.manager.restore(arrays)
+        self.places.restore(arrays)
+
+    def _group(
+        self, features: StereoFeatures, ids: np.ndarray, informs: frozenset[Part] | None
+    ) -> Observations:
+        null = self.likelihood.log_outlier()
+        if informs is None:
+            return Observations(features.z, features.cov, self.model, self.likelihood, ids, log_clutter=null)
+        return Observations(features.z, features.cov, self.model, self.likelihood, ids, informs=informs)
+
+    def _weighing(self) -> np.ndarray:
+        """Features (K,) whose keys are landmarks, this sighting included, and weigh the particles."""
+        if self.config.weigh == "all":
+            return self.names >= 0
+        manager = self.manager
+        often = manager.sightings + 1 >= manager.config.sightings
+        return np.isin(self.names, manager.names[often])
+
+    def _matched(self, frame: StereoFrame, belief: Belief) -> np.ndarray:
+        """Name of each feature's landmark (K,)."""
+        features = frame.features
+        out = np.full(len(features), NULL, dtype=np.int64)
+        rows = np.arange(len(features)) if frame.free is None else np.flatnonzero(frame.free)
+        names = self._alike(features.keys[rows], belief)
+        if names.size and rows.size:
+            mean, cov = self._expected(self._ids_of(names, belief), belief)
+            gate = Gate(features.z[rows], features.cov[rows], names, mean, cov, self.config.gate)
+            out[rows] = self.index.match(features.keys[rows], gate).ids
+        return out
+
+    def _alike(self, keys: np.ndarray, belief: Belief) -> np.ndarray:
+        """Names of landmarks that may be in view and whose keys come near to that of any feature.
+
+        Keys further away are neither taken nor forbid others by the ratio, whatever is expected where.
+        """
+        store, limits = self.index.store, self.config.limits
+        names = self.places.in_view(store.ids, belief.state[belief.mode])
+        if not names.size or not keys.shape[0]:
+            return names[:0]
+        most = limits.largest(store.length) / limits.ratio
+        near = (keys @ store.keys[store.rows(names)].T).max(axis=0) >= 1.0 - 0.5 * most**2
+        return np.asarray(names[near])
+
+    def _expected(self, ids: np.ndarray, belief: Belief) -> tuple[np.ndarray, np.ndarray]:
+        """Pixels (k, 3) where some of the particles expect landmarks (k,), and their covariance (k, 3, 3).
+
+        What is uncertain within a particle, given its path, hardly differs between them: the heaviest one's is taken.
+        """
+        few = np.append(self._evenly(belief.weights), belief.mode)
+        records, prior = belief.read(ids, few), belief.prior.take(few)
+        state = prior.predicted()
+        px = self.model.predict(state[:-1, None], records.mean[:-1])
+        jac = self.model.jacobians(state[-1], records.mean[-1])
+        assert jac.state is not None and jac.landmark is not None
+        moved = jac.state @ prior.spread(prior.mean)[-1]
+        within = jac.landmark @ records.cov[-1] @ jac.landmark.mT + moved @ moved.mT
+        off = px - px.mean(axis=0)
+        between = np.einsum("nka,nkb->kab", off, off) / px.shape[0]
+        return px.mean(axis=0), symmetrise(within + between) + self.config.slack_px**2 * np.eye(3)
+
+    def _ids_of(self, names: np.ndarray, belief: Belief) -> np.ndarray:
+        """Ids (k,) that the map has given to names (k,); what is new in the catalogue is noted, from its end on."""
+        if self.manager.next_name > self._ids.size:
+            self._ids = np.concatenate([self._ids, np.full(self.manager.next_name, NULL, dtype=np.int64)])
+        last = self._told
+        for landmark, name in reversed(belief.catalogue.items()):
+            if landmark <= last:
+                break
+            self._ids[name], self._told = landmark, max(self._told, landmark)
+        return self._ids[names]
+
+    def _evenly(self, weights: np.ndarray) -> np.ndarray:
+        """Rows of particles, each for an equal share of the weight."""
+        count = min(self.config.cloud, weights.size)
+        steps = (np.arange(count) + 0.5) / count
+        return np.minimum(np.searchsorted(np.cumsum(weights), steps), weights.size - 1)
+
+    def _forget(self, belief: Belief, names: np.ndarray) -> None:
+        if names.size:
+            belief.map.remove(self._ids_of(names, belief))
+            self.index.store.remove(names)
+
+    def _place(self, belief: Belief, names: np.ndarray) -> None:
+        """Notes where the heaviest particle has landmarks now."""
+        if names.size:
+            ids = self._ids_of(names, belief)
+            mode = belief.mode
+            self.places.put(names, belief.read(ids, np.array([mode])).mean[0], belief.state[mode])
+
+    def _worth_a_key(self, frame: StereoFrame, seen: np.ndarray) -> np.ndarray:
+        """Rows of features that start landmarks."""
+        features = frame.features
+        able = ~seen & self._deep(features)
+        if frame.free is not None:
+            able &= frame.free
+        rows = np.flatnonzero(able)
+        if not rows.size:
+            return rows
+        nearest = self.index.nearest(features.keys[rows])
+        chosen = self.manager.choose(features.z[rows, :2], features.keys[rows], nearest, features.z[seen, :2])
+        return rows[chosen]
+
+    def _deep(self, features: StereoFeatures) -> np.ndarray:
+        """Whether the depth of features is known well enough for a Gaussian in space, (K,)."""
+        return np.sqrt(features.cov_points[:, 2, 2]) <= self.config.depth_share * features.points[:, 2]

@@ -1,0 +1,185 @@
+"""`rbpf run stereo` from end to end, on a few small rendered pairs."""
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from rbpf.cli import main
+from rbpf.lie import SE3
+from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+from rbpf.validation.simulation.exposure import Imaging
+from rbpf.validation.simulation.images import simulate_images
+from rbpf.validation.simulation.textured_room import TexturedRoom
+from rbpf.validation.trajectory_files import read_tum
+
+FRAMES = 8
+RIG = RectifiedStereo(Pinhole(320, 240, 220.0, 220.0, 159.5, 119.5), 0.12)
+FILES = {
+    "trajectory.tum", "odometry.tum", "map.npz", "map.csv", "timings.csv", "diagnostics.csv", "config.yaml",
+    "summary.json", "report.html", "path.png", "map.png", "particles.png", "error.png", "tracking.png", "timings.png",
+    "trajectory.npz", "truth.npz", "validation_groundtruth.json", "groundtruth_path.png", "groundtruth_error.png",
+    "groundtruth_nees.png",
+}  # fmt: skip
+REQUIRED = {
+    "system", "recording", "frames", "particles", "dof", "seed", "ms_per_frame", "updates", "distance_m",
+    "sift_features", "landmarks_mean_per_particle", "vo_ate_rmse_m", "ate_rmse_m", "ate_sim3_rmse_m",
+    "rpe_translation_rmse_m", "rpe_rotation_rmse_deg", "peak_memory_mb", "log_evidence",
+}  # fmt: skip
+TIMED = ("ms_per_frame", "ms_per_update", "peak_memory_mb")
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("rendered") / "room"
+    world = TexturedRoom(frames=FRAMES, rate_hz=5.0)
+    simulate_images(world, Imaging(known=0, noise_std=1.0), RIG, folder, seed=1)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def finished(room, tmp_path_factory):
+    out = tmp_path_factory.mktemp("finished") / "run"
+    assert run(room, out) == 0
+    return out
+
+
+def run(sequence: Path, out: Path, *arguments: str) -> int:
+    return main(["run", "stereo", str(sequence), "--particles", "50", "--out", str(out), *arguments])
+
+
+def summary(out: Path) -> dict[str, object]:
+    entries = json.loads((out / "summary.json").read_text())
+    return {name: value for name, value in entries.items() if name not in TIMED}
+
+
+def table(path: Path) -> np.ndarray:
+    return np.genfromtxt(path, delimiter=",", names=True)
+
+
+def test_what_it_leaves(finished):
+    assert {path.name for path in finished.iterdir()} == FILES
+    entries = json.loads((finished / "summary.json").read_text())
+    assert entries.keys() >= REQUIRED
+    assert entries["frames"] == FRAMES and entries["particles"] == 50 and entries["dof"] == 6
+    assert entries["log_evidence"] is None
+    assert "problems" not in entries and "failure" not in entries
+    assert 0 < entries["landmarks_mean_per_particle"] < entries["sift_features"]
+
+
+def test_the_files_agree(finished):
+    entries = summary(finished)
+    path, alone = read_tum(finished / "trajectory.tum"), read_tum(finished / "odometry.tum")
+    assert len(path) == len(alone) == FRAMES
+    np.testing.assert_allclose(path.world_from_body[0], SE3.identity(), atol=1e-12)
+    steps = np.linalg.norm(np.diff(path.positions, axis=0), axis=1)
+    assert entries["distance_m"] == pytest.approx(steps.sum())
+    rows, times = table(finished / "diagnostics.csv"), table(finished / "timings.csv")
+    assert rows["updated"].sum() == entries["updates"]
+    assert entries["observations_per_update"] == pytest.approx(rows["observed"][rows["updated"] > 0].mean())
+    stages = sum(times[f"{name}_ms"] for name in ("features", "odometry", "matching", "filter"))
+    assert (stages <= times["milliseconds"] + 1e-3).all()
+    landmarks = table(finished / "map.csv")
+    assert landmarks["landmark"].sum() == entries["landmarks_mean_per_particle"]
+    assert (landmarks["sightings"][landmarks["landmark"] > 0] >= 3).all()
+    np.testing.assert_array_equal(np.load(finished / "map.npz")["id"], landmarks["id"])
+
+
+def test_it_follows_the_camera(finished):
+    """The camera goes about a metre."""
+    entries = summary(finished)
+    assert entries["distance_m"] > 0.3
+    assert entries["ate_rmse_m"] < 0.01 and entries["vo_ate_rmse_m"] < 0.01
+
+
+def test_repeated_from_its_configuration(finished, room, tmp_path):
+    assert run(room, tmp_path / "again", "--config", str(finished / "config.yaml")) == 0
+    for name in ("trajectory.tum", "odometry.tum", "map.csv", "diagnostics.csv"):
+        assert (tmp_path / "again" / name).read_bytes() == (finished / name).read_bytes()
+    assert summary(tmp_path / "again") == summary(finished)
+    assert yaml.safe_load((finished / "config.yaml").read_text())["system"] == "stereo"
+
+
+def test_resumed(finished, room, tmp_path):
+    """From the checkpoint of the sixth pair: the same bytes."""
+    out = tmp_path / "run"
+    assert run(room, out, "--set", "checkpoint_every=6") == 0
+    assert (out / "checkpoint.npz").is_file()
+    assert run(room, out, "--set", "checkpoint_every=6", "--resume") == 0
+    for name in ("trajectory.tum", "odometry.tum", "map.csv", "diagnostics.csv"):
+        assert (out / name).read_bytes() == (finished / name).read_bytes()
+
+
+def test_options(room, tmp_path):
+    """Three degrees of freedom, another seed, a setting, and a recording for the viewer."""
+    pytest.importorskip("rerun")
+    out, recording = tmp_path / "run", tmp_path / "run.rrd"
+    arguments = ["--dof", "3", "--seed", "4", "--set", "proposal.kind=ekf", "--rerun", str(recording)]
+    assert run(room, out, *arguments) == 0
+    settings = yaml.safe_load((out / "config.yaml").read_text())
+    assert (settings["dof"], settings["seed"], settings["proposal"]["kind"]) == (3, 4, "ekf")
+    np.testing.assert_allclose(read_tum(out / "trajectory.tum").positions[:, 1], 0.0, atol=1e-12)
+    assert recording.stat().st_size > 10_000
+
+
+def test_a_lost_image(room, tmp_path):
+    """An image that is gone from one camera leaves its pair out; one that is no image is passed over, and said."""
+    spoilt = shutil.copytree(room, tmp_path / "room")
+    images = sorted((spoilt / "mav0" / "cam1" / "data").iterdir())
+    images[4].write_bytes(images[4].read_bytes()[:200])
+    assert run(spoilt, tmp_path / "run") == 0
+    entries = summary(tmp_path / "run")
+    assert entries["frames"] == FRAMES and entries["frames_measured"] == FRAMES - 1
+    assert len(entries["problems"]) == 1 and entries["problems"][0].startswith("pair 4 is passed over: ")
+    assert entries["ate_rmse_m"] < 0.05
+
+
+def test_swapped_cameras(room, tmp_path, capsys):
+    spoilt = shutil.copytree(room, tmp_path / "room")
+    left, right = spoilt / "mav0" / "cam0" / "data", spoilt / "mav0" / "cam1" / "data"
+    left.rename(tmp_path / "aside")
+    right.rename(left)
+    (tmp_path / "aside").rename(right)
+    assert run(spoilt, tmp_path / "run") == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "left and right image seem to be swapped" in said and "Traceback" not in said
+
+
+def test_swapped_on_the_way(room, tmp_path, capsys):
+    """What was computed before is kept, with the reason."""
+    spoilt = shutil.copytree(room, tmp_path / "room")
+    left, right = (sorted((spoilt / "mav0" / cam / "data").iterdir())[5] for cam in ("cam0", "cam1"))
+    images = cv2.imread(str(left), 0), cv2.imread(str(right), 0)
+    cv2.imwrite(str(left), images[1])
+    cv2.imwrite(str(right), images[0])
+    assert run(spoilt, tmp_path / "run") == 2
+    assert "what was computed before it is in" in " ".join(capsys.readouterr().err.split())
+    entries = summary(tmp_path / "run")
+    assert entries["frames"] == 5 and "swapped" in entries["failure"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--set", "particle=3"], "there is no setting particle"),
+        (["--set", "likelihood.kind=uniform"], "settings: "),
+        (["--set", "map.gate=-1"], "expected gate and depth_share above 0"),
+        (["--dof", "5"], ""),
+    ],
+)
+def test_bad_arguments(room, tmp_path, capsys, arguments, message):
+    try:
+        code = run(room, tmp_path / "run", *arguments)
+    except SystemExit as stop:  # of the parser
+        code = int(stop.code or 0)
+    assert code == 2
+    assert message in " ".join(capsys.readouterr().err.split())
+
+
+def test_no_stereo_sequence(tmp_path, capsys):
+    assert run(tmp_path, tmp_path / "run") == 2
+    assert "the folder is neither" in " ".join(capsys.readouterr().err.split())

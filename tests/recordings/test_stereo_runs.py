@@ -1,0 +1,116 @@
+"""Stereo SLAM on recordings, beside its own odometry and, where the association is known, the batch optimum."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rbpf.lie import SE3
+from rbpf.sensors.features import CameraTruth
+from rbpf.sensors.readers import stereo_tracks
+from rbpf.sensors.readers.images import open_stereo
+from rbpf.sensors.readers.images.sequence import ImageFrame, ImageSequence, Source
+from rbpf.sensors.readers.images.stereo import StereoSequence
+from rbpf.systems.filtering import LikelihoodConfig
+from rbpf.systems.stereo.config import MapConfig, StereoConfig
+from rbpf.systems.stereo.run import StereoRun, run_features, run_images
+from rbpf.validation.gtsam_ba_camera import solve_features
+from rbpf.validation.stereo_scores import score_stereo
+
+pytestmark = pytest.mark.real_data
+
+
+class Some(Source):
+    """Images of a sequence in another order, with the times given."""
+
+    def __init__(self, sequence: StereoSequence, rows: list[int], stamps_ns: np.ndarray) -> None:
+        self.images = list(sequence.frames())
+        self.rows, self.stamps_ns = rows, stamps_ns
+
+    def frames(self, start: int):
+        for row, stamp in list(zip(self.rows, self.stamps_ns.tolist(), strict=True))[start:]:
+            frame = self.images[row]
+            yield ImageFrame(stamp, frame.image, frame.right, frame.problem)
+
+
+def there_and_back(sequence: StereoSequence) -> StereoSequence:
+    """Forward, then backward, at an even pace; true poses where the recording has them."""
+    count = len(sequence)
+    rows = [*range(count), *range(count - 2, -1, -1)]
+    step = int(np.median(np.diff(sequence.stamps_ns)))
+    stamps = np.arange(len(rows), dtype=np.int64) * step
+    near = [int(np.abs(sequence.truth.stamps_ns - stamp).argmin()) for stamp in sequence.stamps_ns]
+    truth = CameraTruth(stamps, sequence.truth.world_from_camera[near][rows])
+    pair = sequence.pair
+    back = ImageSequence(pair.name, pair.camera, stamps, truth, pair.baseline_m, Some(sequence, rows, stamps))
+    return StereoSequence(back, sequence.rig)
+
+
+def scores(run: StereoRun) -> dict[str, float]:
+    assert run.failure is None and run.notes == []
+    return score_stereo(run)
+
+
+def test_a_room_in_part(data_dir):
+    """The first 30 pairs of the room, with a quarter of the particles."""
+    sequence = open_stereo(data_dir / "stereo_zed_room1")
+    rows = list(range(30))
+    stamps = sequence.stamps_ns[rows]
+    part = replace(sequence.pair, stamps_ns=stamps, source=Some(sequence, rows, stamps))
+    run = run_images(StereoSequence(part, sequence.rig), StereoConfig(particles=100))
+    found = scores(run)
+    assert found["ate_rmse_m"] < 0.009
+    assert 5 <= run.updated.sum() < 30  # at first the camera is at rest
+    assert run.observed[run.updated > 0][3:].mean() > 20
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_the_room(data_dir, seed):
+    """The truth is good to about a centimetre."""
+    run = run_images(open_stereo(data_dir / "stereo_zed_room1"), StereoConfig(seed=seed))
+    found = scores(run)
+    assert run.stamps_ns.size == 105
+    assert found["ate_rmse_m"] <= 0.009
+    assert found["ate_rmse_m"] <= found["vo_ate_rmse_m"]
+
+
+@pytest.mark.slow
+def test_the_road(data_dir):
+    """The median of three seeds is no worse than that of their odometry."""
+    sequence = open_stereo(data_dir / "stereo_kitti_seq1")
+    found = [scores(run_images(sequence, StereoConfig(seed=seed))) for seed in range(3)]
+    median = {name: np.median([one[name] for one in found]) for name in found[0]}
+    assert median["ate_sim3_rmse_m"] <= 0.035
+    assert median["ate_rmse_m"] <= 0.25
+    assert median["ate_rmse_m"] <= median["vo_ate_rmse_m"]
+    assert median["ate_sim3_rmse_m"] <= median["vo_ate_sim3_rmse_m"]
+
+
+@pytest.mark.slow
+def test_there_and_back_again(data_dir):
+    """Back where it began the camera knows where it is; its odometry does not."""
+    sequence = there_and_back(open_stereo(data_dir / "stereo_zed_room1"))
+    run = run_images(sequence, StereoConfig())
+    found = scores(run)
+    assert found["ate_rmse_m"] <= 0.009
+    ends = [np.linalg.norm(SE3.translation(poses[-1])) for poses in (run.world_from_camera, run.odometry)]
+    assert ends[0] < 0.004
+    assert ends[0] < 0.6 * ends[1]
+    off = scores(run_images(sequence, StereoConfig(map=MapConfig(used=False))))
+    assert found["ate_rmse_m"] < off["ate_rmse_m"]
+
+
+@pytest.mark.slow
+def test_beside_the_batch(data_dir):
+    """Recorded tracks: no truth, so that the batch optimum of the same measurements takes its place."""
+    tracks = stereo_tracks.read(data_dir / "gtsam_stereo_vo")
+    run = run_features(tracks.log, StereoConfig(likelihood=LikelihoodConfig("truncated")))
+    assert run.failure is None
+    batch = solve_features(tracks.log, robust=1.345, marginals=False).world_from_camera
+    truth = CameraTruth(run.stamps_ns, batch)
+    run.truth = truth
+    found = score_stereo(run)
+    length = np.linalg.norm(np.diff(batch[:, 4:], axis=0), axis=1).sum()
+    assert found["ate_rmse_m"] < 0.01 * length
+    assert found["ate_rmse_m"] < found["vo_ate_rmse_m"]

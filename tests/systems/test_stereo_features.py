@@ -1,0 +1,115 @@
+"""Stereo SLAM on simulated pixels with known association, beside the batch optimum of the same measurements."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rbpf.errors import InputError
+from rbpf.lie import SE3
+from rbpf.sensors.features import FeatureFrame, FeatureLog
+from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig
+from rbpf.systems.stereo.config import OdometryConfig, StereoConfig, TriggerConfig
+from rbpf.systems.stereo.run import StereoRun, run_features
+from rbpf.validation.gtsam_ba_camera import solve_features
+from rbpf.validation.simulation.features import MONO, STEREO, Measuring, simulate_features
+from rbpf.validation.simulation.lab_points import LabWorld
+from rbpf.validation.simulation.textured_lab import LabDrive
+
+CONFIG = StereoConfig(
+    particles=200,
+    trigger=TriggerConfig(0.0, 0.0),
+    likelihood=LikelihoodConfig("gaussian"),
+    proposal=ProposalConfig("ekf", iterations=1),
+)
+
+
+def simulated(frames: int = 40, seed: int = 0, camera=STEREO) -> FeatureLog:
+    world = LabWorld(LabDrive(frames=frames, every=4), points=8000)
+    return simulate_features(world, Measuring(known=0, measurements=40, new_per_frame=20), camera, seed)
+
+
+@pytest.fixture(scope="module")
+def log() -> FeatureLog:
+    return simulated()
+
+
+def rmse(run: StereoRun, poses: np.ndarray) -> float:
+    """Of the positions; the first camera is the world."""
+    true = SE3.between(run.truth.world_from_camera[0], run.truth.world_from_camera)
+    off = SE3.translation(poses) - SE3.translation(true)
+    return float(np.sqrt(np.square(off).sum(axis=1).mean()))
+
+
+def test_beside_the_batch(log):
+    """The filter sees the past only, the batch all of it; the odometry forgets."""
+    run = run_features(log, CONFIG)
+    batch = solve_features(log, marginals=False).world_from_camera
+    batch = SE3.between(batch[0], batch)
+    ours, best, alone = (rmse(run, poses) for poses in (run.world_from_camera, batch, run.odometry))
+    assert ours < 2.5 * best
+    assert ours < 0.8 * alone
+    assert np.isfinite(run.log_evidence).all()
+    assert run.filter.belief().map.ids.size > 100
+
+
+@pytest.mark.parametrize("kind", ["truncated", "outliers"])
+def test_the_paper_s_filter(log, kind):
+    """Prior proposal; the truncated likelihood is no density, so that there is no evidence."""
+    config = replace(
+        CONFIG,
+        particles=400,
+        likelihood=LikelihoodConfig(kind, outlier_volume=640.0 * 480.0 * 60.0),
+        proposal=ProposalConfig("prior"),
+    )
+    run = run_features(log, config)
+    assert rmse(run, run.world_from_camera) < rmse(run, run.odometry)
+    assert np.isfinite(run.log_evidence).all() == (kind == "outliers")
+
+
+def test_compiled_as_plain(log):
+    few = FeatureLog(log.name, log.camera, log.frames[:6], None, log.truth)
+    config = replace(CONFIG, particles=20, likelihood=LikelihoodConfig("truncated"))
+    one, other = run_features(few, config), run_features(few, replace(config, compiled=False))
+    np.testing.assert_allclose(one.world_from_camera, other.world_from_camera, atol=1e-7)
+
+
+def test_three_degrees_of_freedom(log):
+    run = run_features(log, replace(CONFIG, dof=3))
+    np.testing.assert_allclose(run.filter.particles.state[:, 5], 0.0, atol=1e-12)
+    np.testing.assert_allclose(run.world_from_camera[:, 5], 0.0, atol=1e-12)
+    assert rmse(run, run.world_from_camera) < 0.05
+
+
+def test_without_times(log):
+    """Stamps that count frames are seconds to the odometry, and stay what they are."""
+    frames = [FeatureFrame(t, f.landmarks, f.z, f.cov_z) for t, f in enumerate(log.frames)]
+    run = run_features(FeatureLog("steps", log.camera, frames), CONFIG)
+    np.testing.assert_array_equal(run.stamps_ns, np.arange(len(frames)))
+    assert run.notes == []
+    assert np.linalg.norm(SE3.translation(run.world_from_camera[-1])) > 0.3
+
+
+def test_halves_of_the_landmarks(log):
+    """The map holds odd names alone, or even ones, and the odometry always the even ones."""
+    for split, remainder in (("apart", 1), ("same", 0)):
+        run = run_features(log, replace(CONFIG, odometry=OdometryConfig(split=split)))
+        names = np.array(list(run.filter.belief().catalogue.values()))
+        assert names.size > 50 and (names % 2 == remainder).all()
+    seen = np.intersect1d(log.frames[0].landmarks, log.frames[1].landmarks)
+    assert run.agreeing[1] <= (seen % 2 == 0).sum()
+
+
+def test_resumed(log, tmp_path):
+    config, place = replace(CONFIG, particles=30, checkpoint_every=7), tmp_path / "checkpoint.npz"
+    few = FeatureLog(log.name, log.camera, log.frames[:20], None, log.truth)
+    whole = run_features(few, config, checkpoint=place)
+    resumed = run_features(few, config, checkpoint=place, resume=True)
+    np.testing.assert_array_equal(resumed.world_from_camera, whole.world_from_camera)
+    np.testing.assert_array_equal(resumed.odometry, whole.odometry)
+    np.testing.assert_array_equal(resumed.cov, whole.cov)
+
+
+def test_one_camera_is_refused():
+    with pytest.raises(InputError, match="stereo SLAM needs a log of a rectified pair"):
+        run_features(simulated(4, camera=MONO), CONFIG)

@@ -1,0 +1,85 @@
+"""A stereo run from recording to report: filter, scores, files, pictures."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rbpf.sensors.readers.images import open_stereo
+from rbpf.systems.stereo.config import StereoConfig
+from rbpf.systems.stereo.run import StereoRun, run_images
+from rbpf.validation.files import prepare_folder
+from rbpf.validation.map_summary import summarise_map
+from rbpf.validation.stereo_folder import write_stereo_run
+from rbpf.validation.stereo_pictures import plot_stereo_run
+from rbpf.validation.stereo_rerun import write_stereo_rerun
+from rbpf.validation.validate import report_run
+
+CHECKPOINT = "checkpoint.npz"
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class StereoRecording:
+    """Where a run's input lies.
+
+    Attributes:
+        pairs: a sequence of any kind that `open_stereo` knows.
+        calibration: camera.yaml in place of the sequence's own camera.
+    """
+
+    pairs: Path
+    calibration: Path | None = None
+
+    def sources(self) -> dict[str, str]:
+        """For config.yaml."""
+        named = {"recording": self.pairs, "calibration": self.calibration}
+        return {name: str(path) for name, path in named.items() if path is not None}
+
+
+def start_stereo(
+    recording: StereoRecording,
+    config: StereoConfig,
+    out: Path | None = None,
+    resume: bool = False,
+    on_frame: Progress | None = None,
+) -> StereoRun:
+    """Opens a sequence and filters it.
+
+    Args:
+        recording: what to filter.
+        config: all settings.
+        out: folder for checkpoints, created where it does not exist; None keeps none.
+        resume: go on from the checkpoint in `out`.
+        on_frame: called with the pairs done and their number.
+
+    Raises:
+        InputError: the recording or a setting is wrong.
+    """
+    sequence = open_stereo(recording.pairs, recording.calibration)
+    if out is not None:
+        prepare_folder(out)
+    total = len(sequence)
+    told = None if on_frame is None else lambda t, _run: on_frame(t + 1, total)
+    return run_images(sequence, config, told, None if out is None else out / CHECKPOINT, resume)
+
+
+def finish_stereo(
+    run: StereoRun, recording: StereoRecording, out: Path, rerun: Path | None = None
+) -> dict[str, Any]:
+    """Writes all files, pictures and the report of a run; returns the entries of summary.json.
+
+    Args:
+        run: what was filtered.
+        recording: where it came from.
+        out: the run's folder.
+        rerun: file of a recording for the Rerun viewer; None writes none.
+    """
+    mapped = summarise_map(run.filter)
+    entries = write_stereo_run(run, mapped, out, recording.sources())
+    plot_stereo_run(run, mapped, out)
+    if rerun is not None:
+        write_stereo_rerun(run, open_stereo(recording.pairs, recording.calibration), mapped, rerun)
+    verdict = report_run(out)
+    return entries | {"verdict": verdict.trust}

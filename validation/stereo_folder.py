@@ -1,0 +1,140 @@
+"""Everything that a stereo run leaves in its folder. Each file is written under a temporary name, then renamed.
+
+trajectory.tum           online filtered mean at every pair; the first camera is the world
+trajectory.npz           the same with its covariance; truth.npz: the ground truth at these pairs; see
+                         `rbpf.validation.run_files`
+odometry.tum             the path by visual odometry alone
+map.npz, map.csv         landmarks: name, mean, covariance (within + between particles); how often each was seen
+timings.csv              milliseconds per pair: whole, features, odometry, matching with the map, filter
+diagnostics.csv          features, matches that agree with the motion, landmarks; updates, sample size, evidence, NIS
+config.yaml              everything needed to repeat the run
+summary.json             the figures
+*.png                    pictures
+report.html              one page with all figures and pictures
+"""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from rbpf import __version__
+from rbpf.systems.stereo.run import StereoRun
+from rbpf.systems.stereo.sensor import StereoSensor
+from rbpf.validation.files import (
+    milliseconds_per_frame,
+    nis_ratio,
+    peak_memory_mb,
+    prepare_folder,
+    write_csv,
+    write_map,
+    write_text,
+)
+from rbpf.validation.map_summary import MapSummary
+from rbpf.validation.run_files import write_path, write_truth
+from rbpf.validation.stereo_scores import distance_m, score_stereo, stereo_truth
+from rbpf.validation.trajectory import Trajectory
+from rbpf.validation.trajectory_files import write_tum
+
+_STAGES = "features", "odometry", "matching", "filter"
+
+
+def write_stereo_run(
+    run: StereoRun, mapped: MapSummary, out: Path, sources: dict[str, str]
+) -> dict[str, Any]:
+    """Writes all data files of a run.
+
+    Args:
+        run: what was filtered.
+        mapped: its map.
+        out: the run's folder.
+        sources: what it was filtered from, for config.yaml: recording, calibration.
+
+    Returns:
+        The entries of summary.json.
+    """
+    prepare_folder(out)
+    write_tum(out / "trajectory.tum", Trajectory(run.stamps_ns, run.world_from_camera))
+    write_tum(out / "odometry.tum", Trajectory(run.stamps_ns, run.odometry))
+    write_map(out, mapped, _facts(run, mapped))
+    write_path(out, run.stamps_ns, run.world_from_camera, run.cov)
+    write_truth(out, stereo_truth(run))
+    _write_tables(run, out)
+    config = {"rbpf": __version__, "system": "stereo", **sources, **asdict(run.config)}
+    write_text(out / "config.yaml", yaml.safe_dump(config, sort_keys=False))
+    entries = summarise_stereo(run, mapped)
+    write_text(out / "summary.json", json.dumps(entries, indent=2, allow_nan=False) + "\n")
+    return entries
+
+
+def summarise_stereo(run: StereoRun, mapped: MapSummary) -> dict[str, Any]:
+    """The entries of summary.json."""
+    updated = run.updated.astype(bool)
+    log_evidence = run.log_evidence[updated]
+    notes = {"problems": run.notes} if run.notes else {}
+    failure = {} if run.failure is None else {"failure": run.failure}
+    return {
+        "system": "stereo",
+        "recording": run.name,
+        "frames": int(run.stamps_ns.size),
+        "frames_measured": int((run.features >= run.config.odometry.estimate.least_matches).sum()),
+        "updates": int(updated.sum()),
+        "distance_m": distance_m(run.world_from_camera),
+        "particles": run.config.particles,
+        "dof": run.config.dof,
+        "seed": run.config.seed,
+        "ms_per_frame": milliseconds_per_frame(run.seconds),
+        "ms_per_update": milliseconds_per_frame((run.seconds_matching + run.seconds_filter)[updated]),
+        **_key_counts(run, mapped),
+        "features_per_frame": float(run.features.mean()),
+        "observations_per_update": float(run.observed[updated].mean()) if updated.any() else 0.0,
+        "resamplings": int(run.resampled.sum()),
+        "ess_mean": float(run.ess[updated].mean()) if updated.any() else 0.0,
+        "log_evidence": float(log_evidence.sum()) if np.isfinite(log_evidence).all() else None,
+        "nis_per_dof": nis_ratio(run.nis, run.nis_dof),
+        "peak_memory_mb": peak_memory_mb(),
+        **score_stereo(run),
+        **notes,
+        **failure,
+    }
+
+
+def _key_counts(run: StereoRun, mapped: MapSummary) -> dict[str, float | int]:
+    """Keys ever started, and landmarks; all particles hold the same, as all associate alike."""
+    sensor = run.front_end.sensor
+    if not isinstance(sensor, StereoSensor):
+        return {"sift_features": 0, "landmarks_mean_per_particle": float(mapped.ids.size)}
+    return {
+        "sift_features": int(sensor.manager.next_name),
+        "landmarks_mean_per_particle": float(sensor.manager.promoted.sum()),
+    }
+
+
+def _facts(run: StereoRun, mapped: MapSummary) -> dict[str, np.ndarray]:
+    """How often each landmark was seen, and whether it is one or a key on trial."""
+    sensor = run.front_end.sensor
+    if not isinstance(sensor, StereoSensor):
+        return {}
+    rows = np.searchsorted(sensor.manager.names, mapped.ids)
+    return {
+        "sightings": sensor.manager.sightings[rows],
+        "landmark": sensor.manager.promoted[rows].astype(int),
+    }
+
+
+def _write_tables(run: StereoRun, out: Path) -> None:
+    """timings.csv and diagnostics.csv."""
+    steps = range(run.stamps_ns.size)
+    seconds = run.seconds, *(getattr(run, f"seconds_{stage}") for stage in _STAGES)
+    columns = ((1e3 * column).round(4).tolist() for column in seconds)
+    names = ["step", "milliseconds", *(f"{stage}_ms" for stage in _STAGES)]
+    write_csv(out / "timings.csv", names, zip(steps, *columns, strict=True))
+    whole = "features", "agreeing", "updated", "observed", "resampled", "nis_dof"
+    real = "ess", "log_evidence", "nis"
+    counts = (getattr(run, name).astype(int).tolist() for name in whole)
+    numbers = (getattr(run, name).tolist() for name in real)
+    rows = zip(steps, run.stamps_ns.tolist(), *counts, *numbers, strict=True)
+    write_csv(out / "diagnostics.csv", ["step", "stamp_ns", *whole, *real], rows)
