@@ -1,9 +1,9 @@
 """Settings from a YAML file, from key=value pairs and from the command line, in this order."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, is_dataclass
+from dataclasses import asdict, fields, is_dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
 import yaml
@@ -13,7 +13,10 @@ from rbpf.errors import InputError
 _HEADER = ("rbpf", "system", "recording", "known_points", "board", "square_m", "calibration")
 """What a config.yaml says about the run besides its settings."""
 
-Config = TypeVar("Config")
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+Config = TypeVar("Config", bound="DataclassInstance")
 
 
 def load_settings(
@@ -37,7 +40,7 @@ def load_settings(
     values.update(given)
     _refuse_unknown(values, kind, "")
     try:
-        return msgspec.convert(values, kind, strict=False)
+        return msgspec.convert(_over(asdict(kind()), values), kind, strict=False)
     except msgspec.ValidationError as error:
         raise InputError(f"settings: {error}") from error
 
@@ -68,6 +71,16 @@ def _put(values: dict[str, Any], pair: str) -> None:
         if not isinstance(group, dict):
             raise InputError(f"--set {pair}: {name} is no group of settings")
     group[last] = None if text in ("", "null", "none") else text
+
+
+def _over(defaults: dict[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Values over the system's own defaults: those of a group may differ from the defaults of its class."""
+    both = dict(defaults)
+    for name, value in values.items():
+        inner = defaults.get(name)
+        nested = isinstance(inner, dict) and isinstance(value, dict)
+        both[name] = _over(inner, value) if nested and inner is not None else value
+    return both
 
 
 def _refuse_unknown(values: Mapping[str, Any], kind: Any, prefix: str) -> None:

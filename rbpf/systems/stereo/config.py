@@ -12,6 +12,9 @@ from rbpf.sensors.sift import SiftConfig
 from rbpf.sensors.stereo_matching import StereoConfig as PairConfig
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig, ResamplingConfig
 
+OUTLIER_VOLUME_PX3 = 640.0 * 480.0 * 60.0
+"""Of the pixels (u_left, v, u_right): an image, and disparities of so many pixels."""
+
 
 @dataclass(frozen=True)
 class OdometryConfig:
@@ -128,7 +131,9 @@ class StereoConfig:
     trigger: TriggerConfig = field(default_factory=TriggerConfig)
     map: MapConfig = field(default_factory=MapConfig)
     keys: KeyConfig = field(default_factory=KeyConfig)
-    likelihood: LikelihoodConfig = field(default_factory=lambda: LikelihoodConfig("truncated"))
+    likelihood: LikelihoodConfig = field(
+        default_factory=lambda: LikelihoodConfig("truncated", outlier_volume=OUTLIER_VOLUME_PX3)
+    )
     proposal: ProposalConfig = field(default_factory=lambda: ProposalConfig("prior"))
     resampling: ResamplingConfig = field(default_factory=ResamplingConfig)
 

@@ -1,0 +1,28 @@
+"""Settings that are given go over the system's own defaults, not over those of a group's class."""
+
+from dataclasses import asdict
+
+from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig
+from rbpf.systems.mono.config import MonoConfig
+from rbpf.systems.settings import load_settings
+from rbpf.systems.stereo.config import StereoConfig
+
+
+def test_the_rest_of_a_group_keeps_the_systems_defaults():
+    found = load_settings(StereoConfig, "stereo", None, ["likelihood.truncation=9", "sift.length=128"], {})
+    assert found.likelihood.kind == "truncated" != LikelihoodConfig().kind
+    assert found.likelihood.truncation == 9.0
+    assert found.likelihood.outlier_volume == StereoConfig().likelihood.outlier_volume
+    assert found.sift.length == 128 and found.sift.working_scale == 0.5
+    found = load_settings(MonoConfig, "mono", None, ["proposal.weights=linearised"], {})
+    assert found.proposal.iterations == MonoConfig().proposal.iterations != ProposalConfig().iterations
+
+
+def test_nothing_given_is_the_default():
+    for kind in (MonoConfig, StereoConfig):
+        assert asdict(load_settings(kind, "any", None, [], {})) == asdict(kind())
+
+
+def test_a_group_can_be_nothing():
+    found = load_settings(StereoConfig, "stereo", None, ["keys.distinct=0.2"], {"keys": {"distinct": None}})
+    assert found.keys.distinct is None and found.keys.patience == 3
