@@ -126,9 +126,15 @@ def test_how_rays_are_used():
     state, landmark = frozenset({Part.STATE}), frozenset({Part.LANDMARK})
     epipolar, marginal, off = (groups_of(constrain) for constrain in ("epipolar", "marginal", "off"))
     assert set().union(*epipolar) == {(EpipolarRay, state), (CameraRay, landmark)}
-    assert set().union(*marginal) == {(CameraRay, state), (CameraRay, state | landmark)}
+    assert set().union(*marginal) == {(EpipolarRay, state), (CameraRay, state), (CameraRay, state | landmark)}
     assert set().union(*off) == {(CameraRay, landmark)}
-    assert marginal[1] == {(CameraRay, state)} and epipolar[1] == {(EpipolarRay, state)} and off[1] == set()
+    assert marginal[1] == epipolar[1] == {(EpipolarRay, state)} and off[1] == set()
+
+
+def test_without_points_the_prior_of_depth_holds_the_scale():
+    """Young rays then constrain the pose by the marginal, where their prior counts."""
+    found = groups_of("marginal", without_known(LOG))
+    assert found[1] == {(CameraRay, frozenset({Part.STATE}))}
 
 
 @every_constraint
