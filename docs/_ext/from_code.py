@@ -1,6 +1,6 @@
 """Directives whose content is taken from the program when the documentation is built, so that it stays true.
 
-```{settings}                        every setting of a range-bearing run
+```{settings} stereo                 every setting of a run of a system
 ```{command-help} run range-bearing  what `rbpf run range-bearing --help` prints
 ```{modules} rbpf.maps               the modules of a package, each under a heading
 """
@@ -27,11 +27,15 @@ _MODULE = "## {name}\n\n```{{eval-rst}}\n.. automodule:: {name}\n{members}```\n\
 class Settings(SphinxDirective):
     """Name, default and meaning of each field of a configuration and of the configurations inside it."""
 
+    required_arguments = 1
+
     def run(self) -> list[nodes.Node]:
         """A table for the run and one for each group."""
         from rbpf.systems.range_bearing.config import RangeBearingConfig
+        from rbpf.systems.stereo.config import StereoConfig
 
-        return [node for name, config in _groups("", RangeBearingConfig()) for node in _table(name, config)]
+        config = {"range-bearing": RangeBearingConfig, "stereo": StereoConfig}[self.arguments[0]]()
+        return [node for name, part in _groups("", config) for node in _table(name, part)]
 
 
 class CommandHelp(SphinxDirective):
