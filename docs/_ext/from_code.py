@@ -33,9 +33,11 @@ class Settings(SphinxDirective):
         """A table for the run and one for each group."""
         from rbpf.systems.mono.config import MonoConfig
         from rbpf.systems.range_bearing.config import RangeBearingConfig
+        from rbpf.systems.stereo.config import StereoConfig
 
-        config = {"mono": MonoConfig, "range-bearing": RangeBearingConfig}[self.arguments[0]]()
-        return [node for name, group in _groups("", config) for node in _table(name, group)]
+        configs = {"mono": MonoConfig, "range-bearing": RangeBearingConfig, "stereo": StereoConfig}
+        config = configs[self.arguments[0]]()
+        return [node for name, part in _groups("", config) for node in _table(name, part)]
 
 
 class CommandHelp(SphinxDirective):

@@ -128,7 +128,10 @@ def test_how_rays_are_used():
     assert set().union(*epipolar) == {(EpipolarRay, state), (CameraRay, landmark)}
     assert set().union(*marginal) == {(EpipolarRay, state), (CameraRay, state), (CameraRay, state | landmark)}
     assert set().union(*off) == {(CameraRay, landmark)}
-    assert marginal[1] == epipolar[1] == {(EpipolarRay, state)} and off[1] == set()
+    assert epipolar[1] == {(EpipolarRay, state)} and off[1] == set()
+    seen = [np.isin(frame.landmarks, known(LOG.known).names).sum() for frame in LOG.frames]
+    assert (seen[1], marginal[1]) == (2, {(CameraRay, state)})
+    assert (seen[2], marginal[2]) == (4, {(EpipolarRay, state)})
 
 
 def test_without_points_the_prior_of_depth_holds_the_scale():

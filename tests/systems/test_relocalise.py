@@ -245,7 +245,7 @@ def lost_sensor(found, reach_px):
     sensor.table.add(np.zeros((k, 31, 31), np.uint8), np.zeros((k, 2)), SE3.identity())
     cov = (np.array(reach_px) / CONFIG.search.sigmas)[:, None, None] ** 2 * np.eye(2)
     hits, px = np.array(found, dtype=bool), np.zeros((k, 2))
-    sensor.searched = Searched(np.arange(k), px, cov, px, np.ones(k), hits)
+    sensor.searched = Searched(np.arange(k), px, cov, px, np.ones(k), hits, np.zeros(k, dtype=bool))
     sensor.bad_frames = CONFIG.search.lost_frames
     return sensor
 

@@ -24,7 +24,10 @@ CONSTELLATION = -1
 """Name of the known points' frame in the catalogue; features have names from 0 on."""
 
 ENOUGH = 4
-"""Points that must be seen for new rays to start at their depth, and for the scale to be theirs."""
+"""Points that must be seen for new rays to start at their depth."""
+
+HOLD = 3
+"""Points that must be seen for the scale to be theirs: so many determine the camera's pose."""
 
 GroupView = ConstellationView | MembersView
 """Measurements of several known points at once."""
@@ -71,7 +74,7 @@ class FeatureSensor(Sensor):
             k = rows[~is_ray]
             groups.append(Observations(frame.z[k], frame.cov_z[k], self.point, ids=ids[k]))
         if is_ray.any():
-            scaled = sum(group.z.size for group in groups) >= 2 * ENOUGH
+            scaled = sum(group.z.size for group in groups) >= 2 * HOLD
             groups += self._ray_groups(frame, belief, rows[is_ray], ids[rows[is_ray]], scaled)
         return groups
 

@@ -53,6 +53,9 @@ class MapConfig:
         margin_px: landmarks so far outside the image, as the heaviest particle sees it, may be in it.
         turn_deg: a landmark is not looked for once its line of sight has turned by this since it was seen last.
         scale: nor once it is so many times nearer or farther.
+        doubt_px: where landmarks are expected with a larger standard deviation than this, the gate lets much pass: the
+            matches must then agree on one motion …
+        agreeing: … and be so many, else none is taken, and the doubt stays.
         depth_share: a feature starts a landmark if the standard deviation of its depth is below this share of it.
     """
 
@@ -65,6 +68,8 @@ class MapConfig:
     margin_px: float = 20.0
     turn_deg: float = 45.0
     scale: float = 2.0
+    doubt_px: float = 15.0
+    agreeing: int = 6
     depth_share: float = 0.1
 
     def __post_init__(self) -> None:

@@ -9,6 +9,9 @@ from rbpf.lie import SE3
 from rbpf.sensors.pinhole import RectifiedStereo
 from rbpf.systems.stereo.config import MapConfig
 
+SIGMAS = 3.0
+"""The image is widened by so many standard deviations of the camera's direction."""
+
 
 @dataclass
 class _Rows:
@@ -43,9 +46,12 @@ class Places:
         self._rows.place[names] = place
         self._rows.seen_from[names] = SE3.translation(world_from_camera)
 
-    def in_view(self, names: np.ndarray, world_from_camera: np.ndarray) -> np.ndarray:
-        """Those of landmarks (M,) that a camera (7,) may see and know again."""
-        names = names[self._in_image(SE3.inverse_transform(world_from_camera, self._rows.place[names]))]
+    def in_view(self, names: np.ndarray, world_from_camera: np.ndarray, doubt_rad: float = 0.0) -> np.ndarray:
+        """Those of landmarks (M,) that a camera (7,), whose direction is in some doubt, may see and know again."""
+        camera = self.rig.camera
+        margin = self.config.margin_px + min(SIGMAS * camera.fx * doubt_rad, 0.5 * camera.width)
+        local = SE3.inverse_transform(world_from_camera, self._rows.place[names])
+        names = names[self._in_image(local, margin)]
         place = self._rows.place[names]
         then = place - self._rows.seen_from[names]
         now = place - SE3.translation(world_from_camera)
@@ -55,9 +61,9 @@ class Places:
         alike = (cosine >= np.cos(np.deg2rad(self.config.turn_deg))) & (ratio <= np.log(self.config.scale))
         return np.asarray(names[alike])
 
-    def _in_image(self, local: np.ndarray) -> np.ndarray:
+    def _in_image(self, local: np.ndarray, margin: float) -> np.ndarray:
         """Rows of points (M, 3) in the camera's frame that are in both images, or nearly; most are far from it."""
-        camera, margin = self.rig.camera, self.config.margin_px
+        camera = self.rig.camera
         across = (max(camera.cx, camera.width - camera.cx) + margin) / camera.fx
         down = (max(camera.cy, camera.height - camera.cy) + margin) / camera.fy
         x, y, z = local.T

@@ -15,18 +15,22 @@ import numpy as np
 
 from rbpf.belief import Belief
 from rbpf.exchange import NULL
-from rbpf.gaussian import symmetrise
 from rbpf.maps.point import Point
 from rbpf.models import Births, Likelihood, Observations, Part, Sensor
+from rbpf.motion.stereo_vo import VoConfig, estimate_motion
 from rbpf.sensors.key_index import Gate, KeyIndex
 from rbpf.sensors.key_management import KeyConfig, KeyManager
 from rbpf.sensors.pinhole import RectifiedStereo
 from rbpf.sensors.stereo_features import StereoFeatures
 from rbpf.sensors.stereo_points import StereoPoint
+from rbpf.systems.stereo.cloud import Cloud, Expected
 from rbpf.systems.stereo.config import MapConfig
 from rbpf.systems.stereo.landmarks import Places
 
 _MAP = frozenset({Part.LANDMARK})
+
+TINY = 1e-6
+"""Added to the variance of expected pixels, px²: a landmark may be known exactly."""
 
 
 @dataclass(frozen=True)
@@ -140,42 +144,52 @@ class StereoSensor(Sensor):
         features = frame.features
         out = np.full(len(features), NULL, dtype=np.int64)
         rows = np.arange(len(features)) if frame.free is None else np.flatnonzero(frame.free)
-        names = self._alike(features.keys[rows], belief)
-        if names.size and rows.size:
-            mean, cov = self._expected(self._ids_of(names, belief), belief)
-            gate = Gate(features.z[rows], features.cov[rows], names, mean, cov, self.config.gate)
-            out[rows] = self.index.match(features.keys[rows], gate).ids
+        cloud = Cloud.of(belief, self.config.cloud)
+        names = self._alike(features.keys[rows], cloud)
+        if not (names.size and rows.size):
+            return out
+        ids = self._ids_of(names, belief)
+        seen = cloud.expected(belief, self.model, ids)
+        total = seen.cov + self.config.slack_px**2 * np.eye(3)
+        gate = Gate(features.z[rows], features.cov[rows], names, seen.mean, total, self.config.gate)
+        found = self.index.match(features.keys[rows], gate).ids
+        taken = np.flatnonzero(found >= 0)
+        of = np.searchsorted(names, found[taken])
+        agreed = self._agreed(seen.take(of), features.take(rows[taken]))
+        out[rows[taken[agreed]]] = found[taken[agreed]]
         return out
 
-    def _alike(self, keys: np.ndarray, belief: Belief) -> np.ndarray:
-        """Names of landmarks that may be in view and whose keys come near to that of any feature.
+    def _agreed(self, seen: Expected, features: StereoFeatures) -> np.ndarray:
+        """Which matches (k,) are taken: all, unless they are expected so vaguely that the gate tells little."""
+        all_of_them = np.ones(len(features), dtype=bool)
+        if not len(features) or np.median(seen.deviation) <= self.config.doubt_px:
+            return all_of_them
+        if len(features) < self.config.agreeing:
+            return ~all_of_them
+        # As the heaviest particle sees them, moved by an increment of any size.
+        motion = estimate_motion(
+            self.model.rig,
+            seen.by_heaviest,
+            features.z,
+            seen.within + TINY * np.eye(3),
+            features.cov,
+            np.random.default_rng(self.manager.frame),
+            config=VoConfig(least_matches=self.config.agreeing),
+        )
+        return motion.inliers
+
+    def _alike(self, keys: np.ndarray, cloud: Cloud) -> np.ndarray:
+        """Names of landmarks that may be in view and whose keys come near to that of any feature, ascending.
 
         Keys further away are neither taken nor forbid others by the ratio, whatever is expected where.
         """
         store, limits = self.index.store, self.config.limits
-        names = self.places.in_view(store.ids, belief.state[belief.mode])
+        names = self.places.in_view(store.ids, cloud.middle, cloud.doubt_rad)
         if not names.size or not keys.shape[0]:
             return names[:0]
         most = limits.largest(store.length) / limits.ratio
         near = (keys @ store.keys[store.rows(names)].T).max(axis=0) >= 1.0 - 0.5 * most**2
         return np.asarray(names[near])
-
-    def _expected(self, ids: np.ndarray, belief: Belief) -> tuple[np.ndarray, np.ndarray]:
-        """Pixels (k, 3) where some of the particles expect landmarks (k,), and their covariance (k, 3, 3).
-
-        What is uncertain within a particle, given its path, hardly differs between them: the heaviest one's is taken.
-        """
-        few = np.append(self._evenly(belief.weights), belief.mode)
-        records, prior = belief.read(ids, few), belief.prior.take(few)
-        state = prior.predicted()
-        px = self.model.predict(state[:-1, None], records.mean[:-1])
-        jac = self.model.jacobians(state[-1], records.mean[-1])
-        assert jac.state is not None and jac.landmark is not None
-        moved = jac.state @ prior.spread(prior.mean)[-1]
-        within = jac.landmark @ records.cov[-1] @ jac.landmark.mT + moved @ moved.mT
-        off = px - px.mean(axis=0)
-        between = np.einsum("nka,nkb->kab", off, off) / px.shape[0]
-        return px.mean(axis=0), symmetrise(within + between) + self.config.slack_px**2 * np.eye(3)
 
     def _ids_of(self, names: np.ndarray, belief: Belief) -> np.ndarray:
         """Ids (k,) that the map has given to names (k,); what is new in the catalogue is noted, from its end on."""
@@ -187,12 +201,6 @@ class StereoSensor(Sensor):
                 break
             self._ids[name], self._told = landmark, max(self._told, landmark)
         return self._ids[names]
-
-    def _evenly(self, weights: np.ndarray) -> np.ndarray:
-        """Rows of particles, each for an equal share of the weight."""
-        count = min(self.config.cloud, weights.size)
-        steps = (np.arange(count) + 0.5) / count
-        return np.minimum(np.searchsorted(np.cumsum(weights), steps), weights.size - 1)
 
     def _forget(self, belief: Belief, names: np.ndarray) -> None:
         if names.size:
