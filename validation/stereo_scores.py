@@ -31,9 +31,13 @@ def score_stereo(run: StereoRun) -> dict[str, float | int]:
 
 
 def stereo_truth(run: StereoRun) -> RunTruth | None:
-    """The truth at a run's pairs; the run begins at the origin, wherever the truth does."""
+    """The truth at a run's pairs, told from its first one, as the run is; to be aligned where that has no truth."""
     truth = true_path(run.truth, run.stamps_ns)
-    return None if truth is None else RunTruth(truth.rows, truth.world_from_camera, {}, "rigid")
+    if truth is None:
+        return None
+    if truth.rows[0] != 0:
+        return RunTruth(truth.rows, truth.world_from_camera, {}, "rigid")
+    return RunTruth(truth.rows, SE3.between(truth.world_from_camera[0], truth.world_from_camera))
 
 
 def compared(run: StereoRun, poses: np.ndarray, truth: TruePath) -> tuple[Trajectory, Trajectory]:
