@@ -13,7 +13,9 @@ import pytest
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 
 ROOT = Path(__file__).resolve().parents[2]
-SECONDS_LONG = {"mono_blackouts", "mono_loop", "mono_overconfidence", "mono_still_camera", "mono_video"}
+SECONDS_LONG = {
+    "mono_blackouts", "mono_loop", "mono_overconfidence", "mono_still_camera", "mono_video", "reproduce_s05",
+}  # fmt: skip
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 LONGEST_SENSOR = 40
 
@@ -118,6 +120,13 @@ def range_only_beacons(figures: dict[str, float]) -> None:
     assert figures["path"] < 0.3
 
 
+def reproduce_s05(figures: dict[str, float]) -> None:
+    assert figures["path, filter"] < 0.1
+    assert figures["map, filter, aligned"] < figures["map, odometry, aligned"] + 0.05
+    assert 0.0 < figures["mean ms of an update"] < 1e3 * figures["mean seconds per pair"]
+    assert figures["mean seconds per pair"] < figures["the paper's"]
+
+
 def smoothing(figures: dict[str, float]) -> None:
     assert figures["ancestral paths"] < 0.5 * figures["filter"]
     assert figures["backward"] < 0.5 * figures["filter"]
@@ -151,6 +160,7 @@ CLAIMS: dict[str, Callable[[Any], None]] = {
         own_landmark,
         own_proposal,
         range_only_beacons,
+        reproduce_s05,
         smoothing,
         target_tracking,
     )
