@@ -83,6 +83,7 @@ def main(
     seed: int = 0,
     step: int = 200,
     texel_m: float = 0.003,
+    quick: bool = False,
 ) -> dict[str, float]:
     """Renders the drive, unless it is there, and filters it.
 
@@ -96,7 +97,10 @@ def main(
         seed: of the images and of the filter.
         step: pairs between rows of the table.
         texel_m: side of a texel of the walls.
+        quick: thirty coarse pairs and 100 particles, to see that it works.
     """
+    if quick:
+        frames, every, particles, width, step, texel_m = 30, 3, 100, 320, 15, 0.01
     images = out / "lab"
     if not images.exists():
         size = 0.78125 * width, 0.78125 * width, 0.5 * width - 0.5, 0.375 * width - 0.5

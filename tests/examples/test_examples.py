@@ -26,6 +26,7 @@ SECONDS_LONG = {
     "verdict",
     "mono_realism",
     "reproduce_e06",
+    "reproduce_s05",
 }
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 LONGEST_SENSOR = 40
@@ -187,6 +188,13 @@ def reproduce_e06(figures: dict[str, float]) -> None:
     assert of("first sighting: divergence") > 5.0  # half the resolution sees half the parallax
 
 
+def reproduce_s05(figures: dict[str, float]) -> None:
+    assert figures["path, filter"] < 0.1
+    assert figures["map, filter, aligned"] < figures["map, odometry, aligned"] + 0.05
+    assert 0.0 < figures["mean ms of an update"] < 1e3 * figures["mean seconds per pair"]
+    assert figures["mean seconds per pair"] < figures["the paper's"]
+
+
 def smoothing(figures: dict[str, float]) -> None:
     assert figures["ancestral paths"] < 0.5 * figures["filter"]
     assert figures["backward"] < 0.5 * figures["filter"]
@@ -243,6 +251,7 @@ CLAIMS: dict[str, Callable[[Any], None]] = {
         own_proposal,
         range_only_beacons,
         reproduce_e06,
+        reproduce_s05,
         smoothing,
         sweep,
         target_tracking,
