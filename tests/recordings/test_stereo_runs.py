@@ -59,7 +59,7 @@ def test_a_room_in_part(data_dir):
     found = scores(run)
     assert found["ate_rmse_m"] < 0.009
     assert 5 <= run.updated.sum() < 30  # at first the camera is at rest
-    assert run.observed[run.updated > 0][3:].mean() > 20
+    assert run.observed[-1] > 20  # the map fills by 15 keys an update
 
 
 @pytest.mark.slow
