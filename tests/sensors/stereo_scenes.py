@@ -17,7 +17,7 @@ def room(frames=3, every=8, seed=1):
     """Pairs of images, depths (H, W) and rectangles (H, W) of the left ones, and poses (T, 7)."""
     rng = np.random.default_rng(seed)
     scene = TexturedRoom(frames=frames * every, texel_m=0.004).build(rng)
-    imaging = Imaging(known=0)
+    imaging = Imaging(known=0, noise_std=2.0, blur_s=0.0, exposure_drift=0.0, vignetting=0.0)
     renderer = Renderer(scene.rectangles, RIG.camera, imaging.grid)
     shutter = Shutter(scene, imaging, RIG.camera, renderer, rng)
     chosen = range(0, frames * every, every)
