@@ -16,6 +16,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SECONDS_LONG = {
     "against_colmap",
     "error_ratios",
+    "lab_images",
     "mono_blackouts",
     "mono_budget",
     "mono_loop",
@@ -23,6 +24,7 @@ SECONDS_LONG = {
     "mono_still_camera",
     "mono_video",
     "consistency_runs",
+    "validate_run",
     "verdict",
     "mono_realism",
     "reproduce_e06",
