@@ -26,7 +26,8 @@ def started(tmp_path_factory):
     """The run, and the true poses in the board's frame."""
     folder = tmp_path_factory.mktemp("board") / "desk"
     world = TexturedDesk(frames=60, board=(8, 5), square_m=0.06, speed_m_s=0.6, turn_rad_s=1.0, start_s=0.3)
-    simulate_images(world, Imaging(noise_std=1.0, known=0), CAMERA, folder, seed=0)
+    imaging = Imaging(noise_std=1.0, blur_s=0.0, exposure_drift=0.0, vignetting=0.0, known=0)
+    simulate_images(world, imaging, CAMERA, folder, seed=0)
     sequence, known = Recording(folder, board=BOARD).open()
     entry = yaml.safe_load((folder / "chessboard.yaml").read_text())[0]
     assert sequence.truth is not None
