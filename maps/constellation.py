@@ -117,13 +117,13 @@ class UncertainConstellation(Landmark):
     def in_group(self, records: Records) -> tuple[np.ndarray, np.ndarray]:
         """The points in their own frame: means (N, M, 3) and covariances (N, M, 3, 3)."""
         frame, local, slope, info = self._fit(records)
-        by_frame = _by_frame(local)
-        by_points = by_frame @ slope[:, None]
+        of_frame = by_frame(local)
+        by_points = of_frame @ slope[:, None]
         back = np.swapaxes(SE3.rotation(frame), -1, -2)
         for m in range(len(self.points)):
             by_points[:, m, :, 3 * m : 3 * m + 3] += back
         covs = by_points @ records.cov[:, :1, :, :] @ np.swapaxes(by_points, -1, -2)
-        of_fit = by_frame @ np.linalg.inv(info)[:, None] @ np.swapaxes(by_frame, -1, -2)
+        of_fit = of_frame @ np.linalg.inv(info)[:, None] @ np.swapaxes(of_frame, -1, -2)
         return local, gaussian.symmetrise(covs + of_fit)
 
     def _points_of(self, mean: np.ndarray) -> np.ndarray:
@@ -141,9 +141,9 @@ class UncertainConstellation(Landmark):
         frame = _closed_fit(given, world)
         for _ in range(ROUNDS):
             local = SE3.inverse_transform(frame[:, None], world)
-            by_frame = _by_frame(local)
-            weighed = np.swapaxes(by_frame, -1, -2) @ weight
-            info = (weighed @ by_frame).sum(axis=1)
+            of_frame = by_frame(local)
+            weighed = np.swapaxes(of_frame, -1, -2) @ weight
+            info = (weighed @ of_frame).sum(axis=1)
             vector = (weighed @ (local - given)[..., None]).sum(axis=1)
             step = -np.linalg.solve(info, vector)[..., 0]
             frame = SE3.retract(frame, step)
@@ -155,8 +155,8 @@ class UncertainConstellation(Landmark):
         return frame, SE3.inverse_transform(frame[:, None], world), slope, info
 
 
-def _by_frame(local: np.ndarray) -> np.ndarray:
-    """∂(T⁻¹p)/∂ξ = [[q]× | −I] (…, 3, 6) at q = T⁻¹p."""
+def by_frame(local: np.ndarray) -> np.ndarray:
+    """∂(T⁻¹p)/∂ξ = [[q]× | −I] (…, 3, 6) at q = T⁻¹p, for T Exp(ξ); with a minus and turned by R that of T q."""
     return np.concatenate([skew(local), np.broadcast_to(-np.eye(3), (*local.shape, 3))], axis=-1)
 
 

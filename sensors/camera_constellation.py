@@ -145,11 +145,6 @@ class ConstellationView(ObservationModel):
         assert const is not None
         return SE3.transform(SE3.retract(const, landmark)[..., None, :], self.points)
 
-    def in_camera(self, state: np.ndarray, landmark: np.ndarray, const: np.ndarray | None) -> np.ndarray:
-        """The points (…, m, 3) in the camera's frame."""
-        assert const is not None
-        return self._chain(state, landmark, const)[1]
-
     def kernel(self) -> FusedKernel | None:
         """Compiled."""
         from rbpf.sensors.constellation_kernel import constellation_view

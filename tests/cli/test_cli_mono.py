@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import shutil
 import sys
 from pathlib import Path
 
@@ -245,3 +246,16 @@ def test_rendered_sequences_can_be_opened(tmp_path):
         sequence = open_images(out)
         assert len(sequence) == 2 and sequence.camera.width == 96
         assert read_known_points(out / "known_points.csv").names.size == 6
+
+
+def test_a_run_is_compared_with_its_batch_optimum_afterwards(finished, tmp_path):
+    """From the files in the folder alone, with the figures that the run itself had."""
+    folder = tmp_path / "run"
+    shutil.copytree(finished, folder)
+    assert main(["validate", str(folder), "--against", "gtsam"]) == 0
+    written = json.loads((folder / "validation_gtsam.json").read_text())
+    apart = json.loads((folder / "summary.json").read_text())["filter_minus_batch_rmse_m"]
+    assert written["figures"]["filter_minus_batch_rmse_m"] == pytest.approx(apart, rel=1e-3)
+    assert written["figures"]["landmarks_count"] > 0
+    assert all((folder / name).is_file() for name in written["pictures"]) and written["pictures"]
+    assert "Against gtsam" in (folder / "report.html").read_text()

@@ -9,8 +9,7 @@ from scipy.optimize import least_squares
 from rbpf import gaussian
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.lie.matrices import skew
-from rbpf.maps.constellation import LEAST, Constellation, UncertainConstellation
+from rbpf.maps.constellation import LEAST, Constellation, UncertainConstellation, by_frame
 from rbpf.models import Records
 from rbpf.sensors.camera_points import CameraPoint
 from rbpf.sensors.corners import texture
@@ -107,8 +106,7 @@ def first_records(
         group = Constellation(points.positions)
         return group.started(n, frame, gaussian.symmetrise(half @ half.T)), group
     shape = UncertainConstellation(points.positions, points.cov)
-    by_frame = np.concatenate([-skew(local), np.broadcast_to(np.eye(3), (*local.shape, 3))], axis=-1)
-    moved = by_frame @ half[:6] + half[6:].reshape(*local.shape, -1)
+    moved = half[6:].reshape(*local.shape, -1) - by_frame(local) @ half[:6]
     turned = (SE3.rotation(frame) @ moved).reshape(-1, half.shape[1])
     world = SE3.transform(frame, local)
     return shape.started(n, world, gaussian.symmetrise(turned @ turned.T)), shape
