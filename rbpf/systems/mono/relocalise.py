@@ -14,9 +14,10 @@ from rbpf.sensors.corners import corners
 from rbpf.sensors.keypoints import describe, describe_windows
 from rbpf.sensors.patches import search, warp
 from rbpf.sensors.pinhole import Pinhole
+from rbpf.systems.mono.appearance import Appearances
 from rbpf.systems.mono.config import RecoveryConfig
 from rbpf.systems.mono.image_sensor import ImageSensor
-from rbpf.systems.mono.viewing import affines
+from rbpf.systems.mono.viewing import affines, turned
 
 SCALES = (0.7, 1.0, 1.4)
 """Sizes at which the lost image is described, times that at which features are seen from the last trusted pose."""
@@ -134,8 +135,9 @@ class Relocaliser:
         rows, at = looks.rows[pairs[0]], looks.px[pairs[1]]
         table, config = self.sensor.table, self.sensor.config
         homogeneous = np.concatenate([looks.points[pairs[0]], np.ones((rows.size, 1))], axis=-1)
-        turn = affines(self.sensor.camera, homogeneous, table.first_pose[rows], world_from_camera)
-        templates = warp(table.source[rows], turn, config.template_px)
+        sources, poses = nearest_looks(table, rows, homogeneous, world_from_camera)
+        turn = affines(self.sensor.camera, homogeneous, poses, world_from_camera)
+        templates = warp(sources, turn, config.template_px)
         cov = np.tile(CORNER_PX**2 * np.eye(2), (rows.size, 1, 1))
         matches = search(looks.image, templates, at, cov, sigmas=config.sigmas, most_px=config.largest_px)
         return np.where((matches.score >= LEAST_ALIKE)[:, None], matches.px, at)
@@ -163,7 +165,8 @@ class Relocaliser:
             return known[3]
         table = self.sensor.table
         homogeneous = np.concatenate([points, np.ones((rows.size, 1))], axis=-1)
-        turn = affines(self.sensor.camera, homogeneous, table.first_pose[rows], near)
+        sources, poses = nearest_looks(table, rows, homogeneous, near)
+        turn = affines(self.sensor.camera, homogeneous, poses, near)
         # Features behind the camera or at a grazing angle are described as they were seen at first.
         with np.errstate(all="ignore"):
             area = turn[:, 0, 0] * turn[:, 1, 1] - turn[:, 0, 1] * turn[:, 1, 0]
@@ -171,9 +174,23 @@ class Relocaliser:
         angle = np.arctan2(turn[:, 1, 0] - turn[:, 0, 1], turn[:, 0, 0] + turn[:, 1, 1])
         sane = np.isfinite(turn).all(axis=(1, 2)) & (scale > 0.25) & (scale < 4.0)
         scale, angle = np.where(sane, scale, 1.0), np.where(sane, angle, 0.0)
-        looks = describe_windows(table.source[rows], np.clip(scale, LEAST_SCALE, LARGEST_SCALE), angle)
+        looks = describe_windows(sources, np.clip(scale, LEAST_SCALE, LARGEST_SCALE), angle)
         self._seen_from = *asked, looks
         return looks
+
+
+def nearest_looks(
+    table: Appearances, rows: np.ndarray, place: np.ndarray, world_from_camera: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Of features at homogeneous places (K, 4), the windows (K, S, S) that were kept from the side nearest to a pose.
+
+    And the poses (K, 7) from which that was.
+    """
+    first, last = table.first_pose[rows], table.last_pose[rows]
+    of_first, of_last = (turned(place, pose, world_from_camera)[0] for pose in (first, last))
+    later = of_last > of_first
+    sources = np.where(later[:, None, None], table.last_source[rows], table.source[rows])
+    return sources, np.where(later[:, None], last, first)
 
 
 def known_places(sensor: ImageSensor, belief: Belief, share: float) -> tuple[np.ndarray, np.ndarray]:
