@@ -125,6 +125,7 @@ class RecoveryConfig:
         within_px: a feature agrees with a pose when it is seen as near to its projection.
         triples: of features from which poses are computed.
         inliers: features that must agree with a pose.
+        few: it is enough that so many agree if the last view before the loss shows the same motion.
         sure: when so many agree, less has to be found of what should then be seen.
         inlier_share: share of the matches that must agree.
         spread: standard deviation of the inliers' places in their narrowest direction, in widths of the image.
@@ -143,6 +144,7 @@ class RecoveryConfig:
     within_px: float = 4.0
     triples: int = 300
     inliers: int = 8
+    few: int = 5
     sure: int = 12
     inlier_share: float = 0.25
     spread: float = 0.03
