@@ -6,8 +6,10 @@ import pytest
 from rbpf.lie import SE3
 from rbpf.sensors.corners import corners
 from rbpf.sensors.uncertain_resection import GATE, squared_distances
+from rbpf.systems.mono.config import RecoveryConfig
 from rbpf.systems.mono.last_view import LEAST, LastView, mutual
 from rbpf.systems.mono.likeness import described
+from rbpf.systems.mono.relocalise import agrees, confirmed
 from tests.systems.plane_sequences import CAMERA, known_points, texture, view
 
 HERE = SE3.retract(SE3.identity(), np.array([0.02, 0.01, 0.03, 0.05, 0.02, -0.03]))
@@ -70,3 +72,14 @@ def test_pairs_are_the_most_alike_both_ways():
     assert [pair.tolist() for pair in mutual(alike, px)] == [[1], [0]]
     px[2] = [55.0, 0.0]  # the rival of the third is the same thing
     assert [pair.tolist() for pair in mutual(alike, px)] == [[1, 2], [0, 1]]
+
+
+def test_few_landmarks_are_enough_where_most_corners_agree():
+    config = RecoveryConfig()
+    assert confirmed(config.few, 90, 100, config)
+    assert not confirmed(config.few - 1, 100, 100, config)  # these give the scale
+    assert not confirmed(30, 60, 100, config)  # most show another motion
+    assert not confirmed(30, LEAST - 1, LEAST - 1, config)
+    assert agrees(np.arange(100) < 90)
+    assert not agrees(np.arange(100) < 60)
+    assert not agrees(np.ones(LEAST - 1, dtype=bool))
