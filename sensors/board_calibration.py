@@ -19,8 +19,7 @@ LEAST_VIEWS = 5
 MOST_UNCERTAIN = 0.02
 """Standard deviation of the focal length, as a share of it, above which the views say too little."""
 LEAST_TURN = np.deg2rad(10.0)
-"""Angle between the board's normals in two of the views that there has to be: seen from one direction, near and small is
-the same as far and large."""
+"""Angle between the board's normals that two views must have: from one direction, near and small is far and large."""
 OUTLYING = 4.0
 """Views whose error is this many times the median one are left out, and …"""
 HARMLESS_PX = 0.3
@@ -97,7 +96,8 @@ def calibrate(views: Sequence[BoardView], board: Board, width: int, height: int)
     Raises:
         InputError: there are too few views, or they are too much alike to determine the camera.
     """
-    used, left_out = list(views), []
+    used = list(views)
+    left_out: list[str] = []
     while True:
         _require_enough(used, left_out)
         found = _fitted(used, board, width, height)

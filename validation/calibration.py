@@ -1,4 +1,4 @@
-"""A camera from pictures of a chessboard: camera.yaml for the readers, the figures, and a picture of corners and residuals.
+"""A camera from pictures of a chessboard: camera.yaml for the readers, figures, a picture of corners and residuals.
 
 camera.yaml        the camera, as `rbpf.sensors.readers.images.calibration` reads it
 calibration.json   reprojection error, standard deviations, which images were used
@@ -144,8 +144,8 @@ def _nothing(images: Path, board: Board, looked_at: int, empty: np.ndarray | Non
                 f"places where four squares meet, give --board {columns}x{rows}"
             )
     return (
-        f"{images}: no chessboard of {size} inner corners is found in {looked_at} images: it has to be seen whole, with "
-        "its white border, sharp and evenly lit; --board counts the places where four squares meet"
+        f"{images}: no chessboard of {size} inner corners is found in {looked_at} images: it has to be seen whole, "
+        "with its white border, sharp and evenly lit; --board counts the places where four squares meet"
     )
 
 
@@ -159,7 +159,7 @@ def _draw(found: BoardCalibration) -> Any:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13.0, 8.0), layout="constrained")
-    axes = figure.subplot_mosaic([["image", "residuals"], ["image", "views"]], width_ratios=[1.7, 1.0])
+    axes: Any = figure.subplot_mosaic([["image", "residuals"], ["image", "views"]], width_ratios=[1.7, 1.0])
     _draw_image(axes["image"], found)
     residuals = found.residuals.reshape(-1, 2)
     label(axes["residuals"], "residuals of all corners", "u [px]", "v [px]", equal=True)

@@ -23,9 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
-from rbpf import __version__
 from rbpf.systems.mono.video import VideoRun
 from rbpf.validation.camera_files import write_features
 from rbpf.validation.files import (
@@ -41,6 +39,7 @@ from rbpf.validation.mono_log import feature_log
 from rbpf.validation.mono_map import MonoMap
 from rbpf.validation.mono_posterior import write_posterior
 from rbpf.validation.mono_scores import camera_truth, score_camera
+from rbpf.validation.provenance import write_config
 from rbpf.validation.run_files import write_path, write_truth
 from rbpf.validation.trajectory import Trajectory
 from rbpf.validation.trajectory_files import write_tum
@@ -77,8 +76,7 @@ def write_mono_run(
     write_posterior(run, out)
     write_features(out, feature_log(run))
     _write_tables(run, out)
-    config = {"rbpf": __version__, "system": "mono", **sources, **asdict(run.config)}
-    write_text(out / "config.yaml", yaml.safe_dump(config, sort_keys=False))
+    write_config(out, "mono", sources, asdict(run.config))
     entries = summarise_camera(run, mapped)
     write_summary(out, entries)
     return entries

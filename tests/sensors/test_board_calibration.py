@@ -42,7 +42,7 @@ def test_errors_are_those_that_the_standard_deviations_tell():
     normalised = []
     for seed in range(8):
         result = calibrate(exact_views(CAMERA, directions(12), 0.2, seed), BOARD, *SIZE)
-        normalised.append(((result.camera.params - CAMERA.params)[:4] / result.std[:4]))
+        normalised.append((result.camera.params - CAMERA.params)[:4] / result.std[:4])
     # 32 squares of unit normals, correlated within a run: their mean is 1 within a half.
     assert 0.4 < np.square(normalised).mean() < 1.9
 

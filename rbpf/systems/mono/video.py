@@ -102,7 +102,7 @@ def run_images(
         sequence: of images.
         config: all settings.
         known: points of known position that are seen in the first image; without them the scale is arbitrary.
-        on_frame: called after each frame.
+        on_frame: called after each frame; a KeyboardInterrupt from it leaves a checkpoint behind.
         checkpoint: file of checkpoints; None writes none.
         resume: go on from the checkpoint, if there is one.
 
@@ -125,8 +125,13 @@ def run_images(
             break
         if checkpoint is not None and (t + 1) % config.checkpoint_every == 0:
             save(run, checkpoint)
-        if on_frame is not None:
-            on_frame(t, frame, run)
+        try:
+            if on_frame is not None:
+                on_frame(t, frame, run)
+        except KeyboardInterrupt:
+            if checkpoint is not None:
+                save(run, checkpoint)
+            raise
         waited = time.perf_counter()
     cut(run)
     if checkpoint is not None and run.failure is None:
