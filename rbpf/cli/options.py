@@ -86,6 +86,8 @@ class MonoOptions(ImageRunOptions):
         board: in place of known points, inner corners of a chessboard that is seen whole in the first image, as 9x6;
             the world is then the board's; by default none.
         square: side of its squares, m; by default none.
+        map: folder of a run, or its known_map.npz, that the camera is to be found in; by default a map is made.
+        localize: the map is known: the start is found by recognition, and the map is not changed.
         video: write the annotated video.
         batch: also adjust the same measurements in batch with GTSAM.
         batch_limit: seconds after which the batch adjustment is given up; the run's results stay.
@@ -95,6 +97,8 @@ class MonoOptions(ImageRunOptions):
     known_points: Path | None = None
     board: str | None = None
     square: float | None = None
+    map: Path | None = None
+    localize: Flag = False
     video: bool = True
     batch: bool = True
     batch_limit: float = 300.0

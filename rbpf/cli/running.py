@@ -51,7 +51,9 @@ def run_mono(options: Annotated[MonoOptions, tyro.conf.arg(name="")]) -> None:
     named = given(options, "particles", "seed")
     config = load_settings(MonoConfig, "mono", options.config, options.set, named)
     board = given_board(options.board, options.square)
-    recording = Recording(options.sequence, options.known_points, options.calibration, board)
+    if options.localize != (options.map is not None):
+        raise InputError("a camera is found in a known map with both: --map RUN --localize")
+    recording = Recording(options.sequence, options.known_points, options.calibration, board, options.map)
     _prepare(options)
     with progress() as bar:
         with patient(told(bar, bar.add_task("filtering", total=None))) as tell:
