@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 DEFAULT_DATA = Path(__file__).resolve().parent.parent.parent / "shared" / "data"
@@ -41,4 +42,22 @@ def plain_pictures() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Figure, "savefig", plain)
+        yield
+
+
+@pytest.fixture(scope="module")
+def keypoints_once() -> Iterator[None]:
+    """In an image that one of the module's tests has seen, keypoints are not looked for again."""
+    from rbpf.sensors.sift import KeyPoints, Sift, SiftConfig
+
+    detect, known = Sift.detect, dict[tuple[SiftConfig, bytes], KeyPoints]()
+
+    def once(sift: Sift, image: np.ndarray) -> KeyPoints:
+        key = sift.config, image.tobytes()
+        if key not in known:
+            known[key] = detect(sift, image)
+        return known[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Sift, "detect", once)
         yield

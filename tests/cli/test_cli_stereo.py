@@ -13,6 +13,7 @@ from rbpf.lie import SE3
 from rbpf.validation.trajectory_files import read_tum
 from tests.cli.stereo_sequences import FRAMES, run
 
+pytestmark = pytest.mark.usefixtures("keypoints_once")
 FILES = {
     "trajectory.tum", "odometry.tum", "map.npz", "map.csv", "timings.csv", "diagnostics.csv", "config.yaml",
     "summary.json", "report.html", "path.png", "map.png", "particles.png", "error.png", "tracking.png", "timings.png",
@@ -28,7 +29,7 @@ TIMED = ("ms_per_frame", "ms_per_update", "peak_memory_mb")
 
 
 @pytest.fixture(scope="module")
-def finished(room, tmp_path_factory):
+def finished(room, tmp_path_factory, keypoints_once):
     out = tmp_path_factory.mktemp("finished") / "run"
     assert run(room, out) == 0
     return out
