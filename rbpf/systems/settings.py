@@ -10,7 +10,10 @@ import yaml
 
 from rbpf.errors import InputError
 
-_HEADER = ("rbpf", "system", "recording", "known_points", "board", "square_m", "calibration")
+_HEADER = (
+    "rbpf", "system", "versions", "input_sha256",
+    "recording", "known_points", "board", "square_m", "calibration", "map", "localize",
+)  # fmt: skip
 """What a config.yaml says about the run besides its settings."""
 
 if TYPE_CHECKING:

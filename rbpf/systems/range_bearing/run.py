@@ -124,7 +124,7 @@ def run(
         config: all settings.
         out: folder for checkpoints; None writes none.
         resume: go on from the checkpoint in `out`, if there is one.
-        on_step: called with the steps done and their number.
+        on_step: called with the steps done and their number; a KeyboardInterrupt from it leaves a checkpoint behind.
 
     Raises:
         InputError: the log or a setting does not fit, or no particle explains the observations.
@@ -141,6 +141,12 @@ def run(
         associations.restore(extra)
         if anchor is not None:
             anchor.restore(extra, build_model(log, config), build_point(log))
+
+    def save() -> None:
+        if checkpoint is not None:
+            kept = {} if anchor is None else anchor.arrays()
+            filter_.save(checkpoint, progress.arrays() | associations.arrays() | kept)
+
     for t in range(filter_.steps, total):
         frame = log.frames[t]
         started = time.perf_counter()
@@ -151,11 +157,14 @@ def run(
             estimate = anchor.state_estimate(anchor.after_step(report, control))
         progress.put(t, report, estimate, time.perf_counter() - started)
         associations.record(report, frame.z.shape[0])
-        if checkpoint is not None and filter_.steps % config.checkpoint_every == 0:
-            kept = {} if anchor is None else anchor.arrays()
-            filter_.save(checkpoint, progress.arrays() | associations.arrays() | kept)
-        if on_step is not None:
-            on_step(t + 1, total)
+        if filter_.steps % config.checkpoint_every == 0:
+            save()
+        try:
+            if on_step is not None:
+                on_step(t + 1, total)
+        except KeyboardInterrupt:
+            save()
+            raise
     used = named_associations(log)
     if config.association == "ml":
         used = associations.of(filter_.belief().mode)
