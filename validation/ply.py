@@ -1,6 +1,5 @@
 """Maps and paths as PLY files (G. Turk, 1994), binary little-endian: for MeshLab, CloudCompare, Blender."""
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +7,7 @@ from numpy.typing import NDArray
 
 from rbpf.errors import InputError
 from rbpf.lie import Array
+from rbpf.validation.writing import whole
 
 _VERTEX = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
 _SIGMA = [("sigma_m", "<f4")]
@@ -46,9 +46,8 @@ def write_ply(
     lines = np.empty(0 if edges is None else len(edges), dtype=_EDGE)
     if edges is not None:
         lines["vertex1"], lines["vertex2"] = edges.T
-    partial = path.with_name(path.name + ".partial")
-    partial.write_bytes(_header(vertices, lines) + vertices.tobytes() + lines.tobytes())
-    os.replace(partial, path)
+    with whole(path) as partial:
+        partial.write_bytes(_header(vertices, lines) + vertices.tobytes() + lines.tobytes())
 
 
 def read_ply(path: Path) -> dict[str, np.ndarray]:

@@ -227,6 +227,12 @@ def main(arguments: list[str] | None = None) -> int:
     except InputError as error:
         print(f"rbpf: {error}", file=sys.stderr)
         return 2
+    except OSError as error:
+        print(
+            f"rbpf: {error}; what was finished is kept, --resume goes on from the last checkpoint",
+            file=sys.stderr,
+        )
+        return 2
     except KeyboardInterrupt:
         print("rbpf: stopped; --resume goes on from the last checkpoint", file=sys.stderr)
         return 130

@@ -76,6 +76,7 @@ def assemble(
         config.resampling.build(),
         config.particles,
         np.random.default_rng(config.seed),
+        lag=config.lag,
     )
     if start is not None and config.known == "frame":
         add_constellation(landmark_map, features.camera, start, config)

@@ -124,13 +124,13 @@ def run_images(
             run.failure = f"frame {t} of {sequence.name}: {error}"
             break
         if checkpoint is not None and (t + 1) % config.checkpoint_every == 0:
-            save(run, checkpoint)
+            _keep(run, checkpoint)
         if on_frame is not None:
             on_frame(t, frame, run)
         waited = time.perf_counter()
-    cut(run)
     if checkpoint is not None and run.failure is None:
-        save(run, checkpoint)
+        _keep(run, checkpoint)
+    cut(run)
     return run
 
 
@@ -179,6 +179,14 @@ def _begin(
     run = VideoRun(sequence, config, known, filter_, sensor, stamps, poses, covs, *numbers)
     run.recovery.stamp_ns = int(stamps[0])
     return run, law
+
+
+def _keep(run: VideoRun, checkpoint: Path) -> None:
+    """Writes a checkpoint; where the disk is full the run goes on all the same, and the last one stays."""
+    try:
+        save(run, checkpoint)
+    except InputError as error:
+        run.problems.append(f"frame {run.filter.steps - 1}: no checkpoint is kept: {error}")
 
 
 def _waiting(run: VideoRun) -> PoseLaw | None:

@@ -45,8 +45,8 @@ class VideoImages(Source):
     def frames(self, start: int) -> Generator[ImageFrame]:
         with _opened(self.path) as capture:
             # Jumping to an image is inexact in most codecs, going through those before it is not.
-            for _ in range(start):
-                capture.grab()
+            if not all(capture.grab() for _ in range(start)):
+                return
             indices = range(start, len(self.stamps_ns))
             with closing(decode_ahead(lambda index: self._next(capture, index), indices)) as frames:
                 for frame in frames:
