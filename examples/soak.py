@@ -1,7 +1,7 @@
 """Does a filter run for ever? 100,000 frames of a camera and of a robot, in worlds whose points come and go.
 
 Both keep a fixed lag of their paths and forget landmarks that have not been seen for long. One row per 1,000 frames:
-the time of a step, the memory of the process and all that the filter refers to, and how far off it is. Tables and
+the processor's time for a step, the memory of the process and all that the filter refers to, and how far off it is. Tables and
 picture say whether anything grows.
 """
 
@@ -107,7 +107,7 @@ def draw(columns: dict[str, dict[str, np.ndarray]], path: Path) -> None:
     """Time, memory, what is held and the error, by frame."""
     figure = Figure(figsize=(9.0, 7.0), layout="constrained")
     shown = {
-        "ms_per_frame": "median time of a step [ms]",
+        "ms_per_frame": "median processor time of a step [ms]",
         "resident_mb": "memory of the process [MB]",
         "held_kb": "held by the filter [kB]",
         "error_m": "RMS error [m]",

@@ -36,7 +36,8 @@ class Window:
 
     Attributes:
         frames: filtered up to its end.
-        ms_per_frame: median time of a filter step, ms.
+        ms_per_frame: median time that the processor spends on a filter step, ms; what else the machine does is not
+            in it.
         resident_mb: memory of the process at its end; its peak where the system does not tell.
         held_kb: all that the filter refers to.
         nodes: of the particles' ancestry.
@@ -136,9 +137,9 @@ def soak(
     for first in range(0, frames, every):
         seconds, squares = [], []
         for t, (frame, pose) in enumerate(islice(seen, min(every, frames - first)), first):
-            started = time.perf_counter()
+            started = time.process_time()
             position = step(frame, t)
-            seconds.append(time.perf_counter() - started)
+            seconds.append(time.process_time() - started)
             place = SE2.translation(pose) if pose.size == SE2.size else SE3.translation(pose)
             squares.append(float(np.square(position - place).sum()))
         yield _window(filter_, first + len(seconds), float(np.median(seconds)), float(np.mean(squares)))
