@@ -1,8 +1,8 @@
 """Does a filter run for ever? 100,000 frames of a camera and of a robot, in worlds whose points come and go.
 
 Both keep a fixed lag of their paths and forget landmarks that have not been seen for long. One row per 1,000 frames:
-the processor's time for a step, the memory of the process and all that the filter refers to, and how far off it is. Tables and
-picture say whether anything grows.
+the processor's time for a step, the memory of the process and all that the filter refers to, and how far off it is.
+Tables and picture say whether anything grows.
 """
 
 from dataclasses import astuple, dataclass

@@ -143,6 +143,8 @@ def _restore(filter_: "Filter", arrays: dict[str, np.ndarray], rng_state: dict[s
     filter_.marginals.restore(arrays)
     filter_.particles = Particles(state.copy(), log_weights.copy())
     steps, stamp = checked(arrays, "filter/numbers", (2,), "i").tolist()
+    if steps < 0:
+        raise InputError(f"the array filter/numbers counts {steps} steps")
     filter_.steps, filter_.stamp_ns = steps, stamp if checked(arrays, "filter/started", (), "b") else None
     filter_.log_evidence = float(checked(arrays, "filter/log_evidence", (), "f"))
     filter_.rng.bit_generator.state = rng_state

@@ -63,9 +63,19 @@ def read_ply(path: Path) -> dict[str, np.ndarray]:
     lines = head.decode("ascii", "replace").splitlines()
     if lines[:2] != ["ply", "format binary_little_endian 1.0"]:
         raise InputError(f"{path}: expected a binary little-endian PLY file.")
+    try:
+        return _elements(lines[2:], body)
+    except (LookupError, ValueError, TypeError, OverflowError) as error:
+        raise InputError(
+            f"{path}: expected the elements of a PLY file as its header says, found others."
+        ) from error
+
+
+def _elements(lines: list[str], body: bytes) -> dict[str, np.ndarray]:
+    """Of the lines of a header and of what follows it; nothing is allocated that the file does not hold."""
     codes = {name: code for code, name in _NAMES.items()}
     kinds: dict[str, tuple[int, list[tuple[str, str]]]] = {}
-    for line in lines[2:]:
+    for line in lines:
         word, *rest = line.split()
         if word == "element":
             kinds[rest[0]] = (int(rest[1]), [])
@@ -73,6 +83,8 @@ def read_ply(path: Path) -> dict[str, np.ndarray]:
             list(kinds.values())[-1][1].append((rest[1], codes[rest[0]]))
     found, start = {}, 0
     for name, (count, fields) in kinds.items():
+        if count < 0:
+            raise ValueError("a negative number of elements")
         found[name] = np.frombuffer(body, dtype=fields, count=count, offset=start)
         start += found[name].nbytes
     return found

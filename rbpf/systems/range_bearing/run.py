@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from rbpf.anchoring import Anchored, StartAnchor
+from rbpf.checkpoint import fitting
 from rbpf.diagnostics import motion_correction
 from rbpf.errors import InputError
 from rbpf.estimate import Estimate
@@ -140,10 +141,11 @@ def run(
     problems: list[str] = []
     if resume and checkpoint is not None and checkpoint.exists():
         extra = filter_.load(checkpoint)
-        progress.restore(extra)
-        associations.restore(extra)
-        if anchor is not None:
-            anchor.restore(extra, build_model(log, config), build_point(log))
+        with fitting(checkpoint):
+            progress.restore(extra)
+            associations.restore(extra)
+            if anchor is not None:
+                anchor.restore(extra, build_model(log, config), build_point(log))
     for t in range(filter_.steps, total):
         frame = log.frames[t]
         started = time.perf_counter()

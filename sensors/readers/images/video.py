@@ -1,8 +1,8 @@
 """Video files that OpenCV's FFmpeg can decode, with a `camera.yaml` beside the video or given.
 
 The number of images and their rate are those of the file's header, unless `camera.yaml` has `rate_hz`. A header without
-a number is counted by going through the video once. A video that ends before its last announced image ends with a
-frame that has none and says so.
+a number, or with one that the file is too small for, is counted by going through the video once. A video that ends
+before its last announced image ends with a frame that has none and says so.
 """
 
 from collections.abc import Generator, Iterator
@@ -105,7 +105,8 @@ def _header(path: Path) -> tuple[int, float, tuple[int, int]]:
         there, image = capture.read()
         if not there:
             raise InputError(f"{path}: not one image of the video can be decoded; {_ACTION}.")
-        if not 0 < count < np.inf:
+        # A header may claim what it likes; no image takes less than a byte.
+        if not 0 < count <= path.stat().st_size:
             count = 1
             while capture.grab():
                 count += 1
