@@ -83,6 +83,7 @@ def assemble(
         config.resampling.build(),
         config.particles,
         np.random.default_rng(config.seed),
+        lag=config.lag,
     )
     if mapped is not None:
         add_known_points(landmark_map, mapped, config.particles)
