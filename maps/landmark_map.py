@@ -134,7 +134,7 @@ class LandmarkMap(Conditional):
         """
         records = self.read(ids, slice(particle, particle + 1))
         kernel = model.kernel() if self.compiled else None
-        if kernel is not None and self.layouts[self.kinds[ids[0]]].landmark.components == 1:
+        if kernel is not None and self._layout_of(int(ids[0])).landmark.components == 1:
             return *linearise_compiled(kernel, records, z, state, self.space.dim), records
         const = None if records.const is None else records.const[0]
         return *linearise(model, self.space, z, state[None], records.mean[0], const), records
