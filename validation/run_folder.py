@@ -131,6 +131,7 @@ def summarise(run: Run, summary_map: MapSummary) -> dict[str, Any]:
         "map_share_of_dense": _map_share(run),
         "peak_memory_mb": peak_memory_mb(),
         **reported(scores),
+        **({"problems": run.problems} if run.problems else {}),
     }
 
 

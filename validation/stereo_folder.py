@@ -8,6 +8,7 @@ map.npz, map.csv         landmarks: name, mean, covariance (within + between par
 timings.csv              milliseconds per pair: whole, features, odometry, matching with the map, filter
 diagnostics.csv          features, matches that agree with the motion, landmarks; updates, sample size, evidence, NIS
 config.yaml              everything needed to repeat the run
+checkpoint.npz           what --resume goes on from
 summary.json             the figures
 *.png                    pictures
 report.html              one page with all figures and pictures

@@ -4,7 +4,6 @@ TUM: a line `timestamp tx ty tz qx qy qz qw` per pose, seconds and metres, # sta
 KITTI: the 12 numbers of world_from_camera's upper 3 x 4 block per line, row by row; no times.
 """
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +11,7 @@ import numpy as np
 from rbpf.lie import SE3, Array
 from rbpf.sensors.readers.table import read_columns
 from rbpf.validation.trajectory import Trajectory
+from rbpf.validation.writing import whole
 
 TUM_COLUMNS = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 KITTI_COLUMNS = tuple(f"{name}{row}" for row in "123" for name in ("r1", "r2", "r3", "t"))
@@ -44,6 +44,9 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
     Args:
         path: the file; one that is there is replaced.
         trajectory: what to write.
+
+    Raises:
+        InputError: the place cannot be written to, or the disk is full.
     """
     rows = zip(trajectory.stamps_ns.tolist(), trajectory.world_from_body.tolist(), strict=True)
     lines = [_tum_line(stamp_ns, numbers) for stamp_ns, numbers in rows]
@@ -77,12 +80,8 @@ def read_kitti(path: Path) -> Trajectory:
 
 
 def _write_whole(path: Path, lines: list[str]) -> None:
-    partial = path.with_name(f"{path.name}.{os.getpid()}.part")
-    try:
+    with whole(path) as partial:
         partial.write_text("".join(lines), encoding="utf-8")
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def _tum_line(stamp_ns: int, pose: list[float]) -> str:

@@ -67,6 +67,12 @@ def main(arguments: list[str] | None = None) -> int:
     except InputError as error:
         print(f"{PROGRAM}: {error}", file=sys.stderr)
         return BAD_INPUT
+    except OSError as error:
+        print(
+            f"{PROGRAM}: {error}; what was finished is kept, --resume goes on from the last checkpoint",
+            file=sys.stderr,
+        )
+        return BAD_INPUT
     except KeyboardInterrupt as stopped:
         print(f"{PROGRAM}: {stopped or 'stopped'}", file=sys.stderr)
         return STOPPED

@@ -118,13 +118,13 @@ class Sightings:
 
 def ray_ends(features: FeatureSensor, belief: Belief, ids: np.ndarray, sigmas: float) -> np.ndarray:
     """Nearest and farthest point (K, 2, 4) on rays in the heaviest particle, homogeneous, so many σ of ρ apart."""
-    records, mode = belief.read(ids), belief.mode
+    records = belief.read_mode(ids)
     assert records.const is not None
-    mean = records.mean[mode][:, None].repeat(2, axis=1)
-    spread = sigmas * np.sqrt(records.cov[mode][:, 2, 2])
+    mean = records.mean[0][:, None].repeat(2, axis=1)
+    spread = sigmas * np.sqrt(records.cov[0][:, 2, 2])
     mean[:, 0, 2] += spread
     mean[:, 1, 2] = np.maximum(mean[:, 1, 2] - spread, 0.0)
-    return features.inverse_depth.homogeneous(mean, records.const[mode][:, None])
+    return features.inverse_depth.homogeneous(mean, records.const[0][:, None])
 
 
 def _in_reported_world(place: np.ndarray, filter_: Filter, mode: int) -> np.ndarray:

@@ -142,18 +142,18 @@ def run_images(
             run.failure = f"frame {t} of {sequence.name}: {error}"
             break
         if checkpoint is not None and (t + 1) % config.checkpoint_every == 0:
-            save(run, checkpoint)
+            _keep(run, checkpoint)
         try:
             if on_frame is not None:
                 on_frame(t, frame, run)
         except KeyboardInterrupt:
             if checkpoint is not None:
-                save(run, checkpoint)
+                _keep(run, checkpoint)
             raise
         waited = time.perf_counter()
-    cut(run)
     if checkpoint is not None and run.failure is None:
-        save(run, checkpoint)
+        _keep(run, checkpoint)
+    cut(run)
     return run
 
 
@@ -222,6 +222,14 @@ def _empty(
     run = VideoRun(sequence, config, known, mapped, filter_, sensor, stamps, poses, covs, *numbers)
     run.recovery.stamp_ns = int(stamps[0])
     return run
+
+
+def _keep(run: VideoRun, checkpoint: Path) -> None:
+    """Writes a checkpoint; where the disk is full the run goes on all the same, and the last one stays."""
+    try:
+        save(run, checkpoint)
+    except InputError as error:
+        run.problems.append(f"frame {run.filter.steps - 1}: no checkpoint is kept: {error}")
 
 
 def _waiting(run: VideoRun) -> PoseLaw | None:

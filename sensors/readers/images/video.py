@@ -1,8 +1,8 @@
 """Video files that OpenCV's FFmpeg can decode, with a `camera.yaml` beside the video or given.
 
 The number of images and their rate are those of the file's header, unless `camera.yaml` has `rate_hz`. A header without
-a number is counted by going through the video once. A video that ends before its last announced image ends with a
-frame that has none and says so.
+a number, or with one that the file is too small for, is counted by going through the video once. A video that ends
+before its last announced image ends with a frame that has none and says so.
 """
 
 from collections.abc import Generator, Iterator
@@ -45,8 +45,8 @@ class VideoImages(Source):
     def frames(self, start: int) -> Generator[ImageFrame]:
         with opened(self.path) as capture:
             # Jumping to an image is inexact in most codecs, going through those before it is not.
-            for _ in range(start):
-                capture.grab()
+            if not all(capture.grab() for _ in range(start)):
+                return
             indices = range(start, len(self.stamps_ns))
             with closing(decode_ahead(lambda index: self._next(capture, index), indices)) as frames:
                 for frame in frames:
@@ -110,7 +110,8 @@ def video_header(path: Path) -> tuple[int, float, tuple[int, int]]:
         there, image = capture.read()
         if not there:
             raise InputError(f"{path}: not one image of the video can be decoded; {_ACTION}.")
-        if not 0 < count < np.inf:
+        # A header may claim what it likes; no image takes less than a byte.
+        if not 0 < count <= path.stat().st_size:
             count = 1
             while capture.grab():
                 count += 1
