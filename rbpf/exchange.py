@@ -34,6 +34,8 @@ class Part(Enum):
 class Transition:
     """p(x_t, s_t | x_{t-1}, s_{t-1}, u_t): ε = B s + w₁ in the right chart at `mean`; s_t = A s + b + w₂.
 
+    Mathematics (substate).
+
     Arrays may have a first axis of length 1 where they do not differ between particles.
 
     Attributes:
