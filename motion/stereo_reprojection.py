@@ -5,8 +5,8 @@ eliminating m leaves
 
     ν = z − g(T, m̂) − A (z⁻ − m̂),   A = ∂g/∂m,   cov ν = S = R + A R⁻ Aᵀ
 
-by Mathematics (vo-innovation). A R⁻ Aᵀ is J_P C J_Pᵀ with the covariance C of the earlier point in space. `Points` says which m̂: by default that of least
-Mathematics (vo-profile).
+by Mathematics (vo-innovation). A R⁻ Aᵀ is J_P C J_Pᵀ with the covariance C of the earlier point in space. `Points`
+says which m̂: by default that of least Mathematics (vo-profile).
 """
 
 from dataclasses import dataclass
