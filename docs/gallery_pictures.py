@@ -44,7 +44,7 @@ def draw_vessel(path: Path) -> None:
             np.random.default_rng(100), EkfProposal()
         ),
     }
-    figure = Figure(figsize=(7.0, 4.5), layout="constrained")
+    figure = Figure(figsize=(7.0, 3.2), layout="constrained")
     axes = figure.subplots()
     distance, bearing = measurements.T
     axes.plot(distance * np.cos(bearing), distance * np.sin(bearing), ".", color="0.6", label="radar")
