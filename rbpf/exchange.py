@@ -109,7 +109,7 @@ class Observations:
     cov: Float[np.ndarray, "K p p"]
     model: "ObservationModel"
     likelihood: "Likelihood | None" = None
-    ids: Int[np.ndarray, "*N K"] | None = None
+    ids: Int[np.ndarray, "... K"] | None = None
     log_new: float = 0.0
     log_clutter: float = 0.0
     informs: frozenset[Part] = frozenset({Part.STATE, Part.LANDMARK})

@@ -2,6 +2,7 @@
 
 import importlib
 import inspect
+import re
 import shlex
 import subprocess
 import tomllib
@@ -140,6 +141,18 @@ def test_commands_in_a_sentence_exist(page):
             check_program(command[1:], where)
         elif command[1].endswith(".py"):
             assert (ROOT / command[1]).is_file(), where
+
+
+def test_every_command_is_on_the_page_of_commands():
+    """Those that are above others, as `rbpf run`, have no options of their own."""
+    page = (ROOT / "docs" / "command_line.md").read_text(encoding="utf-8")
+    shown = {tuple(words.split()) for words in re.findall(r"\{command-help\} ?(.*)", page)}
+    below = [
+        (*above, name)
+        for above in ((), ("run",), ("simulate",))
+        for name in re.search(r"\{([\w,-]+)\}", help_text(above))[1].split(",")
+    ]
+    assert set(below) - {("run",), ("simulate",), ("simulate", "room")} == shown - {()}
 
 
 def path_of(words: list[str]) -> list[str]:
