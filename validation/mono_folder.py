@@ -17,15 +17,11 @@ summary.json             the figures
 report.html              one page with all figures and pictures
 """
 
-import json
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
-from rbpf import __version__
 from rbpf.systems.mono.video import VideoRun
 from rbpf.validation.camera_files import write_features
 from rbpf.validation.files import (
@@ -33,9 +29,10 @@ from rbpf.validation.files import (
     nis_ratio,
     peak_memory_mb,
     prepare_folder,
+    write_config,
     write_csv,
     write_map,
-    write_text,
+    write_summary,
 )
 from rbpf.validation.mono_log import feature_log
 from rbpf.validation.mono_map import MonoMap
@@ -77,16 +74,10 @@ def write_mono_run(
     write_posterior(run, out)
     write_features(out, feature_log(run))
     _write_tables(run, out)
-    config = {"rbpf": __version__, "system": "mono", **sources, **asdict(run.config)}
-    write_text(out / "config.yaml", yaml.safe_dump(config, sort_keys=False))
+    write_config(out, "mono", sources, run.config)
     entries = summarise_camera(run, mapped)
     write_summary(out, entries)
     return entries
-
-
-def write_summary(out: Path, entries: dict[str, Any]) -> None:
-    """summary.json."""
-    write_text(out / "summary.json", json.dumps(entries, indent=2, allow_nan=False) + "\n")
 
 
 def summarise_camera(run: VideoRun, mapped: MonoMap) -> dict[str, Any]:
