@@ -162,11 +162,11 @@ class StartAnchor:
         if "anchor/second" in arrays:
             values = (arrays[f"anchor/{name}"].copy() for name in ("state", "delta", "factor"))
             self._second = _FirstMotion(int(arrays["anchor/second"]), *values)
-            lineage.retain(self._second.generation)
+            lineage.take_up(self._second.generation)
         if "anchor/latest" in arrays:
             anchored = Anchored(arrays["anchor/latest_mean"].copy(), arrays["anchor/latest_factor"].copy())
             self._latest = (int(arrays["anchor/latest"]), anchored)
-            lineage.retain(self._latest[0])
+            lineage.take_up(self._latest[0])
 
     def _record_first(self, report: StepReport) -> None:
         first = 0

@@ -27,6 +27,9 @@ class Part(Enum):
     LANDMARK = "landmark"
     SUBSTATE = "linear substate"
 
+    __hash__ = object.__hash__
+    """Members are single objects; Enum's own hash, asked for at every use of a set of parts, is run by Python."""
+
 
 @dataclass(frozen=True)
 class Transition:

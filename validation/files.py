@@ -2,22 +2,20 @@
 
 import csv
 import json
-import os
 import resource
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict
 from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
-from rbpf import __version__, gaussian
+from rbpf import gaussian
 from rbpf.checkpoint import save_arrays
 from rbpf.errors import InputError
 from rbpf.validation.map_summary import MapSummary
+from rbpf.validation.writing import whole
 
 
 def prepare_folder(out: Path) -> None:
@@ -35,28 +33,14 @@ def prepare_folder(out: Path) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Writes a whole file or none."""
-    temporary = path.with_name(path.name + ".partial")
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, path)
+    """Writes a whole file or none; raises InputError where the place cannot be written to, or the disk is full."""
+    with whole(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
 
 
 def write_summary(out: Path, entries: Mapping[str, Any]) -> None:
     """summary.json."""
     write_text(out / "summary.json", json.dumps(entries, indent=2, allow_nan=False) + "\n")
-
-
-def write_config(out: Path, system: str, sources: Mapping[str, str | float], config: Any) -> None:
-    """config.yaml.
-
-    Args:
-        out: the run's folder.
-        system: its name.
-        sources: what was filtered: recording, calibration and the like.
-        config: a dataclass with all settings.
-    """
-    entries = {"rbpf": __version__, "system": system, **sources, **asdict(config)}
-    write_text(out / "config.yaml", yaml.safe_dump(entries, sort_keys=False))
 
 
 def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:

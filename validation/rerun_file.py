@@ -13,6 +13,7 @@ from rbpf.lie import SE3
 from rbpf.sensors.pinhole import Pinhole
 from rbpf.sensors.readers.images import ImageFrame
 from rbpf.validation.figures import SIGMAS
+from rbpf.validation.map_summary import MapSummary
 
 QUALITY = 75
 """Of the JPEG images in the recording, in per cent."""
@@ -74,28 +75,33 @@ def log_lens(rr: Any, stream: Any, camera: Pinhole) -> None:
     stream.log("world/camera", lens, static=True)
 
 
-def log_frame(rr: Any, stream: Any, t: int, after_ns: int, frame: ImageFrame) -> None:
-    """Number, time since the first one [ns], and image of a frame; what is logged next belongs to it."""
+def log_time(stream: Any, t: int, after_ns: int) -> None:
+    """Number of a frame and time since the first one [ns]; what is logged next belongs to it."""
     stream.set_time("frame", sequence=t)
     stream.set_time("time", duration=1e-9 * float(after_ns))
+
+
+def log_image(rr: Any, stream: Any, frame: ImageFrame) -> None:
+    """A frame's image, if it has one."""
     if frame.image is not None:
         stream.log("world/camera/image", rr.Image(frame.image).compress(jpeg_quality=QUALITY))
 
 
-def log_camera(rr: Any, stream: Any, world_from_camera: np.ndarray) -> None:
-    """Where the camera is, (7,)."""
-    at = rr.Quaternion(xyzw=world_from_camera[:4])
-    stream.log("world/camera", rr.Transform3D(translation=SE3.translation(world_from_camera), quaternion=at))
+def log_pose(rr: Any, stream: Any, name: str, pose: np.ndarray) -> None:
+    """Where a camera or a robot is in the world, (7,)."""
+    turned = rr.Quaternion(xyzw=pose[:4])
+    stream.log(f"world/{name}", rr.Transform3D(translation=SE3.translation(pose), quaternion=turned))
 
 
-def ellipsoids(rr: Any, mean: np.ndarray, cov: np.ndarray, **options: Any) -> Any:
-    """The `SIGMAS` ellipsoids of Gaussians (M, 3), (M, 3, 3)."""
-    values, vectors = np.linalg.eigh(cov)
+def ellipsoids(rr: Any, landmarks: MapSummary) -> Any:
+    """A map's 3σ ellipsoids, with the landmarks' names."""
+    values, vectors = np.linalg.eigh(landmarks.cov)
     turned = vectors * np.where(np.linalg.det(vectors) < 0.0, -1.0, 1.0)[:, None, None]
-    poses = np.concatenate([turned, mean[..., None]], axis=-1)
+    poses = np.concatenate([turned, landmarks.mean[..., None]], axis=-1)
     return rr.Ellipsoids3D(
-        centers=mean,
+        centers=landmarks.mean,
         half_sizes=SIGMAS * np.sqrt(np.maximum(values, 0.0)),
         quaternions=SE3.from_matrix(poses)[:, :4],
-        **options,
+        labels=[str(name) for name in landmarks.ids],
+        show_labels=False,
     )

@@ -25,7 +25,6 @@ from rbpf.validation.files import (
     nis_ratio,
     peak_memory_mb,
     prepare_folder,
-    write_config,
     write_csv,
     write_map,
     write_summary,
@@ -33,6 +32,7 @@ from rbpf.validation.files import (
 from rbpf.validation.map_summary import MapSummary, summarise_map
 from rbpf.validation.measurement_files import write_measurements
 from rbpf.validation.measurements import Measurements
+from rbpf.validation.provenance import write_config
 from rbpf.validation.run_files import write_path, write_truth
 from rbpf.validation.run_truth import robot_truth
 from rbpf.validation.scores import Scores, as_trajectory, score
@@ -73,7 +73,7 @@ def write_run(run: Run, out: Path, recording: Path, extra: dict[str, Any] | None
         ["step", "stamp_ns", "ess", "resampled", "log_evidence", "nis", "nis_dof"],
         zip(range(stamps.size), stamps, *(column.tolist() for column in columns), strict=True),
     )
-    write_config(out, "range-bearing", {"recording": str(recording)}, run.config)
+    write_config(out, "range-bearing", {"recording": str(recording)}, asdict(run.config))
     entries = summarise(run, summary_map) | (extra or {})
     write_summary(out, entries)
     return entries
@@ -130,6 +130,7 @@ def summarise(run: Run, summary_map: MapSummary) -> dict[str, Any]:
         "map_share_of_dense": _map_share(run),
         "peak_memory_mb": peak_memory_mb(),
         **reported(scores),
+        **({"problems": run.problems} if run.problems else {}),
     }
 
 

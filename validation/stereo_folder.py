@@ -8,11 +8,13 @@ map.npz, map.csv         landmarks: name, mean, covariance (within + between par
 timings.csv              milliseconds per pair: whole, features, odometry, matching with the map, filter
 diagnostics.csv          features, matches that agree with the motion, landmarks; updates, sample size, evidence, NIS
 config.yaml              everything needed to repeat the run
+checkpoint.npz           what --resume goes on from
 summary.json             the figures
 *.png                    pictures
 report.html              one page with all figures and pictures
 """
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +27,12 @@ from rbpf.validation.files import (
     nis_ratio,
     peak_memory_mb,
     prepare_folder,
-    write_config,
     write_csv,
     write_map,
     write_summary,
 )
 from rbpf.validation.map_summary import MapSummary
+from rbpf.validation.provenance import write_config
 from rbpf.validation.run_files import write_path, write_truth
 from rbpf.validation.stereo_scores import distance_m, score_stereo, stereo_truth
 from rbpf.validation.trajectory import Trajectory
@@ -60,7 +62,7 @@ def write_stereo_run(
     write_path(out, run.stamps_ns, run.world_from_camera, run.cov)
     write_truth(out, stereo_truth(run))
     _write_tables(run, out)
-    write_config(out, "stereo", sources, run.config)
+    write_config(out, "stereo", sources, asdict(run.config))
     entries = summarise_stereo(run, mapped)
     write_summary(out, entries)
     return entries

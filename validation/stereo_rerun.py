@@ -13,7 +13,7 @@ from rbpf.lie import SE3
 from rbpf.sensors.readers.images.stereo import StereoSequence
 from rbpf.systems.stereo.run import StereoRun
 from rbpf.validation.map_summary import MapSummary
-from rbpf.validation.rerun_file import ellipsoids, log_camera, log_frame, log_lens, recording
+from rbpf.validation.rerun_file import ellipsoids, log_image, log_lens, log_pose, log_time, recording
 
 
 def write_stereo_rerun(run: StereoRun, sequence: StereoSequence, mapped: MapSummary, path: Path) -> None:
@@ -31,7 +31,8 @@ def write_stereo_rerun(run: StereoRun, sequence: StereoSequence, mapped: MapSumm
     with recording(path, run.name) as (rr, stream):
         _log_static(rr, stream, run, mapped)
         for t, frame in zip(range(run.stamps_ns.size), sequence.frames(), strict=False):
-            log_frame(rr, stream, t, int(run.stamps_ns[t] - run.stamps_ns[0]), frame)
+            log_time(stream, t, int(run.stamps_ns[t] - run.stamps_ns[0]))
+            log_image(rr, stream, frame)
             _log_pair(rr, stream, run, t)
 
 
@@ -39,10 +40,10 @@ def _log_static(rr: Any, stream: Any, run: StereoRun, mapped: MapSummary) -> Non
     log_lens(rr, stream, run.front_end.rig.camera)
     for name, poses in (("path", run.world_from_camera), ("odometry", run.odometry)):
         stream.log(f"world/{name}", rr.LineStrips3D([SE3.translation(poses)]), static=True)
-    stream.log("world/map", ellipsoids(rr, mapped.mean, mapped.cov), static=True)
+    stream.log("world/map", ellipsoids(rr, mapped), static=True)
 
 
 def _log_pair(rr: Any, stream: Any, run: StereoRun, t: int) -> None:
-    log_camera(rr, stream, run.world_from_camera[t])
+    log_pose(rr, stream, "camera", run.world_from_camera[t])
     for name in ("features", "agreeing", "observed"):
         stream.log(f"plots/{name}", rr.Scalars(float(getattr(run, name)[t])))
