@@ -14,7 +14,6 @@ summary.json             the figures
 report.html              one page with all figures and pictures
 """
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -30,7 +29,7 @@ from rbpf.validation.files import (
     prepare_folder,
     write_csv,
     write_map,
-    write_text,
+    write_summary,
 )
 from rbpf.validation.map_summary import MapSummary
 from rbpf.validation.provenance import write_config
@@ -65,7 +64,7 @@ def write_stereo_run(
     _write_tables(run, out)
     write_config(out, "stereo", sources, asdict(run.config))
     entries = summarise_stereo(run, mapped)
-    write_text(out / "summary.json", json.dumps(entries, indent=2, allow_nan=False) + "\n")
+    write_summary(out, entries)
     return entries
 
 
