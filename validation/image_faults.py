@@ -96,7 +96,7 @@ def truncate_files(share: float, seed: int = 0) -> Fault[Sequence]:
 
     def fault(sequence: Sequence) -> Sequence:
         bad = np.random.default_rng(seed).random(len(sequence)) < share
-        rows = frozenset(np.flatnonzero(bad[1:]) + 1)
+        rows = frozenset((np.flatnonzero(bad[1:]) + 1).tolist())
         return _with_source(sequence, lambda source: Unreadable(source, rows))
 
     return fault

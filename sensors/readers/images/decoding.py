@@ -77,7 +77,7 @@ def _require_size(path: Path, data: NDArray[np.uint8]) -> None:
     from PIL import Image
 
     try:
-        Image.open(BytesIO(data)).close()
+        Image.open(BytesIO(data.tobytes())).close()
     except (Image.DecompressionBombError, Image.DecompressionBombWarning):
         raise UnreadableImageError(f"{path}: the image claims to be larger than any camera's.") from None
     except Exception:
