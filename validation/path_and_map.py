@@ -15,13 +15,14 @@ from rbpf.lie import SE2, SE3, Array, SE2Group, SE3Group
 from rbpf.systems.mono.run import MonoRun
 from rbpf.systems.mono.video import VideoRun
 from rbpf.systems.range_bearing.run import Run
+from rbpf.systems.stereo.run import StereoRun
 from rbpf.validation.camera_map import summarise_points
 from rbpf.validation.map_summary import MapSummary, summarise_map
 from rbpf.validation.mono_map import summarise_mono_map
 from rbpf.validation.trajectory import Trajectory
 from rbpf.validation.trajectory_files import read_tum
 
-AnyRun = Run | MonoRun | VideoRun
+AnyRun = Run | MonoRun | VideoRun | StereoRun
 
 
 @final
@@ -67,6 +68,8 @@ def of_run(run: AnyRun) -> PathAndMap:
         return PathAndMap(stamps, run.progress.mean, run.progress.cov, summary)
     if isinstance(run, MonoRun):
         return PathAndMap(run.stamps_ns, run.world_from_camera, run.cov, summarise_points(run.filter))
+    if isinstance(run, StereoRun):
+        return PathAndMap(run.stamps_ns, run.world_from_camera, run.cov, summarise_map(run.filter))
     mapped = summarise_mono_map(run.filter)
     full, found = ~mapped.is_ray, mapped.landmarks
     points = MapSummary(found.ids[full], found.mean[full], found.cov[full])

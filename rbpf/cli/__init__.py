@@ -99,6 +99,7 @@ def run_stereo(options: Annotated[StereoOptions, tyro.conf.arg(name="")]) -> Non
     """Stereo SLAM over a sequence of pairs of images (S05: SIFT landmarks, visual odometry, 400 particles)."""
     from rbpf.systems.settings import load_settings
     from rbpf.systems.stereo.config import StereoConfig
+    from rbpf.validation.mono import Telling
     from rbpf.validation.mono_rerun import require_rerun
     from rbpf.validation.stereo import StereoRecording, finish_stereo, start_stereo
 
@@ -111,7 +112,12 @@ def run_stereo(options: Annotated[StereoOptions, tyro.conf.arg(name="")]) -> Non
     with progress() as bar:
         task = bar.add_task("filtering", total=None)
         run = start_stereo(recording, config, options.out, options.resume, told(bar, task))
-    entries = finish_stereo(run, recording, options.out, options.rerun)
+        solving = bar.add_task("batch", total=None, visible=options.batch)
+        telling = Telling(
+            on_iteration=lambda count, _error: bar.update(solving, completed=count),
+            batch_s=options.batch_limit,
+        )
+        entries = finish_stereo(run, recording, options.out, options.rerun, options.batch, telling)
     _print_summary(entries, options.out)
     if run.failure is not None:
         raise InputError(f"{run.failure}; what was computed before it is in {options.out}")

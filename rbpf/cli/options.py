@@ -99,6 +99,8 @@ class StereoOptions:
         set: a setting as key=value, such as proposal.kind=ekf or sift.length=128.
         resume: go on from the checkpoint in the results' folder.
         rerun: also write a recording (.rrd) for the Rerun viewer.
+        batch: also adjust the same measurements in batch with GTSAM.
+        batch_limit: seconds after which the batch adjustment is given up; the run's results stay.
         threads: threads of the kernels; by default all.
     """
 
@@ -112,6 +114,8 @@ class StereoOptions:
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     resume: tyro.conf.FlagCreatePairsOff[bool] = False
     rerun: Path | None = None
+    batch: bool = True
+    batch_limit: float = 300.0
     threads: int | None = None
 
 
