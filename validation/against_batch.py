@@ -119,7 +119,11 @@ def compare_folder(folder: Path, instants: int = INSTANTS, robust: float | None 
 
 
 def compare(
-    filtered: PathAndMap, problem: Problem, instants: int = INSTANTS, robust: float | None = None
+    filtered: PathAndMap,
+    problem: Problem,
+    instants: int = INSTANTS,
+    robust: float | None = None,
+    optimum: Optimum | None = None,
 ) -> AgainstBatch:
     """A filter's path and map beside the batch optimum of the same measurements.
 
@@ -128,13 +132,15 @@ def compare(
         problem: the measurements.
         instants: at how many poses are compared, each with a batch of its own; 0 compares none.
         robust: Huber's threshold of the batch in standard deviations; None takes all as Gaussian, as the filter does.
+        optimum: of the whole problem, with covariances, where it is known already.
 
     Raises:
         InputError: path and measurements are not of one run, or the batch cannot be solved.
     """
     name = name_of(problem)
     _require_one_run(filtered, problem)
-    optimum = solve_problem(problem, filtered.world_from_body, robust)
+    if optimum is None:
+        optimum = solve_problem(problem, filtered.world_from_body, robust)
     floats = floats_in_scale(problem)
     scale = scale_onto(filtered.at(optimum.steps), optimum.estimate, name) if floats else 1.0
     scaled = rescaled(filtered, scale)

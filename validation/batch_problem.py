@@ -150,6 +150,11 @@ def solve_problem(
     if isinstance(problem, FeatureLog):
         return _solve_camera(problem, start, robust, marginals)
     found = gtsam_ba.solve(problem, robust, marginals, incremental=len(problem.stamps_ns) > AFAR)
+    return robot_optimum(problem, found)
+
+
+def robot_optimum(problem: Measurements, found: gtsam_ba.BatchSolution) -> Optimum:
+    """A robot's batch solution in the form that runs of all systems share."""
     points = _summary(list(found.landmarks), found.landmarks, found.cov_landmarks, problem.z.shape[1])
     estimate = PathAndMap(problem.stamps_ns, found.world_from_robot, found.cov_poses, points)
     return Optimum(problem, estimate, np.arange(len(problem.stamps_ns)), found.error)

@@ -7,7 +7,7 @@ import numpy as np
 from rbpf.validation.against_batch import AgainstBatch, compare_folder
 from rbpf.validation.against_colmap import compare_folder_with_colmap
 from rbpf.validation.comparison import Comparison
-from rbpf.validation.gaussian_differences import Differences
+from rbpf.validation.gaussian_differences import Differences, figures_of
 from rbpf.validation.offline_pictures import plot_against_batch, plot_against_colmap
 from rbpf.validation.path_and_map import read_path_and_map
 from rbpf.validation.run_record import RunRecord
@@ -49,9 +49,7 @@ def _figures(found: AgainstBatch) -> dict[str, object]:
         "filter_minus_batch_max_m": found.path.max,
         "batch_error": found.optimum.error,
     }
-    for name, differences in (("landmarks", found.landmarks), ("poses", found.poses)):
-        rows = differences.as_dict().items()
-        figures |= {f"{name}_{key}": value for key, value in rows if not isinstance(value, list)}
+    figures |= figures_of("landmarks", found.landmarks) | figures_of("poses", found.poses)
     for name, fit in (("filter", found.fit_filter), ("batch", found.fit_batch)):
         figures |= {f"{name}_{key}": value for key, value in asdict(fit).items()}
     return figures

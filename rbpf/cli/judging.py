@@ -47,7 +47,7 @@ def report(run: tyro.conf.Positional[Path]) -> None:
 
 
 def _say(verdict: "Verdict", run: Path) -> None:
-    for sentence in verdict.sentences:
+    for sentence in filter(None, (*verdict.sentences, verdict.advice)):
         CONSOLE.print(sentence, highlight=False)
     CONSOLE.print(f"the page is {run / 'report.html'}")
 
