@@ -165,6 +165,8 @@ def _compare_poses(
 ) -> Differences:
     """Online poses beside the last ones of the optima of what had been measured until then."""
     floats, last = floats_in_scale(problem), int(optimum.steps[-1])
+    start = filtered.world_from_body.copy()
+    start[optimum.steps] = optimum.estimate.world_from_body  # nearer than the filter's own path
     if not len(filtered.cov_poses) or instants < 1:
         return no_differences(filtered.space.dim)
     parts = []
@@ -172,7 +174,7 @@ def _compare_poses(
         then = (
             optimum
             if step == last
-            else solve_problem(first_steps(problem, step + 1), filtered.world_from_body[: step + 1], robust)
+            else solve_problem(first_steps(problem, step + 1), start[: step + 1], robust)
         )
         if int(then.steps[-1]) == step:
             ours = filtered.at(then.steps)
