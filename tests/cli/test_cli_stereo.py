@@ -203,6 +203,47 @@ def test_a_run_is_compared_with_its_batch_optimum_afterwards(finished, tmp_path)
     assert "Against gtsam" in (folder / "report.html").read_text()
 
 
+def old(folder: Path) -> None:
+    path = folder / "config.yaml"
+    path.write_text(path.read_text().replace("rbpf: ", "rbpf: 0.0.0-", 1))
+
+
+def moved(folder: Path) -> None:
+    path = folder / "config.yaml"
+    path.write_text(path.read_text().replace("/room", "/nowhere"))
+
+
+def another(folder: Path) -> None:
+    path = folder / "observations_frames.csv"
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines[:-1], lines[-1] + "0", ""]))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "against", "message"),
+    [
+        (lambda folder: None, "colmap", "has 2 readable key frames of 8 images, expected 3"),
+        (moved, "colmap", "nowhere"),
+        (old, "colmap", "was written by rbpf 0.0.0-"),
+        (old, "gtsam", "was written by rbpf 0.0.0-"),
+        (another, "gtsam", "stamp"),
+        (lambda folder: (folder / "observations.csv").unlink(), "gtsam", "holds no observations.csv"),
+        (lambda folder: (folder / "truth.npz").unlink(), "groundtruth", "no ground truth"),
+    ],
+)
+def test_what_cannot_be_compared_is_one_sentence_and_the_report_is_written(
+    finished, tmp_path, capsys, spoil, against, message
+):
+    folder = shutil.copytree(finished, tmp_path / "run")
+    spoil(folder)
+    (folder / "report.html").unlink()
+    capsys.readouterr()
+    assert main(["validate", str(folder), "--against", against]) == 2
+    said = capsys.readouterr().err
+    assert message in " ".join(said.split()) and said.startswith("rbpf: ") and said.count("\n") == 1
+    assert f"Not compared with {against}" in (folder / "report.html").read_text()
+
+
 def test_two_runs_have_no_evidence_to_compare(finished, capsys):
     assert main(["compare", str(finished), str(finished)]) == 2
     assert "'truncated' is not a density" in " ".join(capsys.readouterr().err.split())
