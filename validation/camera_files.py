@@ -169,7 +169,9 @@ def _read_camera(table: HeadedTable, measurement: str) -> Pinhole | RectifiedSte
     numbers = table.numbers("camera", 9).tolist()
     fx, fy, cx, cy, k1, k2, p1, p2, k3 = numbers
     camera = Pinhole(int(width), int(height), fx, fy, cx, cy, (k1, k2, p1, p2, k3))
-    return RectifiedStereo(camera, float(table.numbers("baseline", 1)[0])) if measurement == "stereo" else camera
+    return (
+        RectifiedStereo(camera, float(table.numbers("baseline", 1)[0])) if measurement == "stereo" else camera
+    )
 
 
 def _read_known(folder: Path) -> KnownPoints | None:

@@ -87,7 +87,10 @@ def robot_causes(
     start = InitialEstimate(runs[0].progress.mean, dict(batch.landmarks))
     again = gtsam_ba.solve(measured, marginals=False, initial=start)
     found = error(batch.world_from_robot)
-    out = [Cause(AS_IT_IS, tuple(error(run.progress.mean) for run in runs), found), Cause(BATCH, (found,), found)]
+    out = [
+        Cause(AS_IT_IS, tuple(error(run.progress.mean) for run in runs), found),
+        Cause(BATCH, (found,), found),
+    ]
     out.append(Cause(FROM_FILTER, (error(again.world_from_robot),), found))
     for name, changed in _robot_changes(config):
         if told is not None:

@@ -12,9 +12,7 @@ scale is measured, well or badly, not for those where a stiff prior holds it.
 
 from typing import Any
 
-import gtsam
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csc_array
 

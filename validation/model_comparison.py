@@ -209,8 +209,10 @@ def _require_same_data(config_a: Config, config_b: Config) -> None:
 
 
 def _config_of(record: RunRecord) -> RangeBearingConfig | StereoConfig:
-    kind = StereoConfig if record.system == "stereo" else RangeBearingConfig
-    return load_settings(kind, record.system, record.folder / "config.yaml", (), {})
+    path = record.folder / "config.yaml"
+    if record.system == "stereo":
+        return load_settings(StereoConfig, "stereo", path, (), {})
+    return load_settings(RangeBearingConfig, "range-bearing", path, (), {})
 
 
 def _in_order(jobs: list[tuple[Any, Data]], workers: int, told: Callable[[int, int], None]) -> list[float]:

@@ -20,9 +20,7 @@ MAP_SHARE = 0.9
 """The map's picture holds the path and this share of the points; single points far off do not make it small."""
 
 
-def plot_stereo_run(
-    run: StereoRun, mapped: MapSummary, out: Path, batch: Batch | None = None
-) -> list[str]:
+def plot_stereo_run(run: StereoRun, mapped: MapSummary, out: Path, batch: Batch | None = None) -> list[str]:
     """Draws path, map, particles, error, tracking and times; returns the file names."""
     views, truth = best_views(run.world_from_camera), true_path(run.truth, run.stamps_ns)
     figures = {

@@ -23,9 +23,7 @@ def names(*values: int) -> np.ndarray:
 
 def seen(tracks: Tracks) -> list[dict[int, float]]:
     """Column of each track in each pair."""
-    return [
-        dict(zip(f.landmarks.tolist(), f.z[:, 0].tolist(), strict=True)) for f in tracks.frames(STAMPS)
-    ]
+    return [dict(zip(f.landmarks.tolist(), f.z[:, 0].tolist(), strict=True)) for f in tracks.frames(STAMPS)]
 
 
 def matched(*rows: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:

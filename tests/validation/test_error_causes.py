@@ -10,7 +10,14 @@ from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.run import run as filter_log
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.camera_files import write_features
-from rbpf.validation.error_causes import AS_IT_IS, BATCH, FROM_FILTER, camera_causes, robot_causes, scaled_noise
+from rbpf.validation.error_causes import (
+    AS_IT_IS,
+    BATCH,
+    FROM_FILTER,
+    camera_causes,
+    robot_causes,
+    scaled_noise,
+)
 from rbpf.validation.error_ratios import robot_ratio
 from rbpf.validation.run_files import RunTruth, write_path, write_truth
 from rbpf.validation.simulation.features import MONO, Measuring, simulate_features

@@ -30,7 +30,12 @@ class Tracks:
         self._last = np.zeros(0, dtype=np.int64), np.zeros((0, 9))
 
     def note(
-        self, step: int, z: np.ndarray, cov: np.ndarray, matches: tuple[np.ndarray, np.ndarray], names: np.ndarray
+        self,
+        step: int,
+        z: np.ndarray,
+        cov: np.ndarray,
+        matches: tuple[np.ndarray, np.ndarray],
+        names: np.ndarray,
     ) -> None:
         """A pair is what the next one will be matched with.
 
