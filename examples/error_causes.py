@@ -1,7 +1,7 @@
 """Why is a filter further from the truth than the batch optimum of its measurements? One thing changed at a time.
 
-`--recording` is a robot's log; `--run` the folder of a finished monocular run with ground truth. Without either a log is
-simulated. The table has one row for each change: the error with it, and its ratio to the batch's.
+`--recording` is a robot's log; `--run` the folder of a finished monocular run with ground truth. Without either a log
+is simulated. The table has one row for each change: the error with it, and its ratio to the batch's.
 """
 
 from pathlib import Path

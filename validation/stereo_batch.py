@@ -1,4 +1,4 @@
-"""The batch adjustment of the pixels that a stereo run used, by odometry or by the map: the best it could have known."""
+"""The batch adjustment of the pixels that a stereo run used, by odometry or map: the best it could have known."""
 
 from typing import Any
 
