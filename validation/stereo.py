@@ -6,11 +6,14 @@ from pathlib import Path
 from typing import Any
 
 from rbpf.sensors.readers.images import open_stereo
+from rbpf.sensors.readers.images.stereo import StereoSequence
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.run import StereoRun, run_images
 from rbpf.validation.files import prepare_folder
 from rbpf.validation.map_summary import summarise_map
+from rbpf.validation.report import VIDEO
 from rbpf.validation.stereo_folder import write_stereo_run
+from rbpf.validation.stereo_frames import write_annotated_pairs
 from rbpf.validation.stereo_pictures import plot_stereo_run
 from rbpf.validation.stereo_rerun import write_stereo_rerun
 from rbpf.validation.validate import report_run
@@ -31,6 +34,14 @@ class StereoRecording:
 
     pairs: Path
     calibration: Path | None = None
+
+    def open(self) -> StereoSequence:
+        """The pairs.
+
+        Raises:
+            InputError: a file is wrong.
+        """
+        return open_stereo(self.pairs, self.calibration)
 
     def sources(self) -> dict[str, str]:
         """For config.yaml."""
@@ -57,7 +68,7 @@ def start_stereo(
     Raises:
         InputError: the recording or a setting is wrong.
     """
-    sequence = open_stereo(recording.pairs, recording.calibration)
+    sequence = recording.open()
     if out is not None:
         prepare_folder(out)
     total = len(sequence)
@@ -66,20 +77,31 @@ def start_stereo(
 
 
 def finish_stereo(
-    run: StereoRun, recording: StereoRecording, out: Path, rerun: Path | None = None
+    run: StereoRun,
+    recording: StereoRecording,
+    out: Path,
+    video: bool = True,
+    rerun: Path | None = None,
+    on_frame: Progress | None = None,
 ) -> dict[str, Any]:
-    """Writes all files, pictures and the report of a run; returns the entries of summary.json.
+    """Writes all files, pictures, the annotated video and the report of a run; returns the entries of summary.json.
 
     Args:
         run: what was filtered.
         recording: where it came from.
         out: the run's folder.
+        video: also write the annotated video.
         rerun: file of a recording for the Rerun viewer; None writes none.
+        on_frame: called with the pairs drawn and their number.
     """
     mapped = summarise_map(run.filter)
     entries = write_stereo_run(run, mapped, out, recording.sources())
     plot_stereo_run(run, mapped, out)
+    if video:
+        write_annotated_pairs(run, recording.open(), out / VIDEO, on_frame)
+    else:
+        (out / VIDEO).unlink(missing_ok=True)
     if rerun is not None:
-        write_stereo_rerun(run, open_stereo(recording.pairs, recording.calibration), mapped, rerun)
+        write_stereo_rerun(run, recording.open(), mapped, rerun)
     verdict = report_run(out)
     return entries | {"verdict": verdict.trust}

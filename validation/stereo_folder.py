@@ -10,6 +10,7 @@ diagnostics.csv          features, matches that agree with the motion, landmarks
 config.yaml              everything needed to repeat the run
 summary.json             the figures
 *.png                    pictures
+annotated.mp4            the left images with their features
 report.html              one page with all figures and pictures
 """
 

@@ -60,7 +60,7 @@ def run_mono(options: Annotated[MonoOptions, tyro.conf.arg(name="")]) -> None:
     from rbpf.systems.mono.config import MonoConfig
     from rbpf.systems.settings import load_settings
     from rbpf.validation.mono import Recording, Telling, finish_mono, start_mono
-    from rbpf.validation.mono_rerun import require_rerun
+    from rbpf.validation.rerun_file import require_rerun
 
     if options.rerun is not None:
         require_rerun()
@@ -99,7 +99,7 @@ def run_stereo(options: Annotated[StereoOptions, tyro.conf.arg(name="")]) -> Non
     """Stereo SLAM over a sequence of pairs of images (S05: SIFT landmarks, visual odometry, 400 particles)."""
     from rbpf.systems.settings import load_settings
     from rbpf.systems.stereo.config import StereoConfig
-    from rbpf.validation.mono_rerun import require_rerun
+    from rbpf.validation.rerun_file import require_rerun
     from rbpf.validation.stereo import StereoRecording, finish_stereo, start_stereo
 
     if options.rerun is not None:
@@ -111,7 +111,8 @@ def run_stereo(options: Annotated[StereoOptions, tyro.conf.arg(name="")]) -> Non
     with progress() as bar:
         task = bar.add_task("filtering", total=None)
         run = start_stereo(recording, config, options.out, options.resume, told(bar, task))
-    entries = finish_stereo(run, recording, options.out, options.rerun)
+        drawing = bar.add_task("drawing", total=None, visible=options.video)
+        entries = finish_stereo(run, recording, options.out, options.video, options.rerun, told(bar, drawing))
     _print_summary(entries, options.out)
     if run.failure is not None:
         raise InputError(f"{run.failure}; what was computed before it is in {options.out}")

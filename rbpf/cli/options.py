@@ -98,6 +98,7 @@ class StereoOptions:
         config: YAML file of settings, such as a former run's config.yaml.
         set: a setting as key=value, such as proposal.kind=ekf or sift.length=128.
         resume: go on from the checkpoint in the results' folder.
+        video: write the annotated video.
         rerun: also write a recording (.rrd) for the Rerun viewer.
         threads: threads of the kernels; by default all.
     """
@@ -111,6 +112,7 @@ class StereoOptions:
     config: Path | None = None
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     resume: tyro.conf.FlagCreatePairsOff[bool] = False
+    video: bool = True
     rerun: Path | None = None
     threads: int | None = None
 

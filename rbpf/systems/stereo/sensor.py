@@ -26,6 +26,7 @@ from rbpf.sensors.stereo_points import StereoPoint
 from rbpf.systems.stereo.cloud import Cloud, Expected
 from rbpf.systems.stereo.config import MapConfig
 from rbpf.systems.stereo.landmarks import Places
+from rbpf.systems.stereo.seen import FEATURE, LANDMARK, NEW, TRIAL
 
 _MAP = frozenset({Part.LANDMARK})
 
@@ -112,6 +113,18 @@ class StereoSensor(Sensor):
         self.places.put(names, self.model.invert(pose, features.z), pose)
         self.names[rows] = names
         return [Births(features.z, features.cov, self.model, self.point, facts=names.tolist())]
+
+    def kinds(self) -> np.ndarray:
+        """What each feature (K,) of the last pair was to the map, see `rbpf.systems.stereo.seen`."""
+        manager = self.manager
+        out = np.full(self.names.size, FEATURE)
+        rows = np.searchsorted(manager.names, self.names)
+        held = np.flatnonzero(rows < manager.names.size)
+        held = held[manager.names[rows[held]] == self.names[held]]
+        rows = rows[held]
+        out[held] = np.where(manager.promoted[rows], LANDMARK, TRIAL)
+        out[held[manager.sightings[rows] == 1]] = NEW
+        return out
 
     def arrays(self) -> dict[str, np.ndarray]:
         """For a checkpoint."""
