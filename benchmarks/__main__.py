@@ -30,6 +30,8 @@ NAMES = (
     "key_search",
     "motion_estimate",
     "stereo_step",
+    "stereo_frames",
+    "stereo_memory",
     "bootstrap_peers",
     "mrpt_peer",
 )

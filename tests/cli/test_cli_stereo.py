@@ -23,7 +23,7 @@ FILES = {
     "trajectory.tum", "odometry.tum", "map.npz", "map.csv", "timings.csv", "diagnostics.csv", "config.yaml",
     "summary.json", "report.html", "path.png", "map.png", "particles.png", "error.png", "tracking.png", "timings.png",
     "trajectory.npz", "truth.npz", "validation_groundtruth.json", "groundtruth_path.png", "groundtruth_error.png",
-    "groundtruth_nees.png",
+    "groundtruth_nees.png", "annotated.mp4",
 }  # fmt: skip
 REQUIRED = {
     "system", "recording", "frames", "particles", "dof", "seed", "ms_per_frame", "updates", "distance_m",
