@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 import tyro
+from matplotlib.figure import Figure
 
 from rbpf.lie import SE3
 from rbpf.sensors.features import FeatureLog
@@ -27,6 +28,9 @@ from rbpf.validation.simulation.features import STEREO, Measuring, simulate_feat
 from rbpf.validation.simulation.lab_points import LabWorld
 from rbpf.validation.simulation.textured_lab import LabDrive
 from rbpf.validation.tables import write_table
+
+DIM = 6
+"""Of a pose: what the NEES of an honest filter is on the average."""
 
 DEFAULT, CLIPPED = "default: prior, T_l = 4, updates within 16.3", "what is clipped does not update"
 
@@ -107,7 +111,8 @@ def main(
     world = LabWorld(LabDrive(frames=frames, every=every), points=8000)
     measuring = Measuring(noise_px=noise_px, measurements=40, known=0, new_per_frame=20)
     logs = [simulate_features(world, measuring, STEREO, seed) for seed in range(seeds)]
-    rows, results = [], {}
+    rows: list[list[str | float]] = []
+    results = {}
     for name, config in variants(particles).items():
         runs = [figures_of(log, config) for log in logs]
         error = 1e3 * float(np.mean([run.error_m for run in runs]))
@@ -117,7 +122,22 @@ def main(
     results["odometry alone: error, mm"] = 1e3 * float(np.mean([run.odometry_m for run in runs]))
     rows.append(["odometry alone", results["odometry alone: error, mm"], ""])
     write_table(out / "table.csv", ["variant", "error mm", "median NEES"], rows)
+    draw(rows[:-1], results["odometry alone: error, mm"], out / "table.png")
     return results
+
+
+def draw(rows: list[list[str | float]], odometry_mm: float, file: Path) -> None:
+    """Error and NEES of the variants, beside that of the odometry and what is right."""
+    figure = Figure(figsize=(11.0, 4.5), layout="constrained")
+    names = [str(row[0]) for row in rows][::-1]
+    sides = zip(figure.subplots(1, 2, sharey=True), ("error, mm", "median NEES"), strict=True)
+    for column, (axes, what) in enumerate(sides, start=1):
+        axes.barh(names, [float(row[column]) for row in rows][::-1])
+        right = odometry_mm if column == 1 else DIM
+        axes.axvline(right, color="black", ls="--", label="odometry alone" if column == 1 else "right")
+        axes.set(xlabel=what)
+        axes.legend(fontsize="small")
+    figure.savefig(file, dpi=110)
 
 
 if __name__ == "__main__":

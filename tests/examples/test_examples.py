@@ -29,6 +29,7 @@ SECONDS_LONG = {
     "mono_realism",
     "reproduce_e06",
     "reproduce_s05",
+    "stereo_overconfidence",
 }
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 LONGEST_SENSOR = 40
@@ -192,7 +193,9 @@ def reproduce_e06(figures: dict[str, float]) -> None:
 
 def reproduce_s05(figures: dict[str, float]) -> None:
     assert figures["path, filter"] < 0.1
+    assert figures["path, best particle"] < 0.1
     assert figures["map, filter, aligned"] < figures["map, odometry, aligned"] + 0.05
+    assert figures["map, best particle, aligned"] < 0.2
     assert 0.0 < figures["mean ms of an update"] < 1e3 * figures["mean seconds per pair"]
     assert figures["mean seconds per pair"] < figures["the paper's"]
 
@@ -200,6 +203,13 @@ def reproduce_s05(figures: dict[str, float]) -> None:
 def smoothing(figures: dict[str, float]) -> None:
     assert figures["ancestral paths"] < 0.5 * figures["filter"]
     assert figures["backward"] < 0.5 * figures["filter"]
+
+
+def stereo_overconfidence(figures: dict[str, float]) -> None:
+    default = "default: prior, T_l = 4, updates within 16.3"
+    clipped = "what is clipped does not update"
+    assert figures[f"{default}: error, mm"] < figures["odometry alone: error, mm"]
+    assert figures[f"{default}: NEES"] < 0.7 * figures[f"{clipped}: NEES"]
 
 
 def sweep(figures: dict[str, float]) -> None:
@@ -255,6 +265,7 @@ CLAIMS: dict[str, Callable[[Any], None]] = {
         reproduce_e06,
         reproduce_s05,
         smoothing,
+        stereo_overconfidence,
         sweep,
         target_tracking,
         validate_run,
