@@ -27,7 +27,7 @@ def scene():
     rng = np.random.default_rng(3)
     true = path(12, rng, 0.0)
     places = rng.uniform([-3.0, -1.0, 1.0], [3.0, 1.0, 6.0], (10, 3))
-    names, record = np.arange(10) * 3 + 1, Record(frames=(4,))
+    names, record = np.arange(10) * 3 + 1, Record(due=(4,))
     for t in range(12):
         seen = rng.permutation(10)[:6]
         record.sightings.append((names[seen], t, SE3.inverse_transform(true[t], places[seen])))
@@ -65,12 +65,12 @@ def test_rows_of_the_table_are_taken_when_they_are_due():
     run = SimpleNamespace(
         front_end=SimpleNamespace(sensor=sensor), updated=np.zeros(6), stamps_ns=np.arange(6)
     )
-    record = Record(frames=(2, 4))
+    record = Record(due=(2, 4))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("rbpf.validation.s05.record.sensor_of", lambda one: one.front_end.sensor)
         for t in range(6):
             record(t, run)
-    assert [row.frame for row in record.rows] == [2, 4, 6]
+    assert [row.pairs for row in record.rows] == [2, 4, 6]
     assert record.rows[0].landmarks == 2 and record.rows[0].features == 9
     assert len(record.cpu) == 6 and min(record.cpu) >= 0.0
 

@@ -18,9 +18,9 @@ KINDS = "filter", "odometry", "wheels"
 
 
 class Row(NamedTuple):
-    """A line of Table I: landmarks per particle, and keys ever started."""
+    """A line of Table I after so many pairs: landmarks per particle, and keys ever started."""
 
-    frame: int
+    pairs: int
     landmarks: int
     features: int
 
@@ -30,13 +30,13 @@ class Record:
     """What happened pair by pair.
 
     Attributes:
-        frames: after which a row of the table is due.
+        due: pairs after which a row of the table is due.
         rows: of the table.
         sightings: name (k,), pair, points (k, 3) in the camera.
         cpu: (T,) processor time of each pair, its features not included.
     """
 
-    frames: tuple[int, ...]
+    due: tuple[int, ...]
     rows: list[Row] = field(default_factory=list)
     sightings: list[tuple[np.ndarray, int, np.ndarray]] = field(default_factory=list)
     cpu: list[float] = field(default_factory=list)
@@ -50,7 +50,7 @@ class Record:
         if run.updated[t]:
             seen = sensor.names >= 0
             self.sightings.append((sensor.names[seen], t, end.for_filter().features.points[seen]))
-        if t + 1 in self.frames or t + 1 == run.stamps_ns.size:
+        if t + 1 in self.due or t + 1 == run.stamps_ns.size:
             self.rows.append(Row(t + 1, int(sensor.manager.promoted.sum()), sensor.manager.next_name))
         self._clock = time.process_time()
 
