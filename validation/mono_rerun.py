@@ -15,9 +15,10 @@ from rbpf.systems.mono.sightings import Sighting
 from rbpf.systems.mono.video import VideoRun
 from rbpf.validation.annotated import FOUND, MISSED, STARTED
 from rbpf.validation.figures import outline
+from rbpf.validation.map_summary import MapSummary
 from rbpf.validation.mono_frames import RAY
 from rbpf.validation.mono_map import MonoMap
-from rbpf.validation.rerun_file import ellipsoids, log_image, log_lens, log_pose, recording, set_time
+from rbpf.validation.rerun_file import ellipsoids, log_image, log_lens, log_pose, log_time, recording
 
 NEAREST = 0.02
 """Homogeneous weight below which a point that was seen counts as at infinity and is left out, 1/m."""
@@ -34,23 +35,23 @@ def write_rerun(run: VideoRun, mapped: MonoMap, path: Path) -> None:
     Raises:
         InputError: Rerun is not installed, or the file cannot be written.
     """
-    with recording(run.sequence.name, path) as (rr, stream):
+    with recording(path, run.sequence.name) as (rr, stream):
         _log_static(rr, stream, run, mapped)
-        for t, (frame, sighting) in enumerate(zip(run.sequence.frames(), run.sightings.frames, strict=False)):
-            set_time(stream, t, run.stamps_ns)
-            log_image(rr, stream, frame.image)
+        seen = zip(run.sequence.frames(), run.sightings.frames, strict=False)
+        for t, (frame, sighting) in enumerate(seen):
+            log_time(stream, t, int(run.stamps_ns[t] - run.stamps_ns[0]))
+            log_image(rr, stream, frame)
             _log_search(rr, stream, sighting)
             _log_world(rr, stream, run, sighting, t)
 
 
 def _log_static(rr: Any, stream: Any, run: VideoRun, mapped: MonoMap) -> None:
     """What does not change: the camera's lens, the known points and the final map."""
-    full, landmarks = ~mapped.is_ray, mapped.landmarks
+    full = ~mapped.is_ray
     log_lens(rr, stream, run.sequence.camera)
     stream.log("world/path", rr.LineStrips3D([SE3.translation(run.world_from_camera)]), static=True)
-    labels = [str(name) for name in landmarks.ids[full]]
-    points = ellipsoids(rr, landmarks.mean[full], landmarks.cov[full], labels=labels, show_labels=False)
-    stream.log("world/map/points", points, static=True)
+    points = MapSummary(mapped.landmarks.ids[full], mapped.landmarks.mean[full], mapped.landmarks.cov[full])
+    stream.log("world/map/points", ellipsoids(rr, points), static=True)
     stream.log("world/map/rays", rr.LineStrips3D(mapped.ends[mapped.is_ray], colors=[RAY]), static=True)
     if run.known is not None:
         stream.log(
@@ -72,7 +73,7 @@ def _log_search(rr: Any, stream: Any, sighting: Sighting) -> None:
 
 def _log_world(rr: Any, stream: Any, run: VideoRun, sighting: Sighting, t: int) -> None:
     """Where the camera is, and what it sees there."""
-    log_pose(rr, stream, run.world_from_camera[t])
+    log_pose(rr, stream, "camera", run.world_from_camera[t])
     near = sighting.found & (sighting.place[:, 3] >= NEAREST)
     seen = sighting.place[near, :3] / sighting.place[near, 3:]
     stream.log("world/seen", rr.Points3D(seen, colors=[FOUND], radii=0.005))

@@ -18,6 +18,9 @@ def write_annotated(run: VideoRun, path: Path, on_frame: Callable[[int, int], No
         run: what was filtered.
         path: the file.
         on_frame: called with the frames written and their number.
+
+    Raises:
+        InputError: the place cannot be written to, or the disk is full.
     """
     camera = run.sequence.camera
     write_video(annotated_frames(run), drawn_size(camera.width, camera.height), run.stamps_ns, path, on_frame)

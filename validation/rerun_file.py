@@ -1,4 +1,4 @@
-"""Recordings for the Rerun viewer (https://rerun.io), written without a screen: what those of all cameras have."""
+"""What recordings of runs for the Rerun viewer (https://rerun.io) share."""
 
 import os
 from collections.abc import Iterator
@@ -11,7 +11,9 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.readers.images import ImageFrame
 from rbpf.validation.figures import SIGMAS
+from rbpf.validation.map_summary import MapSummary
 
 QUALITY = 75
 """Of the JPEG images in the recording, in per cent."""
@@ -36,12 +38,12 @@ def require_rerun() -> Any:
 
 
 @contextmanager
-def recording(name: str, path: Path) -> Iterator[tuple[Any, Any]]:
-    """The package, and the stream of a recording; the file appears under its name when it is complete.
+def recording(path: Path, name: str) -> Iterator[tuple[Any, Any]]:
+    """The package and a stream into a file, which appears under its name when it is complete.
 
     Args:
-        name: of the recording.
         path: the file, .rrd.
+        name: of the recording.
 
     Raises:
         InputError: Rerun is not installed, or the file cannot be written.
@@ -61,20 +63,8 @@ def recording(name: str, path: Path) -> Iterator[tuple[Any, Any]]:
         partial.unlink(missing_ok=True)
 
 
-def set_time(stream: Any, t: int, stamps_ns: np.ndarray) -> None:
-    """What follows belongs to frame t."""
-    stream.set_time("frame", sequence=t)
-    stream.set_time("time", duration=1e-9 * float(stamps_ns[t] - stamps_ns[0]))
-
-
-def log_image(rr: Any, stream: Any, image: np.ndarray | None) -> None:
-    """What the camera sees, if it could be read."""
-    if image is not None:
-        stream.log("world/camera/image", rr.Image(image).compress(jpeg_quality=QUALITY))
-
-
 def log_lens(rr: Any, stream: Any, camera: Pinhole) -> None:
-    """The camera; Rerun's pixels start at a corner, not at a centre."""
+    """The camera's; Rerun's pixels start at a corner, not at a centre."""
     lens = rr.Pinhole(
         focal_length=[camera.fx, camera.fy],
         principal_point=[camera.cx + 0.5, camera.cy + 0.5],
@@ -85,18 +75,33 @@ def log_lens(rr: Any, stream: Any, camera: Pinhole) -> None:
     stream.log("world/camera", lens, static=True)
 
 
-def log_pose(rr: Any, stream: Any, world_from_camera: np.ndarray) -> None:
-    """Where the camera (7,) is."""
-    at = SE3.translation(world_from_camera)
-    stream.log(
-        "world/camera", rr.Transform3D(translation=at, quaternion=rr.Quaternion(xyzw=world_from_camera[:4]))
-    )
+def log_time(stream: Any, t: int, after_ns: int) -> None:
+    """Number of a frame and time since the first one [ns]; what is logged next belongs to it."""
+    stream.set_time("frame", sequence=t)
+    stream.set_time("time", duration=1e-9 * float(after_ns))
 
 
-def ellipsoids(rr: Any, mean: np.ndarray, cov: np.ndarray, **how: Any) -> Any:
-    """3σ ellipsoids of points (M, 3) with covariances (M, 3, 3)."""
-    values, vectors = np.linalg.eigh(cov)
+def log_image(rr: Any, stream: Any, frame: ImageFrame) -> None:
+    """A frame's image, if it has one."""
+    if frame.image is not None:
+        stream.log("world/camera/image", rr.Image(frame.image).compress(jpeg_quality=QUALITY))
+
+
+def log_pose(rr: Any, stream: Any, name: str, pose: np.ndarray) -> None:
+    """Where a camera or a robot is in the world, (7,)."""
+    turned = rr.Quaternion(xyzw=pose[:4])
+    stream.log(f"world/{name}", rr.Transform3D(translation=SE3.translation(pose), quaternion=turned))
+
+
+def ellipsoids(rr: Any, landmarks: MapSummary) -> Any:
+    """A map's 3σ ellipsoids, with the landmarks' names."""
+    values, vectors = np.linalg.eigh(landmarks.cov)
     turned = vectors * np.where(np.linalg.det(vectors) < 0.0, -1.0, 1.0)[:, None, None]
-    poses = np.concatenate([turned, mean[..., None]], axis=-1)
-    sizes = SIGMAS * np.sqrt(np.maximum(values, 0.0))
-    return rr.Ellipsoids3D(centers=mean, half_sizes=sizes, quaternions=SE3.from_matrix(poses)[:, :4], **how)
+    poses = np.concatenate([turned, landmarks.mean[..., None]], axis=-1)
+    return rr.Ellipsoids3D(
+        centers=landmarks.mean,
+        half_sizes=SIGMAS * np.sqrt(np.maximum(values, 0.0)),
+        quaternions=SE3.from_matrix(poses)[:, :4],
+        labels=[str(name) for name in landmarks.ids],
+        show_labels=False,
+    )

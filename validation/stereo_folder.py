@@ -4,27 +4,28 @@ trajectory.tum           online filtered mean at every pair; the first camera is
 trajectory.npz           the same with its covariance; truth.npz: the ground truth at these pairs; see
                          `rbpf.validation.run_files`
 odometry.tum             the path by visual odometry alone
+batch.tum                the batch optimum of the same measurements
+observations*.csv        the measurements used, by odometry or by the map; see `rbpf.validation.camera_files`
 map.npz, map.csv         landmarks: name, mean, covariance (within + between particles); how often each was seen
 timings.csv              milliseconds per pair: whole, features, odometry, matching with the map, filter
 diagnostics.csv          features, matches that agree with the motion, landmarks; updates, sample size, evidence, NIS
 config.yaml              everything needed to repeat the run
+checkpoint.npz           what --resume goes on from
 summary.json             the figures
 *.png                    pictures
 annotated.mp4            the left images with their features
 report.html              one page with all figures and pictures
 """
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
-from rbpf import __version__
 from rbpf.systems.stereo.run import StereoRun
 from rbpf.systems.stereo.sensor import StereoSensor
+from rbpf.validation.camera_files import write_features
 from rbpf.validation.files import (
     milliseconds_per_frame,
     nis_ratio,
@@ -32,9 +33,10 @@ from rbpf.validation.files import (
     prepare_folder,
     write_csv,
     write_map,
-    write_text,
+    write_summary,
 )
 from rbpf.validation.map_summary import MapSummary
+from rbpf.validation.provenance import write_config
 from rbpf.validation.run_files import write_path, write_truth
 from rbpf.validation.stereo_scores import distance_m, score_stereo, stereo_truth
 from rbpf.validation.trajectory import Trajectory
@@ -63,11 +65,11 @@ def write_stereo_run(
     write_map(out, mapped, _facts(run, mapped))
     write_path(out, run.stamps_ns, run.world_from_camera, run.cov)
     write_truth(out, stereo_truth(run))
+    write_features(out, run.front_end.log(run.name, run.stamps_ns, run.truth))
     _write_tables(run, out)
-    config = {"rbpf": __version__, "system": "stereo", **sources, **asdict(run.config)}
-    write_text(out / "config.yaml", yaml.safe_dump(config, sort_keys=False))
+    write_config(out, "stereo", sources, asdict(run.config))
     entries = summarise_stereo(run, mapped)
-    write_text(out / "summary.json", json.dumps(entries, indent=2, allow_nan=False) + "\n")
+    write_summary(out, entries)
     return entries
 
 

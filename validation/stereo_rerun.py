@@ -17,7 +17,7 @@ from rbpf.systems.stereo.run import StereoRun
 from rbpf.systems.stereo.seen import LANDMARK
 from rbpf.validation.annotated import FOUND
 from rbpf.validation.map_summary import MapSummary
-from rbpf.validation.rerun_file import ellipsoids, log_image, log_lens, log_pose, recording, set_time
+from rbpf.validation.rerun_file import ellipsoids, log_image, log_lens, log_pose, log_time, recording
 from rbpf.validation.stereo_frames import COLOURS, NAMES
 
 
@@ -33,20 +33,24 @@ def write_stereo_rerun(run: StereoRun, sequence: StereoSequence, mapped: MapSumm
     Raises:
         InputError: Rerun is not installed, or the file cannot be written.
     """
-    with recording(run.name, path) as (rr, stream):
-        log_lens(rr, stream, run.front_end.rig.camera)
-        for name, poses in (("path", run.world_from_camera), ("odometry", run.odometry)):
-            stream.log(f"world/{name}", rr.LineStrips3D([SE3.translation(poses)]), static=True)
-        stream.log("world/map", ellipsoids(rr, mapped.mean, mapped.cov), static=True)
+    with recording(path, run.name) as (rr, stream):
+        _log_static(rr, stream, run, mapped)
         for t, frame in zip(range(run.stamps_ns.size), sequence.frames(), strict=False):
-            set_time(stream, t, run.stamps_ns)
-            log_image(rr, stream, frame.image)
+            log_time(stream, t, int(run.stamps_ns[t] - run.stamps_ns[0]))
+            log_image(rr, stream, frame)
             _log_pair(rr, stream, run, t)
+
+
+def _log_static(rr: Any, stream: Any, run: StereoRun, mapped: MapSummary) -> None:
+    log_lens(rr, stream, run.front_end.rig.camera)
+    for name, poses in (("path", run.world_from_camera), ("odometry", run.odometry)):
+        stream.log(f"world/{name}", rr.LineStrips3D([SE3.translation(poses)]), static=True)
+    stream.log("world/map", ellipsoids(rr, mapped), static=True)
 
 
 def _log_pair(rr: Any, stream: Any, run: StereoRun, t: int) -> None:
     at, seen = run.world_from_camera[t], run.seen[t]
-    log_pose(rr, stream, at)
+    log_pose(rr, stream, "camera", at)
     for kind, name in NAMES.items():
         pixels = rr.Points2D(seen.of(kind)[:, :2] + 0.5, colors=[COLOURS[kind]])
         stream.log(f"world/camera/image/{name.replace(' ', '_')}", pixels)

@@ -16,7 +16,7 @@ from rbpf.validation.mono_views import best_views
 from rbpf.validation.simulation.exposure import Imaging
 from rbpf.validation.simulation.images import simulate_images
 from rbpf.validation.simulation.textured_desk import TexturedDesk
-from rbpf.validation.video_file import frame_rate
+from rbpf.validation.video_file import frame_rate, is_complete
 
 
 @pytest.fixture(scope="module")
@@ -112,3 +112,19 @@ def test_equal_stamps_still_have_a_rate():
     assert frame_rate(np.arange(5) * 33_333_333) == pytest.approx(30.0, abs=0.01)
     assert frame_rate(np.zeros(5, dtype=np.int64)) == 1.0
     assert frame_rate(np.array([0])) == 1.0
+
+
+def test_a_video_that_the_encoder_could_not_finish_is_seen(tmp_path):
+    import imageio_ffmpeg
+
+    path = tmp_path / "a.mp4"
+    encoder = imageio_ffmpeg.write_frames(str(path), (64, 48), ffmpeg_log_level="error")
+    encoder.send(None)
+    for grey in (0, 100, 200):
+        encoder.send(np.full((48, 64, 3), grey, np.uint8))
+    encoder.close()
+    data = path.read_bytes()
+    assert is_complete(path)
+    for length in (0, 5, 40, len(data) // 2, len(data) - 1):
+        path.write_bytes(data[:length])
+        assert not is_complete(path)

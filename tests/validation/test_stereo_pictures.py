@@ -111,6 +111,6 @@ def test_features_in_the_recording(run, tmp_path, monkeypatch):
 
 def test_a_recording_that_fails_leaves_nothing(tmp_path):
     pytest.importorskip("rerun")
-    with pytest.raises(ZeroDivisionError), recording("x", tmp_path / "x.rrd"):
+    with pytest.raises(ZeroDivisionError), recording(tmp_path / "x.rrd", "x"):
         raise ZeroDivisionError
     assert list(tmp_path.iterdir()) == []
