@@ -13,6 +13,7 @@ from rbpf.systems.plain_yaml import read_plain_yaml
 _HEADER = (
     "rbpf", "system", "versions", "input_sha256",
     "recording", "known_points", "board", "square_m", "calibration", "map", "localize",
+    "aruco", "marker_m", "gap_m", "dictionary",
 )  # fmt: skip
 """What a config.yaml says about the run besides its settings."""
 
