@@ -85,7 +85,7 @@ class Recording:
             "recording": self.images,
             "known_points": self.known_points,
             "calibration": self.calibration,
-            "map": self.map,
+            "known_map": self.map,
         }
         board: dict[str, str | float] = {}
         if self.board is not None:

@@ -18,10 +18,26 @@ CONFIG = "config.yaml"
 LIBRARIES = "numpy", "scipy", "numba", "opencv-python-headless"
 """Whose version may change a run's bytes."""
 
-_FILES = "recording", "known_points", "calibration", "map"
+_FILES = "recording", "known_points", "calibration", "known_map"
 """Entries that name files or folders that a run read."""
-_OPTIONS = {"known_points": "known-points", "square_m": "square", "marker_m": "marker", "gap_m": "gap"}
-_NAMED = "known_points", "calibration", "board", "square_m", "aruco", "marker_m", "gap_m", "dictionary", "map"
+_OPTIONS = {
+    "known_points": "known-points",
+    "known_map": "map",
+    "square_m": "square",
+    "marker_m": "marker",
+    "gap_m": "gap",
+}
+_NAMED = (
+    "known_points",
+    "calibration",
+    "board",
+    "square_m",
+    "aruco",
+    "marker_m",
+    "gap_m",
+    "dictionary",
+    "known_map",
+)
 _FLAGS = ("localize",)
 _CHUNK = 1 << 20
 
