@@ -12,6 +12,11 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 import pytest
 
+from tests.shapes import switch, watch
+
+if os.environ.get("RBPF_SHAPES") != "0":
+    watch()
+
 DEFAULT_DATA = Path(__file__).resolve().parent.parent.parent / "shared" / "data"
 
 
@@ -22,6 +27,12 @@ def data_dir() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no recordings at {folder}: set RBPF_DATA to the folder that holds them")
     return folder
+
+
+@pytest.fixture
+def unchecked_shapes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For tests that hand over arrays of a wrong shape, and want to hear of it from the program."""
+    monkeypatch.setattr(switch, "on", False)
 
 
 @pytest.fixture(scope="module")

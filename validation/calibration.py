@@ -178,7 +178,8 @@ def _draw_image(axes: Any, found: BoardCalibration) -> None:
         f"{len(found.views)} views, reprojection error {found.rms_px:.3f} px; "
         f"residuals enlarged {enlarged:.0f} times"
     )
-    label(axes, title, "u [px]", "v [px]", equal=True)
+    label(axes, title, "u [px]", "v [px]", equal=False)
+    axes.set_aspect("equal")
     axes.plot(*px.T, ".", markersize=3, color=COLOURS["truth"])
     shift = enlarged * found.residuals.reshape(-1, 2)
     axes.quiver(*px.T, *shift.T, angles="xy", scale_units="xy", scale=1.0, width=0.001, color=COLOURS["map"])

@@ -120,8 +120,8 @@ def start_mono(
     Raises:
         InputError: the recording or a setting is wrong.
     """
-    sequence, known = recording.open()
     mapped = None if recording.map is None else read_known_map(recording.map)
+    sequence, known = recording.open()
     if out is not None:
         prepare_folder(out)
     total = len(sequence)

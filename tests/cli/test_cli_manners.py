@@ -90,19 +90,20 @@ def test_every_command_is_in_this_file(capsys, monkeypatch):
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_says_what_each_option_is_its_default_and_its_unit(command, capsys, monkeypatch):
     text = " ".join(help_of(command, capsys, monkeypatch).replace("│", " ").split())
+    options = text[text.index("show this help") :]
     for item in fields(COMMANDS[command]):
         shown = f"--{item.name.replace('_', '-')}"
-        start = text.find(shown + " ") if shown + " " in text else text.find(item.name.upper())
-        needed = item.default is MISSING
-        assert start >= 0 or needed, f"{command} {shown} is not in its help"
-        told = text[start : text.index("(", start) + 40] if start >= 0 else text
-        assert "(default:" in told or "(required)" in told or "(repeatable)" in told, f"{command} {shown}"
+        found = re.search(rf"{shown}[ ,](.+?)\((default: [^)]*|required|repeatable)\)", options)
+        if found is None:
+            assert item.default is MISSING, f"{command} {shown} is not in its help"
+            assert "(required)" in text
+            continue
+        assert len(found[1].split()) >= 3, f"{command} {shown} does not say what it is"
+        assert " --" not in found[1].replace(" --no-", ""), f"{command} {shown} has no default"
         if item.default is None:
-            assert "by default" in told or "None for none" in told, (
-                f"{command} {shown} does not say its default"
-            )
+            assert "by default" in found[1] or "None for none" in found[1], f"{command} {shown}: by default?"
         if isinstance(item.default, float):
-            assert UNIT.search(told), f"{command} {shown} has no unit: {told}"
+            assert UNIT.search(found[1]), f"{command} {shown} has no unit: {found[1]}"
 
 
 def test_json_is_one_object_on_standard_output(log, tmp_path, capsys):

@@ -23,8 +23,8 @@ from rbpf.validation.trajectory_files import read_tum
 from tests.cli.mono_sequences import CAMERA, FRAMES, run, sentence, summary
 
 FILES = {
-    "trajectory.tum", "map.npz", "map.csv", "timings.csv", "diagnostics.csv", "config.yaml", "summary.json",
-    "report.html", "path.png", "map.png", "particles.png", "error.png", "tracking.png", "timings.png",
+    "trajectory.tum", "map.npz", "map.csv", "known_map.npz", "timings.csv", "diagnostics.csv", "config.yaml",
+    "summary.json", "report.html", "path.png", "map.png", "particles.png", "error.png", "tracking.png", "timings.png",
     "batch.tum", "posterior.tum", "posterior.npz", "checkpoint.npz",
     "observations.csv", "observations_frames.csv", "observations_known_points.csv",
     "trajectory.npz",

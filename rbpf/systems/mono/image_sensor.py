@@ -20,6 +20,9 @@ from rbpf.systems.mono.appearance import SOURCE_HALF_PX, Appearances
 from rbpf.systems.mono.config import SearchConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor
 
+LEAST_SEEN = 4
+"""Points of a known map that tell where the camera is; one that sees fewer has left the map, nothing new is mapped."""
+
 
 @final
 class ImageSensor(Sensor):
@@ -137,7 +140,7 @@ class ImageSensor(Sensor):
         tracked: patches look different from there.
         """
         found, config = self.searched.found, self.config
-        if not found.size:
+        if not found.size or (self.features.fixed and found.sum() < LEAST_SEEN):
             return True
         if not self.lost:
             return bool(found.mean() < config.lost_share)

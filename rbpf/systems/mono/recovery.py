@@ -20,7 +20,7 @@ LEAST_CONTRAST = 10
 """Grey levels that are all nearer to each other are those of a lens cap."""
 
 VIEWS_PER_FRAME = 2
-"""Views of an earlier map that a camera that was lost on its way is looked for from, in turn."""
+"""Views of an earlier map from which a lost camera is looked for in a frame, in turn."""
 
 FROZEN = 5
 """Times that an image has to come again: drivers repeat single images when the camera is late."""
@@ -104,9 +104,12 @@ class Recovery:
         return PoseLaw(pose, cov + np.diag(reach**2), self.std_velocity)
 
     def _found(self, filter_: Filter, image: np.ndarray, trusted: np.ndarray) -> PoseLaw | None:
-        """Where the camera is recognised, looking from the last trusted pose; then from some of the map's views."""
+        """Where the camera is recognised, looking from the last trusted pose; then from views of the map.
+
+        In the first frame from all of them, later from some in turn.
+        """
         belief, count = filter_.belief(), self.views.shape[0]
-        tried = count if self.never_found else min(VIEWS_PER_FRAME, count)
+        tried = min(count, VIEWS_PER_FRAME if filter_.steps else count)
         chosen = (filter_.steps * tried + np.arange(tried)) % max(count, 1)
         for near in [trusted, *self.views[chosen]]:
             found = self.relocaliser.find(belief, image, near)
