@@ -1,9 +1,9 @@
 """Simulation-based calibration of any model that can simulate: is the truth ranked uniformly among posterior samples?
 
-Draw parameters from the prior, data from the parameters, samples from what the filter takes for the posterior. If that is
-the posterior, the rank of the true parameter among L samples is uniform on 0 … L, whatever the model
-(S. Talts et al., "Validating Bayesian inference algorithms with simulation-based calibration", 2018). A histogram like ∪
-is an over-confident filter, like ∩ a cautious one, a slope is a bias.
+Draw parameters from the prior, data from the parameters, samples from what the filter takes for the posterior. If that
+is the posterior, the rank of the true parameter among L samples is uniform on 0 … L, whatever the model (S. Talts et
+al., "Validating Bayesian inference algorithms with simulation-based calibration", 2018). A histogram like ∪ is an
+over-confident filter, like ∩ a cautious one, a slope is a bias.
 
 Samples of a particle filter have weights: the rank follows from the weight below the truth, Σ_i w_i 1[θ_i < θ],
 as the place of the truth among the gaps of as many samples as the weights are worth, ties broken at random.

@@ -29,7 +29,7 @@ def exact(scale: float = 1.0, shift: float = 0.0, weighted: bool = False):
             return mean + std * rng.normal(size=(100, 2)), np.ones(100)
         wide = 1.5 * std
         samples = mean + wide * rng.normal(size=(2000, 2))
-        off = np.square((samples - mean)).sum(axis=1)
+        off = np.square(samples - mean).sum(axis=1)
         return samples, np.exp(-0.5 * off / std**2 + 0.5 * off / wide**2)
 
     return infer
