@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from rbpf.validation.writing import whole
+
 SIGMAS = 3.0
 COLOURS = {
     "filter": "tab:blue",
@@ -20,8 +22,8 @@ COLOURS = {
 def save_figures(figures: Mapping[str, Any], out: Path) -> list[str]:
     """Saves figures by file name, each whole or not at all; returns the names."""
     for name, figure in figures.items():
-        figure.savefig(out / f"{name}.partial", format="png", dpi=110, bbox_inches="tight")
-        (out / f"{name}.partial").replace(out / name)
+        with whole(out / name) as temporary:
+            figure.savefig(temporary, format="png", dpi=110, bbox_inches="tight")
     return list(figures)
 
 
@@ -33,6 +35,18 @@ def new_axes(title: str, ylabel: str = "y [m]", xlabel: str = "x [m]", equal: bo
     axes = figure.subplots()
     label(axes, title, xlabel, ylabel, equal)
     return figure, axes
+
+
+def stacked_axes(count: int, title: str) -> tuple[Any, list[Any]]:
+    """A figure of pairs of axes one above the other that share what is along them."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.0, 2.0 + 2.0 * count), layout="constrained")
+    rows = list(figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0])
+    rows[0].set_title(title)
+    for axes in rows:
+        axes.grid(alpha=0.3)
+    return figure, rows
 
 
 def label(axes: Any, title: str, xlabel: str, ylabel: str, equal: bool) -> None:

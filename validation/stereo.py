@@ -9,11 +9,10 @@ from rbpf.errors import InputError
 from rbpf.sensors.readers.images import open_stereo
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.run import StereoRun, run_images
-from rbpf.validation.files import prepare_folder
+from rbpf.validation.files import prepare_folder, write_summary
 from rbpf.validation.map_summary import summarise_map
 from rbpf.validation.mono import BATCH, Telling
 from rbpf.validation.mono_batch import Batch
-from rbpf.validation.mono_folder import write_summary
 from rbpf.validation.stereo_batch import adjust_stereo, score_stereo_batch
 from rbpf.validation.stereo_folder import write_stereo_run
 from rbpf.validation.stereo_pictures import plot_stereo_run

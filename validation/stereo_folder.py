@@ -10,20 +10,18 @@ map.npz, map.csv         landmarks: name, mean, covariance (within + between par
 timings.csv              milliseconds per pair: whole, features, odometry, matching with the map, filter
 diagnostics.csv          features, matches that agree with the motion, landmarks; updates, sample size, evidence, NIS
 config.yaml              everything needed to repeat the run
+checkpoint.npz           what --resume goes on from
 summary.json             the figures
 *.png                    pictures
 report.html              one page with all figures and pictures
 """
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
-from rbpf import __version__
 from rbpf.systems.stereo.run import StereoRun
 from rbpf.systems.stereo.sensor import StereoSensor
 from rbpf.validation.camera_files import write_features
@@ -34,9 +32,10 @@ from rbpf.validation.files import (
     prepare_folder,
     write_csv,
     write_map,
-    write_text,
+    write_summary,
 )
 from rbpf.validation.map_summary import MapSummary
+from rbpf.validation.provenance import write_config
 from rbpf.validation.run_files import write_path, write_truth
 from rbpf.validation.stereo_scores import distance_m, score_stereo, stereo_truth
 from rbpf.validation.trajectory import Trajectory
@@ -67,10 +66,9 @@ def write_stereo_run(
     write_truth(out, stereo_truth(run))
     write_features(out, run.front_end.log(run.name, run.stamps_ns, run.truth))
     _write_tables(run, out)
-    config = {"rbpf": __version__, "system": "stereo", **sources, **asdict(run.config)}
-    write_text(out / "config.yaml", yaml.safe_dump(config, sort_keys=False))
+    write_config(out, "stereo", sources, asdict(run.config))
     entries = summarise_stereo(run, mapped)
-    write_text(out / "summary.json", json.dumps(entries, indent=2, allow_nan=False) + "\n")
+    write_summary(out, entries)
     return entries
 
 

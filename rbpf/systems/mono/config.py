@@ -43,7 +43,8 @@ class RayConfig:
         least_px: depth is measured once a change of ρ by its first standard deviation moves the image by this. Before,
             the parallax tells more of the error of the sampled pose than of depth, and the prior of ρ, which does not
             change as long as depth is not measured, would count anew in every frame.
-        line_px: likewise, from where on there is an epipolar line.
+        line_px: likewise, from where on there is an epipolar line; well below the noise of a measurement, since
+            what depth moves below it is not modelled and stays the same from frame to frame.
     """
 
     constrain: Literal["epipolar", "marginal", "off"] = "marginal"
@@ -53,7 +54,7 @@ class RayConfig:
     ready_ratio: float = 0.1
     ready_weight: float = 0.95
     least_px: float = 10.0
-    line_px: float = 1.0
+    line_px: float = 0.3
 
 
 @dataclass(frozen=True)
@@ -158,6 +159,7 @@ class MonoConfig:
         known: the known points as one rigid group whose frame is marginalised, or as separate landmarks in a world
             whose place each particle samples in the first frame (E06).
         births_per_frame: landmarks started in one frame at most.
+        lag: frames of the particles' paths that are kept, None keeps all.
         checkpoint_every: frames between checkpoints.
         velocity: how the camera moves.
         ray: landmarks of unknown depth.
@@ -174,6 +176,7 @@ class MonoConfig:
     start_std_rad: float = 0.5
     known: Literal["frame", "points"] = "frame"
     births_per_frame: int = 1000
+    lag: int | None = None
     checkpoint_every: int = 500
     velocity: VelocityConfig = field(default_factory=VelocityConfig)
     ray: RayConfig = field(default_factory=RayConfig)
