@@ -78,8 +78,9 @@ def refine(
     """Adds Σ HᵀS⁻¹H, Σ HᵀS⁻¹ν, Σ νᵀS⁻¹ν and Σ log|2πS| over the observations, S = J P Jᵀ + R; see docs/mathematics.md.
 
     `address` is that of the model's kernel. `state` (N, E) holds the linearisation points; observation k reads slab
-    `slabs[k]` of `pool` (slabs, fields, N) at the rows `maps[which[k]]`; `mask` (K, N) or (0, 0) says which particles saw it; `form` and `form_params`
-    name the likelihood, `factor` (N or 1, d, r) is the prior's, used for gating only; `sizes` = (d, D, A).
+    `slabs[k]` of `pool` (slabs, fields, N) at the rows `maps[which[k]]`; `mask` (K, N) or (0, 0) says which particles
+    saw it; `form` and `form_params` name the likelihood, `factor` (N or 1, d, r) is the prior's, used for gating only;
+    `sizes` = (d, D, A).
     """
     n_particles, size = state.shape
     n_obs, p = noise.shape[0], noise.shape[1]
