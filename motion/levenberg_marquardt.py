@@ -155,7 +155,7 @@ def minimise(evaluate: Evaluate, x: Array, retract: Retract, rule: Rule | None =
 def _linearised(residual: Array, jac: Array) -> _Local:
     # [J ε] = Q [R r]: R has J's singular values and V, and r = Qᵀε; it is as small as the number of unknowns.
     size = jac.shape[1]
-    triangle = np.linalg.qr(np.column_stack([jac, residual]), mode="r")
+    triangle = np.asarray(np.linalg.qr(np.column_stack([jac, residual]), mode="r"))
     u, s, vt = np.linalg.svd(triangle[:size, :size])
     # Along a direction that is not determined there is nowhere to go.
     along = np.where(s > SINGULAR * s[0], u.T @ triangle[:size, size], 0.0)
