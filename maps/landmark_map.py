@@ -6,6 +6,7 @@ from typing import Any, final
 
 import numpy as np
 
+from rbpf.archive import checked, within
 from rbpf.errors import InputError
 from rbpf.genealogy import Lineage
 from rbpf.lie import LieGroup
@@ -50,7 +51,6 @@ class LandmarkMap(Conditional):
         self.evidence = evidence
         self.compiled = compiled
         self.layouts: list[Layout] = []
-        self.kinds = np.zeros(0, dtype=np.int64)
         self.catalogue: dict[int, Any] = {}
         self._planned: tuple[Sequence[Observations], Plan] | None = None
 
@@ -85,11 +85,7 @@ class LandmarkMap(Conditional):
         kind = self._kind(landmark)
         columns = self.layouts[kind].pack(records, log_odds)
         ids = np.array([self.store.add(column) for column in columns], dtype=np.int64)
-        if ids.size and ids[-1] >= self.kinds.size:
-            grown = np.full(max(64, 2 * int(ids[-1])), -1)
-            grown[: self.kinds.size] = self.kinds
-            self.kinds = grown
-        self.kinds[ids] = kind
+        self.store.columns.kind[self.store.columns.rows(ids)] = kind
         return ids
 
     def remove(self, ids: np.ndarray) -> None:
@@ -97,7 +93,6 @@ class LandmarkMap(Conditional):
         self._known(ids)
         self._planned = None
         self.store.remove(ids)
-        self.kinds[ids] = -1
         for landmark in ids.tolist():
             self.catalogue.pop(landmark, None)
 
@@ -107,7 +102,7 @@ class LandmarkMap(Conditional):
         ids = np.asarray(ids)
         if ids.size == 0:
             raise InputError("no landmark was named")
-        kinds = self.kinds[ids]
+        kinds = self.store.columns.kinds(ids)
         if (kinds != kinds[0]).any():
             raise InputError(
                 "read() takes landmarks of one parametrisation at a time; `landmark_of` tells which"
@@ -139,7 +134,7 @@ class LandmarkMap(Conditional):
         """
         records = self.read(ids, slice(particle, particle + 1))
         kernel = model.kernel() if self.compiled else None
-        if kernel is not None and self.layouts[self.kinds[ids[0]]].landmark.components == 1:
+        if kernel is not None and self._layout_of(int(ids[0])).landmark.components == 1:
             return *linearise_compiled(kernel, records, z, state, self.space.dim), records
         const = None if records.const is None else records.const[0]
         return *linearise(model, self.space, z, state[None], records.mean[0], const), records
@@ -151,7 +146,7 @@ class LandmarkMap(Conditional):
 
     def are(self, ids: np.ndarray, landmark: Landmark) -> np.ndarray:
         """Which landmarks (K,) of the map have this parametrisation, (K,) bool."""
-        return np.asarray(self.kinds[ids] == self._kind(landmark))
+        return self.store.columns.kinds(ids) == self._kind(landmark)
 
     def promote(self, ids: np.ndarray, to: Landmark | None = None) -> None:
         """Turns landmarks into single Gaussian points in all particles at once, by their own `promote`."""
@@ -163,7 +158,7 @@ class LandmarkMap(Conditional):
             kind = self._kind(to or Point(records.mean.shape[-1]))
             log_odds = column[-1][:, None] if self.evidence else None
             self.store.replace(int(landmark_id), self.layouts[kind].pack(records, log_odds)[0])
-            self.kinds[landmark_id] = kind
+            self.store.columns.kind[self.store.columns.row(int(landmark_id))] = kind
 
     def ready(self, weights: np.ndarray, share: float = 0.95) -> np.ndarray:
         """Landmarks of several components or with constants that are ready in `share` of the weight (N,)."""
@@ -248,7 +243,7 @@ class LandmarkMap(Conditional):
         if not plain or len({type(fact) for fact in facts}) > 1:
             raise InputError("facts in the catalogue can be saved if all are numbers or all are text")
         return self.store.arrays() | {
-            "map/kinds": self.kinds[ids],
+            "map/kinds": self.store.columns.kinds(ids),
             "map/fact_ids": np.array(fact_ids, dtype=np.int64),
             "map/facts": np.array(facts),
         }
@@ -262,12 +257,24 @@ class LandmarkMap(Conditional):
         return {"evidence": self.evidence, **kinds}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """The inverse of `arrays`; the parametrisations must have been registered in the same order."""
+        """The inverse of `arrays`; the parametrisations must have been registered in the same order.
+
+        Raises:
+            InputError: an array is missing, or is not what it should be.
+        """
         self.store.restore(arrays)
-        ids = self.ids
-        self.kinds = np.full(max(64, 2 * int(ids.max(initial=0)) + 2), -1)
-        self.kinds[ids] = arrays["map/kinds"]
-        facts = zip(arrays["map/fact_ids"].tolist(), arrays["map/facts"].tolist(), strict=True)
+        count = self.store.columns.count
+        kinds = within(arrays, "map/kinds", count, 0, len(self.layouts))
+        sizes = np.array([layout.fields for layout in self.layouts], dtype=np.int64)[kinds]
+        if not np.array_equal(sizes, self.store.columns.fields[:count]):
+            raise InputError("the landmarks' records have other sizes than their parametrisations")
+        self.store.columns.kind[:count] = kinds
+        named = checked(arrays, "map/fact_ids", (None,), "i")
+        if not self.store.columns.held(named).all():
+            raise InputError("the array map/fact_ids names a landmark that the map does not hold")
+        facts = zip(
+            named.tolist(), checked(arrays, "map/facts", (named.size,), "iufbU").tolist(), strict=True
+        )
         self.catalogue = dict(facts)
 
     def register(self, landmark: Landmark) -> None:
@@ -288,19 +295,18 @@ class LandmarkMap(Conditional):
         if planned is not None and len(planned[0]) == len(groups) and all(map(is_, planned[0], groups)):
             return planned[1]
         plain = np.array([layout.landmark.components == 1 for layout in self.layouts], dtype=bool)
-        plan = make_plan(groups, self.n, self.kinds, plain)
+        plan = make_plan(groups, self.n, self.store.columns.kinds, plain)
         self._planned = (groups, plan)
         return plan
 
     def _layout_of(self, landmark_id: int) -> Layout:
-        return self.layouts[self.kinds[landmark_id]]
+        return self.layouts[self.store.columns.kind[self.store.columns.row(int(landmark_id))]]
 
     def _known(self, ids: np.ndarray | Sequence[int]) -> None:
         named = np.asarray(ids)
-        held = (named >= 0) & (named < self.kinds.size)
-        if not (held.all() and (self.kinds[named] >= 0).all()):
-            unknown = next(i for i in named.tolist() if i not in self.store)
-            raise InputError(f"the map holds no landmark {unknown}")
+        held = self.store.columns.held(named)
+        if not held.all():
+            raise InputError(f"the map holds no landmark {named[~held][0]}")
 
     def _is_ready(self, landmark_id: int) -> np.ndarray:
         layout = self._layout_of(landmark_id)

@@ -4,7 +4,7 @@ Rows that speak of different landmarks are independent given the state; rows of 
 twice in a step (two cameras, two groups) are correlated through it and have to be stacked.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -16,6 +16,9 @@ STATE = frozenset({Part.STATE})
 MAP = frozenset({Part.LANDMARK})
 BOTH = STATE | MAP
 """What observations inform."""
+
+Kinds = Callable[[np.ndarray], np.ndarray]
+"""Numbers (K,) of the parametrisations of landmarks (K,), -1 where the map holds none."""
 
 
 @dataclass(frozen=True)
@@ -55,13 +58,13 @@ class Plan:
     late: list[Row] = field(default_factory=list)
 
 
-def make_plan(groups: Sequence[Observations], n: int, kinds: np.ndarray, plain: np.ndarray) -> Plan:
+def make_plan(groups: Sequence[Observations], n: int, kinds: Kinds, plain: np.ndarray) -> Plan:
     """Sorts the rows of all groups.
 
     Args:
         groups: observations that read a landmark.
         n: particles.
-        kinds: (ids,) number of each landmark's parametrisation, -1 where the map holds none.
+        kinds: tells of landmarks (K,) the numbers (K,) of their parametrisations, -1 where the map holds none.
         plain: (kinds,) whether that parametrisation has a single component.
 
     Raises:
@@ -84,7 +87,7 @@ def make_plan(groups: Sequence[Observations], n: int, kinds: np.ndarray, plain: 
             rows.setdefault(row.landmark, []).append(row)
     batches: dict[tuple[int, int], list[Row]] = {}
     for landmark, sightings in rows.items():
-        kind = int(kinds[landmark])
+        kind = int(kinds(np.array([landmark]))[0])
         if not plain[kind]:
             plan.late.extend(sightings)
         elif _overlap(sightings):
@@ -96,7 +99,7 @@ def make_plan(groups: Sequence[Observations], n: int, kinds: np.ndarray, plain: 
     return plan
 
 
-def _are_simple(named: Sequence[np.ndarray], kinds: np.ndarray, plain: np.ndarray) -> bool:
+def _are_simple(named: Sequence[np.ndarray], kinds: Kinds, plain: np.ndarray) -> bool:
     """Whether all particles agree, no landmark is seen twice and each group's have one plain parametrisation."""
     seen = set[int]()
     for ids in named:
@@ -107,13 +110,13 @@ def _are_simple(named: Sequence[np.ndarray], kinds: np.ndarray, plain: np.ndarra
         seen.update(landmarks)
         if len(seen) < before + len(landmarks):
             return False
-        of = kinds[landmarks] if landmarks else kinds[:0]
+        of = kinds(np.array(landmarks, dtype=np.int64))
         if of.size and not (plain[of[0]] and (of == of[0]).all()):
             return False
     return True
 
 
-def _checked_ids(group: Observations, n: int, kinds: np.ndarray) -> np.ndarray:
+def _checked_ids(group: Observations, n: int, kinds: Kinds) -> np.ndarray:
     ids, count = group.ids, group.z.shape[0]
     if ids is None:
         raise InputError(f"{type(group.model).__name__} reads a landmark: its observations need ids")
@@ -124,10 +127,7 @@ def _checked_ids(group: Observations, n: int, kinds: np.ndarray) -> np.ndarray:
             f"ids of {type(group.model).__name__} must be integers: landmarks, NULL = -1 or NEW = -2"
         )
     named = ids[ids >= 0]
-    if named.size == 0 or (named.max() < kinds.size and kinds[named].min() >= 0):
-        return ids
-    held = named < kinds.size
-    held[held] = kinds[named[held]] >= 0
+    held = kinds(named) >= 0
     if not held.all():
         raise InputError(f"a measurement names landmark {named[~held][0]}, which the map does not hold")
     return ids

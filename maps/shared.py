@@ -10,11 +10,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rbpf.archive import checked, within
 from rbpf.errors import InputError
 from rbpf.genealogy import Lineage, Schedule
+from rbpf.maps.columns import Columns
 from rbpf.maps.pool import Pool
 
 ALL = slice(None)
+MOST_FIELDS = 1 << 20
+"""No record is longer."""
+
 HOT_SHARE = 0.75
 """A column with fewer surviving rows than this share of the particles gives its dense slab back."""
 COLD_SHARE = 0.9
@@ -51,10 +56,7 @@ class SharedStore:
         self.n = n
         self.lineage = lineage
         self.pools: dict[int, Pool] = {}
-        self._fields = np.zeros(64, dtype=np.int64)
-        self._slab = np.full(64, -1)
-        self._generation = np.zeros(64, dtype=np.int64)
-        self._size = 0
+        self.columns = Columns()
         self._cold: dict[int, Cold] = {}
         self._members: dict[int, set[int]] = {}
         self._schedule = Schedule()
@@ -63,31 +65,30 @@ class SharedStore:
     @property
     def ids(self) -> np.ndarray:
         """Columns alive, ascending."""
-        return np.flatnonzero(self._fields[: self._size])
+        return self.columns.ids.copy()
+
+    @property
+    def started(self) -> int:
+        """Columns ever added."""
+        return self.columns.started
 
     def __contains__(self, column: object) -> bool:
         """Whether a column is alive."""
-        return isinstance(column, int | np.integer) and bool(
-            0 <= column < self._size and self._fields[column] > 0
-        )
+        return isinstance(column, int | np.integer) and bool(self.columns.held(np.array([column]))[0])
 
     def add(self, records: np.ndarray) -> int:
         """Stores a new column (fields, N) and returns its id; ids are never used again."""
         self._checked(records)
-        column = self._size
-        if column == self._fields.size:
-            self._fields = np.concatenate([self._fields, np.zeros_like(self._fields)])
-            self._slab = np.concatenate([self._slab, np.full_like(self._slab, -1)])
-            self._generation = np.concatenate([self._generation, np.zeros_like(self._generation)])
-        self._size += 1
+        column = self.columns.add()
         self._occupy(column, records)
         return column
 
     def remove(self, columns: np.ndarray) -> None:
         """Drops columns from all particles."""
-        for column in np.unique(columns):
-            self._vacate(int(column))
-            self._fields[column] = 0
+        gone = np.unique(columns)
+        for column in gone.tolist():
+            self._vacate(column)
+        self.columns.remove(gone)
 
     def replace(self, column: int, records: np.ndarray) -> None:
         """Overwrites a column in all particles (fields, N); the record size may change."""
@@ -97,34 +98,36 @@ class SharedStore:
 
     def read(self, column: int, particles: np.ndarray | slice = ALL) -> np.ndarray:
         """Records of all or some particles, (fields, N)."""
-        generation = int(self._generation[column])
+        row = self.columns.row(column)
+        generation = int(self.columns.generation[row])
         rows = self.lineage.rows(generation)[particles]
         cold = self._cold.get(column)
         if cold is not None:
             return cold.data[:, np.searchsorted(cold.kept, rows)]
-        slab = self._pool(column).data[self._slab[column]]
+        slab = self._pool(row).data[self.columns.slab[row]]
         return slab[:, particles].copy() if generation == self.lineage.generation else slab[:, rows]
 
     def is_warm(self, columns: np.ndarray) -> bool:
         """Whether `access` may read columns (K,) as they are."""
-        return bool((self._slab[columns] >= 0).all())
+        return bool((self.columns.slab[self.columns.rows(columns)] >= 0).all())
 
     def access(self, columns: np.ndarray) -> Access:
         """Lets a kernel read columns (K,), at least one, of one record size; cold ones are warmed up first."""
-        slabs = self._slab[columns]
+        at = self.columns.rows(columns)
+        slabs = self.columns.slab[at]
         if slabs.min() < 0:
             for column in columns[slabs < 0].tolist():
                 if column in self._cold:
                     self.replace(column, self.read(column))
-            slabs = self._slab[columns]
-        generations = self._generation[columns].tolist()
+            slabs = self.columns.slab[at]
+        generations = self.columns.generation[at].tolist()
         number = {generation: k for k, generation in enumerate(dict.fromkeys(generations))}
         if len(number) == 1:
             maps, which = self.lineage.rows(generations[0])[None], np.zeros(columns.size, dtype=np.int64)
         else:
             which = np.array([number[generation] for generation in generations])
             maps = np.array([self.lineage.rows(generation) for generation in number])
-        return Access(self._pool(int(columns[0])).data, slabs, which, maps)
+        return Access(self._pool(int(at[0])).data, slabs, which, maps)
 
     def rewrite(self, columns: np.ndarray) -> tuple[Access, np.ndarray]:
         """Lets a kernel overwrite columns (K,) in every particle: what to read, and the slabs to write.
@@ -133,16 +136,17 @@ class SharedStore:
         """
         access = self.access(columns)
         now = self.lineage.generation
-        generations = self._generation[columns]
+        at = self.columns.rows(columns)
+        generations = self.columns.generation[at]
         if (generations == now).all():
             return access, access.slabs
         stale = np.unique(columns[generations != now])
-        pool = self._pool(int(columns[0]))
-        old = self._slab[stale].copy()
-        self._slab[stale] = pool.take(stale.size)
+        rows, pool = self.columns.rows(stale), self._pool(int(at[0]))
+        old = self.columns.slab[rows].copy()
+        self.columns.slab[rows] = pool.take(stale.size)
         pool.give(old)
-        self._move(stale, now)
-        targets = self._slab[columns]
+        self._move(stale, rows, now)
+        targets = self.columns.slab[at]
         if len(set(columns.tolist())) == columns.size:
             return Access(pool.data, access.slabs, access.which, access.maps), targets
         _, first = np.unique(columns, return_index=True)
@@ -177,48 +181,60 @@ class SharedStore:
     @property
     def dense_bytes(self) -> int:
         """Bytes that separate copies for all particles would take."""
-        return int(self._fields[: self._size].sum()) * 8 * self.n
+        return int(self.columns.fields[: self.columns.count].sum()) * 8 * self.n
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Everything that a checkpoint must hold."""
         ids = self.ids
         out = {
-            "store/size": np.array(self._size),
+            "store/size": np.array(self.columns.started),
             "store/ids": ids,
-            "store/fields": self._fields[ids],
-            "store/generation": self._generation[ids],
+            "store/fields": self.columns.fields[: ids.size].copy(),
+            "store/generation": self.columns.generation[: ids.size].copy(),
             "store/due": self._schedule.array(),
         }
-        for column in ids:
-            cold = self._cold.get(int(column))
+        for row, column in enumerate(ids.tolist()):
+            cold = self._cold.get(column)
             if cold is not None:
                 out[f"store/{column}/kept"], out[f"store/{column}/data"] = cold.kept, cold.data
             else:
-                out[f"store/{column}/data"] = self._pool(int(column)).data[self._slab[column]]
+                out[f"store/{column}/data"] = self._pool(row).data[self.columns.slab[row]]
         return out
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """The inverse of `arrays`, into an empty store."""
-        self._size = int(arrays["store/size"])
-        room = max(64, 2 * self._size)
-        self._fields, self._generation = np.zeros(room, dtype=np.int64), np.zeros(room, dtype=np.int64)
-        self._slab = np.full(room, -1)
-        for column, fields, generation in zip(
-            arrays["store/ids"], arrays["store/fields"], arrays["store/generation"], strict=True
-        ):
-            name = f"store/{column}"
-            self._fields[column], self._generation[column] = fields, generation
-            self._members.setdefault(int(generation), set()).add(int(column))
-            if f"{name}/kept" in arrays:
-                self._cold[int(column)] = Cold(arrays[f"{name}/kept"].copy(), arrays[f"{name}/data"].copy())
-            else:
-                self._fill(int(column), arrays[f"{name}/data"])
+        """The inverse of `arrays`, into an empty store.
+
+        Raises:
+            InputError: an array is missing, or is not what it should be.
+        """
+        started = int(checked(arrays, "store/size", (), "i"))
+        self.columns.restore(checked(arrays, "store/ids", (None,), "i"), started)
+        count = self.columns.count
+        self.columns.fields[:count] = within(arrays, "store/fields", count, 1, MOST_FIELDS)
+        now = self.lineage.generation
+        self.columns.generation[:count] = within(arrays, "store/generation", count, 0, now + 1)
+        for row, column in enumerate(self.ids.tolist()):
+            self._members.setdefault(int(self.columns.generation[row]), set()).add(column)
         for generation in self._members:
-            self.lineage.retain(generation)
+            self.lineage.take_up(generation)
+        for row, column in enumerate(self.ids.tolist()):
+            self._restore_column(row, column, arrays)
         self._schedule = Schedule.of(arrays["store/due"])
 
-    def _pool(self, column: int) -> Pool:
-        fields = int(self._fields[column])
+    def _restore_column(self, row: int, column: int, arrays: dict[str, np.ndarray]) -> None:
+        name, fields = f"store/{column}", int(self.columns.fields[row])
+        if f"{name}/kept" not in arrays:
+            self._fill(row, checked(arrays, f"{name}/data", (fields, self.n), "f"))
+            return
+        kept = within(arrays, f"{name}/kept", None, 0, self.n)
+        data = checked(arrays, f"{name}/data", (fields, kept.size), "f").copy()
+        alive = self.lineage.survivors(int(self.columns.generation[row]))
+        if (np.diff(kept) <= 0).any() or np.setdiff1d(alive, kept).size:
+            raise InputError(f"the array {name}/kept does not hold the particles that have descendants")
+        self._cold[column] = Cold(kept, data)
+
+    def _pool(self, row: int) -> Pool:
+        fields = int(self.columns.fields[row])
         if fields not in self.pools:
             self.pools[fields] = Pool(fields, self.n)
         return self.pools[fields]
@@ -228,21 +244,23 @@ class SharedStore:
             raise InputError(f"landmark records must be (fields, {self.n}), got {records.shape}")
 
     def _occupy(self, column: int, records: np.ndarray) -> None:
-        self._fields[column] = records.shape[0]
-        self._fill(column, records)
-        self._generation[column] = self.lineage.generation
+        row = self.columns.row(column)
+        self.columns.fields[row] = records.shape[0]
+        self._fill(row, records)
+        self.columns.generation[row] = self.lineage.generation
         self._join([column], self.lineage.generation)
 
-    def _fill(self, column: int, records: np.ndarray) -> None:
-        pool = self._pool(column)
-        self._slab[column] = pool.take(1)[0]
-        pool.data[self._slab[column]] = records
+    def _fill(self, row: int, records: np.ndarray) -> None:
+        pool = self._pool(row)
+        self.columns.slab[row] = pool.take(1)[0]
+        pool.data[self.columns.slab[row]] = records
 
     def _vacate(self, column: int) -> None:
-        self._leave(int(self._generation[column]), [column])
+        row = self.columns.row(column)
+        self._leave(int(self.columns.generation[row]), [column])
         if self._cold.pop(column, None) is None:
-            self._pool(column).give(self._slab[column : column + 1])
-        self._slab[column] = -1
+            self._pool(row).give(self.columns.slab[row : row + 1])
+        self.columns.slab[row] = -1
 
     def _shrink(self, column: int, alive: np.ndarray) -> None:
         cold = self._cold.get(column)
@@ -250,17 +268,18 @@ class SharedStore:
             if alive.size <= COLD_SHARE * cold.kept.size:
                 self._cold[column] = Cold(alive, cold.data.take(np.searchsorted(cold.kept, alive), axis=1))
         elif alive.size <= HOT_SHARE * self.n:
-            pool = self._pool(column)
-            self._cold[column] = Cold(alive, pool.data[self._slab[column]].take(alive, axis=1))
-            pool.give(self._slab[column : column + 1])
-            self._slab[column] = -1
+            row = self.columns.row(column)
+            pool = self._pool(row)
+            self._cold[column] = Cold(alive, pool.data[self.columns.slab[row]].take(alive, axis=1))
+            pool.give(self.columns.slab[row : row + 1])
+            self.columns.slab[row] = -1
 
-    def _move(self, columns: np.ndarray, now: int) -> None:
+    def _move(self, columns: np.ndarray, rows: np.ndarray, now: int) -> None:
         """To the present generation: all of one past generation together, as a resampling leaves them."""
-        past = self._generation[columns]
+        past = self.columns.generation[rows]
         for generation in np.unique(past).tolist():
             self._leave(generation, columns[past == generation].tolist())
-        self._generation[columns] = now
+        self.columns.generation[rows] = now
         self._join(columns.tolist(), now)
 
     def _join(self, columns: list[int], generation: int) -> None:

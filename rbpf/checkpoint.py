@@ -6,14 +6,16 @@ classes, sizes), the state of the random generator and a SHA-256 digest of all o
 
 import hashlib
 import json
-import os
-import zipfile
-import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rbpf.archive import checked
+from rbpf.archive import load_arrays as load_arrays
+from rbpf.archive import save_arrays as save_arrays
 from rbpf.errors import InputError
 from rbpf.genealogy import Lineage
 from rbpf.history import History
@@ -75,7 +77,8 @@ def read_checkpoint(filter_: "Filter", path: Path) -> dict[str, np.ndarray]:
                 f"{path} belongs to a filter with {name} = {value}, this one has {found.get(name)}: "
                 "build the filter with the options of the saved run, and register its landmarks"
             )
-    _restore(filter_, arrays, rng)
+    with _unchanged_by_failure(filter_), fitting(path):
+        _restore(filter_, arrays, rng)
     return {name.removeprefix("extra/"): array for name, array in arrays.items() if name.startswith("extra/")}
 
 
@@ -95,52 +98,42 @@ def fingerprint(filter_: "Filter") -> dict[str, Any]:
     }
 
 
-def save_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Writes an `.npz` under a temporary name, then renames it.
+@contextmanager
+def fitting(path: Path) -> Iterator[None]:
+    """Around the reading of a checkpoint's arrays: those that do not fit together make one clear sentence.
 
     Raises:
-        InputError: the place cannot be written to, or an array holds Python objects.
-    """
-    temporary = path.with_name(path.name + ".partial")
-    try:
-        with open(temporary, "wb") as file:
-            np.savez(file, allow_pickle=False, **arrays)
-        os.replace(temporary, path)
-    except (OSError, ValueError) as error:
-        temporary.unlink(missing_ok=True)
-        raise InputError(f"{path} cannot be written: {error}") from error
-
-
-def load_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Reads every array of an `.npz`.
-
-    Raises:
-        InputError: the file is missing, cut off or not an archive of plain arrays.
+        InputError: an array is missing, or is not what it should be.
     """
     try:
-        with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
-    except FileNotFoundError as error:
-        raise InputError(f"{path} does not exist") from error
-    except (
-        OSError,
-        ValueError,
-        EOFError,
-        KeyError,
-        zipfile.BadZipFile,
-        zlib.error,
-        NotImplementedError,
-        AttributeError,
-        TypeError,
-        RuntimeError,
-        MemoryError,
-        SyntaxError,
-        OverflowError,
-    ) as error:
-        raise InputError(f"{path} is damaged or cut off: it is not a complete archive of arrays") from error
+        yield
+    except InputError as error:
+        raise InputError(f"{path} cannot be used: {error}") from error
+    except (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, AssertionError) as error:
+        reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        raise InputError(
+            f"{path} is damaged: its arrays do not fit together ({reason}); use an earlier checkpoint"
+        ) from error
+
+
+@contextmanager
+def _unchanged_by_failure(filter_: "Filter") -> Iterator[None]:
+    """Puts a filter back as it was if it cannot be restored; what is restored takes new objects, never the old ones."""
+    held = [(item, dict(vars(item))) for item in (filter_, *filter_.marginals.parts.values())]
+    rng = filter_.rng.bit_generator.state
+    try:
+        yield
+    except InputError:
+        for item, attributes in held:
+            vars(item).clear()
+            vars(item).update(attributes)
+        filter_.rng.bit_generator.state = rng
+        raise
 
 
 def _restore(filter_: "Filter", arrays: dict[str, np.ndarray], rng_state: dict[str, Any]) -> None:
+    state = checked(arrays, "particles/state", filter_.particles.state.shape, "f")
+    log_weights = checked(arrays, "particles/log_weights", (filter_.n,), "f")
     lineage = Lineage(filter_.n)
     lineage.restore(arrays)
     history = History(lineage, filter_.history.lag, filter_.history.clouds)
@@ -148,10 +141,12 @@ def _restore(filter_: "Filter", arrays: dict[str, np.ndarray], rng_state: dict[s
     filter_.lineage, filter_.history = lineage, history
     filter_.marginals.begin(filter_.n, lineage)
     filter_.marginals.restore(arrays)
-    filter_.particles = Particles(arrays["particles/state"].copy(), arrays["particles/log_weights"].copy())
-    steps, stamp = (int(value) for value in arrays["filter/numbers"])
-    filter_.steps, filter_.stamp_ns = steps, stamp if arrays["filter/started"] else None
-    filter_.log_evidence = float(arrays["filter/log_evidence"])
+    filter_.particles = Particles(state.copy(), log_weights.copy())
+    steps, stamp = checked(arrays, "filter/numbers", (2,), "i").tolist()
+    if steps < 0:
+        raise InputError(f"the array filter/numbers counts {steps} steps")
+    filter_.steps, filter_.stamp_ns = steps, stamp if checked(arrays, "filter/started", (), "b") else None
+    filter_.log_evidence = float(checked(arrays, "filter/log_evidence", (), "f"))
     filter_.rng.bit_generator.state = rng_state
 
 

@@ -10,10 +10,16 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from rbpf.archive import checked, within
+from rbpf.errors import InputError
 from rbpf.kernels import forest
 
 _FIRST_CHECK = 4
 """Age in generations at which a block is first looked through for dead rows; it then grows by a quarter each time."""
+
+
+MOST_GENERATIONS = 1 << 40
+"""No run resamples so often."""
 
 
 class Lineage:
@@ -30,6 +36,7 @@ class Lineage:
         self.generation = 0
         self._retained: Counter[int] = Counter()
         self._mark = 0
+        self._oldest = 0
         self._allocate(4 * n)
         self._leaves = np.arange(n)
         self._generation[:n] = 0
@@ -100,6 +107,16 @@ class Lineage:
         """Keeps the nodes of a generation."""
         self._retained[generation] += 1
 
+    def take_up(self, generation: int) -> None:
+        """`retain`, for a generation that a checkpoint says was kept.
+
+        Raises:
+            InputError: the ancestry does not reach back to it, or it has not come yet.
+        """
+        if not self._oldest <= generation <= self.generation:
+            raise InputError(f"the ancestry does not hold generation {generation}")
+        self.retain(generation)
+
     def release(self, generation: int) -> None:
         """Ends one `retain`."""
         self._retained[generation] -= 1
@@ -118,14 +135,48 @@ class Lineage:
         return arrays
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """The inverse of `arrays`; what is stored per generation must `retain` again."""
-        self._allocate(arrays["lineage/parent"].size)
-        for name in ("parent", "children", "generation", "row", "leaves", "free"):
-            setattr(self, f"_{name}", arrays[f"lineage/{name}"].copy())
-        self.generation, self._n_free = (int(v) for v in arrays["lineage/now"])
+        """The inverse of `arrays`; what is stored per generation must be taken up again.
+
+        Raises:
+            InputError: an array is missing, or they are no forest. Compiled code would follow them anywhere.
+        """
+        size = checked(arrays, "lineage/parent", (None,), "i").size
+        now, n_free = within(arrays, "lineage/now", 2, 0, MOST_GENERATIONS).tolist()
+        within(arrays, "lineage/free", None, 0, max(size, 1))
+        self._allocate(size)
+        self._parent = within(arrays, "lineage/parent", size, -1, size)
+        self._children = within(arrays, "lineage/children", size, 0, 2 * size + 2)
+        self._generation = within(arrays, "lineage/generation", size, -1, now + 1)
+        self._row = within(arrays, "lineage/row", size, 0, self.n)
+        self._leaves = within(arrays, "lineage/leaves", self.n, 0, size)
+        self._free = arrays["lineage/free"].astype(np.int64)
+        self.generation, self._n_free = now, n_free
+        self._require_forest()
         self._retained.clear()
         self._cache.clear()
         self._survivors.clear()
+
+    def _require_forest(self) -> None:
+        """Refuses what is no forest: parents are older than their children, and what is free is nobody's ancestor."""
+        alive, children = np.zeros(self._parent.size, dtype=bool), np.zeros(self._parent.size, dtype=np.int64)
+        nodes = np.unique(self._leaves)
+        sound = nodes.size == self.n and self._n_free <= self._parent.size <= self._free.size
+        children[nodes] = 1
+        self._oldest = 0
+        while sound and nodes.size:
+            alive[nodes] = True
+            parents = self._parent[nodes]
+            if (parents < 0).any():
+                self._oldest = max(self._oldest, int(self._generation[nodes[parents < 0]].max()))
+            older = parents >= 0
+            sound = bool((self._generation[parents[older]] < self._generation[nodes[older]]).all())
+            sound = sound and bool((self._generation[nodes] >= 0).all())
+            np.add.at(children, parents[older], 1)
+            nodes = np.unique(parents[older & ~alive[parents]])
+        free = self._free[: self._n_free]
+        sound = sound and np.unique(free).size == self._parent.size - int(alive.sum()) == free.size
+        if not (sound and not alive[free].any() and np.array_equal(children[alive], self._children[alive])):
+            raise InputError("the particles' ancestry is no forest")
 
     def _allocate(self, size: int) -> None:
         self._parent = np.full(size, -1)

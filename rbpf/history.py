@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rbpf.archive import checked, within
+from rbpf.errors import InputError
 from rbpf.genealogy import Lineage, Schedule
 
 
@@ -88,25 +90,33 @@ class History:
         return out
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """The inverse of `arrays`."""
+        """The inverse of `arrays`.
+
+        Raises:
+            InputError: an array is missing, or is not what it should be.
+        """
         self.blocks, self._by_generation = [], {}
-        self._schedule = Schedule.of(arrays["history/due"])
-        for number, generation in enumerate(arrays["history/generations"]):
-            part = {
-                name: arrays[f"history/{number}/{name}"]
-                for name in ("kept", "stamps_ns", "states", "log_weights")
-            }
-            block = PathBlock(
-                int(generation),
-                part["kept"].copy(),
-                [int(stamp) for stamp in part["stamps_ns"]],
-                list(part["states"].copy()),
-                list(part["log_weights"].copy()),
-            )
+        self._schedule = Schedule.of(checked(arrays, "history/due", (None, 2), "i"))
+        generations = checked(arrays, "history/generations", (None,), "i").tolist()
+        for number, generation in enumerate(generations):
+            self.lineage.take_up(generation)
+            block = self._block(number, generation, arrays)
             self.blocks.append(block)
-            self._by_generation[block.generation] = block
-            self.lineage.retain(block.generation)
+            self._by_generation[generation] = block
+        if (np.diff(generations) <= 0).any():
+            raise InputError("the generations of the history do not ascend")
         self._steps = self.stamps_ns.size
+
+    def _block(self, number: int, generation: int, arrays: dict[str, np.ndarray]) -> PathBlock:
+        name, n = f"history/{number}", self.lineage.n
+        kept = within(arrays, f"{name}/kept", None, 0, n)
+        stamps = checked(arrays, f"{name}/stamps_ns", (None,), "i").tolist()
+        states = checked(arrays, f"{name}/states", (len(stamps), kept.size, None), "f")
+        weights = checked(arrays, f"{name}/log_weights", (len(stamps), n) if self.clouds else (0,), "f")
+        alive = self.lineage.survivors(generation)
+        if not stamps or (np.diff(kept) <= 0).any() or np.setdiff1d(alive, kept).size:
+            raise InputError(f"the array {name}/kept does not hold the particles that have descendants")
+        return PathBlock(generation, kept, stamps, list(states.copy()), list(weights.copy()))
 
     def _append(self, block: PathBlock) -> None:
         self.blocks.append(block)

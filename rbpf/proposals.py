@@ -2,9 +2,9 @@
 
 All densities live in one chart per particle, at the transition's mean, and there in whitened coordinates u:
 ε = μ + L u, so that the prior is N(0, I) even where Q = L Lᵀ is singular. With the information Λ = Σ HᵀS⁻¹H and
-η = Σ HᵀS⁻¹ν about ε − μ, the refined law of u is N(M⁻¹Lᵀη, M⁻¹) with M = I + LᵀΛL, and the joint marginal of the
-observations is log w₁ = −½[Σ νᵀS⁻¹ν − (Lᵀη)ᵀM⁻¹(Lᵀη)] − ½[Σ log|2πS| + log|M|]: E06 (10) for all observations
-together, with their correlation through the pose.
+η = Σ HᵀS⁻¹ν about ε − μ, the refined law of u is N(M⁻¹Lᵀη, M⁻¹), M = I + LᵀΛL, Mathematics (refined), and the
+joint marginal of the observations is log w₁ = −½[Σ νᵀS⁻¹ν − (Lᵀη)ᵀM⁻¹(Lᵀη)] − ½[Σ log|2πS| + log|M|],
+Mathematics (look-ahead): E06 (10) for all observations together, with their correlation through the pose.
 """
 
 from dataclasses import dataclass, replace

@@ -6,6 +6,7 @@ from typing import Any, final
 import numpy as np
 
 from rbpf import gaussian
+from rbpf.archive import checked
 from rbpf.conditional import GAUSSIAN
 from rbpf.errors import InputError
 from rbpf.genealogy import Lineage
@@ -51,7 +52,7 @@ class KalmanSubstate(Conditional):
         self.cov = self._cov[None]
 
     def predict(self, transition: Transition, space: LieGroup) -> Prior:
-        """Joint law of (ε, s_t): ε = B s + w₁, s_t = A s + b + w₂, kept as s_t | ε."""
+        """Joint law of (ε, s_t), Mathematics (joint-substate), kept as s_t | ε."""
         if transition.coupling is None or transition.dynamics is None or transition.drift is None:
             raise InputError(
                 "the motion model must give coupling, dynamics and drift: the filter has a Kalman substate"
@@ -141,7 +142,12 @@ class KalmanSubstate(Conditional):
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """The inverse of `arrays`."""
-        self.mean, self.cov = arrays["substate/mean"].copy(), arrays["substate/cov"].copy()
+        m = self._mean.size
+        mean = checked(arrays, "substate/mean", self.mean.shape, "f")
+        cov = checked(arrays, "substate/cov", (None, m, m), "f")
+        if cov.shape[0] not in (1, mean.shape[0]):
+            raise InputError(f"the array substate/cov must have 1 or {mean.shape[0]} matrices")
+        self.mean, self.cov = mean.copy(), cov.copy()
 
     def _rows(
         self, state: np.ndarray, substate: np.ndarray, groups: Sequence[Observations]

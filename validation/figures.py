@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from rbpf.validation.writing import whole
+
 SIGMAS = 3.0
 COLOURS = {
     "filter": "tab:blue",
@@ -20,8 +22,8 @@ COLOURS = {
 def save_figures(figures: Mapping[str, Any], out: Path) -> list[str]:
     """Saves figures by file name, each whole or not at all; returns the names."""
     for name, figure in figures.items():
-        figure.savefig(out / f"{name}.partial", format="png", dpi=110, bbox_inches="tight")
-        (out / f"{name}.partial").replace(out / name)
+        with whole(out / name) as temporary:
+            figure.savefig(temporary, format="png", dpi=110, bbox_inches="tight")
     return list(figures)
 
 

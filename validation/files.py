@@ -1,7 +1,6 @@
 """What every system's run folder is written with: whole files or none, tables, maps, figures."""
 
 import csv
-import os
 import resource
 import sys
 from collections.abc import Iterable, Mapping, Sequence
@@ -15,6 +14,7 @@ from rbpf import gaussian
 from rbpf.checkpoint import save_arrays
 from rbpf.errors import InputError
 from rbpf.validation.map_summary import MapSummary
+from rbpf.validation.writing import whole
 
 
 def prepare_folder(out: Path) -> None:
@@ -32,10 +32,9 @@ def prepare_folder(out: Path) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Writes a whole file or none."""
-    temporary = path.with_name(path.name + ".partial")
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, path)
+    """Writes a whole file or none; raises InputError where the place cannot be written to, or the disk is full."""
+    with whole(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
 
 
 def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:

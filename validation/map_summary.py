@@ -1,12 +1,16 @@
 """The map of a finished filter as one Gaussian per landmark, within + between particles."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rbpf import gaussian
 from rbpf.anchoring import Anchored
+from rbpf.archive import checked
+from rbpf.checkpoint import fitting
+from rbpf.errors import InputError
 from rbpf.filter import Filter
 from rbpf.models import Records
 from rbpf.sensors.range_bearing import RelativePosition
@@ -29,6 +33,28 @@ class MapSummary:
     def named(self) -> dict[int, np.ndarray]:
         """Positions by name."""
         return dict(zip(self.ids.tolist(), self.mean, strict=True))
+
+
+def map_of(path: Path, arrays: dict[str, np.ndarray]) -> MapSummary:
+    """The landmarks of a map.npz that are points; those whose depth is not known are left out.
+
+    Args:
+        path: of the file, for messages.
+        arrays: what it holds.
+
+    Raises:
+        InputError: an array is missing, or is not what it should be.
+    """
+    with fitting(path):
+        ids = checked(arrays, "id", (None,), "iu")
+        mean = checked(arrays, "mean", (ids.size, None), "f")
+        if mean.shape[1] not in (2, 3):
+            raise InputError(f"the array mean must have points in the plane or in space, got {mean.shape}")
+        cov = checked(arrays, "cov", (ids.size, mean.shape[1], mean.shape[1]), "f")
+        known = np.ones(ids.size, dtype=bool)
+        if "ray" in arrays:
+            known = checked(arrays, "ray", (ids.size,), "iub") == 0
+    return MapSummary(ids[known], mean[known], cov[known])
 
 
 def summarise_map(filter_: Filter, anchored: Anchored | None = None) -> MapSummary:

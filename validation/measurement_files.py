@@ -29,8 +29,8 @@ one line per step from 1 on: previous_robot_from_robot, and the lower triangle o
 chart there, in the order [omega, v].
 """
 
-import os
 from collections.abc import Iterable
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +40,7 @@ from rbpf.lie import SE2, SE3, Array, SE2Group, SE3Group
 from rbpf.sensors.readers.text import quoted
 from rbpf.validation.measurement_table import HeadedTable
 from rbpf.validation.measurements import KINDS, Measurements, are_covariances, are_poses, point_dim
+from rbpf.validation.writing import whole
 
 OBSERVATIONS = "observations.csv"
 ODOMETRY = "observations_odometry.csv"
@@ -58,18 +59,12 @@ def write_measurements(folder: Path, m: Measurements) -> None:
         m: what to write.
 
     Raises:
-        OSError: the folder is missing or cannot be written.
+        InputError: the folder is missing or cannot be written to, or the disk is full.
     """
     texts = {OBSERVATIONS: _observations_text(m), ODOMETRY: _odometry_text(m)}
-    partial = {name: folder / f"{name}.{os.getpid()}.part" for name in texts}
-    try:
+    with ExitStack() as both:
         for name, text in texts.items():
-            partial[name].write_text(text, encoding="utf-8")
-        for name in texts:
-            os.replace(partial[name], folder / name)
-    finally:
-        for path in partial.values():
-            path.unlink(missing_ok=True)
+            both.enter_context(whole(folder / name)).write_text(text, encoding="utf-8")
 
 
 def read_measurements(folder: Path) -> Measurements:

@@ -17,7 +17,8 @@ PATHS, MEAN = "posterior.npz", "posterior.tum"
 def posterior_paths(run: VideoRun) -> np.ndarray:
     """(T, N, 7) world_from_camera of each particle of the last frame along its ancestors, in the reported world.
 
-    Where there are known points, each particle's path is told from its own mean of their world's place.
+    With `MonoConfig.lag` those of the last frames. Where there are known points, each particle's path is told from
+    its own mean of their world's place.
     """
     paths, world = run.filter.history.paths()[..., :7], world_of(run.filter)
     return paths if world is None else SE3.between(world.mean, paths)
@@ -26,8 +27,9 @@ def posterior_paths(run: VideoRun) -> np.ndarray:
 def write_posterior(run: VideoRun, out: Path) -> None:
     """posterior.npz with all paths and the particles' log-weights, posterior.tum with their weighted mean."""
     paths, log_weights = posterior_paths(run), run.filter.particles.log_weights
-    arrays = {"stamps_ns": run.stamps_ns, "world_from_camera": paths, "log_weights": log_weights}
+    stamps_ns = run.filter.history.stamps_ns
+    arrays = {"stamps_ns": stamps_ns, "world_from_camera": paths, "log_weights": log_weights}
     save_arrays(out / PATHS, arrays)
     weights = np.exp(log_weights)
     mean = np.array([SE3.mean(poses, weights) for poses in paths])
-    write_tum(out / MEAN, Trajectory(run.stamps_ns, mean))
+    write_tum(out / MEAN, Trajectory(stamps_ns, mean))

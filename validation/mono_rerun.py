@@ -18,6 +18,7 @@ from rbpf.lie import SE3
 from rbpf.systems.mono.sightings import Sighting
 from rbpf.systems.mono.video import VideoRun
 from rbpf.validation.figures import SIGMAS, outline
+from rbpf.validation.map_summary import MapSummary
 from rbpf.validation.mono_frames import FOUND, MISSED, RAY, STARTED
 from rbpf.validation.mono_map import MonoMap
 
@@ -81,6 +82,20 @@ def write_rerun(run: VideoRun, mapped: MonoMap, path: Path) -> None:
         partial.unlink(missing_ok=True)
 
 
+def ellipsoids(rr: Any, landmarks: MapSummary) -> Any:
+    """A map's 3σ ellipsoids, with the landmarks' names."""
+    values, vectors = np.linalg.eigh(landmarks.cov)
+    turned = vectors * np.where(np.linalg.det(vectors) < 0.0, -1.0, 1.0)[:, None, None]
+    poses = np.concatenate([turned, landmarks.mean[..., None]], axis=-1)
+    return rr.Ellipsoids3D(
+        centers=landmarks.mean,
+        half_sizes=SIGMAS * np.sqrt(np.maximum(values, 0.0)),
+        quaternions=SE3.from_matrix(poses)[:, :4],
+        labels=[str(name) for name in landmarks.ids],
+        show_labels=False,
+    )
+
+
 def _log_static(rr: Any, stream: Any, run: VideoRun, mapped: MonoMap) -> None:
     """What does not change: the camera's lens, the known points and the final map."""
     camera, full = run.sequence.camera, ~mapped.is_ray
@@ -93,17 +108,8 @@ def _log_static(rr: Any, stream: Any, run: VideoRun, mapped: MonoMap) -> None:
     )
     stream.log("world/camera", lens, static=True)
     stream.log("world/path", rr.LineStrips3D([SE3.translation(run.world_from_camera)]), static=True)
-    values, vectors = np.linalg.eigh(mapped.landmarks.cov[full])
-    turned = vectors * np.where(np.linalg.det(vectors) < 0.0, -1.0, 1.0)[:, None, None]
-    poses = np.concatenate([turned, mapped.landmarks.mean[full][..., None]], axis=-1)
-    ellipsoids = rr.Ellipsoids3D(
-        centers=mapped.landmarks.mean[full],
-        half_sizes=SIGMAS * np.sqrt(np.maximum(values, 0.0)),
-        quaternions=SE3.from_matrix(poses)[:, :4],
-        labels=[str(name) for name in mapped.landmarks.ids[full]],
-        show_labels=False,
-    )
-    stream.log("world/map/points", ellipsoids, static=True)
+    points = MapSummary(mapped.landmarks.ids[full], mapped.landmarks.mean[full], mapped.landmarks.cov[full])
+    stream.log("world/map/points", ellipsoids(rr, points), static=True)
     stream.log("world/map/rays", rr.LineStrips3D(mapped.ends[mapped.is_ray], colors=[RAY]), static=True)
     if run.known is not None:
         stream.log(

@@ -1,6 +1,5 @@
 """The annotated video of a run: images are decoded again, drawn and encoded one after the other."""
 
-import os
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
@@ -9,12 +8,15 @@ import numpy as np
 
 from rbpf.systems.mono.video import VideoRun
 from rbpf.validation.mono_frames import Caption, draw_frame, drawn_size
+from rbpf.validation.writing import whole
 
 SHORTEST_S, LONGEST_S = 1.0 / 120.0, 1.0
 """Bounds of the time per image, for sequences whose stamps say little: photos, equal stamps."""
 
 QUALITY = "23"
 """Constant rate factor of H.264: 18 is nearly without loss, 28 poor."""
+
+ENCODING = "-preset", "veryfast", "-fflags", "+bitexact", "-flags:v", "+bitexact"
 
 
 def write_annotated(run: VideoRun, path: Path, on_frame: Callable[[int, int], None] | None = None) -> None:
@@ -24,41 +26,31 @@ def write_annotated(run: VideoRun, path: Path, on_frame: Callable[[int, int], No
         run: what was filtered.
         path: the file.
         on_frame: called with the frames written and their number.
+
+    Raises:
+        InputError: the place cannot be written to, or the disk is full.
     """
     import imageio_ffmpeg
 
     camera = run.sequence.camera
-    partial = path.with_name(path.name + ".partial.mp4")
-    encoder = imageio_ffmpeg.write_frames(
-        str(partial),
-        drawn_size(camera.width, camera.height),
-        fps=frame_rate(run.stamps_ns),
-        codec="libx264",
-        quality=None,
-        macro_block_size=2,
-        pix_fmt_out="yuv420p",
-        output_params=[
-            "-crf",
-            QUALITY,
-            "-preset",
-            "veryfast",
-            "-fflags",
-            "+bitexact",
-            "-flags:v",
-            "+bitexact",
-        ],
-        ffmpeg_log_level="error",
-    )
-    try:
+    with whole(path) as partial:
+        encoder = imageio_ffmpeg.write_frames(
+            str(partial),
+            drawn_size(camera.width, camera.height),
+            fps=frame_rate(run.stamps_ns),
+            codec="libx264",
+            quality=None,
+            macro_block_size=2,
+            pix_fmt_out="yuv420p",
+            output_params=["-crf", QUALITY, *ENCODING],
+            ffmpeg_log_level="error",
+        )
         with closing(encoder):
             encoder.send(None)
             for t, picture in enumerate(annotated_frames(run)):
                 encoder.send(np.ascontiguousarray(picture))
                 if on_frame is not None:
                     on_frame(t + 1, run.stamps_ns.size)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def annotated_frames(run: VideoRun) -> Iterator[np.ndarray]:

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any, final
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from rbpf import __version__
@@ -14,10 +13,12 @@ from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3, Array, SE2Group, SE3Group
 from rbpf.systems.mono.run import MonoRun
 from rbpf.systems.mono.video import VideoRun
+from rbpf.systems.plain_yaml import read_plain_yaml
 from rbpf.systems.range_bearing.run import Run
 from rbpf.validation.camera_map import summarise_points
-from rbpf.validation.map_summary import MapSummary, summarise_map
+from rbpf.validation.map_summary import MapSummary, map_of, summarise_map
 from rbpf.validation.mono_map import summarise_mono_map
+from rbpf.validation.run_files import path_of
 from rbpf.validation.trajectory import Trajectory
 from rbpf.validation.trajectory_files import read_tum
 
@@ -80,14 +81,9 @@ def read_config(folder: Path) -> dict[str, Any]:
         InputError: it is no run folder, or one of another version.
     """
     path = folder / "config.yaml"
-    try:
-        config = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise InputError(
-            f"{folder} holds no config.yaml: expected the folder that `rbpf run` leaves."
-        ) from error
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise InputError(f"{path} cannot be read: {' '.join(str(error).split())}") from error
+    if not path.exists():
+        raise InputError(f"{folder} holds no config.yaml: expected the folder that `rbpf run` leaves.")
+    config = read_plain_yaml(path)
     if not isinstance(config, dict) or "rbpf" not in config or "system" not in config:
         raise InputError(
             f"{path}: expected the settings of a run with its version and system, found other content."
@@ -112,7 +108,7 @@ def read_path_and_map(folder: Path) -> PathAndMap:
 def _read_path(folder: Path) -> tuple[NDArray[np.int64], Array, Array]:
     if (folder / "trajectory.npz").exists():
         arrays = _arrays(folder / "trajectory.npz", ("stamps_ns", "mean", "cov"))
-        return arrays["stamps_ns"], arrays["mean"], arrays["cov"]
+        return path_of(folder / "trajectory.npz", arrays)
     path = read_tum(folder / "trajectory.tum")
     poses = path.world_from_body
     if _read_map(folder).mean.shape[1] == 2:
@@ -123,9 +119,7 @@ def _read_path(folder: Path) -> tuple[NDArray[np.int64], Array, Array]:
 
 
 def _read_map(folder: Path) -> MapSummary:
-    arrays = _arrays(folder / "map.npz", ("id", "mean", "cov"))
-    full = arrays["ray"] == 0 if "ray" in arrays else np.ones(len(arrays["id"]), dtype=bool)
-    return MapSummary(arrays["id"][full], arrays["mean"][full], arrays["cov"][full])
+    return map_of(folder / "map.npz", _arrays(folder / "map.npz", ("id", "mean", "cov")))
 
 
 def _arrays(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:

@@ -1,6 +1,5 @@
 """Maps and paths as PLY files (G. Turk, 1994), binary little-endian: for MeshLab, CloudCompare, Blender."""
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +7,7 @@ from numpy.typing import NDArray
 
 from rbpf.errors import InputError
 from rbpf.lie import Array
+from rbpf.validation.writing import whole
 
 _VERTEX = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
 _SIGMA = [("sigma_m", "<f4")]
@@ -46,9 +46,8 @@ def write_ply(
     lines = np.empty(0 if edges is None else len(edges), dtype=_EDGE)
     if edges is not None:
         lines["vertex1"], lines["vertex2"] = edges.T
-    partial = path.with_name(path.name + ".partial")
-    partial.write_bytes(_header(vertices, lines) + vertices.tobytes() + lines.tobytes())
-    os.replace(partial, path)
+    with whole(path) as partial:
+        partial.write_bytes(_header(vertices, lines) + vertices.tobytes() + lines.tobytes())
 
 
 def read_ply(path: Path) -> dict[str, np.ndarray]:
@@ -64,9 +63,19 @@ def read_ply(path: Path) -> dict[str, np.ndarray]:
     lines = head.decode("ascii", "replace").splitlines()
     if lines[:2] != ["ply", "format binary_little_endian 1.0"]:
         raise InputError(f"{path}: expected a binary little-endian PLY file.")
+    try:
+        return _elements(lines[2:], body)
+    except (LookupError, ValueError, TypeError, OverflowError) as error:
+        raise InputError(
+            f"{path}: expected the elements of a PLY file as its header says, found others."
+        ) from error
+
+
+def _elements(lines: list[str], body: bytes) -> dict[str, np.ndarray]:
+    """Of the lines of a header and of what follows it; nothing is allocated that the file does not hold."""
     codes = {name: code for code, name in _NAMES.items()}
     kinds: dict[str, tuple[int, list[tuple[str, str]]]] = {}
-    for line in lines[2:]:
+    for line in lines:
         word, *rest = line.split()
         if word == "element":
             kinds[rest[0]] = (int(rest[1]), [])
@@ -74,6 +83,8 @@ def read_ply(path: Path) -> dict[str, np.ndarray]:
             list(kinds.values())[-1][1].append((rest[1], codes[rest[0]]))
     found, start = {}, 0
     for name, (count, fields) in kinds.items():
+        if count < 0:
+            raise ValueError("a negative number of elements")
         found[name] = np.frombuffer(body, dtype=fields, count=count, offset=start)
         start += found[name].nbytes
     return found

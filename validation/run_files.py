@@ -13,7 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from rbpf.checkpoint import load_arrays, save_arrays
+from rbpf.archive import checked, load_arrays, save_arrays
+from rbpf.checkpoint import fitting
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3, SE2Group, SE3Group
 from rbpf.validation.alignment import Alignment
@@ -125,15 +126,39 @@ def read_path(folder: Path) -> FilteredPath:
     if not (folder / TRAJECTORY).is_file():
         raise InputError(f"{folder} has no {TRAJECTORY}: it was left by another version of rbpf; {again}")
     arrays = load_arrays(folder / TRAJECTORY)
-    if int(arrays.get("version", np.array(0))) != VERSION:
-        found = int(arrays.get("version", np.array(0)))
+    version = arrays.get("version", np.array(0))
+    if version.shape or version.dtype.kind != "i" or int(version) != VERSION:
         raise InputError(
-            f"{folder / TRAJECTORY} has version {found}, this program reads version {VERSION}; {again}"
+            f"{folder / TRAJECTORY} has version {version}, this program reads version {VERSION}; {again}"
         )
-    names = ("stamps_ns", "mean", "cov", "correction", "cov_correction")
-    if any(name not in arrays for name in names) or not _fits(*(arrays[name] for name in names)):
-        raise InputError(f"{folder / TRAJECTORY} does not hold the poses of a run; {again}")
-    return FilteredPath(*(arrays[name] for name in names))
+    try:
+        stamps, mean, cov = path_of(folder / TRAJECTORY, arrays)
+        correction = checked(arrays, "correction", (stamps.size, None), "f")
+        cov_correction = checked(arrays, "cov_correction", (stamps.size, *2 * correction.shape[1:]), "f")
+    except InputError as error:
+        raise InputError(
+            f"{folder / TRAJECTORY} does not hold the poses of a run ({error}); {again}"
+        ) from error
+    return FilteredPath(stamps, mean, cov, correction, cov_correction)
+
+
+def path_of(path: Path, arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Stamps (T,), poses (T, E) and covariances (T, d, d) of a trajectory.npz.
+
+    Args:
+        path: of the file, for messages.
+        arrays: what it holds.
+
+    Raises:
+        InputError: an array is missing, or is not what it should be.
+    """
+    with fitting(path):
+        stamps = checked(arrays, "stamps_ns", (None,), "i")
+        mean = checked(arrays, "mean", (stamps.size, None), "f")
+        dim = {SE2.size: SE2.dim, SE3.size: SE3.dim}.get(mean.shape[1])
+        if dim is None:
+            raise InputError(f"the array mean must have poses in the plane or in space, got {mean.shape}")
+        return stamps, mean, checked(arrays, "cov", (stamps.size, dim, dim), "f")
 
 
 def read_truth(folder: Path, path: FilteredPath) -> RunTruth:
@@ -147,32 +172,15 @@ def read_truth(folder: Path, path: FilteredPath) -> RunTruth:
             f"{folder} has no ground truth: its recording has none; compare it with its batch optimum instead"
         )
     arrays = load_arrays(folder / TRUTH)
-    try:
-        rows, poses = arrays["rows"], arrays["poses"]
-        alignment = _ALIGNMENTS[str(arrays["alignment"])]
-        landmarks = dict(zip(arrays["ids"].tolist(), arrays["landmarks"], strict=True))
-        fits = poses.shape == (rows.size, path.mean.shape[1]) and rows.dtype.kind == "i"
-    except (KeyError, ValueError) as error:
-        raise InputError(f"{folder / TRUTH} is not the ground truth of a run: {error}") from error
+    with fitting(folder / TRUTH):
+        rows = checked(arrays, "rows", (None,), "i")
+        poses = checked(arrays, "poses", (rows.size, None), "f")
+        alignment = _ALIGNMENTS[str(checked(arrays, "alignment", (), "U"))]
+        ids = checked(arrays, "ids", (None,), "i")
+        landmarks = dict(zip(ids.tolist(), checked(arrays, "landmarks", (ids.size, None), "f"), strict=True))
+    fits = poses.shape[1] == path.mean.shape[1]
     if not fits or (rows.size and not 0 <= rows.min() <= rows.max() < len(path.mean)):
         raise InputError(f"{folder / TRUTH} belongs to another run than {folder / TRAJECTORY}")
     if not rows.size:
         raise InputError(f"{folder}: no step of the run has the time of a true pose")
     return RunTruth(rows, poses, landmarks, alignment)
-
-
-def _fits(
-    stamps: np.ndarray, mean: np.ndarray, cov: np.ndarray, correction: np.ndarray, cov_correction: np.ndarray
-) -> bool:
-    steps, dim = (
-        len(stamps),
-        {SE2.size: SE2.dim, SE3.size: SE3.dim}.get(mean.shape[-1] if mean.ndim == 2 else 0),
-    )
-    rank = correction.shape[-1]
-    return (
-        dim is not None
-        and mean.shape[0] == steps
-        and cov.shape == (steps, dim, dim)
-        and correction.shape == (steps, rank)
-        and cov_correction.shape == (steps, rank, rank)
-    )

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from rbpf.checkpoint import load_arrays
 from rbpf.errors import InputError
-from rbpf.validation.map_summary import MapSummary
+from rbpf.systems.plain_yaml import read_plain_yaml
+from rbpf.validation.map_summary import MapSummary, map_of
 from rbpf.validation.run_files import FilteredPath, RunTruth, read_path, read_truth
 
 MOST_BYTES = 1 << 30
@@ -60,10 +60,7 @@ class RunRecord:
             InputError: map.npz is missing or damaged.
         """
         arrays = load_arrays(self.folder / "map.npz")
-        if not {"id", "mean", "cov"} <= arrays.keys():
-            raise InputError(f"{self.folder / 'map.npz'} does not hold a map")
-        known = arrays["ray"] == 0 if "ray" in arrays else np.ones(len(arrays["id"]), dtype=bool)
-        return MapSummary(arrays["id"][known], arrays["mean"][known], arrays["cov"][known])
+        return map_of(self.folder / "map.npz", arrays)
 
     def table(self, name: str) -> dict[str, np.ndarray]:
         """A table of numbers by its columns' names: diagnostics.csv, timings.csv.
@@ -94,18 +91,20 @@ def open_run(folder: Path) -> RunRecord:
     for name in ("config.yaml", "summary.json"):
         if not (folder / name).is_file():
             raise InputError(f"{folder} has no {name}: expected the folder that a finished `rbpf run` left")
-    with _opened(folder / "config.yaml") as file:
-        config = _mapping(folder / "config.yaml", yaml.safe_load, file.read())
+    config = _mapping(folder / "config.yaml", read_plain_yaml(folder / "config.yaml"))
     with _opened(folder / "summary.json") as file:
-        summary = _mapping(folder / "summary.json", json.loads, file.read())
+        summary = _mapping(folder / "summary.json", _json(folder / "summary.json", file.read()))
     return RunRecord(folder, config, summary)
 
 
-def _mapping(path: Path, load: Any, text: str) -> dict[str, Any]:
+def _json(path: Path, text: str) -> Any:
     try:
-        found = load(text)
-    except (ValueError, yaml.YAMLError, RecursionError) as error:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path} is damaged: {' '.join(str(error).split())}") from error
+
+
+def _mapping(path: Path, found: Any) -> dict[str, Any]:
     if not isinstance(found, dict):
         raise InputError(f"{path} is damaged: expected names with values")
     return {str(name): value for name, value in found.items()}

@@ -8,6 +8,7 @@ map.npz, map.csv         landmarks: name, mean, covariance (within + between par
 timings.csv              milliseconds per pair: whole, features, odometry, matching with the map, filter
 diagnostics.csv          features, matches that agree with the motion, landmarks; updates, sample size, evidence, NIS
 config.yaml              everything needed to repeat the run
+checkpoint.npz           what --resume goes on from
 summary.json             the figures
 *.png                    pictures
 report.html              one page with all figures and pictures
@@ -19,9 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
-from rbpf import __version__
 from rbpf.systems.stereo.run import StereoRun
 from rbpf.systems.stereo.sensor import StereoSensor
 from rbpf.validation.files import (
@@ -34,6 +33,7 @@ from rbpf.validation.files import (
     write_text,
 )
 from rbpf.validation.map_summary import MapSummary
+from rbpf.validation.provenance import write_config
 from rbpf.validation.run_files import write_path, write_truth
 from rbpf.validation.stereo_scores import distance_m, score_stereo, stereo_truth
 from rbpf.validation.trajectory import Trajectory
@@ -63,8 +63,7 @@ def write_stereo_run(
     write_path(out, run.stamps_ns, run.world_from_camera, run.cov)
     write_truth(out, stereo_truth(run))
     _write_tables(run, out)
-    config = {"rbpf": __version__, "system": "stereo", **sources, **asdict(run.config)}
-    write_text(out / "config.yaml", yaml.safe_dump(config, sort_keys=False))
+    write_config(out, "stereo", sources, asdict(run.config))
     entries = summarise_stereo(run, mapped)
     write_text(out / "summary.json", json.dumps(entries, indent=2, allow_nan=False) + "\n")
     return entries

@@ -10,15 +10,12 @@ import os
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.readers.images.stereo import StereoSequence
 from rbpf.systems.stereo.run import StereoRun
-from rbpf.validation.figures import SIGMAS
 from rbpf.validation.map_summary import MapSummary
-from rbpf.validation.mono_rerun import AXIS_M, QUALITY, require_rerun
+from rbpf.validation.mono_rerun import AXIS_M, QUALITY, ellipsoids, require_rerun
 
 
 def write_stereo_rerun(run: StereoRun, sequence: StereoSequence, mapped: MapSummary, path: Path) -> None:
@@ -66,15 +63,7 @@ def _log_static(rr: Any, stream: Any, run: StereoRun, mapped: MapSummary) -> Non
     stream.log("world/camera", lens, static=True)
     for name, poses in (("path", run.world_from_camera), ("odometry", run.odometry)):
         stream.log(f"world/{name}", rr.LineStrips3D([SE3.translation(poses)]), static=True)
-    values, vectors = np.linalg.eigh(mapped.cov)
-    turned = vectors * np.where(np.linalg.det(vectors) < 0.0, -1.0, 1.0)[:, None, None]
-    poses = np.concatenate([turned, mapped.mean[..., None]], axis=-1)
-    ellipsoids = rr.Ellipsoids3D(
-        centers=mapped.mean,
-        half_sizes=SIGMAS * np.sqrt(np.maximum(values, 0.0)),
-        quaternions=SE3.from_matrix(poses)[:, :4],
-    )
-    stream.log("world/map", ellipsoids, static=True)
+    stream.log("world/map", ellipsoids(rr, mapped), static=True)
 
 
 def _log_pair(rr: Any, stream: Any, run: StereoRun, t: int) -> None:

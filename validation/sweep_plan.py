@@ -19,10 +19,10 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-import yaml
 
 from rbpf import __version__
 from rbpf.errors import InputError
+from rbpf.systems.plain_yaml import read_plain_yaml
 from rbpf.validation.sweep_systems import system_named
 
 MOST_RUNS = 100_000
@@ -94,13 +94,7 @@ def read_plan(path: Path) -> list[Job]:
     Raises:
         InputError: the file is unreadable, names something unknown, or a sequence is not there.
     """
-    try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read: {error}") from error
-    except (yaml.YAMLError, RecursionError) as error:
-        raise InputError(f"{path} is not YAML: {' '.join(str(error).split())}") from error
-    return plan(_converted(path, values), path.parent, str(path))
+    return plan(_converted(path, read_plain_yaml(path)), path.parent, str(path))
 
 
 def plan(file: SweepFile, folder: Path, where: str = "the sweep") -> list[Job]:

@@ -1,10 +1,9 @@
-"""Trajectories in files: the TUM format (read and written) and KITTI odometry's (read).
+"""Trajectories in files: the TUM format and KITTI odometry's, both read and written.
 
 TUM: a line `timestamp tx ty tz qx qy qz qw` per pose, seconds and metres, # starts a comment.
 KITTI: the 12 numbers of world_from_camera's upper 3 x 4 block per line, row by row; no times.
 """
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +11,7 @@ import numpy as np
 from rbpf.lie import SE3, Array
 from rbpf.sensors.readers.table import read_columns
 from rbpf.validation.trajectory import Trajectory
+from rbpf.validation.writing import whole
 
 TUM_COLUMNS = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 KITTI_COLUMNS = tuple(f"{name}{row}" for row in "123" for name in ("r1", "r2", "r3", "t"))
@@ -44,15 +44,24 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
     Args:
         path: the file; one that is there is replaced.
         trajectory: what to write.
+
+    Raises:
+        InputError: the place cannot be written to, or the disk is full.
     """
     rows = zip(trajectory.stamps_ns.tolist(), trajectory.world_from_body.tolist(), strict=True)
     lines = [_tum_line(stamp_ns, numbers) for stamp_ns, numbers in rows]
-    partial = path.with_name(f"{path.name}.{os.getpid()}.part")
-    try:
-        partial.write_text("".join(["# " + " ".join(TUM_COLUMNS) + "\n", *lines]), encoding="utf-8")
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+    _write_whole(path, ["# " + " ".join(TUM_COLUMNS) + "\n", *lines])
+
+
+def write_kitti(path: Path, trajectory: Trajectory) -> None:
+    """Write a trajectory in KITTI format, with every digit; the file appears under its name when complete.
+
+    Args:
+        path: the file; one that is there is replaced.
+        trajectory: what to write; its times are lost.
+    """
+    rows = SE3.matrix(trajectory.world_from_body)[:, :3].reshape(-1, 12).tolist()
+    _write_whole(path, [" ".join(map(repr, row)) + "\n" for row in rows])
 
 
 def read_kitti(path: Path) -> Trajectory:
@@ -68,6 +77,11 @@ def read_kitti(path: Path) -> Trajectory:
         problem = "expected a rotation matrix in columns 1-3, 5-7 and 9-11, found one that is not orthonormal"
         raise table.error(int(np.argmax(wrong)), problem)
     return Trajectory(np.arange(len(matrices)), SE3.from_matrix(matrices))
+
+
+def _write_whole(path: Path, lines: list[str]) -> None:
+    with whole(path) as partial:
+        partial.write_text("".join(lines), encoding="utf-8")
 
 
 def _tum_line(stamp_ns: int, pose: list[float]) -> str:

@@ -6,11 +6,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
-import yaml
 
 from rbpf.errors import InputError
+from rbpf.systems.plain_yaml import read_plain_yaml
 
-_HEADER = ("rbpf", "system", "recording", "known_points", "board", "square_m", "calibration")
+_HEADER = (
+    "rbpf", "system", "versions", "input_sha256",
+    "recording", "known_points", "board", "square_m", "calibration", "map", "localize",
+)  # fmt: skip
 """What a config.yaml says about the run besides its settings."""
 
 if TYPE_CHECKING:
@@ -46,12 +49,7 @@ def load_settings(
 
 
 def _read(path: Path, expected: str) -> dict[str, Any]:
-    try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read: {error}") from error
-    except yaml.YAMLError as error:
-        raise InputError(f"{path} is not YAML: {' '.join(str(error).split())}") from error
+    values = read_plain_yaml(path)
     if not isinstance(values, dict):
         raise InputError(f"{path} must hold settings as `name: value`, one per line")
     system = values.get("system", expected)

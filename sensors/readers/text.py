@@ -7,6 +7,9 @@ from pathlib import Path
 
 from rbpf.errors import InputError
 
+MOST_BYTES = 1 << 30
+"""No table of a recording is larger."""
+
 
 def line_error(path: Path, line: int, problem: str) -> InputError:
     """Error that points at a line, counted from 1."""
@@ -29,7 +32,13 @@ def read_bytes(path: Path, hint: str = "") -> bytes:
         InputError: the file is missing or cannot be read.
     """
     try:
+        if path.stat().st_size > MOST_BYTES:
+            raise InputError(
+                f"{path}: the file is larger than {MOST_BYTES >> 20} MiB{hint and '; expected ' + hint}."
+            )
         return path.read_bytes()
+    except InputError:
+        raise
     except FileNotFoundError:
         raise InputError(f"{path}: no such file{hint and '; expected ' + hint}.") from None
     except (OSError, ValueError) as error:

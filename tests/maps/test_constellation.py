@@ -138,4 +138,4 @@ def test_two_groups_in_one_map():
         group = UncertainConstellation(points, COVS.copy())
         held.add_records(group.started(2, points, 1e-4 * np.eye(12)), group)
     assert len(held.layouts) == 2
-    assert held.kinds[:3].tolist() == [0, 0, 1]
+    assert held.store.columns.kinds(np.arange(3)).tolist() == [0, 0, 1]

@@ -158,7 +158,7 @@ def test_a_failed_write_leaves_no_half_file(tmp_path, monkeypatch):
         raise OSError("disk full")
 
     monkeypatch.setattr("os.replace", fail)
-    with pytest.raises(OSError, match="disk full"):
+    with pytest.raises(InputError, match="cannot be written: disk full"):
         write_measurements(tmp_path, world(2, "position", seed=1))
     assert (tmp_path / OBSERVATIONS).read_bytes() == before
     assert sorted(path.name for path in tmp_path.iterdir()) == [OBSERVATIONS, ODOMETRY]

@@ -74,7 +74,7 @@ def test_writing_that_fails_keeps_the_old_file_and_leaves_nothing_behind(tmp_pat
         raise OSError("disk full")
 
     monkeypatch.setattr(Path, "write_text", fail)
-    with pytest.raises(OSError, match="disk full"):
+    with pytest.raises(InputError, match="cannot be written: disk full"):
         write_tum(target, wander(3, 4))
     assert target.read_text() == "old"
     assert list(tmp_path.iterdir()) == [target]

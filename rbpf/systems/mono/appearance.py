@@ -5,6 +5,8 @@ from typing import final
 
 import numpy as np
 
+from rbpf.archive import checked
+
 SOURCE_HALF_PX = 15
 """The window that is kept of a first sighting reaches this far from its centre: enough to be turned and shrunk."""
 
@@ -87,8 +89,13 @@ class Appearances:
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """The inverse of `arrays`."""
-        self._rows = _Rows(*(arrays[f"appearance/{item.name}"].copy() for item in fields(_Rows)))
-        self.count = self._rows.alive.size
+        count = checked(arrays, "appearance/alive", (None,), "b").size
+        columns = []
+        for item in fields(_Rows):
+            empty = getattr(self._rows, item.name)[:0]
+            name, shape = f"appearance/{item.name}", (count, *empty.shape[1:])
+            columns.append(checked(arrays, name, shape, empty.dtype.kind).astype(empty.dtype))
+        self._rows, self.count = _Rows(*columns), count
 
     def _reserve(self, count: int) -> None:
         room = self._rows.alive.size

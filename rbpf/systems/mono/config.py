@@ -158,6 +158,7 @@ class MonoConfig:
         known: the known points as one rigid group whose frame is marginalised, or as separate landmarks in a world
             whose place each particle samples in the first frame (E06).
         births_per_frame: landmarks started in one frame at most.
+        lag: frames of the particles' paths that are kept, None keeps all.
         checkpoint_every: frames between checkpoints.
         velocity: how the camera moves.
         ray: landmarks of unknown depth.
@@ -174,6 +175,7 @@ class MonoConfig:
     start_std_rad: float = 0.5
     known: Literal["frame", "points"] = "frame"
     births_per_frame: int = 1000
+    lag: int | None = None
     checkpoint_every: int = 500
     velocity: VelocityConfig = field(default_factory=VelocityConfig)
     ray: RayConfig = field(default_factory=RayConfig)

@@ -44,15 +44,22 @@ class FeatureSensor(Sensor):
         rays: settings of landmarks without depth.
         births_per_frame: landmarks started in one frame at most.
         start: known points that are one landmark, a `Constellation`.
+        fixed: the map is known: its points tell where the camera is, and are not changed by what is seen of them.
     """
 
     def __init__(
-        self, camera: Pinhole, rays: RayConfig, births_per_frame: int, start: KnownStart | None = None
+        self,
+        camera: Pinhole,
+        rays: RayConfig,
+        births_per_frame: int,
+        start: KnownStart | None = None,
+        fixed: bool = False,
     ) -> None:
         rho = (rays.rho_per_m, rays.std_rho_per_m)
         self.camera = camera
         self.rays = rays
-        self.births_per_frame = births_per_frame
+        self.births_per_frame = 0 if fixed else births_per_frame
+        self.fixed = fixed
         self.point = CameraPoint(camera)
         self.ray = CameraRay(camera, rho)
         self.epipolar = EpipolarRay(camera, rho, rays.line_px)
@@ -71,7 +78,8 @@ class FeatureSensor(Sensor):
         is_ray = belief.map.are(ids[rows], self.inverse_depth)
         if (~is_ray).any():
             k = rows[~is_ray]
-            groups.append(Observations(frame.z[k], frame.cov_z[k], self.point, ids=ids[k]))
+            informs = _STATE if self.fixed else _BOTH
+            groups.append(Observations(frame.z[k], frame.cov_z[k], self.point, ids=ids[k], informs=informs))
         if is_ray.any():
             scaled = sum(group.z.size for group in groups) >= 2 * HOLD
             groups += self._ray_groups(frame, belief, rows[is_ray], ids[rows[is_ray]], scaled)

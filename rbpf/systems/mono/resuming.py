@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rbpf.archive import checked
+from rbpf.checkpoint import fitting
 from rbpf.errors import InputError
 
 if TYPE_CHECKING:
@@ -36,13 +38,14 @@ def restore(run: "VideoRun", path: Path) -> None:
     arrays = run.filter.load(path)
     if not np.array_equal(arrays.get("progress/stamps_ns", ()), run.stamps_ns):
         raise InputError(f"{path} belongs to a run over another sequence: start without --resume")
-    for name in _PER_FRAME:
-        getattr(run, name)[: run.filter.steps] = arrays[f"progress/{name}"]
-    run.problems = arrays["progress/problems"].tolist()
-    run.relocalisations = arrays["progress/relocalisations"].tolist()
-    run.sensor.restore(arrays)
-    run.sightings.restore(arrays)
-    run.recovery.restore(arrays)
+    with fitting(path):
+        for name in _PER_FRAME:
+            getattr(run, name)[: run.filter.steps] = arrays[f"progress/{name}"]
+        run.problems = checked(arrays, "progress/problems", (None,), "U").tolist()
+        run.relocalisations = checked(arrays, "progress/relocalisations", (None,), "i").tolist()
+        run.sensor.restore(arrays)
+        run.sightings.restore(arrays)
+        run.recovery.restore(arrays)
 
 
 def cut(run: "VideoRun") -> None:

@@ -54,12 +54,16 @@ class Sighting:
 
 @final
 class Sightings:
-    """The sightings of all frames so far."""
+    """The sightings of all frames so far.
 
-    def __init__(self) -> None:
+    Args:
+        given: rows of the sensor's table that were there before the first frame, and are not told as started in it.
+    """
+
+    def __init__(self, given: int = 0) -> None:
         self.frames: list[Sighting] = []
         self._names = Names()
-        self._started = 0
+        self._given = self._started = given
 
     def record(self, sensor: ImageSensor, filter_: Filter, world: Anchored | None) -> None:
         """Takes note of the sensor's last frame, once the filter has made its step.
@@ -100,7 +104,7 @@ class Sightings:
             for item in fields(Sighting)
         ]
         self.frames = [Sighting(*parts) for parts in zip(*columns, strict=True)]
-        self._started = sum(frame.started.shape[0] for frame in self.frames)
+        self._started = self._given + sum(frame.started.shape[0] for frame in self.frames)
 
     def _lines(self, features: FeatureSensor, belief: Belief, rows: np.ndarray) -> np.ndarray:
         """Ends (K, 2, 2) of the epipolar lines of those features that are rays, in the heaviest particle."""

@@ -44,14 +44,20 @@ def build_filter(
     return assemble(config, features, start, None if wrapped is None else wrapped(features))
 
 
-def build_features(camera: Pinhole, config: MonoConfig, start: KnownStart | None) -> FeatureSensor:
-    """What turns found features into observations."""
+def build_features(
+    camera: Pinhole, config: MonoConfig, start: KnownStart | None, fixed: bool = False
+) -> FeatureSensor:
+    """What turns found features into observations; with `fixed` of a map that is known and stays as it is."""
     group = start if config.known == "frame" else None
-    return FeatureSensor(camera, config.ray, config.births_per_frame, group)
+    return FeatureSensor(camera, config.ray, config.births_per_frame, group, fixed)
 
 
 def assemble(
-    config: MonoConfig, features: FeatureSensor, start: KnownStart | None, sensor: Sensor | None = None
+    config: MonoConfig,
+    features: FeatureSensor,
+    start: KnownStart | None,
+    sensor: Sensor | None = None,
+    mapped: KnownPoints | None = None,
 ) -> Filter:
     """The filter, with the known points in its map.
 
@@ -60,6 +66,7 @@ def assemble(
         features: what turns found features into observations.
         start: known points, if there are any.
         sensor: what finds features and hands them to `features`; by default the features come as they are.
+        mapped: points of a map that the camera is to be found in, in the world of the particles.
     """
     motion = build_motion(config.velocity)
     landmark_map = LandmarkMap(motion.space, compiled=config.compiled)
@@ -76,8 +83,11 @@ def assemble(
         config.resampling.build(),
         config.particles,
         np.random.default_rng(config.seed),
+        lag=config.lag,
     )
-    if start is not None and config.known == "frame":
+    if mapped is not None:
+        add_known_points(landmark_map, mapped, config.particles)
+    elif start is not None and config.known == "frame":
         add_constellation(landmark_map, features.camera, start, config)
     elif start is not None:
         add_known_points(landmark_map, start.points, config.particles)

@@ -41,7 +41,8 @@ class Associations:
             if (ids == ids[:1]).all():
                 ids = ids[:1]
         lineage = self._filter.lineage
-        lineage.retain(lineage.generation)
+        if ids.shape[0] > 1:
+            lineage.retain(lineage.generation)
         self._steps.append((lineage.generation, ids))
 
     def of(self, particle: int) -> list[np.ndarray]:
@@ -64,5 +65,6 @@ class Associations:
         for generation, n, k in arrays["associations/shapes"].tolist():
             ids = arrays["associations/ids"][first : first + n * k].reshape(n, k)
             first += n * k
-            self._filter.lineage.retain(generation)
+            if n > 1:
+                self._filter.lineage.take_up(generation)
             self._steps.append((generation, ids.copy()))

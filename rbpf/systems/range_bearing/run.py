@@ -2,12 +2,13 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 import numpy as np
 
 from rbpf.anchoring import Anchored, StartAnchor
+from rbpf.checkpoint import fitting
 from rbpf.diagnostics import motion_correction
 from rbpf.errors import InputError
 from rbpf.estimate import Estimate
@@ -100,6 +101,7 @@ class Run:
         associations: per step, the landmark of each sighting, −1 where it was not used: the log's name where the
             association is known, else the map's id along the ancestors of the best particle.
         anchored: the start in each particle's world, which the map is relative to; None where it is not re-estimated.
+        problems: what went wrong on the way, in words.
     """
 
     log: RobotLog
@@ -108,6 +110,7 @@ class Run:
     progress: Progress
     associations: list[np.ndarray]
     anchored: Anchored | None
+    problems: list[str] = field(default_factory=list)
 
 
 def run(
@@ -124,7 +127,7 @@ def run(
         config: all settings.
         out: folder for checkpoints; None writes none.
         resume: go on from the checkpoint in `out`, if there is one.
-        on_step: called with the steps done and their number.
+        on_step: called with the steps done and their number; a KeyboardInterrupt from it leaves a checkpoint behind.
 
     Raises:
         InputError: the log or a setting does not fit, or no particle explains the observations.
@@ -135,12 +138,25 @@ def run(
     associations = Associations(filter_)
     anchor = StartAnchor(filter_, config.anchor_every) if config.anchor_every else None
     checkpoint = None if out is None else out / CHECKPOINT
+    problems: list[str] = []
     if resume and checkpoint is not None and checkpoint.exists():
         extra = filter_.load(checkpoint)
-        progress.restore(extra)
-        associations.restore(extra)
-        if anchor is not None:
-            anchor.restore(extra, build_model(log, config), build_point(log))
+        with fitting(checkpoint):
+            progress.restore(extra)
+            associations.restore(extra)
+            if anchor is not None:
+                anchor.restore(extra, build_model(log, config), build_point(log))
+
+    def save() -> None:
+        if checkpoint is None:
+            return
+        kept = {} if anchor is None else anchor.arrays()
+        try:
+            filter_.save(checkpoint, progress.arrays() | associations.arrays() | kept)
+        except InputError as error:
+            # On a full disk the run goes on all the same, and the last checkpoint stays.
+            problems.append(f"step {filter_.steps - 1}: no checkpoint is kept: {error}")
+
     for t in range(filter_.steps, total):
         frame = log.frames[t]
         started = time.perf_counter()
@@ -151,12 +167,16 @@ def run(
             estimate = anchor.state_estimate(anchor.after_step(report, control))
         progress.put(t, report, estimate, time.perf_counter() - started)
         associations.record(report, frame.z.shape[0])
-        if checkpoint is not None and filter_.steps % config.checkpoint_every == 0:
-            kept = {} if anchor is None else anchor.arrays()
-            filter_.save(checkpoint, progress.arrays() | associations.arrays() | kept)
-        if on_step is not None:
-            on_step(t + 1, total)
+        if filter_.steps % config.checkpoint_every == 0 or t + 1 == total:
+            save()
+        try:
+            if on_step is not None:
+                on_step(t + 1, total)
+        except KeyboardInterrupt:
+            save()
+            raise
     used = named_associations(log)
     if config.association == "ml":
         used = associations.of(filter_.belief().mode)
-    return Run(log, config, filter_, progress, used, None if anchor is None else anchor.estimate())
+    anchored = None if anchor is None else anchor.estimate()
+    return Run(log, config, filter_, progress, used, anchored, problems)

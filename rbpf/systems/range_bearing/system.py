@@ -1,5 +1,7 @@
 """Range-bearing SLAM in the plane and in space: odometry motion, a mounted sensor, point landmarks."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from rbpf.filter import Filter
@@ -15,13 +17,22 @@ from rbpf.sensors.rigid_point import RigidPointModel
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 
 
-def build_filter(log: RobotLog, config: RangeBearingConfig) -> Filter:
-    """The filter for a log; the robot starts at the origin of the world."""
+def build_filter(
+    log: RobotLog, config: RangeBearingConfig, wrapped: Callable[[Sensor], Sensor] | None = None
+) -> Filter:
+    """The filter for a log; the robot starts at the origin of the world.
+
+    Args:
+        log: the recording.
+        config: all settings.
+        wrapped: puts a sensor around the usual one, to change what it observes or starts.
+    """
     landmark_map = LandmarkMap(log.space, evidence=config.association == "ml", compiled=config.compiled)
     landmark_map.register(build_point(log))
+    sensor = build_sensor(log, config)
     return Filter(
         OdometryMotion(log.space),
-        build_sensor(log, config),
+        sensor if wrapped is None else wrapped(sensor),
         landmark_map,
         config.proposal.build(),
         config.resampling.build(),

@@ -113,6 +113,7 @@ class StereoConfig:
         seed: of all random generators.
         dof: degrees of freedom of the camera: 6, or 3 for one that moves in its x–z plane and turns about y.
         compiled: run the fused kernels; false runs their NumPy twins.
+        lag: updates of the particles' paths that are kept, None keeps all.
         checkpoint_every: pairs between checkpoints.
         sift: keypoints of the images.
         pair: matching of the two images of a pair.
@@ -129,6 +130,7 @@ class StereoConfig:
     seed: int = 0
     dof: Literal[3, 6] = 6
     compiled: bool = True
+    lag: int | None = None
     checkpoint_every: int = 500
     sift: SiftConfig = field(default_factory=SiftConfig)
     pair: PairConfig = field(default_factory=PairConfig)

@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rbpf.archive import checked, within
+from rbpf.checkpoint import fitting
 from rbpf.errors import InputError
 from rbpf.estimate import Estimate
 
@@ -39,13 +41,16 @@ def restore(run: "StereoRun", path: Path) -> None:
     arrays = run.filter.load(path)
     if not np.array_equal(arrays.get("progress/stamps_ns", ()), run.stamps_ns):
         raise InputError(f"{path} belongs to a run over another recording: start without --resume")
-    run.frames_done, run.last_update = (int(x) for x in arrays["progress/done"])
-    for name in _PER_FRAME:
-        getattr(run, name)[: run.frames_done] = arrays[f"progress/{name}"]
-    run.notes = arrays["progress/notes"].tolist()
-    run.at_update = Estimate(arrays["progress/at_update"], arrays["progress/cov_at_update"])
-    run.front_end.restore(arrays)
-    run.reckoning.restore(arrays)
+    with fitting(path):
+        run.frames_done, run.last_update = within(
+            arrays, "progress/done", 2, 0, run.stamps_ns.size + 1
+        ).tolist()
+        for name in _PER_FRAME:
+            getattr(run, name)[: run.frames_done] = arrays[f"progress/{name}"]
+        run.notes = checked(arrays, "progress/notes", (None,), "U").tolist()
+        run.at_update = Estimate(arrays["progress/at_update"], arrays["progress/cov_at_update"])
+        run.front_end.restore(arrays)
+        run.reckoning.restore(arrays)
 
 
 def cut(run: "StereoRun") -> None:

@@ -100,7 +100,7 @@ def run_images(
     Args:
         sequence: the recording.
         config: all settings.
-        on_frame: called after each pair.
+        on_frame: called after each pair; a KeyboardInterrupt from it leaves a checkpoint behind.
         checkpoint: file of checkpoints; None writes none.
         resume: go on from the checkpoint, if there is one.
 
@@ -167,11 +167,26 @@ def _all(
             break
         run.frames_done = t + 1
         if checkpoint is not None and (t + 1) % run.config.checkpoint_every == 0:
-            save(run, checkpoint)
-        if on_frame is not None:
-            on_frame(t, run)
+            _keep(run, checkpoint)
+        try:
+            if on_frame is not None:
+                on_frame(t, run)
+        except KeyboardInterrupt:
+            if checkpoint is not None:
+                _keep(run, checkpoint)
+            raise
+    if checkpoint is not None and run.failure is None:
+        _keep(run, checkpoint)
     cut(run)
     return run
+
+
+def _keep(run: StereoRun, checkpoint: Path) -> None:
+    """Writes a checkpoint; where the disk is full the run goes on all the same, and the last one stays."""
+    try:
+        save(run, checkpoint)
+    except InputError as error:
+        run.notes.append(f"pair {run.frames_done - 1}: no checkpoint is kept: {error}")
 
 
 def _frame(run: StereoRun, t: int, frame: Any) -> None:

@@ -27,6 +27,7 @@ def build_filter(sensor: Sensor, config: StereoConfig) -> Filter:
         config.resampling.build(),
         config.particles,
         np.random.default_rng(config.seed),
+        lag=config.lag,
     )
 
 

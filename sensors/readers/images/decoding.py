@@ -4,6 +4,7 @@ Colour becomes grey by OpenCV's weights (ITU-R BT.601); 16 bits become 8 over th
 A photo is turned as its EXIF orientation says, as viewers and OpenCV's calibration do.
 """
 
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +35,7 @@ def read_grey(path: Path) -> Grey:
         raise UnreadableImageError(f"{path}: the image cannot be read ({error}).") from None
     if not data.size:
         raise UnreadableImageError(f"{path}: the file is empty, expected an image.")
+    _require_size(path, data)
     try:
         image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
     except cv2.error as error:
@@ -68,6 +70,18 @@ def require_shape(path: Path, image: Grey, shape: tuple[int, int]) -> Grey:
             f"{path}: expected {shape[1]}x{shape[0]} px as in the camera file, {found}."
         )
     return image
+
+
+def _require_size(path: Path, data: NDArray[np.uint8]) -> None:
+    """Refuses, before anything is decoded, an image whose header claims more pixels than Pillow takes for sane."""
+    from PIL import Image
+
+    try:
+        Image.open(BytesIO(data.tobytes())).close()
+    except (Image.DecompressionBombError, Image.DecompressionBombWarning):
+        raise UnreadableImageError(f"{path}: the image claims to be larger than any camera's.") from None
+    except Exception:
+        pass
 
 
 def _to_8_bits(path: Path, image: np.ndarray) -> Grey:

@@ -1,8 +1,8 @@
 """Video files that OpenCV's FFmpeg can decode, with a `camera.yaml` beside the video or given.
 
 The number of images and their rate are those of the file's header, unless `camera.yaml` has `rate_hz`. A header without
-a number is counted by going through the video once. A video that ends before its last announced image ends with a
-frame that has none and says so.
+a number, or with one that the file is too small for, is counted by going through the video once. A video that ends
+before its last announced image ends with a frame that has none and says so.
 """
 
 from collections.abc import Generator, Iterator
@@ -43,10 +43,10 @@ class VideoImages(Source):
     shape: tuple[int, int]
 
     def frames(self, start: int) -> Generator[ImageFrame]:
-        with _opened(self.path) as capture:
+        with opened(self.path) as capture:
             # Jumping to an image is inexact in most codecs, going through those before it is not.
-            for _ in range(start):
-                capture.grab()
+            if not all(capture.grab() for _ in range(start)):
+                return
             indices = range(start, len(self.stamps_ns))
             with closing(decode_ahead(lambda index: self._next(capture, index), indices)) as frames:
                 for frame in frames:
@@ -84,7 +84,7 @@ def read(path: Path, calibration: Path | None) -> ImageSequence:
         InputError: the video cannot be decoded, or the camera file is missing or does not fit.
     """
     camera = find_calibration(path.parent, calibration)
-    count, rate_hz, shape = _header(path)
+    count, rate_hz, shape = video_header(path)
     camera.require_shape(shape, str(path))
     stamps_ns = evenly(count, camera.rate_hz or rate_hz or DEFAULT_RATE_HZ)
     return ImageSequence(
@@ -97,15 +97,21 @@ def read(path: Path, calibration: Path | None) -> ImageSequence:
     )
 
 
-def _header(path: Path) -> tuple[int, float, tuple[int, int]]:
+def video_header(path: Path) -> tuple[int, float, tuple[int, int]]:
+    """Number of images, their rate [Hz] or 0 where it is not told, height and width.
+
+    Raises:
+        InputError: no image can be decoded.
+    """
     import cv2
 
-    with _opened(path) as capture:
+    with opened(path) as capture:
         count, rate_hz = capture.get(cv2.CAP_PROP_FRAME_COUNT), capture.get(cv2.CAP_PROP_FPS)
         there, image = capture.read()
         if not there:
             raise InputError(f"{path}: not one image of the video can be decoded; {_ACTION}.")
-        if not 0 < count < np.inf:
+        # A header may claim what it likes; no image takes less than a byte.
+        if not 0 < count <= path.stat().st_size:
             count = 1
             while capture.grab():
                 count += 1
@@ -113,7 +119,12 @@ def _header(path: Path) -> tuple[int, float, tuple[int, int]]:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Any]:
+def opened(path: Path) -> Iterator[Any]:
+    """OpenCV's decoder of a video, closed at the end.
+
+    Raises:
+        InputError: it cannot be opened.
+    """
     import cv2
 
     # Other backends take the number in a name such as 000001 for a pattern of images.

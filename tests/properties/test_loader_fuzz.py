@@ -1,0 +1,262 @@
+"""Settings, run folders, maps and checkpoints that are damaged or made up: one InputError, and nothing else."""
+
+import io
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from rbpf.archive import load_arrays, save_arrays
+from rbpf.checkpoint import _digest
+from rbpf.errors import InputError
+from rbpf.systems.mono.config import MonoConfig
+from rbpf.systems.settings import load_settings
+from rbpf.systems.stereo.config import StereoConfig
+from rbpf.validation.comparison import read_comparisons
+from rbpf.validation.path_and_map import read_path_and_map
+from rbpf.validation.report import write_report
+from rbpf.validation.run_record import open_run
+from rbpf.validation.sweep import read_rows
+from rbpf.validation.sweep_plan import read_plan
+from tests.core.worlds import Recipe, content, drive, planar_world, same
+from tests.properties.mutations import damaged
+
+FEW = settings(max_examples=60, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
+SETTINGS = (
+    b"rbpf: 0.1.0\nsystem: mono\nparticles: 20\nray:\n  constrain: marginal\nsearch: {measurements: 25}\n"
+)
+SWEEP = b"system: range-bearing\nsequences: [log]\nparticles: [10]\nseeds: 2\noptions: {plain: {}}\n"
+RECIPE = Recipe(n=4)
+
+
+def read_or_refused(read: Any) -> None:
+    """Anything but success and one sentence fails."""
+    try:
+        read()
+    except InputError as error:
+        said = str(error)
+    else:
+        return
+    assert said.strip() and "\n" not in said
+
+
+@FEW
+@given(whole=damaged(SETTINGS), kind=st.sampled_from([MonoConfig, StereoConfig]))
+def test_settings(tmp_path_factory, whole, kind):
+    path = tmp_path_factory.getbasetemp() / "settings.yaml"
+    path.write_bytes(whole)
+    read_or_refused(lambda: load_settings(kind, "mono", path, (), {}))
+
+
+@FEW
+@given(whole=damaged(SWEEP))
+def test_sweeps(tmp_path_factory, whole):
+    path = tmp_path_factory.getbasetemp() / "sweep.yaml"
+    path.write_bytes(whole)
+    read_or_refused(lambda: read_plan(path))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("particles: !!python/object/apply:os.system ['touch pwned']\n", "not YAML"),
+        ("a: &a [x]\nb: [*a, *a]\n", "alias"),
+        ("particles: !!timestamp x\n", "none of its type"),
+        ("particles: 2001-99-99\n", "none of its type"),
+        ("a: " + "[" * 5000 + "\n", "none of its type|not YAML"),
+        ("#" * (2 << 20), "bytes"),
+    ],
+)
+def test_settings_run_nothing_and_unfold_into_nothing(tmp_path, text, words):
+    (tmp_path / "config.yaml").write_text(text)
+    with pytest.raises(InputError, match=words):
+        load_settings(MonoConfig, "mono", tmp_path / "config.yaml", (), {})
+    assert not Path("pwned").exists()
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    """The folder of a small run."""
+    from rbpf.systems.range_bearing.config import RangeBearingConfig
+    from rbpf.validation.range_bearing import finish_run, start_run
+    from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
+
+    folder = tmp_path_factory.mktemp("run")
+    simulate_robot(RobotWorld(steps=5, landmarks=8), folder / "log", seed=0)
+    out = folder / "out"
+    finish_run(
+        start_run(folder / "log", RangeBearingConfig(particles=4), out), folder / "log", out, batch=False
+    )
+    return out
+
+
+READ = ["config.yaml", "summary.json", "trajectory.npz", "truth.npz", "map.npz", "diagnostics.csv"]
+
+
+@FEW
+@given(data=st.data())
+def test_run_folders(run, data):
+    path = run / data.draw(st.sampled_from([*READ, "validation_groundtruth.json"]))
+    whole = path.read_bytes()
+    try:
+        path.write_bytes(data.draw(damaged(whole)))
+        read_or_refused(lambda: read_all(run))
+        read_or_refused(lambda: read_path_and_map(run))
+        read_or_refused(lambda: read_comparisons(run))
+    finally:
+        path.write_bytes(whole)
+
+
+def read_all(run: Path) -> None:
+    record = open_run(run)
+    record.path(), record.truth(), record.map(), record.table("diagnostics.csv")
+
+
+@settings(max_examples=20, suppress_health_check=[HealthCheck.too_slow])
+@given(data=st.data())
+def test_the_report_of_a_damaged_run(run, data):
+    path = run / data.draw(st.sampled_from(READ))
+    whole = path.read_bytes()
+    try:
+        path.write_bytes(data.draw(damaged(whole)))
+        read_or_refused(lambda: write_report(run))
+    finally:
+        path.write_bytes(whole)
+
+
+@FEW
+@given(data=st.data())
+def test_arrays_of_other_shapes_and_types(run, data):
+    """An archive that is whole, but in which an array is another one."""
+    path = run / data.draw(st.sampled_from(["trajectory.npz", "truth.npz", "map.npz"]))
+    whole = path.read_bytes()
+    arrays = load_arrays(path)
+    name = data.draw(st.sampled_from(sorted(arrays)))
+    arrays[name] = data.draw(others(arrays[name]))
+    try:
+        save_arrays(path, arrays)
+        read_or_refused(lambda: read_all(run))
+        read_or_refused(lambda: read_path_and_map(run))
+    finally:
+        path.write_bytes(whole)
+
+
+@FEW
+@given(whole=damaged(b'{"key": "a", "figures": {"x": 1}}\n{"key": "b", "figures": {}}\n'))
+def test_finished_rows_of_a_sweep(tmp_path_factory, whole):
+    path = tmp_path_factory.getbasetemp() / "rows.jsonl"
+    path.write_bytes(whole)
+    read_or_refused(lambda: read_rows(path))
+
+
+@st.composite
+def others(draw: st.DrawFn, array: np.ndarray) -> np.ndarray:
+    """An array that has another shape, type or content."""
+    kind = draw(st.sampled_from(["shape", "type", "text", "content", "empty", "scalar"]))
+    if kind == "shape":
+        return np.zeros((*array.shape, 2), array.dtype)
+    if kind == "type":
+        return array.astype(float) if array.dtype.kind in "iub" else np.zeros(array.shape, np.int64)
+    if kind == "text":
+        return np.full(array.shape, "x")
+    if kind == "empty":
+        return array[:0] if array.ndim else np.zeros(0, array.dtype)
+    if kind == "scalar" or not array.size:
+        return np.array(7)
+    changed = array.copy()
+    if array.dtype.kind in "if":
+        flat = changed.reshape(-1)
+        extreme = [-1, -(2**62), 2**62, 7] if array.dtype.kind == "i" else [np.nan, np.inf, -1e300, 0.5]
+        flat[draw(st.integers(0, flat.size - 1))] = draw(st.sampled_from(extreme))
+    return changed
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory) -> Path:
+    """A checkpoint after some steps, resamplings among them."""
+    path = tmp_path_factory.mktemp("saved") / "run.npz"
+    filter_ = RECIPE.build()
+    drive(filter_, planar_world(12, seed=4))
+    filter_.save(path)
+    return path
+
+
+@settings(max_examples=150, suppress_health_check=[HealthCheck.too_slow])
+@given(data=st.data())
+def test_checkpoints_made_up_with_a_digest_that_is_right(saved, tmp_path_factory, data):
+    """Refused, and the filter is as it was; or it goes on: compiled code must not follow a wrong index."""
+    arrays = load_arrays(saved)
+    header = json.loads(str(arrays.pop("header")))
+    name = data.draw(st.sampled_from(sorted(arrays)))
+    arrays[name] = data.draw(others(arrays[name]))
+    if data.draw(st.booleans()) and data.draw(st.booleans()):
+        del arrays[name]
+    path = tmp_path_factory.getbasetemp() / "made_up.npz"
+    save_arrays(path, {"header": np.array(json.dumps(header | {"digest": _digest(arrays)})), **arrays})
+    filter_ = RECIPE.build()
+    before = content(filter_)
+    try:
+        filter_.load(path)
+    except InputError as error:
+        assert str(path) in str(error)  # noqa: PT017
+        assert same(content(filter_), before)
+        return
+    read_or_refused(lambda: drive(filter_, planar_world(16, seed=4), 12, 16))
+
+
+def member(header: bytes, body: bytes = b"", compressed: bool = False) -> bytes:
+    """An archive of one array with such a header."""
+    buffer = io.BytesIO()
+    npy = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + body
+    kind = zipfile.ZIP_DEFLATED if compressed else zipfile.ZIP_STORED
+    with zipfile.ZipFile(buffer, "w", kind) as archive:
+        archive.writestr("a.npy", npy)
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,)}\n",
+        b"{'descr': '<f8', 'fortran_order': False, 'shape': (-1,)}\n",
+        b"{'descr': '<U0', 'fortran_order': False, 'shape': (1000000000000,)}\n",
+        b"{'descr': '<U999999999', 'fortran_order': False, 'shape': (1000,)}\n",
+        b"{'descr': '|O', 'fortran_order': False, 'shape': (1,)}\n",
+        b"{'descr': [('a', '<f8')], 'fortran_order': False, 'shape': (1,)}\n",
+        b"__import__('os').system('touch pwned')\n",
+        b"(" * 9000 + b"\n",
+        b"{'descr': '<f8', 'fortran_order': False, 'shape': (True,)}\n",
+    ],
+    ids=["huge", "negative", "no bytes each", "long text", "objects", "records", "code", "nested", "truth"],
+)
+def test_headers_that_claim_too_much(tmp_path, header):
+    (tmp_path / "a.npz").write_bytes(member(header, b"\0" * 8))
+    with pytest.raises(InputError, match="is damaged or cut off"):
+        load_arrays(tmp_path / "a.npz")
+    assert not Path("pwned").exists()
+
+
+def test_an_archive_that_unfolds_is_refused(tmp_path):
+    header = b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000,)}\n"
+    (tmp_path / "a.npz").write_bytes(member(header, b"\0" * 8_000_000, compressed=True))
+    with pytest.raises(InputError, match="is damaged or cut off"):
+        load_arrays(tmp_path / "a.npz")
+
+
+@given(
+    st.dictionaries(
+        st.text("abc/", min_size=1, max_size=5),
+        st.sampled_from(
+            [np.arange(6.0).reshape(2, 3), np.array(3), np.array("é"), np.zeros((0, 2)), np.array([True])]
+        ),
+    )
+)
+def test_what_is_saved_is_loaded(tmp_path_factory, arrays):
+    path = tmp_path_factory.getbasetemp() / "same.npz"
+    save_arrays(path, arrays)
+    assert same(load_arrays(path), arrays)

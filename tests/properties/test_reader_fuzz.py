@@ -1,0 +1,188 @@
+"""Every reader of recordings and of results, on damaged files: what they read, or one InputError, and nothing else."""
+
+import zlib
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from rbpf.errors import InputError
+from rbpf.lie import SE3
+from rbpf.sensors.readers import open_log, stereo_tracks, text
+from rbpf.sensors.readers.images import open_images, open_stereo, read_known_points
+from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
+from rbpf.validation.camera_files import read_features, write_features
+from rbpf.validation.measurement_files import read_measurements, write_measurements
+from rbpf.validation.ply import read_ply, write_ply
+from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
+from rbpf.validation.simulation.streams import CameraStream, Turnover
+from rbpf.validation.trajectory import Trajectory
+from rbpf.validation.trajectory_files import read_kitti, read_tum, write_tum
+from tests.properties.mutations import damaged
+from tests.readers import test_mrclam, test_stereo_tracks, test_victoria_park, test_wheel_odometry
+from tests.readers.images import folders
+from tests.validation.worlds import world
+
+POSES = SE3.exp(np.linspace(0.0, 1.0, 18).reshape(3, 6))
+KNOWN = "id,u_px,v_px,x_m,y_m,z_m,sigma_m\n1,5.5,6.5,0.1,0.2,1.6,0.03\n2,15.5,6.5,0.3,0.2,1.6,0.03\n"
+
+Read = Callable[[Path], object]
+
+
+def frames(path: Path) -> object:
+    """All images of a sequence, but no more than a few."""
+    return list(islice(open_images(path).frames(), 8))
+
+
+def pairs(path: Path) -> object:
+    return list(islice(open_stereo(path).frames(), 8))
+
+
+def euroc(folder: Path) -> None:
+    folders.write_euroc(folder)
+    truth = folder / "mav0" / "state_groundtruth_estimate0"
+    folders.write_asl_truth(truth, POSES, folders.EUROC_NS, SE3.identity())
+
+
+def kitti(folder: Path) -> None:
+    folders.write_kitti(folder)
+    (folder / "poses.txt").write_text("".join(folders.matrix_row(pose) for pose in POSES))
+
+
+def plain(folder: Path) -> None:
+    folders.write_plain(folder)
+    (folder / "times.txt").write_text("0.0\n0.1\n0.2\n")
+
+
+def mrclam(folder: Path) -> None:
+    test_mrclam.write(folder, test_mrclam.log_files())
+
+
+def victoria(folder: Path) -> None:
+    (folder / "graph.txt").write_text(test_victoria_park.GRAPH)
+
+
+def results(folder: Path) -> None:
+    write_tum(folder / "path.tum", Trajectory(np.arange(3) * 10**8, POSES))
+    (folder / "path.kitti").write_text("".join(folders.matrix_row(pose) for pose in POSES))
+    (folder / "known_points.csv").write_text(KNOWN)
+    write_ply(folder / "map.ply", POSES[:, 4:], np.zeros((3, 3), np.uint8))
+
+
+def features(folder: Path) -> None:
+    log = CameraStream(Turnover(points=12, measurements=8), seed=0).first()
+    write_features(folder, replace(log, frames=[log.frames[0]] * 2))
+
+
+RECORDINGS: dict[str, tuple[Callable[[Path], object], Read, str]] = {
+    "folder": (plain, frames, "*"),
+    "TUM": (folders.write_tum, frames, "*.txt"),
+    "TUM camera": (folders.write_tum, frames, "camera.yaml"),
+    "EuRoC": (euroc, frames, "**/*.[cy]*"),
+    "EuRoC pair": (folders.write_rectified, pairs, "**/*.[cy]*"),
+    "KITTI": (kitti, frames, "*.txt"),
+    "KITTI pair": (kitti, pairs, "calib.txt"),
+    "7-Scenes": (folders.write_seven_scenes, frames, "*.txt"),
+    "MRCLAM": (mrclam, open_log, "*.dat"),
+    "MRPT": (lambda f: simulate_robot(RobotWorld(4, 5), f, 0), open_log, "*.*"),
+    "Victoria Park": (victoria, open_log, "graph.txt"),
+    "stereo tracks": (test_stereo_tracks.folder, stereo_tracks.read, "*.txt"),
+    "wheel odometry": (test_wheel_odometry.folder, read_wheel_odometry, "odometry.*"),
+    "known points": (results, lambda f: read_known_points(f / "known_points.csv"), "known_points.csv"),
+    "path": (results, lambda f: read_tum(f / "path.tum"), "path.tum"),
+    "path of KITTI": (results, lambda f: read_kitti(f / "path.kitti"), "path.kitti"),
+    "PLY": (results, lambda f: read_ply(f / "map.ply"), "map.ply"),
+    "features": (features, read_features, "observations*.csv"),
+    "measurements": (lambda f: write_measurements(f, world(2, "position")), read_measurements, "*.csv"),
+}
+
+
+@pytest.fixture(scope="module", params=sorted(RECORDINGS))
+def recording(request, tmp_path_factory) -> tuple[Path, Read, list[Path]]:
+    """A whole recording, its reader, and the files that are damaged."""
+    write, read, pattern = RECORDINGS[request.param]
+    folder = tmp_path_factory.mktemp("recording")
+    write(folder)
+    read(folder)
+    files = sorted(path for path in folder.glob(pattern) if path.is_file())
+    assert files
+    return folder, read, files
+
+
+@settings(max_examples=60, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
+@given(data=st.data())
+def test_a_damaged_file_is_read_or_refused(recording, data):
+    folder, read, files = recording
+    path = data.draw(st.sampled_from(files), "file")
+    whole = path.read_bytes()
+    try:
+        path.write_bytes(data.draw(damaged(whole), "content"))
+        read_or_refused(read, folder)
+    finally:
+        path.write_bytes(whole)
+    assert not (folder / "pwned").exists() and not Path("pwned").exists()
+
+
+def read_or_refused(read: Read, folder: Path) -> None:
+    """Anything but success and one sentence fails."""
+    try:
+        read(folder)
+    except InputError as error:
+        said = str(error)
+    else:
+        return
+    assert said.strip() and "\n" not in said
+
+
+@settings(max_examples=25, suppress_health_check=[HealthCheck.too_slow])
+@given(data=st.data())
+def test_a_damaged_video_is_read_or_refused(video, data):
+    whole = video.read_bytes()
+    try:
+        video.write_bytes(data.draw(damaged(whole)))
+        read_or_refused(frames, video)
+    finally:
+        video.write_bytes(whole)
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory) -> Path:
+    """A short one."""
+    return folders.write_video(tmp_path_factory.mktemp("video") / "clip.avi", count=4)
+
+
+def test_a_video_that_claims_more_images_than_it_has_bytes_is_counted(video):
+    """The AVI header has the number of images at a fixed place."""
+    whole = video.read_bytes()
+    place = whole.index(b"avih") + 8 + 16
+    claimed = whole[:place] + (2**31 - 1).to_bytes(4, "little") + whole[place + 4 :]
+    lengths = whole.index(b"strh") + 8 + 32
+    claimed = claimed[:lengths] + (2**31 - 1).to_bytes(4, "little") + claimed[lengths + 4 :]
+    liar = video.with_name("liar.avi")
+    liar.write_bytes(claimed)
+    assert len(open_images(liar)) == 4
+
+
+def test_an_image_that_claims_to_be_huge_is_not_decoded(tmp_path):
+    """A PNG header of 60000 x 60000 pixels, and hardly anything behind it."""
+    folders.write_plain(tmp_path)
+    size = (60_000).to_bytes(4, "big") * 2 + bytes([8, 0, 0, 0, 0])
+    chunk = b"IHDR" + size
+    header = (
+        b"\x89PNG\r\n\x1a\n" + len(size).to_bytes(4, "big") + chunk + zlib.crc32(chunk).to_bytes(4, "big")
+    )
+    (tmp_path / "1.png").write_bytes(header + (80).to_bytes(4, "big") + b"IDAT" + b"\0" * 84)
+    problem = list(open_images(tmp_path).frames())[1].problem
+    assert problem is not None and "larger than any camera's" in problem
+
+
+def test_a_table_that_is_too_large_is_not_read(tmp_path, monkeypatch):
+    (tmp_path / "known_points.csv").write_text(KNOWN)
+    monkeypatch.setattr(text, "MOST_BYTES", 20)
+    with pytest.raises(InputError, match="larger than"):
+        read_known_points(tmp_path / "known_points.csv")

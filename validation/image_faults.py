@@ -1,0 +1,239 @@
+"""Deliberate faults of cameras: functions from a sequence of images, or of pairs of them, to a damaged sequence.
+
+    damaged = black_out(60, 30)(open_images("desk"))
+
+Everything else of the sequence stays as it is, its ground truth too. Faults can be applied one after the other, and
+every one of them gives the same bytes whenever and from wherever the sequence is read.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import numpy as np
+
+from rbpf.errors import InputError
+from rbpf.sensors.pinhole import RectifiedStereo
+from rbpf.sensors.readers.images.sequence import ImageFrame, ImageSequence, Source
+from rbpf.sensors.readers.images.stereo import StereoSequence
+
+Sequence = TypeVar("Sequence", ImageSequence, StereoSequence)
+Fault = Callable[[Sequence], Sequence]
+Paint = Callable[[int, np.ndarray, bool], np.ndarray]
+"""Changes image (H, W) uint8 number t, of the right camera or not."""
+
+
+@dataclass(frozen=True)
+class Painted(Source):
+    """Images of another source, changed one by one."""
+
+    source: Source
+    paint: Paint
+
+    def frames(self, start: int) -> Iterator[ImageFrame]:
+        """From number `start` on."""
+        for t, frame in enumerate(self.source.frames(start), start):
+            left, right = (
+                None if image is None else self.paint(t, image, is_right)
+                for image, is_right in ((frame.image, False), (frame.right, True))
+            )
+            yield replace(frame, image=left, right=right)
+
+
+@dataclass(frozen=True)
+class Chosen(Source):
+    """Some images of another source, and what they say of their time."""
+
+    source: Source
+    rows: np.ndarray
+    stamps_ns: np.ndarray
+
+    def frames(self, start: int) -> Iterator[ImageFrame]:
+        """From number `start` on."""
+        wanted = dict(zip(self.rows[start:].tolist(), self.stamps_ns[start:].tolist(), strict=True))
+        if not wanted:
+            return
+        first = int(self.rows[start])
+        for row, frame in enumerate(self.source.frames(first), first):
+            if row in wanted:
+                yield replace(frame, stamp_ns=wanted[row])
+            if row == self.rows[-1]:
+                return
+
+
+@dataclass(frozen=True)
+class Unreadable(Source):
+    """Images of another source, some of which cannot be read."""
+
+    source: Source
+    rows: frozenset[int]
+
+    def frames(self, start: int) -> Iterator[ImageFrame]:
+        """From number `start` on."""
+        for t, frame in enumerate(self.source.frames(start), start):
+            problem = "the file is damaged, incomplete or no image"
+            yield ImageFrame(frame.stamp_ns, None, None, problem) if t in self.rows else frame
+
+
+def keep_every(step: int) -> Fault[Sequence]:
+    """A slower camera: one image of so many."""
+    return lambda sequence: _chosen(sequence, np.arange(0, len(sequence), step))
+
+
+def drop_frames(share: float, seed: int = 0) -> Fault[Sequence]:
+    """Loses a share of the images without a trace, never the first one."""
+
+    def fault(sequence: Sequence) -> Sequence:
+        kept = np.random.default_rng(seed).random(len(sequence)) >= share
+        kept[0] = True
+        return _chosen(sequence, np.flatnonzero(kept))
+
+    return fault
+
+
+def truncate_files(share: float, seed: int = 0) -> Fault[Sequence]:
+    """A share of the images cannot be read, never the first one."""
+
+    def fault(sequence: Sequence) -> Sequence:
+        bad = np.random.default_rng(seed).random(len(sequence)) < share
+        rows = frozenset((np.flatnonzero(bad[1:]) + 1).tolist())
+        return _with_source(sequence, lambda source: Unreadable(source, rows))
+
+    return fault
+
+
+def black_out(first: int, count: int) -> Fault[Sequence]:
+    """The light is out: images from number `first` on are black."""
+    return painted(lambda t, image, _: np.zeros_like(image) if first <= t < first + count else image)
+
+
+def jump_exposure(every: int, least: float = 0.4, most: float = 1.8, seed: int = 0) -> Fault[Sequence]:
+    """The camera's gain jumps every so many images, between these factors; the first images are as they were."""
+
+    def paint(t: int, image: np.ndarray, is_right: bool) -> np.ndarray:
+        if t < every:
+            return image
+        gain = np.random.default_rng([seed, t // every]).uniform(np.log(least), np.log(most))
+        return np.clip(np.rint(image * np.exp(gain)), 0, 255).astype(np.uint8)
+
+    return painted(paint)
+
+
+def blur_motion(length_px: int, first: int = 1, count: int | None = None) -> Fault[Sequence]:
+    """Smears images along a line of this length, whose direction turns from image to image; never the first one."""
+
+    def paint(t: int, image: np.ndarray, is_right: bool) -> np.ndarray:
+        if t < max(first, 1) or (count is not None and t >= first + count):
+            return image
+        along = np.arange(length_px) - (length_px - 1) / 2
+        steps = np.rint(np.stack([along * np.sin(0.7 * t), along * np.cos(0.7 * t)], axis=-1)).astype(int)
+        edge = int(np.abs(steps).max())
+        padded = np.pad(image, edge, mode="edge").astype(np.float32)
+        height, width = image.shape
+        total = np.zeros(image.shape, np.float32)
+        for down, across in steps + edge:
+            total += padded[down : down + height, across : across + width]
+        return np.rint(total / length_px).astype(np.uint8)
+
+    return painted(paint)
+
+
+def salt_and_pepper(share: float, seed: int = 0) -> Fault[Sequence]:
+    """A share of the pixels is black or white, others in every image; not in the first one."""
+
+    def paint(t: int, image: np.ndarray, is_right: bool) -> np.ndarray:
+        if t == 0:
+            return image
+        rng = np.random.default_rng([seed, t, is_right])
+        struck = rng.random(image.shape, dtype=np.float32) < share
+        changed = image.copy()
+        changed[struck] = np.where(rng.random(int(struck.sum())) < 0.5, 0, 255)
+        return changed
+
+    return painted(paint)
+
+
+def cover_view(
+    share: float, first: int, count: int, disparity_px: int = 12, seed: int = 0
+) -> Fault[Sequence]:
+    """A textured thing as high as the image and a share of it wide passes through the view in so many images.
+
+    Args:
+        share: of the width.
+        first: image in which it comes in at the left.
+        count: images until it has gone out at the right.
+        disparity_px: how much further left the right camera sees it.
+        seed: of its texture.
+    """
+
+    def paint(t: int, image: np.ndarray, is_right: bool) -> np.ndarray:
+        if not first <= t < first + count:
+            return image
+        height, width = image.shape
+        size = round(share * width)
+        left = round((t - first + 1) / (count + 1) * (width + size)) - size - disparity_px * is_right
+        columns = np.arange(max(left, 0), max(min(left + size, width), 0))
+        changed = image.copy()
+        changed[:, columns] = _blobs(height, size, seed)[:, columns - left]
+        return changed
+
+    return painted(paint)
+
+
+def wrong_focal(factor: float) -> Fault[Sequence]:
+    """The calibration's focal lengths are so many times the right ones."""
+
+    def fault(sequence: Sequence) -> Sequence:
+        one = _images(sequence)
+        camera = replace(one.camera, fx=factor * one.camera.fx, fy=factor * one.camera.fy)
+        return _with_images(sequence, replace(one, camera=camera))
+
+    return fault
+
+
+def jitter_stamps(std_s: float, seed: int = 0) -> Fault[Sequence]:
+    """Stamps with a random error, which stay in order; the first one is right."""
+
+    def fault(sequence: Sequence) -> Sequence:
+        error = 1e9 * std_s * np.random.default_rng(seed).standard_normal(len(sequence))
+        error[0] = 0.0
+        jittered = np.sort(
+            np.maximum(sequence.stamps_ns + np.rint(error).astype(np.int64), sequence.stamps_ns[0])
+        )
+        return _chosen(sequence, np.arange(len(sequence)), jittered)
+
+    return fault
+
+
+def painted(paint: Paint) -> Fault[Sequence]:
+    """Any change of single images."""
+    return lambda sequence: _with_source(sequence, lambda source: Painted(source, paint))
+
+
+def _blobs(height: int, width: int, seed: int) -> np.ndarray:
+    """A texture (H, W) uint8 of corners: random grey squares of eight pixels."""
+    squares = np.random.default_rng(seed).integers(20, 235, (height // 8 + 1, width // 8 + 1), dtype=np.uint8)
+    return np.kron(squares, np.ones((8, 8), np.uint8))[:height, :width]
+
+
+def _chosen(sequence: Sequence, rows: np.ndarray, stamps_ns: np.ndarray | None = None) -> Sequence:
+    one = _images(sequence)
+    stamps = one.stamps_ns[rows] if stamps_ns is None else stamps_ns
+    return _with_images(sequence, replace(one, stamps_ns=stamps, source=Chosen(one.source, rows, stamps)))
+
+
+def _with_source(sequence: Sequence, change: Callable[[Source], Source]) -> Sequence:
+    one = _images(sequence)
+    return _with_images(sequence, replace(one, source=change(one.source)))
+
+
+def _images(sequence: ImageSequence | StereoSequence) -> ImageSequence:
+    return sequence.pair if isinstance(sequence, StereoSequence) else sequence
+
+
+def _with_images(sequence: Sequence, images: ImageSequence) -> Sequence:
+    if isinstance(sequence, StereoSequence):
+        return replace(sequence, pair=images, rig=RectifiedStereo(images.camera, sequence.rig.baseline_m))
+    if isinstance(sequence, ImageSequence):
+        return images
+    raise InputError(f"expected a sequence of images or of pairs of them, got a {type(sequence).__name__}")
