@@ -9,19 +9,17 @@ npz      run.npz: stamps_ns (T,), world_from_body (T, E), cov_poses (T, d, d); l
          cov_landmarks (M, D, D)
 """
 
-import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from rbpf.checkpoint import save_arrays
 from rbpf.errors import InputError
-from rbpf.lie import SE3
 from rbpf.validation.batch_problem import read_problem
 from rbpf.validation.export import MODEL, export_colmap, export_ply, raised
 from rbpf.validation.files import prepare_folder
 from rbpf.validation.measurement_files import OBSERVATIONS
-from rbpf.validation.mono_rerun import AXIS_M, ellipsoids, require_rerun
 from rbpf.validation.path_and_map import PathAndMap, read_path_and_map
+from rbpf.validation.rerun_file import AXIS_M, ellipsoids, log_pose, log_time, recording
 from rbpf.validation.trajectory_files import write_kitti, write_tum
 
 
@@ -82,20 +80,14 @@ def _npz(_run: Path, estimate: PathAndMap, out: Path) -> list[Path]:
 
 
 def _rerun(run: Path, estimate: PathAndMap, out: Path) -> list[Path]:
-    rr, path = require_rerun(), out / "run.rrd"
-    partial, trajectory = out / "run.rrd.partial", estimate.trajectory
-    with rr.RecordingStream("rbpf", recording_id=run.resolve().name) as stream:
-        stream.save(str(partial))
+    path, trajectory = out / "run.rrd", estimate.trajectory
+    with recording(path, run.resolve().name) as (rr, stream):
         stream.log("world/path", rr.LineStrips3D([trajectory.positions]), static=True)
         stream.log("world/map", ellipsoids(rr, raised(estimate.landmarks)), static=True)
         for t, pose in enumerate(trajectory.world_from_body):
-            stream.set_time("frame", sequence=t)
-            stream.set_time("time", duration=1e-9 * float(estimate.stamps_ns[t] - estimate.stamps_ns[0]))
-            turned = rr.Quaternion(xyzw=pose[:4])
-            stream.log("world/body", rr.Transform3D(translation=SE3.translation(pose), quaternion=turned))
+            log_time(stream, t, int(estimate.stamps_ns[t] - estimate.stamps_ns[0]))
+            log_pose(rr, stream, "body", pose)
             stream.log("world/body", rr.TransformAxes3D(AXIS_M))
-        stream.flush()
-    os.replace(partial, path)
     return [path]
 
 

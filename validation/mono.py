@@ -11,9 +11,9 @@ from rbpf.sensors.readers.images import ImageSequence, KnownPixels, open_images,
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.known_map import read_known_map
 from rbpf.systems.mono.video import VideoRun, first_image, run_images
-from rbpf.validation.files import prepare_folder
+from rbpf.validation.files import prepare_folder, write_summary
 from rbpf.validation.mono_batch import Batch, adjust_run, score_batch
-from rbpf.validation.mono_folder import write_mono_run, write_summary
+from rbpf.validation.mono_folder import write_mono_run
 from rbpf.validation.mono_map import summarise_mono_map
 from rbpf.validation.mono_pictures import plot_mono_run
 from rbpf.validation.mono_rerun import write_rerun

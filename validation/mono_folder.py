@@ -18,7 +18,6 @@ summary.json             the figures
 report.html              one page with all figures and pictures
 """
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -35,7 +34,7 @@ from rbpf.validation.files import (
     prepare_folder,
     write_csv,
     write_map,
-    write_text,
+    write_summary,
 )
 from rbpf.validation.mono_known_map import known_map
 from rbpf.validation.mono_log import feature_log
@@ -90,11 +89,6 @@ def found_at(run: VideoRun) -> int | None:
     """The first frame in which a camera was where the filter believes; None where there is none."""
     tracked = np.flatnonzero(~run.lost.astype(bool))
     return int(tracked[0]) if tracked.size else None
-
-
-def write_summary(out: Path, entries: dict[str, Any]) -> None:
-    """summary.json."""
-    write_text(out / "summary.json", json.dumps(entries, indent=2, allow_nan=False) + "\n")
 
 
 def summarise_camera(run: VideoRun, mapped: MonoMap) -> dict[str, Any]:

@@ -51,6 +51,25 @@ def write_annotated(run: VideoRun, path: Path, on_frame: Callable[[int, int], No
                 encoder.send(np.ascontiguousarray(picture))
                 if on_frame is not None:
                     on_frame(t + 1, run.stamps_ns.size)
+        if not is_complete(partial):
+            # The encoder says nothing through the pipe of what went wrong behind it.
+            raise OSError("the encoder could not finish, the disk may be full")
+
+
+def is_complete(path: Path) -> bool:
+    """Whether an MP4 holds all that it announces: its boxes fill the file, and the frames' index is among them."""
+    size, place, kinds = path.stat().st_size, 0, list[bytes]()
+    with path.open("rb") as file:
+        while place + 8 <= size:
+            file.seek(place)
+            length, kind = int.from_bytes(file.read(4), "big"), file.read(4)
+            if length == 1:
+                length = int.from_bytes(file.read(8), "big")
+            if length < 8:
+                return False
+            kinds.append(kind)
+            place += length
+    return place == size and b"moov" in kinds
 
 
 def annotated_frames(run: VideoRun) -> Iterator[np.ndarray]:

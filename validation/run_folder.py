@@ -12,7 +12,6 @@ summary.json             the figures
 *.png, report.html       pictures, and one page with all of them
 """
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -28,7 +27,7 @@ from rbpf.validation.files import (
     prepare_folder,
     write_csv,
     write_map,
-    write_text,
+    write_summary,
 )
 from rbpf.validation.map_summary import MapSummary, summarise_map
 from rbpf.validation.measurement_files import write_measurements
@@ -76,7 +75,7 @@ def write_run(run: Run, out: Path, recording: Path, extra: dict[str, Any] | None
     )
     write_config(out, "range-bearing", {"recording": str(recording)}, asdict(run.config))
     entries = summarise(run, summary_map) | (extra or {})
-    write_text(out / "summary.json", json.dumps(entries, indent=2, allow_nan=False) + "\n")
+    write_summary(out, entries)
     return entries
 
 

@@ -4,6 +4,8 @@ trajectory.tum           online filtered mean at every pair; the first camera is
 trajectory.npz           the same with its covariance; truth.npz: the ground truth at these pairs; see
                          `rbpf.validation.run_files`
 odometry.tum             the path by visual odometry alone
+batch.tum                the batch optimum of the same measurements
+observations*.csv        the measurements used, by odometry or by the map; see `rbpf.validation.camera_files`
 map.npz, map.csv         landmarks: name, mean, covariance (within + between particles); how often each was seen
 timings.csv              milliseconds per pair: whole, features, odometry, matching with the map, filter
 diagnostics.csv          features, matches that agree with the motion, landmarks; updates, sample size, evidence, NIS
@@ -14,7 +16,6 @@ summary.json             the figures
 report.html              one page with all figures and pictures
 """
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ import numpy as np
 
 from rbpf.systems.stereo.run import StereoRun
 from rbpf.systems.stereo.sensor import StereoSensor
+from rbpf.validation.camera_files import write_features
 from rbpf.validation.files import (
     milliseconds_per_frame,
     nis_ratio,
@@ -30,7 +32,7 @@ from rbpf.validation.files import (
     prepare_folder,
     write_csv,
     write_map,
-    write_text,
+    write_summary,
 )
 from rbpf.validation.map_summary import MapSummary
 from rbpf.validation.provenance import write_config
@@ -62,10 +64,11 @@ def write_stereo_run(
     write_map(out, mapped, _facts(run, mapped))
     write_path(out, run.stamps_ns, run.world_from_camera, run.cov)
     write_truth(out, stereo_truth(run))
+    write_features(out, run.front_end.log(run.name, run.stamps_ns, run.truth))
     _write_tables(run, out)
     write_config(out, "stereo", sources, asdict(run.config))
     entries = summarise_stereo(run, mapped)
-    write_text(out / "summary.json", json.dumps(entries, indent=2, allow_nan=False) + "\n")
+    write_summary(out, entries)
     return entries
 
 

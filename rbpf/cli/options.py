@@ -68,10 +68,14 @@ class ImageRunOptions(RunOptions):
     Attributes:
         calibration: camera.yaml in place of the sequence's own; by default that one is read.
         rerun: also write a recording (.rrd) for the Rerun viewer; by default none.
+        batch: also adjust the same measurements in batch with GTSAM.
+        batch_limit: seconds after which the batch adjustment is given up; the run's results stay.
     """
 
     calibration: Path | None = None
     rerun: Path | None = None
+    batch: bool = True
+    batch_limit: float = 300.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,8 +93,6 @@ class MonoOptions(ImageRunOptions):
         map: folder of a run, or its known_map.npz, that the camera is to be found in; by default a map is made.
         localize: the map is known: the start is found by recognition, and the map is not changed.
         video: write the annotated video.
-        batch: also adjust the same measurements in batch with GTSAM.
-        batch_limit: seconds after which the batch adjustment is given up; the run's results stay.
     """
 
     sequence: tyro.conf.Positional[Path]
@@ -100,8 +102,6 @@ class MonoOptions(ImageRunOptions):
     map: Path | None = None
     localize: Flag = False
     video: bool = True
-    batch: bool = True
-    batch_limit: float = 300.0
 
 
 @dataclass(frozen=True, kw_only=True)

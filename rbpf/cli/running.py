@@ -44,7 +44,7 @@ def run_mono(options: Annotated[MonoOptions, tyro.conf.arg(name="")]) -> None:
     from rbpf.systems.mono.config import MonoConfig
     from rbpf.systems.settings import load_settings
     from rbpf.validation.mono import Recording, Telling, finish_mono, start_mono
-    from rbpf.validation.mono_rerun import require_rerun
+    from rbpf.validation.rerun_file import require_rerun
 
     if options.rerun is not None:
         require_rerun()
@@ -77,7 +77,8 @@ def run_stereo(options: Annotated[StereoOptions, tyro.conf.arg(name="")]) -> Non
     """Stereo SLAM over a sequence of pairs of images (S05: SIFT landmarks, visual odometry, 400 particles)."""
     from rbpf.systems.settings import load_settings
     from rbpf.systems.stereo.config import StereoConfig
-    from rbpf.validation.mono_rerun import require_rerun
+    from rbpf.validation.mono import Telling
+    from rbpf.validation.rerun_file import require_rerun
     from rbpf.validation.stereo import StereoRecording, finish_stereo, start_stereo
 
     if options.rerun is not None:
@@ -86,10 +87,16 @@ def run_stereo(options: Annotated[StereoOptions, tyro.conf.arg(name="")]) -> Non
     config = load_settings(StereoConfig, "stereo", options.config, options.set, named)
     recording = StereoRecording(options.sequence, options.calibration)
     _prepare(options)
-    with progress() as bar, patient(told(bar, bar.add_task("filtering", total=None))) as tell:
-        run = start_stereo(recording, config, options.out, options.resume, tell)
-    with finishing():
-        entries = finish_stereo(run, recording, options.out, options.rerun)
+    with progress() as bar:
+        with patient(told(bar, bar.add_task("filtering", total=None))) as tell:
+            run = start_stereo(recording, config, options.out, options.resume, tell)
+        solving = bar.add_task("batch", total=None, visible=options.batch)
+        telling = Telling(
+            on_iteration=lambda count, _error: bar.update(solving, completed=count),
+            batch_s=options.batch_limit,
+        )
+        with finishing():
+            entries = finish_stereo(run, recording, options.out, options.rerun, options.batch, telling)
     _finish(entries, options, run.failure)
 
 

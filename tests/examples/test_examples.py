@@ -71,6 +71,11 @@ def custom_sensor(figures: dict[str, float]) -> None:
     assert 0.8 < figures["nis_per_dof"] < 1.25
 
 
+def error_causes(figures: dict[str, float]) -> None:
+    assert figures["batch started from the filter"] == pytest.approx(figures["batch"], rel=1e-3)
+    assert figures["10× particles"] < figures["as it is"] * 1.5
+
+
 def error_ratios(figures: dict[str, float]) -> None:
     assert figures.keys() == {"simulated_robot", "rendered_desk"}
     assert 0.8 < figures["simulated_robot"] < 6.0
@@ -254,6 +259,7 @@ CLAIMS: dict[str, Callable[[Any], None]] = {
         checkpoint,
         consistency_runs,
         custom_sensor,
+        error_causes,
         error_ratios,
         evidence,
         fused_kernel,

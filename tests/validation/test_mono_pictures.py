@@ -11,7 +11,7 @@ from rbpf.systems.mono.sightings import Sighting, Sightings
 from rbpf.systems.mono.video import run_images
 from rbpf.validation.mono_frames import FOUND, MISSED, RAY, Caption, draw_frame, drawn_size
 from rbpf.validation.mono_map import summarise_mono_map
-from rbpf.validation.mono_video import frame_rate
+from rbpf.validation.mono_video import frame_rate, is_complete
 from rbpf.validation.mono_views import best_views
 from rbpf.validation.simulation.exposure import Imaging
 from rbpf.validation.simulation.images import simulate_images
@@ -111,3 +111,19 @@ def test_equal_stamps_still_have_a_rate():
     assert frame_rate(np.arange(5) * 33_333_333) == pytest.approx(30.0, abs=0.01)
     assert frame_rate(np.zeros(5, dtype=np.int64)) == 1.0
     assert frame_rate(np.array([0])) == 1.0
+
+
+def test_a_video_that_the_encoder_could_not_finish_is_seen(tmp_path):
+    import imageio_ffmpeg
+
+    path = tmp_path / "a.mp4"
+    encoder = imageio_ffmpeg.write_frames(str(path), (64, 48), ffmpeg_log_level="error")
+    encoder.send(None)
+    for grey in (0, 100, 200):
+        encoder.send(np.full((48, 64, 3), grey, np.uint8))
+    encoder.close()
+    data = path.read_bytes()
+    assert is_complete(path)
+    for length in (0, 5, 40, len(data) // 2, len(data) - 1):
+        path.write_bytes(data[:length])
+        assert not is_complete(path)

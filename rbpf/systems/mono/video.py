@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -239,9 +239,21 @@ def _waiting(run: VideoRun) -> PoseLaw | None:
     return PoseLaw(SE3.identity(), np.zeros((6, 6)), start_std(run.config.velocity))
 
 
+def _fitting(run: VideoRun, frame: ImageFrame) -> ImageFrame:
+    """The frame, without its image if that is not what the camera takes: readers see to it, other sources may not."""
+    camera, image = run.sequence.camera, frame.image
+    if image is None or (image.shape == (camera.height, camera.width) and image.dtype == np.uint8):
+        return frame
+    problem = (
+        f"expected {camera.width}x{camera.height} grey levels of 8 bits, got {image.shape} {image.dtype}"
+    )
+    return replace(frame, image=None, problem=f"the image is not used: {problem}")
+
+
 def _frame(run: VideoRun, t: int, frame: ImageFrame, law: PoseLaw | None) -> None:
     started = time.perf_counter()
-    frame, was_lost, never_found = run.recovery.checked(frame), run.sensor.lost, run.recovery.never_found
+    frame, was_lost = run.recovery.checked(_fitting(run, frame)), run.sensor.lost
+    never_found = run.recovery.never_found
     law = law or run.recovery.law(frame, run.filter)
     report = run.filter.step(frame, law, frame.stamp_ns)
     run.recovery.note(frame, run.filter)

@@ -200,6 +200,8 @@ def _frame(run: StereoRun, t: int, frame: Any) -> None:
         run.filter.steps == 0 or triggered(at.since_update, run.config.trigger, t - run.last_update)
     ):
         _update(run, t, at.since_update)
+    if whole:
+        run.front_end.note(t, at.agree, bool(run.updated[t]))
     estimate = moved_on(run.at_update, at.since_update) if not run.updated[t] else run.at_update
     run.world_from_camera[t], run.cov[t] = estimate.mean, estimate.cov
     run.seconds[t] = time.perf_counter() - started

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rbpf.errors import InputError
 from rbpf.sensors.readers.table import Table, parse_table
 from rbpf.sensors.readers.text import line_error, quoted, read_lines
 
@@ -28,6 +29,9 @@ class KnownPixels:
         std_m: (M,) standard deviation of each position, m.
         own_frame: the positions are in a frame of the points' own, as a chessboard's, of which the recording's ground
             truth knows nothing.
+
+    Raises:
+        InputError: a shape is another one, a number is not finite, or a standard deviation is negative.
     """
 
     names: np.ndarray
@@ -35,6 +39,18 @@ class KnownPixels:
     positions: np.ndarray
     std_m: np.ndarray
     own_frame: bool = False
+
+    def __post_init__(self) -> None:
+        """Checks what is given: the points may be made by hand."""
+        count = np.size(self.names)
+        for name, shape in (("px", (count, 2)), ("positions", (count, 3)), ("std_m", (count,))):
+            values = getattr(self, name)
+            if np.shape(values) != shape or not np.isfinite(values).all():
+                raise InputError(f"{name} of {count} known points must be {shape} finite numbers")
+        if (np.asarray(self.std_m) < 0.0).any():
+            raise InputError(
+                "the standard deviation of a known point is negative: std_m must be zero or more"
+            )
 
 
 def read_known_points(path: str | Path) -> KnownPixels:

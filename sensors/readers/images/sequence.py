@@ -47,6 +47,9 @@ class ImageSequence:
         truth: world_from_camera of the (left) camera at its own stamps, without landmarks; None where unknown.
         baseline_m: of a rectified stereo pair, None where there is one camera.
         source: where the images come from.
+
+    Raises:
+        InputError: the stamps are no whole numbers, or one is before the one it follows.
     """
 
     name: str
@@ -55,6 +58,16 @@ class ImageSequence:
     truth: CameraTruth | None
     baseline_m: float | None
     source: Source
+
+    def __post_init__(self) -> None:
+        """Checks the stamps: a sequence may be made by hand."""
+        stamps = np.asarray(self.stamps_ns)
+        if stamps.ndim != 1 or stamps.dtype.kind not in "iu":
+            raise InputError(
+                f"{self.name}: stamps_ns must be (T,) whole numbers, got {stamps.shape} {stamps.dtype}"
+            )
+        if (late := np.flatnonzero(np.diff(stamps) < 0)).size:
+            raise InputError(f"{self.name}: the stamp of image {late[0] + 1} is before the one it follows")
 
     def __len__(self) -> int:
         return len(self.stamps_ns)

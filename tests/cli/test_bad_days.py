@@ -1,0 +1,170 @@
+"""Full disks, killed runs, damaged files: one sentence, no traceback, and nothing finished is lost."""
+
+import json
+import resource
+import shutil
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+from rbpf.cli import main
+from rbpf.errors import InputError
+from rbpf.sensors.pinhole import RectifiedStereo
+from rbpf.sensors.readers.images import open_images, open_stereo
+from rbpf.systems.mono.config import MonoConfig
+from rbpf.systems.mono.video import run_images
+from rbpf.systems.range_bearing.config import RangeBearingConfig
+from rbpf.systems.stereo.config import StereoConfig
+from rbpf.systems.stereo.run import run_images as run_pairs
+from rbpf.validation.file_faults import FILE_FAULTS, damaged_copy, kill_and_resume, run_command
+from rbpf.validation.range_bearing import start_run
+from rbpf.validation.simulation.exposure import Imaging
+from rbpf.validation.simulation.images import simulate_images
+from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
+from rbpf.validation.simulation.textured_desk import TexturedDesk
+from rbpf.validation.writing import whole
+from tests.cli.mono_sequences import CAMERA, FRAMES
+
+ONE_IMAGE = {"an image truncated"}
+"""The damage that a run survives."""
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory):
+    """Pairs of images; the monocular system takes the left ones."""
+    folder = tmp_path_factory.mktemp("rendered") / "desk"
+    world = TexturedDesk(frames=FRAMES, texel_m=0.003)
+    simulate_images(world, Imaging(noise_std=1.0), RectifiedStereo(CAMERA, 0.12), folder, seed=1)
+    return folder
+
+
+@contextmanager
+def full_disk(most_bytes):
+    """No file grows beyond so many bytes: what writes more gets an error, as on a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def command(desk, out, *more):
+    known = ["--known-points", str(desk / "known_points.csv"), "--particles", "8", "--no-video", "--no-batch"]
+    return ["run", "mono", str(desk), *known, "--out", str(out), *more]
+
+
+def said(capsys):
+    """The one sentence of a command that failed."""
+    error = capsys.readouterr().err
+    assert "Traceback" not in error
+    sentence = error[error.index("rbpf: ") :]
+    assert sentence.count("\n") == 1
+    return sentence
+
+
+@pytest.mark.parametrize("name", sorted(FILE_FAULTS))
+def test_damaged_files(desk, tmp_path, capsys, name):
+    copy = damaged_copy(desk, FILE_FAULTS[name], tmp_path / "copy")
+    code = main(command(copy, tmp_path / "run"))
+    if name in ONE_IMAGE:
+        entries = json.loads((tmp_path / "run" / "summary.json").read_text())
+        assert code == 0 and entries["frames_tracked"] == FRAMES and "frame 8" in entries["problems"][0]
+    else:
+        assert code == 2 and str(copy) in said(capsys)
+        assert not (tmp_path / "run" / "summary.json").exists()
+
+
+@pytest.mark.parametrize("most_bytes", [500, 20_000, 60_000])
+def test_results_on_a_full_disk(desk, tmp_path, capsys, most_bytes):
+    """What is there afterwards is whole; with room again the run goes on from what there was."""
+    out = tmp_path / "run"
+    with full_disk(most_bytes):
+        assert main(command(desk, out)) == 2
+    assert "cannot be written: File too large" in said(capsys)
+    assert not list(out.glob("*.partial*"))
+    for path in out.glob("*.npz"):
+        np.load(path).close()
+    assert main(command(desk, out, "--resume")) == 0
+    assert json.loads((out / "summary.json").read_text())["frames"] == FRAMES
+
+
+def test_no_room_for_checkpoints(desk, tmp_path):
+    """The runs go on to the end and say it; the old checkpoint stays."""
+    place = tmp_path / "checkpoint.npz"
+    mono, stereo = MonoConfig(particles=8, checkpoint_every=5), StereoConfig(particles=20, checkpoint_every=5)
+    runs = {
+        "mono": lambda: run_images(open_images(desk), mono, checkpoint=place),
+        "stereo": lambda: run_pairs(open_stereo(desk), stereo, checkpoint=place),
+    }
+    for run in runs.values():
+        place.write_bytes(b"the last one")
+        with full_disk(1000):
+            done = run()
+        notes = getattr(done, "problems", None) or done.notes
+        assert done.stamps_ns.size == FRAMES and done.failure is None
+        assert sum("no checkpoint is kept" in note and "File too large" in note for note in notes) == 4
+        assert place.read_bytes() == b"the last one"
+        assert [path.name for path in tmp_path.iterdir()] == ["checkpoint.npz"]
+
+
+def test_no_room_for_checkpoints_of_a_robot(tmp_path):
+    simulate_robot(RobotWorld(steps=12, landmarks=10), tmp_path / "log", seed=0)
+    with full_disk(1000):
+        done = start_run(tmp_path / "log", RangeBearingConfig(particles=5, checkpoint_every=5), tmp_path)
+    assert done.filter.steps == 12
+    assert len(done.problems) == 3 and all("no checkpoint is kept" in problem for problem in done.problems)
+
+
+def test_a_place_that_cannot_be_written_to(tmp_path):
+    (tmp_path / "file.txt").write_text("before")
+    refused = pytest.raises(InputError, match=r"file\.txt cannot be written: File too large")
+    with refused, full_disk(10), whole(tmp_path / "file.txt") as temporary:
+        temporary.write_text("x" * 100)
+    assert [path.name for path in tmp_path.iterdir()] == ["file.txt"]
+    assert (tmp_path / "file.txt").read_text() == "before"
+
+
+def test_a_stereo_run_is_finished_once(desk, tmp_path, monkeypatch):
+    """Killed while it draws, it does not measure a single pair again."""
+    out = tmp_path / "run"
+    arguments = ["run", "stereo", str(desk), "--particles", "20", "--out", str(out)]
+    assert main(arguments) == 0
+    first = (out / "trajectory.tum").read_bytes()
+    (out / "trajectory.tum").unlink()
+    monkeypatch.setattr("rbpf.systems.stereo.run._frame", None)
+    assert main([*arguments, "--resume"]) == 0
+    assert (out / "trajectory.tum").read_bytes() == first
+
+
+@pytest.mark.slow
+def test_killed_at_random_moments_and_resumed(desk, tmp_path):
+    every = ["--set", "checkpoint_every=2"]
+    assert main(command(desk, tmp_path / "whole", *every)) == 0
+    out = tmp_path / "killed"
+    ended = kill_and_resume(command(desk, out, *every), out, 3, np.random.default_rng(1), longest_s=0.5)
+    assert ended.code == 0 and not ended.traceback
+    for name in ("trajectory.tum", "map.csv", "diagnostics.csv", "observations.csv"):
+        assert (out / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+
+
+@pytest.mark.slow
+def test_a_full_disk_in_a_process_of_its_own(desk, tmp_path):
+    ended = run_command(command(desk, tmp_path / "run"), most_bytes=20_000)
+    assert ended.code == 2 and not ended.traceback and "cannot be written: File too large" in ended.said
+
+
+def test_a_damaged_checkpoint_leaves_the_results(desk, tmp_path, capsys):
+    out = tmp_path / "run"
+    assert main(command(desk, out)) == 0
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    checkpoint = out / "checkpoint.npz"
+    checkpoint.write_bytes(checkpoint.read_bytes()[:-700])
+    capsys.readouterr()
+    assert main(command(desk, out, "--resume")) == 2
+    assert "checkpoint.npz is damaged or cut off" in said(capsys)
+    assert {path.name: path.read_bytes() for path in out.iterdir() if path != checkpoint} == {
+        name: data for name, data in before.items() if name != "checkpoint.npz"
+    }
+    shutil.rmtree(out)
