@@ -4,7 +4,7 @@ BIN := .venv/bin
 STAMP := .venv/stamp
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test check bench docs clean
+.PHONY: help setup demo test check bench coverage docs clean
 
 help:
 	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' Makefile
@@ -36,10 +36,13 @@ check: $(STAMP) ## format, lint, types, import rules and the fast tests
 bench: $(STAMP) ## run the benchmarks against their baselines
 	$(BIN)/python -m benchmarks
 
+coverage: $(STAMP) ## all tests, with the share of lines that they run
+	$(BIN)/python -m pytest -n 2 --cov --cov-report=term --cov-report=html:coverage
+
 docs: $(STAMP) ## build the documentation into docs/_build
 	$(BIN)/sphinx-build -W -b html docs docs/_build/html
 
 clean: ## remove everything that make made, .venv included
-	rm -rf .venv demo build dist *.egg-info docs/_build .mypy_cache .pytest_cache .ruff_cache \
+	rm -rf .venv demo build dist coverage .coverage *.egg-info docs/_build .mypy_cache .pytest_cache .ruff_cache \
 	  .hypothesis .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

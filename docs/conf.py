@@ -19,6 +19,7 @@ extensions = [
     "sphinx.ext.mathjax",
     "from_code",
     "plain_docstrings",
+    "short_signatures",
 ]
 exclude_patterns = ["_build", "_ext"]
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}

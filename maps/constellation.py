@@ -13,7 +13,8 @@ from rbpf.models import Landmark, Records
 MOST = 12
 """Points that may each have an error of their own; a record's covariance grows with the square of their number."""
 ROUNDS = 20
-"""Gauss-Newton steps to the frame at most; it starts from the closed solution for equal errors."""
+"""Gauss-Newton steps to the frame at most; it starts from the closed solution for equal errors,
+of the points' means over the particles."""
 SETTLED = 1e-10
 """Length of the last step, radians and metres."""
 LEAST = 1e-12
@@ -106,9 +107,8 @@ class UncertainConstellation(Landmark):
 
     def frame(self, records: Records) -> tuple[np.ndarray, np.ndarray]:
         """world_from_group (N, 7), a factor (N, 6, 6) of its covariance in the right chart there; of one landmark."""
-        frame, _, slope, info = self._fit(records)
-        moved = slope @ records.cov[:, 0] @ np.swapaxes(slope, -1, -2)
-        return frame, gaussian.psd_factor(gaussian.symmetrise(moved + np.linalg.inv(info)))
+        frame, _, _, cov = self._fit(records)
+        return frame, gaussian.psd_factor(cov)
 
     def in_world(self, records: Records) -> np.ndarray:
         """The points (N, M, 3) of one landmark."""
@@ -116,14 +116,15 @@ class UncertainConstellation(Landmark):
 
     def in_group(self, records: Records) -> tuple[np.ndarray, np.ndarray]:
         """The points in their own frame: means (N, M, 3) and covariances (N, M, 3, 3)."""
-        frame, local, slope, info = self._fit(records)
+        frame, slope, cov_fit, _ = self._fit(records)
+        local = SE3.inverse_transform(frame[:, None], self.in_world(records))
         of_frame = by_frame(local)
         by_points = of_frame @ slope[:, None]
         back = np.swapaxes(SE3.rotation(frame), -1, -2)
         for m in range(len(self.points)):
             by_points[:, m, :, 3 * m : 3 * m + 3] += back
         covs = by_points @ records.cov[:, :1, :, :] @ np.swapaxes(by_points, -1, -2)
-        of_fit = of_frame @ np.linalg.inv(info)[:, None] @ np.swapaxes(of_frame, -1, -2)
+        of_fit = of_frame @ cov_fit[:, None] @ np.swapaxes(of_frame, -1, -2)
         return local, gaussian.symmetrise(covs + of_fit)
 
     def _points_of(self, mean: np.ndarray) -> np.ndarray:
@@ -133,26 +134,19 @@ class UncertainConstellation(Landmark):
         """The frame (N, 7) that fits the shape to the points: Gauss-Newton on r_m = T⁻¹ p_m − k_m, weighed as e_m.
 
         Returns:
-            The frame; the points (N, M, 3) in it; the frame's derivative by all points (N, 6, 3M); the information
-            (N, 6, 6) about the frame that the shape leaves when the points are known.
+            The frame; its derivative by all points (N, 6, 3M); its covariance (N, 6, 6) given the points, which the
+            errors of the shape leave; and that of all.
         """
+        from rbpf.kernels.rigid_fit import rigid_fit
+
         world, given = self.in_world(records), np.asarray(self.points)
-        weight = np.asarray(self._info_points)
-        frame = _closed_fit(given, world)
-        for _ in range(ROUNDS):
-            local = SE3.inverse_transform(frame[:, None], world)
-            of_frame = by_frame(local)
-            weighed = np.swapaxes(of_frame, -1, -2) @ weight
-            info = (weighed @ of_frame).sum(axis=1)
-            vector = (weighed @ (local - given)[..., None]).sum(axis=1)
-            step = -np.linalg.solve(info, vector)[..., 0]
-            frame = SE3.retract(frame, step)
-            if np.abs(step).max() <= SETTLED:
-                break
-        back = np.swapaxes(SE3.rotation(frame), -1, -2)
-        by_point = -np.linalg.solve(info[:, None], weighed @ back[:, None])
-        slope = np.moveaxis(by_point, 1, 2).reshape(len(frame), 6, self.dim)
-        return frame, SE3.inverse_transform(frame[:, None], world), slope, info
+        n, start = world.shape[0], _closed_fit(given, world.mean(axis=0)[None])
+        frame, slope = np.empty((n, 7)), np.empty((n, 6, self.dim))
+        cov_fit, cov = np.empty((n, 6, 6)), np.empty((n, 6, 6))
+        held = (np.ascontiguousarray(part) for part in (world, records.cov[:, 0]))
+        shape = (given, np.asarray(self._info_points), start)
+        rigid_fit(*held, *shape, ROUNDS, SETTLED, frame, slope, cov_fit, cov)
+        return frame, slope, cov_fit, cov
 
 
 def by_frame(local: np.ndarray) -> np.ndarray:

@@ -14,12 +14,13 @@ from rbpf.likelihoods import Gaussian
 from rbpf.maps.layout import Layout
 from rbpf.maps.plan import BOTH, MAP, STATE, Plan, by_use, make_plan, require_apart
 from rbpf.maps.point import Point
-from rbpf.maps.reading import project_compiled, read_records
+from rbpf.maps.reading import linearise_compiled, project_compiled, read_records
 from rbpf.maps.rows import RowEngine
 from rbpf.maps.shared import ALL, SharedStore
 from rbpf.models import (
     Births,
     Conditional,
+    Jacobians,
     Landmark,
     LogDensities,
     ObservationModel,
@@ -122,6 +123,21 @@ class LandmarkMap(Conditional):
         kernel = model.kernel()
         assert kernel is not None
         return project_compiled(self.store, self._layout_of(int(ids[0])), kernel, ids, anchor, weights, prior)
+
+    def innovations(
+        self, model: ObservationModel, z: np.ndarray, ids: np.ndarray, state: np.ndarray, particle: int
+    ) -> tuple[np.ndarray, Jacobians, Records]:
+        """Of landmarks (K,) measured as z (K, p), in one particle at a state (E,).
+
+        Returns:
+            ν (K, p), its Jacobians (K, p, …), and the records (1, K, …).
+        """
+        records = self.read(ids, slice(particle, particle + 1))
+        kernel = model.kernel() if self.compiled else None
+        if kernel is not None and self._layout_of(int(ids[0])).landmark.components == 1:
+            return *linearise_compiled(kernel, records, z, state, self.space.dim), records
+        const = None if records.const is None else records.const[0]
+        return *linearise(model, self.space, z, state[None], records.mean[0], const), records
 
     def landmark_of(self, landmark_id: int) -> Landmark:
         """The parametrisation of a landmark."""

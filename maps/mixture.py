@@ -10,7 +10,7 @@ from rbpf.models import Landmark, Records
 
 @final
 class MixturePoint(Landmark):
-    """A world point as C weighted Gaussians, as the ring that a range-only beacon leaves.
+    """A world point as C weighted Gaussians, as the ring that a range-only beacon leaves: Mathematics (mixture).
 
     Args:
         components: C, at least 2.

@@ -4,9 +4,10 @@ import numpy as np
 
 from rbpf.kernels.gather import gather
 from rbpf.kernels.project import project
+from rbpf.kernels.single import linearise_one
 from rbpf.maps.layout import Layout
 from rbpf.maps.shared import ALL, SharedStore
-from rbpf.models import FusedKernel, Records
+from rbpf.models import FusedKernel, Jacobians, Records
 from rbpf.proposals import Prior
 
 
@@ -15,13 +16,31 @@ def read_records(
 ) -> Records:
     """Estimates (N, K, …) of landmarks (K,) of one parametrisation, in all or some particles; cold ones stay cold."""
     landmark = layout.landmark
-    if particles is not ALL or landmark.components > 1 or not store.is_warm(ids):
+    if landmark.components > 1 or not store.is_warm(ids):
         return layout.unpack(np.array([store.read(int(i), particles) for i in ids]))
-    n, k, dim = store.n, ids.size, landmark.dim
     access = store.access(ids)
+    maps = access.maps if particles is ALL else np.ascontiguousarray(access.maps[:, particles])
+    n, k, dim = maps.shape[1], ids.size, landmark.dim
     mean, cov, const = np.empty((n, k, dim)), np.empty((n, k, dim, dim)), np.empty((n, k, landmark.constants))
-    gather(access.pool, access.slabs, access.which, access.maps, mean, cov, const)
+    gather(access.pool, access.slabs, access.which, maps, mean, cov, const)
     return Records(mean, cov, const if landmark.constants else None)
+
+
+def linearise_compiled(
+    kernel: FusedKernel, records: Records, z: np.ndarray, state: np.ndarray, dim: int
+) -> tuple[np.ndarray, Jacobians]:
+    """Innovations (K, p) and Jacobians of one particle's landmarks, records (1, K, …), at its state (E,).
+
+    The twin of `rbpf.numeric.linearise`, for a state of `dim` coordinates.
+    """
+    mean = records.mean[0]
+    count, p = z.shape
+    const = np.empty((count, 0)) if records.const is None else records.const[0]
+    jac_state, jac_landmark = np.empty((count, p, dim)), np.empty((count, p, mean.shape[1]))
+    nu = np.empty((count, p))
+    arrays = (np.ascontiguousarray(array, dtype=float) for array in (state, mean, const, z))
+    linearise_one(kernel.function.address, kernel.params, *arrays, nu, jac_state, jac_landmark)
+    return nu, Jacobians(jac_state, jac_landmark)
 
 
 def project_compiled(
@@ -41,7 +60,7 @@ def project_compiled(
     access = store.access(ids)
     mean, cov = np.empty((count, p)), np.empty((count, p, p))
     project(
-        kernel.function,
+        kernel.function.address,
         kernel.params,
         np.ascontiguousarray(prior.predicted()),
         access.pool,

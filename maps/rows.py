@@ -102,7 +102,7 @@ class RowEngine:
         run_driver(
             refine,
             state.shape[0] * batch.ks.size,
-            kernel.function,
+            kernel.function.address,
             kernel.params,
             np.ascontiguousarray(state),
             access.pool,
@@ -136,7 +136,7 @@ class RowEngine:
         run_driver(
             update,
             state.shape[0] * batch.ks.size,
-            kernel.function,
+            kernel.function.address,
             kernel.params,
             np.ascontiguousarray(state),
             access.pool,

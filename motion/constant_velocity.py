@@ -1,6 +1,6 @@
 """Constant velocity on SE(3), driven by white-noise acceleration (E06 §3.1).
 
-    T_t = T_{t−1} Exp(δ v_{t−1} + w₁),   v_t = v_{t−1} + w₂,   cov(w₁, w₂) = Q of E06 (5)
+    T_t = T_{t−1} Exp(δ v_{t−1} + w₁),   v_t = v_{t−1} + w₂,   cov(w₁, w₂) = Q of E06 (5), Mathematics (velocity-noise)
 
 The velocity v = [ω, v] is that of the body in its own frame. E06 writes camera_from_world with the exponential on the
 left: the same motion, with the sign of v reversed.
@@ -36,7 +36,7 @@ class PoseLaw:
 
 
 def velocity_walk(std_walk: np.ndarray, dt: float) -> np.ndarray:
-    """Factor L (12, 12) of E06 (5), Q = L Lᵀ, in closed form; its first six columns are what moves the pose.
+    """Factor L (12, 12) of E06 (5), Q = L Lᵀ, Mathematics (velocity-factor); its first six columns move the pose.
 
     The last six columns carry the variance δΣ/4 that the velocity keeps once the pose is given.
 

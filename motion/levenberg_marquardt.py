@@ -2,7 +2,7 @@
 
 Minimises ½‖ε(x)‖² with the correction x ⊕ (−χ), where χ solves S05 (15)–(16) with d = 0 in the least-squares sense,
 
-    [J; λI] χ = [ε; 0],    J = ∂ε/∂ξ of ε(x ⊕ ξ).
+    [J; λI] χ = [ε; 0],    J = ∂ε/∂ξ of ε(x ⊕ ξ),    Mathematics (vo-step).
 
 With J = U S Vᵀ that is χ = V diag(s / (s² + λ²)) Uᵀε for every λ, so that a step that is tried again with more damping
 costs no decomposition. λ follows the ratio of the decrease found to the decrease promised (H. B. Nielsen 1999).

@@ -5,7 +5,7 @@ proportional to the inverse depth ρ̂, and the square of a noisy ρ̂ is larger
 average. With the information I = Σ JᵀS⁻¹J as found and D = Σ var ρ̂ (∂J/∂ρ)ᵀS⁻¹(∂J/∂ρ), the derivative of the score
 is I − D while the score itself has the covariance I, because ν is independent of m̂. Hence (W. Fuller 1987, §3.2)
 
-    cov = (I − D)⁻¹ I (I − D)⁻¹.
+    cov = (I − D)⁻¹ I (I − D)⁻¹,    Mathematics (vo-covariance).
 
 Leaving out what lies beyond a gate costs true matches, and the farthest, which speak most: the rest determines the
 motion less well than as many that were not chosen would.

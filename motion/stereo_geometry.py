@@ -3,7 +3,7 @@
 A homogeneous point X = (x, y, z, ρ) in the left camera's frame, at (x, y, z) / ρ, and its pixels m = (u_left, v,
 u_right) are related by (m, 1) ~ Q X. A point seen at m is seen after a motion T = previous_camera_from_camera at g with
 
-    (g, 1) ~ H (m, 1),    H = Q T⁻¹ Q⁻¹,
+    (g, 1) ~ H (m, 1),    H = Q T⁻¹ Q⁻¹,    Mathematics (vo-homography),
 
 a homography, which does not notice where infinity is: noise may well make the disparity of a far point negative.
 """
@@ -98,7 +98,7 @@ class Seen:
 
     @property
     def by_motion(self) -> Array:
-        """(…, 3, 6) ∂g/∂ξ, order [ω, v]."""
+        """(…, 3, 6) ∂g/∂ξ, order [ω, v]: Mathematics (vo-jacobian)."""
         return np.concatenate([self.by_turn, self.nearness[..., None, None] * self.by_nearness], axis=-1)
 
 

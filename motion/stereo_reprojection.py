@@ -3,9 +3,10 @@
 Both measurements are noisy, z⁻ = m + v⁻ and z = g(T, m) + v ({py:mod}`rbpf.motion.stereo_geometry`). About any m̂,
 eliminating m leaves
 
-    ν = z − g(T, m̂) − A (z⁻ − m̂),    A = ∂g/∂m,    cov ν = S = R + A R⁻ Aᵀ.
+    ν = z − g(T, m̂) − A (z⁻ − m̂),   A = ∂g/∂m,   cov ν = S = R + A R⁻ Aᵀ
 
-A R⁻ Aᵀ is J_P C J_Pᵀ with the covariance C of the earlier point in space. `Points` says which m̂.
+by Mathematics (vo-innovation). A R⁻ Aᵀ is J_P C J_Pᵀ with the covariance C of the earlier point in space. `Points`
+says which m̂: by default that of least Mathematics (vo-profile).
 """
 
 from dataclasses import dataclass

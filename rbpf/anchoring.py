@@ -6,7 +6,7 @@ when the whole world is moved (odometry, sensors that measure relative to the ro
 be re-estimated from its own map: given the rest of the trajectory and the map without the first frame's measurements,
 x_0 has the law of a filter step run backwards,
 
-    p(x_0 | x_1, u_1, z_0, m) ∝ p(x_1 | x_0, u_1) p(z_0 | x_0, m),
+    p(x_0 | x_1, u_1, z_0, m) ∝ p(x_1 | x_0, u_1) p(z_0 | x_0, m),    Mathematics (start-again)
 
 which leaves the posterior invariant (a Gibbs step for x_0, W. Gilks and C. Berzuini 2001) and, taken as the Gaussian
 that it is instead of a draw from it, marginalises the world's place exactly. Poses and landmarks are then reported

@@ -1,8 +1,8 @@
 """Maximum-likelihood association per particle, with mutual exclusion, first sightings and clutter.
 
 Each measurement is explained by a landmark within the gate, by a new landmark (only where nothing known is near), or
-by clutter; no landmark explains two. Costs are negative log-densities in the measurement's units, so that the choice
-and the particle's weight speak of the same thing.
+by clutter; no landmark explains two. Costs, Mathematics (association-cost), are negative log-densities in the
+measurement's units, so that the choice and the particle's weight speak of the same thing.
 """
 
 from dataclasses import dataclass

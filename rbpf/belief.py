@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -28,17 +29,17 @@ class Belief:
     prior: Prior
     marginals: Marginals
 
-    @property
+    @cached_property
     def state(self) -> np.ndarray:
         """(N, E) predicted states, or sampled ones after the update."""
         return self.prior.predicted()
 
-    @property
+    @cached_property
     def weights(self) -> np.ndarray:
         """(N,) summing to one."""
         return np.exp(self.log_weights)
 
-    @property
+    @cached_property
     def mode(self) -> int:
         """The particle of highest weight."""
         return int(np.argmax(self.log_weights))
@@ -63,6 +64,17 @@ class Belief:
         """Estimates (N, K, …) of landmarks of one parametrisation, in all particles or in the rows named."""
         return self.map.read(np.asarray(ids, dtype=np.int64), particles)
 
+    def read_mode(self, ids: Sequence[int] | np.ndarray) -> Records:
+        """Estimates (1, K, …) in the particle of highest weight alone."""
+        return self.read(ids, slice(self.mode, self.mode + 1))
+
+    def innovations(
+        self, model: ObservationModel, z: np.ndarray, ids: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of K measurements in the particle of highest weight: ν (K, p), ∂z/∂state (K, p, d) and J P Jᵀ (K, p, p)."""
+        nu, jac, records = self.map.innovations(model, z, ids, self.state[self.mode], self.mode)
+        return nu, jac.state, jac.landmark @ records.cov[0] @ np.swapaxes(jac.landmark, -1, -2)
+
     def predictions(
         self, model: ObservationModel, z: np.ndarray, cov: np.ndarray, ids: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
@@ -82,13 +94,13 @@ class Belief:
 
         The covariance is within + between particles, H Q Hᵀ included, without the measurement's own noise.
         """
-        records = self.read(ids)
         if self.map.is_compiled(model, ids):
-            const = None if records.const is None else records.const[self.mode]
-            anchor = model.predict(self.state[self.mode][None], records.mean[self.mode], const)
+            at_mode = self.read_mode(ids)
+            const = None if at_mode.const is None else at_mode.const[0]
+            anchor = model.predict(self.state[self.mode][None], at_mode.mean[0], const)
             mean, cov = self.map.project(model, ids, anchor, self.weights, self.prior)
             return anchor + mean, cov
-        state = self.state[:, None, :]
+        records, state = self.read(ids), self.state[:, None, :]
         predicted = model.predict(state, records.mean, records.const)
         mode = predicted[self.mode]
         offset, jac = linearise(model, self.prior.space, predicted, state, records.mean, records.const)

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from rbpf.arrays import Bool, Float, Int
+
 if TYPE_CHECKING:
     from rbpf.models import Landmark, Likelihood, ObservationModel
 
@@ -27,41 +29,46 @@ class Part(Enum):
     LANDMARK = "landmark"
     SUBSTATE = "linear substate"
 
+    __hash__ = object.__hash__
+    """Members are single objects; Enum's own hash, asked for at every use of a set of parts, is run by Python."""
+
 
 @dataclass(frozen=True)
 class Transition:
     """p(x_t, s_t | x_{t-1}, s_{t-1}, u_t): ε = B s + w₁ in the right chart at `mean`; s_t = A s + b + w₂.
 
+    Mathematics (substate).
+
     Arrays may have a first axis of length 1 where they do not differ between particles.
 
     Attributes:
         mean: (N, E) chart's origin, x_t = mean · Exp(ε).
-        noise_factor: (N or 1, d+m, r) L with cov(w₁, w₂) = L Lᵀ; may be singular.
+        noise_factor: (N or 1, joint = d+m, r) L with cov(w₁, w₂) = L Lᵀ; may be singular.
         coupling: B, (N or 1, d, m); None where there is no substate.
         dynamics: A, (N or 1, m, m).
         drift: b, (N or 1, m).
     """
 
-    mean: np.ndarray
-    noise_factor: np.ndarray
-    coupling: np.ndarray | None = None
-    dynamics: np.ndarray | None = None
-    drift: np.ndarray | None = None
+    mean: Float[np.ndarray, "N E"]
+    noise_factor: Float[np.ndarray, "#N joint r"]
+    coupling: Float[np.ndarray, "#N d m"] | None = None
+    dynamics: Float[np.ndarray, "#N m m"] | None = None
+    drift: Float[np.ndarray, "#N m"] | None = None
 
 
 class Jacobians(NamedTuple):
     """Derivatives of a predicted measurement: (…, p, d), (…, p, D), (…, p, m); None where it is not read."""
 
-    state: np.ndarray | None = None
-    landmark: np.ndarray | None = None
-    substate: np.ndarray | None = None
+    state: Float[np.ndarray, "*batch p d"] | None = None
+    landmark: Float[np.ndarray, "*batch p D"] | None = None
+    substate: Float[np.ndarray, "*batch p m"] | None = None
 
 
 class FusedKernel(NamedTuple):
     """A compiled `rbpf.kernels.signature.observation_kernel` and the constants (P,) it is called with."""
 
     function: Any
-    params: np.ndarray
+    params: Float[np.ndarray, " P"]
 
 
 @dataclass(frozen=True)
@@ -75,10 +82,10 @@ class Records:
         log_weights: (N, K, C) log-weights of the components; None where C = 1.
     """
 
-    mean: np.ndarray
-    cov: np.ndarray
-    const: np.ndarray | None = None
-    log_weights: np.ndarray | None = None
+    mean: Float[np.ndarray, "N K *C D"]
+    cov: Float[np.ndarray, "N K *C D D"]
+    const: Float[np.ndarray, "N K A"] | None = None
+    log_weights: Float[np.ndarray, "N K C"] | None = None
 
 
 @dataclass(frozen=True)
@@ -98,11 +105,11 @@ class Observations:
             a measurement, one for each (E06 §5.2: the epipolar part for the state, all of it for the depth).
     """
 
-    z: np.ndarray
-    cov: np.ndarray
+    z: Float[np.ndarray, "K p"]
+    cov: Float[np.ndarray, "K p p"]
     model: "ObservationModel"
     likelihood: "Likelihood | None" = None
-    ids: np.ndarray | None = None
+    ids: Int[np.ndarray, "... K"] | None = None
     log_new: float = 0.0
     log_clutter: float = 0.0
     informs: frozenset[Part] = frozenset({Part.STATE, Part.LANDMARK})
@@ -120,16 +127,16 @@ class Births:
         facts: per landmark, what the catalogue remembers of it (a descriptor, the log's own name).
     """
 
-    z: np.ndarray
-    cov: np.ndarray
+    z: Float[np.ndarray, "K p"]
+    cov: Float[np.ndarray, "K p p"]
     model: "ObservationModel"
     landmark: "Landmark"
-    mask: np.ndarray | None = None
+    mask: Bool[np.ndarray, "N K"] | None = None
     facts: Sequence[Any] = field(default_factory=tuple)
 
 
 class LogDensities(NamedTuple):
     """log p(z | x) (N,) of all observations, and of those that took no part in the refinement."""
 
-    all: np.ndarray
-    late: np.ndarray
+    all: Float[np.ndarray, " N"]
+    late: Float[np.ndarray, " N"]

@@ -1,8 +1,8 @@
 """The Rao-Blackwellised particle filter: one step, for every variant.
 
-    p(x_0:t, m | z_1:t, u_1:t) ≈ Σ_i w_i δ(x_0:t − x_0:t^i) p(m | x_0:t^i, z_1:t)
+    p(x_0:t, m | z_1:t, u_1:t) ≈ Σ_i w_i δ(x_0:t − x_0:t^i) p(m | x_0:t^i, z_1:t)        Mathematics (posterior)
 
-The bootstrap filter, FastSLAM 2.0 and the exact importance ratio differ in the proposal alone.
+The bootstrap filter, FastSLAM 2.0 and the exact importance ratio, Mathematics (correction), differ in the proposal.
 """
 
 from collections.abc import Sequence
@@ -47,7 +47,7 @@ class StepReport:
             proposal that did not look at the observations, the weighted samples.
         ess: effective sample size before resampling.
         resampled: whether the particles were resampled.
-        log_evidence: log p(z_t | z_1:t−1); NaN where a likelihood is not a density.
+        log_evidence: log p(z_t | z_1:t−1), Mathematics (evidence-increment); NaN where a likelihood is not a density.
         nis: weighted mean squared Mahalanobis distance of the joint innovation, NaN without a linearised one.
         rows: its degrees of freedom.
         groups: the observations that were used.

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rbpf.arrays import Bool, Float, Int
 from rbpf.errors import InputError
 from rbpf.exchange import NEW as NEW
 from rbpf.exchange import NULL as NULL
@@ -35,7 +36,7 @@ class MotionModel(ABC):
     space: LieGroup
 
     @abstractmethod
-    def transition(self, state: np.ndarray, control: Any, dt: float) -> Transition:
+    def transition(self, state: Float[np.ndarray, "N E"], control: Any, dt: float) -> Transition:
         """Law of the next state. Given states (N, E), a control and a time step in seconds."""
 
 
@@ -48,19 +49,19 @@ class ObservationModel(ABC):
     @abstractmethod
     def predict(
         self,
-        state: np.ndarray,
-        landmark: np.ndarray | None = None,
-        const: np.ndarray | None = None,
-        substate: np.ndarray | None = None,
-    ) -> np.ndarray:
+        state: Float[np.ndarray, "*#batch E"],
+        landmark: Float[np.ndarray, "*#batch D"] | None = None,
+        const: Float[np.ndarray, "*#batch A"] | None = None,
+        substate: Float[np.ndarray, "*#batch m"] | None = None,
+    ) -> Float[np.ndarray, "*batch p"]:
         """h: plain NumPy that broadcasts over leading axes; (…, E), (…, D), (…, A), (…, m) → (…, p)."""
 
     def jacobians(
         self,
-        state: np.ndarray,
-        landmark: np.ndarray | None = None,
-        const: np.ndarray | None = None,
-        substate: np.ndarray | None = None,
+        state: Float[np.ndarray, "*#batch E"],
+        landmark: Float[np.ndarray, "*#batch D"] | None = None,
+        const: Float[np.ndarray, "*#batch A"] | None = None,
+        substate: Float[np.ndarray, "*#batch m"] | None = None,
     ) -> Jacobians | None:
         """Analytic derivatives, in the right chart at the state; None asks for numeric ones.
 
@@ -68,32 +69,43 @@ class ObservationModel(ABC):
         """
         return None
 
-    def residual(self, z: np.ndarray, predicted: np.ndarray) -> np.ndarray:
+    def residual(
+        self, z: Float[np.ndarray, "*#batch p"], predicted: Float[np.ndarray, "*#batch p"]
+    ) -> Float[np.ndarray, "*batch p"]:
         """Z − h (…, p); override to wrap angles."""
         return z - predicted
 
     def innovation(
         self,
-        z: np.ndarray,
-        state: np.ndarray,
-        landmark: np.ndarray | None = None,
-        const: np.ndarray | None = None,
-        substate: np.ndarray | None = None,
-    ) -> np.ndarray:
+        z: Float[np.ndarray, "*#batch p"],
+        state: Float[np.ndarray, "*#batch E"],
+        landmark: Float[np.ndarray, "*#batch D"] | None = None,
+        const: Float[np.ndarray, "*#batch A"] | None = None,
+        substate: Float[np.ndarray, "*#batch m"] | None = None,
+    ) -> Float[np.ndarray, "*batch p"]:
         """ν (…, p): residual(z, predict(…)); override, with `jacobians`, for a constraint g(z, x, l) = 0 on z."""
         return self.residual(z, self.predict(state, landmark, const, substate))
 
-    def visible(self, state: np.ndarray, landmark: np.ndarray, const: np.ndarray | None = None) -> np.ndarray:
+    def visible(
+        self,
+        state: Float[np.ndarray, "*#batch E"],
+        landmark: Float[np.ndarray, "*#batch D"],
+        const: Float[np.ndarray, "*#batch A"] | None = None,
+    ) -> Bool[np.ndarray, "*batch"]:
         """Whether the sensor could see the landmark (…), bool; by default always."""
         return np.ones(np.broadcast_shapes(state.shape[:-1], landmark.shape[:-1]), dtype=bool)
 
-    def invert(self, state: np.ndarray, z: np.ndarray) -> np.ndarray:
+    def invert(
+        self, state: Float[np.ndarray, "*#batch E"], z: Float[np.ndarray, "*#batch p"]
+    ) -> Float[np.ndarray, "*batch D"]:
         """The landmark (…, D) that would be measured as z (…, p) from the state, for `initialise`."""
         raise InputError(
             f"{type(self).__name__} cannot start landmarks: override invert(state, z) or initialise(state, z, cov)"
         )
 
-    def initialise(self, state: np.ndarray, z: np.ndarray, cov: np.ndarray) -> Records:
+    def initialise(
+        self, state: Float[np.ndarray, "N E"], z: Float[np.ndarray, "K p"], cov: Float[np.ndarray, "K p p"]
+    ) -> Records:
         """First estimate of landmarks from (N, E), (K, p), (K, p, p); by default `invert` and its numeric Jacobian."""
         from rbpf.numeric import invert_with_covariance
 
@@ -112,10 +124,12 @@ class Landmark(ABC):
     components: int = 1
 
     @abstractmethod
-    def homogeneous(self, mean: np.ndarray, const: np.ndarray | None = None) -> np.ndarray:
+    def homogeneous(
+        self, mean: Float[np.ndarray, "*#batch D"], const: Float[np.ndarray, "*#batch A"] | None = None
+    ) -> Float[np.ndarray, "*batch h"]:
         """World point of (…, D) and (…, A): (…, 4), (…, 3) in the plane; its last entry may be 0, at infinity."""
 
-    def ready(self, records: Records) -> np.ndarray:
+    def ready(self, records: Records) -> Bool[np.ndarray, "N K"]:
         """Whether an estimate is Gaussian enough to be promoted, (N, K) bool; by default never."""
         return np.zeros(records.mean.shape[:2], dtype=bool)
 
@@ -135,10 +149,14 @@ class Likelihood(ABC):
     params: np.ndarray = np.zeros(1)
 
     @abstractmethod
-    def log_density(self, nu: np.ndarray, cov: np.ndarray) -> np.ndarray:
+    def log_density(
+        self, nu: Float[np.ndarray, "*#batch p"], cov: Float[np.ndarray, "*#batch p p"]
+    ) -> Float[np.ndarray, "*batch"]:
         """(…, p), (…, p, p) → (…)."""
 
-    def inlier(self, nu: np.ndarray, cov: np.ndarray) -> np.ndarray:
+    def inlier(
+        self, nu: Float[np.ndarray, "*#batch p"], cov: Float[np.ndarray, "*#batch p p"]
+    ) -> Bool[np.ndarray, "*batch"]:
         """Whether the observation may move the state and the landmark, (…) bool; by default always."""
         return np.ones(nu.shape[:-1], dtype=bool)
 
@@ -178,7 +196,7 @@ class LineariseAt(ABC):
     """What a proposal may ask: the observations' information about the increment."""
 
     @abstractmethod
-    def __call__(self, increment: np.ndarray) -> "Terms":
+    def __call__(self, increment: Float[np.ndarray, "N d"]) -> "Terms":
         """Terms (relative to the prior's mean) linearised at the increments (N, d) in the prior's chart."""
 
 
@@ -192,17 +210,22 @@ class Conditional(ABC):
         """Makes room for n particles whose ancestry `lineage` keeps."""
 
     @abstractmethod
-    def terms(self, state: np.ndarray, groups: Sequence[Observations], prior: "Prior") -> "Terms":
+    def terms(
+        self, state: Float[np.ndarray, "N E"], groups: Sequence[Observations], prior: "Prior"
+    ) -> "Terms":
         """The information of the groups about a right perturbation of the states (N, E)."""
 
     @abstractmethod
     def correct(
-        self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]
+        self,
+        state: Float[np.ndarray, "N E"],
+        increment: Float[np.ndarray, "N d"],
+        groups: Sequence[Observations],
     ) -> LogDensities:
         """Log p(z | x) at the sampled states, and the update by the same observations."""
 
     @abstractmethod
-    def resample(self, ancestors: np.ndarray) -> None:
+    def resample(self, ancestors: Int[np.ndarray, " N"]) -> None:
         """Every particle i becomes a copy of particle ancestors[i]; `lineage` has been advanced."""
 
     def predict(self, transition: Transition, space: LieGroup) -> "Prior":
@@ -228,5 +251,7 @@ class Resampler(ABC):
     """Chooses ancestors in proportion to the weights; E[number of descendants of i] = N W_i."""
 
     @abstractmethod
-    def ancestors(self, weights: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
+    def ancestors(
+        self, weights: Float[np.ndarray, " N"], rng: np.random.Generator
+    ) -> Int[np.ndarray, " N"] | None:
         """(N,) normalised weights → (N,) ancestors, or None for no resampling in this step."""

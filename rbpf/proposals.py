@@ -2,12 +2,13 @@
 
 All densities live in one chart per particle, at the transition's mean, and there in whitened coordinates u:
 ε = μ + L u, so that the prior is N(0, I) even where Q = L Lᵀ is singular. With the information Λ = Σ HᵀS⁻¹H and
-η = Σ HᵀS⁻¹ν about ε − μ, the refined law of u is N(M⁻¹Lᵀη, M⁻¹) with M = I + LᵀΛL, and the joint marginal of the
-observations is log w₁ = −½[Σ νᵀS⁻¹ν − (Lᵀη)ᵀM⁻¹(Lᵀη)] − ½[Σ log|2πS| + log|M|]: E06 (10) for all observations
-together, with their correlation through the pose.
+η = Σ HᵀS⁻¹ν about ε − μ, the refined law of u is N(M⁻¹Lᵀη, M⁻¹), M = I + LᵀΛL, Mathematics (refined), and the
+joint marginal of the observations is log w₁ = −½[Σ νᵀS⁻¹ν − (Lᵀη)ᵀM⁻¹(Lᵀη)] − ½[Σ log|2πS| + log|M|],
+Mathematics (look-ahead): E06 (10) for all observations together, with their correlation through the pose.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import final
 
 import numpy as np
@@ -64,11 +65,22 @@ class Prior:
 
     def predicted(self) -> np.ndarray:
         """States (N, E) at the mean."""
-        return self.base if self.centred else self.at(self.mean)
+        return self._predicted
 
     def spread(self, increment: np.ndarray) -> np.ndarray:
         """The factor (N, d, r) in the charts at the states at increments (N or 1, d), to first order."""
-        return self.factor if self.centred else self.space.right_jacobian(increment) @ self.factor
+        if self.centred:
+            return self.factor
+        return self._spread if increment is self.mean else self.space.right_jacobian(increment) @ self.factor
+
+    @cached_property
+    def _predicted(self) -> np.ndarray:
+        """Asked for several times in a step, as is `_spread`."""
+        return self.base if self.centred else self.at(self.mean)
+
+    @cached_property
+    def _spread(self) -> np.ndarray:
+        return np.asarray(self.space.right_jacobian(self.mean) @ self.factor)
 
     def take(self, ancestors: np.ndarray | slice) -> "Prior":
         """The laws of the ancestors."""

@@ -15,7 +15,7 @@ _UNIT_NORMAL = 1.0 / (2.0 * np.pi)
 
 
 def innovation_covariance(jac: np.ndarray, cov: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """S = J P Jᵀ + R, (N, K, p, p)."""
+    """S = J P Jᵀ + R, (N, K, p, p): Mathematics (innovation-covariance)."""
     cross = gaussian.product(jac, cov)
     return gaussian.symmetrise(gaussian.product(cross, np.swapaxes(jac, -1, -2))) + noise
 

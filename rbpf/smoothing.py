@@ -73,7 +73,7 @@ def backward_simulation(
 def _transition_log_density(
     motion: MotionModel, before: np.ndarray, after: np.ndarray, control: object, dt: float
 ) -> np.ndarray:
-    """Log p(after_j | before_i) up to what does not depend on i, (J, N)."""
+    """Log p(after_j | before_i) up to what does not depend on i, (J, N): Mathematics (backward)."""
     transition = motion.transition(before, control, dt)
     if transition.coupling is not None and transition.coupling.shape[-1]:
         raise InputError("backward simulation takes motion models without a substate")

@@ -52,7 +52,7 @@ class KalmanSubstate(Conditional):
         self.cov = self._cov[None]
 
     def predict(self, transition: Transition, space: LieGroup) -> Prior:
-        """Joint law of (ε, s_t): ε = B s + w₁, s_t = A s + b + w₂, kept as s_t | ε."""
+        """Joint law of (ε, s_t), Mathematics (joint-substate), kept as s_t | ε."""
         if transition.coupling is None or transition.dynamics is None or transition.drift is None:
             raise InputError(
                 "the motion model must give coupling, dynamics and drift: the filter has a Kalman substate"

@@ -129,7 +129,7 @@ class ConstellationView(ObservationModel):
         turned = (
             slope @ (np.swapaxes(SE3.rotation(state[..., :7]), -1, -2) @ SE3.rotation(frame))[..., None, :, :]
         )
-        # a·(−[p]× ω) = (a × p)·ω with the sign of dω × p = −[p]× dω reversed twice.
+        # a·(ω × k) = −(a × k)·ω
         by_frame = np.concatenate([-np.cross(turned, self.points[:, None, :]), turned], axis=-1)
         by_landmark = by_frame @ SE3.right_jacobian(landmark)[..., None, :, :]
         shape = (*slope.shape[:-3], self.dim)

@@ -1,11 +1,17 @@
-"""Compiled twins of the camera's models: one landmark and one measurement at a time, see `camera_points`."""
+"""Compiled twins of the camera's models: one landmark and one measurement at a time, see `camera_points`.
+
+Each loop over the lanes writes few arrays, so that it compiles to vector instructions; rows of the Jacobian by the
+landmark hold where it lies until that Jacobian is due.
+"""
 
 import math
 
+import numpy as np
 from numba import njit
 
+from rbpf.kernels.block import flat
 from rbpf.kernels.quaternion import rotation
-from rbpf.kernels.signature import observation_kernel
+from rbpf.kernels.signature import BLOCK, observation_kernel
 from rbpf.sensors.pinhole_kernels import project
 
 GRAZING = 0.2
@@ -19,116 +25,192 @@ def forward_depth(x, y, z):
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def store_by_state(row, a0, a1, a2, x, y, z, w, jac_state, i):
-    """One row (a0, a1, a2) of the slope: a × c by rotation, −w a by translation."""
-    jac_state[row, 0, i] = a1 * z - a2 * y
-    jac_state[row, 1, i] = a2 * x - a0 * z
-    jac_state[row, 2, i] = a0 * y - a1 * x
-    jac_state[row, 3, i] = -w * a0
-    jac_state[row, 4, i] = -w * a1
-    jac_state[row, 5, i] = -w * a2
+def store_by_state(a0, a1, a2, x, y, z, row, i):
+    """One row a = (a0, a1, a2) of the slope at c = (x, y, z): a × c by rotation, −a by translation."""
+    row[i] = a1 * z - a2 * y
+    row[BLOCK + i] = a2 * x - a0 * z
+    row[2 * BLOCK + i] = a0 * y - a1 * x
+    row[3 * BLOCK + i] = -a0
+    row[4 * BLOCK + i] = -a1
+    row[5 * BLOCK + i] = -a2
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _rotation_at(pose, i):
+    """Rotation of lane i."""
+    return rotation(pose[i], pose[BLOCK + i], pose[2 * BLOCK + i], pose[3 * BLOCK + i])
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def locate(pose, point, n, place):
+    """Points in the camera's frame, their depth kept positive, into the first three rows of `place`."""
+    for i in range(n):
+        r = _rotation_at(pose, i)
+        a, b = point[i] - pose[4 * BLOCK + i], point[BLOCK + i] - pose[5 * BLOCK + i]
+        c = point[2 * BLOCK + i] - pose[6 * BLOCK + i]
+        x = r[0] * a + r[3] * b + r[6] * c
+        y = r[1] * a + r[4] * b + r[7] * c
+        place[i], place[BLOCK + i] = x, y
+        place[2 * BLOCK + i] = forward_depth(x, y, r[2] * a + r[5] * b + r[8] * c)
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def measure(place, z0, z1, params, n, nu, across, down):
+    """Residuals, and both rows by the state, of what lies at `place` in the camera's frame."""
+    camera = (
+        params[0], params[1], params[2], params[3], params[4], params[5], params[6], params[7], params[8]
+    )  # fmt: skip
+    for i in range(n):
+        x, y, depth = place[i], place[BLOCK + i], place[2 * BLOCK + i]
+        px, py, d00, d01, d02, d10, d11, d12 = project(x, y, depth, camera)
+        nu[i], nu[BLOCK + i] = z0 - px, z1 - py
+        store_by_state(d00, d01, d02, x, y, depth, across, i)
+        store_by_state(d10, d11, d12, x, y, depth, down, i)
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def turn(pose, row, n, by_point):
+    """One row by the point, a Rᵀ, from the −a in the row by the state."""
+    for i in range(n):
+        r = _rotation_at(pose, i)
+        a0, a1, a2 = -row[3 * BLOCK + i], -row[4 * BLOCK + i], -row[5 * BLOCK + i]
+        by_point[i] = a0 * r[0] + a1 * r[1] + a2 * r[2]
+        by_point[BLOCK + i] = a0 * r[3] + a1 * r[4] + a2 * r[5]
+        by_point[2 * BLOCK + i] = a0 * r[6] + a1 * r[7] + a2 * r[8]
 
 
 @observation_kernel
 def camera_point(state, mean, const, z, params, n, nu, jac_state, jac_landmark):
     """A world point; params are the camera's."""
+    pose, by_point = flat(state), flat(jac_landmark)
+    across, down = flat(jac_state[0]), flat(jac_state[1])
+    locate(pose, flat(mean), n, by_point)
+    measure(by_point, z[0], z[1], params, n, flat(nu), across, down)
+    turn(pose, across, n, by_point)
+    turn(pose, down, n, by_point[3 * BLOCK :])
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _measure_stereo(place, z, params, n, nu):
+    """Residuals of (u_left, v, u_right); params are fx, fy, cx, cy and the baseline."""
+    fx, fy, cx, cy, baseline = params[0], params[1], params[2], params[3], params[4]
+    z0, z1, z2 = z[0], z[1], z[2]
     for i in range(n):
-        r = rotation(state[0, i], state[1, i], state[2, i], state[3, i])
-        a, b, c = mean[0, i] - state[4, i], mean[1, i] - state[5, i], mean[2, i] - state[6, i]
-        x = r[0] * a + r[3] * b + r[6] * c
-        y = r[1] * a + r[4] * b + r[7] * c
-        depth = forward_depth(x, y, r[2] * a + r[5] * b + r[8] * c)
-        px, py, d00, d01, d02, d10, d11, d12 = project(x, y, depth, params)
-        nu[0, i] = z[0] - px
-        nu[1, i] = z[1] - py
-        store_by_state(0, d00, d01, d02, x, y, depth, 1.0, jac_state, i)
-        store_by_state(1, d10, d11, d12, x, y, depth, 1.0, jac_state, i)
-        for k in range(3):
-            jac_landmark[0, k, i] = d00 * r[3 * k] + d01 * r[3 * k + 1] + d02 * r[3 * k + 2]
-            jac_landmark[1, k, i] = d10 * r[3 * k] + d11 * r[3 * k + 1] + d12 * r[3 * k + 2]
+        x, y, depth = place[i], place[BLOCK + i], place[2 * BLOCK + i]
+        gx, gy = fx / depth, fy / depth
+        nu[i] = z0 - gx * x - cx
+        nu[BLOCK + i] = z1 - gy * y - cy
+        nu[2 * BLOCK + i] = z2 - gx * (x - baseline) - cx
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _store_pixel(place, fx, fy, baseline, n, row):
+    """A row by the state, of fx (x − baseline) / z + fy y / z."""
+    for i in range(n):
+        x, y, depth = place[i], place[BLOCK + i], place[2 * BLOCK + i]
+        gx, gy = fx / depth, fy / depth
+        store_by_state(gx, gy, -(gx * (x - baseline) + gy * y) / depth, x, y, depth, row, i)
 
 
 @observation_kernel
 def stereo_point(state, mean, const, z, params, n, nu, jac_state, jac_landmark):
     """A world point in a rectified pair, z = (u_left, v, u_right); params are fx, fy, cx, cy and the baseline."""
-    fx, fy, cx, cy, baseline = params[0], params[1], params[2], params[3], params[4]
-    for i in range(n):
-        r = rotation(state[0, i], state[1, i], state[2, i], state[3, i])
-        a, b, c = mean[0, i] - state[4, i], mean[1, i] - state[5, i], mean[2, i] - state[6, i]
-        x = r[0] * a + r[3] * b + r[6] * c
-        y = r[1] * a + r[4] * b + r[7] * c
-        depth = forward_depth(x, y, r[2] * a + r[5] * b + r[8] * c)
-        gx, gy = fx / depth, fy / depth
-        left, down, right = gx * x, gy * y, gx * (x - baseline)
-        nu[0, i] = z[0] - left - cx
-        nu[1, i] = z[1] - down - cy
-        nu[2, i] = z[2] - right - cx
-        e, f, g = -left / depth, -down / depth, -right / depth
-        store_by_state(0, gx, 0.0, e, x, y, depth, 1.0, jac_state, i)
-        store_by_state(1, 0.0, gy, f, x, y, depth, 1.0, jac_state, i)
-        store_by_state(2, gx, 0.0, g, x, y, depth, 1.0, jac_state, i)
-        for k in range(3):
-            jac_landmark[0, k, i] = gx * r[3 * k] + e * r[3 * k + 2]
-            jac_landmark[1, k, i] = gy * r[3 * k + 1] + f * r[3 * k + 2]
-            jac_landmark[2, k, i] = gx * r[3 * k] + g * r[3 * k + 2]
+    pose, by_point = flat(state), flat(jac_landmark)
+    left, down, right = flat(jac_state[0]), flat(jac_state[1]), flat(jac_state[2])
+    locate(pose, flat(mean), n, by_point)
+    _measure_stereo(by_point, z, params, n, flat(nu))
+    _store_pixel(by_point, params[0], 0.0, 0.0, n, left)
+    _store_pixel(by_point, 0.0, params[1], 0.0, n, down)
+    _store_pixel(by_point, params[0], 0.0, params[4], n, right)
+    turn(pose, left, n, by_point)
+    turn(pose, down, n, by_point[3 * BLOCK :])
+    turn(pose, right, n, by_point[6 * BLOCK :])
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _ray(state, mean, const, z, params, nu, jac_state, jac_landmark, i):
-    """Residual and derivatives of the full 2-D measurement of lane i."""
-    r = rotation(state[0, i], state[1, i], state[2, i], state[3, i])
-    s = rotation(const[0, i], const[1, i], const[2, i], const[3, i])
-    u, v, rho = mean[0, i], mean[1, i], mean[2, i]
-    ta, tb, tc = const[4, i] - state[4, i], const[5, i] - state[5, i], const[6, i] - state[6, i]
-    a = s[0] * u + s[1] * v + s[2] + rho * ta
-    b = s[3] * u + s[4] * v + s[5] + rho * tb
-    c = s[6] * u + s[7] * v + s[8] + rho * tc
-    x = r[0] * a + r[3] * b + r[6] * c
-    y = r[1] * a + r[4] * b + r[7] * c
-    depth = forward_depth(x, y, r[2] * a + r[5] * b + r[8] * c)
-    px, py, d00, d01, d02, d10, d11, d12 = project(x, y, depth, params)
-    nu[0, i] = z[0] - px
-    nu[1, i] = z[1] - py
-    store_by_state(0, d00, d01, d02, x, y, depth, rho, jac_state, i)
-    store_by_state(1, d10, d11, d12, x, y, depth, rho, jac_state, i)
-    e0 = d00 * r[0] + d01 * r[1] + d02 * r[2]
-    e1 = d00 * r[3] + d01 * r[4] + d02 * r[5]
-    e2 = d00 * r[6] + d01 * r[7] + d02 * r[8]
-    f0 = d10 * r[0] + d11 * r[1] + d12 * r[2]
-    f1 = d10 * r[3] + d11 * r[4] + d12 * r[5]
-    f2 = d10 * r[6] + d11 * r[7] + d12 * r[8]
-    jac_landmark[0, 0, i] = e0 * s[0] + e1 * s[3] + e2 * s[6]
-    jac_landmark[0, 1, i] = e0 * s[1] + e1 * s[4] + e2 * s[7]
-    jac_landmark[0, 2, i] = e0 * ta + e1 * tb + e2 * tc
-    jac_landmark[1, 0, i] = f0 * s[0] + f1 * s[3] + f2 * s[6]
-    jac_landmark[1, 1, i] = f0 * s[1] + f1 * s[4] + f2 * s[7]
-    jac_landmark[1, 2, i] = f0 * ta + f1 * tb + f2 * tc
+def _locate_ray(pose, ray, anchor, n, place):
+    """As `locate`, of directions R_a (u, v, 1) + ρ (t_a − t)."""
+    for i in range(n):
+        r, s = _rotation_at(pose, i), _rotation_at(anchor, i)
+        u, v, rho = ray[i], ray[BLOCK + i], ray[2 * BLOCK + i]
+        a = s[0] * u + s[1] * v + s[2] + rho * (anchor[4 * BLOCK + i] - pose[4 * BLOCK + i])
+        b = s[3] * u + s[4] * v + s[5] + rho * (anchor[5 * BLOCK + i] - pose[5 * BLOCK + i])
+        c = s[6] * u + s[7] * v + s[8] + rho * (anchor[6 * BLOCK + i] - pose[6 * BLOCK + i])
+        x = r[0] * a + r[3] * b + r[6] * c
+        y = r[1] * a + r[4] * b + r[7] * c
+        place[i], place[BLOCK + i] = x, y
+        place[2 * BLOCK + i] = forward_depth(x, y, r[2] * a + r[5] * b + r[8] * c)
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _turn_ray(pose, anchor, row, n, by_ray):
+    """One row by (u, v, ρ) from the −a in the row by the state."""
+    for i in range(n):
+        r, s = _rotation_at(pose, i), _rotation_at(anchor, i)
+        a0, a1, a2 = -row[3 * BLOCK + i], -row[4 * BLOCK + i], -row[5 * BLOCK + i]
+        e0 = a0 * r[0] + a1 * r[1] + a2 * r[2]
+        e1 = a0 * r[3] + a1 * r[4] + a2 * r[5]
+        e2 = a0 * r[6] + a1 * r[7] + a2 * r[8]
+        by_ray[i] = e0 * s[0] + e1 * s[3] + e2 * s[6]
+        by_ray[BLOCK + i] = e0 * s[1] + e1 * s[4] + e2 * s[7]
+        by_ray[2 * BLOCK + i] = (
+            e0 * (anchor[4 * BLOCK + i] - pose[4 * BLOCK + i])
+            + e1 * (anchor[5 * BLOCK + i] - pose[5 * BLOCK + i])
+            + e2 * (anchor[6 * BLOCK + i] - pose[6 * BLOCK + i])
+        )
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _scale_shift(ray, n, row):
+    """A direction moves with the camera's position by ρ times as much as a point."""
+    for i in range(n):
+        rho = ray[2 * BLOCK + i]
+        row[3 * BLOCK + i] *= rho
+        row[4 * BLOCK + i] *= rho
+        row[5 * BLOCK + i] *= rho
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _both(state, mean, const, z, params, n, nu, jac_state, jac_landmark):
+    """Residual and derivatives of the full 2-D measurement."""
+    pose, ray, anchor, by_ray = flat(state), flat(mean), flat(const), flat(jac_landmark)
+    across, down = flat(jac_state[0]), flat(jac_state[1])
+    _locate_ray(pose, ray, anchor, n, by_ray)
+    measure(by_ray, z[0], z[1], params, n, flat(nu), across, down)
+    _turn_ray(pose, anchor, across, n, by_ray)
+    _turn_ray(pose, anchor, down, n, by_ray[3 * BLOCK :])
+    _scale_shift(ray, n, across)
+    _scale_shift(ray, n, down)
 
 
 @observation_kernel
 def camera_ray(state, mean, const, z, params, n, nu, jac_state, jac_landmark):
     """Inverse depth, both dimensions; params are the camera's."""
+    _both(state, mean, const, z, params, n, nu, jac_state, jac_landmark)
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _take_out(along, least, n, first, second):
+    """From vectors (first, second) their part along ∂h/∂ρ, (2, BLOCK) flat, where that is as long as √`least`."""
     for i in range(n):
-        _ray(state, mean, const, z, params, nu, jac_state, jac_landmark, i)
+        a, b = along[i], along[BLOCK + i]
+        squared = a * a + b * b
+        share = 1.0 / squared if squared >= least else 0.0
+        part = share * (a * first[i] + b * second[i])
+        first[i] -= a * part
+        second[i] -= b * part
 
 
 @observation_kernel
 def epipolar_ray(state, mean, const, z, params, n, nu, jac_state, jac_landmark):
     """Inverse depth, across the epipolar line only; params: the camera's, then the least |∂h/∂q| in px per 1/m."""
+    _both(state, mean, const, z, params, n, nu, jac_state, jac_landmark)
     least = params[9] * params[9]
+    along = np.empty(2 * BLOCK)
     for i in range(n):
-        _ray(state, mean, const, z, params, nu, jac_state, jac_landmark, i)
-        a, b = jac_landmark[0, 2, i], jac_landmark[1, 2, i]
-        squared = a * a + b * b
-        share = 1.0 / squared if squared >= least else 0.0
-        along = share * (a * nu[0, i] + b * nu[1, i])
-        nu[0, i] -= a * along
-        nu[1, i] -= b * along
-        for k in range(6):
-            along = share * (a * jac_state[0, k, i] + b * jac_state[1, k, i])
-            jac_state[0, k, i] -= a * along
-            jac_state[1, k, i] -= b * along
-        for k in range(3):
-            along = share * (a * jac_landmark[0, k, i] + b * jac_landmark[1, k, i])
-            jac_landmark[0, k, i] -= a * along
-            jac_landmark[1, k, i] -= b * along
+        along[i], along[BLOCK + i] = jac_landmark[0, 2, i], jac_landmark[1, 2, i]
+    _take_out(along, least, n, nu[0], nu[1])
+    for k in range(6):
+        _take_out(along, least, n, jac_state[0, k], jac_state[1, k])
+    for k in range(3):
+        _take_out(along, least, n, jac_landmark[0, k], jac_landmark[1, k])

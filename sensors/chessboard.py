@@ -80,15 +80,34 @@ def find_board(image: np.ndarray, board: Board) -> KnownPixels:
         InputError: the board is not seen whole, or it is too small in the image.
     """
     image = checked_image(image)
-    px = _ordered(image, _detected(image, board), board)
-    grid = px.reshape(board.rows, board.columns, 2)
-    side = min(np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min() for axis in (0, 1))
+    px = board_corners(image, board)
+    if px is None:
+        raise InputError(
+            f"no chessboard of {board.columns}x{board.rows} inner corners is seen in the first image: it has to be "
+            "seen whole, with its white border, sharp and evenly lit"
+        )
+    side = least_side(px, board)
     if side < LEAST_SQUARE_PX:
         raise InputError(
             f"the chessboard's squares are only {side:.1f} px wide in the first image: start nearer to it"
         )
     chosen = spread_rows(board.corners, MOST)
     return KnownPixels(chosen, px[chosen], board.corners[chosen], np.zeros(chosen.size), own_frame=True)
+
+
+def board_corners(image: np.ndarray, board: Board, thorough: bool = True) -> np.ndarray | None:
+    """All corners (rows · columns, 2) of a board in an image (H, W) uint8, in the order of the board's frame, px.
+
+    None where the board is not seen whole. Without `thorough` a second look at images that show none is left out.
+    """
+    px = _detected(image, board, _SEARCHES if thorough else _SEARCHES[:2])
+    return None if px is None else _ordered(image, px, board)
+
+
+def least_side(px: np.ndarray, board: Board) -> float:
+    """Least distance of corners (rows · columns, 2) that are neighbours along a side of a square, px."""
+    grid = px.reshape(board.rows, board.columns, 2)
+    return min(float(np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min()) for axis in (0, 1))
 
 
 def spread_rows(points: np.ndarray, count: int) -> np.ndarray:
@@ -102,28 +121,23 @@ def spread_rows(points: np.ndarray, count: int) -> np.ndarray:
     return np.sort(np.array(chosen, dtype=np.int64))
 
 
-def _detected(image: np.ndarray, board: Board) -> np.ndarray:
+def _detected(image: np.ndarray, board: Board, searches: tuple[int | str, ...]) -> np.ndarray | None:
     """Corners (rows · columns, 2) in one of the orders in which a detector may give them."""
     import cv2
 
-    for search in _SEARCHES:
+    for search in searches:
         flags = getattr(cv2, search) if isinstance(search, str) else search
         found, px = cv2.findChessboardCornersSB(image, (board.columns, board.rows), flags=flags)
         if found:
             return _refined(image, np.asarray(px, dtype=np.float32).reshape(-1, 2), board)
-    raise InputError(
-        f"no chessboard of {board.columns}x{board.rows} inner corners is seen in the first image: it has to be seen "
-        "whole, with its white border, sharp and evenly lit"
-    )
+    return None
 
 
 def _refined(image: np.ndarray, px: np.ndarray, board: Board) -> np.ndarray:
     """Corners to a fraction of a pixel: where the slopes of the image all point past them (saddle points)."""
     import cv2
 
-    grid = px.reshape(board.rows, board.columns, 2)
-    side = min(float(np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min()) for axis in (0, 1))
-    half = int(np.clip(0.4 * side, 2, 11))
+    half = int(np.clip(0.4 * least_side(px, board), 2, 11))
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
     refined = cv2.cornerSubPix(image, px.reshape(-1, 1, 2).copy(), (half, half), (-1, -1), criteria)
     return np.asarray(refined, dtype=float).reshape(-1, 2)

@@ -4,9 +4,10 @@ import math
 
 from numba import njit
 
+from rbpf.kernels.block import flat
 from rbpf.kernels.quaternion import rotation
-from rbpf.kernels.signature import observation_kernel
-from rbpf.sensors.camera_kernels import forward_depth, store_by_state
+from rbpf.kernels.signature import BLOCK, observation_kernel
+from rbpf.sensors.camera_kernels import forward_depth, locate, measure, store_by_state, turn
 from rbpf.sensors.pinhole_kernels import project
 
 HEADER = 9
@@ -95,7 +96,7 @@ def constellation_view(state, mean, const, z, params, n, nu, jac_state, jac_land
             for row in range(2):
                 d = (d00, d01, d02) if row == 0 else (d10, d11, d12)
                 out = 2 * k + row
-                store_by_state(out, d[0], d[1], d[2], c0, c1, depth, 1.0, jac_state, i)
+                store_by_state(d[0], d[1], d[2], c0, c1, depth, flat(jac_state[out]), i)
                 e0 = d[0] * r[0] + d[1] * r[1] + d[2] * r[2]
                 e1 = d[0] * r[3] + d[1] * r[4] + d[2] * r[5]
                 e2 = d[0] * r[6] + d[1] * r[7] + d[2] * r[8]
@@ -116,26 +117,13 @@ def constellation_view(state, mean, const, z, params, n, nu, jac_state, jac_land
 @observation_kernel
 def members_view(state, mean, const, z, params, n, nu, jac_state, jac_landmark):
     """Pixels of several points of one record (p_1, p_2, …); params: the camera's, then which points they are."""
-    count, size = z.shape[0] // 2, mean.shape[0]
-    for i in range(n):
-        r = rotation(state[0, i], state[1, i], state[2, i], state[3, i])
-        for k in range(count):
-            own = 3 * int(params[HEADER + k])
-            a = mean[own, i] - state[4, i]
-            b = mean[own + 1, i] - state[5, i]
-            c = mean[own + 2, i] - state[6, i]
-            x = r[0] * a + r[3] * b + r[6] * c
-            y = r[1] * a + r[4] * b + r[7] * c
-            depth = forward_depth(x, y, r[2] * a + r[5] * b + r[8] * c)
-            px, py, d00, d01, d02, d10, d11, d12 = project(x, y, depth, params)
-            nu[2 * k, i] = z[2 * k] - px
-            nu[2 * k + 1, i] = z[2 * k + 1] - py
-            for row in range(2):
-                d = (d00, d01, d02) if row == 0 else (d10, d11, d12)
-                out = 2 * k + row
-                store_by_state(out, d[0], d[1], d[2], x, y, depth, 1.0, jac_state, i)
-                for f in range(size):
-                    jac_landmark[out, f, i] = 0.0
-                for f in range(3):
-                    along = d[0] * r[3 * f] + d[1] * r[3 * f + 1] + d[2] * r[3 * f + 2]
-                    jac_landmark[out, own + f, i] = along
+    pose, points = flat(state), flat(mean)
+    jac_landmark[:, :, :n] = 0.0
+    for k in range(z.shape[0] // 2):
+        own, out = 3 * int(params[HEADER + k]), 2 * k
+        across, down = flat(jac_state[out]), flat(jac_state[out + 1])
+        by_point = flat(jac_landmark[out])[own * BLOCK :]
+        locate(pose, points[own * BLOCK :], n, by_point)
+        measure(by_point, z[out], z[out + 1], params, n, flat(nu)[out * BLOCK :], across, down)
+        turn(pose, across, n, by_point)
+        turn(pose, down, n, flat(jac_landmark[out + 1])[own * BLOCK :])

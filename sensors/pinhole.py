@@ -12,6 +12,7 @@ from typing import final
 
 import numpy as np
 
+from rbpf.arrays import Bool, Float
 from rbpf.errors import InputError
 from rbpf.sensors.camera_checks import check_finite, check_size
 
@@ -72,7 +73,7 @@ class Pinhole:
         object.__setattr__(self, "distortion", tuple(self.distortion))
 
     @cached_property
-    def params(self) -> np.ndarray:
+    def params(self) -> Float[np.ndarray, "9"]:
         """(9,) fx, fy, cx, cy, k1, k2, p1, p2, k3: what the compiled twin reads."""
         return np.array([self.fx, self.fy, self.cx, self.cy, *self.distortion], dtype=np.float64)
 
@@ -97,7 +98,7 @@ class Pinhole:
         positive = roots.real[(roots.imag == 0.0) & (roots.real > 0.0)]
         return float(1.0 / np.sqrt(positive.max())) if positive.size else float("inf")
 
-    def project(self, point: np.ndarray) -> np.ndarray:
+    def project(self, point: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
         """Pixels (…, 2) of points (…, 3) in the camera's frame.
 
         Only the direction counts: (u, v, 1) and a point at infinity work. Nothing is checked, see `visible`; a
@@ -106,7 +107,7 @@ class Pinhole:
         with np.errstate(all="ignore"):
             return self.params[:2] * self._distort(_normalise(point)) + self.params[2:4]
 
-    def slope(self, point: np.ndarray) -> np.ndarray:
+    def slope(self, point: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2 3"]:
         """∂px/∂point (…, 2, 3) at points (…, 3) in the camera's frame."""
         point = np.asarray(point, float)
         with np.errstate(all="ignore"):
@@ -114,7 +115,7 @@ class Pinhole:
             by_uv = self.params[:2, None] * self._distort_slope(uv) / point[..., 2, None, None]
             return np.concatenate([by_uv, -by_uv @ uv[..., None]], axis=-1)
 
-    def unproject(self, px: np.ndarray) -> np.ndarray:
+    def unproject(self, px: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
         """Normalised coordinates (u, v) (…, 2) of pixels (…, 2): the point lies in the direction (u, v, 1).
 
         Newton's method on the distortion. NaN where no direction in which the distortion is one-to-one projects to
@@ -125,11 +126,11 @@ class Pinhole:
             uv = self._undistort(target.reshape(-1, 2))
         return uv.reshape(target.shape)
 
-    def unproject_slope(self, px: np.ndarray) -> np.ndarray:
+    def unproject_slope(self, px: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2 2"]:
         """∂(u, v)/∂px (…, 2, 2) at pixels (…, 2); NaN where `unproject` is."""
         return _inverse(self._distort_slope(self.unproject(px))) / self.params[:2]
 
-    def inside(self, px: np.ndarray, margin_px: float = 0.0) -> np.ndarray:
+    def inside(self, px: Float[np.ndarray, "*batch 2"], margin_px: float = 0.0) -> Bool[np.ndarray, "*batch"]:
         """Whether pixels (…, 2) are in the image (…), and at least `margin_px` from its border.
 
         The image reaches half a pixel beyond the centres of its outermost pixels.
@@ -139,7 +140,9 @@ class Pinhole:
         within = (px >= margin_px - 0.5) & (px <= past)
         return within[..., 0] & within[..., 1]
 
-    def visible(self, point: np.ndarray, margin_px: float = 0.0) -> np.ndarray:
+    def visible(
+        self, point: Float[np.ndarray, "*batch 3"], margin_px: float = 0.0
+    ) -> Bool[np.ndarray, "*batch"]:
         """Whether points (…, 3) are seen (…): in front of the camera, not folded back, and inside the image."""
         with np.errstate(all="ignore"):
             seen = self._unique(_normalise(point)) & self.inside(self.project(point), margin_px)
@@ -245,17 +248,17 @@ class RectifiedStereo:
             found = f"the camera of a rectified stereo pair has distortion {self.camera.distortion}"
             raise InputError(f"{found}: rectify the images and give the camera of the rectified ones")
 
-    def project(self, point: np.ndarray) -> np.ndarray:
+    def project(self, point: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
         """Pixels (u_left, v, u_right) (…, 3) of points (…, 3) in the left camera's frame; nothing is checked."""
         right = self.camera.project(self._from_right(point))[..., :1]
         return np.concatenate([self.camera.project(point), right], axis=-1)
 
-    def slope(self, point: np.ndarray) -> np.ndarray:
+    def slope(self, point: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:
         """∂px/∂point (…, 3, 3) at points (…, 3) in the left camera's frame."""
         right = self.camera.slope(self._from_right(point))[..., :1, :]
         return np.concatenate([self.camera.slope(point), right], axis=-2)
 
-    def locate(self, z: np.ndarray) -> np.ndarray:
+    def locate(self, z: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
         """Points (…, 3) in the left camera's frame seen at (u_left, v, u_right) (…, 3); NaN without disparity."""
         z = np.asarray(z, float)
         disparity = np.where(z[..., 0] > z[..., 2], z[..., 0] - z[..., 2], np.nan)[..., None]
@@ -263,16 +266,17 @@ class RectifiedStereo:
         ray = np.concatenate([uv, np.ones_like(disparity)], axis=-1)
         return self.camera.fx * self.baseline_m / disparity * ray
 
-    def inside(self, px: np.ndarray, margin_px: float = 0.0) -> np.ndarray:
+    def inside(self, px: Float[np.ndarray, "*batch 3"], margin_px: float = 0.0) -> Bool[np.ndarray, "*batch"]:
         """Whether (u_left, v, u_right) (…, 3) are in both images (…), and at least `margin_px` from their borders."""
         px = np.asarray(px, float)
-        left, right = px[..., :2], px[..., [2, 1]]
-        return self.camera.inside(left, margin_px) & self.camera.inside(right, margin_px)
+        return self.camera.inside(px[..., :2], margin_px) & self.camera.inside(px[..., [2, 1]], margin_px)
 
-    def visible(self, point: np.ndarray, margin_px: float = 0.0) -> np.ndarray:
+    def visible(
+        self, point: Float[np.ndarray, "*batch 3"], margin_px: float = 0.0
+    ) -> Bool[np.ndarray, "*batch"]:
         """Whether points (…, 3) are seen in both images (…)."""
-        left = self.camera.visible(point, margin_px)
-        return left & self.camera.visible(self._from_right(point), margin_px)
+        right = self._from_right(point)
+        return self.camera.visible(point, margin_px) & self.camera.visible(right, margin_px)
 
     def _from_right(self, point: np.ndarray) -> np.ndarray:
         """Points in the right camera's frame."""

@@ -62,7 +62,7 @@ class StereoFeatures:
 
 
 def locate_slope(rig: RectifiedStereo, z: np.ndarray) -> np.ndarray:
-    """∂P/∂(u_left, v, u_right) (…, 3, 3) of `RectifiedStereo.locate` at pixels z (…, 3).
+    """∂P/∂(u_left, v, u_right) (…, 3, 3) of `RectifiedStereo.locate` at pixels z (…, 3), Mathematics (stereo-slope).
 
     With disparity d = u_left − u_right, P = (fx b / d) (u, v, 1) in normalised coordinates: every pixel of d moves P
     along its own ray by −P/d, and u_left and v turn the ray besides.

@@ -8,7 +8,7 @@ The noise of z = (u_left, v, u_right): what a keypoint's place means on the obje
 standard deviation σ_p per axis. The refinement looks for what lies at the left place, whatever that is: u_right shares
 the error of u_left and adds that of the disparity, σ_d. Both grow with the keypoint's scale,
 
-    cov = [[σ_p², 0, σ_p²], [0, σ_p², 0], [σ_p², 0, σ_p² + σ_d²]].
+    cov = [[σ_p², 0, σ_p²], [0, σ_p², 0], [σ_p², 0, σ_p² + σ_d²]],    Mathematics (stereo-noise).
 
 Without the refinement both places have their own error, and cov = σ_p² I.
 """

@@ -1,9 +1,21 @@
 """Fixtures and markers shared by all tests."""
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+# For the processes that xdist starts: two of them, each with as many threads as cores, wait for one another. The small
+# matrices of the tests gain nothing from threads.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import numpy as np
 import pytest
+
+from tests.shapes import switch, watch
+
+if os.environ.get("RBPF_SHAPES") != "0":
+    watch()
 
 DEFAULT_DATA = Path(__file__).resolve().parent.parent.parent / "shared" / "data"
 
@@ -15,3 +27,52 @@ def data_dir() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no recordings at {folder}: set RBPF_DATA to the folder that holds them")
     return folder
+
+
+@pytest.fixture
+def unchecked_shapes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For tests that hand over arrays of a wrong shape, and want to hear of it from the program."""
+    monkeypatch.setattr(switch, "on", False)
+
+
+@pytest.fixture(scope="module")
+def plain_pictures() -> Iterator[None]:
+    """Pictures are painted small and without ticks and words, which takes a tenth of the time.
+
+    They still depend on what they show, so that runs can be compared by their bytes. Who asks for a run whose
+    pictures are looked at does without this fixture.
+    """
+    from matplotlib.figure import Figure
+
+    savefig = Figure.savefig
+
+    def plain(figure: Figure, path: Path, **options: Any) -> None:
+        figure.set_layout_engine("none")
+        for axes in figure.axes:
+            axes.set_axis_off()
+            axes.set_title("")
+            if (legend := axes.get_legend()) is not None:
+                legend.remove()
+        savefig(figure, path, format=options.get("format"), dpi=30)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Figure, "savefig", plain)
+        yield
+
+
+@pytest.fixture(scope="module")
+def keypoints_once() -> Iterator[None]:
+    """In an image that one of the module's tests has seen, keypoints are not looked for again."""
+    from rbpf.sensors.sift import KeyPoints, Sift, SiftConfig
+
+    detect, known = Sift.detect, dict[tuple[SiftConfig, bytes], KeyPoints]()
+
+    def once(sift: Sift, image: np.ndarray) -> KeyPoints:
+        key = sift.config, image.tobytes()
+        if key not in known:
+            known[key] = detect(sift, image)
+        return known[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Sift, "detect", once)
+        yield

@@ -63,7 +63,7 @@ def export_colmap(
 
 def colmap_model(estimate: PathAndMap, problem: Problem | None) -> Any:
     """The model that `export_colmap` writes."""
-    landmarks = _raised(estimate.landmarks)
+    landmarks = raised(estimate.landmarks)
     colours = colours_by_sigma(standard_deviations(estimate.landmarks.cov))
     if not isinstance(problem, FeatureLog):
         body = estimate.trajectory.world_from_body
@@ -82,7 +82,7 @@ def colmap_model(estimate: PathAndMap, problem: Problem | None) -> Any:
 def export_ply(estimate: PathAndMap, folder: Path) -> list[str]:
     """Writes map.ply and path.ply; returns their names."""
     prepare_folder(folder)
-    landmarks, std = _raised(estimate.landmarks), standard_deviations(estimate.landmarks.cov)
+    landmarks, std = raised(estimate.landmarks), standard_deviations(estimate.landmarks.cov)
     write_ply(folder / MAP, landmarks.mean, colours_by_sigma(std), std)
     at = estimate.trajectory.positions
     steps = np.arange(max(len(at) - 1, 0))
@@ -91,10 +91,11 @@ def export_ply(estimate: PathAndMap, folder: Path) -> list[str]:
     return [MAP, PATH]
 
 
-def _raised(landmarks: MapSummary) -> MapSummary:
-    """Landmarks of the plane at height 0."""
-    rise = 3 - landmarks.mean.shape[1]
-    return replace(landmarks, mean=np.pad(landmarks.mean, ((0, 0), (0, rise))))
+def raised(landmarks: MapSummary) -> MapSummary:
+    """Landmarks of the plane at height 0, with no spread above it."""
+    more = (0, 3 - landmarks.mean.shape[1])
+    mean, cov = np.pad(landmarks.mean, ((0, 0), more)), np.pad(landmarks.cov, ((0, 0), more, more))
+    return replace(landmarks, mean=mean, cov=cov)
 
 
 def _on_map(table: Sightings, ids: NDArray[np.int64]) -> Sightings:

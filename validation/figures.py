@@ -37,6 +37,18 @@ def new_axes(title: str, ylabel: str = "y [m]", xlabel: str = "x [m]", equal: bo
     return figure, axes
 
 
+def stacked_axes(count: int, title: str) -> tuple[Any, list[Any]]:
+    """A figure of pairs of axes one above the other that share what is along them."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.0, 2.0 + 2.0 * count), layout="constrained")
+    rows = list(figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0])
+    rows[0].set_title(title)
+    for axes in rows:
+        axes.grid(alpha=0.3)
+    return figure, rows
+
+
 def label(axes: Any, title: str, xlabel: str, ylabel: str, equal: bool) -> None:
     """Title, names and grid of a pair of axes."""
     axes.set(title=title, xlabel=xlabel, ylabel=ylabel)

@@ -1,6 +1,7 @@
 """What every system's run folder is written with: whole files or none, tables, maps, figures."""
 
 import csv
+import json
 import resource
 import sys
 from collections.abc import Iterable, Mapping, Sequence
@@ -35,6 +36,11 @@ def write_text(path: Path, text: str) -> None:
     """Writes a whole file or none; raises InputError where the place cannot be written to, or the disk is full."""
     with whole(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def write_summary(out: Path, entries: Mapping[str, Any]) -> None:
+    """summary.json."""
+    write_text(out / "summary.json", json.dumps(entries, indent=2, allow_nan=False) + "\n")
 
 
 def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:

@@ -9,10 +9,11 @@ from rbpf.errors import InputError
 from rbpf.sensors.chessboard import Board, find_board
 from rbpf.sensors.readers.images import ImageSequence, KnownPixels, open_images, read_known_points
 from rbpf.systems.mono.config import MonoConfig
+from rbpf.systems.mono.known_map import read_known_map
 from rbpf.systems.mono.video import VideoRun, first_image, run_images
-from rbpf.validation.files import prepare_folder
+from rbpf.validation.files import prepare_folder, write_summary
 from rbpf.validation.mono_batch import Batch, adjust_run, score_batch
-from rbpf.validation.mono_folder import write_mono_run, write_summary
+from rbpf.validation.mono_folder import write_mono_run
 from rbpf.validation.mono_map import summarise_mono_map
 from rbpf.validation.mono_pictures import plot_mono_run
 from rbpf.validation.mono_rerun import write_rerun
@@ -52,32 +53,40 @@ class Recording:
         known_points: table of known points; None starts without any.
         calibration: camera.yaml in place of the sequence's own camera.
         board: chessboard that is seen in the first image; its corners are the known points, in its frame.
+        map: run folder, or its map, in which the camera is to be found; the map is not changed. None maps anew.
 
     Raises:
-        InputError: both known points and a board are given.
+        InputError: two of known points, board and map are given.
     """
 
     images: Path
     known_points: Path | None = None
     calibration: Path | None = None
     board: Board | None = None
+    map: Path | None = None
 
     def __post_init__(self) -> None:
         if self.known_points is not None and self.board is not None:
             raise InputError("a run starts from known points or from a chessboard: give one of the two")
+        if self.map is not None and (self.known_points is not None or self.board is not None):
+            raise InputError(
+                "in a known map a run starts from the map: leave out known points and chessboard"
+            )
 
-    def sources(self) -> dict[str, str | float]:
+    def sources(self) -> dict[str, str | float | bool]:
         """For config.yaml."""
         named = {
             "recording": self.images,
             "known_points": self.known_points,
             "calibration": self.calibration,
+            "map": self.map,
         }
         board: dict[str, str | float] = {}
         if self.board is not None:
             size = f"{self.board.columns}x{self.board.rows}"
             board = {"board": size, "square_m": self.board.square_m}
-        return {name: str(path) for name, path in named.items() if path is not None} | board
+        localize = {} if self.map is None else {"localize": True}
+        return {name: str(path) for name, path in named.items() if path is not None} | board | localize
 
     def open(self) -> tuple[ImageSequence, KnownPixels | None]:
         """The images, and the known points if there are any.
@@ -111,12 +120,14 @@ def start_mono(
     Raises:
         InputError: the recording or a setting is wrong.
     """
+    mapped = None if recording.map is None else read_known_map(recording.map)
     sequence, known = recording.open()
     if out is not None:
         prepare_folder(out)
     total = len(sequence)
     told = None if on_frame is None else lambda t, _frame, _run: on_frame(t + 1, total)
-    return run_images(sequence, config, known, told, None if out is None else out / CHECKPOINT, resume)
+    checkpoint = None if out is None else out / CHECKPOINT
+    return run_images(sequence, config, known, told, checkpoint, resume, mapped)
 
 
 def finish_mono(

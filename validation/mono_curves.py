@@ -8,7 +8,7 @@ from rbpf.lie import SE3
 from rbpf.systems.mono.video import VideoRun
 from rbpf.validation.accuracy import ate
 from rbpf.validation.alignment import Alignment
-from rbpf.validation.figures import COLOURS, SIGMAS
+from rbpf.validation.figures import COLOURS, SIGMAS, stacked_axes
 from rbpf.validation.mono_batch import Batch
 from rbpf.validation.mono_scores import TruePath, usual_alignment
 from rbpf.validation.trajectory import Trajectory
@@ -30,7 +30,7 @@ def error_figure(run: VideoRun, truth: TruePath, batch: Batch | None = None) -> 
     cov = turn @ run.cov[truth.rows][:, 3:, 3:] @ np.swapaxes(turn, -1, -2)
     band = SIGMAS * np.sqrt(np.maximum(np.einsum("taa->ta", cov), 0.0))
     name = "no alignment" if how == "none" else f"after the {how} alignment"
-    figure, rows = _rows(3, f"{run.sequence.name}: error of the position, {name}")
+    figure, rows = stacked_axes(3, f"{run.sequence.name}: error of the position, {name}")
     if batch is not None:
         _batch_error(rows, truth, batch, how)
     for axis, axes in enumerate(rows):
@@ -61,7 +61,7 @@ def _batch_error(rows: list[Any], truth: TruePath, batch: Batch, how: Alignment)
 
 def tracking_figure(run: VideoRun) -> Any:
     """Landmarks looked for and found, effective sample size, innovations."""
-    figure, (upper, middle, lower) = _rows(3, f"{run.sequence.name}: search and filter")
+    figure, (upper, middle, lower) = stacked_axes(3, f"{run.sequence.name}: search and filter")
     frames = np.arange(run.found.size)
     upper.plot(frames, run.searched, color="0.6", lw=1.0, label="looked for")
     upper.plot(frames, run.found, color=COLOURS["known"], lw=1.0, label="found")
@@ -83,7 +83,7 @@ def tracking_figure(run: VideoRun) -> Any:
 
 def timings_figure(run: VideoRun) -> Any:
     """Time per frame by stage; decoding apart."""
-    figure, (axes,) = _rows(1, f"{run.sequence.name}: time per frame")
+    figure, (axes,) = stacked_axes(1, f"{run.sequence.name}: time per frame")
     frames = np.arange(run.seconds.size)
     search, births = 1e3 * run.seconds_search, 1e3 * run.seconds_births
     rest = 1e3 * run.seconds - search - births
@@ -97,17 +97,6 @@ def timings_figure(run: VideoRun) -> Any:
     axes.set(xlabel="frame", ylabel="ms", ylim=(0.0, 1.3 * high))
     axes.legend(loc="best", fontsize="small")
     return figure
-
-
-def _rows(count: int, title: str) -> tuple[Any, list[Any]]:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9.0, 2.0 + 2.0 * count), layout="constrained")
-    rows = list(figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0])
-    rows[0].set_title(title)
-    for axes in rows:
-        axes.grid(alpha=0.3)
-    return figure, rows
 
 
 def _shade_lost(axes: Any, run: VideoRun) -> None:

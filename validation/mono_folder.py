@@ -7,6 +7,7 @@ batch.tum                batch optimum of the same measurements, of the frames t
 observations*.csv        the measurements used, and the known points
 trajectory.npz           the same with its covariance; truth.npz: the ground truth at these frames; see
                          `rbpf.validation.run_files`
+known_map.npz            the points with what they look like, for --map; see `rbpf.systems.mono.known_map`
 map.npz, map.csv         landmarks: id, mean, covariance (within + between particles); whether it is a ray, was known
 timings.csv              milliseconds per frame and stage; and waiting for the decoded image
 diagnostics.csv          what was looked for and found, whether the camera was lost; sample size, evidence, NIS
@@ -17,15 +18,13 @@ summary.json             the figures
 report.html              one page with all figures and pictures
 """
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
-from rbpf import __version__
+from rbpf.systems.mono.known_map import NAME, write_known_map
 from rbpf.systems.mono.video import VideoRun
 from rbpf.validation.camera_files import write_features
 from rbpf.validation.files import (
@@ -35,19 +34,21 @@ from rbpf.validation.files import (
     prepare_folder,
     write_csv,
     write_map,
-    write_text,
+    write_summary,
 )
+from rbpf.validation.mono_known_map import known_map
 from rbpf.validation.mono_log import feature_log
 from rbpf.validation.mono_map import MonoMap
 from rbpf.validation.mono_posterior import write_posterior
 from rbpf.validation.mono_scores import camera_truth, score_camera
+from rbpf.validation.provenance import write_config
 from rbpf.validation.run_files import write_path, write_truth
 from rbpf.validation.trajectory import Trajectory
 from rbpf.validation.trajectory_files import write_tum
 
 
 def write_mono_run(
-    run: VideoRun, mapped: MonoMap, out: Path, sources: dict[str, str | float]
+    run: VideoRun, mapped: MonoMap, out: Path, sources: dict[str, str | float | bool]
 ) -> dict[str, Any]:
     """Writes all data files of a run.
 
@@ -55,7 +56,7 @@ def write_mono_run(
         run: what was filtered.
         mapped: its map.
         out: the run's folder.
-        sources: what it was filtered from, for config.yaml: recording, known_points, board, calibration.
+        sources: what it was filtered from, for config.yaml: recording, known_points, board, calibration, map.
 
     Returns:
         The entries of summary.json.
@@ -66,27 +67,28 @@ def write_mono_run(
     write_truth(out, camera_truth(run))
     table = run.sensor.table
     rows = mapped.landmarks.ids
-    given = 0 if run.known is None else run.known.names.size
     facts = {
         "ray": mapped.is_ray.astype(int),
-        "known": (rows < given).astype(int),
+        "known": (rows < run.given).astype(int),
         "attempts": table.attempts[rows],
         "found": table.found[rows],
     }
     write_map(out, mapped.landmarks, facts)
+    if run.mapped is None:
+        write_known_map(out / NAME, known_map(run, mapped))
     write_posterior(run, out)
     write_features(out, feature_log(run))
     _write_tables(run, out)
-    config = {"rbpf": __version__, "system": "mono", **sources, **asdict(run.config)}
-    write_text(out / "config.yaml", yaml.safe_dump(config, sort_keys=False))
+    write_config(out, "mono", sources, asdict(run.config))
     entries = summarise_camera(run, mapped)
     write_summary(out, entries)
     return entries
 
 
-def write_summary(out: Path, entries: dict[str, Any]) -> None:
-    """summary.json."""
-    write_text(out / "summary.json", json.dumps(entries, indent=2, allow_nan=False) + "\n")
+def found_at(run: VideoRun) -> int | None:
+    """The first frame in which a camera was where the filter believes; None where there is none."""
+    tracked = np.flatnonzero(~run.lost.astype(bool))
+    return int(tracked[0]) if tracked.size else None
 
 
 def summarise_camera(run: VideoRun, mapped: MonoMap) -> dict[str, Any]:
@@ -103,7 +105,8 @@ def summarise_camera(run: VideoRun, mapped: MonoMap) -> dict[str, Any]:
         "frames_tracked": int((~lost).sum()),
         "lost_frames": int(lost.sum()),
         "relocalisations": len(run.relocalisations),
-        "known_points": 0 if run.known is None else int(run.known.names.size),
+        "known_points": run.given,
+        **({} if run.mapped is None else {"localized": True, "found_at_frame": found_at(run)}),
         "particles": run.config.particles,
         "seed": run.config.seed,
         "ms_per_frame": milliseconds_per_frame(run.seconds),

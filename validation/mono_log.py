@@ -33,6 +33,8 @@ def feature_log(run: VideoRun) -> FeatureLog:
 
 def known_points(run: VideoRun) -> KnownPoints | None:
     """The known points under the names that they have in the log."""
+    if run.mapped is not None:
+        return run.mapped.points
     if run.known is None:
         return None
     cov = run.known.std_m[:, None, None] ** 2 * np.eye(3)

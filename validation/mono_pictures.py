@@ -14,7 +14,7 @@ from rbpf.validation.mono_batch import Batch
 from rbpf.validation.mono_curves import error_figure, timings_figure, tracking_figure
 from rbpf.validation.mono_map import MonoMap
 from rbpf.validation.mono_scores import TruePath, true_path
-from rbpf.validation.mono_views import Views, best_views, close_up
+from rbpf.validation.mono_views import Views, best_views, close_up, draw_particles
 
 MAP_SHARE = 0.9
 """The map's picture holds the path and this share of the points; single points far off do not make it small."""
@@ -100,16 +100,5 @@ def _particles(run: VideoRun, views: Views) -> Any:
     at = SE3.translation(poses if world is None else SE3.between(world.mean, poses))
     turn = SE3.matrix(run.world_from_camera[-1])[:3, :3]
     mean, cov = SE3.translation(run.world_from_camera[-1]), turn @ run.cov[-1][3:, 3:] @ turn.T
-    for axes, (right, up) in shown:
-        axes.scatter(
-            at[:, right], at[:, up], s=1000 * particles.weights, color=COLOURS["filter"], alpha=0.5,
-            label="particles; area is weight",
-        )  # fmt: skip
-        chosen = [right, up]
-        ellipse = outline(mean[chosen], cov[np.ix_(chosen, chosen)])
-        axes.plot(*ellipse.T, color=COLOURS["map"], lw=1.0, label=f"{SIGMAS:g}σ of the pose")
-        axes.plot(mean[right], mean[up], "x", color=COLOURS["map"], label="mean")
-        axes.ticklabel_format(useOffset=False)
-        axes.tick_params(axis="x", labelrotation=30)
-    shown[0][0].legend(loc="best", fontsize="small")
+    draw_particles(shown, at, particles.weights, mean, cov)
     return figure

@@ -44,6 +44,8 @@ def usual_alignment(run: VideoRun) -> Alignment:
     Not at all with known points in the truth's world; rigidly with known points in a frame of their own, such as a
     chessboard's; with its scale without any.
     """
+    if run.mapped is not None:
+        return run.mapped.alignment
     if run.known is None:
         return "similarity"
     return "rigid" if run.known.own_frame else "none"

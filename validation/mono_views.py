@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from rbpf.lie import SE3
-from rbpf.validation.figures import label
+from rbpf.validation.figures import COLOURS, SIGMAS, label, outline
 
 _UPRIGHT = 0.05
 """Weight of the direction of the images' upper side beside that of their rows, which do not tilt with the camera."""
@@ -59,3 +59,25 @@ def close_up(axes: Any, shown: tuple[int, int], points: np.ndarray) -> None:
     ends = middle[shown[1]] - half, middle[shown[1]] + half
     axes.set_ylim(*(reversed(ends) if axes.yaxis_inverted() else ends))
     axes.set_aspect("equal", adjustable="box")
+
+
+def draw_particles(
+    shown: list[tuple[Any, tuple[int, int]]],
+    at: np.ndarray,
+    weights: np.ndarray,
+    mean: np.ndarray,
+    cov: np.ndarray,
+) -> None:
+    """Particles (N, 3) with weights (N,), and mean (3,) and covariance (3, 3) of the position, in all views."""
+    for axes, (right, up) in shown:
+        axes.scatter(
+            at[:, right], at[:, up], s=1000 * weights, color=COLOURS["filter"], alpha=0.5,
+            label="particles; area is weight",
+        )  # fmt: skip
+        chosen = [right, up]
+        ellipse = outline(mean[chosen], cov[np.ix_(chosen, chosen)])
+        axes.plot(*ellipse.T, color=COLOURS["map"], lw=1.0, label=f"{SIGMAS:g}σ of the pose")
+        axes.plot(mean[right], mean[up], "x", color=COLOURS["map"], label="mean")
+        axes.ticklabel_format(useOffset=False)
+        axes.tick_params(axis="x", labelrotation=30)
+    shown[0][0].legend(loc="best", fontsize="small")

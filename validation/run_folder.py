@@ -12,15 +12,12 @@ summary.json             the figures
 *.png, report.html       pictures, and one page with all of them
 """
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
-from rbpf import __version__
 from rbpf.lie import SE2Group
 from rbpf.systems.range_bearing.run import Run
 from rbpf.validation.files import (
@@ -30,11 +27,12 @@ from rbpf.validation.files import (
     prepare_folder,
     write_csv,
     write_map,
-    write_text,
+    write_summary,
 )
 from rbpf.validation.map_summary import MapSummary, summarise_map
 from rbpf.validation.measurement_files import write_measurements
 from rbpf.validation.measurements import Measurements
+from rbpf.validation.provenance import write_config
 from rbpf.validation.run_files import write_path, write_truth
 from rbpf.validation.run_truth import robot_truth
 from rbpf.validation.scores import Scores, as_trajectory, score
@@ -75,15 +73,9 @@ def write_run(run: Run, out: Path, recording: Path, extra: dict[str, Any] | None
         ["step", "stamp_ns", "ess", "resampled", "log_evidence", "nis", "nis_dof"],
         zip(range(stamps.size), stamps, *(column.tolist() for column in columns), strict=True),
     )
-    config = {
-        "rbpf": __version__,
-        "system": "range-bearing",
-        "recording": str(recording),
-        **asdict(run.config),
-    }
-    write_text(out / "config.yaml", yaml.safe_dump(config, sort_keys=False))
+    write_config(out, "range-bearing", {"recording": str(recording)}, asdict(run.config))
     entries = summarise(run, summary_map) | (extra or {})
-    write_text(out / "summary.json", json.dumps(entries, indent=2, allow_nan=False) + "\n")
+    write_summary(out, entries)
     return entries
 
 

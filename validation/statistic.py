@@ -160,7 +160,7 @@ def _bias(correction: np.ndarray, cov: np.ndarray, excess: float) -> Statistic |
 
 
 def coverage(
-    nees: np.ndarray, dim: int, samples: float, probabilities: Sequence[float] = (0.5, 0.9, 0.95)
+    nees: np.ndarray, dim: int, samples: float, probabilities: Sequence[float] = PROBABILITIES
 ) -> list[Statistic]:
     """How often the truth lies in the credible region of a probability, for each of some.
 

@@ -14,15 +14,12 @@ summary.json             the figures
 report.html              one page with all figures and pictures
 """
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
-from rbpf import __version__
 from rbpf.systems.stereo.run import StereoRun
 from rbpf.systems.stereo.sensor import StereoSensor
 from rbpf.validation.files import (
@@ -32,9 +29,10 @@ from rbpf.validation.files import (
     prepare_folder,
     write_csv,
     write_map,
-    write_text,
+    write_summary,
 )
 from rbpf.validation.map_summary import MapSummary
+from rbpf.validation.provenance import write_config
 from rbpf.validation.run_files import write_path, write_truth
 from rbpf.validation.stereo_scores import distance_m, score_stereo, stereo_truth
 from rbpf.validation.trajectory import Trajectory
@@ -64,10 +62,9 @@ def write_stereo_run(
     write_path(out, run.stamps_ns, run.world_from_camera, run.cov)
     write_truth(out, stereo_truth(run))
     _write_tables(run, out)
-    config = {"rbpf": __version__, "system": "stereo", **sources, **asdict(run.config)}
-    write_text(out / "config.yaml", yaml.safe_dump(config, sort_keys=False))
+    write_config(out, "stereo", sources, asdict(run.config))
     entries = summarise_stereo(run, mapped)
-    write_text(out / "summary.json", json.dumps(entries, indent=2, allow_nan=False) + "\n")
+    write_summary(out, entries)
     return entries
 
 

@@ -9,10 +9,10 @@ from rbpf.lie import SE3
 from rbpf.systems.stereo.run import StereoRun
 from rbpf.validation.accuracy import ate
 from rbpf.validation.alignment import align
-from rbpf.validation.figures import COLOURS, SIGMAS, outline, save_figures
+from rbpf.validation.figures import COLOURS, SIGMAS, outline, save_figures, stacked_axes
 from rbpf.validation.map_summary import MapSummary
 from rbpf.validation.mono_scores import TruePath, true_path
-from rbpf.validation.mono_views import Views, best_views, close_up
+from rbpf.validation.mono_views import Views, best_views, close_up, draw_particles
 from rbpf.validation.stereo_scores import compared
 
 MAP_SHARE = 0.9
@@ -74,17 +74,7 @@ def _particles(run: StereoRun, views: Views) -> Any:
     at, best = SE3.translation(particles.state), run.at_update
     turn = SE3.rotation(best.mean)
     mean, cov = SE3.translation(best.mean), turn @ best.cov[3:, 3:] @ turn.T
-    for axes, (right, up) in shown:
-        axes.scatter(
-            at[:, right], at[:, up], s=1000 * particles.weights, color=COLOURS["filter"], alpha=0.5,
-            label="particles; area is weight",
-        )  # fmt: skip
-        chosen = [right, up]
-        ellipse = outline(mean[chosen], cov[np.ix_(chosen, chosen)])
-        axes.plot(*ellipse.T, color=COLOURS["map"], lw=1.0, label=f"{SIGMAS:g}σ of the pose")
-        axes.ticklabel_format(useOffset=False)
-        axes.tick_params(axis="x", labelrotation=30)
-    shown[0][0].legend(loc="best", fontsize="small")
+    draw_particles(shown, at, particles.weights, mean, cov)
     return figure
 
 
@@ -96,7 +86,7 @@ def _error(run: StereoRun, truth: TruePath) -> Any:
     turn = moved.rotation @ SE3.rotation(run.world_from_camera[truth.rows])
     cov = turn @ run.cov[truth.rows][:, 3:, 3:] @ turn.mT
     band = SIGMAS * np.sqrt(np.maximum(np.einsum("taa->ta", cov), 0.0))
-    figure, rows = _rows(3, f"{run.name}: error of the position after the rigid alignment")
+    figure, rows = stacked_axes(3, f"{run.name}: error of the position after the rigid alignment")
     for axis, axes in enumerate(rows):
         low, high = -1e3 * band[:, axis], 1e3 * band[:, axis]
         axes.fill_between(truth.rows, low, high, color=COLOURS["filter"], alpha=0.2, lw=0, label="3σ")
@@ -110,7 +100,7 @@ def _error(run: StereoRun, truth: TruePath) -> Any:
 
 def _tracking(run: StereoRun) -> Any:
     """Features and landmarks, and the effective sample size at the updates."""
-    figure, (upper, lower) = _rows(2, f"{run.name}: features and filter")
+    figure, (upper, lower) = stacked_axes(2, f"{run.name}: features and filter")
     pairs, at = np.arange(run.features.size), np.flatnonzero(run.updated)
     upper.plot(pairs, run.features, color="0.6", lw=1.0, label="features")
     upper.plot(pairs, run.agreeing, color=COLOURS["odometry"], lw=1.0, label="agree with the motion")
@@ -127,7 +117,7 @@ def _tracking(run: StereoRun) -> Any:
 
 def _timings(run: StereoRun) -> Any:
     """Time per pair by stage; decoding apart (S05 Fig. 7)."""
-    figure, (axes,) = _rows(1, f"{run.name}: time per pair")
+    figure, (axes,) = stacked_axes(1, f"{run.name}: time per pair")
     stages = {"features": run.seconds_features, "odometry": run.seconds_odometry}
     stages |= {"matching with the map": run.seconds_matching, "filter": run.seconds_filter}
     axes.stackplot(
@@ -141,14 +131,3 @@ def _timings(run: StereoRun) -> Any:
     axes.set(xlabel="pair", ylabel="ms", ylim=(0.0, high))
     axes.legend(loc="best", fontsize="small")
     return figure
-
-
-def _rows(count: int, title: str) -> tuple[Any, list[Any]]:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9.0, 2.0 + 2.0 * count), layout="constrained")
-    rows = list(figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0])
-    rows[0].set_title(title)
-    for axes in rows:
-        axes.grid(alpha=0.3)
-    return figure, rows

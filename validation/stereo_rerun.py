@@ -6,19 +6,14 @@ world/map                the final map with 3σ ellipsoids
 plots/…                  features, matches and landmarks over the pairs
 """
 
-import os
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.readers.images.stereo import StereoSequence
 from rbpf.systems.stereo.run import StereoRun
-from rbpf.validation.figures import SIGMAS
 from rbpf.validation.map_summary import MapSummary
-from rbpf.validation.mono_rerun import AXIS_M, QUALITY, require_rerun
+from rbpf.validation.rerun_file import ellipsoids, log_image, log_lens, log_pose, log_time, recording
 
 
 def write_stereo_rerun(run: StereoRun, sequence: StereoSequence, mapped: MapSummary, path: Path) -> None:
@@ -33,53 +28,22 @@ def write_stereo_rerun(run: StereoRun, sequence: StereoSequence, mapped: MapSumm
     Raises:
         InputError: Rerun is not installed, or the file cannot be written.
     """
-    rr = require_rerun()
-    partial = path.with_name(path.name + ".partial")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with rr.RecordingStream("rbpf", recording_id=run.name) as stream:
-            stream.save(str(partial))
-            _log_static(rr, stream, run, mapped)
-            for t, frame in zip(range(run.stamps_ns.size), sequence.frames(), strict=False):
-                stream.set_time("frame", sequence=t)
-                stream.set_time("time", duration=1e-9 * float(run.stamps_ns[t] - run.stamps_ns[0]))
-                if frame.image is not None:
-                    stream.log("world/camera/image", rr.Image(frame.image).compress(jpeg_quality=QUALITY))
-                _log_pair(rr, stream, run, t)
-            stream.flush()
-        os.replace(partial, path)
-    except OSError as error:
-        raise InputError(f"{path} cannot be written: {error}") from error
-    finally:
-        partial.unlink(missing_ok=True)
+    with recording(path, run.name) as (rr, stream):
+        _log_static(rr, stream, run, mapped)
+        for t, frame in zip(range(run.stamps_ns.size), sequence.frames(), strict=False):
+            log_time(stream, t, int(run.stamps_ns[t] - run.stamps_ns[0]))
+            log_image(rr, stream, frame)
+            _log_pair(rr, stream, run, t)
 
 
 def _log_static(rr: Any, stream: Any, run: StereoRun, mapped: MapSummary) -> None:
-    camera = run.front_end.rig.camera
-    lens = rr.Pinhole(
-        focal_length=[camera.fx, camera.fy],
-        principal_point=[camera.cx + 0.5, camera.cy + 0.5],
-        resolution=[camera.width, camera.height],
-        camera_xyz=rr.ViewCoordinates.RDF,
-        image_plane_distance=AXIS_M,
-    )
-    stream.log("world/camera", lens, static=True)
+    log_lens(rr, stream, run.front_end.rig.camera)
     for name, poses in (("path", run.world_from_camera), ("odometry", run.odometry)):
         stream.log(f"world/{name}", rr.LineStrips3D([SE3.translation(poses)]), static=True)
-    values, vectors = np.linalg.eigh(mapped.cov)
-    turned = vectors * np.where(np.linalg.det(vectors) < 0.0, -1.0, 1.0)[:, None, None]
-    poses = np.concatenate([turned, mapped.mean[..., None]], axis=-1)
-    ellipsoids = rr.Ellipsoids3D(
-        centers=mapped.mean,
-        half_sizes=SIGMAS * np.sqrt(np.maximum(values, 0.0)),
-        quaternions=SE3.from_matrix(poses)[:, :4],
-    )
-    stream.log("world/map", ellipsoids, static=True)
+    stream.log("world/map", ellipsoids(rr, mapped), static=True)
 
 
 def _log_pair(rr: Any, stream: Any, run: StereoRun, t: int) -> None:
-    at = run.world_from_camera[t]
-    pose = rr.Transform3D(translation=SE3.translation(at), quaternion=rr.Quaternion(xyzw=at[:4]))
-    stream.log("world/camera", pose)
+    log_pose(rr, stream, "camera", run.world_from_camera[t])
     for name in ("features", "agreeing", "observed"):
         stream.log(f"plots/{name}", rr.Scalars(float(getattr(run, name)[t])))

@@ -1,4 +1,4 @@
-"""Trajectories in files: the TUM format (read and written) and KITTI odometry's (read).
+"""Trajectories in files: the TUM format and KITTI odometry's, both read and written.
 
 TUM: a line `timestamp tx ty tz qx qy qz qw` per pose, seconds and metres, # starts a comment.
 KITTI: the 12 numbers of world_from_camera's upper 3 x 4 block per line, row by row; no times.
@@ -50,8 +50,18 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
     """
     rows = zip(trajectory.stamps_ns.tolist(), trajectory.world_from_body.tolist(), strict=True)
     lines = [_tum_line(stamp_ns, numbers) for stamp_ns, numbers in rows]
-    with whole(path) as partial:
-        partial.write_text("".join(["# " + " ".join(TUM_COLUMNS) + "\n", *lines]), encoding="utf-8")
+    _write_whole(path, ["# " + " ".join(TUM_COLUMNS) + "\n", *lines])
+
+
+def write_kitti(path: Path, trajectory: Trajectory) -> None:
+    """Write a trajectory in KITTI format, with every digit; the file appears under its name when complete.
+
+    Args:
+        path: the file; one that is there is replaced.
+        trajectory: what to write; its times are lost.
+    """
+    rows = SE3.matrix(trajectory.world_from_body)[:, :3].reshape(-1, 12).tolist()
+    _write_whole(path, [" ".join(map(repr, row)) + "\n" for row in rows])
 
 
 def read_kitti(path: Path) -> Trajectory:
@@ -67,6 +77,11 @@ def read_kitti(path: Path) -> Trajectory:
         problem = "expected a rotation matrix in columns 1-3, 5-7 and 9-11, found one that is not orthonormal"
         raise table.error(int(np.argmax(wrong)), problem)
     return Trajectory(np.arange(len(matrices)), SE3.from_matrix(matrices))
+
+
+def _write_whole(path: Path, lines: list[str]) -> None:
+    with whole(path) as partial:
+        partial.write_text("".join(lines), encoding="utf-8")
 
 
 def _tum_line(stamp_ns: int, pose: list[float]) -> str:

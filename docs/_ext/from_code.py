@@ -3,14 +3,17 @@
 ```{settings} mono                   every setting of a system's run
 ```{command-help} run range-bearing  what `rbpf run range-bearing --help` prints
 ```{modules} rbpf.maps               the modules of a package, each under a heading
+```{examples}                        every program of examples/ with the first sentence of its docstring
 """
 
+import ast
 import os
 from contextlib import redirect_stdout, suppress
 from dataclasses import fields, is_dataclass
 from importlib import import_module
 from inspect import cleandoc, getdoc
 from io import StringIO
+from pathlib import Path
 from pkgutil import iter_modules
 from re import DOTALL, search
 from typing import Any, ClassVar
@@ -75,6 +78,19 @@ class Modules(SphinxDirective):
         return self.parse_text_to_nodes(text, allow_section_headings=True)
 
 
+class Examples(SphinxDirective):
+    """What each example is about."""
+
+    def run(self) -> list[nodes.Node]:
+        """A list."""
+        listed = nodes.bullet_list()
+        for path in sorted((Path(self.env.srcdir).parent / "examples").glob("*.py")):
+            about = (ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or "").split("\n\n")[0]
+            text = nodes.Text(f": {' '.join(about.split())}")
+            listed += nodes.list_item("", nodes.paragraph("", "", nodes.literal(text=path.name), text))
+        return [listed]
+
+
 def _groups(name: str, config: Any) -> list[tuple[str, Any]]:
     inner = [(item.name, getattr(config, item.name)) for item in fields(config)]
     nested = [
@@ -127,4 +143,5 @@ def setup(app: Sphinx) -> dict[str, Any]:
     app.add_directive("settings", Settings)
     app.add_directive("command-help", CommandHelp)
     app.add_directive("modules", Modules)
+    app.add_directive("examples", Examples)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

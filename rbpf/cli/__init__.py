@@ -1,269 +1,79 @@
 """The command line: thin, one function per command."""
 
 import sys
-from dataclasses import replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import tyro
 from tyro.extras import SubcommandApp
 
-from rbpf.cli import judging
-from rbpf.cli.options import (
-    ImagesOptions,
-    LabOptions,
-    MonoOptions,
-    RangeBearingOptions,
-    StereoOptions,
-    given_board,
-)
-from rbpf.cli.showing import CONSOLE, progress, told
+from rbpf.cli import cameras, exporting, installed, judging
+from rbpf.cli.options import ImagesOptions, MonoOptions, Printed
+from rbpf.cli.running import RUN, repeated, run_mono
+from rbpf.cli.simulating import SIMULATE, simulate_desk
 from rbpf.errors import InputError
 
-if TYPE_CHECKING:
-    from rbpf.validation.simulation.textured_scene import ImageWorld
+PROGRAM = "rbpf"
+BAD_INPUT, STOPPED = 2, 130
+"""Exit codes; 0 is success, 1 a fault of the program."""
 
-FOCAL_SHARE = {ImagesOptions: 0.8, LabOptions: 0.78125}
-"""Focal length by default, as a share of the images' width."""
+APP = SubcommandApp()
+_DESCRIPTION = """Rao-Blackwellised particle filters for SLAM. `rbpf COMMAND --help` says more.
 
-APP, RUN, SIMULATE = SubcommandApp(), SubcommandApp(), SubcommandApp()
-
-
-@RUN.command(name="range-bearing")
-def run_range_bearing(options: Annotated[RangeBearingOptions, tyro.conf.arg(name="")]) -> None:
-    """Range-bearing SLAM over a robot's log (FastSLAM 2.0), beside the batch optimum of the same measurements."""
-    from rbpf.systems.range_bearing.config import RangeBearingConfig
-    from rbpf.systems.settings import load_settings
-    from rbpf.validation.range_bearing import finish_run, start_run
-
-    given = _given(options, "particles", "seed", "association")
-    config = load_settings(RangeBearingConfig, "range-bearing", options.config, options.set, given)
-    _prepare(options.threads)
-    with progress() as bar:
-        task = bar.add_task("filtering", total=None)
-        run = start_run(
-            options.log,
-            config,
-            options.out,
-            options.resume,
-            told(bar, task),
-        )
-    if options.batch:
-        CONSOLE.print("solving the batch problem with the same measurements …")
-    entries = finish_run(run, options.log, options.out, options.batch)
-    _print_summary(entries, options.out)
+Exit codes: 0 success, 1 a fault of the program, 2 bad input (said in one sentence), 130 stopped by Ctrl-C."""
 
 
-@RUN.command(name="mono")
-def run_mono(options: Annotated[MonoOptions, tyro.conf.arg(name="")]) -> None:
-    """Monocular SLAM over a sequence of images or a video (E06: active search, inverse depth, FastSLAM 2.0)."""
-    from rbpf.systems.mono.config import MonoConfig
-    from rbpf.systems.settings import load_settings
-    from rbpf.validation.mono import Recording, Telling, finish_mono, start_mono
-    from rbpf.validation.mono_rerun import require_rerun
+@dataclass(frozen=True, kw_only=True)
+class DemoOptions(Printed):
+    """Options of `rbpf demo`.
 
-    if options.rerun is not None:
-        require_rerun()
-    config = load_settings(
-        MonoConfig, "mono", options.config, options.set, _given(options, "particles", "seed")
-    )
-    board = given_board(options.board, options.square)
-    recording = Recording(options.sequence, options.known_points, options.calibration, board)
-    _prepare(options.threads)
-    with progress() as bar:
-        task = bar.add_task("filtering", total=None)
-        run = start_mono(
-            recording,
-            config,
-            options.out,
-            options.resume,
-            told(bar, task),
-        )
-        solving = bar.add_task("batch", total=None, visible=options.batch)
-        drawing = bar.add_task("drawing", total=None, visible=options.video)
-        telling = Telling(
-            on_frame=told(bar, drawing),
-            on_iteration=lambda count, _error: bar.update(solving, completed=count),
-            batch_s=options.batch_limit,
-        )
-        entries = finish_mono(
-            run, recording, options.out, options.video, options.rerun, options.batch, telling
-        )
-    _print_summary(entries, options.out)
-    if run.failure is not None:
-        raise InputError(f"{run.failure}; what was computed before it is in {options.out}")
-
-
-@RUN.command(name="stereo")
-def run_stereo(options: Annotated[StereoOptions, tyro.conf.arg(name="")]) -> None:
-    """Stereo SLAM over a sequence of pairs of images (S05: SIFT landmarks, visual odometry, 400 particles)."""
-    from rbpf.systems.settings import load_settings
-    from rbpf.systems.stereo.config import StereoConfig
-    from rbpf.validation.mono_rerun import require_rerun
-    from rbpf.validation.stereo import StereoRecording, finish_stereo, start_stereo
-
-    if options.rerun is not None:
-        require_rerun()
-    given = _given(options, "particles", "seed", "dof")
-    config = load_settings(StereoConfig, "stereo", options.config, options.set, given)
-    recording = StereoRecording(options.sequence, options.calibration)
-    _prepare(options.threads)
-    with progress() as bar:
-        task = bar.add_task("filtering", total=None)
-        run = start_stereo(recording, config, options.out, options.resume, told(bar, task))
-    entries = finish_stereo(run, recording, options.out, options.rerun)
-    _print_summary(entries, options.out)
-    if run.failure is not None:
-        raise InputError(f"{run.failure}; what was computed before it is in {options.out}")
-
-
-@SIMULATE.command(name="range-bearing")
-def simulate_range_bearing(
-    out: Path,
-    seed: int = 0,
-    spatial: tyro.conf.FlagCreatePairsOff[bool] = False,
-    steps: int = 200,
-    landmarks: int = 60,
-) -> None:
-    """A log of a robot among landmarks, with ground truth.
-
-    Args:
-        out: folder for the log.
-        seed: of the random generator.
-        spatial: six degrees of freedom instead of three.
-        steps: number of steps.
-        landmarks: number of landmarks.
+    Attributes:
+        out: folder for the images and the results.
+        frames: number of images, 30 per second.
     """
-    from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 
-    simulate_robot(RobotWorld(steps, landmarks, spatial), out, seed)
-    CONSOLE.print(f"wrote {out}")
-
-
-@SIMULATE.command(name="desk")
-def simulate_desk(options: Annotated[ImagesOptions, tyro.conf.arg(name="")]) -> None:
-    """Images of a textured desk with papers, books and boxes on it, taken by a hand-held camera, with ground truth."""
-    from rbpf.validation.simulation.textured_desk import TexturedDesk
-
-    lies = TexturedDesk(frames=options.frames, contrast=options.contrast)
-    board = given_board(options.board, options.square)
-    if board is not None:
-        squares = board.columns + 1, board.rows + 1
-        lies = replace(lies, board=squares, square_m=board.square_m)
-    _render(lies, options)
-
-
-@SIMULATE.command(name="room")
-def simulate_room(options: Annotated[ImagesOptions, tyro.conf.arg(name="")]) -> None:
-    """Images of a room with pictures on its walls, carried in a circle, with ground truth."""
-    from rbpf.validation.simulation.textured_room import TexturedRoom
-
-    if options.board is not None or options.square is not None:
-        raise InputError("a room has no chessboard: leave out --board and --square, or simulate a desk")
-    _render(TexturedRoom(frames=options.frames, contrast=options.contrast), options)
-
-
-@SIMULATE.command(name="lab")
-def simulate_lab(options: Annotated[LabOptions, tyro.conf.arg(name="")]) -> None:
-    """Stereo images of a laboratory of two rooms, taken from a robot, with ground truth and the wheels' odometry."""
-    from rbpf.validation.simulation.textured_lab import LabDrive, TexturedLab
-
-    drive = LabDrive(options.trajectory, options.frames, options.every)
-    _render(TexturedLab(drive, texel_m=options.texel_m, contrast=options.contrast), options)
-
-
-def _render(world: "ImageWorld", options: ImagesOptions | LabOptions) -> None:
-    from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
-    from rbpf.validation.simulation.exposure import Imaging
-    from rbpf.validation.simulation.images import simulate_images
-
-    first, count = options.blackout or (0, 0)
-    imaging = Imaging(
-        noise_std=options.noise_std,
-        exposure_drift=options.exposure_drift,
-        blur_s=options.blur_s,
-        vignetting=options.vignetting,
-        blackout=range(first, first + count),
-        depth=options.depth,
-        known=options.known,
-        jpeg=options.jpeg,
-    )
-    focal = options.focal_px or FOCAL_SHARE[type(options)] * options.width
-    middle = 0.5 * (options.width - 1), 0.5 * (options.height - 1)
-    camera = Pinhole(options.width, options.height, focal, focal, *middle, options.distortion)
-    lens = camera if options.baseline_m is None else RectifiedStereo(camera, options.baseline_m)
-    with progress() as bar:
-        task = bar.add_task("rendering", total=options.frames)
-        simulate_images(world, imaging, lens, options.out, options.seed, told(bar, task))
-    CONSOLE.print(f"wrote {options.out}, {_megabytes(options.out):.0f} MB")
+    out: Path = Path("demo")
+    frames: int = 240
 
 
 @APP.command(name="demo")
-def demo(out: Path = Path("demo"), frames: int = 240) -> None:
-    """Render a desk that a camera moves over, run monocular SLAM on the images, leave plots and the annotated video.
-
-    Args:
-        out: folder for the images and the results.
-        frames: number of images.
-    """
-    images = out / "desk"
+def demo(options: Annotated[DemoOptions, tyro.conf.arg(name="")]) -> None:
+    """Render a desk that a camera moves over, run monocular SLAM on the images, leave plots and the annotated video."""
+    images = options.out / "desk"
     if not (images / "known_points.csv").is_file():
-        simulate_desk(ImagesOptions(images, frames=frames))
-    run_mono(MonoOptions(images, images / "known_points.csv", out=out / "run"))
+        simulate_desk(ImagesOptions(out=images, frames=options.frames))
+    known = images / "known_points.csv"
+    run_mono(MonoOptions(sequence=images, known_points=known, out=options.out / "run", json=options.json))
 
 
 APP.command(RUN, name="run")
 APP.command(SIMULATE, name="simulate")
+APP.command(name="calibrate")(cameras.calibrate)
 APP.command(name="validate")(judging.validate)
 APP.command(name="report")(judging.report)
+APP.command(name="export")(exporting.export)
 APP.command(name="sweep")(judging.sweep)
 APP.command(name="compare")(judging.compare)
+APP.command(name="doctor")(installed.doctor)
+APP.command(name="completion")(installed.completion)
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Parses the command line, runs the command; bad input becomes one sentence and exit code 2."""
     try:
-        APP.cli(prog="rbpf", description="Rao-Blackwellised particle filters for SLAM.", args=arguments)
+        given = sys.argv[1:] if arguments is None else arguments
+        APP.cli(prog=PROGRAM, description=_DESCRIPTION, args=repeated(list(given)))
     except InputError as error:
-        print(f"rbpf: {error}", file=sys.stderr)
-        return 2
+        print(f"{PROGRAM}: {error}", file=sys.stderr)
+        return BAD_INPUT
     except OSError as error:
         print(
-            f"rbpf: {error}; what was finished is kept, --resume goes on from the last checkpoint",
+            f"{PROGRAM}: {error}; what was finished is kept, --resume goes on from the last checkpoint",
             file=sys.stderr,
         )
-        return 2
-    except KeyboardInterrupt:
-        print("rbpf: stopped; --resume goes on from the last checkpoint", file=sys.stderr)
-        return 130
+        return BAD_INPUT
+    except KeyboardInterrupt as stopped:
+        print(f"{PROGRAM}: {stopped or 'stopped'}", file=sys.stderr)
+        return STOPPED
     return 0
-
-
-def _given(options: object, *names: str) -> dict[str, object]:
-    """Those of some options that were given."""
-    values = {name: getattr(options, name) for name in names}
-    return {name: value for name, value in values.items() if value is not None}
-
-
-def _prepare(threads: int | None) -> None:
-    """Threads as asked for, and compiled kernels."""
-    import numba
-
-    from rbpf.kernels import compile_once
-
-    if threads is not None:
-        if not 1 <= threads <= numba.config.NUMBA_NUM_THREADS:
-            raise InputError(f"--threads must lie in 1..{numba.config.NUMBA_NUM_THREADS}, got {threads}")
-        numba.set_num_threads(threads)
-    compile_once(lambda: CONSOLE.print("compiling the kernels, which takes a minute and is done once …"))
-
-
-def _megabytes(folder: Path) -> float:
-    """Size of all files in a folder."""
-    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) / 1e6
-
-
-def _print_summary(entries: dict[str, object], out: Path) -> None:
-    for name, value in entries.items():
-        CONSOLE.print(f"{name:>34}  {value:.6g}" if isinstance(value, float) else f"{name:>34}  {value}")
-    CONSOLE.print(f"results, pictures and report.html are in {out}")

@@ -6,21 +6,22 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from rbpf.cli.showing import CONSOLE, progress, told
+from rbpf.cli.options import Printed
+from rbpf.cli.showing import answer, progress, told, waiting
 from rbpf.errors import InputError
 
 if TYPE_CHECKING:
     from rbpf.validation.verdict import Verdict
 
 
-@dataclass(frozen=True)
-class ValidateOptions:
+@dataclass(frozen=True, kw_only=True)
+class ValidateOptions(Printed):
     """Options of `rbpf validate`.
 
     Attributes:
         run: folder that `rbpf run` left.
         against: ground truth of the recording, batch optimum of the same measurements, or a reconstruction.
-        out: a further folder for the JSON; one is always written into the run's own.
+        out: a further folder for the JSON, which is always written into the run's own; by default none.
     """
 
     run: tyro.conf.Positional[Path]
@@ -32,35 +33,44 @@ def validate(options: Annotated[ValidateOptions, tyro.conf.arg(name="")]) -> Non
     """Compare a run with the truth or an optimum: JSON, pictures, and two sentences on top of its report."""
     from rbpf.validation.validate import validate as compare
 
-    _say(compare(options.run, options.against, options.out), options.run)
+    with waiting(f"comparing with {options.against} …"):
+        verdict = compare(options.run, options.against, options.out)
+    _tell(verdict, options.run, options.json)
 
 
-def report(run: tyro.conf.Positional[Path]) -> None:
-    """Build the report of a run again, from the files in its folder.
+@dataclass(frozen=True, kw_only=True)
+class ReportOptions(Printed):
+    """Options of `rbpf report`.
 
-    Args:
+    Attributes:
         run: folder that `rbpf run` left.
     """
+
+    run: tyro.conf.Positional[Path]
+
+
+def report(options: Annotated[ReportOptions, tyro.conf.arg(name="")]) -> None:
+    """Build the report of a run again, from the files in its folder."""
     from rbpf.validation.report import write_report
 
-    _say(write_report(run), run)
+    _tell(write_report(options.run), options.run, options.json)
 
 
-def _say(verdict: "Verdict", run: Path) -> None:
-    for sentence in verdict.sentences:
-        CONSOLE.print(sentence, highlight=False)
-    CONSOLE.print(f"the page is {run / 'report.html'}")
+def _tell(verdict: "Verdict", run: Path, as_json: bool) -> None:
+    page = run / "report.html"
+    entries = {"trust": verdict.trust, "sentences": list(verdict.sentences), "report": str(page)}
+    answer(entries, as_json, *verdict.sentences, f"the page is {page}")
 
 
-@dataclass(frozen=True)
-class SweepOptions:
+@dataclass(frozen=True, kw_only=True)
+class SweepOptions(Printed):
     """Options of `rbpf sweep`.
 
     Attributes:
         config: YAML file with system, sequences, particles, seeds, options and settings.
         out: folder for the rows and the table; what is finished there is not computed again.
-        workers: processes of this machine; by default one per core.
-        scheduler: address of a Dask scheduler (tcp://HOST:PORT) whose workers run instead.
+        workers: processes of this machine; -1 is one per core.
+        scheduler: address of a Dask scheduler (tcp://HOST:PORT) whose workers run instead; by default none.
     """
 
     config: tyro.conf.Positional[Path]
@@ -81,26 +91,39 @@ def sweep(options: Annotated[SweepOptions, tyro.conf.arg(name="")]) -> None:
     with progress() as bar:
         task = bar.add_task("running", total=len(jobs))
         rows = run_all(jobs, options.out, options.workers, options.scheduler, told(bar, task))
-    CONSOLE.print(f"{len(rows)} runs are in {options.out / TABLE}")
     failures = [row["failure"] for row in rows if "failure" in row]
+    path = options.out / TABLE
+    entries = {"runs": len(rows), "failed": len(failures), "table": str(path)}
+    answer(entries, options.json, f"{len(rows)} runs are in {path}")
     if failures:
         raise InputError(f"{len(failures)} of {len(rows)} runs were not possible, the first: {failures[0]}")
 
 
-def compare(
-    run_a: tyro.conf.Positional[Path], run_b: tyro.conf.Positional[Path], seeds: int = 5, workers: int = -1
-) -> None:
-    """Which of two runs' settings explains their common recording better: difference of log-evidence, with its error.
+@dataclass(frozen=True, kw_only=True)
+class CompareOptions(Printed):
+    """Options of `rbpf compare`.
 
-    Args:
+    Attributes:
         run_a: folder that `rbpf run` left.
         run_b: another one of the same recording.
         seeds: runs of each, from which the error is told.
-        workers: processes; by default one per core.
+        workers: processes; -1 is one per core.
     """
+
+    run_a: tyro.conf.Positional[Path]
+    run_b: tyro.conf.Positional[Path]
+    seeds: int = 5
+    workers: int = -1
+
+
+def compare(options: Annotated[CompareOptions, tyro.conf.arg(name="")]) -> None:
+    """Which of two runs' settings explains their recording better: difference of log-evidence, with its error."""
     from rbpf.validation.model_comparison import compare_runs
 
+    a, b = options.run_a, options.run_b
     with progress() as bar:
-        task = bar.add_task("filtering", total=2 * seeds)
-        found = compare_runs(run_a, run_b, seeds, workers, told(bar, task))
-    CONSOLE.print(found.sentence(str(run_a), str(run_b)), highlight=False)
+        task = bar.add_task("filtering", total=2 * options.seeds)
+        found = compare_runs(a, b, options.seeds, options.workers, told(bar, task))
+    sentence = found.sentence(str(a), str(b))
+    entries = {"difference": found.difference, "error": found.error, "sentence": sentence}
+    answer(entries, options.json, sentence)

@@ -1,9 +1,22 @@
-"""What all commands show progress with."""
+"""What all commands show progress and results with: sentences and bars on standard error, JSON on standard output."""
 
-from collections.abc import Callable
+import json
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 CONSOLE = Console(stderr=True)
 
@@ -14,6 +27,47 @@ def told(bar: Progress, task: TaskID) -> Callable[[int, int], None]:
 
 
 def progress() -> Progress:
-    """A bar with an estimate of the time that is left."""
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    """A bar with the time that has passed and an estimate of what is left."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left:"),
+        TimeRemainingColumn(),
+    )
     return Progress(*columns, console=CONSOLE)
+
+
+@contextmanager
+def waiting(what: str) -> Iterator[None]:
+    """A line with a turning mark, for work that cannot tell how far it is."""
+    with CONSOLE.status(what):
+        yield
+
+
+def say(sentence: str) -> None:
+    """A sentence, on standard error."""
+    CONSOLE.print(sentence, highlight=False, soft_wrap=True)
+
+
+def answer(entries: Mapping[str, Any], as_json: bool, *sentences: str) -> None:
+    """A command's result: its entries as one JSON object on standard output, or sentences on standard error."""
+    if as_json:
+        sys.stdout.write(json.dumps(entries, default=str, allow_nan=False) + "\n")
+        return
+    for sentence in sentences:
+        say(sentence)
+
+
+def table(entries: Mapping[str, Any], width: int = 34) -> str:
+    """Names and values, one a line."""
+    return "\n".join(
+        f"{name:>{width}}  {value:.6g}" if isinstance(value, float) else f"{name:>{width}}  {value}"
+        for name, value in entries.items()
+    )
+
+
+def megabytes(folder: Path) -> float:
+    """Size of all files in a folder."""
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) / 1e6

@@ -50,8 +50,8 @@ def _run(
     inputs = [_block(part) for part in (lanes.state, lanes.landmark, lanes.const)]
     try:
         arrays = [output.array for output in outputs]
-        call_kernel(fused.function, *inputs, np.array(z), fused.params, count, *arrays)
-    except TypeError as error:
+        call_kernel(fused.function.address, *inputs, np.array(z), fused.params, count, *arrays)
+    except AttributeError as error:
         raise FindingError(f"{name} gives no fused kernel: decorate it with @observation_kernel") from error
     for what, output in zip(_OUTPUTS, outputs, strict=True):
         require(output.intact, f"{name} writes outside {what}, which has shape {output.array.shape}")

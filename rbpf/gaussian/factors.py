@@ -9,6 +9,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rbpf.arrays import Float, Like
 from rbpf.errors import InputError
 from rbpf.gaussian.storage import Array, entries_first, entries_last, gram, symmetrise
 
@@ -19,7 +20,7 @@ _SINGULAR = 1e-12
 _NO_SCALE = 1e-100
 
 
-def cholesky(cov: ArrayLike) -> Array:
+def cholesky(cov: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch n n"]:
     """Lower Cholesky factor of positive definite matrices; the upper triangle is not read.
 
     Args:
@@ -39,7 +40,7 @@ def cholesky(cov: ArrayLike) -> Array:
     return chol
 
 
-def psd_factor(cov: ArrayLike) -> Array:
+def psd_factor(cov: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch n n"]:
     """Square factor L with L L^T = cov of positive semi-definite, possibly singular matrices.
 
     A definite matrix gets its lower Cholesky factor, any other one its scaled eigenvectors; each
@@ -66,7 +67,9 @@ def psd_factor(cov: ArrayLike) -> Array:
     return factor
 
 
-def solve_lower(chol: ArrayLike, b: ArrayLike) -> Array:
+def solve_lower(
+    chol: Like[ArrayLike, "*#batch n n"], b: Like[ArrayLike, "*#batch n"]
+) -> Float[np.ndarray, "*batch n"]:
     """Solve chol x = b by forward substitution.
 
     Args:
@@ -79,7 +82,9 @@ def solve_lower(chol: ArrayLike, b: ArrayLike) -> Array:
     return solve_lower_matrix(chol, np.asarray(b, dtype=float)[..., None])[..., 0]
 
 
-def solve_lower_matrix(chol: ArrayLike, b: ArrayLike) -> Array:
+def solve_lower_matrix(
+    chol: Like[ArrayLike, "*#batch n n"], b: Like[ArrayLike, "*#batch n k"]
+) -> Float[np.ndarray, "*batch n k"]:
     """Solve chol X = B by forward substitution.
 
     Args:
@@ -100,7 +105,7 @@ def solve_lower_matrix(chol: ArrayLike, b: ArrayLike) -> Array:
     return entries_last(out)
 
 
-def inverse(cov: ArrayLike) -> Array:
+def inverse(cov: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch n n"]:
     """Inverse of positive definite matrices, exactly symmetric.
 
     Args:
@@ -117,13 +122,13 @@ def inverse(cov: ArrayLike) -> Array:
     return gram(np.swapaxes(half, -1, -2))
 
 
-def log_det(chol: ArrayLike) -> Array:
+def log_det(chol: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch"]:
     """Logarithm of the determinant, log |chol chol^T|, (..., n, n) -> (...)."""
     diagonal = np.diagonal(np.asarray(chol, dtype=float), axis1=-2, axis2=-1)
     return 2.0 * np.log(diagonal).sum(-1)
 
 
-def generalised_inverse(cov: Array) -> Array:
+def generalised_inverse(cov: Float[np.ndarray, "*batch n n"]) -> Float[np.ndarray, "*batch n n"]:
     """Symmetric G with cov G cov = cov of semi-definite matrices, null directions left out.
 
     Args:

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rbpf.arrays import Float, Like
 from rbpf.errors import InputError
 from rbpf.gaussian.factors import cholesky, generalised_inverse, log_det, psd_factor, solve_lower
 from rbpf.gaussian.storage import Array, gram, product
@@ -16,19 +17,21 @@ _LOG_2PI = float(np.log(2.0 * np.pi))
 class Gaussian(NamedTuple):
     """Mean (..., n) and covariance (..., n, n)."""
 
-    mean: Array
-    cov: Array
+    mean: Float[np.ndarray, "*batch n"]
+    cov: Float[np.ndarray, "*batch n n"]
 
 
 class Transformed(NamedTuple):
     """Mean (..., m) and covariance (..., m, m) of y, and cov_xy = cov(x, y) (..., n, m)."""
 
-    mean: Array
-    cov: Array
-    cov_xy: Array
+    mean: Float[np.ndarray, "*batch m"]
+    cov: Float[np.ndarray, "*batch m m"]
+    cov_xy: Float[np.ndarray, "*batch n m"]
 
 
-def log_density(residual: ArrayLike, cov: ArrayLike) -> Array:
+def log_density(
+    residual: Like[ArrayLike, "*#batch n"], cov: Like[ArrayLike, "*#batch n n"]
+) -> Float[np.ndarray, "*batch"]:
     """Logarithm of the density N(residual; 0, cov).
 
     Args:
@@ -47,8 +50,11 @@ def log_density(residual: ArrayLike, cov: ArrayLike) -> Array:
 
 
 def sample(
-    mean: ArrayLike, factor: ArrayLike, rng: np.random.Generator, shape: tuple[int, ...] = ()
-) -> Array:
+    mean: Like[ArrayLike, "*#batch n"],
+    factor: Like[ArrayLike, "*#batch n r"],
+    rng: np.random.Generator,
+    shape: tuple[int, ...] = (),
+) -> Float[np.ndarray, "... n"]:
     """Draws of mean + factor e with e ~ N(0, I).
 
     Args:
@@ -67,12 +73,12 @@ def sample(
 
 
 def condition(
-    mean_a: ArrayLike,
-    mean_b: ArrayLike,
-    cov_aa: ArrayLike,
-    cov_ab: ArrayLike,
-    cov_bb: ArrayLike,
-    b: ArrayLike,
+    mean_a: Like[ArrayLike, "*#batch n"],
+    mean_b: Like[ArrayLike, "*#batch m"],
+    cov_aa: Like[ArrayLike, "*#batch n n"],
+    cov_ab: Like[ArrayLike, "*#batch n m"],
+    cov_bb: Like[ArrayLike, "*#batch m m"],
+    b: Like[ArrayLike, "*#batch m"],
 ) -> Gaussian:
     """Law of a given b, where (a, b) are jointly Gaussian.
 
@@ -104,7 +110,10 @@ def condition(
 
 
 def unscented_transform(
-    function: Callable[[Array], Array], mean: ArrayLike, cov: ArrayLike, kappa: float | None = None
+    function: Callable[[Array], Array],
+    mean: Like[ArrayLike, "*#batch n"],
+    cov: Like[ArrayLike, "*#batch n n"],
+    kappa: float | None = None,
 ) -> Transformed:
     """Gaussian of y = function(x) from the 2n + 1 symmetric sigma points.
 

@@ -5,25 +5,26 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rbpf.arrays import Float, Like
 from rbpf.errors import InputError
 
 Array = NDArray[np.float64]
 
 
-def symmetrise(cov: ArrayLike) -> Array:
+def symmetrise(cov: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch n n"]:
     """Symmetric part, (..., n, n) -> (..., n, n)."""
     cov = np.asarray(cov, dtype=float)
     return 0.5 * (cov + np.swapaxes(cov, -1, -2))
 
 
-def pack(cov: ArrayLike) -> Array:
+def pack(cov: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch packed"]:
     """Lower triangle row by row, c00 c10 c11 c20 c21 c22 ..., (..., n, n) -> (..., n (n + 1) / 2)."""
     cov = np.asarray(cov, dtype=float)
     rows, columns = _triangle(cov.shape[-1])
     return cov[..., rows, columns]
 
 
-def unpack(packed: ArrayLike, n: int) -> Array:
+def unpack(packed: Like[ArrayLike, "*batch packed"], n: int) -> Float[np.ndarray, "*batch {n} {n}"]:
     """Symmetric matrix of a packed lower triangle, (..., n (n + 1) / 2) -> (..., n, n).
 
     Raises:
@@ -52,13 +53,15 @@ def entries_last(entries: Array) -> Array:
     return entries.transpose(*range(2, entries.ndim), 0, 1)
 
 
-def product(a: Array, b: Array) -> Array:
+def product(
+    a: Float[np.ndarray, "*#batch n k"], b: Float[np.ndarray, "*#batch k m"]
+) -> Float[np.ndarray, "*batch n m"]:
     """Matrix product of stacks that broadcast, (..., n, k) and (..., k, m) -> (..., n, m)."""
     ndim = max(a.ndim, b.ndim)
     return entries_last(np.einsum("ik...,kj...->ij...", entries_first(a, ndim), entries_first(b, ndim)))
 
 
-def gram(factor: Array) -> Array:
+def gram(factor: Float[np.ndarray, "*batch n r"]) -> Float[np.ndarray, "*batch n n"]:
     """Product factor factor^T, exactly symmetric, (..., n, r) -> (..., n, n)."""
     entries = entries_first(factor)
     return entries_last(np.einsum("ir...,jr...->ij...", entries, entries))

@@ -23,6 +23,8 @@ _DRIVERS = (
     "substate",
     "soundness",
     "robust_fit",
+    "rigid_fit",
+    "single",
 )
 
 

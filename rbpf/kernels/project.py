@@ -1,10 +1,11 @@
 """Driver: where landmarks will be measured, under all particles (E06 §4.1)."""
 
 import numpy as np
-from numba import njit, void
+from numba import int64, njit, void
 
-from rbpf.kernels.block import innovation_covariance, load_record
-from rbpf.kernels.signature import BLOCK, CUBE, INDEX_MATRIX, INDICES, KERNEL_TYPE, MATRIX, VECTOR
+from rbpf.kernels.block import load_record
+from rbpf.kernels.innovation import innovation_covariance
+from rbpf.kernels.signature import BLOCK, CUBE, INDEX_MATRIX, INDICES, MATRIX, VECTOR, kernel_at
 
 
 @njit(cache=True, error_model="numpy")
@@ -49,7 +50,7 @@ def _add_between(weights, offset, mean, cov):
 
 @njit(
     void(
-        KERNEL_TYPE,
+        int64,
         VECTOR,
         MATRIX,
         CUBE,
@@ -66,12 +67,13 @@ def _add_between(weights, offset, mean, cov):
     cache=True,
     error_model="numpy",
 )
-def project(kernel, params, state, pool, slabs, which, maps, anchor, weights, factor, sizes, mean, cov):
+def project(address, params, state, pool, slabs, which, maps, anchor, weights, factor, sizes, mean, cov):
     """Fills `mean` (K, p), relative to `anchor` (K, p), and `cov` (K, p, p) = within + between particles.
 
     The kernel's residual of `anchor`, with the sign reversed, is where a particle expects the landmark. Within is
     J P Jᵀ + H L (H L)ᵀ, with the `factor` L (N or 1, d, r) of the state. Other arguments as in `refine`.
     """
+    kernel = kernel_at(address)
     n_particles, size = state.shape
     p = anchor.shape[1]
     dim, dim_map, size_const = sizes[0], sizes[1], sizes[2]

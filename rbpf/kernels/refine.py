@@ -10,29 +10,29 @@ from rbpf.kernels.block import (
     add_squares,
     add_transposed_product,
     cholesky,
-    innovation_covariance,
     load_record,
     packed,
     whiten_matrix,
     whiten_vector,
 )
 from rbpf.kernels.gate import accept_predicted, leave_out
+from rbpf.kernels.innovation import innovation_covariance
 from rbpf.kernels.signature import (
     BLOCK,
     CUBE,
     FACTORS_PER_LOG,
     INDEX_MATRIX,
     INDICES,
-    KERNEL_TYPE,
     MASK,
     MATRIX,
     VECTOR,
+    kernel_at,
 )
 
 
 @njit(
     void(
-        KERNEL_TYPE,
+        int64,
         VECTOR,
         MATRIX,
         CUBE,
@@ -56,7 +56,7 @@ from rbpf.kernels.signature import (
     error_model="numpy",
 )
 def refine(
-    kernel,
+    address,
     params,
     state,
     pool,
@@ -77,9 +77,10 @@ def refine(
 ):
     """Adds Σ HᵀS⁻¹H, Σ HᵀS⁻¹ν, Σ νᵀS⁻¹ν and Σ log|2πS| over the observations, S = J P Jᵀ + R; see docs/mathematics.md.
 
-    `state` (N, E) holds the linearisation points; observation k reads slab `slabs[k]` of `pool` (slabs, fields, N)
-    at the rows `maps[which[k]]`; `mask` (K, N) or (0, 0) says which particles saw it; `form` and `form_params`
-    name the likelihood, `factor` (N or 1, d, r) is the prior's, used for gating only; `sizes` = (d, D, A).
+    `address` is that of the model's kernel. `state` (N, E) holds the linearisation points; observation k reads slab
+    `slabs[k]` of `pool` (slabs, fields, N) at the rows `maps[which[k]]`; `mask` (K, N) or (0, 0) says which particles
+    saw it; `form` and `form_params` name the likelihood, `factor` (N or 1, d, r) is the prior's, used for gating only;
+    `sizes` = (d, D, A).
     """
     n_particles, size = state.shape
     n_obs, p = noise.shape[0], noise.shape[1]
@@ -88,6 +89,7 @@ def refine(
     for block in prange((n_particles + BLOCK - 1) // BLOCK):
         start = block * BLOCK
         count = min(BLOCK, n_particles - start)
+        kernel = kernel_at(address)
         x = np.empty((size, BLOCK))
         mean = np.empty((dim_map, BLOCK))
         cov = np.empty((size_cov, BLOCK))

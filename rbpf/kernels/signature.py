@@ -5,7 +5,8 @@ from pathlib import Path
 from typing import Any, final
 
 from numba import cfunc, float64, int64, types, void
-from numba.core.types.function_type import WrapperAddressProtocol
+from numba.core import cgutils
+from numba.extending import intrinsic
 
 from rbpf.kernels.stale import discard_stale
 
@@ -30,22 +31,27 @@ KERNEL_TYPE = types.FunctionType(_SIGNATURE)
 
 
 @final
-class ObservationKernel(WrapperAddressProtocol):
-    """A compiled kernel as the drivers take it: its type is looked up, not worked out anew at every call."""
-
-    _numba_type_ = KERNEL_TYPE
+class ObservationKernel:
+    """A compiled kernel; the drivers take its address, a plain number, which costs nothing to hand over."""
 
     def __init__(self, compiled: Any) -> None:
         self.compiled = compiled
         """Numba's object, which owns the machine code."""
-
-    def __wrapper_address__(self) -> int:
+        self.address = int(compiled.address)
         """Where the machine code starts."""
-        return int(self.compiled.address)
 
-    def signature(self) -> Any:
-        """The kernel's signature."""
-        return _SIGNATURE
+
+@intrinsic
+def kernel_at(_typing: Any, address: Any) -> Any:
+    """Inside a driver: the kernel that starts at an address (int64), as something to call."""
+
+    def build(context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        made = cgutils.create_struct_proxy(KERNEL_TYPE)(context, builder)
+        made.c_addr = builder.inttoptr(arguments[0], cgutils.voidptr_t)
+        made.py_addr = made.jit_addr = cgutils.get_null_value(cgutils.voidptr_t)
+        return made._getvalue()
+
+    return KERNEL_TYPE(address), build
 
 
 def observation_kernel(function: Callable[..., None]) -> ObservationKernel:

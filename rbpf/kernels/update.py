@@ -10,22 +10,22 @@ from rbpf.kernels.block import (
     add_squares,
     add_transposed_product,
     cholesky,
-    innovation_covariance,
     load_record,
     whiten_matrix,
     whiten_vector,
 )
 from rbpf.kernels.gate import is_inlier, leave_out, log_likelihood
+from rbpf.kernels.innovation import innovation_covariance
 from rbpf.kernels.signature import (
     BLOCK,
     CUBE,
     FACTORS_PER_LOG,
     INDEX_MATRIX,
     INDICES,
-    KERNEL_TYPE,
     MASK,
     MATRIX,
     VECTOR,
+    kernel_at,
 )
 
 
@@ -47,7 +47,7 @@ def _store_record(pool, slab, source, rows, start, count, mean, cov):
 
 @njit(
     void(
-        KERNEL_TYPE,
+        int64,
         VECTOR,
         MATRIX,
         CUBE,
@@ -68,7 +68,7 @@ def _store_record(pool, slab, source, rows, start, count, mean, cov):
     error_model="numpy",
 )
 def update(
-    kernel,
+    address,
     params,
     state,
     pool,
@@ -97,6 +97,7 @@ def update(
     for block in prange((n_particles + BLOCK - 1) // BLOCK):
         start = block * BLOCK
         count = min(BLOCK, n_particles - start)
+        kernel = kernel_at(address)
         x = np.empty((size, BLOCK))
         mean = np.empty((dim_map, BLOCK))
         cov = np.empty((size_cov, BLOCK))

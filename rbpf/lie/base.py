@@ -7,6 +7,8 @@ from typing import final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rbpf.arrays import Float, Like
+
 Array = NDArray[np.float64]
 
 _MEAN_ITERATIONS = 50
@@ -34,7 +36,7 @@ class Manifold(ABC):
     dim: int
 
     @abstractmethod
-    def identity(self, shape: tuple[int, ...] = ()) -> Array:
+    def identity(self, shape: tuple[int, ...] = ()) -> Float[np.ndarray, "*shape {self.size}"]:
         """Origin of the space, repeated.
 
         Args:
@@ -45,7 +47,9 @@ class Manifold(ABC):
         """
 
     @abstractmethod
-    def retract(self, x: ArrayLike, xi: ArrayLike) -> Array:
+    def retract(
+        self, x: Like[ArrayLike, "*#batch {self.size}"], xi: Like[ArrayLike, "*#batch {self.dim}"]
+    ) -> Float[np.ndarray, "*batch {self.size}"]:
         """Point reached from x along xi.
 
         Args:
@@ -57,7 +61,9 @@ class Manifold(ABC):
         """
 
     @abstractmethod
-    def local(self, x: ArrayLike, y: ArrayLike) -> Array:
+    def local(
+        self, x: Like[ArrayLike, "*#batch {self.size}"], y: Like[ArrayLike, "*#batch {self.size}"]
+    ) -> Float[np.ndarray, "*batch {self.dim}"]:
         """Coordinates of y in the chart at x; the inverse of `retract`.
 
         Args:
@@ -69,7 +75,7 @@ class Manifold(ABC):
         """
 
     @abstractmethod
-    def normalise(self, x: ArrayLike) -> Array:
+    def normalise(self, x: Like[ArrayLike, "*#batch {self.size}"]) -> Float[np.ndarray, "*batch {self.size}"]:
         """Nearest valid storage: unit quaternion, wrapped angle.
 
         Args:
@@ -80,7 +86,12 @@ class Manifold(ABC):
         """
 
     @final
-    def interpolate(self, a: ArrayLike, b: ArrayLike, s: ArrayLike) -> Array:
+    def interpolate(
+        self,
+        a: Like[ArrayLike, "*#batch {self.size}"],
+        b: Like[ArrayLike, "*#batch {self.size}"],
+        s: Like[ArrayLike, "*#batch"],
+    ) -> Float[np.ndarray, "*batch {self.size}"]:
         """Point at the fraction s of the geodesic from a to b.
 
         Args:
@@ -94,7 +105,9 @@ class Manifold(ABC):
         return self.retract(a, np.asarray(s, dtype=float)[..., None] * self.local(a, b))
 
     @final
-    def mean(self, x: ArrayLike, weights: ArrayLike) -> Array:
+    def mean(
+        self, x: Like[ArrayLike, "N {self.size}"], weights: Like[ArrayLike, " N"]
+    ) -> Float[np.ndarray, " {self.size}"]:
         """Weighted Fréchet mean: the m with sum_i w_i local(m, x_i) = 0.
 
         Gauss-Newton from the heaviest point. It is unique where the points lie within a quarter
@@ -123,52 +136,70 @@ class LieGroup(Manifold):
     """A manifold with a smooth group operation; the chart at x is xi -> x Exp(xi)."""
 
     @abstractmethod
-    def exp(self, xi: ArrayLike) -> Array:
+    def exp(self, xi: Like[ArrayLike, "*#batch {self.dim}"]) -> Float[np.ndarray, "*batch {self.size}"]:
         """Exponential map, (..., d) -> (..., E)."""
 
     @abstractmethod
-    def log(self, x: ArrayLike) -> Array:
+    def log(self, x: Like[ArrayLike, "*#batch {self.size}"]) -> Float[np.ndarray, "*batch {self.dim}"]:
         """Logarithm, (..., E) -> (..., d), with the rotation angle in [0, pi]."""
 
     @abstractmethod
-    def compose(self, a: ArrayLike, b: ArrayLike) -> Array:
+    def compose(
+        self, a: Like[ArrayLike, "*#batch {self.size}"], b: Like[ArrayLike, "*#batch {self.size}"]
+    ) -> Float[np.ndarray, "*batch {self.size}"]:
         """Group product a b, (..., E) and (..., E) -> (..., E)."""
 
     @abstractmethod
-    def inverse(self, a: ArrayLike) -> Array:
+    def inverse(self, a: Like[ArrayLike, "*#batch {self.size}"]) -> Float[np.ndarray, "*batch {self.size}"]:
         """Group inverse, (..., E) -> (..., E)."""
 
     @abstractmethod
-    def adjoint(self, a: ArrayLike) -> Array:
+    def adjoint(
+        self, a: Like[ArrayLike, "*#batch {self.size}"]
+    ) -> Float[np.ndarray, "*batch {self.dim} {self.dim}"]:
         """Ad_a with a Exp(xi) = Exp(Ad_a xi) a, (..., E) -> (..., d, d)."""
 
     @abstractmethod
-    def left_jacobian(self, xi: ArrayLike) -> Array:
+    def left_jacobian(
+        self, xi: Like[ArrayLike, "*#batch {self.dim}"]
+    ) -> Float[np.ndarray, "*batch {self.dim} {self.dim}"]:
         """J_l with Exp(xi + delta) = Exp(J_l delta) Exp(xi) to first order, (..., d) -> (..., d, d)."""
 
     @abstractmethod
-    def left_jacobian_inverse(self, xi: ArrayLike) -> Array:
+    def left_jacobian_inverse(
+        self, xi: Like[ArrayLike, "*#batch {self.dim}"]
+    ) -> Float[np.ndarray, "*batch {self.dim} {self.dim}"]:
         """Inverse of `left_jacobian`, (..., d) -> (..., d, d); singular at an angle of 2 pi."""
 
     @final
-    def right_jacobian(self, xi: ArrayLike) -> Array:
+    def right_jacobian(
+        self, xi: Like[ArrayLike, "*#batch {self.dim}"]
+    ) -> Float[np.ndarray, "*batch {self.dim} {self.dim}"]:
         """J_r with Exp(xi + delta) = Exp(xi) Exp(J_r delta) to first order, (..., d) -> (..., d, d)."""
         return self.left_jacobian(-np.asarray(xi, dtype=float))
 
     @final
-    def right_jacobian_inverse(self, xi: ArrayLike) -> Array:
+    def right_jacobian_inverse(
+        self, xi: Like[ArrayLike, "*#batch {self.dim}"]
+    ) -> Float[np.ndarray, "*batch {self.dim} {self.dim}"]:
         """Inverse of `right_jacobian`, (..., d) -> (..., d, d); singular at an angle of 2 pi."""
         return self.left_jacobian_inverse(-np.asarray(xi, dtype=float))
 
     @final
-    def between(self, a: ArrayLike, b: ArrayLike) -> Array:
+    def between(
+        self, a: Like[ArrayLike, "*#batch {self.size}"], b: Like[ArrayLike, "*#batch {self.size}"]
+    ) -> Float[np.ndarray, "*batch {self.size}"]:
         """Product a^-1 b, (..., E) and (..., E) -> (..., E)."""
         return self.compose(self.inverse(a), b)
 
-    def retract(self, x: ArrayLike, xi: ArrayLike) -> Array:
+    def retract(
+        self, x: Like[ArrayLike, "*#batch {self.size}"], xi: Like[ArrayLike, "*#batch {self.dim}"]
+    ) -> Float[np.ndarray, "*batch {self.size}"]:
         """Product x Exp(xi); see `Manifold.retract`. A group may fuse the two steps for speed."""
         return self.compose(x, self.exp(xi))
 
-    def local(self, x: ArrayLike, y: ArrayLike) -> Array:
+    def local(
+        self, x: Like[ArrayLike, "*#batch {self.size}"], y: Like[ArrayLike, "*#batch {self.size}"]
+    ) -> Float[np.ndarray, "*batch {self.dim}"]:
         """Log(x^-1 y); see `Manifold.local`. A group may fuse the two steps for speed."""
         return self.log(self.between(x, y))

@@ -5,6 +5,7 @@ from typing import final
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rbpf.arrays import Float, Like
 from rbpf.errors import InputError
 from rbpf.lie.base import Array, LieGroup
 
@@ -29,37 +30,49 @@ class Euclidean(LieGroup):
     def __repr__(self) -> str:
         return f"Euclidean({self.dim})"
 
-    def identity(self, shape: tuple[int, ...] = ()) -> Array:
+    def identity(self, shape: tuple[int, ...] = ()) -> Float[np.ndarray, "*shape {self.size}"]:
         return np.zeros((*shape, self.size))
 
-    def exp(self, xi: ArrayLike) -> Array:
+    def exp(self, xi: Like[ArrayLike, "*#batch {self.dim}"]) -> Float[np.ndarray, "*batch {self.size}"]:
         return np.array(xi, dtype=float)
 
-    def log(self, x: ArrayLike) -> Array:
+    def log(self, x: Like[ArrayLike, "*#batch {self.size}"]) -> Float[np.ndarray, "*batch {self.dim}"]:
         return np.array(x, dtype=float)
 
-    def compose(self, a: ArrayLike, b: ArrayLike) -> Array:
+    def compose(
+        self, a: Like[ArrayLike, "*#batch {self.size}"], b: Like[ArrayLike, "*#batch {self.size}"]
+    ) -> Float[np.ndarray, "*batch {self.size}"]:
         return np.asarray(a, dtype=float) + np.asarray(b, dtype=float)
 
-    def inverse(self, a: ArrayLike) -> Array:
+    def inverse(self, a: Like[ArrayLike, "*#batch {self.size}"]) -> Float[np.ndarray, "*batch {self.size}"]:
         return -np.asarray(a, dtype=float)
 
-    def retract(self, x: ArrayLike, xi: ArrayLike) -> Array:
+    def retract(
+        self, x: Like[ArrayLike, "*#batch {self.size}"], xi: Like[ArrayLike, "*#batch {self.dim}"]
+    ) -> Float[np.ndarray, "*batch {self.size}"]:
         return self.compose(x, xi)
 
-    def local(self, x: ArrayLike, y: ArrayLike) -> Array:
+    def local(
+        self, x: Like[ArrayLike, "*#batch {self.size}"], y: Like[ArrayLike, "*#batch {self.size}"]
+    ) -> Float[np.ndarray, "*batch {self.dim}"]:
         return np.asarray(y, dtype=float) - np.asarray(x, dtype=float)
 
-    def normalise(self, x: ArrayLike) -> Array:
+    def normalise(self, x: Like[ArrayLike, "*#batch {self.size}"]) -> Float[np.ndarray, "*batch {self.size}"]:
         return np.array(x, dtype=float)
 
-    def adjoint(self, a: ArrayLike) -> Array:
+    def adjoint(
+        self, a: Like[ArrayLike, "*#batch {self.size}"]
+    ) -> Float[np.ndarray, "*batch {self.dim} {self.dim}"]:
         return self._unit_matrices(np.shape(a)[:-1])
 
-    def left_jacobian(self, xi: ArrayLike) -> Array:
+    def left_jacobian(
+        self, xi: Like[ArrayLike, "*#batch {self.dim}"]
+    ) -> Float[np.ndarray, "*batch {self.dim} {self.dim}"]:
         return self._unit_matrices(np.shape(xi)[:-1])
 
-    def left_jacobian_inverse(self, xi: ArrayLike) -> Array:
+    def left_jacobian_inverse(
+        self, xi: Like[ArrayLike, "*#batch {self.dim}"]
+    ) -> Float[np.ndarray, "*batch {self.dim} {self.dim}"]:
         return self._unit_matrices(np.shape(xi)[:-1])
 
     def _unit_matrices(self, shape: tuple[int, ...]) -> Array:

@@ -7,6 +7,7 @@ from typing import final
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rbpf.arrays import Float, Like
 from rbpf.errors import InputError
 from rbpf.lie.base import Array, LieGroup, join
 
@@ -39,12 +40,12 @@ class Product(LieGroup):
     def __repr__(self) -> str:
         return f"Product({', '.join(map(repr, self.groups))})"
 
-    def split(self, x: ArrayLike) -> list[Array]:
+    def split(self, x: Like[ArrayLike, "*#batch {self.size}"]) -> list[Array]:
         """Views of the factors' storages: (..., E) -> one (..., E_i) per factor."""
         array = np.asarray(x, dtype=float)
         return [array[..., part] for part in self._storage]
 
-    def split_tangent(self, xi: ArrayLike) -> list[Array]:
+    def split_tangent(self, xi: Like[ArrayLike, "*#batch {self.dim}"]) -> list[Array]:
         """Views of the factors' tangents: (..., d) -> one (..., d_i) per factor."""
         array = np.asarray(xi, dtype=float)
         return [array[..., part] for part in self._tangent]
@@ -53,43 +54,55 @@ class Product(LieGroup):
         """One array from storages or tangents of all factors; their leading axes broadcast."""
         return join([np.asarray(part, dtype=float) for part in parts])
 
-    def identity(self, shape: tuple[int, ...] = ()) -> Array:
+    def identity(self, shape: tuple[int, ...] = ()) -> Float[np.ndarray, "*shape {self.size}"]:
         return join([group.identity(shape) for group in self.groups])
 
-    def exp(self, xi: ArrayLike) -> Array:
+    def exp(self, xi: Like[ArrayLike, "*#batch {self.dim}"]) -> Float[np.ndarray, "*batch {self.size}"]:
         parts = zip(self.groups, self.split_tangent(xi), strict=True)
         return join([group.exp(part) for group, part in parts])
 
-    def log(self, x: ArrayLike) -> Array:
+    def log(self, x: Like[ArrayLike, "*#batch {self.size}"]) -> Float[np.ndarray, "*batch {self.dim}"]:
         return join([group.log(part) for group, part in zip(self.groups, self.split(x), strict=True)])
 
-    def compose(self, a: ArrayLike, b: ArrayLike) -> Array:
+    def compose(
+        self, a: Like[ArrayLike, "*#batch {self.size}"], b: Like[ArrayLike, "*#batch {self.size}"]
+    ) -> Float[np.ndarray, "*batch {self.size}"]:
         parts = zip(self.groups, self.split(a), self.split(b), strict=True)
         return join([group.compose(left, right) for group, left, right in parts])
 
-    def inverse(self, a: ArrayLike) -> Array:
+    def inverse(self, a: Like[ArrayLike, "*#batch {self.size}"]) -> Float[np.ndarray, "*batch {self.size}"]:
         parts = zip(self.groups, self.split(a), strict=True)
         return join([group.inverse(part) for group, part in parts])
 
-    def retract(self, x: ArrayLike, xi: ArrayLike) -> Array:
+    def retract(
+        self, x: Like[ArrayLike, "*#batch {self.size}"], xi: Like[ArrayLike, "*#batch {self.dim}"]
+    ) -> Float[np.ndarray, "*batch {self.size}"]:
         parts = zip(self.groups, self.split(x), self.split_tangent(xi), strict=True)
         return join([group.retract(point, step) for group, point, step in parts])
 
-    def local(self, x: ArrayLike, y: ArrayLike) -> Array:
+    def local(
+        self, x: Like[ArrayLike, "*#batch {self.size}"], y: Like[ArrayLike, "*#batch {self.size}"]
+    ) -> Float[np.ndarray, "*batch {self.dim}"]:
         parts = zip(self.groups, self.split(x), self.split(y), strict=True)
         return join([group.local(origin, point) for group, origin, point in parts])
 
-    def normalise(self, x: ArrayLike) -> Array:
+    def normalise(self, x: Like[ArrayLike, "*#batch {self.size}"]) -> Float[np.ndarray, "*batch {self.size}"]:
         parts = zip(self.groups, self.split(x), strict=True)
         return join([group.normalise(part) for group, part in parts])
 
-    def adjoint(self, a: ArrayLike) -> Array:
+    def adjoint(
+        self, a: Like[ArrayLike, "*#batch {self.size}"]
+    ) -> Float[np.ndarray, "*batch {self.dim} {self.dim}"]:
         return self._block_diagonal(self.split(a), [group.adjoint for group in self.groups])
 
-    def left_jacobian(self, xi: ArrayLike) -> Array:
+    def left_jacobian(
+        self, xi: Like[ArrayLike, "*#batch {self.dim}"]
+    ) -> Float[np.ndarray, "*batch {self.dim} {self.dim}"]:
         return self._block_diagonal(self.split_tangent(xi), [group.left_jacobian for group in self.groups])
 
-    def left_jacobian_inverse(self, xi: ArrayLike) -> Array:
+    def left_jacobian_inverse(
+        self, xi: Like[ArrayLike, "*#batch {self.dim}"]
+    ) -> Float[np.ndarray, "*batch {self.dim} {self.dim}"]:
         functions = [group.left_jacobian_inverse for group in self.groups]
         return self._block_diagonal(self.split_tangent(xi), functions)
 

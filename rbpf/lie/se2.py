@@ -9,6 +9,7 @@ from typing import final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rbpf.arrays import Float, Like
 from rbpf.lie.base import Array, LieGroup
 from rbpf.lie.series import coefficient_b, coefficient_c
 
@@ -27,61 +28,69 @@ class SE2Group(LieGroup):
     def __repr__(self) -> str:
         return "SE2"
 
-    def identity(self, shape: tuple[int, ...] = ()) -> Array:
+    def identity(self, shape: tuple[int, ...] = ()) -> Float[np.ndarray, "*shape 3"]:
         return np.zeros((*shape, 3))
 
-    def exp(self, xi: ArrayLike) -> Array:
+    def exp(self, xi: Like[ArrayLike, "*#batch 3"]) -> Float[np.ndarray, "*batch 3"]:
         xi = _contiguous(xi)
         half = 0.5 * xi[..., 0]
         return _pack(_wrap(xi[..., 0]), _sinc(half) * _phasor(half) * _planar(xi))
 
-    def log(self, x: ArrayLike) -> Array:
+    def log(self, x: Like[ArrayLike, "*#batch 3"]) -> Float[np.ndarray, "*batch 3"]:
         x = _contiguous(x)
         angle = _wrap(x[..., 0])
         half = 0.5 * angle
         return _pack(angle, _phasor(-half) * _planar(x) / _sinc(half))
 
-    def compose(self, a: ArrayLike, b: ArrayLike) -> Array:
+    def compose(
+        self, a: Like[ArrayLike, "*#batch 3"], b: Like[ArrayLike, "*#batch 3"]
+    ) -> Float[np.ndarray, "*batch 3"]:
         a, b = _contiguous(a), _contiguous(b)
         return _pack(_wrap(a[..., 0] + b[..., 0]), _planar(a) + _phasor(a[..., 0]) * _planar(b))
 
-    def inverse(self, a: ArrayLike) -> Array:
+    def inverse(self, a: Like[ArrayLike, "*#batch 3"]) -> Float[np.ndarray, "*batch 3"]:
         a = _contiguous(a)
         return _pack(_wrap(-a[..., 0]), -_phasor(-a[..., 0]) * _planar(a))
 
-    def retract(self, x: ArrayLike, xi: ArrayLike) -> Array:
+    def retract(
+        self, x: Like[ArrayLike, "*#batch 3"], xi: Like[ArrayLike, "*#batch 3"]
+    ) -> Float[np.ndarray, "*batch 3"]:
         # The rotations exp(i theta) and exp(i omega / 2) of the increment are one.
         x, xi = _contiguous(x), _contiguous(xi)
         half = 0.5 * xi[..., 0]
         step = _sinc(half) * _phasor(x[..., 0] + half) * _planar(xi)
         return _pack(_wrap(x[..., 0] + xi[..., 0]), _planar(x) + step)
 
-    def local(self, x: ArrayLike, y: ArrayLike) -> Array:
+    def local(
+        self, x: Like[ArrayLike, "*#batch 3"], y: Like[ArrayLike, "*#batch 3"]
+    ) -> Float[np.ndarray, "*batch 3"]:
         x, y = _contiguous(x), _contiguous(y)
         angle = _wrap(y[..., 0] - x[..., 0])
         half = 0.5 * angle
         return _pack(angle, _phasor(-x[..., 0] - half) * (_planar(y) - _planar(x)) / _sinc(half))
 
-    def normalise(self, x: ArrayLike) -> Array:
+    def normalise(self, x: Like[ArrayLike, "*#batch 3"]) -> Float[np.ndarray, "*batch 3"]:
         x = _contiguous(x)
         return _pack(_wrap(x[..., 0]), _planar(x))
 
-    def adjoint(self, a: ArrayLike) -> Array:
+    def adjoint(self, a: Like[ArrayLike, "*#batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:
         a = _contiguous(a)
         return _block(_phasor(a[..., 0]), -1j * _planar(a))
 
-    def left_jacobian(self, xi: ArrayLike) -> Array:
+    def left_jacobian(self, xi: Like[ArrayLike, "*#batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:
         xi = _contiguous(xi)
         half = 0.5 * xi[..., 0]
         return _block(_sinc(half) * _phasor(half), _coupling(xi))
 
-    def left_jacobian_inverse(self, xi: ArrayLike) -> Array:
+    def left_jacobian_inverse(self, xi: Like[ArrayLike, "*#batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:
         xi = _contiguous(xi)
         half = 0.5 * xi[..., 0]
         inverse = _phasor(-half) / _sinc(half)
         return _block(inverse, -inverse * _coupling(xi))
 
-    def transform(self, a: ArrayLike, p: ArrayLike) -> Array:
+    def transform(
+        self, a: Like[ArrayLike, "*#batch 3"], p: Like[ArrayLike, "*#batch 2"]
+    ) -> Float[np.ndarray, "*batch 2"]:
         """World points of body points.
 
         Args:
@@ -94,20 +103,22 @@ class SE2Group(LieGroup):
         a, p = _contiguous(a), np.asarray(p, dtype=float)
         return _pair(_planar(a) + _phasor(a[..., 0]) * (p[..., 0] + 1j * p[..., 1]))
 
-    def inverse_transform(self, a: ArrayLike, p: ArrayLike) -> Array:
+    def inverse_transform(
+        self, a: Like[ArrayLike, "*#batch 3"], p: Like[ArrayLike, "*#batch 2"]
+    ) -> Float[np.ndarray, "*batch 2"]:
         """Body points of world points; arguments as in `transform`, the frames of p exchanged."""
         a, p = _contiguous(a), np.asarray(p, dtype=float)
         return _pair(_phasor(-a[..., 0]) * (p[..., 0] + 1j * p[..., 1] - _planar(a)))
 
-    def translation(self, a: ArrayLike) -> Array:
+    def translation(self, a: Like[ArrayLike, "*#batch 3"]) -> Float[np.ndarray, "*batch 2"]:
         """View of the translation, (..., 3) -> (..., 2)."""
         return np.asarray(a, dtype=float)[..., 1:]
 
-    def rotation(self, a: ArrayLike) -> Array:
+    def rotation(self, a: Like[ArrayLike, "*#batch 3"]) -> Float[np.ndarray, "*batch 2 2"]:
         """Rotation matrix, (..., 3) -> (..., 2, 2)."""
         return _matrix(_phasor(_contiguous(a)[..., 0]))
 
-    def matrix(self, a: ArrayLike) -> Array:
+    def matrix(self, a: Like[ArrayLike, "*#batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:
         """Homogeneous matrix, (..., 3) -> (..., 3, 3)."""
         a = _contiguous(a)
         out = np.zeros((*a.shape[:-1], 3, 3))
@@ -116,7 +127,7 @@ class SE2Group(LieGroup):
         out[..., 2, 2] = 1.0
         return out
 
-    def from_matrix(self, m: ArrayLike) -> Array:
+    def from_matrix(self, m: Like[ArrayLike, "*#batch 3 3"]) -> Float[np.ndarray, "*batch 3"]:
         """Element of a homogeneous matrix, (..., 3, 3) -> (..., 3)."""
         m = np.asarray(m, dtype=float)
         angle = np.arctan2(m[..., 1, 0] - m[..., 0, 1], m[..., 0, 0] + m[..., 1, 1])

@@ -8,6 +8,7 @@ from typing import final
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rbpf.arrays import Float, Like
 from rbpf.errors import InputError
 from rbpf.lie.base import Array, LieGroup, join
 from rbpf.lie.matrices import quat_from_matrix
@@ -23,44 +24,52 @@ class SE3Group(LieGroup):
     def __repr__(self) -> str:
         return "SE3"
 
-    def identity(self, shape: tuple[int, ...] = ()) -> Array:
+    def identity(self, shape: tuple[int, ...] = ()) -> Float[np.ndarray, "*shape 7"]:
         out = np.zeros((*shape, 7))
         out[..., 3] = 1.0
         return out
 
-    def exp(self, xi: ArrayLike) -> Array:
+    def exp(self, xi: Like[ArrayLike, "*#batch 6"]) -> Float[np.ndarray, "*batch 7"]:
         return _one(_compiled().exp, xi, 6, (7,))
 
-    def log(self, x: ArrayLike) -> Array:
+    def log(self, x: Like[ArrayLike, "*#batch 7"]) -> Float[np.ndarray, "*batch 6"]:
         return _one(_compiled().log, x, 7, (6,))
 
-    def compose(self, a: ArrayLike, b: ArrayLike) -> Array:
+    def compose(
+        self, a: Like[ArrayLike, "*#batch 7"], b: Like[ArrayLike, "*#batch 7"]
+    ) -> Float[np.ndarray, "*batch 7"]:
         return _two(_compiled().compose, a, b, 7, 7)
 
-    def inverse(self, a: ArrayLike) -> Array:
+    def inverse(self, a: Like[ArrayLike, "*#batch 7"]) -> Float[np.ndarray, "*batch 7"]:
         return _one(_compiled().inverse, a, 7, (7,))
 
-    def retract(self, x: ArrayLike, xi: ArrayLike) -> Array:
+    def retract(
+        self, x: Like[ArrayLike, "*#batch 7"], xi: Like[ArrayLike, "*#batch 6"]
+    ) -> Float[np.ndarray, "*batch 7"]:
         return _two(_compiled().retract, x, xi, 6, 7)
 
-    def local(self, x: ArrayLike, y: ArrayLike) -> Array:
+    def local(
+        self, x: Like[ArrayLike, "*#batch 7"], y: Like[ArrayLike, "*#batch 7"]
+    ) -> Float[np.ndarray, "*batch 6"]:
         return _two(_compiled().local, x, y, 7, 6)
 
-    def normalise(self, x: ArrayLike) -> Array:
+    def normalise(self, x: Like[ArrayLike, "*#batch 7"]) -> Float[np.ndarray, "*batch 7"]:
         out = np.array(x, dtype=float)
         out[..., :4] /= np.sqrt(np.square(out[..., :4]).sum(axis=-1, keepdims=True))
         return out
 
-    def adjoint(self, a: ArrayLike) -> Array:
+    def adjoint(self, a: Like[ArrayLike, "*#batch 7"]) -> Float[np.ndarray, "*batch 6 6"]:
         return _one(_matrices().adjoint, a, 7, (6, 6))
 
-    def left_jacobian(self, xi: ArrayLike) -> Array:
+    def left_jacobian(self, xi: Like[ArrayLike, "*#batch 6"]) -> Float[np.ndarray, "*batch 6 6"]:
         return _one(_matrices().left_jacobian, xi, 6, (6, 6))
 
-    def left_jacobian_inverse(self, xi: ArrayLike) -> Array:
+    def left_jacobian_inverse(self, xi: Like[ArrayLike, "*#batch 6"]) -> Float[np.ndarray, "*batch 6 6"]:
         return _one(_matrices().left_jacobian_inverse, xi, 6, (6, 6))
 
-    def transform(self, a: ArrayLike, p: ArrayLike) -> Array:
+    def transform(
+        self, a: Like[ArrayLike, "*#batch 7"], p: Like[ArrayLike, "*#batch 3"]
+    ) -> Float[np.ndarray, "*batch 3"]:
         """World points of body points.
 
         Args:
@@ -72,19 +81,21 @@ class SE3Group(LieGroup):
         """
         return _two(_compiled().transform, a, p, 3, 3)
 
-    def inverse_transform(self, a: ArrayLike, p: ArrayLike) -> Array:
+    def inverse_transform(
+        self, a: Like[ArrayLike, "*#batch 7"], p: Like[ArrayLike, "*#batch 3"]
+    ) -> Float[np.ndarray, "*batch 3"]:
         """Body points of world points; arguments as in `transform`, the frames of p exchanged."""
         return _two(_compiled().inverse_transform, a, p, 3, 3)
 
-    def translation(self, a: ArrayLike) -> Array:
+    def translation(self, a: Like[ArrayLike, "*#batch 7"]) -> Float[np.ndarray, "*batch 3"]:
         """View of the translation, (..., 7) -> (..., 3)."""
         return np.asarray(a, dtype=float)[..., 4:]
 
-    def rotation(self, a: ArrayLike) -> Array:
+    def rotation(self, a: Like[ArrayLike, "*#batch 7"]) -> Float[np.ndarray, "*batch 3 3"]:
         """Rotation matrix, (..., 7) -> (..., 3, 3)."""
         return _one(_matrices().rotations, a, 7, (3, 3))
 
-    def matrix(self, a: ArrayLike) -> Array:
+    def matrix(self, a: Like[ArrayLike, "*#batch 7"]) -> Float[np.ndarray, "*batch 4 4"]:
         """Homogeneous matrix, (..., 7) -> (..., 4, 4)."""
         a = np.asarray(a, dtype=float)
         out = np.zeros((*a.shape[:-1], 4, 4))
@@ -93,12 +104,18 @@ class SE3Group(LieGroup):
         out[..., 3, 3] = 1.0
         return out
 
-    def from_matrix(self, m: ArrayLike) -> Array:
+    def from_matrix(self, m: Like[ArrayLike, "*batch row 4"]) -> Float[np.ndarray, "*batch 7"]:
         """Element of a homogeneous (or 3 x 4) matrix, (..., 4, 4) -> (..., 7), with qw >= 0."""
         m = np.asarray(m, dtype=float)
         return np.concatenate([quat_from_matrix(m[..., :3, :3]), m[..., :3, 3]], axis=-1)
 
-    def from_ypr(self, t: ArrayLike, yaw: ArrayLike, pitch: ArrayLike, roll: ArrayLike) -> Array:
+    def from_ypr(
+        self,
+        t: Like[ArrayLike, "*#batch 3"],
+        yaw: Like[ArrayLike, "*#batch"],
+        pitch: Like[ArrayLike, "*#batch"],
+        roll: Like[ArrayLike, "*#batch"],
+    ) -> Float[np.ndarray, "*batch 7"]:
         """Element with the rotation Rz(yaw) Ry(pitch) Rx(roll).
 
         Args:
@@ -118,7 +135,9 @@ class SE3Group(LieGroup):
         quat = np.stack(np.broadcast_arrays(x, y, z, w), axis=-1)
         return join([quat, np.asarray(t, dtype=float)])
 
-    def ypr(self, a: ArrayLike) -> tuple[Array, Array, Array]:
+    def ypr(
+        self, a: Like[ArrayLike, "*#batch 7"]
+    ) -> tuple[Float[np.ndarray, "*batch"], Float[np.ndarray, "*batch"], Float[np.ndarray, "*batch"]]:
         """Yaw, pitch and roll [rad], each (...); at a pitch of +-pi/2 only yaw -+ roll is defined."""
         rotation = self.rotation(a)
         yaw = np.arctan2(rotation[..., 1, 0], rotation[..., 0, 0])

@@ -10,7 +10,10 @@ import msgspec
 from rbpf.errors import InputError
 from rbpf.systems.plain_yaml import read_plain_yaml
 
-_HEADER = ("rbpf", "system", "recording", "known_points", "board", "square_m", "calibration")
+_HEADER = (
+    "rbpf", "system", "versions", "input_sha256",
+    "recording", "known_points", "board", "square_m", "calibration", "map", "localize",
+)  # fmt: skip
 """What a config.yaml says about the run besides its settings."""
 
 if TYPE_CHECKING:

@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3, Array
 from rbpf.sensors.readers.table import parse_number
 from rbpf.sensors.readers.text import line_error, quoted, read_text
+from rbpf.sensors.readers.yaml_nodes import compose
 
 _MOUNT = ("x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg")
 _SIGNS = {"up": 1.0, "down": -1.0}
@@ -37,7 +37,9 @@ def read_sensor(path: Path, planar: bool, hint: str) -> tuple[Array, float]:
     Raises:
         InputError: the file is missing or not as described above.
     """
-    fields = _mapping(path, _compose(path, hint), ("robot_from_sensor", "positive_pitch"), optional=("std",))
+    keys = ("robot_from_sensor", "positive_pitch")
+    node = compose(path, read_text(path, hint), " and ".join(keys))
+    fields = _mapping(path, node, keys, optional=("std",))
     mount = _mapping(path, fields["robot_from_sensor"], _MOUNT)
     values = np.array([_number(path, key, mount[key]) for key in _MOUNT])
     yaw, pitch, roll = np.deg2rad(values[3:])
@@ -48,21 +50,6 @@ def read_sensor(path: Path, planar: bool, hint: str) -> tuple[Array, float]:
         problem = "expected pitch_deg and roll_deg to be 0, as the odometry is planar"
         raise line_error(path, _line(fields["robot_from_sensor"]), problem)
     return SE2.normalise(np.array([yaw, values[0], values[1]])), sign
-
-
-def _compose(path: Path, hint: str) -> yaml.Node:
-    # Nodes instead of values: they know their lines, and no tag in the file can construct anything.
-    text = read_text(path, hint)
-    try:
-        node = yaml.compose(text, Loader=yaml.BaseLoader)
-    except yaml.MarkedYAMLError as error:
-        line = error.problem_mark.line + 1 if error.problem_mark else 1
-        raise line_error(path, line, f"expected YAML, found a syntax error ({error.problem})") from None
-    except (yaml.YAMLError, RecursionError, ValueError, OverflowError):
-        raise InputError(f"{path}: expected YAML, found something else.") from None
-    if node is None:
-        raise InputError(f"{path}: expected robot_from_sensor and positive_pitch, found only comments.")
-    return node
 
 
 def _mapping(

@@ -7,12 +7,7 @@ import yaml
 from rbpf.cli import main
 from rbpf.lie import SE3
 from rbpf.validation.trajectory_files import read_tum
-from tests.cli.mono_sequences import render_desk, run, sentence, summary
-
-
-@pytest.fixture(scope="module")
-def desk(tmp_path_factory):
-    return render_desk(tmp_path_factory.mktemp("rendered") / "desk")
+from tests.cli.mono_sequences import run, sentence, summary
 
 
 def test_a_rendered_board_is_what_a_run_starts_from(tmp_path, capsys):

@@ -20,11 +20,11 @@ from rbpf.validation.camera_files import read_features
 from rbpf.validation.gtsam_ba_camera import CameraEstimate, solve_features
 from rbpf.validation.mono_batch import ROBUST
 from rbpf.validation.trajectory_files import read_tum
-from tests.cli.mono_sequences import CAMERA, FRAMES, as_folder, render_desk, run, sentence, summary
+from tests.cli.mono_sequences import CAMERA, FRAMES, run, sentence, summary
 
 FILES = {
-    "trajectory.tum", "map.npz", "map.csv", "timings.csv", "diagnostics.csv", "config.yaml", "summary.json",
-    "report.html", "path.png", "map.png", "particles.png", "error.png", "tracking.png", "timings.png",
+    "trajectory.tum", "map.npz", "map.csv", "known_map.npz", "timings.csv", "diagnostics.csv", "config.yaml",
+    "summary.json", "report.html", "path.png", "map.png", "particles.png", "error.png", "tracking.png", "timings.png",
     "batch.tum", "posterior.tum", "posterior.npz", "checkpoint.npz",
     "observations.csv", "observations_frames.csv", "observations_known_points.csv",
     "trajectory.npz",
@@ -37,16 +37,6 @@ REQUIRED = {
     "batch_frames", "batch_ate_rmse_m", "batch_ate_sim3_rmse_m", "filter_minus_batch_rmse_m",
 }  # fmt: skip
 TIMED = ("ms_per_frame", "peak_memory_mb")
-
-
-@pytest.fixture(scope="module")
-def desk(tmp_path_factory):
-    return render_desk(tmp_path_factory.mktemp("rendered") / "desk")
-
-
-@pytest.fixture
-def folder(desk, tmp_path):
-    return as_folder(desk, tmp_path / "folder")
 
 
 @pytest.fixture(scope="module")
@@ -232,7 +222,7 @@ def test_a_missing_rerun_is_said_before_the_run(desk, tmp_path, monkeypatch, cap
 def test_the_program_starts_without_rerun_and_encoder(monkeypatch):
     monkeypatch.setitem(sys.modules, "rerun", None)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    for name in ("mono", "mono_rerun", "mono_video"):
+    for name in ("mono", "mono_rerun", "rerun_file", "mono_video"):
         assert importlib.reload(importlib.import_module(f"rbpf.validation.{name}"))
 
 

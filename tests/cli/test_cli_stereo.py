@@ -9,16 +9,11 @@ import numpy as np
 import pytest
 import yaml
 
-from rbpf.cli import main
 from rbpf.lie import SE3
-from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
-from rbpf.validation.simulation.exposure import Imaging
-from rbpf.validation.simulation.images import simulate_images
-from rbpf.validation.simulation.textured_room import TexturedRoom
 from rbpf.validation.trajectory_files import read_tum
+from tests.cli.stereo_sequences import FRAMES, run
 
-FRAMES = 8
-RIG = RectifiedStereo(Pinhole(320, 240, 220.0, 220.0, 159.5, 119.5), 0.12)
+pytestmark = pytest.mark.usefixtures("keypoints_once")
 FILES = {
     "trajectory.tum", "odometry.tum", "map.npz", "map.csv", "timings.csv", "diagnostics.csv", "config.yaml",
     "summary.json", "report.html", "path.png", "map.png", "particles.png", "error.png", "tracking.png", "timings.png",
@@ -34,22 +29,10 @@ TIMED = ("ms_per_frame", "ms_per_update", "peak_memory_mb")
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("rendered") / "room"
-    world = TexturedRoom(frames=FRAMES, rate_hz=5.0)
-    simulate_images(world, Imaging(known=0, noise_std=1.0), RIG, folder, seed=1)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def finished(room, tmp_path_factory):
+def finished(room, tmp_path_factory, keypoints_once):
     out = tmp_path_factory.mktemp("finished") / "run"
     assert run(room, out) == 0
     return out
-
-
-def run(sequence: Path, out: Path, *arguments: str) -> int:
-    return main(["run", "stereo", str(sequence), "--particles", "50", "--out", str(out), *arguments])
 
 
 def summary(out: Path) -> dict[str, object]:

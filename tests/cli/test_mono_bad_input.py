@@ -7,17 +7,7 @@ import numpy as np
 import pytest
 
 from rbpf.cli import main
-from tests.cli.mono_sequences import FRAMES, as_folder, render_desk
-
-
-@pytest.fixture(scope="module")
-def desk(tmp_path_factory):
-    return render_desk(tmp_path_factory.mktemp("rendered") / "desk")
-
-
-@pytest.fixture
-def folder(desk, tmp_path):
-    return as_folder(desk, tmp_path / "folder")
+from tests.cli.mono_sequences import FRAMES
 
 
 def run(folder, out, *arguments):

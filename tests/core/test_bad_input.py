@@ -202,6 +202,7 @@ class TestModels:
             ),
         ],
     )
+    @pytest.mark.usefixtures("unchecked_shapes")
     def test_observations_of_wrong_shape(self, model, match):
         fails(on_a_line(), match, seen(model, [[1.0]]))
 

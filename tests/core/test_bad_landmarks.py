@@ -72,6 +72,7 @@ class TestLandmarks:
             ([True], "ids of RangeBearing must be integers"),
         ],
     )
+    @pytest.mark.usefixtures("unchecked_shapes")
     def test_ids(self, filter_, ids, match):
         ids = None if ids is None else np.array(ids)
         fails(filter_, match, seen(RangeBearing(SE2), [[5.0, 0.0]], ids=ids))

@@ -68,6 +68,7 @@ def kernels() -> dict[str, Kerneled]:
 
 
 @pytest.mark.parametrize("sentence", kernels())
+@pytest.mark.usefixtures("unchecked_shapes")
 def test_findings_about_kernels(sentence):
     findings = check_model(kernels()[sentence])
     assert len(findings) == 1

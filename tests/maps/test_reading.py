@@ -52,6 +52,34 @@ def test_records_are_the_columns(n):
                 np.testing.assert_array_equal(read.const, plain.const)
 
 
+@pytest.mark.parametrize("some", [slice(3, 4), slice(2, 6), np.array([5, 0, 5])], ids=str)
+def test_records_of_some_particles(some):
+    landmark_map, _, points, rays = grown(7, np.random.default_rng(1))
+    for ids in (points[-2:], rays[-2:], points, rays):
+        part, whole = landmark_map.read(ids, some), landmark_map.read(ids)
+        np.testing.assert_array_equal(part.mean, whole.mean[some])
+        np.testing.assert_array_equal(part.cov, whole.cov[some])
+        if whole.const is not None:
+            np.testing.assert_array_equal(part.const, whole.const[some])
+
+
+@pytest.mark.parametrize("camera_model", [CameraPoint, CameraRay, EpipolarRay])
+def test_innovations_in_the_heaviest_particle_equal_numpys(camera_model):
+    rng, n, k = np.random.default_rng(4), 7, 4
+    landmark_map, _, points, rays = grown(n, rng)
+    ids = (points if camera_model is CameraPoint else rays)[-k:]
+    state = SE3.exp(0.05 * rng.normal(size=(n, 6)))
+    prior = Prior(SE3, state, np.zeros((1, 6)), np.zeros((1, 6, 6)))
+    log_weights = np.log(np.arange(1.0, n + 1.0) / 28.0)
+    belief = Belief(log_weights, prior, Marginals(SE3, [landmark_map]))
+    model, z = camera_model(CAMERA), rng.uniform([200, 100], [400, 300], (k, 2))
+    found = belief.innovations(model, z, ids)
+    landmark_map.compiled = False
+    for part, expected in zip(found, belief.innovations(model, z, ids), strict=True):
+        assert part.shape == expected.shape
+        np.testing.assert_allclose(part, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
+
+
 @pytest.mark.parametrize("n", [7, 300])
 @pytest.mark.parametrize("shared", [True, False], ids=["one factor", "own factors"])
 def test_projections_equal_numpys(n, shared):

@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 
 from rbpf.errors import InputError
 from rbpf.lie import SE2
-from rbpf.sensors.readers import LogNoise, RobotLog, open_log
+from rbpf.sensors.readers import LogNoise, open_log
 from rbpf.sensors.readers.dead_reckoning import integrate
+from tests.readers.fuzzing import is_log_or_one_sentence, mutated, pieces, write
 
 BARCODES = "# subject barcode\n1 5\n2 14\n6 63\n7 81\n"
 ODOMETRY = "# time v w\n100.0 0.5 0.0\n100.3 0.2 1.0\n100.9 0.0 -2.0\n101.4 0.4 0.5\n103.0 0.1 0.1\n"
@@ -32,12 +33,6 @@ def log_files():
         "Robot3_Groundtruth.dat": TRUTH,
         "Landmark_Groundtruth.dat": LANDMARKS,
     }
-
-
-def write(folder, files):
-    for name, text in files.items():
-        (folder / name).write_bytes(text if isinstance(text, bytes) else text.encode())
-    return folder
 
 
 def opened(folder, files, noise=None):
@@ -203,31 +198,14 @@ def test_missing_measurements(tmp_path):
         opened(tmp_path, {"Barcodes.dat": BARCODES})
 
 
-def is_log_or_one_sentence(path):
-    try:
-        return isinstance(open_log(path), RobotLog)
-    except InputError as error:
-        return "\n" not in str(error)
-
-
 @pytest.fixture(scope="module")
 def scratch(tmp_path_factory):
     return tmp_path_factory.mktemp("mrclam")
 
 
-PIECES = st.one_of(
-    st.binary(max_size=6),
-    st.sampled_from([b"nan", b"-", b"1e400", b"9" * 30, b"\n", b" ", b"0", b"-1", b"#"]),
-)
-
-
 @given(data=st.data())
 def test_any_mutation_gives_a_log_or_one_sentence(scratch, data):
-    files = {name: text.encode() for name, text in log_files().items()}
-    name = data.draw(st.sampled_from(sorted(files)))
-    start = data.draw(st.integers(0, len(files[name])))
-    stop = data.draw(st.integers(start, min(start + 12, len(files[name]))))
-    files[name] = files[name][:start] + data.draw(PIECES) + files[name][stop:]
+    files = mutated(data, log_files(), pieces(b" ", b"#"))
     assert is_log_or_one_sentence(write(scratch, files))
 
 

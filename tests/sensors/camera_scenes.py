@@ -64,6 +64,6 @@ def compiled(
         return np.ascontiguousarray(part[np.minimum(np.arange(BLOCK), n - 1)].T)
 
     inputs = (lanes(state), lanes(mean), lanes(const))
-    call_kernel(fused.function, *inputs, z, fused.params, n, nu, by_state, by_landmark)
+    call_kernel(fused.function.address, *inputs, z, fused.params, n, nu, by_state, by_landmark)
     parts = [np.moveaxis(part[..., :n], -1, 0) for part in (nu, by_state, by_landmark)]
     return parts[0], parts[1], parts[2]

@@ -35,11 +35,11 @@ class Waves:
         frequency = self.frequency @ np.asarray(affine)
         damping = np.sinc(frequency).prod(axis=1)
         damping *= np.exp(-2.0 * (np.pi * self.blur_px) ** 2 * (frequency**2).sum(axis=1))
-        v, u = np.indices(shape)
-        grey = np.full(shape, mean)
         phase = self.phase + 2.0 * np.pi * (self.frequency @ np.asarray(shift) - frequency @ middle)
-        for height, (fu, fv), start in zip(gain * self.height * damping, frequency, phase, strict=True):
-            grey += height * np.cos(2.0 * np.pi * (fu * u + fv * v) + start)
+        # cos(a + b) is the real part of exp(ia) exp(ib): all waves at once are a matrix product.
+        v, u = (2.0 * np.pi * np.arange(count)[:, None] for count in shape)
+        down = gain * self.height * damping * np.exp(1j * (v * frequency[:, 1] + phase))
+        grey = mean + (down @ np.exp(1j * u * frequency[:, 0]).T).real
         if noise:
             grey += noise * rng.normal(size=shape)
         return np.clip(np.rint(grey), 0, 255).astype(np.uint8)

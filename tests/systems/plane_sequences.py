@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cache
 
 import cv2
 import numpy as np
@@ -15,13 +16,16 @@ CAMERA = Pinhole(320, 240, 260.0, 260.0, 159.5, 119.5)
 TEXEL_M, DEPTH_M, TILT = 0.004, 1.5, 0.35
 
 
+@cache
 def texture(seed: int = 0, size: int = 1000) -> np.ndarray:
-    """Blobs of all sizes, grey."""
+    """Blobs of all sizes, grey; not to be written to."""
     rng, total = np.random.default_rng(seed), np.zeros((size, size))
     for sigma in (1.5, 3.0, 6.0, 12.0):
         layer = cv2.GaussianBlur(rng.normal(size=(size, size)), (0, 0), sigma)
         total += layer / layer.std()
-    return np.clip(128.0 + 30.0 * total, 0, 255).astype(np.uint8)
+    picture = np.clip(128.0 + 30.0 * total, 0, 255).astype(np.uint8)
+    picture.flags.writeable = False
+    return picture
 
 
 def on_plane(texels: np.ndarray) -> np.ndarray:

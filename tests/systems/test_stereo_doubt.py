@@ -15,6 +15,7 @@ from rbpf.systems.stereo.run import StereoRun, run_images
 from rbpf.systems.stereo.sensor import StereoFrame
 from tests.systems.stereo_sequences import pairs
 
+pytestmark = pytest.mark.usefixtures("keypoints_once")
 COUNT = 10
 CONFIG = StereoConfig(
     particles=60,
@@ -26,7 +27,7 @@ WIDE = Odometry(SE3.identity(), np.diag(np.repeat([0.1**2, 0.2**2], 3)))
 
 
 @pytest.fixture
-def settled() -> StereoRun:
+def settled(keypoints_once: None) -> StereoRun:
     """Before the last pair, which shows what the map has."""
     return run_images(pairs(COUNT), CONFIG)
 

@@ -11,7 +11,7 @@ from rbpf.sensors.features import FeatureFrame, FeatureLog
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig
 from rbpf.systems.stereo.config import OdometryConfig, StereoConfig, TriggerConfig
 from rbpf.systems.stereo.run import StereoRun, run_features
-from rbpf.validation.gtsam_ba_camera import solve_features
+from rbpf.validation.gtsam_ba_camera import CameraEstimate, solve_features
 from rbpf.validation.simulation.features import MONO, STEREO, Measuring, simulate_features
 from rbpf.validation.simulation.lab_points import LabWorld
 from rbpf.validation.simulation.textured_lab import LabDrive
@@ -44,7 +44,8 @@ def rmse(run: StereoRun, poses: np.ndarray) -> float:
 def test_beside_the_batch(log):
     """The filter sees the past only, the batch all of it; the odometry forgets."""
     run = run_features(log, CONFIG)
-    batch = solve_features(log, marginals=False).world_from_camera
+    start = CameraEstimate(run.world_from_camera, {})
+    batch = solve_features(log, start, marginals=False).world_from_camera
     batch = SE3.between(batch[0], batch)
     ours, best, alone = (rmse(run, poses) for poses in (run.world_from_camera, batch, run.odometry))
     assert ours < 2.5 * best

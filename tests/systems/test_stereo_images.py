@@ -14,6 +14,7 @@ from rbpf.systems.stereo.front_ends import ImageFrontEnd
 from rbpf.systems.stereo.run import StereoRun, run_images
 from tests.systems.stereo_sequences import flat, missing, pairs, swapped
 
+pytestmark = pytest.mark.usefixtures("keypoints_once")
 CONFIG = StereoConfig(particles=60)
 COUNT = 12
 
@@ -26,7 +27,7 @@ def error_m(run: StereoRun, poses: np.ndarray) -> float:
 
 
 @pytest.fixture(scope="module")
-def plain() -> StereoRun:
+def plain(keypoints_once: None) -> StereoRun:
     return run_images(pairs(COUNT), CONFIG)
 
 

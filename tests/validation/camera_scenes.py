@@ -9,6 +9,7 @@ from scipy.optimize import least_squares
 from rbpf.lie import SE3, Array
 from rbpf.sensors.features import CameraTruth, FeatureFrame, FeatureLog, KnownPoints
 from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+from tests.validation.numeric import shrunk, slope_of
 
 PLAIN = Pinhole(640, 480, 400.0, 390.0, 321.0, 243.0)
 BENT = replace(PLAIN, distortion=(-0.25, 0.06, 1e-3, -5e-4, 0.0))
@@ -107,25 +108,29 @@ def solve_by_scipy(log: FeatureLog, velocity: Array | None = None, robust: float
     around = np.array([log.truth.landmarks[name] for name in names.tolist()])
 
     def parts(x: Array) -> tuple[Array, Array, Array]:
-        path = SE3.retract(log.truth.world_from_camera, x[:split].reshape(-1, 6))
-        end = split + around.size
-        return path, around + x[split:end].reshape(-1, 3), x[end:].reshape(-1, 6)
+        lead, end = x.shape[:-1], split + around.size
+        path = SE3.retract(log.truth.world_from_camera, x[..., :split].reshape(*lead, -1, 6))
+        points = around + x[..., split:end].reshape(*lead, -1, 3)
+        return path, points, x[..., end:].reshape(*lead, -1, 6)
 
     def residuals(x: Array) -> Array:
         path, points, speeds = parts(x)
-        e = log.camera.project(SE3.inverse_transform(path[steps], points[place])) - z
-        e = _shrunk(np.einsum("kij,kj->ki", whiten, e), robust)
-        prior = np.einsum("kij,kj->ki", whiten_fixed, points[fixed] - log.known.positions)
+        e = log.camera.project(SE3.inverse_transform(path[..., steps, :], points[..., place, :])) - z
+        e = shrunk(np.einsum("kij,...kj->...ki", whiten, e), robust)
+        prior = np.einsum("kij,...kj->...ki", whiten_fixed, points[..., fixed, :] - log.known.positions)
         moved = [] if velocity is None else [_motion(path, speeds, dt, velocity)]
-        return np.concatenate([e.ravel(), prior.ravel(), *moved])
+        return np.concatenate([part.reshape(*x.shape[:-1], -1) for part in (e, prior, *moved)], axis=-1)
 
     speeds = np.zeros(0 if velocity is None else split)
     x0 = np.concatenate([np.zeros(split + around.size), speeds])
-    found = least_squares(residuals, x0, jac="3-point", x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15)
-    slope = _slope(residuals, found.x)
+    found = least_squares(
+        residuals, x0, lambda x: slope_of(residuals, x), x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15
+    )
+    slope = slope_of(residuals, found.x)
     cov = np.linalg.inv(slope.T @ slope)
     path, points, speeds = parts(found.x)
-    spread = _slope(lambda x: SE3.local(path, parts(x)[0]).ravel(), found.x).reshape(count, 6, -1)
+    spread = slope_of(lambda x: SE3.local(path, parts(x)[0]).reshape(len(x), -1), found.x)
+    spread = spread.reshape(count, 6, -1)
     blocks = cov[split : split + around.size, split : split + around.size].reshape(
         len(names), 3, len(names), 3
     )
@@ -134,25 +139,7 @@ def solve_by_scipy(log: FeatureLog, velocity: Array | None = None, robust: float
 
 
 def _motion(path: Array, speeds: Array, dt: Array, std: Array) -> Array:
-    w1 = SE3.local(path[:-1], path[1:]) - dt[:, None] * speeds[:-1]
-    out = []
-    for step, first, second in zip(dt, w1, np.diff(speeds, axis=0), strict=True):
-        cov = np.kron([[step**3 / 3, step**2 / 2], [step**2 / 2, step]], np.diag(std**2))
-        out.append(np.linalg.solve(np.linalg.cholesky(cov), np.concatenate([first, second])))
-    return np.concatenate(out)
-
-
-def _shrunk(whitened: Array, robust: float | None) -> Array:
-    if robust is None:
-        return whitened
-    norm = np.linalg.norm(whitened, axis=-1, keepdims=True)
-    beyond = np.maximum(norm, robust)
-    return whitened * np.sqrt(robust * (2 * beyond - robust)) / beyond
-
-
-def _slope(function, x):
-    step = 1e-5
-    columns = [
-        (function(x + step * axis) - function(x - step * axis)) / (2 * step) for axis in np.eye(len(x))
-    ]
-    return np.stack(columns, axis=-1)
+    w1 = SE3.local(path[..., :-1, :], path[..., 1:, :]) - dt[:, None] * speeds[..., :-1, :]
+    noise = np.concatenate([w1, np.diff(speeds, axis=-2)], axis=-1)
+    covs = [np.kron([[t**3 / 3, t**2 / 2], [t**2 / 2, t]], np.diag(std**2)) for t in dt]
+    return np.einsum("tij,...tj->...ti", np.linalg.inv(np.linalg.cholesky(covs)), noise)

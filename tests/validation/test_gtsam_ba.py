@@ -14,6 +14,7 @@ from rbpf.validation.gtsam_ba_chart import PLANAR, SPATIAL
 from rbpf.validation.gtsam_ba_graph import Problem
 from rbpf.validation.gtsam_ba_optimise import CHUNK
 from rbpf.validation.measurements import InitialEstimate, dead_reckoning, initial_estimate
+from tests.validation.factors import check_derivatives
 from tests.validation.joint_ekf import joint_ekf
 from tests.validation.worlds import seen, solve_by_scipy, world
 
@@ -67,29 +68,8 @@ def test_derivatives_of_every_factor_are_those_of_its_residual(dim, kind, singul
     m = world(dim, kind, singular)
     problem = Problem(m)
     graph, values = problem.graph(soft), problem.values(initial_estimate(m))
-    step = 1e-6
     for i in range(graph.size()):
-        factor = graph.at(i)
-        slope, offset = factor.linearize(values).jacobian()
-        np.testing.assert_allclose(-offset, factor.whitenedError(values), atol=1e-9)
-        zero, columns = values.zeroVectors(), []
-        for key in factor.keys():  # noqa: SIM118, no mapping
-            for axis in step * np.eye(len(zero.at(key))):
-                errors = []
-                for sign in (1, -1):
-                    moved = gtsam.VectorValues(zero)
-                    moved.update(_single(key, sign * axis))
-                    errors.append(factor.whitenedError(values.retract(moved)))
-                columns.append((errors[0] - errors[1]) / (2 * step))
-        np.testing.assert_allclose(
-            slope, np.stack(columns, axis=1), rtol=1e-6, atol=1e-6 * np.abs(slope).max()
-        )
-
-
-def _single(key, vector):
-    values = gtsam.VectorValues()
-    values.insert(key, vector)
-    return values
+        check_derivatives(graph.at(i), values, rtol=1e-6)
 
 
 @pytest.mark.parametrize("noise", [1.0, 1e-3])

@@ -10,6 +10,7 @@ from scipy.optimize import least_squares
 from rbpf import gaussian
 from rbpf.lie import SE2, SE3, Array
 from rbpf.validation.measurements import Kind, Measurements
+from tests.validation.numeric import shrunk, slope_of
 
 Index = NDArray[np.int64]
 
@@ -95,29 +96,33 @@ def solve_by_scipy(m: Measurements, robust: float | None = None) -> Reference:
     model, whiten = m.model(), np.linalg.inv(np.linalg.cholesky(m.cov_z))
 
     def path_of(x: Array) -> Array:
-        path = [m.start]
-        for delta, factor, noise in zip(m.deltas, factors, x[:split].reshape(len(factors), -1), strict=True):
-            path.append(m.space.retract(m.space.compose(path[-1], delta), factor @ noise))
-        return np.array(path)
+        lead = x.shape[:-1]
+        path = [np.broadcast_to(m.start, (*lead, m.start.size))]
+        noises = np.moveaxis(x[..., :split].reshape(*lead, len(factors), -1), -2, 0)
+        for delta, factor, noise in zip(m.deltas, factors, noises, strict=True):
+            path.append(m.space.retract(m.space.compose(path[-1], delta), noise @ factor.T))
+        return np.stack(path, axis=-2)
 
     def sightings(x: Array) -> Array:
-        points = x[split:].reshape(len(names), -1)
-        nu = model.residual(m.z, model.predict(path_of(x)[m.steps], points[place]))
-        return np.einsum("kij,kj->ki", whiten, nu)
+        points = x[..., split:].reshape(*x.shape[:-1], len(names), -1)
+        predicted = model.predict(path_of(x)[..., m.steps, :], points[..., place, :])
+        return np.einsum("kij,...kj->...ki", whiten, model.residual(m.z, predicted))
 
     def residuals(x: Array) -> Array:
-        return np.concatenate([x[:split], _shrunk(sightings(x), robust).ravel()])
+        seen = shrunk(sightings(x), robust).reshape(*x.shape[:-1], -1)
+        return np.concatenate([x[..., :split], seen], axis=-1)
 
     first = [np.flatnonzero(m.landmarks == name)[0] for name in names]
     start = path_of(np.zeros(split))
     x0 = np.concatenate([np.zeros(split), model.invert(start[m.steps[first]], m.z[first]).ravel()])
-    found = least_squares(residuals, x0, jac="3-point", xtol=1e-15, ftol=1e-15, gtol=1e-15, max_nfev=300)
-    optimum, path = found.x, path_of(found.x)
-    slope = _slope(residuals, optimum) if robust is None else found.jac
-    cov = np.linalg.inv(slope.T @ slope)
-    spread = _slope(lambda x: m.space.local(path, path_of(x)).ravel(), optimum).reshape(
-        len(path), m.space.dim, -1
+    found = least_squares(
+        residuals, x0, lambda x: slope_of(residuals, x), xtol=1e-15, ftol=1e-15, gtol=1e-15, max_nfev=300
     )
+    optimum, path = found.x, path_of(found.x)
+    slope = slope_of(residuals, optimum) if robust is None else found.jac
+    cov = np.linalg.inv(slope.T @ slope)
+    spread = slope_of(lambda x: m.space.local(path, path_of(x)).reshape(len(x), -1), optimum)
+    spread = spread.reshape(len(path), m.space.dim, -1)
     blocks = cov[split:, split:].reshape(len(names), m.z.shape[1], len(names), -1)
     cov_landmarks = np.array([blocks[i, :, i] for i in range(len(names))])
     points = optimum[split:].reshape(len(names), -1)
@@ -131,19 +136,3 @@ def _thin_factor(cov: Array) -> Array:
     values, vectors = np.linalg.eigh(cov)
     kept = values > 1e-12 * values[-1]
     return vectors[:, kept] * np.sqrt(values[kept])
-
-
-def _shrunk(whitened: Array, robust: float | None) -> Array:
-    if robust is None:
-        return whitened
-    norm = np.linalg.norm(whitened, axis=-1, keepdims=True)
-    beyond = np.maximum(norm, robust)
-    return whitened * np.sqrt(robust * (2 * beyond - robust)) / beyond
-
-
-def _slope(function, x):
-    step = 1e-5
-    columns = [
-        (function(x + step * axis) - function(x - step * axis)) / (2 * step) for axis in np.eye(len(x))
-    ]
-    return np.stack(columns, axis=-1)

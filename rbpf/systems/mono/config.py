@@ -43,7 +43,8 @@ class RayConfig:
         least_px: depth is measured once a change of ρ by its first standard deviation moves the image by this. Before,
             the parallax tells more of the error of the sampled pose than of depth, and the prior of ρ, which does not
             change as long as depth is not measured, would count anew in every frame.
-        line_px: likewise, from where on there is an epipolar line.
+        line_px: likewise, from where on there is an epipolar line; well below the noise of a measurement, since
+            what depth moves below it is not modelled and stays the same from frame to frame.
     """
 
     constrain: Literal["epipolar", "marginal", "off"] = "marginal"
@@ -53,7 +54,7 @@ class RayConfig:
     ready_ratio: float = 0.1
     ready_weight: float = 0.95
     least_px: float = 10.0
-    line_px: float = 1.0
+    line_px: float = 0.3
 
 
 @dataclass(frozen=True)

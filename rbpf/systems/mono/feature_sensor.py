@@ -11,7 +11,6 @@ from rbpf.maps.constellation import Constellation
 from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.maps.point import Point
 from rbpf.models import Births, Observations, Part, Sensor
-from rbpf.numeric import linearise
 from rbpf.sensors.camera_constellation import ConstellationView, MembersView
 from rbpf.sensors.camera_points import CameraModel, CameraPoint, CameraRay, EpipolarRay
 from rbpf.sensors.features import FeatureFrame
@@ -45,15 +44,22 @@ class FeatureSensor(Sensor):
         rays: settings of landmarks without depth.
         births_per_frame: landmarks started in one frame at most.
         start: known points that are one landmark, a `Constellation`.
+        fixed: the map is known: its points tell where the camera is, and are not changed by what is seen of them.
     """
 
     def __init__(
-        self, camera: Pinhole, rays: RayConfig, births_per_frame: int, start: KnownStart | None = None
+        self,
+        camera: Pinhole,
+        rays: RayConfig,
+        births_per_frame: int,
+        start: KnownStart | None = None,
+        fixed: bool = False,
     ) -> None:
         rho = (rays.rho_per_m, rays.std_rho_per_m)
         self.camera = camera
         self.rays = rays
-        self.births_per_frame = births_per_frame
+        self.births_per_frame = 0 if fixed else births_per_frame
+        self.fixed = fixed
         self.point = CameraPoint(camera)
         self.ray = CameraRay(camera, rho)
         self.epipolar = EpipolarRay(camera, rho, rays.line_px)
@@ -66,13 +72,14 @@ class FeatureSensor(Sensor):
         """Groups for points and for rays."""
         known = self._names.ids(belief.catalogue)
         ids = np.array([known.get(name, -1) for name in frame.landmarks.tolist()], dtype=np.int64)
-        usable = (ids >= 0) & self.camera.inside(frame.z)
-        rows = np.flatnonzero(usable)
-        groups = self._constellation_group(frame, belief)
+        inside = self.camera.inside(frame.z)
+        rows = np.flatnonzero((ids >= 0) & inside)
+        groups = self._constellation_group(frame, inside, belief)
         is_ray = belief.map.are(ids[rows], self.inverse_depth)
         if (~is_ray).any():
             k = rows[~is_ray]
-            groups.append(Observations(frame.z[k], frame.cov_z[k], self.point, ids=ids[k]))
+            informs = _STATE if self.fixed else _BOTH
+            groups.append(Observations(frame.z[k], frame.cov_z[k], self.point, ids=ids[k], informs=informs))
         if is_ray.any():
             scaled = sum(group.z.size for group in groups) >= 2 * HOLD
             groups += self._ray_groups(frame, belief, rows[is_ray], ids[rows[is_ray]], scaled)
@@ -86,8 +93,10 @@ class FeatureSensor(Sensor):
         known = self._names.ids(belief.catalogue)
         names = frame.landmarks.tolist()
         new = [k for k, name in enumerate(names) if name not in known and name not in self._place]
-        has_ray = self.camera.inside(frame.z) & np.isfinite(self.camera.unproject(frame.z)).all(axis=-1)
-        new = [k for k in new if has_ray[k]][: self.births_per_frame]
+        if new:
+            z = frame.z[new]
+            has_ray = self.camera.inside(z) & np.isfinite(self.camera.unproject(z)).all(axis=-1)
+            new = [k for k, seen in zip(new, has_ray.tolist(), strict=True) if seen][: self.births_per_frame]
         if not new:
             return []
         names = frame.landmarks[new].tolist()
@@ -110,14 +119,14 @@ class FeatureSensor(Sensor):
 
     def _depths(self, belief: Belief, observed: Sequence[Observations]) -> np.ndarray:
         """Of the points that were just seen, and of the known points in view, in the heaviest particle."""
-        mode, pose = belief.mode, belief.state[belief.mode][:7]
+        pose = belief.state[belief.mode][:7]
         seen = [np.zeros((0, 3))]
         for group in observed:
             if group.ids is not None and isinstance(group.model, CameraPoint):
-                seen.append(SE3.inverse_transform(pose, belief.read(group.ids).mean[mode]))
+                seen.append(SE3.inverse_transform(pose, belief.read_mode(group.ids).mean[0]))
         if self._start is not None:
             landmark = self._names.ids(belief.catalogue)[CONSTELLATION]
-            points = belief.map.landmark_of(landmark).in_world(belief.read([landmark]))[mode]
+            points = belief.map.landmark_of(landmark).in_world(belief.read_mode([landmark]))[0]
             seen.append(SE3.inverse_transform(pose, points))
         point = np.concatenate(seen)
         return np.asarray(point[self.camera.visible(point), 2])
@@ -143,38 +152,29 @@ class FeatureSensor(Sensor):
         Returns:
             Which features, ν (k, 2), H (k, 2, d) and J P Jᵀ (k, 2, 2).
         """
-        mode = belief.mode
         which, nus, jacs, covs = [], [], [], []
         for model, chosen, ids in self._by_kind(belief, names, members):
-            records = belief.read(ids)
-            const = None if records.const is None else records.const[mode]
             z = px[chosen].reshape(1, -1) if isinstance(model, GroupView) else px[chosen]
-            nu, jac = linearise(
-                model, belief.prior.space, z, belief.state[mode][None], records.mean[mode], const
-            )
-            assert jac.state is not None and jac.landmark is not None
-            cov = jac.landmark @ records.cov[mode] @ np.swapaxes(jac.landmark, -1, -2)
+            nu, jac, cov = belief.innovations(model, z, ids)
             which.append(chosen)
             nus.append(nu.reshape(-1, 2))
-            jacs.append(jac.state.reshape(chosen.size, 2, -1))
+            jacs.append(jac.reshape(chosen.size, 2, -1))
             covs.append(_diagonal_blocks(cov, chosen.size))
         return np.concatenate(which), np.concatenate(nus), np.concatenate(jacs), np.concatenate(covs)
 
     def places(self, belief: Belief, names: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where features (K,) are in the world of the heaviest particle: which of them, homogeneous points (k, 4)."""
-        mode, which, out = belief.mode, [np.zeros(0, dtype=np.int64)], [np.zeros((0, 4))]
+        which, out = [np.zeros(0, dtype=np.int64)], [np.zeros((0, 4))]
         for model, chosen, ids in self._by_kind(belief, names, members):
-            records = belief.read(ids)
-            const = None if records.const is None else records.const[mode]
+            records = belief.read_mode(ids)
+            const = None if records.const is None else records.const[0]
             which.append(chosen)
             if isinstance(model, GroupView):
                 out.append(
-                    np.pad(
-                        model.in_world(records.mean[mode], const)[0], ((0, 0), (0, 1)), constant_values=1.0
-                    )
+                    np.pad(model.in_world(records.mean[0], const)[0], ((0, 0), (0, 1)), constant_values=1.0)
                 )
             else:
-                x, w = model.place(records.mean[mode], const)
+                x, w = model.place(records.mean[0], const)
                 out.append(np.concatenate([x, w], axis=-1))
         return np.concatenate(which), np.concatenate(out)
 
@@ -184,8 +184,8 @@ class FeatureSensor(Sensor):
         for model, chosen, ids in self._by_kind(belief, names, members):
             out[chosen] = True
             if model is self.ray:
-                records, mode = belief.read(ids), belief.mode
-                rho, variance = records.mean[mode, :, 2], records.cov[mode, :, 2, 2]
+                records = belief.read_mode(ids)
+                rho, variance = records.mean[0, :, 2], records.cov[0, :, 2, 2]
                 out[chosen] = (rho > 0.0) & (np.sqrt(variance) <= share * rho)
         return out
 
@@ -224,14 +224,16 @@ class FeatureSensor(Sensor):
             return ConstellationView(self.camera, self._start.points.positions[places])
         return MembersView(self.camera, places)
 
-    def _constellation_group(self, frame: FeatureFrame, belief: Belief) -> list[Observations]:
+    def _constellation_group(
+        self, frame: FeatureFrame, inside: np.ndarray, belief: Belief
+    ) -> list[Observations]:
         """All known points that are seen, as one measurement; the first sight of them is in the map already."""
-        rows = [k for k, name in enumerate(frame.landmarks.tolist()) if name in self._place]
-        rows = [k for k in rows if self.camera.inside(frame.z[k])]
+        names = frame.landmarks.tolist()
+        rows = [k for k, name in enumerate(names) if name in self._place and inside[k]]
         if not rows or self._has_entered(frame, rows):
             return []
         landmark = self._names.ids(belief.catalogue)[CONSTELLATION]
-        view = self._view(belief, np.array([self._place[name] for name in frame.landmarks[rows].tolist()]))
+        view = self._view(belief, np.array([self._place[names[k]] for k in rows]))
         z, cov = frame.z[rows].reshape(1, -1), np.zeros((1, view.dim, view.dim))
         for k, row in enumerate(rows):
             cov[0, 2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = frame.cov_z[row]
@@ -240,8 +242,10 @@ class FeatureSensor(Sensor):
     def _has_entered(self, frame: FeatureFrame, rows: list[int]) -> bool:
         assert self._start is not None
         first = self._start.sight
+        if frame.stamp_ns != first.stamp_ns:
+            return False
         order = np.argsort(first.landmarks), np.argsort(frame.landmarks[rows])
-        return frame.stamp_ns == first.stamp_ns and np.array_equal(first.z[order[0]], frame.z[rows][order[1]])
+        return np.array_equal(first.z[order[0]], frame.z[rows][order[1]])
 
     def _ray_groups(
         self, frame: FeatureFrame, belief: Belief, rows: np.ndarray, ids: np.ndarray, scaled: bool
@@ -267,11 +271,9 @@ class FeatureSensor(Sensor):
 
     def _has_parallax(self, belief: Belief, ids: np.ndarray) -> np.ndarray:
         """Whether the particle of highest weight sees depth move the image (K,), E06 §5.1, last paragraph."""
-        records, mode = belief.read(ids), belief.mode
-        assert records.const is not None
-        jacobians = self.ray.jacobians(belief.state[mode], records.mean[mode], records.const[mode])
-        assert jacobians.landmark is not None
-        by_rho = np.sqrt(np.square(jacobians.landmark[..., 2]).sum(axis=-1))
+        state, mode = belief.state[belief.mode], belief.mode
+        _, jac, _ = belief.map.innovations(self.ray, np.zeros((ids.size, 2)), ids, state, mode)
+        by_rho = np.sqrt(np.square(jac.landmark[..., 2]).sum(axis=-1))
         return by_rho * self.rays.std_rho_per_m >= self.rays.least_px
 
     def _promote(self, belief: Belief, observed: Sequence[Observations]) -> None:

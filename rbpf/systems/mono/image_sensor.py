@@ -20,6 +20,9 @@ from rbpf.systems.mono.appearance import SOURCE_HALF_PX, Appearances
 from rbpf.systems.mono.config import SearchConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor
 
+LEAST_SEEN = 4
+"""Points of a known map that tell where the camera is; one that sees fewer has left the map, nothing new is mapped."""
+
 
 @final
 class ImageSensor(Sensor):
@@ -68,6 +71,21 @@ class ImageSensor(Sensor):
         source = np.array([self._window(padded, px + SOURCE_HALF_PX + 1.0) for px in known_px])
         self.table.add(source, known_px, SE3.identity(), members)
         self._given = known_px
+
+    def begin_lost(
+        self, windows: np.ndarray, first_px: np.ndarray, first_pose: np.ndarray, positions: np.ndarray
+    ) -> None:
+        """Takes the points of a map that is known, K of them; where in it the camera is has to be found out.
+
+        Args:
+            windows: (K, S, S) uint8 around their first sightings.
+            first_px: (K, 2) where those were.
+            first_pose: (K, 7) world_from_camera then.
+            positions: (K, 3) of the points.
+        """
+        rows = self.table.add(windows, first_px, first_pose)
+        self.table.place[rows] = np.concatenate([positions, np.ones((rows.size, 1))], axis=1)
+        self.bad_frames = self.config.lost_frames
 
     def observe(self, frame: ImageFrame, belief: Belief) -> Sequence[Observations]:
         """What is found of the features that should be seen."""
@@ -122,7 +140,7 @@ class ImageSensor(Sensor):
         tracked: patches look different from there.
         """
         found, config = self.searched.found, self.config
-        if not found.size:
+        if not found.size or (self.features.fixed and found.sum() < LEAST_SEEN):
             return True
         if not self.lost:
             return bool(found.mean() < config.lost_share)
@@ -139,6 +157,8 @@ class ImageSensor(Sensor):
         if not searched.rows.size or self.bad_frames:
             return nothing
         table.note(searched.rows, searched.found)
+        if self.features.fixed:
+            return nothing
         rows = searched.rows
         failing = 1.0 - table.found[rows] / table.attempts[rows] > config.failure_ratio
         drop = rows[failing & (table.attempts[rows] >= config.trial)]

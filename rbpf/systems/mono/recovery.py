@@ -19,6 +19,9 @@ from rbpf.systems.mono.relocalise import Relocaliser
 LEAST_CONTRAST = 10
 """Grey levels that are all nearer to each other are those of a lens cap."""
 
+VIEWS_PER_FRAME = 2
+"""Views of an earlier map from which a lost camera is looked for in a frame, in turn."""
+
 FROZEN = 5
 """Times that an image has to come again: drivers repeat single images when the camera is late."""
 
@@ -31,16 +34,30 @@ class Recovery:
         sensor: of the run; it says whether the camera is lost.
         config: settings.
         std_velocity: (6,) standard deviation of the velocity of a camera that is found again, rad/s, m/s.
+        views: (V, 7) poses to look from as well, where the map was made before this run; none for other runs.
+        size_m: of such a map: how far from where it is told the camera may be as long as it was never found.
     """
 
-    def __init__(self, sensor: ImageSensor, config: RecoveryConfig, std_velocity: np.ndarray) -> None:
+    def __init__(
+        self,
+        sensor: ImageSensor,
+        config: RecoveryConfig,
+        std_velocity: np.ndarray,
+        views: np.ndarray | None = None,
+        size_m: float = 0.0,
+    ) -> None:
         self.sensor = sensor
         self.config = config
         self.std_velocity = std_velocity
         self.relocaliser = Relocaliser(sensor, config)
         self.stamp_ns = 0
         """When the pose was trusted last."""
-        self._trusted = SE3.identity(), np.zeros((6, 6))
+        self.views = np.zeros((0, 7)) if views is None else views
+        self.never_found = self.views.shape[0] > 0
+        """Whether the camera has not been found yet in a map that was made before."""
+        self._size_m = size_m
+        start = self.views[0] if self.never_found else SE3.identity()
+        self._trusted = start, np.zeros((6, 6))
         self._cloud: Particles | None = None
         self._last: np.ndarray | None = None
         self._repeats = 0
@@ -78,7 +95,7 @@ class Recovery:
             return None
         pose, cov = self.trusted
         if frame.image is not None:
-            found = self.relocaliser.find(filter_.belief(), frame.image, pose)
+            found = self._found(filter_, frame.image, pose)
             if found is not None:
                 attempt = self.relocaliser.attempt
                 self.sensor.recognised = attempt is not None and attempt.agreeing >= self.config.sure
@@ -86,10 +103,26 @@ class Recovery:
         reach = np.repeat([self.config.reach_rad, self.config.reach_m], 3)
         return PoseLaw(pose, cov + np.diag(reach**2), self.std_velocity)
 
+    def _found(self, filter_: Filter, image: np.ndarray, trusted: np.ndarray) -> PoseLaw | None:
+        """Where the camera is recognised, looking from the last trusted pose; then from views of the map.
+
+        In the first frame from all of them, later from some in turn.
+        """
+        belief, count = filter_.belief(), self.views.shape[0]
+        tried = min(count, VIEWS_PER_FRAME if filter_.steps else count)
+        chosen = (filter_.steps * tried + np.arange(tried)) % max(count, 1)
+        for near in [trusted, *self.views[chosen]]:
+            found = self.relocaliser.find(belief, image, near)
+            if found is not None:
+                return found
+        return None
+
     def drift(self, frame: ImageFrame) -> np.ndarray:
         """Covariance (6, 6) of how far the camera may have gone while it was lost, [ω, v]."""
         if not self.sensor.lost:
             return np.zeros((6, 6))
+        if self.never_found:
+            return np.diag(np.repeat([np.pi, self._size_m], 3) ** 2)
         seconds = (frame.stamp_ns - self.stamp_ns) * 1e-9
         return np.diag((np.repeat([self.config.drift_rad_s, self.config.drift_m_s], 3) * seconds) ** 2)
 
@@ -97,6 +130,7 @@ class Recovery:
         """Remembers the particles after a step, if they can be trusted."""
         if not self.sensor.bad_frames:
             self._cloud, self.stamp_ns = filter_.particles, frame.stamp_ns
+            self.never_found = False
 
     @property
     def trusted(self) -> tuple[np.ndarray, np.ndarray]:
@@ -119,6 +153,7 @@ class Recovery:
             "recovery/last": last,
             "recovery/repeats": np.array(self._repeats),
             "recovery/blank": np.array(self._blank),
+            "recovery/never_found": np.array(self.never_found),
         }
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
@@ -127,4 +162,5 @@ class Recovery:
         self.stamp_ns = int(arrays["recovery/stamp_ns"])
         last = arrays["recovery/last"]
         self._last = last if last.size else None
+        self.never_found = bool(arrays["recovery/never_found"])
         self._repeats, self._blank = int(arrays["recovery/repeats"]), bool(arrays["recovery/blank"])

@@ -54,12 +54,16 @@ class Sighting:
 
 @final
 class Sightings:
-    """The sightings of all frames so far."""
+    """The sightings of all frames so far.
 
-    def __init__(self) -> None:
+    Args:
+        given: rows of the sensor's table that were there before the first frame, and are not told as started in it.
+    """
+
+    def __init__(self, given: int = 0) -> None:
         self.frames: list[Sighting] = []
         self._names = Names()
-        self._started = 0
+        self._given = self._started = given
 
     def record(self, sensor: ImageSensor, filter_: Filter) -> None:
         """Takes note of the sensor's last frame, once the filter has made its step."""
@@ -94,7 +98,7 @@ class Sightings:
             for item in fields(Sighting)
         ]
         self.frames = [Sighting(*parts) for parts in zip(*columns, strict=True)]
-        self._started = sum(frame.started.shape[0] for frame in self.frames)
+        self._started = self._given + sum(frame.started.shape[0] for frame in self.frames)
 
     def _lines(self, features: FeatureSensor, belief: Belief, rows: np.ndarray) -> np.ndarray:
         """Ends (K, 2, 2) of the epipolar lines of those features that are rays, in the heaviest particle."""
@@ -114,13 +118,13 @@ class Sightings:
 
 def ray_ends(features: FeatureSensor, belief: Belief, ids: np.ndarray, sigmas: float) -> np.ndarray:
     """Nearest and farthest point (K, 2, 4) on rays in the heaviest particle, homogeneous, so many σ of ρ apart."""
-    records, mode = belief.read(ids), belief.mode
+    records = belief.read_mode(ids)
     assert records.const is not None
-    mean = records.mean[mode][:, None].repeat(2, axis=1)
-    spread = sigmas * np.sqrt(records.cov[mode][:, 2, 2])
+    mean = records.mean[0][:, None].repeat(2, axis=1)
+    spread = sigmas * np.sqrt(records.cov[0][:, 2, 2])
     mean[:, 0, 2] += spread
     mean[:, 1, 2] = np.maximum(mean[:, 1, 2] - spread, 0.0)
-    return features.inverse_depth.homogeneous(mean, records.const[mode][:, None])
+    return features.inverse_depth.homogeneous(mean, records.const[0][:, None])
 
 
 def _in_reported_world(place: np.ndarray, filter_: Filter, mode: int) -> np.ndarray:

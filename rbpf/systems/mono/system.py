@@ -11,6 +11,7 @@ from rbpf.lie import SE3
 from rbpf.maps.constellation import Constellation, UncertainConstellation
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
+from rbpf.maps.shared import ALL
 from rbpf.models import Conditional, MotionModel, Records, Sensor
 from rbpf.motion.constant_velocity import MarginalVelocity, PoseLaw, SampledVelocity
 from rbpf.sensors.features import FeatureFrame, FeatureLog, KnownPoints
@@ -44,14 +45,20 @@ def build_filter(
     return assemble(config, features, start, None if wrapped is None else wrapped(features))
 
 
-def build_features(camera: Pinhole, config: MonoConfig, start: KnownStart | None) -> FeatureSensor:
-    """What turns found features into observations."""
+def build_features(
+    camera: Pinhole, config: MonoConfig, start: KnownStart | None, fixed: bool = False
+) -> FeatureSensor:
+    """What turns found features into observations; with `fixed` of a map that is known and stays as it is."""
     group = start if config.known == "frame" else None
-    return FeatureSensor(camera, config.ray, config.births_per_frame, group)
+    return FeatureSensor(camera, config.ray, config.births_per_frame, group, fixed)
 
 
 def assemble(
-    config: MonoConfig, features: FeatureSensor, start: KnownStart | None, sensor: Sensor | None = None
+    config: MonoConfig,
+    features: FeatureSensor,
+    start: KnownStart | None,
+    sensor: Sensor | None = None,
+    mapped: KnownPoints | None = None,
 ) -> Filter:
     """The filter, with the known points in its map.
 
@@ -60,6 +67,7 @@ def assemble(
         features: what turns found features into observations.
         start: known points, if there are any.
         sensor: what finds features and hands them to `features`; by default the features come as they are.
+        mapped: points of a map that the camera is to be found in, in the world of the particles.
     """
     motion = build_motion(config.velocity)
     landmark_map = LandmarkMap(motion.space, compiled=config.compiled)
@@ -78,7 +86,9 @@ def assemble(
         np.random.default_rng(config.seed),
         lag=config.lag,
     )
-    if start is not None and config.known == "frame":
+    if mapped is not None:
+        add_known_points(landmark_map, mapped, config.particles)
+    elif start is not None and config.known == "frame":
         add_constellation(landmark_map, features.camera, start, config)
     elif start is not None:
         add_known_points(landmark_map, start.points, config.particles)
@@ -121,22 +131,19 @@ def world_of(filter_: Filter) -> Anchored | None:
 
 def frame_of(filter_: Filter, particle: int) -> np.ndarray | None:
     """The same frame (7,) in one particle's world."""
-    held = _constellation(filter_)
-    if held is None:
-        return None
-    group, records = held
-    one = slice(particle, particle + 1)
-    const = None if records.const is None else records.const[one]
-    return np.asarray(group.frame(Records(records.mean[one], records.cov[one], const))[0][0])
+    held = _constellation(filter_, slice(particle, particle + 1))
+    return None if held is None else np.asarray(held[0].frame(held[1])[0][0])
 
 
-def _constellation(filter_: Filter) -> tuple[Constellation | UncertainConstellation, Records] | None:
+def _constellation(
+    filter_: Filter, particles: slice = ALL
+) -> tuple[Constellation | UncertainConstellation, Records] | None:
     """The known points' landmark and its records. It was the first one: no other one has to be asked."""
     landmark_map = filter_.belief().map
     first = next(iter(landmark_map.catalogue), None)
     if first is None or landmark_map.catalogue[first] != CONSTELLATION:
         return None
-    return landmark_map.landmark_of(first), landmark_map.read(np.array([first]))
+    return landmark_map.landmark_of(first), landmark_map.read(np.array([first]), particles)
 
 
 def start_law(log: FeatureLog, config: MonoConfig) -> PoseLaw:

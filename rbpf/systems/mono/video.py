@@ -15,6 +15,7 @@ from rbpf.sensors.features import FeatureFrame, KnownPoints
 from rbpf.sensors.readers.images import ImageFrame, ImageSequence, KnownPixels
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.image_sensor import ImageSensor
+from rbpf.systems.mono.known_map import KnownMap
 from rbpf.systems.mono.known_start import KnownStart, require_texture, resect_known
 from rbpf.systems.mono.recovery import Recovery
 from rbpf.systems.mono.resuming import cut, restore, save
@@ -31,6 +32,7 @@ class VideoRun:
         sequence: what was filtered.
         config: with what settings.
         known: the known points, None where it started without any.
+        mapped: the map that the camera is found in, and that is not changed; None where the run makes its own.
         filter: in its final state.
         sensor: its image sensor.
         stamps_ns: (T,).
@@ -57,6 +59,7 @@ class VideoRun:
     sequence: ImageSequence
     config: MonoConfig
     known: KnownPixels | None
+    mapped: KnownMap | None
     filter: Filter
     sensor: ImageSensor
     stamps_ns: np.ndarray
@@ -75,7 +78,7 @@ class VideoRun:
     seconds_waiting: np.ndarray
     seconds_births: np.ndarray
     seconds_telling: np.ndarray
-    sightings: Sightings = field(default_factory=Sightings)
+    sightings: Sightings = field(init=False)
     problems: list[str] = field(default_factory=list)
     relocalisations: list[int] = field(default_factory=list)
     failure: str | None = None
@@ -83,7 +86,17 @@ class VideoRun:
 
     def __post_init__(self) -> None:
         """Watches over the sensor from the start."""
-        self.recovery = Recovery(self.sensor, self.config.recovery, start_std(self.config.velocity))
+        found, std = self.mapped, start_std(self.config.velocity)
+        views, size = (None, 0.0) if found is None else (found.views, found.size_m)
+        self.recovery = Recovery(self.sensor, self.config.recovery, std, views, size)
+        self.sightings = Sightings(0 if found is None else found.names.size)
+
+    @property
+    def given(self) -> int:
+        """Number of landmarks that were known from the start: the first rows of the sensor's table."""
+        if self.mapped is not None:
+            return int(self.mapped.names.size)
+        return 0 if self.known is None else int(self.known.names.size)
 
 
 def run_images(
@@ -93,6 +106,7 @@ def run_images(
     on_frame: Callable[[int, ImageFrame, VideoRun], None] | None = None,
     checkpoint: Path | None = None,
     resume: bool = False,
+    mapped: KnownMap | None = None,
 ) -> VideoRun:
     """Filters a whole sequence.
 
@@ -102,15 +116,19 @@ def run_images(
         sequence: of images.
         config: all settings.
         known: points of known position that are seen in the first image; without them the scale is arbitrary.
-        on_frame: called after each frame.
+        on_frame: called after each frame; a KeyboardInterrupt from it leaves a checkpoint behind.
         checkpoint: file of checkpoints; None writes none.
         resume: go on from the checkpoint, if there is one.
+        mapped: a map that the camera is to be found in, in place of making one; it is not changed.
 
     Raises:
         InputError: the first image cannot be read, the known points do not determine the camera, or the checkpoint
             is of another run.
     """
-    run, law = _begin(sequence, config, known, first_image(sequence))
+    if mapped is None:
+        run, law = _begin(sequence, config, known, first_image(sequence))
+    else:
+        run, law = _begin_in(sequence, config, mapped), None
     if resume and checkpoint is not None and checkpoint.exists():
         restore(run, checkpoint)
     waited = time.perf_counter()
@@ -125,8 +143,13 @@ def run_images(
             break
         if checkpoint is not None and (t + 1) % config.checkpoint_every == 0:
             _keep(run, checkpoint)
-        if on_frame is not None:
-            on_frame(t, frame, run)
+        try:
+            if on_frame is not None:
+                on_frame(t, frame, run)
+        except KeyboardInterrupt:
+            if checkpoint is not None:
+                _keep(run, checkpoint)
+            raise
         waited = time.perf_counter()
     if checkpoint is not None and run.failure is None:
         _keep(run, checkpoint)
@@ -171,14 +194,34 @@ def _begin(
     sensor = ImageSensor(features, config.search)
     if known is not None:
         sensor.begin(image, known.px, config.known == "frame")
+    return _empty(sequence, config, sensor, assemble(config, features, start, sensor), known), law
+
+
+def _begin_in(sequence: ImageSequence, config: MonoConfig, mapped: KnownMap) -> VideoRun:
+    """A run before its first frame, somewhere in a map."""
+    mapped.require_camera(sequence.camera, sequence.name)
+    features = build_features(sequence.camera, config, None, fixed=True)
+    sensor = ImageSensor(features, config.search)
+    sensor.begin_lost(mapped.windows, mapped.first_px, mapped.first_pose, mapped.positions)
+    filter_ = assemble(config, features, None, sensor, mapped.points)
+    return _empty(sequence, config, sensor, filter_, None, mapped)
+
+
+def _empty(
+    sequence: ImageSequence,
+    config: MonoConfig,
+    sensor: ImageSensor,
+    filter_: Filter,
+    known: KnownPixels | None,
+    mapped: KnownMap | None = None,
+) -> VideoRun:
     total = len(sequence)
     numbers = np.zeros((13, total))
     poses, covs = np.zeros((total, 7)), np.zeros((total, 6, 6))
-    filter_ = assemble(config, features, start, sensor)
     stamps = np.asarray(sequence.stamps_ns, dtype=np.int64)
-    run = VideoRun(sequence, config, known, filter_, sensor, stamps, poses, covs, *numbers)
+    run = VideoRun(sequence, config, known, mapped, filter_, sensor, stamps, poses, covs, *numbers)
     run.recovery.stamp_ns = int(stamps[0])
-    return run, law
+    return run
 
 
 def _keep(run: VideoRun, checkpoint: Path) -> None:
@@ -209,7 +252,8 @@ def _fitting(run: VideoRun, frame: ImageFrame) -> ImageFrame:
 
 def _frame(run: VideoRun, t: int, frame: ImageFrame, law: PoseLaw | None) -> None:
     started = time.perf_counter()
-    frame, was_lost = run.recovery.checked(_fitting(run, frame)), run.sensor.lost
+    frame = run.recovery.checked(_fitting(run, frame))
+    was_lost, never_found = run.sensor.lost, run.recovery.never_found
     law = law or run.recovery.law(frame, run.filter)
     report = run.filter.step(frame, law, frame.stamp_ns)
     run.recovery.note(frame, run.filter)
@@ -228,6 +272,8 @@ def _frame(run: VideoRun, t: int, frame: ImageFrame, law: PoseLaw | None) -> Non
         run.problems.append(f"frame {t}: {frame.problem}")
     if run.sensor.lost and not was_lost:
         run.problems.append(f"frame {t}: the camera is lost, its pose is held until the map is seen again")
-    if was_lost and not run.sensor.lost:
+    if never_found and not run.sensor.lost:
+        run.problems.append(f"frame {t}: the camera is found in the map")
+    elif was_lost and not run.sensor.lost:
         run.problems.append(f"frame {t}: the camera is found again")
         run.relocalisations.append(t)

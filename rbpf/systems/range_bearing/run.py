@@ -127,7 +127,7 @@ def run(
         config: all settings.
         out: folder for checkpoints; None writes none.
         resume: go on from the checkpoint in `out`, if there is one.
-        on_step: called with the steps done and their number.
+        on_step: called with the steps done and their number; a KeyboardInterrupt from it leaves a checkpoint behind.
 
     Raises:
         InputError: the log or a setting does not fit, or no particle explains the observations.
@@ -146,6 +146,17 @@ def run(
             associations.restore(extra)
             if anchor is not None:
                 anchor.restore(extra, build_model(log, config), build_point(log))
+
+    def save() -> None:
+        if checkpoint is None:
+            return
+        kept = {} if anchor is None else anchor.arrays()
+        try:
+            filter_.save(checkpoint, progress.arrays() | associations.arrays() | kept)
+        except InputError as error:
+            # On a full disk the run goes on all the same, and the last checkpoint stays.
+            problems.append(f"step {filter_.steps - 1}: no checkpoint is kept: {error}")
+
     for t in range(filter_.steps, total):
         frame = log.frames[t]
         started = time.perf_counter()
@@ -156,15 +167,14 @@ def run(
             estimate = anchor.state_estimate(anchor.after_step(report, control))
         progress.put(t, report, estimate, time.perf_counter() - started)
         associations.record(report, frame.z.shape[0])
-        if checkpoint is not None and (filter_.steps % config.checkpoint_every == 0 or t + 1 == total):
-            kept = {} if anchor is None else anchor.arrays()
-            try:
-                filter_.save(checkpoint, progress.arrays() | associations.arrays() | kept)
-            except InputError as error:
-                # On a full disk the run goes on all the same, and the last checkpoint stays.
-                problems.append(f"step {t}: no checkpoint is kept: {error}")
-        if on_step is not None:
-            on_step(t + 1, total)
+        if filter_.steps % config.checkpoint_every == 0 or t + 1 == total:
+            save()
+        try:
+            if on_step is not None:
+                on_step(t + 1, total)
+        except KeyboardInterrupt:
+            save()
+            raise
     used = named_associations(log)
     if config.association == "ml":
         used = associations.of(filter_.belief().mode)

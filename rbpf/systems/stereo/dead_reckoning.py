@@ -119,7 +119,10 @@ def standstill() -> Odometry:
 
 
 def chained(first: Odometry, second: Odometry) -> Odometry:
-    """One motion after another, with independent errors: C = Ad⁻¹ C₁ Ad⁻ᵀ + C₂ with Ad of the second."""
+    """One motion after another, with independent errors: C = Ad⁻¹ C₁ Ad⁻ᵀ + C₂ with Ad of the second.
+
+    Mathematics (chain).
+    """
     back = SE3.adjoint(SE3.inverse(second.delta))
     cov = gaussian.symmetrise(back @ first.cov @ back.T + second.cov)
     return Odometry(SE3.compose(first.delta, second.delta), cov)

@@ -100,7 +100,7 @@ def run_images(
     Args:
         sequence: the recording.
         config: all settings.
-        on_frame: called after each pair.
+        on_frame: called after each pair; a KeyboardInterrupt from it leaves a checkpoint behind.
         checkpoint: file of checkpoints; None writes none.
         resume: go on from the checkpoint, if there is one.
 
@@ -168,8 +168,13 @@ def _all(
         run.frames_done = t + 1
         if checkpoint is not None and (t + 1) % run.config.checkpoint_every == 0:
             _keep(run, checkpoint)
-        if on_frame is not None:
-            on_frame(t, run)
+        try:
+            if on_frame is not None:
+                on_frame(t, run)
+        except KeyboardInterrupt:
+            if checkpoint is not None:
+                _keep(run, checkpoint)
+            raise
     if checkpoint is not None and run.failure is None:
         _keep(run, checkpoint)
     cut(run)

@@ -9,6 +9,7 @@ import yaml
 from rbpf.errors import InputError
 from rbpf.sensors.readers.table import parse_number
 from rbpf.sensors.readers.text import line_error, quoted, read_text
+from rbpf.sensors.readers.yaml_nodes import compose
 
 
 @dataclass(frozen=True)
@@ -137,13 +138,4 @@ def read_yaml(path: Path, hint: str) -> Value:
     if text.startswith("%YAML:"):
         # OpenCV writes this first line with a colon, which YAML does not have.
         text = "#" + text
-    try:
-        node = yaml.compose(text, Loader=yaml.BaseLoader)
-    except yaml.MarkedYAMLError as error:
-        line = error.problem_mark.line + 1 if error.problem_mark else 1
-        raise line_error(path, line, f"expected YAML, found a syntax error ({error.problem})") from None
-    except (yaml.YAMLError, RecursionError, ValueError, OverflowError):
-        raise InputError(f"{path}: expected YAML, found something else.") from None
-    if node is None:
-        raise InputError(f"{path}: expected {hint}, found only comments.")
-    return Value(path, "the file", node)
+    return Value(path, "the file", compose(path, text, hint))

@@ -43,7 +43,7 @@ class VideoImages(Source):
     shape: tuple[int, int]
 
     def frames(self, start: int) -> Generator[ImageFrame]:
-        with _opened(self.path) as capture:
+        with opened(self.path) as capture:
             # Jumping to an image is inexact in most codecs, going through those before it is not.
             if not all(capture.grab() for _ in range(start)):
                 return
@@ -84,7 +84,7 @@ def read(path: Path, calibration: Path | None) -> ImageSequence:
         InputError: the video cannot be decoded, or the camera file is missing or does not fit.
     """
     camera = find_calibration(path.parent, calibration)
-    count, rate_hz, shape = _header(path)
+    count, rate_hz, shape = video_header(path)
     camera.require_shape(shape, str(path))
     stamps_ns = evenly(count, camera.rate_hz or rate_hz or DEFAULT_RATE_HZ)
     return ImageSequence(
@@ -97,10 +97,15 @@ def read(path: Path, calibration: Path | None) -> ImageSequence:
     )
 
 
-def _header(path: Path) -> tuple[int, float, tuple[int, int]]:
+def video_header(path: Path) -> tuple[int, float, tuple[int, int]]:
+    """Number of images, their rate [Hz] or 0 where it is not told, height and width.
+
+    Raises:
+        InputError: no image can be decoded.
+    """
     import cv2
 
-    with _opened(path) as capture:
+    with opened(path) as capture:
         count, rate_hz = capture.get(cv2.CAP_PROP_FRAME_COUNT), capture.get(cv2.CAP_PROP_FPS)
         there, image = capture.read()
         if not there:
@@ -114,7 +119,12 @@ def _header(path: Path) -> tuple[int, float, tuple[int, int]]:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Any]:
+def opened(path: Path) -> Iterator[Any]:
+    """OpenCV's decoder of a video, closed at the end.
+
+    Raises:
+        InputError: it cannot be opened.
+    """
     import cv2
 
     # Other backends take the number in a name such as 000001 for a pattern of images.

@@ -1,0 +1,53 @@
+"""`rbpf calibrate`: the camera from pictures of a chessboard."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from rbpf.cli.options import Printed
+from rbpf.cli.showing import answer, progress, say, told
+from rbpf.sensors.chessboard import Board
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrateOptions(Printed):
+    """Options of `rbpf calibrate`.
+
+    Attributes:
+        images: folder of images of the board, 15 or more from different directions, or a video of it.
+        board: inner corners of the chessboard, the places where four squares meet, as 9x6.
+        square: side of its squares, m.
+        out: folder for camera.yaml, calibration.png and calibration.json.
+    """
+
+    images: tyro.conf.Positional[Path]
+    board: str
+    square: float
+    out: Path = Path("calibration")
+
+
+def calibrate(options: Annotated[CalibrateOptions, tyro.conf.arg(name="")]) -> None:
+    """Find the camera's focal lengths, centre and distortion from pictures of a chessboard, and write camera.yaml."""
+    from rbpf.validation.calibration import PICTURE, calibrate_images, write_calibration
+
+    board = Board.parse(options.board, options.square)
+    with progress() as bar:
+        found, looked_at = calibrate_images(
+            options.images, board, told(bar, bar.add_task("looking for the board", total=None))
+        )
+    entries = write_calibration(found, board, looked_at, options.out)
+    camera, std = found.camera, found.std
+    left_out = f", {len(found.left_out)} left out" if found.left_out else ""
+    answer(
+        entries | {"out": str(options.out)},
+        options.json,
+        f"{len(found.views)} views of {looked_at} images{left_out}; reprojection error {found.rms_px:.3f} px; "
+        f"corners in {100 * found.covered:.0f} % of the image",
+        f"fx {camera.fx:.2f} ± {std[0]:.2f}, fy {camera.fy:.2f} ± {std[1]:.2f}, cx {camera.cx:.2f} ± {std[2]:.2f}, "
+        f"cy {camera.cy:.2f} ± {std[3]:.2f} px",
+        f"camera.yaml and {PICTURE} are in {options.out}; use it with --calibration {options.out / 'camera.yaml'}",
+    )
+    if found.covered < 0.5 and not options.json:
+        say("the board was seen in less than half of the image: distortion is uncertain where it was not")

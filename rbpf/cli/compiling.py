@@ -1,0 +1,114 @@
+"""Compiled kernels: which there are, whether they are in the cache, and compiling them with a word of warning."""
+
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numba
+import numpy as np
+
+import rbpf
+from rbpf.errors import InputError
+
+_ROOT = Path(rbpf.__file__).parent
+
+
+def kernel_modules() -> list[str]:
+    """Modules of `rbpf` with compiled functions of their own; those that are only compiled into others are left out."""
+    folders = "sensors", "motion", "maps", "systems", "validation"
+    paths = [*sorted((_ROOT / "kernels").glob("*.py"))]
+    for folder in folders:
+        paths += sorted((_ROOT / folder).rglob("*_kernel*.py"))
+    chosen = [path for path in paths if _has_own(path.read_text(encoding="utf-8"))]
+    return [".".join(["rbpf", *path.relative_to(_ROOT).with_suffix("").parts]) for path in chosen]
+
+
+def _has_own(source: str) -> bool:
+    return source.count("@njit(") + source.count("@observation_kernel") > source.count('inline="always"')
+
+
+def cached(module: str) -> bool:
+    """Whether a compiled copy of a module's functions is in Numba's cache."""
+    name = module.rpartition(".")[2]
+    if numba.config.CACHE_DIR:
+        return any(Path(numba.config.CACHE_DIR).glob(f"*/{name}.*.nbi"))
+    source = _ROOT.joinpath(*module.split(".")[1:]).resolve()
+    return any((source.parent / "__pycache__").glob(f"{name}.*.nbi"))
+
+
+def compile_kernels(announce: Callable[[str], None], every: bool = False) -> list[str]:
+    """Compiles what is not in the cache; with `every`, loads all of them.
+
+    Args:
+        announce: called with a sentence before the first one is compiled.
+        every: also load those that are in the cache, which finds out whether they can be.
+
+    Returns:
+        The modules that were compiled.
+    """
+    import rbpf.kernels  # noqa: F401  (discards copies that are older than their sources)
+
+    modules = kernel_modules()
+    missing = [name for name in modules if not cached(name)]
+    if missing:
+        announce(
+            f"compiling {len(missing)} of {len(modules)} kernels: this takes a minute or two and is done once …"
+        )
+    for name in modules if every else missing:
+        import_module(name)
+    return missing
+
+
+def use_threads(threads: int | None) -> None:
+    """Sets the number of threads of the kernels; None leaves all.
+
+    Raises:
+        InputError: the machine does not have so many.
+    """
+    if threads is None:
+        return
+    if not 1 <= threads <= numba.config.NUMBA_NUM_THREADS:
+        raise InputError(f"--threads must lie in 1..{numba.config.NUMBA_NUM_THREADS}, got {threads}")
+    numba.set_num_threads(threads)
+
+
+def warm_up() -> None:
+    """Calls what is compiled at its first call, as the systems call it, on a few numbers."""
+    rng = np.random.default_rng(0)
+    _search_patches(rng)
+    _measure_motion(rng)
+    _filter_log()
+
+
+def _search_patches(rng: np.random.Generator) -> None:
+    from rbpf.sensors.corners import corners
+    from rbpf.sensors.patches import cut, search, warp
+
+    image = rng.integers(0, 256, (30, 40)).repeat(5, axis=0).repeat(5, axis=1).astype(np.uint8)
+    px, _ = corners(image, np.zeros((0, 2)), 4)
+    windows = [window for place in px if (window := cut(image, place)) is not None]
+    templates = warp(np.array(windows), np.tile(np.eye(2), (len(windows), 1, 1)))
+    search(image, templates, px[: len(windows)], np.tile(4.0 * np.eye(2), (len(windows), 1, 1)))
+
+
+def _measure_motion(rng: np.random.Generator) -> None:
+    from rbpf.motion.stereo_vo import estimate_motion
+    from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+
+    rig = RectifiedStereo(Pinhole(640, 480, 500.0, 500.0, 319.5, 239.5), 0.12)
+    before = rng.uniform([-1.0, -1.0, 2.0], [1.0, 1.0, 5.0], (40, 3))
+    z_prev, z_now = rig.project(before), rig.project(before + np.array([0.02, 0.0, 0.05]))
+    estimate_motion(rig, z_prev, z_now, np.eye(3), np.eye(3), rng)
+
+
+def _filter_log() -> None:
+    from rbpf.sensors.readers import open_log
+    from rbpf.systems.range_bearing.config import RangeBearingConfig
+    from rbpf.systems.range_bearing.run import run
+    from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
+
+    with TemporaryDirectory() as folder:
+        simulate_robot(RobotWorld(5, 20, False), Path(folder) / "log", 0)
+        config = RangeBearingConfig(particles=10)
+        run(open_log(Path(folder) / "log", config.noise), config)

@@ -1,0 +1,82 @@
+"""`rbpf doctor` and `rbpf completion`: about the installation itself."""
+
+import time
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import tyro
+
+from rbpf.cli.compiling import cached, compile_kernels, kernel_modules, warm_up
+from rbpf.cli.options import Printed
+from rbpf.cli.showing import answer, say, table, waiting
+from rbpf.errors import InputError
+
+
+@dataclass(frozen=True, kw_only=True)
+class DoctorOptions(Printed):
+    """Options of `rbpf doctor`.
+
+    Attributes:
+        compile: compile the kernels, once, so that the first run need not.
+    """
+
+    compile: bool = True
+
+
+def doctor(options: Annotated[DoctorOptions, tyro.conf.arg(name="")]) -> None:
+    """Say what is installed, in which versions, which parts work here; compile the kernels."""
+    from rbpf.validation.installation import machine, parts, versions
+
+    found, tried = machine(), parts()
+    libraries = versions()
+    compiled = _compile() if options.compile else {}
+    missing = [name for name in kernel_modules() if not cached(name)]
+    broken = [part for part in tried if part.needed and not part.works]
+    entries = {
+        **found,
+        "libraries": libraries,
+        "parts": [part._asdict() for part in tried],
+        **compiled,
+        "kernels_missing": missing,
+        "works": not broken,
+    }
+    marks = {
+        (True, True): "works",
+        (True, False): "BROKEN",
+        (False, True): "works",
+        (False, False): "not installed",
+    }
+    lines = {part.name: f"{marks[part.needed, part.works]}: {part.says}" for part in tried}
+    known = {name: number or "missing" for name, number in libraries.items()}
+    kernels = f"{len(kernel_modules()) - len(missing)} of {len(kernel_modules())} compiled"
+    answer(entries, options.json, table({**found, **known, **lines, "kernels": kernels}, 26))
+    if broken:
+        raise InputError(f"{', '.join(part.name for part in broken)}: needed, and broken here; see above")
+
+
+def _compile() -> dict[str, float]:
+    started = time.perf_counter()
+    with waiting("compiling and trying the kernels …"):
+        compile_kernels(say, every=True)
+        warm_up()
+    return {"kernels_seconds": round(time.perf_counter() - started, 1)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompletionOptions:
+    """Options of `rbpf completion`.
+
+    Attributes:
+        shell: for which it is.
+    """
+
+    shell: tyro.conf.Positional[Literal["bash", "zsh", "tcsh"]]
+
+
+def completion(options: Annotated[CompletionOptions, tyro.conf.arg(name="")]) -> None:
+    """Print what makes a shell complete the commands and options of rbpf: eval "$(rbpf completion bash)"."""
+    from rbpf.cli import APP, PROGRAM
+
+    with suppress(SystemExit):
+        APP.cli(prog=PROGRAM, args=["--tyro-print-completion", options.shell])

@@ -1,0 +1,57 @@
+"""Ctrl-C during a run: the frame that is being filtered is finished, a checkpoint is written, then the run stops."""
+
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+from rbpf.cli.showing import say
+
+Told = Callable[[int, int], None]
+
+
+class StoppedError(KeyboardInterrupt):
+    """Someone stopped a command; the text says how to go on."""
+
+
+@contextmanager
+def patient(tell: Told) -> Iterator[Told]:
+    """What a run is to tell its progress to, in place of `tell`: after Ctrl-C it stops the run at the next frame.
+
+    A second Ctrl-C stops it at once, without a checkpoint of its own.
+    """
+    asked = threading.Event()
+
+    def ask(_number: int, _frame: FrameType | None) -> None:
+        if asked.is_set():
+            raise StoppedError("stopped; the same command with --resume goes on from the last checkpoint")
+        asked.set()
+        say("stopping after this frame; Ctrl-C again stops at once …")
+
+    def listening(done: int, total: int) -> None:
+        tell(done, total)
+        if asked.is_set():
+            raise StoppedError(
+                f"stopped after {done} of {total}; the same command with --resume goes on from there"
+            )
+
+    if threading.current_thread() is not threading.main_thread():
+        yield listening
+        return
+    before = signal.signal(signal.SIGINT, ask)
+    try:
+        yield listening
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def finishing() -> Iterator[None]:
+    """Work after the filter: what Ctrl-C leaves of it is said."""
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        raise StoppedError(
+            "stopped while the results were written; the same command with --resume filters only what is missing"
+        ) from error

@@ -1,0 +1,127 @@
+"""`rbpf run`: one function per system, and the same run again."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from tyro.extras import SubcommandApp
+
+from rbpf.cli.compiling import compile_kernels, use_threads
+from rbpf.cli.interrupts import finishing, patient
+from rbpf.cli.options import MonoOptions, RangeBearingOptions, RunOptions, StereoOptions, given, given_board
+from rbpf.cli.showing import answer, progress, say, table, told
+from rbpf.errors import InputError
+
+RUN = SubcommandApp()
+RUN.__doc__ = """Filter a recording; `rbpf run SYSTEM --help` says more.
+
+`rbpf run --from RUN/config.yaml [--out NEW]` repeats a run: the same recording, the same settings, the same bytes.
+It is refused when the recording has changed. Further options are those of the run's system."""
+
+
+@RUN.command(name="range-bearing")
+def run_range_bearing(options: Annotated[RangeBearingOptions, tyro.conf.arg(name="")]) -> None:
+    """Range-bearing SLAM over a robot's log (FastSLAM 2.0), beside the batch optimum of the same measurements."""
+    from rbpf.systems.range_bearing.config import RangeBearingConfig
+    from rbpf.systems.settings import load_settings
+    from rbpf.validation.range_bearing import finish_run, start_run
+
+    named = given(options, "particles", "seed", "association")
+    config = load_settings(RangeBearingConfig, "range-bearing", options.config, options.set, named)
+    _prepare(options)
+    with progress() as bar, patient(told(bar, bar.add_task("filtering", total=None))) as tell:
+        run = start_run(options.log, config, options.out, options.resume, tell)
+    if options.batch:
+        say("solving the batch problem with the same measurements …")
+    with finishing():
+        entries = finish_run(run, options.log, options.out, options.batch)
+    _finish(entries, options, None)
+
+
+@RUN.command(name="mono")
+def run_mono(options: Annotated[MonoOptions, tyro.conf.arg(name="")]) -> None:
+    """Monocular SLAM over a sequence of images or a video (E06: active search, inverse depth, FastSLAM 2.0)."""
+    from rbpf.systems.mono.config import MonoConfig
+    from rbpf.systems.settings import load_settings
+    from rbpf.validation.mono import Recording, Telling, finish_mono, start_mono
+    from rbpf.validation.rerun_file import require_rerun
+
+    if options.rerun is not None:
+        require_rerun()
+    named = given(options, "particles", "seed")
+    config = load_settings(MonoConfig, "mono", options.config, options.set, named)
+    board = given_board(options.board, options.square)
+    if options.localize != (options.map is not None):
+        raise InputError("a camera is found in a known map with both: --map RUN --localize")
+    recording = Recording(options.sequence, options.known_points, options.calibration, board, options.map)
+    _prepare(options)
+    with progress() as bar:
+        with patient(told(bar, bar.add_task("filtering", total=None))) as tell:
+            run = start_mono(recording, config, options.out, options.resume, tell)
+        solving = bar.add_task("batch", total=None, visible=options.batch)
+        drawing = bar.add_task("drawing", total=None, visible=options.video)
+        telling = Telling(
+            on_frame=told(bar, drawing),
+            on_iteration=lambda count, _error: bar.update(solving, completed=count),
+            batch_s=options.batch_limit,
+        )
+        with finishing():
+            entries = finish_mono(
+                run, recording, options.out, options.video, options.rerun, options.batch, telling
+            )
+    _finish(entries, options, run.failure)
+
+
+@RUN.command(name="stereo")
+def run_stereo(options: Annotated[StereoOptions, tyro.conf.arg(name="")]) -> None:
+    """Stereo SLAM over a sequence of pairs of images (S05: SIFT landmarks, visual odometry, 400 particles)."""
+    from rbpf.systems.settings import load_settings
+    from rbpf.systems.stereo.config import StereoConfig
+    from rbpf.validation.rerun_file import require_rerun
+    from rbpf.validation.stereo import StereoRecording, finish_stereo, start_stereo
+
+    if options.rerun is not None:
+        require_rerun()
+    named = given(options, "particles", "seed", "dof")
+    config = load_settings(StereoConfig, "stereo", options.config, options.set, named)
+    recording = StereoRecording(options.sequence, options.calibration)
+    _prepare(options)
+    with progress() as bar, patient(told(bar, bar.add_task("filtering", total=None))) as tell:
+        run = start_stereo(recording, config, options.out, options.resume, tell)
+    with finishing():
+        entries = finish_stereo(run, recording, options.out, options.rerun)
+    _finish(entries, options, run.failure)
+
+
+def repeated(arguments: list[str]) -> list[str]:
+    """`run --from RUN/config.yaml …` as the command that the run was started with, and its settings.
+
+    Raises:
+        InputError: the file does not tell a run, or its recording has changed.
+    """
+    if arguments[:1] != ["run"] or "--from" not in arguments[:2]:
+        return arguments
+    if len(arguments) < 3:
+        raise InputError("--from takes the config.yaml of a run: rbpf run --from RUN/config.yaml")
+    from rbpf.validation.provenance import read_origin
+
+    config = Path(arguments[2])
+    origin = read_origin(config)
+    options = ["--config", str(origin.config)]
+    for name, value in origin.sources.items():
+        options += [f"--{name}", value] if value else [f"--{name}"]
+    out = [] if "--out" in arguments else ["--out", str(origin.config.parent) + "-again"]
+    return ["run", origin.system, origin.recording, *options, *out, *arguments[3:]]
+
+
+def _prepare(options: RunOptions) -> None:
+    """Threads as asked for, and compiled kernels."""
+    use_threads(options.threads)
+    compile_kernels(say)
+
+
+def _finish(entries: dict[str, Any], options: RunOptions, failure: str | None) -> None:
+    result = entries | {"out": str(options.out)}
+    answer(result, options.json, table(entries), f"results, pictures and report.html are in {options.out}")
+    if failure is not None:
+        raise InputError(f"{failure}; what was computed before it is in {options.out}")

@@ -1,0 +1,100 @@
+"""`rbpf simulate`: logs and images of worlds whose truth is known."""
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+from tyro.extras import SubcommandApp
+
+from rbpf.cli.compiling import compile_kernels
+from rbpf.cli.options import ImagesOptions, LabOptions, LogOptions, RenderOptions, given_board
+from rbpf.cli.showing import answer, megabytes, progress, say, told
+from rbpf.errors import InputError
+
+if TYPE_CHECKING:
+    from rbpf.validation.simulation.exposure import Imaging
+    from rbpf.validation.simulation.textured_scene import ImageWorld
+
+FOCAL_SHARE = {ImagesOptions: 0.8, LabOptions: 0.78125}
+"""Focal length by default, as a share of the images' width."""
+
+SIMULATE = SubcommandApp()
+SIMULATE.__doc__ = "Make a recording of a world whose truth is known."
+
+
+@SIMULATE.command(name="range-bearing")
+def simulate_range_bearing(options: Annotated[LogOptions, tyro.conf.arg(name="")]) -> None:
+    """A log of a robot among landmarks, with ground truth."""
+    from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
+
+    simulate_robot(RobotWorld(options.steps, options.landmarks, options.spatial), options.out, options.seed)
+    answer({"out": str(options.out), "steps": options.steps}, options.json, f"wrote {options.out}")
+
+
+@SIMULATE.command(name="desk")
+def simulate_desk(options: Annotated[ImagesOptions, tyro.conf.arg(name="")]) -> None:
+    """Images of a textured desk with papers, books and boxes on it, taken by a hand-held camera, with ground truth."""
+    from rbpf.validation.simulation.textured_desk import TexturedDesk
+
+    lies = TexturedDesk(frames=options.frames, contrast=options.contrast)
+    board = given_board(options.board, options.square)
+    if board is not None:
+        squares = board.columns + 1, board.rows + 1
+        lies = replace(lies, board=squares, square_m=board.square_m)
+    _render(lies, options)
+
+
+@SIMULATE.command(name="room")
+def simulate_room(options: Annotated[ImagesOptions, tyro.conf.arg(name="")]) -> None:
+    """Images of a room with pictures on its walls, carried in a circle, with ground truth."""
+    from rbpf.validation.simulation.textured_room import TexturedRoom
+
+    if options.board is not None or options.square is not None:
+        raise InputError("a room has no chessboard: leave out --board and --square, or simulate a desk")
+    _render(TexturedRoom(frames=options.frames, contrast=options.contrast), options)
+
+
+@SIMULATE.command(name="lab")
+def simulate_lab(options: Annotated[LabOptions, tyro.conf.arg(name="")]) -> None:
+    """Stereo images of a laboratory of two rooms, taken from a robot, with ground truth and the wheels' odometry."""
+    from rbpf.validation.simulation.textured_lab import LabDrive, TexturedLab
+
+    drive = LabDrive(options.trajectory, options.frames, options.every)
+    _render(TexturedLab(drive, texel_m=options.texel_m, contrast=options.contrast), options)
+
+
+def _render(world: "ImageWorld", options: ImagesOptions | LabOptions) -> None:
+    from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+    from rbpf.validation.simulation.images import simulate_images
+
+    focal = options.focal_px or FOCAL_SHARE[type(options)] * options.width
+    middle = 0.5 * (options.width - 1), 0.5 * (options.height - 1)
+    camera = Pinhole(options.width, options.height, focal, focal, *middle, options.distortion)
+    lens = camera if options.baseline_m is None else RectifiedStereo(camera, options.baseline_m)
+    imaging = _imaging(options)
+    compile_kernels(say)
+    with progress() as bar:
+        task = bar.add_task("rendering", total=options.frames)
+        simulate_images(world, imaging, lens, options.out, options.seed, told(bar, task))
+    size = megabytes(options.out)
+    answer(
+        {"out": str(options.out), "megabytes": round(size, 1)},
+        options.json,
+        f"wrote {options.out}, {size:.0f} MB",
+    )
+
+
+def _imaging(options: RenderOptions) -> "Imaging":
+    from rbpf.validation.simulation.exposure import Imaging
+
+    first, count = options.blackout or (0, 0)
+    return Imaging(
+        noise_std=options.noise_std,
+        exposure_drift=options.exposure_drift,
+        blur_s=options.blur_s,
+        vignetting=options.vignetting,
+        blackout=range(first, first + count),
+        depth=options.depth,
+        known=options.known,
+        jpeg=options.jpeg,
+    )

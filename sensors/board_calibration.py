@@ -1,0 +1,176 @@
+"""The camera from several views of a chessboard (Z. Zhang 2000, by OpenCV): focal lengths, principal point, distortion.
+
+How much distortion is told is chosen by the Bayesian information criterion (G. Schwarz 1978): a coefficient that the
+corners do not need would bend the image where no corner was.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rbpf.errors import InputError
+from rbpf.sensors.chessboard import Board
+from rbpf.sensors.pinhole import Pinhole
+
+LEAST_VIEWS = 5
+"""Three determine the camera; with fewer than five no mistake is noticed."""
+MOST_UNCERTAIN = 0.02
+"""Standard deviation of the focal length, as a share of it, above which the views say too little."""
+LEAST_TURN = np.deg2rad(10.0)
+"""Angle between the board's normals that two views must have: from one direction, near and small is far and large."""
+OUTLYING = 4.0
+"""Views whose error is this many times the median one are left out, and …"""
+HARMLESS_PX = 0.3
+"""… those with less than this are not."""
+
+_MODELS = (
+    (0, ("CALIB_FIX_K1", "CALIB_FIX_K2", "CALIB_FIX_K3", "CALIB_ZERO_TANGENT_DIST")),
+    (2, ("CALIB_FIX_K3", "CALIB_ZERO_TANGENT_DIST")),
+    (4, ("CALIB_FIX_K3",)),
+    (5, ()),
+)
+"""Numbers of coefficients, and what OpenCV is told to leave at zero: none; k1, k2; and p1, p2; and k3."""
+
+
+class BoardView(NamedTuple):
+    """Corners (rows · columns, 2) of the board in one image, px, and the image's name."""
+
+    name: str
+    px: np.ndarray
+
+
+@dataclass(frozen=True)
+class BoardCalibration:
+    """A camera, and how well it explains V views of M corners.
+
+    Attributes:
+        camera: the camera.
+        std: (9,) standard deviations of fx, fy, cx, cy [px], k1, k2, p1, p2, k3; 0 where a coefficient was not needed.
+        views: those that were used.
+        residuals: (V, M, 2) where corners were found less where the camera sees them, px.
+        normals: (V, 3) of the board in the camera's frame.
+        left_out: names of views that no camera explains together with the others.
+    """
+
+    camera: Pinhole
+    std: np.ndarray
+    views: tuple[BoardView, ...]
+    residuals: np.ndarray
+    normals: np.ndarray
+    left_out: tuple[str, ...] = ()
+
+    @property
+    def rms_px(self) -> float:
+        """Reprojection error: root of the mean squared distance of the corners, px."""
+        return float(np.sqrt(np.square(self.residuals).sum(axis=-1).mean()))
+
+    @property
+    def rms_by_view_px(self) -> np.ndarray:
+        """(V,) the same for each view."""
+        return np.asarray(np.sqrt(np.square(self.residuals).sum(axis=-1).mean(axis=-1)))
+
+    @property
+    def turn_rad(self) -> float:
+        """Largest angle between the board's normals in two views."""
+        return float(np.arccos(np.clip(self.normals @ self.normals.T, -1.0, 1.0)).max())
+
+    @property
+    def covered(self) -> float:
+        """Share of the image, in 8 × 6 fields, in which a corner was seen."""
+        px = np.concatenate([view.px for view in self.views])
+        field = (px / [self.camera.width, self.camera.height] * [8, 6]).astype(int).clip(0, [7, 5])
+        return len(np.unique(field, axis=0)) / 48
+
+
+def calibrate(views: Sequence[BoardView], board: Board, width: int, height: int) -> BoardCalibration:
+    """The camera that explains the views.
+
+    Args:
+        views: of the board, all in images of one size.
+        board: what is printed.
+        width: of the images, px.
+        height: of the images, px.
+
+    Raises:
+        InputError: there are too few views, or they are too much alike to determine the camera.
+    """
+    used = list(views)
+    left_out: list[str] = []
+    while True:
+        _require_enough(used, left_out)
+        found = _fitted(used, board, width, height)
+        rms = found.rms_by_view_px
+        worst = int(rms.argmax())
+        if rms[worst] <= max(OUTLYING * float(np.median(rms)), HARMLESS_PX):
+            break
+        left_out.append(used.pop(worst).name)
+    focal = np.array([found.camera.fx, found.camera.fy])
+    doubt = float((found.std[:2] / focal).max())
+    if found.turn_rad < LEAST_TURN or not doubt <= MOST_UNCERTAIN:
+        raise InputError(
+            f"the {len(used)} views show the board from too much the same direction, the focal length stays open: turn "
+            "and tilt the board, or the camera, by some 30 degrees to all sides between the images"
+        )
+    return replace(found, left_out=tuple(left_out))
+
+
+def _require_enough(views: Sequence[BoardView], left_out: Sequence[str]) -> None:
+    if len(views) >= LEAST_VIEWS:
+        return
+    agree = f" that agree ({', '.join(left_out)} did not)" if left_out else ""
+    raise InputError(
+        f"the board is found in {len(views)} images{agree}, expected at least {LEAST_VIEWS}, better 15, from different "
+        "directions: take more"
+    )
+
+
+def _fitted(views: Sequence[BoardView], board: Board, width: int, height: int) -> BoardCalibration:
+    """The model of distortion with the least information criterion."""
+    scores, fits = [], []
+    for count, fixed in _MODELS:
+        fit = _solved(views, board, width, height, fixed)
+        numbers = fit.residuals.size
+        parameters = 4 + count + 6 * len(views)
+        mean_square = max(float(np.square(fit.residuals).mean()), np.finfo(float).tiny)
+        scores.append(numbers * np.log(mean_square) + parameters * np.log(numbers))
+        fits.append(fit)
+    return fits[int(np.argmin(scores))]
+
+
+def _solved(
+    views: Sequence[BoardView], board: Board, width: int, height: int, fixed: Sequence[str]
+) -> BoardCalibration:
+    import cv2
+
+    flags = sum(getattr(cv2, name) for name in fixed)
+    points = [board.corners.astype(np.float32)] * len(views)
+    px = [view.px.astype(np.float32).reshape(-1, 1, 2) for view in views]
+    try:
+        solved = cv2.calibrateCameraExtended(points, px, (width, height), None, None, flags=flags)
+    except cv2.error as error:
+        raise InputError(
+            f"no camera explains the {len(views)} views ({error.err}): are they all of one flat board?"
+        ) from error
+    _, matrix, distortion, turns, shifts, std = solved[:6]
+    camera = _camera(matrix, distortion.ravel()[:5], width, height)
+    seen = [
+        _seen(cv2, board, turn, shift, matrix, distortion) for turn, shift in zip(turns, shifts, strict=True)
+    ]
+    residuals = np.array([view.px for view in views]) - np.array(seen)
+    normals = np.array([cv2.Rodrigues(turn)[0][:, 2] for turn in turns])
+    return BoardCalibration(camera, std.ravel()[:9].copy(), tuple(views), residuals, normals)
+
+
+def _camera(matrix: np.ndarray, distortion: np.ndarray, width: int, height: int) -> Pinhole:
+    fx, fy, cx, cy = (float(matrix[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    k1, k2, p1, p2, k3 = (float(value) for value in np.pad(distortion, (0, 5 - distortion.size)))
+    return Pinhole(width, height, fx, fy, cx, cy, (k1, k2, p1, p2, k3))
+
+
+def _seen(
+    cv2: Any, board: Board, turn: np.ndarray, shift: np.ndarray, matrix: np.ndarray, distortion: np.ndarray
+) -> np.ndarray:
+    px, _ = cv2.projectPoints(board.corners, turn, shift, matrix, distortion)
+    return np.asarray(px).reshape(-1, 2)

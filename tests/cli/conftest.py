@@ -1,0 +1,31 @@
+"""Sequences that the tests of the command line share, and cheap pictures."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.cli.mono_sequences import as_folder, render_desk
+from tests.cli.stereo_sequences import render_room
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cheap(plain_pictures: None) -> None:
+    """Pictures as they are meant to be looked at are painted in tests/cli/test_painting.py."""
+
+
+@pytest.fixture(scope="session")
+def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A few images of a desk with known points; not to be written to."""
+    return render_desk(tmp_path_factory.mktemp("rendered") / "desk")
+
+
+@pytest.fixture
+def folder(desk: Path, tmp_path: Path) -> Path:
+    """The desk's images as a folder of the test's own."""
+    return as_folder(desk, tmp_path / "folder")
+
+
+@pytest.fixture(scope="session")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A few pairs of images of a room; not to be written to."""
+    return render_room(tmp_path_factory.mktemp("rendered") / "room")

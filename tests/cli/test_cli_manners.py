@@ -1,0 +1,255 @@
+"""What every command owes to people and to programs: help, JSON, exit codes, Ctrl-C, the same run again."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import MISSING, fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from rbpf.cli import APP, DemoOptions, main
+from rbpf.cli.cameras import CalibrateOptions
+from rbpf.cli.compiling import cached, kernel_modules
+from rbpf.cli.exporting import ExportOptions
+from rbpf.cli.installed import DoctorOptions
+from rbpf.cli.judging import CompareOptions, ReportOptions, SweepOptions, ValidateOptions
+from rbpf.cli.options import (
+    ImagesOptions,
+    LabOptions,
+    LogOptions,
+    MonoOptions,
+    RangeBearingOptions,
+    StereoOptions,
+)
+from tests.cli.test_cli import outputs
+
+COMMANDS = {
+    "demo": DemoOptions,
+    "run range-bearing": RangeBearingOptions,
+    "run mono": MonoOptions,
+    "run stereo": StereoOptions,
+    "simulate range-bearing": LogOptions,
+    "simulate desk": ImagesOptions,
+    "simulate room": ImagesOptions,
+    "simulate lab": LabOptions,
+    "calibrate": CalibrateOptions,
+    "validate": ValidateOptions,
+    "report": ReportOptions,
+    "export": ExportOptions,
+    "sweep": SweepOptions,
+    "compare": CompareOptions,
+    "doctor": DoctorOptions,
+}
+UNIT = re.compile(r"\b(px|m|s|seconds|share|rich|particles|grey levels|Hz)\b")
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("simulated") / "log"
+    assert main(["simulate", "range-bearing", "--out", str(folder), "--steps", "30"]) == 0
+    return folder
+
+
+def quick(log, out, *arguments):
+    """Arguments of a short run."""
+    return [
+        "run",
+        "range-bearing",
+        str(log),
+        "--out",
+        str(out),
+        "--particles",
+        "20",
+        "--no-batch",
+        *arguments,
+    ]
+
+
+def help_of(command, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit) as ended:
+        main([*command.split(), "--help"])
+    assert ended.value.code == 0
+    return capsys.readouterr().out
+
+
+def test_every_command_is_in_this_file(capsys, monkeypatch):
+    text = help_of("", capsys, monkeypatch)
+    named = set(re.search(r"\{([\w,-]+)\}", text)[1].split(","))
+    assert named == {command.split()[0] for command in COMMANDS} | {"completion"}
+    assert "0 success" in text and "130 stopped" in text
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_says_what_each_option_is_its_default_and_its_unit(command, capsys, monkeypatch):
+    text = " ".join(help_of(command, capsys, monkeypatch).replace("│", " ").split())
+    options = text[text.index("show this help") :]
+    for item in fields(COMMANDS[command]):
+        shown = f"--{item.name.replace('_', '-')}"
+        found = re.search(rf"{shown}[ ,](.+?)\((default: [^)]*|required|repeatable)\)", options)
+        if found is None:
+            assert item.default is MISSING, f"{command} {shown} is not in its help"
+            assert "(required)" in text
+            continue
+        assert len(found[1].split()) >= 3, f"{command} {shown} does not say what it is"
+        assert " --" not in found[1].replace(" --no-", ""), f"{command} {shown} has no default"
+        if item.default is None:
+            assert "by default" in found[1] or "None for none" in found[1], f"{command} {shown}: by default?"
+        if isinstance(item.default, float):
+            assert UNIT.search(found[1]), f"{command} {shown} has no unit: {found[1]}"
+
+
+def test_json_is_one_object_on_standard_output(log, tmp_path, capsys):
+    assert main(quick(log, tmp_path / "run", "--json")) == 0
+    out, _ = capsys.readouterr()
+    entries = json.loads(out)
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary.items() <= entries.items()
+    for command in (
+        ["validate", str(tmp_path / "run")],
+        ["report", str(tmp_path / "run")],
+        ["export", str(tmp_path / "run"), "--format", "tum"],
+        ["simulate", "range-bearing", "--out", str(tmp_path / "log"), "--steps", "3"],
+        ["doctor", "--no-compile"],
+    ):
+        assert main([*command, "--json"]) == 0
+        assert isinstance(json.loads(capsys.readouterr().out), dict), command
+
+
+def test_without_json_nothing_is_on_standard_output(log, tmp_path, capsys):
+    assert main(quick(log, tmp_path / "run")) == 0
+    out, err = capsys.readouterr()
+    assert out == "" and "report.html" in err
+
+
+def test_bad_input_is_exit_code_2_and_a_fault_is_1(log, tmp_path):
+    def code(*arguments, prelude=""):
+        program = f"import sys; {prelude}\nfrom rbpf.cli import main; sys.exit(main())"
+        return subprocess.run([sys.executable, "-c", program, *arguments], capture_output=True, text=True)
+
+    refused = code("report", str(tmp_path / "nothing"))
+    assert refused.returncode == 2 and refused.stderr.count("\n") == 1 and "Traceback" not in refused.stderr
+    assert code("no-such-command").returncode == 2
+    assert code("report").returncode == 2
+    broken = code(
+        "report", "x", prelude="import rbpf.validation.report as r; r.write_report = lambda folder: 1 / 0"
+    )
+    assert broken.returncode == 1 and "ZeroDivisionError" in broken.stderr
+
+
+@pytest.mark.parametrize("after", [0.0, 0.4])
+def test_ctrl_c_leaves_a_run_that_resumes_to_the_same_bytes(tmp_path, after):
+    """A real signal to a real process, at two moments."""
+    log = tmp_path / "log"
+    assert main(["simulate", "range-bearing", "--out", str(log), "--steps", "1500"]) == 0
+    arguments = ["--particles", "300", "--no-batch", "--set", "checkpoint_every=100000"]
+    whole = ["run", "range-bearing", str(log), "--out", str(tmp_path / "whole"), *arguments]
+    cut = ["run", "range-bearing", str(log), "--out", str(tmp_path / "cut"), *arguments]
+    process = subprocess.Popen(
+        [sys.executable, "-c", _STOPPABLE, *cut], stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "filtering\n"
+    time.sleep(after)
+    process.send_signal(signal.SIGINT)
+    _, error = process.communicate(timeout=120)
+    assert process.returncode == 130, error
+    said = re.search(
+        r"stopped after (\d+) of 1500; the same command with --resume goes on", " ".join(error.split())
+    )
+    assert said is not None and 5 <= int(said[1]) < 1500
+    assert (tmp_path / "cut" / "checkpoint.npz").exists()
+    assert not (tmp_path / "cut" / "summary.json").exists()
+    assert main(whole) == 0
+    assert main([*cut, "--resume"]) == 0
+    assert outputs(tmp_path / "whole") == outputs(tmp_path / "cut")
+
+
+_STOPPABLE = """
+import sys
+import rbpf.systems.range_bearing.run as system
+from rbpf.filter import Filter
+step = Filter.step
+def told(self, *arguments):
+    if self.steps == 5:
+        print("filtering", flush=True)
+    return step(self, *arguments)
+Filter.step = told
+from rbpf.cli import main
+sys.exit(main())
+"""
+
+
+def test_a_run_is_repeated_from_its_config(log, tmp_path, capsys):
+    assert main(quick(log, tmp_path / "a", "--seed", "4", "--set", "proposal.iterations=1")) == 0
+    config = tmp_path / "a" / "config.yaml"
+    entries = yaml.safe_load(config.read_text())
+    assert entries["versions"]["numpy"] == np.__version__ and len(entries["input_sha256"]) == 64
+    again = ["run", "--from", str(config), "--no-batch"]
+    assert main([*again, "--out", str(tmp_path / "b")]) == 0
+    assert outputs(tmp_path / "a") == outputs(tmp_path / "b")
+    assert main(again) == 0
+    assert outputs(tmp_path / "a") == outputs(tmp_path / "a-again")
+    capsys.readouterr()
+    path = next(log.glob("observations.csv"))
+    before = path.read_text()
+    path.write_text(before.rstrip("\n") + "\n\n")
+    try:
+        assert main(again) == 2
+        assert "has changed since the run" in " ".join(capsys.readouterr().err.split())
+    finally:
+        path.write_text(before)
+    assert main(["run", "--from"]) == 2
+    assert main(["run", "--from", str(tmp_path / "nothing" / "config.yaml")]) == 2
+
+
+def test_the_doctor_finds_everything_here_and_what_is_missing(capsys, monkeypatch):
+    assert main(["doctor", "--json"]) == 0
+    entries = json.loads(capsys.readouterr().out)
+    assert entries["works"] and not entries["kernels_missing"]
+    assert entries["python"] == sys.version.split()[0] and entries["libraries"]["numpy"] == np.__version__
+    assert all(cached(module) for module in kernel_modules())
+    monkeypatch.setitem(sys.modules, "gtsam", None)
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    assert main(["doctor", "--no-compile", "--json"]) == 2
+    out, err = capsys.readouterr()
+    parts = {part["name"]: part for part in json.loads(out)["parts"]}
+    assert not parts["batch optimum"]["works"] and parts["images and video"]["works"]
+    assert "rbpf[viewing]" in parts["Rerun recordings"]["says"]
+    assert "batch optimum: needed, and broken here" in err
+
+
+def test_the_first_compilation_is_announced(log, tmp_path):
+    """In an empty cache; what is compiled there is not waited for."""
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    command = [sys.executable, "-u", "-m", "rbpf.cli", *quick(log, tmp_path / "run")]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment)
+    try:
+        assert process.stderr is not None
+        first = process.stderr.readline()
+    finally:
+        process.kill()
+        process.communicate()
+    assert "compiling" in first and "done once" in first
+
+
+@pytest.mark.skipif(not Path("/bin/bash").exists(), reason="needs bash")
+def test_bash_completes_commands(tmp_path, capsys):
+    assert main(["completion", "bash"]) == 0
+    script = tmp_path / "completion.sh"
+    script.write_text(capsys.readouterr().out)
+    ask = f'source {script}; COMP_WORDS=(rbpf cali); COMP_CWORD=1; F=$(complete -p rbpf | sed "s/.*-F //; s/ .*//"); '
+    ask += '$F; printf "%s\\n" "${COMPREPLY[@]}"'
+    found = subprocess.run(["/bin/bash", "-c", ask], capture_output=True, text=True, check=False)
+    assert "calibrate" in found.stdout.split(), found.stderr
+
+
+def test_the_program_has_one_entry():
+    assert APP.cli is not None

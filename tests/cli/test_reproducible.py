@@ -1,0 +1,68 @@
+"""The same seed gives the same bytes, whatever the number of threads, and again from a run's own config.yaml."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from rbpf.cli import main
+from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+from rbpf.validation.simulation.exposure import Imaging
+from rbpf.validation.simulation.images import simulate_images
+from rbpf.validation.simulation.textured_desk import TexturedDesk
+from rbpf.validation.simulation.textured_room import TexturedRoom
+
+pytestmark = pytest.mark.slow
+
+TIMED_FILES = {"timings.csv", "timings.png", "report.html", "checkpoint.npz"}
+TIMED_ENTRIES = {"ms_per_frame", "ms_per_update", "peak_memory_mb"}
+CAMERA = Pinhole(320, 240, 250.0, 250.0, 159.5, 119.5)
+
+
+def outputs(folder: Path) -> dict[str, bytes]:
+    """All files but timings; summary.json without its timings."""
+    kept = {path.name: path.read_bytes() for path in folder.iterdir() if path.name not in TIMED_FILES}
+    entries = json.loads(kept["summary.json"])
+    kept["summary.json"] = json.dumps({k: v for k, v in entries.items() if k not in TIMED_ENTRIES}).encode()
+    return kept
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory):
+    """Arguments by system; enough particles that the kernels do run on several threads."""
+    folder = tmp_path_factory.mktemp("rendered")
+    imaging = Imaging(noise_std=1.0)
+    simulate_images(TexturedDesk(frames=8, texel_m=0.003), imaging, CAMERA, folder / "desk", seed=1)
+    rig = RectifiedStereo(CAMERA, 0.12)
+    simulate_images(TexturedRoom(frames=6, rate_hz=5.0), Imaging(known=0), rig, folder / "room", seed=1)
+    desk = folder / "desk"
+    known = ["--known-points", str(desk / "known_points.csv")]
+    return {
+        "mono": [str(desk), *known, "--particles", "900", "--no-video", "--no-batch"],
+        "stereo": [str(folder / "room"), "--particles", "600"],
+    }
+
+
+@pytest.mark.parametrize("system", ["mono", "stereo"])
+def test_threads_change_no_byte_of_a_run_over_images(recordings, tmp_path, system):
+    for threads in ("1", "2"):
+        libraries = {f"{name}_NUM_THREADS": threads for name in ("OPENBLAS", "OMP", "MKL")}
+        environment = {**os.environ, **libraries, "NUMBA_NUM_THREADS": "2"}
+        command = [sys.executable, "-m", "rbpf.cli", "run", system, *recordings[system], "--threads", threads]
+        command += ["--out", str(tmp_path / threads)]
+        subprocess.run(command, check=True, env=environment, capture_output=True)
+    one, two = outputs(tmp_path / "1"), outputs(tmp_path / "2")
+    assert one.keys() == two.keys()
+    assert [name for name in one if one[name] != two[name]] == []
+
+
+@pytest.mark.parametrize("system", ["mono", "stereo"])
+def test_a_run_over_images_is_repeated_from_its_config(recordings, tmp_path, system):
+    assert main(["run", system, *recordings[system], "--seed", "7", "--out", str(tmp_path / "a")]) == 0
+    options = ["--no-video", "--no-batch"] if system == "mono" else []
+    again = ["run", "--from", str(tmp_path / "a" / "config.yaml"), "--out", str(tmp_path / "b"), *options]
+    assert main(again) == 0
+    assert outputs(tmp_path / "a") == outputs(tmp_path / "b")

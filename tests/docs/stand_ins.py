@@ -1,0 +1,153 @@
+"""What the tests put in place of what a reader has: small recordings, and shorter forms of long commands.
+
+Nothing else is changed: every command runs with the words that stand on the page, in a folder in which its
+recordings exist under the names that the page uses.
+"""
+
+import os
+import shutil
+from pathlib import Path
+
+import cv2
+import imageio_ffmpeg
+import numpy as np
+
+from rbpf.cli import main
+from rbpf.sensors.pinhole import Pinhole
+from rbpf.validation.simulation.exposure import Imaging
+from rbpf.validation.simulation.images import simulate_images
+from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
+from rbpf.validation.simulation.textured_desk import TexturedDesk
+from tests.cli.mono_sequences import render_desk
+
+SHORTER = {
+    ("demo",): ["--frames", "12"],
+    ("simulate", "range-bearing"): ["--steps", "20", "--landmarks", "20"],
+    ("simulate", "desk"): ["--frames", "8", "--width", "160", "--height", "120"],
+    ("simulate", "room"): ["--frames", "4", "--width", "160", "--height", "120"],
+    ("simulate", "lab"): ["--frames", "3", "--width", "160", "--height", "120"],
+}
+"""Added to a command that would render or simulate for minutes."""
+
+LEFT_OUT = {("sweep",): "--scheduler"}
+"""An option with its value: tests/validation/test_sweep.py starts a cluster."""
+
+NAMES = {
+    "IMAGES": "desk",
+    "SEQUENCE": "desk",
+    "PAIRS": "pairs",
+    "LOG": "log",
+    "log": "log",
+    "DATA/mono_redkitchen_a": "desk",
+    "DATA/stereo_zed_room1": "desk",
+    "DATA/mono_robot_lateral": "desk",
+    "phone.mp4": "phone.mp4",
+    "board.mp4": "board.mp4",
+}
+"""Names on the pages, and the recordings of `Shelf` that they stand for."""
+
+NAMES_OF_PAGE = {
+    "docs/how_to/stereo.md": {"SEQUENCE": "pairs", "path/to/sequence": "pairs"},
+    "docs/how_to/stereo_features.md": {"path/to/sequence": "pairs"},
+    "docs/how_to/sweep.md": {"other_log": "log"},
+}
+
+BEFORE = {
+    "docs/how_to/compare.md": [
+        ["run", "mono", "desk", "--known-points", "desk/known_points.csv", "--out", "out/mono", "--no-video"]
+    ],
+}
+"""Commands that a page takes as done."""
+
+PREAMBLE = {
+    "docs/how_to/sensor.md": (
+        "from examples.custom_sensor import LampSensor\nfrom examples.gps_fix import *\n"
+    ),
+}
+"""Names that a page's programs take from the examples that the page shows."""
+
+
+class Shelf:
+    """Small recordings, each made when it is first asked for."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def get(self, name: str) -> Path:
+        """Folder or file of a recording."""
+        path = self.folder / name
+        if not path.exists():
+            getattr(self, "_" + name.split(".")[0])(path)
+        return path
+
+    def _desk(self, path: Path) -> None:
+        render_desk(path)
+
+    def _log(self, path: Path) -> None:
+        simulate_robot(RobotWorld(steps=20, landmarks=20), path, seed=0)
+
+    def _pairs(self, path: Path) -> None:
+        small = ["--frames", "4", "--width", "320", "--height", "240", "--noise-std", "2"]
+        assert main(["simulate", "lab", "--out", str(path), *small]) == 0
+
+    def _phone(self, path: Path) -> None:
+        _film(sorted((self.get("desk") / "mav0" / "cam0" / "data").glob("*.png")), path)
+
+    def _board(self, path: Path) -> None:
+        board = self.folder / "board"
+        camera = Pinhole(480, 360, 380.0, 380.0, 239.5, 179.5)
+        world = TexturedDesk(frames=16, texel_m=0.003, board=(10, 7), square_m=0.024)
+        simulate_images(world, Imaging(noise_std=1.0), camera, board, seed=1)
+        _film(sorted((board / "mav0" / "cam0" / "data").glob("*.png")), path)
+
+
+def lay_out(page: str, shelf: Shelf, folder: Path) -> None:
+    """The folder in which a page's commands run: every recording that it names, under that name."""
+    text = (Path(__file__).resolve().parents[2] / page).read_text(encoding="utf-8")
+    for name, recording in (NAMES | NAMES_OF_PAGE.get(page, {})).items():
+        if name in text:
+            place(shelf.get(recording), folder / name)
+    for command in BEFORE.get(page, []):
+        for word in command:
+            if word in ("desk", "pairs", "log"):
+                place(shelf.get(word), folder / word)
+        assert main(command) == 0
+
+
+def place(recording: Path, name: Path) -> None:
+    """A copy, so that what a page does to it stays on the page."""
+    if name.exists():
+        return
+    name.parent.mkdir(parents=True, exist_ok=True)
+    if recording.is_dir():
+        shutil.copytree(recording, name)
+    else:
+        shutil.copy(recording, name)
+        calibration = recording.with_suffix(".yaml")
+        if calibration.exists():
+            shutil.copy(calibration, name.with_suffix(".yaml"))
+
+
+def shortened(arguments: list[str]) -> list[str]:
+    """The words of an `rbpf` command, with what makes it short."""
+    for start, option in LEFT_OUT.items():
+        if tuple(arguments[: len(start)]) == start and option in arguments:
+            at = arguments.index(option)
+            arguments = arguments[:at] + arguments[at + 2 :]
+    for start, more in SHORTER.items():
+        if tuple(arguments[: len(start)]) == start:
+            arguments = arguments + more
+    return arguments
+
+
+def _film(images: list[Path], path: Path) -> None:
+    """The images as a video of 30 frames per second."""
+    frames = [np.ascontiguousarray(cv2.imread(os.fspath(image))[..., ::-1]) for image in images]
+    height, width = frames[0].shape[:2]
+    writer = imageio_ffmpeg.write_frames(
+        os.fspath(path), (width, height), fps=30, quality=9, macro_block_size=1
+    )
+    writer.send(None)
+    for frame in frames:
+        writer.send(frame)
+    writer.close()

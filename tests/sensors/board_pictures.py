@@ -1,0 +1,51 @@
+"""Pictures of a chessboard by a camera that is known, with the simulator."""
+
+from functools import cache
+
+import numpy as np
+
+from rbpf.lie import SE3
+from rbpf.sensors.chessboard import Board
+from rbpf.sensors.pinhole import Pinhole
+from rbpf.validation.simulation.furniture import Furniture
+from rbpf.validation.simulation.render import Renderer
+from rbpf.validation.simulation.textures import wood
+
+BOARD = Board(9, 6, 0.024)
+CAMERA = Pinhole(640, 480, 520.0, 523.0, 330.0, 236.0, (-0.25, 0.08, 0.001, -0.0015, 0.0))
+
+
+def directions(count: int) -> np.ndarray:
+    """Poses (count, 7) of a camera around a board at the origin that lies face up: tilted, turned, near and far."""
+    rng = np.random.default_rng(5)
+    poses = []
+    for k in range(count):
+        tilt, around = rng.uniform(0.15, 0.7), 2.0 * np.pi * k / count
+        distance = rng.uniform(0.24, 0.36)
+        aim = np.append(rng.uniform(-0.03, 0.03, 2), 0.0)
+        back = np.array([np.sin(tilt) * np.cos(around), np.sin(tilt) * np.sin(around), np.cos(tilt)])
+        poses.append(_looking(aim + distance * back, aim, rng.uniform(-0.5, 0.5)))
+    return np.array(poses)
+
+
+def _looking(at: np.ndarray, aim: np.ndarray, roll: float) -> np.ndarray:
+    """Pose (7,) of a camera at one place that looks at another."""
+    z = (aim - at) / np.linalg.norm(aim - at)
+    x = np.cross(z, [np.sin(roll), np.cos(roll), 0.0])
+    x /= np.linalg.norm(x)
+    return SE3.from_matrix(np.column_stack([np.column_stack([x, np.cross(z, x), z]), at]))
+
+
+@cache
+def pictures(count: int = 12, camera: Pinhole = CAMERA, noise: float = 2.0) -> tuple[np.ndarray, ...]:
+    """Images (H, W) uint8 from all these directions."""
+    desk = Furniture(np.random.default_rng(0), 0.002, 1.0)
+    desk.flat(np.array([0.0, 0.0, -0.001]), 0.0, (1.5, 1.5), wood)
+    desk.board(np.zeros(3), (BOARD.columns + 1, BOARD.rows + 1), BOARD.square_m)
+    renderer = Renderer(desk.rectangles, camera, grid=4)
+    rng = np.random.default_rng(1)
+    images = []
+    for pose in directions(count):
+        light = renderer.image(pose)
+        images.append(np.clip(light + rng.normal(0.0, noise, light.shape), 0, 255).astype(np.uint8))
+    return tuple(images)

@@ -1,0 +1,97 @@
+"""The camera that rendered the boards is found again, within what its standard deviations say."""
+
+import numpy as np
+import pytest
+
+from rbpf.errors import InputError
+from rbpf.lie import SE3
+from rbpf.sensors.board_calibration import BoardView, calibrate
+from rbpf.sensors.chessboard import Board, board_corners
+from rbpf.sensors.pinhole import Pinhole
+from tests.sensors.board_pictures import BOARD, CAMERA, directions, pictures
+
+SIZE = CAMERA.width, CAMERA.height
+
+
+def exact_views(camera: Pinhole, poses: np.ndarray, noise_px: float, seed: int = 0) -> list[BoardView]:
+    """Where the corners are, without images, with noise."""
+    rng = np.random.default_rng(seed)
+    corners = BOARD.corners * [1.0, -1.0, -1.0] + [-4 * BOARD.square_m, 2.5 * BOARD.square_m, 0.0]
+    views = []
+    for k, pose in enumerate(poses):
+        px = camera.project(SE3.inverse_transform(pose, corners))
+        views.append(BoardView(f"{k}.png", px + rng.normal(0.0, noise_px, px.shape)))
+    return views
+
+
+@pytest.mark.slow
+def test_rendered_boards_give_the_camera_that_rendered_them():
+    found = [board_corners(image, BOARD) for image in pictures()]
+    views = [BoardView(str(k), px) for k, px in enumerate(found) if px is not None]
+    assert len(views) >= 10
+    result = calibrate(views, BOARD, *SIZE)
+    assert result.rms_px < 0.08
+    # Without k3, which these images do not need; corners of rendered images have small common errors.
+    error = np.abs(result.camera.params - CAMERA.params)
+    assert result.std[8] == 0.0
+    assert (error[:8] < 4.0 * result.std[:8]).all()
+    assert (error[:4] < 0.5).all()
+
+
+def test_errors_are_those_that_the_standard_deviations_tell():
+    normalised = []
+    for seed in range(8):
+        result = calibrate(exact_views(CAMERA, directions(12), 0.2, seed), BOARD, *SIZE)
+        normalised.append((result.camera.params - CAMERA.params)[:4] / result.std[:4])
+    # 32 squares of unit normals, correlated within a run: their mean is 1 within a half.
+    assert 0.4 < np.square(normalised).mean() < 1.9
+
+
+@pytest.mark.parametrize(
+    ("distortion", "count"),
+    [((0.0, 0.0, 0.0, 0.0, 0.0), 0), ((-0.2, 0.05, 0.0, 0.0, 0.0), 2), ((-0.25, 0.1, 0.002, -0.001, 0.0), 4)],
+)
+def test_no_more_distortion_is_told_than_there_is(distortion, count):
+    camera = Pinhole(*SIZE, 500.0, 500.0, 319.5, 239.5, distortion)
+    result = calibrate(exact_views(camera, directions(15), 0.1), BOARD, *SIZE)
+    assert np.count_nonzero(result.camera.distortion) == count
+
+
+def test_a_view_that_fits_no_camera_is_left_out():
+    views = exact_views(CAMERA, directions(12), 0.1)
+    spoilt = views[4].px + np.random.default_rng(1).normal(0.0, 6.0, views[4].px.shape)
+    views[4] = BoardView("bent.png", spoilt)
+    result = calibrate(views, BOARD, *SIZE)
+    assert result.left_out == ("bent.png",)
+    assert result.rms_px < 0.2
+
+
+def test_too_few_views_and_views_that_are_all_alike():
+    views = exact_views(CAMERA, directions(4), 0.1)
+    with pytest.raises(InputError, match="found in 4 images, expected at least 5"):
+        calibrate(views, BOARD, *SIZE)
+
+
+@pytest.mark.parametrize("turned", [0, None])
+def test_views_from_one_direction_are_refused(turned):
+    """Straight from above at three heights, focal length and height are one; a single tilt says little more."""
+    poses = directions(3)[:1] if turned == 0 else np.tile(SE3.from_matrix(np.diag([1.0, -1, -1, 1])), (3, 1))
+    poses = np.repeat(poses, 9 // len(poses), axis=0)
+    if turned is None:
+        poses[:, 6] = np.linspace(0.25, 0.35, len(poses))
+    with pytest.raises(InputError, match="from too much the same direction"):
+        calibrate(exact_views(CAMERA, poses, 0.2), BOARD, *SIZE)
+
+
+def test_the_share_of_the_image_that_corners_were_seen_in():
+    result = calibrate(exact_views(CAMERA, directions(12), 0.1), BOARD, *SIZE)
+    assert 0.3 < result.covered <= 1.0
+
+
+@pytest.mark.slow
+def test_a_board_in_another_order_of_its_sides_is_the_same():
+    turned = Board(BOARD.rows, BOARD.columns, BOARD.square_m)
+    found = [board_corners(image, turned) for image in pictures()]
+    views = [BoardView(str(k), px) for k, px in enumerate(found) if px is not None]
+    result = calibrate(views, turned, *SIZE)
+    assert np.abs(result.camera.params - CAMERA.params)[:4].max() < 0.5

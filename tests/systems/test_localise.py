@@ -1,0 +1,165 @@
+"""A camera is found in the map of an earlier run, and followed in it; the map stays as it is."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from rbpf.errors import InputError
+from rbpf.lie import SE3
+from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.readers.images.sequence import ImageSequence, Source
+from rbpf.systems.mono.config import MonoConfig
+from rbpf.systems.mono.known_map import KnownMap, read_known_map, write_known_map
+from rbpf.systems.mono.video import run_images
+from rbpf.validation.mono_known_map import known_map
+from rbpf.validation.mono_map import summarise_mono_map
+from tests.systems.plane_sequences import CAMERA, known_points, path, sequence
+
+MAPPED, FRAMES = 60, 90
+
+
+@dataclass(frozen=True)
+class Part(Source):
+    """Images of another source from a number on."""
+
+    inner: Source
+    first: int
+
+    def frames(self, start):
+        return self.inner.frames(self.first + start)
+
+
+def from_frame(whole: ImageSequence, first: int) -> ImageSequence:
+    return replace(whole, stamps_ns=whole.stamps_ns[first:], source=Part(whole.source, first))
+
+
+@pytest.fixture(scope="module")
+def mapped() -> KnownMap:
+    run = run_images(sequence(MAPPED), MonoConfig(particles=20), known_points())
+    return known_map(run, summarise_mono_map(run.filter))
+
+
+@pytest.fixture(scope="module")
+def localised(mapped):
+    return run_images(from_frame(sequence(FRAMES), MAPPED), MonoConfig(particles=20), mapped=mapped)
+
+
+def made_up(count: int = 12) -> KnownMap:
+    rng = np.random.default_rng(0)
+    return KnownMap(
+        CAMERA, "none", np.arange(count), rng.normal(size=(count, 3)), np.tile(0.01 * np.eye(3), (count, 1, 1)),
+        rng.integers(0, 256, (count, 31, 31), dtype=np.uint8), rng.uniform(0, 200, (count, 2)),
+        np.tile(SE3.identity(), (count, 1)), np.tile(SE3.identity(), (3, 1)),
+    )  # fmt: skip
+
+
+def test_the_map_is_that_of_the_run(mapped):
+    assert mapped.names.size >= 15 and mapped.alignment == "none"
+    assert mapped.views.shape[0] == 16
+    # A landmark projects, from where it was seen first, to where it was seen first.
+    seen = SE3.inverse_transform(mapped.first_pose, mapped.positions)
+    error = np.linalg.norm(CAMERA.project(seen) - mapped.first_px, axis=1)
+    assert np.median(error) < 2.0
+
+
+def test_the_camera_is_found_at_once_and_followed(localised):
+    assert not localised.lost.any()
+    assert localised.problems[0] == "frame 0: the camera is found in the map"
+    assert localised.relocalisations == []
+    truth = path(FRAMES)[MAPPED:]
+    error = np.linalg.norm(localised.world_from_camera[:, 4:] - truth[:, 4:], axis=1)
+    assert np.sqrt(np.square(error).mean()) < 0.02
+    turned = np.linalg.norm(SE3.local(localised.world_from_camera, truth)[:, :3], axis=1)
+    assert np.sqrt(np.square(turned).mean()) < np.deg2rad(1.0)
+
+
+def test_the_map_is_not_changed_and_nothing_is_added(localised, mapped):
+    belief = localised.filter.belief()
+    ids = belief.map.ids
+    assert ids.size == mapped.names.size
+    records = belief.read(ids)
+    for particle in range(belief.weights.size):
+        np.testing.assert_array_equal(records.mean[particle], mapped.positions)
+        np.testing.assert_allclose(records.cov[particle], mapped.cov, rtol=0, atol=1e-15)
+
+
+def test_uncertain_points_make_an_uncertain_pose(mapped):
+    few = from_frame(sequence(MAPPED + 6), MAPPED)
+    vague = replace(mapped, cov=mapped.cov + 0.03**2 * np.eye(3))
+    stds = []
+    for known in (mapped, vague):
+        run = run_images(few, MonoConfig(particles=20), mapped=known)
+        assert not run.lost[-1]
+        stds.append(np.sqrt(np.trace(run.cov[-1, 3:, 3:])))
+    assert stds[1] > 1.5 * stds[0]
+
+
+def test_a_camera_that_sees_something_else_is_lost_and_says_how_little_it_knows(mapped):
+    blank = from_frame(sequence(MAPPED + 4, lambda _t, image: image // 4 + 100), MAPPED)
+    other = replace(
+        mapped, windows=np.random.default_rng(1).integers(0, 256, mapped.windows.shape, dtype=np.uint8)
+    )
+    run = run_images(blank, MonoConfig(particles=20), mapped=other)
+    assert run.lost.all()
+    assert np.sqrt(run.cov[:, 3:, 3:].diagonal(axis1=1, axis2=2)).min() >= mapped.size_m
+
+
+def test_a_resumed_run_has_the_same_bytes(localised, mapped, tmp_path):
+    whole, config = from_frame(sequence(FRAMES), MAPPED), MonoConfig(particles=20, checkpoint_every=10)
+    checkpoint = tmp_path / "checkpoint.npz"
+
+    def stop(t, _frame, _run):
+        if t == 7:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_images(whole, config, None, stop, checkpoint, mapped=mapped)
+    run = run_images(whole, config, None, None, checkpoint, resume=True, mapped=mapped)
+    np.testing.assert_array_equal(run.world_from_camera, localised.world_from_camera)
+    np.testing.assert_array_equal(run.cov, localised.cov)
+
+
+def test_the_file_keeps_every_bit(tmp_path):
+    written = made_up()
+    write_known_map(tmp_path / "known_map.npz", written)
+    read = read_known_map(tmp_path)
+    assert read.camera == written.camera and read.alignment == written.alignment
+    for name in ("names", "positions", "cov", "windows", "first_px", "first_pose", "views"):
+        np.testing.assert_array_equal(getattr(read, name), getattr(written, name))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"version": np.array(9)}, "no map of this version"),
+        ({"positions": np.zeros((12, 2))}, "expected positions of shape"),
+        ({"positions": np.full((12, 3), np.nan)}, "expected positions of shape"),
+        ({"cov": np.tile(-np.eye(3), (12, 1, 1))}, "none less than zero"),
+        ({"alignment": np.array("upside down")}, "is damaged"),
+        ({"camera": np.array([-1.0, 1, 1, 1, 0, 0, 0, 0, 0])}, "must be positive"),
+        ({"views": np.zeros((0, 7))}, "expected views"),
+    ],
+)
+def test_a_damaged_file_is_refused(tmp_path, change, words):
+    path = tmp_path / "known_map.npz"
+    write_known_map(path, made_up())
+    with np.load(path) as archive:
+        arrays = dict(archive)
+    np.savez(path, **(arrays | change))
+    with pytest.raises(InputError, match=words):
+        read_known_map(path)
+
+
+def test_no_map_too_small_a_map_and_another_camera(tmp_path, mapped):
+    with pytest.raises(InputError, match="there is no such map"):
+        read_known_map(tmp_path)
+    write_known_map(tmp_path / "known_map.npz", made_up(5))
+    with pytest.raises(InputError, match="holds 5 points of known depth"):
+        read_known_map(tmp_path)
+    (tmp_path / "known_map.npz").write_bytes(b"no archive")
+    with pytest.raises(InputError, match=r"known_map\.npz"):
+        read_known_map(tmp_path)
+    wide = replace(mapped, camera=Pinhole(320, 240, 180.0, 180.0, 159.5, 119.5))
+    with pytest.raises(InputError, match="the map was made with images of 320x240"):
+        run_images(sequence(3), MonoConfig(particles=5), mapped=wide)

@@ -1,0 +1,104 @@
+"""Wheel and source distribution hold the whole package, and it works from where nothing of this folder is."""
+
+import os
+import subprocess
+import sys
+import tarfile
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from rbpf.cli import main
+from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
+
+ROOT = Path(__file__).resolve().parents[1]
+FOLDERS = {"rbpf": "rbpf", **{f"rbpf/{name}": name for name in ("sensors", "motion", "maps", "validation")}}
+"""Where the package's folders are in a distribution, and in the project."""
+
+LEFT_BEHIND = {".pyc", ".nbi", ".nbc"}
+
+
+def package_files() -> set[str]:
+    """Every file of the package, by its name in a distribution."""
+    return {
+        f"{inside}/{path.relative_to(ROOT / folder)}"
+        for inside, folder in FOLDERS.items()
+        for path in (ROOT / folder).rglob("*")
+        if path.is_file() and path.suffix not in LEFT_BEHIND and "__pycache__" not in path.parts
+    }
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    """Folder with a wheel and a source distribution, built from a copy, so that nothing is left in the project."""
+    copy, out = tmp_path_factory.mktemp("source") / "rbpf", tmp_path_factory.mktemp("dist")
+    listed = subprocess.run(
+        ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
+        cwd=ROOT, capture_output=True, text=True, check=True,
+    ).stdout.split("\0")  # fmt: skip
+    for name in filter(None, listed):
+        source, target = ROOT / name, copy / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if source.is_symlink():
+            target.symlink_to(os.readlink(source))
+        elif source.is_file():
+            target.write_bytes(source.read_bytes())
+    run([sys.executable, "-m", "build", "--no-isolation", "--outdir", str(out), str(copy)])
+    return out
+
+
+def run(command: list[str], **options) -> str:
+    done = subprocess.run(command, capture_output=True, text=True, check=False, **options)
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
+    return done.stdout
+
+
+@pytest.mark.slow
+def test_the_wheel_holds_every_file_of_the_package(built):
+    (wheel,) = built.glob("*.whl")
+    names = {name for name in zipfile.ZipFile(wheel).namelist() if name.startswith("rbpf/")}
+    assert names == package_files()
+
+
+@pytest.mark.slow
+def test_the_source_distribution_holds_every_file_of_the_package(built):
+    (archive,) = built.glob("*.tar.gz")
+    with tarfile.open(archive) as files:
+        names = {member.name.split("/", 1)[1] for member in files.getmembers() if member.isfile()}
+    assert {name for name in names if name.startswith("rbpf/")} == package_files()
+    assert {"pyproject.toml", "README.md", "LICENSE"} <= names
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A run to report on: kernels are compiled for this folder already, and would take minutes in another one."""
+    folder = tmp_path_factory.mktemp("finished")
+    simulate_robot(RobotWorld(steps=8, landmarks=10), folder / "log", seed=0)
+    arguments = ["--out", str(folder / "run"), "--particles", "5", "--no-batch"]
+    assert main(["run", "range-bearing", str(folder / "log"), *arguments]) == 0
+    return folder / "run"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["*.whl", "*.tar.gz"])
+def test_an_installed_package_simulates_and_reports(built, kind, finished, tmp_path):
+    """In an environment of its own: the dependencies are those of this one, the package is what was built."""
+    (distribution,) = built.glob(kind)
+    venv.create(tmp_path / "environment", with_pip=False)
+    python = tmp_path / "environment" / "bin" / "python"
+    (site,) = (tmp_path / "environment" / "lib").glob("python*/site-packages")
+    run([sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--no-index",
+         "--target", str(site), str(distribution)])  # fmt: skip
+    lower = [path for path in sys.path if path.endswith("site-packages")]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(site), *lower])}
+    where = run([str(python), "-c", "import rbpf; print(rbpf.__file__)"], cwd=tmp_path, env=environment)
+    assert Path(where.strip()) == site / "rbpf" / "__init__.py"
+    rbpf = [str(python), "-m", "rbpf.cli"]
+    run([*rbpf, "simulate", "range-bearing", "--out", "log", "--steps", "8"], cwd=tmp_path, env=environment)
+    assert (tmp_path / "log" / "odometry.csv").is_file()
+    report = finished / "report.html"
+    report.unlink()
+    run([*rbpf, "report", str(finished)], cwd=tmp_path, env=environment)
+    assert report.stat().st_size > 10_000

@@ -1,0 +1,96 @@
+"""Signatures say the shapes of their arrays, and the tests check them."""
+
+import inspect
+import os
+from types import FunctionType
+from typing import Annotated, get_args, get_origin
+
+import numpy as np
+import pytest
+
+import rbpf.exchange
+import rbpf.gaussian
+import rbpf.lie
+import rbpf.models
+import rbpf.sensors.pinhole
+from rbpf.arrays import Float
+from rbpf.exchange import Records
+from rbpf.gaussian import product
+from rbpf.lie import SE2, SE3
+from rbpf.sensors.pinhole import Pinhole
+from tests.shapes import ShapeError, checked, fits
+
+PUBLIC = [rbpf.exchange, rbpf.gaussian, rbpf.lie, rbpf.models, rbpf.sensors.pinhole]
+on = pytest.mark.skipif(os.environ.get("RBPF_SHAPES") == "0", reason="shapes are not checked in this run")
+
+
+def public_functions():
+    for module in PUBLIC:
+        for name, value in vars(module).items():
+            if name.startswith("_") or not getattr(value, "__module__", "").startswith("rbpf."):
+                continue
+            if isinstance(value, FunctionType):
+                yield f"{module.__name__}.{name}", value
+            elif inspect.isclass(value):
+                methods = [
+                    member for key, member in vars(value).items() if key == "__init__" or key[0] != "_"
+                ]
+                yield from (
+                    (f"{value.__qualname__}.{method.__name__}", method)
+                    for method in methods
+                    if isinstance(method, FunctionType)
+                )
+
+
+def test_no_array_of_a_public_signature_is_without_its_shape():
+    bare = [
+        f"{where}: {name}"
+        for where, function in public_functions()
+        for name, hint in function.__annotations__.items()
+        if np.ndarray in (hint, *get_args(hint)) and get_origin(hint) is not dict
+    ]
+    assert not bare
+
+
+@pytest.mark.parametrize("wrong", [{"cov": np.zeros((3, 1, 2, 2))}, {"const": np.zeros((3, 2))}])
+def test_arrays_that_are_handed_over_together_agree(wrong):
+    def handed_over(records: Records) -> None: ...
+
+    sound = {"mean": np.zeros((3, 2, 2)), "cov": np.zeros((3, 2, 2, 2)), "const": np.zeros((3, 2, 7))}
+    checked(handed_over)(Records(**sound))
+    with pytest.raises(ShapeError, match="records"):
+        checked(handed_over)(Records(**{**sound, **wrong}))
+
+
+@on
+def test_a_result_is_compared_with_the_arguments_broadcast():
+    assert SE2.compose(np.zeros((4, 1, 3)), np.zeros((5, 3))).shape == (4, 5, 3)
+    camera = Pinhole(320, 240, 200.0, 200.0, 159.5, 119.5)
+    with pytest.raises(ShapeError, match="point"):
+        camera.project(np.zeros((5, 4)))  # the fourth number would be ignored
+
+
+@on
+def test_a_result_of_another_length_is_found():
+    def doubled(a: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
+        return np.concatenate([a, a])
+
+    with pytest.raises(ShapeError, match="return"):
+        checked(doubled)(np.zeros(2))
+
+
+@on
+def test_whole_numbers_are_no_measurements():
+    with pytest.raises(ShapeError, match="int64"):
+        product(np.ones((2, 2), dtype=np.int64), np.eye(2))
+
+
+def test_bad_input_is_refused_by_the_program_first():
+    with pytest.raises(rbpf.errors.InputError, match="expected an array"):
+        SE3.exp(np.zeros(5))
+
+
+def test_lists_fit_where_they_are_allowed():
+    assert fits([1.0, 2.0], Annotated[object, "2"])
+    assert not fits([1.0, 2.0], Annotated[object, "3"])
+    assert fits(None, Annotated[object, "2"] | None)

@@ -1,0 +1,187 @@
+"""A camera from pictures of a chessboard: camera.yaml for the readers, figures, a picture of corners and residuals.
+
+camera.yaml        the camera, as `rbpf.sensors.readers.images.calibration` reads it
+calibration.json   reprojection error, standard deviations, which images were used
+calibration.png    where corners were found, and by how much the camera misses them
+"""
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rbpf.errors import InputError
+from rbpf.sensors.board_calibration import BoardCalibration, BoardView, calibrate
+from rbpf.sensors.chessboard import Board, board_corners
+from rbpf.sensors.readers.images.calibration import NAME
+from rbpf.sensors.readers.images.uncalibrated import Shot, read_shots
+from rbpf.validation.figures import COLOURS, label, save_figures
+from rbpf.validation.files import prepare_folder, write_text
+
+FIGURES, PICTURE = "calibration.json", "calibration.png"
+MOST_SHOTS, MOST_VIEWS = 150, 40
+"""Images that are looked at, and views that take part; more change nothing but the time."""
+
+_NAMES = "fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"
+
+
+@dataclass
+class _Found:
+    views: list[BoardView]
+    width: int = 0
+    height: int = 0
+    looked_at: int = 0
+
+
+def calibrate_images(
+    images: Path, board: Board, on_image: Callable[[int, int], None] | None = None
+) -> tuple[BoardCalibration, int]:
+    """The camera that took pictures of a board.
+
+    Args:
+        images: folder of images, or a video.
+        board: what is printed.
+        on_image: called with the images looked at and their number.
+
+    Returns:
+        The calibration, and how many images were looked at.
+
+    Raises:
+        InputError: no or too few images show the board, they differ in size, or they do not determine the camera.
+    """
+    total, shots = read_shots(images, MOST_SHOTS)
+    found, empty = _Found([]), None
+    for shot in _counted(shots, total, on_image):
+        _require_size(found, shot, images)
+        px = board_corners(shot.image, board, thorough=not found.views)
+        found.looked_at += 1
+        if px is not None:
+            found.views.append(BoardView(shot.name, px))
+        elif empty is None:
+            empty = shot.image
+    if not found.views:
+        raise InputError(_nothing(images, board, found.looked_at, empty))
+    return calibrate(_spread(found.views), board, found.width, found.height), found.looked_at
+
+
+def write_calibration(found: BoardCalibration, board: Board, looked_at: int, out: Path) -> dict[str, Any]:
+    """Writes the three files; returns the entries of calibration.json."""
+    prepare_folder(out)
+    entries = summarise_calibration(found, board, looked_at)
+    save_figures({PICTURE: _draw(found)}, out)
+    write_text(out / FIGURES, json.dumps(entries, indent=2, allow_nan=False) + "\n")
+    write_text(out / NAME, camera_text(found))
+    return entries
+
+
+def camera_text(found: BoardCalibration) -> str:
+    """What camera.yaml holds."""
+    camera = found.camera
+    lines = [
+        f"# from {len(found.views)} views of a chessboard; reprojection error {found.rms_px:.3f} px",
+        "model: pinhole",
+        *(f"{name}: {getattr(camera, name):.6f}" for name in _NAMES[:4]),
+        f"width: {camera.width}",
+        f"height: {camera.height}",
+        f"distortion: [{', '.join(f'{value:.8f}' for value in camera.distortion)}]",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def summarise_calibration(found: BoardCalibration, board: Board, looked_at: int) -> dict[str, Any]:
+    """The entries of calibration.json."""
+    return {
+        "board": f"{board.columns}x{board.rows}",
+        "square_m": board.square_m,
+        "images": looked_at,
+        "views": len(found.views),
+        "views_left_out": list(found.left_out),
+        "width": found.camera.width,
+        "height": found.camera.height,
+        **dict(zip(_NAMES, found.camera.params.tolist(), strict=True)),
+        "std": dict(zip(_NAMES, found.std.tolist(), strict=True)),
+        "reprojection_rms_px": found.rms_px,
+        "worst_view_rms_px": float(found.rms_by_view_px.max()),
+        "image_covered": found.covered,
+    }
+
+
+def _counted(
+    shots: Iterator[Shot], total: int, on_image: Callable[[int, int], None] | None
+) -> Iterator[Shot]:
+    for number, shot in enumerate(shots, 1):
+        yield shot
+        if on_image is not None:
+            on_image(number, total)
+
+
+def _require_size(found: _Found, shot: Shot, images: Path) -> None:
+    height, width = shot.image.shape
+    if not found.looked_at:
+        found.width, found.height = width, height
+    elif (width, height) != (found.width, found.height):
+        raise InputError(
+            f"{images}: {shot.name} has {width}x{height} px, the images before it {found.width}x{found.height}: "
+            "calibrate with images of one camera in one setting, all upright or all on their side"
+        )
+
+
+def _nothing(images: Path, board: Board, looked_at: int, empty: np.ndarray | None) -> str:
+    """Why no board was found; squares are often counted in place of corners."""
+    size = f"{board.columns}x{board.rows}"
+    if empty is None:
+        return f"{images}: none of its images can be read"
+    for less in (-1, 1):
+        columns, rows = board.columns + less, board.rows + less
+        if min(columns, rows) < 3:
+            continue
+        if board_corners(empty, Board(columns, rows, board.square_m)) is not None:
+            return (
+                f"{images}: a chessboard of {columns}x{rows} inner corners is seen, not of {size}: --board counts the "
+                f"places where four squares meet, give --board {columns}x{rows}"
+            )
+    return (
+        f"{images}: no chessboard of {size} inner corners is found in {looked_at} images: it has to be seen whole, "
+        "with its white border, sharp and evenly lit; --board counts the places where four squares meet"
+    )
+
+
+def _spread(views: list[BoardView]) -> list[BoardView]:
+    rows = np.unique(np.linspace(0, len(views) - 1, min(len(views), MOST_VIEWS)).round().astype(int))
+    return [views[row] for row in rows]
+
+
+def _draw(found: BoardCalibration) -> Any:
+    """Corners with residuals, enlarged; the residuals; the error of each view."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(13.0, 8.0), layout="constrained")
+    axes: Any = figure.subplot_mosaic([["image", "residuals"], ["image", "views"]], width_ratios=[1.7, 1.0])
+    _draw_image(axes["image"], found)
+    residuals = found.residuals.reshape(-1, 2)
+    label(axes["residuals"], "residuals of all corners", "u [px]", "v [px]", equal=True)
+    axes["residuals"].plot(*residuals.T, ".", markersize=2, color=COLOURS["filter"])
+    label(axes["views"], "error of each view", "view", "root mean square [px]", equal=False)
+    axes["views"].bar(np.arange(len(found.views)), found.rms_by_view_px, color=COLOURS["filter"])
+    axes["views"].axhline(found.rms_px, color=COLOURS["batch"])
+    return figure
+
+
+def _draw_image(axes: Any, found: BoardCalibration) -> None:
+    px = np.concatenate([view.px for view in found.views])
+    length = 0.02 * found.camera.width
+    enlarged = length / max(found.rms_px, np.finfo(float).eps)
+    title = (
+        f"{len(found.views)} views, reprojection error {found.rms_px:.3f} px; "
+        f"residuals enlarged {enlarged:.0f} times"
+    )
+    label(axes, title, "u [px]", "v [px]", equal=False)
+    axes.set_aspect("equal")
+    axes.plot(*px.T, ".", markersize=3, color=COLOURS["truth"])
+    shift = enlarged * found.residuals.reshape(-1, 2)
+    axes.quiver(*px.T, *shift.T, angles="xy", scale_units="xy", scale=1.0, width=0.001, color=COLOURS["map"])
+    axes.set(xlim=(-0.5, found.camera.width - 0.5), ylim=(found.camera.height - 0.5, -0.5))
+    axes.plot(found.camera.cx, found.camera.cy, "+", markersize=14, color=COLOURS["known"])

@@ -1,0 +1,147 @@
+"""What is installed, in which versions, and which parts of it work here."""
+
+import os
+import platform
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from importlib import import_module
+from importlib.metadata import PackageNotFoundError, requires, version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rbpf import __version__
+
+TIMEOUT_S = 30
+
+
+class Part(NamedTuple):
+    """Something that the program does with a library.
+
+    Attributes:
+        name: what it does.
+        works: whether it was tried and worked.
+        needed: whether it belongs to every installation; else it comes with an extra of the package.
+        says: version or path; where it does not work, why, and what to do.
+    """
+
+    name: str
+    works: bool
+    needed: bool
+    says: str
+
+
+def machine() -> dict[str, Any]:
+    """Python, system, processor."""
+    return {
+        "rbpf": __version__,
+        "installed_in": str(Path(__file__).resolve().parents[1]),
+        "python": sys.version.split()[0],
+        "system": f"{platform.system()} {platform.release()}",
+        "machine": platform.machine(),
+        "cores": os.cpu_count() or 1,
+    }
+
+
+def versions() -> dict[str, str | None]:
+    """Of what the package requires; None for what is missing."""
+    names = [
+        re.split(r"[^\w.-]", line, maxsplit=1)[0] for line in requires("rbpf") or () if "extra ==" not in line
+    ]
+    return {name: _version(name) for name in names}
+
+
+def parts() -> list[Part]:
+    """Tries every part."""
+    return [_tried(*probe) for probe in _PROBES]
+
+
+def _tried(name: str, extra: str, probe: Callable[[], str]) -> Part:
+    try:
+        return Part(name, True, not extra, probe())
+    except Exception as error:  # whatever a broken library raises as it is loaded
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        remedy = (
+            f"pip install 'rbpf[{extra}]'"
+            if extra
+            else "install the package again: pip install --force-reinstall"
+        )
+        return Part(name, False, not extra, f"{reason}; {remedy}")
+
+
+def _version(name: str) -> str | None:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
+
+
+def _compiler() -> str:
+    numba = import_module("numba")
+    folder = Path(numba.config.CACHE_DIR or Path(__file__).resolve().parents[1] / "sensors" / "__pycache__")
+    folder.mkdir(parents=True, exist_ok=True)
+    if not os.access(folder, os.W_OK):
+        raise PermissionError(
+            f"{folder} cannot be written to, kernels are compiled anew: set NUMBA_CACHE_DIR"
+        )
+    return f"Numba {numba.__version__}, {numba.config.NUMBA_NUM_THREADS} threads, cache writable"
+
+
+def _images() -> str:
+    cv2 = import_module("cv2")
+    cv2.SIFT_create()
+    names = [cv2.videoio_registry.getBackendName(key) for key in cv2.videoio_registry.getBackends()]
+    if "FFMPEG" not in names:
+        raise RuntimeError("OpenCV was built without FFmpeg and reads no video")
+    return f"OpenCV {cv2.__version__}, with SIFT and video"
+
+
+def _gtsam() -> str:
+    gtsam = import_module("gtsam")
+    graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(), gtsam.noiseModel.Unit.Create(6)))
+    start.insert(0, gtsam.Pose3())
+    gtsam.LevenbergMarquardtOptimizer(graph, start).optimize()
+    return f"GTSAM {_version('gtsam')}"
+
+
+def _colmap() -> str:
+    pycolmap = import_module("pycolmap")
+    pycolmap.Reconstruction()
+    return f"pycolmap {pycolmap.__version__}"
+
+
+def _ffmpeg() -> str:
+    path = import_module("imageio_ffmpeg").get_ffmpeg_exe()
+    subprocess.run([path, "-version"], check=True, capture_output=True, timeout=TIMEOUT_S)
+    return path
+
+
+def _pictures() -> str:
+    figure = import_module("matplotlib.figure").Figure()
+    figure.canvas.draw()
+    return f"Matplotlib {_version('matplotlib')}"
+
+
+def _rerun() -> str:
+    import_module("rerun")
+    return f"rerun-sdk {_version('rerun-sdk')}"
+
+
+def _cluster() -> str:
+    import_module("distributed")
+    return f"Dask {_version('dask')}"
+
+
+_PROBES: tuple[tuple[str, str, Callable[[], str]], ...] = (
+    ("compiled kernels", "", _compiler),
+    ("images and video", "", _images),
+    ("batch optimum", "", _gtsam),
+    ("reconstruction", "", _colmap),
+    ("annotated video", "", _ffmpeg),
+    ("pictures", "", _pictures),
+    ("Rerun recordings", "viewing", _rerun),
+    ("sweeps on a cluster", "cluster", _cluster),
+)
+"""What it does, the extra that it comes with, how it is tried."""

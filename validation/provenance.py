@@ -1,0 +1,130 @@
+"""Where a run comes from: config.yaml with versions, settings and a digest of the input, to repeat it from."""
+
+import hashlib
+import platform
+from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import yaml
+
+from rbpf import __version__
+from rbpf.errors import InputError
+from rbpf.validation.files import write_text
+from rbpf.validation.path_and_map import read_config
+
+CONFIG = "config.yaml"
+LIBRARIES = "numpy", "scipy", "numba", "opencv-python-headless"
+"""Whose version may change a run's bytes."""
+
+_FILES = "recording", "known_points", "calibration", "map"
+"""Entries that name files or folders that a run read."""
+_OPTIONS = {"known_points": "known-points", "square_m": "square"}
+_FLAGS = ("localize",)
+_CHUNK = 1 << 20
+
+
+class Origin(NamedTuple):
+    """How a run was started: its system, its recording, its other sources by option, its settings' file."""
+
+    system: str
+    recording: str
+    sources: dict[str, str]
+    config: Path
+
+
+def write_config(out: Path, system: str, sources: Mapping[str, Any], settings: Mapping[str, Any]) -> None:
+    """Writes config.yaml: everything that is needed to repeat a run.
+
+    Args:
+        out: the run's folder.
+        system: its name.
+        sources: what the run read, by name; `recording` is one of them.
+        settings: of the system.
+    """
+    digest = digest_of({name: Path(str(sources[name])) for name in _FILES if name in sources}, out)
+    head = {"rbpf": __version__, "system": system, **sources}
+    if digest is not None:
+        head["input_sha256"] = digest
+    text = yaml.safe_dump({**head, "versions": library_versions(), **settings}, sort_keys=False)
+    write_text(out / CONFIG, text)
+
+
+def library_versions() -> dict[str, str]:
+    """Python, and the libraries that compute."""
+    found = {"python": platform.python_version()}
+    for name in LIBRARIES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def digest_of(sources: Mapping[str, Path], without: Path | None = None) -> str | None:
+    """SHA-256 over the names and the content of all files of a run's input; None where one is not there.
+
+    Args:
+        sources: files and folders, by what they are for.
+        without: a folder whose files are left out, as the run's own inside its recording.
+    """
+    whole = hashlib.sha256()
+    for name, path in sorted(sources.items()):
+        if not path.exists():
+            return None
+        whole.update(f"{name}\n".encode())
+        for file in _files(path, without):
+            relative = "" if path.is_file() else file.relative_to(path).as_posix()
+            whole.update(f"{relative}\n{file.stat().st_size}\n".encode())
+            _add(whole, file)
+    return whole.hexdigest()
+
+
+def read_origin(config: Path) -> Origin:
+    """What a run was started with, from its config.yaml.
+
+    Raises:
+        InputError: the file does not tell a run of this version, or what the run read has changed or is gone.
+    """
+    if config.is_dir():
+        config = config / CONFIG
+    if config.name != CONFIG:
+        raise InputError(f"{config}: expected the {CONFIG} that a run left in its folder")
+    entries = read_config(config.parent)
+    if "recording" not in entries:
+        raise InputError(f"{config} names no recording: it is no run's, give it with --config instead")
+    files = {name: Path(str(entries[name])) for name in _FILES if name in entries}
+    for name, path in files.items():
+        if not path.exists():
+            raise InputError(
+                f"{config}: its {name} {path} is not there: repeat from the folder the run was started in"
+            )
+    if "input_sha256" in entries and digest_of(files, config.parent) != entries["input_sha256"]:
+        raise InputError(
+            f"{entries['recording']} has changed since the run of {config}: it cannot be repeated; to use its settings "
+            "alone give --config"
+        )
+    named = [name for name in ("known_points", "calibration", "board", "square_m", "map") if name in entries]
+    sources = {_OPTIONS.get(name, name): str(entries[name]) for name in named}
+    sources |= {name: "" for name in _FLAGS if entries.get(name)}
+    return Origin(str(entries["system"]), str(entries["recording"]), sources, config)
+
+
+def _files(path: Path, without: Path | None) -> list[Path]:
+    if path.is_file():
+        return [path]
+    found = sorted(file for file in path.rglob("*") if file.is_file())
+    if without is None or without.resolve() == path.resolve():
+        return found
+    inside = without.resolve()
+    return [file for file in found if not file.resolve().is_relative_to(inside)]
+
+
+def _add(whole: Any, file: Path) -> None:
+    try:
+        with file.open("rb") as content:
+            while chunk := content.read(_CHUNK):
+                whole.update(chunk)
+    except OSError as error:
+        raise InputError(f"{file} cannot be read: {error.strerror}") from error
