@@ -14,6 +14,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SECONDS_LONG = {
     "against_colmap",
     "error_ratios",
+    "fault_matrix",
     "lab_images",
     "mono_blackouts",
     "mono_budget",
@@ -22,6 +23,7 @@ SECONDS_LONG = {
     "mono_still_camera",
     "mono_video",
     "consistency_runs",
+    "soak",
     "validate_run",
     "verdict",
     "mono_realism",
@@ -87,6 +89,13 @@ def error_ratios(figures: dict[str, float]) -> None:
 def evidence(figures: dict[float, float]) -> None:
     low, right, high = figures.values()
     assert right > max(low, high) + 3.0
+
+
+def fault_matrix(figures: dict[str, float]) -> None:
+    assert figures["tracebacks"] == 0.0
+    assert figures["resumed as uninterrupted"] == 1.0
+    assert figures["mono: none: as without"] < 0.02
+    assert figures["stereo: none: as without"] < 0.02
 
 
 def fused_kernel(figures: dict[str, float]) -> None:
@@ -237,6 +246,12 @@ def stereo_lab(figures: dict[str, float]) -> None:
     assert figures["landmarks_mean_per_particle"] > 20
 
 
+def soak(figures: dict[str, float]) -> None:
+    for system in ("camera", "robot"):
+        assert figures[f"{system}, resident_mb"] < 1.1
+        assert figures[f"{system}, held_kb"] < 2.5
+
+
 def sweep(figures: dict[str, float]) -> None:
     assert figures["refined three times, 40"] < figures["bootstrap, 10"]
 
@@ -272,6 +287,7 @@ CLAIMS: dict[str, Callable[[Any], None]] = {
         error_causes,
         error_ratios,
         evidence,
+        fault_matrix,
         fused_kernel,
         gps_fix,
         lab_images,

@@ -252,8 +252,8 @@ def _fitting(run: VideoRun, frame: ImageFrame) -> ImageFrame:
 
 def _frame(run: VideoRun, t: int, frame: ImageFrame, law: PoseLaw | None) -> None:
     started = time.perf_counter()
-    frame, was_lost = run.recovery.checked(_fitting(run, frame)), run.sensor.lost
-    never_found = run.recovery.never_found
+    frame = run.recovery.checked(_fitting(run, frame))
+    was_lost, never_found = run.sensor.lost, run.recovery.never_found
     law = law or run.recovery.law(frame, run.filter)
     report = run.filter.step(frame, law, frame.stamp_ns)
     run.recovery.note(frame, run.filter)
