@@ -122,10 +122,12 @@ class StereoOptions(ImageRunOptions):
         sequence: images of a rectified pair, or of one that its calibration rectifies: a folder of EuRoC ASL with cam0
             and cam1, or of KITTI odometry with image_0 and image_1.
         dof: degrees of freedom of the camera: 6, or 3 in its x-z plane; by default as in the configuration.
+        video: write the annotated video.
     """
 
     sequence: tyro.conf.Positional[Path]
     dof: Literal[3, 6] | None = None
+    video: bool = True
 
 
 @dataclass(frozen=True, kw_only=True)

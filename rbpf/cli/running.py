@@ -100,12 +100,16 @@ def run_stereo(options: Annotated[StereoOptions, tyro.conf.arg(name="")]) -> Non
         with patient(told(bar, bar.add_task("filtering", total=None))) as tell:
             run = start_stereo(recording, config, options.out, options.resume, tell)
         solving = bar.add_task("batch", total=None, visible=options.batch)
+        drawing = bar.add_task("drawing", total=None, visible=options.video)
         telling = Telling(
+            on_frame=told(bar, drawing),
             on_iteration=lambda count, _error: bar.update(solving, completed=count),
             batch_s=options.batch_limit,
         )
         with finishing():
-            entries = finish_stereo(run, recording, options.out, options.rerun, options.batch, telling)
+            entries = finish_stereo(
+                run, recording, options.out, options.video, options.rerun, options.batch, telling
+            )
     _finish(entries, options, run.failure)
 
 
