@@ -62,6 +62,7 @@ PREAMBLE = {
     "docs/how_to/sensor.md": (
         "from examples.custom_sensor import LampSensor\nfrom examples.gps_fix import *\n"
     ),
+    "docs/how_to/rates.md": "from examples.gps_fix import Position\n",
 }
 """Names that a page's programs take from the examples that the page shows."""
 
