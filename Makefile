@@ -36,7 +36,7 @@ check: $(STAMP) ## format, lint, types, import rules and the fast tests
 	$(PYTEST) -m "not slow and not real_data"
 
 bench: $(STAMP) ## run the benchmarks against their baselines
-	$(BIN)/python -m benchmarks
+	$(BIN)/python -m benchmarks --gate
 
 coverage: $(STAMP) ## all tests, with the share of lines that they run
 	$(BIN)/python -m pytest -n 2 --cov --cov-report=term --cov-report=html:coverage
