@@ -7,24 +7,37 @@ there are passed over. A simulated log and a rendered desk are always in the tab
 
 import os
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.readers import stereo_tracks
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
-from rbpf.validation.error_ratios import HEADER, ErrorRatio, camera_ratio, robot_ratio
+from rbpf.systems.stereo.config import StereoConfig
+from rbpf.validation.error_ratios import (
+    HEADER,
+    ErrorRatio,
+    camera_ratio,
+    robot_ratio,
+    stereo_ratio,
+    tracks_ratio,
+)
 from rbpf.validation.figures import COLOURS, new_axes, save_figures
 from rbpf.validation.mono import Recording
 from rbpf.validation.simulation.exposure import Imaging
 from rbpf.validation.simulation.images import simulate_images
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 from rbpf.validation.simulation.textured_desk import TexturedDesk
+from rbpf.validation.stereo import StereoRecording
 from rbpf.validation.tables import write_table
 
 ROBOTS = "mrpt_kf_slam_2d", "mrpt_kf_slam_6d", "mrclam6_robot1"
 CAMERAS = "mono_redkitchen_a", "stereo_zed_room1"
-GOAL = 1.5
+PAIRS = "stereo_zed_room1", "stereo_kitti_seq1"
+TRACKS, TRACKED = "gtsam_stereo_vo", 30
+"""The recorded tracks, and how many of their frames are filtered."""
 
 
 def main(quick: bool = False, out: Path = Path("out"), seeds: int = 5) -> dict[str, float]:
@@ -55,6 +68,13 @@ def recorded(data: Path, seeds: int) -> Iterator[ErrorRatio]:
     for name in ROBOTS:
         if (data / name).is_dir():
             yield robot_ratio(data / name, RangeBearingConfig(), range(seeds))
+    for name in PAIRS:
+        if (data / name).is_dir():
+            yield stereo_ratio(StereoRecording(data / name), StereoConfig(), range(seeds))
+    if (data / TRACKS).is_dir():
+        tracks = stereo_tracks.read(data / TRACKS)
+        first = replace(tracks.log, frames=tracks.log.frames[:TRACKED])
+        yield tracks_ratio(first, StereoConfig(), range(min(seeds, 2)), tracks.world_from_camera)
     for name in CAMERAS:
         if (data / name).is_dir():
             yield camera_ratio(

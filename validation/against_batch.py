@@ -119,7 +119,11 @@ def compare_folder(folder: Path, instants: int = INSTANTS, robust: float | None 
 
 
 def compare(
-    filtered: PathAndMap, problem: Problem, instants: int = INSTANTS, robust: float | None = None
+    filtered: PathAndMap,
+    problem: Problem,
+    instants: int = INSTANTS,
+    robust: float | None = None,
+    optimum: Optimum | None = None,
 ) -> AgainstBatch:
     """A filter's path and map beside the batch optimum of the same measurements.
 
@@ -128,13 +132,15 @@ def compare(
         problem: the measurements.
         instants: at how many poses are compared, each with a batch of its own; 0 compares none.
         robust: Huber's threshold of the batch in standard deviations; None takes all as Gaussian, as the filter does.
+        optimum: of the whole problem, with covariances, where it is known already.
 
     Raises:
         InputError: path and measurements are not of one run, or the batch cannot be solved.
     """
     name = name_of(problem)
     _require_one_run(filtered, problem)
-    optimum = solve_problem(problem, filtered.world_from_body, robust)
+    if optimum is None:
+        optimum = solve_problem(problem, filtered.world_from_body, robust)
     floats = floats_in_scale(problem)
     scale = scale_onto(filtered.at(optimum.steps), optimum.estimate, name) if floats else 1.0
     scaled = rescaled(filtered, scale)
@@ -159,6 +165,8 @@ def _compare_poses(
 ) -> Differences:
     """Online poses beside the last ones of the optima of what had been measured until then."""
     floats, last = floats_in_scale(problem), int(optimum.steps[-1])
+    start = filtered.world_from_body.copy()
+    start[optimum.steps] = optimum.estimate.world_from_body  # nearer than the filter's own path
     if not len(filtered.cov_poses) or instants < 1:
         return no_differences(filtered.space.dim)
     parts = []
@@ -166,7 +174,7 @@ def _compare_poses(
         then = (
             optimum
             if step == last
-            else solve_problem(first_steps(problem, step + 1), filtered.world_from_body[: step + 1], robust)
+            else solve_problem(first_steps(problem, step + 1), start[: step + 1], robust)
         )
         if int(then.steps[-1]) == step:
             ours = filtered.at(then.steps)

@@ -8,14 +8,16 @@ normalised squared error
 which is d for a filter that lost nothing, and more where it has drifted off or claims too little.
 """
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import LieGroup
+from rbpf.validation.against_batch import compare
 from rbpf.validation.autocorrelation import degrees_of_freedom
+from rbpf.validation.batch_problem import robot_optimum
 from rbpf.validation.comparison import Comparison
 from rbpf.validation.comparison_figures import (
     landmark_figure,
@@ -26,10 +28,12 @@ from rbpf.validation.comparison_figures import (
 )
 from rbpf.validation.consistency import whitened_errors
 from rbpf.validation.figures import save_figures
+from rbpf.validation.gaussian_differences import figures_of
 from rbpf.validation.gtsam_ba import BatchSolution, solve
 from rbpf.validation.map_summary import MapSummary
 from rbpf.validation.measurement_files import read_measurements
 from rbpf.validation.measurements import Measurements
+from rbpf.validation.path_and_map import PathAndMap
 from rbpf.validation.run_files import FilteredPath, in_space
 from rbpf.validation.run_record import RunRecord
 from rbpf.validation.statistic import NOISE_FACTOR, STATE_FACTOR, Statistic, variance_ratio
@@ -86,7 +90,7 @@ def compare_with_batch(record: RunRecord) -> Comparison:
         )
     batch = solve(measured, incremental=len(measured.stamps_ns) > LONG)
     errors = batch_errors(path, record.map(), batch)
-    figures = _figures(path, measured, batch, errors)
+    figures = _figures(path, measured, batch, errors) | _densities(path, record.map(), measured, batch)
     apart = figures["filter_minus_batch_rmse_m"]
     accuracy = f"The path is {1e3 * apart:.3g} mm (rms) from the batch optimum of the same measurements."
     statistics = batch_statistics(measured, batch, errors)
@@ -144,6 +148,18 @@ def _figures(
             "landmark_sigma_difference_median": float(np.sqrt(np.median(errors.sigmas))),
             "landmark_sigma_difference_max": float(np.sqrt(errors.sigmas.max())),
         }
+    return figures
+
+
+def _densities(
+    path: FilteredPath, found: MapSummary, measured: Measurements, batch: BatchSolution
+) -> dict[str, Any]:
+    """Landmarks, and poses at a few instants, as Gaussians beside the batch's; the likelihood of both."""
+    filtered = PathAndMap(path.stamps_ns, path.mean, path.cov, found)
+    beside = compare(filtered, measured, optimum=robot_optimum(measured, batch))
+    figures = figures_of("landmarks", beside.landmarks) | figures_of("poses", beside.poses)
+    for name, fit in (("filter", beside.fit_filter), ("batch", beside.fit_batch)):
+        figures |= {f"{name}_{key}": value for key, value in asdict(fit).items()}
     return figures
 
 

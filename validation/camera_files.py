@@ -13,7 +13,12 @@ observations.csv
     # rows: how many lines follow the columns' names
     step,stamp_ns,landmark,u_px,v_px,c00,c10,c11
 
-one line per measurement, in the order of the frames, its covariance [px^2] as the lower triangle by rows;
+one line per measurement, in the order of the frames, its covariance [px^2] as the lower triangle by rows; of a
+rectified stereo pair
+
+    # measurement: stereo
+    # baseline: between the cameras, m
+    step,stamp_ns,landmark,u_left_px,v_px,u_right_px,c00,c10,c11,c20,c21,c22
 
 observations_frames.csv
 
@@ -40,7 +45,7 @@ import numpy as np
 
 from rbpf import gaussian
 from rbpf.sensors.features import FeatureFrame, FeatureLog, KnownPoints
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
 from rbpf.sensors.readers.text import quoted
 from rbpf.validation.files import write_text
 from rbpf.validation.measurement_table import HeadedTable
@@ -52,41 +57,35 @@ KNOWN = "observations_known_points.csv"
 TITLES = {OBSERVATIONS: "rbpf observations 1", FRAMES: "rbpf frames 1", KNOWN: "rbpf known points 1"}
 _HINT = "a file that every run over images writes into its folder"
 _COLUMNS = {
-    OBSERVATIONS: ("step", "stamp_ns", "landmark", "u_px", "v_px", "c00", "c10", "c11"),
     FRAMES: ("step", "stamp_ns"),
     KNOWN: ("landmark", "x_m", "y_m", "z_m", "c00", "c10", "c11", "c20", "c21", "c22"),
 }
+_MEASURED = {
+    "pinhole": ("u_px", "v_px", "c00", "c10", "c11"),
+    "stereo": ("u_left_px", "v_px", "u_right_px", "c00", "c10", "c11", "c20", "c21", "c22"),
+}
+CAMERAS = tuple(_MEASURED)
+"""What a camera's measurements are called in the file's header."""
 
 
 def write_features(folder: Path, log: FeatureLog) -> None:
-    """Writes the files of a log of one camera; those of a former run are replaced."""
-    assert isinstance(log.camera, Pinhole)
+    """Writes the files of a log of one camera or a rectified pair; those of a former run are replaced."""
     stamps = np.array([frame.stamp_ns for frame in log.frames], dtype=np.int64)
     steps = np.repeat(np.arange(stamps.size), [frame.landmarks.size for frame in log.frames])
     names, z, cov = (
         np.concatenate([getattr(f, part) for f in log.frames]) for part in ("landmarks", "z", "cov_z")
     )
-    camera = log.camera
-    header = {
-        "space": "SE3",
-        "measurement": "pinhole",
-        "size": f"{camera.width} {camera.height}",
-        "camera": " ".join(repr(float(x)) for x in _intrinsics(camera)),
-    }
+    header = _header(log.camera)
+    columns = _columns(header["measurement"])
     numbers = np.concatenate([z, gaussian.pack(cov)], axis=1)
-    _write(folder, OBSERVATIONS, log.name, header, np.stack([steps, stamps[steps], names], axis=1), numbers)
-    _write(
-        folder,
-        FRAMES,
-        log.name,
-        {},
-        np.stack([np.arange(stamps.size), stamps], axis=1),
-        np.empty((stamps.size, 0)),
-    )
+    rows = np.stack([steps, stamps[steps], names], axis=1)
+    _write(folder, OBSERVATIONS, columns, log.name, header, rows, numbers)
+    rows = np.stack([np.arange(stamps.size), stamps], axis=1)
+    _write(folder, FRAMES, _COLUMNS[FRAMES], log.name, {}, rows, np.empty((stamps.size, 0)))
     (folder / KNOWN).unlink(missing_ok=True)
     if log.known is not None:
         numbers = np.concatenate([log.known.positions, gaussian.pack(log.known.cov)], axis=1)
-        _write(folder, KNOWN, log.name, {}, log.known.names[:, None], numbers)
+        _write(folder, KNOWN, _COLUMNS[KNOWN], log.name, {}, log.known.names[:, None], numbers)
 
 
 def read_features(folder: Path) -> FeatureLog:
@@ -97,9 +96,9 @@ def read_features(folder: Path) -> FeatureLog:
     """
     seen = HeadedTable.read(folder / OBSERVATIONS, TITLES[OBSERVATIONS], _HINT)
     seen.choice("space", ("SE3",))
-    seen.choice("measurement", ("pinhole",))
+    measurement = seen.choice("measurement", CAMERAS)
     stamps = _read_frames(folder, seen.text("recording"))
-    integers, numbers = seen.body(_COLUMNS[OBSERVATIONS], 3)
+    integers, numbers = seen.body(_columns(measurement), 3)
     steps = integers[:, 0]
     seen.require(
         (steps >= 0) & (steps < stamps.size), f"a step from 0 to {stamps.size - 1}, the last in {FRAMES}"
@@ -107,10 +106,28 @@ def read_features(folder: Path) -> FeatureLog:
     seen.require(integers[:, 1] == stamps[steps], f"the stamp that {FRAMES} gives this step")
     seen.require(np.diff(steps, prepend=0) >= 0, "steps in order")
     cuts = np.searchsorted(steps, np.arange(1, stamps.size))
-    columns = (integers[:, 2], numbers[:, :2], gaussian.unpack(numbers[:, 2:], 2))
+    camera = _read_camera(seen, measurement)
+    p = camera.dim
+    columns = (integers[:, 2], numbers[:, :p], gaussian.unpack(numbers[:, p:], p))
     parts = zip(stamps.tolist(), *(np.split(column, cuts) for column in columns), strict=True)
     frames = [FeatureFrame(*part) for part in parts]
-    return FeatureLog(seen.text("recording"), _read_camera(seen), frames, _read_known(folder))
+    return FeatureLog(seen.text("recording"), camera, frames, _read_known(folder))
+
+
+def _columns(measurement: str) -> tuple[str, ...]:
+    return ("step", "stamp_ns", "landmark", *_MEASURED[measurement])
+
+
+def _header(camera: Pinhole | RectifiedStereo) -> dict[str, str]:
+    if isinstance(camera, RectifiedStereo):
+        header = _header(camera.camera) | {"measurement": "stereo"}
+        return header | {"baseline": repr(float(camera.baseline_m))}
+    return {
+        "space": "SE3",
+        "measurement": "pinhole",
+        "size": f"{camera.width} {camera.height}",
+        "camera": " ".join(repr(float(x)) for x in _intrinsics(camera)),
+    }
 
 
 def _intrinsics(camera: Pinhole) -> tuple[float, ...]:
@@ -118,11 +135,17 @@ def _intrinsics(camera: Pinhole) -> tuple[float, ...]:
 
 
 def _write(
-    folder: Path, name: str, recording: str, header: dict[str, str], integers: np.ndarray, numbers: np.ndarray
+    folder: Path,
+    name: str,
+    columns: tuple[str, ...],
+    recording: str,
+    header: dict[str, str],
+    integers: np.ndarray,
+    numbers: np.ndarray,
 ) -> None:
     lines = [f"# {TITLES[name]}", f"# recording: {recording}"]
     lines += [f"# {key}: {value}" for key, value in header.items()]
-    lines += [f"# rows: {len(integers)}", ",".join(_COLUMNS[name])]
+    lines += [f"# rows: {len(integers)}", ",".join(columns)]
     rows = zip(integers.tolist(), numbers.tolist(), strict=True)
     lines += [",".join(map(repr, [*whole, *real])) for whole, real in rows]
     write_text(folder / name, "\n".join([*lines, ""]))
@@ -141,11 +164,14 @@ def _read_frames(folder: Path, recording: str) -> np.ndarray:
     return np.ascontiguousarray(integers[:, 1])
 
 
-def _read_camera(table: HeadedTable) -> Pinhole:
+def _read_camera(table: HeadedTable, measurement: str) -> Pinhole | RectifiedStereo:
     width, height = table.numbers("size", 2).tolist()
     numbers = table.numbers("camera", 9).tolist()
     fx, fy, cx, cy, k1, k2, p1, p2, k3 = numbers
-    return Pinhole(int(width), int(height), fx, fy, cx, cy, (k1, k2, p1, p2, k3))
+    camera = Pinhole(int(width), int(height), fx, fy, cx, cy, (k1, k2, p1, p2, k3))
+    return (
+        RectifiedStereo(camera, float(table.numbers("baseline", 1)[0])) if measurement == "stereo" else camera
+    )
 
 
 def _read_known(folder: Path) -> KnownPoints | None:

@@ -12,10 +12,14 @@ from typing import Any, final
 import numpy as np
 
 from rbpf.errors import InputError
+from rbpf.lie import Array
+from rbpf.sensors.features import FeatureLog
 from rbpf.sensors.readers import open_log
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.range_bearing.run import Run, run
+from rbpf.systems.stereo.config import StereoConfig
+from rbpf.systems.stereo.run import StereoRun, run_features
 from rbpf.validation.accuracy import ate
 from rbpf.validation.alignment import Alignment
 from rbpf.validation.batch_problem import Optimum, floats_in_scale, problem_of, solve_problem
@@ -23,6 +27,7 @@ from rbpf.validation.mono import Recording, start_mono
 from rbpf.validation.mono_scores import true_path
 from rbpf.validation.path_and_map import AnyRun, PathAndMap, of_run
 from rbpf.validation.scores import as_trajectory, truth_at
+from rbpf.validation.stereo import StereoRecording, start_stereo
 from rbpf.validation.trajectory import Trajectory, associate
 
 HEADER = ("recording", "particles", "seeds", "filter_m", "least_m", "most_m", "batch_m", "ratio")
@@ -100,6 +105,59 @@ def camera_ratio(recording: Recording, config: MonoConfig, seeds: Sequence[int] 
 
     errors = _over_seeds(lambda seed: start_mono(recording, _seeded(config, seed)), truth, seeds)
     return ErrorRatio(name, config.particles, *errors, "rigid" if known else "similarity")
+
+
+def stereo_ratio(recording: StereoRecording, config: StereoConfig, seeds: Sequence[int] = (0,)) -> ErrorRatio:
+    """Filters pairs of images with each seed, and adjusts the pixels that each used.
+
+    Raises:
+        InputError: the recording is wrong, or has too little ground truth.
+    """
+    name = f"{recording.pairs.resolve().name} (stereo)"
+
+    def truth(found: AnyRun) -> Trajectory:
+        assert isinstance(found, StereoRun)
+        at = true_path(found.truth, found.stamps_ns)
+        if at is None:
+            raise InputError(
+                f"{name} has no ground truth to tell the errors by, or less than {LEAST} poses of it."
+            )
+        return Trajectory(found.stamps_ns[at.rows], at.world_from_camera)
+
+    errors = _over_seeds(lambda seed: start_stereo(recording, _seeded(config, seed)), truth, seeds)
+    return ErrorRatio(name, config.particles, *errors, "rigid")
+
+
+def tracks_ratio(
+    log: FeatureLog, config: StereoConfig, seeds: Sequence[int] = (0,), start: Array | None = None
+) -> ErrorRatio:
+    """Filters named pixels of a stereo pair without ground truth, beside the optimum of the same pixels.
+
+    What the optimum is off by is taken from its own covariance: the root b of the mean trace of its positions'. What
+    the filter is off by is then √(b² + d²), d its distance from the optimum (rms).
+
+    Args:
+        log: the pixels.
+        config: of the filter.
+        seeds: of it.
+        start: (T, 7) where the batch begins; the filter's path by default.
+
+    Raises:
+        InputError: the log is of one camera, or the batch does not converge.
+    """
+    ours, batch = [], []
+    optimum: Optimum | None = None
+    for seed in seeds:
+        found = run_features(log, _seeded(config, seed))
+        if optimum is None:
+            begin = found.world_from_camera if start is None else start[: len(found.stamps_ns)]
+            optimum = solve_problem(problem_of(found), begin)
+        path = optimum.estimate
+        off = ate(of_run(found).at(optimum.steps).trajectory, path.trajectory).rmse
+        spread = float(np.sqrt(np.trace(path.cov_poses[:, 3:, 3:], axis1=1, axis2=2).mean()))
+        ours.append(float(np.hypot(off, spread)))
+        batch.append(spread)
+    return ErrorRatio(log.name, config.particles, tuple(ours), tuple(batch), "none")
 
 
 def error_of(estimate: PathAndMap, truth: Trajectory, alignment: Alignment) -> float:

@@ -59,6 +59,12 @@ class Differences:
         )
 
 
+def figures_of(name: str, differences: Differences) -> dict[str, Any]:
+    """Single numbers for a report's page, under names that begin with a word."""
+    rows = differences.as_dict().items()
+    return {f"{name}_{key}": value for key, value in rows if not isinstance(value, list)}
+
+
 def compare_maps(ours: PathAndMap, other: PathAndMap, across: bool) -> Differences:
     """The landmarks that both estimates have; those that one of them holds exactly are left out.
 

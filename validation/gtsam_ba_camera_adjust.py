@@ -12,6 +12,7 @@ from rbpf.lie import SE3, Array
 from rbpf.validation.gtsam_ba_camera_data import CameraEstimate, in_camera
 from rbpf.validation.gtsam_ba_camera_graph import SCALE, CameraProblem, CameraState
 from rbpf.validation.gtsam_ba_camera_points import collapsed, in_front, is_open, place, triangulate
+from rbpf.validation.gtsam_ba_schur import MOST_POSES, marginals_by_schur
 from rbpf.validation.gtsam_ba_solvers import (
     ITERATIONS,
     ROUGH,
@@ -152,6 +153,12 @@ def covariances(found: Adjusted) -> tuple[Array, dict[int, Array]]:
     """Marginal covariances of all poses (T, 6, 6) in the right chart, and of all landmarks, each (3, 3)."""
     problem = found.problem
     poses = dict.fromkeys(problem.pose_keys)
+    if not problem.scaled and problem.velocity is None and len(poses) <= MOST_POSES:
+        names = problem.table.names.tolist()
+        of_poses, of_points = marginals_by_schur(
+            found.graph, found.values, list(poses), problem.point_keys, problem.held_keys, problem.name
+        )
+        return of_poses[problem.slots], dict(zip(names, of_points, strict=True))
     keys = [*poses, *problem.point_keys]
     try:
         blocks = dict(zip(keys, marginals(found.graph, found.values, keys), strict=True))

@@ -106,6 +106,15 @@ class CameraProblem:
         """Whether the scale has to be held."""
         return not self.known and not isinstance(self.table.camera, RectifiedStereo)
 
+    @property
+    def held_keys(self) -> list[int]:
+        """What hard constraints hold: known points without errors; without any known points, the first pose."""
+        if not self.known:
+            return [self.pose_keys[0]]
+        exact = {name for name, (_, cov) in self.known.items() if not cov.any()}
+        pairs = zip(self.table.names.tolist(), self.point_keys, strict=True)
+        return [key for name, key in pairs if name in exact]
+
     def graph(
         self, start: CameraState, loose: NDArray[np.bool_], held: Array, scale: float = SOFT_SCALE
     ) -> Any:

@@ -24,6 +24,7 @@ from rbpf.sensors.readers.log import RobotLog
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.settings import load_settings
+from rbpf.systems.stereo.config import StereoConfig
 from rbpf.validation.run_record import RunRecord, open_run
 
 NOISY = 3.0
@@ -32,7 +33,7 @@ NOISY = 3.0
 CLEAR = 2.0
 """A difference of this many of its errors is one."""
 
-Config = RangeBearingConfig | MonoConfig
+Config = RangeBearingConfig | MonoConfig | StereoConfig
 Data = Path | RobotLog | FeatureLog
 
 
@@ -132,6 +133,7 @@ def compare_evidence(
         raise InputError(f"log-evidences are compared over 2 seeds or more, got {len(seeds)}")
     for name, config in (("first", config_a), ("second", config_b)):
         _require_density(config, name)
+    _require_same_data(config_a, config_b)
     jobs = [(replace(config, seed=seed), data) for config in (config_a, config_b) for seed in seeds]
     logs = _in_order(jobs, workers, on_run or (lambda _done, _total: None))
     return evidence_difference(logs[: len(seeds)], logs[len(seeds) :])
@@ -151,7 +153,9 @@ def compare_runs(
     """
     records = open_run(run_a), open_run(run_b)
     for record in records:
-        if record.system == "mono":
+        if record.system == "stereo":
+            _require_density(_config_of(record), str(record.folder))
+        if record.system in ("mono", "stereo"):
             raise InputError(
                 f"{record.folder}: what is measured in images depends on where the filter looks for it, so that two "
                 "settings do not explain the same data; compare them on a FeatureLog by compare_evidence"
@@ -179,15 +183,36 @@ def _log_evidence(logs: np.ndarray) -> tuple[float, float]:
 
 
 def _require_density(config: Config, name: str) -> None:
-    if isinstance(config, RangeBearingConfig) and not config.likelihood.build().normalised:
+    if isinstance(config, MonoConfig) or config.likelihood.build().normalised:
+        return
+    raise InputError(
+        f"the {name} configuration has no evidence: its likelihood {config.likelihood.kind!r} is not a density "
+        "(it does not integrate to one); use gaussian, or outliers for sightings that may be wrong"
+    )
+
+
+def _require_same_data(config_a: Config, config_b: Config) -> None:
+    """What moves the particles of a stereo filter is given, not explained: both must be given the same."""
+    if not (isinstance(config_a, StereoConfig) and isinstance(config_b, StereoConfig)):
+        return
+    if config_a.odometry.split != "apart" or config_b.odometry.split != "apart":
         raise InputError(
-            f"the {name} configuration has no evidence: its likelihood {config.likelihood.kind!r} is not a density "
-            "(it does not integrate to one); use gaussian, or outliers for sightings that may be wrong"
+            "by default stereo odometry moves the particles by the very pixels that the map then explains, so that "
+            "an evidence would count them twice; set odometry.split to apart in both configurations"
         )
+    for name in ("odometry", "trigger", "dof"):
+        if getattr(config_a, name) != getattr(config_b, name):
+            raise InputError(
+                f"two stereo configurations that differ in {name} do not explain the same data: what odometry says "
+                "is given to the filter, and differs between them"
+            )
 
 
-def _config_of(record: RunRecord) -> RangeBearingConfig:
-    return load_settings(RangeBearingConfig, "range-bearing", record.folder / "config.yaml", (), {})
+def _config_of(record: RunRecord) -> RangeBearingConfig | StereoConfig:
+    path = record.folder / "config.yaml"
+    if record.system == "stereo":
+        return load_settings(StereoConfig, "stereo", path, (), {})
+    return load_settings(RangeBearingConfig, "range-bearing", path, (), {})
 
 
 def _in_order(jobs: list[tuple[Any, Data]], workers: int, told: Callable[[int, int], None]) -> list[float]:
@@ -203,6 +228,7 @@ def _in_order(jobs: list[tuple[Any, Data]], workers: int, told: Callable[[int, i
 def _evidence(config: Config, data: Data) -> float:
     from rbpf.systems.mono.run import run as run_mono
     from rbpf.systems.range_bearing.run import run as run_robot
+    from rbpf.systems.stereo.run import run_features as run_stereo
 
     if isinstance(config, RangeBearingConfig):
         if isinstance(data, Path):
@@ -214,5 +240,6 @@ def _evidence(config: Config, data: Data) -> float:
         if isinstance(data, RobotLog):
             return float(run_robot(data, config).filter.log_evidence)
     elif isinstance(data, FeatureLog):
-        return float(run_mono(data, config).filter.log_evidence)
+        filtered = run_stereo(data, config) if isinstance(config, StereoConfig) else run_mono(data, config)
+        return float(filtered.filter.log_evidence)
     raise InputError(f"a {type(config).__name__} does not filter a {type(data).__name__}")

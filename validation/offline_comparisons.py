@@ -1,17 +1,21 @@
 """A run over images on its page: beside the batch optimum of its measurements, and beside COLMAP's reconstruction."""
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 
 from rbpf.validation.against_batch import AgainstBatch, compare_folder
 from rbpf.validation.against_colmap import compare_folder_with_colmap
+from rbpf.validation.colmap_pipeline import ReconstructionOptions
 from rbpf.validation.comparison import Comparison
-from rbpf.validation.gaussian_differences import Differences
+from rbpf.validation.gaussian_differences import Differences, figures_of
 from rbpf.validation.offline_pictures import plot_against_batch, plot_against_colmap
 from rbpf.validation.path_and_map import read_path_and_map
 from rbpf.validation.run_record import RunRecord
 from rbpf.validation.statistic import STATE_FACTOR, Statistic
+
+KEY_FRAMES = 60
+"""Most of a run that are reconstructed: matching takes minutes for so many, and grows faster than they do."""
 
 HUBER = 1.345
 """Threshold of the batch's loss: matches in images hold false ones."""
@@ -31,7 +35,9 @@ def compare_camera_with_batch(record: RunRecord) -> Comparison:
 
 def compare_camera_with_colmap(record: RunRecord) -> Comparison:
     """COLMAP's reconstruction of every n-th image; errors as `compare_folder_with_colmap`."""
-    found = compare_folder_with_colmap(record.folder)
+    usual = ReconstructionOptions()
+    every = max(usual.every, -(-len(record.path().mean) // KEY_FRAMES))
+    found = compare_folder_with_colmap(record.folder, replace(usual, every=every))
     figures = {f"run_{name}": value for name, value in found.run.as_dict().items()}
     if found.truth is not None:
         figures |= {f"truth_{name}": value for name, value in found.truth.as_dict().items()}
@@ -49,9 +55,7 @@ def _figures(found: AgainstBatch) -> dict[str, object]:
         "filter_minus_batch_max_m": found.path.max,
         "batch_error": found.optimum.error,
     }
-    for name, differences in (("landmarks", found.landmarks), ("poses", found.poses)):
-        rows = differences.as_dict().items()
-        figures |= {f"{name}_{key}": value for key, value in rows if not isinstance(value, list)}
+    figures |= figures_of("landmarks", found.landmarks) | figures_of("poses", found.poses)
     for name, fit in (("filter", found.fit_filter), ("batch", found.fit_batch)):
         figures |= {f"{name}_{key}": value for key, value in asdict(fit).items()}
     return figures

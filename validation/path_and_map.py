@@ -15,6 +15,7 @@ from rbpf.systems.mono.run import MonoRun
 from rbpf.systems.mono.video import VideoRun
 from rbpf.systems.plain_yaml import read_plain_yaml
 from rbpf.systems.range_bearing.run import Run
+from rbpf.systems.stereo.run import StereoRun
 from rbpf.validation.camera_map import summarise_points
 from rbpf.validation.map_summary import MapSummary, map_of, summarise_map
 from rbpf.validation.mono_map import summarise_mono_map
@@ -22,7 +23,7 @@ from rbpf.validation.run_files import path_of
 from rbpf.validation.trajectory import Trajectory
 from rbpf.validation.trajectory_files import read_tum
 
-AnyRun = Run | MonoRun | VideoRun
+AnyRun = Run | MonoRun | VideoRun | StereoRun
 
 
 @final
@@ -68,6 +69,8 @@ def of_run(run: AnyRun) -> PathAndMap:
         return PathAndMap(stamps, run.progress.mean, run.progress.cov, summary)
     if isinstance(run, MonoRun):
         return PathAndMap(run.stamps_ns, run.world_from_camera, run.cov, summarise_points(run.filter))
+    if isinstance(run, StereoRun):
+        return PathAndMap(run.stamps_ns, run.world_from_camera, run.cov, summarise_map(run.filter))
     mapped = summarise_mono_map(run.filter)
     full, found = ~mapped.is_ray, mapped.landmarks
     points = MapSummary(found.ids[full], found.mean[full], found.cov[full])

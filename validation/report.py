@@ -4,7 +4,7 @@ A video stays a file beside the page.
 """
 
 import base64
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from rbpf.validation.comparison import Comparison, read_comparisons
 from rbpf.validation.comparison_figures import timings_figure
 from rbpf.validation.figures import save_figures
 from rbpf.validation.files import write_text
+from rbpf.validation.noise_advice import noise_advice
 from rbpf.validation.own_statistics import compare_with_itself
 from rbpf.validation.run_record import RunRecord, open_run
 from rbpf.validation.statistic import Statistic
@@ -51,7 +52,7 @@ def write_report(folder: Path, problems: list[str] | None = None) -> Verdict:
     """
     record, problems = open_run(folder), list(problems or ())
     comparisons = _comparisons(record, problems)
-    verdict = verdict_of(comparisons)
+    verdict = replace(verdict_of(comparisons), advice=_advice(record, comparisons))
     _draw_timings(record, problems)
     drawn = {name for comparison in comparisons for name in comparison.pictures}
     own = [path.name for path in sorted(folder.glob("*.png")) if path.name not in drawn]
@@ -71,6 +72,10 @@ def verdict_of(comparisons: list[Comparison]) -> Verdict:
     accuracy = " ".join(comparison.accuracy for comparison in others[:1]) or _NO_ACCURACY
     independent = [statistic.name for comparison in others for statistic in comparison.statistics]
     return judge(accuracy, [s for comparison in comparisons for s in comparison.statistics], independent)
+
+
+def _advice(record: RunRecord, comparisons: list[Comparison]) -> str:
+    return noise_advice(record, [s for comparison in comparisons for s in comparison.statistics])
 
 
 def _comparisons(record: RunRecord, problems: list[str]) -> list[Comparison]:

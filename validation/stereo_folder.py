@@ -4,6 +4,8 @@ trajectory.tum           online filtered mean at every pair; the first camera is
 trajectory.npz           the same with its covariance; truth.npz: the ground truth at these pairs; see
                          `rbpf.validation.run_files`
 odometry.tum             the path by visual odometry alone
+batch.tum                the batch optimum of the same measurements
+observations*.csv        the measurements used, by odometry or by the map; see `rbpf.validation.camera_files`
 map.npz, map.csv         landmarks: name, mean, covariance (within + between particles); how often each was seen
 timings.csv              milliseconds per pair: whole, features, odometry, matching with the map, filter
 diagnostics.csv          features, matches that agree with the motion, landmarks; updates, sample size, evidence, NIS
@@ -11,6 +13,7 @@ config.yaml              everything needed to repeat the run
 checkpoint.npz           what --resume goes on from
 summary.json             the figures
 *.png                    pictures
+annotated.mp4            the left images with their features
 report.html              one page with all figures and pictures
 """
 
@@ -22,6 +25,7 @@ import numpy as np
 
 from rbpf.systems.stereo.run import StereoRun
 from rbpf.systems.stereo.sensor import StereoSensor
+from rbpf.validation.camera_files import write_features
 from rbpf.validation.files import (
     milliseconds_per_frame,
     nis_ratio,
@@ -61,6 +65,7 @@ def write_stereo_run(
     write_map(out, mapped, _facts(run, mapped))
     write_path(out, run.stamps_ns, run.world_from_camera, run.cov)
     write_truth(out, stereo_truth(run))
+    write_features(out, run.front_end.log(run.name, run.stamps_ns, run.truth))
     _write_tables(run, out)
     write_config(out, "stereo", sources, asdict(run.config))
     entries = summarise_stereo(run, mapped)

@@ -11,6 +11,7 @@ from rbpf.validation.accuracy import ate
 from rbpf.validation.alignment import align
 from rbpf.validation.figures import COLOURS, SIGMAS, outline, save_figures, stacked_axes
 from rbpf.validation.map_summary import MapSummary
+from rbpf.validation.mono_batch import Batch
 from rbpf.validation.mono_scores import TruePath, true_path
 from rbpf.validation.mono_views import Views, best_views, close_up, draw_particles
 from rbpf.validation.stereo_scores import compared
@@ -19,11 +20,11 @@ MAP_SHARE = 0.9
 """The map's picture holds the path and this share of the points; single points far off do not make it small."""
 
 
-def plot_stereo_run(run: StereoRun, mapped: MapSummary, out: Path) -> list[str]:
+def plot_stereo_run(run: StereoRun, mapped: MapSummary, out: Path, batch: Batch | None = None) -> list[str]:
     """Draws path, map, particles, error, tracking and times; returns the file names."""
     views, truth = best_views(run.world_from_camera), true_path(run.truth, run.stamps_ns)
     figures = {
-        "path.png": _path(run, views, truth),
+        "path.png": _path(run, views, truth, batch),
         "map.png": _map(run, mapped, views),
         "particles.png": _particles(run, views),
         "tracking.png": _tracking(run),
@@ -34,7 +35,7 @@ def plot_stereo_run(run: StereoRun, mapped: MapSummary, out: Path) -> list[str]:
     return save_figures(figures, out)
 
 
-def _path(run: StereoRun, views: Views, truth: TruePath | None) -> Any:
+def _path(run: StereoRun, views: Views, truth: TruePath | None, batch: Batch | None) -> Any:
     figure, shown = views.axes(f"{run.name}: path")
     at, alone = SE3.translation(run.world_from_camera), SE3.translation(run.odometry)
     for axes, (right, up) in shown:
@@ -45,6 +46,9 @@ def _path(run: StereoRun, views: Views, truth: TruePath | None) -> Any:
                 true[:, right], true[:, up], color=COLOURS["truth"], lw=1.2, ls="--", label="truth, moved"
             )
         axes.plot(alone[:, right], alone[:, up], color=COLOURS["odometry"], lw=1.0, label="odometry alone")
+        if batch is not None:
+            best = SE3.translation(batch.world_from_camera)
+            axes.plot(best[:, right], best[:, up], color=COLOURS["batch"], lw=1.2, label="batch optimum")
         axes.plot(at[:, right], at[:, up], color=COLOURS["filter"], lw=1.2, label="filter")
         axes.plot(at[0, right], at[0, up], "o", color=COLOURS["filter"], ms=5, label="first pair")
     shown[0][0].legend(loc="best", fontsize="small")

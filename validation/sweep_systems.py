@@ -83,6 +83,25 @@ def _run_mono(sequence: Mapping[str, Path], pairs: Sequence[str], given: Mapping
     return figures | _pose_nees(SE3, done.world_from_camera, done.cov, camera_truth(done))
 
 
+def _stereo_settings(pairs: Sequence[str], given: Mapping[str, Any]) -> Any:
+    from rbpf.systems.stereo.config import StereoConfig
+
+    return load_settings(StereoConfig, "stereo", None, pairs, given)
+
+
+def _run_stereo(sequence: Mapping[str, Path], pairs: Sequence[str], given: Mapping[str, Any]) -> Figures:
+    from rbpf.lie import SE3
+    from rbpf.validation.map_summary import summarise_map
+    from rbpf.validation.stereo import StereoRecording, start_stereo
+    from rbpf.validation.stereo_folder import summarise_stereo
+    from rbpf.validation.stereo_scores import stereo_truth
+
+    recording = StereoRecording(sequence["recording"], sequence.get("calibration"))
+    done = start_stereo(recording, _stereo_settings(pairs, given))
+    figures = summarise_stereo(done, summarise_map(done.filter))
+    return figures | _pose_nees(SE3, done.world_from_camera, done.cov, stereo_truth(done))
+
+
 def _pose_nees(space: Any, mean: np.ndarray, cov: np.ndarray, truth: RunTruth | None) -> Figures:
     """Mean over the steps, of d degrees of freedom; nothing where the truth is not told in the filter's world."""
     if truth is None or truth.alignment != "none":
@@ -95,4 +114,5 @@ def _pose_nees(space: Any, mean: np.ndarray, cov: np.ndarray, truth: RunTruth | 
 SYSTEMS = {
     "range-bearing": SweepSystem(("recording",), _robot_settings, _run_robot),
     "mono": SweepSystem(("recording", "known_points", "calibration"), _mono_settings, _run_mono),
+    "stereo": SweepSystem(("recording", "calibration"), _stereo_settings, _run_stereo),
 }

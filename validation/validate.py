@@ -44,8 +44,8 @@ def _camera_colmap(record: RunRecord) -> Comparison:
 ANY = "*"
 COMPARISONS: dict[str, dict[str, Compare]] = {
     "groundtruth": {ANY: _groundtruth},
-    "gtsam": {"range-bearing": _range_bearing_gtsam, "mono": _camera_gtsam},
-    "colmap": {"mono": _camera_colmap},
+    "gtsam": {"range-bearing": _range_bearing_gtsam, "mono": _camera_gtsam, "stereo": _camera_gtsam},
+    "colmap": {"mono": _camera_colmap, "stereo": _camera_colmap},
 }
 """By what a run is compared with, then by the run's system."""
 

@@ -2,7 +2,9 @@
 
 The second follows from the statistics of `rbpf.validation.statistic` alone:
 
-- do not trust: one of them contradicts the filter;
+- do not trust: one of them contradicts the filter. It is *over-confident* if one of these says that errors are larger
+  than claimed, or biased; otherwise it is *cautious*: its uncertainty is larger than needed, which misleads whoever
+  weighs it against something else, but leaves nobody nearer to a wall than he was told;
 - trust: none contradicts, and one that compares its poses with something else (truth, batch optimum) supports it;
 - cannot tell: otherwise. The run is too short or too much alike from step to step, or there is nothing to compare it
   with: good innovations alone do not show that the particles follow the right path.
@@ -17,6 +19,14 @@ import numpy as np
 from rbpf.validation.statistic import Statistic
 
 Trust = Literal["trust", "do not trust", "cannot tell"]
+
+Leaning = Literal["over-confident", "cautious", ""]
+
+_LEANINGS: dict[Leaning, str] = {
+    "over-confident": "it claims to know more than it does (over-confident); ",
+    "cautious": "it is larger than needed (cautious, not over-confident); ",
+    "": "",
+}
 
 _OPENINGS: dict[Trust, str] = {
     "trust": "Trust its uncertainty",
@@ -33,16 +43,20 @@ class Verdict:
         accuracy: how good the run is, one sentence.
         trust: whether its uncertainty can be trusted.
         reason: why, half a sentence.
+        leaning: to which side the uncertainty is wrong, where it is not to be trusted.
+        advice: what to try next, a sentence; empty where there is nothing to say.
     """
 
     accuracy: str
     trust: Trust
     reason: str
+    leaning: Leaning = ""
+    advice: str = ""
 
     @property
     def sentences(self) -> tuple[str, str]:
         """Both, each with its full stop."""
-        return self.accuracy, f"{_OPENINGS[self.trust]}: {self.reason}."
+        return self.accuracy, f"{_OPENINGS[self.trust]}: {_LEANINGS[self.leaning]}{self.reason}."
 
 
 def judge(accuracy: str, statistics: Sequence[Statistic], independent: Sequence[str] = ()) -> Verdict:
@@ -60,7 +74,10 @@ def judge(accuracy: str, statistics: Sequence[Statistic], independent: Sequence[
             if len(against) > 1
             else ""
         )
-        return Verdict(accuracy, "do not trust", described(max(against, key=_distance)) + more)
+        daring = [s for s in against if _claims_too_much(s)]
+        worst = max(daring or against, key=_distance)
+        leaning: Leaning = "over-confident" if daring else "cautious"
+        return Verdict(accuracy, "do not trust", described(worst) + more, leaning)
     judging = [s for s in statistics if s.name in independent]
     support = [s for s in judging if s.outcome == "supports"]
     if support:
@@ -107,6 +124,12 @@ def _why_open(statistic: Statistic) -> str:
         f"the run is worth only {statistic.samples:.0f} independent samples of it, too few to say that it lies within "
         f"{_number(max(statistic.zone[0], 0.0))} to {_number(statistic.zone[1])}, or that it does not"
     )
+
+
+def _claims_too_much(statistic: Statistic) -> bool:
+    """Whether one that contradicts the filter says that it errs more than it claims."""
+    below = statistic.high < statistic.zone[0]
+    return below if statistic.kind == "share" else not below
 
 
 def _distance(statistic: Statistic) -> float:

@@ -57,9 +57,9 @@ def report(options: Annotated[ReportOptions, tyro.conf.arg(name="")]) -> None:
 
 
 def _tell(verdict: "Verdict", run: Path, as_json: bool) -> None:
-    page = run / "report.html"
-    entries = {"trust": verdict.trust, "sentences": list(verdict.sentences), "report": str(page)}
-    answer(entries, as_json, *verdict.sentences, f"the page is {page}")
+    page, said = run / "report.html", list(filter(None, (*verdict.sentences, verdict.advice)))
+    entries = {"trust": verdict.trust, "sentences": said, "report": str(page)}
+    answer(entries, as_json, *said, f"the page is {page}")
 
 
 @dataclass(frozen=True, kw_only=True)

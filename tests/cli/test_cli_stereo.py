@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
+from rbpf.cli import main
 from rbpf.lie import SE3
 from rbpf.validation.trajectory_files import read_tum
 from tests.cli.stereo_sequences import FRAMES, run
@@ -18,7 +19,8 @@ FILES = {
     "trajectory.tum", "odometry.tum", "map.npz", "map.csv", "timings.csv", "diagnostics.csv", "config.yaml",
     "summary.json", "report.html", "path.png", "map.png", "particles.png", "error.png", "tracking.png", "timings.png",
     "trajectory.npz", "truth.npz", "validation_groundtruth.json", "groundtruth_path.png", "groundtruth_error.png",
-    "groundtruth_nees.png", "checkpoint.npz",
+    "groundtruth_nees.png", "checkpoint.npz", "batch.tum", "observations.csv", "observations_frames.csv",
+    "annotated.mp4",
 }  # fmt: skip
 REQUIRED = {
     "system", "recording", "frames", "particles", "dof", "seed", "ms_per_frame", "updates", "distance_m",
@@ -161,6 +163,75 @@ def test_bad_arguments(room, tmp_path, capsys, arguments, message):
         code = int(stop.code or 0)
     assert code == 2
     assert message in " ".join(capsys.readouterr().err.split())
+
+
+def test_the_batch_stands_beside(finished):
+    """The optimum of the same pixels is nearer to the truth than odometry, and near the filter."""
+    entries = summary(finished)
+    assert len(read_tum(finished / "batch.tum")) == entries["batch_frames"] == FRAMES
+    assert entries["batch_ate_rmse_m"] < entries["vo_ate_rmse_m"]
+    assert 0.0 < entries["filter_minus_batch_rmse_m"] < 0.01
+
+
+def test_a_run_is_compared_with_its_batch_optimum_afterwards(finished, tmp_path):
+    """From the files in the folder alone, with the figures that the run itself had."""
+    folder = shutil.copytree(finished, tmp_path / "run")
+    (folder / "batch.tum").unlink()
+    assert main(["validate", str(folder), "--against", "gtsam"]) == 0
+    written = json.loads((folder / "validation_gtsam.json").read_text())
+    apart = summary(folder)["filter_minus_batch_rmse_m"]
+    assert written["figures"]["filter_minus_batch_rmse_m"] == pytest.approx(apart, rel=0.02)
+    assert written["figures"]["landmarks_count"] > 10
+    assert written["figures"]["landmarks_kullback_leibler_median"] > 0.0
+    assert written["figures"]["poses_bhattacharyya_median"] > 0.0
+    assert all((folder / name).is_file() for name in written["pictures"]) and written["pictures"]
+    assert "Against gtsam" in (folder / "report.html").read_text()
+
+
+def old(folder: Path) -> None:
+    path = folder / "config.yaml"
+    path.write_text(path.read_text().replace("rbpf: ", "rbpf: 0.0.0-", 1))
+
+
+def moved(folder: Path) -> None:
+    path = folder / "config.yaml"
+    path.write_text(path.read_text().replace("/room", "/nowhere"))
+
+
+def another(folder: Path) -> None:
+    path = folder / "observations_frames.csv"
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines[:-1], lines[-1] + "0", ""]))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "against", "message"),
+    [
+        (lambda folder: None, "colmap", "has 2 readable key frames of 8 images, expected 3"),
+        (moved, "colmap", "nowhere"),
+        (old, "colmap", "was written by rbpf 0.0.0-"),
+        (old, "gtsam", "was written by rbpf 0.0.0-"),
+        (another, "gtsam", "stamp"),
+        (lambda folder: (folder / "observations.csv").unlink(), "gtsam", "holds no observations.csv"),
+        (lambda folder: (folder / "truth.npz").unlink(), "groundtruth", "no ground truth"),
+    ],
+)
+def test_what_cannot_be_compared_is_one_sentence_and_the_report_is_written(
+    finished, tmp_path, capsys, spoil, against, message
+):
+    folder = shutil.copytree(finished, tmp_path / "run")
+    spoil(folder)
+    (folder / "report.html").unlink()
+    capsys.readouterr()
+    assert main(["validate", str(folder), "--against", against]) == 2
+    said = capsys.readouterr().err
+    assert message in " ".join(said.split()) and said.startswith("rbpf: ") and said.count("\n") == 1
+    assert f"Not compared with {against}" in (folder / "report.html").read_text()
+
+
+def test_two_runs_have_no_evidence_to_compare(finished, capsys):
+    assert main(["compare", str(finished), str(finished)]) == 2
+    assert "'truncated' is not a density" in " ".join(capsys.readouterr().err.split())
 
 
 def test_no_stereo_sequence(tmp_path, capsys):

@@ -29,6 +29,7 @@ SECONDS_LONG = {
     "mono_realism",
     "reproduce_e06",
     "reproduce_s05",
+    "stereo_overconfidence",
     "stereo_lab",
     "range_bearing_robot",
 }
@@ -71,6 +72,11 @@ def custom_sensor(figures: dict[str, float]) -> None:
     assert figures["findings"] == 0
     assert figures["filter"] < 0.25 * figures["odometry"]
     assert 0.8 < figures["nis_per_dof"] < 1.25
+
+
+def error_causes(figures: dict[str, float]) -> None:
+    assert figures["batch started from the filter"] == pytest.approx(figures["batch"], rel=1e-3)
+    assert figures["10× particles"] < figures["as it is"] * 1.5
 
 
 def error_ratios(figures: dict[str, float]) -> None:
@@ -211,7 +217,9 @@ def reproduce_e06(figures: dict[str, float]) -> None:
 
 def reproduce_s05(figures: dict[str, float]) -> None:
     assert figures["path, filter"] < 0.1
+    assert figures["path, best particle"] < 0.1
     assert figures["map, filter, aligned"] < figures["map, odometry, aligned"] + 0.05
+    assert figures["map, best particle, aligned"] < 0.2
     assert 0.0 < figures["mean ms of an update"] < 1e3 * figures["mean seconds per pair"]
     assert figures["mean seconds per pair"] < figures["the paper's"]
 
@@ -224,6 +232,13 @@ def range_bearing_robot(figures: dict[str, float]) -> None:
 def smoothing(figures: dict[str, float]) -> None:
     assert figures["ancestral paths"] < 0.5 * figures["filter"]
     assert figures["backward"] < 0.5 * figures["filter"]
+
+
+def stereo_overconfidence(figures: dict[str, float]) -> None:
+    default = "default: prior, T_l = 4, updates within 16.3"
+    clipped = "what is clipped does not update"
+    assert figures[f"{default}: error, mm"] < figures["odometry alone: error, mm"]
+    assert figures[f"{default}: NEES"] < 0.7 * figures[f"{clipped}: NEES"]
 
 
 def stereo_lab(figures: dict[str, float]) -> None:
@@ -269,6 +284,7 @@ CLAIMS: dict[str, Callable[[Any], None]] = {
         checkpoint,
         consistency_runs,
         custom_sensor,
+        error_causes,
         error_ratios,
         evidence,
         fault_matrix,
@@ -293,6 +309,7 @@ CLAIMS: dict[str, Callable[[Any], None]] = {
         reproduce_e06,
         reproduce_s05,
         smoothing,
+        stereo_overconfidence,
         stereo_lab,
         sweep,
         target_tracking,

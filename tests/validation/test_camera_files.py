@@ -7,30 +7,35 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.sensors.features import FeatureFrame, FeatureLog, KnownPoints
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
 from rbpf.validation.camera_files import FRAMES, KNOWN, OBSERVATIONS, read_features, write_features
 
 CAMERA = Pinhole(640, 480, 512.1, 511.9, 319.4, 239.6, (0.1, -0.05, 1e-3, -2e-3, 0.01))
 
 
-def log(known: bool = True) -> FeatureLog:
+def log(known: bool = True, camera: Pinhole | RectifiedStereo = CAMERA) -> FeatureLog:
     """Four frames, of which the second saw nothing."""
+    p = camera.dim
     rng, frames = np.random.default_rng(0), []
     for t, count in enumerate((5, 0, 3, 4)):
-        root = rng.standard_normal((count, 2, 2))
-        cov = root @ np.swapaxes(root, -1, -2) + np.eye(2)
+        root = rng.standard_normal((count, p, p))
+        cov = root @ np.swapaxes(root, -1, -2) + np.eye(p)
         cov = 0.5 * (cov + np.swapaxes(cov, -1, -2))
-        z = rng.uniform(0.0, 480.0, (count, 2))
+        z = rng.uniform(0.0, 480.0, (count, p))
         frames.append(FeatureFrame(1_400_000_000_000_000_000 + t * 33_333_333, np.arange(count) + t, z, cov))
     points = KnownPoints(np.arange(4), rng.standard_normal((4, 3)), np.tile(1e-4 * np.eye(3), (4, 1, 1)))
-    return FeatureLog("a desk", CAMERA, frames, points if known else None)
+    return FeatureLog("a desk", camera, frames, points if known else None)
 
 
+PAIR = RectifiedStereo(replace(CAMERA, distortion=(0.0,) * 5), 0.1 + 0.2)
+
+
+@pytest.mark.parametrize("camera", [CAMERA, PAIR])
 @pytest.mark.parametrize("known", [True, False])
-def test_reading_gives_back_the_same_bits(tmp_path, known):
+def test_reading_gives_back_the_same_bits(tmp_path, known, camera):
     write_features(tmp_path, log())
-    write_features(tmp_path, log(known))
-    again, original = read_features(tmp_path), log(known)
+    write_features(tmp_path, log(known, camera))
+    again, original = read_features(tmp_path), log(known, camera)
     assert again.name == original.name and again.camera == original.camera
     for one, other in zip(again.frames, original.frames, strict=True):
         assert one.stamp_ns == other.stamp_ns
@@ -68,6 +73,24 @@ def test_a_damaged_file_is_named(tmp_path, name, old, new, words):
     with pytest.raises(InputError, match=words) as error:
         read_features(tmp_path)
     assert name in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("# baseline: 0.3", "# baseline: -0.3", "baseline must be positive"),
+        ("# baseline: ", "# base: ", "expected a line '# baseline"),
+        ("u_right_px", "u_px", "expected the columns"),
+        ("# measurement: stereo", "# measurement: pinhole", "expected the columns"),
+    ],
+)
+def test_a_damaged_file_of_pairs_is_named(tmp_path, old, new, words):
+    write_features(tmp_path, log(camera=PAIR))
+    text = (tmp_path / OBSERVATIONS).read_text()
+    assert old in text
+    (tmp_path / OBSERVATIONS).write_text(text.replace(old, new, 1))
+    with pytest.raises(InputError, match=words):
+        read_features(tmp_path)
 
 
 def test_a_stamp_that_belongs_to_another_frame_is_refused(tmp_path):

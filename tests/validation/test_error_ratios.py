@@ -8,9 +8,12 @@ import pytest
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.systems.range_bearing.config import RangeBearingConfig
-from rbpf.validation.error_ratios import HEADER, ErrorRatio, error_of, robot_ratio
+from rbpf.systems.stereo.config import StereoConfig
+from rbpf.validation.error_ratios import HEADER, ErrorRatio, error_of, robot_ratio, tracks_ratio
 from rbpf.validation.map_summary import MapSummary
 from rbpf.validation.path_and_map import PathAndMap
+from rbpf.validation.simulation.features import STEREO, Measuring, simulate_features
+from rbpf.validation.simulation.point_worlds import DeskWorld
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 from rbpf.validation.trajectory import Trajectory
 
@@ -60,6 +63,16 @@ def test_a_log_is_filtered_and_solved(tmp_path):
     assert len(found.filter_errors_m) == 2
     assert found.batch_errors_m[0] == found.batch_errors_m[1]
     assert 0.8 < found.ratio < 10.0
+
+
+def test_tracks_without_truth_are_judged_by_the_optimums_own_covariance():
+    """√(b² + d²): never below 1, and near it for a filter of many landmarks."""
+    log = simulate_features(DeskWorld(frames=12), Measuring(), STEREO, 0)
+    found = tracks_ratio(replace(log, truth=None, known=None), StereoConfig(particles=50), (0, 1))
+    assert found.batch_errors_m[0] == found.batch_errors_m[1] > 0.0
+    assert 1.0 < found.ratio < 10.0
+    off = np.sqrt(np.square(found.filter_errors_m) - np.square(found.batch_errors_m))
+    assert (off > 0.0).all() and off[0] != off[1]
 
 
 def test_a_log_without_truth_is_refused(tmp_path):

@@ -10,8 +10,9 @@ from rbpf.sensors.readers.noise import LogNoise
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
+from rbpf.systems.stereo.config import OdometryConfig, StereoConfig, TriggerConfig
 from rbpf.validation.model_comparison import compare_evidence, evidence_difference
-from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
+from rbpf.validation.simulation.features import MONO, STEREO, Measuring, simulate_features
 from rbpf.validation.simulation.point_worlds import DeskWorld
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 from rbpf.validation.trials import simulated_log
@@ -64,6 +65,34 @@ def test_monocular_configurations_are_compared_on_features():
     slow = replace(MonoConfig(), velocity=replace(MonoConfig().velocity, walk_m_s=0.001, walk_rad_s=0.001))
     found = compare_evidence(MonoConfig(), slow, log, range(2))
     assert found.difference > 0.0
+
+
+APART = StereoConfig(
+    particles=60, odometry=OdometryConfig(split="apart"), likelihood=LikelihoodConfig(kind="gaussian")
+)
+
+
+def test_stereo_configurations_are_compared_on_what_odometry_has_not_used():
+    log = simulate_features(DeskWorld(frames=12), Measuring(), STEREO, 0)
+    shaken = replace(APART, proposal=ProposalConfig("prior"), map=replace(APART.map, used=False))
+    found = compare_evidence(APART, APART, log, range(3))
+    assert abs(found.difference) <= 1e-9 and np.isfinite(found.log_evidence_a)
+    assert found.log_evidence_a != compare_evidence(shaken, shaken, log, range(2)).log_evidence_a
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "message"),
+    [
+        (StereoConfig(), APART, "the first configuration has no evidence.*'truncated' is not a density"),
+        (replace(APART, odometry=OdometryConfig()), APART, "count them twice"),
+        (replace(APART, dof=3), APART, "differ in dof"),
+        (replace(APART, trigger=TriggerConfig(moved_m=0.5)), APART, "differ in trigger"),
+    ],
+)
+def test_stereo_configurations_without_a_common_evidence_are_refused(first, second, message):
+    log = simulate_features(DeskWorld(frames=3), Measuring(), STEREO, 0)
+    with pytest.raises(InputError, match=message):
+        compare_evidence(first, second, log, range(2))
 
 
 def test_what_does_not_belong_together_is_refused():

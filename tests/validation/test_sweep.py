@@ -104,7 +104,7 @@ def test_a_run_that_is_not_possible_does_not_stop_the_others(config, tmp_path, c
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"system": "sonar"}, "range-bearing, mono"),
+        ({"system": "sonar"}, "range-bearing, mono, stereo"),
         ({"sequences": []}, "sequences is empty"),
         ({"sequences": ["nowhere"]}, "no sequence"),
         ({"sequences": [{"recording": "log", "lens": "log"}]}, "entries recording"),
@@ -192,3 +192,21 @@ def test_images_are_swept_with_their_known_points(tmp_path):
     assert alone["known_points"] == 0
     assert "pose_nees_mean" not in alone
     assert alone["frames_tracked"] == known["frames_tracked"] == FRAMES
+
+
+def test_pairs_of_images_are_swept(tmp_path):
+    """With and without the map: the same odometry, another filter."""
+    from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+    from rbpf.validation.simulation.exposure import Imaging
+    from rbpf.validation.simulation.images import simulate_images
+    from rbpf.validation.simulation.textured_room import TexturedRoom
+
+    rig = RectifiedStereo(Pinhole(320, 240, 220.0, 220.0, 159.5, 119.5), 0.12)
+    world = TexturedRoom(frames=5, rate_hz=5.0)
+    simulate_images(world, Imaging(known=0, noise_std=1.0), rig, tmp_path / "room", seed=1)
+    options = {"map": {}, "no map": {"map.used": False}}
+    file = SweepFile("stereo", ["room"], [20], options=options)
+    mapped, alone = sweep(plan(file, tmp_path), tmp_path / "out", workers=1)
+    assert mapped["vo_ate_rmse_m"] == alone["vo_ate_rmse_m"] > 0.0
+    assert mapped["landmarks_mean_per_particle"] > 0 == alone["landmarks_mean_per_particle"]
+    assert mapped["pose_nees_mean"] > 0.0

@@ -22,9 +22,11 @@ from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 from rbpf.validation.trials import simulated_log
 from rbpf.validation.validate import COMPARISONS, validate
 
+pytestmark = pytest.mark.usefixtures("plain_pictures")
+
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory):
+def finished(tmp_path_factory, plain_pictures):
     """A finished run."""
     folder = tmp_path_factory.mktemp("validated")
     simulate_robot(RobotWorld(steps=40, landmarks=30), folder / "log", seed=0)
@@ -82,6 +84,12 @@ def test_gtsam_stands_beside(run_folder, tmp_path, capsys):
     assert entries["figures"]["filter_minus_batch_rmse_m"] == pytest.approx(apart, rel=1e-3)
     residuals = next(s for s in entries["statistics"] if s["name"].startswith("residuals"))
     assert 0.7 < residuals["value"] < 1.3
+    figures = entries["figures"]
+    assert figures["landmarks_count"] == figures["landmarks_compared"]
+    assert 0.0 < figures["landmarks_kullback_leibler_median"] < 5.0
+    assert 0.0 < figures["poses_bhattacharyya_median"] < 5.0 and figures["poses_count"] == 3
+    assert 0.5 < figures["landmarks_sigma_ratio_median"] < 1.5
+    assert figures["batch_log_likelihood"] > figures["filter_log_likelihood"] - 5.0
     assert "Against gtsam" in page(run_folder)
     assert "Against the ground truth" in page(run_folder)
     assert "uncertainty" in capsys.readouterr().err.replace("\n", " ")

@@ -19,7 +19,7 @@ from rbpf.validation.faults import bias_odometry, scale_odometry_noise, scale_se
 from rbpf.validation.own_statistics import innovation_statistics
 from rbpf.validation.run_truth import robot_truth
 from rbpf.validation.simulation.robot import RobotWorld
-from rbpf.validation.statistic import variance_ratio
+from rbpf.validation.statistic import coverage, variance_ratio
 from rbpf.validation.trials import simulated_log
 from rbpf.validation.verdict import Verdict, judge
 
@@ -144,6 +144,21 @@ def test_a_linear_gaussian_run_with_wrong_noise_is_not(claimed):
     verdict = linear_gaussian(claimed)
     assert verdict.trust == "do not trust"
     assert ("too large" if claimed > 1.0 else "too small") in verdict.reason
+    assert verdict.leaning == ("cautious" if claimed > 1.0 else "over-confident")
+    assert verdict.leaning in verdict.sentences[1]
+
+
+def test_one_that_claims_too_much_outweighs_all_that_are_cautious():
+    """A wide innovation must not hide a pose that is further off than it says."""
+    cautious = variance_ratio("innovations", 0.01, 5000.0, 1.1)
+    daring = variance_ratio("poses", 20.0, 50.0, 2.0)
+    few_inside = coverage(np.full(200, 30.0), 6, 200.0, (0.5,))
+    many_inside = coverage(np.full(5000, 0.1), 6, 5000.0, (0.5,))
+    assert judge("", [cautious]).leaning == judge("", many_inside).leaning == "cautious"
+    assert judge("", [cautious, daring]).leaning == "over-confident"
+    assert judge("", [cautious, daring]).reason.startswith("poses: ")
+    assert judge("", [cautious, *few_inside]).leaning == "over-confident"
+    assert judge("", [variance_ratio("poses", 1.0, 2.0, 2.0)]).leaning == ""
 
 
 def test_a_run_of_few_independent_samples_cannot_be_told():

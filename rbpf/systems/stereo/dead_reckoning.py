@@ -1,6 +1,6 @@
 """Where the camera has come since the filter was updated, and by odometry alone: pair after pair, over missing ones."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple, final
 
 import numpy as np
@@ -28,14 +28,19 @@ class Reckoned:
     Attributes:
         since_update: motion since the filter's last update.
         world_from_camera: (7,) by odometry alone; the first camera is the world.
-        agreeing: matches that agree with the motion.
+        agree: (K,) which matches agree with the motion; none where nothing was matched.
         note: what had to be assumed, in words; empty where nothing had.
     """
 
     since_update: Odometry
     world_from_camera: np.ndarray
-    agreeing: int = 0
+    agree: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
     note: str = ""
+
+    @property
+    def agreeing(self) -> int:
+        """How many matches agree with the motion."""
+        return int(self.agree.sum())
 
 
 @final
@@ -68,7 +73,7 @@ class DeadReckoning:
         self.odometer.rng = rng
         step = self.odometer.step(*matches, self._seconds(stamp_ns))
         self._stamp_ns = stamp_ns
-        self._at = self._moved(step.odometry, int(step.estimate.inliers.sum()), step.note)
+        self._at = self._moved(step.odometry, step.estimate.inliers, step.note)
         return self._at
 
     def assumed(self, stamp_ns: int) -> Reckoned:
@@ -76,7 +81,7 @@ class DeadReckoning:
         if not self.begun:
             return self._at
         expected = self.odometer.prediction.law(self.odometer.velocity, self._seconds(stamp_ns))
-        return self._moved(expected, 0, "")
+        return self._moved(expected, np.zeros(0, dtype=bool), "")
 
     def updated(self) -> None:
         """The filter has taken the motion up to the last measured pair."""
@@ -107,10 +112,10 @@ class DeadReckoning:
         assert self._stamp_ns is not None
         return 1e-9 * (stamp_ns - self._stamp_ns)
 
-    def _moved(self, step: Odometry, agreeing: int, note: str) -> Reckoned:
+    def _moved(self, step: Odometry, agree: np.ndarray, note: str) -> Reckoned:
         step = self._plane.law(step)
         world = SE3.compose(self._at.world_from_camera, step.delta)
-        return Reckoned(chained(self._at.since_update, step), world, agreeing, note)
+        return Reckoned(chained(self._at.since_update, step), world, agree, note)
 
 
 def standstill() -> Odometry:

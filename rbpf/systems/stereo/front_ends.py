@@ -1,16 +1,18 @@
 """What a recording shows, pair by pair: features of images, or the named pixels of a log."""
 
 from abc import ABC, abstractmethod
+from dataclasses import replace
 from typing import Any, final
 
 import numpy as np
 
 from rbpf.errors import InputError
+from rbpf.exchange import NULL
 from rbpf.filter import StepReport
 from rbpf.maps.point import Point
 from rbpf.models import Part, Sensor
 from rbpf.motion.stereo_odometer import match_names
-from rbpf.sensors.features import FeatureFrame, FeatureLog
+from rbpf.sensors.features import CameraTruth, FeatureFrame, FeatureLog
 from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
 from rbpf.sensors.pinhole import RectifiedStereo
 from rbpf.sensors.readers.images import ImageFrame
@@ -19,7 +21,10 @@ from rbpf.sensors.stereo_matching import StereoSift
 from rbpf.sensors.stereo_points import StereoPoint
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.dead_reckoning import Pixels
+from rbpf.systems.stereo.measured import MeasuredPair
+from rbpf.systems.stereo.seen import FEATURE, LANDMARK
 from rbpf.systems.stereo.sensor import StereoFrame, StereoSensor
+from rbpf.systems.stereo.tracks import Tracks
 
 
 class FrontEnd(ABC):
@@ -49,6 +54,14 @@ class FrontEnd(ABC):
     def for_filter(self) -> Any:
         """The pair looked at, as the sensor takes it."""
 
+    @abstractmethod
+    def seen(self, updated: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Pixels (K, 3) of the pair looked at, and what each was to the map (K,), see `rbpf.systems.stereo.seen`.
+
+        Args:
+            updated: whether the filter has taken the pair.
+        """
+
     def observed(self, report: StepReport) -> int:
         """Landmarks that weighed the particles in the filter's last step."""
         weighed = (group.ids for group in report.groups if Part.STATE in group.informs)
@@ -57,6 +70,20 @@ class FrontEnd(ABC):
     def seconds(self) -> float:
         """Time that the sensor took to find landmarks in its last pair."""
         return 0.0
+
+    @abstractmethod
+    def note(self, step: int, agree: np.ndarray, updated: bool) -> None:
+        """Takes note of what was used of the pair kept, for `log`.
+
+        Args:
+            step: number of the pair.
+            agree: (M,) which of the matches agree with the motion; none where nothing was matched.
+            updated: whether the filter has taken the pair.
+        """
+
+    @abstractmethod
+    def log(self, name: str, stamps_ns: np.ndarray, truth: CameraTruth | None) -> FeatureLog:
+        """The pixels that the pairs of stamps (T,) were filtered by."""
 
     @abstractmethod
     def arrays(self) -> dict[str, np.ndarray]:
@@ -87,10 +114,15 @@ class ImageFrontEnd(FrontEnd):
             rig, *nothing, np.zeros((0, config.sift.length), dtype=np.float32)
         )
         self._now = self._kept = self._none
+        self._matches = np.zeros((2, 0), dtype=np.intp)
+        self.tracks = Tracks()
 
-    def look(self, frame: ImageFrame) -> tuple[int, str]:
-        """SIFT in both images, matched along the rows."""
-        self._now = self._none
+    def look(self, frame: ImageFrame | MeasuredPair) -> tuple[int, str]:
+        """SIFT in both images, matched along the rows; or what was measured in them before."""
+        self._now, self._matches = self._none, np.zeros((2, 0), dtype=np.intp)
+        if isinstance(frame, MeasuredPair):
+            self._now = self._none if frame.features is None else frame.features
+            return len(self._now), frame.problem
         if frame.image is None or frame.right is None:
             return 0, frame.problem or "an image is missing"
         self._now = self.sift.measure(frame.image, frame.right)
@@ -102,6 +134,7 @@ class ImageFrontEnd(FrontEnd):
         if self.config.odometry.split != "none":
             found = found.take(half_of(self._kept.keys)[found.first] & half_of(self._now.keys)[found.second])
         before, now = self._kept.take(found.first), self._now.take(found.second)
+        self._matches = np.stack([found.first, found.second])
         return Pixels(before.z, now.z, before.cov, now.cov)
 
     def keep(self) -> None:
@@ -115,18 +148,31 @@ class ImageFrontEnd(FrontEnd):
         half = half_of(self._now.keys)
         return StereoFrame(self._now, ~half if split == "apart" else half)
 
+    def seen(self, updated: bool) -> tuple[np.ndarray, np.ndarray]:
+        return self._now.z, self.sensor.kinds() if updated else np.full(len(self._now), FEATURE)
+
     def seconds(self) -> float:
         return self.sensor.seconds
+
+    def note(self, step: int, agree: np.ndarray, updated: bool) -> None:
+        first, second = self._matches[:, agree] if agree.size else self._matches[:, :0]
+        names = self.sensor.names if updated else np.full(len(self._kept), NULL, dtype=np.int64)
+        self.tracks.note(step, self._kept.z, self._kept.cov, (first, second), names)
+
+    def log(self, name: str, stamps_ns: np.ndarray, truth: CameraTruth | None) -> FeatureLog:
+        return FeatureLog(name, self.rig, self.tracks.frames(stamps_ns), truth=truth)
 
     def arrays(self) -> dict[str, np.ndarray]:
         kept = self._kept
         names = ("z", "cov", "scale", "orientation", "keys")
-        return {f"pair/{name}": getattr(kept, name) for name in names} | self.sensor.arrays()
+        pair = {f"pair/{name}": getattr(kept, name) for name in names}
+        return pair | self.sensor.arrays() | self.tracks.arrays()
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         names = ("z", "cov", "scale", "orientation", "keys")
         self._kept = StereoFeatures.measured(self.rig, *(arrays[f"pair/{name}"].copy() for name in names))
         self.sensor.restore(arrays)
+        self.tracks.restore(arrays)
 
 
 @final
@@ -148,6 +194,7 @@ class NameFrontEnd(FrontEnd):
             )
         self.rig = log.camera
         self.config = config
+        self._log = log
         self.sensor = NamedLandmarkSensor(StereoPoint(log.camera), Point(3), config.likelihood.build())
         self._now = self._kept = FeatureFrame(
             0, np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3))
@@ -178,6 +225,16 @@ class NameFrontEnd(FrontEnd):
             chosen &= frame.landmarks % 2 == (1 if config.odometry.split == "apart" else 0)
         chosen &= frame.z[:, 0] > frame.z[:, 2]
         return FeatureFrame(frame.stamp_ns, frame.landmarks[chosen], frame.z[chosen], frame.cov_z[chosen])
+
+    def seen(self, updated: bool) -> tuple[np.ndarray, np.ndarray]:
+        return self._now.z, np.full(self._now.landmarks.size, LANDMARK if updated else FEATURE)
+
+    def note(self, step: int, agree: np.ndarray, updated: bool) -> None:
+        """The log has it all."""
+
+    def log(self, name: str, stamps_ns: np.ndarray, truth: CameraTruth | None) -> FeatureLog:
+        """The given one, up to the last pair that was filtered."""
+        return replace(self._log, frames=self._log.frames[: stamps_ns.size])
 
     def arrays(self) -> dict[str, np.ndarray]:
         kept = self._kept
