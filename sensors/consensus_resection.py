@@ -52,7 +52,7 @@ def resect_consensus(
     """
     if points.shape[0] < 4:
         return None
-    poses = _candidates(points, camera.unproject(px), triples, rng)
+    poses = three_point_poses(points, camera.unproject(px), triples, rng)
     if not poses.shape[0]:
         return None
     errors = _errors(camera, poses, points, px)
@@ -61,8 +61,10 @@ def resect_consensus(
     return refined(camera, pose, points, px, within_px)
 
 
-def _candidates(points: np.ndarray, uv: np.ndarray, triples: int, rng: np.random.Generator) -> np.ndarray:
-    """Poses world_from_camera (C, 7) of three points each (OpenCV's P3P)."""
+def three_point_poses(
+    points: np.ndarray, uv: np.ndarray, triples: int, rng: np.random.Generator
+) -> np.ndarray:
+    """Poses world_from_camera (C, 7) of three of the points (M, 3) each, seen at uv (M, 2) (OpenCV's P3P)."""
     import cv2
 
     matrices = []

@@ -12,7 +12,8 @@ from rbpf.lie import SE3
 from rbpf.sensors.readers.images import ImageFrame, ImageSequence, KnownPixels, open_images, read_known_points
 from rbpf.sensors.readers.images.sequence import Source
 from rbpf.systems.mono.config import MonoConfig
-from rbpf.systems.mono.relocalise import Attempt, known_places
+from rbpf.systems.mono.likeness import known_places
+from rbpf.systems.mono.relocalise import Attempt
 from rbpf.systems.mono.resuming import save
 from rbpf.systems.mono.video import VideoRun, run_images
 from rbpf.validation.blackouts import SETTLED_S, Blackouts, Outcome, Series, pose_differences

@@ -81,10 +81,40 @@ class ActiveSearch:
             return Searched.nothing()
         rows, mean, cov = self._predict(rows, belief)
         cov = cov + self.config.noise_px**2 * np.eye(2)
-        turn = affines(self.camera, self.table.place[rows], self.table.first_pose[rows], pose)
-        templates = warp(self.table.source[rows], turn, self.config.template_px)
+        templates = self._templates(rows, self.table.source, self.table.first_pose, pose)
         searched = Searched(rows, mean, cov, *self._looked_for(image, templates, mean, cov))
+        searched = self._by_last_look(image, templates, searched, pose)
         return self._agreeing(image, belief, templates, searched) if searched.found.any() else searched
+
+    def _templates(
+        self, rows: np.ndarray, sources: np.ndarray, poses: np.ndarray, pose: np.ndarray
+    ) -> np.ndarray:
+        """Windows (F, S, S) that were cut from poses (F, 7), of the rows, as they look from a pose."""
+        turn = affines(self.camera, self.table.place[rows], poses[rows], pose)
+        return warp(sources[rows], turn, self.config.template_px)
+
+    def _by_last_look(
+        self, image: np.ndarray, templates: np.ndarray, searched: Searched, pose: np.ndarray
+    ) -> Searched:
+        """What is not found as it looked at first is looked for as it looked later; changes its templates."""
+        rows, table = searched.rows, self.table
+        missed = np.flatnonzero(
+            ~searched.found & (table.last_pose[rows] != table.first_pose[rows]).any(axis=1)
+        )
+        if not missed.size:
+            return searched
+        later = self._templates(rows[missed], table.last_source, table.last_pose, pose)
+        px, score, found, alike = self._looked_for(image, later, searched.mean[missed], searched.cov[missed])
+        better = score > searched.score[missed]
+        chosen = missed[better]
+        templates[chosen] = later[better]
+        out = replace(
+            searched, px=searched.px.copy(), score=searched.score.copy(),
+            found=searched.found.copy(), alike=searched.alike.copy(),
+        )  # fmt: skip
+        out.px[chosen], out.score[chosen] = px[better], score[better]
+        out.found[chosen], out.alike[chosen] = found[better], alike[better]
+        return out
 
     def _looked_for(
         self, image: np.ndarray, templates: np.ndarray, mean: np.ndarray, cov: np.ndarray

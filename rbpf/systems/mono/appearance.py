@@ -17,8 +17,10 @@ class _Rows:
 
     Attributes:
         source: (F, S, S) uint8 window around the first sighting.
+        last_source: (F, S, S) uint8 window around a later one, from where it looked different; else the first.
         first_px: (F, 2) where that was.
         first_pose: (F, 7) world_from_camera of the first sighting, in the mode's world.
+        last_pose: (F, 7) likewise of the later one.
         place: (F, 4) homogeneous point in the mode's world at the last sighting.
         attempts: (F,) times looked for.
         found: (F,) times found.
@@ -28,8 +30,10 @@ class _Rows:
     """
 
     source: np.ndarray
+    last_source: np.ndarray
     first_px: np.ndarray
     first_pose: np.ndarray
+    last_pose: np.ndarray
     place: np.ndarray
     attempts: np.ndarray
     found: np.ndarray
@@ -46,7 +50,9 @@ class Appearances:
         size = 2 * SOURCE_HALF_PX + 1
         self._rows = _Rows(
             np.zeros((0, size, size), dtype=np.uint8),
+            np.zeros((0, size, size), dtype=np.uint8),
             np.zeros((0, 2)),
+            np.zeros((0, 7)),
             np.zeros((0, 7)),
             np.zeros((0, 4)),
             np.zeros(0, dtype=np.int64),
@@ -73,6 +79,7 @@ class Appearances:
         rows = np.arange(self.count, self.count + k)
         self.count += k
         self.source[rows], self.first_px[rows], self.first_pose[rows] = source, px, pose
+        self.last_source[rows], self.last_pose[rows] = source, pose
         self.attempts[rows], self.found[rows], self.alive[rows] = 1, 1, True
         self.member[rows] = -1 if member is None else member
         return rows

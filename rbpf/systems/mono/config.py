@@ -75,6 +75,8 @@ class SearchConfig:
         margin_px: features this near to the border are left alone.
         turn_deg: a feature is not looked for once its line of sight has turned by this.
         scale: nor once it is this many times nearer or farther than at first.
+        look_deg: a feature's look is kept anew when its line of sight has turned by this since it was kept last …
+        look_scale: … or it is this many times nearer or farther.
         trial: a feature is judged after having been looked for this often.
         failure_ratio: it is dropped from all particles when it was not found in more than this share.
         lost_share: the camera is lost when fewer than this share of what was looked for is found …
@@ -96,6 +98,8 @@ class SearchConfig:
     margin_px: float = 8.0
     turn_deg: float = 50.0
     scale: float = 2.0
+    look_deg: float = 10.0
+    look_scale: float = 1.15
     trial: int = 10
     failure_ratio: float = 0.5
     lost_share: float = 0.25
@@ -122,6 +126,7 @@ class RecoveryConfig:
         within_px: a feature agrees with a pose when it is seen as near to its projection.
         triples: of features from which poses are computed.
         inliers: features that must agree with a pose.
+        few: it is enough that so many agree if the last view before the loss shows the same motion.
         sure: when so many agree, less has to be found of what should then be seen.
         inlier_share: share of the matches that must agree.
         spread: standard deviation of the inliers' places in their narrowest direction, in widths of the image.
@@ -140,6 +145,7 @@ class RecoveryConfig:
     within_px: float = 4.0
     triples: int = 300
     inliers: int = 8
+    few: int = 5
     sure: int = 12
     inlier_share: float = 0.25
     spread: float = 0.03

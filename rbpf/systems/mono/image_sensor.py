@@ -19,6 +19,7 @@ from rbpf.systems.mono.active_search import ActiveSearch, Searched
 from rbpf.systems.mono.appearance import SOURCE_HALF_PX, Appearances
 from rbpf.systems.mono.config import SearchConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor
+from rbpf.systems.mono.viewing import turned
 
 LEAST_SEEN = 4
 """Points of a known map that tell where the camera is; one that sees fewer has left the map, nothing new is mapped."""
@@ -115,6 +116,7 @@ class ImageSensor(Sensor):
         self._place(belief, self.measured.landmarks)
         sightings = self.measured
         if frame.image is not None and not self.bad_frames:
+            self._keep_looks(frame.image, belief)
             sightings = self._with_corners(frame, belief)
         births = self.features.births(sightings, belief, observed)
         self._place_rays(belief, births)
@@ -170,6 +172,23 @@ class ImageSensor(Sensor):
         if rows.size:
             chosen, place = self.features.places(belief, rows, self.table.member[rows])
             self.table.place[rows[chosen]] = place
+
+    def _keep_looks(self, image: np.ndarray, belief: Belief) -> None:
+        """Keeps windows of the features that were found and look different by now.
+
+        How a patch lies in space is not known. A patch that is taken to face the camera of its first sighting is alike
+        to about 25° from there; a camera that was lost and comes from another side would not know it again.
+        """
+        rows, px = self.measured.landmarks, self.measured.z
+        if not rows.size:
+            return
+        config, table, pose = self.config, self.table, belief.state[belief.mode][:7]
+        cosine, ratio = turned(table.place[rows], pose, table.last_pose[rows])
+        away = np.maximum(ratio, 1.0 / ratio) >= config.look_scale
+        for k in np.flatnonzero((cosine <= np.cos(np.deg2rad(config.look_deg))) | away):
+            window = cut(image, px[k], SOURCE_HALF_PX)
+            if window is not None:
+                table.last_source[rows[k]], table.last_pose[rows[k]] = window, pose
 
     def _place_rays(self, belief: Belief, births: Sequence[Births]) -> None:
         """Remembers where in the mode's world features start."""

@@ -14,7 +14,8 @@ from rbpf.proposals import Prior
 from rbpf.sensors.readers.images import ImageFrame
 from rbpf.systems.mono.config import RecoveryConfig
 from rbpf.systems.mono.image_sensor import ImageSensor
-from rbpf.systems.mono.relocalise import Relocaliser
+from rbpf.systems.mono.last_view import LastView
+from rbpf.systems.mono.relocalise import BORDER_PX, Relocaliser
 
 LEAST_CONTRAST = 10
 """Grey levels that are all nearer to each other are those of a lens cap."""
@@ -59,6 +60,9 @@ class Recovery:
         start = self.views[0] if self.never_found else SE3.identity()
         self._trusted = start, np.zeros((6, 6))
         self._cloud: Particles | None = None
+        self._image: np.ndarray | None = None
+        self._mode = SE3.identity()
+        self._view: LastView | None = None
         self._last: np.ndarray | None = None
         self._repeats = 0
         self._blank = False
@@ -97,8 +101,7 @@ class Recovery:
         if frame.image is not None:
             found = self._found(filter_, frame.image, pose)
             if found is not None:
-                attempt = self.relocaliser.attempt
-                self.sensor.recognised = attempt is not None and attempt.agreeing >= self.config.sure
+                self.sensor.recognised = self.relocaliser.sure
                 return PoseLaw(found.mean, found.cov + cov, self.std_velocity)
         reach = np.repeat([self.config.reach_rad, self.config.reach_m], 3)
         return PoseLaw(pose, cov + np.diag(reach**2), self.std_velocity)
@@ -112,7 +115,8 @@ class Recovery:
         tried = min(count, VIEWS_PER_FRAME if filter_.steps else count)
         chosen = (filter_.steps * tried + np.arange(tried)) % max(count, 1)
         for near in [trusted, *self.views[chosen]]:
-            found = self.relocaliser.find(belief, image, near)
+            last = self._last_view() if near is trusted else None
+            found = self.relocaliser.find(belief, image, near, last)
             if found is not None:
                 return found
         return None
@@ -130,6 +134,7 @@ class Recovery:
         """Remembers the particles after a step, if they can be trusted."""
         if not self.sensor.bad_frames:
             self._cloud, self.stamp_ns = filter_.particles, frame.stamp_ns
+            self._image, self._view = frame.image, None
             self.never_found = False
 
     @property
@@ -140,7 +145,21 @@ class Recovery:
             poses, log_weights = self._cloud.state[:, :7], self._cloud.log_weights
             estimate = mixture_estimate(Prior.exactly(SE3, poses), None, log_weights)
             self._trusted, self._cloud = (estimate.mean, estimate.cov), None
+            self._mode = poses[log_weights.argmax()].copy()
         return self._trusted
+
+    def _last_view(self) -> LastView | None:
+        """The last image with a trusted pose, from where the heaviest particle was then."""
+        if self._view is None and self._image is not None:
+            self._view = LastView(
+                self.sensor.camera,
+                self._image,
+                self._mode,
+                self.config.corners,
+                self.config.spacing_px,
+                BORDER_PX,
+            )
+        return self._view
 
     def arrays(self) -> dict[str, np.ndarray]:
         """For a checkpoint."""
@@ -151,6 +170,8 @@ class Recovery:
             "recovery/cov": cov,
             "recovery/stamp_ns": np.array(self.stamp_ns),
             "recovery/last": last,
+            "recovery/image": np.zeros((0, 0), dtype=np.uint8) if self._image is None else self._image,
+            "recovery/mode": self._mode,
             "recovery/repeats": np.array(self._repeats),
             "recovery/blank": np.array(self._blank),
             "recovery/never_found": np.array(self.never_found),
@@ -162,5 +183,8 @@ class Recovery:
         self.stamp_ns = int(arrays["recovery/stamp_ns"])
         last = arrays["recovery/last"]
         self._last = last if last.size else None
+        image = arrays["recovery/image"]
+        self._image, self._view = image if image.size else None, None
+        self._mode = arrays["recovery/mode"]
         self.never_found = bool(arrays["recovery/never_found"])
         self._repeats, self._blank = int(arrays["recovery/repeats"]), bool(arrays["recovery/blank"])

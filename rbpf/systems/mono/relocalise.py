@@ -9,28 +9,31 @@ from rbpf import gaussian
 from rbpf.belief import Belief
 from rbpf.lie import SE3
 from rbpf.motion.constant_velocity import PoseLaw
-from rbpf.sensors.consensus_resection import Resected, refined, resect_consensus
+from rbpf.sensors.consensus_resection import Resected, refined, resect_consensus, three_point_poses
 from rbpf.sensors.corners import corners
-from rbpf.sensors.keypoints import describe, describe_windows
+from rbpf.sensors.keypoints import describe_windows
 from rbpf.sensors.patches import search, warp
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.uncertain_resection import GATE, Sights, refined_on_all, squared_distances
 from rbpf.systems.mono.config import RecoveryConfig
 from rbpf.systems.mono.image_sensor import ImageSensor
+from rbpf.systems.mono.last_view import LEAST, LastView
+from rbpf.systems.mono.likeness import (
+    described,
+    distances,
+    expected,
+    known_places,
+    nearest_looks,
+    unmistakable,
+)
 from rbpf.systems.mono.viewing import affines
 
-SCALES = (0.7, 1.0, 1.4)
-"""Sizes at which the lost image is described, times that at which features are seen from the last trusted pose."""
 BORDER_PX = 16.0
-SAME = 0.05
-"""Features this near to each other, in distances from the camera, may be one: they are no rivals of each other."""
-RIVAL = 1.5
-"""Places this near to each other, in least distances of corners, may show one thing."""
-LARGEST_DISTANCE = 0.65
-"""Of the descriptors of one thing, seen from places that are not too different: half of all others are further."""
 CORNER_PX, LEAST_ALIKE = 2.0, 0.5
 """How well a corner is found again, per axis; the least correlation of a patch that says it better."""
 MOST_ROUNDS = 10
 """Of a pose's refinement on what is seen around it."""
+MOST_SHARE = 0.8
+"""Of the corners of the last view that are found again, so many must show the motion that the map shows."""
 LEAST_SCALE, LARGEST_SCALE = 0.4, 1.2
 """A window that was kept is described at these sizes."""
 
@@ -44,6 +47,8 @@ class Attempt:
         places: corners of the image.
         pairs: of a landmark and a place that are like each other and like nothing else.
         agreeing: pairs that a pose explains, after the search around it; 0 where no pose was computed.
+        matched: corners of the last view before the loss that are found again; 0 where they were too few.
+        confirming: of these, how many the pose explains.
         accepted: whether that was convincing.
     """
 
@@ -51,6 +56,8 @@ class Attempt:
     places: int = 0
     pairs: int = 0
     agreeing: int = 0
+    matched: int = 0
+    confirming: int = 0
     accepted: bool = False
 
 
@@ -80,13 +87,24 @@ class Relocaliser:
         """The last one."""
         self._seen_from: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None = None
 
-    def find(self, belief: Belief, image: np.ndarray, near: np.ndarray) -> PoseLaw | None:
+    @property
+    def sure(self) -> bool:
+        """Whether the last image was recognised beyond doubt."""
+        one, config = self.attempt, self.config
+        return one is not None and (
+            one.agreeing >= config.sure or confirmed(one.agreeing, one.confirming, one.matched, config)
+        )
+
+    def find(
+        self, belief: Belief, image: np.ndarray, near: np.ndarray, last: LastView | None = None
+    ) -> PoseLaw | None:
         """Where the camera must be, if enough of the map's landmarks with known depth are seen.
 
         Args:
             belief: where they are, in the heaviest particle.
             image: (H, W) uint8.
             near: (7,) world_from_camera from which the landmarks' looks are predicted: the last trusted pose.
+            last: the image from there, if there is one.
 
         Returns:
             The law in the heaviest particle's world; None where the camera is not found.
@@ -100,29 +118,81 @@ class Relocaliser:
         self.attempt = replace(self.attempt, places=px.shape[0])
         if px.shape[0] < config.inliers:
             return None
-        away = distances(self._looks(rows, points, near), image, px)
+        there = described(image, px)
+        away = distances(self._looks(rows, points, near), there)
         size = np.linalg.norm(points - SE3.translation(near), axis=-1).mean()
         pairs = unmistakable(away, points / size, px / config.spacing_px, config.ratio)
-        self.attempt = replace(self.attempt, pairs=pairs[0].size)
-        # Drawn anew for each image: a run that is resumed draws the same.
-        rng = np.random.default_rng(px.shape[0])
+        again = None if last is None else last.seen_again(there, px, points)
+        matched, view = (0, None) if again is None else (again[0].size, again[1])
+        self.attempt = replace(self.attempt, pairs=pairs[0].size, matched=matched)
         looks = Looks(image, rows, points, px)
-        places = self._sharp(looks, pairs, near)
-        rough = resect_consensus(camera, points[pairs[0]], places, config.within_px, config.triples, rng)
+        rough = self._rough(points[pairs[0]], self._sharp(looks, pairs, near), view)
         if rough is None:
             return None
-        grown = self._grown(looks, rough.world_from_camera, away)
+        if last is not None and again is not None:
+            view = last.sharpened(image, *again, rough)
+        grown = self._grown(looks, rough, away, view)
         if grown is None:
             return None
         found, places = grown
-        accepted = convincing(found, places, camera.width, config)
-        self.attempt = replace(self.attempt, agreeing=int(found.inliers.sum()), accepted=accepted)
+        confirming = 0
+        if view is not None:
+            confirming = int((squared_distances(camera, found.world_from_camera[None], view) <= GATE).sum())
+        accepted = convincing(found, places, camera.width, config) or confirmed(
+            int(found.inliers.sum()), confirming, matched, config
+        )
+        self.attempt = replace(
+            self.attempt, agreeing=int(found.inliers.sum()), confirming=confirming, accepted=accepted
+        )
         if not accepted:
             return None
         noise = config.inflation * max(found.rms_px, self.sensor.config.noise_px)
         return PoseLaw(
             found.world_from_camera, gaussian.symmetrise(noise**2 * np.linalg.inv(found.information))
         )
+
+    def _rough(self, points: np.ndarray, places: np.ndarray, view: Sights | None) -> np.ndarray | None:
+        """The pose (7,) of three landmarks (M, 3) that most of them agree with, and the corners of the last view."""
+        config, camera = self.config, self.sensor.camera
+        # Drawn anew for each image: a run that is resumed draws the same.
+        rng = np.random.default_rng(points.shape[0])
+        if points.shape[0] < 3:
+            return None
+        both = None if view is None else self._rough_with(points, places, view, rng)
+        if both is not None:
+            return both
+        found = resect_consensus(camera, points, places, config.within_px, config.triples, rng)
+        return None if found is None else found.world_from_camera
+
+    def _rough_with(
+        self, points: np.ndarray, places: np.ndarray, view: Sights, rng: np.random.Generator
+    ) -> np.ndarray | None:
+        """The same with the corners of the last view; None where these show another motion, or none."""
+        config, camera = self.config, self.sensor.camera
+        poses = three_point_poses(points, camera.unproject(places), config.triples, rng)
+        if not poses.shape[0]:
+            return None
+        both = known_sights(points, places, config.within_px) + view
+        # A landmark says twice as much as a corner of unknown depth, and fixes the scale.
+        weights = np.where(np.arange(both.std_px.size) < points.shape[0], 2.0, 1.0)
+        losses = np.minimum(squared_distances(camera, poses, both), 4.0 * GATE) @ weights
+        found = refined_on_all(camera, poses[losses.argmin()], both)
+        if found is None or not agrees(found.inliers[points.shape[0] :]):
+            return None
+        return found.world_from_camera
+
+    def _refined(
+        self, rough: np.ndarray, points: np.ndarray, places: np.ndarray, view: Sights | None
+    ) -> Resected | None:
+        """A pose refined on landmarks, and on the corners of the last view if these agree; `inliers` of landmarks."""
+        config, camera = self.config, self.sensor.camera
+        alone = refined(camera, rough, points, places, config.within_px)
+        if view is None:
+            return alone
+        found = refined_on_all(camera, rough, known_sights(points, places, config.within_px) + view)
+        if found is None or not agrees(found.inliers[len(points) :]):
+            return alone
+        return replace(found, inliers=found.inliers[: len(points)])
 
     def _sharp(
         self, looks: Looks, pairs: tuple[np.ndarray, np.ndarray], world_from_camera: np.ndarray
@@ -134,13 +204,16 @@ class Relocaliser:
         rows, at = looks.rows[pairs[0]], looks.px[pairs[1]]
         table, config = self.sensor.table, self.sensor.config
         homogeneous = np.concatenate([looks.points[pairs[0]], np.ones((rows.size, 1))], axis=-1)
-        turn = affines(self.sensor.camera, homogeneous, table.first_pose[rows], world_from_camera)
-        templates = warp(table.source[rows], turn, config.template_px)
+        sources, poses = nearest_looks(table, rows, homogeneous, world_from_camera)
+        turn = affines(self.sensor.camera, homogeneous, poses, world_from_camera)
+        templates = warp(sources, turn, config.template_px)
         cov = np.tile(CORNER_PX**2 * np.eye(2), (rows.size, 1, 1))
         matches = search(looks.image, templates, at, cov, sigmas=config.sigmas, most_px=config.largest_px)
         return np.where((matches.score >= LEAST_ALIKE)[:, None], matches.px, at)
 
-    def _grown(self, looks: Looks, rough: np.ndarray, away: np.ndarray) -> tuple[Resected, np.ndarray] | None:
+    def _grown(
+        self, looks: Looks, rough: np.ndarray, away: np.ndarray, view: Sights | None = None
+    ) -> tuple[Resected, np.ndarray] | None:
         """The pose (7,) refined on all that is found around it, again and again while it explains more of it.
 
         Few landmarks in one part of the image determine a pose that is right for them alone; from there it has to reach
@@ -150,7 +223,7 @@ class Relocaliser:
         for _ in range(MOST_ROUNDS):
             pairs = expected(self.sensor.camera, rough, looks.points, looks.px, away, self.config.around_px)
             places = self._sharp(looks, pairs, rough)
-            found = refined(self.sensor.camera, rough, looks.points[pairs[0]], places, self.config.within_px)
+            found = self._refined(rough, looks.points[pairs[0]], places, view)
             if found is None or (best is not None and found.inliers.sum() <= best[0].inliers.sum()):
                 break
             best, rough = (found, places), found.world_from_camera
@@ -163,7 +236,8 @@ class Relocaliser:
             return known[3]
         table = self.sensor.table
         homogeneous = np.concatenate([points, np.ones((rows.size, 1))], axis=-1)
-        turn = affines(self.sensor.camera, homogeneous, table.first_pose[rows], near)
+        sources, poses = nearest_looks(table, rows, homogeneous, near)
+        turn = affines(self.sensor.camera, homogeneous, poses, near)
         # Features behind the camera or at a grazing angle are described as they were seen at first.
         with np.errstate(all="ignore"):
             area = turn[:, 0, 0] * turn[:, 1, 1] - turn[:, 0, 1] * turn[:, 1, 0]
@@ -171,71 +245,9 @@ class Relocaliser:
         angle = np.arctan2(turn[:, 1, 0] - turn[:, 0, 1], turn[:, 0, 0] + turn[:, 1, 1])
         sane = np.isfinite(turn).all(axis=(1, 2)) & (scale > 0.25) & (scale < 4.0)
         scale, angle = np.where(sane, scale, 1.0), np.where(sane, angle, 0.0)
-        looks = describe_windows(table.source[rows], np.clip(scale, LEAST_SCALE, LARGEST_SCALE), angle)
+        looks = describe_windows(sources, np.clip(scale, LEAST_SCALE, LARGEST_SCALE), angle)
         self._seen_from = *asked, looks
         return looks
-
-
-def known_places(sensor: ImageSensor, belief: Belief, share: float) -> tuple[np.ndarray, np.ndarray]:
-    """Rows (K,) of the living features whose depth is known to this share, and where they are (K, 3)."""
-    table = sensor.table
-    rows = np.flatnonzero(table.alive)
-    rows = rows[sensor.features.deep(belief, rows, table.member[rows], share)]
-    which, places = sensor.features.places(belief, rows, table.member[rows])
-    return rows[which], places[:, :3] / places[:, 3:]
-
-
-def distances(looks: np.ndarray, image: np.ndarray, px: np.ndarray) -> np.ndarray:
-    """Least distance (L, K) of descriptors (L, 128) from those of places (K, 2) of an image, over `SCALES`."""
-    scales = np.repeat(SCALES, px.shape[0])
-    there = describe(image, np.tile(px, (len(SCALES), 1)), scales)
-    alike = (looks @ there.T).reshape(looks.shape[0], len(SCALES), -1).max(axis=1)
-    return np.asarray(np.sqrt(np.maximum(2.0 - 2.0 * alike, 0.0)))
-
-
-def unmistakable(
-    away: np.ndarray, points: np.ndarray, px: np.ndarray, ratio: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs (M,), (M,) of landmark and place that are like each other and like nothing else (D. Lowe's ratio).
-
-    Args:
-        away: (L, K) distances of descriptors.
-        points: (L, 3) of the landmarks; nearer than `SAME` they are no rivals.
-        px: (K, 2) of the places; nearer than `RIVAL` they are no rivals.
-        ratio: of the distances from the best and the next.
-    """
-    best = away.argmin(axis=1)
-    chosen = away[np.arange(best.size), best]
-    other_place = np.linalg.norm(px[best][:, None] - px, axis=-1) > RIVAL
-    other_point = np.linalg.norm(points[:, None] - points, axis=-1) > SAME
-    next_place = np.where(other_place, away, np.inf).min(axis=1)
-    next_point = np.where(other_point, away[:, best].T, np.inf).min(axis=1)
-    return _one_each(best, chosen, chosen <= ratio * np.minimum(next_place, next_point))
-
-
-def expected(
-    camera: Pinhole,
-    world_from_camera: np.ndarray,
-    points: np.ndarray,
-    px: np.ndarray,
-    away: np.ndarray,
-    around_px: float,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs (M,), (M,) of landmark and the place most like it near to where it should be seen from a pose."""
-    seen = SE3.inverse_transform(world_from_camera, points)
-    near = np.linalg.norm(camera.project(seen)[:, None] - px, axis=-1) <= around_px
-    masked = np.where(near & camera.visible(seen)[:, None], away, np.inf)
-    best = masked.argmin(axis=1)
-    chosen = masked[np.arange(best.size), best]
-    return _one_each(best, chosen, chosen <= LARGEST_DISTANCE)
-
-
-def _one_each(best: np.ndarray, chosen: np.ndarray, clear: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of several landmarks at one place only the most alike counts: one is mistaken, or they are the same."""
-    order = np.flatnonzero(clear)[np.argsort(chosen[clear], kind="stable")]
-    _, first = np.unique(best[order], return_index=True)
-    kept = np.sort(order[first])
-    return kept, best[kept]
 
 
 def convincing(found: Resected, px: np.ndarray, width: int, config: RecoveryConfig) -> bool:
@@ -246,3 +258,21 @@ def convincing(found: Resected, px: np.ndarray, width: int, config: RecoveryConf
     places = px[found.inliers]
     narrow = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)[1] / np.sqrt(count)
     return bool(narrow >= config.spread * width)
+
+
+def confirmed(landmarks: int, corners_: int, of: int, config: RecoveryConfig) -> bool:
+    """Some landmarks agree, which fix the scale, and most of the last view's corners: these alone leave no doubt."""
+    return landmarks >= config.few and corners_ >= max(LEAST, MOST_SHARE * of)
+
+
+def agrees(corners_: np.ndarray) -> bool:
+    """Whether nearly all corners (K,) of the last view show the motion that the map shows.
+
+    Where the map is torn they do not, and it is the map in which the camera has to be found.
+    """
+    return bool(corners_.sum() >= max(LEAST, MOST_SHARE * corners_.size))
+
+
+def known_sights(points: np.ndarray, px: np.ndarray, within_px: float) -> Sights:
+    """Of landmarks (M, 3) at px (M, 2), which agree within so many pixels."""
+    return Sights(points, np.zeros_like(points), px, np.full(len(px), within_px / np.sqrt(GATE)))

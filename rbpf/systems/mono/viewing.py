@@ -44,3 +44,17 @@ def affines(
     on_patch = position + along[..., None] * world_rays
     first = camera.project(SE3.inverse_transform(first_pose[:, None], on_patch))
     return np.stack([first[:, 0] - first[:, 1], first[:, 2] - first[:, 3]], axis=-1) / 2.0
+
+
+def turned(place: np.ndarray, one_pose: np.ndarray, other_pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Between two cameras, of each place: cosine (K,) of the lines of sight, and ratio (K,) of the distances.
+
+    Args:
+        place: (K, 4) homogeneous world points.
+        one_pose: (7,) or (K, 7) world_from_camera.
+        other_pose: likewise.
+    """
+    one, other = (place[:, :3] - place[:, 3:] * SE3.translation(pose) for pose in (one_pose, other_pose))
+    far, near = np.linalg.norm(one, axis=-1), np.linalg.norm(other, axis=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return (one * other).sum(axis=-1) / (far * near), far / near
