@@ -12,7 +12,8 @@ from rbpf.sensors.consensus_resection import Resected
 from rbpf.sensors.corners import corners
 from rbpf.systems.mono.config import MonoConfig, RecoveryConfig
 from rbpf.systems.mono.image_sensor import ImageSensor, Searched
-from rbpf.systems.mono.relocalise import Looks, Relocaliser, convincing, known_places, unmistakable
+from rbpf.systems.mono.likeness import known_places, unmistakable
+from rbpf.systems.mono.relocalise import Looks, Relocaliser, convincing
 from rbpf.systems.mono.system import build_features
 from rbpf.systems.mono.video import VideoRun, run_images
 from tests.systems.plane_sequences import CAMERA, Pictures, known_points, path, sequence, texture, view

@@ -112,7 +112,7 @@ class Relocaliser:
         config, camera = self.config, self.sensor.camera
         rows, points = known_places(self.sensor, belief, config.depth_share)
         self.attempt = Attempt(rows.size)
-        if rows.size < config.inliers:
+        if rows.size < (config.inliers if last is None else config.few):
             return None
         px, _ = corners(image, np.zeros((0, 2)), config.corners, config.spacing_px, BORDER_PX)
         self.attempt = replace(self.attempt, places=px.shape[0])
