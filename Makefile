@@ -2,6 +2,8 @@
 PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/stamp
+# Each process takes a stretch of the tests, so that what a module prepares is prepared once, and helps when it is done.
+PYTEST := $(BIN)/python -m pytest -n 2 --dist worksteal
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test check bench coverage docs clean
@@ -24,17 +26,17 @@ demo: $(STAMP) ## simulate, filter and report into demo/
 	$(BIN)/rbpf demo --out demo
 
 test: $(STAMP) ## all tests
-	$(BIN)/python -m pytest -n 2
+	$(PYTEST)
 
 check: $(STAMP) ## format, lint, types, import rules and the fast tests
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/python -m pytest -n 2 -m "not slow and not real_data"
+	$(PYTEST) -m "not slow and not real_data"
 
 bench: $(STAMP) ## run the benchmarks against their baselines
-	$(BIN)/python -m benchmarks
+	$(BIN)/python -m benchmarks --gate
 
 coverage: $(STAMP) ## all tests, with the share of lines that they run
 	$(BIN)/python -m pytest -n 2 --cov --cov-report=term --cov-report=html:coverage

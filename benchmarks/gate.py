@@ -7,9 +7,10 @@ from pathlib import Path
 from benchmarks.rows import Row
 
 
-def write_baseline(path: Path, rows: Sequence[Row]) -> None:
-    """Ratios and tolerances, by name."""
-    figures = {
+def write_baseline(path: Path, rows: Sequence[Row], partial: bool) -> None:
+    """Ratios and tolerances, by name; where only some were run, those of the others stay."""
+    kept = json.loads(path.read_text(encoding="utf-8")) if partial else {}
+    figures = kept | {
         row.name: {
             "ratio": round(row.ratio, 4),
             "higher": row.higher,
@@ -22,10 +23,13 @@ def write_baseline(path: Path, rows: Sequence[Row]) -> None:
 
 
 def regressions(path: Path, rows: Sequence[Row], partial: bool) -> list[str]:
-    """What got worse by more than its tolerance, and, unless only some were run, what is missing; in sentences."""
+    """What got worse by more than its tolerance or has no baseline; in sentences.
+
+    Unless only some were run, also what the baseline has and the run has not.
+    """
     baseline = json.loads(path.read_text(encoding="utf-8"))
     measured = {row.name: row.ratio for row in rows}
-    sentences = []
+    sentences = [f"{name}: no baseline, record one" for name in measured if name not in baseline]
     for name, entry in baseline.items():
         if name not in measured:
             if not partial and not entry["optional"]:

@@ -14,7 +14,7 @@ from rbpf.likelihoods import Gaussian
 from rbpf.maps.layout import Layout
 from rbpf.maps.plan import BOTH, MAP, STATE, Plan, by_use, make_plan, require_apart
 from rbpf.maps.point import Point
-from rbpf.maps.reading import linearise_compiled, project_compiled, read_records
+from rbpf.maps.reading import linearise_one_particle, project_compiled, read_records
 from rbpf.maps.rows import RowEngine
 from rbpf.maps.shared import ALL, SharedStore
 from rbpf.models import (
@@ -68,9 +68,7 @@ class LandmarkMap(Conditional):
     def add(self, births: Births, state: np.ndarray) -> np.ndarray:
         """Starts landmarks from first sightings at the states (N, E); returns their ids (K,)."""
         records = births.model.initialise(state, births.z, births.cov)
-        log_odds = None
-        if births.mask is not None:
-            log_odds = np.where(births.mask, 0.0, -np.inf)
+        log_odds = None if births.mask is None else np.where(births.mask, 0.0, -np.inf)
         ids = self.add_records(records, births.landmark, log_odds)
         for landmark, fact in zip(ids.tolist(), births.facts, strict=False):
             self.catalogue[landmark] = fact
@@ -98,15 +96,13 @@ class LandmarkMap(Conditional):
 
     def read(self, ids: np.ndarray, particles: np.ndarray | slice = ALL) -> Records:
         """Estimates (N, K, …) of landmarks that share one parametrisation, in all or some particles."""
-        self._known(ids)
         ids = np.asarray(ids)
         if ids.size == 0:
             raise InputError("no landmark was named")
         kinds = self.store.columns.kinds(ids)
-        if (kinds != kinds[0]).any():
-            raise InputError(
-                "read() takes landmarks of one parametrisation at a time; `landmark_of` tells which"
-            )
+        if kinds[0] < 0 or (kinds != kinds[0]).any():
+            self._known(ids)
+            raise InputError("read() takes landmarks of one parametrisation at a time: see `landmark_of`")
         return read_records(self.store, self.layouts[kinds[0]], ids, particles)
 
     def is_compiled(self, model: ObservationModel, ids: np.ndarray) -> bool:
@@ -127,17 +123,10 @@ class LandmarkMap(Conditional):
     def innovations(
         self, model: ObservationModel, z: np.ndarray, ids: np.ndarray, state: np.ndarray, particle: int
     ) -> tuple[np.ndarray, Jacobians, Records]:
-        """Of landmarks (K,) measured as z (K, p), in one particle at a state (E,).
-
-        Returns:
-            ν (K, p), its Jacobians (K, p, …), and the records (1, K, …).
-        """
+        """ν (K, p) of landmarks (K,) in one particle at a state (E,), its Jacobians, and the records (1, K, …)."""
         records = self.read(ids, slice(particle, particle + 1))
         kernel = model.kernel() if self.compiled else None
-        if kernel is not None and self._layout_of(int(ids[0])).landmark.components == 1:
-            return *linearise_compiled(kernel, records, z, state, self.space.dim), records
-        const = None if records.const is None else records.const[0]
-        return *linearise(model, self.space, z, state[None], records.mean[0], const), records
+        return *linearise_one_particle(model, kernel, self.space, records, z, state), records
 
     def landmark_of(self, landmark_id: int) -> Landmark:
         """The parametrisation of a landmark."""
@@ -272,10 +261,8 @@ class LandmarkMap(Conditional):
         named = checked(arrays, "map/fact_ids", (None,), "i")
         if not self.store.columns.held(named).all():
             raise InputError("the array map/fact_ids names a landmark that the map does not hold")
-        facts = zip(
-            named.tolist(), checked(arrays, "map/facts", (named.size,), "iufbU").tolist(), strict=True
-        )
-        self.catalogue = dict(facts)
+        facts = checked(arrays, "map/facts", (named.size,), "iufbU").tolist()
+        self.catalogue = dict(zip(named.tolist(), facts, strict=True))
 
     def register(self, landmark: Landmark) -> None:
         """Names a parametrisation before it is first used, so that a checkpoint can be read back."""

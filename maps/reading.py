@@ -5,9 +5,11 @@ import numpy as np
 from rbpf.kernels.gather import gather
 from rbpf.kernels.project import project
 from rbpf.kernels.single import linearise_one
+from rbpf.lie import LieGroup
 from rbpf.maps.layout import Layout
 from rbpf.maps.shared import ALL, SharedStore
-from rbpf.models import FusedKernel, Jacobians, Records
+from rbpf.models import FusedKernel, Jacobians, ObservationModel, Records
+from rbpf.numeric import linearise
 from rbpf.proposals import Prior
 
 
@@ -26,21 +28,32 @@ def read_records(
     return Records(mean, cov, const if landmark.constants else None)
 
 
-def linearise_compiled(
-    kernel: FusedKernel, records: Records, z: np.ndarray, state: np.ndarray, dim: int
+def linearise_one_particle(
+    model: ObservationModel,
+    kernel: FusedKernel | None,
+    space: LieGroup,
+    records: Records,
+    z: np.ndarray,
+    state: np.ndarray,
 ) -> tuple[np.ndarray, Jacobians]:
     """Innovations (K, p) and Jacobians of one particle's landmarks, records (1, K, …), at its state (E,).
 
-    The twin of `rbpf.numeric.linearise`, for a state of `dim` coordinates.
+    What `rbpf.numeric.linearise` gives, by the model's kernel where there is one.
     """
     mean = records.mean[0]
+    const = None if records.const is None else records.const[0]
+    if kernel is None or records.log_weights is not None:
+        return linearise(model, space, z, state[None], mean, const)
     count, p = z.shape
-    const = np.empty((count, 0)) if records.const is None else records.const[0]
-    jac_state, jac_landmark = np.empty((count, p, dim)), np.empty((count, p, mean.shape[1]))
-    nu = np.empty((count, p))
+    nu, jac_state, jac_map = (
+        np.empty((count, p)),
+        np.empty((count, p, space.dim)),
+        np.empty((*z.shape, mean.shape[1])),
+    )
+    const = np.empty((count, 0)) if const is None else const
     arrays = (np.ascontiguousarray(array, dtype=float) for array in (state, mean, const, z))
-    linearise_one(kernel.function.address, kernel.params, *arrays, nu, jac_state, jac_landmark)
-    return nu, Jacobians(jac_state, jac_landmark)
+    linearise_one(kernel.function.address, kernel.params, *arrays, nu, jac_state, jac_map)
+    return nu, Jacobians(jac_state, jac_map)
 
 
 def project_compiled(

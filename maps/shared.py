@@ -114,17 +114,20 @@ class SharedStore:
     def access(self, columns: np.ndarray) -> Access:
         """Lets a kernel read columns (K,), at least one, of one record size; cold ones are warmed up first."""
         at = self.columns.rows(columns)
-        for column in columns[self.columns.slab[at] < 0].tolist():
-            if column in self._cold:
-                self.replace(column, self.read(column))
-        generations = self.columns.generation[at]
-        if (generations == generations[0]).all():
-            maps, which = self.lineage.rows(int(generations[0]))[None], np.zeros(columns.size, dtype=np.int64)
+        slabs = self.columns.slab[at]
+        if slabs.min() < 0:
+            for column in columns[slabs < 0].tolist():
+                if column in self._cold:
+                    self.replace(column, self.read(column))
+            slabs = self.columns.slab[at]
+        generations = self.columns.generation[at].tolist()
+        number = {generation: k for k, generation in enumerate(dict.fromkeys(generations))}
+        if len(number) == 1:
+            maps, which = self.lineage.rows(generations[0])[None], np.zeros(columns.size, dtype=np.int64)
         else:
-            number: dict[int, int] = {}
-            which = np.array([number.setdefault(g, len(number)) for g in generations.tolist()])
-            maps = np.array([self.lineage.rows(g) for g in number])
-        return Access(self._pool(int(at[0])).data, self.columns.slab[at], which, maps)
+            which = np.array([number[generation] for generation in generations])
+            maps = np.array([self.lineage.rows(generation) for generation in number])
+        return Access(self._pool(int(at[0])).data, slabs, which, maps)
 
     def rewrite(self, columns: np.ndarray) -> tuple[Access, np.ndarray]:
         """Lets a kernel overwrite columns (K,) in every particle: what to read, and the slabs to write.

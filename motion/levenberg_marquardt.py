@@ -10,7 +10,6 @@ costs no decomposition. λ follows the ratio of the decrease found to the decrea
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -56,14 +55,16 @@ class Minimum:
     Attributes:
         x: (E,).
         residual: (m,) ε there.
-        jacobian: (m, d) J there.
+        s: (d,) singular values of J there, descending.
+        vt: (d, d) its right singular vectors, by rows.
         iterations: steps that were tried.
         converged: whether the remaining offset is below the rule's.
     """
 
     x: Array
     residual: Array
-    jacobian: Array
+    s: Array
+    vt: Array
     iterations: int
     converged: bool
 
@@ -72,11 +73,10 @@ class Minimum:
         """‖ε‖²."""
         return float(self.residual @ self.residual)
 
-    @cached_property
+    @property
     def factor(self) -> Array:
         """V S⁻¹ (d, d), a square root of `cov`."""
-        _, s, vt = np.linalg.svd(self.jacobian, full_matrices=False)
-        return vt.T / np.maximum(s, SINGULAR * s[0])
+        return self.vt.T / np.maximum(self.s, SINGULAR * self.s[0])
 
     @property
     def cov(self) -> Array:
@@ -147,15 +147,18 @@ def minimise(evaluate: Evaluate, x: Array, retract: Retract, rule: Rule | None =
         if not (gain > 0.0 and np.isfinite(slope).all()):
             damping, growth = growth * max(damping, SINGULAR * float(local.s[0])), 2.0 * growth
             continue
-        x, residual, jac, local = tried, found, slope, _linearised(found, slope)
+        x, residual, local = tried, found, _linearised(found, slope)
         damping, growth = damping * np.sqrt(max(1.0 / 9.0, 1.0 - (2.0 * gain - 1.0) ** 3)), 2.0
-    return Minimum(x, residual, jac, iterations, _settled(local, rule))
+    return Minimum(x, residual, local.s, local.vt, iterations, _settled(local, rule))
 
 
 def _linearised(residual: Array, jac: Array) -> _Local:
-    u, s, vt = np.linalg.svd(jac, full_matrices=False)
+    # [J ε] = Q [R r]: R has J's singular values and V, and r = Qᵀε; it is as small as the number of unknowns.
+    size = jac.shape[1]
+    triangle = np.asarray(np.linalg.qr(np.column_stack([jac, residual]), mode="r"))
+    u, s, vt = np.linalg.svd(triangle[:size, :size])
     # Along a direction that is not determined there is nowhere to go.
-    along = np.where(s > SINGULAR * s[0], u.T @ residual, 0.0)
+    along = np.where(s > SINGULAR * s[0], u.T @ triangle[:size, size], 0.0)
     return _Local(float(residual @ residual), along, s, vt)
 
 

@@ -11,19 +11,13 @@ import numpy as np
 
 from rbpf import gaussian
 from rbpf.lie import SE3, Array
-from rbpf.motion.stereo_geometry import Matches, homography, points_from_pixels, raise_pixels, see
+from rbpf.motion.stereo_geometry import Matches, homography, lens, points_from_pixels, raise_pixels
 
 REFINEMENTS = 2
 """Gauss-Newton steps on the nine pixels of a triple."""
 
-STIFFNESS = 1e-9
-"""Added to the information of a triple, as a share of its trace: three points on a line leave a turn open."""
-
 FARTHEST = 1e4
 """Baselines away at most is a point put for the alignment."""
-
-FLAT = 1e-12
-"""Shortest length that is divided by: points that coincide have no direction."""
 
 
 @dataclass(frozen=True)
@@ -85,45 +79,23 @@ def triples(count: int, n: int, rng: np.random.Generator) -> np.ndarray:
     return np.stack([first, second, third + (third >= high)], axis=1)
 
 
-def align(before: Array, now: Array) -> Array:
-    """Motions T (…, 7) with T now = before, for triples of points (…, 3, 3); exact where the triangles are congruent.
-
-    The triangles' planes are laid on one another, with their centres and the directions of their first edges.
-    """
-    turn = _frame(before) @ _frame(now).mT
-    shift = before.mean(axis=-2) - (turn @ now.mean(axis=-2)[..., None])[..., 0]
-    return SE3.from_matrix(np.concatenate([turn, shift[..., None]], axis=-1))
-
-
-def _frame(points: Array) -> Array:
-    """Rotations (…, 3, 3): the triangle's first edge, the direction across it in its plane, and the plane's normal."""
-    edge = _unit(points[..., 1, :] - points[..., 0, :])
-    normal = _unit(np.cross(edge, points[..., 2, :] - points[..., 0, :]))
-    return np.stack([edge, np.cross(normal, edge), normal], axis=-1)
-
-
-def _unit(v: Array) -> Array:
-    return v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), FLAT)
-
-
 class _Search:
     """What stays the same for all motions."""
 
     def __init__(self, matches: Matches, start: Array) -> None:
-        self.matches, self.start = matches, start
+        self.matches, self.start = matches, np.ascontiguousarray(start, dtype=float)
         self.before, self.now = (_points(matches, z) for z in (matches.z_prev, matches.z_now))
-        # Wᵀ W = (R⁻ + R)⁻¹.
-        info = gaussian.inverse(matches.cov_prev + matches.cov_now)
-        self.white = np.ascontiguousarray(gaussian.cholesky(info).mT)
+        # W = L⁻¹ with L Lᵀ = R⁻ + R.
+        chol = gaussian.cholesky(matches.cov_prev + matches.cov_now)
+        self.white = np.ascontiguousarray(gaussian.solve_lower_matrix(chol, np.eye(3)))
 
     def candidates(self, rows: np.ndarray) -> Array:
-        """Motions (C, 7) of triples (C, 3)."""
-        aligned = align(self.before[rows], self.now[rows])
-        guesses = np.stack([aligned, np.broadcast_to(self.start, aligned.shape)])
-        nearer = self.squared(guesses, rows).sum(axis=-1).argmin(axis=0)
-        motions = guesses[nearer, np.arange(len(rows))]
-        for _ in range(REFINEMENTS):
-            motions = self._step(motions, rows)
+        """Motions (C, 7) of triples (C, 3): aligned, or the start where that is better, and refined (compiled)."""
+        from rbpf.motion.stereo_triple_kernels import propose
+
+        matches, motions = self.matches, np.empty((len(rows), 7))
+        pixels = (matches.z_prev, matches.z_now, self.white, lens(matches.camera))
+        propose(rows, self.before, self.now, *pixels, self.start, REFINEMENTS, motions)
         return motions
 
     def scores(self, motions: Array, gate: float) -> tuple[Array, Array]:
@@ -135,26 +107,6 @@ class _Search:
         matrices = homography(matches.camera, motions)
         stereo_kernels.scores(matrices, matches.z_prev, matches.z_now, self.white, gate, score, agreeing)
         return score, agreeing / len(matches)
-
-    def squared(self, motions: Array, rows: np.ndarray) -> Array:
-        """Squared distances (…, k) of some rows (…, k) at motions (…, 7); infinite behind the camera."""
-        raised = raise_pixels(homography(self.matches.camera, motions), self.matches.z_prev[rows])
-        front = raised[..., 3] > 0.0
-        seen = raised[..., :3] / np.where(front, raised[..., 3], 1.0)[..., None]
-        return np.where(front, np.square(self._white_miss(seen, rows)).sum(axis=-1), np.inf)
-
-    def _white_miss(self, seen: Array, rows: np.ndarray) -> Array:
-        return np.einsum("...ij,...j->...i", self.white[rows], self.matches.z_now[rows] - seen)
-
-    def _step(self, motions: Array, rows: np.ndarray) -> Array:
-        """A Gauss-Newton step of each motion (C, 7) on its triple (C, 3)."""
-        seen = see(self.matches.camera, motions, self.matches.z_prev[rows])
-        miss = self._white_miss(seen.pixels, rows).reshape(len(rows), -1, 1)
-        jac = (self.white[rows] @ seen.by_motion).reshape(len(rows), -1, 6)
-        info = jac.mT @ jac
-        stiff = STIFFNESS * np.trace(info, axis1=1, axis2=2) + np.finfo(float).tiny
-        step = np.linalg.solve(info + stiff[:, None, None] * np.eye(6), jac.mT @ miss)
-        return SE3.retract(motions, step[..., 0])
 
 
 def _points(matches: Matches, pixels: Array) -> Array:

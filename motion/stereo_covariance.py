@@ -39,15 +39,16 @@ def honest_covariance(matches: Matches, found: Innovation, factor: Array) -> Arr
 
 def _noise(matches: Matches, found: Innovation) -> Array:
     """D (6, 6)."""
-    seen, info = found.seen, np.linalg.inv(found.cov)
-    gain = matches.cov_prev @ seen.by_pixels.mT
-    cov_pixels = matches.cov_prev - gain @ info @ gain.mT
-    # ρ = (u_left − u_right) / (f b).
+    seen = found.seen
+    # ρ = (u_left − u_right) / (f b), of the pixels m̂: cov m̂ = R⁻ − R⁻Aᵀ S⁻¹ A R⁻.
     shift = matches.camera.camera.fx * matches.camera.baseline_m
-    disparity = np.array([1.0, 0.0, -1.0]) / shift
-    variance = np.einsum("i,kij,j->k", disparity, cov_pixels, disparity)
+    across = matches.cov_prev @ (np.array([1.0, 0.0, -1.0]) / shift)
+    gain = seen.by_pixels @ across[..., None]
+    solved = np.linalg.solve(found.cov, np.concatenate([gain, seen.by_nearness], axis=-1))
+    variance = (across[:, 0] - across[:, 2]) / shift - (gain * solved[..., :1]).sum(axis=(1, 2))
     noise = np.zeros((6, 6))
-    noise[3:, 3:] = np.einsum("k,kpi,kpq,kqj->ij", variance, seen.by_nearness, info, seen.by_nearness)
+    scaled = variance[:, None, None] * seen.by_nearness
+    noise[3:, 3:] = scaled.reshape(-1, 3).T @ solved[..., 1:].reshape(-1, 3)
     return noise
 
 

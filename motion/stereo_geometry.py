@@ -102,6 +102,12 @@ class Seen:
         return np.concatenate([self.by_turn, self.nearness[..., None, None] * self.by_nearness], axis=-1)
 
 
+def lens(camera: StereoCamera) -> Array:
+    """What compiled functions take a camera for, (5,): fx, fy, cx, cy, fx · baseline."""
+    one = camera.camera
+    return np.array([one.fx, one.fy, one.cx, one.cy, one.fx * camera.baseline_m])
+
+
 def pixels_from_points(camera: StereoCamera) -> Array:
     """Q (4, 4)."""
     one, shift = camera.camera, camera.camera.fx * camera.baseline_m

@@ -16,7 +16,7 @@ import numpy as np
 
 from rbpf import gaussian
 from rbpf.lie import Array
-from rbpf.motion.stereo_geometry import Matches, Seen, homography, see
+from rbpf.motion.stereo_geometry import Matches, Seen, homography, lens, see
 
 Points = Literal["adjusted", "propagated", "exact"]
 """What the earlier frame's points are taken for.
@@ -90,15 +90,11 @@ def white_rows(matches: Matches, delta: Array, points: Points) -> WhiteRows:
     """The innovation at a motion, whitened (compiled)."""
     from rbpf.motion import stereo_kernels
 
-    one, shift, count = (
-        matches.camera.camera,
-        matches.camera.camera.fx * matches.camera.baseline_m,
-        len(matches),
-    )
+    count = len(matches)
     found = WhiteRows(np.empty((count, 3, 7)), np.empty(count, dtype=bool), np.empty((count, 3)))
     stereo_kernels.white_rows(
         homography(matches.camera, delta),
-        np.array([one.fx, one.fy, one.cx, one.cy, shift]),
+        lens(matches.camera),
         *(matches.z_prev, matches.z_now, matches.cov_prev, matches.cov_now),
         points != "exact",
         SWEEPS if points == "adjusted" else 0,

@@ -95,9 +95,8 @@ class Belief:
         The covariance is within + between particles, H Q Hᵀ included, without the measurement's own noise.
         """
         if self.map.is_compiled(model, ids):
-            at_mode = self.read_mode(ids)
-            const = None if at_mode.const is None else at_mode.const[0]
-            anchor = model.predict(self.state[self.mode][None], at_mode.mean[0], const)
+            nothing = np.zeros((ids.size, model.dim))
+            anchor = -self.map.innovations(model, nothing, ids, self.state[self.mode], self.mode)[0]
             mean, cov = self.map.project(model, ids, anchor, self.weights, self.prior)
             return anchor + mean, cov
         records, state = self.read(ids), self.state[:, None, :]

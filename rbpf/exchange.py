@@ -84,7 +84,7 @@ class Records:
 
     mean: Float[np.ndarray, "N K *C D"]
     cov: Float[np.ndarray, "N K *C D D"]
-    const: Float[np.ndarray, "N K A"] | None = None
+    const: Float[np.ndarray, "#N K A"] | None = None
     log_weights: Float[np.ndarray, "N K C"] | None = None
 
 

@@ -30,27 +30,37 @@ class Gaussian(Likelihood):
 class TruncatedMahalanobis(Likelihood):
     """−½ min(T_l, νᵀS⁻¹ν), S05 (6); a null match costs T_l/2. It is no density: evidence is not defined.
 
+    What T_l bounds is the weight. That a landmark is not updated by what is clipped does not follow, and S05 does not
+    say so: at 4.0 a quarter of the true measurements would be lost, those that contradict the particle's map.
+
     Args:
         limit: T_l, dimensionless; the paper's is 4.0.
+        update_limit: νᵀS⁻¹ν beyond which an observation does not move the state or the landmark either; None is T_l.
     """
 
     normalised = False
     form = 1
 
-    def __init__(self, limit: float = 4.0) -> None:
+    def __init__(self, limit: float = 4.0, update_limit: float | None = None) -> None:
         if not limit > 0:
             raise InputError(
                 f"the limit T_l of a truncated Mahalanobis likelihood must be positive, got {limit}"
             )
-        self.params = np.array([float(limit)])
+        update_limit = limit if update_limit is None else update_limit
+        if not update_limit >= limit:
+            raise InputError(
+                f"the update_limit of a truncated Mahalanobis likelihood must be at least T_l = {limit:g}, "
+                f"got {update_limit}"
+            )
+        self.params = np.array([limit, update_limit], dtype=float)
 
     def log_density(self, nu: np.ndarray, cov: np.ndarray) -> np.ndarray:
         """(…, p), (…, p, p) → (…)."""
         return -0.5 * np.minimum(self.params[0], squared_mahalanobis(nu, cov))
 
     def inlier(self, nu: np.ndarray, cov: np.ndarray) -> np.ndarray:
-        """Within the limit."""
-        return squared_mahalanobis(nu, cov) <= self.params[0]
+        """Within the limit for updates."""
+        return squared_mahalanobis(nu, cov) <= self.params[1]
 
     def log_outlier(self) -> float:
         """−T_l/2."""

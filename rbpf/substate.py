@@ -64,9 +64,11 @@ class KalmanSubstate(Conditional):
                 f"the substate has {m} numbers: expected coupling (·, {d}, {m}), dynamics (·, {m}, {m}) and "
                 f"drift (·, {m}), the motion model gives (·, …) {sizes}"
             )
-        blocks = (transition.coupling, transition.dynamics)
-        shared = np.broadcast_shapes(*(block.shape[:1] for block in blocks))
-        stack = np.concatenate([np.broadcast_to(b, (*shared, *b.shape[1:])) for b in blocks], axis=1)
+        blocks = [transition.coupling, transition.dynamics]
+        if blocks[0].shape[0] != blocks[1].shape[0]:
+            shared = max(block.shape[0] for block in blocks)
+            blocks = [np.broadcast_to(block, (shared, *block.shape[1:])) for block in blocks]
+        stack = np.concatenate(blocks, axis=1)
         means = (stack @ self.mean[..., None])[..., 0]
         self._increment_mean = means[:, :d]
         self._predicted = means[:, d:] + transition.drift

@@ -29,6 +29,12 @@ def data_dir() -> Path:
     return folder
 
 
+@pytest.fixture(autouse=True)
+def next_test() -> None:
+    """Shapes are checked anew in each test."""
+    switch.test += 1
+
+
 @pytest.fixture
 def unchecked_shapes(monkeypatch: pytest.MonkeyPatch) -> None:
     """For tests that hand over arrays of a wrong shape, and want to hear of it from the program."""

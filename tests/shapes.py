@@ -1,4 +1,4 @@
-"""Every call of a function of the package is checked against the shapes in its signature, in the tests alone.
+"""The first calls of each function of the package in each test are checked against the shapes in its signature.
 
 `watch` has to run before the package is imported. A call is checked after it has returned, so that bad input is refused
 by the program's own sentence; for the same reason what a dataclass holds is checked where it is handed over, not where
@@ -24,8 +24,11 @@ COMPILED = "rbpf.kernels"
 """Numba reads these functions itself."""
 
 
-switch = SimpleNamespace(on=True)
-"""Off in tests that hand over what is wrong on purpose: fixture `unchecked_shapes`."""
+CALLS = 8
+"""Of a function that are checked in each test: a filter of thousands of steps would take several times as long else."""
+
+switch = SimpleNamespace(on=True, test=0)
+"""Off in tests that hand over what is wrong on purpose: fixture `unchecked_shapes`; and the number of the test."""
 
 
 class ShapeError(TypeError):
@@ -46,6 +49,14 @@ def checked(function: Callable[..., Any]) -> Callable[..., Any]:
     if not hints:
         return function
     signature = inspect.signature(function)
+    seen = SimpleNamespace(test=-1, calls=0)
+
+    @wraps(function)
+    def some(*args: Any, **kwargs: Any) -> Any:
+        if seen.test != switch.test:
+            seen.test, seen.calls = switch.test, 0
+        seen.calls += 1
+        return (call if seen.calls <= CALLS else function)(*args, **kwargs)
 
     @jaxtyped(typechecker=None)
     @wraps(function)
@@ -60,7 +71,7 @@ def checked(function: Callable[..., Any]) -> Callable[..., Any]:
                 raise ShapeError(f"{function.__qualname__}: {name} is {given}, expected {hint}")
         return result
 
-    return call
+    return some
 
 
 def fits(value: Any, hint: Any) -> bool:

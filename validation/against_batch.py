@@ -20,6 +20,7 @@ from typing import Any, final
 import numpy as np
 
 from rbpf.errors import InputError
+from rbpf.lie import Array
 from rbpf.validation.accuracy import AbsoluteError, ate
 from rbpf.validation.batch_problem import (
     Fit,
@@ -47,6 +48,9 @@ from rbpf.validation.path_and_map import AnyRun, PathAndMap, of_run, read_path_a
 
 INSTANTS = 3
 """At how many instants poses are compared, the last one among them."""
+
+MOST_ITERATIONS = 150
+"""Of the batch at an earlier instant; where landmarks are still too far off to settle, that instant is left out."""
 
 LEAST_STEPS = 3
 """Of a run that is compared."""
@@ -171,16 +175,21 @@ def _compare_poses(
         return no_differences(filtered.space.dim)
     parts = []
     for step in np.unique(np.linspace(0, last, instants + 1).astype(int)[1:]).tolist():
-        then = (
-            optimum
-            if step == last
-            else solve_problem(first_steps(problem, step + 1), start[: step + 1], robust)
-        )
-        if int(then.steps[-1]) == step:
+        then = optimum if step == last else _until(problem, step, start, robust)
+        if then is not None and int(then.steps[-1]) == step:
             ours = filtered.at(then.steps)
             scale = scale_onto(ours, then.estimate, name_of(problem)) if floats else 1.0
             parts.append(compare_last_pose(rescaled(ours, scale), then.estimate, step, floats))
     return joined(parts, filtered.space.dim)
+
+
+def _until(problem: Problem, step: int, start: Array, robust: float | None) -> Optimum | None:
+    """The optimum of what had been measured until then; None where so little does not determine one."""
+    try:
+        part = first_steps(problem, step + 1)
+        return solve_problem(part, start[: step + 1], robust, most_iterations=MOST_ITERATIONS)
+    except InputError:
+        return None
 
 
 def _require_one_run(filtered: PathAndMap, problem: Problem) -> None:

@@ -55,6 +55,7 @@ def solve_features(
     velocity: ArrayLike | None = None,
     marginals: bool = True,
     on_iteration: Callable[[float], None] | None = None,
+    tolerance: float | None = None,
 ) -> CameraSolution:
     """Solve for all poses and landmarks at once.
 
@@ -74,6 +75,8 @@ def solve_features(
         marginals: compute covariances.
         on_iteration: told the error before each iteration, also of adjustments on the way to an initial estimate; what
             it raises ends it all.
+        tolerance: fraction of the error that is no gain any more; by default a billionth, for which far landmarks creep
+            through hundreds of iterations.
 
     Raises:
         InputError: a number makes no sense, the first frame sees too few known points and there is no initial
@@ -93,7 +96,7 @@ def solve_features(
     problem = CameraProblem(log.name, stamps_ns, table, known, robust, acceleration(velocity))
     check_problem(problem)
     start = adjuster.begin(problem, initial or from_scratch(log.name, stamps_ns, table, known, on_iteration))
-    found = adjuster.adjust(problem, start, on_iteration=on_iteration)
+    found = adjuster.adjust(problem, start, tolerance or adjuster.FINE, on_iteration)
     adjuster.require_converged(found)
     cov_poses, cov_landmarks = adjuster.covariances(found) if marginals else (np.empty((0, 6, 6)), {})
     state, names = found.state, found.problem.table.names

@@ -7,6 +7,7 @@ from typing import Any
 
 from rbpf.errors import InputError
 from rbpf.sensors.chessboard import Board, find_board
+from rbpf.sensors.markers import MarkerBoard, find_markers
 from rbpf.sensors.readers.images import ImageSequence, KnownPixels, open_images, read_known_points
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.known_map import read_known_map
@@ -53,10 +54,11 @@ class Recording:
         known_points: table of known points; None starts without any.
         calibration: camera.yaml in place of the sequence's own camera.
         board: chessboard that is seen in the first image; its corners are the known points, in its frame.
+        markers: board of ArUco markers of which some are seen in the first image; likewise.
         map: run folder, or its map, in which the camera is to be found; the map is not changed. None maps anew.
 
     Raises:
-        InputError: two of known points, board and map are given.
+        InputError: two of known points, board, markers and map are given.
     """
 
     images: Path
@@ -64,11 +66,15 @@ class Recording:
     calibration: Path | None = None
     board: Board | None = None
     map: Path | None = None
+    markers: MarkerBoard | None = None
 
     def __post_init__(self) -> None:
         if self.known_points is not None and self.board is not None:
             raise InputError("a run starts from known points or from a chessboard: give one of the two")
-        if self.map is not None and (self.known_points is not None or self.board is not None):
+        starts = self.known_points, self.board, self.markers
+        if self.markers is not None and any(start is not None for start in starts[:2]):
+            raise InputError("a run starts from markers, a chessboard or known points: give one of the three")
+        if self.map is not None and any(start is not None for start in starts):
             raise InputError(
                 "in a known map a run starts from the map: leave out known points and chessboard"
             )
@@ -79,12 +85,16 @@ class Recording:
             "recording": self.images,
             "known_points": self.known_points,
             "calibration": self.calibration,
-            "map": self.map,
+            "known_map": self.map,
         }
         board: dict[str, str | float] = {}
         if self.board is not None:
             size = f"{self.board.columns}x{self.board.rows}"
             board = {"board": size, "square_m": self.board.square_m}
+        if self.markers is not None:
+            size = f"{self.markers.columns}x{self.markers.rows}"
+            board = {"aruco": size, "marker_m": self.markers.side_m, "gap_m": self.markers.gap_m}
+            board["dictionary"] = self.markers.dictionary
         localize = {} if self.map is None else {"localize": True}
         return {name: str(path) for name, path in named.items() if path is not None} | board | localize
 
@@ -98,6 +108,8 @@ class Recording:
         sequence = open_images(self.images, self.calibration)
         if self.board is not None:
             known = find_board(first_image(sequence), self.board)
+        if self.markers is not None:
+            known = find_markers(first_image(sequence), self.markers)
         return sequence, known
 
 

@@ -70,6 +70,7 @@ def adjust_log(
     limit_s: float | None = None,
     on_iteration: Told | None = None,
     twice: bool = True,
+    tolerance: float | None = None,
 ) -> Batch:
     """Adjusts all frames that the first one is connected with through landmarks.
 
@@ -82,6 +83,7 @@ def adjust_log(
         limit_s: time after which it is given up; None waits.
         on_iteration: told how far it is.
         twice: also start from the known points alone; not needed near the optimum.
+        tolerance: see `solve_features`.
 
     Raises:
         InputError: too few frames are connected, it takes too long, or it does not converge.
@@ -94,7 +96,7 @@ def adjust_log(
     part = replace(log, frames=[log.frames[t] for t in frames], known=_softened(log.known))
     watch = _Watch(limit_s, on_iteration)
     start = CameraEstimate(world_from_camera[frames], {})
-    solution = _best(part, [start, None] if twice and log.known is not None else [start], watch)
+    solution = _best(part, [start, None] if twice and log.known is not None else [start], watch, tolerance)
     return Batch(replace(part, known=log.known), frames, solution)
 
 
@@ -105,13 +107,19 @@ def _softened(known: KnownPoints | None) -> KnownPoints | None:
     return replace(known, cov=np.tile((EXACT * extent) ** 2 * np.eye(3), (known.names.size, 1, 1)))
 
 
-def _best(log: FeatureLog, starts: Sequence[CameraEstimate | None], watch: "_Watch") -> CameraSolution:
+def _best(
+    log: FeatureLog, starts: Sequence[CameraEstimate | None], watch: "_Watch", tolerance: float | None
+) -> CameraSolution:
     """The solution of least error; a start that leads nowhere is passed over, if another one does not."""
     found: list[CameraSolution] = []
     problem: InputError | None = None
     for start in starts:
         try:
-            found.append(solve_features(log, start, robust=ROBUST, marginals=False, on_iteration=watch))
+            found.append(
+                solve_features(
+                    log, start, robust=ROBUST, marginals=False, on_iteration=watch, tolerance=tolerance
+                )
+            )
         except InputError as error:
             problem = error
     if not found:

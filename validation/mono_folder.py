@@ -56,7 +56,7 @@ def write_mono_run(
         run: what was filtered.
         mapped: its map.
         out: the run's folder.
-        sources: what it was filtered from, for config.yaml: recording, known_points, board, calibration, map.
+        sources: what it was filtered from, for config.yaml: recording, known_points, board, calibration, known_map.
 
     Returns:
         The entries of summary.json.

@@ -5,7 +5,7 @@ import numpy as np
 from rbpf.lie import SE3
 from rbpf.sensors.chessboard import spread_rows
 from rbpf.systems.mono.known_map import KnownMap
-from rbpf.systems.mono.system import frame_of
+from rbpf.systems.mono.system import world_of
 from rbpf.systems.mono.video import VideoRun
 from rbpf.validation.mono_map import MonoMap
 from rbpf.validation.mono_scores import usual_alignment
@@ -25,9 +25,9 @@ def known_map(run: VideoRun, mapped: MonoMap) -> KnownMap:
     kept = np.flatnonzero(~mapped.is_ray & table.alive[mapped.landmarks.ids])
     rows, positions = mapped.landmarks.ids[kept], mapped.landmarks.mean[kept]
     first = table.first_pose[rows]
-    frame = frame_of(run.filter, run.filter.belief().mode)
-    if frame is not None:
-        first = SE3.compose(SE3.inverse(frame), first)
+    world = world_of(run.filter)
+    if world is not None:
+        first = SE3.compose(SE3.inverse(world.mean[run.filter.belief().mode]), first)
     return KnownMap(
         camera=run.sequence.camera,
         alignment=usual_alignment(run),

@@ -13,9 +13,10 @@ from typing import Any
 from rbpf.lie import SE3
 from rbpf.systems.mono.sightings import Sighting
 from rbpf.systems.mono.video import VideoRun
+from rbpf.validation.annotated import FOUND, MISSED, STARTED
 from rbpf.validation.figures import outline
 from rbpf.validation.map_summary import MapSummary
-from rbpf.validation.mono_frames import FOUND, MISSED, RAY, STARTED
+from rbpf.validation.mono_frames import RAY
 from rbpf.validation.mono_map import MonoMap
 from rbpf.validation.rerun_file import ellipsoids, log_image, log_lens, log_pose, log_time, recording
 

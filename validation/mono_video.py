@@ -1,22 +1,14 @@
 """The annotated video of a run: images are decoded again, drawn and encoded one after the other."""
 
 from collections.abc import Callable, Iterator
-from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 
 from rbpf.systems.mono.video import VideoRun
-from rbpf.validation.mono_frames import Caption, draw_frame, drawn_size
-from rbpf.validation.writing import whole
-
-SHORTEST_S, LONGEST_S = 1.0 / 120.0, 1.0
-"""Bounds of the time per image, for sequences whose stamps say little: photos, equal stamps."""
-
-QUALITY = "23"
-"""Constant rate factor of H.264: 18 is nearly without loss, 28 poor."""
-
-ENCODING = "-preset", "veryfast", "-fflags", "+bitexact", "-flags:v", "+bitexact"
+from rbpf.validation.annotated import Caption, drawn_size
+from rbpf.validation.mono_frames import draw_frame
+from rbpf.validation.video_file import write_video
 
 
 def write_annotated(run: VideoRun, path: Path, on_frame: Callable[[int, int], None] | None = None) -> None:
@@ -30,46 +22,8 @@ def write_annotated(run: VideoRun, path: Path, on_frame: Callable[[int, int], No
     Raises:
         InputError: the place cannot be written to, or the disk is full.
     """
-    import imageio_ffmpeg
-
     camera = run.sequence.camera
-    with whole(path) as partial:
-        encoder = imageio_ffmpeg.write_frames(
-            str(partial),
-            drawn_size(camera.width, camera.height),
-            fps=frame_rate(run.stamps_ns),
-            codec="libx264",
-            quality=None,
-            macro_block_size=2,
-            pix_fmt_out="yuv420p",
-            output_params=["-crf", QUALITY, *ENCODING],
-            ffmpeg_log_level="error",
-        )
-        with closing(encoder):
-            encoder.send(None)
-            for t, picture in enumerate(annotated_frames(run)):
-                encoder.send(np.ascontiguousarray(picture))
-                if on_frame is not None:
-                    on_frame(t + 1, run.stamps_ns.size)
-        if not is_complete(partial):
-            # The encoder says nothing through the pipe of what went wrong behind it.
-            raise OSError("the encoder could not finish, the disk may be full")
-
-
-def is_complete(path: Path) -> bool:
-    """Whether an MP4 holds all that it announces: its boxes fill the file, and the frames' index is among them."""
-    size, place, kinds = path.stat().st_size, 0, list[bytes]()
-    with path.open("rb") as file:
-        while place + 8 <= size:
-            file.seek(place)
-            length, kind = int.from_bytes(file.read(4), "big"), file.read(4)
-            if length == 1:
-                length = int.from_bytes(file.read(8), "big")
-            if length < 8:
-                return False
-            kinds.append(kind)
-            place += length
-    return place == size and b"moov" in kinds
+    write_video(annotated_frames(run), drawn_size(camera.width, camera.height), run.stamps_ns, path, on_frame)
 
 
 def annotated_frames(run: VideoRun) -> Iterator[np.ndarray]:
@@ -88,11 +42,3 @@ def annotated_frames(run: VideoRun) -> Iterator[np.ndarray]:
         if frame.image is None:
             alarm = f"NO IMAGE {alarm}"
         yield draw_frame(frame.image, sighting, Caption(text, alarm), camera.width, camera.height)
-
-
-def frame_rate(stamps_ns: np.ndarray) -> float:
-    """Images per second of a video that runs as fast as the recording."""
-    gaps = np.diff(stamps_ns) * 1e-9
-    gaps = gaps[gaps > 0.0]
-    typical = float(np.median(gaps)) if gaps.size else LONGEST_S
-    return round(1.0 / min(max(typical, SHORTEST_S), LONGEST_S), 3)

@@ -18,9 +18,26 @@ CONFIG = "config.yaml"
 LIBRARIES = "numpy", "scipy", "numba", "opencv-python-headless"
 """Whose version may change a run's bytes."""
 
-_FILES = "recording", "known_points", "calibration", "map"
+_FILES = "recording", "known_points", "calibration", "known_map"
 """Entries that name files or folders that a run read."""
-_OPTIONS = {"known_points": "known-points", "square_m": "square"}
+_OPTIONS = {
+    "known_points": "known-points",
+    "known_map": "map",
+    "square_m": "square",
+    "marker_m": "marker",
+    "gap_m": "gap",
+}
+_NAMED = (
+    "known_points",
+    "calibration",
+    "board",
+    "square_m",
+    "aruco",
+    "marker_m",
+    "gap_m",
+    "dictionary",
+    "known_map",
+)
 _FLAGS = ("localize",)
 _CHUNK = 1 << 20
 
@@ -105,8 +122,7 @@ def read_origin(config: Path) -> Origin:
             f"{entries['recording']} has changed since the run of {config}: it cannot be repeated; to use its settings "
             "alone give --config"
         )
-    named = [name for name in ("known_points", "calibration", "board", "square_m", "map") if name in entries]
-    sources = {_OPTIONS.get(name, name): str(entries[name]) for name in named}
+    sources = {_OPTIONS.get(name, name): str(entries[name]) for name in _NAMED if name in entries}
     sources |= {name: "" for name in _FLAGS if entries.get(name)}
     return Origin(str(entries["system"]), str(entries["recording"]), sources, config)
 

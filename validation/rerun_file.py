@@ -1,6 +1,5 @@
 """What recordings of runs for the Rerun viewer (https://rerun.io) share."""
 
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,7 +12,9 @@ from rbpf.lie import SE3
 from rbpf.sensors.pinhole import Pinhole
 from rbpf.sensors.readers.images import ImageFrame
 from rbpf.validation.figures import SIGMAS
+from rbpf.validation.files import prepare_folder
 from rbpf.validation.map_summary import MapSummary
+from rbpf.validation.writing import whole
 
 QUALITY = 75
 """Of the JPEG images in the recording, in per cent."""
@@ -49,18 +50,11 @@ def recording(path: Path, name: str) -> Iterator[tuple[Any, Any]]:
         InputError: Rerun is not installed, or the file cannot be written.
     """
     rr = require_rerun()
-    partial = path.with_name(path.name + ".partial")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with rr.RecordingStream("rbpf", recording_id=name) as stream:
-            stream.save(str(partial))
-            yield rr, stream
-            stream.flush()
-        os.replace(partial, path)
-    except OSError as error:
-        raise InputError(f"{path} cannot be written: {error}") from error
-    finally:
-        partial.unlink(missing_ok=True)
+    prepare_folder(path.parent)
+    with whole(path) as partial, rr.RecordingStream("rbpf", recording_id=name) as stream:
+        stream.save(str(partial))
+        yield rr, stream
+        stream.flush()
 
 
 def log_lens(rr: Any, stream: Any, camera: Pinhole) -> None:

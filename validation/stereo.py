@@ -7,14 +7,17 @@ from typing import Any
 
 from rbpf.errors import InputError
 from rbpf.sensors.readers.images import open_stereo
+from rbpf.sensors.readers.images.stereo import StereoSequence
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.run import StereoRun, run_images
 from rbpf.validation.files import prepare_folder, write_summary
 from rbpf.validation.map_summary import summarise_map
 from rbpf.validation.mono import BATCH, Telling
 from rbpf.validation.mono_batch import Batch
+from rbpf.validation.report import VIDEO
 from rbpf.validation.stereo_batch import adjust_stereo, score_stereo_batch
 from rbpf.validation.stereo_folder import write_stereo_run
+from rbpf.validation.stereo_frames import write_annotated_pairs
 from rbpf.validation.stereo_pictures import plot_stereo_run
 from rbpf.validation.stereo_rerun import write_stereo_rerun
 from rbpf.validation.trajectory_files import write_tum
@@ -36,6 +39,14 @@ class StereoRecording:
 
     pairs: Path
     calibration: Path | None = None
+
+    def open(self) -> StereoSequence:
+        """The pairs.
+
+        Raises:
+            InputError: a file is wrong.
+        """
+        return open_stereo(self.pairs, self.calibration)
 
     def sources(self) -> dict[str, str]:
         """For config.yaml."""
@@ -62,7 +73,7 @@ def start_stereo(
     Raises:
         InputError: the recording or a setting is wrong.
     """
-    sequence = open_stereo(recording.pairs, recording.calibration)
+    sequence = recording.open()
     if out is not None:
         prepare_folder(out)
     total = len(sequence)
@@ -74,11 +85,12 @@ def finish_stereo(
     run: StereoRun,
     recording: StereoRecording,
     out: Path,
+    video: bool = True,
     rerun: Path | None = None,
     batch: bool = True,
     telling: Telling | None = None,
 ) -> dict[str, Any]:
-    """Writes all files, pictures and the report of a run; returns the entries of summary.json.
+    """Writes all files, pictures, the annotated video and the report of a run; returns the entries of summary.json.
 
     The filter's own files are complete before the batch adjustment begins.
 
@@ -86,17 +98,22 @@ def finish_stereo(
         run: what was filtered.
         recording: where it came from.
         out: the run's folder.
+        video: also write the annotated video.
         rerun: file of a recording for the Rerun viewer; None writes none.
         batch: also adjust the same measurements in batch, and score the optimum.
         telling: whom to tell how far it is, and the time that the batch adjustment may take.
     """
-    mapped = summarise_map(run.filter)
+    mapped, telling = summarise_map(run.filter), telling or Telling()
     entries = write_stereo_run(run, mapped, out, recording.sources())
     (out / BATCH).unlink(missing_ok=True)
-    optimum = _adjusted(run, out, entries, telling or Telling()) if batch else None
+    optimum = _adjusted(run, out, entries, telling) if batch else None
     plot_stereo_run(run, mapped, out, optimum)
+    if video:
+        write_annotated_pairs(run, recording.open(), out / VIDEO, telling.on_frame)
+    else:
+        (out / VIDEO).unlink(missing_ok=True)
     if rerun is not None:
-        write_stereo_rerun(run, open_stereo(recording.pairs, recording.calibration), mapped, rerun)
+        write_stereo_rerun(run, recording.open(), mapped, rerun)
     verdict = report_run(out)
     return entries | {"verdict": verdict.trust}
 

@@ -5,6 +5,7 @@ from typing import Any
 from rbpf.errors import InputError
 from rbpf.systems.stereo.run import StereoRun
 from rbpf.validation.accuracy import ate
+from rbpf.validation.batch_problem import STEREO_TOLERANCE
 from rbpf.validation.mono_batch import Batch, Told, adjust_log
 from rbpf.validation.mono_scores import true_path
 from rbpf.validation.trajectory import Trajectory
@@ -32,7 +33,7 @@ def adjust_stereo(run: StereoRun, limit_s: float | None = None, on_iteration: To
             f"the run has {count} sightings, more than the {MOST} that are adjusted in batch with it: "
             "compare it afterwards by rbpf validate RUN --against gtsam"
         )
-    return adjust_log(log, run.world_from_camera, limit_s, on_iteration)
+    return adjust_log(log, run.world_from_camera, limit_s, on_iteration, tolerance=STEREO_TOLERANCE)
 
 
 def score_stereo_batch(run: StereoRun, batch: Batch) -> dict[str, Any]:

@@ -13,6 +13,7 @@ config.yaml              everything needed to repeat the run
 checkpoint.npz           what --resume goes on from
 summary.json             the figures
 *.png                    pictures
+annotated.mp4            the left images with their features
 report.html              one page with all figures and pictures
 """
 

@@ -8,6 +8,7 @@ import tyro
 
 from rbpf.errors import InputError
 from rbpf.sensors.chessboard import Board
+from rbpf.sensors.markers import MarkerBoard
 
 Flag = tyro.conf.FlagCreatePairsOff[bool]
 
@@ -90,6 +91,11 @@ class MonoOptions(ImageRunOptions):
         board: in place of known points, inner corners of a chessboard that is seen whole in the first image, as 9x6;
             the world is then the board's; by default none.
         square: side of its squares, m; by default none.
+        aruco: in place of known points, a board of so many ArUco markers, as 5x7, of which some are seen in the first
+            image; the world is then the board's; by default none.
+        marker: side of a marker, its black border included, m; by default none.
+        gap: between two markers, m.
+        dictionary: of the markers' patterns, as 4x4_50 or 6x6_250.
         map: folder of a run, or its known_map.npz, that the camera is to be found in; by default a map is made.
         localize: the map is known: the start is found by recognition, and the map is not changed.
         video: write the annotated video.
@@ -99,6 +105,10 @@ class MonoOptions(ImageRunOptions):
     known_points: Path | None = None
     board: str | None = None
     square: float | None = None
+    aruco: str | None = None
+    marker: float | None = None
+    gap: float = 0.01
+    dictionary: str = "4x4_50"
     map: Path | None = None
     localize: Flag = False
     video: bool = True
@@ -112,10 +122,12 @@ class StereoOptions(ImageRunOptions):
         sequence: images of a rectified pair, or of one that its calibration rectifies: a folder of EuRoC ASL with cam0
             and cam1, or of KITTI odometry with image_0 and image_1.
         dof: degrees of freedom of the camera: 6, or 3 in its x-z plane; by default as in the configuration.
+        video: write the annotated video.
     """
 
     sequence: tyro.conf.Positional[Path]
     dof: Literal[3, 6] | None = None
+    video: bool = True
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -224,6 +236,21 @@ def given(options: object, *names: str) -> dict[str, object]:
     """Those of some options that were given."""
     values = {name: getattr(options, name) for name in names}
     return {name: value for name, value in values.items() if value is not None}
+
+
+def given_markers(options: MonoOptions) -> MarkerBoard | None:
+    """The board of `--aruco` and `--marker`.
+
+    Raises:
+        InputError: one of the two is missing or makes no sense.
+    """
+    if options.aruco is None and options.marker is None:
+        return None
+    if options.aruco is None or options.marker is None:
+        raise InputError(
+            "a board of markers needs their number and their side: --aruco 5x7 --marker 0.04 --gap 0.01"
+        )
+    return MarkerBoard.parse(options.aruco, options.marker, options.gap, options.dictionary)
 
 
 def given_board(size: str | None, square_m: float | None) -> Board | None:

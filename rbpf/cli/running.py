@@ -8,7 +8,15 @@ from tyro.extras import SubcommandApp
 
 from rbpf.cli.compiling import compile_kernels, use_threads
 from rbpf.cli.interrupts import finishing, patient
-from rbpf.cli.options import MonoOptions, RangeBearingOptions, RunOptions, StereoOptions, given, given_board
+from rbpf.cli.options import (
+    MonoOptions,
+    RangeBearingOptions,
+    RunOptions,
+    StereoOptions,
+    given,
+    given_board,
+    given_markers,
+)
 from rbpf.cli.showing import answer, progress, say, table, told
 from rbpf.errors import InputError
 
@@ -53,7 +61,8 @@ def run_mono(options: Annotated[MonoOptions, tyro.conf.arg(name="")]) -> None:
     board = given_board(options.board, options.square)
     if options.localize != (options.map is not None):
         raise InputError("a camera is found in a known map with both: --map RUN --localize")
-    recording = Recording(options.sequence, options.known_points, options.calibration, board, options.map)
+    markers, points = given_markers(options), options.known_points
+    recording = Recording(options.sequence, points, options.calibration, board, options.map, markers)
     _prepare(options)
     with progress() as bar:
         with patient(told(bar, bar.add_task("filtering", total=None))) as tell:
@@ -91,12 +100,16 @@ def run_stereo(options: Annotated[StereoOptions, tyro.conf.arg(name="")]) -> Non
         with patient(told(bar, bar.add_task("filtering", total=None))) as tell:
             run = start_stereo(recording, config, options.out, options.resume, tell)
         solving = bar.add_task("batch", total=None, visible=options.batch)
+        drawing = bar.add_task("drawing", total=None, visible=options.video)
         telling = Telling(
+            on_frame=told(bar, drawing),
             on_iteration=lambda count, _error: bar.update(solving, completed=count),
             batch_s=options.batch_limit,
         )
         with finishing():
-            entries = finish_stereo(run, recording, options.out, options.rerun, options.batch, telling)
+            entries = finish_stereo(
+                run, recording, options.out, options.video, options.rerun, options.batch, telling
+            )
     _finish(entries, options, run.failure)
 
 

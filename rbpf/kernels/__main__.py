@@ -18,4 +18,5 @@ for name in (
 ):
     import_module(f"rbpf.sensors.{name}")
 import_module("rbpf.motion.stereo_kernels")
+import_module("rbpf.motion.stereo_triple_kernels")
 import_module("rbpf.validation.simulation.raster_kernel")

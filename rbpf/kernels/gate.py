@@ -1,7 +1,8 @@
 """Likelihoods inside the kernels: which lanes take an observation as an inlier, and at what log-density.
 
-Forms: 0 Gaussian, 1 truncated Mahalanobis (parameter 0: T_l), 2 Gaussian with outliers (parameter 0: log(1−ε),
-parameter 1: log ε/V). `weight` is 1 where the lane uses the observation and 0 where it is left out.
+Forms: 0 Gaussian, 1 truncated Mahalanobis (parameter 0: T_l, parameter 1: limit of updates), 2 Gaussian with outliers
+(parameter 0: log(1−ε), parameter 1: log ε/V). `weight` is 1 where the lane uses the observation and 0
+where it is left out.
 """
 
 import math
@@ -68,9 +69,9 @@ def gaussian_log_density(squared, scale, p):
 
 @njit(cache=True, error_model="numpy")
 def is_inlier(form, params, squared, scale, p):
-    """Whether the inlier's term is at least the outlier's."""
+    """Whether the inlier's term is at least the outlier's; of the truncated form, whether it is within the limit."""
     if form == 1:
-        return squared <= params[0]
+        return squared <= params[1]
     return form == 0 or gaussian_log_density(squared, scale, p) + params[0] >= params[1]
 
 

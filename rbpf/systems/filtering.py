@@ -15,20 +15,23 @@ class LikelihoodConfig:
 
     Attributes:
         kind: Gaussian, truncated Mahalanobis (S05 (6)), or Gaussian with outliers.
-        truncation: T_l of the truncated form.
+        truncation: T_l of the truncated form, which bounds the weight.
+        update_limit: of the truncated form, squared Mahalanobis distance beyond which a landmark is not updated either;
+            16.3 holds 99.9 % of a Gaussian in three dimensions.
         outlier_rate: ε.
         outlier_volume: V, of the measurement space, in its units.
     """
 
     kind: Literal["gaussian", "truncated", "outliers"] = "gaussian"
     truncation: float = 4.0
+    update_limit: float = 16.3
     outlier_rate: float = 0.02
     outlier_volume: float = 60.0
 
     def build(self) -> Likelihood:
         """The likelihood."""
         if self.kind == "truncated":
-            return TruncatedMahalanobis(self.truncation)
+            return TruncatedMahalanobis(self.truncation, max(self.update_limit, self.truncation))
         if self.kind == "outliers":
             return GaussianWithOutliers(self.outlier_rate, self.outlier_volume)
         return Gaussian()

@@ -10,9 +10,10 @@ import msgspec
 from rbpf.errors import InputError
 from rbpf.systems.plain_yaml import read_plain_yaml
 
-_HEADER = (
+HEADER = (
     "rbpf", "system", "versions", "input_sha256",
-    "recording", "known_points", "board", "square_m", "calibration", "map", "localize",
+    "recording", "known_points", "board", "square_m", "calibration", "known_map", "localize",
+    "aruco", "marker_m", "gap_m", "dictionary",
 )  # fmt: skip
 """What a config.yaml says about the run besides its settings."""
 
@@ -55,7 +56,7 @@ def _read(path: Path, expected: str) -> dict[str, Any]:
     system = values.get("system", expected)
     if system != expected:
         raise InputError(f"{path} holds settings of the system {system!r}, not of {expected}")
-    return {name: value for name, value in values.items() if name not in _HEADER}
+    return {name: value for name, value in values.items() if name not in HEADER}
 
 
 def _put(values: dict[str, Any], pair: str) -> None:

@@ -171,7 +171,7 @@ def test_bad_settings_are_one_sentence(log, tmp_path, capsys, arguments, message
     assert message in error
     sentence = error[error.index("rbpf: ") :]
     assert sentence.count("\n") == 1
-    assert not list((tmp_path / "run").glob("*")) if (tmp_path / "run").exists() else True
+    assert not list((tmp_path / "run").glob("*"))
 
 
 def test_a_damaged_log_names_file_and_line(log, tmp_path, capsys):

@@ -1,11 +1,13 @@
 """`rbpf run mono --board` and `rbpf simulate desk --board`."""
 
+import cv2
 import numpy as np
 import pytest
 import yaml
 
 from rbpf.cli import main
 from rbpf.lie import SE3
+from rbpf.sensors.pinhole import Pinhole
 from rbpf.validation.trajectory_files import read_tum
 from tests.cli.mono_sequences import run, sentence, summary
 
@@ -37,12 +39,52 @@ def test_a_rendered_board_is_what_a_run_starts_from(tmp_path, capsys):
         (("--board", "nine", "--square", "0.02"), "inner corners as 9x6"),
         (("--board", "9x6", "--square", "-1"), "must be positive"),
         (("--board", "9x6", "--square", "0.02", "--known-points", "here.csv"), "give one of the two"),
+        (("--aruco", "5x7"), "their number and their side"),
+        (("--aruco", "5", "--marker", "0.04"), "their number as 5x7"),
+        (("--aruco", "5x7", "--marker", "0.04", "--dictionary", "9x9"), "no dictionary"),
+        (("--aruco", "5x7", "--marker", "0.04", "--known-points", "here.csv"), "give one of the three"),
     ],
 )
 def test_a_board_that_makes_no_sense_is_refused(desk, tmp_path, capsys, arguments, words):
     assert run(desk, tmp_path / "run", *arguments, known=False) == 2
     assert words in sentence(capsys)
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.slow
+def test_markers_are_what_a_run_starts_from(tmp_path, capsys):
+    """A sheet of markers under a camera that moves sideways, by homographies."""
+    patterns = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    sheet = cv2.aruco.GridBoard((5, 4), 0.06, 0.02, patterns).generateImage((800, 640), marginSize=20)
+    folder = tmp_path / "sheet"
+    folder.mkdir()
+    camera = Pinhole(320, 240, 260.0, 260.0, 159.5, 119.5)
+    across, texels = 0.06 * 5 + 0.02 * 4, 800 - 40
+    for t in range(10):
+        at = np.array([0.19 + 0.004 * t, 0.15, -0.45])  # in the board's frame: z goes into the sheet
+        corners = np.array([[0.0, 0, 0], [across, 0, 0], [across, 0.3, 0], [0, 0.3, 0]]) - at
+        metres = texels / across
+        drawn = 20 + metres * (corners + at)[:, :2] - 0.5
+        homography = cv2.getPerspectiveTransform(
+            drawn.astype(np.float32), camera.project(corners).astype(np.float32)
+        )
+        image = cv2.warpPerspective(sheet, homography, (320, 240), flags=cv2.INTER_AREA, borderValue=190)
+        noise = np.random.default_rng(t).normal(0.0, 1.0, image.shape)
+        cv2.imwrite(str(folder / f"{t}.png"), np.clip(cv2.GaussianBlur(image, (0, 0), 0.8) + noise, 0, 255))
+    lens = "fx: 260\nfy: 260\ncx: 159.5\ncy: 119.5\nwidth: 320\nheight: 240\n"
+    (folder / "camera.yaml").write_text(lens)
+    board = ("--aruco", "5x4", "--marker", "0.06", "--gap", "0.02")
+    assert run(folder, tmp_path / "run", *board, known=False) == 0
+    assert summary(tmp_path / "run")["known_points"] == 12
+    path = read_tum(tmp_path / "run" / "trajectory.tum").positions
+    truth = np.array([[0.19 + 0.004 * t, 0.15, -0.45] for t in range(10)])
+    assert np.linalg.norm(path - truth, axis=1).max() < 0.01
+    again = ["run", "--from", str(tmp_path / "run" / "config.yaml"), "--no-video", "--no-batch"]
+    assert main(again) == 0
+    repeated = (tmp_path / "run-again" / "trajectory.tum").read_bytes()
+    assert repeated == (tmp_path / "run" / "trajectory.tum").read_bytes()
+    assert run(folder, tmp_path / "run", *board, "--dictionary", "6x6_50", known=False) == 2
+    assert "no marker of a board of 5x4 from 6X6_50" in " ".join(sentence(capsys).split())
 
 
 def test_a_room_has_no_board(tmp_path, capsys):

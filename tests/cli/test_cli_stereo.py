@@ -20,6 +20,7 @@ FILES = {
     "summary.json", "report.html", "path.png", "map.png", "particles.png", "error.png", "tracking.png", "timings.png",
     "trajectory.npz", "truth.npz", "validation_groundtruth.json", "groundtruth_path.png", "groundtruth_error.png",
     "groundtruth_nees.png", "checkpoint.npz", "batch.tum", "observations.csv", "observations_frames.csv",
+    "annotated.mp4",
 }  # fmt: skip
 REQUIRED = {
     "system", "recording", "frames", "particles", "dof", "seed", "ms_per_frame", "updates", "distance_m",

@@ -6,6 +6,7 @@ recordings exist under the names that the page uses.
 
 import os
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -13,17 +14,16 @@ import imageio_ffmpeg
 import numpy as np
 
 from rbpf.cli import main
-from rbpf.sensors.pinhole import Pinhole
 from rbpf.validation.simulation.exposure import Imaging
 from rbpf.validation.simulation.images import simulate_images
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 from rbpf.validation.simulation.textured_desk import TexturedDesk
 from tests.cli.mono_sequences import render_desk
+from tests.sensors.board_pictures import CAMERA, pictures
 
 SHORTER = {
-    ("demo",): ["--frames", "12"],
     ("simulate", "range-bearing"): ["--steps", "20", "--landmarks", "20"],
-    ("simulate", "desk"): ["--frames", "8", "--width", "160", "--height", "120"],
+    ("simulate", "desk"): ["--frames", "8", "--width", "480", "--height", "360"],
     ("simulate", "room"): ["--frames", "4", "--width", "160", "--height", "120"],
     ("simulate", "lab"): ["--frames", "3", "--width", "160", "--height", "120"],
 }
@@ -47,6 +47,7 @@ NAMES = {
 """Names on the pages, and the recordings of `Shelf` that they stand for."""
 
 NAMES_OF_PAGE = {
+    "docs/phone_video.md": {"phone.mp4": "walk.mp4"},
     "docs/how_to/stereo.md": {"SEQUENCE": "pairs", "path/to/sequence": "pairs"},
     "docs/how_to/stereo_features.md": {"path/to/sequence": "pairs"},
     "docs/how_to/sweep.md": {"other_log": "log"},
@@ -60,9 +61,18 @@ BEFORE = {
 """Commands that a page takes as done."""
 
 PREAMBLE = {
-    "docs/how_to/sensor.md": (
-        "from examples.custom_sensor import LampSensor\nfrom examples.gps_fix import *\n"
-    ),
+    "docs/how_to/sensor.md": """
+from examples.custom_sensor import LampSensor
+from examples.gps_fix import *
+from rbpf.models import Records
+
+filter_ = Filter(OdometryMotion(SE2), PositionReceiver(0.5), n=20, rng=np.random.default_rng(0))
+fix = np.array([0.1, 0.2])
+filter_.step(fix)
+state = np.zeros((20, 3))
+records = Records(np.tile([3.0, 1.0], (20, 2, 1)), np.tile(0.01 * np.eye(2), (20, 2, 1, 1)))
+""",
+    "docs/how_to/rates.md": "from examples.gps_fix import Position\n",
 }
 """Names that a page's programs take from the examples that the page shows."""
 
@@ -91,14 +101,17 @@ class Shelf:
         assert main(["simulate", "lab", "--out", str(path), *small]) == 0
 
     def _phone(self, path: Path) -> None:
-        _film(sorted((self.get("desk") / "mav0" / "cam0" / "data").glob("*.png")), path)
+        _film(_images(self.get("desk")), path)
 
     def _board(self, path: Path) -> None:
-        board = self.folder / "board"
-        camera = Pinhole(480, 360, 380.0, 380.0, 239.5, 179.5)
-        world = TexturedDesk(frames=16, texel_m=0.003, board=(10, 7), square_m=0.024)
-        simulate_images(world, Imaging(noise_std=1.0), camera, board, seed=1)
-        _film(sorted((board / "mav0" / "cam0" / "data").glob("*.png")), path)
+        _film([np.repeat(image[..., None], 3, axis=-1) for image in pictures()], path)
+
+    def _walk(self, path: Path) -> None:
+        """The camera that took the board's pictures, over a desk on which the board lies."""
+        folder = self.folder / "walked"
+        world = TexturedDesk(frames=8, texel_m=0.003, board=(10, 7), square_m=0.024)
+        simulate_images(world, Imaging(noise_std=1.0), CAMERA, folder, seed=1)
+        _film(_images(folder), path)
 
 
 def lay_out(page: str, shelf: Shelf, folder: Path) -> None:
@@ -107,6 +120,8 @@ def lay_out(page: str, shelf: Shelf, folder: Path) -> None:
     for name, recording in (NAMES | NAMES_OF_PAGE.get(page, {})).items():
         if name in text:
             place(shelf.get(recording), folder / name)
+    if "make demo" in text:  # which renders a desk only where there is none
+        place(shelf.get("desk"), folder / "demo" / "desk")
     for command in BEFORE.get(page, []):
         for word in command:
             if word in ("desk", "pairs", "log"):
@@ -140,14 +155,19 @@ def shortened(arguments: list[str]) -> list[str]:
     return arguments
 
 
-def _film(images: list[Path], path: Path) -> None:
+def _images(sequence: Path) -> list[np.ndarray]:
+    """Those of a rendered sequence, in colour."""
+    paths = sorted((sequence / "mav0" / "cam0" / "data").glob("*.png"))
+    return [np.ascontiguousarray(cv2.imread(os.fspath(path))[..., ::-1]) for path in paths]
+
+
+def _film(frames: Sequence[np.ndarray], path: Path) -> None:
     """The images as a video of 30 frames per second."""
-    frames = [np.ascontiguousarray(cv2.imread(os.fspath(image))[..., ::-1]) for image in images]
     height, width = frames[0].shape[:2]
     writer = imageio_ffmpeg.write_frames(
         os.fspath(path), (width, height), fps=30, quality=9, macro_block_size=1
     )
     writer.send(None)
     for frame in frames:
-        writer.send(frame)
+        writer.send(np.ascontiguousarray(frame))
     writer.close()

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from rbpf.errors import InputError
 from rbpf.filter import Filter
 from rbpf.lie import Euclidean
 from rbpf.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobis
@@ -39,6 +40,18 @@ def test_four_clips_a_quarter_of_the_inliers_in_space(rng):
     """χ² with three degrees of freedom exceeds 4.0 with a probability of 0.26."""
     nu = rng.normal(size=(200_000, 3))
     assert 1.0 - TRUNCATED.inlier(nu, np.eye(3)[None]).mean() == pytest.approx(0.2615, abs=0.003)
+
+
+def test_what_is_clipped_may_update_all_the_same(rng):
+    """The second limit is that of updates, and leaves the density and the cost of a null match as they are."""
+    nu, cov = rng.normal(scale=2.0, size=(300, 3)), random_covs(rng, (300,), 3, 1.0)
+    wide, squared = TruncatedMahalanobis(4.0, 9.0), np.einsum("ni,nij,nj->n", nu, np.linalg.inv(cov), nu)
+    assert ((squared > 4.0) & (squared < 9.0)).sum() > 20
+    np.testing.assert_array_equal(wide.inlier(nu, cov), squared < 9.0)
+    np.testing.assert_array_equal(wide.log_density(nu, cov), TRUNCATED.log_density(nu, cov))
+    assert wide.log_outlier() == -2.0
+    with pytest.raises(InputError, match=r"update_limit .* must be at least T_l = 4, got 3"):
+        TruncatedMahalanobis(4.0, 3.0)
 
 
 @pytest.mark.parametrize("p", [1, 2])

@@ -14,6 +14,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SECONDS_LONG = {
     "against_colmap",
     "error_ratios",
+    "fault_matrix",
     "lab_images",
     "mono_blackouts",
     "mono_budget",
@@ -22,11 +23,13 @@ SECONDS_LONG = {
     "mono_still_camera",
     "mono_video",
     "consistency_runs",
+    "soak",
     "validate_run",
     "verdict",
     "mono_realism",
     "reproduce_e06",
     "reproduce_s05",
+    "stereo_overconfidence",
     "stereo_lab",
     "range_bearing_robot",
 }
@@ -86,6 +89,13 @@ def error_ratios(figures: dict[str, float]) -> None:
 def evidence(figures: dict[float, float]) -> None:
     low, right, high = figures.values()
     assert right > max(low, high) + 3.0
+
+
+def fault_matrix(figures: dict[str, float]) -> None:
+    assert figures["tracebacks"] == 0.0
+    assert figures["resumed as uninterrupted"] == 1.0
+    assert figures["mono: none: as without"] < 0.02
+    assert figures["stereo: none: as without"] < 0.02
 
 
 def fused_kernel(figures: dict[str, float]) -> None:
@@ -207,7 +217,9 @@ def reproduce_e06(figures: dict[str, float]) -> None:
 
 def reproduce_s05(figures: dict[str, float]) -> None:
     assert figures["path, filter"] < 0.1
+    assert figures["path, best particle"] < 0.1
     assert figures["map, filter, aligned"] < figures["map, odometry, aligned"] + 0.05
+    assert figures["map, best particle, aligned"] < 0.2
     assert 0.0 < figures["mean ms of an update"] < 1e3 * figures["mean seconds per pair"]
     assert figures["mean seconds per pair"] < figures["the paper's"]
 
@@ -222,9 +234,22 @@ def smoothing(figures: dict[str, float]) -> None:
     assert figures["backward"] < 0.5 * figures["filter"]
 
 
+def stereo_overconfidence(figures: dict[str, float]) -> None:
+    default = "default: prior, T_l = 4, updates within 16.3"
+    clipped = "what is clipped does not update"
+    assert figures[f"{default}: error, mm"] < figures["odometry alone: error, mm"]
+    assert figures[f"{default}: NEES"] < 0.7 * figures[f"{clipped}: NEES"]
+
+
 def stereo_lab(figures: dict[str, float]) -> None:
     assert figures["ate_rmse_m"] < 0.1
     assert figures["landmarks_mean_per_particle"] > 20
+
+
+def soak(figures: dict[str, float]) -> None:
+    for system in ("camera", "robot"):
+        assert figures[f"{system}, resident_mb"] < 1.1
+        assert figures[f"{system}, held_kb"] < 2.5
 
 
 def sweep(figures: dict[str, float]) -> None:
@@ -262,6 +287,7 @@ CLAIMS: dict[str, Callable[[Any], None]] = {
         error_causes,
         error_ratios,
         evidence,
+        fault_matrix,
         fused_kernel,
         gps_fix,
         lab_images,
@@ -283,6 +309,7 @@ CLAIMS: dict[str, Callable[[Any], None]] = {
         reproduce_e06,
         reproduce_s05,
         smoothing,
+        stereo_overconfidence,
         stereo_lab,
         sweep,
         target_tracking,

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from rbpf.lie import SE3
-from rbpf.motion.stereo_consensus import Draws, _Search, align, consensus, triples
+from rbpf.motion.stereo_consensus import Draws, _Search, consensus, triples
 from rbpf.motion.stereo_geometry import see
 from tests.motion.stereo_pairs import LEAP, ROAD, ROOM, World, correlated, mistaken, simulate
+from tests.motion.triples_in_numpy import align, proposed, squared_distances
 
 GATE = 11.345
 
@@ -31,11 +32,6 @@ def test_alignment():
     motions, now = SE3.exp(rng.normal(size=(30, 6))), rng.normal(size=(30, 3, 3))
     found = align(SE3.transform(motions[:, None], now), now)
     np.testing.assert_allclose(SE3.local(motions, found), 0.0, atol=1e-9)
-
-
-def test_points_that_coincide_or_lie_on_a_line_align_to_something():
-    line = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 2.0], [0.0, 0.0, 3.0]])
-    assert np.isfinite(align(np.stack([line, 0.0 * line]), np.stack([line, line]))).all()
 
 
 @pytest.mark.parametrize("world", [ROAD, ROOM, LEAP], ids=["road", "room", "leap"])
@@ -88,6 +84,30 @@ def test_how_many_triples_it_takes(share, needed):
     assert Draws().needed(0.0) == np.inf
 
 
+@pytest.mark.parametrize("world", [ROAD, ROOM, LEAP], ids=["road", "room", "leap"])
+def test_compiled_proposals(world):
+    """Beside NumPy's, among false matches and points behind the camera; triples on a line may differ."""
+    rng = np.random.default_rng(11)
+    matches, _ = mistaken(correlated(world, 60, rng), 0.3, rng)
+    search = _Search(matches, SE3.exp(np.array([0.0, 0.01, 0.0, 0.0, 0.0, 0.1])))
+    rows = triples(len(matches), 300, rng)
+    found, (expected, condition) = search.candidates(rows), proposed(search, rows)
+    sound = condition < 1e9
+    assert sound.mean() > 0.9
+    off = np.abs(SE3.matrix(found) - SE3.matrix(expected)).max(axis=(1, 2))
+    assert (off[sound] <= 1e-6 * np.abs(expected[sound, 4:]).max(axis=1).clip(1.0)).all()
+
+
+def test_triples_that_coincide_or_lie_on_a_line_propose_something():
+    rng = np.random.default_rng(12)
+    matches = simulate(ROOM, 9, rng).matches
+    for array in (matches.z_prev, matches.z_now):
+        array[1:3] = array[0]
+        array[3:6] = array[0] + np.outer([1.0, 2.0, 3.0], [9.0, 2.0, 9.0])
+    rows = np.array([[0, 1, 2], [3, 4, 5], [0, 1, 7]])
+    assert np.isfinite(_Search(matches, SE3.identity()).candidates(rows)).all()
+
+
 def test_compiled_scores():
     """Beside the distances of each match by NumPy, also where some are behind the camera."""
     rng = np.random.default_rng(10)
@@ -95,7 +115,7 @@ def test_compiled_scores():
     search = _Search(matches, SE3.identity())
     motions = SE3.exp(rng.normal(scale=[0.1] * 3 + [0.5, 0.5, 2.0], size=(20, 6)))
     motions[0] = SE3.exp(np.array(LEAP.xi))
-    squared = search.squared(motions, np.arange(50))
+    squared = squared_distances(search, motions, np.arange(50))
     score, share = search.scores(motions, GATE)
     assert np.isinf(squared).any() and (squared <= GATE).any()
     np.testing.assert_allclose(score, np.minimum(squared, GATE).sum(axis=1), rtol=1e-9)

@@ -14,13 +14,17 @@ from hypothesis import strategies as st
 from rbpf.archive import load_arrays, save_arrays
 from rbpf.checkpoint import _digest
 from rbpf.errors import InputError
+from rbpf.lie import SE3
+from rbpf.systems.mono.appearance import SOURCE_HALF_PX
 from rbpf.systems.mono.config import MonoConfig
+from rbpf.systems.mono.known_map import KnownMap, read_known_map, write_known_map
 from rbpf.systems.settings import load_settings
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.validation.comparison import read_comparisons
 from rbpf.validation.path_and_map import read_path_and_map
 from rbpf.validation.report import write_report
 from rbpf.validation.run_record import open_run
+from rbpf.validation.simulation.streams import CAMERA
 from rbpf.validation.sweep import read_rows
 from rbpf.validation.sweep_plan import read_plan
 from tests.core.worlds import Recipe, content, drive, planar_world, same
@@ -152,6 +156,43 @@ def test_finished_rows_of_a_sweep(tmp_path_factory, whole):
     path = tmp_path_factory.getbasetemp() / "rows.jsonl"
     path.write_bytes(whole)
     read_or_refused(lambda: read_rows(path))
+
+
+@pytest.fixture(scope="module")
+def known(tmp_path_factory) -> Path:
+    """A map to find a camera in."""
+    rng, path = np.random.default_rng(0), tmp_path_factory.mktemp("known") / "known.npz"
+    count, side = 8, 2 * SOURCE_HALF_PX + 1
+    found = KnownMap(
+        camera=CAMERA,
+        alignment="none",
+        names=np.arange(count),
+        positions=rng.normal(size=(count, 3)),
+        cov=np.tile(0.01 * np.eye(3), (count, 1, 1)),
+        windows=rng.integers(0, 255, (count, side, side), dtype=np.uint8),
+        first_px=rng.uniform(20, 200, (count, 2)),
+        first_pose=np.tile(SE3.identity(), (count, 1)),
+        views=SE3.identity()[None],
+    )
+    write_known_map(path, found)
+    assert read_known_map(path).names.size == count
+    return path
+
+
+@FEW
+@given(data=st.data())
+def test_maps_to_find_a_camera_in(known, data):
+    whole = known.read_bytes()
+    try:
+        if data.draw(st.booleans()):
+            known.write_bytes(data.draw(damaged(whole)))
+        else:
+            arrays = load_arrays(known)
+            name = data.draw(st.sampled_from(sorted(arrays)))
+            save_arrays(known, arrays | {name: data.draw(others(arrays[name]))})
+        read_or_refused(lambda: read_known_map(known))
+    finally:
+        known.write_bytes(whole)
 
 
 @st.composite

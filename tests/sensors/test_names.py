@@ -1,6 +1,8 @@
 """The catalogue read backwards."""
 
-from rbpf.sensors.names import Names
+import numpy as np
+
+from rbpf.sensors.names import Names, Numbers
 
 
 def test_names_follow_the_catalogue():
@@ -33,3 +35,29 @@ def test_another_catalogue():
 def test_an_unchanged_catalogue_is_not_read_again():
     names, catalogue = Names(), {0: 10}
     assert names.ids(catalogue) is names.ids(catalogue)
+
+
+def test_numbers_follow_the_catalogue():
+    """Names as they come, ids that a removal leaves apart, more names than there was room for."""
+    numbers, catalogue = Numbers(), {0: 5, 1: 3}
+    np.testing.assert_array_equal(numbers.ids(catalogue, np.array([3, 5, 4])), [1, 0, -1])
+    del catalogue[0]
+    catalogue |= {7: 900, 9: 4}
+    np.testing.assert_array_equal(numbers.ids(catalogue, np.array([900, 4, 3])), [7, 9, 1])
+
+
+def test_numbers_read_only_what_is_new():
+    class Counting(dict):
+        reads = 0
+
+        def __getitem__(self, key):
+            Counting.reads += 1
+            return super().__getitem__(key)
+
+    numbers, catalogue = Numbers(), Counting({k: k for k in range(500)})
+    numbers.ids(catalogue, np.array([499]))
+    assert Counting.reads == 500
+    del catalogue[3]
+    catalogue[500] = 500
+    np.testing.assert_array_equal(numbers.ids(catalogue, np.array([500, 2])), [500, 2])
+    assert Counting.reads == 501

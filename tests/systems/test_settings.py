@@ -1,10 +1,11 @@
 """Settings that are given go over the system's own defaults, not over those of a group's class."""
 
-from dataclasses import asdict
+from dataclasses import asdict, fields
 
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig
 from rbpf.systems.mono.config import MonoConfig
-from rbpf.systems.settings import load_settings
+from rbpf.systems.range_bearing.config import RangeBearingConfig
+from rbpf.systems.settings import HEADER, load_settings
 from rbpf.systems.stereo.config import StereoConfig
 
 
@@ -26,3 +27,9 @@ def test_nothing_given_is_the_default():
 def test_a_group_can_be_nothing():
     found = load_settings(StereoConfig, "stereo", None, ["keys.distinct=0.2"], {"keys": {"distinct": None}})
     assert found.keys.distinct is None and found.keys.patience == 3
+
+
+def test_what_a_config_says_of_its_run_is_no_setting_of_any_system():
+    """Else a setting of that name would be passed over when the file is read back."""
+    for config in (MonoConfig(), StereoConfig(), RangeBearingConfig()):
+        assert not set(HEADER) & {item.name for item in fields(config)}

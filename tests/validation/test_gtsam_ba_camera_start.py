@@ -46,7 +46,13 @@ def test_the_same_optimum_is_found_from_scratch(camera):
     assert np.abs(SE3.local(expected.world_from_camera, found.world_from_camera)).max() < 1e-4
 
 
-@pytest.mark.parametrize(("camera", "known", "outliers"), [(MONO, 4, 0.0), (MONO, 6, 0.1), (PAIR, 0, 0.0)])
+@pytest.mark.parametrize(
+    ("camera", "known", "outliers"),
+    [
+        (MONO, 4, 0.0),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in ((MONO, 6, 0.1), (PAIR, 0, 0.0))),
+    ],
+)
 def test_a_camera_that_rests_at_first_is_followed(camera, known, outliers):
     measuring = Measuring(known=known, outlier_rate=outliers)
     log = simulate_features(DeskWorld(frames=90), measuring, camera, seed=1)

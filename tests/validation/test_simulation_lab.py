@@ -1,6 +1,7 @@
 """The simulated laboratory: plan, drives, furniture, its twin in points, and its images."""
 
 import doctest
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -35,11 +36,28 @@ STEREO = RectifiedStereo(CAMERA, 0.12)
 CLEAN = Imaging(noise_std=0.0, exposure_drift=0.0, lens_px=0.0, blur_s=0.0, vignetting=0.0, known=0)
 TOUR = LabDrive().travelled()
 SEEDS = range(3)
+DRAWN = [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in SEEDS[1:])]
 
 
 @cache
 def drawn(seed: int = 0, texel_m: float = 0.05, every: int = 400) -> TexturedScene:
     return TexturedLab(LabDrive(every=every), texel_m=texel_m).build(np.random.default_rng(seed))
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A world of images that is drawn already, which takes most of the time."""
+
+    scene: TexturedScene
+
+    def build(self, rng: np.random.Generator) -> TexturedScene:
+        return self.scene
+
+
+@pytest.fixture(scope="module")
+def near() -> TexturedScene:
+    """Nine images of the beginning, finely painted."""
+    return TexturedLab(LabDrive(frames=9, every=6), texel_m=0.015).build(np.random.default_rng(0))
 
 
 def test_the_tour_is_as_long_as_that_of_the_paper() -> None:
@@ -99,7 +117,7 @@ def test_the_camera_looks_ahead_from_the_height_of_the_robot() -> None:
     np.testing.assert_allclose(right, [1.0, 0.0, 0.0], atol=1e-12)
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", DRAWN)
 def test_the_renderer_sees_what_single_rays_see(seed: int) -> None:
     """Thousands of rectangles, most of them hidden: no tile may drop one that is seen."""
     scene = drawn(seed)
@@ -116,7 +134,7 @@ def test_the_renderer_sees_what_single_rays_see(seed: int) -> None:
         assert (seen[row, column] == rows).mean() > 0.99 and np.isfinite(expected).all()
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", DRAWN)
 def test_the_twin_in_points_is_seen_as_the_images_are(seed: int) -> None:
     """A point measured in the world of points is what a ray hits in that of images; posters hang 1 cm before walls."""
     scene = drawn(seed)
@@ -135,10 +153,9 @@ def test_the_twin_in_points_is_seen_as_the_images_are(seed: int) -> None:
 
 
 @pytest.fixture(scope="module")
-def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def rendered(near: TexturedScene, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("lab") / "lab"
-    world = TexturedLab(LabDrive(frames=9, every=6), texel_m=0.015)
-    simulate_images(world, CLEAN, STEREO, folder, 0)
+    simulate_images(Drawn(near), CLEAN, STEREO, folder, 0)
     return folder
 
 
@@ -168,16 +185,15 @@ def shift_px(expected: np.ndarray, image: np.ndarray, mask: np.ndarray) -> np.nd
     return np.asarray(shift)
 
 
-def test_texture_is_in_both_images_where_the_truth_says(rendered: Path) -> None:
+def test_texture_is_in_both_images_where_the_truth_says(rendered: Path, near: TexturedScene) -> None:
     """The left image, carried to the right one and to a later one by depth and poses from the files, fits as it is."""
-    scene = TexturedLab(LabDrive(frames=9, every=6), texel_m=0.015).build(np.random.default_rng(0))
     sequence = open_images(rendered)
     assert sequence.baseline_m == 0.12 and sequence.truth is not None
     frames = list(sequence.frames())
     left, right, later = (
         np.asarray(image, float) for image in (frames[0].image, frames[0].right, frames[8].image)
     )
-    renderer = Renderer(scene.rectangles, CAMERA)
+    renderer = Renderer(near.rectangles, CAMERA)
     first, last = sequence.truth.world_from_camera[[0, 8]]
     beside = SE3.compose(first, SE3.exp([0.0, 0.0, 0.0, 0.12, 0.0, 0.0]))
     assert np.linalg.norm(SE3.translation(last) - SE3.translation(first)) > 0.2
@@ -213,6 +229,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
+@pytest.mark.slow
 def test_a_seed_gives_the_same_bytes_and_fewer_frames_their_beginning(tmp_path: Path) -> None:
     small = RectifiedStereo(Pinhole(96, 72, 75.0, 75.0, 47.5, 35.5), 0.12)
     for name, frames, seed in (("first", 4, 3), ("again", 4, 3), ("short", 3, 3), ("other", 4, 4)):
@@ -228,10 +245,14 @@ def test_a_seed_gives_the_same_bytes_and_fewer_frames_their_beginning(tmp_path: 
 
 def test_images_can_be_jpeg(tmp_path: Path) -> None:
     camera = Pinhole(96, 72, 75.0, 75.0, 47.5, 35.5)
-    world = TexturedLab(LabDrive(frames=2, every=100), texel_m=0.05)
+    scene = drawn()
+    two = replace(
+        scene, stamps_ns=scene.stamps_ns[:2], world_from_camera=scene.world_from_camera[:2], odometry=None
+    )
     read = {}
     for quality in (0, 50, 95):
-        simulate_images(world, Imaging(jpeg=quality, known=0, depth=True), camera, tmp_path / str(quality), 0)
+        imaging = Imaging(jpeg=quality, known=0, depth=True)
+        simulate_images(Drawn(two), imaging, camera, tmp_path / str(quality), 0)
         folder = tmp_path / str(quality) / "mav0"
         suffix = ".jpg" if quality else ".png"
         assert {path.suffix for path in (folder / "cam0" / "data").iterdir()} == {suffix}

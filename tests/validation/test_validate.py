@@ -22,9 +22,11 @@ from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 from rbpf.validation.trials import simulated_log
 from rbpf.validation.validate import COMPARISONS, validate
 
+pytestmark = pytest.mark.usefixtures("plain_pictures")
+
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory):
+def finished(tmp_path_factory, plain_pictures):
     """A finished run."""
     folder = tmp_path_factory.mktemp("validated")
     simulate_robot(RobotWorld(steps=40, landmarks=30), folder / "log", seed=0)

@@ -110,11 +110,12 @@ def read_known_map(path: Path) -> KnownMap:
     if path.stat().st_size > MOST_BYTES:
         raise InputError(f"{path} is larger than any map")
     arrays = load_arrays(path)
-    if int(arrays.get("version", np.zeros(())).reshape(-1)[:1].sum()) != VERSION:
+    version = arrays.get("version", np.zeros(()))
+    if version.shape or version.dtype.kind != "i" or int(version) != VERSION:
         raise InputError(f"{path} is no map of this version of the program: map again")
     try:
         found = _parsed(arrays)
-    except (KeyError, ValueError) as error:
+    except (LookupError, ValueError, TypeError, AttributeError) as error:
         raise InputError(f"{path} is damaged: {' '.join(str(error).split())}") from error
     if found.names.size < LEAST:
         raise InputError(

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rbpf.anchoring import relative_estimate
+from rbpf.anchoring import Anchored, relative_estimate
 from rbpf.estimate import Estimate
 from rbpf.filter import Filter, StepReport
 from rbpf.lie import SE3
@@ -96,7 +96,11 @@ def pose_estimate(filter_: Filter, report: StepReport) -> Estimate:
     With known points it is that of the samples, each with its own uncertain world: the pose and the world's place are
     correlated before sampling. Without them it is that of the refined mixture.
     """
-    world = world_of(filter_)
+    return estimate_in(world_of(filter_), filter_, report)
+
+
+def estimate_in(world: Anchored | None, filter_: Filter, report: StepReport) -> Estimate:
+    """The same, where the known points' frame is has been asked already."""
     if world is None:
         return Estimate(report.estimate.mean[:7], report.estimate.cov[:6, :6])
     particles = filter_.particles

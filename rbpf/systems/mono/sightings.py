@@ -5,12 +5,12 @@ from typing import final
 
 import numpy as np
 
+from rbpf.anchoring import Anchored
 from rbpf.belief import Belief
 from rbpf.filter import Filter
 from rbpf.sensors.names import Names
 from rbpf.systems.mono.feature_sensor import FeatureSensor
 from rbpf.systems.mono.image_sensor import ImageSensor
-from rbpf.systems.mono.system import frame_of
 from rbpf.systems.mono.viewing import directions
 
 _SIGMAS = 3.0
@@ -65,11 +65,17 @@ class Sightings:
         self._names = Names()
         self._given = self._started = given
 
-    def record(self, sensor: ImageSensor, filter_: Filter) -> None:
-        """Takes note of the sensor's last frame, once the filter has made its step."""
+    def record(self, sensor: ImageSensor, filter_: Filter, world: Anchored | None) -> None:
+        """Takes note of the sensor's last frame, once the filter has made its step.
+
+        Args:
+            sensor: of the run.
+            filter_: after the step.
+            world: the world that poses are told in, in each particle's own; None where they are one.
+        """
         searched, belief = sensor.searched, filter_.belief()
         px = np.where(searched.found[:, None], searched.px, np.nan)
-        place = _in_reported_world(sensor.table.place[searched.rows], filter_, belief.mode)
+        place = _in_reported_world(sensor.table.place[searched.rows], world, belief.mode)
         place[~searched.found] = np.nan
         line = self._lines(sensor.features, belief, searched.rows)
         started = sensor.table.first_px[self._started :].copy()
@@ -127,9 +133,8 @@ def ray_ends(features: FeatureSensor, belief: Belief, ids: np.ndarray, sigmas: f
     return features.inverse_depth.homogeneous(mean, records.const[0][:, None])
 
 
-def _in_reported_world(place: np.ndarray, filter_: Filter, mode: int) -> np.ndarray:
+def _in_reported_world(place: np.ndarray, world: Anchored | None, mode: int) -> np.ndarray:
     """Homogeneous points (K, 4) of the heaviest particle's world in the world that poses are told in."""
-    frame = frame_of(filter_, mode)
-    if frame is None:
+    if world is None:
         return place.copy()
-    return np.concatenate([directions(place, frame), place[:, 3:]], axis=1)
+    return np.concatenate([directions(place, world.mean[mode]), place[:, 3:]], axis=1)

@@ -11,7 +11,6 @@ from rbpf.lie import SE3
 from rbpf.maps.constellation import Constellation, UncertainConstellation
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
-from rbpf.maps.shared import ALL
 from rbpf.models import Conditional, MotionModel, Records, Sensor
 from rbpf.motion.constant_velocity import MarginalVelocity, PoseLaw, SampledVelocity
 from rbpf.sensors.features import FeatureFrame, FeatureLog, KnownPoints
@@ -129,21 +128,13 @@ def world_of(filter_: Filter) -> Anchored | None:
     return Anchored(*group.frame(records))
 
 
-def frame_of(filter_: Filter, particle: int) -> np.ndarray | None:
-    """The same frame (7,) in one particle's world."""
-    held = _constellation(filter_, slice(particle, particle + 1))
-    return None if held is None else np.asarray(held[0].frame(held[1])[0][0])
-
-
-def _constellation(
-    filter_: Filter, particles: slice = ALL
-) -> tuple[Constellation | UncertainConstellation, Records] | None:
+def _constellation(filter_: Filter) -> tuple[Constellation | UncertainConstellation, Records] | None:
     """The known points' landmark and its records. It was the first one: no other one has to be asked."""
     landmark_map = filter_.belief().map
     first = next(iter(landmark_map.catalogue), None)
     if first is None or landmark_map.catalogue[first] != CONSTELLATION:
         return None
-    return landmark_map.landmark_of(first), landmark_map.read(np.array([first]), particles)
+    return landmark_map.landmark_of(first), landmark_map.read(np.array([first]))
 
 
 def start_law(log: FeatureLog, config: MonoConfig) -> PoseLaw:

@@ -19,9 +19,9 @@ from rbpf.systems.mono.known_map import KnownMap
 from rbpf.systems.mono.known_start import KnownStart, require_texture, resect_known
 from rbpf.systems.mono.recovery import Recovery
 from rbpf.systems.mono.resuming import cut, restore, save
-from rbpf.systems.mono.run import pose_estimate
+from rbpf.systems.mono.run import estimate_in
 from rbpf.systems.mono.sightings import Sightings
-from rbpf.systems.mono.system import assemble, build_features, start_cov, start_std
+from rbpf.systems.mono.system import assemble, build_features, start_cov, start_std, world_of
 
 
 @dataclass
@@ -252,13 +252,14 @@ def _fitting(run: VideoRun, frame: ImageFrame) -> ImageFrame:
 
 def _frame(run: VideoRun, t: int, frame: ImageFrame, law: PoseLaw | None) -> None:
     started = time.perf_counter()
-    frame, was_lost = run.recovery.checked(_fitting(run, frame)), run.sensor.lost
-    never_found = run.recovery.never_found
+    frame = run.recovery.checked(_fitting(run, frame))
+    was_lost, never_found = run.sensor.lost, run.recovery.never_found
     law = law or run.recovery.law(frame, run.filter)
     report = run.filter.step(frame, law, frame.stamp_ns)
     run.recovery.note(frame, run.filter)
     run.seconds[t] = time.perf_counter() - started
-    estimate = pose_estimate(run.filter, report)
+    world = world_of(run.filter)
+    estimate = estimate_in(world, run.filter, report)
     run.world_from_camera[t], run.cov[t] = estimate.mean, estimate.cov + run.recovery.drift(frame)
     searched = run.sensor.searched
     run.searched[t], run.found[t] = searched.rows.size, run.sensor.measured.landmarks.size
@@ -266,7 +267,7 @@ def _frame(run: VideoRun, t: int, frame: ImageFrame, law: PoseLaw | None) -> Non
     run.ess[t], run.log_evidence[t] = report.ess, report.log_evidence
     run.resampled[t], run.nis[t], run.nis_dof[t] = report.resampled, report.nis, report.rows
     run.seconds_search[t], run.seconds_births[t] = run.sensor.seconds, run.sensor.seconds_births
-    run.sightings.record(run.sensor, run.filter)
+    run.sightings.record(run.sensor, run.filter, world)
     run.seconds_telling[t] = time.perf_counter() - started - run.seconds[t]
     if frame.problem is not None:
         run.problems.append(f"frame {t}: {frame.problem}")

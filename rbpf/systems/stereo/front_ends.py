@@ -21,6 +21,8 @@ from rbpf.sensors.stereo_matching import StereoSift
 from rbpf.sensors.stereo_points import StereoPoint
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.dead_reckoning import Pixels
+from rbpf.systems.stereo.measured import MeasuredPair
+from rbpf.systems.stereo.seen import FEATURE, LANDMARK
 from rbpf.systems.stereo.sensor import StereoFrame, StereoSensor
 from rbpf.systems.stereo.tracks import Tracks
 
@@ -51,6 +53,14 @@ class FrontEnd(ABC):
     @abstractmethod
     def for_filter(self) -> Any:
         """The pair looked at, as the sensor takes it."""
+
+    @abstractmethod
+    def seen(self, updated: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Pixels (K, 3) of the pair looked at, and what each was to the map (K,), see `rbpf.systems.stereo.seen`.
+
+        Args:
+            updated: whether the filter has taken the pair.
+        """
 
     def observed(self, report: StepReport) -> int:
         """Landmarks that weighed the particles in the filter's last step."""
@@ -107,9 +117,12 @@ class ImageFrontEnd(FrontEnd):
         self._matches = np.zeros((2, 0), dtype=np.intp)
         self.tracks = Tracks()
 
-    def look(self, frame: ImageFrame) -> tuple[int, str]:
-        """SIFT in both images, matched along the rows."""
+    def look(self, frame: ImageFrame | MeasuredPair) -> tuple[int, str]:
+        """SIFT in both images, matched along the rows; or what was measured in them before."""
         self._now, self._matches = self._none, np.zeros((2, 0), dtype=np.intp)
+        if isinstance(frame, MeasuredPair):
+            self._now = self._none if frame.features is None else frame.features
+            return len(self._now), frame.problem
         if frame.image is None or frame.right is None:
             return 0, frame.problem or "an image is missing"
         self._now = self.sift.measure(frame.image, frame.right)
@@ -134,6 +147,9 @@ class ImageFrontEnd(FrontEnd):
             return StereoFrame(self._now)
         half = half_of(self._now.keys)
         return StereoFrame(self._now, ~half if split == "apart" else half)
+
+    def seen(self, updated: bool) -> tuple[np.ndarray, np.ndarray]:
+        return self._now.z, self.sensor.kinds() if updated else np.full(len(self._now), FEATURE)
 
     def seconds(self) -> float:
         return self.sensor.seconds
@@ -209,6 +225,9 @@ class NameFrontEnd(FrontEnd):
             chosen &= frame.landmarks % 2 == (1 if config.odometry.split == "apart" else 0)
         chosen &= frame.z[:, 0] > frame.z[:, 2]
         return FeatureFrame(frame.stamp_ns, frame.landmarks[chosen], frame.z[chosen], frame.cov_z[chosen])
+
+    def seen(self, updated: bool) -> tuple[np.ndarray, np.ndarray]:
+        return self._now.z, np.full(self._now.landmarks.size, LANDMARK if updated else FEATURE)
 
     def note(self, step: int, agree: np.ndarray, updated: bool) -> None:
         """The log has it all."""

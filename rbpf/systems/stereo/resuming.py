@@ -29,7 +29,7 @@ def save(run: "StereoRun", path: Path) -> None:
     arrays["progress/done"] = np.array([done, run.last_update])
     arrays["progress/at_update"] = run.at_update.mean
     arrays["progress/cov_at_update"] = run.at_update.cov
-    run.filter.save(path, arrays | run.front_end.arrays() | run.reckoning.arrays())
+    run.filter.save(path, arrays | run.front_end.arrays() | run.reckoning.arrays() | run.seen.arrays())
 
 
 def restore(run: "StereoRun", path: Path) -> None:
@@ -51,6 +51,7 @@ def restore(run: "StereoRun", path: Path) -> None:
         run.at_update = Estimate(arrays["progress/at_update"], arrays["progress/cov_at_update"])
         run.front_end.restore(arrays)
         run.reckoning.restore(arrays)
+        run.seen.restore(arrays)
 
 
 def cut(run: "StereoRun") -> None:

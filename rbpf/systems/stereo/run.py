@@ -18,7 +18,9 @@ from rbpf.sensors.readers.images.stereo import StereoSequence
 from rbpf.systems.stereo.config import StereoConfig, TriggerConfig
 from rbpf.systems.stereo.dead_reckoning import DeadReckoning, Reckoned, chained
 from rbpf.systems.stereo.front_ends import FrontEnd, ImageFrontEnd, NameFrontEnd
+from rbpf.systems.stereo.measured import MeasuredSequence
 from rbpf.systems.stereo.resuming import cut, restore, save
+from rbpf.systems.stereo.seen import Seen
 from rbpf.systems.stereo.system import build_filter, build_reckoning
 
 
@@ -51,6 +53,7 @@ class StereoRun:
         frames_done: pairs so far.
         last_update: pair at which the filter was updated last.
         at_update: its estimate then.
+        seen: what each pair showed.
     """
 
     name: str
@@ -83,10 +86,11 @@ class StereoRun:
     frames_done: int = 0
     last_update: int = 0
     at_update: Estimate = field(default_factory=lambda: Estimate(SE3.identity(), np.zeros((6, 6))))
+    seen: Seen = field(default_factory=Seen)
 
 
 def run_images(
-    sequence: StereoSequence,
+    sequence: StereoSequence | MeasuredSequence,
     config: StereoConfig,
     on_frame: Callable[[int, StereoRun], None] | None = None,
     checkpoint: Path | None = None,
@@ -98,7 +102,7 @@ def run_images(
     filtered is kept: the run is then shorter and has a `failure`.
 
     Args:
-        sequence: the recording.
+        sequence: the recording, or its features.
         config: all settings.
         on_frame: called after each pair; a KeyboardInterrupt from it leaves a checkpoint behind.
         checkpoint: file of checkpoints; None writes none.
@@ -205,6 +209,7 @@ def _frame(run: StereoRun, t: int, frame: Any) -> None:
     estimate = moved_on(run.at_update, at.since_update) if not run.updated[t] else run.at_update
     run.world_from_camera[t], run.cov[t] = estimate.mean, estimate.cov
     run.seconds[t] = time.perf_counter() - started
+    run.seen.record(*run.front_end.seen(bool(run.updated[t])))
 
 
 def _reckon(run: StereoRun, t: int, problem: str) -> tuple[Reckoned, bool]:

@@ -20,12 +20,14 @@ from rbpf.models import Births, Likelihood, Observations, Part, Sensor
 from rbpf.motion.stereo_vo import VoConfig, estimate_motion
 from rbpf.sensors.key_index import Gate, KeyIndex
 from rbpf.sensors.key_management import KeyConfig, KeyManager
+from rbpf.sensors.names import Numbers
 from rbpf.sensors.pinhole import RectifiedStereo
 from rbpf.sensors.stereo_features import StereoFeatures
 from rbpf.sensors.stereo_points import StereoPoint
 from rbpf.systems.stereo.cloud import Cloud, Expected
 from rbpf.systems.stereo.config import MapConfig
 from rbpf.systems.stereo.landmarks import Places
+from rbpf.systems.stereo.seen import FEATURE, LANDMARK, NEW, TRIAL
 
 _MAP = frozenset({Part.LANDMARK})
 
@@ -72,8 +74,7 @@ class StereoSensor(Sensor):
         """(K,) of the last pair's features, NULL where they are no landmark's."""
         self.seconds = 0.0
         """Time that matching the last pair took."""
-        self._ids = np.full(64, NULL, dtype=np.int64)
-        self._told = -1
+        self._numbers = Numbers()
 
     def observe(self, frame: StereoFrame, belief: Belief) -> Sequence[Observations]:
         """The features that are landmarks, and those that are keys on trial."""
@@ -84,7 +85,7 @@ class StereoSensor(Sensor):
             self.names = self._matched(frame, belief)
         seen = self.names >= 0
         ids = np.full(seen.size, NULL, dtype=np.int64)
-        ids[seen] = self._ids_of(self.names[seen], belief)
+        ids[seen] = self._numbers.ids(belief.catalogue, self.names[seen])
         weighing = self._weighing()
         groups = []
         for chosen, informs in ((weighing | ~seen, None), (seen & ~weighing, _MAP)):
@@ -112,6 +113,18 @@ class StereoSensor(Sensor):
         self.places.put(names, self.model.invert(pose, features.z), pose)
         self.names[rows] = names
         return [Births(features.z, features.cov, self.model, self.point, facts=names.tolist())]
+
+    def kinds(self) -> np.ndarray:
+        """What each feature (K,) of the last pair was to the map, see `rbpf.systems.stereo.seen`."""
+        manager = self.manager
+        out = np.full(self.names.size, FEATURE)
+        rows = np.searchsorted(manager.names, self.names)
+        held = np.flatnonzero(rows < manager.names.size)
+        held = held[manager.names[rows[held]] == self.names[held]]
+        rows = rows[held]
+        out[held] = np.where(manager.promoted[rows], LANDMARK, TRIAL)
+        out[held[manager.sightings[rows] == 1]] = NEW
+        return out
 
     def arrays(self) -> dict[str, np.ndarray]:
         """For a checkpoint."""
@@ -148,7 +161,7 @@ class StereoSensor(Sensor):
         names = self._alike(features.keys[rows], cloud)
         if not (names.size and rows.size):
             return out
-        ids = self._ids_of(names, belief)
+        ids = self._numbers.ids(belief.catalogue, names)
         seen = cloud.expected(belief, self.model, ids)
         total = seen.cov + self.config.slack_px**2 * np.eye(3)
         gate = Gate(features.z[rows], features.cov[rows], names, seen.mean, total, self.config.gate)
@@ -191,26 +204,15 @@ class StereoSensor(Sensor):
         near = (keys @ store.keys[store.rows(names)].T).max(axis=0) >= 1.0 - 0.5 * most**2
         return np.asarray(names[near])
 
-    def _ids_of(self, names: np.ndarray, belief: Belief) -> np.ndarray:
-        """Ids (k,) that the map has given to names (k,); what is new in the catalogue is noted, from its end on."""
-        if self.manager.next_name > self._ids.size:
-            self._ids = np.concatenate([self._ids, np.full(self.manager.next_name, NULL, dtype=np.int64)])
-        last = self._told
-        for landmark, name in reversed(belief.catalogue.items()):
-            if landmark <= last:
-                break
-            self._ids[name], self._told = landmark, max(self._told, landmark)
-        return self._ids[names]
-
     def _forget(self, belief: Belief, names: np.ndarray) -> None:
         if names.size:
-            belief.map.remove(self._ids_of(names, belief))
+            belief.map.remove(self._numbers.ids(belief.catalogue, names))
             self.index.store.remove(names)
 
     def _place(self, belief: Belief, names: np.ndarray) -> None:
         """Notes where the heaviest particle has landmarks now."""
         if names.size:
-            ids = self._ids_of(names, belief)
+            ids = self._numbers.ids(belief.catalogue, names)
             mode = belief.mode
             self.places.put(names, belief.read(ids, np.array([mode])).mean[0], belief.state[mode])
 

@@ -1,0 +1,74 @@
+"""Time of a whole pair of 640 × 480 in the stereo system, on images of the laboratory in memory; 400 particles."""
+
+import time
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import cv2
+import numpy as np
+
+from benchmarks.mono_frames import Decoded
+from benchmarks.rows import Row, Settings
+from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+from rbpf.sensors.readers.images import open_stereo
+from rbpf.sensors.readers.images.stereo import StereoSequence
+from rbpf.systems.stereo.config import StereoConfig
+from rbpf.systems.stereo.run import run_images
+from rbpf.validation.simulation.exposure import Imaging
+from rbpf.validation.simulation.images import simulate_images
+from rbpf.validation.simulation.textured_lab import LabDrive, TexturedLab
+
+RIG = RectifiedStereo(Pinhole(640, 480, 500.0, 500.0, 319.5, 239.5), 0.12)
+SETTLING, TIMED = 5, 30
+AIM_MS, GOAL_MS = 250.0, 100.0
+STAGES = "features", "odometry", "matching", "filter"
+
+
+def rendered(pairs: int) -> StereoSequence:
+    """The start of the robot's tour, each second frame, with coarse texels."""
+    world, imaging = TexturedLab(LabDrive(frames=pairs, every=2), texel_m=0.01), Imaging(known=0)
+    with TemporaryDirectory() as folder:
+        lab = Path(folder) / "lab"
+        simulate_images(world, imaging, RIG, lab, seed=0)
+        sequence = open_stereo(lab)
+        held = Decoded(list(sequence.frames()))
+    return StereoSequence(replace(sequence.pair, source=held), RIG)
+
+
+def run(settings: Settings) -> list[Row]:
+    """The system beside OpenCV's SIFT alone on both whole images, without matching, map or filter."""
+    sequence = rendered(SETTLING + settings.repetitions(TIMED))
+    done = run_images(sequence, StereoConfig())
+    whole = 1e3 * done.seconds[SETTLING:]
+    plain = 1e3 * sift_alone(sequence)
+    median = float(np.median(whole))
+    split = ", ".join(
+        f"{name} {1e3 * getattr(done, f'seconds_{name}')[SETTLING:].mean():.3g} ms" for name in STAGES
+    )
+    return [
+        Row(
+            "stereo pair 640x480, 400 particles",
+            median,
+            "ms",
+            "OpenCV's SIFT of both images in full size",
+            plain,
+            plain / median,
+            aim=f"<= {AIM_MS:g} ms, goal {GOAL_MS:g} ms",
+            met=median <= AIM_MS,
+            notes=f"means: {split}; fastest {whole.min():.3g} ms; {done.features.mean():.3g} features, "
+            f"{int(done.updated.sum())} updates in {done.seconds.size} pairs",
+            tolerance=0.5,
+        )
+    ]
+
+
+def sift_alone(sequence: StereoSequence) -> float:
+    """Median seconds of a pair."""
+    detector, seconds = cv2.SIFT.create(), []
+    for frame in list(sequence.frames())[SETTLING::3]:
+        start = time.perf_counter()
+        for image in (frame.image, frame.right):
+            detector.detectAndCompute(image, None)
+        seconds.append(time.perf_counter() - start)
+    return float(np.median(seconds))

@@ -1,0 +1,57 @@
+"""Peak memory of a process that updates 400 particles, each with 11,000 landmarks of its own.
+
+The worst case: no landmark's estimate is shared between particles, as if none had ever been resampled.
+"""
+
+import json
+import subprocess
+import sys
+
+from benchmarks.rows import Row, Settings
+
+AIM_MB = 2048.0
+NUMBERS = 9
+"""Of a landmark's estimate: mean and covariance, six of it different."""
+
+
+def run(settings: Settings) -> list[Row]:
+    """In a process of its own, beside what the numbers of all estimates take."""
+    turns = settings.repetitions(6)
+    told = subprocess.run(
+        [sys.executable, "-m", "benchmarks.stereo_memory", str(turns)],
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout
+    peak, before, landmarks, particles = json.loads(told.splitlines()[-1])
+    floor = 8.0 * NUMBERS * landmarks * particles / 2**20
+    return [
+        Row(
+            f"stereo memory, {particles} particles, {landmarks} landmarks each",
+            peak,
+            "MiB",
+            "mean and covariance of every landmark in every particle",
+            floor,
+            floor / peak,
+            aim=f"<= {AIM_MB:g} MiB",
+            met=peak <= AIM_MB,
+            notes=f"{before:.0f} MiB before the map is filled; nothing shared between particles; {turns} updates",
+        )
+    ]
+
+
+def measure(turns: int) -> list[float]:
+    """Peak and start of this process in MiB, landmarks and particles."""
+    from benchmarks.stereo_step import LARGE, Drive
+    from rbpf.validation.files import peak_memory_mb
+
+    Drive(100, 1)()
+    before = peak_memory_mb()
+    drive = Drive(LARGE, turns)
+    for _ in range(turns):
+        drive()
+    return [peak_memory_mb(), before, LARGE, drive.config.particles]
+
+
+if __name__ == "__main__":
+    print(json.dumps(measure(int(sys.argv[1]))))

@@ -1,0 +1,164 @@
+"""Features of a sequence of pairs, measured once and kept in files, to be filtered as often as one likes.
+
+Decoding and SIFT take most of a pair's time, and depend on no setting of the filter. `measure_pairs` goes on where it
+was interrupted: what it keeps are chunks of pairs, each a file that appears when it is complete.
+"""
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from itertools import islice
+from pathlib import Path
+from typing import final
+
+import numpy as np
+
+from rbpf.checkpoint import load_arrays, save_arrays
+from rbpf.errors import InputError
+from rbpf.sensors.features import CameraTruth
+from rbpf.sensors.pinhole import RectifiedStereo
+from rbpf.sensors.readers.images.stereo import StereoSequence
+from rbpf.sensors.stereo_features import StereoFeatures
+from rbpf.sensors.stereo_matching import StereoSift
+from rbpf.systems.stereo.config import StereoConfig
+
+CHUNK = 100
+"""Pairs in a file."""
+
+KEPT = ("z", "cov", "scale", "orientation", "keys")
+"""What the rest of `StereoFeatures` follows from."""
+
+
+@dataclass(frozen=True)
+class MeasuredPair:
+    """A pair whose features are known.
+
+    Attributes:
+        features: None where the pair could not be measured.
+        problem: why not, in words.
+        seconds: that measuring took.
+    """
+
+    features: StereoFeatures | None
+    problem: str
+    seconds: float
+
+
+@final
+@dataclass(frozen=True)
+class MeasuredSequence:
+    """A sequence in place of which `run_images` takes its features.
+
+    Attributes:
+        name: of the recording.
+        rig: the two cameras.
+        stamps_ns: (T,) int64 times of the pairs.
+        truth: world_from_camera; None where unknown.
+        folder: holds the features.
+    """
+
+    name: str
+    rig: RectifiedStereo
+    stamps_ns: np.ndarray
+    truth: CameraTruth | None
+    folder: Path
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    def frames(self, start: int = 0) -> Iterator[MeasuredPair]:
+        """Pairs from number `start` on."""
+        for first in range(start - start % CHUNK, len(self), CHUNK):
+            pairs = _read(self.folder, first, self.rig)
+            yield from pairs[max(start - first, 0) : len(self) - first]
+
+    def first(self, count: int) -> "MeasuredSequence":
+        """The first `count` pairs alone."""
+        return MeasuredSequence(self.name, self.rig, self.stamps_ns[:count], self.truth, self.folder)
+
+
+def measure_pairs(
+    sequence: StereoSequence,
+    config: StereoConfig,
+    folder: Path,
+    on_pair: Callable[[int, int], None] | None = None,
+) -> MeasuredSequence:
+    """Measures what is not in `folder` yet.
+
+    Args:
+        sequence: the recording.
+        config: of which `sift` and `pair` count here; a run over the features needs the same.
+        folder: for the files, created where it does not exist.
+        on_pair: called with the pairs done and their number.
+
+    Raises:
+        InputError: the folder holds features of another recording or measured otherwise, or a pair is refused.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    _claim(folder, sequence, config)
+    total, sift = len(sequence), StereoSift(sequence.rig, config.sift, config.pair)
+    missing = [first for first in range(0, total, CHUNK) if not _file(folder, first).exists()]
+    for first in missing:
+        pairs = []
+        for frame in islice(sequence.frames(first), CHUNK):
+            started = time.process_time()
+            features, problem = None, frame.problem or ""
+            if frame.image is not None and frame.right is not None:
+                features = sift.measure(frame.image, frame.right)
+            pairs.append(MeasuredPair(features, problem, time.process_time() - started))
+            if on_pair is not None:
+                on_pair(first + len(pairs), total)
+        _write(folder, first, pairs, config.sift.length)
+    return MeasuredSequence(sequence.name, sequence.rig, sequence.stamps_ns, sequence.truth, folder)
+
+
+def _file(folder: Path, first: int) -> Path:
+    return folder / f"pairs_{first:06d}.npz"
+
+
+def _claim(folder: Path, sequence: StereoSequence, config: StereoConfig) -> None:
+    """Notes whose features these are, or checks that they are the sequence's."""
+    stamps = sequence.stamps_ns
+    ours = {
+        "recording": sequence.name,
+        "stamps_ns": [len(stamps), int(stamps[0]), int(stamps[-1])],
+        "sift": asdict(config.sift),
+        "pair": asdict(config.pair),
+    }
+    note = folder / "features.json"
+    if not note.exists():
+        note.write_text(json.dumps(ours, indent=2) + "\n", encoding="utf-8")
+    elif json.loads(note.read_text(encoding="utf-8")) != ours:
+        raise InputError(
+            f"{folder} holds features of another recording or with other settings: choose another folder"
+        )
+
+
+def _write(folder: Path, first: int, pairs: list[MeasuredPair], length: int) -> None:
+    empty = {"z": (0, 3), "cov": (0, 3, 3), "scale": (0,), "orientation": (0,), "keys": (0, length)}
+    arrays = {
+        name: np.concatenate(
+            [
+                np.zeros(shape, dtype=np.float32 if name == "keys" else float),
+                *(getattr(pair.features, name) for pair in pairs if pair.features is not None),
+            ]
+        )
+        for name, shape in empty.items()
+    }
+    arrays["count"] = np.array([-1 if pair.features is None else len(pair.features) for pair in pairs])
+    arrays["problem"] = np.array([pair.problem for pair in pairs], dtype=np.str_)
+    arrays["seconds"] = np.array([pair.seconds for pair in pairs])
+    save_arrays(_file(folder, first), arrays)
+
+
+def _read(folder: Path, first: int, rig: RectifiedStereo) -> list[MeasuredPair]:
+    arrays, pairs, at = load_arrays(_file(folder, first)), [], 0
+    told = zip(arrays["count"].tolist(), arrays["problem"].tolist(), arrays["seconds"].tolist(), strict=True)
+    for count, problem, seconds in told:
+        features = None
+        if count >= 0:
+            part = (arrays[name][at : at + count] for name in KEPT)
+            features, at = StereoFeatures.measured(rig, *part), at + count
+        pairs.append(MeasuredPair(features, problem, seconds))
+    return pairs

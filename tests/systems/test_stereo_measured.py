@@ -1,0 +1,61 @@
+"""Features kept in files: a run over them is the run over the images."""
+
+import numpy as np
+import pytest
+
+from rbpf.errors import InputError
+from rbpf.sensors.sift import SiftConfig
+from rbpf.systems.stereo import measured
+from rbpf.systems.stereo.config import StereoConfig
+from rbpf.systems.stereo.measured import measure_pairs
+from rbpf.systems.stereo.run import run_images
+from tests.systems.stereo_sequences import missing, pairs
+
+CONFIG, COUNT, BAD = StereoConfig(particles=40), 7, 4
+
+
+@pytest.fixture(autouse=True)
+def small_chunks(monkeypatch):
+    monkeypatch.setattr(measured, "CHUNK", 3)
+
+
+def sequence():
+    return pairs(COUNT, lambda t, frame: missing(frame) if t == BAD else frame)
+
+
+def test_the_same_run(tmp_path):
+    """To the last bit, with what was wrong with a pair; a part of it, and from the middle on."""
+    told = []
+    kept = measure_pairs(sequence(), CONFIG, tmp_path, lambda done, total: told.append((done, total)))
+    assert told == [(k, COUNT) for k in range(1, COUNT + 1)]
+    ours, plain = run_images(kept, CONFIG), run_images(sequence(), CONFIG)
+    for name in ("world_from_camera", "cov", "odometry", "features", "agreeing", "observed"):
+        np.testing.assert_array_equal(getattr(ours, name), getattr(plain, name))
+    assert ours.notes == plain.notes and len(ours.notes) == 1
+    assert len(kept.first(5)) == 5 and run_images(kept.first(5), CONFIG).stamps_ns.size == 5
+    late = list(kept.frames(COUNT - 2))
+    assert len(late) == 2
+    np.testing.assert_array_equal(late[1].features.keys, list(kept.frames())[-1].features.keys)
+
+
+def test_it_goes_on_where_it_was_interrupted(tmp_path):
+    """Chunks that are complete are not measured again; one that is lost is."""
+    measure_pairs(sequence(), CONFIG, tmp_path)
+    files = sorted(tmp_path.glob("*.npz"))
+    assert len(files) == 3
+    before = files[1].read_bytes()
+    files[1].unlink()
+    told = []
+    measure_pairs(sequence(), CONFIG, tmp_path, lambda done, _total: told.append(done))
+    assert told == [4, 5, 6]
+    again, first = (np.load(file) for file in (files[1], files[0]))
+    assert again["count"].tolist()[1] == -1 and (first["count"] > 0).all()
+    assert len(files[1].read_bytes()) == len(before)
+
+
+def test_features_of_another_recording_are_refused(tmp_path):
+    measure_pairs(sequence(), CONFIG, tmp_path)
+    with pytest.raises(InputError, match="another recording or with other settings"):
+        measure_pairs(pairs(COUNT + 1), CONFIG, tmp_path)
+    with pytest.raises(InputError, match="another recording or with other settings"):
+        measure_pairs(sequence(), StereoConfig(sift=SiftConfig(length=128)), tmp_path)

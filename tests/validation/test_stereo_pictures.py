@@ -1,0 +1,116 @@
+"""What a stereo run keeps of each pair, and the frames that are drawn from it."""
+
+from contextlib import nullcontext
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rbpf.systems.stereo.config import StereoConfig, TriggerConfig
+from rbpf.systems.stereo.run import StereoRun, run_images
+from rbpf.systems.stereo.seen import FEATURE, LANDMARK, NEW, TRIAL, PairSeen, Seen
+from rbpf.validation.annotated import Caption, drawn_size
+from rbpf.validation.map_summary import summarise_map
+from rbpf.validation.rerun_file import recording
+from rbpf.validation.stereo_frames import COLOURS, annotated_pairs, draw_pair
+from rbpf.validation.stereo_rerun import write_stereo_rerun
+from tests.systems.plane_sequences import CAMERA
+from tests.systems.stereo_sequences import missing, pairs
+
+CONFIG, COUNT, BAD = StereoConfig(particles=40, trigger=TriggerConfig(0.0, 0.0)), 8, 5
+
+
+def sequence():
+    return pairs(COUNT, lambda t, frame: missing(frame) if t == BAD else frame)
+
+
+@pytest.fixture(scope="module")
+def run() -> StereoRun:
+    return run_images(sequence(), CONFIG)
+
+
+def test_what_each_feature_was(run):
+    """New keys in the first pair, on trial in the second, landmarks from the third on; as many as were counted."""
+    kinds = [np.bincount(seen.kind, minlength=4) for seen in run.seen]
+    assert len(kinds) == COUNT and [len(seen.kind) for seen in run.seen] == run.features.tolist()
+    assert kinds[0][NEW] > 5 and kinds[0][LANDMARK] == kinds[0][TRIAL] == 0
+    assert kinds[1][TRIAL] > 3 and kinds[1][LANDMARK] == 0
+    np.testing.assert_array_equal([k[LANDMARK] for k in kinds], run.observed)
+    assert kinds[-1][LANDMARK] > 5
+    assert sum(k[NEW] for k in kinds) == run.front_end.sensor.manager.next_name
+    assert len(run.seen[BAD].kind) == 0
+
+
+def test_between_updates_all_are_features():
+    rare = run_images(pairs(3), replace(CONFIG, trigger=TriggerConfig(9.0, 9.0)))
+    assert (rare.seen[2].kind == FEATURE).all() and len(rare.seen[2].kind) > 20
+
+
+def test_it_comes_back_from_arrays(run):
+    restored = Seen()
+    restored.restore(run.seen.arrays())
+    assert len(restored) == len(run.seen)
+    for ours, theirs in zip(restored, run.seen, strict=True):
+        np.testing.assert_array_equal(ours.z, theirs.z)
+        np.testing.assert_array_equal(ours.kind, theirs.kind)
+
+
+@pytest.mark.parametrize("kind", [FEATURE, TRIAL, LANDMARK, NEW])
+def test_a_feature_is_drawn_where_it_is(kind):
+    """A cross at the left pixel, and a line as long as the disparity, at twice the size, below the caption."""
+    seen = PairSeen(np.array([[60.0, 40.0, 30.0]]), np.array([kind]))
+    picture = draw_pair(np.zeros((90, 120), dtype=np.uint8), seen, Caption("pair 0", ""), (120, 90))
+    assert picture.shape[:2] == drawn_size(120, 90)[::-1]
+    rows, columns = np.nonzero((picture[24:] == COLOURS[kind]).all(axis=-1))
+    assert abs(np.median(rows) - 80.5) <= 1.0
+    assert abs(columns.min() - 60.5) <= 2.0 and 120 <= columns.max() <= 126
+
+
+def test_frames_of_a_run(run):
+    frames = list(annotated_pairs(run, sequence()))
+    assert len(frames) == COUNT
+    assert {frame.shape for frame in frames} == {(*drawn_size(CAMERA.width, CAMERA.height)[::-1], 3)}
+    green = [int((frame[24:] == COLOURS[LANDMARK]).all(axis=-1).sum()) for frame in frames]
+    assert green[0] == green[1] == green[BAD] == 0 and green[-1] > 50
+    red = [int(((frame[:24, :, 0] > 120) & (frame[:24, :, 1] < 70)).sum()) for frame in frames]
+    assert red[BAD] > 20 and red[0] == 0
+
+
+class Stream:
+    """Keeps what is logged for the viewer."""
+
+    def __init__(self) -> None:
+        self.logged: dict[str, list[Any]] = {}
+
+    def log(self, place: str, what: Any, static: bool = False) -> None:
+        self.logged.setdefault(place, []).append(what)
+
+    def set_time(self, name: str, **time: float) -> None:
+        self.logged.setdefault(f"time/{name}", []).append(time)
+
+
+def test_features_in_the_recording(run, tmp_path, monkeypatch):
+    """Every pair's features under what they were, half a pixel aside, and landmarks where the map has them."""
+    rr = pytest.importorskip("rerun")
+    stream = Stream()
+    monkeypatch.setattr("rbpf.validation.stereo_rerun.recording", lambda *_: nullcontext((rr, stream)))
+    write_stereo_rerun(run, sequence(), summarise_map(run.filter), tmp_path / "unused.rrd")
+    logged = stream.logged
+    assert len(logged["time/frame"]) == COUNT and len(logged["world/camera/image"]) == COUNT
+    for kind, name in ((LANDMARK, "landmark"), (TRIAL, "on_trial"), (NEW, "new"), (FEATURE, "feature")):
+        pixels = logged[f"world/camera/image/{name}"]
+        for seen, drawn in zip(run.seen, pixels, strict=True):
+            xy = np.array(drawn.positions.as_arrow_array().to_pylist()).reshape(-1, 2)
+            np.testing.assert_allclose(xy, seen.of(kind)[:, :2] + 0.5, atol=1e-4)
+    places = np.array(logged["world/seen"][-1].positions.as_arrow_array().to_pylist())
+    mapped = summarise_map(run.filter).mean
+    nearest = np.linalg.norm(places[:, None] - mapped, axis=2).min(axis=1)
+    assert len(places) > 5 and np.median(nearest) < 0.02
+
+
+def test_a_recording_that_fails_leaves_nothing(tmp_path):
+    pytest.importorskip("rerun")
+    with pytest.raises(ZeroDivisionError), recording(tmp_path / "x.rrd", "x"):
+        raise ZeroDivisionError
+    assert list(tmp_path.iterdir()) == []

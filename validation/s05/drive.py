@@ -1,0 +1,96 @@
+"""The robot's drive: rendered once, its features measured once, filtered as often as it takes."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from rbpf.errors import InputError
+from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+from rbpf.sensors.readers.images import open_stereo
+from rbpf.systems.stereo.config import StereoConfig, TriggerConfig
+from rbpf.systems.stereo.measured import MeasuredSequence, measure_pairs
+from rbpf.validation.simulation.exposure import Imaging
+from rbpf.validation.simulation.images import simulate_images
+from rbpf.validation.simulation.textured_lab import LabDrive, TexturedLab
+
+FOCAL, BASELINE_M = 0.78125, 0.12
+"""Focal length as a share of the image's width: that of `rbpf simulate lab`."""
+
+NOISE_STD = 5.0
+"""Grey levels. With the other defaults of the simulator as many features agree from pair to pair as in a real room."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What is rendered, and how it is filtered.
+
+    Attributes:
+        out: folder for images, features, table and pictures.
+        frames: pairs, the first of the tour.
+        every: only each so many-th frame is a pair.
+        width: of the images, px.
+        texel_m: side of a texel of the walls.
+        particles: number of particles.
+        dof: degrees of freedom; the paper's are 3.
+        trigger_m: way between updates.
+        seed: of the images and of the filter.
+    """
+
+    out: Path
+    frames: int = 4000
+    every: int = 1
+    width: int = 640
+    texel_m: float = 0.003
+    particles: int = 400
+    dof: int = 3
+    trigger_m: float = 0.015
+    seed: int = 0
+
+    @property
+    def images(self) -> Path:
+        """Folder of the rendered sequence."""
+        return self.out / "lab"
+
+    def config(self) -> StereoConfig:
+        """Settings of the filter: the defaults, which are the paper's, with its three degrees of freedom."""
+        if self.dof not in (3, 6):
+            raise InputError(f"dof must be 3 or 6, got {self.dof}")
+        trigger = TriggerConfig(self.trigger_m, self.trigger_m)
+        return StereoConfig(self.particles, self.seed, 3 if self.dof == 3 else 6, trigger=trigger)
+
+
+def measured_drive(
+    setting: Setting, told: Callable[[str, int, int], None] = lambda what, done, total: None
+) -> MeasuredSequence:
+    """The features of the drive; images and features that are there already are taken as they are.
+
+    Args:
+        setting: what is rendered.
+        told: called with what is being done, how many pairs are done, and their number.
+
+    Raises:
+        InputError: what is there is of another drive, or shorter.
+    """
+    if not setting.images.exists():
+        width = setting.width
+        size = FOCAL * width, FOCAL * width, 0.5 * width - 0.5, 0.375 * width - 0.5
+        rig = RectifiedStereo(Pinhole(width, 3 * width // 4, *size), BASELINE_M)
+        world = TexturedLab(LabDrive(frames=setting.frames, every=setting.every), texel_m=setting.texel_m)
+        imaging = Imaging(noise_std=NOISE_STD, known=0)
+        simulate_images(
+            world,
+            imaging,
+            rig,
+            setting.images,
+            setting.seed,
+            lambda done, total: told("rendered", done, total),
+        )
+    sequence = open_stereo(setting.images)
+    if len(sequence) < setting.frames:
+        have = f"{setting.images} has {len(sequence)} pairs, {setting.frames} are asked for"
+        raise InputError(f"{have}: delete it, or take another --out")
+    features = setting.out / "features"
+    whole = measure_pairs(
+        sequence, setting.config(), features, lambda done, total: told("measured", done, total)
+    )
+    return whole.first(setting.frames)

@@ -1,0 +1,144 @@
+"""What a run over the drive leaves: rows of Table I, sightings, and the paths and maps that follow from them."""
+
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from rbpf.lie import SE3
+from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
+from rbpf.systems.stereo.run import StereoRun
+from rbpf.systems.stereo.sensor import StereoSensor
+from rbpf.validation.alignment import align
+from rbpf.validation.scores import poses_at
+
+KINDS = "filter", "odometry", "wheels"
+
+
+class Row(NamedTuple):
+    """A line of Table I after so many pairs: landmarks per particle, and keys ever started."""
+
+    pairs: int
+    landmarks: int
+    features: int
+
+
+@dataclass
+class Record:
+    """What happened pair by pair.
+
+    Attributes:
+        due: pairs after which a row of the table is due.
+        rows: of the table.
+        sightings: name (k,), pair, points (k, 3) in the camera.
+        cpu: (T,) processor time of each pair, its features not included.
+    """
+
+    due: tuple[int, ...]
+    rows: list[Row] = field(default_factory=list)
+    sightings: list[tuple[np.ndarray, int, np.ndarray]] = field(default_factory=list)
+    cpu: list[float] = field(default_factory=list)
+    _clock: float = field(default_factory=time.process_time)
+
+    def __call__(self, t: int, run: StereoRun) -> None:
+        """After pair t."""
+        now = time.process_time()
+        self.cpu.append(now - self._clock)
+        sensor, end = sensor_of(run), run.front_end
+        if run.updated[t]:
+            seen = sensor.names >= 0
+            self.sightings.append((sensor.names[seen], t, end.for_filter().features.points[seen]))
+        if t + 1 in self.due or t + 1 == run.stamps_ns.size:
+            self.rows.append(Row(t + 1, int(sensor.manager.promoted.sum()), sensor.manager.next_name))
+        self._clock = time.process_time()
+
+    def places(self, path: np.ndarray, names: np.ndarray) -> np.ndarray:
+        """Mean places (M, 3) of landmarks (M,), ascending, along a path (T, 7)."""
+        total, count = np.zeros((names.size, 3)), np.zeros(names.size)
+        for seen, t, points in self.sightings:
+            row = np.minimum(np.searchsorted(names, seen), names.size - 1)
+            held = names[row] == seen
+            np.add.at(total, row[held], SE3.transform(path[t], points[held]))
+            np.add.at(count, row[held], 1.0)
+        return total / count[:, None]
+
+
+class Paths(NamedTuple):
+    """Poses (T, 7) of all pairs relative to the first camera."""
+
+    truth: np.ndarray
+    filter: np.ndarray
+    odometry: np.ndarray
+    wheels: np.ndarray
+
+
+@dataclass(frozen=True)
+class Best:
+    """The particle of highest weight at the end.
+
+    Attributes:
+        names: (M,) of its landmarks.
+        places: (M, 3) of them in its world.
+        path: (U, 7) along its ancestors, at the updates.
+        cloud: (N, 3) where all particles are.
+    """
+
+    names: np.ndarray
+    places: np.ndarray
+    path: np.ndarray
+    cloud: np.ndarray
+
+
+def sensor_of(run: StereoRun) -> StereoSensor:
+    """The sensor of a run over images."""
+    sensor = run.front_end.sensor
+    assert isinstance(sensor, StereoSensor)
+    return sensor
+
+
+def paths_of(run: StereoRun, images: Path) -> Paths:
+    """All four paths at the run's pairs."""
+    wheels = read_wheel_odometry(images)
+    by_wheels = wheels.world_from_camera(SE3.identity())
+    _, by_wheels = poses_at(SE3, wheels.stamps_ns, by_wheels, run.stamps_ns)
+    assert run.truth is not None
+    _, true = poses_at(SE3, run.truth.stamps_ns, run.truth.world_from_camera, run.stamps_ns)
+    true, by_wheels = (SE3.between(path[0], path) for path in (true, by_wheels))
+    return Paths(true, run.world_from_camera, run.odometry, by_wheels)
+
+
+def best_particle(run: StereoRun) -> Best:
+    """Its map and its path, without any smoothing."""
+    belief, manager = run.filter.belief(), sensor_of(run).manager
+    names = manager.names[manager.promoted]
+    by_name = {name: landmark for landmark, name in belief.catalogue.items()}
+    ids = np.array([by_name[name] for name in names.tolist()], dtype=np.int64)
+    mode = belief.mode
+    places = belief.read(ids, np.array([mode])).mean[0]
+    return Best(names, places, run.filter.history.paths()[:, mode], SE3.translation(belief.state))
+
+
+def errors(record: Record, paths: Paths, best: Best, updated: np.ndarray) -> dict[str, float]:
+    """Root mean square errors of paths and maps in metres: in the world of the first camera, then after alignment."""
+    pairs = {"path, best particle": (SE3.translation(best.path), SE3.translation(paths.truth[updated]))}
+    true_places = record.places(paths.truth, best.names)
+    pairs["map, best particle"] = best.places, true_places
+    for name in KINDS:
+        path = getattr(paths, name)
+        pairs[f"path, {name}"] = SE3.translation(path), SE3.translation(paths.truth)
+        pairs[f"map, {name}"] = record.places(path, best.names), true_places
+    figures = {}
+    for name, (ours, true) in pairs.items():
+        figures[name] = rms(ours - true)
+        figures[f"{name}, aligned"] = rms(align(ours, true).transform(ours) - true)
+    for name in KINDS:
+        off = SE3.translation(getattr(paths, name)[-1]) - SE3.translation(paths.truth[-1])
+        figures[f"end, {name}"] = float(np.linalg.norm(off))
+    return figures
+
+
+def rms(off: np.ndarray) -> float:
+    """Of lengths (K,)."""
+    return float(np.sqrt(np.square(off).sum(axis=1).mean()))
