@@ -1,15 +1,18 @@
 """Why is a filter further from the truth than the batch optimum of its measurements? One thing changed at a time.
 
 `--recording` is a robot's log; `--run` the folder of a finished monocular run with ground truth. Without either a log
-is simulated. The table has one row for each change: the error with it, and its ratio to the batch's.
+is simulated. The table has one row for each change: the error with it, and its ratio to the batch's; the picture
+shows the errors.
 """
 
 from pathlib import Path
 
 import tyro
+from matplotlib.figure import Figure
 
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.error_causes import HEADER, Cause, camera_causes, robot_causes
+from rbpf.validation.figures import COLOURS, new_axes, save_figures
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 from rbpf.validation.tables import write_table
 
@@ -42,7 +45,17 @@ def main(
                 simulate_robot(RobotWorld(steps=30 if quick else 200, landmarks=25), recording, seed=0)
         causes = robot_causes(recording, RangeBearingConfig(particles=particles), range(seeds), told=print)
     write_table(out / "causes.csv", list(HEADER), [cause.row() for cause in causes])
+    save_figures({"causes.png": picture(causes)}, out)
     return {cause.name: cause.row()[1] for cause in causes}
+
+
+def picture(causes: list[Cause]) -> Figure:
+    """The error that remains with each change."""
+    figure, axes = new_axes("one thing changed at a time", "", "position error [m]", equal=False)
+    errors = [cause.row()[1] for cause in causes]
+    axes.barh([cause.name for cause in causes], errors, color=COLOURS["filter"])
+    axes.invert_yaxis()
+    return figure
 
 
 if __name__ == "__main__":

@@ -59,9 +59,9 @@ class Transition:
 class Jacobians(NamedTuple):
     """Derivatives of a predicted measurement: (…, p, d), (…, p, D), (…, p, m); None where it is not read."""
 
-    state: Float[np.ndarray, "*batch p d"] | None = None
-    landmark: Float[np.ndarray, "*batch p D"] | None = None
-    substate: Float[np.ndarray, "*batch p m"] | None = None
+    state: Float[np.ndarray, "... p d"] | None = None
+    landmark: Float[np.ndarray, "... p D"] | None = None
+    substate: Float[np.ndarray, "... p m"] | None = None
 
 
 class FusedKernel(NamedTuple):

@@ -82,7 +82,7 @@ class ObservationModel(ABC):
         landmark: Float[np.ndarray, "*#batch D"] | None = None,
         const: Float[np.ndarray, "*#batch A"] | None = None,
         substate: Float[np.ndarray, "*#batch m"] | None = None,
-    ) -> Float[np.ndarray, "*batch p"]:
+    ) -> Float[np.ndarray, "... p"]:
         """ν (…, p): residual(z, predict(…)); override, with `jacobians`, for a constraint g(z, x, l) = 0 on z."""
         return self.residual(z, self.predict(state, landmark, const, substate))
 

@@ -13,6 +13,7 @@ import yaml
 from rbpf.cli import main
 
 FILES = {
+    "checkpoint.npz",
     "trajectory.tum",
     "map.npz",
     "map.csv",

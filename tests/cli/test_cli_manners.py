@@ -144,6 +144,7 @@ def test_bad_input_is_exit_code_2_and_a_fault_is_1(log, tmp_path):
     assert broken.returncode == 1 and "ZeroDivisionError" in broken.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("after", [0.0, 0.4])
 def test_ctrl_c_leaves_a_run_that_resumes_to_the_same_bytes(tmp_path, after):
     """A real signal to a real process, at two moments."""
@@ -226,6 +227,7 @@ def test_the_doctor_finds_everything_here_and_what_is_missing(capsys, monkeypatc
     assert "batch optimum: needed, and broken here" in err
 
 
+@pytest.mark.slow
 def test_the_first_compilation_is_announced(log, tmp_path):
     """In an empty cache; what is compiled there is not waited for."""
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}

@@ -233,7 +233,7 @@ def _version():
             lambda f: (f / "config.yaml").write_text("rbpf: 99.1.0\nsystem: mono"),
             "was written by rbpf 99.1.0",
         ),
-        (lambda f: (f / "config.yaml").write_text("{"), "cannot be read"),
+        (lambda f: (f / "config.yaml").write_text("{"), "is not YAML"),
         (lambda f: (f / "observations.csv").unlink(), "holds no observations.csv"),
         (lambda f: (f / "map.npz").unlink(), "holds no map.npz"),
         (lambda f: save_arrays(f / "map.npz", {"id": np.arange(2)}), "found no mean"),
