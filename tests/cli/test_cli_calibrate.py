@@ -16,6 +16,11 @@ BOARD_OPTIONS = ("--board", "9x6", "--square", str(BOARD.square_m))
 
 
 @pytest.fixture(scope="module")
+def plain_pictures() -> None:
+    """Not here: the picture is looked at."""
+
+
+@pytest.fixture(scope="module")
 def images(tmp_path_factory):
     folder = tmp_path_factory.mktemp("board") / "images"
     folder.mkdir()

@@ -18,6 +18,7 @@ from rbpf.validation.simulation.exposure import Imaging
 from rbpf.validation.simulation.images import simulate_images
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 from rbpf.validation.simulation.textured_desk import TexturedDesk
+from tests.cli.mono_sequences import CAMERA as DESK_CAMERA
 from tests.cli.mono_sequences import render_desk
 from tests.sensors.board_pictures import CAMERA, pictures
 
@@ -48,6 +49,7 @@ NAMES = {
 
 NAMES_OF_PAGE = {
     "docs/phone_video.md": {"phone.mp4": "walk.mp4"},
+    "docs/how_to/known_points.md": {"IMAGES": "longer"},
     "docs/how_to/stereo.md": {"SEQUENCE": "pairs", "path/to/sequence": "pairs"},
     "docs/how_to/stereo_features.md": {"path/to/sequence": "pairs"},
     "docs/how_to/sweep.md": {"other_log": "log"},
@@ -92,6 +94,10 @@ class Shelf:
 
     def _desk(self, path: Path) -> None:
         render_desk(path)
+
+    def _longer(self, path: Path) -> None:
+        """Long enough for a map in which a camera can be found."""
+        simulate_images(TexturedDesk(frames=120), Imaging(jpeg=90), DESK_CAMERA, path, seed=3)
 
     def _log(self, path: Path) -> None:
         simulate_robot(RobotWorld(steps=20, landmarks=20), path, seed=0)

@@ -309,6 +309,7 @@ CLAIMS: dict[str, Callable[[Any], None]] = {
         reproduce_e06,
         reproduce_s05,
         smoothing,
+        soak,
         stereo_overconfidence,
         stereo_lab,
         sweep,
