@@ -26,6 +26,8 @@ from rbpf.validation.simulation.textured_desk import TexturedDesk
 from rbpf.validation.writing import whole
 from tests.cli.mono_sequences import CAMERA, FRAMES
 
+pytestmark = pytest.mark.slow
+
 ONE_IMAGE = {"an image truncated"}
 """The damage that a run survives."""
 

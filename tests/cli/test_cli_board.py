@@ -11,6 +11,8 @@ from rbpf.sensors.pinhole import Pinhole
 from rbpf.validation.trajectory_files import read_tum
 from tests.cli.mono_sequences import run, sentence, summary
 
+pytestmark = pytest.mark.slow
+
 
 def test_a_rendered_board_is_what_a_run_starts_from(tmp_path, capsys):
     size = ["--frames", "8", "--width", "320", "--height", "240", "--board", "6x4", "--square", "0.04"]

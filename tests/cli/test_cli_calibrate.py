@@ -12,6 +12,8 @@ from rbpf.sensors.readers.images.calibration import read_calibration
 from tests.cli.mono_sequences import sentence
 from tests.sensors.board_pictures import BOARD, CAMERA, pictures
 
+pytestmark = pytest.mark.slow
+
 BOARD_OPTIONS = ("--board", "9x6", "--square", str(BOARD.square_m))
 
 

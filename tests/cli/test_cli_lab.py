@@ -9,6 +9,8 @@ from rbpf.cli import main
 from rbpf.sensors.readers.images import open_images, read_known_points
 from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
 
+pytestmark = pytest.mark.slow
+
 SMALL = ["--width", "96", "--height", "72", "--texel-m", "0.05"]
 
 

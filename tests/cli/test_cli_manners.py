@@ -30,6 +30,8 @@ from rbpf.cli.options import (
 )
 from tests.cli.test_cli import outputs
 
+pytestmark = pytest.mark.slow
+
 COMMANDS = {
     "demo": DemoOptions,
     "run range-bearing": RangeBearingOptions,

@@ -22,6 +22,8 @@ from rbpf.validation.mono_batch import ROBUST
 from rbpf.validation.trajectory_files import read_tum
 from tests.cli.mono_sequences import CAMERA, FRAMES, run, sentence, summary
 
+pytestmark = pytest.mark.slow
+
 FILES = {
     "trajectory.tum", "map.npz", "map.csv", "known_map.npz", "timings.csv", "diagnostics.csv", "config.yaml",
     "summary.json", "report.html", "path.png", "map.png", "particles.png", "error.png", "tracking.png", "timings.png",

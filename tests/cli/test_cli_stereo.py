@@ -14,7 +14,7 @@ from rbpf.lie import SE3
 from rbpf.validation.trajectory_files import read_tum
 from tests.cli.stereo_sequences import FRAMES, run
 
-pytestmark = pytest.mark.usefixtures("keypoints_once")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("keypoints_once")]
 FILES = {
     "trajectory.tum", "odometry.tum", "map.npz", "map.csv", "timings.csv", "diagnostics.csv", "config.yaml",
     "summary.json", "report.html", "path.png", "map.png", "particles.png", "error.png", "tracking.png", "timings.png",

@@ -9,6 +9,8 @@ import pytest
 from rbpf.cli import main
 from tests.cli.mono_sequences import FRAMES
 
+pytestmark = pytest.mark.slow
+
 
 def run(folder, out, *arguments):
     return main(

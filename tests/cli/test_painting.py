@@ -9,6 +9,8 @@ import pytest
 from rbpf.cli import main
 from tests.cli import mono_sequences, stereo_sequences
 
+pytestmark = pytest.mark.slow
+
 PICTURES = {
     "path.png",
     "map.png",

@@ -30,6 +30,8 @@ from rbpf.validation.sweep_plan import read_plan
 from tests.core.worlds import Recipe, content, drive, planar_world, same
 from tests.properties.mutations import damaged
 
+pytestmark = pytest.mark.slow
+
 FEW = settings(max_examples=60, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
 SETTINGS = (
     b"rbpf: 0.1.0\nsystem: mono\nparticles: 20\nray:\n  constrain: marginal\nsearch: {measurements: 25}\n"

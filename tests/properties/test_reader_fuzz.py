@@ -28,6 +28,8 @@ from tests.readers import test_mrclam, test_stereo_tracks, test_victoria_park, t
 from tests.readers.images import folders
 from tests.validation.worlds import world
 
+pytestmark = pytest.mark.slow
+
 POSES = SE3.exp(np.linspace(0.0, 1.0, 18).reshape(3, 6))
 KNOWN = "id,u_px,v_px,x_m,y_m,z_m,sigma_m\n1,5.5,6.5,0.1,0.2,1.6,0.03\n2,15.5,6.5,0.3,0.2,1.6,0.03\n"
 

@@ -18,6 +18,8 @@ from rbpf.systems.mono.system import build_features
 from rbpf.systems.mono.video import VideoRun, run_images
 from tests.systems.plane_sequences import CAMERA, Pictures, known_points, path, sequence, texture, view
 
+pytestmark = pytest.mark.slow
+
 START, DARK, FRAMES = 40, 20, 90
 CONFIG = MonoConfig(particles=50, checkpoint_every=START)
 

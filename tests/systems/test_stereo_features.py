@@ -16,6 +16,8 @@ from rbpf.validation.simulation.features import MONO, STEREO, Measuring, simulat
 from rbpf.validation.simulation.lab_points import LabWorld
 from rbpf.validation.simulation.textured_lab import LabDrive
 
+pytestmark = pytest.mark.slow
+
 CONFIG = StereoConfig(
     particles=200,
     trigger=TriggerConfig(0.0, 0.0),

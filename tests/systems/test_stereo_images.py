@@ -14,7 +14,7 @@ from rbpf.systems.stereo.front_ends import ImageFrontEnd
 from rbpf.systems.stereo.run import StereoRun, run_images
 from tests.systems.stereo_sequences import flat, missing, pairs, swapped
 
-pytestmark = pytest.mark.usefixtures("keypoints_once")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("keypoints_once")]
 CONFIG = StereoConfig(particles=60)
 COUNT = 12
 

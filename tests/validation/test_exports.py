@@ -11,6 +11,8 @@ from rbpf.lie import SE3
 from rbpf.validation.path_and_map import read_path_and_map
 from rbpf.validation.trajectory_files import read_kitti, read_tum, write_kitti
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module", params=["planar", "spatial"])
 def run(request, tmp_path_factory):

@@ -18,6 +18,8 @@ from rbpf.validation.simulation.features import STEREO as PAIR
 from rbpf.validation.simulation.point_worlds import DeskWorld
 from tests.validation.camera_scenes import ACCELERATION, BENT, PLAIN, STEREO, WHOLE, scene
 
+pytestmark = pytest.mark.slow
+
 SQUARE = np.array([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.2, 0.3, 0.0], [0.0, 0.3, 0.0]])
 
 

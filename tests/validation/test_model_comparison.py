@@ -17,6 +17,8 @@ from rbpf.validation.simulation.point_worlds import DeskWorld
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 from rbpf.validation.trials import simulated_log
 
+pytestmark = pytest.mark.slow
+
 CONFIG = RangeBearingConfig(particles=400)
 
 

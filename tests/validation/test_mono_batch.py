@@ -14,6 +14,8 @@ from rbpf.validation.simulation.features import MONO, Measuring, simulate_featur
 from rbpf.validation.simulation.point_worlds import DeskWorld
 from tests.exactness.models import known
 
+pytestmark = pytest.mark.slow
+
 FRAMES = 30
 
 

@@ -22,6 +22,8 @@ from rbpf.validation.simulation.point_worlds import DeskWorld
 from tests.exactness.models import known
 from tests.systems.mono_logs import SMALL
 
+pytestmark = pytest.mark.slow
+
 FRAMES = 40
 
 

@@ -19,6 +19,8 @@ from rbpf.validation.simulation.textured_desk import TexturedDesk
 from rbpf.validation.simulation.textured_room import TexturedRoom
 from rbpf.validation.simulation.textured_scene import ImageWorld, stamps_ns
 
+pytestmark = pytest.mark.slow
+
 cv2 = pytest.importorskip("cv2")
 
 CAMERA = Pinhole(160, 120, 110.0, 110.0, 79.5, 59.5, (-0.1, 0.02, 1e-3, 0.0, 0.0))

@@ -29,6 +29,8 @@ from rbpf.validation.simulation.textured_lab import (
 )
 from rbpf.validation.simulation.textured_scene import TexturedScene, cast
 
+pytestmark = pytest.mark.slow
+
 cv2 = pytest.importorskip("cv2")
 
 CAMERA = Pinhole(320, 240, 250.0, 250.0, 159.5, 119.5)

@@ -13,6 +13,8 @@ from rbpf.validation.sweep import ROWS, TABLE, read_rows, sweep
 from rbpf.validation.sweep_plan import SweepFile, plan, read_plan
 from tests.cli.mono_sequences import FRAMES, render_desk
 
+pytestmark = pytest.mark.slow
+
 PLAN = {
     "system": "range-bearing",
     "sequences": ["log"],

@@ -23,6 +23,8 @@ from rbpf.validation.statistic import coverage, variance_ratio
 from rbpf.validation.trials import simulated_log
 from rbpf.validation.verdict import Verdict, judge
 
+pytestmark = pytest.mark.slow
+
 LONG, SHORT = RobotWorld(steps=200, landmarks=80), RobotWorld(steps=120, landmarks=80)
 CONFIG = RangeBearingConfig(particles=300)
 
