@@ -3,9 +3,8 @@
 In the loop the first landmarks come back after most of a lap; nobody tells the filter, it only recognises them by name.
 In the corridor nothing ever comes back, so that the error can only grow. The paths start from four known points. A
 prior of the inverse depth that fits a desk (0.8 ± 0.4 per metre) does not fit a room (0.15 … 0.6): all landmarks
-are off in the same direction, and where their prior told the pose anything it would bend the scale of the whole map.
-The table has this prior, one that fits a room, and the default, which adapts to depths just seen, with one and three
-linearisations; and the batch.
+are off in the same direction, and together they bend the scale of the whole map. The table has this prior, one that
+fits a room, and the default, which adapts to depths just seen, with one and three linearisations; and the batch.
 
 For the loop it also has what happens when it closes: the error just before the first landmarks come back and two
 seconds after, with the filter's own σ, how many ancestors the particles have one second earlier, and how many seconds

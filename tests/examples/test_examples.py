@@ -149,7 +149,7 @@ def mono_eigenvalues(figures: dict[str, float]) -> None:
 
 
 def mono_loop(figures: dict[str, float]) -> None:
-    # A prior of depth that does not fit the world costs little: young rays constrain by their lines.
+    # The quick lap is too short for a prior that does not fit the world to bend the map as it does on a whole one.
     assert figures["loop / desk's prior"] < 2.0 * figures["loop / room's prior"]
     assert 0.8 < figures["loop / default"] < 4.0
 
