@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rbpf.sensors.features import FeatureFrame, FeatureLog, KnownPoints
+from rbpf.systems.mono.known_start import located_points
 from rbpf.systems.mono.sightings import Sighting
 from rbpf.systems.mono.video import VideoRun
 
@@ -37,8 +38,7 @@ def known_points(run: VideoRun) -> KnownPoints | None:
         return run.mapped.points
     if run.known is None:
         return None
-    cov = run.known.std_m[:, None, None] ** 2 * np.eye(3)
-    return KnownPoints(np.arange(run.known.names.size), run.known.positions, cov)
+    return located_points(run.sequence.camera, run.known, run.config.search.noise_px)[0]
 
 
 def _measured(sighting: Sighting, count: int, trusted: bool) -> Measured:

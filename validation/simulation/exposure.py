@@ -41,7 +41,7 @@ class Imaging:
         depth: whether depth images are written.
         jpeg: quality of JPEG files, 1 to 100; 0 writes PNG, which loses nothing.
         known: number of corners in the first image whose positions are given, at least 4; 0 for none.
-        known_std_m: standard deviation per axis of these positions.
+        known_std_m: standard deviation of these positions, the root of their covariance's trace.
         known_exact: leave the positions without their error.
     """
 

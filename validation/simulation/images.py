@@ -127,7 +127,8 @@ def _write_known(
 ) -> None:
     """known_points.csv."""
     known = known_corners(scene, renderer, camera, imaging.known)
-    error = 0.0 if imaging.known_exact else imaging.known_std_m * rng.standard_normal(known.positions.shape)
+    per_axis = 0.0 if imaging.known_exact else imaging.known_std_m / np.sqrt(3.0)
+    error = per_axis * rng.standard_normal(known.positions.shape)
     lines = ["id,u_px,v_px,x_m,y_m,z_m,sigma_m"]
     for name, (px, position) in enumerate(zip(known.px, known.positions + error, strict=True), start=1):
         numbers = [f"{x:.4f}" for x in px] + [f"{x:.6f}" for x in position]

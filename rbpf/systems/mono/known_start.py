@@ -21,6 +21,10 @@ from rbpf.sensors.resection import resect
 MOST_SIGMAS, MOST_PX = 6.0, 4.0
 """A known point may be seen this far from where the resected camera sees it: so many σ, and so many pixels more."""
 
+SPHERE, NEEDLE = 3.0**-0.5, 0.05
+"""Share of a known point's standard deviation along an axis across the line of sight: alike in all directions, and of a
+point that was located from views five degrees apart."""
+
 SAME_PX = 1.0
 """Known points nearer to each other in the image are one."""
 
@@ -29,7 +33,7 @@ LEAST_TEXTURE = 2.0
 
 
 def resect_known(camera: Pinhole, known: KnownPixels, noise_px: float) -> np.ndarray:
-    """Pose world_from_camera (7,) that explains the known points.
+    """Pose world_from_camera (7,) that best explains the known points, each of them counting alike.
 
     Args:
         camera: of the first image.
@@ -60,6 +64,39 @@ def resect_known(camera: Pinhole, known: KnownPixels, noise_px: float) -> np.nda
             f"{error[worst]:.1f} px away; check the positions, their axes and which point is which"
         )
     return world_from_camera
+
+
+def located_points(
+    camera: Pinhole, known: KnownPixels, noise_px: float
+) -> tuple[KnownPoints, np.ndarray]:
+    """Known points, named 0, 1, …, with the covariance of their errors, and the first camera.
+
+    What cameras or a depth sensor locate is uncertain along the line of sight, and hardly across it: so the given
+    standard deviation is taken. Across it the first image has the word: where even the best camera leaves residuals
+    beyond the noise of a measurement, the points are as uncertain as these, at most alike in all directions.
+
+    Args:
+        camera: of the first image.
+        known: M points.
+        noise_px: standard deviation of where they are seen.
+
+    Returns:
+        The points, whose covariances have the traces std_m², and world_from_camera (7,).
+
+    Raises:
+        InputError: as `resect_known`.
+    """
+    pose = resect_known(camera, known, noise_px)
+    local = SE3.inverse_transform(pose, known.positions)
+    residual = camera.project(local) - known.px
+    excess = max(np.square(residual).sum() / (residual.size - 6) - noise_px**2, 0.0)
+    seen = excess * (local[:, 2] / camera.fx) ** 2
+    var_across = np.clip(seen, (NEEDLE * known.std_m) ** 2, (SPHERE * known.std_m) ** 2)[:, None, None]
+    line = SE3.rotation(pose) @ (local / np.linalg.norm(local, axis=1, keepdims=True))[..., None]
+    along = line @ np.swapaxes(line, -1, -2)
+    var_along = known.std_m[:, None, None] ** 2 - 2.0 * var_across
+    cov = var_along * along + var_across * (np.eye(3) - along)
+    return KnownPoints(np.arange(known.names.size), known.positions, cov), pose
 
 
 @dataclass(frozen=True)

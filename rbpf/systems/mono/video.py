@@ -11,12 +11,12 @@ from rbpf.errors import InputError
 from rbpf.filter import Filter
 from rbpf.lie import SE3
 from rbpf.motion.constant_velocity import PoseLaw
-from rbpf.sensors.features import FeatureFrame, KnownPoints
+from rbpf.sensors.features import FeatureFrame
 from rbpf.sensors.readers.images import ImageFrame, ImageSequence, KnownPixels
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.image_sensor import ImageSensor
 from rbpf.systems.mono.known_map import KnownMap
-from rbpf.systems.mono.known_start import KnownStart, require_texture, resect_known
+from rbpf.systems.mono.known_start import KnownStart, located_points, require_texture
 from rbpf.systems.mono.recovery import Recovery
 from rbpf.systems.mono.resuming import cut, restore, save
 from rbpf.systems.mono.run import estimate_in
@@ -180,12 +180,9 @@ def _begin(
     """A run before its first frame, and where the camera is in it: at the origin, unless the known points tell."""
     start, law = None, PoseLaw(SE3.identity(), np.zeros((6, 6)))
     if known is not None:
-        count = known.names.size
-        cov = known.std_m[:, None, None] ** 2 * np.eye(3)
-        points = KnownPoints(np.arange(count), known.positions, cov)
-        noise = np.tile(config.search.noise_px**2 * np.eye(2), (count, 1, 1))
+        points, pose = located_points(sequence.camera, known, config.search.noise_px)
+        noise = np.tile(config.search.noise_px**2 * np.eye(2), (known.names.size, 1, 1))
         sight = FeatureFrame(int(sequence.stamps_ns[0]), points.names, known.px, noise)
-        pose = resect_known(sequence.camera, known, config.search.noise_px)
         start = KnownStart(points, pose, points.names, sight)
         require_texture(image, known)
         if config.known == "points":

@@ -3,7 +3,8 @@
     id,u_px,v_px,x_m,y_m,z_m,sigma_m
     1,517.426,320.498,-0.25433,0.12486,1.60044,0.0365
 
-The columns may come in any order, and others beside them are passed over. Pixel centres are at whole numbers.
+sigma_m is the standard deviation of the place as a whole, the root of its covariance's trace: the root mean square
+distance from where the point truly is. The columns may come in any order, and others beside them are passed over. Pixel centres are at whole numbers.
 """
 
 from dataclasses import dataclass
@@ -26,7 +27,7 @@ class KnownPixels:
         names: (M,) int64, each once.
         px: (M, 2) pixels in the first image as it is stored (distorted).
         positions: (M, 3) in the world, m.
-        std_m: (M,) standard deviation of each position, m.
+        std_m: (M,) standard deviation of each position as a whole, the root of its covariance's trace, m.
         own_frame: the positions are in a frame of the points' own, as a chessboard's, of which the recording's ground
             truth knows nothing.
 
