@@ -1,4 +1,6 @@
-"""Memory for the dense records of a store."""
+"""Memory for the records of a store: dense slabs and compacted columns, and how a kernel reaches the slabs."""
+
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -35,3 +37,21 @@ class Pool:
     def give(self, slabs: np.ndarray) -> None:
         """Returns slabs."""
         self._free.extend(slabs.tolist())
+
+
+@dataclass
+class Cold:
+    """A compacted column: records (fields, n) of the writers `kept` (n,) that still have descendants."""
+
+    kept: np.ndarray
+    data: np.ndarray
+
+
+@dataclass(frozen=True)
+class Access:
+    """What a kernel needs to read columns: slab, and the row of each particle, `maps[which[k]]`."""
+
+    pool: np.ndarray
+    slabs: np.ndarray
+    which: np.ndarray
+    maps: np.ndarray

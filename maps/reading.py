@@ -19,7 +19,7 @@ def read_records(
     """Estimates (N, K, …) of landmarks (K,) of one parametrisation, in all or some particles; cold ones stay cold."""
     landmark = layout.landmark
     if landmark.components > 1 or not store.is_warm(ids):
-        return layout.unpack(np.array([store.read(int(i), particles) for i in ids]))
+        return layout.unpack(store.read_all(ids, particles))
     access = store.access(ids)
     maps = access.maps if particles is ALL else np.ascontiguousarray(access.maps[:, particles])
     n, k, dim = maps.shape[1], ids.size, landmark.dim

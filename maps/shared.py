@@ -6,15 +6,13 @@ column is rewritten only when it is observed; one that is left alone is compacte
 descendants, whose number falls like 1/age as lineages coalesce. See `docs/adr` for the comparison with a tree.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from rbpf.archive import checked, within
 from rbpf.errors import InputError
 from rbpf.genealogy import Lineage, Schedule
 from rbpf.maps.columns import Columns
-from rbpf.maps.pool import Pool
+from rbpf.maps.pool import Access, Cold, Pool
 
 ALL = slice(None)
 MOST_FIELDS = 1 << 20
@@ -24,24 +22,6 @@ HOT_SHARE = 0.75
 """A column with fewer surviving rows than this share of the particles gives its dense slab back."""
 COLD_SHARE = 0.9
 """A compacted column is compacted again when no more than this share of its rows survives."""
-
-
-@dataclass
-class Cold:
-    """A compacted column: records (fields, n) of the writers `kept` (n,) that still have descendants."""
-
-    kept: np.ndarray
-    data: np.ndarray
-
-
-@dataclass(frozen=True)
-class Access:
-    """What a kernel needs to read columns: slab, and the row of each particle, `maps[which[k]]`."""
-
-    pool: np.ndarray
-    slabs: np.ndarray
-    which: np.ndarray
-    maps: np.ndarray
 
 
 class SharedStore:
@@ -98,14 +78,30 @@ class SharedStore:
 
     def read(self, column: int, particles: np.ndarray | slice = ALL) -> np.ndarray:
         """Records of all or some particles, (fields, N)."""
-        row = self.columns.row(column)
-        generation = int(self.columns.generation[row])
-        rows = self.lineage.rows(generation)[particles]
-        cold = self._cold.get(column)
-        if cold is not None:
-            return cold.data[:, np.searchsorted(cold.kept, rows)]
-        slab = self._pool(row).data[self.columns.slab[row]]
-        return slab[:, particles].copy() if generation == self.lineage.generation else slab[:, rows]
+        return self.read_all(np.array([column]), particles)[0]
+
+    def read_all(self, columns: np.ndarray, particles: np.ndarray | slice = ALL) -> np.ndarray:
+        """Records (K, fields, N) of columns (K,), at least one, of one record size; cold ones stay cold."""
+        at = self.columns.rows(columns)
+        generations = self.columns.generation[at].tolist()
+        rows = {g: self.lineage.rows(g)[particles] for g in dict.fromkeys(generations)}
+        pool = self._pool(int(at[0])).data
+        out = np.empty((columns.size, pool.shape[1], rows[generations[0]].size))
+        # Columns that were compacted together share one array of writers.
+        found: dict[int, np.ndarray] = {}
+        slabs = self.columns.slab[at].tolist()
+        for k, (column, generation, slab) in enumerate(
+            zip(columns.tolist(), generations, slabs, strict=True)
+        ):
+            if slab >= 0:
+                pool[slab].take(rows[generation], axis=1, out=out[k], mode="clip")
+                continue
+            cold = self._cold[column]
+            where = found.get(id(cold.kept))
+            if where is None:
+                where = found[id(cold.kept)] = np.searchsorted(cold.kept, rows[generation])
+            cold.data.take(where, axis=1, out=out[k], mode="clip")
+        return out
 
     def is_warm(self, columns: np.ndarray) -> bool:
         """Whether `access` may read columns (K,) as they are."""
@@ -116,9 +112,9 @@ class SharedStore:
         at = self.columns.rows(columns)
         slabs = self.columns.slab[at]
         if slabs.min() < 0:
-            for column in columns[slabs < 0].tolist():
-                if column in self._cold:
-                    self.replace(column, self.read(column))
+            cold = np.unique(columns[slabs < 0])
+            for column, records in zip(cold.tolist(), self.read_all(cold), strict=True):
+                self.replace(column, records)
             slabs = self.columns.slab[at]
         generations = self.columns.generation[at].tolist()
         number = {generation: k for k, generation in enumerate(dict.fromkeys(generations))}

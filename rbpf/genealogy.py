@@ -48,6 +48,8 @@ class Lineage:
         self._identity = np.arange(n)
         self._cache: dict[int, np.ndarray] = {}
         self._survivors: dict[int, np.ndarray] = {}
+        self._settled: dict[int, int] = {}
+        """Generations of which one row has all descendants: it always will, and the trunk need not be climbed again."""
 
     @property
     def nodes(self) -> int:
@@ -78,17 +80,7 @@ class Lineage:
         if generation == self.generation:
             return self._identity
         if generation not in self._cache:
-            self._mark += 1
-            self._cache[generation] = forest.rows_at(
-                self._parent,
-                self._generation,
-                self._row,
-                self._leaves,
-                generation,
-                self._found,
-                self._stamp,
-                self._mark,
-            )
+            self._cache[generation] = self._ancestors(generation)
         return self._cache[generation]
 
     def survivors(self, generation: int) -> np.ndarray:
@@ -122,6 +114,7 @@ class Lineage:
         self._retained[generation] -= 1
         if self._retained[generation] == 0:
             del self._retained[generation]
+            self._settled.pop(generation, None)
 
     def is_retained(self, generation: int) -> bool:
         """Whether `rows` may be asked for a generation."""
@@ -155,6 +148,25 @@ class Lineage:
         self._retained.clear()
         self._cache.clear()
         self._survivors.clear()
+        self._settled.clear()
+
+    def _ancestors(self, generation: int) -> np.ndarray:
+        if generation in self._settled:
+            return np.full(self.n, self._settled[generation])
+        self._mark += 1
+        rows = forest.rows_at(
+            self._parent,
+            self._generation,
+            self._row,
+            self._leaves,
+            generation,
+            self._found,
+            self._stamp,
+            self._mark,
+        )
+        if (rows == rows[0]).all():
+            self._settled[generation] = int(rows[0])
+        return np.asarray(rows)
 
     def _require_forest(self) -> None:
         """Refuses what is no forest: parents are older than their children, and what is free is nobody's ancestor."""

@@ -106,6 +106,11 @@ class Trial:
         np.testing.assert_array_equal(self.store.ids, sorted(self.copies.columns))
         for column, records in self.copies.columns.items():
             np.testing.assert_array_equal(self.store.read(column), records)
+        if self.copies.columns:
+            columns, _ = self.some()
+            particles = self.rng.integers(0, self.n, self.rng.integers(1, 5))
+            together = [self.copies.columns[column][:, particles] for column in columns.tolist()]
+            np.testing.assert_array_equal(self.store.read_all(columns, particles), together)
         assert self.store.dense_bytes == 8 * sum(records.size for records in self.copies.columns.values())
         # A compacted column holds at most half of the rows, and for each an index beside the fields.
         assert self.store.stored_bytes <= 2 * self.store.dense_bytes
