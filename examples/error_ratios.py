@@ -7,7 +7,6 @@ there are passed over. A simulated log and a rendered desk are always in the tab
 
 import os
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -36,8 +35,7 @@ from rbpf.validation.tables import write_table
 ROBOTS = "mrpt_kf_slam_2d", "mrpt_kf_slam_6d", "mrclam6_robot1"
 CAMERAS = "mono_redkitchen_a", "stereo_zed_room1"
 PAIRS = "stereo_zed_room1", "stereo_kitti_seq1"
-TRACKS, TRACKED = "gtsam_stereo_vo", 30
-"""The recorded tracks, and how many of their frames are filtered."""
+TRACKS = "gtsam_stereo_vo"
 RENDERED_PX = 0.25
 """Noise of a match in rendered images, nearly: told one pixel the filter weighs its measurements too little."""
 
@@ -76,8 +74,7 @@ def recorded(data: Path, seeds: int) -> Iterator[ErrorRatio]:
             yield stereo_ratio(StereoRecording(data / name), StereoConfig(), range(seeds))
     if (data / TRACKS).is_dir():
         tracks = stereo_tracks.read(data / TRACKS)
-        first = replace(tracks.log, frames=tracks.log.frames[:TRACKED])
-        yield tracks_ratio(first, StereoConfig(), range(min(seeds, 2)), tracks.world_from_camera)
+        yield tracks_ratio(tracks.log, StereoConfig(), range(seeds), tracks.world_from_camera)
     for name in CAMERAS:
         if (data / name).is_dir():
             yield camera_ratio(
