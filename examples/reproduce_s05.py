@@ -48,6 +48,7 @@ def main(
     trigger_m: float = 0.015,
     seed: int = 0,
     sweep_frames: int = 0,
+    sweep_seeds: int = 3,
     quick: bool = False,
 ) -> dict[str, float]:
     """Renders the drive and measures its features, unless they are there, and filters it.
@@ -62,6 +63,7 @@ def main(
         trigger_m: way between updates.
         seed: of the images and of the filter.
         sweep_frames: so many first pairs are filtered with other settings, too.
+        sweep_seeds: each with so many seeds of the filter.
         quick: thirty coarse pairs and 100 particles, to see that it works.
     """
     setting = Setting(out, frames, every, width, 0.003, particles, dof, trigger_m, seed)
@@ -81,7 +83,7 @@ def main(
     draw_errors(paths, run.stamps_ns, out / "errors.png")
     draw_time(run, features, out / "time.png")
     if sweep_frames:
-        rows = list(sweep(drive.first(sweep_frames), setting.config()))
+        rows = list(sweep(drive.first(sweep_frames), setting.config(), range(sweep_seeds)))
         write_table(out / "sweep.csv", HEADER, rows)
     return figures
 

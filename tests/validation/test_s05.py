@@ -7,9 +7,10 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.sensors.features import CameraTruth
 from rbpf.validation.s05.drive import Setting
 from rbpf.validation.s05.record import Best, Paths, Record, errors
-from rbpf.validation.s05.sweeps import settings
+from rbpf.validation.s05.sweeps import HEADER, settings, sweep
 
 
 def path(count: int, rng: np.random.Generator, noise: float) -> np.ndarray:
@@ -83,3 +84,30 @@ def test_sweeps_change_one_thing(tmp_path):
         assert len(changed) == (0 if name == "as it is" else 2 if name.startswith("refined") else 1), name
     with pytest.raises(InputError, match="dof must be 3 or 6"):
         Setting(tmp_path, dof=4).config()
+
+
+def test_a_sweep_tells_median_and_range_over_the_seeds(tmp_path, monkeypatch):
+    """The true path is at the origin; each seed is off by its own constant, its odometry by ten times that."""
+    base, still = Setting(tmp_path).config(), np.tile(SE3.identity(), (5, 1))
+
+    def off(by: float) -> np.ndarray:
+        path = still.copy()
+        path[1:, 4] = by
+        return path
+
+    def run_images(drive, config):
+        ours, cov = off(0.1 * config.seed), np.tile(0.01 * np.eye(6), (5, 1, 1))
+        stamps, truth = np.arange(5), CameraTruth(np.arange(5), still)
+        names = {"stamps_ns": stamps, "truth": truth, "world_from_camera": ours, "cov": cov}
+        return SimpleNamespace(**names, odometry=off(config.seed), seconds=np.full(5, 0.5))
+
+    monkeypatch.setattr("rbpf.validation.s05.sweeps.run_images", run_images)
+    first, alone, *others = map(list, sweep(None, base, (1, 2, 4)))
+    assert [first[0], *(row[0] for row in others)] == list(settings(base))
+    assert {len(row) for row in (first, alone, *others)} == {len(HEADER)}
+    share = np.sqrt(4 / 5)
+    assert first[1:5] == pytest.approx([0.2 * share, 0.1 * share, 0.4 * share, 0.2])
+    assert first[5:8] == pytest.approx([4.0, 1.0, 16.0]) and first[9] == 0.5
+    assert alone[0] == "odometry alone" and alone[1:5] == pytest.approx(
+        [2.0 * share, share, 4.0 * share, 2.0]
+    )

@@ -14,7 +14,8 @@ from rbpf.validation.consistency import whitened_errors
 from rbpf.validation.s05.record import rms
 from rbpf.validation.stereo_scores import stereo_truth
 
-HEADER = ("setting", "error m", "at the end m", "median NEES", "right", "s per pair")
+ERROR, NEES = ("error m", "least", "most"), ("median NEES", "least NEES", "most NEES")
+HEADER = ("setting", *ERROR, "at the end m", *NEES, "right", "s per pair")
 
 PARTICLES = 100, 1600
 NOISE = (1e-3, 5e-4), (5e-3, 2e-3)
@@ -38,12 +39,18 @@ def settings(base: StereoConfig) -> dict[str, StereoConfig]:
     return out
 
 
-def sweep(drive: MeasuredSequence, base: StereoConfig) -> Iterator[list[str | float]]:
-    """A row for each setting, and one for the odometry alone."""
+def sweep(
+    drive: MeasuredSequence, base: StereoConfig, seeds: Sequence[int] = (0,)
+) -> Iterator[list[str | float]]:
+    """A row for each setting, and one for the odometry alone: medians over the seeds of the filter, least and most."""
     for name, config in settings(base).items():
-        run = run_images(drive, config)
-        yield [name, *figures_of(run)]
-    yield ["odometry alone", *_off(run, run.odometry), "", "", ""]
+        runs = [run_images(drive, replace(config, seed=seed)) for seed in seeds]
+        off, end, nees, right, seconds = np.array([figures_of(run) for run in runs]).T
+        middle = float(np.median(end)), float(np.median(seconds))
+        yield [name, *_spread(off), middle[0], *_spread(nees), float(right[0]), middle[1]]
+        if config == base:
+            off, end = np.array([_off(run, run.odometry) for run in runs]).T
+            yield ["odometry alone", *_spread(off), float(np.median(end)), "", "", "", "", ""]
 
 
 def figures_of(run: StereoRun) -> Sequence[float]:
@@ -61,3 +68,7 @@ def _off(run: StereoRun, path: np.ndarray) -> Sequence[float]:
     assert truth is not None
     off = SE3.translation(path[truth.rows]) - SE3.translation(truth.poses)
     return [rms(off), float(np.linalg.norm(off[-1]))]
+
+
+def _spread(values: np.ndarray) -> Sequence[float]:
+    return [float(np.median(values)), float(values.min()), float(values.max())]
