@@ -234,6 +234,13 @@ def smoothing(figures: dict[str, float]) -> None:
     assert figures["backward"] < 0.5 * figures["filter"]
 
 
+def stereo_revisit(figures: dict[str, float]) -> None:
+    assert len(figures) == 4
+    for way in ("there", "there and back"):
+        recording = f"simulated lab, seed 0, {way}"
+        assert figures[f"{recording}: filter"] < figures[f"{recording}: odometry"]
+
+
 def stereo_overconfidence(figures: dict[str, float]) -> None:
     default = "default: prior, T_l = 4, updates within 16.3"
     clipped = "what is clipped does not update"
@@ -312,6 +319,7 @@ CLAIMS: dict[str, Callable[[Any], None]] = {
         smoothing,
         soak,
         stereo_overconfidence,
+        stereo_revisit,
         stereo_lab,
         sweep,
         target_tracking,

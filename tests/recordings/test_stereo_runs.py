@@ -8,40 +8,14 @@ import pytest
 from rbpf.sensors.features import CameraTruth
 from rbpf.sensors.readers import stereo_tracks
 from rbpf.sensors.readers.images import open_stereo
-from rbpf.sensors.readers.images.sequence import ImageFrame, ImageSequence, Source
 from rbpf.sensors.readers.images.stereo import StereoSequence
 from rbpf.systems.stereo.config import MapConfig, StereoConfig
 from rbpf.systems.stereo.run import StereoRun, run_features, run_images
 from rbpf.validation.gtsam_ba_camera import solve_features
 from rbpf.validation.stereo_scores import score_stereo
+from rbpf.validation.there_and_back import Reordered, pairs_there_and_back
 
 pytestmark = pytest.mark.real_data
-
-
-class Some(Source):
-    """Images of a sequence in another order, with the times given."""
-
-    def __init__(self, sequence: StereoSequence, rows: list[int], stamps_ns: np.ndarray) -> None:
-        self.images = list(sequence.frames())
-        self.rows, self.stamps_ns = rows, stamps_ns
-
-    def frames(self, start: int):
-        for row, stamp in list(zip(self.rows, self.stamps_ns.tolist(), strict=True))[start:]:
-            frame = self.images[row]
-            yield ImageFrame(stamp, frame.image, frame.right, frame.problem)
-
-
-def there_and_back(sequence: StereoSequence) -> StereoSequence:
-    """Forward, then backward, at an even pace; true poses where the recording has them."""
-    count = len(sequence)
-    rows = [*range(count), *range(count - 2, -1, -1)]
-    step = int(np.median(np.diff(sequence.stamps_ns)))
-    stamps = np.arange(len(rows), dtype=np.int64) * step
-    near = [int(np.abs(sequence.truth.stamps_ns - stamp).argmin()) for stamp in sequence.stamps_ns]
-    truth = CameraTruth(stamps, sequence.truth.world_from_camera[near][rows])
-    pair = sequence.pair
-    back = ImageSequence(pair.name, pair.camera, stamps, truth, pair.baseline_m, Some(sequence, rows, stamps))
-    return StereoSequence(back, sequence.rig)
 
 
 def scores(run: StereoRun) -> dict[str, float]:
@@ -54,7 +28,7 @@ def test_a_room_in_part(data_dir):
     sequence = open_stereo(data_dir / "stereo_zed_room1")
     rows = list(range(30))
     stamps = sequence.stamps_ns[rows]
-    part = replace(sequence.pair, stamps_ns=stamps, source=Some(sequence, rows, stamps))
+    part = replace(sequence.pair, stamps_ns=stamps, source=Reordered(sequence, np.array(rows), stamps))
     run = run_images(StereoSequence(part, sequence.rig), StereoConfig(particles=100))
     found = scores(run)
     assert found["ate_rmse_m"] < 0.009
@@ -88,7 +62,7 @@ def test_the_road(data_dir):
 @pytest.mark.slow
 def test_there_and_back_again(data_dir):
     """A path that comes back: with the map better than without, along all of it."""
-    sequence = there_and_back(open_stereo(data_dir / "stereo_zed_room1"))
+    sequence = pairs_there_and_back(open_stereo(data_dir / "stereo_zed_room1"))
     run = run_images(sequence, StereoConfig())
     found = scores(run)
     assert found["ate_rmse_m"] <= 0.009
