@@ -32,10 +32,10 @@ def read(path: Path, calibration: Path | None, tolerance_s: float) -> Pair:
     _require_pair(left, right, mav)
     listed = [read_stamped(folder / "data.csv", KIND, ",", nanoseconds=True) for folder in folders]
     *rows, notes = pair_stamps(listed[0].stamps_ns, listed[1].stamps_ns, tolerance_s, str(mav))
-    files = [
-        [lines.files(folder / "data")[row] for row in chosen]
-        for lines, folder, chosen in zip(listed, folders, rows, strict=True)
-    ]
+    files = []
+    for lines, folder, chosen in zip(listed, folders, rows, strict=True):
+        paths = lines.files(folder / "data")
+        files.append([paths[row] for row in chosen])
     shape = _shape(files, folders, left)
     stamps_ns = listed[0].stamps_ns[rows[0]]
     source = FileImages(stamps_ns, shape, files[0], files[1])

@@ -12,6 +12,7 @@ from rbpf.sensors.pinhole import Pinhole
 from rbpf.sensors.readers.images import open_images, open_stereo
 from rbpf.sensors.readers.images.pairing import pair_stamps
 from rbpf.sensors.readers.images.rectification import Rectification
+from rbpf.sensors.readers.images.stamped import StampedLines
 from tests.readers.images.folders import (
     CAM0,
     EUROC_NS,
@@ -55,6 +56,20 @@ def test_a_euroc_pair(tmp_path):
     expected = SE3.compose(poses, CAM0)
     np.testing.assert_allclose(SE3.local(sequence.truth.world_from_camera, expected), 0.0, atol=1e-9)
     assert [frame.stamp_ns for frame in sequence.frames(1)] == list(EUROC_NS[1:])
+
+
+def test_a_euroc_pair_lists_each_folder_once(tmp_path, monkeypatch):
+    """However long it is: listed for each image, 4,000 pairs took minutes to open."""
+    listed, files = [], StampedLines.files
+
+    def counted(lines, folder):
+        listed.append(folder.parent.name)
+        return files(lines, folder)
+
+    write_rectified(tmp_path)
+    monkeypatch.setattr(StampedLines, "files", counted)
+    assert levels(open_stereo(tmp_path)) == [(10, 100), (20, 110), (30, 120)]
+    assert sorted(listed) == ["cam0", "cam1"]
 
 
 def test_a_kitti_pair(tmp_path):
