@@ -59,7 +59,7 @@ def test_a_euroc_pair(tmp_path):
 
 
 def test_a_euroc_pair_lists_each_folder_once(tmp_path, monkeypatch):
-    """However long it is: listed for each image, 4,000 pairs took minutes to open."""
+    """However long it is: listed for each image, 4,000 pairs took a minute to open."""
     listed, files = [], StampedLines.files
 
     def counted(lines, folder):
