@@ -50,6 +50,7 @@ def demo(options: Annotated[DemoOptions, tyro.conf.arg(name="")]) -> None:
 APP.command(RUN, name="run")
 APP.command(SIMULATE, name="simulate")
 APP.command(name="calibrate")(cameras.calibrate)
+APP.command(name="recalibrate")(cameras.recalibrate)
 APP.command(name="validate")(judging.validate)
 APP.command(name="report")(judging.report)
 APP.command(name="export")(exporting.export)
