@@ -13,7 +13,7 @@ CONFIG = MonoConfig(particles=5)
 
 
 def found_with_uncertain_depth(std_px: float) -> tuple[list[bool], int]:
-    """Whether a feature was found each time, that could be so far off wherever the camera is; and how many others were."""
+    """Whether a feature that could be so far off, wherever the camera is, was found each time; how many others were."""
     doubted = known_points().names.size  # the first that is no known point
 
     def widened(t, frame, run):
