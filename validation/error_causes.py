@@ -1,8 +1,8 @@
 """Why a filter is further from the truth than the batch optimum of its measurements: one thing changed at a time.
 
 The filter is run again on the same measurements with more particles, another linearisation, other weights, and, for a
-camera, perfect associations and depths; the batch is started from the filter and from its own start. What brings the
-error down to the batch's is what kept it up.
+camera, perfect associations and depths; the batch is started from the filter and from its own start, and, for a robot,
+told what had been measured until then and no more. What brings the error down to the batch's is what kept it up.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -38,6 +38,7 @@ from rbpf.validation.run_truth import robot_truth
 from rbpf.validation.trajectory import Trajectory
 
 AS_IT_IS, BATCH, FROM_FILTER = "as it is", "batch", "batch started from the filter"
+ONLINE = "batch of what was measured until then"
 HEADER = ("changed", "error_m", "least_m", "most_m", "ratio")
 
 Told = Callable[[str], None]
@@ -92,6 +93,7 @@ def robot_causes(
         Cause(BATCH, (found,), found),
     ]
     out.append(Cause(FROM_FILTER, (error(again.world_from_robot),), found))
+    out.append(Cause(ONLINE, (error(gtsam_ba.solve_online(measured)),), found))
     for name, changed in _robot_changes(config):
         if told is not None:
             told(name)

@@ -76,3 +76,29 @@ def solve(
         raise optimiser.explain(problem, error) from error
     path, landmarks = problem.estimate(values)
     return BatchSolution(path, dict(landmarks), cov_poses, cov_landmarks, graph.error(values), iterations)
+
+
+def solve_online(m: Measurements, robust: float | None = None) -> Array:
+    """The last pose of the optimum of what had been measured until then, step after step: what no filter can do better.
+
+    By ISAM2 (M. Kaess et al., 2012), which linearises anew what has moved; directions without noise are given a tenth
+    of the step's largest standard deviation.
+
+    Args:
+        m: the measurements.
+        robust: as for `solve`.
+
+    Returns:
+        (T, E) poses.
+
+    Raises:
+        InputError: a sighting has no noise, or the measurements do not determine a variable.
+    """
+    from rbpf.validation import gtsam_ba_optimise as optimiser
+    from rbpf.validation.gtsam_ba_graph import Problem
+
+    problem = Problem(m, robust)
+    try:
+        return optimiser.online(problem)
+    except RuntimeError as error:
+        raise optimiser.explain(problem, error) from error

@@ -1,6 +1,7 @@
 """Optimisation of a `Problem` in GTSAM, from afar and then to the last digit; covariances at the optimum."""
 
 import re
+from collections.abc import Iterator
 from typing import Any
 
 import gtsam
@@ -13,6 +14,9 @@ from rbpf.validation.gtsam_ba_solvers import EXACT, ROUGH, gauss_newton, levenbe
 
 CHUNK = 50
 """Steps that `incremental` adds at once."""
+
+MOVED = 1e-3
+"""How far a variable may be from where `online` linearised it [rad, m]."""
 
 _SYMBOL = re.compile(r"\(Symbol: ([xl])(\d+)\)")
 
@@ -46,18 +50,33 @@ def optimise(problem: Problem, graph: Any, values: Any) -> tuple[Any, int]:
 
 
 def incremental(problem: Problem) -> Any:
-    """Values from ISAM2, `CHUNK` steps at a time, so that every loop is closed from near by.
+    """Values from ISAM2, `CHUNK` steps at a time, so that every loop is closed from near by."""
+    *_, (_, isam) = _grown(problem, CHUNK)
+    return isam.calculateEstimate()
 
+
+def online(problem: Problem) -> Array:
+    """The newest pose of ISAM2's estimate after each step, (T, E)."""
+    return np.array([pose for pose, _ in _grown(problem, 1, MOVED)])
+
+
+def _grown(problem: Problem, chunk: int, moved: float | None = None) -> Iterator[tuple[Array, Any]]:
+    """The newest pose (E,), and ISAM2, after every `chunk` steps.
+
+    With `moved`, all that has moved by so much [rad, m] is linearised anew every time, else as GTSAM usually does.
     A new pose starts by odometry from the estimate of the one before, a new landmark by its first sighting.
     """
     params = gtsam.ISAM2Params()
     params.setFactorization("QR")
+    if moved is not None:
+        params.relinearizeSkip = 1
+        params.setRelinearizeThreshold(moved)
     isam, m = gtsam.ISAM2(params), problem.m
     held = isam.getLinearizationPoint()  # while Python knows this object, no call of a factor copies it
     pose, seen = m.start, set[int]()
-    for first in range(0, len(m.stamps_ns), CHUNK):
+    for first in range(0, len(m.stamps_ns), chunk):
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        for step in range(first, min(first + CHUNK, len(m.stamps_ns))):
+        for step in range(first, min(first + chunk, len(m.stamps_ns))):
             pose = m.space.compose(pose, m.deltas[step - 1]) if step else pose
             problem.add_step(graph, step, soft=True)
             values.insert(problem.pose_key(step), problem.chart.pose(pose))
@@ -67,9 +86,11 @@ def incremental(problem: Problem) -> Any:
                     seen.add(landmark)
                     values.insert(problem.landmark_key(landmark), problem.model.invert(pose, m.z[row]))
         isam.update(graph, values)
+        if moved is not None:
+            isam.update()
         pose = problem.chart.storage(isam.calculateEstimate(), problem.pose_key(step))
+        yield pose, isam
     del held
-    return isam.calculateEstimate()
 
 
 def covariances(problem: Problem, graph: Any, values: Any) -> tuple[Array, dict[int, Array]]:

@@ -104,25 +104,29 @@ def described(statistic: Statistic) -> str:
         )
     if statistic.kind == "share":
         return f"{statistic.name}: {100 * value:.0f} % ({100 * low:.0f} to {100 * high:.0f})"
-    interval = f"{_number(low)} to {_number(high)}, where 1 is right"
-    return f"{statistic.name}: squared errors are {_number(value)} times what it expects ({interval}), {_sigma(value)}"
+    times, least, most = (_number(_root(ratio)) for ratio in (value, low, high))
+    found = f"errors are {times} times as large as it claims ({least} to {most}, where 1 is right)"
+    return f"{statistic.name}: {found}, {_side(value)}"
 
 
-def _sigma(ratio: float) -> str:
+def _root(ratio: float) -> float:
+    """Of variances to one of standard deviations, which is what a reader thinks in."""
+    return float(np.sqrt(max(ratio, 0.0)))
+
+
+def _side(ratio: float) -> str:
     if ratio <= 0.0:
         return "its standard deviations are far too large"
-    factor = float(np.sqrt(ratio))
-    if factor > 1.1:
-        return f"its standard deviations are about {_number(factor)} times too small"
-    if factor < 1.0 / 1.1:
-        return f"its standard deviations are about {_number(1.0 / factor)} times too large"
-    return "its standard deviations are right within a tenth"
+    if abs(np.log(_root(ratio))) <= np.log(1.1):
+        return "its standard deviations are right within a tenth"
+    return f"its standard deviations are too {'small' if ratio > 1.0 else 'large'}"
 
 
 def _why_open(statistic: Statistic) -> str:
+    zone = statistic.zone if statistic.kind != "ratio" else tuple(map(_root, statistic.zone))
     return (
-        f"the run is worth only {statistic.samples:.0f} independent samples of it, too few to say that it lies within "
-        f"{_number(max(statistic.zone[0], 0.0))} to {_number(statistic.zone[1])}, or that it does not"
+        f"the run is worth only {statistic.samples:.0f} independent samples of it, too few to say that this lies "
+        f"within {_number(max(zone[0], 0.0))} to {_number(zone[1])}, or that it does not"
     )
 
 

@@ -31,11 +31,14 @@ class ValidateOptions(Printed):
 
 def validate(options: Annotated[ValidateOptions, tyro.conf.arg(name="")]) -> None:
     """Compare a run with the truth or an optimum: JSON, pictures, and two sentences on top of its report."""
+    from rbpf.validation.comparison import read_comparisons
     from rbpf.validation.validate import validate as compare
 
     with waiting(f"comparing with {options.against} …"):
         verdict = compare(options.run, options.against, options.out)
-    _tell(verdict, options.run, options.json)
+    # The page's first sentence is about the truth where there is one; who asked for another comparison wants that one.
+    asked = [c.accuracy for c in read_comparisons(options.run) if c.against == options.against]
+    _tell(verdict, options.run, options.json, *(found for found in asked if found not in verdict.accuracy))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,8 +59,8 @@ def report(options: Annotated[ReportOptions, tyro.conf.arg(name="")]) -> None:
     _tell(write_report(options.run), options.run, options.json)
 
 
-def _tell(verdict: "Verdict", run: Path, as_json: bool) -> None:
-    page, said = run / "report.html", list(filter(None, (*verdict.sentences, verdict.advice)))
+def _tell(verdict: "Verdict", run: Path, as_json: bool, *first: str) -> None:
+    page, said = run / "report.html", list(filter(None, (*first, *verdict.sentences, verdict.advice)))
     entries = {"trust": verdict.trust, "sentences": said, "report": str(page)}
     answer(entries, as_json, *said, f"the page is {page}")
 

@@ -11,6 +11,7 @@ import yaml
 
 from rbpf.cli import main
 from rbpf.lie import SE3
+from rbpf.validation.colmap_pipeline import ReconstructionOptions
 from rbpf.validation.trajectory_files import read_tum
 from tests.cli.stereo_sequences import FRAMES, run
 
@@ -186,6 +187,21 @@ def test_a_run_is_compared_with_its_batch_optimum_afterwards(finished, tmp_path)
     assert written["figures"]["poses_bhattacharyya_median"] > 0.0
     assert all((folder / name).is_file() for name in written["pictures"]) and written["pictures"]
     assert "Against gtsam" in (folder / "report.html").read_text()
+
+
+def test_a_run_is_compared_with_a_reconstruction(finished, tmp_path, monkeypatch, capsys):
+    """The baseline tells the scale; so few pairs must all be key frames, and begin with a smaller angle."""
+    near = ReconstructionOptions(every=1, features=800, least_angle_deg=4.0)
+    monkeypatch.setattr("rbpf.validation.offline_comparisons.ReconstructionOptions", lambda: near)
+    folder = shutil.copytree(finished, tmp_path / "run")
+    assert main(["validate", str(folder), "--against", "colmap"]) == 0
+    assert "(rms) from COLMAP's reconstruction" in " ".join(capsys.readouterr().err.split())
+    figures = json.loads((folder / "validation_colmap.json").read_text())["figures"]
+    assert figures["run_registered"] == figures["run_key_frames"] == FRAMES
+    assert figures["run_alignment"] == figures["truth_alignment"] == "rigid"
+    assert figures["truth_ate_rmse_m"] < 0.01 and figures["run_ate_rmse_m"] < 0.03
+    assert figures["run_landmarks"] > 10 and figures["run_surface_median_m"] < 0.05
+    assert "Against colmap" in (folder / "report.html").read_text()
 
 
 def old(folder: Path) -> None:

@@ -51,6 +51,7 @@ NAMES_OF_PAGE = {
     "docs/phone_video.md": {"phone.mp4": "walk.mp4"},
     "docs/how_to/known_points.md": {"IMAGES": "longer"},
     "docs/how_to/stereo.md": {"SEQUENCE": "pairs", "path/to/sequence": "pairs"},
+    "docs/how_to/stereo_confidence.md": {"SEQUENCE": "pairs"},
     "docs/how_to/stereo_features.md": {"path/to/sequence": "pairs"},
     "docs/how_to/sweep.md": {"other_log": "log"},
 }

@@ -14,6 +14,7 @@ from rbpf.validation.error_causes import (
     AS_IT_IS,
     BATCH,
     FROM_FILTER,
+    ONLINE,
     camera_causes,
     robot_causes,
     scaled_noise,
@@ -33,6 +34,7 @@ def test_a_robots_causes_agree_with_the_table_of_ratios(tmp_path):
     assert rows[AS_IT_IS].errors_m == pytest.approx(ratio.filter_errors_m)
     assert rows[BATCH].errors_m[0] == pytest.approx(ratio.batch_errors_m[0])
     assert rows[FROM_FILTER].errors_m[0] == pytest.approx(rows[BATCH].errors_m[0], rel=1e-3)
+    assert rows[BATCH].errors_m[0] < rows[ONLINE].errors_m[0] < 2.0 * rows[AS_IT_IS].errors_m[0]
     many = rows["10× particles"]
     assert many.errors_m != rows[AS_IT_IS].errors_m
     assert many.row()[4] == pytest.approx(np.median(many.errors_m) / many.batch_m)

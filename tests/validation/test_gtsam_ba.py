@@ -9,7 +9,8 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3
-from rbpf.validation.gtsam_ba import solve
+from rbpf.validation.batch_problem import first_steps
+from rbpf.validation.gtsam_ba import solve, solve_online
 from rbpf.validation.gtsam_ba_chart import PLANAR, SPATIAL
 from rbpf.validation.gtsam_ba_graph import Problem
 from rbpf.validation.gtsam_ba_optimise import CHUNK
@@ -144,6 +145,19 @@ def test_any_start_near_by_leads_to_the_same_optimum():
     for found in (solve(m, initial=InitialEstimate(moved, points)), solve(m, incremental=True)):
         assert found.error == pytest.approx(expected.error, rel=1e-9)
         assert np.abs(SE3.local(expected.world_from_robot, found.world_from_robot)).max() < 1e-6
+
+
+@pytest.mark.parametrize("singular", [False, True])
+def test_the_online_optimum_knows_nothing_of_the_future(singular):
+    m = world(2, "range_bearing", singular, steps=30)
+    found = solve_online(m)
+    for step in (5, 14, 29):
+        then = solve(first_steps(m, step + 1))
+        off = m.space.local(then.world_from_robot[-1], found[step])
+        assert (np.abs(off) < 0.1 * np.sqrt(np.diag(then.cov_poses[-1]))).all()
+    whole = solve(m)
+    early = m.space.local(whole.world_from_robot[5], found[5])
+    assert (np.abs(early) > 0.3 * np.sqrt(np.diag(whole.cov_poses[5]))).any()
 
 
 def test_the_order_of_the_sightings_does_not_matter():

@@ -163,6 +163,16 @@ def test_one_that_claims_too_much_outweighs_all_that_are_cautious():
     assert judge("", [variance_ratio("poses", 1.0, 2.0, 2.0)]).leaning == ""
 
 
+def test_the_reason_is_told_in_standard_deviations():
+    """A table may have squares; who reads one sentence wants to know how many times further off the run is."""
+    reason = judge("", [variance_ratio("poses", 225.0, 500.0, 2.0)]).reason
+    assert reason.startswith("poses: errors are 15 times as large as it claims (14 to 16, where 1 is right)")
+    assert reason.endswith("its standard deviations are too small")
+    assert "0.1 times as large" in judge("", [variance_ratio("poses", 0.01, 500.0, 2.0)]).reason
+    open_ = judge("", [variance_ratio("poses", 1.0, 2.0, 2.0)], ["poses"]).reason
+    assert "right within a tenth" in open_ and "within 0.5 to 2," in open_
+
+
 def test_a_run_of_few_independent_samples_cannot_be_told():
     statistic = variance_ratio("poses", 1.0, 2.0, 2.0)
     verdict = judge("The path is good.", [statistic], ["poses"])
