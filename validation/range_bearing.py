@@ -66,7 +66,7 @@ def finish_run(finished: Run, recording: Path, out: Path, batch: bool = True) ->
         extra |= extra_batch
         stamps = np.array([frame.stamp_ns for frame in log.frames], dtype=np.int64)
         write_tum(out / "batch.tum", as_trajectory(log, stamps, path))
-    entries = write_run(finished, out, recording, extra)
+    entries = write_run(finished, out, recording, extra, batch)
     plot_run(finished, summarise_map(finished.filter, finished.anchored), out, paths)
     verdict = report_run(out)
     return entries | {"verdict": verdict.trust}

@@ -1,14 +1,16 @@
 """`rbpf run`: one function per system, and the same run again."""
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypeVar
 
 import tyro
 from tyro.extras import SubcommandApp
 
 from rbpf.cli.compiling import compile_kernels, use_threads
-from rbpf.cli.interrupts import finishing, patient
+from rbpf.cli.interrupts import Told, finishing, patient
 from rbpf.cli.options import (
+    ImageRunOptions,
     MonoOptions,
     RangeBearingOptions,
     RunOptions,
@@ -19,6 +21,18 @@ from rbpf.cli.options import (
 )
 from rbpf.cli.showing import answer, progress, say, table, told
 from rbpf.errors import InputError
+
+if TYPE_CHECKING:
+    from rbpf.validation.image_run import Telling
+
+
+class _Failing(Protocol):
+    """A run that may have ended before its recording did."""
+
+    failure: str | None
+
+
+ImageRun = TypeVar("ImageRun", bound=_Failing)
 
 RUN = SubcommandApp()
 RUN.__doc__ = """Filter a recording; `rbpf run SYSTEM --help` says more.
@@ -51,7 +65,7 @@ def run_mono(options: Annotated[MonoOptions, tyro.conf.arg(name="")]) -> None:
     """Monocular SLAM over a sequence of images or a video (E06: active search, inverse depth, FastSLAM 2.0)."""
     from rbpf.systems.mono.config import MonoConfig
     from rbpf.systems.settings import load_settings
-    from rbpf.validation.mono import Recording, Telling, finish_mono, start_mono
+    from rbpf.validation.mono import Recording, finish_mono, start_mono
     from rbpf.validation.rerun_file import require_rerun
 
     if options.rerun is not None:
@@ -63,22 +77,13 @@ def run_mono(options: Annotated[MonoOptions, tyro.conf.arg(name="")]) -> None:
         raise InputError("a camera is found in a known map with both: --map RUN --localize")
     markers, points = given_markers(options), options.known_points
     recording = Recording(options.sequence, points, options.calibration, board, options.map, markers)
-    _prepare(options)
-    with progress() as bar:
-        with patient(told(bar, bar.add_task("filtering", total=None))) as tell:
-            run = start_mono(recording, config, options.out, options.resume, tell)
-        solving = bar.add_task("batch", total=None, visible=options.batch)
-        drawing = bar.add_task("drawing", total=None, visible=options.video)
-        telling = Telling(
-            on_frame=told(bar, drawing),
-            on_iteration=lambda count, _error: bar.update(solving, completed=count),
-            batch_s=options.batch_limit,
-        )
-        with finishing():
-            entries = finish_mono(
-                run, recording, options.out, options.video, options.rerun, options.batch, telling
-            )
-    _finish(entries, options, run.failure)
+    _run_images(
+        options,
+        lambda tell: start_mono(recording, config, options.out, options.resume, tell),
+        lambda run, telling: finish_mono(
+            run, recording, options.out, options.video, options.rerun, options.batch, telling
+        ),
+    )
 
 
 @RUN.command(name="stereo")
@@ -86,7 +91,6 @@ def run_stereo(options: Annotated[StereoOptions, tyro.conf.arg(name="")]) -> Non
     """Stereo SLAM over a sequence of pairs of images (S05: SIFT landmarks, visual odometry, 400 particles)."""
     from rbpf.systems.settings import load_settings
     from rbpf.systems.stereo.config import StereoConfig
-    from rbpf.validation.mono import Telling
     from rbpf.validation.rerun_file import require_rerun
     from rbpf.validation.stereo import StereoRecording, finish_stereo, start_stereo
 
@@ -95,22 +99,13 @@ def run_stereo(options: Annotated[StereoOptions, tyro.conf.arg(name="")]) -> Non
     named = given(options, "particles", "seed", "dof")
     config = load_settings(StereoConfig, "stereo", options.config, options.set, named)
     recording = StereoRecording(options.sequence, options.calibration)
-    _prepare(options)
-    with progress() as bar:
-        with patient(told(bar, bar.add_task("filtering", total=None))) as tell:
-            run = start_stereo(recording, config, options.out, options.resume, tell)
-        solving = bar.add_task("batch", total=None, visible=options.batch)
-        drawing = bar.add_task("drawing", total=None, visible=options.video)
-        telling = Telling(
-            on_frame=told(bar, drawing),
-            on_iteration=lambda count, _error: bar.update(solving, completed=count),
-            batch_s=options.batch_limit,
-        )
-        with finishing():
-            entries = finish_stereo(
-                run, recording, options.out, options.video, options.rerun, options.batch, telling
-            )
-    _finish(entries, options, run.failure)
+    _run_images(
+        options,
+        lambda tell: start_stereo(recording, config, options.out, options.resume, tell),
+        lambda run, telling: finish_stereo(
+            run, recording, options.out, options.video, options.rerun, options.batch, telling
+        ),
+    )
 
 
 def repeated(arguments: list[str]) -> list[str]:
@@ -132,6 +127,30 @@ def repeated(arguments: list[str]) -> list[str]:
         options += [f"--{name}", value] if value else [f"--{name}"]
     out = [] if "--out" in arguments else ["--out", str(origin.config.parent) + "-again"]
     return ["run", origin.system, origin.recording, *options, *out, *arguments[3:]]
+
+
+def _run_images(
+    options: ImageRunOptions,
+    start: Callable[[Told], ImageRun],
+    finish: Callable[[ImageRun, "Telling"], dict[str, Any]],
+) -> None:
+    """Filters, then writes everything, with a bar for each stage of the work."""
+    from rbpf.validation.image_run import Telling
+
+    _prepare(options)
+    with progress() as bar:
+        with patient(told(bar, bar.add_task("filtering", total=None))) as tell:
+            run = start(tell)
+        solving = bar.add_task("batch", total=None, visible=options.batch)
+        drawing = bar.add_task("drawing", total=None, visible=options.video)
+        telling = Telling(
+            on_frame=told(bar, drawing),
+            on_iteration=lambda count, _error: bar.update(solving, completed=count),
+            batch_s=options.batch_limit,
+        )
+        with finishing():
+            entries = finish(run, telling)
+    _finish(entries, options, run.failure)
 
 
 def _prepare(options: RunOptions) -> None:

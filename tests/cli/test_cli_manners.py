@@ -195,11 +195,15 @@ def test_a_run_is_repeated_from_its_config(log, tmp_path, capsys):
     config = tmp_path / "a" / "config.yaml"
     entries = yaml.safe_load(config.read_text())
     assert entries["versions"]["numpy"] == np.__version__ and len(entries["input_sha256"]) == 64
-    again = ["run", "--from", str(config), "--no-batch"]
+    assert entries["batch"] is False
+    again = ["run", "--from", str(config)]
     assert main([*again, "--out", str(tmp_path / "b")]) == 0
     assert outputs(tmp_path / "a") == outputs(tmp_path / "b")
     assert main(again) == 0
     assert outputs(tmp_path / "a") == outputs(tmp_path / "a-again")
+    assert not (tmp_path / "a-again" / "batch.tum").exists()
+    assert main([*again, "--batch"]) == 0
+    assert (tmp_path / "a-again" / "batch.tum").exists()
     capsys.readouterr()
     path = next(log.glob("observations.csv"))
     before = path.read_text()
