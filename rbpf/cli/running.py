@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypeVar
 
 import tyro
-from tyro.extras import SubcommandApp
 
+from rbpf.cli.commands import Commands
 from rbpf.cli.compiling import compile_kernels, use_threads
 from rbpf.cli.interrupts import Told, finishing, patient
 from rbpf.cli.options import (
@@ -34,14 +34,13 @@ class _Failing(Protocol):
 
 ImageRun = TypeVar("ImageRun", bound=_Failing)
 
-RUN = SubcommandApp()
-RUN.__doc__ = """Filter a recording; `rbpf run SYSTEM --help` says more.
+RUN = Commands("""Filter a recording; `rbpf run SYSTEM --help` says more.
 
 `rbpf run --from RUN/config.yaml [--out NEW]` repeats a run: the same recording, the same settings, the same bytes.
-It is refused when the recording has changed. Further options are those of the run's system."""
+It is refused when the recording has changed. Further options are those of the run's system.""")
 
 
-@RUN.command(name="range-bearing")
+@RUN.add("range-bearing")
 def run_range_bearing(options: Annotated[RangeBearingOptions, tyro.conf.arg(name="")]) -> None:
     """Range-bearing SLAM over a robot's log (FastSLAM 2.0), beside the batch optimum of the same measurements."""
     from rbpf.systems.range_bearing.config import RangeBearingConfig
@@ -60,7 +59,7 @@ def run_range_bearing(options: Annotated[RangeBearingOptions, tyro.conf.arg(name
     _finish(entries, options, None)
 
 
-@RUN.command(name="mono")
+@RUN.add("mono")
 def run_mono(options: Annotated[MonoOptions, tyro.conf.arg(name="")]) -> None:
     """Monocular SLAM over a sequence of images or a video (E06: active search, inverse depth, FastSLAM 2.0)."""
     from rbpf.systems.mono.config import MonoConfig
@@ -86,7 +85,7 @@ def run_mono(options: Annotated[MonoOptions, tyro.conf.arg(name="")]) -> None:
     )
 
 
-@RUN.command(name="stereo")
+@RUN.add("stereo")
 def run_stereo(options: Annotated[StereoOptions, tyro.conf.arg(name="")]) -> None:
     """Stereo SLAM over a sequence of pairs of images (S05: SIFT landmarks, visual odometry, 400 particles)."""
     from rbpf.systems.settings import load_settings
@@ -156,7 +155,7 @@ def _run_images(
 def _prepare(options: RunOptions) -> None:
     """Threads as asked for, and compiled kernels."""
     use_threads(options.threads)
-    compile_kernels(say)
+    compile_kernels()
 
 
 def _finish(entries: dict[str, Any], options: RunOptions, failure: str | None) -> None:

@@ -16,7 +16,7 @@ import yaml
 
 from rbpf.cli import APP, DemoOptions, main
 from rbpf.cli.cameras import CalibrateOptions
-from rbpf.cli.compiling import cached, kernel_modules
+from rbpf.cli.compiling import cached, compile_kernels, kernel_modules
 from rbpf.cli.exporting import ExportOptions
 from rbpf.cli.installed import DoctorOptions
 from rbpf.cli.judging import CompareOptions, ReportOptions, SweepOptions, ValidateOptions
@@ -106,6 +106,20 @@ def test_help_says_what_each_option_is_its_default_and_its_unit(command, capsys,
             assert "by default" in found[1] or "None for none" in found[1], f"{command} {shown}: by default?"
         if isinstance(item.default, float):
             assert UNIT.search(found[1]), f"{command} {shown} has no unit: {found[1]}"
+
+
+@pytest.mark.parametrize(
+    "arguments", ["nonsense", "nonsense --help", "run nonsense --help", "simulate nonsense -h"]
+)
+def test_a_command_that_there_is_not_is_named_even_where_help_is_asked_for(arguments, capsys):
+    assert main(arguments.split()) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and "nonsense`: there are " in err
+
+
+def test_a_slip_of_the_pen_is_told_the_nearest_command(capsys):
+    assert main(["simulate", "dsek", "--out", "x"]) == 2
+    assert "no command `rbpf simulate dsek`: did you mean desk?" in capsys.readouterr().err
 
 
 def test_json_is_one_object_on_standard_output(log, tmp_path, capsys):
@@ -223,6 +237,7 @@ def test_the_doctor_finds_everything_here_and_what_is_missing(capsys, monkeypatc
     assert entries["works"] and not entries["kernels_missing"]
     assert entries["python"] == sys.version.split()[0] and entries["libraries"]["numpy"] == np.__version__
     assert all(cached(module) for module in kernel_modules())
+    assert compile_kernels() == []
     monkeypatch.setitem(sys.modules, "gtsam", None)
     monkeypatch.setitem(sys.modules, "rerun", None)
     assert main(["doctor", "--no-compile", "--json"]) == 2
