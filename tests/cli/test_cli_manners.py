@@ -28,7 +28,7 @@ from rbpf.cli.options import (
     RangeBearingOptions,
     StereoOptions,
 )
-from tests.cli.test_cli import outputs
+from tests.cli.run_outputs import outputs
 
 pytestmark = pytest.mark.slow
 
