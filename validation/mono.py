@@ -131,7 +131,7 @@ def finish_mono(
     batch: bool = True,
     telling: Telling | None = None,
 ) -> dict[str, Any]:
-    """Writes all files, pictures, the annotated video and the report of a run; returns the entries of summary.json.
+    """Writes all files, pictures, video and report of a run; returns the entries of summary.json and the verdict.
 
     The filter's own files are complete before the batch adjustment begins.
 
@@ -161,4 +161,4 @@ def finish_mono(
     if rerun is not None:
         write_rerun(run, mapped, rerun)
     verdict = report_run(out)
-    return entries | {"verdict": verdict.trust}
+    return entries | {"verdict": verdict.trust, "sentences": verdict.said}

@@ -160,6 +160,8 @@ def _prepare(options: RunOptions) -> None:
 
 def _finish(entries: dict[str, Any], options: RunOptions, failure: str | None) -> None:
     result = entries | {"out": str(options.out)}
-    answer(result, options.json, table(entries), f"results, pictures and report.html are in {options.out}")
+    shown = {name: value for name, value in entries.items() if name != "sentences"}
+    where = f"results, pictures and report.html are in {options.out}"
+    answer(result, options.json, table(shown), *entries["sentences"], where)
     if failure is not None:
         raise InputError(f"{failure}; what was computed before it is in {options.out}")
