@@ -7,9 +7,18 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.sensors.features import FeatureFrame
 from rbpf.sensors.pinhole import Pinhole
 from rbpf.sensors.readers.images import KnownPixels
-from rbpf.systems.mono.known_start import require_texture, resect_known
+from rbpf.systems.mono.known_start import (
+    NEEDLE,
+    SPHERE,
+    KnownStart,
+    first_records,
+    located_points,
+    require_texture,
+    resect_known,
+)
 
 CAMERA = Pinhole(320, 240, 260.0, 260.0, 159.5, 119.5)
 POSE = SE3.exp(np.array([0.2, -0.3, 0.1, 0.5, -0.2, 0.4]))
@@ -54,6 +63,51 @@ def test_three_points():
     three = KnownPixels(*(column[:3] for column in (given.names, given.px, given.positions, given.std_m)))
     with pytest.raises(InputError, match="at least four"):
         resect_known(CAMERA, three, 1.0)
+
+
+def test_what_is_given_of_a_point_is_uncertain_along_the_line_of_sight():
+    given = replace(points(), std_m=np.linspace(0.01, 0.06, 6))
+    located, pose = located_points(CAMERA, given, noise_px=1.0)
+    assert np.abs(SE3.local(pose, POSE)).max() < 1e-6
+    np.testing.assert_allclose(np.trace(located.cov, axis1=1, axis2=2), given.std_m**2)
+    line = given.positions - POSE[4:]
+    line /= np.linalg.norm(line, axis=1, keepdims=True)
+    along = np.sqrt(np.einsum("ma,mab,mb->m", line, located.cov, line))
+    np.testing.assert_allclose(along, given.std_m * np.sqrt(1.0 - 2.0 * NEEDLE**2), rtol=1e-6)
+
+
+def test_the_first_image_shows_that_points_are_uncertain_across_the_line_of_sight_too():
+    rng, std = np.random.default_rng(3), 0.03
+    shares = []
+    for error in (0.0, 0.008, 0.03):
+        given = replace(points(), std_m=np.full(6, std))
+        across = error * rng.standard_normal((6, 3))
+        across -= (across @ SE3.rotation(POSE)[:, 2])[:, None] * SE3.rotation(POSE)[:, 2]
+        located, _ = located_points(CAMERA, replace(given, positions=given.positions + across), 0.3)
+        shares.append(np.sqrt(np.linalg.eigvalsh(located.cov)[:, 0]) / std)
+    np.testing.assert_allclose(shares[0], NEEDLE, rtol=1e-6)
+    assert (shares[1] > 1.5 * NEEDLE).all() and (shares[1] < SPHERE).all()
+    np.testing.assert_allclose(shares[2], SPHERE, rtol=1e-6)
+
+
+def test_points_with_errors_along_the_line_of_sight_place_the_camera_honestly():
+    """The squared error of their frame is what its covariance says, 6, but for the least share across the line."""
+    rng, nees = np.random.default_rng(5), []
+    exact, std_px, std_m = points(), 0.5, 0.03
+    for _ in range(200):
+        px = exact.px + std_px * rng.standard_normal(exact.px.shape)
+        seen = np.concatenate([CAMERA.unproject(exact.px), np.ones((6, 1))], axis=1)
+        line = seen / np.linalg.norm(seen, axis=1, keepdims=True) @ SE3.rotation(POSE).T
+        placed = exact.positions + std_m * rng.standard_normal((6, 1)) * line
+        given = replace(exact, px=px, positions=placed, std_m=np.full(6, std_m))
+        located, pose = located_points(CAMERA, given, std_px)
+        sight = FeatureFrame(0, located.names, px, np.tile(std_px**2 * np.eye(2), (6, 1, 1)))
+        start = KnownStart(located, pose, np.arange(6), sight)
+        records, group = first_records(CAMERA, start, 1, np.diag(np.repeat([0.25, 1.0], 3)))
+        frame, factor = (part[0] for part in group.frame(records))
+        error = SE3.local(frame, SE3.inverse(POSE))
+        nees.append(error @ np.linalg.solve(factor @ factor.T, error))
+    assert 4.0 < np.mean(nees) < 6.5
 
 
 @pytest.mark.parametrize("shown", ["nothing", "an edge", "a corner"])

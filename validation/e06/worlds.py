@@ -139,7 +139,7 @@ class StillTarget:
         pose = looking(np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0]]))[0]
         px = camera.project(SE3.inverse_transform(pose, positions))
         px = px + noise_px * rng.standard_normal(px.shape)
-        positions = positions + std_m * rng.standard_normal(positions.shape)
+        positions = positions + std_m / np.sqrt(3.0) * rng.standard_normal(positions.shape)
         return KnownPixels(np.arange(1, 5), px, positions, np.full(4, std_m))
 
     def _poster(self, rng: np.random.Generator) -> Rectangle:

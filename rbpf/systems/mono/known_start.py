@@ -25,6 +25,9 @@ SPHERE, NEEDLE = 3.0**-0.5, 0.05
 """Share of a known point's standard deviation along an axis across the line of sight: alike in all directions, and of a
 point that was located from views five degrees apart."""
 
+SURE = 0.95
+"""Residuals that noise alone would exceed less often than this leaves are beyond the noise."""
+
 SAME_PX = 1.0
 """Known points nearer to each other in the image are one."""
 
@@ -66,9 +69,7 @@ def resect_known(camera: Pinhole, known: KnownPixels, noise_px: float) -> np.nda
     return world_from_camera
 
 
-def located_points(
-    camera: Pinhole, known: KnownPixels, noise_px: float
-) -> tuple[KnownPoints, np.ndarray]:
+def located_points(camera: Pinhole, known: KnownPixels, noise_px: float) -> tuple[KnownPoints, np.ndarray]:
     """Known points, named 0, 1, …, with the covariance of their errors, and the first camera.
 
     What cameras or a depth sensor locate is uncertain along the line of sight, and hardly across it: so the given
@@ -86,10 +87,13 @@ def located_points(
     Raises:
         InputError: as `resect_known`.
     """
+    from scipy.stats import chi2
+
     pose = resect_known(camera, known, noise_px)
     local = SE3.inverse_transform(pose, known.positions)
     residual = camera.project(local) - known.px
-    excess = max(np.square(residual).sum() / (residual.size - 6) - noise_px**2, 0.0)
+    squared, dof = float(np.square(residual).sum()), residual.size - 6
+    excess = squared / dof - noise_px**2 if squared > chi2.ppf(SURE, dof) * noise_px**2 else 0.0
     seen = excess * (local[:, 2] / camera.fx) ** 2
     var_across = np.clip(seen, (NEEDLE * known.std_m) ** 2, (SPHERE * known.std_m) ** 2)[:, None, None]
     line = SE3.rotation(pose) @ (local / np.linalg.norm(local, axis=1, keepdims=True))[..., None]

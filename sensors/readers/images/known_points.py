@@ -4,7 +4,8 @@
     1,517.426,320.498,-0.25433,0.12486,1.60044,0.0365
 
 sigma_m is the standard deviation of the place as a whole, the root of its covariance's trace: the root mean square
-distance from where the point truly is. The columns may come in any order, and others beside them are passed over. Pixel centres are at whole numbers.
+distance from where the point truly is. The columns may come in any order, and others beside them are passed over.
+Pixel centres are at whole numbers.
 """
 
 from dataclasses import dataclass
