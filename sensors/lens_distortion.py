@@ -11,6 +11,8 @@ from typing import final
 
 import numpy as np
 
+from rbpf.arrays import Bool, Float
+
 SETTLED, SOLVED = 1e-14, 1e-12
 """Errors of `undistort`, relative to 1 + the distance from the axis: the iteration ends, the result is accepted."""
 
@@ -52,7 +54,7 @@ class RadialTangential:
         positive = roots.real[(roots.imag == 0.0) & (roots.real > 0.0)]
         return float(1.0 / np.sqrt(positive.max())) if positive.size else float("inf")
 
-    def distort(self, uv: np.ndarray) -> np.ndarray:
+    def distort(self, uv: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
         """Distorted coordinates (…, 2) of normalised ones."""
         if self.is_plain:
             return uv
@@ -64,7 +66,7 @@ class RadialTangential:
         down = v * radial + 2.0 * p2 * u * v + p1 * (s + 2.0 * v * v)
         return np.stack([along, down], axis=-1)
 
-    def slope(self, uv: np.ndarray) -> np.ndarray:
+    def slope(self, uv: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2 2"]:
         """Its derivative (…, 2, 2), a symmetric matrix."""
         k1, k2, p1, p2, k3 = self.coefficients
         u, v = uv[..., 0], uv[..., 1]
@@ -76,7 +78,7 @@ class RadialTangential:
         down = radial + bend * v * v + 6.0 * p1 * v + 2.0 * p2 * u
         return np.stack([along, across, across, down], axis=-1).reshape(*uv.shape, 2)
 
-    def is_unique(self, uv: np.ndarray) -> np.ndarray:
+    def is_unique(self, uv: Float[np.ndarray, "*batch 2"]) -> Bool[np.ndarray, "*batch"]:
         """Whether the distortion is one-to-one up to (u, v) (…).
 
         Within the monotonic radius radial distortion is; with tangential distortion its derivative must be positive
@@ -89,7 +91,7 @@ class RadialTangential:
         within = np.hypot(uv[..., 0], uv[..., 1]) < self.monotonic_radius
         return within & (trace > 0.0) & (_determinant(slope) > 0.0)
 
-    def undistort(self, target: np.ndarray) -> np.ndarray:
+    def undistort(self, target: Float[np.ndarray, "K 2"]) -> Float[np.ndarray, "K 2"]:
         """Normalised coordinates (K, 2) of distorted ones, NaN where there are none."""
         if self.is_plain:
             return np.where(self.is_unique(target)[:, None], target, np.nan)
@@ -132,7 +134,7 @@ def _determinant(matrix: np.ndarray) -> np.ndarray:
     return matrix[..., 0, 0] * matrix[..., 1, 1] - matrix[..., 0, 1] * matrix[..., 1, 0]
 
 
-def inverse(matrix: np.ndarray) -> np.ndarray:
+def inverse(matrix: Float[np.ndarray, "*batch 2 2"]) -> Float[np.ndarray, "*batch 2 2"]:
     """Of symmetric (…, 2, 2) matrices."""
     a, b, d = matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 1, 1]
     adjugate = np.stack([d, -b, -b, a], axis=-1).reshape(matrix.shape)
