@@ -16,6 +16,7 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.sensors.board_calibration import BoardCalibration, BoardView, calibrate
 from rbpf.sensors.chessboard import Board, board_corners
+from rbpf.sensors.pinhole import Pinhole
 from rbpf.sensors.readers.images.calibration import NAME
 from rbpf.sensors.readers.images.uncalibrated import Shot, read_shots
 from rbpf.validation.figures import COLOURS, label, save_figures
@@ -73,15 +74,15 @@ def write_calibration(found: BoardCalibration, board: Board, looked_at: int, out
     entries = summarise_calibration(found, board, looked_at)
     save_figures({PICTURE: _draw(found)}, out)
     write_text(out / FIGURES, json.dumps(entries, indent=2, allow_nan=False) + "\n")
-    write_text(out / NAME, camera_text(found))
+    about = f"from {len(found.views)} views of a chessboard; reprojection error {found.rms_px:.3f} px"
+    write_text(out / NAME, camera_text(found.camera, about))
     return entries
 
 
-def camera_text(found: BoardCalibration) -> str:
-    """What camera.yaml holds."""
-    camera = found.camera
+def camera_text(camera: Pinhole, about: str) -> str:
+    """What camera.yaml holds, under a line that says where it comes from."""
     lines = [
-        f"# from {len(found.views)} views of a chessboard; reprojection error {found.rms_px:.3f} px",
+        f"# {about}",
         "model: pinhole",
         *(f"{name}: {getattr(camera, name):.6f}" for name in _NAMES[:4]),
         f"width: {camera.width}",

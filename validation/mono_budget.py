@@ -34,10 +34,10 @@ from rbpf.validation.mono_parts import (
     adjust_near,
     agreeing_matches,
     batch_depths,
-    refine_calibration,
     reprojection_errors,
 )
 from rbpf.validation.mono_scores import true_path, usual_alignment
+from rbpf.validation.self_calibration import refine_calibration
 from rbpf.validation.trajectory import Trajectory
 
 MANY = 10

@@ -1,8 +1,8 @@
-"""Perfect parts for a monocular filter: matches, depths and a calibration that a batch adjustment vouches for."""
+"""Perfect parts for a monocular filter: matches and depths that a batch adjustment vouches for."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple, final
+from typing import final
 
 import numpy as np
 
@@ -11,7 +11,6 @@ from rbpf.lie import SE3
 from rbpf.models import Births, Observations, Sensor
 from rbpf.sensors.camera_points import CameraRay
 from rbpf.sensors.features import FeatureFrame, FeatureLog
-from rbpf.sensors.pinhole import Pinhole
 from rbpf.systems.mono.feature_sensor import FeatureSensor
 from rbpf.validation.mono_batch import Batch, adjust_log
 
@@ -20,12 +19,6 @@ WRONG_PX = 3.0
 
 DEPTH_SHARE = 0.01
 """Standard deviation of a depth that is given, as a share of it."""
-
-_GRID = np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1)], dtype=float)
-"""Where the error is looked at for a quadratic of two variables."""
-
-_STEPS = np.array([[0.01, 0.02], [0.003, 0.006]])
-"""Of focal length, as a share, and of k1: in a first round and a second."""
 
 
 def reprojection_errors(batch: Batch) -> list[np.ndarray]:
@@ -99,57 +92,3 @@ class GivenDepths(Sensor):
                 model = CameraRay(self.features.camera, (rho, DEPTH_SHARE * rho))
             out.append(Births(group.z[k : k + 1], group.cov[k : k + 1], model, group.landmark, facts=[name]))
         return out
-
-
-class Calibrated(NamedTuple):
-    """A camera whose focal length and k1 explain the measurements best, and the batch with it."""
-
-    camera: Pinhole
-    batch: Batch
-
-
-def refine_calibration(log: FeatureLog, batch: Batch) -> Calibrated:
-    """Focal length and k1 of the least error of the batch: the lowest point of a quadratic, fitted twice.
-
-    Args:
-        log: the measurements.
-        batch: their optimum with the given camera.
-    """
-    best = batch
-    for size in _STEPS:
-        camera = _camera(best.log)
-        solved = [_with_camera(log, best, _changed(camera, *(size * step))) for step in _GRID]
-        lowest = _lowest(_GRID, np.array([one.solution.error for one in solved]))
-        solved.append(_with_camera(log, best, _changed(camera, *(size * lowest))))
-        best = min([best, *solved], key=lambda one: one.solution.error)
-    return Calibrated(_camera(best.log), best)
-
-
-def _camera(log: FeatureLog) -> Pinhole:
-    assert isinstance(log.camera, Pinhole)
-    return log.camera
-
-
-def _changed(camera: Pinhole, focal: float, k1: float) -> Pinhole:
-    k1_now, k2, p1, p2, k3 = camera.distortion
-    return replace(
-        camera,
-        fx=camera.fx * (1.0 + focal),
-        fy=camera.fy * (1.0 + focal),
-        distortion=(k1_now + k1, k2, p1, p2, k3),
-    )
-
-
-def _with_camera(log: FeatureLog, batch: Batch, camera: Pinhole) -> Batch:
-    return adjust_near(replace(log, camera=camera), batch)
-
-
-def _lowest(grid: np.ndarray, errors: np.ndarray) -> np.ndarray:
-    """Where the quadratic through errors (7,) at places (7, 2) is lowest, no farther out than twice the grid."""
-    a, b = grid.T
-    terms = np.stack([np.ones_like(a), a, b, 0.5 * a * a, a * b, 0.5 * b * b], axis=1)
-    _, ga, gb, haa, hab, hbb = np.linalg.lstsq(terms, errors, rcond=None)[0]
-    hessian = np.array([[haa, hab], [hab, hbb]])
-    if np.linalg.eigvalsh(hessian)[0] <= 0.0:
-        return np.asarray(grid[np.argmin(errors)])
-    return np.clip(-np.linalg.solve(hessian, [ga, gb]), -2.0, 2.0)

@@ -50,6 +50,7 @@ def demo(options: Annotated[DemoOptions, tyro.conf.arg(name="")]) -> None:
 APP.add_group("run", RUN)
 APP.add_group("simulate", SIMULATE)
 APP.add("calibrate")(cameras.calibrate)
+APP.add("recalibrate")(cameras.recalibrate)
 APP.add("validate")(judging.validate)
 APP.add("report")(judging.report)
 APP.add("export")(exporting.export)

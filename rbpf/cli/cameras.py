@@ -1,4 +1,4 @@
-"""`rbpf calibrate`: the camera from pictures of a chessboard."""
+"""`rbpf calibrate` and `rbpf recalibrate`: the camera from pictures of a chessboard, or from what a run measured."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -62,3 +62,35 @@ def calibrate(options: Annotated[CalibrateOptions, tyro.conf.arg(name="")]) -> N
             f"the camera is known to {100 * loose:.1f} % of its focal length only, and a run with it will bend: film "
             "the board larger, and tilted in all directions"
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecalibrateOptions(Printed):
+    """Options of `rbpf recalibrate`.
+
+    Attributes:
+        run: folder of a finished run of one camera.
+        out: folder for camera.yaml.
+    """
+
+    run: tyro.conf.Positional[Path]
+    out: Path = Path("recalibration")
+
+
+def recalibrate(options: Annotated[RecalibrateOptions, tyro.conf.arg(name="")]) -> None:
+    """Find the focal length and k1 that a run's own measurements prefer, and write camera.yaml: for nominal cameras."""
+    from rbpf.validation.self_calibration import recalibrate as from_run
+
+    with progress() as bar:
+        entries, found = from_run(
+            options.run, options.out, told(bar, bar.add_task("adjusting with other cameras", total=None))
+        )
+    focal, k1 = entries["fx"], entries["k1"]
+    answer(
+        entries | {"out": str(options.out)},
+        options.json,
+        f"focal length {focal['before']:.2f} → {focal['after']:.2f} px (± {found.std[0] * focal['after']:.2f}), "
+        f"k1 {k1['before']:.4f} → {k1['after']:.4f} (± {found.std[1]:.4f}); "
+        f"half the squared misfit {entries['error_before']:.0f} → {entries['error_after']:.0f}",
+        f"camera.yaml is in {options.out}; use it with --calibration {options.out / 'camera.yaml'}",
+    )

@@ -15,7 +15,7 @@ import pytest
 import yaml
 
 from rbpf.cli import APP, DemoOptions, main
-from rbpf.cli.cameras import CalibrateOptions
+from rbpf.cli.cameras import CalibrateOptions, RecalibrateOptions
 from rbpf.cli.compiling import cached, compile_kernels, kernel_modules
 from rbpf.cli.exporting import ExportOptions
 from rbpf.cli.installed import DoctorOptions
@@ -42,6 +42,7 @@ COMMANDS = {
     "simulate room": ImagesOptions,
     "simulate lab": LabOptions,
     "calibrate": CalibrateOptions,
+    "recalibrate": RecalibrateOptions,
     "validate": ValidateOptions,
     "report": ReportOptions,
     "export": ExportOptions,

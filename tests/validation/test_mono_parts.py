@@ -14,7 +14,6 @@ from rbpf.validation.mono_parts import (
     GivenDepths,
     agreeing_matches,
     batch_depths,
-    refine_calibration,
     reprojection_errors,
 )
 from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
@@ -83,16 +82,3 @@ def test_landmarks_start_at_the_given_depths(log, batch):
     rho = np.array([1.0 / depths[name] for name in rays])
     np.testing.assert_allclose(records.mean[0, :, 2], rho, rtol=1e-9)
     np.testing.assert_allclose(np.sqrt(records.cov[0, :, 2, 2]), DEPTH_SHARE * rho, rtol=1e-6)
-
-
-def test_a_wrong_focal_length_and_distortion_are_mended(log, batch):
-    camera = log.camera
-    wrong = replace(
-        camera, fx=1.015 * camera.fx, fy=1.015 * camera.fy, distortion=(-0.02, 0.0, 0.0, 0.0, 0.0)
-    )
-    spoilt = replace(log, camera=wrong)
-    start = adjust_log(spoilt, batch.world_from_camera)
-    refined = refine_calibration(spoilt, start)
-    assert refined.batch.solution.error < start.solution.error
-    assert abs(refined.camera.fx / camera.fx - 1.0) < 0.005
-    assert abs(refined.camera.distortion[0]) < 0.007

@@ -23,6 +23,9 @@ ALIKE = 0.9
 ENOUGH = 4
 """Matches that must agree on a motion for it to say where the others are."""
 
+WIDEST = 2.0
+"""An ellipse larger than so many times what is searched of it is hardly searched at all."""
+
 
 @dataclass(frozen=True)
 class Searched:
@@ -133,7 +136,7 @@ class ActiveSearch:
         which, nu, jac, cov = self._innovations(belief, searched.rows[hits], searched.px[hits])
         fit = fit_motion(nu, jac, cov, self._prior_factor(belief))
         found = np.zeros_like(searched.found)
-        found[hits[which[fit.squared <= self.config.gate]]] = True
+        found[hits[which[(fit.squared <= self.config.gate) & self._placed(cov)]]] = True
         searched = replace(searched, found=found)
         if found.sum() < ENOUGH:
             return searched
@@ -147,12 +150,24 @@ class ActiveSearch:
         if not missed.size:
             return searched
         which, nu, jac, cov = self._innovations(belief, searched.rows[missed], searched.mean[missed])
-        missed = missed[which]
+        placed = self._placed(cov)
+        missed, nu, jac, cov = missed[which[placed]], nu[placed], jac[placed], cov[placed]
+        if not missed.size:
+            return searched
         mean = searched.mean[missed] - nu + jac @ fit.increment
         cov = cov + jac @ fit.cov @ np.swapaxes(jac, -1, -2)
         px, score, found = searched.px.copy(), searched.score.copy(), searched.found.copy()
         px[missed], score[missed], found[missed], _ = self._looked_for(image, templates[missed], mean, cov)
         return replace(searched, px=px, score=score, found=found)
+
+    def _placed(self, cov: np.ndarray) -> np.ndarray:
+        """Which features (K,) are where the camera's motion puts them, up to what is searched.
+
+        One with a depth more uncertain than that, cov (K, 2, 2) where the camera is known, agrees with every motion:
+        which of several places that look alike is the right one cannot be told.
+        """
+        own = self.config.sigmas * np.sqrt(np.linalg.eigvalsh(cov)[:, -1])
+        return np.asarray(own <= WIDEST * self.config.largest_px)
 
     def _innovations(
         self, belief: Belief, rows: np.ndarray, px: np.ndarray
