@@ -16,10 +16,12 @@ setup: $(STAMP) ## make .venv with the project and everything it needs (done onc
 $(STAMP): pyproject.toml requirements.lock
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "$(PYTHON) is older than Python 3.11; name a newer one: make PYTHON=python3.12 setup" >&2; exit 2; }
-	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --requirement requirements.lock
-	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
-	$(BIN)/python -m rbpf.kernels
+	@echo "setting up .venv, which is done once. 1 of 2: download and install the packages; pip says nothing for some minutes …"
+	@$(PYTHON) -m venv .venv
+	@$(BIN)/python -m pip install --quiet --requirement requirements.lock
+	@$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
+	@echo "2 of 2: compile the kernels, and try what is installed …"
+	@$(BIN)/rbpf doctor
 	@touch $@
 
 demo: $(STAMP) ## simulate, filter and report into demo/

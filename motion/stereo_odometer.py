@@ -120,6 +120,7 @@ class StereoOdometer:
             what = "the last velocity" if self.velocity.any() else "a camera at rest"
             return OdometerStep(expected, found, f"{found.failure}; {what} is assumed, widely")
         odometry, note = _joined(found, expected)
+        note = "; ".join(filter(None, (note, _two_motions(found))))
         if self.prediction.keep_velocity:
             self.velocity = SE3.log(odometry.delta) / dt
         return OdometerStep(odometry, found, note)
@@ -157,6 +158,16 @@ def chain(increments: Sequence[Array]) -> Array:
     for delta in increments:
         path.append(SE3.compose(path[-1], delta))
     return np.array(path)
+
+
+def _two_motions(found: MotionEstimate) -> str:
+    """In words, that part of what is seen moves; empty where nothing does."""
+    if not found.elsewhere:
+        return ""
+    return (
+        f"{found.inliers.sum()} of {found.inliers.size} matches agree on a motion and {found.elsewhere} on another: "
+        "something in the view moves, and the camera's motion is taken to be that of the many"
+    )
 
 
 def _joined(found: MotionEstimate, expected: Odometry) -> tuple[Odometry, str]:

@@ -81,6 +81,8 @@ class MotionEstimate:
             what the gate cuts off made up for.
         iterations: of the optimiser.
         failure: why no motion was found, in words; empty where one was.
+        elsewhere: number of matches that are far from this motion and agree on another one, as those on a thing that
+            moves; false matches agree on none.
     """
 
     previous_camera_from_camera: Array
@@ -89,6 +91,7 @@ class MotionEstimate:
     rms: float
     iterations: int
     failure: str = ""
+    elsewhere: int = 0
 
     @property
     def found(self) -> bool:
@@ -130,7 +133,8 @@ def estimate_motion(
     if real.sum() < config.least_matches:
         return _failed(start, matches, f"{complaint}, {config.least_matches} are needed")
     motion = consensus(matches.rows(real), start, config.gate, rng, config.draws)
-    return _refined(matches, real, motion, start, config)
+    found = _refined(matches, real, motion, start, config)
+    return replace(found, elsewhere=_elsewhere(matches, real, found, config, rng)) if found.found else found
 
 
 def fit(matches: Matches, start: Array, config: VoConfig) -> Minimum:
@@ -174,6 +178,19 @@ def _refined(
         return _failed(start, matches, f"the optimiser did not converge in {iterations} iterations")
     rms = np.sqrt(trimming(config.gate) * found.squared / max(len(found.residual) - 6, 1))
     return MotionEstimate(motion, _covariance(part, found, config), inliers, float(rms), iterations)
+
+
+def _elsewhere(
+    matches: Matches, real: np.ndarray, found: MotionEstimate, config: VoConfig, rng: np.random.Generator
+) -> int:
+    """How many matches agree on another motion; those just outside the gate belong to the one that was found."""
+    squared = _squared(matches, found.previous_camera_from_camera, config)
+    far = matches.rows(real & (squared > WIDE * config.gate))
+    if len(far) < config.least_matches:
+        return 0
+    motion = consensus(far, SE3.identity(), config.gate, rng, config.draws)
+    other = _refined(far, np.ones(len(far), dtype=bool), motion, motion, config)
+    return int(other.inliers.sum())
 
 
 def _squared(matches: Matches, motion: Array, config: VoConfig) -> Array:

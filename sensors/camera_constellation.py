@@ -1,5 +1,6 @@
 """A camera's view of known points that one landmark holds together, see `rbpf.maps.constellation`."""
 
+from abc import abstractmethod
 from functools import cached_property
 from typing import final
 
@@ -11,22 +12,33 @@ from rbpf.sensors.camera_points import CameraPoint, forward
 from rbpf.sensors.pinhole import Pinhole
 
 
-@final
-class MembersView(ObservationModel):
-    """The pixels of m points of an `UncertainConstellation` (p_1, p_2, …), one after the other: z (2m,).
+class PointsView(ObservationModel):
+    """The pixels of m points that one landmark holds together, one after the other: z (2m,).
 
     Where the state holds more than world_from_camera, the pose comes first.
 
     Args:
         camera: of the image.
-        places: (m,) which of the landmark's points are seen.
+        count: m.
     """
 
-    def __init__(self, camera: Pinhole, places: np.ndarray) -> None:
+    def __init__(self, camera: Pinhole, count: int) -> None:
         self.camera = camera
-        self.places = places
-        self.dim = 2 * places.size
-        self._point = CameraPoint(camera)
+        self.dim = 2 * count
+
+    @abstractmethod
+    def in_world(self, landmark: np.ndarray, const: np.ndarray | None) -> np.ndarray:
+        """The points (…, m, 3) in the world."""
+
+    @abstractmethod
+    def slopes(
+        self, state: np.ndarray, landmark: np.ndarray, const: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """∂z/∂state (…, m, 2, d) and ∂z/∂landmark (…, m, 2, D) of each point."""
+
+    def in_camera(self, state: np.ndarray, landmark: np.ndarray, const: np.ndarray | None) -> np.ndarray:
+        """The points (…, m, 3) in the camera's frame."""
+        return SE3.inverse_transform(state[..., None, :7], self.in_world(landmark, const))
 
     def predict(
         self,
@@ -37,7 +49,7 @@ class MembersView(ObservationModel):
     ) -> np.ndarray:
         """Every point by E06 (7)–(9)."""
         assert landmark is not None
-        px = self._point.predict(state[..., None, :], self.in_world(landmark, const))
+        px = self.camera.project(forward(self.in_camera(state, landmark, const)))
         return px.reshape(*px.shape[:-2], self.dim)
 
     def jacobians(
@@ -47,28 +59,46 @@ class MembersView(ObservationModel):
         const: np.ndarray | None = None,
         substate: np.ndarray | None = None,
     ) -> Jacobians:
-        """Those of each point, side by side."""
+        """Those of each point, one below the other."""
         assert landmark is not None
-        by_state, by_point, _ = self._point.jacobians(state[..., None, :], self.in_world(landmark, const))
-        assert by_state is not None and by_point is not None
-        by_landmark = np.zeros((*by_point.shape[:-1], landmark.shape[-1]))
-        for k, place in enumerate(self.places.tolist()):
-            by_landmark[..., k, :, 3 * place : 3 * place + 3] = by_point[..., k, :, :]
-        shape = (*by_point.shape[:-3], self.dim)
+        by_state, by_landmark = self.slopes(state, landmark, const)
+        shape = (*by_state.shape[:-3], self.dim)
         return Jacobians(by_state.reshape(*shape, -1), by_landmark.reshape(*shape, -1))
 
     def visible(self, state: np.ndarray, landmark: np.ndarray, const: np.ndarray | None = None) -> np.ndarray:
         """Whether all of its points are in the image."""
         return np.asarray(self.camera.visible(self.in_camera(state, landmark, const)).all(axis=-1))
 
+
+@final
+class MembersView(PointsView):
+    """The pixels of m points of an `UncertainConstellation` (p_1, p_2, …), one after the other: z (2m,).
+
+    Args:
+        camera: of the image.
+        places: (m,) which of the landmark's points are seen.
+    """
+
+    def __init__(self, camera: Pinhole, places: np.ndarray) -> None:
+        super().__init__(camera, places.size)
+        self.places = places
+        self._point = CameraPoint(camera)
+
     def in_world(self, landmark: np.ndarray, const: np.ndarray | None) -> np.ndarray:
         """The points (…, m, 3) in the world."""
         points = landmark.reshape(*landmark.shape[:-1], -1, 3)
         return np.asarray(points[..., self.places, :])
 
-    def in_camera(self, state: np.ndarray, landmark: np.ndarray, const: np.ndarray | None) -> np.ndarray:
-        """The points (…, m, 3) in the camera's frame."""
-        return SE3.inverse_transform(state[..., None, :7], self.in_world(landmark, const))
+    def slopes(
+        self, state: np.ndarray, landmark: np.ndarray, const: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Those of a `CameraPoint`; a pixel depends on its own point alone."""
+        by_state, by_point, _ = self._point.jacobians(state[..., None, :], self.in_world(landmark, const))
+        assert by_state is not None and by_point is not None
+        by_landmark = np.zeros((*by_point.shape[:-1], landmark.shape[-1]))
+        for k, place in enumerate(self.places.tolist()):
+            by_landmark[..., k, :, 3 * place : 3 * place + 3] = by_point[..., k, :, :]
+        return by_state, by_landmark
 
     def kernel(self) -> FusedKernel | None:
         """Compiled."""
@@ -83,11 +113,10 @@ class MembersView(ObservationModel):
 
 
 @final
-class ConstellationView(ObservationModel):
+class ConstellationView(PointsView):
     """The pixels of m exact points of a `Constellation`, one after the other: z (2m,).
 
-    The landmark is ξ with constant G: point m lies at G Exp(ξ) k_m. Where the state holds more than world_from_camera,
-    the pose comes first.
+    The landmark is ξ with constant G: point m lies at G Exp(ξ) k_m.
 
     Args:
         camera: of the image.
@@ -95,55 +124,30 @@ class ConstellationView(ObservationModel):
     """
 
     def __init__(self, camera: Pinhole, points: np.ndarray) -> None:
-        self.camera = camera
+        super().__init__(camera, points.shape[0])
         self.points = points
-        self.dim = 2 * points.shape[0]
-
-    def predict(
-        self,
-        state: np.ndarray,
-        landmark: np.ndarray | None = None,
-        const: np.ndarray | None = None,
-        substate: np.ndarray | None = None,
-    ) -> np.ndarray:
-        """Every point by E06 (7)–(9)."""
-        assert landmark is not None and const is not None
-        _, in_camera = self._chain(state, landmark, const)
-        px = self.camera.project(forward(in_camera))
-        return px.reshape(*px.shape[:-2], self.dim)
-
-    def jacobians(
-        self,
-        state: np.ndarray,
-        landmark: np.ndarray | None = None,
-        const: np.ndarray | None = None,
-        substate: np.ndarray | None = None,
-    ) -> Jacobians:
-        """∂z/∂state = D [[c]× | −I]; ∂z/∂ξ = D R [−[k]× | I] J_r(ξ), with R = R_cᵀ R_G Exp(ξ)."""
-        assert landmark is not None and const is not None
-        frame, in_camera = self._chain(state, landmark, const)
-        direction = forward(in_camera)
-        slope = self.camera.slope(direction)
-        by_state = np.zeros((*slope.shape[:-1], 6 + state.shape[-1] - 7))
-        by_state[..., :3], by_state[..., 3:6] = np.cross(slope, direction[..., None, :]), -slope
-        turned = (
-            slope @ (np.swapaxes(SE3.rotation(state[..., :7]), -1, -2) @ SE3.rotation(frame))[..., None, :, :]
-        )
-        # a·(ω × k) = −(a × k)·ω
-        by_frame = np.concatenate([-np.cross(turned, self.points[:, None, :]), turned], axis=-1)
-        by_landmark = by_frame @ SE3.right_jacobian(landmark)[..., None, :, :]
-        shape = (*slope.shape[:-3], self.dim)
-        return Jacobians(by_state.reshape(*shape, -1), by_landmark.reshape(*shape, -1))
-
-    def visible(self, state: np.ndarray, landmark: np.ndarray, const: np.ndarray | None = None) -> np.ndarray:
-        """Whether all of its points are in the image."""
-        assert const is not None
-        return np.asarray(self.camera.visible(self._chain(state, landmark, const)[1]).all(axis=-1))
 
     def in_world(self, landmark: np.ndarray, const: np.ndarray | None) -> np.ndarray:
         """The points (…, m, 3) in the world."""
         assert const is not None
         return SE3.transform(SE3.retract(const, landmark)[..., None, :], self.points)
+
+    def slopes(
+        self, state: np.ndarray, landmark: np.ndarray, const: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """∂z/∂state = D [[c]× | −I]; ∂z/∂ξ = D R [−[k]× | I] J_r(ξ), with R = R_cᵀ R_G Exp(ξ)."""
+        assert const is not None
+        direction = forward(self.in_camera(state, landmark, const))
+        slope = self.camera.slope(direction)
+        by_state = np.zeros((*slope.shape[:-1], 6 + state.shape[-1] - 7))
+        by_state[..., :3], by_state[..., 3:6] = np.cross(slope, direction[..., None, :]), -slope
+        frame = SE3.retract(const, landmark)
+        turned = (
+            slope @ (np.swapaxes(SE3.rotation(state[..., :7]), -1, -2) @ SE3.rotation(frame))[..., None, :, :]
+        )
+        # a·(ω × k) = −(a × k)·ω
+        by_frame = np.concatenate([-np.cross(turned, self.points[:, None, :]), turned], axis=-1)
+        return by_state, by_frame @ SE3.right_jacobian(landmark)[..., None, :, :]
 
     def kernel(self) -> FusedKernel | None:
         """Compiled."""
@@ -155,11 +159,3 @@ class ConstellationView(ObservationModel):
     def _params(self) -> np.ndarray:
         """The camera's, then (x, y, z) of each point: asked for several times in a step."""
         return np.concatenate([self.camera.params, self.points.ravel()])
-
-    def _chain(
-        self, state: np.ndarray, landmark: np.ndarray, const: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """world_from_group (…, 7), and the points (…, m, 3) in the camera's frame."""
-        frame = SE3.retract(const, landmark)
-        world = SE3.transform(frame[..., None, :], self.points)
-        return frame, SE3.inverse_transform(state[..., None, :7], world)

@@ -1,9 +1,7 @@
 """Pinhole camera with radial-tangential distortion (D. Brown 1966, A. Conrady 1919), and the rectified stereo pair.
 
-Model, order of the coefficients and pixel convention are OpenCV's: the centre of the top-left pixel is (0, 0).
-With s = u² + v² and ρ(s) = 1 + k1 s + k2 s² + k3 s³, the normalised coordinates (u, v) = (x/z, y/z) are distorted to
-
-    u ρ(s) + 2 p1 u v + p2 (s + 2 u²),    v ρ(s) + 2 p2 u v + p1 (s + 2 v²).
+Order of the coefficients and pixel convention are OpenCV's: the centre of the top-left pixel is (0, 0). The distortion
+is that of `rbpf.sensors.lens_distortion`.
 """
 
 from dataclasses import dataclass
@@ -15,18 +13,7 @@ import numpy as np
 from rbpf.arrays import Bool, Float
 from rbpf.errors import InputError
 from rbpf.sensors.camera_checks import check_finite, check_size
-
-SETTLED, SOLVED = 1e-14, 1e-12
-"""Errors of `unproject`, relative to 1 + the distance from the axis: the iteration ends, the result is accepted."""
-
-STALLED = 0.999
-"""A step that leaves more of the error than this has no solution ahead."""
-
-ARMIJO = 0.25
-"""Share of the decrease promised by the derivative that a step has to keep (L. Armijo 1966)."""
-
-ITERATIONS, HALVINGS = 60, 20
-"""Of Newton's method, and of one of its steps."""
+from rbpf.sensors.lens_distortion import RadialTangential, inverse
 
 
 @final
@@ -78,25 +65,17 @@ class Pinhole:
         return np.array([self.fx, self.fy, self.cx, self.cy, *self.distortion], dtype=np.float64)
 
     @cached_property
-    def _is_plain(self) -> bool:
-        """Whether nothing is distorted."""
-        return not any(self.distortion)
+    def _lens(self) -> RadialTangential:
+        return RadialTangential(self.distortion)
 
     @cached_property
     def _size(self) -> np.ndarray:
         return np.array([self.width, self.height])
 
-    @cached_property
+    @property
     def monotonic_radius(self) -> float:
-        """Distance from the axis, in normalised coordinates, at which radial distortion folds the image back.
-
-        The smallest positive root of d(r ρ(r²))/dr = 1 + 3 k1 r² + 5 k2 r⁴ + 7 k3 r⁶; infinite where there is none.
-        """
-        k1, k2, _, _, k3 = self.distortion
-        # As a polynomial in 1/r² its first coefficient is 1: no division by a small k3.
-        roots = np.roots([1.0, 3.0 * k1, 5.0 * k2, 7.0 * k3])
-        positive = roots.real[(roots.imag == 0.0) & (roots.real > 0.0)]
-        return float(1.0 / np.sqrt(positive.max())) if positive.size else float("inf")
+        """Distance from the axis, in normalised coordinates, at which radial distortion folds the image back, or ∞."""
+        return self._lens.monotonic_radius
 
     def project(self, point: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
         """Pixels (…, 2) of points (…, 3) in the camera's frame.
@@ -105,14 +84,14 @@ class Pinhole:
         point in the plane of the camera, z = 0, gets pixels that are not finite.
         """
         with np.errstate(all="ignore"):
-            return self.params[:2] * self._distort(_normalise(point)) + self.params[2:4]
+            return self.params[:2] * self._lens.distort(_normalise(point)) + self.params[2:4]
 
     def slope(self, point: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2 3"]:
         """∂px/∂point (…, 2, 3) at points (…, 3) in the camera's frame."""
         point = np.asarray(point, float)
         with np.errstate(all="ignore"):
             uv = _normalise(point)
-            by_uv = self.params[:2, None] * self._distort_slope(uv) / point[..., 2, None, None]
+            by_uv = self.params[:2, None] * self._lens.slope(uv) / point[..., 2, None, None]
             return np.concatenate([by_uv, -by_uv @ uv[..., None]], axis=-1)
 
     def unproject(self, px: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
@@ -123,12 +102,12 @@ class Pinhole:
         """
         with np.errstate(all="ignore"):
             target = (np.asarray(px, float) - self.params[2:4]) / self.params[:2]
-            uv = self._undistort(target.reshape(-1, 2))
+            uv = self._lens.undistort(target.reshape(-1, 2))
         return uv.reshape(target.shape)
 
     def unproject_slope(self, px: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2 2"]:
         """∂(u, v)/∂px (…, 2, 2) at pixels (…, 2); NaN where `unproject` is."""
-        return _inverse(self._distort_slope(self.unproject(px))) / self.params[:2]
+        return inverse(self._lens.slope(self.unproject(px))) / self.params[:2]
 
     def inside(self, px: Float[np.ndarray, "*batch 2"], margin_px: float = 0.0) -> Bool[np.ndarray, "*batch"]:
         """Whether pixels (…, 2) are in the image (…), and at least `margin_px` from its border.
@@ -145,82 +124,8 @@ class Pinhole:
     ) -> Bool[np.ndarray, "*batch"]:
         """Whether points (…, 3) are seen (…): in front of the camera, not folded back, and inside the image."""
         with np.errstate(all="ignore"):
-            seen = self._unique(_normalise(point)) & self.inside(self.project(point), margin_px)
+            seen = self._lens.is_unique(_normalise(point)) & self.inside(self.project(point), margin_px)
         return np.logical_and(seen, np.asarray(point)[..., 2] > 0.0)
-
-    def _distort(self, uv: np.ndarray) -> np.ndarray:
-        """Distorted coordinates (…, 2) of normalised ones."""
-        if self._is_plain:
-            return uv
-        k1, k2, p1, p2, k3 = self.distortion
-        u, v = uv[..., 0], uv[..., 1]
-        s = u * u + v * v
-        radial = 1.0 + s * (k1 + s * (k2 + s * k3))
-        along = u * radial + 2.0 * p1 * u * v + p2 * (s + 2.0 * u * u)
-        down = v * radial + 2.0 * p2 * u * v + p1 * (s + 2.0 * v * v)
-        return np.stack([along, down], axis=-1)
-
-    def _distort_slope(self, uv: np.ndarray) -> np.ndarray:
-        """Its derivative (…, 2, 2), a symmetric matrix."""
-        k1, k2, p1, p2, k3 = self.distortion
-        u, v = uv[..., 0], uv[..., 1]
-        s = u * u + v * v
-        radial = 1.0 + s * (k1 + s * (k2 + s * k3))
-        bend = 2.0 * (k1 + s * (2.0 * k2 + s * 3.0 * k3))
-        across = bend * u * v + 2.0 * p1 * u + 2.0 * p2 * v
-        along = radial + bend * u * u + 2.0 * p1 * v + 6.0 * p2 * u
-        down = radial + bend * v * v + 6.0 * p1 * v + 2.0 * p2 * u
-        return np.stack([along, across, across, down], axis=-1).reshape(*uv.shape, 2)
-
-    def _unique(self, uv: np.ndarray) -> np.ndarray:
-        """Whether the distortion is one-to-one up to (u, v) (…).
-
-        Within the monotonic radius radial distortion is; with tangential distortion its derivative must be positive
-        definite besides, which a weak one is anywhere near the image.
-        """
-        if self._is_plain:
-            return np.isfinite(uv[..., 0]) & np.isfinite(uv[..., 1])
-        slope = self._distort_slope(uv)
-        trace = slope[..., 0, 0] + slope[..., 1, 1]
-        within = np.hypot(uv[..., 0], uv[..., 1]) < self.monotonic_radius
-        return within & (trace > 0.0) & (_determinant(slope) > 0.0)
-
-    def _undistort(self, target: np.ndarray) -> np.ndarray:
-        """Normalised coordinates (K, 2) of distorted ones, NaN where there are none."""
-        if self._is_plain:
-            return np.where(self._unique(target)[:, None], target, np.nan)
-        # Half of the radius is clear of the fold, where the derivative has no inverse.
-        length = np.maximum(np.linalg.norm(target, axis=1, keepdims=True), np.finfo(float).tiny)
-        uv = target * np.minimum(1.0, 0.5 * self.monotonic_radius / length)
-        error = self._misfit(uv, target)
-        active = np.flatnonzero(error > SETTLED)
-        for _ in range(ITERATIONS):
-            if not active.size:
-                break
-            uv[active], reached = self._newton(uv[active], target[active], error[active])
-            error[active], active = reached, active[(reached > SETTLED) & (reached < STALLED * error[active])]
-        found = (error <= SOLVED) & self._unique(uv)
-        return np.where(found[:, None], uv, np.nan)
-
-    def _newton(self, uv: np.ndarray, target: np.ndarray, error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """A step of each (K, 2), halved until it stays on this side of the fold and brings the error (K,) down."""
-        miss = target - self._distort(uv)
-        step = (_inverse(self._distort_slope(uv)) @ miss[..., None])[..., 0]
-        waiting = np.arange(len(uv))
-        for share in 0.5 ** np.arange(HALVINGS):
-            if not waiting.size:
-                break
-            tried = uv[waiting] + share * step[waiting]
-            reached = self._misfit(tried, target[waiting])
-            better = (reached < (1.0 - ARMIJO * share) * error[waiting]) & self._unique(tried)
-            uv[waiting[better]], error[waiting[better]] = tried[better], reached[better]
-            waiting = waiting[~better]
-        return uv, error
-
-    def _misfit(self, uv: np.ndarray, target: np.ndarray) -> np.ndarray:
-        """Distance (K,) of distorted coordinates from where they should be, relative to 1 + the latter's length."""
-        miss = np.linalg.norm(target - self._distort(uv), axis=-1)
-        return miss / (1.0 + np.linalg.norm(target, axis=-1))
 
 
 @final
@@ -287,15 +192,3 @@ def _normalise(point: np.ndarray) -> np.ndarray:
     """(x/z, y/z) (…, 2) of points (…, 3)."""
     point = np.asarray(point, float)
     return point[..., :2] / point[..., 2:]
-
-
-def _determinant(matrix: np.ndarray) -> np.ndarray:
-    """Of (…, 2, 2) matrices."""
-    return matrix[..., 0, 0] * matrix[..., 1, 1] - matrix[..., 0, 1] * matrix[..., 1, 0]
-
-
-def _inverse(matrix: np.ndarray) -> np.ndarray:
-    """Of symmetric (…, 2, 2) matrices."""
-    a, b, d = matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 1, 1]
-    adjugate = np.stack([d, -b, -b, a], axis=-1).reshape(matrix.shape)
-    return adjugate / _determinant(matrix)[..., None, None]

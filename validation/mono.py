@@ -1,7 +1,7 @@
 """A run over images from recording to report: filter, batch optimum, scores, files, pictures, video."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,37 +12,17 @@ from rbpf.sensors.readers.images import ImageSequence, KnownPixels, open_images,
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.known_map import read_known_map
 from rbpf.systems.mono.video import VideoRun, first_image, run_images
-from rbpf.validation.files import prepare_folder, write_summary
-from rbpf.validation.mono_batch import Batch, adjust_run, score_batch
+from rbpf.validation.files import prepare_folder
+from rbpf.validation.image_run import BATCH, CHECKPOINT, Progress, Telling, write_batch
+from rbpf.validation.mono_batch import adjust_run, score_batch
 from rbpf.validation.mono_folder import write_mono_run
 from rbpf.validation.mono_map import summarise_mono_map
 from rbpf.validation.mono_pictures import plot_mono_run
 from rbpf.validation.mono_rerun import write_rerun
 from rbpf.validation.mono_video import write_annotated
+from rbpf.validation.provenance import left_out
 from rbpf.validation.report import VIDEO
-from rbpf.validation.trajectory_files import write_tum
 from rbpf.validation.validate import report_run
-
-CHECKPOINT = "checkpoint.npz"
-
-BATCH = "batch.tum"
-
-Progress = Callable[[int, int], None]
-
-
-@dataclass(frozen=True)
-class Telling:
-    """Who is told how far the work after the filter is.
-
-    Attributes:
-        on_frame: called with the frames drawn and their number.
-        on_iteration: called with the number of an iteration of the batch adjustment and the error before it.
-        batch_s: time after which the batch adjustment is given up; None waits.
-    """
-
-    on_frame: Progress | None = None
-    on_iteration: Callable[[int, float], None] | None = None
-    batch_s: float | None = None
 
 
 @dataclass(frozen=True)
@@ -151,7 +131,7 @@ def finish_mono(
     batch: bool = True,
     telling: Telling | None = None,
 ) -> dict[str, Any]:
-    """Writes all files, pictures, the annotated video and the report of a run; returns the entries of summary.json.
+    """Writes all files, pictures, video and report of a run; returns the entries of summary.json and the verdict.
 
     The filter's own files are complete before the batch adjustment begins.
 
@@ -166,8 +146,13 @@ def finish_mono(
     """
     telling = telling or Telling()
     mapped = summarise_mono_map(run.filter)
-    entries = write_mono_run(run, mapped, out, recording.sources())
-    optimum = _adjusted(run, out, entries, telling) if batch else None
+    sources = recording.sources() | left_out(video=video, batch=batch)
+    entries = write_mono_run(run, mapped, out, sources)
+    (out / BATCH).unlink(missing_ok=True)
+    optimum = None
+    if batch:
+        adjust = partial(adjust_run, run, telling.batch_s, telling.on_iteration)
+        optimum = write_batch(out, entries, adjust, partial(score_batch, run))
     plot_mono_run(run, mapped, out, optimum)
     if video:
         write_annotated(run, out / VIDEO, telling.on_frame)
@@ -176,19 +161,4 @@ def finish_mono(
     if rerun is not None:
         write_rerun(run, mapped, rerun)
     verdict = report_run(out)
-    return entries | {"verdict": verdict.trust}
-
-
-def _adjusted(run: VideoRun, out: Path, entries: dict[str, Any], telling: Telling) -> Batch | None:
-    """The batch optimum, its path and its figures; or the reason why there is none among the figures."""
-    (out / BATCH).unlink(missing_ok=True)
-    optimum = None
-    try:
-        optimum = adjust_run(run, telling.batch_s, telling.on_iteration)
-    except InputError as error:
-        entries["batch_problem"] = str(error)
-    if optimum is not None:
-        write_tum(out / BATCH, optimum.trajectory)
-        entries |= score_batch(run, optimum)
-    write_summary(out, entries)
-    return optimum
+    return entries | {"verdict": verdict.trust, "sentences": verdict.said}

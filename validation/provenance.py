@@ -39,6 +39,8 @@ _NAMED = (
     "known_map",
 )
 _FLAGS = ("localize",)
+_MADE = "video", "batch"
+"""What a run makes besides its data, unless it is told not to."""
 _CHUNK = 1 << 20
 
 
@@ -66,6 +68,11 @@ def write_config(out: Path, system: str, sources: Mapping[str, Any], settings: M
         head["input_sha256"] = digest
     text = yaml.safe_dump({**head, "versions": library_versions(), **settings}, sort_keys=False)
     write_text(out / CONFIG, text)
+
+
+def left_out(**wanted: bool) -> dict[str, bool]:
+    """What a run was told not to make, as entries of config.yaml, so that a repetition does not make it either."""
+    return {name: False for name in _MADE if not wanted.get(name, True)}
 
 
 def library_versions() -> dict[str, str]:
@@ -124,6 +131,7 @@ def read_origin(config: Path) -> Origin:
         )
     sources = {_OPTIONS.get(name, name): str(entries[name]) for name in _NAMED if name in entries}
     sources |= {name: "" for name in _FLAGS if entries.get(name)}
+    sources |= {f"no-{name}": "" for name in _MADE if entries.get(name) is False}
     return Origin(str(entries["system"]), str(entries["recording"]), sources, config)
 
 

@@ -48,7 +48,7 @@ def start_run(
 
 
 def finish_run(finished: Run, recording: Path, out: Path, batch: bool = True) -> dict[str, Any]:
-    """Writes all files, pictures and the report of a run; returns the entries of summary.json.
+    """Writes all files, pictures and the report of a run; returns the entries of summary.json and the verdict.
 
     Args:
         finished: what was filtered.
@@ -66,10 +66,10 @@ def finish_run(finished: Run, recording: Path, out: Path, batch: bool = True) ->
         extra |= extra_batch
         stamps = np.array([frame.stamp_ns for frame in log.frames], dtype=np.int64)
         write_tum(out / "batch.tum", as_trajectory(log, stamps, path))
-    entries = write_run(finished, out, recording, extra)
+    entries = write_run(finished, out, recording, extra, batch)
     plot_run(finished, summarise_map(finished.filter, finished.anchored), out, paths)
     verdict = report_run(out)
-    return entries | {"verdict": verdict.trust}
+    return entries | {"verdict": verdict.trust, "sentences": verdict.said}
 
 
 def _solve_batch(finished: Run) -> tuple[np.ndarray, dict[str, Any]]:

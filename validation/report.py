@@ -52,7 +52,7 @@ def write_report(folder: Path, problems: list[str] | None = None) -> Verdict:
     """
     record, problems = open_run(folder), list(problems or ())
     comparisons = _comparisons(record, problems)
-    verdict = replace(verdict_of(comparisons), advice=_advice(record, comparisons))
+    verdict = replace(verdict_of(comparisons, _beside_own_batch(record)), advice=_advice(record, comparisons))
     _draw_timings(record, problems)
     drawn = {name for comparison in comparisons for name in comparison.pictures}
     own = [path.name for path in sorted(folder.glob("*.png")) if path.name not in drawn]
@@ -66,12 +66,28 @@ def write_report(folder: Path, problems: list[str] | None = None) -> Verdict:
     return verdict
 
 
-def verdict_of(comparisons: list[Comparison]) -> Verdict:
-    """The verdict from all comparisons of a run, its own statistics among them."""
+def verdict_of(comparisons: list[Comparison], otherwise: str = _NO_ACCURACY) -> Verdict:
+    """The verdict from all comparisons of a run, its own statistics among them.
+
+    Args:
+        comparisons: of the run.
+        otherwise: how good the run is, where none of them says it.
+    """
     others = [comparison for comparison in comparisons if comparison.accuracy]
-    accuracy = " ".join(comparison.accuracy for comparison in others[:1]) or _NO_ACCURACY
+    accuracy = " ".join(comparison.accuracy for comparison in others[:1]) or otherwise
     independent = [statistic.name for comparison in others for statistic in comparison.statistics]
     return judge(accuracy, [s for comparison in comparisons for s in comparison.statistics], independent)
+
+
+def _beside_own_batch(record: RunRecord) -> str:
+    """How good a run is that was compared with nothing, from the batch optimum that it found itself."""
+    apart = record.summary.get("filter_minus_batch_rmse_m")
+    if not isinstance(apart, float):
+        return _NO_ACCURACY
+    return (
+        f"How far the path is from the truth is not known; it is {1e3 * apart:.3g} mm (rms) from the batch optimum of "
+        "the same measurements."
+    )
 
 
 def _advice(record: RunRecord, comparisons: list[Comparison]) -> str:

@@ -32,14 +32,16 @@ from rbpf.validation.files import (
 from rbpf.validation.map_summary import MapSummary, summarise_map
 from rbpf.validation.measurement_files import write_measurements
 from rbpf.validation.measurements import Measurements
-from rbpf.validation.provenance import write_config
+from rbpf.validation.provenance import left_out, write_config
 from rbpf.validation.run_files import write_path, write_truth
 from rbpf.validation.run_truth import robot_truth
 from rbpf.validation.scores import Scores, as_trajectory, score
 from rbpf.validation.trajectory_files import write_tum
 
 
-def write_run(run: Run, out: Path, recording: Path, extra: dict[str, Any] | None = None) -> dict[str, Any]:
+def write_run(
+    run: Run, out: Path, recording: Path, extra: dict[str, Any] | None = None, batch: bool = True
+) -> dict[str, Any]:
     """Writes all data files of a run.
 
     Args:
@@ -47,6 +49,7 @@ def write_run(run: Run, out: Path, recording: Path, extra: dict[str, Any] | None
         out: the run's folder.
         recording: where the log lies, for config.yaml.
         extra: further entries of summary.json.
+        batch: whether the batch optimum is asked for, for config.yaml.
 
     Returns:
         The entries of summary.json.
@@ -73,7 +76,9 @@ def write_run(run: Run, out: Path, recording: Path, extra: dict[str, Any] | None
         ["step", "stamp_ns", "ess", "resampled", "log_evidence", "nis", "nis_dof"],
         zip(range(stamps.size), stamps, *(column.tolist() for column in columns), strict=True),
     )
-    write_config(out, "range-bearing", {"recording": str(recording)}, asdict(run.config))
+    write_config(
+        out, "range-bearing", {"recording": str(recording)} | left_out(batch=batch), asdict(run.config)
+    )
     entries = summarise(run, summary_map) | (extra or {})
     write_summary(out, entries)
     return entries

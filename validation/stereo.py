@@ -1,31 +1,25 @@
 """A stereo run from recording to report: filter, batch optimum, scores, files, pictures."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from rbpf.errors import InputError
 from rbpf.sensors.readers.images import open_stereo
 from rbpf.sensors.readers.images.stereo import StereoSequence
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.run import StereoRun, run_images
-from rbpf.validation.files import prepare_folder, write_summary
+from rbpf.validation.files import prepare_folder
+from rbpf.validation.image_run import BATCH, CHECKPOINT, Progress, Telling, write_batch
 from rbpf.validation.map_summary import summarise_map
-from rbpf.validation.mono import BATCH, Telling
-from rbpf.validation.mono_batch import Batch
+from rbpf.validation.provenance import left_out
 from rbpf.validation.report import VIDEO
 from rbpf.validation.stereo_batch import adjust_stereo, score_stereo_batch
 from rbpf.validation.stereo_folder import write_stereo_run
 from rbpf.validation.stereo_frames import write_annotated_pairs
 from rbpf.validation.stereo_pictures import plot_stereo_run
 from rbpf.validation.stereo_rerun import write_stereo_rerun
-from rbpf.validation.trajectory_files import write_tum
 from rbpf.validation.validate import report_run
-
-CHECKPOINT = "checkpoint.npz"
-
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -90,7 +84,7 @@ def finish_stereo(
     batch: bool = True,
     telling: Telling | None = None,
 ) -> dict[str, Any]:
-    """Writes all files, pictures, the annotated video and the report of a run; returns the entries of summary.json.
+    """Writes all files, pictures, video and report of a run; returns the entries of summary.json and the verdict.
 
     The filter's own files are complete before the batch adjustment begins.
 
@@ -104,9 +98,13 @@ def finish_stereo(
         telling: whom to tell how far it is, and the time that the batch adjustment may take.
     """
     mapped, telling = summarise_map(run.filter), telling or Telling()
-    entries = write_stereo_run(run, mapped, out, recording.sources())
+    sources = recording.sources() | left_out(video=video, batch=batch)
+    entries = write_stereo_run(run, mapped, out, sources)
     (out / BATCH).unlink(missing_ok=True)
-    optimum = _adjusted(run, out, entries, telling) if batch else None
+    optimum = None
+    if batch:
+        adjust = partial(adjust_stereo, run, telling.batch_s, telling.on_iteration)
+        optimum = write_batch(out, entries, adjust, partial(score_stereo_batch, run))
     plot_stereo_run(run, mapped, out, optimum)
     if video:
         write_annotated_pairs(run, recording.open(), out / VIDEO, telling.on_frame)
@@ -115,18 +113,4 @@ def finish_stereo(
     if rerun is not None:
         write_stereo_rerun(run, recording.open(), mapped, rerun)
     verdict = report_run(out)
-    return entries | {"verdict": verdict.trust}
-
-
-def _adjusted(run: StereoRun, out: Path, entries: dict[str, Any], telling: Telling) -> Batch | None:
-    """The batch optimum, its path and its figures; or the reason why there is none among the figures."""
-    optimum = None
-    try:
-        optimum = adjust_stereo(run, telling.batch_s, telling.on_iteration)
-    except InputError as error:
-        entries["batch_problem"] = str(error)
-    if optimum is not None:
-        write_tum(out / BATCH, optimum.trajectory)
-        entries |= score_stereo_batch(run, optimum)
-    write_summary(out, entries)
-    return optimum
+    return entries | {"verdict": verdict.trust, "sentences": verdict.said}

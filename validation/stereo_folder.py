@@ -17,6 +17,7 @@ annotated.mp4            the left images with their features
 report.html              one page with all figures and pictures
 """
 
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -46,7 +47,7 @@ _STAGES = "features", "odometry", "matching", "filter"
 
 
 def write_stereo_run(
-    run: StereoRun, mapped: MapSummary, out: Path, sources: dict[str, str]
+    run: StereoRun, mapped: MapSummary, out: Path, sources: Mapping[str, str | bool]
 ) -> dict[str, Any]:
     """Writes all data files of a run.
 
@@ -54,7 +55,7 @@ def write_stereo_run(
         run: what was filtered.
         mapped: its map.
         out: the run's folder.
-        sources: what it was filtered from, for config.yaml: recording, calibration.
+        sources: what it was filtered from, for config.yaml: recording, calibration; and what was left out.
 
     Returns:
         The entries of summary.json.

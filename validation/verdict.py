@@ -54,6 +54,11 @@ class Verdict:
     advice: str = ""
 
     @property
+    def said(self) -> list[str]:
+        """Both sentences, and the advice if there is any."""
+        return [text for text in (*self.sentences, self.advice) if text]
+
+    @property
     def sentences(self) -> tuple[str, str]:
         """Both, each with its full stop."""
         return self.accuracy, f"{_OPENINGS[self.trust]}: {_LEANINGS[self.leaning]}{self.reason}."

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from tyro.extras import SubcommandApp
 
 from rbpf.cli import cameras, exporting, installed, judging
+from rbpf.cli.commands import Commands
 from rbpf.cli.options import ImagesOptions, MonoOptions, Printed
 from rbpf.cli.running import RUN, repeated, run_mono
 from rbpf.cli.simulating import SIMULATE, simulate_desk
@@ -18,7 +18,7 @@ PROGRAM = "rbpf"
 BAD_INPUT, STOPPED = 2, 130
 """Exit codes; 0 is success, 1 a fault of the program."""
 
-APP = SubcommandApp()
+APP = Commands()
 _DESCRIPTION = """Rao-Blackwellised particle filters for SLAM. `rbpf COMMAND --help` says more.
 
 Exit codes: 0 success, 1 a fault of the program, 2 bad input (said in one sentence), 130 stopped by Ctrl-C."""
@@ -37,7 +37,7 @@ class DemoOptions(Printed):
     frames: int = 240
 
 
-@APP.command(name="demo")
+@APP.add("demo")
 def demo(options: Annotated[DemoOptions, tyro.conf.arg(name="")]) -> None:
     """Render a desk that a camera moves over, run monocular SLAM on the images, leave plots and the annotated video."""
     images = options.out / "desk"
@@ -47,24 +47,26 @@ def demo(options: Annotated[DemoOptions, tyro.conf.arg(name="")]) -> None:
     run_mono(MonoOptions(sequence=images, known_points=known, out=options.out / "run", json=options.json))
 
 
-APP.command(RUN, name="run")
-APP.command(SIMULATE, name="simulate")
-APP.command(name="calibrate")(cameras.calibrate)
-APP.command(name="recalibrate")(cameras.recalibrate)
-APP.command(name="validate")(judging.validate)
-APP.command(name="report")(judging.report)
-APP.command(name="export")(exporting.export)
-APP.command(name="sweep")(judging.sweep)
-APP.command(name="compare")(judging.compare)
-APP.command(name="doctor")(installed.doctor)
-APP.command(name="completion")(installed.completion)
+APP.add_group("run", RUN)
+APP.add_group("simulate", SIMULATE)
+APP.add("calibrate")(cameras.calibrate)
+APP.add("recalibrate")(cameras.recalibrate)
+APP.add("validate")(judging.validate)
+APP.add("report")(judging.report)
+APP.add("export")(exporting.export)
+APP.add("sweep")(judging.sweep)
+APP.add("compare")(judging.compare)
+APP.add("doctor")(installed.doctor)
+APP.add("completion")(installed.completion)
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Parses the command line, runs the command; bad input becomes one sentence and exit code 2."""
     try:
         given = sys.argv[1:] if arguments is None else arguments
-        APP.cli(prog=PROGRAM, description=_DESCRIPTION, args=repeated(list(given)))
+        expanded = repeated(list(given))
+        APP.require_known(expanded, PROGRAM)
+        APP.cli(prog=PROGRAM, description=_DESCRIPTION, args=expanded)
     except InputError as error:
         print(f"{PROGRAM}: {error}", file=sys.stderr)
         return BAD_INPUT

@@ -10,6 +10,9 @@ from rbpf.cli.options import Printed
 from rbpf.cli.showing import answer, progress, say, told
 from rbpf.sensors.chessboard import Board
 
+LOOSE = 0.01
+"""Standard deviation of focal lengths and centre, as a share of the focal length, from which on a run bends."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrateOptions(Printed):
@@ -49,8 +52,16 @@ def calibrate(options: Annotated[CalibrateOptions, tyro.conf.arg(name="")]) -> N
         f"cy {camera.cy:.2f} ± {std[3]:.2f} px",
         f"camera.yaml and {PICTURE} are in {options.out}; use it with --calibration {options.out / 'camera.yaml'}",
     )
-    if found.covered < 0.5 and not options.json:
+    if options.json:
+        return
+    if found.covered < 0.5:
         say("the board was seen in less than half of the image: distortion is uncertain where it was not")
+    loose = float(max(std[:4])) / camera.fx
+    if loose > LOOSE:
+        say(
+            f"the camera is known to {100 * loose:.1f} % of its focal length only, and a run with it will bend: film "
+            "the board larger, and tilted in all directions"
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

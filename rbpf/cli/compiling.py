@@ -1,6 +1,7 @@
 """Compiled kernels: which there are, whether they are in the cache, and compiling them with a word of warning."""
 
 from collections.abc import Callable
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -9,6 +10,7 @@ import numba
 import numpy as np
 
 import rbpf
+from rbpf.cli.showing import progress, say
 from rbpf.errors import InputError
 
 _ROOT = Path(rbpf.__file__).parent
@@ -37,12 +39,13 @@ def cached(module: str) -> bool:
     return any((source.parent / "__pycache__").glob(f"{name}.*.nbi"))
 
 
-def compile_kernels(announce: Callable[[str], None], every: bool = False) -> list[str]:
-    """Compiles what is not in the cache; with `every`, loads all of them.
+def compile_kernels(every: bool = False) -> list[str]:
+    """Compiles what is not in the cache, with a word and a bar; with `every`, loads and tries all of them.
+
+    Some are compiled as they are loaded, others at their first call: nothing is left that would be announced again.
 
     Args:
-        announce: called with a sentence before the first one is compiled.
-        every: also load those that are in the cache, which finds out whether they can be.
+        every: also load and call those that are in the cache, which finds out whether they work.
 
     Returns:
         The modules that were compiled.
@@ -52,11 +55,17 @@ def compile_kernels(announce: Callable[[str], None], every: bool = False) -> lis
     modules = kernel_modules()
     missing = [name for name in modules if not cached(name)]
     if missing:
-        announce(
-            f"compiling {len(missing)} of {len(modules)} kernels: this takes a minute or two and is done once …"
-        )
-    for name in modules if every else missing:
-        import_module(name)
+        say(f"compiling {len(missing)} of {len(modules)} kernels: this takes some minutes and is done once …")
+    work: list[Callable[[], object]] = [
+        partial(import_module, name) for name in (modules if every else missing)
+    ]
+    if work:
+        work += [_search_patches, _measure_motion, _filter_log]
+        with progress() as bar:
+            task = bar.add_task("compiling" if missing else "trying the kernels", total=len(work))
+            for part in work:
+                part()
+                bar.advance(task)
     return missing
 
 
@@ -73,18 +82,12 @@ def use_threads(threads: int | None) -> None:
     numba.set_num_threads(threads)
 
 
-def warm_up() -> None:
-    """Calls what is compiled at its first call, as the systems call it, on a few numbers."""
-    rng = np.random.default_rng(0)
-    _search_patches(rng)
-    _measure_motion(rng)
-    _filter_log()
-
-
-def _search_patches(rng: np.random.Generator) -> None:
+def _search_patches() -> None:
+    """Calls what is compiled at its first call, as the systems call it, on a few numbers; so do those below."""
     from rbpf.sensors.corners import corners
     from rbpf.sensors.patches import cut, search, warp
 
+    rng = np.random.default_rng(0)
     image = rng.integers(0, 256, (30, 40)).repeat(5, axis=0).repeat(5, axis=1).astype(np.uint8)
     px, _ = corners(image, np.zeros((0, 2)), 4)
     windows = [window for place in px if (window := cut(image, place)) is not None]
@@ -92,10 +95,11 @@ def _search_patches(rng: np.random.Generator) -> None:
     search(image, templates, px[: len(windows)], np.tile(4.0 * np.eye(2), (len(windows), 1, 1)))
 
 
-def _measure_motion(rng: np.random.Generator) -> None:
+def _measure_motion() -> None:
     from rbpf.motion.stereo_vo import estimate_motion
     from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
 
+    rng = np.random.default_rng(0)
     rig = RectifiedStereo(Pinhole(640, 480, 500.0, 500.0, 319.5, 239.5), 0.12)
     before = rng.uniform([-1.0, -1.0, 2.0], [1.0, 1.0, 5.0], (40, 3))
     z_prev, z_now = rig.project(before), rig.project(before + np.array([0.02, 0.0, 0.05]))

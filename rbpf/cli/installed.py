@@ -7,9 +7,9 @@ from typing import Annotated, Literal
 
 import tyro
 
-from rbpf.cli.compiling import cached, compile_kernels, kernel_modules, warm_up
+from rbpf.cli.compiling import cached, compile_kernels, kernel_modules
 from rbpf.cli.options import Printed
-from rbpf.cli.showing import answer, say, table, waiting
+from rbpf.cli.showing import answer, table
 from rbpf.errors import InputError
 
 
@@ -57,9 +57,7 @@ def doctor(options: Annotated[DoctorOptions, tyro.conf.arg(name="")]) -> None:
 
 def _compile() -> dict[str, float]:
     started = time.perf_counter()
-    with waiting("compiling and trying the kernels …"):
-        compile_kernels(say, every=True)
-        warm_up()
+    compile_kernels(every=True)
     return {"kernels_seconds": round(time.perf_counter() - started, 1)}
 
 

@@ -60,7 +60,7 @@ def report(options: Annotated[ReportOptions, tyro.conf.arg(name="")]) -> None:
 
 
 def _tell(verdict: "Verdict", run: Path, as_json: bool, *first: str) -> None:
-    page, said = run / "report.html", list(filter(None, (*first, *verdict.sentences, verdict.advice)))
+    page, said = run / "report.html", [*first, *verdict.said]
     entries = {"trust": verdict.trust, "sentences": said, "report": str(page)}
     answer(entries, as_json, *said, f"the page is {page}")
 

@@ -71,12 +71,14 @@ class ImageRunOptions(RunOptions):
         rerun: also write a recording (.rrd) for the Rerun viewer; by default none.
         batch: also adjust the same measurements in batch with GTSAM.
         batch_limit: seconds after which the batch adjustment is given up; the run's results stay.
+        video: write the annotated video.
     """
 
     calibration: Path | None = None
     rerun: Path | None = None
     batch: bool = True
     batch_limit: float = 300.0
+    video: bool = True
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,7 +100,6 @@ class MonoOptions(ImageRunOptions):
         dictionary: of the markers' patterns, as 4x4_50 or 6x6_250.
         map: folder of a run, or its known_map.npz, that the camera is to be found in; by default a map is made.
         localize: the map is known: the start is found by recognition, and the map is not changed.
-        video: write the annotated video.
     """
 
     sequence: tyro.conf.Positional[Path]
@@ -111,7 +112,6 @@ class MonoOptions(ImageRunOptions):
     dictionary: str = "4x4_50"
     map: Path | None = None
     localize: Flag = False
-    video: bool = True
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,12 +122,10 @@ class StereoOptions(ImageRunOptions):
         sequence: images of a rectified pair, or of one that its calibration rectifies: a folder of EuRoC ASL with cam0
             and cam1, or of KITTI odometry with image_0 and image_1.
         dof: degrees of freedom of the camera: 6, or 3 in its x-z plane; by default as in the configuration.
-        video: write the annotated video.
     """
 
     sequence: tyro.conf.Positional[Path]
     dof: Literal[3, 6] | None = None
-    video: bool = True
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,14 +1,16 @@
 """`rbpf run`: one function per system, and the same run again."""
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypeVar
 
 import tyro
-from tyro.extras import SubcommandApp
 
+from rbpf.cli.commands import Commands
 from rbpf.cli.compiling import compile_kernels, use_threads
-from rbpf.cli.interrupts import finishing, patient
+from rbpf.cli.interrupts import Told, finishing, patient
 from rbpf.cli.options import (
+    ImageRunOptions,
     MonoOptions,
     RangeBearingOptions,
     RunOptions,
@@ -20,14 +22,25 @@ from rbpf.cli.options import (
 from rbpf.cli.showing import answer, progress, say, table, told
 from rbpf.errors import InputError
 
-RUN = SubcommandApp()
-RUN.__doc__ = """Filter a recording; `rbpf run SYSTEM --help` says more.
+if TYPE_CHECKING:
+    from rbpf.validation.image_run import Telling
+
+
+class _Failing(Protocol):
+    """A run that may have ended before its recording did."""
+
+    failure: str | None
+
+
+ImageRun = TypeVar("ImageRun", bound=_Failing)
+
+RUN = Commands("""Filter a recording; `rbpf run SYSTEM --help` says more.
 
 `rbpf run --from RUN/config.yaml [--out NEW]` repeats a run: the same recording, the same settings, the same bytes.
-It is refused when the recording has changed. Further options are those of the run's system."""
+It is refused when the recording has changed. Further options are those of the run's system.""")
 
 
-@RUN.command(name="range-bearing")
+@RUN.add("range-bearing")
 def run_range_bearing(options: Annotated[RangeBearingOptions, tyro.conf.arg(name="")]) -> None:
     """Range-bearing SLAM over a robot's log (FastSLAM 2.0), beside the batch optimum of the same measurements."""
     from rbpf.systems.range_bearing.config import RangeBearingConfig
@@ -46,12 +59,12 @@ def run_range_bearing(options: Annotated[RangeBearingOptions, tyro.conf.arg(name
     _finish(entries, options, None)
 
 
-@RUN.command(name="mono")
+@RUN.add("mono")
 def run_mono(options: Annotated[MonoOptions, tyro.conf.arg(name="")]) -> None:
     """Monocular SLAM over a sequence of images or a video (E06: active search, inverse depth, FastSLAM 2.0)."""
     from rbpf.systems.mono.config import MonoConfig
     from rbpf.systems.settings import load_settings
-    from rbpf.validation.mono import Recording, Telling, finish_mono, start_mono
+    from rbpf.validation.mono import Recording, finish_mono, start_mono
     from rbpf.validation.rerun_file import require_rerun
 
     if options.rerun is not None:
@@ -63,30 +76,20 @@ def run_mono(options: Annotated[MonoOptions, tyro.conf.arg(name="")]) -> None:
         raise InputError("a camera is found in a known map with both: --map RUN --localize")
     markers, points = given_markers(options), options.known_points
     recording = Recording(options.sequence, points, options.calibration, board, options.map, markers)
-    _prepare(options)
-    with progress() as bar:
-        with patient(told(bar, bar.add_task("filtering", total=None))) as tell:
-            run = start_mono(recording, config, options.out, options.resume, tell)
-        solving = bar.add_task("batch", total=None, visible=options.batch)
-        drawing = bar.add_task("drawing", total=None, visible=options.video)
-        telling = Telling(
-            on_frame=told(bar, drawing),
-            on_iteration=lambda count, _error: bar.update(solving, completed=count),
-            batch_s=options.batch_limit,
-        )
-        with finishing():
-            entries = finish_mono(
-                run, recording, options.out, options.video, options.rerun, options.batch, telling
-            )
-    _finish(entries, options, run.failure)
+    _run_images(
+        options,
+        lambda tell: start_mono(recording, config, options.out, options.resume, tell),
+        lambda run, telling: finish_mono(
+            run, recording, options.out, options.video, options.rerun, options.batch, telling
+        ),
+    )
 
 
-@RUN.command(name="stereo")
+@RUN.add("stereo")
 def run_stereo(options: Annotated[StereoOptions, tyro.conf.arg(name="")]) -> None:
     """Stereo SLAM over a sequence of pairs of images (S05: SIFT landmarks, visual odometry, 400 particles)."""
     from rbpf.systems.settings import load_settings
     from rbpf.systems.stereo.config import StereoConfig
-    from rbpf.validation.mono import Telling
     from rbpf.validation.rerun_file import require_rerun
     from rbpf.validation.stereo import StereoRecording, finish_stereo, start_stereo
 
@@ -95,22 +98,13 @@ def run_stereo(options: Annotated[StereoOptions, tyro.conf.arg(name="")]) -> Non
     named = given(options, "particles", "seed", "dof")
     config = load_settings(StereoConfig, "stereo", options.config, options.set, named)
     recording = StereoRecording(options.sequence, options.calibration)
-    _prepare(options)
-    with progress() as bar:
-        with patient(told(bar, bar.add_task("filtering", total=None))) as tell:
-            run = start_stereo(recording, config, options.out, options.resume, tell)
-        solving = bar.add_task("batch", total=None, visible=options.batch)
-        drawing = bar.add_task("drawing", total=None, visible=options.video)
-        telling = Telling(
-            on_frame=told(bar, drawing),
-            on_iteration=lambda count, _error: bar.update(solving, completed=count),
-            batch_s=options.batch_limit,
-        )
-        with finishing():
-            entries = finish_stereo(
-                run, recording, options.out, options.video, options.rerun, options.batch, telling
-            )
-    _finish(entries, options, run.failure)
+    _run_images(
+        options,
+        lambda tell: start_stereo(recording, config, options.out, options.resume, tell),
+        lambda run, telling: finish_stereo(
+            run, recording, options.out, options.video, options.rerun, options.batch, telling
+        ),
+    )
 
 
 def repeated(arguments: list[str]) -> list[str]:
@@ -134,14 +128,40 @@ def repeated(arguments: list[str]) -> list[str]:
     return ["run", origin.system, origin.recording, *options, *out, *arguments[3:]]
 
 
+def _run_images(
+    options: ImageRunOptions,
+    start: Callable[[Told], ImageRun],
+    finish: Callable[[ImageRun, "Telling"], dict[str, Any]],
+) -> None:
+    """Filters, then writes everything, with a bar for each stage of the work."""
+    from rbpf.validation.image_run import Telling
+
+    _prepare(options)
+    with progress() as bar:
+        with patient(told(bar, bar.add_task("filtering", total=None))) as tell:
+            run = start(tell)
+        solving = bar.add_task("batch", total=None, visible=options.batch)
+        drawing = bar.add_task("drawing", total=None, visible=options.video)
+        telling = Telling(
+            on_frame=told(bar, drawing),
+            on_iteration=lambda count, _error: bar.update(solving, completed=count),
+            batch_s=options.batch_limit,
+        )
+        with finishing():
+            entries = finish(run, telling)
+    _finish(entries, options, run.failure)
+
+
 def _prepare(options: RunOptions) -> None:
     """Threads as asked for, and compiled kernels."""
     use_threads(options.threads)
-    compile_kernels(say)
+    compile_kernels()
 
 
 def _finish(entries: dict[str, Any], options: RunOptions, failure: str | None) -> None:
     result = entries | {"out": str(options.out)}
-    answer(result, options.json, table(entries), f"results, pictures and report.html are in {options.out}")
+    shown = {name: value for name, value in entries.items() if name != "sentences"}
+    where = f"results, pictures and report.html are in {options.out}"
+    answer(result, options.json, table(shown), *entries["sentences"], where)
     if failure is not None:
         raise InputError(f"{failure}; what was computed before it is in {options.out}")

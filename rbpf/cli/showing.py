@@ -20,6 +20,9 @@ from rich.progress import (
 
 CONSOLE = Console(stderr=True)
 
+_MOST_LINES = 4
+"""Of a list in a table on the terminal."""
+
 
 def told(bar: Progress, task: TaskID) -> Callable[[int, int], None]:
     """Something that is told how many are done, and of how many."""
@@ -61,11 +64,22 @@ def answer(entries: Mapping[str, Any], as_json: bool, *sentences: str) -> None:
 
 
 def table(entries: Mapping[str, Any], width: int = 34) -> str:
-    """Names and values, one a line."""
-    return "\n".join(
-        f"{name:>{width}}  {value:.6g}" if isinstance(value, float) else f"{name:>{width}}  {value}"
-        for name, value in entries.items()
-    )
+    """Names and values, one a line; of a long list the beginning, one item a line."""
+    lines = []
+    for name, value in entries.items():
+        shown = [str(item) for item in value] if isinstance(value, list) else [_shown(value)]
+        hidden = len(shown) - _MOST_LINES
+        if hidden > 0:
+            shown[_MOST_LINES:] = [f"… and {hidden} more, in summary.json"]
+        lines += [f"{name:>{width}}  {shown[0]}"] if shown else []
+        lines += [f"{'':>{width}}  {line}" for line in shown[1:]]
+    return "\n".join(lines)
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {_shown(item)}" for name, item in value.items())
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 def megabytes(folder: Path) -> float:

@@ -4,11 +4,11 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
-from tyro.extras import SubcommandApp
 
+from rbpf.cli.commands import Commands
 from rbpf.cli.compiling import compile_kernels
 from rbpf.cli.options import ImagesOptions, LabOptions, LogOptions, RenderOptions, given_board
-from rbpf.cli.showing import answer, megabytes, progress, say, told
+from rbpf.cli.showing import answer, megabytes, progress, told
 from rbpf.errors import InputError
 
 if TYPE_CHECKING:
@@ -18,11 +18,10 @@ if TYPE_CHECKING:
 FOCAL_SHARE = {ImagesOptions: 0.8, LabOptions: 0.78125}
 """Focal length by default, as a share of the images' width."""
 
-SIMULATE = SubcommandApp()
-SIMULATE.__doc__ = "Make a recording of a world whose truth is known."
+SIMULATE = Commands("Make a recording of a world whose truth is known.")
 
 
-@SIMULATE.command(name="range-bearing")
+@SIMULATE.add("range-bearing")
 def simulate_range_bearing(options: Annotated[LogOptions, tyro.conf.arg(name="")]) -> None:
     """A log of a robot among landmarks, with ground truth."""
     from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
@@ -31,7 +30,7 @@ def simulate_range_bearing(options: Annotated[LogOptions, tyro.conf.arg(name="")
     answer({"out": str(options.out), "steps": options.steps}, options.json, f"wrote {options.out}")
 
 
-@SIMULATE.command(name="desk")
+@SIMULATE.add("desk")
 def simulate_desk(options: Annotated[ImagesOptions, tyro.conf.arg(name="")]) -> None:
     """Images of a textured desk with papers, books and boxes on it, taken by a hand-held camera, with ground truth."""
     from rbpf.validation.simulation.textured_desk import TexturedDesk
@@ -44,7 +43,7 @@ def simulate_desk(options: Annotated[ImagesOptions, tyro.conf.arg(name="")]) -> 
     _render(lies, options)
 
 
-@SIMULATE.command(name="room")
+@SIMULATE.add("room")
 def simulate_room(options: Annotated[ImagesOptions, tyro.conf.arg(name="")]) -> None:
     """Images of a room with pictures on its walls, carried in a circle, with ground truth."""
     from rbpf.validation.simulation.textured_room import TexturedRoom
@@ -54,7 +53,7 @@ def simulate_room(options: Annotated[ImagesOptions, tyro.conf.arg(name="")]) -> 
     _render(TexturedRoom(frames=options.frames, contrast=options.contrast), options)
 
 
-@SIMULATE.command(name="lab")
+@SIMULATE.add("lab")
 def simulate_lab(options: Annotated[LabOptions, tyro.conf.arg(name="")]) -> None:
     """Stereo images of a laboratory of two rooms, taken from a robot, with ground truth and the wheels' odometry."""
     from rbpf.validation.simulation.textured_lab import LabDrive, TexturedLab
@@ -72,7 +71,7 @@ def _render(world: "ImageWorld", options: ImagesOptions | LabOptions) -> None:
     camera = Pinhole(options.width, options.height, focal, focal, *middle, options.distortion)
     lens = camera if options.baseline_m is None else RectifiedStereo(camera, options.baseline_m)
     imaging = _imaging(options)
-    compile_kernels(say)
+    compile_kernels()
     with progress() as bar:
         task = bar.add_task("rendering", total=options.frames)
         simulate_images(world, imaging, lens, options.out, options.seed, told(bar, task))

@@ -5,36 +5,8 @@ runs along particles and compiles to vector instructions. Lanes never mix: the r
 the number of threads. The docstrings of the drivers give the mathematics; `rbpf.reference` is their NumPy twin.
 """
 
-from collections.abc import Callable
-from importlib import import_module
 from pathlib import Path
 
 from rbpf.kernels.stale import discard_stale
-
-_DRIVERS = (
-    "refine",
-    "update",
-    "posterior",
-    "forest",
-    "rigid",
-    "rigid_matrices",
-    "gather",
-    "project",
-    "substate",
-    "soundness",
-    "robust_fit",
-    "rigid_fit",
-    "single",
-)
-
-
-def compile_once(announce: Callable[[], None]) -> None:
-    """Loads the drivers; calls `announce` first where no compiled copy is cached beside them."""
-    cache = Path(__file__).parent / "__pycache__"
-    if not all(any(cache.glob(f"{name}.*.nbi")) for name in _DRIVERS):
-        announce()
-    for name in _DRIVERS:
-        import_module(f"rbpf.kernels.{name}")
-
 
 discard_stale(Path(__file__).parent)

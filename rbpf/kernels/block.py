@@ -5,6 +5,7 @@ Sizes are small run-time numbers; the innermost loop always runs along the parti
 
 import math
 
+import numpy as np
 from numba import njit
 
 from rbpf.kernels.signature import BLOCK
@@ -14,6 +15,36 @@ from rbpf.kernels.signature import BLOCK
 def packed(a, b):
     """Index of entry (a, b) of a symmetric matrix stored as its lower triangle by rows."""
     return a * (a + 1) // 2 + b if a >= b else b * (b + 1) // 2 + a
+
+
+@njit(cache=True, error_model="numpy")
+def workspace(size, p, dim, dim_map, size_const):
+    """Memory for a block that sees one landmark after another.
+
+    States (E, ·), a record's mean (D, ·), packed covariance and constants (A, ·), innovations (p, ·), Jacobians by the
+    state (p, d, ·) and by the landmark (p, D, ·), J P (p, D, ·) and S (p, p, ·). The Jacobian by the state is zero: a
+    kernel fills the leading columns, those of what it reads.
+    """
+    size_cov = dim_map * (dim_map + 1) // 2
+    return (
+        np.empty((size, BLOCK)),
+        np.empty((dim_map, BLOCK)),
+        np.empty((size_cov, BLOCK)),
+        np.empty((size_const, BLOCK)),
+        np.empty((p, BLOCK)),
+        np.zeros((p, dim, BLOCK)),
+        np.empty((p, dim_map, BLOCK)),
+        np.empty((p, dim_map, BLOCK)),
+        np.empty((p, p, BLOCK)),
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def load_states(state, start, count, x):
+    """Gathers the states of the `count` particles from `start` on."""
+    for e in range(state.shape[1]):
+        for i in range(count):
+            x[e, i] = state[start + i, e]
 
 
 @njit(cache=True, error_model="numpy")

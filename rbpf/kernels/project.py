@@ -3,7 +3,7 @@
 import numpy as np
 from numba import int64, njit, void
 
-from rbpf.kernels.block import load_record
+from rbpf.kernels.block import load_record, load_states, workspace
 from rbpf.kernels.innovation import innovation_covariance
 from rbpf.kernels.signature import BLOCK, CUBE, INDEX_MATRIX, INDICES, MATRIX, VECTOR, kernel_at
 
@@ -77,15 +77,9 @@ def project(address, params, state, pool, slabs, which, maps, anchor, weights, f
     n_particles, size = state.shape
     p = anchor.shape[1]
     dim, dim_map, size_const = sizes[0], sizes[1], sizes[2]
-    x = np.empty((size, BLOCK))
-    record = np.empty((dim_map, BLOCK))
-    packed_cov = np.empty((dim_map * (dim_map + 1) // 2, BLOCK))
-    const = np.empty((size_const, BLOCK))
-    nu = np.empty((p, BLOCK))
-    jac_state = np.zeros((p, dim, BLOCK))
-    jac_map = np.empty((p, dim_map, BLOCK))
-    cross = np.empty((p, dim_map, BLOCK))
-    total = np.empty((p, p, BLOCK))
+    x, record, packed_cov, const, nu, jac_state, jac_map, cross, total = workspace(
+        size, p, dim, dim_map, size_const
+    )
     column = np.empty((p, BLOCK))
     offset = np.empty((p, n_particles))
     nothing = np.zeros((p, p))
@@ -94,9 +88,7 @@ def project(address, params, state, pool, slabs, which, maps, anchor, weights, f
         for start in range(0, n_particles, BLOCK):
             count = min(BLOCK, n_particles - start)
             if k == 0 or n_particles > BLOCK:
-                for e in range(size):
-                    for i in range(count):
-                        x[e, i] = state[start + i, e]
+                load_states(state, start, count, x)
             load_record(pool, slabs[k], maps[which[k]], start, count, record, packed_cov, const)
             kernel(x, record, const, anchor[k], params, count, nu, jac_state, jac_map)
             innovation_covariance(jac_map, packed_cov, nothing, count, cross, total)

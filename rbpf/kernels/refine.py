@@ -11,9 +11,11 @@ from rbpf.kernels.block import (
     add_transposed_product,
     cholesky,
     load_record,
+    load_states,
     packed,
     whiten_matrix,
     whiten_vector,
+    workspace,
 )
 from rbpf.kernels.gate import accept_predicted, leave_out
 from rbpf.kernels.innovation import innovation_covariance
@@ -85,20 +87,13 @@ def refine(
     n_particles, size = state.shape
     n_obs, p = noise.shape[0], noise.shape[1]
     dim, dim_map, size_const = sizes[0], sizes[1], sizes[2]
-    size_cov = dim_map * (dim_map + 1) // 2
     for block in prange((n_particles + BLOCK - 1) // BLOCK):
         start = block * BLOCK
         count = min(BLOCK, n_particles - start)
         kernel = kernel_at(address)
-        x = np.empty((size, BLOCK))
-        mean = np.empty((dim_map, BLOCK))
-        cov = np.empty((size_cov, BLOCK))
-        const = np.empty((size_const, BLOCK))
-        nu = np.empty((p, BLOCK))
-        jac_state = np.zeros((p, dim, BLOCK))  # a kernel fills the leading columns, those of what it reads
-        jac_map = np.empty((p, dim_map, BLOCK))
-        cross = np.empty((p, dim_map, BLOCK))
-        total = np.empty((p, p, BLOCK))
+        x, mean, cov, const, nu, jac_state, jac_map, cross, total = workspace(
+            size, p, dim, dim_map, size_const
+        )
         weight = np.ones(BLOCK)
         scale = np.ones(BLOCK)
         sum_info = np.zeros((dim * (dim + 1) // 2, BLOCK))
@@ -108,9 +103,7 @@ def refine(
         penalty = np.zeros(BLOCK)
         used = np.zeros(BLOCK)
         pivots = 0
-        for e in range(size):
-            for i in range(count):
-                x[e, i] = state[start + i, e]
+        load_states(state, start, count, x)
         for k in range(n_obs):
             load_record(pool, slabs[k], maps[which[k]], start, count, mean, cov, const)
             kernel(x, mean, const, z[k], params, count, nu, jac_state, jac_map)

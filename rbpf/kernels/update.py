@@ -11,8 +11,10 @@ from rbpf.kernels.block import (
     add_transposed_product,
     cholesky,
     load_record,
+    load_states,
     whiten_matrix,
     whiten_vector,
+    workspace,
 )
 from rbpf.kernels.gate import is_inlier, leave_out, log_likelihood
 from rbpf.kernels.innovation import innovation_covariance
@@ -93,29 +95,20 @@ def update(
     n_particles, size = state.shape
     n_obs, p = noise.shape[0], noise.shape[1]
     dim, dim_map, size_const = sizes[0], sizes[1], sizes[2]
-    size_cov = dim_map * (dim_map + 1) // 2
     for block in prange((n_particles + BLOCK - 1) // BLOCK):
         start = block * BLOCK
         count = min(BLOCK, n_particles - start)
         kernel = kernel_at(address)
-        x = np.empty((size, BLOCK))
-        mean = np.empty((dim_map, BLOCK))
-        cov = np.empty((size_cov, BLOCK))
-        const = np.empty((size_const, BLOCK))
-        nu = np.empty((p, BLOCK))
-        jac_state = np.zeros((p, dim, BLOCK))  # a kernel fills the leading columns, those of what it reads
-        jac_map = np.empty((p, dim_map, BLOCK))
-        cross = np.empty((p, dim_map, BLOCK))
-        total = np.empty((p, p, BLOCK))
+        x, mean, cov, const, nu, jac_state, jac_map, cross, total = workspace(
+            size, p, dim, dim_map, size_const
+        )
         weight = np.ones(BLOCK)
         scale = np.ones(BLOCK)
         squared = np.zeros(BLOCK)
         used = np.zeros(BLOCK)
         pivots = 0
         sum_log = np.zeros(BLOCK)
-        for e in range(size):
-            for i in range(count):
-                x[e, i] = state[start + i, e]
+        load_states(state, start, count, x)
         for k in range(n_obs):
             rows = maps[which[k]]
             load_record(pool, slabs[k], rows, start, count, mean, cov, const)

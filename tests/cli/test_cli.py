@@ -4,13 +4,13 @@ import json
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 
 from rbpf.cli import main
+from tests.cli.run_outputs import outputs
 
 FILES = {
     "checkpoint.npz",
@@ -38,7 +38,6 @@ FILES = {
     "groundtruth_landmarks.png",
     "groundtruth_map.png",
 }
-TIMINGS = ("ms_per_frame", "peak_memory_mb")
 REQUIRED = {
     "system", "recording", "frames", "particles", "seed", "ms_per_frame", "landmarks", "resamplings", "ess_mean",
     "log_evidence", "peak_memory_mb", "ate_rmse_m", "path_rmse_m", "landmark_error_mean_m",
@@ -59,20 +58,6 @@ def run(log, out, *arguments):
     return main(
         ["run", "range-bearing", str(log), "--out", str(out), "--particles", "30", "--no-batch", *arguments]
     )
-
-
-def outputs(folder: Path) -> dict[str, bytes]:
-    """All files but timings; summary.json without its timings."""
-    kept = {}
-    for path in sorted(folder.iterdir()):
-        if path.name in ("timings.csv", "timings.png", "report.html", "checkpoint.npz"):
-            continue
-        content = path.read_bytes()
-        if path.name == "summary.json":
-            entries = {k: v for k, v in json.loads(content).items() if k not in TIMINGS}
-            content = json.dumps(entries).encode()
-        kept[path.name] = content
-    return kept
 
 
 def test_a_run_leaves_everything(log, tmp_path):

@@ -62,7 +62,16 @@ def test_a_video_is_as_good(tmp_path, capsys):
     assert calibrate(path, tmp_path / "out") == 0
     camera = read_calibration(tmp_path / "out" / "camera.yaml").camera
     np.testing.assert_allclose(camera.params[:4], CAMERA.params[:4], atol=1.0)
-    assert "reprojection error" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "reprojection error" in said and "will bend" not in said
+
+
+def test_a_camera_that_is_not_known_well_is_said_to_be(images, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("rbpf.cli.cameras.LOOSE", 1e-5)
+    assert calibrate(images, tmp_path / "out") == 0
+    assert "0.0 % of its focal length only, and a run with it will bend" in " ".join(
+        capsys.readouterr().err.split()
+    )
 
 
 def blank(folder):

@@ -16,7 +16,7 @@ import yaml
 
 from rbpf.cli import APP, DemoOptions, main
 from rbpf.cli.cameras import CalibrateOptions, RecalibrateOptions
-from rbpf.cli.compiling import cached, kernel_modules
+from rbpf.cli.compiling import cached, compile_kernels, kernel_modules
 from rbpf.cli.exporting import ExportOptions
 from rbpf.cli.installed import DoctorOptions
 from rbpf.cli.judging import CompareOptions, ReportOptions, SweepOptions, ValidateOptions
@@ -28,7 +28,7 @@ from rbpf.cli.options import (
     RangeBearingOptions,
     StereoOptions,
 )
-from tests.cli.test_cli import outputs
+from tests.cli.run_outputs import outputs
 
 pytestmark = pytest.mark.slow
 
@@ -109,6 +109,20 @@ def test_help_says_what_each_option_is_its_default_and_its_unit(command, capsys,
             assert UNIT.search(found[1]), f"{command} {shown} has no unit: {found[1]}"
 
 
+@pytest.mark.parametrize(
+    "arguments", ["nonsense", "nonsense --help", "run nonsense --help", "simulate nonsense -h"]
+)
+def test_a_command_that_there_is_not_is_named_even_where_help_is_asked_for(arguments, capsys):
+    assert main(arguments.split()) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and "nonsense`: there are " in err
+
+
+def test_a_slip_of_the_pen_is_told_the_nearest_command(capsys):
+    assert main(["simulate", "dsek", "--out", "x"]) == 2
+    assert "no command `rbpf simulate dsek`: did you mean desk?" in capsys.readouterr().err
+
+
 def test_json_is_one_object_on_standard_output(log, tmp_path, capsys):
     assert main(quick(log, tmp_path / "run", "--json")) == 0
     out, _ = capsys.readouterr()
@@ -130,6 +144,7 @@ def test_without_json_nothing_is_on_standard_output(log, tmp_path, capsys):
     assert main(quick(log, tmp_path / "run")) == 0
     out, err = capsys.readouterr()
     assert out == "" and "report.html" in err
+    assert "Do not trust its uncertainty: " in err or "can be trusted cannot be told: " in err
 
 
 def test_bad_input_is_exit_code_2_and_a_fault_is_1(log, tmp_path):
@@ -196,11 +211,15 @@ def test_a_run_is_repeated_from_its_config(log, tmp_path, capsys):
     config = tmp_path / "a" / "config.yaml"
     entries = yaml.safe_load(config.read_text())
     assert entries["versions"]["numpy"] == np.__version__ and len(entries["input_sha256"]) == 64
-    again = ["run", "--from", str(config), "--no-batch"]
+    assert entries["batch"] is False
+    again = ["run", "--from", str(config)]
     assert main([*again, "--out", str(tmp_path / "b")]) == 0
     assert outputs(tmp_path / "a") == outputs(tmp_path / "b")
     assert main(again) == 0
     assert outputs(tmp_path / "a") == outputs(tmp_path / "a-again")
+    assert not (tmp_path / "a-again" / "batch.tum").exists()
+    assert main([*again, "--batch"]) == 0
+    assert (tmp_path / "a-again" / "batch.tum").exists()
     capsys.readouterr()
     path = next(log.glob("observations.csv"))
     before = path.read_text()
@@ -220,6 +239,7 @@ def test_the_doctor_finds_everything_here_and_what_is_missing(capsys, monkeypatc
     assert entries["works"] and not entries["kernels_missing"]
     assert entries["python"] == sys.version.split()[0] and entries["libraries"]["numpy"] == np.__version__
     assert all(cached(module) for module in kernel_modules())
+    assert compile_kernels() == []
     monkeypatch.setitem(sys.modules, "gtsam", None)
     monkeypatch.setitem(sys.modules, "rerun", None)
     assert main(["doctor", "--no-compile", "--json"]) == 2

@@ -4,7 +4,6 @@ import importlib
 import json
 import shutil
 import sys
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -21,6 +20,7 @@ from rbpf.validation.gtsam_ba_camera import CameraEstimate, solve_features
 from rbpf.validation.mono_batch import ROBUST
 from rbpf.validation.trajectory_files import read_tum
 from tests.cli.mono_sequences import CAMERA, FRAMES, run, sentence, summary
+from tests.cli.run_outputs import outputs
 
 pytestmark = pytest.mark.slow
 
@@ -38,7 +38,6 @@ REQUIRED = {
     "ate_sim3_rmse_m", "rpe_translation_rmse_m", "rpe_rotation_rmse_deg", "peak_memory_mb",
     "batch_frames", "batch_ate_rmse_m", "batch_ate_sim3_rmse_m", "filter_minus_batch_rmse_m",
 }  # fmt: skip
-TIMED = ("ms_per_frame", "peak_memory_mb")
 
 
 @pytest.fixture(scope="module")
@@ -46,14 +45,6 @@ def finished(desk, tmp_path_factory):
     out = tmp_path_factory.mktemp("finished") / "run"
     assert run(desk, out, "--video") == 0
     return out
-
-
-def outputs(folder: Path) -> dict[str, bytes]:
-    """All files that hold no times; summary.json without its times."""
-    timed = {"timings.csv", "timings.png", "report.html", "checkpoint.npz"}
-    kept = {path.name: path.read_bytes() for path in folder.iterdir() if path.name not in timed}
-    entries = {name: value for name, value in summary(folder).items() if name not in TIMED}
-    return kept | {"summary.json": json.dumps(entries).encode()}
 
 
 def test_a_run_leaves_all_files_and_figures(finished):

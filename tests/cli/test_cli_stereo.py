@@ -1,7 +1,11 @@
 """`rbpf run stereo` from end to end, on a few small rendered pairs."""
 
 import json
+import re
 import shutil
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -13,6 +17,7 @@ from rbpf.cli import main
 from rbpf.lie import SE3
 from rbpf.validation.colmap_pipeline import ReconstructionOptions
 from rbpf.validation.trajectory_files import read_tum
+from tests.cli.run_outputs import outputs, untimed_summary
 from tests.cli.stereo_sequences import FRAMES, run
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("keypoints_once")]
@@ -28,7 +33,6 @@ REQUIRED = {
     "sift_features", "landmarks_mean_per_particle", "vo_ate_rmse_m", "ate_rmse_m", "ate_sim3_rmse_m",
     "rpe_translation_rmse_m", "rpe_rotation_rmse_deg", "peak_memory_mb", "log_evidence",
 }  # fmt: skip
-TIMED = ("ms_per_frame", "ms_per_update", "peak_memory_mb")
 
 
 @pytest.fixture(scope="module")
@@ -36,11 +40,6 @@ def finished(room, tmp_path_factory, keypoints_once):
     out = tmp_path_factory.mktemp("finished") / "run"
     assert run(room, out) == 0
     return out
-
-
-def summary(out: Path) -> dict[str, object]:
-    entries = json.loads((out / "summary.json").read_text())
-    return {name: value for name, value in entries.items() if name not in TIMED}
 
 
 def table(path: Path) -> np.ndarray:
@@ -58,7 +57,7 @@ def test_what_it_leaves(finished):
 
 
 def test_the_files_agree(finished):
-    entries = summary(finished)
+    entries = untimed_summary(finished)
     path, alone = read_tum(finished / "trajectory.tum"), read_tum(finished / "odometry.tum")
     assert len(path) == len(alone) == FRAMES
     np.testing.assert_allclose(path.world_from_body[0], SE3.identity(), atol=1e-12)
@@ -77,7 +76,7 @@ def test_the_files_agree(finished):
 
 def test_it_follows_the_camera(finished):
     """The camera goes about a metre."""
-    entries = summary(finished)
+    entries = untimed_summary(finished)
     assert entries["distance_m"] > 0.3
     assert entries["ate_rmse_m"] < 0.01 and entries["vo_ate_rmse_m"] < 0.01
 
@@ -86,7 +85,7 @@ def test_repeated_from_its_configuration(finished, room, tmp_path):
     assert run(room, tmp_path / "again", "--config", str(finished / "config.yaml")) == 0
     for name in ("trajectory.tum", "odometry.tum", "map.csv", "diagnostics.csv"):
         assert (tmp_path / "again" / name).read_bytes() == (finished / name).read_bytes()
-    assert summary(tmp_path / "again") == summary(finished)
+    assert untimed_summary(tmp_path / "again") == untimed_summary(finished)
     assert yaml.safe_load((finished / "config.yaml").read_text())["system"] == "stereo"
 
 
@@ -98,6 +97,43 @@ def test_resumed(finished, room, tmp_path):
     assert run(room, out, "--set", "checkpoint_every=6", "--resume") == 0
     for name in ("trajectory.tum", "odometry.tum", "map.csv", "diagnostics.csv"):
         assert (out / name).read_bytes() == (finished / name).read_bytes()
+
+
+def test_ctrl_c_leaves_a_run_that_resumes_to_the_same_bytes(finished, room, tmp_path):
+    """A real signal to a real process, in the middle of an update; the pair is finished first."""
+    arguments = ["run", "stereo", str(room), "--particles", "50", "--out", str(tmp_path / "cut")]
+    command = [sys.executable, "-c", _WAITING, *arguments]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    process = subprocess.Popen(command, text=True, **pipes)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "updating\n"
+    process.send_signal(signal.SIGINT)
+    _, error = process.communicate("go on\n", timeout=120)
+    assert process.returncode == 130, error
+    said = re.search(
+        rf"stopped after (\d) of {FRAMES}; the same command with --resume", " ".join(error.split())
+    )
+    assert said is not None and 3 <= int(said[1]) < FRAMES
+    assert {path.name for path in (tmp_path / "cut").iterdir()} == {"checkpoint.npz"}
+    assert main([*arguments, "--resume"]) == 0
+    again, whole = outputs(tmp_path / "cut"), outputs(finished)
+    assert again.keys() == whole.keys()
+    assert [name for name in whole if again[name] != whole[name]] == []
+
+
+_WAITING = """
+import sys
+from rbpf.filter import Filter
+step = Filter.step
+def waiting(self, *arguments):
+    if self.steps == 2:
+        print("updating", flush=True)
+        sys.stdin.readline()
+    return step(self, *arguments)
+Filter.step = waiting
+from rbpf.cli import main
+sys.exit(main())
+"""
 
 
 def test_options(room, tmp_path):
@@ -118,7 +154,7 @@ def test_a_lost_image(room, tmp_path):
     images = sorted((spoilt / "mav0" / "cam1" / "data").iterdir())
     images[4].write_bytes(images[4].read_bytes()[:200])
     assert run(spoilt, tmp_path / "run") == 0
-    entries = summary(tmp_path / "run")
+    entries = untimed_summary(tmp_path / "run")
     assert entries["frames"] == FRAMES and entries["frames_measured"] == FRAMES - 1
     assert len(entries["problems"]) == 1 and entries["problems"][0].startswith("pair 4 is passed over: ")
     assert entries["ate_rmse_m"] < 0.05
@@ -144,7 +180,7 @@ def test_swapped_on_the_way(room, tmp_path, capsys):
     cv2.imwrite(str(right), images[0])
     assert run(spoilt, tmp_path / "run") == 2
     assert "what was computed before it is in" in " ".join(capsys.readouterr().err.split())
-    entries = summary(tmp_path / "run")
+    entries = untimed_summary(tmp_path / "run")
     assert entries["frames"] == 5 and "swapped" in entries["failure"]
 
 
@@ -168,7 +204,7 @@ def test_bad_arguments(room, tmp_path, capsys, arguments, message):
 
 def test_the_batch_stands_beside(finished):
     """The optimum of the same pixels is nearer to the truth than odometry, and near the filter."""
-    entries = summary(finished)
+    entries = untimed_summary(finished)
     assert len(read_tum(finished / "batch.tum")) == entries["batch_frames"] == FRAMES
     assert entries["batch_ate_rmse_m"] < entries["vo_ate_rmse_m"]
     assert 0.0 < entries["filter_minus_batch_rmse_m"] < 0.01
@@ -180,7 +216,7 @@ def test_a_run_is_compared_with_its_batch_optimum_afterwards(finished, tmp_path)
     (folder / "batch.tum").unlink()
     assert main(["validate", str(folder), "--against", "gtsam"]) == 0
     written = json.loads((folder / "validation_gtsam.json").read_text())
-    apart = summary(folder)["filter_minus_batch_rmse_m"]
+    apart = untimed_summary(folder)["filter_minus_batch_rmse_m"]
     assert written["figures"]["filter_minus_batch_rmse_m"] == pytest.approx(apart, rel=0.02)
     assert written["figures"]["landmarks_count"] > 10
     assert written["figures"]["landmarks_kullback_leibler_median"] > 0.0

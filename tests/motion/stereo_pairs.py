@@ -76,3 +76,10 @@ def mistaken(pair: Pair, share: float, rng: np.random.Generator) -> tuple[Matche
     mask = np.zeros(len(matches), dtype=bool)
     mask[wrong] = True
     return Matches(matches.camera, matches.z_prev, z_now, matches.cov_prev, matches.cov_now), mask
+
+
+def joined(first: Matches, second: Matches) -> Matches:
+    """The matches of both, of one camera."""
+    names = "z_prev", "z_now", "cov_prev", "cov_now"
+    both = (np.concatenate([getattr(first, name), getattr(second, name)]) for name in names)
+    return Matches(first.camera, *both)

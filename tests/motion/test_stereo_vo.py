@@ -22,6 +22,7 @@ from tests.motion.stereo_pairs import (
     ROOM,
     World,
     correlated,
+    joined,
     mistaken,
     noiseless,
     simulate,
@@ -281,3 +282,20 @@ def test_bias_of_the_translation():
     assert abs(bias["adjusted"]) < 0.25  # three standard deviations of the mean
     assert 0.25 < bias["propagated"] < 0.8
     assert 0.5 < bias["exact"] < 1.2
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_matches_on_a_thing_that_moves_are_counted(seed):
+    rng = np.random.default_rng(seed)
+    room, thing = simulate(ROOM, 60, rng), simulate(LEAP, 20, rng)
+    found = estimated(joined(room.matches, thing.matches))
+    assert found.inliers[:60].sum() >= 54 and not found.inliers[60:].any()
+    assert 16 <= found.elsewhere <= 20
+
+
+@pytest.mark.parametrize("world", [ROAD, ROOM], ids=["road", "room"])
+def test_false_matches_agree_on_no_motion(world):
+    rng = np.random.default_rng(0)
+    for share in (0.0, 0.2, 0.4):
+        matches, _ = mistaken(simulate(world, 80, rng), share, rng)
+        assert estimated(matches).elsewhere == 0

@@ -12,6 +12,7 @@ from rbpf.systems.stereo.config import MapConfig, OdometryConfig, StereoConfig, 
 from rbpf.systems.stereo.dead_reckoning import Pixels
 from rbpf.systems.stereo.front_ends import ImageFrontEnd
 from rbpf.systems.stereo.run import StereoRun, run_images
+from rbpf.validation.image_faults import cover_view
 from tests.systems.stereo_sequences import flat, missing, pairs, swapped
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("keypoints_once")]
@@ -116,6 +117,14 @@ def test_a_bad_pair_is_survived(change, plain):
     assert error_m(bad, bad.world_from_camera) < 0.006
     assert np.trace(bad.cov[5]) > 50.0 * np.trace(plain.cov[5])
     assert np.trace(bad.cov[7]) < 10.0 * np.trace(plain.cov[7])
+
+
+def test_a_thing_that_moves_through_the_view_is_said(plain):
+    """It covers up to a third of the view: as long as it and the room are seen there are two motions."""
+    run = run_images(cover_view(1 / 3, 3, 8)(pairs(COUNT)), CONFIG)
+    said = [note for note in run.notes if "something in the view moves" in note]
+    assert len(said) >= 3 and all(int(note.split()[1][:-1]) in range(3, 12) for note in said)
+    assert plain.notes == []
 
 
 def test_a_bad_start():

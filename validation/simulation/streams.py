@@ -5,6 +5,7 @@ the robot go round for ever, and every point is replaced by another one, with a 
 time. What a filter is given is its first frame as a log, and then one frame after the other.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -77,7 +78,31 @@ class _Points:
         return rows[np.argsort(self.names[rows], kind="stable")][: self._turnover.measurements]
 
 
-class CameraStream:
+class _Stream(ABC):
+    """Something that goes on for ever among points that are replaced."""
+
+    _rng: np.random.Generator
+    _points: _Points
+    _first: Seen
+
+    def frames(self) -> Iterator[Seen]:
+        """Frame after frame, the first one included."""
+        t = 0
+        while True:
+            yield self._first if t == 0 else self._measure(t)
+            self._points.renew(self._draw(len(self._points.places)), self._rng)
+            t += 1
+
+    @abstractmethod
+    def _draw(self, count: int) -> np.ndarray:
+        """Fresh points (count, D)."""
+
+    @abstractmethod
+    def _measure(self, t: int) -> Seen:
+        """Frame t."""
+
+
+class CameraStream(_Stream):
     """A camera goes round over a desk for ever and looks at it.
 
     Args:
@@ -102,14 +127,6 @@ class CameraStream:
         assert isinstance(self._first.frame, FeatureFrame)
         return FeatureLog("a stream of features", CAMERA, [self._first.frame], known)
 
-    def frames(self) -> Iterator[Seen]:
-        """Frame after frame, the first one included."""
-        t = 0
-        while True:
-            yield self._first if t == 0 else self._measure(t)
-            self._points.renew(self._draw(len(self._points.places)), self._rng)
-            t += 1
-
     def _draw(self, count: int) -> np.ndarray:
         return self._rng.uniform([-0.7, -0.7, 0.0], [0.7, 0.7, 0.3], (count, 3))
 
@@ -131,7 +148,7 @@ class CameraStream:
         return Seen(FeatureFrame(round(s * 1e9), names, z[keep], cov), pose)
 
 
-class RobotStream:
+class RobotStream(_Stream):
     """A robot drives round in a circle for ever, with noisy odometry, among landmarks that it sees ahead.
 
     Args:
@@ -161,14 +178,6 @@ class RobotStream:
         """The first frame alone."""
         assert isinstance(self._first.frame, Frame)
         return RobotLog("a stream of ranges", SE2, "range_bearing", SE2.identity(), [self._first.frame])
-
-    def frames(self) -> Iterator[Seen]:
-        """Frame after frame, the first one included."""
-        t = 0
-        while True:
-            yield self._first if t == 0 else self._measure(t)
-            self._points.renew(self._draw(len(self._points.places)), self._rng)
-            t += 1
 
     def _draw(self, count: int) -> np.ndarray:
         reach = self.radius_m + 3.0

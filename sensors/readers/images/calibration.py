@@ -21,7 +21,10 @@ from rbpf.sensors.readers.images.mapping import Value, read_yaml
 from rbpf.sensors.readers.text import quoted
 
 NAME = "camera.yaml"
-KIND = f"a {NAME} with the keys fx, fy, cx, cy, width, height and, if the images are distorted, distortion"
+KIND = (
+    f"a {NAME} with the keys fx, fy, cx, cy, width, height and, if the images are distorted, distortion "
+    "(`rbpf calibrate` makes one)"
+)
 
 _REQUIRED = ("fx", "fy", "cx", "cy", "width", "height")
 _OPTIONAL = ("model", "distortion", "rate_hz", "baseline_m")

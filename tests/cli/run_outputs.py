@@ -1,0 +1,20 @@
+"""What two runs that should be the same are compared by: everything in their folders that does not tell times."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+TIMED_FILES = {"timings.csv", "timings.png", "report.html", "checkpoint.npz"}
+TIMED_ENTRIES = {"ms_per_frame", "ms_per_update", "peak_memory_mb"}
+
+
+def untimed_summary(folder: Path) -> dict[str, Any]:
+    """summary.json without times and memory."""
+    entries = json.loads((folder / "summary.json").read_text())
+    return {name: value for name, value in entries.items() if name not in TIMED_ENTRIES}
+
+
+def outputs(folder: Path) -> dict[str, bytes]:
+    """The bytes of all files but timings, by name; of summary.json those of its other entries."""
+    kept = {path.name: path.read_bytes() for path in folder.iterdir() if path.name not in TIMED_FILES}
+    return kept | {"summary.json": json.dumps(untimed_summary(folder)).encode()}

@@ -1,0 +1,249 @@
+"""What each example shows: a function of its name that is given its figures."""
+
+from typing import Any
+
+import pytest
+
+
+def against_batch(figures: dict[str, float]) -> None:
+    assert figures["300 particles"] < figures["10 particles"]
+
+
+def against_colmap(figures: dict[str, float]) -> None:
+    assert figures["run: share_registered"] >= 0.9
+    assert figures["run: ate_rmse_m"] < 0.02
+    assert figures["COLMAP's own error [m]"] < 0.01
+    assert figures["run: surface_median_m"] < 0.1
+    assert figures["both: pose_difference_max"] < 1e-4
+    assert figures["both: pose_covariance_error_max"] < 0.05
+
+
+def batch_check(figures: dict[str, float]) -> None:
+    assert figures["filter"] < 0.5 * figures["odometry alone"]
+    assert figures["from_batch"] < 0.1
+
+
+def checkpoint(figures: dict[str, bool]) -> None:
+    assert figures["same"]
+    assert figures["refused"]
+
+
+def consistency_runs(figures: dict[str, float]) -> None:
+    sampled = "monocular, 20 particles, start sampled (known points as landmarks)"
+    assert figures[sampled] > 2.0 * figures["monocular, 20 particles, as it is"]
+    assert figures["range-bearing, 10 particles"] > figures["range-bearing, 40 particles"]
+    fixed = "range-bearing, 20 particles, start never re-estimated"
+    assert figures[fixed] > 2.0 * figures["range-bearing, 20 particles, as it is"]
+
+
+def custom_sensor(figures: dict[str, float]) -> None:
+    assert figures["findings"] == 0
+    assert figures["filter"] < 0.25 * figures["odometry"]
+    assert 0.8 < figures["nis_per_dof"] < 1.25
+
+
+def error_causes(figures: dict[str, float]) -> None:
+    assert figures["batch started from the filter"] == pytest.approx(figures["batch"], rel=1e-3)
+    assert figures["10× particles"] < figures["as it is"] * 1.5
+
+
+def error_ratios(figures: dict[str, float]) -> None:
+    assert figures.keys() == {"simulated_robot", "rendered_desk"}
+    assert all(0.8 < ratio < 6.0 for ratio in figures.values())
+
+
+def evidence(figures: dict[float, float]) -> None:
+    low, right, high = figures.values()
+    assert right > max(low, high) + 3.0
+
+
+def fault_matrix(figures: dict[str, float]) -> None:
+    assert figures["tracebacks"] == 0.0
+    assert figures["resumed as uninterrupted"] == 1.0
+    assert figures["mono: none: as without"] < 0.02
+    assert figures["stereo: none: as without"] < 0.02
+
+
+def fused_kernel(figures: dict[str, float]) -> None:
+    assert figures["findings"] == 0
+    assert figures["difference"] < 1e-6
+    assert figures["speedup"] > 1.0
+
+
+def gps_fix(figures: dict[str, float]) -> None:
+    assert figures["sigma_heading_end"] < 0.1 * figures["sigma_heading_start"]
+    assert figures["position_rmse"] < 0.5 * 2**0.5
+    assert figures["share_within_3_sigma"] > 0.95
+
+
+def lab_images(figures: dict[str, dict[str, float]]) -> None:
+    clear, dim = figures.values()
+    assert dim["share matched, left to right"] < 0.9 * clear["share matched, left to right"]
+    assert dim["disparity against the truth, px"] > 1.3 * clear["disparity against the truth, px"]
+    assert 0.3 < dim["share matched, frame to frame"] + dim["share matched, left to right"] < 1.4
+    assert dim["stereo matches"] > 50.0
+
+
+def mono_blackouts(figures: dict[str, float]) -> None:
+    assert figures["blackouts"] >= 2
+    assert figures["recovered"] == 1.0
+    assert figures["wrong"] == 0.0
+    assert figures["median error a second later [m]"] < 0.03
+
+
+def mono_budget(figures: dict[str, float]) -> None:
+    assert figures["same measurements"] == pytest.approx(figures["as it is"], rel=1e-3)
+    assert figures["batch"] < 0.5 * figures["as it is"]
+    assert figures["10× particles"] < figures["as it is"]
+
+
+def mono_depth(figures: dict[str, float]) -> None:
+    assert figures["kl_depth"] > 10.0 * figures["kl_inverse"]
+    assert figures["kl_depth_end"] < 0.01
+
+
+def mono_desk(figures: dict[str, float]) -> None:
+    assert 1.0 < figures["ratio"] < 2.5
+    assert 3.0 < figures["nees"] < 15.0
+
+
+def mono_eigenvalues(figures: dict[str, float]) -> None:
+    assert figures["dominant"] < 45
+    assert figures["thirtieth"] < 0.05
+
+
+def mono_loop(figures: dict[str, float]) -> None:
+    # The quick lap is too short for a prior that does not fit the world to bend the map as it does on a whole one.
+    assert figures["loop / desk's prior"] < 2.0 * figures["loop / room's prior"]
+    assert 0.8 < figures["loop / default"] < 4.0
+
+
+def mono_overconfidence(figures: dict[str, float]) -> None:
+    assert figures["default / points"] > 3.0 * figures["default / frame"]
+
+
+def mono_realism(figures: dict[str, float]) -> None:
+    assert 0.8 < figures["rendered desk"] <= 1.0
+    assert figures["rendered desk"] <= figures["rendered desk, perfect pictures"] + 0.05
+
+
+def mono_still_camera(figures: dict[str, float]) -> None:
+    assert figures["epipolar / points / stay rays"] < 0.1
+    assert figures["epipolar / frame / stay rays"] < 0.5
+    assert figures["off / frame / become points"] < 0.5
+
+
+def mono_video(figures: dict[str, float]) -> None:
+    assert figures["frames_tracked"] == 20
+    assert figures["ate_rmse_m"] < 0.02
+
+
+def motion_evidence(figures: dict[str, Any]) -> None:
+    turns, straight = figures.values()
+    assert turns.difference > 3.0 * turns.error
+    assert straight.difference < -2.0 * straight.error
+
+
+def own_landmark(figures: dict[str, float]) -> None:
+    assert figures["findings"] == 0
+    assert figures["located"] >= 25
+    assert figures["map"] < 0.5
+    assert figures["path"] < 0.2
+
+
+def own_proposal(figures: dict[float, tuple[float, float]]) -> None:
+    errors, sizes = zip(*figures.values(), strict=True)
+    assert max(errors) < 0.15
+    assert sizes[0] > sizes[1] > sizes[2]
+
+
+def range_only_beacons(figures: dict[str, float]) -> None:
+    assert figures["promoted"] >= 4
+    assert figures["map"] < 0.5
+    assert figures["path"] < 0.3
+
+
+def reproduce_e06(figures: dict[str, float]) -> None:
+    assert {name.split(":")[0] for name in figures} == {f"Fig. {k}" for k in range(2, 10)}
+
+    def of(text: str) -> float:
+        (value,) = [value for name, value in figures.items() if text in name]
+        return value
+
+    assert of("processor time per frame") < 1.5
+    assert of("choice of what to look for") < 0.2
+    assert of("landmarks of a flat desk") < 0.03
+    assert of("observations per frame") > 20
+    assert of("frames in which the camera was lost") == 0
+    assert of("epipolar lines longer than 2 px") >= 3
+    assert of("distance of what is found from its epipolar line") < 3.0
+    assert of("epipolar constraint against none") < 0.5
+    assert of("first sighting: divergence") > 5.0  # half the resolution sees half the parallax
+
+
+def reproduce_s05(figures: dict[str, float]) -> None:
+    assert figures["path, filter"] < 0.1
+    assert figures["path, best particle"] < 0.1
+    assert figures["map, filter, aligned"] < figures["map, odometry, aligned"] + 0.05
+    assert figures["map, best particle, aligned"] < 0.2
+    assert 0.0 < figures["mean ms of an update"] < 1e3 * figures["mean seconds per pair"]
+    assert figures["mean seconds per pair"] < figures["the paper's"]
+
+
+def range_bearing_robot(figures: dict[str, float]) -> None:
+    assert figures["path_rmse_m"] < 0.5 * figures["odometry_path_rmse_m"]
+    assert figures["batch_path_rmse_m"] < 1.5 * figures["path_rmse_m"]
+
+
+def smoothing(figures: dict[str, float]) -> None:
+    assert figures["ancestral paths"] < 0.5 * figures["filter"]
+    assert figures["backward"] < 0.5 * figures["filter"]
+
+
+def stereo_revisit(figures: dict[str, float]) -> None:
+    assert len(figures) == 4
+    for way in ("there", "there and back"):
+        recording = f"simulated lab, seed 0, {way}"
+        assert figures[f"{recording}: filter"] < figures[f"{recording}: odometry"]
+
+
+def stereo_overconfidence(figures: dict[str, float]) -> None:
+    default = "default: prior, T_l = 4, updates within 16.3"
+    clipped = "what is clipped does not update"
+    # The quick path is too short for the map to bring much.
+    assert figures[f"{default}: error, mm"] < 1.2 * figures["odometry alone: error, mm"]
+    assert figures[f"{default}: NEES"] < figures[f"{clipped}: NEES"]
+
+
+def stereo_lab(figures: dict[str, float]) -> None:
+    assert figures["ate_rmse_m"] < 0.1
+    assert figures["landmarks_mean_per_particle"] > 20
+
+
+def soak(figures: dict[str, float]) -> None:
+    for system in ("camera", "robot"):
+        assert figures[f"{system}, resident_mb"] < 1.1
+        assert figures[f"{system}, held_kb"] < 2.5
+
+
+def sweep(figures: dict[str, float]) -> None:
+    assert figures["refined three times, 40"] < figures["bootstrap, 10"]
+
+
+def validate_run(figures: dict[str, str]) -> None:
+    assert set(figures) == {"groundtruth", "gtsam"}
+    assert set(figures.values()) <= {"trust", "cannot tell"}
+
+
+def verdict(figures: dict[str, float]) -> None:
+    assert figures["nothing, innovations, do not trust"] == 0.0
+    assert figures["nothing, truth, do not trust"] == 0.0
+    for name, share in figures.items():
+        assert name.startswith("nothing") or not name.endswith(", do not trust") or share == 1.0
+
+
+def target_tracking(figures: dict[str, dict[str, float]]) -> None:
+    bootstrap, marginalised, refined = figures.values()
+    for better in (marginalised, refined):
+        assert better["position_rmse"] < bootstrap["position_rmse"]
+        assert better["spread"] < 0.7 * bootstrap["spread"]
