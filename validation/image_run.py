@@ -35,7 +35,7 @@ class Telling:
 def write_batch(
     out: Path,
     entries: dict[str, Any],
-    adjust: Callable[[], Batch],
+    adjust: Callable[[], Batch] | None,
     scores: Callable[[Batch], dict[str, Any]],
 ) -> Batch | None:
     """Writes the batch optimum's path, and its figures, or the reason why there is none, to summary.json.
@@ -43,9 +43,12 @@ def write_batch(
     Args:
         out: the run's folder.
         entries: of summary.json; those of the batch are added.
-        adjust: finds the optimum; what it raises as `InputError` is the reason.
+        adjust: finds the optimum; what it raises as `InputError` is the reason. None leaves it out.
         scores: its figures.
     """
+    (out / BATCH).unlink(missing_ok=True)
+    if adjust is None:
+        return None
     optimum = None
     try:
         optimum = adjust()

@@ -13,7 +13,7 @@ from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.known_map import read_known_map
 from rbpf.systems.mono.video import VideoRun, first_image, run_images
 from rbpf.validation.files import prepare_folder
-from rbpf.validation.image_run import BATCH, CHECKPOINT, Progress, Telling, write_batch
+from rbpf.validation.image_run import CHECKPOINT, Progress, Telling, write_batch
 from rbpf.validation.mono_batch import adjust_run, score_batch
 from rbpf.validation.mono_folder import write_mono_run
 from rbpf.validation.mono_map import summarise_mono_map
@@ -148,11 +148,8 @@ def finish_mono(
     mapped = summarise_mono_map(run.filter)
     sources = recording.sources() | left_out(video=video, batch=batch)
     entries = write_mono_run(run, mapped, out, sources)
-    (out / BATCH).unlink(missing_ok=True)
-    optimum = None
-    if batch:
-        adjust = partial(adjust_run, run, telling.batch_s, telling.on_iteration)
-        optimum = write_batch(out, entries, adjust, partial(score_batch, run))
+    adjust = partial(adjust_run, run, telling.batch_s, telling.on_iteration)
+    optimum = write_batch(out, entries, adjust if batch else None, partial(score_batch, run))
     plot_mono_run(run, mapped, out, optimum)
     if video:
         write_annotated(run, out / VIDEO, telling.on_frame)

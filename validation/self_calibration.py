@@ -18,8 +18,8 @@ from rbpf.validation.mono_batch import Batch, adjust_log
 from rbpf.validation.mono_parts import adjust_near
 from rbpf.validation.path_and_map import read_path_and_map
 
-_GRID = np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1)], dtype=float)
-"""Where the error is looked at for a quadratic of two variables."""
+_AROUND = np.array([(1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1)], dtype=float)
+"""Where the error is looked at, beside the middle, for a quadratic of two variables."""
 
 _STEPS = np.array([[0.01, 0.02], [0.003, 0.006]])
 """Of focal length, as a share, and of k1: first a coarse grid, then a fine one."""
@@ -65,10 +65,10 @@ def refine_calibration(log: FeatureLog, batch: Batch, told: Told | None = None) 
     for size in _STEPS:
         for _ in range(ROUNDS):
             camera = _camera(best.log)
-            solved = [_with_camera(log, best, _changed(camera, *(size * step))) for step in _GRID]
-            lowest, inverse = _lowest(_GRID, np.array([one.solution.error for one in solved]))
+            solved = [best, *(_with_camera(log, best, _changed(camera, *(size * step))) for step in _AROUND)]
+            lowest, inverse = _lowest(np.array([one.solution.error for one in solved]))
             solved.append(_with_camera(log, best, _changed(camera, *(size * lowest))))
-            best = min([best, *solved], key=lambda one: one.solution.error)
+            best = min(solved, key=lambda one: one.solution.error)
             std = size * np.sqrt(np.diagonal(inverse))
             done += 1
             if told is not None:
@@ -102,12 +102,9 @@ def recalibrate(folder: Path, out: Path, told: Told | None = None) -> tuple[dict
     write_text(out / NAME, camera_text(found.camera, about))
     before, after = problem.camera, found.camera
     entries: dict[str, Any] = {
-        name: {"before": before_, "after": after_}
-        for name, before_, after_ in (
-            ("fx", before.fx, after.fx),
-            ("fy", before.fy, after.fy),
-            ("k1", before.distortion[0], after.distortion[0]),
-        )
+        "fx": {"before": before.fx, "after": after.fx},
+        "fy": {"before": before.fy, "after": after.fy},
+        "k1": {"before": before.distortion[0], "after": after.distortion[0]},
     }
     shares = {"std_focal_share": found.std[0], "std_k1": found.std[1]}
     entries |= {name: float(value) if np.isfinite(value) else None for name, value in shares.items()}
@@ -134,12 +131,13 @@ def _with_camera(log: FeatureLog, batch: Batch, camera: Pinhole) -> Batch:
     return adjust_near(replace(log, camera=camera), batch)
 
 
-def _lowest(grid: np.ndarray, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where the quadratic through errors (7,) at places (7, 2) is lowest, no farther out than twice the grid.
+def _lowest(errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where the quadratic through errors (7,), in the middle and around it, is lowest, no farther out than two steps.
 
     Returns:
         The place (2,) and the inverse (2, 2) of the curvature, NaN where the quadratic has no lowest point.
     """
+    grid = np.concatenate([np.zeros((1, 2)), _AROUND])
     a, b = grid.T
     terms = np.stack([np.ones_like(a), a, b, 0.5 * a * a, a * b, 0.5 * b * b], axis=1)
     _, ga, gb, haa, hab, hbb = np.linalg.lstsq(terms, errors, rcond=None)[0]

@@ -10,7 +10,7 @@ from rbpf.sensors.readers.images.stereo import StereoSequence
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.run import StereoRun, run_images
 from rbpf.validation.files import prepare_folder
-from rbpf.validation.image_run import BATCH, CHECKPOINT, Progress, Telling, write_batch
+from rbpf.validation.image_run import CHECKPOINT, Progress, Telling, write_batch
 from rbpf.validation.map_summary import summarise_map
 from rbpf.validation.provenance import left_out
 from rbpf.validation.report import VIDEO
@@ -100,11 +100,8 @@ def finish_stereo(
     mapped, telling = summarise_map(run.filter), telling or Telling()
     sources = recording.sources() | left_out(video=video, batch=batch)
     entries = write_stereo_run(run, mapped, out, sources)
-    (out / BATCH).unlink(missing_ok=True)
-    optimum = None
-    if batch:
-        adjust = partial(adjust_stereo, run, telling.batch_s, telling.on_iteration)
-        optimum = write_batch(out, entries, adjust, partial(score_stereo_batch, run))
+    adjust = partial(adjust_stereo, run, telling.batch_s, telling.on_iteration)
+    optimum = write_batch(out, entries, adjust if batch else None, partial(score_stereo_batch, run))
     plot_stereo_run(run, mapped, out, optimum)
     if video:
         write_annotated_pairs(run, recording.open(), out / VIDEO, telling.on_frame)

@@ -85,4 +85,6 @@ def known_points() -> KnownPixels:
     corner, side, down = on_plane(np.array([[500.0, 500.0], [501.0, 500.0], [500.0, 501.0]]))
     normal = np.cross(side - corner, down - corner)
     points = rays * (normal @ corner / (rays @ normal))[:, None]
-    return KnownPixels(np.arange(len(px)), px, points, np.full(len(px), 0.002))
+    return KnownPixels(
+        np.arange(len(px)), px, points, np.full(len(px), 0.002 * np.sqrt(3.0))
+    )  # 2 mm per axis

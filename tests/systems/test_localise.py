@@ -69,7 +69,7 @@ def test_the_camera_is_found_at_once_and_followed(localised):
     assert localised.relocalisations == []
     truth = path(FRAMES)[MAPPED:]
     error = np.linalg.norm(localised.world_from_camera[:, 4:] - truth[:, 4:], axis=1)
-    assert np.sqrt(np.square(error).mean()) < 0.03  # its map is 17 mm off
+    assert np.sqrt(np.square(error).mean()) < 0.02
     turned = np.linalg.norm(SE3.local(localised.world_from_camera, truth)[:, :3], axis=1)
     assert np.sqrt(np.square(turned).mean()) < np.deg2rad(1.0)
 
