@@ -9,7 +9,7 @@ from rbpf.errors import InputError
 from rbpf.genealogy import Lineage
 from rbpf.lie import LieGroup
 from rbpf.likelihoods import Gaussian
-from rbpf.models import Conditional, LogDensities, Observations, Part, Transition
+from rbpf.models import Conditional, LineariseAt, LogDensities, Observations, Part, Transition
 from rbpf.numeric import linearise
 from rbpf.proposals import Prior, Terms
 from rbpf.reference import information
@@ -98,6 +98,10 @@ class Marginals(Conditional):
                     total.add(part)
         return Terms.zeros(state.shape[0], self.space.dim) if total is None else total
 
+    def linearised(self, prior: Prior, groups: Sequence[Observations]) -> LineariseAt:
+        """What the observations say about the state, to be linearised wherever a proposal asks."""
+        return _LineariseGroups(self, prior, groups)
+
     def correct(
         self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]
     ) -> LogDensities:
@@ -143,3 +147,21 @@ class Marginals(Conditional):
                 )
             routed[supplies].append(group)
         return routed
+
+
+@final
+class _LineariseGroups(LineariseAt):
+    """Terms of all groups, relative to the prior's mean, linearised anywhere in its chart."""
+
+    def __init__(self, marginals: Marginals, prior: Prior, groups: Sequence[Observations]) -> None:
+        self._marginals = marginals
+        self._prior = prior
+        self._groups = groups
+
+    def __call__(self, increment: np.ndarray) -> Terms:
+        prior = self._prior
+        if increment is prior.mean:
+            terms = self._marginals.terms(prior.predicted(), self._groups, prior)
+            return terms if prior.centred else terms.charted(prior.space.right_jacobian(increment))
+        terms = self._marginals.terms(prior.at(increment), self._groups, prior)
+        return terms.charted(prior.space.right_jacobian(increment)).shifted(increment - prior.mean)

@@ -25,7 +25,6 @@ from rbpf.history import History
 from rbpf.models import (
     Births,
     Conditional,
-    LineariseAt,
     MotionModel,
     Observations,
     Proposal,
@@ -33,7 +32,7 @@ from rbpf.models import (
     Sensor,
 )
 from rbpf.particles import Particles, effective_sample_size, reweight, uniform_log_weights
-from rbpf.proposals import EkfProposal, Prior, Proposed, Terms
+from rbpf.proposals import EkfProposal, Prior, Proposed
 from rbpf.resampling import EssTriggered, Systematic
 
 
@@ -144,7 +143,7 @@ class Filter:
         stamp_ns, dt = self._clock(stamp_ns)
         prior = self._predict(control, dt)
         groups = self._observe(frame, Belief(self.particles.log_weights, prior, self.marginals))
-        proposed = self.proposal.propose(prior, _LineariseGroups(self.marginals, prior, groups))
+        proposed = self.proposal.propose(prior, self.marginals.linearised(prior, groups))
         log_weights, look_ahead = reweight(self.particles.log_weights, proposed.log_w1, f"step {self.steps}")
         mixture: tuple[Prior, Proposed | None, np.ndarray] = (prior, proposed, log_weights)
 
@@ -164,9 +163,7 @@ class Filter:
         normalised = all(group.likelihood is None or group.likelihood.normalised for group in groups)
         evidence = look_ahead + correction if normalised else float("nan")
         self.log_evidence += evidence
-        self.steps += 1
-        self.stamp_ns = stamp_ns
-        self.history.record(stamp_ns, state, log_weights)
+        self._end(stamp_ns)
         return StepReport(
             stamp_ns=stamp_ns,
             mixture=mixture,
@@ -179,6 +176,29 @@ class Filter:
             first_sightings=first_sightings,
             births=births,
         )
+
+    def follow(
+        self, state: np.ndarray, frame: Any, control: Any = None, stamp_ns: int | None = None
+    ) -> np.ndarray:
+        """A step along given states (E,) or (N, E): what is marginalised is conditioned on them, p(m | x_0:t, z_1:t).
+
+        Mapping with known poses, or the maps of paths that were drawn elsewhere. The weights stay as they are.
+
+        Returns:
+            (N,) log-likelihood of the observations.
+
+        Raises:
+            InputError: see `step`, which has the same arguments.
+        """
+        stamp_ns, dt = self._clock(stamp_ns)
+        state = checked_start(np.asarray(state, dtype=float), self.n, self.space)
+        prior, log_weights = self._predict(control, dt), self.particles.log_weights
+        groups = self._observe(frame, Belief(log_weights, Prior.exactly(self.space, state), self.marginals))
+        densities = self.marginals.correct(state, self.space.local(prior.base, state), groups)
+        self.particles = Particles(state, log_weights)
+        self._start_landmarks(frame, groups)
+        self._end(stamp_ns)
+        return densities.all
 
     def estimate(self) -> Estimate:
         """Mean and covariance of the particles as they are."""
@@ -259,6 +279,11 @@ class Filter:
         # A parent of weight zero that was not resampled keeps it, whatever its second factor is.
         return state, densities.all + log_ratio - np.where(log_w1 == -np.inf, 0.0, log_w1)
 
+    def _end(self, stamp_ns: int) -> None:
+        self.steps += 1
+        self.stamp_ns = stamp_ns
+        self.history.record(stamp_ns, self.particles.state, self.particles.log_weights)
+
     def _start_landmarks(self, frame: Any, groups: list[Observations]) -> tuple[list[Births], np.ndarray]:
         belief = self.belief()
         born, ids, first = list[Births](), [np.zeros(0, dtype=np.int64)], 0
@@ -268,20 +293,3 @@ class Filter:
                 born.append(births)
             first = end
         return born, np.concatenate(ids)
-
-
-class _LineariseGroups(LineariseAt):
-    """Terms of all groups, relative to the prior's mean, linearised anywhere in its chart."""
-
-    def __init__(self, marginals: Marginals, prior: Prior, groups: Sequence[Observations]) -> None:
-        self._marginals = marginals
-        self._prior = prior
-        self._groups = groups
-
-    def __call__(self, increment: np.ndarray) -> Terms:
-        prior = self._prior
-        if increment is prior.mean:
-            terms = self._marginals.terms(prior.predicted(), self._groups, prior)
-            return terms if prior.centred else terms.charted(prior.space.right_jacobian(increment))
-        terms = self._marginals.terms(prior.at(increment), self._groups, prior)
-        return terms.charted(prior.space.right_jacobian(increment)).shifted(increment - prior.mean)

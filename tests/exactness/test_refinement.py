@@ -6,7 +6,6 @@ from scipy.linalg import block_diag
 
 from rbpf import reference
 from rbpf.conditional import Marginals
-from rbpf.filter import _LineariseGroups
 from rbpf.lie import SE2, SE3
 from rbpf.models import NEW, NULL, Observations
 from rbpf.numeric import linearise
@@ -178,7 +177,7 @@ def test_terms_linearised_elsewhere_stay_in_the_priors_chart(space, rng):
     held = scene.map()
     marginals = Marginals(space, [held])
     for increment in (prior.mean, at):
-        proposed = refined(prior, _LineariseGroups(marginals, prior, [group])(increment))
+        proposed = refined(prior, marginals.linearised(prior, [group])(increment))
         kalmans = [
             _chart_ekf(scene, group, prior.factor[i], scene.state[i], prior.mean[i], increment[i], i)
             for i in range(3)

@@ -58,6 +58,25 @@ class RayConfig:
 
 
 @dataclass(frozen=True)
+class StartConfig:
+    """A start without known points: the first frames are adjusted in one piece, and the particles drawn anew from that.
+
+    Attributes:
+        redraw: whether they are; else the particles go on with what the prior of depth has made of the first frames.
+        first: the first adjustment comes after so many frames …
+        growth: … and the next ones after this many times as many each.
+        frames: that take part in an adjustment at most, evenly chosen.
+        known_share: it ends when the depth of this share of the features in view is known (`RayConfig.ready_ratio`).
+    """
+
+    redraw: bool = True
+    first: int = 6
+    growth: float = 1.25
+    frames: int = 60
+    known_share: float = 0.75
+
+
+@dataclass(frozen=True)
 class SearchConfig:
     """Active search in images, E06 §4.1.
 
@@ -169,6 +188,7 @@ class MonoConfig:
         checkpoint_every: frames between checkpoints.
         velocity: how the camera moves.
         ray: landmarks of unknown depth.
+        start: without known points.
         search: of landmarks in images.
         recovery: when the camera is lost.
         proposal: where particles are sampled.
@@ -186,6 +206,7 @@ class MonoConfig:
     checkpoint_every: int = 500
     velocity: VelocityConfig = field(default_factory=VelocityConfig)
     ray: RayConfig = field(default_factory=RayConfig)
+    start: StartConfig = field(default_factory=StartConfig)
     search: SearchConfig = field(default_factory=SearchConfig)
     recovery: RecoveryConfig = field(default_factory=RecoveryConfig)
     proposal: ProposalConfig = field(default_factory=lambda: ProposalConfig(iterations=1))

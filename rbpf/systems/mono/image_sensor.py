@@ -124,6 +124,10 @@ class ImageSensor(Sensor):
         self.seconds_births = time.perf_counter() - started
         return births
 
+    def place_all(self, belief: Belief) -> None:
+        """Remembers where all features are after the particles were drawn anew."""
+        self._place(belief, np.flatnonzero(self.table.alive[: self.table.count]))
+
     def arrays(self) -> dict[str, np.ndarray]:
         """For a checkpoint."""
         return self.table.arrays() | {"search/bad_frames": np.array(self.bad_frames)}

@@ -26,7 +26,9 @@ def save(run: "VideoRun", path: Path) -> None:
     arrays["progress/stamps_ns"] = run.stamps_ns
     arrays["progress/problems"] = np.array(run.problems, dtype=np.str_)
     arrays["progress/relocalisations"] = np.array(run.relocalisations, dtype=np.int64)
-    run.filter.save(path, arrays | run.sensor.arrays() | run.sightings.arrays() | run.recovery.arrays())
+    for part in (run.sensor, run.sightings, run.recovery, run.start):
+        arrays |= part.arrays()
+    run.filter.save(path, arrays)
 
 
 def restore(run: "VideoRun", path: Path) -> None:
@@ -46,6 +48,7 @@ def restore(run: "VideoRun", path: Path) -> None:
         run.sensor.restore(arrays)
         run.sightings.restore(arrays)
         run.recovery.restore(arrays)
+        run.start.restore(arrays)
 
 
 def cut(run: "VideoRun") -> None:

@@ -14,7 +14,8 @@ from rbpf.models import Sensor
 from rbpf.sensors.features import FeatureLog
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor
-from rbpf.systems.mono.system import build_filter, start_law, world_of
+from rbpf.systems.mono.system import assemble, features_of, start_law, world_of
+from rbpf.systems.mono.unknown_start import UnknownStart
 
 
 @dataclass
@@ -62,12 +63,15 @@ def run(
         log: of one camera.
         config: all settings.
         on_step: called after each frame with its number, the filter and what the step did.
-        wrapped: puts a sensor around the usual one, see `build_filter`.
+        wrapped: puts a sensor around the usual one, see `build_filter`; the particles are then not drawn anew at a
+            start without known points, which would not be what that sensor observes.
 
     Raises:
         InputError: the log or a setting does not fit, or no particle explains the observations.
     """
-    filter_ = build_filter(log, config, wrapped)
+    features, known = features_of(log, config)
+    filter_ = assemble(config, features, known, None if wrapped is None else wrapped(features))
+    start = UnknownStart(config, needed=log.known is None and wrapped is None)
     control = start_law(log, config)
     total = len(log.frames)
     numbers = [np.zeros(total) for _ in range(6)]
@@ -76,9 +80,13 @@ def run(
     for t, frame in enumerate(log.frames):
         started = time.perf_counter()
         report = filter_.step(frame, control if t == 0 else None, frame.stamp_ns)
-        done.seconds[t] = time.perf_counter() - started
         estimate = pose_estimate(filter_, report)
         done.world_from_camera[t], done.cov[t] = estimate.mean, estimate.cov
+        if start.due(t + 1, lost=False):
+            path = done.world_from_camera[: t + 1]
+            done.filter = filter_ = start.redrawn(filter_, features, log.frames[: t + 1], path)
+            done.world_from_camera[t], done.cov[t] = pose_of(filter_)
+        done.seconds[t] = time.perf_counter() - started
         done.ess[t], done.resampled[t], done.log_evidence[t] = (
             report.ess,
             report.resampled,
@@ -97,6 +105,12 @@ def pose_estimate(filter_: Filter, report: StepReport) -> Estimate:
     correlated before sampling. Without them it is that of the refined mixture.
     """
     return estimate_in(world_of(filter_), filter_, report)
+
+
+def pose_of(filter_: Filter) -> tuple[np.ndarray, np.ndarray]:
+    """Mean (7,) and covariance (6, 6) of the particles' poses as they are, where there are no known points."""
+    estimate = filter_.estimate()
+    return estimate.mean[:7], estimate.cov[:6, :6]
 
 
 def estimate_in(world: Anchored | None, filter_: Filter, report: StepReport) -> Estimate:

@@ -8,6 +8,7 @@ import numpy as np
 from rbpf.anchoring import Anchored
 from rbpf.belief import Belief
 from rbpf.filter import Filter
+from rbpf.sensors.features import FeatureFrame
 from rbpf.sensors.names import Names
 from rbpf.systems.mono.feature_sensor import FeatureSensor
 from rbpf.systems.mono.image_sensor import ImageSensor
@@ -85,6 +86,26 @@ class Sightings:
         self.frames.append(
             Sighting(searched.rows, searched.mean, searched.cov, px, line, place, started, held)
         )
+
+    def measured(self, stamps_ns: np.ndarray, found: np.ndarray, noise_px: float) -> list[FeatureFrame]:
+        """What the filter used in each frame, and what started features; names are rows of the sensor's table.
+
+        Of a frame in which too little agreed to be trusted nothing was used, and nothing is told.
+
+        Args:
+            stamps_ns: (T,) of the frames.
+            found: (T,) number of features that were used.
+            noise_px: standard deviation of a place, per axis.
+        """
+        out, count = [], self._given
+        for stamp, used, frame in zip(stamps_ns.tolist(), found.tolist(), self.frames, strict=True):
+            kept = frame.found & bool(used)
+            started = np.arange(count, count + frame.started.shape[0])
+            count += started.size
+            names = np.concatenate([frame.rows[kept], started])
+            cov = np.tile(noise_px**2 * np.eye(2), (names.size, 1, 1))
+            out.append(FeatureFrame(stamp, names, np.concatenate([frame.px[kept], frame.started]), cov))
+        return out
 
     def arrays(self) -> dict[str, np.ndarray]:
         """For a checkpoint."""

@@ -35,13 +35,22 @@ def build_filter(
     Raises:
         InputError: the log is not a monocular one.
     """
+    features, start = features_of(log, config)
+    return assemble(config, features, start, None if wrapped is None else wrapped(features))
+
+
+def features_of(log: FeatureLog, config: MonoConfig) -> tuple[FeatureSensor, KnownStart | None]:
+    """What turns the features of a log into observations, and what its first frame shows of known points.
+
+    Raises:
+        InputError: the log is not a monocular one.
+    """
     if not isinstance(log.camera, Pinhole):
         raise InputError(f"{log.name}: monocular SLAM needs a log of one camera, this is a stereo log")
     if any((frame.landmarks < 0).any() for frame in log.frames):
         raise InputError(f"{log.name}: a landmark has a negative name, number the landmarks from 0 on")
     start = None if log.known is None else _known_start(log)
-    features = build_features(log.camera, config, start)
-    return assemble(config, features, start, None if wrapped is None else wrapped(features))
+    return build_features(log.camera, config, start), start
 
 
 def build_features(
@@ -96,7 +105,7 @@ def assemble(
 
 def build_motion(config: VelocityConfig) -> MotionModel:
     """Constant velocity in one of the three modes."""
-    walk = np.repeat([config.walk_rad_s, config.walk_m_s], 3)
+    walk = walk_std(config)
     if config.mode == "marginal":
         return MarginalVelocity(walk)
     return SampledVelocity(walk, config.mode, start_std(config))
@@ -169,3 +178,8 @@ def start_cov(config: MonoConfig) -> np.ndarray:
 def start_std(config: VelocityConfig) -> np.ndarray:
     """Standard deviation (6,) of a velocity of which nothing is known."""
     return np.repeat([config.start_rad_s, config.start_m_s], 3)
+
+
+def walk_std(config: VelocityConfig) -> np.ndarray:
+    """Standard deviation (6,) of the velocity's walk in one second, (rad/s, m/s)/√s."""
+    return np.repeat([config.walk_rad_s, config.walk_m_s], 3)

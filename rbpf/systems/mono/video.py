@@ -19,9 +19,10 @@ from rbpf.systems.mono.known_map import KnownMap
 from rbpf.systems.mono.known_start import KnownStart, located_points, require_texture
 from rbpf.systems.mono.recovery import Recovery
 from rbpf.systems.mono.resuming import cut, restore, save
-from rbpf.systems.mono.run import estimate_in
+from rbpf.systems.mono.run import estimate_in, pose_of
 from rbpf.systems.mono.sightings import Sightings
 from rbpf.systems.mono.system import assemble, build_features, start_cov, start_std, world_of
+from rbpf.systems.mono.unknown_start import UnknownStart
 
 
 @dataclass
@@ -54,6 +55,7 @@ class VideoRun:
         relocalisations: numbers of the frames in which it was found again.
         failure: why it ended before the last frame, in words; None where it did not.
         recovery: what finds the camera again.
+        start: what draws the particles anew while it starts without known points.
     """
 
     sequence: ImageSequence
@@ -83,6 +85,7 @@ class VideoRun:
     relocalisations: list[int] = field(default_factory=list)
     failure: str | None = None
     recovery: Recovery = field(init=False)
+    start: UnknownStart = field(init=False)
 
     def __post_init__(self) -> None:
         """Watches over the sensor from the start."""
@@ -90,6 +93,7 @@ class VideoRun:
         views, size = (None, 0.0) if found is None else (found.views, found.size_m)
         self.recovery = Recovery(self.sensor, self.config.recovery, std, views, size)
         self.sightings = Sightings(0 if found is None else found.names.size)
+        self.start = UnknownStart(self.config, needed=found is None and self.known is None)
 
     @property
     def given(self) -> int:
@@ -265,6 +269,8 @@ def _frame(run: VideoRun, t: int, frame: ImageFrame, law: PoseLaw | None) -> Non
     run.resampled[t], run.nis[t], run.nis_dof[t] = report.resampled, report.nis, report.rows
     run.seconds_search[t], run.seconds_births[t] = run.sensor.seconds, run.sensor.seconds_births
     run.sightings.record(run.sensor, run.filter, world)
+    if run.start.due(t + 1, run.sensor.lost):
+        _redraw(run, t, frame)
     run.seconds_telling[t] = time.perf_counter() - started - run.seconds[t]
     if frame.problem is not None:
         run.problems.append(f"frame {t}: {frame.problem}")
@@ -275,3 +281,13 @@ def _frame(run: VideoRun, t: int, frame: ImageFrame, law: PoseLaw | None) -> Non
     elif was_lost and not run.sensor.lost:
         run.problems.append(f"frame {t}: the camera is found again")
         run.relocalisations.append(t)
+
+
+def _redraw(run: VideoRun, t: int, frame: ImageFrame) -> None:
+    """Draws the particles of a start without known points anew."""
+    stamps, path = run.stamps_ns[: t + 1], run.world_from_camera[: t + 1]
+    measured = run.sightings.measured(stamps, run.found[: t + 1], run.config.search.noise_px)
+    run.filter = run.start.redrawn(run.filter, run.sensor.features, measured, path)
+    run.world_from_camera[t], run.cov[t] = pose_of(run.filter)
+    run.sensor.place_all(run.filter.belief())
+    run.recovery.note(frame, run.filter)
