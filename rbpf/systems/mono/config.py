@@ -66,14 +66,14 @@ class StartConfig:
         first: the first adjustment comes after so many frames …
         growth: … and the next ones after this many times as many each.
         frames: that take part in an adjustment at most, evenly chosen.
-        known_share: it ends when the depth of this share of the features in view is known (`RayConfig.ready_ratio`).
+        depth_share: it ends when the depth of half of the features in view is known to this share of it.
     """
 
     redraw: bool = True
     first: int = 6
     growth: float = 1.25
     frames: int = 60
-    known_share: float = 0.75
+    depth_share: float = 0.03
 
 
 @dataclass(frozen=True)

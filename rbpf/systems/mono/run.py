@@ -7,10 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from rbpf.anchoring import Anchored, relative_estimate
-from rbpf.estimate import Estimate
+from rbpf.estimate import Estimate, mixture_estimate
 from rbpf.filter import Filter, StepReport
 from rbpf.lie import SE3
 from rbpf.models import Sensor
+from rbpf.particles import uniform_log_weights
+from rbpf.proposals import Prior
 from rbpf.sensors.features import FeatureLog
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor
@@ -27,7 +29,8 @@ class MonoRun:
         config: with what settings.
         filter: in its final state.
         stamps_ns: (T,).
-        world_from_camera: (T, 7) online filtered mean, in the world of the known points, else of the first camera.
+        world_from_camera: (T, 7) online filtered mean, in the world of the known points, else of the first camera; the
+            frames of a start without known points are told anew at its end, when there is a scale to tell them in.
         cov: (T, 6, 6) of it in the right chart at the mean, order [ω, v].
         ess: (T,) effective sample size before resampling.
         resampled: (T,) bool.
@@ -84,8 +87,10 @@ def run(
         done.world_from_camera[t], done.cov[t] = estimate.mean, estimate.cov
         if start.due(t + 1, lost=False):
             path = done.world_from_camera[: t + 1]
-            done.filter = filter_ = start.redrawn(filter_, features, log.frames[: t + 1], path)
-            done.world_from_camera[t], done.cov[t] = pose_of(filter_)
+            drawn = start.redrawn(filter_, features, log.frames[: t + 1], path)
+            if drawn is not None:
+                done.filter = filter_ = drawn[0]
+                done.world_from_camera[: t + 1], done.cov[: t + 1] = told_anew(drawn[1])
         done.seconds[t] = time.perf_counter() - started
         done.ess[t], done.resampled[t], done.log_evidence[t] = (
             report.ess,
@@ -107,10 +112,11 @@ def pose_estimate(filter_: Filter, report: StepReport) -> Estimate:
     return estimate_in(world_of(filter_), filter_, report)
 
 
-def pose_of(filter_: Filter) -> tuple[np.ndarray, np.ndarray]:
-    """Mean (7,) and covariance (6, 6) of the particles' poses as they are, where there are no known points."""
-    estimate = filter_.estimate()
-    return estimate.mean[:7], estimate.cov[:6, :6]
+def told_anew(paths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Means (T, 7) and covariances (T, 6, 6) of paths (T, N, 7) of equal weight."""
+    log_weights = uniform_log_weights(paths.shape[1])
+    told = [mixture_estimate(Prior.exactly(SE3, poses), None, log_weights) for poses in paths]
+    return np.array([each.mean for each in told]), np.array([each.cov for each in told])
 
 
 def estimate_in(world: Anchored | None, filter_: Filter, report: StepReport) -> Estimate:

@@ -5,8 +5,8 @@ the camera (R, t) sees it in the direction c = Rᵀ(d − q t), however far it i
 
     Σ ρ(|z − h(c)|/σ) + ½ Σ ((q − q̄)/σ_q)² + ½ Σ |(v_k − v_{k−1})/σ_v|² + ½ ((s − 1)/σ_s)²,
 
-with Cauchy's loss ρ, the prior of an inverse distance, velocities v between frames that walk as in E06 (4), and the scale
-s of the structure, which no image tells: it is held. Levenberg's and Marquardt's method finds the minimum.
+with Cauchy's loss ρ, the prior of an inverse distance, velocities v between frames that walk as in E06 (4), and the
+scale s = Σ q / (F q̄), which no image tells: it is held. Levenberg's and Marquardt's method finds the minimum.
 """
 
 from dataclasses import dataclass
@@ -60,15 +60,11 @@ class Expected:
         rho: mean and standard deviation of an inverse distance, 1/m.
         std_start: (6,) of the velocity at first, rad/s, m/s.
         std_walk: (6,) of its walk in one second, (rad/s, m/s)/√s.
-        scale_of: (F,) inverse distances that tell the scale, s = Σ w q / Σ w `scale_of`.
-        weight: (F,) w of each.
     """
 
     rho: tuple[float, float]
     std_start: np.ndarray
     std_walk: np.ndarray
-    scale_of: np.ndarray
-    weight: np.ndarray
 
 
 @final
@@ -181,8 +177,8 @@ class Linearised:
         self._std_velocity = np.concatenate([expected.std_start[None], walked])
         self.velocity = self._differences(SE3.log(self._relative) / self._interval[:, None])
         self.prior = (at.inverse - expected.rho[0]) / expected.rho[1]
-        self._by_scale = expected.weight / (expected.weight @ expected.scale_of) / SCALE_STD
-        self.scale = float(self._by_scale @ at.inverse - 1.0 / SCALE_STD)
+        self._by_scale = 1.0 / (at.inverse.size * expected.rho[0] * SCALE_STD)
+        self.scale = float(self._by_scale * at.inverse.sum() - 1.0 / SCALE_STD)
         quadratic = sum(np.square(part).sum() for part in (self.velocity, self.prior, self.scale))
         self.cost = float(0.5 * SCALE**2 * np.log1p(squared).sum() + 0.5 * quadratic)
 
@@ -213,7 +209,7 @@ class Linearised:
         self._add_motion(h[:free, :free], b[:free])
         q = free + 2 + 3 * np.arange(features)
         h[q, q] += self.expected.rho[1] ** -2
-        h[np.ix_(q, q)] += np.outer(self._by_scale, self._by_scale)
+        h[np.ix_(q, q)] += self._by_scale**2
         b[q] -= self.prior / self.expected.rho[1] + self.scale * self._by_scale
         return h[6:, 6:], b[6:]
 

@@ -1,10 +1,10 @@
-"""A start without known points: the particles are drawn anew from the optimum of all that the first frames measured.
+"""A start without known points: the particles are drawn anew from the optimum of the first frames.
 
-Before a camera has moved, nothing tells the depth of what it sees, and of a scene that is nearly flat two shapes with two
-motions look alike. Particles decide too early: each image alone tells little, those that happen to fit it survive, and
-what later images say comes too late. All first images together tell it well. So while depths are unknown, the frames
-until now are adjusted in one piece now and then (`rbpf.systems.mono.start_optimum`), whole paths are drawn from the
-Gaussian about the optimum, and each particle's map is that of its path (a block move: A. Doucet, M. Briers and
+Before a camera has moved, nothing tells the depth of what it sees, and of a scene that is nearly flat two shapes with
+two motions look alike. Particles decide too early: each image alone tells little, those that happen to fit it survive,
+and what later images say comes too late. All first images together tell it well. So while depths are unknown, the
+frames until now are adjusted in one piece now and then (`rbpf.systems.mono.start_optimum`), whole paths are drawn from
+the Gaussian about the optimum, and each particle's map is that of its path (a block move: A. Doucet, M. Briers and
 S. Sénécal, 2006).
 """
 
@@ -27,6 +27,11 @@ LEAST_SEEN = 3
 
 LEAST_FRAMES = 3
 
+SHARED = 6
+"""Features that two frames in a row must have in common: three determine a pose, and half of them may be wrong."""
+
+TINY = np.finfo(float).tiny
+
 
 @final
 class UnknownStart:
@@ -42,7 +47,7 @@ class UnknownStart:
         self.over = not (needed and config.start.redraw)
         """Whether depths are known well enough, and the filter goes on alone."""
         self._next = config.start.first
-        self._last: tuple[np.ndarray, np.ndarray, Structure, np.ndarray] | None = None
+        self._last: tuple[np.ndarray, np.ndarray, Structure] | None = None
 
     def due(self, frames: int, lost: bool) -> bool:
         """Whether the particles are to be drawn anew after so many frames; never again once the camera was lost."""
@@ -51,41 +56,46 @@ class UnknownStart:
 
     def redrawn(
         self, filter_: Filter, features: FeatureSensor, frames: Sequence[FeatureFrame], path: np.ndarray
-    ) -> Filter:
-        """A filter whose particles are drawn anew, in place of one that has just made its T-th step.
+    ) -> tuple[Filter, np.ndarray] | None:
+        """A filter whose particles are drawn anew, in place of one that has just made its T-th step, and their paths.
 
         Args:
             filter_: the one so far; the new one has its sensors and its random generator.
             features: what it observes with.
             frames: T, all that was measured.
             path: (T, 7) world_from_camera, where the filter was.
+
+        Returns:
+            The filter, and (T, N, 7) world_from_camera; None where too little was seen, and the old one goes on.
         """
         self._next = int(np.ceil(self.config.start.growth * len(frames)))
         found = self._found(filter_, features, frames, path)
         if found is None:
-            return filter_
+            return None
         steps, best = found
         stamps = np.array([frame.stamp_ns for frame in frames], dtype=np.int64)
         paths = between(stamps[steps], best.paths(self.config.particles, filter_.rng), stamps)
-        return self._along(paths, set(steps.tolist()), filter_, features, frames)
+        return self._along(paths, set(steps.tolist()), filter_, features, frames), paths
 
     def arrays(self) -> dict[str, np.ndarray]:
         """For a checkpoint."""
-        names, steps, structure, std = self._last or _NOTHING
+        names, steps, structure = self._last or _NOTHING
         return {
             "start/progress": np.array([self.over, self._next]),
-            "start/names": names, "start/steps": steps, "start/std": std,
-            "start/path": structure.path, "start/direction": structure.direction,
+            "start/names": names,
+            "start/steps": steps,
+            "start/path": structure.path,
+            "start/direction": structure.direction,
             "start/inverse": structure.inverse,
-        }  # fmt: skip
+        }
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """The inverse of `arrays`."""
         over, self._next = arrays["start/progress"].tolist()
         self.over = bool(over)
         structure = Structure(arrays["start/path"], arrays["start/direction"], arrays["start/inverse"])
-        names, steps, std = (arrays[f"start/{name}"] for name in ("names", "steps", "std"))
-        self._last = (names, steps, structure, std) if names.size else None
+        names, steps = arrays["start/names"], arrays["start/steps"]
+        self._last = (names, steps, structure) if names.size else None
 
     def _found(
         self, filter_: Filter, features: FeatureSensor, frames: Sequence[FeatureFrame], path: np.ndarray
@@ -96,19 +106,23 @@ class UnknownStart:
         seen_by = np.concatenate([frames[t].landmarks for t in steps])
         names, count = np.unique(seen_by[np.isin(seen_by, held)], return_counts=True)
         names = names[count >= LEAST_SEEN]
-        if steps.size < LEAST_FRAMES or not np.isin(frames[steps[0]].landmarks, names).any():
+        if steps.size < LEAST_FRAMES:
             return None
         seen = self._window(features, [frames[t] for t in steps], names)
+        self.over = not _hang_together(seen)
+        if self.over:
+            return None
         starts = [self._where_the_filter_is(filter_, features, names, path[steps])]
-        expected = self._expected(names)
+        ray, velocity = self.config.ray, self.config.velocity
+        rho = ray.rho_per_m, ray.std_rho_per_m
+        expected = Expected(rho, start_std(velocity), walk_std(velocity))
         if self._last is not None:
             starts.append(self._gone_on(features, seen, names, path[steps], steps))
         best = min((optimum(seen, expected, start) for start in starts), key=lambda each: each.cost)
-        std = best.std_inverse()
-        self._last = names, steps, best.structure, std
-        now = np.isin(names, frames[-1].landmarks)
-        known = std < self.config.ray.ready_ratio * best.structure.inverse
-        self.over = bool(now.any() and known[now].mean() >= self.config.start.known_share)
+        self._last = names, steps, best.structure
+        relative = best.std_inverse() / np.maximum(best.structure.inverse, TINY)
+        relative = relative[np.isin(names, frames[-1].landmarks)]
+        self.over = bool(relative.size and np.median(relative) < self.config.start.depth_share)
         return steps, best
 
     def _chosen(self, frames: Sequence[FeatureFrame]) -> np.ndarray:
@@ -133,20 +147,6 @@ class UnknownStart:
             float(np.sqrt(np.mean([np.trace(cov) / 2.0 for f in frames for cov in f.cov_z]))),
         )
 
-    def _expected(self, names: np.ndarray) -> Expected:
-        """The scale is that of the last adjustment, told by what was known best then; at first that of the prior."""
-        ray, velocity = self.config.ray, self.config.velocity
-        scale_of, weight = np.full(names.size, ray.rho_per_m), np.ones(names.size)
-        if self._last is not None:
-            before, _, structure, std = self._last
-            again, now, then = np.intersect1d(names, before, return_indices=True)
-            if again.size:
-                weight[:] = 0.0
-                scale_of[now] = structure.inverse[then]
-                weight[now] = np.maximum(structure.inverse[then], 0.0) / std[then] ** 2
-        rho = ray.rho_per_m, ray.std_rho_per_m
-        return Expected(rho, start_std(velocity), walk_std(velocity), scale_of, weight)
-
     def _where_the_filter_is(
         self, filter_: Filter, features: FeatureSensor, names: np.ndarray, path: np.ndarray
     ) -> Structure:
@@ -161,7 +161,7 @@ class UnknownStart:
     ) -> Structure:
         """The last adjustment's path and structure, gone on with as the filter moved, and what is new at the prior."""
         assert self._last is not None
-        before, old_steps, structure, _ = self._last
+        before, old_steps, structure = self._last
         joint = int(np.searchsorted(steps, old_steps[-1], side="right")) - 1
         start = between(old_steps, structure.path[None], steps[: joint + 1])[:, 0]
         onward = SE3.compose(start[-1:], SE3.between(path[joint : joint + 1], path[joint + 1 :]))
@@ -187,7 +187,7 @@ class UnknownStart:
     ) -> Filter:
         """A filter that has followed paths (T, N, 7), measuring in the frames that they were drawn from."""
         new = assemble(self.config, features, None)
-        new.rng = old.rng
+        new.rng, new.log_evidence = old.rng, old.log_evidence
         start = min(steps)
         for t, frame in enumerate(frames):
             law = PoseLaw(SE3.identity(), np.zeros((6, 6)), start_std(self.config.velocity))
@@ -214,8 +214,15 @@ def _unseen(frame: FeatureFrame) -> FeatureFrame:
     return FeatureFrame(frame.stamp_ns, frame.landmarks[:0], frame.z[:0], frame.cov_z[:0])
 
 
+def _hang_together(seen: Window) -> bool:
+    """Whether each two frames in a row have features in common."""
+    sees = np.zeros((seen.stamps_ns.size, seen.feature.max(initial=-1) + 1), dtype=bool)
+    sees[seen.frame, seen.feature] = True
+    return bool(((sees[1:] & sees[:-1]).sum(axis=1) >= SHARED).all())
+
+
 def between(times: np.ndarray, paths: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Poses (W, n, 7) of paths (n, T, 7) at other times (W,): on the way between two; the first before, the last after."""
+    """Poses (W, n, 7) of paths (n, T, 7) at other times (W,): on the way between two, or the first or the last."""
     moved = SE3.log(SE3.between(paths[:, :-1], paths[:, 1:]))
     k = np.clip(np.searchsorted(times, wanted, side="right") - 1, 0, times.size - 2)
     share = np.clip((wanted - times[k]) / (times[k + 1] - times[k]), 0.0, 1.0)
@@ -232,5 +239,4 @@ _NOTHING = (
     np.zeros(0, dtype=np.int64),
     np.zeros(0, dtype=np.int64),
     Structure(np.zeros((0, 7)), np.zeros((0, 3)), np.zeros(0)),
-    np.zeros(0),
 )

@@ -19,10 +19,16 @@ from rbpf.systems.mono.known_map import KnownMap
 from rbpf.systems.mono.known_start import KnownStart, located_points, require_texture
 from rbpf.systems.mono.recovery import Recovery
 from rbpf.systems.mono.resuming import cut, restore, save
-from rbpf.systems.mono.run import estimate_in, pose_of
+from rbpf.systems.mono.run import estimate_in, told_anew
 from rbpf.systems.mono.sightings import Sightings
 from rbpf.systems.mono.system import assemble, build_features, start_cov, start_std, world_of
 from rbpf.systems.mono.unknown_start import UnknownStart
+
+TORN = (
+    "the first frames have too few features in common to be adjusted in one piece: path and map may be bent; move the "
+    "camera sideways at first, or start with known points"
+)
+"""Of a start without known points that ended before depths were known."""
 
 
 @dataclass
@@ -37,7 +43,8 @@ class VideoRun:
         filter: in its final state.
         sensor: its image sensor.
         stamps_ns: (T,).
-        world_from_camera: (T, 7) online filtered mean, in the world of the known points, else of the first camera.
+        world_from_camera: (T, 7) online filtered mean, in the world of the known points, else of the first camera; the
+            frames of a start without known points are told anew at its end, when there is a scale to tell them in.
         cov: (T, 6, 6) of it in the right chart at the mean, order [ω, v].
         searched: (T,) landmarks looked for.
         found: (T,) landmarks found.
@@ -269,9 +276,9 @@ def _frame(run: VideoRun, t: int, frame: ImageFrame, law: PoseLaw | None) -> Non
     run.resampled[t], run.nis[t], run.nis_dof[t] = report.resampled, report.nis, report.rows
     run.seconds_search[t], run.seconds_births[t] = run.sensor.seconds, run.sensor.seconds_births
     run.sightings.record(run.sensor, run.filter, world)
+    run.seconds_telling[t] = time.perf_counter() - started - run.seconds[t]
     if run.start.due(t + 1, run.sensor.lost):
         _redraw(run, t, frame)
-    run.seconds_telling[t] = time.perf_counter() - started - run.seconds[t]
     if frame.problem is not None:
         run.problems.append(f"frame {t}: {frame.problem}")
     if run.sensor.lost and not was_lost:
@@ -285,9 +292,15 @@ def _frame(run: VideoRun, t: int, frame: ImageFrame, law: PoseLaw | None) -> Non
 
 def _redraw(run: VideoRun, t: int, frame: ImageFrame) -> None:
     """Draws the particles of a start without known points anew."""
+    started = time.perf_counter()
     stamps, path = run.stamps_ns[: t + 1], run.world_from_camera[: t + 1]
     measured = run.sightings.measured(stamps, run.found[: t + 1], run.config.search.noise_px)
-    run.filter = run.start.redrawn(run.filter, run.sensor.features, measured, path)
-    run.world_from_camera[t], run.cov[t] = pose_of(run.filter)
-    run.sensor.place_all(run.filter.belief())
-    run.recovery.note(frame, run.filter)
+    drawn = run.start.redrawn(run.filter, run.sensor.features, measured, path)
+    if drawn is not None:
+        run.filter = drawn[0]
+        run.world_from_camera[: t + 1], run.cov[: t + 1] = told_anew(drawn[1])
+        run.sensor.place_all(run.filter.belief())
+        run.recovery.note(frame, run.filter)
+    elif run.start.over:
+        run.problems.append(f"frame {t}: {TORN}")
+    run.seconds[t] += time.perf_counter() - started
