@@ -9,8 +9,8 @@ from rbpf.lie import SE3
 from rbpf.sensors.features import FeatureLog
 from rbpf.systems.mono.config import MonoConfig, StartConfig, VelocityConfig
 from rbpf.systems.mono.run import run
-from rbpf.systems.mono.unknown_start import UnknownStart, between
-from rbpf.systems.mono.video import TORN, VideoRun, run_images
+from rbpf.systems.mono.unknown_start import TORN, UnknownStart, between
+from rbpf.systems.mono.video import VideoRun, run_images
 from rbpf.validation.accuracy import ate
 from rbpf.validation.trajectory import Trajectory
 from tests.exactness.models import known

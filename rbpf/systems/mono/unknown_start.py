@@ -32,6 +32,12 @@ SHARED = 6
 
 TINY = np.finfo(float).tiny
 
+TORN = (
+    "the first frames have too few features in common to be adjusted in one piece: path and map may be bent; move the "
+    "camera sideways at first, or start with known points"
+)
+"""Of a start without known points that ended before depths were known."""
+
 
 @final
 class UnknownStart:

@@ -22,13 +22,7 @@ from rbpf.systems.mono.resuming import cut, restore, save
 from rbpf.systems.mono.run import estimate_in, told_anew
 from rbpf.systems.mono.sightings import Sightings
 from rbpf.systems.mono.system import assemble, build_features, start_cov, start_std, world_of
-from rbpf.systems.mono.unknown_start import UnknownStart
-
-TORN = (
-    "the first frames have too few features in common to be adjusted in one piece: path and map may be bent; move the "
-    "camera sideways at first, or start with known points"
-)
-"""Of a start without known points that ended before depths were known."""
+from rbpf.systems.mono.unknown_start import TORN, UnknownStart
 
 
 @dataclass
