@@ -23,6 +23,9 @@ ALIKE = 0.9
 ENOUGH = 4
 """Matches that must agree on a motion for it to say where the others are."""
 
+TRUSTED = 6
+"""Trusted matches that tell the motion alone: three determine it, and half of them may be wrong."""
+
 WIDEST = 2.0
 """An ellipse larger than so many times what is searched of it is hardly searched at all."""
 
@@ -134,13 +137,20 @@ class ActiveSearch:
         """Only matches that agree with one motion; what was mistaken is looked for again where the motion puts it."""
         hits = np.flatnonzero(searched.found)
         which, nu, jac, cov = self._innovations(belief, searched.rows[hits], searched.px[hits])
-        fit = fit_motion(nu, jac, cov, self._prior_factor(belief))
+        trusted = self.trusted(searched.rows[hits[which]])
+        fit = fit_motion(nu, jac, cov, self._prior_factor(belief), trusted)
         found = np.zeros_like(searched.found)
         found[hits[which[(fit.squared <= self.config.gate) & self._placed(cov)]]] = True
         searched = replace(searched, found=found)
         if found.sum() < ENOUGH:
             return searched
         return self._again(image, belief, templates, searched, fit)
+
+    def trusted(self, rows: np.ndarray) -> np.ndarray:
+        """Which features (K,) tell where the camera is, by their records; all of them where those are too few."""
+        table = self.table
+        kept = (table.member[rows] >= 0) | (table.found_share(rows) >= self.config.trusted_share)
+        return kept if kept.sum() >= TRUSTED else np.ones(rows.size, dtype=bool)
 
     def _again(
         self, image: np.ndarray, belief: Belief, templates: np.ndarray, searched: Searched, fit: Fit
@@ -195,7 +205,7 @@ class ActiveSearch:
         column, line = np.clip(px * _CELLS / size, 0, _CELLS - 1).astype(np.int64).T
         cell = column + _CELLS * line
         self.in_view = px
-        worth = (table.found[rows] + 1.0) / (table.attempts[rows] + 2.0) - 0.2 * table.missed[rows]
+        worth = table.found_share(rows) - 0.2 * table.missed[rows]
         order = np.lexsort((-worth, cell))
         _, first = np.unique(cell[order], return_index=True)
         rank = np.arange(order.size) - np.repeat(first, np.diff(np.append(first, order.size)))

@@ -84,6 +84,10 @@ class Appearances:
         self.member[rows] = -1 if member is None else member
         return rows
 
+    def found_share(self, rows: np.ndarray) -> np.ndarray:
+        """Share (k,) of the looks for features (k,) that found them, as expected after these looks (P. Laplace)."""
+        return np.asarray((self.found[rows] + 1.0) / (self.attempts[rows] + 2.0))
+
     def note(self, rows: np.ndarray, found: np.ndarray) -> None:
         """Counts a search for features (k,) that were found or not (k,) bool."""
         self.attempts[rows] += 1

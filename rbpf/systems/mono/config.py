@@ -98,6 +98,8 @@ class SearchConfig:
         look_scale: … or it is this many times nearer or farther.
         trial: a feature is judged after having been looked for this often.
         failure_ratio: it is dropped from all particles when it was not found in more than this share.
+        trusted_share: a feature tells where the camera is only while it has been found in this share of the looks,
+            (1 + found) / (2 + looks): what moves by itself is soon not where a thing at rest would be.
         lost_share: the camera is lost when fewer than this share of what was looked for is found …
         lost_frames: … in this many frames in a row.
         regained_share: it is not lost any more when at least this share is found …
@@ -121,6 +123,7 @@ class SearchConfig:
     look_scale: float = 1.15
     trial: int = 10
     failure_ratio: float = 0.5
+    trusted_share: float = 0.6
     lost_share: float = 0.25
     lost_frames: int = 3
     regained_share: float = 0.5

@@ -32,20 +32,29 @@ class Fit(NamedTuple):
     cov: np.ndarray
 
 
-def fit_motion(nu: np.ndarray, jac: np.ndarray, cov: np.ndarray, factor: np.ndarray) -> Fit:
-    """The motion that K matches agree on.
+def fit_motion(
+    nu: np.ndarray, jac: np.ndarray, cov: np.ndarray, factor: np.ndarray, trusted: np.ndarray
+) -> Fit:
+    """The motion that the trusted ones of K matches agree on.
 
     Args:
         nu: (K, p) innovations at the predicted pose.
         jac: (K, p, d) by the pose, H.
         cov: (K, p, p) of the innovations given the pose, S = J P Jᵀ + R.
         factor: (d, r) of the prior's covariance, Q = L Lᵀ.
+        trusted: (K,) which tell the motion; the others are only judged by it.
     """
     from rbpf.kernels.robust_fit import robust_fit
 
     rank = factor.shape[1]
-    squared, u, chol_info = np.empty(nu.shape[0]), np.empty(rank), np.empty((rank, rank))
-    arrays = (np.ascontiguousarray(array, dtype=float) for array in (nu, jac, cov, factor))
-    robust_fit(*arrays, ROUNDS, SCALE, squared, u, chol_info)
+    told, u, chol_info = np.empty(int(trusted.sum())), np.empty(rank), np.empty((rank, rank))
+    rows = (np.ascontiguousarray(array[trusted], dtype=float) for array in (nu, jac, cov))
+    robust_fit(*rows, np.ascontiguousarray(factor, dtype=float), ROUNDS, SCALE, told, u, chol_info)
     half = gaussian.solve_lower_matrix(chol_info, factor.T)
-    return Fit(squared, factor @ u, half.T @ half)
+    increment, spread = factor @ u, half.T @ half
+    squared = np.empty(nu.shape[0])
+    squared[trusted] = told
+    jac, cov, off = jac[~trusted], cov[~trusted], (nu - jac @ increment)[~trusted]
+    given = cov + jac @ spread @ np.swapaxes(jac, -1, -2)
+    squared[~trusted] = (off * np.linalg.solve(given, off[..., None])[..., 0]).sum(axis=-1)
+    return Fit(squared, increment, spread)

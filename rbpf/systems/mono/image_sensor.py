@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import final
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from rbpf.belief import Belief
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.models import Births, Observations, Sensor
+from rbpf.models import Births, Observations, Part, Sensor
 from rbpf.sensors.camera_points import CameraRay
 from rbpf.sensors.corners import corners
 from rbpf.sensors.features import FeatureFrame
@@ -23,6 +24,8 @@ from rbpf.systems.mono.viewing import turned
 
 LEAST_SEEN = 4
 """Points of a known map that tell where the camera is; one that sees fewer has left the map, nothing new is mapped."""
+
+_MAP = frozenset({Part.LANDMARK})
 
 
 @final
@@ -107,7 +110,7 @@ class ImageSensor(Sensor):
             self.bad_frames = 0 if frame.image is not None else self.bad_frames + 1
         self.measured = self._features(frame.stamp_ns, rows, px)
         self.seconds = time.perf_counter() - started
-        return self.features.observe(self.measured, belief)
+        return self._observations(belief)
 
     def births(self, frame: ImageFrame, belief: Belief, observed: Sequence[Observations]) -> Sequence[Births]:
         """Notes what was found, drops what fails, and starts features at corners where there is room."""
@@ -137,6 +140,18 @@ class ImageSensor(Sensor):
         self.table.restore(arrays)
         self.bad_frames = int(arrays["search/bad_frames"])
         self._given = None
+
+    def _observations(self, belief: Belief) -> list[Observations]:
+        """Of what was measured; what is not trusted only updates the map."""
+        frame = self.measured
+        trusted = self.search.trusted(frame.landmarks)
+        if trusted.all():
+            return list(self.features.observe(frame, belief))
+        doubted = self.features.observe(_part(frame, ~trusted), belief)
+        return [
+            *self.features.observe(_part(frame, trusted), belief),
+            *(replace(group, informs=_MAP) for group in doubted if Part.LANDMARK in group.informs),
+        ]
 
     def _fails(self) -> bool:
         """Whether so little agrees that it may be chance. Once lost, more has to agree: the camera may be anywhere.
@@ -232,3 +247,7 @@ class ImageSensor(Sensor):
                 f"a known point at ({px[0]:.1f}, {px[1]:.1f}) px is nearer than {SOURCE_HALF_PX} px to the border"
             )
         return window
+
+
+def _part(frame: FeatureFrame, rows: np.ndarray) -> FeatureFrame:
+    return FeatureFrame(frame.stamp_ns, frame.landmarks[rows], frame.z[rows], frame.cov_z[rows])
