@@ -128,13 +128,25 @@ class Filter:
         """Number of particles."""
         return self.particles.n
 
-    def step(self, frame: Any, control: Any = None, stamp_ns: int | None = None) -> StepReport:
+    def expect(self, control: Any = None, stamp_ns: int | None = None) -> Belief:
+        """What `step` would tell the sensors, for looking at a frame before it is filtered; no particle moves."""
+        _, dt = self._clock(stamp_ns)
+        return Belief(self.particles.log_weights, self._predict(control, dt), self.marginals)
+
+    def step(
+        self,
+        frame: Any,
+        control: Any = None,
+        stamp_ns: int | None = None,
+        proposal: Proposal | None = None,
+    ) -> StepReport:
         """Predicts, observes, refines, weighs, resamples, samples, corrects and updates; then starts landmarks.
 
         Args:
             frame: what the sensors observe.
             control: what the motion model moves by.
             stamp_ns: time of the frame; by default the previous one plus one second.
+            proposal: of this step, where the filter's own would not do.
 
         Raises:
             InputError: time runs backwards, shapes do not fit, or no particle explains the observations. If the
@@ -144,7 +156,8 @@ class Filter:
         stamp_ns, dt = self._clock(stamp_ns)
         prior = self._predict(control, dt)
         groups = self._observe(frame, Belief(self.particles.log_weights, prior, self.marginals))
-        proposed = self.proposal.propose(prior, _LineariseGroups(self.marginals, prior, groups))
+        proposal = proposal or self.proposal
+        proposed = proposal.propose(prior, _LineariseGroups(self.marginals, prior, groups))
         log_weights, look_ahead = reweight(self.particles.log_weights, proposed.log_w1, f"step {self.steps}")
         mixture: tuple[Prior, Proposed | None, np.ndarray] = (prior, proposed, log_weights)
 
@@ -154,7 +167,7 @@ class Filter:
             log_weights = uniform_log_weights(self.n)
             prior, groups = self._descend(ancestors, prior, groups)
 
-        state, log_w2 = self._sample_and_update(prior, proposed, groups, ancestors)
+        state, log_w2 = self._sample_and_update(prior, proposed, groups, ancestors, proposal.exact)
         log_weights, correction = reweight(log_weights, log_w2, f"step {self.steps}")
         self.particles = Particles(state, log_weights)
         if proposed.nis is None:
@@ -245,7 +258,12 @@ class Filter:
         return prior.take(ancestors), groups
 
     def _sample_and_update(
-        self, prior: Prior, proposed: Proposed, groups: list[Observations], ancestors: np.ndarray | None
+        self,
+        prior: Prior,
+        proposed: Proposed,
+        groups: list[Observations],
+        ancestors: np.ndarray | None,
+        exact: bool,
     ) -> tuple[np.ndarray, np.ndarray]:
         """One state for each descendant, and log w₂ = log p(z|x) + log p(x|x⁻) − log q(x) − log w₁."""
         parents = np.arange(self.n) if ancestors is None else ancestors
@@ -253,7 +271,7 @@ class Filter:
         increment = prior.mean + np.einsum("nar,nr->na", prior.factor, whitened)
         state = prior.at(increment)
         densities = self.marginals.correct(state, increment, groups)
-        if not self.proposal.exact:
+        if not exact:
             return state, densities.late
         log_w1 = proposed.log_w1[parents]
         # A parent of weight zero that was not resampled keeps it, whatever its second factor is.

@@ -1,6 +1,6 @@
 """Where the camera has come since the filter was updated, and by odometry alone: pair after pair, over missing ones."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple, final
 
 import numpy as np
@@ -30,12 +30,16 @@ class Reckoned:
         world_from_camera: (7,) by odometry alone; the first camera is the world.
         agree: (K,) which matches agree with the motion; none where nothing was matched.
         note: what had to be assumed, in words; empty where nothing had.
+        assumed: pairs since the filter's last update over which the motion was only assumed.
+        known: pairs since the last of these whose motion was measured again.
     """
 
     since_update: Odometry
     world_from_camera: np.ndarray
     agree: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
     note: str = ""
+    assumed: int = 0
+    known: int = 0
 
     @property
     def agreeing(self) -> int:
@@ -57,6 +61,7 @@ class DeadReckoning:
         self._plane = StereoOdometry(3 if dof == 3 else 6)
         self._stamp_ns: int | None = None
         self._at = Reckoned(standstill(), SE3.identity())
+        self._passed = 0
 
     @property
     def begun(self) -> bool:
@@ -73,13 +78,19 @@ class DeadReckoning:
         self.odometer.rng = rng
         step = self.odometer.step(*matches, self._seconds(stamp_ns))
         self._stamp_ns = stamp_ns
-        self._at = self._moved(step.odometry, step.estimate.inliers, step.note)
+        at = self._moved(step.odometry, step.estimate.inliers, step.note)
+        before = self._at
+        missed = 0 if step.estimate.found else 1 + self._passed
+        known = 0 if missed else before.known + 1
+        self._at = replace(at, assumed=before.assumed + missed, known=known)
+        self._passed = 0
         return self._at
 
     def assumed(self, stamp_ns: int) -> Reckoned:
         """A pair that cannot be measured: the last velocity is expected to go on."""
         if not self.begun:
             return self._at
+        self._passed += 1
         expected = self.odometer.prediction.law(self.odometer.velocity, self._seconds(stamp_ns))
         return self._moved(expected, np.zeros(0, dtype=bool), "")
 
@@ -98,6 +109,7 @@ class DeadReckoning:
             "reckoning/delta": at.since_update.delta,
             "reckoning/cov": at.since_update.cov,
             "reckoning/world_from_camera": at.world_from_camera,
+            "reckoning/missed": np.array([at.assumed, at.known, self._passed]),
         }
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
@@ -106,7 +118,9 @@ class DeadReckoning:
         self._stamp_ns = int(stamps[0]) if stamps.size else None
         self.odometer.velocity = arrays["reckoning/velocity"].copy()
         motion = Odometry(arrays["reckoning/delta"].copy(), arrays["reckoning/cov"].copy())
-        self._at = Reckoned(motion, arrays["reckoning/world_from_camera"].copy())
+        assumed, known, self._passed = (int(count) for count in arrays["reckoning/missed"])
+        world = arrays["reckoning/world_from_camera"].copy()
+        self._at = Reckoned(motion, world, assumed=assumed, known=known)
 
     def _seconds(self, stamp_ns: int) -> float:
         assert self._stamp_ns is not None

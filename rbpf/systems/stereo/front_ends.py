@@ -6,6 +6,7 @@ from typing import Any, final
 
 import numpy as np
 
+from rbpf.belief import Belief
 from rbpf.errors import InputError
 from rbpf.exchange import NULL
 from rbpf.filter import StepReport
@@ -51,8 +52,16 @@ class FrontEnd(ABC):
         """The pair looked at is what the next one is matched with."""
 
     @abstractmethod
-    def for_filter(self) -> Any:
-        """The pair looked at, as the sensor takes it."""
+    def for_filter(self, doubt: bool = False) -> Any:
+        """The pair looked at, as the sensor takes it.
+
+        Args:
+            doubt: the motion up to it was only assumed, for all or part of the way.
+        """
+
+    @abstractmethod
+    def recognised(self, belief: Belief) -> int:
+        """Landmarks of the map that the pair looked at shows, all in one place, to particles in doubt."""
 
     @abstractmethod
     def seen(self, updated: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -109,6 +118,7 @@ class ImageFrontEnd(FrontEnd):
         self.sift = StereoSift(rig, config.sift, config.pair)
         likelihood = config.likelihood.build()
         self.sensor: StereoSensor = StereoSensor(rig, config.map, config.keys, config.sift.length, likelihood)
+        self._likelihoods = likelihood, config.recovery.likelihood.build()
         nothing = np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0), np.zeros(0)
         self._none = StereoFeatures.measured(
             rig, *nothing, np.zeros((0, config.sift.length), dtype=np.float32)
@@ -140,13 +150,20 @@ class ImageFrontEnd(FrontEnd):
     def keep(self) -> None:
         self._kept = self._now
 
-    def for_filter(self) -> StereoFrame:
+    def for_filter(self, doubt: bool = False) -> StereoFrame:
         """All features, or the half that is the map's."""
+        self.sensor.likelihood = self._likelihoods[doubt]
         split = self.config.odometry.split
         if split == "none":
-            return StereoFrame(self._now)
+            return StereoFrame(self._now, doubt=doubt)
         half = half_of(self._now.keys)
-        return StereoFrame(self._now, ~half if split == "apart" else half)
+        return StereoFrame(self._now, ~half if split == "apart" else half, doubt)
+
+    def recognised(self, belief: Belief) -> int:
+        """By their keys, as many as agree on one motion."""
+        if not self.config.map.used:
+            return 0
+        return int((self.sensor.matched(self.for_filter(doubt=True), belief) >= 0).sum())
 
     def seen(self, updated: bool) -> tuple[np.ndarray, np.ndarray]:
         return self._now.z, self.sensor.kinds() if updated else np.full(len(self._now), FEATURE)
@@ -195,7 +212,8 @@ class NameFrontEnd(FrontEnd):
         self.rig = log.camera
         self.config = config
         self._log = log
-        self.sensor = NamedLandmarkSensor(StereoPoint(log.camera), Point(3), config.likelihood.build())
+        self._likelihoods = config.likelihood.build(), config.recovery.likelihood.build()
+        self.sensor = NamedLandmarkSensor(StereoPoint(log.camera), Point(3), self._likelihoods[False])
         self._now = self._kept = FeatureFrame(
             0, np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3))
         )
@@ -217,8 +235,13 @@ class NameFrontEnd(FrontEnd):
     def keep(self) -> None:
         self._kept = self._now
 
-    def for_filter(self) -> FeatureFrame:
+    def recognised(self, belief: Belief) -> int:
+        """By their names."""
+        return int(np.isin(self.for_filter().landmarks, list(belief.catalogue.values())).sum())
+
+    def for_filter(self, doubt: bool = False) -> FeatureFrame:
         """All of them, those of odd or even names, or none."""
+        self.sensor.likelihood = self._likelihoods[doubt]
         config, frame = self.config, self._now
         chosen = np.full(frame.landmarks.size, config.map.used)
         if config.odometry.split != "none":

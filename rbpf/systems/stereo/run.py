@@ -17,6 +17,7 @@ from rbpf.sensors.features import CameraTruth, FeatureLog
 from rbpf.sensors.readers.images.stereo import StereoSequence
 from rbpf.systems.stereo.config import StereoConfig, TriggerConfig
 from rbpf.systems.stereo.dead_reckoning import DeadReckoning, Reckoned, chained
+from rbpf.systems.stereo.doubt import waits
 from rbpf.systems.stereo.front_ends import FrontEnd, ImageFrontEnd, NameFrontEnd
 from rbpf.systems.stereo.measured import MeasuredSequence
 from rbpf.systems.stereo.resuming import cut, restore, save
@@ -201,9 +202,10 @@ def _frame(run: StereoRun, t: int, frame: Any) -> None:
     run.agreeing[t], run.odometry[t] = at.agreeing, at.world_from_camera
     run.seconds_odometry[t] = time.perf_counter() - started - run.seconds_features[t]
     if whole and (
-        run.filter.steps == 0 or triggered(at.since_update, run.config.trigger, t - run.last_update)
+        run.filter.steps == 0
+        or (triggered(at.since_update, run.config.trigger, t - run.last_update) and not waits(run, t, at))
     ):
-        _update(run, t, at.since_update)
+        _update(run, t, at)
     if whole:
         run.front_end.note(t, at.agree, bool(run.updated[t]))
     estimate = moved_on(run.at_update, at.since_update) if not run.updated[t] else run.at_update
@@ -240,10 +242,12 @@ def triggered(motion: Odometry, config: TriggerConfig, frames: int) -> bool:
     return far or turned_far or (config.frames > 0 and frames >= config.frames)
 
 
-def _update(run: StereoRun, t: int, motion: Odometry) -> None:
+def _update(run: StereoRun, t: int, at: Reckoned) -> None:
     started = time.perf_counter()
-    control = motion if run.filter.steps else None
-    report = run.filter.step(run.front_end.for_filter(), control, int(run.stamps_ns[t]))
+    control = at.since_update if run.filter.steps else None
+    doubt = run.config.recovery.used and at.assumed > 0
+    proposal = run.config.recovery.proposal.build() if doubt else None
+    report = run.filter.step(run.front_end.for_filter(doubt), control, int(run.stamps_ns[t]), proposal)
     run.reckoning.updated()
     run.at_update = Estimate(report.estimate.mean, report.estimate.cov)
     run.last_update = t

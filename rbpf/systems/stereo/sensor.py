@@ -42,10 +42,12 @@ class StereoFrame:
     Attributes:
         features: of the pair.
         free: (K,) which of them the map may use; None is all.
+        doubt: the camera's motion was only assumed: matches with the map must agree on one motion.
     """
 
     features: StereoFeatures
     free: np.ndarray | None = None
+    doubt: bool = False
 
 
 @final
@@ -82,7 +84,7 @@ class StereoSensor(Sensor):
         features = frame.features
         self.names = np.full(len(features), NULL, dtype=np.int64)
         if self.config.used:
-            self.names = self._matched(frame, belief)
+            self.names = self.matched(frame, belief)
         seen = self.names >= 0
         ids = np.full(seen.size, NULL, dtype=np.int64)
         ids[seen] = self._numbers.ids(belief.catalogue, self.names[seen])
@@ -152,8 +154,8 @@ class StereoSensor(Sensor):
         often = manager.sightings + 1 >= manager.config.sightings
         return np.isin(self.names, manager.names[often])
 
-    def _matched(self, frame: StereoFrame, belief: Belief) -> np.ndarray:
-        """Name of each feature's landmark (K,)."""
+    def matched(self, frame: StereoFrame, belief: Belief) -> np.ndarray:
+        """Name of each feature's landmark (K,), NULL where it has none."""
         features = frame.features
         out = np.full(len(features), NULL, dtype=np.int64)
         rows = np.arange(len(features)) if frame.free is None else np.flatnonzero(frame.free)
@@ -168,14 +170,15 @@ class StereoSensor(Sensor):
         found = self.index.match(features.keys[rows], gate).ids
         taken = np.flatnonzero(found >= 0)
         of = np.searchsorted(names, found[taken])
-        agreed = self._agreed(seen.take(of), features.take(rows[taken]))
+        agreed = self._agreed(seen.take(of), features.take(rows[taken]), frame.doubt)
         out[rows[taken[agreed]]] = found[taken[agreed]]
         return out
 
-    def _agreed(self, seen: Expected, features: StereoFeatures) -> np.ndarray:
+    def _agreed(self, seen: Expected, features: StereoFeatures, doubt: bool) -> np.ndarray:
         """Which matches (k,) are taken: all, unless they are expected so vaguely that the gate tells little."""
         all_of_them = np.ones(len(features), dtype=bool)
-        if not len(features) or np.median(seen.deviation) <= self.config.doubt_px:
+        vague = doubt or (len(features) and np.median(seen.deviation) > self.config.doubt_px)
+        if not vague:
             return all_of_them
         if len(features) < self.config.agreeing:
             return ~all_of_them
