@@ -8,6 +8,7 @@ import numpy as np
 from rbpf import gaussian
 from rbpf.lie import SE3
 from rbpf.motion.odometry import Odometry
+from rbpf.motion.stereo_motions import Known, nothing_known
 from rbpf.motion.stereo_odometer import StereoOdometer
 from rbpf.motion.stereo_odometry import StereoOdometry
 
@@ -29,6 +30,7 @@ class Reckoned:
         since_update: motion since the filter's last update.
         world_from_camera: (7,) by odometry alone; the first camera is the world.
         agree: (K,) which matches agree with the motion; none where nothing was matched.
+        moving: (K,) which agree on another one: they are of things that move.
         note: what had to be assumed, in words; empty where nothing had.
         assumed: pairs since the filter's last update over which the motion was only assumed.
         known: pairs since the last of these whose motion was measured again.
@@ -37,6 +39,7 @@ class Reckoned:
     since_update: Odometry
     world_from_camera: np.ndarray
     agree: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    moving: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
     note: str = ""
     assumed: int = 0
     known: int = 0
@@ -68,22 +71,41 @@ class DeadReckoning:
         """Whether there is a pair to measure from."""
         return self._stamp_ns is not None
 
+    @property
+    def in_doubt(self) -> bool:
+        """Whether the motion since the filter's last update was only assumed, for all or part of the way."""
+        return self._at.assumed > 0
+
     def begin(self, stamp_ns: int) -> Reckoned:
         """The first pair that can be measured from."""
         self._stamp_ns = stamp_ns
         return self._at
 
-    def measured(self, stamp_ns: int, matches: Pixels, rng: np.random.Generator) -> Reckoned:
-        """A pair that is matched with the last measured one; the next one is measured from it."""
-        self.odometer.rng = rng
-        step = self.odometer.step(*matches, self._seconds(stamp_ns))
-        self._stamp_ns = stamp_ns
-        at = self._moved(step.odometry, step.estimate.inliers, step.note)
-        before = self._at
+    def measured(
+        self, stamp_ns: int, matches: Pixels, rng: np.random.Generator, known: Known = nothing_known
+    ) -> Reckoned:
+        """A pair that is matched with the last measured one; the next one is measured from it.
+
+        Args:
+            stamp_ns: its time.
+            matches: of the two.
+            rng: for the consensus.
+            known: log-density of what else the pair shows, after a motion since the filter's last update.
+        """
+        self.odometer.rng, before = rng, self._at
+
+        def after(increment: Odometry) -> float:
+            return known(chained(before.since_update, self._plane.law(increment)))
+
+        step = self.odometer.step(*matches, self._seconds(stamp_ns), after)
         missed = 0 if step.estimate.found else 1 + self._passed
-        known = 0 if missed else before.known + 1
-        self._at = replace(at, assumed=before.assumed + missed, known=known)
-        self._passed = 0
+        self._stamp_ns, self._passed = stamp_ns, 0
+        self._at = replace(
+            self._moved(step.odometry, step.estimate.inliers, step.note),
+            moving=step.moving,
+            assumed=before.assumed + missed,
+            known=0 if missed else before.known + 1,
+        )
         return self._at
 
     def assumed(self, stamp_ns: int) -> Reckoned:

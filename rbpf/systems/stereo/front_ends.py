@@ -24,7 +24,7 @@ from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.dead_reckoning import Pixels
 from rbpf.systems.stereo.measured import MeasuredPair
 from rbpf.systems.stereo.seen import FEATURE, LANDMARK
-from rbpf.systems.stereo.sensor import StereoFrame, StereoSensor
+from rbpf.systems.stereo.sensor import StereoFrame, StereoSensor, log_support
 from rbpf.systems.stereo.tracks import Tracks
 
 
@@ -62,6 +62,14 @@ class FrontEnd(ABC):
     @abstractmethod
     def recognised(self, belief: Belief) -> int:
         """Landmarks of the map that the pair looked at shows, all in one place, to particles in doubt."""
+
+    @abstractmethod
+    def log_support(self, belief: Belief, doubt: bool) -> float:
+        """How well the map's landmarks are seen by particles, a log-density beside that of false matches."""
+
+    @abstractmethod
+    def leave_out(self, moving: np.ndarray) -> None:
+        """Matches (M,) that are of things that move: the map does not take their features."""
 
     @abstractmethod
     def seen(self, updated: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -125,11 +133,13 @@ class ImageFrontEnd(FrontEnd):
         )
         self._now = self._kept = self._none
         self._matches = np.zeros((2, 0), dtype=np.intp)
+        self._moving = np.zeros(0, dtype=np.intp)
         self.tracks = Tracks()
 
     def look(self, frame: ImageFrame | MeasuredPair) -> tuple[int, str]:
         """SIFT in both images, matched along the rows; or what was measured in them before."""
         self._now, self._matches = self._none, np.zeros((2, 0), dtype=np.intp)
+        self._moving = self._matches[1]
         if isinstance(frame, MeasuredPair):
             self._now = self._none if frame.features is None else frame.features
             return len(self._now), frame.problem
@@ -137,6 +147,9 @@ class ImageFrontEnd(FrontEnd):
             return 0, frame.problem or "an image is missing"
         self._now = self.sift.measure(frame.image, frame.right)
         return len(self._now), ""
+
+    def leave_out(self, moving: np.ndarray) -> None:
+        self._moving = self._matches[1, moving]
 
     def matches(self) -> Pixels:
         """By their keys."""
@@ -151,19 +164,25 @@ class ImageFrontEnd(FrontEnd):
         self._kept = self._now
 
     def for_filter(self, doubt: bool = False) -> StereoFrame:
-        """All features, or the half that is the map's."""
+        """All features that stand still, or the half of them that is the map's."""
         self.sensor.likelihood = self._likelihoods[doubt]
-        split = self.config.odometry.split
-        if split == "none":
-            return StereoFrame(self._now, doubt=doubt)
-        half = half_of(self._now.keys)
-        return StereoFrame(self._now, ~half if split == "apart" else half, doubt)
+        split, free = self.config.odometry.split, np.ones(len(self._now), dtype=bool)
+        if split != "none":
+            half = half_of(self._now.keys)
+            free = ~half if split == "apart" else half
+        free[self._moving] = False
+        return StereoFrame(self._now, free, doubt)
 
     def recognised(self, belief: Belief) -> int:
         """By their keys, as many as agree on one motion."""
         if not self.config.map.used:
             return 0
         return int((self.sensor.matched(self.for_filter(doubt=True), belief) >= 0).sum())
+
+    def log_support(self, belief: Belief, doubt: bool) -> float:
+        if not self.config.map.used:
+            return 0.0
+        return self.sensor.log_support(self.for_filter(doubt), belief, self._likelihoods[True])
 
     def seen(self, updated: bool) -> tuple[np.ndarray, np.ndarray]:
         return self._now.z, self.sensor.kinds() if updated else np.full(len(self._now), FEATURE)
@@ -217,10 +236,11 @@ class NameFrontEnd(FrontEnd):
         self._now = self._kept = FeatureFrame(
             0, np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3))
         )
+        self._matched = self._moving = np.zeros(0, dtype=np.intp)
 
     def look(self, frame: FeatureFrame) -> tuple[int, str]:
         """Nothing is to be done."""
-        self._now = frame
+        self._now, self._moving = frame, np.zeros(0, dtype=np.intp)
         return frame.landmarks.size, ""
 
     def matches(self) -> Pixels:
@@ -229,7 +249,7 @@ class NameFrontEnd(FrontEnd):
         if self.config.odometry.split != "none":
             even = self._kept.landmarks[before] % 2 == 0
             before, now = before[even], now[even]
-        kept, seen = self._kept, self._now
+        kept, seen, self._matched = self._kept, self._now, now
         return Pixels(kept.z[before], seen.z[now], kept.cov_z[before], seen.cov_z[now])
 
     def keep(self) -> None:
@@ -239,6 +259,18 @@ class NameFrontEnd(FrontEnd):
         """By their names."""
         return int(np.isin(self.for_filter().landmarks, list(belief.catalogue.values())).sum())
 
+    def log_support(self, belief: Belief, doubt: bool) -> float:
+        frame, ids = self.for_filter(), {name: i for i, name in belief.catalogue.items()}
+        rows = np.flatnonzero(np.isin(frame.landmarks, list(ids)))
+        if not rows.size:
+            return 0.0
+        named = np.array([ids[name] for name in frame.landmarks[rows].tolist()])
+        mean, cov = belief.project(self.sensor.model, named)
+        return log_support(self._likelihoods[True], frame.z[rows] - mean, frame.cov_z[rows] + cov)
+
+    def leave_out(self, moving: np.ndarray) -> None:
+        self._moving = self._matched[moving]
+
     def for_filter(self, doubt: bool = False) -> FeatureFrame:
         """All of them, those of odd or even names, or none."""
         self.sensor.likelihood = self._likelihoods[doubt]
@@ -247,6 +279,7 @@ class NameFrontEnd(FrontEnd):
         if config.odometry.split != "none":
             chosen &= frame.landmarks % 2 == (1 if config.odometry.split == "apart" else 0)
         chosen &= frame.z[:, 0] > frame.z[:, 2]
+        chosen[self._moving] = False
         return FeatureFrame(frame.stamp_ns, frame.landmarks[chosen], frame.z[chosen], frame.cov_z[chosen])
 
     def seen(self, updated: bool) -> tuple[np.ndarray, np.ndarray]:

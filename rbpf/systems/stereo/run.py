@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -226,11 +227,20 @@ def _reckon(run: StereoRun, t: int, problem: str) -> tuple[Reckoned, bool]:
         at = reckoning.begin(stamp)
     else:
         rng = np.random.default_rng([run.config.seed, t])
-        at = reckoning.measured(stamp, run.front_end.matches(), rng)
+        at = reckoning.measured(stamp, run.front_end.matches(), rng, partial(_log_support, run, t))
+        run.front_end.leave_out(at.moving)
         if at.note:
             run.notes.append(f"pair {t}: {at.note}")
     run.front_end.keep()
     return at, True
+
+
+def _log_support(run: StereoRun, t: int, since_update: Odometry) -> float:
+    """What the map says of a motion up to pair t."""
+    if not run.filter.steps:
+        return 0.0
+    belief = run.filter.expect(since_update, int(run.stamps_ns[t]))
+    return run.front_end.log_support(belief, run.reckoning.in_doubt)
 
 
 def triggered(motion: Odometry, config: TriggerConfig, frames: int) -> bool:

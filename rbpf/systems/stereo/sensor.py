@@ -174,6 +174,20 @@ class StereoSensor(Sensor):
         out[rows[taken[agreed]]] = found[taken[agreed]]
         return out
 
+    def log_support(self, frame: StereoFrame, belief: Belief, likelihood: Likelihood) -> float:
+        """Log-density of the features that are landmarks, beside that of features of unknown things.
+
+        Keys on trial have no say: they may be of what moves.
+        """
+        names = self.matched(frame, belief)
+        often = self.manager.names[self.manager.promoted]
+        rows = np.flatnonzero(np.isin(names, often))
+        if not rows.size:
+            return 0.0
+        features, ids = frame.features.take(rows), self._numbers.ids(belief.catalogue, names[rows])
+        seen = Cloud.of(belief, self.config.cloud).expected(belief, self.model, ids)
+        return log_support(likelihood, features.z - seen.mean, features.cov + seen.cov)
+
     def _agreed(self, seen: Expected, features: StereoFeatures, doubt: bool) -> np.ndarray:
         """Which matches (k,) are taken: all, unless they are expected so vaguely that the gate tells little."""
         all_of_them = np.ones(len(features), dtype=bool)
@@ -235,3 +249,8 @@ class StereoSensor(Sensor):
     def _deep(self, features: StereoFeatures) -> np.ndarray:
         """Whether the depth of features is known well enough for a Gaussian in space, (K,)."""
         return np.sqrt(features.cov_points[:, 2, 2]) <= self.config.depth_share * features.points[:, 2]
+
+
+def log_support(likelihood: Likelihood, nu: np.ndarray, cov: np.ndarray) -> float:
+    """Σ log p(ν) / p(false match) of innovations (K, 3) with covariances (K, 3, 3)."""
+    return float((likelihood.log_density(nu, cov) - likelihood.log_outlier()).sum())
