@@ -6,10 +6,12 @@ Each group of matches agrees on a motion x. The probability that group h stands 
 
 Each match is as likely as any other to be of what stands still: n_h. The groups' own likelihoods are the same whichever
 of them stands still, and so are the volumes that they leave open; what moves may move by as much as a camera may. That
-none of them stands still is one case more, as likely as a single match: then the motion is only expected.
+none of them stands still is one case more, as likely as a single match, and is believed on the map's word alone.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import final
 
 import numpy as np
 
@@ -17,30 +19,46 @@ from rbpf import gaussian
 from rbpf.lie import SE3
 from rbpf.motion.odometry import Odometry
 
-Known = Callable[[Odometry], float]
-"""Log-density of what else is known of the place, as a map, after an increment; up to a constant."""
 
-
-def nothing_known(increment: Odometry) -> float:
-    """Of a camera without a map."""
+def _nothing(increment: Odometry) -> float:
     return 0.0
 
 
-def camera_motion(counts: Sequence[int], laws: Sequence[Odometry], expected: Odometry, known: Known) -> int:
+@final
+@dataclass(frozen=True)
+class Known:
+    """What is known besides the matches of two frames; by default nothing.
+
+    Attributes:
+        log_density: of a map's landmarks in the later frame, after an increment; up to a constant.
+        mapped: (K,) matches that are of the map's landmarks.
+    """
+
+    log_density: Callable[[Odometry], float] = _nothing
+    mapped: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
+
+    def contradicts(self, agree: np.ndarray) -> bool:
+        """Whether most of the landmarks among the matches do not agree (K,) with a motion."""
+        return bool(self.mapped.any() and 2 * agree[self.mapped].sum() < self.mapped.sum())
+
+
+def camera_motion(
+    counts: Sequence[int], laws: Sequence[Odometry], known: Known, expected: Odometry, trusted: bool
+) -> int:
     """Number of the most probable motion; −1 where it is none of them.
 
     Args:
         counts: (M,) matches that agree on each.
         laws: (M,) of each, with its covariance.
+        known: of the map.
         expected: before anything was seen.
-        known: of the place.
+        trusted: whether that follows from a velocity that was measured; before, any motion is as likely.
     """
-    none = -0.5 * SE3.dim + known(expected)
-    scores = [none, *map(_score, counts, laws, [expected] * len(laws), [known] * len(laws))]
-    return int(np.argmax(scores)) - 1
-
-
-def _score(count: int, law: Odometry, expected: Odometry, known: Known) -> float:
-    off = SE3.local(expected.delta, law.delta)
-    white = gaussian.solve_lower(gaussian.cholesky(expected.cov), off)
-    return float(np.log(count) - 0.5 * white @ white) + known(law)
+    of_map = np.array([known.log_density(law) for law in laws])
+    scores = np.log(counts) + of_map
+    if trusted:
+        chol = gaussian.cholesky(expected.cov)
+        off = [gaussian.solve_lower(chol, SE3.local(expected.delta, law.delta)) for law in laws]
+        scores = scores - 0.5 * np.square(off).sum(axis=1)
+    best = int(np.argmax(scores))
+    return -1 if known.log_density(expected) > of_map[best] + np.log(counts[best]) else best

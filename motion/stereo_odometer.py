@@ -11,7 +11,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
 from rbpf.motion.odometry import Odometry
 from rbpf.motion.stereo_geometry import StereoCamera
-from rbpf.motion.stereo_motions import Known, camera_motion, nothing_known
+from rbpf.motion.stereo_motions import Known, camera_motion
 from rbpf.motion.stereo_vo import MotionEstimate, VoConfig, estimate_motion, no_motion
 
 ROUNDING = 1e-14
@@ -114,7 +114,7 @@ class StereoOdometer:
         cov_prev: Array,
         cov_now: Array,
         dt: float,
-        known: Known = nothing_known,
+        known: Known | None = None,
     ) -> OdometerStep:
         """The increment over `dt` seconds from matched pixels; see `rbpf.motion.stereo_vo.estimate_motion`.
 
@@ -124,7 +124,7 @@ class StereoOdometer:
             cov_prev: (K, 3, 3) of the earlier pixels.
             cov_now: (K, 3, 3) of the later ones.
             dt: seconds between the frames.
-            known: of the place after an increment; asked where matches agree on several motions.
+            known: besides the matches: asked where these agree on several motions, or landmarks do not agree.
 
         Raises:
             InputError: as `estimate_motion`, or dt is not positive.
@@ -136,9 +136,10 @@ class StereoOdometer:
             self.camera, z_prev, z_now, cov_prev, cov_now, self.rng, expected.delta, self.config
         )
         moving, several = np.zeros(found.inliers.size, dtype=bool), ""
-        if found.others:
+        known = known or Known()
+        if found.others or (found.found and known.contradicts(found.inliers)):
             found, moving = self._of_camera(found, expected, known)
-            several = _several_motions(found, moving)
+            several = _several_motions(found, moving) if moving.any() else ""
         if not found.found:
             what = "the last velocity" if self.velocity.any() else "a camera at rest"
             return OdometerStep(expected, found, f"{found.failure}; {what} is assumed, widely", moving)
@@ -153,12 +154,12 @@ class StereoOdometer:
         """The camera's motion of several, and which matches agree on the others."""
         motions = [found, *found.others]
         counts, laws = [int(one.inliers.sum()) for one in motions], [_joined(one, expected)[0] for one in motions]
-        chosen = camera_motion(counts, laws, expected, known)
+        chosen = camera_motion(counts, laws, known, expected, bool(self.velocity.any()))
         moving = np.any([one.inliers for row, one in enumerate(motions) if row != chosen], axis=0)
         if chosen >= 0:
             return motions[chosen], moving
         many = " and ".join(map(str, counts))
-        why = f"{many} of {found.inliers.size} matches agree on a motion each, and the map on none of these"
+        why = f"{many} of {found.inliers.size} matches agree on a motion, which the map contradicts"
         return no_motion(found, why), moving
 
 

@@ -120,7 +120,7 @@ class RecoveryConfig:
     """
 
     used: bool = True
-    patience: int = 30
+    patience: int = 60
     proposal: ProposalConfig = field(default_factory=lambda: ProposalConfig("ekf", iterations=5))
     likelihood: LikelihoodConfig = field(
         default_factory=lambda: LikelihoodConfig("outliers", outlier_volume=OUTLIER_VOLUME_PX3)

@@ -8,7 +8,7 @@ import numpy as np
 from rbpf import gaussian
 from rbpf.lie import SE3
 from rbpf.motion.odometry import Odometry
-from rbpf.motion.stereo_motions import Known, nothing_known
+from rbpf.motion.stereo_motions import Known
 from rbpf.motion.stereo_odometer import StereoOdometer
 from rbpf.motion.stereo_odometry import StereoOdometry
 
@@ -82,7 +82,7 @@ class DeadReckoning:
         return self._at
 
     def measured(
-        self, stamp_ns: int, matches: Pixels, rng: np.random.Generator, known: Known = nothing_known
+        self, stamp_ns: int, matches: Pixels, rng: np.random.Generator, known: Known | None = None
     ) -> Reckoned:
         """A pair that is matched with the last measured one; the next one is measured from it.
 
@@ -90,14 +90,15 @@ class DeadReckoning:
             stamp_ns: its time.
             matches: of the two.
             rng: for the consensus.
-            known: log-density of what else the pair shows, after a motion since the filter's last update.
+            known: besides the matches, its density that of a motion since the filter's last update.
         """
-        self.odometer.rng, before = rng, self._at
+        self.odometer.rng, before, known = rng, self._at, known or Known()
+        density = known.log_density
 
         def after(increment: Odometry) -> float:
-            return known(chained(before.since_update, self._plane.law(increment)))
+            return density(chained(before.since_update, self._plane.law(increment)))
 
-        step = self.odometer.step(*matches, self._seconds(stamp_ns), after)
+        step = self.odometer.step(*matches, self._seconds(stamp_ns), replace(known, log_density=after))
         missed = 0 if step.estimate.found else 1 + self._passed
         self._stamp_ns, self._passed = stamp_ns, 0
         self._at = replace(

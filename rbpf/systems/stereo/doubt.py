@@ -7,23 +7,35 @@ apart, none of them within millimetres of the right place, and landmarks started
 
 from typing import TYPE_CHECKING
 
+from rbpf.lie import SE3
+from rbpf.motion.odometry import Odometry
 from rbpf.systems.stereo.dead_reckoning import Reckoned
 
 if TYPE_CHECKING:
     from rbpf.systems.stereo.run import StereoRun
 
 
-def waits(run: "StereoRun", t: int, at: Reckoned) -> bool:
-    """Whether pair t is not to update the filter: the motion up to it was only assumed, and the map says nothing yet."""
-    recovery = run.config.recovery
+def motion_for_update(run: "StereoRun", t: int, at: Reckoned) -> Odometry | None:
+    """By what the particles are moved at pair t; None where the map does not say yet where the camera has come.
+
+    A place that is found far from where the camera was assumed to go takes the place of the law's mean: something has
+    deceived the odometry. Its covariance stays, and leaves the rest to each particle's own map.
+    """
+    recovery, motion = run.config.recovery, at.since_update
     if not (recovery.used and at.assumed):
-        return False
-    belief = run.filter.expect(at.since_update, int(run.stamps_ns[t]))
-    count, after = run.front_end.recognised(belief), f"after {at.assumed} pairs whose motion was only assumed"
+        return motion
+    belief = run.filter.expect(motion, int(run.stamps_ns[t]))
+    after = f"after {at.assumed} pair{'s'[: at.assumed > 1]} whose motion was only assumed"
+    count = run.front_end.recognised(belief)
+    if count < run.config.map.agreeing:
+        place = run.front_end.anywhere(belief)
+        if place is not None:
+            count, heaviest = place[1], run.filter.particles.state[belief.mode]
+            motion = Odometry(SE3.between(heaviest, place[0]), motion.cov)
     if count >= run.config.map.agreeing:
         run.notes.append(f"pair {t}: the camera is found again by {count} landmarks of the map, {after}")
-        return False
+        return motion
     if at.known >= recovery.patience:
         run.notes.append(f"pair {t}: the camera is not found again in the map, which goes on from here, {after}")
-        return False
-    return True
+        return motion
+    return None

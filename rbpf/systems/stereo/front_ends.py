@@ -20,6 +20,7 @@ from rbpf.sensors.readers.images import ImageFrame
 from rbpf.sensors.stereo_features import StereoFeatures, match_frames
 from rbpf.sensors.stereo_matching import StereoSift
 from rbpf.sensors.stereo_points import StereoPoint
+from rbpf.systems.stereo.anywhere import find_anywhere
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.dead_reckoning import Pixels
 from rbpf.systems.stereo.measured import MeasuredPair
@@ -66,6 +67,14 @@ class FrontEnd(ABC):
     @abstractmethod
     def log_support(self, belief: Belief, doubt: bool) -> float:
         """How well the map's landmarks are seen by particles, a log-density beside that of false matches."""
+
+    @abstractmethod
+    def mapped(self) -> np.ndarray:
+        """Which matches (M,) are of landmarks of the map: these were seen where it has them, in the pair kept."""
+
+    @abstractmethod
+    def anywhere(self, belief: Belief) -> tuple[np.ndarray, int] | None:
+        """Where in the map the pair looked at was taken, world_from_camera (7,), and landmarks that say so."""
 
     @abstractmethod
     def leave_out(self, moving: np.ndarray) -> None:
@@ -134,6 +143,7 @@ class ImageFrontEnd(FrontEnd):
         self._now = self._kept = self._none
         self._matches = np.zeros((2, 0), dtype=np.intp)
         self._moving = np.zeros(0, dtype=np.intp)
+        self._names = np.zeros(0, dtype=np.int64)
         self.tracks = Tracks()
 
     def look(self, frame: ImageFrame | MeasuredPair) -> tuple[int, str]:
@@ -147,6 +157,15 @@ class ImageFrontEnd(FrontEnd):
             return 0, frame.problem or "an image is missing"
         self._now = self.sift.measure(frame.image, frame.right)
         return len(self._now), ""
+
+    def mapped(self) -> np.ndarray:
+        return np.isin(self._names[self._matches[0]], self.sensor.landmarks())
+
+    def anywhere(self, belief: Belief) -> tuple[np.ndarray, int] | None:
+        if not self.config.map.used:
+            return None
+        frame, least = self.for_filter(doubt=True), self.config.odometry.estimate
+        return find_anywhere(self.sensor, frame, belief, least)
 
     def leave_out(self, moving: np.ndarray) -> None:
         self._moving = self._matches[1, moving]
@@ -193,6 +212,9 @@ class ImageFrontEnd(FrontEnd):
     def note(self, step: int, agree: np.ndarray, updated: bool) -> None:
         first, second = self._matches[:, agree] if agree.size else self._matches[:, :0]
         names = self.sensor.names if updated else np.full(len(self._kept), NULL, dtype=np.int64)
+        carried = np.full(len(self._kept), NULL, dtype=np.int64)
+        carried[second] = self._names[first]
+        self._names = np.where(names >= 0, names, carried)
         self.tracks.note(step, self._kept.z, self._kept.cov, (first, second), names)
 
     def log(self, name: str, stamps_ns: np.ndarray, truth: CameraTruth | None) -> FeatureLog:
@@ -201,12 +223,13 @@ class ImageFrontEnd(FrontEnd):
     def arrays(self) -> dict[str, np.ndarray]:
         kept = self._kept
         names = ("z", "cov", "scale", "orientation", "keys")
-        pair = {f"pair/{name}": getattr(kept, name) for name in names}
+        pair = {f"pair/{name}": getattr(kept, name) for name in names} | {"pair/names": self._names}
         return pair | self.sensor.arrays() | self.tracks.arrays()
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         names = ("z", "cov", "scale", "orientation", "keys")
         self._kept = StereoFeatures.measured(self.rig, *(arrays[f"pair/{name}"].copy() for name in names))
+        self._names = arrays["pair/names"].copy()
         self.sensor.restore(arrays)
         self.tracks.restore(arrays)
 
@@ -267,6 +290,14 @@ class NameFrontEnd(FrontEnd):
         named = np.array([ids[name] for name in frame.landmarks[rows].tolist()])
         mean, cov = belief.project(self.sensor.model, named)
         return log_support(self._likelihoods[True], frame.z[rows] - mean, frame.cov_z[rows] + cov)
+
+    def mapped(self) -> np.ndarray:
+        """Nothing need be told apart: names are never mistaken."""
+        return np.zeros(self._matched.size, dtype=bool)
+
+    def anywhere(self, belief: Belief) -> tuple[np.ndarray, int] | None:
+        """A name is looked for everywhere as it is."""
+        return None
 
     def leave_out(self, moving: np.ndarray) -> None:
         self._moving = self._matched[moving]

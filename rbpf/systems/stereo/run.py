@@ -14,11 +14,12 @@ from rbpf.estimate import Estimate
 from rbpf.filter import Filter, StepReport
 from rbpf.lie import SE3
 from rbpf.motion.odometry import Odometry
+from rbpf.motion.stereo_motions import Known
 from rbpf.sensors.features import CameraTruth, FeatureLog
 from rbpf.sensors.readers.images.stereo import StereoSequence
 from rbpf.systems.stereo.config import StereoConfig, TriggerConfig
 from rbpf.systems.stereo.dead_reckoning import DeadReckoning, Reckoned, chained
-from rbpf.systems.stereo.doubt import waits
+from rbpf.systems.stereo.doubt import motion_for_update
 from rbpf.systems.stereo.front_ends import FrontEnd, ImageFrontEnd, NameFrontEnd
 from rbpf.systems.stereo.measured import MeasuredSequence
 from rbpf.systems.stereo.resuming import cut, restore, save
@@ -204,9 +205,11 @@ def _frame(run: StereoRun, t: int, frame: Any) -> None:
     run.seconds_odometry[t] = time.perf_counter() - started - run.seconds_features[t]
     if whole and (
         run.filter.steps == 0
-        or (triggered(at.since_update, run.config.trigger, t - run.last_update) and not waits(run, t, at))
+        or triggered(at.since_update, run.config.trigger, t - run.last_update)
     ):
-        _update(run, t, at)
+        motion = motion_for_update(run, t, at)
+        if motion is not None:
+            _update(run, t, motion, run.config.recovery.used and at.assumed > 0)
     if whole:
         run.front_end.note(t, at.agree, bool(run.updated[t]))
     estimate = moved_on(run.at_update, at.since_update) if not run.updated[t] else run.at_update
@@ -227,7 +230,9 @@ def _reckon(run: StereoRun, t: int, problem: str) -> tuple[Reckoned, bool]:
         at = reckoning.begin(stamp)
     else:
         rng = np.random.default_rng([run.config.seed, t])
-        at = reckoning.measured(stamp, run.front_end.matches(), rng, partial(_log_support, run, t))
+        matches = run.front_end.matches()
+        known = Known(partial(_log_support, run, t), run.front_end.mapped())
+        at = reckoning.measured(stamp, matches, rng, known)
         run.front_end.leave_out(at.moving)
         if at.note:
             run.notes.append(f"pair {t}: {at.note}")
@@ -252,10 +257,9 @@ def triggered(motion: Odometry, config: TriggerConfig, frames: int) -> bool:
     return far or turned_far or (config.frames > 0 and frames >= config.frames)
 
 
-def _update(run: StereoRun, t: int, at: Reckoned) -> None:
+def _update(run: StereoRun, t: int, motion: Odometry, doubt: bool) -> None:
     started = time.perf_counter()
-    control = at.since_update if run.filter.steps else None
-    doubt = run.config.recovery.used and at.assumed > 0
+    control = motion if run.filter.steps else None
     proposal = run.config.recovery.proposal.build() if doubt else None
     report = run.filter.step(run.front_end.for_filter(doubt), control, int(run.stamps_ns[t]), proposal)
     run.reckoning.updated()

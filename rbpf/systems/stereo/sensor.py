@@ -87,7 +87,7 @@ class StereoSensor(Sensor):
             self.names = self.matched(frame, belief)
         seen = self.names >= 0
         ids = np.full(seen.size, NULL, dtype=np.int64)
-        ids[seen] = self._numbers.ids(belief.catalogue, self.names[seen])
+        ids[seen] = self.ids(belief, self.names[seen])
         weighing = self._weighing()
         groups = []
         for chosen, informs in ((weighing | ~seen, None), (seen & ~weighing, _MAP)):
@@ -115,6 +115,14 @@ class StereoSensor(Sensor):
         self.places.put(names, self.model.invert(pose, features.z), pose)
         self.names[rows] = names
         return [Births(features.z, features.cov, self.model, self.point, facts=names.tolist())]
+
+    def ids(self, belief: Belief, names: np.ndarray) -> np.ndarray:
+        """The map's numbers (k,) of keys (k,)."""
+        return self._numbers.ids(belief.catalogue, names)
+
+    def landmarks(self) -> np.ndarray:
+        """Names (M,) of the keys that have been seen often enough."""
+        return np.asarray(self.manager.names[self.manager.promoted])
 
     def kinds(self) -> np.ndarray:
         """What each feature (K,) of the last pair was to the map, see `rbpf.systems.stereo.seen`."""
@@ -163,7 +171,7 @@ class StereoSensor(Sensor):
         names = self._alike(features.keys[rows], cloud)
         if not (names.size and rows.size):
             return out
-        ids = self._numbers.ids(belief.catalogue, names)
+        ids = self.ids(belief, names)
         seen = cloud.expected(belief, self.model, ids)
         total = seen.cov + self.config.slack_px**2 * np.eye(3)
         gate = Gate(features.z[rows], features.cov[rows], names, seen.mean, total, self.config.gate)
@@ -180,11 +188,10 @@ class StereoSensor(Sensor):
         Keys on trial have no say: they may be of what moves.
         """
         names = self.matched(frame, belief)
-        often = self.manager.names[self.manager.promoted]
-        rows = np.flatnonzero(np.isin(names, often))
+        rows = np.flatnonzero(np.isin(names, self.landmarks()))
         if not rows.size:
             return 0.0
-        features, ids = frame.features.take(rows), self._numbers.ids(belief.catalogue, names[rows])
+        features, ids = frame.features.take(rows), self.ids(belief, names[rows])
         seen = Cloud.of(belief, self.config.cloud).expected(belief, self.model, ids)
         return log_support(likelihood, features.z - seen.mean, features.cov + seen.cov)
 
@@ -223,13 +230,13 @@ class StereoSensor(Sensor):
 
     def _forget(self, belief: Belief, names: np.ndarray) -> None:
         if names.size:
-            belief.map.remove(self._numbers.ids(belief.catalogue, names))
+            belief.map.remove(self.ids(belief, names))
             self.index.store.remove(names)
 
     def _place(self, belief: Belief, names: np.ndarray) -> None:
         """Notes where the heaviest particle has landmarks now."""
         if names.size:
-            ids = self._numbers.ids(belief.catalogue, names)
+            ids = self.ids(belief, names)
             mode = belief.mode
             self.places.put(names, belief.read(ids, np.array([mode])).mean[0], belief.state[mode])
 
