@@ -153,12 +153,12 @@ class StereoOdometer:
     ) -> tuple[MotionEstimate, np.ndarray]:
         """The camera's motion of several, and which matches agree on the others."""
         motions = [found, *found.others]
-        counts, laws = [int(one.inliers.sum()) for one in motions], [_joined(one, expected)[0] for one in motions]
-        chosen = camera_motion(counts, laws, known, expected, bool(self.velocity.any()))
-        moving = np.any([one.inliers for row, one in enumerate(motions) if row != chosen], axis=0)
+        groups, laws = np.array([one.inliers for one in motions]), [_joined(one, expected)[0] for one in motions]
+        chosen = camera_motion(groups, laws, known, expected, bool(self.velocity.any()))
+        moving = np.any([group for row, group in enumerate(groups) if row != chosen], axis=0)
         if chosen >= 0:
             return motions[chosen], moving
-        many = " and ".join(map(str, counts))
+        many = " and ".join(map(str, groups.sum(axis=1)))
         why = f"{many} of {found.inliers.size} matches agree on a motion, which the map contradicts"
         return no_motion(found, why), moving
 

@@ -212,10 +212,16 @@ class ImageFrontEnd(FrontEnd):
     def note(self, step: int, agree: np.ndarray, updated: bool) -> None:
         first, second = self._matches[:, agree] if agree.size else self._matches[:, :0]
         names = self.sensor.names if updated else np.full(len(self._kept), NULL, dtype=np.int64)
-        carried = np.full(len(self._kept), NULL, dtype=np.int64)
-        carried[second] = self._names[first]
-        self._names = np.where(names >= 0, names, carried)
+        self._names = np.where(names >= 0, names, self._followed(agree))
         self.tracks.note(step, self._kept.z, self._kept.cov, (first, second), names)
+
+    def _followed(self, agree: np.ndarray) -> np.ndarray:
+        """Landmarks (K,) of the pair kept that the one before had; where no motion was found, all that do not move."""
+        names = np.full(len(self._kept), NULL, dtype=np.int64)
+        followed = agree if agree.any() else ~np.isin(self._matches[1], self._moving)
+        first, second = self._matches[:, followed] if agree.size else self._matches[:, :0]
+        names[second] = self._names[first]
+        return names
 
     def log(self, name: str, stamps_ns: np.ndarray, truth: CameraTruth | None) -> FeatureLog:
         return FeatureLog(name, self.rig, self.tracks.frames(stamps_ns), truth=truth)
