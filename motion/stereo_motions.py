@@ -2,12 +2,12 @@
 
 Each group of matches agrees on a motion x. The probability that group h stands still, and the others move, is
 
-    P(h) ∝ n_h · N(x_h; expected) · p(map | x_h) · (1 / f − 1)^{l_h},    Mathematics (vo-static).
+    P(h) ∝ n_h · N(x_h; expected) · p(map | x_h) · B(h),    Mathematics (vo-static).
 
-Each match is as likely as any other to be of what stands still: n_h. Of l_h matches it is known that they are of
-landmarks, which stand still but for the share f of matches that are mistaken. The groups' own likelihoods are the same
-whichever of them stands still, and so are the volumes that they leave open; what moves may move by as much as a camera
-may. That none of them stands still is one case more, as likely as a single match; of the map alone it is believed.
+Each match is as likely as any other to be of what stands still: n_h. B is the group's past: what stood still goes on to
+do so, and what moved to move, but for a share of the matches that are mistaken, and for things that begin or stop. The
+groups' own likelihoods are the same whichever of them stands still, and so are the volumes that they leave open; what
+moves may move by as much as a camera may. That none of them stands still is one case more, as likely as a single match.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,11 +21,11 @@ from rbpf.lie import SE3
 from rbpf.motion.odometry import Odometry
 
 
-FALSE = 0.1
-"""Share of matches that are mistaken: between pairs of two recordings 4 and 10 % are (how_to/stereo_features)."""
+MISTAKEN = 0.1
+"""Share of matches: 4 and 10 % between the pairs of two recordings (how_to/stereo_features)."""
 
-FOLLOWED = float(np.log((1.0 - FALSE) / FALSE))
-"""What a landmark that is followed from the earlier frame speaks for the group in which it is found."""
+CHANGES = 0.01
+"""Share of pairs in which a thing begins to move or stops."""
 
 
 def _nothing(increment: Odometry) -> float:
@@ -39,15 +39,24 @@ class Known:
 
     Attributes:
         log_density: of a map's landmarks in the later frame, after an increment; up to a constant.
-        mapped: (K,) matches that are of the map's landmarks.
+        stood: (K,) of each match 1 if it stood still in the earlier frame, −1 if it moved, 0 where that is not known.
     """
 
     log_density: Callable[[Odometry], float] = _nothing
-    mapped: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    stood: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int8))
 
     def contradicts(self, agree: np.ndarray) -> bool:
-        """Whether most of the landmarks among the matches do not agree (K,) with a motion."""
-        return bool(self.mapped.any() and 2 * agree[self.mapped].sum() < self.mapped.sum())
+        """Whether the matches (K,) of a motion are not those that stood still before."""
+        if not self.stood.size:
+            return False
+        still = self.stood > 0
+        return bool((still & agree).sum() < (still & ~agree).sum() or self.stood[agree].sum() < 0)
+
+    def log_past(self, group: np.ndarray) -> float:
+        """Log B of a group (K,): bounded, for a thing begins or stops as a whole."""
+        odds = np.log((1.0 - MISTAKEN) / MISTAKEN) * self.stood[group].sum() if self.stood.size else 0.0
+        kept, changed = np.log1p(-CHANGES), np.log(CHANGES)
+        return float(np.logaddexp(kept, changed - odds) - np.logaddexp(kept - odds, changed))
 
 
 def camera_motion(
@@ -58,18 +67,17 @@ def camera_motion(
     Args:
         groups: (M, K) which matches agree on each; none on several.
         laws: (M,) of each, with its covariance.
-        known: of the map.
+        known: of the map, and of the matches.
         expected: before anything was seen.
         trusted: whether that follows from a velocity that was measured; before, any motion is as likely.
     """
-    mapped = known.mapped if known.mapped.size else np.zeros(groups.shape[1], dtype=bool)
-    nobody = ~groups.any(axis=0)
-    everyone = np.vstack([groups, nobody])
-    of_map = [known.log_density(law) for law in (*laws, expected)] + FOLLOWED * everyone[:, mapped].sum(axis=1)
-    scores = np.log(groups.sum(axis=1)) + of_map[:-1]
-    if trusted:
-        chol = gaussian.cholesky(expected.cov)
-        off = [gaussian.solve_lower(chol, SE3.local(expected.delta, law.delta)) for law in laws]
-        scores = scores - 0.5 * np.square(off).sum(axis=1)
-    best = int(np.argmax(scores))
-    return -1 if of_map[-1] > of_map[best] + np.log(groups[best].sum()) else best
+    everyone = [*groups, ~groups.any(axis=0)]
+    scores = np.array([known.log_past(group) for group in everyone])
+    scores += [known.log_density(law) for law in (*laws, expected)]
+    none, scores = scores[-1], scores[:-1] + np.log(groups.sum(axis=1))
+    if not trusted:
+        return int(np.argmax(scores)) if scores.max() >= none else -1
+    chol = gaussian.cholesky(expected.cov)
+    off = [gaussian.solve_lower(chol, SE3.local(expected.delta, law.delta)) for law in laws]
+    best = int(np.argmax(scores - 0.5 * np.square(off).sum(axis=1)))
+    return best if scores[best] >= none else -1

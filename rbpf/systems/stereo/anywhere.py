@@ -30,7 +30,8 @@ def find_anywhere(
     """
     free = np.arange(len(frame.features)) if frame.free is None else np.flatnonzero(frame.free)
     names = sensor.index.match(frame.features.keys[free]).ids
-    features, names = frame.features.take(free[names >= 0]), names[names >= 0]
+    known = np.isin(names, sensor.proven())
+    features, names = frame.features.take(free[known]), names[known]
     if names.size < config.least_matches:
         return None
     records = belief.read_mode(sensor.ids(belief, names))

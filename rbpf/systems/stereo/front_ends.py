@@ -69,8 +69,8 @@ class FrontEnd(ABC):
         """How well the map's landmarks are seen by particles, a log-density beside that of false matches."""
 
     @abstractmethod
-    def mapped(self) -> np.ndarray:
-        """Which matches (M,) are of landmarks of the map: these were seen where it has them, in the pair kept."""
+    def stood(self) -> np.ndarray:
+        """Of each match (M,) whether it stood still in the pair kept, see `rbpf.motion.stereo_motions.Known`."""
 
     @abstractmethod
     def anywhere(self, belief: Belief) -> tuple[np.ndarray, int] | None:
@@ -143,7 +143,7 @@ class ImageFrontEnd(FrontEnd):
         self._now = self._kept = self._none
         self._matches = np.zeros((2, 0), dtype=np.intp)
         self._moving = np.zeros(0, dtype=np.intp)
-        self._names = np.zeros(0, dtype=np.int64)
+        self._stood = np.zeros(0, dtype=np.int8)
         self.tracks = Tracks()
 
     def look(self, frame: ImageFrame | MeasuredPair) -> tuple[int, str]:
@@ -158,8 +158,8 @@ class ImageFrontEnd(FrontEnd):
         self._now = self.sift.measure(frame.image, frame.right)
         return len(self._now), ""
 
-    def mapped(self) -> np.ndarray:
-        return np.isin(self._names[self._matches[0]], self.sensor.landmarks())
+    def stood(self) -> np.ndarray:
+        return self._stood[self._matches[0]]
 
     def anywhere(self, belief: Belief) -> tuple[np.ndarray, int] | None:
         if not self.config.map.used:
@@ -212,16 +212,8 @@ class ImageFrontEnd(FrontEnd):
     def note(self, step: int, agree: np.ndarray, updated: bool) -> None:
         first, second = self._matches[:, agree] if agree.size else self._matches[:, :0]
         names = self.sensor.names if updated else np.full(len(self._kept), NULL, dtype=np.int64)
-        self._names = np.where(names >= 0, names, self._followed(agree))
+        self._stood = standing(self._stood, self._matches, agree, self._moving, len(self._kept))
         self.tracks.note(step, self._kept.z, self._kept.cov, (first, second), names)
-
-    def _followed(self, agree: np.ndarray) -> np.ndarray:
-        """Landmarks (K,) of the pair kept that the one before had; where no motion was found, all that do not move."""
-        names = np.full(len(self._kept), NULL, dtype=np.int64)
-        followed = agree if agree.any() else ~np.isin(self._matches[1], self._moving)
-        first, second = self._matches[:, followed] if agree.size else self._matches[:, :0]
-        names[second] = self._names[first]
-        return names
 
     def log(self, name: str, stamps_ns: np.ndarray, truth: CameraTruth | None) -> FeatureLog:
         return FeatureLog(name, self.rig, self.tracks.frames(stamps_ns), truth=truth)
@@ -229,13 +221,13 @@ class ImageFrontEnd(FrontEnd):
     def arrays(self) -> dict[str, np.ndarray]:
         kept = self._kept
         names = ("z", "cov", "scale", "orientation", "keys")
-        pair = {f"pair/{name}": getattr(kept, name) for name in names} | {"pair/names": self._names}
+        pair = {f"pair/{name}": getattr(kept, name) for name in names} | {"pair/stood": self._stood}
         return pair | self.sensor.arrays() | self.tracks.arrays()
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         names = ("z", "cov", "scale", "orientation", "keys")
         self._kept = StereoFeatures.measured(self.rig, *(arrays[f"pair/{name}"].copy() for name in names))
-        self._names = arrays["pair/names"].copy()
+        self._stood = arrays["pair/stood"].copy()
         self.sensor.restore(arrays)
         self.tracks.restore(arrays)
 
@@ -265,11 +257,13 @@ class NameFrontEnd(FrontEnd):
         self._now = self._kept = FeatureFrame(
             0, np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3))
         )
-        self._matched = self._moving = np.zeros(0, dtype=np.intp)
+        self._matches, self._stood = np.zeros((2, 0), dtype=np.intp), np.zeros(0, dtype=np.int8)
+        self._moving = self._matches[1]
 
     def look(self, frame: FeatureFrame) -> tuple[int, str]:
         """Nothing is to be done."""
-        self._now, self._moving = frame, np.zeros(0, dtype=np.intp)
+        self._now, self._matches = frame, np.zeros((2, 0), dtype=np.intp)
+        self._moving = self._matches[1]
         return frame.landmarks.size, ""
 
     def matches(self) -> Pixels:
@@ -278,7 +272,7 @@ class NameFrontEnd(FrontEnd):
         if self.config.odometry.split != "none":
             even = self._kept.landmarks[before] % 2 == 0
             before, now = before[even], now[even]
-        kept, seen, self._matched = self._kept, self._now, now
+        kept, seen, self._matches = self._kept, self._now, np.stack([before, now])
         return Pixels(kept.z[before], seen.z[now], kept.cov_z[before], seen.cov_z[now])
 
     def keep(self) -> None:
@@ -297,16 +291,15 @@ class NameFrontEnd(FrontEnd):
         mean, cov = belief.project(self.sensor.model, named)
         return log_support(self._likelihoods[True], frame.z[rows] - mean, frame.cov_z[rows] + cov)
 
-    def mapped(self) -> np.ndarray:
-        """Nothing need be told apart: names are never mistaken."""
-        return np.zeros(self._matched.size, dtype=bool)
+    def stood(self) -> np.ndarray:
+        return self._stood[self._matches[0]]
 
     def anywhere(self, belief: Belief) -> tuple[np.ndarray, int] | None:
         """A name is looked for everywhere as it is."""
         return None
 
     def leave_out(self, moving: np.ndarray) -> None:
-        self._moving = self._matched[moving]
+        self._moving = self._matches[1, moving]
 
     def for_filter(self, doubt: bool = False) -> FeatureFrame:
         """All of them, those of odd or even names, or none."""
@@ -323,7 +316,8 @@ class NameFrontEnd(FrontEnd):
         return self._now.z, np.full(self._now.landmarks.size, LANDMARK if updated else FEATURE)
 
     def note(self, step: int, agree: np.ndarray, updated: bool) -> None:
-        """The log has it all."""
+        """The log has it all but what stands still."""
+        self._stood = standing(self._stood, self._matches, agree, self._moving, self._kept.landmarks.size)
 
     def log(self, name: str, stamps_ns: np.ndarray, truth: CameraTruth | None) -> FeatureLog:
         """The given one, up to the last pair that was filtered."""
@@ -331,11 +325,34 @@ class NameFrontEnd(FrontEnd):
 
     def arrays(self) -> dict[str, np.ndarray]:
         kept = self._kept
-        return {"pair/names": kept.landmarks, "pair/z": kept.z, "pair/cov": kept.cov_z}
+        pair = {"pair/names": kept.landmarks, "pair/z": kept.z, "pair/cov": kept.cov_z}
+        return pair | {"pair/stood": self._stood}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         names, z, cov = (arrays[f"pair/{name}"].copy() for name in ("names", "z", "cov"))
-        self._kept = FeatureFrame(0, names, z, cov)
+        self._kept, self._stood = FeatureFrame(0, names, z, cov), arrays["pair/stood"].copy()
+
+
+def standing(
+    before: np.ndarray, matches: np.ndarray, agree: np.ndarray, moving: np.ndarray, count: int
+) -> np.ndarray:
+    """Of each of so many features whether it stands still: 1, it moves: −1, or that is not known: 0.
+
+    Args:
+        before: the same of the earlier pair's features.
+        matches: rows (2, M) of both pairs.
+        agree: (M,) which agree with the camera's motion; where none does, all stay as they were.
+        moving: rows of the features that agree on another motion.
+        count: of features.
+    """
+    now = np.zeros(count, dtype=np.int8)
+    first, second = matches
+    if agree.any():
+        now[second[agree]] = 1
+    else:
+        now[second] = before[first]
+    now[moving] = -1
+    return now
 
 
 def half_of(keys: np.ndarray) -> np.ndarray:

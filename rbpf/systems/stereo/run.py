@@ -231,7 +231,7 @@ def _reckon(run: StereoRun, t: int, problem: str) -> tuple[Reckoned, bool]:
     else:
         rng = np.random.default_rng([run.config.seed, t])
         matches = run.front_end.matches()
-        known = Known(partial(_log_support, run, t), run.front_end.mapped())
+        known = Known(partial(_log_support, run, t), run.front_end.stood())
         at = reckoning.measured(stamp, matches, rng, known)
         run.front_end.leave_out(at.moving)
         if at.note:

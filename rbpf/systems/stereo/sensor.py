@@ -31,6 +31,9 @@ from rbpf.systems.stereo.seen import FEATURE, LANDMARK, NEW, TRIAL
 
 _MAP = frozenset({Part.LANDMARK})
 
+PROVEN = 2
+"""Sightings of a key that stands still: one that moves is not where it was seen first."""
+
 TINY = 1e-6
 """Added to the variance of expected pixels, px²: a landmark may be known exactly."""
 
@@ -42,7 +45,8 @@ class StereoFrame:
     Attributes:
         features: of the pair.
         free: (K,) which of them the map may use; None is all.
-        doubt: the camera's motion was only assumed: matches with the map must agree on one motion.
+        doubt: the camera's motion was only assumed: matches with the map must agree on one motion, of keys that were
+            found again before, and no keys are started.
     """
 
     features: StereoFeatures
@@ -105,6 +109,8 @@ class StereoSensor(Sensor):
         seen = self.names >= 0
         self._forget(belief, self.manager.note(self.names[seen]))
         self._place(belief, self.names[seen])
+        if frame.doubt:
+            return []
         rows = self._worth_a_key(frame, seen)
         if not rows.size:
             return []
@@ -120,9 +126,9 @@ class StereoSensor(Sensor):
         """The map's numbers (k,) of keys (k,)."""
         return self._numbers.ids(belief.catalogue, names)
 
-    def landmarks(self) -> np.ndarray:
-        """Names (M,) of the keys that have been seen often enough."""
-        return np.asarray(self.manager.names[self.manager.promoted])
+    def proven(self) -> np.ndarray:
+        """Names (M,) of the keys that were found again where the map has them: these stand still."""
+        return np.asarray(self.manager.names[self.manager.sightings >= PROVEN])
 
     def kinds(self) -> np.ndarray:
         """What each feature (K,) of the last pair was to the map, see `rbpf.systems.stereo.seen`."""
@@ -169,6 +175,8 @@ class StereoSensor(Sensor):
         rows = np.arange(len(features)) if frame.free is None else np.flatnonzero(frame.free)
         cloud = Cloud.of(belief, self.config.cloud)
         names = self._alike(features.keys[rows], cloud)
+        if frame.doubt:
+            names = names[np.isin(names, self.proven())]
         if not (names.size and rows.size):
             return out
         ids = self.ids(belief, names)
@@ -188,7 +196,7 @@ class StereoSensor(Sensor):
         Keys on trial have no say: they may be of what moves.
         """
         names = self.matched(frame, belief)
-        rows = np.flatnonzero(np.isin(names, self.landmarks()))
+        rows = np.flatnonzero(np.isin(names, self.proven()))
         if not rows.size:
             return 0.0
         features, ids = frame.features.take(rows), self.ids(belief, names[rows])
