@@ -40,17 +40,20 @@ class Known:
     Attributes:
         log_density: of a map's landmarks in the later frame, after an increment; up to a constant.
         stood: (K,) of each match 1 if it stood still in the earlier frame, −1 if it moved, 0 where that is not known.
+        hidden: whether nothing in the earlier frame stood still.
     """
 
     log_density: Callable[[Odometry], float] = _nothing
     stood: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int8))
+    hidden: bool = False
 
     def contradicts(self, agree: np.ndarray) -> bool:
         """Whether the matches (K,) of a motion are not those that stood still before."""
         if not self.stood.size:
             return False
         still = self.stood > 0
-        return bool((still & agree).sum() < (still & ~agree).sum() or self.stood[agree].sum() < 0)
+        few = (still & agree).sum() < (still & ~agree).sum()
+        return bool(self.hidden or few or self.stood[agree].sum() < 0)
 
     def log_past(self, group: np.ndarray) -> float:
         """Log B of a group (K,): bounded, for a thing begins or stops as a whole."""
@@ -74,7 +77,8 @@ def camera_motion(
     everyone = [*groups, ~groups.any(axis=0)]
     scores = np.array([known.log_past(group) for group in everyone])
     scores += [known.log_density(law) for law in (*laws, expected)]
-    none, scores = scores[-1], scores[:-1] + np.log(groups.sum(axis=1))
+    none = scores[-1] + np.log((1.0 - CHANGES) / CHANGES) * known.hidden
+    scores = scores[:-1] + np.log(groups.sum(axis=1))
     if not trusted:
         return int(np.argmax(scores)) if scores.max() >= none else -1
     chol = gaussian.cholesky(expected.cov)

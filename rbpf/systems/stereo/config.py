@@ -113,8 +113,8 @@ class RecoveryConfig:
 
     Attributes:
         used: whether anything is done; without, such a motion moves the particles like any other, as in S05.
-        patience: pairs whose motion is known again, after which the map goes on from wherever the camera may be: it
-            may have come to where nothing was mapped.
+        patience: pairs after which the map goes on from wherever the camera may be: it may have come to where
+            nothing was mapped.
         proposal: of an update after such a motion.
         likelihood: of landmarks then: a density, that the motion's law can be weighed against.
     """

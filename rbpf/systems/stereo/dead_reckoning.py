@@ -33,7 +33,8 @@ class Reckoned:
         moving: (K,) which agree on another one: they are of things that move.
         note: what had to be assumed, in words; empty where nothing had.
         assumed: pairs since the filter's last update over which the motion was only assumed.
-        known: pairs since the last of these whose motion was measured again.
+        waiting: pairs since the first of these.
+        hidden: whether nothing in the pair stood still.
     """
 
     since_update: Odometry
@@ -42,7 +43,8 @@ class Reckoned:
     moving: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
     note: str = ""
     assumed: int = 0
-    known: int = 0
+    waiting: int = 0
+    hidden: bool = False
 
     @property
     def agreeing(self) -> int:
@@ -98,14 +100,15 @@ class DeadReckoning:
         def after(increment: Odometry) -> float:
             return density(chained(before.since_update, self._plane.law(increment)))
 
-        step = self.odometer.step(*matches, self._seconds(stamp_ns), replace(known, log_density=after))
+        step = self.odometer.step(*matches, self._seconds(stamp_ns), replace(known, log_density=after, hidden=before.hidden))
         missed = 0 if step.estimate.found else 1 + self._passed
         self._stamp_ns, self._passed = stamp_ns, 0
         self._at = replace(
             self._moved(step.odometry, step.estimate.inliers, step.note),
             moving=step.moving,
             assumed=before.assumed + missed,
-            known=0 if missed else before.known + 1,
+            waiting=before.waiting + 1 if missed or before.assumed else 0,
+            hidden=bool(step.moving.any() and not step.estimate.found),
         )
         return self._at
 
@@ -132,7 +135,7 @@ class DeadReckoning:
             "reckoning/delta": at.since_update.delta,
             "reckoning/cov": at.since_update.cov,
             "reckoning/world_from_camera": at.world_from_camera,
-            "reckoning/missed": np.array([at.assumed, at.known, self._passed]),
+            "reckoning/missed": np.array([at.assumed, at.waiting, at.hidden, self._passed]),
         }
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
@@ -141,9 +144,9 @@ class DeadReckoning:
         self._stamp_ns = int(stamps[0]) if stamps.size else None
         self.odometer.velocity = arrays["reckoning/velocity"].copy()
         motion = Odometry(arrays["reckoning/delta"].copy(), arrays["reckoning/cov"].copy())
-        assumed, known, self._passed = (int(count) for count in arrays["reckoning/missed"])
+        assumed, waiting, hidden, self._passed = (int(count) for count in arrays["reckoning/missed"])
         world = arrays["reckoning/world_from_camera"].copy()
-        self._at = Reckoned(motion, world, assumed=assumed, known=known)
+        self._at = Reckoned(motion, world, assumed=assumed, waiting=waiting, hidden=bool(hidden))
 
     def _seconds(self, stamp_ns: int) -> float:
         assert self._stamp_ns is not None

@@ -35,7 +35,7 @@ def motion_for_update(run: "StereoRun", t: int, at: Reckoned) -> Odometry | None
     if count >= run.config.map.agreeing:
         run.notes.append(f"pair {t}: the camera is found again by {count} landmarks of the map, {after}")
         return motion
-    if at.known >= recovery.patience:
+    if at.waiting >= recovery.patience:
         run.notes.append(f"pair {t}: the camera is not found again in the map, which goes on from here, {after}")
         return motion
     return None

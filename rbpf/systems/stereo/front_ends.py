@@ -213,6 +213,7 @@ class ImageFrontEnd(FrontEnd):
         first, second = self._matches[:, agree] if agree.size else self._matches[:, :0]
         names = self.sensor.names if updated else np.full(len(self._kept), NULL, dtype=np.int64)
         self._stood = standing(self._stood, self._matches, agree, self._moving, len(self._kept))
+        self._stood[names >= 0] = 1
         self.tracks.note(step, self._kept.z, self._kept.cov, (first, second), names)
 
     def log(self, name: str, stamps_ns: np.ndarray, truth: CameraTruth | None) -> FeatureLog:
