@@ -201,7 +201,7 @@ class ImageFrontEnd(FrontEnd):
     def log_support(self, belief: Belief, doubt: bool) -> float:
         if not self.config.map.used:
             return 0.0
-        return self.sensor.log_support(self.for_filter(doubt), belief, self._likelihoods[True])
+        return self.sensor.log_support(self.for_filter(doubt), belief)
 
     def seen(self, updated: bool) -> tuple[np.ndarray, np.ndarray]:
         return self._now.z, self.sensor.kinds() if updated else np.full(len(self._now), FEATURE)
@@ -290,7 +290,7 @@ class NameFrontEnd(FrontEnd):
             return 0.0
         named = np.array([ids[name] for name in frame.landmarks[rows].tolist()])
         mean, cov = belief.project(self.sensor.model, named)
-        return log_support(self._likelihoods[True], frame.z[rows] - mean, frame.cov_z[rows] + cov)
+        return log_support(frame.z[rows] - mean, frame.cov_z[rows] + cov, frame.z, self.rig)
 
     def stood(self) -> np.ndarray:
         return self._stood[self._matches[0]]

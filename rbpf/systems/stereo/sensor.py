@@ -13,6 +13,7 @@ from typing import final
 
 import numpy as np
 
+from rbpf import gaussian
 from rbpf.belief import Belief
 from rbpf.exchange import NULL
 from rbpf.maps.point import Point
@@ -190,8 +191,8 @@ class StereoSensor(Sensor):
         out[rows[taken[agreed]]] = found[taken[agreed]]
         return out
 
-    def log_support(self, frame: StereoFrame, belief: Belief, likelihood: Likelihood) -> float:
-        """Log-density of the features that are landmarks, beside that of features of unknown things.
+    def log_support(self, frame: StereoFrame, belief: Belief) -> float:
+        """How well landmarks are seen: their log-density beside that of features of unknown things.
 
         Keys on trial have no say: they may be of what moves.
         """
@@ -201,7 +202,7 @@ class StereoSensor(Sensor):
             return 0.0
         features, ids = frame.features.take(rows), self.ids(belief, names[rows])
         seen = Cloud.of(belief, self.config.cloud).expected(belief, self.model, ids)
-        return log_support(likelihood, features.z - seen.mean, features.cov + seen.cov)
+        return log_support(features.z - seen.mean, features.cov + seen.cov, frame.features.z, self.model.rig)
 
     def _agreed(self, seen: Expected, features: StereoFeatures, doubt: bool) -> np.ndarray:
         """Which matches (k,) are taken: all, unless they are expected so vaguely that the gate tells little."""
@@ -266,6 +267,15 @@ class StereoSensor(Sensor):
         return np.sqrt(features.cov_points[:, 2, 2]) <= self.config.depth_share * features.points[:, 2]
 
 
-def log_support(likelihood: Likelihood, nu: np.ndarray, cov: np.ndarray) -> float:
-    """Σ log p(ν) / p(false match) of innovations (K, 3) with covariances (K, 3, 3)."""
-    return float((likelihood.log_density(nu, cov) - likelihood.log_outlier()).sum())
+def log_support(nu: np.ndarray, cov: np.ndarray, z: np.ndarray, rig: RectifiedStereo) -> float:
+    """Σ max(log N(ν; 0, S) − log λ, 0) of features (k,) that are taken for landmarks: each is, or is so by chance.
+
+    Args:
+        nu: (k, 3) innovations, px.
+        cov: (k, 3, 3) S, px².
+        z: (K, 3) of all features of the pair, which are λ per px³ where they may be.
+        rig: the cameras.
+    """
+    depths = max(float(np.ptp(z[:, 0] - z[:, 2])), 1.0)
+    density = len(z) / (rig.camera.width * rig.camera.height * depths)
+    return float(np.maximum(gaussian.log_density(nu, cov) - np.log(density), 0.0).sum())
