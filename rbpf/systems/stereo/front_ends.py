@@ -156,7 +156,7 @@ class ImageFrontEnd(FrontEnd):
         if frame.image is None or frame.right is None:
             return 0, frame.problem or "an image is missing"
         self._now = self.sift.measure(frame.image, frame.right)
-        return len(self._now), ""
+        return len(self._now), self.sift.remark
 
     def stood(self) -> np.ndarray:
         return self._stood[self._matches[0]]

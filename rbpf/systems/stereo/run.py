@@ -226,6 +226,8 @@ def _reckon(run: StereoRun, t: int, problem: str) -> tuple[Reckoned, bool]:
         what = problem or f"it shows {count} features, {least} are needed"
         run.notes.append(f"pair {t} is passed over: {what}; the last velocity is assumed, widely")
         return reckoning.assumed(stamp), False
+    if problem:
+        run.notes.append(f"pair {t}: {problem}")
     if not reckoning.begun:
         at = reckoning.begin(stamp)
     else:
