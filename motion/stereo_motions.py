@@ -20,7 +20,6 @@ from rbpf import gaussian
 from rbpf.lie import SE3
 from rbpf.motion.odometry import Odometry
 
-
 MISTAKEN = 0.1
 """Share of matches: 4 and 10 % between the pairs of two recordings (how_to/stereo_features)."""
 

@@ -153,7 +153,10 @@ class StereoOdometer:
     ) -> tuple[MotionEstimate, np.ndarray]:
         """The camera's motion of several, and which matches agree on the others."""
         motions = [found, *found.others]
-        groups, laws = np.array([one.inliers for one in motions]), [_joined(one, expected)[0] for one in motions]
+        groups, laws = (
+            np.array([one.inliers for one in motions]),
+            [_joined(one, expected)[0] for one in motions],
+        )
         chosen = camera_motion(groups, laws, known, expected, bool(self.velocity.any()))
         moving = np.any([group for row, group in enumerate(groups) if row != chosen], axis=0)
         if chosen >= 0:

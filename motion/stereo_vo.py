@@ -224,7 +224,9 @@ def _covariance(matches: Matches, found: Minimum, config: VoConfig) -> Array:
 def no_motion(found: MotionEstimate, why: str) -> MotionEstimate:
     """An estimate taken back."""
     nobody = np.zeros_like(found.inliers)
-    return MotionEstimate(found.previous_camera_from_camera, np.full((6, 6), np.nan), nobody, float("nan"), 0, why)
+    return MotionEstimate(
+        found.previous_camera_from_camera, np.full((6, 6), np.nan), nobody, float("nan"), 0, why
+    )
 
 
 def _failed(start: Array, matches: Matches, why: str) -> MotionEstimate:

@@ -133,7 +133,8 @@ class StereoSift:
         """In words, what was wrong with the last pair, though it could be measured; empty where nothing was."""
         if not self.struck:
             return ""
-        return f"{100.0 * self.struck:.1f} % of the pixels are struck by impulses, the median of their surroundings is taken"
+        share = f"{100.0 * self.struck:.1f} %"
+        return f"{share} of the pixels are struck by impulses, the median of their surroundings is taken"
 
     def match(
         self, images: tuple[np.ndarray, np.ndarray], left: KeyPoints, right: KeyPoints

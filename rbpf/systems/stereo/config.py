@@ -108,8 +108,8 @@ class TriggerConfig:
 class RecoveryConfig:
     """What is done where the motion since the last update was only assumed, for all or part of the way.
 
-    The assumed motion's law is far wider than what the map's landmarks leave open. No particle that is drawn from it comes
-    to lie where they are seen, and a weight that T_l bounds cannot tell near from far.
+    The assumed motion's law is far wider than what the map's landmarks leave open. No particle that is drawn from it
+    comes to lie where they are seen, and a weight that T_l bounds cannot tell near from far.
 
     Attributes:
         used: whether anything is done; without, such a motion moves the particles like any other, as in S05.

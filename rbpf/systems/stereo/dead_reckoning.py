@@ -100,7 +100,9 @@ class DeadReckoning:
         def after(increment: Odometry) -> float:
             return density(chained(before.since_update, self._plane.law(increment)))
 
-        step = self.odometer.step(*matches, self._seconds(stamp_ns), replace(known, log_density=after, hidden=before.hidden))
+        step = self.odometer.step(
+            *matches, self._seconds(stamp_ns), replace(known, log_density=after, hidden=before.hidden)
+        )
         missed = 0 if step.estimate.found else 1 + self._passed
         self._stamp_ns, self._passed = stamp_ns, 0
         self._at = replace(
@@ -155,7 +157,7 @@ class DeadReckoning:
     def _moved(self, step: Odometry, agree: np.ndarray, note: str) -> Reckoned:
         step = self._plane.law(step)
         world = SE3.compose(self._at.world_from_camera, step.delta)
-        return Reckoned(chained(self._at.since_update, step), world, agree, note)
+        return Reckoned(chained(self._at.since_update, step), world, agree, note=note)
 
 
 def standstill() -> Odometry:

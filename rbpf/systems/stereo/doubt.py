@@ -1,8 +1,8 @@
 """After a motion that was only assumed: the place is found again in the map before any particle moves.
 
-The law of an assumed motion is a Gaussian, which can wait: as long as the map says nothing about where the camera has come,
-it grows with every pair, and no particle is drawn from it. Drawn at once, a few hundred particles would be decimetres
-apart, none of them within millimetres of the right place, and landmarks started then would be so, too.
+The law of an assumed motion is a Gaussian, which can wait: as long as the map says nothing about where the camera has
+come, it grows with every pair, and no particle is drawn from it. Drawn at once, a few hundred particles would be
+decimetres apart, none of them within millimetres of the right place, and landmarks started then would be so, too.
 """
 
 from typing import TYPE_CHECKING
@@ -36,6 +36,8 @@ def motion_for_update(run: "StereoRun", t: int, at: Reckoned) -> Odometry | None
         run.notes.append(f"pair {t}: the camera is found again by {count} landmarks of the map, {after}")
         return motion
     if at.waiting >= recovery.patience:
-        run.notes.append(f"pair {t}: the camera is not found again in the map, which goes on from here, {after}")
+        run.notes.append(
+            f"pair {t}: the camera is not found again in the map, which goes on from here, {after}"
+        )
         return motion
     return None

@@ -20,8 +20,9 @@ from rbpf.sensors.readers.images.stereo import StereoSequence
 from rbpf.systems.stereo.config import StereoConfig, TriggerConfig
 from rbpf.systems.stereo.dead_reckoning import DeadReckoning, Reckoned, chained
 from rbpf.systems.stereo.doubt import motion_for_update
-from rbpf.systems.stereo.front_ends import FrontEnd, ImageFrontEnd, NameFrontEnd
+from rbpf.systems.stereo.front_ends import FrontEnd, ImageFrontEnd
 from rbpf.systems.stereo.measured import MeasuredSequence
+from rbpf.systems.stereo.name_front_end import NameFrontEnd
 from rbpf.systems.stereo.resuming import cut, restore, save
 from rbpf.systems.stereo.seen import Seen
 from rbpf.systems.stereo.system import build_filter, build_reckoning
@@ -204,8 +205,7 @@ def _frame(run: StereoRun, t: int, frame: Any) -> None:
     run.agreeing[t], run.odometry[t] = at.agreeing, at.world_from_camera
     run.seconds_odometry[t] = time.perf_counter() - started - run.seconds_features[t]
     if whole and (
-        run.filter.steps == 0
-        or triggered(at.since_update, run.config.trigger, t - run.last_update)
+        run.filter.steps == 0 or triggered(at.since_update, run.config.trigger, t - run.last_update)
     ):
         motion = motion_for_update(run, t, at)
         if motion is not None:
@@ -233,9 +233,9 @@ def _reckon(run: StereoRun, t: int, problem: str) -> tuple[Reckoned, bool]:
     else:
         rng = np.random.default_rng([run.config.seed, t])
         matches = run.front_end.matches()
-        known = Known(partial(_log_support, run, t), run.front_end.stood())
+        known = Known(partial(_log_support, run, t), run.front_end.standing.before())
         at = reckoning.measured(stamp, matches, rng, known)
-        run.front_end.leave_out(at.moving)
+        run.front_end.standing.leave_out(at.moving)
         if at.note:
             run.notes.append(f"pair {t}: {at.note}")
     run.front_end.keep()
