@@ -167,7 +167,8 @@ class Filter:
             log_weights = uniform_log_weights(self.n)
             prior, groups = self._descend(ancestors, prior, groups)
 
-        state, log_w2 = self._sample_and_update(prior, proposed, groups, ancestors, proposal.exact)
+        parents = np.arange(self.n) if ancestors is None else ancestors
+        state, log_w2 = self._sample_and_update(prior, proposed, groups, parents, proposal.exact)
         log_weights, correction = reweight(log_weights, log_w2, f"step {self.steps}")
         self.particles = Particles(state, log_weights)
         if proposed.nis is None:
@@ -258,15 +259,9 @@ class Filter:
         return prior.take(ancestors), groups
 
     def _sample_and_update(
-        self,
-        prior: Prior,
-        proposed: Proposed,
-        groups: list[Observations],
-        ancestors: np.ndarray | None,
-        exact: bool,
+        self, prior: Prior, proposed: Proposed, groups: list[Observations], parents: np.ndarray, exact: bool
     ) -> tuple[np.ndarray, np.ndarray]:
         """One state for each descendant, and log w₂ = log p(z|x) + log p(x|x⁻) − log q(x) − log w₁."""
-        parents = np.arange(self.n) if ancestors is None else ancestors
         whitened, log_ratio = proposed.sample(parents, self.rng)
         increment = prior.mean + np.einsum("nar,nr->na", prior.factor, whitened)
         state = prior.at(increment)

@@ -44,6 +44,7 @@ class StereoRun:
         cov: (T, 6, 6) of it in the right chart at the mean, order [ω, v].
         odometry: (T, 7) world_from_camera by odometry alone.
         features: (T,) of each pair;  agreeing: (T,) matches that agree with the motion since the last pair.
+        assumed: (T,) pairs since the place was known last over which the motion was only assumed; 0 where it is known.
         updated: (T,) whether the filter was updated;  observed: (T,) landmarks seen then.
         ess: (T,) effective sample size before resampling, 0 without an update;  resampled: (T,).
         log_evidence: (T,) increments, NaN where the likelihood is no density.
@@ -72,6 +73,7 @@ class StereoRun:
     odometry: np.ndarray
     features: np.ndarray
     agreeing: np.ndarray
+    assumed: np.ndarray
     updated: np.ndarray
     observed: np.ndarray
     ess: np.ndarray
@@ -153,7 +155,7 @@ def _begin(
     total = stamps_ns.size
     reckoning, filter_ = build_reckoning(front_end.rig, config), build_filter(front_end.sensor, config)
     poses, covs, odometry = np.zeros((total, 7)), np.zeros((total, 6, 6)), np.zeros((total, 7))
-    numbers = np.zeros((14, total))
+    numbers = np.zeros((15, total))
     return StereoRun(
         name, truth, config, front_end, reckoning, filter_, stamps_ns, poses, covs, odometry, *numbers
     )
@@ -210,6 +212,7 @@ def _frame(run: StereoRun, t: int, frame: Any) -> None:
         motion = motion_for_update(run, t, at)
         if motion is not None:
             _update(run, t, motion, run.config.recovery.used and at.assumed > 0)
+    run.assumed[t] = 0 if run.updated[t] and run.config.recovery.used else at.assumed
     if whole:
         run.front_end.note(t, at.agree, bool(run.updated[t]))
     estimate = moved_on(run.at_update, at.since_update) if not run.updated[t] else run.at_update
