@@ -2,12 +2,13 @@
 
 Each group of matches agrees on a motion x. The probability that group h stands still, and the others move, is
 
-    P(h) ∝ n_h · N(x_h; expected) · p(map | x_h) · B(h),    Mathematics (vo-static).
+    P(h) ∝ (1 + n_h) · N(x_h; expected) · p(map | x_h) · B(h),    Mathematics (vo-static).
 
-Each match is as likely as any other to be of what stands still: n_h. B is the group's past: what stood still goes on to
-do so, and what moved to move, but for a share of the matches that are mistaken, and for things that begin or stop. The
-groups' own likelihoods are the same whichever of them stands still, and so are the volumes that they leave open; what
-moves may move by as much as a camera may. That none of them stands still is one case more, as likely as a single match.
+Of n_h matches nothing is known, each is as likely as any other to be of what stands still. B is the group's past: what
+stood still goes on to do so, and what moved to move, but for a share of the matches that are mistaken, and for things
+that begin or stop. The groups' own likelihoods are the same whichever of them stands still, and so are the volumes that
+they leave open; what moves may move by as much as a camera may. That none of them stands still is one case more, as
+likely as one match more.
 """
 
 from collections.abc import Callable, Sequence
@@ -54,6 +55,11 @@ class Known:
         few = (still & agree).sum() < (still & ~agree).sum()
         return bool(self.hidden or few or self.stood[agree].sum() < 0)
 
+    def fresh(self, groups: np.ndarray) -> np.ndarray:
+        """How many matches of groups (M, K) have no past, (M,)."""
+        chosen = groups & (self.stood == 0) if self.stood.size else groups
+        return np.asarray(chosen.sum(axis=1))
+
     def log_past(self, group: np.ndarray) -> float:
         """Log B of a group (K,): bounded, for a thing begins or stops as a whole."""
         odds = np.log((1.0 - MISTAKEN) / MISTAKEN) * self.stood[group].sum() if self.stood.size else 0.0
@@ -77,7 +83,7 @@ def camera_motion(
     scores = np.array([known.log_past(group) for group in everyone])
     scores += [known.log_density(law) for law in (*laws, expected)]
     none = scores[-1] + np.log((1.0 - CHANGES) / CHANGES) * known.hidden
-    scores = scores[:-1] + np.log(groups.sum(axis=1))
+    scores = scores[:-1] + np.log1p(known.fresh(groups))
     if not trusted:
         return int(np.argmax(scores)) if scores.max() >= none else -1
     chol = gaussian.cholesky(expected.cov)

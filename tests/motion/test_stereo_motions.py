@@ -54,8 +54,8 @@ def test_the_map_decides():
 
 
 def test_none_of_them_is_believed_of_the_map_alone():
-    """Landmarks that no motion explains, and a wide law does: as likely as one match, whatever was expected."""
-    for support, right in ((np.log(200) + 0.1, -1), (np.log(200) - 0.1, 1)):
+    """Landmarks that no motion explains, and a wide law does: as likely as one match more, whatever was expected."""
+    for support, right in ((np.log(201) + 0.1, -1), (np.log(201) - 0.1, 1)):
 
         def of_map(increment: Odometry, support: float = support) -> float:
             return support * (increment is EXPECTED)
