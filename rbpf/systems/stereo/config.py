@@ -108,23 +108,19 @@ class TriggerConfig:
 class RecoveryConfig:
     """What is done where the motion since the last update was only assumed, for all or part of the way.
 
-    The assumed motion's law is far wider than what the map's landmarks leave open. No particle that is drawn from it
-    comes to lie where they are seen, and a weight that T_l bounds cannot tell near from far.
+    The assumed motion's law is far wider than what the map's landmarks leave open: no particle that is drawn from it
+    comes to lie where they are seen.
 
     Attributes:
         used: whether anything is done; without, such a motion moves the particles like any other, as in S05.
         patience: pairs after which the map goes on from wherever the camera may be: it may have come to where
             nothing was mapped.
         proposal: of an update after such a motion.
-        likelihood: of landmarks then: a density, that the motion's law can be weighed against.
     """
 
     used: bool = True
     patience: int = 60
     proposal: ProposalConfig = field(default_factory=lambda: ProposalConfig("ekf", iterations=5))
-    likelihood: LikelihoodConfig = field(
-        default_factory=lambda: LikelihoodConfig("outliers", outlier_volume=OUTLIER_VOLUME_PX3)
-    )
 
     def __post_init__(self) -> None:
         """Checks what no part checks itself."""

@@ -124,7 +124,6 @@ class ImageFrontEnd(FrontEnd):
         self.sift = StereoSift(rig, config.sift, config.pair)
         likelihood = config.likelihood.build()
         self.sensor: StereoSensor = StereoSensor(rig, config.map, config.keys, config.sift.length, likelihood)
-        self._likelihoods = likelihood, config.recovery.likelihood.build()
         nothing = np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0), np.zeros(0)
         self._none = StereoFeatures.measured(
             rig, *nothing, np.zeros((0, config.sift.length), dtype=np.float32)
@@ -165,7 +164,6 @@ class ImageFrontEnd(FrontEnd):
 
     def for_filter(self, doubt: bool = False) -> StereoFrame:
         """All features that stand still, or the half of them that is the map's."""
-        self.sensor.likelihood = self._likelihoods[doubt]
         split, free = self.config.odometry.split, np.ones(len(self._now), dtype=bool)
         if split != "none":
             half = half_of(self._now.keys)

@@ -41,9 +41,10 @@ class NameFrontEnd(FrontEnd):
         self.rig = log.camera
         self.config = config
         self._log = log
-        self._likelihoods = config.likelihood.build(), config.recovery.likelihood.build()
         self.model = StereoPoint(log.camera)
-        self.sensor: NamedLandmarkSensor = NamedLandmarkSensor(self.model, Point(3), self._likelihoods[False])
+        self.sensor: NamedLandmarkSensor = NamedLandmarkSensor(
+            self.model, Point(3), config.likelihood.build()
+        )
         self._now = self._kept = FeatureFrame(
             0, np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3))
         )
@@ -87,7 +88,6 @@ class NameFrontEnd(FrontEnd):
 
     def for_filter(self, doubt: bool = False) -> FeatureFrame:
         """All of them, those of odd or even names, or none."""
-        self.sensor.likelihood = self._likelihoods[doubt]
         config, frame = self.config, self._now
         chosen = np.full(frame.landmarks.size, config.map.used)
         if config.odometry.split != "none":
