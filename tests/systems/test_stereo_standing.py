@@ -1,7 +1,9 @@
 """What stands still is followed from pair to pair."""
 
 import numpy as np
+import pytest
 
+from rbpf.errors import InputError
 from rbpf.systems.stereo.standing import Standing
 
 NONE = np.zeros(0, dtype=np.intp)
@@ -55,7 +57,9 @@ def test_what_the_map_has_stands_still():
 
 def test_state_is_kept():
     standing, other = started(), Standing()
-    other.restore(standing.arrays())
+    other.restore(standing.arrays(), 5)
+    with pytest.raises(InputError, match="pair/stood"):
+        other.restore(standing.arrays(), 4)
     for one in (standing, other):
         one.look()
         one.match(np.arange(5), np.arange(5))

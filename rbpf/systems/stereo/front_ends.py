@@ -207,7 +207,7 @@ class ImageFrontEnd(FrontEnd):
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         names = ("z", "cov", "scale", "orientation", "keys")
         self._kept = StereoFeatures.measured(self.rig, *(arrays[f"pair/{name}"].copy() for name in names))
-        self.standing.restore(arrays)
+        self.standing.restore(arrays, len(self._kept))
         self.sensor.restore(arrays)
         self.tracks.restore(arrays)
 

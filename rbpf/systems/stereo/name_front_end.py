@@ -115,4 +115,4 @@ class NameFrontEnd(FrontEnd):
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         names, z, cov = (arrays[f"pair/{name}"].copy() for name in ("names", "z", "cov"))
         self._kept = FeatureFrame(0, names, z, cov)
-        self.standing.restore(arrays)
+        self.standing.restore(arrays, names.size)

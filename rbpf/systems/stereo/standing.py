@@ -4,6 +4,8 @@ from typing import final
 
 import numpy as np
 
+from rbpf.archive import checked
+
 
 @final
 class Standing:
@@ -54,6 +56,10 @@ class Standing:
         """For a checkpoint."""
         return {"pair/stood": self._stood}
 
-    def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """The inverse of `arrays`."""
-        self._stood = arrays["pair/stood"].copy()
+    def restore(self, arrays: dict[str, np.ndarray], count: int) -> None:
+        """The inverse of `arrays`, of a pair of so many features.
+
+        Raises:
+            InputError: they are not what they should be.
+        """
+        self._stood = checked(arrays, "pair/stood", (count,), "i").copy()
