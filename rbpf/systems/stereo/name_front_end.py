@@ -49,6 +49,7 @@ class NameFrontEnd(FrontEnd):
             0, np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3))
         )
         self.standing = Standing()
+        self._filtered = self._proven = np.zeros(0, dtype=np.int64)
 
     def look(self, frame: FeatureFrame) -> tuple[int, str]:
         """Nothing is to be done."""
@@ -70,12 +71,12 @@ class NameFrontEnd(FrontEnd):
         self._kept = self._now
 
     def recognised(self, belief: Belief) -> int:
-        """By their names."""
-        return int(np.isin(self.for_filter().landmarks, list(belief.catalogue.values())).sum())
+        """By their names, those that the filter has taken more than once."""
+        return int(np.isin(self.for_filter().landmarks, self._proven).sum())
 
     def log_support(self, belief: Belief, doubt: bool) -> float:
         frame, ids = self.for_filter(), {name: i for i, name in belief.catalogue.items()}
-        rows = np.flatnonzero(np.isin(frame.landmarks, list(ids)))
+        rows = np.flatnonzero(np.isin(frame.landmarks, self._proven))
         if not rows.size:
             return 0.0
         named = np.array([ids[name] for name in frame.landmarks[rows].tolist()])
@@ -100,7 +101,11 @@ class NameFrontEnd(FrontEnd):
         return self._now.z, np.full(self._now.landmarks.size, LANDMARK if updated else FEATURE)
 
     def note(self, step: int, agree: np.ndarray, updated: bool) -> None:
-        """The log has it all but what stands still."""
+        """The log has it all but what stands still, and which names the filter has taken again."""
+        if updated:
+            taken = self.for_filter().landmarks
+            self._proven = np.union1d(self._proven, np.intersect1d(self._filtered, taken))
+            self._filtered = np.union1d(self._filtered, taken)
         self.standing.note(self._kept.landmarks.size, agree, np.zeros(0, dtype=np.intp))
 
     def log(self, name: str, stamps_ns: np.ndarray, truth: CameraTruth | None) -> FeatureLog:
@@ -110,9 +115,11 @@ class NameFrontEnd(FrontEnd):
     def arrays(self) -> dict[str, np.ndarray]:
         kept = self._kept
         pair = {"pair/names": kept.landmarks, "pair/z": kept.z, "pair/cov": kept.cov_z}
-        return pair | self.standing.arrays()
+        names = {"names/filtered": self._filtered, "names/proven": self._proven}
+        return pair | names | self.standing.arrays()
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         names, z, cov = (arrays[f"pair/{name}"].copy() for name in ("names", "z", "cov"))
         self._kept = FeatureFrame(0, names, z, cov)
+        self._filtered, self._proven = arrays["names/filtered"].copy(), arrays["names/proven"].copy()
         self.standing.restore(arrays, names.size)
