@@ -124,7 +124,7 @@ class StereoOdometer:
             cov_prev: (K, 3, 3) of the earlier pixels.
             cov_now: (K, 3, 3) of the later ones.
             dt: seconds between the frames.
-            known: besides the matches: asked where these agree on several motions, or landmarks do not agree.
+            known: besides the matches: asked where these agree on several motions, or those that stood still do not.
 
         Raises:
             InputError: as `estimate_motion`, or dt is not positive.
@@ -153,16 +153,14 @@ class StereoOdometer:
     ) -> tuple[MotionEstimate, np.ndarray]:
         """The camera's motion of several, and which matches agree on the others."""
         motions = [found, *found.others]
-        groups, laws = (
-            np.array([one.inliers for one in motions]),
-            [_joined(one, expected)[0] for one in motions],
-        )
+        groups = np.array([one.inliers for one in motions])
+        laws = [_joined(one, expected)[0] for one in motions]
         chosen = camera_motion(groups, laws, known, expected, bool(self.velocity.any()))
         moving = np.any([group for row, group in enumerate(groups) if row != chosen], axis=0)
         if chosen >= 0:
             return motions[chosen], moving
         many = " and ".join(map(str, groups.sum(axis=1)))
-        why = f"{many} of {found.inliers.size} matches agree on a motion, which the map contradicts"
+        why = f"{many} of {found.inliers.size} matches agree on a motion, but not the map and what stood still before"
         return no_motion(found, why), moving
 
 

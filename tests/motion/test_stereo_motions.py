@@ -128,7 +128,10 @@ def test_what_the_map_contradicts_is_not_believed():
     arrays = thing.z_prev, thing.z_now, thing.cov_prev, thing.cov_now, 0.1
     known = Known(lambda increment: 0.0, -np.ones(12, dtype=np.int8))
     found = odometer.step(*arrays, known)
-    assert not found.estimate.found and "which the map contradicts; a camera at rest is assumed" in found.note
+    assert (
+        not found.estimate.found
+        and "but not the map and what stood still before; a camera at rest is assumed" in found.note
+    )
     assert found.moving.sum() >= 10 and not odometer.velocity.any()
     np.testing.assert_array_equal(found.odometry.delta, SE3.identity())
     assert odometer.step(*arrays).estimate.found
