@@ -11,7 +11,8 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
 from rbpf.motion.odometry import Odometry
 from rbpf.motion.stereo_geometry import StereoCamera
-from rbpf.motion.stereo_vo import MotionEstimate, VoConfig, estimate_motion
+from rbpf.motion.stereo_motions import Known, camera_motion
+from rbpf.motion.stereo_vo import MotionEstimate, VoConfig, estimate_motion, no_motion
 
 ROUNDING = 1e-14
 """Variances below this share of the largest are rounding."""
@@ -52,11 +53,13 @@ class OdometerStep(NamedTuple):
         odometry: previous_camera_from_camera and its covariance, to hand to a filter.
         estimate: what the matches said.
         note: in words, where the increment is not simply that; empty else.
+        moving: (K,) matches that agree on another motion than the camera's: they are of things that move.
     """
 
     odometry: Odometry
     estimate: MotionEstimate
     note: str
+    moving: np.ndarray
 
 
 class SeenFrame(Protocol):
@@ -104,8 +107,24 @@ class StereoOdometer:
         self.config, self.prediction = config or VoConfig(), prediction or Prediction()
         self.velocity = np.zeros(6)
 
-    def step(self, z_prev: Array, z_now: Array, cov_prev: Array, cov_now: Array, dt: float) -> OdometerStep:
+    def step(
+        self,
+        z_prev: Array,
+        z_now: Array,
+        cov_prev: Array,
+        cov_now: Array,
+        dt: float,
+        known: Known | None = None,
+    ) -> OdometerStep:
         """The increment over `dt` seconds from matched pixels; see `rbpf.motion.stereo_vo.estimate_motion`.
+
+        Args:
+            z_prev: (K, 3) pixels in the earlier frame.
+            z_now: (K, 3) in the later one.
+            cov_prev: (K, 3, 3) of the earlier pixels.
+            cov_now: (K, 3, 3) of the later ones.
+            dt: seconds between the frames.
+            known: besides the matches: asked where these agree on several motions, or those that stood still do not.
 
         Raises:
             InputError: as `estimate_motion`, or dt is not positive.
@@ -116,14 +135,33 @@ class StereoOdometer:
         found = estimate_motion(
             self.camera, z_prev, z_now, cov_prev, cov_now, self.rng, expected.delta, self.config
         )
+        moving, several = np.zeros(found.inliers.size, dtype=bool), ""
+        known = known or Known()
+        if found.others or (found.found and known.contradicts(found.inliers)):
+            found, moving = self._of_camera(found, expected, known)
+            several = _several_motions(found, moving) if moving.any() else ""
         if not found.found:
             what = "the last velocity" if self.velocity.any() else "a camera at rest"
-            return OdometerStep(expected, found, f"{found.failure}; {what} is assumed, widely")
+            return OdometerStep(expected, found, f"{found.failure}; {what} is assumed, widely", moving)
         odometry, note = _joined(found, expected)
-        note = "; ".join(filter(None, (note, _two_motions(found))))
         if self.prediction.keep_velocity:
             self.velocity = SE3.log(odometry.delta) / dt
-        return OdometerStep(odometry, found, note)
+        return OdometerStep(odometry, found, "; ".join(filter(None, (note, several))), moving)
+
+    def _of_camera(
+        self, found: MotionEstimate, expected: Odometry, known: Known
+    ) -> tuple[MotionEstimate, np.ndarray]:
+        """The camera's motion of several, and which matches agree on the others."""
+        motions = [found, *found.others]
+        groups = np.array([one.inliers for one in motions])
+        laws = [_joined(one, expected)[0] for one in motions]
+        chosen = camera_motion(groups, laws, known, expected, bool(self.velocity.any()))
+        moving = np.any([group for row, group in enumerate(groups) if row != chosen], axis=0)
+        if chosen >= 0:
+            return motions[chosen], moving
+        many = " and ".join(map(str, groups.sum(axis=1)))
+        why = f"{many} of {found.inliers.size} matches agree on a motion, but not the map and what stood still before"
+        return no_motion(found, why), moving
 
 
 def match_names(before: np.ndarray, now: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -160,13 +198,11 @@ def chain(increments: Sequence[Array]) -> Array:
     return np.array(path)
 
 
-def _two_motions(found: MotionEstimate) -> str:
-    """In words, that part of what is seen moves; empty where nothing does."""
-    if not found.elsewhere:
-        return ""
+def _several_motions(found: MotionEstimate, moving: np.ndarray) -> str:
+    """In words, that part of what is seen moves."""
     return (
-        f"{found.inliers.sum()} of {found.inliers.size} matches agree on a motion and {found.elsewhere} on another: "
-        "something in the view moves, and the camera's motion is taken to be that of the many"
+        f"{found.inliers.sum()} of {found.inliers.size} matches agree on a motion and {moving.sum()} on another: "
+        f"something in the view moves, and the camera's motion is taken to be that of the {found.inliers.sum()}"
     )
 
 

@@ -81,8 +81,8 @@ class MotionEstimate:
             what the gate cuts off made up for.
         iterations: of the optimiser.
         failure: why no motion was found, in words; empty where one was.
-        elsewhere: number of matches that are far from this motion and agree on another one, as those on a thing that
-            moves; false matches agree on none.
+        others: motions that matches far from this one agree on, as those on a thing that moves, each with its own
+            inliers; false matches agree on none.
     """
 
     previous_camera_from_camera: Array
@@ -91,12 +91,17 @@ class MotionEstimate:
     rms: float
     iterations: int
     failure: str = ""
-    elsewhere: int = 0
+    others: tuple["MotionEstimate", ...] = ()
 
     @property
     def found(self) -> bool:
         """Whether there is a motion."""
         return not self.failure
+
+    @property
+    def elsewhere(self) -> int:
+        """Number of matches that agree on other motions."""
+        return int(sum(other.inliers.sum() for other in self.others))
 
 
 def estimate_motion(
@@ -134,7 +139,7 @@ def estimate_motion(
         return _failed(start, matches, f"{complaint}, {config.least_matches} are needed")
     motion = consensus(matches.rows(real), start, config.gate, rng, config.draws)
     found = _refined(matches, real, motion, start, config)
-    return replace(found, elsewhere=_elsewhere(matches, real, found, config, rng)) if found.found else found
+    return replace(found, others=_others(matches, real, found, config, rng)) if found.found else found
 
 
 def fit(matches: Matches, start: Array, config: VoConfig) -> Minimum:
@@ -180,17 +185,24 @@ def _refined(
     return MotionEstimate(motion, _covariance(part, found, config), inliers, float(rms), iterations)
 
 
-def _elsewhere(
-    matches: Matches, real: np.ndarray, found: MotionEstimate, config: VoConfig, rng: np.random.Generator
-) -> int:
-    """How many matches agree on another motion; those just outside the gate belong to the one that was found."""
-    squared = _squared(matches, found.previous_camera_from_camera, config)
-    far = matches.rows(real & (squared > WIDE * config.gate))
-    if len(far) < config.least_matches:
-        return 0
-    motion = consensus(far, SE3.identity(), config.gate, rng, config.draws)
-    other = _refined(far, np.ones(len(far), dtype=bool), motion, motion, config)
-    return int(other.inliers.sum())
+def _others(
+    matches: Matches, left: np.ndarray, found: MotionEstimate, config: VoConfig, rng: np.random.Generator
+) -> tuple[MotionEstimate, ...]:
+    """Other motions that matches agree on; those just outside a gate belong to the motion that was found first."""
+    others = list[MotionEstimate]()
+    while found.found:
+        squared = _squared(matches, found.previous_camera_from_camera, config)
+        left = left & (squared > WIDE * config.gate)
+        if left.sum() < config.least_matches:
+            break
+        far, inliers = matches.rows(left), np.zeros(len(matches), dtype=bool)
+        motion = consensus(far, SE3.identity(), config.gate, rng, config.draws)
+        found = _refined(far, np.ones(len(far), dtype=bool), motion, motion, config)
+        inliers[np.flatnonzero(left)[found.inliers]] = True
+        if found.found:
+            found = replace(found, inliers=inliers)
+            others.append(found)
+    return tuple(others)
 
 
 def _squared(matches: Matches, motion: Array, config: VoConfig) -> Array:
@@ -207,6 +219,14 @@ def _covariance(matches: Matches, found: Minimum, config: VoConfig) -> Array:
     pixels = white_rows(matches, found.x, "adjusted").pixels
     adjusted = linearised(matches, found.x, pixels, "adjusted")
     return trimming(config.gate) * honest_covariance(matches, adjusted, found.factor)
+
+
+def no_motion(found: MotionEstimate, why: str) -> MotionEstimate:
+    """An estimate taken back."""
+    nobody = np.zeros_like(found.inliers)
+    return MotionEstimate(
+        found.previous_camera_from_camera, np.full((6, 6), np.nan), nobody, float("nan"), 0, why
+    )
 
 
 def _failed(start: Array, matches: Matches, why: str) -> MotionEstimate:

@@ -127,13 +127,21 @@ class Filter:
         """Number of particles."""
         return self.particles.n
 
-    def step(self, frame: Any, control: Any = None, stamp_ns: int | None = None) -> StepReport:
+    def expect(self, control: Any = None, stamp_ns: int | None = None) -> Belief:
+        """What `step` would tell the sensors, for looking at a frame before it is filtered; no particle moves."""
+        _, dt = self._clock(stamp_ns)
+        return Belief(self.particles.log_weights, self._predict(control, dt), self.marginals)
+
+    def step(
+        self, frame: Any, control: Any = None, stamp_ns: int | None = None, proposal: Proposal | None = None
+    ) -> StepReport:
         """Predicts, observes, refines, weighs, resamples, samples, corrects and updates; then starts landmarks.
 
         Args:
             frame: what the sensors observe.
             control: what the motion model moves by.
             stamp_ns: time of the frame; by default the previous one plus one second.
+            proposal: of this step, where the filter's own would not do.
 
         Raises:
             InputError: time runs backwards, shapes do not fit, or no particle explains the observations. If the
@@ -143,23 +151,23 @@ class Filter:
         stamp_ns, dt = self._clock(stamp_ns)
         prior = self._predict(control, dt)
         groups = self._observe(frame, Belief(self.particles.log_weights, prior, self.marginals))
-        proposed = self.proposal.propose(prior, self.marginals.linearised(prior, groups))
+        proposal = proposal or self.proposal
+        proposed = proposal.propose(prior, self.marginals.linearised(prior, groups))
         log_weights, look_ahead = reweight(self.particles.log_weights, proposed.log_w1, f"step {self.steps}")
         mixture: tuple[Prior, Proposed | None, np.ndarray] = (prior, proposed, log_weights)
-
         weights = np.exp(log_weights)
         ancestors = self.resampler.ancestors(weights, self.rng)
         if ancestors is not None:
             log_weights = uniform_log_weights(self.n)
             prior, groups = self._descend(ancestors, prior, groups)
 
-        state, log_w2 = self._sample_and_update(prior, proposed, groups, ancestors)
+        parents = np.arange(self.n) if ancestors is None else ancestors
+        state, log_w2 = self._sample_and_update(prior, proposed, groups, parents, proposal.exact)
         log_weights, correction = reweight(log_weights, log_w2, f"step {self.steps}")
         self.particles = Particles(state, log_weights)
         if proposed.nis is None:
             mixture = (Prior.exactly(self.space, state), None, log_weights)
         first_sightings, births = self._start_landmarks(frame, groups)
-
         normalised = all(group.likelihood is None or group.likelihood.normalised for group in groups)
         evidence = look_ahead + correction if normalised else float("nan")
         self.log_evidence += evidence
@@ -202,15 +210,13 @@ class Filter:
 
     def estimate(self) -> Estimate:
         """Mean and covariance of the particles as they are."""
-        return mixture_estimate(
-            Prior.exactly(self.space, self.particles.state), None, self.particles.log_weights
-        )
+        here = Prior.exactly(self.space, self.particles.state)
+        return mixture_estimate(here, None, self.particles.log_weights)
 
     def belief(self) -> Belief:
         """The particles as they are, for reading the map."""
-        return Belief(
-            self.particles.log_weights, Prior.exactly(self.space, self.particles.state), self.marginals
-        )
+        here = Prior.exactly(self.space, self.particles.state)
+        return Belief(self.particles.log_weights, here, self.marginals)
 
     def save(self, path: Path | str, extra: dict[str, np.ndarray] | None = None) -> None:
         """Writes a checkpoint from which `load` goes on as if nothing had happened, with arrays of the caller's."""
@@ -265,15 +271,14 @@ class Filter:
         return prior.take(ancestors), groups
 
     def _sample_and_update(
-        self, prior: Prior, proposed: Proposed, groups: list[Observations], ancestors: np.ndarray | None
+        self, prior: Prior, proposed: Proposed, groups: list[Observations], parents: np.ndarray, exact: bool
     ) -> tuple[np.ndarray, np.ndarray]:
         """One state for each descendant, and log w₂ = log p(z|x) + log p(x|x⁻) − log q(x) − log w₁."""
-        parents = np.arange(self.n) if ancestors is None else ancestors
         whitened, log_ratio = proposed.sample(parents, self.rng)
         increment = prior.mean + np.einsum("nar,nr->na", prior.factor, whitened)
         state = prior.at(increment)
         densities = self.marginals.correct(state, increment, groups)
-        if not self.proposal.exact:
+        if not exact:
             return state, densities.late
         log_w1 = proposed.log_w1[parents]
         # A parent of weight zero that was not resampled keeps it, whatever its second factor is.

@@ -21,6 +21,7 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.sensors.candidates import band_pairs
 from rbpf.sensors.disparity import refine
+from rbpf.sensors.impulses import without_impulses
 from rbpf.sensors.key_matching import KeyMatches, MatchLimits, match_pairs
 from rbpf.sensors.patches import checked_image
 from rbpf.sensors.pinhole import RectifiedStereo
@@ -43,6 +44,7 @@ class StereoConfig:
         scale_ratio: largest ratio of the two scales.
         turn_rad: largest difference of the two orientations.
         limits: of the keys.
+        mend: whether pixels that were struck by impulse noise are replaced before anything is looked for.
         refine: whether the disparity is refined on grey values.
         half_px: of the refinement's window.
         least_correlation: of the refined windows, else the match is dropped.
@@ -63,6 +65,7 @@ class StereoConfig:
     scale_ratio: float = 1.5
     turn_rad: float = 0.35
     limits: MatchLimits = field(default_factory=MatchLimits)
+    mend: bool = True
     refine: bool = True
     half_px: int = 5
     least_correlation: float = 0.8
@@ -109,6 +112,8 @@ class StereoSift:
         self.rig = rig
         self.sift = Sift(sift)
         self.config = stereo or StereoConfig()
+        self.struck = 0.0
+        """Share of the pixels that were replaced in the last pair."""
 
     def measure(self, left: np.ndarray, right: np.ndarray) -> StereoFeatures:
         """Features of a pair of images (H, W) uint8; none where there is no texture.
@@ -117,7 +122,19 @@ class StereoSift:
             InputError: the images are not of the camera's size, or they are swapped.
         """
         self._check(left, right)
+        self.struck = 0.0
+        if self.config.mend:
+            (left, one), (right, other) = without_impulses(left), without_impulses(right)
+            self.struck = 0.5 * (one + other)
         return self.match((left, right), self.sift.detect(left), self.sift.detect(right))
+
+    @property
+    def remark(self) -> str:
+        """In words, what was wrong with the last pair, though it could be measured; empty where nothing was."""
+        if not self.struck:
+            return ""
+        share = f"{100.0 * self.struck:.1f} %"
+        return f"{share} of the pixels are struck by impulses, the median of their surroundings is taken"
 
     def match(
         self, images: tuple[np.ndarray, np.ndarray], left: KeyPoints, right: KeyPoints

@@ -136,7 +136,7 @@ def _write_tables(run: StereoRun, out: Path) -> None:
     columns = ((1e3 * column).round(4).tolist() for column in seconds)
     names = ["step", "milliseconds", *(f"{stage}_ms" for stage in _STAGES)]
     write_csv(out / "timings.csv", names, zip(steps, *columns, strict=True))
-    whole = "features", "agreeing", "updated", "observed", "resampled", "nis_dof"
+    whole = "features", "agreeing", "assumed", "updated", "observed", "resampled", "nis_dof"
     real = "ess", "log_evidence", "nis"
     counts = (getattr(run, name).astype(int).tolist() for name in whole)
     numbers = (getattr(run, name).tolist() for name in real)

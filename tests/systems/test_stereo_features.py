@@ -9,7 +9,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.features import FeatureFrame, FeatureLog
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig
-from rbpf.systems.stereo.config import OdometryConfig, StereoConfig, TriggerConfig
+from rbpf.systems.stereo.config import OdometryConfig, RecoveryConfig, StereoConfig, TriggerConfig
 from rbpf.systems.stereo.run import StereoRun, run_features
 from rbpf.validation.gtsam_ba_camera import CameraEstimate, solve_features
 from rbpf.validation.simulation.features import MONO, STEREO, Measuring, simulate_features
@@ -104,6 +104,46 @@ def test_halves_of_the_landmarks(log):
         assert names.size > 50 and (names % 2 == remainder).all()
     seen = np.intersect1d(log.frames[0].landmarks, log.frames[1].landmarks)
     assert run.agreeing[1] <= (seen % 2 == 0).sum()
+
+
+def without_names(log: FeatureLog, first: int, count: int) -> FeatureLog:
+    """In some frames every landmark has a name of its own: nothing is known of the motion there."""
+    frames = list(log.frames)
+    for t in range(first, first + count):
+        frames[t] = replace(frames[t], landmarks=frames[t].landmarks + 100_000 * (1 + t))
+    return replace(log, frames=frames)
+
+
+def test_found_again_by_names(log):
+    """Three frames that match nothing, then the old names: the prior proposal alone does not find back."""
+    config = replace(CONFIG, likelihood=LikelihoodConfig("truncated"), proposal=ProposalConfig("prior"))
+    broken, errors = without_names(log, 20, 3), []
+    for used in (True, False):
+        run = run_features(broken, replace(config, recovery=RecoveryConfig(used=used)))
+        errors.append(rmse(run, run.world_from_camera))
+        assert any("found again by" in note for note in run.notes) == used
+        assert run.assumed[20:23].all() and not run.assumed[24:].any()
+    assert errors[0] < 0.5 * errors[1]
+
+
+@pytest.mark.parametrize("count", [20, 60])
+def test_a_thing_that_moves_through_the_view(log, count):
+    """From frame 20 on points go along with a thing that crosses the view, half as many as the world's or more."""
+    rng, frames = np.random.default_rng(0), list(log.frames)
+    here = np.array([-0.4, -0.3, 2.0]) + rng.uniform(-0.3, 0.3, (count, 3))
+    cov, names = np.tile(0.3**2 * np.eye(3), (count, 1, 1)), 900_000 + np.arange(count)
+    for t in range(20, len(frames)):
+        one, gone = frames[t], np.array([0.05 * (t - 20), 0.0, 0.0])
+        frames[t] = replace(
+            one,
+            landmarks=np.append(one.landmarks, names),
+            z=np.concatenate([one.z, log.camera.project(here + gone) + 0.3 * rng.normal(size=(count, 3))]),
+            cov_z=np.concatenate([one.cov_z, cov]),
+        )
+    config = replace(CONFIG, likelihood=StereoConfig().likelihood)
+    run, whole = run_features(replace(log, frames=frames), config), run_features(log, config)
+    assert sum("something in the view moves" in note for note in run.notes) > 10
+    assert rmse(run, run.world_from_camera) < 1.3 * rmse(whole, whole.world_from_camera)
 
 
 def test_resumed(log, tmp_path):

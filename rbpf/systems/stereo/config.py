@@ -105,6 +105,30 @@ class TriggerConfig:
 
 
 @dataclass(frozen=True)
+class RecoveryConfig:
+    """What is done where the motion since the last update was only assumed, for all or part of the way.
+
+    The assumed motion's law is far wider than what the map's landmarks leave open: no particle that is drawn from it
+    comes to lie where they are seen.
+
+    Attributes:
+        used: whether anything is done; without, such a motion moves the particles like any other, as in S05.
+        patience: pairs after which the map goes on from wherever the camera may be: it may have come to where
+            nothing was mapped.
+        proposal: of an update after such a motion.
+    """
+
+    used: bool = True
+    patience: int = 60
+    proposal: ProposalConfig = field(default_factory=lambda: ProposalConfig("ekf", iterations=5))
+
+    def __post_init__(self) -> None:
+        """Checks what no part checks itself."""
+        if self.patience < 0:
+            raise InputError(f"patience must not be negative, got {self.patience}")
+
+
+@dataclass(frozen=True)
 class StereoConfig:
     """A run of stereo SLAM.
 
@@ -123,6 +147,7 @@ class StereoConfig:
         keys: which features become landmarks, and how long they stay.
         likelihood: of a landmark's innovation, S05 (6) by default.
         proposal: where particles are sampled.
+        recovery: what is done after a motion that was only assumed.
         resampling: when and how.
     """
 
@@ -142,6 +167,7 @@ class StereoConfig:
         default_factory=lambda: LikelihoodConfig("truncated", outlier_volume=OUTLIER_VOLUME_PX3)
     )
     proposal: ProposalConfig = field(default_factory=lambda: ProposalConfig("prior"))
+    recovery: RecoveryConfig = field(default_factory=RecoveryConfig)
     resampling: ResamplingConfig = field(default_factory=ResamplingConfig)
 
     def __post_init__(self) -> None:

@@ -1,29 +1,26 @@
-"""What a recording shows, pair by pair: features of images, or the named pixels of a log."""
+"""What a recording shows, pair by pair: features of images; of a log's named pixels in `name_front_end`."""
 
 from abc import ABC, abstractmethod
-from dataclasses import replace
 from typing import Any, final
 
 import numpy as np
 
-from rbpf.errors import InputError
+from rbpf.belief import Belief
 from rbpf.exchange import NULL
 from rbpf.filter import StepReport
-from rbpf.maps.point import Point
 from rbpf.models import Part, Sensor
-from rbpf.motion.stereo_odometer import match_names
-from rbpf.sensors.features import CameraTruth, FeatureFrame, FeatureLog
-from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
+from rbpf.sensors.features import CameraTruth, FeatureLog
 from rbpf.sensors.pinhole import RectifiedStereo
 from rbpf.sensors.readers.images import ImageFrame
 from rbpf.sensors.stereo_features import StereoFeatures, match_frames
 from rbpf.sensors.stereo_matching import StereoSift
-from rbpf.sensors.stereo_points import StereoPoint
+from rbpf.systems.stereo.anywhere import find_anywhere
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.dead_reckoning import Pixels
 from rbpf.systems.stereo.measured import MeasuredPair
-from rbpf.systems.stereo.seen import FEATURE, LANDMARK
+from rbpf.systems.stereo.seen import FEATURE, LANDMARK, TRIAL
 from rbpf.systems.stereo.sensor import StereoFrame, StereoSensor
+from rbpf.systems.stereo.standing import Standing
 from rbpf.systems.stereo.tracks import Tracks
 
 
@@ -33,10 +30,12 @@ class FrontEnd(ABC):
     Attributes:
         rig: the cameras.
         sensor: what the filter takes.
+        standing: which features stand still; the map takes no others.
     """
 
     rig: RectifiedStereo
     sensor: Sensor
+    standing: Standing
 
     @abstractmethod
     def look(self, frame: Any) -> tuple[int, str]:
@@ -51,8 +50,24 @@ class FrontEnd(ABC):
         """The pair looked at is what the next one is matched with."""
 
     @abstractmethod
-    def for_filter(self) -> Any:
-        """The pair looked at, as the sensor takes it."""
+    def for_filter(self, doubt: bool = False) -> Any:
+        """The pair looked at, as the sensor takes it.
+
+        Args:
+            doubt: the motion up to it was only assumed, for all or part of the way.
+        """
+
+    @abstractmethod
+    def recognised(self, belief: Belief) -> int:
+        """Landmarks of the map that the pair looked at shows, all in one place, to particles in doubt."""
+
+    @abstractmethod
+    def log_support(self, belief: Belief, doubt: bool) -> float:
+        """How well the map's landmarks are seen by particles, a log-density beside that of false matches."""
+
+    @abstractmethod
+    def anywhere(self, belief: Belief) -> tuple[np.ndarray, int] | None:
+        """Where in the map the pair looked at was taken, world_from_camera (7,), and landmarks that say so."""
 
     @abstractmethod
     def seen(self, updated: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -114,19 +129,26 @@ class ImageFrontEnd(FrontEnd):
             rig, *nothing, np.zeros((0, config.sift.length), dtype=np.float32)
         )
         self._now = self._kept = self._none
-        self._matches = np.zeros((2, 0), dtype=np.intp)
+        self.standing = Standing()
         self.tracks = Tracks()
 
     def look(self, frame: ImageFrame | MeasuredPair) -> tuple[int, str]:
         """SIFT in both images, matched along the rows; or what was measured in them before."""
-        self._now, self._matches = self._none, np.zeros((2, 0), dtype=np.intp)
+        self._now = self._none
+        self.standing.look()
         if isinstance(frame, MeasuredPair):
             self._now = self._none if frame.features is None else frame.features
             return len(self._now), frame.problem
         if frame.image is None or frame.right is None:
             return 0, frame.problem or "an image is missing"
         self._now = self.sift.measure(frame.image, frame.right)
-        return len(self._now), ""
+        return len(self._now), self.sift.remark
+
+    def anywhere(self, belief: Belief) -> tuple[np.ndarray, int] | None:
+        if not self.config.map.used:
+            return None
+        frame, least = self.for_filter(doubt=True), self.config.odometry.estimate
+        return find_anywhere(self.sensor, frame, belief, least)
 
     def matches(self) -> Pixels:
         """By their keys."""
@@ -134,19 +156,31 @@ class ImageFrontEnd(FrontEnd):
         if self.config.odometry.split != "none":
             found = found.take(half_of(self._kept.keys)[found.first] & half_of(self._now.keys)[found.second])
         before, now = self._kept.take(found.first), self._now.take(found.second)
-        self._matches = np.stack([found.first, found.second])
+        self.standing.match(found.first, found.second)
         return Pixels(before.z, now.z, before.cov, now.cov)
 
     def keep(self) -> None:
         self._kept = self._now
 
-    def for_filter(self) -> StereoFrame:
-        """All features, or the half that is the map's."""
-        split = self.config.odometry.split
-        if split == "none":
-            return StereoFrame(self._now)
-        half = half_of(self._now.keys)
-        return StereoFrame(self._now, ~half if split == "apart" else half)
+    def for_filter(self, doubt: bool = False) -> StereoFrame:
+        """All features that stand still, or the half of them that is the map's."""
+        split, free = self.config.odometry.split, np.ones(len(self._now), dtype=bool)
+        if split != "none":
+            half = half_of(self._now.keys)
+            free = ~half if split == "apart" else half
+        free[self.standing.moving] = False
+        return StereoFrame(self._now, free, doubt)
+
+    def recognised(self, belief: Belief) -> int:
+        """By their keys, as many as agree on one motion."""
+        if not self.config.map.used:
+            return 0
+        return int((self.sensor.matched(self.for_filter(doubt=True), belief) >= 0).sum())
+
+    def log_support(self, belief: Belief, doubt: bool) -> float:
+        if not self.config.map.used:
+            return 0.0
+        return self.sensor.log_support(self.for_filter(doubt), belief)
 
     def seen(self, updated: bool) -> tuple[np.ndarray, np.ndarray]:
         return self._now.z, self.sensor.kinds() if updated else np.full(len(self._now), FEATURE)
@@ -155,8 +189,10 @@ class ImageFrontEnd(FrontEnd):
         return self.sensor.seconds
 
     def note(self, step: int, agree: np.ndarray, updated: bool) -> None:
-        first, second = self._matches[:, agree] if agree.size else self._matches[:, :0]
+        first, second = self.standing.matches[:, np.flatnonzero(agree)]
         names = self.sensor.names if updated else np.full(len(self._kept), NULL, dtype=np.int64)
+        found = np.isin(self.seen(updated)[1], (LANDMARK, TRIAL))
+        self.standing.note(len(self._kept), agree, np.flatnonzero(found))
         self.tracks.note(step, self._kept.z, self._kept.cov, (first, second), names)
 
     def log(self, name: str, stamps_ns: np.ndarray, truth: CameraTruth | None) -> FeatureLog:
@@ -166,83 +202,14 @@ class ImageFrontEnd(FrontEnd):
         kept = self._kept
         names = ("z", "cov", "scale", "orientation", "keys")
         pair = {f"pair/{name}": getattr(kept, name) for name in names}
-        return pair | self.sensor.arrays() | self.tracks.arrays()
+        return pair | self.standing.arrays() | self.sensor.arrays() | self.tracks.arrays()
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         names = ("z", "cov", "scale", "orientation", "keys")
         self._kept = StereoFeatures.measured(self.rig, *(arrays[f"pair/{name}"].copy() for name in names))
+        self.standing.restore(arrays, len(self._kept))
         self.sensor.restore(arrays)
         self.tracks.restore(arrays)
-
-
-@final
-class NameFrontEnd(FrontEnd):
-    """The named pixels of a log, known association.
-
-    Args:
-        log: of a stereo pair.
-        config: all settings.
-
-    Raises:
-        InputError: the log is of one camera.
-    """
-
-    def __init__(self, log: FeatureLog, config: StereoConfig) -> None:
-        if not isinstance(log.camera, RectifiedStereo):
-            raise InputError(
-                f"{log.name}: stereo SLAM needs a log of a rectified pair, this one is of one camera"
-            )
-        self.rig = log.camera
-        self.config = config
-        self._log = log
-        self.sensor = NamedLandmarkSensor(StereoPoint(log.camera), Point(3), config.likelihood.build())
-        self._now = self._kept = FeatureFrame(
-            0, np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3))
-        )
-
-    def look(self, frame: FeatureFrame) -> tuple[int, str]:
-        """Nothing is to be done."""
-        self._now = frame
-        return frame.landmarks.size, ""
-
-    def matches(self) -> Pixels:
-        """By their names."""
-        before, now = match_names(self._kept.landmarks, self._now.landmarks)
-        if self.config.odometry.split != "none":
-            even = self._kept.landmarks[before] % 2 == 0
-            before, now = before[even], now[even]
-        kept, seen = self._kept, self._now
-        return Pixels(kept.z[before], seen.z[now], kept.cov_z[before], seen.cov_z[now])
-
-    def keep(self) -> None:
-        self._kept = self._now
-
-    def for_filter(self) -> FeatureFrame:
-        """All of them, those of odd or even names, or none."""
-        config, frame = self.config, self._now
-        chosen = np.full(frame.landmarks.size, config.map.used)
-        if config.odometry.split != "none":
-            chosen &= frame.landmarks % 2 == (1 if config.odometry.split == "apart" else 0)
-        chosen &= frame.z[:, 0] > frame.z[:, 2]
-        return FeatureFrame(frame.stamp_ns, frame.landmarks[chosen], frame.z[chosen], frame.cov_z[chosen])
-
-    def seen(self, updated: bool) -> tuple[np.ndarray, np.ndarray]:
-        return self._now.z, np.full(self._now.landmarks.size, LANDMARK if updated else FEATURE)
-
-    def note(self, step: int, agree: np.ndarray, updated: bool) -> None:
-        """The log has it all."""
-
-    def log(self, name: str, stamps_ns: np.ndarray, truth: CameraTruth | None) -> FeatureLog:
-        """The given one, up to the last pair that was filtered."""
-        return replace(self._log, frames=self._log.frames[: stamps_ns.size])
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        kept = self._kept
-        return {"pair/names": kept.landmarks, "pair/z": kept.z, "pair/cov": kept.cov_z}
-
-    def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        names, z, cov = (arrays[f"pair/{name}"].copy() for name in ("names", "z", "cov"))
-        self._kept = FeatureFrame(0, names, z, cov)
 
 
 def half_of(keys: np.ndarray) -> np.ndarray:

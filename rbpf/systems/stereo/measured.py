@@ -36,7 +36,7 @@ class MeasuredPair:
 
     Attributes:
         features: None where the pair could not be measured.
-        problem: why not, in words.
+        problem: why not, or what was wrong with it all the same, in words.
         seconds: that measuring took.
     """
 
@@ -106,6 +106,7 @@ def measure_pairs(
             features, problem = None, frame.problem or ""
             if frame.image is not None and frame.right is not None:
                 features = sift.measure(frame.image, frame.right)
+                problem = sift.remark
             pairs.append(MeasuredPair(features, problem, time.process_time() - started))
             if on_pair is not None:
                 on_pair(first + len(pairs), total)

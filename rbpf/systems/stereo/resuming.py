@@ -14,9 +14,9 @@ if TYPE_CHECKING:
     from rbpf.systems.stereo.run import StereoRun
 
 _PER_FRAME = (
-    "world_from_camera", "cov", "odometry", "features", "agreeing", "updated", "observed", "ess", "resampled",
-    "log_evidence", "nis", "nis_dof", "seconds", "seconds_features", "seconds_odometry", "seconds_matching",
-    "seconds_filter",
+    "world_from_camera", "cov", "odometry", "features", "agreeing", "assumed", "updated", "observed", "ess",
+    "resampled", "log_evidence", "nis", "nis_dof", "seconds", "seconds_features", "seconds_odometry",
+    "seconds_matching", "seconds_filter",
 )  # fmt: skip
 
 

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,15 @@ from rbpf.estimate import Estimate
 from rbpf.filter import Filter, StepReport
 from rbpf.lie import SE3
 from rbpf.motion.odometry import Odometry
+from rbpf.motion.stereo_motions import Known
 from rbpf.sensors.features import CameraTruth, FeatureLog
 from rbpf.sensors.readers.images.stereo import StereoSequence
 from rbpf.systems.stereo.config import StereoConfig, TriggerConfig
 from rbpf.systems.stereo.dead_reckoning import DeadReckoning, Reckoned, chained
-from rbpf.systems.stereo.front_ends import FrontEnd, ImageFrontEnd, NameFrontEnd
+from rbpf.systems.stereo.doubt import motion_for_update
+from rbpf.systems.stereo.front_ends import FrontEnd, ImageFrontEnd
 from rbpf.systems.stereo.measured import MeasuredSequence
+from rbpf.systems.stereo.name_front_end import NameFrontEnd
 from rbpf.systems.stereo.resuming import cut, restore, save
 from rbpf.systems.stereo.seen import Seen
 from rbpf.systems.stereo.system import build_filter, build_reckoning
@@ -40,6 +44,7 @@ class StereoRun:
         cov: (T, 6, 6) of it in the right chart at the mean, order [ω, v].
         odometry: (T, 7) world_from_camera by odometry alone.
         features: (T,) of each pair;  agreeing: (T,) matches that agree with the motion since the last pair.
+        assumed: (T,) pairs since the place was known last over which the motion was only assumed; 0 where it is known.
         updated: (T,) whether the filter was updated;  observed: (T,) landmarks seen then.
         ess: (T,) effective sample size before resampling, 0 without an update;  resampled: (T,).
         log_evidence: (T,) increments, NaN where the likelihood is no density.
@@ -68,6 +73,7 @@ class StereoRun:
     odometry: np.ndarray
     features: np.ndarray
     agreeing: np.ndarray
+    assumed: np.ndarray
     updated: np.ndarray
     observed: np.ndarray
     ess: np.ndarray
@@ -149,7 +155,7 @@ def _begin(
     total = stamps_ns.size
     reckoning, filter_ = build_reckoning(front_end.rig, config), build_filter(front_end.sensor, config)
     poses, covs, odometry = np.zeros((total, 7)), np.zeros((total, 6, 6)), np.zeros((total, 7))
-    numbers = np.zeros((14, total))
+    numbers = np.zeros((15, total))
     return StereoRun(
         name, truth, config, front_end, reckoning, filter_, stamps_ns, poses, covs, odometry, *numbers
     )
@@ -203,7 +209,10 @@ def _frame(run: StereoRun, t: int, frame: Any) -> None:
     if whole and (
         run.filter.steps == 0 or triggered(at.since_update, run.config.trigger, t - run.last_update)
     ):
-        _update(run, t, at.since_update)
+        motion = motion_for_update(run, t, at)
+        if motion is not None:
+            _update(run, t, motion, run.config.recovery.used and at.assumed > 0)
+    run.assumed[t] = 0 if run.updated[t] and run.config.recovery.used else at.assumed
     if whole:
         run.front_end.note(t, at.agree, bool(run.updated[t]))
     estimate = moved_on(run.at_update, at.since_update) if not run.updated[t] else run.at_update
@@ -220,15 +229,28 @@ def _reckon(run: StereoRun, t: int, problem: str) -> tuple[Reckoned, bool]:
         what = problem or f"it shows {count} features, {least} are needed"
         run.notes.append(f"pair {t} is passed over: {what}; the last velocity is assumed, widely")
         return reckoning.assumed(stamp), False
+    if problem:
+        run.notes.append(f"pair {t}: {problem}")
     if not reckoning.begun:
         at = reckoning.begin(stamp)
     else:
         rng = np.random.default_rng([run.config.seed, t])
-        at = reckoning.measured(stamp, run.front_end.matches(), rng)
+        matches = run.front_end.matches()
+        known = Known(partial(_log_support, run, t), run.front_end.standing.before())
+        at = reckoning.measured(stamp, matches, rng, known)
+        run.front_end.standing.leave_out(at.moving)
         if at.note:
             run.notes.append(f"pair {t}: {at.note}")
     run.front_end.keep()
     return at, True
+
+
+def _log_support(run: StereoRun, t: int, since_update: Odometry) -> float:
+    """What the map says of a motion up to pair t."""
+    if not run.filter.steps:
+        return 0.0
+    belief = run.filter.expect(since_update, int(run.stamps_ns[t]))
+    return run.front_end.log_support(belief, run.reckoning.in_doubt)
 
 
 def triggered(motion: Odometry, config: TriggerConfig, frames: int) -> bool:
@@ -240,10 +262,11 @@ def triggered(motion: Odometry, config: TriggerConfig, frames: int) -> bool:
     return far or turned_far or (config.frames > 0 and frames >= config.frames)
 
 
-def _update(run: StereoRun, t: int, motion: Odometry) -> None:
+def _update(run: StereoRun, t: int, motion: Odometry, doubt: bool) -> None:
     started = time.perf_counter()
     control = motion if run.filter.steps else None
-    report = run.filter.step(run.front_end.for_filter(), control, int(run.stamps_ns[t]))
+    proposal = run.config.recovery.proposal.build() if doubt else None
+    report = run.filter.step(run.front_end.for_filter(doubt), control, int(run.stamps_ns[t]), proposal)
     run.reckoning.updated()
     run.at_update = Estimate(report.estimate.mean, report.estimate.cov)
     run.last_update = t

@@ -13,6 +13,7 @@ from typing import final
 
 import numpy as np
 
+from rbpf import gaussian
 from rbpf.belief import Belief
 from rbpf.exchange import NULL
 from rbpf.maps.point import Point
@@ -31,6 +32,9 @@ from rbpf.systems.stereo.seen import FEATURE, LANDMARK, NEW, TRIAL
 
 _MAP = frozenset({Part.LANDMARK})
 
+PROVEN = 2
+"""Sightings of a key that stands still: one that moves is not where it was seen first."""
+
 TINY = 1e-6
 """Added to the variance of expected pixels, px²: a landmark may be known exactly."""
 
@@ -42,10 +46,13 @@ class StereoFrame:
     Attributes:
         features: of the pair.
         free: (K,) which of them the map may use; None is all.
+        doubt: the camera's motion was only assumed: matches with the map must agree on one motion, of keys that were
+            found again before, and no keys are started.
     """
 
     features: StereoFeatures
     free: np.ndarray | None = None
+    doubt: bool = False
 
 
 @final
@@ -82,10 +89,10 @@ class StereoSensor(Sensor):
         features = frame.features
         self.names = np.full(len(features), NULL, dtype=np.int64)
         if self.config.used:
-            self.names = self._matched(frame, belief)
+            self.names = self.matched(frame, belief)
         seen = self.names >= 0
         ids = np.full(seen.size, NULL, dtype=np.int64)
-        ids[seen] = self._numbers.ids(belief.catalogue, self.names[seen])
+        ids[seen] = self.ids(belief, self.names[seen])
         weighing = self._weighing()
         groups = []
         for chosen, informs in ((weighing | ~seen, None), (seen & ~weighing, _MAP)):
@@ -103,6 +110,8 @@ class StereoSensor(Sensor):
         seen = self.names >= 0
         self._forget(belief, self.manager.note(self.names[seen]))
         self._place(belief, self.names[seen])
+        if frame.doubt:
+            return []
         rows = self._worth_a_key(frame, seen)
         if not rows.size:
             return []
@@ -113,6 +122,14 @@ class StereoSensor(Sensor):
         self.places.put(names, self.model.invert(pose, features.z), pose)
         self.names[rows] = names
         return [Births(features.z, features.cov, self.model, self.point, facts=names.tolist())]
+
+    def ids(self, belief: Belief, names: np.ndarray) -> np.ndarray:
+        """The map's numbers (k,) of keys (k,)."""
+        return self._numbers.ids(belief.catalogue, names)
+
+    def proven(self) -> np.ndarray:
+        """Names (M,) of the keys that were found again where the map has them: these stand still."""
+        return np.asarray(self.manager.names[self.manager.sightings >= PROVEN])
 
     def kinds(self) -> np.ndarray:
         """What each feature (K,) of the last pair was to the map, see `rbpf.systems.stereo.seen`."""
@@ -152,30 +169,46 @@ class StereoSensor(Sensor):
         often = manager.sightings + 1 >= manager.config.sightings
         return np.isin(self.names, manager.names[often])
 
-    def _matched(self, frame: StereoFrame, belief: Belief) -> np.ndarray:
-        """Name of each feature's landmark (K,)."""
+    def matched(self, frame: StereoFrame, belief: Belief) -> np.ndarray:
+        """Name of each feature's landmark (K,), NULL where it has none."""
         features = frame.features
         out = np.full(len(features), NULL, dtype=np.int64)
         rows = np.arange(len(features)) if frame.free is None else np.flatnonzero(frame.free)
         cloud = Cloud.of(belief, self.config.cloud)
         names = self._alike(features.keys[rows], cloud)
+        if frame.doubt:
+            names = names[np.isin(names, self.proven())]
         if not (names.size and rows.size):
             return out
-        ids = self._numbers.ids(belief.catalogue, names)
+        ids = self.ids(belief, names)
         seen = cloud.expected(belief, self.model, ids)
         total = seen.cov + self.config.slack_px**2 * np.eye(3)
         gate = Gate(features.z[rows], features.cov[rows], names, seen.mean, total, self.config.gate)
         found = self.index.match(features.keys[rows], gate).ids
         taken = np.flatnonzero(found >= 0)
         of = np.searchsorted(names, found[taken])
-        agreed = self._agreed(seen.take(of), features.take(rows[taken]))
+        agreed = self._agreed(seen.take(of), features.take(rows[taken]), frame.doubt)
         out[rows[taken[agreed]]] = found[taken[agreed]]
         return out
 
-    def _agreed(self, seen: Expected, features: StereoFeatures) -> np.ndarray:
+    def log_support(self, frame: StereoFrame, belief: Belief) -> float:
+        """How well landmarks are seen: their log-density beside that of features of unknown things.
+
+        Keys on trial have no say: they may be of what moves.
+        """
+        names = self.matched(frame, belief)
+        rows = np.flatnonzero(np.isin(names, self.proven()))
+        if not rows.size:
+            return 0.0
+        features, ids = frame.features.take(rows), self.ids(belief, names[rows])
+        seen = Cloud.of(belief, self.config.cloud).expected(belief, self.model, ids)
+        return log_support(features.z - seen.mean, features.cov + seen.cov, frame.features.z, self.model.rig)
+
+    def _agreed(self, seen: Expected, features: StereoFeatures, doubt: bool) -> np.ndarray:
         """Which matches (k,) are taken: all, unless they are expected so vaguely that the gate tells little."""
         all_of_them = np.ones(len(features), dtype=bool)
-        if not len(features) or np.median(seen.deviation) <= self.config.doubt_px:
+        vague = doubt or (len(features) and np.median(seen.deviation) > self.config.doubt_px)
+        if not vague:
             return all_of_them
         if len(features) < self.config.agreeing:
             return ~all_of_them
@@ -206,13 +239,13 @@ class StereoSensor(Sensor):
 
     def _forget(self, belief: Belief, names: np.ndarray) -> None:
         if names.size:
-            belief.map.remove(self._numbers.ids(belief.catalogue, names))
+            belief.map.remove(self.ids(belief, names))
             self.index.store.remove(names)
 
     def _place(self, belief: Belief, names: np.ndarray) -> None:
         """Notes where the heaviest particle has landmarks now."""
         if names.size:
-            ids = self._numbers.ids(belief.catalogue, names)
+            ids = self.ids(belief, names)
             mode = belief.mode
             self.places.put(names, belief.read(ids, np.array([mode])).mean[0], belief.state[mode])
 
@@ -232,3 +265,17 @@ class StereoSensor(Sensor):
     def _deep(self, features: StereoFeatures) -> np.ndarray:
         """Whether the depth of features is known well enough for a Gaussian in space, (K,)."""
         return np.sqrt(features.cov_points[:, 2, 2]) <= self.config.depth_share * features.points[:, 2]
+
+
+def log_support(nu: np.ndarray, cov: np.ndarray, z: np.ndarray, rig: RectifiedStereo) -> float:
+    """Σ max(log N(ν; 0, S) − log λ, 0) of features (k,) that are taken for landmarks: each is, or is so by chance.
+
+    Args:
+        nu: (k, 3) innovations, px.
+        cov: (k, 3, 3) S, px².
+        z: (K, 3) of all features of the pair, which are λ per px³ where they may be.
+        rig: the cameras.
+    """
+    depths = max(float(np.ptp(z[:, 0] - z[:, 2])), 1.0)
+    density = len(z) / (rig.camera.width * rig.camera.height * depths)
+    return float(np.maximum(gaussian.log_density(nu, cov) - np.log(density), 0.0).sum())
