@@ -9,6 +9,7 @@ import tyro
 from rbpf.errors import InputError
 from rbpf.sensors.chessboard import Board
 from rbpf.sensors.markers import MarkerBoard
+from rbpf.sensors.readers.images.topics import Topics
 
 Flag = tyro.conf.FlagCreatePairsOff[bool]
 
@@ -68,6 +69,8 @@ class ImageRunOptions(RunOptions):
 
     Attributes:
         calibration: camera.yaml in place of the sequence's own; by default that one is read.
+        image_topic: of a ROS bag, the topic of the images, or LEFT,RIGHT; by default those that the bag has.
+        truth_topic: of a ROS bag, the topic of the camera's true poses; by default none.
         rerun: also write a recording (.rrd) for the Rerun viewer; by default none.
         batch: also adjust the same measurements in batch with GTSAM.
         batch_limit: seconds after which the batch adjustment is given up; the run's results stay.
@@ -75,6 +78,8 @@ class ImageRunOptions(RunOptions):
     """
 
     calibration: Path | None = None
+    image_topic: str | None = None
+    truth_topic: str | None = None
     rerun: Path | None = None
     batch: bool = True
     batch_limit: float = 300.0
@@ -86,8 +91,8 @@ class MonoOptions(ImageRunOptions):
     """Options of `rbpf run mono`.
 
     Attributes:
-        sequence: images: a folder of a known kind (EuRoC, TUM RGB-D, KITTI, 7-Scenes, images with a camera.yaml) or
-            a video with a camera.yaml beside it.
+        sequence: images: a folder of a known kind (EuRoC, TUM RGB-D, KITTI, 7-Scenes, images with a camera.yaml), a
+            video with a camera.yaml beside it, or a ROS bag.
         known_points: table of points of known position that are seen in the first image; by default none: the world is
             the first camera's and its scale is arbitrary.
         board: in place of known points, inner corners of a chessboard that is seen whole in the first image, as 9x6;
@@ -120,7 +125,7 @@ class StereoOptions(ImageRunOptions):
 
     Attributes:
         sequence: images of a rectified pair, or of one that its calibration rectifies: a folder of EuRoC ASL with cam0
-            and cam1, or of KITTI odometry with image_0 and image_1.
+            and cam1, of KITTI odometry with image_0 and image_1, or a ROS bag with two topics of images.
         dof: degrees of freedom of the camera: 6, or 3 in its x-z plane; by default as in the configuration.
     """
 
@@ -234,6 +239,11 @@ def given(options: object, *names: str) -> dict[str, object]:
     """Those of some options that were given."""
     values = {name: getattr(options, name) for name in names}
     return {name: value for name, value in values.items() if value is not None}
+
+
+def given_topics(options: ImageRunOptions) -> Topics:
+    """The topics of `--image-topic` and `--truth-topic`."""
+    return Topics.parse(options.image_topic, options.truth_topic)
 
 
 def given_markers(options: MonoOptions) -> MarkerBoard | None:
