@@ -24,7 +24,7 @@ from docutils.parsers.rst.directives import flag, unchanged
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
-WIDTH = 82
+WIDTH = 100
 """Columns of a page, without scrolling."""
 _MODULE = "## {name}\n\n```{{eval-rst}}\n.. automodule:: {name}\n{members}```\n\n"
 

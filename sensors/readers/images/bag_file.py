@@ -103,8 +103,12 @@ class Bag:
 
 
 def recognises(path: Path) -> bool:
-    """Whether the path ends like a bag, or is a folder with the description of one."""
-    return (path.is_file() and path.suffix in SUFFIXES) or (path / "metadata.yaml").is_file()
+    """Whether the path ends like a bag, or is a folder with a part of one and its description."""
+    if path.is_file():
+        return path.suffix in SUFFIXES
+    return (path / "metadata.yaml").is_file() and any(
+        SUFFIXES & set(file.suffixes) for file in path.iterdir()
+    )
 
 
 @contextmanager

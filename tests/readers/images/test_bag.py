@@ -219,6 +219,12 @@ def test_a_bag_without_images(tmp_path):
         open_images(tmp_path / "walk.bag")
 
 
+def test_a_folder_of_images_with_a_description_is_no_bag(tmp_path):
+    write_plain(tmp_path)
+    (tmp_path / "metadata.yaml").write_text("camera: mine\n")
+    assert levels(open_images(tmp_path)) == [10, 20, 30]
+
+
 def test_only_bags_have_topics(tmp_path):
     with pytest.raises(InputError, match="image topic /cam is given, but only ROS bags have topics"):
         open_images(write_plain(tmp_path), topics=Topics(("/cam",)))
