@@ -20,6 +20,9 @@ from rbpf.sensors.readers.images.matrices import flaw, pose_of_matrix
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
 
+_RADIAL_TANGENTIAL = "plumb_bob", "rational_polynomial"
+"""Models of distortion that begin with k1, k2, p1, p2, k3; the second one goes on with what must be zero."""
+
 
 @dataclass(frozen=True)
 class Info:
@@ -104,15 +107,11 @@ def _field(message: Any, name: str) -> Array:
 
 
 def _distortion(message: Any, where: str) -> tuple[float, float, float, float, float]:
-    """k1, k2, p1, p2, k3 of a lens that is told by these; other models have their place here."""
+    """k1, k2, p1, p2, k3 of a lens that is told by these; one of another kind has its place here."""
     d, model = _field(message, "D").tolist(), message.distortion_model
-    if not any(d):
-        return NO_DISTORTION
-    if model == "plumb_bob" and len(d) in (4, 5):
-        k1, k2, p1, p2, *k3 = d
-        return k1, k2, p1, p2, k3[0] if k3 else 0.0
-    if model == "rational_polynomial" and len(d) >= 5 and not any(d[5:]):
-        return d[0], d[1], d[2], d[3], d[4]
+    if (model in _RADIAL_TANGENTIAL or not (model or any(d))) and not any(d[5:]):
+        k1, k2, p1, p2, k3 = (*d[:5], *NO_DISTORTION)[:5]
+        return k1, k2, p1, p2, k3
     problem = f"the lens is {model[:40]!r} with {len(d)} coefficients, expected plumb_bob with 4 or 5"
     raise InputError(f"{where}: {problem}; rectify the images, or give --calibration.")
 

@@ -24,7 +24,7 @@ TRUTH = Topics(truth="/truth")
 CAMERAS = {
     "four": ({"d": (0.1, 0.2, 0.3, 0.4)}, (0.1, 0.2, 0.3, 0.4, 0.0)),
     "none": ({"d": (), "model": ""}, (0.0,) * 5),
-    "zero": ({"d": (0.0,) * 4, "model": "equidistant"}, (0.0,) * 5),
+    "zero": ({"d": (0.0,) * 8, "model": "rational_polynomial"}, (0.0,) * 5),
     "rational": (
         {"d": (0.1, 0.2, 0.3, 0.4, 0.5, 0.0, 0.0, 0.0), "model": "rational_polynomial"},
         (0.1, 0.2, 0.3, 0.4, 0.5),
@@ -41,6 +41,8 @@ def test_lenses(tmp_path, name):
 WRONG = {
     "fisheye": ({"model": "equidistant", "d": (0.1,) * 4}, "the lens is 'equidistant' with 4 coefficients, expected"),
     "rational": ({"model": "rational_polynomial", "d": (0.1,) * 8}, "the lens is 'rational_polynomial'"),
+    "ideal fisheye": ({"model": "equidistant", "d": (0.0,) * 4}, "the lens is 'equidistant' with 4 coefficients"),
+    "nameless": ({"model": "", "d": (0.1,) * 4}, "the lens is '' with 4 coefficients"),
     "uncalibrated": ({"k": (0.0,) * 9}, "the camera is not calibrated"),
     "nan": ({"k": (np.nan, *K[1:])}, "the camera is not calibrated"),
     "binned": ({"binning": 2}, "the images are binned"),
