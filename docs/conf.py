@@ -38,3 +38,5 @@ python_maximum_signature_line_length = 90
 
 html_theme = "furo"
 html_title = f"rbpf {version}"
+html_static_path = ["_static"]
+html_css_files = ["wide.css"]

@@ -3,7 +3,6 @@
 docs/pictures/robot.png     a robot among landmarks, examples/range_bearing_robot.py
 docs/pictures/vessel.png    a vessel seen by radar, examples/target_tracking.py
 docs/pictures/evidence.png  two motion models compared, examples/motion_evidence.py
-docs/pictures/lab.png       a piece of the laboratory, examples/stereo_lab.py
 """
 
 import sys
@@ -21,7 +20,6 @@ sys.path[:0] = [str(HERE.parent / "examples")]
 
 import motion_evidence  # noqa: E402
 import range_bearing_robot  # noqa: E402
-import stereo_lab  # noqa: E402
 import target_tracking  # noqa: E402
 
 from rbpf import EkfProposal  # noqa: E402
@@ -58,12 +56,11 @@ def draw_vessel(path: Path) -> None:
     figure.savefig(path, dpi=110)
 
 
-def main(out: Path = HERE / "pictures", lab: bool = True) -> None:
+def main(out: Path = HERE / "pictures") -> None:
     """Runs the examples and keeps their pictures.
 
     Args:
         out: folder for the pictures.
-        lab: also the laboratory, which takes some minutes.
     """
     with TemporaryDirectory() as temporary:
         scratch = Path(temporary)
@@ -73,9 +70,6 @@ def main(out: Path = HERE / "pictures", lab: bool = True) -> None:
         shrink(scratch / "vessel.png", out / "vessel.png")
         shrink(scratch / "evidence.png", out / "evidence.png")
         shrink(scratch / "robot" / "map.png", out / "robot.png")
-        if lab:
-            stereo_lab.main(out=scratch / "lab")
-            shrink(scratch / "lab" / "map.png", out / "lab.png")
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
 """A run over images beside a reconstruction of the same images by COLMAP, and the reconstruction beside the truth."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
 
 from rbpf.errors import InputError
-from rbpf.sensors.readers.images import open_images
-from rbpf.sensors.readers.images.sequence import ImageSequence
+from rbpf.sensors.readers.images import ImageSequence, Topics, open_images, open_stereo
 from rbpf.validation.colmap_compare import ColmapComparison, compare_with_path, compare_with_truth
 from rbpf.validation.colmap_pipeline import ReconstructionOptions
 from rbpf.validation.colmap_reconstruct import reconstruct
@@ -49,8 +49,16 @@ def compare_folder_with_colmap(folder: Path, options: ReconstructionOptions | No
         raise InputError(
             f"{folder} is a run of the system {config['system']}, which sees no images; COLMAP needs a run over images."
         )
-    sequence = open_images(Path(str(config["recording"])), config.get("calibration"))
+    sequence = _images(config)
     return compare_with_colmap(read_path_and_map(folder), sequence, options)
+
+
+def _images(config: Mapping[str, Any]) -> ImageSequence:
+    recording, calibration = Path(str(config["recording"])), config.get("calibration")
+    topics = Topics.parse(config.get("image_topic"), config.get("truth_topic"))
+    if config["system"] == "stereo":
+        return open_stereo(recording, calibration, topics=topics).pair
+    return open_images(recording, calibration, topics)
 
 
 def compare_with_colmap(

@@ -129,6 +129,12 @@ def _rerun() -> str:
     return f"rerun-sdk {_version('rerun-sdk')}"
 
 
+def _bags() -> str:
+    import_module("rosbags.rosbag1")
+    import_module("rosbags.rosbag2")
+    return f"rosbags {_version('rosbags')}"
+
+
 def _cluster() -> str:
     import_module("distributed")
     return f"Dask {_version('dask')}"
@@ -142,6 +148,7 @@ _PROBES: tuple[tuple[str, str, Callable[[], str]], ...] = (
     ("annotated video", "", _ffmpeg),
     ("pictures", "", _pictures),
     ("Rerun recordings", "viewing", _rerun),
+    ("ROS bags", "bags", _bags),
     ("sweeps on a cluster", "cluster", _cluster),
 )
 """What it does, the extra that it comes with, how it is tried."""

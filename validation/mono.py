@@ -8,7 +8,8 @@ from typing import Any
 from rbpf.errors import InputError
 from rbpf.sensors.chessboard import Board, find_board
 from rbpf.sensors.markers import MarkerBoard, find_markers
-from rbpf.sensors.readers.images import ImageSequence, KnownPixels, open_images, read_known_points
+from rbpf.sensors.readers.images import ImageSequence, KnownPixels, Topics, open_images, read_known_points
+from rbpf.sensors.readers.images.topics import UNNAMED
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.known_map import read_known_map
 from rbpf.systems.mono.video import VideoRun, first_image, run_images
@@ -36,9 +37,10 @@ class Recording:
         board: chessboard that is seen in the first image; its corners are the known points, in its frame.
         markers: board of ArUco markers of which some are seen in the first image; likewise.
         map: run folder, or its map, in which the camera is to be found; the map is not changed. None maps anew.
+        topics: of a ROS bag, which images and which truth.
 
     Raises:
-        InputError: two of known points, board, markers and map are given.
+        InputError: two of known points, board, markers and map are given, or two topics of images.
     """
 
     images: Path
@@ -47,8 +49,13 @@ class Recording:
     board: Board | None = None
     map: Path | None = None
     markers: MarkerBoard | None = None
+    topics: Topics = UNNAMED
 
     def __post_init__(self) -> None:
+        if len(self.topics.images) > 1:
+            raise InputError(
+                f"one camera has one topic of images: give one of {' and '.join(self.topics.images)}"
+            )
         if self.known_points is not None and self.board is not None:
             raise InputError("a run starts from known points or from a chessboard: give one of the two")
         starts = self.known_points, self.board, self.markers
@@ -76,7 +83,12 @@ class Recording:
             board = {"aruco": size, "marker_m": self.markers.side_m, "gap_m": self.markers.gap_m}
             board["dictionary"] = self.markers.dictionary
         localize = {} if self.map is None else {"localize": True}
-        return {name: str(path) for name, path in named.items() if path is not None} | board | localize
+        return (
+            {name: str(path) for name, path in named.items() if path is not None}
+            | board
+            | localize
+            | self.topics.entries()
+        )
 
     def open(self) -> tuple[ImageSequence, KnownPixels | None]:
         """The images, and the known points if there are any.
@@ -85,7 +97,7 @@ class Recording:
             InputError: a file is wrong, or the board is not found in the first image.
         """
         known = None if self.known_points is None else read_known_points(self.known_points)
-        sequence = open_images(self.images, self.calibration)
+        sequence = open_images(self.images, self.calibration, self.topics)
         if self.board is not None:
             known = find_board(first_image(sequence), self.board)
         if self.markers is not None:

@@ -26,6 +26,8 @@ _OPTIONS = {
     "square_m": "square",
     "marker_m": "marker",
     "gap_m": "gap",
+    "image_topic": "image-topic",
+    "truth_topic": "truth-topic",
 }
 _NAMED = (
     "known_points",
@@ -37,6 +39,8 @@ _NAMED = (
     "gap_m",
     "dictionary",
     "known_map",
+    "image_topic",
+    "truth_topic",
 )
 _FLAGS = ("localize",)
 _MADE = "video", "batch"

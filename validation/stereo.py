@@ -5,8 +5,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from rbpf.sensors.readers.images import open_stereo
+from rbpf.sensors.readers.images import Topics, open_stereo
 from rbpf.sensors.readers.images.stereo import StereoSequence
+from rbpf.sensors.readers.images.topics import UNNAMED
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.run import StereoRun, run_images
 from rbpf.validation.files import prepare_folder
@@ -29,10 +30,12 @@ class StereoRecording:
     Attributes:
         pairs: a sequence of any kind that `open_stereo` knows.
         calibration: camera.yaml in place of the sequence's own camera.
+        topics: of a ROS bag, which images and which truth.
     """
 
     pairs: Path
     calibration: Path | None = None
+    topics: Topics = UNNAMED
 
     def open(self) -> StereoSequence:
         """The pairs.
@@ -40,12 +43,12 @@ class StereoRecording:
         Raises:
             InputError: a file is wrong.
         """
-        return open_stereo(self.pairs, self.calibration)
+        return open_stereo(self.pairs, self.calibration, topics=self.topics)
 
     def sources(self) -> dict[str, str]:
         """For config.yaml."""
         named = {"recording": self.pairs, "calibration": self.calibration}
-        return {name: str(path) for name, path in named.items() if path is not None}
+        return {name: str(path) for name, path in named.items() if path is not None} | self.topics.entries()
 
 
 def start_stereo(

@@ -15,7 +15,8 @@ from inspect import cleandoc, getdoc
 from io import StringIO
 from pathlib import Path
 from pkgutil import iter_modules
-from re import DOTALL, search
+from re import DOTALL, search, sub
+from textwrap import fill
 from typing import Any, ClassVar
 
 from docutils import nodes
@@ -23,7 +24,8 @@ from docutils.parsers.rst.directives import flag, unchanged
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
-WIDTH = "100"
+WIDTH = 100
+"""Columns of a page, without scrolling."""
 _MODULE = "## {name}\n\n```{{eval-rst}}\n.. automodule:: {name}\n{members}```\n\n"
 
 
@@ -53,12 +55,21 @@ class CommandHelp(SphinxDirective):
         """A literal block."""
         from rbpf.cli import main
 
-        os.environ.update(COLUMNS=WIDTH, NO_COLOR="1")
+        os.environ.update(COLUMNS=str(WIDTH), NO_COLOR="1")
         command = self.arguments[0].split() if self.arguments else []
         text = StringIO()
         with redirect_stdout(text), suppress(SystemExit):
             main([*command, "--help"])
-        return [nodes.literal_block(text=text.getvalue(), language="text")]
+        # The program breaks its tables to the width, and leaves sentences and the names of commands to the terminal.
+        lines = (_broken(line) for line in text.getvalue().splitlines())
+        return [nodes.literal_block(text="\n".join(lines), language="text")]
+
+
+def _broken(line: str) -> str:
+    """A line in lines of the page's width."""
+    if len(line) <= WIDTH:
+        return line
+    return fill(sub(r",(?=\S)", ", ", line), WIDTH, subsequent_indent="  ", break_on_hyphens=False)
 
 
 class Modules(SphinxDirective):

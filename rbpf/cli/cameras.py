@@ -25,7 +25,7 @@ class CalibrateOptions(Printed):
         out: folder for camera.yaml, calibration.png and calibration.json.
     """
 
-    images: tyro.conf.Positional[Path]
+    images: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="IMAGES")]
     board: str
     square: float
     out: Path = Path("calibration")
@@ -73,7 +73,7 @@ class RecalibrateOptions(Printed):
         out: folder for camera.yaml.
     """
 
-    run: tyro.conf.Positional[Path]
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
     out: Path = Path("recalibration")
 
 

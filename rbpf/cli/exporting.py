@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from rbpf.cli.options import Printed
+from rbpf.cli.options import Printed, Where
 from rbpf.cli.showing import answer
 
 Format = Literal["tum", "kitti", "ply", "colmap", "rerun", "npz"]
@@ -23,9 +23,9 @@ class ExportOptions(Printed):
         out: folder for the files; by default RUN/export.
     """
 
-    run: tyro.conf.Positional[Path]
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
     format: tuple[Format, ...]
-    out: Path | None = None
+    out: Where = None
 
 
 def export(options: Annotated[ExportOptions, tyro.conf.arg(name="")]) -> None:

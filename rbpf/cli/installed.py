@@ -1,8 +1,10 @@
 """`rbpf doctor` and `rbpf completion`: about the installation itself."""
 
+import sys
 import time
-from contextlib import suppress
+from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass
+from io import StringIO
 from typing import Annotated, Literal
 
 import tyro
@@ -61,6 +63,13 @@ def _compile() -> dict[str, float]:
     return {"kernels_seconds": round(time.perf_counter() - started, 1)}
 
 
+_ZSH = (
+    '\n_tyro_rbpf "$@"\n',
+    '\nif [ "$funcstack[1]" = "_rbpf" ]; then _tyro_rbpf "$@"; else compdef _tyro_rbpf rbpf; fi\n',
+)
+"""The last line for zsh is one for a file in its `fpath`; evaluated, it would complete nothing."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class CompletionOptions:
     """Options of `rbpf completion`.
@@ -69,12 +78,14 @@ class CompletionOptions:
         shell: for which it is.
     """
 
-    shell: tyro.conf.Positional[Literal["bash", "zsh", "tcsh"]]
+    shell: tyro.conf.Positional[Literal["bash", "zsh", "fish"]]
 
 
 def completion(options: Annotated[CompletionOptions, tyro.conf.arg(name="")]) -> None:
     """Print what makes a shell complete the commands and options of rbpf: eval "$(rbpf completion bash)"."""
     from rbpf.cli import APP, PROGRAM
 
-    with suppress(SystemExit):
+    printed = StringIO()
+    with suppress(SystemExit), redirect_stdout(printed):
         APP.cli(prog=PROGRAM, args=["--tyro-print-completion", options.shell])
+    sys.stdout.write(printed.getvalue().replace(*_ZSH))

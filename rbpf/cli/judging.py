@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from rbpf.cli.options import Printed
+from rbpf.cli.options import Printed, Text, Where
 from rbpf.cli.showing import answer, progress, told, waiting
 from rbpf.errors import InputError
 
@@ -24,9 +24,9 @@ class ValidateOptions(Printed):
         out: a further folder for the JSON, which is always written into the run's own; by default none.
     """
 
-    run: tyro.conf.Positional[Path]
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
     against: Literal["groundtruth", "gtsam", "colmap"] = "groundtruth"
-    out: Path | None = None
+    out: Where = None
 
 
 def validate(options: Annotated[ValidateOptions, tyro.conf.arg(name="")]) -> None:
@@ -49,7 +49,7 @@ class ReportOptions(Printed):
         run: folder that `rbpf run` left.
     """
 
-    run: tyro.conf.Positional[Path]
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
 
 
 def report(options: Annotated[ReportOptions, tyro.conf.arg(name="")]) -> None:
@@ -76,10 +76,10 @@ class SweepOptions(Printed):
         scheduler: address of a Dask scheduler (tcp://HOST:PORT) whose workers run instead; by default none.
     """
 
-    config: tyro.conf.Positional[Path]
+    config: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CONFIG")]
     out: Path = Path("sweep")
     workers: int = -1
-    scheduler: str | None = None
+    scheduler: Text = None
 
 
 def sweep(options: Annotated[SweepOptions, tyro.conf.arg(name="")]) -> None:
@@ -113,8 +113,8 @@ class CompareOptions(Printed):
         workers: processes; -1 is one per core.
     """
 
-    run_a: tyro.conf.Positional[Path]
-    run_b: tyro.conf.Positional[Path]
+    run_a: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN_A")]
+    run_b: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN_B")]
     seeds: int = 5
     workers: int = -1
 

@@ -2,15 +2,22 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import tyro
 
 from rbpf.errors import InputError
 from rbpf.sensors.chessboard import Board
 from rbpf.sensors.markers import MarkerBoard
+from rbpf.sensors.readers.images.topics import Topics
 
 Flag = tyro.conf.FlagCreatePairsOff[bool]
+
+# What is None unless it is given: the help says in words what that means.
+Whole = Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="")]
+Real = Annotated[float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="")]
+Text = Annotated[str | None, tyro.conf.arg(metavar="STR", help_behavior_hint="")]
+Where = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,8 +37,8 @@ class RunOptions(Printed):
 
     Attributes:
         out: folder for the results.
-        particles: number of particles; by default as in the configuration.
-        seed: of the random generators; by default as in the configuration.
+        particles: number of particles.
+        seed: of the random generators; by default 0, or as in --config.
         config: YAML file of settings, such as a former run's config.yaml; by default the system's own.
         set: a setting as key=value, such as resampling.scheme=residual; may be given several times.
         resume: go on from the checkpoint in the results' folder, if there is one.
@@ -39,12 +46,12 @@ class RunOptions(Printed):
     """
 
     out: Path = Path("run")
-    particles: int | None = None
-    seed: int | None = None
-    config: Path | None = None
+    particles: Whole = None
+    seed: Whole = None
+    config: Where = None
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     resume: Flag = False
-    threads: int | None = None
+    threads: Whole = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,12 +60,16 @@ class RangeBearingOptions(RunOptions):
 
     Attributes:
         log: recording: a folder of an MRCLAM or MRPT log, or a Victoria Park graph.
-        association: landmarks named by the log, or by maximum likelihood; by default as in the configuration.
+        particles: number of particles; by default 100, or as in --config.
+        association: landmarks named by the log, or by maximum likelihood; by default known, or as in --config.
         batch: also solve for the batch optimum with GTSAM.
     """
 
-    log: tyro.conf.Positional[Path]
-    association: Literal["known", "ml"] | None = None
+    log: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="LOG")]
+    particles: Whole = None
+    association: Annotated[
+        Literal["known", "ml"] | None, tyro.conf.arg(metavar="{known,ml}", help_behavior_hint="")
+    ] = None
     batch: bool = True
 
 
@@ -68,14 +79,18 @@ class ImageRunOptions(RunOptions):
 
     Attributes:
         calibration: camera.yaml in place of the sequence's own; by default that one is read.
+        image_topic: of a ROS bag, the topic of the images, or LEFT,RIGHT; by default those that the bag has.
+        truth_topic: of a ROS bag, the topic of the camera's true poses; by default none.
         rerun: also write a recording (.rrd) for the Rerun viewer; by default none.
         batch: also adjust the same measurements in batch with GTSAM.
         batch_limit: seconds after which the batch adjustment is given up; the run's results stay.
         video: write the annotated video.
     """
 
-    calibration: Path | None = None
-    rerun: Path | None = None
+    calibration: Where = None
+    image_topic: Text = None
+    truth_topic: Text = None
+    rerun: Where = None
     batch: bool = True
     batch_limit: float = 300.0
     video: bool = True
@@ -86,8 +101,9 @@ class MonoOptions(ImageRunOptions):
     """Options of `rbpf run mono`.
 
     Attributes:
-        sequence: images: a folder of a known kind (EuRoC, TUM RGB-D, KITTI, 7-Scenes, images with a camera.yaml) or
-            a video with a camera.yaml beside it.
+        sequence: images: a folder of a known kind (EuRoC, TUM RGB-D, KITTI, 7-Scenes, images with a camera.yaml), a
+            video with a camera.yaml beside it, or a ROS bag.
+        particles: number of particles; by default 50, or as in --config.
         known_points: table of points of known position that are seen in the first image; by default none: the world is
             the first camera's and its scale is arbitrary.
         board: in place of known points, inner corners of a chessboard that is seen whole in the first image, as 9x6;
@@ -102,15 +118,16 @@ class MonoOptions(ImageRunOptions):
         localize: the map is known: the start is found by recognition, and the map is not changed.
     """
 
-    sequence: tyro.conf.Positional[Path]
-    known_points: Path | None = None
-    board: str | None = None
-    square: float | None = None
-    aruco: str | None = None
-    marker: float | None = None
+    sequence: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="IMAGES")]
+    particles: Whole = None
+    known_points: Where = None
+    board: Text = None
+    square: Real = None
+    aruco: Text = None
+    marker: Real = None
     gap: float = 0.01
     dictionary: str = "4x4_50"
-    map: Path | None = None
+    map: Where = None
     localize: Flag = False
 
 
@@ -120,12 +137,14 @@ class StereoOptions(ImageRunOptions):
 
     Attributes:
         sequence: images of a rectified pair, or of one that its calibration rectifies: a folder of EuRoC ASL with cam0
-            and cam1, or of KITTI odometry with image_0 and image_1.
-        dof: degrees of freedom of the camera: 6, or 3 in its x-z plane; by default as in the configuration.
+            and cam1, of KITTI odometry with image_0 and image_1, or a ROS bag with two topics of images.
+        particles: number of particles; by default 400, or as in --config.
+        dof: degrees of freedom of the camera: 6, or 3 in its x-z plane; by default 6, or as in --config.
     """
 
-    sequence: tyro.conf.Positional[Path]
-    dof: Literal[3, 6] | None = None
+    sequence: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PAIRS")]
+    particles: Whole = None
+    dof: Annotated[Literal[3, 6] | None, tyro.conf.arg(metavar="{3,6}", help_behavior_hint="")] = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,7 +158,7 @@ class RenderOptions(Printed):
         height: of the images, px.
         focal_px: focal length, px; by default a share of the width.
         distortion: k1, k2, p1, p2, k3 of the lens; must be none where there are two cameras.
-        baseline_m: of a second camera to the right, m; None for none.
+        baseline_m: of a second camera to the right, m; None or nothing for none.
         known: corners in the first image whose positions are given, at least 4; 0 for none.
         noise_std: of the sensor, grey levels.
         blur_s: the shutter is open this long, s.
@@ -155,16 +174,18 @@ class RenderOptions(Printed):
     seed: int = 0
     width: int = 640
     height: int = 480
-    focal_px: float | None = None
+    focal_px: Real = None
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    baseline_m: float | None = None
+    baseline_m: Real = None
     known: int = 6
     noise_std: float = 3.0
     blur_s: float = 0.01
     exposure_drift: float = 0.15
     vignetting: float = 0.2
     contrast: float = 1.0
-    blackout: tuple[int, int] | None = None
+    blackout: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="INT INT", help_behavior_hint="")] = (
+        None
+    )
     depth: Flag = False
     jpeg: int = 0
 
@@ -181,9 +202,9 @@ class ImagesOptions(RenderOptions):
     """
 
     frames: int = 300
-    focal_px: float | None = None
-    board: str | None = None
-    square: float | None = None
+    focal_px: Real = None
+    board: Text = None
+    square: Real = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -200,10 +221,10 @@ class LabOptions(RenderOptions):
     """
 
     trajectory: Literal["tour", "turn_back"] = "tour"
-    frames: int | None = None
+    frames: Whole = None
     every: int = 1
-    focal_px: float | None = None
-    baseline_m: float | None = 0.12
+    focal_px: Real = None
+    baseline_m: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = 0.12
     noise_std: float = 8.0
     blur_s: float = 0.0
     exposure_drift: float = 0.0
@@ -234,6 +255,11 @@ def given(options: object, *names: str) -> dict[str, object]:
     """Those of some options that were given."""
     values = {name: getattr(options, name) for name in names}
     return {name: value for name, value in values.items() if value is not None}
+
+
+def given_topics(options: ImageRunOptions) -> Topics:
+    """The topics of `--image-topic` and `--truth-topic`."""
+    return Topics.parse(options.image_topic, options.truth_topic)
 
 
 def given_markers(options: MonoOptions) -> MarkerBoard | None:

@@ -18,6 +18,7 @@ from rbpf.cli.options import (
     given,
     given_board,
     given_markers,
+    given_topics,
 )
 from rbpf.cli.showing import answer, progress, say, table, told
 from rbpf.errors import InputError
@@ -75,7 +76,9 @@ def run_mono(options: Annotated[MonoOptions, tyro.conf.arg(name="")]) -> None:
     if options.localize != (options.map is not None):
         raise InputError("a camera is found in a known map with both: --map RUN --localize")
     markers, points = given_markers(options), options.known_points
-    recording = Recording(options.sequence, points, options.calibration, board, options.map, markers)
+    recording = Recording(
+        options.sequence, points, options.calibration, board, options.map, markers, given_topics(options)
+    )
     _run_images(
         options,
         lambda tell: start_mono(recording, config, options.out, options.resume, tell),
@@ -97,7 +100,7 @@ def run_stereo(options: Annotated[StereoOptions, tyro.conf.arg(name="")]) -> Non
         require_rerun()
     named = given(options, "particles", "seed", "dof")
     config = load_settings(StereoConfig, "stereo", options.config, options.set, named)
-    recording = StereoRecording(options.sequence, options.calibration)
+    recording = StereoRecording(options.sequence, options.calibration, given_topics(options))
     _run_images(
         options,
         lambda tell: start_stereo(recording, config, options.out, options.resume, tell),

@@ -13,7 +13,7 @@ from rbpf.systems.plain_yaml import read_plain_yaml
 HEADER = (
     "rbpf", "system", "versions", "input_sha256",
     "recording", "known_points", "board", "square_m", "calibration", "known_map", "localize",
-    "aruco", "marker_m", "gap_m", "dictionary", "video", "batch",
+    "aruco", "marker_m", "gap_m", "dictionary", "image_topic", "truth_topic", "video", "batch",
 )  # fmt: skip
 """What a config.yaml says about the run besides its settings."""
 

@@ -1,4 +1,4 @@
-"""What every command owes to people and to programs: help, JSON, exit codes, Ctrl-C, the same run again."""
+"""What every command owes to people and to programs: JSON, exit codes, Ctrl-C, the same run again."""
 
 import json
 import os
@@ -7,50 +7,16 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import MISSING, fields
-from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 
-from rbpf.cli import APP, DemoOptions, main
-from rbpf.cli.cameras import CalibrateOptions, RecalibrateOptions
+from rbpf.cli import APP, main
 from rbpf.cli.compiling import cached, compile_kernels, kernel_modules
-from rbpf.cli.exporting import ExportOptions
-from rbpf.cli.installed import DoctorOptions
-from rbpf.cli.judging import CompareOptions, ReportOptions, SweepOptions, ValidateOptions
-from rbpf.cli.options import (
-    ImagesOptions,
-    LabOptions,
-    LogOptions,
-    MonoOptions,
-    RangeBearingOptions,
-    StereoOptions,
-)
 from tests.cli.run_outputs import outputs
 
 pytestmark = pytest.mark.slow
-
-COMMANDS = {
-    "demo": DemoOptions,
-    "run range-bearing": RangeBearingOptions,
-    "run mono": MonoOptions,
-    "run stereo": StereoOptions,
-    "simulate range-bearing": LogOptions,
-    "simulate desk": ImagesOptions,
-    "simulate room": ImagesOptions,
-    "simulate lab": LabOptions,
-    "calibrate": CalibrateOptions,
-    "recalibrate": RecalibrateOptions,
-    "validate": ValidateOptions,
-    "report": ReportOptions,
-    "export": ExportOptions,
-    "sweep": SweepOptions,
-    "compare": CompareOptions,
-    "doctor": DoctorOptions,
-}
-UNIT = re.compile(r"\b(px|m|s|seconds|share|rich|particles|grey levels|Hz)\b")
 
 
 @pytest.fixture(scope="module")
@@ -73,40 +39,6 @@ def quick(log, out, *arguments):
         "--no-batch",
         *arguments,
     ]
-
-
-def help_of(command, capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "200")
-    with pytest.raises(SystemExit) as ended:
-        main([*command.split(), "--help"])
-    assert ended.value.code == 0
-    return capsys.readouterr().out
-
-
-def test_every_command_is_in_this_file(capsys, monkeypatch):
-    text = help_of("", capsys, monkeypatch)
-    named = set(re.search(r"\{([\w,-]+)\}", text)[1].split(","))
-    assert named == {command.split()[0] for command in COMMANDS} | {"completion"}
-    assert "0 success" in text and "130 stopped" in text
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_help_says_what_each_option_is_its_default_and_its_unit(command, capsys, monkeypatch):
-    text = " ".join(help_of(command, capsys, monkeypatch).replace("│", " ").split())
-    options = text[text.index("show this help") :]
-    for item in fields(COMMANDS[command]):
-        shown = f"--{item.name.replace('_', '-')}"
-        found = re.search(rf"{shown}[ ,](.+?)\((default: [^)]*|required|repeatable)\)", options)
-        if found is None:
-            assert item.default is MISSING, f"{command} {shown} is not in its help"
-            assert "(required)" in text
-            continue
-        assert len(found[1].split()) >= 3, f"{command} {shown} does not say what it is"
-        assert " --" not in found[1].replace(" --no-", ""), f"{command} {shown} has no default"
-        if item.default is None:
-            assert "by default" in found[1] or "None for none" in found[1], f"{command} {shown}: by default?"
-        if isinstance(item.default, float):
-            assert UNIT.search(found[1]), f"{command} {shown} has no unit: {found[1]}"
 
 
 @pytest.mark.parametrize(
@@ -263,17 +195,6 @@ def test_the_first_compilation_is_announced(log, tmp_path):
         process.kill()
         process.communicate()
     assert "compiling" in first and "done once" in first
-
-
-@pytest.mark.skipif(not Path("/bin/bash").exists(), reason="needs bash")
-def test_bash_completes_commands(tmp_path, capsys):
-    assert main(["completion", "bash"]) == 0
-    script = tmp_path / "completion.sh"
-    script.write_text(capsys.readouterr().out)
-    ask = f'source {script}; COMP_WORDS=(rbpf cali); COMP_CWORD=1; F=$(complete -p rbpf | sed "s/.*-F //; s/ .*//"); '
-    ask += '$F; printf "%s\\n" "${COMPREPLY[@]}"'
-    found = subprocess.run(["/bin/bash", "-c", ask], capture_output=True, text=True, check=False)
-    assert "calibrate" in found.stdout.split(), found.stderr
 
 
 def test_the_program_has_one_entry():

@@ -14,12 +14,14 @@ import imageio_ffmpeg
 import numpy as np
 
 from rbpf.cli import main
+from rbpf.sensors.readers.images import open_images, open_stereo
 from rbpf.validation.simulation.exposure import Imaging
 from rbpf.validation.simulation.images import simulate_images
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 from rbpf.validation.simulation.textured_desk import TexturedDesk
 from tests.cli.mono_sequences import CAMERA as DESK_CAMERA
 from tests.cli.mono_sequences import render_desk
+from tests.readers.images.bags import film_images, film_pairs, recorded
 from tests.sensors.board_pictures import CAMERA, pictures
 
 SHORTER = {
@@ -44,6 +46,8 @@ NAMES = {
     "DATA/mono_robot_lateral": "desk",
     "phone.mp4": "phone.mp4",
     "board.mp4": "board.mp4",
+    "drive.bag": "drive.bag",
+    "stereo.bag": "stereo.bag",
 }
 """Names on the pages, and the recordings of `Shelf` that they stand for."""
 
@@ -112,6 +116,15 @@ class Shelf:
 
     def _board(self, path: Path) -> None:
         _film([np.repeat(image[..., None], 3, axis=-1) for image in pictures()], path)
+
+    def _drive(self, path: Path) -> None:
+        """The desk's images and poses."""
+        with recorded(path) as bag:
+            film_images(bag, open_images(self.get("desk")))
+
+    def _stereo(self, path: Path) -> None:
+        with recorded(path) as bag:
+            film_pairs(bag, open_stereo(self.get("pairs")))
 
     def _walk(self, path: Path) -> None:
         """The camera that took the board's pictures, over a desk on which the board lies."""

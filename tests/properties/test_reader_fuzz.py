@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.readers import open_log, stereo_tracks, text
-from rbpf.sensors.readers.images import open_images, open_stereo, read_known_points
+from rbpf.sensors.readers.images import Topics, open_images, open_stereo, read_known_points
 from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
 from rbpf.validation.camera_files import read_features, write_features
 from rbpf.validation.measurement_files import read_measurements, write_measurements
@@ -25,7 +25,7 @@ from rbpf.validation.trajectory import Trajectory
 from rbpf.validation.trajectory_files import read_kitti, read_tum, write_tum
 from tests.properties.mutations import damaged
 from tests.readers import test_mrclam, test_stereo_tracks, test_victoria_park, test_wheel_odometry
-from tests.readers.images import folders
+from tests.readers.images import bags, folders
 from tests.validation.worlds import world
 
 pytestmark = pytest.mark.slow
@@ -61,6 +61,30 @@ def plain(folder: Path) -> None:
     (folder / "times.txt").write_text("0.0\n0.1\n0.2\n")
 
 
+def bag(name: str) -> tuple[Callable[[Path], object], Read, str]:
+    """A bag with poses, and a pair; all of its files are damaged."""
+    truth = Topics(truth="/truth")
+
+    def write(folder: Path) -> None:
+        bags.write_bag(folder / f"one_{name}")
+        bags.write_pair(folder / f"two_{name}", image="image_raw")
+
+    def read(folder: Path) -> None:
+        problems = []
+        for open_it in (
+            lambda: open_images(folder / f"one_{name}", topics=truth),
+            lambda: open_stereo(folder / f"two_{name}"),
+        ):
+            try:
+                list(open_it().frames())
+            except InputError as error:
+                problems.append(error)
+        if problems:
+            raise problems[0]
+
+    return write, read, "**/*.*"
+
+
 def mrclam(folder: Path) -> None:
     test_mrclam.write(folder, test_mrclam.log_files())
 
@@ -89,6 +113,9 @@ RECORDINGS: dict[str, tuple[Callable[[Path], object], Read, str]] = {
     "EuRoC pair": (folders.write_rectified, pairs, "**/*.[cy]*"),
     "KITTI": (kitti, frames, "*.txt"),
     "KITTI pair": (kitti, pairs, "calib.txt"),
+    "ROS 1": bag("walk.bag"),
+    "ROS 2, database": bag("walk_db3"),
+    "ROS 2, MCAP": bag("walk_mcap"),
     "7-Scenes": (folders.write_seven_scenes, frames, "*.txt"),
     "MRCLAM": (mrclam, open_log, "*.dat"),
     "MRPT": (lambda f: simulate_robot(RobotWorld(4, 5), f, 0), open_log, "*.*"),

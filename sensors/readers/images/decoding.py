@@ -25,14 +25,27 @@ def read_grey(path: Path) -> Grey:
     Raises:
         UnreadableImageError: the file is missing, or is no complete image of a format that OpenCV knows.
     """
-    import cv2
-
     try:
         data = np.fromfile(path, dtype=np.uint8)
     except FileNotFoundError:
         raise UnreadableImageError(f"{path}: no such image.") from None
     except (OSError, ValueError) as error:
         raise UnreadableImageError(f"{path}: the image cannot be read ({error}).") from None
+    return decode(path, data)
+
+
+def decode(path: Path | str, data: NDArray[np.uint8]) -> Grey:
+    """Image (H, W) of the content (B,) of a file.
+
+    Args:
+        path: where it is from, for messages.
+        data: the bytes.
+
+    Raises:
+        UnreadableImageError: they are no complete image of a format that OpenCV knows.
+    """
+    import cv2
+
     if not data.size:
         raise UnreadableImageError(f"{path}: the file is empty, expected an image.")
     _require_size(path, data)
@@ -45,7 +58,7 @@ def read_grey(path: Path) -> Grey:
     return _to_8_bits(path, image)
 
 
-def to_grey(path: Path, image: np.ndarray) -> Grey:
+def to_grey(path: Path | str, image: np.ndarray) -> Grey:
     """Grey image (H, W) of a decoded video image (H, W), (H, W, 1) or (H, W, 3) in the order blue, green, red.
 
     Raises:
@@ -58,7 +71,7 @@ def to_grey(path: Path, image: np.ndarray) -> Grey:
     return _to_8_bits(path, image)
 
 
-def require_shape(path: Path, image: Grey, shape: tuple[int, int]) -> Grey:
+def require_shape(path: Path | str, image: Grey, shape: tuple[int, int]) -> Grey:
     """The image, if it has this height and width.
 
     Raises:
@@ -72,7 +85,7 @@ def require_shape(path: Path, image: Grey, shape: tuple[int, int]) -> Grey:
     return image
 
 
-def _require_size(path: Path, data: NDArray[np.uint8]) -> None:
+def _require_size(path: Path | str, data: NDArray[np.uint8]) -> None:
     """Refuses, before anything is decoded, an image whose header claims more pixels than Pillow takes for sane."""
     from PIL import Image
 
@@ -84,7 +97,7 @@ def _require_size(path: Path, data: NDArray[np.uint8]) -> None:
         pass
 
 
-def _to_8_bits(path: Path, image: np.ndarray) -> Grey:
+def _to_8_bits(path: Path | str, image: np.ndarray) -> Grey:
     if image.dtype == np.uint16:
         return np.rint(image * (255.0 / 65535.0)).astype(np.uint8)
     if image.dtype != np.uint8:

@@ -1,8 +1,9 @@
-"""Recordings of two cameras side by side: EuRoC ASL with `cam0` and `cam1`, KITTI with `image_0` and `image_1`.
+"""Recordings of two cameras side by side: EuRoC ASL (`cam0`, `cam1`), KITTI (`image_0`, `image_1`), ROS bags.
 
-EuRoC's images are paired by their times; what has no partner is left out, which `StereoSequence.notes` says. Images
-that are not rectified become so by the two `sensor.yaml`; the truth is then that of the rectified left camera. KITTI's
-images are rectified and have numbers: one that is missing on either side is a pair with a problem.
+Images of EuRoC and of bags are paired by their times; what has no partner is left out, which `StereoSequence.notes`
+says. Images that are not rectified become so by the two `sensor.yaml` or CameraInfo; the truth is then that of the
+rectified left camera. KITTI's images are rectified and have numbers: one that is missing on either side is a pair with
+a problem.
 """
 
 import logging
@@ -16,9 +17,10 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.sensors.features import CameraTruth
 from rbpf.sensors.pinhole import RectifiedStereo
-from rbpf.sensors.readers.images import euroc, euroc_pair, kitti
+from rbpf.sensors.readers.images import bag, bag_pair, euroc, euroc_pair, kitti
 from rbpf.sensors.readers.images.pairing import TOLERANCE_S
 from rbpf.sensors.readers.images.sequence import ImageFrame, ImageSequence
+from rbpf.sensors.readers.images.topics import UNNAMED, Topics
 
 _log = logging.getLogger(__name__)
 
@@ -68,15 +70,19 @@ class StereoSequence:
 
 
 def open_stereo(
-    path: str | Path, calibration: str | Path | None = None, tolerance_s: float = TOLERANCE_S
+    path: str | Path,
+    calibration: str | Path | None = None,
+    tolerance_s: float = TOLERANCE_S,
+    topics: Topics = UNNAMED,
 ) -> StereoSequence:
     """Open a stereo sequence.
 
     Args:
-        path: its folder.
+        path: its folder, or a ROS bag.
         calibration: a `camera.yaml` of the rectified left camera, in place of the sequence's own calibration; with
             `baseline_m`, in place of its baseline, too.
-        tolerance_s: images of EuRoC's two cameras whose times differ by no more belong together.
+        tolerance_s: images of two cameras whose times differ by no more belong together; KITTI's have numbers.
+        topics: of a ROS bag, where they have to be named.
 
     Raises:
         InputError: nothing is there, or it is no stereo sequence; a file is missing or malformed; no two images
@@ -85,13 +91,20 @@ def open_stereo(
     """
     path = Path(path)
     given = None if calibration is None else Path(calibration)
-    if euroc.recognises(path):
+    if bag.recognises(path):
+        pair, rig, notes = bag_pair.read(path, given, tolerance_s, topics)
+    elif euroc.recognises(path):
+        topics.require_none(path)
         pair, rig, notes = euroc_pair.read(path, given, tolerance_s)
     elif kitti.recognises(path):
+        topics.require_none(path)
         pair, rig, notes = kitti.read_pair(path, given)
     else:
-        found = "no such folder" if not path.is_dir() else "the folder is neither"
-        raise InputError(f"{path}: {found}, expected {euroc_pair.KIND}; or {kitti.PAIR_KIND}.")
+        found = (
+            f"the {'folder' if path.is_dir() else 'file'} is neither" if path.exists() else "no such folder"
+        )
+        kinds = f"{euroc_pair.KIND}; or {kitti.PAIR_KIND}; or {bag_pair.PAIR_KIND}"
+        raise InputError(f"{path}: {found}, expected {kinds}.")
     for note in notes:
         _log.warning("%s", note)
     return StereoSequence(pair, rig, notes)

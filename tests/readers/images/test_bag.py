@@ -1,0 +1,245 @@
+"""ROS bags."""
+
+import numpy as np
+import pytest
+from rosbags.rosbag1 import Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode
+
+from rbpf.errors import InputError
+from rbpf.sensors.readers.images import Topics, bag_file, open_images
+from tests.readers.images.bags import KINDS, SIZE, STAMPS_NS, recorded, write_bag, write_pair
+from tests.readers.images.folders import grey, levels, write_camera, write_plain
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_small_bag(tmp_path, kind):
+    sequence = open_images(write_bag(tmp_path / kind))
+    assert sequence.name == kind.removesuffix(".bag")
+    assert sequence.stamps_ns.tolist() == list(STAMPS_NS)
+    assert sequence.camera.params.tolist() == [20.0, 21.0, 11.5, 7.5, 0.1, 0.01, 0.001, 0.002, 0.0]
+    assert (sequence.camera.height, sequence.camera.width) == SIZE
+    assert sequence.truth is None and sequence.baseline_m is None
+    assert levels(sequence) == [10, 20, 30] and levels(sequence, 2) == [30]
+
+
+@pytest.mark.parametrize("name", ["walk_db3/walk_db3.db3", "walk_mcap/walk_mcap.mcap"])
+def test_a_single_file_of_ros_2_needs_no_folder(tmp_path, name):
+    write_bag(tmp_path / name.split("/")[0])
+    assert levels(open_images(tmp_path / name)) == [10, 20, 30]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_packed_bags(tmp_path, kind):
+    def packed(writer):
+        if isinstance(writer, Writer):
+            writer.set_compression(Writer.CompressionFormat.LZ4)
+        else:
+            writer.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
+        return writer
+
+    assert levels(open_images(write_bag(tmp_path / kind, prepare=packed))) == [10, 20, 30]
+
+
+def test_a_chunk_that_unpacks_to_more_than_there_can_be_is_refused(tmp_path, monkeypatch):
+    def packed(writer):
+        writer.set_compression(Writer.CompressionFormat.BZ2)
+        return writer
+
+    path = tmp_path / "walk.bag"
+    with recorded(path, packed) as bag:
+        bag.info("/camera_info")
+        bag.image("/image_raw", 1, np.zeros((400, 600), np.uint8))
+    monkeypatch.setattr(bag_file, "MOST_BYTES", 2 * path.stat().st_size)
+    with pytest.raises(InputError, match="a chunk is cut off, or larger than"):
+        open_images(path)
+
+
+# What becomes of the pictures.
+
+
+def test_the_same_grey_values_from_every_encoding(tmp_path):
+    """A grey picture in all the ways in which a message may hold it; a Bayer pattern of one level is that level."""
+    level = np.full(SIZE, 77, np.uint8)
+    deep, colour = level.astype(np.uint16) * 257, np.repeat(level[..., None], 3, axis=2)
+    bayer = [f"bayer_{pattern}8" for pattern in ("rggb", "bggr", "gbrg", "grbg")]
+    pictures = {"mono8": level, "mono16": deep, "bgr8": colour, "rgb8": colour} | dict.fromkeys(bayer, level)
+    pictures |= dict.fromkeys(("bgra8", "rgba8"), np.repeat(level[..., None], 4, axis=2))
+    for name, picture in pictures.items():
+        with recorded(tmp_path / f"{name}.bag") as bag:
+            bag.info("/camera_info")
+            bag.image("/image_raw", STAMPS_NS[0], picture, name, padding=6)
+        (frame,) = open_images(tmp_path / f"{name}.bag").frames()
+        np.testing.assert_array_equal(frame.image, level, name)
+
+
+def test_colours_are_told_apart(tmp_path):
+    """Pure blue, green and red by OpenCV's weights; and big-endian values."""
+    colour = np.zeros((*SIZE, 3), np.uint8)
+    colour[..., 0] = 200
+    deep = np.full(SIZE, 0x1234, ">u2")
+    with recorded(tmp_path / "walk.bag") as bag:
+        bag.info("/camera_info")
+        bag.image("/image_raw", 1, colour, "bgr8")
+        bag.image("/image_raw", 2, colour, "rgb8")
+        bag.image("/image_raw", 3, deep, "mono16", is_bigendian=1)
+    assert levels(open_images(tmp_path / "walk.bag")) == [23, 60, 18]
+
+
+def test_compressed_pictures_are_those_of_the_same_files(tmp_path):
+    folder = write_plain(tmp_path / "images")
+    with recorded(tmp_path / "walk.bag") as bag:
+        bag.info("/cam/camera_info", d=(0.0,) * 5)
+        for i, file in enumerate(sorted(folder.glob("*.png"))):
+            bag.compressed("/cam/image_raw/compressed", STAMPS_NS[i], file.read_bytes())
+    both = zip(open_images(folder).frames(), open_images(tmp_path / "walk.bag").frames(), strict=True)
+    for plain, packed in both:
+        np.testing.assert_array_equal(plain.image, packed.image)
+
+
+SPOILT = {
+    "encoding": ({"encoding": "32FC1"}, "the encoding '32FC1' is none of mono8"),
+    "rows": ({"height": 15}, "expected 15 rows of 24 bytes, found 384 bytes"),
+    "step": ({"step": 12}, "24x16 px in rows of 12 bytes"),
+    "huge": ({"height": 2**31, "width": 2**31, "step": 2**31}, "found 384 bytes"),
+}
+
+
+@pytest.mark.parametrize("name", SPOILT)
+def test_one_bad_picture_is_a_frame_that_says_so(tmp_path, name):
+    changes, problem = SPOILT[name]
+    with recorded(tmp_path / "walk.bag") as bag:
+        bag.info("/camera_info")
+        for i, stamp in enumerate(STAMPS_NS):
+            bag.image("/image_raw", stamp, grey(10 * i, SIZE), **(changes if i == 1 else {}))
+    frames = list(open_images(tmp_path / "walk.bag").frames())
+    assert [frame.image is None for frame in frames] == [False, True, False]
+    assert frames[1].stamp_ns == STAMPS_NS[1]
+    assert problem in frames[1].problem and "/image_raw, image 1" in frames[1].problem
+
+
+@pytest.mark.parametrize("name", SPOILT)
+def test_no_picture_that_can_be_read_is_refused(tmp_path, name):
+    changes, problem = SPOILT[name]
+    with recorded(tmp_path / "walk.bag") as bag:
+        bag.info("/camera_info")
+        bag.image("/image_raw", 1, grey(1, SIZE), **changes)
+    with pytest.raises(InputError, match=rf"none of 1 images can be read; the first is .*{problem}"):
+        open_images(tmp_path / "walk.bag")
+
+
+def test_what_else_may_stand_between_pictures(tmp_path):
+    """Another size; a message of which only the header is whole; and one that is too short for a header."""
+    stamped = bytes([0, 1, 0, 0]) + (0).to_bytes(4, "little") + (3).to_bytes(4, "little")
+    with recorded(tmp_path / "walk_db3") as bag:
+        bag.info("/camera_info")
+        bag.image("/image_raw", 1, grey(10, SIZE))
+        bag.image("/image_raw", 2, grey(10, (8, 12)))
+        bag.add_raw("/image_raw", 3, "sensor_msgs/msg/Image", stamped + b"\xff" * 40)
+        bag.add_raw("/image_raw", 4, "sensor_msgs/msg/Image", stamped[:6])
+        bag.image("/image_raw", 5, grey(50, SIZE))
+    sequence = open_images(tmp_path / "walk_db3")
+    assert sequence.stamps_ns.tolist() == [1, 2, 3, 5]
+    frames = list(sequence.frames())
+    assert [frame.image is None for frame in frames] == [False, True, True, False]
+    assert "expected 24x16 px" in frames[1].problem and "a message is damaged" in frames[2].problem
+
+
+def test_a_bag_that_is_damaged_further_on_is_read_until_there(tmp_path, caplog):
+    """Each image in a packed chunk of its own, of which the last one is spoilt."""
+
+    def packed(writer):
+        writer.set_compression(Writer.CompressionFormat.BZ2)
+        writer.chunk_threshold = 300
+        return writer
+
+    path = tmp_path / "walk.bag"
+    with recorded(path, packed) as bag:
+        bag.info("/camera_info")
+        for i, stamp in enumerate(STAMPS_NS):
+            bag.image("/image_raw", stamp, grey(10 + 10 * i, SIZE))
+    whole = path.read_bytes()
+    place = whole.rindex(b"BZh9") + 20
+    path.write_bytes(whole[:place] + bytes(20) + whole[place + 20 :])
+    assert levels(open_images(path)) == [10, 20]
+    assert "The 2 images before it are kept" in caplog.text
+
+
+# Times.
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_times_that_run_backwards(tmp_path, kind):
+    """The headers' times; the bag's own are in order."""
+    with recorded(tmp_path / kind) as bag:
+        bag.info("/camera_info")
+        for received, stamp in enumerate((5, 7, 6)):
+            fields = {"height": 1, "width": 1, "encoding": "mono8", "is_bigendian": 0, "step": 1}
+            bag.add(
+                "/image_raw", stamp, "sensor_msgs/msg/Image", received, data=np.zeros(1, np.uint8), **fields
+            )
+    with pytest.raises(InputError, match="/image_raw: the stamp of image 2 is before the one it follows"):
+        open_images(tmp_path / kind, write_camera(tmp_path))
+
+
+def test_times_that_were_never_set(tmp_path):
+    with pytest.raises(InputError, match="all 3 images have the time 0, their headers are not filled in"):
+        open_images(write_bag(tmp_path / "walk.bag", stamps=(0, 0, 0)))
+
+
+# Which topics.
+
+
+def test_several_topics_of_images_have_to_be_named(tmp_path):
+    path = write_pair(tmp_path / "walk.bag")
+    with pytest.raises(
+        InputError,
+        match=r"image topics are /left/image_rect, /right/image_rect; name one of them with --image-topic",
+    ):
+        open_images(path)
+    assert levels(open_images(path, topics=Topics(("/right/image_rect",)))) == [110, 120, 130]
+
+
+@pytest.mark.parametrize(
+    ("topics", "problem"),
+    [
+        (Topics(("/nothing",)), "/nothing is no topic of images; the bag's image topics are /cam0/image_raw"),
+        (Topics(("/truth",)), "/truth is no topic of images"),
+        (Topics(truth="/nothing"), "expected poses in the topic /nothing, found /truth with poses"),
+    ],
+)
+def test_a_topic_that_is_not_there(tmp_path, topics, problem):
+    with pytest.raises(InputError, match=problem):
+        open_images(write_bag(tmp_path / "walk.bag"), topics=topics)
+
+
+def test_a_bag_without_images(tmp_path):
+    with recorded(tmp_path / "walk.bag") as bag:
+        bag.info("/camera_info")
+    with pytest.raises(InputError, match="the bag has no topic of images"):
+        open_images(tmp_path / "walk.bag")
+
+
+def test_a_folder_of_images_with_a_description_is_no_bag(tmp_path):
+    write_plain(tmp_path)
+    (tmp_path / "metadata.yaml").write_text("camera: mine\n")
+    assert levels(open_images(tmp_path)) == [10, 20, 30]
+
+
+def test_only_bags_have_topics(tmp_path):
+    with pytest.raises(InputError, match="image topic /cam is given, but only ROS bags have topics"):
+        open_images(write_plain(tmp_path), topics=Topics(("/cam",)))
+
+
+@pytest.mark.parametrize("given", ["", "/a,", "/a,/b,/c"])
+def test_names_of_topics_that_are_none(given):
+    with pytest.raises(InputError, match="expected the name of an image topic, or two as LEFT,RIGHT"):
+        Topics.parse(given)
+
+
+def test_names_of_topics_are_what_config_yaml_says():
+    assert (
+        Topics.parse("/a, /b", "/t")
+        == Topics(("/a", "/b"), "/t")
+        == Topics.parse(*Topics.parse("/a,/b", "/t").entries().values())
+    )
+    assert Topics.parse() == Topics() and Topics().entries() == {}
