@@ -8,9 +8,9 @@ from rbpf.kernels.block import flat
 from rbpf.kernels.quaternion import rotation
 from rbpf.kernels.signature import BLOCK, observation_kernel
 from rbpf.sensors.camera_kernels import forward_depth, locate, measure, store_by_state, turn
-from rbpf.sensors.pinhole_kernels import project
+from rbpf.sensors.pinhole_kernels import KIND, project
 
-HEADER = 9
+HEADER = KIND + 1
 """Parameters before the points: the camera's."""
 _SMALL = 1e-2
 """θ² below which the series of the coefficients are exact to rounding with the terms kept."""
