@@ -57,6 +57,11 @@ class Equidistant:
         """Distance from the axis, in normalised coordinates, up to which a direction is seen."""
         return float(np.tan(self.widest))
 
+    @cached_property
+    def reach(self) -> float:
+        """Distance from the axis, in distorted coordinates, of the circle in which it sees."""
+        return float(self._rises_to(np.array(self.widest)))
+
     def distort(self, uv: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
         """Distorted coordinates (…, 2) of normalised ones."""
         return self._scale_and_bend(uv)[0][..., None] * uv
@@ -82,15 +87,15 @@ class Equidistant:
         low, high = np.zeros_like(reached), np.full_like(reached, self.widest)
         angle = np.clip(reached, low, high)
         for _ in range(ITERATIONS):
-            missing = reached - self._reach(angle)
+            missing = reached - self._rises_to(angle)
             low, high = np.where(missing > 0.0, angle, low), np.where(missing < 0.0, angle, high)
-            ahead = angle + missing / self._reach_slope(angle)
+            ahead = angle + missing / self._rises_by(angle)
             before, angle = angle, np.where((ahead >= low) & (ahead <= high), ahead, 0.5 * (low + high))
             if not (np.abs(angle - before) > SETTLED).any():
                 break
         away = np.where(reached > 0.0, reached, 1.0)
         uv = target * np.where(reached > 0.0, np.tan(angle) / away, 1.0)[:, None]
-        found = (reached < self._reach(np.array(self.widest))) & self.is_unique(uv)
+        found = (reached < self.reach) & self.is_unique(uv)
         return np.where(found[:, None], uv, np.nan)
 
     def _scale_and_bend(self, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -99,17 +104,17 @@ class Equidistant:
         near = s < NEAR
         s = np.where(near, 1.0, s)
         angle = np.arctan(np.sqrt(s))
-        scale = self._reach(angle) / np.sqrt(s)
-        bend = (self._reach_slope(angle) / (1.0 + s) - scale) / s
+        scale = self._rises_to(angle) / np.sqrt(s)
+        bend = (self._rises_by(angle) / (1.0 + s) - scale) / s
         return np.where(near, 1.0, scale), np.where(near, 0.0, bend)
 
-    def _reach(self, angle: np.ndarray) -> np.ndarray:
+    def _rises_to(self, angle: np.ndarray) -> np.ndarray:
         """The distance θ_d (…)."""
         k1, k2, k3, k4 = self.coefficients
         s = angle * angle
         return angle * (1.0 + s * (k1 + s * (k2 + s * (k3 + s * k4))))
 
-    def _reach_slope(self, angle: np.ndarray) -> np.ndarray:
+    def _rises_by(self, angle: np.ndarray) -> np.ndarray:
         """∂θ_d/∂θ (…)."""
         k1, k2, k3, k4 = self.coefficients
         s = angle * angle

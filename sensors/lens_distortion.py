@@ -38,6 +38,7 @@ class RadialTangential:
     coefficients: tuple[float, float, float, float, float]
     names: ClassVar = ("k1", "k2", "p1", "p2", "k3")
     kind: ClassVar = 0.0
+    reach: ClassVar = float("inf")
 
     @cached_property
     def is_plain(self) -> bool:

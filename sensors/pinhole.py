@@ -131,6 +131,18 @@ class Pinhole:
         """∂(u, v)/∂px (…, 2, 2) at pixels (…, 2); NaN where `unproject` is."""
         return inverse(self.lens.slope(self.unproject(px))) / self.params[:2]
 
+    def circle(self, margin_px: float) -> Bool[np.ndarray, "H W"] | None:
+        """Pixels (H, W) that far inside the circle in which a fisheye lens sees; None where it fills the image.
+
+        It does with radial-tangential distortion: there `unproject` tells the few pixels that have no direction.
+        """
+        if np.isinf(self.lens.reach):
+            return None
+        rows, columns = np.ogrid[: self.height, : self.width]
+        away = np.hypot((columns - self.cx) / self.fx, (rows - self.cy) / self.fy)
+        within = away < self.lens.reach - margin_px / min(self.fx, self.fy)
+        return None if within.all() else within
+
     def inside(self, px: Float[np.ndarray, "*batch 2"], margin_px: float = 0.0) -> Bool[np.ndarray, "*batch"]:
         """Whether pixels (…, 2) are in the image (…), and at least `margin_px` from its border.
 

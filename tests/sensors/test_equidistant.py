@@ -1,5 +1,7 @@
 """Equidistant lenses of fisheye cameras: OpenCV's `cv2.fisheye`, how far they see, where they fold back."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -61,6 +63,18 @@ def test_it_sees_75_degrees_from_the_axis_and_no_more():
     assert np.isnan(camera.unproject(camera.project(beyond[:3]))).all()
     # The models of landmarks hold the depth positive from `GRAZING` on: there no pixel may still be taken for it.
     assert np.cos(WIDEST) > GRAZING
+
+
+def test_the_circle_in_which_it_sees():
+    camera = FISHEYES["tum-vi"]
+    rows, columns = np.mgrid[:512, :512]
+    seen = np.isfinite(camera.unproject(np.stack([columns, rows], axis=-1).astype(float)))[..., 0]
+    np.testing.assert_array_equal(camera.circle(0.0), seen)
+    px = np.argwhere(camera.circle(16.0))[:, ::-1]
+    for corner in np.array([[-11.0, -11.0], [-11.0, 11.0], [11.0, -11.0], [11.0, 11.0]]):
+        assert np.isfinite(camera.unproject(px + corner)).all()
+    assert replace(camera, width=300, height=300, cx=150.0, cy=150.0).circle(16.0) is None
+    assert Pinhole(640, 480, 320.0, 320.0, 320.0, 240.0, (-0.25, 0.0, 0.0, 0.0, 0.0)).circle(16.0) is None
 
 
 def test_a_lens_that_folds_back_is_seen_up_to_there():

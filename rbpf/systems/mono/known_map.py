@@ -1,6 +1,6 @@
 """The map of a finished run as a place to be found again in: known points, and what they look like.
 
-Its file, `known_map.npz`, holds only plain arrays: version, camera (9,), image_size (2,), alignment, names (K,),
+Its file, `known_map.npz`, holds only plain arrays: version, camera (10,), image_size (2,), alignment, names (K,),
 positions (K, 3), cov (K, 3, 3), windows (K, S, S) uint8, first_px (K, 2), first_pose (K, 7), views (V, 7).
 """
 
@@ -70,9 +70,14 @@ class KnownMap:
         """Refuses another camera than the map's.
 
         Raises:
-            InputError: sizes or focal lengths differ.
+            InputError: sizes, focal lengths or kinds of lens differ.
         """
         mine = self.camera
+        if mine.distortion_model != camera.distortion_model:
+            raise InputError(
+                f"the map was made through a lens with {mine.distortion_model} distortion, {what} has "
+                f"{camera.distortion_model} distortion: correct its calibration, or map with it"
+            )
         same = (mine.width, mine.height) == (camera.width, camera.height)
         ratio = np.array([camera.fx / mine.fx, camera.fy / mine.fy])
         if not same or np.abs(ratio - 1.0).max() > FOCAL_SHARE:
@@ -126,8 +131,11 @@ def read_known_map(path: Path) -> KnownMap:
 
 def _parsed(arrays: dict[str, np.ndarray]) -> KnownMap:
     count, views = arrays["names"].size, arrays["views"].shape[0]
+    if arrays["camera"].shape == (9,):
+        # Before there were lenses to tell apart.
+        arrays = arrays | {"camera": np.append(arrays["camera"], 0.0)}
     shapes = {
-        "camera": (9,), "image_size": (2,), "names": (count,), "positions": (count, 3), "cov": (count, 3, 3),
+        "camera": (10,), "image_size": (2,), "names": (count,), "positions": (count, 3), "cov": (count, 3, 3),
         "windows": (count, _SIDE, _SIDE), "first_px": (count, 2), "first_pose": (count, 7), "views": (views, 7),
     }  # fmt: skip
     for name, shape in shapes.items():
@@ -139,10 +147,8 @@ def _parsed(arrays: dict[str, np.ndarray]) -> KnownMap:
             )
     if not views or (np.linalg.eigvalsh(arrays["cov"]) < 0.0).any():
         raise ValueError("expected views, and covariances that are none less than zero")
-    fx, fy, cx, cy, *distortion = (float(value) for value in arrays["camera"])
     width, height = (int(value) for value in arrays["image_size"])
-    k1, k2, p1, p2, k3 = distortion
-    camera = Pinhole(width, height, fx, fy, cx, cy, (k1, k2, p1, p2, k3))
+    camera = Pinhole.from_params(width, height, arrays["camera"])
     alignment = _ALIGNMENTS[str(arrays["alignment"])]
     rest = (
         arrays[name] for name in ("names", "positions", "cov", "windows", "first_px", "first_pose", "views")
