@@ -17,7 +17,7 @@ from rbpf.errors import InputError
 from rbpf.sensors.board_calibration import BoardCalibration, BoardView, calibrate
 from rbpf.sensors.chessboard import Board, board_corners
 from rbpf.sensors.pinhole import Pinhole
-from rbpf.sensors.readers.images.calibration import NAME, model_of
+from rbpf.sensors.readers.images.calibration import MODELS, NAME, model_of
 from rbpf.sensors.readers.images.uncalibrated import Shot, read_shots
 from rbpf.validation.figures import COLOURS, label, save_figures
 from rbpf.validation.files import prepare_folder, write_text
@@ -38,7 +38,7 @@ class _Found:
 
 
 def calibrate_images(
-    images: Path, board: Board, on_image: Callable[[int, int], None] | None = None
+    images: Path, board: Board, on_image: Callable[[int, int], None] | None = None, model: str = "pinhole"
 ) -> tuple[BoardCalibration, int]:
     """The camera that took pictures of a board.
 
@@ -46,6 +46,7 @@ def calibrate_images(
         images: folder of images, or a video.
         board: what is printed.
         on_image: called with the images looked at and their number.
+        model: of the camera, as in camera.yaml: pinhole or fisheye.
 
     Returns:
         The calibration, and how many images were looked at.
@@ -65,7 +66,8 @@ def calibrate_images(
             empty = shot.image
     if not found.views:
         raise InputError(_nothing(images, board, found.looked_at, empty))
-    return calibrate(_spread(found.views), board, found.width, found.height), found.looked_at
+    views = _spread(found.views)
+    return calibrate(views, board, found.width, found.height, MODELS[model]), found.looked_at
 
 
 def write_calibration(found: BoardCalibration, board: Board, looked_at: int, out: Path) -> dict[str, Any]:
