@@ -20,7 +20,7 @@ from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 from rbpf.validation.simulation.textured_desk import TexturedDesk
 from tests.cli.mono_sequences import CAMERA as DESK_CAMERA
 from tests.cli.mono_sequences import render_desk
-from tests.sensors.board_pictures import CAMERA, pictures
+from tests.sensors.board_pictures import CAMERA, FISHEYE, pictures
 
 SHORTER = {
     ("simulate", "range-bearing"): ["--steps", "20", "--landmarks", "20"],
@@ -44,6 +44,7 @@ NAMES = {
     "DATA/mono_robot_lateral": "desk",
     "phone.mp4": "phone.mp4",
     "board.mp4": "board.mp4",
+    "wide.mp4": "wide.mp4",
 }
 """Names on the pages, and the recordings of `Shelf` that they stand for."""
 
@@ -112,6 +113,9 @@ class Shelf:
 
     def _board(self, path: Path) -> None:
         _film([np.repeat(image[..., None], 3, axis=-1) for image in pictures()], path)
+
+    def _wide(self, path: Path) -> None:
+        _film([np.repeat(image[..., None], 3, axis=-1) for image in pictures(20, FISHEYE)], path)
 
     def _walk(self, path: Path) -> None:
         """The camera that took the board's pictures, over a desk on which the board lies."""
