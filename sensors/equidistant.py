@@ -83,20 +83,22 @@ class Equidistant:
 
         The angle by Newton's method, which halves what is left where it would leave it: θ_d rises up to `widest`.
         """
-        reached = np.linalg.norm(target, axis=1)
-        low, high = np.zeros_like(reached), np.full_like(reached, self.widest)
-        angle = np.clip(reached, low, high)
+        length = np.linalg.norm(target, axis=1)
+        within = length < self.reach
+        length = np.where(within, length, 0.0)
+        low, high = np.zeros_like(length), np.full_like(length, self.widest)
+        angle = np.clip(length, low, high)
         for _ in range(ITERATIONS):
-            missing = reached - self._rises_to(angle)
+            missing = length - self._rises_to(angle)
             low, high = np.where(missing > 0.0, angle, low), np.where(missing < 0.0, angle, high)
             ahead = angle + missing / self._rises_by(angle)
             before, angle = angle, np.where((ahead >= low) & (ahead <= high), ahead, 0.5 * (low + high))
             if not (np.abs(angle - before) > SETTLED).any():
                 break
-        away = np.where(reached > 0.0, reached, 1.0)
-        uv = target * np.where(reached > 0.0, np.tan(angle) / away, 1.0)[:, None]
-        found = (reached < self.reach) & self.is_unique(uv)
-        return np.where(found[:, None], uv, np.nan)
+        uv = (
+            target * np.where(length > 0.0, np.tan(angle) / np.where(length > 0.0, length, 1.0), 1.0)[:, None]
+        )
+        return np.where((within & self.is_unique(uv))[:, None], uv, np.nan)
 
     def _scale_and_bend(self, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """θ_d/r and its derivative by r, over r (…), at the distance r from the axis."""

@@ -24,9 +24,6 @@ MODELS = {
 }
 """Of each kind of lens: numbers of coefficients, and what OpenCV is told to leave at zero."""
 
-_STEP = 1e-5
-"""Of a parameter, for a numeric derivative: a coefficient, or a share of the focal length."""
-
 
 class Solved(NamedTuple):
     """A camera and V boards of M corners before it.
@@ -120,17 +117,8 @@ def _deviations(camera: Pinhole, places: np.ndarray, px: np.ndarray, free: np.nd
 
 
 def _by_camera(camera: Pinhole, places: np.ndarray) -> np.ndarray:
-    """∂px (V, M, 2, P) by fx, fy, cx, cy and the coefficients; central differences."""
-    columns = []
-    for name in ("fx", "fy", "cx", "cy"):
-        value, step = getattr(camera, name), _STEP * camera.fx
-        more, less = (replace(camera, **{name: value + sign * step}).project(places) for sign in (1, -1))
-        columns.append((more - less) / (2.0 * step))
-    for k in range(len(camera.distortion)):
-        change = _STEP * np.eye(len(camera.distortion))[k]
-        more, less = (
-            replace(camera, distortion=tuple((camera.distortion + sign * change).tolist())).project(places)
-            for sign in (1, -1)
-        )
-        columns.append((more - less) / (2.0 * _STEP))
-    return np.stack(columns, axis=-1)
+    """∂px (V, M, 2, P) by fx, fy, cx, cy and the coefficients: pixels are linear in each, so that one more tells it."""
+    k = np.array(camera.distortion)
+    more = [replace(camera, **{name: getattr(camera, name) + 1.0}) for name in ("fx", "fy", "cx", "cy")]
+    more += [replace(camera, distortion=tuple((k + unit).tolist())) for unit in np.eye(k.size)]
+    return np.stack([one.project(places) - camera.project(places) for one in more], axis=-1)
