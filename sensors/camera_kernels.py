@@ -54,9 +54,9 @@ def locate(pose, point, n, place):
         place[2 * BLOCK + i] = forward_depth(x, y, r[2] * a + r[5] * b + r[8] * c)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", inline="always")
 def _measure_equidistant(place, z0, z1, params, n, nu, across, down):
-    """As `measure`: a function of its own, so that its arc tangents do not keep the other loop from being vectors."""
+    """As `measure`: a loop of its own, whose arc tangents would keep the other one from becoming vectors."""
     for i in range(n):
         x, y, depth = place[i], place[BLOCK + i], place[2 * BLOCK + i]
         px, py, d00, d01, d02, d10, d11, d12 = project_equidistant(x, y, depth, params)
