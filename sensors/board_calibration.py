@@ -6,12 +6,13 @@ corners do not need would bend the image where no corner was.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.sensors.chessboard import Board
+from rbpf.sensors.lens_calibration import MODELS, solved
 from rbpf.sensors.pinhole import Pinhole
 
 LEAST_VIEWS = 5
@@ -24,14 +25,6 @@ OUTLYING = 4.0
 """Views whose error is this many times the median one are left out, and …"""
 HARMLESS_PX = 0.3
 """… those with less than this are not."""
-
-_MODELS = (
-    (0, ("CALIB_FIX_K1", "CALIB_FIX_K2", "CALIB_FIX_K3", "CALIB_ZERO_TANGENT_DIST")),
-    (2, ("CALIB_FIX_K3", "CALIB_ZERO_TANGENT_DIST")),
-    (4, ("CALIB_FIX_K3",)),
-    (5, ()),
-)
-"""Numbers of coefficients, and what OpenCV is told to leave at zero: none; k1, k2; and p1, p2; and k3."""
 
 
 class BoardView(NamedTuple):
@@ -47,7 +40,7 @@ class BoardCalibration:
 
     Attributes:
         camera: the camera.
-        std: (9,) standard deviations of fx, fy, cx, cy [px], k1, k2, p1, p2, k3; 0 where a coefficient was not needed.
+        std: (P,) standard deviations of fx, fy, cx, cy [px] and the lens's coefficients; 0 for one that was not needed.
         views: those that were used.
         residuals: (V, M, 2) where corners were found less where the camera sees them, px.
         normals: (V, 3) of the board in the camera's frame.
@@ -84,7 +77,9 @@ class BoardCalibration:
         return len(np.unique(field, axis=0)) / 48
 
 
-def calibrate(views: Sequence[BoardView], board: Board, width: int, height: int) -> BoardCalibration:
+def calibrate(
+    views: Sequence[BoardView], board: Board, width: int, height: int, model: str = "radial-tangential"
+) -> BoardCalibration:
     """The camera that explains the views.
 
     Args:
@@ -92,6 +87,7 @@ def calibrate(views: Sequence[BoardView], board: Board, width: int, height: int)
         board: what is printed.
         width: of the images, px.
         height: of the images, px.
+        model: of the lens's distortion, radial-tangential or equidistant.
 
     Raises:
         InputError: there are too few views, or they are too much alike to determine the camera.
@@ -100,7 +96,7 @@ def calibrate(views: Sequence[BoardView], board: Board, width: int, height: int)
     left_out: list[str] = []
     while True:
         _require_enough(used, left_out)
-        found = _fitted(used, board, width, height)
+        found = _fitted(used, board, width, height, model)
         rms = found.rms_by_view_px
         worst = int(rms.argmax())
         if rms[worst] <= max(OUTLYING * float(np.median(rms)), HARMLESS_PX):
@@ -126,11 +122,13 @@ def _require_enough(views: Sequence[BoardView], left_out: Sequence[str]) -> None
     )
 
 
-def _fitted(views: Sequence[BoardView], board: Board, width: int, height: int) -> BoardCalibration:
+def _fitted(
+    views: Sequence[BoardView], board: Board, width: int, height: int, model: str
+) -> BoardCalibration:
     """The model of distortion with the least information criterion."""
     scores, fits = [], []
-    for count, fixed in _MODELS:
-        fit = _solved(views, board, width, height, fixed)
+    for count, fixed in MODELS[model]:
+        fit = _solved(views, board, width, height, model, fixed)
         numbers = fit.residuals.size
         parameters = 4 + count + 6 * len(views)
         mean_square = max(float(np.square(fit.residuals).mean()), np.finfo(float).tiny)
@@ -140,37 +138,15 @@ def _fitted(views: Sequence[BoardView], board: Board, width: int, height: int) -
 
 
 def _solved(
-    views: Sequence[BoardView], board: Board, width: int, height: int, fixed: Sequence[str]
+    views: Sequence[BoardView], board: Board, width: int, height: int, model: str, fixed: Sequence[str]
 ) -> BoardCalibration:
     import cv2
 
-    flags = sum(getattr(cv2, name) for name in fixed)
-    points = [board.corners.astype(np.float32)] * len(views)
-    px = [view.px.astype(np.float32).reshape(-1, 1, 2) for view in views]
+    px = [view.px for view in views]
     try:
-        solved = cv2.calibrateCameraExtended(points, px, (width, height), None, None, flags=flags)
+        camera, std, places, normals = solved(model, board.corners, px, (width, height), fixed)
     except cv2.error as error:
         raise InputError(
             f"no camera explains the {len(views)} views ({error.err}): are they all of one flat board?"
         ) from error
-    _, matrix, distortion, turns, shifts, std = solved[:6]
-    camera = _camera(matrix, distortion.ravel()[:5], width, height)
-    seen = [
-        _seen(cv2, board, turn, shift, matrix, distortion) for turn, shift in zip(turns, shifts, strict=True)
-    ]
-    residuals = np.array([view.px for view in views]) - np.array(seen)
-    normals = np.array([cv2.Rodrigues(turn)[0][:, 2] for turn in turns])
-    return BoardCalibration(camera, std.ravel()[:9].copy(), tuple(views), residuals, normals)
-
-
-def _camera(matrix: np.ndarray, distortion: np.ndarray, width: int, height: int) -> Pinhole:
-    fx, fy, cx, cy = (float(matrix[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    k1, k2, p1, p2, k3 = (float(value) for value in np.pad(distortion, (0, 5 - distortion.size)))
-    return Pinhole(width, height, fx, fy, cx, cy, (k1, k2, p1, p2, k3))
-
-
-def _seen(
-    cv2: Any, board: Board, turn: np.ndarray, shift: np.ndarray, matrix: np.ndarray, distortion: np.ndarray
-) -> np.ndarray:
-    px, _ = cv2.projectPoints(board.corners, turn, shift, matrix, distortion)
-    return np.asarray(px).reshape(-1, 2)
+    return BoardCalibration(camera, std, tuple(views), np.array(px) - camera.project(places), normals)

@@ -12,7 +12,7 @@ from numba import njit
 from rbpf.kernels.block import flat
 from rbpf.kernels.quaternion import rotation
 from rbpf.kernels.signature import BLOCK, observation_kernel
-from rbpf.sensors.pinhole_kernels import project
+from rbpf.sensors.pinhole_kernels import KIND, project_equidistant, project_radial
 
 GRAZING = 0.2
 """The same as `rbpf.sensors.camera_points.GRAZING`; the tests compare them."""
@@ -55,14 +55,28 @@ def locate(pose, point, n, place):
 
 
 @njit(cache=True, error_model="numpy", inline="always")
+def _measure_equidistant(place, z0, z1, params, n, nu, across, down):
+    """As `measure`: a loop of its own, whose arc tangents would keep the other one from becoming vectors."""
+    for i in range(n):
+        x, y, depth = place[i], place[BLOCK + i], place[2 * BLOCK + i]
+        px, py, d00, d01, d02, d10, d11, d12 = project_equidistant(x, y, depth, params)
+        nu[i], nu[BLOCK + i] = z0 - px, z1 - py
+        store_by_state(d00, d01, d02, x, y, depth, across, i)
+        store_by_state(d10, d11, d12, x, y, depth, down, i)
+
+
+@njit(cache=True, error_model="numpy", inline="always")
 def measure(place, z0, z1, params, n, nu, across, down):
     """Residuals, and both rows by the state, of what lies at `place` in the camera's frame."""
+    if params[KIND] != 0.0:
+        _measure_equidistant(place, z0, z1, params, n, nu, across, down)
+        return
     camera = (
         params[0], params[1], params[2], params[3], params[4], params[5], params[6], params[7], params[8]
     )  # fmt: skip
     for i in range(n):
         x, y, depth = place[i], place[BLOCK + i], place[2 * BLOCK + i]
-        px, py, d00, d01, d02, d10, d11, d12 = project(x, y, depth, camera)
+        px, py, d00, d01, d02, d10, d11, d12 = project_radial(x, y, depth, camera)
         nu[i], nu[BLOCK + i] = z0 - px, z1 - py
         store_by_state(d00, d01, d02, x, y, depth, across, i)
         store_by_state(d10, d11, d12, x, y, depth, down, i)
@@ -205,7 +219,7 @@ def _take_out(along, least, n, first, second):
 def epipolar_ray(state, mean, const, z, params, n, nu, jac_state, jac_landmark):
     """Inverse depth, across the epipolar line only; params: the camera's, then the least |∂h/∂q| in px per 1/m."""
     _both(state, mean, const, z, params, n, nu, jac_state, jac_landmark)
-    least = params[9] * params[9]
+    least = params[KIND + 1] * params[KIND + 1]
     along = np.empty(2 * BLOCK)
     for i in range(n):
         along[i], along[BLOCK + i] = jac_landmark[0, 2, i], jac_landmark[1, 2, i]

@@ -8,9 +8,9 @@ from rbpf.kernels.block import flat
 from rbpf.kernels.quaternion import rotation
 from rbpf.kernels.signature import BLOCK, observation_kernel
 from rbpf.sensors.camera_kernels import forward_depth, locate, measure, store_by_state, turn
-from rbpf.sensors.pinhole_kernels import project
+from rbpf.sensors.pinhole_kernels import KIND, project_equidistant, project_radial
 
-HEADER = 9
+HEADER = KIND + 1
 """Parameters before the points: the camera's."""
 _SMALL = 1e-2
 """θ² below which the series of the coefficients are exact to rounding with the terms kept."""
@@ -68,9 +68,9 @@ def _by_turn(g, k1, k2, d1, d2, w, x):
     )
 
 
-@observation_kernel
-def constellation_view(state, mean, const, z, params, n, nu, jac_state, jac_landmark):
-    """Pixels of several exact points of one group; params: the camera's, then the points in the group's frame."""
+@njit(cache=True, error_model="numpy", inline="always")
+def _view(project, state, mean, const, z, params, n, nu, jac_state, jac_landmark):
+    """`constellation_view` through one kind of lens."""
     count = z.shape[0] // 2
     for i in range(n):
         r = rotation(state[0, i], state[1, i], state[2, i], state[3, i])
@@ -112,6 +112,15 @@ def constellation_view(state, mean, const, z, params, n, nu, jac_state, jac_land
                 for f in range(3):
                     jac_landmark[out, f, i] = turned[f] + carried[f]
                     jac_landmark[out, 3 + f, i] = by_shift[f]
+
+
+@observation_kernel
+def constellation_view(state, mean, const, z, params, n, nu, jac_state, jac_landmark):
+    """Pixels of several exact points of one group; params: the camera's, then the points in the group's frame."""
+    if params[KIND] == 0.0:
+        _view(project_radial, state, mean, const, z, params, n, nu, jac_state, jac_landmark)
+    else:
+        _view(project_equidistant, state, mean, const, z, params, n, nu, jac_state, jac_landmark)
 
 
 @observation_kernel

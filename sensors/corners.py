@@ -23,6 +23,7 @@ def corners(
     border_px: float = 16.0,
     least_step: int = 10,
     least_texture: float = 4.0,
+    within: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The best corners, best first, at least `spacing_px` from each other and from places already taken.
 
@@ -38,6 +39,7 @@ def corners(
         border_px: the least distance of a corner from the outermost pixels' centres.
         least_step: grey levels by which FAST's arc must differ from the corner's pixel.
         least_texture: the lowest score.
+        within: (H, W) bool, where a corner may be; None for everywhere.
 
     Returns:
         Places (k, 2) at whole pixels and their scores (k,), k ≤ count. Equal scores go by row, then column.
@@ -54,6 +56,8 @@ def corners(
     if min(image.shape) <= 2 * margin:
         return np.zeros((0, 2)), np.zeros(0)
     squares, places = _least_eigenvalues(image), _candidates(image, margin, least_step)
+    if within is not None:
+        places = places[within[places[:, 1], places[:, 0]]]
     kept = np.empty(places.shape[0], np.bool_)
     peaks(squares, places, float(least_texture) ** 2, kept)
     places = places[kept]

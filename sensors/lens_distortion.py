@@ -7,7 +7,7 @@ With s = u² + v² and ρ(s) = 1 + k1 s + k2 s² + k3 s³, the normalised coordi
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import final
+from typing import ClassVar, final
 
 import numpy as np
 
@@ -36,6 +36,9 @@ class RadialTangential:
     """
 
     coefficients: tuple[float, float, float, float, float]
+    names: ClassVar = ("k1", "k2", "p1", "p2", "k3")
+    kind: ClassVar = 0.0
+    reach: ClassVar = float("inf")
 
     @cached_property
     def is_plain(self) -> bool:

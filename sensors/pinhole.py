@@ -1,25 +1,31 @@
-"""Pinhole camera with radial-tangential distortion (D. Brown 1966, A. Conrady 1919), and the rectified stereo pair.
+"""Pinhole camera with radial-tangential or equidistant (fisheye) distortion, and the rectified stereo pair.
 
 Order of the coefficients and pixel convention are OpenCV's: the centre of the top-left pixel is (0, 0). The distortion
-is that of `rbpf.sensors.lens_distortion`.
+is that of `rbpf.sensors.lens_distortion` or `rbpf.sensors.equidistant`.
 """
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import final
+from typing import Self, final
 
 import numpy as np
 
 from rbpf.arrays import Bool, Float
 from rbpf.errors import InputError
-from rbpf.sensors.camera_checks import check_finite, check_size
+from rbpf.sensors.camera_checks import check_finite, check_lens, check_size
+from rbpf.sensors.equidistant import Equidistant
 from rbpf.sensors.lens_distortion import RadialTangential, inverse
+
+Lens = RadialTangential | Equidistant
+
+LENSES: dict[str, type[Lens]] = {"radial-tangential": RadialTangential, "equidistant": Equidistant}
+"""By the name of their model of distortion; each has its number, `kind`, that the compiled twin reads."""
 
 
 @final
 @dataclass(frozen=True)
 class Pinhole:
-    """Pinhole camera with radial-tangential distortion (OpenCV's model and pixel convention).
+    """Pinhole camera with distortion (OpenCV's models and pixel convention).
 
     Attributes:
         width: of the image, px.
@@ -28,11 +34,12 @@ class Pinhole:
         fy: focal length along the columns, px.
         cx: column of the principal point, px.
         cy: row of the principal point, px.
-        distortion: k1, k2, p1, p2, k3.
+        distortion: k1, k2, p1, p2, k3; of an equidistant lens k1, k2, k3, k4.
+        distortion_model: radial-tangential, or equidistant: a fisheye lens, of which 75° from the axis are seen.
 
     Raises:
         InputError: a size is no positive whole number, a focal length is not positive, a number is not finite,
-            or there are not five numbers of distortion.
+            there is no such model of distortion, or it has another number of coefficients.
     """
 
     width: int
@@ -41,7 +48,8 @@ class Pinhole:
     fy: float
     cx: float
     cy: float
-    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    distortion_model: str = "radial-tangential"
     dim = 2
 
     def __post_init__(self) -> None:
@@ -51,22 +59,33 @@ class Pinhole:
             check_finite(f"the camera's {name}", getattr(self, name))
         if not (self.fx > 0.0 and self.fy > 0.0):
             raise InputError(f"the camera's fx and fy must be positive, got {self.fx!r} and {self.fy!r} px")
-        if np.shape(self.distortion) != (5,):
-            expected = "the 5 numbers k1, k2, p1, p2, k3 (k3 = 0 if there are four)"
-            raise InputError(f"the camera's distortion must be {expected}, got {self.distortion!r}")
-        for name, number in zip(("k1", "k2", "p1", "p2", "k3"), self.distortion, strict=True):
-            check_finite(f"the camera's {name}", number)
+        check_lens(LENSES, self.distortion_model, self.distortion)
         # A list from a file would make the camera unhashable.
         object.__setattr__(self, "distortion", tuple(self.distortion))
 
-    @cached_property
-    def params(self) -> Float[np.ndarray, "9"]:
-        """(9,) fx, fy, cx, cy, k1, k2, p1, p2, k3: what the compiled twin reads."""
-        return np.array([self.fx, self.fy, self.cx, self.cy, *self.distortion], dtype=np.float64)
+    @classmethod
+    def from_params(cls, width: int, height: int, params: Float[np.ndarray, "10"]) -> Self:
+        """The camera with these `params`.
+
+        Raises:
+            InputError: as of the constructor, or no lens has this kind.
+        """
+        models = {lens.kind: name for name, lens in LENSES.items()}
+        model = models.get(float(params[9]), f"of kind {params[9]:g}")
+        count = len(LENSES[model].names) if model in LENSES else 0
+        fx, fy, cx, cy, *distortion = (float(number) for number in params)
+        return cls(width, height, fx, fy, cx, cy, tuple(distortion[:count]), model)
 
     @cached_property
-    def _lens(self) -> RadialTangential:
-        return RadialTangential(self.distortion)
+    def params(self) -> Float[np.ndarray, "10"]:
+        """(10,) fx, fy, cx, cy, distortion (four numbers and 0, or five), kind of lens; for the compiled twin."""
+        coefficients = np.pad(np.array(self.distortion, dtype=float), (0, 5 - len(self.distortion)))
+        return np.array([self.fx, self.fy, self.cx, self.cy, *coefficients, self.lens.kind], dtype=np.float64)
+
+    @cached_property
+    def lens(self) -> Lens:
+        """The distortion, in normalised coordinates."""
+        return LENSES[self.distortion_model](self.distortion)  # type: ignore[arg-type]  # counted when made
 
     @cached_property
     def _size(self) -> np.ndarray:
@@ -74,8 +93,11 @@ class Pinhole:
 
     @property
     def monotonic_radius(self) -> float:
-        """Distance from the axis, in normalised coordinates, at which radial distortion folds the image back, or ∞."""
-        return self._lens.monotonic_radius
+        """Distance from the axis, in normalised coordinates, at which distortion folds the image back, or ∞.
+
+        Of an equidistant lens no more than tan 75°.
+        """
+        return self.lens.monotonic_radius
 
     def project(self, point: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
         """Pixels (…, 2) of points (…, 3) in the camera's frame.
@@ -84,14 +106,14 @@ class Pinhole:
         point in the plane of the camera, z = 0, gets pixels that are not finite.
         """
         with np.errstate(all="ignore"):
-            return self.params[:2] * self._lens.distort(_normalise(point)) + self.params[2:4]
+            return self.params[:2] * self.lens.distort(_normalise(point)) + self.params[2:4]
 
     def slope(self, point: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2 3"]:
         """∂px/∂point (…, 2, 3) at points (…, 3) in the camera's frame."""
         point = np.asarray(point, float)
         with np.errstate(all="ignore"):
             uv = _normalise(point)
-            by_uv = self.params[:2, None] * self._lens.slope(uv) / point[..., 2, None, None]
+            by_uv = self.params[:2, None] * self.lens.slope(uv) / point[..., 2, None, None]
             return np.concatenate([by_uv, -by_uv @ uv[..., None]], axis=-1)
 
     def unproject(self, px: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
@@ -102,12 +124,24 @@ class Pinhole:
         """
         with np.errstate(all="ignore"):
             target = (np.asarray(px, float) - self.params[2:4]) / self.params[:2]
-            uv = self._lens.undistort(target.reshape(-1, 2))
+            uv = self.lens.undistort(target.reshape(-1, 2))
         return uv.reshape(target.shape)
 
     def unproject_slope(self, px: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2 2"]:
         """∂(u, v)/∂px (…, 2, 2) at pixels (…, 2); NaN where `unproject` is."""
-        return inverse(self._lens.slope(self.unproject(px))) / self.params[:2]
+        return inverse(self.lens.slope(self.unproject(px))) / self.params[:2]
+
+    def circle(self, margin_px: float) -> Bool[np.ndarray, "H W"] | None:
+        """Pixels (H, W) that far inside the circle in which a fisheye lens sees; None where it fills the image.
+
+        It does with radial-tangential distortion: there `unproject` tells the few pixels that have no direction.
+        """
+        if np.isinf(self.lens.reach):
+            return None
+        rows, columns = np.ogrid[: self.height, : self.width]
+        away = np.hypot((columns - self.cx) / self.fx, (rows - self.cy) / self.fy)
+        within = away < self.lens.reach - margin_px / min(self.fx, self.fy)
+        return None if within.all() else within
 
     def inside(self, px: Float[np.ndarray, "*batch 2"], margin_px: float = 0.0) -> Bool[np.ndarray, "*batch"]:
         """Whether pixels (…, 2) are in the image (…), and at least `margin_px` from its border.
@@ -124,7 +158,7 @@ class Pinhole:
     ) -> Bool[np.ndarray, "*batch"]:
         """Whether points (…, 3) are seen (…): in front of the camera, not folded back, and inside the image."""
         with np.errstate(all="ignore"):
-            seen = self._lens.is_unique(_normalise(point)) & self.inside(self.project(point), margin_px)
+            seen = self.lens.is_unique(_normalise(point)) & self.inside(self.project(point), margin_px)
         return np.logical_and(seen, np.asarray(point)[..., 2] > 0.0)
 
 
@@ -149,8 +183,9 @@ class RectifiedStereo:
         check_finite("the stereo baseline", self.baseline_m)
         if self.baseline_m <= 0.0:
             raise InputError(f"the stereo baseline must be positive, got {self.baseline_m!r} m")
-        if any(self.camera.distortion):
-            found = f"the camera of a rectified stereo pair has distortion {self.camera.distortion}"
+        if not self.camera.lens.is_plain:
+            bent = f"{self.camera.distortion_model} distortion {self.camera.distortion}"
+            found = f"the camera of a rectified stereo pair has {bent}"
             raise InputError(f"{found}: rectify the images and give the camera of the rectified ones")
 
     def project(self, point: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:

@@ -39,7 +39,7 @@ def in_view(place, first_pose, alive, pose, params, limits, rows, px):
     """Fills `rows` and their pixels `px` (rows, 2); returns how many there are.
 
     Args of features (F,): `place` (F, 4) homogeneous in the world, `first_pose` (F, 7), `alive` (F,). Of the camera:
-    `pose` (7,), `params` (9,), `limits` (6,) = width, height, margin, monotonic radius, least cosine, most scale.
+    `pose` (7,), `params` (10,), `limits` (6,) = width, height, margin, monotonic radius, least cosine, most scale.
     """
     r = rotation(pose[0], pose[1], pose[2], pose[3])
     low, right, bottom = limits[2] - 0.5, limits[0] - 0.5 - limits[2], limits[1] - 0.5 - limits[2]

@@ -17,7 +17,7 @@ from rbpf.errors import InputError
 from rbpf.sensors.board_calibration import BoardCalibration, BoardView, calibrate
 from rbpf.sensors.chessboard import Board, board_corners
 from rbpf.sensors.pinhole import Pinhole
-from rbpf.sensors.readers.images.calibration import NAME
+from rbpf.sensors.readers.images.calibration import MODELS, NAME, model_of
 from rbpf.sensors.readers.images.uncalibrated import Shot, read_shots
 from rbpf.validation.figures import COLOURS, label, save_figures
 from rbpf.validation.files import prepare_folder, write_text
@@ -26,7 +26,7 @@ FIGURES, PICTURE = "calibration.json", "calibration.png"
 MOST_SHOTS, MOST_VIEWS = 150, 40
 """Images that are looked at, and views that take part; more change nothing but the time."""
 
-_NAMES = "fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"
+_INTRINSICS = "fx", "fy", "cx", "cy"
 
 
 @dataclass
@@ -38,7 +38,7 @@ class _Found:
 
 
 def calibrate_images(
-    images: Path, board: Board, on_image: Callable[[int, int], None] | None = None
+    images: Path, board: Board, on_image: Callable[[int, int], None] | None = None, model: str = "pinhole"
 ) -> tuple[BoardCalibration, int]:
     """The camera that took pictures of a board.
 
@@ -46,6 +46,7 @@ def calibrate_images(
         images: folder of images, or a video.
         board: what is printed.
         on_image: called with the images looked at and their number.
+        model: of the camera, as in camera.yaml: pinhole or fisheye.
 
     Returns:
         The calibration, and how many images were looked at.
@@ -65,7 +66,8 @@ def calibrate_images(
             empty = shot.image
     if not found.views:
         raise InputError(_nothing(images, board, found.looked_at, empty))
-    return calibrate(_spread(found.views), board, found.width, found.height), found.looked_at
+    views = _spread(found.views)
+    return calibrate(views, board, found.width, found.height, MODELS[model]), found.looked_at
 
 
 def write_calibration(found: BoardCalibration, board: Board, looked_at: int, out: Path) -> dict[str, Any]:
@@ -83,8 +85,8 @@ def camera_text(camera: Pinhole, about: str) -> str:
     """What camera.yaml holds, under a line that says where it comes from."""
     lines = [
         f"# {about}",
-        "model: pinhole",
-        *(f"{name}: {getattr(camera, name):.6f}" for name in _NAMES[:4]),
+        f"model: {model_of(camera)}",
+        *(f"{name}: {getattr(camera, name):.6f}" for name in _INTRINSICS),
         f"width: {camera.width}",
         f"height: {camera.height}",
         f"distortion: [{', '.join(f'{value:.8f}' for value in camera.distortion)}]",
@@ -94,6 +96,7 @@ def camera_text(camera: Pinhole, about: str) -> str:
 
 def summarise_calibration(found: BoardCalibration, board: Board, looked_at: int) -> dict[str, Any]:
     """The entries of calibration.json."""
+    names = (*_INTRINSICS, *found.camera.lens.names)
     return {
         "board": f"{board.columns}x{board.rows}",
         "square_m": board.square_m,
@@ -102,8 +105,9 @@ def summarise_calibration(found: BoardCalibration, board: Board, looked_at: int)
         "views_left_out": list(found.left_out),
         "width": found.camera.width,
         "height": found.camera.height,
-        **dict(zip(_NAMES, found.camera.params.tolist(), strict=True)),
-        "std": dict(zip(_NAMES, found.std.tolist(), strict=True)),
+        "model": model_of(found.camera),
+        **dict(zip(names, found.camera.params[: len(names)].tolist(), strict=True)),
+        "std": dict(zip(names, found.std.tolist(), strict=True)),
         "reprojection_rms_px": found.rms_px,
         "worst_view_rms_px": float(found.rms_by_view_px.max()),
         "image_covered": found.covered,

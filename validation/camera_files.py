@@ -9,7 +9,8 @@ observations.csv
     # space: SE3
     # measurement: pinhole
     # size: width and height of the images, px
-    # camera: fx, fy, cx, cy, k1, k2, p1, p2, k3
+    # lens: equidistant, where it is a fisheye lens; else this line is left out
+    # camera: fx, fy, cx, cy, k1, k2, p1, p2, k3, or four numbers of an equidistant lens
     # rows: how many lines follow the columns' names
     step,stamp_ns,landmark,u_px,v_px,c00,c10,c11
 
@@ -45,7 +46,7 @@ import numpy as np
 
 from rbpf import gaussian
 from rbpf.sensors.features import FeatureFrame, FeatureLog, KnownPoints
-from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+from rbpf.sensors.pinhole import LENSES, Pinhole, RectifiedStereo
 from rbpf.sensors.readers.text import quoted
 from rbpf.validation.files import write_text
 from rbpf.validation.measurement_table import HeadedTable
@@ -64,6 +65,8 @@ _MEASURED = {
     "pinhole": ("u_px", "v_px", "c00", "c10", "c11"),
     "stereo": ("u_left_px", "v_px", "u_right_px", "c00", "c10", "c11", "c20", "c21", "c22"),
 }
+PLAIN = "radial-tangential"
+"""The lens that is meant where none is named."""
 CAMERAS = tuple(_MEASURED)
 """What a camera's measurements are called in the file's header."""
 
@@ -122,10 +125,12 @@ def _header(camera: Pinhole | RectifiedStereo) -> dict[str, str]:
     if isinstance(camera, RectifiedStereo):
         header = _header(camera.camera) | {"measurement": "stereo"}
         return header | {"baseline": repr(float(camera.baseline_m))}
+    lens = {} if camera.distortion_model == PLAIN else {"lens": camera.distortion_model}
     return {
         "space": "SE3",
         "measurement": "pinhole",
         "size": f"{camera.width} {camera.height}",
+        **lens,
         "camera": " ".join(repr(float(x)) for x in _intrinsics(camera)),
     }
 
@@ -166,9 +171,10 @@ def _read_frames(folder: Path, recording: str) -> np.ndarray:
 
 def _read_camera(table: HeadedTable, measurement: str) -> Pinhole | RectifiedStereo:
     width, height = table.numbers("size", 2).tolist()
-    numbers = table.numbers("camera", 9).tolist()
-    fx, fy, cx, cy, k1, k2, p1, p2, k3 = numbers
-    camera = Pinhole(int(width), int(height), fx, fy, cx, cy, (k1, k2, p1, p2, k3))
+    lens = table.choice("lens", tuple(LENSES)) if "lens" in table.header else PLAIN
+    numbers = table.numbers("camera", 4 + len(LENSES[lens].names)).tolist()
+    fx, fy, cx, cy, *distortion = numbers
+    camera = Pinhole(int(width), int(height), fx, fy, cx, cy, tuple(distortion), lens)
     return (
         RectifiedStereo(camera, float(table.numbers("baseline", 1)[0])) if measurement == "stereo" else camera
     )

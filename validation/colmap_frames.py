@@ -22,9 +22,12 @@ HALF_ANGLE = 2.0
 def camera_model(camera: Pinhole) -> tuple[str, list[float]]:
     """Name and parameters of COLMAP's model that is exactly our camera.
 
-    PINHOLE without distortion; OPENCV with k1, k2, p1, p2; FULL_OPENCV, whose denominator is left at 1, with k3.
+    PINHOLE without distortion; OPENCV with k1, k2, p1, p2; FULL_OPENCV, whose denominator is left at 1, with k3;
+    OPENCV_FISHEYE where it is equidistant.
     """
     plain = [camera.fx, camera.fy, camera.cx + HALF_PX, camera.cy + HALF_PX]
+    if camera.distortion_model == "equidistant":
+        return "OPENCV_FISHEYE", [*plain, *camera.distortion]
     *four, k3 = camera.distortion
     if k3:
         return "FULL_OPENCV", [*plain, *four, k3, 0.0, 0.0, 0.0]

@@ -101,7 +101,7 @@ def _maker(table: Sightings, pose_keys: list[int]) -> tuple[Maker, list[int]]:
     camera = table.camera
     if isinstance(camera, RectifiedStereo):
         return _stereo_maker(table.z, camera), [0, 2, 1]
-    if camera.distortion[4] == 0.0:
+    if camera.distortion_model == "equidistant" or camera.distortion[4] == 0.0:
         return _mono_maker(table.z, camera), [0, 1]
     slots = np.unique(pose_keys, return_inverse=True)[1]
     together = Together(lambda values: evaluate_sightings(table, path_of(values)[slots], points_of(values)))
@@ -110,7 +110,12 @@ def _maker(table: Sightings, pose_keys: list[int]) -> tuple[Maker, list[int]]:
 
 def _mono_maker(z: Array, camera: Pinhole) -> Maker:
     intrinsics = camera.fx, camera.fy, 0.0, camera.cx, camera.cy
-    if not any(camera.distortion):
+    if camera.distortion_model == "equidistant":
+        fisheye = gtsam.Cal3Fisheye(*intrinsics, *camera.distortion)
+        return lambda row, model, pose, point: gtsam.GenericProjectionFactorCal3Fisheye(
+            z[row], model, pose, point, fisheye
+        )
+    if camera.lens.is_plain:
         plain = gtsam.Cal3_S2(*intrinsics)
         return lambda row, model, pose, point: gtsam.GenericProjectionFactorCal3_S2(
             z[row], model, pose, point, plain

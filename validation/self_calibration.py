@@ -118,12 +118,12 @@ def _camera(log: FeatureLog) -> Pinhole:
 
 
 def _changed(camera: Pinhole, focal: float, k1: float) -> Pinhole:
-    k1_now, k2, p1, p2, k3 = camera.distortion
+    k1_now, *others = camera.distortion
     return replace(
         camera,
         fx=camera.fx * (1.0 + focal),
         fy=camera.fy * (1.0 + focal),
-        distortion=(k1_now + k1, k2, p1, p2, k3),
+        distortion=(k1_now + k1, *others),
     )
 
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -22,12 +22,14 @@ class CalibrateOptions(Printed):
         images: folder of images of the board, 15 or more from different directions, or a video of it.
         board: inner corners of the chessboard, the places where four squares meet, as 9x6.
         square: side of its squares, m.
+        model: of the camera; fisheye is an equidistant lens, for fields of view of some 110 degrees and more.
         out: folder for camera.yaml, calibration.png and calibration.json.
     """
 
     images: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="IMAGES")]
     board: str
     square: float
+    model: Literal["pinhole", "fisheye"] = "pinhole"
     out: Path = Path("calibration")
 
 
@@ -38,7 +40,10 @@ def calibrate(options: Annotated[CalibrateOptions, tyro.conf.arg(name="")]) -> N
     board = Board.parse(options.board, options.square)
     with progress() as bar:
         found, looked_at = calibrate_images(
-            options.images, board, told(bar, bar.add_task("looking for the board", total=None))
+            options.images,
+            board,
+            told(bar, bar.add_task("looking for the board", total=None)),
+            options.model,
         )
     entries = write_calibration(found, board, looked_at, options.out)
     camera, std = found.camera, found.std

@@ -157,7 +157,9 @@ class RenderOptions(Printed):
         width: of the images, px.
         height: of the images, px.
         focal_px: focal length, px; by default a share of the width.
-        distortion: k1, k2, p1, p2, k3 of the lens; must be none where there are two cameras.
+        distortion: k1, k2, p1, p2, k3 of the lens.
+        fisheye: k1, k2, k3, k4 of an equidistant lens in its place; by default none. The ideal one has 0 0 0 0; it
+            sees 140 degrees where the focal length is 0.41 of the width.
         baseline_m: of a second camera to the right, m; None or nothing for none.
         known: corners in the first image whose positions are given, at least 4; 0 for none.
         noise_std: of the sensor, grey levels.
@@ -176,6 +178,7 @@ class RenderOptions(Printed):
     height: int = 480
     focal_px: Real = None
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    fisheye: tuple[float, float, float, float] | None = None
     baseline_m: Real = None
     known: int = 6
     noise_std: float = 3.0

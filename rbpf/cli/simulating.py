@@ -12,6 +12,7 @@ from rbpf.cli.showing import answer, megabytes, progress, told
 from rbpf.errors import InputError
 
 if TYPE_CHECKING:
+    from rbpf.sensors.pinhole import Pinhole
     from rbpf.validation.simulation.exposure import Imaging
     from rbpf.validation.simulation.textured_scene import ImageWorld
 
@@ -63,24 +64,34 @@ def simulate_lab(options: Annotated[LabOptions, tyro.conf.arg(name="")]) -> None
 
 
 def _render(world: "ImageWorld", options: ImagesOptions | LabOptions) -> None:
-    from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
     from rbpf.validation.simulation.images import simulate_images
 
-    focal = options.focal_px or FOCAL_SHARE[type(options)] * options.width
-    middle = 0.5 * (options.width - 1), 0.5 * (options.height - 1)
-    camera = Pinhole(options.width, options.height, focal, focal, *middle, options.distortion)
-    lens = camera if options.baseline_m is None else RectifiedStereo(camera, options.baseline_m)
+    camera = _camera(options)
     imaging = _imaging(options)
     compile_kernels()
     with progress() as bar:
         task = bar.add_task("rendering", total=options.frames)
-        simulate_images(world, imaging, lens, options.out, options.seed, told(bar, task))
+        simulate_images(
+            world, imaging, camera, options.out, options.seed, told(bar, task), options.baseline_m
+        )
     size = megabytes(options.out)
     answer(
         {"out": str(options.out), "megabytes": round(size, 1)},
         options.json,
         f"wrote {options.out}, {size:.0f} MB",
     )
+
+
+def _camera(options: ImagesOptions | LabOptions) -> "Pinhole":
+    from rbpf.sensors.pinhole import Pinhole
+
+    focal = options.focal_px or FOCAL_SHARE[type(options)] * options.width
+    intrinsics = focal, focal, 0.5 * (options.width - 1), 0.5 * (options.height - 1)
+    if options.fisheye is None:
+        return Pinhole(options.width, options.height, *intrinsics, options.distortion)
+    if any(options.distortion):
+        raise InputError("a lens has either --distortion or --fisheye: leave out one of them")
+    return Pinhole(options.width, options.height, *intrinsics, options.fisheye, "equidistant")
 
 
 def _imaging(options: RenderOptions) -> "Imaging":

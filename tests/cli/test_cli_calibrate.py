@@ -10,7 +10,7 @@ from rbpf.cli import main
 from rbpf.sensors.readers.images import open_images
 from rbpf.sensors.readers.images.calibration import read_calibration
 from tests.cli.mono_sequences import sentence
-from tests.sensors.board_pictures import BOARD, CAMERA, pictures
+from tests.sensors.board_pictures import BOARD, CAMERA, FISHEYE, pictures
 
 pytestmark = pytest.mark.slow
 
@@ -50,6 +50,22 @@ def test_the_camera_is_written_for_the_readers(images, tmp_path, capsys):
     assert open_images(images, tmp_path / "out" / "camera.yaml").camera == camera
     picture = cv2.imread(str(tmp_path / "out" / "calibration.png"))
     assert picture.shape[0] > 500 and len(np.unique(picture.reshape(-1, 3), axis=0)) > 10
+
+
+@pytest.mark.slow
+def test_a_fisheye_is_written_for_the_readers(tmp_path, capsys):
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for number, image in enumerate(pictures(20, FISHEYE)):
+        cv2.imwrite(str(folder / f"{number:02d}.png"), image)
+    assert calibrate(folder, tmp_path / "out", "--model", "fisheye", "--json") == 0
+    entries = json.loads(capsys.readouterr().out)
+    camera = read_calibration(tmp_path / "out" / "camera.yaml").camera
+    np.testing.assert_allclose(camera.params[:4], FISHEYE.params[:4], atol=0.5)
+    assert (entries["model"], camera.distortion_model) == ("fisheye", "equidistant")
+    assert entries["k4"] == pytest.approx(camera.distortion[3], abs=1e-8)
+    assert set(entries["std"]) == {"fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"}
+    assert open_images(folder, tmp_path / "out" / "camera.yaml").camera == camera
 
 
 @pytest.mark.slow

@@ -22,7 +22,7 @@ from rbpf.validation.simulation.textured_desk import TexturedDesk
 from tests.cli.mono_sequences import CAMERA as DESK_CAMERA
 from tests.cli.mono_sequences import render_desk
 from tests.readers.images.bags import film_images, film_pairs, recorded
-from tests.sensors.board_pictures import CAMERA, pictures
+from tests.sensors.board_pictures import CAMERA, FISHEYE, pictures
 
 SHORTER = {
     ("simulate", "range-bearing"): ["--steps", "20", "--landmarks", "20"],
@@ -48,6 +48,7 @@ NAMES = {
     "board.mp4": "board.mp4",
     "drive.bag": "drive.bag",
     "stereo.bag": "stereo.bag",
+    "wide.mp4": "wide.mp4",
 }
 """Names on the pages, and the recordings of `Shelf` that they stand for."""
 
@@ -125,6 +126,9 @@ class Shelf:
     def _stereo(self, path: Path) -> None:
         with recorded(path) as bag:
             film_pairs(bag, open_stereo(self.get("pairs")))
+
+    def _wide(self, path: Path) -> None:
+        _film([np.repeat(image[..., None], 3, axis=-1) for image in pictures(20, FISHEYE)], path)
 
     def _walk(self, path: Path) -> None:
         """The camera that took the board's pictures, over a desk on which the board lies."""

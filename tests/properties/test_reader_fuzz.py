@@ -41,6 +41,12 @@ def frames(path: Path) -> object:
     return list(islice(open_images(path).frames(), 8))
 
 
+def seen(path: Path) -> object:
+    """What a camera sees and where."""
+    camera = open_images(path).camera
+    return camera.unproject(camera.project(np.array([[0.1, 0.2, 1.0], [3.0, 2.0, 1.0]]))), camera.circle(2.0)
+
+
 def pairs(path: Path) -> object:
     return list(islice(open_stereo(path).frames(), 8))
 
@@ -49,6 +55,16 @@ def euroc(folder: Path) -> None:
     folders.write_euroc(folder)
     truth = folder / "mav0" / "state_groundtruth_estimate0"
     folders.write_asl_truth(truth, POSES, folders.EUROC_NS, SE3.identity())
+
+
+def fisheye(folder: Path) -> None:
+    folders.write_plain(folder, model="fisheye", distortion=[-0.03, 0.02, -0.012, 0.002])
+
+
+def fisheye_pair(folder: Path) -> None:
+    lens = {"distortion_model": "equidistant", "distortion_coefficients": [-0.03, 0.02, -0.012, 0.002]}
+    folders.write_rectified(folder, **lens)
+    folders.write_asl_camera(folder / "mav0" / "cam0", folders.CAM0, **lens)
 
 
 def kitti(folder: Path) -> None:
@@ -111,6 +127,8 @@ RECORDINGS: dict[str, tuple[Callable[[Path], object], Read, str]] = {
     "TUM camera": (folders.write_tum, frames, "camera.yaml"),
     "EuRoC": (euroc, frames, "**/*.[cy]*"),
     "EuRoC pair": (folders.write_rectified, pairs, "**/*.[cy]*"),
+    "fisheye": (fisheye, seen, "camera.yaml"),
+    "fisheye pair": (fisheye_pair, pairs, "**/sensor.yaml"),
     "KITTI": (kitti, frames, "*.txt"),
     "KITTI pair": (kitti, pairs, "calib.txt"),
     "ROS 1": bag("walk.bag"),

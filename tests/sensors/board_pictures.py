@@ -14,6 +14,8 @@ from rbpf.validation.simulation.textures import wood
 BOARD = Board(9, 6, 0.024)
 CAMERA = Pinhole(640, 480, 520.0, 523.0, 330.0, 236.0, (-0.25, 0.08, 0.001, -0.0015, 0.0))
 
+FISHEYE = Pinhole(640, 480, 262.0, 264.0, 322.0, 236.0, (-0.03, 0.02, -0.012, 0.002), "equidistant")
+
 
 def directions(count: int) -> np.ndarray:
     """Poses (count, 7) of a camera around a board at the origin that lies face up: tilted, turned, near and far."""
@@ -28,6 +30,20 @@ def directions(count: int) -> np.ndarray:
     return np.array(poses)
 
 
+def nearby(count: int) -> np.ndarray:
+    """Poses (count, 7) of a wide camera: so near that the board reaches the borders of its image."""
+    rng = np.random.default_rng(3)
+    poses = []
+    for k in range(count):
+        tilt, around = rng.uniform(0.1, 0.8), 2.0 * np.pi * k / count
+        distance = rng.uniform(0.10, 0.25)
+        back = np.array([np.sin(tilt) * np.cos(around), np.sin(tilt) * np.sin(around), np.cos(tilt)])
+        at = np.append(rng.uniform(-0.05, 0.05, 2), 0.0) + distance * back
+        aim = at - distance * back + np.append(rng.uniform(-0.15, 0.15, 2), 0.0)
+        poses.append(_looking(at, aim, rng.uniform(-0.5, 0.5)))
+    return np.array(poses)
+
+
 def _looking(at: np.ndarray, aim: np.ndarray, roll: float) -> np.ndarray:
     """Pose (7,) of a camera at one place that looks at another."""
     z = (aim - at) / np.linalg.norm(aim - at)
@@ -38,14 +54,14 @@ def _looking(at: np.ndarray, aim: np.ndarray, roll: float) -> np.ndarray:
 
 @cache
 def pictures(count: int = 12, camera: Pinhole = CAMERA, noise: float = 2.0) -> tuple[np.ndarray, ...]:
-    """Images (H, W) uint8 from all these directions."""
+    """Images (H, W) uint8 from all these directions; a fisheye camera's from near by."""
     desk = Furniture(np.random.default_rng(0), 0.002, 1.0)
     desk.flat(np.array([0.0, 0.0, -0.001]), 0.0, (1.5, 1.5), wood)
     desk.board(np.zeros(3), (BOARD.columns + 1, BOARD.rows + 1), BOARD.square_m)
     renderer = Renderer(desk.rectangles, camera, grid=4)
     rng = np.random.default_rng(1)
     images = []
-    for pose in directions(count):
+    for pose in directions(count) if camera.distortion_model != "equidistant" else nearby(count):
         light = renderer.image(pose)
         images.append(np.clip(light + rng.normal(0.0, noise, light.shape), 0, 255).astype(np.uint8))
     return tuple(images)

@@ -12,6 +12,8 @@ from rbpf.sensors.pinhole import Pinhole
 
 PLAIN = Pinhole(640, 480, 400.0, 410.0, 319.5, 239.5)
 DISTORTED = Pinhole(640, 480, 400.0, 410.0, 319.5, 239.5, (-0.28, 0.07, 2e-4, -3e-4, 0.01))
+FISHEYE = Pinhole(640, 480, 400.0, 410.0, 319.5, 239.5, (-0.03, 0.02, -0.012, 0.002), "equidistant")
+CAMERAS = {"plain": PLAIN, "distorted": DISTORTED, "fisheye": FISHEYE}
 
 
 @dataclass(frozen=True)

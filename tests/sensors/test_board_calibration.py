@@ -1,5 +1,7 @@
 """The camera that rendered the boards is found again, within what its standard deviations say."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,7 +10,7 @@ from rbpf.lie import SE3
 from rbpf.sensors.board_calibration import BoardView, calibrate
 from rbpf.sensors.chessboard import Board, board_corners
 from rbpf.sensors.pinhole import Pinhole
-from tests.sensors.board_pictures import BOARD, CAMERA, directions, pictures
+from tests.sensors.board_pictures import BOARD, CAMERA, FISHEYE, directions, nearby, pictures
 
 SIZE = CAMERA.width, CAMERA.height
 
@@ -24,6 +26,14 @@ def exact_views(camera: Pinhole, poses: np.ndarray, noise_px: float, seed: int =
     return views
 
 
+def seen_whole(camera: Pinhole, noise_px: float, seed: int = 0) -> list[BoardView]:
+    """Those views from near by that show the whole board to a fisheye camera."""
+    poses = nearby(20)
+    corners = BOARD.corners * [1.0, -1.0, -1.0] + [-4 * BOARD.square_m, 2.5 * BOARD.square_m, 0.0]
+    seen = camera.visible(SE3.inverse_transform(poses[:, None], corners)).all(axis=1)
+    return exact_views(camera, poses[seen], noise_px, seed)
+
+
 @pytest.mark.slow
 def test_rendered_boards_give_the_camera_that_rendered_them():
     found = [board_corners(image, BOARD) for image in pictures()]
@@ -36,6 +46,45 @@ def test_rendered_boards_give_the_camera_that_rendered_them():
     assert result.std[8] == 0.0
     assert (error[:8] < 4.0 * result.std[:8]).all()
     assert (error[:4] < 0.5).all()
+
+
+@pytest.mark.slow
+def test_rendered_boards_give_the_fisheye_that_rendered_them():
+    found = [board_corners(image, BOARD) for image in pictures(20, FISHEYE)]
+    views = [BoardView(str(k), px) for k, px in enumerate(found) if px is not None]
+    assert len(views) >= 12
+    result = calibrate(views, BOARD, *SIZE, "equidistant")
+    assert result.camera.distortion_model == "equidistant" and result.covered > 0.6
+    assert result.rms_px < 0.08
+    # Corners so near and so tilted have small common errors, which the standard deviations know nothing of.
+    assert (np.abs(result.camera.params - FISHEYE.params)[:4] < 0.5).all()
+    angle, around = np.meshgrid(np.deg2rad(np.arange(0.0, 66.0, 5.0)), np.linspace(0.0, 6.3, 12))
+    rays = np.stack(
+        [np.tan(angle) * np.cos(around), np.tan(angle) * np.sin(around), np.ones_like(angle)], axis=-1
+    )
+    assert np.linalg.norm(result.camera.project(rays) - FISHEYE.project(rays), axis=-1).max() < 0.5
+    # Its middle is a pinhole's with barrel distortion, its borders are not.
+    assert calibrate(views, BOARD, *SIZE).rms_px > 0.5
+
+
+def test_errors_of_a_fisheye_are_those_that_the_standard_deviations_tell():
+    normalised = []
+    for seed in range(10):
+        result = calibrate(seen_whole(FISHEYE, 0.2, seed), BOARD, *SIZE, "equidistant")
+        assert np.count_nonzero(result.std) == 8
+        normalised.append((result.camera.params - FISHEYE.params)[:8] / result.std)
+    # 80 squares of unit normals, strongly correlated within a run.
+    assert 0.4 < np.square(normalised).mean() < 1.9
+
+
+@pytest.mark.parametrize(
+    ("distortion", "count"), [((0.0,) * 4, 0), ((-0.05, 0.02, 0.0, 0.0), 2), (FISHEYE.distortion, 4)]
+)
+def test_no_more_distortion_of_a_fisheye_is_told_than_there_is(distortion, count):
+    camera = replace(FISHEYE, distortion=distortion)
+    result = calibrate(seen_whole(camera, 0.02), BOARD, *SIZE, "equidistant")
+    assert np.count_nonzero(result.camera.distortion) == count == np.count_nonzero(result.std[4:])
+    np.testing.assert_allclose(result.camera.params[:8], camera.params[:8], rtol=0, atol=0.1)
 
 
 def test_errors_are_those_that_the_standard_deviations_tell():

@@ -11,12 +11,12 @@ from rbpf.numeric import numeric_jacobians
 from rbpf.sensors.camera_constellation import ConstellationView, MembersView
 from rbpf.sensors.camera_points import CameraPoint
 from tests.exactness.models import known
-from tests.sensors.camera_scenes import DISTORTED, PLAIN, with_velocity
+from tests.sensors.camera_scenes import CAMERAS, PLAIN, with_velocity
 
 POINTS = np.random.default_rng(0).uniform([-0.5, -0.4, -0.3], [0.5, 0.4, 0.3], size=(4, 3))
 COVS = np.tile(1e-4 * np.eye(3), (4, 1, 1))
 SEEN = np.array([2, 0, 3])
-every_camera = pytest.mark.parametrize("camera", [PLAIN, DISTORTED], ids=["plain", "distorted"])
+every_camera = pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
 every_group = pytest.mark.parametrize("errors", [False, True], ids=["exact", "errors"])
 
 

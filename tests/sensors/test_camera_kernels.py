@@ -8,10 +8,10 @@ from rbpf.sensors import camera_kernels, camera_points
 from rbpf.sensors.camera_constellation import ConstellationView, MembersView
 from rbpf.sensors.camera_points import CameraPoint, CameraRay, EpipolarRay
 from tests.exactness.models import known
-from tests.sensors.camera_scenes import DISTORTED, PLAIN, Rays, compiled, with_velocity
+from tests.sensors.camera_scenes import CAMERAS, DISTORTED, PLAIN, Rays, compiled, with_velocity
 
 Z = np.array([250.0, 310.0])
-every_camera = pytest.mark.parametrize("camera", [PLAIN, DISTORTED], ids=["plain", "distorted"])
+every_camera = pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
 every_state = pytest.mark.parametrize("wide", [False, True], ids=["pose", "pose and velocity"])
 
 

@@ -13,12 +13,11 @@ from rbpf.numeric import numeric_jacobians
 from rbpf.sensors.camera_points import GRAZING, CameraPoint, CameraRay, EpipolarRay, forward
 from rbpf.sensors.pinhole import RectifiedStereo
 from tests.exactness.models import known
-from tests.sensors.camera_scenes import DISTORTED, PLAIN, Rays, with_velocity
+from tests.sensors.camera_scenes import CAMERAS, PLAIN, Rays, with_velocity
 
-CAMERAS = [PLAIN, DISTORTED]
 STEREO = RectifiedStereo(PLAIN, 0.12)
 WITH_VELOCITY = Product(SE3, Euclidean(6))
-every_camera = pytest.mark.parametrize("camera", CAMERAS, ids=["plain", "distorted"])
+every_camera = pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
 
 
 @every_camera
@@ -41,7 +40,7 @@ def test_sound_where_the_state_holds_a_velocity_too(camera, seed):
     assert check_model(CameraPoint(camera), WITH_VELOCITY, example=example) == []
 
 
-@pytest.mark.parametrize("camera", [*CAMERAS, STEREO], ids=["plain", "distorted", "stereo"])
+@pytest.mark.parametrize("camera", [*CAMERAS.values(), STEREO], ids=[*CAMERAS, "stereo"])
 @pytest.mark.parametrize("velocity", [False, True], ids=["pose", "pose and velocity"])
 def test_jacobians_are_the_numeric_ones(camera, velocity):
     rays = Rays.random(seed=1)

@@ -84,6 +84,14 @@ def test_inside_the_border(image, border_px):
     assert px.min(axis=0).max() < least + 8 and (px.max(axis=0) > np.array([319, 239]) - least - 8).all()
 
 
+def test_within_a_mask(image):
+    within = np.hypot(*np.ogrid[-120:120, -160:160]) < 90.0
+    px, _ = corners(image, NONE, 1000, 4.0, 16.0, within=within)
+    everywhere, _ = corners(image, NONE, 1000, 4.0, 16.0)
+    assert 20 < len(px) < len(everywhere)
+    assert within[px[:, 1].astype(int), px[:, 0].astype(int)].all()
+
+
 def test_the_same_image_gives_the_same_corners(image):
     first, again = corners(image, NONE, 50), corners(image.copy(), NONE, 50)
     assert np.array_equal(first[0], again[0]) and np.array_equal(first[1], again[1])

@@ -19,9 +19,9 @@ from rbpf.proposals import Prior, PriorProposal, Terms
 from rbpf.reference import information, innovation_covariance
 from rbpf.sensors.camera_points import CameraPoint, CameraRay, EpipolarRay
 from tests.exactness.models import Frame, Scripted, known
-from tests.sensors.camera_scenes import DISTORTED, PLAIN, Rays
+from tests.sensors.camera_scenes import CAMERAS, PLAIN, Rays
 
-every_camera = pytest.mark.parametrize("camera", [PLAIN, DISTORTED], ids=["plain", "distorted"])
+every_camera = pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
 R = np.diag([1.7, 1.7])
 
 

@@ -14,6 +14,7 @@ from rbpf.errors import InputError
 from rbpf.sensors.pinhole import Pinhole
 
 EUROC = (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05, 0.0)
+TUM_VI = (0.0034823894022493434, 0.0007150348452162257, -0.0020532361418706202, 0.00020293673591811182)
 CAMERAS = {
     "undistorted": Pinhole(640, 480, 525.0, 520.0, 319.5, 239.5),
     "euroc": Pinhole(752, 480, 458.654, 457.296, 367.215, 248.375, EUROC),
@@ -21,7 +22,13 @@ CAMERAS = {
     "pincushion": Pinhole(1280, 720, 700.0, 710.0, 640.0, 355.0, (0.25, 0.12, -0.003, 0.004, 0.05)),
     "folding": Pinhole(640, 480, 320.0, 320.0, 320.0, 240.0, (-0.25, 0.0, 0.0, 0.0, 0.0)),
 }
-every_camera = pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
+FISHEYES = {
+    "ideal": Pinhole(640, 480, 262.0, 262.0, 319.5, 239.5, (0.0, 0.0, 0.0, 0.0), "equidistant"),
+    "tum-vi": Pinhole(512, 512, 190.98, 190.97, 254.93, 256.90, TUM_VI, "equidistant"),
+}
+PINHOLES = pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
+EVERY = CAMERAS | FISHEYES
+every_camera = pytest.mark.parametrize("camera", EVERY.values(), ids=EVERY.keys())
 FOLDING = CAMERAS["folding"]
 
 
@@ -33,6 +40,8 @@ def seen_points(camera: Pinhole) -> np.ndarray:
     """Points at depths from 0.3 m to 30 m all over the image, its border and the axis among them."""
     rng = np.random.default_rng(0)
     grid = np.stack(np.meshgrid(np.linspace(-1.5, 1.5, 41), np.linspace(-1.2, 1.2, 31)), axis=-1)
+    if camera.distortion_model == "equidistant":
+        grid *= 2.4
     uv = np.concatenate([grid.reshape(-1, 2), rng.normal(0.0, 1e-7, (20, 2)), np.zeros((1, 2))])
     rays = np.concatenate([uv, np.ones((len(uv), 1))], axis=1)
     rays = rays[camera.visible(rays)]
@@ -58,7 +67,7 @@ def numeric_slope(function, at: np.ndarray, step: np.ndarray) -> np.ndarray:
 
 
 class TestPinholeAgainstOpenCV:
-    @every_camera
+    @PINHOLES
     def test_projects_as_opencv(self, camera):
         cv2 = pytest.importorskip("cv2")
         points = seen_points(camera)
@@ -68,7 +77,7 @@ class TestPinholeAgainstOpenCV:
         assert len(points) > 100
         np.testing.assert_allclose(camera.project(points), expected[:, 0], rtol=0, atol=1e-9)
 
-    @every_camera
+    @PINHOLES
     def test_slope_is_opencvs_derivative_by_the_translation(self, camera):
         cv2 = pytest.importorskip("cv2")
         points = seen_points(camera)
@@ -78,7 +87,7 @@ class TestPinholeAgainstOpenCV:
         expected = jac[:, 3:6].reshape(-1, 2, 3)
         np.testing.assert_allclose(camera.slope(points), expected, rtol=1e-9, atol=1e-9)
 
-    @every_camera
+    @PINHOLES
     def test_unprojects_as_opencv(self, camera):
         cv2 = pytest.importorskip("cv2")
         px = camera.project(seen_points(camera))
@@ -153,7 +162,7 @@ class TestPinhole:
         rays = np.concatenate([uv, np.ones((*uv.shape[:-1], 1))], axis=-1)
         solved = np.isfinite(uv).all(axis=-1)
         assert uv.shape == px.shape
-        assert solved.all() == (camera is not FOLDING)
+        assert solved.all() == (camera is not FOLDING and camera.distortion_model != "equidistant")
         np.testing.assert_allclose(camera.project(rays)[solved], px[solved], rtol=0, atol=1e-9)
 
     @every_camera
@@ -181,10 +190,15 @@ class TestPinhole:
         assert camera.visible(np.empty((0, 3))).shape == (0,)
 
     def test_params(self):
-        expected = [458.654, 457.296, 367.215, 248.375, *EUROC]
+        expected = [458.654, 457.296, 367.215, 248.375, *EUROC, 0.0]
         np.testing.assert_array_equal(CAMERAS["euroc"].params, expected)
         assert CAMERAS["euroc"].params.dtype == np.float64
         assert CAMERAS["euroc"].dim == 2
+        np.testing.assert_array_equal(FISHEYES["tum-vi"].params[4:], [*TUM_VI, 0.0, 1.0])
+
+    @every_camera
+    def test_params_make_the_same_camera(self, camera):
+        assert Pinhole.from_params(camera.width, camera.height, camera.params) == camera
 
     def test_a_list_of_distortion_makes_an_equal_camera(self):
         camera = Pinhole(752, 480, 458.654, 457.296, 367.215, 248.375, list(EUROC))
@@ -250,6 +264,18 @@ FIVE = "the camera's distortion must be the 5 numbers k1, k2, p1, p2, k3 (k3 = 0
             "the camera's k3 must be a finite number, got inf",
         ),
         ({"distortion": (0.0, 0.0, "x", 0.0, 0.0)}, "the camera's p1 must be a finite number, got 'x'"),
+        (
+            {"distortion_model": "fov"},
+            "the camera's distortion_model must be radial-tangential or equidistant, got 'fov'",
+        ),
+        (
+            {"distortion_model": "equidistant"},
+            "the camera's distortion must be the 4 numbers k1, k2, k3, k4, got (0.0, 0.0, 0.0, 0.0, 0.0)",
+        ),
+        (
+            {"distortion_model": "equidistant", "distortion": (0.0, 0.0, 0.0, float("nan"))},
+            "the camera's k4 must be a finite number, got nan",
+        ),
     ],
 )
 def test_a_wrong_camera_is_refused(wrong, message):

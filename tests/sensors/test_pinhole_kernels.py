@@ -12,6 +12,8 @@ DISTORTIONS = {
     "barrel": (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05, 0.0),
     "strong": (-0.42, 0.21, 0.012, -0.009, -0.06),
     "pincushion": (0.3, 0.2, -0.01, 0.01, 0.08),
+    "equidistant": (0.0, 0.0, 0.0, 0.0),
+    "fisheye": (-0.03, 0.02, -0.012, 0.002),
 }
 
 
@@ -26,11 +28,13 @@ def project_all(points, params):
 
 @pytest.mark.parametrize("distortion", DISTORTIONS.values(), ids=DISTORTIONS.keys())
 def test_pixels_and_slope_equal_numpys(distortion):
-    camera = Pinhole(752, 480, 458.654, 457.296, 367.215, 248.375, distortion)
+    model = "equidistant" if len(distortion) == 4 else "radial-tangential"
+    camera = Pinhole(752, 480, 458.654, 457.296, 367.215, 248.375, distortion, model)
     rng = np.random.default_rng(3)
     depth = rng.uniform(0.2, 40.0, (500, 1)) * rng.choice([-1.0, 1.0], (500, 1))
     points = np.concatenate([rng.uniform(-1.2, 1.2, (500, 2)), np.ones((500, 1))], axis=1) * depth
     points[0] = [0.0, 0.0, 2.0]
+    points[1:5, :2] = points[1:5, 2:] * np.array([[1e-9, 0.0], [-2e-8, 1e-8], [3.6, 0.5], [1e-200, 0.0]])
     out = project_all(points, camera.params)
     np.testing.assert_allclose(out[:, :2], camera.project(points), rtol=1e-12, atol=1e-12 * camera.fx)
     slope, scale = camera.slope(points), camera.fx / np.abs(points[:, 2, None, None])

@@ -58,7 +58,7 @@ class TestRectifiedStereo:
         (
             DISTORTED,
             0.1,
-            "the camera of a rectified stereo pair has distortion (-0.25, 0.0, 0.0, 0.0, 0.0): "
+            "the camera of a rectified stereo pair has radial-tangential distortion (-0.25, 0.0, 0.0, 0.0, 0.0): "
             "rectify the images and give the camera of the rectified ones",
         ),
     ],

@@ -7,7 +7,7 @@ import pytest
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.resection import resect
-from tests.sensors.camera_scenes import DISTORTED, PLAIN
+from tests.sensors.camera_scenes import CAMERAS, DISTORTED, PLAIN
 
 SQUARE = np.array([[-0.2, -0.2, 0.0], [0.2, -0.2, 0.0], [0.2, 0.2, 0.0], [-0.2, 0.2, 0.0]])
 
@@ -35,7 +35,7 @@ def distance(found: np.ndarray, pose: np.ndarray) -> float:
     return float(np.abs(SE3.local(pose, found)).max())
 
 
-@pytest.mark.parametrize("camera", [PLAIN, DISTORTED], ids=["plain", "distorted"])
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
 @pytest.mark.parametrize("count", [4, 5, 12])
 def test_without_noise_it_is_the_truth(camera, count):
     rng = np.random.default_rng(count)

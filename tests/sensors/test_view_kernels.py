@@ -11,6 +11,7 @@ from rbpf.systems.mono.viewing import directions
 CAMERAS = {
     "plain": Pinhole(640, 480, 400.0, 410.0, 319.5, 239.5),
     "folding": Pinhole(640, 480, 300.0, 300.0, 320.0, 240.0, (-0.42, 0.21, 0.012, -0.009, -0.06)),
+    "fisheye": Pinhole(640, 480, 220.0, 220.0, 320.0, 240.0, (-0.03, 0.02, -0.012, 0.002), "equidistant"),
 }
 
 

@@ -120,13 +120,26 @@ def test_a_resumed_run_has_the_same_bytes(localised, mapped, tmp_path):
     np.testing.assert_array_equal(run.cov, localised.cov)
 
 
-def test_the_file_keeps_every_bit(tmp_path):
-    written = made_up()
+FISHEYE = Pinhole(320, 240, 131.0, 131.0, 159.5, 119.5, (-0.03, 0.02, -0.012, 0.002), "equidistant")
+
+
+@pytest.mark.parametrize("change", [{}, {"camera": FISHEYE}], ids=["pinhole", "fisheye"])
+def test_the_file_keeps_every_bit(tmp_path, change):
+    written = replace(made_up(), **change)
     write_known_map(tmp_path / "known_map.npz", written)
     read = read_known_map(tmp_path)
     assert read.camera == written.camera and read.alignment == written.alignment
     for name in ("names", "positions", "cov", "windows", "first_px", "first_pose", "views"):
         np.testing.assert_array_equal(getattr(read, name), getattr(written, name))
+
+
+def test_the_kind_of_lens_is_told_of_a_fisheye_camera_alone(tmp_path):
+    """Files of others are as they were before there was one."""
+    path = tmp_path / "known_map.npz"
+    for camera, count in ((CAMERA, 9), (FISHEYE, 10)):
+        write_known_map(path, replace(made_up(), camera=camera))
+        with np.load(path) as archive:
+            np.testing.assert_array_equal(archive["camera"], camera.params[:count])
 
 
 @pytest.mark.parametrize(
@@ -163,3 +176,6 @@ def test_no_map_too_small_a_map_and_another_camera(tmp_path, mapped):
     wide = replace(mapped, camera=Pinhole(320, 240, 180.0, 180.0, 159.5, 119.5))
     with pytest.raises(InputError, match="the map was made with images of 320x240"):
         run_images(sequence(3), MonoConfig(particles=5), mapped=wide)
+    words = "made through a lens with equidistant distortion, .* has radial-tangential distortion"
+    with pytest.raises(InputError, match=words):
+        run_images(sequence(3), MonoConfig(particles=5), mapped=replace(mapped, camera=FISHEYE))

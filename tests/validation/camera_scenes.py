@@ -14,6 +14,7 @@ from tests.validation.numeric import shrunk, slope_of
 PLAIN = Pinhole(640, 480, 400.0, 390.0, 321.0, 243.0)
 BENT = replace(PLAIN, distortion=(-0.25, 0.06, 1e-3, -5e-4, 0.0))
 WHOLE = replace(PLAIN, distortion=(-0.25, 0.06, 1e-3, -5e-4, 0.02))
+FISHEYE = replace(PLAIN, distortion=(-0.03, 0.02, -0.012, 0.002), distortion_model="equidistant")
 STEREO = RectifiedStereo(PLAIN, 0.15)
 FIRST = SE3.exp(np.array([0.3, -0.2, 1.1, 0.5, -0.7, 0.2]))
 ACCELERATION = np.array([0.2, 0.3, 0.1, 0.5, 0.4, 0.3])

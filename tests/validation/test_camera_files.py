@@ -27,10 +27,11 @@ def log(known: bool = True, camera: Pinhole | RectifiedStereo = CAMERA) -> Featu
     return FeatureLog("a desk", camera, frames, points if known else None)
 
 
+FISHEYE = replace(CAMERA, distortion=(-0.03, 0.02, -0.012, 0.1 + 0.2), distortion_model="equidistant")
 PAIR = RectifiedStereo(replace(CAMERA, distortion=(0.0,) * 5), 0.1 + 0.2)
 
 
-@pytest.mark.parametrize("camera", [CAMERA, PAIR])
+@pytest.mark.parametrize("camera", [CAMERA, FISHEYE, PAIR])
 @pytest.mark.parametrize("known", [True, False])
 def test_reading_gives_back_the_same_bits(tmp_path, known, camera):
     write_features(tmp_path, log())
@@ -86,6 +87,26 @@ def test_a_damaged_file_is_named(tmp_path, name, old, new, words):
 )
 def test_a_damaged_file_of_pairs_is_named(tmp_path, old, new, words):
     write_features(tmp_path, log(camera=PAIR))
+    text = (tmp_path / OBSERVATIONS).read_text()
+    assert old in text
+    (tmp_path / OBSERVATIONS).write_text(text.replace(old, new, 1))
+    with pytest.raises(InputError, match=words):
+        read_features(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        (
+            "# lens: equidistant",
+            "# lens: fov",
+            "expected lens to be radial-tangential or equidistant, found 'fov'",
+        ),
+        ("# lens: equidistant", "# lens: radial-tangential", "expected 9 numbers for camera, found 8"),
+    ],
+)
+def test_a_damaged_lens_is_named(tmp_path, old, new, words):
+    write_features(tmp_path, log(camera=FISHEYE))
     text = (tmp_path / OBSERVATIONS).read_text()
     assert old in text
     (tmp_path / OBSERVATIONS).write_text(text.replace(old, new, 1))

@@ -18,10 +18,10 @@ from rbpf.validation.colmap_frames import (
     to_colmap_pose,
 )
 from rbpf.validation.gtsam_ba_camera_data import CameraEstimate, sightings_of
-from tests.validation.camera_scenes import BENT, PLAIN, WHOLE, scene
+from tests.validation.camera_scenes import BENT, FISHEYE, PLAIN, WHOLE, scene
 
 
-@pytest.mark.parametrize("camera", [PLAIN, BENT, WHOLE], ids=["plain", "four", "five"])
+@pytest.mark.parametrize("camera", [PLAIN, BENT, WHOLE, FISHEYE], ids=["plain", "four", "five", "fisheye"])
 def test_colmap_projects_as_we_do_but_for_half_a_pixel(camera):
     points = np.random.default_rng(0).uniform([-0.6, -0.5, 1.0], [0.6, 0.5, 2.0], (50, 3))
     theirs = to_colmap_camera(camera).img_from_cam(points)
@@ -98,3 +98,4 @@ def test_camera_models_are_the_simplest_that_fit():
     assert to_colmap_camera(camera).model_name == "PINHOLE"
     assert to_colmap_camera(replace(camera, distortion=(0.1, 0.0, 0.0, 0.0, 0.0))).model_name == "OPENCV"
     assert to_colmap_camera(replace(camera, distortion=(0.1, 0.0, 0.0, 0.0, 0.1))).model_name == "FULL_OPENCV"
+    assert to_colmap_camera(FISHEYE).model_name == "OPENCV_FISHEYE"

@@ -69,6 +69,17 @@ def test_a_rendered_desk_is_reconstructed_and_is_right(desk, found):
 
 
 @pytest.mark.slow
+def test_a_desk_through_a_fisheye_lens_is_reconstructed_and_is_right(tmp_path):
+    lens = Pinhole(320, 240, 131.0, 131.0, 159.5, 119.5, (-0.03, 0.02, -0.012, 0.002), "equidistant")
+    sequence, options = rendered(tmp_path / "wide", 150, lens)
+    found = reconstruct(sequence, options)
+    assert found.share >= 0.9
+    compared = compare_with_truth(found, sequence.truth)
+    assert compared.path.rmse < 0.01 * compared.extent_m
+    assert found.as_dict()["reprojection_error_mean_px"] < 1.0
+
+
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_reconstruction(desk, found):
     again = reconstruct(*desk)
     assert (again.world_from_camera == found.world_from_camera).all()

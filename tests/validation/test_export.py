@@ -20,7 +20,7 @@ from rbpf.validation.gtsam_ba_camera_factors import evaluate_sightings
 from rbpf.validation.map_summary import MapSummary
 from rbpf.validation.path_and_map import PathAndMap, of_run
 from rbpf.validation.ply import read_ply, write_ply
-from tests.validation.camera_scenes import BENT, STEREO, scene
+from tests.validation.camera_scenes import BENT, FISHEYE, STEREO, scene
 from tests.validation.linear_worlds import linear_log
 
 
@@ -45,9 +45,9 @@ def reprojection_errors(model):
     return found
 
 
-@pytest.mark.parametrize("kind", ["binary", "text"])
-def test_a_model_read_back_by_colmap_has_our_poses_points_tracks_and_residuals(tmp_path, kind):
-    log = scene(camera=BENT, frames=5, points=12, known=3)
+@pytest.mark.parametrize(("camera", "kind"), [(BENT, "binary"), (BENT, "text"), (FISHEYE, "binary")])
+def test_a_model_read_back_by_colmap_has_our_poses_points_tracks_and_residuals(tmp_path, camera, kind):
+    log = scene(camera=camera, frames=5, points=12, known=3)
     estimate = estimate_of(log)
     export_colmap(estimate, log, tmp_path / "model", kind)
     model = pycolmap.Reconstruction(tmp_path / "model")

@@ -14,10 +14,19 @@ from rbpf.validation.gtsam_ba_camera_adjust import explain
 from rbpf.validation.gtsam_ba_camera_data import known_by_name, sightings_of
 from rbpf.validation.gtsam_ba_camera_factors import evaluate_sightings
 from rbpf.validation.gtsam_ba_camera_graph import CameraProblem, CameraState
-from tests.validation.camera_scenes import ACCELERATION, BENT, PLAIN, STEREO, WHOLE, scene, solve_by_scipy
+from tests.validation.camera_scenes import (
+    ACCELERATION,
+    BENT,
+    FISHEYE,
+    PLAIN,
+    STEREO,
+    WHOLE,
+    scene,
+    solve_by_scipy,
+)
 from tests.validation.factors import check_derivatives
 
-CAMERAS = [PLAIN, BENT, WHOLE, STEREO]
+CAMERAS = [PLAIN, BENT, WHOLE, FISHEYE, STEREO]
 
 
 def estimate(log, seed=5, scale=0.02):

@@ -16,6 +16,7 @@ from rbpf.validation.simulation.textures import clouds, grey_levels
 
 CAMERA = Pinhole(160, 120, 110.0, 108.0, 78.0, 61.5)
 DISTORTED = replace(CAMERA, distortion=(-0.28, 0.07, 1e-3, -5e-4, 0.01))
+FISHEYE = Pinhole(160, 120, 66.0, 66.0, 78.0, 61.5, (-0.03, 0.02, -0.012, 0.002), "equidistant")
 AXES = np.eye(3)
 DESK = TexturedDesk(frames=12, texel_m=0.008, board=(7, 5), square_m=0.1)
 ROOM = TexturedRoom(frames=12, texel_m=0.02)
@@ -46,7 +47,7 @@ def squares(board: Chessboard, camera: Pinhole, pose: np.ndarray, px: np.ndarray
     return np.where(cell == 0, 20.0, 235.0)
 
 
-@pytest.mark.parametrize("camera", [CAMERA, DISTORTED])
+@pytest.mark.parametrize("camera", [CAMERA, DISTORTED, replace(FISHEYE, fx=110.0, fy=108.0)])
 def test_corners_are_seen_where_opencv_projects_them(camera: Pinhole) -> None:
     """A window about each corner is registered (least squares) to the mean of 9 × 9 exact rays per pixel."""
     cv2 = pytest.importorskip("cv2")
@@ -59,8 +60,10 @@ def test_corners_are_seen_where_opencv_projects_them(camera: Pinhole) -> None:
     for pose in scene.world_from_camera[[0, -1]]:
         image = renderer.image(pose)
         points = SE3.inverse_transform(pose, board.corners)
-        seen, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, np.array(camera.distortion))
-        for corner in seen[:, 0]:
+        project = cv2.fisheye.projectPoints if camera.distortion_model == "equidistant" else cv2.projectPoints
+        none, distortion = np.zeros((3, 1)), np.array(camera.distortion)
+        seen = project(points[:, None], none, none, matrix, distortion)[0].reshape(-1, 2)
+        for corner in seen:
             px = np.round(corner) + around
             exact = squares(board, camera, pose, px[:, :, None, None] + within).mean(axis=(2, 3))
             down, across = np.gradient(exact)
@@ -85,7 +88,7 @@ def test_depth_is_that_of_the_plane(camera: Pinhole) -> None:
     np.testing.assert_allclose(depth, expected, rtol=1e-12)
 
 
-@pytest.mark.parametrize("camera", [CAMERA, DISTORTED])
+@pytest.mark.parametrize("camera", [CAMERA, DISTORTED, FISHEYE])
 @pytest.mark.parametrize("size", [0.1, 1.0])
 @pytest.mark.parametrize("seed", range(2))
 def test_the_nearest_of_many_rectangles_is_seen(camera: Pinhole, seed: int, size: float) -> None:

@@ -12,9 +12,12 @@ import yaml
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+from rbpf.sensors.readers.images import open_images, open_stereo
+from rbpf.sensors.readers.images.calibration import read_calibration
 from rbpf.validation.simulation import images, textured_scene
 from rbpf.validation.simulation.exposure import Imaging
 from rbpf.validation.simulation.images import simulate_images
+from rbpf.validation.simulation.render import Renderer
 from rbpf.validation.simulation.textured_desk import TexturedDesk
 from rbpf.validation.simulation.textured_room import TexturedRoom
 from rbpf.validation.simulation.textured_scene import ImageWorld, stamps_ns
@@ -25,6 +28,7 @@ cv2 = pytest.importorskip("cv2")
 
 CAMERA = Pinhole(160, 120, 110.0, 110.0, 79.5, 59.5, (-0.1, 0.02, 1e-3, 0.0, 0.0))
 STEREO = RectifiedStereo(replace(CAMERA, distortion=(0.0,) * 5), 0.1)
+CLEAN = Imaging(noise_std=0.0, exposure_drift=0.0, blur_s=0.0, vignetting=0.0, known=0)
 DESK = TexturedDesk(frames=4, texel_m=0.008)
 ROOM = TexturedRoom(frames=4, texel_m=0.02)
 
@@ -95,6 +99,33 @@ def test_the_folder_is_as_euroc_has_it(tmp_path: Path) -> None:
         "model": "pinhole", "fx": 110.0, "fy": 110.0, "cx": 79.5, "cy": 59.5, "width": 160, "height": 120,
         "distortion": [0.0] * 5, "baseline_m": 0.1,
     }  # fmt: skip
+
+
+WIDE = Pinhole(160, 120, 66.0, 66.0, 79.5, 59.5, (-0.03, 0.02, -0.012, 0.002), "equidistant")
+
+
+@pytest.mark.parametrize("lens", [CAMERA, WIDE], ids=["distorted", "fisheye"])
+def test_two_cameras_that_distort_are_read_as_a_rectified_pair(lens: Pinhole, tmp_path: Path) -> None:
+    simulate_images(ROOM, CLEAN, lens, tmp_path / "room", 0, baseline_m=0.1)
+    assert open_images(tmp_path / "room").camera == lens
+    assert read_calibration(tmp_path / "room" / "camera.yaml").camera == lens
+    sequence = open_stereo(tmp_path / "room")
+    assert sequence.rig.baseline_m == pytest.approx(0.1, rel=1e-9)
+    if lens is WIDE:
+        assert sequence.rig.camera == Pinhole(160, 120, 66.0, 66.0, 79.5, 59.5)
+    scene = ROOM.build(np.random.default_rng(0))
+    renderer = Renderer(scene.rectangles, sequence.rig.camera)
+    for frame, pose in zip(sequence.frames(), scene.world_from_camera, strict=True):
+        right = SE3.compose(pose, SE3.exp([0.0, 0.0, 0.0, 0.1, 0.0, 0.0]))
+        for image, view in ((frame.image, pose), (frame.right, right)):
+            expected = renderer.image(view)
+            alike = [np.corrcoef(image.ravel(), np.roll(expected, k, 1).ravel())[0, 1] for k in (-1, 0, 1)]
+            assert alike[1] > 0.95 and alike[1] > max(alike[0], alike[2]) + 0.02
+
+
+def test_a_baseline_that_is_none(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"the stereo baseline must be positive, got -0.1 m"):
+        simulate_images(ROOM, Imaging(), CAMERA, tmp_path / "room", 0, baseline_m=-0.1)
 
 
 @pytest.mark.parametrize("exact", [True, False])

@@ -17,6 +17,9 @@ from rbpf.validation.simulation.walked_worlds import CorridorWorld, LoopWorld
 from tests.validation.feature_logs import errors, likely, sightings, truth
 
 CAMERAS = [MONO, STEREO]
+FISHEYE = replace(
+    MONO, fx=262.0, fy=262.0, distortion=(-0.03, 0.02, -0.012, 0.002), distortion_model="equidistant"
+)
 DESK = DeskWorld(frames=200)
 STILL = PlanarTargetWorld(frames=800, points=16)
 EXACT = Measuring(dropout=0.0, turnover=0.0)
@@ -57,7 +60,9 @@ def test_measurements_are_projections_with_the_stated_noise(
         np.testing.assert_allclose(frame.cov_z, np.tile(0.49 * np.eye(camera.dim), (len(frame.z), 1, 1)))
 
 
-@pytest.mark.parametrize("camera", [*CAMERAS, replace(MONO, distortion=(-0.28, 0.07, 2e-4, 2e-5, 0.0))])
+@pytest.mark.parametrize(
+    "camera", [*CAMERAS, replace(MONO, distortion=(-0.28, 0.07, 2e-4, 2e-5, 0.0)), FISHEYE]
+)
 @pytest.mark.parametrize("world", [DESK, LoopWorld(frames=200), CorridorWorld(frames=200)])
 def test_only_what_is_visible_is_measured(world: PointWorld, camera: Pinhole | RectifiedStereo) -> None:
     measuring = Measuring(nearest_m=0.7, farthest_m=5.0)

@@ -12,7 +12,7 @@ from rbpf.validation.gtsam_ba_camera_data import CameraEstimate
 from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
 from rbpf.validation.simulation.point_worlds import DeskWorld
 from rbpf.validation.two_optimisers import adjust_by_both
-from tests.validation.camera_scenes import BENT, STEREO, WHOLE, scene
+from tests.validation.camera_scenes import BENT, FISHEYE, STEREO, WHOLE, scene
 
 POSES, COVARIANCES = 1e-4, 0.05
 
@@ -27,7 +27,7 @@ def nees(errors, covs):
     return np.einsum("ki,ki->k", errors, np.linalg.solve(covs, errors[..., None])[..., 0])
 
 
-@pytest.mark.parametrize("camera", [BENT, WHOLE], ids=["four", "five"])
+@pytest.mark.parametrize("camera", [BENT, WHOLE, FISHEYE], ids=["four", "five", "fisheye"])
 @pytest.mark.parametrize("std", [1.0, 0.4])
 def test_small_scenes_have_one_optimum(camera, std):
     log = isotropic(scene(camera=camera, frames=6, points=16, known=5), std)

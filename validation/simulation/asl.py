@@ -16,6 +16,7 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.readers.images.calibration import model_of
 
 DEPTH_PER_M = 5000.0
 """Of a depth image, as TUM's RGB-D recordings have it: out to 13 m."""
@@ -116,7 +117,7 @@ def write_sensor(
     matrix = np.eye(4)
     matrix[0, 3] = offset_m
     # EuRoC has four coefficients; a fifth is written only where it says something.
-    distortion = list(camera.distortion if camera.distortion[4] else camera.distortion[:4])
+    distortion = camera.distortion if any(camera.distortion[4:]) else camera.distortion[:4]
     lines = [
         "sensor_type: camera",
         f"comment: {comment}",
@@ -128,7 +129,7 @@ def write_sensor(
         f"resolution: [{camera.width}, {camera.height}]",
         "camera_model: pinhole",
         f"intrinsics: {[float(x) for x in camera.params[:4]]}",
-        "distortion_model: radial-tangential",
+        f"distortion_model: {camera.distortion_model}",
         f"distortion_coefficients: {[float(x) for x in distortion]}",
     ]
     if sensor.startswith("depth"):
@@ -157,11 +158,11 @@ def write_calibration(folder: Path, camera: Pinhole, baseline_m: float | None) -
     """camera.yaml: the (left) camera, and the baseline of a stereo pair."""
     fx, fy, cx, cy = camera.params[:4].tolist()
     lines = [
-        "model: pinhole",
+        f"model: {model_of(camera)}",
         *[f"{name}: {value}" for name, value in {"fx": fx, "fy": fy, "cx": cx, "cy": cy}.items()],
         f"width: {camera.width}",
         f"height: {camera.height}",
-        f"distortion: {[float(x) for x in camera.distortion]}  # k1, k2, p1, p2, k3 (OpenCV)",
+        f"distortion: {[float(x) for x in camera.distortion]}  # {', '.join(camera.lens.names)} (OpenCV)",
     ]
     if baseline_m is not None:
         lines.append(f"baseline_m: {float(baseline_m)}")

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rbpf.errors import InputError
 from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
 from rbpf.validation.simulation.asl import (
     coded_depth,
@@ -34,6 +35,7 @@ def simulate_images(
     folder: Path,
     seed: int,
     on_frame: OnFrame | None = None,
+    baseline_m: float | None = None,
 ) -> None:
     """Takes pictures of a world and writes them as an EuRoC ASL folder; the same arguments give the same bytes.
 
@@ -48,9 +50,11 @@ def simulate_images(
         folder: to write; must not exist, or be empty.
         seed: of all that is random.
         on_frame: called after every image, in order.
+        baseline_m: to a second camera like a `Pinhole`, to its right; a `RectifiedStereo` has its own.
 
     Raises:
-        InputError: the folder exists, an option asks for frames that there are not, or too few points can be known.
+        InputError: the folder exists, an option asks for frames that there are not, too few points can be known, or
+            the baseline is not positive.
 
     Example:
         >>> import tempfile
@@ -64,7 +68,11 @@ def simulate_images(
     rng = np.random.default_rng(seed)
     scene = world.build(rng)
     imaging.check_frames(len(scene.stamps_ns))
-    left, baseline_m = (camera, None) if isinstance(camera, Pinhole) else (camera.camera, camera.baseline_m)
+    left, baseline_m = (
+        (camera, baseline_m) if isinstance(camera, Pinhole) else (camera.camera, camera.baseline_m)
+    )
+    if baseline_m is not None and not baseline_m > 0.0:
+        raise InputError(f"the stereo baseline must be positive, got {baseline_m!r} m")
     renderer = Renderer(scene.rectangles, left, imaging.grid)
     shutter = Shutter(scene, imaging, left, renderer, rng)
     with whole_folder(folder) as partial:

@@ -46,6 +46,7 @@ class ImageSensor(Sensor):
         self.searched = Searched.nothing()
         self.measured = self._features(0, np.zeros(0, dtype=np.int64), np.zeros((0, 2)))
         self.bad_frames = 0
+        self._within = self.camera.circle(SOURCE_HALF_PX + 1.0)
         self._given: np.ndarray | None = None
         self.recognised = False
         """Whether the prediction of a lost camera is a place that was recognised beyond doubt."""
@@ -226,7 +227,9 @@ class ImageSensor(Sensor):
         if room <= 0:
             return measured
         occupied = np.concatenate([measured.z, self.search.in_view])
-        px, _ = corners(frame.image, occupied, room, config.spacing_px, SOURCE_HALF_PX + 1.0)
+        px, _ = corners(
+            frame.image, occupied, room, config.spacing_px, SOURCE_HALF_PX + 1.0, within=self._within
+        )
         px = px[np.isfinite(self.camera.unproject(px)).all(axis=1)]
         if not px.shape[0]:
             return measured

@@ -1,7 +1,8 @@
 """The map of a finished run as a place to be found again in: known points, and what they look like.
 
-Its file, `known_map.npz`, holds only plain arrays: version, camera (9,), image_size (2,), alignment, names (K,),
-positions (K, 3), cov (K, 3, 3), windows (K, S, S) uint8, first_px (K, 2), first_pose (K, 7), views (V, 7).
+Its file, `known_map.npz`, holds only plain arrays: version, camera (9,), or (10,) with the kind of a fisheye lens,
+image_size (2,), alignment, names (K,), positions (K, 3), cov (K, 3, 3), windows (K, S, S) uint8,
+first_px (K, 2), first_pose (K, 7), views (V, 7).
 """
 
 from dataclasses import dataclass, fields
@@ -13,6 +14,7 @@ import numpy as np
 from rbpf.checkpoint import load_arrays, save_arrays
 from rbpf.errors import InputError
 from rbpf.sensors.features import KnownPoints
+from rbpf.sensors.lens_distortion import RadialTangential
 from rbpf.sensors.pinhole import Pinhole
 from rbpf.systems.mono.appearance import SOURCE_HALF_PX
 
@@ -70,9 +72,14 @@ class KnownMap:
         """Refuses another camera than the map's.
 
         Raises:
-            InputError: sizes or focal lengths differ.
+            InputError: sizes, focal lengths or kinds of lens differ.
         """
         mine = self.camera
+        if mine.distortion_model != camera.distortion_model:
+            raise InputError(
+                f"the map was made through a lens with {mine.distortion_model} distortion, {what} has "
+                f"{camera.distortion_model} distortion: correct its calibration, or map with it"
+            )
         same = (mine.width, mine.height) == (camera.width, camera.height)
         ratio = np.array([camera.fx / mine.fx, camera.fy / mine.fy])
         if not same or np.abs(ratio - 1.0).max() > FOCAL_SHARE:
@@ -91,7 +98,9 @@ def write_known_map(path: Path, found: KnownMap) -> None:
     }
     camera = found.camera
     size = np.array([camera.width, camera.height])
-    head = {"version": np.array(VERSION), "camera": camera.params, "image_size": size}
+    # The kind of lens is told of a fisheye camera alone: files of others are as they were before there was one.
+    params = camera.params if camera.lens.kind != RadialTangential.kind else camera.params[:-1]
+    head = {"version": np.array(VERSION), "camera": params, "image_size": size}
     save_arrays(path, head | {"alignment": np.array(found.alignment)} | arrays)
 
 
@@ -126,8 +135,10 @@ def read_known_map(path: Path) -> KnownMap:
 
 def _parsed(arrays: dict[str, np.ndarray]) -> KnownMap:
     count, views = arrays["names"].size, arrays["views"].shape[0]
+    if arrays["camera"].shape == (9,):
+        arrays = arrays | {"camera": np.append(arrays["camera"], RadialTangential.kind)}
     shapes = {
-        "camera": (9,), "image_size": (2,), "names": (count,), "positions": (count, 3), "cov": (count, 3, 3),
+        "camera": (10,), "image_size": (2,), "names": (count,), "positions": (count, 3), "cov": (count, 3, 3),
         "windows": (count, _SIDE, _SIDE), "first_px": (count, 2), "first_pose": (count, 7), "views": (views, 7),
     }  # fmt: skip
     for name, shape in shapes.items():
@@ -139,10 +150,8 @@ def _parsed(arrays: dict[str, np.ndarray]) -> KnownMap:
             )
     if not views or (np.linalg.eigvalsh(arrays["cov"]) < 0.0).any():
         raise ValueError("expected views, and covariances that are none less than zero")
-    fx, fy, cx, cy, *distortion = (float(value) for value in arrays["camera"])
     width, height = (int(value) for value in arrays["image_size"])
-    k1, k2, p1, p2, k3 = distortion
-    camera = Pinhole(width, height, fx, fy, cx, cy, (k1, k2, p1, p2, k3))
+    camera = Pinhole.from_params(width, height, arrays["camera"])
     alignment = _ALIGNMENTS[str(arrays["alignment"])]
     rest = (
         arrays[name] for name in ("names", "positions", "cov", "windows", "first_px", "first_pose", "views")

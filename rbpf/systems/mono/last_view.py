@@ -55,7 +55,9 @@ class LastView:
     ) -> None:
         self.camera = camera
         self.world_from_camera = world_from_camera
-        px, _ = corners(image, np.zeros((0, 2)), count, spacing_px, max(border_px, SOURCE_HALF_PX + 1.0))
+        border_px = max(border_px, SOURCE_HALF_PX + 1.0)
+        within = camera.circle(border_px)
+        px, _ = corners(image, np.zeros((0, 2)), count, spacing_px, border_px, within=within)
         uv = camera.unproject(px)
         known = np.isfinite(uv).all(axis=1)
         self.windows = np.array([cut(image, place, SOURCE_HALF_PX) for place in px[known]])

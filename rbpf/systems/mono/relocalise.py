@@ -114,7 +114,8 @@ class Relocaliser:
         self.attempt = Attempt(rows.size)
         if rows.size < (config.inliers if last is None else config.few):
             return None
-        px, _ = corners(image, np.zeros((0, 2)), config.corners, config.spacing_px, BORDER_PX)
+        within = camera.circle(BORDER_PX)
+        px, _ = corners(image, np.zeros((0, 2)), config.corners, config.spacing_px, BORDER_PX, within=within)
         self.attempt = replace(self.attempt, places=px.shape[0])
         if px.shape[0] < config.inliers:
             return None

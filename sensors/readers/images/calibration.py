@@ -1,13 +1,14 @@
 """`camera.yaml`: the camera that took the images.
 
-model: pinhole                          # optional; the only one
+model: pinhole                          # optional; or fisheye: an equidistant lens
 fx: 525.0                               # px
 fy: 525.0
 cx: 320.0                               # px, the centre of the top-left pixel is (0, 0)
 cy: 240.0
 width: 640                              # px, must be the size of the images
 height: 480
-distortion: [0.0, 0.0, 0.0, 0.0, 0.0]   # optional; OpenCV's k1, k2, p1, p2, k3; k3 may be left out
+distortion: [0.0, 0.0, 0.0, 0.0, 0.0]   # optional; OpenCV's k1, k2, p1, p2, k3; k3 may be left out;
+                                        # of a fisheye lens cv2.fisheye's k1, k2, k3, k4
 rate_hz: 30.0                           # optional; images per second, where the recording has no times
     baseline_m: 0.12                        # optional; of a rectified pair, where the recording has two cameras
 """
@@ -16,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rbpf.errors import InputError
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.pinhole import LENSES, Pinhole
 from rbpf.sensors.readers.images.mapping import Value, read_yaml
 from rbpf.sensors.readers.text import quoted
 
@@ -25,6 +26,9 @@ KIND = (
     f"a {NAME} with the keys fx, fy, cx, cy, width, height and, if the images are distorted, distortion "
     "(`rbpf calibrate` makes one)"
 )
+
+MODELS = {"pinhole": "radial-tangential", "fisheye": "equidistant"}
+"""What `model` may be, and the model of distortion that it means."""
 
 _REQUIRED = ("fx", "fy", "cx", "cy", "width", "height")
 _OPTIONAL = ("model", "distortion", "rate_hz", "baseline_m")
@@ -87,8 +91,6 @@ def read_calibration(path: Path) -> Calibration:
         if name not in _REQUIRED + _OPTIONAL:
             known = ", ".join(_REQUIRED + _OPTIONAL)
             raise value.error(f"{quoted(name)} is no key of a camera, expected some of {known}")
-    if "model" in entries:
-        entries["model"].choice(["pinhole"])
     return Calibration(
         where=str(path),
         camera=_camera(entries),
@@ -97,17 +99,26 @@ def read_calibration(path: Path) -> Calibration:
     )
 
 
-def coefficients(value: Value) -> tuple[float, float, float, float, float]:
-    """Distortion k1, k2, p1, p2, k3 of a list of four or five.
+def coefficients(value: Value, model: str = "radial-tangential") -> tuple[float, ...]:
+    """Distortion of a list: k1, k2, p1, p2, k3, of which the last may be left out, or k1, k2, k3, k4 if equidistant.
 
     Raises:
         InputError: it is no such list.
     """
-    k1, k2, p1, p2, *k3 = [item.number() for item in value.items(4, 5)]
-    return k1, k2, p1, p2, k3[0] if k3 else 0.0
+    count = len(LENSES[model].names)
+    numbers = [item.number() for item in value.items(*sorted({4, count}))]
+    return (*numbers, *[0.0] * (count - len(numbers)))
+
+
+def model_of(camera: Pinhole) -> str:
+    """What `model` is in the file of a camera."""
+    return next(
+        name for name, distortion_model in MODELS.items() if distortion_model == camera.distortion_model
+    )
 
 
 def _camera(entries: dict[str, Value]) -> Pinhole:
+    model = MODELS[entries["model"].choice(list(MODELS)) if "model" in entries else "pinhole"]
     distortion = entries.get("distortion")
     return Pinhole(
         width=entries["width"].size(),
@@ -116,5 +127,6 @@ def _camera(entries: dict[str, Value]) -> Pinhole:
         fy=entries["fy"].positive(),
         cx=entries["cx"].number(),
         cy=entries["cy"].number(),
-        distortion=coefficients(distortion) if distortion else (0.0, 0.0, 0.0, 0.0, 0.0),
+        distortion=coefficients(distortion, model) if distortion else (0.0,) * len(LENSES[model].names),
+        distortion_model=model,
     )

@@ -1,7 +1,8 @@
 """EuRoC MAV sequences in the ASL layout; the path is `mav0` or the folder that holds it.
 
 - `cam0/sensor.yaml`: `resolution`, `intrinsics` (fx, fy, cx, cy), `camera_model: pinhole`, `distortion_model:
-  radial-tangential` with `distortion_coefficients` (k1, k2, p1, p2[, k3]), and `T_BS`, body_from_camera;
+  radial-tangential` with `distortion_coefficients` (k1, k2, p1, p2[, k3]) or `equidistant` with k1, k2, k3, k4, and
+  `T_BS`, body_from_camera;
 - `cam0/data.csv`: time [ns] and file in `cam0/data` of each image;
 - `cam1`, if there are two cameras: its images are read only where the pair is rectified, which a logged message
   says otherwise (`euroc_stereo`);

@@ -19,6 +19,11 @@ _REQUIRED = (
     "distortion_model",
     "distortion_coefficients",
 )
+_LENSES = {
+    "radial-tangential": "radial-tangential",
+    "radtan": "radial-tangential",
+    "equidistant": "equidistant",
+}
 _MOUNT = "a sensor.yaml with T_BS, the pose of the sensor on the body"
 
 
@@ -43,13 +48,13 @@ def read_camera(path: Path, hint: str) -> AslCamera:
         hint: what is expected to lie there, for the message.
 
     Raises:
-        InputError: the file is missing, or is no pinhole camera with radial-tangential distortion.
+        InputError: the file is missing, or is no pinhole camera with radial-tangential or equidistant distortion.
     """
     whole = read_yaml(path, hint)
     entries = whole.entries()
     whole.require_keys(entries, _REQUIRED)
     entries["camera_model"].choice(["pinhole"])
-    entries["distortion_model"].choice(["radial-tangential", "radtan"])
+    model = _LENSES[entries["distortion_model"].choice(list(_LENSES))]
     width, height = entries["resolution"].items(2)
     fx, fy, cx, cy = entries["intrinsics"].items(4)
     camera = Pinhole(
@@ -59,7 +64,8 @@ def read_camera(path: Path, hint: str) -> AslCamera:
         fy=fy.positive(),
         cx=cx.number(),
         cy=cy.number(),
-        distortion=coefficients(entries["distortion_coefficients"]),
+        distortion=coefficients(entries["distortion_coefficients"], model),
+        distortion_model=model,
     )
     return AslCamera(Calibration(str(path), camera), _mount(entries["T_BS"]))
 

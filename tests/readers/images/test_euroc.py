@@ -32,6 +32,12 @@ def test_a_small_sequence(tmp_path):
     assert all(frame.right is None and frame.problem is None for frame in sequence.frames())
 
 
+def test_a_fisheye_lens(tmp_path):
+    camera = open_images(write_euroc(tmp_path, distortion_model="equidistant")).camera
+    assert camera.distortion_model == "equidistant"
+    assert camera.distortion == (-0.1, 0.01, 0.001, -0.002)
+
+
 def test_without_the_folder_mav0(tmp_path):
     write_euroc(tmp_path)
     (tmp_path / "mav0").rename(tmp_path / "flight")
@@ -86,7 +92,14 @@ def test_a_given_calibration_leaves_the_truth_of_the_camera(tmp_path):
     ("changes", "message"),
     [
         ({"camera_model": "omni"}, "expected camera_model to be pinhole, found 'omni'"),
-        ({"distortion_model": "equidistant"}, "expected distortion_model to be radial-tangential or radtan"),
+        (
+            {"distortion_model": "fov"},
+            "expected distortion_model to be radial-tangential or radtan or equidistant, found 'fov'",
+        ),
+        (
+            {"distortion_model": "equidistant", "distortion_coefficients": [0.0] * 5},
+            "expected distortion_coefficients to be a list of 4, found 5",
+        ),
         ({"intrinsics": [20.0, 21.0, 11.5]}, "expected intrinsics to be a list of 4, found 3"),
         ({"resolution": [48, 32]}, "width and height are 48x32, the images of .*cam0 have 24x16 px"),
         ({"resolution": [24.5, 16]}, r"expected resolution\[0\] to be a whole number"),

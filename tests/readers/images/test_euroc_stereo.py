@@ -52,6 +52,7 @@ def test_a_right_image_that_cannot_be_read_leaves_the_left_one(tmp_path):
     "changes",
     [
         {"distortion_coefficients": [0.1, 0.0, 0.0, 0.0]},
+        {"distortion_model": "equidistant"},
         {"intrinsics": [20.5, 21.0, 11.5, 7.5]},
         {"resolution": [26, 16]},
     ],
@@ -92,3 +93,5 @@ def test_a_given_calibration_with_distortion_makes_it_one_camera(tmp_path):
     assert open_images(tmp_path / "a", write_camera(tmp_path)).baseline_m == pytest.approx(0.11)
     bent = write_camera(tmp_path, distortion=[0.1, 0, 0, 0])
     assert open_images(tmp_path / "a", bent).baseline_m is None
+    fisheye = write_camera(tmp_path, model="fisheye")
+    assert open_images(tmp_path / "a", fisheye).baseline_m is None

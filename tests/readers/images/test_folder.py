@@ -1,6 +1,7 @@
 """Folders of images, and the camera file that all formats share."""
 
 import logging
+from dataclasses import replace
 
 import pytest
 
@@ -62,6 +63,14 @@ def test_distortion_of_four_or_five_numbers(tmp_path):
     assert open_images(tmp_path).camera.distortion == (0.1, -0.2, 0.001, 0.002, 0.3)
 
 
+def test_a_fisheye_lens(tmp_path):
+    write_plain(tmp_path, model="fisheye", distortion=[0.1, -0.2, 0.001, 0.002])
+    camera = open_images(tmp_path).camera
+    assert (camera.distortion_model, camera.distortion) == ("equidistant", (0.1, -0.2, 0.001, 0.002))
+    write_camera(tmp_path, model="fisheye")
+    assert open_images(tmp_path).camera == replace(camera, distortion=(0.0,) * 4)
+
+
 def test_a_first_line_as_opencv_writes_it(tmp_path):
     path = write_camera(write_plain(tmp_path))
     path.write_text("%YAML:1.0\n---\n" + path.read_text())
@@ -90,7 +99,11 @@ def test_a_first_line_as_opencv_writes_it(tmp_path):
             {"distortion": "[0, 0, .nan, 0]"},
             r"camera.yaml, line 7: expected distortion\[2\] to be a finite number",
         ),
-        ({"model": "fisheye"}, "camera.yaml, line 7: expected model to be pinhole, found 'fisheye'"),
+        ({"model": "omni"}, "camera.yaml, line 7: expected model to be pinhole or fisheye, found 'omni'"),
+        (
+            {"model": "fisheye", "distortion": "[0, 0, 0, 0, 0]"},
+            "camera.yaml, line 8: expected distortion to be a list of 4, found 5",
+        ),
         ({"baseline_m": -1}, "camera.yaml, line 7: expected baseline_m to be positive, found -1"),
         ({"rate_hz": 0}, "camera.yaml, line 7: expected rate_hz to be positive, found 0"),
     ],

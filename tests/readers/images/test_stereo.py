@@ -2,16 +2,13 @@
 
 import logging
 
-import cv2
 import numpy as np
 import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.sensors.pinhole import Pinhole
 from rbpf.sensors.readers.images import open_images, open_stereo
 from rbpf.sensors.readers.images.pairing import pair_stamps
-from rbpf.sensors.readers.images.rectification import Rectification
 from rbpf.sensors.readers.images.stamped import StampedLines
 from tests.readers.images.folders import (
     CAM0,
@@ -212,6 +209,10 @@ def test_a_given_calibration(tmp_path):
     bent = write_camera(tmp_path, distortion=[0.1, 0, 0, 0])
     with pytest.raises(InputError, match="rectify the images"):
         open_stereo(tmp_path / "a", bent)
+    with pytest.raises(
+        InputError, match=r"has equidistant distortion \(0.0, 0.0, 0.0, 0.0\): rectify the images"
+    ):
+        open_stereo(tmp_path / "a", write_camera(tmp_path, model="fisheye"))
 
 
 def test_what_is_no_stereo_sequence(tmp_path):
@@ -219,30 +220,6 @@ def test_what_is_no_stereo_sequence(tmp_path):
         open_stereo(write_plain(tmp_path / "a"))
     with pytest.raises(InputError, match="no such folder"):
         open_stereo(tmp_path / "b")
-
-
-LEFT = Pinhole(160, 120, 110.0, 112.0, 80.0, 58.0, (-0.2, 0.05, 1e-3, -5e-4, 0.0))
-RIGHT = Pinhole(160, 120, 108.0, 111.0, 78.0, 61.0, (-0.18, 0.04, 0.0, 1e-3, 0.0))
-APART = SE3.from_ypr(np.array([0.12, 0.005, -0.004]), 0.02, -0.03, 0.015)
-
-
-def test_rectified_cameras_see_a_point_on_one_row():
-    done = Rectification.between(LEFT, RIGHT, APART, "here")
-    assert done.rig.baseline_m == pytest.approx(np.linalg.norm(SE3.translation(APART)), rel=1e-9)
-    points = np.random.default_rng(0).uniform([-0.4, -0.3, 1.5], [0.4, 0.3, 4.0], (200, 3))
-    rectified = done.rig.project(SE3.inverse_transform(done.left_from_rectified, points))
-    inside = done.rig.inside(rectified, 2.0)
-    assert inside.sum() > 100
-    for camera, maps, where, column in (
-        (LEFT, done.maps[0], points, 0),
-        (RIGHT, done.maps[1], SE3.inverse_transform(APART, points), 2),
-    ):
-        # The map at the rectified place names the place in the image as it was taken.
-        place = rectified[inside][:, [column, 1]].astype(np.float32)
-        given = np.column_stack(
-            [cv2.remap(part, place[:, :1], place[:, 1:], cv2.INTER_LINEAR)[:, 0] for part in maps]
-        )
-        np.testing.assert_allclose(given, camera.project(where[inside]), atol=0.1)
 
 
 def test_a_pair_that_is_not_rectified_is_rectified(tmp_path):

@@ -1,0 +1,122 @@
+"""Equidistant lenses of fisheye cameras: OpenCV's `cv2.fisheye`, how far they see, where they fold back."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rbpf.errors import InputError
+from rbpf.sensors.camera_points import GRAZING
+from rbpf.sensors.equidistant import WIDEST, Equidistant
+from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+from tests.sensors.test_pinhole import FISHEYES, matrix, seen_points
+
+every_fisheye = pytest.mark.parametrize("camera", FISHEYES.values(), ids=FISHEYES.keys())
+FOLDING = (-0.3, 0.0, 0.0, 0.0)
+
+
+def ray(angle: float | np.ndarray, around: float = 0.7) -> np.ndarray:
+    """Directions (…, 3) at an angle from the axis."""
+    angle = np.asarray(angle, float)
+    parts = [np.sin(angle) * np.cos(around), np.sin(angle) * np.sin(around), np.cos(angle)]
+    return np.stack(parts, axis=-1)
+
+
+@every_fisheye
+def test_projects_as_opencv(camera):
+    points = seen_points(camera)
+    expected, _ = cv2.fisheye.projectPoints(
+        points[:, None], np.zeros((3, 1)), np.zeros((3, 1)), matrix(camera), np.array(camera.distortion)
+    )
+    assert len(points) > 500
+    assert np.arctan2(np.hypot(*points[:, :2].T), points[:, 2]).max() > np.deg2rad(73.0)
+    np.testing.assert_allclose(camera.project(points), expected[:, 0], rtol=0, atol=1e-9)
+
+
+@every_fisheye
+def test_distorts_and_unprojects_as_opencv(camera):
+    px = camera.project(seen_points(camera))
+    uv = camera.unproject(px)
+    k = matrix(camera), np.array(camera.distortion)
+    np.testing.assert_allclose(cv2.fisheye.distortPoints(uv[:, None], *k)[:, 0], px, rtol=0, atol=1e-8)
+    precise = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-15)
+    expected = cv2.fisheye.undistortPoints(px[:, None], *k, criteria=precise)[:, 0]
+    np.testing.assert_allclose(uv, expected, rtol=0, atol=1e-8)
+
+
+def test_the_ideal_lens_is_the_angle():
+    camera = FISHEYES["ideal"]
+    angles = np.linspace(0.0, 1.3, 20)
+    away = np.linalg.norm(camera.project(ray(angles)) - [camera.cx, camera.cy], axis=1)
+    np.testing.assert_allclose(away, camera.fx * angles, rtol=0, atol=1e-10)
+
+
+def test_it_sees_75_degrees_from_the_axis_and_no_more():
+    camera = Pinhole(2000, 2000, 262.0, 262.0, 1000.0, 1000.0, (0.0, 0.0, 0.0, 0.0), "equidistant")
+    near, beyond = ray(np.deg2rad(74.99)), ray(np.deg2rad([75.01, 80.0, 89.9, 90.0, 100.0]))
+    assert camera.visible(near)
+    assert not camera.visible(beyond).any()
+    assert np.isfinite(camera.unproject(camera.project(near))).all()
+    assert np.isnan(camera.unproject(camera.project(beyond[:3]))).all()
+    # The models of landmarks hold the depth positive from `GRAZING` on: there no pixel may still be taken for it.
+    assert np.cos(WIDEST) > GRAZING
+
+
+def test_the_circle_in_which_it_sees():
+    camera = FISHEYES["tum-vi"]
+    rows, columns = np.mgrid[:512, :512]
+    seen = np.isfinite(camera.unproject(np.stack([columns, rows], axis=-1).astype(float)))[..., 0]
+    np.testing.assert_array_equal(camera.circle(0.0), seen)
+    px = np.argwhere(camera.circle(16.0))[:, ::-1]
+    for corner in np.array([[-11.0, -11.0], [-11.0, 11.0], [11.0, -11.0], [11.0, 11.0]]):
+        assert np.isfinite(camera.unproject(px + corner)).all()
+    assert replace(camera, width=300, height=300, cx=150.0, cy=150.0).circle(16.0) is None
+    assert Pinhole(640, 480, 320.0, 320.0, 320.0, 240.0, (-0.25, 0.0, 0.0, 0.0, 0.0)).circle(16.0) is None
+
+
+def test_a_lens_that_folds_back_is_seen_up_to_there():
+    lens = Equidistant(FOLDING)
+    fold = np.sqrt(1.0 / 0.9)
+    assert lens.widest == pytest.approx(fold, rel=1e-14)
+    camera = Pinhole(900, 900, 262.0, 262.0, 450.0, 450.0, FOLDING, "equidistant")
+    assert camera.visible(ray(fold - 1e-6)) and not camera.visible(ray(fold + 1e-6))
+    reach = 262.0 * fold * (1.0 - 0.3 * fold**2)
+    px = np.array(
+        [[450.0 + 0.999 * reach, 450.0], [450.0 + 1.001 * reach, 450.0], [np.nan, 1.0], [np.inf, 1.0]]
+    )
+    np.testing.assert_array_equal(np.isfinite(camera.unproject(px))[:, 0], [True, False, False, False])
+
+
+@pytest.mark.parametrize(
+    "coefficients", [(0.0, 0.0, 0.0, 1e-300), (0.0, 0.0, 0.0, -0.01), (0.2, -0.3, 0.1, 0.0)]
+)
+def test_it_rises_up_to_the_widest_angle(coefficients):
+    lens = Equidistant(coefficients)
+    angle = np.linspace(0.0, lens.widest * (1.0 - 1e-6), 2001)
+    reach = lens.distort(np.stack([np.tan(angle), np.zeros_like(angle)], axis=-1))[:, 0]
+    assert (np.diff(reach) > 0.0).all()
+
+
+@given(
+    coefficients=st.tuples(*[st.floats(-0.2, 0.2)] * 4),
+    share=st.floats(0.0, 0.98),
+    around=st.floats(0.0, 6.3),
+)
+def test_every_visible_direction_comes_back(coefficients, share, around):
+    lens = Equidistant(coefficients)
+    camera = Pinhole(8000, 8000, 262.0, 262.0, 4000.0, 4000.0, coefficients, "equidistant")
+    seen = ray(share * lens.widest, around)
+    assert camera.visible(seen)
+    again = np.append(camera.unproject(camera.project(seen)), 1.0)
+    least = np.linalg.svd(camera.slope(again)[:, :2], compute_uv=False)[-1] / camera.fx
+    np.testing.assert_allclose(again, seen / seen[2], rtol=0, atol=1e-11 / least)
+
+
+def test_a_rectified_pair_has_no_fisheye_lens():
+    with pytest.raises(
+        InputError, match=r"has equidistant distortion \(0.0, 0.0, 0.0, 0.0\): rectify the images"
+    ):
+        RectifiedStereo(FISHEYES["ideal"], 0.1)
