@@ -23,6 +23,9 @@ NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
 _RADIAL_TANGENTIAL = "plumb_bob", "rational_polynomial"
 """Models of distortion that begin with k1, k2, p1, p2, k3; the second one goes on with what must be zero."""
 
+_EQUIDISTANT = "equidistant", "fisheye"
+"""Models with k1, k2, k3, k4: ROS's name and OpenCV's."""
+
 
 @dataclass(frozen=True)
 class Info:
@@ -74,8 +77,8 @@ def read_info(bag: Bag, image_topic: str) -> Info:
     turn, projection = _field(message, "R").reshape(3, 3), _field(message, "P").reshape(3, 4)
     is_rectified = "rect" in _named(image_topic).rpartition("/")[2]
     intrinsics = projection[:, :3] if is_rectified else _field(message, "K").reshape(3, 3)
-    distortion = NO_DISTORTION if is_rectified else _distortion(message, where)
-    camera = _pinhole(message, intrinsics, distortion, where)
+    lens = {} if is_rectified else _lens(message, where)
+    camera = _pinhole(message, intrinsics, lens, where)
     return Info(Calibration(where, camera), turn, projection, is_rectified)
 
 
@@ -106,23 +109,23 @@ def _field(message: Any, name: str) -> Array:
     return np.array(getattr(message, name if hasattr(message, name) else name.lower()), np.float64)
 
 
-def _distortion(message: Any, where: str) -> tuple[float, float, float, float, float]:
-    """k1, k2, p1, p2, k3 of a lens that is told by these; one of another kind has its place here."""
+def _lens(message: Any, where: str) -> dict[str, Any]:
+    """The camera's model of distortion and its coefficients."""
     d, model = _field(message, "D").tolist(), message.distortion_model
+    if model in _EQUIDISTANT and len(d) == 4:
+        return {"distortion_model": "equidistant", "distortion": tuple(d)}
     if (model in _RADIAL_TANGENTIAL or not (model or any(d))) and not any(d[5:]):
-        k1, k2, p1, p2, k3 = (*d[:5], *NO_DISTORTION)[:5]
-        return k1, k2, p1, p2, k3
-    problem = f"the lens is {model[:40]!r} with {len(d)} coefficients, expected plumb_bob with 4 or 5"
-    raise InputError(f"{where}: {problem}; rectify the images, or give --calibration.")
+        return {"distortion": (*d[:5], *NO_DISTORTION)[:5]}
+    problem = f"the lens is {model[:40]!r} with {len(d)} coefficients"
+    expected = "expected plumb_bob with 4 or 5, or equidistant with 4"
+    raise InputError(f"{where}: {problem}, {expected}; rectify the images, or give --calibration.")
 
 
-def _pinhole(
-    message: Any, intrinsics: Array, distortion: tuple[float, float, float, float, float], where: str
-) -> Pinhole:
+def _pinhole(message: Any, intrinsics: Array, lens: dict[str, Any], where: str) -> Pinhole:
     fx, fy, cx, cy = intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
     if not (np.isfinite(intrinsics).all() and fx > 0.0 and fy > 0.0):
         raise InputError(f"{where}: the camera is not calibrated (fx {fx:g}, fy {fy:g}); give --calibration.")
     try:
-        return Pinhole(message.width, message.height, fx, fy, cx, cy, distortion)
+        return Pinhole(message.width, message.height, fx, fy, cx, cy, **lens)
     except InputError as error:
         raise InputError(f"{where}: {error}; give --calibration.") from None

@@ -38,10 +38,16 @@ def test_lenses(tmp_path, name):
     assert open_images(write_bag(tmp_path / "walk.bag", **changes)).camera.distortion == distortion
 
 
+@pytest.mark.parametrize("model", ["equidistant", "fisheye"])
+def test_a_fisheye_lens(tmp_path, model):
+    camera = open_images(write_bag(tmp_path / "walk.bag", model=model, d=(0.1, 0.2, 0.0, 0.0))).camera
+    assert (camera.distortion_model, camera.distortion) == ("equidistant", (0.1, 0.2, 0.0, 0.0))
+
+
 WRONG = {
-    "fisheye": ({"model": "equidistant", "d": (0.1,) * 4}, "the lens is 'equidistant' with 4 coefficients, expected"),
+    "fisheye": ({"model": "equidistant", "d": (0.1,) * 5}, "the lens is 'equidistant' with 5 coefficients, expected"),
     "rational": ({"model": "rational_polynomial", "d": (0.1,) * 8}, "the lens is 'rational_polynomial'"),
-    "ideal fisheye": ({"model": "equidistant", "d": (0.0,) * 4}, "the lens is 'equidistant' with 4 coefficients"),
+    "another": ({"model": "fov", "d": (0.9,)}, "the lens is 'fov' with 1 coefficients"),
     "nameless": ({"model": "", "d": (0.1,) * 4}, "the lens is '' with 4 coefficients"),
     "uncalibrated": ({"k": (0.0,) * 9}, "the camera is not calibrated"),
     "nan": ({"k": (np.nan, *K[1:])}, "the camera is not calibrated"),
@@ -63,7 +69,7 @@ def test_a_rectified_image_has_the_camera_of_the_projection(tmp_path):
     with recorded(tmp_path / "walk.bag") as bag:
         bag.info("/cam/camera_info", p=(30.0, 0, 12.0, 0, 0, 31.0, 8.0, 0, 0, 0, 1, 0))
         bag.image("/cam/image_rect_color", 1, grey(10, SIZE))
-    assert open_images(tmp_path / "walk.bag").camera.params.tolist() == [30, 31, 12, 8, 0, 0, 0, 0, 0]
+    assert open_images(tmp_path / "walk.bag").camera.params.tolist() == [30, 31, 12, 8, 0, 0, 0, 0, 0, 0]
 
 
 def test_without_a_camera_one_has_to_be_given(tmp_path):
@@ -85,7 +91,7 @@ def test_without_a_camera_one_has_to_be_given(tmp_path):
 def test_a_rectified_pair_of_which_all_right_images_come_last(tmp_path, kind, names):
     sequence = open_stereo(write_pair(tmp_path / kind, names))
     assert (sequence.rig.baseline_m, sequence.notes) == (pytest.approx(0.12), ())
-    assert sequence.rig.camera.params.tolist() == [20.0, 21.0, 11.5, 7.5, 0, 0, 0, 0, 0]
+    assert sequence.rig.camera.params.tolist() == [20.0, 21.0, 11.5, 7.5, 0, 0, 0, 0, 0, 0]
     assert sequence.stamps_ns.tolist() == list(STAMPS_NS)
     assert [int(frame.right[0, 0]) for frame in sequence.frames(1)] == [120, 130]
     assert levels(sequence.pair) == [10, 20, 30]
