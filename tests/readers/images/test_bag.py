@@ -16,7 +16,7 @@ def test_a_small_bag(tmp_path, kind):
     sequence = open_images(write_bag(tmp_path / kind))
     assert sequence.name == kind.removesuffix(".bag")
     assert sequence.stamps_ns.tolist() == list(STAMPS_NS)
-    assert sequence.camera.params.tolist() == [20.0, 21.0, 11.5, 7.5, 0.1, 0.01, 0.001, 0.002, 0.0]
+    assert sequence.camera.params.tolist() == [20.0, 21.0, 11.5, 7.5, 0.1, 0.01, 0.001, 0.002, 0.0, 0.0]
     assert (sequence.camera.height, sequence.camera.width) == SIZE
     assert sequence.truth is None and sequence.baseline_m is None
     assert levels(sequence) == [10, 20, 30] and levels(sequence, 2) == [30]
