@@ -2,7 +2,8 @@
 
 A lens spreads a point over neighbouring pixels, so that no camera sees one that differs from all its neighbours. Where
 more pixels do than a few specks explain, those that stick out are replaced by the median of their surroundings; all
-other pixels, and all other images, stay as they are to the byte.
+other pixels, and all other images, stay as they are to the byte. The dots of a pattern projector look like struck
+pixels: a rig that has one should run without (`pair.mend`).
 """
 
 from typing import NamedTuple

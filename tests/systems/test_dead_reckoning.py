@@ -94,6 +94,17 @@ def test_in_the_plane():
     np.testing.assert_allclose(at[2].since_update.cov[[0, 2, 4]], 0.0, atol=1e-12)
 
 
+def test_pairs_that_were_passed_over_are_counted_until_the_motion_is_found():
+    chain, at = reckoned(6, True)
+    assert [each.assumed for each in at] == [0, 1, 0]
+    assert [chain.assumed(t * SECOND).assumed for t in (3, 4)] == [1, 2]
+
+
+def test_time_has_to_pass():
+    chain, _ = reckoned(6, False)
+    assert [chain.is_later(t * SECOND) for t in (1, 2, 3)] == [False, False, True]
+
+
 def test_before_the_first_pair_nothing_moves():
     chain = DeadReckoning(StereoOdometer(RIG, np.random.default_rng(0)), 6)
     np.testing.assert_array_equal(chain.assumed(SECOND).world_from_camera, SE3.identity())

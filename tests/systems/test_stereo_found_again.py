@@ -83,6 +83,14 @@ def test_resumed_in_doubt(found, tmp_path):
     assert run.notes == found.notes
 
 
+def test_a_map_that_cannot_tell_yet_is_not_waited_for():
+    """The second pair is blurred, when the map has nothing that was found again; and a run without a map."""
+    run = run_images(blur_motion(25, 1, 1)(pairs(10)), CONFIG)
+    assert any("assumed" in note for note in run.notes) and run.updated[2:].any()
+    alone = run_images(blur_motion(25, 4, 2)(pairs(10)), replace(CONFIG, map=replace(CONFIG.map, used=False)))
+    assert not any("not found again in the map" in note for note in alone.notes)
+
+
 def test_where_nothing_was_mapped_the_map_goes_on():
     """After the pairs of its patience; until then no particle moves."""
     poses = np.tile(SE3.identity(), (12, 1))

@@ -75,6 +75,15 @@ class StartConfig:
     frames: int = 60
     depth_share: float = 0.03
 
+    def __post_init__(self) -> None:
+        """Checks what would never end, or never begin."""
+        if self.first < 3 or self.frames < 3:
+            raise InputError(
+                f"start.first and start.frames must be at least 3, got {self.first}, {self.frames}"
+            )
+        if not 1.0 < self.growth < float("inf"):
+            raise InputError(f"start.growth must be above 1 and finite, got {self.growth}")
+
 
 @dataclass(frozen=True)
 class SearchConfig:

@@ -128,9 +128,20 @@ class ImageSensor(Sensor):
         self.seconds_births = time.perf_counter() - started
         return births
 
-    def place_all(self, belief: Belief) -> None:
-        """Remembers where all features are after the particles were drawn anew."""
-        self._place(belief, np.flatnonzero(self.table.alive[: self.table.count]))
+    def drawn_anew(self, belief: Belief, path: np.ndarray, started: np.ndarray) -> None:
+        """Remembers where all features are and were seen first, after the particles were drawn anew.
+
+        Args:
+            belief: of the new particles.
+            path: (T, 7) of the heaviest one.
+            started: (F,) in which of the T frames each feature of the table was started.
+        """
+        table, rows = self.table, np.arange(started.size)
+        held = np.isin(rows, list(belief.catalogue.values()))
+        table.alive[rows[~held]] = False  # started in a frame that did not take part
+        table.first_pose[rows] = table.last_pose[rows] = path[started]
+        table.last_source[rows] = table.source[rows]  # later looks are from the old path
+        self._place(belief, rows[held & table.alive[rows]])
 
     def arrays(self) -> dict[str, np.ndarray]:
         """For a checkpoint."""

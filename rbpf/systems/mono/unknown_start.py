@@ -74,7 +74,7 @@ class UnknownStart:
         Returns:
             The filter, and (T, N, 7) world_from_camera; None where too little was seen, and the old one goes on.
         """
-        self._next = int(np.ceil(self.config.start.growth * len(frames)))
+        self._next = max(int(np.ceil(self.config.start.growth * len(frames))), len(frames) + 1)
         found = self._found(filter_, features, frames, path)
         if found is None:
             return None
@@ -108,12 +108,12 @@ class UnknownStart:
     ) -> tuple[np.ndarray, Optimum] | None:
         """Numbers of the frames that took part, and the best optimum; None where too little is seen."""
         steps = self._chosen(frames)
+        if steps.size < LEAST_FRAMES:
+            return None
         held = np.array(sorted(filter_.belief().catalogue.values()), dtype=np.int64)
         seen_by = np.concatenate([frames[t].landmarks for t in steps])
         names, count = np.unique(seen_by[np.isin(seen_by, held)], return_counts=True)
         names = names[count >= LEAST_SEEN]
-        if steps.size < LEAST_FRAMES:
-            return None
         seen = self._window(features, [frames[t] for t in steps], names)
         self.over = not _hang_together(seen)
         if self.over:
@@ -174,7 +174,8 @@ class UnknownStart:
         whole = np.concatenate([start, onward])
         place = np.empty((names.size, 4))
         _, first = np.unique(seen.feature, return_index=True)
-        uv = features.camera.unproject(seen.px[first])
+        # Where the lens has no direction, straight ahead is enough to start from.
+        uv = np.nan_to_num(features.camera.unproject(seen.px[first]))
         pose, rho = whole[seen.frame[first]], self.config.ray.rho_per_m
         ahead = np.concatenate([uv, np.ones((names.size, 1))], axis=1)
         place[:, :3] = SE3.transform(pose, ahead) + (rho - 1.0) * SE3.translation(pose)

@@ -259,8 +259,7 @@ def _frame(run: VideoRun, t: int, frame: ImageFrame, law: PoseLaw | None) -> Non
     law = law or run.recovery.law(frame, run.filter)
     report = run.filter.step(frame, law, frame.stamp_ns)
     run.recovery.note(frame, run.filter)
-    run.seconds[t] = time.perf_counter() - started
-    world = world_of(run.filter)
+    run.seconds[t], world = time.perf_counter() - started, world_of(run.filter)
     estimate = estimate_in(world, run.filter, report)
     run.world_from_camera[t], run.cov[t] = estimate.mean, estimate.cov + run.recovery.drift(frame)
     searched = run.sensor.searched
@@ -271,7 +270,7 @@ def _frame(run: VideoRun, t: int, frame: ImageFrame, law: PoseLaw | None) -> Non
     run.seconds_search[t], run.seconds_births[t] = run.sensor.seconds, run.sensor.seconds_births
     run.sightings.record(run.sensor, run.filter, world)
     run.seconds_telling[t] = time.perf_counter() - started - run.seconds[t]
-    if run.start.due(t + 1, run.sensor.lost):
+    if run.start.due(t + 1, run.sensor.lost and run.sensor.table.count > 0) and not run.sensor.bad_frames:
         _redraw(run, t, frame)
     if frame.problem is not None:
         run.problems.append(f"frame {t}: {frame.problem}")
@@ -287,13 +286,14 @@ def _frame(run: VideoRun, t: int, frame: ImageFrame, law: PoseLaw | None) -> Non
 def _redraw(run: VideoRun, t: int, frame: ImageFrame) -> None:
     """Draws the particles of a start without known points anew."""
     started = time.perf_counter()
-    stamps, path = run.stamps_ns[: t + 1], run.world_from_camera[: t + 1]
-    measured = run.sightings.measured(stamps, run.found[: t + 1], run.config.search.noise_px)
-    drawn = run.start.redrawn(run.filter, run.sensor.features, measured, path)
+    done = slice(t + 1)
+    measured = run.sightings.measured(run.stamps_ns[done], run.found[done], run.config.search.noise_px)
+    drawn = run.start.redrawn(run.filter, run.sensor.features, measured, run.world_from_camera[done])
     if drawn is not None:
         run.filter = drawn[0]
-        run.world_from_camera[: t + 1], run.cov[: t + 1] = told_anew(drawn[1])
-        run.sensor.place_all(run.filter.belief())
+        run.world_from_camera[done], run.cov[done] = told_anew(drawn[1])
+        belief, counts = run.filter.belief(), [seen.started.shape[0] for seen in run.sightings.frames]
+        run.sensor.drawn_anew(belief, drawn[1][:, belief.mode], np.repeat(np.arange(t + 1), counts))
         run.recovery.note(frame, run.filter)
     elif run.start.over:
         run.problems.append(f"frame {t}: {TORN}")

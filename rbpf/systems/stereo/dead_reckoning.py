@@ -120,7 +120,12 @@ class DeadReckoning:
             return self._at
         self._passed += 1
         expected = self.odometer.prediction.law(self.odometer.velocity, self._seconds(stamp_ns))
-        return self._moved(expected, np.zeros(0, dtype=bool), "")
+        moved = self._moved(expected, np.zeros(0, dtype=bool), "")
+        return replace(moved, assumed=self._at.assumed + self._passed)
+
+    def is_later(self, stamp_ns: int) -> bool:
+        """Whether time has passed since the last measured pair: without it there is no velocity."""
+        return self._stamp_ns is None or stamp_ns > self._stamp_ns
 
     def updated(self) -> None:
         """The filter has taken the motion up to the last measured pair."""

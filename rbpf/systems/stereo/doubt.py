@@ -18,11 +18,13 @@ if TYPE_CHECKING:
 def motion_for_update(run: "StereoRun", t: int, at: Reckoned) -> Odometry | None:
     """By what the particles are moved at pair t; None where the map does not say yet where the camera has come.
 
+    A map that has not got so far that it could say it is not waited for.
+
     A place that is found far from where the camera was assumed to go takes the place of the law's mean: something has
     deceived the odometry. Its covariance stays, and leaves the rest to each particle's own map.
     """
     recovery, motion = run.config.recovery, at.since_update
-    if not (recovery.used and at.assumed):
+    if not (recovery.used and at.assumed) or run.front_end.proven < run.config.map.agreeing:
         return motion
     belief = run.filter.expect(motion, int(run.stamps_ns[t]))
     after = f"after {at.assumed} pair{'s'[: at.assumed > 1]} whose motion was only assumed"

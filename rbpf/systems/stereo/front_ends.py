@@ -57,6 +57,11 @@ class FrontEnd(ABC):
             doubt: the motion up to it was only assumed, for all or part of the way.
         """
 
+    @property
+    @abstractmethod
+    def proven(self) -> int:
+        """Landmarks of the map by which a place can be recognised."""
+
     @abstractmethod
     def recognised(self, belief: Belief) -> int:
         """Landmarks of the map that the pair looked at shows, all in one place, to particles in doubt."""
@@ -170,6 +175,11 @@ class ImageFrontEnd(FrontEnd):
             free = ~half if split == "apart" else half
         free[self.standing.moving] = False
         return StereoFrame(self._now, free, doubt)
+
+    @property
+    def proven(self) -> int:
+        """Those that were found again, if there is a map."""
+        return self.sensor.proven().size if self.config.map.used else 0
 
     def recognised(self, belief: Belief) -> int:
         """By their keys, as many as agree on one motion."""

@@ -70,6 +70,11 @@ class NameFrontEnd(FrontEnd):
     def keep(self) -> None:
         self._kept = self._now
 
+    @property
+    def proven(self) -> int:
+        """Those that the filter has taken more than once."""
+        return self._proven.size
+
     def recognised(self, belief: Belief) -> int:
         """By their names, those that the filter has taken more than once."""
         return int(np.isin(self.for_filter().landmarks, self._proven).sum())

@@ -225,8 +225,14 @@ def _reckon(run: StereoRun, t: int, problem: str) -> tuple[Reckoned, bool]:
     """The motion up to pair t, and whether the pair could be measured."""
     stamp, reckoning = run.per_stamp * int(run.stamps_ns[t]), run.reckoning
     least, count = run.config.odometry.estimate.least_matches, int(run.features[t])
-    if count < least:
-        what = problem or f"it shows {count} features, {least} are needed"
+    is_later = reckoning.is_later(stamp)
+    if count < least or not is_later:
+        few = (
+            f"it shows {count} features, {least} are needed"
+            if is_later
+            else "it has the stamp of the last one"
+        )
+        what = f"{problem}; {few}" if problem and count else problem or few
         run.notes.append(f"pair {t} is passed over: {what}; the last velocity is assumed, widely")
         return reckoning.assumed(stamp), False
     if problem:

@@ -75,7 +75,7 @@ def read_info(bag: Bag, image_topic: str) -> Info:
     message = bag.message(raw)
     _require_whole(message, where)
     turn, projection = _field(message, "R").reshape(3, 3), _field(message, "P").reshape(3, 4)
-    is_rectified = "rect" in _named(image_topic).rpartition("/")[2]
+    is_rectified = _named(image_topic).rpartition("/")[2].startswith("image_rect")
     intrinsics = projection[:, :3] if is_rectified else _field(message, "K").reshape(3, 3)
     lens = {} if is_rectified else _lens(message, where)
     camera = _pinhole(message, intrinsics, lens, where)

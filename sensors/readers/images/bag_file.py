@@ -54,7 +54,7 @@ class Bag:
     def __init__(self, path: Path, reader: Any, types: Any) -> None:
         self.path = path
         self._reader, self._types = reader, types
-        self._ros1 = path.suffix == ".bag"
+        self._ros1 = path.suffix == ".bag" and path.is_file()
         # A file that was not summed up counts none at all.
         counted = any(c.msgcount for c in reader.connections)
         self.topics: dict[str, str] = {

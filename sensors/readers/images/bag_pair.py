@@ -73,6 +73,11 @@ def _told(bag: Bag, streams: list[Stream]) -> tuple[RectifiedStereo, Rectificati
     left, right = (read_info(bag, stream.topic) for stream in streams)
     for info, stream in ((left, streams[0]), (right, streams[1])):
         info.calibration.require_shape(stream.shape, f"{bag.path}, {stream.topic}")
+    if left.is_rectified != right.is_rectified:
+        topics = " and ".join(stream.topic for stream in streams)
+        raise InputError(
+            f"{bag.path}: of {topics} one is rectified and the other is not; give two of a kind."
+        )
     apart = right.shift_m - left.shift_m
     if apart <= 0.0:
         problem = f"P puts the right camera {apart:g} m to the right of the left one"

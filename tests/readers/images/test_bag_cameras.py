@@ -147,6 +147,20 @@ def test_pairs_that_are_refused(tmp_path, bag, topics, problem):
         open_stereo(write_pair(tmp_path / "walk.bag", **bag), topics=topics)
 
 
+def test_a_rectified_and_a_raw_topic_are_no_pair(tmp_path):
+    with recorded(tmp_path / "walk.bag") as bag:
+        for name, image in (("/left", "image_rect"), ("/right", "image_raw")):
+            bag.info(f"{name}/camera_info")
+            bag.image(f"{name}/{image}", 1, grey(10, SIZE))
+    with pytest.raises(InputError, match="one is rectified and the other is not"):
+        open_stereo(tmp_path / "walk.bag")
+
+
+def test_a_folder_may_be_called_like_a_file_of_ros_1(tmp_path):
+    folder = write_bag(tmp_path / "walk_db3").rename(tmp_path / "walk.bag")
+    assert [int(frame.image[0, 0]) for frame in open_images(folder).frames()] == [10, 20, 30]
+
+
 def test_one_topic_is_no_pair(tmp_path):
     with pytest.raises(InputError, match="the bag's image topics are /cam0/image_raw; name two"):
         open_stereo(write_bag(tmp_path / "walk.bag"))
