@@ -1,7 +1,9 @@
 """Chained motions and what is assumed between them."""
 
 import numpy as np
+import pytest
 
+from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.motion.odometry import Odometry
 from rbpf.motion.stereo_odometer import StereoOdometer
@@ -131,3 +133,12 @@ def test_what_triggers():
         assert triggered(motion, config, 1) == enough
     doubt = Odometry(SE3.identity(), np.diag([0.0, 0.0, 0.0, 0.01, 0.0, 1e-4]))
     assert triggered(doubt, config, 1)
+
+
+@pytest.mark.parametrize(
+    ("name", "damaged"), [("velocity", np.zeros(5)), ("cov", np.zeros(6)), ("missed", np.zeros(4))]
+)
+def test_a_damaged_checkpoint_is_refused(name, damaged):
+    chain, _ = reckoned(6, False)
+    with pytest.raises(InputError, match=name):
+        chain.restore(chain.arrays() | {f"reckoning/{name}": damaged})

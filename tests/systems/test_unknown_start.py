@@ -227,3 +227,17 @@ def test_where_the_lens_has_no_direction_the_start_does_not_stop(drawn):
 def test_settings_that_make_no_sense(wrong):
     with pytest.raises(InputError, match=f"start.{next(iter(wrong))}"):
         StartConfig(**wrong)
+
+
+@pytest.mark.parametrize(
+    ("name", "damaged"),
+    [
+        ("start/progress", np.zeros(3, dtype=np.int64)),
+        ("start/path", np.zeros((2, 7))),
+        ("start/inverse", np.zeros(1)),
+        ("start/names", np.zeros(2)),
+    ],
+)
+def test_a_damaged_checkpoint_is_refused(plane, name, damaged):
+    with pytest.raises(InputError, match=name):
+        UnknownStart(SMALL, needed=True).restore(plane.start.arrays() | {name: damaged})

@@ -13,6 +13,7 @@ from typing import final
 
 import numpy as np
 
+from rbpf.archive import checked
 from rbpf.filter import Filter
 from rbpf.lie import SE3
 from rbpf.motion.constant_velocity import PoseLaw
@@ -96,11 +97,20 @@ class UnknownStart:
         }
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """The inverse of `arrays`."""
-        over, self._next = arrays["start/progress"].tolist()
+        """The inverse of `arrays`.
+
+        Raises:
+            InputError: they are not what they should be.
+        """
+        over, self._next = checked(arrays, "start/progress", (2,), "i").tolist()
         self.over = bool(over)
-        structure = Structure(arrays["start/path"], arrays["start/direction"], arrays["start/inverse"])
-        names, steps = arrays["start/names"], arrays["start/steps"]
+        names = checked(arrays, "start/names", (None,), "i")
+        steps = checked(arrays, "start/steps", (None,), "i")
+        structure = Structure(
+            checked(arrays, "start/path", (steps.size, 7), "f"),
+            checked(arrays, "start/direction", (names.size, 3), "f"),
+            checked(arrays, "start/inverse", (names.size,), "f"),
+        )
         self._last = (names, steps, structure) if names.size else None
 
     def _found(
@@ -196,8 +206,8 @@ class UnknownStart:
         new = assemble(self.config, features, None)
         new.rng, new.log_evidence = old.rng, old.log_evidence
         start = min(steps)
+        law = PoseLaw(SE3.identity(), np.zeros((6, 6)), start_std(self.config.velocity))
         for t, frame in enumerate(frames):
-            law = PoseLaw(SE3.identity(), np.zeros((6, 6)), start_std(self.config.velocity))
             state = self._state(new, paths[t], frame.stamp_ns)
             measured = frame if t in steps else _unseen(frame)
             new.follow(state, measured, law if t <= start else None, frame.stamp_ns)

@@ -6,6 +6,7 @@ from typing import NamedTuple, final
 import numpy as np
 
 from rbpf import gaussian
+from rbpf.archive import checked
 from rbpf.lie import SE3
 from rbpf.motion.odometry import Odometry
 from rbpf.motion.stereo_motions import Known
@@ -146,13 +147,20 @@ class DeadReckoning:
         }
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """The inverse of `arrays`."""
-        stamps = arrays["reckoning/stamp_ns"]
+        """The inverse of `arrays`.
+
+        Raises:
+            InputError: they are not what they should be.
+        """
+        stamps = checked(arrays, "reckoning/stamp_ns", (None,), "i")
         self._stamp_ns = int(stamps[0]) if stamps.size else None
-        self.odometer.velocity = arrays["reckoning/velocity"].copy()
-        motion = Odometry(arrays["reckoning/delta"].copy(), arrays["reckoning/cov"].copy())
-        assumed, waiting, hidden, self._passed = (int(count) for count in arrays["reckoning/missed"])
-        world = arrays["reckoning/world_from_camera"].copy()
+        self.odometer.velocity = checked(arrays, "reckoning/velocity", (6,), "f").copy()
+        delta, cov, world = (
+            checked(arrays, f"reckoning/{name}", shape, "f").copy()
+            for name, shape in (("delta", (7,)), ("cov", (6, 6)), ("world_from_camera", (7,)))
+        )
+        motion, missed = Odometry(delta, cov), checked(arrays, "reckoning/missed", (4,), "i")
+        assumed, waiting, hidden, self._passed = missed.tolist()
         self._at = Reckoned(motion, world, assumed=assumed, waiting=waiting, hidden=bool(hidden))
 
     def _seconds(self, stamp_ns: int) -> float:
