@@ -40,7 +40,7 @@ check: $(STAMP) ## format, lint, types, import rules and the fast tests
 bench: $(STAMP) ## run the benchmarks against their baselines
 	$(BIN)/python -m benchmarks --gate
 
-coverage: $(STAMP) ## all tests, with the share of lines that they run
+coverage: $(STAMP) ## all tests, with the fraction of lines that they run
 	$(BIN)/python -m pytest -n 2 --cov --cov-report=term --cov-report=html:coverage
 
 docs: $(STAMP) ## build the documentation into docs/_build

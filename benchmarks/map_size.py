@@ -56,8 +56,8 @@ def run(settings: Settings) -> list[Row]:
         notes = large.run.diversity.text()
         rows.append(compare("update", m, steps[str(m)], steps[str(SIZES[0])], notes))
         part = large.resampling().seconds.sum() / (steps[str(m)].seconds.mean() * (turns + warm_up))
-        share = f"{part:.1%} of the time of all steps; {notes}"
-        rows.append(compare("resampling", m, large.resampling(), small.resampling(), share))
+        fraction = f"{part:.1%} of the time of all steps; {notes}"
+        rows.append(compare("resampling", m, large.resampling(), small.resampling(), fraction))
     return rows
 
 

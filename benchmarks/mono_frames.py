@@ -22,7 +22,7 @@ from rbpf.validation.simulation.textured_desk import TexturedDesk
 
 SETTLING, TIMED, MEASUREMENTS = 30, 90, 25
 AIM_HZ = {320: 100.0, 640: 60.0}
-SHARE_OF_WIDTH = 0.625
+FRACTION_OF_WIDTH = 0.625
 """Focal length over the image's width, the desk world's 400 px at 640."""
 
 
@@ -38,7 +38,7 @@ class Decoded(Source):
 
 def rendered(width: int, frames: int) -> tuple[ImageSequence, KnownPixels]:
     """A desk in images 4 : 3 of this width."""
-    height, focal = width * 3 // 4, SHARE_OF_WIDTH * width
+    height, focal = width * 3 // 4, FRACTION_OF_WIDTH * width
     camera = Pinhole(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
     with TemporaryDirectory() as folder:
         desk = Path(folder) / "desk"
@@ -96,7 +96,7 @@ def by_stage(run: VideoRun) -> dict[str, np.ndarray]:
     """Seconds of each frame (T,) by what they were spent on."""
     return {
         "search": run.seconds_search,
-        "filter": run.seconds - run.seconds_search - run.seconds_births,
-        "births": run.seconds_births,
+        "filter": run.seconds - run.seconds_search - run.seconds_new_landmarks,
+        "new_landmarks": run.seconds_new_landmarks,
         "telling": run.seconds_telling,
     }

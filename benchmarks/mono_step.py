@@ -7,7 +7,7 @@ from benchmarks.rows import Row, Settings, interleaved
 from rbpf.filter import Filter
 from rbpf.sensors.features import FeatureFrame, FeatureLog
 from rbpf.systems.mono.config import MonoConfig
-from rbpf.systems.mono.system import build_filter, start_law
+from rbpf.systems.mono.system import build_filter, start_prior
 from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
 from rbpf.validation.simulation.point_worlds import DeskWorld
 
@@ -23,7 +23,7 @@ class Walk:
         self.filter: Filter = build_filter(log, config)
         self._frames: Iterator[FeatureFrame] = iter(log.frames)
         first = next(self._frames)
-        self.filter.step(first, start_law(log, config), first.stamp_ns)
+        self.filter.step(first, start_prior(log, config), first.stamp_ns)
         for _ in range(SETTLING - 1):
             self()
 

@@ -125,7 +125,7 @@ class Diversity:
             self._retain()
 
     def text(self) -> str:
-        """Rate of resampling, distinct ancestors and the share of the map that is stored."""
+        """Rate of resampling, distinct ancestors and the fraction of the map that is stored."""
         lineage = self.filter.lineage
         age = lineage.generation - self._kept[0]
         store = self.filter.belief().map.store

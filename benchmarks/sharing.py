@@ -10,7 +10,7 @@ from rbpf.resampling import Systematic
 N, M, FIELDS, IN_VIEW = 400, 11_085, 9, 100
 RESAMPLINGS = 1_000
 DISPERSION = 0.08
-AIM_SHARE, AIM_LINEAGES = 0.10, 20
+AIM_FRACTION, AIM_LINEAGES = 0.10, 20
 REAL = 8
 
 
@@ -44,7 +44,7 @@ def rewrite(store: SharedStore, columns: np.ndarray) -> None:
 
 def figure(store: SharedStore, written: np.ndarray) -> Row:
     """What is stored against a copy per particle, and against one record per writer that has descendants."""
-    share, survivors = store.stored_bytes / store.dense_bytes, store.lineage.distinct(0)
+    fraction, survivors = store.stored_bytes / store.dense_bytes, store.lineage.distinct(0)
     alive = {int(generation): store.lineage.distinct(int(generation)) for generation in np.unique(written)}
     least = sum(alive[generation] for generation in written.tolist()) * FIELDS * REAL / store.dense_bytes
     return Row(
@@ -53,10 +53,10 @@ def figure(store: SharedStore, written: np.ndarray) -> Row:
         "MB",
         "a copy per particle",
         store.dense_bytes / 1e6,
-        share,
+        fraction,
         higher=False,
-        aim=f"<= {AIM_SHARE:.0%} of dense, >= {AIM_LINEAGES} lineages",
-        met=share <= AIM_SHARE and survivors >= AIM_LINEAGES,
+        aim=f"<= {AIM_FRACTION:.0%} of dense, >= {AIM_LINEAGES} lineages",
+        met=fraction <= AIM_FRACTION and survivors >= AIM_LINEAGES,
         notes=(
             f"{survivors} lineages of the first generation survive {RESAMPLINGS} resamplings; weights log-normal "
             f"with deviation {DISPERSION:g}; {IN_VIEW} landmarks rewritten per step, one of them new; one record per "

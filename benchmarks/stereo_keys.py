@@ -145,7 +145,7 @@ def with_map(recording: Recording, search: KeySearch, gated: bool, others: np.nd
 def tables(folder: Path, config: SiftConfig) -> Iterator[str]:
     """Lines of the report."""
     whole = {name: read(folder / name, config) for name in NAMES}
-    yield "recording           key  frames apart: matches per pair, share that is right"
+    yield "recording           key  frames apart: matches per pair, fraction that is right"
     for name, gaps in NAMES.items():
         for length in (36, 128):
             recording, cells = shortened(whole[name], length), []
@@ -154,7 +154,7 @@ def tables(folder: Path, config: SiftConfig) -> Iterator[str]:
                 pairs = len(range(0, len(recording.features) - gap, 2))
                 cells.append(f"{gap}: {found / pairs:5.1f} {right / max(found, 1):.3f}")
             yield f"{name:18}  {length:3}  {'   '.join(cells)}"
-    yield "recording           key  other keys  search: matches per frame, share right, time"
+    yield "recording           key  other keys  search: matches per frame, fraction right, time"
     for name, other in (tuple(NAMES), tuple(NAMES)[::-1]):
         for length in (36, 128):
             recording = shortened(whole[name], length)

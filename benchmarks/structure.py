@@ -47,7 +47,11 @@ def called_once(trees: dict[str, ast.Module]) -> tuple[int, int]:
     named, defined = Counter(), []
     for module, tree in trees.items():
         for node in ast.walk(tree):
-            if isinstance(node, ast.FunctionDef) and node.name.startswith("_") and not node.name.startswith("__"):
+            if (
+                isinstance(node, ast.FunctionDef)
+                and node.name.startswith("_")
+                and not node.name.startswith("__")
+            ):
                 if not any(isinstance(d, ast.Name) and d.id == "njit" for d in node.decorator_list):
                     defined.append((module, node.name))
             elif isinstance(node, ast.Name):

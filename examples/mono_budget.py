@@ -64,9 +64,11 @@ def print_place(budget: Budget, frame: int, place: np.ndarray) -> None:
             continue
         pose = line.world_from_camera[rows[0]]
         from_first = SE3.between(line.world_from_camera[0], pose)
-        share, own = (np.linalg.norm(at - place) / np.linalg.norm(place) for at in (pose[4:], from_first[4:]))
+        fraction, own = (
+            np.linalg.norm(at - place) / np.linalg.norm(place) for at in (pose[4:], from_first[4:])
+        )
         print(
-            f"{line.name:>24}: frame {frame} at {pose[4:].round(3)}, {share:.1%} off; "
+            f"{line.name:>24}: frame {frame} at {pose[4:].round(3)}, {fraction:.1%} off; "
             f"seen from the first frame {from_first[4:].round(3)}, {own:.1%} off"
         )
 

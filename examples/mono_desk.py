@@ -102,9 +102,9 @@ def main(
     write_table(out / "errors.csv", header, [*rows, ["mean", *mm.mean(axis=0).tolist(), float(ratio.mean())]])
     print(f"worst recording: {int(ratio.argmax())}, {ratio.max():.2f} times the batch")
     inside = ((nees >= band.low) & (nees <= band.high)).mean(axis=1)
-    for name, curve, share in zip(names, nees, inside, strict=True):
+    for name, curve, fraction in zip(names, nees, inside, strict=True):
         print(
-            f"{name}: NEES {np.median(curve):.1f} (median over the frames), {share:.0%} of the frames in the band"
+            f"{name}: NEES {np.median(curve):.1f} (median over the frames), {fraction:.0%} of the frames in the band"
         )
     write_csv(out / "nees.csv", ["frame", *names], [[t, *nees[:, t].tolist()] for t in range(frames)])
     draw(names, mm, nees, band, out / "mono_desk.png")

@@ -122,11 +122,11 @@ def main(
     ]
     rows = []
     for n, (values, _, ancestors) in spectra.items():
-        share = values / values[0]
-        nth = float(share[n - 1]) if n <= share.size else 0.0
-        above = [int((share > limit).sum()) for limit in (1e-2, 1e-3)]
+        fraction = values / values[0]
+        nth = float(fraction[n - 1]) if n <= fraction.size else 0.0
+        above = [int((fraction > limit).sum()) for limit in (1e-2, 1e-3)]
         rows.append(
-            [n, n - 1, values.size // 3, float(values[0]), float(share[RANK - 1]), nth, *above, ancestors]
+            [n, n - 1, values.size // 3, float(values[0]), float(fraction[RANK - 1]), nth, *above, ancestors]
         )
     write_table(out / "summary.csv", header, rows)
     print(

@@ -29,12 +29,12 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from rbpf.diagnostics import chi_square_band
-from rbpf.motion.constant_velocity import PoseLaw
+from rbpf.motion.constant_velocity import PosePrior
 from rbpf.sensors.features import FeatureLog, KnownPoints
 from rbpf.systems.filtering import ProposalConfig, ResamplingConfig
 from rbpf.systems.mono.config import MonoConfig, RayConfig, VelocityConfig
 from rbpf.systems.mono.run import pose_estimate
-from rbpf.systems.mono.system import build_filter, start_law
+from rbpf.systems.mono.system import build_filter, start_prior
 from rbpf.validation.consistency import PoseErrors, pose_errors
 from rbpf.validation.parallel import in_parallel
 from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
@@ -80,9 +80,9 @@ class Job(NamedTuple):
 def errors_of(job: Job) -> PoseErrors:
     """Simulates and filters; a control knows the true start, or the whole map."""
     log = simulate_features(DeskWorld(frames=job.frames), Measuring(), MONO, job.seed)
-    start = start_law(log, job.config)
+    start = start_prior(log, job.config)
     if job.name == TRUE_START:
-        start = PoseLaw(log.truth.world_from_camera[0], np.zeros((6, 6)))
+        start = PosePrior(log.truth.world_from_camera[0], np.zeros((6, 6)))
     if job.name in SURVEYED:
         log = replace(log, known=surveyed(log, SURVEYED[job.name], np.random.default_rng(job.seed)))
     filter_, estimates = build_filter(log, job.config), []

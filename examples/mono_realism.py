@@ -1,9 +1,9 @@
 """Are the rendered worlds easier than life? What active search finds in them, beside real recordings.
 
-The same system with the same settings filters every sequence. The first table has the share of the searches that ended
+The same system with the same settings filters every sequence. The first table has the fraction of the searches that ended
 with a match, and of those that did not why: nothing in the ellipse was alike enough, or what was alike was astray: it
 did not agree with where the camera went. Then the correlation of what was found: the median, and the tenth that was
-least alike. Survival is the share of features that are not dropped within so many frames of being looked for (Kaplan
+least alike. Survival is the fraction of features that are not dropped within so many frames of being looked for (Kaplan
 and Meier's estimate). Noise and contrast are those of the images themselves, grey levels: the noise is read off the
 smoothest blocks, which in compressed video have lost it.
 
@@ -63,10 +63,10 @@ def draw(found: list[SearchStatistics]) -> Figure:
     panels = upper.subplots((len(found) + 2) // 3, 3, sharex=True, squeeze=False)
     bins = np.linspace(0.4, 1.0, 61)
     for axes, one in zip(panels.flat, found, strict=False):
-        shares = [np.full(part.sum(), 1.0 / one.score.size) for part in (one.found, ~one.found)]
+        fractions = [np.full(part.sum(), 1.0 / one.score.size) for part in (one.found, ~one.found)]
         score = np.maximum(one.score, bins[0])
         axes.hist(
-            [score[one.found], score[~one.found]], bins, weights=shares, stacked=True,
+            [score[one.found], score[~one.found]], bins, weights=fractions, stacked=True,
             color=["tab:green", "tab:red"], label=["taken", "not taken"],
         )  # fmt: skip
         axes.axvline(one.accept, color="black", lw=0.8, ls="--")
@@ -82,7 +82,9 @@ def draw(found: list[SearchStatistics]) -> Figure:
         style = "-" if "rendered" not in one.name else "--" if "perfect" not in one.name else ":"
         curve.plot(one.survival(WATCHED), style, label=one.name)
     curve.set(
-        xlabel="frames in which it was looked for", ylabel="share of features not dropped", ylim=(0.0, 1.02)
+        xlabel="frames in which it was looked for",
+        ylabel="fraction of features not dropped",
+        ylim=(0.0, 1.02),
     )
     curve.grid(alpha=0.3)
     curve.legend(fontsize="small")
@@ -119,9 +121,11 @@ def main(
     for one in found:
         alike = one.score[one.found]
         survival = one.survival(max(TOLD))[list(TOLD)].tolist()
-        shares = one.share_found, one.share_unlike, one.share_astray
+        fractions = one.share_found, one.share_unlike, one.share_astray
         quantiles = [float(np.quantile(alike, q)) for q in (0.5, 0.1)]
-        rows.append([one.name, one.frames, one.lost, *shares, *quantiles, *survival, one.noise, one.contrast])
+        rows.append(
+            [one.name, one.frames, one.lost, *fractions, *quantiles, *survival, one.noise, one.contrast]
+        )
     write_table(out / "realism.csv", header, rows)
     save_figures({"mono_realism.png": draw(found)}, out)
     print(f"picture and table in {out}")

@@ -21,7 +21,7 @@ from rbpf.validation.tables import write_csv, write_table
 
 SYSTEMS = "camera", "robot"
 SETTLED = 0.1
-"""The first share of a run fills the map and is not compared."""
+"""The first fraction of a run fills the map and is not compared."""
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from rbpf.sensors.features import CameraTruth, FeatureLog
 from rbpf.sensors.readers import stereo_tracks
 from rbpf.sensors.readers.images import open_stereo
 from rbpf.systems.stereo.config import StereoConfig
-from rbpf.systems.stereo.measured import measure_pairs
+from rbpf.systems.stereo.feature_cache import cache_features
 from rbpf.systems.stereo.run import StereoRun, run_features, run_images
 from rbpf.validation.batch_problem import solve_problem
 from rbpf.validation.figures import COLOURS, new_axes, save_figures
@@ -72,7 +72,7 @@ def of_pairs(folder: Path, configs: Sequence[StereoConfig]) -> Iterator[list]:
     """Images, measured once."""
     sequence = open_stereo(folder)
     with TemporaryDirectory() as features:
-        both = measure_pairs(pairs_there_and_back(sequence), configs[0], Path(features))
+        both = cache_features(pairs_there_and_back(sequence), configs[0], Path(features))
         for way, part in zip(WAYS, (both.first(len(sequence)), both), strict=True):
             yield row(f"{sequence.name}, {way}", lambda config, part=part: run_images(part, config), configs)
 

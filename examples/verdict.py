@@ -122,10 +122,10 @@ def draw(counts: dict[tuple[str, str], Counter[str]], runs: int, path: Path) -> 
         names = [name for name, by in counts if by == how][::-1]
         left = np.zeros(len(names))
         for trust, colour in COLOURS.items():
-            share = np.array([counts[name, how][trust] / runs for name in names])
-            axes.barh(names, share, left=left, color=colour, label=trust)
-            left += share
-        axes.set(title=f"judged by the {how}", xlabel=f"share of {runs} runs", xlim=(0.0, 1.0))
+            fraction = np.array([counts[name, how][trust] / runs for name in names])
+            axes.barh(names, fraction, left=left, color=colour, label=trust)
+            left += fraction
+        axes.set(title=f"judged by the {how}", xlabel=f"fraction of {runs} runs", xlim=(0.0, 1.0))
         axes.legend(fontsize="small", loc="lower right")
     figure.savefig(path, dpi=110)
 

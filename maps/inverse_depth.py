@@ -17,7 +17,7 @@ class InverseDepth(Landmark):
     its descendants inherit. u and v are normalised image coordinates, q = 1/z in 1/m; q = 0 is at infinity.
 
     Args:
-        ready_ratio: it is ready to become a point when the standard deviation of q is below this share of q.
+        ready_ratio: it is ready to become a point when the standard deviation of q is below this fraction of q.
     """
 
     dim = 3

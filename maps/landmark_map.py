@@ -18,11 +18,11 @@ from rbpf.maps.reading import linearise_one_particle, project_compiled, read_rec
 from rbpf.maps.rows import RowEngine
 from rbpf.maps.shared import ALL, SharedStore
 from rbpf.models import (
-    Births,
     Conditional,
     Jacobians,
     Landmark,
     LogDensities,
+    NewLandmarks,
     ObservationModel,
     Observations,
     Part,
@@ -65,12 +65,12 @@ class LandmarkMap(Conditional):
         """Landmarks held, ascending (M,)."""
         return self.store.ids
 
-    def add(self, births: Births, state: np.ndarray) -> np.ndarray:
+    def add(self, new_landmarks: NewLandmarks, state: np.ndarray) -> np.ndarray:
         """Starts landmarks from first sightings at the states (N, E); returns their ids (K,)."""
-        records = births.model.initialise(state, births.z, births.cov)
-        log_odds = None if births.mask is None else np.where(births.mask, 0.0, -np.inf)
-        ids = self.add_records(records, births.landmark, log_odds)
-        for landmark, fact in zip(ids.tolist(), births.facts, strict=False):
+        records = new_landmarks.model.initialise(state, new_landmarks.z, new_landmarks.cov)
+        log_odds = None if new_landmarks.mask is None else np.where(new_landmarks.mask, 0.0, -np.inf)
+        ids = self.add_records(records, new_landmarks.landmark, log_odds)
+        for landmark, fact in zip(ids.tolist(), new_landmarks.facts, strict=False):
             self.catalogue[landmark] = fact
         return ids
 
@@ -149,10 +149,10 @@ class LandmarkMap(Conditional):
             self.store.replace(int(landmark_id), self.layouts[kind].pack(records, log_odds)[0])
             self.store.columns.kind[self.store.columns.row(int(landmark_id))] = kind
 
-    def ready(self, weights: np.ndarray, share: float = 0.95) -> np.ndarray:
-        """Landmarks of several components or with constants that are ready in `share` of the weight (N,)."""
+    def ready(self, weights: np.ndarray, fraction: float = 0.95) -> np.ndarray:
+        """Landmarks of several components or with constants that are ready in `fraction` of the weight (N,)."""
         waiting = [i for i in self.ids if not isinstance(self.landmark_of(int(i)), Point)]
-        ready = [i for i in waiting if (weights * self._is_ready(int(i))).sum() >= share]
+        ready = [i for i in waiting if (weights * self._is_ready(int(i))).sum() >= fraction]
         return np.array(ready, dtype=np.int64)
 
     def log_odds(self, ids: np.ndarray) -> np.ndarray:
@@ -176,7 +176,7 @@ class LandmarkMap(Conditional):
 
     def terms(self, state: np.ndarray, groups: Sequence[Observations], prior: Prior) -> Terms:
         """Information of single-Gaussian landmarks; those of several components enter after sampling."""
-        for_state = [group for group in groups if Part.STATE in group.informs]
+        for_state = [group for group in groups if Part.STATE in group.updates]
         return self._engine.terms(self._plan(for_state), state, for_state, prior)
 
     def correct(
@@ -201,7 +201,7 @@ class LandmarkMap(Conditional):
         plan = self._plan(groups)
         if plan.late:
             raise InputError("a landmark of several components cannot be observed without being updated")
-        if all(group.likelihood is None or group.likelihood.form == 0 for group in groups):
+        if all(group.likelihood is None or group.likelihood.kernel_id == 0 for group in groups):
             terms = self._engine.terms(plan, state, groups, Prior.exactly(self.space, state))
             return terms.log_factor - 0.5 * (terms.quad + terms.log_det)
         if plan.joint:

@@ -173,7 +173,7 @@ def by_use(groups: Sequence[Observations]) -> dict[frozenset[Part], list[Observa
     """The groups by what they inform."""
     uses: dict[frozenset[Part], list[Observations]] = {STATE: [], BOTH: [], MAP: []}
     for group in groups:
-        uses[group.informs].append(group)
+        uses[group.updates].append(group)
     return uses
 
 
@@ -188,6 +188,6 @@ def require_apart(weigh: Sequence[Observations], both: Sequence[Observations]) -
     shared = np.intersect1d(seen[0][seen[0] >= 0], seen[1])
     if shared.size:
         raise InputError(
-            f"landmark {shared[0]} is observed by a group that informs the state alone and by one that informs both: "
+            f"landmark {shared[0]} is observed by a group that updates the state alone and by one that updates both: "
             "split the second into one for each"
         )

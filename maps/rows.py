@@ -79,7 +79,7 @@ class RowEngine:
         return LogDensities(log_density + late, late)
 
     def _kernel(self, group: Observations) -> FusedKernel | None:
-        if not self.compiled or (group.likelihood is not None and group.likelihood.form < 0):
+        if not self.compiled or (group.likelihood is not None and group.likelihood.kernel_id < 0):
             return None
         return group.model.kernel()
 
@@ -112,7 +112,7 @@ class RowEngine:
             group.z[batch.ks],
             group.cov[batch.ks],
             mask,
-            likelihood.form,
+            likelihood.kernel_id,
             likelihood.params,
             np.ascontiguousarray(prior.factor),
             self._sizes(int(batch.ids[0])),
@@ -147,7 +147,7 @@ class RowEngine:
             group.z[batch.ks],
             group.cov[batch.ks],
             _NO_MASK if batch.mask is None else np.ascontiguousarray(batch.mask.T),
-            likelihood.form,
+            likelihood.kernel_id,
             likelihood.params,
             self._sizes(int(batch.ids[0])),
             log_density,
@@ -226,7 +226,7 @@ class RowEngine:
             assert jac.state is not None and jac.landmark is not None
             mask = row.mask
             likelihood = _likelihood(group)
-            if prior is not None and likelihood.form != 0:
+            if prior is not None and likelihood.kernel_id != 0:
                 cov = reference.innovation_covariance(jac.landmark, records.cov, group.cov[row.k])
                 mask, log_row = reference.gated(nu, jac.state, cov, likelihood, prior, mask)
                 log_factor += log_row
@@ -244,7 +244,7 @@ class RowEngine:
 
         They are sorted by what was measured, so that the order within a frame does not matter.
         """
-        if any(_likelihood(groups[row.group]).form != 0 for row in rows):
+        if any(_likelihood(groups[row.group]).kernel_id != 0 for row in rows):
             for row in sorted(rows, key=lambda row: groups[row.group].z[row.k].tolist()):
                 mask = None if row.mask is None else row.mask[:, None]
                 batch = Batch(row.group, np.array([row.k]), np.array([row.landmark]), mask)

@@ -18,10 +18,10 @@ ALL = slice(None)
 MOST_FIELDS = 1 << 20
 """No record is longer."""
 
-HOT_SHARE = 0.75
-"""A column with fewer surviving rows than this share of the particles gives its dense slab back."""
-COLD_SHARE = 0.9
-"""A compacted column is compacted again when no more than this share of its rows survives."""
+HOT_FRACTION = 0.75
+"""A column with fewer surviving rows than this fraction of the particles gives its dense slab back."""
+COLD_FRACTION = 0.9
+"""A compacted column is compacted again when no more than this fraction of its rows survives."""
 
 
 class SharedStore:
@@ -161,7 +161,7 @@ class SharedStore:
             if not members:
                 continue
             alive = self.lineage.survivors(generation)
-            if alive.size <= COLD_SHARE * self._survivors.get(generation, self.n):
+            if alive.size <= COLD_FRACTION * self._survivors.get(generation, self.n):
                 self._survivors[generation] = alive.size
                 for column in members:
                     self._shrink(column, alive)
@@ -261,9 +261,9 @@ class SharedStore:
     def _shrink(self, column: int, alive: np.ndarray) -> None:
         cold = self._cold.get(column)
         if cold is not None:
-            if alive.size <= COLD_SHARE * cold.kept.size:
+            if alive.size <= COLD_FRACTION * cold.kept.size:
                 self._cold[column] = Cold(alive, cold.data.take(np.searchsorted(cold.kept, alive), axis=1))
-        elif alive.size <= HOT_SHARE * self.n:
+        elif alive.size <= HOT_FRACTION * self.n:
             row = self.columns.row(column)
             pool = self._pool(row)
             self._cold[column] = Cold(alive, pool.data[self.columns.slab[row]].take(alive, axis=1))

@@ -21,7 +21,7 @@ POSE_AND_VELOCITY = Product(SE3, Euclidean(6))
 
 
 @dataclass(frozen=True)
-class PoseLaw:
+class PosePrior:
     """Given as control: the body is where this law says, however it came there. The start of a run, or a kidnapping.
 
     Attributes:
@@ -67,12 +67,12 @@ class MarginalVelocity(MotionModel):
     def __init__(self, std_walk: np.ndarray) -> None:
         self.std_walk = _checked(std_walk)
 
-    def transition(self, state: np.ndarray, control: PoseLaw | None, dt: float) -> Transition:
+    def transition(self, state: np.ndarray, control: PosePrior | None, dt: float) -> Transition:
         """Chart at the previous pose: ε = δ v + w₁."""
         coupling, factor = dt * np.eye(6)[None], velocity_walk(self.std_walk, dt)
         keeps = np.eye(6)[None]
         if control is not None:
-            state, factor = _placed(state, control), _with_law(factor, control)
+            state, factor = _placed(state, control), _with_prior(factor, control)
             coupling = np.zeros((1, 6, 6))
             keeps = keeps if control.std_velocity is None else np.zeros((1, 6, 6))
         return Transition(state, factor[None], coupling, keeps, np.zeros((1, 6)))
@@ -86,7 +86,7 @@ class SampledVelocity(MotionModel):
         std_walk: (6,) or a number, see `velocity_walk`.
         mode: "joint" samples all twelve dimensions; "paper" moves the velocity to its conditional mean given the
             sampled pose, v ← v + (3/2δ) w₁ (E06 §3.1), and drops the variance δΣ/4 around it.
-        std_start: (6,) or a number, standard deviation of the velocity where a `PoseLaw` places the body, rad/s, m/s.
+        std_start: (6,) or a number, standard deviation of the velocity where a `PosePrior` places the body, rad/s, m/s.
     """
 
     space = POSE_AND_VELOCITY
@@ -103,13 +103,13 @@ class SampledVelocity(MotionModel):
             raise InputError(f"a sampled velocity has the mode 'paper' or 'joint', got {mode!r}")
         self.columns = 6 if mode == "paper" else 12
 
-    def transition(self, state: np.ndarray, control: PoseLaw | None, dt: float) -> Transition:
+    def transition(self, state: np.ndarray, control: PosePrior | None, dt: float) -> Transition:
         """Chart at (T Exp(δv), v): T Exp(δv + w₁) = T Exp(δv) Exp(J_r(δv) w₁) to first order."""
         placed, velocity = state[:, :7], state[:, 7:]
         if control is not None:
             stopped = control.std_velocity is not None
             mean = np.concatenate([_placed(placed, control), 0.0 * velocity if stopped else velocity], axis=1)
-            factor = _with_law(np.zeros((12, 12)), control)
+            factor = _with_prior(np.zeros((12, 12)), control)
             if not stopped:
                 factor[6:, 6:] = np.diag(self.std_start)
             return Transition(mean, factor[None])
@@ -119,15 +119,15 @@ class SampledVelocity(MotionModel):
         return Transition(np.concatenate([SE3.retract(placed, step), velocity], axis=1), factor)
 
 
-def _placed(state: np.ndarray, law: PoseLaw) -> np.ndarray:
+def _placed(state: np.ndarray, law: PosePrior) -> np.ndarray:
     if law.mean.shape != (7,) or law.cov.shape != (6, 6) or not np.isfinite(law.mean).all():
         raise InputError(
-            f"a PoseLaw needs a finite mean (7,) and cov (6, 6), got {law.mean} and {law.cov.shape}"
+            f"a PosePrior needs a finite mean (7,) and cov (6, 6), got {law.mean} and {law.cov.shape}"
         )
     return np.broadcast_to(SE3.normalise(law.mean), state.shape).copy()
 
 
-def _with_law(factor: np.ndarray, law: PoseLaw) -> np.ndarray:
+def _with_prior(factor: np.ndarray, law: PosePrior) -> np.ndarray:
     """The pose's noise is the law's, independent of the velocity's."""
     walk = np.linalg.norm(factor[6:], axis=1)
     placed = np.zeros((12, 12))

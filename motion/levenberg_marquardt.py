@@ -23,10 +23,10 @@ Retract = Callable[[Array, Array], Array]
 """x (E,) moved by ξ (d,)."""
 
 SINGULAR = 1e-7
-"""A singular value below this share of the largest counts as this share: its direction is not determined."""
+"""A singular value below this fraction of the largest counts as this fraction: its direction is not determined."""
 
 ROUNDING = 1e-12
-"""A decrease below this share of the squared residuals is not worth a step, nor certain to be found."""
+"""A decrease below this fraction of the squared residuals is not worth a step, nor certain to be found."""
 
 STUCK = 1e8
 """Damping at this multiple of the largest singular value leaves no step."""
@@ -40,7 +40,7 @@ class Rule:
         offset: what is left to go to the linearised problem's minimum, in standard deviations of the solution
             (D. Bates and D. Watts 1981): the iteration has converged below it.
         iterations: most of them.
-        damping: the first λ, as a share of the largest singular value.
+        damping: the first λ, as a fraction of the largest singular value.
     """
 
     offset: float = 1e-6
@@ -115,8 +115,8 @@ class _Local:
     def promised(self, damping: float) -> float:
         """Decrease of ‖ε‖² by the damped step in the linearised problem."""
         squares = self.s**2
-        shares = squares * (squares + 2.0 * damping**2) / (squares + damping**2) ** 2
-        return float(shares @ self.along**2)
+        fractions = squares * (squares + 2.0 * damping**2) / (squares + damping**2) ** 2
+        return float(fractions @ self.along**2)
 
 
 def minimise(evaluate: Evaluate, x: Array, retract: Retract, rule: Rule | None = None) -> Minimum:

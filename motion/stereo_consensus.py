@@ -27,7 +27,7 @@ class Draws:
     Attributes:
         batch: tried at a time.
         most: of all batches.
-        certainty: with this probability one triple without a false match is among them, given the share of matches
+        certainty: with this probability one triple without a false match is among them, given the fraction of matches
             that agree with the best motion so far.
     """
 
@@ -35,9 +35,9 @@ class Draws:
     most: int = 512
     certainty: float = 0.9999
 
-    def needed(self, share: float) -> float:
-        """Triples that it takes where this share of the matches is right."""
-        spoilt = 1.0 - min(share, 1.0 - 1e-9) ** 3
+    def needed(self, fraction: float) -> float:
+        """Triples that it takes where this fraction of the matches is right."""
+        spoilt = 1.0 - min(fraction, 1.0 - 1e-9) ** 3
         return float(np.log1p(-self.certainty) / np.log(spoilt)) if spoilt < 1.0 else np.inf
 
 
@@ -56,17 +56,17 @@ def consensus(
         draws: how many.
     """
     draws, search = draws or Draws(), _Search(matches, start)
-    best, lowest, share = start, np.inf, 0.0
+    best, lowest, fraction = start, np.inf, 0.0
     motions = np.stack([start, SE3.identity()])
     for tried in range(0, draws.most, draws.batch):
-        if tried > draws.needed(share):
+        if tried > draws.needed(fraction):
             break
         found = search.candidates(triples(len(matches), draws.batch, rng))
         motions = np.concatenate([motions, found]) if tried == 0 else found
-        scores, shares = search.scores(motions, gate)
+        scores, fractions = search.scores(motions, gate)
         if scores.min() < lowest:
             first = scores.argmin()
-            best, lowest, share = motions[first], scores[first], float(shares[first])
+            best, lowest, fraction = motions[first], scores[first], float(fractions[first])
     return best
 
 
@@ -99,7 +99,7 @@ class _Search:
         return motions
 
     def scores(self, motions: Array, gate: float) -> tuple[Array, Array]:
-        """Σ min(d², gate) (C,) of motions (C, 7) over all matches, and the shares (C,) that agree (compiled)."""
+        """Σ min(d², gate) (C,) of motions (C, 7) over all matches, and the fractions (C,) that agree (compiled)."""
         from rbpf.motion import stereo_kernels
 
         matches = self.matches

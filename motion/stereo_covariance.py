@@ -23,7 +23,7 @@ LEAST_KEPT = 0.05
 """No direction keeps less of I than this in I − D: where nearly all is noise, what is left cannot be told from it."""
 
 
-def honest_covariance(matches: Matches, found: Innovation, factor: Array) -> Array:
+def consistent_covariance(matches: Matches, found: Innovation, factor: Array) -> Array:
     """Covariance (6, 6) of the motion, in the right chart there.
 
     Args:
@@ -57,7 +57,7 @@ def trimming(gate: float) -> float:
 
     F₃ / F₅, the distributions of χ² with three and five degrees of freedom at the gate: rejection by ν has the
     influence function ν within the gate, the covariance E[νᵀν] / 3 = F₅ and the slope F₅ (P. Huber 1981, §4.5), for
-    each match; the share F₃ of them is within. It is also 3 / E[ν² | within].
+    each match; the fraction F₃ of them is within. It is also 3 / E[ν² | within].
 
     Args:
         gate: squared Mahalanobis distance; infinite for none.

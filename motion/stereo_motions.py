@@ -5,7 +5,7 @@ Each group of matches agrees on a motion x. The probability that group h stands 
     P(h) ∝ (1 + n_h) · N(x_h; expected) · p(map | x_h) · B(h),    Mathematics (vo-static).
 
 Of n_h matches nothing is known, each is as likely as any other to be of what stands still. B is the group's past: what
-stood still goes on to do so, and what moved to move, but for a share of the matches that are mistaken, and for things
+stood still goes on to do so, and what moved to move, but for a fraction of the matches that are mistaken, and for things
 that begin or stop. The groups' own likelihoods are the same whichever of them stands still, and so are the volumes that
 they leave open; what moves may move by as much as a camera may. That none of them stands still is one case more, as
 likely as one match more.

@@ -15,7 +15,7 @@ from rbpf.motion.stereo_motions import Known, camera_motion
 from rbpf.motion.stereo_vo import MotionEstimate, VoConfig, estimate_motion, no_motion
 
 ROUNDING = 1e-14
-"""Variances below this share of the largest are rounding."""
+"""Variances below this fraction of the largest are rounding."""
 
 
 @final

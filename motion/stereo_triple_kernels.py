@@ -12,7 +12,7 @@ from rbpf.kernels.quaternion import cross, multiply, turned
 from rbpf.kernels.rigid import exp_pair
 
 STIFFNESS = 1e-9
-"""Added to the information of a triple, as a share of its trace: three points on a line leave a turn open."""
+"""Added to the information of a triple, as a fraction of its trace: three points on a line leave a turn open."""
 
 FLAT = 1e-12
 """Shortest length that is divided by: points that coincide have no direction."""

@@ -16,7 +16,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
 from rbpf.motion.levenberg_marquardt import Minimum, Rule, minimise
 from rbpf.motion.stereo_consensus import Draws, consensus
-from rbpf.motion.stereo_covariance import honest_covariance, trimming
+from rbpf.motion.stereo_covariance import consistent_covariance, trimming
 from rbpf.motion.stereo_geometry import Matches, StereoCamera
 from rbpf.motion.stereo_matches import checked_matches, possible
 from rbpf.motion.stereo_reprojection import (
@@ -218,7 +218,7 @@ def _covariance(matches: Matches, found: Minimum, config: VoConfig) -> Array:
         return trimming(config.gate) * found.cov
     pixels = white_rows(matches, found.x, "adjusted").pixels
     adjusted = linearised(matches, found.x, pixels, "adjusted")
-    return trimming(config.gate) * honest_covariance(matches, adjusted, found.factor)
+    return trimming(config.gate) * consistent_covariance(matches, adjusted, found.factor)
 
 
 def no_motion(found: MotionEstimate, why: str) -> MotionEstimate:

@@ -27,13 +27,13 @@ if TYPE_CHECKING:
     from rbpf.maps.point import Point as Point
     from rbpf.models import NEW as NEW
     from rbpf.models import NULL as NULL
-    from rbpf.models import Births as Births
     from rbpf.models import Conditional as Conditional
     from rbpf.models import FusedKernel as FusedKernel
     from rbpf.models import Jacobians as Jacobians
     from rbpf.models import Landmark as Landmark
     from rbpf.models import Likelihood as Likelihood
     from rbpf.models import MotionModel as MotionModel
+    from rbpf.models import NewLandmarks as NewLandmarks
     from rbpf.models import ObservationModel as ObservationModel
     from rbpf.models import Observations as Observations
     from rbpf.models import Part as Part
@@ -82,7 +82,7 @@ _HOMES = {
         "FusedKernel",
         "NEW",
         "NULL",
-        "Births",
+        "NewLandmarks",
         "Conditional",
         "Jacobians",
         "Landmark",

@@ -24,13 +24,13 @@ from rbpf.estimate import Estimate, mixture_estimate
 from rbpf.filter import Filter, StepReport
 from rbpf.lie import LieGroup
 from rbpf.likelihoods import Gaussian
-from rbpf.models import Births, Landmark, LineariseAt, ObservationModel, Records
+from rbpf.models import Landmark, LineariseAt, NewLandmarks, ObservationModel, Records
 from rbpf.numeric import linearise
 from rbpf.proposals import EkfProposal, Prior, Terms
 from rbpf.reference import information, innovation_covariance
 
 _MOST_OF_ALL = 0.999
-"""A landmark that owes more than this share of its information to the first frame says nothing about the start."""
+"""A landmark that owes more than this fraction of its information to the first frame says nothing about the start."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class StartAnchor:
         self._every = every
         self._start = filter_.particles.state[0].copy()
         self._proposal = EkfProposal(iterations=iterations)
-        self._seen: list[tuple[np.ndarray, Births]] = []
+        self._seen: list[tuple[np.ndarray, NewLandmarks]] = []
         self._second: _FirstMotion | None = None
         self._latest: tuple[int, Anchored] | None = None
 
@@ -130,11 +130,11 @@ class StartAnchor:
     def arrays(self) -> dict[str, np.ndarray]:
         """For a checkpoint."""
         out = {"anchor/groups": np.array(len(self._seen))}
-        for number, (ids, births) in enumerate(self._seen):
+        for number, (ids, new_landmarks) in enumerate(self._seen):
             out |= {
                 f"anchor/{number}/ids": ids,
-                f"anchor/{number}/z": births.z,
-                f"anchor/{number}/cov": births.cov,
+                f"anchor/{number}/z": new_landmarks.z,
+                f"anchor/{number}/cov": new_landmarks.cov,
             }
         if self._second is not None:
             second = self._second
@@ -158,7 +158,7 @@ class StartAnchor:
         lineage = self._filter.lineage
         for number in range(int(arrays["anchor/groups"])):
             ids, z, cov = (arrays[f"anchor/{number}/{name}"].copy() for name in ("ids", "z", "cov"))
-            self._seen.append((ids, Births(z, cov, model, landmark)))
+            self._seen.append((ids, NewLandmarks(z, cov, model, landmark)))
         if "anchor/second" in arrays:
             values = (arrays[f"anchor/{name}"].copy() for name in ("state", "delta", "factor"))
             self._second = _FirstMotion(int(arrays["anchor/second"]), *values)
@@ -170,9 +170,9 @@ class StartAnchor:
 
     def _record_first(self, report: StepReport) -> None:
         first = 0
-        for births in report.first_sightings:
-            count = births.z.shape[0]
-            self._seen.append((report.births[first : first + count], births))
+        for new_landmarks in report.first_observations:
+            count = new_landmarks.z.shape[0]
+            self._seen.append((report.new_landmarks[first : first + count], new_landmarks))
             first += count
         self._stamp_ns = report.stamp_ns
 
@@ -206,14 +206,14 @@ class StartAnchor:
     def _groups(self) -> list["_Group"]:
         landmark_map = self._filter.belief().map
         groups = []
-        for ids, births in self._seen:
+        for ids, new_landmarks in self._seen:
             held = np.array([i in landmark_map.store for i in ids.tolist()], dtype=bool)
             if not held.any():
                 continue
             records = landmark_map.read(ids[held])
             present = ~np.isneginf(landmark_map.log_odds(ids[held]))
             group = self._without_first_frame(
-                records, births.model, births.z[held], births.cov[held], present
+                records, new_landmarks.model, new_landmarks.z[held], new_landmarks.cov[held], present
             )
             groups.append(group)
         return groups
@@ -229,10 +229,10 @@ class StartAnchor:
         explained = innovation_covariance(jac.landmark, records.cov, np.zeros_like(cov_z))
         chol = np.broadcast_to(gaussian.cholesky(cov_z), explained.shape)
         half = gaussian.solve_lower_matrix(chol, explained)
-        share = np.linalg.eigvalsh(
+        fraction = np.linalg.eigvalsh(
             gaussian.symmetrise(gaussian.solve_lower_matrix(chol, np.swapaxes(half, -1, -2)))
         )
-        use = present & (share[..., -1] < _MOST_OF_ALL)
+        use = present & (fraction[..., -1] < _MOST_OF_ALL)
         left = np.where(use[..., None, None], cov_z - explained, np.eye(z.shape[1]))
         gain = records.cov @ np.swapaxes(jac.landmark, -1, -2) @ gaussian.inverse(left)
         mean = records.mean - np.einsum("nkdp,nkp->nkd", gain, nu)

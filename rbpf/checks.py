@@ -39,12 +39,12 @@ def checked_observations(group: Observations) -> Observations:
             f"{name} measures {p} numbers: expected z (K, {p}) and cov (K, {p}, {p}), "
             f"got {group.z.shape} and {group.cov.shape}"
         )
-    informs = group.informs
-    if not (isinstance(informs, frozenset) and informs and informs <= {Part.STATE, Part.LANDMARK}):
+    updates = group.updates
+    if not (isinstance(updates, frozenset) and updates and updates <= {Part.STATE, Part.LANDMARK}):
         raise InputError(
-            f"observations of {name} inform a frozenset of Part.STATE, Part.LANDMARK or both, got {informs}"
+            f"observations of {name} inform a frozenset of Part.STATE, Part.LANDMARK or both, got {updates}"
         )
-    if Part.STATE not in informs and Part.LANDMARK not in group.model.reads:
+    if Part.STATE not in updates and Part.LANDMARK not in group.model.reads:
         raise InputError(f"{name} reads no landmark: its observations must inform Part.STATE")
     if _are_sound(group.z, group.cov):
         return group

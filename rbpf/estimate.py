@@ -33,6 +33,6 @@ def mixture_estimate(prior: Prior, proposed: Proposed | None, log_weights: np.nd
     mean = prior.space.mean(centres, weights)
     spread = prior.space.local(mean, centres)
     between = np.einsum("n,na,nb->ab", weights, spread, spread)
-    share = weights if factor.shape[0] > 1 else np.ones(1)
-    within = np.einsum("n,nar,nbr->ab", share, factor, factor)
+    fraction = weights if factor.shape[0] > 1 else np.ones(1)
+    within = np.einsum("n,nar,nbr->ab", fraction, factor, factor)
     return Estimate(mean, gaussian.symmetrise(within + between))

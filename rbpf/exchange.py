@@ -101,7 +101,7 @@ class Observations:
             None where the model reads no landmark.
         log_new: log-density, in inverse measurement units, that a particle pays for a NEW observation.
         log_clutter: the same for a NULL one.
-        informs: STATE: it refines and weighs the particles; LANDMARK: it updates the landmark. Two groups may share
+        updates: STATE: it refines and weighs the particles; LANDMARK: it updates the landmark. Two groups may fraction
             a measurement, one for each (E06 §5.2: the epipolar part for the state, all of it for the depth).
     """
 
@@ -112,11 +112,11 @@ class Observations:
     ids: Int[np.ndarray, "... K"] | None = None
     log_new: float = 0.0
     log_clutter: float = 0.0
-    informs: frozenset[Part] = frozenset({Part.STATE, Part.LANDMARK})
+    updates: frozenset[Part] = frozenset({Part.STATE, Part.LANDMARK})
 
 
 @dataclass(frozen=True)
-class Births:
+class NewLandmarks:
     """First sightings that start landmarks, after the update.
 
     Attributes:

@@ -23,9 +23,9 @@ from rbpf.estimate import Estimate, mixture_estimate
 from rbpf.genealogy import Lineage
 from rbpf.history import History
 from rbpf.models import (
-    Births,
     Conditional,
     MotionModel,
+    NewLandmarks,
     Observations,
     Proposal,
     Resampler,
@@ -50,8 +50,8 @@ class StepReport:
         nis: weighted mean squared Mahalanobis distance of the joint innovation, NaN without a linearised one.
         rows: its degrees of freedom.
         groups: the observations that were used.
-        first_sightings: what landmarks were started from.
-        births: their ids, in that order.
+        first_observations: what landmarks were started from.
+        new_landmarks: their ids, in that order.
     """
 
     stamp_ns: int
@@ -62,8 +62,8 @@ class StepReport:
     nis: float
     rows: int
     groups: Sequence[Observations]
-    first_sightings: Sequence[Births]
-    births: np.ndarray
+    first_observations: Sequence[NewLandmarks]
+    new_landmarks: np.ndarray
 
     @cached_property
     def estimate(self) -> Estimate:
@@ -167,7 +167,7 @@ class Filter:
         self.particles = Particles(state, log_weights)
         if proposed.nis is None:
             mixture = (Prior.exactly(self.space, state), None, log_weights)
-        first_sightings, births = self._start_landmarks(frame, groups)
+        first_observations, new_landmarks = self._start_landmarks(frame, groups)
         normalised = all(group.likelihood is None or group.likelihood.normalised for group in groups)
         evidence = look_ahead + correction if normalised else float("nan")
         self.log_evidence += evidence
@@ -181,8 +181,8 @@ class Filter:
             nis=float("nan") if proposed.nis is None else float((weights * proposed.nis).sum()),
             rows=proposed.rows,
             groups=groups,
-            first_sightings=first_sightings,
-            births=births,
+            first_observations=first_observations,
+            new_landmarks=new_landmarks,
         )
 
     def follow(
@@ -289,12 +289,14 @@ class Filter:
         self.stamp_ns = stamp_ns
         self.history.record(stamp_ns, self.particles.state, self.particles.log_weights)
 
-    def _start_landmarks(self, frame: Any, groups: list[Observations]) -> tuple[list[Births], np.ndarray]:
+    def _start_landmarks(
+        self, frame: Any, groups: list[Observations]
+    ) -> tuple[list[NewLandmarks], np.ndarray]:
         belief = self.belief()
-        born, ids, first = list[Births](), [np.zeros(0, dtype=np.int64)], 0
+        born, ids, first = list[NewLandmarks](), [np.zeros(0, dtype=np.int64)], 0
         for sensor, end in zip(self.sensors, self._ends, strict=True):
-            for births in sensor.births(frame, belief, groups[first:end]):
-                ids.append(belief.map.add(births, self.particles.state))
-                born.append(births)
+            for new_landmarks in sensor.new_landmarks(frame, belief, groups[first:end]):
+                ids.append(belief.map.add(new_landmarks, self.particles.state))
+                born.append(new_landmarks)
             first = end
         return born, np.concatenate(ids)

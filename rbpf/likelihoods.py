@@ -1,6 +1,6 @@
 """Likelihoods of an innovation: Gaussian, truncated Mahalanobis (S05 (6)), Gaussian with outliers.
 
-`form` and `params` name the compiled twin in `rbpf.kernels.gate`.
+`kernel_id` and `params` name the compiled twin in `rbpf.kernels.gate`.
 """
 
 from typing import final
@@ -16,7 +16,7 @@ from rbpf.models import Likelihood
 class Gaussian(Likelihood):
     """log N(ν; 0, S)."""
 
-    form = 0
+    kernel_id = 0
 
     def __init__(self) -> None:
         self.params = np.zeros(1)
@@ -39,7 +39,7 @@ class TruncatedMahalanobis(Likelihood):
     """
 
     normalised = False
-    form = 1
+    kernel_id = 1
 
     def __init__(self, limit: float = 4.0, update_limit: float | None = None) -> None:
         if not limit > 0:
@@ -72,11 +72,11 @@ class GaussianWithOutliers(Likelihood):
     """log[(1−ε) N(ν; 0, S) + ε/V].
 
     Args:
-        rate: ε, the share of outliers, in (0, 1).
+        rate: ε, the fraction of outliers, in (0, 1).
         volume: V, of the measurement space in which outliers are uniform, in the measurement's units.
     """
 
-    form = 2
+    kernel_id = 2
 
     def __init__(self, rate: float, volume: float) -> None:
         if not 0 < rate < 1 or not volume > 0:

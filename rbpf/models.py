@@ -14,10 +14,10 @@ from rbpf.arrays import Bool, Float, Int
 from rbpf.errors import InputError
 from rbpf.exchange import NEW as NEW
 from rbpf.exchange import NULL as NULL
-from rbpf.exchange import Births as Births
 from rbpf.exchange import FusedKernel as FusedKernel
 from rbpf.exchange import Jacobians as Jacobians
 from rbpf.exchange import LogDensities as LogDensities
+from rbpf.exchange import NewLandmarks as NewLandmarks
 from rbpf.exchange import Observations as Observations
 from rbpf.exchange import Part as Part
 from rbpf.exchange import Records as Records
@@ -144,7 +144,7 @@ class Likelihood(ABC):
     """Log-density of an innovation ν with covariance S; `normalised` says whether it integrates to one."""
 
     normalised: bool = True
-    form: int = -1
+    kernel_id: int = -1
     """Number of the compiled twin in `rbpf.kernels.gate`, called with `params`; −1 has none."""
     params: np.ndarray = np.zeros(1)
 
@@ -176,7 +176,9 @@ class Sensor(ABC):
     def observe(self, frame: Any, belief: "Belief") -> Sequence[Observations]:
         """Groups of observations of known landmarks (or of none)."""
 
-    def births(self, frame: Any, belief: "Belief", observed: Sequence[Observations]) -> Sequence[Births]:
+    def new_landmarks(
+        self, frame: Any, belief: "Belief", observed: Sequence[Observations]
+    ) -> Sequence[NewLandmarks]:
         """First sightings, given the updated belief and what this sensor observed, ids of the descendants."""
         return ()
 

@@ -35,7 +35,7 @@ def information(
     """
     n, k, p = nu.shape
     use, log_factor = mask, np.zeros(n)
-    if likelihood.form != 0:
+    if likelihood.kernel_id != 0:
         use, log_factor = gated(nu, jac_state, cov, likelihood, prior, mask)
     if use is None:
         use = np.ones((n, k), dtype=bool)

@@ -70,11 +70,11 @@ class Residual(Resampler):
 
 @final
 class EssTriggered(Resampler):
-    """Resamples when the effective sample size falls below a share of N; else the weights stay in the next step.
+    """Resamples when the effective sample size falls below a fraction of N; else the weights stay in the next step.
 
     Args:
         scheme: how to resample.
-        threshold: share of N in [0, 1]; 0 never resamples, 1 whenever the weights differ.
+        threshold: fraction of N in [0, 1]; 0 never resamples, 1 whenever the weights differ.
     """
 
     def __init__(self, scheme: Resampler, threshold: float = 0.5) -> None:

@@ -155,7 +155,7 @@ class KalmanSubstate(Conditional):
         n, m = substate.shape
         nus, jacs, noises = [], [], []
         for group in groups:
-            if group.likelihood is not None and group.likelihood.form != 0:
+            if group.likelihood is not None and group.likelihood.kernel_id != 0:
                 raise InputError(
                     f"{type(group.model).__name__} reads the substate: its likelihood must be Gaussian, "
                     f"not {type(group.likelihood).__name__}"

@@ -18,7 +18,7 @@ from rbpf.sensors.pinhole import Pinhole
 LEAST_VIEWS = 5
 """Three determine the camera; with fewer than five no mistake is noticed."""
 MOST_UNCERTAIN = 0.02
-"""Standard deviation of the focal length, as a share of it, above which the views say too little."""
+"""Standard deviation of the focal length, as a fraction of it, above which the views say too little."""
 LEAST_TURN = np.deg2rad(10.0)
 """Angle between the board's normals that two views must have: from one direction, near and small is far and large."""
 OUTLYING = 4.0

@@ -209,8 +209,8 @@ def _take_out(along, least, n, first, second):
     for i in range(n):
         a, b = along[i], along[BLOCK + i]
         squared = a * a + b * b
-        share = 1.0 / squared if squared >= least else 0.0
-        part = share * (a * first[i] + b * second[i])
+        fraction = 1.0 / squared if squared >= least else 0.0
+        part = fraction * (a * first[i] + b * second[i])
         first[i] -= a * part
         second[i] -= b * part
 

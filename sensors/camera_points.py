@@ -16,7 +16,7 @@ from rbpf.models import FusedKernel, Jacobians, ObservationModel, Records
 from rbpf.sensors.pinhole import Pinhole
 
 GRAZING = 0.2
-"""Least share of its length by which a direction points forward: what is behind the camera projects far outside."""
+"""Least fraction of its length by which a direction points forward: what is behind the camera projects far outside."""
 
 
 class Camera(Protocol):

@@ -18,7 +18,7 @@ SPECKS = 0.001
 
 
 class Mended(NamedTuple):
-    """An image (H, W) uint8 without impulses, and the share of the pixels that were replaced; 0 where none was."""
+    """An image (H, W) uint8 without impulses, and the fraction of the pixels that were replaced; 0 where none was."""
 
     image: np.ndarray
     struck: float

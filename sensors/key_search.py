@@ -38,7 +38,7 @@ class TreeSearch(KeySearch):
 
     Args:
         slack: a key may be missed if another is at most 1 + slack times as far; 0 makes the search exact.
-        tail: share of the tree's keys that may come or go before the tree is made anew.
+        tail: fraction of the tree's keys that may come or go before the tree is made anew.
         least: so many may come or go in any case.
     """
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from rbpf.association import ExistenceModel, Gates, associate
 from rbpf.belief import Belief
-from rbpf.models import NEW, Births, Landmark, Likelihood, ObservationModel, Observations, Sensor
+from rbpf.models import NEW, Landmark, Likelihood, NewLandmarks, ObservationModel, Observations, Sensor
 from rbpf.sensors.names import Names
 
 
@@ -46,14 +46,18 @@ class NamedLandmarkSensor(Sensor):
             return []
         return [Observations(frame.z[known], frame.cov_z[known], self.model, self.likelihood, ids[known])]
 
-    def births(self, frame: Sightings, belief: Belief, observed: Sequence[Observations]) -> Sequence[Births]:
+    def new_landmarks(
+        self, frame: Sightings, belief: Belief, observed: Sequence[Observations]
+    ) -> Sequence[NewLandmarks]:
         """The first sighting of each new name; a second one in the same frame is left to the next frame."""
         names, known = frame.landmarks.tolist(), self._names.ids(belief.catalogue)
         new = [k for k, name in enumerate(names) if name not in known and name not in names[:k]]
         if not new:
             return []
         return [
-            Births(frame.z[new], frame.cov_z[new], self.model, self.landmark, facts=[names[k] for k in new])
+            NewLandmarks(
+                frame.z[new], frame.cov_z[new], self.model, self.landmark, facts=[names[k] for k in new]
+            )
         ]
 
 
@@ -104,7 +108,9 @@ class AnonymousLandmarkSensor(Sensor):
             )
         ]
 
-    def births(self, frame: Sightings, belief: Belief, observed: Sequence[Observations]) -> Sequence[Births]:
+    def new_landmarks(
+        self, frame: Sightings, belief: Belief, observed: Sequence[Observations]
+    ) -> Sequence[NewLandmarks]:
         """Updates the evidence of what should have been seen; starts what some particle takes as new."""
         chosen = np.zeros((belief.log_weights.size, 0), dtype=np.int64)
         if observed and observed[0].ids is not None:
@@ -113,7 +119,9 @@ class AnonymousLandmarkSensor(Sensor):
         new = (chosen == NEW).any(axis=0)
         if not new.any():
             return []
-        return [Births(frame.z[new], frame.cov_z[new], self.model, self.landmark, chosen[:, new] == NEW)]
+        return [
+            NewLandmarks(frame.z[new], frame.cov_z[new], self.model, self.landmark, chosen[:, new] == NEW)
+        ]
 
     def _count_evidence(self, belief: Belief, chosen: np.ndarray) -> None:
         ids = belief.map.ids

@@ -116,12 +116,12 @@ class RadialTangential:
         miss = target - self.distort(uv)
         step = (inverse(self.slope(uv)) @ miss[..., None])[..., 0]
         waiting = np.arange(len(uv))
-        for share in 0.5 ** np.arange(HALVINGS):
+        for fraction in 0.5 ** np.arange(HALVINGS):
             if not waiting.size:
                 break
-            tried = uv[waiting] + share * step[waiting]
+            tried = uv[waiting] + fraction * step[waiting]
             reached = self._misfit(tried, target[waiting])
-            better = (reached < (1.0 - ARMIJO * share) * error[waiting]) & self.is_unique(tried)
+            better = (reached < (1.0 - ARMIJO * fraction) * error[waiting]) & self.is_unique(tried)
             uv[waiting[better]], error[waiting[better]] = tried[better], reached[better]
             waiting = waiting[~better]
         return uv, error

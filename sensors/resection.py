@@ -9,7 +9,7 @@ from rbpf.lie import SE3
 from rbpf.sensors.pinhole import Pinhole
 
 FLAT = 1e-3
-"""Points whose second spread is below this share of the first lie on a line."""
+"""Points whose second spread is below this fraction of the first lie on a line."""
 
 TRIPLES = 20
 """Triples of points that are tried; four points have four."""

@@ -38,7 +38,7 @@ class StereoConfig:
 
     Attributes:
         row_px: rows of a match differ by at most this …
-        row_per_scale: … and this share of the keypoint's scale.
+        row_per_scale: … and this fraction of the keypoint's scale.
         nearest_m: least depth; disparities above that of this depth are left out.
         least_disparity_px: nor does a smaller disparity than this tell a depth.
         scale_ratio: largest ratio of the two scales.
@@ -50,7 +50,7 @@ class StereoConfig:
         least_correlation: of the refined windows, else the match is dropped.
         shift_px: nor may the refinement move it further than this.
         place_px: σ_p of a keypoint of scale 0 …
-        place_per_scale: … and what is added to it in quadrature, as a share of the scale.
+        place_per_scale: … and what is added to it in quadrature, as a fraction of the scale.
         disparity_px: σ_d of a keypoint of scale 0 …
         disparity_per_scale: … and what is added to it in quadrature.
 
@@ -133,8 +133,8 @@ class StereoSift:
         """In words, what was wrong with the last pair, though it could be measured; empty where nothing was."""
         if not self.struck:
             return ""
-        share = f"{100.0 * self.struck:.1f} %"
-        return f"{share} of the pixels are struck by impulses, the median of their surroundings is taken"
+        fraction = f"{100.0 * self.struck:.1f} %"
+        return f"{fraction} of the pixels are struck by impulses, the median of their surroundings is taken"
 
     def match(
         self, images: tuple[np.ndarray, np.ndarray], left: KeyPoints, right: KeyPoints

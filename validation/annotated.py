@@ -16,8 +16,8 @@ _SMALL_PX = 800
 """Images that are narrower are drawn at twice their size: an ellipse of three pixels shows nothing."""
 
 _ARM, _BAND = 4, 24
-_LETTER_SHARE, _SMALLEST, _LARGEST = 1.0 / 62.0, 11.0, 17.0
-"""Height of letters as a share of the drawn width, and its bounds, px."""
+_LETTER_FRACTION, _SMALLEST, _LARGEST = 1.0 / 62.0, 11.0, 17.0
+"""Height of letters as a fraction of the drawn width, and its bounds, px."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ def annotate(
         shown = Image.fromarray(image).resize((scale * size[0], scale * size[1]), Image.Resampling.BILINEAR)
         picture.paste(shown.convert("RGB"), (0, _BAND))
     draw = ImageDraw.Draw(picture)
-    draw.font = ImageFont.load_default(min(max(_LETTER_SHARE * drawn[0], _SMALLEST), _LARGEST))
+    draw.font = ImageFont.load_default(min(max(_LETTER_FRACTION * drawn[0], _SMALLEST), _LARGEST))
 
     def place(px: np.ndarray) -> list[tuple[float, float]]:
         shifted = scale * (np.atleast_2d(px) + 0.5) - 0.5 + [0.0, _BAND]

@@ -63,7 +63,7 @@ class Reconstruction:
     model: Any
 
     @property
-    def share(self) -> float:
+    def fraction(self) -> float:
         """Share of the key frames whose pose was found."""
         return len(self.frames) / len(self.chosen)
 
@@ -78,7 +78,7 @@ class Reconstruction:
             "sequence": self.name,
             "key_frames": len(self.chosen),
             "registered": len(self.frames),
-            "share_registered": self.share,
+            "share_registered": self.fraction,
             "points": len(self.points),
             "reprojection_error_mean_px": float(self.errors_px.mean()),
             "track_length_mean": float(self.track_lengths.mean()),

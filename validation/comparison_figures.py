@@ -9,10 +9,10 @@ from rbpf.diagnostics import chi_square_band
 from rbpf.validation.figures import COLOURS, SIGMAS, label, outline
 
 CLOSE = 0.95
-"""A map's picture holds this share of its landmarks; single ones far off do not make it small."""
+"""A map's picture holds this fraction of its landmarks; single ones far off do not make it small."""
 
 _LOWEST = 0.01
-"""NEES below this share of the band are drawn there."""
+"""NEES below this fraction of the band are drawn there."""
 
 
 def wide_axes(positions: np.ndarray) -> tuple[int, int]:

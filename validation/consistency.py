@@ -8,7 +8,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3, LieGroup
 
 _NOTHING = 1e-12
-"""Variances below this share of the largest, or of one, are none."""
+"""Variances below this fraction of the largest, or of one, are none."""
 
 
 @dataclass(frozen=True)

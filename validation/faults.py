@@ -37,13 +37,13 @@ def bias_odometry(log: RobotLog, sigmas: float) -> RobotLog:
     return _changed(log, change)
 
 
-def swap_names(log: RobotLog, share: float, rng: np.random.Generator) -> RobotLog:
-    """Gives a share of the sightings the name of another landmark, one that is not seen in the same step."""
+def swap_names(log: RobotLog, fraction: float, rng: np.random.Generator) -> RobotLog:
+    """Gives a fraction of the sightings the name of another landmark, one that is not seen in the same step."""
     every = np.unique(np.concatenate([frame.landmarks for frame in log.frames]))
 
     def change(frame: Frame) -> Frame:
         names = frame.landmarks.copy()
-        for k in np.flatnonzero(rng.random(names.size) < share):
+        for k in np.flatnonzero(rng.random(names.size) < fraction):
             names[k] = rng.choice(np.setdiff1d(every, names))
         return replace(frame, landmarks=names)
 

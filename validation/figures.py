@@ -1,4 +1,4 @@
-"""What all pictures of runs share: axes, colours, ellipses, and PNG files drawn without a screen."""
+"""What all pictures of runs fraction: axes, colours, ellipses, and PNG files drawn without a screen."""
 
 from collections.abc import Mapping
 from pathlib import Path

@@ -17,7 +17,7 @@ COLUMNS = ("distances_m", "sigmas", "kullback_leibler", "bhattacharyya", "sigma_
 """What is told of each pair of Gaussians."""
 
 _TINY = 1e-9
-"""A length, as a share of the path's, that is none; a variance, as a share of the largest, that is none."""
+"""A length, as a fraction of the path's, that is none; a variance, as a fraction of the largest, that is none."""
 
 
 @final

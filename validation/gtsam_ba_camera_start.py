@@ -157,8 +157,8 @@ class _Growth:
         self.path[step] = found.pose
         focal = float(np.linalg.norm(self.table.camera.slope(np.array([0.0, 0.0, 1.0]))[0]))
         self.usual = self._distance(points, step)
-        share = np.sqrt(np.trace(found.cov[3:, 3:]) / 3) / self.usual
-        self.blur[step] = (focal * share) ** 2
+        fraction = np.sqrt(np.trace(found.cov[3:, 3:]) / 3) / self.usual
+        self.blur[step] = (focal * fraction) ** 2
 
     def _distance(self, points: Array, step: int) -> float:
         return float(np.median(np.linalg.norm(points - SE3.translation(self.path[step]), axis=1)))

@@ -5,7 +5,7 @@ Landmarks see each other only through the poses. With the information matrix in 
     H = [ H_pp  H_pl ]      S = H_pp − H_pl H_ll⁻¹ H_lp,     Σ_pp = S⁻¹
         [ H_lp  H_ll ]      Σ_ll = H_ll⁻¹ + H_ll⁻¹ H_lp Σ_pp H_pl H_ll⁻¹
 
-H_ll is block-diagonal, so that a landmark's share costs the square of the poses that see it. (B. Triggs et al., "Bundle
+H_ll is block-diagonal, so that a landmark's fraction costs the square of the poses that see it. (B. Triggs et al., "Bundle
 adjustment: a modern synthesis", 2000, §6.) Information squares the condition of the problem: this is for problems whose
 scale is measured, well or badly, not for those where a stiff prior holds it.
 """

@@ -80,22 +80,22 @@ def keep_every(step: int) -> Fault[Sequence]:
     return lambda sequence: _chosen(sequence, np.arange(0, len(sequence), step))
 
 
-def drop_frames(share: float, seed: int = 0) -> Fault[Sequence]:
-    """Loses a share of the images without a trace, never the first one."""
+def drop_frames(fraction: float, seed: int = 0) -> Fault[Sequence]:
+    """Loses a fraction of the images without a trace, never the first one."""
 
     def fault(sequence: Sequence) -> Sequence:
-        kept = np.random.default_rng(seed).random(len(sequence)) >= share
+        kept = np.random.default_rng(seed).random(len(sequence)) >= fraction
         kept[0] = True
         return _chosen(sequence, np.flatnonzero(kept))
 
     return fault
 
 
-def truncate_files(share: float, seed: int = 0) -> Fault[Sequence]:
-    """A share of the images cannot be read, never the first one."""
+def truncate_files(fraction: float, seed: int = 0) -> Fault[Sequence]:
+    """A fraction of the images cannot be read, never the first one."""
 
     def fault(sequence: Sequence) -> Sequence:
-        bad = np.random.default_rng(seed).random(len(sequence)) < share
+        bad = np.random.default_rng(seed).random(len(sequence)) < fraction
         rows = frozenset((np.flatnonzero(bad[1:]) + 1).tolist())
         return _with_source(sequence, lambda source: Unreadable(source, rows))
 
@@ -138,14 +138,14 @@ def blur_motion(length_px: int, first: int = 1, count: int | None = None) -> Fau
     return painted(paint)
 
 
-def salt_and_pepper(share: float, seed: int = 0) -> Fault[Sequence]:
-    """A share of the pixels is black or white, others in every image; not in the first one."""
+def salt_and_pepper(fraction: float, seed: int = 0) -> Fault[Sequence]:
+    """A fraction of the pixels is black or white, others in every image; not in the first one."""
 
     def paint(t: int, image: np.ndarray, is_right: bool) -> np.ndarray:
         if t == 0:
             return image
         rng = np.random.default_rng([seed, t, is_right])
-        struck = rng.random(image.shape, dtype=np.float32) < share
+        struck = rng.random(image.shape, dtype=np.float32) < fraction
         changed = image.copy()
         changed[struck] = np.where(rng.random(int(struck.sum())) < 0.5, 0, 255)
         return changed
@@ -154,12 +154,12 @@ def salt_and_pepper(share: float, seed: int = 0) -> Fault[Sequence]:
 
 
 def cover_view(
-    share: float, first: int, count: int, disparity_px: int = 12, seed: int = 0
+    fraction: float, first: int, count: int, disparity_px: int = 12, seed: int = 0
 ) -> Fault[Sequence]:
-    """A textured thing as high as the image and a share of it wide passes through the view in so many images.
+    """A textured thing as high as the image and a fraction of it wide passes through the view in so many images.
 
     Args:
-        share: of the width.
+        fraction: of the width.
         first: image in which it comes in at the left.
         count: images until it has gone out at the right.
         disparity_px: how much further left the right camera sees it.
@@ -170,7 +170,7 @@ def cover_view(
         if not first <= t < first + count:
             return image
         height, width = image.shape
-        size = round(share * width)
+        size = round(fraction * width)
         left = round((t - first + 1) / (count + 1) * (width + size)) - size - disparity_px * is_right
         columns = np.arange(max(left, 0), max(min(left + size, width), 0))
         changed = image.copy()

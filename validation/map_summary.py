@@ -71,14 +71,14 @@ def summarise_map(filter_: Filter, anchored: Anchored | None = None) -> MapSumma
         held = np.ones(weights.size)
         if landmark_map.evidence:
             held = landmark_map.log_odds(np.array([landmark_id]))[:, 0] > 0
-        share = (weights * held).sum()
-        if share <= 0.5:
+        fraction = (weights * held).sum()
+        if fraction <= 0.5:
             continue
         records = landmark_map.read(np.array([landmark_id]))
         points, within = records.mean[:, 0], records.cov[:, 0]
         if anchored is not None:
             points, within = relative_points(filter_.space, anchored, records)
-        own = weights * held / share
+        own = weights * held / fraction
         mean, cov = mixture_moments(own, points, within)
         names.append(landmark_map.catalogue.get(int(landmark_id), int(landmark_id)))
         means.append(mean)

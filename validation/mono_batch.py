@@ -27,7 +27,7 @@ LEAST = 4
 """Landmarks known, or seen in other frames too, that a frame needs to take part: three leave several poses."""
 
 EXACT = 1e-4
-"""Known points without errors get one of this share of their extent: constraints take GTSAM many times as long."""
+"""Known points without errors get one of this fraction of their extent: constraints take GTSAM many times as long."""
 
 Told = Callable[[int, float], None]
 """Told the number of an iteration and the error before it."""

@@ -73,7 +73,7 @@ class Budget:
         against: "ground truth", or "batch" where there is none.
         alignment: the one that suits the run.
         lines: as it is first.
-        wrong: share of the matches that the batch shows to be wrong.
+        wrong: fraction of the matches that the batch shows to be wrong.
         calibration: what the batch makes of focal length and k1, in words.
     """
 

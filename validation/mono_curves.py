@@ -85,10 +85,10 @@ def timings_figure(run: VideoRun) -> Any:
     """Time per frame by stage; decoding apart."""
     figure, (axes,) = stacked_axes(1, f"{run.sequence.name}: time per frame")
     frames = np.arange(run.seconds.size)
-    search, births = 1e3 * run.seconds_search, 1e3 * run.seconds_births
-    rest = 1e3 * run.seconds - search - births
+    search, new_landmarks = 1e3 * run.seconds_search, 1e3 * run.seconds_new_landmarks
+    rest = 1e3 * run.seconds - search - new_landmarks
     names = ["search in the image", "filter", "new features"]
-    axes.stackplot(frames, search, rest, births, labels=names, alpha=0.7, lw=0)
+    axes.stackplot(frames, search, rest, new_landmarks, labels=names, alpha=0.7, lw=0)
     axes.plot(frames, 1e3 * run.seconds_waiting, color="black", lw=0.6, label="waiting for the decoded image")
     axes.axhline(1e3 / CAMERA_HZ, color=COLOURS["map"], lw=0.8, ls="--", label=f"{CAMERA_HZ:g} Hz")
     high = max(

@@ -128,8 +128,8 @@ def summarise_camera(run: VideoRun, mapped: MonoMap) -> dict[str, Any]:
 def _write_tables(run: VideoRun, out: Path) -> None:
     """timings.csv and diagnostics.csv."""
     frames = range(run.stamps_ns.size)
-    rest = run.seconds - run.seconds_search - run.seconds_births
-    seconds = (run.seconds, run.seconds_search, rest, run.seconds_births, run.seconds_waiting)
+    rest = run.seconds - run.seconds_search - run.seconds_new_landmarks
+    seconds = (run.seconds, run.seconds_search, rest, run.seconds_new_landmarks, run.seconds_waiting)
     write_csv(
         out / "timings.csv",
         ["step", "milliseconds", "search_ms", "filter_ms", "new_features_ms", "waiting_for_image_ms"],

@@ -8,7 +8,7 @@ import numpy as np
 
 from rbpf.belief import Belief
 from rbpf.lie import SE3
-from rbpf.models import Births, Observations, Sensor
+from rbpf.models import NewLandmarks, Observations, Sensor
 from rbpf.sensors.camera_points import CameraRay
 from rbpf.sensors.features import FeatureFrame, FeatureLog
 from rbpf.systems.mono.feature_sensor import FeatureSensor
@@ -17,8 +17,8 @@ from rbpf.validation.mono_batch import Batch, adjust_log
 WRONG_PX = 3.0
 """A match farther than this from the reprojection by the batch is a wrong one."""
 
-DEPTH_SHARE = 0.01
-"""Standard deviation of a depth that is given, as a share of it."""
+DEPTH_FRACTION = 0.01
+"""Standard deviation of a depth that is given, as a fraction of it."""
 
 
 def reprojection_errors(batch: Batch) -> list[np.ndarray]:
@@ -76,19 +76,21 @@ class GivenDepths(Sensor):
         """As the sensor does."""
         return self.features.observe(frame, belief)
 
-    def births(
+    def new_landmarks(
         self, frame: FeatureFrame, belief: Belief, observed: Sequence[Observations]
-    ) -> Sequence[Births]:
+    ) -> Sequence[NewLandmarks]:
         """As the sensor does, but each landmark at its own depth."""
-        groups = self.features.births(frame, belief, observed)
+        groups = self.features.new_landmarks(frame, belief, observed)
         return [single for group in groups for single in self._singles(group)]
 
-    def _singles(self, group: Births) -> list[Births]:
+    def _singles(self, group: NewLandmarks) -> list[NewLandmarks]:
         out = []
         for k, name in enumerate(group.facts):
             model = group.model
             if name in self.depths:
                 rho = 1.0 / self.depths[name]
-                model = CameraRay(self.features.camera, (rho, DEPTH_SHARE * rho))
-            out.append(Births(group.z[k : k + 1], group.cov[k : k + 1], model, group.landmark, facts=[name]))
+                model = CameraRay(self.features.camera, (rho, DEPTH_FRACTION * rho))
+            out.append(
+                NewLandmarks(group.z[k : k + 1], group.cov[k : k + 1], model, group.landmark, facts=[name])
+            )
         return out

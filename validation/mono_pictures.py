@@ -16,8 +16,8 @@ from rbpf.validation.mono_map import MonoMap
 from rbpf.validation.mono_scores import TruePath, true_path
 from rbpf.validation.mono_views import Views, best_views, close_up, draw_particles
 
-MAP_SHARE = 0.9
-"""The map's picture holds the path and this share of the points; single points far off do not make it small."""
+MAP_FRACTION = 0.9
+"""The map's picture holds the path and this fraction of the points; single points far off do not make it small."""
 
 
 def plot_mono_run(run: VideoRun, mapped: MonoMap, out: Path, batch: Batch | None = None) -> list[str]:
@@ -69,7 +69,7 @@ def _map(run: VideoRun, mapped: MonoMap, views: Views) -> Any:
     mean, cov = mapped.landmarks.mean[full], mapped.landmarks.cov[full]
     middle = np.median(np.concatenate([mean, at]), axis=0)
     far = np.linalg.norm(mean - middle, axis=1)
-    near = far <= np.quantile(far, MAP_SHARE) if far.size else np.zeros(0, dtype=bool)
+    near = far <= np.quantile(far, MAP_FRACTION) if far.size else np.zeros(0, dtype=bool)
     for axes, plane in shown:
         right, up = plane
         axes.plot(at[:, right], at[:, up], color=COLOURS["filter"], lw=1.0, label="camera")

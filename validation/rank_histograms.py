@@ -37,36 +37,36 @@ class Ranks:
 
     Attributes:
         names: of the d parameters.
-        shares: (S, d) posterior probability below the true value, in 0 … 1.
+        fractions: (S, d) posterior probability below the true value, in 0 … 1.
         bins: of the histogram.
     """
 
     names: tuple[str, ...]
-    shares: Array
+    fractions: Array
     bins: int
 
     def histogram(self) -> NDArray[np.int64]:
-        """(bins, d) simulations whose share falls into each bin."""
-        at = np.minimum((self.shares * self.bins).astype(int), self.bins - 1)
+        """(bins, d) simulations whose fraction falls into each bin."""
+        at = np.minimum((self.fractions * self.bins).astype(int), self.bins - 1)
         return np.stack([np.bincount(column, minlength=self.bins) for column in at.T], axis=1)
 
     def p_values(self) -> Array:
         """(d,) of the χ² test of uniformity: small where the histogram is not flat."""
         from scipy.stats import chi2
 
-        expected = len(self.shares) / self.bins
+        expected = len(self.fractions) / self.bins
         statistic = (np.square(self.histogram() - expected) / expected).sum(axis=0)
         return np.asarray(chi2.sf(statistic, self.bins - 1))
 
     def spread(self) -> Array:
-        """(d,) variance of the shares over that of a uniform law, 1/12: above 1 is over-confident."""
-        return np.asarray(12.0 * np.square(self.shares - 0.5).mean(axis=0))
+        """(d,) variance of the fractions over that of a uniform law, 1/12: above 1 is over-confident."""
+        return np.asarray(12.0 * np.square(self.fractions - 0.5).mean(axis=0))
 
     def band(self) -> tuple[int, int]:
         """Counts between which a bin of a flat histogram lies in 95 of 100 cases."""
         from scipy.stats import binom
 
-        low, high = binom.ppf([0.025, 0.975], len(self.shares), 1.0 / self.bins)
+        low, high = binom.ppf([0.025, 0.975], len(self.fractions), 1.0 / self.bins)
         return int(low), int(high)
 
 
@@ -88,7 +88,7 @@ def calibrate(
     """
     if bins < 2 or runs < max(LEAST, 5 * bins):
         raise InputError(f"{bins} bins need {max(LEAST, 5 * bins)} runs or more to be told apart, got {runs}")
-    shares = []
+    fractions = []
     for child in np.random.SeedSequence(seed).spawn(runs):
         drawing, filtering, breaking = (np.random.default_rng(s) for s in child.spawn(3))
         truth, data = simulate(drawing)
@@ -98,8 +98,8 @@ def calibrate(
                 f"expected parameters ({len(names)},) and samples (N, {len(names)}) with weights (N,), got "
                 f"{truth.shape}, {samples.shape} and {weights.shape}"
             )
-        shares.append(_below(truth, samples, weights / weights.sum(), breaking))
-    return Ranks(tuple(names), np.array(shares), bins)
+        fractions.append(_below(truth, samples, weights / weights.sum(), breaking))
+    return Ranks(tuple(names), np.array(fractions), bins)
 
 
 def plot_ranks(ranks: Ranks, out: Path, name: str = "ranks.png") -> list[str]:
@@ -116,7 +116,7 @@ def plot_ranks(ranks: Ranks, out: Path, name: str = "ranks.png") -> list[str]:
         axes.stairs(counts, edges, fill=True, color=COLOURS["filter"])
         axes.axhspan(*ranks.band(), color=COLOURS["known"], alpha=0.25, label="95 % of the bins, if right")
         axes.set(
-            title=f"{title} (p = {p:.2g})", xlabel="posterior share below the truth", ylabel="simulations"
+            title=f"{title} (p = {p:.2g})", xlabel="posterior fraction below the truth", ylabel="simulations"
         )
         axes.set_ylim(bottom=0.0)
         axes.legend(loc="lower center", fontsize="small")
@@ -129,7 +129,7 @@ def _below(truth: Array, samples: Array, weights: Array, rng: np.random.Generato
     for column, value in enumerate(truth.tolist()):
         below = samples[:, column] < value
         tied = samples[:, column] == value
-        share = float(weights[below].sum()) + rng.random() * float(weights[tied].sum())
+        fraction = float(weights[below].sum()) + rng.random() * float(weights[tied].sum())
         effective = 1.0 / float(np.square(weights).sum())
-        out[column] = (share * effective + rng.random()) / (effective + 1.0)
+        out[column] = (fraction * effective + rng.random()) / (effective + 1.0)
     return out

@@ -68,8 +68,8 @@ def poses_at(
     gap = true_ns[after] - true_ns[before]
     inside = (true_ns[before] <= stamps_ns) & (stamps_ns <= true_ns[after])
     rows = np.flatnonzero(met | (inside & (gap <= LONGEST_GAP_NS)))
-    share = (stamps_ns[rows] - true_ns[before[rows]]) / np.maximum(gap[rows], 1)
-    return rows, space.interpolate(poses[before[rows]], poses[after[rows]], share)
+    fraction = (stamps_ns[rows] - true_ns[before[rows]]) / np.maximum(gap[rows], 1)
+    return rows, space.interpolate(poses[before[rows]], poses[after[rows]], fraction)
 
 
 def score(

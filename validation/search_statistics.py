@@ -9,8 +9,8 @@ from rbpf.sensors.readers.images import ImageFrame, open_images, read_known_poin
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.video import VideoRun, run_images
 
-SMOOTH_SHARE = 0.05
-"""The noise is read off this share of an image's blocks, the smoothest."""
+SMOOTH_FRACTION = 0.05
+"""The noise is read off this fraction of an image's blocks, the smoothest."""
 BLOCK_PX = 16
 DARKEST, BRIGHTEST = 20.0, 235.0
 """Blocks outside are clipped: they show no noise."""
@@ -62,7 +62,7 @@ class SearchStatistics:
         return float(((self.score >= self.accept) & ~self.found).mean())
 
     def survival(self, most: int) -> np.ndarray:
-        """(most + 1,) share of features that are not dropped within so many frames of being looked for.
+        """(most + 1,) fraction of features that are not dropped within so many frames of being looked for.
 
         E. Kaplan and P. Meier's estimate (1958): a feature that left the view, or lived at the end, is counted as long
         as it was looked for.
@@ -71,7 +71,7 @@ class SearchStatistics:
 
 
 def survival(lengths: np.ndarray, ended: np.ndarray, most: int) -> np.ndarray:
-    """Kaplan–Meier estimate (most + 1,) of the share that lasts beyond 0, 1, … `most`.
+    """Kaplan–Meier estimate (most + 1,) of the fraction that lasts beyond 0, 1, … `most`.
 
     Args:
         lengths: (F,) whole numbers, how long each was watched.
@@ -137,7 +137,7 @@ def _look(image: np.ndarray) -> tuple[float, float]:
     level = blocks.mean(axis=1)
     light = (level > DARKEST) & (level < BRIGHTEST)
     smooth = rough[light] if light.any() else rough
-    return float(np.quantile(smooth, SMOOTH_SHARE)), float(np.median(blocks.std(axis=1)))
+    return float(np.quantile(smooth, SMOOTH_FRACTION)), float(np.median(blocks.std(axis=1)))
 
 
 def _blocks(grey: np.ndarray) -> np.ndarray:

@@ -22,7 +22,7 @@ _AROUND = np.array([(1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1)], dtype=f
 """Where the error is looked at, beside the middle, for a quadratic of two variables."""
 
 _STEPS = np.array([[0.01, 0.02], [0.003, 0.006]])
-"""Of focal length, as a share, and of k1: first a coarse grid, then a fine one."""
+"""Of focal length, as a fraction, and of k1: first a coarse grid, then a fine one."""
 
 ROUNDS = 4
 """A grid follows the lowest error so often at most."""
@@ -38,7 +38,7 @@ class Calibrated:
     Attributes:
         camera: the same but for them.
         batch: the optimum with it.
-        std: (2,) standard deviations of the focal length, as a share, and of k1, with all poses and landmarks unknown;
+        std: (2,) standard deviations of the focal length, as a fraction, and of k1, with all poses and landmarks unknown;
             NaN where the error has no lowest point nearby.
     """
 
@@ -106,8 +106,8 @@ def recalibrate(folder: Path, out: Path, told: Told | None = None) -> tuple[dict
         "fy": {"before": before.fy, "after": after.fy},
         "k1": {"before": before.distortion[0], "after": after.distortion[0]},
     }
-    shares = {"std_focal_share": found.std[0], "std_k1": found.std[1]}
-    entries |= {name: float(value) if np.isfinite(value) else None for name, value in shares.items()}
+    fractions = {"std_focal_share": found.std[0], "std_k1": found.std[1]}
+    entries |= {name: float(value) if np.isfinite(value) else None for name, value in fractions.items()}
     entries["error_before"], entries["error_after"] = start.solution.error, found.batch.solution.error
     return entries, found
 

@@ -16,7 +16,7 @@ from rbpf.anchoring import StartAnchor
 from rbpf.belief import Belief
 from rbpf.filter import Filter
 from rbpf.lie import SE2, SE3
-from rbpf.models import Births, Observations, Sensor
+from rbpf.models import NewLandmarks, Observations, Sensor
 from rbpf.sensors.names import Names
 from rbpf.systems.mono import system as mono
 from rbpf.systems.mono.config import MonoConfig
@@ -83,22 +83,24 @@ class Forgetting(Sensor):
         self._seen.update(dict.fromkeys(frame.landmarks.tolist(), self.frame))
         return self.inner.observe(frame, belief)
 
-    def births(self, frame: Any, belief: Belief, observed: Sequence[Observations]) -> Sequence[Births]:
+    def new_landmarks(
+        self, frame: Any, belief: Belief, observed: Sequence[Observations]
+    ) -> Sequence[NewLandmarks]:
         """What the inner sensor starts, after the old ones have gone."""
-        births = self.inner.births(frame, belief, observed)
+        new_landmarks = self.inner.new_landmarks(frame, belief, observed)
         old = [name for name, seen in self._seen.items() if self.frame - seen > self.after]
         known = self._names.ids(belief.catalogue)
         belief.map.remove(np.array([known[name] for name in old if name in known], dtype=np.int64))
         for name in old:
             del self._seen[name]
-        return births
+        return new_landmarks
 
 
 def camera_steps(stream: CameraStream, config: MonoConfig, forget: int = 600) -> tuple[Filter, Step]:
     """The monocular system's filter over a stream, and what makes its steps."""
     log = stream.first()
     filter_ = mono.build_filter(log, config, lambda sensor: Forgetting(sensor, forget))
-    law = mono.start_law(log, config)
+    law = mono.start_prior(log, config)
 
     def step(frame: Any, t: int) -> np.ndarray:
         report = filter_.step(frame, law if t == 0 else None, frame.stamp_ns)

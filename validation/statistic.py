@@ -32,7 +32,7 @@ BIAS = 0.25
 noise does."""
 
 INFORMED = 0.05
-"""A direction of the motion that the observations inform by less than this share is left out."""
+"""A direction of the motion that the observations inform by less than this fraction is left out."""
 
 PROBABILITIES = 0.5, 0.9, 0.95
 """Of credible regions."""
@@ -50,7 +50,7 @@ class Statistic:
         low: end of its 95 % interval;  high: the other.
         zone: where it may lie.
         samples: effective degrees of freedom or number of independent samples behind it.
-        kind: a ratio of variances, a bias in standard deviations, or a share of cases.
+        kind: a ratio of variances, a bias in standard deviations, or a fraction of cases.
     """
 
     name: str
@@ -175,16 +175,16 @@ def coverage(
     out, tail = [], 0.5 * (1.0 - LEVEL)
     for probability in probabilities:
         bound = float(chi2.ppf(probability, dim))
-        share = float((nees <= bound).mean())
+        fraction = float((nees <= bound).mean())
         # Clopper and Pearson's interval, for a number of samples that need not be whole
-        hits = share * samples
+        hits = fraction * samples
         low = float(beta.ppf(tail, hits, samples - hits + 1.0)) if hits > 0.0 else 0.0
         high = float(beta.ppf(1.0 - tail, hits + 1.0, samples - hits)) if hits < samples else 1.0
         zone = (float(chi2.cdf(bound / STATE_FACTOR**2, dim)), float(chi2.cdf(bound * STATE_FACTOR**2, dim)))
         name = f"poses inside the {100 * probability:g} % region"
         out.append(
             Statistic(
-                name, share, low, high, (zone[0], zone[1] if zone[1] < 0.999 else 1.0), samples, "share"
+                name, fraction, low, high, (zone[0], zone[1] if zone[1] < 0.999 else 1.0), samples, "share"
             )
         )
     return out

@@ -16,8 +16,8 @@ from rbpf.validation.mono_scores import TruePath, true_path
 from rbpf.validation.mono_views import Views, best_views, close_up, draw_particles
 from rbpf.validation.stereo_scores import compared
 
-MAP_SHARE = 0.9
-"""The map's picture holds the path and this share of the points; single points far off do not make it small."""
+MAP_FRACTION = 0.9
+"""The map's picture holds the path and this fraction of the points; single points far off do not make it small."""
 
 
 def plot_stereo_run(run: StereoRun, mapped: MapSummary, out: Path, batch: Batch | None = None) -> list[str]:
@@ -60,7 +60,7 @@ def _map(run: StereoRun, mapped: MapSummary, views: Views) -> Any:
     at, mean, cov = SE3.translation(run.world_from_camera), mapped.mean, mapped.cov
     middle = np.median(np.concatenate([mean, at]), axis=0)
     far = np.linalg.norm(mean - middle, axis=1)
-    near = far <= np.quantile(far, MAP_SHARE) if far.size else np.zeros(0, dtype=bool)
+    near = far <= np.quantile(far, MAP_FRACTION) if far.size else np.zeros(0, dtype=bool)
     for axes, plane in shown:
         chosen = list(plane)
         axes.plot(at[:, plane[0]], at[:, plane[1]], color=COLOURS["filter"], lw=1.0, label="camera")

@@ -11,7 +11,7 @@ from rbpf.cli.showing import answer, progress, say, told
 from rbpf.sensors.chessboard import Board
 
 LOOSE = 0.01
-"""Standard deviation of focal lengths and centre, as a share of the focal length, from which on a run bends."""
+"""Standard deviation of focal lengths and centre, as a fraction of the focal length, from which on a run bends."""
 
 
 @dataclass(frozen=True, kw_only=True)

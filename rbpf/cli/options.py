@@ -156,7 +156,7 @@ class RenderOptions(Printed):
         seed: of the random generator.
         width: of the images, px.
         height: of the images, px.
-        focal_px: focal length, px; by default a share of the width.
+        focal_px: focal length, px; by default a fraction of the width.
         distortion: k1, k2, p1, p2, k3 of the lens.
         fisheye: k1, k2, k3, k4 of an equidistant lens in its place; by default none. The ideal one has 0 0 0 0; it
             sees 140 degrees where the focal length is 0.41 of the width.
@@ -164,8 +164,8 @@ class RenderOptions(Printed):
         known: corners in the first image whose positions are given, at least 4; 0 for none.
         noise_std: of the sensor, grey levels.
         blur_s: the shutter is open this long, s.
-        exposure_drift: greatest change of the exposure, as a share.
-        vignetting: share of the light that is missing in the corners.
+        exposure_drift: greatest change of the exposure, as a fraction.
+        vignetting: fraction of the light that is missing in the corners.
         contrast: of all textures; 1 is rich, 0.1 poor.
         blackout: first frame in the dark and number of frames; by default none.
         depth: also write depth images.

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from rbpf.validation.simulation.exposure import Imaging
     from rbpf.validation.simulation.textured_scene import ImageWorld
 
-FOCAL_SHARE = {ImagesOptions: 0.8, LabOptions: 0.78125}
-"""Focal length by default, as a share of the images' width."""
+FOCAL_FRACTION = {ImagesOptions: 0.8, LabOptions: 0.78125}
+"""Focal length by default, as a fraction of the images' width."""
 
 SIMULATE = Commands("Make a recording of a world whose truth is known.")
 
@@ -85,7 +85,7 @@ def _render(world: "ImageWorld", options: ImagesOptions | LabOptions) -> None:
 def _camera(options: ImagesOptions | LabOptions) -> "Pinhole":
     from rbpf.sensors.pinhole import Pinhole
 
-    focal = options.focal_px or FOCAL_SHARE[type(options)] * options.width
+    focal = options.focal_px or FOCAL_FRACTION[type(options)] * options.width
     intrinsics = focal, focal, 0.5 * (options.width - 1), 0.5 * (options.height - 1)
     if options.fisheye is None:
         return Pinhole(options.width, options.height, *intrinsics, options.distortion)

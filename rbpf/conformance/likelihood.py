@@ -9,7 +9,7 @@ from rbpf.conformance.calls import Check, called, named, require, require_close,
 from rbpf.kernels.gate import is_inlier, log_likelihood
 from rbpf.models import Likelihood
 
-FORMS = (-1, 0, 1, 2)
+KERNEL_IDS = (-1, 0, 1, 2)
 MASS_TOLERANCE = 5e-3
 FAR = 1000.0
 """Standard deviations up to which a density is integrated; out there only a uniform floor is left of it."""
@@ -45,7 +45,7 @@ def _check_shapes(likelihood: Likelihood, rng: np.random.Generator) -> None:
 
 
 def _check_mass(likelihood: Likelihood) -> None:
-    """∫ (p − floor) dν is the inliers' share; a uniform floor stands for outliers in a bounded volume."""
+    """∫ (p − floor) dν is the inliers' fraction; a uniform floor stands for outliers in a bounded volume."""
     if not likelihood.normalised:
         return
     grid = np.sinh(np.linspace(-np.arcsinh(FAR), np.arcsinh(FAR), 20_001))
@@ -60,10 +60,10 @@ def _check_mass(likelihood: Likelihood) -> None:
 
 
 def _check_twin(likelihood: Likelihood, rng: np.random.Generator) -> None:
-    """The compiled `form` says the same as NumPy."""
-    name, form, params = type(likelihood).__name__, likelihood.form, likelihood.params
-    require(form in FORMS, f"{name}.form is {form}, expected one of {FORMS}")
-    if form < 0:
+    """The compiled kernel says the same as NumPy."""
+    name, kernel_id, params = type(likelihood).__name__, likelihood.kernel_id, likelihood.params
+    require(kernel_id in KERNEL_IDS, f"{name}.kernel_id is {kernel_id}, expected one of {KERNEL_IDS}")
+    if kernel_id < 0:
         return
     plain = isinstance(params, np.ndarray) and params.dtype == float and params.ndim == 1
     require(plain, f"{name}.params is not one axis of float64 numbers")
@@ -73,9 +73,9 @@ def _check_twin(likelihood: Likelihood, rng: np.random.Generator) -> None:
     scale = np.exp(-0.5 * gaussian.log_det(chol))
     twin, inlier = np.empty_like(squared), np.empty_like(squared, dtype=bool)
     for at in np.ndindex(squared.shape):
-        lane = (form, params, squared[at], scale[at], 2)
+        lane = (kernel_id, params, squared[at], scale[at], 2)
         twin[at], inlier[at] = log_likelihood(*lane), is_inlier(*lane)
-    what = f"{name}.log_density differs from its compiled form {form}"
+    what = f"{name}.log_density differs from its compiled kernel {kernel_id}"
     require_close(what, likelihood.log_density(nu, cov), twin, 1e-9)
     same = np.array_equal(likelihood.inlier(nu, cov), inlier)
-    require(same, f"{name}.inlier differs from its compiled form {form}")
+    require(same, f"{name}.inlier differs from its compiled kernel {kernel_id}")

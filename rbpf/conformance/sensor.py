@@ -17,7 +17,7 @@ from rbpf.conformance.calls import (
     require_type,
 )
 from rbpf.errors import InputError
-from rbpf.models import NEW, Births, Observations, Part, Sensor
+from rbpf.models import NEW, NewLandmarks, Observations, Part, Sensor
 
 
 def sensor_checks(sensor: Sensor, example: Example) -> list[Check]:
@@ -25,7 +25,7 @@ def sensor_checks(sensor: Sensor, example: Example) -> list[Check]:
     if example.belief is None:
         name = type(sensor).__name__
         raise InputError(f"{name} is tried on a frame and a belief: give Example(frame=…, belief=…)")
-    return [partial(_check_observe, sensor, example), partial(_check_births, sensor, example)]
+    return [partial(_check_observe, sensor, example), partial(_check_new_landmarks, sensor, example)]
 
 
 def observe(sensor: Sensor, example: Example) -> list[Any]:
@@ -61,13 +61,13 @@ def _check_ids(name: str, group: Observations, belief: Any) -> None:
     require((ids >= NEW).all(), f"{name}: ids below {NEW} mean nothing, expected a landmark, NULL or NEW")
 
 
-def _check_births(sensor: Sensor, example: Example) -> None:
-    name, n = named(sensor.births), example.belief.log_weights.size
+def _check_new_landmarks(sensor: Sensor, example: Example) -> None:
+    name, n = named(sensor.new_landmarks), example.belief.log_weights.size
     observed = observe(sensor, example)
-    for births in called(sensor.births, example.frame, example.belief, observed, repeat=False):
-        require_type(f"{name}, for a group,", births, Births)
-        _check_measurements(name, births)
-        k, facts = births.z.shape[0], len(births.facts)
-        if births.mask is not None:
-            require_shape(f"{name}: mask", births.mask, (n, k))
+    for new_landmarks in called(sensor.new_landmarks, example.frame, example.belief, observed, repeat=False):
+        require_type(f"{name}, for a group,", new_landmarks, NewLandmarks)
+        _check_measurements(name, new_landmarks)
+        k, facts = new_landmarks.z.shape[0], len(new_landmarks.facts)
+        if new_landmarks.mask is not None:
+            require_shape(f"{name}: mask", new_landmarks.mask, (n, k))
         require(facts in (0, k), f"{name} gives {facts} facts for {k} landmarks, expected one each or none")

@@ -6,6 +6,14 @@ L L^T = covariance. A result may lie in memory entry by entry, so that what is c
 along the batch: code that insists on C order takes its `numpy.ascontiguousarray`.
 """
 
+from rbpf.gaussian.distributions import (
+    Gaussian,
+    Transformed,
+    condition,
+    log_density,
+    sample,
+    unscented_transform,
+)
 from rbpf.gaussian.factors import (
     cholesky,
     inverse,
@@ -13,14 +21,6 @@ from rbpf.gaussian.factors import (
     psd_factor,
     solve_lower,
     solve_lower_matrix,
-)
-from rbpf.gaussian.laws import (
-    Gaussian,
-    Transformed,
-    condition,
-    log_density,
-    sample,
-    unscented_transform,
 )
 from rbpf.gaussian.storage import pack, product, symmetrise, unpack
 

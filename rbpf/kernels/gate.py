@@ -15,12 +15,12 @@ from rbpf.kernels.signature import BLOCK
 
 
 @njit(cache=True, error_model="numpy")
-def accept_predicted(form, params, nu, jac_state, total, factor, start, count, weight, penalty):
+def accept_predicted(kernel_id, params, nu, jac_state, total, factor, start, count, weight, penalty):
     """Gates with the predictive covariance S + H Q Hᵀ; a rejected lane gets the outlier's density and weight 0.
 
     Densities that are no part of a Mahalanobis distance go, times −2, into `penalty`.
     """
-    if form == 0:
+    if kernel_id == 0:
         return
     p, dim, rank = nu.shape[0], jac_state.shape[1], factor.shape[2]
     spread = np.empty((p, p, BLOCK))
@@ -47,18 +47,18 @@ def accept_predicted(form, params, nu, jac_state, total, factor, start, count, w
     for i in range(count):
         if weight[i] == 0.0:
             continue
-        if is_inlier(form, params, squared[i], scale[i], p):
-            if form == 2:
+        if is_inlier(kernel_id, params, squared[i], scale[i], p):
+            if kernel_id == 2:
                 penalty[i] -= 2.0 * params[0]
         else:
             weight[i] = 0.0
-            penalty[i] -= 2.0 * outlier_log_density(form, params)
+            penalty[i] -= 2.0 * outlier_log_density(kernel_id, params)
 
 
 @njit(cache=True, error_model="numpy")
-def outlier_log_density(form, params):
+def outlier_log_density(kernel_id, params):
     """Log-density that an observation gets where it is taken as an outlier."""
-    return -0.5 * params[0] if form == 1 else params[1]
+    return -0.5 * params[0] if kernel_id == 1 else params[1]
 
 
 @njit(cache=True, error_model="numpy")
@@ -68,20 +68,20 @@ def gaussian_log_density(squared, scale, p):
 
 
 @njit(cache=True, error_model="numpy")
-def is_inlier(form, params, squared, scale, p):
-    """Whether the inlier's term is at least the outlier's; of the truncated form, whether it is within the limit."""
-    if form == 1:
+def is_inlier(kernel_id, params, squared, scale, p):
+    """Whether the inlier's term is at least the outlier's; of the truncated kernel_id, whether it is within the limit."""
+    if kernel_id == 1:
         return squared <= params[1]
-    return form == 0 or gaussian_log_density(squared, scale, p) + params[0] >= params[1]
+    return kernel_id == 0 or gaussian_log_density(squared, scale, p) + params[0] >= params[1]
 
 
 @njit(cache=True, error_model="numpy")
-def log_likelihood(form, params, squared, scale, p):
-    """Log-density of an innovation under the likelihood `form`."""
-    if form == 1:
+def log_likelihood(kernel_id, params, squared, scale, p):
+    """Log-density of an innovation under the likelihood `kernel_id`."""
+    if kernel_id == 1:
         return -0.5 * min(squared, params[0])
     density = gaussian_log_density(squared, scale, p)
-    if form == 0:
+    if kernel_id == 0:
         return density
     high = max(density + params[0], params[1])
     return high + math.log1p(math.exp(min(density + params[0], params[1]) - high))

@@ -68,8 +68,8 @@ def refine(
     z,
     noise,
     mask,
-    form,
-    form_params,
+    kernel_id,
+    kernel_params,
     factor,
     sizes,
     info,
@@ -81,7 +81,7 @@ def refine(
 
     `address` is that of the model's kernel. `state` (N, E) holds the linearisation points; observation k reads slab
     `slabs[k]` of `pool` (slabs, fields, N) at the rows `maps[which[k]]`; `mask` (K, N) or (0, 0) says which particles
-    saw it; `form` and `form_params` name the likelihood, `factor` (N or 1, d, r) is the prior's, used for gating only;
+    saw it; `kernel_id` and `kernel_params` name the likelihood, `factor` (N or 1, d, r) is the prior's, used for gating only;
     `sizes` = (d, D, A).
     """
     n_particles, size = state.shape
@@ -108,12 +108,12 @@ def refine(
             load_record(pool, slabs[k], maps[which[k]], start, count, mean, cov, const)
             kernel(x, mean, const, z[k], params, count, nu, jac_state, jac_map)
             innovation_covariance(jac_map, cov, noise[k], count, cross, total)
-            partial = mask.shape[0] > 0 or form != 0
+            partial = mask.shape[0] > 0 or kernel_id != 0
             if partial:
                 for i in range(count):
                     weight[i] = 1.0 if mask.shape[0] == 0 or mask[k, start + i] else 0.0
                 accept_predicted(
-                    form, form_params, nu, jac_state, total, factor, start, count, weight, penalty
+                    kernel_id, kernel_params, nu, jac_state, total, factor, start, count, weight, penalty
                 )
                 leave_out(weight, count, nu, jac_state, total)
             cholesky(total, count, scale)
@@ -133,7 +133,7 @@ def refine(
         for i in range(count):
             quad[start + i] += sum_quad[i]
             log_det[start + i] += penalty[i]
-            if form != 1:
+            if kernel_id != 1:
                 log_det[start + i] += sum_log[i] + used[i] * p * math.log(2.0 * math.pi)
             for a in range(dim):
                 vector[start + i, a] += sum_vector[a, i]

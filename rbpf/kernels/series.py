@@ -33,8 +33,8 @@ def _horner(coefficients, x):
 def coefficient_b(x):
     """(1 − cos θ)/θ², from the half angle, which does not cancel."""
     theta = math.sqrt(x + TINY)
-    share = math.sin(0.5 * theta) / theta
-    return 2.0 * (share * share)
+    fraction = math.sin(0.5 * theta) / theta
+    return 2.0 * (fraction * fraction)
 
 
 @njit(cache=True, error_model="numpy")

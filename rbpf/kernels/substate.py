@@ -8,7 +8,7 @@ from numba import boolean, njit
 from rbpf.kernels.signature import CUBE
 
 _SINGULAR = 1e-12
-"""The same as `rbpf.gaussian.psd_factor`'s: a pivot below this share of its variance is none."""
+"""The same as `rbpf.gaussian.psd_factor`'s: a pivot below this fraction of its variance is none."""
 
 
 @njit(cache=True, error_model="numpy")

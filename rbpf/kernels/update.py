@@ -81,8 +81,8 @@ def update(
     z,
     noise,
     mask,
-    form,
-    form_params,
+    kernel_id,
+    kernel_params,
     sizes,
     log_density,
 ):
@@ -118,7 +118,7 @@ def update(
                 for i in range(count):
                     weight[i] = 1.0 if mask[k, start + i] else 0.0
                 leave_out(weight, count, nu, cross, total)
-            if form != 0:
+            if kernel_id != 0:
                 for i in range(count):
                     squared[i] = 0.0
                     scale[i] = 1.0
@@ -126,7 +126,7 @@ def update(
             whiten_vector(total, count, nu)
             add_squares(nu, count, squared)
             rejected = False
-            if form == 0:
+            if kernel_id == 0:
                 pivots += p
                 for i in range(count):
                     used[i] += weight[i]
@@ -138,8 +138,10 @@ def update(
             else:
                 for i in range(count):
                     if weight[i] != 0.0:
-                        sum_log[i] += log_likelihood(form, form_params, squared[i], scale[i], p)
-                        weight[i] = 1.0 if is_inlier(form, form_params, squared[i], scale[i], p) else 0.0
+                        sum_log[i] += log_likelihood(kernel_id, kernel_params, squared[i], scale[i], p)
+                        weight[i] = (
+                            1.0 if is_inlier(kernel_id, kernel_params, squared[i], scale[i], p) else 0.0
+                        )
                         rejected = rejected or weight[i] == 0.0
             whiten_matrix(total, count, cross)
             if rejected:
@@ -147,9 +149,9 @@ def update(
             add_transposed_product(cross, nu, count, mean)
             add_gram(cross, -1.0, count, cov)
             _store_record(pool, targets[k], slabs[k], rows, start, count, mean, cov)
-            if form != 0 and mask.shape[0] == 0:
+            if kernel_id != 0 and mask.shape[0] == 0:
                 weight[:] = 1.0
         for i in range(count):
-            if form == 0:
+            if kernel_id == 0:
                 sum_log[i] -= 0.5 * (squared[i] + used[i] * p * math.log(2.0 * math.pi))
             log_density[start + i] += sum_log[i]

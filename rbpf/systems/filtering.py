@@ -64,7 +64,7 @@ class ResamplingConfig:
 
     Attributes:
         scheme: how.
-        ess_threshold: resample when the effective sample size falls below this share of the particles.
+        ess_threshold: resample when the effective sample size falls below this fraction of the particles.
     """
 
     scheme: Literal["systematic", "stratified", "residual", "multinomial"] = "systematic"

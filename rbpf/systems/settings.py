@@ -84,7 +84,10 @@ def _over(defaults: dict[str, Any], values: Mapping[str, Any]) -> dict[str, Any]
 
 def _refuse_unknown(values: Mapping[str, Any], kind: Any, prefix: str) -> None:
     known = {item.name: item for item in fields(kind)}
+    renamed: Mapping[str, str] = getattr(kind, "RENAMED", {})
     for name, value in values.items():
+        if name in renamed:
+            raise InputError(f"the setting {prefix}{name} is now called {prefix}{renamed[name]}")
         if name not in known:
             raise InputError(f"there is no setting {prefix}{name}; known here: {', '.join(sorted(known))}")
         inner: Any = known[name].default_factory

@@ -1,4 +1,4 @@
-"""Sequences that the tests of the command line share, and cheap pictures."""
+"""Sequences that the tests of the command line fraction, and cheap pictures."""
 
 from pathlib import Path
 

@@ -45,7 +45,7 @@ COMMANDS = {
     "compare": CompareOptions,
     "doctor": DoctorOptions,
 }
-UNIT = re.compile(r"\b(px|m|s|seconds|share|rich|particles|grey levels|Hz)\b")
+UNIT = re.compile(r"\b(px|m|s|seconds|fraction|rich|particles|grey levels|Hz)\b")
 
 
 def help_of(command, capsys, monkeypatch):

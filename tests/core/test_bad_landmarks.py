@@ -8,7 +8,7 @@ from rbpf.filter import Filter
 from rbpf.lie import SE2
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
-from rbpf.models import Births, ObservationModel
+from rbpf.models import NewLandmarks, ObservationModel
 from rbpf.motion.odometry import Odometry, OdometryMotion
 from rbpf.sensors.range_bearing import RangeBearing
 from tests.core.scripted import Scripted, fails, seen
@@ -97,23 +97,23 @@ class TestLandmarks:
             _ = Filter(OdometryMotion(SE2), Scripted(), n=N).belief().map
 
     def test_landmarks_of_some_particles_in_a_map_without_evidence(self, filter_):
-        births = Births(
+        new_landmarks = NewLandmarks(
             np.ones((1, 2)), np.eye(2)[None], RangeBearing(SE2), Point(2), np.ones((N, 1), dtype=bool)
         )
         with pytest.raises(InputError, match="only need a map with evidence=True"):
-            filter_.belief().map.add(births, filter_.particles.state)
+            filter_.belief().map.add(new_landmarks, filter_.particles.state)
         with pytest.raises(InputError, match="keeps no log-odds: build it with evidence=True"):
             filter_.belief().map.set_log_odds(np.array([1]), np.zeros((N, 1)))
 
     def test_first_sightings_that_are_not_finite(self, filter_):
-        births = Births(np.array([[np.nan, 0.0]]), np.eye(2)[None], RangeBearing(SE2), Point(2))
+        new_landmarks = NewLandmarks(np.array([[np.nan, 0.0]]), np.eye(2)[None], RangeBearing(SE2), Point(2))
         with pytest.raises(InputError, match="a new Point has a mean or covariance that is not finite"):
-            filter_.belief().map.add(births, filter_.particles.state)
+            filter_.belief().map.add(new_landmarks, filter_.particles.state)
 
     def test_a_model_that_cannot_start_landmarks(self, filter_):
         class Bearing(RangeBearing):  # type: ignore[misc]
             invert = ObservationModel.invert
 
-        births = Births(np.ones((1, 2)), np.eye(2)[None], Bearing(SE2), Point(2))
+        new_landmarks = NewLandmarks(np.ones((1, 2)), np.eye(2)[None], Bearing(SE2), Point(2))
         with pytest.raises(InputError, match=r"Bearing cannot start landmarks: override invert\(state, z\)"):
-            filter_.belief().map.add(births, filter_.particles.state)
+            filter_.belief().map.add(new_landmarks, filter_.particles.state)

@@ -11,7 +11,7 @@ from rbpf.filter import Filter
 from rbpf.lie import SE2, Euclidean
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
-from rbpf.models import Births, MotionModel, ObservationModel, Observations, Part, Sensor, Transition
+from rbpf.models import MotionModel, NewLandmarks, ObservationModel, Observations, Part, Sensor, Transition
 from rbpf.motion.odometry import OdometryMotion
 from rbpf.proposals import PriorProposal
 from rbpf.resampling import EssTriggered, Residual
@@ -176,8 +176,8 @@ def test_catalogue_comes_back_with_its_types(world, tmp_path):
             OdometryMotion(SE2), NamedLandmarkSensor(RangeBearing(SE2), Point(2)), landmark_map, n=3
         )
         landmark_map.register(Point(2))
-        births = replace(first_births(world), facts=names)
-        landmark_map.add(births, filter_.particles.state)
+        new_landmarks = replace(first_births(world), facts=names)
+        landmark_map.add(new_landmarks, filter_.particles.state)
         filter_.save(tmp_path / "run.npz")
         before = dict(landmark_map.catalogue)
         filter_.load(tmp_path / "run.npz")
@@ -185,9 +185,9 @@ def test_catalogue_comes_back_with_its_types(world, tmp_path):
         assert [type(fact) for fact in landmark_map.catalogue.values()] == [type(fact) for fact in names]
 
 
-def first_births(world: World) -> Births:
+def first_births(world: World) -> NewLandmarks:
     frame = world.frames[0]
-    return Births(frame.z[:2], frame.cov_z[:2], RangeBearing(SE2), Point(2))
+    return NewLandmarks(frame.z[:2], frame.cov_z[:2], RangeBearing(SE2), Point(2))
 
 
 @pytest.mark.parametrize(

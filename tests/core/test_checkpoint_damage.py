@@ -58,11 +58,11 @@ def refused(filter_: Filter, path: Path, match: str) -> None:
     np.testing.assert_equal(filter_.rng.bit_generator.state, generator)
 
 
-@given(share=st.floats(0.0, 1.0, exclude_max=True))
-def test_cut_off_anywhere(file, target, tmp_path_factory, share):
+@given(fraction=st.floats(0.0, 1.0, exclude_max=True))
+def test_cut_off_anywhere(file, target, tmp_path_factory, fraction):
     whole = file.read_bytes()
     cut = tmp_path_factory.getbasetemp() / "cut.npz"
-    cut.write_bytes(whole[: int(share * len(whole))])
+    cut.write_bytes(whole[: int(fraction * len(whole))])
     refused(target, cut, "is damaged or cut off|is not a checkpoint")
 
 

@@ -227,9 +227,9 @@ LIKELIHOODS = {
     r"Broken.inlier for ν \(5, 4, 1\) has shape \(5, 4, 1\)": likelihood_with(
         inlier=named("inlier", lambda self, nu, cov: nu > 0)
     ),
-    r"Broken.form is 7, expected one of \(-1, 0, 1, 2\)": likelihood_with(form=7),
-    "Broken.params is not one axis of float64 numbers": likelihood_with(form=0, params=[0.0]),
-    "Broken.log_density differs from its compiled form 0: expected": likelihood_with(form=0),
+    r"Broken.kernel_id is 7, expected one of \(-1, 0, 1, 2\)": likelihood_with(kernel_id=7),
+    "Broken.params is not one axis of float64 numbers": likelihood_with(kernel_id=0, params=[0.0]),
+    "Broken.log_density differs from its compiled kernel 0: expected": likelihood_with(kernel_id=0),
 }
 
 
@@ -245,4 +245,4 @@ def test_an_inlier_that_differs_from_the_compiled_one():
         def inlier(self, nu, cov):
             return np.abs(nu[..., 0]) < 1.0
 
-    assert check_model(Broken()) == ["Broken.inlier differs from its compiled form 0"]
+    assert check_model(Broken()) == ["Broken.inlier differs from its compiled kernel 0"]

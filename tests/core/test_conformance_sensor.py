@@ -10,7 +10,7 @@ from rbpf.conformance import Example, check_model
 from rbpf.errors import InputError
 from rbpf.lie import SE2
 from rbpf.maps.point import Point
-from rbpf.models import Births, Likelihood, ObservationModel, Observations, Sensor
+from rbpf.models import Likelihood, NewLandmarks, ObservationModel, Observations, Sensor
 from rbpf.sensors.range_bearing import RangeBearing
 from tests.core.scripted import says
 from tests.core.worlds import Recipe, drive, planar_world
@@ -21,13 +21,13 @@ COUNTS = iter(range(10**9))
 class Watching(Sensor):
     """Hands out what it was built with."""
 
-    def __init__(self, groups=(), births=()) -> None:
-        self.groups, self.born = groups, births
+    def __init__(self, groups=(), new_landmarks=()) -> None:
+        self.groups, self.born = groups, new_landmarks
 
     def observe(self, frame, belief):
         return self.groups
 
-    def births(self, frame, belief, observed):
+    def new_landmarks(self, frame, belief, observed):
         return self.born
 
 
@@ -50,7 +50,7 @@ def test_sound_sensors(known):
 
 Z, COV = np.array([[3.0, 0.1], [4.0, 0.2]]), np.repeat(np.diag([0.1, 0.1])[None], 2, axis=0)
 GROUP = Observations(Z, COV, RangeBearing(SE2), ids=np.array([1, 2]))
-BIRTHS = Births(Z, COV, RangeBearing(SE2), Point(2))
+BIRTHS = NewLandmarks(Z, COV, RangeBearing(SE2), Point(2))
 SENSORS = {
     "Watching.observe, for a group, returned a str, expected Observations": Watching(["seen"]),
     r"Watching.observe: z of RangeBearing has shape \(2, 1\), expected \(any, 2\)": Watching(
@@ -74,11 +74,13 @@ SENSORS = {
         [replace(GROUP, ids=np.array([99, 0]))]
     ),
     "Watching.observe: ids below -2 mean nothing": Watching([replace(GROUP, ids=np.array([-3, 1]))]),
-    "Watching.births, for a group, returned a Observations, expected Births": Watching([], [GROUP]),
-    r"Watching.births: mask has shape \(2,\), expected \(40, 2\)": Watching(
+    "Watching.new_landmarks, for a group, returned a Observations, expected NewLandmarks": Watching(
+        [], [GROUP]
+    ),
+    r"Watching.new_landmarks: mask has shape \(2,\), expected \(40, 2\)": Watching(
         [], [replace(BIRTHS, mask=np.ones(2, dtype=bool))]
     ),
-    "Watching.births gives 1 facts for 2 landmarks, expected one each or none": Watching(
+    "Watching.new_landmarks gives 1 facts for 2 landmarks, expected one each or none": Watching(
         [], [replace(BIRTHS, facts=["oak"])]
     ),
 }

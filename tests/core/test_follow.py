@@ -8,7 +8,7 @@ from rbpf.filter import Filter
 from rbpf.lie import Euclidean
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
-from rbpf.models import Births, Observations
+from rbpf.models import NewLandmarks, Observations
 from rbpf.substate import KalmanSubstate
 from tests.exactness.models import Frame, Kalman, LinearMotion, Relative, Scripted
 
@@ -20,7 +20,7 @@ STEP = 1_000_000_000
 def frames(rng: np.random.Generator) -> list[Frame]:
     """A landmark at (4, 1), seen three times."""
     z = np.array([4.0, 1.0]) - PATH + rng.multivariate_normal(np.zeros(2), NOISE, size=3)
-    start = Frame(births=[Births(z[:1], NOISE[None], Relative(), Point(2))])
+    start = Frame(new_landmarks=[NewLandmarks(z[:1], NOISE[None], Relative(), Point(2))])
     again = [Frame([Observations(z[t : t + 1], NOISE[None], Relative(), ids=np.array([0]))]) for t in (1, 2)]
     return [start, *again]
 
@@ -43,7 +43,7 @@ def test_the_map_is_that_of_each_given_path():
     filter_, log_densities = followed(states, seen)
     records = filter_.belief().read([0])
     for i in range(4):
-        first = seen[0].births[0].z[0] + states[0, i]
+        first = seen[0].new_landmarks[0].z[0] + states[0, i]
         kalman = Kalman(first, NOISE)
         for t in (1, 2):
             before = kalman.log_evidence

@@ -131,10 +131,10 @@ def test_equal_weights_keep_every_particle(scheme):
 class TestEssTriggered:
     def test_resamples_below_its_threshold_only(self):
         weights = np.array([0.7, 0.1, 0.1, 0.1])
-        share = effective_sample_size(weights) / 4
+        fraction = effective_sample_size(weights) / 4
         rng = np.random.default_rng(0)
-        assert EssTriggered(Systematic(), share - 1e-6).ancestors(weights, rng) is None
-        assert EssTriggered(Systematic(), share + 1e-6).ancestors(weights, rng) is not None
+        assert EssTriggered(Systematic(), fraction - 1e-6).ancestors(weights, rng) is None
+        assert EssTriggered(Systematic(), fraction + 1e-6).ancestors(weights, rng) is not None
 
     def test_hands_on_the_draw_of_its_scheme(self):
         weights = np.array([0.9, 0.05, 0.03, 0.02])

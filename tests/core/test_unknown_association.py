@@ -49,7 +49,7 @@ def test_map_and_accuracy(seed, clutter):
     error = position_error(world, drive(filter_, world))
     assert error < 1.5 * position_error(world, drive(reference, named)) + 0.01
     seen = {name for frame in named.frames for name in frame.landmarks.tolist()}
-    accepted = [landmark for landmark, share in held(filter_).items() if share > 0.5]
+    accepted = [landmark for landmark, fraction in held(filter_).items() if fraction > 0.5]
     assert len(accepted) == len(seen)
     assert nearest(filter_, world, accepted).max() < 0.3
 
@@ -66,7 +66,7 @@ def test_spurious_landmarks_leave_the_map():
     sizes: list[int] = []
 
     def count(t, report):
-        born.update(report.births.tolist())
+        born.update(report.new_landmarks.tolist())
         sizes.append(filter_.belief().map.ids.size)
 
     drive(filter_, world, after=count)
@@ -93,7 +93,7 @@ def test_life_of_a_landmark():
     filter_ = single(LandmarkMap(SE2, evidence=True))
     landmark_map = filter_.belief().map
     report = filter_.step(one_sighting())
-    assert report.births.tolist() == [0]
+    assert report.new_landmarks.tolist() == [0]
     assert (ids_of(report) == NEW).all()
     np.testing.assert_array_equal(landmark_map.log_odds(np.array([0])), 0.0)
     report = filter_.step(one_sighting())
@@ -128,7 +128,7 @@ def test_what_is_out_of_sight_is_not_missed():
 def test_an_empty_map_and_an_empty_frame():
     filter_ = single(LandmarkMap(SE2, evidence=True))
     report = filter_.step(NOTHING)
-    assert report.births.size == 0
+    assert report.new_landmarks.size == 0
     assert report.log_evidence == pytest.approx(0.0)
 
 

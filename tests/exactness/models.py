@@ -9,9 +9,9 @@ import numpy as np
 from rbpf.filter import Filter
 from rbpf.lie import Euclidean
 from rbpf.models import (
-    Births,
     Jacobians,
     MotionModel,
+    NewLandmarks,
     ObservationModel,
     Observations,
     Part,
@@ -85,20 +85,20 @@ class Relative(ObservationModel):
 
 @dataclass(frozen=True)
 class Frame:
-    """What a sensor is told to say: groups of observations, then births."""
+    """What a sensor is told to say: groups of observations, then new_landmarks."""
 
     groups: Sequence[Observations] = ()
-    births: Sequence[Births] = ()
+    new_landmarks: Sequence[NewLandmarks] = ()
 
 
 class Scripted(Sensor):
-    """Hands out a frame's groups and births as they are."""
+    """Hands out a frame's groups and new_landmarks as they are."""
 
     def observe(self, frame, belief):
         return frame.groups
 
-    def births(self, frame, belief, observed):
-        return frame.births
+    def new_landmarks(self, frame, belief, observed):
+        return frame.new_landmarks
 
 
 def single(z: np.ndarray, cov: np.ndarray | float, model: ObservationModel, **options: Any) -> Observations:

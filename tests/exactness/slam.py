@@ -9,7 +9,7 @@ from scipy.linalg import block_diag
 from rbpf.filter import Filter
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
-from rbpf.models import Births, ObservationModel, Observations
+from rbpf.models import NewLandmarks, ObservationModel, Observations
 from rbpf.substate import KalmanSubstate
 from tests.exactness.models import SEEDS, Frame, Kalman
 
@@ -50,15 +50,15 @@ class LinearSlam:
             self._filter(seen, z)
 
     def frames(self, model: ObservationModel) -> list[Frame]:
-        """What a scripted sensor says; landmarks are numbered in the order of their births."""
+        """What a scripted sensor says; landmarks are numbered in the order of their new_landmarks."""
         known: set[int] = set()
         frames = []
         for seen, z in self.measured:
             old, new = ([k for k, i in enumerate(seen) if (i in known) == held] for held in (True, False))
             known.update(seen)
             groups = [Observations(z[old], self._noise(old), model, ids=np.array(seen)[old])] if old else []
-            births = [Births(z[new], self._noise(new), model, Point(2))] if new else []
-            frames.append(Frame(groups, births))
+            new_landmarks = [NewLandmarks(z[new], self._noise(new), model, Point(2))] if new else []
+            frames.append(Frame(groups, new_landmarks))
         return frames
 
     def _noise(self, rows: Sequence[int]) -> np.ndarray:

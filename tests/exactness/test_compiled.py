@@ -10,7 +10,7 @@ from rbpf.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobi
 from rbpf.maps import rows
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
-from rbpf.models import NEW, NULL, Births, Observations
+from rbpf.models import NEW, NULL, NewLandmarks, Observations
 from rbpf.motion.odometry import Odometry, OdometryMotion
 from rbpf.numeric import linearise
 from rbpf.proposals import EkfProposal, PriorProposal, refined
@@ -51,7 +51,7 @@ def with_outliers(group: Observations) -> Observations:
 
 
 def associations(kind: str, rng: np.random.Generator) -> np.ndarray:
-    """Of five measurements: the same in all particles; disjoint sightings; clutter and births in some."""
+    """Of five measurements: the same in all particles; disjoint sightings; clutter and new_landmarks in some."""
     same = np.array([3, 0, 2, 5, 1])
     if kind == "shared":
         return same
@@ -144,8 +144,8 @@ def drive(space, which: int, likelihood, proposal, compiled: bool) -> Filter:
         old = seen[np.isin(seen, held.ids)]
         new = np.setdiff1d(seen, old)
         groups = [Observations(z[old], noise[old], model, likelihood, old)] if old.size else []
-        births = [Births(z[new], noise[new], model, Point(dim))] if new.size else []
-        filter_.step(Frame(groups, births), Odometry(delta, cov))
+        new_landmarks = [NewLandmarks(z[new], noise[new], model, Point(dim))] if new.size else []
+        filter_.step(Frame(groups, new_landmarks), Odometry(delta, cov))
     return filter_
 
 

@@ -1,4 +1,4 @@
-"""What a group of observations informs: the particles, the landmarks, or both."""
+"""What a group of observations updates: the particles, the landmarks, or both."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -31,7 +31,7 @@ every_proposal = pytest.mark.parametrize(
 
 def split(group: Observations) -> list[Observations]:
     """The same measurement twice: once for the state, once for the landmarks."""
-    return [replace(group, informs=STATE), replace(group, informs=MAP)]
+    return [replace(group, updates=STATE), replace(group, updates=MAP)]
 
 
 def scene(space, seed: int = 0) -> tuple[Scene, list[list[Observations]]]:
@@ -131,7 +131,7 @@ def test_for_the_landmarks_alone(space, proposal, compiled):
 def test_compiled_equals_numpy(space):
     world, frames = scene(space, seed=2)
     mixed = [
-        [replace(groups[0], informs=use)]
+        [replace(groups[0], updates=use)]
         for groups, use in zip(frames, (STATE, MAP, STATE, MAP), strict=True)
     ]
     one, other = (run(world, mixed, compiled)[0] for compiled in (True, False))
@@ -154,19 +154,19 @@ def test_density_does_not_depend_on_what_is_updated(likelihood, compiled):
     group.z[1] += 1.0
     zero = np.zeros((PARTICLES, SE2.dim))
     both = world.map(compiled).correct(world.state, zero, [group]).all
-    alone = world.map(compiled).correct(world.state, zero, [replace(group, informs=STATE)]).all
+    alone = world.map(compiled).correct(world.state, zero, [replace(group, updates=STATE)]).all
     np.testing.assert_allclose(alone, both, rtol=1e-10, atol=1e-10)
 
 
 @pytest.mark.parametrize(
-    "informs", [frozenset(), frozenset({Part.SUBSTATE}), STATE | {Part.SUBSTATE}, {Part.STATE}, Part.STATE]
+    "updates", [frozenset(), frozenset({Part.SUBSTATE}), STATE | {Part.SUBSTATE}, {Part.STATE}, Part.STATE]
 )
-def test_what_cannot_be_informed(informs):
+def test_what_cannot_be_informed(updates):
     world, (groups, *_) = scene(SE2)
     with pytest.raises(
         InputError, match=r"of RangeBearing inform a frozenset of Part\.STATE, Part\.LANDMARK or both"
     ):
-        run(world, [[replace(groups[0], informs=informs)]])
+        run(world, [[replace(groups[0], updates=updates)]])
 
 
 def mixture(world: Scene) -> LandmarkMap:
@@ -200,6 +200,6 @@ def test_several_components_without_weighing():
 
 def test_a_landmark_that_is_weighed_apart_and_updated_together_is_refused():
     world, (groups, *_) = scene(SE2)
-    twice = [groups[0], replace(groups[0], informs=STATE)]
-    with pytest.raises(InputError, match="informs the state alone and by one that informs both"):
+    twice = [groups[0], replace(groups[0], updates=STATE)]
+    with pytest.raises(InputError, match="updates the state alone and by one that updates both"):
         run(world, [twice])

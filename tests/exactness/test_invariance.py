@@ -10,7 +10,7 @@ from rbpf.lie import SE2, SE3, Euclidean
 from rbpf.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobis
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
-from rbpf.models import NEW, NULL, Births, Observations
+from rbpf.models import NEW, NULL, NewLandmarks, Observations
 from rbpf.motion.odometry import Odometry, OdometryMotion
 from rbpf.proposals import EkfProposal, PriorProposal
 from rbpf.resampling import EssTriggered, Systematic
@@ -70,7 +70,7 @@ def run(space, likelihood, compiled: bool, orders: np.random.Generator | None) -
             groups.append(Observations(z[order], noise[seen][order], model, likelihood, seen[order]))
         if step == 0:
             z = models[1].predict(truth, landmarks) + rng.multivariate_normal(np.zeros(dim), noise[0], 7)
-            filter_.step(Frame((), [Births(z, noise, models[1], Point(dim))]), Odometry(increment, cov))
+            filter_.step(Frame((), [NewLandmarks(z, noise, models[1], Point(dim))]), Odometry(increment, cov))
             continue
         filter_.step(Frame(groups if orders is None else groups[::-1]), Odometry(increment, cov))
     return filter_
@@ -133,7 +133,7 @@ def test_the_order_of_particles_does_not_matter(proposal, compiled):
             generator(place),
             start[place],
         )
-        filter_.step(Frame((), [Births(z[0], R, model, Point(2))]), Odometry(SE2.identity(), cov))
+        filter_.step(Frame((), [NewLandmarks(z[0], R, model, Point(2))]), Odometry(SE2.identity(), cov))
         reports = [
             filter_.step(
                 Frame([Observations(z[t], R, model, None, ids[t][place], -3.0, -4.0)]),
@@ -163,7 +163,7 @@ def test_the_order_of_groups_does_not_matter():
         motion = LinearMotion(np.eye(2), 0.3 * np.eye(2))
         filter_ = Filter(motion, Scripted(), held, n=PARTICLES, rng=np.random.default_rng(8))
         R = 0.2 * np.eye(2)
-        filter_.step(Frame((), [Births(np.array([[2.0, 1.0]]), R[None], Relative(), Point(2))]))
+        filter_.step(Frame((), [NewLandmarks(np.array([[2.0, 1.0]]), R[None], Relative(), Point(2))]))
         for z in np.random.default_rng(9).normal(scale=0.4, size=(4, 3, 2)):
             groups = [
                 single(z[0], R, fix),

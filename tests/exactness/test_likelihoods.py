@@ -9,7 +9,7 @@ from rbpf.lie import Euclidean
 from rbpf.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobis
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
-from rbpf.models import NULL, Births, ObservationModel, Observations, Records
+from rbpf.models import NULL, NewLandmarks, ObservationModel, Observations, Records
 from rbpf.proposals import EkfProposal, PriorProposal, refined
 from tests.exactness.models import Frame, LinearMotion, LinearObservation, Relative, Scripted, single
 from tests.exactness.scenes import random_covs
@@ -180,7 +180,7 @@ def test_an_outlier_moves_no_landmark(rng):
     motion = LinearMotion(np.eye(2), 0.5 * np.eye(2))
     filter_ = Filter(motion, Scripted(), held, PriorProposal(), n=n, rng=rng)
     R = 0.1 * np.eye(2)
-    born = Births(np.array([[3.0, 1.0]]), R[None], Relative(), Point(2))
+    born = NewLandmarks(np.array([[3.0, 1.0]]), R[None], Relative(), Point(2))
     filter_.step(Frame((), [born]))
     before = held.read(held.ids).mean
     seen = Observations(np.array([[3.4, 1.0]]), R[None], Relative(), TRUNCATED, held.ids)

@@ -238,8 +238,8 @@ def validate_run(figures: dict[str, str]) -> None:
 def verdict(figures: dict[str, float]) -> None:
     assert figures["nothing, innovations, do not trust"] == 0.0
     assert figures["nothing, truth, do not trust"] == 0.0
-    for name, share in figures.items():
-        assert name.startswith("nothing") or not name.endswith(", do not trust") or share == 1.0
+    for name, fraction in figures.items():
+        assert name.startswith("nothing") or not name.endswith(", do not trust") or fraction == 1.0
 
 
 def target_tracking(figures: dict[str, dict[str, float]]) -> None:

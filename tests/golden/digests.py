@@ -66,7 +66,20 @@ def cases(work: Path) -> dict[str, Callable[[Path], None]]:
     """What is run, by name."""
     desk, pairs, plane, space = work / "desk", work / "pairs", work / "plane", work / "space"
     rbpf("simulate", "desk", "--frames", 45, "--width", 320, "--height", 240, "--out", desk)
-    rbpf("simulate", "desk", "--frames", 20, "--baseline-m", 0.1, "--width", 320, "--height", 240, "--out", pairs)
+    rbpf(
+        "simulate",
+        "desk",
+        "--frames",
+        20,
+        "--baseline-m",
+        0.1,
+        "--width",
+        320,
+        "--height",
+        240,
+        "--out",
+        pairs,
+    )
     rbpf("simulate", "range-bearing", "--steps", 80, "--out", plane)
     rbpf("simulate", "range-bearing", "--steps", 60, "--spatial", "--out", space)
     kitchen = beginning("mono_redkitchen_a", 60, work)
@@ -127,7 +140,9 @@ def digests_of(folder: Path) -> dict[str, str]:
         if path.suffix == ".npz":
             with np.load(path, allow_pickle=False) as arrays:
                 content = {
-                    name: digest(str(arrays[name].shape).encode() + np.ascontiguousarray(arrays[name]).tobytes())
+                    name: digest(
+                        str(arrays[name].shape).encode() + np.ascontiguousarray(arrays[name]).tobytes()
+                    )
                     for name in arrays.files
                     if name != "header" and not any(word in name for word in TIMES)
                 }

@@ -67,10 +67,10 @@ def test_bad_ratio(ratio):
         InverseDepth(ratio)
 
 
-@pytest.mark.parametrize("share", [0.02, 0.05, 0.1])
-def test_promotion_is_the_law_of_the_point(share):
+@pytest.mark.parametrize("fraction", [0.02, 0.05, 0.1])
+def test_promotion_is_the_law_of_the_point(fraction):
     """Against samples; transforming the mean alone would miss the bias E[1/q] − 1/E[q] ≈ σ²/q³ (E06 §5.1)."""
-    std, n = share * B[2], 400_000
+    std, n = fraction * B[2], 400_000
     cov = np.diag([0.004, 0.003, std]) ** 2
     cov[0, 2] = cov[2, 0] = 0.5 * 0.004 * std
     records = Records(B[None, None], cov[None, None], ANCHOR[None, None])
@@ -79,12 +79,12 @@ def test_promotion_is_the_law_of_the_point(share):
     rng = np.random.default_rng(2)
     normal = rng.standard_normal((n, 3)) @ np.linalg.cholesky(cov).T
     points = euclidean(B + np.concatenate([normal, -normal]), ANCHOR)
-    mean, error = points.mean(axis=0), 3.0 * share**3 / B[2]
-    np.testing.assert_allclose(found.mean[0, 0], mean, atol=error + 4.0 * share**2 / np.sqrt(n))
+    mean, error = points.mean(axis=0), 3.0 * fraction**3 / B[2]
+    np.testing.assert_allclose(found.mean[0, 0], mean, atol=error + 4.0 * fraction**2 / np.sqrt(n))
     expected = np.cov(points.T)
-    np.testing.assert_allclose(found.cov[0, 0], expected, atol=expected.max() * (8.0 * share**2 + 0.01))
+    np.testing.assert_allclose(found.cov[0, 0], expected, atol=expected.max() * (8.0 * fraction**2 + 0.01))
     naive = np.linalg.norm(euclidean(B, ANCHOR) - mean)
-    np.testing.assert_allclose(naive, np.sqrt(1.0 + B[0] ** 2 + B[1] ** 2) * share**2 / B[2], rtol=0.15)
+    np.testing.assert_allclose(naive, np.sqrt(1.0 + B[0] ** 2 + B[1] ** 2) * fraction**2 / B[2], rtol=0.15)
     assert np.linalg.norm(found.mean[0, 0] - mean) < 0.1 * naive
 
 

@@ -9,7 +9,7 @@ from rbpf.lie import SE2, SE3
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.mixture import MixturePoint, ring
 from rbpf.maps.point import AnchoredPoint, Point
-from rbpf.models import Births, Observations, Records
+from rbpf.models import NewLandmarks, Observations, Records
 from rbpf.proposals import Prior
 from rbpf.sensors.range_bearing import RangeBearing
 
@@ -74,10 +74,10 @@ def test_more_landmarks_than_first_reserved():
 
 def test_a_removed_landmark_leaves_the_catalogue():
     landmark_map, _ = filled()
-    births = Births(
+    new_landmarks = NewLandmarks(
         np.ones((2, 2)), np.repeat(np.eye(2)[None], 2, 0), RangeBearing(SE2), Point(2), facts=["a", "b"]
     )
-    landmark_map.add(births, SE2.identity((N,)))
+    landmark_map.add(new_landmarks, SE2.identity((N,)))
     landmark_map.remove(np.array([0]))
     assert landmark_map.catalogue == {1: "b"}
 
@@ -128,7 +128,7 @@ def test_ready_when_enough_of_the_weight_says_so():
     ids = landmark_map.add_records(Records(mixture.mean, mixture.cov, None, log_weights), MixturePoint(4))
     weights = np.where(np.arange(N) < N // 2, 0.96, 0.04) / (N // 2)
     assert landmark_map.ready(weights).tolist() == ids.tolist()
-    assert landmark_map.ready(weights, share=0.97).size == 0
+    assert landmark_map.ready(weights, fraction=0.97).size == 0
     assert landmark_map.ready(np.full(N, 1 / N)).size == 0
 
 

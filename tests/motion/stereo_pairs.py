@@ -67,10 +67,10 @@ def correlated(world: World, count: int, rng: np.random.Generator) -> Pair:
     return Pair(Matches(world.camera, *pixels, *covs), delta)
 
 
-def mistaken(pair: Pair, share: float, rng: np.random.Generator) -> tuple[Matches, np.ndarray]:
+def mistaken(pair: Pair, fraction: float, rng: np.random.Generator) -> tuple[Matches, np.ndarray]:
     """Some of the later pixels exchanged among one another; which ones, (K,) bool."""
     matches = pair.matches
-    wrong = np.flatnonzero(rng.random(len(matches)) < share)
+    wrong = np.flatnonzero(rng.random(len(matches)) < fraction)
     z_now = matches.z_now.copy()
     z_now[wrong] = matches.z_now[np.roll(wrong, 1)] + rng.normal(scale=3.0, size=(len(wrong), 3))
     mask = np.zeros(len(matches), dtype=bool)

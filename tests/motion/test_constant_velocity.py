@@ -9,7 +9,7 @@ from rbpf.lie import SE3
 from rbpf.motion.constant_velocity import (
     POSE_AND_VELOCITY,
     MarginalVelocity,
-    PoseLaw,
+    PosePrior,
     SampledVelocity,
     velocity_walk,
 )
@@ -17,7 +17,7 @@ from rbpf.motion.constant_velocity import (
 WALK = np.array([0.3, 0.5, 0.7, 1.1, 0.2, 0.9])
 SIGMA = np.diag(WALK**2)
 HALF = np.random.default_rng(3).normal(scale=0.2, size=(6, 8))
-LAW = PoseLaw(SE3.exp(np.array([0.4, -0.2, 1.0, 3.0, -1.0, 2.0])), HALF @ HALF.T)
+LAW = PosePrior(SE3.exp(np.array([0.4, -0.2, 1.0, 3.0, -1.0, 2.0])), HALF @ HALF.T)
 every_time_step = pytest.mark.parametrize("dt", [1.0 / 30.0, 0.5, 2.0, 7.0])
 
 
@@ -150,7 +150,7 @@ def test_a_law_places_the_body(mode, dt):
 
 @pytest.mark.parametrize("mode", ["marginal", "joint", "paper"])
 def test_a_law_with_a_velocity_forgets_the_old_one(mode):
-    law, state = PoseLaw(LAW.mean, LAW.cov, 0.3 * WALK), states(3)
+    law, state = PosePrior(LAW.mean, LAW.cov, 0.3 * WALK), states(3)
     if mode == "marginal":
         transition = MarginalVelocity(WALK).transition(state[:, :7], law, 0.2)
         np.testing.assert_array_equal(transition.dynamics, np.zeros((1, 6, 6)))
@@ -161,7 +161,7 @@ def test_a_law_with_a_velocity_forgets_the_old_one(mode):
     np.testing.assert_allclose((factor @ factor.T)[6:, 6:], np.diag((0.3 * WALK) ** 2), rtol=1e-13)
 
 
-FORGETTING = PoseLaw(LAW.mean, LAW.cov, WALK)
+FORGETTING = PosePrior(LAW.mean, LAW.cov, WALK)
 
 
 @pytest.mark.parametrize("control", [None, LAW, FORGETTING])
@@ -188,11 +188,11 @@ def test_bad_standard_deviations(std):
 @pytest.mark.parametrize(
     ("law", "sentence"),
     [
-        (PoseLaw(LAW.mean[:6], LAW.cov), r"needs a finite mean \(7,\) and cov \(6, 6\)"),
-        (PoseLaw(LAW.mean * np.nan, LAW.cov), r"needs a finite mean \(7,\) and cov \(6, 6\)"),
-        (PoseLaw(LAW.mean, np.eye(3)), r"needs a finite mean \(7,\) and cov \(6, 6\)"),
-        (PoseLaw(LAW.mean, -np.eye(6)), "negative eigenvalue"),
-        (PoseLaw(LAW.mean, np.full((6, 6), np.nan)), "not finite|NaN|nan"),
+        (PosePrior(LAW.mean[:6], LAW.cov), r"needs a finite mean \(7,\) and cov \(6, 6\)"),
+        (PosePrior(LAW.mean * np.nan, LAW.cov), r"needs a finite mean \(7,\) and cov \(6, 6\)"),
+        (PosePrior(LAW.mean, np.eye(3)), r"needs a finite mean \(7,\) and cov \(6, 6\)"),
+        (PosePrior(LAW.mean, -np.eye(6)), "negative eigenvalue"),
+        (PosePrior(LAW.mean, np.full((6, 6), np.nan)), "not finite|NaN|nan"),
     ],
 )
 def test_bad_laws(law, sentence):

@@ -35,11 +35,11 @@ def test_alignment():
 
 
 @pytest.mark.parametrize("world", [ROAD, ROOM, LEAP], ids=["road", "room", "leap"])
-@pytest.mark.parametrize("share", [0.0, 0.3, 0.6])
-def test_false_matches_do_not_move_it(world, share):
+@pytest.mark.parametrize("fraction", [0.0, 0.3, 0.6])
+def test_false_matches_do_not_move_it(world, fraction):
     rng = np.random.default_rng(3)
     pair = simulate(world, 200, rng)
-    matches, wrong = mistaken(pair, share, rng)
+    matches, wrong = mistaken(pair, fraction, rng)
     found = consensus(matches, SE3.identity(), GATE, rng)
     seen = see(matches.camera, found, matches.z_prev)
     off = np.linalg.norm(seen.pixels - matches.z_now, axis=1)
@@ -76,10 +76,10 @@ def test_a_good_guess_takes_part():
     assert np.abs(SE3.local(pair.delta, guided)).max() < 0.05
 
 
-@pytest.mark.parametrize(("share", "needed"), [(0.5, 68.98), (0.3, 336.4)])
-def test_how_many_triples_it_takes(share, needed):
+@pytest.mark.parametrize(("fraction", "needed"), [(0.5, 68.98), (0.3, 336.4)])
+def test_how_many_triples_it_takes(fraction, needed):
     """log(1 − p) / log(1 − w³), Fischler and Bolles (1981)."""
-    assert Draws().needed(share) == pytest.approx(needed, rel=1e-3)
+    assert Draws().needed(fraction) == pytest.approx(needed, rel=1e-3)
     assert Draws().needed(1.0) <= 1.0
     assert Draws().needed(0.0) == np.inf
 
@@ -116,7 +116,7 @@ def test_compiled_scores():
     motions = SE3.exp(rng.normal(scale=[0.1] * 3 + [0.5, 0.5, 2.0], size=(20, 6)))
     motions[0] = SE3.exp(np.array(LEAP.xi))
     squared = squared_distances(search, motions, np.arange(50))
-    score, share = search.scores(motions, GATE)
+    score, fraction = search.scores(motions, GATE)
     assert np.isinf(squared).any() and (squared <= GATE).any()
     np.testing.assert_allclose(score, np.minimum(squared, GATE).sum(axis=1), rtol=1e-9)
-    np.testing.assert_array_equal(share, (squared <= GATE).mean(axis=1))
+    np.testing.assert_array_equal(fraction, (squared <= GATE).mean(axis=1))

@@ -102,11 +102,11 @@ def test_the_other_kinds_are_scipys_least_squares(points):
 
 
 @pytest.mark.parametrize("world", [ROAD, ROOM, LEAP], ids=["road", "room", "leap"])
-@pytest.mark.parametrize("share", [0.0, 0.3, 0.6])
-def test_false_matches_are_found(world, share):
+@pytest.mark.parametrize("fraction", [0.0, 0.3, 0.6])
+def test_false_matches_are_found(world, fraction):
     rng = np.random.default_rng(3)
     pair = simulate(world, 300, rng)
-    matches, wrong = mistaken(pair, share, rng)
+    matches, wrong = mistaken(pair, fraction, rng)
     found = estimated(matches)
     off = SE3.local(pair.delta, found.previous_camera_from_camera)
     assert off @ np.linalg.solve(found.cov, off) < 22.5  # χ²₆, 99.9 %
@@ -296,6 +296,6 @@ def test_matches_on_a_thing_that_moves_are_counted(seed):
 @pytest.mark.parametrize("world", [ROAD, ROOM], ids=["road", "room"])
 def test_false_matches_agree_on_no_motion(world):
     rng = np.random.default_rng(0)
-    for share in (0.0, 0.2, 0.4):
-        matches, _ = mistaken(simulate(world, 80, rng), share, rng)
+    for fraction in (0.0, 0.2, 0.4):
+        matches, _ = mistaken(simulate(world, 80, rng), fraction, rng)
         assert estimated(matches).elsewhere == 0

@@ -56,8 +56,8 @@ def test_paths_are_those_of_a_full_history(seed, lag, clouds):
 def test_random_histories_are_shared(lag):
     """Most of them hold far fewer states than paths, so that the test above speaks of compacted blocks."""
     pairs = [recorded(seed, lag, clouds=False) for seed in range(30)]
-    shares = [history.stored_states / max(1, oracle.paths[..., 0].size) for history, oracle in pairs]
-    assert np.median(shares) < 0.8
+    fractions = [history.stored_states / max(1, oracle.paths[..., 0].size) for history, oracle in pairs]
+    assert np.median(fractions) < 0.8
 
 
 def restored(lineage: Lineage, history: History) -> tuple[Lineage, History]:

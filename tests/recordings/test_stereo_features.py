@@ -69,8 +69,8 @@ def test_they_lie_on_the_same_row_of_both_images(recording):
     assert np.percentile(np.abs(gap), 80) < 1.0
 
 
-@pytest.mark.parametrize(("apart", "share"), [(1, 0.85), (3, 0.65)])
-def test_they_move_as_the_truth_says(recording, features, apart, share):
+@pytest.mark.parametrize(("apart", "fraction"), [(1, 0.85), (3, 0.65)])
+def test_they_move_as_the_truth_says(recording, features, apart, fraction):
     errors = []
     for first in range(PAIRS - apart):
         before, after = features[first], features[first + apart]
@@ -80,7 +80,7 @@ def test_they_move_as_the_truth_says(recording, features, apart, share):
     error = np.concatenate(errors)
     assert len(error) > 30 * (PAIRS - apart)
     assert np.median(error) < 1.5
-    assert np.mean(error < 4.0) > share
+    assert np.mean(error < 4.0) > fraction
 
 
 def test_the_refinement_brings_disparities_closer_to_each_other(recording, features):
@@ -117,13 +117,13 @@ def test_a_prediction_finds_landmarks_more_surely(recording, features):
     mean = expected(recording, 0, 2, before.points)
     seen = np.flatnonzero(rig.inside(mean))
     gate = Gate(after.z, after.cov, seen, mean[seen], np.tile(9.0 * np.eye(3), (seen.size, 1, 1)))
-    shares = []
+    fractions = []
     for found in (index.match(after.keys), index.match(after.keys, gate)):
         rows = np.flatnonzero(found.ids >= 0)
         error = np.abs(after.z[rows] - mean[found.ids[rows]]).max(axis=1)
-        shares.append(((error < 4.0).sum(), np.mean(error < 4.0)))
-    (free, free_share), (gated, gated_share) = shares
-    assert gated >= free and gated_share > free_share and gated_share > 0.85
+        fractions.append(((error < 4.0).sum(), np.mean(error < 4.0)))
+    (free, free_fraction), (gated, gated_fraction) = fractions
+    assert gated >= free and gated_fraction > free_fraction and gated_fraction > 0.85
 
 
 def test_swapped_images_are_noticed(recording):

@@ -189,8 +189,8 @@ def test_only_the_state_learns_from_the_constraint():
         held.begin(6, Lineage(6))
         ids = held.add_records(records, InverseDepth())
         groups = {
-            "across": Observations(z, cov, EpipolarRay(PLAIN), ids=ids, informs=frozenset({Part.STATE})),
-            "depth": Observations(z, cov, CameraRay(PLAIN), ids=ids, informs=frozenset({Part.LANDMARK})),
+            "across": Observations(z, cov, EpipolarRay(PLAIN), ids=ids, updates=frozenset({Part.STATE})),
+            "depth": Observations(z, cov, CameraRay(PLAIN), ids=ids, updates=frozenset({Part.LANDMARK})),
         }
         chosen = [groups[name] for name in parts]
         prior = Prior.exactly(SE3, rays.state)

@@ -102,13 +102,13 @@ def test_it_rises_up_to_the_widest_angle(coefficients):
 
 @given(
     coefficients=st.tuples(*[st.floats(-0.2, 0.2)] * 4),
-    share=st.floats(0.0, 0.98),
+    fraction=st.floats(0.0, 0.98),
     around=st.floats(0.0, 6.3),
 )
-def test_every_visible_direction_comes_back(coefficients, share, around):
+def test_every_visible_direction_comes_back(coefficients, fraction, around):
     lens = Equidistant(coefficients)
     camera = Pinhole(8000, 8000, 262.0, 262.0, 4000.0, 4000.0, coefficients, "equidistant")
-    seen = ray(share * lens.widest, around)
+    seen = ray(fraction * lens.widest, around)
     assert camera.visible(seen)
     again = np.append(camera.unproject(camera.project(seen)), 1.0)
     least = np.linalg.svd(camera.slope(again)[:, :2], compute_uv=False)[-1] / camera.fx

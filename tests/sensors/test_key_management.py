@@ -19,7 +19,7 @@ def features(rng, count):
 
 @given(
     seed=st.integers(0, 10_000),
-    share=st.floats(0.0, 1.0),
+    fraction=st.floats(0.0, 1.0),
     config=st.builds(
         KeyConfig,
         per_frame=st.integers(0, 20),
@@ -28,13 +28,13 @@ def features(rng, count):
         waiting=st.integers(0, 40),
     ),
 )
-def test_sightings_decide_who_stays(seed, share, config):
+def test_sightings_decide_who_stays(seed, fraction, config):
     rng = np.random.default_rng(seed)
     manager = KeyManager(config, SIZE)
     seen: dict[int, list[int]] = {}
     ever = 0
     for frame in range(1, 15):
-        names = manager.names[rng.random(manager.names.size) < share]
+        names = manager.names[rng.random(manager.names.size) < fraction]
         for name in names.tolist():
             seen[name].append(frame)
         overdue = [

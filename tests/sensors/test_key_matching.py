@@ -46,13 +46,13 @@ def by_hand(first, second, possible, limits):
     count=st.integers(1, 20),
     extra=st.integers(0, 20),
     ratio=st.sampled_from([0.6, 0.8, 1.0]),
-    share=st.sampled_from([0.1, 0.5, 1.0]),
+    fraction=st.sampled_from([0.1, 0.5, 1.0]),
 )
-def test_matches_are_those_of_a_plain_loop(seed, count, extra, ratio, share):
+def test_matches_are_those_of_a_plain_loop(seed, count, extra, ratio, fraction):
     rng = np.random.default_rng(seed)
     first, second = noisy_pair(rng, count, extra)
     limits = MatchLimits(0.5, ratio)
-    possible = rng.random((count, count + extra)) < share
+    possible = rng.random((count, count + extra)) < fraction
     matches = match_pairs(first, second, np.nonzero(possible), limits)
     assert list(zip(matches.first.tolist(), matches.second.tolist(), strict=True)) == by_hand(
         first, second, possible, limits

@@ -7,7 +7,7 @@ from rbpf.filter import Filter
 from rbpf.lie import SE2
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
-from rbpf.models import Births
+from rbpf.models import NewLandmarks
 from rbpf.motion.odometry import OdometryMotion
 from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
 from rbpf.sensors.range_bearing import RangeBearing
@@ -36,28 +36,28 @@ def filter_of(sensor: NamedLandmarkSensor) -> Filter:
 def test_names_become_ids(sensor):
     filter_ = filter_of(sensor)
     report = filter_.step(frame("oak", "elm"))
-    assert report.births.tolist() == [0, 1]
+    assert report.new_landmarks.tolist() == [0, 1]
     assert report.groups == []
     report = filter_.step(frame("elm", "ash", "oak"))
     assert ids_of(report).tolist() == [1, 0]
     np.testing.assert_array_equal(report.groups[0].z[:, 0], [3.0, 5.0])
-    assert report.births.tolist() == [2]
+    assert report.new_landmarks.tolist() == [2]
     assert filter_.belief().catalogue == {0: "oak", 1: "elm", 2: "ash"}
 
 
 def test_a_name_seen_twice_in_its_first_frame_starts_one_landmark(sensor):
     filter_ = filter_of(sensor)
-    assert filter_.step(frame(7, 7, 8)).births.tolist() == [0, 1]
+    assert filter_.step(frame(7, 7, 8)).new_landmarks.tolist() == [0, 1]
     report = filter_.step(frame(7, 7))
     assert ids_of(report).tolist() == [0, 0]
-    assert report.births.size == 0
+    assert report.new_landmarks.size == 0
 
 
 def test_an_empty_frame(sensor):
     filter_ = filter_of(sensor)
     report = filter_.step(Sightings(np.zeros(0, dtype=int), np.zeros((0, 2)), np.zeros((0, 2, 2))))
     assert report.groups == []
-    assert report.births.size == 0
+    assert report.new_landmarks.size == 0
 
 
 def test_a_landmark_that_is_replaced_by_another(sensor):
@@ -67,11 +67,13 @@ def test_a_landmark_that_is_replaced_by_another(sensor):
     filter_.step(frame("oak", "elm"))
     landmark_map = filter_.belief().map
     landmark_map.remove(np.array([0]))
-    births = Births(np.array([[5.0, 1.0]]), np.diag([0.01, 0.01])[None], MODEL, Point(2), facts=["ash"])
-    landmark_map.add(births, filter_.particles.state)
+    new_landmarks = NewLandmarks(
+        np.array([[5.0, 1.0]]), np.diag([0.01, 0.01])[None], MODEL, Point(2), facts=["ash"]
+    )
+    landmark_map.add(new_landmarks, filter_.particles.state)
     report = filter_.step(frame("elm", "ash", "oak"))
     assert ids_of(report).tolist() == [1, 2]
-    assert report.births.tolist() == [3]
+    assert report.new_landmarks.tolist() == [3]
 
 
 def test_one_sensor_in_two_filters(sensor):
@@ -91,4 +93,4 @@ def test_names_after_loading_an_earlier_state(sensor, tmp_path):
     filter_.step(frame("ash"))
     report = filter_.step(frame("ash", "elm", "oak"))
     assert ids_of(report).tolist() == [1, 0]
-    assert report.births.tolist() == [2]
+    assert report.new_landmarks.tolist() == [2]

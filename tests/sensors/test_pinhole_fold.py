@@ -83,12 +83,12 @@ def test_tangential_distortion_that_folds_back():
     k2=st.floats(-0.3, 0.3),
     k3=st.floats(-0.1, 0.1),
     tangential=st.tuples(st.floats(-0.01, 0.01), st.floats(-0.01, 0.01)),
-    share=st.floats(0.0, 0.98),
+    fraction=st.floats(0.0, 0.98),
     angle=st.floats(0.0, 6.3),
 )
-def test_every_visible_direction_comes_back(k1, k2, k3, tangential, share, angle):
+def test_every_visible_direction_comes_back(k1, k2, k3, tangential, fraction, angle):
     camera = Pinhole(4000, 4000, 500.0, 500.0, 2000.0, 2000.0, (k1, k2, *tangential, k3))
-    length = share * min(camera.monotonic_radius, 1.5)
+    length = fraction * min(camera.monotonic_radius, 1.5)
     ray = np.array([length * np.cos(angle), length * np.sin(angle), 1.0])
     if camera.visible(ray):
         again = np.append(camera.unproject(camera.project(ray)), 1.0)

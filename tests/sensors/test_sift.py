@@ -69,10 +69,10 @@ def test_pooling_treats_a_mirror_image_alike():
 def test_products_of_keys(length):
     histograms = np.random.default_rng(2).integers(0, 256, (6, 128)).astype(np.float32)
     plain = histograms if length == 128 else pooled(histograms)
-    shares = plain / plain.sum(axis=1, keepdims=True)
+    fractions = plain / plain.sum(axis=1, keepdims=True)
     root, sift = keys_of(histograms, length, "root"), keys_of(histograms, length, "sift")
     assert root.dtype == sift.dtype == np.float32 and root.shape == (6, length)
-    bhattacharyya = np.sqrt(shares[:, None] * shares[None]).sum(axis=2)
+    bhattacharyya = np.sqrt(fractions[:, None] * fractions[None]).sum(axis=2)
     np.testing.assert_allclose(root @ root.T, bhattacharyya, atol=1e-6)
     cosine = plain @ plain.T / np.linalg.norm(plain, axis=1)[:, None] / np.linalg.norm(plain, axis=1)
     np.testing.assert_allclose(sift @ sift.T, cosine, atol=1e-6)

@@ -78,20 +78,20 @@ def test_what_is_given_of_a_point_is_uncertain_along_the_line_of_sight():
 
 def test_the_first_image_shows_that_points_are_uncertain_across_the_line_of_sight_too():
     rng, std = np.random.default_rng(3), 0.03
-    shares = []
+    fractions = []
     for error in (0.0, 0.008, 0.03):
         given = replace(points(), std_m=np.full(6, std))
         across = error * rng.standard_normal((6, 3))
         across -= (across @ SE3.rotation(POSE)[:, 2])[:, None] * SE3.rotation(POSE)[:, 2]
         located, _ = located_points(CAMERA, replace(given, positions=given.positions + across), 0.3)
-        shares.append(np.sqrt(np.linalg.eigvalsh(located.cov)[:, 0]) / std)
-    np.testing.assert_allclose(shares[0], NEEDLE, rtol=1e-6)
-    assert (shares[1] > 1.5 * NEEDLE).all() and (shares[1] < SPHERE).all()
-    np.testing.assert_allclose(shares[2], SPHERE, rtol=1e-6)
+        fractions.append(np.sqrt(np.linalg.eigvalsh(located.cov)[:, 0]) / std)
+    np.testing.assert_allclose(fractions[0], NEEDLE, rtol=1e-6)
+    assert (fractions[1] > 1.5 * NEEDLE).all() and (fractions[1] < SPHERE).all()
+    np.testing.assert_allclose(fractions[2], SPHERE, rtol=1e-6)
 
 
 def test_points_with_errors_along_the_line_of_sight_place_the_camera_honestly():
-    """The squared error of their frame is what its covariance says, 6, but for the least share across the line."""
+    """The squared error of their frame is what its covariance says, 6, but for the least fraction across the line."""
     rng, nees = np.random.default_rng(5), []
     exact, std_px, std_m = points(), 0.5, 0.03
     for _ in range(200):

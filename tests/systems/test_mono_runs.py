@@ -17,7 +17,7 @@ from rbpf.models import Part
 from rbpf.sensors.camera_points import CameraRay, EpipolarRay
 from rbpf.systems.mono.config import MonoConfig, RayConfig, VelocityConfig
 from rbpf.systems.mono.run import MonoRun, run
-from rbpf.systems.mono.system import build_filter, start_law
+from rbpf.systems.mono.system import build_filter, start_prior
 from tests.core.worlds import content, same
 from tests.exactness.models import known
 from tests.systems.mono_logs import SMALL, changed, desk, errors, nees, rows, without_known
@@ -115,7 +115,7 @@ def groups_of(constrain, log=LOG) -> list[set[tuple[type, frozenset[Part]]]]:
     found = []
 
     def record(t, filter_, report):
-        found.append({(type(g.model), g.informs) for g in report.groups if isinstance(g.model, CameraRay)})
+        found.append({(type(g.model), g.updates) for g in report.groups if isinstance(g.model, CameraRay)})
 
     run(log, replace(SMALL, ray=RayConfig(constrain)), record)
     return found
@@ -216,7 +216,7 @@ def test_a_checkpoint_goes_on_with_the_same_bytes(mode, tmp_path):
     whole = run(LOG, config)
     first, second = build_filter(LOG, config), build_filter(LOG, config)
     for t, frame in enumerate(LOG.frames[:5]):
-        first.step(frame, start_law(LOG, config) if t == 0 else None, frame.stamp_ns)
+        first.step(frame, start_prior(LOG, config) if t == 0 else None, frame.stamp_ns)
     first.save(tmp_path / "checkpoint.npz")
     second.load(tmp_path / "checkpoint.npz")
     for frame in LOG.frames[5:]:

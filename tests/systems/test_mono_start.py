@@ -13,7 +13,7 @@ from rbpf.maps.point import Point
 from rbpf.sensors.features import FeatureFrame, FeatureLog, KnownPoints
 from rbpf.systems.mono.config import MonoConfig, VelocityConfig
 from rbpf.systems.mono.run import landmark_cloud, run
-from rbpf.systems.mono.system import build_filter, start_law, world_of
+from rbpf.systems.mono.system import build_filter, start_prior, world_of
 from rbpf.validation.simulation.features import STEREO, Measuring, simulate_features
 from rbpf.validation.simulation.point_worlds import DeskWorld
 from tests.exactness.models import known
@@ -78,7 +78,7 @@ def test_first_sightings_become_rays(mode):
 
 
 def test_at_most_so_many_births():
-    done = run(replace(LOG, frames=LOG.frames[:2]), replace(SMALL, births_per_frame=3))
+    done = run(replace(LOG, frames=LOG.frames[:2]), replace(SMALL, max_new_per_frame=3))
     assert len(done.filter.belief().map.ids) == 1 + 3 + 3
 
 
@@ -88,7 +88,7 @@ def test_without_known_points_the_first_camera_is_the_world(velocity):
     log, settings = without_known(LOG), VelocityConfig(velocity, start_rad_s=0.3, start_m_s=0.2)
     config = replace(SMALL, particles=2000, velocity=settings)
     filter_ = build_filter(log, config)
-    report = filter_.step(log.frames[0], start_law(log, config), log.frames[0].stamp_ns)
+    report = filter_.step(log.frames[0], start_prior(log, config), log.frames[0].stamp_ns)
     np.testing.assert_array_equal(filter_.particles.state[:, :7], SE3.identity((2000,)))
     np.testing.assert_array_equal(report.estimate.cov[:6, :6], np.zeros((6, 6)))
     expected = np.repeat([0.3, 0.2], 3)

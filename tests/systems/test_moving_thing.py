@@ -21,7 +21,7 @@ from tests.systems.plane_sequences import known_points, sequence
 
 CAMERA = Pinhole(320, 240, 250.0, 250.0, 159.5, 119.5)
 FIRST, COUNT, FRAMES = 60, 60, 130
-BLIND = MonoConfig(search=SearchConfig(trusted_share=0.0))
+BLIND = MonoConfig(search=SearchConfig(trusted_fraction=0.0))
 
 
 @pytest.mark.slow
@@ -50,11 +50,11 @@ def test_what_is_often_missed_only_updates_the_map():
     rows = sensor.measured.landmarks
     doubted = [row for row in rows.tolist() if sensor.table.member[row] < 0][:3]
     assert len(doubted) == 3
-    told = sum(group.z.size for group in sensor._observations(belief) if Part.STATE in group.informs)
+    told = sum(group.z.size for group in sensor._observations(belief) if Part.STATE in group.updates)
     sensor.table.attempts[doubted] += 20
     groups = sensor._observations(belief)
-    assert all(Part.STATE in group.informs or group.informs == {Part.LANDMARK} for group in groups)
-    assert sum(group.z.size for group in groups if Part.STATE in group.informs) == told - 2 * len(doubted)
+    assert all(Part.STATE in group.updates or group.updates == {Part.LANDMARK} for group in groups)
+    assert sum(group.z.size for group in groups if Part.STATE in group.updates) == told - 2 * len(doubted)
 
 
 def test_where_few_are_trusted_all_of_them_tell():

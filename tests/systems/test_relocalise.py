@@ -228,7 +228,7 @@ def test_patches_say_more_exactly_than_corners_where_landmarks_are(relocaliser):
     truth = SE3.retract(path(FRAMES)[60], np.array([0.05, -0.1, 0.2, 0.1, -0.1, 0.15]))
     image = view(texture(), truth)
     start = SE3.compose(belief.state[belief.mode][:7], SE3.inverse(run.world_from_camera[-1]))
-    rows, points = known_places(run.sensor, belief, CONFIG.recovery.depth_share)
+    rows, points = known_places(run.sensor, belief, CONFIG.recovery.depth_fraction)
     seen = CAMERA.project(SE3.inverse_transform(SE3.compose(start, truth), points))
     px, _ = corners(image, np.zeros((0, 2)), 500, 6.0, 16.0)
     away = np.linalg.norm(seen[:, None] - px, axis=-1)
@@ -256,7 +256,7 @@ def lost_sensor(found, reach_px):
 def test_only_ellipses_searched_whole_confirm_a_place():
     narrow, wide = 20.0, 3.0 * CONFIG.search.largest_px
     assert still_lost(lost_sensor([True] * 5 + [False] * 5, [narrow] * 10))  # too few
-    assert still_lost(lost_sensor([True] * 8 + [False] * 10, [narrow] * 18))  # too small a share
+    assert still_lost(lost_sensor([True] * 8 + [False] * 10, [narrow] * 18))  # too small a fraction
     assert not still_lost(lost_sensor([True] * 8 + [False] * 8, [narrow] * 16))
     assert not still_lost(lost_sensor([True] * 8 + [False] * 20, [narrow] * 16 + [wide] * 12))
     assert still_lost(lost_sensor([True] * 16, [wide] * 16))

@@ -1,7 +1,10 @@
 """Settings that are given go over the system's own defaults, not over those of a group's class."""
 
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, is_dataclass
 
+import pytest
+
+from rbpf.errors import InputError
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
@@ -33,3 +36,23 @@ def test_what_a_config_says_of_its_run_is_no_setting_of_any_system():
     """Else a setting of that name would be passed over when the file is read back."""
     for config in (MonoConfig(), StereoConfig(), RangeBearingConfig()):
         assert not set(HEADER) & {item.name for item in fields(config)}
+
+
+def renamed(kind: type, prefix: str = "") -> list[tuple[str, str]]:
+    """Every old name of a setting, with the new one, both with their groups."""
+    found = [(prefix + old, prefix + new) for old, new in getattr(kind, "RENAMED", {}).items()]
+    for item in fields(kind):
+        if is_dataclass(item.default_factory):
+            found += renamed(item.default_factory, f"{prefix}{item.name}.")
+    return found
+
+
+@pytest.mark.parametrize("kind", [MonoConfig, StereoConfig, RangeBearingConfig])
+def test_an_old_name_is_refused_with_the_new_one(kind):
+    known = asdict(kind())
+    for old, new in renamed(kind):
+        value = known
+        for name in new.split("."):
+            value = value[name]
+        with pytest.raises(InputError, match=f"the setting {old} is now called {new}$"):
+            load_settings(kind, "any", None, [f"{old}={value}"], {})

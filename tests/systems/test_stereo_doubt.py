@@ -1,4 +1,4 @@
-"""A camera that may be anywhere: matches with the map are taken if enough of them agree on one motion."""
+"""A camera that may be relocalise_globally: matches with the map are taken if enough of them agree on one motion."""
 
 from dataclasses import replace
 
@@ -9,8 +9,8 @@ from rbpf.lie import SE3
 from rbpf.motion.odometry import Odometry
 from rbpf.sensors.stereo_matching import StereoSift
 from rbpf.systems.filtering import ProposalConfig
-from rbpf.systems.stereo.cloud import Cloud
 from rbpf.systems.stereo.config import StereoConfig, TriggerConfig
+from rbpf.systems.stereo.particle_subsample import ParticleSubsample
 from rbpf.systems.stereo.run import StereoRun, run_images
 from rbpf.systems.stereo.sensor import StereoFrame
 from tests.systems.stereo_sequences import pairs
@@ -37,10 +37,10 @@ def last_features(run: StereoRun):
     return StereoSift(run.front_end.rig, CONFIG.sift, CONFIG.pair).measure(frame.image, frame.right)
 
 
-def spoilt(run: StereoRun, features, share: float):
+def spoilt(run: StereoRun, features, fraction: float):
     """Some features' pixels are exchanged among one another."""
     rng, z = np.random.default_rng(0), features.z.copy()
-    rows = rng.permutation(len(features))[: int(share * len(features))]
+    rows = rng.permutation(len(features))[: int(fraction * len(features))]
     z[rows] = z[np.roll(rows, 1)]
     rig = run.front_end.rig
     return features.measured(rig, z, features.cov, features.scale, features.orientation, features.keys)
@@ -85,7 +85,7 @@ def test_the_cloud_speaks_for_all(settled):
     filter_, sensor = settled.filter, settled.front_end.sensor
     belief = filter_.belief()
     ids = belief.map.ids[:12]
-    cloud = Cloud.of(belief, 60)
+    cloud = ParticleSubsample.of(belief, 60)
     found = cloud.expected(belief, sensor.model, ids)
     mean, cov = belief.project(sensor.model, ids)
     np.testing.assert_allclose(found.mean, mean, atol=0.05)

@@ -56,8 +56,8 @@ def test_beside_the_batch(log):
     assert run.filter.belief().map.ids.size > 100
 
 
-@pytest.mark.parametrize(("kind", "share"), [("truncated", 1.0), ("outliers", 1.0)])
-def test_the_prior_proposal(log, kind, share):
+@pytest.mark.parametrize(("kind", "fraction"), [("truncated", 1.0), ("outliers", 1.0)])
+def test_the_prior_proposal(log, kind, fraction):
     """The filter is better than its odometry, by a density and by S05's truncated form, which gives no evidence.
 
     What the latter clips, a quarter of these true measurements, updates the landmarks all the same.
@@ -69,7 +69,7 @@ def test_the_prior_proposal(log, kind, share):
         proposal=ProposalConfig("prior"),
     )
     run = run_features(log, config)
-    assert rmse(run, run.world_from_camera) < share * rmse(run, run.odometry)
+    assert rmse(run, run.world_from_camera) < fraction * rmse(run, run.odometry)
     assert np.isfinite(run.log_evidence).all() == (kind == "outliers")
 
 

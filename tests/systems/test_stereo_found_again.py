@@ -9,8 +9,8 @@ from rbpf.lie import SE3
 from rbpf.motion.odometry import Odometry
 from rbpf.motion.stereo_vo import VoConfig
 from rbpf.sensors.stereo_matching import StereoSift
-from rbpf.systems.stereo.anywhere import find_anywhere
 from rbpf.systems.stereo.config import RecoveryConfig, StereoConfig, TriggerConfig
+from rbpf.systems.stereo.global_relocalisation import relocalise_globally
 from rbpf.systems.stereo.run import StereoRun, run_images
 from rbpf.systems.stereo.sensor import StereoFrame, log_support
 from rbpf.validation.image_faults import blur_motion, cover_view, salt_and_pepper
@@ -121,14 +121,14 @@ def test_anywhere_in_the_map(settled):
     rig, belief = settled.front_end.rig, settled.filter.belief()
     wrong = features.measured(rig, z, features.cov, features.scale, features.orientation, features.keys)
     for seen, least in ((features, 20), (wrong, 8)):
-        place = find_anywhere(settled.front_end.sensor, StereoFrame(seen), belief, VoConfig())
+        place = relocalise_globally(settled.front_end.sensor, StereoFrame(seen), belief, VoConfig())
         assert place is not None and place[1] >= least
         off = SE3.local(settled.world_from_camera[-1], place[0])
         assert np.linalg.norm(off[:3]) < 0.01 and np.linalg.norm(off[3:]) < RIGHT_M
 
 
 def test_another_wall_is_nowhere_in_the_map(settled):
-    place = find_anywhere(
+    place = relocalise_globally(
         settled.front_end.sensor, StereoFrame(features_of(settled, 1)), settled.filter.belief(), VoConfig()
     )
     assert place is None
@@ -140,7 +140,7 @@ def test_far_from_where_it_was_assumed(settled):
     run.front_end._now = features_of(run)
     belief = run.filter.expect(law)
     assert run.front_end.recognised(belief) < CONFIG.map.agreeing
-    place = run.front_end.anywhere(belief)
+    place = run.front_end.relocalise_globally(belief)
     assert place is not None
     np.testing.assert_allclose(place[0][4:], run.world_from_camera[-1, 4:], atol=RIGHT_M)
 
@@ -155,11 +155,11 @@ def test_how_well_landmarks_are_seen():
     assert log_support(nu, cov, z, rig) == pytest.approx(log_normal - np.log(density))
 
 
-@pytest.mark.parametrize(("share", "texture_seed"), [(1 / 3, 12), (0.5, 0)])
-def test_a_thing_that_moves_does_not_take_it_along(share, texture_seed):
+@pytest.mark.parametrize(("fraction", "texture_seed"), [(1 / 3, 12), (0.5, 0)])
+def test_a_thing_that_moves_does_not_take_it_along(fraction, texture_seed):
     """For some pairs most matches are on the thing. Nothing on it becomes a landmark that weighs."""
     first = 6
-    run = run_images(cover_view(share, first, 8, seed=texture_seed)(pairs(14)), CONFIG)
+    run = run_images(cover_view(fraction, first, 8, seed=texture_seed)(pairs(14)), CONFIG)
     said = [note for note in run.notes if "something in the view moves" in note]
     many = [note for note in said if int(note.split()[2]) < 0.5 * int(note.split()[4])]
     assert len(said) >= 4 and len(many) >= 2

@@ -252,7 +252,7 @@ def test_a_checkpoint_of_another_recording(tmp_path):
         (StereoConfig, {"particles": 0}, "particles must be at least 1"),
         (StereoConfig, {"checkpoint_every": 0}, "checkpoint_every must be at least 1"),
         (MapConfig, {"cloud": 0}, "cloud must be at least one particle"),
-        (MapConfig, {"gate": 0.0}, "expected gate and depth_share above 0"),
+        (MapConfig, {"gate": 0.0}, "expected gate and depth_fraction above 0"),
         (TriggerConfig, {"moved_m": -1.0}, "must not be negative"),
     ],
 )

@@ -5,9 +5,9 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.sensors.sift import SiftConfig
-from rbpf.systems.stereo import measured
+from rbpf.systems.stereo import feature_cache as measured
 from rbpf.systems.stereo.config import StereoConfig
-from rbpf.systems.stereo.measured import measure_pairs
+from rbpf.systems.stereo.feature_cache import cache_features
 from rbpf.systems.stereo.run import run_images
 from tests.systems.stereo_sequences import missing, pairs
 
@@ -26,7 +26,7 @@ def sequence():
 def test_the_same_run(tmp_path):
     """To the last bit, with what was wrong with a pair; a part of it, and from the middle on."""
     told = []
-    kept = measure_pairs(sequence(), CONFIG, tmp_path, lambda done, total: told.append((done, total)))
+    kept = cache_features(sequence(), CONFIG, tmp_path, lambda done, total: told.append((done, total)))
     assert told == [(k, COUNT) for k in range(1, COUNT + 1)]
     ours, plain = run_images(kept, CONFIG), run_images(sequence(), CONFIG)
     for name in ("world_from_camera", "cov", "odometry", "features", "agreeing", "observed"):
@@ -40,13 +40,13 @@ def test_the_same_run(tmp_path):
 
 def test_it_goes_on_where_it_was_interrupted(tmp_path):
     """Chunks that are complete are not measured again; one that is lost is."""
-    measure_pairs(sequence(), CONFIG, tmp_path)
+    cache_features(sequence(), CONFIG, tmp_path)
     files = sorted(tmp_path.glob("*.npz"))
     assert len(files) == 3
     before = files[1].read_bytes()
     files[1].unlink()
     told = []
-    measure_pairs(sequence(), CONFIG, tmp_path, lambda done, _total: told.append(done))
+    cache_features(sequence(), CONFIG, tmp_path, lambda done, _total: told.append(done))
     assert told == [4, 5, 6]
     again, first = (np.load(file) for file in (files[1], files[0]))
     assert again["count"].tolist()[1] == -1 and (first["count"] > 0).all()
@@ -54,8 +54,8 @@ def test_it_goes_on_where_it_was_interrupted(tmp_path):
 
 
 def test_features_of_another_recording_are_refused(tmp_path):
-    measure_pairs(sequence(), CONFIG, tmp_path)
+    cache_features(sequence(), CONFIG, tmp_path)
     with pytest.raises(InputError, match="another recording or with other settings"):
-        measure_pairs(pairs(COUNT + 1), CONFIG, tmp_path)
+        cache_features(pairs(COUNT + 1), CONFIG, tmp_path)
     with pytest.raises(InputError, match="another recording or with other settings"):
-        measure_pairs(sequence(), StereoConfig(sift=SiftConfig(length=128)), tmp_path)
+        cache_features(sequence(), StereoConfig(sift=SiftConfig(length=128)), tmp_path)

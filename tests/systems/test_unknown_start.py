@@ -64,10 +64,10 @@ def test_frames_are_adjusted_ever_less_often(monkeypatch):
         return redrawn(self, filter_, features, frames, path)
 
     monkeypatch.setattr(UnknownStart, "redrawn", counted)
-    run(LOG, replace(SMALL, start=StartConfig(first=5, growth=1.5, depth_share=1e-6)))
+    run(LOG, replace(SMALL, start=StartConfig(first=5, growth=1.5, depth_fraction=1e-6)))
     assert counts == [5, 8, 12, 18, 27]
     counts.clear()
-    run(LOG, replace(SMALL, start=StartConfig(first=5, growth=1.5, depth_share=0.5)))
+    run(LOG, replace(SMALL, start=StartConfig(first=5, growth=1.5, depth_fraction=0.5)))
     assert counts[0] == 5 and counts[-1] < 27
     counts.clear()
     run(desk(), SMALL)
@@ -205,7 +205,7 @@ def test_a_frame_without_an_image_is_not_what_is_drawn_after(drawn):
 
 def test_what_the_new_map_has_not_is_not_looked_for(drawn):
     """Features that were started in frames that took no part."""
-    done = run_images(sequence(40), replace(SMALL, start=StartConfig(frames=5, depth_share=1e-6)))
+    done = run_images(sequence(40), replace(SMALL, start=StartConfig(frames=5, depth_fraction=1e-6)))
     table = done.sensor.table
     held = set(done.filter.belief().catalogue.values())
     assert drawn and set(np.flatnonzero(table.alive).tolist()) <= held

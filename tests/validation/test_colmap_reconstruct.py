@@ -61,7 +61,7 @@ def made(points=None, metric=False, scale=1.0):
 @pytest.mark.slow
 def test_a_rendered_desk_is_reconstructed_and_is_right(desk, found):
     sequence, _ = desk
-    assert found.share >= 0.9
+    assert found.fraction >= 0.9
     compared = compare_with_truth(found, sequence.truth)
     assert compared.path.rmse < 0.01 * compared.extent_m
     assert len(found.points) > 100
@@ -73,7 +73,7 @@ def test_a_desk_through_a_fisheye_lens_is_reconstructed_and_is_right(tmp_path):
     lens = Pinhole(320, 240, 131.0, 131.0, 159.5, 119.5, (-0.03, 0.02, -0.012, 0.002), "equidistant")
     sequence, options = rendered(tmp_path / "wide", 150, lens)
     found = reconstruct(sequence, options)
-    assert found.share >= 0.9
+    assert found.fraction >= 0.9
     compared = compare_with_truth(found, sequence.truth)
     assert compared.path.rmse < 0.01 * compared.extent_m
     assert found.as_dict()["reprojection_error_mean_px"] < 1.0
@@ -214,7 +214,7 @@ def test_photos_with_measured_poses_are_met_within_one_per_cent(data_dir):
     sequence = open_images(data_dir / "photos_fountain_p11")
     found = reconstruct(sequence, ReconstructionOptions(every=1, features=2000))
     compared = compare_with_truth(found, sequence.truth)
-    assert found.share == 1.0
+    assert found.fraction == 1.0
     assert compared.path.max < 0.01 * compared.extent_m
     assert compared.path.rmse < 0.01, "a laser scanner's truth is good to a centimetre"
 
@@ -227,6 +227,6 @@ def test_the_kitchen_is_reconstructed_as_well_as_by_the_reference(data_dir):
     points = MapSummary(np.arange(2), np.zeros((2, 3)), np.repeat(np.eye(3)[None], 2, axis=0))
     estimate = PathAndMap(truth.stamps_ns, truth.world_from_camera, np.empty((0, 6, 6)), points)
     compared = compare_with_colmap(estimate, sequence, ReconstructionOptions(every=5, features=2048))
-    assert compared.run.reconstruction.share >= 0.9
+    assert compared.run.reconstruction.fraction >= 0.9
     assert compared.truth.path.rmse < 0.05, "the reference reconstruction is 0.038 m from this truth"
     assert compared.run.path.rmse == pytest.approx(compared.truth.path.rmse, rel=0.05)

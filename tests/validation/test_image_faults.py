@@ -96,9 +96,9 @@ def test_blur_is_the_mean_along_a_line(whole):
 
 def test_something_passes_through_the_view(whole):
     before, after = images(whole), images(cover_view(1 / 3, 2, 8)(whole))
-    share = [(a != b).mean() for a, b in zip(before, after, strict=True)]
-    assert share[1] == 0.0 and share[10] == 0.0
-    assert max(share) == pytest.approx(1 / 3, abs=0.02)
+    fraction = [(a != b).mean() for a, b in zip(before, after, strict=True)]
+    assert fraction[1] == 0.0 and fraction[10] == 0.0
+    assert max(fraction) == pytest.approx(1 / 3, abs=0.02)
     middle = [
         np.flatnonzero((a != b).any(axis=0)).mean() for a, b in zip(before[2:10], after[2:10], strict=True)
     ]

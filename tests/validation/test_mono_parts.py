@@ -10,7 +10,7 @@ from rbpf.sensors.features import FeatureFrame, FeatureLog
 from rbpf.systems.mono.run import run
 from rbpf.validation.mono_batch import Batch, adjust_log
 from rbpf.validation.mono_parts import (
-    DEPTH_SHARE,
+    DEPTH_FRACTION,
     GivenDepths,
     agreeing_matches,
     batch_depths,
@@ -68,8 +68,8 @@ def test_depths_are_the_true_ones(log, batch):
         for name in frame.landmarks.tolist():
             first.setdefault(name, SE3.inverse_transform(pose, truth.landmarks[name])[2])
     assert len(depths) > 30
-    share = np.array([depths[name] / first[name] - 1.0 for name in depths])
-    assert np.median(np.abs(share)) < 0.02
+    fraction = np.array([depths[name] / first[name] - 1.0 for name in depths])
+    assert np.median(np.abs(fraction)) < 0.02
 
 
 def test_landmarks_start_at_the_given_depths(log, batch):
@@ -81,4 +81,4 @@ def test_landmarks_start_at_the_given_depths(log, batch):
     records = belief.read(np.array(list(rays.values())))
     rho = np.array([1.0 / depths[name] for name in rays])
     np.testing.assert_allclose(records.mean[0, :, 2], rho, rtol=1e-9)
-    np.testing.assert_allclose(np.sqrt(records.cov[0, :, 2, 2]), DEPTH_SHARE * rho, rtol=1e-6)
+    np.testing.assert_allclose(np.sqrt(records.cov[0, :, 2, 2]), DEPTH_FRACTION * rho, rtol=1e-6)

@@ -181,13 +181,13 @@ def test_a_near_texture_is_interpolated() -> None:
 @pytest.mark.parametrize("grid", [1, 2, 3])
 def test_an_edge_covers_its_share_of_the_pixel(grid: int) -> None:
     white = np.full((4, 4), 200, dtype=np.uint8)
-    shares, rays = np.linspace(0.05, 0.95, 10), grid * grid
-    for share in shares:
-        edge = (80.0 - 0.5 + share - CAMERA.cx) / CAMERA.fx
+    fractions, rays = np.linspace(0.05, 0.95, 10), grid * grid
+    for fraction in fractions:
+        edge = (80.0 - 0.5 + fraction - CAMERA.cx) / CAMERA.fx
         sheet = Rectangle(np.array([edge - 2.0, -2.0, 1.0]), 2.0 * AXES[0], 4.0 * AXES[1], white)
         row = Renderer([sheet], CAMERA, grid).image(SE3.identity())[60]
         assert row[79] == 200.0 and row[81] == 0.0
-        assert abs(row[80] / 200.0 - share) <= 0.5 / rays + 1e-6
+        assert abs(row[80] / 200.0 - fraction) <= 0.5 / rays + 1e-6
 
 
 @pytest.mark.parametrize("side", [1, 2, 3, 8])

@@ -105,9 +105,9 @@ def test_a_sweep_tells_median_and_range_over_the_seeds(tmp_path, monkeypatch):
     first, alone, *others = map(list, sweep(None, base, (1, 2, 4)))
     assert [first[0], *(row[0] for row in others)] == list(settings(base))
     assert {len(row) for row in (first, alone, *others)} == {len(HEADER)}
-    share = np.sqrt(4 / 5)
-    assert first[1:5] == pytest.approx([0.2 * share, 0.1 * share, 0.4 * share, 0.2])
+    fraction = np.sqrt(4 / 5)
+    assert first[1:5] == pytest.approx([0.2 * fraction, 0.1 * fraction, 0.4 * fraction, 0.2])
     assert first[5:8] == pytest.approx([4.0, 1.0, 16.0]) and first[9] == 0.5
     assert alone[0] == "odometry alone" and alone[1:5] == pytest.approx(
-        [2.0 * share, share, 4.0 * share, 2.0]
+        [2.0 * fraction, fraction, 4.0 * fraction, 2.0]
     )

@@ -21,7 +21,7 @@ def tracks(data_dir):
     return stereo_tracks.read(data_dir / "gtsam_stereo_vo")
 
 
-def first_sightings(tracks):
+def first_observations(tracks):
     """Where each landmark was when it was first seen, on the guessed path."""
     points = {}
     for frame, pose in zip(tracks.log.frames, tracks.world_from_camera, strict=True):
@@ -37,7 +37,7 @@ def test_the_reference_figures_and_the_batch_solution(tracks):
     `solve_features` adds weak priors for what has no parallax, 342 landmarks here; they change the path by less than
     a tenth of a millimetre, and the error by 0.11 %.
     """
-    log, points, guess = tracks.log, first_sightings(tracks), tracks.world_from_camera
+    log, points, guess = tracks.log, first_observations(tracks), tracks.world_from_camera
     assert (len(log.frames), sum(len(frame.z) for frame in log.frames), len(points)) == (77, 52544, 15638)
     table = sightings_of(log)
     stamps = np.array([frame.stamp_ns for frame in log.frames], dtype=np.int64)

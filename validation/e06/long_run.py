@@ -48,7 +48,7 @@ def reproduce(setting: Setting) -> list[Row]:
 
 def _rows(run: VideoRun, cpu: np.ndarray) -> list[Row]:
     counted = run.seconds[WARM_UP:]
-    share, slowest = float((counted <= FRAME_S).mean()), 1e3 * float(counted.max())
+    fraction, slowest = float((counted <= FRAME_S).mean()), 1e3 * float(counted.max())
     held = int(run.sightings.frames[-1].held.sum())
     found = float(run.found.mean())
     points, rays = run.sightings.frames[-1].held[0].tolist()
@@ -62,8 +62,8 @@ def _rows(run: VideoRun, cpu: np.ndarray) -> list[Row]:
             f"{held} ({points} points, {rays} rays)", float(held), held >= LANDMARKS),
         Row("Fig. 6", "observations per frame", f"{LEAST} to {MOST}",
             f"mean {found:.1f}, {within:.0%} of the frames within", found, LEAST <= found <= MOST),
-        Row("Fig. 6", f"share of frames under 33 ms ({run.sequence.camera.width} px wide)", "all (30 Hz)",
-            f"{share:.1%}; {median}; {own}", share, share == 1.0),
+        Row("Fig. 6", f"fraction of frames under 33 ms ({run.sequence.camera.width} px wide)", "all (30 Hz)",
+            f"{fraction:.1%}; {median}; {own}", fraction, fraction == 1.0),
         Row("Fig. 6", "frames in which the camera was lost", "none told", f"{lost}", float(lost), lost == 0),
     ]  # fmt: skip
 

@@ -74,7 +74,7 @@ def reproduce(setting: Setting) -> list[Row]:
 
 
 def _rows(closure: Closure, error: np.ndarray, truth: np.ndarray, full: int) -> list[Row]:
-    share = closure.again / closure.first
+    fraction = closure.again / closure.first
     closed = closure.back >= 0
     before = float(error[closure.back - 1]) if closed else float("nan")
     after = float(np.median(error[-10:])) if closed else float("nan")
@@ -87,8 +87,8 @@ def _rows(closure: Closure, error: np.ndarray, truth: np.ndarray, full: int) -> 
             f"landmarks of the start found again after {away} frames out of sight",
             "re-acquired",
             f"{closure.again} of {closure.first}",
-            share,
-            share >= 0.5,
+            fraction,
+            fraction >= 0.5,
         ),
         Row(
             "Fig. 5",

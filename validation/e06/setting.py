@@ -14,7 +14,7 @@ from rbpf.validation.simulation.textured_scene import ImageWorld
 
 QUICK_WIDTH = 320
 FOCAL_WIDTHS = 0.82
-"""Focal length as a share of the image's width: 63 degrees are seen."""
+"""Focal length as a fraction of the image's width: 63 degrees are seen."""
 
 
 @dataclass(frozen=True)

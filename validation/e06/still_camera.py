@@ -63,11 +63,11 @@ def reproduce(setting: Setting) -> list[Row]:
 
 def _row(found: dict[str, Posterior], treatment: str) -> Row:
     off, here = found["off"], found[treatment]
-    share = here.pose / off.pose
+    fraction = here.pose / off.pose
     sigma = [1e3 * np.cbrt(one.position) for one in (off, here)]
-    ours = f"pose volume x {share:.2g}; σ {sigma[0]:.0f} to {sigma[1]:.0f} mm; NEES {off.nees:.1f} and {here.nees:.1f}"
-    return Row("Fig. 9", f"camera at rest, {TREATMENTS[treatment]} against none", "far better constrained", ours, share,
-               share < 0.5)  # fmt: skip
+    ours = f"pose volume x {fraction:.2g}; σ {sigma[0]:.0f} to {sigma[1]:.0f} mm; NEES {off.nees:.1f} and {here.nees:.1f}"
+    return Row("Fig. 9", f"camera at rest, {TREATMENTS[treatment]} against none", "far better constrained", ours, fraction,
+               fraction < 0.5)  # fmt: skip
 
 
 def _draw(found: dict[str, Posterior], truth: np.ndarray) -> Any:

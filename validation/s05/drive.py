@@ -8,13 +8,13 @@ from rbpf.errors import InputError
 from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
 from rbpf.sensors.readers.images import open_stereo
 from rbpf.systems.stereo.config import StereoConfig, TriggerConfig
-from rbpf.systems.stereo.measured import MeasuredSequence, measure_pairs
+from rbpf.systems.stereo.feature_cache import CachedSequence, cache_features
 from rbpf.validation.simulation.exposure import Imaging
 from rbpf.validation.simulation.images import simulate_images
 from rbpf.validation.simulation.textured_lab import LabDrive, TexturedLab
 
 FOCAL, BASELINE_M = 0.78125, 0.12
-"""Focal length as a share of the image's width: that of `rbpf simulate lab`."""
+"""Focal length as a fraction of the image's width: that of `rbpf simulate lab`."""
 
 NOISE_STD = 5.0
 """Grey levels. With the other defaults of the simulator as many features agree from pair to pair as in a real room."""
@@ -61,7 +61,7 @@ class Setting:
 
 def measured_drive(
     setting: Setting, told: Callable[[str, int, int], None] = lambda what, done, total: None
-) -> MeasuredSequence:
+) -> CachedSequence:
     """The features of the drive; images and features that are there already are taken as they are.
 
     Args:
@@ -90,7 +90,7 @@ def measured_drive(
         have = f"{setting.images} has {len(sequence)} pairs, {setting.frames} are asked for"
         raise InputError(f"{have}: delete it, or take another --out")
     features = setting.out / "features"
-    whole = measure_pairs(
+    whole = cache_features(
         sequence, setting.config(), features, lambda done, total: told("measured", done, total)
     )
     return whole.first(setting.frames)

@@ -8,7 +8,7 @@ import numpy as np
 from rbpf.lie import SE3
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig
 from rbpf.systems.stereo.config import StereoConfig
-from rbpf.systems.stereo.measured import MeasuredSequence
+from rbpf.systems.stereo.feature_cache import CachedSequence
 from rbpf.systems.stereo.run import StereoRun, run_images
 from rbpf.validation.consistency import whitened_errors
 from rbpf.validation.s05.record import rms
@@ -40,7 +40,7 @@ def settings(base: StereoConfig) -> dict[str, StereoConfig]:
 
 
 def sweep(
-    drive: MeasuredSequence, base: StereoConfig, seeds: Sequence[int] = (0,)
+    drive: CachedSequence, base: StereoConfig, seeds: Sequence[int] = (0,)
 ) -> Iterator[list[str | float]]:
     """A row for each setting, and one for the odometry alone: medians over the seeds of the filter, least and most."""
     for name, config in settings(base).items():

@@ -40,8 +40,8 @@ class Wave:
         """
         shape = (len(bound), TERMS)
         frequency = np.exp(rng.uniform(np.log(band_hz[0]), np.log(band_hz[1]), shape))
-        share = 1.0 / frequency
-        amplitude = bound[:, None] * share / share.sum(axis=1, keepdims=True)
+        fraction = 1.0 / frequency
+        amplitude = bound[:, None] * fraction / fraction.sum(axis=1, keepdims=True)
         return cls(amplitude, frequency, rng.uniform(0.0, 2.0 * np.pi, shape))
 
     def __call__(self, seconds: np.ndarray) -> np.ndarray:

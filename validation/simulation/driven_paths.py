@@ -1,6 +1,6 @@
 """Smooth paths of a robot on two wheels, which goes where it faces: straights, bends, turns on the spot, rests.
 
-Curvature and acceleration are continuous. In a bend of length L through the angle Θ the heading is Θ W(x) at the share
+Curvature and acceleration are continuous. In a bend of length L through the angle Θ the heading is Θ W(x) at the fraction
 x of its length, with W = 10 x³ - 15 x⁴ + 6 x⁵: the curvature, its first derivative and those of the neighbouring
 straights, which are zero, agree at both ends.
 """
@@ -15,7 +15,7 @@ from rbpf.lie import SE2
 from rbpf.validation.simulation.camera_paths import eased
 
 KNOTS = 257
-"""Of the table that gives the share of a bend for the way along it."""
+"""Of the table that gives the fraction of a bend for the way along it."""
 
 NODES = 24
 """Of the Gauss-Legendre rule that integrates a position along a bend: exact to the last digits up to half a turn."""
@@ -75,8 +75,8 @@ class Drive:
         """
         self._length = np.array([move.length_m for move in moves])
         self._turn = np.array([move.turn_rad for move in moves])
-        shares, ways = zip(*[_table(move, arm_m) for move in moves], strict=True)
-        self._shares, self._ways = shares, ways
+        fractions, ways = zip(*[_table(move, arm_m) for move in moves], strict=True)
+        self._fractions, self._ways = fractions, ways
         self._ends = np.cumsum([way[-1] for way in ways])
         self._starts = np.concatenate([np.asarray(start, float)[None], np.zeros((len(moves), 3))])
         for k in range(len(moves)):
@@ -87,15 +87,15 @@ class Drive:
         """Where the robot is at times (T,), which lie between 0 and the end."""
         progress = self._progress(np.asarray(seconds, float))
         move = np.minimum(np.searchsorted(self._ends, progress, side="right"), len(self._ends) - 1)
-        share = np.empty_like(progress)
+        fraction = np.empty_like(progress)
         poses = np.empty((len(progress), 3))
         before = np.concatenate([[0.0], self._ends])
         for k in np.unique(move).tolist():
             rows = move == k
-            share[rows] = _share(self._ways[k], self._shares[k], progress[rows] - before[k])
-            poses[rows] = SE2.compose(self._starts[k], self._within(k, share[rows]))
-        way = np.concatenate([[0.0], np.cumsum(self._length)])[move] + self._length[move] * share
-        turned = np.concatenate([[0.0], np.cumsum(self._turn)])[move] + self._turned(move, share)
+            fraction[rows] = _share(self._ways[k], self._fractions[k], progress[rows] - before[k])
+            poses[rows] = SE2.compose(self._starts[k], self._within(k, fraction[rows]))
+        way = np.concatenate([[0.0], np.cumsum(self._length)])[move] + self._length[move] * fraction
+        turned = np.concatenate([[0.0], np.cumsum(self._turn)])[move] + self._turned(move, fraction)
         return Travelled(poses, way, turned)
 
     @property
@@ -128,17 +128,17 @@ class Drive:
         done = self._pace * eased(np.where(early, time, self._lasts[leg] - time), self._ramp_s)
         return np.where(early, self._edges[leg] + done, self._edges[leg + 1] - done)
 
-    def _turned(self, move: np.ndarray, share: np.ndarray) -> np.ndarray:
+    def _turned(self, move: np.ndarray, fraction: np.ndarray) -> np.ndarray:
         """Change of heading (T,) since the start of a move."""
-        return self._turn[move] * np.where(self._length[move] > 0.0, _bent(share), share)
+        return self._turn[move] * np.where(self._length[move] > 0.0, _bent(fraction), fraction)
 
-    def _within(self, k: int, share: np.ndarray) -> np.ndarray:
-        """Poses (T, 3) at shares (T,) of move k, seen from its start."""
+    def _within(self, k: int, fraction: np.ndarray) -> np.ndarray:
+        """Poses (T, 3) at fractions (T,) of move k, seen from its start."""
         node, weight = np.polynomial.legendre.leggauss(NODES)
-        at = 0.5 * share[:, None] * (node + 1.0)
+        at = 0.5 * fraction[:, None] * (node + 1.0)
         heading = self._turn[k] * _bent(at)
-        step = 0.5 * self._length[k] * share[:, None] * weight
-        turned = self._turned(np.full(len(share), k), share)
+        step = 0.5 * self._length[k] * fraction[:, None] * weight
+        turned = self._turned(np.full(len(fraction), k), fraction)
         return np.stack(
             [turned, (step * np.cos(heading)).sum(axis=1), (step * np.sin(heading)).sum(axis=1)], axis=-1
         )
@@ -176,31 +176,31 @@ def along_corners(corners: Sequence[Sequence[float]], bend_m: float) -> tuple[np
 
 
 def _tangent(turn_rad: float) -> float:
-    """Distance of a bend's ends from the corner that it rounds, as a share of its length."""
+    """Distance of a bend's ends from the corner that it rounds, as a fraction of its length."""
     node, weight = np.polynomial.legendre.leggauss(NODES)
     chord = 0.5 * weight @ np.cos(turn_rad * (_bent(0.5 * (node + 1.0)) - 0.5))
     return float(chord / (2.0 * np.cos(0.5 * turn_rad)))
 
 
-def _bent(share: np.ndarray) -> np.ndarray:
-    """W: the part of a bend's turn that is done at a share of its length."""
-    return np.asarray(share**3 * (10.0 - 15.0 * share + 6.0 * share**2))
+def _bent(fraction: np.ndarray) -> np.ndarray:
+    """W: the part of a bend's turn that is done at a fraction of its length."""
+    return np.asarray(fraction**3 * (10.0 - 15.0 * fraction + 6.0 * fraction**2))
 
 
 def _table(move: Move, arm_m: float) -> tuple[np.ndarray, np.ndarray]:
     """Shares (KNOTS,) of a move and the way to them, turning included."""
-    share = np.linspace(0.0, 1.0, KNOTS)
+    fraction = np.linspace(0.0, 1.0, KNOTS)
     if move.length_m == 0.0:
-        return share, arm_m * abs(move.turn_rad) * share
+        return fraction, arm_m * abs(move.turn_rad) * fraction
     node, weight = np.polynomial.legendre.leggauss(NODES)
-    middle = share[:-1, None] + 0.5 * (node + 1.0) / (KNOTS - 1)
+    middle = fraction[:-1, None] + 0.5 * (node + 1.0) / (KNOTS - 1)
     turning = arm_m * move.turn_rad * 30.0 * (middle * (1.0 - middle)) ** 2
     pieces = np.hypot(move.length_m, turning) @ weight * 0.5 / (KNOTS - 1)
-    return share, np.concatenate([[0.0], np.cumsum(pieces)])
+    return fraction, np.concatenate([[0.0], np.cumsum(pieces)])
 
 
-def _share(way: np.ndarray, share: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+def _share(way: np.ndarray, fraction: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     """Shares (T,) of a move for ways (T,) along it."""
     from scipy.interpolate import CubicSpline
 
-    return np.clip(CubicSpline(way, share)(wanted), 0.0, 1.0)
+    return np.clip(CubicSpline(way, fraction)(wanted), 0.0, 1.0)

@@ -9,7 +9,12 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.pinhole import Pinhole
 from rbpf.validation.simulation.camera_paths import Wave
-from rbpf.validation.simulation.limits import check_counts, check_not_negative, check_positive, check_shares
+from rbpf.validation.simulation.limits import (
+    check_counts,
+    check_fractions,
+    check_not_negative,
+    check_positive,
+)
 from rbpf.validation.simulation.render import Renderer
 from rbpf.validation.simulation.textured_scene import TexturedScene, cast
 
@@ -32,10 +37,10 @@ class Imaging:
 
     Attributes:
         noise_std: of the sensor, grey levels.
-        exposure_drift: greatest change of the exposure, as a share; it goes up and down within seconds.
+        exposure_drift: greatest change of the exposure, as a fraction; it goes up and down within seconds.
         lens_px: standard deviation of the lens's point spread; 0 is sharper than any lens.
         blur_s: the shutter is open this long, half before and half after the stamp.
-        vignetting: share of the light that is missing in the corner farthest from the principal point.
+        vignetting: fraction of the light that is missing in the corner farthest from the principal point.
         blackout: frames in which the light is out, counted from 0.
         grid: rays per pixel along each side.
         depth: whether depth images are written.
@@ -64,7 +69,7 @@ class Imaging:
         if self.jpeg > 100:
             raise InputError(f"jpeg must be a quality of 1 to 100, or 0 for PNG, got {self.jpeg}")
         check_not_negative(self, "noise_std", "lens_px", "blur_s")
-        check_shares(self, "exposure_drift", "vignetting")
+        check_fractions(self, "exposure_drift", "vignetting")
         check_positive(self, "known_std_m")
         if 0 < self.known < 4:
             raise InputError(f"known must be at least 4 points, or 0 for none, got {self.known}")
@@ -165,11 +170,11 @@ class Shutter:
         return np.clip(np.rint(signal), 0, 255).astype(np.uint8)
 
 
-def _vignette(camera: Pinhole, share: float) -> np.ndarray:
+def _vignette(camera: Pinhole, fraction: float) -> np.ndarray:
     """(H, W) float32 factors that fall with the square of the distance from the principal point."""
     rows, columns = np.indices((camera.height, camera.width))
     square = (columns - camera.cx) ** 2 + (rows - camera.cy) ** 2
-    return (1.0 - share * square / square.max()).astype(np.float32)
+    return (1.0 - fraction * square / square.max()).astype(np.float32)
 
 
 def _probes(camera: Pinhole) -> np.ndarray:

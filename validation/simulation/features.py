@@ -15,10 +15,10 @@ from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
 from rbpf.validation.simulation.feature_tracks import Tracker
 from rbpf.validation.simulation.limits import (
     check_counts,
+    check_fractions,
     check_not_negative,
     check_order,
     check_positive,
-    check_shares,
 )
 from rbpf.validation.simulation.scene import PointWorld, Scene, hidden
 
@@ -30,10 +30,10 @@ CERTAIN = 5.0
 to be cut off at the border."""
 
 RADIUS = 0.35
-"""Of the ellipse near which the known points are chosen, as a share of the image's size: in its middle half."""
+"""Of the ellipse near which the known points are chosen, as a fraction of the image's size: in its middle half."""
 
 LEAST_SPREAD = 0.05
-"""Known points are on a line if they extend, in the image, less than this share of their length to the side."""
+"""Known points are on a line if they extend, in the image, less than this fraction of their length to the side."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class Measuring:
         check_counts(self, {"measurements": 1, "known": 0, "new_per_frame": 0, "rest_frames": 0})
         check_positive(self, "noise_px", "farthest_m")
         check_not_negative(self, "known_std_m", "border_px", "nearest_m")
-        check_shares(self, "outlier_rate", "dropout", "turnover")
+        check_fractions(self, "outlier_rate", "dropout", "turnover")
         check_order(self, "nearest_m", "farthest_m")
 
 

@@ -73,7 +73,7 @@ class Furniture:
         Args:
             room: (2, 3) least and greatest corner.
             wall: 0 to 3, those at the greatest y and x, then at the least y and x.
-            place: of its middle, as shares of the wall from the left and from the top.
+            place: of its middle, as fractions of the wall from the left and from the top.
             size: m.
             paint: draws it.
         """

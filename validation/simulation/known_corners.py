@@ -12,22 +12,22 @@ from rbpf.validation.simulation.render import Renderer
 from rbpf.validation.simulation.textured_scene import Rectangle, TexturedScene, cast
 
 MIDDLE = 0.15
-"""The corners keep this share of the image's size from its border: they stay in view when the camera begins to move."""
+"""The corners keep this fraction of the image's size from its border: they stay in view when the camera begins to move."""
 
 FLAT = 0.025
-"""All within this share of the image's width of a corner lies in one plane: its patch can be warped."""
+"""All within this fraction of the image's width of a corner lies in one plane: its patch can be warped."""
 
 THICK_M, PARALLEL = 0.005, 0.01
 """Sheets nearer to each other than this, with normals nearer than this [rad], lie in one plane."""
 
 CANDIDATES, QUALITY = 300, 0.01
-"""Most corners to look for, and the least quality of one, as a share of the best (J. Shi, C. Tomasi 1994)."""
+"""Most corners to look for, and the least quality of one, as a fraction of the best (J. Shi, C. Tomasi 1994)."""
 
 STRONGEST = 0.5
 """Share of the corners found that are strong enough, if they are as many as asked for."""
 
 LEAST_SPREAD = 0.05
-"""Corners are on a line if they extend, in the image, less than this share of their length to the side."""
+"""Corners are on a line if they extend, in the image, less than this fraction of their length to the side."""
 
 
 @dataclass(frozen=True)

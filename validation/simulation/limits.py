@@ -29,7 +29,7 @@ def check_not_negative(options: object, *names: str) -> None:
             raise InputError(f"{name} must be zero or a positive number, got {value!r}")
 
 
-def check_shares(options: object, *names: str) -> None:
+def check_fractions(options: object, *names: str) -> None:
     """Refuses what is no probability below one."""
     for name in names:
         value = getattr(options, name)

@@ -12,10 +12,10 @@ from rbpf.errors import InputError
 from rbpf.validation.simulation.camera_paths import Wave, eased, frame_seconds, looking, shaken, slowed
 from rbpf.validation.simulation.limits import (
     check_counts,
+    check_fractions,
     check_not_negative,
     check_order,
     check_positive,
-    check_shares,
 )
 from rbpf.validation.simulation.scene import Scene, frame_stamps, outside, populated
 
@@ -26,7 +26,7 @@ WRIST_HZ = 0.8, 2.0
 TREMOR_HZ = 1.0, 3.0
 
 RISE = 0.25
-"""How far the camera goes up and down about the point looked at, as a share of how far it goes to the side."""
+"""How far the camera goes up and down about the point looked at, as a fraction of how far it goes to the side."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class DeskWorld:
         farthest_m: greatest distance.
         elevation_deg: the camera looks down at this angle, on the average.
         sweep_deg: greatest turn about the point looked at to either side; a quarter as much up and down.
-        wander: greatest shift of the point looked at, as a share of the box's size.
+        wander: greatest shift of the point looked at, as a fraction of the box's size.
         wrist_deg: greatest rotation by the wrist, per axis.
         speed_m_s: highest speed.
         turn_rad_s: highest rate of turn.
@@ -53,7 +53,7 @@ class DeskWorld:
         tremor_deg: greatest rotation by it, per axis.
         start_s: the camera reaches its pace after this time.
         blocks: number of opaque things on the desk.
-        renewal: share of the points that disappear for good per second; others appear elsewhere.
+        renewal: fraction of the points that disappear for good per second; others appear elsewhere.
     """
 
     frames: int = 1000
@@ -79,7 +79,7 @@ class DeskWorld:
         check_counts(self, {"frames": 2, "points": 1, "blocks": 0})
         check_positive(self, "rate_hz", "nearest_m", "farthest_m", "speed_m_s", "turn_rad_s")
         check_not_negative(self, "sweep_deg", "wander", "wrist_deg", "tremor_m", "tremor_deg", "start_s")
-        check_shares(self, "renewal")
+        check_fractions(self, "renewal")
         if not all(0.0 < size < np.inf for size in self.size_m):
             raise InputError(f"size_m must be three positive numbers, got {self.size_m}")
         check_order(self, "nearest_m", "farthest_m")

@@ -1,7 +1,7 @@
 """Numba only: casts the ray of every pixel at textured rectangles, tile by tile.
 
 With M = [across, down, corner] of a rectangle in the camera's frame, a ray (u, v, 1) hits it at depth z and at the
-shares (s, t) of its sides where M (s, t, 1) = z (u, v, 1). So H = M⁻¹ takes the ray to (s, t, 1)/z; its last row gives
+fractions (s, t) of its sides where M (s, t, 1) = z (u, v, 1). So H = M⁻¹ takes the ray to (s, t, 1)/z; its last row gives
 1/z.
 """
 
@@ -126,7 +126,7 @@ def _nearest(
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _bilinear(texels: np.ndarray, start: int, height: int, width: int, s: float, t: float) -> float:
-    """A level of a texture at the shares (s, t); round it lies a border of one texel, equal to its outermost texels."""
+    """A level of a texture at the fractions (s, t); round it lies a border of one texel, equal to its outermost texels."""
     x, y = s * width + 0.5, t * height + 0.5
     i, j = int(x), int(y)
     a, b = x - i, y - j

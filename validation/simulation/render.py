@@ -17,7 +17,7 @@ class Renderer:
     """Takes pictures of rectangles with one camera.
 
     Grey levels are proportional to light. A pixel is the mean of grid² rays on a rotated grid within it; each reads
-    its texture at the level of detail of its share of the pixel, between the two nearest levels.
+    its texture at the level of detail of its fraction of the pixel, between the two nearest levels.
     """
 
     def __init__(self, rectangles: Sequence[Rectangle], camera: Pinhole, grid: int = 2) -> None:
@@ -98,11 +98,11 @@ class Renderer:
         local = SE3.inverse_transform(world_from_camera, corners).reshape(-1, 4, 3)
         following = np.roll(local, -1, axis=1)
         with np.errstate(all="ignore"):
-            share = (NEAR_M - local[..., 2:]) / (following[..., 2:] - local[..., 2:])
-            cut = local + share * (following - local)
+            fraction = (NEAR_M - local[..., 2:]) / (following[..., 2:] - local[..., 2:])
+            cut = local + fraction * (following - local)
             outline = np.concatenate([local, cut], axis=1)
             seen = np.concatenate(
-                [local[..., 2] >= NEAR_M, (share[..., 0] >= 0.0) & (share[..., 0] <= 1.0)], axis=1
+                [local[..., 2] >= NEAR_M, (fraction[..., 0] >= 0.0) & (fraction[..., 0] <= 1.0)], axis=1
             )
             depth = np.where(seen, np.maximum(outline[..., 2], NEAR_M), np.nan)[..., None]
             uv = outline[..., :2] / depth

@@ -17,7 +17,7 @@ from rbpf.sensors.features import FeatureFrame, FeatureLog, KnownPoints
 from rbpf.sensors.pinhole import Pinhole
 from rbpf.sensors.readers.log import Frame, RobotLog
 from rbpf.validation.simulation.camera_paths import looking
-from rbpf.validation.simulation.limits import check_counts, check_positive, check_shares
+from rbpf.validation.simulation.limits import check_counts, check_fractions, check_positive
 
 CAMERA = Pinhole(320, 240, 260.0, 260.0, 159.5, 119.5)
 KNOWN = 5
@@ -45,7 +45,7 @@ class Turnover:
     def __post_init__(self) -> None:
         """Checks that there is something to see."""
         check_counts(self, {"points": 1, "measurements": 1})
-        check_shares(self, "renewal")
+        check_fractions(self, "renewal")
 
 
 class Seen(NamedTuple):

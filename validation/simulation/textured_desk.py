@@ -56,7 +56,7 @@ class TexturedDesk:
         farthest_m: greatest distance.
         elevation_deg: the camera looks down at this angle, on the average.
         sweep_deg: greatest turn about the point looked at to either side; a quarter as much up and down.
-        wander: greatest shift of the point looked at, as a share of the desk's size.
+        wander: greatest shift of the point looked at, as a fraction of the desk's size.
         speed_m_s: highest speed.
         turn_rad_s: highest rate of turn.
         start_s: the camera reaches its pace after this time.
@@ -130,9 +130,9 @@ class TexturedDesk:
         block = (*self.size_m, DESK_M - SHEET_M)
         furniture.box(np.array([0.0, 0.0, -DESK_M]), 0.0, block, textures.wood, textures.wood)
         middle = (0.5 + (np.arange(4) - 1.5) * 0.35 * x / (x + 2.0)).tolist()
-        for share in middle:
+        for fraction in middle:
             size = (rng.uniform(0.25, 0.5, 2) * x).tolist()
-            furniture.hang(room, 0, (share, rng.uniform(0.45, 0.55)), size, textures.picture)
+            furniture.hang(room, 0, (fraction, rng.uniform(0.45, 0.55)), size, textures.picture)
         return furniture
 
     def _lay(self, desk: Furniture, rng: np.random.Generator) -> list[Chessboard]:

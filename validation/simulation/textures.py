@@ -186,7 +186,7 @@ def _disc(
     import cv2
 
     centre = [round(float(x) * 2**FINE) for x in place]
-    axes = [max(1, round(radius * share * 2**FINE)) for share in rng.uniform(0.4, 1.0, 2)]
+    axes = [max(1, round(radius * fraction * 2**FINE)) for fraction in rng.uniform(0.4, 1.0, 2)]
     turn = float(rng.uniform(0.0, 180.0))
     cv2.ellipse(image, centre, axes, turn, 0.0, 360.0, level, -1, cv2.LINE_AA, FINE)
 

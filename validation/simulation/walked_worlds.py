@@ -9,7 +9,12 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.validation.simulation.camera_paths import Wave, eased, frame_seconds, looking, shaken
-from rbpf.validation.simulation.limits import check_counts, check_not_negative, check_positive, check_shares
+from rbpf.validation.simulation.limits import (
+    check_counts,
+    check_fractions,
+    check_not_negative,
+    check_positive,
+)
 from rbpf.validation.simulation.scene import Scene, face_areas, frame_stamps, on_faces, outside, populated
 
 SHAKE_HZ = 0.3, 1.5
@@ -48,7 +53,7 @@ class LoopWorld:
         shake_deg: greatest rotation by it, per axis.
         start_s: the walk reaches its speed after this time.
         blocks: number of opaque pieces of furniture at the outer walls.
-        renewal: share of the points that disappear for good per second; others appear elsewhere.
+        renewal: fraction of the points that disappear for good per second; others appear elsewhere.
     """
 
     frames: int = 1200
@@ -84,10 +89,12 @@ class LoopWorld:
         """Draws the points, the furniture and the path."""
         core, room = self._square(self._core), self._square(self._room)
         blocks = np.concatenate([core[None], self._furniture(rng)])
-        share = face_areas(core, SIDES).sum() / (face_areas(core, SIDES).sum() + face_areas(room, ALL).sum())
+        fraction = face_areas(core, SIDES).sum() / (
+            face_areas(core, SIDES).sum() + face_areas(room, ALL).sum()
+        )
 
         def draw(count: int) -> np.ndarray:
-            near = int(rng.binomial(count, share))
+            near = int(rng.binomial(count, fraction))
             walls = on_faces(core, SIDES, near, rng), on_faces(room, ALL, count - near, rng)
             return rng.permutation(np.concatenate(walls))
 
@@ -150,7 +157,7 @@ class CorridorWorld:
         shake_deg: greatest rotation by it, per axis.
         start_s: the walk reaches its speed after this time.
         blocks: number of opaque pieces of furniture at the walls.
-        renewal: share of the points that disappear for good per second; others appear elsewhere.
+        renewal: fraction of the points that disappear for good per second; others appear elsewhere.
     """
 
     frames: int = 1000
@@ -211,7 +218,7 @@ def _check_walk(world: LoopWorld | CorridorWorld) -> None:
     check_counts(world, {"frames": 2, "points": 1, "blocks": 0})
     check_positive(world, "rate_hz", "height_m", "speed_m_s")
     check_not_negative(world, "shake_m", "shake_deg", "start_s")
-    check_shares(world, "renewal")
+    check_fractions(world, "renewal")
     if not 0.0 < world.eye_m < world.height_m:
         raise InputError(f"eye_m = {world.eye_m} must be between the floor and height_m = {world.height_m}")
 

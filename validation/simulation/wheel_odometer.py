@@ -24,9 +24,9 @@ class WheelOdometer:
 
     Attributes:
         wheelbase_m: true distance between the wheels.
-        scale: both wheels report so much more than they went, as a share.
-        inequality: the right one reports so much more than the left one, as a share: a drift of the heading.
-        wheelbase_error: the robot takes the distance between its wheels for so much greater, as a share.
+        scale: both wheels report so much more than they went, as a fraction.
+        inequality: the right one reports so much more than the left one, as a fraction: a drift of the heading.
+        wheelbase_error: the robot takes the distance between its wheels for so much greater, as a fraction.
         slip_m: standard deviation of a wheel's error after 1 m, in m; it grows with the root of the way.
 
     Raises:

@@ -18,7 +18,7 @@ _CELLS = 6
 """The image is divided into so many columns and rows, from which features are chosen in turn."""
 
 ALIKE = 0.9
-"""Of two places one may be mistaken for the other when their scores differ by less than this share."""
+"""Of two places one may be mistaken for the other when their scores differ by less than this fraction."""
 
 ENOUGH = 4
 """Matches that must agree on a motion for it to say where the others are."""
@@ -149,7 +149,7 @@ class ActiveSearch:
     def trusted(self, rows: np.ndarray) -> np.ndarray:
         """Which features (K,) tell where the camera is, by their records; all of them where those are too few."""
         table = self.table
-        kept = (table.member[rows] >= 0) | (table.found_share(rows) >= self.config.trusted_share)
+        kept = (table.member[rows] >= 0) | (table.found_fraction(rows) >= self.config.trusted_fraction)
         return kept if kept.sum() >= TRUSTED else np.ones(rows.size, dtype=bool)
 
     def _again(
@@ -205,7 +205,7 @@ class ActiveSearch:
         column, line = np.clip(px * _CELLS / size, 0, _CELLS - 1).astype(np.int64).T
         cell = column + _CELLS * line
         self.in_view = px
-        worth = table.found_share(rows) - 0.2 * table.missed[rows]
+        worth = table.found_fraction(rows) - 0.2 * table.missed[rows]
         order = np.lexsort((-worth, cell))
         _, first = np.unique(cell[order], return_index=True)
         rank = np.arange(order.size) - np.repeat(first, np.diff(np.append(first, order.size)))

@@ -84,7 +84,7 @@ class Appearances:
         self.member[rows] = -1 if member is None else member
         return rows
 
-    def found_share(self, rows: np.ndarray) -> np.ndarray:
+    def found_fraction(self, rows: np.ndarray) -> np.ndarray:
         """Share (k,) of the looks for features (k,) that found them, as expected after these looks (P. Laplace)."""
         return np.asarray((self.found[rows] + 1.0) / (self.attempts[rows] + 2.0))
 

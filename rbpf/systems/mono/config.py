@@ -1,7 +1,7 @@
 """Every setting of monocular SLAM on features, with its default, its unit and what it does."""
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import ClassVar, Literal
 
 from rbpf.errors import InputError
 from rbpf.systems.filtering import ProposalConfig, ResamplingConfig
@@ -38,8 +38,8 @@ class RayConfig:
         std_rho_per_m: its standard deviation.
         adapt: a new ray starts at the median inverse depth of the points just seen, with the same relative deviation at
             least, where four or more were seen.
-        ready_ratio: a ray becomes a point when the standard deviation of its inverse depth is below this share of it.
-        ready_weight: share of the particles' weight in which it must be.
+        ready_ratio: a ray becomes a point when the standard deviation of its inverse depth is below this fraction of it.
+        ready_weight: fraction of the particles' weight in which it must be.
         least_px: depth is measured once a change of ρ by its first standard deviation moves the image by this. Before,
             the parallax tells more of the error of the sampled pose than of depth, and the prior of ρ, which does not
             change as long as depth is not measured, would count anew in every frame.
@@ -66,14 +66,18 @@ class StartConfig:
         first: the first adjustment comes after so many frames …
         growth: … and the next ones after this many times as many each.
         frames: that take part in an adjustment at most, evenly chosen.
-        depth_share: it ends when the depth of half of the features in view is known to this share of it.
+        depth_fraction: it ends when the depth of half of the features in view is known to this fraction of it.
     """
+
+    RENAMED: ClassVar[dict[str, str]] = {
+        "depth_share": "depth_fraction",
+    }
 
     redraw: bool = True
     first: int = 6
     growth: float = 1.25
     frames: int = 60
-    depth_share: float = 0.03
+    depth_fraction: float = 0.03
 
     def __post_init__(self) -> None:
         """Checks what would never end, or never begin."""
@@ -106,14 +110,20 @@ class SearchConfig:
         look_deg: a feature's look is kept anew when its line of sight has turned by this since it was kept last …
         look_scale: … or it is this many times nearer or farther.
         trial: a feature is judged after having been looked for this often.
-        failure_ratio: it is dropped from all particles when it was not found in more than this share.
-        trusted_share: a feature tells where the camera is only while it has been found in this share of the looks,
+        failure_ratio: it is dropped from all particles when it was not found in more than this fraction.
+        trusted_fraction: a feature tells where the camera is only while it has been found in this fraction of the looks,
             (1 + found) / (2 + looks): what moves by itself is soon not where a thing at rest would be.
-        lost_share: the camera is lost when fewer than this share of what was looked for is found …
+        lost_fraction: the camera is lost when fewer than this fraction of what was looked for is found …
         lost_frames: … in this many frames in a row.
-        regained_share: it is not lost any more when at least this share is found …
+        regained_fraction: it is not lost any more when at least this fraction is found …
         regained: … and so many features.
     """
+
+    RENAMED: ClassVar[dict[str, str]] = {
+        "trusted_share": "trusted_fraction",
+        "lost_share": "lost_fraction",
+        "regained_share": "regained_fraction",
+    }
 
     measurements: int = 25
     noise_px: float = 1.0
@@ -132,10 +142,10 @@ class SearchConfig:
     look_scale: float = 1.15
     trial: int = 10
     failure_ratio: float = 0.5
-    trusted_share: float = 0.6
-    lost_share: float = 0.25
+    trusted_fraction: float = 0.6
+    lost_fraction: float = 0.25
     lost_frames: int = 3
-    regained_share: float = 0.5
+    regained_fraction: float = 0.5
     regained: int = 6
 
 
@@ -151,18 +161,23 @@ class RecoveryConfig:
         reach_m: likewise of its position.
         corners: places of a lost image that are compared with the map's features at most.
         spacing_px: their least distance.
-        ratio: a feature's distance from the place most like it is below this share of that from the next.
-        depth_share: features take part whose depth is known to this share of it.
+        ratio: a feature's distance from the place most like it is below this fraction of that from the next.
+        depth_fraction: features take part whose depth is known to this fraction of it.
         around_px: the features are looked for this near to where a pose says that they are.
         within_px: a feature agrees with a pose when it is seen as near to its projection.
         triples: of features from which poses are computed.
         inliers: features that must agree with a pose.
         few: it is enough that so many agree if the last view before the loss shows the same motion.
         sure: when so many agree, less has to be found of what should then be seen.
-        inlier_share: share of the matches that must agree.
+        inlier_fraction: fraction of the matches that must agree.
         spread: standard deviation of the inliers' places in their narrowest direction, in widths of the image.
         inflation: of the pose's standard deviations: the map's errors are common to neighbours.
     """
+
+    RENAMED: ClassVar[dict[str, str]] = {
+        "depth_share": "depth_fraction",
+        "inlier_share": "inlier_fraction",
+    }
 
     drift_rad_s: float = 0.25
     drift_m_s: float = 0.25
@@ -171,14 +186,14 @@ class RecoveryConfig:
     corners: int = 500
     spacing_px: float = 6.0
     ratio: float = 0.9
-    depth_share: float = 0.3
+    depth_fraction: float = 0.3
     around_px: float = 15.0
     within_px: float = 4.0
     triples: int = 300
     inliers: int = 8
     few: int = 5
     sure: int = 12
-    inlier_share: float = 0.25
+    inlier_fraction: float = 0.25
     spread: float = 0.03
     inflation: float = 3.0
 
@@ -195,7 +210,7 @@ class MonoConfig:
         start_std_rad: likewise its rotation.
         known: the known points as one rigid group whose frame is marginalised, or as separate landmarks in a world
             whose place each particle samples in the first frame (E06).
-        births_per_frame: landmarks started in one frame at most.
+        max_new_per_frame: landmarks started in one frame at most.
         lag: frames of the particles' paths that are kept, None keeps all.
         checkpoint_every: frames between checkpoints.
         velocity: how the camera moves.
@@ -207,13 +222,17 @@ class MonoConfig:
         resampling: when and how.
     """
 
+    RENAMED: ClassVar[dict[str, str]] = {
+        "births_per_frame": "max_new_per_frame",
+    }
+
     particles: int = 50
     seed: int = 0
     compiled: bool = True
     start_std_m: float = 1.0
     start_std_rad: float = 0.5
     known: Literal["frame", "points"] = "frame"
-    births_per_frame: int = 1000
+    max_new_per_frame: int = 1000
     lag: int | None = None
     checkpoint_every: int = 500
     velocity: VelocityConfig = field(default_factory=VelocityConfig)

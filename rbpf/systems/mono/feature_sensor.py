@@ -10,7 +10,7 @@ from rbpf.lie import SE3
 from rbpf.maps.constellation import Constellation
 from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.maps.point import Point
-from rbpf.models import Births, Observations, Part, Sensor
+from rbpf.models import NewLandmarks, Observations, Part, Sensor
 from rbpf.sensors.camera_constellation import ConstellationView, MembersView
 from rbpf.sensors.camera_points import CameraModel, CameraPoint, CameraRay, EpipolarRay
 from rbpf.sensors.features import FeatureFrame
@@ -42,7 +42,7 @@ class FeatureSensor(Sensor):
     Args:
         camera: of the images.
         rays: settings of landmarks without depth.
-        births_per_frame: landmarks started in one frame at most.
+        max_new_per_frame: landmarks started in one frame at most.
         start: known points that are one landmark, a `Constellation`.
         fixed: the map is known: its points tell where the camera is, and are not changed by what is seen of them.
     """
@@ -51,14 +51,14 @@ class FeatureSensor(Sensor):
         self,
         camera: Pinhole,
         rays: RayConfig,
-        births_per_frame: int,
+        max_new_per_frame: int,
         start: KnownStart | None = None,
         fixed: bool = False,
     ) -> None:
         rho = (rays.rho_per_m, rays.std_rho_per_m)
         self.camera = camera
         self.rays = rays
-        self.births_per_frame = 0 if fixed else births_per_frame
+        self.max_new_per_frame = 0 if fixed else max_new_per_frame
         self.fixed = fixed
         self.point = CameraPoint(camera)
         self.ray = CameraRay(camera, rho)
@@ -78,16 +78,16 @@ class FeatureSensor(Sensor):
         is_ray = belief.map.are(ids[rows], self.inverse_depth)
         if (~is_ray).any():
             k = rows[~is_ray]
-            informs = _STATE if self.fixed else _BOTH
-            groups.append(Observations(frame.z[k], frame.cov_z[k], self.point, ids=ids[k], informs=informs))
+            updates = _STATE if self.fixed else _BOTH
+            groups.append(Observations(frame.z[k], frame.cov_z[k], self.point, ids=ids[k], updates=updates))
         if is_ray.any():
             scaled = sum(group.z.size for group in groups) >= 2 * HOLD
             groups += self._ray_groups(frame, belief, rows[is_ray], ids[rows[is_ray]], scaled)
         return groups
 
-    def births(
+    def new_landmarks(
         self, frame: FeatureFrame, belief: Belief, observed: Sequence[Observations]
-    ) -> Sequence[Births]:
+    ) -> Sequence[NewLandmarks]:
         """Promotes rays that are ready; starts a ray for every new name."""
         self._promote(belief, observed)
         known = self._names.ids(belief.catalogue)
@@ -96,12 +96,12 @@ class FeatureSensor(Sensor):
         if new:
             z = frame.z[new]
             has_ray = self.camera.inside(z) & np.isfinite(self.camera.unproject(z)).all(axis=-1)
-            new = [k for k, seen in zip(new, has_ray.tolist(), strict=True) if seen][: self.births_per_frame]
+            new = [k for k, seen in zip(new, has_ray.tolist(), strict=True) if seen][: self.max_new_per_frame]
         if not new:
             return []
         names = frame.landmarks[new].tolist()
         ray = self.new_ray(belief, observed)
-        return [Births(frame.z[new], frame.cov_z[new], ray, self.inverse_depth, facts=names)]
+        return [NewLandmarks(frame.z[new], frame.cov_z[new], ray, self.inverse_depth, facts=names)]
 
     def new_ray(self, belief: Belief, observed: Sequence[Observations]) -> CameraRay:
         """What starts rays: at the inverse depths of the points that were just seen, where there are enough of them.
@@ -114,8 +114,8 @@ class FeatureSensor(Sensor):
             return self.ray
         rho = 1.0 / depth
         middle = float(np.median(rho))
-        share = self.rays.std_rho_per_m / self.rays.rho_per_m
-        return CameraRay(self.camera, (middle, max(share * middle, float(rho.std()))))
+        fraction = self.rays.std_rho_per_m / self.rays.rho_per_m
+        return CameraRay(self.camera, (middle, max(fraction * middle, float(rho.std()))))
 
     def _depths(self, belief: Belief, observed: Sequence[Observations]) -> np.ndarray:
         """Of the points that were just seen, and of the known points in view, in the heaviest particle."""
@@ -178,15 +178,15 @@ class FeatureSensor(Sensor):
                 out.append(np.concatenate([x, w], axis=-1))
         return np.concatenate(which), np.concatenate(out)
 
-    def deep(self, belief: Belief, names: np.ndarray, members: np.ndarray, share: float) -> np.ndarray:
-        """Whether the heaviest particle knows the depth of features (K,) to this share of it, (K,) bool."""
+    def deep(self, belief: Belief, names: np.ndarray, members: np.ndarray, fraction: float) -> np.ndarray:
+        """Whether the heaviest particle knows the depth of features (K,) to this fraction of it, (K,) bool."""
         out = np.zeros(names.size, dtype=bool)
         for model, chosen, ids in self._by_kind(belief, names, members):
             out[chosen] = True
             if model is self.ray:
                 records = belief.read_mode(ids)
                 rho, variance = records.mean[0, :, 2], records.cov[0, :, 2, 2]
-                out[chosen] = (rho > 0.0) & (np.sqrt(variance) <= share * rho)
+                out[chosen] = (rho > 0.0) & (np.sqrt(variance) <= fraction * rho)
         return out
 
     def first_places(self, world_from_camera: np.ndarray, px: np.ndarray, ray: CameraRay) -> np.ndarray:
@@ -255,19 +255,19 @@ class FeatureSensor(Sensor):
         z, cov = frame.z[rows], frame.cov_z[rows]
 
         def group(
-            model: CameraRay, chosen: np.ndarray, informs: frozenset[Part] = _BOTH
+            model: CameraRay, chosen: np.ndarray, updates: frozenset[Part] = _BOTH
         ) -> list[Observations]:
             if not chosen.any():
                 return []
-            return [Observations(z[chosen], cov[chosen], model, ids=ids[chosen], informs=informs)]
+            return [Observations(z[chosen], cov[chosen], model, ids=ids[chosen], updates=updates)]
 
         if self.rays.constrain == "marginal":
             young = self.epipolar if scaled else self.ray
-            return group(self.ray, deep) + group(young, ~deep, informs=_STATE)
-        updates = group(self.ray, deep, informs=_MAP)
+            return group(self.ray, deep) + group(young, ~deep, updates=_STATE)
+        updates = group(self.ray, deep, updates=_MAP)
         if self.rays.constrain == "off":
             return updates
-        return group(self.epipolar, np.ones_like(deep), informs=_STATE) + updates
+        return group(self.epipolar, np.ones_like(deep), updates=_STATE) + updates
 
     def _has_parallax(self, belief: Belief, ids: np.ndarray) -> np.ndarray:
         """Whether the particle of highest weight sees depth move the image (K,), E06 §5.1, last paragraph."""
@@ -277,7 +277,7 @@ class FeatureSensor(Sensor):
         return by_rho * self.rays.std_rho_per_m >= self.rays.least_px
 
     def _promote(self, belief: Belief, observed: Sequence[Observations]) -> None:
-        updated = [g.ids for g in observed if g.model is self.ray and g.informs != _STATE]
+        updated = [g.ids for g in observed if g.model is self.ray and g.updates != _STATE]
         if not updated:
             return
         ids = np.concatenate([i for i in updated if i is not None])

@@ -10,7 +10,7 @@ import numpy as np
 from rbpf.belief import Belief
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.models import Births, Observations, Part, Sensor
+from rbpf.models import NewLandmarks, Observations, Part, Sensor
 from rbpf.sensors.camera_points import CameraRay
 from rbpf.sensors.corners import corners
 from rbpf.sensors.features import FeatureFrame
@@ -52,8 +52,8 @@ class ImageSensor(Sensor):
         """Whether the prediction of a lost camera is a place that was recognised beyond doubt."""
         self.seconds = 0.0
         """Time of the last search."""
-        self.seconds_births = 0.0
-        """Time of the last `births`."""
+        self.seconds_new_landmarks = 0.0
+        """Time of the last `new_landmarks`."""
 
     @property
     def lost(self) -> bool:
@@ -113,7 +113,9 @@ class ImageSensor(Sensor):
         self.seconds = time.perf_counter() - started
         return self._observations(belief)
 
-    def births(self, frame: ImageFrame, belief: Belief, observed: Sequence[Observations]) -> Sequence[Births]:
+    def new_landmarks(
+        self, frame: ImageFrame, belief: Belief, observed: Sequence[Observations]
+    ) -> Sequence[NewLandmarks]:
         """Notes what was found, drops what fails, and starts features at corners where there is room."""
         started = time.perf_counter()
         failing = self._judge()
@@ -122,11 +124,11 @@ class ImageSensor(Sensor):
         if frame.image is not None and not self.bad_frames:
             self._keep_looks(frame.image, belief)
             sightings = self._with_corners(frame, belief)
-        births = self.features.births(sightings, belief, observed)
-        self._place_rays(belief, births)
+        new_landmarks = self.features.new_landmarks(sightings, belief, observed)
+        self._place_rays(belief, new_landmarks)
         self.features.forget(belief, failing)
-        self.seconds_births = time.perf_counter() - started
-        return births
+        self.seconds_new_landmarks = time.perf_counter() - started
+        return new_landmarks
 
     def drawn_anew(self, belief: Belief, path: np.ndarray, started: np.ndarray) -> None:
         """Remembers where all features are and were seen first, after the particles were drawn anew.
@@ -162,7 +164,7 @@ class ImageSensor(Sensor):
         doubted = self.features.observe(_part(frame, ~trusted), belief)
         return [
             *self.features.observe(_part(frame, trusted), belief),
-            *(replace(group, informs=_MAP) for group in doubted if Part.LANDMARK in group.informs),
+            *(replace(group, updates=_MAP) for group in doubted if Part.LANDMARK in group.updates),
         ]
 
     def _fails(self) -> bool:
@@ -176,12 +178,12 @@ class ImageSensor(Sensor):
         if not found.size or (self.features.fixed and found.sum() < LEAST_SEEN):
             return True
         if not self.lost:
-            return bool(found.mean() < config.lost_share)
+            return bool(found.mean() < config.lost_fraction)
         least = min(config.regained, int(self.table.alive.sum()))
         reach = config.sigmas * np.sqrt(np.einsum("kii->ki", self.searched.cov).max(axis=1))
         found = found[reach <= config.largest_px]
-        share = config.lost_share if self.recognised else config.regained_share
-        return bool(found.sum() < max(least, share * found.size))
+        fraction = config.lost_fraction if self.recognised else config.regained_fraction
+        return bool(found.sum() < max(least, fraction * found.size))
 
     def _judge(self) -> np.ndarray:
         """Counts hits and misses; rows of what is missed too often."""
@@ -221,9 +223,9 @@ class ImageSensor(Sensor):
             if window is not None:
                 table.last_source[rows[k]], table.last_pose[rows[k]] = window, pose
 
-    def _place_rays(self, belief: Belief, births: Sequence[Births]) -> None:
+    def _place_rays(self, belief: Belief, new_landmarks: Sequence[NewLandmarks]) -> None:
         """Remembers where in the mode's world features start."""
-        for group in births:
+        for group in new_landmarks:
             assert isinstance(group.model, CameraRay) and group.facts is not None
             pose = belief.state[belief.mode][:7]
             self.table.place[list(group.facts)] = self.features.first_places(pose, group.z, group.model)
@@ -234,7 +236,7 @@ class ImageSensor(Sensor):
         room = config.measurements - measured.landmarks.size
         if self.table.count > measured.landmarks.size:
             room = min(config.in_view - self.search.in_view.shape[0], config.new_per_frame)
-        room = min(room, self.features.births_per_frame)
+        room = min(room, self.features.max_new_per_frame)
         if room <= 0:
             return measured
         occupied = np.concatenate([measured.z, self.search.in_view])

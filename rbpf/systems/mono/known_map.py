@@ -24,7 +24,7 @@ VERSION = 1
 LEAST = 8
 """Points that a map must hold for a camera to be found in it."""
 MOST_BYTES = 1 << 30
-FOCAL_SHARE = 0.02
+FOCAL_FRACTION = 0.02
 """How far the focal lengths of two cameras may differ for one to recognise what the other has seen."""
 
 _ALIGNMENTS: dict[str, Alignment] = {"none": "none", "rigid": "rigid", "similarity": "similarity"}
@@ -82,7 +82,7 @@ class KnownMap:
             )
         same = (mine.width, mine.height) == (camera.width, camera.height)
         ratio = np.array([camera.fx / mine.fx, camera.fy / mine.fy])
-        if not same or np.abs(ratio - 1.0).max() > FOCAL_SHARE:
+        if not same or np.abs(ratio - 1.0).max() > FOCAL_FRACTION:
             raise InputError(
                 f"the map was made with images of {mine.width}x{mine.height} px, focal length {mine.fx:.0f} px; "
                 f"{what} has {camera.width}x{camera.height} px and {camera.fx:.0f} px: scale its images, or map with it"

@@ -18,10 +18,10 @@ CORNER_PX = 2.0
 """How well a corner is found again, per axis."""
 LEAST_ALIKE, SHARP_PX = 0.8, 0.7
 """Correlation of a patch that says it better, and how well: it is taken to face the last view's camera."""
-DEPTH_SHARE = 0.5
-"""Standard deviation of a corner's depth, as a share of that of the landmarks around."""
+DEPTH_FRACTION = 0.5
+"""Standard deviation of a corner's depth, as a fraction of that of the landmarks around."""
 RATIO = 0.8
-"""A corner's distance from the one most like it is below this share of that from the next (D. Lowe)."""
+"""A corner's distance from the one most like it is below this fraction of that from the next (D. Lowe)."""
 RIVAL_PX = 9.0
 """Places this near to each other may show one thing."""
 LEAST = 30
@@ -86,7 +86,7 @@ class LastView:
         if one.size < LEAST:
             return None
         points = SE3.transform(self.world_from_camera, float(np.median(held)) * self.rays[one])
-        spread = DEPTH_SHARE * (points - SE3.translation(self.world_from_camera))
+        spread = DEPTH_FRACTION * (points - SE3.translation(self.world_from_camera))
         return one, Sights(points, spread, px[other], np.full(one.size, CORNER_PX))
 
     def sharpened(self, image: np.ndarray, rows: np.ndarray, sights: Sights, pose: np.ndarray) -> Sights:

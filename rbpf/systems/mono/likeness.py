@@ -34,11 +34,11 @@ def nearest_looks(
     return sources, np.where(later[:, None], last, first)
 
 
-def known_places(sensor: ImageSensor, belief: Belief, share: float) -> tuple[np.ndarray, np.ndarray]:
-    """Rows (K,) of the living features whose depth is known to this share, and where they are (K, 3)."""
+def known_places(sensor: ImageSensor, belief: Belief, fraction: float) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (K,) of the living features whose depth is known to this fraction, and where they are (K, 3)."""
     table = sensor.table
     rows = np.flatnonzero(table.alive)
-    rows = rows[sensor.features.deep(belief, rows, table.member[rows], share)]
+    rows = rows[sensor.features.deep(belief, rows, table.member[rows], fraction)]
     which, places = sensor.features.places(belief, rows, table.member[rows])
     return rows[which], places[:, :3] / places[:, 3:]
 

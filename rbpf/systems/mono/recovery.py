@@ -8,7 +8,7 @@ import numpy as np
 from rbpf.estimate import mixture_estimate
 from rbpf.filter import Filter
 from rbpf.lie import SE3
-from rbpf.motion.constant_velocity import PoseLaw
+from rbpf.motion.constant_velocity import PosePrior
 from rbpf.particles import Particles
 from rbpf.proposals import Prior
 from rbpf.sensors.readers.images import ImageFrame
@@ -88,7 +88,7 @@ class Recovery:
             return frame
         return replace(frame, image=None, problem=None if was_blank else problem)
 
-    def law(self, frame: ImageFrame, filter_: Filter) -> PoseLaw | None:
+    def law(self, frame: ImageFrame, filter_: Filter) -> PosePrior | None:
         """Nothing while the camera is tracked; where it was seen; else near the last trusted pose.
 
         A camera that moved on with its last velocity for a second would be further off than one that stayed: hands
@@ -102,11 +102,11 @@ class Recovery:
             found = self._found(filter_, frame.image, pose)
             if found is not None:
                 self.sensor.recognised = self.relocaliser.sure
-                return PoseLaw(found.mean, found.cov + cov, self.std_velocity)
+                return PosePrior(found.mean, found.cov + cov, self.std_velocity)
         reach = np.repeat([self.config.reach_rad, self.config.reach_m], 3)
-        return PoseLaw(pose, cov + np.diag(reach**2), self.std_velocity)
+        return PosePrior(pose, cov + np.diag(reach**2), self.std_velocity)
 
-    def _found(self, filter_: Filter, image: np.ndarray, trusted: np.ndarray) -> PoseLaw | None:
+    def _found(self, filter_: Filter, image: np.ndarray, trusted: np.ndarray) -> PosePrior | None:
         """Where the camera is recognised, looking from the last trusted pose; then from views of the map.
 
         In the first frame from all of them, later from some in turn.

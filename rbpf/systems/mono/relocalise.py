@@ -8,7 +8,7 @@ import numpy as np
 from rbpf import gaussian
 from rbpf.belief import Belief
 from rbpf.lie import SE3
-from rbpf.motion.constant_velocity import PoseLaw
+from rbpf.motion.constant_velocity import PosePrior
 from rbpf.sensors.consensus_resection import Resected, refined, resect_consensus, three_point_poses
 from rbpf.sensors.corners import corners
 from rbpf.sensors.keypoints import describe_windows
@@ -32,7 +32,7 @@ CORNER_PX, LEAST_ALIKE = 2.0, 0.5
 """How well a corner is found again, per axis; the least correlation of a patch that says it better."""
 MOST_ROUNDS = 10
 """Of a pose's refinement on what is seen around it."""
-MOST_SHARE = 0.8
+MOST_FRACTION = 0.8
 """Of the corners of the last view that are found again, so many must show the motion that the map shows."""
 LEAST_SCALE, LARGEST_SCALE = 0.4, 1.2
 """A window that was kept is described at these sizes."""
@@ -97,7 +97,7 @@ class Relocaliser:
 
     def find(
         self, belief: Belief, image: np.ndarray, near: np.ndarray, last: LastView | None = None
-    ) -> PoseLaw | None:
+    ) -> PosePrior | None:
         """Where the camera must be, if enough of the map's landmarks with known depth are seen.
 
         Args:
@@ -110,7 +110,7 @@ class Relocaliser:
             The law in the heaviest particle's world; None where the camera is not found.
         """
         config, camera = self.config, self.sensor.camera
-        rows, points = known_places(self.sensor, belief, config.depth_share)
+        rows, points = known_places(self.sensor, belief, config.depth_fraction)
         self.attempt = Attempt(rows.size)
         if rows.size < (config.inliers if last is None else config.few):
             return None
@@ -148,7 +148,7 @@ class Relocaliser:
         if not accepted:
             return None
         noise = config.inflation * max(found.rms_px, self.sensor.config.noise_px)
-        return PoseLaw(
+        return PosePrior(
             found.world_from_camera, gaussian.symmetrise(noise**2 * np.linalg.inv(found.information))
         )
 
@@ -252,9 +252,9 @@ class Relocaliser:
 
 
 def convincing(found: Resected, px: np.ndarray, width: int, config: RecoveryConfig) -> bool:
-    """Enough landmarks agree, a fair share of those matched, and they do not lie on a line or in a corner."""
+    """Enough landmarks agree, a fair fraction of those matched, and they do not lie on a line or in a corner."""
     count = int(found.inliers.sum())
-    if count < max(config.inliers, config.inlier_share * found.inliers.size):
+    if count < max(config.inliers, config.inlier_fraction * found.inliers.size):
         return False
     places = px[found.inliers]
     narrow = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)[1] / np.sqrt(count)
@@ -263,7 +263,7 @@ def convincing(found: Resected, px: np.ndarray, width: int, config: RecoveryConf
 
 def confirmed(landmarks: int, corners_: int, of: int, config: RecoveryConfig) -> bool:
     """Some landmarks agree, which fix the scale, and most of the last view's corners: these alone leave no doubt."""
-    return landmarks >= config.few and corners_ >= max(LEAST, MOST_SHARE * of)
+    return landmarks >= config.few and corners_ >= max(LEAST, MOST_FRACTION * of)
 
 
 def agrees(corners_: np.ndarray) -> bool:
@@ -271,7 +271,7 @@ def agrees(corners_: np.ndarray) -> bool:
 
     Where the map is torn they do not, and it is the map in which the camera has to be found.
     """
-    return bool(corners_.sum() >= max(LEAST, MOST_SHARE * corners_.size))
+    return bool(corners_.sum() >= max(LEAST, MOST_FRACTION * corners_.size))
 
 
 def known_sights(points: np.ndarray, px: np.ndarray, within_px: float) -> Sights:

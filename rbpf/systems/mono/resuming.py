@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 _PER_FRAME = (
     "world_from_camera", "cov", "searched", "found", "lost", "ess", "log_evidence", "resampled", "nis", "nis_dof",
-    "seconds", "seconds_search", "seconds_waiting", "seconds_births", "seconds_telling",
+    "seconds", "seconds_search", "seconds_waiting", "seconds_new_landmarks", "seconds_telling",
 )  # fmt: skip
 
 

@@ -16,7 +16,7 @@ from rbpf.proposals import Prior
 from rbpf.sensors.features import FeatureLog
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor
-from rbpf.systems.mono.system import assemble, features_of, start_law, world_of
+from rbpf.systems.mono.system import assemble, features_of, start_prior, world_of
 from rbpf.systems.mono.unknown_start import UnknownStart
 
 
@@ -75,7 +75,7 @@ def run(
     features, known = features_of(log, config)
     filter_ = assemble(config, features, known, None if wrapped is None else wrapped(features))
     start = UnknownStart(config, needed=log.known is None and wrapped is None)
-    control = start_law(log, config)
+    control = start_prior(log, config)
     total = len(log.frames)
     numbers = [np.zeros(total) for _ in range(6)]
     stamps = np.array([frame.stamp_ns for frame in log.frames], dtype=np.int64)

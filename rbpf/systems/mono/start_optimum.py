@@ -25,7 +25,7 @@ SCALE_STD = 1e-4
 """Standard deviation to which the scale is held."""
 
 ROUNDS, GAIN = 30, 1e-4
-"""Steps at most, and the share of the cost that ends it."""
+"""Steps at most, and the fraction of the cost that ends it."""
 
 DAMPING, FACTOR, STUCK = 1e-3, 5.0, 1e8
 """Of Levenberg's and Marquardt's method: at first, its change after a step, and where there is no way down."""

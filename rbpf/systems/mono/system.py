@@ -12,7 +12,7 @@ from rbpf.maps.constellation import Constellation, UncertainConstellation
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
 from rbpf.models import Conditional, MotionModel, Records, Sensor
-from rbpf.motion.constant_velocity import MarginalVelocity, PoseLaw, SampledVelocity
+from rbpf.motion.constant_velocity import MarginalVelocity, PosePrior, SampledVelocity
 from rbpf.sensors.features import FeatureFrame, FeatureLog, KnownPoints
 from rbpf.sensors.pinhole import Pinhole
 from rbpf.sensors.resection import resect
@@ -25,7 +25,7 @@ from rbpf.systems.mono.known_start import KnownStart, first_records
 def build_filter(
     log: FeatureLog, config: MonoConfig, wrapped: Callable[[FeatureSensor], Sensor] | None = None
 ) -> Filter:
-    """The filter for a log, with its known points in the map; `start_law` says where it starts.
+    """The filter for a log, with its known points in the map; `start_prior` says where it starts.
 
     Args:
         log: of one camera.
@@ -58,7 +58,7 @@ def build_features(
 ) -> FeatureSensor:
     """What turns found features into observations; with `fixed` of a map that is known and stays as it is."""
     group = start if config.known == "frame" else None
-    return FeatureSensor(camera, config.ray, config.births_per_frame, group, fixed)
+    return FeatureSensor(camera, config.ray, config.max_new_per_frame, group, fixed)
 
 
 def assemble(
@@ -146,7 +146,7 @@ def _constellation(filter_: Filter) -> tuple[Constellation | UncertainConstellat
     return landmark_map.landmark_of(first), landmark_map.read(np.array([first]))
 
 
-def start_law(log: FeatureLog, config: MonoConfig) -> PoseLaw:
+def start_prior(log: FeatureLog, config: MonoConfig) -> PosePrior:
     """Where the camera is at first, before the known points are measured: at the origin, exactly, unless they say it.
 
     The law is wide: the measurements of the first frame, not the resection, say where in it the camera is.
@@ -155,8 +155,8 @@ def start_law(log: FeatureLog, config: MonoConfig) -> PoseLaw:
         InputError: fewer than four known points are seen in the first frame, or they do not determine the camera.
     """
     if log.known is None or config.known == "frame":
-        return PoseLaw(SE3.identity(), np.zeros((6, 6)))
-    return PoseLaw(_known_start(log).world_from_camera, start_cov(config))
+        return PosePrior(SE3.identity(), np.zeros((6, 6)))
+    return PosePrior(_known_start(log).world_from_camera, start_cov(config))
 
 
 def _known_start(log: FeatureLog) -> KnownStart:

@@ -16,7 +16,7 @@ import numpy as np
 from rbpf.archive import checked
 from rbpf.filter import Filter
 from rbpf.lie import SE3
-from rbpf.motion.constant_velocity import PoseLaw
+from rbpf.motion.constant_velocity import PosePrior
 from rbpf.sensors.features import FeatureFrame
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor
@@ -138,7 +138,7 @@ class UnknownStart:
         self._last = names, steps, best.structure
         relative = best.std_inverse() / np.maximum(best.structure.inverse, TINY)
         relative = relative[np.isin(names, frames[-1].landmarks)]
-        self.over = bool(relative.size and np.median(relative) < self.config.start.depth_share)
+        self.over = bool(relative.size and np.median(relative) < self.config.start.depth_fraction)
         return steps, best
 
     def _chosen(self, frames: Sequence[FeatureFrame]) -> np.ndarray:
@@ -206,7 +206,7 @@ class UnknownStart:
         new = assemble(self.config, features, None)
         new.rng, new.log_evidence = old.rng, old.log_evidence
         start = min(steps)
-        law = PoseLaw(SE3.identity(), np.zeros((6, 6)), start_std(self.config.velocity))
+        law = PosePrior(SE3.identity(), np.zeros((6, 6)), start_std(self.config.velocity))
         for t, frame in enumerate(frames):
             state = self._state(new, paths[t], frame.stamp_ns)
             measured = frame if t in steps else _unseen(frame)
@@ -242,8 +242,8 @@ def between(times: np.ndarray, paths: np.ndarray, wanted: np.ndarray) -> np.ndar
     """Poses (W, n, 7) of paths (n, T, 7) at other times (W,): on the way between two, or the first or the last."""
     moved = SE3.log(SE3.between(paths[:, :-1], paths[:, 1:]))
     k = np.clip(np.searchsorted(times, wanted, side="right") - 1, 0, times.size - 2)
-    share = np.clip((wanted - times[k]) / (times[k + 1] - times[k]), 0.0, 1.0)
-    return np.swapaxes(SE3.retract(paths[:, k], share[:, None] * moved[:, k]), 0, 1)
+    fraction = np.clip((wanted - times[k]) / (times[k + 1] - times[k]), 0.0, 1.0)
+    return np.swapaxes(SE3.retract(paths[:, k], fraction[:, None] * moved[:, k]), 0, 1)
 
 
 def _structure(path: np.ndarray, place: np.ndarray) -> Structure:

@@ -10,7 +10,7 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.filter import Filter
 from rbpf.lie import SE3
-from rbpf.motion.constant_velocity import PoseLaw
+from rbpf.motion.constant_velocity import PosePrior
 from rbpf.sensors.features import FeatureFrame
 from rbpf.sensors.readers.images import ImageFrame, ImageSequence, KnownPixels
 from rbpf.systems.mono.config import MonoConfig
@@ -49,7 +49,7 @@ class VideoRun:
         nis: (T,) normalised innovation squared;  nis_dof: (T,) its degrees of freedom.
         seconds: (T,) time of the whole frame without decoding;  seconds_search: (T,) of the search in the image.
         seconds_waiting: (T,) until the decoded image was there.
-        seconds_births: (T,) of judging what was looked for and starting landmarks at corners, part of the frame's.
+        seconds_new_landmarks: (T,) of judging what was looked for and starting landmarks at corners, part of the frame's.
         seconds_telling: (T,) of the estimate and of taking notes, after the frame's time.
         sightings: what was looked for, frame by frame.
         problems: what was wrong with single frames, in words.
@@ -79,7 +79,7 @@ class VideoRun:
     seconds: np.ndarray
     seconds_search: np.ndarray
     seconds_waiting: np.ndarray
-    seconds_births: np.ndarray
+    seconds_new_landmarks: np.ndarray
     seconds_telling: np.ndarray
     sightings: Sightings = field(init=False)
     problems: list[str] = field(default_factory=list)
@@ -181,9 +181,9 @@ def _frames_from(sequence: ImageSequence, start: int) -> Iterator[ImageFrame]:
 
 def _begin(
     sequence: ImageSequence, config: MonoConfig, known: KnownPixels | None, image: np.ndarray
-) -> tuple[VideoRun, PoseLaw]:
+) -> tuple[VideoRun, PosePrior]:
     """A run before its first frame, and where the camera is in it: at the origin, unless the known points tell."""
-    start, law = None, PoseLaw(SE3.identity(), np.zeros((6, 6)))
+    start, law = None, PosePrior(SE3.identity(), np.zeros((6, 6)))
     if known is not None:
         points, pose = located_points(sequence.camera, known, config.search.noise_px)
         noise = np.tile(config.search.noise_px**2 * np.eye(2), (known.names.size, 1, 1))
@@ -191,7 +191,7 @@ def _begin(
         start = KnownStart(points, pose, points.names, sight)
         require_texture(image, known)
         if config.known == "points":
-            law = PoseLaw(pose, start_cov(config))
+            law = PosePrior(pose, start_cov(config))
     features = build_features(sequence.camera, config, start)
     sensor = ImageSensor(features, config.search)
     if known is not None:
@@ -234,11 +234,11 @@ def _keep(run: VideoRun, checkpoint: Path) -> None:
         run.problems.append(f"frame {run.filter.steps - 1}: no checkpoint is kept: {error}")
 
 
-def _waiting(run: VideoRun) -> PoseLaw | None:
+def _waiting(run: VideoRun) -> PosePrior | None:
     """The camera stays at the origin until an image shows something; nothing once there are features."""
     if run.sensor.table.count:
         return None
-    return PoseLaw(SE3.identity(), np.zeros((6, 6)), start_std(run.config.velocity))
+    return PosePrior(SE3.identity(), np.zeros((6, 6)), start_std(run.config.velocity))
 
 
 def _fitting(run: VideoRun, frame: ImageFrame) -> ImageFrame:
@@ -252,7 +252,7 @@ def _fitting(run: VideoRun, frame: ImageFrame) -> ImageFrame:
     return replace(frame, image=None, problem=f"the image is not used: {problem}")
 
 
-def _frame(run: VideoRun, t: int, frame: ImageFrame, law: PoseLaw | None) -> None:
+def _frame(run: VideoRun, t: int, frame: ImageFrame, law: PosePrior | None) -> None:
     started = time.perf_counter()
     frame = run.recovery.checked(_fitting(run, frame))
     was_lost, never_found = run.sensor.lost, run.recovery.never_found
@@ -267,7 +267,7 @@ def _frame(run: VideoRun, t: int, frame: ImageFrame, law: PoseLaw | None) -> Non
     run.lost[t] = run.sensor.lost
     run.ess[t], run.log_evidence[t] = report.ess, report.log_evidence
     run.resampled[t], run.nis[t], run.nis_dof[t] = report.resampled, report.nis, report.rows
-    run.seconds_search[t], run.seconds_births[t] = run.sensor.seconds, run.sensor.seconds_births
+    run.seconds_search[t], run.seconds_new_landmarks[t] = run.sensor.seconds, run.sensor.seconds_new_landmarks
     run.sightings.record(run.sensor, run.filter, world)
     run.seconds_telling[t] = time.perf_counter() - started - run.seconds[t]
     if run.start.due(t + 1, run.sensor.lost and run.sensor.table.count > 0) and not run.sensor.bad_frames:

@@ -31,12 +31,12 @@ class Associations:
         self._steps: list[tuple[int, np.ndarray]] = []
 
     def record(self, report: StepReport, sightings: int) -> None:
-        """Keeps a step's ids (n, K), n = 1 where all particles agree; what was new gets the ids of the births."""
+        """Keeps a step's ids (n, K), n = 1 where all particles agree; what was new gets the ids of the new_landmarks."""
         ids = np.full((1, sightings), NULL)
         if report.groups and report.groups[0].ids is not None and report.groups[0].ids.ndim == 2:
             ids = report.groups[0].ids.copy()
             columns = np.flatnonzero((ids == NEW).any(axis=0))
-            for column, landmark in zip(columns, report.births, strict=True):
+            for column, landmark in zip(columns, report.new_landmarks, strict=True):
                 ids[ids[:, column] == NEW, column] = landmark
             if (ids == ids[:1]).all():
                 ids = ids[:1]

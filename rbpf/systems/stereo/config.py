@@ -1,7 +1,7 @@
 """Every setting of stereo SLAM, with its default, its unit and what it does."""
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import ClassVar, Literal
 
 from rbpf.errors import InputError
 from rbpf.motion.stereo_odometer import Prediction
@@ -49,37 +49,41 @@ class MapConfig:
         limits: of the keys of a feature and a landmark.
         gate: largest squared Mahalanobis distance from where the particles expect the landmark; 11.3 holds 99 %.
         slack_px: added to that expectation, standard deviation per axis.
-        cloud: particles, drawn evenly from the weight, that say where a landmark is expected.
+        subsample: particles, drawn evenly from the weight, that say where a landmark is expected.
         margin_px: landmarks so far outside the image, as the heaviest particle sees it, may be in it.
         turn_deg: a landmark is not looked for once its line of sight has turned by this since it was seen last.
         scale: nor once it is so many times nearer or farther.
         doubt_px: where landmarks are expected with a larger standard deviation than this, the gate lets much pass: the
             matches must then agree on one motion …
         agreeing: … and be so many, else none is taken, and the doubt stays.
-        depth_share: a feature starts a landmark if the standard deviation of its depth is below this share of it.
+        depth_fraction: a feature starts a landmark if the standard deviation of its depth is below this fraction of it.
     """
+
+    RENAMED: ClassVar[dict[str, str]] = {
+        "depth_share": "depth_fraction",
+    }
 
     used: bool = True
     weigh: Literal["landmarks", "all"] = "landmarks"
     limits: MatchLimits = field(default_factory=MatchLimits)
     gate: float = 11.3
     slack_px: float = 1.0
-    cloud: int = 32
+    subsample: int = 32
     margin_px: float = 20.0
     turn_deg: float = 45.0
     scale: float = 2.0
     doubt_px: float = 15.0
     agreeing: int = 6
-    depth_share: float = 0.1
+    depth_fraction: float = 0.1
 
     def __post_init__(self) -> None:
         """Checks what no part checks itself."""
-        if self.cloud < 1:
-            raise InputError(f"cloud must be at least one particle, got {self.cloud}")
-        if not (self.gate > 0.0 and self.slack_px >= 0.0 and self.scale >= 1.0 and self.depth_share > 0.0):
-            found = f"{self.gate}, {self.slack_px}, {self.scale} and {self.depth_share}"
+        if self.subsample < 1:
+            raise InputError(f"subsample must be at least one particle, got {self.subsample}")
+        if not (self.gate > 0.0 and self.slack_px >= 0.0 and self.scale >= 1.0 and self.depth_fraction > 0.0):
+            found = f"{self.gate}, {self.slack_px}, {self.scale} and {self.depth_fraction}"
             raise InputError(
-                f"expected gate and depth_share above 0, slack_px from 0 up and scale from 1 up, got {found}"
+                f"expected gate and depth_fraction above 0, slack_px from 0 up and scale from 1 up, got {found}"
             )
 
 

@@ -14,13 +14,13 @@ from rbpf.sensors.pinhole import RectifiedStereo
 from rbpf.sensors.readers.images import ImageFrame
 from rbpf.sensors.stereo_features import StereoFeatures, match_frames
 from rbpf.sensors.stereo_matching import StereoSift
-from rbpf.systems.stereo.anywhere import find_anywhere
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.dead_reckoning import Pixels
-from rbpf.systems.stereo.measured import MeasuredPair
+from rbpf.systems.stereo.feature_cache import CachedPair
+from rbpf.systems.stereo.global_relocalisation import relocalise_globally
+from rbpf.systems.stereo.motion_segmentation import MotionSegmentation
 from rbpf.systems.stereo.seen import FEATURE, LANDMARK, TRIAL
 from rbpf.systems.stereo.sensor import StereoFrame, StereoSensor
-from rbpf.systems.stereo.standing import Standing
 from rbpf.systems.stereo.tracks import Tracks
 
 
@@ -30,12 +30,12 @@ class FrontEnd(ABC):
     Attributes:
         rig: the cameras.
         sensor: what the filter takes.
-        standing: which features stand still; the map takes no others.
+        segmentation: which features stand still; the map takes no others.
     """
 
     rig: RectifiedStereo
     sensor: Sensor
-    standing: Standing
+    segmentation: MotionSegmentation
 
     @abstractmethod
     def look(self, frame: Any) -> tuple[int, str]:
@@ -71,7 +71,7 @@ class FrontEnd(ABC):
         """How well the map's landmarks are seen by particles, a log-density beside that of false matches."""
 
     @abstractmethod
-    def anywhere(self, belief: Belief) -> tuple[np.ndarray, int] | None:
+    def relocalise_globally(self, belief: Belief) -> tuple[np.ndarray, int] | None:
         """Where in the map the pair looked at was taken, world_from_camera (7,), and landmarks that say so."""
 
     @abstractmethod
@@ -84,7 +84,7 @@ class FrontEnd(ABC):
 
     def observed(self, report: StepReport) -> int:
         """Landmarks that weighed the particles in the filter's last step."""
-        weighed = (group.ids for group in report.groups if Part.STATE in group.informs)
+        weighed = (group.ids for group in report.groups if Part.STATE in group.updates)
         return sum(int((ids >= 0).sum()) for ids in weighed if ids is not None)
 
     def seconds(self) -> float:
@@ -134,14 +134,14 @@ class ImageFrontEnd(FrontEnd):
             rig, *nothing, np.zeros((0, config.sift.length), dtype=np.float32)
         )
         self._now = self._kept = self._none
-        self.standing = Standing()
+        self.segmentation = MotionSegmentation()
         self.tracks = Tracks()
 
-    def look(self, frame: ImageFrame | MeasuredPair) -> tuple[int, str]:
+    def look(self, frame: ImageFrame | CachedPair) -> tuple[int, str]:
         """SIFT in both images, matched along the rows; or what was measured in them before."""
         self._now = self._none
-        self.standing.look()
-        if isinstance(frame, MeasuredPair):
+        self.segmentation.look()
+        if isinstance(frame, CachedPair):
             self._now = self._none if frame.features is None else frame.features
             return len(self._now), frame.problem
         if frame.image is None or frame.right is None:
@@ -149,19 +149,22 @@ class ImageFrontEnd(FrontEnd):
         self._now = self.sift.measure(frame.image, frame.right)
         return len(self._now), self.sift.remark
 
-    def anywhere(self, belief: Belief) -> tuple[np.ndarray, int] | None:
+    def relocalise_globally(self, belief: Belief) -> tuple[np.ndarray, int] | None:
         if not self.config.map.used:
             return None
         frame, least = self.for_filter(doubt=True), self.config.odometry.estimate
-        return find_anywhere(self.sensor, frame, belief, least)
+        return relocalise_globally(self.sensor, frame, belief, least)
 
     def matches(self) -> Pixels:
         """By their keys."""
         found = match_frames(self._kept, self._now, self.config.odometry.limits)
         if self.config.odometry.split != "none":
-            found = found.take(half_of(self._kept.keys)[found.first] & half_of(self._now.keys)[found.second])
+            found = found.take(
+                split_by_descriptor(self._kept.keys)[found.first]
+                & split_by_descriptor(self._now.keys)[found.second]
+            )
         before, now = self._kept.take(found.first), self._now.take(found.second)
-        self.standing.match(found.first, found.second)
+        self.segmentation.match(found.first, found.second)
         return Pixels(before.z, now.z, before.cov, now.cov)
 
     def keep(self) -> None:
@@ -171,9 +174,9 @@ class ImageFrontEnd(FrontEnd):
         """All features that stand still, or the half of them that is the map's."""
         split, free = self.config.odometry.split, np.ones(len(self._now), dtype=bool)
         if split != "none":
-            half = half_of(self._now.keys)
+            half = split_by_descriptor(self._now.keys)
             free = ~half if split == "apart" else half
-        free[self.standing.moving] = False
+        free[self.segmentation.moving] = False
         return StereoFrame(self._now, free, doubt)
 
     @property
@@ -199,10 +202,10 @@ class ImageFrontEnd(FrontEnd):
         return self.sensor.seconds
 
     def note(self, step: int, agree: np.ndarray, updated: bool) -> None:
-        first, second = self.standing.matches[:, np.flatnonzero(agree)]
+        first, second = self.segmentation.matches[:, np.flatnonzero(agree)]
         names = self.sensor.names if updated else np.full(len(self._kept), NULL, dtype=np.int64)
         found = np.isin(self.seen(updated)[1], (LANDMARK, TRIAL))
-        self.standing.note(len(self._kept), agree, np.flatnonzero(found))
+        self.segmentation.note(len(self._kept), agree, np.flatnonzero(found))
         self.tracks.note(step, self._kept.z, self._kept.cov, (first, second), names)
 
     def log(self, name: str, stamps_ns: np.ndarray, truth: CameraTruth | None) -> FeatureLog:
@@ -212,17 +215,17 @@ class ImageFrontEnd(FrontEnd):
         kept = self._kept
         names = ("z", "cov", "scale", "orientation", "keys")
         pair = {f"pair/{name}": getattr(kept, name) for name in names}
-        return pair | self.standing.arrays() | self.sensor.arrays() | self.tracks.arrays()
+        return pair | self.segmentation.arrays() | self.sensor.arrays() | self.tracks.arrays()
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         names = ("z", "cov", "scale", "orientation", "keys")
         self._kept = StereoFeatures.measured(self.rig, *(arrays[f"pair/{name}"].copy() for name in names))
-        self.standing.restore(arrays, len(self._kept))
+        self.segmentation.restore(arrays, len(self._kept))
         self.sensor.restore(arrays)
         self.tracks.restore(arrays)
 
 
-def half_of(keys: np.ndarray) -> np.ndarray:
+def split_by_descriptor(keys: np.ndarray) -> np.ndarray:
     """A lot (K,) that falls alike whenever a feature is seen: whether the key's first rows outweigh its last ones."""
     side = keys.shape[1] // 3
     return np.asarray(keys[:, :side].sum(axis=1) > keys[:, -side:].sum(axis=1))

@@ -16,9 +16,9 @@ from rbpf.sensors.stereo_points import StereoPoint
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.dead_reckoning import Pixels
 from rbpf.systems.stereo.front_ends import FrontEnd
+from rbpf.systems.stereo.motion_segmentation import MotionSegmentation
 from rbpf.systems.stereo.seen import FEATURE, LANDMARK
 from rbpf.systems.stereo.sensor import log_support
-from rbpf.systems.stereo.standing import Standing
 
 
 @final
@@ -48,13 +48,13 @@ class NameFrontEnd(FrontEnd):
         self._now = self._kept = FeatureFrame(
             0, np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3))
         )
-        self.standing = Standing()
+        self.segmentation = MotionSegmentation()
         self._filtered = self._proven = np.zeros(0, dtype=np.int64)
 
     def look(self, frame: FeatureFrame) -> tuple[int, str]:
         """Nothing is to be done."""
         self._now = frame
-        self.standing.look()
+        self.segmentation.look()
         return frame.landmarks.size, ""
 
     def matches(self) -> Pixels:
@@ -63,7 +63,7 @@ class NameFrontEnd(FrontEnd):
         if self.config.odometry.split != "none":
             even = self._kept.landmarks[before] % 2 == 0
             before, now = before[even], now[even]
-        self.standing.match(before, now)
+        self.segmentation.match(before, now)
         kept, seen = self._kept, self._now
         return Pixels(kept.z[before], seen.z[now], kept.cov_z[before], seen.cov_z[now])
 
@@ -88,7 +88,7 @@ class NameFrontEnd(FrontEnd):
         mean, cov = belief.project(self.model, named)
         return log_support(frame.z[rows] - mean, frame.cov_z[rows] + cov, frame.z, self.rig)
 
-    def anywhere(self, belief: Belief) -> tuple[np.ndarray, int] | None:
+    def relocalise_globally(self, belief: Belief) -> tuple[np.ndarray, int] | None:
         """A name is looked for everywhere as it is."""
         return None
 
@@ -99,7 +99,7 @@ class NameFrontEnd(FrontEnd):
         if config.odometry.split != "none":
             chosen &= frame.landmarks % 2 == (1 if config.odometry.split == "apart" else 0)
         chosen &= frame.z[:, 0] > frame.z[:, 2]
-        chosen[self.standing.moving] = False
+        chosen[self.segmentation.moving] = False
         return FeatureFrame(frame.stamp_ns, frame.landmarks[chosen], frame.z[chosen], frame.cov_z[chosen])
 
     def seen(self, updated: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -111,7 +111,7 @@ class NameFrontEnd(FrontEnd):
             taken = self.for_filter().landmarks
             self._proven = np.union1d(self._proven, np.intersect1d(self._filtered, taken))
             self._filtered = np.union1d(self._filtered, taken)
-        self.standing.note(self._kept.landmarks.size, agree, np.zeros(0, dtype=np.intp))
+        self.segmentation.note(self._kept.landmarks.size, agree, np.zeros(0, dtype=np.intp))
 
     def log(self, name: str, stamps_ns: np.ndarray, truth: CameraTruth | None) -> FeatureLog:
         """The given one, up to the last pair that was filtered."""
@@ -121,10 +121,10 @@ class NameFrontEnd(FrontEnd):
         kept = self._kept
         pair = {"pair/names": kept.landmarks, "pair/z": kept.z, "pair/cov": kept.cov_z}
         names = {"names/filtered": self._filtered, "names/proven": self._proven}
-        return pair | names | self.standing.arrays()
+        return pair | names | self.segmentation.arrays()
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         names, z, cov = (arrays[f"pair/{name}"].copy() for name in ("names", "z", "cov"))
         self._kept = FeatureFrame(0, names, z, cov)
         self._filtered, self._proven = arrays["names/filtered"].copy(), arrays["names/proven"].copy()
-        self.standing.restore(arrays, names.size)
+        self.segmentation.restore(arrays, names.size)

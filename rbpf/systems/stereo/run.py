@@ -19,9 +19,9 @@ from rbpf.sensors.features import CameraTruth, FeatureLog
 from rbpf.sensors.readers.images.stereo import StereoSequence
 from rbpf.systems.stereo.config import StereoConfig, TriggerConfig
 from rbpf.systems.stereo.dead_reckoning import DeadReckoning, Reckoned, chained
-from rbpf.systems.stereo.doubt import motion_for_update
+from rbpf.systems.stereo.delayed_update import motion_for_update
+from rbpf.systems.stereo.feature_cache import CachedSequence
 from rbpf.systems.stereo.front_ends import FrontEnd, ImageFrontEnd
-from rbpf.systems.stereo.measured import MeasuredSequence
 from rbpf.systems.stereo.name_front_end import NameFrontEnd
 from rbpf.systems.stereo.resuming import cut, restore, save
 from rbpf.systems.stereo.seen import Seen
@@ -96,7 +96,7 @@ class StereoRun:
 
 
 def run_images(
-    sequence: StereoSequence | MeasuredSequence,
+    sequence: StereoSequence | CachedSequence,
     config: StereoConfig,
     on_frame: Callable[[int, StereoRun], None] | None = None,
     checkpoint: Path | None = None,
@@ -242,9 +242,9 @@ def _reckon(run: StereoRun, t: int, problem: str) -> tuple[Reckoned, bool]:
     else:
         rng = np.random.default_rng([run.config.seed, t])
         matches = run.front_end.matches()
-        known = Known(partial(_log_support, run, t), run.front_end.standing.before())
+        known = Known(partial(_log_support, run, t), run.front_end.segmentation.before())
         at = reckoning.measured(stamp, matches, rng, known)
-        run.front_end.standing.leave_out(at.moving)
+        run.front_end.segmentation.leave_out(at.moving)
         if at.note:
             run.notes.append(f"pair {t}: {at.note}")
     run.front_end.keep()

@@ -17,7 +17,7 @@ from rbpf import gaussian
 from rbpf.belief import Belief
 from rbpf.exchange import NULL
 from rbpf.maps.point import Point
-from rbpf.models import Births, Likelihood, Observations, Part, Sensor
+from rbpf.models import Likelihood, NewLandmarks, Observations, Part, Sensor
 from rbpf.motion.stereo_vo import VoConfig, estimate_motion
 from rbpf.sensors.key_index import Gate, KeyIndex
 from rbpf.sensors.key_management import KeyConfig, KeyManager
@@ -25,9 +25,9 @@ from rbpf.sensors.names import Numbers
 from rbpf.sensors.pinhole import RectifiedStereo
 from rbpf.sensors.stereo_features import StereoFeatures
 from rbpf.sensors.stereo_points import StereoPoint
-from rbpf.systems.stereo.cloud import Cloud, Expected
 from rbpf.systems.stereo.config import MapConfig
 from rbpf.systems.stereo.landmarks import Places
+from rbpf.systems.stereo.particle_subsample import Expected, ParticleSubsample
 from rbpf.systems.stereo.seen import FEATURE, LANDMARK, NEW, TRIAL
 
 _MAP = frozenset({Part.LANDMARK})
@@ -95,15 +95,15 @@ class StereoSensor(Sensor):
         ids[seen] = self.ids(belief, self.names[seen])
         weighing = self._weighing()
         groups = []
-        for chosen, informs in ((weighing | ~seen, None), (seen & ~weighing, _MAP)):
+        for chosen, updates in ((weighing | ~seen, None), (seen & ~weighing, _MAP)):
             if (ids[chosen] >= 0).any():
-                groups.append(self._group(features.take(chosen), ids[chosen], informs))
+                groups.append(self._group(features.take(chosen), ids[chosen], updates))
         self.seconds = time.perf_counter() - started
         return groups
 
-    def births(
+    def new_landmarks(
         self, frame: StereoFrame, belief: Belief, observed: Sequence[Observations]
-    ) -> Sequence[Births]:
+    ) -> Sequence[NewLandmarks]:
         """Counts what was seen, drops keys that were not seen again, starts new ones."""
         if not self.config.used:
             return []
@@ -121,7 +121,7 @@ class StereoSensor(Sensor):
         pose = belief.state[belief.mode]
         self.places.put(names, self.model.invert(pose, features.z), pose)
         self.names[rows] = names
-        return [Births(features.z, features.cov, self.model, self.point, facts=names.tolist())]
+        return [NewLandmarks(features.z, features.cov, self.model, self.point, facts=names.tolist())]
 
     def ids(self, belief: Belief, names: np.ndarray) -> np.ndarray:
         """The map's numbers (k,) of keys (k,)."""
@@ -154,12 +154,12 @@ class StereoSensor(Sensor):
         self.places.restore(arrays)
 
     def _group(
-        self, features: StereoFeatures, ids: np.ndarray, informs: frozenset[Part] | None
+        self, features: StereoFeatures, ids: np.ndarray, updates: frozenset[Part] | None
     ) -> Observations:
         null = self.likelihood.log_outlier()
-        if informs is None:
+        if updates is None:
             return Observations(features.z, features.cov, self.model, self.likelihood, ids, log_clutter=null)
-        return Observations(features.z, features.cov, self.model, self.likelihood, ids, informs=informs)
+        return Observations(features.z, features.cov, self.model, self.likelihood, ids, updates=updates)
 
     def _weighing(self) -> np.ndarray:
         """Features (K,) whose keys are landmarks, this sighting included, and weigh the particles."""
@@ -174,14 +174,14 @@ class StereoSensor(Sensor):
         features = frame.features
         out = np.full(len(features), NULL, dtype=np.int64)
         rows = np.arange(len(features)) if frame.free is None else np.flatnonzero(frame.free)
-        cloud = Cloud.of(belief, self.config.cloud)
-        names = self._alike(features.keys[rows], cloud)
+        subsample = ParticleSubsample.of(belief, self.config.subsample)
+        names = self._alike(features.keys[rows], subsample)
         if frame.doubt:
             names = names[np.isin(names, self.proven())]
         if not (names.size and rows.size):
             return out
         ids = self.ids(belief, names)
-        seen = cloud.expected(belief, self.model, ids)
+        seen = subsample.expected(belief, self.model, ids)
         total = seen.cov + self.config.slack_px**2 * np.eye(3)
         gate = Gate(features.z[rows], features.cov[rows], names, seen.mean, total, self.config.gate)
         found = self.index.match(features.keys[rows], gate).ids
@@ -201,7 +201,7 @@ class StereoSensor(Sensor):
         if not rows.size:
             return 0.0
         features, ids = frame.features.take(rows), self.ids(belief, names[rows])
-        seen = Cloud.of(belief, self.config.cloud).expected(belief, self.model, ids)
+        seen = ParticleSubsample.of(belief, self.config.subsample).expected(belief, self.model, ids)
         return log_support(features.z - seen.mean, features.cov + seen.cov, frame.features.z, self.model.rig)
 
     def _agreed(self, seen: Expected, features: StereoFeatures, doubt: bool) -> np.ndarray:
@@ -224,13 +224,13 @@ class StereoSensor(Sensor):
         )
         return motion.inliers
 
-    def _alike(self, keys: np.ndarray, cloud: Cloud) -> np.ndarray:
+    def _alike(self, keys: np.ndarray, subsample: ParticleSubsample) -> np.ndarray:
         """Names of landmarks that may be in view and whose keys come near to that of any feature, ascending.
 
         Keys further away are neither taken nor forbid others by the ratio, whatever is expected where.
         """
         store, limits = self.index.store, self.config.limits
-        names = self.places.in_view(store.ids, cloud.middle, cloud.doubt_rad)
+        names = self.places.in_view(store.ids, subsample.middle, subsample.doubt_rad)
         if not names.size or not keys.shape[0]:
             return names[:0]
         most = limits.largest(store.length) / limits.ratio
@@ -264,7 +264,7 @@ class StereoSensor(Sensor):
 
     def _deep(self, features: StereoFeatures) -> np.ndarray:
         """Whether the depth of features is known well enough for a Gaussian in space, (K,)."""
-        return np.sqrt(features.cov_points[:, 2, 2]) <= self.config.depth_share * features.points[:, 2]
+        return np.sqrt(features.cov_points[:, 2, 2]) <= self.config.depth_fraction * features.points[:, 2]
 
 
 def log_support(nu: np.ndarray, cov: np.ndarray, z: np.ndarray, rig: RectifiedStereo) -> float:

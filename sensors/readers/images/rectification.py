@@ -17,7 +17,7 @@ from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
 from rbpf.sensors.readers.images.sequence import ImageFrame, Source
 
 BESIDE = 0.7
-"""The baseline lies along the rows by this share of its length at least; beyond, most of the view is lost."""
+"""The baseline lies along the rows by this fraction of its length at least; beyond, most of the view is lost."""
 
 OUTSIDE = -10.0
 """A column and a row that no image has: what is drawn from there is black."""

@@ -1,6 +1,6 @@
 """Features of a sequence of pairs, measured once and kept in files, to be filtered as often as one likes.
 
-Decoding and SIFT take most of a pair's time, and depend on no setting of the filter. `measure_pairs` goes on where it
+Decoding and SIFT take most of a pair's time, and depend on no setting of the filter. `cache_features` goes on where it
 was interrupted: what it keeps are chunks of pairs, each a file that appears when it is complete.
 """
 
@@ -31,7 +31,7 @@ KEPT = ("z", "cov", "scale", "orientation", "keys")
 
 
 @dataclass(frozen=True)
-class MeasuredPair:
+class CachedPair:
     """A pair whose features are known.
 
     Attributes:
@@ -47,7 +47,7 @@ class MeasuredPair:
 
 @final
 @dataclass(frozen=True)
-class MeasuredSequence:
+class CachedSequence:
     """A sequence in place of which `run_images` takes its features.
 
     Attributes:
@@ -67,23 +67,23 @@ class MeasuredSequence:
     def __len__(self) -> int:
         return len(self.stamps_ns)
 
-    def frames(self, start: int = 0) -> Iterator[MeasuredPair]:
+    def frames(self, start: int = 0) -> Iterator[CachedPair]:
         """Pairs from number `start` on."""
         for first in range(start - start % CHUNK, len(self), CHUNK):
             pairs = _read(self.folder, first, self.rig)
             yield from pairs[max(start - first, 0) : len(self) - first]
 
-    def first(self, count: int) -> "MeasuredSequence":
+    def first(self, count: int) -> "CachedSequence":
         """The first `count` pairs alone."""
-        return MeasuredSequence(self.name, self.rig, self.stamps_ns[:count], self.truth, self.folder)
+        return CachedSequence(self.name, self.rig, self.stamps_ns[:count], self.truth, self.folder)
 
 
-def measure_pairs(
+def cache_features(
     sequence: StereoSequence,
     config: StereoConfig,
     folder: Path,
     on_pair: Callable[[int, int], None] | None = None,
-) -> MeasuredSequence:
+) -> CachedSequence:
     """Measures what is not in `folder` yet.
 
     Args:
@@ -107,11 +107,11 @@ def measure_pairs(
             if frame.image is not None and frame.right is not None:
                 features = sift.measure(frame.image, frame.right)
                 problem = sift.remark
-            pairs.append(MeasuredPair(features, problem, time.process_time() - started))
+            pairs.append(CachedPair(features, problem, time.process_time() - started))
             if on_pair is not None:
                 on_pair(first + len(pairs), total)
         _write(folder, first, pairs, config.sift.length)
-    return MeasuredSequence(sequence.name, sequence.rig, sequence.stamps_ns, sequence.truth, folder)
+    return CachedSequence(sequence.name, sequence.rig, sequence.stamps_ns, sequence.truth, folder)
 
 
 def _file(folder: Path, first: int) -> Path:
@@ -136,7 +136,7 @@ def _claim(folder: Path, sequence: StereoSequence, config: StereoConfig) -> None
         )
 
 
-def _write(folder: Path, first: int, pairs: list[MeasuredPair], length: int) -> None:
+def _write(folder: Path, first: int, pairs: list[CachedPair], length: int) -> None:
     empty = {"z": (0, 3), "cov": (0, 3, 3), "scale": (0,), "orientation": (0,), "keys": (0, length)}
     arrays = {
         name: np.concatenate(
@@ -153,7 +153,7 @@ def _write(folder: Path, first: int, pairs: list[MeasuredPair], length: int) -> 
     save_arrays(_file(folder, first), arrays)
 
 
-def _read(folder: Path, first: int, rig: RectifiedStereo) -> list[MeasuredPair]:
+def _read(folder: Path, first: int, rig: RectifiedStereo) -> list[CachedPair]:
     arrays, pairs, at = load_arrays(_file(folder, first)), [], 0
     told = zip(arrays["count"].tolist(), arrays["problem"].tolist(), arrays["seconds"].tolist(), strict=True)
     for count, problem, seconds in told:
@@ -161,5 +161,5 @@ def _read(folder: Path, first: int, rig: RectifiedStereo) -> list[MeasuredPair]:
         if count >= 0:
             part = (arrays[name][at : at + count] for name in KEPT)
             features, at = StereoFeatures.measured(rig, *part), at + count
-        pairs.append(MeasuredPair(features, problem, seconds))
+        pairs.append(CachedPair(features, problem, seconds))
     return pairs

@@ -30,7 +30,7 @@ def motion_for_update(run: "StereoRun", t: int, at: Reckoned) -> Odometry | None
     after = f"after {at.assumed} pair{'s'[: at.assumed > 1]} whose motion was only assumed"
     count = run.front_end.recognised(belief)
     if count < run.config.map.agreeing:
-        place = run.front_end.anywhere(belief)
+        place = run.front_end.relocalise_globally(belief)
         if place is not None:
             count, heaviest = place[1], run.filter.particles.state[belief.mode]
             motion = Odometry(SE3.between(heaviest, place[0]), motion.cov)

@@ -8,7 +8,7 @@ from rbpf.archive import checked
 
 
 @final
-class Standing:
+class MotionSegmentation:
     """Follows the features from pair to pair. Call `look`, `match`, `leave_out`, then `note`."""
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Where the particles expect landmarks in a pair of images: of a few of them, each for an equal share of the weight."""
+"""Where the particles expect landmarks in a pair of images: of a few of them, each for an equal fraction of the weight."""
 
 from dataclasses import dataclass, fields
 from typing import final
@@ -40,7 +40,7 @@ class Expected:
 
 @final
 @dataclass(frozen=True)
-class Cloud:
+class ParticleSubsample:
     """A few particles, the heaviest one last.
 
     Attributes:
@@ -56,7 +56,7 @@ class Cloud:
     doubt_rad: float
 
     @classmethod
-    def of(cls, belief: Belief, count: int) -> "Cloud":
+    def of(cls, belief: Belief, count: int) -> "ParticleSubsample":
         """So many at most."""
         weights = belief.weights
         steps = (np.arange(min(count, weights.size)) + 0.5) / min(count, weights.size)

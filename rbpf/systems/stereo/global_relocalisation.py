@@ -14,7 +14,7 @@ from rbpf.motion.stereo_vo import VoConfig, estimate_motion
 from rbpf.systems.stereo.sensor import TINY, StereoFrame, StereoSensor
 
 
-def find_anywhere(
+def relocalise_globally(
     sensor: StereoSensor, frame: StereoFrame, belief: Belief, config: VoConfig
 ) -> tuple[np.ndarray, int] | None:
     """The place, in the world of the heaviest particle.
