@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 
 from benchmarks.rows import Row, Settings, SkippedError, Timing, interleaved
-from rbpf.belief import Belief
-from rbpf.filter import Filter
+from rbpf.core.belief import Belief
+from rbpf.core.filter import Filter
+from rbpf.core.models import MotionModel, ObservationModel, Observations, Part, Sensor, Transition
+from rbpf.core.proposals import PriorProposal
+from rbpf.core.resampling import Systematic
 from rbpf.lie import Euclidean
-from rbpf.models import MotionModel, ObservationModel, Observations, Part, Sensor, Transition
-from rbpf.proposals import PriorProposal
-from rbpf.resampling import Systematic
 
 SIZES = (1_000, 10_000)
 BEACONS = np.array([[0.0, -10.0], [10.0, 0.0]])

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.rows import Row, Settings
-from rbpf.genealogy import Lineage
-from rbpf.particles import effective_sample_size
-from rbpf.resampling import Systematic
+from rbpf.core.genealogy import Lineage
+from rbpf.core.particles import effective_sample_size
+from rbpf.core.resampling import Systematic
 
 PARTICLES = (50, 100, 200, 500, 1000, 2000)
 STEPS = 2_000

@@ -7,8 +7,8 @@ import numba
 from benchmarks.machine import copy_bandwidth
 from benchmarks.rows import Row, Settings, Timing, interleaved
 from benchmarks.worlds import Run, World, planar, spatial
-from rbpf.particles import reweight
-from rbpf.proposals import refined
+from rbpf.core.particles import reweight
+from rbpf.core.proposals import refined
 
 N, K, M = 50_000, 30, 60
 AIM_REFINE_HZ, AIM_UPDATE_HZ, GOAL_UPDATE_HZ = 30.0, 10.0, 30.0

@@ -6,9 +6,9 @@ import numpy as np
 
 from benchmarks.mono_frames import SETTLING, Decoded, rendered
 from benchmarks.rows import Row, Settings
+from rbpf.core.models import Records
 from rbpf.lie import SE3
 from rbpf.maps.point import Point
-from rbpf.models import Records
 from rbpf.sensors.readers.images import ImageFrame
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.video import VideoRun, run_images

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from benchmarks.rows import Row, Settings, interleaved
-from rbpf.filter import Filter
+from rbpf.core.filter import Filter
 from rbpf.sensors.features import FeatureFrame, FeatureLog
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.system import build_filter, start_prior

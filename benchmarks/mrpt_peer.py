@@ -14,7 +14,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from benchmarks.rows import Row, Settings, SkippedError, Timing, interleaved
-from rbpf.filter import Filter
+from rbpf.core.filter import Filter
 from rbpf.lie import SE2
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point

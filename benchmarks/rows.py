@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rbpf.filter import Filter
+from rbpf.core.filter import Filter
 
 GENERATIONS_BACK = 20
 

@@ -3,9 +3,9 @@
 import numpy as np
 
 from benchmarks.rows import Row, Settings
-from rbpf.genealogy import Lineage
+from rbpf.core.genealogy import Lineage
+from rbpf.core.resampling import Systematic
 from rbpf.maps.shared import SharedStore
-from rbpf.resampling import Systematic
 
 N, M, FIELDS, IN_VIEW = 400, 11_085, 9, 100
 RESAMPLINGS = 1_000

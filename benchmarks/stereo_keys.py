@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from benchmarks.plain_odometry import path
-from rbpf.exchange import NULL
+from rbpf.core.exchange import NULL
 from rbpf.lie import SE3
 from rbpf.sensors.key_index import Gate, KeyIndex
 from rbpf.sensors.key_management import KeyConfig, KeyManager

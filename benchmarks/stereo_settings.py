@@ -19,7 +19,7 @@ from rbpf.sensors.readers.images import StereoSequence, open_stereo
 from rbpf.sensors.sift import SiftConfig
 from rbpf.sensors.stereo_features import StereoFeatures
 from rbpf.sensors.stereo_matching import StereoConfig, StereoSift
-from rbpf.validation.alignment import align
+from rbpf.validation.metrics.alignment import align
 
 NAMES = "stereo_zed_room1", "stereo_kitti_seq1"
 SEEDS = 3

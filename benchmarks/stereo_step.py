@@ -8,8 +8,8 @@ generations, and are held by each particle.
 import numpy as np
 
 from benchmarks.rows import Row, Settings, interleaved
+from rbpf.core.models import Records
 from rbpf.lie import SE3
-from rbpf.models import Records
 from rbpf.motion.odometry import Odometry
 from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
 from rbpf.sensors.stereo_features import StereoFeatures

@@ -4,7 +4,7 @@ import numpy as np
 
 from benchmarks.rows import Row, Settings, interleaved
 from benchmarks.worlds import Run, planar
-from rbpf.models import ObservationModel
+from rbpf.core.models import ObservationModel
 
 K, M = 30, 300
 AIM = 10.0

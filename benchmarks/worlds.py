@@ -7,15 +7,15 @@ from itertools import islice
 import numpy as np
 
 from benchmarks.rows import Diversity
-from rbpf.belief import Belief
-from rbpf.filter import Filter
+from rbpf.core.belief import Belief
+from rbpf.core.filter import Filter
+from rbpf.core.models import ObservationModel, Observations, Records, Sensor
+from rbpf.core.proposals import EkfProposal
+from rbpf.core.resampling import EssTriggered, Systematic
 from rbpf.lie import SE2, SE3, SE2Group, SE3Group
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
-from rbpf.models import ObservationModel, Observations, Records, Sensor
 from rbpf.motion.odometry import Odometry, OdometryMotion
-from rbpf.proposals import EkfProposal
-from rbpf.resampling import EssTriggered, Systematic
 from rbpf.sensors.range_bearing import RangeBearing
 
 CIRCLE = 3.0

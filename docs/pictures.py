@@ -16,8 +16,8 @@ from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.video import VideoRun
 from rbpf.validation.mono import Recording, start_mono
 from rbpf.validation.mono_map import summarise_mono_map
-from rbpf.validation.mono_pictures import plot_mono_run
-from rbpf.validation.mono_video import annotated_frames
+from rbpf.validation.report.mono_pictures import plot_mono_run
+from rbpf.validation.report.mono_video import annotated_frames
 from rbpf.validation.simulation.exposure import Imaging
 from rbpf.validation.simulation.images import simulate_images
 from rbpf.validation.simulation.textured_desk import TexturedDesk

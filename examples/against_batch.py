@@ -7,9 +7,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from rbpf.systems.range_bearing.config import RangeBearingConfig
-from rbpf.validation.against_batch import compare_run
-from rbpf.validation.offline_pictures import plot_against_batch
+from rbpf.validation.consistency.against_batch import compare_run
 from rbpf.validation.range_bearing import start_run
+from rbpf.validation.report.offline_pictures import plot_against_batch
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 from rbpf.validation.tables import write_table
 

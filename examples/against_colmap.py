@@ -9,18 +9,18 @@ from tempfile import TemporaryDirectory
 
 from rbpf.sensors.pinhole import Pinhole
 from rbpf.systems.mono.config import MonoConfig
-from rbpf.validation.against_colmap import compare_with_colmap
-from rbpf.validation.batch_problem import problem_of
-from rbpf.validation.colmap_pipeline import ReconstructionOptions
+from rbpf.validation.colmap.against_colmap import compare_with_colmap
+from rbpf.validation.colmap.pipeline import ReconstructionOptions
+from rbpf.validation.colmap.two_optimisers import adjust_by_both
 from rbpf.validation.export import export_colmap, export_ply
+from rbpf.validation.gtsam.batch_problem import problem_of
+from rbpf.validation.metrics.path_and_map import of_run
 from rbpf.validation.mono import Recording, start_mono
-from rbpf.validation.offline_pictures import plot_against_colmap
-from rbpf.validation.path_and_map import of_run
+from rbpf.validation.report.offline_pictures import plot_against_colmap
 from rbpf.validation.simulation.exposure import Imaging
 from rbpf.validation.simulation.images import simulate_images
 from rbpf.validation.simulation.textured_desk import TexturedDesk
 from rbpf.validation.tables import write_table
-from rbpf.validation.two_optimisers import adjust_by_both
 
 
 def main(quick: bool = False, out: Path = Path("out")) -> dict[str, float]:

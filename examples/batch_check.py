@@ -11,12 +11,12 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from rbpf.systems.range_bearing.config import RangeBearingConfig
-from rbpf.validation.gtsam_ba import solve
+from rbpf.validation.gtsam.measurements import dead_reckoning
+from rbpf.validation.gtsam.robot import solve
 from rbpf.validation.map_summary import summarise_map
-from rbpf.validation.measurements import dead_reckoning
+from rbpf.validation.metrics.scores import score
 from rbpf.validation.range_bearing import start_run
 from rbpf.validation.run_folder import used_measurements
-from rbpf.validation.scores import score
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 
 

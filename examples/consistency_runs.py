@@ -2,7 +2,7 @@
 
 The normalised error squared of the pose (NEES), the mean over independent recordings, is 1 per degree of freedom for an
 honest filter, and stays in the green band in 95 % of the steps. A filter is over-confident from the step at which it
-leaves the band upwards and does not come back (`rbpf.validation.monte_carlo.left_for_good`). The upper pictures have
+leaves the band upwards and does not come back (`left_for_good`). The upper pictures have
 the curves for three numbers of particles. The lower ones have, for the middle number, what each remedy does to the mean
 over all steps: iterating the proposal's linearisation, the exact importance ratio instead of the linearised weight,
 re-estimating the start (range-bearing), marginalising the frame of the known points instead of sampling the start
@@ -21,11 +21,11 @@ from matplotlib.figure import Figure
 from rbpf.systems.filtering import ProposalConfig
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
-from rbpf.validation.monte_carlo import Consistency, run_trials
+from rbpf.validation.consistency.monte_carlo import Consistency, run_trials
+from rbpf.validation.consistency.trials import DeskTrial, RobotTrial, Trial
 from rbpf.validation.simulation.point_worlds import DeskWorld
 from rbpf.validation.simulation.robot import RobotWorld
 from rbpf.validation.tables import write_csv, write_table
-from rbpf.validation.trials import DeskTrial, RobotTrial, Trial
 
 MONO, ROBOT = "monocular", "range-bearing"
 Trials = dict[str, Callable[[int], Trial]]

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.error_causes import HEADER, Cause, camera_causes, robot_causes
-from rbpf.validation.figures import COLOURS, new_axes, save_figures
+from rbpf.validation.report.figures import COLOURS, new_axes, save_figures
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 from rbpf.validation.tables import write_table
 

@@ -23,8 +23,8 @@ from rbpf.validation.error_ratios import (
     stereo_ratio,
     tracks_ratio,
 )
-from rbpf.validation.figures import COLOURS, new_axes, save_figures
 from rbpf.validation.mono import Recording
+from rbpf.validation.report.figures import COLOURS, new_axes, save_figures
 from rbpf.validation.simulation.exposure import Imaging
 from rbpf.validation.simulation.images import simulate_images
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot

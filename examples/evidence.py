@@ -3,7 +3,7 @@
 The same recording of position fixes is filtered under three assumptions about their noise. The filter's
 evidence p(z_1:T) is an unbiased estimate here, so that its logarithm may be compared; its spread from seed
 to seed tells how large a difference means something. For a system of the project, `rbpf compare RUN_A RUN_B` and
-`rbpf.validation.model_comparison.compare_evidence` do the same, and refuse a likelihood that is not a density.
+`rbpf.validation.consistency.model_comparison.compare_evidence` do the same, and refuse a likelihood that is not a density.
 """
 
 import numpy as np
@@ -11,7 +11,7 @@ from gps_fix import STD_FIX, PositionReceiver, simulate
 
 from rbpf import SE2, Filter
 from rbpf.motion.odometry import OdometryMotion
-from rbpf.validation.model_comparison import evidence_difference
+from rbpf.validation.consistency.model_comparison import evidence_difference
 
 SEEDS = 5
 

@@ -13,8 +13,8 @@ from custom_sensor import LampSensor, simulate
 from numba import njit
 
 from rbpf import SE2, Filter, LandmarkMap, Point, check_model
+from rbpf.core.models import FusedKernel
 from rbpf.kernels.signature import observation_kernel
-from rbpf.models import FusedKernel
 from rbpf.motion.odometry import OdometryMotion
 from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
 

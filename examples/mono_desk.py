@@ -16,14 +16,14 @@ import tyro
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-from rbpf.diagnostics import Band, chi_square_band
+from rbpf.core.diagnostics import Band, chi_square_band
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.run import run
-from rbpf.validation.consistency import PoseErrors, pose_errors
-from rbpf.validation.gtsam_ba_camera import solve_features
-from rbpf.validation.parallel import in_parallel
+from rbpf.validation.consistency.pose_errors import PoseErrors, pose_errors
+from rbpf.validation.gtsam.camera import solve_features
 from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
 from rbpf.validation.simulation.point_worlds import DeskWorld
+from rbpf.validation.sweep.parallel import in_parallel
 from rbpf.validation.tables import write_csv, write_table
 
 USUAL = 1  # which of the numbers of particles is compared with the batch

@@ -22,10 +22,10 @@ from matplotlib.figure import Figure
 from rbpf.maps.point import Point
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.run import landmark_cloud, run
-from rbpf.validation.consistency import offdiagonal_eigenvalues
-from rbpf.validation.parallel import in_parallel
+from rbpf.validation.consistency.pose_errors import offdiagonal_eigenvalues
 from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
 from rbpf.validation.simulation.point_worlds import DeskWorld
+from rbpf.validation.sweep.parallel import in_parallel
 from rbpf.validation.tables import write_csv, write_table
 
 RANK = 30  # the paper's

@@ -24,18 +24,18 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
-from rbpf.filter import Filter
+from rbpf.core.filter import Filter
 from rbpf.sensors.features import FeatureLog
 from rbpf.systems.filtering import ProposalConfig
 from rbpf.systems.mono.config import MonoConfig, RayConfig
 from rbpf.systems.mono.run import run
 from rbpf.validation.camera_map import summarise_points
-from rbpf.validation.consistency import pose_errors
-from rbpf.validation.gtsam_ba_camera import solve_features
+from rbpf.validation.consistency.pose_errors import pose_errors
+from rbpf.validation.gtsam.camera import solve_features
 from rbpf.validation.map_summary import MapSummary
-from rbpf.validation.parallel import in_parallel
 from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
 from rbpf.validation.simulation.walked_worlds import CorridorWorld, LoopWorld
+from rbpf.validation.sweep.parallel import in_parallel
 from rbpf.validation.tables import write_table
 
 SETTINGS = {

@@ -28,17 +28,17 @@ import tyro
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-from rbpf.diagnostics import chi_square_band
+from rbpf.core.diagnostics import chi_square_band
 from rbpf.motion.constant_velocity import PosePrior
 from rbpf.sensors.features import FeatureLog, KnownPoints
 from rbpf.systems.filtering import ProposalConfig, ResamplingConfig
 from rbpf.systems.mono.config import MonoConfig, RayConfig, VelocityConfig
 from rbpf.systems.mono.run import pose_estimate
 from rbpf.systems.mono.system import build_filter, start_prior
-from rbpf.validation.consistency import PoseErrors, pose_errors
-from rbpf.validation.parallel import in_parallel
+from rbpf.validation.consistency.pose_errors import PoseErrors, pose_errors
 from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
 from rbpf.validation.simulation.point_worlds import DeskWorld
+from rbpf.validation.sweep.parallel import in_parallel
 from rbpf.validation.tables import write_csv, write_table
 
 DEFAULT, MORE, TRUE_START = "default", "four times the particles", "true first pose"

@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 
 from rbpf.sensors.pinhole import Pinhole
 from rbpf.systems.mono.config import MonoConfig
-from rbpf.validation.figures import save_figures
+from rbpf.validation.report.figures import save_figures
 from rbpf.validation.search_statistics import SearchStatistics, measure_search
 from rbpf.validation.simulation.exposure import Imaging
 from rbpf.validation.simulation.images import simulate_images

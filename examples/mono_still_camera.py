@@ -30,11 +30,11 @@ from matplotlib.figure import Figure
 from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.systems.mono.config import MonoConfig, RayConfig
 from rbpf.systems.mono.run import run
-from rbpf.validation.consistency import pose_errors
+from rbpf.validation.consistency.pose_errors import pose_errors
 from rbpf.validation.e06.still_camera import camera_cloud
-from rbpf.validation.parallel import in_parallel
 from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
 from rbpf.validation.simulation.point_worlds import PlanarTargetWorld
+from rbpf.validation.sweep.parallel import in_parallel
 from rbpf.validation.tables import write_table
 
 TREATMENTS = ("off", "epipolar", "marginal")

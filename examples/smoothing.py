@@ -8,7 +8,7 @@ know early on; smoothing does.
 import numpy as np
 
 from rbpf import Euclidean, Filter, MotionModel, ObservationModel, Observations, Part, Sensor, Transition
-from rbpf.smoothing import ancestral_smoothing, backward_simulation
+from rbpf.core.smoothing import ancestral_smoothing, backward_simulation
 
 STEPS, STD_STEP, STD_RANGE, STD_FIX = 60, 0.2, 0.1, 0.3  # metres
 

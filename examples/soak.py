@@ -14,9 +14,9 @@ from matplotlib.figure import Figure
 
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
-from rbpf.validation.parallel import in_parallel
 from rbpf.validation.simulation.streams import CameraStream, RobotStream, Turnover
 from rbpf.validation.soak import COLUMNS, Window, camera_steps, robot_steps, soak
+from rbpf.validation.sweep.parallel import in_parallel
 from rbpf.validation.tables import write_csv, write_table
 
 SYSTEMS = "camera", "robot"

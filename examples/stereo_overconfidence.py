@@ -23,7 +23,7 @@ from rbpf.sensors.features import FeatureLog
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig, ResamplingConfig
 from rbpf.systems.stereo.config import OUTLIER_VOLUME_PX3, OdometryConfig, StereoConfig, TriggerConfig
 from rbpf.systems.stereo.run import run_features
-from rbpf.validation.consistency import whitened_errors
+from rbpf.validation.consistency.pose_errors import whitened_errors
 from rbpf.validation.simulation.features import STEREO, Measuring, simulate_features
 from rbpf.validation.simulation.lab_points import LabWorld
 from rbpf.validation.simulation.textured_lab import LabDrive

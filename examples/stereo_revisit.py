@@ -21,12 +21,12 @@ from rbpf.sensors.readers.images import open_stereo
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.feature_cache import cache_features
 from rbpf.systems.stereo.run import StereoRun, run_features, run_images
-from rbpf.validation.batch_problem import solve_problem
-from rbpf.validation.figures import COLOURS, new_axes, save_figures
+from rbpf.validation.gtsam.batch_problem import solve_problem
+from rbpf.validation.metrics.stereo_scores import score_stereo
+from rbpf.validation.report.figures import COLOURS, new_axes, save_figures
 from rbpf.validation.simulation.features import STEREO, Measuring, simulate_features
 from rbpf.validation.simulation.lab_points import LabWorld
 from rbpf.validation.simulation.textured_lab import LabDrive
-from rbpf.validation.stereo_scores import score_stereo
 from rbpf.validation.tables import write_table
 from rbpf.validation.there_and_back import log_there_and_back, pairs_there_and_back
 

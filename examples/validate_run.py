@@ -9,11 +9,11 @@ from pathlib import Path
 import tyro
 
 from rbpf.systems.range_bearing.config import RangeBearingConfig
-from rbpf.validation.comparison import read_comparisons
+from rbpf.validation.consistency.comparison import read_comparisons
+from rbpf.validation.consistency.validate import validate
 from rbpf.validation.range_bearing import finish_run, start_run
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 from rbpf.validation.tables import write_table
-from rbpf.validation.validate import validate
 
 
 def main(

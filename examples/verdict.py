@@ -19,21 +19,21 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
-from rbpf.models import Jacobians
+from rbpf.core.models import Jacobians
 from rbpf.sensors.range_bearing import RangeBearing
 from rbpf.sensors.readers.log import RobotLog
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.range_bearing.run import run
-from rbpf.validation.against_groundtruth import pose_statistics
-from rbpf.validation.consistency import whitened_errors
+from rbpf.validation.consistency.against_groundtruth import pose_statistics
+from rbpf.validation.consistency.own_statistics import innovation_statistics
+from rbpf.validation.consistency.pose_errors import whitened_errors
+from rbpf.validation.consistency.statistic import Statistic
+from rbpf.validation.consistency.trials import simulated_log
+from rbpf.validation.consistency.verdict import Trust, Verdict, judge
 from rbpf.validation.faults import bias_odometry, scale_odometry_noise, scale_sensor_noise, swap_names
-from rbpf.validation.own_statistics import innovation_statistics
 from rbpf.validation.run_truth import robot_truth
 from rbpf.validation.simulation.robot import RobotWorld
-from rbpf.validation.statistic import Statistic
 from rbpf.validation.tables import write_table
-from rbpf.validation.trials import simulated_log
-from rbpf.validation.verdict import Trust, Verdict, judge
 
 RIGHT, JACOBIAN = "nothing", "wrong derivative"
 Fault = Callable[[RobotLog, np.random.Generator], RobotLog]

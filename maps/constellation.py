@@ -5,10 +5,10 @@ from typing import final
 import numpy as np
 
 from rbpf import gaussian
+from rbpf.core.models import Landmark, Records
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.lie.matrices import skew
-from rbpf.models import Landmark, Records
 
 MOST = 12
 """Points that may each have an error of their own; a record's covariance grows with the square of their number."""

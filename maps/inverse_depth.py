@@ -4,9 +4,9 @@ from typing import final
 
 import numpy as np
 
+from rbpf.core.models import Landmark, Records
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.models import Landmark, Records
 
 
 @final

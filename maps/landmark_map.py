@@ -6,18 +6,10 @@ from typing import Any, final
 
 import numpy as np
 
-from rbpf.archive import checked, within
-from rbpf.errors import InputError
-from rbpf.genealogy import Lineage
-from rbpf.lie import LieGroup
-from rbpf.likelihoods import Gaussian
-from rbpf.maps.layout import Layout
-from rbpf.maps.plan import BOTH, MAP, STATE, Plan, by_use, make_plan, require_apart
-from rbpf.maps.point import Point
-from rbpf.maps.reading import linearise_one_particle, project_compiled, read_records
-from rbpf.maps.rows import RowEngine
-from rbpf.maps.shared import ALL, SharedStore
-from rbpf.models import (
+from rbpf.core.archive import checked, within
+from rbpf.core.genealogy import Lineage
+from rbpf.core.likelihoods import Gaussian
+from rbpf.core.models import (
     Conditional,
     Jacobians,
     Landmark,
@@ -28,9 +20,17 @@ from rbpf.models import (
     Part,
     Records,
 )
-from rbpf.numeric import linearise
-from rbpf.proposals import Prior, Terms
-from rbpf.reference import innovation_covariance
+from rbpf.core.numeric import linearise
+from rbpf.core.proposals import Prior, Terms
+from rbpf.core.reference import innovation_covariance
+from rbpf.errors import InputError
+from rbpf.lie import LieGroup
+from rbpf.maps.layout import Layout
+from rbpf.maps.plan import BOTH, MAP, STATE, Plan, by_use, make_plan, require_apart
+from rbpf.maps.point import Point
+from rbpf.maps.reading import linearise_one_particle, project_compiled, read_records
+from rbpf.maps.rows import RowEngine
+from rbpf.maps.shared import ALL, SharedStore
 
 
 @final

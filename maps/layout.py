@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from rbpf import gaussian
+from rbpf.core.models import Landmark, Records
 from rbpf.errors import InputError
-from rbpf.models import Landmark, Records
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from typing import final
 import numpy as np
 
 from rbpf import gaussian
-from rbpf.models import Landmark, Records
+from rbpf.core.models import Landmark, Records
 
 
 @final

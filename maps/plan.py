@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from rbpf.core.models import NEW, NULL, Observations, Part
 from rbpf.errors import InputError
-from rbpf.models import NEW, NULL, Observations, Part
 
 STATE = frozenset({Part.STATE})
 MAP = frozenset({Part.LANDMARK})

@@ -4,8 +4,8 @@ from typing import final
 
 import numpy as np
 
+from rbpf.core.models import Landmark
 from rbpf.lie import SE2Group, SE3Group
-from rbpf.models import Landmark
 
 
 @final

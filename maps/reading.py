@@ -2,15 +2,15 @@
 
 import numpy as np
 
+from rbpf.core.models import FusedKernel, Jacobians, ObservationModel, Records
+from rbpf.core.numeric import linearise
+from rbpf.core.proposals import Prior
 from rbpf.kernels.gather import gather
 from rbpf.kernels.project import project
 from rbpf.kernels.single import linearise_one
 from rbpf.lie import LieGroup
 from rbpf.maps.layout import Layout
 from rbpf.maps.shared import ALL, SharedStore
-from rbpf.models import FusedKernel, Jacobians, ObservationModel, Records
-from rbpf.numeric import linearise
-from rbpf.proposals import Prior
 
 
 def read_records(
@@ -38,7 +38,7 @@ def linearise_one_particle(
 ) -> tuple[np.ndarray, Jacobians]:
     """Innovations (K, p) and Jacobians of one particle's landmarks, records (1, K, …), at its state (E,).
 
-    What `rbpf.numeric.linearise` gives, by the model's kernel where there is one.
+    What `rbpf.core.numeric.linearise` gives, by the model's kernel where there is one.
     """
     mean = records.mean[0]
     const = None if records.const is None else records.const[0]

@@ -4,18 +4,19 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from rbpf import gaussian, reference
+from rbpf import gaussian
+from rbpf.core import reference
+from rbpf.core.likelihoods import Gaussian
+from rbpf.core.models import FusedKernel, Likelihood, LogDensities, Observations, Part, Records
+from rbpf.core.numeric import linearise
+from rbpf.core.proposals import Prior, Terms
 from rbpf.kernels.refine import refine
 from rbpf.kernels.threads import run_driver
 from rbpf.kernels.update import update
 from rbpf.lie import LieGroup
-from rbpf.likelihoods import Gaussian
 from rbpf.maps.layout import Layout
 from rbpf.maps.plan import Batch, Plan, Row
 from rbpf.maps.shared import SharedStore
-from rbpf.models import FusedKernel, Likelihood, LogDensities, Observations, Part, Records
-from rbpf.numeric import linearise
-from rbpf.proposals import Prior, Terms
 
 GAUSSIAN = Gaussian()
 _NO_MASK = np.zeros((0, 0), dtype=np.bool_)

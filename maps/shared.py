@@ -8,9 +8,9 @@ descendants, whose number falls like 1/age as lineages coalesce. See `docs/adr` 
 
 import numpy as np
 
-from rbpf.archive import checked, within
+from rbpf.core.archive import checked, within
+from rbpf.core.genealogy import Lineage, Schedule
 from rbpf.errors import InputError
-from rbpf.genealogy import Lineage, Schedule
 from rbpf.maps.columns import Columns
 from rbpf.maps.pool import Access, Cold, Pool
 

@@ -12,9 +12,9 @@ from typing import Literal, final
 import numpy as np
 
 from rbpf import gaussian
+from rbpf.core.models import MotionModel, Transition
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Euclidean, Product
-from rbpf.models import MotionModel, Transition
 
 POSE_AND_VELOCITY = Product(SE3, Euclidean(6))
 """State (N, 13) of `SampledVelocity`: world_from_body, then its velocity."""

@@ -6,9 +6,9 @@ from typing import final
 import numpy as np
 
 from rbpf import gaussian
+from rbpf.core.models import MotionModel, Transition
 from rbpf.errors import InputError
 from rbpf.lie import LieGroup
-from rbpf.models import MotionModel, Transition
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,9 @@ from typing import Literal, final
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rbpf.core.models import MotionModel, Transition
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.models import MotionModel, Transition
 from rbpf.motion.odometry import Odometry, OdometryMotion
 
 PLANAR = np.diag([0.0, 1.0, 0.0, 1.0, 0.0, 1.0])

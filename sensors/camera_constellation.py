@@ -6,8 +6,8 @@ from typing import final
 
 import numpy as np
 
+from rbpf.core.models import FusedKernel, Jacobians, ObservationModel
 from rbpf.lie import SE3
-from rbpf.models import FusedKernel, Jacobians, ObservationModel
 from rbpf.sensors.camera_points import CameraPoint, forward
 from rbpf.sensors.pinhole import Pinhole
 

@@ -10,9 +10,9 @@ from typing import Protocol, final
 import numpy as np
 
 from rbpf import gaussian
+from rbpf.core.models import FusedKernel, Jacobians, ObservationModel, Records
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.models import FusedKernel, Jacobians, ObservationModel, Records
 from rbpf.sensors.pinhole import Pinhole
 
 GRAZING = 0.2

@@ -10,8 +10,8 @@ from typing import final
 
 import numpy as np
 
+from rbpf.core.exchange import NULL
 from rbpf.errors import InputError
-from rbpf.exchange import NULL
 from rbpf.sensors.candidates import gate_pairs
 from rbpf.sensors.key_matching import MatchLimits, distances, match_pairs, two_best
 from rbpf.sensors.key_search import ExactSearch, KeySearch

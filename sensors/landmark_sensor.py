@@ -5,9 +5,9 @@ from typing import Protocol, final
 
 import numpy as np
 
-from rbpf.association import ExistenceModel, Gates, associate
-from rbpf.belief import Belief
-from rbpf.models import NEW, Landmark, Likelihood, NewLandmarks, ObservationModel, Observations, Sensor
+from rbpf.core.association import ExistenceModel, Gates, associate
+from rbpf.core.belief import Belief
+from rbpf.core.models import NEW, Landmark, Likelihood, NewLandmarks, ObservationModel, Observations, Sensor
 from rbpf.sensors.names import Names
 
 

@@ -9,8 +9,8 @@ from abc import abstractmethod
 
 import numpy as np
 
+from rbpf.core.models import Jacobians, ObservationModel
 from rbpf.lie import SE2Group, SE3Group
-from rbpf.models import Jacobians, ObservationModel
 
 
 class RigidPointModel(ObservationModel):

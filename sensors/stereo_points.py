@@ -5,8 +5,8 @@ from typing import final
 import numpy as np
 
 from rbpf import gaussian
+from rbpf.core.models import FusedKernel, Records
 from rbpf.lie import SE3
-from rbpf.models import FusedKernel, Records
 from rbpf.sensors.camera_points import CameraModel
 from rbpf.sensors.pinhole import RectifiedStereo
 

@@ -17,7 +17,7 @@ from rbpf.systems.mono.relocalise import Attempt
 from rbpf.systems.mono.resuming import save
 from rbpf.systems.mono.video import VideoRun, run_images
 from rbpf.validation.blackouts import SETTLED_S, Blackouts, Outcome, Series, pose_differences
-from rbpf.validation.parallel import in_parallel
+from rbpf.validation.sweep.parallel import in_parallel
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,8 @@ from rbpf.sensors.chessboard import Board, board_corners
 from rbpf.sensors.pinhole import Pinhole
 from rbpf.sensors.readers.images.calibration import MODELS, NAME, model_of
 from rbpf.sensors.readers.images.uncalibrated import Shot, read_shots
-from rbpf.validation.figures import COLOURS, label, save_figures
 from rbpf.validation.files import prepare_folder, write_text
+from rbpf.validation.report.figures import COLOURS, label, save_figures
 
 FIGURES, PICTURE = "calibration.json", "calibration.png"
 MOST_SHOTS, MOST_VIEWS = 150, 40

@@ -3,7 +3,7 @@
 import numpy as np
 
 from rbpf import gaussian
-from rbpf.filter import Filter
+from rbpf.core.filter import Filter
 from rbpf.lie import SE3
 from rbpf.maps.point import Point
 from rbpf.sensors.range_bearing import RelativePosition

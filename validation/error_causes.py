@@ -22,20 +22,20 @@ from rbpf.systems.mono.run import run as filter_log
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.range_bearing.run import run as filter_robot
 from rbpf.systems.settings import load_settings
-from rbpf.validation import gtsam_ba
-from rbpf.validation.accuracy import ate
-from rbpf.validation.alignment import Alignment
-from rbpf.validation.batch_problem import AFAR
 from rbpf.validation.camera_files import read_features
-from rbpf.validation.measurements import InitialEstimate
-from rbpf.validation.mono_batch import adjust_log
+from rbpf.validation.gtsam import robot
+from rbpf.validation.gtsam.batch_problem import AFAR
+from rbpf.validation.gtsam.measurements import InitialEstimate
+from rbpf.validation.gtsam.mono_batch import adjust_log
+from rbpf.validation.metrics.accuracy import ate
+from rbpf.validation.metrics.alignment import Alignment
+from rbpf.validation.metrics.trajectory import Trajectory
 from rbpf.validation.mono_budget import MANY
 from rbpf.validation.mono_parts import GivenDepths, agreeing_matches, batch_depths
 from rbpf.validation.run_files import in_space
 from rbpf.validation.run_folder import used_measurements
 from rbpf.validation.run_record import open_run
 from rbpf.validation.run_truth import robot_truth
-from rbpf.validation.trajectory import Trajectory
 
 AS_IT_IS, BATCH, FROM_FILTER = "as it is", "batch", "batch started from the filter"
 ONLINE = "batch of what was measured until then"
@@ -84,16 +84,16 @@ def robot_causes(
 
     runs = [filter_robot(log, replace(config, seed=seed)) for seed in seeds]
     measured = used_measurements(runs[0])
-    batch = gtsam_ba.solve(measured, marginals=False, incremental=len(stamps) > AFAR)
+    batch = robot.solve(measured, marginals=False, incremental=len(stamps) > AFAR)
     start = InitialEstimate(runs[0].progress.mean, dict(batch.landmarks))
-    again = gtsam_ba.solve(measured, marginals=False, initial=start)
+    again = robot.solve(measured, marginals=False, initial=start)
     found = error(batch.world_from_robot)
     out = [
         Cause(AS_IT_IS, tuple(error(run.progress.mean) for run in runs), found),
         Cause(BATCH, (found,), found),
     ]
     out.append(Cause(FROM_FILTER, (error(again.world_from_robot),), found))
-    out.append(Cause(ONLINE, (error(gtsam_ba.solve_online(measured)),), found))
+    out.append(Cause(ONLINE, (error(robot.solve_online(measured)),), found))
     for name, changed in _robot_changes(config):
         if told is not None:
             told(name)

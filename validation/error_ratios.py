@@ -20,15 +20,15 @@ from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.range_bearing.run import Run, run
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.run import StereoRun, run_features
-from rbpf.validation.accuracy import ate
-from rbpf.validation.alignment import Alignment
-from rbpf.validation.batch_problem import Optimum, floats_in_scale, problem_of, solve_problem
+from rbpf.validation.gtsam.batch_problem import Optimum, floats_in_scale, problem_of, solve_problem
+from rbpf.validation.metrics.accuracy import ate
+from rbpf.validation.metrics.alignment import Alignment
+from rbpf.validation.metrics.mono_scores import true_path
+from rbpf.validation.metrics.path_and_map import AnyRun, PathAndMap, of_run
+from rbpf.validation.metrics.scores import as_trajectory, truth_at
+from rbpf.validation.metrics.trajectory import Trajectory, associate
 from rbpf.validation.mono import Recording, start_mono
-from rbpf.validation.mono_scores import true_path
-from rbpf.validation.path_and_map import AnyRun, PathAndMap, of_run
-from rbpf.validation.scores import as_trajectory, truth_at
 from rbpf.validation.stereo import StereoRecording, start_stereo
-from rbpf.validation.trajectory import Trajectory, associate
 
 HEADER = ("recording", "particles", "seeds", "filter_m", "least_m", "most_m", "batch_m", "ratio")
 """Of a table of `ErrorRatio.row`."""

@@ -16,14 +16,14 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.features import FeatureLog
 from rbpf.sensors.pinhole import Pinhole
-from rbpf.validation.batch_problem import Problem
-from rbpf.validation.colmap_model import build_model
-from rbpf.validation.colours import colours_by_sigma, standard_deviations
+from rbpf.validation.colmap.model import build_model
 from rbpf.validation.files import prepare_folder
-from rbpf.validation.gtsam_ba_camera_data import Sightings, sightings_of
+from rbpf.validation.gtsam.batch_problem import Problem
+from rbpf.validation.gtsam.camera_data import Sightings, sightings_of
 from rbpf.validation.map_summary import MapSummary
-from rbpf.validation.path_and_map import PathAndMap
+from rbpf.validation.metrics.path_and_map import PathAndMap
 from rbpf.validation.ply import write_ply
+from rbpf.validation.report.colours import colours_by_sigma, standard_deviations
 
 MAP, PATH, MODEL = "map.ply", "path.ply", "colmap"
 

@@ -12,14 +12,14 @@ npz      run.npz: stamps_ns (T,), world_from_body (T, E), cov_poses (T, d, d); l
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from rbpf.checkpoint import save_arrays
+from rbpf.core.checkpoint import save_arrays
 from rbpf.errors import InputError
-from rbpf.validation.batch_problem import read_problem
 from rbpf.validation.export import MODEL, export_colmap, export_ply, raised
 from rbpf.validation.files import prepare_folder
+from rbpf.validation.gtsam.batch_problem import read_problem
 from rbpf.validation.measurement_files import OBSERVATIONS
-from rbpf.validation.path_and_map import PathAndMap, read_path_and_map
-from rbpf.validation.rerun_file import AXIS_M, ellipsoids, log_pose, log_time, recording
+from rbpf.validation.metrics.path_and_map import PathAndMap, read_path_and_map
+from rbpf.validation.report.rerun_file import AXIS_M, ellipsoids, log_pose, log_time, recording
 from rbpf.validation.trajectory_files import write_kitti, write_tum
 
 

@@ -28,7 +28,7 @@ from rbpf.validation.image_faults import (
     truncate_files,
     wrong_focal,
 )
-from rbpf.validation.mono_scores import true_path
+from rbpf.validation.metrics.mono_scores import true_path
 
 NONE = "none"
 RIGHT_M, RIGHT_DEG = 0.03, 2.0

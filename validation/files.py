@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from rbpf import gaussian
-from rbpf.checkpoint import save_arrays
+from rbpf.core.checkpoint import save_arrays
 from rbpf.errors import InputError
 from rbpf.validation.map_summary import MapSummary
 from rbpf.validation.writing import whole

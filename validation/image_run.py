@@ -7,7 +7,7 @@ from typing import Any
 
 from rbpf.errors import InputError
 from rbpf.validation.files import write_summary
-from rbpf.validation.mono_batch import Batch
+from rbpf.validation.gtsam.mono_batch import Batch
 from rbpf.validation.trajectory_files import write_tum
 
 CHECKPOINT = "checkpoint.npz"

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 
 from rbpf import gaussian
-from rbpf.anchoring import Anchored
-from rbpf.archive import checked
-from rbpf.checkpoint import fitting
+from rbpf.core.anchoring import Anchored
+from rbpf.core.archive import checked
+from rbpf.core.checkpoint import fitting
+from rbpf.core.filter import Filter
+from rbpf.core.models import Records
 from rbpf.errors import InputError
-from rbpf.filter import Filter
-from rbpf.models import Records
 from rbpf.sensors.range_bearing import RelativePosition
 
 

@@ -38,8 +38,8 @@ from numpy.typing import NDArray
 
 from rbpf.lie import SE2, SE3, Array, SE2Group, SE3Group
 from rbpf.sensors.readers.text import quoted
+from rbpf.validation.gtsam.measurements import KINDS, Measurements, are_covariances, are_poses, point_dim
 from rbpf.validation.measurement_table import HeadedTable
-from rbpf.validation.measurements import KINDS, Measurements, are_covariances, are_poses, point_dim
 from rbpf.validation.writing import whole
 
 OBSERVATIONS = "observations.csv"

@@ -13,17 +13,17 @@ from rbpf.sensors.readers.images.topics import UNNAMED
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.known_map import read_known_map
 from rbpf.systems.mono.video import VideoRun, first_image, run_images
+from rbpf.validation.consistency.validate import report_run
 from rbpf.validation.files import prepare_folder
+from rbpf.validation.gtsam.mono_batch import adjust_run, score_batch
 from rbpf.validation.image_run import CHECKPOINT, Progress, Telling, write_batch
-from rbpf.validation.mono_batch import adjust_run, score_batch
 from rbpf.validation.mono_folder import write_mono_run
 from rbpf.validation.mono_map import summarise_mono_map
-from rbpf.validation.mono_pictures import plot_mono_run
-from rbpf.validation.mono_rerun import write_rerun
-from rbpf.validation.mono_video import write_annotated
 from rbpf.validation.provenance import left_out
-from rbpf.validation.report import VIDEO
-from rbpf.validation.validate import report_run
+from rbpf.validation.report.mono_pictures import plot_mono_run
+from rbpf.validation.report.mono_rerun import write_rerun
+from rbpf.validation.report.mono_video import write_annotated
+from rbpf.validation.report.page import VIDEO
 
 
 @dataclass(frozen=True)

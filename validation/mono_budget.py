@@ -24,9 +24,12 @@ from rbpf.sensors.features import FeatureLog
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.run import run as filter_log
 from rbpf.systems.mono.video import VideoRun
-from rbpf.validation.accuracy import ate
-from rbpf.validation.alignment import Alignment
-from rbpf.validation.mono_batch import Batch, adjust_run
+from rbpf.validation.gtsam.mono_batch import Batch, adjust_run
+from rbpf.validation.gtsam.self_calibration import refine_calibration
+from rbpf.validation.metrics.accuracy import ate
+from rbpf.validation.metrics.alignment import Alignment
+from rbpf.validation.metrics.mono_scores import true_path, usual_alignment
+from rbpf.validation.metrics.trajectory import Trajectory
 from rbpf.validation.mono_log import feature_log
 from rbpf.validation.mono_parts import (
     WRONG_PX,
@@ -36,9 +39,6 @@ from rbpf.validation.mono_parts import (
     batch_depths,
     reprojection_errors,
 )
-from rbpf.validation.mono_scores import true_path, usual_alignment
-from rbpf.validation.self_calibration import refine_calibration
-from rbpf.validation.trajectory import Trajectory
 
 MANY = 10
 """Times as many particles."""

@@ -36,14 +36,14 @@ from rbpf.validation.files import (
     write_map,
     write_summary,
 )
+from rbpf.validation.metrics.mono_scores import camera_truth, score_camera
+from rbpf.validation.metrics.trajectory import Trajectory
 from rbpf.validation.mono_known_map import known_map
 from rbpf.validation.mono_log import feature_log
 from rbpf.validation.mono_map import MonoMap
 from rbpf.validation.mono_posterior import write_posterior
-from rbpf.validation.mono_scores import camera_truth, score_camera
 from rbpf.validation.provenance import write_config
 from rbpf.validation.run_files import write_path, write_truth
-from rbpf.validation.trajectory import Trajectory
 from rbpf.validation.trajectory_files import write_tum
 
 

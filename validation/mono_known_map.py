@@ -7,8 +7,8 @@ from rbpf.sensors.chessboard import spread_rows
 from rbpf.systems.mono.known_map import KnownMap
 from rbpf.systems.mono.system import world_of
 from rbpf.systems.mono.video import VideoRun
+from rbpf.validation.metrics.mono_scores import usual_alignment
 from rbpf.validation.mono_map import MonoMap
-from rbpf.validation.mono_scores import usual_alignment
 
 MOST_VIEWS = 16
 """Poses that are kept, to look from at a camera of which nothing is known."""

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from rbpf import gaussian
-from rbpf.anchoring import Anchored
-from rbpf.filter import Filter
+from rbpf.core.anchoring import Anchored
+from rbpf.core.filter import Filter
+from rbpf.core.models import Records
 from rbpf.lie import SE3
 from rbpf.maps.constellation import Constellation, UncertainConstellation
 from rbpf.maps.inverse_depth import InverseDepth
-from rbpf.models import Records
 from rbpf.systems.mono.system import world_of
 from rbpf.validation.map_summary import MapSummary, mixture_moments, relative_points
 

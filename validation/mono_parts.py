@@ -6,13 +6,13 @@ from typing import final
 
 import numpy as np
 
-from rbpf.belief import Belief
+from rbpf.core.belief import Belief
+from rbpf.core.models import NewLandmarks, Observations, Sensor
 from rbpf.lie import SE3
-from rbpf.models import NewLandmarks, Observations, Sensor
 from rbpf.sensors.camera_points import CameraRay
 from rbpf.sensors.features import FeatureFrame, FeatureLog
 from rbpf.systems.mono.feature_sensor import FeatureSensor
-from rbpf.validation.mono_batch import Batch, adjust_log
+from rbpf.validation.gtsam.mono_batch import Batch, adjust_log
 
 WRONG_PX = 3.0
 """A match farther than this from the reprojection by the batch is a wrong one."""

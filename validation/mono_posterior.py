@@ -4,11 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
-from rbpf.checkpoint import save_arrays
+from rbpf.core.checkpoint import save_arrays
 from rbpf.lie import SE3
 from rbpf.systems.mono.system import world_of
 from rbpf.systems.mono.video import VideoRun
-from rbpf.validation.trajectory import Trajectory
+from rbpf.validation.metrics.trajectory import Trajectory
 from rbpf.validation.trajectory_files import write_tum
 
 PATHS, MEAN = "posterior.npz", "posterior.tum"

@@ -12,7 +12,7 @@ import yaml
 from rbpf import __version__
 from rbpf.errors import InputError
 from rbpf.validation.files import write_text
-from rbpf.validation.path_and_map import read_config
+from rbpf.validation.metrics.path_and_map import read_config
 
 CONFIG = "config.yaml"
 LIBRARIES = "numpy", "scipy", "numba", "opencv-python-headless"

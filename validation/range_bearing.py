@@ -9,14 +9,14 @@ import numpy as np
 from rbpf.sensors.readers import open_log
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.range_bearing.run import Run, run
+from rbpf.validation.consistency.validate import report_run
 from rbpf.validation.files import prepare_folder
+from rbpf.validation.gtsam.measurements import dead_reckoning
 from rbpf.validation.map_summary import summarise_map
-from rbpf.validation.measurements import dead_reckoning
-from rbpf.validation.plots import plot_run
+from rbpf.validation.metrics.scores import as_trajectory, score
+from rbpf.validation.report.plots import plot_run
 from rbpf.validation.run_folder import reported, used_measurements, write_run
-from rbpf.validation.scores import as_trajectory, score
 from rbpf.validation.trajectory_files import write_tum
-from rbpf.validation.validate import report_run
 
 _SHORT = 300
 """Steps up to which dead reckoning is a good enough start for the batch problem."""
@@ -74,7 +74,7 @@ def finish_run(finished: Run, recording: Path, out: Path, batch: bool = True) ->
 
 def _solve_batch(finished: Run) -> tuple[np.ndarray, dict[str, Any]]:
     """The batch optimum (T, E), its scores, and how far the filter is from it."""
-    from rbpf.validation.gtsam_ba import solve
+    from rbpf.validation.gtsam.robot import solve
 
     log = finished.log
     measurements = used_measurements(finished)

@@ -1,7 +1,7 @@
 """Two files that every system's run leaves behind, so that it can be judged later without its recording.
 
 trajectory.npz   stamps_ns (T,), mean (T, E) and cov (T, d, d) in the right chart at it: the online filtered poses;
-                 correction (T, r), cov_correction (T, r, r) of the motions, see `rbpf.diagnostics.Correction`, r = 0
+                 correction (T, r), cov_correction (T, r, r) of the motions, see `rbpf.core.diagnostics.Correction`, r = 0
                  where the system does not tell them; version
 truth.npz        rows (R,) of the steps with a true pose, poses (R, E); ids (M,) and landmarks (M, D);
                  alignment: what brings the estimate into the truth's world, "none" where it is the same one;
@@ -13,12 +13,12 @@ from pathlib import Path
 
 import numpy as np
 
-from rbpf.archive import checked, load_arrays, save_arrays
-from rbpf.checkpoint import fitting
+from rbpf.core.archive import checked, load_arrays, save_arrays
+from rbpf.core.checkpoint import fitting
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3, SE2Group, SE3Group
-from rbpf.validation.alignment import Alignment
-from rbpf.validation.trajectory import Trajectory
+from rbpf.validation.metrics.alignment import Alignment
+from rbpf.validation.metrics.trajectory import Trajectory
 
 TRAJECTORY = "trajectory.npz"
 TRUTH = "truth.npz"

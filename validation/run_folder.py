@@ -29,13 +29,13 @@ from rbpf.validation.files import (
     write_map,
     write_summary,
 )
+from rbpf.validation.gtsam.measurements import Measurements
 from rbpf.validation.map_summary import MapSummary, summarise_map
 from rbpf.validation.measurement_files import write_measurements
-from rbpf.validation.measurements import Measurements
+from rbpf.validation.metrics.scores import Scores, as_trajectory, score
 from rbpf.validation.provenance import left_out, write_config
 from rbpf.validation.run_files import write_path, write_truth
 from rbpf.validation.run_truth import robot_truth
-from rbpf.validation.scores import Scores, as_trajectory, score
 from rbpf.validation.trajectory_files import write_tum
 
 

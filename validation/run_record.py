@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from rbpf.checkpoint import load_arrays
+from rbpf.core.checkpoint import load_arrays
 from rbpf.errors import InputError
 from rbpf.systems.plain_yaml import read_plain_yaml
 from rbpf.validation.map_summary import MapSummary, map_of

@@ -5,8 +5,8 @@ import numpy as np
 from rbpf.lie import SE2Group
 from rbpf.sensors.range_bearing import RelativePosition
 from rbpf.sensors.readers.log import RobotLog
+from rbpf.validation.metrics.scores import truth_at
 from rbpf.validation.run_files import RunTruth
-from rbpf.validation.scores import truth_at
 
 
 def robot_truth(log: RobotLog) -> RunTruth | None:

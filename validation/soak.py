@@ -12,11 +12,11 @@ from typing import Any, final
 
 import numpy as np
 
-from rbpf.anchoring import StartAnchor
-from rbpf.belief import Belief
-from rbpf.filter import Filter
+from rbpf.core.anchoring import StartAnchor
+from rbpf.core.belief import Belief
+from rbpf.core.filter import Filter
+from rbpf.core.models import NewLandmarks, Observations, Sensor
 from rbpf.lie import SE2, SE3
-from rbpf.models import NewLandmarks, Observations, Sensor
 from rbpf.sensors.names import Names
 from rbpf.systems.mono import system as mono
 from rbpf.systems.mono.config import MonoConfig

@@ -10,17 +10,17 @@ from rbpf.sensors.readers.images.stereo import StereoSequence
 from rbpf.sensors.readers.images.topics import UNNAMED
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.run import StereoRun, run_images
+from rbpf.validation.consistency.validate import report_run
 from rbpf.validation.files import prepare_folder
+from rbpf.validation.gtsam.stereo_batch import adjust_stereo, score_stereo_batch
 from rbpf.validation.image_run import CHECKPOINT, Progress, Telling, write_batch
 from rbpf.validation.map_summary import summarise_map
 from rbpf.validation.provenance import left_out
-from rbpf.validation.report import VIDEO
-from rbpf.validation.stereo_batch import adjust_stereo, score_stereo_batch
+from rbpf.validation.report.page import VIDEO
+from rbpf.validation.report.stereo_frames import write_annotated_pairs
+from rbpf.validation.report.stereo_pictures import plot_stereo_run
+from rbpf.validation.report.stereo_rerun import write_stereo_rerun
 from rbpf.validation.stereo_folder import write_stereo_run
-from rbpf.validation.stereo_frames import write_annotated_pairs
-from rbpf.validation.stereo_pictures import plot_stereo_run
-from rbpf.validation.stereo_rerun import write_stereo_rerun
-from rbpf.validation.validate import report_run
 
 
 @dataclass(frozen=True)

@@ -37,10 +37,10 @@ from rbpf.validation.files import (
     write_summary,
 )
 from rbpf.validation.map_summary import MapSummary
+from rbpf.validation.metrics.stereo_scores import distance_m, score_stereo, stereo_truth
+from rbpf.validation.metrics.trajectory import Trajectory
 from rbpf.validation.provenance import write_config
 from rbpf.validation.run_files import write_path, write_truth
-from rbpf.validation.stereo_scores import distance_m, score_stereo, stereo_truth
-from rbpf.validation.trajectory import Trajectory
 from rbpf.validation.trajectory_files import write_tum
 
 _STAGES = "features", "odometry", "matching", "filter"

@@ -10,7 +10,7 @@ import numpy as np
 
 from rbpf.lie import SE3, Array
 from rbpf.sensors.readers.table import read_columns
-from rbpf.validation.trajectory import Trajectory
+from rbpf.validation.metrics.trajectory import Trajectory
 from rbpf.validation.writing import whole
 
 TUM_COLUMNS = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")

@@ -84,7 +84,7 @@ class RecalibrateOptions(Printed):
 
 def recalibrate(options: Annotated[RecalibrateOptions, tyro.conf.arg(name="")]) -> None:
     """Find the focal length and k1 that a run's own measurements prefer, and write camera.yaml: for nominal cameras."""
-    from rbpf.validation.self_calibration import recalibrate as from_run
+    from rbpf.validation.gtsam.self_calibration import recalibrate as from_run
 
     with progress() as bar:
         entries, found = from_run(

@@ -11,7 +11,7 @@ from rbpf.cli.showing import answer, progress, told, waiting
 from rbpf.errors import InputError
 
 if TYPE_CHECKING:
-    from rbpf.validation.verdict import Verdict
+    from rbpf.validation.consistency.verdict import Verdict
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,8 +31,8 @@ class ValidateOptions(Printed):
 
 def validate(options: Annotated[ValidateOptions, tyro.conf.arg(name="")]) -> None:
     """Compare a run with the truth or an optimum: JSON, pictures, and two sentences on top of its report."""
-    from rbpf.validation.comparison import read_comparisons
-    from rbpf.validation.validate import validate as compare
+    from rbpf.validation.consistency.comparison import read_comparisons
+    from rbpf.validation.consistency.validate import validate as compare
 
     with waiting(f"comparing with {options.against} …"):
         verdict = compare(options.run, options.against, options.out)
@@ -54,7 +54,7 @@ class ReportOptions(Printed):
 
 def report(options: Annotated[ReportOptions, tyro.conf.arg(name="")]) -> None:
     """Build the report of a run again, from the files in its folder."""
-    from rbpf.validation.report import write_report
+    from rbpf.validation.report.page import write_report
 
     _tell(write_report(options.run), options.run, options.json)
 
@@ -84,9 +84,9 @@ class SweepOptions(Printed):
 
 def sweep(options: Annotated[SweepOptions, tyro.conf.arg(name="")]) -> None:
     """Run particles × seeds × sequences × options in parallel, to one table; call it again to go on."""
-    from rbpf.validation.sweep import TABLE
-    from rbpf.validation.sweep import sweep as run_all
-    from rbpf.validation.sweep_plan import read_plan
+    from rbpf.validation.sweep.plan import read_plan
+    from rbpf.validation.sweep.sweep import TABLE
+    from rbpf.validation.sweep.sweep import sweep as run_all
 
     if options.workers == 0 or options.workers < -1:
         raise InputError(f"--workers must be at least 1, or -1 for one per core, got {options.workers}")
@@ -121,7 +121,7 @@ class CompareOptions(Printed):
 
 def compare(options: Annotated[CompareOptions, tyro.conf.arg(name="")]) -> None:
     """Which of two runs' settings explains their recording better: difference of log-evidence, with its error."""
-    from rbpf.validation.model_comparison import compare_runs
+    from rbpf.validation.consistency.model_comparison import compare_runs
 
     a, b = options.run_a, options.run_b
     with progress() as bar:

@@ -66,7 +66,7 @@ def run_mono(options: Annotated[MonoOptions, tyro.conf.arg(name="")]) -> None:
     from rbpf.systems.mono.config import MonoConfig
     from rbpf.systems.settings import load_settings
     from rbpf.validation.mono import Recording, finish_mono, start_mono
-    from rbpf.validation.rerun_file import require_rerun
+    from rbpf.validation.report.rerun_file import require_rerun
 
     if options.rerun is not None:
         require_rerun()
@@ -93,7 +93,7 @@ def run_stereo(options: Annotated[StereoOptions, tyro.conf.arg(name="")]) -> Non
     """Stereo SLAM over a sequence of pairs of images (S05: SIFT landmarks, visual odometry, 400 particles)."""
     from rbpf.systems.settings import load_settings
     from rbpf.systems.stereo.config import StereoConfig
-    from rbpf.validation.rerun_file import require_rerun
+    from rbpf.validation.report.rerun_file import require_rerun
     from rbpf.validation.stereo import StereoRecording, finish_stereo, start_stereo
 
     if options.rerun is not None:

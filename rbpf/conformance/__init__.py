@@ -1,7 +1,7 @@
 """Says in words what is wrong with a user's model, before a filter is built on it.
 
 Every check calls the model as the filter does, on random arguments or on those of an `Example`, and compares
-the answer with what `rbpf.models` promises: shapes, numeric derivatives, the compiled twin, round trips.
+the answer with what `rbpf.core.models` promises: shapes, numeric derivatives, the compiled twin, round trips.
 """
 
 from typing import Any
@@ -15,9 +15,9 @@ from rbpf.conformance.likelihood import likelihood_checks
 from rbpf.conformance.motion import motion_checks
 from rbpf.conformance.observation import observation_checks
 from rbpf.conformance.sensor import observe, sensor_checks
+from rbpf.core.models import Landmark, Likelihood, MotionModel, ObservationModel, Sensor
 from rbpf.errors import InputError
 from rbpf.lie import LieGroup
-from rbpf.models import Landmark, Likelihood, MotionModel, ObservationModel, Sensor
 
 __all__ = ["Example", "check_model", "require_sound"]
 
@@ -74,7 +74,7 @@ def _checks(model: Any, space: LieGroup | None, rng: np.random.Generator, exampl
     if isinstance(model, Landmark):
         return landmark_checks(model, space, rng, example)
     if not isinstance(model, MotionModel | ObservationModel):
-        raise InputError(f"check_model takes a model of rbpf.models, not a {name}")
+        raise InputError(f"check_model takes a model of rbpf.core.models, not a {name}")
     if space is None:
         raise InputError(f"{name} has no attribute space: tell check_model the group of the state")
     if isinstance(model, MotionModel):

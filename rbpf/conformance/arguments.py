@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from rbpf.conformance.calls import FindingError, called
+from rbpf.core.models import Landmark, ObservationModel, Part, Records
 from rbpf.errors import InputError
 from rbpf.lie import LieGroup, SE2Group, SE3Group
-from rbpf.models import Landmark, ObservationModel, Part, Records
 
 PARTICLES, LANDMARKS = 5, 4
 CANDIDATES = 400

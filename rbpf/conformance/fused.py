@@ -6,10 +6,10 @@ import numpy as np
 
 from rbpf.conformance.arguments import Scene
 from rbpf.conformance.calls import FindingError, named, require, require_close, require_type
+from rbpf.core.models import FusedKernel, Jacobians, ObservationModel
+from rbpf.core.numeric import numeric_jacobians
 from rbpf.kernels.signature import BLOCK
 from rbpf.kernels.single import call_kernel
-from rbpf.models import FusedKernel, Jacobians, ObservationModel
-from rbpf.numeric import numeric_jacobians
 
 KERNEL_TOLERANCE = 1e-9
 GUARD = 64 * BLOCK

@@ -12,7 +12,7 @@ from rbpf.conformance.calls import (
     require_shape,
     require_type,
 )
-from rbpf.models import Landmark, ObservationModel, Records
+from rbpf.core.models import Landmark, ObservationModel, Records
 
 ROUND_TRIP_TOLERANCE = 1e-7
 STD = 1e-3

@@ -13,8 +13,8 @@ from rbpf.conformance.calls import (
     require_shape,
     require_type,
 )
+from rbpf.core.models import Landmark, Records
 from rbpf.lie import LieGroup
-from rbpf.models import Landmark, Records
 
 STD = 0.1
 """Of random estimates, in the parametrisation's units."""

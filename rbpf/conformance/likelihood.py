@@ -6,8 +6,8 @@ import numpy as np
 
 from rbpf import gaussian
 from rbpf.conformance.calls import Check, called, named, require, require_close, require_shape
+from rbpf.core.models import Likelihood
 from rbpf.kernels.gate import is_inlier, log_likelihood
-from rbpf.models import Likelihood
 
 KERNEL_IDS = (-1, 0, 1, 2)
 MASS_TOLERANCE = 5e-3

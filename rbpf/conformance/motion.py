@@ -7,8 +7,8 @@ import numpy as np
 
 from rbpf.conformance.arguments import Example
 from rbpf.conformance.calls import Check, called, require, require_close, require_shape, require_type
+from rbpf.core.models import MotionModel, Transition
 from rbpf.lie import LieGroup
-from rbpf.models import MotionModel, Transition
 
 
 def motion_checks(

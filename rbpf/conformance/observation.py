@@ -17,8 +17,8 @@ from rbpf.conformance.calls import (
 )
 from rbpf.conformance.fused import check_kernel
 from rbpf.conformance.inverse import check_initialise, check_invert
-from rbpf.models import Jacobians, ObservationModel, Part
-from rbpf.numeric import numeric_jacobians
+from rbpf.core.models import Jacobians, ObservationModel, Part
+from rbpf.core.numeric import numeric_jacobians
 
 JACOBIAN_TOLERANCE = 1e-5
 TURN_STEPS = 720

@@ -16,8 +16,8 @@ from rbpf.conformance.calls import (
     require_shape,
     require_type,
 )
+from rbpf.core.models import NEW, NewLandmarks, Observations, Part, Sensor
 from rbpf.errors import InputError
-from rbpf.models import NEW, NewLandmarks, Observations, Part, Sensor
 
 
 def sensor_checks(sensor: Sensor, example: Example) -> list[Check]:

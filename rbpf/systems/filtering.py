@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from rbpf.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobis
-from rbpf.models import Likelihood, Proposal, Resampler
-from rbpf.proposals import EkfProposal, PriorProposal
-from rbpf.resampling import EssTriggered, Multinomial, Residual, Stratified, Systematic
+from rbpf.core.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobis
+from rbpf.core.models import Likelihood, Proposal, Resampler
+from rbpf.core.proposals import EkfProposal, PriorProposal
+from rbpf.core.resampling import EssTriggered, Multinomial, Residual, Stratified, Systematic
 
 
 @dataclass(frozen=True)

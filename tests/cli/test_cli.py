@@ -110,7 +110,7 @@ def test_config_repeats_the_run(log, tmp_path):
 def test_a_resumed_run_is_identical(log, tmp_path, association, monkeypatch):
     arguments = ("--association", association, "--set", "checkpoint_every=15")
     assert run(log, tmp_path / "whole", *arguments) == 0
-    from rbpf.filter import Filter
+    from rbpf.core.filter import Filter
 
     step = Filter.step
 

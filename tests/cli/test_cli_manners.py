@@ -89,7 +89,9 @@ def test_bad_input_is_exit_code_2_and_a_fault_is_1(log, tmp_path):
     assert code("no-such-command").returncode == 2
     assert code("report").returncode == 2
     broken = code(
-        "report", "x", prelude="import rbpf.validation.report as r; r.write_report = lambda folder: 1 / 0"
+        "report",
+        "x",
+        prelude="import rbpf.validation.report.page as r; r.write_report = lambda folder: 1 / 0",
     )
     assert broken.returncode == 1 and "ZeroDivisionError" in broken.stderr
 
@@ -126,7 +128,7 @@ def test_ctrl_c_leaves_a_run_that_resumes_to_the_same_bytes(tmp_path, after):
 _STOPPABLE = """
 import sys
 import rbpf.systems.range_bearing.run as system
-from rbpf.filter import Filter
+from rbpf.core.filter import Filter
 step = Filter.step
 def told(self, *arguments):
     if self.steps == 5:

@@ -15,7 +15,7 @@ import yaml
 
 from rbpf.cli import main
 from rbpf.lie import SE3
-from rbpf.validation.colmap_pipeline import ReconstructionOptions
+from rbpf.validation.colmap.pipeline import ReconstructionOptions
 from rbpf.validation.trajectory_files import read_tum
 from tests.cli.run_outputs import outputs, untimed_summary
 from tests.cli.stereo_sequences import FRAMES, run
@@ -123,7 +123,7 @@ def test_ctrl_c_leaves_a_run_that_resumes_to_the_same_bytes(finished, room, tmp_
 
 _WAITING = """
 import sys
-from rbpf.filter import Filter
+from rbpf.core.filter import Filter
 step = Filter.step
 def waiting(self, *arguments):
     if self.steps == 2:
@@ -228,7 +228,7 @@ def test_a_run_is_compared_with_its_batch_optimum_afterwards(finished, tmp_path)
 def test_a_run_is_compared_with_a_reconstruction(finished, tmp_path, monkeypatch, capsys):
     """The baseline tells the scale; so few pairs must all be key frames, and begin with a smaller angle."""
     near = ReconstructionOptions(every=1, features=800, least_angle_deg=4.0)
-    monkeypatch.setattr("rbpf.validation.offline_comparisons.ReconstructionOptions", lambda: near)
+    monkeypatch.setattr("rbpf.validation.consistency.offline_comparisons.ReconstructionOptions", lambda: near)
     folder = shutil.copytree(finished, tmp_path / "run")
     assert main(["validate", str(folder), "--against", "colmap"]) == 0
     assert "(rms) from COLMAP's reconstruction" in " ".join(capsys.readouterr().err.split())

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from rbpf.core.filter import Filter, StepReport
+from rbpf.core.models import ObservationModel, Observations, Sensor
 from rbpf.errors import InputError
-from rbpf.filter import Filter, StepReport
 from rbpf.lie import SE2
-from rbpf.models import ObservationModel, Observations, Sensor
 from rbpf.sensors.range_bearing import wrap_angle
 from tests.core.worlds import content, same
 

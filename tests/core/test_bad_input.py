@@ -6,11 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rbpf.errors import InputError
-from rbpf.filter import Filter
-from rbpf.lie import SE2, Euclidean
-from rbpf.maps.landmark_map import LandmarkMap
-from rbpf.models import (
+from rbpf.core.filter import Filter
+from rbpf.core.models import (
     NEW,
     NULL,
     Jacobians,
@@ -21,12 +18,15 @@ from rbpf.models import (
     Resampler,
     Transition,
 )
+from rbpf.core.proposals import EkfProposal, PriorProposal
+from rbpf.core.resampling import EssTriggered, Systematic
+from rbpf.core.substate import KalmanSubstate
+from rbpf.errors import InputError
+from rbpf.lie import SE2, Euclidean
+from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.motion.odometry import OdometryMotion
-from rbpf.proposals import EkfProposal, PriorProposal
-from rbpf.resampling import EssTriggered, Systematic
 from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
 from rbpf.sensors.range_bearing import RangeBearing
-from rbpf.substate import KalmanSubstate
 from tests.core.scripted import Scripted, fails, seen
 from tests.core.worlds import Recipe, content, drive, planar_world, same
 

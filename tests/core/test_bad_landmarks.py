@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
+from rbpf.core.filter import Filter
+from rbpf.core.models import NewLandmarks, ObservationModel
 from rbpf.errors import InputError
-from rbpf.filter import Filter
 from rbpf.lie import SE2
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
-from rbpf.models import NewLandmarks, ObservationModel
 from rbpf.motion.odometry import Odometry, OdometryMotion
 from rbpf.sensors.range_bearing import RangeBearing
 from tests.core.scripted import Scripted, fails, seen

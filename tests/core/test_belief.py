@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from rbpf.belief import Belief
-from rbpf.conditional import Marginals
+from rbpf.core.belief import Belief
+from rbpf.core.conditional import Marginals
+from rbpf.core.estimate import mixture_estimate
+from rbpf.core.genealogy import Lineage
+from rbpf.core.models import Records
+from rbpf.core.proposals import Prior, Proposed
 from rbpf.errors import InputError
-from rbpf.estimate import mixture_estimate
-from rbpf.genealogy import Lineage
 from rbpf.lie import SE2, SE3, LieGroup, SE2Group, SE3Group
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
-from rbpf.models import Records
-from rbpf.proposals import Prior, Proposed
 from rbpf.sensors.range_bearing import RangeBearing, RelativePosition
 
 N, K, DRAWS = 12, 3, 400_000

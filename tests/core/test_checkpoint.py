@@ -6,18 +6,26 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from rbpf.core.filter import Filter
+from rbpf.core.models import (
+    MotionModel,
+    NewLandmarks,
+    ObservationModel,
+    Observations,
+    Part,
+    Sensor,
+    Transition,
+)
+from rbpf.core.proposals import PriorProposal
+from rbpf.core.resampling import EssTriggered, Residual
+from rbpf.core.substate import KalmanSubstate
 from rbpf.errors import InputError
-from rbpf.filter import Filter
 from rbpf.lie import SE2, Euclidean
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
-from rbpf.models import MotionModel, NewLandmarks, ObservationModel, Observations, Part, Sensor, Transition
 from rbpf.motion.odometry import OdometryMotion
-from rbpf.proposals import PriorProposal
-from rbpf.resampling import EssTriggered, Residual
 from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
 from rbpf.sensors.range_bearing import RangeBearing
-from rbpf.substate import KalmanSubstate
 from tests.core.worlds import STEP_NS, Recipe, World, content, drive, planar_world, same
 
 STEPS = 30

@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 
 from rbpf.conformance import Example, check_model, require_sound
-from rbpf.errors import InputError
-from rbpf.lie import SE2, SE3, Euclidean
-from rbpf.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobis, squared_mahalanobis
-from rbpf.maps.mixture import MixturePoint
-from rbpf.maps.point import AnchoredPoint, Point
-from rbpf.models import (
+from rbpf.core.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobis, squared_mahalanobis
+from rbpf.core.models import (
     Landmark,
     Likelihood,
     MotionModel,
     Records,
     Transition,
 )
+from rbpf.errors import InputError
+from rbpf.lie import SE2, SE3, Euclidean
+from rbpf.maps.mixture import MixturePoint
+from rbpf.maps.point import AnchoredPoint, Point
 from rbpf.motion.odometry import Odometry, OdometryMotion
 from tests.core.scripted import says
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from rbpf.conformance import check_model
+from rbpf.core.models import FusedKernel, ObservationModel
 from rbpf.kernels.signature import BLOCK, observation_kernel
 from rbpf.lie import SE2
-from rbpf.models import FusedKernel, ObservationModel
 from rbpf.sensors.range_bearing import RangeBearing
 from tests.core.scripted import Polar, says
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from rbpf.conformance import Example, check_model, require_sound
+from rbpf.core.models import Jacobians, ObservationModel, Part, Records
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3, Euclidean
 from rbpf.maps.mixture import MixturePoint, ring
 from rbpf.maps.point import AnchoredPoint
-from rbpf.models import Jacobians, ObservationModel, Part, Records
 from rbpf.sensors.range_bearing import RangeBearing, RelativePosition
 from tests.core.scripted import Polar, says
 
@@ -266,7 +266,7 @@ def test_what_a_check_cannot_do_without():
         check_model(Speed())
     with pytest.raises(InputError, match="RangeBearing sees too few random landmarks"):
         check_model(RangeBearing(SE2, max_range=0.05))
-    with pytest.raises(InputError, match=r"takes a model of rbpf\.models, not a int"):
+    with pytest.raises(InputError, match=r"takes a model of rbpf\.core\.models, not a int"):
         check_model(7)
 
 

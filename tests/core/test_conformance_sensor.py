@@ -7,10 +7,10 @@ import pytest
 
 from rbpf import gaussian
 from rbpf.conformance import Example, check_model
+from rbpf.core.models import Likelihood, NewLandmarks, ObservationModel, Observations, Sensor
 from rbpf.errors import InputError
 from rbpf.lie import SE2
 from rbpf.maps.point import Point
-from rbpf.models import Likelihood, NewLandmarks, ObservationModel, Observations, Sensor
 from rbpf.sensors.range_bearing import RangeBearing
 from tests.core.scripted import says
 from tests.core.worlds import Recipe, drive, planar_world

@@ -4,19 +4,19 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from rbpf.diagnostics import (
+from rbpf.core.diagnostics import (
     ancestor_diversity,
     chi_square_band,
     effective_sample_size,
     motion_correction,
     nees,
 )
-from rbpf.estimate import Estimate
-from rbpf.filter import Filter
-from rbpf.genealogy import Lineage
+from rbpf.core.estimate import Estimate
+from rbpf.core.filter import Filter
+from rbpf.core.genealogy import Lineage
+from rbpf.core.models import MotionModel, ObservationModel, Part, Transition
+from rbpf.core.proposals import PriorProposal
 from rbpf.lie import SE2, SE3, Euclidean
-from rbpf.models import MotionModel, ObservationModel, Part, Transition
-from rbpf.proposals import PriorProposal
 from tests.core.scripted import Scripted, seen
 
 PLANE = Euclidean(2)

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
+from rbpf.core.filter import Filter
+from rbpf.core.models import NewLandmarks, Observations
+from rbpf.core.substate import KalmanSubstate
 from rbpf.errors import InputError
-from rbpf.filter import Filter
 from rbpf.lie import Euclidean
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
-from rbpf.models import NewLandmarks, Observations
-from rbpf.substate import KalmanSubstate
 from tests.exactness.models import Frame, Kalman, LinearMotion, Relative, Scripted
 
 NOISE = np.diag([0.3, 0.5])

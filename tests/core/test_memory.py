@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from rbpf.filter import Filter
+from rbpf.core.filter import Filter
 from rbpf.lie import SE2
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point

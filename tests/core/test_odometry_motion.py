@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rbpf.filter import Filter
+from rbpf.core.filter import Filter
 from rbpf.lie import SE2, SE3, Euclidean
 from rbpf.motion.odometry import Odometry, OdometryMotion
 from tests.core.scripted import Scripted

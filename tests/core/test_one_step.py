@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from rbpf.filter import Filter
+from rbpf.core.filter import Filter
+from rbpf.core.proposals import EkfProposal, PriorProposal
 from rbpf.lie import SE2
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
 from rbpf.motion.odometry import OdometryMotion
-from rbpf.proposals import EkfProposal, PriorProposal
 from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
 from rbpf.sensors.range_bearing import RangeBearing
 from tests.core.worlds import STEP_NS, content, planar_world, same

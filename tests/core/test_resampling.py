@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rbpf.core.particles import effective_sample_size, uniform_log_weights
+from rbpf.core.resampling import EssTriggered, Multinomial, Residual, Stratified, Systematic
 from rbpf.errors import InputError
-from rbpf.particles import effective_sample_size, uniform_log_weights
-from rbpf.resampling import EssTriggered, Multinomial, Residual, Stratified, Systematic
 
 SCHEMES = [Systematic(), Stratified(), Residual(), Multinomial()]
 every_scheme = pytest.mark.parametrize("scheme", SCHEMES, ids=lambda scheme: type(scheme).__name__)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from rbpf.genealogy import Lineage
+from rbpf.core.genealogy import Lineage
 from rbpf.kernels import forest
 
 
@@ -14,7 +14,7 @@ def test_a_settled_generation_is_climbed_to_once(monkeypatch):
         climbed.append(arguments[4])
         return rows_at(*arguments)
 
-    monkeypatch.setattr("rbpf.genealogy.forest.rows_at", counted)
+    monkeypatch.setattr("rbpf.core.genealogy.forest.rows_at", counted)
     lineage = Lineage(4)
     for generation in range(3):
         lineage.retain(generation)

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rbpf.filter import Filter
+from rbpf.core.filter import Filter
+from rbpf.core.models import NEW, NULL, Records, Resampler
+from rbpf.core.resampling import EssTriggered, Systematic
 from rbpf.lie import SE2
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
-from rbpf.models import NEW, NULL, Records, Resampler
 from rbpf.motion.odometry import OdometryMotion
-from rbpf.resampling import EssTriggered, Systematic
 from rbpf.sensors.landmark_sensor import AnonymousLandmarkSensor
 from rbpf.sensors.range_bearing import RangeBearing
 from tests.core.scripted import Scripted, ids_of, seen

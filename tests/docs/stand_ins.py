@@ -72,7 +72,7 @@ PREAMBLE = {
     "docs/how_to/sensor.md": """
 from examples.custom_sensor import LampSensor
 from examples.gps_fix import *
-from rbpf.models import Records
+from rbpf.core.models import Records
 
 filter_ = Filter(OdometryMotion(SE2), PositionReceiver(0.5), n=20, rng=np.random.default_rng(0))
 fix = np.array([0.1, 0.2])

@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from rbpf.filter import Filter
-from rbpf.lie import Euclidean
-from rbpf.models import (
+from rbpf.core.filter import Filter
+from rbpf.core.models import (
     Jacobians,
     MotionModel,
     NewLandmarks,
@@ -18,6 +17,7 @@ from rbpf.models import (
     Sensor,
     Transition,
 )
+from rbpf.lie import Euclidean
 
 SEEDS = 500
 

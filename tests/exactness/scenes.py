@@ -4,12 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rbpf.genealogy import Lineage
+from rbpf.core.genealogy import Lineage
+from rbpf.core.models import ObservationModel, Observations, Records
+from rbpf.core.proposals import Prior
 from rbpf.lie import SE2, SE2Group, SE3Group
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
-from rbpf.models import ObservationModel, Observations, Records
-from rbpf.proposals import Prior
 from rbpf.sensors.range_bearing import RangeBearing, RelativePosition
 
 

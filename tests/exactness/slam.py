@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import block_diag
 
-from rbpf.filter import Filter
+from rbpf.core.filter import Filter
+from rbpf.core.models import NewLandmarks, ObservationModel, Observations
+from rbpf.core.substate import KalmanSubstate
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
-from rbpf.models import NewLandmarks, ObservationModel, Observations
-from rbpf.substate import KalmanSubstate
 from tests.exactness.models import SEEDS, Frame, Kalman
 
 NOISE = np.array([[0.25, 0.08], [0.08, 0.2]])

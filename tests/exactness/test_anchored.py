@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from rbpf.filter import Filter
+from rbpf.core.filter import Filter
+from rbpf.core.models import Jacobians, ObservationModel, Observations, Records
+from rbpf.core.resampling import Systematic
 from rbpf.lie import SE2, SE3
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import AnchoredPoint, Point
-from rbpf.models import Jacobians, ObservationModel, Observations, Records
 from rbpf.motion.odometry import Odometry, OdometryMotion
-from rbpf.resampling import Systematic
 from rbpf.sensors.range_bearing import RangeBearing
 from tests.exactness.models import Frame, Scripted, known
 from tests.exactness.scenes import Scene, random_covs

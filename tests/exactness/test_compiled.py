@@ -3,17 +3,17 @@
 import numpy as np
 import pytest
 
-from rbpf.filter import Filter
+from rbpf.core.filter import Filter
+from rbpf.core.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobis
+from rbpf.core.models import NEW, NULL, NewLandmarks, Observations
+from rbpf.core.numeric import linearise
+from rbpf.core.proposals import EkfProposal, PriorProposal, refined
 from rbpf.kernels.signature import BLOCK
 from rbpf.lie import SE2, SE3
-from rbpf.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobis
 from rbpf.maps import rows
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
-from rbpf.models import NEW, NULL, NewLandmarks, Observations
 from rbpf.motion.odometry import Odometry, OdometryMotion
-from rbpf.numeric import linearise
-from rbpf.proposals import EkfProposal, PriorProposal, refined
 from tests.exactness.models import Frame, Scripted, known
 from tests.exactness.scenes import Scene, random_covs, sensors
 

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from rbpf import gaussian
-from rbpf.genealogy import Lineage
+from rbpf.core.genealogy import Lineage
+from rbpf.core.models import Observations, Records
+from rbpf.core.proposals import Prior
 from rbpf.lie import SE3
 from rbpf.lie.matrices import skew
 from rbpf.maps.constellation import Constellation, UncertainConstellation
 from rbpf.maps.landmark_map import LandmarkMap
-from rbpf.models import Observations, Records
-from rbpf.proposals import Prior
 from rbpf.sensors.camera_constellation import ConstellationView, MembersView
 from tests.exactness.models import Kalman
 from tests.sensors.camera_scenes import DISTORTED

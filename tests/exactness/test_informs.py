@@ -6,17 +6,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from rbpf.core.filter import Filter, StepReport
+from rbpf.core.genealogy import Lineage
+from rbpf.core.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobis
+from rbpf.core.models import Observations, Part, Records
+from rbpf.core.proposals import EkfProposal, PriorProposal
+from rbpf.core.resampling import EssTriggered, Systematic
 from rbpf.errors import InputError
-from rbpf.filter import Filter, StepReport
-from rbpf.genealogy import Lineage
 from rbpf.lie import SE2, SE3
-from rbpf.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobis
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.mixture import MixturePoint
-from rbpf.models import Observations, Part, Records
 from rbpf.motion.odometry import Odometry, OdometryMotion
-from rbpf.proposals import EkfProposal, PriorProposal
-from rbpf.resampling import EssTriggered, Systematic
 from tests.exactness.models import Frame, Scripted
 from tests.exactness.scenes import Scene, sensors
 

@@ -5,16 +5,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rbpf.filter import Filter
+from rbpf.core.filter import Filter
+from rbpf.core.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobis
+from rbpf.core.models import NEW, NULL, NewLandmarks, Observations
+from rbpf.core.proposals import EkfProposal, PriorProposal
+from rbpf.core.resampling import EssTriggered, Systematic
+from rbpf.core.substate import KalmanSubstate
 from rbpf.lie import SE2, SE3, Euclidean
-from rbpf.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobis
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
-from rbpf.models import NEW, NULL, NewLandmarks, Observations
 from rbpf.motion.odometry import Odometry, OdometryMotion
-from rbpf.proposals import EkfProposal, PriorProposal
-from rbpf.resampling import EssTriggered, Systematic
-from rbpf.substate import KalmanSubstate
 from tests.exactness.models import Frame, LinearMotion, LinearObservation, Relative, Scripted, single
 from tests.exactness.scenes import random_covs, sensors
 

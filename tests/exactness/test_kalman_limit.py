@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from rbpf.filter import Filter
+from rbpf.core.filter import Filter
+from rbpf.core.models import Transition
+from rbpf.core.proposals import EkfProposal, PriorProposal
+from rbpf.core.resampling import EssTriggered, Systematic
+from rbpf.core.substate import KalmanSubstate
 from rbpf.lie import Euclidean
-from rbpf.models import Transition
-from rbpf.proposals import EkfProposal, PriorProposal
-from rbpf.resampling import EssTriggered, Systematic
-from rbpf.substate import KalmanSubstate
 from tests.exactness.models import Frame, Kalman, LinearMotion, LinearObservation, Scripted, single
 
 TOLERANCE = 1e-9

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
+from rbpf.core.filter import Filter
+from rbpf.core.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobis
+from rbpf.core.models import NULL, NewLandmarks, ObservationModel, Observations, Records
+from rbpf.core.proposals import EkfProposal, PriorProposal, refined
 from rbpf.errors import InputError
-from rbpf.filter import Filter
 from rbpf.lie import Euclidean
-from rbpf.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobis
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
-from rbpf.models import NULL, NewLandmarks, ObservationModel, Observations, Records
-from rbpf.proposals import EkfProposal, PriorProposal, refined
 from tests.exactness.models import Frame, LinearMotion, LinearObservation, Relative, Scripted, single
 from tests.exactness.scenes import random_covs
 
@@ -101,7 +101,7 @@ def test_without_a_density_there_is_no_evidence(proposal):
 
 def held_landmarks(cov: np.ndarray, n: int = 8) -> LandmarkMap:
     """Two landmarks that every particle believes at (3, 1) and (−2, 4)."""
-    from rbpf.genealogy import Lineage
+    from rbpf.core.genealogy import Lineage
 
     held = LandmarkMap(PLANE)
     held.begin(n, Lineage(n))

@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
+from rbpf.core.filter import Filter
+from rbpf.core.models import MotionModel, ObservationModel, Part
+from rbpf.core.proposals import EkfProposal, PriorProposal
+from rbpf.core.resampling import EssTriggered, Residual, Systematic
+from rbpf.core.substate import KalmanSubstate
 from rbpf.errors import InputError
-from rbpf.filter import Filter
 from rbpf.lie import SE2, Euclidean
 from rbpf.maps.landmark_map import LandmarkMap
-from rbpf.models import MotionModel, ObservationModel, Part
 from rbpf.motion.odometry import Odometry, OdometryMotion
-from rbpf.proposals import EkfProposal, PriorProposal
-from rbpf.resampling import EssTriggered, Residual, Systematic
 from rbpf.sensors.range_bearing import RelativePosition
-from rbpf.substate import KalmanSubstate
 from tests.exactness.models import Frame, Kalman, LinearMotion, Relative, Scripted, assert_unbiased, deviation
 from tests.exactness.slam import LinearSlam, moments, unnormalised_errors
 

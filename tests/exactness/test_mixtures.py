@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
-from rbpf.filter import Filter
-from rbpf.genealogy import Lineage
+from rbpf.core.filter import Filter
+from rbpf.core.genealogy import Lineage
+from rbpf.core.models import ObservationModel, Observations, Records
+from rbpf.core.proposals import EkfProposal
+from rbpf.core.resampling import EssTriggered, Systematic
 from rbpf.lie import Euclidean
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.mixture import MixturePoint, ring
 from rbpf.maps.point import Point
-from rbpf.models import ObservationModel, Observations, Records
-from rbpf.proposals import EkfProposal
-from rbpf.resampling import EssTriggered, Systematic
 from tests.exactness.models import (
     SEEDS,
     Frame,

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
-from rbpf import reference
-from rbpf.conditional import Marginals
+from rbpf.core import reference
+from rbpf.core.conditional import Marginals
+from rbpf.core.models import NEW, NULL, Observations
+from rbpf.core.numeric import linearise
+from rbpf.core.proposals import Prior, Proposed, Terms, refined
 from rbpf.lie import SE2, SE3
-from rbpf.models import NEW, NULL, Observations
-from rbpf.numeric import linearise
-from rbpf.proposals import Prior, Proposed, Terms, refined
 from tests.exactness.models import Kalman, known
 from tests.exactness.scenes import Scene, random_covs, sensors
 

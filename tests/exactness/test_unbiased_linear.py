@@ -7,11 +7,11 @@ from functools import partial
 import numpy as np
 import pytest
 
-from rbpf.filter import Filter
-from rbpf.models import Conditional, Resampler
-from rbpf.proposals import EkfProposal, PriorProposal
-from rbpf.resampling import EssTriggered, Multinomial, Residual, Stratified, Systematic
-from rbpf.substate import KalmanSubstate
+from rbpf.core.filter import Filter
+from rbpf.core.models import Conditional, Resampler
+from rbpf.core.proposals import EkfProposal, PriorProposal
+from rbpf.core.resampling import EssTriggered, Multinomial, Residual, Stratified, Systematic
+from rbpf.core.substate import KalmanSubstate
 from tests.exactness.models import (
     SEEDS,
     Frame,

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from rbpf.filter import Filter
+from rbpf.core.filter import Filter
+from rbpf.core.likelihoods import GaussianWithOutliers
+from rbpf.core.models import Likelihood, MotionModel, ObservationModel, Part, Proposal, Transition
+from rbpf.core.proposals import EkfProposal, PriorProposal
+from rbpf.core.resampling import EssTriggered, Systematic
 from rbpf.lie import Euclidean
-from rbpf.likelihoods import GaussianWithOutliers
-from rbpf.models import Likelihood, MotionModel, ObservationModel, Part, Proposal, Transition
-from rbpf.proposals import EkfProposal, PriorProposal
-from rbpf.resampling import EssTriggered, Systematic
 from tests.exactness.models import Frame, Scripted, assert_unbiased, deviation, log_ratios, single
 
 pytestmark = pytest.mark.slow

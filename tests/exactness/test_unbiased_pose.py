@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from rbpf.filter import Filter
+from rbpf.core.filter import Filter
+from rbpf.core.models import MotionModel, ObservationModel, Part, Transition
+from rbpf.core.proposals import EkfProposal, PriorProposal
+from rbpf.core.resampling import Systematic
+from rbpf.core.substate import KalmanSubstate
 from rbpf.lie import SE2
-from rbpf.models import MotionModel, ObservationModel, Part, Transition
 from rbpf.motion.odometry import Odometry, OdometryMotion
-from rbpf.proposals import EkfProposal, PriorProposal
-from rbpf.resampling import Systematic
-from rbpf.substate import KalmanSubstate
 from tests.exactness.models import SEEDS, Frame, Scripted, assert_unbiased, single
 
 pytestmark = pytest.mark.slow

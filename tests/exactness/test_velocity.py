@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from rbpf.filter import Filter
-from rbpf.genealogy import Lineage
+from rbpf.core.filter import Filter
+from rbpf.core.genealogy import Lineage
+from rbpf.core.models import Jacobians, ObservationModel, Part
+from rbpf.core.proposals import PriorProposal
+from rbpf.core.resampling import EssTriggered, Systematic
+from rbpf.core.substate import KalmanSubstate
 from rbpf.lie import SE3
-from rbpf.models import Jacobians, ObservationModel, Part
 from rbpf.motion.constant_velocity import MarginalVelocity, SampledVelocity
-from rbpf.proposals import PriorProposal
-from rbpf.resampling import EssTriggered, Systematic
-from rbpf.substate import KalmanSubstate
 from tests.exactness.models import Frame, Kalman, Scripted, deviation, single
 
 WALK = np.array([0.0, 0.0, 0.0, 0.6, 0.9, 0.4])

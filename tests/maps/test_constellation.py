@@ -6,12 +6,12 @@ from scipy.optimize import least_squares
 
 from rbpf import gaussian
 from rbpf.conformance import check_model
+from rbpf.core.genealogy import Lineage
+from rbpf.core.models import Records
 from rbpf.errors import InputError
-from rbpf.genealogy import Lineage
 from rbpf.lie import SE3
 from rbpf.maps.constellation import MOST, Constellation, UncertainConstellation
 from rbpf.maps.landmark_map import LandmarkMap
-from rbpf.models import Records
 
 POINTS = np.random.default_rng(0).normal(size=(4, 3))
 HALF = np.random.default_rng(1).normal(scale=0.01, size=(4, 3, 4))

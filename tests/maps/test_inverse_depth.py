@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from rbpf.conformance import check_model
+from rbpf.core.genealogy import Lineage
+from rbpf.core.models import Records
 from rbpf.errors import InputError
-from rbpf.genealogy import Lineage
 from rbpf.lie import SE3
 from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
-from rbpf.models import Records
 
 LANDMARK = InverseDepth()
 ANCHOR = SE3.exp(np.array([0.4, -0.8, 1.2, 2.0, -1.0, 0.5]))

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
+from rbpf.core.genealogy import Lineage
+from rbpf.core.models import NewLandmarks, Observations, Records
+from rbpf.core.proposals import Prior
 from rbpf.errors import InputError
-from rbpf.genealogy import Lineage
 from rbpf.lie import SE2, SE3
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.mixture import MixturePoint, ring
 from rbpf.maps.point import AnchoredPoint, Point
-from rbpf.models import NewLandmarks, Observations, Records
-from rbpf.proposals import Prior
 from rbpf.sensors.range_bearing import RangeBearing
 
 N = 40

@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rbpf.core.models import Landmark, Records
 from rbpf.errors import InputError
 from rbpf.maps.layout import Layout
 from rbpf.maps.point import Point
-from rbpf.models import Landmark, Records
 
 
 class Free(Landmark):

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rbpf.core.models import NEW, NULL, ObservationModel, Observations
 from rbpf.errors import InputError
 from rbpf.maps.plan import Plan, Row, make_plan
-from rbpf.models import NEW, NULL, ObservationModel, Observations
 
 N = 4
 NUMBERS = np.array([0, 0, 0, 1, 1, 2, -1])

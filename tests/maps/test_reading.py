@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from rbpf.belief import Belief
-from rbpf.conditional import Marginals
-from rbpf.genealogy import Lineage
+from rbpf.core.belief import Belief
+from rbpf.core.conditional import Marginals
+from rbpf.core.genealogy import Lineage
+from rbpf.core.models import Records
+from rbpf.core.proposals import Prior
 from rbpf.lie import SE3
 from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
-from rbpf.models import Records
-from rbpf.proposals import Prior
 from rbpf.sensors.camera_points import CameraPoint, CameraRay, EpipolarRay
 from rbpf.sensors.pinhole import Pinhole
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from rbpf.conformance import Example, check_model
+from rbpf.core.filter import Filter
 from rbpf.errors import InputError
-from rbpf.filter import Filter
 from rbpf.lie import SE3
 from rbpf.motion.odometry import Odometry
 from rbpf.motion.stereo_odometry import StereoOdometry

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rbpf.genealogy import Lineage
-from rbpf.history import History
+from rbpf.core.genealogy import Lineage
+from rbpf.core.history import History
 
 
 class Copied:

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rbpf.genealogy import Lineage
+from rbpf.core.genealogy import Lineage
 
 
 def drawn(rng: np.random.Generator, n: int, concentration: float) -> np.ndarray:

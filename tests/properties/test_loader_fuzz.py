@@ -11,8 +11,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from rbpf.archive import load_arrays, save_arrays
-from rbpf.checkpoint import _digest
+from rbpf.core.archive import load_arrays, save_arrays
+from rbpf.core.checkpoint import _digest
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.systems.mono.appearance import SOURCE_HALF_PX
@@ -20,13 +20,13 @@ from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.known_map import KnownMap, read_known_map, write_known_map
 from rbpf.systems.settings import load_settings
 from rbpf.systems.stereo.config import StereoConfig
-from rbpf.validation.comparison import read_comparisons
-from rbpf.validation.path_and_map import read_path_and_map
-from rbpf.validation.report import write_report
+from rbpf.validation.consistency.comparison import read_comparisons
+from rbpf.validation.metrics.path_and_map import read_path_and_map
+from rbpf.validation.report.page import write_report
 from rbpf.validation.run_record import open_run
 from rbpf.validation.simulation.streams import CAMERA
-from rbpf.validation.sweep import read_rows
-from rbpf.validation.sweep_plan import read_plan
+from rbpf.validation.sweep.plan import read_plan
+from rbpf.validation.sweep.sweep import read_rows
 from tests.core.worlds import Recipe, content, drive, planar_world, same
 from tests.properties.mutations import damaged
 

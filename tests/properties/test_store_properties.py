@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rbpf.core.genealogy import Lineage
 from rbpf.errors import InputError
-from rbpf.genealogy import Lineage
 from rbpf.maps.shared import SharedStore
 
 

@@ -8,7 +8,7 @@ from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.range_bearing.run import run
 from rbpf.systems.settings import load_settings
 from rbpf.validation.map_summary import summarise_map
-from rbpf.validation.scores import score
+from rbpf.validation.metrics.scores import score
 
 pytestmark = [pytest.mark.real_data, pytest.mark.slow]
 

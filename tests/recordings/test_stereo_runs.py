@@ -11,8 +11,8 @@ from rbpf.sensors.readers.images import open_stereo
 from rbpf.sensors.readers.images.stereo import StereoSequence
 from rbpf.systems.stereo.config import MapConfig, StereoConfig
 from rbpf.systems.stereo.run import StereoRun, run_features, run_images
-from rbpf.validation.gtsam_ba_camera import solve_features
-from rbpf.validation.stereo_scores import score_stereo
+from rbpf.validation.gtsam.camera import solve_features
+from rbpf.validation.metrics.stereo_scores import score_stereo
 from rbpf.validation.there_and_back import Reordered, pairs_there_and_back
 
 pytestmark = pytest.mark.real_data

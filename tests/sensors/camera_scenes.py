@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rbpf.core.models import ObservationModel
 from rbpf.kernels.signature import BLOCK
 from rbpf.kernels.single import call_kernel
 from rbpf.lie import SE3
-from rbpf.models import ObservationModel
 from rbpf.sensors.pinhole import Pinhole
 
 PLAIN = Pinhole(640, 480, 400.0, 410.0, 319.5, 239.5)

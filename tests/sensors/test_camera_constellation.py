@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from rbpf.conformance import Example, check_model
+from rbpf.core.models import Records
+from rbpf.core.numeric import numeric_jacobians
 from rbpf.lie import SE3, Euclidean, Product
 from rbpf.maps.constellation import Constellation, UncertainConstellation
-from rbpf.models import Records
-from rbpf.numeric import numeric_jacobians
 from rbpf.sensors.camera_constellation import ConstellationView, MembersView
 from rbpf.sensors.camera_points import CameraPoint
 from tests.exactness.models import known

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from rbpf.conformance import Example, check_model
+from rbpf.core.models import Records
+from rbpf.core.numeric import numeric_jacobians
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Euclidean, Product
 from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.maps.point import Point
-from rbpf.models import Records
-from rbpf.numeric import numeric_jacobians
 from rbpf.sensors.camera_points import GRAZING, CameraPoint, CameraRay, EpipolarRay, forward
 from rbpf.sensors.pinhole import RectifiedStereo
 from tests.exactness.models import known

@@ -5,18 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rbpf.filter import Filter
-from rbpf.genealogy import Lineage
+from rbpf.core.filter import Filter
+from rbpf.core.genealogy import Lineage
+from rbpf.core.likelihoods import Gaussian
+from rbpf.core.models import Observations, Part, Records
+from rbpf.core.numeric import linearise
+from rbpf.core.proposals import Prior, PriorProposal, Terms
+from rbpf.core.reference import information, innovation_covariance
 from rbpf.lie import SE3
-from rbpf.likelihoods import Gaussian
 from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
-from rbpf.models import Observations, Part, Records
 from rbpf.motion.odometry import Odometry, OdometryMotion
-from rbpf.numeric import linearise
-from rbpf.proposals import Prior, PriorProposal, Terms
-from rbpf.reference import information, innovation_covariance
 from rbpf.sensors.camera_points import CameraPoint, CameraRay, EpipolarRay
 from tests.exactness.models import Frame, Scripted, known
 from tests.sensors.camera_scenes import CAMERAS, PLAIN, Rays

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rbpf.core.exchange import NULL
 from rbpf.errors import InputError
-from rbpf.exchange import NULL
 from rbpf.sensors.key_index import Gate, KeyIndex
 from rbpf.sensors.key_matching import MatchLimits
 from rbpf.sensors.key_search import ExactSearch, TreeSearch

@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from rbpf.core.models import Part
+from rbpf.core.numeric import numeric_jacobians
 from rbpf.lie import SE2, SE3
-from rbpf.models import Part
-from rbpf.numeric import numeric_jacobians
 from rbpf.sensors.range_bearing import RangeBearing, RelativePosition, wrap_angle
 from rbpf.sensors.rigid_point import RigidPointModel
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from rbpf.conformance import check_model
+from rbpf.core.numeric import invert_with_covariance, numeric_jacobians
 from rbpf.lie import SE3
-from rbpf.numeric import invert_with_covariance, numeric_jacobians
 from rbpf.sensors.camera_points import CameraPoint
 from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
 from rbpf.sensors.stereo_points import StereoPoint

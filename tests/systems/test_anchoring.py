@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from rbpf.anchoring import StartAnchor
+from rbpf.core.anchoring import StartAnchor
+from rbpf.core.filter import Filter
+from rbpf.core.proposals import EkfProposal
 from rbpf.errors import InputError
-from rbpf.filter import Filter
 from rbpf.lie import SE2
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
 from rbpf.motion.odometry import Odometry, OdometryMotion
-from rbpf.proposals import EkfProposal
 from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
 from rbpf.sensors.range_bearing import RelativePosition
 from rbpf.sensors.readers.log import Frame

@@ -9,8 +9,8 @@ from rbpf.sensors.chessboard import Board
 from rbpf.sensors.pinhole import Pinhole
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.video import run_images
+from rbpf.validation.gtsam.mono_batch import adjust_run, score_batch
 from rbpf.validation.mono import Recording
-from rbpf.validation.mono_batch import adjust_run, score_batch
 from rbpf.validation.simulation.exposure import Imaging
 from rbpf.validation.simulation.images import simulate_images
 from rbpf.validation.simulation.textured_desk import TexturedDesk

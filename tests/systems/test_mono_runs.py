@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rbpf.filter import Filter
+from rbpf.core.filter import Filter
+from rbpf.core.models import Part
 from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.maps.point import Point
-from rbpf.models import Part
 from rbpf.sensors.camera_points import CameraRay, EpipolarRay
 from rbpf.systems.mono.config import MonoConfig, RayConfig, VelocityConfig
 from rbpf.systems.mono.run import MonoRun, run

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from rbpf.anchoring import Anchored, relative_estimate
-from rbpf.estimate import mixture_estimate
+from rbpf.core.anchoring import Anchored, relative_estimate
+from rbpf.core.estimate import mixture_estimate
+from rbpf.core.proposals import Prior
 from rbpf.lie import SE2, SE3
-from rbpf.proposals import Prior
 
 every_space = pytest.mark.parametrize("space", [SE2, SE3], ids=repr)
 

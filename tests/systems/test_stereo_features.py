@@ -11,7 +11,7 @@ from rbpf.sensors.features import FeatureFrame, FeatureLog
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig
 from rbpf.systems.stereo.config import OdometryConfig, RecoveryConfig, StereoConfig, TriggerConfig
 from rbpf.systems.stereo.run import StereoRun, run_features
-from rbpf.validation.gtsam_ba_camera import CameraEstimate, solve_features
+from rbpf.validation.gtsam.camera import CameraEstimate, solve_features
 from rbpf.validation.simulation.features import MONO, STEREO, Measuring, simulate_features
 from rbpf.validation.simulation.lab_points import LabWorld
 from rbpf.validation.simulation.textured_lab import LabDrive

@@ -8,9 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.validation.accuracy import ate, landmark_errors, rpe
-from rbpf.validation.alignment import Similarity
-from rbpf.validation.trajectory import Trajectory, associate
+from rbpf.validation.metrics.accuracy import ate, landmark_errors, rpe
+from rbpf.validation.metrics.alignment import Similarity
+from rbpf.validation.metrics.trajectory import Trajectory, associate
 from rbpf.validation.trajectory_files import read_kitti, read_tum
 
 FRAMES, METRES = metrics.Unit.frames, metrics.Unit.meters

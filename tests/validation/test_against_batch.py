@@ -8,22 +8,28 @@ import numpy as np
 import pytest
 import yaml
 
-from rbpf.checkpoint import save_arrays
+from rbpf.core.checkpoint import save_arrays
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.run import run as run_features
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.range_bearing.run import run
-from rbpf.validation.against_batch import SAME, SCALED, compare, compare_folder, compare_run
-from rbpf.validation.batch_problem import first_steps, fit_of, problem_of, read_problem, solve_problem
 from rbpf.validation.camera_files import write_features
+from rbpf.validation.consistency.against_batch import (
+    SAME,
+    SCALED,
+    compare,
+    compare_folder,
+    compare_run,
+)
 from rbpf.validation.files import write_map
-from rbpf.validation.gaussian_differences import compare_last_pose, rescaled, scale_onto
+from rbpf.validation.gtsam.batch_problem import first_steps, fit_of, problem_of, read_problem, solve_problem
 from rbpf.validation.map_summary import MapSummary
-from rbpf.validation.path_and_map import PathAndMap, of_run, read_path_and_map
+from rbpf.validation.metrics.gaussian_differences import compare_last_pose, rescaled, scale_onto
+from rbpf.validation.metrics.path_and_map import PathAndMap, of_run, read_path_and_map
+from rbpf.validation.metrics.trajectory import Trajectory
 from rbpf.validation.run_folder import write_run
-from rbpf.validation.trajectory import Trajectory
 from rbpf.validation.trajectory_files import write_tum
 from tests.validation.camera_scenes import scene
 from tests.validation.linear_worlds import linear_log

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from rbpf.validation.autocorrelation import correlation_time, degrees_of_freedom
+from rbpf.validation.consistency.autocorrelation import correlation_time, degrees_of_freedom
 
 
 def autoregressive(phi: float, steps: int, dim: int, rng: np.random.Generator) -> np.ndarray:

@@ -8,8 +8,8 @@ import pytest
 
 from rbpf.lie import SE3
 from rbpf.sensors.pinhole import Pinhole
-from rbpf.validation.colmap_adjust import adjust_by_colmap, with_held
-from rbpf.validation.colmap_frames import (
+from rbpf.validation.colmap.adjust import adjust_by_colmap, with_held
+from rbpf.validation.colmap.frames import (
     HALF_PX,
     from_colmap_covariance,
     from_colmap_pose,
@@ -17,7 +17,7 @@ from rbpf.validation.colmap_frames import (
     to_colmap_camera,
     to_colmap_pose,
 )
-from rbpf.validation.gtsam_ba_camera_data import CameraEstimate, sightings_of
+from rbpf.validation.gtsam.camera_data import CameraEstimate, sightings_of
 from tests.validation.camera_scenes import BENT, FISHEYE, PLAIN, WHOLE, scene
 
 

@@ -10,17 +10,17 @@ from rbpf.lie import SE3
 from rbpf.sensors.features import CameraTruth
 from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
 from rbpf.sensors.readers.images import open_images
-from rbpf.validation.against_colmap import compare_folder_with_colmap, compare_with_colmap
-from rbpf.validation.cloud_distance import cloud_distance
-from rbpf.validation.colmap_compare import compare_with_path, compare_with_truth
-from rbpf.validation.colmap_pipeline import ReconstructionOptions
-from rbpf.validation.colmap_reconstruct import Reconstruction, reconstruct
+from rbpf.validation.colmap.against_colmap import compare_folder_with_colmap, compare_with_colmap
+from rbpf.validation.colmap.cloud_distance import cloud_distance
+from rbpf.validation.colmap.compare import compare_with_path, compare_with_truth
+from rbpf.validation.colmap.pipeline import ReconstructionOptions
+from rbpf.validation.colmap.reconstruct import Reconstruction, reconstruct
 from rbpf.validation.map_summary import MapSummary
-from rbpf.validation.path_and_map import PathAndMap
+from rbpf.validation.metrics.path_and_map import PathAndMap
+from rbpf.validation.metrics.trajectory import Trajectory
 from rbpf.validation.simulation.exposure import Imaging
 from rbpf.validation.simulation.images import simulate_images
 from rbpf.validation.simulation.textured_desk import TexturedDesk
-from rbpf.validation.trajectory import Trajectory
 from tests.systems import plane_sequences
 
 CAMERA = Pinhole(320, 240, 260.0, 260.0, 159.5, 119.5)

@@ -8,10 +8,10 @@ from rbpf.lie import SE3
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.run import run
 from rbpf.validation.camera_map import summarise_points
-from rbpf.validation.consistency import offdiagonal_eigenvalues, pose_errors
-from rbpf.validation.parallel import in_parallel
+from rbpf.validation.consistency.pose_errors import offdiagonal_eigenvalues, pose_errors
 from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
 from rbpf.validation.simulation.point_worlds import DeskWorld
+from rbpf.validation.sweep.parallel import in_parallel
 from rbpf.validation.tables import write_table
 
 

@@ -11,11 +11,11 @@ from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.validation.error_ratios import HEADER, ErrorRatio, error_of, robot_ratio, tracks_ratio
 from rbpf.validation.map_summary import MapSummary
-from rbpf.validation.path_and_map import PathAndMap
+from rbpf.validation.metrics.path_and_map import PathAndMap
+from rbpf.validation.metrics.trajectory import Trajectory
 from rbpf.validation.simulation.features import STEREO, Measuring, simulate_features
 from rbpf.validation.simulation.point_worlds import DeskWorld
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
-from rbpf.validation.trajectory import Trajectory
 
 
 def estimate(poses):

@@ -10,16 +10,16 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.range_bearing.run import run
-from rbpf.validation.batch_problem import problem_of
-from rbpf.validation.colmap_frames import from_colmap_pose
-from rbpf.validation.colmap_model import LEFT, RIGHT, build_model, image_id, image_name
-from rbpf.validation.colours import colours_by_sigma, standard_deviations
+from rbpf.validation.colmap.frames import from_colmap_pose
+from rbpf.validation.colmap.model import LEFT, RIGHT, build_model, image_id, image_name
 from rbpf.validation.export import MAP, PATH, colmap_model, export_colmap, export_ply
-from rbpf.validation.gtsam_ba_camera_data import sightings_of
-from rbpf.validation.gtsam_ba_camera_factors import evaluate_sightings
+from rbpf.validation.gtsam.batch_problem import problem_of
+from rbpf.validation.gtsam.camera_data import sightings_of
+from rbpf.validation.gtsam.camera_factors import evaluate_sightings
 from rbpf.validation.map_summary import MapSummary
-from rbpf.validation.path_and_map import PathAndMap, of_run
+from rbpf.validation.metrics.path_and_map import PathAndMap, of_run
 from rbpf.validation.ply import read_ply, write_ply
+from rbpf.validation.report.colours import colours_by_sigma, standard_deviations
 from tests.validation.camera_scenes import BENT, FISHEYE, STEREO, scene
 from tests.validation.linear_worlds import linear_log
 

@@ -9,11 +9,11 @@ from scipy.stats import chi2
 
 from rbpf.lie import SE3
 from rbpf.sensors.features import KnownPoints
-from rbpf.validation.gtsam_ba_camera import CameraEstimate, solve_features
-from rbpf.validation.gtsam_ba_camera_adjust import explain
-from rbpf.validation.gtsam_ba_camera_data import known_by_name, sightings_of
-from rbpf.validation.gtsam_ba_camera_factors import evaluate_sightings
-from rbpf.validation.gtsam_ba_camera_graph import CameraProblem, CameraState
+from rbpf.validation.gtsam.camera import CameraEstimate, solve_features
+from rbpf.validation.gtsam.camera_adjust import explain
+from rbpf.validation.gtsam.camera_data import known_by_name, sightings_of
+from rbpf.validation.gtsam.camera_factors import evaluate_sightings
+from rbpf.validation.gtsam.camera_graph import CameraProblem, CameraState
 from tests.validation.camera_scenes import (
     ACCELERATION,
     BENT,

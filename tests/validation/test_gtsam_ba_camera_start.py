@@ -10,9 +10,9 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.features import FeatureFrame, KnownPoints
 from rbpf.sensors.pinhole import Pinhole
-from rbpf.validation.gtsam_ba_camera import CameraEstimate, solve_features
-from rbpf.validation.gtsam_ba_camera_data import Sightings
-from rbpf.validation.gtsam_ba_camera_resection import locate
+from rbpf.validation.gtsam.camera import CameraEstimate, solve_features
+from rbpf.validation.gtsam.camera_data import Sightings
+from rbpf.validation.gtsam.camera_resection import locate
 from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
 from rbpf.validation.simulation.features import STEREO as PAIR
 from rbpf.validation.simulation.point_worlds import DeskWorld

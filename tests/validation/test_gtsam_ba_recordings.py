@@ -5,11 +5,11 @@ import pytest
 
 from rbpf.lie import SE2
 from rbpf.sensors.readers import open_log
-from rbpf.validation.accuracy import landmark_errors
-from rbpf.validation.alignment import align
-from rbpf.validation.gtsam_ba import solve
-from rbpf.validation.gtsam_ba_graph import Problem
-from rbpf.validation.measurements import from_log, initial_estimate
+from rbpf.validation.gtsam.measurements import from_log, initial_estimate
+from rbpf.validation.gtsam.robot import solve
+from rbpf.validation.gtsam.robot_graph import Problem
+from rbpf.validation.metrics.accuracy import landmark_errors
+from rbpf.validation.metrics.alignment import align
 from tests.validation.joint_ekf import joint_ekf
 
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from rbpf.errors import InputError
-from rbpf.validation import gtsam_ba_camera_adjust as adjuster
-from rbpf.validation.gtsam_ba_camera_data import CameraEstimate, known_by_name, sightings_of
-from rbpf.validation.gtsam_ba_camera_graph import CameraProblem
-from rbpf.validation.gtsam_ba_schur import marginals_by_schur
-from rbpf.validation.gtsam_ba_solvers import marginals
+from rbpf.validation.gtsam import camera_adjust as adjuster
+from rbpf.validation.gtsam.camera_data import CameraEstimate, known_by_name, sightings_of
+from rbpf.validation.gtsam.camera_graph import CameraProblem
+from rbpf.validation.gtsam.schur import marginals_by_schur
+from rbpf.validation.gtsam.solvers import marginals
 from tests.validation.camera_scenes import BENT, STEREO, scene
 
 

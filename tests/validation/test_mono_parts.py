@@ -8,7 +8,7 @@ import pytest
 from rbpf.lie import SE3
 from rbpf.sensors.features import FeatureFrame, FeatureLog
 from rbpf.systems.mono.run import run
-from rbpf.validation.mono_batch import Batch, adjust_log
+from rbpf.validation.gtsam.mono_batch import Batch, adjust_log
 from rbpf.validation.mono_parts import (
     DEPTH_FRACTION,
     GivenDepths,

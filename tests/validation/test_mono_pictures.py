@@ -9,14 +9,14 @@ from rbpf.sensors.readers.images import open_images, read_known_points
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.sightings import Sighting, Sightings
 from rbpf.systems.mono.video import run_images
-from rbpf.validation.annotated import FOUND, MISSED, Caption, drawn_size
-from rbpf.validation.mono_frames import RAY, draw_frame
 from rbpf.validation.mono_map import summarise_mono_map
-from rbpf.validation.mono_views import best_views
+from rbpf.validation.report.annotated import FOUND, MISSED, Caption, drawn_size
+from rbpf.validation.report.mono_frames import RAY, draw_frame
+from rbpf.validation.report.mono_views import best_views
+from rbpf.validation.report.video_file import frame_rate, is_complete
 from rbpf.validation.simulation.exposure import Imaging
 from rbpf.validation.simulation.images import simulate_images
 from rbpf.validation.simulation.textured_desk import TexturedDesk
-from rbpf.validation.video_file import frame_rate, is_complete
 
 
 @pytest.fixture(scope="module")

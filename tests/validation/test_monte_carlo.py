@@ -3,17 +3,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rbpf.diagnostics import ancestors_by_step, coalescence_steps
+from rbpf.core.diagnostics import ancestors_by_step, coalescence_steps
+from rbpf.core.genealogy import Lineage
+from rbpf.core.history import History
 from rbpf.errors import InputError
-from rbpf.genealogy import Lineage
-from rbpf.history import History
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
-from rbpf.validation.monte_carlo import Consistency, left_for_good, run_trials
+from rbpf.validation.consistency.monte_carlo import Consistency, left_for_good, run_trials
+from rbpf.validation.consistency.trials import DeskTrial, RobotTrial, Trial
 from rbpf.validation.simulation.features import Measuring
 from rbpf.validation.simulation.point_worlds import DeskWorld
 from rbpf.validation.simulation.robot import RobotWorld
-from rbpf.validation.trials import DeskTrial, RobotTrial, Trial
 
 
 def honest(rng: np.random.Generator, scale: float = 1.0, steps: int = 60) -> Trial:

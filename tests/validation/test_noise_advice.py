@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rbpf.filter import Filter
-from rbpf.validation.noise_advice import noise_advice
-from rbpf.validation.own_statistics import INNOVATIONS
+from rbpf.core.filter import Filter
+from rbpf.validation.consistency.noise_advice import noise_advice
+from rbpf.validation.consistency.own_statistics import INNOVATIONS
+from rbpf.validation.consistency.statistic import step_ratio, variance_ratio
 from rbpf.validation.run_record import RunRecord
-from rbpf.validation.statistic import step_ratio, variance_ratio
 from tests.validation.test_verdict import Receiver, Walk
 
 

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
+from rbpf.core.exchange import Observations, Part, Transition
+from rbpf.core.filter import Filter
+from rbpf.core.models import MotionModel, ObservationModel, Sensor
 from rbpf.errors import InputError
-from rbpf.exchange import Observations, Part, Transition
-from rbpf.filter import Filter
 from rbpf.lie import Euclidean
-from rbpf.models import MotionModel, ObservationModel, Sensor
-from rbpf.validation.rank_histograms import calibrate, plot_ranks
+from rbpf.validation.consistency.rank_histograms import calibrate, plot_ranks
 
 FIXES = 4
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from rbpf.validation.statistic import (
+from rbpf.validation.consistency.statistic import (
     Statistic,
     coverage,
     motion_statistics,

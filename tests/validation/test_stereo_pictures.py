@@ -10,11 +10,11 @@ import pytest
 from rbpf.systems.stereo.config import StereoConfig, TriggerConfig
 from rbpf.systems.stereo.run import StereoRun, run_images
 from rbpf.systems.stereo.seen import FEATURE, LANDMARK, NEW, TRIAL, PairSeen, Seen
-from rbpf.validation.annotated import Caption, drawn_size
 from rbpf.validation.map_summary import summarise_map
-from rbpf.validation.rerun_file import recording
-from rbpf.validation.stereo_frames import COLOURS, annotated_pairs, draw_pair
-from rbpf.validation.stereo_rerun import write_stereo_rerun
+from rbpf.validation.report.annotated import Caption, drawn_size
+from rbpf.validation.report.rerun_file import recording
+from rbpf.validation.report.stereo_frames import COLOURS, annotated_pairs, draw_pair
+from rbpf.validation.report.stereo_rerun import write_stereo_rerun
 from tests.systems.plane_sequences import CAMERA
 from tests.systems.stereo_sequences import missing, pairs
 
@@ -94,7 +94,7 @@ def test_features_in_the_recording(run, tmp_path, monkeypatch):
     """Every pair's features under what they were, half a pixel aside, and landmarks where the map has them."""
     rr = pytest.importorskip("rerun")
     stream = Stream()
-    monkeypatch.setattr("rbpf.validation.stereo_rerun.recording", lambda *_: nullcontext((rr, stream)))
+    monkeypatch.setattr("rbpf.validation.report.stereo_rerun.recording", lambda *_: nullcontext((rr, stream)))
     write_stereo_rerun(run, sequence(), summarise_map(run.filter), tmp_path / "unused.rrd")
     logged = stream.logged
     assert len(logged["time/frame"]) == COUNT and len(logged["world/camera/image"]) == COUNT

@@ -9,9 +9,9 @@ import pytest
 from rbpf.lie import SE3
 from rbpf.motion.stereo_odometer import Prediction, StereoOdometer, odometry_path
 from rbpf.sensors.readers import stereo_tracks
-from rbpf.validation.gtsam_ba_camera import CameraEstimate, solve_features
-from rbpf.validation.gtsam_ba_camera_data import sightings_of
-from rbpf.validation.gtsam_ba_camera_graph import CameraProblem, CameraState
+from rbpf.validation.gtsam.camera import CameraEstimate, solve_features
+from rbpf.validation.gtsam.camera_data import sightings_of
+from rbpf.validation.gtsam.camera_graph import CameraProblem, CameraState
 
 pytestmark = [pytest.mark.real_data, pytest.mark.slow]
 

@@ -8,7 +8,7 @@ from rbpf.lie import SE3
 from rbpf.motion.levenberg_marquardt import Rule
 from rbpf.motion.stereo_vo import VoConfig, fit
 from rbpf.sensors.features import FeatureFrame, FeatureLog
-from rbpf.validation.gtsam_ba_camera import CameraEstimate, solve_features
+from rbpf.validation.gtsam.camera import CameraEstimate, solve_features
 from tests.motion.stereo_pairs import LEAP, ROAD, ROOM, correlated
 
 STRICT = VoConfig(rule=Rule(offset=1e-7, iterations=100))

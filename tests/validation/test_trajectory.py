@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3
-from rbpf.validation.alignment import Similarity
-from rbpf.validation.trajectory import Trajectory, associate
+from rbpf.validation.metrics.alignment import Similarity
+from rbpf.validation.metrics.trajectory import Trajectory, associate
 
 MS = 1_000_000
 

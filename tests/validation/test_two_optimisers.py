@@ -7,11 +7,11 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.validation.colmap_adjust import adjust_by_colmap, with_held
-from rbpf.validation.gtsam_ba_camera_data import CameraEstimate
+from rbpf.validation.colmap.adjust import adjust_by_colmap, with_held
+from rbpf.validation.colmap.two_optimisers import adjust_by_both
+from rbpf.validation.gtsam.camera_data import CameraEstimate
 from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
 from rbpf.validation.simulation.point_worlds import DeskWorld
-from rbpf.validation.two_optimisers import adjust_by_both
 from tests.validation.camera_scenes import BENT, FISHEYE, STEREO, WHOLE, scene
 
 POSES, COVARIANCES = 1e-4, 0.05

@@ -7,20 +7,20 @@ import numpy as np
 import pytest
 import yaml
 
-from rbpf.checkpoint import load_arrays, save_arrays
 from rbpf.cli import main
+from rbpf.core.checkpoint import load_arrays, save_arrays
 from rbpf.errors import InputError
 from rbpf.sensors.readers.log import Truth
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.range_bearing.run import run
-from rbpf.validation.against_groundtruth import truth_errors
-from rbpf.validation.report import write_report
+from rbpf.validation.consistency.against_groundtruth import truth_errors
+from rbpf.validation.consistency.trials import simulated_log
+from rbpf.validation.consistency.validate import COMPARISONS, validate
+from rbpf.validation.report.page import write_report
 from rbpf.validation.run_files import RunTruth, read_path, read_truth, write_path, write_truth
 from rbpf.validation.run_record import open_run
 from rbpf.validation.run_truth import robot_truth
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
-from rbpf.validation.trials import simulated_log
-from rbpf.validation.validate import COMPARISONS, validate
 
 pytestmark = pytest.mark.usefixtures("plain_pictures")
 
@@ -193,7 +193,7 @@ def test_a_run_without_truth_is_compared_with_the_batch_optimum_that_it_found_or
 
 
 def test_a_further_comparison_is_one_function(run_folder, monkeypatch):
-    from rbpf.validation.comparison import Comparison
+    from rbpf.validation.consistency.comparison import Comparison
 
     def reconstruction(record):
         return Comparison("colmap", f"{record.name} is good.", {"ate_m": 0.01})

@@ -5,23 +5,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rbpf.diagnostics import motion_correction
-from rbpf.exchange import Observations, Part, Transition
-from rbpf.filter import Filter
+from rbpf.core.diagnostics import motion_correction
+from rbpf.core.exchange import Observations, Part, Transition
+from rbpf.core.filter import Filter
+from rbpf.core.models import MotionModel, ObservationModel, Sensor
 from rbpf.lie import Euclidean
-from rbpf.models import MotionModel, ObservationModel, Sensor
 from rbpf.sensors.range_bearing import RangeBearing
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.range_bearing.run import run
-from rbpf.validation.against_groundtruth import pose_statistics
-from rbpf.validation.consistency import whitened_errors
+from rbpf.validation.consistency.against_groundtruth import pose_statistics
+from rbpf.validation.consistency.own_statistics import innovation_statistics
+from rbpf.validation.consistency.pose_errors import whitened_errors
+from rbpf.validation.consistency.statistic import coverage, variance_ratio
+from rbpf.validation.consistency.trials import simulated_log
+from rbpf.validation.consistency.verdict import Verdict, judge
 from rbpf.validation.faults import bias_odometry, scale_odometry_noise, scale_sensor_noise, swap_names
-from rbpf.validation.own_statistics import innovation_statistics
 from rbpf.validation.run_truth import robot_truth
 from rbpf.validation.simulation.robot import RobotWorld
-from rbpf.validation.statistic import coverage, variance_ratio
-from rbpf.validation.trials import simulated_log
-from rbpf.validation.verdict import Verdict, judge
 
 pytestmark = pytest.mark.slow
 

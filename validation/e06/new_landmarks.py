@@ -9,12 +9,12 @@ from rbpf.lie import SE3
 from rbpf.sensors.readers.images import ImageFrame
 from rbpf.systems.mono.sightings import Sighting
 from rbpf.systems.mono.video import VideoRun, run_images
-from rbpf.validation.annotated import Caption
 from rbpf.validation.e06.setting import Row, Setting
 from rbpf.validation.e06.worlds import LoopOverDesk
-from rbpf.validation.figures import COLOURS, label, outline, save_figures
-from rbpf.validation.mono_frames import draw_frame
 from rbpf.validation.mono_map import MonoMap, summarise_mono_map
+from rbpf.validation.report.annotated import Caption
+from rbpf.validation.report.figures import COLOURS, label, outline, save_figures
+from rbpf.validation.report.mono_frames import draw_frame
 
 FIRST = 20
 """The frame is not looked for before this one: the camera is still at rest."""

@@ -11,8 +11,8 @@ from rbpf.lie import SE3
 from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
 from rbpf.systems.stereo.run import StereoRun
 from rbpf.systems.stereo.sensor import StereoSensor
-from rbpf.validation.alignment import align
-from rbpf.validation.scores import poses_at
+from rbpf.validation.metrics.alignment import align
+from rbpf.validation.metrics.scores import poses_at
 
 KINDS = "filter", "odometry", "wheels"
 

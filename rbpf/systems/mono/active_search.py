@@ -6,7 +6,7 @@ from typing import final
 
 import numpy as np
 
-from rbpf.belief import Belief
+from rbpf.core.belief import Belief
 from rbpf.sensors.patches import search, warp
 from rbpf.systems.mono.appearance import Appearances
 from rbpf.systems.mono.config import SearchConfig

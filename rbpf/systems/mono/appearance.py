@@ -5,7 +5,7 @@ from typing import final
 
 import numpy as np
 
-from rbpf.archive import checked
+from rbpf.core.archive import checked
 
 SOURCE_HALF_PX = 15
 """The window that is kept of a first sighting reaches this far from its centre: enough to be turned and shrunk."""

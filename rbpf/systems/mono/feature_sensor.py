@@ -5,12 +5,12 @@ from typing import final
 
 import numpy as np
 
-from rbpf.belief import Belief
+from rbpf.core.belief import Belief
+from rbpf.core.models import NewLandmarks, Observations, Part, Sensor
 from rbpf.lie import SE3
 from rbpf.maps.constellation import Constellation
 from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.maps.point import Point
-from rbpf.models import NewLandmarks, Observations, Part, Sensor
 from rbpf.sensors.camera_constellation import ConstellationView, MembersView
 from rbpf.sensors.camera_points import CameraModel, CameraPoint, CameraRay, EpipolarRay
 from rbpf.sensors.features import FeatureFrame

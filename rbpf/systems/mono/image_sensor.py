@@ -7,10 +7,10 @@ from typing import final
 
 import numpy as np
 
-from rbpf.belief import Belief
+from rbpf.core.belief import Belief
+from rbpf.core.models import NewLandmarks, Observations, Part, Sensor
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.models import NewLandmarks, Observations, Part, Sensor
 from rbpf.sensors.camera_points import CameraRay
 from rbpf.sensors.corners import corners
 from rbpf.sensors.features import FeatureFrame

@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from rbpf.checkpoint import load_arrays, save_arrays
+from rbpf.core.checkpoint import load_arrays, save_arrays
 from rbpf.errors import InputError
 from rbpf.sensors.features import KnownPoints
 from rbpf.sensors.lens_distortion import RadialTangential

@@ -7,10 +7,10 @@ from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 
 from rbpf import gaussian
+from rbpf.core.models import Records
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.maps.constellation import LEAST, Constellation, UncertainConstellation, by_frame
-from rbpf.models import Records
 from rbpf.sensors.camera_points import CameraPoint
 from rbpf.sensors.corners import texture
 from rbpf.sensors.features import FeatureFrame, KnownPoints

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from rbpf.belief import Belief
+from rbpf.core.belief import Belief
 from rbpf.lie import SE3
 from rbpf.sensors.keypoints import describe
 from rbpf.sensors.pinhole import Pinhole

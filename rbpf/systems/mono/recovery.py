@@ -5,12 +5,12 @@ from typing import final
 
 import numpy as np
 
-from rbpf.estimate import mixture_estimate
-from rbpf.filter import Filter
+from rbpf.core.estimate import mixture_estimate
+from rbpf.core.filter import Filter
+from rbpf.core.particles import Particles
+from rbpf.core.proposals import Prior
 from rbpf.lie import SE3
 from rbpf.motion.constant_velocity import PosePrior
-from rbpf.particles import Particles
-from rbpf.proposals import Prior
 from rbpf.sensors.readers.images import ImageFrame
 from rbpf.systems.mono.config import RecoveryConfig
 from rbpf.systems.mono.image_sensor import ImageSensor

@@ -6,7 +6,7 @@ from typing import final
 import numpy as np
 
 from rbpf import gaussian
-from rbpf.belief import Belief
+from rbpf.core.belief import Belief
 from rbpf.lie import SE3
 from rbpf.motion.constant_velocity import PosePrior
 from rbpf.sensors.consensus_resection import Resected, refined, resect_consensus, three_point_poses

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rbpf.archive import checked
-from rbpf.checkpoint import fitting
+from rbpf.core.archive import checked
+from rbpf.core.checkpoint import fitting
 from rbpf.errors import InputError
 
 if TYPE_CHECKING:

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rbpf.anchoring import Anchored, relative_estimate
-from rbpf.estimate import Estimate, mixture_estimate
-from rbpf.filter import Filter, StepReport
+from rbpf.core.anchoring import Anchored, relative_estimate
+from rbpf.core.estimate import Estimate, mixture_estimate
+from rbpf.core.filter import Filter, StepReport
+from rbpf.core.models import Sensor
+from rbpf.core.particles import uniform_log_weights
+from rbpf.core.proposals import Prior
 from rbpf.lie import SE3
-from rbpf.models import Sensor
-from rbpf.particles import uniform_log_weights
-from rbpf.proposals import Prior
 from rbpf.sensors.features import FeatureLog
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor

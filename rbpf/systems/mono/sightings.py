@@ -5,9 +5,9 @@ from typing import final
 
 import numpy as np
 
-from rbpf.anchoring import Anchored
-from rbpf.belief import Belief
-from rbpf.filter import Filter
+from rbpf.core.anchoring import Anchored
+from rbpf.core.belief import Belief
+from rbpf.core.filter import Filter
 from rbpf.sensors.features import FeatureFrame
 from rbpf.sensors.names import Names
 from rbpf.systems.mono.feature_sensor import FeatureSensor

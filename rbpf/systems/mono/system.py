@@ -4,19 +4,19 @@ from collections.abc import Callable
 
 import numpy as np
 
-from rbpf.anchoring import Anchored
+from rbpf.core.anchoring import Anchored
+from rbpf.core.filter import Filter
+from rbpf.core.models import Conditional, MotionModel, Records, Sensor
+from rbpf.core.substate import KalmanSubstate
 from rbpf.errors import InputError
-from rbpf.filter import Filter
 from rbpf.lie import SE3
 from rbpf.maps.constellation import Constellation, UncertainConstellation
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
-from rbpf.models import Conditional, MotionModel, Records, Sensor
 from rbpf.motion.constant_velocity import MarginalVelocity, PosePrior, SampledVelocity
 from rbpf.sensors.features import FeatureFrame, FeatureLog, KnownPoints
 from rbpf.sensors.pinhole import Pinhole
 from rbpf.sensors.resection import resect
-from rbpf.substate import KalmanSubstate
 from rbpf.systems.mono.config import MonoConfig, VelocityConfig
 from rbpf.systems.mono.feature_sensor import CONSTELLATION, FeatureSensor
 from rbpf.systems.mono.known_start import KnownStart, first_records

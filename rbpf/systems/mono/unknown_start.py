@@ -13,8 +13,8 @@ from typing import final
 
 import numpy as np
 
-from rbpf.archive import checked
-from rbpf.filter import Filter
+from rbpf.core.archive import checked
+from rbpf.core.filter import Filter
 from rbpf.lie import SE3
 from rbpf.motion.constant_velocity import PosePrior
 from rbpf.sensors.features import FeatureFrame

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from rbpf.core.filter import Filter
 from rbpf.errors import InputError
-from rbpf.filter import Filter
 from rbpf.lie import SE3
 from rbpf.motion.constant_velocity import PosePrior
 from rbpf.sensors.features import FeatureFrame

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from rbpf.filter import Filter, StepReport
-from rbpf.models import NEW, NULL
+from rbpf.core.filter import Filter, StepReport
+from rbpf.core.models import NEW, NULL
 from rbpf.sensors.readers.log import RobotLog
 
 

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from rbpf.anchoring import Anchored, StartAnchor
-from rbpf.checkpoint import fitting
-from rbpf.diagnostics import motion_correction
+from rbpf.core.anchoring import Anchored, StartAnchor
+from rbpf.core.checkpoint import fitting
+from rbpf.core.diagnostics import motion_correction
+from rbpf.core.estimate import Estimate
+from rbpf.core.filter import Filter, StepReport
 from rbpf.errors import InputError
-from rbpf.estimate import Estimate
-from rbpf.filter import Filter, StepReport
 from rbpf.sensors.readers.log import RobotLog
 from rbpf.systems.range_bearing.associations import Associations, named_associations
 from rbpf.systems.range_bearing.config import RangeBearingConfig
@@ -36,7 +36,7 @@ class Progress:
         seconds: (T,) time of the step.
         correction: (T, d) what the observations say about the motion, in its own whitened coordinates; NaN where the
             proposal did not ask them.
-        cov_correction: (T, d, d) what an honest filter expects of it; see `rbpf.diagnostics.Correction`.
+        cov_correction: (T, d, d) what an honest filter expects of it; see `rbpf.core.diagnostics.Correction`.
     """
 
     mean: np.ndarray

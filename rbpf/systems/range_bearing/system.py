@@ -4,11 +4,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from rbpf.filter import Filter
+from rbpf.core.filter import Filter
+from rbpf.core.models import Sensor
 from rbpf.lie import SE2Group
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
-from rbpf.models import Sensor
 from rbpf.motion.odometry import Odometry, OdometryMotion
 from rbpf.sensors.landmark_sensor import AnonymousLandmarkSensor, NamedLandmarkSensor
 from rbpf.sensors.range_bearing import RangeBearing, RelativePosition

@@ -14,7 +14,7 @@ from typing import final
 
 import numpy as np
 
-from rbpf.checkpoint import load_arrays, save_arrays
+from rbpf.core.checkpoint import load_arrays, save_arrays
 from rbpf.errors import InputError
 from rbpf.sensors.features import CameraTruth
 from rbpf.sensors.pinhole import RectifiedStereo

@@ -5,10 +5,10 @@ from typing import Any, final
 
 import numpy as np
 
-from rbpf.belief import Belief
-from rbpf.exchange import NULL
-from rbpf.filter import StepReport
-from rbpf.models import Part, Sensor
+from rbpf.core.belief import Belief
+from rbpf.core.exchange import NULL
+from rbpf.core.filter import StepReport
+from rbpf.core.models import Part, Sensor
 from rbpf.sensors.features import CameraTruth, FeatureLog
 from rbpf.sensors.pinhole import RectifiedStereo
 from rbpf.sensors.readers.images import ImageFrame

@@ -5,10 +5,10 @@ from typing import final
 
 import numpy as np
 
-from rbpf.belief import Belief
+from rbpf.core.belief import Belief
+from rbpf.core.proposals import Prior
 from rbpf.gaussian import symmetrise
 from rbpf.lie import SE3
-from rbpf.proposals import Prior
 from rbpf.sensors.stereo_points import StereoPoint
 
 

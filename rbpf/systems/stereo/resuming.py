@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rbpf.archive import checked, within
-from rbpf.checkpoint import fitting
+from rbpf.core.archive import checked, within
+from rbpf.core.checkpoint import fitting
+from rbpf.core.estimate import Estimate
 from rbpf.errors import InputError
-from rbpf.estimate import Estimate
 
 if TYPE_CHECKING:
     from rbpf.systems.stereo.run import StereoRun

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from rbpf.core.estimate import Estimate
+from rbpf.core.filter import Filter, StepReport
 from rbpf.errors import InputError
-from rbpf.estimate import Estimate
-from rbpf.filter import Filter, StepReport
 from rbpf.lie import SE3
 from rbpf.motion.odometry import Odometry
 from rbpf.motion.stereo_motions import Known

@@ -14,10 +14,10 @@ from typing import final
 import numpy as np
 
 from rbpf import gaussian
-from rbpf.belief import Belief
-from rbpf.exchange import NULL
+from rbpf.core.belief import Belief
+from rbpf.core.exchange import NULL
+from rbpf.core.models import Likelihood, NewLandmarks, Observations, Part, Sensor
 from rbpf.maps.point import Point
-from rbpf.models import Likelihood, NewLandmarks, Observations, Part, Sensor
 from rbpf.motion.stereo_vo import VoConfig, estimate_motion
 from rbpf.sensors.key_index import Gate, KeyIndex
 from rbpf.sensors.key_management import KeyConfig, KeyManager

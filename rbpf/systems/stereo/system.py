@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from rbpf.filter import Filter
+from rbpf.core.filter import Filter
+from rbpf.core.models import Sensor
 from rbpf.lie import SE3
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
-from rbpf.models import Sensor
 from rbpf.motion.stereo_odometer import StereoOdometer
 from rbpf.motion.stereo_odometry import StereoOdometry
 from rbpf.sensors.pinhole import RectifiedStereo

@@ -9,7 +9,7 @@ from typing import final
 import numpy as np
 
 from rbpf import gaussian
-from rbpf.exchange import NULL
+from rbpf.core.exchange import NULL
 from rbpf.sensors.features import FeatureFrame
 
 LEAST = 2

@@ -1,0 +1,289 @@
+"""Where the start lies in each particle's world, told again from everything that was learnt since.
+
+A filter that starts from a known pose fixes its world by what it saw first, when the map was still poor; later
+observations sharpen the map, but no particle can move the world it has committed to. Where the models do not change
+when the whole world is moved (odometry, sensors that measure relative to the robot), the start pose of a particle can
+be re-estimated from its own map: given the rest of the trajectory and the map without the first frame's measurements,
+x_0 has the law of a filter step run backwards,
+
+    p(x_0 | x_1, u_1, z_0, m) ∝ p(x_1 | x_0, u_1) p(z_0 | x_0, m),    Mathematics (start-again)
+
+which leaves the posterior invariant (a Gibbs step for x_0, W. Gilks and C. Berzuini 2001) and, taken as the Gaussian
+that it is instead of a draw from it, marginalises the world's place exactly. Poses and landmarks are then reported
+relative to it.
+"""
+
+from dataclasses import dataclass
+from typing import Any, final
+
+import numpy as np
+
+from rbpf import gaussian
+from rbpf.core.estimate import Estimate, mixture_estimate
+from rbpf.core.filter import Filter, StepReport
+from rbpf.core.likelihoods import Gaussian
+from rbpf.core.models import Landmark, LineariseAt, NewLandmarks, ObservationModel, Records
+from rbpf.core.numeric import linearise
+from rbpf.core.proposals import EkfProposal, Prior, Terms
+from rbpf.core.reference import information, innovation_covariance
+from rbpf.errors import InputError
+from rbpf.lie import LieGroup
+
+_MOST_OF_ALL = 0.999
+"""A landmark that owes more than this fraction of its information to the first frame says nothing about the start."""
+
+
+@dataclass(frozen=True)
+class Anchored:
+    """The start pose in each particle's own world.
+
+    Attributes:
+        mean: (N, E) world_from_start.
+        factor: (N, d, d) of its covariance, in the right chart at the mean.
+    """
+
+    mean: np.ndarray
+    factor: np.ndarray
+
+
+def relative_estimate(
+    space: LieGroup,
+    anchored: Anchored,
+    state: np.ndarray,
+    log_weights: np.ndarray,
+    origin: np.ndarray | None = None,
+) -> Estimate:
+    """Mean and covariance of states (N, E) relative to the anchored frame, origin · x_0⁻¹ · x.
+
+    Args:
+        space: the group of the states.
+        anchored: the frame x_0 in each particle's own world.
+        state: (N, E) sampled states.
+        log_weights: (N,) normalised.
+        origin: (E,) what the frame is called in the result; by default the identity.
+    """
+    relative = space.between(anchored.mean, state)
+    factor = space.adjoint(space.inverse(relative)) @ anchored.factor
+    base = relative if origin is None else space.compose(origin, relative)
+    return mixture_estimate(Prior(space, base, np.zeros((1, space.dim)), factor), None, log_weights)
+
+
+@final
+class StartAnchor:
+    """Remembers the first frame and the first motion of a filter, and re-estimates the start from time to time.
+
+    Call `after_step` after every step of the filter.
+
+    Args:
+        filter_: before its first step, started from one known state.
+        every: steps between re-estimations; in between, descendants inherit their ancestor's.
+        iterations: linearisations.
+
+    Raises:
+        InputError: `every` is not positive.
+    """
+
+    def __init__(self, filter_: Filter, every: int = 10, iterations: int = 2) -> None:
+        if every < 1:
+            raise InputError(f"an anchor is re-estimated every 1, 2, … steps, got {every}")
+        self._filter = filter_
+        self._every = every
+        self._start = filter_.particles.state[0].copy()
+        self._proposal = EkfProposal(iterations=iterations)
+        self._seen: list[tuple[np.ndarray, NewLandmarks]] = []
+        self._second: _FirstMotion | None = None
+        self._latest: tuple[int, Anchored] | None = None
+
+    def after_step(self, report: StepReport, control: Any = None) -> Anchored:
+        """Takes note of a step that moved by `control`; returns the start in each present particle's world."""
+        steps = self._filter.steps
+        if steps == 1:
+            self._record_first(report)
+        elif steps == 2:
+            self._record_second(report, control)
+        if self._latest is None or steps % self._every == 0 or steps <= 3:
+            self._remember(self.estimate())
+        return self.current()
+
+    def current(self) -> Anchored:
+        """The latest re-estimation, inherited by the present particles."""
+        assert self._latest is not None
+        generation, anchored = self._latest
+        rows = self._filter.lineage.rows(generation)
+        return Anchored(anchored.mean[rows], anchored.factor[rows])
+
+    def estimate(self) -> Anchored:
+        """The start in each present particle's world from all that is known now; before any motion, the start."""
+        space, n = self._filter.space, self._filter.n
+        if self._second is None:
+            return Anchored(np.repeat(self._start[None], n, axis=0), np.zeros((n, space.dim, space.dim)))
+        prior = self._prior()
+        proposed = self._proposal.propose(prior, _FirstFrame(prior, self._groups()))
+        mean = prior.at(np.einsum("nar,nr->na", prior.factor, proposed.mean))
+        return Anchored(mean, _square(prior.factor @ proposed.root))
+
+    def state_estimate(self, anchored: Anchored) -> Estimate:
+        """Mean and covariance of the present state relative to the start, start · x_0⁻¹ · x."""
+        space, particles = self._filter.space, self._filter.particles
+        return relative_estimate(space, anchored, particles.state, particles.log_weights, self._start)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """For a checkpoint."""
+        out = {"anchor/groups": np.array(len(self._seen))}
+        for number, (ids, new_landmarks) in enumerate(self._seen):
+            out |= {
+                f"anchor/{number}/ids": ids,
+                f"anchor/{number}/z": new_landmarks.z,
+                f"anchor/{number}/cov": new_landmarks.cov,
+            }
+        if self._second is not None:
+            second = self._second
+            out |= {
+                "anchor/second": np.array(second.generation),
+                "anchor/state": second.state,
+                "anchor/delta": second.delta,
+                "anchor/factor": second.factor,
+            }
+        if self._latest is not None:
+            generation, anchored = self._latest
+            out |= {
+                "anchor/latest": np.array(generation),
+                "anchor/latest_mean": anchored.mean,
+                "anchor/latest_factor": anchored.factor,
+            }
+        return out
+
+    def restore(self, arrays: dict[str, np.ndarray], model: ObservationModel, landmark: Landmark) -> None:
+        """The inverse of `arrays`; all first sightings must have been of one model and parametrisation."""
+        lineage = self._filter.lineage
+        for number in range(int(arrays["anchor/groups"])):
+            ids, z, cov = (arrays[f"anchor/{number}/{name}"].copy() for name in ("ids", "z", "cov"))
+            self._seen.append((ids, NewLandmarks(z, cov, model, landmark)))
+        if "anchor/second" in arrays:
+            values = (arrays[f"anchor/{name}"].copy() for name in ("state", "delta", "factor"))
+            self._second = _FirstMotion(int(arrays["anchor/second"]), *values)
+            lineage.take_up(self._second.generation)
+        if "anchor/latest" in arrays:
+            anchored = Anchored(arrays["anchor/latest_mean"].copy(), arrays["anchor/latest_factor"].copy())
+            self._latest = (int(arrays["anchor/latest"]), anchored)
+            lineage.take_up(self._latest[0])
+
+    def _record_first(self, report: StepReport) -> None:
+        first = 0
+        for new_landmarks in report.first_observations:
+            count = new_landmarks.z.shape[0]
+            self._seen.append((report.new_landmarks[first : first + count], new_landmarks))
+            first += count
+        self._stamp_ns = report.stamp_ns
+
+    def _record_second(self, report: StepReport, control: Any) -> None:
+        filter_ = self._filter
+        dt = (report.stamp_ns - self._stamp_ns) * 1e-9
+        transition = filter_.motion.transition(self._start[None], control, dt)
+        delta = filter_.space.between(self._start, transition.mean[0])
+        generation = filter_.lineage.generation
+        filter_.lineage.retain(generation)
+        self._second = _FirstMotion(
+            generation, filter_.particles.state.copy(), delta, transition.noise_factor[0]
+        )
+
+    def _remember(self, anchored: Anchored) -> None:
+        lineage = self._filter.lineage
+        if self._latest is not None:
+            lineage.release(self._latest[0])
+        lineage.retain(lineage.generation)
+        self._latest = (lineage.generation, anchored)
+
+    def _prior(self) -> Prior:
+        """x_0 = x_1 · Exp(−w) · Δ⁻¹ = x_1 Δ⁻¹ · Exp(−Ad_Δ w), with Δ = x_0⁻¹ E[x_1]."""
+        assert self._second is not None
+        space, second = self._filter.space, self._second
+        ancestors = second.state[self._filter.lineage.rows(second.generation)]
+        base = space.compose(ancestors, space.inverse(second.delta))
+        factor = space.adjoint(second.delta) @ second.factor
+        return Prior(space, base, np.zeros((1, space.dim)), np.repeat(factor[None], base.shape[0], axis=0))
+
+    def _groups(self) -> list["_Group"]:
+        landmark_map = self._filter.belief().map
+        groups = []
+        for ids, new_landmarks in self._seen:
+            held = np.array([i in landmark_map.store for i in ids.tolist()], dtype=bool)
+            if not held.any():
+                continue
+            records = landmark_map.read(ids[held])
+            present = ~np.isneginf(landmark_map.log_odds(ids[held]))
+            group = self._without_first_frame(
+                records, new_landmarks.model, new_landmarks.z[held], new_landmarks.cov[held], present
+            )
+            groups.append(group)
+        return groups
+
+    def _without_first_frame(
+        self, records: Records, model: ObservationModel, z: np.ndarray, cov_z: np.ndarray, present: np.ndarray
+    ) -> "_Group":
+        """Takes the first frame's information out of the landmarks again: a Kalman update with −R."""
+        space, n = self._filter.space, self._filter.n
+        start = np.repeat(self._start[None, None], n, axis=0)
+        nu, jac = linearise(model, space, z, start, records.mean, records.const)
+        assert jac.landmark is not None
+        explained = innovation_covariance(jac.landmark, records.cov, np.zeros_like(cov_z))
+        chol = np.broadcast_to(gaussian.cholesky(cov_z), explained.shape)
+        half = gaussian.solve_lower_matrix(chol, explained)
+        fraction = np.linalg.eigvalsh(
+            gaussian.symmetrise(gaussian.solve_lower_matrix(chol, np.swapaxes(half, -1, -2)))
+        )
+        use = present & (fraction[..., -1] < _MOST_OF_ALL)
+        left = np.where(use[..., None, None], cov_z - explained, np.eye(z.shape[1]))
+        gain = records.cov @ np.swapaxes(jac.landmark, -1, -2) @ gaussian.inverse(left)
+        mean = records.mean - np.einsum("nkdp,nkp->nkd", gain, nu)
+        cov = gaussian.symmetrise(records.cov + gain @ jac.landmark @ records.cov)
+        return _Group(Records(mean, cov, records.const), model, z, cov_z, use)
+
+
+@dataclass(frozen=True)
+class _FirstMotion:
+    """Where the first motion led each particle of a generation (N, E), its mean Δ (E,) and noise factor (d, r)."""
+
+    generation: int
+    state: np.ndarray
+    delta: np.ndarray
+    factor: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Group:
+    """First sightings z (K, p) of landmarks known from elsewhere, and in which particles (N, K)."""
+
+    records: Records
+    model: ObservationModel
+    z: np.ndarray
+    cov_z: np.ndarray
+    use: np.ndarray
+
+
+class _FirstFrame(LineariseAt):
+    """Information of the first frame about the start."""
+
+    def __init__(self, prior: Prior, groups: list[_Group]) -> None:
+        self._prior = prior
+        self._groups = groups
+
+    def __call__(self, increment: np.ndarray) -> Terms:
+        space = self._prior.space
+        state = self._prior.at(increment)
+        total = Terms.zeros(state.shape[0], space.dim)
+        for group in self._groups:
+            records = group.records
+            nu, jac = linearise(group.model, space, group.z, state[:, None], records.mean, records.const)
+            assert jac.state is not None and jac.landmark is not None
+            cov = innovation_covariance(jac.landmark, records.cov, group.cov_z)
+            total.add(information(nu, jac.state, cov, Gaussian(), self._prior, group.use))
+        charted = total.charted(np.broadcast_to(space.right_jacobian(increment), total.info.shape))
+        offset = np.broadcast_to(increment - self._prior.mean, (state.shape[0], space.dim))
+        return charted.shifted(offset)
+
+
+def _square(factor: np.ndarray) -> np.ndarray:
+    """A (N, d, d) factor of the same covariance as one of shape (N, d, r), r ≤ d."""
+    n, d, r = factor.shape
+    return np.concatenate([factor, np.zeros((n, d, d - r))], axis=2) if r < d else factor

@@ -1,0 +1,263 @@
+"""Who descends from whom: the lineage of the particles, and their paths.
+
+Ancestry changes only where particles are resampled. Each resampling starts a generation; whatever is stored per
+particle (poses, landmarks) is stored per generation, by the row of the particle that wrote it, and read back
+through `Lineage.rows`. Resampling therefore copies nothing but ancestor indices.
+"""
+
+from collections import Counter
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from rbpf.core.archive import checked, within
+from rbpf.errors import InputError
+from rbpf.kernels import forest
+
+_FIRST_CHECK = 4
+"""Age in generations at which a block is first looked through for dead rows; it then grows by a quarter each time."""
+
+
+MOST_GENERATIONS = 1 << 40
+"""No run resamples so often."""
+
+
+class Lineage:
+    """The forest of ancestors of N particles.
+
+    A generation that somebody stores rows of must be kept by `retain` until `release`.
+
+    Args:
+        n: number of particles.
+    """
+
+    def __init__(self, n: int) -> None:
+        self.n = n
+        self.generation = 0
+        self._retained: Counter[int] = Counter()
+        self._mark = 0
+        self._oldest = 0
+        self._allocate(4 * n)
+        self._leaves = np.arange(n)
+        self._generation[:n] = 0
+        self._row[:n] = np.arange(n)
+        self._children[:n] = 1
+        self._free = np.arange(4 * n - 1, n - 1, -1)
+        self._n_free = self._free.size
+        self._free = np.concatenate([self._free, np.zeros(n, dtype=np.int64)])
+        self._identity = np.arange(n)
+        self._cache: dict[int, np.ndarray] = {}
+        self._survivors: dict[int, np.ndarray] = {}
+        self._settled: dict[int, int] = {}
+        """Generations of which one row has all descendants: it always will, and the trunk need not be climbed again."""
+
+    @property
+    def nodes(self) -> int:
+        """Number of nodes held."""
+        return self._parent.size - self._n_free
+
+    def advance(self, ancestors: np.ndarray) -> None:
+        """Starts a generation in which particle i descends from particle ancestors[i] (N,)."""
+        if self._n_free < self.n:
+            self._make_room()
+        self.generation += 1
+        self._n_free = forest.advance(
+            self._parent,
+            self._children,
+            self._generation,
+            self._row,
+            self._free,
+            self._n_free,
+            self._leaves,
+            np.ascontiguousarray(ancestors, dtype=np.int64),
+            self.generation,
+        )
+        self._cache.clear()
+        self._survivors.clear()
+
+    def rows(self, generation: int) -> np.ndarray:
+        """Row in a retained generation of each particle's ancestor, (N,) int."""
+        if generation == self.generation:
+            return self._identity
+        if generation not in self._cache:
+            self._cache[generation] = self._ancestors(generation)
+        return self._cache[generation]
+
+    def survivors(self, generation: int) -> np.ndarray:
+        """Particles of a retained generation that still have descendants, ascending."""
+        if generation not in self._survivors:
+            alive = np.zeros(self.n, dtype=np.bool_)
+            alive[self.rows(generation)] = True
+            self._survivors[generation] = np.flatnonzero(alive)
+        return self._survivors[generation]
+
+    def distinct(self, generation: int) -> int:
+        """Number of particles of a retained generation that still have descendants."""
+        return self.survivors(generation).size
+
+    def retain(self, generation: int) -> None:
+        """Keeps the nodes of a generation."""
+        self._retained[generation] += 1
+
+    def take_up(self, generation: int) -> None:
+        """`retain`, for a generation that a checkpoint says was kept.
+
+        Raises:
+            InputError: the ancestry does not reach back to it, or it has not come yet.
+        """
+        if not self._oldest <= generation <= self.generation:
+            raise InputError(f"the ancestry does not hold generation {generation}")
+        self.retain(generation)
+
+    def release(self, generation: int) -> None:
+        """Ends one `retain`."""
+        self._retained[generation] -= 1
+        if self._retained[generation] == 0:
+            del self._retained[generation]
+            self._settled.pop(generation, None)
+
+    def is_retained(self, generation: int) -> bool:
+        """Whether `rows` may be asked for a generation."""
+        return generation == self.generation or self._retained[generation] > 0
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Everything that a checkpoint must hold."""
+        names = ("parent", "children", "generation", "row", "leaves", "free")
+        arrays = {f"lineage/{name}": getattr(self, f"_{name}") for name in names}
+        arrays["lineage/now"] = np.array([self.generation, self._n_free])
+        return arrays
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """The inverse of `arrays`; what is stored per generation must be taken up again.
+
+        Raises:
+            InputError: an array is missing, or they are no forest. Compiled code would follow them anywhere.
+        """
+        size = checked(arrays, "lineage/parent", (None,), "i").size
+        now, n_free = within(arrays, "lineage/now", 2, 0, MOST_GENERATIONS).tolist()
+        within(arrays, "lineage/free", None, 0, max(size, 1))
+        self._allocate(size)
+        self._parent = within(arrays, "lineage/parent", size, -1, size)
+        self._children = within(arrays, "lineage/children", size, 0, 2 * size + 2)
+        self._generation = within(arrays, "lineage/generation", size, -1, now + 1)
+        self._row = within(arrays, "lineage/row", size, 0, self.n)
+        self._leaves = within(arrays, "lineage/leaves", self.n, 0, size)
+        self._free = arrays["lineage/free"].astype(np.int64)
+        self.generation, self._n_free = now, n_free
+        self._require_forest()
+        self._retained.clear()
+        self._cache.clear()
+        self._survivors.clear()
+        self._settled.clear()
+
+    def _ancestors(self, generation: int) -> np.ndarray:
+        if generation in self._settled:
+            return np.full(self.n, self._settled[generation])
+        self._mark += 1
+        rows = forest.rows_at(
+            self._parent,
+            self._generation,
+            self._row,
+            self._leaves,
+            generation,
+            self._found,
+            self._stamp,
+            self._mark,
+        )
+        if (rows == rows[0]).all():
+            self._settled[generation] = int(rows[0])
+        return np.asarray(rows)
+
+    def _require_forest(self) -> None:
+        """Refuses what is no forest: parents are older than their children, and what is free is nobody's ancestor."""
+        alive, children = np.zeros(self._parent.size, dtype=bool), np.zeros(self._parent.size, dtype=np.int64)
+        nodes = np.unique(self._leaves)
+        sound = nodes.size == self.n and self._n_free <= self._parent.size <= self._free.size
+        children[nodes] = 1
+        self._oldest = 0
+        while sound and nodes.size:
+            alive[nodes] = True
+            parents = self._parent[nodes]
+            if (parents < 0).any():
+                self._oldest = max(self._oldest, int(self._generation[nodes[parents < 0]].max()))
+            older = parents >= 0
+            sound = bool((self._generation[parents[older]] < self._generation[nodes[older]]).all())
+            sound = sound and bool((self._generation[nodes] >= 0).all())
+            np.add.at(children, parents[older], 1)
+            nodes = np.unique(parents[older & ~alive[parents]])
+        free = self._free[: self._n_free]
+        sound = sound and np.unique(free).size == self._parent.size - int(alive.sum()) == free.size
+        if not (sound and not alive[free].any() and np.array_equal(children[alive], self._children[alive])):
+            raise InputError("the particles' ancestry is no forest")
+
+    def _allocate(self, size: int) -> None:
+        self._parent = np.full(size, -1)
+        self._children = np.zeros(size, dtype=np.int64)
+        self._generation = np.full(size, -1)
+        self._row = np.zeros(size, dtype=np.int64)
+        self._found = np.zeros(size, dtype=np.int64)
+        self._stamp = np.zeros(size, dtype=np.int64)
+
+    def _make_room(self) -> None:
+        """Splices chains that nobody needs out of the forest, and doubles it where that is not enough."""
+        needed = np.zeros(self.generation + 1, dtype=np.bool_)
+        needed[[g for g in self._retained if g <= self.generation]] = True
+        self._mark += 1
+        self._n_free = forest.splice(
+            self._parent,
+            self._children,
+            self._generation,
+            self._free,
+            self._n_free,
+            self._leaves,
+            needed,
+            self._stamp,
+            self._mark,
+        )
+        if self._n_free < self._parent.size // 2:
+            self._grow()
+
+    def _grow(self) -> None:
+        old = self._parent.size
+        for name, value in (
+            ("parent", -1),
+            ("children", 0),
+            ("generation", -1),
+            ("row", 0),
+            ("found", 0),
+            ("stamp", 0),
+        ):
+            extra = np.full(old, value, dtype=np.int64)
+            setattr(self, f"_{name}", np.concatenate([getattr(self, f"_{name}"), extra]))
+        free = np.zeros(2 * old + self.n, dtype=np.int64)
+        free[: self._n_free] = self._free[: self._n_free]
+        free[self._n_free : self._n_free + old] = np.arange(2 * old - 1, old - 1, -1)
+        self._free, self._n_free = free, self._n_free + old
+
+
+@dataclass
+class Schedule:
+    """When each generation's rows are next worth compacting: at ages growing by a quarter, as lineages coalesce."""
+
+    due: dict[int, set[int]] = field(default_factory=dict)
+
+    def add(self, generation: int, now: int) -> None:
+        """Looks again when the generation is older by a quarter."""
+        self.due.setdefault(now + max(_FIRST_CHECK, (now - generation) // 4), set()).add(generation)
+
+    def pop(self, now: int) -> list[int]:
+        """Generations to look through now."""
+        return sorted(self.due.pop(now, ()))
+
+    def array(self) -> np.ndarray:
+        """(n, 2) pairs of due age and generation, for a checkpoint."""
+        pairs = [(when, g) for when in sorted(self.due) for g in sorted(self.due[when])]
+        return np.array(pairs, dtype=np.int64).reshape(-1, 2)
+
+    @classmethod
+    def of(cls, pairs: np.ndarray) -> "Schedule":
+        """The inverse of `array`."""
+        schedule = cls()
+        for when, generation in pairs:
+            schedule.due.setdefault(int(when), set()).add(int(generation))
+        return schedule

@@ -1,0 +1,92 @@
+"""Resampling: four unbiased schemes, and a wrapper that resamples only when the weights have degenerated.
+
+R. Douc, O. Cappé, E. Moulines, "Comparison of resampling schemes for particle filtering" (2005). Ancestors come in
+ascending order, so that what is gathered by them is read forwards.
+"""
+
+from typing import final
+
+import numpy as np
+
+from rbpf.core.models import Resampler
+from rbpf.core.particles import effective_sample_size
+from rbpf.errors import InputError
+
+_ROUNDING = 1e-12
+"""Relative error within which weights count as equal, and N W as whole."""
+
+
+def _inverse_cdf(weights: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Index of the weight that each point of [0, 1), ascending, falls on; never one of weight zero."""
+    cdf = np.cumsum(weights)
+    last = int(np.flatnonzero(weights)[-1])
+    return np.minimum(np.searchsorted(cdf / cdf[-1], points, side="right"), last)
+
+
+@final
+class Systematic(Resampler):
+    """One uniform number, a comb of N teeth."""
+
+    def ancestors(self, weights: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """(N,) → (N,)."""
+        n = weights.size
+        return _inverse_cdf(weights, (np.arange(n) + rng.random()) / n)
+
+
+@final
+class Stratified(Resampler):
+    """One uniform number in each of N strata."""
+
+    def ancestors(self, weights: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """(N,) → (N,)."""
+        n = weights.size
+        return _inverse_cdf(weights, (np.arange(n) + rng.random(n)) / n)
+
+
+@final
+class Multinomial(Resampler):
+    """N independent draws."""
+
+    def ancestors(self, weights: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """(N,) → (N,)."""
+        return _inverse_cdf(weights, np.sort(rng.random(weights.size)))
+
+
+@final
+class Residual(Resampler):
+    """⌊N W_i⌋ descendants each, the rest by multinomial draws of the remainders."""
+
+    def ancestors(self, weights: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """(N,) → (N,)."""
+        n = weights.size
+        counts = np.floor(n * weights * (1.0 + _ROUNDING)).astype(np.int64)
+        rest = n - int(counts.sum())
+        if rest > 0:
+            remainders = np.maximum(n * weights - counts, 0.0)
+            draws = _inverse_cdf(remainders / remainders.sum(), np.sort(rng.random(rest)))
+            counts += np.bincount(draws, minlength=n)
+        return np.repeat(np.arange(n), counts)
+
+
+@final
+class EssTriggered(Resampler):
+    """Resamples when the effective sample size falls below a fraction of N; else the weights stay in the next step.
+
+    Args:
+        scheme: how to resample.
+        threshold: fraction of N in [0, 1]; 0 never resamples, 1 whenever the weights differ.
+    """
+
+    def __init__(self, scheme: Resampler, threshold: float = 0.5) -> None:
+        if not 0 <= threshold <= 1:
+            raise InputError(
+                f"the threshold of the effective sample size must lie in [0, 1], got {threshold}"
+            )
+        self.scheme = scheme
+        self.threshold = threshold
+
+    def ancestors(self, weights: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
+        """(N,) → (N,) or None."""
+        if effective_sample_size(weights) >= self.threshold * weights.size * (1.0 - _ROUNDING):
+            return None
+        return self.scheme.ancestors(weights, rng)

@@ -1,0 +1,104 @@
+"""Smoothed trajectories: along ancestors, with a fixed lag, and by backward simulation where there is no map."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rbpf.core.history import History
+from rbpf.core.models import MotionModel
+from rbpf.errors import InputError
+from rbpf.lie import LieGroup
+
+
+@dataclass(frozen=True)
+class Smoothed:
+    """A smoothed trajectory: stamps (T,), means (T, E), covariances (T, d, d) in the charts at the means."""
+
+    stamps_ns: np.ndarray
+    mean: np.ndarray
+    cov: np.ndarray
+
+
+def ancestral_smoothing(space: LieGroup, history: History, weights: np.ndarray) -> Smoothed:
+    """p(x_t | z_1:T) from the ancestors of the present particles; a history with a lag gives fixed-lag smoothing.
+
+    Args:
+        space: group of the state.
+        history: of the filter.
+        weights: (N,) present weights.
+    """
+    return _summary(space, history.stamps_ns, history.paths(), weights)
+
+
+def backward_simulation(
+    motion: MotionModel,
+    history: History,
+    count: int,
+    rng: np.random.Generator,
+    controls: list[object] | None = None,
+) -> Smoothed:
+    """p(x_t | z_1:T) from `count` trajectories drawn backwards through stored clouds.
+
+    S. Godsill, A. Doucet, M. West, "Monte Carlo smoothing for nonlinear time series" (2004). For models without a
+    marginalised part: with a map the backward weight would need every landmark's future information.
+
+    Args:
+        motion: the filter's; its noise must be regular.
+        history: made with clouds=True and without a lag.
+        count: trajectories.
+        rng: source of randomness.
+        controls: control of each step; entry t moved the state from t−1 to t.
+
+    Raises:
+        InputError: the history holds no clouds, or the motion has a substate or singular noise.
+    """
+    if not history.clouds or history.lag is not None:
+        raise InputError(
+            "backward simulation needs whole clouds: build the filter with clouds=True and no lag"
+        )
+    clouds = [states for block in history.blocks for states in block.states]
+    log_weights = [weights for block in history.blocks for weights in block.log_weights]
+    stamps = history.stamps_ns
+    chosen = _draw(np.repeat(log_weights[-1][None], count, axis=0), rng)
+    paths = [clouds[-1][chosen]]
+    for t in range(len(clouds) - 2, -1, -1):
+        control = None if controls is None else controls[t + 1]
+        log_density = _transition_log_density(
+            motion, clouds[t], paths[0], control, (stamps[t + 1] - stamps[t]) * 1e-9
+        )
+        paths.insert(0, clouds[t][_draw(log_weights[t] + log_density, rng)])
+    return _summary(motion.space, stamps, np.array(paths), np.full(count, 1.0 / count))
+
+
+def _transition_log_density(
+    motion: MotionModel, before: np.ndarray, after: np.ndarray, control: object, dt: float
+) -> np.ndarray:
+    """Log p(after_j | before_i) up to what does not depend on i, (J, N): Mathematics (backward)."""
+    transition = motion.transition(before, control, dt)
+    if transition.coupling is not None and transition.coupling.shape[-1]:
+        raise InputError("backward simulation takes motion models without a substate")
+    factor = transition.noise_factor
+    cov = factor @ np.swapaxes(factor, -1, -2)
+    if (np.linalg.matrix_rank(factor) < motion.space.dim).any():
+        raise InputError("backward simulation needs a motion model with regular noise")
+    log_det = np.linalg.slogdet(cov)[1]
+    increment = motion.space.local(transition.mean[None], after[:, None])
+    solved = np.einsum(
+        "nab,jnb->jna", np.broadcast_to(np.linalg.inv(cov), (before.shape[0], *cov.shape[1:])), increment
+    )
+    jacobian = motion.space.right_jacobian_inverse(increment)
+    chart = np.linalg.slogdet(jacobian)[1]
+    return -0.5 * ((increment * solved).sum(-1) + log_det) + chart
+
+
+def _draw(log_weights: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """One index per row of log-weights (J, N)."""
+    weights = np.exp(log_weights - log_weights.max(axis=1, keepdims=True))
+    cdf = np.cumsum(weights, axis=1)
+    return (cdf < rng.random((cdf.shape[0], 1)) * cdf[:, -1:]).sum(axis=1)
+
+
+def _summary(space: LieGroup, stamps_ns: np.ndarray, paths: np.ndarray, weights: np.ndarray) -> Smoothed:
+    means = np.array([space.mean(states, weights) for states in paths])
+    spread = space.local(means[:, None], paths)
+    return Smoothed(stamps_ns, means, np.einsum("n,tna,tnb->tab", weights, spread, spread))

@@ -1,0 +1,71 @@
+"""A run over images beside a reconstruction of the same images by COLMAP, and the reconstruction beside the truth."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, final
+
+from rbpf.errors import InputError
+from rbpf.sensors.readers.images import ImageSequence, Topics, open_images, open_stereo
+from rbpf.validation.colmap.compare import ColmapComparison, compare_with_path, compare_with_truth
+from rbpf.validation.colmap.pipeline import ReconstructionOptions
+from rbpf.validation.colmap.reconstruct import reconstruct
+from rbpf.validation.metrics.path_and_map import PathAndMap, read_config, read_path_and_map
+
+OVER_IMAGES = "mono", "stereo"
+"""Systems whose runs have images."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class AgainstColmap:
+    """A run beside COLMAP.
+
+    Attributes:
+        run: the run's path and map, as the reference that COLMAP's world is brought onto.
+        truth: the ground truth as the reference, which tells how good COLMAP itself is; None without.
+    """
+
+    run: ColmapComparison
+    truth: ColmapComparison | None
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {"run": self.run.as_dict(), "truth": None if self.truth is None else self.truth.as_dict()}
+
+
+def compare_folder_with_colmap(folder: Path, options: ReconstructionOptions | None = None) -> AgainstColmap:
+    """Reconstructs the images that a run folder's config.yaml names, and compares.
+
+    Args:
+        folder: of a run over images; its recording must still lie where it was.
+        options: of the reconstruction.
+
+    Raises:
+        InputError: the run has no images, the folder is of another version, or the reconstruction fails.
+    """
+    config = read_config(folder)
+    if config["system"] not in OVER_IMAGES:
+        raise InputError(
+            f"{folder} is a run of the system {config['system']}, which sees no images; COLMAP needs a run over images."
+        )
+    sequence = _images(config)
+    return compare_with_colmap(read_path_and_map(folder), sequence, options)
+
+
+def _images(config: Mapping[str, Any]) -> ImageSequence:
+    recording, calibration = Path(str(config["recording"])), config.get("calibration")
+    topics = Topics.parse(config.get("image_topic"), config.get("truth_topic"))
+    if config["system"] == "stereo":
+        return open_stereo(recording, calibration, topics=topics).pair
+    return open_images(recording, calibration, topics)
+
+
+def compare_with_colmap(
+    estimate: PathAndMap, sequence: ImageSequence, options: ReconstructionOptions | None = None
+) -> AgainstColmap:
+    """A run's path and map beside the reconstruction of its images, and this beside the truth; see above."""
+    found = reconstruct(sequence, options)
+    points = estimate.landmarks
+    run = compare_with_path(found, estimate.trajectory, points.mean, points.cov)
+    return AgainstColmap(run, None if sequence.truth is None else compare_with_truth(found, sequence.truth))

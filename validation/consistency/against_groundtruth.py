@@ -1,0 +1,184 @@
+"""A run against the ground truth of its recording: errors, and whether they are as large as the filter says."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from rbpf.errors import InputError
+from rbpf.lie import SE2
+from rbpf.validation.consistency.autocorrelation import degrees_of_freedom
+from rbpf.validation.consistency.comparison import Comparison
+from rbpf.validation.consistency.pose_errors import WhitenedErrors, whitened_errors
+from rbpf.validation.consistency.statistic import STATE_FACTOR, Statistic, coverage, variance_ratio
+from rbpf.validation.map_summary import MapSummary
+from rbpf.validation.metrics.accuracy import AbsoluteError, ate, rpe
+from rbpf.validation.metrics.trajectory import associate
+from rbpf.validation.run_files import FilteredPath, RunTruth, in_space
+from rbpf.validation.run_record import RunRecord
+from rbpf.validation.trajectory_files import read_tum
+
+NAME = "groundtruth"
+NEES = "poses against the truth"
+LEAST = 3
+"""Steps with a true pose that a comparison needs."""
+
+_HOW = {
+    "none": "without any alignment",
+    "rigid": "after a rigid alignment",
+    "similarity": "after an alignment with scale (the recording's own scale is arbitrary)",
+}
+
+
+@dataclass(frozen=True)
+class TruthErrors:
+    """A run beside the truth.
+
+    Attributes:
+        path: filtered poses.
+        truth: at the steps `truth.rows`.
+        positions: errors of the aligned positions.
+        whitened: errors of the poses in units of the filter's own; None where they are not told in one world.
+        landmarks: the map's points whose true places are known, with (M, D) errors; None likewise.
+    """
+
+    path: FilteredPath
+    truth: RunTruth
+    positions: AbsoluteError
+    whitened: WhitenedErrors | None
+    landmarks: "LandmarkErrors | None"
+
+
+@dataclass(frozen=True)
+class LandmarkErrors:
+    """Landmarks in units of the filter's own deviations.
+
+    Attributes:
+        map: M landmarks of the run.
+        errors: (M, D) from the truth, m.
+        squares: (M,) normalised squared errors; an honest filter's are χ² of D.
+    """
+
+    map: MapSummary
+    errors: np.ndarray
+    squares: np.ndarray
+
+
+def truth_errors(record: RunRecord, std_m: float = 0.0, std_rad: float = 0.0) -> TruthErrors:
+    """Errors of a run.
+
+    Args:
+        record: the run.
+        std_m: standard deviation of the true positions themselves, per axis.
+        std_rad: likewise of the true rotations.
+
+    Raises:
+        InputError: the run has no truth, or too little.
+    """
+    path, truth = record.path(), record.truth()
+    if truth.rows.size < LEAST:
+        raise InputError(
+            f"{record.folder}: {truth.rows.size} steps of the run have a true pose, a comparison needs {LEAST}"
+        )
+    reference = in_space(path.stamps_ns[truth.rows], truth.poses)
+    positions = ate(path.trajectory(truth.rows), reference, truth.alignment)
+    whitened = landmarks = None
+    if truth.alignment == "none":
+        turns = 1 if path.space.dim == SE2.dim else 3
+        own = np.repeat([std_rad**2, std_m**2], [turns, path.space.dim - turns])
+        cov = path.cov[truth.rows] + np.diag(own)
+        whitened = whitened_errors(path.space, path.mean[truth.rows], cov, truth.poses)
+        landmarks = _landmark_errors(record.map(), truth)
+    return TruthErrors(path, truth, positions, whitened, landmarks)
+
+
+def pose_statistics(errors: WhitenedErrors) -> list[Statistic]:
+    """NEES of the poses and coverage of their credible regions; none where all poses are held to be exact."""
+    known = errors.ranks > 0
+    if not known.any():
+        return []
+    dim = errors.errors.shape[1]
+    dof, nees = degrees_of_freedom(errors.errors[known]), errors.nees[known]
+    ratio = variance_ratio(NEES, float(nees.sum() / errors.ranks[known].sum()), dof, STATE_FACTOR)
+    full = errors.ranks[known] == dim
+    return [ratio, *(coverage(nees[full], dim, max(dof / dim, 1.0)) if full.any() else [])]
+
+
+def compare_with_truth(record: RunRecord, std_m: float = 0.0, std_rad: float = 0.0) -> Comparison:
+    """The comparison, with pictures in the run's folder; arguments and errors as `truth_errors`."""
+    from rbpf.validation.report.truth_pictures import draw_truth
+
+    errors = truth_errors(record, std_m, std_rad)
+    batch = _batch_error(record, errors)
+    accuracy = _accuracy(errors, batch)
+    figures = _figures(errors) | ({} if batch is None else {"batch_position_rmse_m": batch})
+    statistics = [] if errors.whitened is None else pose_statistics(errors.whitened)
+    return Comparison(NAME, accuracy, figures, statistics, draw_truth(record, errors))
+
+
+def _landmark_errors(found: MapSummary, truth: RunTruth) -> LandmarkErrors | None:
+    kept = np.array([name in truth.landmarks for name in found.ids.tolist()], dtype=bool)
+    if not kept.any():
+        return None
+    found = MapSummary(found.ids[kept], found.mean[kept], found.cov[kept])
+    true = np.array([truth.landmarks[name] for name in found.ids.tolist()])
+    error = true - found.mean
+    squares = np.einsum("md,mde,me->m", error, np.linalg.pinv(found.cov, hermitian=True), error)
+    return LandmarkErrors(found, error, squares)
+
+
+def _batch_error(record: RunRecord, errors: TruthErrors) -> float | None:
+    """Of the batch optimum's positions at the same steps, aligned in the same way; None without one."""
+    if not (record.folder / "batch.tum").is_file():
+        return None
+    rows, path = errors.truth.rows, errors.path
+    reference = in_space(path.stamps_ns[rows], errors.truth.poses)
+    batch, reference = associate(read_tum(record.folder / "batch.tum"), reference, 0)
+    return ate(batch, reference, errors.truth.alignment).rmse
+
+
+def _accuracy(errors: TruthErrors, batch: float | None) -> str:
+    at, total = errors.positions, len(errors.path.mean)
+    words = (
+        f"The path is {_metres(at.rmse)} (rms) from the truth, {_metres(at.max)} at worst, over {at.keys.size} of "
+        f"{total} steps {_HOW[errors.truth.alignment]}"
+    )
+    if batch is not None:
+        words += f"; the batch optimum of the same measurements is {_metres(batch)} from it"
+    return words + "."
+
+
+def _figures(errors: TruthErrors) -> dict[str, Any]:
+    path, rows = errors.path, errors.truth.rows
+    relative = rpe(
+        path.trajectory(rows),
+        in_space(path.stamps_ns[rows], errors.truth.poses),
+        alignment=errors.positions.alignment,
+    )
+    figures: dict[str, Any] = {
+        "alignment": errors.truth.alignment,
+        "steps_compared": int(rows.size),
+        "position_rmse_m": errors.positions.rmse,
+        "position_max_m": errors.positions.max,
+        "motion_translation_rmse_m": relative.translation_rmse,
+        "motion_rotation_rmse_deg": relative.rotation_rmse_deg,
+    }
+    if errors.whitened is not None:
+        nees, known = errors.whitened.nees, errors.whitened.ranks > 0
+        figures |= {
+            "pose_nees_mean": float(nees[known].mean()) if known.any() else 0.0,
+            "pose_nees_median": float(np.median(nees[known])) if known.any() else 0.0,
+            "pose_nees_right": float(errors.whitened.ranks[known].mean()) if known.any() else 0.0,
+        }
+    if errors.landmarks is not None:
+        figures |= {
+            "landmarks_compared": int(errors.landmarks.squares.size),
+            "landmark_rmse_m": float(np.sqrt(np.square(errors.landmarks.errors).sum(axis=1).mean())),
+            "landmark_nees_mean": float(errors.landmarks.squares.mean()),
+            "landmark_nees_right": float(errors.landmarks.errors.shape[1]),
+        }
+    return figures
+
+
+def _metres(value: float) -> str:
+    return f"{1e3 * value:.2g} mm" if value < 0.0995 else f"{value:.2f} m"

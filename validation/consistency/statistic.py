@@ -1,0 +1,196 @@
+"""Statistics that an honest filter keeps near a known value, and what their intervals say about it.
+
+Most of them are a ratio r of squared errors to what the filter expects of them: 1 for an honest filter, 9 where its
+standard deviations are three times too small. From ν effective degrees of freedom, the 95 % interval of r is
+
+    [r ν / χ²_ν(0.975), r ν / χ²_ν(0.025)]
+
+An interval inside the statistic's zone supports the filter, one wholly outside contradicts it, and one across the
+zone's border leaves it open: there are too few independent samples. The zone says how wrong a standard deviation may be
+before it matters, the interval whether that can be told; no threshold depends on a run.
+"""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from rbpf.validation.consistency.autocorrelation import correlation_time
+
+LEVEL = 0.95
+"""Of all intervals."""
+
+STATE_FACTOR = 2.0
+"""The standard deviations of poses and landmarks may be wrong by this: they rest on few independent samples."""
+
+NOISE_FACTOR = 1.1
+"""Those of measurements and motions: they rest on thousands, and an error in them is repeated in every step."""
+
+BIAS = 0.25
+"""A motion's bias per step may have this many of its standard deviations: over 16 steps it adds up to as much as the
+noise does."""
+
+INFORMED = 0.05
+"""A direction of the motion that the observations inform by less than this fraction is left out."""
+
+PROBABILITIES = 0.5, 0.9, 0.95
+"""Of credible regions."""
+
+Outcome = Literal["supports", "contradicts", "leaves open"]
+
+
+@dataclass(frozen=True)
+class Statistic:
+    """One number about a filter's honesty.
+
+    Attributes:
+        name: what it is, in few words.
+        value: of this run.
+        low: end of its 95 % interval;  high: the other.
+        zone: where it may lie.
+        samples: effective degrees of freedom or number of independent samples behind it.
+        kind: a ratio of variances, a bias in standard deviations, or a fraction of cases.
+    """
+
+    name: str
+    value: float
+    low: float
+    high: float
+    zone: tuple[float, float]
+    samples: float
+    kind: Literal["ratio", "bias", "share"] = "ratio"
+
+    @property
+    def outcome(self) -> Outcome:
+        """What it says about the filter."""
+        if self.low > self.zone[1] or self.high < self.zone[0]:
+            return "contradicts"
+        return "supports" if self.zone[0] <= self.low and self.high <= self.zone[1] else "leaves open"
+
+    def entries(self) -> dict[str, Any]:
+        """For JSON; bounds that are infinite are null."""
+        values = asdict(self) | {"zone": list(self.zone), "outcome": self.outcome}
+        return {name: _finite(value) for name, value in values.items()}
+
+    @classmethod
+    def of_entries(cls, entries: dict[str, Any]) -> "Statistic":
+        """The inverse of `entries`."""
+        low, high = entries["zone"]
+        zone = (-np.inf if low is None else low, np.inf if high is None else high)
+        top = np.inf if entries["high"] is None else entries["high"]
+        names = ("name", "value", "low", "samples", "kind")
+        return cls(**{name: entries[name] for name in names}, high=top, zone=zone)
+
+
+def variance_ratio(name: str, value: float, dof: float, factor: float) -> Statistic:
+    """A ratio of squared errors to what was expected of them.
+
+    Args:
+        name: of the statistic.
+        value: r.
+        dof: ν, effective degrees of freedom.
+        factor: standard deviations may be wrong by this, either way.
+    """
+    from scipy.stats import chi2
+
+    tail = 0.5 * (1.0 - LEVEL)
+    low, high = (value * dof / bound for bound in chi2.ppf([1.0 - tail, tail], dof))
+    return Statistic(name, value, float(low), float(high), (factor**-2, factor**2), dof)
+
+
+def step_ratio(
+    name: str, squares: np.ndarray, dofs: np.ndarray, factor: float = NOISE_FACTOR
+) -> Statistic | None:
+    """Ratio of squared errors (T,), each χ² of `dofs` (T,) for an honest filter and independent from step to step.
+
+    Where the steps are correlated, or scatter more than χ² does, they count for less. None without any.
+    """
+    used = np.isfinite(squares) & (dofs > 0)
+    squares, dofs = squares[used], dofs[used]
+    if not squares.size:
+        return None
+    total = float(dofs.sum())
+    value = float(squares.sum()) / total
+    standard = (squares - value * dofs) / np.sqrt(2.0 * dofs)
+    excess = float(standard.var()) / value**2 if value > 0.0 else 1.0
+    dof = total / (correlation_time(standard) * max(excess, 1.0))
+    return variance_ratio(name, value, max(dof, 1.0), factor)
+
+
+def motion_statistics(correction: np.ndarray, cov: np.ndarray) -> list[Statistic]:
+    """Size and bias of what the observations say about the motion; see `rbpf.core.diagnostics.Correction`.
+
+    Args:
+        correction: (T, r) in the motion's whitened coordinates; rows of NaN are left out.
+        cov: (T, r, r) what an honest filter expects of it.
+    """
+    known = np.isfinite(correction).all(axis=1)
+    correction, cov = correction[known], cov[known]
+    values, vectors = np.linalg.eigh(cov)
+    informed = values > INFORMED
+    turned = np.einsum("tab,ta->tb", vectors, correction)
+    squares = np.where(informed, np.square(turned) / np.where(informed, values, 1.0), 0.0).sum(axis=1)
+    size = step_ratio("motion against measurements", squares, informed.sum(axis=1).astype(float))
+    if size is None:
+        return []
+    bias = _bias(correction, cov, max(size.value, 1.0))
+    return [size, *([] if bias is None else [bias])]
+
+
+def _bias(correction: np.ndarray, cov: np.ndarray, excess: float) -> Statistic | None:
+    """The constant b that explains the corrections best, û = cov b: its clearest component that is informed."""
+    from scipy.stats import norm
+
+    total = cov.sum(axis=0)
+    values, vectors = np.linalg.eigh(total)
+    informed = values > 1.0
+    if not informed.any():
+        return None
+    along = (vectors.T @ correction.sum(axis=0))[informed] / values[informed]
+    std = np.sqrt(excess / values[informed])
+    margin = float(norm.ppf(0.5 + 0.5 * LEVEL ** (1.0 / along.size)))  # all components together
+    lows = np.maximum(np.abs(along) - margin * std, 0.0)
+    worst = int(np.argmax(lows)) if lows.any() else int(np.argmax(np.abs(along) + margin * std))
+    size = float(np.abs(along[worst]))
+    top = float((np.abs(along) + margin * std).max())
+    return Statistic(
+        "bias of the motion", size, float(lows[worst]), top, (-np.inf, BIAS), len(correction), "bias"
+    )
+
+
+def coverage(
+    nees: np.ndarray, dim: int, samples: float, probabilities: Sequence[float] = PROBABILITIES
+) -> list[Statistic]:
+    """How often the truth lies in the credible region of a probability, for each of some.
+
+    Args:
+        nees: (T,) normalised squared errors.
+        dim: degrees of freedom of one.
+        samples: how many independent ones they are worth.
+        probabilities: of the regions.
+    """
+    from scipy.stats import beta, chi2
+
+    out, tail = [], 0.5 * (1.0 - LEVEL)
+    for probability in probabilities:
+        bound = float(chi2.ppf(probability, dim))
+        fraction = float((nees <= bound).mean())
+        # Clopper and Pearson's interval, for a number of samples that need not be whole
+        hits = fraction * samples
+        low = float(beta.ppf(tail, hits, samples - hits + 1.0)) if hits > 0.0 else 0.0
+        high = float(beta.ppf(1.0 - tail, hits + 1.0, samples - hits)) if hits < samples else 1.0
+        zone = (float(chi2.cdf(bound / STATE_FACTOR**2, dim)), float(chi2.cdf(bound * STATE_FACTOR**2, dim)))
+        name = f"poses inside the {100 * probability:g} % region"
+        out.append(
+            Statistic(
+                name, fraction, low, high, (zone[0], zone[1] if zone[1] < 0.999 else 1.0), samples, "share"
+            )
+        )
+    return out
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value

@@ -1,0 +1,239 @@
+"""The batch problem of any run: its measurements, from memory or from its folder; the optimum; how likely they are.
+
+Range-bearing measurements are those of `rbpf.validation.gtsam.measurements`, a camera's are a `FeatureLog`.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import count
+from pathlib import Path
+from typing import final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rbpf.errors import InputError
+from rbpf.lie import Array
+from rbpf.sensors.features import FeatureLog
+from rbpf.sensors.pinhole import RectifiedStereo
+from rbpf.systems.mono.run import MonoRun
+from rbpf.systems.range_bearing.run import Run
+from rbpf.systems.stereo.run import StereoRun
+from rbpf.validation.camera_files import CAMERAS, read_features
+from rbpf.validation.gtsam import camera, robot
+from rbpf.validation.gtsam.camera_data import CameraEstimate, sightings_of
+from rbpf.validation.gtsam.camera_factors import evaluate_sightings
+from rbpf.validation.gtsam.divergence import mahalanobis
+from rbpf.validation.gtsam.measurements import Measurements
+from rbpf.validation.gtsam.mono_batch import connected_frames
+from rbpf.validation.map_summary import MapSummary
+from rbpf.validation.measurement_files import OBSERVATIONS, read_measurements
+from rbpf.validation.metrics.path_and_map import AnyRun, PathAndMap
+from rbpf.validation.mono_log import feature_log
+from rbpf.validation.run_folder import used_measurements
+
+Problem = Measurements | FeatureLog
+
+STEREO_TOLERANCE = 1e-6
+"""Of a pair's batch: far landmarks creep; ten times as exact moves a path of 60 m by less than a millimetre."""
+
+AFAR = 300
+"""Steps from which on a robot's batch is begun incrementally."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Optimum:
+    """The batch optimum of a problem.
+
+    Attributes:
+        problem: what was solved: the part that hangs together.
+        estimate: path and map with marginal covariances; only landmarks that the measurements determine.
+        steps: (B,) steps of the run that took part, one per pose.
+        error: half the sum of squared whitened residuals, or the sum of their robust losses.
+    """
+
+    problem: Problem
+    estimate: PathAndMap
+    steps: NDArray[np.intp]
+    error: float
+
+
+@final
+@dataclass(frozen=True)
+class Fit:
+    """How well a path and a map explain sightings.
+
+    Attributes:
+        log_likelihood: Σ log N(z − h(x̂, m̂); 0, R) [nats].
+        rms_sigmas: root of the mean square whitened residual per measured number.
+        sightings: how many took part.
+    """
+
+    log_likelihood: float
+    rms_sigmas: float
+    sightings: int
+
+
+def problem_of(run: AnyRun) -> Problem:
+    """The measurements that a run in memory used."""
+    if isinstance(run, Run):
+        return used_measurements(run)
+    if isinstance(run, MonoRun):
+        return run.log
+    if isinstance(run, StereoRun):
+        return run.front_end.log(run.name, run.stamps_ns, run.truth)
+    return feature_log(run)
+
+
+def read_problem(folder: Path) -> Problem:
+    """The measurements that a run left in its folder.
+
+    Raises:
+        InputError: there are none, or a file is malformed.
+    """
+    path = folder / OBSERVATIONS
+    if not path.exists():
+        raise InputError(
+            f"{folder} holds no {OBSERVATIONS}: expected the folder of a finished run of this version."
+        )
+    with path.open(encoding="utf-8", errors="replace") as file:
+        head = [line for line, _ in zip(file, range(20), strict=False) if line.startswith("#")]
+    kinds = [line.split(":")[1].strip() for line in head if line.startswith("# measurement:")]
+    return read_features(folder) if kinds and kinds[0] in CAMERAS else read_measurements(folder)
+
+
+def name_of(problem: Problem) -> str:
+    """Of the recording."""
+    return problem.name if isinstance(problem, FeatureLog) else problem.recording
+
+
+def stamps_of(problem: Problem) -> NDArray[np.int64]:
+    """(T,) times of the steps."""
+    if isinstance(problem, FeatureLog):
+        return np.array([frame.stamp_ns for frame in problem.frames], dtype=np.int64)
+    return problem.stamps_ns
+
+
+def floats_in_scale(problem: Problem) -> bool:
+    """Whether nothing in the measurements tells the scale: one camera and no known points."""
+    return (
+        isinstance(problem, FeatureLog)
+        and problem.known is None
+        and not isinstance(problem.camera, RectifiedStereo)
+    )
+
+
+def first_steps(problem: Problem, count: int) -> Problem:
+    """What had been measured after so many steps."""
+    if isinstance(problem, FeatureLog):
+        return replace(problem, frames=problem.frames[:count])
+    rows = problem.steps < count
+    return replace(
+        problem,
+        stamps_ns=problem.stamps_ns[:count],
+        deltas=problem.deltas[: count - 1],
+        covs=problem.covs[: count - 1],
+        **{name: getattr(problem, name)[rows] for name in ("steps", "landmarks", "z", "cov_z")},
+    )
+
+
+def solve_problem(
+    problem: Problem,
+    start: Array,
+    robust: float | None = None,
+    marginals: bool = True,
+    most_iterations: int | None = None,
+) -> Optimum:
+    """GTSAM's optimum.
+
+    Args:
+        problem: T steps.
+        start: (T, E) poses of the filter, where a camera's adjustment begins; a robot's begins with its odometry.
+        robust: Huber's threshold in standard deviations; None takes all as Gaussian, as the filter does.
+        marginals: compute covariances; without them the optimum has no poses' and NaN as landmarks'.
+        most_iterations: of a camera's adjustment, after which it is given up; None goes on as long as there is a gain.
+
+    Raises:
+        InputError: the measurements do not determine everything, or the optimiser does not converge.
+    """
+    if isinstance(problem, FeatureLog):
+        return _solve_camera(problem, start, robust, marginals, most_iterations)
+    found = robot.solve(problem, robust, marginals, incremental=len(problem.stamps_ns) > AFAR)
+    return robot_optimum(problem, found)
+
+
+def robot_optimum(problem: Measurements, found: robot.BatchSolution) -> Optimum:
+    """A robot's batch solution in the form that runs of all systems share."""
+    points = _summary(list(found.landmarks), found.landmarks, found.cov_landmarks, problem.z.shape[1])
+    estimate = PathAndMap(problem.stamps_ns, found.world_from_robot, found.cov_poses, points)
+    return Optimum(problem, estimate, np.arange(len(problem.stamps_ns)), found.error)
+
+
+def fit_of(problem: Problem, estimate: PathAndMap, names: NDArray[np.int64]) -> Fit:
+    """How likely the sightings of the named landmarks are, of the estimate's own poses and landmarks.
+
+    Args:
+        problem: T steps.
+        estimate: T poses, and the named landmarks among its own.
+        names: (L,) of the landmarks that count.
+    """
+    places = estimate.landmarks.named()
+    if isinstance(problem, FeatureLog):
+        table = sightings_of(problem)
+        table = table.rows(np.isin(table.names, names)[table.index])
+        points = np.array([places[name] for name in table.names.tolist()]).reshape(-1, 3)
+        residuals, cov = evaluate_sightings(table, estimate.world_from_body, points)[0], table.cov_z
+    else:
+        rows, model = np.flatnonzero(np.isin(problem.landmarks, names)), problem.model()
+        size = problem.z.shape[1]
+        points = np.array([places[name] for name in problem.landmarks[rows].tolist()]).reshape(-1, size)
+        predicted = model.predict(estimate.world_from_body[problem.steps[rows]], points)
+        residuals, cov = model.residual(problem.z[rows], predicted), problem.cov_z[rows]
+    square = np.square(mahalanobis(residuals, cov))
+    log_norm = np.linalg.slogdet(2.0 * np.pi * cov)[1]
+    rms = float(np.sqrt(square.sum() / max(residuals.size, 1)))
+    return Fit(float(-0.5 * (square + log_norm).sum()), rms, len(residuals))
+
+
+def _solve_camera(
+    log: FeatureLog, start: Array, robust: float | None, marginals: bool, most: int | None
+) -> Optimum:
+    steps = connected_frames(log)
+    if len(steps) < 2:
+        raise InputError(f"{log.name}: no two frames share enough landmarks for a batch adjustment.")
+    part = replace(log, frames=[log.frames[step] for step in steps.tolist()])
+    begin = CameraEstimate(start[steps], {})
+    tolerance = STEREO_TOLERANCE if isinstance(log.camera, RectifiedStereo) else None
+    found = camera.solve_features(
+        part,
+        begin,
+        robust=robust,
+        marginals=marginals,
+        tolerance=tolerance,
+        on_iteration=None if most is None else _counted(log.name, most),
+    )
+    names = sorted(found.landmarks.keys() - set(found.undetermined))
+    points = _summary(names, found.landmarks, found.cov_landmarks, 3)
+    estimate = PathAndMap(stamps_of(part), found.world_from_camera, found.cov_poses, points)
+    return Optimum(part, estimate, steps, found.error)
+
+
+def _counted(name: str, most: int) -> Callable[[float], None]:
+    """Gives an adjustment up after so many iterations."""
+    counter = count(1)
+
+    def watch(_error: float) -> None:
+        if next(counter) > most:
+            raise InputError(f"The batch adjustment of {name} did not converge in {most} iterations.")
+
+    return watch
+
+
+def _summary(names: list[int], means: dict[int, Array], covs: dict[int, Array], dim: int) -> MapSummary:
+    unknown = np.full((dim, dim), np.nan)
+    return MapSummary(
+        np.array(names, dtype=np.int64),
+        np.array([means[name] for name in names]).reshape(-1, dim),
+        np.array([covs.get(name, unknown) for name in names]).reshape(-1, dim, dim),
+    )

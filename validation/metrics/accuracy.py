@@ -1,0 +1,200 @@
+"""How far an estimate is from the truth: absolute and relative error of trajectories, error of landmarks.
+
+The definitions are those of J. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS
+2012.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rbpf.errors import InputError
+from rbpf.lie import SE3, Array
+from rbpf.validation.metrics.alignment import Alignment, Similarity, fit
+from rbpf.validation.metrics.trajectory import Trajectory
+
+Unit = Literal["frames", "metres"]
+
+
+@final
+@dataclass(frozen=True)
+class AbsoluteError:
+    """Distances between estimated and true positions.
+
+    Attributes:
+        keys: (N,) the reference stamp of each pose, or the name of each landmark.
+        distances: (N,) [m].
+        alignment: what was applied to the estimate first.
+    """
+
+    keys: NDArray[np.int64]
+    distances: Array
+    alignment: Similarity
+
+    @property
+    def rmse(self) -> float:
+        """Root of the mean square distance [m]."""
+        return _rms(self.distances)
+
+    @property
+    def mean(self) -> float:
+        """Mean distance [m]."""
+        return float(self.distances.mean())
+
+    @property
+    def median(self) -> float:
+        """Median distance [m]."""
+        return float(np.median(self.distances))
+
+    @property
+    def max(self) -> float:
+        """Largest distance [m]."""
+        return float(self.distances.max())
+
+
+@final
+@dataclass(frozen=True)
+class RelativeError:
+    """Differences between estimated and true motions over pairs of poses.
+
+    Attributes:
+        pairs: (P, 2) rows of the first and second pose of each pair.
+        translations: (P,) [m].
+        rotations_deg: (P,) angles in [0, 180].
+    """
+
+    pairs: NDArray[np.intp]
+    translations: Array
+    rotations_deg: Array
+
+    def __len__(self) -> int:
+        return len(self.pairs)
+
+    @property
+    def translation_rmse(self) -> float:
+        """Root of the mean square translation [m]."""
+        return _rms(self.translations)
+
+    @property
+    def rotation_rmse_deg(self) -> float:
+        """Root of the mean square angle [deg]."""
+        return _rms(self.rotations_deg)
+
+
+def ate(
+    estimate: Trajectory, reference: Trajectory, alignment: Alignment | Similarity = "none"
+) -> AbsoluteError:
+    """Absolute trajectory error, the distance of each position from the true one.
+
+    Args:
+        estimate: T poses.
+        reference: the T poses that belong to them (`associate` pairs by time; recordings without times pair
+            by row as they are).
+        alignment: fitted to all T positions before, or a similarity to apply.
+
+    Raises:
+        InputError: the lengths differ or are 0, or the alignment is unknown.
+    """
+    _require_pairs(estimate, reference)
+    applied = fit(alignment, estimate.positions, reference.positions)
+    distances = _norm(applied.transform(estimate.positions) - reference.positions)
+    return AbsoluteError(reference.stamps_ns, distances, applied)
+
+
+def rpe(
+    estimate: Trajectory,
+    reference: Trajectory,
+    delta: float = 1,
+    unit: Unit = "frames",
+    alignment: Alignment | Similarity = "none",
+) -> RelativeError:
+    """Relative pose error, the difference of the motions between consecutive poses `delta` apart.
+
+    The first pair starts at the first pose and each further pair where the one before ends.
+
+    Args:
+        estimate: T poses.
+        reference: the T poses that belong to them.
+        delta: length of a pair, a whole number of frames or metres along the estimated path once aligned.
+        unit: of `delta`.
+        alignment: as for `ate`; a rigid one changes nothing, a similarity the scale.
+
+    Raises:
+        InputError: the lengths differ or are 0, `delta` or `unit` is not as expected, or the trajectory is
+            shorter than one pair.
+    """
+    _require_pairs(estimate, reference)
+    moved = estimate.transformed(fit(alignment, estimate.positions, reference.positions))
+    ends = _pair_ends(moved.positions, delta, unit)
+    if len(ends) < 2:
+        raise InputError(f"Expected a trajectory longer than {delta:g} {unit}; choose a shorter delta.")
+    first, second = ends[:-1], ends[1:]
+    error = SE3.between(_motion(reference, first, second), _motion(moved, first, second))
+    angles = _norm(SE3.log(error)[:, :3])
+    return RelativeError(np.stack([first, second], axis=1), _norm(SE3.translation(error)), np.degrees(angles))
+
+
+def landmark_errors(
+    estimate: Mapping[int, Array], truth: Mapping[int, Array], alignment: Alignment | Similarity = "none"
+) -> AbsoluteError:
+    """Distances of the landmarks that both maps have, ordered by name.
+
+    Args:
+        estimate: name of a landmark to its (D,) position, D = 2 or 3 [m].
+        truth: the same for the true map.
+        alignment: fitted to the common landmarks before, or a similarity to apply (a trajectory's, say).
+
+    Raises:
+        InputError: no landmark is in both maps, or the alignment is unknown.
+    """
+    names = sorted(estimate.keys() & truth.keys())
+    if not names:
+        raise InputError(
+            f"None of the {len(estimate)} estimated landmarks is among the {len(truth)} true ones."
+        )
+    found, true = (np.array([points[name] for name in names], dtype=float) for points in (estimate, truth))
+    applied = fit(alignment, found, true)
+    return AbsoluteError(np.array(names), _norm(applied.transform(found) - true), applied)
+
+
+def _require_pairs(estimate: Trajectory, reference: Trajectory) -> None:
+    if len(estimate) != len(reference) or not len(estimate):
+        counts = f"{len(estimate)} and {len(reference)}"
+        raise InputError(
+            f"Expected as many estimated as true poses, found {counts}; pair them with associate."
+        )
+
+
+def _pair_ends(positions: Array, delta: float, unit: Unit) -> NDArray[np.intp]:
+    if unit not in ("frames", "metres"):
+        raise InputError(f"Expected the unit frames or metres, found {unit!r}.")
+    if unit == "metres":
+        return _ends_by_path(positions, delta)
+    if delta < 1 or delta != int(delta):
+        raise InputError(f"Expected delta to be a whole number of frames, at least 1, found {delta:g}.")
+    return np.arange(0, len(positions), int(delta))
+
+
+def _ends_by_path(positions: Array, delta: float) -> NDArray[np.intp]:
+    if not delta > 0.0:
+        raise InputError(f"Expected delta to be a positive number of metres, found {delta:g}.")
+    path = np.concatenate([[0.0], np.cumsum(_norm(np.diff(positions, axis=0)))])
+    ends = [0]
+    while (end := int(np.searchsorted(path, path[ends[-1]] + delta))) < len(path):
+        ends.append(end)
+    return np.array(ends)
+
+
+def _motion(trajectory: Trajectory, first: NDArray[np.intp], second: NDArray[np.intp]) -> Array:
+    return SE3.between(trajectory.world_from_body[first], trajectory.world_from_body[second])
+
+
+def _norm(vectors: Array) -> Array:
+    return np.sqrt(np.square(vectors).sum(-1))
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.square(values).mean()))

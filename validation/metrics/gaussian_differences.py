@@ -1,0 +1,171 @@
+"""Landmarks and poses of two estimates as Gaussians in one frame, chart and gauge, and how far they are apart."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rbpf.errors import InputError
+from rbpf.lie import SE3, Array
+from rbpf.validation.gtsam.divergence import bhattacharyya, kullback_leibler, mahalanobis, sigma_ratio
+from rbpf.validation.map_summary import MapSummary
+from rbpf.validation.metrics.path_and_map import PathAndMap
+
+COLUMNS = ("distances_m", "sigmas", "kullback_leibler", "bhattacharyya", "sigma_ratio")
+"""What is told of each pair of Gaussians."""
+
+_TINY = 1e-9
+"""A length, as a fraction of the path's, that is none; a variance, as a fraction of the largest, that is none."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Differences:
+    """Gaussians of the filter beside those of the optimum, K of them.
+
+    Attributes:
+        keys: (K,) names of landmarks, or steps of poses.
+        distances_m: (K,) between the means.
+        sigmas: (K,) between the means in the filter's standard deviations, √(δᵀ P_f⁻¹ δ).
+        kullback_leibler: (K,) KL(optimum ‖ filter) [nats]: what believing the filter instead of the optimum costs.
+        bhattacharyya: (K,) the symmetric distance.
+        sigma_ratio: (K,) the filter's mean standard deviation over the optimum's; below 1 is over-confident.
+        dims: of the Gaussians.
+    """
+
+    keys: NDArray[np.int64]
+    distances_m: Array
+    sigmas: Array
+    kullback_leibler: Array
+    bhattacharyya: Array
+    sigma_ratio: Array
+    dims: int
+
+    def __len__(self) -> int:
+        return len(self.keys)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Medians and 90 % quantiles for JSON, and every row."""
+        figures: dict[str, Any] = {"count": len(self), "dims": self.dims}
+        for name in COLUMNS:
+            values = getattr(self, name)
+            if len(self):
+                figures[f"{name}_median"] = float(np.median(values))
+                figures[f"{name}_p90"] = float(np.quantile(values, 0.9))
+        return (
+            figures | {"keys": self.keys.tolist()} | {name: getattr(self, name).tolist() for name in COLUMNS}
+        )
+
+
+def figures_of(name: str, differences: Differences) -> dict[str, Any]:
+    """Single numbers for a report's page, under names that begin with a word."""
+    rows = differences.as_dict().items()
+    return {f"{name}_{key}": value for key, value in rows if not isinstance(value, list)}
+
+
+def compare_maps(ours: PathAndMap, other: PathAndMap, across: bool) -> Differences:
+    """The landmarks that both estimates have; those that one of them holds exactly are left out.
+
+    Args:
+        ours: the filter's.
+        other: the optimum's, of the same world.
+        across: compare across the line from the first camera only, where the scale is not measured.
+    """
+    shared, rows, others = np.intersect1d(ours.landmarks.ids, other.landmarks.ids, return_indices=True)
+    delta = ours.landmarks.mean[rows] - other.landmarks.mean[others]
+    covs = ours.landmarks.cov[rows], other.landmarks.cov[others]
+    moved = other.landmarks.mean[others] - other.world_from_body[0, 4:] if across else None
+    return _differences(shared, np.linalg.norm(delta, axis=1), delta, covs, moved)
+
+
+def compare_last_pose(ours: PathAndMap, other: PathAndMap, step: int, across: bool) -> Differences:
+    """The last poses of two estimates, in the chart at the other's; see `compare_maps`."""
+    space, mine, theirs = ours.space, ours.world_from_body[-1], other.world_from_body[-1]
+    delta = space.local(theirs, mine)
+    carry = space.right_jacobian_inverse(delta)
+    covs = (carry @ ours.cov_poses[-1] @ carry.T)[None], other.cov_poses[-1][None]
+    distances = np.linalg.norm(ours.trajectory.positions[-1:] - other.trajectory.positions[-1:], axis=1)
+    moved = None
+    if across:
+        away = SE3.translation(theirs) - SE3.translation(other.world_from_body[0])
+        moved = np.concatenate([np.zeros(3), SE3.rotation(theirs).T @ away])[None]
+    return _differences(np.array([step]), distances, delta[None], covs, moved)
+
+
+def joined(parts: Sequence[Differences], dims: int) -> Differences:
+    """Rows of several, one after the other."""
+    if not parts:
+        return no_differences(dims)
+    rows = {name: np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS}
+    return Differences(np.concatenate([part.keys for part in parts]), **rows, dims=parts[0].dims)
+
+
+def no_differences(dims: int) -> Differences:
+    """None at all."""
+    none = np.zeros(0)
+    return Differences(np.zeros(0, dtype=np.int64), none, none, none, none, none, dims)
+
+
+def scale_onto(ours: PathAndMap, other: PathAndMap, name: str) -> float:
+    """The factor that brings our positions, taken from the first one, closest to the other's.
+
+    Raises:
+        InputError: our path does not move, so that it has no scale.
+    """
+    mine, theirs = (one.trajectory.positions - one.trajectory.positions[0] for one in (ours, other))
+    square = float(np.square(mine).sum())
+    if square <= _TINY**2:
+        raise InputError(
+            f"The gauge of {name} is not observable: the camera of the run stays where it began."
+        )
+    return float((mine * theirs).sum() / square)
+
+
+def rescaled(estimate: PathAndMap, scale: float) -> PathAndMap:
+    """Path and map, multiplied about the first pose of SE(3)."""
+    if scale == 1.0:
+        return estimate
+    origin, landmarks = estimate.world_from_body[0, 4:], estimate.landmarks
+    poses = estimate.world_from_body.copy()
+    poses[:, 4:] = origin + scale * (poses[:, 4:] - origin)
+    by = np.repeat([1.0, scale], 3)
+    mean = origin + scale * (landmarks.mean - origin)
+    return replace(
+        estimate,
+        world_from_body=poses,
+        cov_poses=estimate.cov_poses * np.outer(by, by),
+        landmarks=MapSummary(landmarks.ids, mean, scale**2 * landmarks.cov),
+    )
+
+
+def _differences(
+    keys: NDArray[np.int64], distances: Array, delta: Array, covs: tuple[Array, Array], moved: Array | None
+) -> Differences:
+    if moved is not None:
+        basis = _across(moved)
+        delta = np.einsum("kni,kn->ki", basis, delta)
+        covs = covs[0] @ basis, covs[1] @ basis
+        covs = basis.mT @ covs[0], basis.mT @ covs[1]
+    kept = _regular(covs[0]) & _regular(covs[1])
+    delta, ours, theirs = delta[kept], covs[0][kept], covs[1][kept]
+    return Differences(
+        keys=keys[kept],
+        distances_m=distances[kept],
+        sigmas=mahalanobis(delta, ours),
+        kullback_leibler=kullback_leibler(-delta, theirs, ours),
+        bhattacharyya=bhattacharyya(delta, ours, theirs),
+        sigma_ratio=sigma_ratio(ours, theirs),
+        dims=delta.shape[-1],
+    )
+
+
+def _across(moved: Array) -> Array:
+    """Orthonormal bases (K, n, n-1) of what is perpendicular to vectors (K, n)."""
+    return np.linalg.svd(moved[:, None, :])[2][:, 1:].mT
+
+
+def _regular(cov: Array) -> NDArray[np.bool_]:
+    values = np.linalg.eigvalsh(cov)
+    return np.asarray(values[:, 0] > _TINY**2 * np.maximum(values[:, -1], np.finfo(float).tiny))

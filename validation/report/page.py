@@ -1,0 +1,178 @@
+"""One page per run, from the files in its folder: verdict, comparisons with their pictures, the run's own figures.
+
+A video stays a file beside the page.
+"""
+
+import base64
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from rbpf.errors import InputError
+from rbpf.validation.consistency.comparison import Comparison, read_comparisons
+from rbpf.validation.consistency.noise_advice import noise_advice
+from rbpf.validation.consistency.own_statistics import compare_with_itself
+from rbpf.validation.consistency.statistic import Statistic
+from rbpf.validation.consistency.verdict import Verdict, judge
+from rbpf.validation.files import write_text
+from rbpf.validation.report.comparison_figures import timings_figure
+from rbpf.validation.report.figures import save_figures
+from rbpf.validation.run_record import RunRecord, open_run
+
+PAGE = "report.html"
+VIDEO = "annotated.mp4"
+TIMINGS = "timings.png"
+
+_NO_ACCURACY = "How far the path is from the right one is not known: the run was compared with nothing."
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of the page."""
+
+    title: str
+    accuracy: str = ""
+    statistics: list[dict[str, str]] = field(default_factory=list)
+    entries: list[tuple[str, str]] = field(default_factory=list)
+    images: list[tuple[str, str]] = field(default_factory=list)
+
+
+def write_report(folder: Path, problems: list[str] | None = None) -> Verdict:
+    """Builds `report.html` of a run from the files in its folder.
+
+    Args:
+        folder: of the run.
+        problems: what else has to be said, one sentence each.
+
+    Returns:
+        The verdict that stands on top.
+
+    Raises:
+        InputError: the folder is not that of a run.
+    """
+    record, problems = open_run(folder), list(problems or ())
+    comparisons = _comparisons(record, problems)
+    verdict = replace(verdict_of(comparisons, _beside_own_batch(record)), advice=_advice(record, comparisons))
+    _draw_timings(record, problems)
+    drawn = {name for comparison in comparisons for name in comparison.pictures}
+    own = [path.name for path in sorted(folder.glob("*.png")) if path.name not in drawn]
+    sections = [_section(folder, comparison) for comparison in comparisons]
+    sections.append(Section("The run", entries=_flat(record.summary), images=_images(folder, own)))
+    video = VIDEO if (folder / VIDEO).is_file() else None
+    page = _template().render(
+        title=record.name, verdict=verdict, problems=problems, sections=sections, video=video
+    )
+    write_text(folder / PAGE, page)
+    return verdict
+
+
+def verdict_of(comparisons: list[Comparison], otherwise: str = _NO_ACCURACY) -> Verdict:
+    """The verdict from all comparisons of a run, its own statistics among them.
+
+    Args:
+        comparisons: of the run.
+        otherwise: how good the run is, where none of them says it.
+    """
+    others = [comparison for comparison in comparisons if comparison.accuracy]
+    accuracy = " ".join(comparison.accuracy for comparison in others[:1]) or otherwise
+    independent = [statistic.name for comparison in others for statistic in comparison.statistics]
+    return judge(accuracy, [s for comparison in comparisons for s in comparison.statistics], independent)
+
+
+def _beside_own_batch(record: RunRecord) -> str:
+    """How good a run is that was compared with nothing, from the batch optimum that it found itself."""
+    apart = record.summary.get("filter_minus_batch_rmse_m")
+    if not isinstance(apart, float):
+        return _NO_ACCURACY
+    return (
+        f"How far the path is from the truth is not known; it is {1e3 * apart:.3g} mm (rms) from the batch optimum of "
+        "the same measurements."
+    )
+
+
+def _advice(record: RunRecord, comparisons: list[Comparison]) -> str:
+    return noise_advice(record, [s for comparison in comparisons for s in comparison.statistics])
+
+
+def _comparisons(record: RunRecord, problems: list[str]) -> list[Comparison]:
+    """Those in the folder, the truth's first, and the run's own statistics."""
+    found: list[Comparison] = []
+    try:
+        found = sorted(read_comparisons(record.folder), key=lambda c: (c.against != "groundtruth", c.against))
+    except InputError as error:
+        problems.append(f"{error}.")
+    try:
+        found.append(compare_with_itself(record))
+    except InputError as error:
+        problems.append(f"{error}.")
+    return found
+
+
+def _section(folder: Path, comparison: Comparison) -> Section:
+    titles = {"groundtruth": "Against the ground truth", "itself": "Innovations"}
+    return Section(
+        titles.get(comparison.against, f"Against {comparison.against}"),
+        comparison.accuracy,
+        [_row(statistic) for statistic in comparison.statistics],
+        [] if comparison.against == "itself" else _flat(comparison.figures),
+        _images(folder, comparison.pictures),
+    )
+
+
+def _row(statistic: Statistic) -> dict[str, str]:
+    unit = 100.0 if statistic.kind == "share" else 1.0
+    sign = " %" if statistic.kind == "share" else ""
+
+    def shown(value: float) -> str:
+        return f"{unit * value:.3g}{sign}"
+
+    low, high = statistic.zone
+    zone = f"up to {shown(high)}" if low < -1e9 else f"{shown(low)} to {shown(high)}"
+    return {
+        "name": statistic.name,
+        "value": shown(statistic.value),
+        "interval": f"{shown(statistic.low)} to {shown(statistic.high)}",
+        "zone": zone,
+        "samples": f"{statistic.samples:.0f}",
+        "outcome": statistic.outcome,
+    }
+
+
+def _draw_timings(record: RunRecord, problems: list[str]) -> None:
+    """Times per step, where the run has not drawn them itself."""
+    if (record.folder / TIMINGS).is_file():
+        return
+    try:
+        table = record.table("timings.csv")
+    except InputError as error:
+        problems.append(f"{error}.")
+        return
+    if "milliseconds" in table:
+        title = f"{record.name}: time per step"
+        save_figures({TIMINGS: timings_figure(title, {"filter": table["milliseconds"]})}, record.folder)
+
+
+def _images(folder: Path, names: list[str]) -> list[tuple[str, str]]:
+    there = [name for name in names if (folder / name).is_file()]
+    return [(Path(name).stem, base64.b64encode((folder / name).read_bytes()).decode()) for name in there]
+
+
+def _template() -> Any:
+    from jinja2 import Environment, PackageLoader, select_autoescape
+
+    loader = PackageLoader("rbpf.validation.report", "templates")
+    return Environment(loader=loader, autoescape=select_autoescape()).get_template(PAGE)
+
+
+def _flat(entries: dict[str, Any]) -> list[tuple[str, str]]:
+    rows: list[tuple[str, str]] = []
+    for name, value in entries.items():
+        if isinstance(value, dict):
+            rows.extend((f"{name}.{inner}", _shown(item)) for inner, item in value.items())
+        else:
+            rows.append((name, _shown(value)))
+    return rows
+
+
+def _shown(value: Any) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

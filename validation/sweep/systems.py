@@ -1,0 +1,118 @@
+"""What a sweep can run: by the system's name, how a sequence is opened and a single run becomes a row of figures.
+
+A new system is one function from a sequence and settings to figures, entered into `SYSTEMS`.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rbpf.errors import InputError
+from rbpf.systems.settings import load_settings
+from rbpf.validation.consistency.pose_errors import whitened_errors
+from rbpf.validation.run_files import RunTruth
+
+Figures = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class SweepSystem:
+    """A system that a sweep can run.
+
+    Attributes:
+        fields: of a sequence, each a path; the first is the recording itself.
+        check: raises `InputError` where settings are wrong.
+        run: filters a sequence with settings key=value, and given ones by name, to figures.
+    """
+
+    fields: tuple[str, ...]
+    check: Callable[[Sequence[str], Mapping[str, Any]], object]
+    run: Callable[[Mapping[str, Path], Sequence[str], Mapping[str, Any]], Figures]
+
+
+def system_named(name: str) -> SweepSystem:
+    """A system of `SYSTEMS`.
+
+    Raises:
+        InputError: there is none of this name.
+    """
+    if name not in SYSTEMS:
+        raise InputError(f"a sweep runs one of the systems {', '.join(SYSTEMS)}, not {name!r}")
+    return SYSTEMS[name]
+
+
+def _robot_settings(pairs: Sequence[str], given: Mapping[str, Any]) -> Any:
+    from rbpf.systems.range_bearing.config import RangeBearingConfig
+
+    return load_settings(RangeBearingConfig, "range-bearing", None, pairs, given)
+
+
+def _run_robot(sequence: Mapping[str, Path], pairs: Sequence[str], given: Mapping[str, Any]) -> Figures:
+    from rbpf.sensors.readers import open_log
+    from rbpf.systems.range_bearing.run import run
+    from rbpf.validation.map_summary import summarise_map
+    from rbpf.validation.run_folder import summarise
+    from rbpf.validation.run_truth import robot_truth
+
+    config = _robot_settings(pairs, given)
+    log = open_log(sequence["recording"], config.noise)
+    done = run(log, config)
+    figures = summarise(done, summarise_map(done.filter, done.anchored))
+    return figures | _pose_nees(log.space, done.progress.mean, done.progress.cov, robot_truth(log))
+
+
+def _mono_settings(pairs: Sequence[str], given: Mapping[str, Any]) -> Any:
+    from rbpf.systems.mono.config import MonoConfig
+
+    return load_settings(MonoConfig, "mono", None, pairs, given)
+
+
+def _run_mono(sequence: Mapping[str, Path], pairs: Sequence[str], given: Mapping[str, Any]) -> Figures:
+    from rbpf.lie import SE3
+    from rbpf.validation.metrics.mono_scores import camera_truth
+    from rbpf.validation.mono import Recording, start_mono
+    from rbpf.validation.mono_folder import summarise_camera
+    from rbpf.validation.mono_map import summarise_mono_map
+
+    recording = Recording(sequence["recording"], sequence.get("known_points"), sequence.get("calibration"))
+    done = start_mono(recording, _mono_settings(pairs, given))
+    figures = summarise_camera(done, summarise_mono_map(done.filter))
+    return figures | _pose_nees(SE3, done.world_from_camera, done.cov, camera_truth(done))
+
+
+def _stereo_settings(pairs: Sequence[str], given: Mapping[str, Any]) -> Any:
+    from rbpf.systems.stereo.config import StereoConfig
+
+    return load_settings(StereoConfig, "stereo", None, pairs, given)
+
+
+def _run_stereo(sequence: Mapping[str, Path], pairs: Sequence[str], given: Mapping[str, Any]) -> Figures:
+    from rbpf.lie import SE3
+    from rbpf.validation.map_summary import summarise_map
+    from rbpf.validation.metrics.stereo_scores import stereo_truth
+    from rbpf.validation.stereo import StereoRecording, start_stereo
+    from rbpf.validation.stereo_folder import summarise_stereo
+
+    recording = StereoRecording(sequence["recording"], sequence.get("calibration"))
+    done = start_stereo(recording, _stereo_settings(pairs, given))
+    figures = summarise_stereo(done, summarise_map(done.filter))
+    return figures | _pose_nees(SE3, done.world_from_camera, done.cov, stereo_truth(done))
+
+
+def _pose_nees(space: Any, mean: np.ndarray, cov: np.ndarray, truth: RunTruth | None) -> Figures:
+    """Mean over the steps, of d degrees of freedom; nothing where the truth is not told in the filter's world."""
+    if truth is None or truth.alignment != "none":
+        return {}
+    errors = whitened_errors(space, mean[truth.rows], cov[truth.rows], truth.poses)
+    known = errors.ranks > 0
+    return {"pose_nees_mean": float(errors.nees[known].mean())} if known.any() else {}
+
+
+SYSTEMS = {
+    "range-bearing": SweepSystem(("recording",), _robot_settings, _run_robot),
+    "mono": SweepSystem(("recording", "known_points", "calibration"), _mono_settings, _run_mono),
+    "stereo": SweepSystem(("recording", "calibration"), _stereo_settings, _run_stereo),
+}
