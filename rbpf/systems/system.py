@@ -1,0 +1,176 @@
+"""What every SLAM system is: an object that takes one frame at a time, and says what it knows after each.
+
+    slam = MonoSlam(camera, config)
+    for stamp_ns, image in source:
+        frame = slam.track(image, stamp_ns)      # pose, covariance, state of tracking, what was observed
+
+A system does not know where its frames come from nor how many there are, and keeps what it needs to go on, no more. Who
+wants a record of a run, pictures or files listens to what `track` returns (`rbpf.runs`).
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from rbpf.arrays import Float, Int
+from rbpf.core.filter import Filter
+from rbpf.lie import LieGroup
+
+
+class TrackingState(StrEnum):
+    """Whether the pose of a frame can be relied on."""
+
+    INITIALISING = "initialising"
+    """There is a pose, but earlier ones may still be revised: the scale or the first depths are not settled."""
+    TRACKED = "tracked"
+    """The frame was measured and agrees with the map."""
+    PREDICTED = "predicted"
+    """The frame told nothing, or not enough: the pose is the motion model's or the odometry's."""
+    LOST = "lost"
+    """The camera is not where the filter believes; the pose is the last trusted one."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """One number, or one array of fixed shape, that a system says of every frame. Declared once, used everywhere.
+
+    Attributes:
+        name: key in `Tracked.values` and in the log of a run.
+        meaning: one sentence, for documentation and the report.
+        unit: SI, as "s" or "px"; empty for pure numbers.
+        kind: float, int or bool.
+        shape: of the value of one frame.
+        table: file of the run folder that has it as a column, "diagnostics.csv" or "timings.csv"; None for neither.
+        heading: its name there; by default `name`. Times are written in milliseconds.
+    """
+
+    name: str
+    meaning: str
+    unit: str = ""
+    kind: type = float
+    shape: tuple[int, ...] = ()
+    table: str | None = None
+    heading: str | None = None
+
+
+@dataclass(frozen=True)
+class Ragged:
+    """An array per frame whose first axis has as many rows as the frame showed things.
+
+    Attributes:
+        name: key in `Tracked.observed`.
+        meaning: one sentence.
+        shape: of one row.
+        kind: NumPy type that it is kept in.
+    """
+
+    name: str
+    meaning: str
+    shape: tuple[int, ...] = ()
+    kind: str = "float64"
+
+
+@dataclass(frozen=True, eq=False)
+class Revision:
+    """Poses of earlier frames, estimated anew with what came after them.
+
+    Attributes:
+        stamps_ns: (T,) of the frames, the current one included.
+        poses: (T, E) world_from_body.
+        covs: (T, d, d) in the right chart at each.
+    """
+
+    stamps_ns: Int[np.ndarray, " T"]
+    poses: Float[np.ndarray, "T E"]
+    covs: Float[np.ndarray, "T d d"]
+
+
+@dataclass(frozen=True, eq=False)
+class Tracked:
+    """What a system says of a frame.
+
+    Attributes:
+        stamp_ns: time of the frame.
+        pose: (E,) world_from_body, the mean of the filtered posterior; the body is the camera or the robot.
+        cov: (d, d) its covariance in the right chart at the mean, [ω, v], rad and m.
+        state: whether the pose can be relied on.
+        values: the system's columns for this frame, by name.
+        observed: what was looked for and seen, arrays by name, see `System.observed`.
+        messages: what was wrong or worth saying, in words.
+        revision: earlier poses that this frame has changed; None where there are none.
+    """
+
+    stamp_ns: int
+    pose: Float[np.ndarray, " E"]
+    cov: Float[np.ndarray, "d d"]
+    state: TrackingState
+    values: Mapping[str, Any] = field(default_factory=dict)
+    observed: Mapping[str, np.ndarray] = field(default_factory=dict)
+    messages: tuple[str, ...] = ()
+    revision: Revision | None = None
+
+
+class System(ABC):
+    """A SLAM system. Subclasses add `track`, with the arguments that their sensor has.
+
+    Attributes:
+        name: as on the command line.
+        columns: what `Tracked.values` holds, in the order of the tables that are written.
+        observed: what `Tracked.observed` holds.
+        space: group of the poses.
+        config: all settings.
+        filter: the particle filter as it is now.
+    """
+
+    name: ClassVar[str]
+    columns: ClassVar[tuple[Column, ...]]
+    observed: ClassVar[tuple[Ragged, ...]] = ()
+    space: LieGroup
+    config: Any
+    filter: Filter
+
+    @abstractmethod
+    def take(self, frame: Any) -> Tracked:
+        """`track` with a frame as recordings have it.
+
+        Raises:
+            InputError: no particle explains the frame, or time runs backwards; a frame that shows nothing is survived.
+        """
+
+    @abstractmethod
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Everything besides the filter that a checkpoint must hold."""
+
+    @abstractmethod
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """The inverse of `arrays`, into a system built with the same arguments.
+
+        Raises:
+            InputError: an array is missing, or is not what it should be.
+        """
+
+    def save(self, path: Path | str, extra: Mapping[str, np.ndarray] | None = None) -> None:
+        """Writes a checkpoint, after any frame, with further arrays of the caller's.
+
+        Raises:
+            InputError: the file cannot be written.
+        """
+        self.filter.save(path, self.arrays() | dict(extra or {}))
+
+    def load(self, path: Path | str) -> dict[str, np.ndarray]:
+        """Goes on from a checkpoint as if nothing had happened.
+
+        Returns:
+            The arrays of `extra`, among others.
+
+        Raises:
+            InputError: the file is missing or damaged, or belongs to another system or other settings.
+        """
+        arrays = self.filter.load(path)
+        self.restore(arrays)
+        return arrays
