@@ -10,10 +10,10 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from rbpf.runs.measurements import dead_reckoning
+from rbpf.systems.map_estimate import estimate_map
 from rbpf.systems.range_bearing.config import RangeBearingConfig
-from rbpf.validation.gtsam.measurements import dead_reckoning
 from rbpf.validation.gtsam.robot import solve
-from rbpf.validation.map_summary import summarise_map
 from rbpf.validation.metrics.scores import score
 from rbpf.validation.range_bearing import start_run
 from rbpf.validation.run_folder import used_measurements
@@ -27,7 +27,7 @@ def main() -> dict[str, float]:
         run = start_run(Path(folder), RangeBearingConfig(particles=100))
     measurements = used_measurements(run)
     batch = solve(measurements)
-    summary = summarise_map(run.filter, run.anchored)
+    summary = estimate_map(run.filter, run.anchored)
     names = summary.ids.tolist()
 
     estimates = {

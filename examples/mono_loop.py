@@ -27,12 +27,12 @@ from matplotlib.figure import Figure
 from rbpf.core.filter import Filter
 from rbpf.sensors.features import FeatureLog
 from rbpf.systems.filtering import ProposalConfig
+from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.mono.config import MonoConfig, RayConfig
 from rbpf.systems.mono.run import run
 from rbpf.validation.camera_map import summarise_points
 from rbpf.validation.consistency.pose_errors import pose_errors
 from rbpf.validation.gtsam.camera import solve_features
-from rbpf.validation.map_summary import MapSummary
 from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
 from rbpf.validation.simulation.walked_worlds import CorridorWorld, LoopWorld
 from rbpf.validation.sweep.parallel import in_parallel
@@ -63,7 +63,7 @@ class Walk(NamedTuple):
     path: np.ndarray
     error: np.ndarray
     sigma: np.ndarray
-    map: MapSummary
+    map: MapEstimate
     ancestors: list[int]
 
 

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 
 from rbpf.errors import InputError
+from rbpf.runs.files import prepare_folder, write_text
 from rbpf.sensors.board_calibration import BoardCalibration, BoardView, calibrate
 from rbpf.sensors.chessboard import Board, board_corners
 from rbpf.sensors.pinhole import Pinhole
 from rbpf.sensors.readers.images.calibration import MODELS, NAME, model_of
 from rbpf.sensors.readers.images.uncalibrated import Shot, read_shots
-from rbpf.validation.files import prepare_folder, write_text
 from rbpf.validation.report.figures import COLOURS, label, save_figures
 
 FIGURES, PICTURE = "calibration.json", "calibration.png"

@@ -7,11 +7,11 @@ from rbpf.core.filter import Filter
 from rbpf.lie import SE3
 from rbpf.maps.point import Point
 from rbpf.sensors.range_bearing import RelativePosition
+from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.mono.system import world_of
-from rbpf.validation.map_summary import MapSummary
 
 
-def summarise_points(filter_: Filter) -> MapSummary:
+def summarise_points(filter_: Filter) -> MapEstimate:
     """Mixture moments of all point landmarks, the uncertainty of the known points' frame included.
 
     Landmarks whose depth is not known yet have no position and are left out. Without a frame of known points the world
@@ -37,4 +37,4 @@ def summarise_points(filter_: Filter) -> MapSummary:
     between = np.einsum("n,nkd,nke->kde", belief.weights, points - mean, points - mean)
     cov = np.einsum("n,nkde->kde", belief.weights, within) + between
     names = np.array([belief.catalogue[i] for i in ids.tolist()], dtype=np.int64)
-    return MapSummary(names, mean, gaussian.symmetrise(cov))
+    return MapEstimate(names, mean, gaussian.symmetrise(cov))

@@ -14,6 +14,10 @@ from typing import Any, final
 import numpy as np
 
 from rbpf.errors import InputError
+from rbpf.runs.alignment import Alignment
+from rbpf.runs.camera_files import read_features
+from rbpf.runs.measurements import InitialEstimate
+from rbpf.runs.trajectory import Trajectory
 from rbpf.sensors.features import FeatureFrame, FeatureLog
 from rbpf.sensors.readers import open_log
 from rbpf.systems.filtering import ProposalConfig
@@ -22,14 +26,10 @@ from rbpf.systems.mono.run import run as filter_log
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.range_bearing.run import run as filter_robot
 from rbpf.systems.settings import load_settings
-from rbpf.validation.camera_files import read_features
 from rbpf.validation.gtsam import robot
 from rbpf.validation.gtsam.batch_problem import AFAR
-from rbpf.validation.gtsam.measurements import InitialEstimate
 from rbpf.validation.gtsam.mono_batch import adjust_log
 from rbpf.validation.metrics.accuracy import ate
-from rbpf.validation.metrics.alignment import Alignment
-from rbpf.validation.metrics.trajectory import Trajectory
 from rbpf.validation.mono_budget import MANY
 from rbpf.validation.mono_parts import GivenDepths, agreeing_matches, batch_depths
 from rbpf.validation.run_files import in_space

@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.runs.files import prepare_folder
 from rbpf.sensors.features import FeatureLog
 from rbpf.sensors.pinhole import Pinhole
+from rbpf.systems.map_estimate import MapEstimate
 from rbpf.validation.colmap.model import build_model
-from rbpf.validation.files import prepare_folder
 from rbpf.validation.gtsam.batch_problem import Problem
 from rbpf.validation.gtsam.camera_data import Sightings, sightings_of
-from rbpf.validation.map_summary import MapSummary
 from rbpf.validation.metrics.path_and_map import PathAndMap
 from rbpf.validation.ply import write_ply
 from rbpf.validation.report.colours import colours_by_sigma, standard_deviations
@@ -91,7 +91,7 @@ def export_ply(estimate: PathAndMap, folder: Path) -> list[str]:
     return [MAP, PATH]
 
 
-def raised(landmarks: MapSummary) -> MapSummary:
+def raised(landmarks: MapEstimate) -> MapEstimate:
     """Landmarks of the plane at height 0, with no spread above it."""
     more = (0, 3 - landmarks.mean.shape[1])
     mean, cov = np.pad(landmarks.mean, ((0, 0), more)), np.pad(landmarks.cov, ((0, 0), more, more))

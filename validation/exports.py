@@ -14,13 +14,13 @@ from pathlib import Path
 
 from rbpf.core.checkpoint import save_arrays
 from rbpf.errors import InputError
+from rbpf.runs.files import prepare_folder
+from rbpf.runs.measurement_files import OBSERVATIONS
+from rbpf.runs.trajectory import write_kitti, write_tum
 from rbpf.validation.export import MODEL, export_colmap, export_ply, raised
-from rbpf.validation.files import prepare_folder
 from rbpf.validation.gtsam.batch_problem import read_problem
-from rbpf.validation.measurement_files import OBSERVATIONS
 from rbpf.validation.metrics.path_and_map import PathAndMap, read_path_and_map
 from rbpf.validation.report.rerun_file import AXIS_M, ellipsoids, log_pose, log_time, recording
-from rbpf.validation.trajectory_files import write_kitti, write_tum
 
 
 def export_run(run: Path, formats: Sequence[str], out: Path) -> list[Path]:

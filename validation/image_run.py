@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from rbpf.errors import InputError
-from rbpf.validation.files import write_summary
+from rbpf.runs.files import write_summary
+from rbpf.runs.trajectory import write_tum
 from rbpf.validation.gtsam.mono_batch import Batch
-from rbpf.validation.trajectory_files import write_tum
 
 CHECKPOINT = "checkpoint.npz"
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from rbpf.errors import InputError
+from rbpf.runs.files import prepare_folder
 from rbpf.sensors.chessboard import Board, find_board
 from rbpf.sensors.markers import MarkerBoard, find_markers
 from rbpf.sensors.readers.images import ImageSequence, KnownPixels, Topics, open_images, read_known_points
@@ -14,7 +15,6 @@ from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.known_map import read_known_map
 from rbpf.systems.mono.video import VideoRun, first_image, run_images
 from rbpf.validation.consistency.validate import report_run
-from rbpf.validation.files import prepare_folder
 from rbpf.validation.gtsam.mono_batch import adjust_run, score_batch
 from rbpf.validation.image_run import CHECKPOINT, Progress, Telling, write_batch
 from rbpf.validation.mono_folder import write_mono_run

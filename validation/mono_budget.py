@@ -20,6 +20,8 @@ from typing import Any
 
 import numpy as np
 
+from rbpf.runs.alignment import Alignment
+from rbpf.runs.trajectory import Trajectory
 from rbpf.sensors.features import FeatureLog
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.run import run as filter_log
@@ -27,9 +29,7 @@ from rbpf.systems.mono.video import VideoRun
 from rbpf.validation.gtsam.mono_batch import Batch, adjust_run
 from rbpf.validation.gtsam.self_calibration import refine_calibration
 from rbpf.validation.metrics.accuracy import ate
-from rbpf.validation.metrics.alignment import Alignment
 from rbpf.validation.metrics.mono_scores import true_path, usual_alignment
-from rbpf.validation.metrics.trajectory import Trajectory
 from rbpf.validation.mono_log import feature_log
 from rbpf.validation.mono_parts import (
     WRONG_PX,

@@ -24,10 +24,8 @@ from typing import Any
 
 import numpy as np
 
-from rbpf.systems.mono.known_map import NAME, write_known_map
-from rbpf.systems.mono.video import VideoRun
-from rbpf.validation.camera_files import write_features
-from rbpf.validation.files import (
+from rbpf.runs.camera_files import write_features
+from rbpf.runs.files import (
     milliseconds_per_frame,
     nis_ratio,
     peak_memory_mb,
@@ -36,15 +34,16 @@ from rbpf.validation.files import (
     write_map,
     write_summary,
 )
+from rbpf.runs.trajectory import Trajectory, write_tum
+from rbpf.systems.mono.known_map import NAME, write_known_map
+from rbpf.systems.mono.video import VideoRun
 from rbpf.validation.metrics.mono_scores import camera_truth, score_camera
-from rbpf.validation.metrics.trajectory import Trajectory
 from rbpf.validation.mono_known_map import known_map
 from rbpf.validation.mono_log import feature_log
 from rbpf.validation.mono_map import MonoMap
 from rbpf.validation.mono_posterior import write_posterior
 from rbpf.validation.provenance import write_config
 from rbpf.validation.run_files import write_path, write_truth
-from rbpf.validation.trajectory_files import write_tum
 
 
 def write_mono_run(

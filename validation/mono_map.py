@@ -11,8 +11,8 @@ from rbpf.core.models import Records
 from rbpf.lie import SE3
 from rbpf.maps.constellation import Constellation, UncertainConstellation
 from rbpf.maps.inverse_depth import InverseDepth
+from rbpf.systems.map_estimate import MapEstimate, mixture_moments, relative_points
 from rbpf.systems.mono.system import world_of
-from rbpf.validation.map_summary import MapSummary, mixture_moments, relative_points
 
 LEAST_RHO = 0.02
 """Inverse depth below which a ray is drawn and written as if it ended there, 1/m: at 50 m."""
@@ -32,7 +32,7 @@ class MonoMap:
         ends: (M, 2, 3) nearest and farthest point of a ray, in the heaviest particle; NaN for points.
     """
 
-    landmarks: MapSummary
+    landmarks: MapEstimate
     is_ray: np.ndarray
     ends: np.ndarray
 
@@ -80,7 +80,7 @@ def summarise_mono_map(filter_: Filter) -> MonoMap:
 
 def _gathered(rows: _Rows) -> MonoMap:
     order = np.argsort(np.array(rows.names, dtype=np.int64), kind="stable")
-    summary = MapSummary(
+    summary = MapEstimate(
         np.array(rows.names, dtype=np.int64)[order],
         np.array(rows.means).reshape(-1, 3)[order],
         np.array(rows.covs).reshape(-1, 3, 3)[order],

@@ -6,10 +6,9 @@ import numpy as np
 
 from rbpf.core.checkpoint import save_arrays
 from rbpf.lie import SE3
+from rbpf.runs.trajectory import Trajectory, write_tum
 from rbpf.systems.mono.system import world_of
 from rbpf.systems.mono.video import VideoRun
-from rbpf.validation.metrics.trajectory import Trajectory
-from rbpf.validation.trajectory_files import write_tum
 
 PATHS, MEAN = "posterior.npz", "posterior.tum"
 

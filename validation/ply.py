@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from rbpf.errors import InputError
 from rbpf.lie import Array
-from rbpf.validation.writing import whole
+from rbpf.runs.files import whole
 
 _VERTEX = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
 _SIGMA = [("sigma_m", "<f4")]

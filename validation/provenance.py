@@ -11,7 +11,7 @@ import yaml
 
 from rbpf import __version__
 from rbpf.errors import InputError
-from rbpf.validation.files import write_text
+from rbpf.runs.files import write_text
 from rbpf.validation.metrics.path_and_map import read_config
 
 CONFIG = "config.yaml"

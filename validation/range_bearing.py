@@ -6,17 +6,17 @@ from typing import Any
 
 import numpy as np
 
+from rbpf.runs.files import prepare_folder
+from rbpf.runs.measurements import dead_reckoning
+from rbpf.runs.trajectory import write_tum
 from rbpf.sensors.readers import open_log
+from rbpf.systems.map_estimate import estimate_map
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.range_bearing.run import Run, run
 from rbpf.validation.consistency.validate import report_run
-from rbpf.validation.files import prepare_folder
-from rbpf.validation.gtsam.measurements import dead_reckoning
-from rbpf.validation.map_summary import summarise_map
 from rbpf.validation.metrics.scores import as_trajectory, score
 from rbpf.validation.report.plots import plot_run
 from rbpf.validation.run_folder import reported, used_measurements, write_run
-from rbpf.validation.trajectory_files import write_tum
 
 _SHORT = 300
 """Steps up to which dead reckoning is a good enough start for the batch problem."""
@@ -67,7 +67,7 @@ def finish_run(finished: Run, recording: Path, out: Path, batch: bool = True) ->
         stamps = np.array([frame.stamp_ns for frame in log.frames], dtype=np.int64)
         write_tum(out / "batch.tum", as_trajectory(log, stamps, path))
     entries = write_run(finished, out, recording, extra, batch)
-    plot_run(finished, summarise_map(finished.filter, finished.anchored), out, paths)
+    plot_run(finished, estimate_map(finished.filter, finished.anchored), out, paths)
     verdict = report_run(out)
     return entries | {"verdict": verdict.trust, "sentences": verdict.said}
 

@@ -17,8 +17,8 @@ from rbpf.core.archive import checked, load_arrays, save_arrays
 from rbpf.core.checkpoint import fitting
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3, SE2Group, SE3Group
-from rbpf.validation.metrics.alignment import Alignment
-from rbpf.validation.metrics.trajectory import Trajectory
+from rbpf.runs.alignment import Alignment
+from rbpf.runs.trajectory import Trajectory
 
 TRAJECTORY = "trajectory.npz"
 TRUTH = "truth.npz"

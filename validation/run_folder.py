@@ -4,7 +4,7 @@ trajectory.tum           online filtered mean at every step
 trajectory.npz           the same with its covariance; truth.npz: the ground truth at these steps; see
                          `rbpf.validation.run_files`
 map.npz, map.csv         landmarks: id, mean, covariance (within + between particles)
-observations.csv, observations_odometry.csv   the measurements used; see `rbpf.validation.measurement_files`
+observations.csv, observations_odometry.csv   the measurements used; see `rbpf.runs.measurement_files`
 timings.csv              milliseconds per step
 diagnostics.csv          effective sample size, resampling, log-evidence, NIS per step
 config.yaml              everything needed to repeat the run
@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 
 from rbpf.lie import SE2Group
-from rbpf.systems.range_bearing.run import Run
-from rbpf.validation.files import (
+from rbpf.runs.files import (
     milliseconds_per_frame,
     nis_ratio,
     peak_memory_mb,
@@ -29,14 +28,15 @@ from rbpf.validation.files import (
     write_map,
     write_summary,
 )
-from rbpf.validation.gtsam.measurements import Measurements
-from rbpf.validation.map_summary import MapSummary, summarise_map
-from rbpf.validation.measurement_files import write_measurements
+from rbpf.runs.measurement_files import write_measurements
+from rbpf.runs.measurements import Measurements
+from rbpf.runs.trajectory import write_tum
+from rbpf.systems.map_estimate import MapEstimate, estimate_map
+from rbpf.systems.range_bearing.run import Run
 from rbpf.validation.metrics.scores import Scores, as_trajectory, score
 from rbpf.validation.provenance import left_out, write_config
 from rbpf.validation.run_files import write_path, write_truth
 from rbpf.validation.run_truth import robot_truth
-from rbpf.validation.trajectory_files import write_tum
 
 
 def write_run(
@@ -60,7 +60,7 @@ def write_run(
     write_tum(out / "trajectory.tum", as_trajectory(log, stamps, progress.mean))
     write_path(out, stamps, progress.mean, progress.cov, progress.correction, progress.cov_correction)
     write_truth(out, robot_truth(log))
-    summary_map = summarise_map(run.filter, run.anchored)
+    summary_map = estimate_map(run.filter, run.anchored)
     write_map(out, summary_map)
     write_measurements(out, used_measurements(run))
     write_csv(out / "timings.csv", ["step", "milliseconds"], enumerate(np.round(progress.seconds * 1e3, 4)))
@@ -113,7 +113,7 @@ def used_measurements(run: Run) -> Measurements:
     )
 
 
-def summarise(run: Run, summary_map: MapSummary) -> dict[str, Any]:
+def summarise(run: Run, summary_map: MapEstimate) -> dict[str, Any]:
     """The entries of summary.json."""
     progress, config = run.progress, run.config
     scores = score(run.log, progress.mean, summary_map.named(), config.association == "ml")

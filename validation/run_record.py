@@ -13,8 +13,8 @@ import numpy as np
 
 from rbpf.core.checkpoint import load_arrays
 from rbpf.errors import InputError
+from rbpf.systems.map_estimate import MapEstimate, map_of
 from rbpf.systems.plain_yaml import read_plain_yaml
-from rbpf.validation.map_summary import MapSummary, map_of
 from rbpf.validation.run_files import FilteredPath, RunTruth, read_path, read_truth
 
 MOST_BYTES = 1 << 30
@@ -53,7 +53,7 @@ class RunRecord:
         """The ground truth at the run's steps; errors as `read_truth`."""
         return read_truth(self.folder, self.path())
 
-    def map(self) -> MapSummary:
+    def map(self) -> MapEstimate:
         """The landmarks that are points; those whose depth is not known are left out.
 
         Raises:

@@ -17,13 +17,13 @@ from rbpf.core.belief import Belief
 from rbpf.core.filter import Filter
 from rbpf.core.models import NewLandmarks, Observations, Sensor
 from rbpf.lie import SE2, SE3
+from rbpf.runs.files import peak_memory_mb
 from rbpf.sensors.names import Names
 from rbpf.systems.mono import system as mono
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.run import pose_estimate
 from rbpf.systems.range_bearing import system as range_bearing
 from rbpf.systems.range_bearing.config import RangeBearingConfig
-from rbpf.validation.files import peak_memory_mb
 from rbpf.validation.simulation.streams import CameraStream, RobotStream
 
 Step = Callable[[Any, int], np.ndarray]

@@ -5,16 +5,16 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from rbpf.runs.files import prepare_folder
 from rbpf.sensors.readers.images import Topics, open_stereo
 from rbpf.sensors.readers.images.stereo import StereoSequence
 from rbpf.sensors.readers.images.topics import UNNAMED
+from rbpf.systems.map_estimate import estimate_map
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.run import StereoRun, run_images
 from rbpf.validation.consistency.validate import report_run
-from rbpf.validation.files import prepare_folder
 from rbpf.validation.gtsam.stereo_batch import adjust_stereo, score_stereo_batch
 from rbpf.validation.image_run import CHECKPOINT, Progress, Telling, write_batch
-from rbpf.validation.map_summary import summarise_map
 from rbpf.validation.provenance import left_out
 from rbpf.validation.report.page import VIDEO
 from rbpf.validation.report.stereo_frames import write_annotated_pairs
@@ -100,7 +100,7 @@ def finish_stereo(
         batch: also adjust the same measurements in batch, and score the optimum.
         telling: whom to tell how far it is, and the time that the batch adjustment may take.
     """
-    mapped, telling = summarise_map(run.filter), telling or Telling()
+    mapped, telling = estimate_map(run.filter), telling or Telling()
     sources = recording.sources() | left_out(video=video, batch=batch)
     entries = write_stereo_run(run, mapped, out, sources)
     adjust = partial(adjust_stereo, run, telling.batch_s, telling.on_iteration)

@@ -5,7 +5,7 @@ trajectory.npz           the same with its covariance; truth.npz: the ground tru
                          `rbpf.validation.run_files`
 odometry.tum             the path by visual odometry alone
 batch.tum                the batch optimum of the same measurements
-observations*.csv        the measurements used, by odometry or by the map; see `rbpf.validation.camera_files`
+observations*.csv        the measurements used, by odometry or by the map; see `rbpf.runs.camera_files`
 map.npz, map.csv         landmarks: name, mean, covariance (within + between particles); how often each was seen
 timings.csv              milliseconds per pair: whole, features, odometry, matching with the map, filter
 diagnostics.csv          features, matches that agree with the motion, landmarks; updates, sample size, evidence, NIS
@@ -24,10 +24,8 @@ from typing import Any
 
 import numpy as np
 
-from rbpf.systems.stereo.run import StereoRun
-from rbpf.systems.stereo.sensor import StereoSensor
-from rbpf.validation.camera_files import write_features
-from rbpf.validation.files import (
+from rbpf.runs.camera_files import write_features
+from rbpf.runs.files import (
     milliseconds_per_frame,
     nis_ratio,
     peak_memory_mb,
@@ -36,18 +34,19 @@ from rbpf.validation.files import (
     write_map,
     write_summary,
 )
-from rbpf.validation.map_summary import MapSummary
+from rbpf.runs.trajectory import Trajectory, write_tum
+from rbpf.systems.map_estimate import MapEstimate
+from rbpf.systems.stereo.run import StereoRun
+from rbpf.systems.stereo.sensor import StereoSensor
 from rbpf.validation.metrics.stereo_scores import distance_m, score_stereo, stereo_truth
-from rbpf.validation.metrics.trajectory import Trajectory
 from rbpf.validation.provenance import write_config
 from rbpf.validation.run_files import write_path, write_truth
-from rbpf.validation.trajectory_files import write_tum
 
 _STAGES = "features", "odometry", "matching", "filter"
 
 
 def write_stereo_run(
-    run: StereoRun, mapped: MapSummary, out: Path, sources: Mapping[str, str | bool]
+    run: StereoRun, mapped: MapEstimate, out: Path, sources: Mapping[str, str | bool]
 ) -> dict[str, Any]:
     """Writes all data files of a run.
 
@@ -74,7 +73,7 @@ def write_stereo_run(
     return entries
 
 
-def summarise_stereo(run: StereoRun, mapped: MapSummary) -> dict[str, Any]:
+def summarise_stereo(run: StereoRun, mapped: MapEstimate) -> dict[str, Any]:
     """The entries of summary.json."""
     updated = run.updated.astype(bool)
     log_evidence = run.log_evidence[updated]
@@ -106,7 +105,7 @@ def summarise_stereo(run: StereoRun, mapped: MapSummary) -> dict[str, Any]:
     }
 
 
-def _key_counts(run: StereoRun, mapped: MapSummary) -> dict[str, float | int]:
+def _key_counts(run: StereoRun, mapped: MapEstimate) -> dict[str, float | int]:
     """Keys ever started, and landmarks; all particles hold the same, as all associate alike."""
     sensor = run.front_end.sensor
     if not isinstance(sensor, StereoSensor):
@@ -117,7 +116,7 @@ def _key_counts(run: StereoRun, mapped: MapSummary) -> dict[str, float | int]:
     }
 
 
-def _facts(run: StereoRun, mapped: MapSummary) -> dict[str, np.ndarray]:
+def _facts(run: StereoRun, mapped: MapEstimate) -> dict[str, np.ndarray]:
     """How often each landmark was seen, and whether it is one or a key on trial."""
     sensor = run.front_end.sensor
     if not isinstance(sensor, StereoSensor):

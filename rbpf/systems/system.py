@@ -13,13 +13,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
 from rbpf.arrays import Float, Int
 from rbpf.core.filter import Filter
-from rbpf.lie import LieGroup
+from rbpf.lie import SE2Group, SE3Group
+from rbpf.systems.map_estimate import MapEstimate
+
+Gauge = Literal["none", "first frame", "rigid", "similarity"]
+"""What a system's world has in common with the ground truth's: it is the same one; it begins at the first frame's pose;
+it is the same up to a rigid motion; up to a motion and a scale."""
 
 
 class TrackingState(StrEnum):
@@ -56,6 +61,21 @@ class Column:
     shape: tuple[int, ...] = ()
     table: str | None = None
     heading: str | None = None
+
+
+DIAGNOSTICS = "diagnostics.csv"
+TIMINGS = "timings.csv"
+
+ESS = Column("ess", "effective sample size before resampling", table=DIAGNOSTICS)
+RESAMPLED = Column("resampled", "whether the particles were resampled", kind=bool, table=DIAGNOSTICS)
+LOG_EVIDENCE = Column(
+    "log_evidence",
+    "increment of the log-evidence; NaN where a likelihood is no density",
+    "nat",
+    table=DIAGNOSTICS,
+)
+NIS = Column("nis", "normalised innovation squared; NaN without a linearised innovation", table=DIAGNOSTICS)
+NIS_DOF = Column("nis_dof", "its degrees of freedom", kind=int, table=DIAGNOSTICS)
 
 
 @dataclass(frozen=True)
@@ -120,17 +140,21 @@ class System(ABC):
 
     Attributes:
         name: as on the command line.
+        frame_word: what a frame is called in messages.
         columns: what `Tracked.values` holds, in the order of the tables that are written.
         observed: what `Tracked.observed` holds.
         space: group of the poses.
+        gauge: what its world has in common with the ground truth's.
         config: all settings.
         filter: the particle filter as it is now.
     """
 
     name: ClassVar[str]
-    columns: ClassVar[tuple[Column, ...]]
-    observed: ClassVar[tuple[Ragged, ...]] = ()
-    space: LieGroup
+    frame_word: ClassVar[str] = "frame"
+    columns: tuple[Column, ...]
+    observed: tuple[Ragged, ...] = ()
+    space: SE2Group | SE3Group
+    gauge: Gauge = "first frame"
     config: Any
     filter: Filter
 
@@ -141,6 +165,10 @@ class System(ABC):
         Raises:
             InputError: no particle explains the frame, or time runs backwards; a frame that shows nothing is survived.
         """
+
+    @abstractmethod
+    def map(self) -> MapEstimate:
+        """The landmarks as they are known now, each a Gaussian within + between particles, in the reported world."""
 
     @abstractmethod
     def arrays(self) -> dict[str, np.ndarray]:

@@ -10,6 +10,7 @@ import pytest
 
 from rbpf.cli import main
 from rbpf.errors import InputError
+from rbpf.runs.files import whole
 from rbpf.sensors.pinhole import RectifiedStereo
 from rbpf.sensors.readers.images import open_images, open_stereo
 from rbpf.systems.mono.config import MonoConfig
@@ -23,7 +24,6 @@ from rbpf.validation.simulation.exposure import Imaging
 from rbpf.validation.simulation.images import simulate_images
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 from rbpf.validation.simulation.textured_desk import TexturedDesk
-from rbpf.validation.writing import whole
 from tests.cli.mono_sequences import CAMERA, FRAMES
 
 pytestmark = pytest.mark.slow

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from rbpf.cli import main
+from rbpf.runs.camera_files import read_features
 from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
 from rbpf.sensors.readers.images import open_images, open_stereo
 from rbpf.sensors.readers.images.calibration import read_calibration
-from rbpf.validation.camera_files import read_features
 from rbpf.validation.simulation.exposure import Imaging
 from rbpf.validation.simulation.images import simulate_images
 from rbpf.validation.simulation.textured_desk import TexturedDesk

@@ -13,12 +13,12 @@ import yaml
 from rbpf.cli import main
 from rbpf.core.filter import Filter
 from rbpf.lie import SE3
+from rbpf.runs.camera_files import read_features
+from rbpf.runs.trajectory import read_tum
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.run import run as filter_log
-from rbpf.validation.camera_files import read_features
 from rbpf.validation.gtsam.camera import CameraEstimate, solve_features
 from rbpf.validation.gtsam.mono_batch import ROBUST
-from rbpf.validation.trajectory_files import read_tum
 from tests.cli.mono_sequences import CAMERA, FRAMES, run, sentence, summary
 from tests.cli.run_outputs import outputs
 

@@ -13,16 +13,15 @@ from hypothesis import strategies as st
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.runs.camera_files import read_features, write_features
+from rbpf.runs.measurement_files import read_measurements, write_measurements
+from rbpf.runs.trajectory import Trajectory, read_kitti, read_tum, write_tum
 from rbpf.sensors.readers import open_log, stereo_tracks, text
 from rbpf.sensors.readers.images import Topics, open_images, open_stereo, read_known_points
 from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
-from rbpf.validation.camera_files import read_features, write_features
-from rbpf.validation.measurement_files import read_measurements, write_measurements
-from rbpf.validation.metrics.trajectory import Trajectory
 from rbpf.validation.ply import read_ply, write_ply
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 from rbpf.validation.simulation.streams import CameraStream, Turnover
-from rbpf.validation.trajectory_files import read_kitti, read_tum, write_tum
 from tests.properties.mutations import damaged
 from tests.readers import test_mrclam, test_stereo_tracks, test_victoria_park, test_wheel_odometry
 from tests.readers.images import bags, folders

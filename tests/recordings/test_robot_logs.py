@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from rbpf.sensors.readers import open_log
+from rbpf.systems.map_estimate import estimate_map
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.range_bearing.run import run
 from rbpf.systems.settings import load_settings
-from rbpf.validation.map_summary import summarise_map
 from rbpf.validation.metrics.scores import score
 
 pytestmark = [pytest.mark.real_data, pytest.mark.slow]
@@ -20,7 +20,7 @@ def mean_scores(path, seeds, *settings):
         config = load_settings(RangeBearingConfig, "range-bearing", None, settings, {"seed": seed})
         log = open_log(path, config.noise)
         finished = run(log, config)
-        landmarks = summarise_map(finished.filter, finished.anchored).named()
+        landmarks = estimate_map(finished.filter, finished.anchored).named()
         found = score(log, finished.progress.mean, landmarks, config.association == "ml")
         rows.append(
             (

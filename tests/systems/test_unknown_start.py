@@ -7,13 +7,13 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.runs.trajectory import Trajectory
 from rbpf.sensors.features import FeatureLog
 from rbpf.systems.mono.config import MonoConfig, StartConfig, VelocityConfig
 from rbpf.systems.mono.run import run
 from rbpf.systems.mono.unknown_start import TORN, UnknownStart, between
 from rbpf.systems.mono.video import VideoRun, run_images
 from rbpf.validation.metrics.accuracy import ate
-from rbpf.validation.metrics.trajectory import Trajectory
 from tests.exactness.models import known
 from tests.systems.mono_logs import SMALL, changed, desk, rows, without_known
 from tests.systems.plane_sequences import path, sequence

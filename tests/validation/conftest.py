@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rbpf.lie import SE3
-from rbpf.validation.metrics.trajectory import Trajectory
+from rbpf.runs.trajectory import Trajectory
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rbpf.lie import Array
-from rbpf.validation.gtsam.measurements import Measurements
+from rbpf.runs.measurements import Measurements
 
 
 class Filtered(NamedTuple):

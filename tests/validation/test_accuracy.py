@@ -8,10 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.runs.alignment import Similarity
+from rbpf.runs.trajectory import Trajectory, associate, read_kitti, read_tum
 from rbpf.validation.metrics.accuracy import ate, landmark_errors, rpe
-from rbpf.validation.metrics.alignment import Similarity
-from rbpf.validation.metrics.trajectory import Trajectory, associate
-from rbpf.validation.trajectory_files import read_kitti, read_tum
 
 FRAMES, METRES = metrics.Unit.frames, metrics.Unit.meters
 TRANSLATION = metrics.PoseRelation.translation_part

@@ -11,11 +11,14 @@ import yaml
 from rbpf.core.checkpoint import save_arrays
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.runs.camera_files import write_features
+from rbpf.runs.files import write_map
+from rbpf.runs.trajectory import Trajectory, write_tum
+from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.run import run as run_features
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.range_bearing.run import run
-from rbpf.validation.camera_files import write_features
 from rbpf.validation.consistency.against_batch import (
     SAME,
     SCALED,
@@ -23,14 +26,10 @@ from rbpf.validation.consistency.against_batch import (
     compare_folder,
     compare_run,
 )
-from rbpf.validation.files import write_map
 from rbpf.validation.gtsam.batch_problem import first_steps, fit_of, problem_of, read_problem, solve_problem
-from rbpf.validation.map_summary import MapSummary
 from rbpf.validation.metrics.gaussian_differences import compare_last_pose, rescaled, scale_onto
 from rbpf.validation.metrics.path_and_map import PathAndMap, of_run, read_path_and_map
-from rbpf.validation.metrics.trajectory import Trajectory
 from rbpf.validation.run_folder import write_run
-from rbpf.validation.trajectory_files import write_tum
 from tests.validation.camera_scenes import scene
 from tests.validation.linear_worlds import linear_log
 
@@ -145,7 +144,7 @@ def scaled_by(estimate, scale):
     poses[:, 4:] = first + scale * (poses[:, 4:] - first)
     by = np.repeat([1.0, scale], 3)
     points = estimate.landmarks
-    moved = MapSummary(points.ids, first + scale * (points.mean - first), scale**2 * points.cov)
+    moved = MapEstimate(points.ids, first + scale * (points.mean - first), scale**2 * points.cov)
     return PathAndMap(estimate.stamps_ns, poses, estimate.cov_poses * np.outer(by, by), moved)
 
 

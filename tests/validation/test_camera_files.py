@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from rbpf.errors import InputError
+from rbpf.runs.camera_files import FRAMES, KNOWN, OBSERVATIONS, read_features, write_features
 from rbpf.sensors.features import FeatureFrame, FeatureLog, KnownPoints
 from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
-from rbpf.validation.camera_files import FRAMES, KNOWN, OBSERVATIONS, read_features, write_features
 
 CAMERA = Pinhole(640, 480, 512.1, 511.9, 319.4, 239.6, (0.1, -0.05, 1e-3, -2e-3, 0.01))
 

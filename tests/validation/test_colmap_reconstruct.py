@@ -7,17 +7,17 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.runs.trajectory import Trajectory
 from rbpf.sensors.features import CameraTruth
 from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
 from rbpf.sensors.readers.images import open_images
+from rbpf.systems.map_estimate import MapEstimate
 from rbpf.validation.colmap.against_colmap import compare_folder_with_colmap, compare_with_colmap
 from rbpf.validation.colmap.cloud_distance import cloud_distance
 from rbpf.validation.colmap.compare import compare_with_path, compare_with_truth
 from rbpf.validation.colmap.pipeline import ReconstructionOptions
 from rbpf.validation.colmap.reconstruct import Reconstruction, reconstruct
-from rbpf.validation.map_summary import MapSummary
 from rbpf.validation.metrics.path_and_map import PathAndMap
-from rbpf.validation.metrics.trajectory import Trajectory
 from rbpf.validation.simulation.exposure import Imaging
 from rbpf.validation.simulation.images import simulate_images
 from rbpf.validation.simulation.textured_desk import TexturedDesk
@@ -224,7 +224,7 @@ def test_photos_with_measured_poses_are_met_within_one_per_cent(data_dir):
 def test_the_kitchen_is_reconstructed_as_well_as_by_the_reference(data_dir):
     sequence = open_images(data_dir / "mono_redkitchen_a")
     truth = sequence.truth
-    points = MapSummary(np.arange(2), np.zeros((2, 3)), np.repeat(np.eye(3)[None], 2, axis=0))
+    points = MapEstimate(np.arange(2), np.zeros((2, 3)), np.repeat(np.eye(3)[None], 2, axis=0))
     estimate = PathAndMap(truth.stamps_ns, truth.world_from_camera, np.empty((0, 6, 6)), points)
     compared = compare_with_colmap(estimate, sequence, ReconstructionOptions(every=5, features=2048))
     assert compared.run.reconstruction.fraction >= 0.9

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from rbpf.errors import InputError
+from rbpf.runs.camera_files import write_features
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.run import run as filter_log
 from rbpf.systems.range_bearing.config import RangeBearingConfig
-from rbpf.validation.camera_files import write_features
 from rbpf.validation.error_causes import (
     AS_IT_IS,
     BATCH,

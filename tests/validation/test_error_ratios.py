@@ -7,19 +7,19 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.runs.trajectory import Trajectory
+from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.validation.error_ratios import HEADER, ErrorRatio, error_of, robot_ratio, tracks_ratio
-from rbpf.validation.map_summary import MapSummary
 from rbpf.validation.metrics.path_and_map import PathAndMap
-from rbpf.validation.metrics.trajectory import Trajectory
 from rbpf.validation.simulation.features import STEREO, Measuring, simulate_features
 from rbpf.validation.simulation.point_worlds import DeskWorld
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 
 
 def estimate(poses):
-    nothing = MapSummary(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+    nothing = MapEstimate(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
     return PathAndMap(np.arange(len(poses)), poses, np.empty((0, 6, 6)), nothing)
 
 

@@ -8,6 +8,7 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.range_bearing.run import run
 from rbpf.validation.colmap.frames import from_colmap_pose
@@ -16,7 +17,6 @@ from rbpf.validation.export import MAP, PATH, colmap_model, export_colmap, expor
 from rbpf.validation.gtsam.batch_problem import problem_of
 from rbpf.validation.gtsam.camera_data import sightings_of
 from rbpf.validation.gtsam.camera_factors import evaluate_sightings
-from rbpf.validation.map_summary import MapSummary
 from rbpf.validation.metrics.path_and_map import PathAndMap, of_run
 from rbpf.validation.ply import read_ply, write_ply
 from rbpf.validation.report.colours import colours_by_sigma, standard_deviations
@@ -30,7 +30,7 @@ def estimate_of(log, names=None):
     stamps = np.array([frame.stamp_ns for frame in log.frames])
     std = np.linspace(0.01, 0.2, len(names))
     points = np.array([log.truth.landmarks[name] for name in names])
-    summary = MapSummary(np.array(names), points, std[:, None, None] ** 2 * np.eye(3))
+    summary = MapEstimate(np.array(names), points, std[:, None, None] ** 2 * np.eye(3))
     return PathAndMap(stamps, log.truth.world_from_camera, np.empty((0, 6, 6)), summary)
 
 

@@ -8,8 +8,8 @@ import pytest
 
 from rbpf.cli import main
 from rbpf.lie import SE3
+from rbpf.runs.trajectory import read_kitti, read_tum, write_kitti
 from rbpf.validation.metrics.path_and_map import read_path_and_map
-from rbpf.validation.trajectory_files import read_kitti, read_tum, write_kitti
 
 pytestmark = pytest.mark.slow
 

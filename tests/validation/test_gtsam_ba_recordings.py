@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from rbpf.lie import SE2
+from rbpf.runs.alignment import align
+from rbpf.runs.measurements import from_log, initial_estimate
 from rbpf.sensors.readers import open_log
-from rbpf.validation.gtsam.measurements import from_log, initial_estimate
 from rbpf.validation.gtsam.robot import solve
 from rbpf.validation.gtsam.robot_graph import Problem
 from rbpf.validation.metrics.accuracy import landmark_errors
-from rbpf.validation.metrics.alignment import align
 from tests.validation.joint_ekf import joint_ekf
 
 

@@ -8,10 +8,10 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE2
+from rbpf.runs.measurement_files import OBSERVATIONS, ODOMETRY, read_measurements, write_measurements
+from rbpf.runs.measurements import Measurements, dead_reckoning, from_log, initial_estimate
 from rbpf.sensors.range_bearing import RangeBearing, RelativePosition
 from rbpf.sensors.readers import Frame, RobotLog, open_log
-from rbpf.validation.gtsam.measurements import Measurements, dead_reckoning, from_log, initial_estimate
-from rbpf.validation.measurement_files import OBSERVATIONS, ODOMETRY, read_measurements, write_measurements
 from tests.validation.worlds import seen, world
 
 FIELDS = [field for field in Measurements.__dataclass_fields__ if field != "space"]

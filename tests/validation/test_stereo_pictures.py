@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rbpf.systems.map_estimate import estimate_map
 from rbpf.systems.stereo.config import StereoConfig, TriggerConfig
 from rbpf.systems.stereo.run import StereoRun, run_images
 from rbpf.systems.stereo.seen import FEATURE, LANDMARK, NEW, TRIAL, PairSeen, Seen
-from rbpf.validation.map_summary import summarise_map
 from rbpf.validation.report.annotated import Caption, drawn_size
 from rbpf.validation.report.rerun_file import recording
 from rbpf.validation.report.stereo_frames import COLOURS, annotated_pairs, draw_pair
@@ -95,7 +95,7 @@ def test_features_in_the_recording(run, tmp_path, monkeypatch):
     rr = pytest.importorskip("rerun")
     stream = Stream()
     monkeypatch.setattr("rbpf.validation.report.stereo_rerun.recording", lambda *_: nullcontext((rr, stream)))
-    write_stereo_rerun(run, sequence(), summarise_map(run.filter), tmp_path / "unused.rrd")
+    write_stereo_rerun(run, sequence(), estimate_map(run.filter), tmp_path / "unused.rrd")
     logged = stream.logged
     assert len(logged["time/frame"]) == COUNT and len(logged["world/camera/image"]) == COUNT
     for kind, name in ((LANDMARK, "landmark"), (TRIAL, "on_trial"), (NEW, "new"), (FEATURE, "feature")):
@@ -104,7 +104,7 @@ def test_features_in_the_recording(run, tmp_path, monkeypatch):
             xy = np.array(drawn.positions.as_arrow_array().to_pylist()).reshape(-1, 2)
             np.testing.assert_allclose(xy, seen.of(kind)[:, :2] + 0.5, atol=1e-4)
     places = np.array(logged["world/seen"][-1].positions.as_arrow_array().to_pylist())
-    mapped = summarise_map(run.filter).mean
+    mapped = estimate_map(run.filter).mean
     nearest = np.linalg.norm(places[:, None] - mapped, axis=2).min(axis=1)
     assert len(places) > 5 and np.median(nearest) < 0.02
 

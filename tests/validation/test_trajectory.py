@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3
-from rbpf.validation.metrics.alignment import Similarity
-from rbpf.validation.metrics.trajectory import Trajectory, associate
+from rbpf.runs.alignment import Similarity
+from rbpf.runs.trajectory import Trajectory, associate
 
 MS = 1_000_000
 

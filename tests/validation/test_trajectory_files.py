@@ -8,8 +8,7 @@ from evo.tools import file_interface
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.validation.metrics.trajectory import Trajectory
-from rbpf.validation.trajectory_files import read_kitti, read_tum, write_tum
+from rbpf.runs.trajectory import Trajectory, read_kitti, read_tum, write_tum
 
 POSE = "1.0 2.0 3.0 0.0 0.0 0.0 1.0"
 

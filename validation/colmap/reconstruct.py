@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from rbpf.errors import InputError
 from rbpf.lie import Array
+from rbpf.runs.trajectory import Trajectory
 from rbpf.sensors.pinhole import Pinhole
 from rbpf.sensors.readers.images.sequence import ImageSequence
 from rbpf.validation.colmap.frames import from_colmap_pose
@@ -28,7 +29,6 @@ from rbpf.validation.colmap.pipeline import (
     quiet,
     write_key_frames,
 )
-from rbpf.validation.metrics.trajectory import Trajectory
 
 
 @final

@@ -7,16 +7,15 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import SE2
+from rbpf.runs.trajectory import associate, read_tum
+from rbpf.systems.map_estimate import MapEstimate
 from rbpf.validation.consistency.autocorrelation import degrees_of_freedom
 from rbpf.validation.consistency.comparison import Comparison
 from rbpf.validation.consistency.pose_errors import WhitenedErrors, whitened_errors
 from rbpf.validation.consistency.statistic import STATE_FACTOR, Statistic, coverage, variance_ratio
-from rbpf.validation.map_summary import MapSummary
 from rbpf.validation.metrics.accuracy import AbsoluteError, ate, rpe
-from rbpf.validation.metrics.trajectory import associate
 from rbpf.validation.run_files import FilteredPath, RunTruth, in_space
 from rbpf.validation.run_record import RunRecord
-from rbpf.validation.trajectory_files import read_tum
 
 NAME = "groundtruth"
 NEES = "poses against the truth"
@@ -59,7 +58,7 @@ class LandmarkErrors:
         squares: (M,) normalised squared errors; an honest filter's are χ² of D.
     """
 
-    map: MapSummary
+    map: MapEstimate
     errors: np.ndarray
     squares: np.ndarray
 
@@ -116,11 +115,11 @@ def compare_with_truth(record: RunRecord, std_m: float = 0.0, std_rad: float = 0
     return Comparison(NAME, accuracy, figures, statistics, draw_truth(record, errors))
 
 
-def _landmark_errors(found: MapSummary, truth: RunTruth) -> LandmarkErrors | None:
+def _landmark_errors(found: MapEstimate, truth: RunTruth) -> LandmarkErrors | None:
     kept = np.array([name in truth.landmarks for name in found.ids.tolist()], dtype=bool)
     if not kept.any():
         return None
-    found = MapSummary(found.ids[kept], found.mean[kept], found.cov[kept])
+    found = MapEstimate(found.ids[kept], found.mean[kept], found.cov[kept])
     true = np.array([truth.landmarks[name] for name in found.ids.tolist()])
     error = true - found.mean
     squares = np.einsum("md,mde,me->m", error, np.linalg.pinv(found.cov, hermitian=True), error)

@@ -15,16 +15,16 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import LieGroup
+from rbpf.runs.measurement_files import read_measurements
+from rbpf.runs.measurements import Measurements
+from rbpf.systems.map_estimate import MapEstimate
 from rbpf.validation.consistency.against_batch import compare
 from rbpf.validation.consistency.autocorrelation import degrees_of_freedom
 from rbpf.validation.consistency.comparison import Comparison
 from rbpf.validation.consistency.pose_errors import whitened_errors
 from rbpf.validation.consistency.statistic import NOISE_FACTOR, STATE_FACTOR, Statistic, variance_ratio
 from rbpf.validation.gtsam.batch_problem import robot_optimum
-from rbpf.validation.gtsam.measurements import Measurements
 from rbpf.validation.gtsam.robot import BatchSolution, solve
-from rbpf.validation.map_summary import MapSummary
-from rbpf.validation.measurement_files import read_measurements
 from rbpf.validation.metrics.gaussian_differences import figures_of
 from rbpf.validation.metrics.path_and_map import PathAndMap
 from rbpf.validation.report.comparison_figures import (
@@ -59,14 +59,14 @@ class BatchErrors:
     white: np.ndarray
     landmarks: np.ndarray
     sigmas: np.ndarray
-    map: MapSummary
+    map: MapEstimate
 
 
-def batch_errors(path: FilteredPath, found: MapSummary, batch: BatchSolution) -> BatchErrors:
+def batch_errors(path: FilteredPath, found: MapEstimate, batch: BatchSolution) -> BatchErrors:
     """Compares poses and landmarks with a batch solution with marginals, in one world."""
     poses, white = _expected_poses(path.space, path, batch)
     kept = np.array([name in batch.landmarks for name in found.ids.tolist()], dtype=bool)
-    found = MapSummary(found.ids[kept], found.mean[kept], found.cov[kept])
+    found = MapEstimate(found.ids[kept], found.mean[kept], found.cov[kept])
     names = found.ids.tolist()
     dim = found.mean.shape[1]
     delta = np.array([batch.landmarks[name] for name in names]).reshape(-1, dim) - found.mean
@@ -152,7 +152,7 @@ def _figures(
 
 
 def _densities(
-    path: FilteredPath, found: MapSummary, measured: Measurements, batch: BatchSolution
+    path: FilteredPath, found: MapEstimate, measured: Measurements, batch: BatchSolution
 ) -> dict[str, Any]:
     """Landmarks, and poses at a few instants, as Gaussians beside the batch's; the likelihood of both."""
     filtered = PathAndMap(path.stamps_ns, path.mean, path.cov, found)

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from rbpf.errors import InputError
+from rbpf.runs.files import write_text
 from rbpf.validation.consistency.statistic import Statistic
-from rbpf.validation.files import write_text
 
 _PREFIX = "validation_"
 

@@ -13,13 +13,13 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.readers import open_log
 from rbpf.sensors.readers.log import RobotLog
+from rbpf.systems.map_estimate import MapEstimate, estimate_map
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.run import run as run_mono
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.range_bearing.run import run as run_robot
 from rbpf.validation.camera_map import summarise_points
 from rbpf.validation.consistency.pose_errors import whitened_errors
-from rbpf.validation.map_summary import MapSummary, summarise_map
 from rbpf.validation.run_truth import robot_truth
 from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
 from rbpf.validation.simulation.point_worlds import DeskWorld
@@ -74,7 +74,7 @@ class RobotTrial:
         assert truth is not None
         given = log if self.spoil is None else self.spoil(log, np.random.default_rng(seed))
         done = run_robot(given, replace(self.config, seed=seed))
-        progress, found = done.progress, summarise_map(done.filter, done.anchored)
+        progress, found = done.progress, estimate_map(done.filter, done.anchored)
         errors = whitened_errors(log.space, progress.mean, progress.cov, truth.poses)
         return Trial(
             log.space.dim,
@@ -141,7 +141,7 @@ def simulated_log(world: RobotWorld, seed: int) -> RobotLog:
         return open_log(name)
 
 
-def _landmark_nees(found: MapSummary, truth: dict[int, np.ndarray]) -> np.ndarray:
+def _landmark_nees(found: MapEstimate, truth: dict[int, np.ndarray]) -> np.ndarray:
     known = np.array([name in truth for name in found.ids.tolist()], dtype=bool)
     error = np.array([truth[name] for name in found.ids[known].tolist()]).reshape(-1, found.mean.shape[1])
     error = error - found.mean[known]

@@ -7,9 +7,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from rbpf.errors import InputError
+from rbpf.runs.files import prepare_folder
 from rbpf.validation.consistency.comparison import Comparison, clear_comparisons, write_comparison
 from rbpf.validation.consistency.verdict import Verdict
-from rbpf.validation.files import prepare_folder
 from rbpf.validation.report.page import write_report
 from rbpf.validation.run_files import TRUTH
 from rbpf.validation.run_record import RunRecord, open_run

@@ -1,6 +1,6 @@
 """The batch problem of any run: its measurements, from memory or from its folder; the optimum; how likely they are.
 
-Range-bearing measurements are those of `rbpf.validation.gtsam.measurements`, a camera's are a `FeatureLog`.
+Range-bearing measurements are those of `rbpf.runs.measurements`, a camera's are a `FeatureLog`.
 """
 
 from collections.abc import Callable
@@ -14,20 +14,20 @@ from numpy.typing import NDArray
 
 from rbpf.errors import InputError
 from rbpf.lie import Array
+from rbpf.runs.camera_files import CAMERAS, read_features
+from rbpf.runs.measurement_files import OBSERVATIONS, read_measurements
+from rbpf.runs.measurements import Measurements
 from rbpf.sensors.features import FeatureLog
 from rbpf.sensors.pinhole import RectifiedStereo
+from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.mono.run import MonoRun
 from rbpf.systems.range_bearing.run import Run
 from rbpf.systems.stereo.run import StereoRun
-from rbpf.validation.camera_files import CAMERAS, read_features
 from rbpf.validation.gtsam import camera, robot
 from rbpf.validation.gtsam.camera_data import CameraEstimate, sightings_of
 from rbpf.validation.gtsam.camera_factors import evaluate_sightings
 from rbpf.validation.gtsam.divergence import mahalanobis
-from rbpf.validation.gtsam.measurements import Measurements
 from rbpf.validation.gtsam.mono_batch import connected_frames
-from rbpf.validation.map_summary import MapSummary
-from rbpf.validation.measurement_files import OBSERVATIONS, read_measurements
 from rbpf.validation.metrics.path_and_map import AnyRun, PathAndMap
 from rbpf.validation.mono_log import feature_log
 from rbpf.validation.run_folder import used_measurements
@@ -230,9 +230,9 @@ def _counted(name: str, most: int) -> Callable[[float], None]:
     return watch
 
 
-def _summary(names: list[int], means: dict[int, Array], covs: dict[int, Array], dim: int) -> MapSummary:
+def _summary(names: list[int], means: dict[int, Array], covs: dict[int, Array], dim: int) -> MapEstimate:
     unknown = np.full((dim, dim), np.nan)
-    return MapSummary(
+    return MapEstimate(
         np.array(names, dtype=np.int64),
         np.array([means[name] for name in names]).reshape(-1, dim),
         np.array([covs.get(name, unknown) for name in names]).reshape(-1, dim, dim),

@@ -11,13 +11,13 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from rbpf.errors import InputError
+from rbpf.runs.alignment import Alignment
+from rbpf.runs.trajectory import Trajectory
 from rbpf.sensors.features import FeatureLog, KnownPoints
 from rbpf.systems.mono.video import VideoRun
 from rbpf.validation.gtsam.camera import CameraEstimate, CameraSolution, solve_features
 from rbpf.validation.metrics.accuracy import ate
-from rbpf.validation.metrics.alignment import Alignment
 from rbpf.validation.metrics.mono_scores import score_path, usual_alignment
-from rbpf.validation.metrics.trajectory import Trajectory
 from rbpf.validation.mono_log import feature_log
 
 ROBUST = 1.345

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from rbpf.errors import InputError
+from rbpf.runs.files import prepare_folder, write_text
 from rbpf.sensors.features import FeatureLog
 from rbpf.sensors.pinhole import Pinhole
 from rbpf.sensors.readers.images.calibration import NAME
 from rbpf.validation.calibration import camera_text
-from rbpf.validation.files import prepare_folder, write_text
 from rbpf.validation.gtsam.batch_problem import read_problem
 from rbpf.validation.gtsam.mono_batch import Batch, adjust_log
 from rbpf.validation.metrics.path_and_map import read_path_and_map

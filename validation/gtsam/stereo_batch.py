@@ -3,12 +3,12 @@
 from typing import Any
 
 from rbpf.errors import InputError
+from rbpf.runs.trajectory import Trajectory
 from rbpf.systems.stereo.run import StereoRun
 from rbpf.validation.gtsam.batch_problem import STEREO_TOLERANCE
 from rbpf.validation.gtsam.mono_batch import Batch, Told, adjust_log
 from rbpf.validation.metrics.accuracy import ate
 from rbpf.validation.metrics.mono_scores import true_path
-from rbpf.validation.metrics.trajectory import Trajectory
 
 MOST = 300_000
 """Sightings that are adjusted at once after a run: more take minutes and gigabytes, and are left to who asks for it."""

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
-from rbpf.validation.metrics.alignment import Alignment, Similarity, fit
-from rbpf.validation.metrics.trajectory import Trajectory
+from rbpf.runs.alignment import Alignment, Similarity, fit
+from rbpf.runs.trajectory import Trajectory
 
 Unit = Literal["frames", "metres"]
 

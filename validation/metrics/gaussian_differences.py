@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
+from rbpf.systems.map_estimate import MapEstimate
 from rbpf.validation.gtsam.divergence import bhattacharyya, kullback_leibler, mahalanobis, sigma_ratio
-from rbpf.validation.map_summary import MapSummary
 from rbpf.validation.metrics.path_and_map import PathAndMap
 
 COLUMNS = ("distances_m", "sigmas", "kullback_leibler", "bhattacharyya", "sigma_ratio")
@@ -136,7 +136,7 @@ def rescaled(estimate: PathAndMap, scale: float) -> PathAndMap:
         estimate,
         world_from_body=poses,
         cov_poses=estimate.cov_poses * np.outer(by, by),
-        landmarks=MapSummary(landmarks.ids, mean, scale**2 * landmarks.cov),
+        landmarks=MapEstimate(landmarks.ids, mean, scale**2 * landmarks.cov),
     )
 
 

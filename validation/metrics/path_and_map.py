@@ -11,17 +11,16 @@ from rbpf import __version__
 from rbpf.core.checkpoint import load_arrays
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3, Array, SE2Group, SE3Group
+from rbpf.runs.trajectory import Trajectory, read_tum
+from rbpf.systems.map_estimate import MapEstimate, estimate_map, map_of
 from rbpf.systems.mono.run import MonoRun
 from rbpf.systems.mono.video import VideoRun
 from rbpf.systems.plain_yaml import read_plain_yaml
 from rbpf.systems.range_bearing.run import Run
 from rbpf.systems.stereo.run import StereoRun
 from rbpf.validation.camera_map import summarise_points
-from rbpf.validation.map_summary import MapSummary, map_of, summarise_map
-from rbpf.validation.metrics.trajectory import Trajectory
 from rbpf.validation.mono_map import summarise_mono_map
 from rbpf.validation.run_files import path_of
-from rbpf.validation.trajectory_files import read_tum
 
 AnyRun = Run | MonoRun | VideoRun | StereoRun
 
@@ -41,7 +40,7 @@ class PathAndMap:
     stamps_ns: NDArray[np.int64]
     world_from_body: Array
     cov_poses: Array
-    landmarks: MapSummary
+    landmarks: MapEstimate
 
     @property
     def space(self) -> SE2Group | SE3Group:
@@ -65,15 +64,15 @@ def of_run(run: AnyRun) -> PathAndMap:
     """The online filtered poses of a run in memory, and its last map, within + between particles."""
     if isinstance(run, Run):
         stamps = np.array([frame.stamp_ns for frame in run.log.frames], dtype=np.int64)
-        summary = summarise_map(run.filter, run.anchored)
+        summary = estimate_map(run.filter, run.anchored)
         return PathAndMap(stamps, run.progress.mean, run.progress.cov, summary)
     if isinstance(run, MonoRun):
         return PathAndMap(run.stamps_ns, run.world_from_camera, run.cov, summarise_points(run.filter))
     if isinstance(run, StereoRun):
-        return PathAndMap(run.stamps_ns, run.world_from_camera, run.cov, summarise_map(run.filter))
+        return PathAndMap(run.stamps_ns, run.world_from_camera, run.cov, estimate_map(run.filter))
     mapped = summarise_mono_map(run.filter)
     full, found = ~mapped.is_ray, mapped.landmarks
-    points = MapSummary(found.ids[full], found.mean[full], found.cov[full])
+    points = MapEstimate(found.ids[full], found.mean[full], found.cov[full])
     return PathAndMap(run.stamps_ns, run.world_from_camera, run.cov, points)
 
 
@@ -121,7 +120,7 @@ def _read_path(folder: Path) -> tuple[NDArray[np.int64], Array, Array]:
     return path.stamps_ns, poses, np.empty((0, dim, dim))
 
 
-def _read_map(folder: Path) -> MapSummary:
+def _read_map(folder: Path) -> MapEstimate:
     return map_of(folder / "map.npz", _arrays(folder / "map.npz", ("id", "mean", "cov")))
 
 

@@ -6,10 +6,10 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import SE2Group, SE3Group
+from rbpf.runs.trajectory import Trajectory
 from rbpf.sensors.readers.log import RobotLog, Truth
 from rbpf.validation.metrics.accuracy import ate, landmark_errors, rpe
 from rbpf.validation.metrics.matching import match_points
-from rbpf.validation.metrics.trajectory import Trajectory
 
 LONGEST_GAP_NS = 500_000_000
 """Truth is interpolated between poses no further apart than this; an instant in a longer gap is not scored."""

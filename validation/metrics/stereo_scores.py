@@ -3,10 +3,10 @@
 import numpy as np
 
 from rbpf.lie import SE3
+from rbpf.runs.trajectory import Trajectory
 from rbpf.systems.stereo.run import StereoRun
 from rbpf.validation.metrics.accuracy import ate, rpe
 from rbpf.validation.metrics.mono_scores import TruePath, true_path
-from rbpf.validation.metrics.trajectory import Trajectory
 from rbpf.validation.run_files import RunTruth
 
 

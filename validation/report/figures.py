@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from rbpf.validation.writing import whole
+from rbpf.runs.files import whole
 
 SIGMAS = 3.0
 COLOURS = {

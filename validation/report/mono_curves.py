@@ -5,12 +5,12 @@ from typing import Any
 import numpy as np
 
 from rbpf.lie import SE3
+from rbpf.runs.alignment import Alignment
+from rbpf.runs.trajectory import Trajectory
 from rbpf.systems.mono.video import VideoRun
 from rbpf.validation.gtsam.mono_batch import Batch
 from rbpf.validation.metrics.accuracy import ate
-from rbpf.validation.metrics.alignment import Alignment
 from rbpf.validation.metrics.mono_scores import TruePath, usual_alignment
-from rbpf.validation.metrics.trajectory import Trajectory
 from rbpf.validation.report.figures import COLOURS, SIGMAS, stacked_axes
 
 CAMERA_HZ = 30.0

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 
 from rbpf.lie import SE3
+from rbpf.runs.alignment import Similarity, align
 from rbpf.systems.mono.system import world_of
 from rbpf.systems.mono.video import VideoRun
 from rbpf.validation.gtsam.mono_batch import Batch
-from rbpf.validation.metrics.alignment import Similarity, align
 from rbpf.validation.metrics.mono_scores import TruePath, true_path
 from rbpf.validation.mono_map import MonoMap
 from rbpf.validation.report.figures import COLOURS, SIGMAS, outline, save_figures

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from rbpf.lie import SE3
+from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.mono.sightings import Sighting
 from rbpf.systems.mono.video import VideoRun
-from rbpf.validation.map_summary import MapSummary
 from rbpf.validation.mono_map import MonoMap
 from rbpf.validation.report.annotated import FOUND, MISSED, STARTED
 from rbpf.validation.report.figures import outline
@@ -50,7 +50,7 @@ def _log_static(rr: Any, stream: Any, run: VideoRun, mapped: MonoMap) -> None:
     full = ~mapped.is_ray
     log_lens(rr, stream, run.sequence.camera)
     stream.log("world/path", rr.LineStrips3D([SE3.translation(run.world_from_camera)]), static=True)
-    points = MapSummary(mapped.landmarks.ids[full], mapped.landmarks.mean[full], mapped.landmarks.cov[full])
+    points = MapEstimate(mapped.landmarks.ids[full], mapped.landmarks.mean[full], mapped.landmarks.cov[full])
     stream.log("world/map/points", ellipsoids(rr, points), static=True)
     stream.log("world/map/rays", rr.LineStrips3D(mapped.ends[mapped.is_ray], colors=[RAY]), static=True)
     if run.known is not None:

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from rbpf.errors import InputError
+from rbpf.runs.files import write_text
 from rbpf.validation.consistency.comparison import Comparison, read_comparisons
 from rbpf.validation.consistency.noise_advice import noise_advice
 from rbpf.validation.consistency.own_statistics import compare_with_itself
 from rbpf.validation.consistency.statistic import Statistic
 from rbpf.validation.consistency.verdict import Verdict, judge
-from rbpf.validation.files import write_text
 from rbpf.validation.report.comparison_figures import timings_figure
 from rbpf.validation.report.figures import save_figures
 from rbpf.validation.run_record import RunRecord, open_run

@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 
+from rbpf.runs.alignment import align
+from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.range_bearing.run import Run
-from rbpf.validation.map_summary import MapSummary
-from rbpf.validation.metrics.alignment import align
 from rbpf.validation.metrics.scores import as_trajectory, truth_at
 from rbpf.validation.report.figures import COLOURS, SIGMAS, new_axes, outline, save_figures
 
 
-def plot_run(run: Run, summary: MapSummary, out: Path, others: dict[str, np.ndarray]) -> list[str]:
+def plot_run(run: Run, summary: MapEstimate, out: Path, others: dict[str, np.ndarray]) -> list[str]:
     """Draws path, map, particles and diagnostics; returns the file names.
 
     Args:
@@ -58,7 +58,7 @@ def _truth(run: Run) -> _TrueWorld | None:
     return _TrueWorld(alignment.transform(true), alignment.transform(points))
 
 
-def _draw_path(run: Run, summary: MapSummary, others: dict[str, np.ndarray]) -> Any:
+def _draw_path(run: Run, summary: MapEstimate, others: dict[str, np.ndarray]) -> Any:
     figure, axes = new_axes(f"{run.log.name}: path, seen from above")
     for name, poses in others.items():
         at = _positions(run, poses)
@@ -79,7 +79,7 @@ def _draw_path(run: Run, summary: MapSummary, others: dict[str, np.ndarray]) -> 
     return figure
 
 
-def _draw_map(run: Run, summary: MapSummary, others: dict[str, np.ndarray]) -> Any:
+def _draw_map(run: Run, summary: MapEstimate, others: dict[str, np.ndarray]) -> Any:
     figure, axes = new_axes(f"{run.log.name}: map with {SIGMAS:g}σ ellipses, seen from above")
     at = _positions(run, run.progress.mean)
     axes.plot(at[:, 0], at[:, 1], color=COLOURS["filter"], lw=0.6, alpha=0.5, label="filter")
@@ -94,7 +94,7 @@ def _draw_map(run: Run, summary: MapSummary, others: dict[str, np.ndarray]) -> A
     return figure
 
 
-def _draw_particles(run: Run, summary: MapSummary, others: dict[str, np.ndarray]) -> Any:
+def _draw_particles(run: Run, summary: MapEstimate, others: dict[str, np.ndarray]) -> Any:
     particles = run.filter.particles
     figure, axes = new_axes(f"{run.log.name}: {particles.n} particles at the last step; area is weight")
     at = _positions(run, particles.state)
@@ -105,7 +105,7 @@ def _draw_particles(run: Run, summary: MapSummary, others: dict[str, np.ndarray]
     return figure
 
 
-def _draw_diagnostics(run: Run, summary: MapSummary, others: dict[str, np.ndarray]) -> Any:
+def _draw_diagnostics(run: Run, summary: MapEstimate, others: dict[str, np.ndarray]) -> Any:
     from matplotlib.figure import Figure
 
     progress, steps = run.progress, np.arange(run.progress.ess.size)

@@ -9,12 +9,11 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.runs.files import prepare_folder, whole
 from rbpf.sensors.pinhole import Pinhole
 from rbpf.sensors.readers.images import ImageFrame
-from rbpf.validation.files import prepare_folder
-from rbpf.validation.map_summary import MapSummary
+from rbpf.systems.map_estimate import MapEstimate
 from rbpf.validation.report.figures import SIGMAS
-from rbpf.validation.writing import whole
 
 QUALITY = 75
 """Of the JPEG images in the recording, in per cent."""
@@ -87,7 +86,7 @@ def log_pose(rr: Any, stream: Any, name: str, pose: np.ndarray) -> None:
     stream.log(f"world/{name}", rr.Transform3D(translation=SE3.translation(pose), quaternion=turned))
 
 
-def ellipsoids(rr: Any, landmarks: MapSummary) -> Any:
+def ellipsoids(rr: Any, landmarks: MapEstimate) -> Any:
     """A map's 3σ ellipsoids, with the landmarks' names."""
     values, vectors = np.linalg.eigh(landmarks.cov)
     turned = vectors * np.where(np.linalg.det(vectors) < 0.0, -1.0, 1.0)[:, None, None]

@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 
 from rbpf.lie import SE3
+from rbpf.runs.alignment import align
+from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.stereo.run import StereoRun
 from rbpf.validation.gtsam.mono_batch import Batch
-from rbpf.validation.map_summary import MapSummary
 from rbpf.validation.metrics.accuracy import ate
-from rbpf.validation.metrics.alignment import align
 from rbpf.validation.metrics.mono_scores import TruePath, true_path
 from rbpf.validation.metrics.stereo_scores import compared
 from rbpf.validation.report.figures import COLOURS, SIGMAS, outline, save_figures, stacked_axes
@@ -20,7 +20,7 @@ MAP_FRACTION = 0.9
 """The map's picture holds the path and this fraction of the points; single points far off do not make it small."""
 
 
-def plot_stereo_run(run: StereoRun, mapped: MapSummary, out: Path, batch: Batch | None = None) -> list[str]:
+def plot_stereo_run(run: StereoRun, mapped: MapEstimate, out: Path, batch: Batch | None = None) -> list[str]:
     """Draws path, map, particles, error, tracking and times; returns the file names."""
     views, truth = best_views(run.world_from_camera), true_path(run.truth, run.stamps_ns)
     figures = {
@@ -55,7 +55,7 @@ def _path(run: StereoRun, views: Views, truth: TruePath | None, batch: Batch | N
     return figure
 
 
-def _map(run: StereoRun, mapped: MapSummary, views: Views) -> Any:
+def _map(run: StereoRun, mapped: MapEstimate, views: Views) -> Any:
     figure, shown = views.axes(f"{run.name}: map with {SIGMAS:g}σ ellipses")
     at, mean, cov = SE3.translation(run.world_from_camera), mapped.mean, mapped.cov
     middle = np.median(np.concatenate([mean, at]), axis=0)

@@ -13,15 +13,15 @@ from typing import Any
 
 from rbpf.lie import SE3
 from rbpf.sensors.readers.images.stereo import StereoSequence
+from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.stereo.run import StereoRun
 from rbpf.systems.stereo.seen import LANDMARK
-from rbpf.validation.map_summary import MapSummary
 from rbpf.validation.report.annotated import FOUND
 from rbpf.validation.report.rerun_file import ellipsoids, log_image, log_lens, log_pose, log_time, recording
 from rbpf.validation.report.stereo_frames import COLOURS, NAMES
 
 
-def write_stereo_rerun(run: StereoRun, sequence: StereoSequence, mapped: MapSummary, path: Path) -> None:
+def write_stereo_rerun(run: StereoRun, sequence: StereoSequence, mapped: MapEstimate, path: Path) -> None:
     """Writes the recording; it appears under its name when it is complete.
 
     Args:
@@ -41,7 +41,7 @@ def write_stereo_rerun(run: StereoRun, sequence: StereoSequence, mapped: MapSumm
             _log_pair(rr, stream, run, t)
 
 
-def _log_static(rr: Any, stream: Any, run: StereoRun, mapped: MapSummary) -> None:
+def _log_static(rr: Any, stream: Any, run: StereoRun, mapped: MapEstimate) -> None:
     log_lens(rr, stream, run.front_end.rig.camera)
     for name, poses in (("path", run.world_from_camera), ("odometry", run.odometry)):
         stream.log(f"world/{name}", rr.LineStrips3D([SE3.translation(poses)]), static=True)

@@ -6,6 +6,7 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3
+from rbpf.runs.trajectory import read_tum
 from rbpf.validation.report.comparison_figures import (
     error_figure,
     landmark_figure,
@@ -17,7 +18,6 @@ from rbpf.validation.report.comparison_figures import (
 from rbpf.validation.report.figures import save_figures
 from rbpf.validation.run_files import FilteredPath, in_space
 from rbpf.validation.run_record import RunRecord
-from rbpf.validation.trajectory_files import read_tum
 
 if TYPE_CHECKING:
     from rbpf.validation.consistency.against_groundtruth import LandmarkErrors, TruthErrors

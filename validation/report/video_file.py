@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rbpf.validation.writing import whole
+from rbpf.runs.files import whole
 
 SHORTEST_S, LONGEST_S = 1.0 / 120.0, 1.0
 """Bounds of the time per image, for sequences whose stamps say little: photos, equal stamps."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.validation.files import write_csv, write_text
+from rbpf.runs.files import write_csv, write_text
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import SE2
+from rbpf.runs.files import write_csv, write_text
 from rbpf.sensors.readers.wheel_odometry import MOTION, MOUNT, NAME, SIGMA, WheelOdometry
-from rbpf.validation.files import write_csv, write_text
 from rbpf.validation.simulation.driven_paths import Travelled
 from rbpf.validation.simulation.limits import check_not_negative, check_positive
 

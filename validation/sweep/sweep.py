@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from rbpf.errors import InputError
-from rbpf.validation.files import prepare_folder, write_csv
+from rbpf.runs.files import prepare_folder, write_csv
 from rbpf.validation.sweep.plan import Job
 from rbpf.validation.sweep.systems import system_named
 

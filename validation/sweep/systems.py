@@ -52,15 +52,15 @@ def _robot_settings(pairs: Sequence[str], given: Mapping[str, Any]) -> Any:
 
 def _run_robot(sequence: Mapping[str, Path], pairs: Sequence[str], given: Mapping[str, Any]) -> Figures:
     from rbpf.sensors.readers import open_log
+    from rbpf.systems.map_estimate import estimate_map
     from rbpf.systems.range_bearing.run import run
-    from rbpf.validation.map_summary import summarise_map
     from rbpf.validation.run_folder import summarise
     from rbpf.validation.run_truth import robot_truth
 
     config = _robot_settings(pairs, given)
     log = open_log(sequence["recording"], config.noise)
     done = run(log, config)
-    figures = summarise(done, summarise_map(done.filter, done.anchored))
+    figures = summarise(done, estimate_map(done.filter, done.anchored))
     return figures | _pose_nees(log.space, done.progress.mean, done.progress.cov, robot_truth(log))
 
 
@@ -91,14 +91,14 @@ def _stereo_settings(pairs: Sequence[str], given: Mapping[str, Any]) -> Any:
 
 def _run_stereo(sequence: Mapping[str, Path], pairs: Sequence[str], given: Mapping[str, Any]) -> Figures:
     from rbpf.lie import SE3
-    from rbpf.validation.map_summary import summarise_map
+    from rbpf.systems.map_estimate import estimate_map
     from rbpf.validation.metrics.stereo_scores import stereo_truth
     from rbpf.validation.stereo import StereoRecording, start_stereo
     from rbpf.validation.stereo_folder import summarise_stereo
 
     recording = StereoRecording(sequence["recording"], sequence.get("calibration"))
     done = start_stereo(recording, _stereo_settings(pairs, given))
-    figures = summarise_stereo(done, summarise_map(done.filter))
+    figures = summarise_stereo(done, estimate_map(done.filter))
     return figures | _pose_nees(SE3, done.world_from_camera, done.cov, stereo_truth(done))
 
 

@@ -37,10 +37,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rbpf.lie import SE2, SE3, Array, SE2Group, SE3Group
+from rbpf.runs.files import whole
+from rbpf.runs.headed_table import HeadedTable
+from rbpf.runs.measurements import KINDS, Measurements, are_covariances, are_poses, point_dim
 from rbpf.sensors.readers.text import quoted
-from rbpf.validation.gtsam.measurements import KINDS, Measurements, are_covariances, are_poses, point_dim
-from rbpf.validation.measurement_table import HeadedTable
-from rbpf.validation.writing import whole
 
 OBSERVATIONS = "observations.csv"
 ODOMETRY = "observations_odometry.csv"

@@ -45,11 +45,11 @@ from pathlib import Path
 import numpy as np
 
 from rbpf import gaussian
+from rbpf.runs.files import write_text
+from rbpf.runs.headed_table import HeadedTable
 from rbpf.sensors.features import FeatureFrame, FeatureLog, KnownPoints
 from rbpf.sensors.pinhole import LENSES, Pinhole, RectifiedStereo
 from rbpf.sensors.readers.text import quoted
-from rbpf.validation.files import write_text
-from rbpf.validation.measurement_table import HeadedTable
 
 OBSERVATIONS = "observations.csv"
 FRAMES = "observations_frames.csv"

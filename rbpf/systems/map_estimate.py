@@ -17,7 +17,7 @@ from rbpf.sensors.range_bearing import RelativePosition
 
 
 @dataclass(frozen=True)
-class MapSummary:
+class MapEstimate:
     """Landmarks of a run.
 
     Attributes:
@@ -35,7 +35,7 @@ class MapSummary:
         return dict(zip(self.ids.tolist(), self.mean, strict=True))
 
 
-def map_of(path: Path, arrays: dict[str, np.ndarray]) -> MapSummary:
+def map_of(path: Path, arrays: dict[str, np.ndarray]) -> MapEstimate:
     """The landmarks of a map.npz that are points; those whose depth is not known are left out.
 
     Args:
@@ -54,10 +54,10 @@ def map_of(path: Path, arrays: dict[str, np.ndarray]) -> MapSummary:
         known = np.ones(ids.size, dtype=bool)
         if "ray" in arrays:
             known = checked(arrays, "ray", (ids.size,), "iub") == 0
-    return MapSummary(ids[known], mean[known], cov[known])
+    return MapEstimate(ids[known], mean[known], cov[known])
 
 
-def summarise_map(filter_: Filter, anchored: Anchored | None = None) -> MapSummary:
+def estimate_map(filter_: Filter, anchored: Anchored | None = None) -> MapEstimate:
     """Mixture moments of every landmark that exists in most of the weight.
 
     Args:
@@ -84,7 +84,7 @@ def summarise_map(filter_: Filter, anchored: Anchored | None = None) -> MapSumma
         means.append(mean)
         covs.append(cov)
     dim = landmark_map.layouts[0].landmark.dim
-    return MapSummary(
+    return MapEstimate(
         np.array(names, dtype=np.int64),
         np.array(means).reshape(-1, dim),
         np.array(covs).reshape(-1, dim, dim),

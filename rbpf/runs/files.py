@@ -1,10 +1,12 @@
-"""What every system's run folder is written with: whole files or none, tables, maps, figures."""
+"""Files that a run leaves: whole or not there at all; tables, maps and summaries."""
 
 import csv
 import json
+import os
 import resource
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -14,8 +16,28 @@ import numpy as np
 from rbpf import gaussian
 from rbpf.core.checkpoint import save_arrays
 from rbpf.errors import InputError
-from rbpf.validation.map_summary import MapSummary
-from rbpf.validation.writing import whole
+from rbpf.systems.map_estimate import MapEstimate
+
+
+@contextmanager
+def whole(path: Path) -> Iterator[Path]:
+    """A temporary place beside a file, which gets the file's name when everything is written.
+
+    Nothing stays of what fails half way, and a file that was there before stays as it was.
+
+    Raises:
+        InputError: the place cannot be written to, or the disk is full.
+    """
+    temporary = path.with_name(f"{path.stem}.partial{path.suffix}")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    except OSError as error:
+        reason = (error.strerror or str(error)).strip().splitlines()[0]
+        raise InputError(f"{path} cannot be written: {reason}") from error
+    finally:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
 
 
 def prepare_folder(out: Path) -> None:
@@ -52,7 +74,7 @@ def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) 
     write_text(path, buffer.getvalue())
 
 
-def write_map(out: Path, summary: MapSummary, facts: Mapping[str, np.ndarray] | None = None) -> None:
+def write_map(out: Path, summary: MapEstimate, facts: Mapping[str, np.ndarray] | None = None) -> None:
     """map.npz and map.csv.
 
     Args:

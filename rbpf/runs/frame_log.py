@@ -1,0 +1,193 @@
+"""What a run remembers of every frame: columns of numbers, and what each frame showed.
+
+The columns are those that every system has, below, and the system's own (`System.columns`, `System.observed`). A
+system declares a column once, with name, unit, shape and meaning; tables, checkpoints, data frames and the report
+follow from that.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, final
+
+import numpy as np
+
+from rbpf.core.archive import checked
+from rbpf.errors import InputError
+from rbpf.lie import SE2Group, SE3Group
+from rbpf.systems.system import (
+    DIAGNOSTICS,
+    TIMINGS,
+    Column,
+    Ragged,
+    System,
+    Tracked,
+    TrackingState,
+)
+
+COMMON = (
+    Column("seconds", "time that the system took, without reading and decoding", "s", table=TIMINGS),
+    Column("seconds_waiting", "time until the frame was read and decoded", "s"),
+    Column("state", "state of tracking, as its place in `TrackingState`", kind=int),
+)
+"""Columns of every system; times are written in milliseconds."""
+
+_STATES = list(TrackingState)
+
+
+@final
+class FrameLog:
+    """One row per frame.
+
+    `log["ess"]` is a column (T, …); `log.poses`, `log.covs` and `log.stamps_ns` are the path as it is known now;
+    `log.observed(t)` is what frame t showed.
+
+    Args:
+        space: group of the poses.
+        columns: what the system says of every frame besides `COMMON`.
+        ragged: what it says of what every frame showed.
+    """
+
+    def __init__(
+        self, space: SE2Group | SE3Group, columns: Sequence[Column], ragged: Sequence[Ragged] = ()
+    ) -> None:
+        self.space = space
+        self.columns = (*COMMON, *columns)
+        self.ragged = tuple(ragged)
+        self._path: dict[str, list[Any]] = {"stamps_ns": [], "poses": [], "covs": []}
+        self._rows: dict[str, list[Any]] = {column.name: [] for column in self.columns}
+        self._observed: dict[str, list[np.ndarray]] = {field.name: [] for field in self.ragged}
+
+    @classmethod
+    def of(cls, system: System) -> "FrameLog":
+        """An empty log for a system."""
+        return cls(system.space, system.columns, system.observed)
+
+    def __len__(self) -> int:
+        return len(self._path["stamps_ns"])
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """A column (T, …) by name.
+
+        Raises:
+            KeyError: there is no such column.
+        """
+        column = next((column for column in self.columns if column.name == name), None)
+        if column is None:
+            raise KeyError(f"no column is called {name!r}: {', '.join(self._rows)}")
+        return np.array(self._rows[name], dtype=column.kind).reshape(len(self), *column.shape)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._rows
+
+    @property
+    def stamps_ns(self) -> np.ndarray:
+        """(T,) int64 times of the frames."""
+        return np.array(self._path["stamps_ns"], dtype=np.int64)
+
+    @property
+    def poses(self) -> np.ndarray:
+        """(T, E) world_from_body: filtered means, revised ones where the system has revised them."""
+        return np.array(self._path["poses"], dtype=float).reshape(len(self), self.space.size)
+
+    @property
+    def covs(self) -> np.ndarray:
+        """(T, d, d) covariances of the poses in the right chart at each."""
+        return np.array(self._path["covs"], dtype=float).reshape(len(self), self.space.dim, self.space.dim)
+
+    @property
+    def states(self) -> list[TrackingState]:
+        """State of tracking after each frame."""
+        return [_STATES[int(state)] for state in self._rows["state"]]
+
+    def lost(self) -> np.ndarray:
+        """(T,) bool, whether the system said that it was lost."""
+        return np.array([state is TrackingState.LOST for state in self.states], dtype=bool)
+
+    def observed(self, t: int) -> dict[str, np.ndarray]:
+        """What frame t showed, arrays by name."""
+        return {name: frames[t] for name, frames in self._observed.items()}
+
+    def append(self, tracked: Tracked, seconds: float, waiting: float = 0.0) -> None:
+        """The next frame."""
+        own = {"seconds": seconds, "seconds_waiting": waiting, "state": _STATES.index(tracked.state)}
+        for name, values in self._rows.items():
+            values.append(own[name] if name in own else tracked.values[name])
+        for field in self.ragged:
+            rows = np.asarray(tracked.observed[field.name], dtype=field.kind)
+            self._observed[field.name].append(rows.reshape(-1, *field.shape))
+        for name, value in zip(self._path, (tracked.stamp_ns, tracked.pose, tracked.cov), strict=True):
+            self._path[name].append(value)
+        revision = tracked.revision
+        if revision is not None:
+            first = len(self) - len(revision.poses)
+            self._path["poses"][first:] = list(revision.poses)
+            self._path["covs"][first:] = list(revision.covs)
+
+    def table(self, name: str) -> tuple[list[str], list[list[Any]]]:
+        """A table of the run folder: its header, and its columns as plain numbers; times in milliseconds."""
+        header, columns = ["step"], [list(range(len(self)))]
+        if name == DIAGNOSTICS:
+            header, columns = ["step", "stamp_ns"], [*columns, self._path["stamps_ns"]]
+        for column in self.columns:
+            if column.table != name:
+                continue
+            values = self[column.name]
+            if name == TIMINGS:
+                header.append("milliseconds" if column.name == "seconds" else column.heading or column.name)
+                columns.append((1e3 * values).round(4).tolist())
+            else:
+                header.append(column.heading or column.name)
+                columns.append((values.astype(int) if column.kind is bool else values).tolist())
+        return header, columns
+
+    def to_dataframe(self) -> Any:
+        """A pandas DataFrame: times, poses and all columns of single numbers.
+
+        Raises:
+            InputError: pandas is not installed.
+        """
+        try:
+            import pandas
+        except ImportError as error:
+            raise InputError(
+                "a data frame needs pandas, which is not installed: pip install pandas"
+            ) from error
+        scalars = {column.name: self[column.name] for column in self.columns if not column.shape}
+        poses = {f"pose_{i}": values for i, values in enumerate(self.poses.T)}
+        return pandas.DataFrame({"stamp_ns": self.stamps_ns, **poses, **scalars})
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """For a checkpoint."""
+        out = {"log/stamps_ns": self.stamps_ns, "log/poses": self.poses, "log/covs": self.covs}
+        out |= {f"log/{column.name}": self[column.name] for column in self.columns}
+        for field in self.ragged:
+            frames = self._observed[field.name]
+            empty = np.zeros((0, *field.shape), dtype=field.kind)
+            out[f"observed/{field.name}"] = np.concatenate([empty, *frames])
+            out[f"observed/{field.name}/counts"] = np.array([len(rows) for rows in frames], dtype=np.int64)
+        return out
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """The inverse of `arrays`, into an empty log of the same system.
+
+        Raises:
+            InputError: an array is missing, or is not what it should be.
+        """
+        found = dict(arrays)
+        total = checked(found, "log/stamps_ns", (None,), "i").size
+        self._path["stamps_ns"] = found["log/stamps_ns"].tolist()
+        self._path["poses"] = list(checked(found, "log/poses", (total, self.space.size), "f").copy())
+        dim = self.space.dim
+        self._path["covs"] = list(checked(found, "log/covs", (total, dim, dim), "f").copy())
+        for column in self.columns:
+            values = checked(found, f"log/{column.name}", (total, *column.shape), "fiub")
+            self._rows[column.name] = values.tolist() if not column.shape else list(values.copy())
+        for field in self.ragged:
+            counts = checked(found, f"observed/{field.name}/counts", (total,), "i")
+            rows = checked(found, f"observed/{field.name}", (None, *field.shape), "fiub")
+            if (counts < 0).any() or counts.sum() != len(rows):
+                raise InputError(
+                    f"the array observed/{field.name} has {len(rows)} rows, expected {counts.sum()}"
+                )
+            self._observed[field.name] = (
+                np.split(rows.astype(field.kind), np.cumsum(counts)[:-1]) if total else []
+            )

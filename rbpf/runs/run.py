@@ -1,0 +1,165 @@
+"""A run: a system, a recording, and what the system said of every frame; and the one loop that makes it.
+
+    run = Run("desk", MonoSlam(camera, config))
+    drive(run, source)                           # or run.take(frame), one at a time
+    run.log["ess"], run.log.poses, run.messages
+
+Whoever wants to follow a run while it is made (a progress bar, a live view, a plot) is a listener: it is called with
+the run and what `track` returned, after each frame.
+"""
+
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from rbpf.core.archive import checked
+from rbpf.core.checkpoint import fitting
+from rbpf.errors import InputError
+from rbpf.runs.frame_log import FrameLog
+from rbpf.runs.truth import Truth
+from rbpf.systems.system import System, Tracked, TrackingState
+
+
+class Source(Protocol):
+    """Where frames come from: a recording, a camera, anything."""
+
+    name: str
+
+    def frames(self, start: int = 0) -> Iterator[Any]:
+        """Frames from number `start` on, each with a `stamp_ns`, as the system's `take` expects them."""
+
+
+@dataclass(eq=False)
+class Run:
+    """What a system said of a recording.
+
+    Attributes:
+        name: of the recording.
+        system: as it is now.
+        truth: ground truth of the recording; None where it has none.
+        log: one row per frame.
+        messages: what was worth saying of single frames, in words: "frame 12: …".
+        failure: why the run ended before the recording did, in words; None where it did not.
+    """
+
+    name: str
+    system: System
+    truth: Truth | None = None
+    log: FrameLog = field(init=False)
+    messages: list[str] = field(default_factory=list)
+    failure: str | None = None
+
+    def __post_init__(self) -> None:
+        self.log = FrameLog.of(self.system)
+
+    def take(self, frame: Any, waiting: float = 0.0) -> Tracked:
+        """Gives the system a frame and keeps what it says; `waiting` is the time [s] that the frame took to arrive.
+
+        Raises:
+            InputError: as the system's `take`.
+        """
+        started = time.perf_counter()
+        tracked = self.system.take(frame)
+        seconds = time.perf_counter() - started
+        self.messages += [f"{self.system.frame_word} {len(self.log)}: {words}" for words in tracked.messages]
+        self.log.append(tracked, seconds, waiting)
+        return tracked
+
+    def relocalisations(self) -> list[int]:
+        """Numbers of the frames in which the system found itself again after it had been lost."""
+        lost = np.concatenate([[False], self.log.lost()])
+        tracked = np.array([state is TrackingState.TRACKED for state in self.log.states], dtype=bool)
+        return np.flatnonzero(lost[:-1] & tracked).tolist()
+
+    def save(self, path: Path) -> None:
+        """Writes a checkpoint of the system and of everything gathered so far.
+
+        Raises:
+            InputError: the file cannot be written.
+        """
+        messages = {"log/messages": np.array(self.messages, dtype=np.str_)}
+        self.system.save(path, self.log.arrays() | messages)
+
+    def load(self, path: Path) -> None:
+        """Goes on from a checkpoint.
+
+        Raises:
+            InputError: the file is missing or damaged, or belongs to a run of another kind or with other settings.
+        """
+        arrays = self.system.load(path)
+        with fitting(path):
+            self.log.restore(arrays)
+            self.messages = checked(arrays, "log/messages", (None,), "U").tolist()
+
+
+Listener = Callable[[Run, Tracked], None]
+
+
+def drive(
+    run: Run,
+    source: Source,
+    listeners: Iterable[Listener] = (),
+    checkpoint: Path | None = None,
+    every: int = 500,
+    resume: bool = False,
+    stamps_ns: Sequence[int] | np.ndarray | None = None,
+) -> Run:
+    """Takes all frames of a source that the run has not taken yet.
+
+    What was computed before a frame that cannot be filtered is kept: the run is then shorter and has a `failure`. A
+    disk that is full ends no run; it goes on with the last checkpoint that could be written.
+
+    Args:
+        run: new, or as far as it has come.
+        source: of frames.
+        listeners: called after each frame; a KeyboardInterrupt from one leaves a checkpoint behind.
+        checkpoint: file of checkpoints; None writes none.
+        every: frames between checkpoints.
+        resume: go on from the checkpoint, if there is one.
+        stamps_ns: (T,) times of all frames, where they are known: a checkpoint must be of the same.
+
+    Raises:
+        InputError: the first frame is refused, or the checkpoint is of another run.
+    """
+    if resume and checkpoint is not None and checkpoint.exists():
+        run.load(checkpoint)
+        done = run.log.stamps_ns
+        if stamps_ns is not None and not np.array_equal(done, np.asarray(stamps_ns)[: done.size]):
+            raise InputError(f"{checkpoint} belongs to a run over another recording: start without --resume")
+    if stamps_ns is not None and len(run.log) >= len(stamps_ns):
+        return run  # a finished run that is resumed
+
+    waited = time.perf_counter()
+    for frame in source.frames(len(run.log)):
+        try:
+            tracked = run.take(frame, time.perf_counter() - waited)
+        except InputError as error:
+            if not len(run.log):
+                raise
+            run.failure = f"{run.system.frame_word} {len(run.log)} of {run.name}: {error}"
+            break
+        if checkpoint is not None and len(run.log) % every == 0:
+            _keep(run, checkpoint)
+        try:
+            for listener in listeners:
+                listener(run, tracked)
+        except KeyboardInterrupt:
+            if checkpoint is not None:
+                _keep(run, checkpoint)
+            raise
+        waited = time.perf_counter()
+    if checkpoint is not None and run.failure is None:
+        _keep(run, checkpoint)
+    return run
+
+
+def _keep(run: Run, checkpoint: Path) -> None:
+    """Writes a checkpoint; where the disk is full the run goes on all the same, and the last one stays."""
+    try:
+        run.save(checkpoint)
+    except InputError as error:
+        run.messages.append(f"{run.system.frame_word} {len(run.log) - 1}: no checkpoint is kept: {error}")

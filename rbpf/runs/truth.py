@@ -1,0 +1,142 @@
+"""Ground truth of a recording at a run's own frames, and the file that keeps it (truth.npz).
+
+truth.npz    rows (R,) of the frames with a true pose, poses (R, E); ids (M,) and landmarks (M, D); alignment: what
+             brings the estimate into the truth's world, "none" where both are expressed in the same one
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from rbpf.core.archive import checked, load_arrays, save_arrays
+from rbpf.core.checkpoint import fitting
+from rbpf.errors import InputError
+from rbpf.lie import SE2Group, SE3Group
+from rbpf.runs.alignment import Alignment
+from rbpf.sensors.range_bearing import RelativePosition
+from rbpf.systems.system import Gauge
+
+TRUTH = "truth.npz"
+
+LONGEST_GAP_NS = 500_000_000
+"""Truth is interpolated between poses no further apart than this; an instant in a longer gap is not scored."""
+
+_ALIGNMENTS: dict[str, Alignment] = {"none": "none", "rigid": "rigid", "similarity": "similarity"}
+
+
+class GroundTruth(Protocol):
+    """True poses (T, E) world_from_body at stamps (T,), and landmarks by name, as recordings have them."""
+
+    @property
+    def stamps_ns(self) -> np.ndarray: ...
+    @property
+    def poses(self) -> np.ndarray: ...
+    @property
+    def landmarks(self) -> Mapping[int, np.ndarray]: ...
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Ground truth at a run's own frames.
+
+    Attributes:
+        rows: (R,) frames that have a true pose.
+        poses: (R, E) world_from_body.
+        landmarks: name of a landmark to its (D,) position.
+        alignment: what brings the estimate into the truth's world; "none" where both are expressed in the same one.
+    """
+
+    rows: np.ndarray
+    poses: np.ndarray
+    landmarks: dict[int, np.ndarray] = field(default_factory=dict)
+    alignment: Alignment = "none"
+
+
+def truth_at(
+    space: SE2Group | SE3Group, truth: GroundTruth, stamps_ns: np.ndarray, gauge: Gauge
+) -> Truth | None:
+    """The truth at a run's frames; None where no frame has a true pose.
+
+    Args:
+        space: group of the poses.
+        truth: of the recording.
+        stamps_ns: (T,) of the frames.
+        gauge: what the run's world is. Where it begins at the first frame, so does the truth, if it is known there;
+            else only an alignment brings the two together.
+    """
+    rows, poses = poses_at(space, truth.stamps_ns, truth.poses, stamps_ns)
+    if not rows.size:
+        return None
+    dim = 2 if isinstance(space, SE2Group) else 3
+    landmarks = {name: np.asarray(point, dtype=float)[:dim] for name, point in truth.landmarks.items()}
+    if gauge != "first frame":
+        return Truth(rows, poses, landmarks, _ALIGNMENTS[gauge])
+    if rows[0] != 0:
+        return Truth(rows, poses, landmarks, "rigid")
+    model, start = RelativePosition(space), poses[0]
+    moved = {name: model.predict(start, point) for name, point in landmarks.items()}
+    return Truth(rows, space.between(start, poses), moved, "none")
+
+
+def poses_at(
+    space: SE2Group | SE3Group, true_ns: np.ndarray, poses: np.ndarray, stamps_ns: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of `stamps_ns` that lie inside true stamps (T,), and the interpolated true poses (T, E) there.
+
+    Stamps that count steps are met exactly; between poses the geodesic is followed.
+    """
+    last = true_ns.size - 1
+    after = np.searchsorted(true_ns, stamps_ns, side="left")
+    exact = np.minimum(after, last)
+    met = true_ns[exact] == stamps_ns
+    before = np.clip(np.where(met, exact, after - 1), 0, last)
+    after = np.clip(np.where(met, exact, after), 0, last)
+    gap = true_ns[after] - true_ns[before]
+    inside = (true_ns[before] <= stamps_ns) & (stamps_ns <= true_ns[after])
+    rows = np.flatnonzero(met | (inside & (gap <= LONGEST_GAP_NS)))
+    fraction = (stamps_ns[rows] - true_ns[before[rows]]) / np.maximum(gap[rows], 1)
+    return rows, space.interpolate(poses[before[rows]], poses[after[rows]], fraction)
+
+
+def write_truth(out: Path, truth: Truth | None) -> None:
+    """Writes truth.npz, or removes one of an earlier run where there is no truth."""
+    if truth is None:
+        (out / TRUTH).unlink(missing_ok=True)
+        return
+    points = np.array(list(truth.landmarks.values()), dtype=float)
+    arrays = {
+        "rows": truth.rows,
+        "poses": truth.poses,
+        "ids": np.array(list(truth.landmarks), dtype=np.int64),
+        "landmarks": points.reshape(len(truth.landmarks), points.shape[-1]),
+        "alignment": np.array(truth.alignment),
+    }
+    save_arrays(out / TRUTH, arrays)
+
+
+def read_truth(folder: Path, steps: int, size: int) -> Truth:
+    """Reads truth.npz of a run of so many steps, with poses of so many numbers.
+
+    Raises:
+        InputError: there is none, it is damaged or another run's, or no step has a true pose.
+    """
+    path = folder / TRUTH
+    if not path.is_file():
+        raise InputError(
+            f"{folder} has no ground truth: its recording has none; compare it with its batch optimum instead"
+        )
+    arrays = load_arrays(path)
+    with fitting(path):
+        rows = checked(arrays, "rows", (None,), "i")
+        poses = checked(arrays, "poses", (rows.size, None), "f")
+        alignment = _ALIGNMENTS[str(checked(arrays, "alignment", (), "U"))]
+        ids = checked(arrays, "ids", (None,), "i")
+        landmarks = dict(zip(ids.tolist(), checked(arrays, "landmarks", (ids.size, None), "f"), strict=True))
+    if poses.shape[1] != size or (rows.size and not 0 <= rows.min() <= rows.max() < steps):
+        raise InputError(f"{path} belongs to another run than {folder / 'trajectory.npz'}")
+    if not rows.size:
+        raise InputError(f"{folder}: no step of the run has the time of a true pose")
+    return Truth(rows, poses, landmarks, alignment)

@@ -1,0 +1,303 @@
+"""Range-bearing SLAM in the plane and in space: odometry, a mounted sensor, point landmarks, FastSLAM 2.0.
+
+slam = RangeBearingSlam(RangeBearingConfig(particles=100))
+for stamp_ns, odometry, names, z, cov_z in log:
+frame = slam.track(z, cov_z, names, odometry, stamp_ns)
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar, Literal, final
+
+import numpy as np
+
+from rbpf.core.anchoring import StartAnchor
+from rbpf.core.diagnostics import motion_correction
+from rbpf.core.filter import Filter, StepReport
+from rbpf.core.models import NEW, NULL, Sensor
+from rbpf.lie import SE2, SE2Group, SE3Group
+from rbpf.maps.landmark_map import LandmarkMap
+from rbpf.maps.point import Point
+from rbpf.motion.odometry import Odometry, OdometryMotion
+from rbpf.sensors.landmark_sensor import AnonymousLandmarkSensor, NamedLandmarkSensor
+from rbpf.sensors.range_bearing import RangeBearing, RelativePosition
+from rbpf.sensors.readers.log import Frame, RobotLog
+from rbpf.sensors.rigid_point import RigidPointModel
+from rbpf.systems.map_estimate import MapEstimate, estimate_map
+from rbpf.systems.range_bearing.config import RangeBearingConfig
+from rbpf.systems.system import (
+    ESS,
+    LOG_EVIDENCE,
+    NIS,
+    NIS_DOF,
+    RESAMPLED,
+    Column,
+    Ragged,
+    System,
+    Tracked,
+    TrackingState,
+)
+
+Kind = Literal["range_bearing", "position"]
+
+
+@final
+class RangeBearingSlam(System):
+    """A robot with odometry among point landmarks; it starts at the origin of the world.
+
+    Args:
+        config: all settings.
+        space: SE2 or SE3, group of the robot's poses.
+        measurement: "range_bearing" (range, yaw[, pitch]) or "position" (point in the sensor's frame).
+        robot_from_sensor: (E,) mounting pose of the sensor; by default the robot's own frame.
+        pitch_sign: +1 where positive pitch points up, −1 where it points down.
+        keep_associations: remember which landmark each particle took every observation for, until the end of the run
+            tells which lineage survives; the memory that this takes grows with the run.
+        wrapped: puts a sensor around the usual one, to change what it observes or starts.
+    """
+
+    name: ClassVar[str] = "range-bearing"
+    frame_word: ClassVar[str] = "step"
+
+    def __init__(
+        self,
+        config: RangeBearingConfig | None = None,
+        space: SE2Group | SE3Group = SE2,
+        measurement: Kind = "range_bearing",
+        robot_from_sensor: np.ndarray | None = None,
+        pitch_sign: float = 1.0,
+        keep_associations: bool = False,
+        wrapped: Callable[[Sensor], Sensor] | None = None,
+    ) -> None:
+        self.config = config = config or RangeBearingConfig()
+        self.space, self.measurement, self.pitch_sign = space, measurement, pitch_sign
+        self.robot_from_sensor = space.identity() if robot_from_sensor is None else robot_from_sensor
+        self.model = self._model()
+        self.point = Point(2 if isinstance(space, SE2Group) else 3)
+        landmark_map = LandmarkMap(space, evidence=config.association == "ml", compiled=config.compiled)
+        landmark_map.register(self.point)
+        sensor = self._sensor()
+        self.filter = Filter(
+            OdometryMotion(space),
+            sensor if wrapped is None else wrapped(sensor),
+            landmark_map,
+            config.proposal.build(),
+            config.resampling.build(),
+            config.particles,
+            np.random.default_rng(config.seed),
+            lag=config.lag,
+        )
+        self.anchor = StartAnchor(self.filter, config.anchor_every) if config.anchor_every else None
+        self._names: set[int] = set()
+        self._associations = _Associations(self.filter) if keep_associations else None
+        d, e, p = space.dim, space.size, self.model.dim
+        self.columns = (
+            ESS,
+            RESAMPLED,
+            LOG_EVIDENCE,
+            NIS,
+            NIS_DOF,
+            Column(
+                "correction",
+                "what the observations say about the motion, in its whitened coordinates",
+                shape=(d,),
+            ),
+            Column("cov_correction", "what a consistent filter expects of the correction", shape=(d, d)),
+            Column("delta", "odometry, previous_robot_from_robot; NaN in the first frame", shape=(e,)),
+            Column("cov_delta", "its covariance in the right chart", "rad² and m²", shape=(d, d)),
+        )
+        self.observed = (
+            Ragged(
+                "landmarks", "name of each observation's landmark, −1 where it was not used", kind="int64"
+            ),
+            Ragged("z", "measurements", (p,)),
+            Ragged("cov_z", "their covariance", (p, p)),
+        )
+
+    @classmethod
+    def of_log(
+        cls, log: RobotLog, config: RangeBearingConfig | None = None, keep_associations: bool = False
+    ) -> "RangeBearingSlam":
+        """The system for the robot and the sensor of a log."""
+        kind: Kind = "position" if log.measurement == "position" else "range_bearing"
+        return cls(config, log.space, kind, log.robot_from_sensor, log.pitch_sign, keep_associations)
+
+    def track(
+        self,
+        z: np.ndarray,
+        cov_z: np.ndarray,
+        landmarks: np.ndarray | None = None,
+        odometry: Odometry | None = None,
+        stamp_ns: int | None = None,
+    ) -> Tracked:
+        """One step: the motion since the last one, and what was then observed.
+
+        Args:
+            z: (K, p) measurements.
+            cov_z: (K, p, p) their covariance.
+            landmarks: (K,) names; None, or −1, where they are not known.
+            odometry: motion since the last step; None in the first one.
+            stamp_ns: time; by default one second after the last step.
+
+        Raises:
+            InputError: time runs backwards, a shape does not fit, or no particle explains the observations.
+        """
+        names = np.full(len(z), NULL) if landmarks is None else np.asarray(landmarks, dtype=np.int64)
+        report = self.filter.step(Observed(names, z, cov_z), odometry, stamp_ns)
+
+        # Poses are reported relative to where the start lies in each particle's world, as far as that is known by now.
+        estimate = report.estimate
+        if self.anchor is not None:
+            estimate = self.anchor.state_estimate(self.anchor.after_step(report, odometry))
+
+        used = self._used(names, report)
+        if self._associations is not None:
+            self._associations.record(report, len(z))
+        d, e = self.space.dim, self.space.size
+        correction = motion_correction(report.mixture)
+        return Tracked(
+            report.stamp_ns,
+            estimate.mean,
+            estimate.cov,
+            TrackingState.TRACKED if (used != NULL).any() else TrackingState.PREDICTED,
+            {
+                "ess": report.ess,
+                "resampled": report.resampled,
+                "log_evidence": report.log_evidence,
+                "nis": report.nis,
+                "nis_dof": report.rows,
+                "correction": np.full(d, np.nan) if correction is None else correction.mean,
+                "cov_correction": np.full((d, d), np.nan) if correction is None else correction.cov,
+                "delta": np.full(e, np.nan) if odometry is None else odometry.delta,
+                "cov_delta": np.full((d, d), np.nan) if odometry is None else odometry.cov,
+            },
+            {"landmarks": used, "z": z, "cov_z": cov_z},
+        )
+
+    def take(self, frame: Frame) -> Tracked:
+        """`track` with a frame of a log."""
+        odometry = None
+        if frame.delta is not None and frame.cov_delta is not None:
+            odometry = Odometry(frame.delta, frame.cov_delta)
+        return self.track(frame.z, frame.cov_z, frame.landmarks, odometry, frame.stamp_ns)
+
+    def map(self) -> MapEstimate:
+        """The landmarks, relative to the start in each particle's world."""
+        return estimate_map(self.filter, None if self.anchor is None else self.anchor.estimate())
+
+    def associations(self) -> list[np.ndarray]:
+        """Landmark of every observation, one array (K,) per step, along the ancestors of the best particle.
+
+        Only with `keep_associations`; before the end of a run the association of the last steps may still change.
+        """
+        assert self._associations is not None
+        return self._associations.of(self.filter.belief().mode)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Where the start is, and the associations that are kept."""
+        kept = {"names": np.array(sorted(self._names), dtype=np.int64)}
+        if self._associations is not None:
+            kept |= self._associations.arrays()
+        return kept if self.anchor is None else kept | self.anchor.arrays()
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """The inverse of `arrays`."""
+        self._names = set(arrays["names"].tolist())
+        if self._associations is not None:
+            self._associations.restore(arrays)
+        if self.anchor is not None:
+            self.anchor.restore(arrays, self.model, self.point)
+
+    def _model(self) -> RigidPointModel:
+        """How the sensor measures a point."""
+        unknown = self.config.unknown
+        max_range = np.inf if unknown.max_range_m is None else unknown.max_range_m
+        if self.measurement == "position":
+            return RelativePosition(self.space, self.robot_from_sensor, max_range)
+        view = np.deg2rad(unknown.half_field_of_view_deg)
+        return RangeBearing(self.space, self.robot_from_sensor, self.pitch_sign, max_range, view)
+
+    def _sensor(self) -> Sensor:
+        """With the log's names or without."""
+        config, likelihood = self.config, self.config.likelihood.build()
+        if config.association == "known":
+            return NamedLandmarkSensor(self.model, self.point, likelihood)
+        gates, existence = config.unknown.gates(self.model.dim), config.unknown.existence()
+        return AnonymousLandmarkSensor(self.model, self.point, gates, existence, likelihood)
+
+    def _used(self, names: np.ndarray, report: StepReport) -> np.ndarray:
+        """The landmark of each observation (K,) as known now, −1 where none was updated or started by it.
+
+        With names, one that comes a second time in its first frame is not used; without, it is the best particle's.
+        """
+        if self.config.association == "known":
+            listed, known = names.tolist(), self._names
+            used = [
+                name if name in known or name not in listed[:k] else NULL for k, name in enumerate(listed)
+            ]
+            self._names |= set(listed)
+            return np.array(used, dtype=np.int64)
+        ids = _ids_with_new(report, len(names))
+        return ids[self.filter.belief().mode if len(ids) > 1 else 0]
+
+
+@dataclass(frozen=True)
+class Observed:
+    """What the sensor takes: names (K,), measurements (K, p) and their covariance (K, p, p)."""
+
+    landmarks: np.ndarray
+    z: np.ndarray
+    cov_z: np.ndarray
+
+
+def _ids_with_new(report: StepReport, count: int) -> np.ndarray:
+    """Ids (N or 1, K) of a step's observations in every particle; what was new has the ids that it got."""
+    ids = np.full((1, count), NULL)
+    if report.groups and report.groups[0].ids is not None and report.groups[0].ids.ndim == 2:
+        ids = report.groups[0].ids.copy()
+        columns = np.flatnonzero((ids == NEW).any(axis=0))
+        for column, landmark in zip(columns, report.new_landmarks, strict=True):
+            ids[ids[:, column] == NEW, column] = landmark
+    return ids
+
+
+class _Associations:
+    """Ids of every observation in every particle, until it is known which lineage survives."""
+
+    def __init__(self, filter_: Filter) -> None:
+        self._filter = filter_
+        self._steps: list[tuple[int, np.ndarray]] = []
+
+    def record(self, report: StepReport, count: int) -> None:
+        """Keeps a step's ids (n, K), n = 1 where all particles agree."""
+        ids = _ids_with_new(report, count)
+        if (ids == ids[:1]).all():
+            ids = ids[:1]
+        lineage = self._filter.lineage
+        if ids.shape[0] > 1:
+            lineage.retain(lineage.generation)
+        self._steps.append((lineage.generation, ids))
+
+    def of(self, particle: int) -> list[np.ndarray]:
+        """Ids along the ancestors of a particle, one array per step."""
+        lineage = self._filter.lineage
+        return [ids[lineage.rows(g)[particle] if ids.shape[0] > 1 else 0] for g, ids in self._steps]
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """For a checkpoint."""
+        shapes = [(g, *ids.shape) for g, ids in self._steps]
+        flat = [ids.ravel() for _, ids in self._steps]
+        return {
+            "associations/shapes": np.array(shapes, dtype=np.int64).reshape(-1, 3),
+            "associations/ids": np.concatenate([np.zeros(0, dtype=np.int64), *flat]),
+        }
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """The inverse of `arrays`."""
+        first = 0
+        for generation, n, k in arrays["associations/shapes"].tolist():
+            ids = arrays["associations/ids"][first : first + n * k].reshape(n, k)
+            first += n * k
+            if n > 1:
+                self._filter.lineage.take_up(generation)
+            self._steps.append((generation, ids.copy()))
