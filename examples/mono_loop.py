@@ -28,7 +28,7 @@ from rbpf.core.filter import Filter
 from rbpf.sensors.features import FeatureLog
 from rbpf.systems.filtering import ProposalConfig
 from rbpf.systems.map_estimate import MapEstimate
-from rbpf.systems.mono.config import MonoConfig, RayConfig
+from rbpf.systems.mono.config import InverseDepthConfig, MonoConfig
 from rbpf.systems.mono.run import run
 from rbpf.validation.camera_map import summarise_points
 from rbpf.validation.consistency.pose_errors import pose_errors
@@ -39,8 +39,12 @@ from rbpf.validation.sweep.parallel import in_parallel
 from rbpf.validation.tables import write_table
 
 SETTINGS = {
-    "desk's prior": MonoConfig(ray=RayConfig(rho_per_m=0.8, std_rho_per_m=0.4, adapt=False)),
-    "room's prior": MonoConfig(ray=RayConfig(rho_per_m=0.3, std_rho_per_m=0.15, adapt=False)),
+    "desk's prior": MonoConfig(
+        inverse_depth=InverseDepthConfig(mean_per_m=0.8, std_per_m=0.4, from_scene_depth=False)
+    ),
+    "room's prior": MonoConfig(
+        inverse_depth=InverseDepthConfig(mean_per_m=0.3, std_per_m=0.15, from_scene_depth=False)
+    ),
     "default": MonoConfig(),
     "3 linearisations": MonoConfig(proposal=ProposalConfig(iterations=3)),
 }

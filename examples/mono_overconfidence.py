@@ -32,7 +32,7 @@ from rbpf.core.diagnostics import chi_square_band
 from rbpf.motion.constant_velocity import PosePrior
 from rbpf.sensors.features import FeatureLog, KnownPoints
 from rbpf.systems.filtering import ProposalConfig, ResamplingConfig
-from rbpf.systems.mono.config import MonoConfig, RayConfig, VelocityConfig
+from rbpf.systems.mono.config import InverseDepthConfig, MonoConfig, VelocityConfig
 from rbpf.systems.mono.run import pose_estimate
 from rbpf.systems.mono.system import build_filter, start_prior
 from rbpf.validation.consistency.pose_errors import PoseErrors, pose_errors
@@ -57,8 +57,12 @@ def variants(particles: int) -> dict[str, MonoConfig]:
         "three linearisations": replace(base, proposal=ProposalConfig(iterations=3)),
         "epipolar constraint": replace(base, ray=replace(ray, constrain="epipolar")),
         "rays do not constrain": replace(base, ray=replace(ray, constrain="off")),
-        "twice the σ of inverse depth": replace(base, ray=RayConfig(std_rho_per_m=2.0 * ray.std_rho_per_m)),
-        "inverse depth 0.8 ± 0.4": replace(base, ray=RayConfig(std_rho_per_m=0.4, adapt=False)),
+        "twice the σ of inverse depth": replace(
+            base, inverse_depth=InverseDepthConfig(std_per_m=2.0 * ray.std_per_m)
+        ),
+        "inverse depth 0.8 ± 0.4": replace(
+            base, inverse_depth=InverseDepthConfig(std_per_m=0.4, from_scene_depth=False)
+        ),
         "resampling below 0.1 N": replace(base, resampling=ResamplingConfig(ess_threshold=0.1)),
         "resampling below 0.7 N": replace(base, resampling=ResamplingConfig(ess_threshold=0.7)),
         "velocity sampled": replace(base, velocity=VelocityConfig(mode="joint")),

@@ -28,7 +28,7 @@ import tyro
 from matplotlib.figure import Figure
 
 from rbpf.maps.inverse_depth import InverseDepth
-from rbpf.systems.mono.config import MonoConfig, RayConfig
+from rbpf.systems.mono.config import InverseDepthConfig, MonoConfig
 from rbpf.systems.mono.run import run
 from rbpf.validation.consistency.pose_errors import pose_errors
 from rbpf.validation.e06.still_camera import camera_cloud
@@ -39,7 +39,7 @@ from rbpf.validation.tables import write_table
 
 TREATMENTS = ("off", "epipolar", "marginal")
 NEVER = 1e-6  # ready_ratio of rays that stay rays
-KINDS = {"stay rays": NEVER, "become points": RayConfig().ready_ratio}
+KINDS = {"stay rays": NEVER, "become points": InverseDepthConfig().promote_std_ratio}
 STARTS = {"points": "sampled (E06)", "frame": "marginalised"}
 
 
@@ -67,13 +67,13 @@ class Posterior(NamedTuple):
 def filtered(job: Job) -> Posterior:
     """Simulates and filters."""
     log = simulate_features(PlanarTargetWorld(frames=job.frames), Measuring(turnover=0.0), MONO, job.seed)
-    ray = RayConfig(constrain=job.treatment, ready_ratio=KINDS[job.kind])
-    done = run(log, MonoConfig(particles=job.particles, seed=job.seed, known=job.known, ray=ray))
+    ray = InverseDepthConfig(pose_update=job.treatment, promote_std_ratio=KINDS[job.kind])
+    done = run(log, MonoConfig(particles=job.particles, seed=job.seed, known=job.known, inverse_depth=ray))
     cov = done.cov[-1:]
     errors = pose_errors(done.world_from_camera[-1:], cov, log.truth.world_from_camera[-1:])
     volumes = [0.5 * float(np.linalg.slogdet(part)[1]) for part in (cov[0], cov[0, 3:, 3:])]
     landmark_map = done.filter.belief().map
-    rays = int(landmark_map.are(landmark_map.ids, InverseDepth(ray.ready_ratio)).sum())
+    rays = int(landmark_map.are(landmark_map.ids, InverseDepth(ray.promote_std_ratio)).sum())
     return Posterior(
         *volumes, float(errors.nees[0]), rays, camera_cloud(done.filter, np.random.default_rng(job.seed))
     )

@@ -173,7 +173,7 @@ def undisturbed(sequence: ImageSequence, blackouts: Blackouts, starts: list[int]
 def in_view(run: VideoRun, truth: np.ndarray) -> int:
     """Landmarks of known depth that are in view from where the camera truly is; truth (2, 7) before and after."""
     pose = SE3.compose(run.recovery.trusted[0], SE3.between(truth[0], truth[1]))
-    _, points = known_places(run.sensor, run.filter.belief(), run.config.recovery.depth_fraction)
+    _, points = known_places(run.sensor, run.filter.belief(), run.config.relocalisation.depth_std_ratio)
     return int(run.sensor.camera.visible(SE3.inverse_transform(pose, points)).sum())
 
 

@@ -117,7 +117,7 @@ def measure_search(folder: Path, config: MonoConfig, name: str | None = None) ->
         int(run.lost.sum()),
         np.concatenate(score),
         np.concatenate(found),
-        config.search.accept,
+        config.search.min_correlation,
         table.attempts.copy(),
         ~table.alive,
         noise,

@@ -36,7 +36,7 @@ def found_with_uncertain_depth(std_px: float) -> tuple[list[bool], int]:
 @pytest.mark.parametrize("fraction", [0.9, 1.1])
 def test_a_feature_that_may_be_anywhere_agrees_with_no_motion(fraction):
     """What is alike within a small part of its ellipse is alike by chance."""
-    widest = WIDEST * CONFIG.search.largest_px / CONFIG.search.sigmas
+    widest = WIDEST * CONFIG.search.max_radius_px / CONFIG.search.ellipse_sigmas
     found, others = found_with_uncertain_depth(fraction * widest)
     assert found and all(one == (fraction < 1.0) for one in found)
     assert others > 10

@@ -6,7 +6,7 @@ import pytest
 from rbpf.lie import SE3
 from rbpf.sensors.corners import corners
 from rbpf.sensors.uncertain_resection import GATE, squared_distances
-from rbpf.systems.mono.config import RecoveryConfig
+from rbpf.systems.mono.config import RelocalisationConfig
 from rbpf.systems.mono.last_view import LEAST, LastView, mutual
 from rbpf.systems.mono.likeness import described
 from rbpf.systems.mono.relocalise import agrees, confirmed
@@ -75,7 +75,7 @@ def test_pairs_are_the_most_alike_both_ways():
 
 
 def test_few_landmarks_are_enough_where_most_corners_agree():
-    config = RecoveryConfig()
+    config = RelocalisationConfig()
     assert confirmed(config.few, 90, 100, config)
     assert not confirmed(config.few - 1, 100, 100, config)  # these give the scale
     assert not confirmed(30, 60, 100, config)  # most show another motion

@@ -120,7 +120,10 @@ def test_looks_are_kept_when_they_have_changed(wall):
         scale = np.maximum(lengths[0] / lengths[1], lengths[1] / lengths[0])
         whole = ((px >= SOURCE_HALF_PX) & (px <= np.array([319.0, 239.0]) - SOURCE_HALF_PX)).all(axis=1)
         changed = (sensor.table.last_pose != before).any(axis=1)
-        assert (changed == (whole & ((turn >= SEARCH.look_deg) | (scale >= SEARCH.look_scale)))).all()
+        assert (
+            changed
+            == (whole & ((turn >= SEARCH.appearance_turn_deg) | (scale >= SEARCH.appearance_scale_change)))
+        ).all()
         kept.append(int(changed.sum()))
     assert kept[0] == 0
     assert min(kept[1], kept[3]) > 10

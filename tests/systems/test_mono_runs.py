@@ -15,7 +15,7 @@ from rbpf.core.models import Part
 from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.maps.point import Point
 from rbpf.sensors.camera_points import CameraRay, EpipolarRay
-from rbpf.systems.mono.config import MonoConfig, RayConfig, VelocityConfig
+from rbpf.systems.mono.config import InverseDepthConfig, MonoConfig, VelocityConfig
 from rbpf.systems.mono.run import MonoRun, run
 from rbpf.systems.mono.system import build_filter, start_prior
 from tests.core.worlds import content, same
@@ -29,8 +29,8 @@ every_constraint = pytest.mark.parametrize("constrain", ["epipolar", "marginal",
 SETTINGS = [
     SMALL,
     replace(SMALL, known="points"),
-    replace(SMALL, velocity=VelocityConfig("joint"), ray=RayConfig("epipolar")),
-    replace(SMALL, velocity=VelocityConfig("paper"), ray=RayConfig("off")),
+    replace(SMALL, velocity=VelocityConfig("joint"), inverse_depth=InverseDepthConfig("epipolar")),
+    replace(SMALL, velocity=VelocityConfig("paper"), inverse_depth=InverseDepthConfig("off")),
 ]
 every_setting = pytest.mark.parametrize("config", SETTINGS, ids=["default", "points", "joint", "paper"])
 
@@ -117,7 +117,7 @@ def groups_of(constrain, log=LOG) -> list[set[tuple[type, frozenset[Part]]]]:
     def record(t, filter_, report):
         found.append({(type(g.model), g.updates) for g in report.groups if isinstance(g.model, CameraRay)})
 
-    run(log, replace(SMALL, ray=RayConfig(constrain)), record)
+    run(log, replace(SMALL, inverse_depth=InverseDepthConfig(constrain)), record)
     return found
 
 
@@ -145,12 +145,16 @@ def test_a_camera_at_rest_learns_no_depth(constrain):
     """The same image again and again."""
     frames = [replace(LOG.frames[0], stamp_ns=LOG.frames[0].stamp_ns + t * 10**8) for t in range(8)]
     still = VelocityConfig(walk_rad_s=1e-3, walk_m_s=1e-3, start_rad_s=1e-3, start_m_s=1e-3)
-    config = replace(SMALL, ray=RayConfig(constrain, adapt=False), velocity=still)
+    config = replace(
+        SMALL, inverse_depth=InverseDepthConfig(constrain, from_scene_depth=False), velocity=still
+    )
     done = run(replace(LOG, frames=frames, truth=None), config)
     held = done.filter.belief().map
     rays = [i for i in held.ids.tolist() if isinstance(held.landmark_of(i), InverseDepth)]
     assert len(rays) == len(LOG.frames[0].landmarks) - 4
-    np.testing.assert_array_equal(held.read(np.array(rays)).cov[..., 2, 2], RayConfig().std_rho_per_m ** 2)
+    np.testing.assert_array_equal(
+        held.read(np.array(rays)).cov[..., 2, 2], InverseDepthConfig().std_per_m ** 2
+    )
 
 
 @every_setting

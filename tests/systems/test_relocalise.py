@@ -10,7 +10,7 @@ import pytest
 from rbpf.lie import SE3
 from rbpf.sensors.consensus_resection import Resected
 from rbpf.sensors.corners import corners
-from rbpf.systems.mono.config import MonoConfig, RecoveryConfig
+from rbpf.systems.mono.config import MonoConfig, RelocalisationConfig
 from rbpf.systems.mono.image_sensor import ImageSensor, Searched
 from rbpf.systems.mono.likeness import known_places, unmistakable
 from rbpf.systems.mono.relocalise import Looks, Relocaliser, convincing
@@ -120,7 +120,7 @@ def test_a_frozen_camera_is_noticed(tracked, tmp_path):
 def relocaliser(tracked):
     """Of the tracked run, and its belief."""
     run = tracked.run
-    return Relocaliser(run.sensor, CONFIG.recovery), run.filter.belief(), run
+    return Relocaliser(run.sensor, CONFIG.relocalisation), run.filter.belief(), run
 
 
 def test_the_pose_found_is_right_and_its_covariance_fair(relocaliser):
@@ -129,7 +129,7 @@ def test_the_pose_found_is_right_and_its_covariance_fair(relocaliser):
     law = finder.find(belief, view(texture(), truth), run.recovery.trusted[0])
     assert law is not None
     assert finder.attempt is not None and finder.attempt.accepted
-    assert CONFIG.recovery.inliers <= finder.attempt.agreeing <= finder.attempt.landmarks
+    assert CONFIG.relocalisation.min_inliers <= finder.attempt.agreeing <= finder.attempt.landmarks
     start = SE3.compose(belief.state[belief.mode][:7], SE3.inverse(run.world_from_camera[-1]))
     error = SE3.log(SE3.between(SE3.compose(start, truth), law.mean))
     assert np.abs(error).max() < 0.03
@@ -154,16 +154,16 @@ def test_nothing_is_found_in_noise_or_in_grey(relocaliser):
 def test_too_few_landmarks_find_nothing(relocaliser):
     _, belief, run = relocaliser
     image, near = view(texture(), path(FRAMES)[-1]), run.recovery.trusted[0]
-    assert Relocaliser(run.sensor, RecoveryConfig()).find(belief, image, near) is not None
-    assert Relocaliser(run.sensor, RecoveryConfig(inliers=1000)).find(belief, image, near) is None
+    assert Relocaliser(run.sensor, RelocalisationConfig()).find(belief, image, near) is not None
+    assert Relocaliser(run.sensor, RelocalisationConfig(min_inliers=1000)).find(belief, image, near) is None
 
 
 def test_inliers_on_a_line_do_not_convince():
     rng, along = np.random.default_rng(0), np.linspace(30.0, 290.0, 20)
     line = np.stack([along, 0.5 * along + rng.normal(size=20)], axis=-1)
     found = Resected(SE3.identity(), np.eye(6), np.ones(20, dtype=bool), 1.0)
-    assert not convincing(found, line, CAMERA.width, RecoveryConfig())
-    assert convincing(found, rng.uniform(0, 240, (20, 2)), CAMERA.width, RecoveryConfig())
+    assert not convincing(found, line, CAMERA.width, RelocalisationConfig())
+    assert convincing(found, rng.uniform(0, 240, (20, 2)), CAMERA.width, RelocalisationConfig())
 
 
 def test_likeness_must_be_unmistakable():
@@ -228,7 +228,7 @@ def test_patches_say_more_exactly_than_corners_where_landmarks_are(relocaliser):
     truth = SE3.retract(path(FRAMES)[60], np.array([0.05, -0.1, 0.2, 0.1, -0.1, 0.15]))
     image = view(texture(), truth)
     start = SE3.compose(belief.state[belief.mode][:7], SE3.inverse(run.world_from_camera[-1]))
-    rows, points = known_places(run.sensor, belief, CONFIG.recovery.depth_fraction)
+    rows, points = known_places(run.sensor, belief, CONFIG.relocalisation.depth_std_ratio)
     seen = CAMERA.project(SE3.inverse_transform(SE3.compose(start, truth), points))
     px, _ = corners(image, np.zeros((0, 2)), 500, 6.0, 16.0)
     away = np.linalg.norm(seen[:, None] - px, axis=-1)
@@ -246,7 +246,7 @@ def lost_sensor(found, reach_px):
     sensor = ImageSensor(build_features(CAMERA, CONFIG, None), CONFIG.search)
     k = len(found)
     sensor.table.add(np.zeros((k, 31, 31), np.uint8), np.zeros((k, 2)), SE3.identity())
-    cov = (np.array(reach_px) / CONFIG.search.sigmas)[:, None, None] ** 2 * np.eye(2)
+    cov = (np.array(reach_px) / CONFIG.search.ellipse_sigmas)[:, None, None] ** 2 * np.eye(2)
     hits, px = np.array(found, dtype=bool), np.zeros((k, 2))
     sensor.searched = Searched(np.arange(k), px, cov, px, np.ones(k), hits, np.zeros(k, dtype=bool))
     sensor.bad_frames = CONFIG.search.lost_frames
@@ -254,7 +254,7 @@ def lost_sensor(found, reach_px):
 
 
 def test_only_ellipses_searched_whole_confirm_a_place():
-    narrow, wide = 20.0, 3.0 * CONFIG.search.largest_px
+    narrow, wide = 20.0, 3.0 * CONFIG.search.max_radius_px
     assert still_lost(lost_sensor([True] * 5 + [False] * 5, [narrow] * 10))  # too few
     assert still_lost(lost_sensor([True] * 8 + [False] * 10, [narrow] * 18))  # too small a fraction
     assert not still_lost(lost_sensor([True] * 8 + [False] * 8, [narrow] * 16))

@@ -19,7 +19,7 @@ from tests.systems.mono_logs import SMALL, changed, desk, rows, without_known
 from tests.systems.plane_sequences import path, sequence
 
 LOG = without_known(desk(frames=30))
-NEVER = replace(SMALL, start=StartConfig(redraw=False))
+NEVER = replace(SMALL, start=StartConfig(batch_adjust=False))
 SECOND = 1_000_000_000
 
 
@@ -64,10 +64,10 @@ def test_frames_are_adjusted_ever_less_often(monkeypatch):
         return redrawn(self, filter_, features, frames, path)
 
     monkeypatch.setattr(UnknownStart, "redrawn", counted)
-    run(LOG, replace(SMALL, start=StartConfig(first=5, growth=1.5, depth_fraction=1e-6)))
+    run(LOG, replace(SMALL, start=StartConfig(first_adjustment=5, growth=1.5, depth_std_ratio=1e-6)))
     assert counts == [5, 8, 12, 18, 27]
     counts.clear()
-    run(LOG, replace(SMALL, start=StartConfig(first=5, growth=1.5, depth_fraction=0.5)))
+    run(LOG, replace(SMALL, start=StartConfig(first_adjustment=5, growth=1.5, depth_std_ratio=0.5)))
     assert counts[0] == 5 and counts[-1] < 27
     counts.clear()
     run(desk(), SMALL)
@@ -98,7 +98,7 @@ def test_every_velocity_goes_on_from_the_path_that_was_drawn(velocity, drawn):
 
 def test_few_of_the_frames_do_as_well(drawn):
     """Half of them at most take part; those between are on the way, and measure nothing."""
-    config = replace(SMALL, start=StartConfig(frames=8))
+    config = replace(SMALL, start=StartConfig(max_frames=8))
     done = run(LOG, config)
     assert drawn and off(done.world_from_camera, known(LOG.truth).world_from_camera, done.stamps_ns) < 0.02
 
@@ -205,7 +205,7 @@ def test_a_frame_without_an_image_is_not_what_is_drawn_after(drawn):
 
 def test_what_the_new_map_has_not_is_not_looked_for(drawn):
     """Features that were started in frames that took no part."""
-    done = run_images(sequence(40), replace(SMALL, start=StartConfig(frames=5, depth_fraction=1e-6)))
+    done = run_images(sequence(40), replace(SMALL, start=StartConfig(max_frames=5, depth_std_ratio=1e-6)))
     table = done.sensor.table
     held = set(done.filter.belief().catalogue.values())
     assert drawn and set(np.flatnonzero(table.alive).tolist()) <= held
@@ -223,7 +223,9 @@ def test_where_the_lens_has_no_direction_the_start_does_not_stop(drawn):
     assert drawn and np.isfinite(done.world_from_camera).all()
 
 
-@pytest.mark.parametrize("wrong", [{"first": 2}, {"frames": 0}, {"growth": 1.0}, {"growth": float("nan")}])
+@pytest.mark.parametrize(
+    "wrong", [{"first_adjustment": 2}, {"max_frames": 0}, {"growth": 1.0}, {"growth": float("nan")}]
+)
 def test_settings_that_make_no_sense(wrong):
     with pytest.raises(InputError, match=f"start.{next(iter(wrong))}"):
         StartConfig(**wrong)

@@ -38,7 +38,7 @@ def follow(sequence: ImageSequence, count: int, config: SearchConfig) -> tuple[n
     for k, image in enumerate(images[1:]):
         assert image is not None
         matches = search(image, templates, at + step, wide)
-        good = matches.score >= config.accept
+        good = matches.score >= config.min_correlation
         track[good, k] = matches.px[good]
         step[good], at[good] = matches.px[good] - at[good], matches.px[good]
     return px, track

@@ -7,7 +7,7 @@ import numpy as np
 
 from rbpf.sensors.pinhole import Pinhole
 from rbpf.sensors.readers.images import ImageSequence, KnownPixels, open_images, read_known_points
-from rbpf.systems.mono.config import MonoConfig, RayConfig
+from rbpf.systems.mono.config import InverseDepthConfig, MonoConfig
 from rbpf.validation.simulation.exposure import Imaging
 from rbpf.validation.simulation.images import simulate_images
 from rbpf.validation.simulation.textured_scene import ImageWorld
@@ -68,10 +68,10 @@ class Setting:
         height, focal = 3 * width // 4, FOCAL_WIDTHS * width
         return Pinhole(width, height, focal, focal, 0.5 * width - 0.5, 0.5 * height - 0.5)
 
-    def config(self, ray: RayConfig | None = None) -> MonoConfig:
+    def config(self, ray: InverseDepthConfig | None = None) -> MonoConfig:
         """Of a run: the defaults."""
         config = MonoConfig(particles=self.particles, seed=self.seed)
-        return config if ray is None else replace(config, ray=ray)
+        return config if ray is None else replace(config, inverse_depth=ray)
 
     def sequence(
         self, name: str, world: ImageWorld, imaging: Imaging | None = None

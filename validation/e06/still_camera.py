@@ -6,7 +6,7 @@ import numpy as np
 
 from rbpf.core.filter import Filter
 from rbpf.lie import SE3
-from rbpf.systems.mono.config import MonoConfig, RayConfig
+from rbpf.systems.mono.config import InverseDepthConfig, MonoConfig
 from rbpf.systems.mono.system import world_of
 from rbpf.systems.mono.video import run_images
 from rbpf.validation.consistency.pose_errors import pose_errors
@@ -50,8 +50,8 @@ def reproduce(setting: Setting) -> list[Row]:
     truth = true_poses(sequence)[-1:]
     found = {}
     for treatment in TREATMENTS:
-        ray = RayConfig(constrain=treatment, ready_ratio=NEVER)  # type: ignore[arg-type]
-        config = MonoConfig(particles=setting.particles, seed=setting.seed, ray=ray)
+        ray = InverseDepthConfig(pose_update=treatment, promote_std_ratio=NEVER)  # type: ignore[arg-type]
+        config = MonoConfig(particles=setting.particles, seed=setting.seed, inverse_depth=ray)
         run = run_images(sequence, config, known)
         errors = pose_errors(run.world_from_camera[-1:], run.cov[-1:], truth)
         pose, position = (np.sqrt(np.linalg.det(part)) for part in (run.cov[-1], run.cov[-1, 3:, 3:]))

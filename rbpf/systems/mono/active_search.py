@@ -126,9 +126,9 @@ class ActiveSearch:
         self, image: np.ndarray, templates: np.ndarray, mean: np.ndarray, cov: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Place (K, 2), score (K,), whether that is a match (K,), and whether another place is much alike (K,)."""
-        sigmas, most = self.config.sigmas, self.config.largest_px
+        sigmas, most = self.config.ellipse_sigmas, self.config.max_radius_px
         matches = search(image, templates, mean, cov, sigmas=sigmas, most_px=most)
-        accepted = (matches.score >= self.config.accept) & self.camera.inside(matches.px)
+        accepted = (matches.score >= self.config.min_correlation) & self.camera.inside(matches.px)
         return matches.px, matches.score, accepted, matches.ratio >= ALIKE
 
     def _agreeing(
@@ -140,7 +140,7 @@ class ActiveSearch:
         trusted = self.trusted(searched.rows[hits[which]])
         fit = fit_motion(nu, jac, cov, self._prior_factor(belief), trusted)
         found = np.zeros_like(searched.found)
-        found[hits[which[(fit.squared <= self.config.gate) & self._placed(cov)]]] = True
+        found[hits[which[(fit.squared <= self.config.gate_chi2) & self._placed(cov)]]] = True
         searched = replace(searched, found=found)
         if found.sum() < ENOUGH:
             return searched
@@ -176,8 +176,8 @@ class ActiveSearch:
         One with a depth more uncertain than that, cov (K, 2, 2) where the camera is known, agrees with every motion:
         which of several places that look alike is the right one cannot be told.
         """
-        own = self.config.sigmas * np.sqrt(np.linalg.eigvalsh(cov)[:, -1])
-        return np.asarray(own <= WIDEST * self.config.largest_px)
+        own = self.config.ellipse_sigmas * np.sqrt(np.linalg.eigvalsh(cov)[:, -1])
+        return np.asarray(own <= WIDEST * self.config.max_radius_px)
 
     def _innovations(
         self, belief: Belief, rows: np.ndarray, px: np.ndarray
@@ -195,8 +195,10 @@ class ActiveSearch:
         from rbpf.sensors.view_kernels import in_view
 
         table, camera, config = self.table, self.camera, self.config
-        of_image = (camera.width, camera.height, config.margin_px, camera.monotonic_radius)
-        limits = np.array([*of_image, np.cos(np.deg2rad(config.turn_deg)), config.scale], dtype=float)
+        of_image = (camera.width, camera.height, config.border_px, camera.monotonic_radius)
+        limits = np.array(
+            [*of_image, np.cos(np.deg2rad(config.max_turn_deg)), config.max_scale_change], dtype=float
+        )
         rows, px = np.empty(table.count, dtype=np.int64), np.empty((table.count, 2))
         columns = (table.place, table.first_pose, table.alive)
         count = in_view(*columns, np.ascontiguousarray(pose), camera.params, limits, rows, px)

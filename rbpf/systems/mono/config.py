@@ -27,63 +27,81 @@ class VelocityConfig:
 
 
 @dataclass(frozen=True)
-class RayConfig:
-    """Landmarks whose depth is not known yet, E06 §5.
+class InverseDepthConfig:
+    """Features whose depth is not known yet: rays with an inverse depth, E06 §5.
 
     Attributes:
-        constrain: how they constrain the pose: by their epipolar line (the paper's); by the 2-D marginal with finite
+        pose_update: how they constrain the pose: by their epipolar line (the paper's); by the 2-D marginal with finite
             depth variance from where on depth is measured, and by the line before, if points are seen that hold the
             scale; or not at all.
-        rho_per_m: mean inverse depth of a new landmark, 1/m; without known points it sets the scale.
-        std_rho_per_m: its standard deviation.
-        adapt: a new ray starts at the median inverse depth of the points just seen, with the same relative deviation at
-            least, where four or more were seen.
-        ready_ratio: a ray becomes a point when the standard deviation of its inverse depth is below this fraction of it.
-        ready_weight: fraction of the particles' weight in which it must be.
-        least_px: depth is measured once a change of ρ by its first standard deviation moves the image by this. Before,
-            the parallax tells more of the error of the sampled pose than of depth, and the prior of ρ, which does not
-            change as long as depth is not measured, would count anew in every frame.
-        line_px: likewise, from where on there is an epipolar line; well below the noise of a measurement, since
-            what depth moves below it is not modelled and stays the same from frame to frame.
+        mean_per_m: mean inverse depth of a new feature, 1/m; without known points it sets the scale.
+        std_per_m: its standard deviation.
+        from_scene_depth: a new feature starts at the median inverse depth of the points just seen, with the same relative
+            deviation at least, where four or more were seen.
+        promote_std_ratio: a ray becomes a point when the standard deviation of its inverse depth is below this fraction
+            of it.
+        promote_weight: fraction of the particles' weight in which it must be.
+        depth_parallax_px: depth is measured once a change of ρ by its first standard deviation moves the image by this.
+            Before, the parallax says more of the error of the sampled pose than of depth, and the prior of ρ, which does
+            not change as long as depth is not measured, would count anew in every frame.
+        epipolar_parallax_px: likewise, from where on there is an epipolar line; well below the noise of a measurement,
+            since what depth moves below it is not modelled and stays the same from frame to frame.
     """
 
-    constrain: Literal["epipolar", "marginal", "off"] = "marginal"
-    rho_per_m: float = 0.8
-    std_rho_per_m: float = 0.6
-    adapt: bool = True
-    ready_ratio: float = 0.1
-    ready_weight: float = 0.95
-    least_px: float = 10.0
-    line_px: float = 0.3
+    RENAMED: ClassVar[dict[str, str]] = {
+        "constrain": "pose_update",
+        "rho_per_m": "mean_per_m",
+        "std_rho_per_m": "std_per_m",
+        "adapt": "from_scene_depth",
+        "ready_ratio": "promote_std_ratio",
+        "ready_weight": "promote_weight",
+        "least_px": "depth_parallax_px",
+        "line_px": "epipolar_parallax_px",
+    }
+
+    pose_update: Literal["epipolar", "marginal", "off"] = "marginal"
+    mean_per_m: float = 0.8
+    std_per_m: float = 0.6
+    from_scene_depth: bool = True
+    promote_std_ratio: float = 0.1
+    promote_weight: float = 0.95
+    depth_parallax_px: float = 10.0
+    epipolar_parallax_px: float = 0.3
 
 
 @dataclass(frozen=True)
 class StartConfig:
-    """A start without known points: the first frames are adjusted in one piece, and the particles drawn anew from that.
+    """A start without known points: the first frames are adjusted in batch, and the particles resampled from the result.
 
     Attributes:
-        redraw: whether they are; else the particles go on with what the prior of depth has made of the first frames.
-        first: the first adjustment comes after so many frames …
+        batch_adjust: whether they are; else the particles go on with what the prior of depth has made of the first frames.
+        first_adjustment: the first one comes after so many frames …
         growth: … and the next ones after this many times as many each.
-        frames: that take part in an adjustment at most, evenly chosen.
-        depth_fraction: it ends when the depth of half of the features in view is known to this fraction of it.
+        max_frames: that take part in an adjustment at most, evenly chosen.
+        depth_std_ratio: the start ends when half of the depths in view have a standard deviation below this fraction of
+            them.
     """
 
     RENAMED: ClassVar[dict[str, str]] = {
-        "depth_share": "depth_fraction",
+        "redraw": "batch_adjust",
+        "first": "first_adjustment",
+        "frames": "max_frames",
+        "depth_share": "depth_std_ratio",
+        "depth_fraction": "depth_std_ratio",
     }
 
-    redraw: bool = True
-    first: int = 6
+    batch_adjust: bool = True
+    first_adjustment: int = 6
     growth: float = 1.25
-    frames: int = 60
-    depth_fraction: float = 0.03
+    max_frames: int = 60
+    depth_std_ratio: float = 0.03
 
     def __post_init__(self) -> None:
         """Checks what would never end, or never begin."""
-        if self.first < 3 or self.frames < 3:
+        if self.first_adjustment < 3 or self.max_frames < 3:
             raise InputError(
-                f"start.first and start.frames must be at least 3, got {self.first}, {self.frames}"
+                "start.first_adjustment and start.max_frames must be at least 3, got "
+                f"{self.first_adjustment}, {self.max_frames}"
             )
         if not 1.0 < self.growth < float("inf"):
             raise InputError(f"start.growth must be above 1 and finite, got {self.growth}")
@@ -94,108 +112,136 @@ class SearchConfig:
     """Active search in images, E06 §4.1.
 
     Attributes:
-        measurements: landmarks looked for in a frame at most.
+        measurements: features looked for in a frame at most.
         noise_px: standard deviation of a found place, per axis.
         template_px: side of the patch that is compared, odd.
-        accept: least normalised cross-correlation of a match.
-        sigmas: size of the ellipse that is searched, in standard deviations.
-        largest_px: an ellipse is not searched further than this from its centre.
-        in_view: features are started while fewer than this are in view.
+        min_correlation: least normalised cross-correlation of a match.
+        ellipse_sigmas: size of the ellipse that is searched, in standard deviations.
+        max_radius_px: an ellipse is not searched further than this from its centre.
+        min_in_view: features are started while fewer than this are in view.
         new_per_frame: features started in a frame at most; in the first one, as many as are measured.
-        gate: squared Mahalanobis distance from the motion that most matches agree on, beyond which one is dropped.
+        gate_chi2: squared Mahalanobis distance from the motion that most matches agree on, beyond which one is dropped.
         spacing_px: new features keep this distance from others.
-        margin_px: features this near to the border are left alone.
-        turn_deg: a feature is not looked for once its line of sight has turned by this.
-        scale: nor once it is this many times nearer or farther than at first.
-        look_deg: a feature's look is kept anew when its line of sight has turned by this since it was kept last …
-        look_scale: … or it is this many times nearer or farther.
-        trial: a feature is judged after having been looked for this often.
-        failure_ratio: it is dropped from all particles when it was not found in more than this fraction.
-        trusted_fraction: a feature tells where the camera is only while it has been found in this fraction of the looks,
-            (1 + found) / (2 + looks): what moves by itself is soon not where a thing at rest would be.
+        border_px: features this near to the border are left alone.
+        max_turn_deg: a feature is not looked for once its line of sight has turned by this.
+        max_scale_change: nor once it is this many times nearer or farther than at first.
+        appearance_turn_deg: a feature's last appearance is renewed when its line of sight has turned by this since …
+        appearance_scale_change: … or it is this many times nearer or farther.
+        min_attempts: a feature is judged after having been looked for this often.
+        max_failure_ratio: it is dropped from all particles when it was not found in more than this fraction.
+        trusted_fraction: a feature says where the camera is only while it has been found in this fraction of the attempts,
+            (1 + found) / (2 + attempts): what moves by itself is soon not where a thing at rest would be.
         lost_fraction: the camera is lost when fewer than this fraction of what was looked for is found …
         lost_frames: … in this many frames in a row.
-        regained_fraction: it is not lost any more when at least this fraction is found …
-        regained: … and so many features.
+        recovered_fraction: it is not lost any more when at least this fraction is found …
+        recovered_features: … and so many features.
     """
 
     RENAMED: ClassVar[dict[str, str]] = {
+        "accept": "min_correlation",
+        "sigmas": "ellipse_sigmas",
+        "largest_px": "max_radius_px",
+        "in_view": "min_in_view",
+        "gate": "gate_chi2",
+        "margin_px": "border_px",
+        "turn_deg": "max_turn_deg",
+        "scale": "max_scale_change",
+        "look_deg": "appearance_turn_deg",
+        "look_scale": "appearance_scale_change",
+        "trial": "min_attempts",
+        "failure_ratio": "max_failure_ratio",
         "trusted_share": "trusted_fraction",
         "lost_share": "lost_fraction",
-        "regained_share": "regained_fraction",
+        "regained_share": "recovered_fraction",
+        "regained_fraction": "recovered_fraction",
+        "regained": "recovered_features",
     }
 
     measurements: int = 25
     noise_px: float = 1.0
     template_px: int = 11
-    accept: float = 0.8
-    sigmas: float = 3.0
-    largest_px: float = 40.0
-    in_view: int = 35
+    min_correlation: float = 0.8
+    ellipse_sigmas: float = 3.0
+    max_radius_px: float = 40.0
+    min_in_view: int = 35
     new_per_frame: int = 3
-    gate: float = 9.2
+    gate_chi2: float = 9.2
     spacing_px: float = 20.0
-    margin_px: float = 8.0
-    turn_deg: float = 50.0
-    scale: float = 2.0
-    look_deg: float = 10.0
-    look_scale: float = 1.15
-    trial: int = 10
-    failure_ratio: float = 0.5
+    border_px: float = 8.0
+    max_turn_deg: float = 50.0
+    max_scale_change: float = 2.0
+    appearance_turn_deg: float = 10.0
+    appearance_scale_change: float = 1.15
+    min_attempts: int = 10
+    max_failure_ratio: float = 0.5
     trusted_fraction: float = 0.6
     lost_fraction: float = 0.25
     lost_frames: int = 3
-    regained_fraction: float = 0.5
-    regained: int = 6
+    recovered_fraction: float = 0.5
+    recovered_features: int = 6
 
 
 @dataclass(frozen=True)
-class RecoveryConfig:
-    """What happens when the camera is lost.
+class RelocalisationConfig:
+    """Tracking loss: the pose prior while the camera is lost, and how it is found in the map again.
 
     Attributes:
         drift_rad_s: while lost it stays at its last trusted pose, with a standard deviation that grows by this.
         drift_m_s: likewise of its position.
-        reach_rad: around the trusted pose landmarks are looked for with this standard deviation; further away the
-            camera is found by what landmarks look like.
-        reach_m: likewise of its position.
-        corners: places of a lost image that are compared with the map's features at most.
+        search_std_rad: around the trusted pose features are looked for with this standard deviation; further away the
+            camera is found by matching descriptors.
+        search_std_m: likewise of its position.
+        max_corners: corners of a lost image that are compared with the map's features at most.
         spacing_px: their least distance.
-        ratio: a feature's distance from the place most like it is below this fraction of that from the next.
-        depth_fraction: features take part whose depth is known to this fraction of it.
-        around_px: the features are looked for this near to where a pose says that they are.
-        within_px: a feature agrees with a pose when it is seen as near to its projection.
-        triples: of features from which poses are computed.
-        inliers: features that must agree with a pose.
-        few: it is enough that so many agree if the last view before the loss shows the same motion.
-        sure: when so many agree, less has to be found of what should then be seen.
-        inlier_fraction: fraction of the matches that must agree.
-        spread: standard deviation of the inliers' places in their narrowest direction, in widths of the image.
-        inflation: of the pose's standard deviations: the map's errors are common to neighbours.
+        descriptor_ratio: of the descriptor distances of a feature from its best and its next match, at most (D. Lowe).
+        depth_std_ratio: features take part whose depth has a standard deviation below this fraction of it.
+        match_radius_px: around a candidate pose, features are matched this near to their projections.
+        inlier_px: a match agrees with a pose when it is as near to its projection.
+        p3p_samples: triples of matches from which poses are computed.
+        min_inliers: features that must agree with a pose.
+        min_inliers_with_last_view: so many are enough if the last image before the loss shows the same motion.
+        certain_inliers: when so many agree, less has to be found of what should then be seen.
+        min_inlier_fraction: fraction of the matches that must agree.
+        min_spread: standard deviation of the inliers' places in their narrowest direction, in widths of the image.
+        std_inflation: of the pose's standard deviations: the map's errors are common to neighbours.
     """
 
     RENAMED: ClassVar[dict[str, str]] = {
-        "depth_share": "depth_fraction",
-        "inlier_share": "inlier_fraction",
+        "reach_rad": "search_std_rad",
+        "reach_m": "search_std_m",
+        "corners": "max_corners",
+        "ratio": "descriptor_ratio",
+        "depth_share": "depth_std_ratio",
+        "depth_fraction": "depth_std_ratio",
+        "around_px": "match_radius_px",
+        "within_px": "inlier_px",
+        "triples": "p3p_samples",
+        "inliers": "min_inliers",
+        "few": "min_inliers_with_last_view",
+        "sure": "certain_inliers",
+        "inlier_share": "min_inlier_fraction",
+        "inlier_fraction": "min_inlier_fraction",
+        "spread": "min_spread",
+        "inflation": "std_inflation",
     }
 
     drift_rad_s: float = 0.25
     drift_m_s: float = 0.25
-    reach_rad: float = 0.05
-    reach_m: float = 0.05
-    corners: int = 500
+    search_std_rad: float = 0.05
+    search_std_m: float = 0.05
+    max_corners: int = 500
     spacing_px: float = 6.0
-    ratio: float = 0.9
-    depth_fraction: float = 0.3
-    around_px: float = 15.0
-    within_px: float = 4.0
-    triples: int = 300
-    inliers: int = 8
-    few: int = 5
-    sure: int = 12
-    inlier_fraction: float = 0.25
-    spread: float = 0.03
-    inflation: float = 3.0
+    descriptor_ratio: float = 0.9
+    depth_std_ratio: float = 0.3
+    match_radius_px: float = 15.0
+    inlier_px: float = 4.0
+    p3p_samples: int = 300
+    min_inliers: int = 8
+    min_inliers_with_last_view: int = 5
+    certain_inliers: int = 12
+    min_inlier_fraction: float = 0.25
+    min_spread: float = 0.03
+    std_inflation: float = 3.0
 
 
 @dataclass(frozen=True)
@@ -214,16 +260,18 @@ class MonoConfig:
         lag: frames of the particles' paths that are kept, None keeps all.
         checkpoint_every: frames between checkpoints.
         velocity: how the camera moves.
-        ray: landmarks of unknown depth.
+        inverse_depth: features whose depth is not known yet.
         start: without known points.
-        search: of landmarks in images.
-        recovery: when the camera is lost.
+        search: of features in images.
+        relocalisation: when the camera is lost.
         proposal: where particles are sampled.
         resampling: when and how.
     """
 
     RENAMED: ClassVar[dict[str, str]] = {
         "births_per_frame": "max_new_per_frame",
+        "ray": "inverse_depth",
+        "recovery": "relocalisation",
     }
 
     particles: int = 50
@@ -236,10 +284,10 @@ class MonoConfig:
     lag: int | None = None
     checkpoint_every: int = 500
     velocity: VelocityConfig = field(default_factory=VelocityConfig)
-    ray: RayConfig = field(default_factory=RayConfig)
+    inverse_depth: InverseDepthConfig = field(default_factory=InverseDepthConfig)
     start: StartConfig = field(default_factory=StartConfig)
     search: SearchConfig = field(default_factory=SearchConfig)
-    recovery: RecoveryConfig = field(default_factory=RecoveryConfig)
+    relocalisation: RelocalisationConfig = field(default_factory=RelocalisationConfig)
     proposal: ProposalConfig = field(default_factory=lambda: ProposalConfig(iterations=1))
     resampling: ResamplingConfig = field(default_factory=ResamplingConfig)
 

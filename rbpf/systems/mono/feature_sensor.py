@@ -16,7 +16,7 @@ from rbpf.sensors.camera_points import CameraModel, CameraPoint, CameraRay, Epip
 from rbpf.sensors.features import FeatureFrame
 from rbpf.sensors.names import Names
 from rbpf.sensors.pinhole import Pinhole
-from rbpf.systems.mono.config import RayConfig
+from rbpf.systems.mono.config import InverseDepthConfig
 from rbpf.systems.mono.known_start import KnownStart
 
 CONSTELLATION = -1
@@ -37,7 +37,7 @@ _BOTH = _STATE | _MAP
 
 @final
 class FeatureSensor(Sensor):
-    """Landmarks start as rays, constrain the pose as `RayConfig` says, and become points when their depth is known.
+    """Landmarks start as rays, constrain the pose as `InverseDepthConfig` says, and become points when their depth is known.
 
     Args:
         camera: of the images.
@@ -50,20 +50,20 @@ class FeatureSensor(Sensor):
     def __init__(
         self,
         camera: Pinhole,
-        rays: RayConfig,
+        rays: InverseDepthConfig,
         max_new_per_frame: int,
         start: KnownStart | None = None,
         fixed: bool = False,
     ) -> None:
-        rho = (rays.rho_per_m, rays.std_rho_per_m)
+        rho = (rays.mean_per_m, rays.std_per_m)
         self.camera = camera
         self.rays = rays
         self.max_new_per_frame = 0 if fixed else max_new_per_frame
         self.fixed = fixed
         self.point = CameraPoint(camera)
         self.ray = CameraRay(camera, rho)
-        self.epipolar = EpipolarRay(camera, rho, rays.line_px)
-        self.inverse_depth = InverseDepth(rays.ready_ratio)
+        self.epipolar = EpipolarRay(camera, rho, rays.epipolar_parallax_px)
+        self.inverse_depth = InverseDepth(rays.promote_std_ratio)
         self._names = Names()
         self._start = start
         self._place = {} if start is None else {name: m for m, name in enumerate(start.points.names.tolist())}
@@ -109,12 +109,12 @@ class FeatureSensor(Sensor):
         Rays that all start too near or too far agree with one another on a wrong scale: the prior takes them as
         independent, the scene's depth is common to them.
         """
-        depth = self._depths(belief, observed) if self.rays.adapt else np.zeros(0)
+        depth = self._depths(belief, observed) if self.rays.from_scene_depth else np.zeros(0)
         if depth.size < ENOUGH:
             return self.ray
         rho = 1.0 / depth
         middle = float(np.median(rho))
-        fraction = self.rays.std_rho_per_m / self.rays.rho_per_m
+        fraction = self.rays.std_per_m / self.rays.mean_per_m
         return CameraRay(self.camera, (middle, max(fraction * middle, float(rho.std()))))
 
     def _depths(self, belief: Belief, observed: Sequence[Observations]) -> np.ndarray:
@@ -261,11 +261,11 @@ class FeatureSensor(Sensor):
                 return []
             return [Observations(z[chosen], cov[chosen], model, ids=ids[chosen], updates=updates)]
 
-        if self.rays.constrain == "marginal":
+        if self.rays.pose_update == "marginal":
             young = self.epipolar if scaled else self.ray
             return group(self.ray, deep) + group(young, ~deep, updates=_STATE)
         updates = group(self.ray, deep, updates=_MAP)
-        if self.rays.constrain == "off":
+        if self.rays.pose_update == "off":
             return updates
         return group(self.epipolar, np.ones_like(deep), updates=_STATE) + updates
 
@@ -274,7 +274,7 @@ class FeatureSensor(Sensor):
         state, mode = belief.state[belief.mode], belief.mode
         _, jac, _ = belief.map.innovations(self.ray, np.zeros((ids.size, 2)), ids, state, mode)
         by_rho = np.sqrt(np.square(jac.landmark[..., 2]).sum(axis=-1))
-        return by_rho * self.rays.std_rho_per_m >= self.rays.least_px
+        return by_rho * self.rays.std_per_m >= self.rays.depth_parallax_px
 
     def _promote(self, belief: Belief, observed: Sequence[Observations]) -> None:
         updated = [g.ids for g in observed if g.model is self.ray and g.updates != _STATE]
@@ -282,7 +282,7 @@ class FeatureSensor(Sensor):
             return
         ids = np.concatenate([i for i in updated if i is not None])
         ready = belief.weights @ self.inverse_depth.ready(belief.read(ids))
-        belief.map.promote(ids[ready >= self.rays.ready_weight], Point(3))
+        belief.map.promote(ids[ready >= self.rays.promote_weight], Point(3))
 
 
 def _diagonal_blocks(cov: np.ndarray, count: int) -> np.ndarray:

@@ -179,10 +179,10 @@ class ImageSensor(Sensor):
             return True
         if not self.lost:
             return bool(found.mean() < config.lost_fraction)
-        least = min(config.regained, int(self.table.alive.sum()))
-        reach = config.sigmas * np.sqrt(np.einsum("kii->ki", self.searched.cov).max(axis=1))
-        found = found[reach <= config.largest_px]
-        fraction = config.lost_fraction if self.recognised else config.regained_fraction
+        least = min(config.recovered_features, int(self.table.alive.sum()))
+        reach = config.ellipse_sigmas * np.sqrt(np.einsum("kii->ki", self.searched.cov).max(axis=1))
+        found = found[reach <= config.max_radius_px]
+        fraction = config.lost_fraction if self.recognised else config.recovered_fraction
         return bool(found.sum() < max(least, fraction * found.size))
 
     def _judge(self) -> np.ndarray:
@@ -195,8 +195,8 @@ class ImageSensor(Sensor):
         if self.features.fixed:
             return nothing
         rows = searched.rows
-        failing = 1.0 - table.found[rows] / table.attempts[rows] > config.failure_ratio
-        drop = rows[failing & (table.attempts[rows] >= config.trial)]
+        failing = 1.0 - table.found[rows] / table.attempts[rows] > config.max_failure_ratio
+        drop = rows[failing & (table.attempts[rows] >= config.min_attempts)]
         table.alive[drop] = False
         return np.asarray(drop[table.member[drop] < 0])
 
@@ -217,8 +217,8 @@ class ImageSensor(Sensor):
             return
         config, table, pose = self.config, self.table, belief.state[belief.mode][:7]
         cosine, ratio = turned(table.place[rows], pose, table.last_pose[rows])
-        away = np.maximum(ratio, 1.0 / ratio) >= config.look_scale
-        for k in np.flatnonzero((cosine <= np.cos(np.deg2rad(config.look_deg))) | away):
+        away = np.maximum(ratio, 1.0 / ratio) >= config.appearance_scale_change
+        for k in np.flatnonzero((cosine <= np.cos(np.deg2rad(config.appearance_turn_deg))) | away):
             window = cut(image, px[k], SOURCE_HALF_PX)
             if window is not None:
                 table.last_source[rows[k]], table.last_pose[rows[k]] = window, pose
@@ -235,7 +235,7 @@ class ImageSensor(Sensor):
         config, measured = self.config, self.measured
         room = config.measurements - measured.landmarks.size
         if self.table.count > measured.landmarks.size:
-            room = min(config.in_view - self.search.in_view.shape[0], config.new_per_frame)
+            room = min(config.min_in_view - self.search.in_view.shape[0], config.new_per_frame)
         room = min(room, self.features.max_new_per_frame)
         if room <= 0:
             return measured

@@ -12,7 +12,7 @@ from rbpf.core.proposals import Prior
 from rbpf.lie import SE3
 from rbpf.motion.constant_velocity import PosePrior
 from rbpf.sensors.readers.images import ImageFrame
-from rbpf.systems.mono.config import RecoveryConfig
+from rbpf.systems.mono.config import RelocalisationConfig
 from rbpf.systems.mono.image_sensor import ImageSensor
 from rbpf.systems.mono.last_view import LastView
 from rbpf.systems.mono.relocalise import BORDER_PX, Relocaliser
@@ -42,7 +42,7 @@ class Recovery:
     def __init__(
         self,
         sensor: ImageSensor,
-        config: RecoveryConfig,
+        config: RelocalisationConfig,
         std_velocity: np.ndarray,
         views: np.ndarray | None = None,
         size_m: float = 0.0,
@@ -103,7 +103,7 @@ class Recovery:
             if found is not None:
                 self.sensor.recognised = self.relocaliser.sure
                 return PosePrior(found.mean, found.cov + cov, self.std_velocity)
-        reach = np.repeat([self.config.reach_rad, self.config.reach_m], 3)
+        reach = np.repeat([self.config.search_std_rad, self.config.search_std_m], 3)
         return PosePrior(pose, cov + np.diag(reach**2), self.std_velocity)
 
     def _found(self, filter_: Filter, image: np.ndarray, trusted: np.ndarray) -> PosePrior | None:
@@ -155,7 +155,7 @@ class Recovery:
                 self.sensor.camera,
                 self._image,
                 self._mode,
-                self.config.corners,
+                self.config.max_corners,
                 self.config.spacing_px,
                 BORDER_PX,
             )

@@ -14,7 +14,7 @@ from rbpf.sensors.corners import corners
 from rbpf.sensors.keypoints import describe_windows
 from rbpf.sensors.patches import search, warp
 from rbpf.sensors.uncertain_resection import GATE, Sights, refined_on_all, squared_distances
-from rbpf.systems.mono.config import RecoveryConfig
+from rbpf.systems.mono.config import RelocalisationConfig
 from rbpf.systems.mono.image_sensor import ImageSensor
 from rbpf.systems.mono.last_view import LEAST, LastView
 from rbpf.systems.mono.likeness import (
@@ -80,7 +80,7 @@ class Relocaliser:
         config: when a pose is accepted.
     """
 
-    def __init__(self, sensor: ImageSensor, config: RecoveryConfig) -> None:
+    def __init__(self, sensor: ImageSensor, config: RelocalisationConfig) -> None:
         self.sensor = sensor
         self.config = config
         self.attempt: Attempt | None = None
@@ -92,7 +92,8 @@ class Relocaliser:
         """Whether the last image was recognised beyond doubt."""
         one, config = self.attempt, self.config
         return one is not None and (
-            one.agreeing >= config.sure or confirmed(one.agreeing, one.confirming, one.matched, config)
+            one.agreeing >= config.certain_inliers
+            or confirmed(one.agreeing, one.confirming, one.matched, config)
         )
 
     def find(
@@ -110,19 +111,21 @@ class Relocaliser:
             The law in the heaviest particle's world; None where the camera is not found.
         """
         config, camera = self.config, self.sensor.camera
-        rows, points = known_places(self.sensor, belief, config.depth_fraction)
+        rows, points = known_places(self.sensor, belief, config.depth_std_ratio)
         self.attempt = Attempt(rows.size)
-        if rows.size < (config.inliers if last is None else config.few):
+        if rows.size < (config.min_inliers if last is None else config.min_inliers_with_last_view):
             return None
         within = camera.circle(BORDER_PX)
-        px, _ = corners(image, np.zeros((0, 2)), config.corners, config.spacing_px, BORDER_PX, within=within)
+        px, _ = corners(
+            image, np.zeros((0, 2)), config.max_corners, config.spacing_px, BORDER_PX, within=within
+        )
         self.attempt = replace(self.attempt, places=px.shape[0])
-        if px.shape[0] < config.inliers:
+        if px.shape[0] < config.min_inliers:
             return None
         there = described(image, px)
         away = distances(self._looks(rows, points, near), there)
         size = np.linalg.norm(points - SE3.translation(near), axis=-1).mean()
-        pairs = unmistakable(away, points / size, px / config.spacing_px, config.ratio)
+        pairs = unmistakable(away, points / size, px / config.spacing_px, config.descriptor_ratio)
         again = None if last is None else last.seen_again(there, px, points)
         matched, view = (0, None) if again is None else (again[0].size, again[1])
         self.attempt = replace(self.attempt, pairs=pairs[0].size, matched=matched)
@@ -147,7 +150,7 @@ class Relocaliser:
         )
         if not accepted:
             return None
-        noise = config.inflation * max(found.rms_px, self.sensor.config.noise_px)
+        noise = config.std_inflation * max(found.rms_px, self.sensor.config.noise_px)
         return PosePrior(
             found.world_from_camera, gaussian.symmetrise(noise**2 * np.linalg.inv(found.information))
         )
@@ -162,7 +165,7 @@ class Relocaliser:
         both = None if view is None else self._rough_with(points, places, view, rng)
         if both is not None:
             return both
-        found = resect_consensus(camera, points, places, config.within_px, config.triples, rng)
+        found = resect_consensus(camera, points, places, config.inlier_px, config.p3p_samples, rng)
         return None if found is None else found.world_from_camera
 
     def _rough_with(
@@ -170,10 +173,10 @@ class Relocaliser:
     ) -> np.ndarray | None:
         """The same with the corners of the last view; None where these show another motion, or none."""
         config, camera = self.config, self.sensor.camera
-        poses = three_point_poses(points, camera.unproject(places), config.triples, rng)
+        poses = three_point_poses(points, camera.unproject(places), config.p3p_samples, rng)
         if not poses.shape[0]:
             return None
-        both = known_sights(points, places, config.within_px) + view
+        both = known_sights(points, places, config.inlier_px) + view
         # A landmark says twice as much as a corner of unknown depth, and fixes the scale.
         weights = np.where(np.arange(both.std_px.size) < points.shape[0], 2.0, 1.0)
         losses = np.minimum(squared_distances(camera, poses, both), 4.0 * GATE) @ weights
@@ -187,10 +190,10 @@ class Relocaliser:
     ) -> Resected | None:
         """A pose refined on landmarks, and on the corners of the last view if these agree; `inliers` of landmarks."""
         config, camera = self.config, self.sensor.camera
-        alone = refined(camera, rough, points, places, config.within_px)
+        alone = refined(camera, rough, points, places, config.inlier_px)
         if view is None:
             return alone
-        found = refined_on_all(camera, rough, known_sights(points, places, config.within_px) + view)
+        found = refined_on_all(camera, rough, known_sights(points, places, config.inlier_px) + view)
         if found is None or not agrees(found.inliers[len(points) :]):
             return alone
         return replace(found, inliers=found.inliers[: len(points)])
@@ -209,7 +212,9 @@ class Relocaliser:
         turn = affines(self.sensor.camera, homogeneous, poses, world_from_camera)
         templates = warp(sources, turn, config.template_px)
         cov = np.tile(CORNER_PX**2 * np.eye(2), (rows.size, 1, 1))
-        matches = search(looks.image, templates, at, cov, sigmas=config.sigmas, most_px=config.largest_px)
+        matches = search(
+            looks.image, templates, at, cov, sigmas=config.ellipse_sigmas, most_px=config.max_radius_px
+        )
         return np.where((matches.score >= LEAST_ALIKE)[:, None], matches.px, at)
 
     def _grown(
@@ -222,7 +227,9 @@ class Relocaliser:
         """
         best = None
         for _ in range(MOST_ROUNDS):
-            pairs = expected(self.sensor.camera, rough, looks.points, looks.px, away, self.config.around_px)
+            pairs = expected(
+                self.sensor.camera, rough, looks.points, looks.px, away, self.config.match_radius_px
+            )
             places = self._sharp(looks, pairs, rough)
             found = self._refined(rough, looks.points[pairs[0]], places, view)
             if found is None or (best is not None and found.inliers.sum() <= best[0].inliers.sum()):
@@ -251,19 +258,19 @@ class Relocaliser:
         return looks
 
 
-def convincing(found: Resected, px: np.ndarray, width: int, config: RecoveryConfig) -> bool:
+def convincing(found: Resected, px: np.ndarray, width: int, config: RelocalisationConfig) -> bool:
     """Enough landmarks agree, a fair fraction of those matched, and they do not lie on a line or in a corner."""
     count = int(found.inliers.sum())
-    if count < max(config.inliers, config.inlier_fraction * found.inliers.size):
+    if count < max(config.min_inliers, config.min_inlier_fraction * found.inliers.size):
         return False
     places = px[found.inliers]
     narrow = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)[1] / np.sqrt(count)
-    return bool(narrow >= config.spread * width)
+    return bool(narrow >= config.min_spread * width)
 
 
-def confirmed(landmarks: int, corners_: int, of: int, config: RecoveryConfig) -> bool:
+def confirmed(landmarks: int, corners_: int, of: int, config: RelocalisationConfig) -> bool:
     """Some landmarks agree, which fix the scale, and most of the last view's corners: these alone leave no doubt."""
-    return landmarks >= config.few and corners_ >= max(LEAST, MOST_FRACTION * of)
+    return landmarks >= config.min_inliers_with_last_view and corners_ >= max(LEAST, MOST_FRACTION * of)
 
 
 def agrees(corners_: np.ndarray) -> bool:

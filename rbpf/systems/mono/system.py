@@ -58,7 +58,7 @@ def build_features(
 ) -> FeatureSensor:
     """What turns found features into observations; with `fixed` of a map that is known and stays as it is."""
     group = start if config.known == "frame" else None
-    return FeatureSensor(camera, config.ray, config.max_new_per_frame, group, fixed)
+    return FeatureSensor(camera, config.inverse_depth, config.max_new_per_frame, group, fixed)
 
 
 def assemble(

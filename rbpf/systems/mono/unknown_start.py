@@ -51,9 +51,9 @@ class UnknownStart:
 
     def __init__(self, config: MonoConfig, needed: bool) -> None:
         self.config = config
-        self.over = not (needed and config.start.redraw)
+        self.over = not (needed and config.start.batch_adjust)
         """Whether depths are known well enough, and the filter goes on alone."""
-        self._next = config.start.first
+        self._next = config.start.first_adjustment
         self._last: tuple[np.ndarray, np.ndarray, Structure] | None = None
 
     def due(self, frames: int, lost: bool) -> bool:
@@ -129,8 +129,8 @@ class UnknownStart:
         if self.over:
             return None
         starts = [self._where_the_filter_is(filter_, features, names, path[steps])]
-        ray, velocity = self.config.ray, self.config.velocity
-        rho = ray.rho_per_m, ray.std_rho_per_m
+        ray, velocity = self.config.inverse_depth, self.config.velocity
+        rho = ray.mean_per_m, ray.std_per_m
         expected = Expected(rho, start_std(velocity), walk_std(velocity))
         if self._last is not None:
             starts.append(self._gone_on(features, seen, names, path[steps], steps))
@@ -138,7 +138,7 @@ class UnknownStart:
         self._last = names, steps, best.structure
         relative = best.std_inverse() / np.maximum(best.structure.inverse, TINY)
         relative = relative[np.isin(names, frames[-1].landmarks)]
-        self.over = bool(relative.size and np.median(relative) < self.config.start.depth_fraction)
+        self.over = bool(relative.size and np.median(relative) < self.config.start.depth_std_ratio)
         return steps, best
 
     def _chosen(self, frames: Sequence[FeatureFrame]) -> np.ndarray:
@@ -146,7 +146,7 @@ class UnknownStart:
         stamps = np.array([frame.stamp_ns for frame in frames])
         fresh = np.append(True, np.diff(stamps) > 0) & [frame.landmarks.size > 0 for frame in frames]
         steps = np.flatnonzero(fresh)
-        most = min(self.config.start.frames, steps.size)
+        most = min(self.config.start.max_frames, steps.size)
         return steps[np.linspace(0, steps.size - 1, most).round().astype(np.int64)]
 
     def _window(self, features: FeatureSensor, frames: list[FeatureFrame], names: np.ndarray) -> Window:
@@ -186,7 +186,7 @@ class UnknownStart:
         _, first = np.unique(seen.feature, return_index=True)
         # Where the lens has no direction, straight ahead is enough to start from.
         uv = np.nan_to_num(features.camera.unproject(seen.px[first]))
-        pose, rho = whole[seen.frame[first]], self.config.ray.rho_per_m
+        pose, rho = whole[seen.frame[first]], self.config.inverse_depth.mean_per_m
         ahead = np.concatenate([uv, np.ones((names.size, 1))], axis=1)
         place[:, :3] = SE3.transform(pose, ahead) + (rho - 1.0) * SE3.translation(pose)
         place[:, 3] = rho

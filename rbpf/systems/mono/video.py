@@ -92,7 +92,7 @@ class VideoRun:
         """Watches over the sensor from the start."""
         found, std = self.mapped, start_std(self.config.velocity)
         views, size = (None, 0.0) if found is None else (found.views, found.size_m)
-        self.recovery = Recovery(self.sensor, self.config.recovery, std, views, size)
+        self.recovery = Recovery(self.sensor, self.config.relocalisation, std, views, size)
         self.sightings = Sightings(0 if found is None else found.names.size)
         self.start = UnknownStart(self.config, needed=found is None and self.known is None)
 
