@@ -12,9 +12,9 @@ from typing import final
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rbpf.core.least_squares import Minimum, Rule, minimise
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
-from rbpf.motion.levenberg_marquardt import Minimum, Rule, minimise
 from rbpf.motion.stereo_consensus import Draws, consensus
 from rbpf.motion.stereo_covariance import consistent_covariance, trimming
 from rbpf.motion.stereo_geometry import Matches, StereoCamera
@@ -142,7 +142,7 @@ def estimate_motion(
     return replace(found, others=_others(matches, real, found, config, rng)) if found.found else found
 
 
-def fit(matches: Matches, start: Array, config: VoConfig) -> Minimum:
+def fit(matches: Matches, start: Array, config: VoConfig) -> Minimum[Array]:
     """The motion (7,) of least reprojection error near a start, all matches taken as true.
 
     Args:
@@ -160,7 +160,7 @@ def fit(matches: Matches, start: Array, config: VoConfig) -> Minimum:
     return found
 
 
-def _minimum(matches: Matches, start: Array, points: Points, rule: Rule) -> Minimum:
+def _minimum(matches: Matches, start: Array, points: Points, rule: Rule) -> Minimum[Array]:
     return minimise(lambda motion: residuals(matches, motion, points), start, SE3.retract, rule)
 
 
@@ -211,7 +211,7 @@ def _squared(matches: Matches, motion: Array, config: VoConfig) -> Array:
     return squared_distances(matches, motion, points)
 
 
-def _covariance(matches: Matches, found: Minimum, config: VoConfig) -> Array:
+def _covariance(matches: Matches, found: Minimum[Array], config: VoConfig) -> Array:
     if config.points == "exact":
         return found.cov
     if config.points == "propagated":
