@@ -192,5 +192,5 @@ def map_error(filter_: Filter, landmarks: dict[int, np.ndarray]) -> float:
     belief = filter_.belief()
     ids = belief.map.ids
     points = np.einsum("n,nkd->kd", belief.weights, belief.read(ids).mean)
-    truth = np.array([landmarks[belief.catalogue[i]] for i in ids.tolist()])
+    truth = np.array([landmarks[i] for i in ids.tolist()])
     return float(np.linalg.norm(points - truth, axis=1).mean())

@@ -104,7 +104,7 @@ def main() -> dict[str, float]:
         located += ready.tolist()
     belief = filter_.belief()
     means = np.einsum("n,nkd->kd", belief.weights, belief.read(located).mean)
-    distances = np.linalg.norm(means - points[[belief.catalogue[i] for i in located]], axis=1)
+    distances = np.linalg.norm(means - points[located], axis=1)
     figures = {
         "findings": len(findings),
         "located": len(located),

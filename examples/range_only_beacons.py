@@ -64,8 +64,8 @@ def main() -> dict[str, float]:
     distances = {}
     for beacon, step in promoted.items():
         mean = np.einsum("n,nd->d", belief.weights, belief.read([beacon]).mean[:, 0])
-        distances[beacon] = float(np.linalg.norm(mean - BEACONS[belief.catalogue[beacon]]))
-        print(f"beacon {belief.catalogue[beacon]}: a point since step {step}, {distances[beacon]:.2f} m off")
+        distances[beacon] = float(np.linalg.norm(mean - BEACONS[beacon]))
+        print(f"beacon {beacon}: a point since step {step}, {distances[beacon]:.2f} m off")
     print(f"still a ring: {len(BEACONS) - len(promoted)} of {len(BEACONS)} beacons")
     print(f"mean position error of the robot: {np.mean(errors):.2f} m")
     return {"promoted": len(promoted), "map": max(distances.values()), "path": float(np.mean(errors))}

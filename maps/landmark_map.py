@@ -62,29 +62,65 @@ class LandmarkMap(Conditional):
 
     @property
     def ids(self) -> np.ndarray:
-        """Landmarks held, ascending (M,)."""
+        """Landmarks held (M,), in the order in which they were started."""
         return self.store.ids
 
     def add(self, new_landmarks: NewLandmarks, state: np.ndarray) -> np.ndarray:
         """Starts landmarks from first sightings at the states (N, E); returns their ids (K,)."""
         records = new_landmarks.model.initialise(state, new_landmarks.z, new_landmarks.cov)
         log_odds = None if new_landmarks.mask is None else np.where(new_landmarks.mask, 0.0, -np.inf)
-        ids = self.add_records(records, new_landmarks.landmark, log_odds)
+        ids = self.add_records(records, new_landmarks.landmark, log_odds, new_landmarks.ids)
         for landmark, fact in zip(ids.tolist(), new_landmarks.facts, strict=False):
             self.catalogue[landmark] = fact
         return ids
 
     def add_records(
-        self, records: Records, landmark: Landmark, log_odds: np.ndarray | None = None
+        self,
+        records: Records,
+        landmark: Landmark,
+        log_odds: np.ndarray | None = None,
+        ids: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Adds landmarks whose estimates (N, K, …) are known; returns their ids (K,)."""
+        """Adds landmarks whose estimates (N, K, …) are known.
+
+        Args:
+            records: the estimates.
+            landmark: their parametrisation.
+            log_odds: (N, K) that they exist, for a map with evidence.
+            ids: (K,) that they shall have; by default numbers that no landmark had before.
+
+        Returns:
+            Their ids (K,).
+
+        Raises:
+            InputError: an id is no number from 0 up, comes twice or is in use, or the shapes do not fit.
+        """
         if log_odds is not None and not self.evidence:
             raise InputError("landmarks of some particles only need a map with evidence=True")
         kind = self._kind(landmark)
         columns = self.layouts[kind].pack(records, log_odds)
-        ids = np.array([self.store.add(column) for column in columns], dtype=np.int64)
+        given: list[int | None] = [None] * columns.shape[0]
+        if ids is not None:
+            ids = np.asarray(ids)
+            if ids.shape != (columns.shape[0],) or ids.dtype.kind not in "iu" or (ids < 0).any():
+                raise InputError(
+                    f"ids of {columns.shape[0]} new landmarks must be as many whole numbers from 0 up, got {ids}"
+                )
+            taken = self.holds(ids)
+            if taken.any() or np.unique(ids).size < ids.size:
+                twice = ids[taken] if taken.any() else np.sort(ids)[:-1][np.diff(np.sort(ids)) == 0]
+                raise InputError(f"a new landmark needs an id of its own: {twice[0]} is in use")
+            given = ids.tolist()
+        ids = np.array(
+            [self.store.add(column, number) for column, number in zip(columns, given, strict=True)],
+            dtype=np.int64,
+        )
         self.store.columns.kind[self.store.columns.rows(ids)] = kind
         return ids
+
+    def holds(self, ids: np.ndarray) -> np.ndarray:
+        """Which of some ids (K,) are those of landmarks held, (K,) bool."""
+        return self.store.columns.held(ids)
 
     def remove(self, ids: np.ndarray) -> None:
         """Drops landmarks from all particles."""

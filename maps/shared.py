@@ -44,22 +44,22 @@ class SharedStore:
 
     @property
     def ids(self) -> np.ndarray:
-        """Columns alive, ascending."""
+        """Columns alive, in the order in which they were added."""
         return self.columns.ids.copy()
 
     @property
-    def started(self) -> int:
-        """Columns ever added."""
-        return self.columns.started
+    def next_id(self) -> int:
+        """One more than the largest id that was ever used."""
+        return self.columns.next_id
 
     def __contains__(self, column: object) -> bool:
         """Whether a column is alive."""
         return isinstance(column, int | np.integer) and bool(self.columns.held(np.array([column]))[0])
 
-    def add(self, records: np.ndarray) -> int:
-        """Stores a new column (fields, N) and returns its id; ids are never used again."""
+    def add(self, records: np.ndarray, column: int | None = None) -> int:
+        """Stores a new column (fields, N) and returns its id: the one given, which must not be alive, or a new one."""
         self._checked(records)
-        column = self.columns.add()
+        column = self.columns.add(column)
         self._occupy(column, records)
         return column
 
@@ -183,7 +183,7 @@ class SharedStore:
         """Everything that a checkpoint must hold."""
         ids = self.ids
         out = {
-            "store/size": np.array(self.columns.started),
+            "store/size": np.array(self.columns.next_id),
             "store/ids": ids,
             "store/fields": self.columns.fields[: ids.size].copy(),
             "store/generation": self.columns.generation[: ids.size].copy(),
@@ -203,8 +203,8 @@ class SharedStore:
         Raises:
             InputError: an array is missing, or is not what it should be.
         """
-        started = int(checked(arrays, "store/size", (), "i"))
-        self.columns.restore(checked(arrays, "store/ids", (None,), "i"), started)
+        next_id = int(checked(arrays, "store/size", (), "i"))
+        self.columns.restore(checked(arrays, "store/ids", (None,), "i"), next_id)
         count = self.columns.count
         self.columns.fields[:count] = within(arrays, "store/fields", count, 1, MOST_FIELDS)
         now = self.lineage.generation

@@ -1,4 +1,4 @@
-"""Sensors of landmarks: with names that the recording gives, or without, by maximum likelihood in each particle."""
+"""Sensors of landmarks: numbered by the recording, or associated by maximum likelihood in each particle."""
 
 from collections.abc import Sequence
 from typing import Protocol, final
@@ -8,11 +8,11 @@ import numpy as np
 from rbpf.core.association import ExistenceModel, Gates, associate
 from rbpf.core.belief import Belief
 from rbpf.core.models import NEW, Landmark, Likelihood, NewLandmarks, ObservationModel, Observations, Sensor
-from rbpf.sensors.names import Names
+from rbpf.errors import InputError
 
 
-class Sightings(Protocol):
-    """What these sensors need of a frame: `landmarks` (K,) names, `z` (K, p), `cov_z` (K, p, p)."""
+class LandmarkFrame(Protocol):
+    """What these sensors need of a frame: `landmarks` (K,) numbers, `z` (K, p), `cov_z` (K, p, p)."""
 
     landmarks: np.ndarray
     z: np.ndarray
@@ -21,7 +21,9 @@ class Sightings(Protocol):
 
 @final
 class NamedLandmarkSensor(Sensor):
-    """Known association: each sighting carries the landmark's name; a name never seen before starts one.
+    """Known association: each observation carries the landmark's number, which is its id in the map.
+
+    A number that the map does not hold starts a landmark. Names that are text have to be numbered by the caller.
 
     Args:
         model: how a landmark is measured.
@@ -35,30 +37,29 @@ class NamedLandmarkSensor(Sensor):
         self.model = model
         self.landmark = landmark
         self.likelihood = likelihood
-        self._names = Names()
 
-    def observe(self, frame: Sightings, belief: Belief) -> Sequence[Observations]:
-        """The sightings of landmarks that the map holds."""
-        known_ids = self._names.ids(belief.catalogue)
-        ids = np.array([known_ids.get(name, NEW) for name in frame.landmarks.tolist()], dtype=np.int64)
-        known = ids != NEW
+    def observe(self, frame: LandmarkFrame, belief: Belief) -> Sequence[Observations]:
+        """The observations of landmarks that the map holds."""
+        if frame.landmarks.size and frame.landmarks.dtype.kind not in "iu":
+            first = frame.landmarks[0]
+            raise InputError(f"landmarks must be whole numbers from 0 up, got {first!r}: number their names")
+        known = belief.map.holds(frame.landmarks)
         if not known.any():
             return []
-        return [Observations(frame.z[known], frame.cov_z[known], self.model, self.likelihood, ids[known])]
+        ids = frame.landmarks[known]
+        return [Observations(frame.z[known], frame.cov_z[known], self.model, self.likelihood, ids)]
 
     def new_landmarks(
-        self, frame: Sightings, belief: Belief, observed: Sequence[Observations]
+        self, frame: LandmarkFrame, belief: Belief, observed: Sequence[Observations]
     ) -> Sequence[NewLandmarks]:
-        """The first sighting of each new name; a second one in the same frame is left to the next frame."""
-        names, known = frame.landmarks.tolist(), self._names.ids(belief.catalogue)
-        new = [k for k, name in enumerate(names) if name not in known and name not in names[:k]]
-        if not new:
+        """The first observation of each new landmark; a second one in the same frame is left to the next frame."""
+        first = np.zeros(frame.landmarks.size, dtype=bool)
+        first[np.unique(frame.landmarks, return_index=True)[1]] = True
+        new = first & ~belief.map.holds(frame.landmarks)
+        if not new.any():
             return []
-        return [
-            NewLandmarks(
-                frame.z[new], frame.cov_z[new], self.model, self.landmark, facts=[names[k] for k in new]
-            )
-        ]
+        ids = frame.landmarks[new]
+        return [NewLandmarks(frame.z[new], frame.cov_z[new], self.model, self.landmark, ids=ids)]
 
 
 @final
@@ -70,8 +71,8 @@ class AnonymousLandmarkSensor(Sensor):
     Args:
         model: how a landmark is measured; its `visible` says which ones should have been seen.
         landmark: its parametrisation.
-        gates: candidates and the cost of first sightings and clutter.
-        existence: counts sightings and misses.
+        gates: candidates, and the cost of new landmarks and clutter.
+        existence: counts observations and misses.
         likelihood: of the innovation, None is Gaussian.
     """
 
@@ -89,8 +90,8 @@ class AnonymousLandmarkSensor(Sensor):
         self.existence = existence or ExistenceModel()
         self.likelihood = likelihood
 
-    def observe(self, frame: Sightings, belief: Belief) -> Sequence[Observations]:
-        """Every sighting, with each particle's own association."""
+    def observe(self, frame: LandmarkFrame, belief: Belief) -> Sequence[Observations]:
+        """Every measurement, with each particle's own association."""
         if not frame.z.shape[0]:
             return []
         ids = belief.map.ids
@@ -109,7 +110,7 @@ class AnonymousLandmarkSensor(Sensor):
         ]
 
     def new_landmarks(
-        self, frame: Sightings, belief: Belief, observed: Sequence[Observations]
+        self, frame: LandmarkFrame, belief: Belief, observed: Sequence[Observations]
     ) -> Sequence[NewLandmarks]:
         """Updates the evidence of what should have been seen; starts what some particle takes as new."""
         chosen = np.zeros((belief.log_weights.size, 0), dtype=np.int64)

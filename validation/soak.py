@@ -66,7 +66,7 @@ class Forgetting(Sensor):
     """A sensor that drops landmarks which have not been seen for long, so that the map of a changing world is bounded.
 
     Args:
-        inner: a sensor of named landmarks; frames have `landmarks` (K,), the names that are the catalogue's facts.
+        inner: a sensor of named landmarks; frames have `landmarks` (K,), numbers.
         after: frames.
     """
 
@@ -90,7 +90,8 @@ class Forgetting(Sensor):
         new_landmarks = self.inner.new_landmarks(frame, belief, observed)
         old = [name for name, seen in self._seen.items() if self.frame - seen > self.after]
         known = self._names.ids(belief.catalogue)
-        belief.map.remove(np.array([known[name] for name in old if name in known], dtype=np.int64))
+        ids = np.array([known.get(name, name) for name in old], dtype=np.int64)
+        belief.map.remove(ids[belief.map.holds(ids)])
         for name in old:
             del self._seen[name]
         return new_landmarks
@@ -157,7 +158,7 @@ def _window(filter_: Filter, frames: int, seconds: float, square: float) -> Wind
         nodes=filter_.lineage.nodes,
         states=filter_.history.stored_states,
         landmarks=landmark_map.ids.size,
-        started=landmark_map.store.started,
+        started=landmark_map.store.next_id,
         error_m=float(np.sqrt(square)),
     )
 

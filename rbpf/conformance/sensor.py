@@ -71,3 +71,7 @@ def _check_new_landmarks(sensor: Sensor, example: Example) -> None:
         if new_landmarks.mask is not None:
             require_shape(f"{name}: mask", new_landmarks.mask, (n, k))
         require(facts in (0, k), f"{name} gives {facts} facts for {k} landmarks, expected one each or none")
+        if new_landmarks.ids is not None:
+            require_shape(f"{name}: ids", new_landmarks.ids, (k,))
+            taken = new_landmarks.ids[example.belief.map.holds(new_landmarks.ids)]
+            require(taken.size == 0, f"{name} starts landmarks {taken.tolist()}, which the map holds already")

@@ -124,6 +124,7 @@ class NewLandmarks:
         model: whose `initialise` gives the records.
         landmark: the parametrisation.
         mask: (N, K) which particles take them as new; None is all.
+        ids: (K,) numbers from 0 up by which the sensor knows them, none of them in use; None lets the map number them.
         facts: per landmark, what the catalogue remembers of it (a descriptor, the log's own name).
     """
 
@@ -133,6 +134,7 @@ class NewLandmarks:
     landmark: "Landmark"
     mask: Bool[np.ndarray, "N K"] | None = None
     facts: Sequence[Any] = field(default_factory=tuple)
+    ids: Int[np.ndarray, " K"] | None = None
 
 
 class LogDensities(NamedTuple):

@@ -55,16 +55,16 @@ class TestLandmarks:
         filter_ = Recipe(n=N).build()
         drive(filter_, planar_world(4, landmarks=5, seed=8))
         filter_.sensors = [Scripted()]
-        filter_.belief().map.remove(np.array([0]))
+        filter_.belief().map.remove(np.array([3]))
         return filter_
 
     @pytest.mark.parametrize(
         ("ids", "match"),
         [
             (None, "RangeBearing reads a landmark: its observations need ids"),
-            ([0], "names landmark 0, which the map does not hold"),
+            ([3], "names landmark 3, which the map does not hold"),
             ([77], "names landmark 77, which the map does not hold"),
-            ([[1]] * (N - 1) + [[10**9]], "names landmark 1000000000, which the map does not hold"),
+            ([[4]] * (N - 1) + [[10**9]], "names landmark 1000000000, which the map does not hold"),
             ([1, 2], rf"ids of 1 measurements must be \(1,\) or \({N}, 1\), got \(2,\)"),
             ([[1]], r"got \(1, 1\)"),
             ([-3], "ids of RangeBearing must be integers: landmarks, NULL = -1 or NEW = -2"),
@@ -85,8 +85,8 @@ class TestLandmarks:
     def test_reading_the_map(self, filter_):
         landmark_map = filter_.belief().map
         for use in (landmark_map.read, landmark_map.remove):
-            with pytest.raises(InputError, match="the map holds no landmark 0"):
-                use(np.array([0]))
+            with pytest.raises(InputError, match="the map holds no landmark 3"):
+                use(np.array([3]))
         with pytest.raises(InputError, match="the map holds no landmark -1"):
             landmark_map.landmark_of(-1)
         with pytest.raises(InputError, match="no landmark was named"):
@@ -103,7 +103,7 @@ class TestLandmarks:
         with pytest.raises(InputError, match="only need a map with evidence=True"):
             filter_.belief().map.add(new_landmarks, filter_.particles.state)
         with pytest.raises(InputError, match="keeps no log-odds: build it with evidence=True"):
-            filter_.belief().map.set_log_odds(np.array([1]), np.zeros((N, 1)))
+            filter_.belief().map.set_log_odds(np.array([4]), np.zeros((N, 1)))
 
     def test_first_sightings_that_are_not_finite(self, filter_):
         new_landmarks = NewLandmarks(np.array([[np.nan, 0.0]]), np.eye(2)[None], RangeBearing(SE2), Point(2))

@@ -36,7 +36,7 @@ def example() -> Example:
     """Six landmarks, of which the first was removed, in forty particles."""
     filter_ = Recipe().build()
     drive(filter_, planar_world(5, landmarks=6, seed=8))
-    filter_.belief().map.remove(np.array([0]))
+    filter_.belief().map.remove(np.array([4]))
     return Example(frame=planar_world(6, landmarks=6, seed=8).frames[5], belief=filter_.belief())
 
 
@@ -49,7 +49,7 @@ def test_sound_sensors(known):
 
 
 Z, COV = np.array([[3.0, 0.1], [4.0, 0.2]]), np.repeat(np.diag([0.1, 0.1])[None], 2, axis=0)
-GROUP = Observations(Z, COV, RangeBearing(SE2), ids=np.array([1, 2]))
+GROUP = Observations(Z, COV, RangeBearing(SE2), ids=np.array([2, 5]))
 BIRTHS = NewLandmarks(Z, COV, RangeBearing(SE2), Point(2))
 SENSORS = {
     "Watching.observe, for a group, returned a str, expected Observations": Watching(["seen"]),
@@ -65,20 +65,26 @@ SENSORS = {
     ),
     "Watching.observe gives no ids, but RangeBearing reads a landmark": Watching([replace(GROUP, ids=None)]),
     r"Watching.observe: ids has shape \(3,\), expected \(2,\) or \(40, 2\)": Watching(
-        [replace(GROUP, ids=np.array([1, 2, 3]))]
+        [replace(GROUP, ids=np.array([2, 3, 5]))]
     ),
     "Watching.observe: ids are float64, expected integers": Watching(
-        [replace(GROUP, ids=np.array([1.0, 2.0]))]
+        [replace(GROUP, ids=np.array([2.0, 5.0]))]
     ),
-    r"Watching.observe names landmarks \[0, 99\], which the map does not hold": Watching(
-        [replace(GROUP, ids=np.array([99, 0]))]
+    r"Watching.observe names landmarks \[4, 99\], which the map does not hold": Watching(
+        [replace(GROUP, ids=np.array([99, 4]))]
     ),
-    "Watching.observe: ids below -2 mean nothing": Watching([replace(GROUP, ids=np.array([-3, 1]))]),
+    "Watching.observe: ids below -2 mean nothing": Watching([replace(GROUP, ids=np.array([-3, 2]))]),
     "Watching.new_landmarks, for a group, returned a Observations, expected NewLandmarks": Watching(
         [], [GROUP]
     ),
     r"Watching.new_landmarks: mask has shape \(2,\), expected \(40, 2\)": Watching(
         [], [replace(BIRTHS, mask=np.ones(2, dtype=bool))]
+    ),
+    r"Watching.new_landmarks: ids has shape \(1,\), expected \(2,\)": Watching(
+        [], [replace(BIRTHS, ids=np.array([7]))]
+    ),
+    r"Watching.new_landmarks starts landmarks \[2\], which the map holds already": Watching(
+        [], [replace(BIRTHS, ids=np.array([2, 7]))]
     ),
     "Watching.new_landmarks gives 1 facts for 2 landmarks, expected one each or none": Watching(
         [], [replace(BIRTHS, facts=["oak"])]

@@ -9,36 +9,52 @@ from rbpf.errors import InputError
 from rbpf.maps.columns import Columns
 
 
-def filled(columns: Columns, count: int, model: dict[int, int]) -> None:
-    """New columns; everything told of one is its id, or follows from it."""
-    for _ in range(count):
-        column = columns.add()
+def filled(columns: Columns, ids: list[int | None]) -> list[int]:
+    """New columns; everything noted of one follows from its id."""
+    added = []
+    for wanted in ids:
+        column = columns.add(wanted)
         row = columns.row(column)
         columns.fields[row], columns.generation[row] = column + 1, 2 * column
         columns.slab[row], columns.kind[row] = 3 * column, column % 3
-        model[column] = column % 3
+        added.append(column)
+    return added
 
 
-@given(st.lists(st.tuples(st.integers(0, 90), st.integers(0, 90), st.integers(0, 2**32 - 1)), max_size=8))
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 90), st.integers(0, 90), st.integers(0, 2**32 - 1), st.booleans()),
+        max_size=8,
+    )
+)
 def test_as_a_dictionary(edits):
-    columns, model, started = Columns(), dict[int, int](), 0
-    for new, gone, seed in edits:
-        filled(columns, new, model)
-        started += new
+    """Ids that are counted up, and ids of the caller's in any order."""
+    columns, model, next_id = Columns(), dict[int, int](), 0
+    for new, gone, seed, numbered in edits:
         rng = np.random.default_rng(seed)
+        free = np.setdiff1d(np.arange(1000), list(model))
+        ids = rng.choice(free, new, replace=False).tolist() if numbered else [None] * new
+        added = filled(columns, ids)
+        assert added == (ids if numbered else list(range(next_id, next_id + new)))
+        next_id = max([next_id, *(column + 1 for column in added)])
+        model |= {column: column % 3 for column in added}
         removed = rng.choice(sorted(model), min(gone, len(model)), replace=False).astype(np.int64)
-        columns.remove(np.sort(removed))
+        columns.remove(removed)
         for column in removed.tolist():
             del model[column]
-        ids = np.array(sorted(model), dtype=np.int64)
+        ids = np.array(list(model), dtype=np.int64)
         np.testing.assert_array_equal(columns.ids, ids)
-        assert columns.started == started
+        assert columns.next_id == next_id
+        again = Columns()
+        again.restore(ids, next_id)
+        np.testing.assert_array_equal(again.rows(ids), columns.rows(ids))
         rows = columns.rows(ids)
-        np.testing.assert_array_equal(rows, [columns.row(column) for column in model] if model else rows)
+        np.testing.assert_array_equal(rows, np.arange(ids.size))
+        assert [columns.row(column) for column in model] == rows.tolist()
         np.testing.assert_array_equal(columns.fields[rows], ids + 1)
         np.testing.assert_array_equal(columns.generation[rows], 2 * ids)
         np.testing.assert_array_equal(columns.slab[rows], 3 * ids)
-        asked = np.arange(-2, started + 3)
+        asked = np.arange(-2, next_id + 3)
         np.testing.assert_array_equal(columns.held(asked), [column in model for column in asked.tolist()])
         np.testing.assert_array_equal(
             columns.kinds(asked), [model.get(column, -1) for column in asked.tolist()]
@@ -47,20 +63,20 @@ def test_as_a_dictionary(edits):
 
 def test_memory_follows_what_is_held():
     """A thousand columns at once; then one at a time for ever."""
-    columns, model = Columns(), dict[int, int]()
-    filled(columns, 1000, model)
+    columns = Columns()
+    filled(columns, [None] * 1000)
     assert columns.fields.size == 1024
     columns.remove(np.arange(990))
     assert columns.fields.size == 64
     for oldest in range(990, 6000):
-        filled(columns, 1, model)
+        filled(columns, [None])
         columns.remove(np.array([oldest]))
-    assert columns.fields.size == 64 and columns.started == 6010
+    assert columns.fields.size == 64 and columns.next_id == 6010
     np.testing.assert_array_equal(columns.ids, np.arange(6000, 6010))
     np.testing.assert_array_equal(columns.generation[:10], 2 * columns.ids)
 
 
-@pytest.mark.parametrize("ids", [[3, 2], [1, 1], [-1, 2], [2, 9]])
+@pytest.mark.parametrize("ids", [[1, 1], [3, 1, 3], [-1, 2], [2, 9]])
 def test_ids_that_cannot_be(ids):
-    with pytest.raises(InputError, match="do not ascend"):
+    with pytest.raises(InputError, match="not different numbers from 0 to 8"):
         Columns().restore(np.array(ids), 9)

@@ -1,5 +1,7 @@
 """A map by itself: kinds side by side, promotion, readiness, log-odds, rings."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -203,3 +205,40 @@ def test_a_landmark_removed_after_the_refinement_is_missed_by_the_update():
     landmark_map.remove(np.array([1]))
     with pytest.raises(InputError, match="names landmark 1, which the map does not hold"):
         landmark_map.correct(state, np.zeros((N, 3)), groups)
+
+
+def numbered(*ids: int) -> NewLandmarks:
+    count = len(ids)
+    cov = np.repeat(np.eye(2)[None], count, 0)
+    return NewLandmarks(np.ones((count, 2)), cov, RangeBearing(SE2), Point(2), ids=np.array(ids))
+
+
+def test_landmarks_have_the_numbers_that_their_sensor_gives_them():
+    """They stay in the order in which they were started; the map goes on counting above the largest."""
+    landmark_map, _ = filled()
+    state = np.tile(SE2.identity(), (landmark_map.n, 1))
+    assert landmark_map.add(numbered(5, 2), state).tolist() == [5, 2]
+    assert landmark_map.add(replace(numbered(0), ids=None), state).tolist() == [6]
+    landmark_map.remove(np.array([5]))
+    assert landmark_map.add(numbered(3, 5), state).tolist() == [3, 5]
+    assert landmark_map.ids.tolist() == [2, 6, 3, 5]
+    assert landmark_map.holds(np.array([0, 2, 3, 4, 5, 6, 7])).tolist() == [0, 1, 1, 0, 1, 1, 0]
+
+
+@pytest.mark.parametrize(
+    ("ids", "message"),
+    [
+        ([4, 4], "needs an id of its own: 4 is in use"),
+        ([4, 1], "needs an id of its own: 1 is in use"),
+        ([4, -1], "as many whole numbers from 0 up"),
+        ([4], "ids of 2 new landmarks must be as many"),
+        ([4.0, 5.0], "whole numbers"),
+    ],
+)
+def test_numbers_that_no_new_landmark_can_have(ids, message):
+    landmark_map, _ = filled()
+    state = np.tile(SE2.identity(), (landmark_map.n, 1))
+    landmark_map.add(numbered(0, 1), state)
+    with pytest.raises(InputError, match=message):
+        landmark_map.add(replace(numbered(7, 8), ids=np.array(ids)), state)
+    assert landmark_map.ids.tolist() == [0, 1]

@@ -1,10 +1,10 @@
-"""Which landmark a named sighting is of, and which sightings start one."""
+"""Landmarks that the recording numbers: which are observed, and which are started."""
 
 import numpy as np
 import pytest
 
 from rbpf.core.filter import Filter
-from rbpf.core.models import NewLandmarks
+from rbpf.errors import InputError
 from rbpf.lie import SE2
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
@@ -33,23 +33,29 @@ def filter_of(sensor: NamedLandmarkSensor) -> Filter:
     return Filter(OdometryMotion(SE2), sensor, landmark_map, n=3, rng=np.random.default_rng(0))
 
 
-def test_names_become_ids(sensor):
+def test_numbers_are_ids(sensor):
     filter_ = filter_of(sensor)
-    report = filter_.step(frame("oak", "elm"))
-    assert report.new_landmarks.tolist() == [0, 1]
+    report = filter_.step(frame(7, 3))
+    assert report.new_landmarks.tolist() == [7, 3]
     assert report.groups == []
-    report = filter_.step(frame("elm", "ash", "oak"))
-    assert ids_of(report).tolist() == [1, 0]
+    report = filter_.step(frame(3, 20, 7))
+    assert ids_of(report).tolist() == [3, 7]
     np.testing.assert_array_equal(report.groups[0].z[:, 0], [3.0, 5.0])
-    assert report.new_landmarks.tolist() == [2]
-    assert filter_.belief().catalogue == {0: "oak", 1: "elm", 2: "ash"}
+    assert report.new_landmarks.tolist() == [20]
+    assert filter_.belief().map.ids.tolist() == [7, 3, 20]
+
+
+@pytest.mark.parametrize(("name", "message"), [("oak", "got .*oak.*: number their names"), (-1, "from 0 up")])
+def test_other_names_are_refused(name, message, sensor):
+    with pytest.raises(InputError, match=message):
+        filter_of(sensor).step(frame(name))
 
 
 def test_a_name_seen_twice_in_its_first_frame_starts_one_landmark(sensor):
     filter_ = filter_of(sensor)
-    assert filter_.step(frame(7, 7, 8)).new_landmarks.tolist() == [0, 1]
+    assert filter_.step(frame(7, 7, 8)).new_landmarks.tolist() == [7, 8]
     report = filter_.step(frame(7, 7))
-    assert ids_of(report).tolist() == [0, 0]
+    assert ids_of(report).tolist() == [7, 7]
     assert report.new_landmarks.size == 0
 
 
@@ -60,37 +66,30 @@ def test_an_empty_frame(sensor):
     assert report.new_landmarks.size == 0
 
 
-def test_a_landmark_that_is_replaced_by_another(sensor):
-    """As many names as before, but not the same ones."""
+def test_a_landmark_that_was_removed_starts_anew(sensor):
     filter_ = filter_of(sensor)
-    filter_.step(frame("oak", "elm"))
-    filter_.step(frame("oak", "elm"))
-    landmark_map = filter_.belief().map
-    landmark_map.remove(np.array([0]))
-    new_landmarks = NewLandmarks(
-        np.array([[5.0, 1.0]]), np.diag([0.01, 0.01])[None], MODEL, Point(2), facts=["ash"]
-    )
-    landmark_map.add(new_landmarks, filter_.particles.state)
-    report = filter_.step(frame("elm", "ash", "oak"))
-    assert ids_of(report).tolist() == [1, 2]
-    assert report.new_landmarks.tolist() == [3]
+    filter_.step(frame(4, 5))
+    filter_.belief().map.remove(np.array([4]))
+    report = filter_.step(frame(5, 4))
+    assert ids_of(report).tolist() == [5]
+    assert report.new_landmarks.tolist() == [4]
 
 
 def test_one_sensor_in_two_filters(sensor):
     first, second = filter_of(sensor), filter_of(sensor)
-    first.step(frame("oak", "elm"))
-    second.step(frame("elm", "oak"))
-    assert ids_of(first.step(frame("oak"))).tolist() == [0]
-    assert ids_of(second.step(frame("oak"))).tolist() == [1]
+    first.step(frame(4, 5))
+    second.step(frame(5))
+    assert ids_of(first.step(frame(4))).tolist() == [4]
+    assert second.step(frame(4)).groups == []
 
 
-def test_names_after_loading_an_earlier_state(sensor, tmp_path):
+def test_numbers_after_loading_an_earlier_state(sensor, tmp_path):
     filter_ = filter_of(sensor)
-    filter_.step(frame("oak"))
+    filter_.step(frame(9))
     filter_.save(tmp_path / "run.npz")
-    filter_.step(frame("elm"))
+    filter_.step(frame(2))
     filter_.load(tmp_path / "run.npz")
-    filter_.step(frame("ash"))
-    report = filter_.step(frame("ash", "elm", "oak"))
-    assert ids_of(report).tolist() == [1, 0]
+    filter_.step(frame(6))
+    report = filter_.step(frame(6, 2, 9))
+    assert ids_of(report).tolist() == [6, 9]
     assert report.new_landmarks.tolist() == [2]

@@ -100,7 +100,7 @@ def test_halves_of_the_landmarks(log):
     """The map holds odd names alone, or even ones, and the odometry always the even ones."""
     for split, remainder in (("apart", 1), ("same", 0)):
         run = run_features(log, replace(CONFIG, odometry=OdometryConfig(split=split)))
-        names = np.array(list(run.filter.belief().catalogue.values()))
+        names = run.filter.belief().map.ids
         assert names.size > 50 and (names % 2 == remainder).all()
     seen = np.intersect1d(log.frames[0].landmarks, log.frames[1].landmarks)
     assert run.agreeing[1] <= (seen % 2 == 0).sum()

@@ -80,12 +80,11 @@ class NameFrontEnd(FrontEnd):
         return int(np.isin(self.for_filter().landmarks, self._proven).sum())
 
     def log_support(self, belief: Belief, doubt: bool) -> float:
-        frame, ids = self.for_filter(), {name: i for i, name in belief.catalogue.items()}
+        frame = self.for_filter()
         rows = np.flatnonzero(np.isin(frame.landmarks, self._proven))
         if not rows.size:
             return 0.0
-        named = np.array([ids[name] for name in frame.landmarks[rows].tolist()])
-        mean, cov = belief.project(self.model, named)
+        mean, cov = belief.project(self.model, frame.landmarks[rows])
         return log_support(frame.z[rows] - mean, frame.cov_z[rows] + cov, frame.z, self.rig)
 
     def relocalise_globally(self, belief: Belief) -> tuple[np.ndarray, int] | None:
