@@ -43,7 +43,7 @@ def run(settings: Settings) -> list[Row]:
 def measure(turns: int) -> list[float]:
     """Peak and start of this process in MiB, landmarks and particles."""
     from benchmarks.stereo_step import LARGE, Drive
-    from rbpf.runs.files import peak_memory_mb
+    from rbpf.runs.folder import peak_memory_mb
 
     Drive(100, 1)()
     before = peak_memory_mb()

@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from rbpf.runs.measurements import dead_reckoning
+from rbpf.sensors.readers.measurements import dead_reckoning
 from rbpf.systems.map_estimate import estimate_map
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.gtsam.robot import solve

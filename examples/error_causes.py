@@ -10,9 +10,9 @@ from pathlib import Path
 import tyro
 from matplotlib.figure import Figure
 
+from rbpf.runs.plots import COLOURS, new_axes, save_figures
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.error_causes import HEADER, Cause, camera_causes, robot_causes
-from rbpf.validation.report.figures import COLOURS, new_axes, save_figures
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 from rbpf.validation.tables import write_table
 

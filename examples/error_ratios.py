@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from rbpf.runs.plots import COLOURS, new_axes, save_figures
 from rbpf.sensors.pinhole import Pinhole
 from rbpf.sensors.readers import stereo_tracks
 from rbpf.systems.mono.config import MonoConfig, SearchConfig
@@ -24,7 +25,6 @@ from rbpf.validation.error_ratios import (
     tracks_ratio,
 )
 from rbpf.validation.mono import Recording
-from rbpf.validation.report.figures import COLOURS, new_axes, save_figures
 from rbpf.validation.simulation.exposure import Imaging
 from rbpf.validation.simulation.images import simulate_images
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot

@@ -21,11 +21,11 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
+from rbpf.runs.plots import save_figures
 from rbpf.sensors.pinhole import Pinhole
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.validation.blackout_runs import run_series
 from rbpf.validation.blackouts import Blackouts, Outcome, Series
-from rbpf.validation.report.figures import save_figures
 from rbpf.validation.simulation.exposure import Imaging
 from rbpf.validation.simulation.images import simulate_images
 from rbpf.validation.simulation.textured_desk import TexturedDesk

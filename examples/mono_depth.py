@@ -17,8 +17,8 @@ import numpy as np
 import tyro
 
 from rbpf.lie import SE3
+from rbpf.runs.plots import save_figures
 from rbpf.validation.e06.depth_curves import Passing, draw_curves, shape_of
-from rbpf.validation.report.figures import save_figures
 from rbpf.validation.simulation.features import MONO
 from rbpf.validation.tables import write_table
 

@@ -20,9 +20,9 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
+from rbpf.runs.plots import save_figures
 from rbpf.sensors.pinhole import Pinhole
 from rbpf.systems.mono.config import MonoConfig
-from rbpf.validation.report.figures import save_figures
 from rbpf.validation.search_statistics import SearchStatistics, measure_search
 from rbpf.validation.simulation.exposure import Imaging
 from rbpf.validation.simulation.images import simulate_images

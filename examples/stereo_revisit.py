@@ -15,6 +15,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import tyro
 
+from rbpf.runs.plots import COLOURS, new_axes, save_figures
 from rbpf.sensors.features import CameraTruth, FeatureLog
 from rbpf.sensors.readers import stereo_tracks
 from rbpf.sensors.readers.images import open_stereo
@@ -23,7 +24,6 @@ from rbpf.systems.stereo.feature_cache import cache_features
 from rbpf.systems.stereo.run import StereoRun, run_features, run_images
 from rbpf.validation.gtsam.batch_problem import solve_problem
 from rbpf.validation.metrics.stereo_scores import score_stereo
-from rbpf.validation.report.figures import COLOURS, new_axes, save_figures
 from rbpf.validation.simulation.features import STEREO, Measuring, simulate_features
 from rbpf.validation.simulation.lab_points import LabWorld
 from rbpf.validation.simulation.textured_lab import LabDrive

@@ -15,11 +15,12 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.runs.alignment import Alignment
-from rbpf.runs.camera_files import read_features
-from rbpf.runs.measurements import InitialEstimate
-from rbpf.runs.trajectory import Trajectory
+from rbpf.runs.measurement_files import read_feature_log
+from rbpf.runs.reading import RunFolder
+from rbpf.runs.trajectory import Trajectory, in_space
 from rbpf.sensors.features import FeatureFrame, FeatureLog
 from rbpf.sensors.readers import open_log
+from rbpf.sensors.readers.measurements import InitialEstimate
 from rbpf.systems.filtering import ProposalConfig
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.run import run as filter_log
@@ -32,9 +33,7 @@ from rbpf.validation.gtsam.mono_batch import adjust_log
 from rbpf.validation.metrics.accuracy import ate
 from rbpf.validation.mono_budget import MANY
 from rbpf.validation.mono_parts import GivenDepths, agreeing_matches, batch_depths
-from rbpf.validation.run_files import in_space
 from rbpf.validation.run_folder import used_measurements
-from rbpf.validation.run_record import open_run
 from rbpf.validation.run_truth import robot_truth
 
 AS_IT_IS, BATCH, FROM_FILTER = "as it is", "batch", "batch started from the filter"
@@ -110,8 +109,8 @@ def camera_causes(
     Raises:
         InputError: the folder is none, or has no ground truth.
     """
-    record, log = open_run(folder), read_features(folder)
-    path, truth = record.path(), record.truth()
+    record, log = RunFolder.open(folder), read_feature_log(folder)
+    path, truth = record.path, record.truth
     config = load_settings(MonoConfig, "mono", folder / "config.yaml", (), {})
 
     def error(rows: np.ndarray, poses: np.ndarray) -> float:

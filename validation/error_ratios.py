@@ -14,6 +14,7 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.lie import Array
 from rbpf.runs.alignment import Alignment
+from rbpf.runs.path_and_map import PathAndMap
 from rbpf.runs.trajectory import Trajectory, associate
 from rbpf.sensors.features import FeatureLog
 from rbpf.sensors.readers import open_log
@@ -25,7 +26,7 @@ from rbpf.systems.stereo.run import StereoRun, run_features
 from rbpf.validation.gtsam.batch_problem import Optimum, floats_in_scale, problem_of, solve_problem
 from rbpf.validation.metrics.accuracy import ate
 from rbpf.validation.metrics.mono_scores import true_path
-from rbpf.validation.metrics.path_and_map import AnyRun, PathAndMap, of_run
+from rbpf.validation.metrics.path_and_map import AnyRun, of_run
 from rbpf.validation.metrics.scores import as_trajectory, truth_at
 from rbpf.validation.mono import Recording, start_mono
 from rbpf.validation.stereo import StereoRecording, start_stereo

@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.files import prepare_folder
+from rbpf.runs.path_and_map import PathAndMap
 from rbpf.sensors.features import FeatureLog
 from rbpf.sensors.pinhole import Pinhole
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.validation.colmap.model import build_model
 from rbpf.validation.gtsam.batch_problem import Problem
 from rbpf.validation.gtsam.camera_data import Sightings, sightings_of
-from rbpf.validation.metrics.path_and_map import PathAndMap
 from rbpf.validation.ply import write_ply
 from rbpf.validation.report.colours import colours_by_sigma, standard_deviations
 

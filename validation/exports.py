@@ -16,10 +16,11 @@ from rbpf.core.checkpoint import save_arrays
 from rbpf.errors import InputError
 from rbpf.runs.files import prepare_folder
 from rbpf.runs.measurement_files import OBSERVATIONS
+from rbpf.runs.path_and_map import PathAndMap
+from rbpf.runs.reading import RunFolder
 from rbpf.runs.trajectory import write_kitti, write_tum
 from rbpf.validation.export import MODEL, export_colmap, export_ply, raised
 from rbpf.validation.gtsam.batch_problem import read_problem
-from rbpf.validation.metrics.path_and_map import PathAndMap, read_path_and_map
 from rbpf.validation.report.rerun_file import AXIS_M, ellipsoids, log_pose, log_time, recording
 
 
@@ -40,7 +41,7 @@ def export_run(run: Path, formats: Sequence[str], out: Path) -> list[Path]:
     unknown = [name for name in formats if name not in FORMATS]
     if unknown:
         raise InputError(f"a run is exported as {', '.join(FORMATS)}, not as {unknown[0]}")
-    estimate = read_path_and_map(run)
+    estimate = RunFolder.open(run).estimate
     prepare_folder(out)
     return [path for name in dict.fromkeys(formats) for path in FORMATS[name](run, estimate, out)]
 

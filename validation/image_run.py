@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from rbpf.errors import InputError
-from rbpf.runs.files import write_summary
+from rbpf.runs.folder import write_summary
 from rbpf.runs.trajectory import write_tum
 from rbpf.validation.gtsam.mono_batch import Batch
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from rbpf.errors import InputError
 from rbpf.runs.files import prepare_folder
+from rbpf.runs.provenance import left_out
 from rbpf.sensors.chessboard import Board, find_board
 from rbpf.sensors.markers import MarkerBoard, find_markers
 from rbpf.sensors.readers.images import ImageSequence, KnownPixels, Topics, open_images, read_known_points
@@ -19,7 +20,6 @@ from rbpf.validation.gtsam.mono_batch import adjust_run, score_batch
 from rbpf.validation.image_run import CHECKPOINT, Progress, Telling, write_batch
 from rbpf.validation.mono_folder import write_mono_run
 from rbpf.validation.mono_map import summarise_mono_map
-from rbpf.validation.provenance import left_out
 from rbpf.validation.report.mono_pictures import plot_mono_run
 from rbpf.validation.report.mono_rerun import write_rerun
 from rbpf.validation.report.mono_video import write_annotated

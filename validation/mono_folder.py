@@ -6,7 +6,7 @@ posterior.npz            these paths (T, N, 7) and the particles' log-weights
 batch.tum                batch optimum of the same measurements, of the frames that took part
 observations*.csv        the measurements used, and the known points
 trajectory.npz           the same with its covariance; truth.npz: the ground truth at these frames; see
-                         `rbpf.validation.run_files`
+                         `rbpf.runs.results`
 known_map.npz            the points with what they look like, for --map; see `rbpf.systems.mono.known_map`
 map.npz, map.csv         landmarks: id, mean, covariance (within + between particles); whether it is a ray, was known
 timings.csv              milliseconds per frame and stage; and waiting for the decoded image
@@ -18,23 +18,25 @@ summary.json             the figures
 report.html              one page with all figures and pictures
 """
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from rbpf.runs.camera_files import write_features
-from rbpf.runs.files import (
+from rbpf.runs.files import prepare_folder, write_csv
+from rbpf.runs.folder import (
     milliseconds_per_frame,
     nis_ratio,
     peak_memory_mb,
-    prepare_folder,
-    write_csv,
     write_map,
     write_summary,
+    write_trajectory,
 )
+from rbpf.runs.measurement_files import write_measurements
+from rbpf.runs.provenance import write_config
 from rbpf.runs.trajectory import Trajectory, write_tum
+from rbpf.runs.truth import write_truth
 from rbpf.systems.mono.known_map import NAME, write_known_map
 from rbpf.systems.mono.video import VideoRun
 from rbpf.validation.metrics.mono_scores import camera_truth, score_camera
@@ -42,8 +44,6 @@ from rbpf.validation.mono_known_map import known_map
 from rbpf.validation.mono_log import feature_log
 from rbpf.validation.mono_map import MonoMap
 from rbpf.validation.mono_posterior import write_posterior
-from rbpf.validation.provenance import write_config
-from rbpf.validation.run_files import write_path, write_truth
 
 
 def write_mono_run(
@@ -62,7 +62,7 @@ def write_mono_run(
     """
     prepare_folder(out)
     write_tum(out / "trajectory.tum", Trajectory(run.stamps_ns, run.world_from_camera))
-    write_path(out, run.stamps_ns, run.world_from_camera, run.cov)
+    write_trajectory(out, run.stamps_ns, run.world_from_camera, run.cov)
     write_truth(out, camera_truth(run))
     table = run.sensor.table
     rows = mapped.landmarks.ids
@@ -72,11 +72,11 @@ def write_mono_run(
         "attempts": table.attempts[rows],
         "found": table.found[rows],
     }
-    write_map(out, mapped.landmarks, facts)
+    write_map(out, replace(mapped.landmarks, columns=facts, ray_ends=mapped.ends))
     if run.mapped is None:
         write_known_map(out / NAME, known_map(run, mapped))
     write_posterior(run, out)
-    write_features(out, feature_log(run))
+    write_measurements(out, feature_log(run))
     _write_tables(run, out)
     write_config(out, "mono", sources, asdict(run.config))
     entries = summarise_camera(run, mapped)

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from rbpf.runs.files import prepare_folder
-from rbpf.runs.measurements import dead_reckoning
 from rbpf.runs.trajectory import write_tum
 from rbpf.sensors.readers import open_log
+from rbpf.sensors.readers.measurements import dead_reckoning
 from rbpf.systems.map_estimate import estimate_map
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.range_bearing.run import Run, run

@@ -2,7 +2,7 @@
 
 trajectory.tum           online filtered mean at every step
 trajectory.npz           the same with its covariance; truth.npz: the ground truth at these steps; see
-                         `rbpf.validation.run_files`
+                         `rbpf.runs.results`
 map.npz, map.csv         landmarks: id, mean, covariance (within + between particles)
 observations.csv, observations_odometry.csv   the measurements used; see `rbpf.runs.measurement_files`
 timings.csv              milliseconds per step
@@ -19,23 +19,23 @@ from typing import Any
 import numpy as np
 
 from rbpf.lie import SE2Group
-from rbpf.runs.files import (
+from rbpf.runs.files import prepare_folder, write_csv
+from rbpf.runs.folder import (
     milliseconds_per_frame,
     nis_ratio,
     peak_memory_mb,
-    prepare_folder,
-    write_csv,
     write_map,
     write_summary,
+    write_trajectory,
 )
 from rbpf.runs.measurement_files import write_measurements
-from rbpf.runs.measurements import Measurements
+from rbpf.runs.provenance import left_out, write_config
 from rbpf.runs.trajectory import write_tum
+from rbpf.runs.truth import write_truth
+from rbpf.sensors.readers.measurements import Measurements
 from rbpf.systems.map_estimate import MapEstimate, estimate_map
 from rbpf.systems.range_bearing.run import Run
 from rbpf.validation.metrics.scores import Scores, as_trajectory, score
-from rbpf.validation.provenance import left_out, write_config
-from rbpf.validation.run_files import write_path, write_truth
 from rbpf.validation.run_truth import robot_truth
 
 
@@ -58,7 +58,7 @@ def write_run(
     log, progress = run.log, run.progress
     stamps = np.array([frame.stamp_ns for frame in log.frames], dtype=np.int64)
     write_tum(out / "trajectory.tum", as_trajectory(log, stamps, progress.mean))
-    write_path(out, stamps, progress.mean, progress.cov, progress.correction, progress.cov_correction)
+    write_trajectory(out, stamps, progress.mean, progress.cov, (progress.correction, progress.cov_correction))
     write_truth(out, robot_truth(log))
     summary_map = estimate_map(run.filter, run.anchored)
     write_map(out, summary_map)

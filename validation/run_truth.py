@@ -3,10 +3,10 @@
 import numpy as np
 
 from rbpf.lie import SE2Group
+from rbpf.runs.truth import RunTruth
 from rbpf.sensors.range_bearing import RelativePosition
 from rbpf.sensors.readers.log import RobotLog
 from rbpf.validation.metrics.scores import truth_at
-from rbpf.validation.run_files import RunTruth
 
 
 def robot_truth(log: RobotLog) -> RunTruth | None:

@@ -17,7 +17,7 @@ from rbpf.core.belief import Belief
 from rbpf.core.filter import Filter
 from rbpf.core.models import NewLandmarks, Observations, Sensor
 from rbpf.lie import SE2, SE3
-from rbpf.runs.files import peak_memory_mb
+from rbpf.runs.folder import peak_memory_mb
 from rbpf.sensors.names import Names
 from rbpf.systems.mono import system as mono
 from rbpf.systems.mono.config import MonoConfig

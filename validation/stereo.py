@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from rbpf.runs.files import prepare_folder
+from rbpf.runs.provenance import left_out
 from rbpf.sensors.readers.images import Topics, open_stereo
 from rbpf.sensors.readers.images.stereo import StereoSequence
 from rbpf.sensors.readers.images.topics import UNNAMED
@@ -15,7 +16,6 @@ from rbpf.systems.stereo.run import StereoRun, run_images
 from rbpf.validation.consistency.validate import report_run
 from rbpf.validation.gtsam.stereo_batch import adjust_stereo, score_stereo_batch
 from rbpf.validation.image_run import CHECKPOINT, Progress, Telling, write_batch
-from rbpf.validation.provenance import left_out
 from rbpf.validation.report.page import VIDEO
 from rbpf.validation.report.stereo_frames import write_annotated_pairs
 from rbpf.validation.report.stereo_pictures import plot_stereo_run

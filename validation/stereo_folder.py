@@ -2,10 +2,10 @@
 
 trajectory.tum           online filtered mean at every pair; the first camera is the world
 trajectory.npz           the same with its covariance; truth.npz: the ground truth at these pairs; see
-                         `rbpf.validation.run_files`
+                         `rbpf.runs.results`
 odometry.tum             the path by visual odometry alone
 batch.tum                the batch optimum of the same measurements
-observations*.csv        the measurements used, by odometry or by the map; see `rbpf.runs.camera_files`
+observations*.csv        the measurements used, by odometry or by the map; see `rbpf.runs.measurement_files`
 map.npz, map.csv         landmarks: name, mean, covariance (within + between particles); how often each was seen
 timings.csv              milliseconds per pair: whole, features, odometry, matching with the map, filter
 diagnostics.csv          features, matches that agree with the motion, landmarks; updates, sample size, evidence, NIS
@@ -18,29 +18,29 @@ report.html              one page with all figures and pictures
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from rbpf.runs.camera_files import write_features
-from rbpf.runs.files import (
+from rbpf.runs.files import prepare_folder, write_csv
+from rbpf.runs.folder import (
     milliseconds_per_frame,
     nis_ratio,
     peak_memory_mb,
-    prepare_folder,
-    write_csv,
     write_map,
     write_summary,
+    write_trajectory,
 )
+from rbpf.runs.measurement_files import write_measurements
+from rbpf.runs.provenance import write_config
 from rbpf.runs.trajectory import Trajectory, write_tum
+from rbpf.runs.truth import write_truth
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.stereo.run import StereoRun
 from rbpf.systems.stereo.sensor import StereoSensor
 from rbpf.validation.metrics.stereo_scores import distance_m, score_stereo, stereo_truth
-from rbpf.validation.provenance import write_config
-from rbpf.validation.run_files import write_path, write_truth
 
 _STAGES = "features", "odometry", "matching", "filter"
 
@@ -62,10 +62,10 @@ def write_stereo_run(
     prepare_folder(out)
     write_tum(out / "trajectory.tum", Trajectory(run.stamps_ns, run.world_from_camera))
     write_tum(out / "odometry.tum", Trajectory(run.stamps_ns, run.odometry))
-    write_map(out, mapped, _facts(run, mapped))
-    write_path(out, run.stamps_ns, run.world_from_camera, run.cov)
+    write_map(out, replace(mapped, columns=_facts(run, mapped)))
+    write_trajectory(out, run.stamps_ns, run.world_from_camera, run.cov)
     write_truth(out, stereo_truth(run))
-    write_features(out, run.front_end.log(run.name, run.stamps_ns, run.truth))
+    write_measurements(out, run.front_end.log(run.name, run.stamps_ns, run.truth))
     _write_tables(run, out)
     write_config(out, "stereo", sources, asdict(run.config))
     entries = summarise_stereo(run, mapped)

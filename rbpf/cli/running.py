@@ -120,7 +120,7 @@ def repeated(arguments: list[str]) -> list[str]:
         return arguments
     if len(arguments) < 3:
         raise InputError("--from takes the config.yaml of a run: rbpf run --from RUN/config.yaml")
-    from rbpf.validation.provenance import read_origin
+    from rbpf.runs.provenance import read_origin
 
     config = Path(arguments[2])
     origin = read_origin(config)

@@ -1,86 +1,222 @@
 """Measurements in files: what every run leaves behind for the comparison with a batch optimiser.
 
-Two text files in the run's folder, numbers with every digit (reading gives back the same bits):
+Text files in the run's folder, numbers with every digit (reading gives back the same bits). Each begins with named
+values; below a line with the columns' names there is one line per row. Covariances are their lower triangles by rows.
 
-observations.csv
+observations.csv    one line per measurement, in the order of the frames
 
     # rbpf observations 1
     # recording: NAME
     # space: SE2 | SE3
-    # measurement: range_bearing | position
+    # measurement: range_bearing | position | pinhole | stereo
+    …                 what the sensor is: see below
+    # rows: how many lines follow the columns' names
+    step,stamp_ns,landmark,z0,z1[,z2],c00,c10,c11[,c20,c21,c22]
+
+of a robot with
+
     # pitch_sign: 1 | -1
     # robot_from_sensor: E numbers, SE2 [theta, x, y], SE3 [qx, qy, qz, qw, tx, ty, tz]
     # start: E numbers, the known pose of step 0
     # start_stamp_ns: time of step 0
-    # rows: how many lines follow the columns' names
-    step,stamp_ns,landmark,z0,z1[,z2],c00,c10,c11[,c20,c21,c22]
 
-one line per measurement, its covariance as the lower triangle by rows; and
+of a camera, whose columns are u_px,v_px or u_left_px,v_px,u_right_px in place of z0,…, with
 
-observations_odometry.csv
+    # size: width and height of the images, px
+    # lens: equidistant, where it is a fisheye lens; else this line is left out
+    # camera: fx, fy, cx, cy, k1, k2, p1, p2, k3, or four numbers of an equidistant lens
+    # baseline: between the cameras of a rectified stereo pair, m; else this line is left out
 
-    # rbpf odometry 1
-    # recording: NAME
-    # space: SE2 | SE3
-    # rows: how many lines follow the columns' names
+observations_odometry.csv    of a robot: one line per step from 1 on, previous_robot_from_robot and its covariance in
+                             the right chart there, [ω, v]; `rbpf odometry 1`
     step,stamp_ns,d0,…,c00,c10,c11,…
 
-one line per step from 1 on: previous_robot_from_robot, and the lower triangle of its covariance in the right
-chart there, in the order [omega, v].
+observations_frames.csv    of a camera: one line per frame, with measurements or without; `rbpf frames 1`
+    step,stamp_ns
+
+observations_known_points.csv    of a camera: points known beforehand, if there are any, m; `rbpf known points 1`
+    landmark,x_m,y_m,z_m,c00,c10,c11,c20,c21,c22
 """
 
-from collections.abc import Iterable
+import re
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Self, final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rbpf import gaussian
+from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3, Array, SE2Group, SE3Group
 from rbpf.runs.files import whole
-from rbpf.runs.headed_table import HeadedTable
-from rbpf.runs.measurements import KINDS, Measurements, are_covariances, are_poses, point_dim
-from rbpf.sensors.readers.text import quoted
+from rbpf.sensors.features import FeatureFrame, FeatureLog, KnownPoints
+from rbpf.sensors.pinhole import LENSES, Pinhole, RectifiedStereo
+from rbpf.sensors.readers.measurements import KINDS, Measurements, are_covariances, are_poses, point_dim
+from rbpf.sensors.readers.table import parse_number
+from rbpf.sensors.readers.text import line_error, quoted, read_lines
 
 OBSERVATIONS = "observations.csv"
 ODOMETRY = "observations_odometry.csv"
+FRAMES = "observations_frames.csv"
+KNOWN = "observations_known_points.csv"
 
-_TITLES = {OBSERVATIONS: "rbpf observations 1", ODOMETRY: "rbpf odometry 1"}
-_COVARIANCE = "a positive semi-definite covariance"
+PLAIN = "radial-tangential"
+"""The lens that is meant where none is named."""
+
+_TITLES = {
+    OBSERVATIONS: "rbpf observations 1",
+    ODOMETRY: "rbpf odometry 1",
+    FRAMES: "rbpf frames 1",
+    KNOWN: "rbpf known points 1",
+}
 _HINT = "a file that every filter run writes into its folder"
+_COVARIANCE = "a positive semi-definite covariance"
 _SPACES: dict[str, SE2Group | SE3Group] = {"SE2": SE2, "SE3": SE3}
+_PIXELS = {"pinhole": ["u_px", "v_px"], "stereo": ["u_left_px", "v_px", "u_right_px"]}
+_KNOWN_COLUMNS = ["landmark", "x_m", "y_m", "z_m", "c00", "c10", "c11", "c20", "c21", "c22"]
+_WHOLE = re.compile(r"[+-]?\d{1,19}", re.ASCII)
+_INT64 = np.iinfo(np.int64)
 
 
-def write_measurements(folder: Path, m: Measurements) -> None:
-    """Write both files; they appear under their names when both are complete.
+def write_measurements(folder: Path, m: Measurements | FeatureLog) -> None:
+    """Writes the files; they appear under their names when all are complete, and those of a former run are replaced.
 
     Args:
-        folder: the run's folder; files of these names in it are replaced.
-        m: what to write.
+        folder: the run's folder.
+        m: of a robot, or of one camera or a rectified pair.
 
     Raises:
         InputError: the folder is missing or cannot be written to, or the disk is full.
     """
-    texts = {OBSERVATIONS: _observations_text(m), ODOMETRY: _odometry_text(m)}
-    with ExitStack() as both:
+    texts = _camera_texts(m) if isinstance(m, FeatureLog) else _robot_texts(m)
+    with ExitStack() as together:
         for name, text in texts.items():
-            both.enter_context(whole(folder / name)).write_text(text, encoding="utf-8")
+            together.enter_context(whole(folder / name)).write_text(text, encoding="utf-8")
+    for name in _TITLES.keys() - texts.keys():
+        (folder / name).unlink(missing_ok=True)
 
 
-def read_measurements(folder: Path) -> Measurements:
-    """Read what `write_measurements` wrote.
+def read_measurements(folder: Path) -> Measurements | FeatureLog:
+    """Reads what `write_measurements` wrote; a camera's log has no truth.
 
     Raises:
         InputError: names the file and the line that is not as expected.
     """
-    seen, moved = (HeadedTable.read(folder / name, title, _HINT) for name, title in _TITLES.items())
+    table = _Table.read(folder / OBSERVATIONS)
+    kind = table.choice("measurement", (*KINDS, *_PIXELS))
+    return _read_camera_log(folder, table, kind) if kind in _PIXELS else _read_robot(folder, table)
+
+
+def read_robot_measurements(folder: Path) -> Measurements:
+    """`read_measurements` of a robot's run; a camera's is refused."""
+    table = _Table.read(folder / OBSERVATIONS)
+    table.choice("measurement", tuple(KINDS))
+    return _read_robot(folder, table)
+
+
+def read_feature_log(folder: Path) -> FeatureLog:
+    """`read_measurements` of a camera's run; a robot's is refused."""
+    table = _Table.read(folder / OBSERVATIONS)
+    return _read_camera_log(folder, table, table.choice("measurement", tuple(_PIXELS)))
+
+
+def _robot_texts(m: Measurements) -> dict[str, str]:
+    header = {
+        "space": repr(m.space),
+        "measurement": m.measurement,
+        "pitch_sign": f"{m.pitch_sign:g}",
+        "robot_from_sensor": _joined(m.robot_from_sensor, " "),
+        "start": _joined(m.start, " "),
+        "start_stamp_ns": str(int(m.stamps_ns[0])),
+    }
+    observed = np.stack([m.steps, m.stamps_ns[m.steps], m.landmarks], axis=1)
+    moves = np.stack([np.arange(1, len(m.stamps_ns)), m.stamps_ns[1:]], axis=1)
+    numbers = np.concatenate([m.z, _lower(m.cov_z)], axis=1)
+    odometry = np.concatenate([m.deltas, _lower(m.covs)], axis=1)
+    return {
+        OBSERVATIONS: _text(OBSERVATIONS, m.recording, header, _observed(_axes(m.space)), observed, numbers),
+        ODOMETRY: _text(ODOMETRY, m.recording, {"space": repr(m.space)}, _moves(m.space), moves, odometry),
+    }
+
+
+def _camera_texts(log: FeatureLog) -> dict[str, str]:
+    stamps = np.array([frame.stamp_ns for frame in log.frames], dtype=np.int64)
+    steps = np.repeat(np.arange(stamps.size), [frame.landmarks.size for frame in log.frames])
+    names, z, cov = (
+        np.concatenate([getattr(f, part) for f in log.frames]) for part in ("landmarks", "z", "cov_z")
+    )
+    header = _camera_header(log.camera)
+    columns = _observed(_PIXELS[header["measurement"]])
+    rows = np.stack([steps, stamps[steps], names], axis=1)
+    numbers = np.concatenate([z, gaussian.pack(cov)], axis=1)
+    frames = np.stack([np.arange(stamps.size), stamps], axis=1)
+    nothing = np.empty((stamps.size, 0))
+    texts = {
+        OBSERVATIONS: _text(OBSERVATIONS, log.name, header, columns, rows, numbers),
+        FRAMES: _text(FRAMES, log.name, {}, ["step", "stamp_ns"], frames, nothing),
+    }
+    if log.known is not None:
+        numbers = np.concatenate([log.known.positions, gaussian.pack(log.known.cov)], axis=1)
+        texts[KNOWN] = _text(KNOWN, log.name, {}, _KNOWN_COLUMNS, log.known.names[:, None], numbers)
+    return texts
+
+
+def _camera_header(camera: Pinhole | RectifiedStereo) -> dict[str, str]:
+    if isinstance(camera, RectifiedStereo):
+        header = _camera_header(camera.camera) | {"measurement": "stereo"}
+        return header | {"baseline": repr(float(camera.baseline_m))}
+    lens = {} if camera.distortion_model == PLAIN else {"lens": camera.distortion_model}
+    numbers = (camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion)
+    return {
+        "space": "SE3",
+        "measurement": "pinhole",
+        "size": f"{camera.width} {camera.height}",
+        **lens,
+        "camera": " ".join(repr(float(x)) for x in numbers),
+    }
+
+
+def _text(
+    name: str,
+    recording: str,
+    header: Mapping[str, str],
+    columns: list[str],
+    integers: np.ndarray,
+    numbers: np.ndarray,
+) -> str:
+    lines = [f"# {_TITLES[name]}", f"# recording: {recording}"]
+    lines += [f"# {key}: {value}" for key, value in header.items()]
+    lines += [f"# rows: {len(integers)}", ",".join(columns)]
+    rows = zip(integers.tolist(), numbers.tolist(), strict=True)
+    lines += [",".join(map(repr, [*whole_numbers, *real])) for whole_numbers, real in rows]
+    return "\n".join([*lines, ""])
+
+
+def _read_robot(folder: Path, seen: "_Table") -> Measurements:
+    moved = _Table.read(folder / ODOMETRY)
     space = _SPACES[seen.choice("space", tuple(_SPACES))]
     for key in ("recording", "space"):
-        if moved.text(key) != seen.text(key):
-            problem = f"expected {key} {seen.text(key)} as in {OBSERVATIONS}, found {quoted(moved.text(key))}"
-            raise moved.header_error(key, f"{problem}; take both files from one run")
-    stamps, deltas, covs = _read_moves(moved, space, seen.whole("start_stamp_ns"))
-    steps, landmarks, z, cov_z = _read_sightings(seen, space, stamps)
+        moved.require_same(key, seen)
+
+    integers, numbers = moved.body(_moves(space), 2)
+    moved.require(integers[:, 0] == np.arange(1, len(integers) + 1), "one row per step, from step 1 in order")
+    stamps = np.concatenate([[seen.whole("start_stamp_ns")], integers[:, 1]])
+    moved.require(np.diff(stamps) >= 0, "stamps in order of time")
+    deltas, covs = numbers[:, : space.size], _symmetric(numbers[:, space.size :], space.dim)
+    moved.require(are_poses(space, deltas), "an increment that begins with a quaternion of length 1")
+    moved.require(are_covariances(covs), _COVARIANCE)
+
+    integers, numbers = seen.body(_observed(_axes(space)), 3)
+    steps, stamp, landmarks = integers.T
+    inside = (steps >= 0) & (steps < len(stamps))
+    seen.require(inside, f"a step from 0 to {len(stamps) - 1}, the last one in {ODOMETRY}")
+    seen.require(stamp == stamps[steps], f"the stamp that {ODOMETRY} gives this step")
+    p = point_dim(space)
+    cov_z = _symmetric(numbers[:, p:], p)
+    seen.require(are_covariances(cov_z), _COVARIANCE)
     return Measurements(
         recording=seen.text("recording"),
         space=space,
@@ -93,95 +229,74 @@ def read_measurements(folder: Path) -> Measurements:
         covs=covs,
         steps=steps,
         landmarks=landmarks,
-        z=z,
+        z=numbers[:, :p],
         cov_z=cov_z,
     )
 
 
-def _observations_text(m: Measurements) -> str:
-    header = {
-        "recording": m.recording,
-        "space": repr(m.space),
-        "measurement": m.measurement,
-        "pitch_sign": f"{m.pitch_sign:g}",
-        "robot_from_sensor": _joined(m.robot_from_sensor, " "),
-        "start": _joined(m.start, " "),
-        "start_stamp_ns": str(int(m.stamps_ns[0])),
-    }
-    integers = np.stack([m.steps, m.stamps_ns[m.steps], m.landmarks], axis=1)
-    numbers = np.concatenate([m.z, _lower(m.cov_z)], axis=1)
-    return _text(_TITLES[OBSERVATIONS], header, _observation_columns(m.space), integers, numbers)
+def _read_camera_log(folder: Path, seen: "_Table", kind: str) -> FeatureLog:
+    seen.choice("space", ("SE3",))
+    listed = _Table.read(folder / FRAMES)
+    listed.require_same("recording", seen)
+    integers, _ = listed.body(["step", "stamp_ns"], 2)
+    listed.require(integers[:, 0] == np.arange(len(integers)), "one row per frame, from step 0 in order")
+    stamps = np.ascontiguousarray(integers[:, 1])
+    listed.require(np.diff(stamps, prepend=stamps[:1]) >= 0, "stamps in order of time")
+
+    integers, numbers = seen.body(_observed(_PIXELS[kind]), 3)
+    steps = integers[:, 0]
+    seen.require(
+        (steps >= 0) & (steps < stamps.size), f"a step from 0 to {stamps.size - 1}, the last in {FRAMES}"
+    )
+    seen.require(integers[:, 1] == stamps[steps], f"the stamp that {FRAMES} gives this step")
+    seen.require(np.diff(steps, prepend=0) >= 0, "steps in order")
+    cuts = np.searchsorted(steps, np.arange(1, stamps.size))
+    camera = _read_camera(seen, kind)
+    p = camera.dim
+    columns = (integers[:, 2], numbers[:, :p], gaussian.unpack(numbers[:, p:], p))
+    parts = zip(stamps.tolist(), *(np.split(column, cuts) for column in columns), strict=True)
+
+    known = None
+    if (folder / KNOWN).exists():
+        table = _Table.read(folder / KNOWN)
+        names, numbers = table.body(_KNOWN_COLUMNS, 1)
+        known = KnownPoints(names[:, 0].copy(), numbers[:, :3].copy(), gaussian.unpack(numbers[:, 3:], 3))
+    return FeatureLog(seen.text("recording"), camera, [FeatureFrame(*part) for part in parts], known)
 
 
-def _odometry_text(m: Measurements) -> str:
-    header = {"recording": m.recording, "space": repr(m.space)}
-    integers = np.stack([np.arange(1, len(m.stamps_ns)), m.stamps_ns[1:]], axis=1)
-    numbers = np.concatenate([m.deltas, _lower(m.covs)], axis=1)
-    return _text(_TITLES[ODOMETRY], header, _odometry_columns(m.space), integers, numbers)
+def _read_camera(table: "_Table", kind: str) -> Pinhole | RectifiedStereo:
+    width, height = table.numbers("size", 2).tolist()
+    lens = table.choice("lens", tuple(LENSES)) if "lens" in table.header else PLAIN
+    fx, fy, cx, cy, *distortion = table.numbers("camera", 4 + len(LENSES[lens].names)).tolist()
+    camera = Pinhole(int(width), int(height), fx, fy, cx, cy, tuple(distortion), lens)
+    return RectifiedStereo(camera, float(table.numbers("baseline", 1)[0])) if kind == "stereo" else camera
 
 
-def _text(
-    title: str, header: dict[str, str], columns: list[str], integers: NDArray[np.int64], numbers: Array
-) -> str:
-    lines = [f"# {title}", *(f"# {key}: {value}" for key, value in header.items())]
-    lines += [f"# rows: {len(integers)}", ",".join(columns)]
-    lines += [f"{_joined(i, ',')},{_joined(x, ',')}" for i, x in zip(integers, numbers, strict=True)]
-    return "\n".join([*lines, ""])
-
-
-def _joined(numbers: NDArray[np.int64] | Array, separator: str) -> str:
-    return separator.join(map(repr, numbers.tolist()))
-
-
-def _observation_columns(space: SE2Group | SE3Group) -> list[str]:
-    count = point_dim(space)
-    return ["step", "stamp_ns", "landmark", *_indexed("z", count), *_triangle(count)]
-
-
-def _odometry_columns(space: SE2Group | SE3Group) -> list[str]:
-    return ["step", "stamp_ns", *_indexed("d", space.size), *_triangle(space.dim)]
-
-
-def _indexed(name: str, count: int) -> Iterable[str]:
-    return (f"{name}{i}" for i in range(count))
-
-
-def _triangle(count: int) -> Iterable[str]:
-    return (f"c{i}{j}" for i in range(count) for j in range(i + 1))
-
-
-def _read_moves(
-    table: HeadedTable, space: SE2Group | SE3Group, start_ns: int
-) -> tuple[NDArray[np.int64], Array, Array]:
-    integers, numbers = table.body(_odometry_columns(space), 2)
-    table.require(integers[:, 0] == np.arange(1, len(integers) + 1), "one row per step, from step 1 in order")
-    stamps = np.concatenate([[start_ns], integers[:, 1]])
-    table.require(np.diff(stamps) >= 0, "stamps in order of time")
-    deltas, covs = numbers[:, : space.size], _symmetric(numbers[:, space.size :], space.dim)
-    table.require(are_poses(space, deltas), "an increment that begins with a quaternion of length 1")
-    table.require(are_covariances(covs), _COVARIANCE)
-    return stamps, deltas, covs
-
-
-def _read_sightings(
-    table: HeadedTable, space: SE2Group | SE3Group, stamps: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64], Array, Array]:
-    integers, numbers = table.body(_observation_columns(space), 3)
-    steps, stamp, landmarks = integers.T
-    inside = (steps >= 0) & (steps < len(stamps))
-    table.require(inside, f"a step from 0 to {len(stamps) - 1}, the last one in {ODOMETRY}")
-    table.require(stamp == stamps[steps], f"the stamp that {ODOMETRY} gives this step")
-    dim = point_dim(space)
-    cov = _symmetric(numbers[:, dim:], dim)
-    table.require(are_covariances(cov), _COVARIANCE)
-    return steps, landmarks, numbers[:, :dim], cov
-
-
-def _read_pose(table: HeadedTable, key: str, space: SE2Group | SE3Group) -> Array:
+def _read_pose(table: "_Table", key: str, space: SE2Group | SE3Group) -> Array:
     pose = table.numbers(key, space.size)
     if not are_poses(space, pose[None])[0]:
         raise table.header_error(key, f"expected {key} to begin with a quaternion of length 1")
     return pose
+
+
+def _axes(space: SE2Group | SE3Group) -> list[str]:
+    return [f"z{i}" for i in range(point_dim(space))]
+
+
+def _observed(measured: list[str]) -> list[str]:
+    return ["step", "stamp_ns", "landmark", *measured, *_triangle(len(measured))]
+
+
+def _moves(space: SE2Group | SE3Group) -> list[str]:
+    return ["step", "stamp_ns", *(f"d{i}" for i in range(space.size)), *_triangle(space.dim)]
+
+
+def _triangle(count: int) -> list[str]:
+    return [f"c{i}{j}" for i in range(count) for j in range(i + 1)]
+
+
+def _joined(numbers: Array, separator: str) -> str:
+    return separator.join(map(repr, numbers.tolist()))
 
 
 def _lower(cov: Array) -> Array:
@@ -194,3 +309,114 @@ def _symmetric(triangle: Array, dim: int) -> Array:
     cov = np.empty((len(triangle), dim, dim))
     cov[:, row, column] = cov[:, column, row] = triangle
     return cov
+
+
+@final
+@dataclass(frozen=True)
+class _Table:
+    """Lines of one of the files, checked as they are asked for; every method raises InputError at a malformed one.
+
+    Attributes:
+        path: the file.
+        header: line number and text of each named value.
+        columns: the line with the columns' names.
+        columns_line: its number, from 1.
+        rows: the lines below it.
+    """
+
+    path: Path
+    header: dict[str, tuple[int, str]]
+    columns: str
+    columns_line: int
+    rows: list[str]
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """Reads a file whose first line is its title."""
+        lines, title = read_lines(path, _HINT), _TITLES[path.name]
+        if lines[0] != f"# {title}":
+            raise line_error(path, 1, f"expected '# {title}', found {quoted(lines[0])}")
+        header: dict[str, tuple[int, str]] = {}
+        for number, line in enumerate(lines[1:], 2):
+            if not line.startswith("#"):
+                return cls(path, header, line, number, lines[number:])
+            key, _, value = line.removeprefix("#").partition(":")
+            header[key.strip()] = (number, value.strip())
+        raise line_error(path, len(lines), "expected the columns' names below, found the file's end")
+
+    def text(self, key: str) -> str:
+        """Named value."""
+        return self._entry(key)[1]
+
+    def choice(self, key: str, allowed: Sequence[str]) -> str:
+        """Named value that is one of several."""
+        if self.text(key) not in allowed:
+            problem = f"expected {key} to be {' or '.join(allowed)}, found {quoted(self.text(key))}"
+            raise self.header_error(key, problem)
+        return self.text(key)
+
+    def whole(self, key: str) -> int:
+        """Named whole number."""
+        line, text = self._entry(key)
+        return self._whole_number(line, key, text)
+
+    def numbers(self, key: str, count: int) -> Array:
+        """Named numbers, (count,)."""
+        line, text = self._entry(key)
+        fields = text.split()
+        if len(fields) != count:
+            raise self.header_error(key, f"expected {count} numbers for {key}, found {len(fields)}")
+        return np.array([parse_number(self.path, line, key, field) for field in fields])
+
+    def body(self, names: Sequence[str], integers: int) -> tuple[NDArray[np.int64], Array]:
+        """The first `integers` columns, which are whole numbers, and the others (n, k)."""
+        if self.columns != ",".join(names):
+            problem = f"expected the columns {','.join(names)}, found {quoted(self.columns)}"
+            raise line_error(self.path, self.columns_line, problem)
+        count = self.whole("rows")
+        if count != len(self.rows):
+            problem = f"expected {count} rows as the header says, found {len(self.rows)}; copy the file again"
+            raise self.row_error(len(self.rows) - 1, problem)
+        wholes = np.empty((count, integers), dtype=np.int64)
+        numbers = np.empty((count, len(names) - integers))
+        for row, text in enumerate(self.rows):
+            line, fields = self.columns_line + 1 + row, text.split(",")
+            if len(fields) != len(names):
+                problem = f"expected {len(names)} columns ({', '.join(names)}), found {len(fields)}"
+                raise self.row_error(row, problem)
+            named = list(zip(names, fields, strict=True))
+            wholes[row] = [self._whole_number(line, *field) for field in named[:integers]]
+            numbers[row] = [parse_number(self.path, line, *field) for field in named[integers:]]
+        return wholes, numbers
+
+    def require(self, valid: NDArray[np.bool_], expected: str) -> None:
+        """Refuses the first row where `valid` (n,) is False."""
+        if not valid.all():
+            raise self.row_error(int(np.argmin(valid)), f"expected {expected}")
+
+    def require_same(self, key: str, other: "_Table") -> None:
+        """Refuses a named value that another of the run's files has otherwise."""
+        if self.text(key) != other.text(key):
+            found = (
+                f"expected {key} {other.text(key)} as in {other.path.name}, found {quoted(self.text(key))}"
+            )
+            raise self.header_error(key, f"{found}; take both files from one run")
+
+    def header_error(self, key: str, problem: str) -> InputError:
+        """Error that points at a named value."""
+        return line_error(self.path, self._entry(key)[0], problem)
+
+    def row_error(self, row: int, problem: str) -> InputError:
+        """Error that points at a row, counted from 0."""
+        return line_error(self.path, self.columns_line + 1 + row, problem)
+
+    def _entry(self, key: str) -> tuple[int, str]:
+        if key not in self.header:
+            problem = f"expected a line '# {key}: ...' above this one, found none"
+            raise line_error(self.path, self.columns_line, problem)
+        return self.header[key]
+
+    def _whole_number(self, line: int, name: str, text: str) -> int:
+        if not _WHOLE.fullmatch(text) or not _INT64.min <= int(text) <= _INT64.max:
+            raise line_error(self.path, line, f"expected {name} to be a whole number, found {quoted(text)}")
+        return int(text)

@@ -20,7 +20,7 @@ from rbpf.core.archive import checked
 from rbpf.core.checkpoint import fitting
 from rbpf.errors import InputError
 from rbpf.runs.frame_log import FrameLog
-from rbpf.runs.truth import Truth
+from rbpf.runs.truth import RunTruth
 from rbpf.systems.system import System, Tracked, TrackingState
 
 
@@ -48,7 +48,7 @@ class Run:
 
     name: str
     system: System
-    truth: Truth | None = None
+    truth: RunTruth | None = None
     log: FrameLog = field(init=False)
     messages: list[str] = field(default_factory=list)
     failure: str | None = None

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rbpf.errors import InputError
-from rbpf.lie import SE3, Array
+from rbpf.lie import SE2, SE3, Array
 from rbpf.runs.alignment import Similarity
 from rbpf.runs.files import whole
 from rbpf.sensors.readers.table import read_columns
@@ -67,6 +67,13 @@ class Trajectory:
     def transformed(self, similarity: Similarity) -> "Trajectory":
         """The trajectory in the world that a similarity leads to."""
         return Trajectory(self.stamps_ns, similarity.transform_poses(self.world_from_body))
+
+
+def in_space(stamps_ns: NDArray[np.int64], poses: Array) -> Trajectory:
+    """Poses (T, E) of SE2 or SE3 as a trajectory in space."""
+    if poses.shape[1] == SE2.size:
+        return Trajectory.from_planar(stamps_ns, poses)
+    return Trajectory(stamps_ns, poses)
 
 
 def associate(

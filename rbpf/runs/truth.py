@@ -39,7 +39,7 @@ class GroundTruth(Protocol):
 
 
 @dataclass(frozen=True)
-class Truth:
+class RunTruth:
     """Ground truth at a run's own frames.
 
     Attributes:
@@ -57,7 +57,7 @@ class Truth:
 
 def truth_at(
     space: SE2Group | SE3Group, truth: GroundTruth, stamps_ns: np.ndarray, gauge: Gauge
-) -> Truth | None:
+) -> RunTruth | None:
     """The truth at a run's frames; None where no frame has a true pose.
 
     Args:
@@ -73,12 +73,12 @@ def truth_at(
     dim = 2 if isinstance(space, SE2Group) else 3
     landmarks = {name: np.asarray(point, dtype=float)[:dim] for name, point in truth.landmarks.items()}
     if gauge != "first frame":
-        return Truth(rows, poses, landmarks, _ALIGNMENTS[gauge])
+        return RunTruth(rows, poses, landmarks, _ALIGNMENTS[gauge])
     if rows[0] != 0:
-        return Truth(rows, poses, landmarks, "rigid")
+        return RunTruth(rows, poses, landmarks, "rigid")
     model, start = RelativePosition(space), poses[0]
     moved = {name: model.predict(start, point) for name, point in landmarks.items()}
-    return Truth(rows, space.between(start, poses), moved, "none")
+    return RunTruth(rows, space.between(start, poses), moved, "none")
 
 
 def poses_at(
@@ -101,7 +101,7 @@ def poses_at(
     return rows, space.interpolate(poses[before[rows]], poses[after[rows]], fraction)
 
 
-def write_truth(out: Path, truth: Truth | None) -> None:
+def write_truth(out: Path, truth: RunTruth | None) -> None:
     """Writes truth.npz, or removes one of an earlier run where there is no truth."""
     if truth is None:
         (out / TRUTH).unlink(missing_ok=True)
@@ -117,7 +117,7 @@ def write_truth(out: Path, truth: Truth | None) -> None:
     save_arrays(out / TRUTH, arrays)
 
 
-def read_truth(folder: Path, steps: int, size: int) -> Truth:
+def read_truth(folder: Path, steps: int, size: int) -> RunTruth:
     """Reads truth.npz of a run of so many steps, with poses of so many numbers.
 
     Raises:
@@ -139,4 +139,4 @@ def read_truth(folder: Path, steps: int, size: int) -> Truth:
         raise InputError(f"{path} belongs to another run than {folder / 'trajectory.npz'}")
     if not rows.size:
         raise InputError(f"{folder}: no step of the run has the time of a true pose")
-    return Truth(rows, poses, landmarks, alignment)
+    return RunTruth(rows, poses, landmarks, alignment)

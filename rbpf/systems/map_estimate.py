@@ -1,60 +1,50 @@
 """The map of a finished filter as one Gaussian per landmark, within + between particles."""
 
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from rbpf import gaussian
 from rbpf.core.anchoring import Anchored
-from rbpf.core.archive import checked
-from rbpf.core.checkpoint import fitting
 from rbpf.core.filter import Filter
 from rbpf.core.models import Records
-from rbpf.errors import InputError
 from rbpf.sensors.range_bearing import RelativePosition
 
 
 @dataclass(frozen=True)
 class MapEstimate:
-    """Landmarks of a run.
+    """Landmarks of a run, M of them.
 
     Attributes:
         ids: (M,) names: the log's where the association is known, else the map's.
         mean: (M, D) positions in the world, metres.
         cov: (M, D, D).
+        columns: what the system adds to each landmark, (M,) by name. `ray` is 1 for one whose depth is not known yet.
+        ray_ends: (M, 2, 3) nearest and farthest point of a ray, NaN for points; None where there are no rays.
     """
 
     ids: np.ndarray
     mean: np.ndarray
     cov: np.ndarray
+    columns: dict[str, np.ndarray] = field(default_factory=dict)
+    ray_ends: np.ndarray | None = None
 
     def named(self) -> dict[int, np.ndarray]:
         """Positions by name."""
         return dict(zip(self.ids.tolist(), self.mean, strict=True))
 
+    def is_ray(self) -> np.ndarray:
+        """(M,) bool, whether the depth is not known yet."""
+        return np.asarray(self.columns.get("ray", np.zeros(self.ids.size))) != 0
 
-def map_of(path: Path, arrays: dict[str, np.ndarray]) -> MapEstimate:
-    """The landmarks of a map.npz that are points; those whose depth is not known are left out.
-
-    Args:
-        path: of the file, for messages.
-        arrays: what it holds.
-
-    Raises:
-        InputError: an array is missing, or is not what it should be.
-    """
-    with fitting(path):
-        ids = checked(arrays, "id", (None,), "iu")
-        mean = checked(arrays, "mean", (ids.size, None), "f")
-        if mean.shape[1] not in (2, 3):
-            raise InputError(f"the array mean must have points in the plane or in space, got {mean.shape}")
-        cov = checked(arrays, "cov", (ids.size, mean.shape[1], mean.shape[1]), "f")
-        known = np.ones(ids.size, dtype=bool)
-        if "ray" in arrays:
-            known = checked(arrays, "ray", (ids.size,), "iub") == 0
-    return MapEstimate(ids[known], mean[known], cov[known])
+    def points(self) -> "MapEstimate":
+        """The landmarks that are points."""
+        if "ray" not in self.columns:
+            return self
+        full = ~self.is_ray()
+        columns = {name: column[full] for name, column in self.columns.items() if name != "ray"}
+        return MapEstimate(self.ids[full], self.mean[full], self.cov[full], columns)
 
 
 def estimate_map(filter_: Filter, anchored: Anchored | None = None) -> MapEstimate:

@@ -13,13 +13,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, Protocol
 
 import numpy as np
 
 from rbpf.arrays import Float, Int
 from rbpf.core.filter import Filter
 from rbpf.lie import SE2Group, SE3Group
+from rbpf.sensors.features import FeatureLog
+from rbpf.sensors.readers.measurements import Measurements
 from rbpf.systems.map_estimate import MapEstimate
 
 Gauge = Literal["none", "first frame", "rigid", "similarity"]
@@ -135,6 +137,29 @@ class Tracked:
     revision: Revision | None = None
 
 
+class Recorded(Protocol):
+    """What a run has kept of what the system said, see `rbpf.runs.frame_log.FrameLog`."""
+
+    @property
+    def stamps_ns(self) -> np.ndarray:
+        """(T,) times of the frames."""
+
+    @property
+    def poses(self) -> np.ndarray:
+        """(T, E) world_from_body."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """A column (T, …)."""
+
+    def observed(self, t: int) -> dict[str, np.ndarray]:
+        """What frame t showed."""
+
+    def lost(self) -> np.ndarray:
+        """(T,) bool."""
+
+
 class System(ABC):
     """A SLAM system. Subclasses add `track`, with the arguments that their sensor has.
 
@@ -169,6 +194,22 @@ class System(ABC):
     @abstractmethod
     def map(self) -> MapEstimate:
         """The landmarks as they are known now, each a Gaussian within + between particles, in the reported world."""
+
+    @abstractmethod
+    def measurements(self, name: str, log: Recorded) -> FeatureLog | Measurements:
+        """What the system used of a recording of this name, landmarks named as in `map`: for a batch optimiser."""
+
+    def particle_poses(self) -> np.ndarray:
+        """(N, E) world_from_body of the particles as they are now, in the reported world."""
+        return self.filter.particles.state[:, : self.space.size]
+
+    def summary(self, log: Recorded) -> dict[str, Any]:
+        """Further entries of a run's summary.json; they go before the common ones of the same name."""
+        return {}
+
+    def files(self, log: Recorded) -> dict[str, dict[str, np.ndarray]]:
+        """Further files of a run's folder, arrays by the file's name and their own."""
+        return {}
 
     @abstractmethod
     def arrays(self) -> dict[str, np.ndarray]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rbpf.cli import main
-from rbpf.runs.camera_files import read_features
+from rbpf.runs.measurement_files import read_feature_log
 from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
 from rbpf.sensors.readers.images import open_images, open_stereo
 from rbpf.sensors.readers.images.calibration import read_calibration
@@ -47,7 +47,7 @@ def test_one_camera_is_as_near_to_the_truth_as_a_pinhole(finished):
     assert entries["ate_rmse_m"] < 0.01
     assert entries["batch_ate_rmse_m"] < 0.01
     assert 10 <= entries["observations_per_frame"] <= 25
-    log = read_features(finished)
+    log = read_feature_log(finished)
     assert log.camera == CAMERA
     uv = CAMERA.unproject(np.concatenate([frame.z for frame in log.frames]))
     assert (np.arctan(np.hypot(*uv.T)) > EDGE).sum() > FRAMES, (

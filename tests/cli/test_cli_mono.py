@@ -13,7 +13,7 @@ import yaml
 from rbpf.cli import main
 from rbpf.core.filter import Filter
 from rbpf.lie import SE3
-from rbpf.runs.camera_files import read_features
+from rbpf.runs.measurement_files import read_feature_log
 from rbpf.runs.trajectory import read_tum
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.run import run as filter_log
@@ -82,7 +82,7 @@ def test_the_map_is_in_that_world_and_flags_rays(desk, finished):
 
 def test_the_measurements_are_those_that_the_filter_used(finished):
     """Filtered again without the images, they give the same path to the last bit."""
-    log, config = read_features(finished), MonoConfig(particles=8)
+    log, config = read_feature_log(finished), MonoConfig(particles=8)
     again = filter_log(log, config)
     told = read_tum(finished / "trajectory.tum")
     np.testing.assert_array_equal(again.stamps_ns, told.stamps_ns)
@@ -90,7 +90,7 @@ def test_the_measurements_are_those_that_the_filter_used(finished):
 
 
 def test_the_batch_optimum_of_them_lies_beside(finished):
-    log, told = read_features(finished), read_tum(finished / "batch.tum")
+    log, told = read_feature_log(finished), read_tum(finished / "batch.tum")
     start = CameraEstimate(read_tum(finished / "trajectory.tum").world_from_body, {})
     both = [solve_features(log, one, robust=ROBUST, marginals=False) for one in (start, None)]
     plain = min(both, key=lambda solution: solution.error)

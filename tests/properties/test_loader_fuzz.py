@@ -15,15 +15,14 @@ from rbpf.core.archive import load_arrays, save_arrays
 from rbpf.core.checkpoint import _digest
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.runs.results import load
 from rbpf.systems.mono.appearance import SOURCE_HALF_PX
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.known_map import KnownMap, read_known_map, write_known_map
 from rbpf.systems.settings import load_settings
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.validation.consistency.comparison import read_comparisons
-from rbpf.validation.metrics.path_and_map import read_path_and_map
 from rbpf.validation.report.page import write_report
-from rbpf.validation.run_record import open_run
 from rbpf.validation.simulation.streams import CAMERA
 from rbpf.validation.sweep.plan import read_plan
 from rbpf.validation.sweep.sweep import read_rows
@@ -112,15 +111,15 @@ def test_run_folders(run, data):
     try:
         path.write_bytes(data.draw(damaged(whole)))
         read_or_refused(lambda: read_all(run))
-        read_or_refused(lambda: read_path_and_map(run))
+        read_or_refused(lambda: load(run).estimate)
         read_or_refused(lambda: read_comparisons(run))
     finally:
         path.write_bytes(whole)
 
 
 def read_all(run: Path) -> None:
-    record = open_run(run)
-    record.path(), record.truth(), record.map(), record.table("diagnostics.csv")
+    record = load(run)
+    record.path, record.truth, record.map.points(), record.table("diagnostics.csv")
 
 
 @settings(max_examples=20, suppress_health_check=[HealthCheck.too_slow])
@@ -147,7 +146,7 @@ def test_arrays_of_other_shapes_and_types(run, data):
     try:
         save_arrays(path, arrays)
         read_or_refused(lambda: read_all(run))
-        read_or_refused(lambda: read_path_and_map(run))
+        read_or_refused(lambda: load(run).estimate)
     finally:
         path.write_bytes(whole)
 

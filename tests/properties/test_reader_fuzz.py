@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.runs.camera_files import read_features, write_features
-from rbpf.runs.measurement_files import read_measurements, write_measurements
+from rbpf.runs.measurement_files import read_feature_log, read_robot_measurements, write_measurements
 from rbpf.runs.trajectory import Trajectory, read_kitti, read_tum, write_tum
 from rbpf.sensors.readers import open_log, stereo_tracks, text
 from rbpf.sensors.readers.images import Topics, open_images, open_stereo, read_known_points
@@ -117,7 +116,7 @@ def results(folder: Path) -> None:
 
 def features(folder: Path) -> None:
     log = CameraStream(Turnover(points=12, measurements=8), seed=0).first()
-    write_features(folder, replace(log, frames=[log.frames[0]] * 2))
+    write_measurements(folder, replace(log, frames=[log.frames[0]] * 2))
 
 
 RECORDINGS: dict[str, tuple[Callable[[Path], object], Read, str]] = {
@@ -143,8 +142,8 @@ RECORDINGS: dict[str, tuple[Callable[[Path], object], Read, str]] = {
     "path": (results, lambda f: read_tum(f / "path.tum"), "path.tum"),
     "path of KITTI": (results, lambda f: read_kitti(f / "path.kitti"), "path.kitti"),
     "PLY": (results, lambda f: read_ply(f / "map.ply"), "map.ply"),
-    "features": (features, read_features, "observations*.csv"),
-    "measurements": (lambda f: write_measurements(f, world(2, "position")), read_measurements, "*.csv"),
+    "features": (features, read_feature_log, "observations*.csv"),
+    "measurements": (lambda f: write_measurements(f, world(2, "position")), read_robot_measurements, "*.csv"),
 }
 
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rbpf.lie import Array
-from rbpf.runs.measurements import Measurements
+from rbpf.sensors.readers.measurements import Measurements
 
 
 class Filtered(NamedTuple):

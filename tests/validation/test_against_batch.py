@@ -11,9 +11,9 @@ import yaml
 from rbpf.core.checkpoint import save_arrays
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.runs.camera_files import write_features
-from rbpf.runs.files import write_map
-from rbpf.runs.trajectory import Trajectory, write_tum
+from rbpf.runs.folder import write_map, write_summary, write_trajectory
+from rbpf.runs.measurement_files import write_measurements
+from rbpf.runs.path_and_map import PathAndMap
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.run import run as run_features
@@ -28,7 +28,7 @@ from rbpf.validation.consistency.against_batch import (
 )
 from rbpf.validation.gtsam.batch_problem import first_steps, fit_of, problem_of, read_problem, solve_problem
 from rbpf.validation.metrics.gaussian_differences import compare_last_pose, rescaled, scale_onto
-from rbpf.validation.metrics.path_and_map import PathAndMap, of_run, read_path_and_map
+from rbpf.validation.metrics.path_and_map import of_run
 from rbpf.validation.run_folder import write_run
 from tests.validation.camera_scenes import scene
 from tests.validation.linear_worlds import linear_log
@@ -105,18 +105,11 @@ def test_a_folder_tells_the_same_as_the_run(linear_run, folder):
         assert getattr(stored.landmarks, name) == pytest.approx(getattr(direct.landmarks, name))
     progress = linear_run.progress
     stamps = np.array([frame.stamp_ns for frame in linear_run.log.frames])
-    save_arrays(folder / "trajectory.npz", {"stamps_ns": stamps, "mean": progress.mean, "cov": progress.cov})
+    write_trajectory(folder, stamps, progress.mean, progress.cov)
     with_poses = compare_folder(folder)
     assert with_poses.poses.sigmas == pytest.approx(compare_run(linear_run).poses.sigmas)
     text = json.dumps(with_poses.as_dict(), allow_nan=False)
     assert json.loads(text)["landmarks"]["count"] == 5
-
-
-def test_a_folder_with_poses_alone_has_no_covariances_to_compare(folder):
-    (folder / "trajectory.npz").unlink(missing_ok=True)
-    estimate = read_path_and_map(folder)
-    assert estimate.cov_poses.shape == (0, 3, 3)
-    assert len(compare_folder(folder).poses) == 0
 
 
 def test_known_points_make_one_world_of_filter_and_batch():
@@ -211,10 +204,14 @@ def test_a_camera_that_stays_has_no_scale():
 
 def test_a_run_over_images_is_read_from_its_folder(tmp_path):
     log, estimate = camera_problem()
-    write_features(tmp_path, log)
-    write_tum(tmp_path / "trajectory.tum", Trajectory(estimate.stamps_ns, estimate.world_from_body))
+    write_measurements(tmp_path, log)
+    steps = len(estimate.stamps_ns)
+    write_trajectory(
+        tmp_path, estimate.stamps_ns, estimate.world_from_body, np.tile(np.eye(6), (steps, 1, 1))
+    )
+    write_summary(tmp_path, {})
     rays = np.arange(len(estimate.landmarks.ids)) < 2
-    write_map(tmp_path, estimate.landmarks, {"ray": rays.astype(int)})
+    write_map(tmp_path, replace(estimate.landmarks, columns={"ray": rays.astype(int)}))
     config = {"rbpf": _version(), "system": "mono", "recording": "somewhere"}
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(config))
     assert len(read_problem(tmp_path).frames) == len(log.frames)
@@ -232,7 +229,8 @@ def _version():
 @pytest.mark.parametrize(
     ("spoil", "says"),
     [
-        (lambda f: shutil.rmtree(f), "holds no config.yaml"),
+        (lambda f: shutil.rmtree(f), "there is no such folder"),
+        (lambda f: (f / "config.yaml").unlink(), "has no config.yaml"),
         (lambda f: (f / "config.yaml").write_text("a: 1"), "expected the settings of a run"),
         (
             lambda f: (f / "config.yaml").write_text("rbpf: 99.1.0\nsystem: mono"),
@@ -241,7 +239,7 @@ def _version():
         (lambda f: (f / "config.yaml").write_text("{"), "is not YAML"),
         (lambda f: (f / "observations.csv").unlink(), "holds no observations.csv"),
         (lambda f: (f / "map.npz").unlink(), "holds no map.npz"),
-        (lambda f: save_arrays(f / "map.npz", {"id": np.arange(2)}), "found no mean"),
+        (lambda f: save_arrays(f / "map.npz", {"id": np.arange(2)}), "array mean is missing"),
     ],
 )
 def test_a_folder_that_is_no_finished_run_is_refused(folder, spoil, says):

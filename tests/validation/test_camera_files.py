@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rbpf.errors import InputError
-from rbpf.runs.camera_files import FRAMES, KNOWN, OBSERVATIONS, read_features, write_features
+from rbpf.runs.measurement_files import FRAMES, KNOWN, OBSERVATIONS, read_feature_log, write_measurements
 from rbpf.sensors.features import FeatureFrame, FeatureLog, KnownPoints
 from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
 
@@ -34,9 +34,9 @@ PAIR = RectifiedStereo(replace(CAMERA, distortion=(0.0,) * 5), 0.1 + 0.2)
 @pytest.mark.parametrize("camera", [CAMERA, FISHEYE, PAIR])
 @pytest.mark.parametrize("known", [True, False])
 def test_reading_gives_back_the_same_bits(tmp_path, known, camera):
-    write_features(tmp_path, log())
-    write_features(tmp_path, log(known, camera))
-    again, original = read_features(tmp_path), log(known, camera)
+    write_measurements(tmp_path, log())
+    write_measurements(tmp_path, log(known, camera))
+    again, original = read_feature_log(tmp_path), log(known, camera)
     assert again.name == original.name and again.camera == original.camera
     for one, other in zip(again.frames, original.frames, strict=True):
         assert one.stamp_ns == other.stamp_ns
@@ -67,12 +67,12 @@ def test_reading_gives_back_the_same_bits(tmp_path, known, camera):
     ],
 )
 def test_a_damaged_file_is_named(tmp_path, name, old, new, words):
-    write_features(tmp_path, log())
+    write_measurements(tmp_path, log())
     text = (tmp_path / name).read_text()
     assert old in text
     (tmp_path / name).write_text(text.replace(old, new, 1))
     with pytest.raises(InputError, match=words) as error:
-        read_features(tmp_path)
+        read_feature_log(tmp_path)
     assert name in str(error.value)
 
 
@@ -86,12 +86,12 @@ def test_a_damaged_file_is_named(tmp_path, name, old, new, words):
     ],
 )
 def test_a_damaged_file_of_pairs_is_named(tmp_path, old, new, words):
-    write_features(tmp_path, log(camera=PAIR))
+    write_measurements(tmp_path, log(camera=PAIR))
     text = (tmp_path / OBSERVATIONS).read_text()
     assert old in text
     (tmp_path / OBSERVATIONS).write_text(text.replace(old, new, 1))
     with pytest.raises(InputError, match=words):
-        read_features(tmp_path)
+        read_feature_log(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -106,18 +106,18 @@ def test_a_damaged_file_of_pairs_is_named(tmp_path, old, new, words):
     ],
 )
 def test_a_damaged_lens_is_named(tmp_path, old, new, words):
-    write_features(tmp_path, log(camera=FISHEYE))
+    write_measurements(tmp_path, log(camera=FISHEYE))
     text = (tmp_path / OBSERVATIONS).read_text()
     assert old in text
     (tmp_path / OBSERVATIONS).write_text(text.replace(old, new, 1))
     with pytest.raises(InputError, match=words):
-        read_features(tmp_path)
+        read_feature_log(tmp_path)
 
 
 def test_a_stamp_that_belongs_to_another_frame_is_refused(tmp_path):
-    write_features(tmp_path, log())
-    write_features(tmp_path / ".", replace(log(), frames=log().frames))
+    write_measurements(tmp_path, log())
+    write_measurements(tmp_path / ".", replace(log(), frames=log().frames))
     text = (tmp_path / OBSERVATIONS).read_text()
     (tmp_path / OBSERVATIONS).write_text(text.replace("1400000000066666666", "1400000000066666667"))
     with pytest.raises(InputError, match="gives this step"):
-        read_features(tmp_path)
+        read_feature_log(tmp_path)

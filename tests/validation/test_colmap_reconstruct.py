@@ -7,6 +7,7 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.runs.path_and_map import PathAndMap
 from rbpf.runs.trajectory import Trajectory
 from rbpf.sensors.features import CameraTruth
 from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
@@ -17,7 +18,6 @@ from rbpf.validation.colmap.cloud_distance import cloud_distance
 from rbpf.validation.colmap.compare import compare_with_path, compare_with_truth
 from rbpf.validation.colmap.pipeline import ReconstructionOptions
 from rbpf.validation.colmap.reconstruct import Reconstruction, reconstruct
-from rbpf.validation.metrics.path_and_map import PathAndMap
 from rbpf.validation.simulation.exposure import Imaging
 from rbpf.validation.simulation.images import simulate_images
 from rbpf.validation.simulation.textured_desk import TexturedDesk

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from rbpf.errors import InputError
-from rbpf.runs.camera_files import write_features
+from rbpf.runs.folder import write_trajectory
+from rbpf.runs.measurement_files import write_measurements
+from rbpf.runs.truth import RunTruth, write_truth
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.run import run as filter_log
 from rbpf.systems.range_bearing.config import RangeBearingConfig
@@ -20,7 +22,6 @@ from rbpf.validation.error_causes import (
     scaled_noise,
 )
 from rbpf.validation.error_ratios import robot_ratio
-from rbpf.validation.run_files import RunTruth, write_path, write_truth
 from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
 from rbpf.validation.simulation.point_worlds import DeskWorld
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
@@ -55,8 +56,8 @@ def folder(tmp_path):
     log = simulate_features(DeskWorld(frames=25), Measuring(), MONO, 3)
     config = MonoConfig(particles=8)
     run = filter_log(log, config)
-    write_features(tmp_path, log)
-    write_path(tmp_path, run.stamps_ns, run.world_from_camera, run.cov)
+    write_measurements(tmp_path, log)
+    write_trajectory(tmp_path, run.stamps_ns, run.world_from_camera, run.cov)
     write_truth(tmp_path, RunTruth(np.arange(25), log.truth.world_from_camera))
     (tmp_path / "config.yaml").write_text("rbpf: 0\nsystem: mono\nparticles: 8\n")
     (tmp_path / "summary.json").write_text("{}")

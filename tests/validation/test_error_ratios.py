@@ -7,12 +7,12 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.runs.path_and_map import PathAndMap
 from rbpf.runs.trajectory import Trajectory
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.validation.error_ratios import HEADER, ErrorRatio, error_of, robot_ratio, tracks_ratio
-from rbpf.validation.metrics.path_and_map import PathAndMap
 from rbpf.validation.simulation.features import STEREO, Measuring, simulate_features
 from rbpf.validation.simulation.point_worlds import DeskWorld
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot

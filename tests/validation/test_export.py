@@ -8,6 +8,7 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.runs.path_and_map import PathAndMap
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.range_bearing.run import run
@@ -17,7 +18,7 @@ from rbpf.validation.export import MAP, PATH, colmap_model, export_colmap, expor
 from rbpf.validation.gtsam.batch_problem import problem_of
 from rbpf.validation.gtsam.camera_data import sightings_of
 from rbpf.validation.gtsam.camera_factors import evaluate_sightings
-from rbpf.validation.metrics.path_and_map import PathAndMap, of_run
+from rbpf.validation.metrics.path_and_map import of_run
 from rbpf.validation.ply import read_ply, write_ply
 from rbpf.validation.report.colours import colours_by_sigma, standard_deviations
 from tests.validation.camera_scenes import BENT, FISHEYE, STEREO, scene

@@ -8,8 +8,8 @@ import pytest
 
 from rbpf.cli import main
 from rbpf.lie import SE3
+from rbpf.runs.results import load
 from rbpf.runs.trajectory import read_kitti, read_tum, write_kitti
-from rbpf.validation.metrics.path_and_map import read_path_and_map
 
 pytestmark = pytest.mark.slow
 
@@ -31,7 +31,7 @@ def test_all_formats_hold_the_run(run, tmp_path, capsys):
     files = json.loads(capsys.readouterr().out)["files"]
     names = {"trajectory.tum", "trajectory_kitti.txt", "map.ply", "path.ply", "colmap", "run.rrd", "run.npz"}
     assert {path.name for path in tmp_path.iterdir()} == names and len(files) == len(names)
-    estimate = read_path_and_map(run)
+    estimate = load(run).estimate
     poses = estimate.trajectory.world_from_body
     np.testing.assert_array_equal(read_tum(tmp_path / "trajectory.tum").stamps_ns, estimate.stamps_ns)
     for path in (read_tum(tmp_path / "trajectory.tum"), read_kitti(tmp_path / "trajectory_kitti.txt")):
@@ -47,7 +47,7 @@ def test_all_formats_hold_the_run(run, tmp_path, capsys):
 
 
 def test_kitti_files_are_read_back(tmp_path, run):
-    trajectory = read_path_and_map(run).trajectory
+    trajectory = load(run).estimate.trajectory
     write_kitti(tmp_path / "poses.txt", trajectory)
     again = read_kitti(tmp_path / "poses.txt")
     assert np.abs(SE3.local(again.world_from_body, trajectory.world_from_body)).max() < 1e-9

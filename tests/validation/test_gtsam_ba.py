@@ -9,7 +9,7 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3
-from rbpf.runs.measurements import InitialEstimate, dead_reckoning, initial_estimate
+from rbpf.sensors.readers.measurements import InitialEstimate, dead_reckoning, initial_estimate
 from rbpf.validation.gtsam.batch_problem import first_steps
 from rbpf.validation.gtsam.chart import PLANAR, SPATIAL
 from rbpf.validation.gtsam.robot import solve, solve_online

@@ -5,8 +5,8 @@ import pytest
 
 from rbpf.lie import SE2
 from rbpf.runs.alignment import align
-from rbpf.runs.measurements import from_log, initial_estimate
 from rbpf.sensors.readers import open_log
+from rbpf.sensors.readers.measurements import from_log, initial_estimate
 from rbpf.validation.gtsam.robot import solve
 from rbpf.validation.gtsam.robot_graph import Problem
 from rbpf.validation.metrics.accuracy import landmark_errors

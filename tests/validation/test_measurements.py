@@ -8,10 +8,10 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE2
-from rbpf.runs.measurement_files import OBSERVATIONS, ODOMETRY, read_measurements, write_measurements
-from rbpf.runs.measurements import Measurements, dead_reckoning, from_log, initial_estimate
+from rbpf.runs.measurement_files import OBSERVATIONS, ODOMETRY, read_robot_measurements, write_measurements
 from rbpf.sensors.range_bearing import RangeBearing, RelativePosition
 from rbpf.sensors.readers import Frame, RobotLog, open_log
+from rbpf.sensors.readers.measurements import Measurements, dead_reckoning, from_log, initial_estimate
 from tests.validation.worlds import seen, world
 
 FIELDS = [field for field in Measurements.__dataclass_fields__ if field != "space"]
@@ -28,7 +28,7 @@ def assert_same(found, expected):
 def test_files_give_back_the_same_bits(tmp_path, dim, kind):
     m = world(dim, kind)
     write_measurements(tmp_path, m)
-    assert_same(read_measurements(tmp_path), m)
+    assert_same(read_robot_measurements(tmp_path), m)
     assert sorted(path.name for path in tmp_path.iterdir()) == [OBSERVATIONS, ODOMETRY]
 
 
@@ -39,7 +39,7 @@ def test_extreme_numbers_come_back(tmp_path):
     covs[0] = np.diag([0.0, 1e-300, np.nextafter(1.0, 2.0)])
     m = replace(m, z=z, covs=covs, landmarks=m.landmarks - 2**62, recording="zurich, 2nd: été")
     write_measurements(tmp_path, m)
-    assert_same(read_measurements(tmp_path), m)
+    assert_same(read_robot_measurements(tmp_path), m)
 
 
 def test_a_run_without_sightings_and_one_of_a_single_step_come_back(tmp_path):
@@ -50,7 +50,7 @@ def test_a_run_without_sightings_and_one_of_a_single_step_come_back(tmp_path):
     single = replace(single, stamps_ns=m.stamps_ns[:1], deltas=m.deltas[:0], covs=m.covs[:0])
     for short in (blind, single):
         write_measurements(tmp_path, short)
-        assert_same(read_measurements(tmp_path), short)
+        assert_same(read_robot_measurements(tmp_path), short)
 
 
 def test_the_files_are_as_documented(tmp_path):
@@ -76,10 +76,10 @@ def test_missing_and_cut_files_are_refused(tmp_path, name):
     for cut in (text[:-3], text[: text.rindex("\n", 0, -1) + 1], text[:20], text[: text.index("step")], ""):
         path.write_text(cut)
         with pytest.raises(InputError, match=re.escape(str(path))):
-            read_measurements(tmp_path)
+            read_robot_measurements(tmp_path)
     path.unlink()
     with pytest.raises(InputError, match="no such file; expected a file that every filter run writes"):
-        read_measurements(tmp_path)
+        read_robot_measurements(tmp_path)
 
 
 BAD_SIGHTINGS = [
@@ -112,7 +112,7 @@ def test_malformed_sightings_are_refused_by_line(tmp_path, old, new, complaint):
     assert text.count(old) >= 1
     path.write_text(text.replace(old, new, 1))
     with pytest.raises(InputError, match=complaint):
-        read_measurements(tmp_path)
+        read_robot_measurements(tmp_path)
 
 
 def spoiled(path, line, column, value):
@@ -140,14 +140,14 @@ def test_malformed_numbers_are_refused_by_line(tmp_path, name, line, column, val
     write_measurements(tmp_path, world(2, "position"))
     spoiled(tmp_path / name, line, column, value)
     with pytest.raises(InputError, match=re.escape(str(tmp_path / name)) + ", " + complaint):
-        read_measurements(tmp_path)
+        read_robot_measurements(tmp_path)
 
 
 def test_quaternions_that_are_none_are_refused_by_line(tmp_path):
     write_measurements(tmp_path, world(3, "position"))
     spoiled(tmp_path / ODOMETRY, 7, 5, "3.0")
     with pytest.raises(InputError, match="line 7: expected an increment that begins with a quaternion"):
-        read_measurements(tmp_path)
+        read_robot_measurements(tmp_path)
 
 
 def test_a_failed_write_leaves_no_half_file(tmp_path, monkeypatch):
@@ -232,4 +232,4 @@ def test_a_log_without_odometry_or_frames_is_refused():
 def test_recordings_come_back_from_files(data_dir, tmp_path, folder):
     m = from_log(open_log(data_dir / folder))
     write_measurements(tmp_path, m)
-    assert_same(read_measurements(tmp_path), m)
+    assert_same(read_robot_measurements(tmp_path), m)

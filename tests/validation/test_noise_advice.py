@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from rbpf.core.filter import Filter
+from rbpf.runs.results import Results
 from rbpf.validation.consistency.noise_advice import noise_advice
 from rbpf.validation.consistency.own_statistics import INNOVATIONS
 from rbpf.validation.consistency.statistic import step_ratio, variance_ratio
-from rbpf.validation.run_record import RunRecord
 from tests.validation.test_verdict import Receiver, Walk
 
 
-def record(system: str, **config: object) -> RunRecord:
-    return RunRecord(Path("run"), {"system": system, **config}, {})
+def record(system: str, **config: object) -> Results:
+    return Results(Path("run"), {"system": system, **config}, {})
 
 
 def innovations(value: float):

@@ -10,6 +10,9 @@ import yaml
 from rbpf.cli import main
 from rbpf.core.checkpoint import load_arrays, save_arrays
 from rbpf.errors import InputError
+from rbpf.runs.folder import write_summary, write_trajectory
+from rbpf.runs.results import load
+from rbpf.runs.truth import RunTruth, write_truth
 from rbpf.sensors.readers.log import Truth
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.range_bearing.run import run
@@ -17,8 +20,6 @@ from rbpf.validation.consistency.against_groundtruth import truth_errors
 from rbpf.validation.consistency.trials import simulated_log
 from rbpf.validation.consistency.validate import COMPARISONS, validate
 from rbpf.validation.report.page import write_report
-from rbpf.validation.run_files import RunTruth, read_path, read_truth, write_path, write_truth
-from rbpf.validation.run_record import open_run
 from rbpf.validation.run_truth import robot_truth
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 
@@ -65,13 +66,13 @@ def test_a_finished_run_has_its_verdict_on_top(finished):
 
 
 def test_errors_are_those_of_the_run_itself(finished):
-    record = open_run(finished)
+    record = load(finished)
     errors = truth_errors(record)
     summary = record.summary
     assert errors.positions.rmse == pytest.approx(summary["path_rmse_m"])
     landmark = np.linalg.norm(errors.landmarks.errors, axis=1).mean()
     assert landmark == pytest.approx(summary["landmark_error_mean_m"])
-    path, truth = record.path(), record.truth()
+    path, truth = record.path, record.truth
     last = path.space.local(path.mean[-1], truth.poses[-1])
     assert errors.whitened.nees[-1] == pytest.approx(last @ np.linalg.solve(path.cov[-1], last))
 
@@ -107,12 +108,12 @@ def spoil_version(folder):
 
 
 def spoil_truth_of_another_run(folder):
-    path = read_path(folder)
+    path = load(folder).path
     write_truth(folder, RunTruth(np.array([500]), path.mean[:1]))
 
 
 def spoil_truth_without_steps(folder):
-    path = read_path(folder)
+    path = load(folder).path
     write_truth(folder, RunTruth(np.zeros(0, dtype=np.int64), path.mean[:0]))
 
 
@@ -160,7 +161,7 @@ def test_what_cannot_be_compared_is_one_sentence_and_the_report_is_written(
         (lambda folder: shutil.rmtree(folder), "no such folder"),
         (lambda folder: (folder / "summary.json").unlink(), "summary.json"),
         (lambda folder: (folder / "summary.json").write_text("{"), "damaged"),
-        (lambda folder: (folder / "config.yaml").write_text("[1, 2]"), "config.yaml is damaged"),
+        (lambda folder: (folder / "config.yaml").write_text("[1, 2]"), "expected the settings of a run"),
     ],
 )
 def test_a_folder_that_is_no_run_is_refused(run_folder, spoil, message, capsys):
@@ -227,15 +228,17 @@ def test_path_and_truth_survive_the_files(tmp_path):
     log = simulated_log(RobotWorld(steps=15), 0)
     progress = run(log, RangeBearingConfig(particles=10)).progress
     stamps = np.arange(15)
-    write_path(tmp_path, stamps, progress.mean, progress.cov)
+    write_trajectory(tmp_path, stamps, progress.mean, progress.cov)
     write_truth(tmp_path, robot_truth(log))
-    path = read_path(tmp_path)
+    write_summary(tmp_path, {})
+    (tmp_path / "config.yaml").write_text("rbpf: 1\nsystem: range-bearing\n")
+    path = load(tmp_path).path
     np.testing.assert_array_equal(path.cov, progress.cov)
-    truth = read_truth(tmp_path, path)
+    truth = load(tmp_path).truth
     np.testing.assert_array_equal(truth.poses, robot_truth(log).poses)
     write_truth(tmp_path, None)
     with pytest.raises(InputError, match="no ground truth"):
-        read_truth(tmp_path, path)
+        _ = load(tmp_path).truth
 
 
 def test_settings_of_the_run_are_still_readable(finished):

@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 
 from rbpf import gaussian
 from rbpf.lie import SE2, SE3, Array
-from rbpf.runs.measurements import Kind, Measurements
+from rbpf.sensors.readers.measurements import Kind, Measurements
 from tests.validation.numeric import shrunk, slope_of
 
 Index = NDArray[np.int64]

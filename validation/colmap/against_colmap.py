@@ -6,11 +6,13 @@ from pathlib import Path
 from typing import Any, final
 
 from rbpf.errors import InputError
+from rbpf.runs.path_and_map import PathAndMap
+from rbpf.runs.provenance import read_config
+from rbpf.runs.reading import RunFolder
 from rbpf.sensors.readers.images import ImageSequence, Topics, open_images, open_stereo
 from rbpf.validation.colmap.compare import ColmapComparison, compare_with_path, compare_with_truth
 from rbpf.validation.colmap.pipeline import ReconstructionOptions
 from rbpf.validation.colmap.reconstruct import reconstruct
-from rbpf.validation.metrics.path_and_map import PathAndMap, read_config, read_path_and_map
 
 OVER_IMAGES = "mono", "stereo"
 """Systems whose runs have images."""
@@ -50,7 +52,7 @@ def compare_folder_with_colmap(folder: Path, options: ReconstructionOptions | No
             f"{folder} is a run of the system {config['system']}, which sees no images; COLMAP needs a run over images."
         )
     sequence = _images(config)
-    return compare_with_colmap(read_path_and_map(folder), sequence, options)
+    return compare_with_colmap(RunFolder.open(folder).estimate, sequence, options)
 
 
 def _images(config: Mapping[str, Any]) -> ImageSequence:

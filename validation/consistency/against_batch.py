@@ -21,6 +21,8 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import Array
+from rbpf.runs.path_and_map import PathAndMap
+from rbpf.runs.reading import RunFolder
 from rbpf.validation.gtsam.batch_problem import (
     Fit,
     Optimum,
@@ -44,7 +46,7 @@ from rbpf.validation.metrics.gaussian_differences import (
     rescaled,
     scale_onto,
 )
-from rbpf.validation.metrics.path_and_map import AnyRun, PathAndMap, of_run, read_path_and_map
+from rbpf.validation.metrics.path_and_map import AnyRun, of_run
 
 INSTANTS = 3
 """At how many instants poses are compared, the last one among them."""
@@ -119,7 +121,7 @@ def compare_folder(folder: Path, instants: int = INSTANTS, robust: float | None 
     Raises:
         InputError: also if the folder is not that of a finished run of this version.
     """
-    return compare(read_path_and_map(folder), read_problem(folder), instants, robust)
+    return compare(RunFolder.open(folder).estimate, read_problem(folder), instants, robust)
 
 
 def compare(

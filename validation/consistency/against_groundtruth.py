@@ -7,15 +7,15 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import SE2
-from rbpf.runs.trajectory import associate, read_tum
+from rbpf.runs.reading import FilteredPath, RunFolder
+from rbpf.runs.trajectory import associate, in_space, read_tum
+from rbpf.runs.truth import RunTruth
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.validation.consistency.autocorrelation import degrees_of_freedom
 from rbpf.validation.consistency.comparison import Comparison
 from rbpf.validation.consistency.pose_errors import WhitenedErrors, whitened_errors
 from rbpf.validation.consistency.statistic import STATE_FACTOR, Statistic, coverage, variance_ratio
 from rbpf.validation.metrics.accuracy import AbsoluteError, ate, rpe
-from rbpf.validation.run_files import FilteredPath, RunTruth, in_space
-from rbpf.validation.run_record import RunRecord
 
 NAME = "groundtruth"
 NEES = "poses against the truth"
@@ -63,7 +63,7 @@ class LandmarkErrors:
     squares: np.ndarray
 
 
-def truth_errors(record: RunRecord, std_m: float = 0.0, std_rad: float = 0.0) -> TruthErrors:
+def truth_errors(record: RunFolder, std_m: float = 0.0, std_rad: float = 0.0) -> TruthErrors:
     """Errors of a run.
 
     Args:
@@ -74,7 +74,7 @@ def truth_errors(record: RunRecord, std_m: float = 0.0, std_rad: float = 0.0) ->
     Raises:
         InputError: the run has no truth, or too little.
     """
-    path, truth = record.path(), record.truth()
+    path, truth = record.path, record.truth
     if truth.rows.size < LEAST:
         raise InputError(
             f"{record.folder}: {truth.rows.size} steps of the run have a true pose, a comparison needs {LEAST}"
@@ -87,7 +87,7 @@ def truth_errors(record: RunRecord, std_m: float = 0.0, std_rad: float = 0.0) ->
         own = np.repeat([std_rad**2, std_m**2], [turns, path.space.dim - turns])
         cov = path.cov[truth.rows] + np.diag(own)
         whitened = whitened_errors(path.space, path.mean[truth.rows], cov, truth.poses)
-        landmarks = _landmark_errors(record.map(), truth)
+        landmarks = _landmark_errors(record.map.points(), truth)
     return TruthErrors(path, truth, positions, whitened, landmarks)
 
 
@@ -103,7 +103,7 @@ def pose_statistics(errors: WhitenedErrors) -> list[Statistic]:
     return [ratio, *(coverage(nees[full], dim, max(dof / dim, 1.0)) if full.any() else [])]
 
 
-def compare_with_truth(record: RunRecord, std_m: float = 0.0, std_rad: float = 0.0) -> Comparison:
+def compare_with_truth(record: RunFolder, std_m: float = 0.0, std_rad: float = 0.0) -> Comparison:
     """The comparison, with pictures in the run's folder; arguments and errors as `truth_errors`."""
     from rbpf.validation.report.truth_pictures import draw_truth
 
@@ -126,7 +126,7 @@ def _landmark_errors(found: MapEstimate, truth: RunTruth) -> LandmarkErrors | No
     return LandmarkErrors(found, error, squares)
 
 
-def _batch_error(record: RunRecord, errors: TruthErrors) -> float | None:
+def _batch_error(record: RunFolder, errors: TruthErrors) -> float | None:
     """Of the batch optimum's positions at the same steps, aligned in the same way; None without one."""
     if not (record.folder / "batch.tum").is_file():
         return None

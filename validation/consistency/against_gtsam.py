@@ -15,8 +15,12 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import LieGroup
-from rbpf.runs.measurement_files import read_measurements
-from rbpf.runs.measurements import Measurements
+from rbpf.runs.measurement_files import read_robot_measurements
+from rbpf.runs.path_and_map import PathAndMap
+from rbpf.runs.plots import save_figures
+from rbpf.runs.reading import FilteredPath, RunFolder
+from rbpf.runs.trajectory import in_space
+from rbpf.sensors.readers.measurements import Measurements
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.validation.consistency.against_batch import compare
 from rbpf.validation.consistency.autocorrelation import degrees_of_freedom
@@ -26,7 +30,6 @@ from rbpf.validation.consistency.statistic import NOISE_FACTOR, STATE_FACTOR, St
 from rbpf.validation.gtsam.batch_problem import robot_optimum
 from rbpf.validation.gtsam.robot import BatchSolution, solve
 from rbpf.validation.metrics.gaussian_differences import figures_of
-from rbpf.validation.metrics.path_and_map import PathAndMap
 from rbpf.validation.report.comparison_figures import (
     landmark_figure,
     map_figure,
@@ -34,9 +37,6 @@ from rbpf.validation.report.comparison_figures import (
     path_figure,
     wide_axes,
 )
-from rbpf.validation.report.figures import save_figures
-from rbpf.validation.run_files import FilteredPath, in_space
-from rbpf.validation.run_record import RunRecord
 
 NAME = "gtsam"
 LONG = 300
@@ -76,21 +76,21 @@ def batch_errors(path: FilteredPath, found: MapEstimate, batch: BatchSolution) -
     return BatchErrors(poses, white, expected, sigmas, found)
 
 
-def compare_with_batch(record: RunRecord) -> Comparison:
+def compare_with_batch(record: RunFolder) -> Comparison:
     """The comparison, with pictures in the run's folder.
 
     Raises:
         InputError: the run's measurements are missing or damaged, belong to another run, or do not determine the
             batch problem.
     """
-    path, measured = record.path(), read_measurements(record.folder)
+    path, measured = record.path, read_robot_measurements(record.folder)
     if not np.array_equal(measured.stamps_ns, path.stamps_ns):
         raise InputError(
             f"{record.folder}: trajectory and measurements share no common steps, they belong to different runs"
         )
     batch = solve(measured, incremental=len(measured.stamps_ns) > LONG)
-    errors = batch_errors(path, record.map(), batch)
-    figures = _figures(path, measured, batch, errors) | _densities(path, record.map(), measured, batch)
+    errors = batch_errors(path, record.map.points(), batch)
+    figures = _figures(path, measured, batch, errors) | _densities(path, record.map.points(), measured, batch)
     apart = figures["filter_minus_batch_rmse_m"]
     accuracy = f"The path is {1e3 * apart:.3g} mm (rms) from the batch optimum of the same measurements."
     statistics = batch_statistics(measured, batch, errors)
@@ -163,7 +163,7 @@ def _densities(
     return figures
 
 
-def _draw(record: RunRecord, path: FilteredPath, batch: BatchSolution, errors: BatchErrors) -> list[str]:
+def _draw(record: RunFolder, path: FilteredPath, batch: BatchSolution, errors: BatchErrors) -> list[str]:
     name, ours = record.name, path.trajectory().positions
     theirs = in_space(path.stamps_ns, batch.world_from_robot).positions
     plane, known = wide_axes(theirs), np.flatnonzero(np.isfinite(errors.poses))

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from rbpf.errors import InputError
+from rbpf.runs.reading import RunFolder
 from rbpf.sensors.features import FeatureLog
 from rbpf.sensors.readers import open_log
 from rbpf.sensors.readers.log import RobotLog
@@ -25,7 +26,6 @@ from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.settings import load_settings
 from rbpf.systems.stereo.config import StereoConfig
-from rbpf.validation.run_record import RunRecord, open_run
 
 NOISY = 3.0
 """Spread s of log Ẑ over the seeds beyond which its law is not used."""
@@ -151,7 +151,7 @@ def compare_runs(
     Raises:
         InputError: they are runs of different systems or recordings, or of images, or have no evidence.
     """
-    records = open_run(run_a), open_run(run_b)
+    records = RunFolder.open(run_a), RunFolder.open(run_b)
     for record in records:
         if record.system == "stereo":
             _require_density(_config_of(record), str(record.folder))
@@ -208,7 +208,7 @@ def _require_same_data(config_a: Config, config_b: Config) -> None:
             )
 
 
-def _config_of(record: RunRecord) -> RangeBearingConfig | StereoConfig:
+def _config_of(record: RunFolder) -> RangeBearingConfig | StereoConfig:
     path = record.folder / "config.yaml"
     if record.system == "stereo":
         return load_settings(StereoConfig, "stereo", path, (), {})

@@ -8,15 +8,15 @@ errors that repeat from step to step, such as a known point that is given a litt
 
 from typing import Any
 
+from rbpf.runs.reading import RunFolder
 from rbpf.validation.consistency.own_statistics import INNOVATIONS
 from rbpf.validation.consistency.statistic import Statistic
-from rbpf.validation.run_record import RunRecord
 
 SETTINGS = {"mono": ("search", "noise_px")}
 """By system, where its configuration holds the one standard deviation of all measurements, px."""
 
 
-def noise_advice(record: RunRecord, statistics: list[Statistic]) -> str:
+def noise_advice(record: RunFolder, statistics: list[Statistic]) -> str:
     """One sentence where innovations contradict the stated noise; empty where they do not."""
     found = [s for s in statistics if s.name == INNOVATIONS and s.outcome == "contradicts"]
     if not found or found[0].value <= 0.0:
@@ -28,7 +28,7 @@ def noise_advice(record: RunRecord, statistics: list[Statistic]) -> str:
     )
 
 
-def _how(record: RunRecord, factor: float) -> str:
+def _how(record: RunFolder, factor: float) -> str:
     section, name = SETTINGS.get(record.system, ("", ""))
     settings: Any = record.config.get(section)
     value = settings.get(name) if isinstance(settings, dict) else None

@@ -4,15 +4,14 @@ from dataclasses import asdict, replace
 
 import numpy as np
 
+from rbpf.runs.reading import RunFolder
 from rbpf.validation.colmap.against_colmap import compare_folder_with_colmap
 from rbpf.validation.colmap.pipeline import ReconstructionOptions
 from rbpf.validation.consistency.against_batch import AgainstBatch, compare_folder
 from rbpf.validation.consistency.comparison import Comparison
 from rbpf.validation.consistency.statistic import STATE_FACTOR, Statistic
 from rbpf.validation.metrics.gaussian_differences import Differences, figures_of
-from rbpf.validation.metrics.path_and_map import read_path_and_map
 from rbpf.validation.report.offline_pictures import plot_against_batch, plot_against_colmap
-from rbpf.validation.run_record import RunRecord
 
 KEY_FRAMES = 60
 """Most of a run that are reconstructed: matching takes minutes for so many, and grows faster than they do."""
@@ -21,7 +20,7 @@ HUBER = 1.345
 """Threshold of the batch's loss: matches in images hold false ones."""
 
 
-def compare_camera_with_batch(record: RunRecord) -> Comparison:
+def compare_camera_with_batch(record: RunFolder) -> Comparison:
     """The batch optimum, with pictures in the run's folder; errors as `compare_folder`."""
     found = compare_folder(record.folder, robust=HUBER)
     apart = 1e3 * found.path.rmse
@@ -33,16 +32,16 @@ def compare_camera_with_batch(record: RunRecord) -> Comparison:
     )
 
 
-def compare_camera_with_colmap(record: RunRecord) -> Comparison:
+def compare_camera_with_colmap(record: RunFolder) -> Comparison:
     """COLMAP's reconstruction of every n-th image; errors as `compare_folder_with_colmap`."""
     usual = ReconstructionOptions()
-    every = max(usual.every, -(-len(record.path().mean) // KEY_FRAMES))
+    every = max(usual.every, -(-len(record.path.mean) // KEY_FRAMES))
     found = compare_folder_with_colmap(record.folder, replace(usual, every=every))
     figures = {f"run_{name}": value for name, value in found.run.as_dict().items()}
     if found.truth is not None:
         figures |= {f"truth_{name}": value for name, value in found.truth.as_dict().items()}
     accuracy = f"The path is {1e3 * found.run.path.rmse:.3g} mm (rms) from COLMAP's reconstruction of the same images."
-    pictures = plot_against_colmap(found.run, read_path_and_map(record.folder), record.folder)
+    pictures = plot_against_colmap(found.run, RunFolder.open(record.folder).estimate, record.folder)
     return Comparison("colmap", accuracy, figures, [], pictures)
 
 

@@ -3,9 +3,9 @@
 import numpy as np
 
 from rbpf.errors import InputError
+from rbpf.runs.reading import RunFolder
 from rbpf.validation.consistency.comparison import Comparison
 from rbpf.validation.consistency.statistic import Statistic, motion_statistics, step_ratio
-from rbpf.validation.run_record import RunRecord
 
 INNOVATIONS = "innovations of the measurements"
 
@@ -29,7 +29,7 @@ def innovation_statistics(
     return [*([] if innovations is None else [innovations]), *motion]
 
 
-def own_statistics(record: RunRecord) -> list[Statistic]:
+def own_statistics(record: RunFolder) -> list[Statistic]:
     """`innovation_statistics` of a run folder.
 
     Raises:
@@ -40,14 +40,14 @@ def own_statistics(record: RunRecord) -> list[Statistic]:
         raise InputError(f"{record.folder / 'diagnostics.csv'} has no columns nis and nis_dof")
     correction, cov = np.zeros((0, 0)), np.zeros((0, 0, 0))
     try:
-        path = record.path()
+        path = record.path
         correction, cov = path.correction, path.cov_correction
     except InputError:
         pass  # a folder of another version has no such file; whoever needs the poses says so
     return innovation_statistics(table["nis"], table["nis_dof"], correction, cov)
 
 
-def compare_with_itself(record: RunRecord) -> Comparison:
+def compare_with_itself(record: RunFolder) -> Comparison:
     """The run's own statistics as a comparison; its accuracy stays open."""
     statistics = own_statistics(record)
     figures = {statistic.name: statistic.value for statistic in statistics if np.isfinite(statistic.value)}

@@ -106,7 +106,7 @@ def plot_ranks(ranks: Ranks, out: Path, name: str = "ranks.png") -> list[str]:
     """Histograms with the band of a flat one; returns the file's name."""
     from matplotlib.figure import Figure
 
-    from rbpf.validation.report.figures import COLOURS, save_figures
+    from rbpf.runs.plots import COLOURS, save_figures
 
     figure = Figure(figsize=(4.0 * len(ranks.names), 3.0), layout="constrained")
     panels = figure.subplots(1, len(ranks.names), squeeze=False)[0]

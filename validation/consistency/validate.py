@@ -8,34 +8,34 @@ from pathlib import Path
 
 from rbpf.errors import InputError
 from rbpf.runs.files import prepare_folder
+from rbpf.runs.reading import RunFolder
+from rbpf.runs.truth import TRUTH
 from rbpf.validation.consistency.comparison import Comparison, clear_comparisons, write_comparison
 from rbpf.validation.consistency.verdict import Verdict
 from rbpf.validation.report.page import write_report
-from rbpf.validation.run_files import TRUTH
-from rbpf.validation.run_record import RunRecord, open_run
 
-Compare = Callable[[RunRecord], Comparison]
+Compare = Callable[[RunFolder], Comparison]
 
 
-def _groundtruth(record: RunRecord) -> Comparison:
+def _groundtruth(record: RunFolder) -> Comparison:
     from rbpf.validation.consistency.against_groundtruth import compare_with_truth
 
     return compare_with_truth(record)
 
 
-def _range_bearing_gtsam(record: RunRecord) -> Comparison:
+def _range_bearing_gtsam(record: RunFolder) -> Comparison:
     from rbpf.validation.consistency.against_gtsam import compare_with_batch
 
     return compare_with_batch(record)
 
 
-def _camera_gtsam(record: RunRecord) -> Comparison:
+def _camera_gtsam(record: RunFolder) -> Comparison:
     from rbpf.validation.consistency.offline_comparisons import compare_camera_with_batch
 
     return compare_camera_with_batch(record)
 
 
-def _camera_colmap(record: RunRecord) -> Comparison:
+def _camera_colmap(record: RunFolder) -> Comparison:
     from rbpf.validation.consistency.offline_comparisons import compare_camera_with_colmap
 
     return compare_camera_with_colmap(record)
@@ -64,7 +64,7 @@ def validate(folder: Path, against: str, out: Path | None = None) -> Verdict:
     Raises:
         InputError: the comparison is not possible; the report is written all the same, and says why.
     """
-    record = open_run(folder)
+    record = RunFolder.open(folder)
     try:
         comparison = _comparison(record.system, against)(record)
     except InputError as error:

@@ -3,6 +3,7 @@
 import numpy as np
 
 from rbpf.lie import SE3
+from rbpf.runs.plots import save_figures
 from rbpf.sensors.corners import corners
 from rbpf.sensors.patches import cut, search, warp
 from rbpf.sensors.readers.images import ImageSequence
@@ -11,7 +12,6 @@ from rbpf.systems.mono.config import SearchConfig
 from rbpf.validation.e06.depth_curves import Passing, Shape, draw_curves, shape_of
 from rbpf.validation.e06.setting import Row, Setting, true_poses
 from rbpf.validation.e06.worlds import SidewaysDesk
-from rbpf.validation.report.figures import save_figures
 from rbpf.validation.simulation.textured_scene import cast
 from rbpf.validation.tables import write_csv
 

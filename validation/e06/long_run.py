@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 
 from rbpf.lie import SE3
+from rbpf.runs.plots import COLOURS, SIGMAS, label, outline, save_figures
 from rbpf.sensors.readers.images import ImageFrame
 from rbpf.systems.mono.video import VideoRun, run_images
 from rbpf.validation.e06.setting import Row, Setting, true_poses
 from rbpf.validation.e06.worlds import LoopOverDesk
 from rbpf.validation.mono_map import MonoMap, summarise_mono_map
-from rbpf.validation.report.figures import COLOURS, SIGMAS, label, outline, save_figures
 
 FRAME_S = 1.0 / 30.0
 WARM_UP = 5

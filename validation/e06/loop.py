@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 
 from rbpf.lie import SE3
+from rbpf.runs.plots import COLOURS, SIGMAS, label, outline, save_figures
 from rbpf.systems.mono.sightings import Sighting
 from rbpf.systems.mono.video import VideoRun, run_images
 from rbpf.validation.e06.setting import Row, Setting, true_poses
 from rbpf.validation.e06.worlds import LoopOverDesk
 from rbpf.validation.mono_map import MonoMap, summarise_mono_map
-from rbpf.validation.report.figures import COLOURS, SIGMAS, label, outline, save_figures
 
 START = 15
 """Landmarks that were started in so many first frames are those of the start."""

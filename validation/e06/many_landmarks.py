@@ -8,12 +8,12 @@ import numpy as np
 from rbpf.core.models import Records
 from rbpf.lie import SE3
 from rbpf.maps.point import Point
+from rbpf.runs.plots import label, save_figures
 from rbpf.sensors.readers.images import ImageFrame
 from rbpf.systems.mono.appearance import SOURCE_HALF_PX
 from rbpf.systems.mono.video import VideoRun, run_images
 from rbpf.validation.e06.setting import Row, Setting
 from rbpf.validation.e06.worlds import flat_desk
-from rbpf.validation.report.figures import label, save_figures
 
 SIZES = 100, 300, 1000, 3000, 10_000
 AWAY_M = 2.0, 20.0

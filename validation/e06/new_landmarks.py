@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from rbpf.lie import SE3
+from rbpf.runs.plots import COLOURS, label, outline, save_figures
 from rbpf.sensors.readers.images import ImageFrame
 from rbpf.systems.mono.sightings import Sighting
 from rbpf.systems.mono.video import VideoRun, run_images
@@ -13,7 +14,6 @@ from rbpf.validation.e06.setting import Row, Setting
 from rbpf.validation.e06.worlds import LoopOverDesk
 from rbpf.validation.mono_map import MonoMap, summarise_mono_map
 from rbpf.validation.report.annotated import Caption
-from rbpf.validation.report.figures import COLOURS, label, outline, save_figures
 from rbpf.validation.report.mono_frames import draw_frame
 
 FIRST = 20

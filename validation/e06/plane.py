@@ -7,11 +7,11 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.runs.plots import COLOURS, SIGMAS, label, outline, save_figures
 from rbpf.systems.mono.video import VideoRun, run_images
 from rbpf.validation.e06.setting import Row, Setting
 from rbpf.validation.e06.worlds import flat_desk
 from rbpf.validation.mono_map import MonoMap, summarise_mono_map
-from rbpf.validation.report.figures import COLOURS, SIGMAS, label, outline, save_figures
 
 ASKED_M, GOAL_M = 0.01, 0.003
 LEAST = 4

@@ -6,13 +6,13 @@ import numpy as np
 
 from rbpf.core.filter import Filter
 from rbpf.lie import SE3
+from rbpf.runs.plots import save_figures
 from rbpf.systems.mono.config import InverseDepthConfig, MonoConfig
 from rbpf.systems.mono.system import world_of
 from rbpf.systems.mono.video import run_images
 from rbpf.validation.consistency.pose_errors import pose_errors
 from rbpf.validation.e06.setting import Row, Setting, true_poses
 from rbpf.validation.e06.worlds import StillTarget
-from rbpf.validation.report.figures import save_figures
 from rbpf.validation.simulation.exposure import Imaging
 
 TREATMENTS = {"off": "four points alone", "epipolar": "epipolar constraint", "marginal": "2-D marginal"}

@@ -1,6 +1,6 @@
 """The batch problem of any run: its measurements, from memory or from its folder; the optimum; how likely they are.
 
-Range-bearing measurements are those of `rbpf.runs.measurements`, a camera's are a `FeatureLog`.
+Range-bearing measurements are those of `rbpf.sensors.readers.measurements`, a camera's are a `FeatureLog`.
 """
 
 from collections.abc import Callable
@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from rbpf.errors import InputError
 from rbpf.lie import Array
-from rbpf.runs.camera_files import CAMERAS, read_features
 from rbpf.runs.measurement_files import OBSERVATIONS, read_measurements
-from rbpf.runs.measurements import Measurements
+from rbpf.runs.path_and_map import PathAndMap
 from rbpf.sensors.features import FeatureLog
 from rbpf.sensors.pinhole import RectifiedStereo
+from rbpf.sensors.readers.measurements import Measurements
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.mono.run import MonoRun
 from rbpf.systems.range_bearing.run import Run
@@ -28,7 +28,7 @@ from rbpf.validation.gtsam.camera_data import CameraEstimate, sightings_of
 from rbpf.validation.gtsam.camera_factors import evaluate_sightings
 from rbpf.validation.gtsam.divergence import mahalanobis
 from rbpf.validation.gtsam.mono_batch import connected_frames
-from rbpf.validation.metrics.path_and_map import AnyRun, PathAndMap
+from rbpf.validation.metrics.path_and_map import AnyRun
 from rbpf.validation.mono_log import feature_log
 from rbpf.validation.run_folder import used_measurements
 
@@ -92,15 +92,11 @@ def read_problem(folder: Path) -> Problem:
     Raises:
         InputError: there are none, or a file is malformed.
     """
-    path = folder / OBSERVATIONS
-    if not path.exists():
+    if not (folder / OBSERVATIONS).exists():
         raise InputError(
             f"{folder} holds no {OBSERVATIONS}: expected the folder of a finished run of this version."
         )
-    with path.open(encoding="utf-8", errors="replace") as file:
-        head = [line for line, _ in zip(file, range(20), strict=False) if line.startswith("#")]
-    kinds = [line.split(":")[1].strip() for line in head if line.startswith("# measurement:")]
-    return read_features(folder) if kinds and kinds[0] in CAMERAS else read_measurements(folder)
+    return read_measurements(folder)
 
 
 def name_of(problem: Problem) -> str:

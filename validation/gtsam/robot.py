@@ -11,7 +11,7 @@ from typing import final
 import numpy as np
 
 from rbpf.lie import Array
-from rbpf.runs.measurements import InitialEstimate, Measurements, initial_estimate
+from rbpf.sensors.readers.measurements import InitialEstimate, Measurements, initial_estimate
 
 
 @final

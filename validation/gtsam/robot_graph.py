@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from rbpf.errors import InputError
 from rbpf.lie import Array, SE2Group
-from rbpf.runs.measurements import InitialEstimate, Measurements
+from rbpf.sensors.readers.measurements import InitialEstimate, Measurements
 from rbpf.validation.gtsam.chart import PLANAR, SPATIAL
 from rbpf.validation.gtsam.solvers import huber, noise
 

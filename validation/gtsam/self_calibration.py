@@ -9,13 +9,13 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.runs.files import prepare_folder, write_text
+from rbpf.runs.reading import RunFolder
 from rbpf.sensors.features import FeatureLog
 from rbpf.sensors.pinhole import Pinhole
 from rbpf.sensors.readers.images.calibration import NAME
 from rbpf.validation.calibration import camera_text
 from rbpf.validation.gtsam.batch_problem import read_problem
 from rbpf.validation.gtsam.mono_batch import Batch, adjust_log
-from rbpf.validation.metrics.path_and_map import read_path_and_map
 from rbpf.validation.mono_parts import adjust_near
 
 _AROUND = np.array([(1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1)], dtype=float)
@@ -95,7 +95,7 @@ def recalibrate(folder: Path, out: Path, told: Told | None = None) -> tuple[dict
     problem = read_problem(folder)
     if not isinstance(problem, FeatureLog) or not isinstance(problem.camera, Pinhole):
         raise InputError(f"{folder} is no run of one camera: only that can calibrate its camera")
-    start = adjust_log(problem, read_path_and_map(folder).world_from_body)
+    start = adjust_log(problem, RunFolder.open(folder).estimate.world_from_body)
     found = refine_calibration(problem, start, told)
     prepare_folder(out)
     about = f"focal length and k1 from what the run over {problem.name} measured"

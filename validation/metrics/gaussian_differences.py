@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
+from rbpf.runs.path_and_map import PathAndMap
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.validation.gtsam.divergence import bhattacharyya, kullback_leibler, mahalanobis, sigma_ratio
-from rbpf.validation.metrics.path_and_map import PathAndMap
 
 COLUMNS = ("distances_m", "sigmas", "kullback_leibler", "bhattacharyya", "sigma_ratio")
 """What is told of each pair of Gaussians."""

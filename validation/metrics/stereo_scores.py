@@ -4,10 +4,10 @@ import numpy as np
 
 from rbpf.lie import SE3
 from rbpf.runs.trajectory import Trajectory
+from rbpf.runs.truth import RunTruth
 from rbpf.systems.stereo.run import StereoRun
 from rbpf.validation.metrics.accuracy import ate, rpe
 from rbpf.validation.metrics.mono_scores import TruePath, true_path
-from rbpf.validation.run_files import RunTruth
 
 
 def score_stereo(run: StereoRun) -> dict[str, float | int]:

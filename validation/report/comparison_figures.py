@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from rbpf.core.diagnostics import chi_square_band
-from rbpf.validation.report.figures import COLOURS, SIGMAS, label, outline
+from rbpf.runs.plots import COLOURS, SIGMAS, label, outline
 
 CLOSE = 0.95
 """A map's picture holds this fraction of its landmarks; single ones far off do not make it small."""

@@ -6,12 +6,12 @@ import numpy as np
 
 from rbpf.lie import SE3
 from rbpf.runs.alignment import Alignment
+from rbpf.runs.plots import COLOURS, SIGMAS, stacked_axes
 from rbpf.runs.trajectory import Trajectory
 from rbpf.systems.mono.video import VideoRun
 from rbpf.validation.gtsam.mono_batch import Batch
 from rbpf.validation.metrics.accuracy import ate
 from rbpf.validation.metrics.mono_scores import TruePath, usual_alignment
-from rbpf.validation.report.figures import COLOURS, SIGMAS, stacked_axes
 
 CAMERA_HZ = 30.0
 

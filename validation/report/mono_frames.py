@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from rbpf.runs.plots import outline
 from rbpf.systems.mono.sightings import Sighting
 from rbpf.validation.report.annotated import (
     FOUND,
@@ -15,7 +16,6 @@ from rbpf.validation.report.annotated import (
     cross,
     drawn_scale,
 )
-from rbpf.validation.report.figures import outline
 
 RAY = (255, 190, 40)
 LEGEND = (("found", FOUND), ("missed", MISSED), ("epipolar line", RAY), ("new", STARTED))

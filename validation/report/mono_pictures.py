@@ -7,12 +7,12 @@ import numpy as np
 
 from rbpf.lie import SE3
 from rbpf.runs.alignment import Similarity, align
+from rbpf.runs.plots import COLOURS, SIGMAS, outline, save_figures
 from rbpf.systems.mono.system import world_of
 from rbpf.systems.mono.video import VideoRun
 from rbpf.validation.gtsam.mono_batch import Batch
 from rbpf.validation.metrics.mono_scores import TruePath, true_path
 from rbpf.validation.mono_map import MonoMap
-from rbpf.validation.report.figures import COLOURS, SIGMAS, outline, save_figures
 from rbpf.validation.report.mono_curves import error_figure, timings_figure, tracking_figure
 from rbpf.validation.report.mono_views import Views, best_views, close_up, draw_particles
 

@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from rbpf.lie import SE3
+from rbpf.runs.plots import outline
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.mono.sightings import Sighting
 from rbpf.systems.mono.video import VideoRun
 from rbpf.validation.mono_map import MonoMap
 from rbpf.validation.report.annotated import FOUND, MISSED, STARTED
-from rbpf.validation.report.figures import outline
 from rbpf.validation.report.mono_frames import RAY
 from rbpf.validation.report.rerun_file import ellipsoids, log_image, log_lens, log_pose, log_time, recording
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from rbpf.lie import SE3
-from rbpf.validation.report.figures import COLOURS, SIGMAS, label, outline
+from rbpf.runs.plots import COLOURS, SIGMAS, label, outline
 
 _UPRIGHT = 0.05
 """Weight of the direction of the images' upper side beside that of their rows, which do not tilt with the camera."""

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 
 from rbpf.lie import Array
+from rbpf.runs.path_and_map import PathAndMap
+from rbpf.runs.plots import COLOURS, label, new_axes, outline, save_figures
 from rbpf.validation.colmap.compare import ColmapComparison
 from rbpf.validation.consistency.against_batch import AgainstBatch
-from rbpf.validation.metrics.path_and_map import PathAndMap
-from rbpf.validation.report.figures import COLOURS, label, new_axes, outline, save_figures
 from rbpf.validation.report.mono_views import best_views
 
 _BINS = 20

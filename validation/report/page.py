@@ -10,14 +10,14 @@ from typing import Any
 
 from rbpf.errors import InputError
 from rbpf.runs.files import write_text
+from rbpf.runs.plots import save_figures
+from rbpf.runs.reading import RunFolder
 from rbpf.validation.consistency.comparison import Comparison, read_comparisons
 from rbpf.validation.consistency.noise_advice import noise_advice
 from rbpf.validation.consistency.own_statistics import compare_with_itself
 from rbpf.validation.consistency.statistic import Statistic
 from rbpf.validation.consistency.verdict import Verdict, judge
 from rbpf.validation.report.comparison_figures import timings_figure
-from rbpf.validation.report.figures import save_figures
-from rbpf.validation.run_record import RunRecord, open_run
 
 PAGE = "report.html"
 VIDEO = "annotated.mp4"
@@ -50,7 +50,7 @@ def write_report(folder: Path, problems: list[str] | None = None) -> Verdict:
     Raises:
         InputError: the folder is not that of a run.
     """
-    record, problems = open_run(folder), list(problems or ())
+    record, problems = RunFolder.open(folder), list(problems or ())
     comparisons = _comparisons(record, problems)
     verdict = replace(verdict_of(comparisons, _beside_own_batch(record)), advice=_advice(record, comparisons))
     _draw_timings(record, problems)
@@ -79,7 +79,7 @@ def verdict_of(comparisons: list[Comparison], otherwise: str = _NO_ACCURACY) -> 
     return judge(accuracy, [s for comparison in comparisons for s in comparison.statistics], independent)
 
 
-def _beside_own_batch(record: RunRecord) -> str:
+def _beside_own_batch(record: RunFolder) -> str:
     """How good a run is that was compared with nothing, from the batch optimum that it found itself."""
     apart = record.summary.get("filter_minus_batch_rmse_m")
     if not isinstance(apart, float):
@@ -90,11 +90,11 @@ def _beside_own_batch(record: RunRecord) -> str:
     )
 
 
-def _advice(record: RunRecord, comparisons: list[Comparison]) -> str:
+def _advice(record: RunFolder, comparisons: list[Comparison]) -> str:
     return noise_advice(record, [s for comparison in comparisons for s in comparison.statistics])
 
 
-def _comparisons(record: RunRecord, problems: list[str]) -> list[Comparison]:
+def _comparisons(record: RunFolder, problems: list[str]) -> list[Comparison]:
     """Those in the folder, the truth's first, and the run's own statistics."""
     found: list[Comparison] = []
     try:
@@ -138,7 +138,7 @@ def _row(statistic: Statistic) -> dict[str, str]:
     }
 
 
-def _draw_timings(record: RunRecord, problems: list[str]) -> None:
+def _draw_timings(record: RunFolder, problems: list[str]) -> None:
     """Times per step, where the run has not drawn them itself."""
     if (record.folder / TIMINGS).is_file():
         return

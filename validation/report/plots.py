@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from rbpf.runs.alignment import align
+from rbpf.runs.plots import COLOURS, SIGMAS, new_axes, outline, save_figures
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.range_bearing.run import Run
 from rbpf.validation.metrics.scores import as_trajectory, truth_at
-from rbpf.validation.report.figures import COLOURS, SIGMAS, new_axes, outline, save_figures
 
 
 def plot_run(run: Run, summary: MapEstimate, out: Path, others: dict[str, np.ndarray]) -> list[str]:

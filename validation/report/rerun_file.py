@@ -10,10 +10,10 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.files import prepare_folder, whole
+from rbpf.runs.plots import SIGMAS
 from rbpf.sensors.pinhole import Pinhole
 from rbpf.sensors.readers.images import ImageFrame
 from rbpf.systems.map_estimate import MapEstimate
-from rbpf.validation.report.figures import SIGMAS
 
 QUALITY = 75
 """Of the JPEG images in the recording, in per cent."""

@@ -7,13 +7,13 @@ import numpy as np
 
 from rbpf.lie import SE3
 from rbpf.runs.alignment import align
+from rbpf.runs.plots import COLOURS, SIGMAS, outline, save_figures, stacked_axes
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.stereo.run import StereoRun
 from rbpf.validation.gtsam.mono_batch import Batch
 from rbpf.validation.metrics.accuracy import ate
 from rbpf.validation.metrics.mono_scores import TruePath, true_path
 from rbpf.validation.metrics.stereo_scores import compared
-from rbpf.validation.report.figures import COLOURS, SIGMAS, outline, save_figures, stacked_axes
 from rbpf.validation.report.mono_views import Views, best_views, close_up, draw_particles
 
 MAP_FRACTION = 0.9

@@ -6,7 +6,9 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3
-from rbpf.runs.trajectory import read_tum
+from rbpf.runs.plots import save_figures
+from rbpf.runs.reading import FilteredPath, RunFolder
+from rbpf.runs.trajectory import in_space, read_tum
 from rbpf.validation.report.comparison_figures import (
     error_figure,
     landmark_figure,
@@ -15,15 +17,12 @@ from rbpf.validation.report.comparison_figures import (
     path_figure,
     wide_axes,
 )
-from rbpf.validation.report.figures import save_figures
-from rbpf.validation.run_files import FilteredPath, in_space
-from rbpf.validation.run_record import RunRecord
 
 if TYPE_CHECKING:
     from rbpf.validation.consistency.against_groundtruth import LandmarkErrors, TruthErrors
 
 
-def draw_truth(record: RunRecord, errors: "TruthErrors") -> list[str]:
+def draw_truth(record: RunFolder, errors: "TruthErrors") -> list[str]:
     """Draws paths, errors with the filter's 3σ, NEES, landmarks and map into the run's folder; returns their names."""
     rows, name = errors.truth.rows, record.name
     moved = errors.positions.alignment
@@ -66,13 +65,13 @@ def position_std(path: FilteredPath, rotation: np.ndarray) -> np.ndarray:
     return np.sqrt(np.maximum(np.einsum("tab,tbc,tac->ta", turn, local, turn), 0.0))
 
 
-def lost_steps(record: RunRecord) -> np.ndarray:
+def lost_steps(record: RunFolder) -> np.ndarray:
     """(T,) bool: where the run's own diagnostics say that it was lost."""
     try:
         table = record.table("diagnostics.csv")
     except InputError:
         table = {}
-    return table.get("lost", np.zeros(len(record.path().mean))).astype(bool)
+    return table.get("lost", np.zeros(len(record.path.mean))).astype(bool)
 
 
 def _map(title: str, path: np.ndarray, landmarks: "LandmarkErrors", plane: tuple[int, int]) -> object:

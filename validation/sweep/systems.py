@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from rbpf.errors import InputError
+from rbpf.runs.truth import RunTruth
 from rbpf.systems.settings import load_settings
 from rbpf.validation.consistency.pose_errors import whitened_errors
-from rbpf.validation.run_files import RunTruth
 
 Figures = dict[str, Any]
 

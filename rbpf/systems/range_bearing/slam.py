@@ -7,7 +7,7 @@ frame = slam.track(z, cov_z, names, odometry, stamp_ns)
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar, Literal, final
+from typing import Any, ClassVar, final
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from rbpf.motion.odometry import Odometry, OdometryMotion
 from rbpf.sensors.landmark_sensor import AnonymousLandmarkSensor, NamedLandmarkSensor
 from rbpf.sensors.range_bearing import RangeBearing, RelativePosition
 from rbpf.sensors.readers.log import Frame, RobotLog
+from rbpf.sensors.readers.measurements import Kind, Measurements
 from rbpf.sensors.rigid_point import RigidPointModel
 from rbpf.systems.map_estimate import MapEstimate, estimate_map
 from rbpf.systems.range_bearing.config import RangeBearingConfig
@@ -33,12 +34,11 @@ from rbpf.systems.system import (
     RESAMPLED,
     Column,
     Ragged,
+    Recorded,
     System,
     Tracked,
     TrackingState,
 )
-
-Kind = Literal["range_bearing", "position"]
 
 
 @final
@@ -184,6 +184,46 @@ class RangeBearingSlam(System):
     def map(self) -> MapEstimate:
         """The landmarks, relative to the start in each particle's world."""
         return estimate_map(self.filter, None if self.anchor is None else self.anchor.estimate())
+
+    def measurements(self, name: str, log: Recorded) -> Measurements:
+        """The odometry, and every observation that updated a landmark or started one."""
+        frames = [log.observed(t) for t in range(len(log))]
+        landmarks = (
+            [frame["landmarks"] for frame in frames] if self._associations is None else self.associations()
+        )
+        used = [np.flatnonzero(ids >= 0) for ids in landmarks]
+        p = self.model.dim
+
+        def gathered(key: str, shape: tuple[int, ...]) -> np.ndarray:
+            parts = [frame[key][rows] for frame, rows in zip(frames, used, strict=True)]
+            return np.concatenate([np.zeros((0, *shape)), *parts])
+
+        return Measurements(
+            recording=name,
+            space=self.space,
+            measurement=self.measurement,
+            pitch_sign=self.pitch_sign,
+            robot_from_sensor=self.robot_from_sensor,
+            start=self.space.identity(),
+            stamps_ns=log.stamps_ns,
+            deltas=log["delta"][1:],
+            covs=log["cov_delta"][1:],
+            steps=np.repeat(np.arange(len(used)), [rows.size for rows in used]),
+            landmarks=np.concatenate([np.zeros(0, dtype=np.int64), *(ids[ids >= 0] for ids in landmarks)]),
+            z=gathered("z", (p,)),
+            cov_z=gathered("cov_z", (p, p)),
+        )
+
+    def summary(self, log: Recorded) -> dict[str, Any]:
+        """How much was observed and kept, and how far the particles have forgotten the past."""
+        store = self.filter.belief().map.store
+        used = self.measurements("", log).steps.size
+        return {
+            "landmarks": int(self.map().ids.size),
+            "observations": int(used),
+            "ancestors_of_first_generation": self.filter.history.distinct_first(),
+            "map_share_of_dense": round(store.stored_bytes / max(store.dense_bytes, 1), 4),
+        }
 
     def associations(self) -> list[np.ndarray]:
         """Landmark of every observation, one array (K,) per step, along the ancestors of the best particle.

@@ -12,7 +12,7 @@ import yaml
 from rbpf import __version__
 from rbpf.errors import InputError
 from rbpf.runs.files import write_text
-from rbpf.validation.metrics.path_and_map import read_config
+from rbpf.systems.plain_yaml import read_plain_yaml
 
 CONFIG = "config.yaml"
 LIBRARIES = "numpy", "scipy", "numba", "opencv-python-headless"
@@ -55,6 +55,30 @@ class Origin(NamedTuple):
     recording: str
     sources: dict[str, str]
     config: Path
+
+
+def read_config(folder: Path) -> dict[str, Any]:
+    """The entries of a run folder's config.yaml.
+
+    Raises:
+        InputError: it is no run folder.
+    """
+    path = folder / "config.yaml"
+    if not path.exists():
+        raise InputError(f"{folder} holds no config.yaml: expected the folder that `rbpf run` leaves.")
+    config = read_plain_yaml(path)
+    if not isinstance(config, dict) or "rbpf" not in config or "system" not in config:
+        raise InputError(
+            f"{path}: expected the settings of a run with its version and system, found other content."
+        )
+    return {str(name): value for name, value in config.items()}
+
+
+def require_own_version(config: Mapping[str, Any], folder: Path) -> None:
+    """Refuses a run of another version, whose settings or files may mean something else; patches are alike."""
+    if str(config["rbpf"]).split(".")[:2] != __version__.split(".")[:2]:
+        written = f"{folder} was written by rbpf {config['rbpf']}, this is {__version__}"
+        raise InputError(f"{written}; run again with --config {folder / CONFIG}.")
 
 
 def write_config(out: Path, system: str, sources: Mapping[str, Any], settings: Mapping[str, Any]) -> None:
@@ -120,6 +144,7 @@ def read_origin(config: Path) -> Origin:
     if config.name != CONFIG:
         raise InputError(f"{config}: expected the {CONFIG} that a run left in its folder")
     entries = read_config(config.parent)
+    require_own_version(entries, config.parent)
     if "recording" not in entries:
         raise InputError(f"{config} names no recording: it is no run's, give it with --config instead")
     files = {name: Path(str(entries[name])) for name in _FILES if name in entries}

@@ -1,0 +1,195 @@
+"""Everything that a run leaves in its folder. Each file is written under a temporary name, then renamed.
+
+trajectory.tum           online filtered mean at every frame
+trajectory.npz           the same with covariances, and the last particles, see `rbpf.runs.results`
+truth.npz                the ground truth at these frames, see `rbpf.runs.truth`
+odometry.tum             the path by odometry alone, where there is odometry
+map.npz, map.csv         landmarks: id, mean, covariance (within + between particles), and what the system adds
+observations*.csv        the measurements used, see `rbpf.runs.measurement_files`
+timings.csv              milliseconds per frame and stage
+diagnostics.csv          the system's figures of every frame: sample size, evidence, NIS, what was found
+config.yaml              everything needed to repeat the run
+checkpoint.npz           what --resume goes on from
+summary.json             the figures
+*.png, annotated.mp4     pictures; every frame with what was looked for in it
+report.html              one page with all figures and pictures
+
+What else a system leaves stands in its `files`: of the monocular one posterior.npz, posterior.tum and known_map.npz.
+"""
+
+import json
+import math
+import resource
+import sys
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rbpf import gaussian
+from rbpf.core.archive import save_arrays
+from rbpf.lie import SE3
+from rbpf.runs.files import (
+    MAP,
+    POSTERIOR,
+    SUMMARY,
+    TRAJECTORY,
+    VERSION,
+    prepare_folder,
+    write_csv,
+    write_text,
+)
+from rbpf.runs.measurement_files import write_measurements
+from rbpf.runs.provenance import write_config
+from rbpf.runs.run import Run
+from rbpf.runs.trajectory import Trajectory, in_space, write_tum
+from rbpf.runs.truth import write_truth
+from rbpf.systems.map_estimate import MapEstimate
+from rbpf.systems.system import DIAGNOSTICS, TIMINGS
+
+
+def write_run(run: Run, out: Path, sources: Mapping[str, str | float | bool]) -> dict[str, Any]:
+    """Writes all data files of a run.
+
+    Args:
+        run: what was filtered.
+        out: the run's folder.
+        sources: what it was filtered from, for config.yaml; `recording` is one of them.
+
+    Returns:
+        The entries of summary.json.
+
+    Raises:
+        InputError: the folder cannot be written to, or the disk is full.
+    """
+    prepare_folder(out)
+    log, system = run.log, run.system
+    write_tum(out / "trajectory.tum", in_space(log.stamps_ns, log.poses))
+    corrections = (log["correction"], log["cov_correction"]) if "correction" in log else None
+    particles = system.particle_poses(), system.filter.particles.weights
+    write_trajectory(out, log.stamps_ns, log.poses, log.covs, corrections, particles)
+    write_truth(out, run.truth)
+    if "odometry" in log:
+        write_tum(out / "odometry.tum", in_space(log.stamps_ns, log["odometry"]))
+    landmarks = system.map()
+    write_map(out, landmarks)
+    write_measurements(out, system.measurements(run.name, log))
+    for table in (TIMINGS, DIAGNOSTICS):
+        header, columns = log.table(table)
+        write_csv(out / table, header, zip(*columns, strict=True))
+    for name, arrays in system.files(log).items():
+        save_arrays(out / name, arrays)
+        if name == POSTERIOR:
+            _write_posterior_mean(out, arrays)
+    write_config(out, system.name, sources, asdict(system.config))
+    entries = summarise(run)
+    write_summary(out, entries)
+    return entries
+
+
+def summarise(run: Run) -> dict[str, Any]:
+    """The entries of summary.json that need no comparison."""
+    log, config = run.log, run.system.config
+    evidence = log["log_evidence"]
+    return {
+        "system": run.system.name,
+        "recording": run.name,
+        "frames": len(log),
+        "particles": config.particles,
+        "seed": config.seed,
+        "ms_per_frame": milliseconds_per_frame(log["seconds"]),
+        "resamplings": int(log["resampled"].sum()),
+        "ess_mean": float(log["ess"].mean()),
+        "log_evidence": float(np.sum(evidence)) if np.isfinite(evidence).all() else None,
+        "nis_per_dof": nis_ratio(log["nis"], log["nis_dof"]),
+        "peak_memory_mb": peak_memory_mb(),
+        **run.system.summary(log),
+        **({"problems": run.messages} if run.messages else {}),
+        **({} if run.failure is None else {"failure": run.failure}),
+    }
+
+
+def write_summary(out: Path, entries: Mapping[str, Any]) -> None:
+    """summary.json; numbers that are not finite become null, which JSON has."""
+    plain = {
+        name: None if isinstance(v, float) and not math.isfinite(v) else v for name, v in entries.items()
+    }
+    write_text(out / SUMMARY, json.dumps(plain, indent=2, allow_nan=False) + "\n")
+
+
+def write_map(out: Path, found: MapEstimate) -> None:
+    """map.npz and map.csv."""
+    arrays = {"id": found.ids, "mean": found.mean, "cov": found.cov, **found.columns}
+    if found.ray_ends is not None:
+        arrays["ray_ends"] = found.ray_ends
+    save_arrays(out / MAP, arrays)
+    axes = "xyz"[: found.mean.shape[1]]
+    cov_names = [f"c{axes[a]}{axes[b]}" for a in range(len(axes)) for b in range(a + 1)]
+    numbers = np.concatenate([found.mean, gaussian.pack(found.cov)], axis=1).tolist()
+    columns = [column.tolist() for column in found.columns.values()]
+    rows = ([name, *row, *more] for name, row, *more in zip(found.ids, numbers, *columns, strict=True))
+    write_csv(out / "map.csv", ["id", *(f"{axis}_m" for axis in axes), *cov_names, *found.columns], rows)
+
+
+def milliseconds_per_frame(seconds: np.ndarray) -> dict[str, float]:
+    """Median and 95th percentile of times (T,) [s], in ms."""
+    milliseconds = seconds * 1e3
+    return {
+        "median": round(float(np.median(milliseconds)), 3),
+        "p95": round(float(np.percentile(milliseconds, 95)), 3),
+    }
+
+
+def nis_ratio(nis: np.ndarray, dof: np.ndarray) -> float | None:
+    """NIS per degree of freedom over all frames (T,); None without a linearised innovation."""
+    used = np.isfinite(nis) & (dof > 0)
+    return float(nis[used].sum() / dof[used].sum()) if used.any() else None
+
+
+def peak_memory_mb() -> float:
+    """Largest resident size of this process so far."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return round(peak / (2**20 if sys.platform == "darwin" else 2**10), 1)
+
+
+def write_trajectory(
+    out: Path,
+    stamps_ns: np.ndarray,
+    mean: np.ndarray,
+    cov: np.ndarray,
+    corrections: tuple[np.ndarray, np.ndarray] | None = None,
+    particles: tuple[np.ndarray, np.ndarray] | None = None,
+) -> None:
+    """trajectory.npz: what the report and comparisons are made of, see `rbpf.runs.results`.
+
+    Args:
+        out: the run's folder.
+        stamps_ns: (T,).
+        mean: (T, E).
+        cov: (T, d, d).
+        corrections: (T, r) of the motions and their covariances (T, r, r); None where the system reports none.
+        particles: poses (N, E) of the last frame's particles, and their weights (N,).
+    """
+    steps = len(mean)
+    correction, cov_correction = corrections or (np.zeros((steps, 0)), np.zeros((steps, 0, 0)))
+    poses, weights = particles or (np.zeros((0, mean.shape[1])), np.zeros(0))
+    arrays = {
+        "version": np.array(VERSION),
+        "stamps_ns": stamps_ns,
+        "mean": mean,
+        "cov": cov,
+        "correction": correction,
+        "cov_correction": cov_correction,
+        "particles": poses,
+        "weights": weights,
+    }
+    save_arrays(out / TRAJECTORY, arrays)
+
+
+def _write_posterior_mean(out: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """posterior.tum: the mean over the last frame's particles of their whole paths."""
+    weights = np.exp(arrays["log_weights"])
+    mean = np.array([SE3.mean(poses, weights) for poses in arrays["world_from_camera"]])
+    write_tum(out / "posterior.tum", Trajectory(arrays["stamps_ns"], mean))

@@ -1,0 +1,387 @@
+"""Pictures of a run of any system, from its folder, drawn without a screen: one set for all.
+
+path.png        the path beside the truth, the odometry and the batch optimum, in the run's own world
+map.png         landmarks with 3σ ellipses, rays, known points
+particles.png   the last frame's particles
+error.png       error of the position along the truth's axes beside what the filter itself believes
+tracking.png    what was looked for and found, effective sample size, innovations (a robot's: ess.png)
+timings.png     time per frame by stage
+
+A further figure of every run is one function from `RunFolder` to a matplotlib figure, entered into `FIGURES`.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rbpf.errors import InputError
+from rbpf.lie import SE3
+from rbpf.runs.alignment import align, fit
+from rbpf.runs.files import whole
+from rbpf.runs.reading import FilteredPath, RunFolder
+from rbpf.runs.trajectory import associate, in_space, read_tum
+from rbpf.runs.truth import TRUTH
+from rbpf.sensors.features import FeatureLog
+
+SIGMAS = 3.0
+COLOURS = {
+    "filter": "tab:blue",
+    "truth": "black",
+    "batch": "tab:orange",
+    "odometry": "tab:grey",
+    "map": "tab:red",
+    "known": "tab:green",
+}
+
+MAP_FRACTION = 0.9
+"""The map's picture holds the path and this fraction of the points; single points far off do not make it small."""
+
+CAMERA_HZ = 30.0
+"""What a camera's frames are to keep up with."""
+
+_UPRIGHT = 0.05
+"""Weight of the direction of the images' upper side beside that of their rows, which do not tilt with the camera."""
+
+_NOT_COUNTS = {
+    "step", "stamp_ns", "ess", "resampled", "log_evidence", "nis", "nis_dof", "lost", "updated", "assumed",
+}  # fmt: skip
+"""Columns of diagnostics.csv that are no curve of the picture's first row: all others are."""
+
+
+def draw_run(found: RunFolder) -> list[str]:
+    """Draws all figures of a run into its folder; returns their file names."""
+    figures = {}
+    for name, draw in FIGURES.items():
+        figure = draw(found)
+        if figure is not None:
+            figures["ess.png" if name == "tracking.png" and found.system == "range-bearing" else name] = (
+                figure
+            )
+    return save_figures(figures, found.folder)
+
+
+def path_figure(found: RunFolder) -> Any:
+    """The path, beside what there is to compare it with."""
+    views, path = Views.of(found), found.trajectory
+    figure, shown = views.axes(f"{found.name}: path")
+    curves = []
+    if (found.folder / TRUTH).is_file():
+        curves.append(("truth", *truth_in_world(found), "--"))
+    for name, label_ in (("odometry", "odometry alone"), ("batch", "batch optimum")):
+        if (found.folder / f"{name}.tum").is_file():
+            curves.append((name, read_tum(found.folder / f"{name}.tum").positions, label_, "-"))
+    lost = lost_frames(found)
+    for axes, (right, up) in shown:
+        for name, at, label_, style in (*curves, ("filter", path.positions, "filter", "-")):
+            axes.plot(at[:, right], at[:, up], style, color=COLOURS[name], lw=1.2, label=label_)
+        at = path.positions
+        axes.plot(at[0, right], at[0, up], "o", color=COLOURS["filter"], ms=5, label="first frame")
+        if lost.any():
+            axes.plot(at[lost, right], at[lost, up], ".", color=COLOURS["map"], ms=4, label="lost")
+    shown[0][0].legend(loc="best", fontsize="small")
+    return figure
+
+
+def map_figure(found: RunFolder) -> Any:
+    """Path and map: points with 3σ ellipses, rays, known points."""
+    views, landmarks, at = Views.of(found), found.map, found.trajectory.positions
+    figure, shown = views.axes(f"{found.name}: map with {SIGMAS:g}σ ellipses")
+    points, more = landmarks.points(), (0, 3 - landmarks.mean.shape[1])
+    mean, cov = np.pad(points.mean, ((0, 0), more)), np.pad(points.cov, ((0, 0), more, more))
+    middle = np.median(np.concatenate([mean, at]), axis=0)
+    far = np.linalg.norm(mean - middle, axis=1)
+    near = far <= np.quantile(far, MAP_FRACTION) if far.size else np.zeros(0, dtype=bool)
+    measured = found.measurements
+    known = measured.known if isinstance(measured, FeatureLog) else None
+    for axes, plane in shown:
+        right, up = plane
+        axes.plot(at[:, right], at[:, up], color=COLOURS["filter"], lw=1.0, label="path")
+        axes.plot(mean[:, right], mean[:, up], ".", color="black", ms=3, label="landmarks")
+        ellipses = outline(mean[near][:, plane], cov[near][:, plane][:, :, plane])
+        axes.plot(ellipses[..., 0].T, ellipses[..., 1].T, color="black", lw=0.5, alpha=0.5)
+        if landmarks.ray_ends is not None and landmarks.is_ray().any():
+            ends = landmarks.ray_ends[landmarks.is_ray()]
+            lines = axes.plot(ends[..., right].T, ends[..., up].T, color=COLOURS["map"], lw=0.7, alpha=0.7)
+            lines[0].set_label("rays (depth not known yet)")
+        if known is not None:
+            places = known.positions
+            axes.plot(
+                places[:, right], places[:, up], "+", color=COLOURS["known"], ms=9, label="known points"
+            )
+        close_up(axes, plane, np.concatenate([mean[near], at]))
+    shown[0][0].legend(loc="best", fontsize="small")
+    return figure
+
+
+def particles_figure(found: RunFolder) -> Any:
+    """Particles of the last frame, and mean and covariance of the position."""
+    poses, weights = found.particles
+    views, path = Views.of(found), found.path
+    figure, shown = views.axes(f"{found.name}: {len(poses)} particles at the last frame")
+    at = in_space(np.zeros(len(poses), dtype=np.int64), poses).positions
+    mean, cov = path.trajectory().positions[-1], position_covariances(path)[-1]
+    for axes, (right, up) in shown:
+        axes.scatter(
+            at[:, right], at[:, up], s=1000 * weights, color=COLOURS["filter"], alpha=0.5,
+            label="particles; area is weight",
+        )  # fmt: skip
+        chosen = [right, up]
+        ellipse = outline(mean[chosen], cov[np.ix_(chosen, chosen)])
+        axes.plot(*ellipse.T, color=COLOURS["map"], lw=1.0, label=f"{SIGMAS:g}σ of the pose")
+        axes.plot(mean[right], mean[up], "x", color=COLOURS["map"], label="mean")
+        axes.ticklabel_format(useOffset=False)
+        axes.tick_params(axis="x", labelrotation=30)
+    shown[0][0].legend(loc="best", fontsize="small")
+    return figure
+
+
+def error_figure(found: RunFolder) -> Any | None:
+    """Error of the position along the truth's axes, beside what the filter believes (3σ); None without truth."""
+    if not (found.folder / TRUTH).is_file():
+        return None
+    truth, path = found.truth, found.path
+    rows, how = truth.rows, truth.alignment
+    estimate, reference = path.trajectory(rows), in_space(path.stamps_ns[rows], truth.poses)
+    moved = fit(how, estimate.positions, reference.positions)
+    error = moved.transform(estimate.positions) - reference.positions
+    turned = moved.scale * moved.rotation
+    cov = turned @ position_covariances(path)[rows] @ turned.T
+    band = SIGMAS * np.sqrt(np.maximum(np.einsum("taa->ta", cov), 0.0))
+    used = [axis for axis in range(3) if error[:, axis].any() or band[:, axis].any()] or [0]
+    name = "no alignment" if how == "none" else f"after the {how} alignment"
+    unit, word = (1e3, "mm") if np.abs(error).max(initial=0.0) < 1.0 else (1.0, "m")
+    figure, panels = stacked_axes(len(used), f"{found.name}: error of the position, {name}")
+    batch = None
+    if (found.folder / "batch.tum").is_file():
+        batch, true = associate(read_tum(found.folder / "batch.tum"), reference, 0)
+        at_batch = np.searchsorted(path.stamps_ns, true.stamps_ns)
+        batch_error = fit(how, batch.positions, true.positions).transform(batch.positions) - true.positions
+    lost = lost_frames(found)
+    for axes, axis in zip(panels, used, strict=True):
+        low, high = -unit * band[:, axis], unit * band[:, axis]
+        label_ = f"{SIGMAS:g}σ of the filter"
+        axes.fill_between(rows, low, high, color=COLOURS["filter"], alpha=0.2, lw=0, label=label_)
+        if batch is not None:
+            axes.plot(
+                at_batch,
+                unit * batch_error[:, axis],
+                color=COLOURS["batch"],
+                lw=1.0,
+                label="error of the batch",
+            )
+        axes.plot(rows, unit * error[:, axis], color=COLOURS["filter"], lw=1.0, label="error of the filter")
+        axes.axhline(0.0, color="black", lw=0.5)
+        axes.set_ylabel(f"{'xyz'[axis]} [{word}]")
+        shade(axes, lost)
+    panels[0].legend(loc="best", fontsize="small")
+    panels[-1].set_xlabel("frame")
+    return figure
+
+
+def tracking_figure(found: RunFolder) -> Any:
+    """What was looked for and found, effective sample size, innovations, frame by frame."""
+    table = found.table("diagnostics.csv")
+    counts = {name: values for name, values in table.items() if name not in _NOT_COUNTS}
+    updated = np.flatnonzero(table.get("updated", np.ones(table["step"].size)))
+    rows = (["counts"] if counts else []) + ["ess"] + (["nis"] if (table["nis_dof"] > 0).any() else [])
+    figure, panels = stacked_axes(len(rows), f"{found.name}: observations and filter")
+    for axes, row in zip(panels, rows, strict=True):
+        if row == "counts":
+            for name, values in counts.items():
+                axes.plot(table["step"], values, lw=1.0, label=name.replace("_", " "))
+            axes.set(ylabel="number", ylim=(0, None))
+        elif row == "ess":
+            label_ = "effective sample size"
+            axes.plot(updated, table["ess"][updated], color=COLOURS["filter"], lw=0.8, label=label_)
+            limit = found.config["resampling"]["ess_threshold"] * found.config["particles"]
+            axes.axhline(limit, color=COLOURS["map"], lw=0.8, ls="--", label="resampling below")
+            axes.set(ylabel="particles", ylim=(0, None))
+        else:
+            shown = (table["nis_dof"] > 0) & np.isfinite(table["nis"]) & (table["nis"] > 0)
+            ratio = table["nis"][shown] / table["nis_dof"][shown]
+            name = "NIS / degrees of freedom"
+            axes.plot(table["step"][shown], ratio, ".", ms=3, color=COLOURS["filter"], label=name)
+            axes.axhline(1.0, color="black", lw=0.8, label="mean of a consistent filter")
+            axes.set(ylabel="ratio", yscale="log")
+        shade(axes, table.get("lost", np.zeros(table["step"].size)).astype(bool))
+        axes.legend(loc="best", fontsize="small")
+    panels[-1].set_xlabel("frame")
+    return figure
+
+
+def timings_figure(found: RunFolder) -> Any:
+    """Milliseconds per frame by stage, one over the other; frames that compile run out of the picture."""
+    table = found.table("timings.csv")
+    stages = {n.removesuffix("_ms").replace("_", " "): v for n, v in table.items() if n.endswith("_ms")}
+    waiting = stages.pop("waiting for image", None)
+    stages = stages or {"filter": table["milliseconds"]}
+    figure, (axes,) = stacked_axes(1, f"{found.name}: time per frame")
+    axes.stackplot(table["step"], *stages.values(), labels=list(stages), alpha=0.7, lw=0)
+    high = 2.5 * max(float(np.median(table["milliseconds"])), 1e-3)
+    if waiting is not None:
+        axes.plot(table["step"], waiting, color="black", lw=0.6, label="waiting for the decoded image")
+        axes.axhline(1e3 / CAMERA_HZ, color=COLOURS["map"], lw=0.8, ls="--", label=f"{CAMERA_HZ:g} Hz")
+        high = max(1.3e3 / CAMERA_HZ, high)
+    axes.set(xlabel="frame", ylabel="ms", ylim=(0.0, high))
+    axes.legend(loc="best", fontsize="small")
+    return figure
+
+
+FIGURES: Mapping[str, Callable[[RunFolder], Any | None]] = {
+    "path.png": path_figure,
+    "map.png": map_figure,
+    "particles.png": particles_figure,
+    "error.png": error_figure,
+    "tracking.png": tracking_figure,
+    "timings.png": timings_figure,
+}
+
+
+def truth_in_world(found: RunFolder) -> tuple[np.ndarray, str]:
+    """True positions (R, 3) in the run's own world, and what was done to them, for the legend."""
+    truth, path = found.truth, found.path
+    true = in_space(path.stamps_ns[truth.rows], truth.poses).positions
+    if truth.alignment == "none":
+        return true, "truth"
+    back = align(true, path.trajectory(truth.rows).positions, with_scale=truth.alignment == "similarity")
+    words = "moved and scaled" if truth.alignment == "similarity" else "moved"
+    return back.transform(true), f"truth, {words} onto the filter"
+
+
+def position_covariances(path: FilteredPath) -> np.ndarray:
+    """(T, 3, 3) of the positions along the axes of the run's world; zero in z for a path in the plane."""
+    local = np.zeros((len(path.mean), 3, 3))
+    if path.space.dim == 3:
+        local[:, :2, :2] = path.cov[:, 1:, 1:]
+    else:
+        local = path.cov[:, 3:, 3:]
+    turn = SE3.rotation(path.trajectory().world_from_body)
+    return np.asarray(turn @ local @ turn.mT)
+
+
+def lost_frames(found: RunFolder) -> np.ndarray:
+    """(T,) bool: where the run's own diagnostics say that it was lost."""
+    try:
+        table = found.table("diagnostics.csv")
+    except InputError:
+        table = {}
+    return table.get("lost", np.zeros(len(found.path.mean))).astype(bool)
+
+
+@dataclass(frozen=True)
+class Views:
+    """From where a world is drawn: from above and, in space, from the side.
+
+    Attributes:
+        top: the axes to the right and up the page, seen from above.
+        side: likewise seen from the side; None in the plane.
+        down: whether the vertical axis points down, as a camera's y axis does.
+    """
+
+    top: tuple[int, int]
+    side: tuple[int, int] | None
+    down: bool = False
+
+    @classmethod
+    def of(cls, found: RunFolder) -> "Views":
+        """For a run: of a robot z is up, of a camera what its images' rows are square to."""
+        if found.path.space.dim == 3:
+            return cls((0, 1), None)
+        if found.system == "range-bearing":
+            return cls((0, 1), (0, 2))
+        return cls.of_camera(found.path.mean)
+
+    @classmethod
+    def of_camera(cls, world_from_camera: np.ndarray) -> "Views":
+        """For a path (T, 7): a camera is seldom rolled, so that the vertical is square to its images' rows."""
+        turn = SE3.rotation(world_from_camera)
+        upper = -turn[:, :, 1].mean(axis=0)
+        score = np.square(turn[:, :, 0]).mean(axis=0) - _UPRIGHT * np.abs(upper)
+        vertical = int(np.argmin(score))
+        first, second = (vertical + 1) % 3, (vertical + 2) % 3
+        down = bool(upper[vertical] < 0.0)
+        top = (second, first) if down else (first, second)
+        return cls(top, (top[0], vertical), down)
+
+    def axes(self, title: str) -> tuple[Any, list[tuple[Any, list[int]]]]:
+        """A figure, and its pairs of axes with the world's axes that they show."""
+        from matplotlib.figure import Figure
+
+        planes = [plane for plane in (self.top, self.side) if plane is not None]
+        figure = Figure(figsize=(6.5 * len(planes), 6.0), layout="constrained")
+        panels = figure.subplots(1, len(planes), squeeze=False)[0]
+        shown = [(axes, list(plane)) for axes, plane in zip(panels, planes, strict=True)]
+        for (axes, (right, up)), view in zip(shown, ("from above", "from the side"), strict=False):
+            label(axes, f"{title}, seen {view}", f"{'xyz'[right]} [m]", f"{'xyz'[up]} [m]", equal=True)
+        if self.down:
+            shown[1][0].invert_yaxis()
+        return figure, shown
+
+
+def close_up(axes: Any, shown: list[int], points: np.ndarray) -> None:
+    """Limits that hold points (K, 3) with a margin; what is far away (rays) runs out of the picture."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle, half = 0.5 * (low + high), 0.55 * max(float((high - low).max()), 1e-3)
+    axes.set_xlim(middle[shown[0]] - half, middle[shown[0]] + half)
+    ends = middle[shown[1]] - half, middle[shown[1]] + half
+    axes.set_ylim(*(reversed(ends) if axes.yaxis_inverted() else ends))
+    axes.set_aspect("equal", adjustable="box")
+
+
+def shade(axes: Any, lost: np.ndarray) -> None:
+    """Marks frames (T,) in which the system was lost."""
+    if lost.any():
+        axes.fill_between(
+            np.arange(lost.size), 0, 1, where=lost, transform=axes.get_xaxis_transform(), color=COLOURS["map"],
+            alpha=0.2, lw=0, label="lost",
+        )  # fmt: skip
+
+
+def save_figures(figures: Mapping[str, Any], out: Path) -> list[str]:
+    """Saves figures by file name, each whole or not at all; returns the names."""
+    for name, figure in figures.items():
+        with whole(out / name) as temporary:
+            figure.savefig(temporary, format="png", dpi=110, bbox_inches="tight")
+    return list(figures)
+
+
+def new_axes(title: str, ylabel: str = "y [m]", xlabel: str = "x [m]", equal: bool = True) -> tuple[Any, Any]:
+    """A figure of one pair of axes, by default of equal scale."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.0, 6.0))
+    axes = figure.subplots()
+    label(axes, title, xlabel, ylabel, equal)
+    return figure, axes
+
+
+def stacked_axes(count: int, title: str) -> tuple[Any, list[Any]]:
+    """A figure of pairs of axes one above the other that share what is along them."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.0, 2.0 + 2.0 * count), layout="constrained")
+    rows = list(figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0])
+    rows[0].set_title(title)
+    for axes in rows:
+        axes.grid(alpha=0.3)
+    return figure, rows
+
+
+def label(axes: Any, title: str, xlabel: str, ylabel: str, equal: bool) -> None:
+    """Title, names and grid of a pair of axes."""
+    axes.set(title=title, xlabel=xlabel, ylabel=ylabel)
+    if equal:
+        axes.set_aspect("equal", adjustable="datalim")
+    axes.grid(alpha=0.3)
+
+
+def outline(mean: np.ndarray, cov: np.ndarray, points: int = 40) -> np.ndarray:
+    """The `SIGMAS` ellipses (..., points, 2) of Gaussians (..., 2), (..., 2, 2)."""
+    angle = np.linspace(0.0, 2.0 * np.pi, points)
+    circle = SIGMAS * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    values, vectors = np.linalg.eigh(cov)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
+    return mean[..., None, :] + circle @ np.swapaxes(root, -1, -2)

@@ -1,0 +1,240 @@
+"""A run folder of any system, read back: what pictures, comparisons and reports are made of.
+
+Each part is read when it is asked for, so that a folder that lacks one still has the others.
+
+trajectory.npz   stamps_ns (T,), mean (T, E) and cov (T, d, d) in the right chart at it: the online filtered poses;
+                 correction (T, r), cov_correction (T, r, r) of the motions, see `rbpf.core.diagnostics.Correction`, r = 0
+                 where the system does not report them; particles (N, E) and weights (N,) of the last frame; version
+"""
+
+import csv
+import json
+from dataclasses import dataclass
+from functools import cached_property
+from io import StringIO
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+from rbpf.core.archive import checked, load_arrays
+from rbpf.core.checkpoint import fitting
+from rbpf.errors import InputError
+from rbpf.lie import SE2, SE3, SE2Group, SE3Group
+from rbpf.runs.files import MAP, TRAJECTORY, VERSION
+from rbpf.runs.measurement_files import read_measurements
+from rbpf.runs.path_and_map import PathAndMap
+from rbpf.runs.provenance import read_config, require_own_version
+from rbpf.runs.trajectory import Trajectory, in_space
+from rbpf.runs.truth import RunTruth, read_truth
+from rbpf.sensors.features import FeatureLog
+from rbpf.sensors.readers.measurements import Measurements
+from rbpf.systems.map_estimate import MapEstimate
+
+MOST_BYTES = 1 << 30
+"""No file of a run folder is larger."""
+
+
+@dataclass(frozen=True)
+class FilteredPath:
+    """Filtered poses of a run.
+
+    Attributes:
+        stamps_ns: (T,).
+        mean: (T, E) in SE2 or SE3.
+        cov: (T, d, d) in the right chart at the mean.
+        correction: (T, r) of the motions, r = 0 where the system does not report them.
+        cov_correction: (T, r, r).
+    """
+
+    stamps_ns: np.ndarray
+    mean: np.ndarray
+    cov: np.ndarray
+    correction: np.ndarray
+    cov_correction: np.ndarray
+
+    @property
+    def space(self) -> SE2Group | SE3Group:
+        """The group of the poses."""
+        return SE2 if self.mean.shape[1] == SE2.size else SE3
+
+    def trajectory(self, rows: np.ndarray | slice = slice(None)) -> Trajectory:
+        """Some of the poses, in space."""
+        return in_space(self.stamps_ns[rows], self.mean[rows])
+
+
+@dataclass(frozen=True, repr=False)
+class RunFolder:
+    """A run folder.
+
+    Attributes:
+        folder: where it lies.
+        config: the entries of config.yaml.
+        summary: the entries of summary.json.
+    """
+
+    folder: Path
+    config: dict[str, Any]
+    summary: dict[str, Any]
+
+    @classmethod
+    def open(cls, folder: Path | str) -> Self:
+        """Opens a run folder.
+
+        Raises:
+            InputError: it is not one, or one of another version, or its config.yaml or summary.json is damaged.
+        """
+        folder = Path(folder)
+        if not folder.is_dir():
+            raise InputError(f"{folder}: expected the folder of a run, there is no such folder")
+        for name in ("config.yaml", "summary.json"):
+            if not (folder / name).is_file():
+                raise InputError(
+                    f"{folder} has no {name}: expected the folder that a finished `rbpf run` left"
+                )
+        return cls(folder, read_config(folder), _summary(folder / "summary.json"))
+
+    @property
+    def system(self) -> str:
+        """Which system made it."""
+        return str(self.config.get("system", ""))
+
+    @property
+    def name(self) -> str:
+        """Of the recording."""
+        return str(self.summary.get("recording", self.folder.name))
+
+    @cached_property
+    def path(self) -> FilteredPath:
+        """The filtered poses, with what they were corrected by.
+
+        Raises:
+            InputError: trajectory.npz is missing, damaged or of another version of the program.
+        """
+        file, again = self.folder / TRAJECTORY, f"repeat the run with --config {self.folder / 'config.yaml'}"
+        if not file.is_file():
+            raise InputError(
+                f"{self.folder} has no {file.name}: it was left by another version of rbpf; {again}"
+            )
+        arrays = load_arrays(file)
+        version = arrays.get("version", np.array(0))
+        if version.shape or version.dtype.kind != "i" or int(version) != VERSION:
+            raise InputError(f"{file} has version {version}, this program reads version {VERSION}; {again}")
+        try:
+            with fitting(file):
+                stamps = checked(arrays, "stamps_ns", (None,), "i")
+                mean = checked(arrays, "mean", (stamps.size, None), "f")
+                dim = {SE2.size: SE2.dim, SE3.size: SE3.dim}.get(mean.shape[1])
+                if dim is None:
+                    raise InputError(
+                        f"the array mean must have poses in the plane or in space, got {mean.shape}"
+                    )
+                cov = checked(arrays, "cov", (stamps.size, dim, dim), "f")
+                correction = checked(arrays, "correction", (stamps.size, None), "f")
+                shape = stamps.size, *2 * correction.shape[1:]
+                cov_correction = checked(arrays, "cov_correction", shape, "f")
+        except InputError as error:
+            raise InputError(f"{file} does not hold the poses of a run ({error}); {again}") from error
+        return FilteredPath(stamps, mean, cov, correction, cov_correction)
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The online filtered path in space; errors as `path`."""
+        return self.path.trajectory()
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """(T, d, d) of the poses in the right chart at each, [ω, v]; errors as `path`."""
+        return self.path.cov
+
+    @cached_property
+    def truth(self) -> RunTruth:
+        """The ground truth at the run's frames; errors as `read_truth`."""
+        return read_truth(self.folder, len(self.path.mean), self.path.mean.shape[1])
+
+    @cached_property
+    def map(self) -> MapEstimate:
+        """All landmarks, with the system's columns; `map.points()` are those whose depth is known.
+
+        Raises:
+            InputError: map.npz is missing or damaged.
+        """
+        file = self.folder / MAP
+        if not file.exists():
+            raise InputError(f"{self.folder} holds no {MAP}: expected the folder of a finished run.")
+        arrays = load_arrays(file)
+        with fitting(file):
+            ids = checked(arrays, "id", (None,), "iu")
+            mean = checked(arrays, "mean", (ids.size, None), "f")
+            if mean.shape[1] not in (2, 3):
+                raise InputError(
+                    f"the array mean must have points in the plane or in space, got {mean.shape}"
+                )
+            cov = checked(arrays, "cov", (ids.size, mean.shape[1], mean.shape[1]), "f")
+            ends = checked(arrays, "ray_ends", (ids.size, 2, 3), "f") if "ray_ends" in arrays else None
+            more = [name for name in arrays if name not in ("id", "mean", "cov", "ray_ends")]
+            columns = {name: checked(arrays, name, (ids.size,), "iubf") for name in more}
+        return MapEstimate(ids, mean, cov, columns, ends)
+
+    @cached_property
+    def particles(self) -> tuple[np.ndarray, np.ndarray]:
+        """Poses (N, E) of the last frame's particles in the reported world, and their weights (N,).
+
+        Raises:
+            InputError: trajectory.npz does not hold them.
+        """
+        file = self.folder / TRAJECTORY
+        arrays = load_arrays(file)
+        with fitting(file):
+            poses = checked(arrays, "particles", (None, self.path.mean.shape[1]), "f")
+            return poses, checked(arrays, "weights", (len(poses),), "f")
+
+    @cached_property
+    def measurements(self) -> FeatureLog | Measurements:
+        """What the run used; errors as `read_measurements`."""
+        return read_measurements(self.folder)
+
+    @property
+    def estimate(self) -> PathAndMap:
+        """Poses and the landmarks that are points, with their covariances.
+
+        Raises:
+            InputError: the run was made by another version of the program, or as `path` and `map`.
+        """
+        require_own_version(self.config, self.folder)
+        return PathAndMap(self.path.stamps_ns, self.path.mean, self.path.cov, self.map.points())
+
+    def table(self, name: str) -> dict[str, np.ndarray]:
+        """A table of numbers by its columns' names: diagnostics.csv, timings.csv.
+
+        Raises:
+            InputError: it is missing, or holds something else.
+        """
+        path = self.folder / name
+        rows = list(csv.reader(StringIO(_text(path))))
+        if not rows or any(len(row) != len(rows[0]) for row in rows):
+            raise InputError(f"{path}: expected a table whose rows have as many cells as its header")
+        try:
+            values = np.array(rows[1:], dtype=float).reshape(len(rows) - 1, len(rows[0]))
+        except ValueError as error:
+            raise InputError(f"{path}: expected numbers below the header: {error}") from error
+        return dict(zip(rows[0], values.T, strict=True))
+
+
+def _summary(path: Path) -> dict[str, Any]:
+    try:
+        found = json.loads(_text(path))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path} is damaged: {' '.join(str(error).split())}") from error
+    if not isinstance(found, dict):
+        raise InputError(f"{path} is damaged: expected names with values")
+    return {str(name): value for name, value in found.items()}
+
+
+def _text(path: Path) -> str:
+    try:
+        if path.stat().st_size > MOST_BYTES:
+            raise InputError(f"{path} is larger than any file of a run")
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} cannot be read: {error}") from error

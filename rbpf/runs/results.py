@@ -1,0 +1,71 @@
+"""A finished run, for people: in a notebook, a script, or a shell.
+
+run = rbpf.load("RUN")
+run.trajectory, run.covariance, run.map, run.to_dataframe(), run.plot()
+"""
+
+from html import escape
+from pathlib import Path
+from typing import Any, final
+
+from rbpf.errors import InputError
+from rbpf.runs.plots import map_figure
+from rbpf.runs.reading import RunFolder
+
+_SHOWN = (
+    "frames", "particles", "ate_rmse_m", "path_rmse_m", "ate_sim3_rmse_m", "filter_minus_batch_rmse_m", "ms_per_frame",
+)  # fmt: skip
+"""Entries of summary.json that stand for a run in a notebook."""
+
+
+@final
+class Results(RunFolder):
+    """A run folder, see `RunFolder`, with what people look at."""
+
+    def to_dataframe(self) -> Any:
+        """A pandas DataFrame, one row per frame: times, position, diagnostics and timings.
+
+        Raises:
+            InputError: pandas is not installed, or a file is missing or damaged.
+        """
+        try:
+            import pandas
+        except ImportError as error:
+            raise InputError(
+                "a data frame needs pandas, which is not installed: pip install pandas"
+            ) from error
+        position = dict(zip(("x_m", "y_m", "z_m"), self.trajectory.positions.T, strict=True))
+        columns = {"stamp_ns": self.path.stamps_ns, **position}
+        for name in ("diagnostics.csv", "timings.csv"):
+            columns |= {key: v for key, v in self.table(name).items() if key not in ("step", "stamp_ns")}
+        return pandas.DataFrame(columns)
+
+    def plot(self) -> Any:
+        """A matplotlib figure of the path and the map with 3σ ellipses; errors as `path` and `map`."""
+        return map_figure(self)
+
+    def __repr__(self) -> str:
+        shown = ", ".join(f"{name} {value}" for name, value in self._figures())
+        return f"<run {self.folder}: {self.system}, {self.name}; {shown}>"
+
+    def _repr_html_(self) -> str:
+        """For notebooks: the run's main figures."""
+        rows = [("system", self.system), ("recording", self.name), *self._figures()]
+        cells = "".join(
+            f"<tr><th>{escape(name)}</th><td>{escape(str(value))}</td></tr>" for name, value in rows
+        )
+        return f"<table><caption>{escape(str(self.folder))}</caption>{cells}</table>"
+
+    def _figures(self) -> list[tuple[str, str]]:
+        found = [(name, self.summary[name]) for name in _SHOWN if name in self.summary]
+        found = [(n, v.get("median") if isinstance(v, dict) else v) for n, v in found]
+        return [(name, f"{value:.4g}" if isinstance(value, float) else str(value)) for name, value in found]
+
+
+def load(folder: Path | str) -> Results:
+    """Opens a run folder.
+
+    Raises:
+        InputError: it is not one, or one of another version, or its config.yaml or summary.json is damaged.
+    """
+    return Results.open(folder)
