@@ -39,7 +39,7 @@ class TwoFrames:
 
     def peer(self) -> np.ndarray:
         """Consensus and refinement of the left image, points taken as exact, no covariance: the increment (7,)."""
-        points, seen = CAMERA.locate(self.z_prev), self.z_now[:, :2].copy()
+        points, seen = CAMERA.triangulate(self.z_prev), self.z_now[:, :2].copy()
         _, turn, shift, inliers = cv2.solvePnPRansac(
             points, seen, self.matrix, None, reprojectionError=2.0, confidence=0.9999
         )

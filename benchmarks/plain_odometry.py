@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from rbpf.lie import SE3
-from rbpf.sensors.key_matching import MatchLimits
+from rbpf.sensors.descriptor_matching import MatchLimits
 from rbpf.sensors.pinhole import RectifiedStereo
 from rbpf.sensors.stereo_features import StereoFeatures, match_frames
 
@@ -50,7 +50,7 @@ def refined(
     for _ in range(STEPS):
         turn = SE3.rotation(pose)
         local = SE3.transform(pose, before.points)
-        by_point = rig.slope(local) @ turn
+        by_point = rig.jacobian(local) @ turn
         jac = np.concatenate([-by_point @ skew(before.points), by_point], axis=-1)
         cov = after.cov + by_point @ before.cov_points @ by_point.swapaxes(1, 2)
         white = np.linalg.inv(np.linalg.cholesky(cov))

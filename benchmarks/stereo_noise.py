@@ -15,7 +15,7 @@ import numpy as np
 
 from benchmarks.plain_odometry import WITHIN_PX, motion
 from rbpf.lie import SE3
-from rbpf.sensors.key_matching import MatchLimits
+from rbpf.sensors.descriptor_matching import MatchLimits
 from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
 from rbpf.sensors.readers.images import StereoSequence, open_stereo
 from rbpf.sensors.stereo_features import match_frames

@@ -28,7 +28,7 @@ SETTINGS = {
     "whole image": (SiftConfig(features=0, working_scale=1.0), StereoConfig()),
     "half": (SiftConfig(features=0), StereoConfig()),
     "half, not refined": (SiftConfig(features=0), StereoConfig(refine=False)),
-    "half, keys of 128": (SiftConfig(features=0, length=128), StereoConfig()),
+    "half, descriptors of 128": (SiftConfig(features=0, length=128), StereoConfig()),
     "half, contrast 0.02": (SiftConfig(features=0, contrast=0.02), StereoConfig()),
     "half, 300 keypoints": (SiftConfig(features=300), StereoConfig()),
     "0.35": (SiftConfig(features=0, working_scale=0.35), StereoConfig()),

@@ -33,13 +33,15 @@ class Drive:
         rng, config = np.random.default_rng(0), StereoConfig()
         self.rng, self.config, self.turn = rng, config, 0
         likelihood = config.likelihood.build()
-        self.sensor = StereoSensor(RIG, config.map, config.keys, config.sift.length, likelihood)
+        self.sensor = StereoSensor(RIG, config.map, config.new_landmarks, config.sift.length, likelihood)
         self.filter = build_filter(self.sensor, config)
         azimuth, height = rng.uniform(-np.pi, np.pi, landmarks), rng.uniform(-1.0, 1.0, landmarks)
         away = rng.uniform(1.5, 8.0, landmarks)
         self.places = np.stack([away * np.sin(azimuth), height, away * np.cos(azimuth)], axis=1)
-        keys = np.abs(rng.standard_normal((landmarks, config.sift.length)))
-        self.keys = (keys / np.linalg.norm(keys, axis=1, keepdims=True)).astype(np.float32)
+        descriptors = np.abs(rng.standard_normal((landmarks, config.sift.length)))
+        self.descriptors = (descriptors / np.linalg.norm(descriptors, axis=1, keepdims=True)).astype(
+            np.float32
+        )
         self._fill(landmarks)
         self.frames = [self._features(turned(turn)) for turn in range(1, turns + SETTLING + 1)]
         for _ in range(SETTLING):
@@ -56,7 +58,7 @@ class Drive:
         names = sensor.manager.add(landmarks)
         table = np.column_stack([names, np.full(landmarks, 5), np.zeros(landmarks, dtype=np.int64)])
         sensor.manager.restore({"key_manager/table": table, "key_manager/counters": np.array([0, landmarks])})
-        sensor.index.store.add(names, self.keys)
+        sensor.index.store.add(names, self.descriptors)
         sensor.places.put(names, self.places, SE3.identity())
         held = self.filter.belief().map
         for part in np.array_split(names, max(1, landmarks // 500)):
@@ -67,20 +69,22 @@ class Drive:
 
     def _features(self, pose: np.ndarray) -> StereoFeatures:
         """Of landmarks in view, and of things never seen."""
-        rng, length = self.rng, self.keys.shape[1]
+        rng, length = self.rng, self.descriptors.shape[1]
         local = SE3.inverse_transform(pose, self.places)
         seen = np.flatnonzero(RIG.visible(local, 5.0))
         seen = rng.permutation(seen)[: FEATURES - NEW - 28]
         fresh = FEATURES - seen.size
         other = np.abs(rng.standard_normal((fresh, length)))
-        keys = np.concatenate([self.keys[seen] + KEY * rng.standard_normal((seen.size, length)), other])
-        keys = (keys / np.linalg.norm(keys, axis=1, keepdims=True)).astype(np.float32)
+        descriptors = np.concatenate(
+            [self.descriptors[seen] + KEY * rng.standard_normal((seen.size, length)), other]
+        )
+        descriptors = (descriptors / np.linalg.norm(descriptors, axis=1, keepdims=True)).astype(np.float32)
         spread = rng.uniform([-1.5, -1.0, 3.0], [1.5, 1.0, 6.0], (fresh, 3))
         z = RIG.project(np.concatenate([local[seen], spread]))
         z += rng.multivariate_normal(np.zeros(3), NOISE, FEATURES)
         zero = np.zeros(FEATURES)
         cov = np.tile(NOISE, (FEATURES, 1, 1))
-        return StereoFeatures.measured(RIG, z, cov, zero + 2.0, zero, keys)
+        return StereoFeatures.measured(RIG, z, cov, zero + 2.0, zero, descriptors)
 
 
 def turned(times: int) -> np.ndarray:

@@ -12,7 +12,7 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.sensors.chessboard import Board
-from rbpf.sensors.lens_calibration import MODELS, solved
+from rbpf.sensors.lens_calibration import MODELS, fit_lens
 from rbpf.sensors.pinhole import Pinhole
 
 LEAST_VIEWS = 5
@@ -144,7 +144,7 @@ def _solved(
 
     px = [view.px for view in views]
     try:
-        camera, std, places, normals = solved(model, board.corners, px, (width, height), fixed)
+        camera, std, places, normals = fit_lens(model, board.corners, px, (width, height), fixed)
     except cv2.error as error:
         raise InputError(
             f"no camera explains the {len(views)} views ({error.err}): are they all of one flat board?"

@@ -25,7 +25,7 @@ def check_lens(lenses: Mapping[str, Any], model: str, distortion: Any) -> None:
     """Refuses another model of distortion, and another number of coefficients than it has."""
     if model not in lenses:
         raise InputError(f"the camera's distortion_model must be {' or '.join(lenses)}, got {model!r}")
-    names = lenses[model].names
+    names = lenses[model].coefficient_names
     if np.shape(distortion) != (len(names),):
         left_out = " (k3 = 0 if there are four)" if len(names) == 5 else ""
         expected = f"the {len(names)} numbers {', '.join(names)}{left_out}"

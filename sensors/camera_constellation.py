@@ -8,7 +8,7 @@ import numpy as np
 
 from rbpf.core.models import FusedKernel, Jacobians, ObservationModel
 from rbpf.lie import SE3
-from rbpf.sensors.camera_points import CameraPoint, forward
+from rbpf.sensors.camera_points import CameraPoint, clamp_depth
 from rbpf.sensors.pinhole import Pinhole
 
 
@@ -49,7 +49,7 @@ class PointsView(ObservationModel):
     ) -> np.ndarray:
         """Every point by E06 (7)–(9)."""
         assert landmark is not None
-        px = self.camera.project(forward(self.in_camera(state, landmark, const)))
+        px = self.camera.project(clamp_depth(self.in_camera(state, landmark, const)))
         return px.reshape(*px.shape[:-2], self.dim)
 
     def jacobians(
@@ -137,8 +137,8 @@ class ConstellationView(PointsView):
     ) -> tuple[np.ndarray, np.ndarray]:
         """∂z/∂state = D [[c]× | −I]; ∂z/∂ξ = D R [−[k]× | I] J_r(ξ), with R = R_cᵀ R_G Exp(ξ)."""
         assert const is not None
-        direction = forward(self.in_camera(state, landmark, const))
-        slope = self.camera.slope(direction)
+        direction = clamp_depth(self.in_camera(state, landmark, const))
+        slope = self.camera.jacobian(direction)
         by_state = np.zeros((*slope.shape[:-1], 6 + state.shape[-1] - 7))
         by_state[..., :3], by_state[..., 3:6] = np.cross(slope, direction[..., None, :]), -slope
         frame = SE3.retract(const, landmark)

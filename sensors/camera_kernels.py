@@ -14,14 +14,14 @@ from rbpf.kernels.quaternion import rotation
 from rbpf.kernels.signature import BLOCK, observation_kernel
 from rbpf.sensors.pinhole_kernels import KIND, project_equidistant, project_radial
 
-GRAZING = 0.2
-"""The same as `rbpf.sensors.camera_points.GRAZING`; the tests compare them."""
+MIN_DEPTH_FRACTION = 0.2
+"""The same as `rbpf.sensors.camera_points.MIN_DEPTH_FRACTION`; the tests compare them."""
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def forward_depth(x, y, z):
+def clamp_depth(x, y, z):
     """The depth kept positive."""
-    return max(z, GRAZING * math.sqrt(x * x + y * y + z * z))
+    return max(z, MIN_DEPTH_FRACTION * math.sqrt(x * x + y * y + z * z))
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -51,7 +51,7 @@ def locate(pose, point, n, place):
         x = r[0] * a + r[3] * b + r[6] * c
         y = r[1] * a + r[4] * b + r[7] * c
         place[i], place[BLOCK + i] = x, y
-        place[2 * BLOCK + i] = forward_depth(x, y, r[2] * a + r[5] * b + r[8] * c)
+        place[2 * BLOCK + i] = clamp_depth(x, y, r[2] * a + r[5] * b + r[8] * c)
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -153,7 +153,7 @@ def _locate_ray(pose, ray, anchor, n, place):
         x = r[0] * a + r[3] * b + r[6] * c
         y = r[1] * a + r[4] * b + r[7] * c
         place[i], place[BLOCK + i] = x, y
-        place[2 * BLOCK + i] = forward_depth(x, y, r[2] * a + r[5] * b + r[8] * c)
+        place[2 * BLOCK + i] = clamp_depth(x, y, r[2] * a + r[5] * b + r[8] * c)
 
 
 @njit(cache=True, error_model="numpy", inline="always")

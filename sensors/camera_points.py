@@ -15,8 +15,8 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.pinhole import Pinhole
 
-GRAZING = 0.2
-"""Least fraction of its length by which a direction points forward: what is behind the camera projects far outside."""
+MIN_DEPTH_FRACTION = 0.2
+"""Least fraction of its length by which a direction points clamp_depth: what is behind the camera projects far outside."""
 
 
 class Camera(Protocol):
@@ -27,7 +27,7 @@ class Camera(Protocol):
     def project(self, point: np.ndarray) -> np.ndarray:
         """(…, 3) in the camera's frame → (…, p) px."""
 
-    def slope(self, point: np.ndarray) -> np.ndarray:
+    def jacobian(self, point: np.ndarray) -> np.ndarray:
         """Its derivative (…, p, 3)."""
 
     def visible(self, point: np.ndarray, margin_px: float = 0.0) -> np.ndarray:
@@ -48,18 +48,20 @@ class CameraModel(ObservationModel):
         self.dim = camera.dim
 
     @abstractmethod
-    def place(self, landmark: np.ndarray, const: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    def world_point(self, landmark: np.ndarray, const: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """Homogeneous world point: x (…, 3) and w (…, 1)."""
 
     @abstractmethod
-    def place_slope(self, landmark: np.ndarray, const: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    def world_point_jacobian(
+        self, landmark: np.ndarray, const: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Derivatives of x (…, 3, D) and w (…, 1, D) by the landmark."""
 
     def in_camera(
         self, state: np.ndarray, landmark: np.ndarray, const: np.ndarray | None = None
     ) -> np.ndarray:
         """Direction (…, 3) from the camera, in its frame; the point itself where w = 1."""
-        x, w = self.place(landmark, const)
+        x, w = self.world_point(landmark, const)
         position = SE3.translation(state[..., :7])
         return SE3.inverse_transform(state[..., :7], x + (1.0 - w) * position)
 
@@ -72,7 +74,7 @@ class CameraModel(ObservationModel):
     ) -> np.ndarray:
         """E06 (7)–(9) with distortion."""
         assert landmark is not None
-        return self.camera.project(forward(self.in_camera(state, landmark, const)))
+        return self.camera.project(clamp_depth(self.in_camera(state, landmark, const)))
 
     def jacobians(
         self,
@@ -83,13 +85,13 @@ class CameraModel(ObservationModel):
     ) -> Jacobians:
         """∂z/∂ξ = D [[c]× | −w I] and ∂z/∂b = D Rᵀ(∂x/∂b − t ∂w/∂b), with D the camera's slope."""
         assert landmark is not None
-        direction = forward(self.in_camera(state, landmark, const))
-        slope = self.camera.slope(direction)
-        _, w = self.place(landmark, const)
+        direction = clamp_depth(self.in_camera(state, landmark, const))
+        slope = self.camera.jacobian(direction)
+        _, w = self.world_point(landmark, const)
         by_rotation = np.cross(slope, direction[..., None, :])
         by_state = np.zeros((*by_rotation.shape[:-1], 6 + state.shape[-1] - 7))
         by_state[..., :3], by_state[..., 3:6] = by_rotation, -w[..., None] * slope
-        dx, dw = self.place_slope(landmark, const)
+        dx, dw = self.world_point_jacobian(landmark, const)
         moved = dx - SE3.translation(state[..., :7])[..., :, None] * dw
         turned = np.swapaxes(SE3.rotation(state[..., :7]), -1, -2) @ moved
         return Jacobians(by_state, slope @ turned)
@@ -103,11 +105,13 @@ class CameraModel(ObservationModel):
 class CameraPoint(CameraModel):
     """A world point in metres (E06 §3.2): two numbers from one camera, three from a stereo pair."""
 
-    def place(self, landmark: np.ndarray, const: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    def world_point(self, landmark: np.ndarray, const: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """The point, w = 1."""
         return landmark, np.ones((*landmark.shape[:-1], 1))
 
-    def place_slope(self, landmark: np.ndarray, const: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    def world_point_jacobian(
+        self, landmark: np.ndarray, const: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Identity and zero."""
         return np.eye(3), np.zeros((1, 3))
 
@@ -138,14 +142,16 @@ class CameraRay(CameraModel):
         self.pinhole = camera
         self.rho = rho
 
-    def place(self, landmark: np.ndarray, const: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    def world_point(self, landmark: np.ndarray, const: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """The ray: x = R_a (u, v, 1) + q t_a, w = q."""
         assert const is not None
         ray = np.concatenate([landmark[..., :2], np.ones((*landmark.shape[:-1], 1))], axis=-1)
         rho, position = landmark[..., 2:], SE3.translation(const)
         return SE3.transform(const, ray) + (rho - 1.0) * position, rho
 
-    def place_slope(self, landmark: np.ndarray, const: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    def world_point_jacobian(
+        self, landmark: np.ndarray, const: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """First two columns of R_a, and t_a."""
         assert const is not None
         turned = SE3.rotation(const)[..., :2]
@@ -155,7 +161,7 @@ class CameraRay(CameraModel):
     def initialise(self, state: np.ndarray, z: np.ndarray, cov: np.ndarray) -> Records:
         """The ray through z from each particle's own camera, with the prior inverse depth."""
         n, k = state.shape[0], z.shape[0]
-        uv, slope = self.pinhole.unproject(z), self.pinhole.unproject_slope(z)
+        uv, slope = self.pinhole.unproject(z), self.pinhole.unproject_jacobian(z)
         mean = np.concatenate([uv, np.full((k, 1), self.rho[0])], axis=1)
         full = np.zeros((k, 3, 3))
         full[:, :2, :2] = gaussian.symmetrise(slope @ cov @ np.swapaxes(slope, -1, -2))
@@ -240,8 +246,8 @@ class EpipolarRay(CameraRay):
         return np.eye(2) - np.where(has_line, along, 0.0)
 
 
-def forward(direction: np.ndarray) -> np.ndarray:
+def clamp_depth(direction: np.ndarray) -> np.ndarray:
     """Directions (…, 3) with the depth kept positive, so that what lies behind the camera projects far outside."""
     length = np.sqrt(np.square(direction).sum(axis=-1))
-    depth = np.maximum(direction[..., 2], GRAZING * length)
+    depth = np.maximum(direction[..., 2], MIN_DEPTH_FRACTION * length)
     return np.concatenate([direction[..., :2], depth[..., None]], axis=-1)

@@ -103,7 +103,7 @@ def refined(
         if inliers.sum() < 4:
             return None
         by_pose = np.concatenate([skew(seen), np.broadcast_to(-np.eye(3), (len(seen), 3, 3))], axis=-1)
-        jac = camera.slope(seen) @ by_pose
+        jac = camera.jacobian(seen) @ by_pose
         information = np.einsum("kpa,kpb->ab", jac, jac)
         if np.linalg.cond(information) > 1e12:
             return None

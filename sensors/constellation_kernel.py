@@ -7,7 +7,7 @@ from numba import njit
 from rbpf.kernels.block import flat
 from rbpf.kernels.quaternion import rotation
 from rbpf.kernels.signature import BLOCK, observation_kernel
-from rbpf.sensors.camera_kernels import forward_depth, locate, measure, store_by_state, turn
+from rbpf.sensors.camera_kernels import clamp_depth, locate, measure, store_by_state, turn
 from rbpf.sensors.pinhole_kernels import KIND, project_equidistant, project_radial
 
 HEADER = KIND + 1
@@ -89,7 +89,7 @@ def _view(project, state, mean, const, z, params, n, nu, jac_state, jac_landmark
             u2 = s[6] * p0 + s[7] * p1 + s[8] * p2 + const[6, i] - state[6, i]
             c0 = r[0] * u0 + r[3] * u1 + r[6] * u2
             c1 = r[1] * u0 + r[4] * u1 + r[7] * u2
-            depth = forward_depth(c0, c1, r[2] * u0 + r[5] * u1 + r[8] * u2)
+            depth = clamp_depth(c0, c1, r[2] * u0 + r[5] * u1 + r[8] * u2)
             px, py, d00, d01, d02, d10, d11, d12 = project(c0, c1, depth, params)
             nu[2 * k, i] = z[2 * k] - px
             nu[2 * k + 1, i] = z[2 * k + 1] - py

@@ -21,9 +21,9 @@ def corners(
     count: int,
     spacing_px: float = 20.0,
     border_px: float = 16.0,
-    least_step: int = 10,
-    least_texture: float = 4.0,
-    within: np.ndarray | None = None,
+    fast_threshold: int = 10,
+    min_score: float = 4.0,
+    mask: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The best corners, best first, at least `spacing_px` from each other and from places already taken.
 
@@ -37,9 +37,9 @@ def corners(
         count: at most so many.
         spacing_px: the least distance.
         border_px: the least distance of a corner from the outermost pixels' centres.
-        least_step: grey levels by which FAST's arc must differ from the corner's pixel.
-        least_texture: the lowest score.
-        within: (H, W) bool, where a corner may be; None for everywhere.
+        fast_threshold: grey levels by which FAST's arc must differ from the corner's pixel.
+        min_score: the lowest score.
+        mask: (H, W) bool, where a corner may be; None for everywhere.
 
     Returns:
         Places (k, 2) at whole pixels and their scores (k,), k ≤ count. Equal scores go by row, then column.
@@ -55,11 +55,11 @@ def corners(
     margin = int(np.ceil(max(border_px, MARGIN_PX)))
     if min(image.shape) <= 2 * margin:
         return np.zeros((0, 2)), np.zeros(0)
-    squares, places = _least_eigenvalues(image), _candidates(image, margin, least_step)
-    if within is not None:
-        places = places[within[places[:, 1], places[:, 0]]]
+    squares, places = _least_eigenvalues(image), _candidates(image, margin, fast_threshold)
+    if mask is not None:
+        places = places[mask[places[:, 1], places[:, 0]]]
     kept = np.empty(places.shape[0], np.bool_)
-    peaks(squares, places, float(least_texture) ** 2, kept)
+    peaks(squares, places, float(min_score) ** 2, kept)
     places = places[kept]
     found = np.sqrt(squares[places[:, 1], places[:, 0]].astype(float))
     order, chosen = np.argsort(-found, kind="stable"), np.empty(max(count, 0), np.int64)
@@ -68,7 +68,7 @@ def corners(
     return places[chosen].astype(float), found[chosen]
 
 
-def texture(image: np.ndarray, px: np.ndarray) -> np.ndarray:
+def corner_score(image: np.ndarray, px: np.ndarray) -> np.ndarray:
     """The score of `corners` at places (K, 2) inside the image, rounded to whole pixels: (K,) grey levels per pixel."""
     column, row = np.rint(px).astype(int).T
     return np.sqrt(np.maximum(_least_eigenvalues(checked_image(image))[row, column], 0.0)).astype(float)
@@ -84,7 +84,7 @@ def _least_eigenvalues(image: np.ndarray) -> np.ndarray:
     return np.asarray(squares)
 
 
-def _candidates(image: np.ndarray, margin: int, least_step: int) -> np.ndarray:
+def _candidates(image: np.ndarray, margin: int, fast_threshold: int) -> np.ndarray:
     """FAST's corners (M, 2) inside the margin, row by row.
 
     All of them: of equal neighbours, which ideal and saturated images have, FAST's own suppression keeps none.
@@ -93,5 +93,5 @@ def _candidates(image: np.ndarray, margin: int, least_step: int) -> np.ndarray:
 
     first = margin - _FAST_RADIUS_PX
     inner = image[first : image.shape[0] - first, first : image.shape[1] - first]
-    found = cv2.FastFeatureDetector.create(least_step, False).detect(inner)
+    found = cv2.FastFeatureDetector.create(fast_threshold, False).detect(inner)
     return np.rint(cv2.KeyPoint.convert(found)).astype(np.int64).reshape(-1, 2) + first

@@ -19,7 +19,7 @@ _TINY = 1e-9
 
 @final
 @dataclass(frozen=True)
-class Refined:
+class SubpixelMatches:
     """Places in the right image.
 
     Attributes:
@@ -33,7 +33,7 @@ class Refined:
 
 def refine(
     left: np.ndarray, right: np.ndarray, px: np.ndarray, u_right: np.ndarray, half_px: int = 5
-) -> Refined:
+) -> SubpixelMatches:
     """Refines columns u_right (K,), at which places px (K, 2) of the left image are in the right one.
 
     Args:
@@ -57,7 +57,7 @@ def refine(
     window = _centred(_windows(right, u, v, half_px, half_px))
     correlation = _dot(template, window) / np.sqrt(energy * np.maximum(_dot(window, window), _TINY))
     whole = _inside(left, px[:, 0], v, half_px) & _inside(right, u, v, half_px)
-    return Refined(np.where(whole, u, np.nan), np.where(whole, correlation, 0.0))
+    return SubpixelMatches(np.where(whole, u, np.nan), np.where(whole, correlation, 0.0))
 
 
 def _windows(image: np.ndarray, u: np.ndarray, v: np.ndarray, high: int, wide: int) -> np.ndarray:

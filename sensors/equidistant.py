@@ -12,7 +12,7 @@ import numpy as np
 
 from rbpf.arrays import Bool, Float
 
-WIDEST = np.deg2rad(75.0)
+MAX_ANGLE = np.deg2rad(75.0)
 """Largest angle from the axis that is seen, less than where `rbpf.sensors.camera_points.forward` begins to bend: (u, v)
 and its errors grow without bound towards 90°."""
 
@@ -36,12 +36,12 @@ class Equidistant:
     """
 
     coefficients: tuple[float, float, float, float]
-    names: ClassVar = ("k1", "k2", "k3", "k4")
+    coefficient_names: ClassVar = ("k1", "k2", "k3", "k4")
     kind: ClassVar = 1.0
-    is_plain: ClassVar = False
+    is_identity: ClassVar = False
 
     @cached_property
-    def widest(self) -> float:
+    def max_angle(self) -> float:
         """Angle from the axis [rad] up to which a direction is seen: 75°, or where the image folds back before.
 
         There is the smallest positive root of 1 + 3 k1 θ² + 5 k2 θ⁴ + 7 k3 θ⁶ + 9 k4 θ⁸.
@@ -50,23 +50,23 @@ class Equidistant:
         # As a polynomial in 1/θ² its first coefficient is 1: no division by a small k4.
         roots = np.roots([1.0, 3.0 * k1, 5.0 * k2, 7.0 * k3, 9.0 * k4])
         positive = roots.real[(roots.imag == 0.0) & (roots.real > 0.0)]
-        return float(min(WIDEST, 1.0 / np.sqrt(positive.max()))) if positive.size else float(WIDEST)
+        return float(min(MAX_ANGLE, 1.0 / np.sqrt(positive.max()))) if positive.size else float(MAX_ANGLE)
 
     @cached_property
     def monotonic_radius(self) -> float:
         """Distance from the axis, in normalised coordinates, up to which a direction is seen."""
-        return float(np.tan(self.widest))
+        return float(np.tan(self.max_angle))
 
     @cached_property
-    def reach(self) -> float:
+    def image_radius(self) -> float:
         """Distance from the axis, in distorted coordinates, of the circle in which it sees."""
-        return float(self._rises_to(np.array(self.widest)))
+        return float(self._rises_to(np.array(self.max_angle)))
 
     def distort(self, uv: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
         """Distorted coordinates (…, 2) of normalised ones."""
         return self._scale_and_bend(uv)[0][..., None] * uv
 
-    def slope(self, uv: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2 2"]:
+    def jacobian(self, uv: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2 2"]:
         """Its derivative (…, 2, 2), a symmetric matrix."""
         scale, bend = self._scale_and_bend(uv)
         u, v = uv[..., 0], uv[..., 1]
@@ -74,19 +74,19 @@ class Equidistant:
         parts = [scale + bend * u * u, across, across, scale + bend * v * v]
         return np.stack(parts, axis=-1).reshape(*uv.shape, 2)
 
-    def is_unique(self, uv: Float[np.ndarray, "*batch 2"]) -> Bool[np.ndarray, "*batch"]:
-        """Whether a direction (u, v) (…) is seen: nearer to the axis than `widest`, where the lens is one-to-one."""
+    def is_invertible(self, uv: Float[np.ndarray, "*batch 2"]) -> Bool[np.ndarray, "*batch"]:
+        """Whether a direction (u, v) (…) is seen: nearer to the axis than `max_angle`, where the lens is one-to-one."""
         return np.hypot(uv[..., 0], uv[..., 1]) < self.monotonic_radius
 
     def undistort(self, target: Float[np.ndarray, "K 2"]) -> Float[np.ndarray, "K 2"]:
         """Normalised coordinates (K, 2) of distorted ones, NaN where there are none.
 
-        The angle by Newton's method, which halves what is left where it would leave it: θ_d rises up to `widest`.
+        The angle by Newton's method, which halves what is left where it would leave it: θ_d rises up to `max_angle`.
         """
         length = np.linalg.norm(target, axis=1)
-        within = length < self.reach
+        within = length < self.image_radius
         length = np.where(within, length, 0.0)
-        low, high = np.zeros_like(length), np.full_like(length, self.widest)
+        low, high = np.zeros_like(length), np.full_like(length, self.max_angle)
         angle = np.clip(length, low, high)
         for _ in range(ITERATIONS):
             missing = length - self._rises_to(angle)
@@ -98,7 +98,7 @@ class Equidistant:
         uv = (
             target * np.where(length > 0.0, np.tan(angle) / np.where(length > 0.0, length, 1.0), 1.0)[:, None]
         )
-        return np.where((within & self.is_unique(uv))[:, None], uv, np.nan)
+        return np.where((within & self.is_invertible(uv))[:, None], uv, np.nan)
 
     def _scale_and_bend(self, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """θ_d/r and its derivative by r, over r (…), at the distance r from the axis."""

@@ -25,7 +25,7 @@ MODELS = {
 """Of each kind of lens: numbers of coefficients, and what OpenCV is told to leave at zero."""
 
 
-class Solved(NamedTuple):
+class LensFit(NamedTuple):
     """A camera and V boards of M corners before it.
 
     Attributes:
@@ -41,9 +41,9 @@ class Solved(NamedTuple):
     normals: np.ndarray
 
 
-def solved(
+def fit_lens(
     model: str, board: np.ndarray, px: Sequence[np.ndarray], size: tuple[int, int], fixed: Sequence[str]
-) -> Solved:
+) -> LensFit:
     """The camera of least squared error.
 
     Args:
@@ -67,9 +67,11 @@ def solved(
     rotations = np.array([cv2.Rodrigues(turn)[0] for turn in turns])
     places = board @ rotations.mT + np.array(shifts).reshape(-1, 1, 3)
     if std is None:
-        free = [True] * 4 + [f"CALIB_FIX_{name.upper()}" not in fixed for name in camera.lens.names]
+        free = [True] * 4 + [
+            f"CALIB_FIX_{name.upper()}" not in fixed for name in camera.lens.coefficient_names
+        ]
         std = _deviations(camera, places, np.array(px), np.array(free))
-    return Solved(camera, std, places, rotations[..., 2])
+    return LensFit(camera, std, places, rotations[..., 2])
 
 
 def _radial_tangential(
@@ -104,7 +106,7 @@ def _deviations(camera: Pinhole, places: np.ndarray, px: np.ndarray, free: np.nd
     """
     by_camera = _by_camera(camera, places)[..., free]
     turned = np.concatenate([-skew(places), np.broadcast_to(np.eye(3), (*places.shape, 3))], axis=-1)
-    by_pose = camera.slope(places) @ turned
+    by_pose = camera.jacobian(places) @ turned
     v, m = places.shape[:2]
     a, b = by_camera.reshape(v, 2 * m, -1), by_pose.reshape(v, 2 * m, 6)
     shared = a.mT @ b

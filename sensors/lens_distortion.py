@@ -36,12 +36,12 @@ class RadialTangential:
     """
 
     coefficients: tuple[float, float, float, float, float]
-    names: ClassVar = ("k1", "k2", "p1", "p2", "k3")
+    coefficient_names: ClassVar = ("k1", "k2", "p1", "p2", "k3")
     kind: ClassVar = 0.0
-    reach: ClassVar = float("inf")
+    image_radius: ClassVar = float("inf")
 
     @cached_property
-    def is_plain(self) -> bool:
+    def is_identity(self) -> bool:
         """Whether nothing is distorted."""
         return not any(self.coefficients)
 
@@ -59,7 +59,7 @@ class RadialTangential:
 
     def distort(self, uv: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
         """Distorted coordinates (…, 2) of normalised ones."""
-        if self.is_plain:
+        if self.is_identity:
             return uv
         k1, k2, p1, p2, k3 = self.coefficients
         u, v = uv[..., 0], uv[..., 1]
@@ -69,7 +69,7 @@ class RadialTangential:
         down = v * radial + 2.0 * p2 * u * v + p1 * (s + 2.0 * v * v)
         return np.stack([along, down], axis=-1)
 
-    def slope(self, uv: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2 2"]:
+    def jacobian(self, uv: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2 2"]:
         """Its derivative (…, 2, 2), a symmetric matrix."""
         k1, k2, p1, p2, k3 = self.coefficients
         u, v = uv[..., 0], uv[..., 1]
@@ -81,23 +81,23 @@ class RadialTangential:
         down = radial + bend * v * v + 6.0 * p1 * v + 2.0 * p2 * u
         return np.stack([along, across, across, down], axis=-1).reshape(*uv.shape, 2)
 
-    def is_unique(self, uv: Float[np.ndarray, "*batch 2"]) -> Bool[np.ndarray, "*batch"]:
+    def is_invertible(self, uv: Float[np.ndarray, "*batch 2"]) -> Bool[np.ndarray, "*batch"]:
         """Whether the distortion is one-to-one up to (u, v) (…).
 
         Within the monotonic radius radial distortion is; with tangential distortion its derivative must be positive
         definite besides, which a weak one is anywhere near the image.
         """
-        if self.is_plain:
+        if self.is_identity:
             return np.isfinite(uv[..., 0]) & np.isfinite(uv[..., 1])
-        slope = self.slope(uv)
+        slope = self.jacobian(uv)
         trace = slope[..., 0, 0] + slope[..., 1, 1]
         within = np.hypot(uv[..., 0], uv[..., 1]) < self.monotonic_radius
         return within & (trace > 0.0) & (_determinant(slope) > 0.0)
 
     def undistort(self, target: Float[np.ndarray, "K 2"]) -> Float[np.ndarray, "K 2"]:
         """Normalised coordinates (K, 2) of distorted ones, NaN where there are none."""
-        if self.is_plain:
-            return np.where(self.is_unique(target)[:, None], target, np.nan)
+        if self.is_identity:
+            return np.where(self.is_invertible(target)[:, None], target, np.nan)
         # Half of the radius is clear of the fold, where the derivative has no inverse.
         length = np.maximum(np.linalg.norm(target, axis=1, keepdims=True), np.finfo(float).tiny)
         uv = target * np.minimum(1.0, 0.5 * self.monotonic_radius / length)
@@ -108,20 +108,20 @@ class RadialTangential:
                 break
             uv[active], reached = self._newton(uv[active], target[active], error[active])
             error[active], active = reached, active[(reached > SETTLED) & (reached < STALLED * error[active])]
-        found = (error <= SOLVED) & self.is_unique(uv)
+        found = (error <= SOLVED) & self.is_invertible(uv)
         return np.where(found[:, None], uv, np.nan)
 
     def _newton(self, uv: np.ndarray, target: np.ndarray, error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """A step of each (K, 2), halved until it stays on this side of the fold and brings the error (K,) down."""
         miss = target - self.distort(uv)
-        step = (inverse(self.slope(uv)) @ miss[..., None])[..., 0]
+        step = (inverse(self.jacobian(uv)) @ miss[..., None])[..., 0]
         waiting = np.arange(len(uv))
         for fraction in 0.5 ** np.arange(HALVINGS):
             if not waiting.size:
                 break
             tried = uv[waiting] + fraction * step[waiting]
             reached = self._misfit(tried, target[waiting])
-            better = (reached < (1.0 - ARMIJO * fraction) * error[waiting]) & self.is_unique(tried)
+            better = (reached < (1.0 - ARMIJO * fraction) * error[waiting]) & self.is_invertible(tried)
             uv[waiting[better]], error[waiting[better]] = tried[better], reached[better]
             waiting = waiting[~better]
         return uv, error

@@ -18,7 +18,7 @@ LARGEST_SIZE = 101
 
 @final
 @dataclass(frozen=True)
-class Matches:
+class PatchMatches:
     """Where templates were found, one row each.
 
     Attributes:
@@ -101,7 +101,7 @@ def search(
     sigmas: float = 3.0,
     most_px: float = 40.0,
     least_std: float = 3.0,
-) -> Matches:
+) -> PatchMatches:
     """Looks for each template in the ellipse where it is expected, by zero-mean normalised cross-correlation.
 
     Every whole pixel of the ellipse is tried where the whole template fits into the image; half a pixel's diagonal is
@@ -135,7 +135,7 @@ def search(
     found[:, 2:4] = -1.0
     pairs = _pairs(image, templates, covs, limits)
     run_driver(search_all, pairs, image, templates, centres, covs, limits, found)
-    return Matches(found[:, :2], found[:, 2], found[:, 3], found[:, [4, 5, 5, 6]].reshape(count, 2, 2))
+    return PatchMatches(found[:, :2], found[:, 2], found[:, 3], found[:, [4, 5, 5, 6]].reshape(count, 2, 2))
 
 
 def checked_image(image: np.ndarray) -> np.ndarray:

@@ -72,7 +72,7 @@ class Pinhole:
         """
         models = {lens.kind: name for name, lens in LENSES.items()}
         model = models.get(float(params[9]), f"of kind {params[9]:g}")
-        count = len(LENSES[model].names) if model in LENSES else 0
+        count = len(LENSES[model].coefficient_names) if model in LENSES else 0
         fx, fy, cx, cy, *distortion = (float(number) for number in params)
         return cls(width, height, fx, fy, cx, cy, tuple(distortion[:count]), model)
 
@@ -108,12 +108,12 @@ class Pinhole:
         with np.errstate(all="ignore"):
             return self.params[:2] * self.lens.distort(_normalise(point)) + self.params[2:4]
 
-    def slope(self, point: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2 3"]:
+    def jacobian(self, point: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2 3"]:
         """∂px/∂point (…, 2, 3) at points (…, 3) in the camera's frame."""
         point = np.asarray(point, float)
         with np.errstate(all="ignore"):
             uv = _normalise(point)
-            by_uv = self.params[:2, None] * self.lens.slope(uv) / point[..., 2, None, None]
+            by_uv = self.params[:2, None] * self.lens.jacobian(uv) / point[..., 2, None, None]
             return np.concatenate([by_uv, -by_uv @ uv[..., None]], axis=-1)
 
     def unproject(self, px: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
@@ -127,20 +127,20 @@ class Pinhole:
             uv = self.lens.undistort(target.reshape(-1, 2))
         return uv.reshape(target.shape)
 
-    def unproject_slope(self, px: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2 2"]:
+    def unproject_jacobian(self, px: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2 2"]:
         """∂(u, v)/∂px (…, 2, 2) at pixels (…, 2); NaN where `unproject` is."""
-        return inverse(self.lens.slope(self.unproject(px))) / self.params[:2]
+        return inverse(self.lens.jacobian(self.unproject(px))) / self.params[:2]
 
-    def circle(self, margin_px: float) -> Bool[np.ndarray, "H W"] | None:
+    def field_of_view_mask(self, margin_px: float) -> Bool[np.ndarray, "H W"] | None:
         """Pixels (H, W) that far inside the circle in which a fisheye lens sees; None where it fills the image.
 
         It does with radial-tangential distortion: there `unproject` tells the few pixels that have no direction.
         """
-        if np.isinf(self.lens.reach):
+        if np.isinf(self.lens.image_radius):
             return None
         rows, columns = np.ogrid[: self.height, : self.width]
         away = np.hypot((columns - self.cx) / self.fx, (rows - self.cy) / self.fy)
-        within = away < self.lens.reach - margin_px / min(self.fx, self.fy)
+        within = away < self.lens.image_radius - margin_px / min(self.fx, self.fy)
         return None if within.all() else within
 
     def inside(self, px: Float[np.ndarray, "*batch 2"], margin_px: float = 0.0) -> Bool[np.ndarray, "*batch"]:
@@ -158,7 +158,7 @@ class Pinhole:
     ) -> Bool[np.ndarray, "*batch"]:
         """Whether points (…, 3) are seen (…): in front of the camera, not folded back, and inside the image."""
         with np.errstate(all="ignore"):
-            seen = self.lens.is_unique(_normalise(point)) & self.inside(self.project(point), margin_px)
+            seen = self.lens.is_invertible(_normalise(point)) & self.inside(self.project(point), margin_px)
         return np.logical_and(seen, np.asarray(point)[..., 2] > 0.0)
 
 
@@ -183,7 +183,7 @@ class RectifiedStereo:
         check_finite("the stereo baseline", self.baseline_m)
         if self.baseline_m <= 0.0:
             raise InputError(f"the stereo baseline must be positive, got {self.baseline_m!r} m")
-        if not self.camera.lens.is_plain:
+        if not self.camera.lens.is_identity:
             bent = f"{self.camera.distortion_model} distortion {self.camera.distortion}"
             found = f"the camera of a rectified stereo pair has {bent}"
             raise InputError(f"{found}: rectify the images and give the camera of the rectified ones")
@@ -193,12 +193,12 @@ class RectifiedStereo:
         right = self.camera.project(self._from_right(point))[..., :1]
         return np.concatenate([self.camera.project(point), right], axis=-1)
 
-    def slope(self, point: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:
+    def jacobian(self, point: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:
         """∂px/∂point (…, 3, 3) at points (…, 3) in the left camera's frame."""
-        right = self.camera.slope(self._from_right(point))[..., :1, :]
-        return np.concatenate([self.camera.slope(point), right], axis=-2)
+        right = self.camera.jacobian(self._from_right(point))[..., :1, :]
+        return np.concatenate([self.camera.jacobian(point), right], axis=-2)
 
-    def locate(self, z: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+    def triangulate(self, z: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
         """Points (…, 3) in the left camera's frame seen at (u_left, v, u_right) (…, 3); NaN without disparity."""
         z = np.asarray(z, float)
         disparity = np.where(z[..., 0] > z[..., 2], z[..., 0] - z[..., 2], np.nan)[..., None]

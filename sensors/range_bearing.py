@@ -51,7 +51,7 @@ class RangeBearing(RigidPointModel):
         pitch = self.pitch_sign * np.arctan2(point[..., 2], flat)
         return np.stack([np.hypot(flat, point[..., 2]), yaw, pitch], axis=-1)
 
-    def slope(self, point: np.ndarray) -> np.ndarray:
+    def measure_jacobian(self, point: np.ndarray) -> np.ndarray:
         """∂(range, yaw[, pitch])/∂point."""
         x, y = point[..., 0], point[..., 1]
         flat2 = x * x + y * y
@@ -120,7 +120,7 @@ class RelativePosition(RigidPointModel):
         """The point itself."""
         return point
 
-    def slope(self, point: np.ndarray) -> np.ndarray:
+    def measure_jacobian(self, point: np.ndarray) -> np.ndarray:
         """The identity."""
         return np.broadcast_to(np.eye(self.dim), (*point.shape, self.dim))
 

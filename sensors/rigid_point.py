@@ -36,7 +36,7 @@ class RigidPointModel(ObservationModel):
         """Z (…, p) of points (…, D) in the sensor's frame."""
 
     @abstractmethod
-    def slope(self, point: np.ndarray) -> np.ndarray:
+    def measure_jacobian(self, point: np.ndarray) -> np.ndarray:
         """∂z/∂point (…, p, D)."""
 
     @abstractmethod
@@ -65,7 +65,7 @@ class RigidPointModel(ObservationModel):
         """∂z/∂ξ = D [−ω × p | −I] and ∂z/∂landmark = D Rᵀ, with D taken to the robot's frame."""
         assert landmark is not None
         in_robot = self.space.inverse_transform(state, landmark)
-        slope = self.slope(self.space.inverse_transform(self.robot_from_sensor, in_robot))
+        slope = self.measure_jacobian(self.space.inverse_transform(self.robot_from_sensor, in_robot))
         slope = slope @ np.swapaxes(self.space.rotation(self.robot_from_sensor), -1, -2)
         by_landmark = slope @ np.swapaxes(self.space.rotation(state), -1, -2)
         return Jacobians(np.concatenate([_by_rotation(slope, in_robot), -slope], axis=-1), by_landmark)

@@ -1,14 +1,14 @@
-"""Keypoints of the difference of Gaussians with SIFT keys (D. Lowe, IJCV 60(2), 2004), the features of S05 §III-A.
+"""Keypoints of the difference of Gaussians with SIFT descriptors (D. Lowe, IJCV 60(2), 2004), the features of S05 §III-A.
 
 OpenCV detects and describes. Pixels are (column, row), with the centre of the top-left one at (0, 0).
 
-A key has 128 entries: 4 × 4 spatial windows of 8 orientations each; or 36, as S05 has it: 3 × 3 windows of 4
-orientations. S05 does not say how its keys were formed. Here windows are added two by two in both directions,
+A descriptor has 128 entries: 4 × 4 spatial windows of 8 orientations each; or 36, as S05 has it: 3 × 3 windows of 4
+orientations. S05 does not say how its descriptors were formed. Here windows are added two by two in both directions,
 overlapping, so that 4 become 3; and with h_o the histogram's entry at o · 45°, the entry at o · 90° becomes
 h_2o + (h_2o−1 + h_2o+1) / 2, so that every one of the 8 counts once and none is preferred to its mirror image.
 
 Entries are then scaled to length 1 ("sift"), or to sum 1 and their roots taken ("root"), which makes the product of
-two keys the Bhattacharyya coefficient of two histograms (R. Arandjelović, A. Zisserman, CVPR 2012). Either way
+two descriptors the Bhattacharyya coefficient of two histograms (R. Arandjelović, A. Zisserman, CVPR 2012). Either way
 |a − b|² = 2 − 2 aᵀb.
 """
 
@@ -28,7 +28,7 @@ _SIGMA = 1.6
 
 @dataclass(frozen=True)
 class SiftConfig:
-    """Settings of the detector and of the keys.
+    """Settings of the detector and of the descriptors.
 
     Attributes:
         features: the most keypoints of an image, those of highest contrast; 0 for all.
@@ -37,7 +37,7 @@ class SiftConfig:
         contrast: least contrast of an extremum; OpenCV's unit, Lowe's 0.03 is 0.09 with three layers.
         edge: largest ratio of principal curvatures.
         layers: scales per octave.
-        length: of a key, 36 or 128.
+        length: of a descriptor, 36 or 128.
         norm: "root" or "sift", see the module.
 
     Raises:
@@ -61,14 +61,14 @@ class SiftConfig:
             expected = "contrast of at least 0, edge above 1 and at least one layer"
             raise InputError(f"expected {expected}, got {self.contrast}, {self.edge} and {self.layers}")
         if self.length not in LENGTHS:
-            raise InputError(f"a key has 36 or 128 entries, got length {self.length}")
+            raise InputError(f"a descriptor has 36 or 128 entries, got length {self.length}")
         if self.norm not in ("root", "sift"):
             raise InputError(f'norm must be "root" or "sift", got {self.norm!r}')
 
 
 @final
 @dataclass(frozen=True)
-class KeyPoints:
+class Keypoints:
     """Keypoints of an image, of highest contrast first.
 
     Attributes:
@@ -76,22 +76,26 @@ class KeyPoints:
         scale: (K,) standard deviation of the Gaussian at which each was found, px.
         orientation: (K,) direction of the strongest slope, [0, 2π), from the columns' axis towards the rows'.
         contrast: (K,) of the extremum.
-        keys: (K, d) float32 of length 1.
+        descriptors: (K, d) float32 of length 1.
     """
 
     px: np.ndarray
     scale: np.ndarray
     orientation: np.ndarray
     contrast: np.ndarray
-    keys: np.ndarray
+    descriptors: np.ndarray
 
     def __len__(self) -> int:
         return self.px.shape[0]
 
-    def take(self, rows: np.ndarray) -> "KeyPoints":
+    def take(self, rows: np.ndarray) -> "Keypoints":
         """Some of them, by number or by mask."""
-        return KeyPoints(
-            self.px[rows], self.scale[rows], self.orientation[rows], self.contrast[rows], self.keys[rows]
+        return Keypoints(
+            self.px[rows],
+            self.scale[rows],
+            self.orientation[rows],
+            self.contrast[rows],
+            self.descriptors[rows],
         )
 
 
@@ -107,7 +111,7 @@ class Sift:
         self.config = config or SiftConfig()
         self._detector: Any = None
 
-    def detect(self, image: np.ndarray) -> KeyPoints:
+    def detect(self, image: np.ndarray) -> Keypoints:
         """Keypoints of an image (H, W) uint8; none where there is no texture.
 
         A place with two strong directions is two keypoints.
@@ -121,12 +125,12 @@ class Sift:
             return self._none()
         table = np.array([(*p.pt, p.size, p.angle, p.response) for p in found])
         ratio = self.config.working_scale
-        points = KeyPoints(
+        points = Keypoints(
             px=(table[:, :2] + 0.5) / ratio - 0.5,
             scale=0.5 * table[:, 2] / ratio,
             orientation=np.deg2rad(table[:, 3]) % (2.0 * np.pi),
             contrast=table[:, 4],
-            keys=keys_of(histograms, self.config.length, self.config.norm),
+            descriptors=descriptors_from_histograms(histograms, self.config.length, self.config.norm),
         )
         # OpenCV keeps the strongest, and ties, in no particular order.
         order = np.lexsort((points.orientation, points.px[:, 0], points.px[:, 1], -points.contrast))
@@ -143,21 +147,21 @@ class Sift:
             )
         return self._detector
 
-    def _none(self) -> KeyPoints:
+    def _none(self) -> Keypoints:
         none = np.zeros(0)
-        return KeyPoints(
+        return Keypoints(
             np.zeros((0, 2)), none, none, none, np.zeros((0, self.config.length), dtype=np.float32)
         )
 
 
-def keys_of(histograms: np.ndarray, length: int, norm: str = "root") -> np.ndarray:
-    """Keys (K, length) float32 of length 1, of SIFT histograms (K, 128) ordered by row, column and orientation."""
-    keys = histograms.astype(np.float32)
+def descriptors_from_histograms(histograms: np.ndarray, length: int, norm: str = "root") -> np.ndarray:
+    """Descriptors (K, length) float32 of length 1, of SIFT histograms (K, 128) ordered by row, column and orientation."""
+    descriptors = histograms.astype(np.float32)
     if length == 36:
-        keys = pooled(keys)
+        descriptors = pooled(descriptors)
     if norm == "root":
-        keys = np.sqrt(keys)
-    return keys / np.maximum(np.linalg.norm(keys, axis=1, keepdims=True), np.float32(1e-9))
+        descriptors = np.sqrt(descriptors)
+    return descriptors / np.maximum(np.linalg.norm(descriptors, axis=1, keepdims=True), np.float32(1e-9))
 
 
 def pooled(histograms: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 
 from rbpf import gaussian
 from rbpf.sensors.candidates import gate_pairs
-from rbpf.sensors.key_matching import KeyMatches, MatchLimits, match_all, match_pairs
+from rbpf.sensors.descriptor_matching import DescriptorMatches, MatchLimits, match_all, match_pairs
 from rbpf.sensors.pinhole import RectifiedStereo
 
 
@@ -26,7 +26,7 @@ class StereoFeatures:
         cov_points: (K, 3, 3) C^L, m²: `cov` through the Jacobian of the triangulation.
         scale: (K,) of the keypoint, px.
         orientation: (K,) of the keypoint, radians.
-        keys: (K, 36) or (K, 128) float32 of length 1.
+        descriptors: (K, 36) or (K, 128) float32 of length 1.
     """
 
     z: np.ndarray
@@ -35,7 +35,7 @@ class StereoFeatures:
     cov_points: np.ndarray
     scale: np.ndarray
     orientation: np.ndarray
-    keys: np.ndarray
+    descriptors: np.ndarray
 
     @classmethod
     def measured(
@@ -45,13 +45,13 @@ class StereoFeatures:
         cov: np.ndarray,
         scale: np.ndarray,
         orientation: np.ndarray,
-        keys: np.ndarray,
+        descriptors: np.ndarray,
     ) -> "StereoFeatures":
         """Features whose points and their covariances follow from the pixels."""
-        points = rig.locate(z)
-        jac = locate_slope(rig, z)
+        points = rig.triangulate(z)
+        jac = triangulate_jacobian(rig, z)
         cov_points = gaussian.symmetrise(jac @ cov @ np.swapaxes(jac, -1, -2))
-        return cls(z, cov, points, cov_points, scale, orientation, keys)
+        return cls(z, cov, points, cov_points, scale, orientation, descriptors)
 
     def __len__(self) -> int:
         return self.z.shape[0]
@@ -61,13 +61,13 @@ class StereoFeatures:
         return StereoFeatures(*(getattr(self, item.name)[rows] for item in fields(self)))
 
 
-def locate_slope(rig: RectifiedStereo, z: np.ndarray) -> np.ndarray:
-    """∂P/∂(u_left, v, u_right) (…, 3, 3) of `RectifiedStereo.locate` at pixels z (…, 3), Mathematics (stereo-slope).
+def triangulate_jacobian(rig: RectifiedStereo, z: np.ndarray) -> np.ndarray:
+    """∂P/∂(u_left, v, u_right) (…, 3, 3) of `RectifiedStereo.triangulate` at pixels z (…, 3), Mathematics (stereo-slope).
 
     With disparity d = u_left − u_right, P = (fx b / d) (u, v, 1) in normalised coordinates: every pixel of d moves P
     along its own ray by −P/d, and u_left and v turn the ray besides.
     """
-    points = rig.locate(z)
+    points = rig.triangulate(z)
     disparity = (z[..., 0] - z[..., 2])[..., None]
     slope = np.zeros((*points.shape, 3))
     slope[..., 0] = -points / disparity
@@ -83,7 +83,7 @@ def match_frames(
     limits: MatchLimits,
     predicted: tuple[np.ndarray, np.ndarray] | None = None,
     gate: float = 11.3,
-) -> KeyMatches:
+) -> DescriptorMatches:
     """Which features of an earlier pair are seen again in a later one.
 
     Args:
@@ -98,7 +98,7 @@ def match_frames(
         Pairs of rows, `first` before and `second` after.
     """
     if predicted is None:
-        return match_all(before.keys, after.keys, limits)
+        return match_all(before.descriptors, after.descriptors, limits)
     mean, cov = predicted
     k, m = gate_pairs(after.z, after.cov, mean, cov, gate)
-    return match_pairs(before.keys, after.keys, (m, k), limits)
+    return match_pairs(before.descriptors, after.descriptors, (m, k), limits)

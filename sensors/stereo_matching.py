@@ -1,8 +1,8 @@
 """SIFT features of a rectified stereo pair (S05 §III-B): keypoints of both images, matched along the rows.
 
 A keypoint of the left image may match those of the right one that lie on its row, to the left of it by a disparity
-that a depth beyond the nearest has, at a like scale and orientation. Of these candidates the nearest key is taken
-(`key_matching`), and the place in the right image is refined on grey values (`disparity`).
+that a depth beyond the nearest has, at a like scale and orientation. Of these candidates the nearest descriptor is taken
+(`descriptor_matching`), and the place in the right image is refined on grey values (`disparity`).
 
 The noise of z = (u_left, v, u_right): what a keypoint's place means on the object changes from view to view, with
 standard deviation σ_p per axis. The refinement looks for what lies at the left place, whatever that is: u_right shares
@@ -14,18 +14,18 @@ Without the refinement both places have their own error, and cov = σ_p² I.
 """
 
 from dataclasses import dataclass, field
-from typing import final
+from typing import ClassVar, final
 
 import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.sensors.candidates import band_pairs
+from rbpf.sensors.descriptor_matching import DescriptorMatches, MatchLimits, match_pairs
 from rbpf.sensors.disparity import refine
-from rbpf.sensors.impulses import without_impulses
-from rbpf.sensors.key_matching import KeyMatches, MatchLimits, match_pairs
+from rbpf.sensors.impulse_noise import remove_impulses
 from rbpf.sensors.patches import checked_image
 from rbpf.sensors.pinhole import RectifiedStereo
-from rbpf.sensors.sift import KeyPoints, Sift, SiftConfig
+from rbpf.sensors.sift import Keypoints, Sift, SiftConfig
 from rbpf.sensors.stereo_features import StereoFeatures
 
 SWAPPED, FEWER = 20, 4
@@ -43,8 +43,8 @@ class StereoConfig:
         least_disparity_px: nor does a smaller disparity than this tell a depth.
         scale_ratio: largest ratio of the two scales.
         turn_rad: largest difference of the two orientations.
-        limits: of the keys.
-        mend: whether pixels that were struck by impulse noise are replaced before anything is looked for.
+        limits: of the descriptors.
+        filter_impulses: whether impulse noise (salt and pepper) is removed before keypoints are detected.
         refine: whether the disparity is refined on grey values.
         half_px: of the refinement's window.
         least_correlation: of the refined windows, else the match is dropped.
@@ -58,6 +58,8 @@ class StereoConfig:
         InputError: a number is out of its range.
     """
 
+    RENAMED: ClassVar[dict[str, str]] = {"mend": "filter_impulses"}
+
     row_px: float = 1.0
     row_per_scale: float = 0.25
     nearest_m: float = 0.3
@@ -65,7 +67,7 @@ class StereoConfig:
     scale_ratio: float = 1.5
     turn_rad: float = 0.35
     limits: MatchLimits = field(default_factory=MatchLimits)
-    mend: bool = True
+    filter_impulses: bool = True
     refine: bool = True
     half_px: int = 5
     least_correlation: float = 0.8
@@ -112,8 +114,8 @@ class StereoSift:
         self.rig = rig
         self.sift = Sift(sift)
         self.config = stereo or StereoConfig()
-        self.struck = 0.0
-        """Share of the pixels that were replaced in the last pair."""
+        self.impulse_fraction = 0.0
+        """Fraction of the pixels that were replaced in the last pair."""
 
     def measure(self, left: np.ndarray, right: np.ndarray) -> StereoFeatures:
         """Features of a pair of images (H, W) uint8; none where there is no texture.
@@ -122,22 +124,22 @@ class StereoSift:
             InputError: the images are not of the camera's size, or they are swapped.
         """
         self._check(left, right)
-        self.struck = 0.0
-        if self.config.mend:
-            (left, one), (right, other) = without_impulses(left), without_impulses(right)
-            self.struck = 0.5 * (one + other)
+        self.impulse_fraction = 0.0
+        if self.config.filter_impulses:
+            (left, one), (right, other) = remove_impulses(left), remove_impulses(right)
+            self.impulse_fraction = 0.5 * (one + other)
         return self.match((left, right), self.sift.detect(left), self.sift.detect(right))
 
     @property
     def remark(self) -> str:
         """In words, what was wrong with the last pair, though it could be measured; empty where nothing was."""
-        if not self.struck:
+        if not self.impulse_fraction:
             return ""
-        fraction = f"{100.0 * self.struck:.1f} %"
-        return f"{fraction} of the pixels are struck by impulses, the median of their surroundings is taken"
+        fraction = f"{100.0 * self.impulse_fraction:.1f} %"
+        return f"{fraction} of the pixels have impulse noise, the median of their surroundings is taken"
 
     def match(
-        self, images: tuple[np.ndarray, np.ndarray], left: KeyPoints, right: KeyPoints
+        self, images: tuple[np.ndarray, np.ndarray], left: Keypoints, right: Keypoints
     ) -> StereoFeatures:
         """Features of a pair of images whose keypoints are known.
 
@@ -167,12 +169,17 @@ class StereoSift:
         shared = np.array([[1.0, 0.0, 1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 1.0]])
         return place[:, None, None] * shared + disparity[:, None, None] * np.diag([0.0, 0.0, 1.0])
 
-    def _features(self, keypoints: KeyPoints, z: np.ndarray) -> StereoFeatures:
+    def _features(self, keypoints: Keypoints, z: np.ndarray) -> StereoFeatures:
         return StereoFeatures.measured(
-            self.rig, z, self.noise(keypoints.scale), keypoints.scale, keypoints.orientation, keypoints.keys
+            self.rig,
+            z,
+            self.noise(keypoints.scale),
+            keypoints.scale,
+            keypoints.orientation,
+            keypoints.descriptors,
         )
 
-    def _along_rows(self, left: KeyPoints, right: KeyPoints) -> KeyMatches:
+    def _along_rows(self, left: Keypoints, right: Keypoints) -> DescriptorMatches:
         """Matches of one keypoint of each image at most; a place that has two orientations counts once."""
         config = self.config
         reach = config.row_px + config.row_per_scale * left.scale
@@ -183,7 +190,7 @@ class StereoSift:
         near &= np.abs(np.log(left.scale[k] / right.scale[m])) <= np.log(config.scale_ratio)
         near &= np.cos(left.orientation[k] - right.orientation[m]) >= np.cos(config.turn_rad)
         return one_per_place(
-            match_pairs(left.keys, right.keys, (k[near], m[near]), config.limits), left, right
+            match_pairs(left.descriptors, right.descriptors, (k[near], m[near]), config.limits), left, right
         )
 
     def _check(self, left: np.ndarray, right: np.ndarray) -> None:
@@ -195,7 +202,7 @@ class StereoSift:
             size = f"{left.shape[1]}x{left.shape[0]}"
             raise InputError(f"the camera takes {camera.width}x{camera.height} px, the images have {size} px")
 
-    def _check_order(self, left: KeyPoints, right: KeyPoints, found: int) -> None:
+    def _check_order(self, left: Keypoints, right: Keypoints, found: int) -> None:
         """Refuses a pair whose keypoints match far better the other way round."""
         if FEWER * found >= min(len(left), len(right)):
             return
@@ -207,8 +214,8 @@ class StereoSift:
             )
 
 
-def one_per_place(matches: KeyMatches, left: KeyPoints, right: KeyPoints) -> KeyMatches:
-    """Of matches whose keypoints share their place in an image those of the nearest keys, in the order of the first."""
+def one_per_place(matches: DescriptorMatches, left: Keypoints, right: Keypoints) -> DescriptorMatches:
+    """Of matches whose keypoints share their place in an image those of the nearest descriptors, in the order of the first."""
     order = np.argsort(matches.distance, kind="stable")
     for keypoints, rows in ((left, matches.first), (right, matches.second)):
         _, first = np.unique(keypoints.px[rows[order]], axis=0, return_index=True)

@@ -27,22 +27,24 @@ class StereoPoint(CameraModel):
         super().__init__(rig, margin_px)
         self.rig = rig
 
-    def place(self, landmark: np.ndarray, const: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    def world_point(self, landmark: np.ndarray, const: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """The point, w = 1."""
         return landmark, np.ones((*landmark.shape[:-1], 1))
 
-    def place_slope(self, landmark: np.ndarray, const: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    def world_point_jacobian(
+        self, landmark: np.ndarray, const: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Identity and zero."""
         return np.eye(3), np.zeros((1, 3))
 
     def invert(self, state: np.ndarray, z: np.ndarray) -> np.ndarray:
         """S05 (4); NaN without disparity."""
-        return SE3.transform(state[..., :7], self.rig.locate(z))
+        return SE3.transform(state[..., :7], self.rig.triangulate(z))
 
     def initialise(self, state: np.ndarray, z: np.ndarray, cov: np.ndarray) -> Records:
         """Points (N, K, 3) with R C^L Rᵀ, S05 (4) and (7)."""
-        local = self.rig.locate(z)
-        by_pixel = np.linalg.inv(self.rig.slope(local))
+        local = self.rig.triangulate(z)
+        by_pixel = np.linalg.inv(self.rig.jacobian(local))
         turned = SE3.rotation(state[:, None, :7]) @ by_pixel
         mean = SE3.transform(state[:, None, :7], local)
         return Records(mean, gaussian.symmetrise(turned @ cov @ np.swapaxes(turned, -1, -2)))

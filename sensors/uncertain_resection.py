@@ -55,7 +55,7 @@ def refined_on_all(camera: Pinhole, pose: np.ndarray, sights: Sights) -> Resecte
             return None
         seen, white = seen[inliers], white[inliers]
         by_pose = np.concatenate([skew(seen), np.broadcast_to(-np.eye(3), (len(seen), 3, 3))], axis=-1)
-        jac = white @ camera.slope(seen) @ by_pose
+        jac = white @ camera.jacobian(seen) @ by_pose
         information = np.einsum("kpa,kpb->ab", jac, jac)
         if np.linalg.cond(information) > 1e12:
             return None
@@ -77,7 +77,7 @@ def _compared(
     turn = SE3.inverse_transform(poses[:, None], sights.points + sights.spread) - seen
     std = sights.std_px
     with np.errstate(all="ignore"):
-        along = np.einsum("cmpa,cma->cmp", camera.slope(seen), turn) / std[:, None]
+        along = np.einsum("cmpa,cma->cmp", camera.jacobian(seen), turn) / std[:, None]
         length = np.square(along).sum(axis=-1)
         shrink = (1.0 - 1.0 / np.sqrt(1.0 + length)) / np.maximum(length, 1e-300)
         outer = along[..., :, None] * along[..., None, :]

@@ -69,11 +69,11 @@ def plain_pictures() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def keypoints_once() -> Iterator[None]:
     """In an image that one of the module's tests has seen, keypoints are not looked for again."""
-    from rbpf.sensors.sift import KeyPoints, Sift, SiftConfig
+    from rbpf.sensors.sift import Keypoints, Sift, SiftConfig
 
-    detect, known = Sift.detect, dict[tuple[SiftConfig, bytes], KeyPoints]()
+    detect, known = Sift.detect, dict[tuple[SiftConfig, bytes], Keypoints]()
 
-    def once(sift: Sift, image: np.ndarray) -> KeyPoints:
+    def once(sift: Sift, image: np.ndarray) -> Keypoints:
         key = sift.config, image.tobytes()
         if key not in known:
             known[key] = detect(sift, image)

@@ -20,7 +20,7 @@ from rbpf.sensors.board_calibration import BoardCalibration, BoardView, calibrat
 from rbpf.sensors.chessboard import Board, board_corners
 from rbpf.sensors.pinhole import Pinhole
 from rbpf.sensors.readers.images.calibration import MODELS, NAME, model_of
-from rbpf.sensors.readers.images.uncalibrated import Shot, read_shots
+from rbpf.sensors.readers.images.uncalibrated import NamedImage, read_shots
 
 FIGURES, PICTURE = "calibration.json", "calibration.png"
 MOST_SHOTS, MOST_VIEWS = 150, 40
@@ -96,7 +96,7 @@ def camera_text(camera: Pinhole, about: str) -> str:
 
 def summarise_calibration(found: BoardCalibration, board: Board, looked_at: int) -> dict[str, Any]:
     """The entries of calibration.json."""
-    names = (*_INTRINSICS, *found.camera.lens.names)
+    names = (*_INTRINSICS, *found.camera.lens.coefficient_names)
     return {
         "board": f"{board.columns}x{board.rows}",
         "square_m": board.square_m,
@@ -115,15 +115,15 @@ def summarise_calibration(found: BoardCalibration, board: Board, looked_at: int)
 
 
 def _counted(
-    shots: Iterator[Shot], total: int, on_image: Callable[[int, int], None] | None
-) -> Iterator[Shot]:
+    shots: Iterator[NamedImage], total: int, on_image: Callable[[int, int], None] | None
+) -> Iterator[NamedImage]:
     for number, shot in enumerate(shots, 1):
         yield shot
         if on_image is not None:
             on_image(number, total)
 
 
-def _require_size(found: _Found, shot: Shot, images: Path) -> None:
+def _require_size(found: _Found, shot: NamedImage, images: Path) -> None:
     height, width = shot.image.shape
     if not found.looked_at:
         found.width, found.height = width, height

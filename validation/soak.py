@@ -18,7 +18,7 @@ from rbpf.core.filter import Filter
 from rbpf.core.models import NewLandmarks, Observations, Sensor
 from rbpf.lie import SE2, SE3
 from rbpf.runs.folder import peak_memory_mb
-from rbpf.sensors.names import Names
+from rbpf.sensors.catalogue_index import NameIndex
 from rbpf.systems.mono import system as mono
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.run import pose_estimate
@@ -75,7 +75,7 @@ class Forgetting(Sensor):
         self.after = after
         self.frame = 0
         self._seen: dict[int, int] = {}
-        self._names = Names()
+        self._names = NameIndex()
 
     def observe(self, frame: Any, belief: Belief) -> Sequence[Observations]:
         """What the inner sensor observes."""

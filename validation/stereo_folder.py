@@ -112,7 +112,7 @@ def _key_counts(run: StereoRun, mapped: MapEstimate) -> dict[str, float | int]:
         return {"sift_features": 0, "landmarks_mean_per_particle": float(mapped.ids.size)}
     return {
         "sift_features": int(sensor.manager.next_name),
-        "landmarks_mean_per_particle": float(sensor.manager.promoted.sum()),
+        "landmarks_mean_per_particle": float(sensor.manager.confirmed.sum()),
     }
 
 
@@ -123,8 +123,8 @@ def _facts(run: StereoRun, mapped: MapEstimate) -> dict[str, np.ndarray]:
         return {}
     rows = np.searchsorted(sensor.manager.names, mapped.ids)
     return {
-        "sightings": sensor.manager.sightings[rows],
-        "landmark": sensor.manager.promoted[rows].astype(int),
+        "sightings": sensor.manager.observations[rows],
+        "landmark": sensor.manager.confirmed[rows].astype(int),
     }
 
 

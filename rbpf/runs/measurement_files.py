@@ -267,7 +267,7 @@ def _read_camera_log(folder: Path, seen: "_Table", kind: str) -> FeatureLog:
 def _read_camera(table: "_Table", kind: str) -> Pinhole | RectifiedStereo:
     width, height = table.numbers("size", 2).tolist()
     lens = table.choice("lens", tuple(LENSES)) if "lens" in table.header else PLAIN
-    fx, fy, cx, cy, *distortion = table.numbers("camera", 4 + len(LENSES[lens].names)).tolist()
+    fx, fy, cx, cy, *distortion = table.numbers("camera", 4 + len(LENSES[lens].coefficient_names)).tolist()
     camera = Pinhole(int(width), int(height), fx, fy, cx, cy, tuple(distortion), lens)
     return RectifiedStereo(camera, float(table.numbers("baseline", 1)[0])) if kind == "stereo" else camera
 

@@ -10,7 +10,7 @@ from rbpf.sensors.readers.log import Frame
 from rbpf.sensors.readers.table import Table
 
 
-def require_sightings(table: Table, distance: str, *angles: str) -> None:
+def require_observations(table: Table, distance: str, *angles: str) -> None:
     """Refuse ranges that are not positive and angles beyond a turn, which are probably degrees.
 
     Raises:

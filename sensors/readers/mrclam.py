@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from rbpf.errors import InputError
 from rbpf.lie import SE2, Array
-from rbpf.sensors.readers.assembly import assemble, diagonal, require_sightings
+from rbpf.sensors.readers.assembly import assemble, diagonal, require_observations
 from rbpf.sensors.readers.dead_reckoning import integrate
 from rbpf.sensors.readers.log import RobotLog, Truth
 from rbpf.sensors.readers.noise import LogNoise
@@ -100,7 +100,7 @@ def _read_sightings(
     path: Path, barcodes: dict[int, int]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], Array]:
     table = read_columns(path, ("time", "barcode", "range", "bearing"), KIND)
-    require_sightings(table, "range", "bearing")
+    require_observations(table, "range", "bearing")
     subjects = np.array([barcodes.get(barcode, 0) for barcode in table.integers("barcode").tolist()])
     kept = subjects > _LAST_ROBOT
     unknown = np.count_nonzero(subjects == 0)

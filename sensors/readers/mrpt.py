@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rbpf.lie import SE2, SE3, Array
-from rbpf.sensors.readers.assembly import assemble, diagonal, require_distinct, require_sightings
+from rbpf.sensors.readers.assembly import assemble, diagonal, require_distinct, require_observations
 from rbpf.sensors.readers.covariance import planar_to_chart, read_covariances, spatial_to_chart
 from rbpf.sensors.readers.log import RobotLog, Truth
 from rbpf.sensors.readers.mrpt_sensor import read_sensor
@@ -104,7 +104,7 @@ def _require_order(sightings: Table, odometry: Table) -> tuple[NDArray[np.int64]
 def _measurements(table: Table, planar: bool, noise: LogNoise, path: Path) -> tuple[Array, Array]:
     applicable = ["std_range_m", "std_bearing_rad", "scale_odometry"] + ["std_pitch_rad"] * (not planar)
     noise.require_only(applicable, path, f"an MRPT log in {'the plane' if planar else 'space'}")
-    require_sightings(table, "range_m", "yaw_rad")
+    require_observations(table, "range_m", "yaw_rad")
     pitch = table["pitch_rad"]
     std = [
         standard_deviations(table, "std_range_m", noise.std_range_m),

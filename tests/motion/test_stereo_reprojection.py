@@ -46,9 +46,9 @@ def test_the_earlier_points_covariance_in_space():
     matches, delta = correlated(ROAD, 20, np.random.default_rng(2))
     camera = matches.camera
     before = camera.locate(matches.z_prev)
-    by_z = np.linalg.inv(camera.slope(before))
+    by_z = np.linalg.inv(camera.jacobian(before))
     cov_points = by_z @ matches.cov_prev @ by_z.mT
-    by_point = camera.slope(SE3.inverse_transform(delta, before)) @ SE3.rotation(delta).T
+    by_point = camera.jacobian(SE3.inverse_transform(delta, before)) @ SE3.rotation(delta).T
     expected = matches.cov_now + by_point @ cov_points @ by_point.mT
     np.testing.assert_allclose(innovation(matches, delta, "propagated").cov, expected, rtol=1e-8)
     np.testing.assert_array_equal(innovation(matches, delta, "exact").cov, matches.cov_now)

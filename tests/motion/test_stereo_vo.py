@@ -86,8 +86,8 @@ def test_the_other_kinds_are_scipys_least_squares(points):
     ours = fit(matches, delta, VoConfig(points, rule=STRICT))
     camera, best = matches.camera, ours.x
     before = camera.locate(matches.z_prev)
-    by_z = np.linalg.inv(camera.slope(before))
-    by_prev = camera.slope(SE3.inverse_transform(best, before)) @ SE3.rotation(best).T @ by_z
+    by_z = np.linalg.inv(camera.jacobian(before))
+    by_prev = camera.jacobian(SE3.inverse_transform(best, before)) @ SE3.rotation(best).T @ by_z
     noise = by_prev @ matches.cov_prev @ by_prev.mT if points == "propagated" else 0.0
     white = np.linalg.inv(np.linalg.cholesky(matches.cov_now + noise))
 

@@ -42,7 +42,9 @@ def frames(path: Path) -> object:
 def seen(path: Path) -> object:
     """What a camera sees and where."""
     camera = open_images(path).camera
-    return camera.unproject(camera.project(np.array([[0.1, 0.2, 1.0], [3.0, 2.0, 1.0]]))), camera.circle(2.0)
+    return camera.unproject(
+        camera.project(np.array([[0.1, 0.2, 1.0], [3.0, 2.0, 1.0]]))
+    ), camera.field_of_view_mask(2.0)
 
 
 def pairs(path: Path) -> object:

@@ -5,8 +5,8 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.sensors.key_index import Gate, KeyIndex
-from rbpf.sensors.key_matching import MatchLimits, distances
+from rbpf.sensors.descriptor_index import DescriptorIndex, Gate
+from rbpf.sensors.descriptor_matching import MatchLimits, distances
 from rbpf.sensors.readers.images import open_stereo
 from rbpf.sensors.sift import SiftConfig
 from rbpf.sensors.stereo_features import match_frames
@@ -60,7 +60,7 @@ def test_they_lie_on_the_same_row_of_both_images(recording):
         found, there = sensor.measure(left, right), sensor.sift.detect(right)
         near = np.abs(found.z[:, 2, None] - there.px[None, :, 0]) <= 2.0
         near &= np.abs(found.z[:, 1, None] - there.px[None, :, 1]) <= 4.0
-        distance = np.where(near, distances(found.keys @ there.keys.T), np.inf)
+        distance = np.where(near, distances(found.descriptors @ there.descriptors.T), np.inf)
         partner = distance.argmin(axis=1)
         sure = np.isfinite(distance.min(axis=1))
         gaps.append((found.z[:, 1] - there.px[partner, 1])[sure])
@@ -111,14 +111,14 @@ def test_longer_keys_err_less(recording, features):
 
 def test_a_prediction_finds_landmarks_more_surely(recording, features):
     rig = recording[1]
-    index = KeyIndex(36)
+    index = DescriptorIndex(36)
     before, after = features[0], features[2]
-    index.store.add(np.arange(len(before)), before.keys)
+    index.store.add(np.arange(len(before)), before.descriptors)
     mean = expected(recording, 0, 2, before.points)
     seen = np.flatnonzero(rig.inside(mean))
     gate = Gate(after.z, after.cov, seen, mean[seen], np.tile(9.0 * np.eye(3), (seen.size, 1, 1)))
     fractions = []
-    for found in (index.match(after.keys), index.match(after.keys, gate)):
+    for found in (index.match(after.descriptors), index.match(after.descriptors, gate)):
         rows = np.flatnonzero(found.ids >= 0)
         error = np.abs(after.z[rows] - mean[found.ids[rows]]).max(axis=1)
         fractions.append(((error < 4.0).sum(), np.mean(error < 4.0)))

@@ -71,7 +71,7 @@ def test_rays_on_either_side_of_the_threshold(camera):
 
 
 def test_both_keep_the_same_depth_in_front():
-    assert camera_kernels.GRAZING == camera_points.GRAZING
+    assert camera_kernels.MIN_DEPTH_FRACTION == camera_points.MIN_DEPTH_FRACTION
 
 
 ANGLES = [0.0, 1e-9, 1e-3, 0.1 - 1e-9, 0.1 + 1e-9, 0.5, 1.0, 3.0, np.pi, 5.0]

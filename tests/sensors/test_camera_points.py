@@ -10,7 +10,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3, Euclidean, Product
 from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.maps.point import Point
-from rbpf.sensors.camera_points import GRAZING, CameraPoint, CameraRay, EpipolarRay, forward
+from rbpf.sensors.camera_points import MIN_DEPTH_FRACTION, CameraPoint, CameraRay, EpipolarRay, clamp_depth
 from rbpf.sensors.pinhole import RectifiedStereo
 from tests.exactness.models import known
 from tests.sensors.camera_scenes import CAMERAS, PLAIN, Rays, with_velocity
@@ -118,15 +118,15 @@ def test_behind_the_camera_is_finite_and_far_outside(camera, point):
         assert not model.visible(identity, landmark, const)
     side = np.linalg.norm(point[:2]) / np.linalg.norm(point)
     px = CameraPoint(PLAIN).predict(identity, point) - [319.5, 239.5]
-    assert np.linalg.norm(px) >= 0.99 * 400.0 * side / GRAZING
+    assert np.linalg.norm(px) >= 0.99 * 400.0 * side / MIN_DEPTH_FRACTION
 
 
 def test_forward_leaves_what_is_in_front():
     direction = np.random.default_rng(4).normal(size=(50, 3)) * [1.0, 1.0, 0.3] + [0.0, 0.0, 2.0]
-    np.testing.assert_array_equal(forward(direction), direction)
-    behind = forward(-direction)
+    np.testing.assert_array_equal(clamp_depth(direction), direction)
+    behind = clamp_depth(-direction)
     np.testing.assert_array_equal(behind[:, :2], -direction[:, :2])
-    np.testing.assert_allclose(behind[:, 2], GRAZING * np.linalg.norm(direction, axis=1))
+    np.testing.assert_allclose(behind[:, 2], MIN_DEPTH_FRACTION * np.linalg.norm(direction, axis=1))
 
 
 def test_visible_keeps_a_margin():

@@ -86,7 +86,7 @@ def test_inside_the_border(image, border_px):
 
 def test_within_a_mask(image):
     within = np.hypot(*np.ogrid[-120:120, -160:160]) < 90.0
-    px, _ = corners(image, NONE, 1000, 4.0, 16.0, within=within)
+    px, _ = corners(image, NONE, 1000, 4.0, 16.0, mask=within)
     everywhere, _ = corners(image, NONE, 1000, 4.0, 16.0)
     assert 20 < len(px) < len(everywhere)
     assert within[px[:, 1].astype(int), px[:, 0].astype(int)].all()
@@ -106,21 +106,21 @@ def test_equal_squares_share_the_places():
 
 
 def test_the_threshold_on_texture(image):
-    _, scores = corners(image, NONE, 1000, 5.0, 16.0, least_texture=0.0)
+    _, scores = corners(image, NONE, 1000, 5.0, 16.0, min_score=0.0)
     middle = float(np.median(scores))
-    _, rich = corners(image, NONE, 1000, 5.0, 16.0, least_texture=middle)
+    _, rich = corners(image, NONE, 1000, 5.0, 16.0, min_score=middle)
     assert scores.min() < middle <= rich.min()
 
 
 def test_a_dark_image_gives_corners_once_asked_for_faint_ones():
     dark = squares([(30, 30), (90, 60)], level=8)
     assert len(corners(dark, NONE, 10)[0]) == 0
-    assert len(corners(dark, NONE, 10, 6.0, least_step=3, least_texture=0.2)[0]) == 8
+    assert len(corners(dark, NONE, 10, 6.0, fast_threshold=3, min_score=0.2)[0]) == 8
 
 
 @pytest.mark.parametrize("level", [0, 128, 255])
 def test_a_flat_image_has_none(level):
-    px, scores = corners(np.full((100, 101), level, np.uint8), NONE, 10, least_texture=0.0)
+    px, scores = corners(np.full((100, 101), level, np.uint8), NONE, 10, min_score=0.0)
     assert px.shape == (0, 2) and scores.shape == (0,)
 
 

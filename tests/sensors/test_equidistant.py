@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rbpf.errors import InputError
-from rbpf.sensors.camera_points import GRAZING
-from rbpf.sensors.equidistant import WIDEST, Equidistant
+from rbpf.sensors.camera_points import MIN_DEPTH_FRACTION
+from rbpf.sensors.equidistant import MAX_ANGLE, Equidistant
 from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
 from tests.sensors.test_pinhole import FISHEYES, matrix, seen_points
 
@@ -61,26 +61,29 @@ def test_it_sees_75_degrees_from_the_axis_and_no_more():
     assert not camera.visible(beyond).any()
     assert np.isfinite(camera.unproject(camera.project(near))).all()
     assert np.isnan(camera.unproject(camera.project(beyond[:3]))).all()
-    # The models of landmarks hold the depth positive from `GRAZING` on: there no pixel may still be taken for it.
-    assert np.cos(WIDEST) > GRAZING
+    # The models of landmarks hold the depth positive from `MIN_DEPTH_FRACTION` on: there no pixel may still be taken for it.
+    assert np.cos(MAX_ANGLE) > MIN_DEPTH_FRACTION
 
 
 def test_the_circle_in_which_it_sees():
     camera = FISHEYES["tum-vi"]
     rows, columns = np.mgrid[:512, :512]
     seen = np.isfinite(camera.unproject(np.stack([columns, rows], axis=-1).astype(float)))[..., 0]
-    np.testing.assert_array_equal(camera.circle(0.0), seen)
-    px = np.argwhere(camera.circle(16.0))[:, ::-1]
+    np.testing.assert_array_equal(camera.field_of_view_mask(0.0), seen)
+    px = np.argwhere(camera.field_of_view_mask(16.0))[:, ::-1]
     for corner in np.array([[-11.0, -11.0], [-11.0, 11.0], [11.0, -11.0], [11.0, 11.0]]):
         assert np.isfinite(camera.unproject(px + corner)).all()
-    assert replace(camera, width=300, height=300, cx=150.0, cy=150.0).circle(16.0) is None
-    assert Pinhole(640, 480, 320.0, 320.0, 320.0, 240.0, (-0.25, 0.0, 0.0, 0.0, 0.0)).circle(16.0) is None
+    assert replace(camera, width=300, height=300, cx=150.0, cy=150.0).field_of_view_mask(16.0) is None
+    assert (
+        Pinhole(640, 480, 320.0, 320.0, 320.0, 240.0, (-0.25, 0.0, 0.0, 0.0, 0.0)).field_of_view_mask(16.0)
+        is None
+    )
 
 
 def test_a_lens_that_folds_back_is_seen_up_to_there():
     lens = Equidistant(FOLDING)
     fold = np.sqrt(1.0 / 0.9)
-    assert lens.widest == pytest.approx(fold, rel=1e-14)
+    assert lens.max_angle == pytest.approx(fold, rel=1e-14)
     camera = Pinhole(900, 900, 262.0, 262.0, 450.0, 450.0, FOLDING, "equidistant")
     assert camera.visible(ray(fold - 1e-6)) and not camera.visible(ray(fold + 1e-6))
     reach = 262.0 * fold * (1.0 - 0.3 * fold**2)
@@ -95,7 +98,7 @@ def test_a_lens_that_folds_back_is_seen_up_to_there():
 )
 def test_it_rises_up_to_the_widest_angle(coefficients):
     lens = Equidistant(coefficients)
-    angle = np.linspace(0.0, lens.widest * (1.0 - 1e-6), 2001)
+    angle = np.linspace(0.0, lens.max_angle * (1.0 - 1e-6), 2001)
     reach = lens.distort(np.stack([np.tan(angle), np.zeros_like(angle)], axis=-1))[:, 0]
     assert (np.diff(reach) > 0.0).all()
 
@@ -108,10 +111,10 @@ def test_it_rises_up_to_the_widest_angle(coefficients):
 def test_every_visible_direction_comes_back(coefficients, fraction, around):
     lens = Equidistant(coefficients)
     camera = Pinhole(8000, 8000, 262.0, 262.0, 4000.0, 4000.0, coefficients, "equidistant")
-    seen = ray(fraction * lens.widest, around)
+    seen = ray(fraction * lens.max_angle, around)
     assert camera.visible(seen)
     again = np.append(camera.unproject(camera.project(seen)), 1.0)
-    least = np.linalg.svd(camera.slope(again)[:, :2], compute_uv=False)[-1] / camera.fx
+    least = np.linalg.svd(camera.jacobian(again)[:, :2], compute_uv=False)[-1] / camera.fx
     np.testing.assert_allclose(again, seen / seen[2], rtol=0, atol=1e-11 / least)
 
 

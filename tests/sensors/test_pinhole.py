@@ -85,7 +85,7 @@ class TestPinholeAgainstOpenCV:
             points[:, None], np.zeros(3), np.zeros(3), matrix(camera), np.array(camera.distortion)
         )
         expected = jac[:, 3:6].reshape(-1, 2, 3)
-        np.testing.assert_allclose(camera.slope(points), expected, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(camera.jacobian(points), expected, rtol=1e-9, atol=1e-9)
 
     @PINHOLES
     def test_unprojects_as_opencv(self, camera):
@@ -109,7 +109,7 @@ class TestPinhole:
         points = seen_points(camera)
         numeric = numeric_slope(camera.project, points, 1e-3 * points[:, 2])
         scale = camera.fx / points[:, 2, None, None]
-        np.testing.assert_allclose(camera.slope(points) / scale, numeric / scale, rtol=0, atol=1e-8)
+        np.testing.assert_allclose(camera.jacobian(points) / scale, numeric / scale, rtol=0, atol=1e-8)
 
     @every_camera
     def test_slope_at_the_border(self, camera):
@@ -117,14 +117,14 @@ class TestPinhole:
         uv = uv[np.isfinite(uv[:, 0])]
         rays = np.concatenate([uv, np.ones((len(uv), 1))], axis=1)
         numeric = numeric_slope(camera.project, rays, np.full(len(rays), 1e-3))
-        np.testing.assert_allclose(camera.slope(rays) / camera.fx, numeric / camera.fx, rtol=0, atol=1e-8)
+        np.testing.assert_allclose(camera.jacobian(rays) / camera.fx, numeric / camera.fx, rtol=0, atol=1e-8)
 
     @every_camera
     def test_on_the_axis(self, camera):
         point = np.array([0.0, 0.0, 4.0])
         np.testing.assert_array_equal(camera.project(point), [camera.cx, camera.cy])
         expected = [[camera.fx / 4.0, 0.0, 0.0], [0.0, camera.fy / 4.0, 0.0]]
-        np.testing.assert_allclose(camera.slope(point), expected, rtol=1e-15)
+        np.testing.assert_allclose(camera.jacobian(point), expected, rtol=1e-15)
         np.testing.assert_array_equal(camera.unproject(np.array([camera.cx, camera.cy])), [0.0, 0.0])
 
     @every_camera
@@ -132,10 +132,10 @@ class TestPinhole:
     def test_only_the_direction_counts(self, camera, scale):
         points = seen_points(camera)
         np.testing.assert_allclose(camera.project(scale * points), camera.project(points), rtol=0, atol=1e-9)
-        along = (camera.slope(points) @ points[..., None])[..., 0]
+        along = (camera.jacobian(points) @ points[..., None])[..., 0]
         np.testing.assert_allclose(along / camera.fx, 0.0, atol=1e-13)
         np.testing.assert_allclose(
-            camera.slope(scale * points) * scale, camera.slope(points), rtol=1e-9, atol=1e-9
+            camera.jacobian(scale * points) * scale, camera.jacobian(points), rtol=1e-9, atol=1e-9
         )
         np.testing.assert_array_equal(camera.visible(scale * points), camera.visible(points))
 
@@ -166,25 +166,25 @@ class TestPinhole:
         np.testing.assert_allclose(camera.project(rays)[solved], px[solved], rtol=0, atol=1e-9)
 
     @every_camera
-    def test_unproject_slope_is_the_derivative_and_the_inverse(self, camera):
+    def test_unproject_jacobian_is_the_derivative_and_the_inverse(self, camera):
         px = camera.project(seen_points(camera))
         uv = camera.unproject(px)
         inner = np.hypot(*uv.T) < 0.8 * camera.monotonic_radius
         px, uv = px[inner], uv[inner]
-        slope = camera.unproject_slope(px)
+        slope = camera.unproject_jacobian(px)
         numeric = numeric_slope(camera.unproject, px, np.full(len(px), 0.05))
         np.testing.assert_allclose(slope * camera.fx, numeric * camera.fx, rtol=1e-7, atol=1e-7)
         rays = np.concatenate([uv, np.ones((len(uv), 1))], axis=1)
-        both = camera.slope(rays)[..., :2] @ slope
+        both = camera.jacobian(rays)[..., :2] @ slope
         np.testing.assert_allclose(both, np.broadcast_to(np.eye(2), both.shape), rtol=0, atol=1e-9)
 
     def test_batch_and_single_agree(self):
         camera, points = CAMERAS["wide"], seen_points(CAMERAS["wide"])[:24].reshape(2, 3, 4, 3)
         single = points[1, 2, 3]
-        for function in (camera.project, camera.slope, camera.visible):
+        for function in (camera.project, camera.jacobian, camera.visible):
             np.testing.assert_array_equal(function(points)[1, 2, 3], function(single))
         px = camera.project(points)
-        for function in (camera.unproject, camera.unproject_slope, camera.inside):
+        for function in (camera.unproject, camera.unproject_jacobian, camera.inside):
             np.testing.assert_array_equal(function(px)[1, 2, 3], function(px[1, 2, 3]))
         assert camera.unproject(np.empty((0, 2))).shape == (0, 2)
         assert camera.visible(np.empty((0, 3))).shape == (0,)

@@ -43,7 +43,7 @@ def test_a_point_beyond_a_second_fold_is_not_visible():
     camera = Pinhole(640, 480, 320.0, 320.0, 320.0, 240.0, (-0.5, 0.1, 0.0, 0.0, 0.0))
     ray = np.array([1.6, 0.0, 1.0])
     assert camera.monotonic_radius == pytest.approx(1.0, rel=1e-14)
-    assert camera.slope(ray)[0, 0] > 0.0
+    assert camera.jacobian(ray)[0, 0] > 0.0
     assert camera.inside(camera.project(ray))
     assert not camera.visible(ray)
     # It lands beyond the pixel of the first fold, 512, which no direction within the radius exceeds.
@@ -65,7 +65,7 @@ def test_pixels_beyond_the_fold_have_no_direction():
     px[:, 1] = FOLDING.cy
     finite = np.isfinite(FOLDING.unproject(px[1:]))
     np.testing.assert_array_equal(finite, [[True, True], [True, True], [False, False], [False, False]])
-    np.testing.assert_array_equal(np.isfinite(FOLDING.unproject_slope(px[1:]))[:, 0, 0], finite[:, 0])
+    np.testing.assert_array_equal(np.isfinite(FOLDING.unproject_jacobian(px[1:]))[:, 0, 0], finite[:, 0])
     assert np.isnan(FOLDING.unproject(np.array([[np.nan, 1.0], [np.inf, 1.0]]))).all()
 
 
@@ -93,5 +93,5 @@ def test_every_visible_direction_comes_back(k1, k2, k3, tangential, fraction, an
     if camera.visible(ray):
         again = np.append(camera.unproject(camera.project(ray)), 1.0)
         np.testing.assert_allclose(camera.project(again), camera.project(ray), rtol=0, atol=1e-8)
-        least = np.linalg.svd(camera.slope(ray), compute_uv=False)[-1] / camera.fx
+        least = np.linalg.svd(camera.jacobian(ray), compute_uv=False)[-1] / camera.fx
         np.testing.assert_allclose(again, ray, rtol=0, atol=1e-11 / least)

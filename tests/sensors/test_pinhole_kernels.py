@@ -37,7 +37,7 @@ def test_pixels_and_slope_equal_numpys(distortion):
     points[1:5, :2] = points[1:5, 2:] * np.array([[1e-9, 0.0], [-2e-8, 1e-8], [3.6, 0.5], [1e-200, 0.0]])
     out = project_all(points, camera.params)
     np.testing.assert_allclose(out[:, :2], camera.project(points), rtol=1e-12, atol=1e-12 * camera.fx)
-    slope, scale = camera.slope(points), camera.fx / np.abs(points[:, 2, None, None])
+    slope, scale = camera.jacobian(points), camera.fx / np.abs(points[:, 2, None, None])
     np.testing.assert_allclose(out[:, 2:].reshape(-1, 2, 3) / scale, slope / scale, rtol=1e-12, atol=1e-12)
 
 

@@ -26,16 +26,16 @@ class TestRectifiedStereo:
         step = 1e-4 * np.eye(3)[:, None]
         numeric = (STEREO.project(self.points + step) - STEREO.project(self.points - step)) / 2e-4
         numeric = np.moveaxis(numeric, 0, -1)
-        np.testing.assert_allclose(STEREO.slope(self.points), numeric, rtol=0, atol=1e-5)
+        np.testing.assert_allclose(STEREO.jacobian(self.points), numeric, rtol=0, atol=1e-5)
 
     def test_round_trip(self):
-        np.testing.assert_allclose(STEREO.locate(STEREO.project(self.points)), self.points, rtol=1e-10)
+        np.testing.assert_allclose(STEREO.triangulate(STEREO.project(self.points)), self.points, rtol=1e-10)
         z = np.array([[[400.0, 100.0, 380.0], [20.0, 470.0, 19.0]]])
-        np.testing.assert_allclose(STEREO.project(STEREO.locate(z)), z, rtol=1e-12)
+        np.testing.assert_allclose(STEREO.project(STEREO.triangulate(z)), z, rtol=1e-12)
 
     def test_no_point_without_disparity(self):
         z = np.array([[100.0, 100.0, 100.0], [100.0, 100.0, 101.0], [101.0, 100.0, 100.0]])
-        np.testing.assert_array_equal(np.isfinite(STEREO.locate(z)).all(axis=1), [False, False, True])
+        np.testing.assert_array_equal(np.isfinite(STEREO.triangulate(z)).all(axis=1), [False, False, True])
 
     def test_visible_in_both_images(self):
         # 0.6 m to the left at 1 m: u_left is 4.5, u_right is −58.5.

@@ -1,11 +1,11 @@
-"""Keypoints and keys."""
+"""Keypoints and descriptors."""
 
 import cv2
 import numpy as np
 import pytest
 
 from rbpf.errors import InputError
-from rbpf.sensors.sift import Sift, SiftConfig, keys_of, pooled
+from rbpf.sensors.sift import Sift, SiftConfig, descriptors_from_histograms, pooled
 from tests.sensors.stereo_scenes import room
 
 
@@ -38,7 +38,7 @@ def test_places_orientations_and_keys_turn_with_the_image():
     same = near & (np.cos(change) > np.cos(0.1))
     assert same.any(axis=1).mean() > 0.9
     k, m = np.nonzero(same)
-    assert np.median(np.einsum("cd,cd->c", first.keys[k], turned.keys[m])) > 0.99
+    assert np.median(np.einsum("cd,cd->c", first.descriptors[k], turned.descriptors[m])) > 0.99
 
 
 def test_pooling_adds_what_it_says():
@@ -55,9 +55,9 @@ def test_pooling_adds_what_it_says():
 
 
 def test_pooling_treats_a_mirror_image_alike():
-    def mirrored(keys, side, turns):
-        cells = keys.reshape(-1, side, side, turns)[:, ::-1]
-        return cells[..., -np.arange(turns) % turns].reshape(keys.shape)
+    def mirrored(descriptors, side, turns):
+        cells = descriptors.reshape(-1, side, side, turns)[:, ::-1]
+        return cells[..., -np.arange(turns) % turns].reshape(descriptors.shape)
 
     histograms = np.random.default_rng(1).random((4, 128))
     np.testing.assert_allclose(
@@ -70,7 +70,10 @@ def test_products_of_keys(length):
     histograms = np.random.default_rng(2).integers(0, 256, (6, 128)).astype(np.float32)
     plain = histograms if length == 128 else pooled(histograms)
     fractions = plain / plain.sum(axis=1, keepdims=True)
-    root, sift = keys_of(histograms, length, "root"), keys_of(histograms, length, "sift")
+    root, sift = (
+        descriptors_from_histograms(histograms, length, "root"),
+        descriptors_from_histograms(histograms, length, "sift"),
+    )
     assert root.dtype == sift.dtype == np.float32 and root.shape == (6, length)
     bhattacharyya = np.sqrt(fractions[:, None] * fractions[None]).sum(axis=2)
     np.testing.assert_allclose(root @ root.T, bhattacharyya, atol=1e-6)
@@ -79,13 +82,13 @@ def test_products_of_keys(length):
 
 
 def test_an_empty_histogram_is_no_division_by_zero():
-    assert not keys_of(np.zeros((1, 128)), 36).any()
+    assert not descriptors_from_histograms(np.zeros((1, 128)), 36).any()
 
 
 @pytest.mark.parametrize("level", [0, 128, 255])
 def test_nothing_is_found_where_nothing_is(level):
     points = Sift().detect(np.full((60, 80), level, dtype=np.uint8))
-    assert len(points) == 0 and points.px.shape == (0, 2) and points.keys.shape == (0, 36)
+    assert len(points) == 0 and points.px.shape == (0, 2) and points.descriptors.shape == (0, 36)
 
 
 def test_the_strongest_come_first_and_are_kept():
@@ -106,7 +109,7 @@ def test_threads_change_nothing():
             found.append(Sift(SiftConfig(features=100)).detect(image))
     finally:
         cv2.setNumThreads(before)
-    for name in ("px", "scale", "orientation", "contrast", "keys"):
+    for name in ("px", "scale", "orientation", "contrast", "descriptors"):
         assert getattr(found[0], name).tobytes() == getattr(found[1], name).tobytes()
 
 

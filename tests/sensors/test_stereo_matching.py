@@ -5,10 +5,10 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.sensors.key_matching import KeyMatches, MatchLimits
+from rbpf.sensors.descriptor_matching import DescriptorMatches, MatchLimits
 from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
-from rbpf.sensors.sift import KeyPoints, SiftConfig
-from rbpf.sensors.stereo_features import locate_slope, match_frames
+from rbpf.sensors.sift import Keypoints, SiftConfig
+from rbpf.sensors.stereo_features import match_frames, triangulate_jacobian
 from rbpf.sensors.stereo_matching import StereoConfig, StereoSift, one_per_place
 from tests.sensors.stereo_scenes import RIG, room, true_disparity
 
@@ -58,8 +58,8 @@ def test_the_stated_noise_covers_the_error():
 
 def test_points_and_covariances_follow_from_the_pixels():
     features = measured()
-    np.testing.assert_array_equal(features.points, RIG.locate(features.z))
-    jac = locate_slope(RIG, features.z)
+    np.testing.assert_array_equal(features.points, RIG.triangulate(features.z))
+    jac = triangulate_jacobian(RIG, features.z)
     np.testing.assert_allclose(
         features.cov_points, jac @ features.cov @ jac.swapaxes(1, 2), rtol=1e-9, atol=1e-15
     )
@@ -73,11 +73,14 @@ def test_the_jacobian_of_the_triangulation():
     z = np.array([[320.0, 100.0, 300.0], [50.0, 470.0, 47.0], [600.0, 10.0, 500.0]])
     step = 1e-4
     numeric = np.stack(
-        [(rig.locate(z + step * e) - rig.locate(z - step * e)) / (2 * step) for e in np.eye(3)], axis=-1
+        [(rig.triangulate(z + step * e) - rig.triangulate(z - step * e)) / (2 * step) for e in np.eye(3)],
+        axis=-1,
     )
-    np.testing.assert_allclose(locate_slope(rig, z), numeric, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(triangulate_jacobian(rig, z), numeric, rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(
-        locate_slope(rig, z) @ rig.slope(rig.locate(z)), np.tile(np.eye(3), (3, 1, 1)), atol=1e-9
+        triangulate_jacobian(rig, z) @ rig.jacobian(rig.triangulate(z)),
+        np.tile(np.eye(3), (3, 1, 1)),
+        atol=1e-9,
     )
 
 
@@ -123,9 +126,9 @@ def test_a_prediction_lets_only_near_ones_compete():
 def test_a_place_counts_once():
     px = np.array([[10.0, 5.0], [10.0, 5.0], [30.0, 5.0], [40.0, 5.0]])
     zeros = np.zeros(4)
-    left = KeyPoints(px, zeros + 1.0, zeros, zeros, np.zeros((4, 36), dtype=np.float32))
-    right = KeyPoints(px[[0, 3, 2, 2]], zeros + 1.0, zeros, zeros, left.keys)
-    matches = KeyMatches(np.arange(4), np.arange(4), np.array([0.2, 0.1, 0.4, 0.3]))
+    left = Keypoints(px, zeros + 1.0, zeros, zeros, np.zeros((4, 36), dtype=np.float32))
+    right = Keypoints(px[[0, 3, 2, 2]], zeros + 1.0, zeros, zeros, left.descriptors)
+    matches = DescriptorMatches(np.arange(4), np.arange(4), np.array([0.2, 0.1, 0.4, 0.3]))
     kept = one_per_place(matches, left, right)
     assert kept.first.tolist() == [1, 3] and kept.second.tolist() == [1, 3]
 
@@ -181,7 +184,9 @@ def test_sizes_that_differ():
 
 def test_the_same_pair_gives_the_same_bytes():
     first, again = measured(), measured()
-    assert first.z.tobytes() == again.z.tobytes() and first.keys.tobytes() == again.keys.tobytes()
+    assert (
+        first.z.tobytes() == again.z.tobytes() and first.descriptors.tobytes() == again.descriptors.tobytes()
+    )
 
 
 @pytest.mark.parametrize(

@@ -28,8 +28,10 @@ def test_nothing_given_is_the_default():
 
 
 def test_a_group_can_be_nothing():
-    found = load_settings(StereoConfig, "stereo", None, ["keys.distinct=0.2"], {"keys": {"distinct": None}})
-    assert found.keys.distinct is None and found.keys.patience == 3
+    found = load_settings(
+        StereoConfig, "stereo", None, ["new_landmarks.distinct=0.2"], {"new_landmarks": {"distinct": None}}
+    )
+    assert found.new_landmarks.distinct is None and found.new_landmarks.patience == 3
 
 
 def test_what_a_config_says_of_its_run_is_no_setting_of_any_system():

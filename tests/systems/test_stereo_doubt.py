@@ -43,7 +43,7 @@ def spoilt(run: StereoRun, features, fraction: float):
     rows = rng.permutation(len(features))[: int(fraction * len(features))]
     z[rows] = z[np.roll(rows, 1)]
     rig = run.front_end.rig
-    return features.measured(rig, z, features.cov, features.scale, features.orientation, features.keys)
+    return features.measured(rig, z, features.cov, features.scale, features.orientation, features.descriptors)
 
 
 def test_false_matches_do_not_agree(settled):

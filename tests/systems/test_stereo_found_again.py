@@ -119,7 +119,9 @@ def test_anywhere_in_the_map(settled):
     z, rows = features.z.copy(), rng.permutation(len(features))[: len(features) // 2]
     z[rows] = z[np.roll(rows, 1)]
     rig, belief = settled.front_end.rig, settled.filter.belief()
-    wrong = features.measured(rig, z, features.cov, features.scale, features.orientation, features.keys)
+    wrong = features.measured(
+        rig, z, features.cov, features.scale, features.orientation, features.descriptors
+    )
     for seen, least in ((features, 20), (wrong, 8)):
         place = relocalise_globally(settled.front_end.sensor, StereoFrame(seen), belief, VoConfig())
         assert place is not None and place[1] >= least
@@ -169,5 +171,5 @@ def test_a_thing_that_moves_does_not_take_it_along(fraction, texture_seed):
 def test_salt_and_pepper():
     """Said at each pair but the first, and without harm."""
     run = run_images(salt_and_pepper(0.02)(pairs(12)), CONFIG)
-    assert sum("struck by impulses" in note for note in run.notes) == 11
+    assert sum("have impulse noise" in note for note in run.notes) == 11
     assert errors_m(run).max() < RIGHT_M and not run.assumed.any()

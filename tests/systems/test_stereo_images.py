@@ -7,7 +7,7 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.sensors.key_management import KeyConfig
+from rbpf.sensors.landmark_management import NewLandmarkConfig
 from rbpf.systems.stereo.config import MapConfig, OdometryConfig, StereoConfig, TriggerConfig
 from rbpf.systems.stereo.dead_reckoning import Pixels
 from rbpf.systems.stereo.front_ends import ImageFrontEnd
@@ -44,10 +44,10 @@ def test_the_path(plain):
 
 def test_landmarks_are_found_again(plain):
     sensor = plain.front_end.sensor
-    assert (sensor.manager.promoted).sum() > 15
+    assert (sensor.manager.confirmed).sum() > 15
     assert plain.observed[3:].mean() > 10
-    config = CONFIG.keys
-    assert (~sensor.manager.promoted).sum() <= config.waiting
+    config = CONFIG.new_landmarks
+    assert (~sensor.manager.confirmed).sum() <= config.max_candidates
     ids = plain.filter.belief().map.ids
     names = [plain.filter.belief().catalogue[i] for i in ids.tolist()]
     np.testing.assert_array_equal(sorted(names), sensor.manager.names)
@@ -57,7 +57,7 @@ def test_landmarks_are_found_again(plain):
 def test_the_map_is_where_the_plane_is(plain):
     """Every landmark seen often lies on the plane, within a few of its own standard deviations."""
     belief, sensor = plain.filter.belief(), plain.front_end.sensor
-    often = sensor.manager.names[sensor.manager.sightings >= 5]
+    often = sensor.manager.names[sensor.manager.observations >= 5]
     by_name = {name: i for i, name in belief.catalogue.items()}
     records = belief.read(np.array([by_name[n] for n in often.tolist()]))
     points = SE3.transform(plain.truth.world_from_camera[0], records.mean[belief.mode])
@@ -195,12 +195,12 @@ def test_without_a_map_the_particles_follow_the_odometry():
     assert 0.0 < np.linalg.norm(off) < 5.0 * spread / np.sqrt(400)
 
 
-def test_keys_that_are_not_seen_again_leave():
+def test_candidates_that_are_not_seen_again_leave():
     """A patience of one frame: what was not seen in the last update is gone."""
-    run = run_images(pairs(COUNT), replace(CONFIG, keys=KeyConfig(patience=1)))
+    run = run_images(pairs(COUNT), replace(CONFIG, new_landmarks=NewLandmarkConfig(patience=1)))
     manager = run.front_end.sensor.manager
-    waiting = ~manager.promoted
-    assert (manager.last_seen[waiting] == manager.frame).all()
+    candidates = ~manager.confirmed
+    assert (manager.last_observed[candidates] == manager.frame).all()
     assert manager.next_name > manager.names.size
 
 

@@ -35,7 +35,7 @@ def test_the_same_run(tmp_path):
     assert len(kept.first(5)) == 5 and run_images(kept.first(5), CONFIG).stamps_ns.size == 5
     late = list(kept.frames(COUNT - 2))
     assert len(late) == 2
-    np.testing.assert_array_equal(late[1].features.keys, list(kept.frames())[-1].features.keys)
+    np.testing.assert_array_equal(late[1].features.descriptors, list(kept.frames())[-1].features.descriptors)
 
 
 def test_it_goes_on_where_it_was_interrupted(tmp_path):

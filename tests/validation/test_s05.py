@@ -61,7 +61,7 @@ def test_errors_of_maps_and_paths(scene):
 
 
 def test_rows_of_the_table_are_taken_when_they_are_due():
-    manager = SimpleNamespace(promoted=np.array([True, False, True]), next_name=9)
+    manager = SimpleNamespace(confirmed=np.array([True, False, True]), next_name=9)
     sensor = SimpleNamespace(manager=manager, names=np.zeros(0, dtype=np.int64))
     run = SimpleNamespace(
         front_end=SimpleNamespace(sensor=sensor), updated=np.zeros(6), stamps_ns=np.arange(6)

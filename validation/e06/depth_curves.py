@@ -48,7 +48,7 @@ class Passing:
         slopes = ray.jacobians(self.poses, landmark, SE3.identity()).landmark
         assert slopes is not None
         slope = slopes[..., :2].reshape(len(rho), -1, 2)
-        moved = slope @ (self.std_px * self.camera.unproject_slope(first_px[None])[0])
+        moved = slope @ (self.std_px * self.camera.unproject_jacobian(first_px[None])[0])
         cov = moved @ np.swapaxes(moved, 1, 2) + self.std_px**2 * np.eye(count)
         return Sightings(px.reshape(len(rho), -1), np.linalg.cholesky(cov))
 

@@ -115,7 +115,7 @@ def _mono_maker(z: Array, camera: Pinhole) -> Maker:
         return lambda row, model, pose, point: gtsam.GenericProjectionFactorCal3Fisheye(
             z[row], model, pose, point, fisheye
         )
-    if camera.lens.is_plain:
+    if camera.lens.is_identity:
         plain = gtsam.Cal3_S2(*intrinsics)
         return lambda row, model, pose, point: gtsam.GenericProjectionFactorCal3_S2(
             z[row], model, pose, point, plain
@@ -144,7 +144,7 @@ def evaluate_sightings(table: Sightings, path: Array, points: Array) -> Evaluati
     place = np.where(front[:, None], place, [0.0, 0.0, 1.0])
     pinhole = table.camera.camera if isinstance(table.camera, RectifiedStereo) else table.camera
     residuals = np.where(front[:, None], table.camera.project(place) - table.z, 2 * pinhole.fx)
-    slope = np.where(front[:, None, None], table.camera.slope(place), 0.0)
+    slope = np.where(front[:, None, None], table.camera.jacobian(place), 0.0)
     # c = T⁻¹ l moves by c × ω − v: the rows of the slope s turn with s · (c × ω) = (s × c) · ω.
     by_pose = np.concatenate([np.cross(slope, place[:, None]), -slope], axis=-1)
     return residuals, [by_pose, slope @ SE3.rotation(path[table.steps]).mT]

@@ -155,7 +155,7 @@ class _Growth:
     def _set(self, step: int, points: Array, found: Resected) -> None:
         # An error of the camera's place is one of the rays: as pixels at the distance of what it sees.
         self.path[step] = found.pose
-        focal = float(np.linalg.norm(self.table.camera.slope(np.array([0.0, 0.0, 1.0]))[0]))
+        focal = float(np.linalg.norm(self.table.camera.jacobian(np.array([0.0, 0.0, 1.0]))[0]))
         self.usual = self._distance(points, step)
         fraction = np.sqrt(np.trace(found.cov[3:, 3:]) / 3) / self.usual
         self.blur[step] = (focal * fraction) ** 2

@@ -1,7 +1,7 @@
 """A recording of a stereo run for the Rerun viewer (https://rerun.io), written without a screen.
 
 world/camera             the left camera's pose
-world/camera/image       its images, with features: landmarks, keys on trial, new ones, and the rest
+world/camera/image       its images, with features: landmarks, candidates, new ones, and the rest
 world/seen               where the pair's landmarks were seen
 world/path, world/odometry   the filter's path, and that of the odometry alone
 world/map                the final map with 3σ ellipsoids
@@ -54,7 +54,7 @@ def _log_pair(rr: Any, stream: Any, run: StereoRun, t: int) -> None:
     for kind, name in NAMES.items():
         pixels = rr.Points2D(seen.of(kind)[:, :2] + 0.5, colors=[COLOURS[kind]])
         stream.log(f"world/camera/image/{name.replace(' ', '_')}", pixels)
-    places = SE3.transform(at, run.front_end.rig.locate(seen.of(LANDMARK)))
+    places = SE3.transform(at, run.front_end.rig.triangulate(seen.of(LANDMARK)))
     stream.log("world/seen", rr.Points3D(places, colors=[FOUND], radii=0.005))
     for name in ("features", "agreeing", "observed"):
         stream.log(f"plots/{name}", rr.Scalars(float(getattr(run, name)[t])))

@@ -18,7 +18,7 @@ KINDS = "filter", "odometry", "wheels"
 
 
 class Row(NamedTuple):
-    """A line of Table I after so many pairs: landmarks per particle, and keys ever started."""
+    """A line of Table I after so many pairs: landmarks per particle, and candidates ever started."""
 
     pairs: int
     landmarks: int
@@ -51,7 +51,7 @@ class Record:
             seen = sensor.names >= 0
             self.sightings.append((sensor.names[seen], t, end.for_filter().features.points[seen]))
         if t + 1 in self.due or t + 1 == run.stamps_ns.size:
-            self.rows.append(Row(t + 1, int(sensor.manager.promoted.sum()), sensor.manager.next_name))
+            self.rows.append(Row(t + 1, int(sensor.manager.confirmed.sum()), sensor.manager.next_name))
         self._clock = time.process_time()
 
     def places(self, path: np.ndarray, names: np.ndarray) -> np.ndarray:
@@ -112,7 +112,7 @@ def paths_of(run: StereoRun, images: Path) -> Paths:
 def best_particle(run: StereoRun) -> Best:
     """Its map and its path, without any smoothing."""
     belief, manager = run.filter.belief(), sensor_of(run).manager
-    names = manager.names[manager.promoted]
+    names = manager.names[manager.confirmed]
     by_name = {name: landmark for landmark, name in belief.catalogue.items()}
     ids = np.array([by_name[name] for name in names.tolist()], dtype=np.int64)
     mode = belief.mode

@@ -162,7 +162,7 @@ def write_calibration(folder: Path, camera: Pinhole, baseline_m: float | None) -
         *[f"{name}: {value}" for name, value in {"fx": fx, "fy": fy, "cx": cx, "cy": cy}.items()],
         f"width: {camera.width}",
         f"height: {camera.height}",
-        f"distortion: {[float(x) for x in camera.distortion]}  # {', '.join(camera.lens.names)} (OpenCV)",
+        f"distortion: {[float(x) for x in camera.distortion]}  # {', '.join(camera.lens.coefficient_names)} (OpenCV)",
     ]
     if baseline_m is not None:
         lines.append(f"baseline_m: {float(baseline_m)}")

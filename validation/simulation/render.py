@@ -35,7 +35,7 @@ class Renderer:
         rows, columns = np.mgrid[: camera.height, : camera.width].astype(float)
         px = np.stack([columns, rows], axis=-1)
         self._uv = camera.unproject(px)
-        self._slope = np.ascontiguousarray(camera.unproject_slope(px)).reshape(*px.shape[:2], 4)
+        self._slope = np.ascontiguousarray(camera.unproject_jacobian(px)).reshape(*px.shape[:2], 4)
         self._tiles = _tile_bounds(self._uv, self._slope, raster_kernel.TILE)
         self._view = _extent(self._tiles.reshape(1, -1, 2, 2).swapaxes(2, 3).reshape(1, -1, 2))[0]
         self._sides = sides(rectangles)

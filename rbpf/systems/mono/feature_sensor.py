@@ -13,8 +13,8 @@ from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.maps.point import Point
 from rbpf.sensors.camera_constellation import ConstellationView, MembersView
 from rbpf.sensors.camera_points import CameraModel, CameraPoint, CameraRay, EpipolarRay
+from rbpf.sensors.catalogue_index import NameIndex
 from rbpf.sensors.features import FeatureFrame
-from rbpf.sensors.names import Names
 from rbpf.sensors.pinhole import Pinhole
 from rbpf.systems.mono.config import InverseDepthConfig
 from rbpf.systems.mono.known_start import KnownStart
@@ -64,7 +64,7 @@ class FeatureSensor(Sensor):
         self.ray = CameraRay(camera, rho)
         self.epipolar = EpipolarRay(camera, rho, rays.epipolar_parallax_px)
         self.inverse_depth = InverseDepth(rays.promote_std_ratio)
-        self._names = Names()
+        self._names = NameIndex()
         self._start = start
         self._place = {} if start is None else {name: m for m, name in enumerate(start.points.names.tolist())}
 
@@ -174,7 +174,7 @@ class FeatureSensor(Sensor):
                     np.pad(model.in_world(records.mean[0], const)[0], ((0, 0), (0, 1)), constant_values=1.0)
                 )
             else:
-                x, w = model.place(records.mean[0], const)
+                x, w = model.world_point(records.mean[0], const)
                 out.append(np.concatenate([x, w], axis=-1))
         return np.concatenate(which), np.concatenate(out)
 
@@ -192,7 +192,7 @@ class FeatureSensor(Sensor):
     def first_places(self, world_from_camera: np.ndarray, px: np.ndarray, ray: CameraRay) -> np.ndarray:
         """Homogeneous points (k, 4) of rays that start at px (k, 2) from a camera (7,)."""
         records = ray.initialise(world_from_camera[None], px, np.zeros((px.shape[0], 2, 2)))
-        x, w = self.ray.place(records.mean[0], records.const[0] if records.const is not None else None)
+        x, w = self.ray.world_point(records.mean[0], records.const[0] if records.const is not None else None)
         return np.concatenate([x, w], axis=-1)
 
     def forget(self, belief: Belief, names: np.ndarray) -> None:

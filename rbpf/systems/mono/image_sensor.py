@@ -46,7 +46,7 @@ class ImageSensor(Sensor):
         self.searched = Searched.nothing()
         self.measured = self._features(0, np.zeros(0, dtype=np.int64), np.zeros((0, 2)))
         self.bad_frames = 0
-        self._within = self.camera.circle(SOURCE_HALF_PX + 1.0)
+        self._within = self.camera.field_of_view_mask(SOURCE_HALF_PX + 1.0)
         self._given: np.ndarray | None = None
         self.recognised = False
         """Whether the prediction of a lost camera is a place that was recognised beyond doubt."""
@@ -241,7 +241,7 @@ class ImageSensor(Sensor):
             return measured
         occupied = np.concatenate([measured.z, self.search.in_view])
         px, _ = corners(
-            frame.image, occupied, room, config.spacing_px, SOURCE_HALF_PX + 1.0, within=self._within
+            frame.image, occupied, room, config.spacing_px, SOURCE_HALF_PX + 1.0, mask=self._within
         )
         px = px[np.isfinite(self.camera.unproject(px)).all(axis=1)]
         if not px.shape[0]:

@@ -12,7 +12,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.maps.constellation import LEAST, Constellation, UncertainConstellation, by_frame
 from rbpf.sensors.camera_points import CameraPoint
-from rbpf.sensors.corners import texture
+from rbpf.sensors.corners import corner_score
 from rbpf.sensors.features import FeatureFrame, KnownPoints
 from rbpf.sensors.pinhole import Pinhole
 from rbpf.sensors.readers.images import KnownPixels
@@ -138,9 +138,9 @@ def first_records(
     points = start.points
     exact = not points.cov.any()
     fit = _FirstImage(camera, start, cov_frame, exact)
-    x = least_squares(fit.residual, np.zeros(fit.size), fit.slope, method="lm").x
+    x = least_squares(fit.residual, np.zeros(fit.size), fit.jacobian, method="lm").x
     pose, local = fit.split(x)
-    half = np.linalg.pinv(fit.slope(x))
+    half = np.linalg.pinv(fit.jacobian(x))
     frame = SE3.inverse(pose)
     half[:6] = -SE3.adjoint(pose) @ SE3.right_jacobian(x[:6]) @ half[:6]  # in the frame's own right chart
     if exact:
@@ -177,7 +177,7 @@ class _FirstImage:
         seen = gaussian.solve_lower(self._chol_px, nu).ravel()
         return np.concatenate([seen, gaussian.solve_lower(self._chol_prior, -x)])
 
-    def slope(self, x: np.ndarray) -> np.ndarray:
+    def jacobian(self, x: np.ndarray) -> np.ndarray:
         """Its derivative by x."""
         pose, local = self.split(x)
         by_pose, by_point, _ = self.model.jacobians(pose, local[self.start.rows])
@@ -200,7 +200,7 @@ def require_texture(image: np.ndarray, known: KnownPixels) -> None:
     Raises:
         InputError: there is nothing to recognise at a point.
     """
-    score = texture(image, known.px)
+    score = corner_score(image, known.px)
     worst = int(np.argmin(score))
     if score[worst] < LEAST_TEXTURE:
         u, v = known.px[worst]

@@ -56,8 +56,8 @@ class LastView:
         self.camera = camera
         self.world_from_camera = world_from_camera
         border_px = max(border_px, SOURCE_HALF_PX + 1.0)
-        within = camera.circle(border_px)
-        px, _ = corners(image, np.zeros((0, 2)), count, spacing_px, border_px, within=within)
+        within = camera.field_of_view_mask(border_px)
+        px, _ = corners(image, np.zeros((0, 2)), count, spacing_px, border_px, mask=within)
         uv = camera.unproject(px)
         known = np.isfinite(uv).all(axis=1)
         self.windows = np.array([cut(image, place, SOURCE_HALF_PX) for place in px[known]])

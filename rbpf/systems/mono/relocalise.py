@@ -115,9 +115,9 @@ class Relocaliser:
         self.attempt = Attempt(rows.size)
         if rows.size < (config.min_inliers if last is None else config.min_inliers_with_last_view):
             return None
-        within = camera.circle(BORDER_PX)
+        within = camera.field_of_view_mask(BORDER_PX)
         px, _ = corners(
-            image, np.zeros((0, 2)), config.max_corners, config.spacing_px, BORDER_PX, within=within
+            image, np.zeros((0, 2)), config.max_corners, config.spacing_px, BORDER_PX, mask=within
         )
         self.attempt = replace(self.attempt, places=px.shape[0])
         if px.shape[0] < config.min_inliers:

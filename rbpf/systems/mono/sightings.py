@@ -8,8 +8,8 @@ import numpy as np
 from rbpf.core.anchoring import Anchored
 from rbpf.core.belief import Belief
 from rbpf.core.filter import Filter
+from rbpf.sensors.catalogue_index import NameIndex
 from rbpf.sensors.features import FeatureFrame
-from rbpf.sensors.names import Names
 from rbpf.systems.mono.feature_sensor import FeatureSensor
 from rbpf.systems.mono.image_sensor import ImageSensor
 from rbpf.systems.mono.viewing import directions
@@ -63,7 +63,7 @@ class Sightings:
 
     def __init__(self, given: int = 0) -> None:
         self.frames: list[Sighting] = []
-        self._names = Names()
+        self._names = NameIndex()
         self._given = self._started = given
 
     def record(self, sensor: ImageSensor, filter_: Filter, world: Anchored | None) -> None:

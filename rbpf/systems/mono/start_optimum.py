@@ -17,7 +17,7 @@ import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, cholesky, solve_triangular
 
 from rbpf.lie import SE3
-from rbpf.sensors.camera_points import forward
+from rbpf.sensors.camera_points import clamp_depth
 from rbpf.sensors.pinhole import Pinhole
 from rbpf.systems.mono.consensus import SCALE
 
@@ -167,7 +167,7 @@ class Linearised:
         pose, feature = at.path[seen.frame], seen.feature
         position = SE3.translation(pose)
         place = at.direction[feature] + (1.0 - at.inverse[feature, None]) * position
-        self._direction = forward(SE3.inverse_transform(pose, place))
+        self._direction = clamp_depth(SE3.inverse_transform(pose, place))
         self.misfit = (seen.px - seen.camera.project(self._direction)) / seen.noise_px
         squared = np.square(self.misfit).sum(axis=1) / SCALE**2
         self.weight = 1.0 / (1.0 + squared)
@@ -217,7 +217,7 @@ class Linearised:
         """Derivatives of what should be seen by the pose (K, 2, 6) and the feature (K, 2, 3)."""
         seen, at, direction = self.seen, self.at, self._direction
         pose, inverse = at.path[seen.frame], at.inverse[seen.feature, None, None]
-        slope = seen.camera.slope(direction) / seen.noise_px
+        slope = seen.camera.jacobian(direction) / seen.noise_px
         by_pose = np.concatenate([np.cross(slope, direction[:, None, :]), -inverse * slope], axis=2)
         turned = slope @ np.swapaxes(SE3.rotation(pose), 1, 2)
         along = turned @ tangents(at.direction)[seen.feature]

@@ -6,8 +6,8 @@ from typing import ClassVar, Literal
 from rbpf.errors import InputError
 from rbpf.motion.stereo_odometer import Prediction
 from rbpf.motion.stereo_vo import VoConfig
-from rbpf.sensors.key_management import KeyConfig
-from rbpf.sensors.key_matching import MatchLimits
+from rbpf.sensors.descriptor_matching import MatchLimits
+from rbpf.sensors.landmark_management import NewLandmarkConfig
 from rbpf.sensors.sift import SiftConfig
 from rbpf.sensors.stereo_matching import StereoConfig as PairConfig
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig, ResamplingConfig
@@ -23,7 +23,7 @@ class OdometryConfig:
     Attributes:
         estimate: how a motion is estimated from matches.
         prediction: what is expected before anything is seen, and assumed where nothing is.
-        limits: of the keys of two pairs.
+        limits: of the descriptors of two pairs.
         std_added_rad: injected per update (S05 §V), standard deviation of the turn about each axis.
         std_added_m: likewise of the shift along each axis.
         split: S05 uses each feature twice, for the odometry and for the map ("none"). To measure what that does, the
@@ -45,8 +45,8 @@ class MapConfig:
 
     Attributes:
         used: whether there is a map; without one the filter is the odometry and its noise.
-        weigh: whether keys that are no landmarks yet weigh the particles, too; in the map they are in any case.
-        limits: of the keys of a feature and a landmark.
+        weigh: whether candidates, no landmarks yet, weigh the particles, too; in the map they are in any case.
+        limits: of the descriptors of a feature and a landmark.
         gate: largest squared Mahalanobis distance from where the particles expect the landmark; 11.3 holds 99 %.
         slack_px: added to that expectation, standard deviation per axis.
         subsample: particles, drawn evenly from the weight, that say where a landmark is expected.
@@ -148,12 +148,14 @@ class StereoConfig:
         odometry: motion from pair to pair.
         trigger: when the filter is updated.
         map: which features are landmarks.
-        keys: which features become landmarks, and how long they stay.
+        new_landmarks: which features become landmarks, and how long they stay.
         likelihood: of a landmark's innovation, S05 (6) by default.
         proposal: where particles are sampled.
         recovery: what is done after a motion that was only assumed.
         resampling: when and how.
     """
+
+    RENAMED: ClassVar[dict[str, str]] = {"keys": "new_landmarks"}
 
     particles: int = 400
     seed: int = 0
@@ -166,7 +168,7 @@ class StereoConfig:
     odometry: OdometryConfig = field(default_factory=OdometryConfig)
     trigger: TriggerConfig = field(default_factory=TriggerConfig)
     map: MapConfig = field(default_factory=MapConfig)
-    keys: KeyConfig = field(default_factory=KeyConfig)
+    new_landmarks: NewLandmarkConfig = field(default_factory=NewLandmarkConfig)
     likelihood: LikelihoodConfig = field(
         default_factory=lambda: LikelihoodConfig("truncated", outlier_volume=OUTLIER_VOLUME_PX3)
     )

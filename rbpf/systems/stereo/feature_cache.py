@@ -26,7 +26,7 @@ from rbpf.systems.stereo.config import StereoConfig
 CHUNK = 100
 """Pairs in a file."""
 
-KEPT = ("z", "cov", "scale", "orientation", "keys")
+KEPT = ("z", "cov", "scale", "orientation", "descriptors")
 """What the rest of `StereoFeatures` follows from."""
 
 
@@ -137,11 +137,11 @@ def _claim(folder: Path, sequence: StereoSequence, config: StereoConfig) -> None
 
 
 def _write(folder: Path, first: int, pairs: list[CachedPair], length: int) -> None:
-    empty = {"z": (0, 3), "cov": (0, 3, 3), "scale": (0,), "orientation": (0,), "keys": (0, length)}
+    empty = {"z": (0, 3), "cov": (0, 3, 3), "scale": (0,), "orientation": (0,), "descriptors": (0, length)}
     arrays = {
         name: np.concatenate(
             [
-                np.zeros(shape, dtype=np.float32 if name == "keys" else float),
+                np.zeros(shape, dtype=np.float32 if name == "descriptors" else float),
                 *(getattr(pair.features, name) for pair in pairs if pair.features is not None),
             ]
         )

@@ -128,7 +128,9 @@ class ImageFrontEnd(FrontEnd):
         self.config = config
         self.sift = StereoSift(rig, config.sift, config.pair)
         likelihood = config.likelihood.build()
-        self.sensor: StereoSensor = StereoSensor(rig, config.map, config.keys, config.sift.length, likelihood)
+        self.sensor: StereoSensor = StereoSensor(
+            rig, config.map, config.new_landmarks, config.sift.length, likelihood
+        )
         nothing = np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0), np.zeros(0)
         self._none = StereoFeatures.measured(
             rig, *nothing, np.zeros((0, config.sift.length), dtype=np.float32)
@@ -156,12 +158,12 @@ class ImageFrontEnd(FrontEnd):
         return relocalise_globally(self.sensor, frame, belief, least)
 
     def matches(self) -> Pixels:
-        """By their keys."""
+        """By their descriptors."""
         found = match_frames(self._kept, self._now, self.config.odometry.limits)
         if self.config.odometry.split != "none":
             found = found.take(
-                split_by_descriptor(self._kept.keys)[found.first]
-                & split_by_descriptor(self._now.keys)[found.second]
+                split_by_descriptor(self._kept.descriptors)[found.first]
+                & split_by_descriptor(self._now.descriptors)[found.second]
             )
         before, now = self._kept.take(found.first), self._now.take(found.second)
         self.segmentation.match(found.first, found.second)
@@ -174,7 +176,7 @@ class ImageFrontEnd(FrontEnd):
         """All features that stand still, or the half of them that is the map's."""
         split, free = self.config.odometry.split, np.ones(len(self._now), dtype=bool)
         if split != "none":
-            half = split_by_descriptor(self._now.keys)
+            half = split_by_descriptor(self._now.descriptors)
             free = ~half if split == "apart" else half
         free[self.segmentation.moving] = False
         return StereoFrame(self._now, free, doubt)
@@ -185,7 +187,7 @@ class ImageFrontEnd(FrontEnd):
         return self.sensor.proven().size if self.config.map.used else 0
 
     def recognised(self, belief: Belief) -> int:
-        """By their keys, as many as agree on one motion."""
+        """By their descriptors, as many as agree on one motion."""
         if not self.config.map.used:
             return 0
         return int((self.sensor.matched(self.for_filter(doubt=True), belief) >= 0).sum())
@@ -213,19 +215,19 @@ class ImageFrontEnd(FrontEnd):
 
     def arrays(self) -> dict[str, np.ndarray]:
         kept = self._kept
-        names = ("z", "cov", "scale", "orientation", "keys")
+        names = ("z", "cov", "scale", "orientation", "descriptors")
         pair = {f"pair/{name}": getattr(kept, name) for name in names}
         return pair | self.segmentation.arrays() | self.sensor.arrays() | self.tracks.arrays()
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        names = ("z", "cov", "scale", "orientation", "keys")
+        names = ("z", "cov", "scale", "orientation", "descriptors")
         self._kept = StereoFeatures.measured(self.rig, *(arrays[f"pair/{name}"].copy() for name in names))
         self.segmentation.restore(arrays, len(self._kept))
         self.sensor.restore(arrays)
         self.tracks.restore(arrays)
 
 
-def split_by_descriptor(keys: np.ndarray) -> np.ndarray:
-    """A lot (K,) that falls alike whenever a feature is seen: whether the key's first rows outweigh its last ones."""
-    side = keys.shape[1] // 3
-    return np.asarray(keys[:, :side].sum(axis=1) > keys[:, -side:].sum(axis=1))
+def split_by_descriptor(descriptors: np.ndarray) -> np.ndarray:
+    """A lot (K,) that falls alike whenever a feature is seen: whether the descriptor's first rows outweigh its last ones."""
+    side = descriptors.shape[1] // 3
+    return np.asarray(descriptors[:, :side].sum(axis=1) > descriptors[:, -side:].sum(axis=1))

@@ -1,6 +1,6 @@
-"""Where in its whole map a stereo camera is, by the keys of what it sees: without a prediction.
+"""Where in its whole map a stereo camera is, by the descriptors of what it sees: without a prediction.
 
-Keys alone mistake some features, so that the matches must agree on one place. The consensus is that of visual odometry;
+Descriptors alone mistake some features, so that the matches must agree on one place. The consensus is that of visual odometry;
 the map takes the place of the earlier pair, as a camera would see it that stands far enough back to have all matched
 landmarks before it.
 """
@@ -20,7 +20,7 @@ def relocalise_globally(
     """The place, in the world of the heaviest particle.
 
     Args:
-        sensor: whose keys they are.
+        sensor: whose descriptors they are.
         frame: the pair.
         belief: where the landmarks are.
         config: of the consensus; `least_matches` are needed.
@@ -29,7 +29,7 @@ def relocalise_globally(
         world_from_camera (7,) and the number of landmarks that agree; None where too few do.
     """
     free = np.arange(len(frame.features)) if frame.free is None else np.flatnonzero(frame.free)
-    names = sensor.index.match(frame.features.keys[free]).ids
+    names = sensor.index.match(frame.features.descriptors[free]).ids
     known = np.isin(names, sensor.proven())
     features, names = frame.features.take(free[known]), names[known]
     if names.size < config.least_matches:
@@ -41,7 +41,7 @@ def relocalise_globally(
     world_from_view = SE3.identity()
     world_from_view[4:] = middle - [0.0, 0.0, 2.0 * far]
     local = SE3.inverse_transform(world_from_view, place)
-    slope = sensor.model.rig.slope(local)
+    slope = sensor.model.rig.jacobian(local)
     seen = gaussian.symmetrise(slope @ cov @ slope.mT) + TINY * np.eye(3)
     z, rng = sensor.model.rig.project(local), np.random.default_rng(sensor.manager.frame)
     found = estimate_motion(sensor.model.rig, z, features.z, seen, features.cov, rng, config=config)

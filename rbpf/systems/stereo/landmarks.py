@@ -15,7 +15,7 @@ SIGMAS = 3.0
 
 @dataclass
 class _Rows:
-    """One row per key ever started, which is its name.
+    """One row per landmark or candidate ever started, which is its name.
 
     Attributes:
         place: (F, 3) in the world of the heaviest particle, when it was seen last.

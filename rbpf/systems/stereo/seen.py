@@ -7,7 +7,7 @@ from typing import final
 import numpy as np
 
 FEATURE, LANDMARK, TRIAL, NEW = range(4)
-"""What a feature is: nothing to the map, a landmark that weighed the particles, a key on trial, a key that was
+"""What a feature is: nothing to the map, a landmark that weighed the particles, a candidate, a candidate that was
 started."""
 
 

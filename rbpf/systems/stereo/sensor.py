@@ -1,8 +1,8 @@
 """The map's landmarks in the features of a stereo pair, and new ones (S05 §III-B, §V).
 
-A landmark competes for a feature if it may be in view, its key is like the feature's, and the particles expect it
+A landmark competes for a feature if it may be in view, its descriptor is like the feature's, and the particles expect it
 there. Each feature is then one landmark's, the same for all particles, or has none: a null correspondence, which costs
-all particles the same. Keys that have not been seen often enough to be landmarks are in the map, where they follow
+all particles the same. Candidates, not seen often enough to be landmarks yet, are in the map, where they follow
 each particle's path, without a say in the particles' weights.
 """
 
@@ -19,9 +19,9 @@ from rbpf.core.exchange import NULL
 from rbpf.core.models import Likelihood, NewLandmarks, Observations, Part, Sensor
 from rbpf.maps.point import Point
 from rbpf.motion.stereo_vo import VoConfig, estimate_motion
-from rbpf.sensors.key_index import Gate, KeyIndex
-from rbpf.sensors.key_management import KeyConfig, KeyManager
-from rbpf.sensors.names import Numbers
+from rbpf.sensors.catalogue_index import NumberIndex
+from rbpf.sensors.descriptor_index import DescriptorIndex, Gate
+from rbpf.sensors.landmark_management import LandmarkManager, NewLandmarkConfig
 from rbpf.sensors.pinhole import RectifiedStereo
 from rbpf.sensors.stereo_features import StereoFeatures
 from rbpf.sensors.stereo_points import StereoPoint
@@ -33,7 +33,7 @@ from rbpf.systems.stereo.seen import FEATURE, LANDMARK, NEW, TRIAL
 _MAP = frozenset({Part.LANDMARK})
 
 PROVEN = 2
-"""Sightings of a key that stands still: one that moves is not where it was seen first."""
+"""Observations of a landmark that stands still: one that moves is not where it was seen first."""
 
 TINY = 1e-6
 """Added to the variance of expected pixels, px²: a landmark may be known exactly."""
@@ -46,8 +46,8 @@ class StereoFrame:
     Attributes:
         features: of the pair.
         free: (K,) which of them the map may use; None is all.
-        doubt: the camera's motion was only assumed: matches with the map must agree on one motion, of keys that were
-            found again before, and no keys are started.
+        doubt: the camera's motion was only assumed: matches with the map must agree on one motion, of landmarks that were
+            found again before, and no new landmarks are started.
     """
 
     features: StereoFeatures
@@ -57,34 +57,39 @@ class StereoFrame:
 
 @final
 class StereoSensor(Sensor):
-    """Finds landmarks by their keys, and manages which keys there are.
+    """Finds landmarks by their descriptors, starts candidates, and drops those that are not seen again.
 
     Args:
         rig: the cameras.
         config: how landmarks are matched.
-        keys: which features become landmarks.
-        length: of a key.
+        new_landmarks: which features become landmarks.
+        length: of a descriptor.
         likelihood: of an innovation.
     """
 
     def __init__(
-        self, rig: RectifiedStereo, config: MapConfig, keys: KeyConfig, length: int, likelihood: Likelihood
+        self,
+        rig: RectifiedStereo,
+        config: MapConfig,
+        new_landmarks: NewLandmarkConfig,
+        length: int,
+        likelihood: Likelihood,
     ) -> None:
         self.config = config
         self.likelihood = likelihood
         self.model = StereoPoint(rig)
         self.point = Point(3)
-        self.index = KeyIndex(length, config.limits)
-        self.manager = KeyManager(keys, (rig.camera.width, rig.camera.height))
+        self.index = DescriptorIndex(length, config.limits)
+        self.manager = LandmarkManager(new_landmarks, (rig.camera.width, rig.camera.height))
         self.places = Places(rig, config)
         self.names = np.zeros(0, dtype=np.int64)
         """(K,) of the last pair's features, NULL where they are no landmark's."""
         self.seconds = 0.0
         """Time that matching the last pair took."""
-        self._numbers = Numbers()
+        self._numbers = NumberIndex()
 
     def observe(self, frame: StereoFrame, belief: Belief) -> Sequence[Observations]:
-        """The features that are landmarks, and those that are keys on trial."""
+        """The features that are landmarks, and those that are candidates."""
         started = time.perf_counter()
         features = frame.features
         self.names = np.full(len(features), NULL, dtype=np.int64)
@@ -104,32 +109,32 @@ class StereoSensor(Sensor):
     def new_landmarks(
         self, frame: StereoFrame, belief: Belief, observed: Sequence[Observations]
     ) -> Sequence[NewLandmarks]:
-        """Counts what was seen, drops keys that were not seen again, starts new ones."""
+        """Counts what was seen, drops candidates that were not seen again, starts new ones."""
         if not self.config.used:
             return []
         seen = self.names >= 0
-        self._forget(belief, self.manager.note(self.names[seen]))
+        self._forget(belief, self.manager.observe(self.names[seen]))
         self._place(belief, self.names[seen])
         if frame.doubt:
             return []
-        rows = self._worth_a_key(frame, seen)
+        rows = self._worth_a_landmark(frame, seen)
         if not rows.size:
             return []
         features = frame.features.take(rows)
         names = self.manager.add(rows.size)
-        self.index.store.add(names, features.keys)
+        self.index.store.add(names, features.descriptors)
         pose = belief.state[belief.mode]
         self.places.put(names, self.model.invert(pose, features.z), pose)
         self.names[rows] = names
         return [NewLandmarks(features.z, features.cov, self.model, self.point, facts=names.tolist())]
 
     def ids(self, belief: Belief, names: np.ndarray) -> np.ndarray:
-        """The map's numbers (k,) of keys (k,)."""
+        """The map's numbers (k,) of landmarks (k,)."""
         return self._numbers.ids(belief.catalogue, names)
 
     def proven(self) -> np.ndarray:
-        """Names (M,) of the keys that were found again where the map has them: these stand still."""
-        return np.asarray(self.manager.names[self.manager.sightings >= PROVEN])
+        """Names (M,) of the landmarks that were found again where the map has them: these stand still."""
+        return np.asarray(self.manager.names[self.manager.observations >= PROVEN])
 
     def kinds(self) -> np.ndarray:
         """What each feature (K,) of the last pair was to the map, see `rbpf.systems.stereo.seen`."""
@@ -139,8 +144,8 @@ class StereoSensor(Sensor):
         held = np.flatnonzero(rows < manager.names.size)
         held = held[manager.names[rows[held]] == self.names[held]]
         rows = rows[held]
-        out[held] = np.where(manager.promoted[rows], LANDMARK, TRIAL)
-        out[held[manager.sightings[rows] == 1]] = NEW
+        out[held] = np.where(manager.confirmed[rows], LANDMARK, TRIAL)
+        out[held[manager.observations[rows] == 1]] = NEW
         return out
 
     def arrays(self) -> dict[str, np.ndarray]:
@@ -162,11 +167,11 @@ class StereoSensor(Sensor):
         return Observations(features.z, features.cov, self.model, self.likelihood, ids, updates=updates)
 
     def _weighing(self) -> np.ndarray:
-        """Features (K,) whose keys are landmarks, this sighting included, and weigh the particles."""
+        """Features (K,) of landmarks, this observation included, that weigh the particles."""
         if self.config.weigh == "all":
             return self.names >= 0
         manager = self.manager
-        often = manager.sightings + 1 >= manager.config.sightings
+        often = manager.observations + 1 >= manager.config.observations
         return np.isin(self.names, manager.names[often])
 
     def matched(self, frame: StereoFrame, belief: Belief) -> np.ndarray:
@@ -175,7 +180,7 @@ class StereoSensor(Sensor):
         out = np.full(len(features), NULL, dtype=np.int64)
         rows = np.arange(len(features)) if frame.free is None else np.flatnonzero(frame.free)
         subsample = ParticleSubsample.of(belief, self.config.subsample)
-        names = self._alike(features.keys[rows], subsample)
+        names = self._alike(features.descriptors[rows], subsample)
         if frame.doubt:
             names = names[np.isin(names, self.proven())]
         if not (names.size and rows.size):
@@ -184,7 +189,7 @@ class StereoSensor(Sensor):
         seen = subsample.expected(belief, self.model, ids)
         total = seen.cov + self.config.slack_px**2 * np.eye(3)
         gate = Gate(features.z[rows], features.cov[rows], names, seen.mean, total, self.config.gate)
-        found = self.index.match(features.keys[rows], gate).ids
+        found = self.index.match(features.descriptors[rows], gate).ids
         taken = np.flatnonzero(found >= 0)
         of = np.searchsorted(names, found[taken])
         agreed = self._agreed(seen.take(of), features.take(rows[taken]), frame.doubt)
@@ -194,7 +199,7 @@ class StereoSensor(Sensor):
     def log_support(self, frame: StereoFrame, belief: Belief) -> float:
         """How well landmarks are seen: their log-density beside that of features of unknown things.
 
-        Keys on trial have no say: they may be of what moves.
+        Candidates have no say: they may be of what moves.
         """
         names = self.matched(frame, belief)
         rows = np.flatnonzero(np.isin(names, self.proven()))
@@ -224,17 +229,17 @@ class StereoSensor(Sensor):
         )
         return motion.inliers
 
-    def _alike(self, keys: np.ndarray, subsample: ParticleSubsample) -> np.ndarray:
-        """Names of landmarks that may be in view and whose keys come near to that of any feature, ascending.
+    def _alike(self, descriptors: np.ndarray, subsample: ParticleSubsample) -> np.ndarray:
+        """Names of landmarks that may be in view and whose descriptors come near to that of any feature, ascending.
 
-        Keys further away are neither taken nor forbid others by the ratio, whatever is expected where.
+        Descriptors further away are neither taken nor forbid others by the ratio, whatever is expected where.
         """
         store, limits = self.index.store, self.config.limits
         names = self.places.in_view(store.ids, subsample.middle, subsample.doubt_rad)
-        if not names.size or not keys.shape[0]:
+        if not names.size or not descriptors.shape[0]:
             return names[:0]
         most = limits.largest(store.length) / limits.ratio
-        near = (keys @ store.keys[store.rows(names)].T).max(axis=0) >= 1.0 - 0.5 * most**2
+        near = (descriptors @ store.descriptors[store.rows(names)].T).max(axis=0) >= 1.0 - 0.5 * most**2
         return np.asarray(names[near])
 
     def _forget(self, belief: Belief, names: np.ndarray) -> None:
@@ -249,7 +254,7 @@ class StereoSensor(Sensor):
             mode = belief.mode
             self.places.put(names, belief.read(ids, np.array([mode])).mean[0], belief.state[mode])
 
-    def _worth_a_key(self, frame: StereoFrame, seen: np.ndarray) -> np.ndarray:
+    def _worth_a_landmark(self, frame: StereoFrame, seen: np.ndarray) -> np.ndarray:
         """Rows of features that start landmarks."""
         features = frame.features
         able = ~seen & self._deep(features)
@@ -258,8 +263,10 @@ class StereoSensor(Sensor):
         rows = np.flatnonzero(able)
         if not rows.size:
             return rows
-        nearest = self.index.nearest(features.keys[rows])
-        chosen = self.manager.choose(features.z[rows, :2], features.keys[rows], nearest, features.z[seen, :2])
+        nearest = self.index.nearest(features.descriptors[rows])
+        chosen = self.manager.select(
+            features.z[rows, :2], features.descriptors[rows], nearest, features.z[seen, :2]
+        )
         return rows[chosen]
 
     def _deep(self, features: StereoFeatures) -> np.ndarray:

@@ -15,7 +15,7 @@ from rbpf.lie import Array
 from rbpf.sensors.pinhole import Pinhole
 from rbpf.sensors.readers.images.bag_file import Bag
 from rbpf.sensors.readers.images.calibration import Calibration
-from rbpf.sensors.readers.images.matrices import flaw, pose_of_matrix
+from rbpf.sensors.readers.images.matrices import pose_of_matrix, rigid_motion_error
 
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
@@ -28,7 +28,7 @@ _EQUIDISTANT = "equidistant", "fisheye"
 
 
 @dataclass(frozen=True)
-class Info:
+class CameraInfo:
     """A camera as its messages tell it.
 
     Attributes:
@@ -50,7 +50,7 @@ class Info:
             InputError: it is no rotation.
         """
         placed = np.column_stack([self.turn, np.zeros(3)])
-        if not np.isfinite(placed).all() or flaw(placed):
+        if not np.isfinite(placed).all() or rigid_motion_error(placed):
             raise InputError(f"{self.calibration.where}: R is no rotation; calibrate the two as a pair.")
         return pose_of_matrix(placed)
 
@@ -61,7 +61,7 @@ class Info:
         return float(-shift / fx) if fx > 0.0 and np.isfinite(shift) else 0.0
 
 
-def read_info(bag: Bag, image_topic: str) -> Info:
+def read_info(bag: Bag, image_topic: str) -> CameraInfo:
     """The camera of a topic of images, from the first message about it.
 
     Raises:
@@ -79,7 +79,7 @@ def read_info(bag: Bag, image_topic: str) -> Info:
     intrinsics = projection[:, :3] if is_rectified else _field(message, "K").reshape(3, 3)
     lens = {} if is_rectified else _lens(message, where)
     camera = _pinhole(message, intrinsics, lens, where)
-    return Info(Calibration(where, camera), turn, projection, is_rectified)
+    return CameraInfo(Calibration(where, camera), turn, projection, is_rectified)
 
 
 def _named(image_topic: str) -> str:

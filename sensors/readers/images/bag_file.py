@@ -27,7 +27,7 @@ _LITTLE, _BIG = Struct("<4xII"), Struct(">4xII")
 
 
 @dataclass(frozen=True)
-class Raw:
+class RawMessage:
     """A message as it lies in the bag.
 
     Attributes:
@@ -72,7 +72,7 @@ class Bag:
         """Topics of some types, in alphabetical order."""
         return sorted(topic for topic, kind in self.topics.items() if kind in types)
 
-    def messages(self, topic: str) -> Iterator[Raw]:
+    def messages(self, topic: str) -> Iterator[RawMessage]:
         """Messages of a topic in the order of the bag; those too short or too wrong to have a time are left out.
 
         Raises:
@@ -82,9 +82,9 @@ class Bag:
         with _refusing(self.path), closing(self._reader.messages(connections=chosen)) as found:
             for connection, _, data in found:
                 if (stamp := self._stamp(data)) is not None:
-                    yield Raw(connection.msgtype, data, stamp)
+                    yield RawMessage(connection.msgtype, data, stamp)
 
-    def message(self, raw: Raw) -> Any:
+    def message(self, raw: RawMessage) -> Any:
         """The message with its fields by name.
 
         Raises:

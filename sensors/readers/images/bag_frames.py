@@ -10,7 +10,7 @@ from typing import final
 import numpy as np
 
 from rbpf.errors import InputError
-from rbpf.sensors.readers.images.bag_file import Bag, Raw, opened
+from rbpf.sensors.readers.images.bag_file import Bag, RawMessage, opened
 from rbpf.sensors.readers.images.bag_image import COMPRESSED, IMAGE, read_message
 from rbpf.sensors.readers.images.decoding import Grey, UnreadableImageError, require_shape
 from rbpf.sensors.readers.images.files import decode_ahead
@@ -20,7 +20,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Stream:
+class ImageStream:
     """A topic of images.
 
     Attributes:
@@ -41,7 +41,7 @@ def image_topics(bag: Bag) -> list[str]:
     return bag.of_type(IMAGE, COMPRESSED)
 
 
-def read_stream(bag: Bag, topic: str) -> Stream:
+def read_stream(bag: Bag, topic: str) -> ImageStream:
     """Goes through a topic once, for its times and its first image.
 
     Raises:
@@ -73,7 +73,7 @@ def read_stream(bag: Bag, topic: str) -> Stream:
         raise InputError(
             f"{where}: all {len(stamps)} images have the time {stamps_ns[0]}, their headers are not filled in."
         )
-    return Stream(topic, stamps_ns, *first)
+    return ImageStream(topic, stamps_ns, *first)
 
 
 @final
@@ -117,7 +117,7 @@ class BagImages(Source):
                 yield self._read(bag, raw, f"{bag.path}, {topic}, image {number}")
                 row = next(wanted, None)
 
-    def _read(self, bag: Bag, raw: Raw, where: str) -> tuple[Grey | None, str | None]:
+    def _read(self, bag: Bag, raw: RawMessage, where: str) -> tuple[Grey | None, str | None]:
         try:
             return require_shape(where, read_message(bag, raw, where), self.shape), None
         except UnreadableImageError as error:

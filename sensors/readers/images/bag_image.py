@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from rbpf.errors import InputError
-from rbpf.sensors.readers.images.bag_file import Bag, Raw
+from rbpf.sensors.readers.images.bag_file import Bag, RawMessage
 from rbpf.sensors.readers.images.decoding import Grey, UnreadableImageError, decode, to_grey
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
@@ -31,7 +31,7 @@ _LAYOUTS = {
 """Encoding to channels, type of their values, and OpenCV's way to grey, None where it is grey."""
 
 
-def read_message(bag: Bag, raw: Raw, where: str) -> Grey:
+def read_message(bag: Bag, raw: RawMessage, where: str) -> Grey:
     """Image (H, W) of a message.
 
     Args:

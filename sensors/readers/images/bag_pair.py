@@ -14,9 +14,9 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
 from rbpf.sensors.pinhole import RectifiedStereo
 from rbpf.sensors.readers.images.bag import chosen
-from rbpf.sensors.readers.images.bag_camera import Info, read_info
+from rbpf.sensors.readers.images.bag_camera import CameraInfo, read_info
 from rbpf.sensors.readers.images.bag_file import Bag, opened
-from rbpf.sensors.readers.images.bag_frames import BagImages, Stream, read_stream
+from rbpf.sensors.readers.images.bag_frames import BagImages, ImageStream, read_stream
 from rbpf.sensors.readers.images.bag_poses import read_poses
 from rbpf.sensors.readers.images.calibration import read_calibration
 from rbpf.sensors.readers.images.euroc_camera import AslCamera
@@ -53,13 +53,13 @@ def read(path: Path, calibration: Path | None, tolerance_s: float, topics: Topic
     return ImageSequence(bag.name, rig.camera, stamps_ns, truth or None, rig.baseline_m, source), rig, notes
 
 
-def _require_one_size(where: str, streams: list[Stream]) -> None:
+def _require_one_size(where: str, streams: list[ImageStream]) -> None:
     left, right = (f"{stream.shape[1]}x{stream.shape[0]}" for stream in streams)
     if left != right:
         raise InputError(f"{where}: the images have {left} and {right} px, expected one size.")
 
 
-def _given(calibration: Path, streams: list[Stream]) -> RectifiedStereo:
+def _given(calibration: Path, streams: list[ImageStream]) -> RectifiedStereo:
     """The rectified pair of a camera.yaml."""
     used = read_calibration(calibration)
     used.require_shape(streams[0].shape, streams[0].topic)
@@ -68,7 +68,7 @@ def _given(calibration: Path, streams: list[Stream]) -> RectifiedStereo:
     return RectifiedStereo(used.camera, used.baseline_m)
 
 
-def _told(bag: Bag, streams: list[Stream]) -> tuple[RectifiedStereo, Rectification | None]:
+def _told(bag: Bag, streams: list[ImageStream]) -> tuple[RectifiedStereo, Rectification | None]:
     """The pair of two CameraInfo, and how its images are rectified, None where they are."""
     left, right = (read_info(bag, stream.topic) for stream in streams)
     for info, stream in ((left, streams[0]), (right, streams[1])):
@@ -96,7 +96,7 @@ def _told(bag: Bag, streams: list[Stream]) -> tuple[RectifiedStereo, Rectificati
     return rectification.rig, rectification
 
 
-def _between(left: Info, right: Info, apart: float) -> Array:
+def _between(left: CameraInfo, right: CameraInfo, apart: float) -> Array:
     """Pose (7,) of the right camera in the frame of the left one, by way of the rectified frames."""
     aside = np.array([0.0, 0.0, 0.0, 1.0, apart, 0.0, 0.0])
     return SE3.compose(

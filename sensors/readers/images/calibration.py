@@ -18,7 +18,7 @@ from pathlib import Path
 
 from rbpf.errors import InputError
 from rbpf.sensors.pinhole import LENSES, Pinhole
-from rbpf.sensors.readers.images.mapping import Value, read_yaml
+from rbpf.sensors.readers.images.mapping import YamlValue, read_yaml
 from rbpf.sensors.readers.text import quoted
 
 NAME = "camera.yaml"
@@ -99,13 +99,13 @@ def read_calibration(path: Path) -> Calibration:
     )
 
 
-def coefficients(value: Value, model: str = "radial-tangential") -> tuple[float, ...]:
+def coefficients(value: YamlValue, model: str = "radial-tangential") -> tuple[float, ...]:
     """Distortion of a list: k1, k2, p1, p2, k3, of which the last may be left out, or k1, k2, k3, k4 if equidistant.
 
     Raises:
         InputError: it is no such list.
     """
-    count = len(LENSES[model].names)
+    count = len(LENSES[model].coefficient_names)
     numbers = [item.number() for item in value.items(*sorted({4, count}))]
     return (*numbers, *[0.0] * (count - len(numbers)))
 
@@ -117,7 +117,7 @@ def model_of(camera: Pinhole) -> str:
     )
 
 
-def _camera(entries: dict[str, Value]) -> Pinhole:
+def _camera(entries: dict[str, YamlValue]) -> Pinhole:
     model = MODELS[entries["model"].choice(list(MODELS)) if "model" in entries else "pinhole"]
     distortion = entries.get("distortion")
     return Pinhole(
@@ -127,6 +127,8 @@ def _camera(entries: dict[str, Value]) -> Pinhole:
         fy=entries["fy"].positive(),
         cx=entries["cx"].number(),
         cy=entries["cy"].number(),
-        distortion=coefficients(distortion, model) if distortion else (0.0,) * len(LENSES[model].names),
+        distortion=coefficients(distortion, model)
+        if distortion
+        else (0.0,) * len(LENSES[model].coefficient_names),
         distortion_model=model,
     )

@@ -8,8 +8,8 @@ import numpy as np
 from rbpf.lie import Array
 from rbpf.sensors.pinhole import Pinhole
 from rbpf.sensors.readers.images.calibration import Calibration, coefficients
-from rbpf.sensors.readers.images.mapping import Value, read_yaml
-from rbpf.sensors.readers.images.matrices import flaw, pose_of_matrix
+from rbpf.sensors.readers.images.mapping import YamlValue, read_yaml
+from rbpf.sensors.readers.images.matrices import pose_of_matrix, rigid_motion_error
 
 _REQUIRED = (
     "T_BS",
@@ -82,11 +82,11 @@ def read_mount(path: Path) -> Array:
     return _mount(entries["T_BS"])
 
 
-def _mount(value: Value) -> Array:
+def _mount(value: YamlValue) -> Array:
     entries = value.entries()
     value.require_keys(entries, ["data"])
     numbers = [item.number() for item in entries["data"].items(16)]
     matrix = np.reshape(numbers, (4, 4))
-    if (problem := flaw(matrix)) is not None:
+    if (problem := rigid_motion_error(matrix)) is not None:
         raise value.error(f"T_BS: {problem}")
     return pose_of_matrix(matrix)

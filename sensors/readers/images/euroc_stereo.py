@@ -46,7 +46,7 @@ def read_right(
         return None, None
     right = read_camera(folder / "sensor.yaml", "the second camera")
     baseline_m = rectified_baseline(left, right)
-    if baseline_m is None or not used.lens.is_plain:
+    if baseline_m is None or not used.lens.is_identity:
         _log.info("%s: left out, as the two cameras are not rectified", folder)
         return None, None
     listed = read_stamped(folder / "data.csv", "the second camera's images", ",", nanoseconds=True)
@@ -59,7 +59,7 @@ def rectified_baseline(left: AslCamera, right: AslCamera) -> float | None:
     first, second = left.calibration.camera, right.calibration.camera
     if (first.width, first.height) != (second.width, second.height):
         return None
-    if not (first.lens.is_plain and second.lens.is_plain):
+    if not (first.lens.is_identity and second.lens.is_identity):
         return None
     if np.abs(first.params - second.params).max() > ALIKE_PX:
         return None

@@ -22,7 +22,7 @@ from rbpf.sensors.readers.images.calibration import Calibration, read_calibratio
 from rbpf.sensors.readers.images.decoding import SUFFIXES
 from rbpf.sensors.readers.images.files import FileImages, first_shape
 from rbpf.sensors.readers.images.kitti_calibration import Projections, read_projections
-from rbpf.sensors.readers.images.matrices import flaw, pose_of_matrix
+from rbpf.sensors.readers.images.matrices import pose_of_matrix, rigid_motion_error
 from rbpf.sensors.readers.images.sequence import ImageSequence
 from rbpf.sensors.readers.images.stamped import read_stamped
 from rbpf.sensors.readers.table import read_columns
@@ -134,6 +134,6 @@ def _read_poses(file: Path, count: int) -> Array:
         raise InputError(f"{file}: {problem}; copy both from one sequence.")
     matrices = table.values.reshape(-1, 3, 4)
     for row, matrix in enumerate(matrices):
-        if (wrong := flaw(matrix)) is not None:
+        if (wrong := rigid_motion_error(matrix)) is not None:
             raise table.error(row, wrong)
     return pose_of_matrix(matrices)

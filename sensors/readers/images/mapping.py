@@ -13,7 +13,7 @@ from rbpf.sensors.readers.yaml_nodes import compose
 
 
 @dataclass(frozen=True)
-class Value:
+class YamlValue:
     """A value in a YAML file.
 
     Attributes:
@@ -30,7 +30,7 @@ class Value:
         """Error that points at the value's line."""
         return line_error(self.path, self.node.start_mark.line + 1, problem)
 
-    def entries(self) -> dict[str, "Value"]:
+    def entries(self) -> dict[str, "YamlValue"]:
         """Values of a mapping by their keys.
 
         Raises:
@@ -38,12 +38,12 @@ class Value:
         """
         if not isinstance(self.node, yaml.MappingNode):
             raise self.error(f"expected {self.name} to be a mapping such as `fx: 525`, found none")
-        found: dict[str, Value] = {}
+        found: dict[str, YamlValue] = {}
         for key, node in self.node.value:
-            name = Value(self.path, "a key", key).text()
+            name = YamlValue(self.path, "a key", key).text()
             if name in found:
-                raise Value(self.path, name, key).error(f"{name} comes a second time, expected it once")
-            found[name] = Value(self.path, name, node)
+                raise YamlValue(self.path, name, key).error(f"{name} comes a second time, expected it once")
+            found[name] = YamlValue(self.path, name, node)
         return found
 
     def require_keys(self, found: Collection[str], required: Collection[str]) -> None:
@@ -107,7 +107,7 @@ class Value:
             raise self.error(f"expected {self.name} to be a whole number, found {value:.12g}")
         return int(value)
 
-    def items(self, *lengths: int) -> list["Value"]:
+    def items(self, *lengths: int) -> list["YamlValue"]:
         """Values of a list.
 
         Args:
@@ -121,10 +121,10 @@ class Value:
             raise self.error(f"{expected}, found no list")
         if len(self.node.value) not in lengths:
             raise self.error(f"{expected}, found {len(self.node.value)}")
-        return [Value(self.path, f"{self.name}[{i}]", node) for i, node in enumerate(self.node.value)]
+        return [YamlValue(self.path, f"{self.name}[{i}]", node) for i, node in enumerate(self.node.value)]
 
 
-def read_yaml(path: Path, hint: str) -> Value:
+def read_yaml(path: Path, hint: str) -> YamlValue:
     """Content of a YAML file.
 
     Args:
@@ -138,4 +138,4 @@ def read_yaml(path: Path, hint: str) -> Value:
     if text.startswith("%YAML:"):
         # OpenCV writes this first line with a colon, which YAML does not have.
         text = "#" + text
-    return Value(path, "the file", compose(path, text, hint))
+    return YamlValue(path, "the file", compose(path, text, hint))

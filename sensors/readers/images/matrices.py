@@ -8,7 +8,7 @@ SKEWED = 0.02
 """How far RᵀR may be from the identity: single precision and a few digits leave less, another meaning far more."""
 
 
-def flaw(matrix: Array) -> str | None:
+def rigid_motion_error(matrix: Array) -> str | None:
     """What a matrix (3, 4) or (4, 4) lacks to be a rigid motion; None where it is one."""
     rotation = matrix[:3, :3]
     if np.abs(rotation.T @ rotation - np.eye(3)).max() > SKEWED or np.linalg.det(rotation) < 0.0:
@@ -19,5 +19,5 @@ def flaw(matrix: Array) -> str | None:
 
 
 def pose_of_matrix(matrix: Array) -> Array:
-    """Pose (..., 7) of a matrix (..., 3, 4) or (..., 4, 4) without a flaw; its rotation is made exact."""
+    """Pose (..., 7) of a matrix (..., 3, 4) or (..., 4, 4) without a rigid_motion_error; its rotation is made exact."""
     return SE3.normalise(SE3.from_matrix(matrix))

@@ -22,7 +22,7 @@ from rbpf.sensors.pinhole import Pinhole
 from rbpf.sensors.readers.images.calibration import NAME, Calibration, find_calibration
 from rbpf.sensors.readers.images.decoding import SUFFIXES
 from rbpf.sensors.readers.images.files import FileImages, first_shape
-from rbpf.sensors.readers.images.matrices import flaw, pose_of_matrix
+from rbpf.sensors.readers.images.matrices import pose_of_matrix, rigid_motion_error
 from rbpf.sensors.readers.images.sequence import ImageSequence
 from rbpf.sensors.readers.text import quoted, read_text
 
@@ -98,6 +98,6 @@ def _read_pose(path: Path) -> Array | None:
         raise InputError(f"{path}: expected 16 numbers, found {len(matrix)}.")
     if not np.isfinite(matrix).all():
         return None
-    if (problem := flaw(matrix.reshape(4, 4))) is not None:
+    if (problem := rigid_motion_error(matrix.reshape(4, 4))) is not None:
         raise InputError(f"{path}: {problem}.")
     return pose_of_matrix(matrix.reshape(4, 4))

@@ -12,14 +12,14 @@ from rbpf.sensors.readers.images.folder import list_images
 from rbpf.sensors.readers.images.video import SUFFIXES, opened, video_header
 
 
-class Shot(NamedTuple):
+class NamedImage(NamedTuple):
     """An image (H, W) and what it is called."""
 
     name: str
     image: Grey
 
 
-def read_shots(path: Path, most: int) -> tuple[int, Iterator[Shot]]:
+def read_shots(path: Path, most: int) -> tuple[int, Iterator[NamedImage]]:
     """Up to `most` images, evenly spread, of a folder or a video; those that cannot be read are left out.
 
     Args:
@@ -52,16 +52,16 @@ def _spread(count: int, most: int) -> np.ndarray:
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
 
 
-def _of_files(files: list[Path]) -> Iterator[Shot]:
+def _of_files(files: list[Path]) -> Iterator[NamedImage]:
     for file in files:
         try:
             image = read_grey(file)
         except UnreadableImageError:
             continue
-        yield Shot(file.name, image)
+        yield NamedImage(file.name, image)
 
 
-def _of_video(path: Path, chosen: set[int]) -> Iterator[Shot]:
+def _of_video(path: Path, chosen: set[int]) -> Iterator[NamedImage]:
     with opened(path) as capture:
         for index in range(max(chosen) + 1):
             if not capture.grab():
@@ -69,4 +69,4 @@ def _of_video(path: Path, chosen: set[int]) -> Iterator[Shot]:
             if index in chosen:
                 there, image = capture.retrieve()
                 if there:
-                    yield Shot(f"image {index}", to_grey(path, image))
+                    yield NamedImage(f"image {index}", to_grey(path, image))

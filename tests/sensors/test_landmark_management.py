@@ -1,4 +1,4 @@
-"""Which keys enter a map, stay, and become landmarks."""
+"""Which descriptors enter a map, stay, and become landmarks."""
 
 import numpy as np
 import pytest
@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rbpf.errors import InputError
-from rbpf.sensors.key_management import KeyConfig, KeyManager
-from rbpf.sensors.key_matching import distances
-from tests.sensors.test_key_matching import unit
+from rbpf.sensors.descriptor_matching import distances
+from rbpf.sensors.landmark_management import LandmarkManager, NewLandmarkConfig
+from tests.sensors.test_descriptor_matching import unit
 
 SIZE = (640, 480)
 
@@ -21,16 +21,16 @@ def features(rng, count):
     seed=st.integers(0, 10_000),
     fraction=st.floats(0.0, 1.0),
     config=st.builds(
-        KeyConfig,
-        per_frame=st.integers(0, 20),
+        NewLandmarkConfig,
+        max_per_frame=st.integers(0, 20),
         patience=st.integers(1, 4),
-        sightings=st.integers(1, 4),
-        waiting=st.integers(0, 40),
+        observations=st.integers(1, 4),
+        max_candidates=st.integers(0, 40),
     ),
 )
 def test_sightings_decide_who_stays(seed, fraction, config):
     rng = np.random.default_rng(seed)
-    manager = KeyManager(config, SIZE)
+    manager = LandmarkManager(config, SIZE)
     seen: dict[int, list[int]] = {}
     ever = 0
     for frame in range(1, 15):
@@ -40,53 +40,53 @@ def test_sightings_decide_who_stays(seed, fraction, config):
         overdue = [
             name
             for name, frames in seen.items()
-            if len(frames) < config.sightings and frame - frames[-1] >= config.patience
+            if len(frames) < config.observations and frame - frames[-1] >= config.patience
         ]
-        assert manager.note(names).tolist() == overdue
+        assert manager.observe(names).tolist() == overdue
         for name in overdue:
             del seen[name]
-        px, keys = features(rng, 30)
-        chosen = manager.choose(px, keys, np.full(30, np.inf), np.zeros((0, 2)))
-        assert chosen.size <= config.per_frame
+        px, descriptors = features(rng, 30)
+        chosen = manager.select(px, descriptors, np.full(30, np.inf), np.zeros((0, 2)))
+        assert chosen.size <= config.max_per_frame
         new = manager.add(chosen.size)
         assert new.tolist() == list(range(ever, ever + chosen.size))
         ever += chosen.size
         seen.update({name: [frame] for name in new.tolist()})
         assert manager.names.tolist() == sorted(seen)
-        assert manager.sightings.tolist() == [len(seen[name]) for name in sorted(seen)]
-        np.testing.assert_array_equal(manager.promoted, manager.sightings >= config.sightings)
-        if config.sightings > 1:
-            assert (~manager.promoted).sum() <= config.waiting
+        assert manager.observations.tolist() == [len(seen[name]) for name in sorted(seen)]
+        np.testing.assert_array_equal(manager.confirmed, manager.observations >= config.observations)
+        if config.observations > 1:
+            assert (~manager.confirmed).sum() <= config.max_candidates
 
 
 def test_as_in_the_paper():
-    manager = KeyManager(KeyConfig(), SIZE)
-    manager.note(np.zeros(0, dtype=np.int64))
+    manager = LandmarkManager(NewLandmarkConfig(), SIZE)
+    manager.observe(np.zeros(0, dtype=np.int64))
     manager.add(3)
-    assert manager.note(np.array([0, 1])).size == 0
-    assert manager.note(np.array([0])).size == 0
-    assert manager.promoted.tolist() == [True, False, False]
+    assert manager.observe(np.array([0, 1])).size == 0
+    assert manager.observe(np.array([0])).size == 0
+    assert manager.confirmed.tolist() == [True, False, False]
     nobody = np.zeros(0, dtype=np.int64)
-    assert manager.note(nobody).tolist() == [2]
-    assert manager.note(nobody).tolist() == [1]
+    assert manager.observe(nobody).tolist() == [2]
+    assert manager.observe(nobody).tolist() == [1]
     for _ in range(10):
-        assert manager.note(nobody).size == 0
+        assert manager.observe(nobody).size == 0
     assert manager.names.tolist() == [0]
 
 
 @given(seed=st.integers(0, 10_000), spacing=st.floats(0.0, 80.0), distinct=st.floats(0.05, 0.6))
 def test_new_keys_are_apart_from_others(seed, spacing, distinct):
     rng = np.random.default_rng(seed)
-    manager = KeyManager(KeyConfig(spacing_px=spacing, distinct=distinct), SIZE)
-    px, keys = features(rng, 40)
+    manager = LandmarkManager(NewLandmarkConfig(spacing_px=spacing, distinct=distinct), SIZE)
+    px, descriptors = features(rng, 40)
     taken, nearest = rng.uniform([0, 0], SIZE, (10, 2)), rng.uniform(0.0, 0.8, 40)
-    chosen = manager.choose(px, keys, nearest, taken)
+    chosen = manager.select(px, descriptors, nearest, taken)
     assert (nearest[chosen] >= distinct).all()
     places = np.concatenate([taken, px[chosen]])
     gaps = np.linalg.norm(px[chosen][:, None] - places[None], axis=2)
     gaps[np.arange(chosen.size), 10 + np.arange(chosen.size)] = np.inf
     assert (gaps >= spacing - 1e-9).all()
-    between = distances(keys[chosen] @ keys[chosen].T)[~np.eye(chosen.size, dtype=bool)]
+    between = distances(descriptors[chosen] @ descriptors[chosen].T)[~np.eye(chosen.size, dtype=bool)]
     assert (between >= distinct - 1e-3).all()
     if chosen.size < 15:
         # Whoever was left out is too near to something.
@@ -94,7 +94,7 @@ def test_new_keys_are_apart_from_others(seed, spacing, distinct):
         near = np.linalg.norm(px[left][:, None] - places[None], axis=2).min(axis=1) < spacing
         alike = nearest[left] < distinct
         if chosen.size:
-            alike |= distances(keys[left] @ keys[chosen].T).min(axis=1) < distinct
+            alike |= distances(descriptors[left] @ descriptors[chosen].T).min(axis=1) < distinct
         assert (near | alike).all()
 
 
@@ -103,19 +103,23 @@ def test_new_keys_spread_over_the_image():
     corner = rng.uniform([0, 0], [100, 75], (60, 2))
     elsewhere = np.array([[600.0, 450.0], [20.0, 460.0], [620.0, 20.0], [320.0, 240.0]])
     px = np.concatenate([corner, elsewhere])
-    config = KeyConfig(per_frame=6, spacing_px=0.0, distinct=0.0)
-    chosen = KeyManager(config, SIZE).choose(px, unit(rng, 64, 36), np.full(64, np.inf), np.zeros((0, 2)))
+    config = NewLandmarkConfig(max_per_frame=6, spacing_px=0.0, distinct=0.0)
+    chosen = LandmarkManager(config, SIZE).select(
+        px, unit(rng, 64, 36), np.full(64, np.inf), np.zeros((0, 2))
+    )
     assert set(range(60, 64)) <= set(chosen.tolist()) and chosen.size == 6
     occupied = np.repeat(elsewhere[:1], 5, axis=0) + 15.0
-    crowded = KeyManager(config, SIZE).choose(px, unit(rng, 64, 36), np.full(64, np.inf), occupied)
+    crowded = LandmarkManager(config, SIZE).select(px, unit(rng, 64, 36), np.full(64, np.inf), occupied)
     assert 60 not in crowded.tolist()
 
 
 def test_the_best_of_a_cell_comes_first():
     px = np.tile([[10.0, 10.0]], (20, 1))
-    config = KeyConfig(per_frame=5, spacing_px=0.0, distinct=0.0)
-    keys = unit(np.random.default_rng(1), 20, 36)
-    assert KeyManager(config, SIZE).choose(px, keys, np.full(20, np.inf), np.zeros((0, 2))).tolist() == [
+    config = NewLandmarkConfig(max_per_frame=5, spacing_px=0.0, distinct=0.0)
+    descriptors = unit(np.random.default_rng(1), 20, 36)
+    assert LandmarkManager(config, SIZE).select(
+        px, descriptors, np.full(20, np.inf), np.zeros((0, 2))
+    ).tolist() == [
         0,
         1,
         2,
@@ -125,28 +129,28 @@ def test_the_best_of_a_cell_comes_first():
 
 
 def test_a_checkpoint_holds_all():
-    manager, again = KeyManager(KeyConfig(), SIZE), KeyManager(KeyConfig(), SIZE)
-    manager.note(np.zeros(0, dtype=np.int64))
+    manager, again = LandmarkManager(NewLandmarkConfig(), SIZE), LandmarkManager(NewLandmarkConfig(), SIZE)
+    manager.observe(np.zeros(0, dtype=np.int64))
     manager.add(5)
-    manager.note(np.array([1, 3]))
+    manager.observe(np.array([1, 3]))
     manager.remove(np.array([0]))
     again.restore(manager.arrays())
     for each in (manager, again):
-        each.note(np.array([4]))
+        each.observe(np.array([4]))
     assert again.names.tolist() == manager.names.tolist() == [1, 2, 3, 4]
-    np.testing.assert_array_equal(again.sightings, manager.sightings)
-    np.testing.assert_array_equal(again.last_seen, manager.last_seen)
+    np.testing.assert_array_equal(again.observations, manager.observations)
+    np.testing.assert_array_equal(again.last_observed, manager.last_observed)
     assert again.add(1).tolist() == manager.add(1).tolist() == [5]
 
 
 def test_what_is_refused():
-    manager = KeyManager(KeyConfig(), SIZE)
-    with pytest.raises(InputError, match="no key named 0"):
-        manager.note(np.array([0]))
+    manager = LandmarkManager(NewLandmarkConfig(), SIZE)
+    with pytest.raises(InputError, match="no landmark named 0"):
+        manager.observe(np.array([0]))
     for changes, message in (
         ({"cells": 0}, "cells"),
-        ({"waiting": -1}, "waiting"),
+        ({"max_candidates": -1}, "max_candidates"),
         ({"distinct": 3.0}, "distinct"),
     ):
         with pytest.raises(InputError, match=message):
-            KeyConfig(**changes)
+            NewLandmarkConfig(**changes)

@@ -1,4 +1,4 @@
-"""Matching of keys, beside plain loops."""
+"""Matching of descriptors, beside plain loops."""
 
 import numpy as np
 import pytest
@@ -6,14 +6,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rbpf.errors import InputError
-from rbpf.sensors import key_matching
+from rbpf.sensors import descriptor_matching
 from rbpf.sensors.candidates import band_pairs, gate_pairs
-from rbpf.sensors.key_matching import MatchLimits, match_all, match_pairs
+from rbpf.sensors.descriptor_matching import MatchLimits, match_all, match_pairs
 
 
 def unit(rng, count, length=8):
-    keys = np.abs(rng.standard_normal((count, length)))
-    return (keys / np.linalg.norm(keys, axis=1, keepdims=True)).astype(np.float32)
+    descriptors = np.abs(rng.standard_normal((count, length)))
+    return (descriptors / np.linalg.norm(descriptors, axis=1, keepdims=True)).astype(np.float32)
 
 
 def noisy_pair(rng, count, extra, length=8, noise=0.05):
@@ -71,7 +71,7 @@ def test_blocks_do_not_show(monkeypatch):
     limits = MatchLimits(0.5, 0.8)
     whole = match_all(first, second, limits)
     assert len(whole) > 20
-    monkeypatch.setattr(key_matching, "BLOCK", 7)
+    monkeypatch.setattr(descriptor_matching, "BLOCK", 7)
     parts = match_all(first, second, limits)
     np.testing.assert_array_equal(parts.first, whole.first)
     np.testing.assert_array_equal(parts.second, whole.second)
@@ -82,8 +82,8 @@ def test_few_and_many_pairs_give_the_same(monkeypatch):
     first, second = noisy_pair(rng, 40, 60)
     pairs = np.nonzero(rng.random((40, 100)) < 0.3)
     found = [match_pairs(first, second, pairs, MatchLimits(0.5))]
-    monkeypatch.setattr(key_matching, "GATHERED", 0)
-    monkeypatch.setattr(key_matching, "PAIRS", 11)
+    monkeypatch.setattr(descriptor_matching, "GATHERED", 0)
+    monkeypatch.setattr(descriptor_matching, "PAIRS", 11)
     found.append(match_pairs(first, second, pairs, MatchLimits(0.5)))
     np.testing.assert_array_equal(found[0].second, found[1].second)
     assert len(found[0]) > 10
@@ -91,19 +91,19 @@ def test_few_and_many_pairs_give_the_same(monkeypatch):
 
 def test_two_alike_are_ambiguous():
     rng = np.random.default_rng(3)
-    keys = unit(rng, 3)
-    twice = np.concatenate([keys, keys[:1]])
-    matches = match_all(keys, twice, MatchLimits(0.5))
+    descriptors = unit(rng, 3)
+    twice = np.concatenate([descriptors, descriptors[:1]])
+    matches = match_all(descriptors, twice, MatchLimits(0.5))
     assert matches.first.tolist() == [1, 2] and matches.second.tolist() == [1, 2]
     pairs = np.nonzero(np.ones((3, 4), dtype=bool))
-    assert match_pairs(keys, twice, pairs, MatchLimits(0.5)).first.tolist() == [1, 2]
+    assert match_pairs(descriptors, twice, pairs, MatchLimits(0.5)).first.tolist() == [1, 2]
 
 
 def test_only_what_may_compete_competes():
-    keys = unit(np.random.default_rng(4), 3)
-    twice = np.concatenate([keys, keys[:1]])
+    descriptors = unit(np.random.default_rng(4), 3)
+    twice = np.concatenate([descriptors, descriptors[:1]])
     pairs = np.array([0, 1, 2]), np.array([3, 1, 2])
-    assert match_pairs(keys, twice, pairs, MatchLimits(0.5)).second.tolist() == [3, 1, 2]
+    assert match_pairs(descriptors, twice, pairs, MatchLimits(0.5)).second.tolist() == [3, 1, 2]
 
 
 def test_a_row_is_taken_once_even_when_not_mutual():

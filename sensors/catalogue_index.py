@@ -9,7 +9,7 @@ from rbpf.core.exchange import NULL
 
 
 @final
-class Names:
+class NameIndex:
     """The catalogue read backwards: name → id, looked up again only where the catalogue has changed."""
 
     def __init__(self) -> None:
@@ -35,7 +35,7 @@ class Names:
 
 
 @final
-class Numbers:
+class NumberIndex:
     """The same for names that are whole numbers from 0 up and never used again: an array.
 
     A removal leaves it as it is, so that a large map need not be read again: what is removed must not be asked for.

@@ -1,6 +1,6 @@
-"""Which keys of two sets belong to one another: distance, ratio to the next best, and preference on both sides.
+"""Which descriptors of two sets belong to one another: distance, ratio to the next best, and preference on both sides.
 
-Keys are float32 rows of length 1, so that one matrix product tells all distances: |a − b|² = 2 − 2 aᵀb. Where places or
+Descriptors are float32 rows of length 1, so that one matrix product tells all distances: |a − b|² = 2 − 2 aᵀb. Where places or
 a prediction leave few candidates, only those are compared (`match_pairs`), and only those compete in the ratio test.
 """
 
@@ -15,7 +15,7 @@ BLOCK = 4096
 """Columns of a product that are looked at together: a block of a few hundred rows stays in the cache."""
 
 LARGEST = {36: 0.25, 128: 0.55}
-"""Distances of "root" keys by their length: few of one place are further apart, and few of two places nearer."""
+"""Distances of "root" descriptors by their length: few of one place are further apart, and few of two places nearer."""
 
 GATHERED, PAIRS = 8, 65536
 """Comparing a pair on its own costs as much as so many of a matrix product; pairs gathered at a time."""
@@ -26,7 +26,7 @@ class MatchLimits:
     """When a candidate is taken.
 
     Attributes:
-        distance: the largest distance of two keys, at most 2; None for `LARGEST` of their length.
+        distance: the largest distance of two descriptors, at most 2; None for `LARGEST` of their length.
         ratio: largest ratio of the distance to that of the second-best candidate (D. Lowe 2004, §7.1); 1 is no limit.
         mutual: whether each has to be the other's nearest.
 
@@ -45,19 +45,19 @@ class MatchLimits:
             raise InputError(f"expected {expected}, got {self.distance} and {self.ratio}")
 
     def largest(self, length: int) -> float:
-        """Distance up to which keys of this length are taken."""
+        """Distance up to which descriptors of this length are taken."""
         return LARGEST.get(length, 2.0) if self.distance is None else self.distance
 
 
 @final
 @dataclass(frozen=True)
-class KeyMatches:
-    """Pairs of keys, each at most once on either side, in the order of the first set.
+class DescriptorMatches:
+    """Pairs of descriptors, each at most once on either side, in the order of the first set.
 
     Attributes:
         first: (P,) rows of the first set.
         second: (P,) rows of the second set.
-        distance: (P,) of the keys.
+        distance: (P,) of the descriptors.
     """
 
     first: np.ndarray
@@ -67,18 +67,18 @@ class KeyMatches:
     def __len__(self) -> int:
         return self.first.size
 
-    def take(self, rows: np.ndarray) -> "KeyMatches":
+    def take(self, rows: np.ndarray) -> "DescriptorMatches":
         """Some of them, by number or by mask."""
-        return KeyMatches(self.first[rows], self.second[rows], self.distance[rows])
+        return DescriptorMatches(self.first[rows], self.second[rows], self.distance[rows])
 
 
-def match_all(first: np.ndarray, second: np.ndarray, limits: MatchLimits) -> KeyMatches:
-    """Matches keys (K, d) with keys (M, d), every one of which is a candidate."""
+def match_all(first: np.ndarray, second: np.ndarray, limits: MatchLimits) -> DescriptorMatches:
+    """Matches descriptors (K, d) with descriptors (M, d), every one of which is a candidate."""
     return decide(first, second, two_best(first, second), limits)
 
 
 def two_best(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """For each key (K, d) the two best of others (M, d), by a matrix product in blocks of M.
+    """For each descriptor (K, d) the two best of others (M, d), by a matrix product in blocks of M.
 
     Returns:
         Products (K,) with the best and with the next one, −inf where there is none, and the best one's row (K,).
@@ -102,7 +102,7 @@ def decide(
     second: np.ndarray,
     best: tuple[np.ndarray, np.ndarray, np.ndarray],
     limits: MatchLimits,
-) -> KeyMatches:
+) -> DescriptorMatches:
     """Which of the best candidates, as `two_best` gives them, are taken."""
     product, next_best, where = best
     kept = np.flatnonzero(within(product, next_best, limits, first.shape[1]))
@@ -114,12 +114,12 @@ def decide(
 
 def match_pairs(
     first: np.ndarray, second: np.ndarray, pairs: tuple[np.ndarray, np.ndarray], limits: MatchLimits
-) -> KeyMatches:
-    """Matches keys (K, d) with keys (M, d) where only some pairs are possible.
+) -> DescriptorMatches:
+    """Matches descriptors (K, d) with descriptors (M, d) where only some pairs are possible.
 
     Args:
-        first: keys (K, d).
-        second: keys (M, d).
+        first: descriptors (K, d).
+        second: descriptors (M, d).
         pairs: rows (C,) of the first and (C,) of the second set, each pair once.
         limits: when a candidate is taken.
     """
@@ -149,18 +149,18 @@ def within(best: np.ndarray, next_best: np.ndarray, limits: MatchLimits, length:
 
 
 def distances(products: np.ndarray) -> np.ndarray:
-    """Of keys of length 1, from their products."""
+    """Of descriptors of length 1, from their products."""
     return np.sqrt(np.maximum(2.0 - 2.0 * products.astype(np.float64), 0.0))
 
 
-def one_each(matches: KeyMatches) -> KeyMatches:
+def one_each(matches: DescriptorMatches) -> DescriptorMatches:
     """Of matches that share a row of the second set the nearest, of equally near ones the first."""
     order = np.lexsort((matches.distance, matches.second))
     return matches.take(np.sort(_first_of(matches.second, order)))
 
 
 def _products(first: np.ndarray, second: np.ndarray, k: np.ndarray, m: np.ndarray) -> np.ndarray:
-    """Of the keys of pairs (C,): all at once by a matrix product where the pairs are many, else one by one."""
+    """Of the descriptors of pairs (C,): all at once by a matrix product where the pairs are many, else one by one."""
     if k.size * GATHERED > first.shape[0] * second.shape[0]:
         return (first @ second.T)[k, m]
     parts = [slice(start, start + PAIRS) for start in range(0, k.size, PAIRS)]
@@ -173,5 +173,5 @@ def _first_of(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
     return np.asarray(rows[first])
 
 
-def _chosen(first: np.ndarray, second: np.ndarray, products: np.ndarray) -> KeyMatches:
-    return KeyMatches(first, second, distances(products))
+def _chosen(first: np.ndarray, second: np.ndarray, products: np.ndarray) -> DescriptorMatches:
+    return DescriptorMatches(first, second, distances(products))

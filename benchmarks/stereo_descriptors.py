@@ -1,9 +1,9 @@
-"""How many matches of stereo SIFT features are right: python -m benchmarks.stereo_keys FOLDER_OF_RECORDINGS.
+"""How many matches of stereo SIFT features are right: python -m benchmarks.stereo_descriptors FOLDER_OF_RECORDINGS.
 
 Right is what the motion says on which most features agree (`plain_odometry`): a point, carried by it, falls where the
 feature is that it was matched with, up to noise (99.9 % of a Gaussian) and 2 px. The recordings' own truth is not exact
 enough: KITTI's rotations move all features by up to 2 px from frame to frame. Features are matched left to right by
-keys of 128; keys of 36 are formed of the same histograms. Prints the tables of the documentation.
+descriptors of 128; descriptors of 36 are formed of the same histograms. Prints the tables of the documentation.
 """
 
 import argparse
@@ -18,13 +18,13 @@ import numpy as np
 from benchmarks.plain_odometry import path
 from rbpf.core.exchange import NULL
 from rbpf.lie import SE3
-from rbpf.sensors.key_index import Gate, KeyIndex
-from rbpf.sensors.key_management import KeyConfig, KeyManager
-from rbpf.sensors.key_matching import MatchLimits
-from rbpf.sensors.key_search import ExactSearch, KeySearch, TreeSearch
+from rbpf.sensors.descriptor_index import DescriptorIndex, Gate
+from rbpf.sensors.descriptor_matching import MatchLimits
+from rbpf.sensors.descriptor_search import DescriptorSearch, ExactSearch, TreeSearch
+from rbpf.sensors.landmark_management import LandmarkManager, NewLandmarkConfig
 from rbpf.sensors.pinhole import RectifiedStereo
 from rbpf.sensors.readers.images import open_stereo
-from rbpf.sensors.sift import SiftConfig, keys_of
+from rbpf.sensors.sift import SiftConfig, descriptors_from_histograms
 from rbpf.sensors.stereo_features import StereoFeatures, match_frames
 from rbpf.sensors.stereo_matching import StereoSift
 
@@ -48,7 +48,7 @@ class Recording:
         local = SE3.inverse_transform(pose, points)
         seen = self.rig.visible(local)
         local = np.where(seen[:, None], local, np.nan)
-        slope = self.rig.slope(local) @ SE3.rotation(pose).T
+        slope = self.rig.jacobian(local) @ SE3.rotation(pose).T
         return self.rig.project(local), slope @ cov @ slope.swapaxes(1, 2)
 
     def in_world(self, frame: int, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -66,9 +66,13 @@ def read(folder: Path, config: SiftConfig) -> Recording:
 
 
 def shortened(recording: Recording, length: int) -> Recording:
-    """The same with keys of another length, of the same histograms: squares of "root" keys are their shares."""
+    """The same with descriptors of another length, of the same histograms: squares of "root" descriptors are their shares."""
     return replace(
-        recording, features=[replace(f, keys=keys_of(f.keys**2, length)) for f in recording.features]
+        recording,
+        features=[
+            replace(f, descriptors=descriptors_from_histograms(f.descriptors**2, length))
+            for f in recording.features
+        ],
     )
 
 
@@ -107,13 +111,13 @@ class Tally:
         )
 
 
-def with_map(recording: Recording, search: KeySearch, gated: bool, others: np.ndarray) -> Tally:
-    """Goes through a recording with a map that grows as S05 has it, beside keys (D, d) of elsewhere."""
-    length, tally = recording.features[0].keys.shape[1], Tally()
-    index = KeyIndex(length, search=search)
+def with_map(recording: Recording, search: DescriptorSearch, gated: bool, others: np.ndarray) -> Tally:
+    """Goes through a recording with a map that grows as S05 has it, beside descriptors (D, d) of elsewhere."""
+    length, tally = recording.features[0].descriptors.shape[1], Tally()
+    index = DescriptorIndex(length, search=search)
     index.store.add(np.arange(len(others)), others)
     camera = recording.rig.camera
-    manager = KeyManager(KeyConfig(), (camera.width, camera.height))
+    manager = LandmarkManager(NewLandmarkConfig(), (camera.width, camera.height))
     points, covs = np.zeros((0, 3)), np.zeros((0, 3, 3))
     for frame, features in enumerate(recording.features):
         mean, cov = recording.predicted(points, covs, frame)
@@ -121,22 +125,22 @@ def with_map(recording: Recording, search: KeySearch, gated: bool, others: np.nd
         reach = cov[seen] + REACH_PX**2 * np.eye(3)
         gate = Gate(features.z, features.cov, seen + len(others), mean[seen], reach) if gated else None
         start = time.thread_time()
-        ids = index.match(features.keys, gate).ids
+        ids = index.match(features.descriptors, gate).ids
         tally.seconds += time.thread_time() - start
         rows = np.flatnonzero(ids >= len(others))
         names = ids[rows] - len(others)
         tally.frames += 1
         tally.found += int((ids != NULL).sum())
         tally.right += int(agree(mean[names], cov[names], features.z[rows], features.cov[rows]).sum())
-        index.store.remove(manager.note(names) + len(others))
+        index.store.remove(manager.observe(names) + len(others))
         free = np.flatnonzero(ids == NULL)
-        new = manager.choose(
+        new = manager.select(
             features.z[free, :2],
-            features.keys[free],
-            index.nearest(features.keys[free]),
+            features.descriptors[free],
+            index.nearest(features.descriptors[free]),
             features.z[rows, :2],
         )
-        index.store.add(manager.add(new.size) + len(others), features.keys[free[new]])
+        index.store.add(manager.add(new.size) + len(others), features.descriptors[free[new]])
         added = recording.in_world(frame, free[new])
         points, covs = np.concatenate([points, added[0]]), np.concatenate([covs, added[1]])
     return tally
@@ -145,7 +149,7 @@ def with_map(recording: Recording, search: KeySearch, gated: bool, others: np.nd
 def tables(folder: Path, config: SiftConfig) -> Iterator[str]:
     """Lines of the report."""
     whole = {name: read(folder / name, config) for name in NAMES}
-    yield "recording           key  frames apart: matches per pair, fraction that is right"
+    yield "recording    descriptor  frames apart: matches per pair, fraction that is right"
     for name, gaps in NAMES.items():
         for length in (36, 128):
             recording, cells = shortened(whole[name], length), []
@@ -154,11 +158,11 @@ def tables(folder: Path, config: SiftConfig) -> Iterator[str]:
                 pairs = len(range(0, len(recording.features) - gap, 2))
                 cells.append(f"{gap}: {found / pairs:5.1f} {right / max(found, 1):.3f}")
             yield f"{name:18}  {length:3}  {'   '.join(cells)}"
-    yield "recording           key  other keys  search: matches per frame, fraction right, time"
+    yield "recording    descriptor  other descriptors  search: matches per frame, fraction right, time"
     for name, other in (tuple(NAMES), tuple(NAMES)[::-1]):
         for length in (36, 128):
             recording = shortened(whole[name], length)
-            foreign = np.concatenate([f.keys for f in shortened(whole[other], length).features])
+            foreign = np.concatenate([f.descriptors for f in shortened(whole[other], length).features])
             for count in (0, 1000, 10000):
                 others = foreign[:: max(len(foreign) // max(count, 1), 1)][:count]
                 cells = [
@@ -174,7 +178,7 @@ def tables(folder: Path, config: SiftConfig) -> Iterator[str]:
 
 def main() -> None:
     """Prints the tables."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.stereo_keys", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.stereo_descriptors", description=__doc__)
     parser.add_argument("folder", type=Path, help="holds stereo_zed_room1 and stereo_kitti_seq1")
     parser.add_argument("--scale", type=float, default=0.5, help="of the images that SIFT looks at")
     arguments = parser.parse_args()

@@ -1,4 +1,4 @@
-"""Features found in a map's keys: by a matrix product, by a k-d tree, near their predicted places; on one thread."""
+"""Features found in a map's descriptors: by a matrix product, by a k-d tree, near their predicted places; on one thread."""
 
 from collections.abc import Callable
 
@@ -7,39 +7,41 @@ import numpy as np
 
 from benchmarks.patch_search import one_thread, picture
 from benchmarks.rows import Row, Settings, Timing, interleaved
-from rbpf.sensors.key_index import Gate, KeyIndex
-from rbpf.sensors.key_search import ExactSearch, TreeSearch
+from rbpf.sensors.descriptor_index import DescriptorIndex, Gate
+from rbpf.sensors.descriptor_search import ExactSearch, TreeSearch
 from rbpf.sensors.sift import Sift, SiftConfig
 
 SIZES, FEATURES, IN_VIEW = (1000, 10_000, 40_000), 300, 600
 LENGTH, NOISE = 36, 0.012
-"""Per entry: keys of one place are 0.06 to 0.1 apart in recordings."""
+"""Per entry: descriptors of one place are 0.06 to 0.1 apart in recordings."""
 AIM_MS = 10.0
 
 
-def real_keys(count: int) -> np.ndarray:
-    """SIFT keys (count, 36) of smoothed noise of several grains."""
-    sift, keys, size = Sift(SiftConfig(0, 1.0, contrast=0.02)), [], 0
+def real_descriptors(count: int) -> np.ndarray:
+    """SIFT descriptors (count, 36) of smoothed noise of several grains."""
+    sift, descriptors, size = Sift(SiftConfig(0, 1.0, contrast=0.02)), [], 0
     while size < count:
-        image = picture(480, 640, 1.5 + 0.1 * len(keys), seed=len(keys))
-        keys.append(sift.detect(image).keys)
-        size += len(keys[-1])
-    return np.concatenate(keys)[:count]
+        image = picture(480, 640, 1.5 + 0.1 * len(descriptors), seed=len(descriptors))
+        descriptors.append(sift.detect(image).descriptors)
+        size += len(descriptors[-1])
+    return np.concatenate(descriptors)[:count]
 
 
 class Map:
-    """A map of so many keys, and features of which five in six are in it."""
+    """A map of so many descriptors, and features of which five in six are in it."""
 
-    def __init__(self, keys: np.ndarray) -> None:
-        rng, count = np.random.default_rng(0), len(keys)
-        self.keys = keys
+    def __init__(self, descriptors: np.ndarray) -> None:
+        rng, count = np.random.default_rng(0), len(descriptors)
+        self.descriptors = descriptors
         seen, absent = rng.permutation(count)[:FEATURES], FEATURES // 6
-        query = keys[seen] + NOISE * rng.standard_normal((FEATURES, LENGTH)).astype(np.float32)
+        query = descriptors[seen] + NOISE * rng.standard_normal((FEATURES, LENGTH)).astype(np.float32)
         query[:absent] = np.abs(rng.standard_normal((absent, LENGTH)))
         self.query = (query / np.linalg.norm(query, axis=1, keepdims=True)).astype(np.float32)
-        self.exact, self.tree = (KeyIndex(LENGTH, search=search) for search in (ExactSearch(), TreeSearch()))
+        self.exact, self.tree = (
+            DescriptorIndex(LENGTH, search=search) for search in (ExactSearch(), TreeSearch())
+        )
         for index in (self.exact, self.tree):
-            index.store.add(np.arange(count), keys)
+            index.store.add(np.arange(count), descriptors)
         ids = np.union1d(seen, rng.permutation(count)[: IN_VIEW - FEATURES])
         mean = rng.uniform([0, 0, 0], [640, 480, 640], (count, 3))
         cov = np.tile(25.0 * np.eye(3), (ids.size, 1, 1))
@@ -53,7 +55,7 @@ class Map:
             "exact": lambda: self.exact.match(self.query),
             "tree": lambda: self.tree.match(self.query),
             "gated": lambda: self.exact.match(self.query, self.gate),
-            "peer": lambda: self.matcher.knnMatch(self.query, self.keys, 2),
+            "peer": lambda: self.matcher.knnMatch(self.query, self.descriptors, 2),
         }
 
     def agreement(self) -> float:
@@ -63,17 +65,17 @@ class Map:
 
 def run(settings: Settings) -> list[Row]:
     """Two rows for each size of the map, and one for the largest with a gate."""
-    keys, rows = real_keys(max(SIZES)), []
+    descriptors, rows = real_descriptors(max(SIZES)), []
     with one_thread():
         for size in SIZES:
-            task = Map(keys[:size])
+            task = Map(descriptors[:size])
             times = interleaved(task.contestants(), settings.repetitions(15))
             peer = "cv2.BFMatcher.knnMatch"
-            rows.append(row(f"keys of a map of {size}, exact", times, "exact", "peer", peer))
+            rows.append(row(f"descriptors of a map of {size}, exact", times, "exact", "peer", peer))
             notes = f"{100 * task.agreement():.1f} % of the features as by the exact search"
-            rows.append(row(f"keys of a map of {size}, tree", times, "tree", "exact", "exact", notes))
+            rows.append(row(f"descriptors of a map of {size}, tree", times, "tree", "exact", "exact", notes))
     notes = f"{IN_VIEW} landmarks in view, predicted to 5 px"
-    rows.append(row(f"keys of a map of {max(SIZES)}, gated", times, "gated", "exact", "exact", notes))
+    rows.append(row(f"descriptors of a map of {max(SIZES)}, gated", times, "gated", "exact", "exact", notes))
     return rows
 
 
@@ -90,6 +92,6 @@ def row(name: str, times: dict[str, Timing], ours: str, other: str, baseline: st
         theirs / figure,
         aim=f"<= {AIM_MS:g} ms" if gated else "",
         met=figure <= AIM_MS if gated else None,
-        notes=f"{FEATURES} features, keys of {LENGTH}; {notes + '; ' if notes else ''}{times[ours].spread}",
+        notes=f"{FEATURES} features, descriptors of {LENGTH}; {notes + '; ' if notes else ''}{times[ours].spread}",
         tolerance=0.5,
     )
