@@ -102,7 +102,7 @@ def test_where_nothing_was_mapped_the_map_goes_on():
     np.testing.assert_array_equal(run.updated[6:9], [0, 0, 1])
     assert any(note.startswith("pair 8: the camera is not found again in the map") for note in run.notes)
     known = run.front_end.sensor.manager
-    assert known.names[known.last_seen == known.frame].size > 10
+    assert known.names[known.last_observed == known.frame].size > 10
     assert (run.assumed[6:8] > 0).all() and (run.assumed[8:] == 0).all()
 
 
