@@ -7,9 +7,8 @@ import numpy as np
 
 from benchmarks.patch_search import one_thread, picture
 from benchmarks.rows import Row, Settings, Timing, interleaved
-from rbpf.sensors.descriptor_index import DescriptorIndex, Gate
-from rbpf.sensors.descriptor_search import ExactSearch, TreeSearch
-from rbpf.sensors.sift import Sift, SiftConfig
+from rbpf.sensors.descriptors.index import DescriptorIndex, ExactSearch, Gate, TreeSearch
+from rbpf.sensors.features.sift import Sift, SiftConfig
 
 SIZES, FEATURES, IN_VIEW = (1000, 10_000, 40_000), 300, 600
 LENGTH, NOISE = 36, 0.012

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 from benchmarks.rows import Row, Settings, interleaved
 from rbpf.core.filter import Filter
-from rbpf.sensors.features import FeatureFrame, FeatureLog
+from rbpf.sensors.feature_log import FeatureFrame, FeatureLog
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.system import build_filter, start_prior
 from rbpf.validation.simulation.features import MONO, Measuring, simulate_features

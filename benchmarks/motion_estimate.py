@@ -6,7 +6,7 @@ import numpy as np
 from benchmarks.rows import Row, Settings, interleaved
 from rbpf.lie import SE3
 from rbpf.motion.stereo_vo import MotionEstimate, estimate_motion
-from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+from rbpf.sensors.camera import Pinhole, RectifiedStereo
 
 AIM_MS = 5.0
 MATCHES, FALSE, NOISE_PX = 300, 0.2, 0.5

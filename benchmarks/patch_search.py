@@ -9,8 +9,8 @@ import numba
 import numpy as np
 
 from benchmarks.rows import Row, Settings, Timing, interleaved
-from rbpf.sensors.corners import corners
-from rbpf.sensors.patches import cut, search, warp
+from rbpf.sensors.features.corners import corners
+from rbpf.sensors.patches.search import cut, search, warp
 
 K, SIZE, RADIUS_PX, SIGMAS = 25, 11, 10.0, 3.0
 CORNERS, SPACING_PX = 40, 20.0

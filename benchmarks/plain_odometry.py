@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 
 from rbpf.lie import SE3
-from rbpf.sensors.descriptor_matching import MatchLimits
-from rbpf.sensors.pinhole import RectifiedStereo
-from rbpf.sensors.stereo_features import StereoFeatures, match_frames
+from rbpf.sensors.camera import RectifiedStereo
+from rbpf.sensors.descriptors.matching import MatchLimits
+from rbpf.sensors.stereo.features import StereoFeatures, match_frames
 
 WITHIN_PX, TRIALS, STEPS, HUBER = 2.0, 200, 12, 1.5
 

@@ -18,15 +18,14 @@ import numpy as np
 from benchmarks.plain_odometry import path
 from rbpf.core.exchange import NULL
 from rbpf.lie import SE3
-from rbpf.sensors.descriptor_index import DescriptorIndex, Gate
-from rbpf.sensors.descriptor_matching import MatchLimits
-from rbpf.sensors.descriptor_search import DescriptorSearch, ExactSearch, TreeSearch
-from rbpf.sensors.landmark_management import LandmarkManager, NewLandmarkConfig
-from rbpf.sensors.pinhole import RectifiedStereo
+from rbpf.sensors.camera import RectifiedStereo
+from rbpf.sensors.descriptors.index import DescriptorIndex, DescriptorSearch, ExactSearch, Gate, TreeSearch
+from rbpf.sensors.descriptors.landmark_management import LandmarkManager, NewLandmarkConfig
+from rbpf.sensors.descriptors.matching import MatchLimits
+from rbpf.sensors.features.sift import SiftConfig, descriptors_from_histograms
 from rbpf.sensors.readers.images import open_stereo
-from rbpf.sensors.sift import SiftConfig, descriptors_from_histograms
-from rbpf.sensors.stereo_features import StereoFeatures, match_frames
-from rbpf.sensors.stereo_matching import StereoSift
+from rbpf.sensors.stereo.features import StereoFeatures, match_frames
+from rbpf.sensors.stereo.matching import StereoSift
 
 NAMES = {"stereo_zed_room1": (1, 5, 10), "stereo_kitti_seq1": (1, 2, 3)}
 SLACK_PX, RIGHT = 2.0, 16.3

@@ -10,7 +10,7 @@ import numpy as np
 
 from benchmarks.mono_frames import Decoded
 from benchmarks.rows import Row, Settings
-from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.readers.images import open_stereo
 from rbpf.sensors.readers.images.stereo import StereoSequence
 from rbpf.systems.stereo.config import StereoConfig

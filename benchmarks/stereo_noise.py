@@ -15,11 +15,11 @@ import numpy as np
 
 from benchmarks.plain_odometry import WITHIN_PX, motion
 from rbpf.lie import SE3
-from rbpf.sensors.descriptor_matching import MatchLimits
-from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+from rbpf.sensors.camera import Pinhole, RectifiedStereo
+from rbpf.sensors.descriptors.matching import MatchLimits
 from rbpf.sensors.readers.images import StereoSequence, open_stereo
-from rbpf.sensors.stereo_features import match_frames
-from rbpf.sensors.stereo_matching import StereoSift
+from rbpf.sensors.stereo.features import match_frames
+from rbpf.sensors.stereo.matching import StereoSift
 from rbpf.validation.simulation.exposure import Imaging
 from rbpf.validation.simulation.images import simulate_images
 from rbpf.validation.simulation.textured_room import TexturedRoom

@@ -15,11 +15,11 @@ import numpy as np
 from benchmarks.plain_odometry import path
 from rbpf.lie import SE3
 from rbpf.runs.alignment import align
-from rbpf.sensors.pinhole import RectifiedStereo
+from rbpf.sensors.camera import RectifiedStereo
+from rbpf.sensors.features.sift import SiftConfig
 from rbpf.sensors.readers.images import StereoSequence, open_stereo
-from rbpf.sensors.sift import SiftConfig
-from rbpf.sensors.stereo_features import StereoFeatures
-from rbpf.sensors.stereo_matching import StereoConfig, StereoSift
+from rbpf.sensors.stereo.features import StereoFeatures
+from rbpf.sensors.stereo.matching import StereoConfig, StereoSift
 
 NAMES = "stereo_zed_room1", "stereo_kitti_seq1"
 SEEDS = 3

@@ -11,8 +11,8 @@ from benchmarks.rows import Row, Settings, interleaved
 from rbpf.core.models import Records
 from rbpf.lie import SE3
 from rbpf.motion.odometry import Odometry
-from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
-from rbpf.sensors.stereo_features import StereoFeatures
+from rbpf.sensors.camera import Pinhole, RectifiedStereo
+from rbpf.sensors.stereo.features import StereoFeatures
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.sensor import StereoFrame, StereoSensor
 from rbpf.systems.stereo.system import build_filter

@@ -11,7 +11,7 @@ from tempfile import TemporaryDirectory
 import tyro
 from PIL import Image
 
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.video import VideoRun
 from rbpf.validation.mono import Recording, start_mono

@@ -7,7 +7,7 @@ problem for GTSAM and for COLMAP's Ceres: two programs that have to give one ans
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.validation.colmap.against_colmap import compare_with_colmap
 from rbpf.validation.colmap.pipeline import ReconstructionOptions

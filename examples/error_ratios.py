@@ -11,7 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from rbpf.runs.plots import COLOURS, new_axes, save_figures
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers import stereo_tracks
 from rbpf.systems.mono.config import MonoConfig, SearchConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig

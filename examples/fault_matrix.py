@@ -13,7 +13,7 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
-from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.readers.images import open_images, open_stereo, read_known_points
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.stereo.config import StereoConfig

@@ -14,7 +14,7 @@ import matplotlib
 import numpy as np
 import tyro
 
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers.images import open_images
 from rbpf.validation.simulation.exposure import Imaging, Shutter
 from rbpf.validation.simulation.lab_furniture import furnished

@@ -22,7 +22,7 @@ import tyro
 from matplotlib.figure import Figure
 
 from rbpf.runs.plots import save_figures
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.validation.blackout_runs import run_series
 from rbpf.validation.blackouts import Blackouts, Outcome, Series

@@ -13,7 +13,7 @@ import tyro
 from matplotlib.figure import Figure
 
 from rbpf.lie import SE3
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.video import run_images
 from rbpf.validation.mono import Recording

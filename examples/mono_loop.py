@@ -25,7 +25,7 @@ import tyro
 from matplotlib.figure import Figure
 
 from rbpf.core.filter import Filter
-from rbpf.sensors.features import FeatureLog
+from rbpf.sensors.feature_log import FeatureLog
 from rbpf.systems.filtering import ProposalConfig
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.mono.config import InverseDepthConfig, MonoConfig

@@ -30,7 +30,7 @@ from matplotlib.ticker import NullFormatter
 
 from rbpf.core.diagnostics import chi_square_band
 from rbpf.motion.constant_velocity import PosePrior
-from rbpf.sensors.features import FeatureLog, KnownPoints
+from rbpf.sensors.feature_log import FeatureLog, KnownPoints
 from rbpf.systems.filtering import ProposalConfig, ResamplingConfig
 from rbpf.systems.mono.config import InverseDepthConfig, MonoConfig, VelocityConfig
 from rbpf.systems.mono.run import pose_estimate

@@ -21,7 +21,7 @@ import tyro
 from matplotlib.figure import Figure
 
 from rbpf.runs.plots import save_figures
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.validation.search_statistics import SearchStatistics, measure_search
 from rbpf.validation.simulation.exposure import Imaging

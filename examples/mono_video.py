@@ -8,7 +8,7 @@ from pathlib import Path
 
 import tyro
 
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers.images import open_images, read_known_points
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.video import run_images

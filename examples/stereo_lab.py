@@ -10,7 +10,7 @@ from pathlib import Path
 
 import tyro
 
-from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.validation.simulation.exposure import Imaging
 from rbpf.validation.simulation.images import simulate_images

@@ -19,7 +19,7 @@ import tyro
 from matplotlib.figure import Figure
 
 from rbpf.lie import SE3
-from rbpf.sensors.features import FeatureLog
+from rbpf.sensors.feature_log import FeatureLog
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig, ResamplingConfig
 from rbpf.systems.stereo.config import OUTLIER_VOLUME_PX3, OdometryConfig, StereoConfig, TriggerConfig
 from rbpf.systems.stereo.run import run_features

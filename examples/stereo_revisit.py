@@ -16,7 +16,7 @@ import numpy as np
 import tyro
 
 from rbpf.runs.plots import COLOURS, new_axes, save_figures
-from rbpf.sensors.features import CameraTruth, FeatureLog
+from rbpf.sensors.feature_log import CameraTruth, FeatureLog
 from rbpf.sensors.readers import stereo_tracks
 from rbpf.sensors.readers.images import open_stereo
 from rbpf.systems.stereo.config import StereoConfig

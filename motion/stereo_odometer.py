@@ -63,7 +63,7 @@ class OdometerStep(NamedTuple):
 
 
 class SeenFrame(Protocol):
-    """What `odometry_path` reads of a frame: `rbpf.sensors.features.FeatureFrame` is one."""
+    """What `odometry_path` reads of a frame: `rbpf.sensors.feature_log.FeatureFrame` is one."""
 
     @property
     def stamp_ns(self) -> int:

@@ -69,7 +69,7 @@ def plain_pictures() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def keypoints_once() -> Iterator[None]:
     """In an image that one of the module's tests has seen, keypoints are not looked for again."""
-    from rbpf.sensors.sift import Keypoints, Sift, SiftConfig
+    from rbpf.sensors.features.sift import Keypoints, Sift, SiftConfig
 
     detect, known = Sift.detect, dict[tuple[SiftConfig, bytes], Keypoints]()
 

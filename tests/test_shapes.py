@@ -12,15 +12,15 @@ import rbpf.core.exchange
 import rbpf.core.models
 import rbpf.gaussian
 import rbpf.lie
-import rbpf.sensors.pinhole
+import rbpf.sensors.camera
 from rbpf.arrays import Float
 from rbpf.core.exchange import Records
 from rbpf.gaussian import product
 from rbpf.lie import SE2, SE3
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
 from tests.shapes import ShapeError, checked, fits
 
-PUBLIC = [rbpf.core.exchange, rbpf.gaussian, rbpf.lie, rbpf.core.models, rbpf.sensors.pinhole]
+PUBLIC = [rbpf.core.exchange, rbpf.gaussian, rbpf.lie, rbpf.core.models, rbpf.sensors.camera]
 on = pytest.mark.skipif(os.environ.get("RBPF_SHAPES") == "0", reason="shapes are not checked in this run")
 
 

@@ -18,7 +18,7 @@ from rbpf.runs.alignment import Alignment
 from rbpf.runs.measurement_files import read_feature_log
 from rbpf.runs.reading import RunFolder
 from rbpf.runs.trajectory import Trajectory, in_space
-from rbpf.sensors.features import FeatureFrame, FeatureLog
+from rbpf.sensors.feature_log import FeatureFrame, FeatureLog
 from rbpf.sensors.readers import open_log
 from rbpf.sensors.readers.measurements import InitialEstimate
 from rbpf.systems.filtering import ProposalConfig

@@ -16,7 +16,7 @@ from rbpf.lie import Array
 from rbpf.runs.alignment import Alignment
 from rbpf.runs.path_and_map import PathAndMap
 from rbpf.runs.trajectory import Trajectory, associate
-from rbpf.sensors.features import FeatureLog
+from rbpf.sensors.feature_log import FeatureLog
 from rbpf.sensors.readers import open_log
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig

@@ -16,8 +16,8 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.files import prepare_folder
 from rbpf.runs.path_and_map import PathAndMap
-from rbpf.sensors.features import FeatureLog
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
+from rbpf.sensors.feature_log import FeatureLog
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.validation.colmap.model import build_model
 from rbpf.validation.gtsam.batch_problem import Problem

@@ -13,7 +13,7 @@ from typing import TypeVar
 import numpy as np
 
 from rbpf.errors import InputError
-from rbpf.sensors.pinhole import RectifiedStereo
+from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.readers.images.sequence import ImageFrame, ImageSequence, Source
 from rbpf.sensors.readers.images.stereo import StereoSequence
 

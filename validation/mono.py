@@ -8,8 +8,7 @@ from typing import Any
 from rbpf.errors import InputError
 from rbpf.runs.files import prepare_folder
 from rbpf.runs.provenance import left_out
-from rbpf.sensors.chessboard import Board, find_board
-from rbpf.sensors.markers import MarkerBoard, find_markers
+from rbpf.sensors.calibration.boards import Board, MarkerBoard, find_board, find_markers
 from rbpf.sensors.readers.images import ImageSequence, KnownPixels, Topics, open_images, read_known_points
 from rbpf.sensors.readers.images.topics import UNNAMED
 from rbpf.systems.mono.config import MonoConfig

@@ -22,7 +22,7 @@ import numpy as np
 
 from rbpf.runs.alignment import Alignment
 from rbpf.runs.trajectory import Trajectory
-from rbpf.sensors.features import FeatureLog
+from rbpf.sensors.feature_log import FeatureLog
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.run import run as filter_log
 from rbpf.systems.mono.video import VideoRun

@@ -3,7 +3,7 @@
 import numpy as np
 
 from rbpf.lie import SE3
-from rbpf.sensors.chessboard import spread_rows
+from rbpf.sensors.calibration.boards import spread_rows
 from rbpf.systems.mono.known_map import KnownMap
 from rbpf.systems.mono.system import world_of
 from rbpf.systems.mono.video import VideoRun

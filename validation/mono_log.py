@@ -1,6 +1,6 @@
 """What a run over images measured, as a log of features: for batch adjustment, for files, to filter it again."""
 
-from rbpf.sensors.features import FeatureLog, KnownPoints
+from rbpf.sensors.feature_log import FeatureLog, KnownPoints
 from rbpf.systems.mono.known_start import located_points
 from rbpf.systems.mono.video import VideoRun
 

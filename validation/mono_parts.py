@@ -9,8 +9,8 @@ import numpy as np
 from rbpf.core.belief import Belief
 from rbpf.core.models import NewLandmarks, Observations, Sensor
 from rbpf.lie import SE3
-from rbpf.sensors.camera_points import CameraRay
-from rbpf.sensors.features import FeatureFrame, FeatureLog
+from rbpf.sensors.camera.points import CameraRay
+from rbpf.sensors.feature_log import FeatureFrame, FeatureLog
 from rbpf.systems.mono.feature_sensor import FeatureSensor
 from rbpf.validation.gtsam.mono_batch import Batch, adjust_log
 

@@ -7,7 +7,7 @@ from typing import final
 import numpy as np
 
 from rbpf.errors import InputError
-from rbpf.sensors.features import CameraTruth, FeatureLog
+from rbpf.sensors.feature_log import CameraTruth, FeatureLog
 from rbpf.sensors.readers.images.sequence import ImageFrame, Source
 from rbpf.sensors.readers.images.stereo import StereoSequence
 

@@ -84,8 +84,8 @@ def use_threads(threads: int | None) -> None:
 
 def _search_patches() -> None:
     """Calls what is compiled at its first call, as the systems call it, on a few numbers; so do those below."""
-    from rbpf.sensors.corners import corners
-    from rbpf.sensors.patches import cut, search, warp
+    from rbpf.sensors.features.corners import corners
+    from rbpf.sensors.patches.search import cut, search, warp
 
     rng = np.random.default_rng(0)
     image = rng.integers(0, 256, (30, 40)).repeat(5, axis=0).repeat(5, axis=1).astype(np.uint8)
@@ -97,7 +97,7 @@ def _search_patches() -> None:
 
 def _measure_motion() -> None:
     from rbpf.motion.stereo_vo import estimate_motion
-    from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+    from rbpf.sensors.camera import Pinhole, RectifiedStereo
 
     rng = np.random.default_rng(0)
     rig = RectifiedStereo(Pinhole(640, 480, 500.0, 500.0, 319.5, 239.5), 0.12)

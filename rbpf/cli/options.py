@@ -7,8 +7,7 @@ from typing import Annotated, Literal
 import tyro
 
 from rbpf.errors import InputError
-from rbpf.sensors.chessboard import Board
-from rbpf.sensors.markers import MarkerBoard
+from rbpf.sensors.calibration.boards import Board, MarkerBoard
 from rbpf.sensors.readers.images.topics import Topics
 
 Flag = tyro.conf.FlagCreatePairsOff[bool]

@@ -12,7 +12,7 @@ from rbpf.cli.showing import answer, megabytes, progress, told
 from rbpf.errors import InputError
 
 if TYPE_CHECKING:
-    from rbpf.sensors.pinhole import Pinhole
+    from rbpf.sensors.camera import Pinhole
     from rbpf.validation.simulation.exposure import Imaging
     from rbpf.validation.simulation.textured_scene import ImageWorld
 
@@ -83,7 +83,7 @@ def _render(world: "ImageWorld", options: ImagesOptions | LabOptions) -> None:
 
 
 def _camera(options: ImagesOptions | LabOptions) -> "Pinhole":
-    from rbpf.sensors.pinhole import Pinhole
+    from rbpf.sensors.camera import Pinhole
 
     focal = options.focal_px or FOCAL_FRACTION[type(options)] * options.width
     intrinsics = focal, focal, 0.5 * (options.width - 1), 0.5 * (options.height - 1)

@@ -27,5 +27,9 @@ def discard_stale(folder: Path) -> None:
 
 @cache
 def _newest_source() -> float:
-    sources = [*_PACKAGE.glob("kernels/*.py"), *_PACKAGE.glob("*/*kernel*.py")]
+    sources = [
+        *_PACKAGE.glob("kernels/*.py"),
+        *_PACKAGE.glob("*/*kernel*.py"),
+        *_PACKAGE.glob("*/*/*kernel*.py"),
+    ]
     return max(source.stat().st_mtime for source in sources)

@@ -52,8 +52,8 @@ from rbpf import gaussian
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3, Array, SE2Group, SE3Group
 from rbpf.runs.files import whole
-from rbpf.sensors.features import FeatureFrame, FeatureLog, KnownPoints
-from rbpf.sensors.pinhole import LENSES, Pinhole, RectifiedStereo
+from rbpf.sensors.camera import LENSES, Pinhole, RectifiedStereo
+from rbpf.sensors.feature_log import FeatureFrame, FeatureLog, KnownPoints
 from rbpf.sensors.readers.measurements import KINDS, Measurements, are_covariances, are_poses, point_dim
 from rbpf.sensors.readers.table import parse_number
 from rbpf.sensors.readers.text import line_error, quoted, read_lines

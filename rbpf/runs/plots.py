@@ -24,7 +24,7 @@ from rbpf.runs.files import whole
 from rbpf.runs.reading import FilteredPath, RunFolder
 from rbpf.runs.trajectory import associate, in_space, read_tum
 from rbpf.runs.truth import TRUTH
-from rbpf.sensors.features import FeatureLog
+from rbpf.sensors.feature_log import FeatureLog
 
 SIGMAS = 3.0
 COLOURS = {

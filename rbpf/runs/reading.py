@@ -27,7 +27,7 @@ from rbpf.runs.path_and_map import PathAndMap
 from rbpf.runs.provenance import read_config, require_own_version
 from rbpf.runs.trajectory import Trajectory, in_space
 from rbpf.runs.truth import RunTruth, read_truth
-from rbpf.sensors.features import FeatureLog
+from rbpf.sensors.feature_log import FeatureLog
 from rbpf.sensors.readers.measurements import Measurements
 from rbpf.systems.map_estimate import MapEstimate
 

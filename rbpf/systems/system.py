@@ -20,7 +20,7 @@ import numpy as np
 from rbpf.arrays import Float, Int
 from rbpf.core.filter import Filter
 from rbpf.lie import SE2Group, SE3Group
-from rbpf.sensors.features import FeatureLog
+from rbpf.sensors.feature_log import FeatureLog
 from rbpf.sensors.readers.measurements import Measurements
 from rbpf.systems.map_estimate import MapEstimate
 

@@ -17,8 +17,8 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
-from rbpf.sensors.features import FeatureFrame, FeatureLog
-from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+from rbpf.sensors.camera import Pinhole, RectifiedStereo
+from rbpf.sensors.feature_log import FeatureFrame, FeatureLog
 from rbpf.sensors.readers.table import Table, parse_table, read_columns
 from rbpf.sensors.readers.text import line_error, read_text
 

@@ -11,7 +11,7 @@ import pytest
 from rbpf.cli import main
 from rbpf.errors import InputError
 from rbpf.runs.files import whole
-from rbpf.sensors.pinhole import RectifiedStereo
+from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.readers.images import open_images, open_stereo
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.video import run_images

@@ -8,7 +8,7 @@ import yaml
 from rbpf.cli import main
 from rbpf.lie import SE3
 from rbpf.runs.trajectory import read_tum
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
 from tests.cli.mono_sequences import run, sentence, summary
 
 pytestmark = pytest.mark.slow

@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from rbpf.cli import main
-from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.validation.simulation.exposure import Imaging
 from rbpf.validation.simulation.images import simulate_images
 from rbpf.validation.simulation.textured_desk import TexturedDesk

@@ -11,7 +11,7 @@ from rbpf.lie import SE3
 from rbpf.lie.matrices import skew
 from rbpf.maps.constellation import Constellation, UncertainConstellation
 from rbpf.maps.landmark_map import LandmarkMap
-from rbpf.sensors.camera_constellation import ConstellationView, MembersView
+from rbpf.sensors.camera.constellation import ConstellationView, MembersView
 from tests.exactness.models import Kalman
 from tests.sensors.camera_scenes import DISTORTED
 

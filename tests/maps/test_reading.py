@@ -12,8 +12,8 @@ from rbpf.lie import SE3
 from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
-from rbpf.sensors.camera_points import CameraPoint, CameraRay, EpipolarRay
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
+from rbpf.sensors.camera.points import CameraPoint, CameraRay, EpipolarRay
 
 CAMERA = Pinhole(640, 480, 400.0, 400.0, 319.5, 239.5, (-0.1, 0.02, 0.001, -0.001, 0.0))
 

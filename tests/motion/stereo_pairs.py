@@ -6,7 +6,7 @@ import numpy as np
 
 from rbpf.lie import SE3
 from rbpf.motion.stereo_geometry import Matches
-from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+from rbpf.sensors.camera import Pinhole, RectifiedStereo
 
 CAR = RectifiedStereo(Pinhole(1241, 376, 718.0, 718.0, 607.0, 185.0), 0.537)
 HAND = RectifiedStereo(Pinhole(672, 376, 350.0, 352.0, 336.0, 188.0), 0.12)

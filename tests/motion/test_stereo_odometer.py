@@ -9,7 +9,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.motion.stereo_odometer import Prediction, StereoOdometer, chain, match_names, odometry_path
 from rbpf.motion.stereo_vo import VoConfig
-from rbpf.sensors.features import FeatureFrame
+from rbpf.sensors.feature_log import FeatureFrame
 from tests.motion.stereo_pairs import CAR, HAND, ROAD, ROOM, World, simulate
 
 TWIST = np.array([0.1, 0.6, -0.05, 0.2, 0.1, 0.9])

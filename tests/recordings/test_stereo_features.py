@@ -5,12 +5,12 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.sensors.descriptor_index import DescriptorIndex, Gate
-from rbpf.sensors.descriptor_matching import MatchLimits, distances
+from rbpf.sensors.descriptors.index import DescriptorIndex, Gate
+from rbpf.sensors.descriptors.matching import MatchLimits, distances
+from rbpf.sensors.features.sift import SiftConfig
 from rbpf.sensors.readers.images import open_stereo
-from rbpf.sensors.sift import SiftConfig
-from rbpf.sensors.stereo_features import match_frames
-from rbpf.sensors.stereo_matching import StereoConfig, StereoSift
+from rbpf.sensors.stereo.features import match_frames
+from rbpf.sensors.stereo.matching import StereoConfig, StereoSift
 
 pytestmark = pytest.mark.real_data
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rbpf.sensors.features import CameraTruth
+from rbpf.sensors.feature_log import CameraTruth
 from rbpf.sensors.readers import stereo_tracks
 from rbpf.sensors.readers.images import open_stereo
 from rbpf.sensors.readers.images.stereo import StereoSequence

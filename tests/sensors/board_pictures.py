@@ -5,8 +5,8 @@ from functools import cache
 import numpy as np
 
 from rbpf.lie import SE3
-from rbpf.sensors.chessboard import Board
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.calibration.boards import Board
+from rbpf.sensors.camera import Pinhole
 from rbpf.validation.simulation.furniture import Furniture
 from rbpf.validation.simulation.render import Renderer
 from rbpf.validation.simulation.textures import wood

@@ -8,7 +8,7 @@ from rbpf.core.models import ObservationModel
 from rbpf.kernels.signature import BLOCK
 from rbpf.kernels.single import call_kernel
 from rbpf.lie import SE3
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
 
 PLAIN = Pinhole(640, 480, 400.0, 410.0, 319.5, 239.5)
 DISTORTED = Pinhole(640, 480, 400.0, 410.0, 319.5, 239.5, (-0.28, 0.07, 2e-4, -3e-4, 0.01))

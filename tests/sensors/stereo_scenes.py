@@ -4,7 +4,7 @@ from functools import cache
 
 import numpy as np
 
-from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.validation.simulation.exposure import Imaging, Shutter
 from rbpf.validation.simulation.render import Renderer
 from rbpf.validation.simulation.textured_room import TexturedRoom

@@ -7,9 +7,9 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.sensors.board_calibration import BoardView, calibrate
-from rbpf.sensors.chessboard import Board, board_corners
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.calibration.boards import Board, board_corners
+from rbpf.sensors.calibration.camera import BoardView, calibrate
+from rbpf.sensors.camera import Pinhole
 from tests.sensors.board_pictures import BOARD, CAMERA, FISHEYE, directions, nearby, pictures
 
 SIZE = CAMERA.width, CAMERA.height

@@ -8,8 +8,8 @@ from rbpf.core.models import Records
 from rbpf.core.numeric import numeric_jacobians
 from rbpf.lie import SE3, Euclidean, Product
 from rbpf.maps.constellation import Constellation, UncertainConstellation
-from rbpf.sensors.camera_constellation import ConstellationView, MembersView
-from rbpf.sensors.camera_points import CameraPoint
+from rbpf.sensors.camera.constellation import ConstellationView, MembersView
+from rbpf.sensors.camera.points import CameraPoint
 from tests.exactness.models import known
 from tests.sensors.camera_scenes import CAMERAS, PLAIN, with_velocity
 

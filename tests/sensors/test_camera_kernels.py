@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from rbpf.lie import SE3
-from rbpf.sensors import camera_kernels, camera_points
-from rbpf.sensors.camera_constellation import ConstellationView, MembersView
-from rbpf.sensors.camera_points import CameraPoint, CameraRay, EpipolarRay
+from rbpf.sensors.camera import kernels, points
+from rbpf.sensors.camera.constellation import ConstellationView, MembersView
+from rbpf.sensors.camera.points import CameraPoint, CameraRay, EpipolarRay
 from tests.exactness.models import known
 from tests.sensors.camera_scenes import CAMERAS, DISTORTED, PLAIN, Rays, compiled, with_velocity
 
@@ -71,7 +71,7 @@ def test_rays_on_either_side_of_the_threshold(camera):
 
 
 def test_both_keep_the_same_depth_in_front():
-    assert camera_kernels.MIN_DEPTH_FRACTION == camera_points.MIN_DEPTH_FRACTION
+    assert kernels.MIN_DEPTH_FRACTION == points.MIN_DEPTH_FRACTION
 
 
 ANGLES = [0.0, 1e-9, 1e-3, 0.1 - 1e-9, 0.1 + 1e-9, 0.5, 1.0, 3.0, np.pi, 5.0]

@@ -10,8 +10,8 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3, Euclidean, Product
 from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.maps.point import Point
-from rbpf.sensors.camera_points import MIN_DEPTH_FRACTION, CameraPoint, CameraRay, EpipolarRay, clamp_depth
-from rbpf.sensors.pinhole import RectifiedStereo
+from rbpf.sensors.camera import RectifiedStereo
+from rbpf.sensors.camera.points import MIN_DEPTH_FRACTION, CameraPoint, CameraRay, EpipolarRay, clamp_depth
 from tests.exactness.models import known
 from tests.sensors.camera_scenes import CAMERAS, PLAIN, Rays, with_velocity
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from rbpf.errors import InputError
-from rbpf.sensors.chessboard import MOST, Board, find_board, spread_rows
+from rbpf.sensors.calibration.boards import MOST, Board, find_board, spread_rows
 
 BOARD = Board(9, 6, 0.024)
 TEXELS, MARGIN = 40, 60

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from rbpf.lie import SE3
-from rbpf.sensors.consensus_resection import refined, resect_consensus
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
+from rbpf.sensors.camera.resection import refined, resect_consensus
 
 CAMERA = Pinhole(640, 480, 500.0, 510.0, 320.0, 240.0, (-0.2, 0.05, 0.001, -0.001, 0.0))
 POSE = SE3.retract(SE3.identity(), np.array([0.2, -0.3, 0.1, 0.5, -0.2, 0.4]))

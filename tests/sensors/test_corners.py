@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rbpf.errors import InputError
-from rbpf.sensors.corners import MARGIN_PX, WINDOW_PX, corners
+from rbpf.sensors.features.corners import MARGIN_PX, WINDOW_PX, corners
 from tests.sensors.patch_scenes import Waves
 
 NONE = np.zeros((0, 2))

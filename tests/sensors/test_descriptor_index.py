@@ -7,10 +7,8 @@ from hypothesis import strategies as st
 
 from rbpf.core.exchange import NULL
 from rbpf.errors import InputError
-from rbpf.sensors.descriptor_index import DescriptorIndex, Gate
-from rbpf.sensors.descriptor_matching import MatchLimits
-from rbpf.sensors.descriptor_search import ExactSearch, TreeSearch
-from rbpf.sensors.descriptor_store import DescriptorStore
+from rbpf.sensors.descriptors.index import DescriptorIndex, DescriptorStore, ExactSearch, Gate, TreeSearch
+from rbpf.sensors.descriptors.matching import MatchLimits
 from tests.sensors.test_descriptor_matching import unit
 
 LIMITS = MatchLimits(0.3, 0.8)

@@ -6,9 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rbpf.errors import InputError
-from rbpf.sensors import descriptor_matching
-from rbpf.sensors.candidates import band_pairs, gate_pairs
-from rbpf.sensors.descriptor_matching import MatchLimits, match_all, match_pairs
+from rbpf.sensors.descriptors import matching as descriptor_matching
+from rbpf.sensors.descriptors.matching import MatchLimits, band_pairs, gate_pairs, match_all, match_pairs
 
 
 def unit(rng, count, length=8):

@@ -17,7 +17,7 @@ from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
 from rbpf.motion.odometry import Odometry, OdometryMotion
-from rbpf.sensors.camera_points import CameraPoint, CameraRay, EpipolarRay
+from rbpf.sensors.camera.points import CameraPoint, CameraRay, EpipolarRay
 from tests.exactness.models import Frame, Scripted, known
 from tests.sensors.camera_scenes import CAMERAS, PLAIN, Rays
 

@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rbpf.errors import InputError
-from rbpf.sensors.camera_points import MIN_DEPTH_FRACTION
-from rbpf.sensors.equidistant import MAX_ANGLE, Equidistant
-from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+from rbpf.sensors.camera import Pinhole, RectifiedStereo
+from rbpf.sensors.camera.distortion import MAX_ANGLE, Equidistant
+from rbpf.sensors.camera.points import MIN_DEPTH_FRACTION
 from tests.sensors.test_pinhole import FISHEYES, matrix, seen_points
 
 every_fisheye = pytest.mark.parametrize("camera", FISHEYES.values(), ids=FISHEYES.keys())

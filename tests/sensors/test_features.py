@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from rbpf.errors import InputError
-from rbpf.sensors.features import CameraTruth, FeatureFrame, FeatureLog, KnownPoints
-from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+from rbpf.sensors.camera import Pinhole, RectifiedStereo
+from rbpf.sensors.feature_log import CameraTruth, FeatureFrame, FeatureLog, KnownPoints
 
 CAMERA = Pinhole(640, 480, 500.0, 500.0, 320.0, 240.0)
 STEREO = RectifiedStereo(CAMERA, 0.1)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from rbpf.sensors.impulse_noise import TOLERATED_FRACTION, remove_impulses
-from rbpf.sensors.stereo_matching import StereoConfig, StereoSift
+from rbpf.sensors.stereo.impulse_noise import TOLERATED_FRACTION, remove_impulses
+from rbpf.sensors.stereo.matching import StereoConfig, StereoSift
 from rbpf.validation.image_faults import salt_and_pepper
 from tests.systems.stereo_sequences import pairs
 

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from rbpf.errors import InputError
-from rbpf.sensors.corners import corners
-from rbpf.sensors.keypoints import LENGTH, describe, describe_windows
-from rbpf.sensors.patches import cut
+from rbpf.sensors.features.corners import corners
+from rbpf.sensors.features.sift import LENGTH, describe, describe_windows
+from rbpf.sensors.patches.search import cut
 
 
 def textured(seed: int = 0, shape: tuple[int, int] = (240, 320)) -> np.ndarray:

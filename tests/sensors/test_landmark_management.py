@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rbpf.errors import InputError
-from rbpf.sensors.descriptor_matching import distances
-from rbpf.sensors.landmark_management import LandmarkManager, NewLandmarkConfig
+from rbpf.sensors.descriptors.landmark_management import LandmarkManager, NewLandmarkConfig
+from rbpf.sensors.descriptors.matching import distances
 from tests.sensors.test_descriptor_matching import unit
 
 SIZE = (640, 480)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from rbpf.errors import InputError
-from rbpf.sensors.markers import MarkerBoard, find_markers
+from rbpf.sensors.calibration.boards import MarkerBoard, find_markers
 
 BOARD = MarkerBoard(4, 3, 0.04, 0.01, "4X4_50")
 TEXELS_PER_M, MARGIN = 2000.0, 60

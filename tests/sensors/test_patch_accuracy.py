@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from rbpf.sensors.corners import corners
-from rbpf.sensors.patches import cut, search, warp
+from rbpf.sensors.features.corners import corners
+from rbpf.sensors.patches.search import cut, search, warp
 from tests.sensors.patch_scenes import Waves, window
 
 SHAPE = (240, 260)

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from rbpf.errors import InputError
-from rbpf.sensors.patch_correlation_kernels import normalised, score_ellipse
-from rbpf.sensors.patch_kernels import APART_PX, OUTSIDE, interval
-from rbpf.sensors.patches import search
+from rbpf.sensors.patches.kernels import APART_PX, OUTSIDE, interval, normalised, score_ellipse
+from rbpf.sensors.patches.search import search
 from tests.sensors.patch_scenes import Waves, inside_ellipse, interpolated, score_map, unit, window
 
 SHAPE = (90, 110)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from rbpf.errors import InputError
-from rbpf.sensors.patch_warp_kernels import footprint
-from rbpf.sensors.patches import cut, warp
+from rbpf.sensors.patches.kernels import footprint
+from rbpf.sensors.patches.search import cut, warp
 from tests.sensors.patch_scenes import Waves, cubic, unit, window
 
 TURN = np.array([[np.cos(0.5), -np.sin(0.5)], [np.sin(0.5), np.cos(0.5)]])

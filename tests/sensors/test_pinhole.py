@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rbpf.errors import InputError
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
 
 EUROC = (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05, 0.0)
 TUM_VI = (0.0034823894022493434, 0.0007150348452162257, -0.0020532361418706202, 0.00020293673591811182)
@@ -208,7 +208,7 @@ class TestPinhole:
 
     def test_the_import_is_light(self):
         heavy = "{'cv2', 'numba', 'scipy', 'matplotlib', 'gtsam', 'pycolmap'}"
-        program = f"import sys, rbpf.sensors.pinhole; print(sorted({heavy} & set(sys.modules)))"
+        program = f"import sys, rbpf.sensors.camera; print(sorted({heavy} & set(sys.modules)))"
         done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
         assert done.stdout.strip() == "[]"
 

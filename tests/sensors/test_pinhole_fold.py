@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
 
 FOLDING = Pinhole(640, 480, 320.0, 320.0, 320.0, 240.0, (-0.25, 0.0, 0.0, 0.0, 0.0))
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from numba import njit
 
-from rbpf.sensors.pinhole import Pinhole
-from rbpf.sensors.pinhole_kernels import project
+from rbpf.sensors.camera import Pinhole
+from rbpf.sensors.camera.kernels import project
 
 DISTORTIONS = {
     "none": (0.0, 0.0, 0.0, 0.0, 0.0),

@@ -9,8 +9,7 @@ from hypothesis.extra.numpy import arrays
 from rbpf.core.models import Part
 from rbpf.core.numeric import numeric_jacobians
 from rbpf.lie import SE2, SE3
-from rbpf.sensors.range_bearing import RangeBearing, RelativePosition, wrap_angle
-from rbpf.sensors.rigid_point import RigidPointModel
+from rbpf.sensors.range_bearing import RangeBearing, RelativePosition, RigidPointModel, wrap_angle
 
 MOUNTED_2D = np.array([0.4, 0.3, -0.2])
 MOUNTED_3D = SE3.retract(SE3.identity(), np.array([0.3, -0.2, 0.5, 0.1, 0.2, -0.3]))

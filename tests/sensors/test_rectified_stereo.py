@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rbpf.errors import InputError
-from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+from rbpf.sensors.camera import Pinhole, RectifiedStereo
 
 CAMERA = Pinhole(640, 480, 525.0, 520.0, 319.5, 239.5)
 STEREO = RectifiedStereo(CAMERA, 0.12)

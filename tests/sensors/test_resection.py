@@ -6,7 +6,7 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.sensors.resection import resect
+from rbpf.sensors.camera.resection import resect
 from tests.sensors.camera_scenes import CAMERAS, DISTORTED, PLAIN
 
 SQUARE = np.array([[-0.2, -0.2, 0.0], [0.2, -0.2, 0.0], [0.2, 0.2, 0.0], [-0.2, 0.2, 0.0]])

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from rbpf.errors import InputError
-from rbpf.sensors.sift import Sift, SiftConfig, descriptors_from_histograms, pooled
+from rbpf.sensors.features.sift import Sift, SiftConfig, descriptors_from_histograms, pooled
 from tests.sensors.stereo_scenes import room
 
 

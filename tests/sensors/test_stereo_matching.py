@@ -5,11 +5,11 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.sensors.descriptor_matching import DescriptorMatches, MatchLimits
-from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
-from rbpf.sensors.sift import Keypoints, SiftConfig
-from rbpf.sensors.stereo_features import match_frames, triangulate_jacobian
-from rbpf.sensors.stereo_matching import StereoConfig, StereoSift, one_per_place
+from rbpf.sensors.camera import Pinhole, RectifiedStereo
+from rbpf.sensors.descriptors.matching import DescriptorMatches, MatchLimits
+from rbpf.sensors.features.sift import Keypoints, SiftConfig
+from rbpf.sensors.stereo.features import match_frames, triangulate_jacobian
+from rbpf.sensors.stereo.matching import StereoConfig, StereoSift, one_per_place
 from tests.sensors.stereo_scenes import RIG, room, true_disparity
 
 FULL = SiftConfig(features=0, working_scale=1.0)

@@ -6,9 +6,8 @@ import pytest
 from rbpf.conformance import check_model
 from rbpf.core.numeric import invert_with_covariance, numeric_jacobians
 from rbpf.lie import SE3
-from rbpf.sensors.camera_points import CameraPoint
-from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
-from rbpf.sensors.stereo_points import StereoPoint
+from rbpf.sensors.camera import Pinhole, RectifiedStereo
+from rbpf.sensors.camera.points import CameraPoint, StereoPoint
 from tests.exactness.models import known
 from tests.sensors.camera_scenes import PLAIN, Rays
 from tests.sensors.test_camera_kernels import assert_twins, lanes

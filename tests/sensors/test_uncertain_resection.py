@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from rbpf.lie import SE3
-from rbpf.sensors.pinhole import Pinhole
-from rbpf.sensors.uncertain_resection import GATE, Sights, refined_on_all, squared_distances
+from rbpf.sensors.camera import Pinhole
+from rbpf.sensors.camera.resection import GATE, Sights, refined_on_all, squared_distances
 
 CAMERA = Pinhole(640, 480, 500.0, 510.0, 320.0, 240.0, (-0.2, 0.05, 0.001, -0.001, 0.0))
 POSE = SE3.retract(SE3.identity(), np.array([0.05, -0.1, 0.1, 0.3, -0.1, 0.1]))

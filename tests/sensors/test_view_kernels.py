@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from rbpf.lie import SE3
-from rbpf.sensors.pinhole import Pinhole
-from rbpf.sensors.view_kernels import in_view
+from rbpf.sensors.camera import Pinhole
+from rbpf.sensors.camera.kernels import in_view
 from rbpf.systems.mono.viewing import directions
 
 CAMERAS = {

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from rbpf.lie import SE3
-from rbpf.sensors.features import FeatureFrame, FeatureLog
+from rbpf.sensors.feature_log import FeatureFrame, FeatureLog
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.run import MonoRun
 from rbpf.validation.simulation.features import MONO, Measuring, simulate_features

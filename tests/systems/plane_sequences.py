@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from rbpf.lie import SE3
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers.images import ImageFrame, ImageSequence, KnownPixels
 from rbpf.sensors.readers.images.sequence import Source
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from rbpf.lie import SE3
-from rbpf.sensors.features import CameraTruth
-from rbpf.sensors.pinhole import RectifiedStereo
+from rbpf.sensors.camera import RectifiedStereo
+from rbpf.sensors.feature_log import CameraTruth
 from rbpf.sensors.readers.images import ImageFrame, ImageSequence
 from rbpf.sensors.readers.images.sequence import Source
 from rbpf.sensors.readers.images.stereo import StereoSequence

@@ -5,8 +5,8 @@ import pytest
 import yaml
 
 from rbpf.lie import SE3
-from rbpf.sensors.chessboard import Board
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.calibration.boards import Board
+from rbpf.sensors.camera import Pinhole
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.video import run_images
 from rbpf.validation.gtsam.mono_batch import adjust_run, score_batch

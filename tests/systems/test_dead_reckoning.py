@@ -7,7 +7,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.motion.odometry import Odometry
 from rbpf.motion.stereo_odometer import StereoOdometer
-from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.systems.stereo.config import TriggerConfig
 from rbpf.systems.stereo.dead_reckoning import DeadReckoning, Pixels, chained, standstill
 from rbpf.systems.stereo.run import triggered

@@ -7,8 +7,8 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.sensors.features import FeatureFrame
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
+from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.sensors.readers.images import KnownPixels
 from rbpf.systems.mono.known_start import (
     NEEDLE,

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from rbpf.lie import SE3
-from rbpf.sensors.corners import corners
-from rbpf.sensors.uncertain_resection import GATE, squared_distances
+from rbpf.sensors.camera.resection import GATE, squared_distances
+from rbpf.sensors.features.corners import corners
 from rbpf.systems.mono.config import RelocalisationConfig
 from rbpf.systems.mono.last_view import LEAST, LastView, mutual
 from rbpf.systems.mono.likeness import described

@@ -7,7 +7,7 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers.images.sequence import ImageSequence, Source
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.known_map import KnownMap, read_known_map, write_known_map

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from rbpf.lie import SE3
-from rbpf.sensors.corners import corners
-from rbpf.sensors.features import FeatureFrame
-from rbpf.sensors.patches import cut
+from rbpf.sensors.feature_log import FeatureFrame
+from rbpf.sensors.features.corners import corners
+from rbpf.sensors.patches.search import cut
 from rbpf.systems.mono.active_search import Searched
 from rbpf.systems.mono.appearance import SOURCE_HALF_PX
 from rbpf.systems.mono.config import MonoConfig

@@ -14,7 +14,7 @@ from rbpf.core.filter import Filter
 from rbpf.core.models import Part
 from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.maps.point import Point
-from rbpf.sensors.camera_points import CameraRay, EpipolarRay
+from rbpf.sensors.camera.points import CameraRay, EpipolarRay
 from rbpf.systems.mono.config import InverseDepthConfig, MonoConfig, VelocityConfig
 from rbpf.systems.mono.run import MonoRun, run
 from rbpf.systems.mono.system import build_filter, start_prior

@@ -10,7 +10,7 @@ from rbpf.lie import SE3
 from rbpf.maps.constellation import Constellation, UncertainConstellation
 from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.maps.point import Point
-from rbpf.sensors.features import FeatureFrame, FeatureLog, KnownPoints
+from rbpf.sensors.feature_log import FeatureFrame, FeatureLog, KnownPoints
 from rbpf.systems.mono.config import MonoConfig, VelocityConfig
 from rbpf.systems.mono.run import landmark_cloud, run
 from rbpf.systems.mono.system import build_filter, start_prior, world_of

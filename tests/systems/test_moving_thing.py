@@ -7,7 +7,7 @@ import pytest
 
 from rbpf.core.models import Part
 from rbpf.runs.trajectory import Trajectory
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers.images import open_images, read_known_points
 from rbpf.systems.mono.config import MonoConfig, SearchConfig
 from rbpf.systems.mono.video import run_images

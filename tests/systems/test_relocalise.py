@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from rbpf.lie import SE3
-from rbpf.sensors.consensus_resection import Resected
-from rbpf.sensors.corners import corners
+from rbpf.sensors.camera.resection import Resected
+from rbpf.sensors.features.corners import corners
 from rbpf.systems.mono.config import MonoConfig, RelocalisationConfig
 from rbpf.systems.mono.image_sensor import ImageSensor, Searched
 from rbpf.systems.mono.likeness import known_places, unmistakable

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rbpf.lie import SE3
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
 from rbpf.systems.mono.start_optimum import (
     SCALE_STD,
     Expected,

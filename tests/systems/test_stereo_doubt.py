@@ -7,7 +7,7 @@ import pytest
 
 from rbpf.lie import SE3
 from rbpf.motion.odometry import Odometry
-from rbpf.sensors.stereo_matching import StereoSift
+from rbpf.sensors.stereo.matching import StereoSift
 from rbpf.systems.filtering import ProposalConfig
 from rbpf.systems.stereo.config import StereoConfig, TriggerConfig
 from rbpf.systems.stereo.particle_subsample import ParticleSubsample

@@ -8,7 +8,7 @@ import pytest
 from rbpf.lie import SE3
 from rbpf.motion.odometry import Odometry
 from rbpf.motion.stereo_vo import VoConfig
-from rbpf.sensors.stereo_matching import StereoSift
+from rbpf.sensors.stereo.matching import StereoSift
 from rbpf.systems.stereo.config import RecoveryConfig, StereoConfig, TriggerConfig
 from rbpf.systems.stereo.global_relocalisation import relocalise_globally
 from rbpf.systems.stereo.run import StereoRun, run_images

@@ -7,7 +7,7 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.sensors.landmark_management import NewLandmarkConfig
+from rbpf.sensors.descriptors.landmark_management import NewLandmarkConfig
 from rbpf.systems.stereo.config import MapConfig, OdometryConfig, StereoConfig, TriggerConfig
 from rbpf.systems.stereo.dead_reckoning import Pixels
 from rbpf.systems.stereo.front_ends import ImageFrontEnd

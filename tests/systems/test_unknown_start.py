@@ -8,7 +8,7 @@ import pytest
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.trajectory import Trajectory
-from rbpf.sensors.features import FeatureLog
+from rbpf.sensors.feature_log import FeatureLog
 from rbpf.systems.mono.config import MonoConfig, StartConfig, VelocityConfig
 from rbpf.systems.mono.run import run
 from rbpf.systems.mono.unknown_start import TORN, UnknownStart, between

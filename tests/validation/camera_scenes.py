@@ -7,8 +7,8 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from rbpf.lie import SE3, Array
-from rbpf.sensors.features import CameraTruth, FeatureFrame, FeatureLog, KnownPoints
-from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+from rbpf.sensors.camera import Pinhole, RectifiedStereo
+from rbpf.sensors.feature_log import CameraTruth, FeatureFrame, FeatureLog, KnownPoints
 from tests.validation.numeric import shrunk, slope_of
 
 PLAIN = Pinhole(640, 480, 400.0, 390.0, 321.0, 243.0)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from rbpf.lie import SE3
-from rbpf.sensors.features import FeatureLog
+from rbpf.sensors.feature_log import FeatureLog
 
 
 def truth(log: FeatureLog, frame: int) -> np.ndarray:

@@ -7,8 +7,8 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.runs.measurement_files import FRAMES, KNOWN, OBSERVATIONS, read_feature_log, write_measurements
-from rbpf.sensors.features import FeatureFrame, FeatureLog, KnownPoints
-from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+from rbpf.sensors.camera import Pinhole, RectifiedStereo
+from rbpf.sensors.feature_log import FeatureFrame, FeatureLog, KnownPoints
 
 CAMERA = Pinhole(640, 480, 512.1, 511.9, 319.4, 239.6, (0.1, -0.05, 1e-3, -2e-3, 0.01))
 

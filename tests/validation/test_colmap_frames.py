@@ -7,7 +7,7 @@ import pycolmap
 import pytest
 
 from rbpf.lie import SE3
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
 from rbpf.validation.colmap.adjust import adjust_by_colmap, with_held
 from rbpf.validation.colmap.frames import (
     HALF_PX,

@@ -7,7 +7,7 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
 from rbpf.systems.mono.config import MonoConfig, SearchConfig
 from rbpf.systems.mono.sightings import Sighting
 from rbpf.systems.mono.video import run_images

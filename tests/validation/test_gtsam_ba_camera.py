@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import chi2
 
 from rbpf.lie import SE3
-from rbpf.sensors.features import KnownPoints
+from rbpf.sensors.feature_log import KnownPoints
 from rbpf.validation.gtsam.camera import CameraEstimate, solve_features
 from rbpf.validation.gtsam.camera_adjust import explain
 from rbpf.validation.gtsam.camera_data import known_by_name, sightings_of

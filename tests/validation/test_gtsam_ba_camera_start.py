@@ -8,8 +8,8 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.sensors.features import FeatureFrame, KnownPoints
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
+from rbpf.sensors.feature_log import FeatureFrame, KnownPoints
 from rbpf.validation.gtsam.camera import CameraEstimate, solve_features
 from rbpf.validation.gtsam.camera_data import Sightings
 from rbpf.validation.gtsam.camera_resection import locate

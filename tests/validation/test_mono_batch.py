@@ -7,7 +7,7 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.sensors.features import FeatureFrame, FeatureLog
+from rbpf.sensors.feature_log import FeatureFrame, FeatureLog
 from rbpf.validation.gtsam.camera import solve_features
 from rbpf.validation.gtsam.mono_batch import ROBUST, adjust_log, connected_frames
 from rbpf.validation.simulation.features import MONO, Measuring, simulate_features

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rbpf.lie import SE3
-from rbpf.sensors.features import FeatureFrame, FeatureLog
+from rbpf.sensors.feature_log import FeatureFrame, FeatureLog
 from rbpf.systems.mono.run import run
 from rbpf.validation.gtsam.mono_batch import Batch, adjust_log
 from rbpf.validation.mono_parts import (

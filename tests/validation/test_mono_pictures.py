@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rbpf.lie import SE3
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers.images import open_images, read_known_points
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.sightings import Sighting, Sightings

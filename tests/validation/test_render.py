@@ -7,7 +7,7 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
 from rbpf.validation.simulation.render import Renderer, rotated_grid
 from rbpf.validation.simulation.textured_desk import TexturedDesk
 from rbpf.validation.simulation.textured_room import TexturedRoom

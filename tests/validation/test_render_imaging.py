@@ -8,7 +8,7 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.validation.simulation.exposure import Imaging
 from rbpf.validation.simulation.images import simulate_images
 from rbpf.validation.simulation.textured_desk import TexturedDesk

@@ -7,7 +7,7 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.sensors.features import CameraTruth
+from rbpf.sensors.feature_log import CameraTruth
 from rbpf.validation.s05.drive import Setting
 from rbpf.validation.s05.record import Best, Paths, Record, errors
 from rbpf.validation.s05.sweeps import HEADER, settings, sweep

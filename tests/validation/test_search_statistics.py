@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.validation.search_statistics import measure_search, survival
 from rbpf.validation.simulation.exposure import Imaging

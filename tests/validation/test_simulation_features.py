@@ -8,8 +8,8 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.sensors.features import FeatureLog
-from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+from rbpf.sensors.camera import Pinhole, RectifiedStereo
+from rbpf.sensors.feature_log import FeatureLog
 from rbpf.validation.simulation.features import MONO, STEREO, Measuring, simulate_features
 from rbpf.validation.simulation.point_worlds import DeskWorld, PlanarTargetWorld
 from rbpf.validation.simulation.scene import PointWorld, Scene

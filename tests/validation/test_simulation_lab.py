@@ -10,7 +10,7 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3
-from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.readers.images import open_images
 from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
 from rbpf.validation.simulation import lab_points

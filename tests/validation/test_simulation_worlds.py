@@ -8,7 +8,7 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.sensors.features import FeatureLog
+from rbpf.sensors.feature_log import FeatureLog
 from rbpf.validation.simulation.camera_paths import Wave, eased, looking, slowed, speeds
 from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
 from rbpf.validation.simulation.point_worlds import DeskWorld, PlanarTargetWorld

@@ -7,7 +7,7 @@ import pytest
 from rbpf.core.least_squares import Rule
 from rbpf.lie import SE3
 from rbpf.motion.stereo_vo import VoConfig, fit
-from rbpf.sensors.features import FeatureFrame, FeatureLog
+from rbpf.sensors.feature_log import FeatureFrame, FeatureLog
 from rbpf.validation.gtsam.camera import CameraEstimate, solve_features
 from tests.motion.stereo_pairs import LEAP, ROAD, ROOM, correlated
 

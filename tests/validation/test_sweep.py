@@ -198,7 +198,7 @@ def test_images_are_swept_with_their_known_points(tmp_path):
 
 def test_pairs_of_images_are_swept(tmp_path):
     """With and without the map: the same odometry, another filter."""
-    from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+    from rbpf.sensors.camera import Pinhole, RectifiedStereo
     from rbpf.validation.simulation.exposure import Imaging
     from rbpf.validation.simulation.images import simulate_images
     from rbpf.validation.simulation.textured_room import TexturedRoom

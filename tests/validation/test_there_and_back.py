@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rbpf.errors import InputError
-from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.readers.images import open_stereo
 from rbpf.validation.simulation.exposure import Imaging
 from rbpf.validation.simulation.features import STEREO, Measuring, simulate_features

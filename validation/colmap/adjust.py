@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from rbpf.errors import InputError
 from rbpf.lie import Array
-from rbpf.sensors.features import FeatureLog, KnownPoints
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
+from rbpf.sensors.feature_log import FeatureLog, KnownPoints
 from rbpf.validation.colmap.frames import from_colmap_pose, tangent_slope
 from rbpf.validation.colmap.model import build_model, image_id
 from rbpf.validation.gtsam.camera_data import CameraEstimate, Sightings, sightings_of

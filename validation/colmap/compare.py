@@ -13,7 +13,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
 from rbpf.runs.alignment import Similarity
 from rbpf.runs.trajectory import Trajectory, associate
-from rbpf.sensors.features import CameraTruth
+from rbpf.sensors.feature_log import CameraTruth
 from rbpf.validation.colmap.cloud_distance import CloudDistance, cloud_distance
 from rbpf.validation.colmap.pipeline import LEAST_FRAMES
 from rbpf.validation.colmap.reconstruct import Reconstruction

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbpf.lie import SE3, Array
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
 
 HALF_PX = 0.5
 """Added to our pixels it gives COLMAP's."""

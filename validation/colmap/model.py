@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rbpf.lie import Array
-from rbpf.sensors.pinhole import RectifiedStereo
+from rbpf.sensors.camera import RectifiedStereo
 from rbpf.validation.colmap.frames import HALF_PX, to_colmap_camera, to_colmap_pose
 from rbpf.validation.gtsam.camera_data import Sightings
 

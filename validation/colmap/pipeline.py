@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rbpf.errors import InputError
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers.images.sequence import ImageSequence
 from rbpf.validation.colmap.frames import camera_model
 

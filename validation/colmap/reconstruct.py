@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from rbpf.errors import InputError
 from rbpf.lie import Array
 from rbpf.runs.trajectory import Trajectory
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers.images.sequence import ImageSequence
 from rbpf.validation.colmap.frames import from_colmap_pose
 from rbpf.validation.colmap.pipeline import (

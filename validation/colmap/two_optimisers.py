@@ -10,7 +10,7 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
-from rbpf.sensors.features import FeatureFrame, FeatureLog
+from rbpf.sensors.feature_log import FeatureFrame, FeatureLog
 from rbpf.validation.colmap.adjust import LEAST_HELD, ColmapAdjustment, adjust_by_colmap, with_held
 from rbpf.validation.gtsam.camera import CameraEstimate, CameraSolution, solve_features
 from rbpf.validation.gtsam.mono_batch import connected_frames

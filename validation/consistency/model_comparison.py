@@ -19,7 +19,7 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.runs.reading import RunFolder
-from rbpf.sensors.features import FeatureLog
+from rbpf.sensors.feature_log import FeatureLog
 from rbpf.sensors.readers import open_log
 from rbpf.sensors.readers.log import RobotLog
 from rbpf.systems.mono.config import MonoConfig

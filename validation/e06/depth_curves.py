@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rbpf.lie import SE3
-from rbpf.sensors.camera_points import CameraRay
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
+from rbpf.sensors.camera.points import CameraRay
 
 SHOWN = 1, 2, 3, 5, 10
 COLOURS = ("tab:blue", "tab:orange", "tab:green", "tab:red", "tab:purple")

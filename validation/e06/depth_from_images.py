@@ -4,8 +4,8 @@ import numpy as np
 
 from rbpf.lie import SE3
 from rbpf.runs.plots import save_figures
-from rbpf.sensors.corners import corners
-from rbpf.sensors.patches import cut, search, warp
+from rbpf.sensors.features.corners import corners
+from rbpf.sensors.patches.search import cut, search, warp
 from rbpf.sensors.readers.images import ImageSequence
 from rbpf.systems.mono.appearance import SOURCE_HALF_PX
 from rbpf.systems.mono.config import SearchConfig

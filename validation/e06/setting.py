@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers.images import ImageSequence, KnownPixels, open_images, read_known_points
 from rbpf.systems.mono.config import InverseDepthConfig, MonoConfig
 from rbpf.validation.simulation.exposure import Imaging

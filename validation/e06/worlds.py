@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rbpf.lie import SE3
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers.images import KnownPixels
 from rbpf.validation.simulation import textures
 from rbpf.validation.simulation.camera_paths import UP, Wave, eased, frame_seconds, looking, shaken

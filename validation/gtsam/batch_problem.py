@@ -16,8 +16,8 @@ from rbpf.errors import InputError
 from rbpf.lie import Array
 from rbpf.runs.measurement_files import OBSERVATIONS, read_measurements
 from rbpf.runs.path_and_map import PathAndMap
-from rbpf.sensors.features import FeatureLog
-from rbpf.sensors.pinhole import RectifiedStereo
+from rbpf.sensors.camera import RectifiedStereo
+from rbpf.sensors.feature_log import FeatureLog
 from rbpf.sensors.readers.measurements import Measurements
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.mono.run import MonoRun

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbpf.lie import Array
-from rbpf.sensors.features import FeatureLog
+from rbpf.sensors.feature_log import FeatureLog
 from rbpf.validation.gtsam.camera_data import CameraEstimate, known_by_name, sightings_of
 
 __all__ = ["CameraEstimate", "CameraSolution", "solve_features"]

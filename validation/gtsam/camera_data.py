@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
-from rbpf.sensors.features import FeatureLog, KnownPoints
-from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+from rbpf.sensors.camera import Pinhole, RectifiedStereo
+from rbpf.sensors.feature_log import FeatureLog, KnownPoints
 
 Index = NDArray[np.intp]
 

@@ -14,7 +14,7 @@ import gtsam
 import numpy as np
 
 from rbpf.lie import SE3, Array
-from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.validation.gtsam.camera_data import Sightings, in_camera
 from rbpf.validation.gtsam.solvers import huber, noise
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
-from rbpf.sensors.pinhole import RectifiedStereo
+from rbpf.sensors.camera import RectifiedStereo
 from rbpf.validation.gtsam.camera_data import Sightings
 from rbpf.validation.gtsam.camera_factors import (
     LANDMARK,

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from rbpf.lie import SE3, Array
-from rbpf.sensors.pinhole import RectifiedStereo
+from rbpf.sensors.camera import RectifiedStereo
 from rbpf.validation.gtsam.camera_data import Sightings, in_camera
 from rbpf.validation.gtsam.camera_factors import evaluate_sightings
 

@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from rbpf.errors import InputError
 from rbpf.runs.alignment import Alignment
 from rbpf.runs.trajectory import Trajectory
-from rbpf.sensors.features import FeatureLog, KnownPoints
+from rbpf.sensors.feature_log import FeatureLog, KnownPoints
 from rbpf.systems.mono.video import VideoRun
 from rbpf.validation.gtsam.camera import CameraEstimate, CameraSolution, solve_features
 from rbpf.validation.metrics.accuracy import ate

@@ -10,8 +10,8 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.runs.files import prepare_folder, write_text
 from rbpf.runs.reading import RunFolder
-from rbpf.sensors.features import FeatureLog
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
+from rbpf.sensors.feature_log import FeatureLog
 from rbpf.sensors.readers.images.calibration import NAME
 from rbpf.validation.calibration import camera_text
 from rbpf.validation.gtsam.batch_problem import read_problem

@@ -8,7 +8,7 @@ from rbpf.lie import SE3
 from rbpf.runs.alignment import Alignment
 from rbpf.runs.trajectory import Trajectory
 from rbpf.runs.truth import RunTruth
-from rbpf.sensors.features import CameraTruth
+from rbpf.sensors.feature_log import CameraTruth
 from rbpf.systems.mono.video import VideoRun
 from rbpf.validation.metrics.accuracy import ate, rpe
 from rbpf.validation.metrics.scores import poses_at

@@ -11,7 +11,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.files import prepare_folder, whole
 from rbpf.runs.plots import SIGMAS
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers.images import ImageFrame
 from rbpf.systems.map_estimate import MapEstimate
 

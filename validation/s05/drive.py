@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rbpf.errors import InputError
-from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.readers.images import open_stereo
 from rbpf.systems.stereo.config import StereoConfig, TriggerConfig
 from rbpf.systems.stereo.feature_cache import CachedSequence, cache_features

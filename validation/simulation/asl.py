@@ -15,7 +15,7 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers.images.calibration import model_of
 
 DEPTH_PER_M = 5000.0

@@ -7,7 +7,7 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
 from rbpf.validation.simulation.camera_paths import Wave
 from rbpf.validation.simulation.limits import (
     check_counts,

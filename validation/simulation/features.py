@@ -10,8 +10,8 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.sensors.features import CameraTruth, FeatureFrame, FeatureLog, KnownPoints
-from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+from rbpf.sensors.camera import Pinhole, RectifiedStereo
+from rbpf.sensors.feature_log import CameraTruth, FeatureFrame, FeatureLog, KnownPoints
 from rbpf.validation.simulation.feature_tracks import Tracker
 from rbpf.validation.simulation.limits import (
     check_counts,

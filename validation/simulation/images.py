@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from rbpf.errors import InputError
-from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.validation.simulation.asl import (
     coded_depth,
     image_path,

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from rbpf.lie import SE3
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
 from rbpf.validation.simulation.textured_scene import Rectangle, rays_to_sides, sides
 
 NEAR_M = 1e-3

@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rbpf.lie import SE2, SE3
-from rbpf.sensors.features import FeatureFrame, FeatureLog, KnownPoints
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
+from rbpf.sensors.feature_log import FeatureFrame, FeatureLog, KnownPoints
 from rbpf.sensors.readers.log import Frame, RobotLog
 from rbpf.validation.simulation.camera_paths import looking
 from rbpf.validation.simulation.limits import check_counts, check_fractions, check_positive

@@ -7,7 +7,7 @@ from typing import final
 import numpy as np
 
 from rbpf.core.belief import Belief
-from rbpf.sensors.patches import search, warp
+from rbpf.sensors.patches.search import search, warp
 from rbpf.systems.mono.appearance import Appearances
 from rbpf.systems.mono.config import SearchConfig
 from rbpf.systems.mono.consensus import Fit, fit_motion
@@ -192,7 +192,7 @@ class ActiveSearch:
 
     def _choose(self, pose: np.ndarray) -> np.ndarray:
         """Rows of the features worth looking for, spread over the image (E06 §4.1)."""
-        from rbpf.sensors.view_kernels import in_view
+        from rbpf.sensors.camera.kernels import in_view
 
         table, camera, config = self.table, self.camera, self.config
         of_image = (camera.width, camera.height, config.border_px, camera.monotonic_radius)

@@ -11,11 +11,11 @@ from rbpf.lie import SE3
 from rbpf.maps.constellation import Constellation
 from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.maps.point import Point
-from rbpf.sensors.camera_constellation import ConstellationView, MembersView
-from rbpf.sensors.camera_points import CameraModel, CameraPoint, CameraRay, EpipolarRay
+from rbpf.sensors.camera import Pinhole
+from rbpf.sensors.camera.constellation import ConstellationView, MembersView
+from rbpf.sensors.camera.points import CameraModel, CameraPoint, CameraRay, EpipolarRay
 from rbpf.sensors.catalogue_index import NameIndex
-from rbpf.sensors.features import FeatureFrame
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.systems.mono.config import InverseDepthConfig
 from rbpf.systems.mono.known_start import KnownStart
 

@@ -11,10 +11,10 @@ from rbpf.core.belief import Belief
 from rbpf.core.models import NewLandmarks, Observations, Part, Sensor
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.sensors.camera_points import CameraRay
-from rbpf.sensors.corners import corners
-from rbpf.sensors.features import FeatureFrame
-from rbpf.sensors.patches import cut
+from rbpf.sensors.camera.points import CameraRay
+from rbpf.sensors.feature_log import FeatureFrame
+from rbpf.sensors.features.corners import corners
+from rbpf.sensors.patches.search import cut
 from rbpf.sensors.readers.images import ImageFrame
 from rbpf.systems.mono.active_search import ActiveSearch, Searched
 from rbpf.systems.mono.appearance import SOURCE_HALF_PX, Appearances

@@ -13,9 +13,9 @@ import numpy as np
 
 from rbpf.core.checkpoint import load_arrays, save_arrays
 from rbpf.errors import InputError
-from rbpf.sensors.features import KnownPoints
-from rbpf.sensors.lens_distortion import RadialTangential
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
+from rbpf.sensors.camera.distortion import RadialTangential
+from rbpf.sensors.feature_log import KnownPoints
 from rbpf.systems.mono.appearance import SOURCE_HALF_PX
 
 Alignment = Literal["none", "rigid", "similarity"]

@@ -11,12 +11,12 @@ from rbpf.core.models import Records
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.maps.constellation import LEAST, Constellation, UncertainConstellation, by_frame
-from rbpf.sensors.camera_points import CameraPoint
-from rbpf.sensors.corners import corner_score
-from rbpf.sensors.features import FeatureFrame, KnownPoints
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
+from rbpf.sensors.camera.points import CameraPoint
+from rbpf.sensors.camera.resection import resect
+from rbpf.sensors.feature_log import FeatureFrame, KnownPoints
+from rbpf.sensors.features.corners import corner_score
 from rbpf.sensors.readers.images import KnownPixels
-from rbpf.sensors.resection import resect
 
 MOST_SIGMAS, MOST_PX = 6.0, 4.0
 """A known point may be seen this far from where the resected camera sees it: so many σ, and so many pixels more."""

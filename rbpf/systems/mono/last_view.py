@@ -6,11 +6,11 @@ from typing import final
 import numpy as np
 
 from rbpf.lie import SE3
-from rbpf.sensors.corners import corners
-from rbpf.sensors.keypoints import describe
-from rbpf.sensors.patches import cut, search, warp
-from rbpf.sensors.pinhole import Pinhole
-from rbpf.sensors.uncertain_resection import Sights
+from rbpf.sensors.camera import Pinhole
+from rbpf.sensors.camera.resection import Sights
+from rbpf.sensors.features.corners import corners
+from rbpf.sensors.features.sift import describe
+from rbpf.sensors.patches.search import cut, search, warp
 from rbpf.systems.mono.appearance import SOURCE_HALF_PX
 from rbpf.systems.mono.viewing import affines
 

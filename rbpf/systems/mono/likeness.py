@@ -4,8 +4,8 @@ import numpy as np
 
 from rbpf.core.belief import Belief
 from rbpf.lie import SE3
-from rbpf.sensors.keypoints import describe
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
+from rbpf.sensors.features.sift import describe
 from rbpf.systems.mono.appearance import Appearances
 from rbpf.systems.mono.image_sensor import ImageSensor
 from rbpf.systems.mono.viewing import turned

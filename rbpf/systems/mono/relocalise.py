@@ -9,11 +9,19 @@ from rbpf import gaussian
 from rbpf.core.belief import Belief
 from rbpf.lie import SE3
 from rbpf.motion.constant_velocity import PosePrior
-from rbpf.sensors.consensus_resection import Resected, refined, resect_consensus, three_point_poses
-from rbpf.sensors.corners import corners
-from rbpf.sensors.keypoints import describe_windows
-from rbpf.sensors.patches import search, warp
-from rbpf.sensors.uncertain_resection import GATE, Sights, refined_on_all, squared_distances
+from rbpf.sensors.camera.resection import (
+    GATE,
+    Resected,
+    Sights,
+    refined,
+    refined_on_all,
+    resect_consensus,
+    squared_distances,
+    three_point_poses,
+)
+from rbpf.sensors.features.corners import corners
+from rbpf.sensors.features.sift import describe_windows
+from rbpf.sensors.patches.search import search, warp
 from rbpf.systems.mono.config import RelocalisationConfig
 from rbpf.systems.mono.image_sensor import ImageSensor
 from rbpf.systems.mono.last_view import LEAST, LastView

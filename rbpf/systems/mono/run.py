@@ -13,7 +13,7 @@ from rbpf.core.models import Sensor
 from rbpf.core.particles import uniform_log_weights
 from rbpf.core.proposals import Prior
 from rbpf.lie import SE3
-from rbpf.sensors.features import FeatureLog
+from rbpf.sensors.feature_log import FeatureLog
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor
 from rbpf.systems.mono.system import assemble, features_of, start_prior, world_of

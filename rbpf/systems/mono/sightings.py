@@ -9,7 +9,7 @@ from rbpf.core.anchoring import Anchored
 from rbpf.core.belief import Belief
 from rbpf.core.filter import Filter
 from rbpf.sensors.catalogue_index import NameIndex
-from rbpf.sensors.features import FeatureFrame
+from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.systems.mono.feature_sensor import FeatureSensor
 from rbpf.systems.mono.image_sensor import ImageSensor
 from rbpf.systems.mono.viewing import directions

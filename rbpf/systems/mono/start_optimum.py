@@ -17,8 +17,8 @@ import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, cholesky, solve_triangular
 
 from rbpf.lie import SE3
-from rbpf.sensors.camera_points import clamp_depth
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
+from rbpf.sensors.camera.points import clamp_depth
 from rbpf.systems.mono.consensus import SCALE
 
 SCALE_STD = 1e-4

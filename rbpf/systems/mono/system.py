@@ -14,9 +14,9 @@ from rbpf.maps.constellation import Constellation, UncertainConstellation
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
 from rbpf.motion.constant_velocity import MarginalVelocity, PosePrior, SampledVelocity
-from rbpf.sensors.features import FeatureFrame, FeatureLog, KnownPoints
-from rbpf.sensors.pinhole import Pinhole
-from rbpf.sensors.resection import resect
+from rbpf.sensors.camera import Pinhole
+from rbpf.sensors.camera.resection import resect
+from rbpf.sensors.feature_log import FeatureFrame, FeatureLog, KnownPoints
 from rbpf.systems.mono.config import MonoConfig, VelocityConfig
 from rbpf.systems.mono.feature_sensor import CONSTELLATION, FeatureSensor
 from rbpf.systems.mono.known_start import KnownStart, first_records

@@ -17,7 +17,7 @@ from rbpf.core.archive import checked
 from rbpf.core.filter import Filter
 from rbpf.lie import SE3
 from rbpf.motion.constant_velocity import PosePrior
-from rbpf.sensors.features import FeatureFrame
+from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor
 from rbpf.systems.mono.start_optimum import Expected, Optimum, Structure, Window, optimum

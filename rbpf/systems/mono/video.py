@@ -11,7 +11,7 @@ from rbpf.core.filter import Filter
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.motion.constant_velocity import PosePrior
-from rbpf.sensors.features import FeatureFrame
+from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.sensors.readers.images import ImageFrame, ImageSequence, KnownPixels
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.image_sensor import ImageSensor

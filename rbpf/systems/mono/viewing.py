@@ -3,7 +3,7 @@
 import numpy as np
 
 from rbpf.lie import SE3
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
 
 NEAREST = 1e-3
 """Least inverse-depth weight of a homogeneous point for its patch to be placed in space: beyond, it is at infinity."""

@@ -11,9 +11,8 @@ from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
 from rbpf.motion.odometry import Odometry, OdometryMotion
 from rbpf.sensors.landmark_sensor import AnonymousLandmarkSensor, NamedLandmarkSensor
-from rbpf.sensors.range_bearing import RangeBearing, RelativePosition
+from rbpf.sensors.range_bearing import RangeBearing, RelativePosition, RigidPointModel
 from rbpf.sensors.readers.log import Frame, RobotLog
-from rbpf.sensors.rigid_point import RigidPointModel
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 
 

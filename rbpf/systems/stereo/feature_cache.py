@@ -16,11 +16,11 @@ import numpy as np
 
 from rbpf.core.checkpoint import load_arrays, save_arrays
 from rbpf.errors import InputError
-from rbpf.sensors.features import CameraTruth
-from rbpf.sensors.pinhole import RectifiedStereo
+from rbpf.sensors.camera import RectifiedStereo
+from rbpf.sensors.feature_log import CameraTruth
 from rbpf.sensors.readers.images.stereo import StereoSequence
-from rbpf.sensors.stereo_features import StereoFeatures
-from rbpf.sensors.stereo_matching import StereoSift
+from rbpf.sensors.stereo.features import StereoFeatures
+from rbpf.sensors.stereo.matching import StereoSift
 from rbpf.systems.stereo.config import StereoConfig
 
 CHUNK = 100

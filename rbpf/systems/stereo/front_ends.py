@@ -9,11 +9,11 @@ from rbpf.core.belief import Belief
 from rbpf.core.exchange import NULL
 from rbpf.core.filter import StepReport
 from rbpf.core.models import Part, Sensor
-from rbpf.sensors.features import CameraTruth, FeatureLog
-from rbpf.sensors.pinhole import RectifiedStereo
+from rbpf.sensors.camera import RectifiedStereo
+from rbpf.sensors.feature_log import CameraTruth, FeatureLog
 from rbpf.sensors.readers.images import ImageFrame
-from rbpf.sensors.stereo_features import StereoFeatures, match_frames
-from rbpf.sensors.stereo_matching import StereoSift
+from rbpf.sensors.stereo.features import StereoFeatures, match_frames
+from rbpf.sensors.stereo.matching import StereoSift
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.dead_reckoning import Pixels
 from rbpf.systems.stereo.feature_cache import CachedPair

@@ -6,7 +6,7 @@ from typing import final
 import numpy as np
 
 from rbpf.lie import SE3
-from rbpf.sensors.pinhole import RectifiedStereo
+from rbpf.sensors.camera import RectifiedStereo
 from rbpf.systems.stereo.config import MapConfig
 
 SIGMAS = 3.0

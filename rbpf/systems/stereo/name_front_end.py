@@ -9,10 +9,10 @@ from rbpf.core.belief import Belief
 from rbpf.errors import InputError
 from rbpf.maps.point import Point
 from rbpf.motion.stereo_odometer import match_names
-from rbpf.sensors.features import CameraTruth, FeatureFrame, FeatureLog
+from rbpf.sensors.camera import RectifiedStereo
+from rbpf.sensors.camera.points import StereoPoint
+from rbpf.sensors.feature_log import CameraTruth, FeatureFrame, FeatureLog
 from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
-from rbpf.sensors.pinhole import RectifiedStereo
-from rbpf.sensors.stereo_points import StereoPoint
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.dead_reckoning import Pixels
 from rbpf.systems.stereo.front_ends import FrontEnd

@@ -9,7 +9,7 @@ from rbpf.core.belief import Belief
 from rbpf.core.proposals import Prior
 from rbpf.gaussian import symmetrise
 from rbpf.lie import SE3
-from rbpf.sensors.stereo_points import StereoPoint
+from rbpf.sensors.camera.points import StereoPoint
 
 
 @dataclass(frozen=True)

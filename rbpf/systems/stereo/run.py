@@ -15,7 +15,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.motion.odometry import Odometry
 from rbpf.motion.stereo_motions import Known
-from rbpf.sensors.features import CameraTruth, FeatureLog
+from rbpf.sensors.feature_log import CameraTruth, FeatureLog
 from rbpf.sensors.readers.images.stereo import StereoSequence
 from rbpf.systems.stereo.config import StereoConfig, TriggerConfig
 from rbpf.systems.stereo.dead_reckoning import DeadReckoning, Reckoned, chained

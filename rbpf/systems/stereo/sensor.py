@@ -19,12 +19,12 @@ from rbpf.core.exchange import NULL
 from rbpf.core.models import Likelihood, NewLandmarks, Observations, Part, Sensor
 from rbpf.maps.point import Point
 from rbpf.motion.stereo_vo import VoConfig, estimate_motion
+from rbpf.sensors.camera import RectifiedStereo
+from rbpf.sensors.camera.points import StereoPoint
 from rbpf.sensors.catalogue_index import NumberIndex
-from rbpf.sensors.descriptor_index import DescriptorIndex, Gate
-from rbpf.sensors.landmark_management import LandmarkManager, NewLandmarkConfig
-from rbpf.sensors.pinhole import RectifiedStereo
-from rbpf.sensors.stereo_features import StereoFeatures
-from rbpf.sensors.stereo_points import StereoPoint
+from rbpf.sensors.descriptors.index import DescriptorIndex, Gate
+from rbpf.sensors.descriptors.landmark_management import LandmarkManager, NewLandmarkConfig
+from rbpf.sensors.stereo.features import StereoFeatures
 from rbpf.systems.stereo.config import MapConfig
 from rbpf.systems.stereo.landmarks import Places
 from rbpf.systems.stereo.particle_subsample import Expected, ParticleSubsample

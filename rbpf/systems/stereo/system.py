@@ -9,7 +9,7 @@ from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
 from rbpf.motion.stereo_odometer import StereoOdometer
 from rbpf.motion.stereo_odometry import StereoOdometry
-from rbpf.sensors.pinhole import RectifiedStereo
+from rbpf.sensors.camera import RectifiedStereo
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.dead_reckoning import DeadReckoning
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from rbpf import gaussian
 from rbpf.core.exchange import NULL
-from rbpf.sensors.features import FeatureFrame
+from rbpf.sensors.feature_log import FeatureFrame
 
 LEAST = 2
 """Sightings of a track that is told: a single one says nothing about the path."""

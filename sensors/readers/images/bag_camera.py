@@ -12,7 +12,7 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import Array
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers.images.bag_file import Bag
 from rbpf.sensors.readers.images.calibration import Calibration
 from rbpf.sensors.readers.images.matrices import pose_of_matrix, rigid_motion_error

@@ -12,7 +12,7 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
-from rbpf.sensors.pinhole import RectifiedStereo
+from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.readers.images.bag import chosen
 from rbpf.sensors.readers.images.bag_camera import CameraInfo, read_info
 from rbpf.sensors.readers.images.bag_file import Bag, opened

@@ -12,7 +12,7 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.sensors.features import CameraTruth
+from rbpf.sensors.feature_log import CameraTruth
 from rbpf.sensors.readers.images.bag_file import Bag
 from rbpf.sensors.readers.images.truth import LONGEST, truth_between
 

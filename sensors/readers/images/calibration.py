@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rbpf.errors import InputError
-from rbpf.sensors.pinhole import LENSES, Pinhole
+from rbpf.sensors.camera import LENSES, Pinhole
 from rbpf.sensors.readers.images.mapping import YamlValue, read_yaml
 from rbpf.sensors.readers.text import quoted
 

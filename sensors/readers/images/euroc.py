@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from rbpf.lie import SE3, Array
-from rbpf.sensors.features import CameraTruth
+from rbpf.sensors.feature_log import CameraTruth
 from rbpf.sensors.readers.images.calibration import read_calibration
 from rbpf.sensors.readers.images.euroc_camera import AslCamera, read_camera, read_mount
 from rbpf.sensors.readers.images.euroc_stereo import read_right

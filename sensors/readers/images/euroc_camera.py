@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from rbpf.lie import Array
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers.images.calibration import Calibration, coefficients
 from rbpf.sensors.readers.images.mapping import YamlValue, read_yaml
 from rbpf.sensors.readers.images.matrices import pose_of_matrix, rigid_motion_error

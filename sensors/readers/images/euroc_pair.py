@@ -7,7 +7,7 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.sensors.pinhole import RectifiedStereo
+from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.readers.images import euroc
 from rbpf.sensors.readers.images.calibration import read_calibration
 from rbpf.sensors.readers.images.euroc_camera import AslCamera, read_camera

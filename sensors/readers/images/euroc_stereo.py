@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from rbpf.lie import SE3
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers.images.euroc_camera import AslCamera, read_camera
 from rbpf.sensors.readers.images.stamped import StampedLines, read_stamped
 

@@ -16,8 +16,8 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
-from rbpf.sensors.features import CameraTruth
-from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+from rbpf.sensors.camera import Pinhole, RectifiedStereo
+from rbpf.sensors.feature_log import CameraTruth
 from rbpf.sensors.readers.images.calibration import Calibration, read_calibration
 from rbpf.sensors.readers.images.decoding import SUFFIXES
 from rbpf.sensors.readers.images.files import FileImages, first_shape

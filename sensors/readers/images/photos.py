@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from rbpf.errors import InputError
-from rbpf.sensors.features import CameraTruth
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
+from rbpf.sensors.feature_log import CameraTruth
 from rbpf.sensors.readers.images.calibration import Calibration, read_calibration
 from rbpf.sensors.readers.images.files import FileImages, first_shape
 from rbpf.sensors.readers.images.folder import evenly

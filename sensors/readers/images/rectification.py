@@ -13,7 +13,7 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
-from rbpf.sensors.pinhole import Pinhole, RectifiedStereo
+from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.readers.images.sequence import ImageFrame, Source
 
 BESIDE = 0.7

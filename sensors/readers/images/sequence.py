@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from rbpf.errors import InputError
-from rbpf.sensors.features import CameraTruth
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
+from rbpf.sensors.feature_log import CameraTruth
 
 
 @dataclass(frozen=True)

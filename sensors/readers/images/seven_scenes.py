@@ -17,8 +17,8 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import Array
-from rbpf.sensors.features import CameraTruth
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
+from rbpf.sensors.feature_log import CameraTruth
 from rbpf.sensors.readers.images.calibration import NAME, Calibration, find_calibration
 from rbpf.sensors.readers.images.decoding import SUFFIXES
 from rbpf.sensors.readers.images.files import FileImages, first_shape

@@ -15,8 +15,8 @@ from typing import final
 import numpy as np
 
 from rbpf.errors import InputError
-from rbpf.sensors.features import CameraTruth
-from rbpf.sensors.pinhole import RectifiedStereo
+from rbpf.sensors.camera import RectifiedStereo
+from rbpf.sensors.feature_log import CameraTruth
 from rbpf.sensors.readers.images import bag, bag_pair, euroc, euroc_pair, kitti
 from rbpf.sensors.readers.images.pairing import TOLERANCE_S
 from rbpf.sensors.readers.images.sequence import ImageFrame, ImageSequence

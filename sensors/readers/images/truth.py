@@ -6,7 +6,7 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
-from rbpf.sensors.features import CameraTruth
+from rbpf.sensors.feature_log import CameraTruth
 from rbpf.sensors.readers.images.stamped import read_stamped
 from rbpf.sensors.readers.table import Table
 

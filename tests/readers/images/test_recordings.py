@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rbpf.lie import SE3
-from rbpf.sensors.pinhole import RectifiedStereo
+from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.readers.images import open_images, read_known_points
 
 pytestmark = pytest.mark.real_data

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from rbpf.lie import SE3
-from rbpf.sensors.pinhole import Pinhole
+from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers.images.rectification import OUTSIDE, Rectification
 
 LEFT = Pinhole(160, 120, 110.0, 112.0, 80.0, 58.0, (-0.2, 0.05, 1e-3, -5e-4, 0.0))

@@ -1,0 +1,254 @@
+"""Pinhole camera with radial-tangential or equidistant (fisheye) distortion, and the rectified stereo pair.
+
+Order of the coefficients and pixel convention are OpenCV's: the centre of the top-left pixel is (0, 0). The distortion
+is that of `rbpf.sensors.camera.distortion`.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from numbers import Integral, Real
+from typing import Any, Self, final
+
+import numpy as np
+
+from rbpf.arrays import Bool, Float
+from rbpf.errors import InputError
+from rbpf.sensors.camera.distortion import Equidistant, RadialTangential, inverse
+
+Lens = RadialTangential | Equidistant
+
+LENSES: dict[str, type[Lens]] = {"radial-tangential": RadialTangential, "equidistant": Equidistant}
+"""By the name of their model of distortion; each has its number, `kind`, that the compiled twin reads."""
+
+
+@final
+@dataclass(frozen=True)
+class Pinhole:
+    """Pinhole camera with distortion (OpenCV's models and pixel convention).
+
+    Attributes:
+        width: of the image, px.
+        height: of the image, px.
+        fx: focal length along the rows, px.
+        fy: focal length along the columns, px.
+        cx: column of the principal point, px.
+        cy: row of the principal point, px.
+        distortion: k1, k2, p1, p2, k3; of an equidistant lens k1, k2, k3, k4.
+        distortion_model: radial-tangential, or equidistant: a fisheye lens, of which 75° from the axis are seen.
+
+    Raises:
+        InputError: a size is no positive whole number, a focal length is not positive, a number is not finite,
+            there is no such model of distortion, or it has another number of coefficients.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    distortion_model: str = "radial-tangential"
+    dim = 2
+
+    def __post_init__(self) -> None:
+        for name in ("width", "height"):
+            _check_size(name, getattr(self, name))
+        for name in ("fx", "fy", "cx", "cy"):
+            _check_finite(f"the camera's {name}", getattr(self, name))
+        if not (self.fx > 0.0 and self.fy > 0.0):
+            raise InputError(f"the camera's fx and fy must be positive, got {self.fx!r} and {self.fy!r} px")
+        _check_lens(LENSES, self.distortion_model, self.distortion)
+        # A list from a file would make the camera unhashable.
+        object.__setattr__(self, "distortion", tuple(self.distortion))
+
+    @classmethod
+    def from_params(cls, width: int, height: int, params: Float[np.ndarray, "10"]) -> Self:
+        """The camera with these `params`.
+
+        Raises:
+            InputError: as of the constructor, or no lens has this kind.
+        """
+        models = {lens.kind: name for name, lens in LENSES.items()}
+        model = models.get(float(params[9]), f"of kind {params[9]:g}")
+        count = len(LENSES[model].coefficient_names) if model in LENSES else 0
+        fx, fy, cx, cy, *distortion = (float(number) for number in params)
+        return cls(width, height, fx, fy, cx, cy, tuple(distortion[:count]), model)
+
+    @cached_property
+    def params(self) -> Float[np.ndarray, "10"]:
+        """(10,) fx, fy, cx, cy, distortion (four numbers and 0, or five), kind of lens; for the compiled twin."""
+        coefficients = np.pad(np.array(self.distortion, dtype=float), (0, 5 - len(self.distortion)))
+        return np.array([self.fx, self.fy, self.cx, self.cy, *coefficients, self.lens.kind], dtype=np.float64)
+
+    @cached_property
+    def lens(self) -> Lens:
+        """The distortion, in normalised coordinates."""
+        return LENSES[self.distortion_model](self.distortion)  # type: ignore[arg-type]  # counted when made
+
+    @cached_property
+    def _size(self) -> np.ndarray:
+        return np.array([self.width, self.height])
+
+    @property
+    def monotonic_radius(self) -> float:
+        """Distance from the axis, in normalised coordinates, at which distortion folds the image back, or ∞.
+
+        Of an equidistant lens no more than tan 75°.
+        """
+        return self.lens.monotonic_radius
+
+    def project(self, point: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
+        """Pixels (…, 2) of points (…, 3) in the camera's frame.
+
+        Only the direction counts: (u, v, 1) and a point at infinity work. Nothing is checked, see `visible`; a
+        point in the plane of the camera, z = 0, gets pixels that are not finite.
+        """
+        with np.errstate(all="ignore"):
+            return self.params[:2] * self.lens.distort(_normalise(point)) + self.params[2:4]
+
+    def jacobian(self, point: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2 3"]:
+        """∂px/∂point (…, 2, 3) at points (…, 3) in the camera's frame."""
+        point = np.asarray(point, float)
+        with np.errstate(all="ignore"):
+            uv = _normalise(point)
+            by_uv = self.params[:2, None] * self.lens.jacobian(uv) / point[..., 2, None, None]
+            return np.concatenate([by_uv, -by_uv @ uv[..., None]], axis=-1)
+
+    def unproject(self, px: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
+        """Normalised coordinates (u, v) (…, 2) of pixels (…, 2): the point lies in the direction (u, v, 1).
+
+        Newton's method on the distortion. NaN where no direction in which the distortion is one-to-one projects to
+        the pixel.
+        """
+        with np.errstate(all="ignore"):
+            target = (np.asarray(px, float) - self.params[2:4]) / self.params[:2]
+            uv = self.lens.undistort(target.reshape(-1, 2))
+        return uv.reshape(target.shape)
+
+    def unproject_jacobian(self, px: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2 2"]:
+        """∂(u, v)/∂px (…, 2, 2) at pixels (…, 2); NaN where `unproject` is."""
+        return inverse(self.lens.jacobian(self.unproject(px))) / self.params[:2]
+
+    def field_of_view_mask(self, margin_px: float) -> Bool[np.ndarray, "H W"] | None:
+        """Pixels (H, W) that far inside the circle in which a fisheye lens sees; None where it fills the image.
+
+        It does with radial-tangential distortion: there `unproject` tells the few pixels that have no direction.
+        """
+        if np.isinf(self.lens.image_radius):
+            return None
+        rows, columns = np.ogrid[: self.height, : self.width]
+        away = np.hypot((columns - self.cx) / self.fx, (rows - self.cy) / self.fy)
+        within = away < self.lens.image_radius - margin_px / min(self.fx, self.fy)
+        return None if within.all() else within
+
+    def inside(self, px: Float[np.ndarray, "*batch 2"], margin_px: float = 0.0) -> Bool[np.ndarray, "*batch"]:
+        """Whether pixels (…, 2) are in the image (…), and at least `margin_px` from its border.
+
+        The image reaches half a pixel beyond the centres of its outermost pixels.
+        """
+        px = np.asarray(px, float)
+        past = self._size - 0.5 - margin_px
+        within = (px >= margin_px - 0.5) & (px <= past)
+        return within[..., 0] & within[..., 1]
+
+    def visible(
+        self, point: Float[np.ndarray, "*batch 3"], margin_px: float = 0.0
+    ) -> Bool[np.ndarray, "*batch"]:
+        """Whether points (…, 3) are seen (…): in front of the camera, not folded back, and inside the image."""
+        with np.errstate(all="ignore"):
+            seen = self.lens.is_invertible(_normalise(point)) & self.inside(self.project(point), margin_px)
+        return np.logical_and(seen, np.asarray(point)[..., 2] > 0.0)
+
+
+@final
+@dataclass(frozen=True)
+class RectifiedStereo:
+    """Two equal undistorted pinholes side by side; the left one is the reference.
+
+    Attributes:
+        camera: each of the two.
+        baseline_m: distance of the right one from the left one, along the rows.
+
+    Raises:
+        InputError: the camera is distorted, or the baseline is not positive.
+    """
+
+    camera: Pinhole
+    baseline_m: float
+    dim = 3
+
+    def __post_init__(self) -> None:
+        _check_finite("the stereo baseline", self.baseline_m)
+        if self.baseline_m <= 0.0:
+            raise InputError(f"the stereo baseline must be positive, got {self.baseline_m!r} m")
+        if not self.camera.lens.is_identity:
+            bent = f"{self.camera.distortion_model} distortion {self.camera.distortion}"
+            found = f"the camera of a rectified stereo pair has {bent}"
+            raise InputError(f"{found}: rectify the images and give the camera of the rectified ones")
+
+    def project(self, point: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+        """Pixels (u_left, v, u_right) (…, 3) of points (…, 3) in the left camera's frame; nothing is checked."""
+        right = self.camera.project(self._from_right(point))[..., :1]
+        return np.concatenate([self.camera.project(point), right], axis=-1)
+
+    def jacobian(self, point: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:
+        """∂px/∂point (…, 3, 3) at points (…, 3) in the left camera's frame."""
+        right = self.camera.jacobian(self._from_right(point))[..., :1, :]
+        return np.concatenate([self.camera.jacobian(point), right], axis=-2)
+
+    def triangulate(self, z: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+        """Points (…, 3) in the left camera's frame seen at (u_left, v, u_right) (…, 3); NaN without disparity."""
+        z = np.asarray(z, float)
+        disparity = np.where(z[..., 0] > z[..., 2], z[..., 0] - z[..., 2], np.nan)[..., None]
+        uv = self.camera.unproject(z[..., :2])
+        ray = np.concatenate([uv, np.ones_like(disparity)], axis=-1)
+        return self.camera.fx * self.baseline_m / disparity * ray
+
+    def inside(self, px: Float[np.ndarray, "*batch 3"], margin_px: float = 0.0) -> Bool[np.ndarray, "*batch"]:
+        """Whether (u_left, v, u_right) (…, 3) are in both images (…), and at least `margin_px` from their borders."""
+        px = np.asarray(px, float)
+        return self.camera.inside(px[..., :2], margin_px) & self.camera.inside(px[..., [2, 1]], margin_px)
+
+    def visible(
+        self, point: Float[np.ndarray, "*batch 3"], margin_px: float = 0.0
+    ) -> Bool[np.ndarray, "*batch"]:
+        """Whether points (…, 3) are seen in both images (…)."""
+        right = self._from_right(point)
+        return self.camera.visible(point, margin_px) & self.camera.visible(right, margin_px)
+
+    def _from_right(self, point: np.ndarray) -> np.ndarray:
+        """Points in the right camera's frame."""
+        return np.asarray(point, float) - np.array([self.baseline_m, 0.0, 0.0])
+
+
+def _normalise(point: np.ndarray) -> np.ndarray:
+    """(x/z, y/z) (…, 2) of points (…, 3)."""
+    point = np.asarray(point, float)
+    return point[..., :2] / point[..., 2:]
+
+
+def _check_size(name: str, value: object) -> None:
+    """Refuses what is no positive whole number."""
+    if isinstance(value, bool) or not isinstance(value, Integral) or int(value) <= 0:
+        raise InputError(f"the camera's {name} must be a positive whole number of pixels, got {value!r}")
+
+
+def _check_finite(what: str, value: object) -> None:
+    """Refuses what is no finite number."""
+    if not isinstance(value, Real) or not np.isfinite(float(value)):
+        raise InputError(f"{what} must be a finite number, got {value!r}")
+
+
+def _check_lens(lenses: Mapping[str, Any], model: str, distortion: Any) -> None:
+    """Refuses another model of distortion, and another number of coefficients than it has."""
+    if model not in lenses:
+        raise InputError(f"the camera's distortion_model must be {' or '.join(lenses)}, got {model!r}")
+    names = lenses[model].coefficient_names
+    if np.shape(distortion) != (len(names),):
+        left_out = " (k3 = 0 if there are four)" if len(names) == 5 else ""
+        expected = f"the {len(names)} numbers {', '.join(names)}{left_out}"
+        raise InputError(f"the camera's distortion must be {expected}, got {distortion!r}")
+    for name, number in zip(names, distortion, strict=True):
+        _check_finite(f"the camera's {name}", number)

@@ -1,0 +1,298 @@
+"""Landmarks measured by a camera whose pose is the state, world_from_camera: points (E06 (6)–(9)), rays (§5), stereo points.
+
+For a right perturbation [ω, v] of world_from_camera, the direction c in which a homogeneous world point (x, w) lies,
+c = Rᵀ(x − w t), moves by −ω × c − w v. Where the state holds more than the pose, the pose comes first.
+"""
+
+from abc import abstractmethod
+from typing import Protocol, final
+
+import numpy as np
+
+from rbpf import gaussian
+from rbpf.core.models import FusedKernel, Jacobians, ObservationModel, Records
+from rbpf.errors import InputError
+from rbpf.lie import SE3
+from rbpf.sensors.camera import Pinhole, RectifiedStereo
+
+MIN_DEPTH_FRACTION = 0.2
+"""Least fraction of its length by which a direction points clamp_depth: what is behind the camera projects far outside."""
+
+
+class Camera(Protocol):
+    """What `CameraPoint` needs of a camera; `Pinhole` and `RectifiedStereo` are two."""
+
+    dim: int
+
+    def project(self, point: np.ndarray) -> np.ndarray:
+        """(…, 3) in the camera's frame → (…, p) px."""
+
+    def jacobian(self, point: np.ndarray) -> np.ndarray:
+        """Its derivative (…, p, 3)."""
+
+    def visible(self, point: np.ndarray, margin_px: float = 0.0) -> np.ndarray:
+        """Whether it is in the image (…)."""
+
+
+class CameraModel(ObservationModel):
+    """The chain from a landmark to pixels; a subclass says where the landmark lies.
+
+    Args:
+        camera: of the images.
+        margin_px: a landmark this near to the border is not expected to be seen.
+    """
+
+    def __init__(self, camera: Camera, margin_px: float = 0.0) -> None:
+        self.camera = camera
+        self.margin_px = margin_px
+        self.dim = camera.dim
+
+    @abstractmethod
+    def world_point(self, landmark: np.ndarray, const: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+        """Homogeneous world point: x (…, 3) and w (…, 1)."""
+
+    @abstractmethod
+    def world_point_jacobian(
+        self, landmark: np.ndarray, const: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Derivatives of x (…, 3, D) and w (…, 1, D) by the landmark."""
+
+    def in_camera(
+        self, state: np.ndarray, landmark: np.ndarray, const: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Direction (…, 3) from the camera, in its frame; the point itself where w = 1."""
+        x, w = self.world_point(landmark, const)
+        position = SE3.translation(state[..., :7])
+        return SE3.inverse_transform(state[..., :7], x + (1.0 - w) * position)
+
+    def predict(
+        self,
+        state: np.ndarray,
+        landmark: np.ndarray | None = None,
+        const: np.ndarray | None = None,
+        substate: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """E06 (7)–(9) with distortion."""
+        assert landmark is not None
+        return self.camera.project(clamp_depth(self.in_camera(state, landmark, const)))
+
+    def jacobians(
+        self,
+        state: np.ndarray,
+        landmark: np.ndarray | None = None,
+        const: np.ndarray | None = None,
+        substate: np.ndarray | None = None,
+    ) -> Jacobians:
+        """∂z/∂ξ = D [[c]× | −w I] and ∂z/∂b = D Rᵀ(∂x/∂b − t ∂w/∂b), with D the camera's slope."""
+        assert landmark is not None
+        direction = clamp_depth(self.in_camera(state, landmark, const))
+        slope = self.camera.jacobian(direction)
+        _, w = self.world_point(landmark, const)
+        by_rotation = np.cross(slope, direction[..., None, :])
+        by_state = np.zeros((*by_rotation.shape[:-1], 6 + state.shape[-1] - 7))
+        by_state[..., :3], by_state[..., 3:6] = by_rotation, -w[..., None] * slope
+        dx, dw = self.world_point_jacobian(landmark, const)
+        moved = dx - SE3.translation(state[..., :7])[..., :, None] * dw
+        turned = np.swapaxes(SE3.rotation(state[..., :7]), -1, -2) @ moved
+        return Jacobians(by_state, slope @ turned)
+
+    def visible(self, state: np.ndarray, landmark: np.ndarray, const: np.ndarray | None = None) -> np.ndarray:
+        """Whether it is in front of the camera and in the image."""
+        return self.camera.visible(self.in_camera(state, landmark, const), self.margin_px)
+
+
+@final
+class CameraPoint(CameraModel):
+    """A world point in metres (E06 §3.2): two numbers from one camera, three from a stereo pair."""
+
+    def world_point(self, landmark: np.ndarray, const: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+        """The point, w = 1."""
+        return landmark, np.ones((*landmark.shape[:-1], 1))
+
+    def world_point_jacobian(
+        self, landmark: np.ndarray, const: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Identity and zero."""
+        return np.eye(3), np.zeros((1, 3))
+
+    def kernel(self) -> FusedKernel | None:
+        """Compiled for a pinhole camera."""
+        from rbpf.sensors.camera.kernels import camera_point
+
+        if not isinstance(self.camera, Pinhole):
+            return None
+        return FusedKernel(camera_point, self.camera.params)
+
+
+class CameraRay(CameraModel):
+    """A landmark `InverseDepth` (u, v, q), anchored at world_from_anchor: its 2-D measurement (E06 §5.1).
+
+    Args:
+        camera: of the images.
+        rho: (2,) inverse depth of a landmark just started: mean and standard deviation, 1/m.
+        margin_px: see `CameraModel`.
+    """
+
+    def __init__(
+        self, camera: Pinhole, rho: tuple[float, float] = (1.0, 0.5), margin_px: float = 0.0
+    ) -> None:
+        super().__init__(camera, margin_px)
+        if not (np.isfinite(rho).all() and min(rho) > 0.0):
+            raise InputError(f"the prior of the inverse depth needs a positive mean and deviation, got {rho}")
+        self.pinhole = camera
+        self.rho = rho
+
+    def world_point(self, landmark: np.ndarray, const: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+        """The ray: x = R_a (u, v, 1) + q t_a, w = q."""
+        assert const is not None
+        ray = np.concatenate([landmark[..., :2], np.ones((*landmark.shape[:-1], 1))], axis=-1)
+        rho, position = landmark[..., 2:], SE3.translation(const)
+        return SE3.transform(const, ray) + (rho - 1.0) * position, rho
+
+    def world_point_jacobian(
+        self, landmark: np.ndarray, const: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """First two columns of R_a, and t_a."""
+        assert const is not None
+        turned = SE3.rotation(const)[..., :2]
+        dx = np.concatenate([turned, SE3.translation(const)[..., None]], axis=-1)
+        return dx, np.array([[0.0, 0.0, 1.0]])
+
+    def initialise(self, state: np.ndarray, z: np.ndarray, cov: np.ndarray) -> Records:
+        """The ray through z from each particle's own camera, with the prior inverse depth."""
+        n, k = state.shape[0], z.shape[0]
+        uv, slope = self.pinhole.unproject(z), self.pinhole.unproject_jacobian(z)
+        mean = np.concatenate([uv, np.full((k, 1), self.rho[0])], axis=1)
+        full = np.zeros((k, 3, 3))
+        full[:, :2, :2] = gaussian.symmetrise(slope @ cov @ np.swapaxes(slope, -1, -2))
+        full[:, 2, 2] = self.rho[1] ** 2
+        anchor = np.broadcast_to(state[:, None, :7], (n, k, 7))
+        return Records(np.broadcast_to(mean, (n, k, 3)), np.broadcast_to(full, (n, k, 3, 3)), anchor)
+
+    def kernel(self) -> FusedKernel | None:
+        """Compiled."""
+        from rbpf.sensors.camera.kernels import camera_ray
+
+        return FusedKernel(camera_ray, self.pinhole.params)
+
+
+@final
+class EpipolarRay(CameraRay):
+    """The part of a ray's measurement that does not depend on its depth: E06 §5.2, the epipolar constraint.
+
+    y = n̂ᵀ(z − h(b̂)) with n̂ ⟂ ∂h/∂q, which the limit P_qq → ∞ of the 2-D marginal is. It is handed on as the
+    2-D residual n̂ y with noise R: across the line it is y's, along the line a constant that no particle can change,
+    provided that R is a multiple of the identity. Where the camera has hardly moved sideways there is no epipolar line
+    and depth does not matter: the full residual is used.
+
+    Args:
+        camera: of the images.
+        rho: see `CameraRay`.
+        least_px: the landmark has an epipolar line once a change of q by its first standard deviation moves it by this.
+        margin_px: see `CameraModel`.
+    """
+
+    def __init__(
+        self,
+        camera: Pinhole,
+        rho: tuple[float, float] = (1.0, 0.5),
+        least_px: float = 1.0,
+        margin_px: float = 0.0,
+    ) -> None:
+        super().__init__(camera, rho, margin_px)
+        if not least_px > 0.0:
+            raise InputError(f"least_px must be positive, got {least_px}")
+        self.least_px = least_px
+
+    def jacobians(
+        self,
+        state: np.ndarray,
+        landmark: np.ndarray | None = None,
+        const: np.ndarray | None = None,
+        substate: np.ndarray | None = None,
+    ) -> Jacobians:
+        """Those of the ray, projected on n̂."""
+        by_state, by_landmark, _ = super().jacobians(state, landmark, const)
+        assert by_state is not None and by_landmark is not None
+        across = self._across(by_landmark[..., 2])
+        return Jacobians(across @ by_state, across @ by_landmark)
+
+    def innovation(
+        self,
+        z: np.ndarray,
+        state: np.ndarray,
+        landmark: np.ndarray | None = None,
+        const: np.ndarray | None = None,
+        substate: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """n̂ y."""
+        assert landmark is not None
+        _, by_landmark, _ = super().jacobians(state, landmark, const)
+        assert by_landmark is not None
+        nu = z - self.predict(state, landmark, const)
+        return (self._across(by_landmark[..., 2]) @ nu[..., None])[..., 0]
+
+    def kernel(self) -> FusedKernel | None:
+        """Compiled."""
+        from rbpf.sensors.camera.kernels import epipolar_ray
+
+        return FusedKernel(epipolar_ray, np.append(self.pinhole.params, self.least_px / self.rho[1]))
+
+    def _across(self, by_rho: np.ndarray) -> np.ndarray:
+        """n̂ n̂ᵀ (…, 2, 2), or the identity where ∂h/∂q (…, 2) is too short to have a direction."""
+        squared = np.square(by_rho).sum(axis=-1)[..., None, None]
+        has_line = np.sqrt(squared) * self.rho[1] >= self.least_px
+        along = by_rho[..., :, None] * by_rho[..., None, :] / np.where(has_line, squared, 1.0)
+        return np.eye(2) - np.where(has_line, along, 0.0)
+
+
+@final
+class StereoPoint(CameraModel):
+    """A world point in metres, seen by both cameras.
+
+    S05 (4)–(7) compares points in space, with C^L from the pixels' noise; here pixels are compared, which is the same
+    to first order and stays Gaussian where the point is far.
+
+    Args:
+        rig: the two cameras.
+        margin_px: see `CameraModel`.
+    """
+
+    def __init__(self, rig: RectifiedStereo, margin_px: float = 0.0) -> None:
+        super().__init__(rig, margin_px)
+        self.rig = rig
+
+    def world_point(self, landmark: np.ndarray, const: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+        """The point, w = 1."""
+        return landmark, np.ones((*landmark.shape[:-1], 1))
+
+    def world_point_jacobian(
+        self, landmark: np.ndarray, const: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Identity and zero."""
+        return np.eye(3), np.zeros((1, 3))
+
+    def invert(self, state: np.ndarray, z: np.ndarray) -> np.ndarray:
+        """S05 (4); NaN without disparity."""
+        return SE3.transform(state[..., :7], self.rig.triangulate(z))
+
+    def initialise(self, state: np.ndarray, z: np.ndarray, cov: np.ndarray) -> Records:
+        """Points (N, K, 3) with R C^L Rᵀ, S05 (4) and (7)."""
+        local = self.rig.triangulate(z)
+        by_pixel = np.linalg.inv(self.rig.jacobian(local))
+        turned = SE3.rotation(state[:, None, :7]) @ by_pixel
+        mean = SE3.transform(state[:, None, :7], local)
+        return Records(mean, gaussian.symmetrise(turned @ cov @ np.swapaxes(turned, -1, -2)))
+
+    def kernel(self) -> FusedKernel | None:
+        """Compiled."""
+        from rbpf.sensors.camera.kernels import stereo_point
+
+        return FusedKernel(stereo_point, np.append(self.rig.camera.params[:4], self.rig.baseline_m))
+
+
+def clamp_depth(direction: np.ndarray) -> np.ndarray:
+    """Directions (…, 3) with the depth kept positive, so that what lies behind the camera projects far outside."""
+    length = np.sqrt(np.square(direction).sum(axis=-1))
+    depth = np.maximum(direction[..., 2], MIN_DEPTH_FRACTION * length)
+    return np.concatenate([direction[..., :2], depth[..., None]], axis=-1)

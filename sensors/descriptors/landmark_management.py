@@ -1,0 +1,202 @@
+"""Which features become landmarks: candidates are started, confirmed and dropped (S05 §IV–V).
+
+S05 adds 10 to 15 SIFT features per frame whose descriptors are sufficiently distinct from those held, drops one that is
+not seen again within three frames, and calls it a landmark once it has been seen three times. Until then it is a
+candidate. Here candidates are 60 at most, and new ones are spread over the image. Landmarks and candidates go by names,
+whole numbers that are never used again.
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar, final
+
+import numpy as np
+
+from rbpf.errors import InputError
+from rbpf.sensors.descriptors.matching import distances
+
+DISTINCT = {36: 0.12, 128: 0.3}
+"""Least distance of a new descriptor from others, by its length: descriptors of one place are mostly nearer."""
+
+
+@dataclass(frozen=True)
+class NewLandmarkConfig:
+    """Which features become landmarks, and how long candidates are kept.
+
+    Attributes:
+        max_per_frame: new candidates in a frame at most.
+        distinct: least distance of a new descriptor from those held and from other new ones; None for `DISTINCT`.
+        spacing_px: least distance of a new candidate's pixel from those of matched features and of other new candidates.
+        cells: the image is divided into so many columns and rows, which fill evenly.
+        patience: a candidate that has not been observed in so many frames is dropped.
+        observations: a candidate that was observed so often is a landmark, the first time included.
+        max_candidates: candidates at most.
+
+    Raises:
+        InputError: a number is out of its range.
+    """
+
+    RENAMED: ClassVar[dict[str, str]] = {
+        "per_frame": "max_per_frame",
+        "sightings": "observations",
+        "waiting": "max_candidates",
+    }
+
+    max_per_frame: int = 15
+    distinct: float | None = None
+    spacing_px: float = 10.0
+    cells: int = 6
+    patience: int = 3
+    observations: int = 3
+    max_candidates: int = 60
+
+    def __post_init__(self) -> None:
+        for name in ("cells", "patience", "observations"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name} must be at least 1, got {getattr(self, name)}")
+        for name in ("max_per_frame", "spacing_px", "max_candidates"):
+            if not getattr(self, name) >= 0:
+                raise InputError(f"{name} must not be negative, got {getattr(self, name)}")
+        if self.distinct is not None and not 0.0 <= self.distinct <= 2.0:
+            raise InputError(f"distinct must be a distance from 0 to 2, got {self.distinct}")
+
+
+@final
+class LandmarkManager:
+    """Counts observations of landmarks and candidates, frame by frame. Call `observe`, then `select`, then `add`.
+
+    Args:
+        config: settings.
+        size: width and height of the image, px.
+    """
+
+    def __init__(self, config: NewLandmarkConfig, size: tuple[int, int]) -> None:
+        self.config = config
+        self.size = size
+        self.frame = 0
+        """Frames so far."""
+        self.next_name = 0
+        self._table = np.zeros((0, 3), dtype=np.int64)
+
+    @property
+    def names(self) -> np.ndarray:
+        """(M,) of the descriptors held, ascending."""
+        return self._table[:, 0]
+
+    @property
+    def observations(self) -> np.ndarray:
+        """(M,) how often each was seen."""
+        return self._table[:, 1]
+
+    @property
+    def last_observed(self) -> np.ndarray:
+        """(M,) frame in which each was seen last."""
+        return self._table[:, 2]
+
+    @property
+    def confirmed(self) -> np.ndarray:
+        """(M,) whether each is a landmark."""
+        return self.observations >= self.config.observations
+
+    def observe(self, names: np.ndarray) -> np.ndarray:
+        """Begins a frame in which descriptors (k,), each once, were seen again.
+
+        Returns:
+            Names (j,) of descriptors that are dropped.
+
+        Raises:
+            InputError: a landmark is not held.
+        """
+        rows = self._rows(names)
+        self.frame += 1
+        self._table[rows, 1] += 1
+        self._table[rows, 2] = self.frame
+        overdue = ~self.confirmed & (self.frame - self.last_observed >= self.config.patience)
+        dropped = self.names[overdue].copy()
+        self._table = self._table[~overdue]
+        return dropped
+
+    def select(
+        self, px: np.ndarray, descriptors: np.ndarray, nearest: np.ndarray, taken: np.ndarray
+    ) -> np.ndarray:
+        """Rows (k,) of those features of a frame that are worth a new candidate, in their order.
+
+        Args:
+            px: (K, 2) places of features that matched no landmark, best first.
+            descriptors: (K, d) float32 of length 1.
+            nearest: (K,) distances of these from the nearest descriptor held, infinite where there is none.
+            taken: (L, 2) places of the features that did match.
+        """
+        room = min(self.config.max_per_frame, self.config.max_candidates - int((~self.confirmed).sum()))
+        chosen: list[int] = []
+        for row in self._order(px, taken).tolist():
+            if len(chosen) >= room:
+                break
+            if nearest[row] >= self._distinct(descriptors) and self._apart(
+                row, chosen, px, descriptors, taken
+            ):
+                chosen.append(row)
+        return np.array(sorted(chosen), dtype=np.int64)
+
+    def add(self, count: int) -> np.ndarray:
+        """Takes in new descriptors, seen for the first time in this frame; returns their names (count,)."""
+        names = np.arange(self.next_name, self.next_name + count)
+        self.next_name += count
+        new = np.column_stack([names, np.ones(count, dtype=np.int64), np.full(count, self.frame)])
+        self._table = np.concatenate([self._table, new])
+        return names
+
+    def remove(self, names: np.ndarray) -> None:
+        """Drops descriptors (k,), landmarks or not.
+
+        Raises:
+            InputError: a landmark is not held.
+        """
+        self._table = np.delete(self._table, self._rows(names), axis=0)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """For a checkpoint."""
+        return {
+            "key_manager/table": self._table.copy(),
+            "key_manager/counters": np.array([self.frame, self.next_name]),
+        }
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """The inverse of `arrays`."""
+        self._table = arrays["key_manager/table"].copy()
+        self.frame, self.next_name = (int(x) for x in arrays["key_manager/counters"])
+
+    def _order(self, px: np.ndarray, taken: np.ndarray) -> np.ndarray:
+        """Rows of features, those of the emptiest cells first, in each cell in their order."""
+        cell = self._cell(px)
+        rank = np.zeros(cell.size, dtype=np.int64)
+        count = np.bincount(self._cell(taken), minlength=self.config.cells**2)
+        for row, place in enumerate(cell.tolist()):
+            rank[row] = count[place]
+            count[place] += 1
+        return np.argsort(rank, kind="stable")
+
+    def _cell(self, px: np.ndarray) -> np.ndarray:
+        column, line = np.clip(px * self.config.cells / np.array(self.size), 0, self.config.cells - 1).T
+        return column.astype(np.int64) + self.config.cells * line.astype(np.int64)
+
+    def _apart(
+        self, row: int, chosen: list[int], px: np.ndarray, descriptors: np.ndarray, taken: np.ndarray
+    ) -> bool:
+        """Whether a feature is far enough from others of the frame, in the image and in its descriptor."""
+        others = np.concatenate([taken, px[chosen]])
+        if (np.square(others - px[row]).sum(axis=1) < self.config.spacing_px**2).any():
+            return False
+        return not (distances(descriptors[chosen] @ descriptors[row]) < self._distinct(descriptors)).any()
+
+    def _distinct(self, descriptors: np.ndarray) -> float:
+        given = self.config.distinct
+        return DISTINCT.get(descriptors.shape[1], 0.0) if given is None else given
+
+    def _rows(self, names: np.ndarray) -> np.ndarray:
+        names = np.asarray(names, dtype=np.int64)
+        rows = np.searchsorted(self.names, names)
+        known = rows < self.names.size
+        known[known] = self.names[rows[known]] == names[known]
+        if not known.all():
+            raise InputError(f"there is no landmark named {names[~known][0]}")
+        return rows

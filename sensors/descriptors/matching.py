@@ -1,0 +1,229 @@
+"""Which descriptors of two sets match: distance, ratio to the next best, and preference on both sides.
+
+Descriptors are float32 rows of length 1, so that one matrix product gives all distances: |a − b|² = 2 − 2 aᵀb. Where
+pixels or a prediction leave few candidate pairs (`band_pairs`, `gate_pairs`), only those are compared (`match_pairs`),
+and only those compete in the ratio test.
+"""
+
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from rbpf.errors import InputError
+
+BLOCK = 4096
+"""Columns of a product that are looked at together: a block of a few hundred rows stays in the cache."""
+
+LARGEST = {36: 0.25, 128: 0.55}
+"""Distances of "root" descriptors by their length: few of one place are further apart, and few of two places nearer."""
+
+GATHERED, PAIRS = 8, 65536
+"""Comparing a pair on its own costs as much as so many of a matrix product; pairs gathered at a time."""
+
+
+@dataclass(frozen=True)
+class MatchLimits:
+    """When a candidate is taken.
+
+    Attributes:
+        distance: the largest distance of two descriptors, at most 2; None for `LARGEST` of their length.
+        ratio: largest ratio of the distance to that of the second-best candidate (D. Lowe 2004, §7.1); 1 is no limit.
+        mutual: whether each has to be the other's nearest.
+
+    Raises:
+        InputError: a number is out of its range.
+    """
+
+    distance: float | None = None
+    ratio: float = 0.8
+    mutual: bool = True
+
+    def __post_init__(self) -> None:
+        given = self.distance is None or 0.0 < self.distance <= 2.0
+        if not (given and 0.0 < self.ratio <= 1.0):
+            expected = "a distance in (0, 2] and a ratio in (0, 1]"
+            raise InputError(f"expected {expected}, got {self.distance} and {self.ratio}")
+
+    def largest(self, length: int) -> float:
+        """Distance up to which descriptors of this length are taken."""
+        return LARGEST.get(length, 2.0) if self.distance is None else self.distance
+
+
+@final
+@dataclass(frozen=True)
+class DescriptorMatches:
+    """Pairs of descriptors, each at most once on either side, in the order of the first set.
+
+    Attributes:
+        first: (P,) rows of the first set.
+        second: (P,) rows of the second set.
+        distance: (P,) of the descriptors.
+    """
+
+    first: np.ndarray
+    second: np.ndarray
+    distance: np.ndarray
+
+    def __len__(self) -> int:
+        return self.first.size
+
+    def take(self, rows: np.ndarray) -> "DescriptorMatches":
+        """Some of them, by number or by mask."""
+        return DescriptorMatches(self.first[rows], self.second[rows], self.distance[rows])
+
+
+def match_all(first: np.ndarray, second: np.ndarray, limits: MatchLimits) -> DescriptorMatches:
+    """Matches descriptors (K, d) with descriptors (M, d), every one of which is a candidate."""
+    return decide(first, second, two_best(first, second), limits)
+
+
+def two_best(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """For each descriptor (K, d) the two best of others (M, d), by a matrix product in blocks of M.
+
+    Returns:
+        Products (K,) with the best and with the next one, −inf where there is none, and the best one's row (K,).
+    """
+    rows = np.arange(first.shape[0])
+    best, next_best = np.full((2, rows.size), -np.inf, dtype=np.float32)
+    where = np.zeros(rows.size, dtype=np.int64)
+    for start in range(0, second.shape[0], BLOCK):
+        products = first @ second[start : start + BLOCK].T
+        column = products.argmax(axis=1)
+        top = products[rows, column]
+        products[rows, column] = -np.inf
+        next_best = np.maximum(np.maximum(next_best, products.max(axis=1)), np.minimum(top, best))
+        better = top > best
+        best, where = np.where(better, top, best), np.where(better, start + column, where)
+    return best, next_best, where
+
+
+def decide(
+    first: np.ndarray,
+    second: np.ndarray,
+    best: tuple[np.ndarray, np.ndarray, np.ndarray],
+    limits: MatchLimits,
+) -> DescriptorMatches:
+    """Which of the best candidates, as `two_best` gives them, are taken."""
+    product, next_best, where = best
+    kept = np.flatnonzero(within(product, next_best, limits, first.shape[1]))
+    if limits.mutual and kept.size:
+        preferred = (first @ second[where[kept]].T).argmax(axis=0)
+        kept = kept[preferred == kept]
+    return one_each(_chosen(kept, where[kept], product[kept]))
+
+
+def match_pairs(
+    first: np.ndarray, second: np.ndarray, pairs: tuple[np.ndarray, np.ndarray], limits: MatchLimits
+) -> DescriptorMatches:
+    """Matches descriptors (K, d) with descriptors (M, d) where only some pairs are possible.
+
+    Args:
+        first: descriptors (K, d).
+        second: descriptors (M, d).
+        pairs: rows (C,) of the first and (C,) of the second set, each pair once.
+        limits: when a candidate is taken.
+    """
+    k, m = pairs
+    if not k.size:
+        return _chosen(k, m, np.zeros(0))
+    products = _products(first, second, k, m)
+    best = np.full(first.shape[0], -np.inf, dtype=np.float32)
+    np.maximum.at(best, k, products)
+    top = _first_of(k, np.flatnonzero(products == best[k]))
+    others, next_best = np.delete(np.arange(k.size), top), np.full_like(best, -np.inf)
+    np.maximum.at(next_best, k[others], products[others])
+    top = top[within(products[top], next_best[k[top]], limits, first.shape[1])]
+    if limits.mutual:
+        wanted = np.full(second.shape[0], -np.inf, dtype=np.float32)
+        np.maximum.at(wanted, m, products)
+        top = top[products[top] == wanted[m[top]]]
+    return one_each(_chosen(k[top], m[top], products[top]))
+
+
+def within(best: np.ndarray, next_best: np.ndarray, limits: MatchLimits, length: int) -> np.ndarray:
+    """Whether products (K,) of the best and of the next best candidates pass distance and ratio; −inf is none."""
+    distance, other = distances(best), distances(next_best)
+    # Two equal candidates at distance 0 are ambiguous, too.
+    near = distance <= limits.largest(length)
+    return near & ((distance < limits.ratio * other) | (limits.ratio == 1.0))
+
+
+def distances(products: np.ndarray) -> np.ndarray:
+    """Of descriptors of length 1, from their products."""
+    return np.sqrt(np.maximum(2.0 - 2.0 * products.astype(np.float64), 0.0))
+
+
+def one_each(matches: DescriptorMatches) -> DescriptorMatches:
+    """Of matches that share a row of the second set the nearest, of equally near ones the first."""
+    order = np.lexsort((matches.distance, matches.second))
+    return matches.take(np.sort(_first_of(matches.second, order)))
+
+
+def _products(first: np.ndarray, second: np.ndarray, k: np.ndarray, m: np.ndarray) -> np.ndarray:
+    """Of the descriptors of pairs (C,): all at once by a matrix product where the pairs are many, else one by one."""
+    if k.size * GATHERED > first.shape[0] * second.shape[0]:
+        return (first @ second.T)[k, m]
+    parts = [slice(start, start + PAIRS) for start in range(0, k.size, PAIRS)]
+    return np.concatenate([np.einsum("cd,cd->c", first[k[part]], second[m[part]]) for part in parts])
+
+
+def _first_of(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Of the rows those at which a value occurs first."""
+    _, first = np.unique(values[rows], return_index=True)
+    return np.asarray(rows[first])
+
+
+def _chosen(first: np.ndarray, second: np.ndarray, products: np.ndarray) -> DescriptorMatches:
+    return DescriptorMatches(first, second, distances(products))
+
+
+def band_pairs(
+    first: np.ndarray, second: np.ndarray, reach: np.ndarray | float
+) -> tuple[np.ndarray, np.ndarray]:
+    """All pairs (C,), (C,) of numbers (K,) and (M,) that differ by at most the reach (K,) or ()."""
+    order = np.argsort(second, kind="stable")
+    low = np.searchsorted(second[order], first - reach, side="left")
+    count = np.maximum(np.searchsorted(second[order], first + reach, side="right") - low, 0)
+    k = np.repeat(np.arange(first.size), count)
+    offset = np.arange(k.size) - np.repeat(np.cumsum(count) - count, count)
+    return k, order[np.repeat(low, count) + offset]
+
+
+def gate_pairs(
+    z: np.ndarray, noise: np.ndarray, mean: np.ndarray, cov: np.ndarray, gate: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """All pairs of a measurement and a prediction that are near to one another.
+
+    Args:
+        z: (K, p) places of features.
+        noise: (K, p, p) their covariances.
+        mean: (M, p) predicted places; those that are not finite are near to nothing.
+        cov: (M, p, p) their covariances, without the measurements' noise.
+        gate: largest squared Mahalanobis distance.
+
+    Returns:
+        Rows (C,) of z and (C,) of mean.
+    """
+    held = np.flatnonzero(np.isfinite(mean).all(axis=1) & np.isfinite(cov).all(axis=(1, 2)))
+    mean, cov = mean[held], cov[held]
+    widest = np.diagonal(noise, axis1=1, axis2=2).max(axis=0, initial=0.0)
+    reach = np.sqrt(gate * (np.diagonal(cov, axis1=1, axis2=2) + widest))
+    m, k = band_pairs(mean[:, 0], z[:, 0], reach[:, 0])
+    for axis in range(1, z.shape[1]):
+        near = np.abs(z[k, axis] - mean[m, axis]) <= reach[m, axis]
+        k, m = k[near], m[near]
+    near = _squared(z[k] - mean[m], noise[k] + cov[m]) <= gate
+    return k[near], held[m[near]]
+
+
+def _squared(nu: np.ndarray, cov: np.ndarray) -> np.ndarray:
+    """Squared Mahalanobis distances (C,) of (C, p) under (C, p, p), by elimination along the pairs; p is 2 or 3."""
+    nu, cov = np.ascontiguousarray(nu.T), np.ascontiguousarray(np.moveaxis(cov, 0, -1))
+    total = np.zeros(nu.shape[1])
+    for j in range(nu.shape[0]):
+        total += nu[j] ** 2 / cov[j, j]
+        factor = cov[j + 1 :, j] / cov[j, j]
+        nu[j + 1 :] -= factor * nu[j]
+        cov[j + 1 :, j + 1 :] -= factor[:, None] * cov[None, j, j + 1 :]
+    return total

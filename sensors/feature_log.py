@@ -1,0 +1,194 @@
+"""What a camera saw, feature by feature: pixels of named landmarks, the landmarks known beforehand, and the truth."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from numbers import Integral
+
+import numpy as np
+
+from rbpf import gaussian
+from rbpf.errors import InputError
+from rbpf.sensors.camera import Pinhole, RectifiedStereo
+
+UNIT = 1e-6
+"""How far a quaternion's length may be from 1: six decimals in a file leave it there."""
+
+
+@dataclass(frozen=True)
+class FeatureFrame:
+    """One image: which landmarks were seen, and where. It is checked by the `FeatureLog`, which knows its index.
+
+    Attributes:
+        stamp_ns: time of the image, integer nanoseconds.
+        landmarks: (K,) int64 names, each once.
+        z: (K, p) pixels: (u, v), or (u_left, v, u_right) of a stereo pair.
+        cov_z: (K, p, p) their covariance, px².
+    """
+
+    stamp_ns: int
+    landmarks: np.ndarray
+    z: np.ndarray
+    cov_z: np.ndarray
+
+
+@dataclass(frozen=True)
+class KnownPoints:
+    """Landmarks known beforehand, such as the corners of a calibration target.
+
+    Attributes:
+        names: (M,) int64, each once.
+        positions: (M, 3) in the world, m.
+        cov: (M, 3, 3) their covariance, m².
+
+    Raises:
+        InputError: a shape or a type is another one, a number is not finite, a name comes twice,
+            or a cov is no covariance.
+    """
+
+    names: np.ndarray
+    positions: np.ndarray
+    cov: np.ndarray
+
+    def __post_init__(self) -> None:
+        where = "the known points"
+        _check_names(where, "names", "M", self.names)
+        count = len(self.names)
+        _check_numbers(where, "positions", self.positions, (count, 3))
+        _check_covariances(where, "cov", self.cov, (count, 3, 3))
+
+
+@dataclass(frozen=True)
+class CameraTruth:
+    """Ground truth of a `FeatureLog`.
+
+    Attributes:
+        stamps_ns: (T,) int64 times of the poses, in order.
+        world_from_camera: (T, 7) poses at these times, unit quaternions.
+        landmarks: name of a landmark to its (3,) position in the world, m.
+
+    Raises:
+        InputError: a shape or a type is another one, a number is not finite, the stamps are out of order,
+            or a quaternion is not of unit length.
+    """
+
+    stamps_ns: np.ndarray
+    world_from_camera: np.ndarray
+    landmarks: dict[int, np.ndarray] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        where = "the ground truth"
+        _check_whole(where, "stamps_ns", "T", self.stamps_ns)
+        _check_numbers(where, "world_from_camera", self.world_from_camera, (len(self.stamps_ns), 7))
+        if (late := np.flatnonzero(np.diff(self.stamps_ns) < 0)).size:
+            raise InputError(
+                f"{where}: stamp {late[0] + 1} is before the one it follows, sort the poses by time"
+            )
+        length = np.linalg.norm(self.world_from_camera[:, :4], axis=1)
+        if (wrong := np.flatnonzero(np.abs(length - 1.0) > UNIT)).size:
+            found = f"pose {wrong[0]} has a quaternion of length {length[wrong[0]]:.9g}"
+            raise InputError(f"{where}: {found}, expected [qx, qy, qz, qw, x, y, z] with a unit quaternion")
+        for name, position in self.landmarks.items():
+            _check_numbers(where, f"landmark {name}", position, (3,))
+
+
+@dataclass(frozen=True)
+class FeatureLog:
+    """A recording of a camera that sees landmarks.
+
+    Attributes:
+        name: short name of the recording.
+        camera: that took the images.
+        frames: the images in order of time; equal stamps, between which no time passes, are allowed.
+        known: landmarks known beforehand, None where there are none.
+        truth: ground truth, None where the log has none.
+
+    Raises:
+        InputError: there is no frame, or one is out of order, names a landmark twice, has a shape or a type that
+            does not fit the camera, a number that is not finite, or a cov_z that is no covariance.
+    """
+
+    name: str
+    camera: Pinhole | RectifiedStereo
+    frames: list[FeatureFrame]
+    known: KnownPoints | None = None
+    truth: CameraTruth | None = None
+
+    def __post_init__(self) -> None:
+        if not self.frames:
+            raise InputError(f"{self.name} holds no frame, expected at least one image")
+        for index, frame in enumerate(self.frames):
+            self._check_frame(index, frame)
+            before = self.frames[max(index - 1, 0)].stamp_ns
+            if frame.stamp_ns < before:
+                raise InputError(
+                    f"frame {index} of {self.name} at {frame.stamp_ns} ns is before the frame it follows "
+                    f"({before} ns): sort the frames by time"
+                )
+
+    def outside(self, margin_px: float = 0.0) -> np.ndarray:
+        """Measurements that are not in the image, or nearer than `margin_px` to its border.
+
+        A log may hold them, because a predicted or noisy pixel can be there: the caller drops or refuses them.
+
+        Returns:
+            (F, 2) int64: index of the frame, and row of its `z`.
+        """
+        return np.array(list(self._outside(margin_px)), dtype=np.int64).reshape(-1, 2)
+
+    def _outside(self, margin_px: float) -> Iterator[tuple[int, int]]:
+        for index, frame in enumerate(self.frames):
+            for row in np.flatnonzero(~self.camera.inside(frame.z, margin_px)):
+                yield index, int(row)
+
+    def _check_frame(self, index: int, frame: FeatureFrame) -> None:
+        where = f"frame {index} of {self.name}"
+        _check_stamp(where, frame.stamp_ns)
+        _check_names(where, "landmarks", "K", frame.landmarks)
+        shape = (len(frame.landmarks), self.camera.dim)
+        _check_numbers(where, "z", frame.z, shape)
+        _check_covariances(where, "cov_z", frame.cov_z, (*shape, self.camera.dim))
+
+
+def _check_stamp(where: str, stamp_ns: object) -> None:
+    if not isinstance(stamp_ns, Integral):
+        raise InputError(f"{where}: stamp_ns must be a whole number of nanoseconds, got {stamp_ns!r}")
+
+
+def _check_whole(where: str, what: str, letter: str, values: np.ndarray) -> None:
+    """Refuses all but a vector of whole numbers."""
+    if not (isinstance(values, np.ndarray) and values.ndim == 1 and values.dtype == np.int64):
+        raise InputError(f"{where}: {what} must be ({letter},) int64, got {_described(values)}")
+
+
+def _check_names(where: str, what: str, letter: str, names: np.ndarray) -> None:
+    """Refuses all but a vector of names, each once."""
+    _check_whole(where, what, letter, names)
+    unique, counts = np.unique(names, return_counts=True)
+    if (counts > 1).any():
+        raise InputError(
+            f"{where}: landmark {unique[np.argmax(counts > 1)]} comes twice, keep one of the two"
+        )
+
+
+def _check_numbers(where: str, what: str, values: np.ndarray, shape: tuple[int, ...]) -> None:
+    """Refuses all but finite numbers of this shape."""
+    if not (isinstance(values, np.ndarray) and values.shape == shape and values.dtype == np.float64):
+        raise InputError(f"{where}: {what} must be {shape} float64, got {_described(values)}")
+    if not (finite := np.isfinite(values)).all():
+        place = tuple(int(i) for i in np.argwhere(~finite)[0])
+        raise InputError(f"{where}: {what} must be finite, entry {place} is {values[place]}")
+
+
+def _check_covariances(where: str, what: str, cov: np.ndarray, shape: tuple[int, ...]) -> None:
+    """Refuses all but symmetric positive semi-definite matrices of this shape."""
+    _check_numbers(where, what, cov, shape)
+    try:
+        gaussian.psd_factor(cov)
+    except InputError as error:
+        raise InputError(f"{where}: {what} is no covariance: {error}") from error
+
+
+def _described(values: object) -> str:
+    if isinstance(values, np.ndarray):
+        return f"{values.shape} {values.dtype}"
+    return f"a {type(values).__name__}"

@@ -1,0 +1,478 @@
+"""Compiled resampling, correlation and refinement of image patches, see `rbpf.sensors.patches.search`.
+
+The refinement is Gauss-Newton on the place p that maximises ρ(p) = tᵀw(p), with the template t and the image's window
+w(p), each without mean and with unit norm: δ = (JᵀJ)⁻¹Jᵀ(t/ρ − w), J = (I − wwᵀ) ∂w/∂p. The gradients are the window's,
+not the template's: the noise of both then comes out smaller than with gradients computed once from the template.
+"""
+
+import math
+from pathlib import Path
+
+import numpy as np
+from numba import njit, prange
+
+from rbpf.kernels.stale import discard_stale
+
+
+@njit(cache=True, error_model="numpy")
+def warp_all(sources, affines, templates):
+    """Fills templates (K, size, size) from sources (K, S, S) and affines (K, 2, 2)."""
+    for k in range(templates.shape[0]):
+        warp_one(sources[k], affines[k], templates[k])
+
+
+@njit(cache=True, error_model="numpy")
+def warp_one(source, affine, template):
+    """One template; NaN where its support leaves the source."""
+    size, middle = template.shape[0], 0.5 * (source.shape[0] - 1)
+    template[:] = np.nan
+    a, b, c, d = affine[0, 0], affine[0, 1], affine[1, 0], affine[1, 1]
+    if not math.isfinite(a * a + b * b + c * c + d * d):
+        return
+    samples = footprint(a, b, c, d, source.shape[0])
+    reach = 0.0
+    for s in range(samples.shape[0]):
+        reach = max(reach, abs(samples[s, 0]), abs(samples[s, 1]))
+    if max(abs(a) + abs(b), abs(c) + abs(d)) * (size // 2) + reach > middle:
+        return
+    for j in range(size):
+        for i in range(size):
+            dx, dy, total = float(i - size // 2), float(j - size // 2), 0.0
+            x, y = middle + a * dx + b * dy, middle + c * dx + d * dy
+            for s in range(samples.shape[0]):
+                total += cubic(source, x + samples[s, 0], y + samples[s, 1])
+            template[j, i] = total / samples.shape[0]
+
+
+@njit(cache=True, error_model="numpy")
+def footprint(a, b, c, d, most):
+    """Offsets (m, 2) in the source whose mean is what a pixel of the template gathers.
+
+    A pixel of the template covers A of a source pixel's square. The source's own pixels are squares already, so
+    what is missing has the covariance (A Aᵀ − I)/12, no less than 0 along each of its axes.
+    """
+    uu, uv, vv = a * a + b * b, a * c + b * d, c * c + d * d
+    angle = 0.5 * math.atan2(2.0 * uv, uu - vv)
+    middle, half = 0.5 * (uu + vv), math.hypot(0.5 * (uu - vv), uv)
+    along, across = math.sqrt(max(middle + half - 1.0, 0.0)), math.sqrt(max(middle - half - 1.0, 0.0))
+    m, n = 1 + min(math.ceil(along), most), 1 + min(math.ceil(across), most)
+    cosine, sine = math.cos(angle), math.sin(angle)
+    samples = np.empty((m * n, 2))
+    for p in range(m):
+        for q in range(n):
+            e, f = _step(along, p, m), _step(across, q, n)
+            samples[p * n + q, 0] = cosine * e - sine * f
+            samples[p * n + q, 1] = sine * e + cosine * f
+    return samples
+
+
+@njit(cache=True, error_model="numpy")
+def _step(width, index, count):
+    """The place of one of `count` equal steps around 0 that have the variance of a box of this width."""
+    if count == 1:
+        return 0.0
+    return width * (index - 0.5 * (count - 1)) / math.sqrt(count * count - 1.0)
+
+
+@njit(cache=True, error_model="numpy")
+def cubic(image, x, y):
+    """Catmull-Rom interpolation at column x and row y inside the image; its border is repeated."""
+    height, width = image.shape
+    u, v = min(int(x), width - 1), min(int(y), height - 1)
+    across, down = weights(x - u), weights(y - v)
+    total = 0.0
+    for j in range(4):
+        row = min(max(v + j - 1, 0), height - 1)
+        line = 0.0
+        for i in range(4):
+            line += across[i] * image[row, min(max(u + i - 1, 0), width - 1)]
+        total += down[j] * line
+    return total
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def weights(t):
+    """Catmull-Rom weights of the samples at −1, 0, 1, 2 for a place t in 0..1."""
+    s = 1.0 - t
+    return (
+        -0.5 * t * s * s,
+        1.0 + t * t * (1.5 * t - 2.5),
+        1.0 + s * s * (1.5 * s - 2.5),
+        -0.5 * s * t * t,
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def cut_window(image, x, y, window):
+    """Fills window (S, S) uint8 around column x and row y."""
+    half = window.shape[0] // 2
+    for j in range(window.shape[0]):
+        for i in range(window.shape[0]):
+            grey = cubic(image, x + (i - half), y + (j - half))
+            window[j, i] = np.uint8(min(max(math.floor(grey + 0.5), 0.0), 255.0))
+
+
+_LANES = 4
+"""Columns of a template taken together, so that a sum is loaded and stored once for all of them."""
+_HALF_DIAGONAL_SQUARED = 0.51
+"""A little over ½ px²: the nearest whole pixel is never further."""
+
+
+@njit(cache=True, error_model="numpy")
+def normalised(template, least_std):
+    """The template without mean and with unit norm, its rows padded by zeros to whole lanes; (0, 0) if flat."""
+    size = template.shape[0]
+    mean, square = 0.0, 0.0
+    for j in range(size):
+        for i in range(size):
+            mean += template[j, i]
+    mean /= size * size
+    for j in range(size):
+        for i in range(size):
+            square += (template[j, i] - mean) ** 2
+    if not (square > 0.0 and square >= least_std * least_std * size * size):
+        return np.zeros((0, 0), np.float32)
+    unit = np.zeros((size, (size + _LANES - 1) // _LANES * _LANES), np.float32)
+    scale = 1.0 / math.sqrt(square)
+    for j in range(size):
+        for i in range(size):
+            unit[j, i] = (template[j, i] - mean) * scale
+    return unit
+
+
+@njit(cache=True, error_model="numpy")
+def ellipse(cov, sigmas):
+    """Variances and covariance of the searched ellipse; NaN where they are those of no Gaussian.
+
+    Half a pixel's diagonal is added to each half axis in quadrature, so that some whole pixel is always inside.
+    """
+    room = _HALF_DIAGONAL_SQUARED / (sigmas * sigmas)
+    uu, uv, vv = cov[0, 0] + room, 0.5 * (cov[0, 1] + cov[1, 0]), cov[1, 1] + room
+    if not (cov[0, 0] >= 0.0 and cov[1, 1] >= 0.0 and abs(uv) < math.sqrt(uu) * math.sqrt(vv)):
+        uu = np.nan
+    return uu, uv, vv
+
+
+@njit(cache=True, error_model="numpy")
+def score_ellipse(image, unit, size, centre, cov, sigmas, columns, rows, scores):
+    """Correlation of the unit template at the whole pixels of the ellipse; −1 where the image is flat."""
+    uu, uv, vv = ellipse(cov, sigmas)
+    slope = uv / vv
+    narrow = max(uu - uv * slope, 0.0)
+    half, (height, width) = size // 2, scores.shape
+    left, top = columns[0] - half, rows[0] - half
+    grey = levels(image[top : top + height + size - 1, left : left + width + size - 1], unit.shape[1] - size)
+    sums, squares = np.zeros(width + size - 1, np.int32), np.zeros(width + size - 1, np.int32)
+    window, window_squares = np.empty(width, np.int32), np.empty(width, np.int32)
+    cross = np.empty(width, np.float32)
+    for y in range(size - 1):
+        _slide(image[top + y, left:], 1, sums, squares)
+    for y in range(height):
+        _slide(image[top + y + size - 1, left:], 1, sums, squares)
+        dy = rows[0] + y - centre[1]
+        reach = math.sqrt(max(narrow * (sigmas * sigmas - dy * dy / vv), 0.0))
+        low = max(np.ceil(centre[0] + slope * dy - reach), float(columns[0]))
+        high = min(np.floor(centre[0] + slope * dy + reach), float(columns[1]))
+        if high >= low and dy * dy <= sigmas * sigmas * vv:
+            start, count = int(low) - columns[0], int(high) - int(low) + 1
+            _correlate(grey[y : y + size], unit, start, count, cross)
+            _window_sums(sums[start:], size, count, window)
+            _window_sums(squares[start:], size, count, window_squares)
+            _divide(cross, window, window_squares, size * size, scores[y, start : start + count])
+        _slide(image[top + y, left:], -1, sums, squares)
+
+
+@njit(cache=True, error_model="numpy")
+def levels(part, padding):
+    """Grey levels with columns of zeros behind them.
+
+    Their mean is taken off: a template without mean does not feel it, and rounding comes down.
+    """
+    total = np.int64(0)
+    for y in range(part.shape[0]):
+        for x in range(part.shape[1]):
+            total += np.int64(part[y, x])
+    middle = np.float32(total // part.size)
+    grey = np.zeros((part.shape[0], part.shape[1] + padding), np.float32)
+    for y in range(part.shape[0]):
+        for x in range(part.shape[1]):
+            grey[y, x] = np.float32(part[y, x]) - middle
+    return grey
+
+
+@njit(cache=True, error_model="numpy")
+def _slide(row, sign, sums, squares):
+    """Adds a row of the image to the sums of each column, or takes it off."""
+    for x in range(sums.shape[0]):
+        grey = np.int32(row[x])
+        sums[x] += np.int32(sign) * grey
+        squares[x] += np.int32(sign) * grey * grey
+
+
+@njit(cache=True, error_model="numpy")
+def _window_sums(columns, size, count, out):
+    """Sums over `size` columns from each of the first `count` on."""
+    total = np.int32(0)
+    for x in range(size - 1):
+        total += columns[x]
+    for x in range(count):
+        total += columns[x + size - 1]
+        out[x] = total
+        total -= columns[x]
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _correlate(grey, unit, start, count, cross):
+    """Σ unit · grey at `count` columns from `start` on."""
+    for x in range(count):
+        cross[x] = 0.0
+    for j in range(unit.shape[0]):
+        for i in range(0, unit.shape[1], _LANES):
+            a, b, c, d = unit[j, i], unit[j, i + 1], unit[j, i + 2], unit[j, i + 3]
+            row = grey[j, start + i : start + i + count + _LANES]
+            for x in range(count):
+                cross[x] += a * row[x] + b * row[x + 1] + c * row[x + 2] + d * row[x + 3]
+
+
+@njit(cache=True, error_model="numpy")
+def _divide(cross, sums, squares, n, out):
+    """Scores from Σ unit · grey and the windows' sums, whose variance is exact."""
+    for x in range(out.shape[0]):
+        spread = float(n) * squares[x] - float(sums[x]) * float(sums[x])
+        score = cross[x] * math.sqrt(n / max(spread, 1.0))
+        out[x] = np.float32(min(score, 1.0)) if spread > 0.0 else np.float32(-1.0)
+
+
+_EVALUATIONS = 12
+_SINGULAR = 1e-9
+"""Determinant of JᵀJ over the product of its diagonal, below which the window has slopes along one line only."""
+_INTERPOLATION_PX = 0.02
+"""Error of the place, per axis, that remains without noise: measured on random textures blurred by 0.5 px."""
+_SETTLED_PX = 0.01
+_REACH_PX = 1.0
+"""A maximum further from the best whole pixel along rows or columns is none of this peak."""
+_MARGIN = 4
+"""What a window needs around it to be moved by `_REACH_PX`, interpolated and differentiated."""
+
+
+@njit(cache=True, error_model="numpy")
+def refine(image, unit, size, column, row, found):
+    """Writes place, score and covariance, found[0:2], [2] and [4:7].
+
+    A step after which ρ is lower is taken back by half. Where no maximum is near, the whole pixel and the score
+    that the caller wrote stay, and the covariance is NaN.
+    """
+    found[0], found[1], found[4:] = float(column), float(row), np.nan
+    area = _area(image, size, column, row)
+    window, w = np.empty((size + 2, size + 2), np.float32), np.empty((size, size), np.float32)
+    x, y, du, dv, highest = 0.0, 0.0, 0.0, 0.0, -1.0
+    uu, uv, vv = 0.0, 0.0, 0.0
+    for _ in range(_EVALUATIONS):
+        interpolate(area, x + du, y + dv, window)
+        a, b, c, gu, gv, rho = _slopes(window, w, unit, _centre(window, w))
+        if rho < highest:
+            du, dv = 0.5 * du, 0.5 * dv
+        else:
+            determinant = a * c - b * b
+            if not (rho > 0.0 and determinant > _SINGULAR * a * c):
+                return
+            x, y, highest, uu, uv, vv = x + du, y + dv, rho, a, b, c
+            du, dv = (c * gu - b * gv) / (determinant * rho), (a * gv - b * gu) / (determinant * rho)
+        if not (abs(x + du) <= _REACH_PX and abs(y + dv) <= _REACH_PX):
+            return
+        if max(abs(du), abs(dv)) < _SETTLED_PX:
+            break
+    found[0], found[1], found[2] = column + x + du, row + y + dv, highest
+    _store_cov(uu, uv, vv, highest, size * size, found)
+
+
+@njit(cache=True, error_model="numpy")
+def _store_cov(uu, uv, vv, rho, n, found):
+    """The residual's variance times (JᵀJ)⁻¹, and the interpolation's own error; NaN where noise explains the slopes.
+
+    Half of the residual is taken as the window's noise. A central difference halves its variance: a quarter of the
+    residual's square sum is what noise adds to each diagonal element of JᵀJ.
+    """
+    unexplained = max(1.0 - rho * rho, 0.0)
+    variance, uu, vv = unexplained / (n - 4), uu - 0.25 * unexplained, vv - 0.25 * unexplained
+    determinant, least = uu * vv - uv * uv, _INTERPOLATION_PX * _INTERPOLATION_PX
+    if uu > 0.0 and determinant > 0.0:
+        found[4], found[5] = variance * vv / determinant + least, -variance * uv / determinant
+        found[6] = variance * uu / determinant + least
+
+
+@njit(cache=True, error_model="numpy")
+def _area(image, size, column, row):
+    """Grey levels around a window, the image's border repeated."""
+    side = size + 2 * _MARGIN
+    area = np.empty((side, side), np.float32)
+    top, left = row - size // 2 - _MARGIN, column - size // 2 - _MARGIN
+    for j in range(side):
+        v = min(max(top + j, 0), image.shape[0] - 1)
+        for i in range(side):
+            area[j, i] = image[v, min(max(left + i, 0), image.shape[1] - 1)]
+    return area
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def interpolate(area, x, y, window):
+    """The window moved by (x, y), one pixel larger on each side, by cubics along rows and then along columns."""
+    u, v = math.floor(x), math.floor(y)
+    across, down = weights(np.float32(x - u)), weights(np.float32(y - v))
+    a, b, c, d = np.float32(across[0]), np.float32(across[1]), np.float32(across[2]), np.float32(across[3])
+    e, f, g, h = np.float32(down[0]), np.float32(down[1]), np.float32(down[2]), np.float32(down[3])
+    side, left, top = window.shape[0], _MARGIN - 2 + int(u), _MARGIN - 2 + int(v)
+    lines = np.empty((side + 3, side), np.float32)
+    for j in range(side + 3):
+        row = area[top + j, left : left + side + 3]
+        for i in range(side):
+            lines[j, i] = a * row[i] + b * row[i + 1] + c * row[i + 2] + d * row[i + 3]
+    for j in range(side):
+        for i in range(side):
+            window[j, i] = e * lines[j, i] + f * lines[j + 1, i] + g * lines[j + 2, i] + h * lines[j + 3, i]
+
+
+@njit(cache=True, error_model="numpy")
+def _centre(window, w):
+    """Fills w with the inside of the window without mean and with unit norm; the norm it had."""
+    size = w.shape[0]
+    mean, square = 0.0, 0.0
+    for j in range(size):
+        for i in range(size):
+            mean += window[j + 1, i + 1]
+    mean /= size * size
+    for j in range(size):
+        for i in range(size):
+            w[j, i] = window[j + 1, i + 1] - mean
+            square += w[j, i] * w[j, i]
+    norm = math.sqrt(square)
+    for j in range(size):
+        for i in range(size):
+            w[j, i] /= norm
+    return norm
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
+def _slopes(window, w, unit, norm):
+    """JᵀJ (three numbers), Jᵀt (two) and ρ, where window slopes are central differences."""
+    size, zero = w.shape[0], np.float32(0.0)
+    su, sv, wu, wv, tu, tv, uu, uv, vv, rho = zero, zero, zero, zero, zero, zero, zero, zero, zero, zero
+    for j in range(size):
+        for i in range(size):
+            u, v = window[j + 1, i + 2] - window[j + 1, i], window[j + 2, i + 1] - window[j, i + 1]
+            su, sv, rho = su + u, sv + v, rho + w[j, i] * unit[j, i]
+            wu, wv = wu + w[j, i] * u, wv + w[j, i] * v
+            tu, tv = tu + unit[j, i] * u, tv + unit[j, i] * v
+            uu, uv, vv = uu + u * u, uv + u * v, vv + v * v
+    n, scale = size * size, 0.5 / norm
+    uu, uv, vv = uu - su * su / n - wu * wu, uv - su * sv / n - wu * wv, vv - sv * sv / n - wv * wv
+    along_u, along_v = tu - rho * wu, tv - rho * wv
+    squared = scale * scale
+    return squared * uu, squared * uv, squared * vv, scale * along_u, scale * along_v, rho
+
+
+APART_PX = 3
+"""Two peaks of the score are two places from this distance on, along rows or columns."""
+OUTSIDE = np.float32(-2.0)
+"""In a map of scores: not searched."""
+
+discard_stale(Path(__file__).parent)
+
+
+@njit(cache=True, error_model="numpy", parallel=True)
+def search_all(image, templates, centres, covs, limits, found):
+    """Fills found (K, 7) = u, v, score, second score, cov_uu, cov_uv, cov_vv.
+
+    limits = (sigmas, most_px, least_std). What was not found keeps what the caller put there.
+    """
+    for k in prange(templates.shape[0]):
+        search_one(image, templates[k], centres[k], covs[k], limits, found[k])
+
+
+@njit(cache=True, error_model="numpy")
+def search_one(image, template, centre, cov, limits, found):
+    """One template in one ellipse."""
+    unit = normalised(template, limits[2])
+    if unit.shape[0] == 0:
+        return
+    columns, rows = interval(centre, cov, limits, image.shape, template.shape[0])
+    width, height = columns[1] - columns[0] + 1, rows[1] - rows[0] + 1
+    if width <= 0 or height <= 0:
+        return
+    scores = np.full((height, width), OUTSIDE, np.float32)
+    score_ellipse(image, unit, template.shape[0], centre, cov, limits[0], columns, rows, scores)
+    v, u = best(scores)
+    if scores[v, u] <= -1.0:
+        return
+    found[2] = scores[v, u]
+    refine(image, unit, template.shape[0], columns[0] + u, rows[0] + v, found)
+    p, q = second(scores, v, u)
+    if p >= 0:
+        other = np.full(found.shape[0], float(scores[p, q]))
+        refine(image, unit, template.shape[0], columns[0] + q, rows[0] + p, other)
+        keep_better(found, other)
+
+
+@njit(cache=True, error_model="numpy")
+def keep_better(found, other):
+    """The better of two peaks, with the other one's score as the second."""
+    found[3] = other[2]
+    if other[2] > found[2]:
+        other[3] = found[2]
+        found[:] = other
+
+
+@njit(cache=True, error_model="numpy")
+def interval(centre, cov, limits, shape, size):
+    """First and last column and row of the whole pixels to search; empty where the last is before the first."""
+    sigmas, most, half = limits[0], limits[1], size // 2
+    uu, _, vv = ellipse(cov, sigmas)
+    if not (
+        math.isfinite(uu) and math.isfinite(vv) and math.isfinite(centre[0]) and math.isfinite(centre[1])
+    ):
+        return (0, -1), (0, -1)
+    across, down = min(sigmas * math.sqrt(uu), most), min(sigmas * math.sqrt(vv), most)
+    columns = _clipped(centre[0], across, half, shape[1] - 1 - half)
+    return columns, _clipped(centre[1], down, half, shape[0] - 1 - half)
+
+
+@njit(cache=True, error_model="numpy")
+def _clipped(centre, reach, first, last):
+    """Whole numbers within reach of the centre and in first..last."""
+    if centre + reach < first or centre - reach > last:
+        return 0, -1
+    return int(max(np.ceil(centre - reach), first)), int(min(np.floor(centre + reach), last))
+
+
+@njit(cache=True, error_model="numpy")
+def best(scores):
+    """Row and column of the highest score, the first of equal ones."""
+    row, column, highest = 0, 0, scores[0, 0]
+    for y in range(scores.shape[0]):
+        for x in range(scores.shape[1]):
+            if scores[y, x] > highest:
+                row, column, highest = y, x, scores[y, x]
+    return row, column
+
+
+@njit(cache=True, error_model="numpy")
+def second(scores, row, column):
+    """Row and column of the highest peak elsewhere, −1 where there is none."""
+    height, width = scores.shape
+    v, u, highest = -1, -1, np.float32(-1.0)
+    for y in range(height):
+        for x in range(width):
+            apart = max(abs(y - row), abs(x - column)) >= APART_PX
+            if scores[y, x] > highest and apart and _is_peak(scores, y, x):
+                v, u, highest = y, x, scores[y, x]
+    return v, u
+
+
+@njit(cache=True, error_model="numpy")
+def _is_peak(scores, row, column):
+    """Whether no searched neighbour scores higher."""
+    for y in range(max(row - 1, 0), min(row + 2, scores.shape[0])):
+        for x in range(max(column - 1, 0), min(column + 2, scores.shape[1])):
+            if scores[y, x] > scores[row, column]:
+                return False
+    return True

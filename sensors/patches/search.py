@@ -1,0 +1,180 @@
+"""Image patches of landmarks: cut at the first sighting, warped to the predicted view, searched for (E06 §4.1).
+
+Pixels are (column, row), with the centre of the top-left one at (0, 0). Images are grey, (H, W) uint8.
+"""
+
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from rbpf.errors import InputError
+
+PAIRS_PER_PRODUCT, PAIRS_PER_TEMPLATE = 1.0 / 400.0, 300.0
+"""What a product of grey levels and a template cost beside the pairs of `rbpf.kernels.threads`."""
+LARGEST_SIZE = 101
+"""Of a template: sums of squares over a window stay far inside 32 bits."""
+
+
+@final
+@dataclass(frozen=True)
+class PatchMatches:
+    """Where templates were found, one row each.
+
+    Attributes:
+        px: (K, 2) place to a fraction of a pixel; NaN where nothing was searched.
+        score: (K,) normalised cross-correlation at the place, −1 where nothing was searched.
+        second: (K,) that of the next peak in the ellipse, at least 3 px away; −1 where there is none.
+        cov: (K, 2, 2) of the place, from the residual and the image's slopes [px²]; NaN where the place is a whole
+            pixel on a slope that rises beyond the ellipse, or where noise alone explains the image's slopes.
+    """
+
+    px: np.ndarray
+    score: np.ndarray
+    second: np.ndarray
+    cov: np.ndarray
+
+    @property
+    def ratio(self) -> np.ndarray:
+        """(K,) second over best score, from 0 (unmistakable) to 1 (ambiguous, or not found)."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = np.maximum(self.second, 0.0) / self.score
+        return np.where(self.score > 0.0, ratio, 1.0)
+
+
+def cut(image: np.ndarray, px: np.ndarray, half: int = 15) -> np.ndarray | None:
+    """A window (2 half + 1, 2 half + 1) uint8 around a place (2,), None where it reaches beyond the image.
+
+    Exact at a whole pixel, else interpolated by cubics (Catmull-Rom).
+
+    Raises:
+        InputError: the image is not (H, W) uint8.
+    """
+    from rbpf.sensors.patches.kernels import cut_window
+
+    image = checked_image(image)
+    x, y = float(px[0]), float(px[1])
+    if not (half <= x <= image.shape[1] - 1 - half and half <= y <= image.shape[0] - 1 - half):
+        return None
+    window = np.empty((2 * half + 1, 2 * half + 1), np.uint8)
+    cut_window(image, x, y, window)
+    return window
+
+
+def warp(sources: np.ndarray, affines: np.ndarray, size: int = 11) -> np.ndarray:
+    """Templates (K, size, size) float32: windows as another view would see them.
+
+    Where the new view is smaller, each pixel gathers all the source pixels that it covers.
+
+    Args:
+        sources: (K, S, S) uint8, from `cut`.
+        affines: (K, 2, 2), source offset [px] by offset in the new view [px]: 2 I for a view of half the size.
+        size: odd.
+
+    Returns:
+        The templates; NaN where the new view shows what the source does not, or the affine map is not finite.
+
+    Raises:
+        InputError: a shape or type is another one, or a size is even.
+    """
+    from rbpf.sensors.patches.kernels import warp_all
+
+    sources, affines = np.ascontiguousarray(sources), np.ascontiguousarray(affines, float)
+    square = sources.ndim == 3 and sources.shape[1] == sources.shape[2] and sources.shape[1] % 2 == 1
+    if not square or sources.dtype != np.uint8:
+        raise InputError(f"sources must be (K, S, S) uint8 with S odd, got {sources.shape} {sources.dtype}")
+    count = sources.shape[0]
+    if affines.shape != (count, 2, 2):
+        raise InputError(f"affines must be ({count}, 2, 2), one for each source, got {affines.shape}")
+    if not _fits(size):
+        raise InputError(f"the size of a template must be odd, from 3 to {LARGEST_SIZE}, got {size}")
+    templates = np.empty((count, size, size), np.float32)
+    warp_all(sources, affines, templates)
+    return templates
+
+
+def search(
+    image: np.ndarray,
+    templates: np.ndarray,
+    centres: np.ndarray,
+    covs: np.ndarray,
+    sigmas: float = 3.0,
+    most_px: float = 40.0,
+    least_std: float = 3.0,
+) -> PatchMatches:
+    """Looks for each template in the ellipse where it is expected, by zero-mean normalised cross-correlation.
+
+    Every whole pixel of the ellipse is tried where the whole template fits into the image; half a pixel's diagonal is
+    added to the half axes in quadrature, so that one at least is. The best one is refined to a fraction of a pixel.
+
+    Args:
+        image: (H, W) uint8.
+        templates: (K, size, size) float32 from `warp`, size odd.
+        centres: (K, 2) expected places.
+        covs: (K, 2, 2) their covariances [px²].
+        sigmas: the ellipse's half axes in standard deviations.
+        most_px: the furthest column and row from the centre; infinite to search a whole image.
+        least_std: a template whose grey levels have a smaller standard deviation is not searched.
+
+    Returns:
+        The matches. Nothing is found for a template that is not finite, or where centre or covariance are none.
+
+    Raises:
+        InputError: a shape or type is another one.
+    """
+    from rbpf.kernels.threads import run_driver
+    from rbpf.sensors.patches.kernels import search_all
+
+    image = checked_image(image)
+    templates = np.ascontiguousarray(templates, np.float32)
+    centres, covs = np.ascontiguousarray(centres, float), np.ascontiguousarray(covs, float)
+    limits = (float(sigmas), float(most_px), float(least_std))
+    _check_search(templates, centres, covs, limits)
+    count = templates.shape[0]
+    found = np.full((count, 7), np.nan)
+    found[:, 2:4] = -1.0
+    pairs = _pairs(image, templates, covs, limits)
+    run_driver(search_all, pairs, image, templates, centres, covs, limits, found)
+    return PatchMatches(found[:, :2], found[:, 2], found[:, 3], found[:, [4, 5, 5, 6]].reshape(count, 2, 2))
+
+
+def checked_image(image: np.ndarray) -> np.ndarray:
+    """The image, its rows one after the other in memory.
+
+    Raises:
+        InputError: it is not (H, W) uint8.
+    """
+    if not isinstance(image, np.ndarray) or image.ndim != 2 or image.dtype != np.uint8:
+        found = f"{image.shape} {image.dtype}" if isinstance(image, np.ndarray) else type(image).__name__
+        raise InputError(f"an image must be grey, (H, W) uint8, got {found}: convert it first")
+    return np.ascontiguousarray(image)
+
+
+def _check_search(
+    templates: np.ndarray, centres: np.ndarray, covs: np.ndarray, limits: tuple[float, float, float]
+) -> None:
+    count, sigmas, most_px, _ = templates.shape[0], *limits
+    if templates.ndim != 3 or templates.shape[1] != templates.shape[2] or not _fits(templates.shape[1]):
+        expected = f"(K, size, size) with an odd size from 3 to {LARGEST_SIZE}"
+        raise InputError(f"templates must be {expected}, got {templates.shape}")
+    if centres.shape != (count, 2) or covs.shape != (count, 2, 2):
+        expected = f"centres ({count}, 2) and covs ({count}, 2, 2), one for each template"
+        raise InputError(f"a search needs {expected}, got {centres.shape} and {covs.shape}")
+    if not (0.0 < sigmas < np.inf and most_px >= 0.0):
+        raise InputError(f"sigmas must be positive and most_px not negative, got {sigmas!r} and {most_px!r}")
+
+
+def _fits(size: int) -> bool:
+    """Whether a template may have this size."""
+    return 3 <= size <= LARGEST_SIZE and size % 2 == 1
+
+
+def _pairs(
+    image: np.ndarray, templates: np.ndarray, covs: np.ndarray, limits: tuple[float, float, float]
+) -> int:
+    """What a search costs, in the unit of `rbpf.kernels.threads`."""
+    variance = np.nan_to_num(np.maximum(covs[:, [0, 1], [0, 1]], 0.0))
+    reach = np.minimum(limits[0] * np.sqrt(variance), limits[1])
+    sides = np.minimum(2.0 * reach + 1.0, image.shape[::-1])
+    products = float(sides.prod(axis=1).sum()) * templates.shape[1] ** 2
+    return int(products * PAIRS_PER_PRODUCT + len(templates) * PAIRS_PER_TEMPLATE)

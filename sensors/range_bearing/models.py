@@ -1,0 +1,225 @@
+"""Range-bearing sensors in the plane and in space, and sensors that measure a point's position.
+
+All are chains with one Jacobian per link:
+
+    world point --world_from_robot⁻¹--> robot frame --robot_from_sensor⁻¹--> sensor frame --measure--> z
+
+For a right perturbation of world_from_robot, p_robot moves by −ω × p_robot − v.
+"""
+
+from abc import abstractmethod
+from typing import final
+
+import numpy as np
+
+from rbpf.core.models import FusedKernel, Jacobians, ObservationModel
+from rbpf.lie import SE2Group, SE3Group
+
+
+class RigidPointModel(ObservationModel):
+    """A sensor mounted on a robot that measures points; a subclass says what is measured in the sensor's frame.
+
+    A landmark's mean is taken as a world point and its constants are not read: anchored ones need a model of their own.
+
+    Args:
+        space: SE2 or SE3, of world_from_robot.
+        robot_from_sensor: (E,) mounting pose, fixed from then on; by default the robot's origin.
+    """
+
+    def __init__(self, space: SE2Group | SE3Group, robot_from_sensor: np.ndarray | None = None) -> None:
+        self.space = space
+        mounting = space.identity() if robot_from_sensor is None else robot_from_sensor
+        self.robot_from_sensor = np.array(mounting, dtype=float)
+        self.robot_from_sensor.flags.writeable = False
+        rotation = space.rotation(self.robot_from_sensor)
+        self._mounting = np.concatenate([rotation.ravel(), space.translation(self.robot_from_sensor)])
+
+    @abstractmethod
+    def measure(self, point: np.ndarray) -> np.ndarray:
+        """Z (…, p) of points (…, D) in the sensor's frame."""
+
+    @abstractmethod
+    def measure_jacobian(self, point: np.ndarray) -> np.ndarray:
+        """∂z/∂point (…, p, D)."""
+
+    @abstractmethod
+    def locate(self, z: np.ndarray) -> np.ndarray:
+        """The point (…, D) in the sensor's frame that is measured as z (…, p)."""
+
+    def predict(
+        self,
+        state: np.ndarray,
+        landmark: np.ndarray | None = None,
+        const: np.ndarray | None = None,
+        substate: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """The chain above."""
+        assert landmark is not None
+        in_robot = self.space.inverse_transform(state, landmark)
+        return self.measure(self.space.inverse_transform(self.robot_from_sensor, in_robot))
+
+    def jacobians(
+        self,
+        state: np.ndarray,
+        landmark: np.ndarray | None = None,
+        const: np.ndarray | None = None,
+        substate: np.ndarray | None = None,
+    ) -> Jacobians:
+        """∂z/∂ξ = D [−ω × p | −I] and ∂z/∂landmark = D Rᵀ, with D taken to the robot's frame."""
+        assert landmark is not None
+        in_robot = self.space.inverse_transform(state, landmark)
+        slope = self.measure_jacobian(self.space.inverse_transform(self.robot_from_sensor, in_robot))
+        slope = slope @ np.swapaxes(self.space.rotation(self.robot_from_sensor), -1, -2)
+        by_landmark = slope @ np.swapaxes(self.space.rotation(state), -1, -2)
+        return Jacobians(np.concatenate([_by_rotation(slope, in_robot), -slope], axis=-1), by_landmark)
+
+    def invert(self, state: np.ndarray, z: np.ndarray) -> np.ndarray:
+        """The chain backwards."""
+        in_robot = self.space.transform(self.robot_from_sensor, self.locate(z))
+        return self.space.transform(state, in_robot)
+
+    def mounting(self) -> np.ndarray:
+        """Parameters of the fused kernels: rotation of the mounting pose by rows, then its translation."""
+        return self._mounting
+
+
+def _by_rotation(slope: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """D ∂p/∂ω, with ∂p/∂ω = (y, −x) in the plane and [p]× in space."""
+    if point.shape[-1] == 2:
+        turned = np.stack([point[..., 1], -point[..., 0]], axis=-1)
+        return (slope @ turned[..., None])[..., :1]
+    x, y, z = (point[..., i] for i in range(3))
+    zero = np.zeros_like(x)
+    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*point.shape, 3)
+    return slope @ cross
+
+
+def wrap_angle(angle: np.ndarray) -> np.ndarray:
+    """The same angle in [−π, π)."""
+    return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
+@final
+class RangeBearing(RigidPointModel):
+    """z = (range, yaw) in the plane, (range, yaw, pitch) in space; metres and radians.
+
+    The point is r (cos yaw cos pitch, sin yaw cos pitch, ± sin pitch), x forward, y left, z up.
+
+    Args:
+        space: SE2 or SE3.
+        robot_from_sensor: (E,) mounting pose.
+        pitch_sign: +1 where positive pitch points up, −1 where it points down.
+        max_range: metres, for `visible`.
+        half_field_of_view: of yaw, radians, for `visible`.
+    """
+
+    def __init__(
+        self,
+        space: SE2Group | SE3Group,
+        robot_from_sensor: np.ndarray | None = None,
+        pitch_sign: float = 1.0,
+        max_range: float = np.inf,
+        half_field_of_view: float = np.pi,
+    ) -> None:
+        super().__init__(space, robot_from_sensor)
+        self.dim = 2 if isinstance(space, SE2Group) else 3
+        self.pitch_sign = float(pitch_sign)
+        self.max_range = max_range
+        self.half_field_of_view = half_field_of_view
+
+    def measure(self, point: np.ndarray) -> np.ndarray:
+        """(…, D) → (…, D)."""
+        flat = np.hypot(point[..., 0], point[..., 1])
+        yaw = np.arctan2(point[..., 1], point[..., 0])
+        if self.dim == 2:
+            return np.stack([flat, yaw], axis=-1)
+        pitch = self.pitch_sign * np.arctan2(point[..., 2], flat)
+        return np.stack([np.hypot(flat, point[..., 2]), yaw, pitch], axis=-1)
+
+    def measure_jacobian(self, point: np.ndarray) -> np.ndarray:
+        """∂(range, yaw[, pitch])/∂point."""
+        x, y = point[..., 0], point[..., 1]
+        flat2 = x * x + y * y
+        if self.dim == 2:
+            distance = np.sqrt(flat2)
+            rows = [x / distance, y / distance, -y / flat2, x / flat2]
+            return np.stack(rows, axis=-1).reshape(*point.shape, 2)
+        z, flat = point[..., 2], np.sqrt(flat2)
+        distance2 = flat2 + z * z
+        distance = np.sqrt(distance2)
+        tilt = self.pitch_sign * z / (flat * distance2)
+        rows = [x / distance, y / distance, z / distance, -y / flat2, x / flat2, np.zeros_like(x)]
+        rows += [-x * tilt, -y * tilt, self.pitch_sign * flat / distance2]
+        return np.stack(rows, axis=-1).reshape(*point.shape, 3)
+
+    def locate(self, z: np.ndarray) -> np.ndarray:
+        """(…, p) → (…, D)."""
+        distance, yaw = z[..., 0], z[..., 1]
+        if self.dim == 2:
+            return np.stack([distance * np.cos(yaw), distance * np.sin(yaw)], axis=-1)
+        flat = distance * np.cos(z[..., 2])
+        height = self.pitch_sign * distance * np.sin(z[..., 2])
+        return np.stack([flat * np.cos(yaw), flat * np.sin(yaw), height], axis=-1)
+
+    def residual(self, z: np.ndarray, predicted: np.ndarray) -> np.ndarray:
+        """Angles wrapped."""
+        difference = z - predicted
+        difference[..., 1:] = wrap_angle(difference[..., 1:])
+        return difference
+
+    def visible(self, state: np.ndarray, landmark: np.ndarray, const: np.ndarray | None = None) -> np.ndarray:
+        """Within range and field of view."""
+        z = self.predict(state, landmark)
+        return (z[..., 0] <= self.max_range) & (np.abs(z[..., 1]) <= self.half_field_of_view)
+
+    def kernel(self) -> FusedKernel:
+        """The compiled twin."""
+        from rbpf.sensors.range_bearing import kernels as compiled
+
+        if self.dim == 2:
+            return FusedKernel(compiled.range_bearing_planar, self.mounting())
+        return FusedKernel(compiled.range_bearing_spatial, np.append(self.mounting(), self.pitch_sign))
+
+
+@final
+class RelativePosition(RigidPointModel):
+    """z = the point in the sensor's frame, metres.
+
+    Args:
+        space: SE2 or SE3.
+        robot_from_sensor: (E,) mounting pose.
+        max_range: metres, for `visible`.
+    """
+
+    def __init__(
+        self,
+        space: SE2Group | SE3Group,
+        robot_from_sensor: np.ndarray | None = None,
+        max_range: float = np.inf,
+    ) -> None:
+        super().__init__(space, robot_from_sensor)
+        self.dim = 2 if isinstance(space, SE2Group) else 3
+        self.max_range = max_range
+
+    def measure(self, point: np.ndarray) -> np.ndarray:
+        """The point itself."""
+        return point
+
+    def measure_jacobian(self, point: np.ndarray) -> np.ndarray:
+        """The identity."""
+        return np.broadcast_to(np.eye(self.dim), (*point.shape, self.dim))
+
+    def locate(self, z: np.ndarray) -> np.ndarray:
+        """The point itself."""
+        return z
+
+    def visible(self, state: np.ndarray, landmark: np.ndarray, const: np.ndarray | None = None) -> np.ndarray:
+        """Within range."""
+        return np.linalg.norm(self.predict(state, landmark), axis=-1) <= self.max_range
+
+    def kernel(self) -> FusedKernel:
+        """The compiled twin."""
+        from rbpf.sensors.range_bearing import kernels as compiled
+
+        function = compiled.position_planar if self.dim == 2 else compiled.position_spatial
+        return FusedKernel(function, self.mounting())

@@ -1,0 +1,299 @@
+"""SIFT features of a rectified stereo pair (S05 §III-B): keypoints of both images, matched along the rows.
+
+A keypoint of the left image may match those of the right one that lie on its row, to the left of it by a disparity
+that a depth beyond the nearest has, at a like scale and orientation. Of these candidates the nearest descriptor is taken
+(`rbpf.sensors.descriptors.matching`), and the place in the right image is refined on grey values (`refine`): a window
+around the left place is moved along the row of the right image until the squared difference of the two is least,
+brightness and contrast left free (Gauss-Newton; B. Lucas, T. Kanade 1981, in one dimension).
+
+The noise of z = (u_left, v, u_right): what a keypoint's place means on the object changes from view to view, with
+standard deviation σ_p per axis. The refinement looks for what lies at the left place, whatever that is: u_right shares
+the error of u_left and adds that of the disparity, σ_d. Both grow with the keypoint's scale,
+
+    cov = [[σ_p², 0, σ_p²], [0, σ_p², 0], [σ_p², 0, σ_p² + σ_d²]],    Mathematics (stereo-noise).
+
+Without the refinement both places have their own error, and cov = σ_p² I.
+"""
+
+from dataclasses import dataclass, field
+from typing import ClassVar, final
+
+import numpy as np
+
+from rbpf.errors import InputError
+from rbpf.sensors.camera import RectifiedStereo
+from rbpf.sensors.descriptors.matching import DescriptorMatches, MatchLimits, band_pairs, match_pairs
+from rbpf.sensors.features.sift import Keypoints, Sift, SiftConfig
+from rbpf.sensors.patches.search import checked_image
+from rbpf.sensors.stereo.features import StereoFeatures
+from rbpf.sensors.stereo.impulse_noise import remove_impulses
+
+SWAPPED, FEWER = 20, 4
+"""So many matches the wrong way round, and so many times fewer the right way, are no accident."""
+
+
+@dataclass(frozen=True)
+class StereoConfig:
+    """How the two images are matched, and how exact the result is.
+
+    Attributes:
+        row_px: rows of a match differ by at most this …
+        row_per_scale: … and this fraction of the keypoint's scale.
+        nearest_m: least depth; disparities above that of this depth are left out.
+        least_disparity_px: nor does a smaller disparity than this tell a depth.
+        scale_ratio: largest ratio of the two scales.
+        turn_rad: largest difference of the two orientations.
+        limits: of the descriptors.
+        filter_impulses: whether impulse noise (salt and pepper) is removed before keypoints are detected.
+        refine: whether the disparity is refined on grey values.
+        half_px: of the refinement's window.
+        least_correlation: of the refined windows, else the match is dropped.
+        shift_px: nor may the refinement move it further than this.
+        place_px: σ_p of a keypoint of scale 0 …
+        place_per_scale: … and what is added to it in quadrature, as a fraction of the scale.
+        disparity_px: σ_d of a keypoint of scale 0 …
+        disparity_per_scale: … and what is added to it in quadrature.
+
+    Raises:
+        InputError: a number is out of its range.
+    """
+
+    RENAMED: ClassVar[dict[str, str]] = {"mend": "filter_impulses"}
+
+    row_px: float = 1.0
+    row_per_scale: float = 0.25
+    nearest_m: float = 0.3
+    least_disparity_px: float = 1.0
+    scale_ratio: float = 1.5
+    turn_rad: float = 0.35
+    limits: MatchLimits = field(default_factory=MatchLimits)
+    filter_impulses: bool = True
+    refine: bool = True
+    half_px: int = 5
+    least_correlation: float = 0.8
+    shift_px: float = 2.0
+    place_px: float = 0.25
+    place_per_scale: float = 0.02
+    disparity_px: float = 0.1
+    disparity_per_scale: float = 0.025
+
+    def __post_init__(self) -> None:
+        positive = (
+            "nearest_m",
+            "least_disparity_px",
+            "turn_rad",
+            "half_px",
+            "shift_px",
+            "place_px",
+            "disparity_px",
+        )
+        for name in positive:
+            if not getattr(self, name) > 0.0:
+                raise InputError(f"{name} must be positive, got {getattr(self, name)}")
+        for name in ("row_px", "row_per_scale", "place_per_scale", "disparity_per_scale"):
+            if not getattr(self, name) >= 0.0:
+                raise InputError(f"{name} must not be negative, got {getattr(self, name)}")
+        if not (self.scale_ratio >= 1.0 and self.least_correlation <= 1.0):
+            found = f"{self.scale_ratio} and {self.least_correlation}"
+            raise InputError(f"scale_ratio must be at least 1 and least_correlation at most 1, got {found}")
+
+
+@final
+class StereoSift:
+    """Measures pairs of images.
+
+    Args:
+        rig: the two cameras.
+        sift: settings of the keypoints.
+        stereo: settings of the matching.
+    """
+
+    def __init__(
+        self, rig: RectifiedStereo, sift: SiftConfig | None = None, stereo: StereoConfig | None = None
+    ) -> None:
+        self.rig = rig
+        self.sift = Sift(sift)
+        self.config = stereo or StereoConfig()
+        self.impulse_fraction = 0.0
+        """Fraction of the pixels that were replaced in the last pair."""
+
+    def measure(self, left: np.ndarray, right: np.ndarray) -> StereoFeatures:
+        """Features of a pair of images (H, W) uint8; none where there is no texture.
+
+        Raises:
+            InputError: the images are not of the camera's size, or they are swapped.
+        """
+        self._check(left, right)
+        self.impulse_fraction = 0.0
+        if self.config.filter_impulses:
+            (left, one), (right, other) = remove_impulses(left), remove_impulses(right)
+            self.impulse_fraction = 0.5 * (one + other)
+        return self.match((left, right), self.sift.detect(left), self.sift.detect(right))
+
+    @property
+    def remark(self) -> str:
+        """In words, what was wrong with the last pair, though it could be measured; empty where nothing was."""
+        if not self.impulse_fraction:
+            return ""
+        fraction = f"{100.0 * self.impulse_fraction:.1f} %"
+        return f"{fraction} of the pixels have impulse noise, the median of their surroundings is taken"
+
+    def match(
+        self, images: tuple[np.ndarray, np.ndarray], left: Keypoints, right: Keypoints
+    ) -> StereoFeatures:
+        """Features of a pair of images whose keypoints are known.
+
+        Raises:
+            InputError: the images are swapped.
+        """
+        matches = self._along_rows(left, right)
+        self._check_order(left, right, len(matches))
+        z = np.column_stack([left.px[matches.first], right.px[matches.second, 0]])
+        if self.config.refine:
+            refined = refine(*images, z[:, :2], z[:, 2], self.config.half_px)
+            good = (np.abs(refined.u - z[:, 2]) <= self.config.shift_px) & (
+                refined.correlation >= self.config.least_correlation
+            )
+            z[:, 2] = refined.u
+            matches, z = matches.take(good), z[good]
+        far = z[:, 0] - z[:, 2] >= self.config.least_disparity_px
+        return self._features(left.take(matches.first[far]), z[far])
+
+    def noise(self, scale: np.ndarray) -> np.ndarray:
+        """Covariances (K, 3, 3) of (u_left, v, u_right) of keypoints of scales (K,), px²."""
+        config = self.config
+        place = config.place_px**2 + (config.place_per_scale * scale) ** 2
+        if not config.refine:
+            return place[:, None, None] * np.eye(3)
+        disparity = config.disparity_px**2 + (config.disparity_per_scale * scale) ** 2
+        shared = np.array([[1.0, 0.0, 1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 1.0]])
+        return place[:, None, None] * shared + disparity[:, None, None] * np.diag([0.0, 0.0, 1.0])
+
+    def _features(self, keypoints: Keypoints, z: np.ndarray) -> StereoFeatures:
+        return StereoFeatures.measured(
+            self.rig,
+            z,
+            self.noise(keypoints.scale),
+            keypoints.scale,
+            keypoints.orientation,
+            keypoints.descriptors,
+        )
+
+    def _along_rows(self, left: Keypoints, right: Keypoints) -> DescriptorMatches:
+        """Matches of one keypoint of each image at most; a place that has two orientations counts once."""
+        config = self.config
+        reach = config.row_px + config.row_per_scale * left.scale
+        k, m = band_pairs(left.px[:, 1], right.px[:, 1], reach)
+        disparity = left.px[k, 0] - right.px[m, 0]
+        most = self.rig.camera.fx * self.rig.baseline_m / config.nearest_m
+        near = (disparity >= config.least_disparity_px) & (disparity <= most)
+        near &= np.abs(np.log(left.scale[k] / right.scale[m])) <= np.log(config.scale_ratio)
+        near &= np.cos(left.orientation[k] - right.orientation[m]) >= np.cos(config.turn_rad)
+        return one_per_place(
+            match_pairs(left.descriptors, right.descriptors, (k[near], m[near]), config.limits), left, right
+        )
+
+    def _check(self, left: np.ndarray, right: np.ndarray) -> None:
+        left, right, camera = checked_image(left), checked_image(right), self.rig.camera
+        if left.shape != right.shape:
+            sizes = " and ".join(f"{image.shape[1]}x{image.shape[0]} px" for image in (left, right))
+            raise InputError(f"left and right image must be of one size, got {sizes}: give a rectified pair")
+        if left.shape != (camera.height, camera.width):
+            size = f"{left.shape[1]}x{left.shape[0]}"
+            raise InputError(f"the camera takes {camera.width}x{camera.height} px, the images have {size} px")
+
+    def _check_order(self, left: Keypoints, right: Keypoints, found: int) -> None:
+        """Refuses a pair whose keypoints match far better the other way round."""
+        if FEWER * found >= min(len(left), len(right)):
+            return
+        swapped = len(self._along_rows(right, left))
+        if swapped >= SWAPPED and swapped > FEWER * found:
+            raise InputError(
+                f"left and right image seem to be swapped: {swapped} matches have a negative disparity and {found} "
+                "a positive one; exchange the two cameras"
+            )
+
+
+def one_per_place(matches: DescriptorMatches, left: Keypoints, right: Keypoints) -> DescriptorMatches:
+    """Of matches whose keypoints share their place in an image those of the nearest descriptors, in the order of the first."""
+    order = np.argsort(matches.distance, kind="stable")
+    for keypoints, rows in ((left, matches.first), (right, matches.second)):
+        _, first = np.unique(keypoints.px[rows[order]], axis=0, return_index=True)
+        order = order[np.sort(first)]
+    return matches.take(np.sort(order))
+
+
+ITERATIONS = 5
+"""Steps; a keypoint is within a pixel of its place, from where three are enough."""
+LONGEST_PX = 1.0
+"""Of a step."""
+_TINY = 1e-9
+
+
+@final
+@dataclass(frozen=True)
+class SubpixelMatches:
+    """Places in the right image.
+
+    Attributes:
+        u: (K,) column there, px; NaN where a window reaches beyond its image.
+        correlation: (K,) of the two windows, normalised, −1 to 1; 0 where there is no u or no texture.
+    """
+
+    u: np.ndarray
+    correlation: np.ndarray
+
+
+def refine(
+    left: np.ndarray, right: np.ndarray, px: np.ndarray, u_right: np.ndarray, half_px: int = 5
+) -> SubpixelMatches:
+    """Refines columns u_right (K,), at which places px (K, 2) of the left image are in the right one.
+
+    Args:
+        left: (H, W) uint8.
+        right: (H, W) uint8.
+        px: (K, 2) places in the left image.
+        u_right: (K,) columns, good to a pixel or two.
+        half_px: the window has 2 half_px + 1 pixels along each side.
+    """
+    u, v = u_right.astype(float), px[:, 1]
+    template = _centred(_windows(left, px[:, 0], v, half_px, half_px))
+    energy = np.maximum(_dot(template, template), _TINY)
+    for _ in range(ITERATIONS):
+        wide = _windows(right, u, v, half_px, half_px + 1)
+        slope = _centred(0.5 * (wide[:, :, 2:] - wide[:, :, :-2]))
+        window = _centred(wide[:, :, 1:-1])
+        gain = _dot(template, window) / energy
+        miss = gain[:, None, None] * template - window
+        step = _dot(slope, miss) / np.maximum(_dot(slope, slope), _TINY)
+        u = u + np.clip(step, -LONGEST_PX, LONGEST_PX)
+    window = _centred(_windows(right, u, v, half_px, half_px))
+    correlation = _dot(template, window) / np.sqrt(energy * np.maximum(_dot(window, window), _TINY))
+    whole = _inside(left, px[:, 0], v, half_px) & _inside(right, u, v, half_px)
+    return SubpixelMatches(np.where(whole, u, np.nan), np.where(whole, correlation, 0.0))
+
+
+def _windows(image: np.ndarray, u: np.ndarray, v: np.ndarray, high: int, wide: int) -> np.ndarray:
+    """(K, 2 high + 1, 2 wide + 1) float32 around places between pixels; the border goes on beyond the image."""
+    column, line = np.floor(u).astype(np.int64), np.floor(v).astype(np.int64)
+    across = (u - column).astype(np.float32)[:, None, None]
+    down = (v - line).astype(np.float32)[:, None, None]
+    columns = np.clip(column[:, None] + np.arange(-wide, wide + 2), 0, image.shape[1] - 1)
+    lines = np.clip(line[:, None] + np.arange(-high, high + 2), 0, image.shape[0] - 1)
+    pixels = image[lines[:, :, None], columns[:, None, :]].astype(np.float32)
+    pixels = pixels[:, :-1] + down * (pixels[:, 1:] - pixels[:, :-1])
+    return pixels[:, :, :-1] + across * (pixels[:, :, 1:] - pixels[:, :, :-1])
+
+
+def _centred(windows: np.ndarray) -> np.ndarray:
+    return windows - windows.mean(axis=(1, 2), keepdims=True)
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.einsum("kij,kij->k", a, b)
+
+
+def _inside(image: np.ndarray, u: np.ndarray, v: np.ndarray, half_px: int) -> np.ndarray:
+    height, width = image.shape
+    across = (u >= half_px) & (u <= width - 1 - half_px)
+    return across & (v >= half_px) & (v <= height - 1 - half_px)
