@@ -8,7 +8,7 @@ import numpy as np
 from benchmarks.patch_search import one_thread, picture
 from benchmarks.rows import Row, Settings, Timing, interleaved
 from rbpf.sensors.descriptors.index import DescriptorIndex, ExactSearch, Gate, TreeSearch
-from rbpf.sensors.features.sift import Sift, SiftConfig
+from rbpf.sensors.features import Sift, SiftConfig
 
 SIZES, FEATURES, IN_VIEW = (1000, 10_000, 40_000), 300, 600
 LENGTH, NOISE = 36, 0.012
@@ -21,7 +21,7 @@ def real_descriptors(count: int) -> np.ndarray:
     sift, descriptors, size = Sift(SiftConfig(0, 1.0, contrast=0.02)), [], 0
     while size < count:
         image = picture(480, 640, 1.5 + 0.1 * len(descriptors), seed=len(descriptors))
-        descriptors.append(sift.detect(image).descriptors)
+        descriptors.append(sift.extract(image).descriptors)
         size += len(descriptors[-1])
     return np.concatenate(descriptors)[:count]
 

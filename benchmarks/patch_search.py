@@ -9,7 +9,7 @@ import numba
 import numpy as np
 
 from benchmarks.rows import Row, Settings, Timing, interleaved
-from rbpf.sensors.features.corners import corners
+from rbpf.sensors.features import CornerDetector
 from rbpf.sensors.patches.search import cut, search, warp
 
 K, SIZE, RADIUS_PX, SIGMAS = 25, 11, 10.0, 3.0
@@ -92,7 +92,7 @@ def one_thread() -> Iterator[None]:
 def run(settings: Settings) -> list[Row]:
     """Three rows; the first two once both contestants have found what there is to find."""
     ellipses, whole, scene = Ellipses(), WholeImage(), picture(480, 640, 4.5)
-    nothing = np.zeros((0, 2))
+    detector = CornerDetector()
     with one_thread():
         for task in (ellipses, whole):
             if max(np.abs(found() - task.truth).max() for found in (task.ours, task.peer)) > 0.1:
@@ -102,7 +102,7 @@ def run(settings: Settings) -> list[Row]:
         everywhere = measure({"rbpf": whole.ours, "peer": whole.peer}, turns // 3)
         chosen = measure(
             {
-                "rbpf": lambda: corners(scene, nothing, CORNERS, SPACING_PX),
+                "rbpf": lambda: detector.detect(scene, CORNERS, None, SPACING_PX),
                 "peer": lambda: cv2.goodFeaturesToTrack(scene, CORNERS, 0.01, SPACING_PX, blockSize=9),
             },
             turns // 3,

@@ -22,10 +22,11 @@ from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.descriptors.index import DescriptorIndex, DescriptorSearch, ExactSearch, Gate, TreeSearch
 from rbpf.sensors.descriptors.landmark_management import LandmarkManager, NewLandmarkConfig
 from rbpf.sensors.descriptors.matching import MatchLimits
+from rbpf.sensors.features import Sift
 from rbpf.sensors.features.sift import SiftConfig, descriptors_from_histograms
 from rbpf.sensors.readers.images import open_stereo
 from rbpf.sensors.stereo.features import StereoFeatures, match_frames
-from rbpf.sensors.stereo.matching import StereoSift
+from rbpf.sensors.stereo.matching import StereoMatcher
 
 NAMES = {"stereo_zed_room1": (1, 5, 10), "stereo_kitti_seq1": (1, 2, 3)}
 SLACK_PX, RIGHT = 2.0, 16.3
@@ -59,7 +60,7 @@ class Recording:
 def read(folder: Path, config: SiftConfig) -> Recording:
     """All of a recording."""
     sequence = open_stereo(folder)
-    sensor = StereoSift(sequence.rig, config)
+    sensor = StereoMatcher(sequence.rig, Sift(config))
     features = [sensor.measure(frame.image, frame.right) for frame in sequence.frames()]
     return Recording(sequence.rig, features, path(sequence.rig, features)[0])
 

@@ -19,7 +19,7 @@ from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.descriptors.matching import MatchLimits
 from rbpf.sensors.readers.images import StereoSequence, open_stereo
 from rbpf.sensors.stereo.features import match_frames
-from rbpf.sensors.stereo.matching import StereoSift
+from rbpf.sensors.stereo.matching import StereoMatcher
 from rbpf.validation.simulation.exposure import Imaging
 from rbpf.validation.simulation.images import simulate_images
 from rbpf.validation.simulation.textured_room import TexturedRoom
@@ -31,7 +31,7 @@ FRAMES = 40
 
 def residuals(sequence: StereoSequence) -> tuple[np.ndarray, np.ndarray]:
     """(P, 3) pixels of (u_left, v, u_right) less their prediction, and scales (P,)."""
-    sensor, misses, scales = StereoSift(sequence.rig), [], []
+    sensor, misses, scales = StereoMatcher(sequence.rig), [], []
     frames = [frame for frame, _ in zip(sequence.frames(), range(FRAMES), strict=False)]
     features = [sensor.measure(frame.image, frame.right) for frame in frames]
     for before, after in pairwise(features):

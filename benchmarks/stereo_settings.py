@@ -16,31 +16,31 @@ from benchmarks.plain_odometry import path
 from rbpf.lie import SE3
 from rbpf.runs.alignment import align
 from rbpf.sensors.camera import RectifiedStereo
-from rbpf.sensors.features.sift import SiftConfig
+from rbpf.sensors.features import Sift, SiftConfig
 from rbpf.sensors.readers.images import StereoSequence, open_stereo
 from rbpf.sensors.stereo.features import StereoFeatures
-from rbpf.sensors.stereo.matching import StereoConfig, StereoSift
+from rbpf.sensors.stereo.matching import PairConfig, StereoMatcher
 
 NAMES = "stereo_zed_room1", "stereo_kitti_seq1"
 SEEDS = 3
 
 SETTINGS = {
-    "whole image": (SiftConfig(features=0, working_scale=1.0), StereoConfig()),
-    "half": (SiftConfig(features=0), StereoConfig()),
-    "half, not refined": (SiftConfig(features=0), StereoConfig(refine=False)),
-    "half, descriptors of 128": (SiftConfig(features=0, length=128), StereoConfig()),
-    "half, contrast 0.02": (SiftConfig(features=0, contrast=0.02), StereoConfig()),
-    "half, 300 keypoints": (SiftConfig(features=300), StereoConfig()),
-    "0.35": (SiftConfig(features=0, working_scale=0.35), StereoConfig()),
+    "whole image": (SiftConfig(features=0, working_scale=1.0), PairConfig()),
+    "half": (SiftConfig(features=0), PairConfig()),
+    "half, not refined": (SiftConfig(features=0), PairConfig(refine=False)),
+    "half, descriptors of 128": (SiftConfig(features=0, length=128), PairConfig()),
+    "half, contrast 0.02": (SiftConfig(features=0, contrast=0.02), PairConfig()),
+    "half, 300 keypoints": (SiftConfig(features=300), PairConfig()),
+    "0.35": (SiftConfig(features=0, working_scale=0.35), PairConfig()),
 }
 
 
-def measured(sequence: StereoSequence, sensor: StereoSift) -> tuple[list[StereoFeatures], np.ndarray]:
+def measured(sequence: StereoSequence, sensor: StereoMatcher) -> tuple[list[StereoFeatures], np.ndarray]:
     """Features of all pairs, and mean milliseconds of SIFT and of the matching."""
     features, seconds = [], np.zeros(2)
     for frame in sequence.frames():
         start = time.process_time()
-        keypoints = sensor.sift.detect(frame.image), sensor.sift.detect(frame.right)
+        keypoints = sensor.extractor.extract(frame.image), sensor.extractor.extract(frame.right)
         middle = time.process_time()
         features.append(sensor.match((frame.image, frame.right), *keypoints))
         seconds += middle - start, time.process_time() - middle
@@ -70,7 +70,7 @@ def lines(folder: Path, names: list[str]) -> Iterator[str]:
         assert truth is not None
         rows = np.abs(truth.stamps_ns[None] - sequence.stamps_ns[:, None]).argmin(axis=1)
         for title, (sift, stereo) in SETTINGS.items():
-            features, ms = measured(sequence, StereoSift(sequence.rig, sift, stereo))
+            features, ms = measured(sequence, StereoMatcher(sequence.rig, Sift(sift), stereo))
             rigid, similar, scale, agreeing = errors(sequence.rig, features, truth.world_from_camera[rows])
             count = np.mean([len(each) for each in features])
             cells = f"{ms[0]:7.1f} {ms[1]:7.1f}  {count:8.0f} {agreeing:6.0f}     {rigid:.4f} {similar:.4f} {scale:.4f}"

@@ -36,7 +36,7 @@ def installed(root: Path, paths: list[Path]) -> list[Path]:
 
 
 def module_of(root: Path, path: Path) -> str:
-    """Its dotted name: sensors/sift.py is rbpf.sensors.features.sift."""
+    """Its dotted name: sensors/features/sift.py is rbpf.sensors.features.sift."""
     parts = path.relative_to(root).with_suffix("").parts
     parts = parts if parts[0] == "rbpf" else ("rbpf", *parts)
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)

@@ -69,16 +69,16 @@ def plain_pictures() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def keypoints_once() -> Iterator[None]:
     """In an image that one of the module's tests has seen, keypoints are not looked for again."""
-    from rbpf.sensors.features.sift import Keypoints, Sift, SiftConfig
+    from rbpf.sensors.features import Features, Sift, SiftConfig
 
-    detect, known = Sift.detect, dict[tuple[SiftConfig, bytes], Keypoints]()
+    extract, known = Sift.extract, dict[tuple[SiftConfig, bytes], Features]()
 
-    def once(sift: Sift, image: np.ndarray) -> Keypoints:
+    def once(sift: Sift, image: np.ndarray) -> Features:
         key = sift.config, image.tobytes()
         if key not in known:
-            known[key] = detect(sift, image)
+            known[key] = extract(sift, image)
         return known[key]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Sift, "detect", once)
+        patch.setattr(Sift, "extract", once)
         yield

@@ -84,12 +84,12 @@ def use_threads(threads: int | None) -> None:
 
 def _search_patches() -> None:
     """Calls what is compiled at its first call, as the systems call it, on a few numbers; so do those below."""
-    from rbpf.sensors.features.corners import corners
+    from rbpf.sensors.features import CornerDetector
     from rbpf.sensors.patches.search import cut, search, warp
 
     rng = np.random.default_rng(0)
     image = rng.integers(0, 256, (30, 40)).repeat(5, axis=0).repeat(5, axis=1).astype(np.uint8)
-    px, _ = corners(image, np.zeros((0, 2)), 4)
+    px = CornerDetector().detect(image, 4).px
     windows = [window for place in px if (window := cut(image, place)) is not None]
     templates = warp(np.array(windows), np.tile(np.eye(2), (len(windows), 1, 1)))
     search(image, templates, px[: len(windows)], np.tile(4.0 * np.eye(2), (len(windows), 1, 1)))

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rbpf.errors import InputError
-from rbpf.sensors.patches.search import checked_image
+from rbpf.sensors.features.interface import checked_image
 from rbpf.sensors.readers.images.known_points import KnownPixels
 
 MOST = 12

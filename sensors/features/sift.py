@@ -1,6 +1,6 @@
 """Keypoints of the difference of Gaussians with SIFT descriptors (D. Lowe, IJCV 60(2), 2004), the features of S05 §III-A.
 
-OpenCV detects and describes. Pixels are (column, row), with the centre of the top-left one at (0, 0).
+OpenCV detects and describes.
 
 A descriptor has 128 entries: 4 × 4 spatial windows of 8 orientations each; or 36, as S05 has it: 3 × 3 windows of 4
 orientations. S05 does not say how its descriptors were formed. Here windows are added two by two in both directions,
@@ -18,7 +18,7 @@ from typing import Any, Literal, final
 import numpy as np
 
 from rbpf.errors import InputError
-from rbpf.sensors.patches.search import checked_image
+from rbpf.sensors.features.interface import Descriptor, FeatureExtractor, Features, Keypoints, checked_image
 
 LENGTHS = (36, 128)
 
@@ -67,40 +67,7 @@ class SiftConfig:
 
 
 @final
-@dataclass(frozen=True)
-class Keypoints:
-    """Keypoints of an image, of highest contrast first.
-
-    Attributes:
-        px: (K, 2) place.
-        scale: (K,) standard deviation of the Gaussian at which each was found, px.
-        orientation: (K,) direction of the strongest slope, [0, 2π), from the columns' axis towards the rows'.
-        contrast: (K,) of the extremum.
-        descriptors: (K, d) float32 of length 1.
-    """
-
-    px: np.ndarray
-    scale: np.ndarray
-    orientation: np.ndarray
-    contrast: np.ndarray
-    descriptors: np.ndarray
-
-    def __len__(self) -> int:
-        return self.px.shape[0]
-
-    def take(self, rows: np.ndarray) -> "Keypoints":
-        """Some of them, by number or by mask."""
-        return Keypoints(
-            self.px[rows],
-            self.scale[rows],
-            self.orientation[rows],
-            self.contrast[rows],
-            self.descriptors[rows],
-        )
-
-
-@final
-class Sift:
+class Sift(FeatureExtractor, Descriptor):
     """Finds and describes keypoints.
 
     Args:
@@ -109,49 +76,64 @@ class Sift:
 
     def __init__(self, config: SiftConfig | None = None) -> None:
         self.config = config or SiftConfig()
-        self._detector: Any = None
+        self.length = self.config.length
+        self._opencv: Any = None
 
-    def detect(self, image: np.ndarray) -> Keypoints:
-        """Keypoints of an image (H, W) uint8; none where there is no texture.
-
-        A place with two strong directions is two keypoints.
-
-        Raises:
-            InputError: the image is not (H, W) uint8.
-        """
-        image = _reduced(checked_image(image), self.config.working_scale)
-        found, histograms = self._opencv().detectAndCompute(image, None)
+    def extract(self, image: np.ndarray) -> Features:
+        """A place with two strong directions is two keypoints."""
+        config = self.config
+        reduced = self._reduced(image)
+        found, histograms = self._sift().detectAndCompute(reduced, None)
         if not found:
-            return self._none()
+            return Features(*_NONE, np.zeros((0, config.length), dtype=np.float32))
         table = np.array([(*p.pt, p.size, p.angle, p.response) for p in found])
-        ratio = self.config.working_scale
-        points = Keypoints(
-            px=(table[:, :2] + 0.5) / ratio - 0.5,
-            scale=0.5 * table[:, 2] / ratio,
+        features = Features(
+            px=(table[:, :2] + 0.5) / config.working_scale - 0.5,
+            scale=0.5 * table[:, 2] / config.working_scale,
             orientation=np.deg2rad(table[:, 3]) % (2.0 * np.pi),
-            contrast=table[:, 4],
-            descriptors=descriptors_from_histograms(histograms, self.config.length, self.config.norm),
+            score=table[:, 4],
+            descriptors=descriptors_from_histograms(histograms, config.length, config.norm),
         )
         # OpenCV keeps the strongest, and ties, in no particular order.
-        order = np.lexsort((points.orientation, points.px[:, 0], points.px[:, 1], -points.contrast))
-        return points.take(order[: self.config.features or None])
+        order = np.lexsort((features.orientation, features.px[:, 0], features.px[:, 1], -features.score))
+        return features.take(order[: config.features or None])
 
-    def _opencv(self) -> Any:
-        if self._detector is None:
+    def describe(self, image: np.ndarray, keypoints: Keypoints) -> np.ndarray:
+        """On the image as it is: what moves between the views, scale and direction, is that of the keypoints."""
+        import cv2
+
+        config = self.config
+        reduced = self._reduced(image)
+        if not len(keypoints):
+            return np.zeros((0, config.length), dtype=np.float32)
+        px = (keypoints.px + 0.5) * config.working_scale - 0.5
+        size = 2.0 * config.working_scale * keypoints.scale
+        degrees = np.rad2deg(keypoints.orientation) % 360.0
+        places = [cv2.KeyPoint(*place) for place in np.column_stack([px, size, degrees]).tolist()]
+        _, histograms = self._sift().compute(reduced, places)
+        return descriptors_from_histograms(histograms, config.length, config.norm)
+
+    def _reduced(self, image: np.ndarray) -> np.ndarray:
+        image, ratio = checked_image(image), self.config.working_scale
+        if ratio == 1.0:
+            return image
+        import cv2
+
+        return cv2.resize(image, None, fx=ratio, fy=ratio, interpolation=cv2.INTER_AREA)
+
+    def _sift(self) -> Any:
+        if self._opencv is None:
             import cv2
 
             config = self.config
-            # Without the precise scaling every place is a quarter of a pixel off.
-            self._detector = cv2.SIFT.create(
+            # Without the precise scaling every pixel is a quarter off.
+            self._opencv = cv2.SIFT.create(
                 config.features, config.layers, config.contrast, config.edge, _SIGMA, True
             )
-        return self._detector
+        return self._opencv
 
-    def _none(self) -> Keypoints:
-        none = np.zeros(0)
-        return Keypoints(
-            np.zeros((0, 2)), none, none, none, np.zeros((0, self.config.length), dtype=np.float32)
-        )
+
+_NONE = np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0)
 
 
 def descriptors_from_histograms(histograms: np.ndarray, length: int, norm: str = "root") -> np.ndarray:
@@ -171,61 +153,3 @@ def pooled(histograms: np.ndarray) -> np.ndarray:
     turns = (cells + beside)[..., ::2]
     lines = turns[:, :-1] + turns[:, 1:]
     return (lines[:, :, :-1] + lines[:, :, 1:]).reshape(-1, 36)
-
-
-def _reduced(image: np.ndarray, ratio: float) -> np.ndarray:
-    if ratio == 1.0:
-        return image
-    import cv2
-
-    return cv2.resize(image, None, fx=ratio, fy=ratio, interpolation=cv2.INTER_AREA)
-
-
-SIZE_PX = 4.0
-"""OpenCV's size of a keypoint whose histograms cover a window of 31 × 31 px."""
-PAD_PX = 6
-"""Windows are set apart by copies of their borders: SIFT blurs the image before it looks."""
-LENGTH = 128
-
-
-def describe(
-    image: np.ndarray, px: np.ndarray, scales: np.ndarray | float = 1.0, turns: np.ndarray | float = 0.0
-) -> np.ndarray:
-    """Descriptors (K, 128) of places (K, 2) in an image.
-
-    Args:
-        image: (H, W) uint8.
-        px: (K, 2).
-        scales: (K,) or one: size of the window that is described, 1 for 31 × 31 px.
-        turns: (K,) or one: angle from the image's columns to those of the window, radians, clockwise as it is seen.
-
-    Raises:
-        InputError: the image is not (H, W) uint8.
-    """
-    import cv2
-
-    count = px.shape[0]
-    if not count:
-        return np.zeros((0, LENGTH), dtype=np.float32)
-    sizes = np.broadcast_to(SIZE_PX * np.asarray(scales, float), count)
-    degrees = np.broadcast_to(np.rad2deg(turns) % 360.0, count)
-    places = [
-        cv2.KeyPoint(float(x), float(y), float(size), float(angle))
-        for (x, y), size, angle in zip(px, sizes, degrees, strict=True)
-    ]
-    _, histograms = cv2.SIFT.create().compute(checked_image(image), places)
-    total = np.maximum(histograms.sum(axis=1, keepdims=True), 1e-9)
-    return np.sqrt(histograms / total)
-
-
-def describe_windows(windows: np.ndarray, scales: np.ndarray, turns: np.ndarray) -> np.ndarray:
-    """Descriptors (K, 128) of the centres of windows (K, S, S) uint8, each at its own scale (K,) and turn (K,)."""
-    count, size = windows.shape[:2]
-    columns = max(1, int(np.ceil(np.sqrt(count))))
-    lines, side = -(-count // columns), size + 2 * PAD_PX
-    tiles = np.zeros((lines * columns, side, side), dtype=np.uint8)
-    tiles[:count] = np.pad(windows, ((0, 0), (PAD_PX, PAD_PX), (PAD_PX, PAD_PX)), mode="edge")
-    sheet = tiles.reshape(lines, columns, side, side).swapaxes(1, 2).reshape(lines * side, columns * side)
-    line, column = np.divmod(np.arange(count), columns)
-    centres = np.stack([column, line], axis=-1) * side + 0.5 * (side - 1)
-    return describe(sheet, centres, scales, turns)

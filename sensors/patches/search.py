@@ -9,6 +9,7 @@ from typing import final
 import numpy as np
 
 from rbpf.errors import InputError
+from rbpf.sensors.features.interface import checked_image
 
 PAIRS_PER_PRODUCT, PAIRS_PER_TEMPLATE = 1.0 / 400.0, 300.0
 """What a product of grey levels and a template cost beside the pairs of `rbpf.kernels.threads`."""
@@ -136,18 +137,6 @@ def search(
     pairs = _pairs(image, templates, covs, limits)
     run_driver(search_all, pairs, image, templates, centres, covs, limits, found)
     return PatchMatches(found[:, :2], found[:, 2], found[:, 3], found[:, [4, 5, 5, 6]].reshape(count, 2, 2))
-
-
-def checked_image(image: np.ndarray) -> np.ndarray:
-    """The image, its rows one after the other in memory.
-
-    Raises:
-        InputError: it is not (H, W) uint8.
-    """
-    if not isinstance(image, np.ndarray) or image.ndim != 2 or image.dtype != np.uint8:
-        found = f"{image.shape} {image.dtype}" if isinstance(image, np.ndarray) else type(image).__name__
-        raise InputError(f"an image must be grey, (H, W) uint8, got {found}: convert it first")
-    return np.ascontiguousarray(image)
 
 
 def _check_search(

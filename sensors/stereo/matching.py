@@ -1,4 +1,4 @@
-"""SIFT features of a rectified stereo pair (S05 §III-B): keypoints of both images, matched along the rows.
+"""Features of a rectified stereo pair (S05 §III-B): those of both images, matched along the rows.
 
 A keypoint of the left image may match those of the right one that lie on its row, to the left of it by a disparity
 that a depth beyond the nearest has, at a like scale and orientation. Of these candidates the nearest descriptor is taken
@@ -23,8 +23,8 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.descriptors.matching import DescriptorMatches, MatchLimits, band_pairs, match_pairs
-from rbpf.sensors.features.sift import Keypoints, Sift, SiftConfig
-from rbpf.sensors.patches.search import checked_image
+from rbpf.sensors.features import Sift
+from rbpf.sensors.features.interface import FeatureExtractor, Features, checked_image
 from rbpf.sensors.stereo.features import StereoFeatures
 from rbpf.sensors.stereo.impulse_noise import remove_impulses
 
@@ -33,7 +33,7 @@ SWAPPED, FEWER = 20, 4
 
 
 @dataclass(frozen=True)
-class StereoConfig:
+class PairConfig:
     """How the two images are matched, and how exact the result is.
 
     Attributes:
@@ -99,21 +99,24 @@ class StereoConfig:
 
 
 @final
-class StereoSift:
+class StereoMatcher:
     """Measures pairs of images.
 
     Args:
         rig: the two cameras.
-        sift: settings of the keypoints.
-        stereo: settings of the matching.
+        extractor: of the features of one image; SIFT by default.
+        config: settings of the matching.
     """
 
     def __init__(
-        self, rig: RectifiedStereo, sift: SiftConfig | None = None, stereo: StereoConfig | None = None
+        self,
+        rig: RectifiedStereo,
+        extractor: FeatureExtractor | None = None,
+        config: PairConfig | None = None,
     ) -> None:
         self.rig = rig
-        self.sift = Sift(sift)
-        self.config = stereo or StereoConfig()
+        self.extractor = extractor or Sift()
+        self.config = config or PairConfig()
         self.impulse_fraction = 0.0
         """Fraction of the pixels that were replaced in the last pair."""
 
@@ -128,7 +131,7 @@ class StereoSift:
         if self.config.filter_impulses:
             (left, one), (right, other) = remove_impulses(left), remove_impulses(right)
             self.impulse_fraction = 0.5 * (one + other)
-        return self.match((left, right), self.sift.detect(left), self.sift.detect(right))
+        return self.match((left, right), self.extractor.extract(left), self.extractor.extract(right))
 
     @property
     def remark(self) -> str:
@@ -138,9 +141,7 @@ class StereoSift:
         fraction = f"{100.0 * self.impulse_fraction:.1f} %"
         return f"{fraction} of the pixels have impulse noise, the median of their surroundings is taken"
 
-    def match(
-        self, images: tuple[np.ndarray, np.ndarray], left: Keypoints, right: Keypoints
-    ) -> StereoFeatures:
+    def match(self, images: tuple[np.ndarray, np.ndarray], left: Features, right: Features) -> StereoFeatures:
         """Features of a pair of images whose keypoints are known.
 
         Raises:
@@ -169,7 +170,7 @@ class StereoSift:
         shared = np.array([[1.0, 0.0, 1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 1.0]])
         return place[:, None, None] * shared + disparity[:, None, None] * np.diag([0.0, 0.0, 1.0])
 
-    def _features(self, keypoints: Keypoints, z: np.ndarray) -> StereoFeatures:
+    def _features(self, keypoints: Features, z: np.ndarray) -> StereoFeatures:
         return StereoFeatures.measured(
             self.rig,
             z,
@@ -179,7 +180,7 @@ class StereoSift:
             keypoints.descriptors,
         )
 
-    def _along_rows(self, left: Keypoints, right: Keypoints) -> DescriptorMatches:
+    def _along_rows(self, left: Features, right: Features) -> DescriptorMatches:
         """Matches of one keypoint of each image at most; a place that has two orientations counts once."""
         config = self.config
         reach = config.row_px + config.row_per_scale * left.scale
@@ -202,7 +203,7 @@ class StereoSift:
             size = f"{left.shape[1]}x{left.shape[0]}"
             raise InputError(f"the camera takes {camera.width}x{camera.height} px, the images have {size} px")
 
-    def _check_order(self, left: Keypoints, right: Keypoints, found: int) -> None:
+    def _check_order(self, left: Features, right: Features, found: int) -> None:
         """Refuses a pair whose keypoints match far better the other way round."""
         if FEWER * found >= min(len(left), len(right)):
             return
@@ -214,7 +215,7 @@ class StereoSift:
             )
 
 
-def one_per_place(matches: DescriptorMatches, left: Keypoints, right: Keypoints) -> DescriptorMatches:
+def one_per_place(matches: DescriptorMatches, left: Features, right: Features) -> DescriptorMatches:
     """Of matches whose keypoints share their place in an image those of the nearest descriptors, in the order of the first."""
     order = np.argsort(matches.distance, kind="stable")
     for keypoints, rows in ((left, matches.first), (right, matches.second)):

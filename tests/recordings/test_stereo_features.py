@@ -7,10 +7,10 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.descriptors.index import DescriptorIndex, Gate
 from rbpf.sensors.descriptors.matching import MatchLimits, distances
-from rbpf.sensors.features.sift import SiftConfig
+from rbpf.sensors.features import Sift, SiftConfig
 from rbpf.sensors.readers.images import open_stereo
 from rbpf.sensors.stereo.features import match_frames
-from rbpf.sensors.stereo.matching import StereoConfig, StereoSift
+from rbpf.sensors.stereo.matching import PairConfig, StereoMatcher
 
 pytestmark = pytest.mark.real_data
 
@@ -31,7 +31,7 @@ def recording(request, data_dir):
 
 def features_of(recording, sift=None, stereo=None):
     _, rig, pairs, _ = recording
-    sensor = StereoSift(rig, sift, stereo)
+    sensor = StereoMatcher(rig, Sift(sift), stereo)
     return [sensor.measure(*pair) for pair in pairs]
 
 
@@ -54,10 +54,10 @@ def test_there_are_enough_features(recording, features):
 
 def test_they_lie_on_the_same_row_of_both_images(recording):
     _, rig, pairs, _ = recording
-    sensor = StereoSift(rig)
+    sensor = StereoMatcher(rig)
     gaps = []
     for left, right in pairs[::4]:
-        found, there = sensor.measure(left, right), sensor.sift.detect(right)
+        found, there = sensor.measure(left, right), sensor.extractor.extract(right)
         near = np.abs(found.z[:, 2, None] - there.px[None, :, 0]) <= 2.0
         near &= np.abs(found.z[:, 1, None] - there.px[None, :, 1]) <= 4.0
         distance = np.where(near, distances(found.descriptors @ there.descriptors.T), np.inf)
@@ -96,7 +96,7 @@ def test_the_refinement_brings_disparities_closer_to_each_other(recording, featu
         gap = np.concatenate(out)
         return np.median(np.abs(gap - np.median(gap)))
 
-    assert spread(features) < 0.75 * spread(features_of(recording, stereo=StereoConfig(refine=False)))
+    assert spread(features) < 0.75 * spread(features_of(recording, stereo=PairConfig(refine=False)))
 
 
 def test_longer_keys_err_less(recording, features):
@@ -129,4 +129,4 @@ def test_a_prediction_finds_landmarks_more_surely(recording, features):
 def test_swapped_images_are_noticed(recording):
     _, rig, pairs, _ = recording
     with pytest.raises(InputError, match="seem to be swapped"):
-        StereoSift(rig).measure(*pairs[0][::-1])
+        StereoMatcher(rig).measure(*pairs[0][::-1])

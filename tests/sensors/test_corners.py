@@ -4,10 +4,17 @@ import numpy as np
 import pytest
 
 from rbpf.errors import InputError
-from rbpf.sensors.features.corners import MARGIN_PX, WINDOW_PX, corners
+from rbpf.sensors.features import CornerDetector
+from rbpf.sensors.features.corners import WINDOW_PX
 from tests.sensors.patch_scenes import Waves
 
 NONE = np.zeros((0, 2))
+
+
+def corners(image, occupied, count, spacing_px=20.0, border_px=16.0, mask=None, **settings):
+    """Pixels and scores."""
+    found = CornerDetector(**settings).detect(image, count, occupied, spacing_px, border_px, mask)
+    return found.px, found.score
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +85,7 @@ def test_places_that_are_not_finite_take_no_room(image):
 @pytest.mark.parametrize("border_px", [0.0, 5.0, 16.0, 60.5])
 def test_inside_the_border(image, border_px):
     px, _ = corners(image, NONE, 1000, 4.0, border_px)
-    least = max(border_px, MARGIN_PX)
+    least = max(border_px, CornerDetector.margin_px)
     assert len(px) > 20 and px.min() >= least
     assert (px <= np.array([319, 239]) - least).all()
     assert px.min(axis=0).max() < least + 8 and (px.max(axis=0) > np.array([319, 239]) - least - 8).all()

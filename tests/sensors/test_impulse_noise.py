@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rbpf.sensors.stereo.impulse_noise import TOLERATED_FRACTION, remove_impulses
-from rbpf.sensors.stereo.matching import StereoConfig, StereoSift
+from rbpf.sensors.stereo.matching import PairConfig, StereoMatcher
 from rbpf.validation.image_faults import salt_and_pepper
 from tests.systems.stereo_sequences import pairs
 
@@ -51,8 +51,8 @@ def test_corrupted_pixels_are_replaced(whole, noisy):
 
 def test_features_are_found_as_without(whole, noisy):
     """Nearly all of them; of the noisy images as they are half are left."""
-    mending = StereoSift(pairs(2).rig)
-    plain = StereoSift(pairs(2).rig, stereo=StereoConfig(filter_impulses=False))
+    mending = StereoMatcher(pairs(2).rig)
+    plain = StereoMatcher(pairs(2).rig, config=PairConfig(filter_impulses=False))
     clean = mending.measure(whole[1].image, whole[1].right)
     assert mending.remark == ""
     filtered = mending.measure(noisy[1].image, noisy[1].right)

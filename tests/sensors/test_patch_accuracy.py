@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rbpf.sensors.features.corners import corners
+from rbpf.sensors.features import CornerDetector
 from rbpf.sensors.patches.search import cut, search, warp
 from tests.sensors.patch_scenes import Waves, window
 
@@ -24,7 +24,7 @@ def errors(affine, blur_px=0.5, noise=2.0, seed=0, accept=0.7):
     waves = Waves(seed, blur_px=blur_px)
     first = waves.image(SHAPE, noise=noise, rng=rng)
     then = waves.image(SHAPE, affine, shift, noise, rng)
-    px, _ = corners(first, np.zeros((0, 2)), 100, 12.0, 60.0)
+    px = CornerDetector().detect(first, 100, None, 12.0, 60.0).px
     truth = MIDDLE + (px - MIDDLE - shift) @ np.linalg.inv(affine).T
     sources = np.stack([cut(first, place, 25) for place in px])
     templates = warp(sources, np.repeat(affine[None], len(px), axis=0))
@@ -96,7 +96,7 @@ def test_found_forth_and_back_in_real_images(data_dir):
 
     paths = sorted((data_dir / "mono_redkitchen_a" / "rgb").glob("*.jpg"))
     first, then = (cv2.imread(str(paths[i]), cv2.IMREAD_GRAYSCALE) for i in (0, 3))
-    px, _ = corners(first, np.zeros((0, 2)), 60, 25.0, 30.0)
+    px = CornerDetector().detect(first, 60, None, 25.0, 30.0).px
     assert len(px) == 60
     wide = np.repeat(100.0 * np.eye(2)[None], 60, axis=0)
     forth = search(then, np.stack([window(first, place, 11) for place in px]), px, wide)

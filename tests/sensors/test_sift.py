@@ -21,7 +21,7 @@ def test_a_blob_is_found_at_its_place_and_scale(std, ratio):
     # The scale-normalised Laplacian of a Gaussian blob is strongest at the blob's own scale; a difference of two
     # Gaussians, σ and 2^(1/3) σ, has its extremum where their product is the blob's variance.
     place = (75.3, 60.8)
-    points = Sift(SiftConfig(working_scale=ratio)).detect(blob(place, std))
+    points = Sift(SiftConfig(working_scale=ratio)).extract(blob(place, std))
     best = points.take(np.arange(1))
     np.testing.assert_allclose(best.px[0], place, atol=0.05)
     assert best.scale[0] == pytest.approx(std * 2 ** (-1 / 6), rel=0.08)
@@ -30,7 +30,7 @@ def test_a_blob_is_found_at_its_place_and_scale(std, ratio):
 def test_places_orientations_and_keys_turn_with_the_image():
     image = room()[0][0][0]
     sift = Sift(SiftConfig(working_scale=1.0, length=128))
-    first, turned = sift.detect(image), sift.detect(np.ascontiguousarray(np.rot90(image)))
+    first, turned = sift.extract(image), sift.extract(np.ascontiguousarray(np.rot90(image)))
     # Turned anticlockwise, (u, v) comes to (v, W − 1 − u), and a direction loses a quarter.
     place = np.column_stack([first.px[:, 1], image.shape[1] - 1 - first.px[:, 0]])
     near = np.linalg.norm(place[:, None] - turned.px[None], axis=2) < 0.1
@@ -87,17 +87,17 @@ def test_an_empty_histogram_is_no_division_by_zero():
 
 @pytest.mark.parametrize("level", [0, 128, 255])
 def test_nothing_is_found_where_nothing_is(level):
-    points = Sift().detect(np.full((60, 80), level, dtype=np.uint8))
+    points = Sift().extract(np.full((60, 80), level, dtype=np.uint8))
     assert len(points) == 0 and points.px.shape == (0, 2) and points.descriptors.shape == (0, 36)
 
 
 def test_the_strongest_come_first_and_are_kept():
     image = room()[0][0][0]
-    everything = Sift(SiftConfig(0, working_scale=1.0)).detect(image)
-    assert (np.diff(everything.contrast) <= 0.0).all() and len(everything) > 100
-    some = Sift(SiftConfig(50, working_scale=1.0)).detect(image)
+    everything = Sift(SiftConfig(0, working_scale=1.0)).extract(image)
+    assert (np.diff(everything.score) <= 0.0).all() and len(everything) > 100
+    some = Sift(SiftConfig(50, working_scale=1.0)).extract(image)
     assert len(some) == 50
-    np.testing.assert_array_equal(some.contrast, everything.contrast[:50])
+    np.testing.assert_array_equal(some.score, everything.score[:50])
 
 
 def test_threads_change_nothing():
@@ -106,10 +106,10 @@ def test_threads_change_nothing():
     try:
         for threads in (1, 4):
             cv2.setNumThreads(threads)
-            found.append(Sift(SiftConfig(features=100)).detect(image))
+            found.append(Sift(SiftConfig(features=100)).extract(image))
     finally:
         cv2.setNumThreads(before)
-    for name in ("px", "scale", "orientation", "contrast", "descriptors"):
+    for name in ("px", "scale", "orientation", "score", "descriptors"):
         assert getattr(found[0], name).tobytes() == getattr(found[1], name).tobytes()
 
 
@@ -132,4 +132,4 @@ def test_settings_out_of_range(changes, message):
 
 def test_an_image_that_is_none():
     with pytest.raises(InputError, match="must be grey"):
-        Sift().detect(np.zeros((10, 10, 3), dtype=np.uint8))
+        Sift().extract(np.zeros((10, 10, 3), dtype=np.uint8))

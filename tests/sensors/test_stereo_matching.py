@@ -7,16 +7,16 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.descriptors.matching import DescriptorMatches, MatchLimits
-from rbpf.sensors.features.sift import Keypoints, SiftConfig
+from rbpf.sensors.features import Features, Sift, SiftConfig
 from rbpf.sensors.stereo.features import match_frames, triangulate_jacobian
-from rbpf.sensors.stereo.matching import StereoConfig, StereoSift, one_per_place
+from rbpf.sensors.stereo.matching import PairConfig, StereoMatcher, one_per_place
 from tests.sensors.stereo_scenes import RIG, room, true_disparity
 
 FULL = SiftConfig(features=0, working_scale=1.0)
 
 
 def measured(index=0, sift=FULL, **changes):
-    return StereoSift(RIG, sift, StereoConfig(**changes)).measure(*room()[0][index])
+    return StereoMatcher(RIG, Sift(sift), PairConfig(**changes)).measure(*room()[0][index])
 
 
 def disparity_error(features, index=0):
@@ -85,13 +85,13 @@ def test_the_jacobian_of_the_triangulation():
 
 
 def test_the_noise_of_a_keypoint():
-    config = StereoConfig(place_px=0.3, place_per_scale=0.1, disparity_px=0.2, disparity_per_scale=0.05)
-    noise = StereoSift(RIG, stereo=config).noise(np.array([0.0, 4.0]))
+    config = PairConfig(place_px=0.3, place_per_scale=0.1, disparity_px=0.2, disparity_per_scale=0.05)
+    noise = StereoMatcher(RIG, config=config).noise(np.array([0.0, 4.0]))
     np.testing.assert_allclose(noise[0], [[0.09, 0, 0.09], [0, 0.09, 0], [0.09, 0, 0.13]])
     place, disparity = 0.09 + 0.16, 0.04 + 0.04
     across = np.array([1.0, 0.0, -1.0])
     assert noise[1, 0, 0] == pytest.approx(place) and across @ noise[1] @ across == pytest.approx(disparity)
-    apart = StereoSift(RIG, stereo=StereoConfig(place_px=0.3, place_per_scale=0.0, refine=False))
+    apart = StereoMatcher(RIG, config=PairConfig(place_px=0.3, place_per_scale=0.0, refine=False))
     np.testing.assert_allclose(apart.noise(np.array([5.0]))[0], 0.09 * np.eye(3))
 
 
@@ -126,8 +126,8 @@ def test_a_prediction_lets_only_near_ones_compete():
 def test_a_place_counts_once():
     px = np.array([[10.0, 5.0], [10.0, 5.0], [30.0, 5.0], [40.0, 5.0]])
     zeros = np.zeros(4)
-    left = Keypoints(px, zeros + 1.0, zeros, zeros, np.zeros((4, 36), dtype=np.float32))
-    right = Keypoints(px[[0, 3, 2, 2]], zeros + 1.0, zeros, zeros, left.descriptors)
+    left = Features(px, zeros + 1.0, zeros, zeros, np.zeros((4, 36), dtype=np.float32))
+    right = Features(px[[0, 3, 2, 2]], zeros + 1.0, zeros, zeros, left.descriptors)
     matches = DescriptorMatches(np.arange(4), np.arange(4), np.array([0.2, 0.1, 0.4, 0.3]))
     kept = one_per_place(matches, left, right)
     assert kept.first.tolist() == [1, 3] and kept.second.tolist() == [1, 3]
@@ -150,13 +150,13 @@ def test_limits_of_the_disparity():
 def test_swapped_images_are_noticed():
     left, right = room()[0][0]
     with pytest.raises(InputError, match=r"seem to be swapped: \d+ matches have a negative disparity"):
-        StereoSift(RIG, FULL).measure(right, left)
+        StereoMatcher(RIG, Sift(FULL)).measure(right, left)
 
 
 @pytest.mark.parametrize("level", [0, 120])
 def test_a_pair_without_texture(level):
     flat = np.full((240, 320), level, dtype=np.uint8)
-    features = StereoSift(RIG, FULL).measure(flat, flat)
+    features = StereoMatcher(RIG, Sift(FULL)).measure(flat, flat)
     assert len(features) == 0
     assert features.z.shape == (0, 3) and features.cov_points.shape == (0, 3, 3)
     assert len(match_frames(features, measured(), MatchLimits())) == 0
@@ -165,21 +165,21 @@ def test_a_pair_without_texture(level):
 
 def test_one_dark_image():
     left, right = room()[0][0]
-    assert len(StereoSift(RIG, FULL).measure(left, np.zeros_like(right))) == 0
+    assert len(StereoMatcher(RIG, Sift(FULL)).measure(left, np.zeros_like(right))) == 0
 
 
 def test_noise_alone_gives_hardly_a_match():
     rng = np.random.default_rng(0)
     pair = rng.integers(0, 256, (2, 240, 320)).astype(np.uint8)
-    assert len(StereoSift(RIG, FULL).measure(*pair)) < 10
+    assert len(StereoMatcher(RIG, Sift(FULL)).measure(*pair)) < 10
 
 
 def test_sizes_that_differ():
     left, right = room()[0][0]
     with pytest.raises(InputError, match="of one size, got 320x240 px and 300x240 px"):
-        StereoSift(RIG, FULL).measure(left, right[:, :300])
+        StereoMatcher(RIG, Sift(FULL)).measure(left, right[:, :300])
     with pytest.raises(InputError, match="the camera takes 320x240 px, the images have 300x240 px"):
-        StereoSift(RIG, FULL).measure(left[:, :300], right[:, :300])
+        StereoMatcher(RIG, Sift(FULL)).measure(left[:, :300], right[:, :300])
 
 
 def test_the_same_pair_gives_the_same_bytes():
@@ -201,4 +201,4 @@ def test_the_same_pair_gives_the_same_bytes():
 )
 def test_settings_out_of_range(changes, message):
     with pytest.raises(InputError, match=message):
-        StereoConfig(**changes)
+        PairConfig(**changes)

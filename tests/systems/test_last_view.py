@@ -5,7 +5,7 @@ import pytest
 
 from rbpf.lie import SE3
 from rbpf.sensors.camera.resection import GATE, squared_distances
-from rbpf.sensors.features.corners import corners
+from rbpf.sensors.features import CornerDetector, Sift, SiftConfig
 from rbpf.systems.mono.config import RelocalisationConfig
 from rbpf.systems.mono.last_view import LEAST, LastView, mutual
 from rbpf.systems.mono.likeness import described
@@ -18,17 +18,18 @@ MOTIONS = {
     "turning": [0.1, 0.15, 0.1, 0.0, 0.0, 0.0],
     "nearer": [0.0, 0.0, 0.1, 0.05, 0.0, 0.3],
 }
+SIFT = Sift(SiftConfig(working_scale=1.0, length=128))
 
 
 @pytest.fixture(scope="module")
 def last():
-    return LastView(CAMERA, view(texture(), HERE), HERE, 500, 6.0, 16.0)
+    return LastView(CAMERA, view(texture(), HERE), HERE, CornerDetector(), SIFT, 500, 6.0, 16.0)
 
 
 def compared(last, image):
     """What is seen again in an image."""
-    px, _ = corners(image, np.zeros((0, 2)), 500, 6.0, 16.0)
-    return last.seen_again(described(image, px), px, known_points().positions)
+    px = CornerDetector().detect(image, 500, None, 6.0, 16.0).px
+    return last.seen_again(described(SIFT, image, px), px, known_points().positions)
 
 
 @pytest.mark.parametrize("motion", MOTIONS.values(), ids=MOTIONS.keys())
@@ -57,12 +58,14 @@ def test_another_place_does_not_show_them(last):
 
 def test_without_landmarks_in_view_no_depth_is_known(last):
     image = view(texture(), HERE)
-    px, _ = corners(image, np.zeros((0, 2)), 500, 6.0, 16.0)
-    assert last.seen_again(described(image, px), px, np.array([[0.0, 0.0, -3.0]])) is None
+    px = CornerDetector().detect(image, 500, None, 6.0, 16.0).px
+    assert last.seen_again(described(SIFT, image, px), px, np.array([[0.0, 0.0, -3.0]])) is None
 
 
 def test_a_view_without_corners_is_never_seen_again():
-    bare = LastView(CAMERA, np.full((240, 320), 90, dtype=np.uint8), HERE, 500, 6.0, 16.0)
+    bare = LastView(
+        CAMERA, np.full((240, 320), 90, dtype=np.uint8), HERE, CornerDetector(), SIFT, 500, 6.0, 16.0
+    )
     assert compared(bare, view(texture(), HERE)) is None
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from rbpf.lie import SE3
 from rbpf.sensors.feature_log import FeatureFrame
-from rbpf.sensors.features.corners import corners
+from rbpf.sensors.features import CornerDetector
 from rbpf.sensors.patches.search import cut
 from rbpf.systems.mono.active_search import Searched
 from rbpf.systems.mono.appearance import SOURCE_HALF_PX
@@ -33,7 +33,7 @@ def around(degrees: float) -> np.ndarray:
 def wall():
     """A sensor with features on the wall, cut from straight ahead, and their places (K, 3)."""
     image = view(texture(), around(0.0))
-    px, _ = corners(image, np.zeros((0, 2)), 40, 16.0, SOURCE_HALF_PX + 30.0)
+    px = CornerDetector().detect(image, 40, None, 16.0, SOURCE_HALF_PX + 30.0).px
     rays = np.concatenate([CAMERA.unproject(px), np.ones((len(px), 1))], axis=1)
     corner, side, down = on_plane(np.array([[500.0, 500.0], [501.0, 500.0], [500.0, 501.0]]))
     normal = np.cross(side - corner, down - corner)

@@ -9,7 +9,7 @@ import pytest
 
 from rbpf.lie import SE3
 from rbpf.sensors.camera.resection import Resected
-from rbpf.sensors.features.corners import corners
+from rbpf.sensors.features import CornerDetector
 from rbpf.systems.mono.config import MonoConfig, RelocalisationConfig
 from rbpf.systems.mono.image_sensor import ImageSensor, Searched
 from rbpf.systems.mono.likeness import known_places, unmistakable
@@ -230,7 +230,7 @@ def test_patches_say_more_exactly_than_corners_where_landmarks_are(relocaliser):
     start = SE3.compose(belief.state[belief.mode][:7], SE3.inverse(run.world_from_camera[-1]))
     rows, points = known_places(run.sensor, belief, CONFIG.relocalisation.depth_std_ratio)
     seen = CAMERA.project(SE3.inverse_transform(SE3.compose(start, truth), points))
-    px, _ = corners(image, np.zeros((0, 2)), 500, 6.0, 16.0)
+    px = CornerDetector().detect(image, 500, None, 6.0, 16.0).px
     away = np.linalg.norm(seen[:, None] - px, axis=-1)
     near = np.flatnonzero(away.min(axis=1) < 6.0)
     pairs = near, away[near].argmin(axis=1)

@@ -7,7 +7,8 @@ import pytest
 
 from rbpf.lie import SE3
 from rbpf.motion.odometry import Odometry
-from rbpf.sensors.stereo.matching import StereoSift
+from rbpf.sensors.features import Sift
+from rbpf.sensors.stereo.matching import StereoMatcher
 from rbpf.systems.filtering import ProposalConfig
 from rbpf.systems.stereo.config import StereoConfig, TriggerConfig
 from rbpf.systems.stereo.particle_subsample import ParticleSubsample
@@ -34,7 +35,7 @@ def settled(keypoints_once: None) -> StereoRun:
 
 def last_features(run: StereoRun):
     frame = list(pairs(COUNT).frames())[-1]
-    return StereoSift(run.front_end.rig, CONFIG.sift, CONFIG.pair).measure(frame.image, frame.right)
+    return StereoMatcher(run.front_end.rig, Sift(CONFIG.sift), CONFIG.pair).measure(frame.image, frame.right)
 
 
 def spoilt(run: StereoRun, features, fraction: float):

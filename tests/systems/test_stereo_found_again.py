@@ -8,7 +8,8 @@ import pytest
 from rbpf.lie import SE3
 from rbpf.motion.odometry import Odometry
 from rbpf.motion.stereo_vo import VoConfig
-from rbpf.sensors.stereo.matching import StereoSift
+from rbpf.sensors.features import Sift
+from rbpf.sensors.stereo.matching import StereoMatcher
 from rbpf.systems.stereo.config import RecoveryConfig, StereoConfig, TriggerConfig
 from rbpf.systems.stereo.global_relocalisation import relocalise_globally
 from rbpf.systems.stereo.run import StereoRun, run_images
@@ -110,7 +111,7 @@ def features_of(run: StereoRun, seed: int = 0):
     sequence = pairs(12)
     source = Pairs(texture(seed), sequence.truth.world_from_camera, lambda t, frame: frame)
     frame = next(iter(source.frames(11)))
-    return StereoSift(run.front_end.rig, CONFIG.sift, CONFIG.pair).measure(frame.image, frame.right)
+    return StereoMatcher(run.front_end.rig, Sift(CONFIG.sift), CONFIG.pair).measure(frame.image, frame.right)
 
 
 def test_anywhere_in_the_map(settled):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rbpf.errors import InputError
-from rbpf.sensors.features.sift import SiftConfig
+from rbpf.sensors.features import SiftConfig
 from rbpf.systems.stereo import feature_cache as measured
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.feature_cache import cache_features

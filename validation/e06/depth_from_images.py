@@ -4,7 +4,7 @@ import numpy as np
 
 from rbpf.lie import SE3
 from rbpf.runs.plots import save_figures
-from rbpf.sensors.features.corners import corners
+from rbpf.sensors.features import CornerDetector
 from rbpf.sensors.patches.search import cut, search, warp
 from rbpf.sensors.readers.images import ImageSequence
 from rbpf.systems.mono.appearance import SOURCE_HALF_PX
@@ -28,7 +28,7 @@ def follow(sequence: ImageSequence, count: int, config: SearchConfig) -> tuple[n
     images = [frame.image for frame in sequence.frames()]
     first = images[0]
     assert first is not None
-    px, _ = corners(first, np.zeros((0, 2)), count, config.spacing_px, SOURCE_HALF_PX + 1.0)
+    px = CornerDetector().detect(first, count, None, config.spacing_px, SOURCE_HALF_PX + 1.0).px
     windows = [cut(first, place, SOURCE_HALF_PX) for place in px]
     source = np.array([window for window in windows if window is not None])
     templates = warp(source, np.tile(np.eye(2), (len(px), 1, 1)), config.template_px)

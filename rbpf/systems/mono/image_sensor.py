@@ -13,7 +13,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.camera.points import CameraRay
 from rbpf.sensors.feature_log import FeatureFrame
-from rbpf.sensors.features.corners import corners
+from rbpf.sensors.features import CornerDetector, Descriptor, Detector, Sift, SiftConfig
 from rbpf.sensors.patches.search import cut
 from rbpf.sensors.readers.images import ImageFrame
 from rbpf.systems.mono.active_search import ActiveSearch, Searched
@@ -35,12 +35,22 @@ class ImageSensor(Sensor):
     Args:
         features: what turns found features into observations and landmarks; a feature's name is its row in `table`.
         config: settings of the search.
+        detector: finds the corners that become landmarks, and those by which a lost camera is found.
+        descriptor: tells them apart where a camera was lost.
     """
 
-    def __init__(self, features: FeatureSensor, config: SearchConfig) -> None:
+    def __init__(
+        self,
+        features: FeatureSensor,
+        config: SearchConfig,
+        detector: Detector | None = None,
+        descriptor: Descriptor | None = None,
+    ) -> None:
         self.features = features
         self.camera = features.camera
         self.config = config
+        self.detector = detector or CornerDetector()
+        self.descriptor = descriptor or Sift(SiftConfig(working_scale=1.0, length=128))
         self.table = Appearances()
         self.search = ActiveSearch(features, self.table, config)
         self.searched = Searched.nothing()
@@ -240,9 +250,9 @@ class ImageSensor(Sensor):
         if room <= 0:
             return measured
         occupied = np.concatenate([measured.z, self.search.in_view])
-        px, _ = corners(
-            frame.image, occupied, room, config.spacing_px, SOURCE_HALF_PX + 1.0, mask=self._within
-        )
+        px = self.detector.detect(
+            frame.image, room, occupied, config.spacing_px, SOURCE_HALF_PX + 1.0, self._within
+        ).px
         px = px[np.isfinite(self.camera.unproject(px)).all(axis=1)]
         if not px.shape[0]:
             return measured

@@ -8,8 +8,7 @@ import numpy as np
 from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.camera.resection import Sights
-from rbpf.sensors.features.corners import corners
-from rbpf.sensors.features.sift import describe
+from rbpf.sensors.features import Descriptor, Detector
 from rbpf.sensors.patches.search import cut, search, warp
 from rbpf.systems.mono.appearance import SOURCE_HALF_PX
 from rbpf.systems.mono.viewing import affines
@@ -39,6 +38,8 @@ class LastView:
         camera: of all images.
         image: (H, W) uint8.
         world_from_camera: (7,) in the world of the map's particle.
+        detector: of the corners.
+        descriptor: of the corners.
         count: of corners at most.
         spacing_px: their least distance.
         border_px: no corner is nearer to the border.
@@ -49,6 +50,8 @@ class LastView:
         camera: Pinhole,
         image: np.ndarray,
         world_from_camera: np.ndarray,
+        detector: Detector,
+        descriptor: Descriptor,
         count: int,
         spacing_px: float,
         border_px: float,
@@ -57,14 +60,15 @@ class LastView:
         self.world_from_camera = world_from_camera
         border_px = max(border_px, SOURCE_HALF_PX + 1.0)
         within = camera.field_of_view_mask(border_px)
-        px, _ = corners(image, np.zeros((0, 2)), count, spacing_px, border_px, mask=within)
+        keypoints = detector.detect(image, count, None, spacing_px, border_px, within)
+        px = keypoints.px
         uv = camera.unproject(px)
         known = np.isfinite(uv).all(axis=1)
         self.windows = np.array([cut(image, place, SOURCE_HALF_PX) for place in px[known]])
         """(K, S, S) around the corners."""
         self.rays = np.concatenate([uv[known], np.ones((int(known.sum()), 1))], axis=1)
         """(K, 3) of the corners, in the camera's frame."""
-        self.looks = describe(image, px[known])
+        self.looks = descriptor.describe(image, keypoints.take(known))
         """(K, 128) their descriptors."""
 
     def seen_again(

@@ -5,7 +5,8 @@ import numpy as np
 from rbpf.core.belief import Belief
 from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole
-from rbpf.sensors.features.sift import describe
+from rbpf.sensors.features import Descriptor, Keypoints
+from rbpf.sensors.features.interface import WINDOW_SCALE_PX
 from rbpf.systems.mono.appearance import Appearances
 from rbpf.systems.mono.image_sensor import ImageSensor
 from rbpf.systems.mono.viewing import turned
@@ -43,10 +44,10 @@ def known_places(sensor: ImageSensor, belief: Belief, fraction: float) -> tuple[
     return rows[which], places[:, :3] / places[:, 3:]
 
 
-def described(image: np.ndarray, px: np.ndarray) -> np.ndarray:
+def described(descriptor: Descriptor, image: np.ndarray, px: np.ndarray) -> np.ndarray:
     """Descriptors (S, K, 128) of places (K, 2) of an image, at `SCALES`."""
-    scales = np.repeat(SCALES, px.shape[0])
-    looks = describe(image, np.tile(px, (len(SCALES), 1)), scales)
+    scales = WINDOW_SCALE_PX * np.repeat(SCALES, px.shape[0])
+    looks = descriptor.describe(image, Keypoints.at(np.tile(px, (len(SCALES), 1)), scales))
     return looks.reshape(len(SCALES), px.shape[0], looks.shape[1])
 
 

@@ -155,6 +155,8 @@ class Recovery:
                 self.sensor.camera,
                 self._image,
                 self._mode,
+                self.sensor.detector,
+                self.sensor.descriptor,
                 self.config.max_corners,
                 self.config.spacing_px,
                 BORDER_PX,

@@ -19,8 +19,7 @@ from rbpf.sensors.camera.resection import (
     squared_distances,
     three_point_poses,
 )
-from rbpf.sensors.features.corners import corners
-from rbpf.sensors.features.sift import describe_windows
+from rbpf.sensors.features.interface import WINDOW_SCALE_PX
 from rbpf.sensors.patches.search import search, warp
 from rbpf.systems.mono.config import RelocalisationConfig
 from rbpf.systems.mono.image_sensor import ImageSensor
@@ -124,13 +123,13 @@ class Relocaliser:
         if rows.size < (config.min_inliers if last is None else config.min_inliers_with_last_view):
             return None
         within = camera.field_of_view_mask(BORDER_PX)
-        px, _ = corners(
-            image, np.zeros((0, 2)), config.max_corners, config.spacing_px, BORDER_PX, mask=within
-        )
+        px = self.sensor.detector.detect(
+            image, config.max_corners, None, config.spacing_px, BORDER_PX, within
+        ).px
         self.attempt = replace(self.attempt, places=px.shape[0])
         if px.shape[0] < config.min_inliers:
             return None
-        there = described(image, px)
+        there = described(self.sensor.descriptor, image, px)
         away = distances(self._looks(rows, points, near), there)
         size = np.linalg.norm(points - SE3.translation(near), axis=-1).mean()
         pairs = unmistakable(away, points / size, px / config.spacing_px, config.descriptor_ratio)
@@ -261,7 +260,8 @@ class Relocaliser:
         angle = np.arctan2(turn[:, 1, 0] - turn[:, 0, 1], turn[:, 0, 0] + turn[:, 1, 1])
         sane = np.isfinite(turn).all(axis=(1, 2)) & (scale > 0.25) & (scale < 4.0)
         scale, angle = np.where(sane, scale, 1.0), np.where(sane, angle, 0.0)
-        looks = describe_windows(sources, np.clip(scale, LEAST_SCALE, LARGEST_SCALE), angle)
+        size = WINDOW_SCALE_PX * np.clip(scale, LEAST_SCALE, LARGEST_SCALE)
+        looks = self.sensor.descriptor.describe_windows(sources, size, angle)
         self._seen_from = *asked, looks
         return looks
 

@@ -8,8 +8,8 @@ from rbpf.motion.stereo_odometer import Prediction
 from rbpf.motion.stereo_vo import VoConfig
 from rbpf.sensors.descriptors.landmark_management import NewLandmarkConfig
 from rbpf.sensors.descriptors.matching import MatchLimits
-from rbpf.sensors.features.sift import SiftConfig
-from rbpf.sensors.stereo.matching import StereoConfig as PairConfig
+from rbpf.sensors.features import SiftConfig
+from rbpf.sensors.stereo.matching import PairConfig
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig, ResamplingConfig
 
 OUTLIER_VOLUME_PX3 = 640.0 * 480.0 * 60.0

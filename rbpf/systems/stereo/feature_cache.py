@@ -18,9 +18,10 @@ from rbpf.core.checkpoint import load_arrays, save_arrays
 from rbpf.errors import InputError
 from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.feature_log import CameraTruth
+from rbpf.sensors.features import Sift
 from rbpf.sensors.readers.images.stereo import StereoSequence
 from rbpf.sensors.stereo.features import StereoFeatures
-from rbpf.sensors.stereo.matching import StereoSift
+from rbpf.sensors.stereo.matching import StereoMatcher
 from rbpf.systems.stereo.config import StereoConfig
 
 CHUNK = 100
@@ -97,7 +98,7 @@ def cache_features(
     """
     folder.mkdir(parents=True, exist_ok=True)
     _claim(folder, sequence, config)
-    total, sift = len(sequence), StereoSift(sequence.rig, config.sift, config.pair)
+    total, sift = len(sequence), StereoMatcher(sequence.rig, Sift(config.sift), config.pair)
     missing = [first for first in range(0, total, CHUNK) if not _file(folder, first).exists()]
     for first in missing:
         pairs = []

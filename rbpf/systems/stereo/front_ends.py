@@ -11,9 +11,10 @@ from rbpf.core.filter import StepReport
 from rbpf.core.models import Part, Sensor
 from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.feature_log import CameraTruth, FeatureLog
+from rbpf.sensors.features import Sift
 from rbpf.sensors.readers.images import ImageFrame
 from rbpf.sensors.stereo.features import StereoFeatures, match_frames
-from rbpf.sensors.stereo.matching import StereoSift
+from rbpf.sensors.stereo.matching import StereoMatcher
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.dead_reckoning import Pixels
 from rbpf.systems.stereo.feature_cache import CachedPair
@@ -126,7 +127,7 @@ class ImageFrontEnd(FrontEnd):
     def __init__(self, rig: RectifiedStereo, config: StereoConfig) -> None:
         self.rig = rig
         self.config = config
-        self.sift = StereoSift(rig, config.sift, config.pair)
+        self.sift = StereoMatcher(rig, Sift(config.sift), config.pair)
         likelihood = config.likelihood.build()
         self.sensor: StereoSensor = StereoSensor(
             rig, config.map, config.new_landmarks, config.sift.length, likelihood

@@ -1,0 +1,226 @@
+"""What finds keypoints in an image and what describes them: the classes to subclass for another front end.
+
+- `Detector`: where an image has something to find again. The base class chooses the best, spread over the image.
+- `Descriptor`: vectors of length 1 whose distance says whether two keypoints show one thing.
+- `FeatureExtractor`: both at once, as the stereo system takes it; `Extractor` puts any two together.
+
+Pixels are (column, row), with the centre of the top-left one at (0, 0). Images are grey, (H, W) uint8.
+"""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, fields
+from typing import Self, final
+
+import numpy as np
+
+from rbpf.errors import InputError
+
+WINDOW_SCALE_PX = 2.0
+"""Scale of a keypoint whose SIFT descriptor covers a window of 31 × 31 px; that of corners, which have none."""
+SHEET_PAD_PX = 6
+"""Windows described on one sheet are set apart by copies of their borders: a descriptor may blur the image first."""
+
+
+@dataclass(frozen=True)
+class Keypoints:
+    """Keypoints of an image, best first.
+
+    Attributes:
+        px: (K, 2) pixel.
+        scale: (K,) standard deviation of the Gaussian at which each was found, px.
+        orientation: (K,) direction, [0, 2π), from the columns' axis towards the rows'.
+        score: (K,) of the detector, in its unit.
+    """
+
+    px: np.ndarray
+    scale: np.ndarray
+    orientation: np.ndarray
+    score: np.ndarray
+
+    @classmethod
+    def at(
+        cls,
+        px: np.ndarray,
+        scale: np.ndarray | float = WINDOW_SCALE_PX,
+        orientation: np.ndarray | float = 0.0,
+        score: np.ndarray | float = 0.0,
+    ) -> "Keypoints":
+        """Keypoints at pixels (K, 2); what is one number is the same for all."""
+        count = px.shape[0]
+        one_each = (np.broadcast_to(np.asarray(value, float), count) for value in (scale, orientation, score))
+        return Keypoints(np.asarray(px, float), *one_each)
+
+    def __len__(self) -> int:
+        return self.px.shape[0]
+
+    def take(self, rows: np.ndarray) -> Self:
+        """Some of them, by number or by mask."""
+        return type(self)(*(getattr(self, item.name)[rows] for item in fields(self)))
+
+
+@final
+@dataclass(frozen=True)
+class Features(Keypoints):
+    """Keypoints of an image with their descriptors, best first.
+
+    Attributes:
+        descriptors: (K, d) float32 of length 1.
+    """
+
+    descriptors: np.ndarray
+
+
+class Detector(ABC):
+    """Finds keypoints.
+
+    A subclass proposes candidates and scores them; `detect`, which is the same for all, chooses among them.
+    """
+
+    margin_px: int = 0
+    """What `candidates` needs of the image around a keypoint."""
+
+    @abstractmethod
+    def candidates(
+        self, image: np.ndarray, margin_px: int, mask: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Local maxima of the detector's response.
+
+        Args:
+            image: (H, W) uint8.
+            margin_px: no candidate may be nearer to the outermost pixels' centres; the image is larger than twice this.
+            mask: (H, W) bool, where a candidate may be; None for everywhere.
+
+        Returns:
+            Pixels (M, 2) and scores (M,). Equal scores are chosen in this order.
+        """
+
+    @final
+    def detect(
+        self,
+        image: np.ndarray,
+        count: int,
+        occupied: np.ndarray | None = None,
+        spacing_px: float = 20.0,
+        border_px: float = 16.0,
+        mask: np.ndarray | None = None,
+    ) -> Keypoints:
+        """The best keypoints, best first, at least `spacing_px` from each other and from pixels already taken.
+
+        Args:
+            image: (H, W) uint8.
+            count: at most so many.
+            occupied: (M, 2) pixels of features already in the image; those that are not finite are passed over.
+            spacing_px: the least distance.
+            border_px: the least distance from the outermost pixels' centres.
+            mask: (H, W) bool, where a keypoint may be; None for everywhere.
+
+        Raises:
+            InputError: the image is not (H, W) uint8, or the occupied pixels are not (M, 2).
+        """
+        from rbpf.sensors.features.kernels import spread
+
+        image = checked_image(image)
+        taken = np.zeros((0, 2)) if occupied is None else np.asarray(occupied, float)
+        if taken.ndim != 2 or taken.shape[1] != 2:
+            raise InputError(f"occupied pixels must be (M, 2), got {taken.shape}")
+        margin = int(np.ceil(max(border_px, self.margin_px)))
+        if min(image.shape) <= 2 * margin:
+            return Keypoints.at(np.zeros((0, 2)))
+        px, score = self.candidates(image, margin, mask)
+        order, chosen = np.argsort(-score, kind="stable"), np.empty(max(count, 0), np.int64)
+        taken = np.ascontiguousarray(taken[np.isfinite(taken).all(axis=1)])
+        chosen = chosen[: spread(np.asarray(px, float), order, taken, float(spacing_px), chosen)]
+        return Keypoints.at(px[chosen], score=score[chosen])
+
+
+class Descriptor(ABC):
+    """Describes keypoints, so that they are found again without knowing where to look."""
+
+    length: int
+    """Entries of a descriptor."""
+
+    @abstractmethod
+    def describe(self, image: np.ndarray, keypoints: Keypoints) -> np.ndarray:
+        """Descriptors (K, length) float32 of length 1: |a − b|² = 2 − 2 aᵀb.
+
+        Args:
+            image: (H, W) uint8.
+            keypoints: K of them, with the scale and the orientation at which they are described.
+
+        Raises:
+            InputError: the image is not (H, W) uint8.
+        """
+
+    @final
+    def describe_windows(self, windows: np.ndarray, scale: np.ndarray, orientation: np.ndarray) -> np.ndarray:
+        """Descriptors (K, length) of the centres of windows (K, S, S) uint8, each at its own scale and orientation (K,)."""
+        count, size = windows.shape[:2]
+        columns = max(1, int(np.ceil(np.sqrt(count))))
+        lines, side = -(-count // columns), size + 2 * SHEET_PAD_PX
+        tiles = np.zeros((lines * columns, side, side), dtype=np.uint8)
+        pad = (SHEET_PAD_PX, SHEET_PAD_PX)
+        tiles[:count] = np.pad(windows, ((0, 0), pad, pad), mode="edge")
+        sheet = tiles.reshape(lines, columns, side, side).swapaxes(1, 2).reshape(lines * side, columns * side)
+        line, column = np.divmod(np.arange(count), columns)
+        centres = np.stack([column, line], axis=-1) * side + 0.5 * (side - 1)
+        return self.describe(sheet, Keypoints.at(centres, scale, orientation))
+
+
+class FeatureExtractor(ABC):
+    """Finds keypoints and describes them."""
+
+    length: int
+    """Entries of a descriptor."""
+
+    @abstractmethod
+    def extract(self, image: np.ndarray) -> Features:
+        """Features of an image (H, W) uint8, best first; none where there is no texture.
+
+        Raises:
+            InputError: the image is not (H, W) uint8.
+        """
+
+
+@final
+class Extractor(FeatureExtractor):
+    """Any detector with any descriptor.
+
+    Args:
+        detector: finds the keypoints.
+        descriptor: describes them.
+        count: keypoints of an image at most.
+        spacing_px: their least distance.
+        border_px: their least distance from the image's border.
+    """
+
+    def __init__(
+        self,
+        detector: Detector,
+        descriptor: Descriptor,
+        count: int = 1000,
+        spacing_px: float = 5.0,
+        border_px: float = 16.0,
+    ) -> None:
+        self.detector = detector
+        self.descriptor = descriptor
+        self.length = descriptor.length
+        self.count = count
+        self.spacing_px = spacing_px
+        self.border_px = border_px
+
+    def extract(self, image: np.ndarray) -> Features:
+        found = self.detector.detect(image, self.count, None, self.spacing_px, self.border_px)
+        descriptors = self.descriptor.describe(image, found)
+        return Features(found.px, found.scale, found.orientation, found.score, descriptors)
+
+
+def checked_image(image: np.ndarray) -> np.ndarray:
+    """The image, its rows one after the other in memory.
+
+    Raises:
+        InputError: it is not (H, W) uint8.
+    """
+    if not isinstance(image, np.ndarray) or image.ndim != 2 or image.dtype != np.uint8:
+        found = f"{image.shape} {image.dtype}" if isinstance(image, np.ndarray) else type(image).__name__
+        raise InputError(f"an image must be grey, (H, W) uint8, got {found}: convert it first")
+    return np.ascontiguousarray(image)
