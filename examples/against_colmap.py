@@ -1,7 +1,6 @@
-"""An independent opinion: COLMAP reconstructs the images of a run from scratch, and adjusts the run's own sightings.
+"""An independent opinion: COLMAP reconstructs the images of a run from scratch.
 
-The reconstruction shares the images and the calibration with the filter and nothing else. The adjustment is the same
-problem for GTSAM and for COLMAP's Ceres: two programs that have to give one answer.
+The reconstruction shares the images and the calibration with the filter and nothing else.
 """
 
 from pathlib import Path
@@ -11,7 +10,6 @@ from rbpf.sensors.camera import Pinhole
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.validation.colmap.against_colmap import compare_with_colmap
 from rbpf.validation.colmap.pipeline import ReconstructionOptions
-from rbpf.validation.colmap.two_optimisers import adjust_by_both
 from rbpf.validation.export import export_colmap, export_ply
 from rbpf.validation.gtsam.batch_problem import problem_of
 from rbpf.validation.metrics.path_and_map import of_run
@@ -34,16 +32,16 @@ def main(quick: bool = False, out: Path = Path("out")) -> dict[str, float]:
         estimate = of_run(run)
         options = ReconstructionOptions(every=every, features=800 if quick else 4096)
         found = compare_with_colmap(estimate, run.sequence, options)
-    both = adjust_by_both(problem_of(run), run.world_from_camera).as_dict()
-    told = {f"run: {name}": value for name, value in found.run.as_dict().items() if isinstance(value, float)}
+    figures = {
+        f"run: {name}": value for name, value in found.run.as_dict().items() if isinstance(value, float)
+    }
     if found.truth is not None:
-        told["COLMAP's own error [m]"] = found.truth.path.rmse
-    told |= {f"both: {name}": value for name, value in both.items() if isinstance(value, float)}
-    write_table(out / "against_colmap.csv", ("figure", "value"), list(told.items()))
+        figures["COLMAP's own error [m]"] = found.truth.path.rmse
+    write_table(out / "against_colmap.csv", ("figure", "value"), list(figures.items()))
     plot_against_colmap(found.run, estimate, out)
     export_colmap(estimate, problem_of(run), out / "colmap")
     export_ply(estimate, out)
-    return told
+    return figures
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
+from examples.studies.file_faults import FILE_FAULTS, damaged_copy, kill_and_resume, run_command
 from rbpf.cli import main
 from rbpf.errors import InputError
 from rbpf.runs.files import whole
@@ -18,7 +19,6 @@ from rbpf.systems.mono.video import run_images
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.run import run_images as run_pairs
-from rbpf.validation.file_faults import FILE_FAULTS, damaged_copy, kill_and_resume, run_command
 from rbpf.validation.range_bearing import start_run
 from rbpf.validation.simulation.exposure import Imaging
 from rbpf.validation.simulation.images import simulate_images

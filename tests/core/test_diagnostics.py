@@ -6,7 +6,9 @@ from scipy.stats import chi2
 
 from rbpf.core.diagnostics import (
     ancestor_diversity,
+    ancestors_by_step,
     chi_square_band,
+    coalescence_steps,
     effective_sample_size,
     motion_correction,
     nees,
@@ -14,6 +16,7 @@ from rbpf.core.diagnostics import (
 from rbpf.core.estimate import Estimate
 from rbpf.core.filter import Filter
 from rbpf.core.genealogy import Lineage
+from rbpf.core.history import History
 from rbpf.core.models import MotionModel, ObservationModel, Part, Transition
 from rbpf.core.proposals import PriorProposal
 from rbpf.lie import SE2, SE3, Euclidean
@@ -142,3 +145,16 @@ def test_a_bootstrap_step_has_no_correction():
     filter_ = Filter(Walk(), Scripted(), proposal=PriorProposal(), n=10, rng=np.random.default_rng(0))
     step = filter_.step(seen(Fix(), [np.zeros(2)]))
     assert motion_correction(step.mixture) is None
+
+
+def test_ancestors_and_coalescence_follow_the_lineage():
+    lineage = Lineage(4)
+    history = History(lineage)
+    for step, ancestors in enumerate([None, [0, 0, 1, 1], [2, 2, 3, 3], None, [0, 1, 2, 2]]):
+        if ancestors is not None:
+            lineage.advance(np.array(ancestors))
+        history.record(step, np.zeros((4, 3)), np.zeros(4))
+    # the last generation descends from rows 0, 1, 2 of the third, those from 2 and 3 of the second, these from row 1
+    np.testing.assert_array_equal(ancestors_by_step(history), [1, 2, 3, 3, 4])
+    assert coalescence_steps(history) == 4
+    assert coalescence_steps(History(Lineage(2))) is None

@@ -90,6 +90,8 @@ def check_program(words: list[str], where: str) -> None:
     """A program of the project takes these arguments; tests/examples runs every example."""
     if words[0] == "-m" and words[1] == "benchmarks":
         assert {word for word in words[2:] if word[0] != "-"} <= set(BENCHMARKS), where
+    elif words[0] == "-m" and words[1].startswith("examples."):
+        takes(ROOT / f"{words[1].replace('.', '/')}.py", words[2:], where)
     elif words[0] == "-m":
         assert importlib.util.find_spec(words[1]) is not None, where
     elif words[0] != "-c":
@@ -137,8 +139,8 @@ def test_commands_in_a_sentence_exist(page):
             assert all(option in helped for option in options if option != "--help"), where
         elif command[0] == "make":
             run_make(["make", command[1]], where) if command[1] != "demo" else None
-        elif command[1:2] == ["-m"] and command[2].startswith("benchmarks"):
-            check_program(command[1:], where)
+        elif command[1:2] == ["-m"] and command[2].startswith(("benchmarks", "examples")):
+            check_program([word for word in command[1:] if word != "…"], where)
         elif command[1].endswith(".py"):
             assert (ROOT / command[1]).is_file(), where
 

@@ -1,4 +1,4 @@
-"""Every example runs, prints something, and shows what its page in the documentation says that it shows."""
+"""Every example and every study runs, prints something, and shows what its page in the documentation says it shows."""
 
 import ast
 import importlib
@@ -12,14 +12,17 @@ from tests.examples import claims
 
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+STUDIES = [
+    path for path in sorted((ROOT / "examples" / "studies").glob("*.py")) if "def main(" in path.read_text()
+]
 LONGEST_SENSOR = 40
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", [*EXAMPLES, *STUDIES], ids=lambda path: path.stem)
 def test_example_shows_what_it_promises(path, capsys, monkeypatch, tmp_path):
     monkeypatch.syspath_prepend(path.parent)
-    main = importlib.import_module(path.stem).main
+    main = importlib.import_module(path.stem if path in EXAMPLES else f"examples.studies.{path.stem}").main
     draws = "quick" in inspect.signature(main).parameters
     figures = main(quick=True, out=tmp_path) if draws else main()
     assert {".png", ".csv"} <= {file.suffix for file in tmp_path.iterdir()} or not draws

@@ -23,7 +23,7 @@ from rbpf.systems.settings import load_settings
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.validation.consistency.comparison import read_comparisons
 from rbpf.validation.report.page import write_report
-from rbpf.validation.simulation.streams import CAMERA
+from rbpf.validation.simulation.features import MONO as CAMERA
 from rbpf.validation.sweep.plan import read_plan
 from rbpf.validation.sweep.sweep import read_rows
 from tests.core.worlds import Recipe, content, drive, planar_world, same

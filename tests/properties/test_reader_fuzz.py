@@ -19,8 +19,9 @@ from rbpf.sensors.readers import open_log, stereo_tracks, text
 from rbpf.sensors.readers.images import Topics, open_images, open_stereo, read_known_points
 from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
 from rbpf.validation.ply import read_ply, write_ply
+from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
+from rbpf.validation.simulation.point_worlds import DeskWorld
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
-from rbpf.validation.simulation.streams import CameraStream, Turnover
 from tests.properties.mutations import damaged
 from tests.readers import test_mrclam, test_stereo_tracks, test_victoria_park, test_wheel_odometry
 from tests.readers.images import bags, folders
@@ -117,7 +118,7 @@ def results(folder: Path) -> None:
 
 
 def features(folder: Path) -> None:
-    log = CameraStream(Turnover(points=12, measurements=8), seed=0).first()
+    log = simulate_features(DeskWorld(frames=1), Measuring(measurements=8), MONO, seed=0)
     write_measurements(folder, replace(log, frames=[log.frames[0]] * 2))
 
 

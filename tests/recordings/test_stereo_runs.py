@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from examples.studies.stereo_revisit import Reordered, pairs_there_and_back
 from rbpf.sensors.feature_log import CameraTruth
 from rbpf.sensors.readers import stereo_tracks
 from rbpf.sensors.readers.images import open_stereo
@@ -13,7 +14,6 @@ from rbpf.systems.stereo.config import MapConfig, StereoConfig
 from rbpf.systems.stereo.run import StereoRun, run_features, run_images
 from rbpf.validation.gtsam.camera import solve_features
 from rbpf.validation.metrics.stereo_scores import score_stereo
-from rbpf.validation.there_and_back import Reordered, pairs_there_and_back
 
 pytestmark = pytest.mark.real_data
 

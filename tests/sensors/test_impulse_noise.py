@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from examples.studies.image_faults import salt_and_pepper
 from rbpf.sensors.stereo.impulse_noise import TOLERATED_FRACTION, remove_impulses
 from rbpf.sensors.stereo.matching import PairConfig, StereoMatcher
-from rbpf.validation.image_faults import salt_and_pepper
 from tests.systems.stereo_sequences import pairs
 
 

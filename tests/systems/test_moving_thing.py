@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from examples.studies.image_faults import cover_view
 from rbpf.core.models import Part
 from rbpf.runs.trajectory import Trajectory
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers.images import open_images, read_known_points
 from rbpf.systems.mono.config import MonoConfig, SearchConfig
 from rbpf.systems.mono.video import run_images
-from rbpf.validation.image_faults import cover_view
 from rbpf.validation.metrics.mono_scores import score_path
 from rbpf.validation.simulation.exposure import Imaging
 from rbpf.validation.simulation.images import simulate_images

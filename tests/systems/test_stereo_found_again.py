@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from examples.studies.image_faults import blur_motion, cover_view, salt_and_pepper
 from rbpf.lie import SE3
 from rbpf.motion.odometry import Odometry
 from rbpf.motion.stereo_vo import VoConfig
@@ -14,7 +15,6 @@ from rbpf.systems.stereo.config import RecoveryConfig, StereoConfig, TriggerConf
 from rbpf.systems.stereo.global_relocalisation import relocalise_globally
 from rbpf.systems.stereo.run import StereoRun, run_images
 from rbpf.systems.stereo.sensor import StereoFrame, log_support
-from rbpf.validation.image_faults import blur_motion, cover_view, salt_and_pepper
 from tests.systems.plane_sequences import texture
 from tests.systems.stereo_sequences import Pairs, pairs
 

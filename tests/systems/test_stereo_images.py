@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from examples.studies.image_faults import cover_view
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.descriptors.landmark_management import NewLandmarkConfig
@@ -12,7 +13,6 @@ from rbpf.systems.stereo.config import MapConfig, OdometryConfig, StereoConfig, 
 from rbpf.systems.stereo.dead_reckoning import Pixels
 from rbpf.systems.stereo.front_ends import ImageFrontEnd
 from rbpf.systems.stereo.run import StereoRun, run_images
-from rbpf.validation.image_faults import cover_view
 from tests.systems.stereo_sequences import flat, missing, pairs, swapped
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("keypoints_once")]

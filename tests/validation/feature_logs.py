@@ -1,9 +1,12 @@
 """What tests read off a simulated `FeatureLog`."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from rbpf.lie import SE3
 from rbpf.sensors.feature_log import FeatureLog
+from rbpf.validation.simulation.scene import Scene
 
 
 def truth(log: FeatureLog, frame: int) -> np.ndarray:
@@ -30,3 +33,21 @@ def sightings(log: FeatureLog) -> dict[int, list[int]]:
 def likely(successes: float, trials: int, probability: float) -> bool:
     """Within four standard deviations of a binomial distribution."""
     return abs(successes - trials * probability) < 4.0 * np.sqrt(trials * probability * (1.0 - probability))
+
+
+@dataclass(frozen=True)
+class StillCamera:
+    """A world of points in view of a camera at rest."""
+
+    frames: int = 10
+    points: int = 20
+
+    def build(self, rng: np.random.Generator) -> Scene:
+        depth = rng.uniform(1.0, 6.0, (self.points, 1))
+        points = depth * np.concatenate(
+            [rng.uniform(-0.45, 0.45, (self.points, 2)), np.ones_like(depth)], axis=1
+        )
+        present = np.tile([0, self.frames], (self.points, 1))
+        stamps = np.arange(self.frames) * 10**8
+        path = SE3.identity((self.frames,))
+        return Scene("still camera", stamps, path, points, present, np.zeros((0, 2, 3)))

@@ -8,7 +8,7 @@ from rbpf.lie import SE3
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.run import run
 from rbpf.validation.camera_map import summarise_points
-from rbpf.validation.consistency.pose_errors import offdiagonal_eigenvalues, pose_errors
+from rbpf.validation.consistency.pose_errors import pose_errors
 from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
 from rbpf.validation.simulation.point_worlds import DeskWorld
 from rbpf.validation.sweep.parallel import in_parallel
@@ -33,26 +33,6 @@ def test_pose_errors_refuses_paths_of_different_lengths():
     path = np.tile(SE3.identity(), (3, 1))
     with pytest.raises(InputError, match="3 poses, 2 covariances and 3 true poses"):
         pose_errors(path, np.tile(np.eye(6), (2, 1, 1)), path)
-
-
-def test_landmarks_that_err_together_have_one_eigenvalue_off_the_diagonal():
-    shift = np.random.default_rng(1).normal(size=200)
-    points = np.zeros((200, 4, 3))
-    points[..., 0] = shift[:, None]
-    values = offdiagonal_eigenvalues(points, np.full(200, -np.log(200.0)))
-    variance = shift.var()
-    np.testing.assert_allclose(values, variance * np.array([3.0, 1.0, 1.0, 1.0, *[0.0] * 8]), atol=1e-12)
-
-
-def test_offdiagonal_eigenvalues_use_the_weights():
-    points = np.random.default_rng(2).normal(size=(3, 2, 3))
-    twice = np.concatenate([points, points[:1]])
-    log_weights = np.log([0.5, 0.25, 0.25])
-    np.testing.assert_allclose(
-        offdiagonal_eigenvalues(points, log_weights),
-        offdiagonal_eigenvalues(twice, np.full(4, np.log(0.25))),
-        atol=1e-12,
-    )
 
 
 @pytest.mark.parametrize("workers", [1, 2])

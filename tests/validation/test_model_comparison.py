@@ -12,10 +12,9 @@ from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.stereo.config import OdometryConfig, StereoConfig, TriggerConfig
 from rbpf.validation.consistency.model_comparison import compare_evidence, evidence_difference
-from rbpf.validation.consistency.trials import simulated_log
 from rbpf.validation.simulation.features import MONO, STEREO, Measuring, simulate_features
 from rbpf.validation.simulation.point_worlds import DeskWorld
-from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
+from rbpf.validation.simulation.robot import RobotWorld, simulate_robot, simulated_log
 
 pytestmark = pytest.mark.slow
 

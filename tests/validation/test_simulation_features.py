@@ -11,17 +11,19 @@ from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.feature_log import FeatureLog
 from rbpf.validation.simulation.features import MONO, STEREO, Measuring, simulate_features
-from rbpf.validation.simulation.point_worlds import DeskWorld, PlanarTargetWorld
+from rbpf.validation.simulation.lab_points import LabWorld
+from rbpf.validation.simulation.point_worlds import DeskWorld
 from rbpf.validation.simulation.scene import PointWorld, Scene
-from rbpf.validation.simulation.walked_worlds import CorridorWorld, LoopWorld
-from tests.validation.feature_logs import errors, likely, sightings, truth
+from rbpf.validation.simulation.textured_lab import LabDrive
+from tests.validation.feature_logs import StillCamera, errors, likely, sightings, truth
 
 CAMERAS = [MONO, STEREO]
 FISHEYE = replace(
     MONO, fx=262.0, fy=262.0, distortion=(-0.03, 0.02, -0.012, 0.002), distortion_model="equidistant"
 )
 DESK = DeskWorld(frames=200)
-STILL = PlanarTargetWorld(frames=800, points=16)
+STILL = StillCamera(frames=800)
+CHANGING = LabWorld(LabDrive(frames=150, every=4), points=3000)
 EXACT = Measuring(dropout=0.0, turnover=0.0)
 
 
@@ -34,9 +36,7 @@ def contents(log: FeatureLog) -> bytes:
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
-@pytest.mark.parametrize(
-    "world", [DESK, LoopWorld(frames=40), CorridorWorld(frames=40, renewal=0.1), PlanarTargetWorld(frames=5)]
-)
+@pytest.mark.parametrize("world", [DESK, DeskWorld(frames=40, renewal=0.1)])
 def test_a_seed_gives_the_same_bytes(world: PointWorld, camera: Pinhole | RectifiedStereo) -> None:
     measuring = Measuring(outlier_rate=0.1)
     first, again, other = (contents(simulate_features(world, measuring, camera, seed)) for seed in (3, 3, 4))
@@ -45,7 +45,7 @@ def test_a_seed_gives_the_same_bytes(world: PointWorld, camera: Pinhole | Rectif
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
-@pytest.mark.parametrize("world", [DESK, LoopWorld(frames=200), CorridorWorld(frames=200)])
+@pytest.mark.parametrize("world", [DESK, CHANGING])
 def test_measurements_are_projections_with_the_stated_noise(
     world: PointWorld, camera: Pinhole | RectifiedStereo
 ) -> None:
@@ -63,7 +63,7 @@ def test_measurements_are_projections_with_the_stated_noise(
 @pytest.mark.parametrize(
     "camera", [*CAMERAS, replace(MONO, distortion=(-0.28, 0.07, 2e-4, 2e-5, 0.0)), FISHEYE]
 )
-@pytest.mark.parametrize("world", [DESK, LoopWorld(frames=200), CorridorWorld(frames=200)])
+@pytest.mark.parametrize("world", [DESK, CHANGING])
 def test_only_what_is_visible_is_measured(world: PointWorld, camera: Pinhole | RectifiedStereo) -> None:
     measuring = Measuring(nearest_m=0.7, farthest_m=5.0)
     log = simulate_features(world, measuring, camera, seed=1)
@@ -89,7 +89,7 @@ def blocked(log: FeatureLog, scene: Scene) -> int:
 
 
 @pytest.mark.parametrize(
-    "world", [DeskWorld(frames=60, blocks=8), LoopWorld(frames=60), CorridorWorld(frames=60)]
+    "world", [DeskWorld(frames=60, blocks=8), LabWorld(LabDrive(frames=6, every=100), points=2000)]
 )
 def test_blocks_hide_what_is_behind_them(world: PointWorld) -> None:
     scene = world.build(np.random.default_rng(2))
@@ -104,7 +104,7 @@ def test_the_budget_is_kept_and_used(places: int) -> None:
 
 
 def test_few_landmarks_enter_the_map_after_the_first_frame() -> None:
-    log = simulate_features(CorridorWorld(frames=300), Measuring(new_per_frame=1), MONO, seed=0)
+    log = simulate_features(CHANGING, Measuring(new_per_frame=1), MONO, seed=0)
     begins = np.bincount([frames[0] for frames in sightings(log).values()])
     assert begins[0] == 25
     assert begins[1:].max() == 1
@@ -165,7 +165,7 @@ def test_share_and_place_of_outliers(camera: Pinhole | RectifiedStereo) -> None:
 
 
 def test_no_outlier_begins_a_landmark() -> None:
-    log = simulate_features(CorridorWorld(frames=300), Measuring(outlier_rate=0.5), MONO, seed=0)
+    log = simulate_features(CHANGING, Measuring(outlier_rate=0.5), MONO, seed=0)
     seen = sightings(log)
     residual = [f.z - MONO.project(truth(log, t)) for t, f in enumerate(log.frames)]
     begun = [
@@ -224,8 +224,7 @@ def test_disparity_tells_the_depth() -> None:
 
 
 def test_a_frame_without_measurements() -> None:
-    world = CorridorWorld(frames=300, points=4, blocks=0, length_m=12.0, glance_deg=0.0)
-    log = simulate_features(world, replace(EXACT, known=0), MONO, seed=1)
+    log = simulate_features(DeskWorld(frames=300, points=2), replace(EXACT, known=0), MONO, seed=1)
     assert min(len(frame.landmarks) for frame in log.frames) == 0
 
 

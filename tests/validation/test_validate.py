@@ -17,11 +17,10 @@ from rbpf.sensors.readers.log import Truth
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.range_bearing.run import run
 from rbpf.validation.consistency.against_groundtruth import truth_errors
-from rbpf.validation.consistency.trials import simulated_log
 from rbpf.validation.consistency.validate import COMPARISONS, validate
 from rbpf.validation.report.page import write_report
 from rbpf.validation.run_truth import robot_truth
-from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
+from rbpf.validation.simulation.robot import RobotWorld, simulate_robot, simulated_log
 
 pytestmark = pytest.mark.usefixtures("plain_pictures")
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from examples.studies.verdict import bias_odometry, scale_odometry_noise, scale_sensor_noise, swap_names
 from rbpf.core.diagnostics import motion_correction
 from rbpf.core.exchange import Observations, Part, Transition
 from rbpf.core.filter import Filter
@@ -17,11 +18,9 @@ from rbpf.validation.consistency.against_groundtruth import pose_statistics
 from rbpf.validation.consistency.own_statistics import innovation_statistics
 from rbpf.validation.consistency.pose_errors import whitened_errors
 from rbpf.validation.consistency.statistic import coverage, variance_ratio
-from rbpf.validation.consistency.trials import simulated_log
 from rbpf.validation.consistency.verdict import Verdict, judge
-from rbpf.validation.faults import bias_odometry, scale_odometry_noise, scale_sensor_noise, swap_names
 from rbpf.validation.run_truth import robot_truth
-from rbpf.validation.simulation.robot import RobotWorld
+from rbpf.validation.simulation.robot import RobotWorld, simulated_log
 
 pytestmark = pytest.mark.slow
 

@@ -1,4 +1,4 @@
-"""Whether a camera filter says honestly how wrong it is: errors of its poses, and how its particles spread the map."""
+"""Errors of estimated poses, in metres and in units of what the filter believes."""
 
 from dataclasses import dataclass
 
@@ -48,29 +48,6 @@ def pose_errors(world_from_camera: np.ndarray, cov: np.ndarray, truth: np.ndarra
     error = SE3.local(world_from_camera, truth)
     nees = np.einsum("ta,tab,tb->t", error, np.linalg.pinv(cov, hermitian=True), error)
     return PoseErrors(distances, nees)
-
-
-def offdiagonal_eigenvalues(points: np.ndarray, log_weights: np.ndarray) -> np.ndarray:
-    """Magnitudes of the eigenvalues of the landmarks' covariance that only the particles can carry, E06 §6.
-
-    Each particle keeps the covariance of each landmark, so that the blocks on the diagonal are set to zero. The
-    covariance of N particles has rank N − 1 at most; without its diagonal blocks it has no such bound, and its
-    eigenvalues have both signs and sum to zero.
-
-    Args:
-        points: (N, K, 3) each particle's means of K landmarks, m.
-        log_weights: (N,) normalised.
-
-    Returns:
-        (3K,) in descending order, m².
-    """
-    n, k, _ = points.shape
-    weights = np.exp(log_weights)
-    spread = (points - np.einsum("n,nkd->kd", weights, points)).reshape(n, 3 * k)
-    cov = (weights[:, None] * spread).T @ spread
-    blocks = cov.reshape(k, 3, k, 3)
-    blocks[np.arange(k), :, np.arange(k)] = 0.0
-    return np.sort(np.abs(np.linalg.eigvalsh(cov)))[::-1]
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from rbpf.errors import InputError
+from rbpf.lie import SE3
 from rbpf.runs.files import prepare_folder, write_text
 from rbpf.runs.reading import RunFolder
 from rbpf.sensors.camera import Pinhole
@@ -16,7 +17,6 @@ from rbpf.sensors.readers.images.calibration import NAME
 from rbpf.validation.calibration import camera_text
 from rbpf.validation.gtsam.batch_problem import read_problem
 from rbpf.validation.gtsam.mono_batch import Batch, adjust_log
-from rbpf.validation.mono_parts import adjust_near
 
 _AROUND = np.array([(1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1)], dtype=float)
 """Where the error is looked at, beside the middle, for a quadratic of two variables."""
@@ -76,6 +76,13 @@ def refine_calibration(log: FeatureLog, batch: Batch, told: Told | None = None) 
             if np.abs(lowest).max() <= 1.0:
                 break
     return Calibrated(_camera(best.log), best, std)
+
+
+def adjust_near(log: FeatureLog, batch: Batch) -> Batch:
+    """The optimum of a log that is nearly the batch's, from the batch's."""
+    path = np.tile(SE3.identity(), (len(log.frames), 1))
+    path[batch.frames] = batch.world_from_camera
+    return adjust_log(log, path, twice=False)
 
 
 def recalibrate(folder: Path, out: Path, told: Told | None = None) -> tuple[dict[str, Any], Calibrated]:

@@ -32,7 +32,7 @@ class Imaging:
     """How pictures are taken, and what is given along with them.
 
     The defaults are those of a small camera indoors: an exposure of a hundredth of a second, the noise of a raised
-    gain, an automatic exposure, a lens that is darker in the corners. `examples/mono_realism.py` compares what active
+    gain, an automatic exposure, a lens that is darker in the corners. `examples/studies/mono_realism.py` compares what active
     search finds with them with real recordings.
 
     Attributes:

@@ -43,8 +43,8 @@ class Measuring:
     Attributes:
         noise_px: standard deviation per coordinate.
         measurements: most of them per frame.
-        known: number of points known beforehand, around the middle of the first image; a world with a target of its
-            own ignores it. They are measured whenever they are visible, and never disappear.
+        known: number of points known beforehand, around the middle of the first image. They are measured whenever they
+            are visible, and never disappear.
         known_std_m: standard deviation per axis of their given positions.
         new_per_frame: most points that enter the map per frame; the first frame takes as many as fit.
         outlier_rate: probability that a measurement lies anywhere in the image; never that which begins a landmark.
@@ -110,20 +110,20 @@ def simulate_features(
 
 
 def _known(scene: Scene, measuring: Measuring, camera: Pinhole | RectifiedStereo) -> np.ndarray:
-    """(M,) rows of the points known beforehand: the world's target, or points visible in the first frame."""
+    """(M,) rows of the points known beforehand, visible in the first frame."""
     visible, z = _view(scene, measuring, camera, 0)
-    wanted = measuring.known if scene.target is None else len(scene.target)
+    wanted = measuring.known
     if wanted > measuring.measurements:
         raise InputError(
             f"{wanted} known points do not fit into {measuring.measurements} measurements per frame"
         )
-    seen = np.flatnonzero(visible) if scene.target is None else scene.target[visible[scene.target]]
+    seen = np.flatnonzero(visible)
     if len(seen) < wanted:
         raise InputError(
             f"the first frame of the {scene.name} sees {len(seen)} points that can be known, expected {wanted}: "
             "simulate more points, fewer known ones or another place of the camera"
         )
-    known = seen[_spread(z[seen, :2], wanted, _image_size(camera))] if scene.target is None else seen
+    known = seen[_spread(z[seen, :2], wanted, _image_size(camera))]
     if wanted > 2 and _flatness(z[known, :2]) < LEAST_SPREAD:
         raise InputError(
             f"the known points of the {scene.name} lie on a line in the first frame: use another seed or more points"

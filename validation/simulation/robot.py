@@ -5,12 +5,15 @@ The folder has the layout of `rbpf.sensors.readers.mrpt`: odometry, observations
 
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.files import write_csv, write_text
+from rbpf.sensors.readers import open_log
+from rbpf.sensors.readers.log import RobotLog
 
 
 @dataclass(frozen=True)
@@ -77,6 +80,13 @@ def simulate_robot(world: RobotWorld, folder: Path, seed: int) -> None:
         "positive_pitch: up\n"
     )
     write_text(folder / "sensor.yaml", text)
+
+
+def simulated_log(world: RobotWorld, seed: int) -> RobotLog:
+    """What `simulate_robot` writes, in memory."""
+    with TemporaryDirectory() as folder:
+        simulate_robot(world, Path(folder), seed)
+        return open_log(folder)
 
 
 def _path(world: RobotWorld) -> np.ndarray:

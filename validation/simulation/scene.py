@@ -24,7 +24,6 @@ class Scene:
         points: (Q, 3) in the world, m.
         present: (Q, 2) int64, the frame in which a point appears and the one in which it is gone for good.
         blocks: (B, 2, 3) least and greatest corner of opaque boxes, m.
-        target: (M,) int64 rows of `points` that are known beforehand; None leaves the choice to the measuring.
     """
 
     name: str
@@ -33,7 +32,6 @@ class Scene:
     points: np.ndarray
     present: np.ndarray
     blocks: np.ndarray
-    target: np.ndarray | None = None
 
 
 class PointWorld(Protocol):

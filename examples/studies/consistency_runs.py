@@ -1,0 +1,449 @@
+"""Does the filter know how wrong it is? Many simulated runs of both systems, with few and many particles.
+
+The normalised error squared of the pose (NEES), the mean over independent recordings, is 1 per degree of freedom for an
+honest filter, and stays in the green band in 95 % of the steps. A filter is over-confident from the step at which it
+leaves the band upwards and does not come back (`left_for_good`). The upper pictures have
+the curves for three numbers of particles. The lower ones have, for the middle number, what each remedy does to the mean
+over all steps: iterating the proposal's linearisation, the exact importance ratio instead of the linearised weight,
+re-estimating the start (range-bearing), marginalising the frame of the known points instead of sampling the start
+(monocular), or the lack of each.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from matplotlib.figure import Figure
+
+from rbpf.core.diagnostics import Band, ancestors_by_step, chi_square_band, coalescence_steps
+from rbpf.core.filter import Filter
+from rbpf.errors import InputError
+from rbpf.lie import SE3
+from rbpf.sensors.readers.log import RobotLog
+from rbpf.systems.filtering import ProposalConfig
+from rbpf.systems.map_estimate import MapEstimate, estimate_map
+from rbpf.systems.mono.config import MonoConfig
+from rbpf.systems.mono.run import run as run_mono
+from rbpf.systems.range_bearing.config import RangeBearingConfig
+from rbpf.systems.range_bearing.run import run as run_robot
+from rbpf.validation.camera_map import summarise_points
+from rbpf.validation.consistency.pose_errors import whitened_errors
+from rbpf.validation.consistency.statistic import PROBABILITIES
+from rbpf.validation.run_truth import robot_truth
+from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
+from rbpf.validation.simulation.point_worlds import DeskWorld
+from rbpf.validation.simulation.robot import RobotWorld, simulated_log
+from rbpf.validation.sweep.parallel import in_parallel
+from rbpf.validation.tables import write_csv, write_table
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One run; T steps, M landmarks.
+
+    Attributes:
+        dim: degrees of freedom of the pose, d.
+        distances: (T,) errors of the position, m, without alignment.
+        nees: (T,) of the pose; NaN where the filter holds it to be known exactly.
+        nis: (T,) normalised innovation squared;  nis_dof: (T,) its degrees of freedom.
+        landmark_nees: (M,) of the landmarks at the end;  landmark_dim: degrees of freedom of one.
+        ancestors: (T,) how many particles of each step still have descendants at the end.
+        coalescence: steps back from the end to the latest ancestor that all particles share; None where there is none.
+        log_evidence: of the whole run.
+    """
+
+    dim: int
+    distances: np.ndarray
+    nees: np.ndarray
+    nis: np.ndarray
+    nis_dof: np.ndarray
+    landmark_nees: np.ndarray
+    landmark_dim: int
+    ancestors: np.ndarray
+    coalescence: int | None
+    log_evidence: float
+
+
+@dataclass(frozen=True)
+class RobotTrial:
+    """Range-bearing SLAM in a simulated world; call it with a seed of world and filter.
+
+    Attributes:
+        world: what is simulated.
+        config: of the filter.
+        spoil: changes what the filter is given, after the simulation; None changes nothing.
+    """
+
+    world: RobotWorld
+    config: RangeBearingConfig
+    spoil: Callable[[RobotLog, np.random.Generator], RobotLog] | None = None
+
+    def __call__(self, seed: int) -> Trial:
+        """Simulates and filters."""
+        log = simulated_log(self.world, seed)
+        truth = robot_truth(log)
+        assert truth is not None
+        given = log if self.spoil is None else self.spoil(log, np.random.default_rng(seed))
+        done = run_robot(given, replace(self.config, seed=seed))
+        progress, found = done.progress, estimate_map(done.filter, done.anchored)
+        errors = whitened_errors(log.space, progress.mean, progress.cov, truth.poses)
+        return Trial(
+            log.space.dim,
+            np.linalg.norm(
+                progress.mean[:, -found.mean.shape[1] :] - truth.poses[:, -found.mean.shape[1] :], axis=1
+            ),
+            np.where(errors.ranks > 0, errors.nees, np.nan),
+            progress.nis,
+            progress.rows,
+            _landmark_nees(found, truth.landmarks),
+            found.mean.shape[1],
+            *_genealogy(done.filter),
+        )
+
+
+@dataclass(frozen=True)
+class DeskTrial:
+    """Monocular SLAM on simulated features; call it with a seed of world and filter.
+
+    Attributes:
+        world: what is simulated.
+        config: of the filter.
+        measuring: how it is measured.
+    """
+
+    world: DeskWorld
+    config: MonoConfig
+    measuring: Measuring = field(default_factory=Measuring)
+
+    def __post_init__(self) -> None:
+        """Errors are told without alignment, which takes known points.
+
+        Raises:
+            InputError: there are fewer than four.
+        """
+        if self.measuring.known < 4:
+            raise InputError(
+                f"a trial needs 4 known points or more to tell errors in one world, got {self.measuring.known}"
+            )
+
+    def __call__(self, seed: int) -> Trial:
+        """Simulates and filters."""
+        log = simulate_features(self.world, self.measuring, MONO, seed)
+        assert log.truth is not None
+        done = run_mono(log, replace(self.config, seed=seed))
+        true = log.truth.world_from_camera
+        errors = whitened_errors(SE3, done.world_from_camera, done.cov, true)
+        return Trial(
+            6,
+            np.linalg.norm(SE3.translation(done.world_from_camera) - SE3.translation(true), axis=1),
+            np.where(errors.ranks > 0, errors.nees, np.nan),
+            done.nis,
+            done.rows,
+            _landmark_nees(summarise_points(done.filter), log.truth.landmarks),
+            3,
+            *_genealogy(done.filter),
+        )
+
+
+def _landmark_nees(found: MapEstimate, truth: dict[int, np.ndarray]) -> np.ndarray:
+    known = np.array([name in truth for name in found.ids.tolist()], dtype=bool)
+    error = np.array([truth[name] for name in found.ids[known].tolist()]).reshape(-1, found.mean.shape[1])
+    error = error - found.mean[known]
+    return np.einsum("md,mde,me->m", error, np.linalg.pinv(found.cov[known], hermitian=True), error)
+
+
+def _genealogy(filter_: Filter) -> tuple[np.ndarray, int | None, float]:
+    return ancestors_by_step(filter_.history), coalescence_steps(filter_.history), filter_.log_evidence
+
+
+LAST = 10
+"""Steps that must be left after the step from which on a filter is over-confident, to be able to say so."""
+
+
+@dataclass(frozen=True)
+class Mean:
+    """A mean over independent runs, with the standard error of it."""
+
+    value: float
+    error: float
+
+    @classmethod
+    def of(cls, values: Sequence[float] | np.ndarray) -> "Mean":
+        """Of one value per run."""
+        numbers = np.asarray(values, dtype=float)
+        spread = float(numbers.std(ddof=1)) if numbers.size > 1 else float("inf")
+        return cls(float(numbers.mean()), float(spread / np.sqrt(numbers.size)))
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """What R runs of T steps say together.
+
+    Attributes:
+        trials: the runs.
+    """
+
+    trials: list[Trial]
+
+    def __post_init__(self) -> None:
+        """Checks that they belong together.
+
+        Raises:
+            InputError: there is none, or they differ in length or dimension.
+        """
+        shapes = {(trial.dim, trial.nees.size) for trial in self.trials}
+        if len(shapes) != 1:
+            raise InputError(
+                f"a test of consistency takes one or more runs of one kind and length, got {len(shapes)}"
+            )
+
+    @property
+    def dim(self) -> int:
+        """Degrees of freedom of a pose, d."""
+        return self.trials[0].dim
+
+    @property
+    def mean_nees(self) -> np.ndarray:
+        """(T,) mean over the runs; NaN where the filter holds the pose to be known exactly."""
+        return np.mean([trial.nees for trial in self.trials], axis=0)
+
+    def band(self, probability: float = 0.95) -> Band:
+        """In which an honest filter's mean NEES of one step lies with a probability."""
+        return chi_square_band(self.dim, len(self.trials), probability)
+
+    @property
+    def overconfident_from(self) -> int | None:
+        """The step from which on the filter is over-confident, by `left_for_good`; None for one that never is."""
+        return left_for_good(self.mean_nees, self.band().high)
+
+    @property
+    def pose_nees(self) -> Mean:
+        """Per degree of freedom, over all steps; 1 is right."""
+        return Mean.of([float(np.nanmean(trial.nees)) / self.dim for trial in self.trials])
+
+    @property
+    def landmark_nees(self) -> Mean:
+        """Per degree of freedom, over all landmarks of a run; 1 is right."""
+        seen = [trial for trial in self.trials if trial.landmark_nees.size]
+        return Mean.of([float(trial.landmark_nees.mean()) / trial.landmark_dim for trial in seen])
+
+    @property
+    def nis(self) -> Mean:
+        """Per degree of freedom; 1 is right."""
+        return Mean.of([_nis_ratio(trial) for trial in self.trials])
+
+    @property
+    def position_rmse(self) -> Mean:
+        """Of one run, m, without alignment."""
+        return Mean.of([float(np.sqrt(np.square(trial.distances).mean())) for trial in self.trials])
+
+    def coverage(self, probability: float) -> Mean:
+        """How often the true pose lies in the credible region of a probability."""
+        from scipy.stats import chi2
+
+        bound = chi2.ppf(probability, self.dim)
+        known = [trial.nees[np.isfinite(trial.nees)] for trial in self.trials]
+        return Mean.of([float((nees <= bound).mean()) for nees in known])
+
+    @property
+    def coalescence(self) -> float:
+        """Median of the steps back to the latest common ancestor; infinite where most runs have none."""
+        return float(np.median([np.inf if t.coalescence is None else t.coalescence for t in self.trials]))
+
+    def ancestors(self, age: int) -> float:
+        """Mean number of particles `age` steps before the end that still have descendants at the end."""
+        return float(
+            np.mean([trial.ancestors[max(trial.ancestors.size - 1 - age, 0)] for trial in self.trials])
+        )
+
+    def entries(self) -> dict[str, Any]:
+        """All figures by name, for a table."""
+        means = {
+            "pose_nees": self.pose_nees,
+            "landmark_nees": self.landmark_nees,
+            "nis": self.nis,
+            "position_rmse_m": self.position_rmse,
+            **{f"coverage_{100 * p:.0f}": self.coverage(p) for p in PROBABILITIES},
+        }
+        start = self.overconfident_from
+        return {
+            "runs": len(self.trials),
+            "overconfident_from": "never" if start is None else start,
+            **{name: mean.value for name, mean in means.items()},
+            **{f"{name}_error": mean.error for name, mean in means.items()},
+            "coalescence": self.coalescence,
+        }
+
+
+def run_trials(trial: Callable[[int], Trial], seeds: Sequence[int], workers: int = 1) -> Consistency:
+    """Runs a trial once per seed.
+
+    Args:
+        trial: a `RobotTrial`, a `DeskTrial` or anything picklable that makes a `Trial` from a seed.
+        seeds: one run each.
+        workers: processes.
+    """
+    return Consistency(in_parallel(trial, seeds, workers))
+
+
+def left_for_good(mean_nees: np.ndarray, high: float) -> int | None:
+    """When a mean NEES (T,) leaves its band upwards and does not come back.
+
+    That is the first step above the band such that, for every later step s, at least half of the steps from it to s
+    are above the band: single steps inside do not end over-confidence, and single ones outside, of which an honest
+    filter has one in forty, do not begin it. It must lie `LAST` steps or more before the end.
+
+    Returns:
+        The step; None for a filter that stays inside or comes back.
+    """
+    votes = np.where(np.nan_to_num(mean_nees, nan=0.0) > high, 1, -1)
+    total = np.concatenate([[0], np.cumsum(votes)])
+    # the sum of the votes from t to s is total[s + 1] − total[t]; its least over s must not be negative
+    least = np.minimum.accumulate(total[:0:-1])[::-1]
+    starts = np.flatnonzero((votes > 0) & (least >= total[:-1]))
+    return int(starts[0]) if starts.size and starts[0] <= mean_nees.size - LAST else None
+
+
+def _nis_ratio(trial: Trial) -> float:
+    used = np.isfinite(trial.nis) & (trial.nis_dof > 0)
+    return float(trial.nis[used].sum() / trial.nis_dof[used].sum()) if used.any() else float("nan")
+
+
+CAMERA, ROBOT = "monocular", "range-bearing"
+Trials = dict[str, Callable[[int], Trial]]
+
+
+def robot_trials(steps: int, particles: tuple[int, ...]) -> tuple[Trials, Trials]:
+    """Range-bearing runs by number of particles, and with one thing changed at the middle number."""
+    world, base = RobotWorld(steps=steps), RangeBearingConfig(particles=particles[1])
+    changed = {
+        "bootstrap proposal": replace(base, proposal=ProposalConfig(kind="prior")),
+        "one linearisation": replace(base, proposal=ProposalConfig(iterations=1)),
+        "linearised weights": replace(base, proposal=ProposalConfig(weights="linearised")),
+        "start never re-estimated": replace(base, anchor_every=0),
+        "start re-estimated in every step": replace(base, anchor_every=1),
+    }
+    sizes = {f"{n} particles": RobotTrial(world, RangeBearingConfig(particles=n)) for n in particles}
+    return sizes, {name: RobotTrial(world, config) for name, config in changed.items()}
+
+
+def desk_trials(frames: int, particles: tuple[int, ...]) -> tuple[Trials, Trials]:
+    """The same for the camera over a desk."""
+    world, base = DeskWorld(frames=frames), MonoConfig(particles=particles[1])
+    changed = {
+        "start sampled (known points as landmarks)": replace(base, known="points"),
+        "three linearisations": replace(base, proposal=ProposalConfig(iterations=3)),
+        "linearised weights": replace(base, proposal=ProposalConfig(weights="linearised", iterations=1)),
+        "epipolar constraint": replace(base, ray=replace(base.ray, constrain="epipolar")),
+    }
+    sizes = {f"{n} particles": DeskTrial(world, MonoConfig(particles=n)) for n in particles}
+    return sizes, {name: DeskTrial(world, config) for name, config in changed.items()}
+
+
+def draw_curves(axes: Any, system: str, found: dict[str, Consistency]) -> None:
+    """Mean NEES per degree of freedom over time."""
+    first = next(iter(found.values()))
+    band, dim = first.band(), first.dim
+    axes.axhspan(
+        band.low / dim, band.high / dim, color="tab:green", alpha=0.25, label="95 % band, honest filter"
+    )
+    for name, consistency in found.items():
+        start = consistency.overconfident_from
+        (line,) = axes.plot(consistency.mean_nees / dim, lw=1.1, label=name)
+        if start is not None:
+            axes.axvline(start, color=line.get_color(), lw=0.8, ls=":")
+    runs = len(first.trials)
+    axes.set(
+        title=f"{system}: NEES of the pose, mean of {runs} runs",
+        xlabel="step",
+        ylabel="NEES / d",
+        yscale="log",
+    )
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize="small")
+
+
+def draw_remedies(axes: Any, found: dict[str, Consistency]) -> None:
+    """Mean over all steps, with its standard error, for poses and landmarks."""
+    places = np.arange(len(found))[::-1]
+    for shift, what, colour in ((0.12, "pose_nees", "tab:blue"), (-0.12, "landmark_nees", "tab:red")):
+        means = [getattr(consistency, what) for consistency in found.values()]
+        values, errors = [mean.value for mean in means], [2.0 * mean.error for mean in means]
+        axes.errorbar(
+            values, places + shift, xerr=errors, fmt="o", color=colour, label=what.replace("_nees", "s")
+        )
+    axes.axvline(1.0, color="tab:green", lw=1.0)
+    axes.set_yticks(places, list(found))
+    axes.set(xlabel="NEES / d, ± 2 standard errors", xscale="log")
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize="small")
+
+
+def table_row(system: str, name: str, consistency: Consistency) -> list[str | int | float]:
+    """One line of the table."""
+    start = consistency.overconfident_from
+    return [
+        system, name, len(consistency.trials), consistency.pose_nees.value, consistency.landmark_nees.value,
+        consistency.nis.value, consistency.coverage(0.5).value, consistency.coverage(0.9).value,
+        consistency.coverage(0.95).value, "never" if start is None else start,
+        1e3 * consistency.position_rmse.value, consistency.coalescence,
+    ]  # fmt: skip
+
+
+def main(
+    runs: int = 50,
+    remedies: int = 20,
+    steps: int = 150,
+    particles: tuple[int, int, int] = (50, 250, 1000),
+    workers: int = 2,
+    out: Path = Path("demo/consistency_runs"),
+    quick: bool = False,
+) -> dict[str, float]:
+    """Runs everything and prints the table.
+
+    Args:
+        runs: recordings for each number of particles.
+        remedies: recordings for each remedy.
+        steps: of each recording.
+        particles: three numbers of them; remedies are tried with the middle one.
+        workers: processes.
+        out: folder for picture and tables.
+        quick: few short recordings, few particles.
+    """
+    if quick:
+        runs, remedies, steps, particles, workers = 6, 3, 40, (10, 20, 40), 1
+    figure = Figure(figsize=(14.0, 9.0), layout="constrained")
+    panels = figure.subplots(2, 2)
+    rows, curves = [], dict[str, np.ndarray]()
+    systems = {CAMERA: desk_trials(steps, particles), ROBOT: robot_trials(steps, particles)}
+    for column, (system, (sizes, changed)) in enumerate(systems.items()):
+        found = {name: run_trials(trial, range(runs), workers) for name, trial in sizes.items()}
+        middle = f"{particles[1]} particles"
+        few = Consistency(found[middle].trials[:remedies])
+        tried = {"as it is": few} | {
+            name: run_trials(trial, range(remedies), workers) for name, trial in changed.items()
+        }
+        draw_curves(panels[0, column], system, found)
+        draw_remedies(panels[1, column], tried)
+        for name, consistency in (found | {f"{middle}, {key}": c for key, c in tried.items()}).items():
+            rows.append(table_row(system, name, consistency))
+            curves[f"{system}, {name}"] = consistency.mean_nees
+    header = [
+        "system", "filter", "runs", "poses", "landmarks", "NIS", "in 50 %", "in 90 %", "in 95 %", "over-confident from",
+        "error [mm]", "coalescence",
+    ]  # fmt: skip
+    rows.sort(key=lambda row: str(row[0]))
+    write_table(out / "consistency.csv", header, rows)
+    steps_of = [[t, *(float(curve[t]) for curve in curves.values())] for t in range(steps)]
+    write_csv(out / "nees.csv", ["step", *curves], steps_of)
+    out.mkdir(parents=True, exist_ok=True)
+    figure.savefig(out / "consistency.png", dpi=110)
+    print(f"picture and tables in {out}")
+    return {f"{row[0]}, {row[1]}": float(row[3]) for row in rows}
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

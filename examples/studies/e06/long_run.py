@@ -1,0 +1,110 @@
+"""Figure 6: a hundred seconds at frame rate."""
+
+import time
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from examples.studies.e06.setting import Row, Setting, true_poses
+from examples.studies.e06.worlds import LoopOverDesk
+from rbpf.lie import SE3
+from rbpf.runs.plots import COLOURS, SIGMAS, label, outline, save_figures
+from rbpf.sensors.readers.images import ImageFrame
+from rbpf.systems.mono.video import VideoRun, run_images
+from rbpf.validation.mono_map import MonoMap, summarise_mono_map
+
+FRAME_S = 1.0 / 30.0
+WARM_UP = 5
+"""First frames, which are not counted: kernels are loaded."""
+
+LAP = 430
+"""Frames of one round."""
+
+WIDTH = 320
+"""Of the images: three thousand of them take long to render."""
+
+LANDMARKS, LEAST, MOST, PARTICLES = 265, 20, 30, 50
+"""The paper's."""
+
+
+def reproduce(setting: Setting) -> list[Row]:
+    """Filters the sequence."""
+    frames = 60 if setting.quick else 3000
+    setting = replace(setting, width=WIDTH)
+    world = LoopOverDesk(frames=frames, laps=frames / LAP, texel_m=0.002)
+    sequence, known = setting.sequence("long_loop", world)
+    clock: list[float] = []
+
+    def note(t: int, frame: ImageFrame, run: VideoRun) -> None:
+        clock.append(time.process_time())
+
+    run = run_images(sequence, setting.config(), known, note)
+    mapped = summarise_mono_map(run.filter)
+    cpu = np.diff(clock, prepend=clock[0])
+    save_figures({"figure_6.png": _draw(run, mapped, true_poses(sequence), cpu)}, setting.out)
+    return _rows(run, cpu)
+
+
+def _rows(run: VideoRun, cpu: np.ndarray) -> list[Row]:
+    counted = run.seconds[WARM_UP:]
+    fraction, slowest = float((counted <= FRAME_S).mean()), 1e3 * float(counted.max())
+    held = int(run.sightings.frames[-1].held.sum())
+    found = float(run.found.mean())
+    points, rays = run.sightings.frames[-1].held[0].tolist()
+    within = float(((run.found >= LEAST) & (run.found <= MOST)).mean())
+    lost = int(run.lost.sum())
+    median = f"median {1e3 * np.median(counted):.1f} ms, slowest {slowest:.0f} ms"
+    own = f"{1e3 * np.median(cpu[WARM_UP:]):.1f} ms of processor time, decoding and notes included"
+    frames, particles = run.stamps_ns.size, run.config.particles
+    return [
+        Row("Fig. 6", f"landmarks after {frames} frames, {particles} particles", f"{LANDMARKS} after 3000, {PARTICLES}",
+            f"{held} ({points} points, {rays} rays)", float(held), held >= LANDMARKS),
+        Row("Fig. 6", "observations per frame", f"{LEAST} to {MOST}",
+            f"mean {found:.1f}, {within:.0%} of the frames within", found, LEAST <= found <= MOST),
+        Row("Fig. 6", f"fraction of frames under 33 ms ({run.sequence.camera.width} px wide)", "all (30 Hz)",
+            f"{fraction:.1%}; {median}; {own}", fraction, fraction == 1.0),
+        Row("Fig. 6", "frames in which the camera was lost", "none told", f"{lost}", float(lost), lost == 0),
+    ]  # fmt: skip
+
+
+def _draw(run: VideoRun, mapped: MonoMap, truth: np.ndarray, cpu: np.ndarray) -> Any:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(14.0, 6.5), layout="constrained")
+    panels: Any = figure.subfigures(1, 2, width_ratios=(1.0, 1.1))
+    above, rows = panels[0].subplots(), panels[1].subplots(3, 1, sharex=True)
+    _draw_map(above, run, mapped, truth)
+    frames = np.arange(run.seconds.size)
+    held = np.array([sighting.held[0] for sighting in run.sightings.frames])
+    rows[0].plot(frames, held.sum(axis=1), color="black", label="landmarks")
+    rows[0].plot(frames, held[:, 0], color=COLOURS["filter"], label="of known depth")
+    rows[1].plot(frames, run.found, color=COLOURS["known"], lw=0.6, label="observations")
+    rows[1].axhspan(LEAST, MOST, color="0.5", alpha=0.15, label="the paper's 20 to 30")
+    rows[2].plot(frames[WARM_UP:], 1e3 * run.seconds[WARM_UP:], ".", ms=1.5, label="time on the clock")
+    rows[2].plot(
+        frames[WARM_UP:], 1e3 * cpu[WARM_UP:], ".", ms=1.0, alpha=0.5, label="processor time, all threads"
+    )
+    rows[2].axhline(1e3 * FRAME_S, color=COLOURS["map"], ls="--", lw=0.8, label="30 Hz")
+    high = float(np.quantile(1e3 * run.seconds[WARM_UP:], 0.995))
+    rows[2].set(xlabel="frame", ylabel="ms", ylim=(0.0, max(40.0, 1.2 * high)))
+    for axes in rows:
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize="small", loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    return figure
+
+
+def _draw_map(axes: Any, run: VideoRun, mapped: MonoMap, truth: np.ndarray) -> None:
+    full = ~mapped.is_ray
+    mean, cov = mapped.landmarks.mean[full], mapped.landmarks.cov[full]
+    label(
+        axes, f"map from above: {full.sum()} points with {SIGMAS:g}σ (Fig. 6)", "x [m]", "y [m]", equal=True
+    )
+    for ellipse in outline(mean[:, :2], cov[:, :2, :2]):
+        axes.plot(*ellipse.T, color=COLOURS["map"], lw=0.4)
+    axes.plot(*mean[:, :2].T, ".", color="black", ms=2)
+    axes.plot(*SE3.translation(truth)[:, :2].T, color=COLOURS["truth"], lw=0.8, ls="--", label="true path")
+    axes.plot(
+        *SE3.translation(run.world_from_camera)[:, :2].T, color=COLOURS["filter"], lw=0.8, label="filter"
+    )
+    axes.legend(fontsize="small")

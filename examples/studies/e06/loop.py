@@ -1,0 +1,126 @@
+"""Figure 5: a loop is closed, and the landmarks of the start are found again."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from examples.studies.e06.setting import Row, Setting, true_poses
+from examples.studies.e06.worlds import LoopOverDesk
+from rbpf.lie import SE3
+from rbpf.runs.plots import COLOURS, SIGMAS, label, outline, save_figures
+from rbpf.systems.mono.sightings import Sighting
+from rbpf.systems.mono.video import VideoRun, run_images
+from rbpf.validation.mono_map import MonoMap, summarise_mono_map
+
+START = 15
+"""Landmarks that were started in so many first frames are those of the start."""
+
+AWAY = 30
+"""Frames without any of them that make an absence."""
+
+
+@dataclass(frozen=True)
+class Closure:
+    """How the landmarks of the start were found again.
+
+    Attributes:
+        first: number of landmarks of the start.
+        again: how many of them were found after the longest absence.
+        left: last frame in which one was found before it.
+        back: first frame in which one was found after it; −1 where there is none.
+    """
+
+    first: int
+    again: int
+    left: int
+    back: int
+
+
+def find_closure(frames: list[Sighting], first: int) -> Closure:
+    """From the sightings of a run, frame by frame, for the features with rows below `first`.
+
+    The absence is the longest run of frames in which none of them was found.
+    """
+    seen = [np.unique(frame.rows[frame.found & (frame.rows < first)]) for frame in frames]
+    seen[0] = np.arange(first)
+    times = np.flatnonzero([rows.size > 0 for rows in seen])
+    gaps = np.diff(times)
+    if not gaps.size or gaps.max() < AWAY:
+        return Closure(first, 0, int(times[-1]), -1)
+    longest = int(gaps.argmax())
+    left, back = int(times[longest]), int(times[longest + 1])
+    again = np.unique(np.concatenate(seen[back:]))
+    return Closure(first, again.size, left, back)
+
+
+def started_until(frames: list[Sighting], until: int) -> int:
+    """Number of features that were started in the first frames, the known points among them."""
+    return sum(frame.started.shape[0] for frame in frames[:until])
+
+
+def reproduce(setting: Setting) -> list[Row]:
+    """Filters the loop."""
+    world = LoopOverDesk(frames=150, radius_m=0.35, texel_m=0.002) if setting.quick else LoopOverDesk()
+    sequence, known = setting.sequence("loop", world)
+    run = run_images(sequence, setting.config(), known)
+    mapped = summarise_mono_map(run.filter)
+    first = started_until(run.sightings.frames, START)
+    closure = find_closure(run.sightings.frames, first)
+    truth = true_poses(sequence)[: run.stamps_ns.size]
+    error = np.linalg.norm(SE3.translation(run.world_from_camera) - SE3.translation(truth), axis=1)
+    save_figures({"figure_5.png": _draw(run, mapped, truth, error, closure)}, setting.out)
+    return _rows(closure, error, truth, int((~mapped.is_ray).sum()))
+
+
+def _rows(closure: Closure, error: np.ndarray, truth: np.ndarray, full: int) -> list[Row]:
+    fraction = closure.again / closure.first
+    closed = closure.back >= 0
+    before = float(error[closure.back - 1]) if closed else float("nan")
+    after = float(np.median(error[-10:])) if closed else float("nan")
+    way = float(np.linalg.norm(np.diff(SE3.translation(truth), axis=0), axis=1).sum())
+    away = closure.back - closure.left - 1 if closed else 0
+    return [
+        Row("Fig. 5", "landmarks in the map (points)", "98", f"{full}", float(full)),
+        Row(
+            "Fig. 5",
+            f"landmarks of the start found again after {away} frames out of sight",
+            "re-acquired",
+            f"{closure.again} of {closure.first}",
+            fraction,
+            fraction >= 0.5,
+        ),
+        Row(
+            "Fig. 5",
+            f"error of the position after {way:.1f} m, before and after they are found",
+            "",
+            f"{1e3 * before:.1f} and {1e3 * after:.1f} mm",
+            after,
+        ),
+    ]
+
+
+def _draw(run: VideoRun, mapped: MonoMap, truth: np.ndarray, error: np.ndarray, closure: Closure) -> Any:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12.0, 5.5), layout="constrained")
+    above, curve = figure.subplots(1, 2)
+    label(above, "map from above, the loop closed (Fig. 5)", "x [m]", "y [m]", equal=True)
+    full = ~mapped.is_ray
+    mean, cov = mapped.landmarks.mean[full], mapped.landmarks.cov[full]
+    for ellipse in outline(mean[:, :2], cov[:, :2, :2]):
+        above.plot(*ellipse.T, color=COLOURS["map"], lw=0.6)
+    above.plot(*mean[:, :2].T, ".", color="black", ms=3, label=f"landmarks, {SIGMAS:g}σ")
+    above.plot(*SE3.translation(truth)[:, :2].T, color=COLOURS["truth"], lw=1.0, ls="--", label="true path")
+    above.plot(
+        *SE3.translation(run.world_from_camera)[:, :2].T, color=COLOURS["filter"], lw=1.2, label="filter"
+    )
+    if run.known is not None:
+        above.plot(*run.known.positions[:, :2].T, "+", color=COLOURS["known"], ms=9, label="known points")
+    above.legend(fontsize="small")
+    label(curve, "error of the position", "frame", "mm", equal=False)
+    curve.plot(1e3 * error, color=COLOURS["filter"])
+    if closure.back >= 0:
+        curve.axvspan(closure.left, closure.back, color="0.5", alpha=0.2, label="start out of sight")
+        curve.legend(fontsize="small")
+    return figure

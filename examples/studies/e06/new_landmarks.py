@@ -1,0 +1,127 @@
+"""Figures 7 and 8: new landmarks on their rays in the map, and on their epipolar lines in the image."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from examples.studies.e06.setting import Row, Setting
+from examples.studies.e06.worlds import LoopOverDesk
+from rbpf.lie import SE3
+from rbpf.runs.plots import COLOURS, label, outline, save_figures
+from rbpf.sensors.readers.images import ImageFrame
+from rbpf.systems.mono.sightings import Sighting
+from rbpf.systems.mono.video import VideoRun, run_images
+from rbpf.validation.mono_map import MonoMap, summarise_mono_map
+from rbpf.validation.report.annotated import Caption
+from rbpf.validation.report.mono_frames import draw_frame
+
+FIRST = 20
+"""The frame is not looked for before this one: the camera is still at rest."""
+
+NEAR_M = 1.5
+"""Rays are drawn to this distance from the middle of the map."""
+
+
+@dataclass
+class Shown:
+    """The frame in which most landmarks without depth were seen to move: image, sightings, map, path so far."""
+
+    frame: int
+    image: np.ndarray
+    sighting: Sighting
+    found: int
+    mapped: MonoMap
+    path: np.ndarray
+
+
+def line_distances(sighting: Sighting) -> np.ndarray:
+    """Distances (K,) of the found rays from their epipolar lines, px."""
+    rows = sighting.found & sighting.is_ray
+    start, end, px = sighting.line[rows, 0], sighting.line[rows, 1], sighting.px[rows]
+    along = end - start
+    length = np.linalg.norm(along, axis=1)
+    cross = along[:, 0] * (px - start)[:, 1] - along[:, 1] * (px - start)[:, 0]
+    return np.asarray(np.abs(cross) / np.maximum(length, 1e-12))
+
+
+def line_lengths(sighting: Sighting) -> np.ndarray:
+    """Lengths (K,) of the epipolar lines of the found rays, px: a camera at rest sees points."""
+    rows = sighting.found & sighting.is_ray
+    return np.asarray(np.linalg.norm(sighting.line[rows, 1] - sighting.line[rows, 0], axis=1))
+
+
+def reproduce(setting: Setting) -> list[Row]:
+    """Looks for the frame with most epipolar lines, and draws it with the map of that moment."""
+    frames = 75 if setting.quick else 480
+    world = LoopOverDesk(frames=frames, texel_m=0.002 if setting.quick else 0.001)
+    name = "short_loop" if setting.quick else "loop"
+    sequence, known = setting.sequence(name, world)
+    best: list[Shown] = []
+
+    def watch(t: int, frame: ImageFrame, run: VideoRun) -> None:
+        sighting = run.sightings.frames[-1]
+        lines = int((line_lengths(sighting) > 2.0 * run.config.search.noise_px).sum())
+        if t < FIRST or frame.image is None or (best and lines <= best[0].found):
+            return
+        path = run.world_from_camera[: t + 1].copy()
+        best[:] = [Shown(t, frame.image, sighting, lines, summarise_mono_map(run.filter), path)]
+
+    run = run_images(sequence, setting.config(), known, watch)
+    (shown,) = best
+    figures = {"figure_7.png": _draw_map(shown), "figure_8.png": _draw_image(shown, run)}
+    save_figures(figures, setting.out)
+    all_lines = np.concatenate([line_distances(sighting) for sighting in run.sightings.frames])
+    rms = float(np.sqrt(np.mean(all_lines**2)))
+    return [
+        Row("Fig. 7", f"landmarks on rays in the map, frame {shown.frame}", "drawn",
+            f"{int(shown.mapped.is_ray.sum())}", float(shown.mapped.is_ray.sum())),
+        Row("Fig. 8", "of these seen on epipolar lines longer than 2 px", "drawn", f"{shown.found}",
+            float(shown.found)),
+        Row("Fig. 8", "distance of what is found from its epipolar line, whole sequence", "zero for a perfect pose",
+            f"rms {rms:.2f} px", rms),
+    ]  # fmt: skip
+
+
+def _draw_map(shown: Shown) -> Any:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.5, 7.0), layout="constrained")
+    axes = figure.subplots()
+    label(
+        axes,
+        f"map at frame {shown.frame}: new landmarks on their rays (Fig. 7)",
+        "x [m]",
+        "y [m]",
+        equal=True,
+    )
+    full, rays = ~shown.mapped.is_ray, shown.mapped.is_ray
+    mean, cov = shown.mapped.landmarks.mean[full], shown.mapped.landmarks.cov[full]
+    camera = SE3.translation(shown.path)
+    ends = shown.mapped.ends[rays]
+    axes.plot(ends[..., 0].T, ends[..., 1].T, color=COLOURS["map"], lw=0.8)
+    axes.plot([], [], color=COLOURS["map"], label="rays (±2σ of inverse depth)")
+    for ellipse in outline(mean[:, :2], cov[:, :2, :2]):
+        axes.plot(*ellipse.T, color=COLOURS["filter"], lw=0.6)
+    axes.plot(*mean[:, :2].T, ".", color="black", ms=4, label="landmarks of known depth, 3σ")
+    axes.plot(*camera[:, :2].T, color=COLOURS["known"], lw=1.2, label="camera")
+    axes.plot(*camera[-1, :2], "o", color=COLOURS["known"])
+    middle = np.median(np.concatenate([mean, camera]), axis=0)
+    axes.set_xlim(middle[0] - NEAR_M, middle[0] + NEAR_M)
+    axes.set_ylim(middle[1] - NEAR_M, middle[1] + NEAR_M)
+    axes.set_aspect("equal", adjustable="box")
+    axes.legend(fontsize="small")
+    return figure
+
+
+def _draw_image(shown: Shown, run: VideoRun) -> Any:
+    from matplotlib.figure import Figure
+
+    camera = run.sequence.camera
+    text = f"frame {shown.frame}   found {int(run.found[shown.frame])} of {int(run.searched[shown.frame])}   (Fig. 8)"
+    picture = draw_frame(shown.image, shown.sighting, Caption(text, ""), camera.width, camera.height)
+    figure = Figure(figsize=(picture.shape[1] / 110.0, picture.shape[0] / 110.0))
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    axes.imshow(picture)
+    axes.set_axis_off()
+    return figure

@@ -1,0 +1,166 @@
+"""What does the map bring? Each recording without it, with it, and played forward and then backward.
+
+The way back sees again all that the way there has seen. Odometry is that of the same runs, from the same features.
+Where recordings lie is told by the environment variable RBPF_DATA; those that are not there are passed over. The
+recorded tracks have no ground truth: the batch optimum of the same pixels takes its place. Pixels of the simulated
+laboratory are always in the table.
+"""
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import final
+
+import numpy as np
+import tyro
+
+from rbpf.errors import InputError
+from rbpf.runs.plots import COLOURS, new_axes, save_figures
+from rbpf.sensors.feature_log import CameraTruth, FeatureLog
+from rbpf.sensors.readers import stereo_tracks
+from rbpf.sensors.readers.images import open_stereo
+from rbpf.sensors.readers.images.sequence import ImageFrame, Source
+from rbpf.sensors.readers.images.stereo import StereoSequence
+from rbpf.systems.stereo.config import StereoConfig
+from rbpf.systems.stereo.feature_cache import cache_features
+from rbpf.systems.stereo.run import StereoRun, run_features, run_images
+from rbpf.validation.gtsam.batch_problem import solve_problem
+from rbpf.validation.metrics.stereo_scores import score_stereo
+from rbpf.validation.simulation.features import STEREO, Measuring, simulate_features
+from rbpf.validation.simulation.lab_points import LabWorld
+from rbpf.validation.simulation.textured_lab import LabDrive
+from rbpf.validation.tables import write_table
+
+
+@final
+class Reordered(Source):
+    """Images of a sequence in another order, with the times given; all are held.
+
+    Args:
+        sequence: of pairs.
+        rows: (T,) which of its pairs.
+        stamps_ns: (T,) their times.
+    """
+
+    def __init__(self, sequence: StereoSequence, rows: np.ndarray, stamps_ns: np.ndarray) -> None:
+        self.images = list(sequence.frames())
+        self.rows, self.stamps_ns = rows, stamps_ns
+
+    def frames(self, start: int) -> Iterator[ImageFrame]:
+        """Images from number `start` on."""
+        for row, stamp in zip(self.rows[start:].tolist(), self.stamps_ns[start:].tolist(), strict=True):
+            yield replace(self.images[row], stamp_ns=stamp)
+
+
+def pairs_there_and_back(sequence: StereoSequence) -> StereoSequence:
+    """T pairs, then T − 1 backward, at an even pace.
+
+    Raises:
+        InputError: the recording has no truth, or less than two pairs.
+    """
+    count, truth = len(sequence), sequence.truth
+    if truth is None or count < 2:
+        raise InputError(f"{sequence.name}: expected two pairs or more, and ground truth")
+    rows = there_and_back(count)
+    stamps = np.arange(rows.size, dtype=np.int64) * int(np.median(np.diff(sequence.stamps_ns)))
+    near = np.array([int(np.abs(truth.stamps_ns - stamp).argmin()) for stamp in sequence.stamps_ns.tolist()])
+    true = CameraTruth(stamps, truth.world_from_camera[near][rows])
+    source = Reordered(sequence, rows, stamps)
+    return StereoSequence(replace(sequence.pair, stamps_ns=stamps, truth=true, source=source), sequence.rig)
+
+
+def log_there_and_back(log: FeatureLog) -> FeatureLog:
+    """T frames, then T − 1 backward; stamps count them. Truth, if there is any, has a pose for each frame."""
+    rows = there_and_back(len(log.frames))
+    frames = [replace(log.frames[row], stamp_ns=t) for t, row in enumerate(rows.tolist())]
+    truth = log.truth
+    if truth is not None:
+        stamps = np.arange(rows.size, dtype=np.int64)
+        truth = CameraTruth(stamps, truth.world_from_camera[rows], truth.landmarks)
+    return replace(log, frames=frames, truth=truth)
+
+
+def there_and_back(count: int) -> np.ndarray:
+    """0 … T − 1 … 0, (2 T − 1,)."""
+    return np.concatenate([np.arange(count), np.arange(count - 2, -1, -1)])
+
+
+PAIRS, TRACKS = ("stereo_zed_room1", "stereo_kitti_seq1"), "gtsam_stereo_vo"
+HEADER = ("recording", "odometry", "filter", "least", "most", "Sim(3): odometry", "filter")
+WAYS = "there", "there and back"
+
+
+def main(
+    quick: bool = False, out: Path = Path("out"), seeds: int = 5, particles: int = 400
+) -> dict[str, float]:
+    """Prints a table in metres, medians over the seeds, and writes it to a folder; `quick` simulates a short path."""
+    out.mkdir(parents=True, exist_ok=True)
+    configs = [StereoConfig(particles, seed) for seed in range(1 if quick else seeds)]
+    rows = list(simulated(configs, 20 if quick else 60))
+    if not quick:
+        rows += recorded(Path(os.environ.get("RBPF_DATA", "../shared/data")), configs)
+    write_table(out / "stereo_revisit.csv", HEADER, rows)
+    save_figures({"stereo_revisit.png": picture(rows)}, out)
+    return {f"{row[0]}: {what}": row[at] for row in rows for at, what in ((1, "odometry"), (2, "filter"))}
+
+
+def simulated(configs: Sequence[StereoConfig], frames: int) -> Iterator[list]:
+    """Pixels of the laboratory, 0.3 px, known association."""
+    world = LabWorld(LabDrive(frames=frames, every=4), points=8000)
+    measuring = Measuring(noise_px=0.3, measurements=40, known=0, new_per_frame=20)
+    yield from of_tracks(simulate_features(world, measuring, STEREO, seed=0), configs)
+
+
+def recorded(data: Path, configs: Sequence[StereoConfig]) -> Iterator[list]:
+    """The recordings that are there."""
+    for name in PAIRS:
+        if (data / name).is_dir():
+            yield from of_pairs(data / name, configs)
+    if (data / TRACKS).is_dir():
+        tracks = stereo_tracks.read(data / TRACKS)
+        batch = solve_problem(tracks.log, tracks.world_from_camera, marginals=False).estimate
+        truth = CameraTruth(batch.trajectory.stamps_ns, batch.world_from_body)
+        yield from of_tracks(replace(tracks.log, truth=truth), configs)
+
+
+def of_pairs(folder: Path, configs: Sequence[StereoConfig]) -> Iterator[list]:
+    """Images, measured once."""
+    sequence = open_stereo(folder)
+    with TemporaryDirectory() as features:
+        both = cache_features(pairs_there_and_back(sequence), configs[0], Path(features))
+        for way, part in zip(WAYS, (both.first(len(sequence)), both), strict=True):
+            yield row(f"{sequence.name}, {way}", lambda config, part=part: run_images(part, config), configs)
+
+
+def of_tracks(log: FeatureLog, configs: Sequence[StereoConfig]) -> Iterator[list]:
+    """Named pixels."""
+    for way, part in zip(WAYS, (log, log_there_and_back(log)), strict=True):
+        yield row(f"{log.name}, {way}", lambda config, part=part: run_features(part, config), configs)
+
+
+def row(name: str, filtered: Callable[[StereoConfig], StereoRun], configs: Sequence[StereoConfig]) -> list:
+    """Errors of the path after rigid alignment, and after similarity alignment."""
+    found = [score_stereo(filtered(config)) for config in configs]
+    median = {key: float(np.median([one[key] for one in found])) for key in found[0]}
+    ours = [one["ate_rmse_m"] for one in found]
+    rigid = [median["vo_ate_rmse_m"], median["ate_rmse_m"], min(ours), max(ours)]
+    return [name, *rigid, median["vo_ate_sim3_rmse_m"], median["ate_sim3_rmse_m"]]
+
+
+def picture(rows: list[list]):
+    """Odometry and filter side by side, on a logarithmic scale."""
+    figure, axes = new_axes("what the map brings", "position error [m]", "", equal=False)
+    places = range(len(rows))
+    for shift, at, name in ((-0.2, 1, "odometry"), (0.2, 2, "filter")):
+        errors = [found[at] for found in rows]
+        axes.bar([place + shift for place in places], errors, 0.38, color=COLOURS[name], label=name)
+    axes.set_yscale("log")
+    axes.set_xticks(list(places), [found[0] for found in rows], rotation=20, ha="right")
+    axes.legend()
+    return figure
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

@@ -1,0 +1,212 @@
+"""Causes of a filter's distance from the optimum: what is changed is changed, and nothing else."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from examples.studies.error_causes import (
+    AS_IT_IS,
+    BATCH,
+    DEPTH_FRACTION,
+    FROM_FILTER,
+    ONLINE,
+    GivenDepths,
+    agreeing_matches,
+    batch_depths,
+    camera_causes,
+    reprojection_errors,
+    robot_causes,
+    scaled_noise,
+)
+from examples.studies.error_ratios import HEADER, ErrorRatio, error_of, robot_ratio, tracks_ratio
+from rbpf.errors import InputError
+from rbpf.lie import SE3
+from rbpf.runs.folder import write_trajectory
+from rbpf.runs.measurement_files import write_measurements
+from rbpf.runs.trajectory import Trajectory
+from rbpf.runs.truth import RunTruth, write_truth
+from rbpf.sensors.feature_log import FeatureFrame, FeatureLog
+from rbpf.systems.map_estimate import MapEstimate
+from rbpf.systems.mono.config import MonoConfig
+from rbpf.systems.mono.run import run
+from rbpf.systems.mono.run import run as filter_log
+from rbpf.systems.range_bearing.config import RangeBearingConfig
+from rbpf.systems.stereo.config import StereoConfig
+from rbpf.validation.gtsam.mono_batch import Batch, adjust_log
+from rbpf.validation.metrics.path_and_map import PathAndMap
+from rbpf.validation.simulation.features import MONO, STEREO, Measuring, simulate_features
+from rbpf.validation.simulation.point_worlds import DeskWorld
+from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
+from tests.exactness.models import known
+from tests.systems.mono_logs import SMALL
+
+
+def test_a_robots_causes_agree_with_the_table_of_ratios(tmp_path):
+    simulate_robot(RobotWorld(steps=25, landmarks=20), tmp_path / "log", seed=1)
+    config = RangeBearingConfig(particles=20)
+    rows = {cause.name: cause for cause in robot_causes(tmp_path / "log", config, (0, 1))}
+    ratio = robot_ratio(tmp_path / "log", config, (0, 1))
+    assert rows[AS_IT_IS].errors_m == pytest.approx(ratio.filter_errors_m)
+    assert rows[BATCH].errors_m[0] == pytest.approx(ratio.batch_errors_m[0])
+    assert rows[FROM_FILTER].errors_m[0] == pytest.approx(rows[BATCH].errors_m[0], rel=1e-3)
+    assert rows[BATCH].errors_m[0] < rows[ONLINE].errors_m[0] < 2.0 * rows[AS_IT_IS].errors_m[0]
+    many = rows["10× particles"]
+    assert many.errors_m != rows[AS_IT_IS].errors_m
+    assert many.row()[4] == pytest.approx(np.median(many.errors_m) / many.batch_m)
+    assert {"one linearisation", "linearised weights, no exact ratio"} <= rows.keys()
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """What a monocular run leaves, as far as it is read here, of a simulated log."""
+    log = simulate_features(DeskWorld(frames=25), Measuring(), MONO, 3)
+    config = MonoConfig(particles=8)
+    run = filter_log(log, config)
+    write_measurements(tmp_path, log)
+    write_trajectory(tmp_path, run.stamps_ns, run.world_from_camera, run.cov)
+    write_truth(tmp_path, RunTruth(np.arange(25), log.truth.world_from_camera))
+    (tmp_path / "config.yaml").write_text("rbpf: 0\nsystem: mono\nparticles: 8\n")
+    (tmp_path / "summary.json").write_text("{}")
+    return tmp_path
+
+
+@pytest.mark.slow
+def test_a_cameras_causes(folder):
+    """The measurements are those of the run: filtered again by the same seed they give the same path."""
+    rows = {cause.name: cause for cause in camera_causes(folder, (0,))}
+    assert rows["same measurements"].errors_m == pytest.approx(rows[AS_IT_IS].errors_m, rel=1e-6)
+    assert rows["perfect associations"].errors_m == pytest.approx(rows[AS_IT_IS].errors_m, rel=0.5)
+    assert rows[BATCH].row()[4] == 1.0
+    assert rows[FROM_FILTER].errors_m[0] == pytest.approx(rows[BATCH].errors_m[0], rel=0.2)
+    assert rows["10× particles"].errors_m != rows[AS_IT_IS].errors_m
+
+
+def test_the_noise_is_scaled_and_nothing_else():
+    log = simulate_features(DeskWorld(frames=3), Measuring(), MONO, 0)
+    half = scaled_noise(log, 0.5)
+    for one, other in zip(half.frames, log.frames, strict=True):
+        np.testing.assert_allclose(one.cov_z, 0.25 * other.cov_z)
+        np.testing.assert_array_equal(one.z, other.z)
+    assert replace(half, frames=log.frames) == log
+
+
+def estimate(poses):
+    nothing = MapEstimate(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+    return PathAndMap(np.arange(len(poses)), poses, np.empty((0, 6, 6)), nothing)
+
+
+def walk(count=20):
+    rng = np.random.default_rng(4)
+    return SE3.exp(np.cumsum(rng.normal(scale=0.2, size=(count, 6)), axis=0))
+
+
+def test_the_error_is_that_after_the_alignment():
+    truth = walk()
+    moved = SE3.compose(SE3.exp(np.array([0.1, 0.5, 0.2, 3.0, 2.0, 1.0])), truth)
+    reference = Trajectory(np.arange(20), truth)
+    assert error_of(estimate(moved), reference, "rigid") < 1e-12
+    assert error_of(estimate(moved), reference, "none") > 1.0
+    larger = np.concatenate([truth[:, :4], 2.0 * truth[:, 4:]], axis=1)
+    assert error_of(estimate(larger), reference, "similarity") < 1e-12
+    assert error_of(estimate(larger), reference, "rigid") > 0.05
+
+
+def test_instants_without_truth_are_passed_over_and_none_is_refused():
+    truth = walk()
+    some = Trajectory(np.arange(0, 20, 4), truth[::4])
+    assert error_of(estimate(truth), some, "rigid") < 1e-12
+    with pytest.raises(InputError, match="share 2 time stamps"):
+        error_of(estimate(truth), Trajectory(np.arange(2), truth[:2]), "rigid")
+    with pytest.raises(InputError, match="same clock"):
+        error_of(estimate(truth), Trajectory(np.arange(20) + 100, truth), "rigid")
+
+
+def test_the_ratio_is_the_median_of_the_seeds_ratios():
+    found = ErrorRatio("here", 50, (0.2, 0.3, 0.9), (0.1, 0.1, 0.3), "rigid")
+    assert found.ratio == pytest.approx(3.0)
+    assert found.row() == pytest.approx(("here", 50, 3, 0.3, 0.2, 0.9, 0.1, 3.0))
+    assert len(found.row()) == len(HEADER)
+    assert found.as_dict()["ratio"] == found.ratio
+
+
+def test_tracks_without_truth_are_judged_by_the_optimums_own_covariance():
+    """√(b² + d²): never below 1, and near it for a filter of many landmarks."""
+    log = simulate_features(DeskWorld(frames=12), Measuring(), STEREO, 0)
+    found = tracks_ratio(replace(log, truth=None, known=None), StereoConfig(particles=50), (0, 1))
+    assert found.batch_errors_m[0] == found.batch_errors_m[1] > 0.0
+    assert 1.0 < found.ratio < 10.0
+    off = np.sqrt(np.square(found.filter_errors_m) - np.square(found.batch_errors_m))
+    assert (off > 0.0).all() and off[0] != off[1]
+
+
+@pytest.mark.slow
+@pytest.mark.real_data
+@pytest.mark.parametrize(("name", "batch"), [("mrpt_kf_slam_2d", 0.0040), ("mrpt_kf_slam_6d", 0.0102)])
+def test_the_filter_is_near_the_optimum_on_published_logs(data_dir, name, batch):
+    found = robot_ratio(data_dir / name, replace(RangeBearingConfig(), particles=100), (0, 1, 2))
+    assert found.batch_errors_m[0] < batch, "after a rigid alignment no more than the reference's without"
+    assert 1.0 <= found.ratio < 1.6
+
+
+pytestmark = pytest.mark.slow
+
+FRAMES = 40
+
+
+@pytest.fixture(scope="module")
+def log() -> FeatureLog:
+    return simulate_features(DeskWorld(frames=FRAMES), Measuring(noise_px=0.3), MONO, 5)
+
+
+@pytest.fixture(scope="module")
+def batch(log) -> Batch:
+    return adjust_log(log, known(log.truth).world_from_camera)
+
+
+def test_the_wrong_matches_are_found_and_no_others(log, batch):
+    rng = np.random.default_rng(0)
+    names, counts = np.unique(np.concatenate([f.landmarks for f in log.frames]), return_counts=True)
+    often = names[counts >= 10]  # of two sightings nobody can tell which one is wrong
+    frames, wrong = [], {}
+    for t, frame in enumerate(log.frames):
+        z = frame.z.copy()
+        row = int(rng.choice(np.flatnonzero(np.isin(frame.landmarks, often))))
+        if t % 3 == 0:
+            z[row] += [20.0, -15.0]
+            wrong[t] = frame.landmarks[row]
+        frames.append(FeatureFrame(frame.stamp_ns, frame.landmarks, z, frame.cov_z))
+    spoilt = replace(log, frames=frames)
+    clean = agreeing_matches(spoilt, adjust_log(spoilt, batch.world_from_camera))
+    for t, (left, all_) in enumerate(zip(clean.frames, log.frames, strict=True)):
+        gone = np.setdiff1d(all_.landmarks, left.landmarks).tolist()
+        assert gone == ([wrong[t]] if t in wrong else [])
+
+
+def test_reprojection_errors_are_as_large_as_the_noise(batch):
+    errors = np.concatenate(reprojection_errors(batch))
+    errors = errors[np.isfinite(errors)]
+    assert 0.3 < np.sqrt(np.square(errors).mean()) < 0.3 * np.sqrt(2.0) + 0.02
+
+
+def test_depths_are_the_true_ones(log, batch):
+    depths, truth = batch_depths(batch), known(log.truth)
+    first = {}
+    for frame, pose in zip(log.frames, truth.world_from_camera, strict=True):
+        for name in frame.landmarks.tolist():
+            first.setdefault(name, SE3.inverse_transform(pose, truth.landmarks[name])[2])
+    assert len(depths) > 30
+    fraction = np.array([depths[name] / first[name] - 1.0 for name in depths])
+    assert np.median(np.abs(fraction)) < 0.02
+
+
+def test_landmarks_start_at_the_given_depths(log, batch):
+    depths = batch_depths(batch)
+    done = run(replace(log, frames=log.frames[:1]), SMALL, wrapped=lambda sensor: GivenDepths(sensor, depths))
+    belief = done.filter.belief()
+    rays = {name: i for i, name in belief.catalogue.items() if name in depths}
+    assert len(rays) > 10
+    records = belief.read(np.array(list(rays.values())))
+    rho = np.array([1.0 / depths[name] for name in rays])
+    np.testing.assert_allclose(records.mean[0, :, 2], rho, rtol=1e-9)
+    np.testing.assert_allclose(np.sqrt(records.cov[0, :, 2, 2]), DEPTH_FRACTION * rho, rtol=1e-6)

@@ -1,0 +1,120 @@
+"""Filters that run for ever: streams without an end, and memory that can be seen to grow where something is kept."""
+
+from itertools import islice
+
+import numpy as np
+import pytest
+
+from examples.studies.soak import Forgetting, camera_steps, held_bytes, resident_mb, robot_steps, soak
+from examples.studies.streams import CAMERA, CameraStream, RobotStream, Turnover
+from rbpf.lie import SE2, SE3
+from rbpf.systems.mono.config import MonoConfig
+from rbpf.systems.range_bearing.config import RangeBearingConfig
+
+QUICK = Turnover(points=40, measurements=8, renewal=0.01)
+
+
+@pytest.mark.parametrize("kind", [CameraStream, RobotStream])
+def test_the_same_seed_gives_the_same_stream(kind):
+    one, other, third = (list(islice(kind(QUICK, seed).frames(), 20)) for seed in (3, 3, 4))
+    for a, b in zip(one, other, strict=True):
+        np.testing.assert_array_equal(a.frame.z, b.frame.z)
+        np.testing.assert_array_equal(a.frame.landmarks, b.frame.landmarks)
+    assert any(
+        a.frame.z.shape != b.frame.z.shape or (a.frame.z != b.frame.z).any()
+        for a, b in zip(one, third, strict=True)
+    )
+
+
+def test_a_camera_sees_points_where_they_are():
+    """Known points stay: their pixels are their projections, up to the noise."""
+    stream = CameraStream(QUICK, 0, noise_px=0.5)
+    known, errors = stream.first().known, []
+    for frame, pose in islice(stream.frames(), 0, 600, 20):
+        rows = np.flatnonzero(frame.landmarks < known.names.size)
+        local = SE3.inverse_transform(pose, known.positions[frame.landmarks[rows]])
+        errors.append(frame.z[rows] - CAMERA.project(local))
+    errors = np.concatenate(errors)
+    assert errors.shape[0] > 100
+    assert errors.std() == pytest.approx(0.5, rel=0.15)
+
+
+def test_points_are_replaced_and_names_never_come_back():
+    stream, last = RobotStream(QUICK, 0), {}
+    seen: set[int] = set()
+    for t, (frame, _) in enumerate(islice(stream.frames(), 1500)):
+        for name in frame.landmarks.tolist():
+            last[name] = t
+        seen.update(frame.landmarks.tolist())
+        assert frame.landmarks.size <= 8 and np.unique(frame.landmarks).size == frame.landmarks.size
+    expected = 40 + 1500 * 32 * 0.01
+    assert max(seen) == pytest.approx(expected, rel=0.2)
+    early = [name for name in seen if 8 <= name < 40]
+    assert all(last[name] < 1000 for name in early)
+
+
+def test_the_odometry_is_the_motion_and_its_noise():
+    stream, poses, whitened = RobotStream(QUICK, 0), [], []
+    for frame, pose in islice(stream.frames(), 400):
+        if poses:
+            error = SE2.local(SE2.between(poses[-1], pose), frame.delta)
+            whitened.append(error / np.sqrt(np.diagonal(frame.cov_delta)))
+        poses.append(pose)
+    assert np.mean(np.square(whitened)) == pytest.approx(1.0, abs=0.12)
+
+
+def test_forgetting():
+    """What has not been seen for three frames is dropped; what is seen is not."""
+
+    stream = RobotStream(Turnover(points=30, measurements=30, renewal=0.0), 0)
+    filter_, step = robot_steps(stream, RangeBearingConfig(particles=3, lag=5), forget=3)
+    window: list[set[int]] = []
+    for t, (frame, _) in enumerate(islice(stream.frames(), 200)):
+        step(frame, t)
+        window = [*window[-3:], set(frame.landmarks.tolist())]
+        held = set(filter_.belief().map.ids.tolist())
+        assert held == set().union(*window)
+    assert isinstance(filter_.sensors[0], Forgetting) and filter_.sensors[0].frame == 200
+
+
+def test_what_is_held_is_counted_once():
+    array = np.zeros(1000)
+    alone = held_bytes([array])
+    assert alone >= 8000
+    assert held_bytes([array, array[3:], {"again": array}]) < alone + 1000
+    assert held_bytes([array, array.copy()]) > alone + 8000
+    assert resident_mb() > 10.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lag", [50, None])
+def test_a_long_run(lag):
+    """With a lag neither memory nor error grows, nor the time by half; without one the memory is seen to grow."""
+    stream = RobotStream(Turnover(renewal=0.002), 0)
+    filter_, step = robot_steps(stream, RangeBearingConfig(particles=10, lag=lag), forget=300)
+    windows = list(soak(stream, filter_, step, 6000, 300))
+    settled = windows[4:]
+    held, times, errors = (
+        np.array([getattr(window, name) for window in settled])
+        for name in ("held_kb", "ms_per_frame", "error_m")
+    )
+    assert windows[-1].started > 4 * windows[-1].landmarks
+    if lag is None:
+        assert held[-4:].mean() > 1.5 * held[:4].mean()
+        return
+    assert held[-4:].mean() < 1.15 * held[:4].mean()
+    assert max(window.states for window in settled) <= lag * 10
+    assert np.median(times[-4:]) < 1.5 * np.median(times[:4])
+    assert errors[-4:].max() < 2.0 * errors[:4].max() and errors.max() < 0.5
+
+
+@pytest.mark.slow
+def test_a_long_monocular_run():
+    stream = CameraStream(Turnover(renewal=0.002), 0)
+    filter_, step = camera_steps(stream, MonoConfig(particles=10, lag=50), forget=300)
+    windows = list(soak(stream, filter_, step, 2400, 300))
+    held = np.array([window.held_kb for window in windows[2:]])
+    assert windows[-1].started > 2 * windows[-1].landmarks
+    assert held.max() < 1.1 * held.min()
+    assert max(window.states for window in windows) <= 50 * 10
+    assert max(window.error_m for window in windows[2:]) < 0.1
