@@ -27,7 +27,7 @@ NAMES = (
     "mono_frames",
     "mono_map_size",
     "patch_search",
-    "key_search",
+    "descriptor_search",
     "motion_estimate",
     "stereo_step",
     "stereo_frames",
