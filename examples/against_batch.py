@@ -6,9 +6,9 @@ Works for a run in memory (`compare_run`) and for a folder that `rbpf run` left 
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from rbpf.runs.recordings import RobotRecording, filter_recording
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.consistency.against_batch import compare_run
-from rbpf.validation.range_bearing import start_run
 from rbpf.validation.report.offline_pictures import plot_against_batch
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 from rbpf.validation.tables import write_table
@@ -21,7 +21,7 @@ def main(quick: bool = False, out: Path = Path("out")) -> dict[str, float]:
     with TemporaryDirectory() as folder:
         simulate_robot(RobotWorld(steps=60 if quick else 200, landmarks=30), Path(folder), seed=0)
         for particles in (10, 300):
-            run = start_run(Path(folder), RangeBearingConfig(particles=particles))
+            run = filter_recording(RobotRecording(Path(folder)), RangeBearingConfig(particles=particles))
             found = compare_run(run, instants=1)
             told = found.landmarks.as_dict()
             names = "distances_m", "sigmas", "kullback_leibler", "sigma_ratio"

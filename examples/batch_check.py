@@ -5,18 +5,17 @@ What lies between the two is the price of sampling and of working online; what l
 truth is noise.
 """
 
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from rbpf.sensors.readers.measurements import dead_reckoning
-from rbpf.systems.map_estimate import estimate_map
+from rbpf.runs.path_and_map import PathAndMap
+from rbpf.runs.recordings import RobotRecording, filter_recording
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.gtsam.robot import solve
-from rbpf.validation.metrics.scores import score
-from rbpf.validation.range_bearing import start_run
-from rbpf.validation.run_folder import used_measurements
+from rbpf.validation.metrics.scores import score_estimate
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 
 
@@ -24,25 +23,27 @@ def main() -> dict[str, float]:
     """Prints errors of odometry, filter and batch, and whether the filter's covariances are honest."""
     with TemporaryDirectory() as folder:
         simulate_robot(RobotWorld(steps=120, landmarks=40), Path(folder), seed=0)
-        run = start_run(Path(folder), RangeBearingConfig(particles=100))
-    measurements = used_measurements(run)
-    batch = solve(measurements)
-    summary = estimate_map(run.filter, run.anchored)
+        run = filter_recording(RobotRecording(Path(folder)), RangeBearingConfig(particles=100))
+    batch = solve(run.system.measurements(run.name, run.log))
+    summary = run.system.map()
     names = summary.ids.tolist()
+    points = np.array([batch.landmarks[name] for name in names])
 
+    nothing = replace(summary, ids=summary.ids[:0])
     estimates = {
-        "odometry alone": (dead_reckoning(measurements), None),
-        "filter": (run.progress.mean, dict(zip(names, summary.mean, strict=True))),
-        "batch optimum": (batch.world_from_robot, batch.landmarks),
+        "odometry alone": (run.log["odometry"], nothing),
+        "filter": (run.log.poses, summary),
+        "batch optimum": (batch.world_from_robot, replace(summary, mean=points)),
     }
     figures = {}
     for name, (path, landmarks) in estimates.items():
-        scores = score(run.log, path, landmarks)
-        figures[name] = scores.path_rmse_m
-        of_map = "" if landmarks is None else f", landmarks {scores.landmark_error_mean_m:.3f} m"
-        print(f"{name:>14}: path {scores.path_rmse_m:.3f} m{of_map}")
+        scores = score_estimate(PathAndMap(run.log.stamps_ns, path, run.log.covs, landmarks), run.truth)
+        figures[name] = scores["path_rmse_m"]
+        error = scores.get("landmark_error_mean_m")
+        of_map = "" if error is None else f", landmarks {error:.3f} m"
+        print(f"{name:>14}: path {figures[name]:.3f} m{of_map}")
 
-    difference = summary.mean - np.array([batch.landmarks[name] for name in names])
+    difference = summary.mean - points
     figures["from_batch"] = float(np.linalg.norm(difference, axis=1).mean())
     print(f"the filter's landmarks are {figures['from_batch']:.3f} m from the optimum's")
     spread = [

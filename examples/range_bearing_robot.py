@@ -10,8 +10,9 @@ from pathlib import Path
 
 import tyro
 
+from rbpf.runs.recordings import RobotRecording, filter_recording
 from rbpf.systems.range_bearing.config import RangeBearingConfig
-from rbpf.validation.range_bearing import finish_run, start_run
+from rbpf.validation.finish import finish_run
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 from rbpf.validation.tables import write_table
 
@@ -36,8 +37,9 @@ def main(
     """
     steps = 40 if quick else steps
     simulate_robot(RobotWorld(steps=steps, landmarks=60), out / "log", seed)
-    run = start_run(out / "log", RangeBearingConfig(particles=particles, seed=seed), out / "run")
-    entries = finish_run(run, out / "log", out / "run")
+    recording = RobotRecording(out / "log")
+    run = filter_recording(recording, RangeBearingConfig(particles=particles, seed=seed))
+    entries = finish_run(run, out / "run", recording.sources())
     figures = {name: float(entries[name]) for name in FIGURES}
     write_table(out / "figures.csv", ["figure", "value"], [[name, value] for name, value in figures.items()])
     shutil.copy(out / "run" / "map.png", out / "map.png")

@@ -8,10 +8,11 @@ from pathlib import Path
 
 import tyro
 
+from rbpf.runs.recordings import RobotRecording, filter_recording
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.consistency.comparison import read_comparisons
 from rbpf.validation.consistency.validate import validate
-from rbpf.validation.range_bearing import finish_run, start_run
+from rbpf.validation.finish import finish_run
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 from rbpf.validation.tables import write_table
 
@@ -35,7 +36,8 @@ def main(
     steps, particles = (40, 50) if quick else (steps, particles)
     log, run = out / "log", out
     simulate_robot(RobotWorld(steps=steps, landmarks=80), log, seed)
-    finish_run(start_run(log, RangeBearingConfig(particles=particles, seed=seed), run), log, run)
+    recording, config = RobotRecording(log), RangeBearingConfig(particles=particles, seed=seed)
+    finish_run(filter_recording(recording, config), run, recording.sources())
     verdicts = {against: validate(run, against) for against in ("groundtruth", "gtsam")}
     rows = [
         [comparison.against, s.name, s.value, s.low, s.high, s.outcome]

@@ -75,6 +75,11 @@ class CameraTruth:
     world_from_camera: np.ndarray
     landmarks: dict[int, np.ndarray] = field(default_factory=dict)
 
+    @property
+    def poses(self) -> np.ndarray:
+        """(T, 7) of the body, which is the camera."""
+        return self.world_from_camera
+
     def __post_init__(self) -> None:
         where = "the ground truth"
         _check_whole(where, "stamps_ns", "T", self.stamps_ns)

@@ -22,17 +22,17 @@ from rbpf.core.diagnostics import Band, ancestors_by_step, chi_square_band, coal
 from rbpf.core.filter import Filter
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.runs.recordings import filter_robot_log
+from rbpf.runs.truth import truth_at
 from rbpf.sensors.readers.log import RobotLog
 from rbpf.systems.filtering import ProposalConfig
-from rbpf.systems.map_estimate import MapEstimate, estimate_map
+from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.run import run as run_mono
 from rbpf.systems.range_bearing.config import RangeBearingConfig
-from rbpf.systems.range_bearing.run import run as run_robot
 from rbpf.validation.camera_map import summarise_points
 from rbpf.validation.consistency.pose_errors import whitened_errors
 from rbpf.validation.consistency.statistic import PROBABILITIES
-from rbpf.validation.run_truth import robot_truth
 from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
 from rbpf.validation.simulation.point_worlds import DeskWorld
 from rbpf.validation.simulation.robot import RobotWorld, simulated_log
@@ -84,23 +84,24 @@ class RobotTrial:
     def __call__(self, seed: int) -> Trial:
         """Simulates and filters."""
         log = simulated_log(self.world, seed)
-        truth = robot_truth(log)
-        assert truth is not None
         given = log if self.spoil is None else self.spoil(log, np.random.default_rng(seed))
-        done = run_robot(given, replace(self.config, seed=seed))
-        progress, found = done.progress, estimate_map(done.filter, done.anchored)
-        errors = whitened_errors(log.space, progress.mean, progress.cov, truth.poses)
+        done = filter_robot_log(given, replace(self.config, seed=seed))
+        path, found = done.log, done.system.map()
+        assert log.truth is not None
+        truth = truth_at(log.space, log.truth, path.stamps_ns, "first frame")
+        assert truth is not None
+        errors = whitened_errors(log.space, path.poses, path.covs, truth.poses)
         return Trial(
             log.space.dim,
             np.linalg.norm(
-                progress.mean[:, -found.mean.shape[1] :] - truth.poses[:, -found.mean.shape[1] :], axis=1
+                path.poses[:, -found.mean.shape[1] :] - truth.poses[:, -found.mean.shape[1] :], axis=1
             ),
             np.where(errors.ranks > 0, errors.nees, np.nan),
-            progress.nis,
-            progress.rows,
+            path["nis"],
+            path["nis_dof"],
             _landmark_nees(found, truth.landmarks),
             found.mean.shape[1],
-            *_genealogy(done.filter),
+            *_genealogy(done.system.filter),
         )
 
 

@@ -29,7 +29,9 @@ from rbpf.runs.alignment import Alignment
 from rbpf.runs.measurement_files import read_feature_log
 from rbpf.runs.plots import COLOURS, new_axes, save_figures
 from rbpf.runs.reading import RunFolder
+from rbpf.runs.recordings import filter_robot_log
 from rbpf.runs.trajectory import Trajectory, in_space
+from rbpf.runs.truth import truth_at
 from rbpf.sensors.camera.points import CameraRay
 from rbpf.sensors.feature_log import FeatureFrame, FeatureLog
 from rbpf.sensors.readers import open_log
@@ -39,15 +41,12 @@ from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor
 from rbpf.systems.mono.run import run as filter_log
 from rbpf.systems.range_bearing.config import RangeBearingConfig
-from rbpf.systems.range_bearing.run import run as filter_robot
 from rbpf.systems.settings import load_settings
 from rbpf.validation.gtsam import robot
 from rbpf.validation.gtsam.batch_problem import AFAR
 from rbpf.validation.gtsam.mono_batch import Batch, adjust_log
 from rbpf.validation.gtsam.self_calibration import adjust_near, refine_calibration
 from rbpf.validation.metrics.accuracy import ate
-from rbpf.validation.run_folder import used_measurements
-from rbpf.validation.run_truth import robot_truth
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 from rbpf.validation.tables import write_table
 
@@ -99,7 +98,8 @@ def robot_causes(
         InputError: the recording is wrong, or has no ground truth.
     """
     log = open_log(recording, config.noise)
-    truth = robot_truth(log)
+    stamps_ns = np.array([frame.stamp_ns for frame in log.frames], dtype=np.int64)
+    truth = None if log.truth is None else truth_at(log.space, log.truth, stamps_ns, "first frame")
     if truth is None:
         raise InputError(f"{recording} has no ground truth to measure errors by")
     stamps = np.array([frame.stamp_ns for frame in log.frames], dtype=np.int64)
@@ -111,14 +111,14 @@ def robot_causes(
         )
         return ate(ours, true, "rigid").rmse
 
-    runs = [filter_robot(log, replace(config, seed=seed)) for seed in seeds]
-    measured = used_measurements(runs[0])
+    runs = [filter_robot_log(log, replace(config, seed=seed)) for seed in seeds]
+    measured = runs[0].system.measurements(log.name, runs[0].log)
     batch = robot.solve(measured, marginals=False, incremental=len(stamps) > AFAR)
-    start = InitialEstimate(runs[0].progress.mean, dict(batch.landmarks))
+    start = InitialEstimate(runs[0].log.poses, dict(batch.landmarks))
     again = robot.solve(measured, marginals=False, initial=start)
     found = error(batch.world_from_robot)
     out = [
-        Cause(AS_IT_IS, tuple(error(run.progress.mean) for run in runs), found),
+        Cause(AS_IT_IS, tuple(error(run.log.poses) for run in runs), found),
         Cause(BATCH, (found,), found),
         Cause(FROM_FILTER, (error(again.world_from_robot),), found),
         Cause(ONLINE, (error(robot.solve_online(measured)),), found),
@@ -129,7 +129,7 @@ def robot_causes(
     }
     for name, changed in changes.items():
         on_change(name)
-        means = [filter_robot(log, replace(changed, seed=seed)).progress.mean for seed in seeds]
+        means = [filter_robot_log(log, replace(changed, seed=seed)).log.poses for seed in seeds]
         out.append(Cause(name, tuple(map(error, means)), found))
     return out
 

@@ -19,20 +19,20 @@ from rbpf.lie import Array
 from rbpf.runs.alignment import Alignment
 from rbpf.runs.path_and_map import PathAndMap
 from rbpf.runs.plots import COLOURS, new_axes, save_figures
-from rbpf.runs.trajectory import Trajectory, associate
+from rbpf.runs.recordings import filter_robot_log
+from rbpf.runs.run import Run
+from rbpf.runs.trajectory import Trajectory, associate, in_space
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureLog
 from rbpf.sensors.readers import open_log, stereo_tracks
 from rbpf.systems.mono.config import MonoConfig, SearchConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
-from rbpf.systems.range_bearing.run import Run, run
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.run import StereoRun, run_features
 from rbpf.validation.gtsam.batch_problem import Optimum, floats_in_scale, problem_of, solve_problem
 from rbpf.validation.metrics.accuracy import ate
 from rbpf.validation.metrics.mono_scores import true_path
 from rbpf.validation.metrics.path_and_map import AnyRun, of_run
-from rbpf.validation.metrics.scores import as_trajectory, truth_at
 from rbpf.validation.mono import Recording, start_mono
 from rbpf.validation.simulation.exposure import Imaging
 from rbpf.validation.simulation.images import simulate_images
@@ -93,7 +93,7 @@ def robot_ratio(recording: Path, config: RangeBearingConfig, seeds: Sequence[int
         InputError: the recording is wrong, or has too little ground truth.
     """
     log = open_log(recording, config.noise)
-    errors = _over_seeds(lambda seed: run(log, _seeded(config, seed)), _robot_truth, seeds)
+    errors = _over_seeds(lambda seed: filter_robot_log(log, _seeded(config, seed)), _robot_truth, seeds)
     return ErrorRatio(log.name, config.particles, *errors, "rigid")
 
 
@@ -207,16 +207,9 @@ def _optimum(found: AnyRun, estimate: PathAndMap) -> Optimum:
 
 def _robot_truth(found: AnyRun) -> Trajectory:
     assert isinstance(found, Run)
-    log = found.log
-    if log.truth is None:
-        raise InputError(f"{log.name} has no ground truth to tell the errors by.")
-    stamps = np.array([frame.stamp_ns for frame in log.frames], dtype=np.int64)
-    rows, poses = truth_at(log.space, log.truth, stamps)
-    if len(rows) < LEAST:
-        raise InputError(
-            f"The ground truth of {log.name} covers {len(rows)} of its steps, expected {LEAST} or more."
-        )
-    return as_trajectory(log, stamps[rows], poses)
+    if found.truth is None:
+        raise InputError(f"{found.name} has no ground truth to tell the errors by, or too little.")
+    return in_space(found.log.stamps_ns[found.truth.rows], found.truth.poses)
 
 
 def _seeded(config: Any, seed: int) -> Any:

@@ -20,7 +20,6 @@ import tyro
 from matplotlib.figure import Figure
 
 from examples.studies.streams import CameraStream, RobotStream, Turnover
-from rbpf.core.anchoring import StartAnchor
 from rbpf.core.belief import Belief
 from rbpf.core.filter import Filter
 from rbpf.core.models import NewLandmarks, Observations, Sensor
@@ -30,8 +29,8 @@ from rbpf.sensors.catalogue_index import NameIndex
 from rbpf.systems.mono import system as mono
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.run import pose_estimate
-from rbpf.systems.range_bearing import system as range_bearing
 from rbpf.systems.range_bearing.config import RangeBearingConfig
+from rbpf.systems.range_bearing.slam import RangeBearingSlam
 from rbpf.validation.sweep.parallel import in_parallel
 from rbpf.validation.tables import write_csv, write_table
 
@@ -121,16 +120,8 @@ def camera_steps(stream: CameraStream, config: MonoConfig, forget: int = 600) ->
 
 def robot_steps(stream: RobotStream, config: RangeBearingConfig, forget: int = 600) -> tuple[Filter, Step]:
     """The range-bearing system's filter over a stream, and what makes its steps."""
-    log = stream.first()
-    filter_ = range_bearing.build_filter(log, config, lambda sensor: Forgetting(sensor, forget))
-    anchor = StartAnchor(filter_, config.anchor_every)
-
-    def step(frame: Any, t: int) -> np.ndarray:
-        control = range_bearing.control_of(frame)
-        report = filter_.step(frame, control, frame.stamp_ns)
-        return anchor.state_estimate(anchor.after_step(report, control)).mean[1:]
-
-    return filter_, step
+    slam = RangeBearingSlam.of_log(stream.first(), config, wrapped=lambda sensor: Forgetting(sensor, forget))
+    return slam.filter, lambda frame, _: slam.take(frame).pose[1:]
 
 
 def soak(

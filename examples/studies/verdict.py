@@ -21,16 +21,16 @@ from matplotlib.figure import Figure
 
 from rbpf.core.models import Jacobians
 from rbpf.lie import SE2
+from rbpf.runs.recordings import filter_robot_log
+from rbpf.runs.truth import truth_at
 from rbpf.sensors.range_bearing import RangeBearing
 from rbpf.sensors.readers.log import Frame, RobotLog
 from rbpf.systems.range_bearing.config import RangeBearingConfig
-from rbpf.systems.range_bearing.run import run
 from rbpf.validation.consistency.against_groundtruth import pose_statistics
 from rbpf.validation.consistency.own_statistics import innovation_statistics
 from rbpf.validation.consistency.pose_errors import whitened_errors
 from rbpf.validation.consistency.statistic import Statistic
 from rbpf.validation.consistency.verdict import Trust, Verdict, judge
-from rbpf.validation.run_truth import robot_truth
 from rbpf.validation.simulation.robot import RobotWorld, simulated_log
 from rbpf.validation.tables import write_table
 
@@ -112,9 +112,10 @@ def wrong_derivative() -> Iterator[None]:
 
 def judged(log: RobotLog, given: RobotLog, config: RangeBearingConfig) -> tuple[Verdict, Verdict]:
     """Verdicts on a run over `given`, without the truth and with that of `log`."""
-    progress = run(given, config).progress
-    own = innovation_statistics(progress.nis, progress.rows, progress.correction, progress.cov_correction)
-    errors = whitened_errors(log.space, progress.mean, progress.cov, robot_truth(log).poses)
+    done = filter_robot_log(given, config).log
+    own = innovation_statistics(done["nis"], done["nis_dof"], done["correction"], done["cov_correction"])
+    truth = truth_at(log.space, log.truth, done.stamps_ns, "first frame")
+    errors = whitened_errors(log.space, done.poses, done.covs, truth.poses)
     beside: list[Statistic] = pose_statistics(errors)
     names = [statistic.name for statistic in beside]
     return judge("", own), judge("", [*beside, *own], names)

@@ -107,12 +107,10 @@ def _measure_motion() -> None:
 
 
 def _filter_log() -> None:
-    from rbpf.sensors.readers import open_log
+    from rbpf.runs.recordings import RobotRecording, filter_recording
     from rbpf.systems.range_bearing.config import RangeBearingConfig
-    from rbpf.systems.range_bearing.run import run
     from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 
     with TemporaryDirectory() as folder:
         simulate_robot(RobotWorld(5, 20, False), Path(folder) / "log", 0)
-        config = RangeBearingConfig(particles=10)
-        run(open_log(Path(folder) / "log", config.noise), config)
+        filter_recording(RobotRecording(Path(folder) / "log"), RangeBearingConfig(particles=10))

@@ -24,6 +24,7 @@ from rbpf.cli.showing import answer, progress, say, table, told
 from rbpf.errors import InputError
 
 if TYPE_CHECKING:
+    from rbpf.runs.run import Run
     from rbpf.validation.image_run import Telling
 
 
@@ -44,20 +45,22 @@ It is refused when the recording has changed. Further options are those of the r
 @RUN.add("range-bearing")
 def run_range_bearing(options: Annotated[RangeBearingOptions, tyro.conf.arg(name="")]) -> None:
     """Range-bearing SLAM over a robot's log (FastSLAM 2.0), beside the batch optimum of the same measurements."""
+    from rbpf.runs.recordings import RobotRecording, filter_recording
     from rbpf.systems.range_bearing.config import RangeBearingConfig
     from rbpf.systems.settings import load_settings
-    from rbpf.validation.range_bearing import finish_run, start_run
+    from rbpf.validation.finish import finish_run
 
     named = given(options, "particles", "seed", "association")
     config = load_settings(RangeBearingConfig, "range-bearing", options.config, options.set, named)
     _prepare(options)
     with progress() as bar, patient(told(bar, bar.add_task("filtering", total=None))) as tell:
-        run = start_run(options.log, config, options.out, options.resume, tell)
+        recording = RobotRecording(options.log)
+        run = filter_recording(recording, config, options.out, options.resume, [listener(tell)])
     if options.batch:
         say("solving the batch problem with the same measurements …")
     with finishing():
-        entries = finish_run(run, options.log, options.out, options.batch)
-    _finish(entries, options, None)
+        entries = finish_run(run, options.out, recording.sources(), batch=options.batch)
+    _finish(entries, options, run.failure)
 
 
 @RUN.add("mono")
@@ -129,6 +132,11 @@ def repeated(arguments: list[str]) -> list[str]:
         options += [f"--{name}", value] if value else [f"--{name}"]
     out = [] if "--out" in arguments else ["--out", str(origin.config.parent) + "-again"]
     return ["run", origin.system, origin.recording, *options, *out, *arguments[3:]]
+
+
+def listener(tell: Told) -> Callable[["Run", object], None]:
+    """What follows a run and tells how many frames are done, and of how many."""
+    return lambda run, _: tell(len(run.log), run.expected or 0)
 
 
 def _run_images(

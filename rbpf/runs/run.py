@@ -1,7 +1,7 @@
 """A run: a system, a recording, and what the system said of every frame; and the one loop that makes it.
 
-    run = Run("desk", MonoSlam(camera, config))
-    drive(run, source)                           # or run.take(frame), one at a time
+    run = Run(source, MonoSlam(camera, config))
+    drive(run)                                   # or run.take(frame), one at a time
     run.log["ess"], run.log.poses, run.messages
 
 Whoever wants to follow a run while it is made (a progress bar, a live view, a plot) is a listener: it is called with
@@ -27,7 +27,9 @@ from rbpf.systems.system import System, Tracked, TrackingState
 class Source(Protocol):
     """Where frames come from: a recording, a camera, anything."""
 
-    name: str
+    @property
+    def name(self) -> str:
+        """Of the recording."""
 
     def frames(self, start: int = 0) -> Iterator[Any]:
         """Frames from number `start` on, each with a `stamp_ns`, as the system's `take` expects them."""
@@ -38,23 +40,30 @@ class Run:
     """What a system said of a recording.
 
     Attributes:
-        name: of the recording.
+        source: where the frames come from.
         system: as it is now.
         truth: ground truth of the recording; None where it has none.
+        expected: number of frames that the recording has; None where it is not known.
         log: one row per frame.
         messages: what was worth saying of single frames, in words: "frame 12: …".
         failure: why the run ended before the recording did, in words; None where it did not.
     """
 
-    name: str
+    source: Source
     system: System
     truth: RunTruth | None = None
+    expected: int | None = None
     log: FrameLog = field(init=False)
     messages: list[str] = field(default_factory=list)
     failure: str | None = None
 
     def __post_init__(self) -> None:
         self.log = FrameLog.of(self.system)
+
+    @property
+    def name(self) -> str:
+        """Of the recording."""
+        return self.source.name
 
     def take(self, frame: Any, waiting: float = 0.0) -> Tracked:
         """Gives the system a frame and keeps what it says; `waiting` is the time [s] that the frame took to arrive.
@@ -101,21 +110,19 @@ Listener = Callable[[Run, Tracked], None]
 
 def drive(
     run: Run,
-    source: Source,
     listeners: Iterable[Listener] = (),
     checkpoint: Path | None = None,
     every: int = 500,
     resume: bool = False,
     stamps_ns: Sequence[int] | np.ndarray | None = None,
 ) -> Run:
-    """Takes all frames of a source that the run has not taken yet.
+    """Takes all frames of the run's source that it has not taken yet.
 
     What was computed before a frame that cannot be filtered is kept: the run is then shorter and has a `failure`. A
     disk that is full ends no run; it goes on with the last checkpoint that could be written.
 
     Args:
         run: new, or as far as it has come.
-        source: of frames.
         listeners: called after each frame; a KeyboardInterrupt from one leaves a checkpoint behind.
         checkpoint: file of checkpoints; None writes none.
         every: frames between checkpoints.
@@ -134,7 +141,7 @@ def drive(
         return run  # a finished run that is resumed
 
     waited = time.perf_counter()
-    for frame in source.frames(len(run.log)):
+    for frame in run.source.frames(len(run.log)):
         try:
             tracked = run.take(frame, time.perf_counter() - waited)
         except InputError as error:

@@ -24,6 +24,9 @@ TRUTH = "truth.npz"
 LONGEST_GAP_NS = 500_000_000
 """Truth is interpolated between poses no further apart than this; an instant in a longer gap is not scored."""
 
+LEAST = 3
+"""Frames with a true pose that a comparison needs."""
+
 _ALIGNMENTS: dict[str, Alignment] = {"none": "none", "rigid": "rigid", "similarity": "similarity"}
 
 
@@ -58,7 +61,7 @@ class RunTruth:
 def truth_at(
     space: SE2Group | SE3Group, truth: GroundTruth, stamps_ns: np.ndarray, gauge: Gauge
 ) -> RunTruth | None:
-    """The truth at a run's frames; None where no frame has a true pose.
+    """The truth at a run's frames; None where fewer than `LEAST` have a true pose.
 
     Args:
         space: group of the poses.
@@ -68,7 +71,7 @@ def truth_at(
             else only an alignment brings the two together.
     """
     rows, poses = poses_at(space, truth.stamps_ns, truth.poses, stamps_ns)
-    if not rows.size:
+    if rows.size < LEAST:
         return None
     dim = 2 if isinstance(space, SE2Group) else 3
     landmarks = {name: np.asarray(point, dtype=float)[:dim] for name, point in truth.landmarks.items()}

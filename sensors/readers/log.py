@@ -42,6 +42,11 @@ class Truth:
     world_from_robot: np.ndarray
     landmarks: dict[int, np.ndarray] = field(default_factory=dict)
 
+    @property
+    def poses(self) -> np.ndarray:
+        """(T, E) of the body."""
+        return self.world_from_robot
+
 
 @dataclass(frozen=True)
 class RobotLog:

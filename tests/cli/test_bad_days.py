@@ -12,6 +12,7 @@ from examples.studies.file_faults import FILE_FAULTS, damaged_copy, kill_and_res
 from rbpf.cli import main
 from rbpf.errors import InputError
 from rbpf.runs.files import whole
+from rbpf.runs.recordings import RobotRecording, filter_recording
 from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.readers.images import open_images, open_stereo
 from rbpf.systems.mono.config import MonoConfig
@@ -19,7 +20,6 @@ from rbpf.systems.mono.video import run_images
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.run import run_images as run_pairs
-from rbpf.validation.range_bearing import start_run
 from rbpf.validation.simulation.exposure import Imaging
 from rbpf.validation.simulation.images import simulate_images
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
@@ -115,9 +115,10 @@ def test_no_room_for_checkpoints(desk, tmp_path):
 def test_no_room_for_checkpoints_of_a_robot(tmp_path):
     simulate_robot(RobotWorld(steps=12, landmarks=10), tmp_path / "log", seed=0)
     with full_disk(1000):
-        done = start_run(tmp_path / "log", RangeBearingConfig(particles=5, checkpoint_every=5), tmp_path)
-    assert done.filter.steps == 12
-    assert len(done.problems) == 3 and all("no checkpoint is kept" in problem for problem in done.problems)
+        config = RangeBearingConfig(particles=5, checkpoint_every=5)
+        done = filter_recording(RobotRecording(tmp_path / "log"), config, tmp_path)
+    assert done.system.filter.steps == 12
+    assert len(done.messages) == 3 and all("no checkpoint is kept" in words for words in done.messages)
 
 
 def test_a_place_that_cannot_be_written_to(tmp_path):

@@ -127,7 +127,6 @@ def test_ctrl_c_leaves_a_run_that_resumes_to_the_same_bytes(tmp_path, after):
 
 _STOPPABLE = """
 import sys
-import rbpf.systems.range_bearing.run as system
 from rbpf.core.filter import Filter
 step = Filter.step
 def told(self, *arguments):

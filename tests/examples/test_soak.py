@@ -69,11 +69,14 @@ def test_forgetting():
     stream = RobotStream(Turnover(points=30, measurements=30, renewal=0.0), 0)
     filter_, step = robot_steps(stream, RangeBearingConfig(particles=3, lag=5), forget=3)
     window: list[set[int]] = []
+    ever: set[int] = set()
     for t, (frame, _) in enumerate(islice(stream.frames(), 200)):
         step(frame, t)
         window = [*window[-3:], set(frame.landmarks.tolist())]
+        ever |= window[-1]
         held = set(filter_.belief().map.ids.tolist())
         assert held == set().union(*window)
+    assert len(ever) > 2 * len(held)
     assert isinstance(filter_.sensors[0], Forgetting) and filter_.sensors[0].frame == 200
 
 

@@ -87,15 +87,20 @@ def test_settings_run_nothing_and_unfold_into_nothing(tmp_path, text, words):
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Path:
     """The folder of a small run."""
+    from rbpf.runs.recordings import RobotRecording, filter_recording
     from rbpf.systems.range_bearing.config import RangeBearingConfig
-    from rbpf.validation.range_bearing import finish_run, start_run
+    from rbpf.validation.finish import finish_run
     from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 
     folder = tmp_path_factory.mktemp("run")
     simulate_robot(RobotWorld(steps=5, landmarks=8), folder / "log", seed=0)
     out = folder / "out"
+    recording = RobotRecording(folder / "log")
     finish_run(
-        start_run(folder / "log", RangeBearingConfig(particles=4), out), folder / "log", out, batch=False
+        filter_recording(recording, RangeBearingConfig(particles=4), out),
+        out,
+        recording.sources(),
+        batch=False,
     )
     return out
 

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
+from rbpf.runs.path_and_map import PathAndMap
+from rbpf.runs.recordings import filter_robot_log as run
 from rbpf.sensors.readers import open_log
-from rbpf.systems.map_estimate import estimate_map
 from rbpf.systems.range_bearing.config import RangeBearingConfig
-from rbpf.systems.range_bearing.run import run
 from rbpf.systems.settings import load_settings
-from rbpf.validation.metrics.scores import score
+from rbpf.validation.metrics.scores import score_estimate
 
 pytestmark = [pytest.mark.real_data, pytest.mark.slow]
 
@@ -20,16 +20,9 @@ def mean_scores(path, seeds, *settings):
         config = load_settings(RangeBearingConfig, "range-bearing", None, settings, {"seed": seed})
         log = open_log(path, config.noise)
         finished = run(log, config)
-        landmarks = estimate_map(finished.filter, finished.anchored).named()
-        found = score(log, finished.progress.mean, landmarks, config.association == "ml")
-        rows.append(
-            (
-                found.path_rmse_m,
-                found.ate_rmse_m,
-                found.landmark_error_mean_m,
-                found.landmark_error_aligned_mean_m,
-            )
-        )
+        found = score_estimate(PathAndMap.of_run(finished), finished.truth, config.association == "ml")
+        names = "path_rmse_m", "ate_rmse_m", "landmark_error_mean_m", "landmark_error_aligned_mean_m"
+        rows.append([found.get(name, np.nan) for name in names])
     return np.mean(rows, axis=0)
 
 
@@ -68,5 +61,5 @@ def test_robot_with_motion_capture(data_dir):
 def test_victoria_park_runs_through(data_dir):
     log = open_log(data_dir / "victoria_park")
     finished = run(log, load_settings(RangeBearingConfig, "range-bearing", None, ["particles=20"], {}))
-    assert np.isfinite(finished.progress.mean).all()
-    assert len(finished.filter.belief().map.ids) == 151
+    assert np.isfinite(finished.log.poses).all()
+    assert len(finished.system.filter.belief().map.ids) == 151

@@ -11,14 +11,14 @@ import yaml
 from rbpf.core.checkpoint import save_arrays
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.runs.folder import write_map, write_summary, write_trajectory
+from rbpf.runs.folder import write_map, write_run, write_summary, write_trajectory
 from rbpf.runs.measurement_files import write_measurements
 from rbpf.runs.path_and_map import PathAndMap
+from rbpf.runs.recordings import filter_robot_log as run
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.run import run as run_features
 from rbpf.systems.range_bearing.config import RangeBearingConfig
-from rbpf.systems.range_bearing.run import run
 from rbpf.validation.consistency.against_batch import (
     SAME,
     SCALED,
@@ -29,7 +29,6 @@ from rbpf.validation.consistency.against_batch import (
 from rbpf.validation.gtsam.batch_problem import first_steps, fit_of, problem_of, read_problem, solve_problem
 from rbpf.validation.metrics.gaussian_differences import compare_last_pose, rescaled, scale_onto
 from rbpf.validation.metrics.path_and_map import of_run
-from rbpf.validation.run_folder import write_run
 from tests.validation.camera_scenes import scene
 from tests.validation.linear_worlds import linear_log
 
@@ -41,7 +40,7 @@ def linear_run():
 
 @pytest.fixture
 def folder(linear_run, tmp_path):
-    write_run(linear_run, tmp_path / "run", tmp_path / "log")
+    write_run(linear_run, tmp_path / "run", {"recording": str(tmp_path / "log")})
     return tmp_path / "run"
 
 
@@ -103,9 +102,8 @@ def test_a_folder_tells_the_same_as_the_run(linear_run, folder):
     assert stored.path.rmse == pytest.approx(direct.path.rmse)
     for name in ("keys", "sigmas", "kullback_leibler"):
         assert getattr(stored.landmarks, name) == pytest.approx(getattr(direct.landmarks, name))
-    progress = linear_run.progress
-    stamps = np.array([frame.stamp_ns for frame in linear_run.log.frames])
-    write_trajectory(folder, stamps, progress.mean, progress.cov)
+    log = linear_run.log
+    write_trajectory(folder, log.stamps_ns, log.poses, log.covs)
     with_poses = compare_folder(folder)
     assert with_poses.poses.sigmas == pytest.approx(compare_run(linear_run).poses.sigmas)
     text = json.dumps(with_poses.as_dict(), allow_nan=False)

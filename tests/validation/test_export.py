@@ -9,9 +9,9 @@ import pytest
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.path_and_map import PathAndMap
+from rbpf.runs.recordings import filter_robot_log as run
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.range_bearing.config import RangeBearingConfig
-from rbpf.systems.range_bearing.run import run
 from rbpf.validation.colmap.frames import from_colmap_pose
 from rbpf.validation.colmap.model import LEFT, RIGHT, build_model, image_id, image_name
 from rbpf.validation.export import MAP, PATH, colmap_model, export_colmap, export_ply

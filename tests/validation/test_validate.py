@@ -11,15 +11,14 @@ from rbpf.cli import main
 from rbpf.core.checkpoint import load_arrays, save_arrays
 from rbpf.errors import InputError
 from rbpf.runs.folder import write_summary, write_trajectory
+from rbpf.runs.recordings import filter_robot_log as run
 from rbpf.runs.results import load
-from rbpf.runs.truth import RunTruth, write_truth
+from rbpf.runs.truth import RunTruth, truth_at, write_truth
 from rbpf.sensors.readers.log import Truth
 from rbpf.systems.range_bearing.config import RangeBearingConfig
-from rbpf.systems.range_bearing.run import run
 from rbpf.validation.consistency.against_groundtruth import truth_errors
 from rbpf.validation.consistency.validate import COMPARISONS, validate
 from rbpf.validation.report.page import write_report
-from rbpf.validation.run_truth import robot_truth
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot, simulated_log
 
 pytestmark = pytest.mark.usefixtures("plain_pictures")
@@ -212,29 +211,28 @@ def test_the_truth_is_told_from_the_first_pose():
         log.space.compose(moved, log.truth.world_from_robot),
         {k: log.space.transform(moved, p[:2]) for k, p in log.truth.landmarks.items()},
     )
-    from dataclasses import replace
-
-    here, there = robot_truth(log), robot_truth(replace(log, truth=truth))
+    stamps = np.array([frame.stamp_ns for frame in log.frames])
+    here, there = (truth_at(log.space, one, stamps, "first frame") for one in (log.truth, truth))
     np.testing.assert_allclose(there.poses, here.poses, atol=1e-12)
     for name, point in here.landmarks.items():
         np.testing.assert_allclose(there.landmarks[name], point, atol=1e-12)
-    late = replace(truth, stamps_ns=truth.stamps_ns[5:], world_from_robot=truth.world_from_robot[5:])
-    assert robot_truth(replace(log, truth=late)).alignment == "rigid"
-    assert robot_truth(replace(log, truth=None)) is None
+    late = Truth(truth.stamps_ns[5:], truth.world_from_robot[5:])
+    assert truth_at(log.space, late, stamps, "first frame").alignment == "rigid"
+    assert truth_at(log.space, Truth(truth.stamps_ns[-2:], truth.poses[-2:]), stamps, "first frame") is None
 
 
 def test_path_and_truth_survive_the_files(tmp_path):
     log = simulated_log(RobotWorld(steps=15), 0)
-    progress = run(log, RangeBearingConfig(particles=10)).progress
-    stamps = np.arange(15)
-    write_trajectory(tmp_path, stamps, progress.mean, progress.cov)
-    write_truth(tmp_path, robot_truth(log))
+    finished = run(log, RangeBearingConfig(particles=10))
+    done = finished.log
+    write_trajectory(tmp_path, done.stamps_ns, done.poses, done.covs)
+    write_truth(tmp_path, finished.truth)
     write_summary(tmp_path, {})
     (tmp_path / "config.yaml").write_text("rbpf: 1\nsystem: range-bearing\n")
     path = load(tmp_path).path
-    np.testing.assert_array_equal(path.cov, progress.cov)
+    np.testing.assert_array_equal(path.cov, done.covs)
     truth = load(tmp_path).truth
-    np.testing.assert_array_equal(truth.poses, robot_truth(log).poses)
+    np.testing.assert_array_equal(truth.poses, finished.truth.poses)
     write_truth(tmp_path, None)
     with pytest.raises(InputError, match="no ground truth"):
         _ = load(tmp_path).truth

@@ -11,15 +11,15 @@ from rbpf.core.exchange import Observations, Part, Transition
 from rbpf.core.filter import Filter
 from rbpf.core.models import MotionModel, ObservationModel, Sensor
 from rbpf.lie import Euclidean
+from rbpf.runs.recordings import filter_robot_log as run
+from rbpf.runs.truth import truth_at
 from rbpf.sensors.range_bearing import RangeBearing
 from rbpf.systems.range_bearing.config import RangeBearingConfig
-from rbpf.systems.range_bearing.run import run
 from rbpf.validation.consistency.against_groundtruth import pose_statistics
 from rbpf.validation.consistency.own_statistics import innovation_statistics
 from rbpf.validation.consistency.pose_errors import whitened_errors
 from rbpf.validation.consistency.statistic import coverage, variance_ratio
 from rbpf.validation.consistency.verdict import Verdict, judge
-from rbpf.validation.run_truth import robot_truth
 from rbpf.validation.simulation.robot import RobotWorld, simulated_log
 
 pytestmark = pytest.mark.slow
@@ -30,9 +30,10 @@ CONFIG = RangeBearingConfig(particles=300)
 
 def verdicts(log, given, config=CONFIG) -> tuple[Verdict, Verdict]:
     """Without the truth, and with it."""
-    progress = run(given, config).progress
-    own = innovation_statistics(progress.nis, progress.rows, progress.correction, progress.cov_correction)
-    poses = pose_statistics(whitened_errors(log.space, progress.mean, progress.cov, robot_truth(log).poses))
+    done = run(given, config).log
+    own = innovation_statistics(done["nis"], done["nis_dof"], done["correction"], done["cov_correction"])
+    truth = truth_at(log.space, log.truth, done.stamps_ns, "first frame")
+    poses = pose_statistics(whitened_errors(log.space, done.poses, done.covs, truth.poses))
     return judge("", own), judge("", [*poses, *own], [statistic.name for statistic in poses])
 
 

@@ -13,12 +13,12 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
 from rbpf.runs.alignment import Similarity
 from rbpf.runs.trajectory import Trajectory, associate
+from rbpf.runs.truth import poses_at
 from rbpf.sensors.feature_log import CameraTruth
 from rbpf.validation.colmap.cloud_distance import CloudDistance, cloud_distance
 from rbpf.validation.colmap.pipeline import LEAST_FRAMES
 from rbpf.validation.colmap.reconstruct import Reconstruction
 from rbpf.validation.metrics.accuracy import AbsoluteError, ate
-from rbpf.validation.metrics.scores import poses_at
 
 
 @final

@@ -226,8 +226,8 @@ def _in_order(jobs: list[tuple[Any, Data]], workers: int, told: Callable[[int, i
 
 
 def _evidence(config: Config, data: Data) -> float:
+    from rbpf.runs.recordings import filter_robot_log
     from rbpf.systems.mono.run import run as run_mono
-    from rbpf.systems.range_bearing.run import run as run_robot
     from rbpf.systems.stereo.run import run_features as run_stereo
 
     if isinstance(config, RangeBearingConfig):
@@ -238,7 +238,7 @@ def _evidence(config: Config, data: Data) -> float:
                 "a log that was read already has its noise: give the recording's path to change it"
             )
         if isinstance(data, RobotLog):
-            return float(run_robot(data, config).filter.log_evidence)
+            return float(filter_robot_log(data, config).system.filter.log_evidence)
     elif isinstance(data, FeatureLog):
         filtered = run_stereo(data, config) if isinstance(config, StereoConfig) else run_mono(data, config)
         return float(filtered.filter.log_evidence)

@@ -16,12 +16,12 @@ from rbpf.errors import InputError
 from rbpf.lie import Array
 from rbpf.runs.measurement_files import OBSERVATIONS, read_measurements
 from rbpf.runs.path_and_map import PathAndMap
+from rbpf.runs.run import Run
 from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.feature_log import FeatureLog
 from rbpf.sensors.readers.measurements import Measurements
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.mono.run import MonoRun
-from rbpf.systems.range_bearing.run import Run
 from rbpf.systems.stereo.run import StereoRun
 from rbpf.validation.gtsam import camera, robot
 from rbpf.validation.gtsam.camera_data import CameraEstimate, sightings_of
@@ -30,7 +30,6 @@ from rbpf.validation.gtsam.divergence import mahalanobis
 from rbpf.validation.gtsam.mono_batch import connected_frames
 from rbpf.validation.metrics.path_and_map import AnyRun
 from rbpf.validation.mono_log import feature_log
-from rbpf.validation.run_folder import used_measurements
 
 Problem = Measurements | FeatureLog
 
@@ -78,7 +77,7 @@ class Fit:
 def problem_of(run: AnyRun) -> Problem:
     """The measurements that a run in memory used."""
     if isinstance(run, Run):
-        return used_measurements(run)
+        return run.system.measurements(run.name, run.log)
     if isinstance(run, MonoRun):
         return run.log
     if isinstance(run, StereoRun):

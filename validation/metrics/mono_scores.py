@@ -7,11 +7,10 @@ import numpy as np
 from rbpf.lie import SE3
 from rbpf.runs.alignment import Alignment
 from rbpf.runs.trajectory import Trajectory
-from rbpf.runs.truth import RunTruth
+from rbpf.runs.truth import RunTruth, poses_at
 from rbpf.sensors.feature_log import CameraTruth
 from rbpf.systems.mono.video import VideoRun
 from rbpf.validation.metrics.accuracy import ate, rpe
-from rbpf.validation.metrics.scores import poses_at
 
 LEAST = 3
 """Instants with a true pose that an alignment needs."""

@@ -1,12 +1,10 @@
 """Path and map of a run in memory, of any of the systems."""
 
-import numpy as np
-
 from rbpf.runs.path_and_map import PathAndMap
+from rbpf.runs.run import Run
 from rbpf.systems.map_estimate import MapEstimate, estimate_map
 from rbpf.systems.mono.run import MonoRun
 from rbpf.systems.mono.video import VideoRun
-from rbpf.systems.range_bearing.run import Run
 from rbpf.systems.stereo.run import StereoRun
 from rbpf.validation.camera_map import summarise_points
 from rbpf.validation.mono_map import summarise_mono_map
@@ -17,9 +15,7 @@ AnyRun = Run | MonoRun | VideoRun | StereoRun
 def of_run(run: AnyRun) -> PathAndMap:
     """The online filtered poses of a run in memory, and its last map, within + between particles."""
     if isinstance(run, Run):
-        stamps = np.array([frame.stamp_ns for frame in run.log.frames], dtype=np.int64)
-        summary = estimate_map(run.filter, run.anchored)
-        return PathAndMap(stamps, run.progress.mean, run.progress.cov, summary)
+        return PathAndMap.of_run(run)
     if isinstance(run, MonoRun):
         return PathAndMap(run.stamps_ns, run.world_from_camera, run.cov, summarise_points(run.filter))
     if isinstance(run, StereoRun):

@@ -1,118 +1,132 @@
-"""Scores of a run against ground truth: positions at the run's own instants, with and without alignment."""
+"""The score table of a run of any system, from its folder: errors against the truth, and distance from the batch.
 
-from dataclasses import dataclass
+Every frame counts, also those in which the system was lost. All errors are in the world in which the run is reported
+beside its truth (`rbpf.runs.truth`): without alignment where both are expressed in one world, after a rigid or a similarity
+alignment otherwise. A further figure of merit of all runs is one function from a path to entries, entered into `MERITS`.
+"""
 
-import numpy as np
+from collections.abc import Callable, Mapping
+from typing import Any
 
 from rbpf.errors import InputError
-from rbpf.lie import SE2Group, SE3Group
-from rbpf.runs.trajectory import Trajectory
-from rbpf.sensors.readers.log import RobotLog, Truth
+from rbpf.runs.alignment import Similarity
+from rbpf.runs.path_and_map import PathAndMap
+from rbpf.runs.reading import RunFolder
+from rbpf.runs.trajectory import Trajectory, associate, in_space, read_tum
+from rbpf.runs.truth import LEAST, TRUTH, RunTruth
+from rbpf.systems.map_estimate import MapEstimate
 from rbpf.validation.metrics.accuracy import ate, landmark_errors, rpe
 from rbpf.validation.metrics.matching import match_points
 
-LONGEST_GAP_NS = 500_000_000
-"""Truth is interpolated between poses no further apart than this; an instant in a longer gap is not scored."""
+BATCH, ODOMETRY = "batch.tum", "odometry.tum"
 
 
-@dataclass(frozen=True)
-class Scores:
-    """Errors of an estimate; metres and degrees, None where there is nothing to compare.
+def absolute_errors(estimate: Trajectory, reference: Trajectory, truth: RunTruth) -> dict[str, float]:
+    """Positions after rigid and after similarity alignment, and without any where one world is shared."""
+    similar = ate(estimate, reference, "similarity")
+    own = {"path_rmse_m": ate(estimate, reference).rmse} if truth.alignment == "none" else {}
+    return {
+        "ate_rmse_m": ate(estimate, reference, "rigid").rmse,
+        "ate_sim3_rmse_m": similar.rmse,
+        "sim3_scale": similar.alignment.scale,
+        **own,
+    }
 
-    Attributes:
-        ate_rmse_m: positions after rigid alignment.
-        path_rmse_m: positions without alignment.
-        rpe_translation_rmse_m: motion from one scored instant to the next.
-        rpe_rotation_rmse_deg: likewise.
-        scored_instants: how many instants have a true pose.
-        landmark_error_mean_m: landmarks without alignment.
-        landmark_error_aligned_mean_m: landmarks after their own rigid alignment.
+
+def relative_errors(estimate: Trajectory, reference: Trajectory, truth: RunTruth) -> dict[str, float]:
+    """Motion from one scored frame to the next; after the similarity alignment where the scale is not measured."""
+    relative = rpe(
+        estimate, reference, alignment="similarity" if truth.alignment == "similarity" else "rigid"
+    )
+    return {
+        "rpe_translation_rmse_m": relative.translation_rmse,
+        "rpe_rotation_rmse_deg": relative.rotation_rmse_deg,
+        "scored_instants": len(reference),
+    }
+
+
+MERITS: tuple[Callable[[Trajectory, Trajectory, RunTruth], Mapping[str, float]], ...] = (
+    absolute_errors,
+    relative_errors,
+)
+"""Figures of merit of a path: the estimate and the truth at the same frames, and how they are brought together."""
+
+
+def score_run(found: RunFolder) -> dict[str, Any]:
+    """Entries of summary.json for the filter, the odometry alone and the batch optimum; none without ground truth.
+
+    Those of the odometry begin with `odometry_` (in a stereo run with `vo_`), those of the optimum with `batch_`.
     """
-
-    ate_rmse_m: float | None = None
-    path_rmse_m: float | None = None
-    rpe_translation_rmse_m: float | None = None
-    rpe_rotation_rmse_deg: float | None = None
-    scored_instants: int = 0
-    landmark_error_mean_m: float | None = None
-    landmark_error_aligned_mean_m: float | None = None
-
-
-def as_trajectory(log: RobotLog, stamps_ns: np.ndarray, world_from_robot: np.ndarray) -> Trajectory:
-    """Poses (T, E) of the log's group as a trajectory in space."""
-    if isinstance(log.space, SE2Group):
-        return Trajectory.from_planar(stamps_ns, world_from_robot)
-    return Trajectory(stamps_ns, world_from_robot)
-
-
-def truth_at(
-    space: SE2Group | SE3Group, truth: Truth, stamps_ns: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of `stamps_ns` that lie inside the truth, and the interpolated true poses there."""
-    return poses_at(space, truth.stamps_ns, truth.world_from_robot, stamps_ns)
+    entries: dict[str, Any] = {}
+    path = found.trajectory
+    batch = read_tum(found.folder / BATCH) if (found.folder / BATCH).is_file() else None
+    if (found.folder / TRUTH).is_file() and found.truth.rows.size >= LEAST:
+        truth = found.truth
+        entries |= score_estimate(found.estimate, truth, found.config.get("association") == "ml")
+        reference = in_space(found.path.stamps_ns[truth.rows], truth.poses)
+        for name, prefix in (
+            (ODOMETRY, "vo_" if found.system == "stereo" else "odometry_"),
+            (BATCH, "batch_"),
+        ):
+            if (found.folder / name).is_file():
+                other = read_tum(found.folder / name)
+                entries |= {prefix + key: v for key, v in score_path(other, reference, truth).items()}
+    if batch is not None:
+        ours, theirs = associate(path, batch, 0)
+        floats = found.system == "mono" and found.summary.get("known_points") == 0
+        apart = ate(ours, theirs, "similarity" if floats else "none")
+        entries["filter_minus_batch_rmse_m"] = apart.rmse
+    return entries
 
 
-def poses_at(
-    space: SE2Group | SE3Group, true_ns: np.ndarray, poses: np.ndarray, stamps_ns: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of `stamps_ns` that lie inside true stamps (T,), and the interpolated true poses (T, E) there.
-
-    Stamps that count steps are met exactly; between poses the geodesic is followed.
-    """
-    last = true_ns.size - 1
-    after = np.searchsorted(true_ns, stamps_ns, side="left")
-    exact = np.minimum(after, last)
-    met = true_ns[exact] == stamps_ns
-    before = np.clip(np.where(met, exact, after - 1), 0, last)
-    after = np.clip(np.where(met, exact, after), 0, last)
-    gap = true_ns[after] - true_ns[before]
-    inside = (true_ns[before] <= stamps_ns) & (stamps_ns <= true_ns[after])
-    rows = np.flatnonzero(met | (inside & (gap <= LONGEST_GAP_NS)))
-    fraction = (stamps_ns[rows] - true_ns[before[rows]]) / np.maximum(gap[rows], 1)
-    return rows, space.interpolate(poses[before[rows]], poses[after[rows]], fraction)
-
-
-def score(
-    log: RobotLog,
-    world_from_robot: np.ndarray,
-    landmarks: dict[int, np.ndarray] | None = None,
-    anonymous: bool = False,
-) -> Scores:
-    """Scores poses (T, E) at the log's frames, and landmarks by the log's names.
+def score_estimate(estimate: PathAndMap, truth: RunTruth, anonymous: bool = False) -> dict[str, float]:
+    """Errors of path and landmarks.
 
     Args:
-        log: the recording, with its truth.
-        world_from_robot: (T, E) estimated poses.
-        landmarks: name to (D,) position; None scores the path alone.
-        anonymous: the names are the map's own; each landmark is scored as the true one nearest to it once the path
-            is aligned, one to one.
+        estimate: a pose for every frame of a run, and its map.
+        truth: at the run's frames.
+        anonymous: the landmarks have no names; see `score_landmarks`.
     """
-    if log.truth is None:
-        return Scores()
-    stamps = np.array([frame.stamp_ns for frame in log.frames])
-    rows, true_poses = truth_at(log.space, log.truth, stamps)
-    values: dict[str, float | int | None] = {"scored_instants": int(rows.size)}
-    alignment = None
-    if rows.size > 2:
-        estimate = as_trajectory(log, stamps[rows], world_from_robot[rows])
-        reference = as_trajectory(log, stamps[rows], true_poses)
-        relative = rpe(estimate, reference)
-        aligned = ate(estimate, reference, "rigid")
-        alignment = aligned.alignment
-        values |= {
-            "ate_rmse_m": aligned.rmse,
-            "path_rmse_m": ate(estimate, reference).rmse,
-            "rpe_translation_rmse_m": relative.translation_rmse,
-            "rpe_rotation_rmse_deg": relative.rotation_rmse_deg,
-        }
-    if landmarks and log.truth.landmarks:
-        dim = 2 if isinstance(log.space, SE2Group) else 3
-        truth = {name: point[:dim] for name, point in log.truth.landmarks.items()}
-        if anonymous:
-            landmarks = match_points(np.array(list(landmarks.values())), truth, alignment)
-        try:
-            values["landmark_error_mean_m"] = landmark_errors(landmarks, truth).mean
-            values["landmark_error_aligned_mean_m"] = landmark_errors(landmarks, truth, "rigid").mean
-        except InputError:
-            return Scores(**values)  # type: ignore[arg-type]
-    return Scores(**values)  # type: ignore[arg-type]
+    reference = in_space(estimate.stamps_ns[truth.rows], truth.poses)
+    ours = estimate.at(truth.rows).trajectory
+    entries: dict[str, float] = {}
+    for merit in MERITS:
+        entries |= merit(ours, reference, truth)
+    start = ate(ours, reference, "rigid").alignment if anonymous else None
+    return entries | score_landmarks(estimate.landmarks, truth, start)
+
+
+def score_path(path: Trajectory, reference: Trajectory, truth: RunTruth) -> dict[str, float]:
+    """All figures of merit of a path whose frames are among those of a run; none where too few have a true pose."""
+    try:
+        estimate, reference = associate(path, reference, 0)
+    except InputError:
+        return {}
+    entries: dict[str, float] = {}
+    for merit in MERITS if len(estimate) >= LEAST else ():
+        entries |= merit(estimate, reference, truth)
+    return entries
+
+
+def score_landmarks(
+    points: MapEstimate, truth: RunTruth, start: Similarity | None = None
+) -> dict[str, float]:
+    """Mean errors of landmarks whose true places are known, without and with an alignment of their own.
+
+    Args:
+        points: landmarks that are points.
+        truth: with the true places by name.
+        start: where the filter gave the landmarks no names, an alignment of the path: each landmark is then scored as
+            the true one nearest to it, one to one.
+    """
+    if not truth.landmarks or not points.ids.size:
+        return {}
+    estimate = points.named() if start is None else match_points(points.mean, truth.landmarks, start)
+    try:
+        own, aligned = (
+            landmark_errors(estimate, truth.landmarks),
+            landmark_errors(estimate, truth.landmarks, "rigid"),
+        )
+    except InputError:  # no landmark is in both
+        return {}
+    return {"landmark_error_mean_m": own.mean, "landmark_error_aligned_mean_m": aligned.mean}

@@ -51,17 +51,18 @@ def _robot_settings(pairs: Sequence[str], given: Mapping[str, Any]) -> Any:
 
 
 def _run_robot(sequence: Mapping[str, Path], pairs: Sequence[str], given: Mapping[str, Any]) -> Figures:
+    from rbpf.runs.folder import summarise
+    from rbpf.runs.path_and_map import PathAndMap
+    from rbpf.runs.recordings import filter_robot_log
     from rbpf.sensors.readers import open_log
-    from rbpf.systems.map_estimate import estimate_map
-    from rbpf.systems.range_bearing.run import run
-    from rbpf.validation.run_folder import summarise
-    from rbpf.validation.run_truth import robot_truth
+    from rbpf.validation.metrics.scores import score_estimate
 
     config = _robot_settings(pairs, given)
-    log = open_log(sequence["recording"], config.noise)
-    done = run(log, config)
-    figures = summarise(done, estimate_map(done.filter, done.anchored))
-    return figures | _pose_nees(log.space, done.progress.mean, done.progress.cov, robot_truth(log))
+    run = filter_robot_log(open_log(sequence["recording"], config.noise), config)
+    figures = summarise(run)
+    if run.truth is not None:
+        figures |= score_estimate(PathAndMap.of_run(run), run.truth, config.association == "ml")
+    return figures | _pose_nees(run.system.space, run.log.poses, run.log.covs, run.truth)
 
 
 def _mono_settings(pairs: Sequence[str], given: Mapping[str, Any]) -> Any:

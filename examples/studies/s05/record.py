@@ -9,10 +9,10 @@ import numpy as np
 
 from rbpf.lie import SE3
 from rbpf.runs.alignment import align
+from rbpf.runs.truth import poses_at
 from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
 from rbpf.systems.stereo.run import StereoRun
 from rbpf.systems.stereo.sensor import StereoSensor
-from rbpf.validation.metrics.scores import poses_at
 
 KINDS = "filter", "odometry", "wheels"
 

@@ -12,6 +12,7 @@ from typing import Any, ClassVar, final
 import numpy as np
 
 from rbpf.core.anchoring import StartAnchor
+from rbpf.core.archive import checked
 from rbpf.core.diagnostics import motion_correction
 from rbpf.core.filter import Filter, StepReport
 from rbpf.core.models import NEW, NULL, Sensor
@@ -88,6 +89,7 @@ class RangeBearingSlam(System):
         )
         self.anchor = StartAnchor(self.filter, config.anchor_every) if config.anchor_every else None
         self._names: set[int] = set()
+        self._odometry = space.identity()
         self._associations = _Associations(self.filter) if keep_associations else None
         d, e, p = space.dim, space.size, self.model.dim
         self.columns = (
@@ -102,6 +104,7 @@ class RangeBearingSlam(System):
                 shape=(d,),
             ),
             Column("cov_correction", "what a consistent filter expects of the correction", shape=(d, d)),
+            Column("odometry", "world_from_robot by odometry alone", shape=(e,)),
             Column("delta", "odometry, previous_robot_from_robot; NaN in the first frame", shape=(e,)),
             Column("cov_delta", "its covariance in the right chart", "rad² and m²", shape=(d, d)),
         )
@@ -115,11 +118,15 @@ class RangeBearingSlam(System):
 
     @classmethod
     def of_log(
-        cls, log: RobotLog, config: RangeBearingConfig | None = None, keep_associations: bool = False
+        cls,
+        log: RobotLog,
+        config: RangeBearingConfig | None = None,
+        keep_associations: bool = False,
+        wrapped: Callable[[Sensor], Sensor] | None = None,
     ) -> "RangeBearingSlam":
         """The system for the robot and the sensor of a log."""
         kind: Kind = "position" if log.measurement == "position" else "range_bearing"
-        return cls(config, log.space, kind, log.robot_from_sensor, log.pitch_sign, keep_associations)
+        return cls(config, log.space, kind, log.robot_from_sensor, log.pitch_sign, keep_associations, wrapped)
 
     def track(
         self,
@@ -143,6 +150,8 @@ class RangeBearingSlam(System):
         """
         names = np.full(len(z), NULL) if landmarks is None else np.asarray(landmarks, dtype=np.int64)
         report = self.filter.step(Observed(names, z, cov_z), odometry, stamp_ns)
+        if odometry is not None:
+            self._odometry = self.space.compose(self._odometry, odometry.delta)
 
         # Poses are reported relative to where the start lies in each particle's world, as far as that is known by now.
         estimate = report.estimate
@@ -167,6 +176,7 @@ class RangeBearingSlam(System):
                 "nis_dof": report.rows,
                 "correction": np.full(d, np.nan) if correction is None else correction.mean,
                 "cov_correction": np.full((d, d), np.nan) if correction is None else correction.cov,
+                "odometry": self._odometry,
                 "delta": np.full(e, np.nan) if odometry is None else odometry.delta,
                 "cov_delta": np.full((d, d), np.nan) if odometry is None else odometry.cov,
             },
@@ -187,9 +197,7 @@ class RangeBearingSlam(System):
     def measurements(self, name: str, log: Recorded) -> Measurements:
         """The odometry, and every observation that updated a landmark or started one."""
         frames = [log.observed(t) for t in range(len(log))]
-        landmarks = (
-            [frame["landmarks"] for frame in frames] if self._associations is None else self.associations()
-        )
+        landmarks = self._final(log)
         used = [np.flatnonzero(ids >= 0) for ids in landmarks]
         p = self.model.dim
 
@@ -216,10 +224,9 @@ class RangeBearingSlam(System):
     def summary(self, log: Recorded) -> dict[str, Any]:
         """How much was observed and kept, and how far the particles have forgotten the past."""
         store = self.filter.belief().map.store
-        used = self.measurements("", log).steps.size
         return {
             "landmarks": int(self.map().ids.size),
-            "observations": int(used),
+            "observations": int(sum((ids >= 0).sum() for ids in self._final(log))),
             "ancestors_of_first_generation": self.filter.history.distinct_first(),
             "map_share_of_dense": round(store.stored_bytes / max(store.dense_bytes, 1), 4),
         }
@@ -232,9 +239,15 @@ class RangeBearingSlam(System):
         assert self._associations is not None
         return self._associations.of(self.filter.belief().mode)
 
+    def _final(self, log: Recorded) -> list[np.ndarray]:
+        """The landmark of every observation, one array (K,) per step, as known now."""
+        if self._associations is not None:
+            return self.associations()
+        return [log.observed(t)["landmarks"] for t in range(len(log))]
+
     def arrays(self) -> dict[str, np.ndarray]:
         """Where the start is, and the associations that are kept."""
-        kept = {"names": np.array(sorted(self._names), dtype=np.int64)}
+        kept = {"names": np.array(sorted(self._names), dtype=np.int64), "odometry": self._odometry}
         if self._associations is not None:
             kept |= self._associations.arrays()
         return kept if self.anchor is None else kept | self.anchor.arrays()
@@ -242,6 +255,7 @@ class RangeBearingSlam(System):
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """The inverse of `arrays`."""
         self._names = set(arrays["names"].tolist())
+        self._odometry = checked(arrays, "odometry", (self.space.size,), "f").copy()
         if self._associations is not None:
             self._associations.restore(arrays)
         if self.anchor is not None:

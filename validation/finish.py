@@ -1,0 +1,133 @@
+"""From a run to its report: files, batch optimum, scores, pictures, video, verdict. It drives no run.
+
+Everything after the files of the run itself is made from its folder, so that it can be made again without the recording;
+only the annotated video needs the images once more.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rbpf.errors import InputError
+from rbpf.runs.folder import write_run, write_summary
+from rbpf.runs.plots import draw_run
+from rbpf.runs.provenance import left_out
+from rbpf.runs.reading import RunFolder
+from rbpf.runs.run import Run
+from rbpf.runs.trajectory import in_space, write_tum
+from rbpf.runs.truth import LEAST, TRUTH
+from rbpf.sensors.camera import RectifiedStereo
+from rbpf.sensors.feature_log import FeatureLog
+from rbpf.systems.map_estimate import MapEstimate
+from rbpf.validation.consistency.validate import report_run
+from rbpf.validation.metrics.accuracy import ate
+from rbpf.validation.metrics.scores import BATCH, score_landmarks, score_run
+
+MOST = 300_000
+"""Observations that are adjusted at once after a run: more take minutes and gigabytes, and are left to who asks for it."""
+
+
+@dataclass(frozen=True)
+class Callbacks:
+    """Who is told how far the work after the filter is.
+
+    Attributes:
+        on_frame: called with the frames drawn and their number.
+        on_iteration: called with the number of an iteration of the batch adjustment and the error before it.
+        batch_s: time after which the batch adjustment is given up; None waits.
+    """
+
+    on_frame: Callable[[int, int], None] | None = None
+    on_iteration: Callable[[int, float], None] | None = None
+    batch_s: float | None = None
+
+
+def finish_run(
+    run: Run,
+    out: Path,
+    sources: Mapping[str, str | float | bool],
+    video: bool = True,
+    rerun: Path | None = None,
+    batch: bool = True,
+    callbacks: Callbacks | None = None,
+) -> dict[str, Any]:
+    """Writes everything that a run leaves; returns the entries of summary.json and the verdict.
+
+    The run's own files are complete before the batch adjustment begins.
+
+    Args:
+        run: what was filtered.
+        out: the run's folder.
+        sources: what it was filtered from, for config.yaml; `recording` is one of them.
+        video: also write the annotated video, of a run over images.
+        rerun: file of a recording for the Rerun viewer; None writes none.
+        batch: also solve for the batch optimum of the same measurements, and score it.
+        callbacks: who is told.
+
+    Raises:
+        InputError: a file cannot be written.
+    """
+    callbacks = callbacks or Callbacks()
+    entries = write_run(run, out, dict(sources) | left_out(video=video, batch=batch))
+    (out / BATCH).unlink(missing_ok=True)
+    if batch:
+        try:
+            entries |= add_batch(RunFolder.open(out), callbacks)
+        except InputError as error:
+            entries["batch_problem"] = str(error)
+    entries |= score_run(RunFolder.open(out))
+    write_summary(out, entries)
+    found = RunFolder.open(out)
+    draw_run(found)
+    verdict = report_run(out)
+    return entries | {"verdict": verdict.trust, "sentences": verdict.said}
+
+
+def add_batch(found: RunFolder, callbacks: Callbacks) -> dict[str, Any]:
+    """Solves for the batch optimum of a run's measurements, writes batch.tum, and returns its entries of summary.json.
+
+    Raises:
+        InputError: there are too many observations, too few frames are connected, it takes too long, or it does not
+            converge.
+    """
+    measured = found.measurements
+    if isinstance(measured, FeatureLog):
+        from rbpf.validation.gtsam.batch_problem import STEREO_TOLERANCE
+        from rbpf.validation.gtsam.mono_batch import adjust_log
+
+        count = sum(frame.landmarks.size for frame in measured.frames)
+        if count > MOST:
+            raise InputError(
+                f"the run has {count} observations, more than the {MOST} that are adjusted in batch with it: "
+                "compare it afterwards by rbpf validate RUN --against gtsam"
+            )
+        stereo = isinstance(measured.camera, RectifiedStereo)
+        tolerance = STEREO_TOLERANCE if stereo else None
+        adjusted = adjust_log(
+            measured, found.path.mean, callbacks.batch_s, callbacks.on_iteration, tolerance=tolerance
+        )
+        write_tum(found.folder / BATCH, adjusted.trajectory)
+        return {
+            "batch_frames": int(adjusted.frames.size),
+            "batch_observations": int(sum(frame.landmarks.size for frame in adjusted.log.frames)),
+            "batch_error": float(adjusted.solution.error),
+        }
+    from rbpf.validation.gtsam.batch_problem import AFAR
+    from rbpf.validation.gtsam.robot import solve
+
+    solution = solve(measured, marginals=False, incremental=len(measured.stamps_ns) > AFAR)
+    write_tum(found.folder / BATCH, in_space(measured.stamps_ns, solution.world_from_robot))
+    entries: dict[str, Any] = {"batch_error": float(solution.error)}
+    if (found.folder / TRUTH).is_file() and found.truth.rows.size >= LEAST:
+        ids = np.array(list(solution.landmarks), dtype=np.int64)
+        means = np.array(list(solution.landmarks.values())).reshape(ids.size, -1)
+        dim = found.map.mean.shape[1]
+        points = MapEstimate(ids, means.reshape(-1, dim), np.zeros((ids.size, dim, dim)))
+        reference = in_space(found.path.stamps_ns[found.truth.rows], found.truth.poses)
+        ours = found.trajectory.at(found.truth.rows)
+        start = ate(ours, reference, "rigid").alignment if found.config.get("association") == "ml" else None
+        entries |= {f"batch_{name}": v for name, v in score_landmarks(points, found.truth, start).items()}
+    return entries
