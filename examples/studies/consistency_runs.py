@@ -338,7 +338,9 @@ def desk_trials(frames: int, particles: tuple[int, ...]) -> tuple[Trials, Trials
         "start sampled (known points as landmarks)": replace(base, known="points"),
         "three linearisations": replace(base, proposal=ProposalConfig(iterations=3)),
         "linearised weights": replace(base, proposal=ProposalConfig(weights="linearised", iterations=1)),
-        "epipolar constraint": replace(base, ray=replace(base.ray, constrain="epipolar")),
+        "epipolar constraint": replace(
+            base, inverse_depth=replace(base.inverse_depth, pose_update="epipolar")
+        ),
     }
     sizes = {f"{n} particles": DeskTrial(world, MonoConfig(particles=n)) for n in particles}
     return sizes, {name: DeskTrial(world, config) for name, config in changed.items()}
