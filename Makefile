@@ -30,9 +30,10 @@ demo: $(STAMP) ## simulate, filter and report into demo/
 test: $(STAMP) ## all tests
 	$(PYTEST)
 
-check: $(STAMP) ## format, lint, types, import rules and the fast tests
+check: $(STAMP) ## format, lint, spelling, types, import rules and the fast tests
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
+	$(BIN)/typos
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(PYTEST) -m "not slow and not real_data"

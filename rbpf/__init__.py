@@ -60,7 +60,7 @@ if TYPE_CHECKING:
     from rbpf.sensors.range_bearing import RelativePosition as RelativePosition
     from rbpf.sensors.readers import open_log as open_log
 
-__version__ = "0.1.0"
+__version__ = "0.2.0.dev0"
 
 _HOMES = {
     "core.smoothing": ["ancestral_smoothing", "backward_simulation"],
