@@ -16,9 +16,8 @@ from rbpf.sensors.readers.images import ImageFrame, ImageSequence, KnownPixels, 
 from rbpf.sensors.readers.images.sequence import Source
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.video import VideoRun, run_images
-from rbpf.validation.simulation.exposure import Imaging
-from rbpf.validation.simulation.images import simulate_images
-from rbpf.validation.simulation.textured_desk import TexturedDesk
+from rbpf.validation.simulation.desk_and_room import TexturedDesk
+from rbpf.validation.simulation.images import Imaging, simulate_images
 
 SETTLING, TIMED, MEASUREMENTS = 30, 90, 25
 AIM_HZ = {320: 100.0, 640: 60.0}

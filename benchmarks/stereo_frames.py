@@ -15,9 +15,8 @@ from rbpf.sensors.readers.images import open_stereo
 from rbpf.sensors.readers.images.stereo import StereoSequence
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.run import run_images
-from rbpf.validation.simulation.exposure import Imaging
-from rbpf.validation.simulation.images import simulate_images
-from rbpf.validation.simulation.textured_lab import LabDrive, TexturedLab
+from rbpf.validation.simulation.images import Imaging, simulate_images
+from rbpf.validation.simulation.lab import LabDrive, TexturedLab
 
 RIG = RectifiedStereo(Pinhole(640, 480, 500.0, 500.0, 319.5, 239.5), 0.12)
 SETTLING, TIMED = 5, 30

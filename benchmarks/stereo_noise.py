@@ -20,9 +20,8 @@ from rbpf.sensors.descriptors.matching import MatchLimits
 from rbpf.sensors.readers.images import StereoSequence, open_stereo
 from rbpf.sensors.stereo.features import match_frames
 from rbpf.sensors.stereo.matching import StereoMatcher
-from rbpf.validation.simulation.exposure import Imaging
-from rbpf.validation.simulation.images import simulate_images
-from rbpf.validation.simulation.textured_room import TexturedRoom
+from rbpf.validation.simulation.desk_and_room import TexturedRoom
+from rbpf.validation.simulation.images import Imaging, simulate_images
 
 NAMES = "stereo_zed_room1", "stereo_kitti_seq1"
 BOUNDS = 0.0, 2.0, 3.0, 4.5, 7.0, 12.0, np.inf

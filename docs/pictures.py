@@ -18,9 +18,8 @@ from rbpf.validation.mono import Recording, start_mono
 from rbpf.validation.mono_map import summarise_mono_map
 from rbpf.validation.report.mono_pictures import plot_mono_run
 from rbpf.validation.report.mono_video import annotated_frames
-from rbpf.validation.simulation.exposure import Imaging
-from rbpf.validation.simulation.images import simulate_images
-from rbpf.validation.simulation.textured_desk import TexturedDesk
+from rbpf.validation.simulation.desk_and_room import TexturedDesk
+from rbpf.validation.simulation.images import Imaging, simulate_images
 
 EVERY = 4
 """Frames of the recording from one of the animation to the next."""

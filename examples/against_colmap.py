@@ -15,9 +15,8 @@ from rbpf.validation.gtsam.batch_problem import problem_of
 from rbpf.validation.metrics.path_and_map import of_run
 from rbpf.validation.mono import Recording, start_mono
 from rbpf.validation.report.offline_pictures import plot_against_colmap
-from rbpf.validation.simulation.exposure import Imaging
-from rbpf.validation.simulation.images import simulate_images
-from rbpf.validation.simulation.textured_desk import TexturedDesk
+from rbpf.validation.simulation.desk_and_room import TexturedDesk
+from rbpf.validation.simulation.images import Imaging, simulate_images
 from rbpf.validation.tables import write_table
 
 

@@ -13,9 +13,8 @@ from rbpf.sensors.readers.images import open_images, read_known_points
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.video import run_images
 from rbpf.validation.mono import Recording, finish_mono
-from rbpf.validation.simulation.exposure import Imaging
-from rbpf.validation.simulation.images import simulate_images
-from rbpf.validation.simulation.textured_desk import TexturedDesk
+from rbpf.validation.simulation.desk_and_room import TexturedDesk
+from rbpf.validation.simulation.images import Imaging, simulate_images
 
 
 def slam(images: Path, known_points: Path | None, particles: int, out: Path) -> dict[str, float]:

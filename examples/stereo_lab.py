@@ -12,9 +12,8 @@ import tyro
 
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.systems.stereo.config import StereoConfig
-from rbpf.validation.simulation.exposure import Imaging
-from rbpf.validation.simulation.images import simulate_images
-from rbpf.validation.simulation.textured_lab import LabDrive, TexturedLab
+from rbpf.validation.simulation.images import Imaging, simulate_images
+from rbpf.validation.simulation.lab import LabDrive, TexturedLab
 from rbpf.validation.stereo import StereoRecording, finish_stereo, start_stereo
 from rbpf.validation.tables import write_table
 

@@ -34,10 +34,9 @@ from rbpf.validation.metrics.accuracy import ate
 from rbpf.validation.metrics.mono_scores import true_path
 from rbpf.validation.metrics.path_and_map import AnyRun, of_run
 from rbpf.validation.mono import Recording, start_mono
-from rbpf.validation.simulation.exposure import Imaging
-from rbpf.validation.simulation.images import simulate_images
+from rbpf.validation.simulation.desk_and_room import TexturedDesk
+from rbpf.validation.simulation.images import Imaging, simulate_images
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
-from rbpf.validation.simulation.textured_desk import TexturedDesk
 from rbpf.validation.stereo import StereoRecording, start_stereo
 from rbpf.validation.tables import write_table
 

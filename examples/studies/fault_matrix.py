@@ -47,9 +47,8 @@ from rbpf.systems.mono.video import run_images
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.run import run_images as run_pairs
 from rbpf.validation.metrics.mono_scores import true_path
-from rbpf.validation.simulation.exposure import Imaging
-from rbpf.validation.simulation.images import simulate_images
-from rbpf.validation.simulation.textured_desk import TexturedDesk
+from rbpf.validation.simulation.desk_and_room import TexturedDesk
+from rbpf.validation.simulation.images import Imaging, simulate_images
 from rbpf.validation.tables import write_csv, write_table
 
 NONE = "none"

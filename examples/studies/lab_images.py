@@ -16,10 +16,9 @@ import tyro
 
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers.images import open_images
-from rbpf.validation.simulation.exposure import Imaging, Shutter
-from rbpf.validation.simulation.lab_furniture import furnished
+from rbpf.validation.simulation.images import Imaging, Shutter
+from rbpf.validation.simulation.lab import LabDrive, TexturedLab, furnished
 from rbpf.validation.simulation.render import Renderer
-from rbpf.validation.simulation.textured_lab import LabDrive, TexturedLab
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

@@ -35,10 +35,8 @@ from rbpf.systems.mono.likeness import known_places
 from rbpf.systems.mono.relocalise import Attempt
 from rbpf.systems.mono.resuming import save
 from rbpf.systems.mono.video import VideoRun, run_images
-from rbpf.validation.simulation.exposure import Imaging
-from rbpf.validation.simulation.images import simulate_images
-from rbpf.validation.simulation.textured_desk import TexturedDesk
-from rbpf.validation.simulation.textured_room import TexturedRoom
+from rbpf.validation.simulation.desk_and_room import TexturedDesk, TexturedRoom
+from rbpf.validation.simulation.images import Imaging, simulate_images
 from rbpf.validation.sweep.parallel import in_parallel
 from rbpf.validation.tables import Cell, write_csv, write_table
 

@@ -25,10 +25,8 @@ from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers.images import ImageFrame, open_images, read_known_points
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.video import VideoRun, run_images
-from rbpf.validation.simulation.exposure import Imaging
-from rbpf.validation.simulation.images import simulate_images
-from rbpf.validation.simulation.textured_desk import TexturedDesk
-from rbpf.validation.simulation.textured_room import TexturedRoom
+from rbpf.validation.simulation.desk_and_room import TexturedDesk, TexturedRoom
+from rbpf.validation.simulation.images import Imaging, simulate_images
 from rbpf.validation.simulation.textured_scene import ImageWorld
 from rbpf.validation.tables import write_table
 

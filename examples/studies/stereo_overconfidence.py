@@ -25,8 +25,7 @@ from rbpf.systems.stereo.config import OUTLIER_VOLUME_PX3, OdometryConfig, Stere
 from rbpf.systems.stereo.run import run_features
 from rbpf.validation.consistency.pose_errors import whitened_errors
 from rbpf.validation.simulation.features import STEREO, Measuring, simulate_features
-from rbpf.validation.simulation.lab_points import LabWorld
-from rbpf.validation.simulation.textured_lab import LabDrive
+from rbpf.validation.simulation.lab import LabDrive, LabWorld
 from rbpf.validation.tables import write_table
 
 DIM = 6

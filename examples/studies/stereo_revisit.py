@@ -29,8 +29,7 @@ from rbpf.systems.stereo.run import StereoRun, run_features, run_images
 from rbpf.validation.gtsam.batch_problem import solve_problem
 from rbpf.validation.metrics.stereo_scores import score_stereo
 from rbpf.validation.simulation.features import STEREO, Measuring, simulate_features
-from rbpf.validation.simulation.lab_points import LabWorld
-from rbpf.validation.simulation.textured_lab import LabDrive
+from rbpf.validation.simulation.lab import LabDrive, LabWorld
 from rbpf.validation.tables import write_table
 
 

@@ -16,8 +16,8 @@ from rbpf.lie import SE2, SE3
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureFrame, FeatureLog, KnownPoints
 from rbpf.sensors.readers.log import Frame, RobotLog
-from rbpf.validation.simulation.camera_paths import looking
 from rbpf.validation.simulation.limits import check_counts, check_fractions, check_positive
+from rbpf.validation.simulation.paths import looking
 
 CAMERA = Pinhole(320, 240, 260.0, 260.0, 159.5, 119.5)
 KNOWN = 5

@@ -13,7 +13,7 @@ from rbpf.errors import InputError
 
 if TYPE_CHECKING:
     from rbpf.sensors.camera import Pinhole
-    from rbpf.validation.simulation.exposure import Imaging
+    from rbpf.validation.simulation.images import Imaging
     from rbpf.validation.simulation.textured_scene import ImageWorld
 
 FOCAL_FRACTION = {ImagesOptions: 0.8, LabOptions: 0.78125}
@@ -34,7 +34,7 @@ def simulate_range_bearing(options: Annotated[LogOptions, tyro.conf.arg(name="")
 @SIMULATE.add("desk")
 def simulate_desk(options: Annotated[ImagesOptions, tyro.conf.arg(name="")]) -> None:
     """Images of a textured desk with papers, books and boxes on it, taken by a hand-held camera, with ground truth."""
-    from rbpf.validation.simulation.textured_desk import TexturedDesk
+    from rbpf.validation.simulation.desk_and_room import TexturedDesk
 
     lies = TexturedDesk(frames=options.frames, contrast=options.contrast)
     board = given_board(options.board, options.square)
@@ -47,7 +47,7 @@ def simulate_desk(options: Annotated[ImagesOptions, tyro.conf.arg(name="")]) -> 
 @SIMULATE.add("room")
 def simulate_room(options: Annotated[ImagesOptions, tyro.conf.arg(name="")]) -> None:
     """Images of a room with pictures on its walls, carried in a circle, with ground truth."""
-    from rbpf.validation.simulation.textured_room import TexturedRoom
+    from rbpf.validation.simulation.desk_and_room import TexturedRoom
 
     if options.board is not None or options.square is not None:
         raise InputError("a room has no chessboard: leave out --board and --square, or simulate a desk")
@@ -57,7 +57,7 @@ def simulate_room(options: Annotated[ImagesOptions, tyro.conf.arg(name="")]) -> 
 @SIMULATE.add("lab")
 def simulate_lab(options: Annotated[LabOptions, tyro.conf.arg(name="")]) -> None:
     """Stereo images of a laboratory of two rooms, taken from a robot, with ground truth and the wheels' odometry."""
-    from rbpf.validation.simulation.textured_lab import LabDrive, TexturedLab
+    from rbpf.validation.simulation.lab import LabDrive, TexturedLab
 
     drive = LabDrive(options.trajectory, options.frames, options.every)
     _render(TexturedLab(drive, texel_m=options.texel_m, contrast=options.contrast), options)
@@ -95,7 +95,7 @@ def _camera(options: ImagesOptions | LabOptions) -> "Pinhole":
 
 
 def _imaging(options: RenderOptions) -> "Imaging":
-    from rbpf.validation.simulation.exposure import Imaging
+    from rbpf.validation.simulation.images import Imaging
 
     first, count = options.blackout or (0, 0)
     return Imaging(

@@ -6,9 +6,8 @@ from pathlib import Path
 
 from rbpf.cli import main
 from rbpf.sensors.camera import Pinhole
-from rbpf.validation.simulation.exposure import Imaging
-from rbpf.validation.simulation.images import simulate_images
-from rbpf.validation.simulation.textured_desk import TexturedDesk
+from rbpf.validation.simulation.desk_and_room import TexturedDesk
+from rbpf.validation.simulation.images import Imaging, simulate_images
 
 CAMERA = Pinhole(240, 180, 190.0, 190.0, 119.5, 89.5)
 FRAMES = 16

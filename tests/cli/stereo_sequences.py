@@ -4,9 +4,8 @@ from pathlib import Path
 
 from rbpf.cli import main
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
-from rbpf.validation.simulation.exposure import Imaging
-from rbpf.validation.simulation.images import simulate_images
-from rbpf.validation.simulation.textured_room import TexturedRoom
+from rbpf.validation.simulation.desk_and_room import TexturedRoom
+from rbpf.validation.simulation.images import Imaging, simulate_images
 
 RIG = RectifiedStereo(Pinhole(320, 240, 220.0, 220.0, 159.5, 119.5), 0.12)
 FRAMES = 8

@@ -20,10 +20,9 @@ from rbpf.systems.mono.video import run_images
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.run import run_images as run_pairs
-from rbpf.validation.simulation.exposure import Imaging
-from rbpf.validation.simulation.images import simulate_images
+from rbpf.validation.simulation.desk_and_room import TexturedDesk
+from rbpf.validation.simulation.images import Imaging, simulate_images
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
-from rbpf.validation.simulation.textured_desk import TexturedDesk
 from tests.cli.mono_sequences import CAMERA, FRAMES
 
 pytestmark = pytest.mark.slow

@@ -10,10 +10,8 @@ from rbpf.runs.measurement_files import read_feature_log
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.readers.images import open_images, open_stereo
 from rbpf.sensors.readers.images.calibration import read_calibration
-from rbpf.validation.simulation.exposure import Imaging
-from rbpf.validation.simulation.images import simulate_images
-from rbpf.validation.simulation.textured_desk import TexturedDesk
-from rbpf.validation.simulation.textured_room import TexturedRoom
+from rbpf.validation.simulation.desk_and_room import TexturedDesk, TexturedRoom
+from rbpf.validation.simulation.images import Imaging, simulate_images
 from tests.cli import stereo_sequences
 from tests.cli.mono_sequences import FRAMES, run, sentence, summary
 

@@ -8,9 +8,8 @@ import yaml
 
 from rbpf.cli import main
 from rbpf.sensors.camera import Pinhole
-from rbpf.validation.simulation.exposure import Imaging
-from rbpf.validation.simulation.images import simulate_images
-from rbpf.validation.simulation.textured_desk import TexturedDesk
+from rbpf.validation.simulation.desk_and_room import TexturedDesk
+from rbpf.validation.simulation.images import Imaging, simulate_images
 from tests.cli.mono_sequences import run, sentence, summary
 
 CAMERA = Pinhole(320, 240, 256.0, 256.0, 159.5, 119.5)

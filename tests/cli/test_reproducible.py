@@ -8,10 +8,8 @@ import pytest
 
 from rbpf.cli import main
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
-from rbpf.validation.simulation.exposure import Imaging
-from rbpf.validation.simulation.images import simulate_images
-from rbpf.validation.simulation.textured_desk import TexturedDesk
-from rbpf.validation.simulation.textured_room import TexturedRoom
+from rbpf.validation.simulation.desk_and_room import TexturedDesk, TexturedRoom
+from rbpf.validation.simulation.images import Imaging, simulate_images
 from tests.cli.run_outputs import outputs
 
 pytestmark = pytest.mark.slow

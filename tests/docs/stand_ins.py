@@ -15,10 +15,9 @@ import numpy as np
 
 from rbpf.cli import main
 from rbpf.sensors.readers.images import open_images, open_stereo
-from rbpf.validation.simulation.exposure import Imaging
-from rbpf.validation.simulation.images import simulate_images
+from rbpf.validation.simulation.desk_and_room import TexturedDesk
+from rbpf.validation.simulation.images import Imaging, simulate_images
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
-from rbpf.validation.simulation.textured_desk import TexturedDesk
 from tests.cli.mono_sequences import CAMERA as DESK_CAMERA
 from tests.cli.mono_sequences import render_desk
 from tests.readers.images.bags import film_images, film_pairs, recorded

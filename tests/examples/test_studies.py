@@ -20,14 +20,12 @@ from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.readers.images import open_stereo
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
-from rbpf.validation.simulation.exposure import Imaging
+from rbpf.validation.simulation.desk_and_room import TexturedDesk
 from rbpf.validation.simulation.features import STEREO, Measuring, simulate_features
-from rbpf.validation.simulation.images import simulate_images
-from rbpf.validation.simulation.lab_points import LabWorld
+from rbpf.validation.simulation.images import Imaging, simulate_images
+from rbpf.validation.simulation.lab import LabDrive, LabWorld, TexturedLab
 from rbpf.validation.simulation.point_worlds import DeskWorld
 from rbpf.validation.simulation.robot import RobotWorld
-from rbpf.validation.simulation.textured_desk import TexturedDesk
-from rbpf.validation.simulation.textured_lab import LabDrive, TexturedLab
 
 
 def honest(rng: np.random.Generator, scale: float = 1.0, steps: int = 60) -> Trial:

@@ -8,7 +8,7 @@ import pytest
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.readers.wheel_odometry import WheelOdometry, read_wheel_odometry
-from rbpf.validation.simulation.wheel_odometer import write_wheel_odometry
+from rbpf.validation.simulation.paths import write_wheel_odometry
 
 HEADER = "#stamp_ns,dx_m,dy_m,dyaw_rad,sigma_x_m,sigma_y_m,sigma_yaw_rad"
 ROWS = ["100,0,0,0,0,0,0", "200,1.0,0.0,1.5707963267948966,0.1,0.2,0.3", "300,2,0.5,0,0.1,0.2,0.3"]

@@ -7,8 +7,8 @@ import numpy as np
 from rbpf.lie import SE3
 from rbpf.sensors.calibration.boards import Board
 from rbpf.sensors.camera import Pinhole
-from rbpf.validation.simulation.furniture import Furniture
 from rbpf.validation.simulation.render import Renderer
+from rbpf.validation.simulation.textured_scene import Furniture
 from rbpf.validation.simulation.textures import wood
 
 BOARD = Board(9, 6, 0.024)

@@ -5,9 +5,9 @@ from functools import cache
 import numpy as np
 
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
-from rbpf.validation.simulation.exposure import Imaging, Shutter
+from rbpf.validation.simulation.desk_and_room import TexturedRoom
+from rbpf.validation.simulation.images import Imaging, Shutter
 from rbpf.validation.simulation.render import Renderer
-from rbpf.validation.simulation.textured_room import TexturedRoom
 
 RIG = RectifiedStereo(Pinhole(320, 240, 260.0, 260.0, 159.5, 119.5), 0.12)
 

@@ -11,9 +11,8 @@ from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.video import run_images
 from rbpf.validation.gtsam.mono_batch import adjust_run, score_batch
 from rbpf.validation.mono import Recording
-from rbpf.validation.simulation.exposure import Imaging
-from rbpf.validation.simulation.images import simulate_images
-from rbpf.validation.simulation.textured_desk import TexturedDesk
+from rbpf.validation.simulation.desk_and_room import TexturedDesk
+from rbpf.validation.simulation.images import Imaging, simulate_images
 
 CAMERA = Pinhole(320, 240, 256.0, 256.0, 159.5, 119.5)
 BOARD = Board(7, 4, 0.06)

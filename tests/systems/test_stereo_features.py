@@ -13,8 +13,7 @@ from rbpf.systems.stereo.config import OdometryConfig, RecoveryConfig, StereoCon
 from rbpf.systems.stereo.run import StereoRun, run_features
 from rbpf.validation.gtsam.camera import CameraEstimate, solve_features
 from rbpf.validation.simulation.features import MONO, STEREO, Measuring, simulate_features
-from rbpf.validation.simulation.lab_points import LabWorld
-from rbpf.validation.simulation.textured_lab import LabDrive
+from rbpf.validation.simulation.lab import LabDrive, LabWorld
 
 pytestmark = pytest.mark.slow
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from rbpf.lie import SE3
 from rbpf.sensors.feature_log import FeatureLog
-from rbpf.validation.simulation.scene import Scene
+from rbpf.validation.simulation.point_worlds import Scene
 
 
 def truth(log: FeatureLog, frame: int) -> np.ndarray:

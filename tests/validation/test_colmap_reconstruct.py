@@ -18,9 +18,8 @@ from rbpf.validation.colmap.cloud_distance import cloud_distance
 from rbpf.validation.colmap.compare import compare_with_path, compare_with_truth
 from rbpf.validation.colmap.pipeline import ReconstructionOptions
 from rbpf.validation.colmap.reconstruct import Reconstruction, reconstruct
-from rbpf.validation.simulation.exposure import Imaging
-from rbpf.validation.simulation.images import simulate_images
-from rbpf.validation.simulation.textured_desk import TexturedDesk
+from rbpf.validation.simulation.desk_and_room import TexturedDesk
+from rbpf.validation.simulation.images import Imaging, simulate_images
 from tests.systems import plane_sequences
 
 CAMERA = Pinhole(320, 240, 260.0, 260.0, 159.5, 119.5)

@@ -6,8 +6,8 @@ from scipy.integrate import cumulative_trapezoid
 
 from rbpf.errors import InputError
 from rbpf.lie import SE2
-from rbpf.validation.simulation import lab_plan
-from rbpf.validation.simulation.driven_paths import Drive, Move, along_corners
+from rbpf.validation.simulation import lab as lab_plan
+from rbpf.validation.simulation.paths import Drive, Move, along_corners
 
 CORNERS = [(0.0, 0.0), (4.0, 0.0), (4.0, 3.0), (1.0, 5.0)]
 

@@ -14,9 +14,8 @@ from rbpf.validation.report.annotated import FOUND, MISSED, Caption, drawn_size
 from rbpf.validation.report.mono_frames import RAY, draw_frame
 from rbpf.validation.report.mono_views import best_views
 from rbpf.validation.report.video_file import frame_rate, is_complete
-from rbpf.validation.simulation.exposure import Imaging
-from rbpf.validation.simulation.images import simulate_images
-from rbpf.validation.simulation.textured_desk import TexturedDesk
+from rbpf.validation.simulation.desk_and_room import TexturedDesk
+from rbpf.validation.simulation.images import Imaging, simulate_images
 
 
 @pytest.fixture(scope="module")

@@ -8,9 +8,8 @@ import pytest
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole
+from rbpf.validation.simulation.desk_and_room import TexturedDesk, TexturedRoom
 from rbpf.validation.simulation.render import Renderer, rotated_grid
-from rbpf.validation.simulation.textured_desk import TexturedDesk
-from rbpf.validation.simulation.textured_room import TexturedRoom
 from rbpf.validation.simulation.textured_scene import Chessboard, ImageWorld, Rectangle, TexturedScene, cast
 from rbpf.validation.simulation.textures import clouds, grey_levels
 

@@ -9,9 +9,8 @@ import pytest
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
-from rbpf.validation.simulation.exposure import Imaging
-from rbpf.validation.simulation.images import simulate_images
-from rbpf.validation.simulation.textured_desk import TexturedDesk
+from rbpf.validation.simulation.desk_and_room import TexturedDesk
+from rbpf.validation.simulation.images import Imaging, simulate_images
 from rbpf.validation.simulation.textured_scene import Rectangle, TexturedScene, stamps_ns
 
 cv2 = pytest.importorskip("cv2")

@@ -15,11 +15,9 @@ from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.readers.images import open_images, open_stereo
 from rbpf.sensors.readers.images.calibration import read_calibration
 from rbpf.validation.simulation import images, textured_scene
-from rbpf.validation.simulation.exposure import Imaging
-from rbpf.validation.simulation.images import simulate_images
+from rbpf.validation.simulation.desk_and_room import TexturedDesk, TexturedRoom
+from rbpf.validation.simulation.images import Imaging, simulate_images
 from rbpf.validation.simulation.render import Renderer
-from rbpf.validation.simulation.textured_desk import TexturedDesk
-from rbpf.validation.simulation.textured_room import TexturedRoom
 from rbpf.validation.simulation.textured_scene import ImageWorld, stamps_ns
 
 pytestmark = pytest.mark.slow

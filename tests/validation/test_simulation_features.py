@@ -11,10 +11,8 @@ from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.feature_log import FeatureLog
 from rbpf.validation.simulation.features import MONO, STEREO, Measuring, simulate_features
-from rbpf.validation.simulation.lab_points import LabWorld
-from rbpf.validation.simulation.point_worlds import DeskWorld
-from rbpf.validation.simulation.scene import PointWorld, Scene
-from rbpf.validation.simulation.textured_lab import LabDrive
+from rbpf.validation.simulation.lab import LabDrive, LabWorld
+from rbpf.validation.simulation.point_worlds import DeskWorld, PointWorld, Scene
 from tests.validation.feature_logs import StillCamera, errors, likely, sightings, truth
 
 CAMERAS = [MONO, STEREO]

@@ -8,8 +8,7 @@ import pytest
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
-from rbpf.validation.simulation.point_worlds import DeskWorld
-from rbpf.validation.simulation.scene import PointWorld, Scene
+from rbpf.validation.simulation.point_worlds import DeskWorld, PointWorld, Scene
 
 EXACT = Measuring(dropout=0.0, turnover=0.0)
 

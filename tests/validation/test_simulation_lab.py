@@ -13,20 +13,23 @@ from rbpf.lie import SE2, SE3
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.readers.images import open_images
 from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
-from rbpf.validation.simulation import lab_points
-from rbpf.validation.simulation.exposure import Imaging
+from rbpf.validation.simulation import lab as lab_points
 from rbpf.validation.simulation.features import Measuring, simulate_features
-from rbpf.validation.simulation.images import simulate_images
-from rbpf.validation.simulation.lab_furniture import furnished
-from rbpf.validation.simulation.lab_plan import DOOR_M, LINTEL_M, PARTITION_M, RATE_HZ, SIZE_M
-from rbpf.validation.simulation.lab_points import LabWorld
-from rbpf.validation.simulation.render import Renderer
-from rbpf.validation.simulation.textured_lab import (
+from rbpf.validation.simulation.images import Imaging, simulate_images
+from rbpf.validation.simulation.lab import (
+    DOOR_M,
+    LINTEL_M,
+    PARTITION_M,
+    RATE_HZ,
     ROBOT_FROM_CAMERA,
+    SIZE_M,
     LabDrive,
+    LabWorld,
     TexturedLab,
+    furnished,
     world_from_camera,
 )
+from rbpf.validation.simulation.render import Renderer
 from rbpf.validation.simulation.textured_scene import TexturedScene, cast
 
 pytestmark = pytest.mark.slow

@@ -9,10 +9,17 @@ import pytest
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.feature_log import FeatureLog
-from rbpf.validation.simulation.camera_paths import Wave, eased, looking, slowed, speeds
 from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
-from rbpf.validation.simulation.point_worlds import DeskWorld
-from rbpf.validation.simulation.scene import PointWorld, Scene, hidden, inside, on_faces, populated
+from rbpf.validation.simulation.paths import Wave, eased, looking, slowed, speeds
+from rbpf.validation.simulation.point_worlds import (
+    DeskWorld,
+    PointWorld,
+    Scene,
+    hidden,
+    inside,
+    on_faces,
+    populated,
+)
 
 DESK = DeskWorld()
 SEEDS = range(4)

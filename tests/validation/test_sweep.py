@@ -199,9 +199,8 @@ def test_images_are_swept_with_their_known_points(tmp_path):
 def test_pairs_of_images_are_swept(tmp_path):
     """With and without the map: the same odometry, another filter."""
     from rbpf.sensors.camera import Pinhole, RectifiedStereo
-    from rbpf.validation.simulation.exposure import Imaging
-    from rbpf.validation.simulation.images import simulate_images
-    from rbpf.validation.simulation.textured_room import TexturedRoom
+    from rbpf.validation.simulation.desk_and_room import TexturedRoom
+    from rbpf.validation.simulation.images import Imaging, simulate_images
 
     rig = RectifiedStereo(Pinhole(320, 240, 220.0, 220.0, 159.5, 119.5), 0.12)
     world = TexturedRoom(frames=5, rate_hz=5.0)

@@ -8,10 +8,9 @@ import pytest
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3
 from rbpf.sensors.readers.wheel_odometry import WheelOdometry
-from rbpf.validation.simulation.lab_plan import RATE_HZ
-from rbpf.validation.simulation.textured_lab import ROBOT_FROM_CAMERA, LabDrive, world_from_camera
+from rbpf.validation.simulation.lab import RATE_HZ, ROBOT_FROM_CAMERA, LabDrive, world_from_camera
+from rbpf.validation.simulation.paths import WheelOdometer
 from rbpf.validation.simulation.textured_scene import stamps_ns
-from rbpf.validation.simulation.wheel_odometer import WheelOdometer
 
 EXACT = WheelOdometer(scale=0.0, inequality=0.0, wheelbase_error=0.0, slip_m=0.0)
 TRAVELLED = LabDrive().travelled()

@@ -1,31 +1,436 @@
-"""Simulates what a camera sees of a textured world: an image sequence on disk, with ground truth and calibration."""
+"""Takes pictures of a textured world: an image sequence on disk, with ground truth and calibration.
+
+The sequence is an EuRoC ASL folder (M. Burri et al., The EuRoC micro aerial vehicle datasets, 2016):
+
+    mav0/cam0, mav0/cam1       data/<stamp>.png or .jpg, data.csv, sensor.yaml; the body is the left camera
+    mav0/depth0                the left camera's depth, 16 bits, 1/5000 m, 0 where there is none or too much
+    mav0/state_groundtruth_estimate0/data.csv
+    camera.yaml                the left camera, and the baseline of a stereo pair
+    known_points.csv           corners of the first image whose positions are given
+"""
 
 import os
-from collections.abc import Callable
+import shutil
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from rbpf.errors import InputError
+from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
-from rbpf.validation.simulation.asl import (
-    coded_depth,
-    image_path,
-    whole_folder,
-    write_calibration,
-    write_image,
-    write_sensor,
-    write_truth,
+from rbpf.sensors.readers.images.calibration import model_of
+from rbpf.validation.simulation.limits import (
+    check_counts,
+    check_fractions,
+    check_not_negative,
+    check_positive,
 )
-from rbpf.validation.simulation.exposure import Imaging, Shutter
-from rbpf.validation.simulation.known_corners import known_corners
+from rbpf.validation.simulation.paths import Wave, write_wheel_odometry
 from rbpf.validation.simulation.render import Renderer
-from rbpf.validation.simulation.textured_scene import ImageWorld, TexturedScene
-from rbpf.validation.simulation.wheel_odometer import write_wheel_odometry
+from rbpf.validation.simulation.textured_scene import ImageWorld, TexturedScene, cast
+
+DRIFT_HZ = 0.1, 0.5
+
+PROBES = 12, 16
+"""Rows and columns of pixels at which the motion during an exposure is measured."""
+
+MOST_RAYS = 8
+"""Along each side of a pixel: more than 64 px of motion during an exposure is rendered with gaps."""
+
+
+@dataclass(frozen=True)
+class Imaging:
+    """How pictures are taken, and what is given along with them.
+
+    The defaults are those of a small camera indoors: an exposure of a hundredth of a second, the noise of a raised
+    gain, an automatic exposure, a lens that is darker in the corners. `examples/studies/mono_realism.py` compares what active
+    search finds with them with real recordings.
+
+    Attributes:
+        noise_std: of the sensor, grey levels.
+        exposure_drift: greatest change of the exposure, as a fraction; it goes up and down within seconds.
+        lens_px: standard deviation of the lens's point spread; 0 is sharper than any lens.
+        blur_s: the shutter is open this long, half before and half after the stamp.
+        vignetting: fraction of the light that is missing in the corner farthest from the principal point.
+        blackout: frames in which the light is out, counted from 0.
+        grid: rays per pixel along each side.
+        depth: whether depth images are written.
+        jpeg: quality of JPEG files, 1 to 100; 0 writes PNG, which loses nothing.
+        known: number of corners in the first image whose positions are given, at least 4; 0 for none.
+        known_std_m: standard deviation of these positions, the root of their covariance's trace.
+        known_exact: leave the positions without their error.
+    """
+
+    noise_std: float = 3.0
+    exposure_drift: float = 0.15
+    lens_px: float = 0.5
+    blur_s: float = 0.01
+    vignetting: float = 0.2
+    blackout: Sequence[int] = ()
+    grid: int = 2
+    depth: bool = False
+    jpeg: int = 0
+    known: int = 6
+    known_std_m: float = 0.001
+    known_exact: bool = False
+
+    def __post_init__(self) -> None:
+        """Checks that the numbers make sense."""
+        check_counts(self, {"grid": 1, "known": 0, "jpeg": 0})
+        if self.jpeg > 100:
+            raise InputError(f"jpeg must be a quality of 1 to 100, or 0 for PNG, got {self.jpeg}")
+        check_not_negative(self, "noise_std", "lens_px", "blur_s")
+        check_fractions(self, "exposure_drift", "vignetting")
+        check_positive(self, "known_std_m")
+        if 0 < self.known < 4:
+            raise InputError(f"known must be at least 4 points, or 0 for none, got {self.known}")
+        if self.known and 0 in self.blackout:
+            raise InputError(
+                "blackout names frame 0, in which the known points are seen: leave it out or set known = 0"
+            )
+
+    @property
+    def suffix(self) -> str:
+        """Of the images' files."""
+        return ".jpg" if self.jpeg else ".png"
+
+    def check_frames(self, frames: int) -> None:
+        """Refuses a blackout of frames that there are not."""
+        wrong = [frame for frame in self.blackout if not 0 <= frame < frames]
+        if wrong:
+            raise InputError(f"blackout names frame {wrong[0]}, but the frames are 0 to {frames - 1}")
+
+
+class Shutter:
+    """Takes the pictures of a scene, in any order: a frame's noise depends on nothing but the seed."""
+
+    def __init__(
+        self,
+        scene: TexturedScene,
+        imaging: Imaging,
+        camera: Pinhole,
+        renderer: Renderer,
+        rng: np.random.Generator,
+    ) -> None:
+        """Draws how the exposure drifts.
+
+        Args:
+            scene: the world.
+            imaging: the options.
+            camera: of each picture.
+            renderer: of the same.
+            rng: generator.
+        """
+        self._scene, self._imaging, self._camera, self._renderer = scene, imaging, camera, renderer
+        frames = np.arange(len(scene.stamps_ns))
+        seconds = 1e-9 * (scene.stamps_ns - scene.stamps_ns[0])
+        self._gain = 1.0 + Wave.random(np.array([imaging.exposure_drift]), DRIFT_HZ, rng)(seconds)[:, 0]
+        self._gain[list(imaging.blackout)] = 0.0
+        before, after = np.maximum(frames - 1, 0), np.minimum(frames + 1, frames[-1])
+        poses = scene.world_from_camera
+        lapse = np.maximum(seconds[after] - seconds[before], np.finfo(float).tiny)[:, None]
+        self._rates = SE3.local(poses[before], poses[after]) / lapse
+        self.velocities = (SE3.translation(poses[after]) - SE3.translation(poses[before])) / lapse
+        """(T, 3) of the camera in the world, m/s."""
+        self._vignette = _vignette(camera, imaging.vignetting)
+        rows, columns = (
+            (np.arange(count) + 0.5) / count * size - 0.5
+            for count, size in zip(PROBES, (camera.height, camera.width), strict=True)
+        )
+        self._probe = camera.unproject(np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2))
+        self._seeds = rng.integers(2**63, size=len(frames))
+
+    def images(self, frame: int, baseline_m: float | None = None) -> list[np.ndarray]:
+        """Pictures (H, W) uint8 of a frame: one, or two with a second camera so far to the right."""
+        rng = np.random.default_rng(self._seeds[frame])
+        poses = self._poses(frame, rng)
+        views = [poses]
+        if baseline_m is not None:
+            views.append(SE3.compose(poses, SE3.exp([0.0, 0.0, 0.0, baseline_m, 0.0, 0.0])))
+        return [self._develop(self._renderer.image(view), self._gain[frame], rng) for view in views]
+
+    def _poses(self, frame: int, rng: np.random.Generator) -> np.ndarray:
+        """(K, 7) poses while the shutter is open: K is a square, and as great as the motion in pixels."""
+        middle = self._scene.world_from_camera[frame]
+        half = 0.5 * self._imaging.blur_s * self._rates[frame]
+        travel = self._travel(middle, half)
+        if travel == 0.0:
+            return middle[None]
+        side = int(np.clip(np.ceil(np.sqrt(travel)), self._imaging.grid, max(self._imaging.grid, MOST_RAYS)))
+        # The renderer deals the rays of a pixel out in order of their columns, which must not follow the time.
+        moment = (rng.permutation(side * side) + 0.5) / (side * side)
+        return SE3.retract(middle, (2.0 * moment - 1.0)[:, None] * half)
+
+    def _travel(self, middle: np.ndarray, half: np.ndarray) -> float:
+        """Greatest distance [px] that what is seen moves from middle ⊖ half to middle ⊕ half."""
+        if not half.any():
+            return 0.0
+        depth, row = cast(self._scene.rectangles, middle, self._probe)
+        ray = np.concatenate([self._probe, np.ones((len(self._probe), 1))], axis=1)[row >= 0]
+        points = SE3.transform(middle, depth[row >= 0, None] * ray)
+        local = SE3.inverse_transform(SE3.retract(middle, np.stack([-half, half])[:, None]), points)
+        seen = self._camera.visible(local).all(axis=0)
+        start, end = self._camera.project(local[:, seen])
+        return float(np.linalg.norm(end - start, axis=-1).max(initial=0.0))
+
+    def _develop(self, light: np.ndarray, gain: float, rng: np.random.Generator) -> np.ndarray:
+        """Grey levels (H, W) uint8 of what the sensor receives."""
+        import cv2
+
+        lens = self._imaging.lens_px
+        focused = np.asarray(cv2.GaussianBlur(light, (0, 0), lens)) if lens > 0.0 else light
+        signal = focused * (gain * self._vignette)
+        if self._imaging.noise_std > 0.0:
+            signal += self._imaging.noise_std * rng.standard_normal(signal.shape, dtype=np.float32)
+        return np.clip(np.rint(signal), 0, 255).astype(np.uint8)
+
+
+def _vignette(camera: Pinhole, fraction: float) -> np.ndarray:
+    """(H, W) float32 factors that fall with the square of the distance from the principal point."""
+    rows, columns = np.indices((camera.height, camera.width))
+    square = (columns - camera.cx) ** 2 + (rows - camera.cy) ** 2
+    return (1.0 - fraction * square / square.max()).astype(np.float32)
+
+
+MIDDLE = 0.15
+"""The corners keep this fraction of the image's size from its border: they stay in view when the camera begins to move."""
+
+FLAT = 0.025
+"""All within this fraction of the image's width of a corner lies in one plane: its patch can be warped."""
+
+THICK_M, PARALLEL = 0.005, 0.01
+"""Sheets nearer to each other than this, with normals nearer than this [rad], lie in one plane."""
+
+CANDIDATES, QUALITY = 300, 0.01
+"""Most corners to look for, and the least quality of one, as a fraction of the best (J. Shi, C. Tomasi 1994)."""
+
+STRONGEST = 0.5
+"""Fraction of the corners found that are strong enough, if they are as many as asked for."""
+
+LEAST_SPREAD = 0.05
+"""Corners are on a line if they extend, in the image, less than this fraction of their length to the side."""
+
+
+def known_corners(
+    scene: TexturedScene, renderer: Renderer, camera: Pinhole, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Strong corners spread over the middle of the first image; the first few of them spread as well as all.
+
+    Args:
+        scene: the world.
+        renderer: of its pictures.
+        camera: that takes them.
+        count: how many, M.
+
+    Returns:
+        Pixels (M, 2) in the first image, and positions (M, 3) in the world, m.
+
+    Raises:
+        InputError: there are too few, or they lie on a line.
+    """
+    import cv2
+
+    # Which rectangles lie in one plane: each gets the number of the first one in its plane.
+    rectangles, pose = scene.rectangles, scene.world_from_camera[0]
+    normal = np.array([np.cross(r.across, r.down) for r in rectangles])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    corner = np.array([r.corner for r in rectangles])
+    apart = np.einsum("rk,rqk->rq", normal, corner - corner[:, None])
+    turned = np.linalg.norm(np.cross(normal[:, None], normal), axis=-1)
+    plane = ((np.abs(apart) < THICK_M) & (turned < PARALLEL)).argmax(axis=1)
+    seen = renderer.depth(pose)[1]
+    planes = np.where(seen >= 0, plane[seen], -1)
+    # Corners are looked for in the middle, where all around lies in one plane.
+    side = 2 * round(FLAT * camera.width) + 1
+    window, label = np.ones((side, side), dtype=np.uint8), planes.astype(np.float32)
+    flat = cv2.erode(label, window) == cv2.dilate(label, window)
+    middle = np.zeros(planes.shape, dtype=bool)
+    top, left = (round(MIDDLE * size) for size in planes.shape)
+    middle[top:-top, left:-left] = True
+    usable = np.asarray(flat & middle & (planes >= 0)).astype(np.uint8)
+    found = cv2.goodFeaturesToTrack(
+        renderer.image(pose), CANDIDATES, QUALITY, FLAT * camera.width, mask=usable, blockSize=5
+    )
+    px = np.zeros((0, 2)) if found is None else np.asarray(found, dtype=float).reshape(-1, 2)
+    if len(px) < count:
+        raise InputError(
+            f"the first image of the {scene.name} has {len(px)} corners that can be known, expected {count}: "
+            "ask for fewer known points or give the world more contrast"
+        )
+    # Of the strongest those that are farthest from any stronger one (M. Brown, R. Szeliski and S. Winder, Multi-image
+    # matching using multi-scale oriented patches, 2005); the farthest first.
+    px = px[: max(count, round(STRONGEST * len(px)))]
+    distance = np.linalg.norm(px[:, None] - px, axis=-1)
+    stronger = np.where(np.tri(len(px), k=-1, dtype=bool), distance, np.inf)
+    px = px[np.argsort(-stronger.min(axis=1), kind="stable")[:count]]
+    extent = np.linalg.svd(px - px.mean(axis=0), compute_uv=False)
+    if count > 2 and extent[1] < LEAST_SPREAD * extent[0]:
+        raise InputError(
+            f"the known points of the {scene.name} lie on a line in the first image: use another seed or more points"
+        )
+    uv = camera.unproject(px)
+    depth, _ = cast(rectangles, pose, uv)
+    local = depth[:, None] * np.concatenate([uv, np.ones((count, 1))], axis=1)
+    return px, SE3.transform(pose, local)
+
+
+DEPTH_PER_M = 5000.0
+"""Of a depth image, as TUM's RGB-D recordings have it: out to 13 m."""
+
+COMPRESSION = 1
+"""Of PNG files, 0 to 9: noise does not become much smaller by trying harder."""
+
+TRUTH_COLUMNS = [
+    "#timestamp",
+    *[f" p_RS_R_{axis} [m]" for axis in "xyz"],
+    *[f" q_RS_{axis} []" for axis in "wxyz"],
+    *[f" v_RS_R_{axis} [m s^-1]" for axis in "xyz"],
+    *[f" b_w_RS_S_{axis} [rad s^-1]" for axis in "xyz"],
+    *[f" b_a_RS_S_{axis} [m s^-2]" for axis in "xyz"],
+]
+
+
+@contextmanager
+def whole_folder(folder: Path) -> Iterator[Path]:
+    """A folder to write into, which becomes `folder` when all is done, and vanishes if it is interrupted.
+
+    Raises:
+        InputError: there is something at `folder` already.
+    """
+    if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
+        raise InputError(f"{folder} exists already: delete it or choose another folder for the images")
+    partial = folder.with_name(folder.name + ".partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    try:
+        partial.mkdir(parents=True)
+    except OSError as error:
+        raise InputError(f"cannot make the folder {partial} for the images: {error.strerror}") from error
+    try:
+        yield partial
+        partial.replace(folder)
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+
+
+def image_path(folder: Path, sensor: str, stamp_ns: int, suffix: str = ".png") -> Path:
+    """Where an image of a sensor (cam0, cam1, depth0) belongs."""
+    return folder / "mav0" / sensor / "data" / f"{stamp_ns}{suffix}"
+
+
+def write_image(path: Path, image: np.ndarray, quality: int = 0) -> None:
+    """A file of an image (H, W) uint8 or uint16; its folder has to be there.
+
+    Args:
+        path: with the suffix .png or .jpg.
+        image: grey levels.
+        quality: of a JPEG file, 1 to 100.
+    """
+    import cv2
+
+    how = [cv2.IMWRITE_JPEG_QUALITY, quality]
+    if path.suffix == ".png":
+        how = [cv2.IMWRITE_PNG_COMPRESSION, COMPRESSION]
+        if image.dtype == np.uint8:
+            # What noise leaves to compress is found by Huffman's code alone, in less time.
+            how += [cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY]
+    _, encoded = cv2.imencode(path.suffix, image, how)
+    path.write_bytes(encoded.tobytes())
+
+
+def coded_depth(depth: np.ndarray) -> np.ndarray:
+    """A depth image (H, W) uint16 of depths [m]."""
+    steps = np.rint(DEPTH_PER_M * depth)
+    return np.where(steps <= np.iinfo(np.uint16).max, steps, 0.0).astype(np.uint16)
+
+
+def write_sensor(
+    folder: Path,
+    sensor: str,
+    camera: Pinhole,
+    offset_m: float,
+    stamps_ns: np.ndarray,
+    comment: str,
+    suffix: str = ".png",
+) -> None:
+    """A sensor's folder with its calibration and its index; the images are written by others.
+
+    Args:
+        folder: of the sequence.
+        sensor: cam0, cam1 or depth0.
+        camera: its calibration.
+        offset_m: of the sensor from the body along the body's x axis.
+        stamps_ns: (T,) of the images.
+        comment: what it is, one line.
+        suffix: of the images' files.
+    """
+    place = folder / "mav0" / sensor
+    (place / "data").mkdir(parents=True)
+    rows = "".join(f"{stamp},{stamp}{suffix}\n" for stamp in stamps_ns.tolist())
+    (place / "data.csv").write_text("#timestamp [ns],filename\n" + rows, encoding="utf-8")
+    seconds = 1e-9 * float(stamps_ns[-1] - stamps_ns[0])
+    rate = (len(stamps_ns) - 1) / seconds if seconds else 0.0
+    matrix = np.eye(4)
+    matrix[0, 3] = offset_m
+    # EuRoC has four coefficients; a fifth is written only where it says something.
+    distortion = camera.distortion if any(camera.distortion[4:]) else camera.distortion[:4]
+    lines = [
+        "sensor_type: camera",
+        f"comment: {comment}",
+        "T_BS:",
+        "  cols: 4",
+        "  rows: 4",
+        f"  data: {matrix.ravel().tolist()}",
+        f"rate_hz: {rate:.6g}",
+        f"resolution: [{camera.width}, {camera.height}]",
+        "camera_model: pinhole",
+        f"intrinsics: {[float(x) for x in camera.params[:4]]}",
+        f"distortion_model: {camera.distortion_model}",
+        f"distortion_coefficients: {[float(x) for x in distortion]}",
+    ]
+    if sensor.startswith("depth"):
+        lines.append(f"depth_per_m: {DEPTH_PER_M}")
+    (place / "sensor.yaml").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def write_truth(
+    folder: Path, stamps_ns: np.ndarray, world_from_body: np.ndarray, velocities: np.ndarray
+) -> None:
+    """Ground truth: poses (T, 7) and velocities (T, 3) in the world [m/s]; there is no gyroscope: its biases are 0."""
+    place = folder / "mav0" / "state_groundtruth_estimate0"
+    place.mkdir(parents=True)
+    quat_xyzw = world_from_body[:, :4]
+    position = SE3.translation(world_from_body)
+    wxyz = np.roll(quat_xyzw, 1, axis=1)
+    table = np.concatenate([position, wxyz, velocities, np.zeros((len(stamps_ns), 6))], axis=1)
+    rows = [
+        ",".join([str(stamp), *(f"{x:.12g}" for x in row)])
+        for stamp, row in zip(stamps_ns.tolist(), table, strict=True)
+    ]
+    (place / "data.csv").write_text("\n".join([",".join(TRUTH_COLUMNS), *rows]) + "\n", encoding="utf-8")
+
+
+def write_calibration(folder: Path, camera: Pinhole, baseline_m: float | None) -> None:
+    """camera.yaml: the (left) camera, and the baseline of a stereo pair."""
+    fx, fy, cx, cy = camera.params[:4].tolist()
+    lines = [
+        f"model: {model_of(camera)}",
+        *[f"{name}: {value}" for name, value in {"fx": fx, "fy": fy, "cx": cx, "cy": cy}.items()],
+        f"width: {camera.width}",
+        f"height: {camera.height}",
+        f"distortion: {[float(x) for x in camera.distortion]}  # {', '.join(camera.lens.coefficient_names)} (OpenCV)",
+    ]
+    if baseline_m is not None:
+        lines.append(f"baseline_m: {float(baseline_m)}")
+    (folder / "camera.yaml").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
 
 OnFrame = Callable[[int, int], None]
-"""Told how many images are done, and how many there will be."""
+"""Called with how many images are done, and how many there will be."""
 
 
 def simulate_images(
@@ -58,13 +463,15 @@ def simulate_images(
 
     Example:
         >>> import tempfile
-        >>> from rbpf.validation.simulation.textured_desk import TexturedDesk
+        >>> from rbpf.validation.simulation.desk_and_room import TexturedDesk
         >>> camera = Pinhole(80, 60, 50.0, 50.0, 39.5, 29.5)
         >>> folder = Path(tempfile.mkdtemp()) / "desk"
         >>> simulate_images(TexturedDesk(frames=2, texel_m=0.01), Imaging(), camera, folder, seed=0)
         >>> len(list((folder / "mav0" / "cam0" / "data").glob("*.png")))
         2
     """
+    import yaml
+
     rng = np.random.default_rng(seed)
     scene = world.build(rng)
     imaging.check_frames(len(scene.stamps_ns))
@@ -76,13 +483,36 @@ def simulate_images(
     renderer = Renderer(scene.rectangles, left, imaging.grid)
     shutter = Shutter(scene, imaging, left, renderer, rng)
     with whole_folder(folder) as partial:
-        _write_sensors(partial, scene, imaging, left, baseline_m)
+        sensors = {"cam0": 0.0}
+        if baseline_m is not None:
+            sensors["cam1"] = baseline_m
+        if imaging.depth:
+            sensors["depth0"] = 0.0
+        for sensor, offset_m in sensors.items():
+            about = f"simulated {scene.name}, {sensor}"
+            suffix = ".png" if sensor == "depth0" else imaging.suffix
+            write_sensor(partial, sensor, left, offset_m, scene.stamps_ns, about, suffix)
         write_calibration(partial, left, baseline_m)
         write_truth(partial, scene.stamps_ns, scene.world_from_camera, shutter.velocities)
         if imaging.known:
-            _write_known(partial, scene, imaging, left, renderer, rng)
+            px, positions = known_corners(scene, renderer, left, imaging.known)
+            per_axis = 0.0 if imaging.known_exact else imaging.known_std_m / np.sqrt(3.0)
+            positions = positions + per_axis * rng.standard_normal(positions.shape)
+            lines = ["id,u_px,v_px,x_m,y_m,z_m,sigma_m"]
+            for name, (uv, xyz) in enumerate(zip(px, positions, strict=True), start=1):
+                numbers = [f"{x:.4f}" for x in uv] + [f"{x:.6f}" for x in xyz]
+                lines.append(",".join([str(name), *numbers, f"{imaging.known_std_m:g}"]))
+            (partial / "known_points.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
         if scene.boards:
-            _write_boards(partial, scene)
+            # Poses as [qx, qy, qz, qw, x, y, z].
+            names = ("columns", "rows", "square_m")
+            boards = [
+                {name: getattr(board, name) for name in names}
+                | {"world_from_board": board.world_from_board.tolist()}
+                for board in scene.boards
+            ]
+            text = yaml.safe_dump(boards, sort_keys=False)
+            (partial / "chessboard.yaml").write_text(text, encoding="utf-8")
         if scene.odometry is not None:
             write_wheel_odometry(partial, scene.odometry)
 
@@ -109,52 +539,3 @@ def _in_parallel(take: Callable[[int], None], frames: int, on_frame: OnFrame | N
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
-
-
-def _write_sensors(
-    folder: Path, scene: TexturedScene, imaging: Imaging, camera: Pinhole, baseline_m: float | None
-) -> None:
-    sensors = {"cam0": 0.0}
-    if baseline_m is not None:
-        sensors["cam1"] = baseline_m
-    if imaging.depth:
-        sensors["depth0"] = 0.0
-    for sensor, offset_m in sensors.items():
-        about = f"simulated {scene.name}, {sensor}"
-        suffix = ".png" if sensor == "depth0" else imaging.suffix
-        write_sensor(folder, sensor, camera, offset_m, scene.stamps_ns, about, suffix)
-
-
-def _write_known(
-    folder: Path,
-    scene: TexturedScene,
-    imaging: Imaging,
-    camera: Pinhole,
-    renderer: Renderer,
-    rng: np.random.Generator,
-) -> None:
-    """known_points.csv."""
-    known = known_corners(scene, renderer, camera, imaging.known)
-    per_axis = 0.0 if imaging.known_exact else imaging.known_std_m / np.sqrt(3.0)
-    error = per_axis * rng.standard_normal(known.positions.shape)
-    lines = ["id,u_px,v_px,x_m,y_m,z_m,sigma_m"]
-    for name, (px, position) in enumerate(zip(known.px, known.positions + error, strict=True), start=1):
-        numbers = [f"{x:.4f}" for x in px] + [f"{x:.6f}" for x in position]
-        lines.append(",".join([str(name), *numbers, f"{imaging.known_std_m:g}"]))
-    (folder / "known_points.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
-def _write_boards(folder: Path, scene: TexturedScene) -> None:
-    """chessboard.yaml: one entry per board, poses as [qx, qy, qz, qw, x, y, z]."""
-    import yaml
-
-    boards = [
-        {
-            "columns": board.columns,
-            "rows": board.rows,
-            "square_m": board.square_m,
-            "world_from_board": board.world_from_board.tolist(),
-        }
-        for board in scene.boards
-    ]
-    (folder / "chessboard.yaml").write_text(yaml.safe_dump(boards, sort_keys=False), encoding="utf-8")

@@ -69,56 +69,24 @@ def simulate_robot(world: RobotWorld, folder: Path, seed: int) -> None:
     """
     rng = np.random.default_rng(seed)
     folder.mkdir(parents=True, exist_ok=True)
-    truth = _path(world)
-    points = _landmarks(world, rng)
-    _write_truth(folder, truth, points)
-    _write_odometry(world, folder, truth, rng)
-    _write_observations(world, folder, truth, points, rng)
-    text = (
-        "robot_from_sensor: {x_m: 0, y_m: 0, z_m: 0, yaw_deg: 0, pitch_deg: 0, roll_deg: 0}\n"
-        f"std: {{range_m: {world.std_range_m}, yaw_deg: {world.std_angle_deg}, pitch_deg: {world.std_angle_deg}}}\n"
-        "positive_pitch: up\n"
-    )
-    write_text(folder / "sensor.yaml", text)
-
-
-def simulated_log(world: RobotWorld, seed: int) -> RobotLog:
-    """What `simulate_robot` writes, in memory."""
-    with TemporaryDirectory() as folder:
-        simulate_robot(world, Path(folder), seed)
-        return open_log(folder)
-
-
-def _path(world: RobotWorld) -> np.ndarray:
-    """(T, 7) true poses, starting at the origin; all lie in the plane z = 0 unless spatial."""
+    # True poses (T, 7), starting at the origin, and landmarks in a box around the circle's centre: in the plane z = 0
+    # unless spatial.
     phase = 2 * np.pi * world.laps * np.arange(world.steps) / (world.steps - 1)
     wave = np.sin(3 * phase) if world.spatial else np.zeros_like(phase)
     position = np.stack(
         [world.radius_m * np.sin(phase), world.radius_m * (1 - np.cos(phase)), 0.5 * wave], axis=-1
     )
-    return SE3.from_ypr(position, phase, 0.1 * wave, 0.2 * wave)
-
-
-def _landmarks(world: RobotWorld, rng: np.random.Generator) -> np.ndarray:
-    """(M, 3) uniform in a box around the circle's centre, flat unless spatial."""
+    truth = SE3.from_ypr(position, phase, 0.1 * wave, 0.2 * wave)
     size = np.array([world.extent_m, world.extent_m, 2.0 if world.spatial else 0.0])
-    centre = np.array([0.0, world.radius_m, 0.0])
-    return centre + rng.uniform(-1, 1, (world.landmarks, 3)) * size
-
-
-def _write_truth(folder: Path, truth: np.ndarray, points: np.ndarray) -> None:
+    points = [0.0, world.radius_m, 0.0] + rng.uniform(-1, 1, (world.landmarks, 3)) * size
     yaw, pitch, roll = SE3.ypr(truth)
-    rows = np.column_stack([SE3.translation(truth), yaw, pitch, roll]).tolist()
+    table = np.column_stack([SE3.translation(truth), yaw, pitch, roll]).tolist()
     header = ["step", "x_m", "y_m", "z_m", "yaw_rad", "pitch_rad", "roll_rad"]
-    write_csv(folder / "robot_path_groundtruth.csv", header, ([t, *row] for t, row in enumerate(rows)))
+    write_csv(folder / "robot_path_groundtruth.csv", header, ([t, *row] for t, row in enumerate(table)))
     header = ["id", "x_m", "y_m", "z_m"]
-    write_csv(
-        folder / "landmarks_groundtruth.csv", header, ([i, *p] for i, p in enumerate(points.tolist(), 1))
-    )
-
-
-def _write_odometry(world: RobotWorld, folder: Path, truth: np.ndarray, rng: np.random.Generator) -> None:
-    """Noise is added to the increment's coordinates, as the log's covariance says."""
+    named = ([i, *place] for i, place in enumerate(points.tolist(), 1))
+    write_csv(folder / "landmarks_groundtruth.csv", header, named)
+    # Odometry: noise is added to the increment's coordinates, as the log's covariance says.
     delta = SE3.between(truth[:-1], truth[1:])
     yaw, pitch, roll = SE3.ypr(delta)
     turn = np.deg2rad(world.std_rotation_deg)
@@ -133,13 +101,8 @@ def _write_odometry(world: RobotWorld, folder: Path, truth: np.ndarray, rng: np.
         header = ["step", "dx_m", "dy_m", "dphi_rad", "cxx", "cxy", "cxp", "cyy", "cyp", "cpp"]
     noisy = exact + std * rng.standard_normal(exact.shape)
     cov = np.diag(std**2)[np.triu_indices(std.size)].tolist()
-    rows = ([t, *row, *cov] for t, row in enumerate(noisy.tolist(), 1))
-    write_csv(folder / "odometry.csv", header, rows)
-
-
-def _write_observations(
-    world: RobotWorld, folder: Path, truth: np.ndarray, points: np.ndarray, rng: np.random.Generator
-) -> None:
+    write_csv(folder / "odometry.csv", header, ([t, *row, *cov] for t, row in enumerate(noisy.tolist(), 1)))
+    # Range, yaw and pitch of the landmarks that are near enough and in view.
     turn = np.deg2rad(world.std_angle_deg)
     std = np.array([world.std_range_m, turn, turn if world.spatial else 0.0])
     view = np.deg2rad(world.half_field_of_view_deg)
@@ -149,25 +112,25 @@ def _write_observations(
         z = np.stack(
             [np.sqrt(x * x + y * y + h * h), np.arctan2(y, x), np.arctan2(h, np.hypot(x, y))], axis=-1
         )
-        seen = (
-            (z[:, 0] <= world.max_range_m)
-            & (np.abs(z[:, 1]) <= view)
-            & (np.abs(z[:, 2]) <= view)
-            & (z[:, 0] > 0.2)
-        )
+        near = (z[:, 0] <= world.max_range_m) & (z[:, 0] > 0.2)
+        seen = near & (np.abs(z[:, 1]) <= view) & (np.abs(z[:, 2]) <= view)
         noisy = z[seen] + std * rng.standard_normal((int(seen.sum()), 3))
         rows.extend(
             [t, i + 1, *row, *std]
             for i, row in zip(np.flatnonzero(seen).tolist(), noisy.tolist(), strict=True)
         )
-    header = [
-        "step",
-        "landmark_id",
-        "range_m",
-        "yaw_rad",
-        "pitch_rad",
-        "std_range_m",
-        "std_yaw_rad",
-        "std_pitch_rad",
-    ]
-    write_csv(folder / "observations.csv", header, rows)
+    header = ["step", "landmark_id", "range_m", "yaw_rad", "pitch_rad"]
+    write_csv(folder / "observations.csv", [*header, "std_range_m", "std_yaw_rad", "std_pitch_rad"], rows)
+    text = (
+        "robot_from_sensor: {x_m: 0, y_m: 0, z_m: 0, yaw_deg: 0, pitch_deg: 0, roll_deg: 0}\n"
+        f"std: {{range_m: {world.std_range_m}, yaw_deg: {world.std_angle_deg}, pitch_deg: {world.std_angle_deg}}}\n"
+        "positive_pitch: up\n"
+    )
+    write_text(folder / "sensor.yaml", text)
+
+
+def simulated_log(world: RobotWorld, seed: int) -> RobotLog:
+    """What `simulate_robot` writes, in memory."""
+    with TemporaryDirectory() as folder:
+        simulate_robot(world, Path(folder), seed)
+        return open_log(folder)

@@ -13,7 +13,7 @@ from rbpf.systems.mono.config import InverseDepthConfig, MonoConfig
 from rbpf.systems.mono.system import world_of
 from rbpf.systems.mono.video import run_images
 from rbpf.validation.consistency.pose_errors import pose_errors
-from rbpf.validation.simulation.exposure import Imaging
+from rbpf.validation.simulation.images import Imaging
 
 TREATMENTS = {"off": "four points alone", "epipolar": "epipolar constraint", "marginal": "2-D marginal"}
 NEVER = 1e-6

@@ -8,8 +8,8 @@ from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers.images import KnownPixels
 from rbpf.validation.simulation import textures
-from rbpf.validation.simulation.camera_paths import UP, Wave, eased, frame_seconds, looking, shaken
-from rbpf.validation.simulation.textured_desk import TexturedDesk
+from rbpf.validation.simulation.desk_and_room import TexturedDesk
+from rbpf.validation.simulation.paths import UP, Wave, eased, frame_seconds, looking, shaken
 from rbpf.validation.simulation.textured_scene import Rectangle, TexturedScene, stamps_ns
 
 RATE_HZ = 30.0

@@ -9,9 +9,8 @@ from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.readers.images import open_stereo
 from rbpf.systems.stereo.config import StereoConfig, TriggerConfig
 from rbpf.systems.stereo.feature_cache import CachedSequence, cache_features
-from rbpf.validation.simulation.exposure import Imaging
-from rbpf.validation.simulation.images import simulate_images
-from rbpf.validation.simulation.textured_lab import LabDrive, TexturedLab
+from rbpf.validation.simulation.images import Imaging, simulate_images
+from rbpf.validation.simulation.lab import LabDrive, TexturedLab
 
 FOCAL, BASELINE_M = 0.78125, 0.12
 """Focal length as a fraction of the image's width: that of `rbpf simulate lab`."""

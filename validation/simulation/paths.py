@@ -1,18 +1,122 @@
-"""Smooth paths of a robot on two wheels, which goes where it faces: straights, bends, turns on the spot, rests.
+"""Smooth paths: of a camera in a hand, and of a robot on two wheels, with what its wheels say.
 
-Curvature and acceleration are continuous. In a bend of length L through the angle Θ the heading is Θ W(x) at the fraction
-x of its length, with W = 10 x³ - 15 x⁴ + 6 x⁵: the curvature, its first derivative and those of the neighbouring
-straights, which are zero, agree at both ends.
+In a hand: sums of sinusoids, a start from rest, and poses that look at something; infinitely differentiable but for the
+start, where the jerk is continuous.
+
+On wheels: straights, bends, turns on the spot and rests of a robot that goes where it faces. Curvature and acceleration
+are continuous. In a bend of length L through the angle Θ the heading is Θ W(x) at the fraction x of its length, with
+W = 10 x³ - 15 x⁴ + 6 x⁵: the curvature, its first derivative and those of the neighbouring straights, which are zero,
+agree at both ends.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
 
 import numpy as np
 
 from rbpf.errors import InputError
-from rbpf.lie import SE2
-from rbpf.validation.simulation.camera_paths import eased
+from rbpf.lie import SE2, SE3
+from rbpf.runs.files import write_csv, write_text
+from rbpf.sensors.readers.wheel_odometry import MOTION, MOUNT, NAME, SIGMA, WheelOdometry
+from rbpf.validation.simulation.limits import check_not_negative, check_positive
+
+UP = np.array([0.0, 0.0, 1.0])
+TERMS = 3
+
+
+@dataclass(frozen=True)
+class Wave:
+    """C smooth random signals around zero, each a sum of sinusoids: Σ a_k sin(2π f_k t + φ_k).
+
+    Attributes:
+        amplitude: (C, K), a_k; their sum bounds the signal.
+        frequency_hz: (C, K), f_k.
+        phase: (C, K), φ_k [rad].
+    """
+
+    amplitude: np.ndarray
+    frequency_hz: np.ndarray
+    phase: np.ndarray
+
+    @classmethod
+    def random(cls, bound: np.ndarray, band_hz: tuple[float, float], rng: np.random.Generator) -> Self:
+        """Frequencies log-uniform in the band; all terms have the same speed.
+
+        Args:
+            bound: (C,) that the signals never pass.
+            band_hz: lowest and highest frequency.
+            rng: generator.
+        """
+        shape = (len(bound), TERMS)
+        frequency = np.exp(rng.uniform(np.log(band_hz[0]), np.log(band_hz[1]), shape))
+        fraction = 1.0 / frequency
+        amplitude = bound[:, None] * fraction / fraction.sum(axis=1, keepdims=True)
+        return cls(amplitude, frequency, rng.uniform(0.0, 2.0 * np.pi, shape))
+
+    def __call__(self, seconds: np.ndarray) -> np.ndarray:
+        """Signals (T, C) at times (T,)."""
+        angle = 2.0 * np.pi * self.frequency_hz * seconds[:, None, None] + self.phase
+        return (self.amplitude * np.sin(angle)).sum(axis=-1)
+
+
+def frame_seconds(frames: int, rate_hz: float) -> np.ndarray:
+    """(T,) times of the frames, the first at 0 [s]."""
+    return np.arange(frames) / rate_hz
+
+
+def eased(seconds: np.ndarray, start_s: float) -> np.ndarray:
+    """Time (T,) of a camera that is held still at first and reaches its pace after `start_s`.
+
+    The pace rises as the polynomial 6 x⁵ - 15 x⁴ + 10 x³, whose first two derivatives vanish at both ends.
+    """
+    if start_s == 0.0:
+        return seconds
+    x = np.minimum(seconds / start_s, 1.0)
+    return start_s * (x**6 - 3.0 * x**5 + 2.5 * x**4) + np.maximum(seconds - start_s, 0.0)
+
+
+def looking(eye: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """Poses world_from_camera (T, 7) of an upright camera.
+
+    Args:
+        eye: (T, 3) position, m.
+        direction: (T, 3) of the optical axis in the world, not vertical, of any length.
+    """
+    forward = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
+    right = np.cross(forward, UP)
+    right /= np.linalg.norm(right, axis=-1, keepdims=True)
+    columns = np.stack([right, np.cross(forward, right), forward, eye], axis=-1)
+    return SE3.from_matrix(columns)
+
+
+def speeds(world_from_camera: np.ndarray, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rates of turn (T - 1,) [rad/s] and speeds (T - 1,) [m/s] between poses (T, 7) at times (T,)."""
+    step = SE3.local(world_from_camera[:-1], world_from_camera[1:]) / np.diff(seconds)[:, None]
+    return np.linalg.norm(step[:, :3], axis=1), np.linalg.norm(step[:, 3:], axis=1)
+
+
+def slowed(
+    path: Callable[[np.ndarray], np.ndarray], seconds: np.ndarray, speed_m_s: float, turn_rad_s: float
+) -> Callable[[np.ndarray], np.ndarray]:
+    """The path, as slow as it takes that neither limit is passed.
+
+    Args:
+        path: poses (T, 7) at times (T,).
+        seconds: (T,) times at which it will be read, at least two.
+        speed_m_s: highest speed.
+        turn_rad_s: highest rate of turn.
+    """
+    turn, speed = speeds(path(seconds), seconds)
+    pace = min(1.0, 1.0 / max(float(turn.max()) / turn_rad_s, float(speed.max()) / speed_m_s))
+    return lambda time: path(pace * time)
+
+
+def shaken(world_from_camera: np.ndarray, wave: Wave, seconds: np.ndarray) -> np.ndarray:
+    """Poses (T, 7) moved by a wave of six channels, [rotation, translation] in the camera's frame."""
+    return SE3.retract(world_from_camera, wave(seconds))
+
 
 KNOTS = 257
 """Of the table that gives the fraction of a bend for the way along it."""
@@ -92,7 +196,7 @@ class Drive:
         before = np.concatenate([[0.0], self._ends])
         for k in np.unique(move).tolist():
             rows = move == k
-            fraction[rows] = _share(self._ways[k], self._fractions[k], progress[rows] - before[k])
+            fraction[rows] = _fraction_at(self._ways[k], self._fractions[k], progress[rows] - before[k])
             poses[rows] = SE2.compose(self._starts[k], self._within(k, fraction[rows]))
         way = np.concatenate([[0.0], np.cumsum(self._length)])[move] + self._length[move] * fraction
         turned = np.concatenate([[0.0], np.cumsum(self._turn)])[move] + self._turned(move, fraction)
@@ -199,8 +303,79 @@ def _table(move: Move, arm_m: float) -> tuple[np.ndarray, np.ndarray]:
     return fraction, np.concatenate([[0.0], np.cumsum(pieces)])
 
 
-def _share(way: np.ndarray, fraction: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+def _fraction_at(way: np.ndarray, fraction: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     """Shares (T,) of a move for ways (T,) along it."""
     from scipy.interpolate import CubicSpline
 
     return np.clip(CubicSpline(way, fraction)(wanted), 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class WheelOdometer:
+    """Two driven wheels side by side, whose turns are counted.
+
+    Wrong diameters and a wrong distance between the wheels err the same way all the time (J. Borenstein, L. Feng,
+    Measurement and correction of systematic odometry errors in mobile robots, 1996); slip is a random walk whose
+    variance grows with the way of each wheel (K. S. Chong, L. Kleeman, Accurate odometry and error modelling for a
+    mobile robot, 1997).
+
+    Attributes:
+        wheelbase_m: true distance between the wheels.
+        scale: both wheels report so much more than they went, as a fraction.
+        inequality: the right one reports so much more than the left one, as a fraction: a drift of the heading.
+        wheelbase_error: the robot takes the distance between its wheels for so much greater, as a fraction.
+        slip_m: standard deviation of a wheel's error after 1 m, in m; it grows with the root of the way.
+
+    Raises:
+        InputError: a number makes no sense.
+    """
+
+    wheelbase_m: float = 0.4
+    scale: float = 0.01
+    inequality: float = 0.002
+    wheelbase_error: float = 0.02
+    slip_m: float = 0.004
+
+    def __post_init__(self) -> None:
+        check_positive(self, "wheelbase_m")
+        check_not_negative(self, "slip_m")
+        for name in ("scale", "inequality", "wheelbase_error"):
+            if not abs(getattr(self, name)) < 0.5:
+                raise InputError(f"{name} must be between -0.5 and 0.5, got {getattr(self, name)!r}")
+
+    def measure(
+        self,
+        travelled: Travelled,
+        stamps_ns: np.ndarray,
+        robot_from_camera: np.ndarray,
+        rng: np.random.Generator,
+    ) -> WheelOdometry:
+        """Readings of a drive.
+
+        Args:
+            travelled: the robot at T times.
+            stamps_ns: (T,) int64 these times.
+            robot_from_camera: (7,) passed on.
+            rng: generator of the slip; more times leave the first readings as they are.
+        """
+        side = 0.5 * self.wheelbase_m * np.array([-1.0, 1.0])
+        way = np.diff(travelled.way_m[:, None] + travelled.heading_rad[:, None] * side, axis=0)
+        counted = way * (1.0 + self.scale + 0.5 * self.inequality * np.array([-1.0, 1.0]))
+        counted += self.slip_m * np.sqrt(np.abs(way)) * rng.standard_normal(way.shape)
+        base = self.wheelbase_m * (1.0 + self.wheelbase_error)
+        forward, turn = counted.mean(axis=1), (counted[:, 1] - counted[:, 0]) / base
+        delta = SE2.exp(np.stack([turn, forward, np.zeros_like(turn)], axis=-1))
+        spread = self.slip_m * np.sqrt(np.abs(counted).sum(axis=1))
+        std = np.stack([spread / base, 0.5 * spread, 0.5 * np.abs(forward) * spread / base], axis=-1)
+        return WheelOdometry(stamps_ns, delta, std, robot_from_camera)
+
+
+def write_wheel_odometry(folder: Path, odometry: WheelOdometry) -> None:
+    """odometry.csv and odometry.yaml, as `rbpf.sensors.readers.wheel_odometry` describes them."""
+    table = np.roll(np.hstack([odometry.delta, odometry.std]).reshape(-1, 2, 3), -1, axis=2).reshape(-1, 6)
+    rows = [[0.0] * 6, *table.tolist()]
+    numbers = [[f"{x:.9g}" for x in row] for row in rows]
+    header = ["#stamp_ns", *MOTION, *SIGMA]
+    stamped = zip(odometry.stamps_ns.tolist(), numbers, strict=True)
+    write_csv(folder / NAME, header, ([stamp, *row] for stamp, row in stamped))
+    write_text(folder / MOUNT, f"robot_from_camera: {odometry.robot_from_camera.tolist()}\n")

@@ -1,0 +1,564 @@
+"""A laboratory, to take pictures of from a robot with a stereo camera (S05 §V), or as a world of points.
+
+Its plan: two rooms of 18 m × 10 m together, a door between them, and the ways of a robot through them. Its furniture:
+shelves, tables, cabinets and cartons along the walls, tables in the middle, posters; all boxes are parallel to the walls,
+so that what is hidden is known exactly for images and for points alike.
+
+The world's z axis points up; x runs along the longer side from the corner of the first room, the floor is z = 0.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from rbpf.errors import InputError
+from rbpf.lie import SE3
+from rbpf.validation.simulation import textures
+from rbpf.validation.simulation.limits import check_counts, check_not_negative, check_positive
+from rbpf.validation.simulation.paths import Drive, Move, Travelled, WheelOdometer, along_corners
+from rbpf.validation.simulation.point_worlds import Scene, frame_stamps, outside
+from rbpf.validation.simulation.textured_scene import Furniture, TexturedScene, stamps_ns
+from rbpf.validation.simulation.textures import Paint
+
+SIZE_M = 18.0, 10.0, 2.8
+"""Of both rooms together."""
+
+PARTITION_M = 9.9, 10.1
+"""Where the wall between the rooms begins and ends along x."""
+
+DOOR_M, LINTEL_M = (4.2, 5.8), 2.1
+"""Where the door begins and ends along y, and its height."""
+
+JAMB_M = 0.3
+"""Nothing stands nearer to the door than this."""
+
+CORNER_M = 0.95
+"""The walls along y stay free so far from the rooms' corners, where the furniture of the others stands."""
+
+BEND_M, ARM_M, RAMP_S = 1.1, 0.5, 1.0
+"""How the robot drives: see `Drive`."""
+
+TOUR_FRAMES, TURN_BACK_FRAMES = 4000, 600
+RATE_HZ = 15.0
+
+AWAY_DEG, AWAY_S = 140.0, 5.0
+"""The robot looks away by this angle and for this time."""
+
+
+@dataclass(frozen=True)
+class Wall:
+    """A wall that furniture stands against.
+
+    Attributes:
+        axis: along which it runs, 0 for x and 1 for y.
+        at_m: its coordinate along the other axis.
+        inwards: +1 or -1, the direction into the room along that axis.
+        free_m: (K, 2) intervals along the wall where something may stand.
+    """
+
+    axis: int
+    at_m: float
+    inwards: int
+    free_m: Sequence[tuple[float, float]]
+
+    def box(self, along: Sequence[float], deep: Sequence[float], high: Sequence[float]) -> np.ndarray:
+        """(2, 3) corners of a box, from intervals along the wall, away from it and above the floor."""
+        corners = np.empty((2, 3))
+        corners[:, self.axis] = along
+        corners[:, 1 - self.axis] = np.sort(self.at_m + self.inwards * np.asarray(deep, float))
+        corners[:, 2] = high
+        return corners
+
+    def sheet(
+        self, along: Sequence[float], deep: float, high: Sequence[float]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Corner, across and down of a sheet that hangs parallel to the wall and faces the room."""
+        left, right = along if self.inwards == (1 if self.axis else -1) else along[::-1]
+        corner, across = np.zeros(3), np.zeros(3)
+        corner[[self.axis, 1 - self.axis, 2]] = left, self.at_m + self.inwards * deep, high[1]
+        across[self.axis] = right - left
+        return corner, across, np.array([0.0, 0.0, high[0] - high[1]])
+
+
+def walls() -> list[Wall]:
+    """The eight walls, in the order first room, second room."""
+    length, width, _ = SIZE_M
+    middle = (CORNER_M, DOOR_M[0] - JAMB_M), (DOOR_M[1] + JAMB_M, width - CORNER_M)
+    whole = ((CORNER_M, width - CORNER_M),)
+    first, second = ((0.0, PARTITION_M[0]),), ((PARTITION_M[1], length),)
+    return [
+        Wall(1, 0.0, 1, whole),
+        Wall(0, 0.0, 1, first),
+        Wall(1, PARTITION_M[0], -1, middle),
+        Wall(0, width, -1, first),
+        Wall(1, PARTITION_M[1], 1, middle),
+        Wall(0, 0.0, 1, second),
+        Wall(1, length, -1, whole),
+        Wall(0, width, -1, second),
+    ]
+
+
+def partition() -> np.ndarray:
+    """(3, 2, 3) blocks of the wall between the rooms: on both sides of the door and above it."""
+    (x0, x1), (y0, y1) = PARTITION_M, DOOR_M
+    width, height = SIZE_M[1:]
+    return np.array(
+        [
+            [[x0, 0.0, 0.0], [x1, y0, height]],
+            [[x0, y1, 0.0], [x1, width, height]],
+            [[x0, y0, LINTEL_M], [x1, y1, height]],
+        ]
+    )
+
+
+ISLANDS = np.array([[[3.9, 3.8], [5.7, 6.2]], [[13.4, 4.0], [14.8, 6.0]]])
+"""(2, 2, 2) where tables stand in the middle of the rooms, least and greatest x and y."""
+
+TOUR = [
+    *[(2.0, 5.0), (2.0, 2.1), (7.6, 2.1), (7.6, 7.9), (2.0, 7.9)],
+    *[(2.0, 5.0), (2.0, 2.1), (7.6, 2.1), (7.6, 5.0)],
+    *[(12.2, 5.0), (12.2, 2.3), (16.0, 2.3), (16.0, 7.7), (12.2, 7.7), (12.2, 5.0)],
+    *[(7.6, 5.0), (7.6, 2.1), (2.0, 2.1), (2.0, 5.0)],
+]
+"""Once round the first room, half a round again, through the door and round the second room, back through the door and
+half round the first room the other way."""
+
+
+def tour() -> Drive:
+    """A drive of 67.9 m in `TOUR_FRAMES` frames."""
+    start, moves = along_corners(TOUR, BEND_M)
+    return Drive(start, moves, (TOUR_FRAMES - 1) / RATE_HZ, ARM_M, RAMP_S)
+
+
+def turn_back() -> Drive:
+    """A drive of 3 m on which the robot twice turns away for `AWAY_S` and back (S05, footnote 1)."""
+    away = np.deg2rad(AWAY_DEG)
+    moves = [Move(1.5)]
+    for turn in (away, -away):
+        moves += [Move(turn_rad=turn), Move(turn_rad=-turn, rest_s=AWAY_S), Move(0.75)]
+    return Drive(np.array([0.0, 1.6, 2.1]), moves, (TURN_BACK_FRAMES - 1) / RATE_HZ, ARM_M, RAMP_S)
+
+
+Box = np.ndarray
+"""(2, 3) least and greatest corner."""
+
+ABOVE_M = 0.9
+"""What hangs higher than this is seen from below as well."""
+
+TOUCHING_M = 0.002
+"""Faces nearer to a wall than this are not seen."""
+
+BOARD_M, TOP_M, LEG_M, BACK_M = 0.025, 0.04, 0.05, 0.01
+"""Thickness of a shelf's boards, of a table's top, of its legs, and of what things lean against."""
+
+TABLE_M = 0.74
+
+HANG_M = 0.01
+"""Posters are this far from what they hang on."""
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A flat parallelogram that can be seen, as `Rectangle` has it.
+
+    Attributes:
+        corner: (3,) top left, m.
+        across: (3,) to the top right, m.
+        down: (3,) to the bottom left, m.
+        paint: of its texture.
+    """
+
+    corner: np.ndarray
+    across: np.ndarray
+    down: np.ndarray
+    paint: Paint
+
+    @property
+    def area_m2(self) -> float:
+        """Area."""
+        return float(np.linalg.norm(np.cross(self.across, self.down)))
+
+
+@dataclass
+class Furnishing:
+    """Collects what stands and hangs in the laboratory.
+
+    Attributes:
+        rng: generator of all sizes and places.
+        blocks: opaque boxes.
+        surfaces: what can be seen of them, and posters.
+    """
+
+    rng: np.random.Generator
+    blocks: list[Box] = field(default_factory=list)
+    surfaces: list[Surface] = field(default_factory=list)
+
+    def add(self, box: Box, side: Paint, top: Paint) -> None:
+        """A box with its visible faces."""
+        self.blocks.append(box)
+        self.surfaces += faces(box, side, top)
+
+    def hang(self, wall: Wall, middle: float, high: float, size: tuple[float, float], paint: Paint) -> None:
+        """A sheet (wide, high) on a wall, its middle at a place along it and above the floor."""
+        wide, tall = 0.5 * size[0], 0.5 * size[1]
+        sheet = wall.sheet((middle - wide, middle + wide), HANG_M, (high - tall, high + tall))
+        self.surfaces.append(Surface(*sheet, paint))
+
+    def uniform(self, low: float, high: float) -> float:
+        """A number between two others."""
+        return float(self.rng.uniform(low, high))
+
+
+def faces(box: Box, side: Paint, top: Paint) -> list[Surface]:
+    """Sides, top and, high above the floor, bottom of a box, seen from without; not those that touch a wall."""
+    (x0, y0, z0), (x1, y1, z1) = box
+    up = np.array([0.0, 0.0, z1 - z0])
+    ring = np.array([[x0, y0, z1], [x1, y0, z1], [x1, y1, z1], [x0, y1, z1]])
+    ends = [(1, y0), (0, x1), (1, y1), (0, x0)]
+    found = [
+        Surface(left, right - left, -up, side)
+        for left, right, (axis, at) in zip(ring, np.roll(ring, -1, axis=0), ends, strict=True)
+        if not _at_a_wall(axis, at)
+    ]
+    if z1 < SIZE_M[2] - TOUCHING_M:
+        found.append(Surface(ring[3], ring[2] - ring[3], ring[0] - ring[3], top))
+    if z0 > ABOVE_M:
+        found.append(Surface(ring[0] - up, ring[1] - ring[0], ring[3] - ring[0], side))
+    return found
+
+
+def furnished(rng: np.random.Generator) -> Furnishing:
+    """The laboratory without floor, ceiling and outer walls; the same generator gives the same laboratory."""
+    lab = Furnishing(rng)
+    for block in partition():
+        lab.add(block, textures.plaster, textures.plaster)
+    for wall in walls():
+        for start, end in wall.free_m:
+            _along(lab, wall, start, end)
+    for low, high in ISLANDS:
+        _island(lab, low, high)
+    return lab
+
+
+def shell() -> list[tuple[Surface, float]]:
+    """Outer walls, floors and ceiling, each with the size of its texels as a multiple of the others'."""
+    length, width, height = SIZE_M
+    ring = np.array([[0.0, width], [length, width], [length, 0.0], [0.0, 0.0]])
+    down = np.array([0.0, 0.0, -height])
+    found = []
+    for left, right in zip(ring, np.roll(ring, -1, axis=0), strict=True):
+        found.append(
+            (Surface(np.append(left, height), np.append(right - left, 0.0), down, textures.plaster), 1.0)
+        )
+    middle = float(np.mean(PARTITION_M))
+    along = np.array([0.0, -width, 0.0])
+    for (x0, x1), paint in {(0.0, middle): textures.wood, (middle, length): textures.carpet}.items():
+        found.append((Surface(np.array([x0, width, 0.0]), np.array([x1 - x0, 0.0, 0.0]), along, paint), 2.0))
+    ceiling = Surface(
+        np.array([length, width, height]), np.array([-length, 0.0, 0.0]), along, textures.plaster
+    )
+    return [*found, (ceiling, 4.0)]
+
+
+def _at_a_wall(axis: int, at: float) -> bool:
+    """Whether a face with this coordinate touches an outer wall or that between the rooms."""
+    near = [0.0, SIZE_M[axis]]
+    return bool(np.abs(np.subtract(near, at)).min() < TOUCHING_M)
+
+
+def _along(lab: Furnishing, wall: Wall, start: float, end: float) -> None:
+    """Fills an interval along a wall, piece by piece."""
+    kinds = _shelf, _table, _cabinet, _cartons
+    place, last = start + lab.uniform(0.0, 0.3), -1
+    while True:
+        kind = int(lab.rng.choice([k for k in range(len(kinds)) if k != last]))
+        wide = lab.uniform(*WIDTHS_M[kind])
+        if place + wide > end:
+            return
+        kinds[kind](lab, wall, place, place + wide)
+        place, last = place + wide + lab.uniform(0.05, 0.5), kind
+
+
+WIDTHS_M = (0.9, 1.5), (1.2, 1.8), (0.6, 1.0), (0.5, 1.1)
+"""Of a shelf, a table, a cabinet, and a heap of cartons."""
+
+
+def _shelf(lab: Furnishing, wall: Wall, start: float, end: float) -> None:
+    """Two uprights, a back, boards, and what stands on them."""
+    deep, high = lab.uniform(0.35, 0.45), lab.uniform(1.6, 2.1)
+    for left in (start, end - BOARD_M):
+        lab.add(wall.box((left, left + BOARD_M), (0.0, deep), (0.0, high)), textures.wood, textures.wood)
+    inner = start + BOARD_M, end - BOARD_M
+    lab.add(wall.box(inner, (0.0, BACK_M), (0.0, high)), textures.plaster, textures.wood)
+    levels = np.linspace(0.08, high, int(lab.rng.integers(5, 7)))
+    for low, top in zip(levels, [*levels[1:], high + 0.4], strict=True):
+        lab.add(wall.box(inner, (BACK_M, deep), (low - BOARD_M, low)), textures.wood, textures.wood)
+        _row(lab, wall, inner, deep, low, top - BOARD_M)
+
+
+def _row(
+    lab: Furnishing, wall: Wall, along: tuple[float, float], deep: float, low: float, top: float
+) -> None:
+    """Books and boxes side by side on a board, with gaps."""
+    place = along[0] + lab.uniform(0.0, 0.1)
+    while place + 0.15 < along[1]:
+        wide = min(lab.uniform(0.15, 0.55), along[1] - place)
+        books = lab.rng.random() < BOOKS
+        high = min(lab.uniform(0.6, 0.95) * (top - low), 0.33 if books else 0.45)
+        front = deep - lab.uniform(0.01, 0.08)
+        paint = textures.spines if books else textures.carton
+        lab.add(wall.box((place, place + wide), (BACK_M, front), (low, low + high)), paint, textures.carton)
+        place += wide + lab.uniform(0.01, 0.2)
+
+
+BOOKS = 0.5
+"""Fraction of books among what stands on shelves."""
+
+
+def _table(lab: Furnishing, wall: Wall, start: float, end: float) -> None:
+    """A table with things on it, perhaps a carton below, and a poster above."""
+    deep = lab.uniform(0.6, 0.8)
+    _desk(lab, wall, (start, end), (0.0, deep))
+    if lab.rng.random() < 0.5:
+        left = lab.uniform(start + 0.1, end - 0.6)
+        box = wall.box((left, left + 0.45), (0.05, 0.45), (0.0, lab.uniform(0.25, 0.45)))
+        lab.add(box, textures.carton, textures.carton)
+    for left, right in ((start, 0.5 * (start + end)), (0.5 * (start + end), end)):
+        _poster(lab, wall, left, right, lab.uniform(1.45, 1.75))
+
+
+def _desk(
+    lab: Furnishing, wall: Wall, along: tuple[float, float], deep: tuple[float, float], rows: int = 1
+) -> None:
+    """A table's top, legs, and rows of things on it."""
+    lab.add(wall.box(along, deep, (TABLE_M - TOP_M, TABLE_M)), textures.wood, textures.wood)
+    for left in (along[0], along[1] - LEG_M):
+        for back in (deep[0], deep[1] - LEG_M):
+            leg = wall.box((left, left + LEG_M), (back, back + LEG_M), (0.0, TABLE_M - TOP_M))
+            lab.add(leg, textures.plaster, textures.plaster)
+    for row in np.linspace(*deep, rows + 1)[:-1]:
+        place = along[0] + lab.uniform(0.05, 0.3)
+        while place + 0.5 < along[1]:
+            wide, back = lab.uniform(0.15, 0.45), row + lab.uniform(0.05, 0.2)
+            low, high = TABLE_M, TABLE_M + lab.uniform(0.08, 0.5)
+            thing = wall.box((place, place + wide), (back, back + lab.uniform(0.1, 0.3)), (low, high))
+            lab.add(thing, textures.carton, textures.carton)
+            place += wide + lab.uniform(0.1, 0.4)
+
+
+def _cabinet(lab: Furnishing, wall: Wall, start: float, end: float) -> None:
+    """A closed box, with a sheet or two on its door."""
+    deep, high = lab.uniform(0.4, 0.6), lab.uniform(1.0, 2.0)
+    lab.add(wall.box((start, end), (0.0, deep), (0.0, high)), textures.wood, textures.plaster)
+    for level in (0.35, 0.75):
+        size = lab.uniform(0.15, 0.5), lab.uniform(0.15, 0.35)
+        middle = 0.5 * (start + end) + lab.uniform(-0.05, 0.05)
+        sheet = wall.sheet(
+            (middle - 0.5 * size[0], middle + 0.5 * size[0]),
+            deep + HANG_M,
+            (level * high - 0.5 * size[1], level * high + 0.5 * size[1]),
+        )
+        lab.surfaces.append(Surface(*sheet, _print(lab)))
+
+
+def _cartons(lab: Furnishing, wall: Wall, start: float, end: float) -> None:
+    """A heap of cartons, each smaller than that below, and a poster above."""
+    low, deep = 0.0, lab.uniform(0.4, 0.6)
+    while low < 1.2:
+        high = low + lab.uniform(0.25, 0.5)
+        lab.add(wall.box((start, end), (0.0, deep), (low, high)), textures.carton, textures.carton)
+        start, end = start + lab.uniform(0.0, 0.15), end - lab.uniform(0.0, 0.15)
+        low, deep = high, 0.9 * deep
+        if end - start < 0.35 or lab.rng.random() < 0.35:
+            break
+    _poster(lab, wall, start, end, max(low + 0.5, lab.uniform(1.4, 1.7)))
+
+
+def _poster(lab: Furnishing, wall: Wall, start: float, end: float, high: float) -> None:
+    """A print on a wall, somewhere between two places, and a smaller one above it."""
+    wide = lab.uniform(0.6, 0.95) * (end - start)
+    middle = lab.uniform(start + 0.5 * wide, end - 0.5 * wide)
+    lab.hang(wall, middle, high, (wide, lab.uniform(0.35, 0.7)), _print(lab))
+    lab.hang(wall, middle, high + 0.65, (0.7 * wide, lab.uniform(0.15, 0.4)), _print(lab))
+
+
+def _print(lab: Furnishing) -> Paint:
+    return textures.picture if lab.rng.random() < 0.7 else textures.page
+
+
+def _island(lab: Furnishing, low: np.ndarray, high: np.ndarray) -> None:
+    """Two tables back to back, things on both, and a board with posters between them."""
+    middle = 0.5 * float(low[0] + high[0])
+    along = float(low[1]), float(high[1])
+    board = 0.5 * BACK_M
+    screen = np.array([[middle - board, along[0] + 0.2, TABLE_M], [middle + board, along[1] - 0.2, 1.45]])
+    lab.add(screen, textures.plaster, textures.wood)
+    for inwards in (-1, 1):
+        side = Wall(1, middle + inwards * board, inwards, (along,))
+        _desk(lab, side, along, (0.0, 0.5 * float(high[0] - low[0]) - board), rows=2)
+        for place in np.linspace(along[0] + 0.6, along[1] - 0.6, 3).tolist():
+            size = lab.uniform(0.25, 0.5), lab.uniform(0.2, 0.35)
+            lab.hang(side, place, 1.22, size, _print(lab))
+
+
+Trajectory = Literal["tour", "turn_back"]
+
+ROBOT_FROM_CAMERA = SE3.from_matrix(
+    np.array([[0.0, 0.0, 1.0, 0.1], [-1.0, 0.0, 0.0, 0.06], [0.0, -1.0, 0.0, 1.0]])
+)
+"""(7,) the left camera looks forwards, 1 m above the floor, from a little before and to the left of the wheels' middle;
+the robot's frame has x forwards, y to the left, z up, its origin between the wheels on the floor."""
+
+
+@dataclass(frozen=True)
+class LabDrive:
+    """How a robot drives through the laboratory.
+
+    Attributes:
+        trajectory: "tour" through both rooms and back, 4,000 frames over 67.9 m; or "turn_back", 600 frames, on which
+            the robot twice looks away for 5 s and back.
+        frames: most images; None for all.
+        every: only each so many-th frame of the trajectory becomes an image.
+
+    Raises:
+        InputError: there is no such trajectory, or it has not as many frames.
+    """
+
+    trajectory: Trajectory = "tour"
+    frames: int | None = None
+    every: int = 1
+
+    def __post_init__(self) -> None:
+        check_counts(self, {"every": 1})
+        if self.trajectory not in DRIVES:
+            raise InputError(f"trajectory must be one of {', '.join(DRIVES)}, got {self.trajectory!r}")
+        if self.frames is not None:
+            check_counts(self, {"frames": 2})
+        if not 2 <= self._count <= self._most:
+            raise InputError(
+                f"with every = {self.every} the {self.trajectory} has {self._most} images, of which at least 2 are "
+                f"needed, got frames = {self.frames}"
+            )
+
+    @property
+    def images(self) -> np.ndarray:
+        """(T,) the frames of the trajectory that become images."""
+        return np.arange(self._count) * self.every
+
+    @property
+    def _most(self) -> int:
+        """Images of the whole trajectory."""
+        return -(-DRIVES[self.trajectory][1] // self.every)
+
+    @property
+    def _count(self) -> int:
+        return self._most if self.frames is None else self.frames
+
+    def travelled(self) -> Travelled:
+        """The robot in every frame of the trajectory up to the last image."""
+        drive, _ = DRIVES[self.trajectory]
+        return drive()(np.arange(self.images[-1] + 1) / RATE_HZ)
+
+
+DRIVES = {
+    "tour": (tour, TOUR_FRAMES),
+    "turn_back": (turn_back, TURN_BACK_FRAMES),
+}
+"""A drive and its number of frames, by name."""
+
+
+def world_from_camera(world_from_robot: np.ndarray) -> np.ndarray:
+    """(T, 7) poses of the left camera for poses (T, 3) of the robot, elements of SE(2)."""
+    theta, x, y = world_from_robot.T
+    still = np.zeros_like(theta)
+    return SE3.compose(SE3.from_ypr(np.stack([x, y, still], axis=-1), theta, still, still), ROBOT_FROM_CAMERA)
+
+
+@dataclass(frozen=True)
+class TexturedLab:
+    """Two rooms of 18 m × 10 m together, with shelves, tables, cabinets, cartons and posters.
+
+    Attributes:
+        drive: of the robot that carries the camera.
+        odometer: of the same robot; it is read in every frame of the trajectory, whether that becomes an image or not.
+        texel_m: side of a texel; of floors twice, of the ceiling four times as much.
+        contrast: of all textures; 1 is rich, 0.1 poor.
+    """
+
+    drive: LabDrive = LabDrive()
+    odometer: WheelOdometer = field(default_factory=WheelOdometer)
+    texel_m: float = 0.003
+    contrast: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_positive(self, "texel_m")
+        check_not_negative(self, "contrast")
+
+    def build(self, rng: np.random.Generator) -> TexturedScene:
+        """Draws the furniture, the textures and the odometer's slip; the drive is always the same.
+
+        A shorter drive leaves all that is drawn as it is.
+        """
+        slip = rng.spawn(1)[0]
+        lab = furnished(rng)
+        rectangles = []
+        for surface, coarse in [*shell(), *((surface, 1.0) for surface in lab.surfaces)]:
+            furniture = Furniture(rng, coarse * self.texel_m, self.contrast)
+            furniture.sheet(surface.corner, surface.across, surface.down, surface.paint)
+            rectangles += furniture.rectangles
+        images, travelled = self.drive.images, self.drive.travelled()
+        path = world_from_camera(travelled.world_from_robot)[images]
+        stamps = stamps_ns(int(images[-1]) + 1, RATE_HZ)
+        odometry = self.odometer.measure(travelled, stamps, ROBOT_FROM_CAMERA, slip)
+        return TexturedScene("lab", stamps[images], path, rectangles, odometry=odometry)
+
+
+PRINTED = {textures.picture, textures.page, textures.carton, textures.spines}
+RICH = 20.0
+"""What is printed has so many times as many points per area as what is painted, of wood or a carpet."""
+
+
+@dataclass(frozen=True)
+class LabWorld:
+    """Points on all that can be seen in the `TexturedLab`; the same seed furnishes both alike.
+
+    All boxes hide what is behind them. Measure it with any camera:
+
+        >>> from rbpf.validation.simulation.features import STEREO, Measuring, simulate_features
+        >>> log = simulate_features(LabWorld(LabDrive(frames=3), points=3000), Measuring(known=0), STEREO, seed=0)
+        >>> len(log.frames), log.frames[0].z.shape
+        (3, (25, 3))
+
+    Attributes:
+        drive: of the robot that carries the camera.
+        points: number of points.
+    """
+
+    drive: LabDrive = field(default_factory=LabDrive)
+    points: int = 12000
+
+    def __post_init__(self) -> None:
+        check_counts(self, {"points": 1})
+
+    def build(self, rng: np.random.Generator) -> Scene:
+        """Draws the furniture and the points."""
+        lab = furnished(rng)
+        surfaces = [*lab.surfaces, *(surface for surface, _ in shell())]
+        blocks = np.array(lab.blocks)
+        points = outside(lambda count: _on(surfaces, count, rng), blocks)(self.points)
+        images = self.drive.images
+        path = world_from_camera(self.drive.travelled().world_from_robot)[images]
+        stamps = frame_stamps(int(images[-1]) + 1, RATE_HZ)[images]
+        present = np.tile([0, len(images)], (self.points, 1))
+        return Scene("lab", stamps, path, points, present, blocks)
+
+
+def _on(surfaces: list[Surface], count: int, rng: np.random.Generator) -> np.ndarray:
+    """Positions (K, 3), uniform on each surface."""
+    weight = np.array([surface.area_m2 * (RICH if surface.paint in PRINTED else 1.0) for surface in surfaces])
+    sides = np.array([[surface.across, surface.down] for surface in surfaces])
+    corner = np.array([surface.corner for surface in surfaces])
+    row = rng.choice(len(surfaces), count, p=weight / weight.sum())
+    return np.asarray(corner[row] + np.einsum("ks,ksx->kx", rng.random((count, 2)), sides[row]))
