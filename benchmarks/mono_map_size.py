@@ -35,7 +35,7 @@ def run(settings: Settings) -> list[Row]:
         ) -> None:
             if t == 0 and more:
                 add_elsewhere(run, more)
-            spent[t] = run.seconds[t] + run.seconds_telling[t]
+            spent[t] = run.seconds[t]
 
         done = run_images(replace(sequence), MonoConfig(particles=50), known, fill)
         assert not done.lost.any()
@@ -69,7 +69,7 @@ def add_elsewhere(run: VideoRun, count: int) -> None:
     ids = landmark_map.add_records(
         Records(mean, np.broadcast_to(1e-4 * np.eye(3), (n, count, 3, 3))), Point(3)
     )
-    source = np.zeros((count, *table.source.shape[1:]), dtype=np.uint8)
+    source = np.zeros((count, *table.first_patch.shape[1:]), dtype=np.uint8)
     rows = table.add(source, np.zeros((count, 2)), pose)
-    table.place[rows] = np.concatenate([points, np.ones((count, 1))], axis=1)
+    table.position[rows] = np.concatenate([points, np.ones((count, 1))], axis=1)
     landmark_map.catalogue.update(zip(ids.tolist(), rows.tolist(), strict=True))

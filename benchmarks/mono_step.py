@@ -7,7 +7,7 @@ from benchmarks.rows import Row, Settings, interleaved
 from rbpf.core.filter import Filter
 from rbpf.sensors.feature_log import FeatureFrame, FeatureLog
 from rbpf.systems.mono.config import MonoConfig
-from rbpf.systems.mono.system import build_filter, start_prior
+from rbpf.systems.mono.slam import MonoSlam
 from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
 from rbpf.validation.simulation.point_worlds import DeskWorld
 
@@ -20,10 +20,10 @@ class Walk:
     """A filter that goes through a log, frame by frame."""
 
     def __init__(self, log: FeatureLog, config: MonoConfig) -> None:
-        self.filter: Filter = build_filter(log, config)
         self._frames: Iterator[FeatureFrame] = iter(log.frames)
-        first = next(self._frames)
-        self.filter.step(first, start_prior(log, config), first.stamp_ns)
+        slam = MonoSlam(log.camera, config, log.known)
+        slam.take(next(self._frames))
+        self.filter: Filter = slam.filter
         for _ in range(SETTLING - 1):
             self()
 

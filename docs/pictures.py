@@ -15,7 +15,6 @@ from rbpf.sensors.camera import Pinhole
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.video import VideoRun
 from rbpf.validation.mono import Recording, start_mono
-from rbpf.validation.mono_map import summarise_mono_map
 from rbpf.validation.report.mono_pictures import plot_mono_run
 from rbpf.validation.report.mono_video import annotated_frames
 from rbpf.validation.simulation.desk_and_room import TexturedDesk
@@ -64,7 +63,7 @@ def main(images: Path | None = None, out: Path = Path(__file__).parent / "pictur
             simulate_images(TexturedDesk(frames=300), Imaging(), camera, images, seed=0)
         run = start_mono(Recording(images, images / "known_points.csv"), MonoConfig())
         animate(run, out / "desk.webp")
-        plot_mono_run(run, summarise_mono_map(run.filter), scratch)
+        plot_mono_run(run, run.slam.map(), scratch)
         shrink(scratch / "map.png", out / "map.png")
     for path in (out / "desk.webp", out / "map.png"):
         print(f"{path}: {path.stat().st_size / 1000:.0f} kB")

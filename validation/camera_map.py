@@ -8,7 +8,7 @@ from rbpf.lie import SE3
 from rbpf.maps.point import Point
 from rbpf.sensors.range_bearing import RelativePosition
 from rbpf.systems.map_estimate import MapEstimate
-from rbpf.systems.mono.system import world_of
+from rbpf.systems.mono.slam import world_of
 
 
 def summarise_points(filter_: Filter) -> MapEstimate:

@@ -18,7 +18,6 @@ from rbpf.validation.consistency.validate import report_run
 from rbpf.validation.gtsam.mono_batch import adjust_run, score_batch
 from rbpf.validation.image_run import CHECKPOINT, Progress, Telling, write_batch
 from rbpf.validation.mono_folder import write_mono_run
-from rbpf.validation.mono_map import summarise_mono_map
 from rbpf.validation.report.mono_pictures import plot_mono_run
 from rbpf.validation.report.mono_rerun import write_rerun
 from rbpf.validation.report.mono_video import write_annotated
@@ -156,7 +155,7 @@ def finish_mono(
         telling: whom to tell how far it is, and the time that the batch adjustment may take.
     """
     telling = telling or Telling()
-    mapped = summarise_mono_map(run.filter)
+    mapped = run.slam.map()
     sources = recording.sources() | left_out(video=video, batch=batch)
     entries = write_mono_run(run, mapped, out, sources)
     adjust = partial(adjust_run, run, telling.batch_s, telling.on_iteration)

@@ -18,7 +18,7 @@ summary.json             the figures
 report.html              one page with all figures and pictures
 """
 
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -37,17 +37,16 @@ from rbpf.runs.measurement_files import write_measurements
 from rbpf.runs.provenance import write_config
 from rbpf.runs.trajectory import Trajectory, write_tum
 from rbpf.runs.truth import write_truth
+from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.mono.known_map import NAME, write_known_map
 from rbpf.systems.mono.video import VideoRun
 from rbpf.validation.metrics.mono_scores import camera_truth, score_camera
-from rbpf.validation.mono_known_map import known_map
 from rbpf.validation.mono_log import feature_log
-from rbpf.validation.mono_map import MonoMap
 from rbpf.validation.mono_posterior import write_posterior
 
 
 def write_mono_run(
-    run: VideoRun, mapped: MonoMap, out: Path, sources: dict[str, str | float | bool]
+    run: VideoRun, mapped: MapEstimate, out: Path, sources: dict[str, str | float | bool]
 ) -> dict[str, Any]:
     """Writes all data files of a run.
 
@@ -64,17 +63,9 @@ def write_mono_run(
     write_tum(out / "trajectory.tum", Trajectory(run.stamps_ns, run.world_from_camera))
     write_trajectory(out, run.stamps_ns, run.world_from_camera, run.cov)
     write_truth(out, camera_truth(run))
-    table = run.sensor.table
-    rows = mapped.landmarks.ids
-    facts = {
-        "ray": mapped.is_ray.astype(int),
-        "known": (rows < run.given).astype(int),
-        "attempts": table.attempts[rows],
-        "found": table.found[rows],
-    }
-    write_map(out, replace(mapped.landmarks, columns=facts, ray_ends=mapped.ends))
+    write_map(out, mapped)
     if run.mapped is None:
-        write_known_map(out / NAME, known_map(run, mapped))
+        write_known_map(out / NAME, run.slam.export_map(run.world_from_camera[~run.lost.astype(bool)]))
     write_posterior(run, out)
     write_measurements(out, feature_log(run))
     _write_tables(run, out)
@@ -90,7 +81,7 @@ def found_at(run: VideoRun) -> int | None:
     return int(tracked[0]) if tracked.size else None
 
 
-def summarise_camera(run: VideoRun, mapped: MonoMap) -> dict[str, Any]:
+def summarise_camera(run: VideoRun, mapped: MapEstimate) -> dict[str, Any]:
     """The entries of summary.json."""
     lost = run.lost.astype(bool)
     looked = run.searched > 0
@@ -109,8 +100,8 @@ def summarise_camera(run: VideoRun, mapped: MonoMap) -> dict[str, Any]:
         "particles": run.config.particles,
         "seed": run.config.seed,
         "ms_per_frame": milliseconds_per_frame(run.seconds),
-        "landmarks_full": int((~mapped.is_ray).sum()),
-        "landmarks_partial": int(mapped.is_ray.sum()),
+        "landmarks_full": int((~mapped.is_ray()).sum()),
+        "landmarks_partial": int(mapped.is_ray().sum()),
         "observations_per_frame": float(run.found.mean()),
         "share_found": hits,
         "resamplings": int(run.resampled.sum()),

@@ -7,7 +7,7 @@ import numpy as np
 from rbpf.core.checkpoint import save_arrays
 from rbpf.lie import SE3
 from rbpf.runs.trajectory import Trajectory, write_tum
-from rbpf.systems.mono.system import world_of
+from rbpf.systems.mono.slam import world_of
 from rbpf.systems.mono.video import VideoRun
 
 PATHS, MEAN = "posterior.npz", "posterior.tum"

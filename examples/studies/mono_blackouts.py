@@ -31,9 +31,7 @@ from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers.images import ImageFrame, ImageSequence, KnownPixels, open_images, read_known_points
 from rbpf.sensors.readers.images.sequence import Source
 from rbpf.systems.mono.config import MonoConfig
-from rbpf.systems.mono.likeness import known_places
-from rbpf.systems.mono.relocalise import Attempt
-from rbpf.systems.mono.resuming import save
+from rbpf.systems.mono.relocalisation import Attempt
 from rbpf.systems.mono.video import VideoRun, run_images
 from rbpf.validation.simulation.desk_and_room import TexturedDesk, TexturedRoom
 from rbpf.validation.simulation.images import Imaging, simulate_images
@@ -208,8 +206,8 @@ class _Watch:
             self.visible = in_view(run, job.reference[[job.dark.start - 1, job.dark.stop]])
         if t < job.dark.stop:
             return
-        if run.recovery.relocaliser.attempt is not None and run.lost[t - 1]:
-            self.attempts.append(run.recovery.relocaliser.attempt)
+        if run.slam.attempt is not None:
+            self.attempts.append(run.slam.attempt)
         tracked = run.lost[job.dark.stop : t + 1][-job.settled - 1 :]
         if tracked.size > job.settled and not tracked.any():
             raise _EnoughError
@@ -292,15 +290,15 @@ def undisturbed(sequence: ImageSequence, blackouts: Blackouts, starts: list[int]
 
     def keep(t: int, frame: ImageFrame, run: VideoRun) -> None:
         if t + 1 in starts:
-            save(run, out / f"{t + 1:05d}.npz")
+            run.save(out / f"{t + 1:05d}.npz")
 
     return run_images(sequence, blackouts.config, known_of(blackouts.folder), keep)
 
 
 def in_view(run: VideoRun, truth: np.ndarray) -> int:
     """Landmarks of known depth that are in view from where the camera truly is; truth (2, 7) before and after."""
-    pose = SE3.compose(run.recovery.trusted[0], SE3.between(truth[0], truth[1]))
-    _, points = known_places(run.sensor, run.filter.belief(), run.config.relocalisation.depth_std_ratio)
+    pose = SE3.compose(run.slam.loss.trusted[0], SE3.between(truth[0], truth[1]))
+    _, points = run.slam.loss.relocaliser.known_landmarks(run.filter.belief())
     return int(run.sensor.camera.visible(SE3.inverse_transform(pose, points)).sum())
 
 
@@ -350,7 +348,7 @@ def details(series: Series, number: int) -> list[Cell]:
     """Of one blackout."""
     one = series.outcomes[number]
     metres, degrees = series.error(one)
-    pairs = max((attempt.pairs for attempt in one.attempts), default=0)
+    pairs = max((attempt.matches for attempt in one.attempts), default=0)
     agreeing = max((attempt.agreeing for attempt in one.attempts), default=0)
     usual = float(series.usual_m[series.judged(one)])
     return [

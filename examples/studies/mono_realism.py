@@ -123,7 +123,9 @@ def measure_search(folder: Path, config: MonoConfig, name: str | None = None) ->
     score, found, looks = [], [], []
 
     def note(t: int, frame: ImageFrame, run: VideoRun) -> None:
-        searched = run.sensor.searched
+        measurement = run.slam.measurement
+        assert measurement is not None
+        searched = measurement.search
         score.append(searched.score)
         found.append(searched.found.copy())
         if t % every == 0 and frame.image is not None:

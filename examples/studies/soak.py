@@ -25,10 +25,10 @@ from rbpf.core.filter import Filter
 from rbpf.core.models import NewLandmarks, Observations, Sensor
 from rbpf.lie import SE2, SE3
 from rbpf.runs.folder import peak_memory_mb
+from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.catalogue_index import NameIndex
-from rbpf.systems.mono import system as mono
 from rbpf.systems.mono.config import MonoConfig
-from rbpf.systems.mono.run import pose_estimate
+from rbpf.systems.mono.slam import MonoSlam
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.range_bearing.slam import RangeBearingSlam
 from rbpf.validation.sweep.parallel import in_parallel
@@ -108,14 +108,13 @@ class Forgetting(Sensor):
 def camera_steps(stream: CameraStream, config: MonoConfig, forget: int = 600) -> tuple[Filter, Step]:
     """The monocular system's filter over a stream, and what makes its steps."""
     log = stream.first()
-    filter_ = mono.build_filter(log, config, lambda sensor: Forgetting(sensor, forget))
-    law = mono.start_prior(log, config)
+    assert isinstance(log.camera, Pinhole)
+    slam = MonoSlam(log.camera, config, log.known, wrapped=lambda sensor: Forgetting(sensor, forget))
 
     def step(frame: Any, t: int) -> np.ndarray:
-        report = filter_.step(frame, law if t == 0 else None, frame.stamp_ns)
-        return SE3.translation(pose_estimate(filter_, report).mean)
+        return SE3.translation(slam.take(frame).pose)
 
-    return filter_, step
+    return slam.filter, step
 
 
 def robot_steps(stream: RobotStream, config: RangeBearingConfig, forget: int = 600) -> tuple[Filter, Step]:

@@ -54,6 +54,7 @@ NAMES = {
 NAMES_OF_PAGE = {
     "docs/phone_video.md": {"phone.mp4": "walk.mp4"},
     "docs/how_to/known_points.md": {"IMAGES": "longer"},
+    "docs/how_to/live.md": {"camera.mp4": "camera.mp4"},
     "docs/how_to/stereo.md": {"SEQUENCE": "pairs", "path/to/sequence": "pairs"},
     "docs/how_to/stereo_confidence.md": {"SEQUENCE": "pairs"},
     "docs/how_to/stereo_features.md": {"path/to/sequence": "pairs"},
@@ -113,6 +114,11 @@ class Shelf:
 
     def _phone(self, path: Path) -> None:
         _film(_images(self.get("desk")), path)
+
+    def _camera(self, path: Path) -> None:
+        """The desk's images, with the camera that took them."""
+        _film(_images(self.get("desk")), path)
+        shutil.copy(self.get("desk") / "camera.yaml", path.with_suffix(".yaml"))
 
     def _board(self, path: Path) -> None:
         _film([np.repeat(image[..., None], 3, axis=-1) for image in pictures()], path)

@@ -20,8 +20,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole
 from rbpf.systems.mono.config import MonoConfig, SearchConfig
-from rbpf.systems.mono.sightings import Sighting
-from rbpf.systems.mono.video import run_images
+from rbpf.systems.mono.video import SearchRecord, run_images
 from rbpf.validation.simulation.render import Renderer
 from rbpf.validation.simulation.textured_scene import cast
 from tests.systems.plane_sequences import known_points, sequence
@@ -37,9 +36,9 @@ def sighting(rows, found, started=0):
     k = len(rows)
     px = np.where(np.array(found, dtype=bool)[:, None], 5.0, np.nan) if k else np.zeros((0, 2))
     line = np.full((k, 2, 2), np.nan)
-    return Sighting(
-        np.array(rows, dtype=int), np.zeros((k, 2)), np.zeros((k, 2, 2)), px, line, np.zeros((k, 4)),
-        np.zeros((started, 2)), np.zeros((1, 2), dtype=int),
+    return SearchRecord(
+        np.array(rows, dtype=int), np.zeros((k, 2)), np.zeros((k, 2, 2)), px, np.zeros((k, 2, 2)), line, np.zeros((k, 4)),
+        np.arange(started), np.zeros((started, 2)),
     )  # fmt: skip
 
 
@@ -107,12 +106,12 @@ def test_the_map_is_filled_with_landmarks_that_are_never_looked_for():
 
     def watch(t, frame, run):
         if t == 5:
-            first = run.sensor.table.count
+            first = len(run.sensor.table)
             fill(run, 500, np.random.default_rng(0))
-            added.extend(range(first, run.sensor.table.count))
+            added.extend(range(first, len(run.sensor.table)))
             held.append(run.filter.belief().map.ids.size)
         elif t > 5:
-            searched.extend(run.sensor.searched.rows.tolist())
+            searched.extend(run.slam.measurement.search.features.tolist())
 
     run = run_images(sequence(10), MonoConfig(particles=5), known_points(), watch)
     assert held == [500]

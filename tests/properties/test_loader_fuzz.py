@@ -16,8 +16,8 @@ from rbpf.core.checkpoint import _digest
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.results import load
-from rbpf.systems.mono.appearance import SOURCE_HALF_PX
 from rbpf.systems.mono.config import MonoConfig
+from rbpf.systems.mono.feature_table import PATCH_PX
 from rbpf.systems.mono.known_map import KnownMap, read_known_map, write_known_map
 from rbpf.systems.settings import load_settings
 from rbpf.systems.stereo.config import StereoConfig
@@ -168,7 +168,7 @@ def test_finished_rows_of_a_sweep(tmp_path_factory, whole):
 def known(tmp_path_factory) -> Path:
     """A map to find a camera in."""
     rng, path = np.random.default_rng(0), tmp_path_factory.mktemp("known") / "known.npz"
-    count, side = 8, 2 * SOURCE_HALF_PX + 1
+    count, side = 8, PATCH_PX
     found = KnownMap(
         camera=CAMERA,
         alignment="none",

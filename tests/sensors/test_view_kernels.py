@@ -6,7 +6,7 @@ import pytest
 from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.camera.kernels import in_view
-from rbpf.systems.mono.viewing import directions
+from rbpf.systems.mono.feature_table import directions
 
 CAMERAS = {
     "plain": Pinhole(640, 480, 400.0, 410.0, 319.5, 239.5),

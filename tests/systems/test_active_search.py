@@ -1,42 +1,305 @@
-"""Which matches of active search count."""
+"""Active search: appearances, the gate that matches pass, who is trusted, and what moves by itself."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from rbpf.systems.mono.active_search import WIDEST
-from rbpf.systems.mono.config import MonoConfig
+from examples.studies.image_faults import cover_view
+from rbpf.core.models import Part
+from rbpf.lie import SE3
+from rbpf.runs.trajectory import Trajectory
+from rbpf.sensors.camera import Pinhole
+from rbpf.sensors.feature_log import FeatureFrame
+from rbpf.sensors.patches.search import cut
+from rbpf.sensors.readers.images import open_images, read_known_points
+from rbpf.systems.mono.active_search import WIDEST, RobustMotionGate, SearchResult
+from rbpf.systems.mono.config import MonoConfig, SearchConfig
+from rbpf.systems.mono.feature_table import PATCH_HALF_PX, view_change
+from rbpf.systems.mono.image_sensor import ImageSensor
+from rbpf.systems.mono.slam import MonoSlam
 from rbpf.systems.mono.video import run_images
-from tests.systems.plane_sequences import known_points, sequence
+from rbpf.validation.metrics.mono_scores import score_path
+from rbpf.validation.simulation.desk_and_room import TexturedDesk
+from rbpf.validation.simulation.images import Imaging, simulate_images
+from tests.systems.mono_logs import SMALL
+from tests.systems.plane_sequences import CAMERA, known_points, on_plane, sequence, texture, view
 
-FRAMES = 6
-CONFIG = MonoConfig(particles=5)
+SEARCH = MonoConfig().search
+ALL = np.ones(20, dtype=bool)
 
 
-def found_with_uncertain_depth(std_px: float) -> tuple[list[bool], int]:
-    """Whether a feature that could be so far off, wherever the camera is, was found each time; how many others were."""
-    doubted = known_points().names.size  # the first that is no known point
+# Appearances: of a wall that leans away, the first one is not known again from the side.
 
-    def widened(t, frame, run):
-        search = run.sensor.search
-        told = type(search)._innovations
 
-        def innovations(belief, rows, px):
-            which, nu, jac, cov = told(search, belief, rows, px)
-            along = np.where(rows[which] == doubted, std_px**2, 0.0)[:, None, None] * np.diag([1.0, 0.0])
-            return which, nu, jac, cov + along
+def around(degrees: float) -> np.ndarray:
+    """A camera that looks at the middle of the wall from one side."""
+    middle, turn = on_plane(np.array([500.0, 500.0])), np.deg2rad(degrees)
+    axis = SE3.exp(np.array([0.0, turn, 0.0, 0.0, 0.0, 0.0]))
+    shift = np.concatenate([[0.0, 0.0, 0.0], middle])
+    return SE3.compose(SE3.compose(SE3.exp(shift), axis), SE3.exp(-shift))
 
-        search._innovations = innovations
 
-    run = run_images(sequence(FRAMES), CONFIG, known_points(), widened)
-    later = run.sightings.frames[2:]
-    found = [bool(frame.found[frame.rows == doubted][0]) for frame in later if doubted in frame.rows]
-    return found, int(later[-1].found.sum())
+@pytest.fixture
+def wall() -> tuple[ImageSensor, np.ndarray]:
+    """A sensor with features on the wall, cut from straight ahead, and their places (K, 3)."""
+    image = view(texture(), around(0.0))
+    sensor = MonoSlam(CAMERA).sensor
+    px = sensor.detector.detect(image, 40, None, 16.0, PATCH_HALF_PX + 30.0).px
+    rays = np.concatenate([CAMERA.unproject(px), np.ones((len(px), 1))], axis=1)
+    corner, side, down = on_plane(np.array([[500.0, 500.0], [501.0, 500.0], [500.0, 501.0]]))
+    normal = np.cross(side - corner, down - corner)
+    points = rays * (normal @ corner / (rays @ normal))[:, None]
+    rows = sensor.table.add(np.array([cut(image, p, PATCH_HALF_PX) for p in px]), px, around(0.0))
+    sensor.table.position[rows] = np.concatenate([points, np.ones((len(px), 1))], axis=1)
+    return sensor, points
+
+
+def see_again_from(sensor: ImageSensor, points: np.ndarray, pose: np.ndarray) -> None:
+    """The features as they are seen from a pose become their last appearance."""
+    image = view(texture(), pose)
+    px = CAMERA.project(SE3.inverse_transform(pose, points))
+    for row, place in enumerate(px):
+        patch = cut(image, place, PATCH_HALF_PX)
+        if patch is not None:
+            sensor.table.last_patch[row], sensor.table.last_pose[row] = patch, pose
+
+
+def test_a_later_appearance_is_found_where_the_first_is_not(wall, monkeypatch):
+    sensor, points = wall
+    there = around(35.0)
+    image, rows = view(texture(), there), np.arange(len(points))
+    px, cov = (
+        CAMERA.project(SE3.inverse_transform(there, points)),
+        np.tile(4.0 * np.eye(2), (len(points), 1, 1)),
+    )
+    search = sensor.search
+    monkeypatch.setattr(search, "choose", lambda pose: (rows, px))
+    monkeypatch.setattr(sensor.features, "project", lambda belief, rows: (rows, px, cov - search._noise()))
+    monkeypatch.setattr(search, "_agreeing", lambda image, belief, templates, result: result)
+    only_first = search.run(image, Seen(there))
+    see_again_from(sensor, points, around(20.0))
+    both = search.run(image, Seen(there))
+    first = only_first.found
+    assert both.found[first].all() and (both.px[first] == only_first.px[first]).all()
+    assert both.found.sum() >= first.sum() + 10
+    assert np.median(np.linalg.norm(both.px[both.found] - px[both.found], axis=1)) < 1.0
+
+
+def test_the_nearest_appearance_is_chosen(wall):
+    sensor, points = wall
+    see_again_from(sensor, points, around(30.0))
+    rows, table = np.arange(len(points)), sensor.table
+    for degrees, later in ((-10.0, False), (10.0, False), (20.0, True), (45.0, True)):
+        patches, poses = table.nearest_appearance(rows, table.position, around(degrees))
+        assert (patches == (table.last_patch if later else table.first_patch)).all()
+        assert (poses == (table.last_pose if later else table.first_pose)).all()
+
+
+def test_turns_are_those_around_the_place():
+    place = np.append(on_plane(np.array([500.0, 500.0])), 1.0)[None]
+    for degrees in (0.0, 12.0, 40.0):
+        cosine, ratio = view_change(place, around(degrees), around(0.0))
+        assert np.rad2deg(np.arccos(np.minimum(cosine, 1.0))) == pytest.approx(degrees, abs=1e-5)
+        assert ratio == pytest.approx(1.0)
+    nearer = SE3.retract(around(0.0), np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.5]))
+    assert view_change(place, nearer, around(0.0))[1] == pytest.approx([2.0 / 3.0])
+
+
+class Seen:
+    """All of a belief that is read here."""
+
+    def __init__(self, pose: np.ndarray) -> None:
+        self.state, self.mode = pose[None], 0
+
+
+def test_appearances_are_renewed_when_they_have_changed_and_are_in_the_checkpoint(wall):
+    sensor, points = wall
+    renewed = []
+    for degrees in (5.0, 14.0, 20.0, 28.0):
+        pose, before = around(degrees), sensor.table.last_pose.copy()
+        px = CAMERA.project(SE3.inverse_transform(pose, points))
+        used = FeatureFrame(0, np.arange(len(points)), px, np.tile(np.eye(2), (len(points), 1, 1)))
+        sensor._keep_appearances(view(texture(), pose), used, pose)
+        now, then = (SE3.translation(p) - points for p in (pose, before))
+        lengths = np.linalg.norm(now, axis=1), np.linalg.norm(then, axis=1)
+        turn = np.rad2deg(np.arccos((now * then).sum(axis=1) / lengths[0] / lengths[1]))
+        scale = np.maximum(lengths[0] / lengths[1], lengths[1] / lengths[0])
+        whole = ((px >= PATCH_HALF_PX) & (px <= np.array([319.0, 239.0]) - PATCH_HALF_PX)).all(axis=1)
+        changed = (sensor.table.last_pose != before).any(axis=1)
+        is_new = (turn >= SEARCH.appearance_turn_deg) | (scale >= SEARCH.appearance_scale_change)
+        assert (changed == (whole & is_new)).all()
+        renewed.append(int(changed.sum()))
+    assert renewed[0] == 0 and min(renewed[1], renewed[3]) > 10
+    assert (sensor.table.first_pose == around(0.0)).all()
+    other = MonoSlam(CAMERA).sensor
+    other.restore(sensor.arrays())
+    for name in ("last_patch", "last_pose", "first_patch", "position"):
+        assert (getattr(other.table, name) == getattr(sensor.table, name)).all()
+
+
+# The gate: the motion that most matches agree on.
+
+
+def matches(seed: int, count: int = 20) -> tuple[np.ndarray, ...]:
+    """ν, H, S of matches of a motion ε drawn from its prior N(0, L Lᵀ), L, and ε."""
+    rng = np.random.default_rng(seed)
+    factor = np.diag([0.05, 0.05, 0.05, 0.1, 0.1, 0.1])
+    motion = factor @ rng.standard_normal(6)
+    jac = 100.0 * rng.standard_normal((count, 2, 6))
+    nu = jac @ motion + rng.standard_normal((count, 2))
+    return nu, jac, np.tile(np.eye(2), (count, 1, 1)), factor, motion
+
+
+fit_motion = RobustMotionGate().fit
+
+
+def test_without_outliers_it_is_near_the_posterior_of_a_linear_model():
+    nu, jac, cov, factor, _ = matches(0)
+    fit = fit_motion(nu, jac, cov, factor, ALL)
+    rows, stacked = nu.ravel(), jac.reshape(-1, 6)
+    info = np.linalg.inv(factor @ factor.T) + stacked.T @ stacked
+    np.testing.assert_allclose(fit.increment, np.linalg.solve(info, stacked.T @ rows), atol=0.01)
+    # The loss takes a little of every match's weight, so that it is never surer than the linear posterior.
+    ratio = np.diag(fit.cov) / np.diag(np.linalg.inv(info))
+    assert (ratio > 1.0).all() and (ratio < 2.5).all()
+
+
+def test_outliers_stay_far_off_and_do_not_move_it():
+    nu, jac, cov, factor, motion = matches(1)
+    wrong = np.arange(20) < 6
+    nu[wrong] += 25.0
+    fit = fit_motion(nu, jac, cov, factor, ALL)
+    assert (fit.squared[wrong] > 50.0).all() and (fit.squared[~wrong] < 15.0).all()
+    assert (np.abs(fit.increment - motion) < 5.0 * np.sqrt(np.diag(fit.cov))).all()
+
+
+def test_a_direction_without_noise_is_not_moved_along():
+    nu, jac, cov, factor, _ = matches(2)
+    fit = fit_motion(nu, jac, cov, factor[:, :4], ALL)
+    assert not fit.increment[4:].any() and not fit.cov[4:].any()
+
+
+def test_a_majority_that_is_not_trusted_is_judged_by_the_trusted_ones():
+    """Twelve that move together, as on a thing that passes, against eight that are known to be at rest."""
+    nu, jac, cov, factor, motion = matches(3)
+    passing = np.arange(20) < 12
+    nu[passing] += jac[passing] @ (factor @ np.array([2.0, -2.0, 2.0, 2.0, -2.0, 2.0]))
+    fit = fit_motion(nu, jac, cov, factor, ~passing)
+    assert (np.abs(fit.increment - motion) < 5.0 * np.sqrt(np.diag(fit.cov))).all()
+    assert np.median(fit.squared[passing]) > 50.0 and (fit.squared[~passing] < 15.0).all()
+    alone = fit_motion(nu[~passing], jac[~passing], cov[~passing], factor, ALL[:8])
+    np.testing.assert_allclose(fit.increment, alone.increment)
+
+
+def test_an_untrusted_match_is_as_far_off_as_its_own_uncertainty_says():
+    """Mahalanobis distances of matches that took no part follow the chi-squared law."""
+    squared = []
+    for seed in range(60):
+        nu, jac, cov, factor, _ = matches(seed)
+        trusted = np.arange(20) < 15
+        squared.append(fit_motion(nu, jac, cov, factor, trusted).squared[~trusted])
+    assert abs(np.mean(squared) / 2.0 - 1.0) < 0.2
 
 
 @pytest.mark.parametrize("fraction", [0.9, 1.1])
 def test_a_feature_that_may_be_anywhere_agrees_with_no_motion(fraction):
     """What is alike within a small part of its ellipse is alike by chance."""
-    widest = WIDEST * CONFIG.search.max_radius_px / CONFIG.search.ellipse_sigmas
-    found, others = found_with_uncertain_depth(fraction * widest)
+    std_px = fraction * WIDEST * SEARCH.max_radius_px / SEARCH.ellipse_sigmas
+    uncertain = known_points().names.size  # the first that is no known point
+
+    def widened(t, frame, run):
+        search = run.sensor.search
+        innovations = type(search)._innovations
+
+        def wider(belief, rows, px):
+            which, nu, jac, cov = innovations(search, belief, rows, px)
+            along = np.where(rows[which] == uncertain, std_px**2, 0.0)[:, None, None] * np.diag([1.0, 0.0])
+            return which, nu, jac, cov + along
+
+        search._innovations = wider
+
+    later = run_images(sequence(6), MonoConfig(particles=5), known_points(), widened).searches[2:]
+    found = [bool(one.found[one.features == uncertain][0]) for one in later if uncertain in one.features]
     assert found and all(one == (fraction < 1.0) for one in found)
-    assert others > 10
+    assert later[-1].found.sum() > 10
+
+
+# A thing that moves through the view: what is new on it has to prove itself before it says where the camera is.
+
+
+@pytest.mark.slow
+def test_a_third_of_the_view_moves_and_the_camera_is_not_taken_along(tmp_path):
+    """It crosses the view in two seconds; features on it are taken for near ones at rest, if they are trusted at once."""
+    camera = Pinhole(320, 240, 250.0, 250.0, 159.5, 119.5)
+    simulate_images(TexturedDesk(frames=150, texel_m=0.003), Imaging(), camera, tmp_path / "desk", seed=1)
+    recording = open_images(tmp_path / "desk")
+    known = read_known_points(tmp_path / "desk" / "known_points.csv")
+    damaged = cover_view(1 / 3, 60, 60)(recording)
+    worst = {}
+    credulous = MonoConfig(search=SearchConfig(trusted_fraction=0.0))
+    for name, config in (("credulous", credulous), ("usual", MonoConfig())):
+        runs = [run_images(damaged, replace(config, seed=seed), known) for seed in (0, 1)]
+        scores = [
+            score_path(recording.truth, Trajectory(run.stamps_ns, run.world_from_camera), "none")
+            for run in runs
+        ]
+        worst[name] = max(score["path_rmse_m"] for score in scores)
+    assert worst["usual"] < 0.03
+    assert worst["credulous"] > 2.0 * worst["usual"]
+
+
+def test_what_is_often_missed_only_updates_the_map():
+    run = run_images(sequence(12), SMALL, known_points())
+    sensor, belief, used = run.sensor, run.filter.belief(), run.slam.measurement.used
+    untrusted = [row for row in used.landmarks.tolist() if sensor.table.member[row] < 0][:3]
+    assert len(untrusted) == 3
+
+    def of_state() -> int:
+        groups = sensor.observations(used, belief)
+        assert all(Part.STATE in group.updates or group.updates == {Part.LANDMARK} for group in groups)
+        return sum(group.z.size for group in groups if Part.STATE in group.updates)
+
+    before = of_state()
+    sensor.table.attempts[untrusted] += 20
+    assert of_state() == before - 2 * len(untrusted)
+
+
+def test_where_few_are_trusted_all_of_them_are():
+    table = run_images(sequence(12), SMALL, known_points()).sensor.table
+    rows = np.arange(8)
+    assert table.trusted(rows, SEARCH.trusted_fraction).all()
+    table.member[rows], table.attempts[rows], table.found[rows] = -1, 10, 2
+    assert table.trusted(rows, SEARCH.trusted_fraction).all()
+    table.found[rows[:6]] = 10
+    np.testing.assert_array_equal(table.trusted(rows, SEARCH.trusted_fraction), rows < 6)
+
+
+# Tracking and losing: how much has to be found.
+
+
+@pytest.mark.parametrize(
+    ("found", "of", "radius_px", "recognised", "is_lost"),
+    [
+        (5, 10, "narrow", False, True),  # too few
+        (8, 18, "narrow", False, True),  # too small a fraction
+        (8, 16, "narrow", False, False),
+        (8, 16, "and wide ones", False, False),  # only ellipses that were searched whole confirm a place
+        (16, 16, "wide", False, True),
+        (8, 24, "narrow", False, True),
+        (8, 24, "narrow", True, False),  # a place that was recognised beyond doubt needs less
+        (5, 7, "narrow", True, True),
+    ],
+)
+def test_how_much_a_lost_camera_has_to_find(found, of, radius_px, recognised, is_lost):
+    sensor = MonoSlam(CAMERA).sensor
+    narrow, wide = 20.0, 3.0 * SEARCH.max_radius_px
+    radius = np.full(of, wide if radius_px == "wide" else narrow)
+    if radius_px == "and wide ones":
+        radius = np.append(radius, np.full(12, wide))
+    k = radius.size
+    sensor.table.add(np.zeros((k, 31, 31), np.uint8), np.zeros((k, 2)), SE3.identity())
+    cov = (radius / SEARCH.ellipse_sigmas)[:, None, None] ** 2 * np.eye(2)
+    result = SearchResult(np.arange(k), np.zeros((k, 2)), cov, found=np.arange(k) < found)
+    sensor.bad_frames = SEARCH.lost_frames
+    assert sensor._too_little(result, recognised) == is_lost

@@ -38,9 +38,9 @@ def started(tmp_path_factory):
 def test_every_corner_is_found_at_its_own_place(started):
     run, truth = started
     count = 0
-    for sighting, pose in zip(run.sightings.frames, truth, strict=True):
-        mine = sighting.found & (sighting.rows < run.known.names.size)
-        places = run.known.positions[sighting.rows[mine]]
+    for sighting, pose in zip(run.searches, truth, strict=True):
+        mine = sighting.found & (sighting.features < run.known.names.size)
+        places = run.known.positions[sighting.features[mine]]
         px = run.sequence.camera.project(SE3.inverse_transform(pose, places))
         assert (np.linalg.norm(px - sighting.px[mine], axis=1) < 2.0).all()
         count += int(mine.sum())

@@ -11,10 +11,11 @@ from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.sensors.readers.images import KnownPixels
 from rbpf.systems.mono.known_start import (
-    NEEDLE,
-    SPHERE,
+    ISOTROPIC,
+    TRIANGULATED,
     KnownStart,
-    first_records,
+    constellation,
+    constellation_records,
     located_points,
     require_texture,
     resect_known,
@@ -73,7 +74,7 @@ def test_what_is_given_of_a_point_is_uncertain_along_the_line_of_sight():
     line = given.positions - POSE[4:]
     line /= np.linalg.norm(line, axis=1, keepdims=True)
     along = np.sqrt(np.einsum("ma,mab,mb->m", line, located.cov, line))
-    np.testing.assert_allclose(along, given.std_m * np.sqrt(1.0 - 2.0 * NEEDLE**2), rtol=1e-6)
+    np.testing.assert_allclose(along, given.std_m * np.sqrt(1.0 - 2.0 * TRIANGULATED**2), rtol=1e-6)
 
 
 def test_the_first_image_shows_that_points_are_uncertain_across_the_line_of_sight_too():
@@ -85,9 +86,9 @@ def test_the_first_image_shows_that_points_are_uncertain_across_the_line_of_sigh
         across -= (across @ SE3.rotation(POSE)[:, 2])[:, None] * SE3.rotation(POSE)[:, 2]
         located, _ = located_points(CAMERA, replace(given, positions=given.positions + across), 0.3)
         fractions.append(np.sqrt(np.linalg.eigvalsh(located.cov)[:, 0]) / std)
-    np.testing.assert_allclose(fractions[0], NEEDLE, rtol=1e-6)
-    assert (fractions[1] > 1.5 * NEEDLE).all() and (fractions[1] < SPHERE).all()
-    np.testing.assert_allclose(fractions[2], SPHERE, rtol=1e-6)
+    np.testing.assert_allclose(fractions[0], TRIANGULATED, rtol=1e-6)
+    assert (fractions[1] > 1.5 * TRIANGULATED).all() and (fractions[1] < ISOTROPIC).all()
+    np.testing.assert_allclose(fractions[2], ISOTROPIC, rtol=1e-6)
 
 
 def test_points_with_errors_along_the_line_of_sight_place_the_camera_honestly():
@@ -103,7 +104,8 @@ def test_points_with_errors_along_the_line_of_sight_place_the_camera_honestly():
         located, pose = located_points(CAMERA, given, std_px)
         sight = FeatureFrame(0, located.names, px, np.tile(std_px**2 * np.eye(2), (6, 1, 1)))
         start = KnownStart(located, pose, np.arange(6), sight)
-        records, group = first_records(CAMERA, start, 1, np.diag(np.repeat([0.25, 1.0], 3)))
+        group, cov_frame = constellation(located), np.diag(np.repeat([0.25, 1.0], 3))
+        records = constellation_records(CAMERA, start, group, 1, cov_frame)
         frame, factor = (part[0] for part in group.frame(records))
         error = SE3.local(frame, SE3.inverse(POSE))
         nees.append(error @ np.linalg.solve(factor @ factor.T, error))
@@ -128,3 +130,19 @@ def test_a_point_where_the_image_shows_no_corner(shown):
         return
     with pytest.raises(InputError, match=r"known point 3 at \(60.0, 200.0\) px cannot be found again"):
         require_texture(image, points())
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "words"),
+    [
+        ("positions", np.nan, "positions of 6 known points"),
+        ("px", np.inf, "px of 6 known points"),
+        ("std_m", np.nan, "std_m of 6 known points"),
+        ("std_m", -0.1, "is negative"),
+    ],
+)
+def test_known_points_that_are_no_numbers(field, value, words):
+    spoiled = getattr(points(), field).copy()
+    spoiled.reshape(-1)[3] = value
+    with pytest.raises(InputError, match=words):
+        replace(points(), **{field: spoiled})

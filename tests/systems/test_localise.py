@@ -12,8 +12,6 @@ from rbpf.sensors.readers.images.sequence import ImageSequence, Source
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.known_map import KnownMap, read_known_map, write_known_map
 from rbpf.systems.mono.video import run_images
-from rbpf.validation.mono_known_map import known_map
-from rbpf.validation.mono_map import summarise_mono_map
 from tests.systems.plane_sequences import CAMERA, known_points, path, sequence
 
 MAPPED, FRAMES = 60, 90
@@ -37,7 +35,7 @@ def from_frame(whole: ImageSequence, first: int) -> ImageSequence:
 @pytest.fixture(scope="module")
 def mapped() -> KnownMap:
     run = run_images(sequence(MAPPED), MonoConfig(particles=20), known_points())
-    return known_map(run, summarise_mono_map(run.filter))
+    return run.slam.export_map(run.world_from_camera)
 
 
 @pytest.fixture(scope="module")

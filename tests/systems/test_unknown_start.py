@@ -1,4 +1,4 @@
-"""A start without known points: when the particles are drawn anew, from what, and what becomes of it."""
+"""A start without known points: the batch adjustment, when particles are resampled from it, and what becomes of it."""
 
 from dataclasses import replace
 
@@ -8,15 +8,28 @@ import pytest
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.trajectory import Trajectory
+from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureLog
 from rbpf.systems.mono.config import MonoConfig, StartConfig, VelocityConfig
 from rbpf.systems.mono.run import run
-from rbpf.systems.mono.unknown_start import TORN, UnknownStart, between
+from rbpf.systems.mono.slam import MonoSlam
+from rbpf.systems.mono.unknown_start import (
+    DISCONNECTED,
+    SCALE_STD,
+    Expected,
+    Linearised,
+    Structure,
+    UnknownStart,
+    Window,
+    between,
+    optimum,
+    tangents,
+)
 from rbpf.systems.mono.video import VideoRun, run_images
 from rbpf.validation.metrics.accuracy import ate
 from tests.exactness.models import known
 from tests.systems.mono_logs import SMALL, changed, desk, rows, without_known
-from tests.systems.plane_sequences import path, sequence
+from tests.systems.plane_sequences import CAMERA, path, sequence
 
 LOG = without_known(desk(frames=30))
 NEVER = replace(SMALL, start=StartConfig(batch_adjust=False))
@@ -40,99 +53,108 @@ def plane() -> VideoRun:
 
 @pytest.mark.slow
 def test_a_flat_scene_is_not_bent(plane):
-    assert plane.start.over
-    drawn, bent = (
+    assert plane.slam.start.over
+    resampled, bent = (
         np.mean([of_plane(run_images(sequence(60), replace(config, seed=seed))) for seed in (1, 2)])
         for config in (SMALL, NEVER)
     )
-    assert drawn < 0.5 * bent and drawn < 0.012
+    assert resampled < 0.5 * bent and resampled < 0.012
 
 
 def test_the_world_starts_at_the_first_camera(plane):
     np.testing.assert_allclose(plane.world_from_camera[0], SE3.identity(), atol=1e-12)
     assert (plane.filter.history.paths()[0] == SE3.identity()).all()
-    assert plane.start.arrays()["start/names"].size > 10
+    assert plane.slam.start.arrays()["start/names"].size > 10
     assert plane.filter.steps == 60 and plane.filter.history.stamps_ns.tolist() == plane.stamps_ns.tolist()
 
 
-def test_frames_are_adjusted_ever_less_often(monkeypatch):
-    counts = []
-    redrawn = UnknownStart.redrawn
+@pytest.fixture
+def adjusted(monkeypatch) -> list[int]:
+    """Numbers of frames of each adjustment, those that found too little included."""
+    counts, original = [], UnknownStart._adjusted
 
-    def counted(self, filter_, features, frames, path):
+    def counted(self, filter_, frames, path):
         counts.append(len(frames))
-        return redrawn(self, filter_, features, frames, path)
+        return original(self, filter_, frames, path)
 
-    monkeypatch.setattr(UnknownStart, "redrawn", counted)
-    run(LOG, replace(SMALL, start=StartConfig(first_adjustment=5, growth=1.5, depth_std_ratio=1e-6)))
-    assert counts == [5, 8, 12, 18, 27]
-    counts.clear()
-    run(LOG, replace(SMALL, start=StartConfig(first_adjustment=5, growth=1.5, depth_std_ratio=0.5)))
-    assert counts[0] == 5 and counts[-1] < 27
-    counts.clear()
-    run(desk(), SMALL)
-    run(LOG, NEVER)
-    assert counts == []
+    monkeypatch.setattr(UnknownStart, "_adjusted", counted)
+    return counts
 
 
 @pytest.fixture
-def drawn(monkeypatch) -> list[int]:
-    """Numbers of frames after which particles were drawn anew."""
-    done, redrawn = [], UnknownStart.redrawn
+def resampled(monkeypatch) -> list[int]:
+    """Numbers of frames after which particles were resampled."""
+    done, original = [], UnknownStart.after_frame
 
-    def noted(self, filter_, features, frames, path):
-        out = redrawn(self, filter_, features, frames, path)
-        done.extend([] if out is None else [len(frames)])
+    def noted(self, *args):
+        out = original(self, *args)
+        done.extend([] if out[0] is None else [len(out[0].stamps_ns)])
         return out
 
-    monkeypatch.setattr(UnknownStart, "redrawn", noted)
+    monkeypatch.setattr(UnknownStart, "after_frame", noted)
     return done
 
 
+def test_frames_are_adjusted_ever_less_often(adjusted):
+    config = StartConfig(first_adjustment=5, growth=1.5, depth_std_ratio=1e-6)
+    run(LOG, replace(SMALL, start=config))
+    assert adjusted == [5, 8, 12, 18, 27]
+    adjusted.clear()
+    run(LOG, replace(SMALL, start=replace(config, depth_std_ratio=0.5)))
+    assert adjusted[0] == 5 and adjusted[-1] < 27
+    adjusted.clear()
+    run(desk(), SMALL)
+    run(LOG, NEVER)
+    assert adjusted == []
+
+
 @pytest.mark.parametrize("velocity", ["marginal", "joint", "paper"])
-def test_every_velocity_goes_on_from_the_path_that_was_drawn(velocity, drawn):
+def test_every_velocity_goes_on_from_the_path_that_was_drawn(velocity, resampled):
     config = replace(SMALL, velocity=VelocityConfig(velocity), particles=30)
     done = run(LOG, config)
-    assert drawn and off(done.world_from_camera, known(LOG.truth).world_from_camera, done.stamps_ns) < 0.02
+    assert (
+        resampled and off(done.world_from_camera, known(LOG.truth).world_from_camera, done.stamps_ns) < 0.02
+    )
 
 
-def test_few_of_the_frames_do_as_well(drawn):
+def test_few_of_the_frames_do_as_well(resampled):
     """Half of them at most take part; those between are on the way, and measure nothing."""
     config = replace(SMALL, start=StartConfig(max_frames=8))
     done = run(LOG, config)
-    assert drawn and off(done.world_from_camera, known(LOG.truth).world_from_camera, done.stamps_ns) < 0.02
+    assert (
+        resampled and off(done.world_from_camera, known(LOG.truth).world_from_camera, done.stamps_ns) < 0.02
+    )
 
 
 def test_the_map_is_conditioned_on_the_paths(plane):
     """A feature's place in each particle is where that particle's own path saw it."""
     belief = plane.filter.belief()
-    points = [
-        k
-        for k in belief.map.ids.tolist()
-        if belief.map.are(np.array([k]), plane.sensor.features.inverse_depth)[0] == 0
-    ]
+    ids = belief.map.ids
+    points = ids[~belief.map.are(ids, plane.slam.features.unknown_depth.landmark)].tolist()
     assert len(points) > 10
     means = belief.read(points).mean
     pose = plane.filter.particles.state[:, None, :7]
     seen = plane.sensor.camera.project(SE3.inverse_transform(pose, means))
     names = [belief.catalogue[k] for k in points]
-    measured = plane.sensor.measured
+    measured = plane.slam.measurement.used
     which = [k for k, name in enumerate(names) if name in measured.landmarks]
     z = measured.z[[measured.landmarks.tolist().index(names[k]) for k in which]]
     assert np.median(np.linalg.norm(seen[:, which] - z, axis=-1)) < 1.0
 
 
-def test_nothing_is_drawn_when_frames_have_too_little_in_common():
+def test_nothing_is_resampled_when_frames_have_too_little_in_common():
     apart = changed(LOG, 3, lambda frame: rows(frame, np.arange(2)))
     assert_the_same(apart, NEVER, SMALL)
 
 
-def test_frames_without_features_are_passed_over(drawn):
+def test_frames_without_features_are_passed_over(resampled):
     empty = changed(
         changed(LOG, 3, lambda frame: rows(frame, np.arange(0))), 4, lambda frame: rows(frame, np.arange(0))
     )
     done = run(empty, SMALL)
-    assert drawn and off(done.world_from_camera, known(LOG.truth).world_from_camera, done.stamps_ns) < 0.02
+    assert (
+        resampled and off(done.world_from_camera, known(LOG.truth).world_from_camera, done.stamps_ns) < 0.02
+    )
 
 
 def assert_the_same(log: FeatureLog, *configs: MonoConfig) -> None:
@@ -140,33 +162,17 @@ def assert_the_same(log: FeatureLog, *configs: MonoConfig) -> None:
     np.testing.assert_array_equal(paths[0], paths[1])
 
 
-def test_a_camera_that_was_lost_is_not_drawn_anew():
-    start = UnknownStart(SMALL, needed=True)
-    assert start.due(6, lost=False) and not start.due(6, lost=True) and not start.due(50, lost=False)
+def test_a_camera_that_was_lost_is_not_adjusted_any_more(adjusted):
+    """Black images after the fourth: the start is over when it is lost, and what was kept for it is gone."""
+    done = run_images(sequence(20, lambda t, image: np.zeros_like(image) if 4 <= t < 8 else image), SMALL)
+    assert done.lost[6] and done.slam.start.over and not adjusted
+    assert not any(name.startswith("start/frames") for name in done.slam.arrays())
 
 
-def test_a_torn_start_is_told(monkeypatch):
-    monkeypatch.setattr("rbpf.systems.mono.unknown_start.SHARED", 1000)
+def test_frames_that_hang_too_little_together_are_said(monkeypatch):
+    monkeypatch.setattr("rbpf.systems.mono.unknown_start.MIN_SHARED", 1000)
     done = run_images(sequence(8), SMALL)
-    assert done.start.over and done.problems == [f"frame 5: {TORN}"]
-
-
-@pytest.mark.slow
-def test_a_resumed_start_ends_in_the_same_bytes(tmp_path):
-    """Broken off between two adjustments."""
-    file = tmp_path / "checkpoint.npz"
-    whole = run_images(sequence(24), SMALL)
-
-    def stop(t, frame, run):
-        if t == 8:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        run_images(sequence(24), SMALL, None, stop, file)
-    assert file.exists()
-    resumed = run_images(sequence(24), SMALL, None, None, file, resume=True)
-    np.testing.assert_array_equal(whole.world_from_camera, resumed.world_from_camera)
-    np.testing.assert_array_equal(whole.cov, resumed.cov)
+    assert done.slam.start.over and done.problems == [f"frame 5: {DISCONNECTED}"]
 
 
 def test_poses_between_are_on_the_way():
@@ -183,35 +189,35 @@ def test_poses_between_are_on_the_way():
     np.testing.assert_allclose(both[0], both[1], atol=1e-9)
 
 
-def test_a_start_that_shows_nothing_at_first_begins_later(drawn):
+def test_a_start_that_shows_nothing_at_first_begins_later(resampled):
     """Logs and videos alike: a lens cap is no loss of a camera that has seen nothing yet."""
     blank = LOG
     for t in range(7):
         blank = changed(blank, t, lambda frame: rows(frame, np.arange(0)))
-    assert np.isfinite(run(blank, SMALL).world_from_camera).all() and drawn
-    drawn.clear()
+    assert np.isfinite(run(blank, SMALL).world_from_camera).all() and resampled
+    resampled.clear()
     ramp = np.tile(np.linspace(60, 200, 320).astype(np.uint8), (240, 1))
     done = run_images(sequence(24, lambda t, image: ramp if t < 8 else image), SMALL)
-    assert done.failure is None and np.isfinite(done.world_from_camera).all() and drawn
-    drawn.clear()
+    assert done.failure is None and np.isfinite(done.world_from_camera).all() and resampled
+    resampled.clear()
     done = run_images(sequence(24, lambda t, image: np.zeros_like(image) if 0 < t < 5 else image), SMALL)
     assert done.failure is None
 
 
-def test_a_frame_without_an_image_is_not_what_is_drawn_after(drawn):
+def test_a_frame_without_an_image_is_not_what_is_resampled_after(resampled):
     done = run_images(sequence(12, lambda t, image: None if t == 5 else image), SMALL)
-    assert drawn[0] == 7 and done.failure is None
+    assert resampled[0] == 7 and done.failure is None
 
 
-def test_what_the_new_map_has_not_is_not_looked_for(drawn):
+def test_what_the_new_map_has_not_is_not_looked_for(resampled):
     """Features that were started in frames that took no part."""
     done = run_images(sequence(40), replace(SMALL, start=StartConfig(max_frames=5, depth_std_ratio=1e-6)))
     table = done.sensor.table
     held = set(done.filter.belief().catalogue.values())
-    assert drawn and set(np.flatnonzero(table.alive).tolist()) <= held
+    assert resampled and set(np.flatnonzero(table.alive).tolist()) <= held
 
 
-def test_where_the_lens_has_no_direction_the_start_does_not_stop(drawn):
+def test_where_the_lens_has_no_direction_the_start_does_not_stop(resampled):
     folded = replace(known(LOG.camera), distortion=(-0.25, 0.0, 0.0, 0.0, 0.0))
     frames = list(LOG.frames)
     for t in (6, 7, 8, 9):
@@ -220,7 +226,7 @@ def test_where_the_lens_has_no_direction_the_start_does_not_stop(drawn):
         z = np.concatenate([frame.z, [[1.0, 1.0]]])
         frames[t] = replace(frame, landmarks=np.append(frame.landmarks, 9999), z=z, cov_z=cov)
     done = run(replace(LOG, camera=folded, frames=frames), SMALL)
-    assert drawn and np.isfinite(done.world_from_camera).all()
+    assert resampled and np.isfinite(done.world_from_camera).all()
 
 
 @pytest.mark.parametrize(
@@ -242,4 +248,114 @@ def test_settings_that_make_no_sense(wrong):
 )
 def test_a_damaged_checkpoint_is_refused(plane, name, damaged):
     with pytest.raises(InputError, match=name):
-        UnknownStart(SMALL, needed=True).restore(plane.start.arrays() | {name: damaged})
+        MonoSlam(CAMERA, SMALL).start.restore(plane.slam.start.arrays() | {name: damaged})
+
+
+# The optimum: its derivatives, its minimum, and what is drawn around it.
+
+LENS = Pinhole(640, 480, 500.0, 510.0, 320.0, 240.0, distortion=(0.05, -0.02, 0.001, 0.0, 0.0))
+EXPECTED = Expected((0.8, 0.6), np.repeat([0.5, 0.5], 3), np.repeat([3.0, 1.5], 3))
+FRAMES, FEATURES = 7, 14
+
+
+def scene(seed: int = 0, noise_px: float = 0.5) -> tuple[Window, Structure]:
+    """A camera that goes sideways before features at 0.7 to 2.5 m; the truth, scaled as the optimum holds it."""
+    rng = np.random.default_rng(seed)
+    inverse = rng.uniform(0.4, 1.4, FEATURES)
+    inverse *= 0.8 / inverse.mean()
+    direction = np.append(rng.uniform(-0.4, 0.4, (FEATURES, 2)), np.ones((FEATURES, 1)), axis=1)
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    moved = np.linspace(0.0, 1.0, FRAMES)[:, None] * [0.05, -0.1, 0.02, 0.15, 0.05, 0.03]
+    path = SE3.retract(SE3.identity(), moved)
+    frame, feature = np.divmod(np.arange(FRAMES * FEATURES), FEATURES)
+    place = direction[feature] / inverse[feature, None]
+    px = LENS.project(SE3.inverse_transform(path[frame], place))
+    px += rng.normal(scale=noise_px, size=px.shape)
+    stamps = np.arange(FRAMES) * 33_000_000
+    return Window(LENS, stamps, frame, feature, px, noise_px), Structure(path, direction, inverse)
+
+
+def start_of(truth: Structure) -> Structure:
+    """A camera that has not moved, and features that are all equally far."""
+    still = np.broadcast_to(SE3.identity(), truth.path.shape).copy()
+    return Structure(still, truth.direction, np.full(FEATURES, 0.8))
+
+
+def test_the_vector_is_the_slope_of_the_cost():
+    """By central differences, at a place where every residual and every loss takes part."""
+    window, truth = scene(noise_px=2.0)
+    step = np.random.default_rng(1).normal(scale=2e-3, size=6 * (FRAMES - 1) + 3 * FEATURES)
+    at = truth.moved(step)
+    _, vector = Linearised(window, EXPECTED, at).normal_equations()
+    numeric = np.empty_like(vector)
+    for k in range(vector.size):
+        nudge = np.zeros(vector.size)
+        nudge[k] = 1e-6
+        ahead, behind = (Linearised(window, EXPECTED, at.moved(s * nudge)).cost for s in (1.0, -1.0))
+        numeric[k] = (behind - ahead) / 2e-6
+    # To first order in a step's velocity, which is what the logarithm's derivative leaves out.
+    np.testing.assert_allclose(vector, numeric, rtol=0.0, atol=1e-3 * np.abs(vector).max())
+
+
+def test_a_camera_that_seems_to_stand_still_is_found_to_have_moved():
+    window, truth = scene()
+    best = optimum(window, EXPECTED, start_of(truth))
+    assert best.cost <= Linearised(window, EXPECTED, truth).cost
+    assert best.structure.inverse.mean() == pytest.approx(0.8, abs=0.8 * 5.0 * SCALE_STD)
+    off = SE3.local(best.structure.path[1:], truth.path[1:]).ravel()
+    cov = np.linalg.inv(best.information)[: off.size, : off.size]
+    assert off @ np.linalg.solve(cov, off) / off.size < 1.6
+    assert np.abs(best.structure.inverse - truth.inverse).max() < 0.1
+
+
+def test_errors_are_as_large_as_the_information_says():
+    """Normalised squared errors of the poses and of the inverse distances over forty windows."""
+    of_poses, of_features = [], []
+    for seed in range(40):
+        window, truth = scene(seed, noise_px=0.2)
+        best = optimum(window, EXPECTED, truth)
+        off = SE3.local(best.structure.path[1:], truth.path[1:]).ravel()
+        cov = np.linalg.inv(best.information)[: off.size, : off.size]
+        of_poses.append(off @ np.linalg.solve(cov, off) / off.size)
+        of_features.append(np.square((best.structure.inverse - truth.inverse) / best.std_inverse()).mean())
+    # Cauchy's loss takes some of the information, and the walk's prior is wider than this motion.
+    assert 0.3 < np.mean(of_poses) < 1.3
+    assert 0.3 < np.mean(of_features) < 1.5
+
+
+def test_paths_are_drawn_with_the_covariance_of_the_optimum():
+    window, truth = scene()
+    best = optimum(window, EXPECTED, truth)
+    paths = best.paths(4000, np.random.default_rng(2))
+    assert (paths[:, 0] == truth.path[0]).all()
+    drawn = SE3.local(best.structure.path[-1], paths[:, -1])
+    last = slice(6 * (FRAMES - 2), 6 * (FRAMES - 1))
+    cov = np.linalg.inv(best.information)
+    std = np.sqrt(np.diag(cov)[last])
+    np.testing.assert_allclose(drawn.std(axis=0), std, rtol=0.06)
+    np.testing.assert_allclose(np.corrcoef(drawn.T), (cov[last, last] / std / std[:, None]), atol=0.06)
+    features = cov.shape[0] - 3 * FEATURES + 2 + 3 * np.arange(FEATURES)
+    np.testing.assert_allclose(best.std_inverse(), np.sqrt(np.diag(cov)[features]), rtol=1e-6)
+
+
+def test_a_wrong_match_moves_little():
+    window, truth = scene()
+    right = optimum(window, EXPECTED, truth).structure.path[-1, 4:]
+    window.px[5] += [40.0, -25.0]
+    wrong = optimum(window, EXPECTED, truth).structure.path[-1, 4:]
+    assert np.linalg.norm(wrong - right) < 0.01
+
+
+def test_what_is_behind_the_camera_does_not_stop_it():
+    window, truth = scene()
+    turned = truth.path.copy()
+    turned[3:] = SE3.retract(turned[3:], np.array([0.0, np.pi, 0.0, 0.0, 0.0, 0.0]))
+    started = Linearised(window, EXPECTED, Structure(turned, truth.direction, truth.inverse))
+    found = optimum(window, EXPECTED, started.at)
+    assert np.isfinite(found.cost) and found.cost < started.cost
+
+
+def test_tangents_are_across():
+    direction = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.6, 0.0, 0.8]])
+    frames = np.concatenate([direction[..., None], tangents(direction)], axis=-1)
+    np.testing.assert_allclose(np.swapaxes(frames, 1, 2) @ frames, np.tile(np.eye(3), (3, 1, 1)), atol=1e-12)

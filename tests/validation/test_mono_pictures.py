@@ -7,9 +7,7 @@ from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers.images import open_images, read_known_points
 from rbpf.systems.mono.config import MonoConfig
-from rbpf.systems.mono.sightings import Sighting, Sightings
-from rbpf.systems.mono.video import run_images
-from rbpf.validation.mono_map import summarise_mono_map
+from rbpf.systems.mono.video import SearchRecord, run_images
 from rbpf.validation.report.annotated import FOUND, MISSED, Caption, drawn_size
 from rbpf.validation.report.mono_frames import RAY, draw_frame
 from rbpf.validation.report.mono_views import best_views
@@ -30,7 +28,7 @@ def run(tmp_path_factory):
 
 
 def test_rays_are_found_on_their_epipolar_lines(run):
-    last = [sighting for sighting in run.sightings.frames[20:] if (sighting.is_ray & sighting.found).any()]
+    last = [sighting for sighting in run.searches[20:] if (sighting.is_ray & sighting.found).any()]
     distances = []
     for sighting in last:
         rows = sighting.is_ray & sighting.found
@@ -43,27 +41,17 @@ def test_rays_are_found_on_their_epipolar_lines(run):
 
 
 def test_places_that_were_seen_lie_in_the_known_points_world(run):
-    sighting = run.sightings.frames[-1]
-    members = sighting.found & (sighting.rows < run.known.names.size)
+    sighting = run.searches[-1]
+    members = sighting.found & (sighting.features < run.known.names.size)
     assert members.any()
-    place = sighting.place[members, :3] / sighting.place[members, 3:]
-    assert np.abs(place - run.known.positions[sighting.rows[members]]).max() < 0.02
-
-
-def test_sightings_come_back_from_arrays(run):
-    restored = Sightings()
-    restored.restore(run.sightings.arrays())
-    assert len(restored.frames) == len(run.sightings.frames)
-    for ours, theirs in zip(restored.frames, run.sightings.frames, strict=True):
-        assert all(
-            np.array_equal(getattr(ours, n), value, equal_nan=True) for n, value in vars(theirs).items()
-        )
+    place = sighting.position[members, :3] / sighting.position[members, 3:]
+    assert np.abs(place - run.known.positions[sighting.features[members]]).max() < 0.02
 
 
 def test_the_map_covers_the_desk_within_its_own_uncertainty(run):
-    mapped = summarise_mono_map(run.filter)
-    new = ~mapped.is_ray & (mapped.landmarks.ids >= run.known.names.size)
-    height, std = mapped.landmarks.mean[new, 2], np.sqrt(mapped.landmarks.cov[new, 2, 2])
+    mapped = run.slam.map()
+    new = ~mapped.is_ray() & (mapped.ids >= run.known.names.size)
+    height, std = mapped.mean[new, 2], np.sqrt(mapped.cov[new, 2, 2])
     assert new.sum() >= 5
     assert (height + 4.0 * std > -0.005).all()  # nothing on the desk lies below its top
     assert (height - 4.0 * std < 0.255).all()  # nor above its highest thing
@@ -89,15 +77,16 @@ def test_views_find_the_vertical(vertical, down, tilt_deg):
 
 
 def test_a_frame_shows_hits_misses_and_lines():
-    sighting = Sighting(
-        rows=np.array([0, 1]),
+    sighting = SearchRecord(
+        features=np.array([0, 1]),
         mean=np.array([[40.0, 30.0], [80.0, 40.0]]),
         cov=np.tile(4.0 * np.eye(2), (2, 1, 1)),
         px=np.array([[41.0, 30.0], [np.nan, np.nan]]),
+        cov_px=np.tile(np.eye(2), (2, 1, 1)),
         line=np.array([[[np.nan] * 2] * 2, [[-1e9, 40.0], [1e9, 40.0]]]),
-        place=np.full((2, 4), np.nan),
-        started=np.zeros((0, 2)),
-        held=np.array([[1, 1]]),
+        position=np.full((2, 4), np.nan),
+        started=np.zeros(0, dtype=int),
+        started_px=np.zeros((0, 2)),
     )
     image = np.full((90, 120), 128, dtype=np.uint8)
     picture = draw_frame(image, sighting, Caption("frame 0", ""), 120, 90)

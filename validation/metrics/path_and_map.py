@@ -7,7 +7,6 @@ from rbpf.systems.mono.run import MonoRun
 from rbpf.systems.mono.video import VideoRun
 from rbpf.systems.stereo.run import StereoRun
 from rbpf.validation.camera_map import summarise_points
-from rbpf.validation.mono_map import summarise_mono_map
 
 AnyRun = Run | MonoRun | VideoRun | StereoRun
 
@@ -20,7 +19,7 @@ def of_run(run: AnyRun) -> PathAndMap:
         return PathAndMap(run.stamps_ns, run.world_from_camera, run.cov, summarise_points(run.filter))
     if isinstance(run, StereoRun):
         return PathAndMap(run.stamps_ns, run.world_from_camera, run.cov, estimate_map(run.filter))
-    mapped = summarise_mono_map(run.filter)
-    full, found = ~mapped.is_ray, mapped.landmarks
-    points = MapEstimate(found.ids[full], found.mean[full], found.cov[full])
+    mapped = run.slam.map()
+    full = ~mapped.is_ray()
+    points = MapEstimate(mapped.ids[full], mapped.mean[full], mapped.cov[full])
     return PathAndMap(run.stamps_ns, run.world_from_camera, run.cov, points)

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from rbpf.runs.plots import outline
-from rbpf.systems.mono.sightings import Sighting
+from rbpf.systems.mono.video import SearchRecord
 from rbpf.validation.report.annotated import (
     FOUND,
     MISSED,
@@ -22,7 +22,7 @@ LEGEND = (("found", FOUND), ("missed", MISSED), ("epipolar line", RAY), ("new", 
 
 
 def draw_frame(
-    image: np.ndarray | None, sighting: Sighting, caption: Caption, width: int, height: int
+    image: np.ndarray | None, sighting: SearchRecord, caption: Caption, width: int, height: int
 ) -> np.ndarray:
     """The frame as it is shown (H, W, 3) uint8.
 
@@ -40,7 +40,7 @@ def draw_frame(
     return annotate(image, (width, height), caption, LEGEND, paint)
 
 
-def _draw_sighting(draw: Any, sighting: Sighting, place: Place, size: tuple[int, int]) -> None:
+def _draw_sighting(draw: Any, sighting: SearchRecord, place: Place, size: tuple[int, int]) -> None:
     found, is_ray, stroke = sighting.found, sighting.is_ray, drawn_scale(size[0])
     for line in sighting.line[is_ray]:
         draw.line(place(_clipped(line, size)), fill=RAY, width=stroke)
@@ -50,7 +50,7 @@ def _draw_sighting(draw: Any, sighting: Sighting, place: Place, size: tuple[int,
         cross(draw, place(px)[0], FOUND)
     for px in sighting.mean[~found]:
         cross(draw, place(px)[0], MISSED)
-    for px in sighting.started:
+    for px in sighting.started_px:
         cross(draw, place(px)[0], STARTED)
 
 

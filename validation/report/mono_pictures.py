@@ -8,11 +8,11 @@ import numpy as np
 from rbpf.lie import SE3
 from rbpf.runs.alignment import Similarity, align
 from rbpf.runs.plots import COLOURS, SIGMAS, outline, save_figures
-from rbpf.systems.mono.system import world_of
+from rbpf.systems.map_estimate import MapEstimate
+from rbpf.systems.mono.slam import world_of
 from rbpf.systems.mono.video import VideoRun
 from rbpf.validation.gtsam.mono_batch import Batch
 from rbpf.validation.metrics.mono_scores import TruePath, true_path
-from rbpf.validation.mono_map import MonoMap
 from rbpf.validation.report.mono_curves import error_figure, timings_figure, tracking_figure
 from rbpf.validation.report.mono_views import Views, best_views, close_up, draw_particles
 
@@ -20,7 +20,7 @@ MAP_FRACTION = 0.9
 """The map's picture holds the path and this fraction of the points; single points far off do not make it small."""
 
 
-def plot_mono_run(run: VideoRun, mapped: MonoMap, out: Path, batch: Batch | None = None) -> list[str]:
+def plot_mono_run(run: VideoRun, mapped: MapEstimate, out: Path, batch: Batch | None = None) -> list[str]:
     """Draws path, map, particles, error, tracking and times; returns the file names."""
     views, truth = best_views(run.world_from_camera), true_path(run.sequence.truth, run.stamps_ns)
     figures = {
@@ -62,11 +62,11 @@ def _path(run: VideoRun, views: Views, truth: TruePath | None, batch: Batch | No
     return figure
 
 
-def _map(run: VideoRun, mapped: MonoMap, views: Views) -> Any:
+def _map(run: VideoRun, mapped: MapEstimate, views: Views) -> Any:
     figure, shown = views.axes(f"{run.sequence.name}: map with {SIGMAS:g}σ ellipses")
     at = SE3.translation(run.world_from_camera)
-    full = ~mapped.is_ray
-    mean, cov = mapped.landmarks.mean[full], mapped.landmarks.cov[full]
+    full = ~mapped.is_ray()
+    mean, cov = mapped.mean[full], mapped.cov[full]
     middle = np.median(np.concatenate([mean, at]), axis=0)
     far = np.linalg.norm(mean - middle, axis=1)
     near = far <= np.quantile(far, MAP_FRACTION) if far.size else np.zeros(0, dtype=bool)
@@ -74,8 +74,8 @@ def _map(run: VideoRun, mapped: MonoMap, views: Views) -> Any:
         right, up = plane
         axes.plot(at[:, right], at[:, up], color=COLOURS["filter"], lw=1.0, label="camera")
         _map_points(axes, plane, mean, cov)
-        if mapped.is_ray.any():
-            ends = mapped.ends[mapped.is_ray]
+        if mapped.is_ray().any() and mapped.ray_ends is not None:
+            ends = mapped.ray_ends[mapped.is_ray()]
             lines = axes.plot(ends[..., right].T, ends[..., up].T, color=COLOURS["map"], lw=0.7, alpha=0.7)
             lines[0].set_label("rays (depth not known yet)")
         if run.known is not None:

@@ -29,9 +29,9 @@ def write_annotated(run: VideoRun, path: Path, on_frame: Callable[[int, int], No
 def annotated_frames(run: VideoRun) -> Iterator[np.ndarray]:
     """The frames (H, W, 3) uint8, as they are needed."""
     camera = run.sequence.camera
-    frames = zip(run.sequence.frames(), run.sightings.frames, strict=False)
+    frames = zip(run.sequence.frames(), run.searches, strict=False)
     for t, (frame, sighting) in enumerate(frames):
-        points, rays = sighting.held[0].tolist()
+        points, rays = int(run.points[t]), int(run.rays[t])
         text = (
             f"frame {t}   found {int(run.found[t])} of {int(run.searched[t])}   "
             f"map {points} points, {rays} rays"

@@ -76,11 +76,10 @@ def _run_mono(sequence: Mapping[str, Path], pairs: Sequence[str], given: Mapping
     from rbpf.validation.metrics.mono_scores import camera_truth
     from rbpf.validation.mono import Recording, start_mono
     from rbpf.validation.mono_folder import summarise_camera
-    from rbpf.validation.mono_map import summarise_mono_map
 
     recording = Recording(sequence["recording"], sequence.get("known_points"), sequence.get("calibration"))
     done = start_mono(recording, _mono_settings(pairs, given))
-    figures = summarise_camera(done, summarise_mono_map(done.filter))
+    figures = summarise_camera(done, done.slam.map())
     return figures | _pose_nees(SE3, done.world_from_camera, done.cov, camera_truth(done))
 
 

@@ -10,8 +10,8 @@ from rbpf.runs.plots import save_figures
 from rbpf.sensors.features import CornerDetector
 from rbpf.sensors.patches.search import cut, search, warp
 from rbpf.sensors.readers.images import ImageSequence
-from rbpf.systems.mono.appearance import SOURCE_HALF_PX
 from rbpf.systems.mono.config import SearchConfig
+from rbpf.systems.mono.feature_table import PATCH_HALF_PX
 from rbpf.validation.simulation.textured_scene import cast
 from rbpf.validation.tables import write_csv
 
@@ -28,8 +28,8 @@ def follow(sequence: ImageSequence, count: int, config: SearchConfig) -> tuple[n
     images = [frame.image for frame in sequence.frames()]
     first = images[0]
     assert first is not None
-    px = CornerDetector().detect(first, count, None, config.spacing_px, SOURCE_HALF_PX + 1.0).px
-    windows = [cut(first, place, SOURCE_HALF_PX) for place in px]
+    px = CornerDetector().detect(first, count, None, config.spacing_px, PATCH_HALF_PX + 1.0).px
+    windows = [cut(first, place, PATCH_HALF_PX) for place in px]
     source = np.array([window for window in windows if window is not None])
     templates = warp(source, np.tile(np.eye(2), (len(px), 1, 1)), config.template_px)
     track = np.full((len(px), len(images) - 1, 2), np.nan)

@@ -11,8 +11,8 @@ from examples.studies.e06.worlds import LoopOverDesk
 from rbpf.lie import SE3
 from rbpf.runs.plots import COLOURS, SIGMAS, label, outline, save_figures
 from rbpf.sensors.readers.images import ImageFrame
+from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.mono.video import VideoRun, run_images
-from rbpf.validation.mono_map import MonoMap, summarise_mono_map
 
 FRAME_S = 1.0 / 30.0
 WARM_UP = 5
@@ -40,7 +40,7 @@ def reproduce(setting: Setting) -> list[Row]:
         clock.append(time.process_time())
 
     run = run_images(sequence, setting.config(), known, note)
-    mapped = summarise_mono_map(run.filter)
+    mapped = run.slam.map()
     cpu = np.diff(clock, prepend=clock[0])
     save_figures({"figure_6.png": _draw(run, mapped, true_poses(sequence), cpu)}, setting.out)
     return _rows(run, cpu)
@@ -49,9 +49,9 @@ def reproduce(setting: Setting) -> list[Row]:
 def _rows(run: VideoRun, cpu: np.ndarray) -> list[Row]:
     counted = run.seconds[WARM_UP:]
     fraction, slowest = float((counted <= FRAME_S).mean()), 1e3 * float(counted.max())
-    held = int(run.sightings.frames[-1].held.sum())
     found = float(run.found.mean())
-    points, rays = run.sightings.frames[-1].held[0].tolist()
+    points, rays = int(run.points[-1]), int(run.rays[-1])
+    held = points + rays
     within = float(((run.found >= LEAST) & (run.found <= MOST)).mean())
     lost = int(run.lost.sum())
     median = f"median {1e3 * np.median(counted):.1f} ms, slowest {slowest:.0f} ms"
@@ -68,7 +68,7 @@ def _rows(run: VideoRun, cpu: np.ndarray) -> list[Row]:
     ]  # fmt: skip
 
 
-def _draw(run: VideoRun, mapped: MonoMap, truth: np.ndarray, cpu: np.ndarray) -> Any:
+def _draw(run: VideoRun, mapped: MapEstimate, truth: np.ndarray, cpu: np.ndarray) -> Any:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(14.0, 6.5), layout="constrained")
@@ -76,7 +76,7 @@ def _draw(run: VideoRun, mapped: MonoMap, truth: np.ndarray, cpu: np.ndarray) ->
     above, rows = panels[0].subplots(), panels[1].subplots(3, 1, sharex=True)
     _draw_map(above, run, mapped, truth)
     frames = np.arange(run.seconds.size)
-    held = np.array([sighting.held[0] for sighting in run.sightings.frames])
+    held = np.stack([run.points, run.rays], axis=1)
     rows[0].plot(frames, held.sum(axis=1), color="black", label="landmarks")
     rows[0].plot(frames, held[:, 0], color=COLOURS["filter"], label="of known depth")
     rows[1].plot(frames, run.found, color=COLOURS["known"], lw=0.6, label="observations")
@@ -94,9 +94,9 @@ def _draw(run: VideoRun, mapped: MonoMap, truth: np.ndarray, cpu: np.ndarray) ->
     return figure
 
 
-def _draw_map(axes: Any, run: VideoRun, mapped: MonoMap, truth: np.ndarray) -> None:
-    full = ~mapped.is_ray
-    mean, cov = mapped.landmarks.mean[full], mapped.landmarks.cov[full]
+def _draw_map(axes: Any, run: VideoRun, mapped: MapEstimate, truth: np.ndarray) -> None:
+    full = ~mapped.is_ray()
+    mean, cov = mapped.mean[full], mapped.cov[full]
     label(
         axes, f"map from above: {full.sum()} points with {SIGMAS:g}σ (Fig. 6)", "x [m]", "y [m]", equal=True
     )

@@ -9,9 +9,8 @@ from examples.studies.e06.setting import Row, Setting, true_poses
 from examples.studies.e06.worlds import LoopOverDesk
 from rbpf.lie import SE3
 from rbpf.runs.plots import COLOURS, SIGMAS, label, outline, save_figures
-from rbpf.systems.mono.sightings import Sighting
-from rbpf.systems.mono.video import VideoRun, run_images
-from rbpf.validation.mono_map import MonoMap, summarise_mono_map
+from rbpf.systems.map_estimate import MapEstimate
+from rbpf.systems.mono.video import SearchRecord, VideoRun, run_images
 
 START = 15
 """Landmarks that were started in so many first frames are those of the start."""
@@ -37,12 +36,12 @@ class Closure:
     back: int
 
 
-def find_closure(frames: list[Sighting], first: int) -> Closure:
+def find_closure(frames: list[SearchRecord], first: int) -> Closure:
     """From the sightings of a run, frame by frame, for the features with rows below `first`.
 
     The absence is the longest run of frames in which none of them was found.
     """
-    seen = [np.unique(frame.rows[frame.found & (frame.rows < first)]) for frame in frames]
+    seen = [np.unique(frame.features[frame.found & (frame.features < first)]) for frame in frames]
     seen[0] = np.arange(first)
     times = np.flatnonzero([rows.size > 0 for rows in seen])
     gaps = np.diff(times)
@@ -54,7 +53,7 @@ def find_closure(frames: list[Sighting], first: int) -> Closure:
     return Closure(first, again.size, left, back)
 
 
-def started_until(frames: list[Sighting], until: int) -> int:
+def started_until(frames: list[SearchRecord], until: int) -> int:
     """Number of features that were started in the first frames, the known points among them."""
     return sum(frame.started.shape[0] for frame in frames[:until])
 
@@ -64,13 +63,13 @@ def reproduce(setting: Setting) -> list[Row]:
     world = LoopOverDesk(frames=150, radius_m=0.35, texel_m=0.002) if setting.quick else LoopOverDesk()
     sequence, known = setting.sequence("loop", world)
     run = run_images(sequence, setting.config(), known)
-    mapped = summarise_mono_map(run.filter)
-    first = started_until(run.sightings.frames, START)
-    closure = find_closure(run.sightings.frames, first)
+    mapped = run.slam.map()
+    first = started_until(run.searches, START)
+    closure = find_closure(run.searches, first)
     truth = true_poses(sequence)[: run.stamps_ns.size]
     error = np.linalg.norm(SE3.translation(run.world_from_camera) - SE3.translation(truth), axis=1)
     save_figures({"figure_5.png": _draw(run, mapped, truth, error, closure)}, setting.out)
-    return _rows(closure, error, truth, int((~mapped.is_ray).sum()))
+    return _rows(closure, error, truth, int((~mapped.is_ray()).sum()))
 
 
 def _rows(closure: Closure, error: np.ndarray, truth: np.ndarray, full: int) -> list[Row]:
@@ -100,14 +99,14 @@ def _rows(closure: Closure, error: np.ndarray, truth: np.ndarray, full: int) -> 
     ]
 
 
-def _draw(run: VideoRun, mapped: MonoMap, truth: np.ndarray, error: np.ndarray, closure: Closure) -> Any:
+def _draw(run: VideoRun, mapped: MapEstimate, truth: np.ndarray, error: np.ndarray, closure: Closure) -> Any:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(12.0, 5.5), layout="constrained")
     above, curve = figure.subplots(1, 2)
     label(above, "map from above, the loop closed (Fig. 5)", "x [m]", "y [m]", equal=True)
-    full = ~mapped.is_ray
-    mean, cov = mapped.landmarks.mean[full], mapped.landmarks.cov[full]
+    full = ~mapped.is_ray()
+    mean, cov = mapped.mean[full], mapped.cov[full]
     for ellipse in outline(mean[:, :2], cov[:, :2, :2]):
         above.plot(*ellipse.T, color=COLOURS["map"], lw=0.6)
     above.plot(*mean[:, :2].T, ".", color="black", ms=3, label=f"landmarks, {SIGMAS:g}σ")

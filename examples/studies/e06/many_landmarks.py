@@ -12,7 +12,7 @@ from rbpf.lie import SE3
 from rbpf.maps.point import Point
 from rbpf.runs.plots import label, save_figures
 from rbpf.sensors.readers.images import ImageFrame
-from rbpf.systems.mono.appearance import SOURCE_HALF_PX
+from rbpf.systems.mono.feature_table import PATCH_PX
 from rbpf.systems.mono.video import VideoRun, run_images
 
 SIZES = 100, 300, 1000, 3000, 10_000
@@ -44,9 +44,11 @@ class _Watch:
         whole = time.process_time() - self._last
         turn, since = divmod(t - WARM_UP, FRAMES)
         if 0 <= turn < len(self.sizes) and since >= SETTLE:
+            measurement = run.slam.measurement
+            assert measurement is not None
             search, step = float(run.seconds_search[t]), float(run.seconds[t])
             self.seconds[self.sizes[turn]].append(
-                [whole, step - search, search, run.sensor.search.seconds_choosing]
+                [whole, step - search, search, measurement.search.seconds_choosing]
             )
         if since == FRAMES - 1 and turn + 1 < len(self.sizes):
             fill(run, self.sizes[turn + 1], self.rng)
@@ -60,14 +62,13 @@ def fill(run: VideoRun, size: int, rng: np.random.Generator) -> None:
     if count <= 0:
         return
     pose = belief.state[belief.mode][:7]
-    window = 2 * SOURCE_HALF_PX + 1
-    source = rng.integers(0, 256, (count, window, window)).astype(np.uint8)
+    source = rng.integers(0, 256, (count, PATCH_PX, PATCH_PX)).astype(np.uint8)
     rows = table.add(source, np.zeros((count, 2)), pose)
     along, turn = rng.uniform(-1.0, ASIDE, count), rng.uniform(0.0, 2.0 * np.pi, count)
     side = np.sqrt(1.0 - along**2)
     direction = np.stack([side * np.cos(turn), side * np.sin(turn), along], axis=-1)
     points = SE3.transform(pose, rng.uniform(*AWAY_M, (count, 1)) * direction)
-    table.place[rows] = np.concatenate([points, np.ones((count, 1))], axis=1)
+    table.position[rows] = np.concatenate([points, np.ones((count, 1))], axis=1)
     n = run.filter.n
     records = Records(
         np.broadcast_to(points, (n, count, 3)), np.broadcast_to(STD_M**2 * np.eye(3), (n, count, 3, 3))

@@ -10,9 +10,8 @@ from examples.studies.e06.worlds import LoopOverDesk
 from rbpf.lie import SE3
 from rbpf.runs.plots import COLOURS, label, outline, save_figures
 from rbpf.sensors.readers.images import ImageFrame
-from rbpf.systems.mono.sightings import Sighting
-from rbpf.systems.mono.video import VideoRun, run_images
-from rbpf.validation.mono_map import MonoMap, summarise_mono_map
+from rbpf.systems.map_estimate import MapEstimate
+from rbpf.systems.mono.video import SearchRecord, VideoRun, run_images
 from rbpf.validation.report.annotated import Caption
 from rbpf.validation.report.mono_frames import draw_frame
 
@@ -29,13 +28,13 @@ class Shown:
 
     frame: int
     image: np.ndarray
-    sighting: Sighting
+    sighting: SearchRecord
     found: int
-    mapped: MonoMap
+    mapped: MapEstimate
     path: np.ndarray
 
 
-def line_distances(sighting: Sighting) -> np.ndarray:
+def line_distances(sighting: SearchRecord) -> np.ndarray:
     """Distances (K,) of the found rays from their epipolar lines, px."""
     rows = sighting.found & sighting.is_ray
     start, end, px = sighting.line[rows, 0], sighting.line[rows, 1], sighting.px[rows]
@@ -45,7 +44,7 @@ def line_distances(sighting: Sighting) -> np.ndarray:
     return np.asarray(np.abs(cross) / np.maximum(length, 1e-12))
 
 
-def line_lengths(sighting: Sighting) -> np.ndarray:
+def line_lengths(sighting: SearchRecord) -> np.ndarray:
     """Lengths (K,) of the epipolar lines of the found rays, px: a camera at rest sees points."""
     rows = sighting.found & sighting.is_ray
     return np.asarray(np.linalg.norm(sighting.line[rows, 1] - sighting.line[rows, 0], axis=1))
@@ -60,22 +59,22 @@ def reproduce(setting: Setting) -> list[Row]:
     best: list[Shown] = []
 
     def watch(t: int, frame: ImageFrame, run: VideoRun) -> None:
-        sighting = run.sightings.frames[-1]
+        sighting = run.searches[-1]
         lines = int((line_lengths(sighting) > 2.0 * run.config.search.noise_px).sum())
         if t < FIRST or frame.image is None or (best and lines <= best[0].found):
             return
         path = run.world_from_camera[: t + 1].copy()
-        best[:] = [Shown(t, frame.image, sighting, lines, summarise_mono_map(run.filter), path)]
+        best[:] = [Shown(t, frame.image, sighting, lines, run.slam.map(), path)]
 
     run = run_images(sequence, setting.config(), known, watch)
     (shown,) = best
     figures = {"figure_7.png": _draw_map(shown), "figure_8.png": _draw_image(shown, run)}
     save_figures(figures, setting.out)
-    all_lines = np.concatenate([line_distances(sighting) for sighting in run.sightings.frames])
+    all_lines = np.concatenate([line_distances(sighting) for sighting in run.searches])
     rms = float(np.sqrt(np.mean(all_lines**2)))
     return [
         Row("Fig. 7", f"landmarks on rays in the map, frame {shown.frame}", "drawn",
-            f"{int(shown.mapped.is_ray.sum())}", float(shown.mapped.is_ray.sum())),
+            f"{int(shown.mapped.is_ray().sum())}", float(shown.mapped.is_ray().sum())),
         Row("Fig. 8", "of these seen on epipolar lines longer than 2 px", "drawn", f"{shown.found}",
             float(shown.found)),
         Row("Fig. 8", "distance of what is found from its epipolar line, whole sequence", "zero for a perfect pose",
@@ -95,10 +94,11 @@ def _draw_map(shown: Shown) -> Any:
         "y [m]",
         equal=True,
     )
-    full, rays = ~shown.mapped.is_ray, shown.mapped.is_ray
-    mean, cov = shown.mapped.landmarks.mean[full], shown.mapped.landmarks.cov[full]
+    full, rays = ~shown.mapped.is_ray(), shown.mapped.is_ray()
+    mean, cov = shown.mapped.mean[full], shown.mapped.cov[full]
     camera = SE3.translation(shown.path)
-    ends = shown.mapped.ends[rays]
+    assert shown.mapped.ray_ends is not None
+    ends = shown.mapped.ray_ends[rays]
     axes.plot(ends[..., 0].T, ends[..., 1].T, color=COLOURS["map"], lw=0.8)
     axes.plot([], [], color=COLOURS["map"], label="rays (±2σ of inverse depth)")
     for ellipse in outline(mean[:, :2], cov[:, :2, :2]):

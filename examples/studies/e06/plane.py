@@ -10,8 +10,8 @@ from examples.studies.e06.worlds import flat_desk
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.plots import COLOURS, SIGMAS, label, outline, save_figures
+from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.mono.video import VideoRun, run_images
-from rbpf.validation.mono_map import MonoMap, summarise_mono_map
 
 ASKED_M, GOAL_M = 0.01, 0.003
 LEAST = 4
@@ -62,10 +62,10 @@ def fit_plane(points: np.ndarray) -> Plane:
     return Plane(middle, axes, local, float(ConvexHull(local[:, :2]).volume))
 
 
-def unknown_points(run: VideoRun, mapped: MonoMap) -> np.ndarray:
+def unknown_points(run: VideoRun, mapped: MapEstimate) -> np.ndarray:
     """(M,) which landmarks of a map are full and were not known beforehand."""
     known = 0 if run.known is None else run.known.names.size
-    return np.asarray(~mapped.is_ray & (mapped.landmarks.ids >= known))
+    return np.asarray(~mapped.is_ray() & (mapped.ids >= known))
 
 
 def reproduce(setting: Setting) -> list[Row]:
@@ -73,9 +73,9 @@ def reproduce(setting: Setting) -> list[Row]:
     frames = 90 if setting.quick else 600
     sequence, known = setting.sequence("flat_desk", flat_desk(frames, 0.002 if setting.quick else 0.001))
     run = run_images(sequence, setting.config(), known)
-    mapped = summarise_mono_map(run.filter)
+    mapped = run.slam.map()
     full = unknown_points(run, mapped)
-    plane = fit_plane(mapped.landmarks.mean[full])
+    plane = fit_plane(mapped.mean[full])
     save_figures({"figure_4.png": _draw(run, mapped, full, plane)}, setting.out)
     seconds = round(frames / 30)
     what = f"{int(full.sum())} landmarks of a flat desk after {seconds} s, {plane.area_m2:.2f} m²"
@@ -88,7 +88,7 @@ def reproduce(setting: Setting) -> list[Row]:
     ]
 
 
-def _draw(run: VideoRun, mapped: MonoMap, full: np.ndarray, plane: Plane) -> Any:
+def _draw(run: VideoRun, mapped: MapEstimate, full: np.ndarray, plane: Plane) -> Any:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13.0, 4.5), layout="constrained")
@@ -96,7 +96,7 @@ def _draw(run: VideoRun, mapped: MonoMap, full: np.ndarray, plane: Plane) -> Any
     frame = next(run.sequence.frames(run.stamps_ns.size // 2))
     image.imshow(frame.image, cmap="gray", vmin=0, vmax=255)
     image.set(title="a view of the desk", xticks=[], yticks=[])
-    cov = plane.axes @ mapped.landmarks.cov[full] @ plane.axes.T
+    cov = plane.axes @ mapped.cov[full] @ plane.axes.T
     camera = (SE3.translation(run.world_from_camera) - plane.middle) @ plane.axes.T
     if camera[:, 2].mean() < 0.0:
         camera[:, 2] *= -1.0

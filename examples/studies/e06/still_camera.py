@@ -10,7 +10,7 @@ from rbpf.core.filter import Filter
 from rbpf.lie import SE3
 from rbpf.runs.plots import save_figures
 from rbpf.systems.mono.config import InverseDepthConfig, MonoConfig
-from rbpf.systems.mono.system import world_of
+from rbpf.systems.mono.slam import world_of
 from rbpf.systems.mono.video import run_images
 from rbpf.validation.consistency.pose_errors import pose_errors
 from rbpf.validation.simulation.images import Imaging

@@ -1,7 +1,9 @@
-"""Every setting of monocular SLAM on features, with its default, its unit and what it does."""
+"""Every setting of monocular SLAM, with its default, its unit and what it does."""
 
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal
+
+import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.systems.filtering import ProposalConfig, ResamplingConfig
@@ -24,6 +26,14 @@ class VelocityConfig:
     walk_m_s: float = 1.5
     start_rad_s: float = 0.5
     start_m_s: float = 0.5
+
+    def walk_std(self) -> np.ndarray:
+        """Standard deviation (6,) of the velocity's walk in one second, (rad/s, m/s)/√s."""
+        return np.repeat([self.walk_rad_s, self.walk_m_s], 3)
+
+    def start_std(self) -> np.ndarray:
+        """Standard deviation (6,) of a velocity of which nothing is known, (rad/s, m/s)."""
+        return np.repeat([self.start_rad_s, self.start_m_s], 3)
 
 
 @dataclass(frozen=True)
@@ -246,7 +256,7 @@ class RelocalisationConfig:
 
 @dataclass(frozen=True)
 class MonoConfig:
-    """A run of monocular SLAM on features.
+    """Monocular SLAM.
 
     Attributes:
         particles: number of particles.

@@ -1,12 +1,18 @@
-"""Points and rays from features that carry names: the measurement side of E06 without its images."""
+"""From features that were found to observations of landmarks, and from the map to where features should be found.
 
+A feature is in the map as a world point once its depth is known; before, as an `UnknownDepth` says: a ray with an
+inverse depth, unless the system is given something else. Known points may be members of one landmark, a constellation.
+"""
+
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import final
 
 import numpy as np
 
+from rbpf import gaussian
 from rbpf.core.belief import Belief
-from rbpf.core.models import NewLandmarks, Observations, Part, Sensor
+from rbpf.core.models import Landmark, NewLandmarks, Observations, Part, Records, Sensor
 from rbpf.lie import SE3
 from rbpf.maps.constellation import Constellation
 from rbpf.maps.inverse_depth import InverseDepth
@@ -15,137 +21,256 @@ from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.camera.constellation import ConstellationView, MembersView
 from rbpf.sensors.camera.points import CameraModel, CameraPoint, CameraRay, EpipolarRay
 from rbpf.sensors.catalogue_index import NameIndex
-from rbpf.sensors.feature_log import FeatureFrame
+from rbpf.sensors.feature_log import FeatureFrame, KnownPoints
 from rbpf.systems.mono.config import InverseDepthConfig
-from rbpf.systems.mono.known_start import KnownStart
 
 CONSTELLATION = -1
-"""Name of the known points' frame in the catalogue; features have names from 0 on."""
+"""Name of the known points' landmark in the catalogue; features have names from 0 on."""
 
-ENOUGH = 4
-"""Points that must be seen for new rays to start at their depth."""
+MIN_DEPTHS = 4
+"""Depths that must be known in view for new features to start at them."""
 
-HOLD = 3
+MIN_SCALED = 3
 """Points that must be seen for the scale to be theirs: so many determine the camera's pose."""
 
-GroupView = ConstellationView | MembersView
-"""Measurements of several known points at once."""
+MIN_RHO = 0.02
+"""Inverse depth below which a ray is reported as if it ended there, 1/m: at 50 m."""
 
 _STATE, _MAP = frozenset({Part.STATE}), frozenset({Part.LANDMARK})
 _BOTH = _STATE | _MAP
 
+GroupView = ConstellationView | MembersView
+"""Measurements of several known points at once."""
+
+
+class UnknownDepth(ABC):
+    """How features are kept and used as long as their depth is not known well enough for a world point.
+
+    Attributes:
+        landmark: their parametrisation in the map; of one component.
+        model: how a camera measures them.
+    """
+
+    landmark: Landmark
+    model: CameraModel
+
+    @abstractmethod
+    def starting(self, depths: np.ndarray) -> CameraModel:
+        """The model whose `initialise` starts features, where points (D,) of these depths [m] are in view."""
+
+    @abstractmethod
+    def observations(
+        self, belief: Belief, z: np.ndarray, cov: np.ndarray, ids: np.ndarray, scaled: bool
+    ) -> list[Observations]:
+        """Of features (K,) at z (K, 2): what they say of the pose and of themselves.
+
+        Args:
+            belief: predicted.
+            z: (K, 2) px.
+            cov: (K, 2, 2) px².
+            ids: (K,) landmarks of this parametrisation.
+            scaled: whether points are seen that hold the scale, which else the prior of depth does.
+        """
+
+    @abstractmethod
+    def promotable(self, belief: Belief, observed: Sequence[Observations]) -> np.ndarray:
+        """Ids (P,) of what was observed and is known well enough now to be turned into world points."""
+
+    @abstractmethod
+    def depth_std_ratio(self, records: Records) -> np.ndarray:
+        """Standard deviation of the depth as a fraction of it (N, K); infinite where the depth is not known at all."""
+
+    @abstractmethod
+    def extent(self, records: Records, sigmas: float, min_weight: float = 0.0) -> np.ndarray:
+        """Nearest and farthest homogeneous point (N, K, 2, 4), so many standard deviations from the mean.
+
+        Their last entry is not below `min_weight`; 0 is at infinity.
+        """
+
+    @abstractmethod
+    def as_points(self, records: Records) -> Records:
+        """The features as Gaussian world points (N, K, 3), however roughly, for reports."""
+
 
 @final
-class FeatureSensor(Sensor):
-    """Landmarks start as rays, constrain the pose as `InverseDepthConfig` says, and become points when their depth is known.
+class InverseDepthRays(UnknownDepth):
+    """Rays with an inverse depth from where a feature was seen first, E06 §5.
 
     Args:
         camera: of the images.
-        rays: settings of landmarks without depth.
-        max_new_per_frame: landmarks started in one frame at most.
-        start: known points that are one landmark, a `Constellation`.
-        fixed: the map is known: its points tell where the camera is, and are not changed by what is seen of them.
+        config: settings.
+    """
+
+    landmark: InverseDepth
+    model: CameraRay
+
+    def __init__(self, camera: Pinhole, config: InverseDepthConfig) -> None:
+        rho = (config.mean_per_m, config.std_per_m)
+        self.camera, self.config = camera, config
+        self.landmark = InverseDepth(config.promote_std_ratio)
+        self.model = CameraRay(camera, rho)
+        self.epipolar = EpipolarRay(camera, rho, config.epipolar_parallax_px)
+
+    def starting(self, depths: np.ndarray) -> CameraModel:
+        """At the median inverse depth of the points in view, where there are enough of them.
+
+        Rays that all start too near or too far agree with one another on a wrong scale: the prior takes them as
+        independent, the scene's depth is common to them.
+        """
+        if not self.config.from_scene_depth or depths.size < MIN_DEPTHS:
+            return self.model
+        rho = 1.0 / depths
+        middle = float(np.median(rho))
+        fraction = self.config.std_per_m / self.config.mean_per_m
+        return CameraRay(self.camera, (middle, max(fraction * middle, float(rho.std()))))
+
+    def observations(
+        self, belief: Belief, z: np.ndarray, cov: np.ndarray, ids: np.ndarray, scaled: bool
+    ) -> list[Observations]:
+        """Epipolar constraint, 2-D marginal, or an update of depth alone, as `InverseDepthConfig.pose_update` says."""
+        # Depth is measured where it moves the image in the particle of highest weight, E06 §5.1, last paragraph.
+        state, mode = belief.state[belief.mode], belief.mode
+        _, jac, _ = belief.map.innovations(self.model, np.zeros((ids.size, 2)), ids, state, mode)
+        by_rho = np.sqrt(np.square(jac.landmark[..., 2]).sum(axis=-1))
+        parallax = by_rho * self.config.std_per_m >= self.config.depth_parallax_px
+
+        def group(model: CameraRay, rows: np.ndarray, updates: frozenset[Part]) -> list[Observations]:
+            if not rows.any():
+                return []
+            return [Observations(z[rows], cov[rows], model, ids=ids[rows], updates=updates)]
+
+        if self.config.pose_update == "marginal":
+            without_parallax = self.epipolar if scaled else self.model
+            return group(self.model, parallax, _BOTH) + group(without_parallax, ~parallax, _STATE)
+        of_depth = group(self.model, parallax, _MAP)
+        if self.config.pose_update == "off":
+            return of_depth
+        return group(self.epipolar, np.ones_like(parallax), _STATE) + of_depth
+
+    def promotable(self, belief: Belief, observed: Sequence[Observations]) -> np.ndarray:
+        """Whose inverse depth is known to `promote_std_ratio` in `promote_weight` of the particles' weight."""
+        updated = [group.ids for group in observed if group.model is self.model and group.updates != _STATE]
+        if not updated:
+            return np.zeros(0, dtype=np.int64)
+        ids = np.concatenate([each for each in updated if each is not None])
+        ready = belief.weights @ self.landmark.ready(belief.read(ids))
+        return np.asarray(ids[ready >= self.config.promote_weight])
+
+    def depth_std_ratio(self, records: Records) -> np.ndarray:
+        """σ_ρ / ρ."""
+        rho, std = records.mean[..., 2], np.sqrt(records.cov[..., 2, 2])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(rho > 0.0, std / rho, np.inf)
+
+    def extent(self, records: Records, sigmas: float, min_weight: float = 0.0) -> np.ndarray:
+        """At ρ + σ and ρ − σ."""
+        assert records.const is not None
+        mean = records.mean[..., None, :].repeat(2, axis=-2)
+        spread = sigmas * np.sqrt(records.cov[..., 2, 2])
+        mean[..., 2] = np.maximum(mean[..., 2] + np.stack([spread, -spread], axis=-1), min_weight)
+        return self.landmark.homogeneous(mean, records.const[..., None, :])
+
+    def as_points(self, records: Records) -> Records:
+        """To first order in (u, v, ρ), with ρ kept away from 0."""
+        assert records.const is not None
+        u, v, q = np.moveaxis(records.mean, -1, 0)
+        q = np.maximum(q, MIN_RHO)
+        direction = np.stack([u, v, np.ones_like(q)], axis=-1)
+        jac = np.zeros((*q.shape, 3, 3))
+        jac[..., 0, 0] = jac[..., 1, 1] = 1.0 / q
+        jac[..., :, 2] = -direction / np.square(q)[..., None]
+        turned = SE3.matrix(records.const)[..., :3, :3] @ jac
+        cov = gaussian.symmetrise(turned @ records.cov @ np.swapaxes(turned, -1, -2))
+        return Records(SE3.transform(records.const, direction / q[..., None]), cov)
+
+
+@final
+class FeatureSensor(Sensor):
+    """Takes features with names (`FeatureFrame`), and says where the map has features, by name.
+
+    Args:
+        camera: of the images.
+        unknown_depth: what features are as long as their depth is not known.
+        max_new_per_frame: features started in one frame at most.
+        group: known points that are one landmark, a constellation; None where there is none.
+        fixed: the map is known: its points say where the camera is, and are not changed by what is seen of them.
     """
 
     def __init__(
         self,
         camera: Pinhole,
-        rays: InverseDepthConfig,
+        unknown_depth: UnknownDepth,
         max_new_per_frame: int,
-        start: KnownStart | None = None,
+        group: KnownPoints | None = None,
         fixed: bool = False,
     ) -> None:
-        rho = (rays.mean_per_m, rays.std_per_m)
         self.camera = camera
-        self.rays = rays
+        self.unknown_depth = unknown_depth
         self.max_new_per_frame = 0 if fixed else max_new_per_frame
         self.fixed = fixed
+        self.group = group
         self.point = CameraPoint(camera)
-        self.ray = CameraRay(camera, rho)
-        self.epipolar = EpipolarRay(camera, rho, rays.epipolar_parallax_px)
-        self.inverse_depth = InverseDepth(rays.promote_std_ratio)
+        self._member = {} if group is None else {name: m for m, name in enumerate(group.names.tolist())}
         self._names = NameIndex()
-        self._start = start
-        self._place = {} if start is None else {name: m for m, name in enumerate(start.points.names.tolist())}
 
     def observe(self, frame: FeatureFrame, belief: Belief) -> Sequence[Observations]:
-        """Groups for points and for rays."""
-        known = self._names.ids(belief.catalogue)
-        ids = np.array([known.get(name, -1) for name in frame.landmarks.tolist()], dtype=np.int64)
-        inside = self.camera.inside(frame.z)
+        """Groups of observations for known points, points, and features of unknown depth."""
+        groups, inside = list[Observations](), self.camera.inside(frame.z)
+
+        # All members of the constellation that are seen are one measurement of it.
+        names = frame.landmarks.tolist()
+        members = [k for k, name in enumerate(names) if name in self._member and inside[k]]
+        if members:
+            landmark, view = self._view(belief, np.array([self._member[names[k]] for k in members]))
+            cov = np.zeros((1, view.dim, view.dim))
+            for k, row in enumerate(members):
+                cov[0, 2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = frame.cov_z[row]
+            groups.append(Observations(frame.z[members].reshape(1, -1), cov, view, ids=landmark))
+
+        ids = self._ids(belief, frame.landmarks)
         rows = np.flatnonzero((ids >= 0) & inside)
-        groups = self._constellation_group(frame, inside, belief)
-        is_ray = belief.map.are(ids[rows], self.inverse_depth)
-        if (~is_ray).any():
-            k = rows[~is_ray]
+        unknown = belief.map.are(ids[rows], self.unknown_depth.landmark)
+        if (~unknown).any():
+            k = rows[~unknown]
             updates = _STATE if self.fixed else _BOTH
             groups.append(Observations(frame.z[k], frame.cov_z[k], self.point, ids=ids[k], updates=updates))
-        if is_ray.any():
-            scaled = sum(group.z.size for group in groups) >= 2 * HOLD
-            groups += self._ray_groups(frame, belief, rows[is_ray], ids[rows[is_ray]], scaled)
+        if unknown.any():
+            k = rows[unknown]
+            scaled = sum(group.z.size for group in groups) >= 2 * MIN_SCALED
+            groups += self.unknown_depth.observations(belief, frame.z[k], frame.cov_z[k], ids[k], scaled)
         return groups
 
     def new_landmarks(
         self, frame: FeatureFrame, belief: Belief, observed: Sequence[Observations]
     ) -> Sequence[NewLandmarks]:
-        """Promotes rays that are ready; starts a ray for every new name."""
-        self._promote(belief, observed)
+        """Turns features whose depth is known by now into points; starts one for every new name."""
+        belief.map.promote(self.unknown_depth.promotable(belief, observed), Point(3))
         known = self._names.ids(belief.catalogue)
         names = frame.landmarks.tolist()
-        new = [k for k, name in enumerate(names) if name not in known and name not in self._place]
+        new = [k for k, name in enumerate(names) if name not in known and name not in self._member]
         if new:
             z = frame.z[new]
             has_ray = self.camera.inside(z) & np.isfinite(self.camera.unproject(z)).all(axis=-1)
             new = [k for k, seen in zip(new, has_ray.tolist(), strict=True) if seen][: self.max_new_per_frame]
         if not new:
             return []
-        names = frame.landmarks[new].tolist()
-        ray = self.new_ray(belief, observed)
-        return [NewLandmarks(frame.z[new], frame.cov_z[new], ray, self.inverse_depth, facts=names)]
+        model = self.unknown_depth.starting(self._depths(belief, observed))
+        facts = frame.landmarks[new].tolist()
+        landmark = self.unknown_depth.landmark
+        return [NewLandmarks(frame.z[new], frame.cov_z[new], model, landmark, facts=facts)]
 
-    def new_ray(self, belief: Belief, observed: Sequence[Observations]) -> CameraRay:
-        """What starts rays: at the inverse depths of the points that were just seen, where there are enough of them.
-
-        Rays that all start too near or too far agree with one another on a wrong scale: the prior takes them as
-        independent, the scene's depth is common to them.
-        """
-        depth = self._depths(belief, observed) if self.rays.from_scene_depth else np.zeros(0)
-        if depth.size < ENOUGH:
-            return self.ray
-        rho = 1.0 / depth
-        middle = float(np.median(rho))
-        fraction = self.rays.std_per_m / self.rays.mean_per_m
-        return CameraRay(self.camera, (middle, max(fraction * middle, float(rho.std()))))
-
-    def _depths(self, belief: Belief, observed: Sequence[Observations]) -> np.ndarray:
-        """Of the points that were just seen, and of the known points in view, in the heaviest particle."""
-        pose = belief.state[belief.mode][:7]
-        seen = [np.zeros((0, 3))]
-        for group in observed:
-            if group.ids is not None and isinstance(group.model, CameraPoint):
-                seen.append(SE3.inverse_transform(pose, belief.read_mode(group.ids).mean[0]))
-        if self._start is not None:
-            landmark = self._names.ids(belief.catalogue)[CONSTELLATION]
-            points = belief.map.landmark_of(landmark).in_world(belief.read_mode([landmark]))[0]
-            seen.append(SE3.inverse_transform(pose, points))
-        point = np.concatenate(seen)
-        return np.asarray(point[self.camera.visible(point), 2])
-
-    def project(
-        self, belief: Belief, names: np.ndarray, members: np.ndarray
-    ) -> list[tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]]:
-        """Where features (K,) should be seen: which of them, their means (k, 2) and covariances (k, 2, 2), by kind."""
-        out = []
-        for model, chosen, ids in self._by_kind(belief, names, members):
+    def project(self, belief: Belief, names: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Where features (K,) should be seen under all particles: which of them, means (k, 2), covariances (k, 2, 2)."""
+        which, means, covs = [], [], []
+        for model, chosen, ids in self._by_model(belief, names):
             mean, cov = belief.project(model, ids)
-            if isinstance(model, GroupView):
-                mean = mean.reshape(-1, 2)
-            cov = _diagonal_blocks(cov, chosen.size)
-            out.append((chosen, (mean, cov)))
-        return out
+            which.append(chosen)
+            means.append(mean.reshape(-1, 2))
+            covs.append(_diagonal_blocks(cov, chosen.size))
+        return np.concatenate(which), np.concatenate(means), np.concatenate(covs)
 
     def innovations(
-        self, belief: Belief, names: np.ndarray, members: np.ndarray, px: np.ndarray
+        self, belief: Belief, names: np.ndarray, px: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Of features (K,) found at px (K, 2), in the heaviest particle at its predicted pose.
 
@@ -153,7 +278,7 @@ class FeatureSensor(Sensor):
             Which features, ν (k, 2), H (k, 2, d) and J P Jᵀ (k, 2, 2).
         """
         which, nus, jacs, covs = [], [], [], []
-        for model, chosen, ids in self._by_kind(belief, names, members):
+        for model, chosen, ids in self._by_model(belief, names):
             z = px[chosen].reshape(1, -1) if isinstance(model, GroupView) else px[chosen]
             nu, jac, cov = belief.innovations(model, z, ids)
             which.append(chosen)
@@ -162,127 +287,91 @@ class FeatureSensor(Sensor):
             covs.append(_diagonal_blocks(cov, chosen.size))
         return np.concatenate(which), np.concatenate(nus), np.concatenate(jacs), np.concatenate(covs)
 
-    def places(self, belief: Belief, names: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where features (K,) are in the world of the heaviest particle: which of them, homogeneous points (k, 4)."""
+    def positions(self, belief: Belief, names: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where features (K,) are in the heaviest particle's world: which of them, homogeneous points (k, 4)."""
         which, out = [np.zeros(0, dtype=np.int64)], [np.zeros((0, 4))]
-        for model, chosen, ids in self._by_kind(belief, names, members):
+        for model, chosen, ids in self._by_model(belief, names):
             records = belief.read_mode(ids)
             const = None if records.const is None else records.const[0]
             which.append(chosen)
             if isinstance(model, GroupView):
-                out.append(
-                    np.pad(model.in_world(records.mean[0], const)[0], ((0, 0), (0, 1)), constant_values=1.0)
-                )
+                points = model.in_world(records.mean[0], const)[0]
+                out.append(np.pad(points, ((0, 0), (0, 1)), constant_values=1.0))
             else:
                 x, w = model.world_point(records.mean[0], const)
                 out.append(np.concatenate([x, w], axis=-1))
         return np.concatenate(which), np.concatenate(out)
 
-    def deep(self, belief: Belief, names: np.ndarray, members: np.ndarray, fraction: float) -> np.ndarray:
+    def depth_known(self, belief: Belief, names: np.ndarray, std_ratio: float) -> np.ndarray:
         """Whether the heaviest particle knows the depth of features (K,) to this fraction of it, (K,) bool."""
         out = np.zeros(names.size, dtype=bool)
-        for model, chosen, ids in self._by_kind(belief, names, members):
+        for model, chosen, ids in self._by_model(belief, names):
             out[chosen] = True
-            if model is self.ray:
-                records = belief.read_mode(ids)
-                rho, variance = records.mean[0, :, 2], records.cov[0, :, 2, 2]
-                out[chosen] = (rho > 0.0) & (np.sqrt(variance) <= fraction * rho)
+            if model is self.unknown_depth.model:
+                out[chosen] = self.unknown_depth.depth_std_ratio(belief.read_mode(ids))[0] <= std_ratio
         return out
 
-    def first_places(self, world_from_camera: np.ndarray, px: np.ndarray, ray: CameraRay) -> np.ndarray:
-        """Homogeneous points (k, 4) of rays that start at px (k, 2) from a camera (7,)."""
-        records = ray.initialise(world_from_camera[None], px, np.zeros((px.shape[0], 2, 2)))
-        x, w = self.ray.world_point(records.mean[0], records.const[0] if records.const is not None else None)
-        return np.concatenate([x, w], axis=-1)
+    def extents(self, belief: Belief, names: np.ndarray, sigmas: float) -> tuple[np.ndarray, np.ndarray]:
+        """Of those features (K,) whose depth is not known: which, and where they may be (k, 2, 4), see `UnknownDepth`."""
+        ids = self._ids(belief, names)
+        held = np.flatnonzero(ids >= 0)
+        unknown = held[belief.map.are(ids[held], self.unknown_depth.landmark)]
+        if not unknown.size:
+            return unknown, np.zeros((0, 2, 4))
+        return unknown, self.unknown_depth.extent(belief.read_mode(ids[unknown]), sigmas)[0]
 
-    def forget(self, belief: Belief, names: np.ndarray) -> None:
+    def remove(self, belief: Belief, names: np.ndarray) -> None:
         """Drops features from all particles."""
-        known = self._names.ids(belief.catalogue)
-        belief.map.remove(np.array([known[name] for name in names.tolist() if name in known], dtype=np.int64))
+        ids = self._ids(belief, names)
+        belief.map.remove(ids[ids >= 0])
 
-    def _by_kind(
-        self, belief: Belief, names: np.ndarray, members: np.ndarray
-    ) -> list[tuple[CameraModel | GroupView, np.ndarray, np.ndarray]]:
-        """Features (K,) by their model: the model, which of them, and the landmarks' ids."""
+    def _ids(self, belief: Belief, names: np.ndarray) -> np.ndarray:
+        """Landmarks (K,) of features (K,), −1 where the map has none of their own."""
         known = self._names.ids(belief.catalogue)
-        ids = np.array([known.get(name, -1) for name in names.tolist()], dtype=np.int64)
-        own = np.flatnonzero((members < 0) & (ids >= 0))
-        is_ray = belief.map.are(ids[own], self.inverse_depth)
+        return np.array([known.get(name, -1) for name in names.tolist()], dtype=np.int64)
+
+    def _by_model(
+        self, belief: Belief, names: np.ndarray
+    ) -> list[tuple[CameraModel | GroupView, np.ndarray, np.ndarray]]:
+        """Features (K,) by how they are measured: the model, which of them, and the landmarks' ids."""
+        ids, member = self._ids(belief, names), np.full(names.size, -1)
+        if self._member:
+            member = np.array([self._member.get(name, -1) for name in names.tolist()], dtype=np.int64)
+        own = np.flatnonzero((member < 0) & (ids >= 0))
+        unknown = belief.map.are(ids[own], self.unknown_depth.landmark)
         out: list[tuple[CameraModel | GroupView, np.ndarray, np.ndarray]] = []
-        for model, chosen in ((self.point, own[~is_ray]), (self.ray, own[is_ray])):
+        for model, chosen in ((self.point, own[~unknown]), (self.unknown_depth.model, own[unknown])):
             if chosen.size:
                 out.append((model, chosen, ids[chosen]))
-        of_group = np.flatnonzero(members >= 0)
+        of_group = np.flatnonzero(member >= 0)
         if of_group.size:
-            out.append((self._view(belief, members[of_group]), of_group, np.array([known[CONSTELLATION]])))
+            landmark, view = self._view(belief, member[of_group])
+            out.append((view, of_group, landmark))
         return out
 
-    def _view(self, belief: Belief, places: np.ndarray) -> GroupView:
-        assert self._start is not None
-        group = belief.map.landmark_of(self._names.ids(belief.catalogue)[CONSTELLATION])
-        if isinstance(group, Constellation):
-            return ConstellationView(self.camera, self._start.points.positions[places])
-        return MembersView(self.camera, places)
-
-    def _constellation_group(
-        self, frame: FeatureFrame, inside: np.ndarray, belief: Belief
-    ) -> list[Observations]:
-        """All known points that are seen, as one measurement; the first sight of them is in the map already."""
-        names = frame.landmarks.tolist()
-        rows = [k for k, name in enumerate(names) if name in self._place and inside[k]]
-        if not rows or self._has_entered(frame, rows):
-            return []
+    def _view(self, belief: Belief, members: np.ndarray) -> tuple[np.ndarray, GroupView]:
+        """The constellation's id (1,), and the camera's view of some of its members."""
+        assert self.group is not None
         landmark = self._names.ids(belief.catalogue)[CONSTELLATION]
-        view = self._view(belief, np.array([self._place[names[k]] for k in rows]))
-        z, cov = frame.z[rows].reshape(1, -1), np.zeros((1, view.dim, view.dim))
-        for k, row in enumerate(rows):
-            cov[0, 2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = frame.cov_z[row]
-        return [Observations(z, cov, view, ids=np.array([landmark]))]
+        if isinstance(belief.map.landmark_of(landmark), Constellation):
+            view: GroupView = ConstellationView(self.camera, self.group.positions[members])
+        else:
+            view = MembersView(self.camera, members)
+        return np.array([landmark]), view
 
-    def _has_entered(self, frame: FeatureFrame, rows: list[int]) -> bool:
-        assert self._start is not None
-        first = self._start.sight
-        if frame.stamp_ns != first.stamp_ns:
-            return False
-        order = np.argsort(first.landmarks), np.argsort(frame.landmarks[rows])
-        return np.array_equal(first.z[order[0]], frame.z[rows][order[1]])
-
-    def _ray_groups(
-        self, frame: FeatureFrame, belief: Belief, rows: np.ndarray, ids: np.ndarray, scaled: bool
-    ) -> list[Observations]:
-        """Of rays; `scaled` says whether points are seen that hold the scale, which else the prior of depth does."""
-        deep = self._has_parallax(belief, ids)
-        z, cov = frame.z[rows], frame.cov_z[rows]
-
-        def group(
-            model: CameraRay, chosen: np.ndarray, updates: frozenset[Part] = _BOTH
-        ) -> list[Observations]:
-            if not chosen.any():
-                return []
-            return [Observations(z[chosen], cov[chosen], model, ids=ids[chosen], updates=updates)]
-
-        if self.rays.pose_update == "marginal":
-            young = self.epipolar if scaled else self.ray
-            return group(self.ray, deep) + group(young, ~deep, updates=_STATE)
-        updates = group(self.ray, deep, updates=_MAP)
-        if self.rays.pose_update == "off":
-            return updates
-        return group(self.epipolar, np.ones_like(deep), updates=_STATE) + updates
-
-    def _has_parallax(self, belief: Belief, ids: np.ndarray) -> np.ndarray:
-        """Whether the particle of highest weight sees depth move the image (K,), E06 §5.1, last paragraph."""
-        state, mode = belief.state[belief.mode], belief.mode
-        _, jac, _ = belief.map.innovations(self.ray, np.zeros((ids.size, 2)), ids, state, mode)
-        by_rho = np.sqrt(np.square(jac.landmark[..., 2]).sum(axis=-1))
-        return by_rho * self.rays.std_per_m >= self.rays.depth_parallax_px
-
-    def _promote(self, belief: Belief, observed: Sequence[Observations]) -> None:
-        updated = [g.ids for g in observed if g.model is self.ray and g.updates != _STATE]
-        if not updated:
-            return
-        ids = np.concatenate([i for i in updated if i is not None])
-        ready = belief.weights @ self.inverse_depth.ready(belief.read(ids))
-        belief.map.promote(ids[ready >= self.rays.promote_weight], Point(3))
+    def _depths(self, belief: Belief, observed: Sequence[Observations]) -> np.ndarray:
+        """Of the points that were just seen, and of the known points in view, in the heaviest particle."""
+        pose = belief.state[belief.mode][:7]
+        seen = [np.zeros((0, 3))]
+        for group in observed:
+            if group.ids is not None and isinstance(group.model, CameraPoint):
+                seen.append(SE3.inverse_transform(pose, belief.read_mode(group.ids).mean[0]))
+        if self.group is not None:
+            landmark = self._names.ids(belief.catalogue)[CONSTELLATION]
+            points = belief.map.landmark_of(landmark).in_world(belief.read_mode([landmark]))[0]
+            seen.append(SE3.inverse_transform(pose, points))
+        point = np.concatenate(seen)
+        return np.asarray(point[self.camera.visible(point), 2])
 
 
 def _diagonal_blocks(cov: np.ndarray, count: int) -> np.ndarray:

@@ -1,41 +1,80 @@
-"""Active search (E06 §4.1): the belief says where to look, and `FeatureSensor` takes what is there."""
+"""Measures a frame: finds the map's features in an image, judges them, and starts new ones at corners."""
 
 import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import final
 
 import numpy as np
 
 from rbpf.core.belief import Belief
 from rbpf.core.models import NewLandmarks, Observations, Part, Sensor
-from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.sensors.camera.points import CameraRay
 from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.sensors.features import CornerDetector, Descriptor, Detector, Sift, SiftConfig
 from rbpf.sensors.patches.search import cut
-from rbpf.sensors.readers.images import ImageFrame
-from rbpf.systems.mono.active_search import ActiveSearch, Searched
-from rbpf.systems.mono.appearance import SOURCE_HALF_PX, Appearances
+from rbpf.systems.mono.active_search import ActiveSearch, OutlierGate, SearchResult
 from rbpf.systems.mono.config import SearchConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor
-from rbpf.systems.mono.viewing import turned
+from rbpf.systems.mono.feature_table import PATCH_HALF_PX, FeatureTable, view_change
 
-LEAST_SEEN = 4
-"""Points of a known map that tell where the camera is; one that sees fewer has left the map, nothing new is mapped."""
+MIN_FIXED = 4
+"""Points of a known map that determine the camera; one that sees fewer has left the map, nothing new is mapped."""
 
 _MAP = frozenset({Part.LANDMARK})
 
 
+def no_features(stamp_ns: int = 0) -> FeatureFrame:
+    """A frame in which nothing was measured."""
+    return FeatureFrame(stamp_ns, np.zeros(0, dtype=np.int64), np.zeros((0, 2)), np.zeros((0, 2, 2)))
+
+
+@dataclass
+class Measurement:
+    """One image on its way through the filter's step: what the sensor is given, and what it has found.
+
+    Attributes:
+        stamp_ns: time of the image.
+        image: (H, W) uint8; None where it cannot be used.
+        known_px: (M, 2) where the image shows the known points, in the run's first image; None in all others.
+        recognised: the prior of the pose is a place that was recognised beyond doubt: less has to be found to confirm it.
+        search: what was looked for.
+        used: features that the filter was given; none where too little agreed to be trusted.
+        started: features that were started after the step.
+        seconds_search: time that the search took.
+        seconds_new_landmarks: time of judging what was looked for and starting features.
+    """
+
+    stamp_ns: int
+    image: np.ndarray | None
+    known_px: np.ndarray | None = None
+    recognised: bool = False
+    search: SearchResult = field(default_factory=SearchResult)
+    used: FeatureFrame = field(default_factory=no_features)
+    started: FeatureFrame = field(default_factory=no_features)
+    seconds_search: float = 0.0
+    seconds_new_landmarks: float = 0.0
+
+    @property
+    def features(self) -> FeatureFrame:
+        """What was used, and what was started."""
+        return FeatureFrame(
+            self.stamp_ns,
+            np.concatenate([self.used.landmarks, self.started.landmarks]),
+            np.concatenate([self.used.z, self.started.z]),
+            np.concatenate([self.used.cov_z, self.started.cov_z]),
+        )
+
+
 @final
 class ImageSensor(Sensor):
-    """Finds the features of the map in images, and new ones.
+    """Finds the features of the map in images, and new ones. It takes `Measurement`s and fills them in.
 
     Args:
         features: what turns found features into observations and landmarks; a feature's name is its row in `table`.
         config: settings of the search.
-        detector: finds the corners that become landmarks, and those by which a lost camera is found.
+        gate: which matches of a frame agree with one motion of the camera.
+        detector: finds the corners that become features, and those by which a lost camera is found.
         descriptor: tells them apart where a camera was lost.
     """
 
@@ -43,105 +82,106 @@ class ImageSensor(Sensor):
         self,
         features: FeatureSensor,
         config: SearchConfig,
+        gate: OutlierGate | None = None,
         detector: Detector | None = None,
         descriptor: Descriptor | None = None,
     ) -> None:
         self.features = features
         self.camera = features.camera
         self.config = config
+        self.table = FeatureTable()
+        self.search = ActiveSearch(features, self.table, config, gate)
         self.detector = detector or CornerDetector()
         self.descriptor = descriptor or Sift(SiftConfig(working_scale=1.0, length=128))
-        self.table = Appearances()
-        self.search = ActiveSearch(features, self.table, config)
-        self.searched = Searched.nothing()
-        self.measured = self._features(0, np.zeros(0, dtype=np.int64), np.zeros((0, 2)))
         self.bad_frames = 0
-        self._within = self.camera.field_of_view_mask(SOURCE_HALF_PX + 1.0)
-        self._given: np.ndarray | None = None
-        self.recognised = False
-        """Whether the prediction of a lost camera is a place that was recognised beyond doubt."""
-        self.seconds = 0.0
-        """Time of the last search."""
-        self.seconds_new_landmarks = 0.0
-        """Time of the last `new_landmarks`."""
+        """Frames in a row in which too little was found."""
+        self._within = self.camera.field_of_view_mask(PATCH_HALF_PX + 1.0)
 
     @property
     def lost(self) -> bool:
         """Whether the camera is not where the filter believes."""
         return self.bad_frames >= self.config.lost_frames
 
-    def begin(self, image: np.ndarray, known_px: np.ndarray, as_group: bool) -> None:
-        """Takes the known points from the first image, where they are at known_px (M, 2).
-
-        Args:
-            image: the first one.
-            known_px: (M, 2).
-            as_group: whether they are one landmark, a constellation, or landmarks of their own.
-
-        Raises:
-            InputError: one is too near to the border.
-        """
-        members = np.arange(known_px.shape[0]) if as_group else None
-        padded = np.pad(image, SOURCE_HALF_PX + 1, mode="edge")  # a known point may lie at the border
-        source = np.array([self._window(padded, px + SOURCE_HALF_PX + 1.0) for px in known_px])
-        self.table.add(source, known_px, SE3.identity(), members)
-        self._given = known_px
+    def begin(self, image: np.ndarray, known_px: np.ndarray, is_group: bool) -> None:
+        """Takes the known points from the first image, where they are at known_px (M, 2); is_group: as a constellation."""
+        padded = np.pad(image, PATCH_HALF_PX + 1, mode="edge")  # a known point may lie at the border
+        patches = [cut(padded, px + PATCH_HALF_PX + 1.0, PATCH_HALF_PX) for px in known_px]
+        member = np.arange(known_px.shape[0]) if is_group else -1
+        self.table.add(np.array(patches), known_px, SE3.identity(), member)
 
     def begin_lost(
-        self, windows: np.ndarray, first_px: np.ndarray, first_pose: np.ndarray, positions: np.ndarray
+        self, patches: np.ndarray, first_px: np.ndarray, first_pose: np.ndarray, positions: np.ndarray
     ) -> None:
         """Takes the points of a map that is known, K of them; where in it the camera is has to be found out.
 
         Args:
-            windows: (K, S, S) uint8 around their first sightings.
+            patches: (K, S, S) uint8 of their first appearances.
             first_px: (K, 2) where those were.
             first_pose: (K, 7) world_from_camera then.
             positions: (K, 3) of the points.
         """
-        rows = self.table.add(windows, first_px, first_pose)
-        self.table.place[rows] = np.concatenate([positions, np.ones((rows.size, 1))], axis=1)
+        rows = self.table.add(patches, first_px, first_pose)
+        self.table.position[rows] = np.concatenate([positions, np.ones((rows.size, 1))], axis=1)
         self.bad_frames = self.config.lost_frames
 
-    def observe(self, frame: ImageFrame, belief: Belief) -> Sequence[Observations]:
+    def observe(self, frame: Measurement, belief: Belief) -> Sequence[Observations]:
         """What is found of the features that should be seen."""
         started = time.perf_counter()
-        rows, px = np.zeros(0, dtype=np.int64), np.zeros((0, 2))
-        self.searched = Searched.nothing()
-        if self._given is not None:
-            rows, px, self._given = np.arange(self._given.shape[0]), self._given, None
+        if frame.known_px is not None:
+            rows, px = np.arange(frame.known_px.shape[0]), frame.known_px
+            frame.used = self._features(frame.stamp_ns, rows, px)
         elif self.table.alive.any():
             if frame.image is not None:
-                self.searched = self.search.run(frame.image, belief)
-                found = self.searched.found
-                rows, px = self.searched.rows[found], self.searched.px[found]
-            self.bad_frames = self.bad_frames + 1 if self._fails() else 0
-            if self.bad_frames:
-                rows, px = rows[:0], px[:0]
+                frame.search = self.search.run(frame.image, belief)
+            self.bad_frames = self.bad_frames + 1 if self._too_little(frame.search, frame.recognised) else 0
+            found = frame.search.found & (not self.bad_frames)
+            frame.used = self._features(frame.stamp_ns, frame.search.features[found], frame.search.px[found])
         else:
             self.bad_frames = 0 if frame.image is not None else self.bad_frames + 1
-        self.measured = self._features(frame.stamp_ns, rows, px)
-        self.seconds = time.perf_counter() - started
-        return self._observations(belief)
+        frame.seconds_search = time.perf_counter() - started
+        # The constellation has been placed by the first image already.
+        is_placed = frame.known_px is not None and self.features.group is not None
+        return [] if is_placed else self.observations(frame.used, belief)
+
+    def observations(self, used: FeatureFrame, belief: Belief) -> list[Observations]:
+        """Of what was found; features that are not trusted only update the map."""
+        trusted = self.table.trusted(used.landmarks, self.config.trusted_fraction)
+        if trusted.all():
+            return list(self.features.observe(used, belief))
+        of_trusted, others = (
+            self.features.observe(
+                FeatureFrame(used.stamp_ns, used.landmarks[rows], used.z[rows], used.cov_z[rows]), belief
+            )
+            for rows in (trusted, ~trusted)
+        )
+        only_map = [replace(group, updates=_MAP) for group in others if Part.LANDMARK in group.updates]
+        return [*of_trusted, *only_map]
 
     def new_landmarks(
-        self, frame: ImageFrame, belief: Belief, observed: Sequence[Observations]
+        self, frame: Measurement, belief: Belief, observed: Sequence[Observations]
     ) -> Sequence[NewLandmarks]:
-        """Notes what was found, drops what fails, and starts features at corners where there is room."""
+        """Counts what was found, drops what fails, and starts features at corners where there is room."""
         started = time.perf_counter()
-        failing = self._judge()
-        self._place(belief, self.measured.landmarks)
-        sightings = self.measured
+        failing = np.zeros(0, dtype=np.int64)
+        if frame.search.features.size and not self.bad_frames:
+            failing = self._judge(frame.search)
+        self.place(belief, frame.used.landmarks)
+        pose = belief.state[belief.mode][:7]
         if frame.image is not None and not self.bad_frames:
-            self._keep_looks(frame.image, belief)
-            sightings = self._with_corners(frame, belief)
-        new_landmarks = self.features.new_landmarks(sightings, belief, observed)
-        self._place_rays(belief, new_landmarks)
-        self.features.forget(belief, failing)
-        self.seconds_new_landmarks = time.perf_counter() - started
+            self._keep_appearances(frame.image, frame.used, pose)
+            frame.started = self._started(frame, frame.image, pose)
+        new_landmarks = self.features.new_landmarks(frame.features, belief, observed)
+        for group in new_landmarks:
+            records = group.model.initialise(pose[None], group.z, np.zeros((len(group.z), 2, 2)))
+            const = None if records.const is None else records.const[0]
+            x, w = self.features.unknown_depth.model.world_point(records.mean[0], const)
+            self.table.position[list(group.facts)] = np.concatenate([x, w], axis=-1)
+        self.features.remove(belief, failing)
+        frame.seconds_new_landmarks = time.perf_counter() - started
         return new_landmarks
 
-    def drawn_anew(self, belief: Belief, path: np.ndarray, started: np.ndarray) -> None:
-        """Remembers where all features are and were seen first, after the particles were drawn anew.
+    def resampled(self, belief: Belief, path: np.ndarray, started: np.ndarray) -> None:
+        """Remembers where all features are and were seen first, after the particles were resampled from a batch posterior.
 
         Args:
             belief: of the new particles.
@@ -152,8 +192,14 @@ class ImageSensor(Sensor):
         held = np.isin(rows, list(belief.catalogue.values()))
         table.alive[rows[~held]] = False  # started in a frame that did not take part
         table.first_pose[rows] = table.last_pose[rows] = path[started]
-        table.last_source[rows] = table.source[rows]  # later looks are from the old path
-        self._place(belief, rows[held & table.alive[rows]])
+        table.last_patch[rows] = table.first_patch[rows]  # later appearances are from the old path
+        self.place(belief, rows[held & table.alive[rows]])
+
+    def place(self, belief: Belief, rows: np.ndarray) -> None:
+        """Remembers where in the heaviest particle's world features are now."""
+        if rows.size:
+            which, position = self.features.positions(belief, rows)
+            self.table.position[rows[which]] = position
 
     def arrays(self) -> dict[str, np.ndarray]:
         """For a checkpoint."""
@@ -163,117 +209,72 @@ class ImageSensor(Sensor):
         """The inverse of `arrays`."""
         self.table.restore(arrays)
         self.bad_frames = int(arrays["search/bad_frames"])
-        self._given = None
 
-    def _observations(self, belief: Belief) -> list[Observations]:
-        """Of what was measured; what is not trusted only updates the map."""
-        frame = self.measured
-        trusted = self.search.trusted(frame.landmarks)
-        if trusted.all():
-            return list(self.features.observe(frame, belief))
-        doubted = self.features.observe(_part(frame, ~trusted), belief)
-        return [
-            *self.features.observe(_part(frame, trusted), belief),
-            *(replace(group, updates=_MAP) for group in doubted if Part.LANDMARK in group.updates),
-        ]
-
-    def _fails(self) -> bool:
+    def _too_little(self, search: SearchResult, recognised: bool) -> bool:
         """Whether so little agrees that it may be chance. Once lost, more has to agree: the camera may be anywhere.
 
         Only features whose whole ellipse was searched tell something then: in a larger one something alike is found by
         chance, or what is there is missed. Of a place that was recognised beyond doubt it is enough that it can be
         tracked: patches look different from there.
         """
-        found, config = self.searched.found, self.config
-        if not found.size or (self.features.fixed and found.sum() < LEAST_SEEN):
+        found, config = search.found, self.config
+        if not found.size or (self.features.fixed and found.sum() < MIN_FIXED):
             return True
         if not self.lost:
             return bool(found.mean() < config.lost_fraction)
         least = min(config.recovered_features, int(self.table.alive.sum()))
-        reach = config.ellipse_sigmas * np.sqrt(np.einsum("kii->ki", self.searched.cov).max(axis=1))
-        found = found[reach <= config.max_radius_px]
-        fraction = config.lost_fraction if self.recognised else config.recovered_fraction
+        radius = config.ellipse_sigmas * np.sqrt(np.einsum("kii->ki", search.cov).max(axis=1))
+        found = found[radius <= config.max_radius_px]
+        fraction = config.lost_fraction if recognised else config.recovered_fraction
         return bool(found.sum() < max(least, fraction * found.size))
 
-    def _judge(self) -> np.ndarray:
-        """Counts hits and misses; rows of what is missed too often."""
-        searched, config, table = self.searched, self.config, self.table
-        nothing = np.zeros(0, dtype=np.int64)
-        if not searched.rows.size or self.bad_frames:
-            return nothing
-        table.note(searched.rows, searched.found)
+    def _judge(self, search: SearchResult) -> np.ndarray:
+        """Counts hits and misses; rows (J,) of what is missed too often."""
+        rows, table, config = search.features, self.table, self.config
+        table.count_search(rows, search.found)
         if self.features.fixed:
-            return nothing
-        rows = searched.rows
+            return np.zeros(0, dtype=np.int64)
         failing = 1.0 - table.found[rows] / table.attempts[rows] > config.max_failure_ratio
         drop = rows[failing & (table.attempts[rows] >= config.min_attempts)]
         table.alive[drop] = False
         return np.asarray(drop[table.member[drop] < 0])
 
-    def _place(self, belief: Belief, rows: np.ndarray) -> None:
-        """Remembers where in the mode's world features are now."""
-        if rows.size:
-            chosen, place = self.features.places(belief, rows, self.table.member[rows])
-            self.table.place[rows[chosen]] = place
+    def _keep_appearances(self, image: np.ndarray, used: FeatureFrame, pose: np.ndarray) -> None:
+        """Renews the last appearance of the features that look different by now.
 
-    def _keep_looks(self, image: np.ndarray, belief: Belief) -> None:
-        """Keeps windows of the features that were found and look different by now.
-
-        How a patch lies in space is not known. A patch that is taken to face the camera of its first sighting is alike
-        to about 25° from there; a camera that was lost and comes from another side would not know it again.
+        How a patch lies in space is not known. One that is taken to face the camera that saw it first is alike to about
+        25° from there; a camera that was lost and comes from another side would not know it again.
         """
-        rows, px = self.measured.landmarks, self.measured.z
+        rows, px = used.landmarks, used.z
         if not rows.size:
             return
-        config, table, pose = self.config, self.table, belief.state[belief.mode][:7]
-        cosine, ratio = turned(table.place[rows], pose, table.last_pose[rows])
-        away = np.maximum(ratio, 1.0 / ratio) >= config.appearance_scale_change
-        for k in np.flatnonzero((cosine <= np.cos(np.deg2rad(config.appearance_turn_deg))) | away):
-            window = cut(image, px[k], SOURCE_HALF_PX)
-            if window is not None:
-                table.last_source[rows[k]], table.last_pose[rows[k]] = window, pose
+        config, table = self.config, self.table
+        cosine, ratio = view_change(table.position[rows], pose, table.last_pose[rows])
+        is_turned = cosine <= np.cos(np.deg2rad(config.appearance_turn_deg))
+        is_scaled = np.maximum(ratio, 1.0 / ratio) >= config.appearance_scale_change
+        for k in np.flatnonzero(is_turned | is_scaled):
+            patch = cut(image, px[k], PATCH_HALF_PX)
+            if patch is not None:
+                table.last_patch[rows[k]], table.last_pose[rows[k]] = patch, pose
 
-    def _place_rays(self, belief: Belief, new_landmarks: Sequence[NewLandmarks]) -> None:
-        """Remembers where in the mode's world features start."""
-        for group in new_landmarks:
-            assert isinstance(group.model, CameraRay) and group.facts is not None
-            pose = belief.state[belief.mode][:7]
-            self.table.place[list(group.facts)] = self.features.first_places(pose, group.z, group.model)
-
-    def _with_corners(self, frame: ImageFrame, belief: Belief) -> FeatureFrame:
-        assert frame.image is not None
-        config, measured = self.config, self.measured
-        room = config.measurements - measured.landmarks.size
-        if self.table.count > measured.landmarks.size:
-            room = min(config.min_in_view - self.search.in_view.shape[0], config.new_per_frame)
+    def _started(self, frame: Measurement, image: np.ndarray, pose: np.ndarray) -> FeatureFrame:
+        """New features at corners, where there is room in the image and in the number that is looked for."""
+        config, used, in_view = self.config, frame.used, frame.search.in_view
+        room = config.measurements - used.landmarks.size
+        if len(self.table) > used.landmarks.size:
+            room = min(config.min_in_view - in_view.shape[0], config.new_per_frame)
         room = min(room, self.features.max_new_per_frame)
         if room <= 0:
-            return measured
-        occupied = np.concatenate([measured.z, self.search.in_view])
-        px = self.detector.detect(
-            frame.image, room, occupied, config.spacing_px, SOURCE_HALF_PX + 1.0, self._within
-        ).px
+            return no_features(frame.stamp_ns)
+        occupied, border_px = np.concatenate([used.z, in_view]), PATCH_HALF_PX + 1.0
+        found = self.detector.detect(image, room, occupied, config.spacing_px, border_px, self._within)
+        px = found.px
         px = px[np.isfinite(self.camera.unproject(px)).all(axis=1)]
         if not px.shape[0]:
-            return measured
-        source = np.array([self._window(frame.image, place) for place in px])
-        rows = self.table.add(source, px, belief.state[belief.mode][:7])
-        return self._features(
-            frame.stamp_ns, np.append(measured.landmarks, rows), np.concatenate([measured.z, px])
-        )
+            return no_features(frame.stamp_ns)
+        patches = np.array([cut(image, place, PATCH_HALF_PX) for place in px])
+        return self._features(frame.stamp_ns, self.table.add(patches, px, pose), px)
 
     def _features(self, stamp_ns: int, rows: np.ndarray, px: np.ndarray) -> FeatureFrame:
         cov = np.repeat(self.config.noise_px**2 * np.eye(2)[None], rows.size, axis=0)
         return FeatureFrame(stamp_ns, rows, px, cov)
-
-    def _window(self, image: np.ndarray, px: np.ndarray) -> np.ndarray:
-        window = cut(image, px, SOURCE_HALF_PX)
-        if window is None:
-            raise InputError(
-                f"a known point at ({px[0]:.1f}, {px[1]:.1f}) px is nearer than {SOURCE_HALF_PX} px to the border"
-            )
-        return window
-
-
-def _part(frame: FeatureFrame, rows: np.ndarray) -> FeatureFrame:
-    return FeatureFrame(frame.stamp_ns, frame.landmarks[rows], frame.z[rows], frame.cov_z[rows])

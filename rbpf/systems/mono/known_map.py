@@ -1,6 +1,6 @@
-"""The map of a finished run as a place to be found again in: known points, and what they look like.
+"""The map of a run: as Gaussians, for reports; and as a place in which later runs find their camera, with its file.
 
-Its file, `known_map.npz`, holds only plain arrays: version, camera (9,), or (10,) with the kind of a fisheye lens,
+The file, `known_map.npz`, holds only plain arrays: version, camera (9,), or (10,) with the kind of a fisheye lens,
 image_size (2,), alignment, names (K,), positions (K, 3), cov (K, 3, 3), windows (K, S, S) uint8,
 first_px (K, 2), first_pose (K, 7), views (V, 7).
 """
@@ -11,12 +11,20 @@ from typing import Literal
 
 import numpy as np
 
+from rbpf.core.anchoring import Anchored
 from rbpf.core.checkpoint import load_arrays, save_arrays
+from rbpf.core.filter import Filter
 from rbpf.errors import InputError
+from rbpf.lie import SE3
+from rbpf.maps.constellation import Constellation, UncertainConstellation
+from rbpf.sensors.calibration.boards import spread_rows
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.camera.distortion import RadialTangential
 from rbpf.sensors.feature_log import KnownPoints
-from rbpf.systems.mono.appearance import SOURCE_HALF_PX
+from rbpf.systems.map_estimate import MapEstimate, mixture_moments, relative_points
+from rbpf.systems.mono.feature_sensor import MIN_RHO, FeatureSensor
+from rbpf.systems.mono.feature_table import PATCH_PX, FeatureTable
+from rbpf.systems.system import Gauge
 
 Alignment = Literal["none", "rigid", "similarity"]
 NAME = "known_map.npz"
@@ -24,11 +32,14 @@ VERSION = 1
 LEAST = 8
 """Points that a map must hold for a camera to be found in it."""
 MOST_BYTES = 1 << 30
+MAX_VIEWS = 16
+"""Poses that are kept, to look from at a camera of which nothing is known."""
+RAY_SIGMAS = 2.0
+"""The part of a ray that is drawn: this far to either side of its mean inverse depth, in standard deviations."""
 FOCAL_FRACTION = 0.02
 """How far the focal lengths of two cameras may differ for one to recognise what the other has seen."""
 
 _ALIGNMENTS: dict[str, Alignment] = {"none": "none", "rigid": "rigid", "similarity": "similarity"}
-_SIDE = 2 * SOURCE_HALF_PX + 1
 
 
 @dataclass(frozen=True)
@@ -89,19 +100,25 @@ class KnownMap:
             )
 
 
+def known_map_arrays(found: KnownMap) -> dict[str, np.ndarray]:
+    """What the file holds."""
+    named = ("camera", "alignment")
+    arrays = {item.name: getattr(found, item.name) for item in fields(KnownMap) if item.name not in named}
+    camera = found.camera
+    # The kind of lens is named for a fisheye camera alone: files of others are as they were before there was one.
+    params = camera.params if camera.lens.kind != RadialTangential.kind else camera.params[:-1]
+    return {
+        "version": np.array(VERSION),
+        "camera": params,
+        "image_size": np.array([camera.width, camera.height]),
+        "alignment": np.array(found.alignment),
+        **arrays,
+    }
+
+
 def write_known_map(path: Path, found: KnownMap) -> None:
     """Writes the file, whole or not at all."""
-    arrays = {
-        item.name: getattr(found, item.name)
-        for item in fields(KnownMap)
-        if item.name not in ("camera", "alignment")
-    }
-    camera = found.camera
-    size = np.array([camera.width, camera.height])
-    # The kind of lens is told of a fisheye camera alone: files of others are as they were before there was one.
-    params = camera.params if camera.lens.kind != RadialTangential.kind else camera.params[:-1]
-    head = {"version": np.array(VERSION), "camera": params, "image_size": size}
-    save_arrays(path, head | {"alignment": np.array(found.alignment)} | arrays)
+    save_arrays(path, known_map_arrays(found))
 
 
 def read_known_map(path: Path) -> KnownMap:
@@ -139,7 +156,7 @@ def _parsed(arrays: dict[str, np.ndarray]) -> KnownMap:
         arrays = arrays | {"camera": np.append(arrays["camera"], RadialTangential.kind)}
     shapes = {
         "camera": (10,), "image_size": (2,), "names": (count,), "positions": (count, 3), "cov": (count, 3, 3),
-        "windows": (count, _SIDE, _SIDE), "first_px": (count, 2), "first_pose": (count, 7), "views": (views, 7),
+        "windows": (count, PATCH_PX, PATCH_PX), "first_px": (count, 2), "first_pose": (count, 7), "views": (views, 7),
     }  # fmt: skip
     for name, shape in shapes.items():
         array = arrays[name]
@@ -157,3 +174,89 @@ def _parsed(arrays: dict[str, np.ndarray]) -> KnownMap:
         arrays[name] for name in ("names", "positions", "cov", "windows", "first_px", "first_pose", "views")
     )
     return KnownMap(camera, alignment, *rest)
+
+
+def estimate_mono_map(filter_: Filter, features: FeatureSensor, world: Anchored | None) -> MapEstimate:
+    """Every landmark of a filter's map, in the order of their names, with the column `ray`.
+
+    A ray is linearised at its mean inverse depth; its ends are those in the heaviest particle.
+
+    Args:
+        filter_: of monocular SLAM.
+        features: its sensor's part that knows what landmarks are.
+        world: the reported world in each particle's own; None where they are one.
+    """
+    belief, unknown_depth = filter_.belief(), features.unknown_depth
+    landmark_map, weights, mode = belief.map, belief.weights, belief.mode
+    if world is None:
+        n = weights.size
+        world = Anchored(np.tile(SE3.identity(), (n, 1)), np.zeros((n, 6, 6)))
+    nowhere = np.full((2, 3), np.nan)
+    rows: list[tuple[int, np.ndarray, np.ndarray, np.ndarray]] = []
+    for landmark_id in landmark_map.ids.tolist():
+        landmark = landmark_map.landmark_of(landmark_id)
+        records = landmark_map.read(np.array([landmark_id]))
+        if isinstance(landmark, Constellation | UncertainConstellation):
+            assert features.group is not None
+            points, within = landmark.in_group(records)
+            for member in range(points.shape[1]):
+                moments = mixture_moments(weights, points[:, member], within[:, member])
+                rows.append((int(features.group.names[member]), *moments, nowhere))
+            continue
+        ends = nowhere
+        if landmark_map.are(np.array([landmark_id]), unknown_depth.landmark)[0]:
+            extent = unknown_depth.extent(belief.read_mode([landmark_id]), RAY_SIGMAS, MIN_RHO)[0, 0]
+            ends = SE3.inverse_transform(world.mean[mode], extent[:, :3] / extent[:, 3:])
+            records = unknown_depth.as_points(records)
+        moments = mixture_moments(weights, *relative_points(SE3, world, records))
+        rows.append((landmark_map.catalogue.get(landmark_id, landmark_id), *moments, ends))
+    names = np.array([row[0] for row in rows], dtype=np.int64)
+    order = np.argsort(names, kind="stable")
+    means, covs, spans = (np.array([row[k] for row in rows]) for k in (1, 2, 3))
+    spans = spans.reshape(-1, 2, 3)[order]
+    columns = {"ray": np.isfinite(spans).all(axis=(1, 2)).astype(int)}
+    return MapEstimate(
+        names[order], means.reshape(-1, 3)[order], covs.reshape(-1, 3, 3)[order], columns, spans
+    )
+
+
+def known_map_of(
+    camera: Pinhole,
+    gauge: Gauge,
+    found: MapEstimate,
+    table: FeatureTable,
+    world_in_mode: np.ndarray | None,
+    poses: np.ndarray,
+) -> KnownMap:
+    """The points of a run's map that it still holds and whose depth is known, with how they look.
+
+    Args:
+        camera: of the run.
+        gauge: of its world.
+        found: its map.
+        table: its features.
+        world_in_mode: (7,) the reported world in the heaviest particle's own; None where it is the same.
+        poses: (T, 7) that were tracked.
+    """
+    kept = np.flatnonzero(~found.is_ray() & table.alive[found.ids])
+    rows, positions = found.ids[kept], found.mean[kept]
+    first = table.first_pose[rows]
+    if world_in_mode is not None:
+        first = SE3.compose(SE3.inverse(world_in_mode), first)
+
+    # Views that are far from each other: a turn by a radian is as far as the scene's depth.
+    centre = poses[:, 4:].mean(axis=0)
+    depth = float(np.linalg.norm(positions - centre, axis=1).mean()) if len(positions) else 1.0
+    ahead = SE3.rotation(poses) @ np.array([0.0, 0.0, 1.0])
+    chosen = spread_rows(np.concatenate([poses[:, 4:] / depth, ahead], axis=1), MAX_VIEWS)
+    return KnownMap(
+        camera=camera,
+        alignment=_ALIGNMENTS[gauge],
+        names=rows,
+        positions=positions,
+        cov=found.cov[kept],
+        windows=table.first_patch[rows],
+        first_px=table.first_px[rows],
+        first_pose=first,
+        views=poses[chosen],
+    )

@@ -1,4 +1,4 @@
-"""The first camera, and what its image says of the points of known position that it shows."""
+"""A start from known points: the first camera, and what its image says of them."""
 
 from dataclasses import dataclass
 
@@ -18,20 +18,20 @@ from rbpf.sensors.feature_log import FeatureFrame, KnownPoints
 from rbpf.sensors.features.corners import corner_score
 from rbpf.sensors.readers.images import KnownPixels
 
-MOST_SIGMAS, MOST_PX = 6.0, 4.0
+MAX_SIGMAS, MAX_PX = 6.0, 4.0
 """A known point may be seen this far from where the resected camera sees it: so many σ, and so many pixels more."""
 
-SPHERE, NEEDLE = 3.0**-0.5, 0.05
-"""Share of a known point's standard deviation along an axis across the line of sight: alike in all directions, and of a
+ISOTROPIC, TRIANGULATED = 3.0**-0.5, 0.05
+"""Fraction of a known point's standard deviation along an axis across the line of sight: alike in all directions, and of a
 point that was located from views five degrees apart."""
 
-SURE = 0.95
+NOISE_PROBABILITY = 0.95
 """Residuals that noise alone would exceed less often than this leaves are beyond the noise."""
 
 SAME_PX = 1.0
 """Known points nearer to each other in the image are one."""
 
-LEAST_TEXTURE = 2.0
+MIN_TEXTURE = 2.0
 """Slope that a known point's surroundings must have in every direction, grey levels per pixel: noise has as much."""
 
 
@@ -55,11 +55,16 @@ def resect_known(camera: Pinhole, known: KnownPixels, noise_px: float) -> np.nda
             f"known point {known.names[worst]} at ({u:.1f}, {v:.1f}) px lies outside the first image of "
             f"{camera.width}x{camera.height} px: give points that are seen in it"
         )
-    _require_different(known)
+    for what, places, least in (("pixel", known.px, SAME_PX), ("position", known.positions, 0.0)):
+        first, second = np.triu_indices(known.names.size, 1)
+        near = np.flatnonzero(np.linalg.norm(places[first] - places[second], axis=1) <= least)
+        if near.size:
+            one, other = known.names[first[near[0]]], known.names[second[near[0]]]
+            raise InputError(f"known points {one} and {other} have the same {what}: keep one of the two")
     world_from_camera = resect(camera, known.positions, known.px)
     local = SE3.inverse_transform(world_from_camera, known.positions)
     error = np.linalg.norm(camera.project(local) - known.px, axis=1)
-    allowed = MOST_SIGMAS * np.hypot(noise_px, camera.fx * known.std_m / local[:, 2]) + MOST_PX
+    allowed = MAX_SIGMAS * np.hypot(noise_px, camera.fx * known.std_m / local[:, 2]) + MAX_PX
     if (error > allowed).any():
         worst = int(np.argmax(error / allowed))
         raise InputError(
@@ -93,9 +98,11 @@ def located_points(camera: Pinhole, known: KnownPixels, noise_px: float) -> tupl
     local = SE3.inverse_transform(pose, known.positions)
     residual = camera.project(local) - known.px
     squared, dof = float(np.square(residual).sum()), residual.size - 6
-    excess = squared / dof - noise_px**2 if squared > chi2.ppf(SURE, dof) * noise_px**2 else 0.0
+    excess = squared / dof - noise_px**2 if squared > chi2.ppf(NOISE_PROBABILITY, dof) * noise_px**2 else 0.0
     seen = excess * (local[:, 2] / camera.fx) ** 2
-    var_across = np.clip(seen, (NEEDLE * known.std_m) ** 2, (SPHERE * known.std_m) ** 2)[:, None, None]
+    var_across = np.clip(seen, (TRIANGULATED * known.std_m) ** 2, (ISOTROPIC * known.std_m) ** 2)[
+        :, None, None
+    ]
     line = SE3.rotation(pose) @ (local / np.linalg.norm(local, axis=1, keepdims=True))[..., None]
     along = line @ np.swapaxes(line, -1, -2)
     var_along = known.std_m[:, None, None] ** 2 - 2.0 * var_across
@@ -105,25 +112,64 @@ def located_points(camera: Pinhole, known: KnownPixels, noise_px: float) -> tupl
 
 @dataclass(frozen=True)
 class KnownStart:
-    """Known points, and the first image's sight of them.
+    """Known points, and what the first frame shows of them.
 
     Attributes:
         points: M of them.
-        world_from_camera: (7,) of the first image, as resected from them.
+        world_from_camera: (7,) of the first frame, as resected from them.
         rows: (K,) which of the points it shows.
-        sight: where, K features with the names of these points.
+        seen: where, K features with the names of these points.
     """
 
     points: KnownPoints
     world_from_camera: np.ndarray
     rows: np.ndarray
-    sight: FeatureFrame
+    seen: FeatureFrame
+
+    @classmethod
+    def from_pixels(cls, camera: Pinhole, known: KnownPixels, noise_px: float) -> "KnownStart":
+        """Of points that are given with their pixels in the first image.
+
+        Raises:
+            InputError: as `resect_known`.
+        """
+        points, pose = located_points(camera, known, noise_px)
+        noise = np.tile(noise_px**2 * np.eye(2), (known.names.size, 1, 1))
+        return cls(points, pose, points.names, FeatureFrame(0, points.names, known.px, noise))
+
+    @classmethod
+    def from_frame(cls, camera: Pinhole, known: KnownPoints, first: FeatureFrame) -> "KnownStart":
+        """Of points that are named features of the first frame.
+
+        Raises:
+            InputError: fewer than four known points are seen in it, or they do not determine the camera.
+        """
+        inside = np.flatnonzero(camera.inside(first.z))
+        _, rows, which = np.intersect1d(known.names, first.landmarks[inside], return_indices=True)
+        k = inside[which]
+        seen = FeatureFrame(first.stamp_ns, first.landmarks[k], first.z[k], first.cov_z[k])
+        return cls(known, resect(camera, known.positions[rows], seen.z), rows, seen)
 
 
-def first_records(
-    camera: Pinhole, start: KnownStart, n: int, cov_frame: np.ndarray
-) -> tuple[Records, Constellation | UncertainConstellation]:
-    """Known points after the first image, whose camera is the world: records (n, 1, …) and their parametrisation.
+def constellation(points: KnownPoints) -> Constellation | UncertainConstellation:
+    """Known points as one landmark.
+
+    Raises:
+        InputError: too many points have errors of their own.
+    """
+    if not points.cov.any():
+        return Constellation(points.positions)
+    return UncertainConstellation(points.positions, points.cov)
+
+
+def constellation_records(
+    camera: Pinhole,
+    start: KnownStart,
+    group: Constellation | UncertainConstellation,
+    n: int,
+    cov_frame: np.ndarray,
+) -> Records:
+    """Known points after the first image, whose camera is the world: records (n, 1, …).
 
     The frame is hardly known before: an update linearised there would leave errors of the second order, larger than a
     pixel, in everything that is mapped afterwards. So the optimum of both, what is given and what is seen, is found
@@ -132,25 +178,21 @@ def first_records(
     Args:
         camera: of the image.
         start: what the image shows of the points.
+        group: the points as one landmark.
         n: number of particles.
         cov_frame: (6, 6) of the points' frame around where the resection puts it.
     """
-    points = start.points
-    exact = not points.cov.any()
-    fit = _FirstImage(camera, start, cov_frame, exact)
+    fit = _FirstImage(camera, start, cov_frame, isinstance(group, Constellation))
     x = least_squares(fit.residual, np.zeros(fit.size), fit.jacobian, method="lm").x
     pose, local = fit.split(x)
     half = np.linalg.pinv(fit.jacobian(x))
     frame = SE3.inverse(pose)
     half[:6] = -SE3.adjoint(pose) @ SE3.right_jacobian(x[:6]) @ half[:6]  # in the frame's own right chart
-    if exact:
-        group = Constellation(points.positions)
-        return group.started(n, frame, gaussian.symmetrise(half @ half.T)), group
-    shape = UncertainConstellation(points.positions, points.cov)
+    if isinstance(group, Constellation):
+        return group.started(n, frame, gaussian.symmetrise(half @ half.T))
     moved = half[6:].reshape(*local.shape, -1) - by_frame(local) @ half[:6]
     turned = (SE3.rotation(frame) @ moved).reshape(-1, half.shape[1])
-    world = SE3.transform(frame, local)
-    return shape.started(n, world, gaussian.symmetrise(turned @ turned.T)), shape
+    return group.started(n, SE3.transform(frame, local), gaussian.symmetrise(turned @ turned.T))
 
 
 class _FirstImage:
@@ -161,7 +203,7 @@ class _FirstImage:
         self.model = CameraPoint(camera)
         self.exact = exact
         self.size = 6 if exact else 6 + start.points.positions.size
-        self._chol_px = gaussian.cholesky(start.sight.cov_z)
+        self._chol_px = gaussian.cholesky(start.seen.cov_z)
         prior = [cov_frame] if exact else [cov_frame, *(start.points.cov + LEAST * np.eye(3))]
         self._chol_prior = gaussian.cholesky(block_diag(*prior))
 
@@ -173,7 +215,7 @@ class _FirstImage:
     def residual(self, x: np.ndarray) -> np.ndarray:
         """Of what is seen, then of what was given."""
         pose, local = self.split(x)
-        nu = self.start.sight.z - self.model.predict(pose, local[self.start.rows])
+        nu = self.start.seen.z - self.model.predict(pose, local[self.start.rows])
         seen = gaussian.solve_lower(self._chol_px, nu).ravel()
         return np.concatenate([seen, gaussian.solve_lower(self._chol_prior, -x)])
 
@@ -182,7 +224,7 @@ class _FirstImage:
         pose, local = self.split(x)
         by_pose, by_point, _ = self.model.jacobians(pose, local[self.start.rows])
         assert by_pose is not None and by_point is not None
-        rows = np.zeros((*self.start.sight.z.shape, self.size))
+        rows = np.zeros((*self.start.seen.z.shape, self.size))
         rows[..., :6] = by_pose @ SE3.right_jacobian(x[:6])
         for k, m in enumerate(() if self.exact else self.start.rows.tolist()):
             rows[k, :, 6 + 3 * m : 9 + 3 * m] = by_point[k]
@@ -202,18 +244,9 @@ def require_texture(image: np.ndarray, known: KnownPixels) -> None:
     """
     score = corner_score(image, known.px)
     worst = int(np.argmin(score))
-    if score[worst] < LEAST_TEXTURE:
+    if score[worst] < MIN_TEXTURE:
         u, v = known.px[worst]
         raise InputError(
             f"known point {known.names[worst]} at ({u:.1f}, {v:.1f}) px cannot be found again, the first image shows "
             "no corner there: check the pixel, or leave the point out"
         )
-
-
-def _require_different(known: KnownPixels) -> None:
-    for what, places, least in (("pixel", known.px, SAME_PX), ("position", known.positions, 0.0)):
-        first, second = np.triu_indices(known.names.size, 1)
-        near = np.flatnonzero(np.linalg.norm(places[first] - places[second], axis=1) <= least)
-        if near.size:
-            one, other = known.names[first[near[0]]], known.names[second[near[0]]]
-            raise InputError(f"known points {one} and {other} have the same {what}: keep one of the two")

@@ -1,93 +1,173 @@
-"""A start without known points: the particles are drawn anew from the optimum of the first frames.
+"""A start without known points: the first frames are adjusted in batch, and the particles resampled from the result.
 
 Before a camera has moved, nothing tells the depth of what it sees, and of a scene that is nearly flat two shapes with
 two motions look alike. Particles decide too early: each image alone tells little, those that happen to fit it survive,
 and what later images say comes too late. All first images together tell it well. So while depths are unknown, the
-frames until now are adjusted in one piece now and then (`rbpf.systems.mono.start_optimum`), whole paths are drawn from
-the Gaussian about the optimum, and each particle's map is that of its path (a block move: A. Doucet, M. Briers and
-S. Sénécal, 2006).
+frames until now are adjusted in one piece now and then, whole paths are drawn from the Gaussian about the optimum, and
+each particle's map is that of its path (a block move: A. Doucet, M. Briers and S. Sénécal, 2006).
+
+The adjustment: a feature is a direction d, a unit vector, and an inverse distance q, both from the first camera, which
+is the origin: the camera (R, t) sees it in the direction c = Rᵀ(d − q t), however far it is. Minimised is, Mathematics
+(start-cost),
+
+    Σ ρ(|z − h(c)|/σ) + ½ Σ ((q − q̄)/σ_q)² + ½ Σ |(v_k − v_{k−1})/σ_v|² + ½ ((s − 1)/σ_s)²,
+
+with Cauchy's loss ρ, the prior of an inverse distance, velocities v between frames that walk as in E06 (4), and the
+scale s = Σ q / (F q̄), which no image tells: it is held.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
 from typing import final
 
 import numpy as np
+from scipy.linalg import LinAlgError, cho_factor, cho_solve, cholesky, solve_triangular
 
-from rbpf.core.archive import checked
+from rbpf.core.archive import checked, within
+from rbpf.core.estimate import mixture_estimate
 from rbpf.core.filter import Filter
+from rbpf.core.particles import uniform_log_weights
+from rbpf.core.proposals import Prior
 from rbpf.lie import SE3
 from rbpf.motion.constant_velocity import PosePrior
+from rbpf.sensors.camera import Pinhole
+from rbpf.sensors.camera.points import clamp_depth
 from rbpf.sensors.feature_log import FeatureFrame
+from rbpf.systems.mono.active_search import CAUCHY_SCALE
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor
-from rbpf.systems.mono.start_optimum import Expected, Optimum, Structure, Window, optimum
-from rbpf.systems.mono.system import assemble, start_std, walk_std
 
-LEAST_SEEN = 3
+MIN_VIEWS = 3
 """Frames that must see a feature for it to take part."""
 
-LEAST_FRAMES = 3
+MIN_FRAMES = 3
 
-SHARED = 6
+MIN_SHARED = 6
 """Features that two frames in a row must have in common: three determine a pose, and half of them may be wrong."""
 
-TINY = np.finfo(float).tiny
-
-TORN = (
+DISCONNECTED = (
     "the first frames have too few features in common to be adjusted in one piece: path and map may be bent; move the "
     "camera sideways at first, or start with known points"
 )
 """Of a start without known points that ended before depths were known."""
 
+SCALE_STD = 1e-4
+"""Standard deviation to which the scale is held."""
+
+MAX_STEPS, MIN_GAIN = 30, 1e-4
+"""Steps of the adjustment at most, and the fraction of the cost that ends it."""
+
+DAMPING, DAMPING_FACTOR, MAX_DAMPING = 1e-3, 5.0, 1e8
+"""Of Levenberg's and Marquardt's method: at first, its change after a step, and where there is no way down."""
+
+MAX_FEATURES = 1 << 20
+"""No frame shows more."""
+
+TINY = np.finfo(float).tiny
+
+
+@dataclass(frozen=True)
+class Resampled:
+    """What a batch adjustment leaves.
+
+    Attributes:
+        filter: whose particles were resampled, in place of the one so far.
+        stamps_ns: (T,) of all frames so far.
+        poses: (T, 7) world_from_camera in them, means over the particles' paths.
+        covs: (T, 6, 6) of them in the right chart at each.
+        path: (T, 7) of the heaviest particle.
+        frame_of: (F,) in which of the frames each of F features was seen first, in the order of their names.
+    """
+
+    filter: Filter
+    stamps_ns: np.ndarray
+    poses: np.ndarray
+    covs: np.ndarray
+    path: np.ndarray
+    frame_of: np.ndarray
+
 
 @final
 class UnknownStart:
-    """Says when the particles are to be drawn anew, and draws them.
+    """Gathers the first frames, adjusts them when it is time, and resamples the particles.
 
     Args:
         config: of the run.
+        features: what the filter observes with.
+        new_filter: makes a filter without particles' past, with `features` as its sensor.
         needed: whether the run starts without known points and without a map.
     """
 
-    def __init__(self, config: MonoConfig, needed: bool) -> None:
-        self.config = config
+    def __init__(
+        self, config: MonoConfig, features: FeatureSensor, new_filter: Callable[[], Filter], needed: bool
+    ) -> None:
+        self.config, self.features, self.new_filter = config, features, new_filter
         self.over = not (needed and config.start.batch_adjust)
         """Whether depths are known well enough, and the filter goes on alone."""
         self._next = config.start.first_adjustment
+        self._frames: list[FeatureFrame] = []
+        self._path: list[np.ndarray] = []
         self._last: tuple[np.ndarray, np.ndarray, Structure] | None = None
+        """Names, numbers of the frames, and optimum of the last adjustment."""
 
-    def due(self, frames: int, lost: bool) -> bool:
-        """Whether the particles are to be drawn anew after so many frames; never again once the camera was lost."""
-        self.over = self.over or lost
-        return not self.over and frames >= self._next
-
-    def redrawn(
-        self, filter_: Filter, features: FeatureSensor, frames: Sequence[FeatureFrame], path: np.ndarray
-    ) -> tuple[Filter, np.ndarray] | None:
-        """A filter whose particles are drawn anew, in place of one that has just made its T-th step, and their paths.
+    def after_frame(
+        self, filter_: Filter, seen: FeatureFrame, pose: np.ndarray, usable: bool, lost: bool
+    ) -> tuple[Resampled | None, str | None]:
+        """Takes note of a frame, and adjusts all so far if it is time.
 
         Args:
-            filter_: the one so far; the new one has its sensors and its random generator.
-            features: what it observes with.
-            frames: T, all that was measured.
-            path: (T, 7) world_from_camera, where the filter was.
+            filter_: after its step; a new one has its sensors and its random generator.
+            seen: what was measured in the frame.
+            pose: (7,) world_from_camera that was reported.
+            usable: whether the frame may be the last of an adjustment.
+            lost: whether the camera is lost: then there will be no adjustment any more.
 
         Returns:
-            The filter, and (T, N, 7) world_from_camera; None where too little was seen, and the old one goes on.
+            The resampled particles, None where they go on as they are; and what there is to say, None for nothing.
         """
-        self._next = max(int(np.ceil(self.config.start.growth * len(frames))), len(frames) + 1)
-        found = self._found(filter_, features, frames, path)
-        if found is None:
-            return None
-        steps, best = found
+        self.over = self.over or lost
+        if self.over:
+            self._frames, self._path = [], []
+            return None, None
+        self._frames.append(seen)
+        self._path.append(pose)
+        count = len(self._frames)
+        if count < self._next or not usable:
+            return None, None
+        self._next = max(int(np.ceil(self.config.start.growth * count)), count + 1)
+        frames, path = self._frames, np.array(self._path)
+        best, self.over = self._adjusted(filter_, frames, path)
+        if best is None:
+            if not self.over:
+                return None, None
+            self._frames, self._path = [], []
+            return None, DISCONNECTED
+
+        # Whole paths are drawn from the Gaussian about the optimum, and a filter follows them.
+        steps, optimum_ = best
         stamps = np.array([frame.stamp_ns for frame in frames], dtype=np.int64)
-        paths = between(stamps[steps], best.paths(self.config.particles, filter_.rng), stamps)
-        return self._along(paths, set(steps.tolist()), filter_, features, frames), paths
+        drawn = optimum_.paths(self.config.particles, filter_.rng)
+        paths = between(stamps[steps], drawn, stamps)
+        filter_ = self._along(paths, set(steps.tolist()), filter_, frames)
+        equal = uniform_log_weights(paths.shape[1])
+        means = [mixture_estimate(Prior.exactly(SE3, poses), None, equal) for poses in paths]
+        poses, covs = np.array([each.mean for each in means]), np.array([each.cov for each in means])
+        _, first = np.unique(np.concatenate([frame.landmarks for frame in frames]), return_index=True)
+        frame_of = np.repeat(np.arange(count), [frame.landmarks.size for frame in frames])[first]
+        self._path = list(poses)
+        if self.over:
+            self._frames, self._path = [], []
+        path = paths[:, filter_.belief().mode]
+        return Resampled(filter_, stamps, poses, covs, path, frame_of), None
 
     def arrays(self) -> dict[str, np.ndarray]:
         """For a checkpoint."""
-        names, steps, structure = self._last or _NOTHING
-        return {
+        nothing = np.zeros(0, dtype=np.int64)
+        no_structure = Structure(np.zeros((0, 7)), np.zeros((0, 3)), np.zeros(0))
+        names, steps, structure = self._last or (nothing, nothing, no_structure)
+        out = {
             "start/progress": np.array([self.over, self._next]),
             "start/names": names,
             "start/steps": steps,
@@ -95,6 +175,17 @@ class UnknownStart:
             "start/direction": structure.direction,
             "start/inverse": structure.inverse,
         }
+        if self._frames:
+            frames = self._frames
+            out |= {
+                "start/frames/stamps_ns": np.array([frame.stamp_ns for frame in frames], dtype=np.int64),
+                "start/frames/counts": np.array([frame.landmarks.size for frame in frames], dtype=np.int64),
+                "start/frames/names": np.concatenate([frame.landmarks for frame in frames]),
+                "start/frames/px": np.concatenate([frame.z for frame in frames]),
+                "start/frames/cov_px": np.concatenate([frame.cov_z for frame in frames]),
+                "start/frames/path": np.array(self._path),
+            }
+        return out
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """The inverse of `arrays`.
@@ -112,69 +203,78 @@ class UnknownStart:
             checked(arrays, "start/inverse", (names.size,), "f"),
         )
         self._last = (names, steps, structure) if names.size else None
+        self._frames, self._path = [], []
+        if "start/frames/stamps_ns" not in arrays:
+            return
+        stamps = checked(arrays, "start/frames/stamps_ns", (None,), "i")
+        counts = within(arrays, "start/frames/counts", stamps.size, 0, MAX_FEATURES)
+        total = int(counts.sum())
+        columns = (
+            checked(arrays, "start/frames/names", (total,), "i"),
+            checked(arrays, "start/frames/px", (total, 2), "f"),
+            checked(arrays, "start/frames/cov_px", (total, 2, 2), "f"),
+        )
+        parts = zip(*(np.split(column, np.cumsum(counts)[:-1]) for column in columns), strict=True)
+        self._frames = [FeatureFrame(t, *part) for t, part in zip(stamps.tolist(), parts, strict=True)]
+        self._path = list(checked(arrays, "start/frames/path", (stamps.size, 7), "f"))
 
-    def _found(
-        self, filter_: Filter, features: FeatureSensor, frames: Sequence[FeatureFrame], path: np.ndarray
-    ) -> tuple[np.ndarray, Optimum] | None:
-        """Numbers of the frames that took part, and the best optimum; None where too little is seen."""
-        steps = self._chosen(frames)
-        if steps.size < LEAST_FRAMES:
-            return None
-        held = np.array(sorted(filter_.belief().catalogue.values()), dtype=np.int64)
-        seen_by = np.concatenate([frames[t].landmarks for t in steps])
-        names, count = np.unique(seen_by[np.isin(seen_by, held)], return_counts=True)
-        names = names[count >= LEAST_SEEN]
-        seen = self._window(features, [frames[t] for t in steps], names)
-        self.over = not _hang_together(seen)
-        if self.over:
-            return None
-        starts = [self._where_the_filter_is(filter_, features, names, path[steps])]
-        ray, velocity = self.config.inverse_depth, self.config.velocity
-        rho = ray.mean_per_m, ray.std_per_m
-        expected = Expected(rho, start_std(velocity), walk_std(velocity))
-        if self._last is not None:
-            starts.append(self._gone_on(features, seen, names, path[steps], steps))
-        best = min((optimum(seen, expected, start) for start in starts), key=lambda each: each.cost)
-        self._last = names, steps, best.structure
-        relative = best.std_inverse() / np.maximum(best.structure.inverse, TINY)
-        relative = relative[np.isin(names, frames[-1].landmarks)]
-        self.over = bool(relative.size and np.median(relative) < self.config.start.depth_std_ratio)
-        return steps, best
-
-    def _chosen(self, frames: Sequence[FeatureFrame]) -> np.ndarray:
-        """Numbers of frames that see something, with a stamp of their own, the first and the last among them."""
+    def _adjusted(
+        self, filter_: Filter, frames: Sequence[FeatureFrame], path: np.ndarray
+    ) -> "tuple[tuple[np.ndarray, Optimum] | None, bool]":
+        """Numbers of the frames that took part, and the best optimum, or None; and whether the start is over."""
+        # Frames that see something, with a stamp of their own, the first and the last among them.
         stamps = np.array([frame.stamp_ns for frame in frames])
         fresh = np.append(True, np.diff(stamps) > 0) & [frame.landmarks.size > 0 for frame in frames]
         steps = np.flatnonzero(fresh)
         most = min(self.config.start.max_frames, steps.size)
-        return steps[np.linspace(0, steps.size - 1, most).round().astype(np.int64)]
+        steps = steps[np.linspace(0, steps.size - 1, most).round().astype(np.int64)]
+        if steps.size < MIN_FRAMES:
+            return None, False
 
-    def _window(self, features: FeatureSensor, frames: list[FeatureFrame], names: np.ndarray) -> Window:
-        taking_part = [np.isin(frame.landmarks, names) for frame in frames]
+        # Features that the map still holds and that enough of these frames see.
+        held = np.array(sorted(filter_.belief().catalogue.values()), dtype=np.int64)
+        chosen = [frames[t] for t in steps.tolist()]
+        seen_by = np.concatenate([frame.landmarks for frame in chosen])
+        names, views = np.unique(seen_by[np.isin(seen_by, held)], return_counts=True)
+        names = names[views >= MIN_VIEWS]
+        seen = self._window(chosen, names)
+        sees = np.zeros((seen.stamps_ns.size, seen.feature.max(initial=-1) + 1), dtype=bool)
+        sees[seen.frame, seen.feature] = True
+        if not ((sees[1:] & sees[:-1]).sum(axis=1) >= MIN_SHARED).all():
+            return None, True
+
+        # The lower of the minima downhill from where the filter is, and from where the last adjustment would have gone.
+        which, position = self.features.positions(filter_.belief(), names)
+        ordered = np.empty_like(position)
+        ordered[which] = position
+        starts = [_structure(SE3.between(path[steps][:1], path[steps]), ordered)]
+        if self._last is not None:
+            starts.append(self._gone_on(seen, names, path[steps], steps))
+        inverse_depth, velocity = self.config.inverse_depth, self.config.velocity
+        rho = inverse_depth.mean_per_m, inverse_depth.std_per_m
+        expected = Expected(rho, velocity.start_std(), velocity.walk_std())
+        best = min((optimum(seen, expected, start) for start in starts), key=lambda each: each.cost)
+        self._last = names, steps, best.structure
+
+        relative = best.std_inverse() / np.maximum(best.structure.inverse, TINY)
+        relative = relative[np.isin(names, frames[-1].landmarks)]
+        depths_known = relative.size > 0 and np.median(relative) < self.config.start.depth_std_ratio
+        return (steps, best), bool(depths_known)
+
+    def _window(self, frames: list[FeatureFrame], names: np.ndarray) -> "Window":
+        """What frames saw of features of these names."""
+        parts = [np.isin(frame.landmarks, names) for frame in frames]
+        seen = [frame.landmarks[part] for frame, part in zip(frames, parts, strict=True)]
         return Window(
-            features.camera,
+            self.features.camera,
             np.array([frame.stamp_ns for frame in frames], dtype=np.int64),
-            np.repeat(np.arange(len(frames)), [part.sum() for part in taking_part]),
-            np.searchsorted(
-                names,
-                np.concatenate([f.landmarks[part] for f, part in zip(frames, taking_part, strict=True)]),
-            ),
-            np.concatenate([f.z[part] for f, part in zip(frames, taking_part, strict=True)]),
-            float(np.sqrt(np.mean([np.trace(cov) / 2.0 for f in frames for cov in f.cov_z]))),
+            np.repeat(np.arange(len(frames)), [part.sum() for part in parts]),
+            np.searchsorted(names, np.concatenate(seen)),
+            np.concatenate([frame.z[part] for frame, part in zip(frames, parts, strict=True)]),
+            float(np.sqrt(np.mean([np.trace(cov) / 2.0 for frame in frames for cov in frame.cov_z]))),
         )
 
-    def _where_the_filter_is(
-        self, filter_: Filter, features: FeatureSensor, names: np.ndarray, path: np.ndarray
-    ) -> Structure:
-        """The heaviest particle's map, and the path that was reported."""
-        which, place = features.places(filter_.belief(), names, np.full(names.size, -1))
-        ordered = np.empty_like(place)
-        ordered[which] = place
-        return _structure(SE3.between(path[:1], path), ordered)
-
-    def _gone_on(
-        self, features: FeatureSensor, seen: Window, names: np.ndarray, path: np.ndarray, steps: np.ndarray
-    ) -> Structure:
+    def _gone_on(self, seen: "Window", names: np.ndarray, path: np.ndarray, steps: np.ndarray) -> "Structure":
         """The last adjustment's path and structure, gone on with as the filter moved, and what is new at the prior."""
         assert self._last is not None
         before, old_steps, structure = self._last
@@ -182,60 +282,43 @@ class UnknownStart:
         start = between(old_steps, structure.path[None], steps[: joint + 1])[:, 0]
         onward = SE3.compose(start[-1:], SE3.between(path[joint : joint + 1], path[joint + 1 :]))
         whole = np.concatenate([start, onward])
-        place = np.empty((names.size, 4))
+        position = np.empty((names.size, 4))
         _, first = np.unique(seen.feature, return_index=True)
         # Where the lens has no direction, straight ahead is enough to start from.
-        uv = np.nan_to_num(features.camera.unproject(seen.px[first]))
+        uv = np.nan_to_num(seen.camera.unproject(seen.px[first]))
         pose, rho = whole[seen.frame[first]], self.config.inverse_depth.mean_per_m
         ahead = np.concatenate([uv, np.ones((names.size, 1))], axis=1)
-        place[:, :3] = SE3.transform(pose, ahead) + (rho - 1.0) * SE3.translation(pose)
-        place[:, 3] = rho
+        position[:, :3] = SE3.transform(pose, ahead) + (rho - 1.0) * SE3.translation(pose)
+        position[:, 3] = rho
         _, now, then = np.intersect1d(names, before, return_indices=True)
-        place[now] = np.concatenate([structure.direction, structure.inverse[:, None]], axis=1)[then]
-        return _structure(whole, place)
+        position[now] = np.concatenate([structure.direction, structure.inverse[:, None]], axis=1)[then]
+        return _structure(whole, position)
 
     def _along(
-        self,
-        paths: np.ndarray,
-        steps: set[int],
-        old: Filter,
-        features: FeatureSensor,
-        frames: Sequence[FeatureFrame],
+        self, paths: np.ndarray, steps: set[int], old: Filter, frames: Sequence[FeatureFrame]
     ) -> Filter:
         """A filter that has followed paths (T, N, 7), measuring in the frames that they were drawn from."""
-        new = assemble(self.config, features, None)
+        new = self.new_filter()
         new.rng, new.log_evidence = old.rng, old.log_evidence
-        start = min(steps)
-        law = PosePrior(SE3.identity(), np.zeros((6, 6)), start_std(self.config.velocity))
+        at_rest = PosePrior(SE3.identity(), np.zeros((6, 6)), self.config.velocity.start_std())
+        first = min(steps)
         for t, frame in enumerate(frames):
-            state = self._state(new, paths[t], frame.stamp_ns)
-            measured = frame if t in steps else _unseen(frame)
-            new.follow(state, measured, law if t <= start else None, frame.stamp_ns)
+            state = paths[t]
+            before, then = new.particles.state, new.stamp_ns
+            if before.shape[1] > 7:  # the velocity is sampled: that which led there
+                seconds = 0.0 if then is None else (frame.stamp_ns - then) * 1e-9
+                moved = before[:, 7:]
+                if seconds > 0.0:
+                    moved = SE3.log(SE3.between(before[:, :7], state)) / seconds
+                state = np.concatenate([state, moved], axis=1)
+            if t not in steps:
+                frame = FeatureFrame(frame.stamp_ns, frame.landmarks[:0], frame.z[:0], frame.cov_z[:0])
+            new.follow(state, frame, at_rest if t <= first else None, frame.stamp_ns)
         held = set(old.belief().catalogue.values())
         gone = [name for name in new.belief().catalogue.values() if name not in held]
-        features.forget(new.belief(), np.array(gone, dtype=np.int64))
+        self.features.remove(new.belief(), np.array(gone, dtype=np.int64))
         new.sensors = old.sensors
         return new
-
-    def _state(self, filter_: Filter, pose: np.ndarray, stamp_ns: int) -> np.ndarray:
-        """The particles' next states (N, E) at poses (N, 7), with the velocity that led there where it is sampled."""
-        before, then = filter_.particles.state, filter_.stamp_ns
-        if before.shape[1] == 7:
-            return pose
-        seconds = 0.0 if then is None else (stamp_ns - then) * 1e-9
-        moved = SE3.log(SE3.between(before[:, :7], pose)) / seconds if seconds > 0.0 else before[:, 7:]
-        return np.concatenate([pose, moved], axis=1)
-
-
-def _unseen(frame: FeatureFrame) -> FeatureFrame:
-    return FeatureFrame(frame.stamp_ns, frame.landmarks[:0], frame.z[:0], frame.cov_z[:0])
-
-
-def _hang_together(seen: Window) -> bool:
-    """Whether each two frames in a row have features in common."""
-    sees = np.zeros((seen.stamps_ns.size, seen.feature.max(initial=-1) + 1), dtype=bool)
-    sees[seen.frame, seen.feature] = True
-    return bool(((sees[1:] & sees[:-1]).sum(axis=1) >= SHARED).all())
 
 
 def between(times: np.ndarray, paths: np.ndarray, wanted: np.ndarray) -> np.ndarray:
@@ -246,14 +329,220 @@ def between(times: np.ndarray, paths: np.ndarray, wanted: np.ndarray) -> np.ndar
     return np.swapaxes(SE3.retract(paths[:, k], fraction[:, None] * moved[:, k]), 0, 1)
 
 
-def _structure(path: np.ndarray, place: np.ndarray) -> Structure:
+@dataclass(frozen=True)
+class Window:
+    """What T frames saw of F features, K observations in all.
+
+    Attributes:
+        camera: of the images.
+        stamps_ns: (T,) of the frames.
+        frame: (K,) in which of them.
+        feature: (K,) which one; no feature twice in a frame.
+        px: (K, 2) where.
+        noise_px: standard deviation, per axis.
+    """
+
+    camera: Pinhole
+    stamps_ns: np.ndarray
+    frame: np.ndarray
+    feature: np.ndarray
+    px: np.ndarray
+    noise_px: float
+
+
+@dataclass(frozen=True)
+class Expected:
+    """What is expected before anything is seen.
+
+    Attributes:
+        rho: mean and standard deviation of an inverse distance, 1/m.
+        std_start: (6,) of the velocity at first, rad/s, m/s.
+        std_walk: (6,) of its walk in one second, (rad/s, m/s)/√s.
+    """
+
+    rho: tuple[float, float]
+    std_start: np.ndarray
+    std_walk: np.ndarray
+
+
+@final
+@dataclass(frozen=True)
+class Structure:
+    """Paths and features.
+
+    Attributes:
+        path: (T, 7) world_from_camera; the first one is the identity.
+        direction: (F, 3) unit vectors.
+        inverse: (F,) 1/m.
+    """
+
+    path: np.ndarray
+    direction: np.ndarray
+    inverse: np.ndarray
+
+    def moved(self, step: np.ndarray) -> "Structure":
+        """By a step (6 (T − 1) + 3 F,) in the right charts of the poses, the tangent planes and 1/m."""
+        free = 6 * (self.path.shape[0] - 1)
+        path, of_features = self.path.copy(), step[free:].reshape(-1, 3)
+        path[1:] = SE3.retract(path[1:], step[:free].reshape(-1, 6))
+        direction = self.direction + (tangents(self.direction) @ of_features[:, :2, None])[..., 0]
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        return Structure(path, direction, self.inverse + of_features[:, 2])
+
+
+@final
+@dataclass(frozen=True)
+class Optimum:
+    """A minimum.
+
+    Attributes:
+        structure: there.
+        cost: the sum above.
+        information: (6 (T − 1) + 3 F, …) of the step from it, by Gauss and Newton with the losses' weights.
+    """
+
+    structure: Structure
+    cost: float
+    information: np.ndarray
+
+    @cached_property
+    def _factor(self) -> np.ndarray:
+        return np.asarray(cholesky(self.information, lower=True))
+
+    def paths(self, n: int, rng: np.random.Generator) -> np.ndarray:
+        """Paths (n, T, 7) drawn from the Gaussian about the minimum (P. Laplace's approximation)."""
+        whitened = rng.standard_normal((self.information.shape[0], n))
+        step = solve_triangular(self._factor.T, whitened, lower=False).T
+        path = self.structure.path
+        out = np.broadcast_to(path, (n, *path.shape)).copy()
+        out[:, 1:] = SE3.retract(path[1:], step[:, : 6 * (path.shape[0] - 1)].reshape(n, -1, 6))
+        return out
+
+    def std_inverse(self) -> np.ndarray:
+        """Standard deviations (F,) of the inverse distances, 1/m."""
+        count = self.structure.inverse.size
+        rows = np.arange(count) * 3 + 2 + self.information.shape[0] - 3 * count
+        picked = np.zeros((self.information.shape[0], count))
+        picked[rows, np.arange(count)] = 1.0
+        half = solve_triangular(self._factor, picked, lower=True)
+        return np.asarray(np.sqrt(np.square(half).sum(axis=0)))
+
+
+def optimum(seen: Window, expected: Expected, start: Structure) -> Optimum:
+    """The minimum that lies downhill from a start, by Levenberg's and Marquardt's method on the normal equations."""
+    now, damping = Linearised(seen, expected, start), DAMPING
+    for _ in range(MAX_STEPS):
+        information, vector = now.normal_equations()
+        while True:
+            ahead = None
+            with suppress(LinAlgError):
+                factor = cho_factor(information + damping * np.diag(np.diag(information)))
+                ahead = Linearised(seen, expected, now.at.moved(np.asarray(cho_solve(factor, vector))))
+            if ahead is not None and ahead.cost < now.cost:
+                break
+            damping *= DAMPING_FACTOR
+            if damping > MAX_DAMPING:
+                return Optimum(now.at, now.cost, information)
+        damping /= DAMPING_FACTOR
+        gain, now = now.cost - ahead.cost, ahead
+        if gain < MIN_GAIN * (1.0 + now.cost):
+            break
+    return Optimum(now.at, now.cost, now.normal_equations()[0])
+
+
+@final
+class Linearised:
+    """All residuals at a structure, whitened; their derivatives where they are asked for."""
+
+    def __init__(self, seen: Window, expected: Expected, at: Structure) -> None:
+        self.seen, self.expected, self.at = seen, expected, at
+        pose, feature = at.path[seen.frame], seen.feature
+        position = SE3.translation(pose)
+        place = at.direction[feature] + (1.0 - at.inverse[feature, None]) * position
+        self._direction = clamp_depth(SE3.inverse_transform(pose, place))
+        self.misfit = (seen.px - seen.camera.project(self._direction)) / seen.noise_px
+        squared = np.square(self.misfit).sum(axis=1) / CAUCHY_SCALE**2
+        self.weight = 1.0 / (1.0 + squared)
+        self._interval = np.diff(seen.stamps_ns) * 1e-9
+        self._relative = SE3.between(at.path[:-1], at.path[1:])
+        walked = expected.std_walk * np.sqrt(self._interval[1:, None])
+        self._std_velocity = np.concatenate([expected.std_start[None], walked])
+        self.velocity = self._differences(SE3.log(self._relative) / self._interval[:, None])
+        self.prior = (at.inverse - expected.rho[0]) / expected.rho[1]
+        self._by_scale = 1.0 / (at.inverse.size * expected.rho[0] * SCALE_STD)
+        self.scale = float(self._by_scale * at.inverse.sum() - 1.0 / SCALE_STD)
+        quadratic = sum(np.square(part).sum() for part in (self.velocity, self.prior, self.scale))
+        self.cost = float(0.5 * CAUCHY_SCALE**2 * np.log1p(squared).sum() + 0.5 * quadratic)
+
+    def _differences(self, velocity: np.ndarray) -> np.ndarray:
+        """The first of T − 1 rows, and from row to row, in standard deviations."""
+        moved = np.concatenate([velocity[:1], np.diff(velocity, axis=0)])
+        return np.asarray(moved / self._std_velocity.reshape(-1, 6, *[1] * (velocity.ndim - 2)))
+
+    def normal_equations(self) -> tuple[np.ndarray, np.ndarray]:
+        """Gauss and Newton's: information of the step, and the vector that it is solved with."""
+        seen, at, direction = self.seen, self.at, self._direction
+        frames, features = at.path.shape[0], at.inverse.size
+        free = 6 * frames
+        h, b = np.zeros((free + 3 * features,) * 2), np.zeros(free + 3 * features)
+        of_poses = h[:free, :free].reshape(frames, 6, frames, 6)
+        of_features = h[free:, free:].reshape(features, 3, features, 3)
+        across = h[:free, free:].reshape(frames, 6, features, 3)
+
+        # Derivatives of what should be seen by the pose (K, 2, 6) and by the feature (K, 2, 3).
+        pose, inverse = at.path[seen.frame], at.inverse[seen.feature, None, None]
+        slope = seen.camera.jacobian(direction) / seen.noise_px
+        by_pose = np.concatenate([np.cross(slope, direction[:, None, :]), -inverse * slope], axis=2)
+        turned = slope @ np.swapaxes(SE3.rotation(pose), 1, 2)
+        along = turned @ tangents(at.direction)[seen.feature]
+        by_feature = np.concatenate([along, -turned @ SE3.translation(pose)[:, :, None]], axis=2)
+
+        # What was seen, each observation with its loss's weight.
+        of_pose, of_feature = (
+            np.swapaxes(self.weight[:, None, None] * by, 1, 2) for by in (by_pose, by_feature)
+        )
+        each = np.arange(frames), np.arange(features)
+        of_poses[each[0], :, each[0]] = _summed(of_pose @ by_pose, seen.frame, frames)
+        of_features[each[1], :, each[1]] = _summed(of_feature @ by_feature, seen.feature, features)
+        across[seen.frame, :, seen.feature] = of_pose @ by_feature
+        h[free:, :free] = h[:free, free:].T
+        misfit = self.misfit[..., None]
+        b[:free] = _summed((of_pose @ misfit)[..., 0], seen.frame, frames).ravel()
+        b[free:] = _summed((of_feature @ misfit)[..., 0], seen.feature, features).ravel()
+
+        # Velocities between frames; their logarithms' derivatives by the poses to first order in a step.
+        steps = frames - 1
+        by_poses, k = np.zeros((steps, 6, frames, 6)), np.arange(steps)
+        by_poses[k, :, k + 1] = np.eye(6) / self._interval[:, None, None]
+        by_poses[k, :, k] = -SE3.adjoint(SE3.inverse(self._relative)) / self._interval[:, None, None]
+        of_velocity = self._differences(by_poses.reshape(steps, 6, -1)).reshape(6 * steps, -1)
+        h[:free, :free] += of_velocity.T @ of_velocity
+        b[:free] -= of_velocity.T @ self.velocity.ravel()
+
+        # The prior of the inverse distances, and the scale.
+        q = free + 2 + 3 * np.arange(features)
+        h[q, q] += self.expected.rho[1] ** -2
+        h[np.ix_(q, q)] += self._by_scale**2
+        b[q] -= self.prior / self.expected.rho[1] + self.scale * self._by_scale
+        return h[6:, 6:], b[6:]
+
+
+def tangents(direction: np.ndarray) -> np.ndarray:
+    """Two unit vectors (F, 3, 2) across each unit vector (F, 3) and one another."""
+    helper = np.where(np.abs(direction[:, :1]) < 0.6, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    first = np.cross(direction, helper)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack([first, np.cross(direction, first)], axis=-1)
+
+
+def _summed(parts: np.ndarray, row: np.ndarray, count: int) -> np.ndarray:
+    """Sums (count, …) of parts (K, …) by their rows (K,)."""
+    out = np.zeros((count, *parts.shape[1:]))
+    np.add.at(out, row, parts)
+    return out
+
+
+def _structure(path: np.ndarray, position: np.ndarray) -> Structure:
     """From homogeneous points (F, 4)."""
-    length = np.linalg.norm(place[:, :3], axis=1, keepdims=True)
-    return Structure(path, place[:, :3] / length, place[:, 3] / length[:, 0])
-
-
-_NOTHING = (
-    np.zeros(0, dtype=np.int64),
-    np.zeros(0, dtype=np.int64),
-    Structure(np.zeros((0, 7)), np.zeros((0, 3)), np.zeros(0)),
-)
+    length = np.linalg.norm(position[:, :3], axis=1, keepdims=True)
+    return Structure(path, position[:, :3] / length, position[:, 3] / length[:, 0])

@@ -1,28 +1,52 @@
-"""Runs monocular SLAM over a sequence of images: search, filter, loss and recovery."""
+"""Takes a sequence of images through `MonoSlam`, and gathers what it reports."""
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 import numpy as np
 
+from rbpf.core.archive import checked
+from rbpf.core.checkpoint import fitting
 from rbpf.core.filter import Filter
 from rbpf.errors import InputError
-from rbpf.lie import SE3
-from rbpf.motion.constant_velocity import PosePrior
 from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.sensors.readers.images import ImageFrame, ImageSequence, KnownPixels
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.image_sensor import ImageSensor
 from rbpf.systems.mono.known_map import KnownMap
-from rbpf.systems.mono.known_start import KnownStart, located_points, require_texture
-from rbpf.systems.mono.recovery import Recovery
-from rbpf.systems.mono.resuming import cut, restore, save
-from rbpf.systems.mono.run import estimate_in, told_anew
-from rbpf.systems.mono.sightings import Sightings
-from rbpf.systems.mono.system import assemble, build_features, start_cov, start_std, world_of
-from rbpf.systems.mono.unknown_start import TORN, UnknownStart
+from rbpf.systems.mono.slam import MonoSlam
+
+_PER_FRAME = (
+    "searched", "found", "lost", "ess", "log_evidence", "resampled", "nis", "nis_dof", "points", "rays",
+    "seconds_search", "seconds_new_landmarks",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class SearchRecord:
+    """What `MonoSlam.observed` says of one frame: K features that were looked for, J that were started."""
+
+    features: np.ndarray
+    mean: np.ndarray
+    cov: np.ndarray
+    px: np.ndarray
+    cov_px: np.ndarray
+    line: np.ndarray
+    position: np.ndarray
+    started: np.ndarray
+    started_px: np.ndarray
+
+    @property
+    def found(self) -> np.ndarray:
+        """(K,) whether each was found."""
+        return np.isfinite(self.px).all(axis=1)
+
+    @property
+    def is_ray(self) -> np.ndarray:
+        """(K,) whether its depth was still unknown after the frame."""
+        return np.isfinite(self.line).all(axis=(1, 2))
 
 
 @dataclass
@@ -34,74 +58,112 @@ class VideoRun:
         config: with what settings.
         known: the known points, None where it started without any.
         mapped: the map that the camera is found in, and that is not changed; None where the run makes its own.
-        filter: in its final state.
-        sensor: its image sensor.
+        slam: the system as it is now.
         stamps_ns: (T,).
         world_from_camera: (T, 7) online filtered mean, in the world of the known points, else of the first camera; the
-            frames of a start without known points are told anew at its end, when there is a scale to tell them in.
+            frames of a start without known points are revised at its end, when there is a scale to report them in.
         cov: (T, 6, 6) of it in the right chart at the mean, order [ω, v].
-        searched: (T,) landmarks looked for.
-        found: (T,) landmarks found.
-        lost: (T,) whether the camera was lost after the frame.
-        ess: (T,) effective sample size before resampling.
-        log_evidence: (T,) increments.
-        resampled: (T,) whether the particles were resampled.
-        nis: (T,) normalised innovation squared;  nis_dof: (T,) its degrees of freedom.
-        seconds: (T,) time of the whole frame without decoding;  seconds_search: (T,) of the search in the image.
-        seconds_waiting: (T,) until the decoded image was there.
-        seconds_new_landmarks: (T,) of judging what was looked for and starting landmarks at corners, part of the frame's.
-        seconds_telling: (T,) of the estimate and of taking notes, after the frame's time.
-        sightings: what was looked for, frame by frame.
+        columns: (T,) each, the system's columns by name; they are attributes too.
+        seconds: (T,) time of the frame without decoding;  seconds_waiting: (T,) until the decoded image was there.
+        searches: what was looked for, frame by frame.
         problems: what was wrong with single frames, in words.
         relocalisations: numbers of the frames in which it was found again.
         failure: why it ended before the last frame, in words; None where it did not.
-        recovery: what finds the camera again.
-        start: what draws the particles anew while it starts without known points.
     """
 
     sequence: ImageSequence
     config: MonoConfig
     known: KnownPixels | None
     mapped: KnownMap | None
-    filter: Filter
-    sensor: ImageSensor
+    slam: MonoSlam
     stamps_ns: np.ndarray
     world_from_camera: np.ndarray
     cov: np.ndarray
-    searched: np.ndarray
-    found: np.ndarray
-    lost: np.ndarray
-    ess: np.ndarray
-    log_evidence: np.ndarray
-    resampled: np.ndarray
-    nis: np.ndarray
-    nis_dof: np.ndarray
-    seconds: np.ndarray
-    seconds_search: np.ndarray
-    seconds_waiting: np.ndarray
-    seconds_new_landmarks: np.ndarray
-    seconds_telling: np.ndarray
-    sightings: Sightings = field(init=False)
+    columns: dict[str, np.ndarray]
+    searches: list[SearchRecord] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
     relocalisations: list[int] = field(default_factory=list)
     failure: str | None = None
-    recovery: Recovery = field(init=False)
-    start: UnknownStart = field(init=False)
 
-    def __post_init__(self) -> None:
-        """Watches over the sensor from the start."""
-        found, std = self.mapped, start_std(self.config.velocity)
-        views, size = (None, 0.0) if found is None else (found.views, found.size_m)
-        self.recovery = Recovery(self.sensor, self.config.relocalisation, std, views, size)
-        self.sightings = Sightings(0 if found is None else found.names.size)
-        self.start = UnknownStart(self.config, needed=found is None and self.known is None)
+    def __getattr__(self, name: str) -> np.ndarray:
+        """A column."""
+        columns = self.__dict__.get("columns", {})
+        if name not in columns:
+            raise AttributeError(name)
+        return np.asarray(columns[name])
+
+    @property
+    def filter(self) -> Filter:
+        """The system's filter."""
+        return self.slam.filter
+
+    @property
+    def sensor(self) -> ImageSensor:
+        """The system's image sensor."""
+        return self.slam.sensor
 
     @property
     def given(self) -> int:
         """Number of landmarks that were known from the start: the first rows of the sensor's table."""
-        if self.mapped is not None:
-            return int(self.mapped.names.size)
-        return 0 if self.known is None else int(self.known.names.size)
+        points = self.slam.known_points
+        return 0 if points is None else int(points.names.size)
+
+    def measured(self) -> list[FeatureFrame]:
+        """What the filter used in each frame, and what started features; names are rows of the sensor's table.
+
+        Of a frame in which too little agreed to be trusted nothing was used, and nothing is reported.
+        """
+        out, noise = [], self.config.search.noise_px**2 * np.eye(2)
+        for stamp, used, one in zip(self.stamps_ns.tolist(), self.found.tolist(), self.searches, strict=True):
+            kept = one.found & bool(used)
+            names = np.concatenate([one.features[kept], one.started])
+            px = np.concatenate([one.px[kept], one.started_px])
+            out.append(FeatureFrame(stamp, names, px, np.tile(noise, (names.size, 1, 1))))
+        return out
+
+    def save(self, path: Path) -> None:
+        """Writes a checkpoint."""
+        done = len(self.searches)
+        arrays = {f"progress/{name}": column[:done] for name, column in self.columns.items()}
+        arrays |= {
+            "progress/world_from_camera": self.world_from_camera[:done],
+            "progress/cov": self.cov[:done],
+            "progress/stamps_ns": self.stamps_ns,
+            "progress/problems": np.array(self.problems, dtype=np.str_),
+            "progress/relocalisations": np.array(self.relocalisations, dtype=np.int64),
+            "searches/counts": np.array([[s.features.size, s.started.size] for s in self.searches]),
+        }
+        for item in fields(SearchRecord):
+            arrays[f"searches/{item.name}"] = np.concatenate([getattr(s, item.name) for s in self.searches])
+        self.slam.save(path, arrays)
+
+    def restore(self, path: Path) -> None:
+        """The inverse of `save`.
+
+        Raises:
+            InputError: the file is damaged, or belongs to a run over another sequence or with other settings.
+        """
+        arrays = self.slam.load(path)
+        if not np.array_equal(arrays.get("progress/stamps_ns", ()), self.stamps_ns):
+            raise InputError(f"{path} belongs to a run over another sequence: start without --resume")
+        with fitting(path):
+            counts = arrays["searches/counts"]
+            done = len(counts)
+            self.world_from_camera[:done] = arrays["progress/world_from_camera"]
+            self.cov[:done] = arrays["progress/cov"]
+            for name, column in self.columns.items():
+                column[:done] = arrays[f"progress/{name}"]
+            self.problems = checked(arrays, "progress/problems", (None,), "U").tolist()
+            self.relocalisations = checked(arrays, "progress/relocalisations", (None,), "i").tolist()
+            looked_for, started = np.cumsum(counts, axis=0)[:-1].T
+            parts = [
+                np.split(
+                    arrays[f"searches/{item.name}"],
+                    started if item.name.startswith("started") else looked_for,
+                )
+                for item in fields(SearchRecord)
+            ]
+            self.searches = [SearchRecord(*each) for each in zip(*parts, strict=True)]
 
 
 def run_images(
@@ -131,21 +193,43 @@ def run_images(
             is of another run.
     """
     if mapped is None:
-        run, law = _begin(sequence, config, known, first_image(sequence))
-    else:
-        run, law = _begin_in(sequence, config, mapped), None
+        first_image(sequence)
+    slam = MonoSlam(sequence.camera, config, known, mapped)
+    total = len(sequence)
+    columns = {name: np.zeros(total) for name in (*_PER_FRAME, "seconds", "seconds_waiting")}
+    stamps = np.asarray(sequence.stamps_ns, dtype=np.int64)
+    paths = np.zeros((total, 7)), np.zeros((total, 6, 6))
+    run = VideoRun(sequence, config, known, mapped, slam, stamps, *paths, columns)
     if resume and checkpoint is not None and checkpoint.exists():
-        restore(run, checkpoint)
+        run.restore(checkpoint)
     waited = time.perf_counter()
-    for t, frame in enumerate(_frames_from(sequence, run.filter.steps), run.filter.steps):
-        run.seconds_waiting[t] = time.perf_counter() - waited
+    done = len(run.searches)
+    frames: Iterator[ImageFrame] = sequence.frames(done) if done < total else iter(())
+    for t, frame in enumerate(frames, done):
+        started = time.perf_counter()
+        columns["seconds_waiting"][t] = started - waited
         try:
-            _frame(run, t, frame, law if t == 0 else _waiting(run))
+            tracked = slam.take(frame)
+            if not slam.filter.steps:
+                raise InputError(
+                    f"{sequence.name}: the first image is needed to start: {tracked.messages[0]}"
+                )
         except InputError as error:
             if t == 0:
                 raise
             run.failure = f"frame {t} of {sequence.name}: {error}"
             break
+        columns["seconds"][t] = time.perf_counter() - started
+        run.world_from_camera[t], run.cov[t] = tracked.pose, tracked.cov
+        if tracked.revision is not None:
+            run.world_from_camera[: t + 1] = tracked.revision.poses
+            run.cov[: t + 1] = tracked.revision.covs
+        for name in _PER_FRAME:
+            columns[name][t] = tracked.values[name]
+        run.searches.append(SearchRecord(**tracked.observed))
+        run.problems += [f"frame {t}: {words}" for words in tracked.messages]
+        if tracked.values["relocalised"]:
+            run.relocalisations.append(t)
         if checkpoint is not None and (t + 1) % config.checkpoint_every == 0:
             _keep(run, checkpoint)
         try:
@@ -158,7 +242,13 @@ def run_images(
         waited = time.perf_counter()
     if checkpoint is not None and run.failure is None:
         _keep(run, checkpoint)
-    cut(run)
+    # A video may end before its last announced image.
+    done = len(run.searches)
+    run.stamps_ns, run.world_from_camera, run.cov = (
+        array[:done] for array in (run.stamps_ns, run.world_from_camera, run.cov)
+    )
+    for name in columns:
+        columns[name] = columns[name][:done]
     return run
 
 
@@ -175,126 +265,9 @@ def first_image(sequence: ImageSequence) -> np.ndarray:
     return first.image
 
 
-def _frames_from(sequence: ImageSequence, start: int) -> Iterator[ImageFrame]:
-    return sequence.frames(start) if start < len(sequence) else iter(())
-
-
-def _begin(
-    sequence: ImageSequence, config: MonoConfig, known: KnownPixels | None, image: np.ndarray
-) -> tuple[VideoRun, PosePrior]:
-    """A run before its first frame, and where the camera is in it: at the origin, unless the known points tell."""
-    start, law = None, PosePrior(SE3.identity(), np.zeros((6, 6)))
-    if known is not None:
-        points, pose = located_points(sequence.camera, known, config.search.noise_px)
-        noise = np.tile(config.search.noise_px**2 * np.eye(2), (known.names.size, 1, 1))
-        sight = FeatureFrame(int(sequence.stamps_ns[0]), points.names, known.px, noise)
-        start = KnownStart(points, pose, points.names, sight)
-        require_texture(image, known)
-        if config.known == "points":
-            law = PosePrior(pose, start_cov(config))
-    features = build_features(sequence.camera, config, start)
-    sensor = ImageSensor(features, config.search)
-    if known is not None:
-        sensor.begin(image, known.px, config.known == "frame")
-    return _empty(sequence, config, sensor, assemble(config, features, start, sensor), known), law
-
-
-def _begin_in(sequence: ImageSequence, config: MonoConfig, mapped: KnownMap) -> VideoRun:
-    """A run before its first frame, somewhere in a map."""
-    mapped.require_camera(sequence.camera, sequence.name)
-    features = build_features(sequence.camera, config, None, fixed=True)
-    sensor = ImageSensor(features, config.search)
-    sensor.begin_lost(mapped.windows, mapped.first_px, mapped.first_pose, mapped.positions)
-    filter_ = assemble(config, features, None, sensor, mapped.points)
-    return _empty(sequence, config, sensor, filter_, None, mapped)
-
-
-def _empty(
-    sequence: ImageSequence,
-    config: MonoConfig,
-    sensor: ImageSensor,
-    filter_: Filter,
-    known: KnownPixels | None,
-    mapped: KnownMap | None = None,
-) -> VideoRun:
-    total = len(sequence)
-    numbers = np.zeros((13, total))
-    poses, covs = np.zeros((total, 7)), np.zeros((total, 6, 6))
-    stamps = np.asarray(sequence.stamps_ns, dtype=np.int64)
-    run = VideoRun(sequence, config, known, mapped, filter_, sensor, stamps, poses, covs, *numbers)
-    run.recovery.stamp_ns = int(stamps[0])
-    return run
-
-
 def _keep(run: VideoRun, checkpoint: Path) -> None:
     """Writes a checkpoint; where the disk is full the run goes on all the same, and the last one stays."""
     try:
-        save(run, checkpoint)
+        run.save(checkpoint)
     except InputError as error:
-        run.problems.append(f"frame {run.filter.steps - 1}: no checkpoint is kept: {error}")
-
-
-def _waiting(run: VideoRun) -> PosePrior | None:
-    """The camera stays at the origin until an image shows something; nothing once there are features."""
-    if run.sensor.table.count:
-        return None
-    return PosePrior(SE3.identity(), np.zeros((6, 6)), start_std(run.config.velocity))
-
-
-def _fitting(run: VideoRun, frame: ImageFrame) -> ImageFrame:
-    """The frame, without its image if that is not what the camera takes: readers see to it, other sources may not."""
-    camera, image = run.sequence.camera, frame.image
-    if image is None or (image.shape == (camera.height, camera.width) and image.dtype == np.uint8):
-        return frame
-    problem = (
-        f"expected {camera.width}x{camera.height} grey levels of 8 bits, got {image.shape} {image.dtype}"
-    )
-    return replace(frame, image=None, problem=f"the image is not used: {problem}")
-
-
-def _frame(run: VideoRun, t: int, frame: ImageFrame, law: PosePrior | None) -> None:
-    started = time.perf_counter()
-    frame = run.recovery.checked(_fitting(run, frame))
-    was_lost, never_found = run.sensor.lost, run.recovery.never_found
-    law = law or run.recovery.law(frame, run.filter)
-    report = run.filter.step(frame, law, frame.stamp_ns)
-    run.recovery.note(frame, run.filter)
-    run.seconds[t], world = time.perf_counter() - started, world_of(run.filter)
-    estimate = estimate_in(world, run.filter, report)
-    run.world_from_camera[t], run.cov[t] = estimate.mean, estimate.cov + run.recovery.drift(frame)
-    searched = run.sensor.searched
-    run.searched[t], run.found[t] = searched.rows.size, run.sensor.measured.landmarks.size
-    run.lost[t] = run.sensor.lost
-    run.ess[t], run.log_evidence[t] = report.ess, report.log_evidence
-    run.resampled[t], run.nis[t], run.nis_dof[t] = report.resampled, report.nis, report.rows
-    run.seconds_search[t], run.seconds_new_landmarks[t] = run.sensor.seconds, run.sensor.seconds_new_landmarks
-    run.sightings.record(run.sensor, run.filter, world)
-    run.seconds_telling[t] = time.perf_counter() - started - run.seconds[t]
-    if run.start.due(t + 1, run.sensor.lost and run.sensor.table.count > 0) and not run.sensor.bad_frames:
-        _redraw(run, t, frame)
-    if frame.problem is not None:
-        run.problems.append(f"frame {t}: {frame.problem}")
-    if run.sensor.lost and not was_lost:
-        run.problems.append(f"frame {t}: the camera is lost, its pose is held until the map is seen again")
-    if never_found and not run.sensor.lost:
-        run.problems.append(f"frame {t}: the camera is found in the map")
-    elif was_lost and not run.sensor.lost:
-        run.problems.append(f"frame {t}: the camera is found again")
-        run.relocalisations.append(t)
-
-
-def _redraw(run: VideoRun, t: int, frame: ImageFrame) -> None:
-    """Draws the particles of a start without known points anew."""
-    started = time.perf_counter()
-    done = slice(t + 1)
-    measured = run.sightings.measured(run.stamps_ns[done], run.found[done], run.config.search.noise_px)
-    drawn = run.start.redrawn(run.filter, run.sensor.features, measured, run.world_from_camera[done])
-    if drawn is not None:
-        run.filter = drawn[0]
-        run.world_from_camera[done], run.cov[done] = told_anew(drawn[1])
-        belief, counts = run.filter.belief(), [seen.started.shape[0] for seen in run.sightings.frames]
-        run.sensor.drawn_anew(belief, drawn[1][:, belief.mode], np.repeat(np.arange(t + 1), counts))
-        run.recovery.note(frame, run.filter)
-    elif run.start.over:
-        run.problems.append(f"frame {t}: {TORN}")
-    run.seconds[t] += time.perf_counter() - started
+        run.problems.append(f"frame {len(run.searches) - 1}: no checkpoint is kept: {error}")

@@ -3,10 +3,11 @@
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 from rbpf.errors import InputError
-from rbpf.sensors.readers.images import open_images
+from rbpf.sensors.readers.images import ImageSequence, open_images
 
 
 def test_nothing_there(tmp_path):
@@ -61,3 +62,17 @@ def test_images_without_a_camera(tmp_path):
 def test_importing_the_readers_imports_no_image_library():
     code = "import sys, rbpf.sensors.readers.images; sys.exit('cv2' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("stamps", "words"),
+    [
+        (np.array([0.0, np.nan, 1.0]), "whole numbers"),
+        (np.array([0, 5, 4]), "image 2 is before"),
+        (np.zeros((3, 1), dtype=np.int64), "whole numbers"),
+    ],
+)
+def test_stamps_that_are_none_or_run_backwards(stamps, words):
+    """A sequence may be made by hand."""
+    with pytest.raises(InputError, match=words):
+        ImageSequence("by hand", None, stamps, None, None, None)

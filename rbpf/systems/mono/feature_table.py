@@ -1,0 +1,198 @@
+"""The table of features: how each looks and from where it was seen, where it is now, and how often it was found.
+
+These facts do not differ between particles. A feature's number is its row here, in everything that a run reports.
+"""
+
+from typing import final
+
+import numpy as np
+
+from rbpf.core.archive import checked
+from rbpf.lie import SE3
+from rbpf.sensors.camera import Pinhole
+
+PATCH_HALF_PX = 15
+"""The patch that is kept of an appearance reaches this far from its centre: enough to be turned and shrunk."""
+PATCH_PX = 2 * PATCH_HALF_PX + 1
+
+MIN_WEIGHT = 1e-3
+"""Least inverse-depth weight of a homogeneous point for its patch to be placed in space: beyond, it is at infinity."""
+
+ENOUGH_TRUSTED = 6
+"""Trusted matches that determine the motion alone: three do, and half of them may be wrong."""
+
+_OFFSETS = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+
+_COLUMNS: dict[str, tuple[type, tuple[int, ...]]] = {
+    "first_patch": (np.uint8, (PATCH_PX, PATCH_PX)),
+    "last_patch": (np.uint8, (PATCH_PX, PATCH_PX)),
+    "first_px": (np.float64, (2,)),
+    "first_pose": (np.float64, (7,)),
+    "last_pose": (np.float64, (7,)),
+    "position": (np.float64, (4,)),
+    "attempts": (np.int64, ()),
+    "found": (np.int64, ()),
+    "missed": (np.int64, ()),
+    "alive": (np.bool_, ()),
+    "member": (np.int64, ()),
+}
+
+
+@final
+class FeatureTable:
+    """One row per feature ever started. Columns are views of the F rows in use.
+
+    Attributes:
+        first_patch: (F, S, S) uint8 of its first appearance.
+        last_patch: (F, S, S) uint8 of a later one, from where it looked different; else the first.
+        first_px: (F, 2) where the first one was.
+        first_pose: (F, 7) world_from_camera of the first one, in the heaviest particle's world.
+        last_pose: (F, 7) likewise of the later one.
+        position: (F, 4) homogeneous point in the heaviest particle's world, when it was last observed.
+        attempts: (F,) times looked for.
+        found: (F,) times found.
+        missed: (F,) times not found in a row.
+        alive: (F,) whether the map still holds it.
+        member: (F,) its number among the points of a known constellation, or −1.
+    """
+
+    first_patch: np.ndarray
+    last_patch: np.ndarray
+    first_px: np.ndarray
+    first_pose: np.ndarray
+    last_pose: np.ndarray
+    position: np.ndarray
+    attempts: np.ndarray
+    found: np.ndarray
+    missed: np.ndarray
+    alive: np.ndarray
+    member: np.ndarray
+
+    def __init__(self) -> None:
+        self._room: dict[str, np.ndarray] = {
+            name: np.zeros((0, *shape), dtype) for name, (dtype, shape) in _COLUMNS.items()
+        }
+        self._use(0)
+
+    def __len__(self) -> int:
+        return len(self.alive)
+
+    def add(
+        self, patches: np.ndarray, px: np.ndarray, pose: np.ndarray, member: np.ndarray | int = -1
+    ) -> np.ndarray:
+        """Starts k features seen at px (k, 2) from poses (7,) or (k, 7), with patches (k, S, S); returns their rows."""
+        first, count = len(self), len(self) + px.shape[0]
+        room = len(self._room["alive"])
+        if count > room:
+            extra = max(count, 2 * room, 64) - room
+            for name, column in self._room.items():
+                more = np.zeros((extra, *column.shape[1:]), dtype=column.dtype)
+                self._room[name] = np.concatenate([column, more])
+        self._use(count)
+        rows = np.arange(first, count)
+        self.first_patch[rows], self.first_px[rows], self.first_pose[rows] = patches, px, pose
+        self.last_patch[rows], self.last_pose[rows] = patches, pose
+        self.attempts[rows], self.found[rows], self.alive[rows] = 1, 1, True
+        self.member[rows] = member
+        return rows
+
+    def count_search(self, rows: np.ndarray, found: np.ndarray) -> None:
+        """Counts an attempt to find features (k,), which were found or not (k,) bool."""
+        self.attempts[rows] += 1
+        self.found[rows] += found
+        self.missed[rows] = np.where(found, 0, self.missed[rows] + 1)
+
+    def found_fraction(self, rows: np.ndarray) -> np.ndarray:
+        """Fraction (k,) of attempts that find features (k,), as expected after those so far (P. Laplace)."""
+        return np.asarray((self.found[rows] + 1.0) / (self.attempts[rows] + 2.0))
+
+    def trusted(self, rows: np.ndarray, min_fraction: float) -> np.ndarray:
+        """Which features (k,) may say where the camera is, by their records; all of them where those are too few."""
+        trusted = (self.member[rows] >= 0) | (self.found_fraction(rows) >= min_fraction)
+        return trusted if trusted.sum() >= ENOUGH_TRUSTED else np.ones(rows.size, dtype=bool)
+
+    def nearest_appearance(
+        self, rows: np.ndarray, position: np.ndarray, world_from_camera: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Of features (k,) at homogeneous points (k, 4), the patches that were kept from the direction nearest to a pose.
+
+        Returns:
+            The patches (k, S, S), and the poses (k, 7) from which they were seen.
+        """
+        first, last = self.first_pose[rows], self.last_pose[rows]
+        of_first, of_last = (view_change(position, pose, world_from_camera)[0] for pose in (first, last))
+        later = of_last > of_first
+        patches = np.where(later[:, None, None], self.last_patch[rows], self.first_patch[rows])
+        return patches, np.where(later[:, None], last, first)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """For a checkpoint."""
+        return {f"features/{name}": getattr(self, name) for name in _COLUMNS}
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """The inverse of `arrays`.
+
+        Raises:
+            InputError: an array is missing, or is not what it should be.
+        """
+        count = checked(arrays, "features/alive", (None,), "b").size
+        for name, (dtype, shape) in _COLUMNS.items():
+            kind = np.dtype(dtype).kind
+            self._room[name] = checked(arrays, f"features/{name}", (count, *shape), kind).astype(dtype)
+        self._use(count)
+
+    def _use(self, count: int) -> None:
+        for name, column in self._room.items():
+            setattr(self, name, column[:count])
+
+
+def directions(position: np.ndarray, world_from_camera: np.ndarray) -> np.ndarray:
+    """Directions (K, 3) in the camera's frame of homogeneous world points (K, 4)."""
+    centre = SE3.translation(world_from_camera)
+    return SE3.inverse_transform(world_from_camera, position[:, :3] + (1.0 - position[:, 3:]) * centre)
+
+
+def patch_affines(
+    camera: Pinhole, position: np.ndarray, first_pose: np.ndarray, world_from_camera: np.ndarray
+) -> np.ndarray:
+    """∂(pixel in the patch's image)/∂(pixel now) (K, 2, 2) of patches that face the camera that saw them (E06 §4.1).
+
+    Args:
+        camera: of both images.
+        position: (K, 4) homogeneous world points.
+        first_pose: (K, 7) world_from_camera of the patches' images.
+        world_from_camera: (7,) now.
+    """
+    point = position[:, :3] / np.maximum(position[:, 3:], MIN_WEIGHT)
+    normal = SE3.translation(first_pose) - point
+    # Four pixels around the feature are cast onto its patch's plane, and seen from the first camera.
+    now = camera.project(directions(position, world_from_camera))
+    uv = camera.unproject(now[:, None] + _OFFSETS)
+    rays = np.concatenate([uv, np.ones((*uv.shape[:-1], 1))], axis=-1)
+    centre = SE3.translation(world_from_camera)
+    world_rays = SE3.transform(world_from_camera, rays) - centre
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = (normal * (point - centre)).sum(axis=-1)[:, None] / (normal[:, None] * world_rays).sum(
+            axis=-1
+        )
+    on_patch = centre + depth[..., None] * world_rays
+    first = camera.project(SE3.inverse_transform(first_pose[:, None], on_patch))
+    return np.stack([first[:, 0] - first[:, 1], first[:, 2] - first[:, 3]], axis=-1) / 2.0
+
+
+def view_change(
+    position: np.ndarray, one_pose: np.ndarray, other_pose: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Between two cameras, of each feature: cosine (K,) of the lines of sight, and ratio (K,) of the distances.
+
+    Args:
+        position: (K, 4) homogeneous world points.
+        one_pose: (7,) or (K, 7) world_from_camera.
+        other_pose: likewise.
+    """
+    one, other = (
+        position[:, :3] - position[:, 3:] * SE3.translation(pose) for pose in (one_pose, other_pose)
+    )
+    far, near = np.linalg.norm(one, axis=-1), np.linalg.norm(other, axis=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return (one * other).sum(axis=-1) / (far * near), far / near

@@ -1,0 +1,614 @@
+"""Tracking loss: which images say nothing, the pose prior while the camera is lost, and how it is found in the map again.
+
+A lost camera stays at its last trusted pose, more uncertain with time. In each image it is looked for in the map, without
+a prediction: corners of the image are matched with the map's features by descriptors, triples of matches give poses
+(P3P), and one is believed when enough features agree with it. The last image before the loss helps: hundreds of its
+corners say how the camera has turned since and in which direction it went.
+"""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple, final
+
+import numpy as np
+
+from rbpf import gaussian
+from rbpf.core.belief import Belief
+from rbpf.core.estimate import mixture_estimate
+from rbpf.core.filter import Filter
+from rbpf.core.particles import Particles
+from rbpf.core.proposals import Prior
+from rbpf.lie import SE3
+from rbpf.motion.constant_velocity import PosePrior
+from rbpf.sensors.camera import Pinhole
+from rbpf.sensors.camera.resection import (
+    GATE,
+    Resected,
+    Sights,
+    refined,
+    refined_on_all,
+    resect_consensus,
+    squared_distances,
+    three_point_poses,
+)
+from rbpf.sensors.features import Keypoints
+from rbpf.sensors.features.interface import WINDOW_SCALE_PX
+from rbpf.sensors.patches.search import cut, search, warp
+from rbpf.systems.mono.config import MonoConfig, RelocalisationConfig
+from rbpf.systems.mono.feature_table import PATCH_HALF_PX, patch_affines
+from rbpf.systems.mono.image_sensor import ImageSensor
+
+MIN_CONTRAST = 10
+"""Grey levels that are all nearer to each other are those of a lens cap."""
+MAX_REPEATS = 5
+"""Times that an image may come again: drivers repeat single images when the camera is late."""
+VIEWS_PER_FRAME = 2
+"""Views of a known map from which a lost camera is looked for in a frame, in turn."""
+
+BORDER_PX = 16.0
+"""No corner is nearer to the border."""
+SCALES = (0.7, 1.0, 1.4)
+"""Sizes at which the lost image is described, times that at which features are seen from the last trusted pose."""
+MIN_PATCH_SCALE, MAX_PATCH_SCALE = 0.4, 1.2
+"""A patch that was kept is described at these sizes."""
+MAX_DISTANCE = 0.65
+"""Of the descriptors of one thing, seen from places that are not too different: half of all others are further."""
+SAME_POINT = 0.05
+"""Features this near to each other, in distances from the camera, may be one: they are no rivals of each other."""
+SAME_CORNER = 1.5
+"""Corners this near to each other, in least distances of corners, may show one thing."""
+CORNER_PX, MIN_CORRELATION = 2.0, 0.5
+"""How well a corner is found again, per axis; the least correlation of a patch that says it better."""
+MAX_ROUNDS = 10
+"""Of a pose's refinement on what is seen around it."""
+
+VIEW_CORRELATION, VIEW_PX = 0.8, 0.7
+"""Of corners of the last view: correlation of a patch that says better where it is, and how well."""
+VIEW_DEPTH_RATIO = 0.5
+"""Standard deviation of a corner's depth, as a fraction of that of the features around."""
+VIEW_RATIO = 0.8
+"""A corner's distance from its best match is below this fraction of that from the next (D. Lowe)."""
+VIEW_SAME_PX = 9.0
+"""Corners of another image this near to each other may show one thing."""
+MIN_VIEW_CORNERS = 30
+"""Corners that must be found again: in images of different places about ten are, by chance."""
+MIN_VIEW_FRACTION = 0.8
+"""Of the corners of the last view that are found again, so many must show the motion that the map shows."""
+
+
+@final
+class ImageScreen:
+    """Says which images cannot be used, and why: wrong size or type, a lens cap, a camera that has frozen.
+
+    Args:
+        camera: that takes them.
+    """
+
+    def __init__(self, camera: Pinhole) -> None:
+        self.camera = camera
+        self._last: np.ndarray | None = None
+        self._repeats = 0
+        self._was_unusable = False
+
+    def usable(self, image: np.ndarray | None) -> tuple[np.ndarray | None, str | None]:
+        """The next image, None where it cannot be used; and the reason, which is said of the first such image in a row."""
+        if image is None:
+            return None, None
+        wanted, found = (self.camera.height, self.camera.width), type(image).__name__
+        if isinstance(image, np.ndarray):
+            found = f"{image.shape} {image.dtype}"
+        if not isinstance(image, np.ndarray) or image.shape != wanted or image.dtype != np.uint8:
+            expected = f"{self.camera.width}x{self.camera.height} grey levels of 8 bits"
+            return None, f"the image is not used: expected {expected}, got {found}"
+        image = image.copy()  # a camera's driver may write the next image into the same memory
+        is_same = self._last is not None and np.array_equal(image, self._last)
+        self._last, self._repeats = image, self._repeats + 1 if is_same else 0
+        reason = None
+        if int(image.max()) - int(image.min()) < MIN_CONTRAST:
+            reason = "the image shows nothing, its grey levels are all alike: it is not used"
+        elif self._repeats >= MAX_REPEATS:
+            times = f"the {MAX_REPEATS + 1}th time"
+            reason = f"the image is the same for {times}, the camera may be frozen: it is not used"
+        was_unusable, self._was_unusable = self._was_unusable, reason is not None
+        if reason is None:
+            return image, None
+        return None, None if was_unusable else reason
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """For a checkpoint."""
+        return {
+            "screen/last": np.zeros((0, 0), dtype=np.uint8) if self._last is None else self._last,
+            "screen/repeats": np.array(self._repeats),
+            "screen/was_unusable": np.array(self._was_unusable),
+        }
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """The inverse of `arrays`."""
+        last = arrays["screen/last"]
+        self._last = last if last.size else None
+        self._repeats, self._was_unusable = int(arrays["screen/repeats"]), bool(arrays["screen/was_unusable"])
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """How far the recognition of one image came.
+
+    Attributes:
+        landmarks: of known depth in the map.
+        corners: of the image.
+        matches: of a landmark and a corner that are like each other and like nothing else.
+        agreeing: matches that a pose explains, after the search around it; 0 where no pose was computed.
+        matched: corners of the last view before the loss that are found again; 0 where they were too few.
+        confirming: of these, how many the pose explains.
+        prior: the pose, for the heaviest particle's world; None where it was not convincing.
+        certain: whether the image was recognised beyond doubt.
+    """
+
+    landmarks: int
+    corners: int = 0
+    matches: int = 0
+    agreeing: int = 0
+    matched: int = 0
+    confirming: int = 0
+    prior: PosePrior | None = None
+    certain: bool = False
+
+
+class LostPrior(NamedTuple):
+    """Where a lost camera may be: a prior, whether it is a place recognised beyond doubt, and the last attempt to do so."""
+
+    pose: PosePrior
+    certain: bool
+    attempt: Attempt | None
+
+
+@final
+class TrackingLoss:
+    """Remembers where the camera was last trusted, and says where it may be while it is lost.
+
+    Args:
+        sensor: of the run.
+        config: all settings.
+        views: (V, 7) poses to look from as well, where the map was made before this run; None for other runs.
+        size_m: of such a map: how far from where it is assumed the camera may be as long as it was never found.
+    """
+
+    def __init__(
+        self, sensor: ImageSensor, config: MonoConfig, views: np.ndarray | None = None, size_m: float = 0.0
+    ) -> None:
+        self.sensor = sensor
+        self.config = config.relocalisation
+        self.std_velocity = config.velocity.start_std()
+        self.relocaliser = Relocaliser(sensor, config.relocalisation)
+        self.views = np.zeros((0, 7)) if views is None else views
+        self.size_m = size_m
+        self.never_found = len(self.views) > 0
+        """Whether the camera has not been found yet in a map that was made before."""
+        self.stamp_ns = 0
+        """When the pose was trusted last."""
+        self._trusted = self.views[0] if self.never_found else SE3.identity(), np.zeros((6, 6))
+        self._particles: Particles | None = None
+        self._image: np.ndarray | None = None
+        self._mode = SE3.identity()
+        self._view: LastView | None = None
+
+    def trust(self, filter_: Filter, image: np.ndarray | None) -> None:
+        """Takes the particles as they are after a step for the last trusted ones, with the image that they were found in."""
+        assert filter_.stamp_ns is not None
+        self._particles, self.stamp_ns = filter_.particles, filter_.stamp_ns
+        self._image, self._view = image, None
+        self.never_found = False
+
+    @property
+    def trusted(self) -> tuple[np.ndarray, np.ndarray]:
+        """The last trusted pose world_from_camera (7,) in the particles' world, and its covariance (6, 6)."""
+        if self._particles is not None:
+            # Averaged only when it is needed: tracking has no time for it.
+            poses, log_weights = self._particles.state[:, :7], self._particles.log_weights
+            estimate = mixture_estimate(Prior.exactly(SE3, poses), None, log_weights)
+            self._trusted, self._particles = (estimate.mean, estimate.cov), None
+            self._mode = poses[log_weights.argmax()].copy()
+        return self._trusted
+
+    def prior(self, filter_: Filter, image: np.ndarray | None) -> LostPrior:
+        """Where a lost camera may be in the next frame: where it is recognised, else near the last trusted pose.
+
+        A camera that moved on with its last velocity for a second would be further off than one that stayed: hands
+        turn back. It is looked for from the last trusted pose; then from views of a known map, in the first frame from
+        all of them, later from some in turn.
+        """
+        pose, cov = self.trusted
+        attempt = None
+        if image is not None:
+            belief, count = filter_.belief(), len(self.views)
+            if self._view is None and self._image is not None:
+                self._view = LastView(self.sensor, self._image, self._mode, self.config)
+            attempt = self.relocaliser.find(belief, image, pose, self._view)
+            tried = min(count, VIEWS_PER_FRAME if filter_.steps else count)
+            for view in self.views[(filter_.steps * tried + np.arange(tried)) % max(count, 1)]:
+                if attempt.prior is not None:
+                    break
+                attempt = self.relocaliser.find(belief, image, view)
+            if attempt.prior is not None:
+                found = attempt.prior
+                prior = PosePrior(found.mean, found.cov + cov, self.std_velocity)
+                return LostPrior(prior, attempt.certain, attempt)
+        std = np.repeat([self.config.search_std_rad, self.config.search_std_m], 3)
+        return LostPrior(PosePrior(pose, cov + np.diag(std**2), self.std_velocity), False, attempt)
+
+    def drift(self, stamp_ns: int) -> np.ndarray:
+        """Covariance (6, 6) of how far the camera may have gone since the pose was trusted, [ω, v]."""
+        if self.never_found:
+            return np.diag(np.repeat([np.pi, self.size_m], 3) ** 2)
+        seconds = (stamp_ns - self.stamp_ns) * 1e-9
+        return np.diag((np.repeat([self.config.drift_rad_s, self.config.drift_m_s], 3) * seconds) ** 2)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """For a checkpoint."""
+        pose, cov = self.trusted
+        return {
+            "loss/pose": pose,
+            "loss/cov": cov,
+            "loss/stamp_ns": np.array(self.stamp_ns),
+            "loss/image": np.zeros((0, 0), dtype=np.uint8) if self._image is None else self._image,
+            "loss/mode": self._mode,
+            "loss/never_found": np.array(self.never_found),
+        }
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """The inverse of `arrays`."""
+        self._trusted, self._particles = (arrays["loss/pose"], arrays["loss/cov"]), None
+        self.stamp_ns = int(arrays["loss/stamp_ns"])
+        image = arrays["loss/image"]
+        self._image, self._view = image if image.size else None, None
+        self._mode = arrays["loss/mode"]
+        self.never_found = bool(arrays["loss/never_found"])
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """What is matched: an image and its corners (K, 2), and landmarks with their rows (L,) and points (L, 3)."""
+
+    image: np.ndarray
+    rows: np.ndarray
+    points: np.ndarray
+    px: np.ndarray
+
+    @property
+    def positions(self) -> np.ndarray:
+        """The points (L, 4), homogeneous."""
+        return np.concatenate([self.points, np.ones((self.rows.size, 1))], axis=-1)
+
+
+@final
+class Relocaliser:
+    """Finds the camera in the map by the appearance of its features.
+
+    Args:
+        sensor: that remembers it.
+        config: when a pose is accepted.
+    """
+
+    def __init__(self, sensor: ImageSensor, config: RelocalisationConfig) -> None:
+        self.sensor = sensor
+        self.camera = sensor.camera
+        self.config = config
+        self._described: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None = None
+
+    def find(
+        self, belief: Belief, image: np.ndarray, near: np.ndarray, last: "LastView | None" = None
+    ) -> Attempt:
+        """Where the camera must be, if enough of the map's landmarks with known depth are seen.
+
+        Args:
+            belief: where they are, in the heaviest particle.
+            image: (H, W) uint8.
+            near: (7,) world_from_camera from which the landmarks' appearances are predicted: the last trusted pose.
+            last: the image from there, if there is one.
+        """
+        config, camera = self.config, self.camera
+        rows, points = self.known_landmarks(belief)
+        attempt = Attempt(rows.size)
+        if rows.size < (config.min_inliers if last is None else config.min_inliers_with_last_view):
+            return attempt
+        px = image_corners(self.sensor, image, config, BORDER_PX).px
+        attempt = replace(attempt, corners=px.shape[0])
+        if px.shape[0] < config.min_inliers:
+            return attempt
+
+        # Landmarks as they should look from near by are matched with the corners; and so is the last view.
+        candidates = Candidates(image, rows, points, px)
+        descriptors = describe_corners(self.sensor, image, px)
+        distances = descriptor_distances(self.describe_landmarks(candidates, near), descriptors)
+        size = np.linalg.norm(points - SE3.translation(near), axis=-1).mean()
+        pairs = match_by_ratio(distances, points / size, px / config.spacing_px, config.descriptor_ratio)
+        again = None if last is None else last.match(descriptors, px, points)
+        view = None if again is None else again[1]
+        attempt = replace(attempt, matches=pairs[0].size, matched=0 if again is None else int(again[0].size))
+
+        # A pose that most of them agree with, and then all that is seen around it.
+        rough = self._consensus(points[pairs[0]], self.refine_px(candidates, pairs, near), view)
+        if rough is None:
+            return attempt
+        if last is not None and again is not None:
+            view = last.refine_px(image, *again, rough)
+        best, places = None, px[:0]
+        for _ in range(MAX_ROUNDS):
+            # Few landmarks in one part of the image determine a pose that is right for them alone; from there it has
+            # to reach their neighbours first.
+            pairs = match_near(camera, rough, points, px, distances, config.match_radius_px)
+            at = self.refine_px(candidates, pairs, rough)
+            found = self._refined(rough, points[pairs[0]], at, view)
+            if found is None or (best is not None and found.inliers.sum() <= best.inliers.sum()):
+                break
+            best, places, rough = found, at, found.world_from_camera
+        if best is None:
+            return attempt
+
+        agreeing, confirming = int(best.inliers.sum()), 0
+        if view is not None:
+            confirming = int((squared_distances(camera, best.world_from_camera[None], view) <= GATE).sum())
+        attempt = replace(attempt, agreeing=agreeing, confirming=confirming)
+        confirmed = is_confirmed(agreeing, confirming, attempt.matched, config)
+        if not (confirmed or is_convincing(best, places, camera.width, config)):
+            return attempt
+        noise = config.std_inflation * max(best.rms_px, self.sensor.config.noise_px)
+        cov = gaussian.symmetrise(noise**2 * np.linalg.inv(best.information))
+        certain = confirmed or agreeing >= config.certain_inliers
+        return replace(attempt, prior=PosePrior(best.world_from_camera, cov), certain=certain)
+
+    def known_landmarks(self, belief: Belief) -> tuple[np.ndarray, np.ndarray]:
+        """Rows (K,) of the living features whose depth is known, and where they are (K, 3)."""
+        features, rows = self.sensor.features, np.flatnonzero(self.sensor.table.alive)
+        rows = rows[features.depth_known(belief, rows, self.config.depth_std_ratio)]
+        which, position = features.positions(belief, rows)
+        return rows[which], position[:, :3] / position[:, 3:]
+
+    def describe_landmarks(self, candidates: Candidates, near: np.ndarray) -> np.ndarray:
+        """Descriptors (L, d) of landmarks, turned and scaled as they would be seen from a pose near by."""
+        known, asked = self._described, (candidates.rows, candidates.points, near)
+        if known is not None and all(map(np.array_equal, known, asked)):
+            return known[3]
+        positions = candidates.positions
+        patches, poses = self.sensor.table.nearest_appearance(candidates.rows, positions, near)
+        affine = patch_affines(self.camera, positions, poses, near)
+        # Features behind the camera or at a grazing angle are described as they were seen at first.
+        with np.errstate(all="ignore"):
+            area = affine[:, 0, 0] * affine[:, 1, 1] - affine[:, 0, 1] * affine[:, 1, 0]
+        scale = np.sqrt(np.abs(area))
+        angle = np.arctan2(affine[:, 1, 0] - affine[:, 0, 1], affine[:, 0, 0] + affine[:, 1, 1])
+        sane = np.isfinite(affine).all(axis=(1, 2)) & (scale > 0.25) & (scale < 4.0)
+        scale, angle = np.where(sane, scale, 1.0), np.where(sane, angle, 0.0)
+        size = WINDOW_SCALE_PX * np.clip(scale, MIN_PATCH_SCALE, MAX_PATCH_SCALE)
+        descriptors = self.sensor.descriptor.describe_windows(patches, size, angle)
+        self._described = *asked, descriptors
+        return descriptors
+
+    def refine_px(
+        self, candidates: Candidates, pairs: tuple[np.ndarray, np.ndarray], world_from_camera: np.ndarray
+    ) -> np.ndarray:
+        """Where in the image the landmarks of pairs are (M, 2): where their patches, seen from a pose, fit best.
+
+        A corner is found again within a few pixels only. Where the patch is too unlike to say better, it stays.
+        """
+        rows, at, config = candidates.rows[pairs[0]], candidates.px[pairs[1]], self.sensor.config
+        positions = candidates.positions[pairs[0]]
+        patches, poses = self.sensor.table.nearest_appearance(rows, positions, world_from_camera)
+        affines = patch_affines(self.camera, positions, poses, world_from_camera)
+        templates = warp(patches, affines, config.template_px)
+        cov = np.tile(CORNER_PX**2 * np.eye(2), (rows.size, 1, 1))
+        sigmas, most_px = config.ellipse_sigmas, config.max_radius_px
+        matches = search(candidates.image, templates, at, cov, sigmas=sigmas, most_px=most_px)
+        return np.where((matches.score >= MIN_CORRELATION)[:, None], matches.px, at)
+
+    def _consensus(self, points: np.ndarray, places: np.ndarray, view: Sights | None) -> np.ndarray | None:
+        """The pose (7,) of three landmarks (M, 3) that most of them agree with, and the corners of the last view."""
+        config, camera = self.config, self.camera
+        if points.shape[0] < 3:
+            return None
+        # Drawn anew for each image: a run that is resumed draws the same.
+        rng = np.random.default_rng(points.shape[0])
+        if view is not None:
+            poses = three_point_poses(points, camera.unproject(places), config.p3p_samples, rng)
+            if poses.shape[0]:
+                both = known_sights(points, places, config.inlier_px) + view
+                # A landmark says twice as much as a corner of unknown depth, and fixes the scale.
+                weights = np.where(np.arange(both.std_px.size) < points.shape[0], 2.0, 1.0)
+                losses = np.minimum(squared_distances(camera, poses, both), 4.0 * GATE) @ weights
+                found = refined_on_all(camera, poses[losses.argmin()], both)
+                if found is not None and most_agree(found.inliers[points.shape[0] :]):
+                    return found.world_from_camera
+        found = resect_consensus(camera, points, places, config.inlier_px, config.p3p_samples, rng)
+        return None if found is None else found.world_from_camera
+
+    def _refined(
+        self, rough: np.ndarray, points: np.ndarray, places: np.ndarray, view: Sights | None
+    ) -> Resected | None:
+        """A pose refined on landmarks, and on the corners of the last view if these agree; `inliers` of landmarks."""
+        inlier_px = self.config.inlier_px
+        if view is not None:
+            found = refined_on_all(self.camera, rough, known_sights(points, places, inlier_px) + view)
+            if found is not None and most_agree(found.inliers[len(points) :]):
+                return replace(found, inliers=found.inliers[: len(points)])
+        return refined(self.camera, rough, points, places, inlier_px)
+
+
+@final
+class LastView:
+    """The last image before a loss and where it was taken.
+
+    The depth of its corners is not known: each says on which line it must be seen. Hundreds of them determine how
+    the camera turned and in which direction it went; how far, the map's landmarks say.
+
+    Args:
+        sensor: its camera, detector and descriptor.
+        image: (H, W) uint8.
+        world_from_camera: (7,) in the world of the map's particle.
+        config: number and distance of the corners.
+    """
+
+    def __init__(
+        self,
+        sensor: ImageSensor,
+        image: np.ndarray,
+        world_from_camera: np.ndarray,
+        config: RelocalisationConfig,
+    ) -> None:
+        self.camera = camera = sensor.camera
+        self.world_from_camera = world_from_camera
+        keypoints = image_corners(sensor, image, config, max(BORDER_PX, PATCH_HALF_PX + 1.0))
+        uv = camera.unproject(keypoints.px)
+        known = np.isfinite(uv).all(axis=1)
+        self.patches = np.array([cut(image, place, PATCH_HALF_PX) for place in keypoints.px[known]])
+        """(K, S, S) around the corners."""
+        self.rays = np.concatenate([uv[known], np.ones((int(known.sum()), 1))], axis=1)
+        """(K, 3) of the corners, in the camera's frame."""
+        self.descriptors = sensor.descriptor.describe(image, keypoints.take(known))
+        """(K, d)."""
+
+    def match(
+        self, descriptors: np.ndarray, px: np.ndarray, landmarks: np.ndarray
+    ) -> tuple[np.ndarray, Sights] | None:
+        """Its corners (P,) and where another image shows them; None where there are too few.
+
+        Args:
+            descriptors: (S, M, d) of corners of the other image, at S sizes.
+            px: (M, 2) these corners.
+            landmarks: (L, 3) in the world: the corners are about as far away as those in view.
+        """
+        held = SE3.inverse_transform(self.world_from_camera, landmarks)
+        held = held[self.camera.visible(held), 2]
+        if not held.size or min(self.rays.shape[0], px.shape[0]) < MIN_VIEW_CORNERS:
+            return None
+        one, other = mutual_matches(similarities(self.descriptors, descriptors), px)
+        if one.size < MIN_VIEW_CORNERS:
+            return None
+        points = SE3.transform(self.world_from_camera, float(np.median(held)) * self.rays[one])
+        spread = VIEW_DEPTH_RATIO * (points - SE3.translation(self.world_from_camera))
+        return one, Sights(points, spread, px[other], np.full(one.size, CORNER_PX))
+
+    def refine_px(self, image: np.ndarray, rows: np.ndarray, sights: Sights, pose: np.ndarray) -> Sights:
+        """The same corners (P,) where their patches, seen from a pose (7,), fit best; as they were where none fits."""
+        position = np.concatenate([sights.points, np.ones((rows.size, 1))], axis=1)
+        first = np.broadcast_to(self.world_from_camera, (rows.size, 7))
+        templates = warp(self.patches[rows], patch_affines(self.camera, position, first, pose))
+        cov = np.tile(CORNER_PX**2 * np.eye(2), (rows.size, 1, 1))
+        matches = search(image, templates, sights.px, cov)
+        alike = matches.score >= VIEW_CORRELATION
+        px = np.where(alike[:, None], matches.px, sights.px)
+        return replace(sights, px=px, std_px=np.where(alike, VIEW_PX, CORNER_PX))
+
+
+def is_convincing(found: Resected, px: np.ndarray, width: int, config: RelocalisationConfig) -> bool:
+    """Enough landmarks agree, a fair fraction of those matched, and they do not lie on a line or in a corner."""
+    count = int(found.inliers.sum())
+    if count < max(config.min_inliers, config.min_inlier_fraction * found.inliers.size):
+        return False
+    places = px[found.inliers]
+    narrow = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)[1] / np.sqrt(count)
+    return bool(narrow >= config.min_spread * width)
+
+
+def is_confirmed(landmarks: int, agreeing: int, matched: int, config: RelocalisationConfig) -> bool:
+    """Some landmarks agree, which fix the scale, and most of the last view's corners: these alone leave no doubt."""
+    least = max(MIN_VIEW_CORNERS, MIN_VIEW_FRACTION * matched)
+    return landmarks >= config.min_inliers_with_last_view and agreeing >= least
+
+
+def most_agree(agreeing: np.ndarray) -> bool:
+    """Whether nearly all corners (K,) of the last view show the motion that the map shows.
+
+    Where the map is torn they do not, and it is the map in which the camera has to be found.
+    """
+    return bool(agreeing.sum() >= max(MIN_VIEW_CORNERS, MIN_VIEW_FRACTION * agreeing.size))
+
+
+def known_sights(points: np.ndarray, px: np.ndarray, inlier_px: float) -> Sights:
+    """Of landmarks (M, 3) at px (M, 2), which agree within so many pixels."""
+    return Sights(points, np.zeros_like(points), px, np.full(len(px), inlier_px / np.sqrt(GATE)))
+
+
+def image_corners(
+    sensor: ImageSensor, image: np.ndarray, config: RelocalisationConfig, border_px: float
+) -> Keypoints:
+    """The best corners of an image, inside the lens' circle."""
+    mask = sensor.camera.field_of_view_mask(border_px)
+    return sensor.detector.detect(image, config.max_corners, None, config.spacing_px, border_px, mask)
+
+
+def describe_corners(sensor: ImageSensor, image: np.ndarray, px: np.ndarray) -> np.ndarray:
+    """Descriptors (S, K, d) of corners (K, 2) of an image, at `SCALES`."""
+    scales = WINDOW_SCALE_PX * np.repeat(SCALES, px.shape[0])
+    descriptors = sensor.descriptor.describe(image, Keypoints.at(np.tile(px, (len(SCALES), 1)), scales))
+    return descriptors.reshape(len(SCALES), px.shape[0], descriptors.shape[1])
+
+
+def similarities(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Greatest product (L, K) of descriptors of unit length (L, d) with those of K places (S, K, d)."""
+    products = (one @ other.reshape(-1, other.shape[-1]).T).reshape(-1, *other.shape[:2])
+    return np.asarray(products.max(axis=1))
+
+
+def descriptor_distances(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Least distance (L, K) of descriptors (L, d) from those of K places (S, K, d)."""
+    return np.asarray(np.sqrt(np.maximum(2.0 - 2.0 * similarities(one, other), 0.0)))
+
+
+def match_by_ratio(
+    distances: np.ndarray, points: np.ndarray, px: np.ndarray, ratio: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs (M,), (M,) of landmark and corner that are like each other and like nothing else (D. Lowe's ratio).
+
+    Args:
+        distances: (L, K) of descriptors.
+        points: (L, 3) of the landmarks; nearer than `SAME_POINT` they are no rivals.
+        px: (K, 2) of the corners; nearer than `SAME_CORNER` they are no rivals.
+        ratio: of the distances from the best and the next.
+    """
+    best = distances.argmin(axis=1)
+    chosen = distances[np.arange(best.size), best]
+    other_corner = np.linalg.norm(px[best][:, None] - px, axis=-1) > SAME_CORNER
+    other_point = np.linalg.norm(points[:, None] - points, axis=-1) > SAME_POINT
+    next_corner = np.where(other_corner, distances, np.inf).min(axis=1)
+    next_point = np.where(other_point, distances[:, best].T, np.inf).min(axis=1)
+    return _one_each(best, chosen, chosen <= ratio * np.minimum(next_corner, next_point))
+
+
+def match_near(
+    camera: Pinhole,
+    world_from_camera: np.ndarray,
+    points: np.ndarray,
+    px: np.ndarray,
+    distances: np.ndarray,
+    radius_px: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs (M,), (M,) of landmark and the corner most like it near to where it should be seen from a pose."""
+    seen = SE3.inverse_transform(world_from_camera, points)
+    near = np.linalg.norm(camera.project(seen)[:, None] - px, axis=-1) <= radius_px
+    masked = np.where(near & camera.visible(seen)[:, None], distances, np.inf)
+    best = masked.argmin(axis=1)
+    chosen = masked[np.arange(best.size), best]
+    return _one_each(best, chosen, chosen <= MAX_DISTANCE)
+
+
+def _one_each(best: np.ndarray, chosen: np.ndarray, clear: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of several landmarks at one corner only the most alike counts: one is mistaken, or they are the same."""
+    order = np.flatnonzero(clear)[np.argsort(chosen[clear], kind="stable")]
+    _, first = np.unique(best[order], return_index=True)
+    kept = np.sort(order[first])
+    return kept, best[kept]
+
+
+def mutual_matches(alike: np.ndarray, px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs (P,), (P,) that are most alike both ways and clearly more than the next place.
+
+    Args:
+        alike: (K, M) products of descriptors of unit length.
+        px: (M, 2) places; nearer than `VIEW_SAME_PX` to the best they are no rivals of it.
+    """
+    best = alike.argmax(axis=1)
+    rows = np.arange(best.size)
+    near = np.linalg.norm(px[best][:, None] - px, axis=-1) <= VIEW_SAME_PX
+    next_best = np.where(near, -1.0, alike).max(axis=1)
+    away, next_away = (np.sqrt(np.maximum(2.0 - 2.0 * a, 0.0)) for a in (alike[rows, best], next_best))
+    kept = np.flatnonzero((alike.argmax(axis=0)[best] == rows) & (away <= VIEW_RATIO * next_away))
+    return kept, best[kept]

@@ -1,0 +1,611 @@
+"""Monocular SLAM (E06): one camera, constant velocity, points and rays, and a particle filter over its pose.
+
+    slam = MonoSlam(camera)
+    for stamp_ns, image in source:
+        frame = slam.track(image, stamp_ns)
+
+`MonoSlam.take` is the life of a frame: is the image usable, where may the camera be, the filter's step with active
+search inside, what is reported, and, as long as depths are unknown, the batch adjustment of the first frames.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, ClassVar, final
+
+import numpy as np
+
+from rbpf.core.anchoring import Anchored, relative_estimate
+from rbpf.core.belief import Belief
+from rbpf.core.estimate import Estimate
+from rbpf.core.filter import Filter, StepReport
+from rbpf.core.models import Conditional, MotionModel, NewLandmarks, Observations, Records, Sensor
+from rbpf.core.substate import KalmanSubstate
+from rbpf.errors import InputError
+from rbpf.lie import SE3
+from rbpf.maps.landmark_map import LandmarkMap
+from rbpf.maps.point import Point
+from rbpf.motion.constant_velocity import MarginalVelocity, PosePrior, SampledVelocity
+from rbpf.sensors.camera import Pinhole
+from rbpf.sensors.feature_log import FeatureFrame, FeatureLog, KnownPoints
+from rbpf.sensors.features import Descriptor, Detector
+from rbpf.sensors.readers.images import ImageFrame, KnownPixels
+from rbpf.systems.map_estimate import MapEstimate
+from rbpf.systems.mono.active_search import OutlierGate
+from rbpf.systems.mono.config import MonoConfig
+from rbpf.systems.mono.feature_sensor import CONSTELLATION, FeatureSensor, InverseDepthRays, UnknownDepth
+from rbpf.systems.mono.feature_table import directions
+from rbpf.systems.mono.image_sensor import ImageSensor, Measurement
+from rbpf.systems.mono.known_map import (
+    NAME,
+    KnownMap,
+    estimate_mono_map,
+    known_map_arrays,
+    known_map_of,
+)
+from rbpf.systems.mono.known_start import KnownStart, constellation, constellation_records, require_texture
+from rbpf.systems.mono.relocalisation import Attempt, ImageScreen, TrackingLoss
+from rbpf.systems.mono.unknown_start import UnknownStart
+from rbpf.systems.system import (
+    DIAGNOSTICS,
+    ESS,
+    LOG_EVIDENCE,
+    NIS,
+    NIS_DOF,
+    RESAMPLED,
+    TIMINGS,
+    Column,
+    Gauge,
+    Ragged,
+    Recorded,
+    Revision,
+    System,
+    Tracked,
+    TrackingState,
+)
+
+LINE_SIGMAS = 3.0
+"""An epipolar line is reported between the inverse depths that lie this far from the mean."""
+
+LOST = "the camera is lost, its pose is held until the map is seen again"
+FOUND_AGAIN = "the camera is found again"
+FOUND_IN_MAP = "the camera is found in the map"
+
+
+@final
+class MonoSlam(System):
+    """A camera that is tracked while its surroundings are mapped.
+
+    It takes images, or features that carry names, but not both. The world is that of the known points or of the known
+    map; without them that of the first camera, in a scale in which new features are 1 / `inverse_depth.mean_per_m` away
+    on the average. Memory: the map and its features' appearances, and what `lag` keeps of the particles' paths.
+
+    Args:
+        camera: of the images.
+        config: all settings.
+        known: points of known position that the first image shows: with their pixels in it, or, for features, under
+            their names. Without them the first frames are adjusted in batch; poses that were reported are then revised.
+        known_map: a map that the camera is to be found in, in place of making one; it is not changed.
+        unknown_depth: how features are kept as long as their depth is not known; by default rays with inverse depth.
+        gate: which matches of a frame agree with one motion of the camera; by default a robust fit.
+        detector: where features are started, and what a lost image is matched by; by default FAST corners, scored as Shi
+            and Tomasi do.
+        descriptor: by what a lost image is matched with the map; by default SIFT.
+        wrapped: puts a sensor around the one that takes named features, to change what it observes or starts. The first
+            frames are then not adjusted in batch, which would not be what that sensor observes.
+
+    Raises:
+        InputError: known points do not determine the camera, or the map was made with another one.
+    """
+
+    name: ClassVar[str] = "mono"
+    columns = (
+        Column("searched", "features looked for", kind=int, table=DIAGNOSTICS),
+        Column("found", "features that the filter used", kind=int, table=DIAGNOSTICS),
+        Column("lost", "whether the camera was lost after the frame", kind=bool, table=DIAGNOSTICS),
+        ESS,
+        RESAMPLED,
+        LOG_EVIDENCE,
+        NIS,
+        NIS_DOF,
+        Column("relocalised", "whether a camera that was lost was found again in the frame", kind=bool),
+        Column("points", "points in the map after the frame", kind=int),
+        Column("rays", "features of unknown depth in the map after the frame", kind=int),
+        Column("seconds_search", "time of the search in the image", "s", table=TIMINGS, heading="search_ms"),
+        Column(
+            "seconds_filter", "time of the filter's step otherwise", "s", table=TIMINGS, heading="filter_ms"
+        ),
+        Column(
+            "seconds_new_landmarks",
+            "time of judging what was looked for and of starting features",
+            "s",
+            table=TIMINGS,
+            heading="new_features_ms",
+        ),
+    )
+    observed = (
+        Ragged("features", "features that were looked for", kind="int64"),
+        Ragged("mean", "their predicted places, px", (2,)),
+        Ragged("cov", "covariance of these, with the noise of the measurement, px²", (2, 2)),
+        Ragged("px", "where each was found, px; NaN where not", (2,)),
+        Ragged("cov_px", "covariance of the noise of px, px²", (2, 2)),
+        Ragged("line", "ends of the epipolar line of one whose depth is unknown, px; else NaN", (2, 2)),
+        Ragged("position", "homogeneous point in the reported world; NaN where it was not found", (4,)),
+        Ragged("started", "features that were started", kind="int64"),
+        Ragged("started_px", "where, px", (2,)),
+    )
+    space = SE3
+
+    def __init__(
+        self,
+        camera: Pinhole,
+        config: MonoConfig | None = None,
+        known: KnownPixels | KnownPoints | None = None,
+        known_map: KnownMap | None = None,
+        unknown_depth: UnknownDepth | None = None,
+        gate: OutlierGate | None = None,
+        detector: Detector | None = None,
+        descriptor: Descriptor | None = None,
+        wrapped: Callable[[Sensor], Sensor] | None = None,
+    ) -> None:
+        if not isinstance(camera, Pinhole):
+            raise InputError("monocular SLAM needs one camera, this is a stereo pair")
+        if known is not None and known_map is not None:
+            raise InputError("in a known map a run starts from the map: leave out known points")
+        self.camera, self.config = camera, config or MonoConfig()
+        self.known, self.known_map = known, known_map
+        config = self.config
+
+        # Known points are located by their pixels at once; under names, by the first frame.
+        self._start: KnownStart | None = None
+        points: KnownPoints | None = known if isinstance(known, KnownPoints) else None
+        if isinstance(known, KnownPixels):
+            self._start = KnownStart.from_pixels(camera, known, config.search.noise_px)
+            points = self._start.points
+        if known_map is not None:
+            known_map.require_camera(camera, "the recording")
+            points = known_map.points
+        self.known_points = points
+        """Points that were known beforehand, under the names that features have; None where there are none."""
+        group = points if config.known == "frame" and known_map is None else None
+
+        rays = unknown_depth or InverseDepthRays(camera, config.inverse_depth)
+        is_fixed = known_map is not None
+        self.features = FeatureSensor(camera, rays, config.max_new_per_frame, group, is_fixed)
+        self.sensor = ImageSensor(self.features, config.search, gate, detector, descriptor)
+        self._named: Sensor = self.features if wrapped is None else wrapped(self.features)
+        self.filter = self._new_filter(_Either(self.sensor, self._named))
+        self.screen = ImageScreen(camera)
+        if known_map is not None:
+            self._add_points(known_map.points)
+            appearances = known_map.windows, known_map.first_px, known_map.first_pose
+            self.sensor.begin_lost(*appearances, known_map.positions)
+            self.loss = TrackingLoss(self.sensor, config, known_map.views, known_map.size_m)
+        else:
+            self.loss = TrackingLoss(self.sensor, config)
+        is_unknown = points is None and wrapped is None
+        self.start = UnknownStart(config, self.features, lambda: self._new_filter(self.features), is_unknown)
+        self.gauge: Gauge = "none"
+        if known_map is not None:
+            self.gauge = known_map.alignment
+        elif known is None:
+            self.gauge = "similarity"
+        elif isinstance(known, KnownPixels) and known.own_frame:
+            self.gauge = "rigid"
+        self.measurement: Measurement | None = None
+        """What the sensor made of the last image; None before the first one, and for named features."""
+        self.attempt: Attempt | None = None
+        """How far the camera was recognised in the last frame; None where it was not lost before it."""
+        self.report: StepReport | None = None
+        """What the filter did in the last frame."""
+
+    def track(self, image: np.ndarray | None, stamp_ns: int) -> Tracked:
+        """Takes an image (H, W) uint8, grey, of the camera's size; None where there is none at this time.
+
+        Images that show nothing, or are of another kind, are passed over: the pose is then predicted, and the message
+        says why.
+
+        Raises:
+            InputError: time runs backwards; the first image does not show the known points; or no particle explains
+                what was found.
+        """
+        return self.take(ImageFrame(stamp_ns, image))
+
+    def take(self, frame: ImageFrame | FeatureFrame) -> Tracked:
+        """The life of a frame, of images or of named features.
+
+        Raises:
+            InputError: see `track`.
+        """
+        before, stamp_ns = self.filter.stamp_ns, int(frame.stamp_ns)
+        if before is not None and stamp_ns < before:
+            raise InputError(f"time runs backwards: a frame at {stamp_ns} ns after one at {before} ns")
+        started = time.perf_counter()
+        sensor, messages = self.sensor, list[str]()
+        was_lost, never_found, first_new = sensor.lost, self.loss.never_found, len(sensor.table)
+
+        # 1. Is there anything to measure?
+        has_images = len(sensor.table) > 0
+        if self.filter.steps and has_images != isinstance(frame, ImageFrame) and self._catalogue:
+            raise InputError("a run takes images or named features, not both")
+        measured: Measurement | FeatureFrame
+        if isinstance(frame, FeatureFrame):
+            if (frame.landmarks < 0).any():
+                raise InputError("a landmark has a negative name, number the landmarks from 0 on")
+            measured, is_empty = frame, frame.landmarks.size == 0
+        else:
+            image, problem = self.screen.usable(frame.image)
+            problem = frame.problem or problem
+            if frame.image is None and problem is None:
+                problem = "there is no image"
+            messages += [] if problem is None else [problem]
+            measured, is_empty = Measurement(stamp_ns, image), image is None
+
+        # 2. The first frame places the known points.
+        prior: PosePrior | None = None
+        if not self.filter.steps:
+            self.loss.stamp_ns = stamp_ns
+            if is_empty and isinstance(self.known, KnownPixels):
+                return self._waiting(stamp_ns, messages)
+            measured, prior = self._begin(measured)
+
+        # 3. Where may the camera be? As it moved, unless nothing has been seen yet or it is lost.
+        self.attempt = None
+        if isinstance(measured, Measurement) and prior is None:
+            if not len(sensor.table):
+                at_rest = self.config.velocity.start_std()
+                prior = PosePrior(SE3.identity(), np.zeros((6, 6)), at_rest)
+            elif sensor.lost:
+                prior, measured.recognised, self.attempt = self.loss.prior(self.filter, measured.image)
+
+        # 4. The filter's step: active search, proposal, weights, samples, landmarks; see `ImageSensor`.
+        report = self.report = self.filter.step(measured, prior, stamp_ns)
+        if isinstance(measured, Measurement):
+            self.measurement = measured
+            if not sensor.bad_frames:
+                self.loss.trust(self.filter, measured.image)
+        seconds_step = time.perf_counter() - started
+
+        # 5. What is reported.
+        world = world_of(self.filter)
+        estimate = self._estimate(world, report)
+        pose, cov = estimate.mean, estimate.cov
+        if sensor.lost:
+            cov = cov + self.loss.drift(stamp_ns)
+        shown = frame if isinstance(frame, FeatureFrame) else measured
+        values = self._values(shown, report, seconds_step)
+        observed = self._observed(shown, world, first_new)
+
+        # 6. While depths are unknown: batch adjustment of the frames so far, and particles drawn from it.
+        revision = None
+        if not self.start.over:
+            seen = measured.features if isinstance(measured, Measurement) else measured
+            is_lost = sensor.lost and len(sensor.table) > 0
+            resampled, words = self.start.after_frame(self.filter, seen, pose, not sensor.bad_frames, is_lost)
+            if resampled is not None:
+                self.filter = resampled.filter
+                revision = Revision(resampled.stamps_ns, resampled.poses, resampled.covs)
+                pose, cov = resampled.poses[-1], resampled.covs[-1]
+                if isinstance(measured, Measurement):
+                    sensor.resampled(self.filter.belief(), resampled.path, resampled.frame_of)
+                    self.loss.trust(self.filter, measured.image)
+            messages = [words, *messages] if words is not None else messages
+
+        # 7. How it stands.
+        if sensor.lost and not was_lost:
+            messages.append(LOST)
+        is_found = was_lost and not sensor.lost
+        if is_found:
+            messages.append(FOUND_IN_MAP if never_found else FOUND_AGAIN)
+        values["relocalised"] = is_found and not never_found
+        state = TrackingState.TRACKED if self.start.over else TrackingState.INITIALISING
+        if sensor.lost:
+            state = TrackingState.LOST
+        elif is_empty or sensor.bad_frames:
+            state = TrackingState.PREDICTED
+        return Tracked(stamp_ns, pose, cov, state, values, observed, tuple(messages), revision)
+
+    def map(self) -> MapEstimate:
+        """Points, and features of unknown depth as what is known of them, in the reported world.
+
+        Columns: `ray`; `known`, whether it was given; of images, `attempts` and `found`, how often it was looked for.
+        """
+        found = estimate_mono_map(self.filter, self.features, world_of(self.filter))
+        known, table = self.known_points, self.sensor.table
+        columns = dict(found.columns)
+        columns["known"] = np.isin(found.ids, [] if known is None else known.names).astype(int)
+        if len(table):
+            columns |= {"attempts": table.attempts[found.ids], "found": table.found[found.ids]}
+        return replace(found, columns=columns)
+
+    def particle_poses(self) -> np.ndarray:
+        """(N, 7) world_from_camera of the particles as they are now, in the reported world."""
+        poses, world = self.filter.particles.state[:, :7], world_of(self.filter)
+        return poses if world is None else SE3.between(world.mean, poses)
+
+    def particle_paths(self) -> np.ndarray:
+        """(T, N, 7) world_from_camera of the particles along their ancestors, in the reported world; with a lag, the last.
+
+        Where there are known points, each particle's path is reported from its own mean of their world's place.
+        """
+        paths, world = self.filter.history.paths()[..., :7], world_of(self.filter)
+        return paths if world is None else SE3.between(world.mean, paths)
+
+    def measurements(self, name: str, log: Recorded) -> FeatureLog:
+        """The features that the filter used, and those that started landmarks, under their numbers.
+
+        Of a frame in which too little agreed to be trusted nothing was used.
+        """
+        frames = []
+        for t, (stamp_ns, used) in enumerate(zip(log.stamps_ns.tolist(), log["found"].tolist(), strict=True)):
+            seen = log.observed(t)
+            kept = np.isfinite(seen["px"]).all(axis=1) & bool(used)
+            names = np.concatenate([seen["features"][kept], seen["started"]])
+            px = np.concatenate([seen["px"][kept], seen["started_px"]])
+            noise = np.tile(self.config.search.noise_px**2 * np.eye(2), (seen["started"].size, 1, 1))
+            frames.append(FeatureFrame(stamp_ns, names, px, np.concatenate([seen["cov_px"][kept], noise])))
+        return FeatureLog(name, self.camera, frames, self.known_points)
+
+    def summary(self, log: Recorded) -> dict[str, Any]:
+        """Frames that were tracked, landmarks, and how much was found."""
+        lost, searched, found, landmarks = log.lost(), log["searched"], log["found"], self.map()
+        tracked, looked = np.flatnonzero(~lost), searched > 0
+        localised = {"localized": True, "found_at_frame": int(tracked[0]) if tracked.size else None}
+        return {
+            "frames_tracked": int((~lost).sum()),
+            "lost_frames": int(lost.sum()),
+            "relocalisations": int(log["relocalised"].sum()),
+            "known_points": 0 if self.known_points is None else int(self.known_points.names.size),
+            **({} if self.known_map is None else localised),
+            "landmarks_full": int((~landmarks.is_ray()).sum()),
+            "landmarks_partial": int(landmarks.is_ray().sum()),
+            "observations_per_frame": float(found.mean()),
+            "share_found": float(found[looked].sum() / searched[looked].sum()) if looked.any() else 0.0,
+        }
+
+    def files(self, log: Recorded) -> dict[str, dict[str, np.ndarray]]:
+        """The particles' paths; and, of images, the map as a place to be found in, unless the run was localised."""
+        posterior = {
+            "stamps_ns": self.filter.history.stamps_ns,
+            "world_from_camera": self.particle_paths(),
+            "log_weights": self.filter.particles.log_weights,
+        }
+        files = {"posterior.npz": posterior}
+        if self.known_map is None and len(self.sensor.table):
+            files[NAME] = known_map_arrays(self.export_map(log.poses[~log.lost()]))
+        return files
+
+    def export_map(self, poses: np.ndarray) -> KnownMap:
+        """The map as a place in which later runs can find their camera.
+
+        Args:
+            poses: (T, 7) that were tracked: some of them, far from each other, are kept to look from.
+        """
+        table, world = self.sensor.table, world_of(self.filter)
+        mode = None if world is None else world.mean[self.filter.belief().mode]
+        return known_map_of(self.camera, self.gauge, self.map(), table, mode, poses)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The sensor's table, the last trusted pose, and the frames of a start that is not over."""
+        arrays: dict[str, np.ndarray] = {}
+        for part in (self.sensor, self.screen, self.loss, self.start):
+            arrays |= part.arrays()
+        return arrays
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """The inverse of `arrays`."""
+        for part in (self.sensor, self.screen, self.loss, self.start):
+            part.restore(arrays)
+
+    @property
+    def _catalogue(self) -> dict[int, Any]:
+        return self.filter.belief().catalogue
+
+    def _new_filter(self, sensor: Sensor) -> Filter:
+        """A filter with an empty map; the parametrisations are named in it, so that a checkpoint can be read back."""
+        config, velocity = self.config, self.config.velocity
+        motion: MotionModel = MarginalVelocity(velocity.walk_std())
+        if velocity.mode != "marginal":
+            motion = SampledVelocity(velocity.walk_std(), velocity.mode, velocity.start_std())
+        landmark_map = LandmarkMap(motion.space, compiled=config.compiled)
+        landmark_map.register(Point(3))
+        landmark_map.register(self.features.unknown_depth.landmark)
+        if self.features.group is not None:
+            landmark_map.register(constellation(self.features.group))
+        parts: list[Conditional] = [landmark_map]
+        if velocity.mode == "marginal":
+            parts.append(KalmanSubstate(SE3, np.zeros(6), np.diag(velocity.start_std() ** 2)))
+        return Filter(
+            motion,
+            sensor,
+            parts,
+            config.proposal.build(),
+            config.resampling.build(),
+            config.particles,
+            np.random.default_rng(config.seed),
+            lag=config.lag,
+        )
+
+    def _begin(
+        self, measured: Measurement | FeatureFrame
+    ) -> tuple[Measurement | FeatureFrame, PosePrior | None]:
+        """What is measured in the first frame, and the camera's pose: the origin, unless known points are the world."""
+        known, config = self.known, self.config
+        if self.known_map is not None:
+            return measured, None
+        if known is None:
+            return measured, PosePrior(SE3.identity(), np.zeros((6, 6)))
+
+        # What the frame shows of the known points.
+        if isinstance(measured, Measurement):
+            if not isinstance(known, KnownPixels):
+                raise InputError(
+                    "known points without pixels are those of named features: images need KnownPixels"
+                )
+            assert self._start is not None and measured.image is not None
+            start = self._start
+            require_texture(measured.image, known)
+            self.sensor.begin(measured.image, known.px, self.features.group is not None)
+            measured.known_px = known.px
+        else:
+            if not isinstance(known, KnownPoints):
+                raise InputError(
+                    "known points with pixels are those of an image: named features need KnownPoints"
+                )
+            start = KnownStart.from_frame(self.camera, known, measured)
+
+        std = np.repeat([config.start_std_rad, config.start_std_m], 3)
+        if self.features.group is None:
+            # Separate landmarks, in a world whose place each particle samples in the first frame: the prior is wide, the
+            # measurements of the frame, not the resection, say where in it the camera is.
+            self._add_points(start.points)
+            return measured, PosePrior(start.world_from_camera, np.diag(std**2))
+
+        # One landmark, placed by what the frame shows of it: the frame is not used again.
+        landmark_map, group = self.filter.belief().map, constellation(start.points)
+        records = constellation_records(self.camera, start, group, config.particles, np.diag(std**2))
+        landmark_map.catalogue[int(landmark_map.add_records(records, group)[0])] = CONSTELLATION
+        if isinstance(measured, FeatureFrame):
+            rest = ~np.isin(measured.landmarks, start.points.names)
+            measured = FeatureFrame(
+                measured.stamp_ns, measured.landmarks[rest], measured.z[rest], measured.cov_z[rest]
+            )
+        return measured, PosePrior(SE3.identity(), np.zeros((6, 6)))
+
+    def _add_points(self, known: KnownPoints) -> None:
+        """They enter the map once, with their σ, and are ordinary landmarks from then on."""
+        landmark_map, n = self.filter.belief().map, self.config.particles
+        mean = np.broadcast_to(known.positions, (n, *known.positions.shape))
+        cov = np.broadcast_to(known.cov, (n, *known.cov.shape))
+        ids = landmark_map.add_records(Records(mean, cov), Point(3))
+        landmark_map.catalogue.update(zip(ids.tolist(), known.names.tolist(), strict=True))
+
+    def _estimate(self, world: Anchored | None, report: StepReport) -> Estimate:
+        """Mean and covariance of world_from_camera after a step.
+
+        With known points it is that of the samples, each with its own uncertain world: the pose and the world's place are
+        correlated before sampling. Without them it is that of the refined mixture.
+        """
+        if world is None:
+            return Estimate(report.estimate.mean[:7], report.estimate.cov[:6, :6])
+        particles = self.filter.particles
+        return relative_estimate(SE3, world, particles.state[:, :7], particles.log_weights)
+
+    def _values(
+        self, measured: Measurement | FeatureFrame, report: StepReport, seconds_step: float
+    ) -> dict[str, Any]:
+        """Of `columns`; whether it was relocalised is added."""
+        landmark_map = self.filter.belief().map
+        rays = int(landmark_map.are(landmark_map.ids, self.features.unknown_depth.landmark).sum())
+        seconds_search = seconds_new = 0.0
+        if isinstance(measured, Measurement):
+            searched, found = measured.search.features.size, measured.used.landmarks.size
+            seconds_search, seconds_new = measured.seconds_search, measured.seconds_new_landmarks
+        else:
+            searched = measured.landmarks.size
+            found = int(self.camera.inside(measured.z).sum())
+        return {
+            "searched": searched,
+            "found": found,
+            "lost": self.sensor.lost,
+            "ess": report.ess,
+            "resampled": report.resampled,
+            "log_evidence": report.log_evidence,
+            "nis": report.nis,
+            "nis_dof": report.rows,
+            "points": landmark_map.ids.size - rays,
+            "rays": rays,
+            "seconds_search": seconds_search,
+            "seconds_filter": seconds_step - seconds_search - seconds_new,
+            "seconds_new_landmarks": seconds_new,
+        }
+
+    def _observed(
+        self, measured: Measurement | FeatureFrame, world: Anchored | None, first_new: int
+    ) -> dict[str, np.ndarray]:
+        """Of `observed`, in the heaviest particle."""
+        if isinstance(measured, FeatureFrame):
+            nowhere = {
+                each.name: np.full((len(measured.z), *each.shape), np.nan) for each in self.observed[1:-2]
+            }
+            seen = {"features": measured.landmarks, "px": measured.z, "cov_px": measured.cov_z}
+            return self._nothing() | nowhere | seen
+        belief, table, search = self.filter.belief(), self.sensor.table, measured.search
+        rows, found, pose = search.features, search.found, belief.state[belief.mode][:7]
+        position = table.position[rows].copy()
+        if world is not None:
+            position[:, :3] = directions(position, world.mean[belief.mode])
+        position[~found] = np.nan
+        line = np.full((rows.size, 2, 2), np.nan)
+        unknown, ends = self.features.extents(belief, rows, LINE_SIGMAS)
+        if unknown.size:
+            direction = directions(ends.reshape(-1, 4), pose)
+            px = self.camera.project(direction)
+            px[~(direction[:, 2] > 0.0)] = np.nan
+            line[unknown] = px.reshape(-1, 2, 2)
+        return {
+            "features": rows,
+            "mean": search.mean,
+            "cov": search.cov,
+            "px": np.where(found[:, None], search.px, np.nan),
+            "cov_px": np.tile(self.config.search.noise_px**2 * np.eye(2), (rows.size, 1, 1)),
+            "line": line,
+            "position": position,
+            "started": np.arange(first_new, len(table)),
+            "started_px": table.first_px[first_new:].copy(),
+        }
+
+    def _nothing(self) -> dict[str, np.ndarray]:
+        return {each.name: np.zeros((0, *each.shape), dtype=each.kind) for each in self.observed}
+
+    def _waiting(self, stamp_ns: int, messages: list[str]) -> Tracked:
+        """Before the first image that can be used: the camera is somewhere around the place that the known points say."""
+        assert self._start is not None
+        std = np.repeat([self.config.start_std_rad, self.config.start_std_m], 3)
+        values = {column.name: column.kind(0) for column in self.columns} | {
+            "ess": float(self.config.particles)
+        }
+        messages = [*messages, "the run starts with the first image that shows the known points"]
+        pose, cov = self._start.world_from_camera, np.diag(std**2)
+        return Tracked(
+            stamp_ns, pose, cov, TrackingState.INITIALISING, values, self._nothing(), tuple(messages)
+        )
+
+
+@final
+class _Either(Sensor):
+    """Images to the one sensor, named features to the other."""
+
+    def __init__(self, images: ImageSensor, named: Sensor) -> None:
+        self.images, self.named = images, named
+
+    def observe(self, frame: Measurement | FeatureFrame, belief: Belief) -> Sequence[Observations]:
+        """As the sensor does."""
+        return self._of(frame).observe(frame, belief)
+
+    def new_landmarks(
+        self, frame: Measurement | FeatureFrame, belief: Belief, observed: Sequence[Observations]
+    ) -> Sequence[NewLandmarks]:
+        """As the sensor does."""
+        return self._of(frame).new_landmarks(frame, belief, observed)
+
+    def _of(self, frame: Measurement | FeatureFrame) -> Sensor:
+        return self.images if isinstance(frame, Measurement) else self.named
+
+
+def world_of(filter_: Filter) -> Anchored | None:
+    """The known points' frame in each particle's own world, which starts at its first camera; None without one."""
+    landmark_map = filter_.belief().map
+    first = next(
+        iter(landmark_map.catalogue), None
+    )  # it was the first landmark: no other one has to be asked
+    if first is None or landmark_map.catalogue[first] != CONSTELLATION:
+        return None
+    return Anchored(*landmark_map.landmark_of(first).frame(landmark_map.read(np.array([first]))))
+
+
+def particle_points(filter_: Filter, ids: Sequence[int]) -> np.ndarray:
+    """Each particle's own mean of point landmarks (N, K, 3), in the world of the known points."""
+    points = filter_.belief().read(np.asarray(ids)).mean
+    world = world_of(filter_)
+    return points if world is None else SE3.inverse_transform(world.mean[:, None], points)

@@ -1,0 +1,274 @@
+"""A camera that is lost says so, finds itself in its map, and does not claim to where it cannot know."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from rbpf.lie import SE3
+from rbpf.sensors.camera.resection import GATE, Resected, squared_distances
+from rbpf.systems.mono.config import MonoConfig, RelocalisationConfig
+from rbpf.systems.mono.relocalisation import (
+    MIN_VIEW_CORNERS,
+    Candidates,
+    LastView,
+    Relocaliser,
+    describe_corners,
+    is_confirmed,
+    is_convincing,
+    match_by_ratio,
+    most_agree,
+    mutual_matches,
+)
+from rbpf.systems.mono.slam import MonoSlam
+from rbpf.systems.mono.video import VideoRun, run_images
+from tests.systems.plane_sequences import CAMERA, Pictures, known_points, path, sequence, texture, view
+
+START, DARK, FRAMES = 40, 20, 90
+CONFIG = MonoConfig(particles=50, checkpoint_every=START)
+RECOVERY = CONFIG.relocalisation
+SENSOR = MonoSlam(CAMERA).sensor
+GREY = np.full((240, 320), 90, dtype=np.uint8)
+
+slow = pytest.mark.slow
+
+
+class Tracked(NamedTuple):
+    """A run, its checkpoint after the first `START` frames, and which features lived then."""
+
+    run: VideoRun
+    checkpoint: Path
+    alive: np.ndarray
+
+
+@pytest.fixture(scope="module")
+def tracked(tmp_path_factory):
+    """A run of all frames."""
+    folder, alive = tmp_path_factory.mktemp("plane"), []
+
+    def keep(t, frame, run):
+        if t + 1 == START:
+            (folder / "latest.npz").rename(folder / "start.npz")
+            alive.append(run.sensor.table.alive.copy())
+
+    run = run_images(sequence(FRAMES), CONFIG, known_points(), keep, folder / "latest.npz")
+    return Tracked(run, folder / "start.npz", alive[0])
+
+
+def resumed(tracked, tmp_path, change):
+    """From the checkpoint on, with other images."""
+    copy = tmp_path / "start.npz"
+    copy.write_bytes(tracked.checkpoint.read_bytes())
+    config = replace(CONFIG, checkpoint_every=10 * FRAMES)
+    return run_images(sequence(FRAMES, change), config, known_points(), None, copy, resume=True)
+
+
+def errors(run):
+    """Distances from the true positions (T,)."""
+    truth = SE3.translation(path(FRAMES))[: len(run.world_from_camera)]
+    return np.linalg.norm(SE3.translation(run.world_from_camera) - truth, axis=1)
+
+
+@slow
+def test_tracking_is_not_disturbed(tracked, tmp_path):
+    """Nor by being broken off."""
+    run = tracked.run
+    assert not run.lost.any() and not run.relocalisations and not run.problems
+    assert errors(run).max() < 0.05
+    again = resumed(tracked, tmp_path, lambda t, image: image)
+    assert again.world_from_camera == pytest.approx(run.world_from_camera, abs=1e-9)
+    assert again.slam.loss.trusted[0] == pytest.approx(run.slam.loss.trusted[0])
+    assert again.slam.loss.stamp_ns == run.stamps_ns[-1]
+
+
+@slow
+@pytest.mark.parametrize("how", ["black", "missing"])
+def test_recovers_after_a_blackout(tracked, tmp_path, how):
+    def dark(t, image):
+        if not START <= t < START + DARK:
+            return image
+        return None if how == "missing" else np.zeros_like(image)
+
+    run = resumed(tracked, tmp_path, dark)
+    assert run.lost[START + 3 : START + DARK].all()
+    assert not run.lost[START + DARK + 3 :].any()
+    assert len(run.relocalisations) == 1
+    assert any("lost" in problem for problem in run.problems)
+    assert sum("shows nothing" in problem for problem in run.problems) == (how == "black")
+    assert errors(run)[-10:].max() < 0.03
+    assert np.trace(run.cov[START + DARK - 1][3:, 3:]) > np.trace(run.cov[START][3:, 3:])
+
+
+@slow
+def test_the_map_survives_the_dark(tracked, tmp_path):
+    held = resumed(tracked, tmp_path, lambda t, image: np.zeros_like(image) if t >= START else image)
+    assert np.array_equal(held.sensor.table.alive, tracked.alive)
+    assert held.lost[-1]
+    assert np.ptp(errors(held)[START:]) < 0.5
+
+
+@slow
+def test_an_unknown_place_is_not_recognised(tracked, tmp_path):
+    other = Pictures(texture(seed=7), path(FRAMES), lambda t, image: image)
+    images = {t: frame.image for t, frame in enumerate(other.frames(0))}
+    run = resumed(tracked, tmp_path, lambda t, image: images[t] if t >= START else image)
+    assert run.lost[START + 3 :].all()
+    assert not run.relocalisations
+    last = SE3.translation(run.world_from_camera[START - 1])
+    assert np.linalg.norm(SE3.translation(run.world_from_camera[-1]) - last) < 0.1
+
+
+@slow
+def test_a_frozen_camera_is_noticed(tracked, tmp_path):
+    still = view(texture(), path(FRAMES)[START])
+    run = resumed(tracked, tmp_path, lambda t, image: still if START <= t < START + DARK else image)
+    assert sum("frozen" in problem for problem in run.problems) == 1
+    assert run.lost[START + DARK - 1]
+    assert not run.lost[-20:].any()
+
+
+class Place(NamedTuple):
+    """What is known when a camera is looked for in the tracked run's map, and an image from a known pose in its world."""
+
+    finder: Relocaliser
+    belief: object
+    near: np.ndarray
+    truth: np.ndarray
+    image: np.ndarray
+
+
+@pytest.fixture(scope="module")
+def place(tracked):
+    run = tracked.run
+    belief = run.filter.belief()
+    truth = SE3.retract(path(FRAMES)[60], np.array([0.05, -0.1, 0.2, 0.1, -0.1, 0.15]))
+    start = SE3.compose(belief.state[belief.mode][:7], SE3.inverse(run.world_from_camera[-1]))
+    finder = Relocaliser(run.sensor, RECOVERY)
+    return Place(finder, belief, run.slam.loss.trusted[0], SE3.compose(start, truth), view(texture(), truth))
+
+
+@slow
+def test_the_pose_found_is_right_and_its_covariance_fair(place):
+    attempt = place.finder.find(place.belief, place.image, place.near)
+    assert attempt.prior is not None
+    assert RECOVERY.min_inliers <= attempt.agreeing <= attempt.landmarks
+    error = SE3.log(SE3.between(place.truth, attempt.prior.mean))
+    assert np.abs(error).max() < 0.03
+    assert (np.abs(error) < 4.0 * np.sqrt(np.diag(attempt.prior.cov)) + 0.01).all()
+
+
+@slow
+def test_what_it_is_not_found_in(place, tracked):
+    """Two copies of the map side by side, noise, and grey."""
+    half = view(texture(), path(FRAMES)[-1])[:, :160]
+    noise = np.random.default_rng(0).integers(0, 255, (240, 320)).astype(np.uint8)
+    for image in (np.hstack([half, half]), noise, GREY):
+        attempt = place.finder.find(place.belief, image, place.near)
+        assert attempt.prior is None and not attempt.certain
+    assert (attempt.corners, attempt.matches) == (0, 0)
+    picky = Relocaliser(tracked.run.sensor, RelocalisationConfig(min_inliers=1000))
+    assert picky.find(place.belief, place.image, place.near).prior is None
+
+
+@slow
+def test_patches_say_more_exactly_than_corners_where_landmarks_are(place):
+    rows, points = place.finder.known_landmarks(place.belief)
+    seen = CAMERA.project(SE3.inverse_transform(place.truth, points))
+    px = SENSOR.detector.detect(place.image, 500, None, 6.0, 16.0).px
+    away = np.linalg.norm(seen[:, None] - px, axis=-1)
+    near = np.flatnonzero(away.min(axis=1) < 6.0)
+    pairs = near, away[near].argmin(axis=1)
+    assert near.size >= 15
+    sharp = place.finder.refine_px(Candidates(place.image, rows, points, px), pairs, place.near)
+    before, after = (np.linalg.norm(at - seen[near], axis=1) for at in (px[pairs[1]], sharp))
+    assert np.median(after) < min(0.7 * np.median(before), 1.5)
+
+
+def test_inliers_on_a_line_do_not_convince():
+    rng, along = np.random.default_rng(0), np.linspace(30.0, 290.0, 20)
+    line = np.stack([along, 0.5 * along + rng.normal(size=20)], axis=-1)
+    found = Resected(SE3.identity(), np.eye(6), np.ones(20, dtype=bool), 1.0)
+    assert not is_convincing(found, line, CAMERA.width, RECOVERY)
+    assert is_convincing(found, rng.uniform(0, 240, (20, 2)), CAMERA.width, RECOVERY)
+
+
+def test_matches_must_be_like_nothing_else():
+    away = np.array([[0.1, 0.5, 0.6], [0.5, 0.2, 0.19], [0.6, 0.5, 0.5]])
+    points, px = np.eye(3), np.array([[0.0, 0.0], [50.0, 0.0], [100.0, 0.0]])
+    landmark, corner = match_by_ratio(away, points, px, 0.8)
+    assert (landmark.tolist(), corner.tolist()) == ([0], [0])
+    # Two names for one landmark, and two corners at one place, are no rivals.
+    landmark, corner = match_by_ratio(away, points, px * [0.01, 1.0], 0.8)
+    assert 1 in landmark
+    landmark, corner = match_by_ratio(np.array([[0.1, 0.5], [0.1, 0.6]]), np.zeros((2, 3)), px[:2], 0.8)
+    assert (landmark.size, corner.tolist()) == (1, [0])
+
+
+# The last view before the loss.
+
+HERE = SE3.retract(SE3.identity(), np.array([0.02, 0.01, 0.03, 0.05, 0.02, -0.03]))
+MOTIONS = {
+    "sideways": [0.0, -0.15, 0.05, 0.4, 0.05, 0.0],
+    "turning": [0.1, 0.15, 0.1, 0.0, 0.0, 0.0],
+    "nearer": [0.0, 0.0, 0.1, 0.05, 0.0, 0.3],
+}
+
+
+@pytest.fixture(scope="module")
+def last():
+    return LastView(SENSOR, view(texture(), HERE), HERE, RECOVERY)
+
+
+def matched(last, image, landmarks=None):
+    """What is seen again in an image."""
+    px = SENSOR.detector.detect(image, 500, None, 6.0, 16.0).px
+    points = known_points().positions if landmarks is None else landmarks
+    return last.match(describe_corners(SENSOR, image, px), px, points)
+
+
+@pytest.mark.parametrize("motion", MOTIONS.values(), ids=MOTIONS.keys())
+def test_corners_are_found_again_on_their_lines(last, motion):
+    there = SE3.retract(HERE, np.array(motion))
+    image = view(texture(), there)
+    again = matched(last, image)
+    assert again is not None
+    rows, sights = again
+    assert rows.size >= MIN_VIEW_CORNERS
+    right = squared_distances(CAMERA, there[None], sights)[0] <= GATE
+    assert right.mean() > 0.9
+    sharp = last.refine_px(image, rows, sights, there)
+    # Across its line: what is left of the depth is along it.
+    before, after = (
+        np.median(squared_distances(CAMERA, there[None], s)[0] * s.std_px**2) for s in (sights, sharp)
+    )
+    assert after < 0.5 * before
+    assert (squared_distances(CAMERA, there[None], sharp)[0][right] <= GATE).mean() > 0.8
+
+
+def test_where_the_last_view_is_not_seen_again(last):
+    """In another place, without landmarks in view, which tell the depth, and where it has no corners."""
+    assert matched(last, view(texture(seed=7), HERE)) is None
+    assert matched(last, GREY) is None
+    assert matched(last, view(texture(), HERE), np.array([[0.0, 0.0, -3.0]])) is None
+    assert matched(LastView(SENSOR, GREY, HERE, RECOVERY), view(texture(), HERE)) is None
+
+
+def test_pairs_are_the_most_alike_both_ways():
+    alike = np.array([[0.9, 0.1, 0.0], [0.95, 0.2, 0.1], [0.1, 0.8, 0.79]])
+    px = np.array([[0.0, 0.0], [50.0, 0.0], [100.0, 0.0]])
+    assert [pair.tolist() for pair in mutual_matches(alike, px)] == [[1], [0]]
+    px[2] = [55.0, 0.0]  # the rival of the third is the same thing
+    assert [pair.tolist() for pair in mutual_matches(alike, px)] == [[1, 2], [0, 1]]
+
+
+def test_few_landmarks_are_enough_where_most_corners_agree():
+    few = RECOVERY.min_inliers_with_last_view
+    assert is_confirmed(few, 90, 100, RECOVERY)
+    assert not is_confirmed(few - 1, 100, 100, RECOVERY)  # these give the scale
+    assert not is_confirmed(30, 60, 100, RECOVERY)  # most show another motion
+    assert not is_confirmed(30, MIN_VIEW_CORNERS - 1, MIN_VIEW_CORNERS - 1, RECOVERY)
+    assert most_agree(np.arange(100) < 90)
+    assert not most_agree(np.arange(100) < 60)
+    assert not most_agree(np.ones(MIN_VIEW_CORNERS - 1, dtype=bool))
