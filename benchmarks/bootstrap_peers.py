@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.rows import Row, Settings, SkippedError, Timing, interleaved
-from rbpf.core.belief import Belief
 from rbpf.core.filter import Filter
-from rbpf.core.models import MotionModel, ObservationModel, Observations, Part, Sensor, Transition
+from rbpf.core.models import Belief, MotionModel, ObservationModel, Observations, Part, Sensor, Transition
 from rbpf.core.proposals import PriorProposal
 from rbpf.core.resampling import Systematic
 from rbpf.lie import Euclidean

@@ -5,7 +5,7 @@ import numpy as np
 from benchmarks.rows import Row, Settings
 from rbpf.core.genealogy import Lineage
 from rbpf.core.resampling import Systematic
-from rbpf.maps.shared import SharedStore
+from rbpf.maps.store import SharedStore
 
 N, M, FIELDS, IN_VIEW = 400, 11_085, 9, 100
 RESAMPLINGS = 1_000

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from benchmarks.plain_odometry import path
-from rbpf.core.exchange import NULL
+from rbpf.core.models import NULL
 from rbpf.lie import SE3
 from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.descriptors.index import DescriptorIndex, DescriptorSearch, ExactSearch, Gate, TreeSearch

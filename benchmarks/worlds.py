@@ -7,9 +7,8 @@ from itertools import islice
 import numpy as np
 
 from benchmarks.rows import Diversity
-from rbpf.core.belief import Belief
 from rbpf.core.filter import Filter
-from rbpf.core.models import ObservationModel, Observations, Records, Sensor
+from rbpf.core.models import Belief, ObservationModel, Observations, Records, Sensor
 from rbpf.core.proposals import EkfProposal
 from rbpf.core.resampling import EssTriggered, Systematic
 from rbpf.lie import SE2, SE3, SE2Group, SE3Group

@@ -28,8 +28,8 @@ class WidenedProposal(Proposal):
         self.refined = EkfProposal()
         self.factor = factor
 
-    def propose(self, prior, terms):
-        proposed = self.refined.propose(prior, terms)
+    def propose(self, prior, linearise):
+        proposed = self.refined.propose(prior, linearise)
         return replace(proposed, root=self.factor * proposed.root)
 
 

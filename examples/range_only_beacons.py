@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from rbpf import SE2, Filter, LandmarkMap, MixturePoint, ObservationModel
-from rbpf.maps.mixture import ring
+from rbpf.maps.point import ring
 from rbpf.motion.odometry import Odometry, OdometryMotion
 from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
 

@@ -7,8 +7,7 @@ import numpy as np
 from rbpf import gaussian
 from rbpf.core.models import Landmark, Records
 from rbpf.errors import InputError
-from rbpf.lie import SE3
-from rbpf.lie.matrices import skew
+from rbpf.lie import SE3, skew
 
 MOST = 12
 """Points that may each have an error of their own; a record's covariance grows with the square of their number."""
@@ -73,8 +72,8 @@ class UncertainConstellation(Landmark):
     """M points, given in a frame of their own up to Gaussian errors; where they are in the world is estimated.
 
     The record's mean is (p_1, …, p_M), where the points are in the world, with their joint covariance: the shape that
-    is given correlates them. A camera sees where the points are, and what it tells is nearly linear in that, however
-    uncertain the frame; told as the frame and an error of each point it is not, and the error of second order is
+    is given correlates them. What a camera measures is nearly linear in where the points are, however uncertain the
+    frame. With the frame and an error of each point as the record it is not, and the error of second order is
     larger than a pixel. The frame follows from the points: p_m = T (k_m + e_m), so that given the points T is the fit
     of the shape to them.
 

@@ -1,4 +1,4 @@
-"""A point on a ray: inverse depth in the frame of the first sighting (E06 §5.1)."""
+"""A point on a ray: inverse depth in the frame of the first observation (E06 §5.1)."""
 
 from typing import final
 
@@ -11,9 +11,9 @@ from rbpf.lie import SE3
 
 @final
 class InverseDepth(Landmark):
-    """b = (u, v, q): the point (u, v, 1)/q in the frame of the first sighting, E06 §5.1.
+    """b = (u, v, q): the point (u, v, 1)/q in the frame of the first observation, E06 §5.1.
 
-    The record's constant is that frame, world_from_anchor (7,): the particle's own pose at the first sighting, which
+    The record's constant is that frame, world_from_anchor (7,): the particle's own pose at the first observation, which
     its descendants inherit. u and v are normalised image coordinates, q = 1/z in 1/m; q = 0 is at infinity.
 
     Args:

@@ -6,35 +6,35 @@ from typing import Any, final
 
 import numpy as np
 
-from rbpf.core.archive import checked, within
+from rbpf import gaussian
+from rbpf.core.checkpoint import checked, within
 from rbpf.core.genealogy import Lineage
 from rbpf.core.likelihoods import Gaussian
+from rbpf.core.linearisation import innovation_covariance, linearise
 from rbpf.core.models import (
-    Conditional,
+    Belief,
     Jacobians,
     Landmark,
     LogDensities,
+    Map,
     NewLandmarks,
     ObservationModel,
     Observations,
     Part,
     Records,
 )
-from rbpf.core.numeric import linearise
-from rbpf.core.proposals import Prior, Terms
-from rbpf.core.reference import innovation_covariance
+from rbpf.core.particles import Information, Prior
 from rbpf.errors import InputError
+from rbpf.kernels.landmarks import gather, linearise_one, project
 from rbpf.lie import LieGroup
 from rbpf.maps.layout import Layout
-from rbpf.maps.plan import BOTH, MAP, STATE, Plan, by_use, make_plan, require_apart
 from rbpf.maps.point import Point
-from rbpf.maps.reading import linearise_one_particle, project_compiled, read_records
-from rbpf.maps.rows import RowEngine
-from rbpf.maps.shared import ALL, SharedStore
+from rbpf.maps.rows import BOTH, MAP, STATE, Plan, RowEngine, by_use, make_plan, require_apart
+from rbpf.maps.store import ALL, SharedStore
 
 
 @final
-class LandmarkMap(Conditional):
+class LandmarkMap(Map):
     """Landmarks of any parametrisation, shared between particles and copied only when written.
 
     Args:
@@ -43,8 +43,6 @@ class LandmarkMap(Conditional):
             landmark may then be present in some particles only.
         compiled: use the models' fused kernels where they have one.
     """
-
-    supplies = Part.LANDMARK
 
     def __init__(self, space: LieGroup, evidence: bool = False, compiled: bool = True) -> None:
         self.space = space
@@ -62,11 +60,23 @@ class LandmarkMap(Conditional):
 
     @property
     def ids(self) -> np.ndarray:
-        """Landmarks held (M,), in the order in which they were started."""
         return self.store.ids
 
+    @property
+    def stored_fraction(self) -> float:
+        return self.store.stored_bytes / max(self.store.dense_bytes, 1)
+
+    def holds(self, ids: np.ndarray) -> np.ndarray:
+        return self.store.columns.held(ids)
+
+    def landmark_of(self, landmark_id: int) -> Landmark:
+        self._known(np.array([landmark_id]))
+        return self._layout_of(landmark_id).landmark
+
+    def are(self, ids: np.ndarray, landmark: Landmark) -> np.ndarray:
+        return self.store.columns.kinds(ids) == self._kind(landmark)
+
     def add(self, new_landmarks: NewLandmarks, state: np.ndarray) -> np.ndarray:
-        """Starts landmarks from first sightings at the states (N, E); returns their ids (K,)."""
         records = new_landmarks.model.initialise(state, new_landmarks.z, new_landmarks.cov)
         log_odds = None if new_landmarks.mask is None else np.where(new_landmarks.mask, 0.0, -np.inf)
         ids = self.add_records(records, new_landmarks.landmark, log_odds, new_landmarks.ids)
@@ -81,100 +91,36 @@ class LandmarkMap(Conditional):
         log_odds: np.ndarray | None = None,
         ids: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Adds landmarks whose estimates (N, K, …) are known.
-
-        Args:
-            records: the estimates.
-            landmark: their parametrisation.
-            log_odds: (N, K) that they exist, for a map with evidence.
-            ids: (K,) that they shall have; by default numbers that no landmark had before.
-
-        Returns:
-            Their ids (K,).
-
-        Raises:
-            InputError: an id is no number from 0 up, comes twice or is in use, or the shapes do not fit.
-        """
         if log_odds is not None and not self.evidence:
             raise InputError("landmarks of some particles only need a map with evidence=True")
         kind = self._kind(landmark)
         columns = self.layouts[kind].pack(records, log_odds)
-        given: list[int | None] = [None] * columns.shape[0]
-        if ids is not None:
+        count = columns.shape[0]
+        if ids is None:
+            ids = np.arange(self.store.next_id, self.store.next_id + count)
+        else:
             ids = np.asarray(ids)
-            if ids.shape != (columns.shape[0],) or ids.dtype.kind not in "iu" or (ids < 0).any():
+            if ids.shape != (count,) or ids.dtype.kind not in "iu" or (ids < 0).any():
                 raise InputError(
-                    f"ids of {columns.shape[0]} new landmarks must be as many whole numbers from 0 up, got {ids}"
+                    f"ids of {count} new landmarks must be as many whole numbers from 0 up, got {ids}"
                 )
-            taken = self.holds(ids)
-            if taken.any() or np.unique(ids).size < ids.size:
-                twice = ids[taken] if taken.any() else np.sort(ids)[:-1][np.diff(np.sort(ids)) == 0]
-                raise InputError(f"a new landmark needs an id of its own: {twice[0]} is in use")
-            given = ids.tolist()
-        ids = np.array(
-            [self.store.add(column, number) for column, number in zip(columns, given, strict=True)],
-            dtype=np.int64,
-        )
+            numbers, times = np.unique(ids, return_counts=True)
+            taken = numbers[self.holds(numbers) | (times > 1)]
+            if taken.size:
+                raise InputError(f"a new landmark needs an id of its own: {taken[0]} is in use")
+        for column, landmark_id in zip(columns, ids.tolist(), strict=True):
+            self.store.add(column, landmark_id)
         self.store.columns.kind[self.store.columns.rows(ids)] = kind
-        return ids
-
-    def holds(self, ids: np.ndarray) -> np.ndarray:
-        """Which of some ids (K,) are those of landmarks held, (K,) bool."""
-        return self.store.columns.held(ids)
+        return ids.astype(np.int64)
 
     def remove(self, ids: np.ndarray) -> None:
-        """Drops landmarks from all particles."""
         self._known(ids)
         self._planned = None
         self.store.remove(ids)
         for landmark in ids.tolist():
             self.catalogue.pop(landmark, None)
 
-    def read(self, ids: np.ndarray, particles: np.ndarray | slice = ALL) -> Records:
-        """Estimates (N, K, …) of landmarks that share one parametrisation, in all or some particles."""
-        ids = np.asarray(ids)
-        if ids.size == 0:
-            raise InputError("no landmark was named")
-        kinds = self.store.columns.kinds(ids)
-        if kinds[0] < 0 or (kinds != kinds[0]).any():
-            self._known(ids)
-            raise InputError("read() takes landmarks of one parametrisation at a time: see `landmark_of`")
-        return read_records(self.store, self.layouts[kinds[0]], ids, particles)
-
-    def is_compiled(self, model: ObservationModel, ids: np.ndarray) -> bool:
-        """Whether `project` can tell what the model measures of landmarks (K,)."""
-        if not self.compiled or type(model).innovation is not ObservationModel.innovation:
-            return False
-        plain = self._layout_of(int(ids[0])).landmark.components == 1
-        return plain and self.store.is_warm(ids) and model.kernel() is not None
-
-    def project(
-        self, model: ObservationModel, ids: np.ndarray, anchor: np.ndarray, weights: np.ndarray, prior: Prior
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """What `Belief.project` gives, relative to the anchors (K, p)."""
-        kernel = model.kernel()
-        assert kernel is not None
-        return project_compiled(self.store, self._layout_of(int(ids[0])), kernel, ids, anchor, weights, prior)
-
-    def innovations(
-        self, model: ObservationModel, z: np.ndarray, ids: np.ndarray, state: np.ndarray, particle: int
-    ) -> tuple[np.ndarray, Jacobians, Records]:
-        """ν (K, p) of landmarks (K,) in one particle at a state (E,), its Jacobians, and the records (1, K, …)."""
-        records = self.read(ids, slice(particle, particle + 1))
-        kernel = model.kernel() if self.compiled else None
-        return *linearise_one_particle(model, kernel, self.space, records, z, state), records
-
-    def landmark_of(self, landmark_id: int) -> Landmark:
-        """The parametrisation of a landmark."""
-        self._known(np.array([landmark_id]))
-        return self._layout_of(landmark_id).landmark
-
-    def are(self, ids: np.ndarray, landmark: Landmark) -> np.ndarray:
-        """Which landmarks (K,) of the map have this parametrisation, (K,) bool."""
-        return self.store.columns.kinds(ids) == self._kind(landmark)
-
-    def promote(self, ids: np.ndarray, to: Landmark | None = None) -> None:
-        """Turns landmarks into single Gaussian points in all particles at once, by their own `promote`."""
+    def promote(self, ids: Sequence[int] | np.ndarray, to: Landmark | None = None) -> None:
         self._planned = None
         for landmark_id in ids:
             layout = self._layout_of(landmark_id)
@@ -187,18 +133,122 @@ class LandmarkMap(Conditional):
 
     def ready(self, weights: np.ndarray, fraction: float = 0.95) -> np.ndarray:
         """Landmarks of several components or with constants that are ready in `fraction` of the weight (N,)."""
-        waiting = [i for i in self.ids if not isinstance(self.landmark_of(int(i)), Point)]
-        ready = [i for i in waiting if (weights * self._is_ready(int(i))).sum() >= fraction]
+        ready = []
+        for landmark_id in self.ids.tolist():
+            landmark = self.landmark_of(landmark_id)
+            if isinstance(landmark, Point):
+                continue
+            held = landmark.ready(self.read(np.array([landmark_id])))[:, 0]
+            if (weights * held).sum() >= fraction:
+                ready.append(landmark_id)
         return np.array(ready, dtype=np.int64)
 
+    def read(self, ids: np.ndarray, particles: np.ndarray | slice = ALL) -> Records:
+        ids = np.asarray(ids)
+        if ids.size == 0:
+            raise InputError("no landmark was named")
+        kinds = self.store.columns.kinds(ids)
+        if kinds[0] < 0 or (kinds != kinds[0]).any():
+            self._known(ids)
+            raise InputError("read() takes landmarks of one parametrisation at a time: see `landmark_of`")
+        layout = self.layouts[kinds[0]]
+        landmark = layout.landmark
+        if landmark.components > 1 or not self.store.is_warm(ids):
+            return layout.unpack(self.store.read_all(ids, particles))
+        access = self.store.access(ids)
+        maps = access.maps if particles is ALL else np.ascontiguousarray(access.maps[:, particles])
+        n, k, dim = maps.shape[1], ids.size, landmark.dim
+        mean, cov = np.empty((n, k, dim)), np.empty((n, k, dim, dim))
+        const = np.empty((n, k, landmark.constants))
+        gather(access.pool, access.slabs, access.which, maps, mean, cov, const)
+        return Records(mean, cov, const if landmark.constants else None)
+
+    def innovations(
+        self, model: ObservationModel, z: np.ndarray, ids: np.ndarray, state: np.ndarray, particle: int
+    ) -> tuple[np.ndarray, Jacobians, Records]:
+        records = self.read(ids, slice(particle, particle + 1))
+        mean = records.mean[0]
+        const = None if records.const is None else records.const[0]
+        kernel = model.kernel() if self.compiled else None
+        if kernel is None or records.log_weights is not None:
+            nu, jac = linearise(model, self.space, z, state[None], mean, const)
+            return nu, jac, records
+        # What `linearise` gives, by the model's kernel.
+        nu = np.empty(z.shape)
+        jac_state, jac_map = np.empty((*z.shape, self.space.dim)), np.empty((*z.shape, mean.shape[1]))
+        const = np.empty((z.shape[0], 0)) if const is None else const
+        arrays = (np.ascontiguousarray(array, dtype=float) for array in (state, mean, const, z))
+        linearise_one(kernel.function.address, kernel.params, *arrays, nu, jac_state, jac_map)
+        return nu, Jacobians(jac_state, jac_map), records
+
+    def predictions(
+        self, model: ObservationModel, z: np.ndarray, cov: np.ndarray, ids: np.ndarray, belief: Belief
+    ) -> tuple[np.ndarray, np.ndarray]:
+        predicted, within = self._predicted(model, self.read(ids), belief)
+        return model.residual(z[:, None, :], predicted[:, None]), within[:, None] + cov[:, None]
+
+    def is_compiled(self, model: ObservationModel, ids: np.ndarray) -> bool:
+        """Whether `project` runs compiled for landmarks (K,) of one parametrisation."""
+        if not self.compiled or type(model).innovation is not ObservationModel.innovation:
+            return False
+        plain = self._layout_of(int(ids[0])).landmark.components == 1
+        return plain and self.store.is_warm(ids) and model.kernel() is not None
+
+    def project(
+        self, model: ObservationModel, ids: np.ndarray, belief: Belief
+    ) -> tuple[np.ndarray, np.ndarray]:
+        prior, weights = belief.prior, belief.weights
+        kernel = model.kernel() if self.is_compiled(model, ids) else None
+        if kernel is not None:
+            # Relative to the particle of highest weight, so that angles need not be wrapped.
+            landmark, k, p = self._layout_of(int(ids[0])).landmark, ids.size, model.dim
+            state = belief.state[belief.mode]
+            anchor = -self.innovations(model, np.zeros((k, p)), ids, state, belief.mode)[0]
+            access = self.store.access(ids)
+            mean, cov = np.empty((k, p)), np.empty((k, p, p))
+            project(
+                kernel.function.address,
+                kernel.params,
+                np.ascontiguousarray(prior.predicted()),
+                access.pool,
+                access.slabs,
+                access.which,
+                access.maps,
+                np.ascontiguousarray(anchor),
+                weights,
+                np.ascontiguousarray(prior.spread(prior.mean)),
+                np.array([self.space.dim, landmark.dim, landmark.constants]),
+                mean,
+                cov,
+            )
+            return anchor + mean, cov
+        predicted, within = self._predicted(model, self.read(ids), belief)
+        mode = predicted[belief.mode]
+        offset = model.residual(predicted, mode)
+        by_particle = weights[:, None, None]
+        mean = (by_particle * offset).sum(axis=0)
+        spread = offset - mean
+        between = spread[..., :, None] * spread[..., None, :]
+        return mode + mean, (by_particle[..., None] * (within + between)).sum(axis=0)
+
+    def _predicted(
+        self, model: ObservationModel, records: Records, belief: Belief
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """What each particle expects to measure of landmarks (N, K, p), and J P Jᵀ + H Q Hᵀ (N, K, p, p)."""
+        prior, state = belief.prior, belief.state[:, None, :]
+        predicted = model.predict(state, records.mean, records.const)
+        _, jac = linearise(model, prior.space, predicted, state, records.mean, records.const)
+        assert jac.state is not None and jac.landmark is not None
+        moved = jac.state @ prior.spread(prior.mean)[:, None]
+        within = jac.landmark @ records.cov @ np.swapaxes(jac.landmark, -1, -2)
+        return predicted, gaussian.symmetrise(within + moved @ np.swapaxes(moved, -1, -2))
+
     def log_odds(self, ids: np.ndarray) -> np.ndarray:
-        """(N, K) log-odds that the landmarks exist; −inf where a particle does not hold one."""
         if not self.evidence:
             return np.zeros((self.n, ids.size))
         return np.array([self.store.read(int(i))[-1] for i in ids]).reshape(ids.size, self.n).T
 
     def set_log_odds(self, ids: np.ndarray, log_odds: np.ndarray) -> None:
-        """Overwrites log-odds (N, K); a landmark at −inf in every particle is removed."""
         if not self.evidence:
             raise InputError("this map keeps no log-odds: build it with evidence=True")
         for landmark_id, column in zip(ids.tolist(), log_odds.T, strict=True):
@@ -210,10 +260,10 @@ class LandmarkMap(Conditional):
         gone = ids[np.isneginf(log_odds).all(axis=0)]
         self.remove(gone)
 
-    def terms(self, state: np.ndarray, groups: Sequence[Observations], prior: Prior) -> Terms:
+    def information(self, state: np.ndarray, groups: Sequence[Observations], prior: Prior) -> Information:
         """Information of single-Gaussian landmarks; those of several components enter after sampling."""
         for_state = [group for group in groups if Part.STATE in group.updates]
-        return self._engine.terms(self._plan(for_state), state, for_state, prior)
+        return self._engine.information(self._plan(for_state), state, for_state, prior)
 
     def correct(
         self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]
@@ -221,28 +271,28 @@ class LandmarkMap(Conditional):
         """Log p(z | x) and the landmarks' Kalman updates at the sampled states."""
         uses = by_use(groups)
         require_apart(uses[STATE], uses[BOTH])
-        log_density, late = np.zeros(self.n), np.zeros(self.n)
+        log_density, after_sampling = np.zeros(self.n), np.zeros(self.n)
         if uses[STATE]:
             log_density += self._density(state, uses[STATE])
         if uses[BOTH]:
             both = self._engine.correct(self._plan(uses[BOTH]), state, uses[BOTH])
-            log_density, late = log_density + both.all, both.late
+            log_density, after_sampling = log_density + both.all, both.after_sampling
         if uses[MAP]:
             self._engine.correct(self._plan(uses[MAP]), state, uses[MAP])
         self._planned = None
-        return LogDensities(log_density, late)
+        return LogDensities(log_density, after_sampling)
 
     def _density(self, state: np.ndarray, groups: Sequence[Observations]) -> np.ndarray:
         """Log p(z | x) (N,) of observations that leave the landmarks as they are."""
         plan = self._plan(groups)
-        if plan.late:
+        if plan.mixtures:
             raise InputError("a landmark of several components cannot be observed without being updated")
         if all(group.likelihood is None or group.likelihood.kernel_id == 0 for group in groups):
-            terms = self._engine.terms(plan, state, groups, Prior.exactly(self.space, state))
-            return terms.log_factor - 0.5 * (terms.quad + terms.log_det)
+            found = self._engine.information(plan, state, groups, Prior.exactly(self.space, state))
+            return found.log_factor - 0.5 * (found.quad + found.log_det)
         if plan.joint:
             raise InputError(
-                "a landmark seen twice in a step needs a Gaussian likelihood to be left as it is"
+                "a landmark observed twice in a step needs a Gaussian likelihood to be left as it is"
             )
         total = plan.log_factor.copy()
         for batch in plan.batches:
@@ -273,7 +323,7 @@ class LandmarkMap(Conditional):
             "map/facts": np.array(facts),
         }
 
-    def options(self) -> dict[str, Any]:
+    def options(self) -> dict[str, object]:
         """Whether there are log-odds, and the parametrisations in the order of their numbers."""
         kinds = {
             f"landmark kind {number}": f"{type(kind).__name__} {kind.dim, kind.constants, kind.components}"
@@ -330,7 +380,3 @@ class LandmarkMap(Conditional):
         held = self.store.columns.held(named)
         if not held.all():
             raise InputError(f"the map holds no landmark {named[~held][0]}")
-
-    def _is_ready(self, landmark_id: int) -> np.ndarray:
-        layout = self._layout_of(landmark_id)
-        return layout.landmark.ready(self.read(np.array([landmark_id])))[:, 0]

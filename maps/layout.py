@@ -41,7 +41,20 @@ class Layout:
             InputError: the shapes do not fit the parametrisation, or a number is not finite.
         """
         n, k = records.mean.shape[:2]
-        self._check(records, n, k)
+        dim, components = self.landmark.dim, self.landmark.components
+        middle = (components,) if components > 1 else ()
+        name = type(self.landmark).__name__
+        if records.mean.shape != (n, k, *middle, dim) or records.cov.shape != (n, k, *middle, dim, dim):
+            raise InputError(
+                f"{name} has {components} component(s) of dimension {dim}: expected means {(n, k, *middle, dim)}, "
+                f"got means {records.mean.shape} and covariances {records.cov.shape}"
+            )
+        if (records.log_weights is None) != (components == 1):
+            raise InputError(f"{name} needs log_weights exactly if it has several components")
+        if (records.const is None) != (self.landmark.constants == 0):
+            raise InputError(
+                f"{name} has {self.landmark.constants} constants per landmark: give them in Records.const"
+            )
         body = np.concatenate([records.mean, gaussian.pack(records.cov)], axis=-1)
         body = body.reshape(n, k, self.landmark.components * self.gaussian_fields)
         parts = [body]
@@ -73,19 +86,3 @@ class Layout:
             mean, cov = mean[:, :, 0], cov[:, :, 0]
         const = rows[..., end : end + self.landmark.constants] if self.landmark.constants else None
         return Records(mean, cov, const, log_weights)
-
-    def _check(self, records: Records, n: int, k: int) -> None:
-        dim, components = self.landmark.dim, self.landmark.components
-        middle = (components,) if components > 1 else ()
-        name = type(self.landmark).__name__
-        if records.mean.shape != (n, k, *middle, dim) or records.cov.shape != (n, k, *middle, dim, dim):
-            raise InputError(
-                f"{name} has {components} component(s) of dimension {dim}: expected means {(n, k, *middle, dim)}, "
-                f"got means {records.mean.shape} and covariances {records.cov.shape}"
-            )
-        if (records.log_weights is None) != (components == 1):
-            raise InputError(f"{name} needs log_weights exactly if it has several components")
-        if (records.const is None) != (self.landmark.constants == 0):
-            raise InputError(
-                f"{name} has {self.landmark.constants} constants per landmark: give them in Records.const"
-            )

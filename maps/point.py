@@ -1,10 +1,11 @@
-"""Landmarks that are Gaussian points: in the plane or in space, free or in the frame of an anchor."""
+"""Landmarks that are points in the plane or in space: Gaussian, in the frame of an anchor, or on a curve (a mixture)."""
 
 from typing import final
 
 import numpy as np
 
-from rbpf.core.models import Landmark
+from rbpf import gaussian
+from rbpf.core.models import Landmark, Records
 from rbpf.lie import SE2Group, SE3Group
 
 
@@ -42,3 +43,63 @@ class AnchoredPoint(Landmark):
         assert const is not None
         world = self.space.transform(const, mean)
         return np.concatenate([world, np.ones((*world.shape[:-1], 1))], axis=-1)
+
+
+@final
+class MixturePoint(Landmark):
+    """A world point as C weighted Gaussians, as the ring that a range-only beacon leaves: Mathematics (mixture).
+
+    Args:
+        components: C, at least 2.
+        dim: 2 or 3.
+        dominant: it is ready to become a single Gaussian when the components within reach of the heaviest one have
+            this weight together.
+        reach: distance from the heaviest component, in its standard deviations, within which another one says the same.
+    """
+
+    def __init__(self, components: int, dim: int = 2, dominant: float = 0.99, reach: float = 3.0) -> None:
+        self.components = components
+        self.dim = dim
+        self.dominant = dominant
+        self.reach = reach
+
+    def homogeneous(self, mean: np.ndarray, const: np.ndarray | None = None) -> np.ndarray:
+        """(…, D) → (…, D+1)."""
+        return np.concatenate([mean, np.ones((*mean.shape[:-1], 1))], axis=-1)
+
+    def ready(self, records: Records) -> np.ndarray:
+        """Whether one component dominates, with those that have come to the same place, (N, K)."""
+        assert records.log_weights is not None
+        heaviest = records.log_weights.argmax(axis=-1)[..., None, None]
+        mean = np.take_along_axis(records.mean, heaviest, axis=2)
+        cov = np.take_along_axis(records.cov, heaviest[..., None], axis=2)
+        offset = gaussian.solve_lower(
+            gaussian.cholesky(np.broadcast_to(cov, records.cov.shape)), records.mean - mean
+        )
+        near = np.square(offset).sum(axis=-1) <= self.reach**2
+        return (np.exp(records.log_weights) * near).sum(axis=-1) >= self.dominant
+
+
+def ring(centre: np.ndarray, radius: np.ndarray, std_radius: float, components: int) -> Records:
+    """Gaussians along a circle, for a beacon whose range alone was measured.
+
+    Args:
+        centre: (N, 2) positions of the sensor.
+        radius: (K,) ranges, metres.
+        std_radius: of the ranges, metres.
+        components: C; neighbours overlap at one standard deviation along the circle.
+
+    Returns:
+        Records with means (N, K, C, 2), covariances (N, K, C, 2, 2) and equal weights.
+    """
+    angle = 2 * np.pi * np.arange(components) / components
+    along = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    across = np.stack([-np.sin(angle), np.cos(angle)], axis=-1)
+    mean = centre[:, None, None, :] + radius[None, :, None, None] * along
+    half_step = radius * np.sin(np.pi / components)
+    cov = std_radius**2 * along[:, :, None] * along[:, None, :] + np.multiply.outer(
+        half_step**2, across[:, :, None] * across[:, None, :]
+    )
+    n, k = centre.shape[0], radius.size
+    weights = np.full((n, k, components), -np.log(components))
+    return Records(mean, np.broadcast_to(cov, (n, k, components, 2, 2)).copy(), None, weights)

@@ -1,22 +1,205 @@
-"""Runs the rows of a plan: compiled where the model has a kernel, else in NumPy; stacked where they share one."""
+"""Observations of landmarks in a step: which of them must be taken together, and what they say and change.
+
+Rows that speak of different landmarks are independent given the state; rows of one landmark that a particle observes
+twice in a step (two cameras, two groups) are correlated through it and are stacked. Rows run compiled where the model
+has a kernel, else in NumPy.
+"""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from rbpf import gaussian
-from rbpf.core import reference
+from rbpf.core import linearisation
 from rbpf.core.likelihoods import Gaussian
-from rbpf.core.models import FusedKernel, Likelihood, LogDensities, Observations, Part, Records
-from rbpf.core.numeric import linearise
-from rbpf.core.proposals import Prior, Terms
-from rbpf.kernels.refine import refine
-from rbpf.kernels.threads import run_driver
-from rbpf.kernels.update import update
+from rbpf.core.linearisation import linearise
+from rbpf.core.models import NEW, NULL, FusedKernel, Likelihood, LogDensities, Observations, Part, Records
+from rbpf.core.particles import Information, Prior
+from rbpf.errors import InputError
+from rbpf.kernels.landmarks import refine, update
+from rbpf.kernels.signature import run_driver
 from rbpf.lie import LieGroup
 from rbpf.maps.layout import Layout
-from rbpf.maps.plan import Batch, Plan, Row
-from rbpf.maps.shared import SharedStore
+from rbpf.maps.store import SharedStore
+
+STATE = frozenset({Part.STATE})
+MAP = frozenset({Part.LANDMARK})
+BOTH = STATE | MAP
+"""What observations update."""
+
+Kinds = Callable[[np.ndarray], np.ndarray]
+"""Numbers (K,) of the parametrisations of landmarks (K,), -1 where the map holds none."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """Measurement k of a group speaks of a landmark, in the particles of `mask` (N,); None is all."""
+
+    group: int
+    k: int
+    landmark: int
+    mask: np.ndarray | None
+
+
+@dataclass
+class Batch:
+    """Independent rows of one group: measurements `ks` (K,) of landmarks `ids` (K,), in `mask` (N, K) or all."""
+
+    group: int
+    ks: np.ndarray
+    ids: np.ndarray
+    mask: np.ndarray | None = None
+
+
+@dataclass
+class Plan:
+    """All rows of a step.
+
+    Attributes:
+        batches: independent rows of single-Gaussian landmarks.
+        joint: rows that share a landmark.
+        mixtures: rows of landmarks with several components, which enter after sampling.
+        log_factor: (N,) what new and clutter observations cost.
+    """
+
+    log_factor: np.ndarray
+    batches: list[Batch] = field(default_factory=list)
+    joint: list[list[Row]] = field(default_factory=list)
+    mixtures: list[Row] = field(default_factory=list)
+
+
+def make_plan(groups: Sequence[Observations], n: int, kinds: Kinds, plain: np.ndarray) -> Plan:
+    """Sorts the rows of all groups.
+
+    Args:
+        groups: observations that read a landmark.
+        n: particles.
+        kinds: landmarks (K,) → numbers (K,) of their parametrisations, -1 where the map holds none.
+        plain: (kinds,) whether that parametrisation has a single component.
+
+    Raises:
+        InputError: ids are missing, have a wrong shape, or name a landmark that the map does not hold.
+    """
+    plan = Plan(np.zeros(n))
+    named = [_checked_ids(group, n, kinds) for group in groups]
+    for group, ids in zip(groups, named, strict=True):
+        for outcome, log_density in ((NEW, group.log_new), (NULL, group.log_clutter)):
+            if log_density != 0.0:
+                count = (ids == outcome).sum(axis=-1)
+                plan.log_factor += np.where(count > 0, log_density, 0.0) * count
+    if _are_simple(named, kinds, plain):
+        chosen = [np.flatnonzero(ids >= 0) for ids in named]
+        plan.batches = [Batch(number, ks, named[number][ks]) for number, ks in enumerate(chosen) if ks.size]
+        return plan
+    rows: dict[int, list[Row]] = {}
+    for number, ids in enumerate(named):
+        for row in _rows(number, ids):
+            rows.setdefault(row.landmark, []).append(row)
+    batches: dict[tuple[int, int], list[Row]] = {}
+    for landmark, observed in rows.items():
+        kind = int(kinds(np.array([landmark]))[0])
+        if not plain[kind]:
+            plan.mixtures.extend(observed)
+            continue
+        # Whether some particle observes the landmark in two rows.
+        masks = [row.mask for row in observed if row.mask is not None]
+        if len(observed) > 1 and (len(masks) < len(observed) or (np.sum(masks, axis=0) > 1).any()):
+            plan.joint.append(observed)
+            continue
+        for row in observed:
+            batches.setdefault((row.group, kind), []).append(row)
+    for together in batches.values():
+        ks, ids = np.array([row.k for row in together]), np.array([row.landmark for row in together])
+        batch = Batch(together[0].group, ks, ids)
+        if any(row.mask is not None for row in together):
+            everyone = np.ones(n, dtype=bool)
+            mask = np.array([everyone if row.mask is None else row.mask for row in together])
+            batch.mask = np.ascontiguousarray(mask.T)
+        plan.batches.append(batch)
+    return plan
+
+
+def _are_simple(named: Sequence[np.ndarray], kinds: Kinds, plain: np.ndarray) -> bool:
+    """Whether all particles agree, no landmark is observed twice and each group's have one plain parametrisation."""
+    seen = set[int]()
+    for ids in named:
+        if ids.ndim != 1:
+            return False
+        landmarks = [landmark for landmark in ids.tolist() if landmark >= 0]
+        before = len(seen)
+        seen.update(landmarks)
+        if len(seen) < before + len(landmarks):
+            return False
+        of = kinds(np.array(landmarks, dtype=np.int64))
+        if of.size and not (plain[of[0]] and (of == of[0]).all()):
+            return False
+    return True
+
+
+def _checked_ids(group: Observations, n: int, kinds: Kinds) -> np.ndarray:
+    ids, count = group.ids, group.z.shape[0]
+    if ids is None:
+        raise InputError(f"{type(group.model).__name__} reads a landmark: its observations need ids")
+    if ids.shape not in ((count,), (n, count)):
+        raise InputError(f"ids of {count} measurements must be ({count},) or ({n}, {count}), got {ids.shape}")
+    if ids.dtype.kind != "i" or (ids.size and ids.min() < NEW):
+        raise InputError(
+            f"ids of {type(group.model).__name__} must be integers: landmarks, NULL = -1 or NEW = -2"
+        )
+    named = ids[ids >= 0]
+    held = kinds(named) >= 0
+    if not held.all():
+        raise InputError(f"a measurement names landmark {named[~held][0]}, which the map does not hold")
+    return ids
+
+
+def _rows(number: int, ids: np.ndarray) -> list[Row]:
+    if ids.ndim == 1:
+        return [Row(number, k, landmark, None) for k, landmark in enumerate(ids.tolist()) if landmark >= 0]
+    rows = []
+    for k in range(ids.shape[1]):
+        column = ids[:, k]
+        first = int(column[0])
+        if (column == first).all():
+            if first >= 0:
+                rows.append(Row(number, k, first, None))
+            continue
+        rows.extend(
+            Row(number, k, int(landmark), column == landmark)
+            for landmark in np.unique(column)
+            if landmark >= 0
+        )
+    return rows
+
+
+def by_use(groups: Sequence[Observations]) -> dict[frozenset[Part], list[Observations]]:
+    """The groups by what they update."""
+    uses: dict[frozenset[Part], list[Observations]] = {STATE: [], BOTH: [], MAP: []}
+    for group in groups:
+        uses[group.updates].append(group)
+    return uses
+
+
+def require_apart(weigh: Sequence[Observations], both: Sequence[Observations]) -> None:
+    """Rows of one landmark are correlated through it; those that do not update it cannot be stacked with others.
+
+    Raises:
+        InputError: a landmark is in both.
+    """
+    if not weigh or not both:
+        return
+    seen = [
+        np.concatenate([np.ravel(group.ids) for group in part if group.ids is not None])
+        for part in (weigh, both)
+    ]
+    shared = np.intersect1d(seen[0][seen[0] >= 0], seen[1])
+    if shared.size:
+        raise InputError(
+            f"landmark {shared[0]} is observed by a group that updates the state alone and by one that updates both: "
+            "split the second into one for each"
+        )
+
 
 GAUSSIAN = Gaussian()
 _NO_MASK = np.zeros((0, 0), dtype=np.bool_)
@@ -37,29 +220,33 @@ class RowEngine:
         self.layout_of = layout_of
         self.compiled = compiled
 
-    def terms(self, plan: Plan, state: np.ndarray, groups: Sequence[Observations], prior: Prior) -> Terms:
-        """Information of all rows but the late ones, about a right perturbation of the states (N, E)."""
-        total = Terms.zeros(state.shape[0], self.space.dim)
+    def information(
+        self, plan: Plan, state: np.ndarray, groups: Sequence[Observations], prior: Prior
+    ) -> Information:
+        """Information of all rows but those of mixtures, about a right perturbation of the states (N, E)."""
+        total = Information.zeros(state.shape[0], self.space.dim)
         total.log_factor += plan.log_factor
         for batch in plan.batches:
             group = groups[batch.group]
             kernel = self._kernel(group)
             if kernel is None:
-                total.add(self._terms_numpy(batch, group, state, prior))
+                total.add(self._information_numpy(batch, group, state, prior))
             else:
-                self._terms_compiled(kernel, batch, group, state, prior, total)
+                self._information_compiled(kernel, batch, group, state, prior, total)
         for rows in plan.joint:
             nu, jac, records, noise, log_factor = self._joint(rows, groups, state, prior)
             jac_map = jac[..., self.space.dim :]
             cov = gaussian.symmetrise(jac_map @ records.cov[:, 0] @ np.swapaxes(jac_map, -1, -2)) + noise
             jac_state = jac[..., : self.space.dim]
-            total.add(reference.information(nu[:, None], jac_state[:, None], cov[:, None], GAUSSIAN, prior))
+            total.add(
+                linearisation.information(nu[:, None], jac_state[:, None], cov[:, None], GAUSSIAN, prior)
+            )
             total.log_factor += log_factor
             literal = np.repeat(
                 [not _likelihood(groups[row.group]).normalised for row in rows],
                 [groups[row.group].model.dim for row in rows],
             )
-            total.log_factor += reference.log_normaliser(cov, literal)
+            total.log_factor += linearisation.log_normaliser(cov, literal)
         return total
 
     def correct(self, plan: Plan, state: np.ndarray, groups: Sequence[Observations]) -> LogDensities:
@@ -74,10 +261,10 @@ class RowEngine:
                 self._correct_compiled(kernel, batch, group, state, log_density)
         for rows in plan.joint:
             self._correct_joint(rows, groups, state, log_density)
-        late = np.zeros(state.shape[0])
-        for row in plan.late:
-            late += self._correct_mixture(row, groups[row.group], state)
-        return LogDensities(log_density + late, late)
+        after_sampling = np.zeros(state.shape[0])
+        for row in plan.mixtures:
+            after_sampling += self._correct_mixture(row, groups[row.group], state)
+        return LogDensities(log_density + after_sampling, after_sampling)
 
     def _kernel(self, group: Observations) -> FusedKernel | None:
         if not self.compiled or (group.likelihood is not None and group.likelihood.kernel_id < 0):
@@ -88,14 +275,14 @@ class RowEngine:
         landmark = self.layout_of(column).landmark
         return np.array([self.space.dim, landmark.dim, landmark.constants])
 
-    def _terms_compiled(
+    def _information_compiled(
         self,
         kernel: FusedKernel,
         batch: Batch,
         group: Observations,
         state: np.ndarray,
         prior: Prior,
-        total: Terms,
+        total: Information,
     ) -> None:
         access = self.store.access(batch.ids)
         likelihood = group.likelihood or GAUSSIAN
@@ -166,7 +353,9 @@ class RowEngine:
         for column, records in zip(ids.tolist(), columns, strict=True):
             self.store.replace(column, records)
 
-    def _terms_numpy(self, batch: Batch, group: Observations, state: np.ndarray, prior: Prior) -> Terms:
+    def _information_numpy(
+        self, batch: Batch, group: Observations, state: np.ndarray, prior: Prior
+    ) -> Information:
         _, records = self._read(batch.ids)
         z, noise = group.z[batch.ks], group.cov[batch.ks]
         parts = []
@@ -174,11 +363,11 @@ class RowEngine:
             mean, cov_map, const = _taken(records, part)
             nu, jac = linearise(group.model, self.space, z, state[part, None], mean, const)
             assert jac.state is not None and jac.landmark is not None
-            cov = reference.innovation_covariance(jac.landmark, cov_map, noise)
+            cov = linearisation.innovation_covariance(jac.landmark, cov_map, noise)
             mask = None if batch.mask is None else batch.mask[part]
             likelihood = _likelihood(group)
-            parts.append(reference.information(nu, jac.state, cov, likelihood, prior.take(part), mask))
-        return Terms.of_parts(parts)
+            parts.append(linearisation.information(nu, jac.state, cov, likelihood, prior.take(part), mask))
+        return Information.of_parts(parts)
 
     def _correct_numpy(
         self, batch: Batch, group: Observations, state: np.ndarray, log_density: np.ndarray
@@ -202,7 +391,7 @@ class RowEngine:
             )
             assert jac.landmark is not None
             mask = None if batch.mask is None else batch.mask[part][:, rows]
-            mean, cov, log_terms = reference.updated(
+            mean, cov, log_terms = linearisation.updated(
                 nu, jac.landmark, mean, cov, group.cov[ks], _likelihood(group), mask
             )
             log_density[part] += log_terms.sum(axis=1)
@@ -228,14 +417,14 @@ class RowEngine:
             mask = row.mask
             likelihood = _likelihood(group)
             if prior is not None and likelihood.kernel_id != 0:
-                cov = reference.innovation_covariance(jac.landmark, records.cov, group.cov[row.k])
-                mask, log_row = reference.gated(nu, jac.state, cov, likelihood, prior, mask)
+                cov = linearisation.innovation_covariance(jac.landmark, records.cov, group.cov[row.k])
+                mask, log_row = linearisation.gated(nu, jac.state, cov, likelihood, prior, mask)
                 log_factor += log_row
             nus.append(nu[:, 0].copy())
             jacs.append(np.concatenate([jac.state[:, 0], jac.landmark[:, 0]], axis=-1))
             noises.append(group.cov[row.k])
             masks.append(mask)
-        nu, jac_all, noise = reference.stacked(nus, jacs, noises, masks)
+        nu, jac_all, noise = linearisation.stacked(nus, jacs, noises, masks)
         return nu, jac_all, records, noise, log_factor
 
     def _correct_joint(
@@ -253,7 +442,7 @@ class RowEngine:
             return
         nu, jac, records, noise, _ = self._joint(rows, groups, state)
         jac_map = jac[:, None, :, self.space.dim :]
-        mean, cov, log_terms = reference.updated(
+        mean, cov, log_terms = linearisation.updated(
             nu[:, None], jac_map, records.mean, records.cov, noise[:, None], GAUSSIAN
         )
         log_density += log_terms[:, 0]
@@ -271,7 +460,7 @@ class RowEngine:
         assert jac.landmark is not None
         mask = None if row.mask is None else np.repeat(row.mask[:, None], mean.shape[1], axis=1)
         likelihood = group.likelihood or GAUSSIAN
-        new_mean, new_cov, log_terms = reference.updated(
+        new_mean, new_cov, log_terms = linearisation.updated(
             nu, jac.landmark, mean, cov, group.cov[row.k], likelihood, mask
         )
         joint = records.log_weights[:, 0] + log_terms

@@ -13,8 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from rbpf.lie import SE3, Array
-from rbpf.lie.matrices import skew
+from rbpf.lie import SE3, Array, skew
 
 
 class PinholeCamera(Protocol):

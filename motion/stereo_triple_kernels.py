@@ -8,8 +8,7 @@ import math
 import numpy as np
 from numba import njit
 
-from rbpf.kernels.quaternion import cross, multiply, turned
-from rbpf.kernels.rigid import exp_pair
+from rbpf.kernels.se3 import cross, exp_pair, multiply, turned
 
 STIFFNESS = 1e-9
 """Added to the information of a triple, as a fraction of its trace: three points on a line leave a turn open."""

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from rbpf.core.likelihoods import Gaussian as Gaussian
     from rbpf.core.likelihoods import GaussianWithOutliers as GaussianWithOutliers
     from rbpf.core.likelihoods import TruncatedMahalanobis as TruncatedMahalanobis
+    from rbpf.core.marginals import KalmanSubstate as KalmanSubstate
     from rbpf.core.models import NEW as NEW
     from rbpf.core.models import NULL as NULL
     from rbpf.core.models import Conditional as Conditional
@@ -40,7 +41,6 @@ if TYPE_CHECKING:
     from rbpf.core.resampling import Systematic as Systematic
     from rbpf.core.smoothing import ancestral_smoothing as ancestral_smoothing
     from rbpf.core.smoothing import backward_simulation as backward_simulation
-    from rbpf.core.substate import KalmanSubstate as KalmanSubstate
     from rbpf.errors import InputError as InputError
     from rbpf.kernels.signature import observation_kernel as observation_kernel
     from rbpf.lie import SE2 as SE2
@@ -48,10 +48,10 @@ if TYPE_CHECKING:
     from rbpf.lie import Euclidean as Euclidean
     from rbpf.lie import Product as Product
     from rbpf.maps.landmark_map import LandmarkMap as LandmarkMap
-    from rbpf.maps.mixture import MixturePoint as MixturePoint
-    from rbpf.maps.mixture import ring as ring
     from rbpf.maps.point import AnchoredPoint as AnchoredPoint
+    from rbpf.maps.point import MixturePoint as MixturePoint
     from rbpf.maps.point import Point as Point
+    from rbpf.maps.point import ring as ring
     from rbpf.motion.odometry import Odometry as Odometry
     from rbpf.motion.odometry import OdometryMotion as OdometryMotion
     from rbpf.sensors.landmark_sensor import AnonymousLandmarkSensor as AnonymousLandmarkSensor
@@ -76,8 +76,7 @@ _HOMES = {
     "lie": ["SE2", "SE3", "Euclidean", "Product"],
     "core.likelihoods": ["Gaussian", "GaussianWithOutliers", "TruncatedMahalanobis"],
     "maps.landmark_map": ["LandmarkMap"],
-    "maps.mixture": ["ring", "MixturePoint"],
-    "maps.point": ["AnchoredPoint", "Point"],
+    "maps.point": ["AnchoredPoint", "MixturePoint", "Point", "ring"],
     "core.models": [
         "FusedKernel",
         "NEW",
@@ -99,7 +98,7 @@ _HOMES = {
     ],
     "core.proposals": ["EkfProposal", "PriorProposal"],
     "core.resampling": ["EssTriggered", "Multinomial", "Residual", "Stratified", "Systematic"],
-    "core.substate": ["KalmanSubstate"],
+    "core.marginals": ["KalmanSubstate"],
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 __all__ = ["__version__", *_HOME_OF]

@@ -5,7 +5,7 @@ from typing import Any, final
 
 import numpy as np
 
-from rbpf.core.exchange import NULL
+from rbpf.core.models import NULL
 
 
 @final

@@ -6,8 +6,16 @@ from typing import Protocol, final
 import numpy as np
 
 from rbpf.core.association import ExistenceModel, Gates, associate
-from rbpf.core.belief import Belief
-from rbpf.core.models import NEW, Landmark, Likelihood, NewLandmarks, ObservationModel, Observations, Sensor
+from rbpf.core.models import (
+    NEW,
+    Belief,
+    Landmark,
+    Likelihood,
+    NewLandmarks,
+    ObservationModel,
+    Observations,
+    Sensor,
+)
 from rbpf.errors import InputError
 
 

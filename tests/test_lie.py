@@ -1,7 +1,10 @@
-"""Group axioms, charts, Jacobians and means: the same tests for every group and every angle."""
+"""Group axioms, charts, Jacobians and means: the same tests for every group, every angle and any input."""
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3, Euclidean, LieGroup, Product
@@ -37,16 +40,19 @@ def random_elements(group: LieGroup, rng: np.random.Generator, shape: tuple[int,
     return group.exp(rng.normal(size=(*shape, group.dim)))
 
 
+def assert_same(group: LieGroup, a: np.ndarray, b: np.ndarray, atol: float = 1e-14) -> None:
+    """As elements of the group."""
+    np.testing.assert_allclose(group.local(a, b), 0.0, atol=atol)
+
+
 @every_group
 @every_batch
 def test_group_axioms(group, shape, rng):
     a, b, c = (random_elements(group, rng, shape) for _ in range(3))
-    one = group.identity(shape)
-    compose, inverse, local = group.compose, group.inverse, group.local
-    zero = np.zeros((*shape, group.dim))
-    np.testing.assert_allclose(local(compose(compose(a, b), c), compose(a, compose(b, c))), zero, atol=1e-14)
-    np.testing.assert_allclose(local(compose(a, inverse(a)), one), zero, atol=1e-14)
-    np.testing.assert_allclose(local(compose(inverse(a), a), one), zero, atol=1e-14)
+    one, compose, inverse = group.identity(shape), group.compose, group.inverse
+    assert_same(group, compose(compose(a, b), c), compose(a, compose(b, c)))
+    assert_same(group, compose(a, inverse(a)), one)
+    assert_same(group, compose(inverse(a), a), one)
     np.testing.assert_allclose(compose(a, one), a, atol=1e-15)
     np.testing.assert_allclose(compose(one, a), a, atol=1e-15)
     np.testing.assert_allclose(group.between(a, compose(a, b)), b, atol=1e-14)
@@ -79,76 +85,48 @@ def test_lists_and_views_are_accepted_and_never_written(group, rng):
 
 @every_group
 @every_angle
-def test_exp_and_log_are_inverse_to_the_last_digits(group, angle, rng):
-    xi = tangents(group, rng, (20,), angle)
-    n = rotations(group)
+def test_exp_and_log_retract_and_local_are_inverse_to_the_last_digits(group, angle, rng):
+    xi, x, n = tangents(group, rng, (20,), angle), random_elements(group, rng, (20,)), rotations(group)
     with np.errstate(all="raise", under="ignore"):
         back = group.log(group.exp(xi))
+        y = group.retract(x, xi)
+        np.testing.assert_allclose(y, group.compose(x, group.exp(xi)), rtol=0.0, atol=1e-14)
+        np.testing.assert_allclose(group.local(x, y), xi, rtol=0.0, atol=2e-14)
+        np.testing.assert_allclose(group.local(x, y), group.log(group.between(x, y)), rtol=0.0, atol=2e-14)
     np.testing.assert_allclose(back[:, :n], xi[:, :n], rtol=0.0, atol=4e-15 * angle)
     np.testing.assert_allclose(back[:, n:], xi[:, n:], rtol=0.0, atol=1e-14)
 
 
 @every_group
 @every_angle
-def test_retract_and_local_are_inverse(group, angle, rng):
-    x = random_elements(group, rng, (20,))
-    xi = tangents(group, rng, (20,), angle)
-    with np.errstate(all="raise", under="ignore"):
-        y = group.retract(x, xi)
-        np.testing.assert_allclose(y, group.compose(x, group.exp(xi)), rtol=0.0, atol=1e-14)
-        np.testing.assert_allclose(group.local(x, y), xi, rtol=0.0, atol=2e-14)
-        np.testing.assert_allclose(group.local(x, y), group.log(group.between(x, y)), rtol=0.0, atol=2e-14)
-
-
-@every_group
-@every_angle
-def test_adjoint_moves_an_increment_to_the_left(group, angle, rng):
-    a = random_elements(group, rng, (20,))
-    xi = tangents(group, rng, (20,), angle)
+def test_adjoint_and_jacobians(group, angle, rng):
+    """The adjoint moves an increment to the left; the Jacobians are central differences, and inverse to one another."""
+    a, xi = random_elements(group, rng, (20,)), tangents(group, rng, (20,), angle)
     left = group.compose(group.exp(np.einsum("nij,nj->ni", group.adjoint(a), xi)), a)
-    np.testing.assert_allclose(
-        group.local(group.compose(a, group.exp(xi)), left), np.zeros_like(xi), atol=5e-14
-    )
-
-
-@every_group
-@every_angle
-def test_jacobians_equal_central_differences(group, angle, rng):
+    assert_same(group, group.compose(a, group.exp(xi)), left, 5e-14)
+    with np.errstate(all="raise", under="ignore"):
+        eye = np.broadcast_to(np.eye(group.dim), (20, group.dim, group.dim))
+        both = group.left_jacobian(xi) @ group.left_jacobian_inverse(xi)
+        np.testing.assert_allclose(both, eye, atol=2e-14)
+        both = group.right_jacobian_inverse(xi) @ group.right_jacobian(xi)
+        np.testing.assert_allclose(both, eye, atol=2e-14)
     # A step of 1e-5 truncates at 1e-10 and rounds at 1e-10.
-    xi = tangents(group, rng, (4, 1), angle)
-    step = 1e-5 * np.eye(group.dim)
+    xi, step = xi[:4, None], 1e-5 * np.eye(group.dim)
     centre = group.exp(xi)
     right = group.local(centre, group.exp(xi + step)) - group.local(centre, group.exp(xi - step))
     numeric = np.swapaxes(right, -1, -2) / 2e-5
     np.testing.assert_allclose(group.right_jacobian(xi[:, 0]), numeric, atol=2e-9)
-    left = np.einsum("nij,njk->nik", group.adjoint(centre[:, 0]), numeric)
-    np.testing.assert_allclose(group.left_jacobian(xi[:, 0]), left, atol=2e-8)
-
-
-@every_group
-@every_angle
-def test_jacobian_inverses(group, angle, rng):
-    xi = tangents(group, rng, (2, 5), angle)
-    eye = np.broadcast_to(np.eye(group.dim), (2, 5, group.dim, group.dim))
-    with np.errstate(all="raise", under="ignore"):
-        left = group.left_jacobian(xi) @ group.left_jacobian_inverse(xi)
-        right = group.right_jacobian_inverse(xi) @ group.right_jacobian(xi)
-    np.testing.assert_allclose(left, eye, atol=2e-14)
-    np.testing.assert_allclose(right, eye, atol=2e-14)
+    by_left = np.einsum("nij,njk->nik", group.adjoint(centre[:, 0]), numeric)
+    np.testing.assert_allclose(group.left_jacobian(xi[:, 0]), by_left, atol=2e-8)
 
 
 @every_group
 def test_interpolation_meets_its_ends_and_adds_up(group, rng):
     a, b = random_elements(group, rng, (2, 7))
     near = group.retract(a, 0.3 * group.local(a, b))
-    np.testing.assert_allclose(
-        group.local(group.interpolate(a, b, 0.0), a), np.zeros((7, group.dim)), atol=1e-14
-    )
-    np.testing.assert_allclose(
-        group.local(group.interpolate(a, b, 1.0), b), np.zeros((7, group.dim)), atol=1e-14
-    )
-    fractions = np.linspace(0.0, 1.0, 7)
-    assert group.interpolate(a[0], b[0], fractions).shape == (7, group.size)
+    assert_same(group, group.interpolate(a, b, 0.0), a)
+    assert_same(group, group.interpolate(a, b, 1.0), b)
+    assert group.interpolate(a[0], b[0], np.linspace(0.0, 1.0, 7)).shape == (7, group.size)
     np.testing.assert_allclose(group.interpolate(a, b, np.full(7, 0.3)), near, atol=1e-14)
 
 
@@ -159,7 +137,7 @@ def test_mean_of_a_symmetric_cloud_is_its_centre(group, rng):
     cloud = group.retract(centre, np.concatenate([xi, -xi]))
     weights = np.tile(rng.dirichlet(np.ones(10)), 2) / 2.0
     mean = group.mean(cloud, weights)
-    np.testing.assert_allclose(group.local(centre, mean), np.zeros(group.dim), atol=1e-13)
+    assert_same(group, centre, mean, 1e-13)
     np.testing.assert_array_equal(group.mean(cloud, weights), mean)
 
 
@@ -170,10 +148,7 @@ def test_weighted_mean_is_stationary_and_moves_with_its_cloud(group, rng):
     mean = group.mean(cloud, weights)
     np.testing.assert_allclose(weights @ group.local(mean, cloud), np.zeros(group.dim), atol=1e-14)
     shift = random_elements(group, rng, ())
-    moved = group.mean(group.compose(shift, cloud), weights)
-    np.testing.assert_allclose(
-        group.local(group.compose(shift, mean), moved), np.zeros(group.dim), atol=1e-13
-    )
+    assert_same(group, group.compose(shift, mean), group.mean(group.compose(shift, cloud), weights), 1e-13)
 
 
 @every_group
@@ -182,6 +157,31 @@ def test_normalise_repairs_storage_and_keeps_valid_elements(group, rng):
     np.testing.assert_allclose(group.normalise(x), x, rtol=1e-15)
     if group is SE3:
         np.testing.assert_allclose(SE3.normalise(x * np.r_[3.0 * np.ones(4), np.ones(3)]), x, rtol=1e-15)
+
+
+@every_group
+@given(
+    far=arrays(float, (3, 12), elements=st.floats(-20.0, 20.0)),
+    near=arrays(float, (2, 12), elements=st.floats(-3.0, 3.0)),
+    inside=arrays(float, 12, elements=st.floats(-1.0, 1.0)),
+)
+def test_any_input(group, far, near, inside):
+    """Vectors as long as the longest tangent; each group takes what it needs."""
+    a, b, c = group.exp(far[:, : group.dim])
+    compose, inverse = group.compose, group.inverse
+    tolerance = 1e-13 * (1.0 + np.abs(far).max())
+    assert_same(group, compose(compose(a, b), c), compose(a, compose(b, c)), tolerance)
+    assert_same(group, inverse(compose(a, b)), compose(inverse(b), inverse(a)), tolerance)
+    assert_same(group, a, group.exp(group.log(a)), tolerance)
+    # Three components of at most one turn by less than pi.
+    x, xi = group.exp(inside[: group.dim]), inside[::-1][: group.dim]
+    np.testing.assert_allclose(group.local(x, group.retract(x, xi)), xi, rtol=0.0, atol=1e-14)
+    # The adjoint is a homomorphism, and the left Jacobian over the right one.
+    a, b = group.exp(near[:, : group.dim])
+    product = group.adjoint(a) @ group.adjoint(b)
+    np.testing.assert_allclose(group.adjoint(compose(a, b)), product, atol=1e-12)
+    left = group.adjoint(a) @ group.right_jacobian(near[0, : group.dim])
+    np.testing.assert_allclose(left, group.left_jacobian(near[0, : group.dim]), atol=1e-12)
 
 
 def test_product_splits_and_joins(rng):

@@ -3,6 +3,9 @@
 import gtsam
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
@@ -104,6 +107,14 @@ def test_points_and_matrices(group, n, rng):
     )
 
 
+@pytest.mark.parametrize(("group", "n"), [(SE2, 2), (SE3, 3)], ids=["SE2", "SE3"])
+@given(arrays(float, (2, 6), elements=st.floats(-20.0, 20.0)))
+def test_moving_a_point_there_and_back(group, n, tangents):
+    a, point = group.exp(tangents[0, : group.dim]), tangents[1, :n]
+    back = group.inverse_transform(a, group.transform(a, point))
+    np.testing.assert_allclose(back, point, rtol=0.0, atol=1e-12)
+
+
 @pytest.mark.parametrize("axis", [*np.eye(3), -np.eye(3)[1], np.array([0.6, 0.0, -0.8])])
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 2.0, np.pi - 1e-9, np.pi])
 def test_quaternions_from_matrices_at_every_largest_component(axis, angle):
@@ -121,34 +132,30 @@ def test_rotations_agree_with_scipy(rng):
     yaw, pitch, roll = rng.uniform(-1.5, 1.5, (3, 40))
     angles = np.stack([yaw, pitch, roll], axis=-1)
     built = SE3.from_ypr(x[:, 4:], yaw, pitch, roll)
-    np.testing.assert_allclose(
-        SE3.rotation(built), Rotation.from_euler("ZYX", angles).as_matrix(), atol=1e-15
-    )
+    scipys = Rotation.from_euler("ZYX", angles).as_matrix()
+    np.testing.assert_allclose(SE3.rotation(built), scipys, atol=1e-15)
     np.testing.assert_array_equal(SE3.translation(built), x[:, 4:])
     np.testing.assert_allclose(np.stack(SE3.ypr(built), axis=-1), angles, atol=1e-14)
     assert SE3.from_ypr([1.0, 2.0, 3.0], yaw, 0.1, 0.2).shape == (40, 7)
 
 
-def test_space_agrees_with_gtsam(rng):
+def test_agrees_with_gtsam(rng):
     for xi, eta in rng.normal(size=(20, 2, 6)):
         pose, other = gtsam.Pose3.Expmap(xi), gtsam.Pose3.Expmap(eta)
         x, y = SE3.exp(xi), SE3.exp(eta)
-        np.testing.assert_allclose(SE3.matrix(x), pose.matrix(), atol=1e-14)
-        np.testing.assert_allclose(SE3.log(x), gtsam.Pose3.Logmap(pose), atol=1e-14)
-        np.testing.assert_allclose(SE3.matrix(SE3.between(x, y)), pose.between(other).matrix(), atol=1e-14)
-        np.testing.assert_allclose(SE3.adjoint(x), pose.AdjointMap(), atol=1e-14)
-        np.testing.assert_allclose(SE3.right_jacobian(xi), gtsam.Pose3.ExpmapDerivative(xi), atol=1e-14)
-        np.testing.assert_allclose(
-            SE3.right_jacobian_inverse(xi), gtsam.Pose3.LogmapDerivative(pose), atol=1e-13
-        )
-
-
-def test_plane_agrees_with_gtsam(rng):
+        for ours, theirs, atol in (
+            (SE3.matrix(x), pose.matrix(), 1e-14),
+            (SE3.log(x), gtsam.Pose3.Logmap(pose), 1e-14),
+            (SE3.matrix(SE3.between(x, y)), pose.between(other).matrix(), 1e-14),
+            (SE3.adjoint(x), pose.AdjointMap(), 1e-14),
+            (SE3.right_jacobian(xi), gtsam.Pose3.ExpmapDerivative(xi), 1e-14),
+            (SE3.right_jacobian_inverse(xi), gtsam.Pose3.LogmapDerivative(pose), 1e-13),
+        ):
+            np.testing.assert_allclose(ours, theirs, atol=atol)
     # GTSAM's planar tangent is [vx, vy, omega].
     order = [1, 2, 0]
     for xi in rng.normal(size=(20, 3)):
-        pose = gtsam.Pose2.Expmap(xi[order])
-        x = SE2.exp(xi)
-        np.testing.assert_allclose(SE2.matrix(x), pose.matrix(), atol=1e-14)
-        np.testing.assert_allclose(SE2.log(x)[order], gtsam.Pose2.Logmap(pose), atol=1e-14)
-        np.testing.assert_allclose(SE2.adjoint(x)[np.ix_(order, order)], pose.AdjointMap(), atol=1e-14)
+        flat, x = gtsam.Pose2.Expmap(xi[order]), SE2.exp(xi)
+        np.testing.assert_allclose(SE2.matrix(x), flat.matrix(), atol=1e-14)
+        np.testing.assert_allclose(SE2.log(x)[order], gtsam.Pose2.Logmap(flat), atol=1e-14)
+        np.testing.assert_allclose(SE2.adjoint(x)[np.ix_(order, order)], flat.AdjointMap(), atol=1e-14)

@@ -8,19 +8,18 @@ from typing import Annotated, get_args, get_origin
 import numpy as np
 import pytest
 
-import rbpf.core.exchange
 import rbpf.core.models
 import rbpf.gaussian
 import rbpf.lie
 import rbpf.sensors.camera
 from rbpf.arrays import Float
-from rbpf.core.exchange import Records
+from rbpf.core.models import Records
 from rbpf.gaussian import product
 from rbpf.lie import SE2, SE3
 from rbpf.sensors.camera import Pinhole
 from tests.shapes import ShapeError, checked, fits
 
-PUBLIC = [rbpf.core.exchange, rbpf.gaussian, rbpf.lie, rbpf.core.models, rbpf.sensors.camera]
+PUBLIC = [rbpf.gaussian, rbpf.lie, rbpf.core.models, rbpf.sensors.camera]
 on = pytest.mark.skipif(os.environ.get("RBPF_SHAPES") == "0", reason="shapes are not checked in this run")
 
 

@@ -21,8 +21,7 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
-from rbpf.core.belief import Belief
-from rbpf.core.models import NewLandmarks, Observations, Sensor
+from rbpf.core.models import Belief, NewLandmarks, Observations, Sensor
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.alignment import Alignment

@@ -20,9 +20,8 @@ import tyro
 from matplotlib.figure import Figure
 
 from examples.studies.streams import CameraStream, RobotStream, Turnover
-from rbpf.core.belief import Belief
 from rbpf.core.filter import Filter
-from rbpf.core.models import NewLandmarks, Observations, Sensor
+from rbpf.core.models import Belief, NewLandmarks, Observations, Sensor
 from rbpf.lie import SE2, SE3
 from rbpf.runs.folder import peak_memory_mb
 from rbpf.sensors.camera import Pinhole

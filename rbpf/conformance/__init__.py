@@ -4,17 +4,17 @@ Every check calls the model as the filter does, on random arguments or on those 
 the answer with what `rbpf.core.models` promises: shapes, numeric derivatives, the compiled twin, round trips.
 """
 
-from typing import Any
-
 import numpy as np
 
-from rbpf.conformance.arguments import Example, Scene
-from rbpf.conformance.calls import Check, run
-from rbpf.conformance.landmark import landmark_checks
-from rbpf.conformance.likelihood import likelihood_checks
-from rbpf.conformance.motion import motion_checks
+from rbpf.conformance.models import (
+    groups_of,
+    landmark_checks,
+    likelihood_checks,
+    motion_checks,
+    sensor_checks,
+)
 from rbpf.conformance.observation import observation_checks
-from rbpf.conformance.sensor import observe, sensor_checks
+from rbpf.conformance.trial import Check, Example, Scene, run
 from rbpf.core.models import Landmark, Likelihood, MotionModel, ObservationModel, Sensor
 from rbpf.errors import InputError
 from rbpf.lie import LieGroup
@@ -23,7 +23,7 @@ __all__ = ["Example", "check_model", "require_sound"]
 
 
 def check_model(
-    model: Any,
+    model: object,
     space: LieGroup | None = None,
     rng: np.random.Generator | None = None,
     example: Example | None = None,
@@ -45,14 +45,23 @@ def check_model(
     rng, example = rng or np.random.default_rng(0), example or Example()
     space = space or getattr(model, "space", None)
     if isinstance(model, Sensor):
-        findings = run(sensor_checks(model, example))
-        return findings or _of_observed_models(model, example, rng)
+        found = run(sensor_checks(model, example))
+        if found or example.belief is None:
+            return found
+        # Of a sound sensor, the models and likelihoods of what it observes.
+        observed: dict[str, None] = {}
+        for group in groups_of(model, example):
+            for part in (group.model, group.likelihood):
+                if part is not None:
+                    findings = check_model(part, example.belief.prior.space, rng, example)
+                    observed.update(dict.fromkeys(findings))
+        return list(observed)
     with np.errstate(all="ignore"):
         return run(_checks(model, space, rng, example))
 
 
 def require_sound(
-    model: Any,
+    model: object,
     space: LieGroup | None = None,
     rng: np.random.Generator | None = None,
     example: Example | None = None,
@@ -67,7 +76,7 @@ def require_sound(
         raise InputError("; ".join(findings))
 
 
-def _checks(model: Any, space: LieGroup | None, rng: np.random.Generator, example: Example) -> list[Check]:
+def _checks(model: object, space: LieGroup | None, rng: np.random.Generator, example: Example) -> list[Check]:
     name = type(model).__name__
     if isinstance(model, Likelihood):
         return likelihood_checks(model, rng)
@@ -79,15 +88,4 @@ def _checks(model: Any, space: LieGroup | None, rng: np.random.Generator, exampl
         raise InputError(f"{name} has no attribute space: tell check_model the group of the state")
     if isinstance(model, MotionModel):
         return motion_checks(model, space, rng, example)
-    return observation_checks(model, Scene.draw(model, space, rng, example), example)
-
-
-def _of_observed_models(sensor: Sensor, example: Example, rng: np.random.Generator) -> list[str]:
-    """Findings about the models and likelihoods of what the sensor observes."""
-    findings: dict[str, None] = {}
-    for group in observe(sensor, example):
-        for part in (group.model, group.likelihood):
-            if part is not None:
-                found = check_model(part, example.belief.prior.space, rng, example)
-                findings.update(dict.fromkeys(found))
-    return list(findings)
+    return observation_checks(model, Scene.draw(model, space, rng, example), example.landmark)

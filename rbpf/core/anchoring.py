@@ -1,10 +1,10 @@
-"""Where the start lies in each particle's world, told again from everything that was learnt since.
+"""The start pose in each particle's world, re-estimated from everything that was learnt since.
 
-A filter that starts from a known pose fixes its world by what it saw first, when the map was still poor; later
+A filter that starts from a known pose fixes its world by what it observed first, when the map was still poor; later
 observations sharpen the map, but no particle can move the world it has committed to. Where the models do not change
 when the whole world is moved (odometry, sensors that measure relative to the robot), the start pose of a particle can
 be re-estimated from its own map: given the rest of the trajectory and the map without the first frame's measurements,
-x_0 has the law of a filter step run backwards,
+x_0 has the distribution of a filter step run backwards,
 
     p(x_0 | x_1, u_1, z_0, m) ∝ p(x_1 | x_0, u_1) p(z_0 | x_0, m),    Mathematics (start-again)
 
@@ -14,18 +14,17 @@ relative to it.
 """
 
 from dataclasses import dataclass
-from typing import Any, final
+from typing import final
 
 import numpy as np
 
 from rbpf import gaussian
-from rbpf.core.estimate import Estimate, mixture_estimate
 from rbpf.core.filter import Filter, StepReport
 from rbpf.core.likelihoods import Gaussian
+from rbpf.core.linearisation import information, innovation_covariance, linearise
 from rbpf.core.models import Landmark, LineariseAt, NewLandmarks, ObservationModel, Records
-from rbpf.core.numeric import linearise
-from rbpf.core.proposals import EkfProposal, Prior, Terms
-from rbpf.core.reference import information, innovation_covariance
+from rbpf.core.particles import Estimate, Information, Prior, mixture_estimate
+from rbpf.core.proposals import EkfProposal
 from rbpf.errors import InputError
 from rbpf.lie import LieGroup
 
@@ -94,15 +93,31 @@ class StartAnchor:
         self._second: _FirstMotion | None = None
         self._latest: tuple[int, Anchored] | None = None
 
-    def after_step(self, report: StepReport, control: Any = None) -> Anchored:
+    def after_step(self, report: StepReport, control: object = None) -> Anchored:
         """Takes note of a step that moved by `control`; returns the start in each present particle's world."""
-        steps = self._filter.steps
+        filter_, steps = self._filter, self._filter.steps
         if steps == 1:
-            self._record_first(report)
+            first = 0
+            for new_landmarks in report.first_observations:
+                count = new_landmarks.z.shape[0]
+                self._seen.append((report.new_landmarks[first : first + count], new_landmarks))
+                first += count
+            self._stamp_ns = report.stamp_ns
         elif steps == 2:
-            self._record_second(report, control)
+            dt = (report.stamp_ns - self._stamp_ns) * 1e-9
+            transition = filter_.motion.transition(self._start[None], control, dt)
+            delta = filter_.space.between(self._start, transition.mean[0])
+            generation = filter_.lineage.generation
+            filter_.lineage.retain(generation)
+            self._second = _FirstMotion(
+                generation, filter_.particles.state.copy(), delta, transition.noise_factor[0]
+            )
         if self._latest is None or steps % self._every == 0 or steps <= 3:
-            self._remember(self.estimate())
+            anchored, lineage = self.estimate(), self._filter.lineage
+            if self._latest is not None:
+                lineage.release(self._latest[0])
+            lineage.retain(lineage.generation)
+            self._latest = (lineage.generation, anchored)
         return self.current()
 
     def current(self) -> Anchored:
@@ -117,10 +132,28 @@ class StartAnchor:
         space, n = self._filter.space, self._filter.n
         if self._second is None:
             return Anchored(np.repeat(self._start[None], n, axis=0), np.zeros((n, space.dim, space.dim)))
-        prior = self._prior()
-        proposed = self._proposal.propose(prior, _FirstFrame(prior, self._groups()))
+        # The first motion, backwards: x_0 = x_1 · Exp(−w) · Δ⁻¹ = x_1 Δ⁻¹ · Exp(−Ad_Δ w), with Δ = x_0⁻¹ E[x_1].
+        second = self._second
+        ancestors = second.state[self._filter.lineage.rows(second.generation)]
+        base = space.compose(ancestors, space.inverse(second.delta))
+        backwards = np.repeat((space.adjoint(second.delta) @ second.factor)[None], n, axis=0)
+        prior = Prior(space, base, np.zeros((1, space.dim)), backwards)
+        # The first frame's measurements of landmarks that are still held, which must be known from elsewhere too.
+        landmark_map, groups = self._filter.belief().map, []
+        for ids, first in self._seen:
+            held = landmark_map.holds(ids)
+            if held.any():
+                records = landmark_map.read(ids[held])
+                present = ~np.isneginf(landmark_map.log_odds(ids[held]))
+                groups.append(
+                    self._without_first_frame(records, first.model, first.z[held], first.cov[held], present)
+                )
+        proposed = self._proposal.propose(prior, _linearised_first_frame(prior, groups))
         mean = prior.at(np.einsum("nar,nr->na", prior.factor, proposed.mean))
-        return Anchored(mean, _square(prior.factor @ proposed.root))
+        # A square factor (N, d, d), also of noise of lower rank.
+        factor = prior.factor @ proposed.root
+        lacking = np.zeros((n, space.dim, space.dim - factor.shape[2]))
+        return Anchored(mean, np.concatenate([factor, lacking], axis=2))
 
     def state_estimate(self, anchored: Anchored) -> Estimate:
         """Mean and covariance of the present state relative to the start, start · x_0⁻¹ · x."""
@@ -154,7 +187,7 @@ class StartAnchor:
         return out
 
     def restore(self, arrays: dict[str, np.ndarray], model: ObservationModel, landmark: Landmark) -> None:
-        """The inverse of `arrays`; all first sightings must have been of one model and parametrisation."""
+        """The inverse of `arrays`; all first observations must have been of one model and parametrisation."""
         lineage = self._filter.lineage
         for number in range(int(arrays["anchor/groups"])):
             ids, z, cov = (arrays[f"anchor/{number}/{name}"].copy() for name in ("ids", "z", "cov"))
@@ -167,56 +200,6 @@ class StartAnchor:
             anchored = Anchored(arrays["anchor/latest_mean"].copy(), arrays["anchor/latest_factor"].copy())
             self._latest = (int(arrays["anchor/latest"]), anchored)
             lineage.take_up(self._latest[0])
-
-    def _record_first(self, report: StepReport) -> None:
-        first = 0
-        for new_landmarks in report.first_observations:
-            count = new_landmarks.z.shape[0]
-            self._seen.append((report.new_landmarks[first : first + count], new_landmarks))
-            first += count
-        self._stamp_ns = report.stamp_ns
-
-    def _record_second(self, report: StepReport, control: Any) -> None:
-        filter_ = self._filter
-        dt = (report.stamp_ns - self._stamp_ns) * 1e-9
-        transition = filter_.motion.transition(self._start[None], control, dt)
-        delta = filter_.space.between(self._start, transition.mean[0])
-        generation = filter_.lineage.generation
-        filter_.lineage.retain(generation)
-        self._second = _FirstMotion(
-            generation, filter_.particles.state.copy(), delta, transition.noise_factor[0]
-        )
-
-    def _remember(self, anchored: Anchored) -> None:
-        lineage = self._filter.lineage
-        if self._latest is not None:
-            lineage.release(self._latest[0])
-        lineage.retain(lineage.generation)
-        self._latest = (lineage.generation, anchored)
-
-    def _prior(self) -> Prior:
-        """x_0 = x_1 · Exp(−w) · Δ⁻¹ = x_1 Δ⁻¹ · Exp(−Ad_Δ w), with Δ = x_0⁻¹ E[x_1]."""
-        assert self._second is not None
-        space, second = self._filter.space, self._second
-        ancestors = second.state[self._filter.lineage.rows(second.generation)]
-        base = space.compose(ancestors, space.inverse(second.delta))
-        factor = space.adjoint(second.delta) @ second.factor
-        return Prior(space, base, np.zeros((1, space.dim)), np.repeat(factor[None], base.shape[0], axis=0))
-
-    def _groups(self) -> list["_Group"]:
-        landmark_map = self._filter.belief().map
-        groups = []
-        for ids, new_landmarks in self._seen:
-            held = np.array([i in landmark_map.store for i in ids.tolist()], dtype=bool)
-            if not held.any():
-                continue
-            records = landmark_map.read(ids[held])
-            present = ~np.isneginf(landmark_map.log_odds(ids[held]))
-            group = self._without_first_frame(
-                records, new_landmarks.model, new_landmarks.z[held], new_landmarks.cov[held], present
-            )
-            groups.append(group)
-        return groups
 
     def _without_first_frame(
         self, records: Records, model: ObservationModel, z: np.ndarray, cov_z: np.ndarray, present: np.ndarray
@@ -252,7 +235,7 @@ class _FirstMotion:
 
 @dataclass(frozen=True)
 class _Group:
-    """First sightings z (K, p) of landmarks known from elsewhere, and in which particles (N, K)."""
+    """First observations z (K, p) of landmarks known from elsewhere, and in which particles (N, K)."""
 
     records: Records
     model: ObservationModel
@@ -261,29 +244,20 @@ class _Group:
     use: np.ndarray
 
 
-class _FirstFrame(LineariseAt):
+def _linearised_first_frame(prior: Prior, groups: list[_Group]) -> LineariseAt:
     """Information of the first frame about the start."""
+    space = prior.space
 
-    def __init__(self, prior: Prior, groups: list[_Group]) -> None:
-        self._prior = prior
-        self._groups = groups
-
-    def __call__(self, increment: np.ndarray) -> Terms:
-        space = self._prior.space
-        state = self._prior.at(increment)
-        total = Terms.zeros(state.shape[0], space.dim)
-        for group in self._groups:
+    def linearise_at(increment: np.ndarray) -> Information:
+        state = prior.at(increment)
+        total = Information.zeros(state.shape[0], space.dim)
+        for group in groups:
             records = group.records
             nu, jac = linearise(group.model, space, group.z, state[:, None], records.mean, records.const)
             assert jac.state is not None and jac.landmark is not None
             cov = innovation_covariance(jac.landmark, records.cov, group.cov_z)
-            total.add(information(nu, jac.state, cov, Gaussian(), self._prior, group.use))
+            total.add(information(nu, jac.state, cov, Gaussian(), prior, group.use))
         charted = total.charted(np.broadcast_to(space.right_jacobian(increment), total.info.shape))
-        offset = np.broadcast_to(increment - self._prior.mean, (state.shape[0], space.dim))
-        return charted.shifted(offset)
+        return charted.shifted(np.broadcast_to(increment - prior.mean, (state.shape[0], space.dim)))
 
-
-def _square(factor: np.ndarray) -> np.ndarray:
-    """A (N, d, d) factor of the same covariance as one of shape (N, d, r), r ≤ d."""
-    n, d, r = factor.shape
-    return np.concatenate([factor, np.zeros((n, d, d - r))], axis=2) if r < d else factor
+    return linearise_at

@@ -1,4 +1,4 @@
-"""Maximum-likelihood association per particle, with mutual exclusion, first sightings and clutter.
+"""Maximum-likelihood association per particle, with mutual exclusion, new landmarks and clutter.
 
 Each measurement is explained by a landmark within the gate, by a new landmark (only where nothing known is near), or
 by clutter; no landmark explains two. Costs, Mathematics (association-cost), are negative log-densities in the
@@ -24,7 +24,7 @@ class Gates:
     Attributes:
         accept: squared Mahalanobis distance up to which a landmark is a candidate.
         isolate: distance beyond which a measurement may start a landmark; between the two it can only be clutter.
-        log_new: log-density of a first sighting, in inverse measurement units.
+        log_new: log-density of a new landmark's first measurement, in inverse measurement units.
         log_clutter: log-density of clutter.
     """
 
@@ -54,17 +54,16 @@ def associate(nu: np.ndarray, cov: np.ndarray, present: np.ndarray, gates: Gates
     isolated = squared.min(axis=2, initial=np.inf) > gates.isolate
     alternative = np.where(isolated, max(gates.log_new, gates.log_clutter), gates.log_clutter)
     fallback = np.where(isolated & (gates.log_new >= gates.log_clutter), NEW, NULL)
-    return _assign(cost, np.minimum(-alternative, 0.1 * _FORBIDDEN), fallback)
-
-
-def _assign(cost: np.ndarray, alternative: np.ndarray, fallback: np.ndarray) -> np.ndarray:
-    """Independent minima where they do not collide, the Hungarian method where they do."""
-    _, k, m = cost.shape
-    if m == 0:
+    alternative = np.minimum(-alternative, 0.1 * _FORBIDDEN)
+    if not cost.shape[2]:
         return fallback
+    # Independent minima where they do not collide, the Hungarian method where two measurements chose one landmark.
+    _, k, m = cost.shape
     best = cost.argmin(axis=2)
     chosen = np.where(np.take_along_axis(cost, best[..., None], axis=2)[..., 0] < alternative, best, fallback)
-    for i in _colliding(chosen):
+    ordered = np.sort(chosen, axis=1)
+    collide = ((ordered[:, 1:] == ordered[:, :-1]) & (ordered[:, 1:] >= 0)).any(axis=1)
+    for i in np.flatnonzero(collide):
         square = np.full((k, m + k), _FORBIDDEN)
         square[:, :m] = cost[i]
         square[np.arange(k), m + np.arange(k)] = alternative[i]
@@ -73,19 +72,13 @@ def _assign(cost: np.ndarray, alternative: np.ndarray, fallback: np.ndarray) -> 
     return chosen
 
 
-def _colliding(chosen: np.ndarray) -> np.ndarray:
-    """Particles in which two measurements chose one landmark."""
-    ordered = np.sort(chosen, axis=1)
-    return np.flatnonzero(((ordered[:, 1:] == ordered[:, :-1]) & (ordered[:, 1:] >= 0)).any(axis=1))
-
-
 @dataclass(frozen=True)
 class ExistenceModel:
     """Log-odds that a landmark exists, per particle (M. Montemerlo and S. Thrun, FastSLAM, 2003).
 
     Attributes:
-        hit: added for each sighting.
-        miss: subtracted where it should have been seen and was not.
+        hit: added for each observation.
+        miss: subtracted where it should have been observed and was not.
         limit: log-odds are held within ± limit, so that no landmark becomes immortal.
         drop: a landmark below this leaves the particle.
     """

@@ -1,101 +1,126 @@
-"""Checkpoints: one file of plain arrays, no pickle, with a digest that a damaged file cannot keep.
+"""Files of named plain arrays, and checkpoints: arrays with a header and a digest that a damaged file cannot keep.
 
-The file is a NumPy `.npz` archive. Its entry `header` is JSON text: format version, the filter's fingerprint (model
-classes, sizes), the state of the random generator and a SHA-256 digest of all other entries.
+A file is a NumPy `.npz` archive, never pickled, and read without trusting a header. What a header claims is compared with
+the file's own size before anything is allocated: members are stored as they are, uncompressed, so that no file unfolds into
+more than itself. A checkpoint's entry `header` is JSON text: format version, the filter's fingerprint (model classes, sizes),
+the state of the random generator and a SHA-256 digest of all other entries.
 """
 
+import ast
 import hashlib
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
+import math
+import os
+import re
+import zipfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rbpf.core.archive import checked
-from rbpf.core.archive import load_arrays as load_arrays
-from rbpf.core.archive import save_arrays as save_arrays
-from rbpf.core.genealogy import Lineage
-from rbpf.core.history import History
-from rbpf.core.particles import Particles
 from rbpf.errors import InputError
 
-if TYPE_CHECKING:
-    from rbpf.core.filter import Filter
-
 VERSION = 1
+"""Of the format of checkpoints."""
+
+LONGEST_HEADER = 1 << 16
+"""Bytes of an array's header; NumPy's own are of about a hundred."""
+
+_MAGIC = b"\x93NUMPY"
+_PLAIN = re.compile(r"[<>|][biufU]\d{1,9}")
+"""Types of arrays that are read: truth values, numbers, text."""
 
 
-def write_checkpoint(filter_: "Filter", path: Path, extra: dict[str, np.ndarray]) -> None:
-    """Saves a filter; the file appears under its name only when it is complete."""
-    arrays = {
-        "particles/state": filter_.particles.state,
-        "particles/log_weights": filter_.particles.log_weights,
-        "filter/numbers": np.array([filter_.steps, -1 if filter_.stamp_ns is None else filter_.stamp_ns]),
-        "filter/started": np.array(filter_.stamp_ns is not None),
-        "filter/log_evidence": np.array(filter_.log_evidence),
-        **filter_.lineage.arrays(),
-        **filter_.history.arrays(),
-        **filter_.marginals.arrays(),
-        **{f"extra/{name}": array for name, array in extra.items()},
-    }
-    header = {
-        "version": VERSION,
-        "fingerprint": fingerprint(filter_),
-        "rng": _jsonable(filter_.rng.bit_generator.state),
-        "digest": _digest(arrays),
-    }
-    save_arrays(path, {"header": np.array(json.dumps(header)), **arrays})
-
-
-def read_checkpoint(filter_: "Filter", path: Path) -> dict[str, np.ndarray]:
-    """Restores a filter built with the same models and returns the extra arrays; a bad file changes nothing.
+def save_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Writes an `.npz` under a temporary name, then renames it.
 
     Raises:
-        InputError: the file is missing, damaged, of another version or of another filter.
+        InputError: the place cannot be written to or is full, or an array holds Python objects.
     """
-    arrays = load_arrays(path)
+    temporary = path.with_name(path.name + ".partial")
     try:
-        header = json.loads(str(arrays.pop("header")))
-        version, digest, rng = header["version"], header["digest"], header["rng"]
-        expected = dict(header["fingerprint"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            f"{path} is not a checkpoint of rbpf: its header is missing or unreadable"
-        ) from error
-    if version != VERSION:
-        raise InputError(f"{path} has checkpoint version {version}, this program reads version {VERSION}")
-    if digest != _digest(arrays):
-        raise InputError(
-            f"{path} is damaged: its content does not match its digest; use an earlier checkpoint"
-        )
-    found = fingerprint(filter_)
-    for name, value in expected.items():
-        if found.get(name) != value:
-            raise InputError(
-                f"{path} belongs to a filter with {name} = {value}, this one has {found.get(name)}: "
-                "build the filter with the options of the saved run, and register its landmarks"
-            )
-    with _unchanged_by_failure(filter_), fitting(path):
-        _restore(filter_, arrays, rng)
-    return {name.removeprefix("extra/"): array for name, array in arrays.items() if name.startswith("extra/")}
+        with open(temporary, "wb") as file:
+            np.savez(file, allow_pickle=False, **arrays)
+            file.flush()
+            # Else a power cut after the renaming could leave neither the old file nor the new one.
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except (OSError, ValueError) as error:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else error
+        raise InputError(f"{path} cannot be written: {reason}") from error
 
 
-def fingerprint(filter_: "Filter") -> dict[str, Any]:
-    """What must agree between the filter that saved and the one that loads."""
-    return {
-        "particles": filter_.n,
-        "motion": type(filter_.motion).__name__,
-        "state size": filter_.space.size,
-        "proposal": type(filter_.proposal).__name__,
-        "resampler": type(filter_.resampler).__name__,
-        "conditional": [type(part).__name__ for part in filter_.marginals.parts.values()],
-        "lag": filter_.history.lag,
-        "clouds": filter_.history.clouds,
-        **filter_.marginals.options(),
-        "random generator": type(filter_.rng.bit_generator).__name__,
-    }
+def load_arrays(path: Path) -> dict[str, np.ndarray]:
+    """Reads every array of an `.npz` that `save_arrays` wrote; they may be written to.
+
+    Raises:
+        InputError: the file is missing, cut off or not an archive of plain arrays.
+    """
+    try:
+        with open(path, "rb") as file, zipfile.ZipFile(file) as archive:
+            members = archive.infolist()
+            if sum(info.file_size for info in members) > os.fstat(file.fileno()).st_size:
+                raise ValueError("the members are larger than the file")
+            return {info.filename.removesuffix(".npy"): _array(archive, info) for info in members}
+    except FileNotFoundError as error:
+        raise InputError(f"{path} does not exist") from error
+    except (
+        OSError,
+        ValueError,
+        EOFError,
+        KeyError,
+        zipfile.BadZipFile,
+        NotImplementedError,
+        AttributeError,
+        TypeError,
+        RuntimeError,
+        MemoryError,
+        SyntaxError,
+        OverflowError,
+    ) as error:
+        raise InputError(f"{path} is damaged or cut off: it is not a complete archive of arrays") from error
+
+
+def checked(
+    arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int | None, ...], kinds: str
+) -> np.ndarray:
+    """One of the arrays of a file.
+
+    Args:
+        arrays: of the file.
+        name: of the array.
+        shape: that it must have; None where any size will do.
+        kinds: letters of the types that it may have, as `dtype.kind` gives them.
+
+    Raises:
+        InputError: it is missing, or is not as expected.
+    """
+    array = arrays.get(name)
+    if array is None:
+        raise InputError(f"the array {name} is missing")
+    fits = len(array.shape) == len(shape) and all(
+        wanted is None or size == wanted for size, wanted in zip(array.shape, shape, strict=True)
+    )
+    if not fits or array.dtype.kind not in kinds:
+        raise InputError(f"the array {name} must be {shape} of kind {kinds}, got {array.shape} {array.dtype}")
+    return array
+
+
+def within(
+    arrays: Mapping[str, np.ndarray], name: str, size: int | None, least: int, stop: int
+) -> np.ndarray:
+    """One of the arrays of a file: whole numbers (size,) from `least` to before `stop`.
+
+    Raises:
+        InputError: it is missing, or is not as expected.
+    """
+    array = checked(arrays, name, (size,), "i")
+    if array.size and not least <= array.min() <= array.max() < stop:
+        raise InputError(f"the array {name} must hold numbers from {least} to {stop - 1}")
+    return array.astype(np.int64)
 
 
 @contextmanager
@@ -116,38 +141,94 @@ def fitting(path: Path) -> Iterator[None]:
         ) from error
 
 
-@contextmanager
-def _unchanged_by_failure(filter_: "Filter") -> Iterator[None]:
-    """Puts a filter back as it was if it cannot be restored; what is restored takes new objects, never the old ones."""
-    held = [(item, dict(vars(item))) for item in (filter_, *filter_.marginals.parts.values())]
-    rng = filter_.rng.bit_generator.state
+def write_checkpoint(
+    path: Path,
+    arrays: dict[str, np.ndarray],
+    fingerprint: Mapping[str, object],
+    rng_state: Mapping[str, object],
+) -> None:
+    """Saves arrays with what they belong to; the file appears under its name only when it is complete.
+
+    Args:
+        path: of the file.
+        arrays: by name.
+        fingerprint: what must agree between who saves and who loads; plain values by name.
+        rng_state: of the random generator.
+
+    Raises:
+        InputError: see `save_arrays`.
+    """
+    header = {
+        "version": VERSION,
+        "fingerprint": fingerprint,
+        "rng": _jsonable(rng_state),
+        "digest": _digest(arrays),
+    }
+    save_arrays(path, {"header": np.array(json.dumps(header)), **arrays})
+
+
+def read_checkpoint(
+    path: Path, fingerprint: Mapping[str, object]
+) -> tuple[dict[str, np.ndarray], dict[str, object]]:
+    """The arrays of a checkpoint, and the state of the random generator.
+
+    Raises:
+        InputError: the file is missing, damaged, of another version or of another filter.
+    """
+    arrays = load_arrays(path)
     try:
-        yield
-    except InputError:
-        for item, attributes in held:
-            vars(item).clear()
-            vars(item).update(attributes)
-        filter_.rng.bit_generator.state = rng
-        raise
+        header = json.loads(str(arrays.pop("header")))
+        version, digest, rng_state = header["version"], header["digest"], header["rng"]
+        expected = dict(header["fingerprint"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{path} is not a checkpoint of rbpf: its header is missing or unreadable"
+        ) from error
+    if version != VERSION:
+        raise InputError(f"{path} has checkpoint version {version}, this program reads version {VERSION}")
+    if digest != _digest(arrays):
+        raise InputError(
+            f"{path} is damaged: its content does not match its digest; use an earlier checkpoint"
+        )
+    for name, value in expected.items():
+        if fingerprint.get(name) != value:
+            raise InputError(
+                f"{path} belongs to a filter with {name} = {value}, this one has {fingerprint.get(name)}: "
+                "build the filter with the options of the saved run, and register its landmarks"
+            )
+    return arrays, rng_state
 
 
-def _restore(filter_: "Filter", arrays: dict[str, np.ndarray], rng_state: dict[str, Any]) -> None:
-    state = checked(arrays, "particles/state", filter_.particles.state.shape, "f")
-    log_weights = checked(arrays, "particles/log_weights", (filter_.n,), "f")
-    lineage = Lineage(filter_.n)
-    lineage.restore(arrays)
-    history = History(lineage, filter_.history.lag, filter_.history.clouds)
-    history.restore(arrays)
-    filter_.lineage, filter_.history = lineage, history
-    filter_.marginals.begin(filter_.n, lineage)
-    filter_.marginals.restore(arrays)
-    filter_.particles = Particles(state.copy(), log_weights.copy())
-    steps, stamp = checked(arrays, "filter/numbers", (2,), "i").tolist()
-    if steps < 0:
-        raise InputError(f"the array filter/numbers counts {steps} steps")
-    filter_.steps, filter_.stamp_ns = steps, stamp if checked(arrays, "filter/started", (), "b") else None
-    filter_.log_evidence = float(checked(arrays, "filter/log_evidence", (), "f"))
-    filter_.rng.bit_generator.state = rng_state
+def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
+    """One member; whatever is wrong with it raises an error that `load_arrays` knows."""
+    if info.compress_type != zipfile.ZIP_STORED or info.flag_bits & 1:
+        raise ValueError("a member is compressed or encrypted")
+    data = archive.read(info)
+    # The header, in the `.npy` format, versions 1 to 3: where the numbers begin, and what they are.
+    if data[:6] != _MAGIC or data[6:8] not in (b"\x01\x00", b"\x02\x00", b"\x03\x00"):
+        raise ValueError("a member is no array")
+    first = 10 if data[6] == 1 else 12
+    start = first + int.from_bytes(data[8:first], "little")
+    if start > min(len(data), LONGEST_HEADER):
+        raise ValueError("a member's header is longer than it can be")
+    entries = ast.literal_eval(data[first:start].decode("latin1").strip())
+    descr, is_fortran, shape = (entries[name] for name in ("descr", "fortran_order", "shape"))
+    if not (isinstance(descr, str) and _PLAIN.fullmatch(descr) and isinstance(shape, tuple)):
+        raise ValueError("a member holds something else than plain numbers or text")
+    if not all(type(size) is int for size in shape):
+        raise ValueError("a member's shape is none")
+    dtype = np.dtype(descr)
+    if math.prod(shape) * max(dtype.itemsize, 1) != len(data) - start or min(shape, default=0) < 0:
+        raise ValueError("a member has another size than its header claims")
+    # The numbers: no bit pattern that is no truth value or no text.
+    flat = np.frombuffer(data, dtype, offset=start)
+    if dtype.kind == "b" and flat.size and flat.view(np.uint8).max() > 1:
+        raise ValueError("a truth value is none")
+    if dtype.kind == "U" and flat.size and dtype.itemsize:
+        codes = flat.view(dtype.byteorder.replace("|", "=") + "u4")
+        if codes.max() > 0x10FFFF or ((codes >= 0xD800) & (codes < 0xE000)).any():
+            raise ValueError("a text holds what is no character")
+    return flat.reshape(shape, order="F" if is_fortran else "C").copy(order="K")
 
 
 def _digest(arrays: dict[str, np.ndarray]) -> str:
@@ -159,7 +240,7 @@ def _digest(arrays: dict[str, np.ndarray]) -> str:
     return digest.hexdigest()
 
 
-def _jsonable(value: Any) -> Any:
+def _jsonable(value: object) -> object:
     if isinstance(value, dict):
         return {name: _jsonable(item) for name, item in value.items()}
     if isinstance(value, np.ndarray):

@@ -4,11 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rbpf.core.estimate import Estimate
-from rbpf.core.genealogy import Lineage
-from rbpf.core.history import History
-from rbpf.core.particles import effective_sample_size
-from rbpf.core.proposals import Prior, Proposed
+from rbpf.core.genealogy import History, Lineage
+from rbpf.core.particles import Estimate, Prior, Proposed, effective_sample_size
 from rbpf.lie import LieGroup
 
 __all__ = [
@@ -34,7 +31,7 @@ class Band:
 
 
 def nees(space: LieGroup, estimate: Estimate, truth: np.ndarray) -> float:
-    """Normalised estimation error squared eᵀP⁺e, e = Log(mean⁻¹ truth); its mean is d for an honest filter.
+    """Normalised estimation error squared eᵀP⁺e, e = Log(mean⁻¹ truth); its mean is d for a consistent filter.
 
     Args:
         space: group of the state.
@@ -51,7 +48,7 @@ def chi_square_band(dof: float, runs: int = 1, probability: float = 0.95) -> Ban
     Args:
         dof: degrees of freedom of one run.
         runs: how many were averaged.
-        probability: that an honest filter stays inside.
+        probability: that a consistent filter stays inside.
     """
     from scipy.stats import chi2
 
@@ -83,7 +80,7 @@ def coalescence_steps(history: History) -> int | None:
 
 @dataclass(frozen=True)
 class Correction:
-    """What the observations of one step say about the motion into it, beside what an honest filter expects of them.
+    """What the observations of one step say about the motion into it, beside what a consistent filter expects of them.
 
     The increment is μ + L u with u ~ N(0, I) before the observations. Given them, u has mean û and covariance C, within
     + between particles. By the law of total variance û has covariance I − C, and it is independent from step to step:

@@ -5,35 +5,46 @@
 The bootstrap filter, FastSLAM 2.0 and the exact importance ratio, Mathematics (correction), differ in the proposal.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import accumulate
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from rbpf.core.belief import Belief
-from rbpf.core.checkpoint import read_checkpoint, write_checkpoint
-from rbpf.core.checks import checked_ancestors, checked_observations, checked_start, checked_transition
-from rbpf.core.conditional import Marginals
-from rbpf.core.estimate import Estimate, mixture_estimate
-from rbpf.core.genealogy import Lineage
-from rbpf.core.history import History
+from rbpf import gaussian
+from rbpf.core.checkpoint import checked, fitting, read_checkpoint, write_checkpoint
+from rbpf.core.genealogy import History, Lineage
+from rbpf.core.marginals import Marginals
 from rbpf.core.models import (
+    Belief,
     Conditional,
     MotionModel,
     NewLandmarks,
     Observations,
+    Part,
     Proposal,
     Resampler,
     Sensor,
+    Transition,
 )
-from rbpf.core.particles import Particles, effective_sample_size, reweight, uniform_log_weights
-from rbpf.core.proposals import EkfProposal, Prior, Proposed
+from rbpf.core.particles import (
+    Estimate,
+    Particles,
+    Prior,
+    Proposed,
+    effective_sample_size,
+    mixture_estimate,
+    reweight,
+    uniform_log_weights,
+)
+from rbpf.core.proposals import EkfProposal
 from rbpf.core.resampling import EssTriggered, Systematic
 from rbpf.errors import InputError
+from rbpf.kernels.increment import are_sound
+from rbpf.lie import LieGroup
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,13 +138,17 @@ class Filter:
         """Number of particles."""
         return self.particles.n
 
-    def expect(self, control: Any = None, stamp_ns: int | None = None) -> Belief:
+    def expect(self, control: object = None, stamp_ns: int | None = None) -> Belief:
         """What `step` would tell the sensors, for looking at a frame before it is filtered; no particle moves."""
         _, dt = self._clock(stamp_ns)
-        return Belief(self.particles.log_weights, self._predict(control, dt), self.marginals)
+        return Belief(self.particles.log_weights, self._predict(control, dt), self.marginals.parts)
 
     def step(
-        self, frame: Any, control: Any = None, stamp_ns: int | None = None, proposal: Proposal | None = None
+        self,
+        frame: object,
+        control: object = None,
+        stamp_ns: int | None = None,
+        proposal: Proposal | None = None,
     ) -> StepReport:
         """Predicts, observes, refines, weighs, resamples, samples, corrects and updates; then starts landmarks.
 
@@ -148,25 +163,51 @@ class Filter:
                 error is about what came in before the particles are weighed (time, control, measurements), the
                 filter is as it was before the step; otherwise it stands between two steps: `load` a checkpoint.
         """
+        # Predict, and observe given the prediction.
         stamp_ns, dt = self._clock(stamp_ns)
         prior = self._predict(control, dt)
-        groups = self._observe(frame, Belief(self.particles.log_weights, prior, self.marginals))
+        groups = self._observe(frame, Belief(self.particles.log_weights, prior, self.marginals.parts))
+
+        # Refine, and weigh by the look-ahead w₁.
         proposal = proposal or self.proposal
         proposed = proposal.propose(prior, self.marginals.linearised(prior, groups))
         log_weights, look_ahead = reweight(self.particles.log_weights, proposed.log_w1, f"step {self.steps}")
         mixture: tuple[Prior, Proposed | None, np.ndarray] = (prior, proposed, log_weights)
         weights = np.exp(log_weights)
+
+        # Resample if it is time: descendants inherit by ancestor, and so do associations of their own.
         ancestors = self.resampler.ancestors(weights, self.rng)
         if ancestors is not None:
             log_weights = uniform_log_weights(self.n)
-            prior, groups = self._descend(ancestors, prior, groups)
+            self.lineage.advance(checked_ancestors(ancestors, self.n, self.resampler))
+            self.marginals.resample(ancestors)
+            prior = prior.take(ancestors)
+            groups = [
+                replace(group, ids=group.ids[ancestors])
+                if group.ids is not None and group.ids.ndim == 2
+                else group
+                for group in groups
+            ]
 
+        # Sample one state for each descendant from its parent's Gaussian, and update what is marginalised.
         parents = np.arange(self.n) if ancestors is None else ancestors
-        state, log_w2 = self._sample_and_update(prior, proposed, groups, parents, proposal.exact)
+        whitened, log_ratio = proposed.sample(parents, self.rng)
+        increment = prior.mean + np.einsum("nar,nr->na", prior.factor, whitened)
+        state = prior.at(increment)
+        densities = self.marginals.correct(state, increment, groups)
+
+        # Correct by log w₂ = log p(z|x) + log p(x|x⁻) − log q(x) − log w₁.
+        log_w2 = densities.after_sampling
+        if proposal.exact:
+            # A parent of weight zero that was not resampled keeps it, whatever its second factor is.
+            log_w1 = proposed.log_w1[parents]
+            log_w2 = densities.all + log_ratio - np.where(log_w1 == -np.inf, 0.0, log_w1)
         log_weights, correction = reweight(log_weights, log_w2, f"step {self.steps}")
         self.particles = Particles(state, log_weights)
         if proposed.nis is None:
             mixture = (Prior.exactly(self.space, state), None, log_weights)
+
+        # Start landmarks, and report.
         first_observations, new_landmarks = self._start_landmarks(frame, groups)
         normalised = all(group.likelihood is None or group.likelihood.normalised for group in groups)
         evidence = look_ahead + correction if normalised else float("nan")
@@ -186,7 +227,7 @@ class Filter:
         )
 
     def follow(
-        self, state: np.ndarray, frame: Any, control: Any = None, stamp_ns: int | None = None
+        self, state: np.ndarray, frame: object, control: object = None, stamp_ns: int | None = None
     ) -> np.ndarray:
         """A step along given states (E,) or (N, E): what is marginalised is conditioned on them, p(m | x_0:t, z_1:t).
 
@@ -201,7 +242,9 @@ class Filter:
         stamp_ns, dt = self._clock(stamp_ns)
         state = checked_start(np.asarray(state, dtype=float), self.n, self.space)
         prior, log_weights = self._predict(control, dt), self.particles.log_weights
-        groups = self._observe(frame, Belief(log_weights, Prior.exactly(self.space, state), self.marginals))
+        groups = self._observe(
+            frame, Belief(log_weights, Prior.exactly(self.space, state), self.marginals.parts)
+        )
         densities = self.marginals.correct(state, self.space.local(prior.base, state), groups)
         self.particles = Particles(state, log_weights)
         self._start_landmarks(frame, groups)
@@ -216,11 +259,26 @@ class Filter:
     def belief(self) -> Belief:
         """The particles as they are, for reading the map."""
         here = Prior.exactly(self.space, self.particles.state)
-        return Belief(self.particles.log_weights, here, self.marginals)
+        return Belief(self.particles.log_weights, here, self.marginals.parts)
 
     def save(self, path: Path | str, extra: dict[str, np.ndarray] | None = None) -> None:
-        """Writes a checkpoint from which `load` goes on as if nothing had happened, with arrays of the caller's."""
-        write_checkpoint(self, Path(path), extra or {})
+        """Writes a checkpoint from which `load` goes on as if nothing had happened, with arrays of the caller's.
+
+        Raises:
+            InputError: the file cannot be written.
+        """
+        arrays = {
+            "particles/state": self.particles.state,
+            "particles/log_weights": self.particles.log_weights,
+            "filter/numbers": np.array([self.steps, -1 if self.stamp_ns is None else self.stamp_ns]),
+            "filter/started": np.array(self.stamp_ns is not None),
+            "filter/log_evidence": np.array(self.log_evidence),
+            **self.lineage.arrays(),
+            **self.history.arrays(),
+            **self.marginals.arrays(),
+            **{f"extra/{name}": array for name, array in (extra or {}).items()},
+        }
+        write_checkpoint(Path(path), arrays, self._fingerprint(), self.rng.bit_generator.state)
 
     def load(self, path: Path | str) -> dict[str, np.ndarray]:
         """Continues from a checkpoint; this filter must have been built with the same models and options.
@@ -231,7 +289,56 @@ class Filter:
         Raises:
             InputError: the file is missing, damaged, or belongs to another filter.
         """
-        return read_checkpoint(self, Path(path))
+        arrays, rng_state = read_checkpoint(Path(path), self._fingerprint())
+        with self._unchanged_by_failure(), fitting(Path(path)):
+            state = checked(arrays, "particles/state", self.particles.state.shape, "f")
+            log_weights = checked(arrays, "particles/log_weights", (self.n,), "f")
+            lineage = Lineage(self.n)
+            lineage.restore(arrays)
+            history = History(lineage, self.history.lag, self.history.clouds)
+            history.restore(arrays)
+            self.lineage, self.history = lineage, history
+            self.marginals.begin(self.n, lineage)
+            self.marginals.restore(arrays)
+            self.particles = Particles(state.copy(), log_weights.copy())
+            steps, stamp = checked(arrays, "filter/numbers", (2,), "i").tolist()
+            if steps < 0:
+                raise InputError(f"the array filter/numbers counts {steps} steps")
+            self.steps, self.stamp_ns = steps, stamp if checked(arrays, "filter/started", (), "b") else None
+            self.log_evidence = float(checked(arrays, "filter/log_evidence", (), "f"))
+            self.rng.bit_generator.state = rng_state
+        return {
+            name.removeprefix("extra/"): array for name, array in arrays.items() if name.startswith("extra/")
+        }
+
+    def _fingerprint(self) -> dict[str, object]:
+        """What must agree between the filter that saved and the one that loads."""
+        return {
+            "particles": self.n,
+            "motion": type(self.motion).__name__,
+            "state size": self.space.size,
+            "proposal": type(self.proposal).__name__,
+            "resampler": type(self.resampler).__name__,
+            "conditional": [type(part).__name__ for part in self.marginals.parts.values()],
+            "lag": self.history.lag,
+            "clouds": self.history.clouds,
+            **self.marginals.options(),
+            "random generator": type(self.rng.bit_generator).__name__,
+        }
+
+    @contextmanager
+    def _unchanged_by_failure(self) -> Iterator[None]:
+        """Puts the filter back as it was if it cannot be restored; what is restored takes new objects, never the old ones."""
+        held = [(item, dict(vars(item))) for item in (self, *self.marginals.parts.values())]
+        rng_state = self.rng.bit_generator.state
+        try:
+            yield
+        except InputError:
+            for item, attributes in held:
+                vars(item).clear()
+                vars(item).update(attributes)
+            self.rng.bit_generator.state = rng_state
+            raise
 
     def _clock(self, stamp_ns: int | None) -> tuple[int, float]:
         previous = self.stamp_ns
@@ -243,13 +350,13 @@ class Filter:
             )
         return int(stamp_ns), 0.0 if previous is None else (stamp_ns - previous) * 1e-9
 
-    def _predict(self, control: Any, dt: float) -> Prior:
+    def _predict(self, control: object, dt: float) -> Prior:
         transition = self.motion.transition(self.particles.state, control, dt)
         what = f"step {self.steps}: {type(self.motion).__name__}.transition"
         checked_transition(transition, self.particles.state, self.space, what)
         return self.marginals.predict(transition, self.space)
 
-    def _observe(self, frame: Any, belief: Belief) -> list[Observations]:
+    def _observe(self, frame: object, belief: Belief) -> list[Observations]:
         observed = [
             [checked_observations(group) for group in sensor.observe(frame, belief)]
             for sensor in self.sensors
@@ -257,40 +364,13 @@ class Filter:
         self._ends = list(accumulate(len(groups) for groups in observed))
         return [group for groups in observed for group in groups]
 
-    def _descend(
-        self, ancestors: np.ndarray, prior: Prior, groups: list[Observations]
-    ) -> tuple[Prior, list[Observations]]:
-        self.lineage.advance(checked_ancestors(ancestors, self.n, self.resampler))
-        self.marginals.resample(ancestors)
-        groups = [
-            replace(group, ids=group.ids[ancestors])
-            if group.ids is not None and group.ids.ndim == 2
-            else group
-            for group in groups
-        ]
-        return prior.take(ancestors), groups
-
-    def _sample_and_update(
-        self, prior: Prior, proposed: Proposed, groups: list[Observations], parents: np.ndarray, exact: bool
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """One state for each descendant, and log w₂ = log p(z|x) + log p(x|x⁻) − log q(x) − log w₁."""
-        whitened, log_ratio = proposed.sample(parents, self.rng)
-        increment = prior.mean + np.einsum("nar,nr->na", prior.factor, whitened)
-        state = prior.at(increment)
-        densities = self.marginals.correct(state, increment, groups)
-        if not exact:
-            return state, densities.late
-        log_w1 = proposed.log_w1[parents]
-        # A parent of weight zero that was not resampled keeps it, whatever its second factor is.
-        return state, densities.all + log_ratio - np.where(log_w1 == -np.inf, 0.0, log_w1)
-
     def _end(self, stamp_ns: int) -> None:
         self.steps += 1
         self.stamp_ns = stamp_ns
         self.history.record(stamp_ns, self.particles.state, self.particles.log_weights)
 
     def _start_landmarks(
-        self, frame: Any, groups: list[Observations]
+        self, frame: object, groups: list[Observations]
     ) -> tuple[list[NewLandmarks], np.ndarray]:
         belief = self.belief()
         born, ids, first = list[NewLandmarks](), [np.zeros(0, dtype=np.int64)], 0
@@ -300,3 +380,78 @@ class Filter:
                 born.append(new_landmarks)
             first = end
         return born, np.concatenate(ids)
+
+
+def checked_transition(transition: Transition, state: np.ndarray, space: LieGroup, what: str) -> Transition:
+    """A transition of the states (N, E).
+
+    Raises:
+        InputError: its mean or noise factor has the wrong shape, or is not finite.
+    """
+    mean, factor, n = transition.mean, transition.noise_factor, state.shape[0]
+    rows = space.dim + (0 if transition.coupling is None else transition.coupling.shape[-1])
+    fits = factor.ndim == 3 and factor.shape[0] in (1, n) and factor.shape[1] == rows
+    if mean.shape != state.shape or not fits:
+        raise InputError(
+            f"{what} returned mean {mean.shape} and noise_factor {factor.shape}: "
+            f"expected {state.shape} and ({n} or 1, {rows}, r)"
+        )
+    if not (np.isfinite(mean).all() and np.isfinite(factor).all()):
+        raise InputError(f"{what} returned NaN or infinity: check the control")
+    return transition
+
+
+def checked_observations(group: Observations) -> Observations:
+    """A group of observations.
+
+    Raises:
+        InputError: z or cov has the wrong shape, or is not finite, or a cov is no covariance.
+    """
+    name, count, p = type(group.model).__name__, group.z.shape[0], group.model.dim
+    if group.z.shape != (count, p) or group.cov.shape != (count, p, p):
+        raise InputError(
+            f"{name} measures {p} numbers: expected z (K, {p}) and cov (K, {p}, {p}), "
+            f"got {group.z.shape} and {group.cov.shape}"
+        )
+    updates = group.updates
+    if not (isinstance(updates, frozenset) and updates and updates <= {Part.STATE, Part.LANDMARK}):
+        raise InputError(
+            f"observations of {name} inform a frozenset of Part.STATE, Part.LANDMARK or both, got {updates}"
+        )
+    if Part.STATE not in updates and Part.LANDMARK not in group.model.reads:
+        raise InputError(f"{name} reads no landmark: its observations must inform Part.STATE")
+    # The usual case, found out quickly: all is finite and the covariances are positive definite.
+    if are_sound(*(np.ascontiguousarray(array, dtype=float) for array in (group.z, group.cov))):
+        return group
+    if not (np.isfinite(group.z).all() and np.isfinite(group.cov).all()):
+        raise InputError(f"a measurement of {name} or its covariance is not finite")
+    try:
+        gaussian.psd_factor(group.cov)
+    except InputError as error:
+        raise InputError(f"the noise of {name} has no covariance: {error}") from error
+    return group
+
+
+def checked_ancestors(ancestors: np.ndarray, n: int, resampler: object) -> np.ndarray:
+    """Ancestors (N,) of a resampler.
+
+    Raises:
+        InputError: one is missing, or is no particle.
+    """
+    if ancestors.shape != (n,) or ancestors.min() < 0 or ancestors.max() >= n:
+        name = type(resampler).__name__
+        raise InputError(f"{name} must return {n} ancestors in 0..{n - 1}, got {ancestors}")
+    return ancestors
+
+
+def checked_start(start: np.ndarray, n: int, space: LieGroup) -> np.ndarray:
+    """States (N, E) from one for all particles or one each.
+
+    Raises:
+        InputError: the shape is another one, or a number is not finite.
+    """
+    size = space.size
+    if start.shape not in ((size,), (n, size)) or not np.isfinite(start).all():
+        what = f"start must be ({size},) or ({n}, {size}) finite numbers"
+        raise InputError(f"{what}, got {start.shape}: {start.tolist()}")
+    return np.array(np.broadcast_to(start, (n, size)))

@@ -1,4 +1,4 @@
-"""Who descends from whom: the lineage of the particles, and their paths.
+"""Who descends from whom: the lineage of the particles, and their paths along it.
 
 Ancestry changes only where particles are resampled. Each resampling starts a generation; whatever is stored per
 particle (poses, landmarks) is stored per generation, by the row of the particle that wrote it, and read back
@@ -10,7 +10,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from rbpf.core.archive import checked, within
+from rbpf.arrays import Int
+from rbpf.core.checkpoint import checked, within
 from rbpf.errors import InputError
 from rbpf.kernels import forest
 
@@ -56,7 +57,7 @@ class Lineage:
         """Number of nodes held."""
         return self._parent.size - self._n_free
 
-    def advance(self, ancestors: np.ndarray) -> None:
+    def advance(self, ancestors: Int[np.ndarray, " N"]) -> None:
         """Starts a generation in which particle i descends from particle ancestors[i] (N,)."""
         if self._n_free < self.n:
             self._make_room()
@@ -75,15 +76,23 @@ class Lineage:
         self._cache.clear()
         self._survivors.clear()
 
-    def rows(self, generation: int) -> np.ndarray:
+    def rows(self, generation: int) -> Int[np.ndarray, " N"]:
         """Row in a retained generation of each particle's ancestor, (N,) int."""
         if generation == self.generation:
             return self._identity
         if generation not in self._cache:
-            self._cache[generation] = self._ancestors(generation)
+            if generation in self._settled:
+                rows = np.full(self.n, self._settled[generation])
+            else:
+                self._mark += 1
+                nodes = self._parent, self._generation, self._row, self._leaves
+                rows = np.asarray(forest.rows_at(*nodes, generation, self._found, self._stamp, self._mark))
+                if (rows == rows[0]).all():
+                    self._settled[generation] = int(rows[0])
+            self._cache[generation] = rows
         return self._cache[generation]
 
-    def survivors(self, generation: int) -> np.ndarray:
+    def survivors(self, generation: int) -> Int[np.ndarray, " n"]:
         """Particles of a retained generation that still have descendants, ascending."""
         if generation not in self._survivors:
             alive = np.zeros(self.n, dtype=np.bool_)
@@ -150,24 +159,6 @@ class Lineage:
         self._survivors.clear()
         self._settled.clear()
 
-    def _ancestors(self, generation: int) -> np.ndarray:
-        if generation in self._settled:
-            return np.full(self.n, self._settled[generation])
-        self._mark += 1
-        rows = forest.rows_at(
-            self._parent,
-            self._generation,
-            self._row,
-            self._leaves,
-            generation,
-            self._found,
-            self._stamp,
-            self._mark,
-        )
-        if (rows == rows[0]).all():
-            self._settled[generation] = int(rows[0])
-        return np.asarray(rows)
-
     def _require_forest(self) -> None:
         """Refuses what is no forest: parents are older than their children, and what is free is nobody's ancestor."""
         alive, children = np.zeros(self._parent.size, dtype=bool), np.zeros(self._parent.size, dtype=np.int64)
@@ -214,19 +205,11 @@ class Lineage:
             self._stamp,
             self._mark,
         )
-        if self._n_free < self._parent.size // 2:
-            self._grow()
-
-    def _grow(self) -> None:
         old = self._parent.size
-        for name, value in (
-            ("parent", -1),
-            ("children", 0),
-            ("generation", -1),
-            ("row", 0),
-            ("found", 0),
-            ("stamp", 0),
-        ):
+        if self._n_free >= old // 2:
+            return
+        empty = {"parent": -1, "children": 0, "generation": -1, "row": 0, "found": 0, "stamp": 0}
+        for name, value in empty.items():
             extra = np.full(old, value, dtype=np.int64)
             setattr(self, f"_{name}", np.concatenate([getattr(self, f"_{name}"), extra]))
         free = np.zeros(2 * old + self.n, dtype=np.int64)
@@ -261,3 +244,131 @@ class Schedule:
         for when, generation in pairs:
             schedule.due.setdefault(int(when), set()).add(int(generation))
         return schedule
+
+
+@dataclass
+class PathBlock:
+    """Poses of one generation: `states` (T, n, E) at the rows `kept` (n,); log-weights where clouds are kept."""
+
+    generation: int
+    kept: np.ndarray
+    stamps_ns: list[int]
+    states: list[np.ndarray]
+    log_weights: list[np.ndarray]
+
+
+class History:
+    """Posterior trajectories: the sampled states of all surviving lineages.
+
+    Args:
+        lineage: the ancestry of the particles.
+        lag: number of steps kept; None keeps all. A fixed lag holds a run of any length in constant memory.
+        clouds: also keep each step's whole cloud and log-weights, which backward simulation needs.
+    """
+
+    def __init__(self, lineage: Lineage, lag: int | None = None, clouds: bool = False) -> None:
+        self.lineage = lineage
+        self.lag = lag
+        self.clouds = clouds
+        self.blocks: list[PathBlock] = []
+        self._by_generation: dict[int, PathBlock] = {}
+        self._schedule = Schedule()
+        self._steps = 0
+
+    def record(self, stamp_ns: int, state: np.ndarray, log_weights: np.ndarray) -> None:
+        """Stores the states (N, E) after a step."""
+        now = self.lineage.generation
+        block = self._by_generation.get(now)
+        if block is None:
+            block = PathBlock(now, np.arange(state.shape[0]), [], [], [])
+            self.blocks.append(block)
+            self._by_generation[now] = block
+            self.lineage.retain(now)
+            if not self.clouds:
+                self._schedule.add(now, now)
+            # Blocks whose lineages have coalesced shrink to the rows that still have descendants.
+            for generation in self._schedule.pop(now):
+                past = self._by_generation.get(generation)
+                if past is None:
+                    continue
+                alive = self.lineage.survivors(generation)
+                if 2 * alive.size <= past.kept.size:
+                    rows = np.searchsorted(past.kept, alive)
+                    past.states = [states[rows] for states in past.states]
+                    past.kept = alive
+                if alive.size > 1:
+                    self._schedule.add(generation, now)
+        block.stamps_ns.append(stamp_ns)
+        block.states.append(state.copy())
+        if self.clouds:
+            block.log_weights.append(log_weights.copy())
+        self._steps += 1
+        if self.lag is not None and self._steps > self.lag:
+            first = self.blocks[0]
+            del first.stamps_ns[0], first.states[0], first.log_weights[:1]
+            self._steps -= 1
+            if not first.states:
+                self.blocks.pop(0)
+                del self._by_generation[first.generation]
+                self.lineage.release(first.generation)
+
+    @property
+    def stamps_ns(self) -> np.ndarray:
+        """(T,) stamps of the steps kept."""
+        return np.array([stamp for block in self.blocks for stamp in block.stamps_ns], dtype=np.int64)
+
+    @property
+    def stored_states(self) -> int:
+        """Number of states held, of T·N without sharing."""
+        return sum(len(block.states) * block.kept.size for block in self.blocks)
+
+    def distinct_first(self) -> int:
+        """How many particles of the first generation kept still have descendants."""
+        return self.lineage.distinct(self.blocks[0].generation) if self.blocks else self.lineage.n
+
+    def paths(self) -> np.ndarray:
+        """(T, N, E): the trajectory of each current particle, along its ancestors."""
+        parts: list[np.ndarray] = []
+        for block in self.blocks:
+            rows = np.searchsorted(block.kept, self.lineage.rows(block.generation))
+            parts.extend(states[rows] for states in block.states)
+        return np.array(parts)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Everything that a checkpoint must hold."""
+        out: dict[str, np.ndarray] = {
+            "history/generations": np.array([b.generation for b in self.blocks], dtype=np.int64)
+        }
+        for number, block in enumerate(self.blocks):
+            out[f"history/{number}/kept"] = block.kept
+            out[f"history/{number}/stamps_ns"] = np.array(block.stamps_ns, dtype=np.int64)
+            out[f"history/{number}/states"] = np.array(block.states)
+            out[f"history/{number}/log_weights"] = np.array(block.log_weights)
+        out["history/due"] = self._schedule.array()
+        return out
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """The inverse of `arrays`.
+
+        Raises:
+            InputError: an array is missing, or is not what it should be.
+        """
+        self.blocks, self._by_generation = [], {}
+        self._schedule = Schedule.of(checked(arrays, "history/due", (None, 2), "i"))
+        generations = checked(arrays, "history/generations", (None,), "i").tolist()
+        for number, generation in enumerate(generations):
+            self.lineage.take_up(generation)
+            name, n = f"history/{number}", self.lineage.n
+            kept = within(arrays, f"{name}/kept", None, 0, n)
+            stamps = checked(arrays, f"{name}/stamps_ns", (None,), "i").tolist()
+            states = checked(arrays, f"{name}/states", (len(stamps), kept.size, None), "f")
+            weights = checked(arrays, f"{name}/log_weights", (len(stamps), n) if self.clouds else (0,), "f")
+            alive = self.lineage.survivors(generation)
+            if not stamps or (np.diff(kept) <= 0).any() or np.setdiff1d(alive, kept).size:
+                raise InputError(f"the array {name}/kept does not hold the particles that have descendants")
+            block = PathBlock(generation, kept, stamps, list(states.copy()), list(weights.copy()))
+            self.blocks.append(block)
+            self._by_generation[generation] = block
+        if (np.diff(generations) <= 0).any():
+            raise InputError("the generations of the history do not ascend")
+        self._steps = self.stamps_ns.size

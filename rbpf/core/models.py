@@ -1,43 +1,175 @@
-"""Every abstract class that a user subclasses, on one page; what they hand over stands in `rbpf.core.exchange`.
+"""Every abstract class that a user subclasses, and what these classes hand to one another.
+
+One step of the filter: a `MotionModel` predicts; each `Sensor` turns the frame into `Observations`, given the `Belief`;
+what is marginalised (`Conditional`: a landmark `Map`, a Kalman substate) says what they tell about the motion; a `Proposal`
+refines and weighs the particles by it; a `Resampler` chooses their descendants; the `Conditional` is updated. Observations
+arise by an `ObservationModel`, perhaps of a `Landmark`, and are weighed by a `Likelihood`.
 
 Shapes: N particles, K observations, E state storage, d its tangent, m linear substate, D landmark, A its constants,
 C components, p measurement, r noise rank. A method that is not abstract is a hook with a default.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+from functools import cached_property
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
+from rbpf import gaussian
 from rbpf.arrays import Bool, Float, Int
-from rbpf.core.exchange import NEW as NEW
-from rbpf.core.exchange import NULL as NULL
-from rbpf.core.exchange import FusedKernel as FusedKernel
-from rbpf.core.exchange import Jacobians as Jacobians
-from rbpf.core.exchange import LogDensities as LogDensities
-from rbpf.core.exchange import NewLandmarks as NewLandmarks
-from rbpf.core.exchange import Observations as Observations
-from rbpf.core.exchange import Part as Part
-from rbpf.core.exchange import Records as Records
-from rbpf.core.exchange import Transition as Transition
+from rbpf.core.genealogy import Lineage
+from rbpf.core.particles import Information, Prior, Proposed
 from rbpf.errors import InputError
+from rbpf.kernels.signature import ObservationKernel
 from rbpf.lie import LieGroup
 
-if TYPE_CHECKING:
-    from rbpf.core.belief import Belief
-    from rbpf.core.genealogy import Lineage
-    from rbpf.core.proposals import Prior, Proposed, Terms
+STEP = float(np.finfo(float).eps) ** (1 / 3)
+"""Step of central differences, where truncation and rounding errors balance."""
+
+Control = TypeVar("Control", contravariant=True)
+"""What a motion model moves by, as odometry."""
+Frame = TypeVar("Frame", contravariant=True)
+"""What a sensor takes, as an image."""
+
+NULL = -1
+"""An observation that a particle takes as clutter."""
+NEW = -2
+"""An observation that a particle takes as the first of a new landmark."""
 
 
-class MotionModel(ABC):
+class Part(Enum):
+    """What an observation can depend on."""
+
+    STATE = "sampled state"
+    LANDMARK = "landmark"
+    SUBSTATE = "linear substate"
+
+    __hash__ = object.__hash__
+    """Members are single objects; Enum's own hash, asked for at every use of a set of parts, is run by Python."""
+
+
+@dataclass(frozen=True)
+class Transition:
+    """p(x_t, s_t | x_{t-1}, s_{t-1}, u_t): ε = B s + w₁ in the right chart at `mean`; s_t = A s + b + w₂.
+
+    Mathematics (substate).
+
+    Arrays may have a first axis of length 1 where they do not differ between particles.
+
+    Attributes:
+        mean: (N, E) chart's origin, x_t = mean · Exp(ε).
+        noise_factor: (N or 1, joint = d+m, r) L with cov(w₁, w₂) = L Lᵀ; may be singular.
+        coupling: B, (N or 1, d, m); None where there is no substate.
+        dynamics: A, (N or 1, m, m).
+        drift: b, (N or 1, m).
+    """
+
+    mean: Float[np.ndarray, "N E"]
+    noise_factor: Float[np.ndarray, "#N joint r"]
+    coupling: Float[np.ndarray, "#N d m"] | None = None
+    dynamics: Float[np.ndarray, "#N m m"] | None = None
+    drift: Float[np.ndarray, "#N m"] | None = None
+
+
+class Jacobians(NamedTuple):
+    """Derivatives of a predicted measurement: (…, p, d), (…, p, D), (…, p, m); None where it is not read."""
+
+    state: Float[np.ndarray, "... p d"] | None = None
+    landmark: Float[np.ndarray, "... p D"] | None = None
+    substate: Float[np.ndarray, "... p m"] | None = None
+
+
+class FusedKernel(NamedTuple):
+    """A compiled `rbpf.kernels.signature.observation_kernel` and the constants (P,) it is called with."""
+
+    function: ObservationKernel
+    params: Float[np.ndarray, " P"]
+
+
+@dataclass(frozen=True)
+class Records:
+    """Estimates of K landmarks in N particles, or of their components.
+
+    Attributes:
+        mean: (N, K, D), or (N, K, C, D) where the parametrisation has C > 1 components.
+        cov: (N, K, D, D) or (N, K, C, D, D).
+        const: (N, K, A), what stays fixed, as an anchor pose; None where A = 0.
+        log_weights: (N, K, C) log-weights of the components; None where C = 1.
+    """
+
+    mean: Float[np.ndarray, "N K *C D"]
+    cov: Float[np.ndarray, "N K *C D D"]
+    const: Float[np.ndarray, "#N K A"] | None = None
+    log_weights: Float[np.ndarray, "N K C"] | None = None
+
+
+@dataclass(frozen=True)
+class Observations:
+    """A group of measurements of one kind taken in one frame.
+
+    Attributes:
+        z: (K, p) measurements.
+        cov: (K, p, p) covariance of their noise.
+        model: how they arise.
+        likelihood: of the innovation; None is Gaussian.
+        ids: landmark of each, (K,) for all particles or (N, K) per particle; NULL and NEW are allowed.
+            None where the model reads no landmark.
+        log_new: log-density, in inverse measurement units, that a particle pays for a NEW observation.
+        log_clutter: the same for a NULL one.
+        updates: STATE: it refines and weighs the particles; LANDMARK: it updates the landmark. Two groups may share
+            a measurement, one for each (E06 §5.2: the epipolar part for the state, all of it for the depth).
+    """
+
+    z: Float[np.ndarray, "K p"]
+    cov: Float[np.ndarray, "K p p"]
+    model: "ObservationModel"
+    likelihood: "Likelihood | None" = None
+    ids: Int[np.ndarray, "... K"] | None = None
+    log_new: float = 0.0
+    log_clutter: float = 0.0
+    updates: frozenset[Part] = frozenset({Part.STATE, Part.LANDMARK})
+
+
+@dataclass(frozen=True)
+class NewLandmarks:
+    """Measurements that start landmarks, after the update.
+
+    Attributes:
+        z: (K, p) measurements;  cov: (K, p, p) their covariance.
+        model: whose `initialise` gives the records.
+        landmark: the parametrisation.
+        mask: (N, K) which particles take them as new; None is all.
+        ids: (K,) numbers from 0 up by which the sensor knows them, none of them in use; None lets the map number them.
+        facts: per landmark, what the catalogue remembers of it (a descriptor, the log's own name).
+    """
+
+    z: Float[np.ndarray, "K p"]
+    cov: Float[np.ndarray, "K p p"]
+    model: "ObservationModel"
+    landmark: "Landmark"
+    mask: Bool[np.ndarray, "N K"] | None = None
+    facts: Sequence[Any] = field(default_factory=tuple)
+    ids: Int[np.ndarray, " K"] | None = None
+
+
+class LogDensities(NamedTuple):
+    """log p(z | x) (N,) of all observations, and of those that could enter only after sampling."""
+
+    all: Float[np.ndarray, " N"]
+    after_sampling: Float[np.ndarray, " N"]
+
+
+class MotionModel(ABC, Generic[Control]):
     """p(x_t | x_{t-1}, u_t), linear-Gaussian in the substate if there is one."""
 
     space: LieGroup
 
     @abstractmethod
-    def transition(self, state: Float[np.ndarray, "N E"], control: Any, dt: float) -> Transition:
-        """Law of the next state. Given states (N, E), a control and a time step in seconds."""
+    def transition(self, state: Float[np.ndarray, "N E"], control: Control, dt: float) -> Transition:
+        """Distribution of the next state, given states (N, E), a control and a time step in seconds."""
 
 
 class ObservationModel(ABC):
@@ -106,10 +238,18 @@ class ObservationModel(ABC):
     def initialise(
         self, state: Float[np.ndarray, "N E"], z: Float[np.ndarray, "K p"], cov: Float[np.ndarray, "K p p"]
     ) -> Records:
-        """First estimate of landmarks from (N, E), (K, p), (K, p, p); by default `invert` and its numeric Jacobian."""
-        from rbpf.core.numeric import invert_with_covariance
+        """First estimate of landmarks from (N, E), (K, p), (K, p, p).
 
-        return invert_with_covariance(self, state, z, cov)
+        By default `invert`, with the covariance J R Jᵀ of its numeric derivative by the measurement.
+        """
+        at, p = state[:, None, :], z.shape[-1]
+        mean = self.invert(at, z)
+        columns = [
+            (self.invert(at, z + STEP * np.eye(p)[j]) - self.invert(at, z - STEP * np.eye(p)[j])) / (2 * STEP)
+            for j in range(p)
+        ]
+        jac = np.stack(columns, axis=-1)
+        return Records(mean, gaussian.symmetrise(jac @ cov @ np.swapaxes(jac, -1, -2)))
 
     def kernel(self) -> FusedKernel | None:
         """A compiled twin of residual(z, predict) and jacobians; None runs them in NumPy."""
@@ -134,10 +274,26 @@ class Landmark(ABC):
         return np.zeros(records.mean.shape[:2], dtype=bool)
 
     def promote(self, records: Records) -> Records:
-        """The estimates as single Gaussians of a world point; by default an unscented transform of each."""
-        from rbpf.core.numeric import promote_to_points
+        """The estimates as single Gaussians of a world point.
 
-        return promote_to_points(self, records)
+        By default the unscented transform of each component (S. Julier and J. Uhlmann 1997), and moment matching.
+        """
+        const = records.const
+        if const is not None and self.components > 1:
+            const = const[:, :, None, :]
+
+        def point(mean: np.ndarray) -> np.ndarray:
+            world = self.homogeneous(mean, const)
+            return world[..., :-1] / world[..., -1:]
+
+        mean, cov, _ = gaussian.unscented_transform(point, records.mean, records.cov)
+        if records.log_weights is None:
+            return Records(mean, cov)
+        weights = np.exp(records.log_weights)[..., None]
+        centre = (weights * mean).sum(axis=2)
+        spread = mean - centre[:, :, None]
+        total = (weights[..., None] * (cov + spread[..., :, None] * spread[..., None, :])).sum(axis=2)
+        return Records(centre, total)
 
 
 class Likelihood(ABC):
@@ -169,18 +325,22 @@ class Likelihood(ABC):
         return 0.0
 
 
-class Sensor(ABC):
+class Sensor(ABC, Generic[Frame]):
     """Raw data → observations, given the predicted belief; then new landmarks."""
 
     @abstractmethod
-    def observe(self, frame: Any, belief: "Belief") -> Sequence[Observations]:
+    def observe(self, frame: Frame, belief: "Belief") -> Sequence[Observations]:
         """Groups of observations of known landmarks (or of none)."""
 
     def new_landmarks(
-        self, frame: Any, belief: "Belief", observed: Sequence[Observations]
+        self, frame: Frame, belief: "Belief", observed: Sequence[Observations]
     ) -> Sequence[NewLandmarks]:
-        """First sightings, given the updated belief and what this sensor observed, ids of the descendants."""
+        """What starts landmarks, given the updated belief and what this sensor observed, ids of the descendants."""
         return ()
+
+
+LineariseAt = Callable[[Float[np.ndarray, "N d"]], Information]
+"""What the observations say about the increment relative to the prior's mean, linearised at increments (N, d)."""
 
 
 class Proposal(ABC):
@@ -190,16 +350,8 @@ class Proposal(ABC):
     """Whether samples are corrected by w₂ = p(z|x) p(x|x⁻) / (q(x) w₁); E06 takes w₂ := 1."""
 
     @abstractmethod
-    def propose(self, prior: "Prior", terms: "LineariseAt") -> "Proposed":
+    def propose(self, prior: Prior, linearise: LineariseAt) -> Proposed:
         """Gaussian to sample from, and the look-ahead weight log w₁."""
-
-
-class LineariseAt(ABC):
-    """What a proposal may ask: the observations' information about the increment."""
-
-    @abstractmethod
-    def __call__(self, increment: Float[np.ndarray, "N d"]) -> "Terms":
-        """Terms (relative to the prior's mean) linearised at the increments (N, d) in the prior's chart."""
 
 
 class Conditional(ABC):
@@ -208,14 +360,26 @@ class Conditional(ABC):
     supplies: Part
 
     @abstractmethod
-    def begin(self, n: int, lineage: "Lineage") -> None:
+    def begin(self, n: int, lineage: Lineage) -> None:
         """Makes room for n particles whose ancestry `lineage` keeps."""
 
+    def predict(self, transition: Transition, space: LieGroup) -> Prior:
+        """Distribution of the increment; only a substate that drives the motion changes it.
+
+        Raises:
+            InputError: the motion model needs a substate.
+        """
+        if transition.coupling is not None and transition.coupling.shape[-1]:
+            raise InputError(
+                "the motion model drives a substate: give the filter a KalmanSubstate to hold it"
+            )
+        return Prior(space, transition.mean, np.zeros((1, space.dim)), transition.noise_factor)
+
     @abstractmethod
-    def terms(
-        self, state: Float[np.ndarray, "N E"], groups: Sequence[Observations], prior: "Prior"
-    ) -> "Terms":
-        """The information of the groups about a right perturbation of the states (N, E)."""
+    def information(
+        self, state: Float[np.ndarray, "N E"], groups: Sequence[Observations], prior: Prior
+    ) -> Information:
+        """What the groups say about a right perturbation of the states (N, E)."""
 
     @abstractmethod
     def correct(
@@ -230,12 +394,6 @@ class Conditional(ABC):
     def resample(self, ancestors: Int[np.ndarray, " N"]) -> None:
         """Every particle i becomes a copy of particle ancestors[i]; `lineage` has been advanced."""
 
-    def predict(self, transition: Transition, space: LieGroup) -> "Prior":
-        """Law of the increment; only a substate that drives the motion changes it."""
-        from rbpf.core.proposals import Prior
-
-        return Prior.of_transition(transition, space)
-
     @abstractmethod
     def arrays(self) -> dict[str, np.ndarray]:
         """Everything that a checkpoint must hold."""
@@ -244,9 +402,222 @@ class Conditional(ABC):
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """The inverse of `arrays`, after `begin`."""
 
-    def options(self) -> dict[str, Any]:
+    def options(self) -> dict[str, object]:
         """What must agree between who saves a checkpoint and who loads it; plain values by name."""
         return {}
+
+
+class Map(Conditional):
+    """Landmarks, given the sampled states: what sensors ask of it and do to it. `rbpf.maps.LandmarkMap` is one.
+
+    Attributes:
+        evidence: whether it keeps, per particle, the log-odds that each landmark exists.
+    """
+
+    supplies = Part.LANDMARK
+    evidence: bool
+    catalogue: dict[int, Any]
+
+    @property
+    @abstractmethod
+    def ids(self) -> Int[np.ndarray, " M"]:
+        """Landmarks held (M,), in the order in which they were started."""
+
+    @property
+    @abstractmethod
+    def stored_fraction(self) -> float:
+        """Memory of the records, as a fraction of what separate copies for all particles would take."""
+
+    @abstractmethod
+    def holds(self, ids: Int[np.ndarray, " K"]) -> Bool[np.ndarray, " K"]:
+        """Which of some ids (K,) are those of landmarks held, (K,) bool."""
+
+    @abstractmethod
+    def landmark_of(self, landmark_id: int) -> Landmark:
+        """The parametrisation of a landmark."""
+
+    @abstractmethod
+    def are(self, ids: Int[np.ndarray, " K"], landmark: Landmark) -> Bool[np.ndarray, " K"]:
+        """Which landmarks (K,) of the map have this parametrisation, (K,) bool."""
+
+    @abstractmethod
+    def read(
+        self, ids: Int[np.ndarray, " K"], particles: Int[np.ndarray, " n"] | slice = slice(None)
+    ) -> Records:
+        """Estimates (N, K, …) of landmarks that share one parametrisation, in all or some particles.
+
+        Raises:
+            InputError: the map does not hold one of them, or their parametrisations differ.
+        """
+
+    @abstractmethod
+    def add(self, new_landmarks: NewLandmarks, state: Float[np.ndarray, "N E"]) -> Int[np.ndarray, " K"]:
+        """Starts landmarks at the states (N, E); returns their ids (K,).
+
+        Raises:
+            InputError: see `add_records`.
+        """
+
+    @abstractmethod
+    def add_records(
+        self,
+        records: Records,
+        landmark: Landmark,
+        log_odds: Float[np.ndarray, "N K"] | None = None,
+        ids: Int[np.ndarray, " K"] | None = None,
+    ) -> Int[np.ndarray, " K"]:
+        """Adds landmarks whose estimates (N, K, …) are known.
+
+        Args:
+            records: the estimates.
+            landmark: their parametrisation.
+            log_odds: (N, K) that they exist, for a map with evidence.
+            ids: (K,) that they shall have; by default numbers that no landmark had before.
+
+        Returns:
+            Their ids (K,).
+
+        Raises:
+            InputError: an id is no number from 0 up, comes twice or is in use, or the shapes do not fit.
+        """
+
+    @abstractmethod
+    def remove(self, ids: Int[np.ndarray, " K"]) -> None:
+        """Drops landmarks (K,) from all particles.
+
+        Raises:
+            InputError: the map does not hold one of them.
+        """
+
+    @abstractmethod
+    def promote(self, ids: Sequence[int] | Int[np.ndarray, " K"], to: Landmark | None = None) -> None:
+        """Turns landmarks into single Gaussian points in all particles at once, by their own `promote`."""
+
+    @abstractmethod
+    def log_odds(self, ids: Int[np.ndarray, " K"]) -> Float[np.ndarray, "N K"]:
+        """(N, K) log-odds that the landmarks exist; −inf where a particle does not hold one."""
+
+    @abstractmethod
+    def set_log_odds(self, ids: Int[np.ndarray, " K"], log_odds: Float[np.ndarray, "N K"]) -> None:
+        """Overwrites log-odds (N, K); a landmark at −inf in every particle is removed.
+
+        Raises:
+            InputError: the map keeps none.
+        """
+
+    @abstractmethod
+    def innovations(
+        self,
+        model: ObservationModel,
+        z: Float[np.ndarray, "K p"],
+        ids: Int[np.ndarray, " K"],
+        state: Float[np.ndarray, " E"],
+        particle: int,
+    ) -> tuple[Float[np.ndarray, "K p"], Jacobians, Records]:
+        """ν (K, p) of landmarks (K,) in one particle at a state (E,), its Jacobians, and the records (1, K, …)."""
+
+    @abstractmethod
+    def predictions(
+        self,
+        model: ObservationModel,
+        z: Float[np.ndarray, "K p"],
+        cov: Float[np.ndarray, "K p p"],
+        ids: Int[np.ndarray, " M"],
+        belief: "Belief",
+    ) -> tuple[Float[np.ndarray, "N K M p"], Float[np.ndarray, "N K M p p"]]:
+        """See `Belief.predictions`."""
+
+    @abstractmethod
+    def project(
+        self, model: ObservationModel, ids: Int[np.ndarray, " K"], belief: "Belief"
+    ) -> tuple[Float[np.ndarray, "K p"], Float[np.ndarray, "K p p"]]:
+        """See `Belief.project`."""
+
+
+@dataclass(frozen=True)
+class Belief:
+    """What a sensor may know before it measures: a weighted mixture of Gaussians, each with its own marginalised part.
+
+    Attributes:
+        log_weights: (N,) normalised.
+        prior: distribution of each particle's increment; after the update its factor is zero.
+        parts: what is marginalised, by what it supplies.
+    """
+
+    log_weights: Float[np.ndarray, " N"]
+    prior: Prior
+    parts: Mapping[Part, Conditional]
+
+    @cached_property
+    def state(self) -> Float[np.ndarray, "N E"]:
+        """(N, E) predicted states, or sampled ones after the update."""
+        return self.prior.predicted()
+
+    @cached_property
+    def weights(self) -> Float[np.ndarray, " N"]:
+        """(N,) summing to one."""
+        return np.exp(self.log_weights)
+
+    @cached_property
+    def mode(self) -> int:
+        """The particle of highest weight."""
+        return int(np.argmax(self.log_weights))
+
+    @property
+    def map(self) -> Map:
+        """The landmark map.
+
+        Raises:
+            InputError: the filter holds none.
+        """
+        held = self.parts.get(Part.LANDMARK)
+        if not isinstance(held, Map):
+            raise InputError("this sensor needs a landmark map: give the filter a LandmarkMap")
+        return held
+
+    @property
+    def catalogue(self) -> dict[int, Any]:
+        """Facts about landmarks that do not differ between particles: names, patches, descriptors, counters."""
+        return self.map.catalogue
+
+    def read(
+        self,
+        ids: Sequence[int] | Int[np.ndarray, " K"],
+        particles: Int[np.ndarray, " n"] | slice = slice(None),
+    ) -> Records:
+        """Estimates (N, K, …) of landmarks of one parametrisation, in all particles or in the rows named."""
+        return self.map.read(np.asarray(ids, dtype=np.int64), particles)
+
+    def read_mode(self, ids: Sequence[int] | Int[np.ndarray, " K"]) -> Records:
+        """Estimates (1, K, …) in the particle of highest weight alone."""
+        return self.read(ids, slice(self.mode, self.mode + 1))
+
+    def innovations(
+        self, model: ObservationModel, z: Float[np.ndarray, "K p"], ids: Int[np.ndarray, " K"]
+    ) -> tuple[Float[np.ndarray, "K p"], Float[np.ndarray, "K p d"], Float[np.ndarray, "K p p"]]:
+        """Of K measurements in the particle of highest weight: ν (K, p), ∂z/∂state (K, p, d) and J P Jᵀ (K, p, p)."""
+        nu, jac, records = self.map.innovations(model, z, ids, self.state[self.mode], self.mode)
+        assert jac.state is not None and jac.landmark is not None
+        return nu, jac.state, jac.landmark @ records.cov[0] @ np.swapaxes(jac.landmark, -1, -2)
+
+    def predictions(
+        self,
+        model: ObservationModel,
+        z: Float[np.ndarray, "K p"],
+        cov: Float[np.ndarray, "K p p"],
+        ids: Int[np.ndarray, " M"],
+    ) -> tuple[Float[np.ndarray, "N K M p"], Float[np.ndarray, "N K M p p"]]:
+        """Innovations ν (N, K, M, p) of K measurements against M landmarks, and S + H Q Hᵀ (N, K, M, p, p)."""
+        return self.map.predictions(model, z, cov, ids, self)
+
+    def project(
+        self, model: ObservationModel, ids: Int[np.ndarray, " K"]
+    ) -> tuple[Float[np.ndarray, "K p"], Float[np.ndarray, "K p p"]]:
+        """Where landmarks will be measured: mean (K, p) and covariance (K, p, p) under all particles (E06 §4.1).
+
+        The covariance is within + between particles, H Q Hᵀ included, without the measurement's own noise.
+        """
+        return self.map.project(model, ids, self)
 
 
 class Resampler(ABC):

@@ -1,11 +1,20 @@
-"""The weighted particles, and the arithmetic of log-weights (S05 (8)–(12))."""
+"""The weighted particles, and the Gaussian that the increment of each is drawn from.
+
+A particle's state moves by an increment ε in the right chart at the motion model's mean. `Prior` is its distribution before
+the observations, `Information` what they say about it, `Proposed` the Gaussian that it is sampled from. The arithmetic of
+log-weights is that of S05 (8)–(12).
+"""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
+from rbpf import gaussian
+from rbpf.arrays import Float, Int
 from rbpf.errors import InputError
+from rbpf.lie import LieGroup
 
 
 @dataclass
@@ -46,20 +55,193 @@ def reweight(log_weights: np.ndarray, log_factors: np.ndarray, what: str) -> tup
         joint = log_weights + log_factors
     high = joint.max()
     if not math.isfinite(high):
-        raise _unusable(log_factors, what)
+        bad = np.flatnonzero(np.isnan(log_factors) | np.isposinf(log_factors))
+        if not bad.size:
+            raise InputError(f"{what}: all particle weights are zero, no particle explains the observations")
+        weight = f"the weight of particle {bad[0]} is {log_factors[bad[0]]}"
+        raise InputError(f"{what}: {weight}; check the models with rbpf.check_model")
     total = float(high + np.log(np.exp(joint - high).sum()))
     return joint - total, total
-
-
-def _unusable(log_factors: np.ndarray, what: str) -> InputError:
-    bad = np.flatnonzero(np.isnan(log_factors) | np.isposinf(log_factors))
-    if bad.size == 0:
-        return InputError(f"{what}: all particle weights are zero, no particle explains the observations")
-    return InputError(
-        f"{what}: the weight of particle {bad[0]} is {log_factors[bad[0]]}; check the models with rbpf.check_model"
-    )
 
 
 def effective_sample_size(weights: np.ndarray) -> float:
     """1 / Σ W², between 1 and N, for normalised weights (N,)."""
     return float(1.0 / np.square(weights).sum())
+
+
+def take(array: np.ndarray, ancestors: np.ndarray | slice) -> np.ndarray:
+    """Rows of the ancestors; an array shared by all particles (first axis 1) stays as it is."""
+    return array if array.shape[0] == 1 else array[ancestors]
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Distribution of the increment before the observations: x = base · Exp(ε), ε ~ N(mean, factor factorᵀ).
+
+    Attributes:
+        space: the group of the states.
+        base: (N, E) origin of each particle's chart.
+        mean: (N or 1, d).
+        factor: (N or 1, d, r).
+        centred: whether the mean is zero.
+    """
+
+    space: LieGroup
+    base: Float[np.ndarray, "N E"]
+    mean: Float[np.ndarray, "#N d"]
+    factor: Float[np.ndarray, "#N d r"]
+    centred: bool = True
+
+    @classmethod
+    def exactly(cls, space: LieGroup, state: Float[np.ndarray, "N E"]) -> "Prior":
+        """States (N, E) that are known exactly."""
+        return cls(space, state, np.zeros((1, space.dim)), np.zeros((1, space.dim, 0)))
+
+    def at(self, increment: Float[np.ndarray, "#N d"]) -> Float[np.ndarray, "N E"]:
+        """States (N, E) at increments (N or 1, d)."""
+        return self.space.retract(self.base, increment)
+
+    def predicted(self) -> Float[np.ndarray, "N E"]:
+        """States (N, E) at the mean."""
+        return self._predicted
+
+    def spread(self, increment: Float[np.ndarray, "#N d"]) -> Float[np.ndarray, "#N d r"]:
+        """The factor (N, d, r) in the charts at the states at increments (N or 1, d), to first order."""
+        if self.centred:
+            return self.factor
+        return self._spread if increment is self.mean else self.space.right_jacobian(increment) @ self.factor
+
+    @cached_property
+    def _predicted(self) -> np.ndarray:
+        """Needed several times in a step, as is `_spread`."""
+        return self.base if self.centred else self.at(self.mean)
+
+    @cached_property
+    def _spread(self) -> np.ndarray:
+        return np.asarray(self.space.right_jacobian(self.mean) @ self.factor)
+
+    def take(self, ancestors: Int[np.ndarray, " N"] | slice) -> "Prior":
+        """Those of the ancestors."""
+        return replace(
+            self,
+            base=self.base[ancestors],
+            mean=take(self.mean, ancestors),
+            factor=take(self.factor, ancestors),
+        )
+
+
+@dataclass
+class Information:
+    """What the observations say about ε − μ, in information form; sums over independent observations add.
+
+    Attributes:
+        info: (N, d, d) Σ HᵀS⁻¹H.
+        vector: (N, d) Σ HᵀS⁻¹ν.
+        quad: (N,) Σ νᵀS⁻¹ν.
+        log_det: (N,) Σ log|2πS|.
+        log_factor: (N,) log-densities that do not depend on the increment: clutter, new landmarks.
+        rows: number of scalar measurements.
+    """
+
+    info: Float[np.ndarray, "N d d"]
+    vector: Float[np.ndarray, "N d"]
+    quad: Float[np.ndarray, " N"]
+    log_det: Float[np.ndarray, " N"]
+    log_factor: Float[np.ndarray, " N"]
+    rows: int = 0
+
+    @classmethod
+    def zeros(cls, n: int, dim: int) -> "Information":
+        """No observations."""
+        return cls(np.zeros((n, dim, dim)), np.zeros((n, dim)), np.zeros(n), np.zeros(n), np.zeros(n))
+
+    @classmethod
+    def of_parts(cls, parts: list["Information"]) -> "Information":
+        """The same observations, of particles that were taken in several parts."""
+        if len(parts) == 1:
+            return parts[0]
+        return cls(
+            np.concatenate([part.info for part in parts]),
+            np.concatenate([part.vector for part in parts]),
+            np.concatenate([part.quad for part in parts]),
+            np.concatenate([part.log_det for part in parts]),
+            np.concatenate([part.log_factor for part in parts]),
+            parts[0].rows,
+        )
+
+    def add(self, other: "Information") -> None:
+        """Adds independent observations, in place."""
+        for name in ("info", "vector", "quad", "log_det", "log_factor"):
+            getattr(self, name).__iadd__(getattr(other, name))
+        self.rows += other.rows
+
+    def charted(self, jacobian: Float[np.ndarray, "#N d d"]) -> "Information":
+        """The same for a perturbation δ of the chart's coordinates, where the state moves by J δ; J (N, d, d)."""
+        turned = np.swapaxes(jacobian, -1, -2)
+        vector = (turned @ self.vector[..., None])[..., 0]
+        return replace(self, info=turned @ self.info @ jacobian, vector=vector)
+
+    def shifted(self, offset: Float[np.ndarray, "#N d"]) -> "Information":
+        """The same relative to a point `offset` (N, d) before the one linearised at: ν + H·offset."""
+        moved = np.einsum("nab,nb->na", self.info, offset)
+        quad = self.quad + (offset * (2.0 * self.vector + moved)).sum(axis=1)
+        return replace(self, vector=self.vector + moved, quad=quad)
+
+
+@dataclass(frozen=True)
+class Proposed:
+    """Gaussian in whitened coordinates u, ε = μ + L u, that each particle's descendants are sampled from.
+
+    Attributes:
+        mean: (N, r) of u.
+        root: (N or 1, r, r) upper triangular; the covariance of u is root rootᵀ.
+        log_w1: (N,) look-ahead weight.
+        nis: (N,) squared Mahalanobis distance of the joint innovation, None where nothing was linearised.
+        rows: number of scalar measurements behind it.
+    """
+
+    mean: Float[np.ndarray, "#N r"]
+    root: Float[np.ndarray, "#N r r"]
+    log_w1: Float[np.ndarray, " N"]
+    nis: Float[np.ndarray, " N"] | None = None
+    rows: int = 0
+
+    def sample(
+        self, ancestors: Int[np.ndarray, " M"], rng: np.random.Generator
+    ) -> tuple[Float[np.ndarray, "M r"], Float[np.ndarray, " M"]]:
+        """One u per descendant (N, r), and log p(u) − log q(u) (N,)."""
+        noise = rng.standard_normal((ancestors.size, self.mean.shape[1]))
+        root = take(self.root, ancestors)
+        u = take(self.mean, ancestors) + np.einsum("nab,nb->na", root, noise)
+        log_root = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
+        return u, 0.5 * (noise * noise - u * u).sum(axis=1) + log_root
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A Gaussian summary of the state.
+
+    Attributes:
+        mean: (E,) weighted Fréchet mean.
+        cov: (d, d) in the right chart at the mean, within + between particles.
+    """
+
+    mean: Float[np.ndarray, " E"]
+    cov: Float[np.ndarray, "d d"]
+
+
+def mixture_estimate(prior: Prior, proposed: Proposed | None, log_weights: np.ndarray) -> Estimate:
+    """Summary of the refined mixture before sampling, or of the prior's states where nothing was proposed."""
+    weights = np.exp(log_weights)
+    factor = prior.factor
+    centres = prior.predicted()
+    if proposed is not None:
+        increment = prior.mean + np.einsum("nar,nr->na", factor, proposed.mean)
+        centres = prior.at(increment)
+        factor = prior.spread(increment) @ proposed.root
+    mean = prior.space.mean(centres, weights)
+    spread = prior.space.local(mean, centres)
+    between = np.einsum("n,na,nb->ab", weights, spread, spread)
+    fraction = weights if factor.shape[0] > 1 else np.ones(1)
+    within = np.einsum("n,nar,nbr->ab", fraction, factor, factor)
+    return Estimate(mean, gaussian.symmetrise(within + between))

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rbpf.core.history import History
+from rbpf.core.genealogy import History
 from rbpf.core.models import MotionModel
 from rbpf.errors import InputError
 from rbpf.lie import LieGroup

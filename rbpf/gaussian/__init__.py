@@ -14,15 +14,18 @@ from rbpf.gaussian.distributions import (
     sample,
     unscented_transform,
 )
-from rbpf.gaussian.factors import (
+from rbpf.gaussian.matrices import (
     cholesky,
     inverse,
     log_det,
+    pack,
+    product,
     psd_factor,
     solve_lower,
     solve_lower_matrix,
+    symmetrise,
+    unpack,
 )
-from rbpf.gaussian.storage import pack, product, symmetrise, unpack
 
 __all__ = [
     "Gaussian",

@@ -1,4 +1,4 @@
-"""Gaussian laws: log-density, sampling, conditioning, and the image under a function."""
+"""Gaussian distributions: log-density, sampling, conditioning, and the image under a function."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -8,8 +8,16 @@ from numpy.typing import ArrayLike
 
 from rbpf.arrays import Float, Like
 from rbpf.errors import InputError
-from rbpf.gaussian.factors import cholesky, generalised_inverse, log_det, psd_factor, solve_lower
-from rbpf.gaussian.storage import Array, gram, product
+from rbpf.gaussian.matrices import (
+    Array,
+    cholesky,
+    generalised_inverse,
+    gram,
+    log_det,
+    product,
+    psd_factor,
+    solve_lower,
+)
 
 _LOG_2PI = float(np.log(2.0 * np.pi))
 
@@ -80,7 +88,7 @@ def condition(
     cov_bb: Like[ArrayLike, "*#batch m m"],
     b: Like[ArrayLike, "*#batch m"],
 ) -> Gaussian:
-    """Law of a given b, where (a, b) are jointly Gaussian.
+    """Distribution of a given b, where (a, b) are jointly Gaussian.
 
     With the gain K = cov_ab cov_bb^- and a factor [F_a; F_b] of the joint covariance, the result is
     mean_a + K (b - mean_b) and (F_a - K F_b)(F_a - K F_b)^T, which cannot lose definiteness.
@@ -101,8 +109,11 @@ def condition(
         InputError: The joint covariance holds NaN, is not symmetric or not positive semi-definite.
     """
     aa, ab, bb = (np.asarray(part, dtype=float) for part in (cov_aa, cov_ab, cov_bb))
-    n = aa.shape[-1]
-    factor = psd_factor(_joint(aa, ab, bb))
+    n, m = ab.shape[-2:]
+    joint = np.empty((*np.broadcast_shapes(aa.shape[:-2], ab.shape[:-2], bb.shape[:-2]), n + m, n + m))
+    joint[..., :n, :n], joint[..., :n, n:] = aa, ab
+    joint[..., n:, :n], joint[..., n:, n:] = np.swapaxes(ab, -1, -2), bb
+    factor = psd_factor(joint)
     gain = product(ab, generalised_inverse(bb))
     innovation = np.asarray(b, dtype=float) - np.asarray(mean_b, dtype=float)
     mean = np.asarray(mean_a, dtype=float) + np.einsum("...ij,...j->...i", gain, innovation)
@@ -141,27 +152,12 @@ def unscented_transform(
         raise InputError(f"unscented_transform needs kappa >= 0, got {kappa}.")
     weights = np.full(2 * n + 1, 0.5 / (n + kappa))
     weights[0] = kappa / (n + kappa)
-    offsets = _sigma_offsets(psd_factor(cov), np.sqrt(n + kappa))
+    # Zero, then plus and minus the factor's columns, (2n + 1, ..., n).
+    columns = np.sqrt(n + kappa) * np.moveaxis(psd_factor(cov), -1, 0)
+    offsets = np.concatenate([np.zeros_like(columns[:1]), columns, -columns])
     values = function(mean + offsets)
     roots = np.sqrt(weights)
     mean_y = np.einsum("s,s...->...", weights, values)
     weighted_y = np.moveaxis(values - mean_y, 0, -1) * roots
     weighted_x = np.moveaxis(offsets, 0, -1) * roots
     return Transformed(mean_y, gram(weighted_y), product(weighted_x, np.swapaxes(weighted_y, -1, -2)))
-
-
-def _sigma_offsets(factor: Array, spread: float) -> Array:
-    # (..., n, n) -> (2n + 1, ..., n): zero, then plus and minus the columns.
-    columns = spread * np.moveaxis(factor, -1, 0)
-    return np.concatenate([np.zeros_like(columns[:1]), columns, -columns])
-
-
-def _joint(cov_aa: Array, cov_ab: Array, cov_bb: Array) -> Array:
-    batch = np.broadcast_shapes(cov_aa.shape[:-2], cov_ab.shape[:-2], cov_bb.shape[:-2])
-    n, m = cov_ab.shape[-2:]
-    out = np.empty((*batch, n + m, n + m))
-    out[..., :n, :n] = cov_aa
-    out[..., :n, n:] = cov_ab
-    out[..., n:, :n] = np.swapaxes(cov_ab, -1, -2)
-    out[..., n:, n:] = cov_bb
-    return out

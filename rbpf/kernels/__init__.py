@@ -2,11 +2,11 @@
 
 A block is `BLOCK` particles side by side, stored field by field (`(fields, BLOCK)`), so that every innermost loop
 runs along particles and compiles to vector instructions. Lanes never mix: the result is the same bytes whatever
-the number of threads. The docstrings of the drivers give the mathematics; `rbpf.core.reference` is their NumPy twin.
+the number of threads. The docstrings of the drivers give the mathematics; `rbpf.core.linearisation` is their NumPy twin.
 """
 
 from pathlib import Path
 
-from rbpf.kernels.stale import discard_stale
+from rbpf.kernels.signature import discard_stale
 
 discard_stale(Path(__file__).parent)

@@ -3,13 +3,10 @@
 import math
 
 import numpy as np
-from numba import float64, int64, njit, types, void
+from numba import float64, int64, njit, void
 
-from rbpf.kernels.quaternion import multiply, rotation, turned
-from rbpf.kernels.rigid import exp_pair
-from rbpf.kernels.signature import CUBE, MATRIX, READ_ONLY
-
-_READ_CUBE = types.Array(float64, 3, "C", readonly=True)
+from rbpf.kernels.se3 import exp_pair, multiply, rotation, turned
+from rbpf.kernels.signature import CUBE, MATRIX, READ_ONLY, READ_ONLY_CUBE
 
 
 @njit(cache=True, error_model="numpy")
@@ -107,7 +104,19 @@ def _spread(slope, cov, out):
 
 
 @njit(
-    void(_READ_CUBE, _READ_CUBE, READ_ONLY, _READ_CUBE, READ_ONLY, int64, float64, MATRIX, CUBE, CUBE, CUBE),
+    void(
+        READ_ONLY_CUBE,
+        READ_ONLY_CUBE,
+        READ_ONLY,
+        READ_ONLY_CUBE,
+        READ_ONLY,
+        int64,
+        float64,
+        MATRIX,
+        CUBE,
+        CUBE,
+        CUBE,
+    ),
     cache=True,
     error_model="numpy",
 )

@@ -1,14 +1,15 @@
-"""The type of a fused observation kernel, and the decorator that makes one."""
+"""What kernels share: the type of a fused observation kernel and the decorator that makes one, threads, stale copies."""
 
 from collections.abc import Callable
+from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import Any, final
 
+import numba
 from numba import cfunc, float64, int64, types, void
 from numba.core import cgutils
 from numba.extending import intrinsic
-
-from rbpf.kernels.stale import discard_stale
 
 BLOCK = 128
 """Particles per block: long enough that what a loop costs to start is small beside its work; in the L2 cache."""
@@ -16,11 +17,16 @@ BLOCK = 128
 FACTORS_PER_LOG = 18
 """Pivots multiplied before one logarithm is taken: 18 factors within 1e±16 stay inside the range of a double."""
 
+PAIRS_PER_THREAD = 8192
+"""Particle-observation pairs worth a thread: a quarter of a millisecond of work, far above a wake-up."""
+
 VECTOR = types.Array(float64, 1, "C")
 MATRIX = types.Array(float64, 2, "C")
 CUBE = types.Array(float64, 3, "C")
+HYPERCUBE = types.Array(float64, 4, "C")
 READ_ONLY = types.Array(float64, 2, "C", readonly=True)
 """A matrix that is not written: the caller's may be locked."""
+READ_ONLY_CUBE = types.Array(float64, 3, "C", readonly=True)
 INDICES = types.Array(int64, 1, "C")
 INDEX_MATRIX = types.Array(int64, 2, "C")
 MASK = types.Array(types.boolean, 2, "C")
@@ -65,3 +71,43 @@ def observation_kernel(function: Callable[..., None]) -> ObservationKernel:
     """
     discard_stale(Path(function.__code__.co_filename).parent)
     return ObservationKernel(cfunc(_SIGNATURE, cache=True, error_model="numpy")(function))
+
+
+def run_driver(driver: Callable[..., None], pairs: int, *arguments: Any) -> None:
+    """Calls a driver on as many threads as `pairs` of particle and observation keep busy."""
+    allowed = numba.get_num_threads()
+    wanted = max(1, min(allowed, pairs // PAIRS_PER_THREAD))
+    if wanted == allowed:
+        driver(*arguments)
+        return
+    numba.set_num_threads(wanted)
+    try:
+        driver(*arguments)
+    finally:
+        numba.set_num_threads(allowed)
+
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+
+
+def discard_stale(folder: Path) -> None:
+    """Deletes compiled copies of the modules in a folder that are older than any kernel source of this package.
+
+    Numba's cache notices when a function's own file changes, not when a function or a constant that it uses does: an
+    old copy would go on with another block size and write outside its arrays.
+    """
+    places = [folder / "__pycache__"]
+    if numba.config.CACHE_DIR:
+        places = [place for place in Path(numba.config.CACHE_DIR).glob("*") if place.is_dir()]
+    for place in places:
+        for index in place.glob("*.nbi"):
+            with suppress(FileNotFoundError):  # another process may be doing the same
+                if index.stat().st_mtime < _newest_source():
+                    index.unlink()
+
+
+@cache
+def _newest_source() -> float:
+    patterns = "kernels/*.py", "*/*kernel*.py", "*/*/*kernel*.py"
+    sources = [source for pattern in patterns for source in _PACKAGE.glob(pattern)]
+    return max(source.stat().st_mtime for source in sources)

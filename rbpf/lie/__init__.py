@@ -7,12 +7,22 @@ robotics" (2018), and Barfoot, "State Estimation for Robotics" (2017), chapter 7
 """
 
 from rbpf.lie.base import Array, LieGroup, Manifold
-from rbpf.lie.euclidean import Euclidean
-from rbpf.lie.product import Product
+from rbpf.lie.product import Euclidean, Product
 from rbpf.lie.se2 import SE2Group
-from rbpf.lie.se3 import SE3Group
+from rbpf.lie.se3 import SE3Group, skew
 
 SE2 = SE2Group()
 SE3 = SE3Group()
 
-__all__ = ["SE2", "SE3", "Array", "Euclidean", "LieGroup", "Manifold", "Product", "SE2Group", "SE3Group"]
+__all__ = [
+    "SE2",
+    "SE3",
+    "Array",
+    "Euclidean",
+    "LieGroup",
+    "Manifold",
+    "Product",
+    "SE2Group",
+    "SE3Group",
+    "skew",
+]

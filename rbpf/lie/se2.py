@@ -4,6 +4,7 @@ The plane is treated as the complex numbers: a rotation is the factor exp(i thet
 Exp([omega, v]) has the translation V v with V = sin(h) / h exp(i h), h = omega / 2.
 """
 
+from math import factorial
 from typing import final
 
 import numpy as np
@@ -11,11 +12,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from rbpf.arrays import Float, Like
 from rbpf.lie.base import Array, LieGroup
-from rbpf.lie.series import coefficient_b, coefficient_c
 
 Complex = NDArray[np.complex128]
 
 _TURN = 2.0 * np.pi
+_TINY = 1e-300
+"""Added to theta^2, so that no division sees zero: its root is far below any angle that changes a result."""
+_C_SERIES = [(-1) ** k / factorial(2 * k + 3) for k in range(10)]
 
 
 @final
@@ -191,4 +194,21 @@ def _block(linear: Complex, column: Complex) -> Array:
 def _coupling(xi: Array) -> Complex:
     # d(translation)/d(omega) of the left Jacobian: v (theta c - i b).
     squared = np.square(xi[..., 0])
-    return _planar(xi) * (xi[..., 0] * coefficient_c(squared) - 1j * coefficient_b(squared))
+    return _planar(xi) * (xi[..., 0] * _coefficient_c(squared) - 1j * _coefficient_b(squared))
+
+
+def _coefficient_b(theta_squared: Array) -> Array:
+    """(1 - cos theta) / theta^2 = sum_k (-x)^k / (2k + 2)! of x = theta^2, from the half angle, which does not cancel."""
+    theta = np.sqrt(theta_squared + _TINY)
+    return np.asarray(2.0 * np.square(np.sin(0.5 * theta) / theta))
+
+
+def _coefficient_c(theta_squared: Array) -> Array:
+    """(theta - sin theta) / theta^3 = sum_k (-x)^k / (2k + 3)! of x = theta^2; by the series below 1, where it cancels."""
+    # Clipping keeps the branch that is not taken from overflowing.
+    small, x = np.minimum(theta_squared, 1.0), np.maximum(theta_squared, 1.0)
+    series = np.full_like(small, _C_SERIES[-1])
+    for coefficient in _C_SERIES[-2::-1]:
+        series = series * small + coefficient
+    theta = np.sqrt(x)
+    return np.where(theta_squared < 1.0, series, (theta - np.sin(theta)) / (x * theta))

@@ -1,8 +1,6 @@
 """SE(3), rigid motions of space; storage [qx, qy, qz, qw, tx, ty, tz], tangent [omega, v]."""
 
 from collections.abc import Callable
-from functools import cache
-from types import ModuleType
 from typing import final
 
 import numpy as np
@@ -10,8 +8,8 @@ from numpy.typing import ArrayLike
 
 from rbpf.arrays import Float, Like
 from rbpf.errors import InputError
+from rbpf.kernels import se3 as kernels
 from rbpf.lie.base import Array, LieGroup, join
-from rbpf.lie.matrices import quat_from_matrix
 
 
 @final
@@ -30,28 +28,28 @@ class SE3Group(LieGroup):
         return out
 
     def exp(self, xi: Like[ArrayLike, "*#batch 6"]) -> Float[np.ndarray, "*batch 7"]:
-        return _one(_compiled().exp, xi, 6, (7,))
+        return _one(kernels.exp, xi, 6, (7,))
 
     def log(self, x: Like[ArrayLike, "*#batch 7"]) -> Float[np.ndarray, "*batch 6"]:
-        return _one(_compiled().log, x, 7, (6,))
+        return _one(kernels.log, x, 7, (6,))
 
     def compose(
         self, a: Like[ArrayLike, "*#batch 7"], b: Like[ArrayLike, "*#batch 7"]
     ) -> Float[np.ndarray, "*batch 7"]:
-        return _two(_compiled().compose, a, b, 7, 7)
+        return _two(kernels.compose, a, b, 7, 7)
 
     def inverse(self, a: Like[ArrayLike, "*#batch 7"]) -> Float[np.ndarray, "*batch 7"]:
-        return _one(_compiled().inverse, a, 7, (7,))
+        return _one(kernels.inverse, a, 7, (7,))
 
     def retract(
         self, x: Like[ArrayLike, "*#batch 7"], xi: Like[ArrayLike, "*#batch 6"]
     ) -> Float[np.ndarray, "*batch 7"]:
-        return _two(_compiled().retract, x, xi, 6, 7)
+        return _two(kernels.retract, x, xi, 6, 7)
 
     def local(
         self, x: Like[ArrayLike, "*#batch 7"], y: Like[ArrayLike, "*#batch 7"]
     ) -> Float[np.ndarray, "*batch 6"]:
-        return _two(_compiled().local, x, y, 7, 6)
+        return _two(kernels.local, x, y, 7, 6)
 
     def normalise(self, x: Like[ArrayLike, "*#batch 7"]) -> Float[np.ndarray, "*batch 7"]:
         out = np.array(x, dtype=float)
@@ -59,13 +57,13 @@ class SE3Group(LieGroup):
         return out
 
     def adjoint(self, a: Like[ArrayLike, "*#batch 7"]) -> Float[np.ndarray, "*batch 6 6"]:
-        return _one(_matrices().adjoint, a, 7, (6, 6))
+        return _one(kernels.adjoint, a, 7, (6, 6))
 
     def left_jacobian(self, xi: Like[ArrayLike, "*#batch 6"]) -> Float[np.ndarray, "*batch 6 6"]:
-        return _one(_matrices().left_jacobian, xi, 6, (6, 6))
+        return _one(kernels.left_jacobian, xi, 6, (6, 6))
 
     def left_jacobian_inverse(self, xi: Like[ArrayLike, "*#batch 6"]) -> Float[np.ndarray, "*batch 6 6"]:
-        return _one(_matrices().left_jacobian_inverse, xi, 6, (6, 6))
+        return _one(kernels.left_jacobian_inverse, xi, 6, (6, 6))
 
     def transform(
         self, a: Like[ArrayLike, "*#batch 7"], p: Like[ArrayLike, "*#batch 3"]
@@ -79,13 +77,13 @@ class SE3Group(LieGroup):
         Returns:
             (..., 3), in the world [m].
         """
-        return _two(_compiled().transform, a, p, 3, 3)
+        return _two(kernels.transform, a, p, 3, 3)
 
     def inverse_transform(
         self, a: Like[ArrayLike, "*#batch 7"], p: Like[ArrayLike, "*#batch 3"]
     ) -> Float[np.ndarray, "*batch 3"]:
         """Body points of world points; arguments as in `transform`, the frames of p exchanged."""
-        return _two(_compiled().inverse_transform, a, p, 3, 3)
+        return _two(kernels.inverse_transform, a, p, 3, 3)
 
     def translation(self, a: Like[ArrayLike, "*#batch 7"]) -> Float[np.ndarray, "*batch 3"]:
         """View of the translation, (..., 7) -> (..., 3)."""
@@ -93,7 +91,7 @@ class SE3Group(LieGroup):
 
     def rotation(self, a: Like[ArrayLike, "*#batch 7"]) -> Float[np.ndarray, "*batch 3 3"]:
         """Rotation matrix, (..., 7) -> (..., 3, 3)."""
-        return _one(_matrices().rotations, a, 7, (3, 3))
+        return _one(kernels.rotations, a, 7, (3, 3))
 
     def matrix(self, a: Like[ArrayLike, "*#batch 7"]) -> Float[np.ndarray, "*batch 4 4"]:
         """Homogeneous matrix, (..., 7) -> (..., 4, 4)."""
@@ -107,7 +105,7 @@ class SE3Group(LieGroup):
     def from_matrix(self, m: Like[ArrayLike, "*batch row 4"]) -> Float[np.ndarray, "*batch 7"]:
         """Element of a homogeneous (or 3 x 4) matrix, (..., 4, 4) -> (..., 7), with qw >= 0."""
         m = np.asarray(m, dtype=float)
-        return np.concatenate([quat_from_matrix(m[..., :3, :3]), m[..., :3, 3]], axis=-1)
+        return np.concatenate([_quat_from_matrix(m[..., :3, :3]), m[..., :3, 3]], axis=-1)
 
     def from_ypr(
         self,
@@ -151,22 +149,6 @@ def _half_angle(angle: ArrayLike) -> tuple[Array, Array]:
     return np.asarray(np.cos(half)), np.asarray(np.sin(half))
 
 
-@cache
-def _compiled() -> ModuleType:
-    """Imported when it is first needed: Numba takes longer to import than all the rest."""
-    from rbpf.kernels import rigid
-
-    return rigid
-
-
-@cache
-def _matrices() -> ModuleType:
-    """Likewise."""
-    from rbpf.kernels import rigid_matrices
-
-    return rigid_matrices
-
-
 def _one(
     function: Callable[[Array, Array], None], x: ArrayLike, size: int, out_shape: tuple[int, ...]
 ) -> Array:
@@ -203,3 +185,31 @@ def _spread(x: Array, shape: tuple[int, ...]) -> Array:
 def _require_size(x: Array, size: int) -> None:
     if x.ndim == 0 or x.shape[-1] != size:
         raise InputError(f"SE3 expected an array (..., {size}), got {x.shape}")
+
+
+def skew(v: Array) -> Array:
+    """Matrix of the cross product, (..., 3) -> (..., 3, 3)."""
+    out = np.zeros((*v.shape[:-1], 3, 3))
+    out[..., 2, 1], out[..., 0, 2], out[..., 1, 0] = v[..., 0], v[..., 1], v[..., 2]
+    out[..., 1, 2], out[..., 2, 0], out[..., 0, 1] = -v[..., 0], -v[..., 1], -v[..., 2]
+    return out
+
+
+def _quat_from_matrix(rotation: Array) -> Array:
+    """Unit quaternion with w >= 0 of a rotation matrix, (..., 3, 3) -> (..., 4), order xyzw.
+
+    All of 4 q q^T is linear in the matrix; its row with the largest diagonal loses no digits.
+    """
+    outer = np.empty((*rotation.shape[:-2], 4, 4))
+    trace = np.trace(rotation, axis1=-2, axis2=-1)
+    swapped = np.swapaxes(rotation, -1, -2)
+    outer[..., :3, :3] = rotation + swapped + (1.0 - trace)[..., None, None] * np.eye(3)
+    odd = rotation - swapped
+    outer[..., 3, 0] = outer[..., 0, 3] = odd[..., 2, 1]
+    outer[..., 3, 1] = outer[..., 1, 3] = odd[..., 0, 2]
+    outer[..., 3, 2] = outer[..., 2, 3] = odd[..., 1, 0]
+    outer[..., 3, 3] = 1.0 + trace
+    best = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
+    quat = np.take_along_axis(outer, best[..., None, None], axis=-2)[..., 0, :]
+    quat = quat / np.sqrt(np.square(quat).sum(-1, keepdims=True))
+    return np.where(quat[..., 3:] < 0.0, -quat, quat)

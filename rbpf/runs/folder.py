@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 
 from rbpf import gaussian
-from rbpf.core.archive import save_arrays
+from rbpf.core.checkpoint import save_arrays
 from rbpf.lie import SE3
 from rbpf.runs.files import (
     MAP,

@@ -10,7 +10,7 @@ from typing import Any, final
 
 import numpy as np
 
-from rbpf.core.archive import checked
+from rbpf.core.checkpoint import checked
 from rbpf.errors import InputError
 from rbpf.lie import SE2Group, SE3Group
 from rbpf.systems.system import (

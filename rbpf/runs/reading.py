@@ -17,8 +17,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from rbpf.core.archive import checked, load_arrays
-from rbpf.core.checkpoint import fitting
+from rbpf.core.checkpoint import checked, fitting, load_arrays
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3, SE2Group, SE3Group
 from rbpf.runs.files import MAP, TRAJECTORY, VERSION

@@ -16,8 +16,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from rbpf.core.archive import checked
-from rbpf.core.checkpoint import fitting
+from rbpf.core.checkpoint import checked, fitting
 from rbpf.errors import InputError
 from rbpf.runs.frame_log import FrameLog
 from rbpf.runs.truth import RunTruth

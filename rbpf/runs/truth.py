@@ -11,8 +11,7 @@ from typing import Protocol
 
 import numpy as np
 
-from rbpf.core.archive import checked, load_arrays, save_arrays
-from rbpf.core.checkpoint import fitting
+from rbpf.core.checkpoint import checked, fitting, load_arrays, save_arrays
 from rbpf.errors import InputError
 from rbpf.lie import SE2Group, SE3Group
 from rbpf.runs.alignment import Alignment

@@ -9,6 +9,7 @@ from rbpf import gaussian
 from rbpf.core.anchoring import Anchored
 from rbpf.core.filter import Filter
 from rbpf.core.models import Records
+from rbpf.lie import SE2Group
 from rbpf.sensors.range_bearing import RelativePosition
 
 
@@ -58,7 +59,7 @@ def estimate_map(filter_: Filter, anchored: Anchored | None = None) -> MapEstima
     landmark_map, weights = belief.map, belief.weights
     names, means, covs = [], [], []
     for landmark_id in landmark_map.ids:
-        held = np.ones(weights.size)
+        held = np.ones(weights.size, dtype=bool)
         if landmark_map.evidence:
             held = landmark_map.log_odds(np.array([landmark_id]))[:, 0] > 0
         fraction = (weights * held).sum()
@@ -73,7 +74,7 @@ def estimate_map(filter_: Filter, anchored: Anchored | None = None) -> MapEstima
         names.append(landmark_map.catalogue.get(int(landmark_id), int(landmark_id)))
         means.append(mean)
         covs.append(cov)
-    dim = landmark_map.layouts[0].landmark.dim
+    dim = 2 if isinstance(filter_.space, SE2Group) else 3
     return MapEstimate(
         np.array(names, dtype=np.int64),
         np.array(means).reshape(-1, dim),

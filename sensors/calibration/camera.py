@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rbpf.errors import InputError
-from rbpf.lie.matrices import skew
+from rbpf.lie import skew
 from rbpf.sensors.calibration.boards import Board
 from rbpf.sensors.camera import Pinhole
 

@@ -5,7 +5,7 @@ import math
 from numba import njit
 
 from rbpf.kernels.block import flat
-from rbpf.kernels.quaternion import rotation
+from rbpf.kernels.se3 import rotation
 from rbpf.kernels.signature import BLOCK, observation_kernel
 from rbpf.sensors.camera.kernels import (
     KIND,

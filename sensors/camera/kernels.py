@@ -10,7 +10,7 @@ import numpy as np
 from numba import boolean, int64, njit, types
 
 from rbpf.kernels.block import flat
-from rbpf.kernels.quaternion import rotation
+from rbpf.kernels.se3 import rotation
 from rbpf.kernels.signature import BLOCK, INDICES, MATRIX, VECTOR, observation_kernel
 from rbpf.sensors.camera.distortion import NEAR
 

@@ -6,8 +6,7 @@ from itertools import combinations, islice
 import numpy as np
 
 from rbpf.errors import InputError
-from rbpf.lie import SE3
-from rbpf.lie.matrices import skew
+from rbpf.lie import SE3, skew
 from rbpf.sensors.camera import Pinhole
 
 FLAT = 1e-3

@@ -11,7 +11,7 @@ from typing import Any, final
 
 import numpy as np
 
-from rbpf.core.exchange import NULL
+from rbpf.core.models import NULL
 from rbpf.errors import InputError
 from rbpf.sensors.descriptors.matching import (
     DescriptorMatches,

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numba import njit, prange
 
-from rbpf.kernels.stale import discard_stale
+from rbpf.kernels.signature import discard_stale
 
 
 @njit(cache=True, error_model="numpy")

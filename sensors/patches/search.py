@@ -12,7 +12,7 @@ from rbpf.errors import InputError
 from rbpf.sensors.features.interface import checked_image
 
 PAIRS_PER_PRODUCT, PAIRS_PER_TEMPLATE = 1.0 / 400.0, 300.0
-"""What a product of grey levels and a template cost beside the pairs of `rbpf.kernels.threads`."""
+"""What a product of grey levels and a template cost beside the pairs of `rbpf.kernels.signature`."""
 LARGEST_SIZE = 101
 """Of a template: sums of squares over a window stay far inside 32 bits."""
 
@@ -123,7 +123,7 @@ def search(
     Raises:
         InputError: a shape or type is another one.
     """
-    from rbpf.kernels.threads import run_driver
+    from rbpf.kernels.signature import run_driver
     from rbpf.sensors.patches.kernels import search_all
 
     image = checked_image(image)
@@ -161,7 +161,7 @@ def _fits(size: int) -> bool:
 def _pairs(
     image: np.ndarray, templates: np.ndarray, covs: np.ndarray, limits: tuple[float, float, float]
 ) -> int:
-    """What a search costs, in the unit of `rbpf.kernels.threads`."""
+    """What a search costs, in the unit of `rbpf.kernels.signature`."""
     variance = np.nan_to_num(np.maximum(covs[:, [0, 1], [0, 1]], 0.0))
     reach = np.minimum(limits[0] * np.sqrt(variance), limits[1])
     sides = np.minimum(2.0 * reach + 1.0, image.shape[::-1])

@@ -6,7 +6,7 @@ from numba import njit
 
 from rbpf.kernels.angles import arctan2, cos_sin
 from rbpf.kernels.block import flat
-from rbpf.kernels.quaternion import rotation
+from rbpf.kernels.se3 import rotation
 from rbpf.kernels.signature import BLOCK, observation_kernel
 
 

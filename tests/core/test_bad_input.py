@@ -1,5 +1,6 @@
 """What a user can hand in that is wrong: one sentence each, and a filter that says in which state it is."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -7,12 +8,14 @@ import numpy as np
 import pytest
 
 from rbpf.core.filter import Filter
+from rbpf.core.marginals import KalmanSubstate
 from rbpf.core.models import (
     NEW,
     NULL,
     Jacobians,
     Likelihood,
     MotionModel,
+    NewLandmarks,
     ObservationModel,
     Part,
     Resampler,
@@ -20,11 +23,11 @@ from rbpf.core.models import (
 )
 from rbpf.core.proposals import EkfProposal, PriorProposal
 from rbpf.core.resampling import EssTriggered, Systematic
-from rbpf.core.substate import KalmanSubstate
 from rbpf.errors import InputError
 from rbpf.lie import SE2, Euclidean
 from rbpf.maps.landmark_map import LandmarkMap
-from rbpf.motion.odometry import OdometryMotion
+from rbpf.maps.point import Point
+from rbpf.motion.odometry import Odometry, OdometryMotion
 from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
 from rbpf.sensors.range_bearing import RangeBearing
 from tests.core.scripted import Scripted, fails, seen
@@ -60,39 +63,51 @@ def on_a_line(motion: MotionModel | None = None, **options) -> Filter:
     return Filter(motion or Walk(), Scripted(), n=N, rng=np.random.default_rng(0), **options)
 
 
-class TestConstruction:
-    @pytest.mark.parametrize("n", [0, -3])
-    def test_no_particles(self, n):
-        with pytest.raises(InputError, match=f"at least one particle, got {n}"):
-            Filter(Walk(), Scripted(), n=n)
+def in_the_plane(conditional=None, **options) -> Filter:
+    held = LandmarkMap(SE2) if conditional is None else conditional
+    return Filter(OdometryMotion(SE2), Scripted(), held, n=N, rng=np.random.default_rng(0), **options)
 
-    @pytest.mark.parametrize("lag", [0, -1])
-    def test_no_lag(self, lag):
-        with pytest.raises(InputError, match=f"keeps at least one step, got {lag}"):
-            Filter(Walk(), Scripted(), lag=lag)
 
-    def test_two_maps(self):
-        with pytest.raises(InputError, match="at most one landmark map and one Kalman substate"):
-            Filter(OdometryMotion(SE2), Scripted(), [LandmarkMap(SE2), LandmarkMap(SE2)])
+MAP = LandmarkMap(SE2)
+# fmt: off
+CONSTRUCTION: dict[str, Callable[[], object]] = {
+    "at least one particle, got 0": lambda: Filter(Walk(), Scripted(), n=0),
+    "at least one particle, got -3": lambda: Filter(Walk(), Scripted(), n=-3),
+    "keeps at least one step, got 0": lambda: Filter(Walk(), Scripted(), lag=0),
+    "keeps at least one step, got -1": lambda: Filter(Walk(), Scripted(), lag=-1),
+    "at most one landmark map and one Kalman substate": lambda: in_the_plane([MAP, LandmarkMap(SE2)]),
+    rf"start must be \(3,\) or \({N}, 3\) finite numbers, got \(2,\)": lambda: in_the_plane(start=np.zeros(2)),
+    rf"start must be .*, got \({N - 1}, 3\)": lambda: in_the_plane(start=np.zeros((N - 1, 3))),
+    rf"start must be .*, got \({N}, 2\)": lambda: in_the_plane(start=np.zeros((N, 2))),
+    r"start must be .*, got \(3,\): \[nan": lambda: in_the_plane(start=np.full(3, np.nan)),
+    r"mean \(2,\) needs a square cov of that size, got \(3, 3\)":
+        lambda: KalmanSubstate(LINE, np.zeros(2), np.eye(3)),
+    "negative eigenvalue": lambda: KalmanSubstate(LINE, np.zeros(2), np.diag([1.0, -1.0])),
+    "at least one iteration, got 0": lambda: EkfProposal(iterations=0),
+    "needs a landmark map: give the filter a LandmarkMap": lambda: in_the_plane(()).belief().map,
+}
+# fmt: on
 
-    @pytest.mark.parametrize(
-        "start", [np.zeros(2), np.zeros((N - 1, 3)), np.zeros((N, 2)), np.full(3, np.nan)]
-    )
-    def test_start_of_wrong_shape(self, start):
-        with pytest.raises(InputError, match=rf"start must be \(3,\) or \({N}, 3\) finite numbers"):
-            Filter(OdometryMotion(SE2), Scripted(), n=N, start=start)
 
-    def test_substate_of_wrong_shape(self):
-        with pytest.raises(InputError, match=r"mean \(2,\) needs a square cov of that size, got \(3, 3\)"):
-            KalmanSubstate(LINE, np.zeros(2), np.eye(3))
+@pytest.mark.parametrize("message", CONSTRUCTION)
+def test_construction(message):
+    with pytest.raises(InputError, match=message):
+        CONSTRUCTION[message]()
 
-    def test_substate_without_a_covariance(self):
-        with pytest.raises(InputError, match="negative eigenvalue"):
-            KalmanSubstate(LINE, np.zeros(2), np.diag([1.0, -1.0]))
 
-    def test_iterations(self):
-        with pytest.raises(InputError, match="at least one iteration, got 0"):
-            EkfProposal(iterations=0)
+ODOMETRY = [
+    (np.zeros(2), np.eye(3), r"odometry needs delta \(3,\) and cov \(3, 3\), got \(2,\)"),
+    (np.zeros(3), np.eye(2), r"odometry needs delta \(3,\) and cov \(3, 3\), got \(3,\) and \(2, 2\)"),
+    (np.zeros(3), -np.eye(3), "the covariance of the odometry is not one: .*negative eigenvalue"),
+    (np.zeros(3), np.triu(np.ones((3, 3))), "the covariance of the odometry is not one: .*not symmetric"),
+    (np.zeros(3), np.full((3, 3), np.nan), "the covariance of the odometry is not one: .*not finite"),
+    (np.array([0.0, np.nan, 0.0]), np.eye(3), "the odometry increment .* holds NaN or infinity"),
+]
+
+
+@pytest.mark.parametrize(("delta", "cov", "match"), ODOMETRY)
+def test_odometry(delta, cov, match):
+    fails(in_the_plane(()), match, [], Odometry(delta, cov))
 
 
 class TestTime:
@@ -114,53 +129,34 @@ class TestTime:
 class TestMeasurements:
     @pytest.mark.parametrize("proposal", [EkfProposal(), PriorProposal()])
     @pytest.mark.parametrize(
-        ("groups", "match"),
+        ("z", "cov", "match"),
         [
-            (seen(Position(), [[np.nan]]), "a measurement of Position or its covariance is not finite"),
-            (
-                seen(Position(), [[1.0]], [[[np.inf]]]),
-                "a measurement of Position or its covariance is not finite",
-            ),
-            (
-                seen(Position(), [[1.0]], [[[-1.0]]]),
-                "the noise of Position has no covariance: .*negative eigenvalue",
-            ),
-            (
-                seen(Position(), [[1.0, 2.0]]),
-                r"Position measures 1 numbers: expected z \(K, 1\) .* got \(1, 2\)",
-            ),
-            (seen(Position(), [1.0]), r"Position measures 1 numbers: expected z \(K, 1\)"),
-            (seen(Position(), [[1.0]], [[1.0]]), r"got \(1, 1\) and \(1, 1\)"),
+            ([[np.nan]], None, "a measurement of Position or its covariance is not finite"),
+            ([[1.0]], [[[np.inf]]], "a measurement of Position or its covariance is not finite"),
+            ([[1.0]], [[[-1.0]]], "the noise of Position has no covariance: .*negative eigenvalue"),
+            ([[1.0, 2.0]], None, r"Position measures 1 numbers: expected z \(K, 1\) .* got \(1, 2\)"),
+            ([1.0], None, r"Position measures 1 numbers: expected z \(K, 1\)"),
+            ([[1.0]], [[1.0]], r"got \(1, 1\) and \(1, 1\)"),
         ],
     )
-    def test_numbers_that_are_no_measurement(self, proposal, groups, match):
-        fails(on_a_line(proposal=proposal), match, groups)
+    def test_numbers_that_are_no_measurement(self, proposal, z, cov, match):
+        fails(on_a_line(proposal=proposal), match, seen(Position(), z, cov))
 
     def test_skewed_covariance(self):
         groups = seen(RangeBearing(SE2), [[1.0, 2.0]], [[[1.0, 0.5], [0.2, 1.0]]], ids=np.zeros(1, dtype=int))
-        filter_ = Filter(OdometryMotion(SE2), Scripted(), LandmarkMap(SE2), n=N)
-        fails(filter_, "the noise of RangeBearing has no covariance: .*is not symmetric", groups)
+        fails(in_the_plane(), "the noise of RangeBearing has no covariance: .*is not symmetric", groups)
 
     def test_no_particle_explains_them(self):
         # Far beyond the range of floating point is still a weight; what cannot be is none.
         assert on_a_line().step(seen(Position(), [[1e3]], [[[1e-2]]])).log_evidence < -1e5
         clutter = {"ids": np.array([NULL]), "log_clutter": -np.inf}
-        filter_ = Filter(OdometryMotion(SE2), Scripted(), LandmarkMap(SE2), n=N)
         groups = seen(RangeBearing(SE2), [[5.0, 0.0]], **clutter)
-        fails(filter_, "step 0: all particle weights are zero, no particle explains", groups)
+        fails(in_the_plane(), "step 0: all particle weights are zero, no particle explains", groups)
 
     def test_one_particle_cannot_explain_them(self):
         ids = np.full((N, 1), NEW)
         ids[2] = NULL
-        filter_ = Filter(
-            OdometryMotion(SE2),
-            Scripted(),
-            LandmarkMap(SE2),
-            resampler=EssTriggered(Systematic(), 0.0),
-            n=N,
-            rng=np.random.default_rng(0),
-        )
-        model = RangeBearing(SE2)
+        filter_, model = in_the_plane(resampler=EssTriggered(Systematic(), 0.0)), RangeBearing(SE2)
         filter_.step(seen(model, [[5.0, 0.0]], ids=ids, log_clutter=-np.inf, log_new=-3.0))
         expected = np.full(N, 1 / (N - 1))
         expected[2] = 0.0
@@ -196,10 +192,7 @@ class TestModels:
         ("model", "match"),
         [
             (Flat(), rf"Flat.predict returned shape \(1, 1\), expected \({N}, 1, 1\)"),
-            (
-                WrongSlope(),
-                rf"WrongSlope.jacobians returned a block of shape \({N}, 1, 2, 1\), expected \({N}, 1, 1",
-            ),
+            (WrongSlope(), rf"jacobians returned a block of shape \({N}, 1, 2, 1\), expected \({N}, 1, 1"),
         ],
     )
     @pytest.mark.usefixtures("unchecked_shapes")
@@ -209,50 +202,43 @@ class TestModels:
     @pytest.mark.parametrize(
         ("given", "match"),
         [
-            ({"mean": np.zeros((N, 2))}, rf"returned mean \({N}, 2\)"),
-            ({"mean": np.zeros(1)}, r"returned mean \(1,\)"),
-            (
-                {"noise_factor": np.ones((1, 1))},
-                rf"noise_factor \(1, 1\): expected \({N}, 1\) and \({N} or 1, 1, r\)",
-            ),
+            ({"mean": np.zeros((N, 2))}, rf"Walk.transition returned mean \({N}, 2\)"),
+            ({"mean": np.zeros(1)}, r"Walk.transition returned mean \(1,\)"),
+            ({"noise_factor": np.ones((1, 1))}, rf"\(1, 1\): expected \({N}, 1\) and \({N} or 1, 1, r\)"),
             ({"noise_factor": np.ones((1, 2, 1))}, r"noise_factor \(1, 2, 1\)"),
             ({"noise_factor": np.ones((N - 1, 1, 1))}, r"noise_factor \(5, 1, 1\)"),
+            ({"noise_factor": np.full((1, 1, 1), np.nan)}, "Walk.transition returned NaN or infinity: check"),
             (
-                {"noise_factor": np.full((1, 1, 1), np.nan)},
-                "returned NaN or infinity: check the control",
+                {"mean": np.full((N, 1), np.inf)},
+                "Walk.transition returned NaN or infinity: check the control",
             ),
-            ({"mean": np.full((N, 1), np.inf)}, "returned NaN or infinity: check the control"),
         ],
     )
     def test_transitions_of_wrong_shape(self, given, match):
-        fails(on_a_line(Walk(**given)), f"Walk.transition {match}" if "returned" in match else match, [])
+        fails(on_a_line(Walk(**given)), match, [])
 
-    def test_substate_that_nobody_drives(self):
-        filter_ = on_a_line(conditional=KalmanSubstate(LINE, np.zeros(1), np.eye(1)))
-        fails(filter_, "must give coupling, dynamics and drift: the filter has a Kalman substate", [])
+    def test_substates(self):
+        def driving(m: int) -> Walk:
+            parts = {"coupling": np.ones((1, 1, m)), "dynamics": np.eye(m)[None], "drift": np.zeros((1, m))}
+            return Walk(noise_factor=np.eye(1 + m)[None], **parts)
 
-    def test_substate_that_nobody_holds(self):
-        parts = {"coupling": np.ones((1, 1, 1)), "dynamics": np.ones((1, 1, 1)), "drift": np.zeros((1, 1))}
-        motion = Walk(noise_factor=np.eye(2)[None], **parts)
-        fails(on_a_line(motion), "drives a substate: give the filter a KalmanSubstate", [])
-
-    def test_substate_of_another_size(self):
-        parts = {"coupling": np.ones((1, 1, 2)), "dynamics": np.eye(2)[None], "drift": np.zeros((1, 2))}
-        motion = Walk(noise_factor=np.eye(3)[None], **parts)
-        filter_ = on_a_line(motion, conditional=KalmanSubstate(LINE, np.zeros(1), np.eye(1)))
-        fails(filter_, r"the substate has 1 numbers: expected coupling \(·, 1, 1\)", [])
+        held = {"conditional": KalmanSubstate(LINE, np.zeros(1), np.eye(1))}
+        fails(
+            on_a_line(**held), "must give coupling, dynamics and drift: the filter has a Kalman substate", []
+        )
+        fails(on_a_line(driving(1)), "drives a substate: give the filter a KalmanSubstate", [])
+        match = r"the substate has 1 numbers: expected coupling \(·, 1, 1\)"
+        fails(on_a_line(driving(2), **held), match, [])
 
     def test_reading_what_the_filter_does_not_hold(self):
         groups = seen(RangeBearing(SE2), [[5.0, 0.0]], ids=np.zeros(1, dtype=int))
-        filter_ = Filter(OdometryMotion(SE2), Scripted(), n=N)
-        fails(filter_, "RangeBearing reads a landmark, which this filter does not hold", groups)
+        fails(in_the_plane(()), "RangeBearing reads a landmark, which this filter does not hold", groups)
 
     def test_landmark_and_substate_in_one_observation(self):
         model = RangeBearing(SE2)
         model.reads = frozenset({Part.STATE, Part.LANDMARK, Part.SUBSTATE})
         groups = seen(model, [[5.0, 0.0]], ids=np.zeros(1, dtype=int))
-        filter_ = Filter(OdometryMotion(SE2), Scripted(), LandmarkMap(SE2), n=N)
-        fails(filter_, "reads a landmark and the substate, which couples them", groups)
+        fails(in_the_plane(), "reads a landmark and the substate, which couples them", groups)
 
     @pytest.mark.parametrize("ancestors", [np.zeros(N - 1, dtype=int), np.full(N, N), np.full(N, -1)])
     def test_resampler_without_manners(self, ancestors):
@@ -261,6 +247,66 @@ class TestModels:
                 return ancestors
 
         fails(on_a_line(resampler=Rude()), f"Rude must return {N} ancestors in 0..{N - 1}", [])
+
+
+class TestLandmarks:
+    @pytest.fixture
+    def filter_(self) -> Filter:
+        """Two landmarks, of which the first was removed again, and a resampling on the way."""
+        filter_ = Recipe(n=N).build()
+        drive(filter_, planar_world(4, landmarks=5, seed=8))
+        filter_.sensors = [Scripted()]
+        filter_.belief().map.remove(np.array([3]))
+        return filter_
+
+    @pytest.mark.parametrize(
+        ("ids", "match"),
+        [
+            (None, "RangeBearing reads a landmark: its observations need ids"),
+            ([3], "names landmark 3, which the map does not hold"),
+            ([77], "names landmark 77, which the map does not hold"),
+            ([[4]] * (N - 1) + [[10**9]], "names landmark 1000000000, which the map does not hold"),
+            ([1, 2], rf"ids of 1 measurements must be \(1,\) or \({N}, 1\), got \(2,\)"),
+            ([[1]], r"got \(1, 1\)"),
+            ([-3], "ids of RangeBearing must be integers: landmarks, NULL = -1 or NEW = -2"),
+            ([1.0], "ids of RangeBearing must be integers"),
+            ([True], "ids of RangeBearing must be integers"),
+        ],
+    )
+    @pytest.mark.usefixtures("unchecked_shapes")
+    def test_ids(self, filter_, ids, match):
+        ids = None if ids is None else np.array(ids)
+        fails(filter_, match, seen(RangeBearing(SE2), [[5.0, 0.0]], ids=ids))
+
+    def test_ids_before_there_is_a_landmark(self):
+        groups = seen(RangeBearing(SE2), [[5.0, 0.0]], ids=np.zeros(1, dtype=int))
+        fails(in_the_plane(), "names landmark 0, which the map does not hold", groups)
+
+    def test_reading_the_map(self, filter_):
+        landmark_map = filter_.belief().map
+        for use in (landmark_map.read, landmark_map.remove):
+            with pytest.raises(InputError, match="the map holds no landmark 3"):
+                use(np.array([3]))
+        with pytest.raises(InputError, match="the map holds no landmark -1"):
+            landmark_map.landmark_of(-1)
+        with pytest.raises(InputError, match="no landmark was named"):
+            landmark_map.read(np.zeros(0, dtype=int))
+
+    def test_landmarks_that_cannot_be_added(self, filter_):
+        class Bearing(RangeBearing):  # type: ignore[misc]
+            invert = ObservationModel.invert
+
+        held = filter_.belief().map
+        new = NewLandmarks(np.ones((1, 2)), np.eye(2)[None], RangeBearing(SE2), Point(2))
+        for changed, match in (
+            ({"mask": np.ones((N, 1), dtype=bool)}, "only need a map with evidence=True"),
+            ({"z": np.array([[np.nan, 0.0]])}, "a new Point has a mean or covariance that is not finite"),
+            ({"model": Bearing(SE2)}, r"Bearing cannot start landmarks: override invert\(state, z\)"),
+        ):
+            with pytest.raises(InputError, match=match):
+                held.add(replace(new, **changed), filter_.particles.state)
+        with pytest.raises(InputError, match="keeps no log-odds: build it with evidence=True"):
+            held.set_log_odds(np.array([4]), np.zeros((N, 1)))
 
 
 def test_particles_of_weight_zero_do_no_harm():

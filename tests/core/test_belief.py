@@ -3,12 +3,10 @@
 import numpy as np
 import pytest
 
-from rbpf.core.belief import Belief
-from rbpf.core.conditional import Marginals
-from rbpf.core.estimate import mixture_estimate
 from rbpf.core.genealogy import Lineage
-from rbpf.core.models import Records
-from rbpf.core.proposals import Prior, Proposed
+from rbpf.core.marginals import Marginals
+from rbpf.core.models import Belief, Records
+from rbpf.core.particles import Prior, Proposed, mixture_estimate
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3, LieGroup, SE2Group, SE3Group
 from rbpf.maps.landmark_map import LandmarkMap
@@ -43,7 +41,7 @@ def belief_of(prior: Prior, dim: int, rng: np.random.Generator, ahead: np.ndarra
     mean = world + 0.02 * rng.normal(size=(N, K, dim))
     records = Records(mean, factor @ np.swapaxes(factor, -1, -2))
     landmark_map.add_records(records, Point(dim))
-    return Belief(np.log(rng.dirichlet(np.ones(N))), prior, marginals), records
+    return Belief(np.log(rng.dirichlet(np.ones(N))), prior, marginals.parts), records
 
 
 def draw(belief: Belief, records: Records, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -97,7 +95,7 @@ def test_the_pose_uncertainty_counts(rng):
     """Without it the covariance would be far too small: H Q Hᵀ is the larger part here."""
     prior = prior_of(SE2, rng, centred=True, scale=0.1)
     belief, _ = belief_of(prior, 2, rng, np.array(AHEAD_2D["ahead"]))
-    certain = Belief(belief.log_weights, Prior.exactly(SE2, prior.base), belief.marginals)
+    certain = Belief(belief.log_weights, Prior.exactly(SE2, prior.base), belief.parts)
     with_pose = belief.project(RangeBearing(SE2), np.arange(K))[1]
     without = certain.project(RangeBearing(SE2), np.arange(K))[1]
     assert (np.linalg.eigvalsh(with_pose - without) > 0).all()

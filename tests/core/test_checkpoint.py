@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from rbpf.core.filter import Filter
+from rbpf.core.marginals import KalmanSubstate
 from rbpf.core.models import (
     MotionModel,
     NewLandmarks,
@@ -18,7 +19,6 @@ from rbpf.core.models import (
 )
 from rbpf.core.proposals import PriorProposal
 from rbpf.core.resampling import EssTriggered, Residual
-from rbpf.core.substate import KalmanSubstate
 from rbpf.errors import InputError
 from rbpf.lie import SE2, Euclidean
 from rbpf.maps.landmark_map import LandmarkMap

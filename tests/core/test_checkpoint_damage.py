@@ -10,14 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rbpf.core.filter import Filter
+from rbpf.core.marginals import KalmanSubstate
 from rbpf.core.proposals import PriorProposal
 from rbpf.core.resampling import Systematic
-from rbpf.core.substate import KalmanSubstate
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3
 from rbpf.maps.landmark_map import LandmarkMap
-from rbpf.maps.mixture import MixturePoint
-from rbpf.maps.point import Point
+from rbpf.maps.point import MixturePoint, Point
 from rbpf.motion.odometry import OdometryMotion
 from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
 from rbpf.sensors.range_bearing import RangeBearing

@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[2]
 RUN = """
 import hashlib
 import numba
-from rbpf.kernels.threads import PAIRS_PER_THREAD
+from rbpf.kernels.signature import PAIRS_PER_THREAD
 from tests.core.worlds import Recipe, content, drive, planar_world
 
 numba.set_num_threads({threads})

@@ -13,11 +13,10 @@ from rbpf.core.diagnostics import (
     motion_correction,
     nees,
 )
-from rbpf.core.estimate import Estimate
 from rbpf.core.filter import Filter
-from rbpf.core.genealogy import Lineage
-from rbpf.core.history import History
+from rbpf.core.genealogy import History, Lineage
 from rbpf.core.models import MotionModel, ObservationModel, Part, Transition
+from rbpf.core.particles import Estimate
 from rbpf.core.proposals import PriorProposal
 from rbpf.lie import SE2, SE3, Euclidean
 from tests.core.scripted import Scripted, seen

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from rbpf.core.filter import Filter
+from rbpf.core.marginals import KalmanSubstate
 from rbpf.core.models import NewLandmarks, Observations
-from rbpf.core.substate import KalmanSubstate
 from rbpf.errors import InputError
 from rbpf.lie import Euclidean
 from rbpf.maps.landmark_map import LandmarkMap

@@ -6,8 +6,7 @@ from scipy.optimize import least_squares
 
 from rbpf.core.least_squares import Rule, minimise
 from rbpf.errors import InputError
-from rbpf.lie import SE3
-from rbpf.lie.matrices import skew
+from rbpf.lie import SE3, skew
 
 TIMES = np.linspace(0.0, 4.0, 40)
 STRICT = Rule(offset=1e-9)

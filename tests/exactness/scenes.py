@@ -6,7 +6,7 @@ import numpy as np
 
 from rbpf.core.genealogy import Lineage
 from rbpf.core.models import ObservationModel, Observations, Records
-from rbpf.core.proposals import Prior
+from rbpf.core.particles import Prior
 from rbpf.lie import SE2, SE2Group, SE3Group
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point

@@ -7,8 +7,8 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from rbpf.core.filter import Filter
+from rbpf.core.marginals import KalmanSubstate
 from rbpf.core.models import NewLandmarks, ObservationModel, Observations
-from rbpf.core.substate import KalmanSubstate
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
 from tests.exactness.models import SEEDS, Frame, Kalman

@@ -5,8 +5,8 @@ import pytest
 
 from rbpf.core.filter import Filter
 from rbpf.core.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobis
+from rbpf.core.linearisation import linearise
 from rbpf.core.models import NEW, NULL, NewLandmarks, Observations
-from rbpf.core.numeric import linearise
 from rbpf.core.proposals import EkfProposal, PriorProposal, refined
 from rbpf.kernels.signature import BLOCK
 from rbpf.lie import SE2, SE3
@@ -74,7 +74,7 @@ def test_refinement_and_update(space, which, likelihood, kind, rng):
     prior = scene.prior(space.dim, shared=kind == "shared")
     maps = [scene.map(compiled) for compiled in (True, False)]
 
-    one, other = (refined(prior, held.terms(scene.state, [group], prior)) for held in maps)
+    one, other = (refined(prior, held.information(scene.state, [group], prior)) for held in maps)
     for name in ("mean", "root", "log_w1", "nis"):
         np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=TOLERANCE, atol=TOLERANCE)
     assert one.rows == other.rows
@@ -105,7 +105,7 @@ def test_particles_taken_in_parts_are_those_taken_together(space, which, kind, r
     for pairs in (10**9, 64):
         monkeypatch.setattr(rows, "PAIRS_AT_ONCE", pairs)
         held = scene.map(compiled=False)
-        terms = held.terms(scene.state, [group], prior)
+        terms = held.information(scene.state, [group], prior)
         densities = held.correct(scene.state, np.zeros((PARTICLES, space.dim)), [group])
         records = held.read(held.ids)
         found.append((terms.info, terms.log_factor, terms.rows, densities.all, records.mean, records.cov))

@@ -6,9 +6,8 @@ import pytest
 from rbpf import gaussian
 from rbpf.core.genealogy import Lineage
 from rbpf.core.models import Observations, Records
-from rbpf.core.proposals import Prior
-from rbpf.lie import SE3
-from rbpf.lie.matrices import skew
+from rbpf.core.particles import Prior
+from rbpf.lie import SE3, skew
 from rbpf.maps.constellation import Constellation, UncertainConstellation
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.sensors.camera.constellation import ConstellationView, MembersView
@@ -106,7 +105,7 @@ def test_information_of_a_frame_has_the_frames_uncertainty(errors):
     world = World(errors, seed=4)
     pose, prior = world.path[:1], Prior.exactly(SE3, world.path[:1])
     held = world.map(1, True)
-    found = held.terms(pose, [world.observed(0)], prior).info[0]
+    found = held.information(pose, [world.observed(0)], prior).info[0]
     mean, cov = held.read(held.ids).mean[0, 0], held.read(held.ids).cov[0, 0]
     J = slope(world.views[0], pose[0], mean, world.given)
     moves = np.stack([SE3.retract(pose[0], sign * 1e-6 * np.eye(6)) for sign in (1.0, -1.0)])

@@ -15,7 +15,7 @@ from rbpf.core.resampling import EssTriggered, Systematic
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3
 from rbpf.maps.landmark_map import LandmarkMap
-from rbpf.maps.mixture import MixturePoint
+from rbpf.maps.point import MixturePoint
 from rbpf.motion.odometry import Odometry, OdometryMotion
 from tests.exactness.models import Frame, Scripted
 from tests.exactness.scenes import Scene, sensors
@@ -193,7 +193,7 @@ def test_several_components_without_weighing():
     densities = held.correct(world.state, zero, split(*groups)[1:])
     expected = other.correct(world.state, zero, groups)
     np.testing.assert_array_equal(densities.all, 0.0)
-    np.testing.assert_array_equal(densities.late, 0.0)
+    np.testing.assert_array_equal(densities.after_sampling, 0.0)
     assert np.ptp(expected.all) > 0.0
     np.testing.assert_array_equal(held.read(held.ids).mean, other.read(other.ids).mean)
 

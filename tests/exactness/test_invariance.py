@@ -7,10 +7,10 @@ import pytest
 
 from rbpf.core.filter import Filter
 from rbpf.core.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobis
+from rbpf.core.marginals import KalmanSubstate
 from rbpf.core.models import NEW, NULL, NewLandmarks, Observations
 from rbpf.core.proposals import EkfProposal, PriorProposal
 from rbpf.core.resampling import EssTriggered, Systematic
-from rbpf.core.substate import KalmanSubstate
 from rbpf.lie import SE2, SE3, Euclidean
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point

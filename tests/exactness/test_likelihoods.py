@@ -142,7 +142,7 @@ def test_two_sightings_of_a_certain_landmark_weigh_like_two_landmarks(likelihood
     densities = [held_landmarks(certain).correct(state, zero, groups).all for groups in (twice, once)]
     np.testing.assert_allclose(densities[0], densities[1], atol=1e-9)
     proposals = [
-        refined(prior, held_landmarks(certain).terms(state, groups, prior)) for groups in (twice, once)
+        refined(prior, held_landmarks(certain).information(state, groups, prior)) for groups in (twice, once)
     ]
     np.testing.assert_allclose(proposals[0].mean, proposals[1].mean, atol=1e-9)
     np.testing.assert_allclose(proposals[0].log_w1, proposals[1].log_w1, atol=1e-9)

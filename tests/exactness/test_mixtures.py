@@ -13,8 +13,7 @@ from rbpf.core.proposals import EkfProposal
 from rbpf.core.resampling import EssTriggered, Systematic
 from rbpf.lie import Euclidean
 from rbpf.maps.landmark_map import LandmarkMap
-from rbpf.maps.mixture import MixturePoint, ring
-from rbpf.maps.point import Point
+from rbpf.maps.point import MixturePoint, Point, ring
 from tests.exactness.models import (
     SEEDS,
     Frame,
@@ -140,7 +139,7 @@ def test_mixtures_take_no_part_in_the_refinement(frames):
     group = frames[1].groups[0]
     prior = filter_.marginals.predict(filter_.motion.transition(state, None, 0.0), PLANE)
     mixtures, all_of_them, points = (
-        filter_.marginals.terms(
+        filter_.marginals.information(
             state, [Observations(group.z[rows], group.cov[rows], group.model, ids=group.ids[rows])], prior
         )
         for rows in ([0, 1], [0, 1, 2], [2])
@@ -150,8 +149,8 @@ def test_mixtures_take_no_part_in_the_refinement(frames):
     np.testing.assert_array_equal(all_of_them.info, points.info)
     assert (np.abs(points.info) > 0.1).any()
     densities = filter_.marginals.correct(state, np.zeros((5, 2)), [group])
-    assert (densities.late != 0.0).all()
-    assert (densities.all != densities.late).all()
+    assert (densities.after_sampling != 0.0).all()
+    assert (densities.all != densities.after_sampling).all()
 
 
 def test_promotion_keeps_the_mixtures_moments(frames):
@@ -211,7 +210,7 @@ def test_a_range_only_beacon_becomes_a_point():
         group = Observations(ranges[t : t + 1, None], variance[None], Range(), ids=np.array([0]))
         density = held.correct(state, np.zeros((n, 2)), [group])
         if promoted_at is not None:
-            np.testing.assert_array_equal(density.late, 0.0)
+            np.testing.assert_array_equal(density.after_sampling, 0.0)
             continue
         before = (
             np.logaddexp.reduce([kalman.log_evidence for kalman in bank]) if t > 1 else np.log(components)
@@ -221,8 +220,8 @@ def test_a_range_only_beacon_becomes_a_point():
             H = (offset / np.linalg.norm(offset))[None]
             kalman.update(ranges[t] - np.linalg.norm(offset) + H @ kalman.mean, H, variance)
         after = np.logaddexp.reduce([kalman.log_evidence for kalman in bank])
-        np.testing.assert_allclose(density.late, after - before, atol=1e-6)
-        np.testing.assert_array_equal(density.all, density.late)
+        np.testing.assert_allclose(density.after_sampling, after - before, atol=1e-6)
+        np.testing.assert_array_equal(density.all, density.after_sampling)
         ready = held.ready(np.full(n, 1.0 / n))
         assert (ready.size == 1) == (max(k.log_evidence for k in bank) - after >= np.log(0.99))
         held.promote(ready)

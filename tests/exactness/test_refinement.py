@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
-from rbpf.core import reference
-from rbpf.core.conditional import Marginals
+from rbpf import gaussian
+from rbpf.core.linearisation import linearise
+from rbpf.core.marginals import Marginals
 from rbpf.core.models import NEW, NULL, Observations
-from rbpf.core.numeric import linearise
-from rbpf.core.proposals import Prior, Proposed, Terms, refined
+from rbpf.core.particles import Information, Prior, Proposed
+from rbpf.core.proposals import refined
 from rbpf.lie import SE2, SE3
 from tests.exactness.models import Kalman, known
 from tests.exactness.scenes import Scene, random_covs, sensors
@@ -82,7 +83,7 @@ def test_refinement_equals_sequential_updates(space, compiled, rank, shared, rng
     prior = scene.prior(rank, shared)
     for model in sensors(space, rng):
         groups = [scene.observe(model, np.array([2, 0, 3]))]
-        proposed = refined(prior, scene.map(compiled).terms(scene.state, groups, prior))
+        proposed = refined(prior, scene.map(compiled).information(scene.state, groups, prior))
         assert_equal(prior, proposed, sequential(scene, groups, prior, rng))
 
 
@@ -94,11 +95,12 @@ def test_a_landmark_seen_by_two_sensors_is_handled_jointly(space, compiled, rng)
     prior = scene.prior(2, shared=True)
     first, second = sensors(space, rng)
     groups = [scene.observe(first, np.array([1, 2, 0, 2])), scene.observe(second, np.array([3, 1]))]
-    proposed = refined(prior, scene.map(compiled).terms(scene.state, groups, prior))
+    proposed = refined(prior, scene.map(compiled).information(scene.state, groups, prior))
     assert_equal(prior, proposed, sequential(scene, groups, prior, rng))
 
     apart = [
-        refined(prior, scene.map(compiled).terms(scene.state, [group], prior)).log_w1 for group in groups
+        refined(prior, scene.map(compiled).information(scene.state, [group], prior)).log_w1
+        for group in groups
     ]
     assert (np.abs(proposed.log_w1 - sum(apart)) > 1e-3).all()
 
@@ -116,7 +118,7 @@ def test_the_landmarks_of_two_sensors_are_updated_jointly(space, compiled, rng):
     d, dim = space.dim, scene.records.mean.shape[-1]
     records = held.read(held.ids)
     np.testing.assert_allclose(densities.all, [kalman.log_evidence for kalman in kalmans], atol=TOLERANCE)
-    np.testing.assert_array_equal(densities.late, 0.0)
+    np.testing.assert_array_equal(densities.after_sampling, 0.0)
     for i, kalman in enumerate(kalmans):
         moved = records.mean[i] - scene.records.mean[i]
         np.testing.assert_allclose(moved.ravel(), kalman.mean[d:], atol=TOLERANCE)
@@ -136,7 +138,7 @@ def test_each_particle_uses_its_own_associations(space, compiled, rng):
     model = sensors(space, rng)[0]
     groups = [scene.observe(model, ids, **costs)]
     log_factor = -2.5 * (ids == NEW).sum(axis=1) - 4.0 * (ids == NULL).sum(axis=1)
-    proposed = refined(prior, scene.map(compiled).terms(scene.state, groups, prior))
+    proposed = refined(prior, scene.map(compiled).information(scene.state, groups, prior))
     assert_equal(prior, proposed, sequential(scene, groups, prior, rng), log_factor)
 
     densities = scene.map(compiled).correct(scene.state, np.zeros((scene.n, space.dim)), groups)
@@ -155,8 +157,8 @@ def test_the_compiled_refinement_equals_its_numpy_twin(space, rng):
             prior = scene.prior(rank, shared)
             quad, log_det, log_factor = rng.normal(size=(3, 40))
             info, vector = random_covs(rng, (40,), d, 3.0), rng.normal(size=(40, d))
-            terms = Terms(info, vector, quad, log_det, log_factor, rows=7)
-            ours, twin = refined(prior, terms), reference.refined(prior, terms)
+            terms = Information(info, vector, quad, log_det, log_factor, rows=7)
+            ours, twin = refined(prior, terms), refined_in_numpy(prior, terms)
             for name in ("mean", "root", "log_w1", "nis"):
                 np.testing.assert_allclose(
                     getattr(ours, name), getattr(twin, name), rtol=TOLERANCE, atol=TOLERANCE
@@ -207,7 +209,20 @@ def _chart_ekf(scene, group, factor, base, mean, at, particle) -> Kalman:
 def test_observing_nothing_leaves_the_prior(rng):
     scene = Scene.random(SE2, rng)
     prior = scene.prior(2, shared=True)
-    proposed = refined(prior, Marginals(SE2, [scene.map()]).terms(scene.state, [], prior))
+    proposed = refined(prior, Marginals(SE2, [scene.map()]).information(scene.state, [], prior))
     np.testing.assert_array_equal(proposed.mean, 0.0)
     np.testing.assert_array_equal(proposed.root, np.tile(np.eye(2), (scene.n, 1, 1)))
     np.testing.assert_array_equal(proposed.log_w1, 0.0)
+
+
+def refined_in_numpy(prior: Prior, terms: Information) -> Proposed:
+    """Twin of `rbpf.core.proposals.refined`."""
+    rank = prior.factor.shape[2]
+    matrix = np.eye(rank) + np.einsum("nar,nab,nbs->nrs", prior.factor, terms.info, prior.factor)
+    linear = np.einsum("nar,na->nr", prior.factor, terms.vector)
+    chol = np.linalg.cholesky(gaussian.symmetrise(matrix))
+    root = np.swapaxes(np.linalg.inv(chol), -1, -2)
+    white = np.einsum("nba,nb->na", root, linear)
+    nis = terms.quad - np.square(white).sum(axis=1)
+    log_w1 = -0.5 * (nis + terms.log_det + gaussian.log_det(chol)) + terms.log_factor
+    return Proposed(np.einsum("nab,nb->na", root, white), root, log_w1, nis, terms.rows)

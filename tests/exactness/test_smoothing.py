@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from rbpf.core.filter import Filter
+from rbpf.core.marginals import KalmanSubstate
 from rbpf.core.proposals import EkfProposal, PriorProposal
 from rbpf.core.resampling import EssTriggered, Systematic
 from rbpf.core.smoothing import _transition_log_density, ancestral_smoothing, backward_simulation
-from rbpf.core.substate import KalmanSubstate
 from rbpf.errors import InputError
 from rbpf.lie import SE2
 from rbpf.motion.odometry import Odometry, OdometryMotion

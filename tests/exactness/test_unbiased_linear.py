@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from rbpf.core.filter import Filter
+from rbpf.core.marginals import KalmanSubstate
 from rbpf.core.models import Conditional, Resampler
 from rbpf.core.proposals import EkfProposal, PriorProposal
 from rbpf.core.resampling import EssTriggered, Multinomial, Residual, Stratified, Systematic
-from rbpf.core.substate import KalmanSubstate
 from tests.exactness.models import (
     SEEDS,
     Frame,

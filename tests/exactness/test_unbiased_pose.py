@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from rbpf.core.filter import Filter
+from rbpf.core.marginals import KalmanSubstate
 from rbpf.core.models import MotionModel, ObservationModel, Part, Transition
 from rbpf.core.proposals import EkfProposal, PriorProposal
 from rbpf.core.resampling import Systematic
-from rbpf.core.substate import KalmanSubstate
 from rbpf.lie import SE2
 from rbpf.motion.odometry import Odometry, OdometryMotion
 from tests.exactness.models import SEEDS, Frame, Scripted, assert_unbiased, single

@@ -5,10 +5,10 @@ import pytest
 
 from rbpf.core.filter import Filter
 from rbpf.core.genealogy import Lineage
+from rbpf.core.marginals import KalmanSubstate
 from rbpf.core.models import Jacobians, ObservationModel, Part
 from rbpf.core.proposals import PriorProposal
 from rbpf.core.resampling import EssTriggered, Systematic
-from rbpf.core.substate import KalmanSubstate
 from rbpf.lie import SE3
 from rbpf.motion.constant_velocity import MarginalVelocity, SampledVelocity
 from tests.exactness.models import Frame, Kalman, Scripted, deviation, single

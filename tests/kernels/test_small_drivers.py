@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
+from rbpf.kernels.increment import are_sound, conditioned
 from rbpf.kernels.robust_fit import robust_fit
-from rbpf.kernels.soundness import are_sound
-from rbpf.kernels.substate import conditioned
 
 
 @pytest.fixture

@@ -1,10 +1,10 @@
 import os
 
-from rbpf.kernels.stale import discard_stale
+from rbpf.kernels.signature import discard_stale
 
 
 def test_compiled_copies_older_than_a_kernel_source_are_deleted(tmp_path, monkeypatch):
-    monkeypatch.setattr("rbpf.kernels.stale.config.CACHE_DIR", "")
+    monkeypatch.setattr("rbpf.kernels.signature.numba.config.CACHE_DIR", "")
     cache = tmp_path / "__pycache__"
     cache.mkdir()
     old, new, other = (cache / name for name in ("a.f-1.py311.nbi", "a.g-9.py311.nbi", "a.pyc"))
@@ -20,7 +20,7 @@ def test_compiled_copies_older_than_a_kernel_source_are_deleted(tmp_path, monkey
 
 
 def test_a_cache_folder_of_its_own_is_looked_at(tmp_path, monkeypatch):
-    monkeypatch.setattr("rbpf.kernels.stale.config.CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr("rbpf.kernels.signature.numba.config.CACHE_DIR", str(tmp_path))
     (tmp_path / "module").mkdir()
     old = tmp_path / "module" / "a.f-1.py311.nbi"
     old.touch()
@@ -30,7 +30,7 @@ def test_a_cache_folder_of_its_own_is_looked_at(tmp_path, monkeypatch):
 
 
 def test_a_copy_that_another_process_has_just_deleted(tmp_path, monkeypatch):
-    monkeypatch.setattr("rbpf.kernels.stale.config.CACHE_DIR", "")
+    monkeypatch.setattr("rbpf.kernels.signature.numba.config.CACHE_DIR", "")
     (tmp_path / "__pycache__").mkdir()
     (tmp_path / "__pycache__" / "a.f-1.py311.nbi").symlink_to(tmp_path / "gone")
     discard_stale(tmp_path)

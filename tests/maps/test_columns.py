@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rbpf.errors import InputError
-from rbpf.maps.columns import Columns
+from rbpf.maps.store import Columns
 
 
 def filled(columns: Columns, ids: list[int | None]) -> list[int]:

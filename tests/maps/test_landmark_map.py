@@ -7,12 +7,11 @@ import pytest
 
 from rbpf.core.genealogy import Lineage
 from rbpf.core.models import NewLandmarks, Observations, Records
-from rbpf.core.proposals import Prior
+from rbpf.core.particles import Prior
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3
 from rbpf.maps.landmark_map import LandmarkMap
-from rbpf.maps.mixture import MixturePoint, ring
-from rbpf.maps.point import AnchoredPoint, Point
+from rbpf.maps.point import AnchoredPoint, MixturePoint, Point, ring
 from rbpf.sensors.range_bearing import RangeBearing
 
 N = 40
@@ -190,7 +189,7 @@ def test_an_update_by_other_groups_than_the_refinement_is_by_the_groups_it_is_gi
     for refined_by in (sighting(0), sighting(1)):
         landmark_map, _ = filled()
         landmark_map.add_records(points(np.random.default_rng(1), 2), Point(2))
-        landmark_map.terms(state, refined_by, Prior.exactly(SE2, state))
+        landmark_map.information(state, refined_by, Prior.exactly(SE2, state))
         densities = landmark_map.correct(state, increment, sighting(1))
         found.append((densities.all, landmark_map.read(np.arange(2)).mean))
     np.testing.assert_array_equal(found[0][0], found[1][0])
@@ -201,7 +200,7 @@ def test_a_landmark_removed_after_the_refinement_is_missed_by_the_update():
     state, groups = np.zeros((N, 3)), sighting(1)
     landmark_map, _ = filled()
     landmark_map.add_records(points(np.random.default_rng(1), 2), Point(2))
-    landmark_map.terms(state, groups, Prior.exactly(SE2, state))
+    landmark_map.information(state, groups, Prior.exactly(SE2, state))
     landmark_map.remove(np.array([1]))
     with pytest.raises(InputError, match="names landmark 1, which the map does not hold"):
         landmark_map.correct(state, np.zeros((N, 3)), groups)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from rbpf.core.models import NEW, NULL, ObservationModel, Observations
 from rbpf.errors import InputError
-from rbpf.maps.plan import Plan, Row, make_plan
+from rbpf.maps.rows import Plan, Row, make_plan
 
 N = 4
 NUMBERS = np.array([0, 0, 0, 1, 1, 2, -1])
@@ -38,7 +38,7 @@ def group(ids, **options) -> Observations:
 
 def rows_of(plan: Plan) -> list[Row]:
     """Every row of a plan, batches taken apart."""
-    rows = [row for rows in plan.joint for row in rows] + list(plan.late)
+    rows = [row for rows in plan.joint for row in rows] + list(plan.mixtures)
     for batch in plan.batches:
         for j, (k, landmark) in enumerate(zip(batch.ks.tolist(), batch.ids.tolist(), strict=True)):
             mask = None if batch.mask is None else batch.mask[:, j]
@@ -78,7 +78,7 @@ def test_every_row_appears_once_and_overlaps_are_stacked(all_ids):
     for batch in plan.batches:
         assert np.unique(kinds(batch.ids)).size == 1
         assert PLAIN[kinds(batch.ids[:1])[0]]
-    assert all(not PLAIN[kinds(np.array([row.landmark]))[0]] for row in plan.late)
+    assert all(not PLAIN[kinds(np.array([row.landmark]))[0]] for row in plan.mixtures)
     together = {rows[0].landmark for rows in plan.joint}
     assert all(len({row.landmark for row in rows}) == 1 for rows in plan.joint)
     for landmark in HELD[:5]:
@@ -117,7 +117,7 @@ def test_agreement_of_all_particles_needs_no_mask():
 
 def test_nothing_seen():
     plan = make_plan([group(np.zeros(0, dtype=int))], N, kinds, PLAIN)
-    assert (plan.batches, plan.joint, plan.late) == ([], [], [])
+    assert (plan.batches, plan.joint, plan.mixtures) == ([], [], [])
 
 
 @pytest.mark.parametrize("ids", [[6], [7], [[0]] * (N - 1) + [[6]]])

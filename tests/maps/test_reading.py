@@ -3,11 +3,9 @@
 import numpy as np
 import pytest
 
-from rbpf.core.belief import Belief
-from rbpf.core.conditional import Marginals
 from rbpf.core.genealogy import Lineage
-from rbpf.core.models import Records
-from rbpf.core.proposals import Prior
+from rbpf.core.models import Belief, Part, Records
+from rbpf.core.particles import Prior
 from rbpf.lie import SE3
 from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.maps.landmark_map import LandmarkMap
@@ -71,7 +69,7 @@ def test_innovations_in_the_heaviest_particle_equal_numpys(camera_model):
     state = SE3.exp(0.05 * rng.normal(size=(n, 6)))
     prior = Prior(SE3, state, np.zeros((1, 6)), np.zeros((1, 6, 6)))
     log_weights = np.log(np.arange(1.0, n + 1.0) / 28.0)
-    belief = Belief(log_weights, prior, Marginals(SE3, [landmark_map]))
+    belief = Belief(log_weights, prior, {Part.LANDMARK: landmark_map})
     model, z = camera_model(CAMERA), rng.uniform([200, 100], [400, 300], (k, 2))
     found = belief.innovations(model, z, ids)
     landmark_map.compiled = False
@@ -90,7 +88,7 @@ def test_projections_equal_numpys(n, shared):
         SE3, SE3.exp(0.02 * rng.normal(size=(n, 6))), 0.01 * rng.normal(size=(n, 6)), factor, centred=False
     )
     weights = rng.uniform(size=n)
-    belief = Belief(np.log(weights / weights.sum()), prior, Marginals(SE3, [landmark_map]))
+    belief = Belief(np.log(weights / weights.sum()), prior, {Part.LANDMARK: landmark_map})
     for model, ids in ((CameraPoint(CAMERA), points[-2:]), (CameraRay(CAMERA), rays[-2:])):
         assert landmark_map.is_compiled(model, ids)
         mean, cov = belief.project(model, ids)

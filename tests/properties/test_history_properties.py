@@ -5,8 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rbpf.core.genealogy import Lineage
-from rbpf.core.history import History
+from rbpf.core.genealogy import History, Lineage
 
 
 class Copied:

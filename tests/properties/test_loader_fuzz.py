@@ -11,8 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from rbpf.core.archive import load_arrays, save_arrays
-from rbpf.core.checkpoint import _digest
+from rbpf.core.checkpoint import _digest, load_arrays, save_arrays
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.results import load

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from rbpf.core.genealogy import Lineage
 from rbpf.errors import InputError
-from rbpf.maps.shared import SharedStore
+from rbpf.maps.store import SharedStore
 
 
 @dataclass

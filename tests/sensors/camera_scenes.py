@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from rbpf.core.models import ObservationModel
+from rbpf.kernels.landmarks import call_kernel
 from rbpf.kernels.signature import BLOCK
-from rbpf.kernels.single import call_kernel
 from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from rbpf.conformance import Example, check_model
+from rbpf.core.linearisation import numeric_jacobians
 from rbpf.core.models import Records
-from rbpf.core.numeric import numeric_jacobians
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Euclidean, Product
 from rbpf.maps.inverse_depth import InverseDepth

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rbpf.core.exchange import NULL
+from rbpf.core.models import NULL
 from rbpf.errors import InputError
 from rbpf.sensors.descriptors.index import DescriptorIndex, DescriptorStore, ExactSearch, Gate, TreeSearch
 from rbpf.sensors.descriptors.matching import MatchLimits

@@ -8,10 +8,10 @@ import pytest
 from rbpf.core.filter import Filter
 from rbpf.core.genealogy import Lineage
 from rbpf.core.likelihoods import Gaussian
+from rbpf.core.linearisation import information, innovation_covariance, linearise
 from rbpf.core.models import Observations, Part, Records
-from rbpf.core.numeric import linearise
-from rbpf.core.proposals import Prior, PriorProposal, Terms
-from rbpf.core.reference import information, innovation_covariance
+from rbpf.core.particles import Information, Prior
+from rbpf.core.proposals import PriorProposal
 from rbpf.lie import SE3
 from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.maps.landmark_map import LandmarkMap
@@ -39,7 +39,7 @@ def covariances(rays: Rays, var_q: float) -> np.ndarray:
     return cov
 
 
-def terms(model: CameraRay, rays: Rays, z: np.ndarray, var_q: float) -> Terms:
+def terms(model: CameraRay, rays: Rays, z: np.ndarray, var_q: float) -> Information:
     nu, jac = linearise(model, SE3, z, rays.state[:, None], rays.mean, rays.const)
     cov = innovation_covariance(known(jac.landmark), covariances(rays, var_q), np.broadcast_to(R, (5, 2, 2)))
     prior = Prior.exactly(SE3, rays.state)
@@ -194,7 +194,7 @@ def test_only_the_state_learns_from_the_constraint():
         }
         chosen = [groups[name] for name in parts]
         prior = Prior.exactly(SE3, rays.state)
-        found = held.terms(rays.state, chosen, prior)
+        found = held.information(rays.state, chosen, prior)
         density = held.correct(rays.state, np.zeros((6, 6)), chosen).all
         results.append((found.info, density, held.read(ids).mean))
     (info, density, untouched), (nothing, none, depth), both = results

@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from rbpf.core.linearisation import numeric_jacobians
 from rbpf.core.models import Part
-from rbpf.core.numeric import numeric_jacobians
 from rbpf.lie import SE2, SE3
 from rbpf.sensors.range_bearing import RangeBearing, RelativePosition, RigidPointModel, wrap_angle
 

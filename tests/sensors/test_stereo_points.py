@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from rbpf.conformance import check_model
-from rbpf.core.numeric import invert_with_covariance, numeric_jacobians
+from rbpf.core.linearisation import numeric_jacobians
+from rbpf.core.models import ObservationModel
 from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.camera.points import CameraPoint, StereoPoint
@@ -54,6 +55,6 @@ def test_it_starts_points():
     records = model.initialise(rays.state, z, cov)
     seen = model.predict(rays.state[:, None], records.mean)
     np.testing.assert_allclose(seen, np.broadcast_to(z, (4, 5, 3)), atol=1e-9)
-    numeric = invert_with_covariance(model, rays.state, z, cov)
+    numeric = ObservationModel.initialise(model, rays.state, z, cov)
     np.testing.assert_allclose(records.mean, numeric.mean, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(records.cov, numeric.cov, rtol=1e-5, atol=1e-9)

@@ -69,7 +69,7 @@ THREADS = """
 import hashlib
 import numba
 from dataclasses import replace
-from rbpf.kernels.threads import PAIRS_PER_THREAD
+from rbpf.kernels.signature import PAIRS_PER_THREAD
 from rbpf.systems.mono.run import run
 from tests.core.worlds import content
 from tests.systems.mono_logs import SMALL, desk

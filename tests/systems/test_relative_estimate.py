@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from rbpf.core.anchoring import Anchored, relative_estimate
-from rbpf.core.estimate import mixture_estimate
-from rbpf.core.proposals import Prior
+from rbpf.core.particles import Prior, mixture_estimate
 from rbpf.lie import SE2, SE3
 
 every_space = pytest.mark.parametrize("space", [SE2, SE3], ids=repr)

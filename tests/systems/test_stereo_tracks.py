@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rbpf.core.exchange import NULL
+from rbpf.core.models import NULL
 from rbpf.systems.stereo.tracks import Tracks
 
 NONE = np.zeros((2, 0), dtype=np.intp)

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from rbpf.core.exchange import Observations, Part, Transition
 from rbpf.core.filter import Filter
-from rbpf.core.models import MotionModel, ObservationModel, Sensor
+from rbpf.core.models import MotionModel, ObservationModel, Observations, Part, Sensor, Transition
 from rbpf.errors import InputError
 from rbpf.lie import Euclidean
 from rbpf.validation.consistency.rank_histograms import calibrate, plot_ranks

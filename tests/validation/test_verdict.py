@@ -7,9 +7,8 @@ import pytest
 
 from examples.studies.verdict import bias_odometry, scale_odometry_noise, scale_sensor_noise, swap_names
 from rbpf.core.diagnostics import motion_correction
-from rbpf.core.exchange import Observations, Part, Transition
 from rbpf.core.filter import Filter
-from rbpf.core.models import MotionModel, ObservationModel, Sensor
+from rbpf.core.models import MotionModel, ObservationModel, Observations, Part, Sensor, Transition
 from rbpf.lie import Euclidean
 from rbpf.runs.recordings import filter_robot_log as run
 from rbpf.runs.truth import truth_at

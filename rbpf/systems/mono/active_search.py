@@ -13,7 +13,7 @@ from typing import NamedTuple, final
 import numpy as np
 
 from rbpf import gaussian
-from rbpf.core.belief import Belief
+from rbpf.core.models import Belief
 from rbpf.sensors.patches.search import search, warp
 from rbpf.systems.mono.config import SearchConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor

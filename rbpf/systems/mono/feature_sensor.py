@@ -11,10 +11,9 @@ from typing import final
 import numpy as np
 
 from rbpf import gaussian
-from rbpf.core.belief import Belief
-from rbpf.core.models import Landmark, NewLandmarks, Observations, Part, Records, Sensor
+from rbpf.core.models import Belief, Landmark, NewLandmarks, Observations, Part, Records, Sensor
 from rbpf.lie import SE3
-from rbpf.maps.constellation import Constellation
+from rbpf.maps.constellation import Constellation, UncertainConstellation
 from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.maps.point import Point
 from rbpf.sensors.camera import Pinhole
@@ -131,6 +130,7 @@ class InverseDepthRays(UnknownDepth):
         # Depth is measured where it moves the image in the particle of highest weight, E06 §5.1, last paragraph.
         state, mode = belief.state[belief.mode], belief.mode
         _, jac, _ = belief.map.innovations(self.model, np.zeros((ids.size, 2)), ids, state, mode)
+        assert jac.landmark is not None
         by_rho = np.sqrt(np.square(jac.landmark[..., 2]).sum(axis=-1))
         parallax = by_rho * self.config.std_per_m >= self.config.depth_parallax_px
 
@@ -368,7 +368,9 @@ class FeatureSensor(Sensor):
                 seen.append(SE3.inverse_transform(pose, belief.read_mode(group.ids).mean[0]))
         if self.group is not None:
             landmark = self._names.ids(belief.catalogue)[CONSTELLATION]
-            points = belief.map.landmark_of(landmark).in_world(belief.read_mode([landmark]))[0]
+            known = belief.map.landmark_of(landmark)
+            assert isinstance(known, Constellation | UncertainConstellation)
+            points = known.in_world(belief.read_mode([landmark]))[0]
             seen.append(SE3.inverse_transform(pose, points))
         point = np.concatenate(seen)
         return np.asarray(point[self.camera.visible(point), 2])

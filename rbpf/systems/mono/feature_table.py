@@ -7,7 +7,7 @@ from typing import final
 
 import numpy as np
 
-from rbpf.core.archive import checked
+from rbpf.core.checkpoint import checked
 from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole
 

@@ -7,8 +7,7 @@ from typing import final
 
 import numpy as np
 
-from rbpf.core.belief import Belief
-from rbpf.core.models import NewLandmarks, Observations, Part, Sensor
+from rbpf.core.models import Belief, NewLandmarks, Observations, Part, Sensor
 from rbpf.lie import SE3
 from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.sensors.features import CornerDetector, Descriptor, Detector, Sift, SiftConfig

@@ -12,11 +12,9 @@ from typing import NamedTuple, final
 import numpy as np
 
 from rbpf import gaussian
-from rbpf.core.belief import Belief
-from rbpf.core.estimate import mixture_estimate
 from rbpf.core.filter import Filter
-from rbpf.core.particles import Particles
-from rbpf.core.proposals import Prior
+from rbpf.core.models import Belief
+from rbpf.core.particles import Particles, Prior, mixture_estimate
 from rbpf.lie import SE3
 from rbpf.motion.constant_velocity import PosePrior
 from rbpf.sensors.camera import Pinhole

@@ -16,13 +16,13 @@ from typing import Any, ClassVar, final
 import numpy as np
 
 from rbpf.core.anchoring import Anchored, relative_estimate
-from rbpf.core.belief import Belief
-from rbpf.core.estimate import Estimate
 from rbpf.core.filter import Filter, StepReport
-from rbpf.core.models import Conditional, MotionModel, NewLandmarks, Observations, Records, Sensor
-from rbpf.core.substate import KalmanSubstate
+from rbpf.core.marginals import KalmanSubstate
+from rbpf.core.models import Belief, Conditional, MotionModel, NewLandmarks, Observations, Records, Sensor
+from rbpf.core.particles import Estimate
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.maps.constellation import Constellation, UncertainConstellation
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
 from rbpf.motion.constant_velocity import MarginalVelocity, PosePrior, SampledVelocity
@@ -601,7 +601,9 @@ def world_of(filter_: Filter) -> Anchored | None:
     )  # it was the first landmark: no other one has to be asked
     if first is None or landmark_map.catalogue[first] != CONSTELLATION:
         return None
-    return Anchored(*landmark_map.landmark_of(first).frame(landmark_map.read(np.array([first]))))
+    group = landmark_map.landmark_of(first)
+    assert isinstance(group, Constellation | UncertainConstellation)
+    return Anchored(*group.frame(landmark_map.read(np.array([first]))))
 
 
 def particle_points(filter_: Filter, ids: Sequence[int]) -> np.ndarray:

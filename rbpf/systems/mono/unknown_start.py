@@ -25,11 +25,9 @@ from typing import final
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, cholesky, solve_triangular
 
-from rbpf.core.archive import checked, within
-from rbpf.core.estimate import mixture_estimate
+from rbpf.core.checkpoint import checked, within
 from rbpf.core.filter import Filter
-from rbpf.core.particles import uniform_log_weights
-from rbpf.core.proposals import Prior
+from rbpf.core.particles import Prior, mixture_estimate, uniform_log_weights
 from rbpf.lie import SE3
 from rbpf.motion.constant_velocity import PosePrior
 from rbpf.sensors.camera import Pinhole

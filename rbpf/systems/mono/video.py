@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rbpf.core.archive import checked
-from rbpf.core.checkpoint import fitting
+from rbpf.core.checkpoint import checked, fitting
 from rbpf.core.filter import Filter
 from rbpf.errors import InputError
 from rbpf.sensors.feature_log import FeatureFrame

@@ -12,7 +12,7 @@ from typing import Any, ClassVar, final
 import numpy as np
 
 from rbpf.core.anchoring import StartAnchor
-from rbpf.core.archive import checked
+from rbpf.core.checkpoint import checked
 from rbpf.core.diagnostics import motion_correction
 from rbpf.core.filter import Filter, StepReport
 from rbpf.core.models import NEW, NULL, Sensor
@@ -223,12 +223,11 @@ class RangeBearingSlam(System):
 
     def summary(self, log: Recorded) -> dict[str, Any]:
         """How much was observed and kept, and how far the particles have forgotten the past."""
-        store = self.filter.belief().map.store
         return {
             "landmarks": int(self.map().ids.size),
             "observations": int(sum((ids >= 0).sum() for ids in self._final(log))),
             "ancestors_of_first_generation": self.filter.history.distinct_first(),
-            "map_share_of_dense": round(store.stored_bytes / max(store.dense_bytes, 1), 4),
+            "map_share_of_dense": round(self.filter.belief().map.stored_fraction, 4),
         }
 
     def associations(self) -> list[np.ndarray]:

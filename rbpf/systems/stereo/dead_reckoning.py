@@ -6,7 +6,7 @@ from typing import NamedTuple, final
 import numpy as np
 
 from rbpf import gaussian
-from rbpf.core.archive import checked
+from rbpf.core.checkpoint import checked
 from rbpf.lie import SE3
 from rbpf.motion.odometry import Odometry
 from rbpf.motion.stereo_motions import Known

@@ -5,10 +5,8 @@ from typing import Any, final
 
 import numpy as np
 
-from rbpf.core.belief import Belief
-from rbpf.core.exchange import NULL
 from rbpf.core.filter import StepReport
-from rbpf.core.models import Part, Sensor
+from rbpf.core.models import NULL, Belief, Part, Sensor
 from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.feature_log import CameraTruth, FeatureLog
 from rbpf.sensors.features import Sift

@@ -8,7 +8,7 @@ landmarks before it.
 import numpy as np
 
 from rbpf import gaussian
-from rbpf.core.belief import Belief
+from rbpf.core.models import Belief
 from rbpf.lie import SE3
 from rbpf.motion.stereo_vo import VoConfig, estimate_motion
 from rbpf.systems.stereo.sensor import TINY, StereoFrame, StereoSensor

@@ -4,7 +4,7 @@ from typing import final
 
 import numpy as np
 
-from rbpf.core.archive import checked
+from rbpf.core.checkpoint import checked
 
 
 @final

@@ -5,7 +5,7 @@ from typing import final
 
 import numpy as np
 
-from rbpf.core.belief import Belief
+from rbpf.core.models import Belief
 from rbpf.errors import InputError
 from rbpf.maps.point import Point
 from rbpf.motion.stereo_odometer import match_names

@@ -5,8 +5,8 @@ from typing import final
 
 import numpy as np
 
-from rbpf.core.belief import Belief
-from rbpf.core.proposals import Prior
+from rbpf.core.models import Belief
+from rbpf.core.particles import Prior
 from rbpf.gaussian import symmetrise
 from rbpf.lie import SE3
 from rbpf.sensors.camera.points import StereoPoint

@@ -5,9 +5,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rbpf.core.archive import checked, within
-from rbpf.core.checkpoint import fitting
-from rbpf.core.estimate import Estimate
+from rbpf.core.checkpoint import checked, fitting, within
+from rbpf.core.particles import Estimate
 from rbpf.errors import InputError
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from rbpf.core.estimate import Estimate
 from rbpf.core.filter import Filter, StepReport
+from rbpf.core.particles import Estimate
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.motion.odometry import Odometry

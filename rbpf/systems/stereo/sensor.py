@@ -14,9 +14,7 @@ from typing import final
 import numpy as np
 
 from rbpf import gaussian
-from rbpf.core.belief import Belief
-from rbpf.core.exchange import NULL
-from rbpf.core.models import Likelihood, NewLandmarks, Observations, Part, Sensor
+from rbpf.core.models import NULL, Belief, Likelihood, NewLandmarks, Observations, Part, Sensor
 from rbpf.maps.point import Point
 from rbpf.motion.stereo_vo import VoConfig, estimate_motion
 from rbpf.sensors.camera import RectifiedStereo

@@ -9,7 +9,7 @@ from typing import final
 import numpy as np
 
 from rbpf import gaussian
-from rbpf.core.exchange import NULL
+from rbpf.core.models import NULL
 from rbpf.sensors.feature_log import FeatureFrame
 
 LEAST = 2

@@ -6,13 +6,14 @@ column is rewritten only when it is observed; one that is left alone is compacte
 descendants, whose number falls like 1/age as lineages coalesce. See `docs/adr` for the comparison with a tree.
 """
 
+from dataclasses import dataclass
+from typing import final
+
 import numpy as np
 
-from rbpf.core.archive import checked, within
+from rbpf.core.checkpoint import checked, within
 from rbpf.core.genealogy import Lineage, Schedule
 from rbpf.errors import InputError
-from rbpf.maps.columns import Columns
-from rbpf.maps.pool import Access, Cold, Pool
 
 ALL = slice(None)
 MOST_FIELDS = 1 << 20
@@ -22,6 +23,176 @@ HOT_FRACTION = 0.75
 """A column with fewer surviving rows than this fraction of the particles gives its dense slab back."""
 COLD_FRACTION = 0.9
 """A compacted column is compacted again when no more than this fraction of its rows survives."""
+
+_FIRST_ROWS = 64
+_FIRST_SLABS = 32
+
+
+@final
+class Columns:
+    """Tables of columns, which come and go, in the order in which they came.
+
+    Memory and time follow the columns that are held, not those that ever were: a filter may run for ever in a world
+    that changes. Row r of every table is the column with the r-th id. Ids are the caller's, or counted up from the
+    largest that was ever used.
+    """
+
+    def __init__(self) -> None:
+        self.count = 0
+        """Columns held."""
+        self.next_id = 0
+        """One more than the largest id that was ever used."""
+        self._ids = np.zeros(_FIRST_ROWS, dtype=np.int64)
+        self._ascending = True
+        """Whether the ids held ascend, as those that are counted up do."""
+        self._sorted: tuple[np.ndarray, np.ndarray] | None = None
+        """Where they do not: the ids ascending, and the rows of each; made when it is asked for."""
+        self.fields = np.zeros(_FIRST_ROWS, dtype=np.int64)
+        self.slab = np.full(_FIRST_ROWS, -1)
+        self.generation = np.zeros(_FIRST_ROWS, dtype=np.int64)
+        self.kind = np.full(_FIRST_ROWS, -1)
+
+    @property
+    def ids(self) -> np.ndarray:
+        """(M,) of the columns held, in the order in which they were added."""
+        return self._ids[: self.count]
+
+    def rows(self, ids: np.ndarray) -> np.ndarray:
+        """Rows (K,) of columns (K,), which must be held."""
+        if not self._ascending:
+            ascending, rows = self._by_id()
+            return rows[ascending.searchsorted(ids)]
+        # All ids from 0 up are their own rows.
+        return ids if self.count == self.next_id else self.ids.searchsorted(ids)
+
+    def row(self, column: int) -> int:
+        """Row of one column, which must be held."""
+        return int(self.rows(np.array(column)))
+
+    def held(self, ids: np.ndarray) -> np.ndarray:
+        """Whether each of some ids (K,) is that of a column held, (K,) bool."""
+        return self._found(ids)[1]
+
+    def kinds(self, ids: np.ndarray) -> np.ndarray:
+        """What `kind` says of each of some ids (K,), −1 where there is no such column."""
+        rows, held = self._found(ids)
+        return np.where(held, self.kind[rows], -1)
+
+    def _found(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rows (K,) of ids (K,), and whether they are held; the rows of others mean nothing."""
+        if not self.count:
+            return np.zeros(ids.shape, dtype=np.int64), np.zeros(ids.shape, dtype=bool)
+        if self._ascending:
+            rows = np.minimum(self.ids.searchsorted(ids), self.count - 1)
+        else:
+            ascending, order = self._by_id()
+            rows = order[np.minimum(ascending.searchsorted(ids), self.count - 1)]
+        return rows, np.asarray(self.ids[rows] == ids)
+
+    def _by_id(self) -> tuple[np.ndarray, np.ndarray]:
+        if self._sorted is None:
+            order = self.ids.argsort(kind="stable")
+            self._sorted = self.ids[order], order
+        return self._sorted
+
+    def add(self, column: int | None = None) -> int:
+        """Makes room for a new column and returns its id: the one given, which must not be held, or the next one."""
+        if self.count == self._ids.size:
+            for name, table in self._tables().items():
+                setattr(self, name, np.concatenate([table, np.zeros_like(table)]))
+        row, column = self.count, self.next_id if column is None else column
+        self._ascending = self._ascending and (not row or column > int(self._ids[row - 1]))
+        self._ids[row], self.slab[row], self.kind[row] = column, -1, -1
+        self.count, self.next_id, self._sorted = row + 1, max(self.next_id, column + 1), None
+        return column
+
+    def remove(self, ids: np.ndarray) -> None:
+        """Drops columns (K,), which must be held, each once; gives memory back when three quarters are empty."""
+        if not ids.size:
+            return
+        gone = np.sort(self.rows(ids))
+        first, count = int(gone.min()), self.count - ids.size
+        kept = np.delete(np.arange(first, self.count), gone - first)
+        room = self._ids.size
+        while room > max(_FIRST_ROWS, 4 * count):
+            room //= 2
+        for name, table in self._tables().items():
+            table[first:count] = table[kept]
+            if room < table.size:
+                setattr(self, name, table[:room].copy())
+        self.count, self._sorted = count, None
+        self._ascending = self._ascending or not count
+
+    def restore(self, ids: np.ndarray, next_id: int) -> None:
+        """Holds the columns (M,) and no others; their tables have to be filled again.
+
+        Raises:
+            InputError: an id comes twice, or one is not between 0 and `next_id`.
+        """
+        ids = checked({"ids": ids}, "ids", (None,), "i").astype(np.int64)
+        if np.unique(ids).size < ids.size or (ids.size and not 0 <= ids.min() <= ids.max() < next_id):
+            raise InputError(f"the landmarks' ids are not different numbers from 0 to {next_id - 1}")
+        room = max(_FIRST_ROWS, 2 * ids.size)
+        for name, table in self._tables().items():
+            setattr(self, name, np.zeros(room, dtype=table.dtype))
+        self.slab[:], self.kind[:] = -1, -1
+        self._ids[: ids.size] = ids
+        self.count, self.next_id = ids.size, next_id
+        self._ascending, self._sorted = bool((np.diff(ids) > 0).all()), None
+
+    def _tables(self) -> dict[str, np.ndarray]:
+        names = ("_ids", "fields", "slab", "generation", "kind")
+        return {name: getattr(self, name) for name in names}
+
+
+class Pool:
+    """Dense slabs (slabs, fields, N) of equal record size, recycled through a free list.
+
+    Args:
+        fields: numbers per record.
+        n: particles.
+    """
+
+    def __init__(self, fields: int, n: int) -> None:
+        self.data = np.zeros((_FIRST_SLABS, fields, n))
+        self._free = list(range(_FIRST_SLABS - 1, -1, -1))
+
+    @property
+    def used(self) -> int:
+        """Number of slabs in use."""
+        return self.data.shape[0] - len(self._free)
+
+    def take(self, count: int) -> np.ndarray:
+        """Free slabs, (count,) int; the pool doubles where there are too few."""
+        while len(self._free) < count:
+            old = self.data.shape[0]
+            self.data = np.concatenate([self.data, np.zeros_like(self.data)])
+            self._free = list(range(2 * old - 1, old - 1, -1)) + self._free
+        taken = self._free[: -count - 1 : -1]
+        del self._free[len(self._free) - count :]
+        return np.array(taken, dtype=np.int64)
+
+    def give(self, slabs: np.ndarray) -> None:
+        """Returns slabs."""
+        self._free.extend(slabs.tolist())
+
+
+@dataclass
+class Cold:
+    """A compacted column: records (fields, n) of the writers `kept` (n,) that still have descendants."""
+
+    kept: np.ndarray
+    data: np.ndarray
+
+
+@dataclass(frozen=True)
+class Access:
+    """What a kernel needs to read columns: slab, and the row of each particle, `maps[which[k]]`."""
+
+    pool: np.ndarray
+    slabs: np.ndarray
+    which: np.ndarray
+    maps: np.ndarray
 
 
 class SharedStore:
@@ -141,7 +312,12 @@ class SharedStore:
         old = self.columns.slab[rows].copy()
         self.columns.slab[rows] = pool.take(stale.size)
         pool.give(old)
-        self._move(stale, rows, now)
+        # All of one past generation together, as a resampling leaves them.
+        past = self.columns.generation[rows]
+        for generation in np.unique(past).tolist():
+            self._leave(generation, stale[past == generation].tolist())
+        self.columns.generation[rows] = now
+        self._join(stale.tolist(), now)
         targets = self.columns.slab[at]
         if len(set(columns.tolist())) == columns.size:
             return Access(pool.data, access.slabs, access.which, access.maps), targets
@@ -164,7 +340,17 @@ class SharedStore:
             if alive.size <= COLD_FRACTION * self._survivors.get(generation, self.n):
                 self._survivors[generation] = alive.size
                 for column in members:
-                    self._shrink(column, alive)
+                    row, cold = self.columns.row(column), self._cold.get(column)
+                    if cold is not None and alive.size <= COLD_FRACTION * cold.kept.size:
+                        rows = np.searchsorted(cold.kept, alive)
+                        self._cold[column] = Cold(alive, cold.data.take(rows, axis=1))
+                    elif cold is None and alive.size <= HOT_FRACTION * self.n:
+                        pool = self._pool(row)
+                        self._cold[column] = Cold(
+                            alive, pool.data[self.columns.slab[row]].take(alive, axis=1)
+                        )
+                        pool.give(self.columns.slab[row : row + 1])
+                        self.columns.slab[row] = -1
             if alive.size > 1:
                 self._schedule.add(generation, now)
 
@@ -214,20 +400,17 @@ class SharedStore:
         for generation in self._members:
             self.lineage.take_up(generation)
         for row, column in enumerate(self.ids.tolist()):
-            self._restore_column(row, column, arrays)
+            name, fields = f"store/{column}", int(self.columns.fields[row])
+            if f"{name}/kept" not in arrays:
+                self._fill(row, checked(arrays, f"{name}/data", (fields, self.n), "f"))
+                continue
+            kept = within(arrays, f"{name}/kept", None, 0, self.n)
+            data = checked(arrays, f"{name}/data", (fields, kept.size), "f").copy()
+            alive = self.lineage.survivors(int(self.columns.generation[row]))
+            if (np.diff(kept) <= 0).any() or np.setdiff1d(alive, kept).size:
+                raise InputError(f"the array {name}/kept does not hold the particles that have descendants")
+            self._cold[column] = Cold(kept, data)
         self._schedule = Schedule.of(arrays["store/due"])
-
-    def _restore_column(self, row: int, column: int, arrays: dict[str, np.ndarray]) -> None:
-        name, fields = f"store/{column}", int(self.columns.fields[row])
-        if f"{name}/kept" not in arrays:
-            self._fill(row, checked(arrays, f"{name}/data", (fields, self.n), "f"))
-            return
-        kept = within(arrays, f"{name}/kept", None, 0, self.n)
-        data = checked(arrays, f"{name}/data", (fields, kept.size), "f").copy()
-        alive = self.lineage.survivors(int(self.columns.generation[row]))
-        if (np.diff(kept) <= 0).any() or np.setdiff1d(alive, kept).size:
-            raise InputError(f"the array {name}/kept does not hold the particles that have descendants")
-        self._cold[column] = Cold(kept, data)
 
     def _pool(self, row: int) -> Pool:
         fields = int(self.columns.fields[row])
@@ -257,26 +440,6 @@ class SharedStore:
         if self._cold.pop(column, None) is None:
             self._pool(row).give(self.columns.slab[row : row + 1])
         self.columns.slab[row] = -1
-
-    def _shrink(self, column: int, alive: np.ndarray) -> None:
-        cold = self._cold.get(column)
-        if cold is not None:
-            if alive.size <= COLD_FRACTION * cold.kept.size:
-                self._cold[column] = Cold(alive, cold.data.take(np.searchsorted(cold.kept, alive), axis=1))
-        elif alive.size <= HOT_FRACTION * self.n:
-            row = self.columns.row(column)
-            pool = self._pool(row)
-            self._cold[column] = Cold(alive, pool.data[self.columns.slab[row]].take(alive, axis=1))
-            pool.give(self.columns.slab[row : row + 1])
-            self.columns.slab[row] = -1
-
-    def _move(self, columns: np.ndarray, rows: np.ndarray, now: int) -> None:
-        """To the present generation: all of one past generation together, as a resampling leaves them."""
-        past = self.columns.generation[rows]
-        for generation in np.unique(past).tolist():
-            self._leave(generation, columns[past == generation].tolist())
-        self.columns.generation[rows] = now
-        self._join(columns.tolist(), now)
 
     def _join(self, columns: list[int], generation: int) -> None:
         members = self._members.get(generation)

@@ -1,17 +1,95 @@
-"""Plain NumPy twins of the compiled drivers; they also serve models without a kernel and rows that are stacked.
+"""Observations linearised: Jacobians on the manifold, and the plain NumPy twins of the compiled drivers.
 
-Shapes: N particles, K observations, p rows, d increment, D landmark. `mask` (N, K) says which particles saw an
-observation; None is all.
+The twins also serve models without a kernel, and rows that are stacked. Shapes: N particles, K observations, p rows,
+d increment, D landmark. `mask` (N, K) says which particles took an observation; None is all.
 """
 
 import numpy as np
 
 from rbpf import gaussian
-from rbpf.core.models import Likelihood
-from rbpf.core.proposals import Prior, Proposed, Terms
+from rbpf.core.models import STEP, Jacobians, Likelihood, ObservationModel, Part
+from rbpf.core.particles import Information, Prior
+from rbpf.errors import InputError
+from rbpf.lie import LieGroup
 
+EVERYTHING = frozenset(Part)
 _UNIT_NORMAL = 1.0 / (2.0 * np.pi)
 """Variance at which log|2πS| is zero: a row of it, with zero residual and Jacobian, says nothing."""
+
+
+def numeric_jacobians(
+    model: ObservationModel,
+    space: LieGroup,
+    state: np.ndarray,
+    landmark: np.ndarray | None = None,
+    const: np.ndarray | None = None,
+    substate: np.ndarray | None = None,
+    by: frozenset[Part] = EVERYTHING,
+) -> Jacobians:
+    """Central differences of −ν for z = h, in the right chart at the state; `model.residual` wraps.
+
+    Those by a part that `by` does not name are left out: each costs two predictions per coordinate.
+    """
+    plus_minus = np.array([STEP, -STEP])
+
+    z = model.predict(state, landmark, const, substate)
+
+    def differences(nu: np.ndarray) -> np.ndarray:
+        return np.moveaxis(nu[1] - nu[0], 0, -1) / (2 * STEP)
+
+    def perturbed(x: np.ndarray) -> np.ndarray:
+        steps = plus_minus[:, None, None] * np.eye(x.shape[-1])
+        return x + steps.reshape(2, x.shape[-1], *(1,) * (x.ndim - 1), x.shape[-1])
+
+    state_part = landmark_part = substate_part = None
+    wanted = model.reads & by
+    if Part.STATE in wanted:
+        steps = plus_minus[:, None, None] * np.eye(space.dim)
+        moved = space.retract(state, steps.reshape(2, space.dim, *(1,) * (state.ndim - 1), space.dim))
+        state_part = differences(model.innovation(z, moved, landmark, const, substate))
+    if landmark is not None and Part.LANDMARK in wanted:
+        landmark_part = differences(model.innovation(z, state, perturbed(landmark), const, substate))
+    if substate is not None and Part.SUBSTATE in wanted:
+        substate_part = differences(model.innovation(z, state, landmark, const, perturbed(substate)))
+    return Jacobians(state_part, landmark_part, substate_part)
+
+
+def linearise(
+    model: ObservationModel,
+    space: LieGroup,
+    z: np.ndarray,
+    state: np.ndarray,
+    landmark: np.ndarray | None = None,
+    const: np.ndarray | None = None,
+    substate: np.ndarray | None = None,
+    by: frozenset[Part] = EVERYTHING,
+) -> tuple[np.ndarray, Jacobians]:
+    """Innovation (N, K, p) and Jacobians at states (N, 1, E), landmarks (N, K, D), substates (N, 1, m).
+
+    Numeric Jacobians by a part that `by` does not name are left out.
+
+    Raises:
+        InputError: a prediction or a Jacobian has the wrong shape.
+    """
+    nu = model.innovation(z, state, landmark, const, substate)
+    parts = (state, landmark, substate)
+    expected = (*np.broadcast_shapes(*(part.shape[:-1] for part in parts if part is not None)), model.dim)
+    if nu.shape != np.broadcast_shapes(expected, z.shape):
+        raise InputError(f"{type(model).__name__}.predict returned shape {nu.shape}, expected {expected}")
+    jacobians = model.jacobians(state, landmark, const, substate)
+    if jacobians is None:
+        jacobians = numeric_jacobians(model, space, state, landmark, const, substate, by)
+    sizes = (space.dim, *(0 if part is None else part.shape[-1] for part in parts[1:]))
+    blocks: list[np.ndarray | None] = []
+    for block, size in zip(jacobians, sizes, strict=True):
+        # A constant block may come without its leading axes.
+        try:
+            blocks.append(None if block is None else np.broadcast_to(block, (*expected, size)))
+        except ValueError as error:
+            shape = None if block is None else block.shape
+            found = f"{type(model).__name__}.jacobians returned a block of shape {shape}"
+            raise InputError(f"{found}, expected {(*expected, size)}") from error
+    return nu, Jacobians(*blocks)
 
 
 def innovation_covariance(jac: np.ndarray, cov: np.ndarray, noise: np.ndarray) -> np.ndarray:
@@ -27,8 +105,8 @@ def information(
     likelihood: Likelihood,
     prior: Prior,
     mask: np.ndarray | None = None,
-) -> Terms:
-    """Terms of independent observations with innovations ν (N, K, p), H (N, K, p, d), S (N, K, p, p).
+) -> Information:
+    """Information of independent observations with innovations ν (N, K, p), H (N, K, p, d), S (N, K, p, p).
 
     An observation that the likelihood calls an outlier at the prediction, S + H Q Hᵀ, takes no part in the
     refinement and enters by its outlier density.
@@ -47,7 +125,7 @@ def information(
     log_det = np.zeros(n)
     if likelihood.normalised:
         log_det = ((gaussian.log_det(chol) + p * np.log(2.0 * np.pi)) * use).sum(axis=1)
-    return Terms(info, vector, np.square(white_nu).sum(axis=(1, 2)), log_det, log_factor, k * p)
+    return Information(info, vector, np.square(white_nu).sum(axis=(1, 2)), log_det, log_factor, k * p)
 
 
 def log_normaliser(cov: np.ndarray, rows: np.ndarray) -> np.ndarray:
@@ -111,7 +189,7 @@ def stacked(
     """Rows of several observations that share a landmark or a substate as one observation per particle.
 
     Given ν (N, p_j), J (N, p_j, c) and R_j (p_j, p_j), returns ν (N, Σp), J (N, Σp, c) and R (N, Σp, Σp). A row that
-    a particle did not see says nothing there.
+    a particle did not take says nothing there.
     """
     n = nus[0].shape[0]
     sizes = [nu.shape[1] for nu in nus]
@@ -127,16 +205,3 @@ def stacked(
             jac[:, rows] *= seen[:, None, None]
             noise[~seen, rows, rows] = _UNIT_NORMAL * np.eye(size)
     return nu, jac, noise
-
-
-def refined(prior: Prior, terms: Terms) -> Proposed:
-    """NumPy twin of `rbpf.core.proposals.refined`."""
-    rank = prior.factor.shape[2]
-    matrix = np.eye(rank) + np.einsum("nar,nab,nbs->nrs", prior.factor, terms.info, prior.factor)
-    linear = np.einsum("nar,na->nr", prior.factor, terms.vector)
-    chol = np.linalg.cholesky(gaussian.symmetrise(matrix))
-    root = np.swapaxes(np.linalg.inv(chol), -1, -2)
-    white = np.einsum("nba,nb->na", root, linear)
-    nis = terms.quad - np.square(white).sum(axis=1)
-    log_w1 = -0.5 * (nis + terms.log_det + gaussian.log_det(chol)) + terms.log_factor
-    return Proposed(np.einsum("nab,nb->na", root, white), root, log_w1, nis, terms.rows)

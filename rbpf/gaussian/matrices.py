@@ -1,23 +1,86 @@
-"""Factors of covariances: Cholesky, semi-definite square root, triangular solves, inverses.
+"""Small symmetric matrices: how they are stored, Cholesky and semi-definite factors, triangular solves, inverses.
 
 Up to n = 8 the loops run over the entries of a matrix and the arithmetic along the batch, which
 LAPACK, called once per matrix, cannot do. Sums use no BLAS: equal input gives equal bytes.
 """
 
 import math
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rbpf.arrays import Float, Like
 from rbpf.errors import InputError
-from rbpf.gaussian.storage import Array, entries_first, entries_last, gram, symmetrise
+
+Array = NDArray[np.float64]
 
 _UNROLLED = 8
 _ASYMMETRY = 1e-9
 _NEGATIVE = 1e-9
 _SINGULAR = 1e-12
 _NO_SCALE = 1e-100
+
+
+def symmetrise(cov: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch n n"]:
+    """Symmetric part, (..., n, n) -> (..., n, n)."""
+    cov = np.asarray(cov, dtype=float)
+    return 0.5 * (cov + np.swapaxes(cov, -1, -2))
+
+
+def pack(cov: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch packed"]:
+    """Lower triangle row by row, c00 c10 c11 c20 c21 c22 ..., (..., n, n) -> (..., n (n + 1) / 2)."""
+    cov = np.asarray(cov, dtype=float)
+    rows, columns = _triangle(cov.shape[-1])
+    return cov[..., rows, columns]
+
+
+def unpack(packed: Like[ArrayLike, "*batch packed"], n: int) -> Float[np.ndarray, "*batch {n} {n}"]:
+    """Symmetric matrix of a packed lower triangle, (..., n (n + 1) / 2) -> (..., n, n).
+
+    Raises:
+        InputError: The last axis does not have n (n + 1) / 2 entries.
+    """
+    packed = np.asarray(packed, dtype=float)
+    rows, columns = _triangle(n)
+    if packed.shape[-1] != rows.size:
+        raise InputError(f"A packed {n} x {n} matrix has {rows.size} entries, got {packed.shape[-1]}.")
+    out = np.empty((*packed.shape[:-1], n, n))
+    out[..., rows, columns] = packed
+    out[..., columns, rows] = packed
+    return out
+
+
+def entries_first(matrix: Array, ndim: int = 0) -> Array:
+    """(..., n, m) -> contiguous (n, m, ...), with at least ndim axes: operations run along the batch."""
+    if matrix.ndim < ndim:
+        matrix = matrix.reshape((1,) * (ndim - matrix.ndim) + matrix.shape)
+    last = matrix.ndim - 1
+    return np.ascontiguousarray(matrix.transpose(last - 1, last, *range(last - 1)))
+
+
+def entries_last(entries: Array) -> Array:
+    """Inverse of `entries_first`, (n, m, ...) -> (..., n, m): a view, so that the way back copies nothing either."""
+    return entries.transpose(*range(2, entries.ndim), 0, 1)
+
+
+def product(
+    a: Float[np.ndarray, "*#batch n k"], b: Float[np.ndarray, "*#batch k m"]
+) -> Float[np.ndarray, "*batch n m"]:
+    """Matrix product of stacks that broadcast, (..., n, k) and (..., k, m) -> (..., n, m)."""
+    ndim = max(a.ndim, b.ndim)
+    return entries_last(np.einsum("ik...,kj...->ij...", entries_first(a, ndim), entries_first(b, ndim)))
+
+
+def gram(factor: Float[np.ndarray, "*batch n r"]) -> Float[np.ndarray, "*batch n n"]:
+    """Product factor factor^T, exactly symmetric, (..., n, r) -> (..., n, n)."""
+    entries = entries_first(factor)
+    return entries_last(np.einsum("ir...,jr...->ij...", entries, entries))
+
+
+@lru_cache
+def _triangle(n: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    return np.tril_indices(n)
 
 
 def cholesky(cov: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch n n"]:
@@ -34,8 +97,15 @@ def cholesky(cov: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch n 
     """
     cov = np.asarray(cov, dtype=float)
     with np.errstate(invalid="ignore"):  # from entries that are infinite, which the complaint covers
-        large = cov.shape[-1] > _UNROLLED
-        chol, definite = _cholesky_lapack(cov) if large else _cholesky_batch(cov, 0.0)
+        if cov.shape[-1] > _UNROLLED:
+            try:
+                chol = np.asarray(np.linalg.cholesky(cov), dtype=float)
+                definite = np.asarray(np.isfinite(chol).all((-1, -2)))
+            except np.linalg.LinAlgError:
+                # LAPACK does not say which matrix of the batch failed.
+                chol, definite = _cholesky_batch(cov, 0.0)
+        else:
+            chol, definite = _cholesky_batch(cov, 0.0)
     _require(definite, "is not positive definite: hand in one of full rank, or use psd_factor")
     return chol
 
@@ -171,15 +241,6 @@ def _cholesky_one(cov: Array, floor: float) -> tuple[Array, NDArray[np.bool_]]:
             rest = sum(x * y for x, y in zip(chol[i][:j], row, strict=False))
             chol[i][j] = (entries[i][j] - rest) / root
     return np.array(chol).reshape(cov.shape), np.array(True)
-
-
-def _cholesky_lapack(cov: Array) -> tuple[Array, NDArray[np.bool_]]:
-    try:
-        chol = np.asarray(np.linalg.cholesky(cov), dtype=float)
-    except np.linalg.LinAlgError:
-        # LAPACK does not say which matrix of the batch failed.
-        return _cholesky_batch(cov, 0.0)
-    return chol, np.asarray(np.isfinite(chol).all((-1, -2)))
 
 
 def _eigen_factor(cov: Array) -> tuple[Array, NDArray[np.bool_]]:

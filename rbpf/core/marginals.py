@@ -1,0 +1,314 @@
+"""What is marginalised: a Kalman-filtered substate, nothing (observations of the state alone), and several parts side by side.
+
+A landmark map is a further part, `rbpf.maps.LandmarkMap`.
+"""
+
+from collections.abc import Sequence
+from typing import final
+
+import numpy as np
+
+from rbpf import gaussian
+from rbpf.core.checkpoint import checked
+from rbpf.core.genealogy import Lineage
+from rbpf.core.likelihoods import Gaussian
+from rbpf.core.linearisation import information, linearise, stacked
+from rbpf.core.models import Conditional, LineariseAt, LogDensities, Observations, Part, Transition
+from rbpf.core.particles import Information, Prior, take
+from rbpf.errors import InputError
+from rbpf.kernels.increment import conditioned
+from rbpf.lie import LieGroup
+
+GAUSSIAN = Gaussian()
+
+
+@final
+class StateOnly(Conditional):
+    """Observations that read the sampled state and nothing else, as a position fix."""
+
+    supplies = Part.STATE
+
+    def __init__(self, space: LieGroup) -> None:
+        self.space = space
+
+    def begin(self, n: int, lineage: Lineage) -> None:
+        """Nothing is stored."""
+
+    def information(self, state: np.ndarray, groups: Sequence[Observations], prior: Prior) -> Information:
+        """S = R."""
+        total = Information.zeros(state.shape[0], self.space.dim)
+        for group in groups:
+            nu, jacobians = linearise(group.model, self.space, group.z, state[:, None, :])
+            assert jacobians.state is not None
+            cov = np.broadcast_to(group.cov, (*nu.shape, nu.shape[-1]))
+            total.add(information(nu, jacobians.state, cov, group.likelihood or GAUSSIAN, prior))
+        return total
+
+    def correct(
+        self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]
+    ) -> LogDensities:
+        """Σ log p(z | x); there is nothing to update."""
+        total = np.zeros(state.shape[0])
+        for group in groups:
+            nu = group.model.innovation(group.z, state[:, None, :])
+            cov = np.broadcast_to(group.cov, (*nu.shape, nu.shape[-1]))
+            total += (group.likelihood or GAUSSIAN).log_density(nu, cov).sum(axis=1)
+        return LogDensities(total, np.zeros_like(total))
+
+    def resample(self, ancestors: np.ndarray) -> None:
+        """Nothing is stored."""
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Nothing is stored."""
+        return {}
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """Nothing is stored."""
+
+
+@final
+class KalmanSubstate(Conditional):
+    """A linear substate s ~ N(ŝ, P) in every particle, given the sampled states.
+
+    The motion model says how it drives the increment and how it moves (`Transition`): the increment is then itself a
+    measurement of it, and is conditioned on exactly. Observations may read it, with the state but not with a landmark.
+
+    Args:
+        space: the group of the sampled state.
+        mean: (m,) initial mean.
+        cov: (m, m) initial covariance, may be singular.
+
+    Attributes:
+        mean: (N, m) of each particle.
+        cov: (N, m, m), or (1, m, m) as long as it does not differ between particles.
+    """
+
+    supplies = Part.SUBSTATE
+
+    def __init__(self, space: LieGroup, mean: np.ndarray, cov: np.ndarray) -> None:
+        self.space = space
+        self._mean = np.asarray(mean, dtype=float)
+        self._cov = np.asarray(cov, dtype=float)
+        if self._cov.shape != (self._mean.size, self._mean.size):
+            raise InputError(
+                f"a substate with mean {self._mean.shape} needs a square cov of that size, got {self._cov.shape}"
+            )
+        gaussian.psd_factor(self._cov)
+
+    def begin(self, n: int, lineage: Lineage) -> None:
+        """Every particle starts with the initial distribution."""
+        self.mean = np.repeat(self._mean[None], n, axis=0)
+        self.cov = self._cov[None]
+
+    def predict(self, transition: Transition, space: LieGroup) -> Prior:
+        """Joint distribution of (ε, s_t), Mathematics (joint-substate), kept as s_t | ε."""
+        if transition.coupling is None or transition.dynamics is None or transition.drift is None:
+            raise InputError(
+                "the motion model must give coupling, dynamics and drift: the filter has a Kalman substate"
+            )
+        d, m = space.dim, self._mean.size
+        sizes = (transition.coupling.shape[1:], transition.dynamics.shape[1:], transition.drift.shape[1:])
+        if sizes != ((d, m), (m, m), (m,)):
+            raise InputError(
+                f"the substate has {m} numbers: expected coupling (·, {d}, {m}), dynamics (·, {m}, {m}) and "
+                f"drift (·, {m}), the motion model gives (·, …) {sizes}"
+            )
+        blocks = [transition.coupling, transition.dynamics]
+        if blocks[0].shape[0] != blocks[1].shape[0]:
+            shared = max(block.shape[0] for block in blocks)
+            blocks = [np.broadcast_to(block, (shared, *block.shape[1:])) for block in blocks]
+        stack = np.concatenate(blocks, axis=1)
+        means = (stack @ self.mean[..., None])[..., 0]
+        self._increment_mean = means[:, :d]
+        self._predicted = means[:, d:] + transition.drift
+        # Joint covariance of (ε, s), then s | ε by its gain and rest; compiled where cov(ε) is definite.
+        parts = stack, self.cov, np.ascontiguousarray(transition.noise_factor, dtype=float)
+        n = max(part.shape[0] for part in parts)
+        joint, factor = np.empty((n, d + m, d + m)), np.empty((n, d, d))
+        self._gain, self._rest = np.empty((n, m, d)), np.empty((n, m, m))
+        if not conditioned(*map(np.ascontiguousarray, parts), joint, factor, self._gain, self._rest):
+            factor = gaussian.psd_factor(joint[:, :d, :d])
+            self._gain = joint[:, d:, :d] @ np.linalg.pinv(joint[:, :d, :d], hermitian=True)
+            closed = np.concatenate([-self._gain, np.broadcast_to(np.eye(m), (n, m, m))], axis=2)
+            self._rest = gaussian.symmetrise(closed @ joint @ np.swapaxes(closed, -1, -2))
+        return Prior(space, transition.mean, self._increment_mean, factor, centred=False)
+
+    def given(self, increment: np.ndarray) -> np.ndarray:
+        """Mean (N, m) of s_t given increments (N, d)."""
+        offset = increment - self._increment_mean
+        return self._predicted + (self._gain @ offset[..., None])[..., 0]
+
+    def information(self, state: np.ndarray, groups: Sequence[Observations], prior: Prior) -> Information:
+        """All rows that read the substate are stacked: they are correlated through it."""
+        increment = self.space.local(prior.base, state)
+        nu, jac, noise = self._rows(state, self.given(increment), groups)
+        slope = self.space.right_jacobian_inverse(increment)
+        jac_state = jac[..., : self.space.dim] + jac[..., self.space.dim :] @ self._gain @ slope
+        jac_sub = jac[..., self.space.dim :]
+        cov = gaussian.symmetrise(jac_sub @ self._rest @ np.swapaxes(jac_sub, -1, -2)) + noise
+        return information(nu[:, None], jac_state[:, None], cov[:, None], GAUSSIAN, prior)
+
+    def correct(
+        self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]
+    ) -> LogDensities:
+        """Conditions on the increment, then on the observations."""
+        self.mean, self.cov = self.given(increment), self._rest
+        total = np.zeros(state.shape[0])
+        if groups:
+            nu, jac, noise = self._rows(state, self.mean, groups)
+            jac = jac[..., self.space.dim :]
+            cov = gaussian.symmetrise(jac @ self.cov @ np.swapaxes(jac, -1, -2)) + noise
+            total = gaussian.log_density(nu, cov)
+            gain = self.cov @ np.swapaxes(jac, -1, -2) @ gaussian.inverse(cov)
+            self.mean = self.mean + np.einsum("nij,nj->ni", gain, nu)
+            closed = np.eye(self._mean.size) - gain @ jac
+            self.cov = gaussian.symmetrise(
+                closed @ self.cov @ np.swapaxes(closed, -1, -2) + gain @ noise @ np.swapaxes(gain, -1, -2)
+            )
+        return LogDensities(total, np.zeros_like(total))
+
+    def resample(self, ancestors: np.ndarray) -> None:
+        """Copies small arrays; what all particles share stays."""
+        self._increment_mean = self._increment_mean[ancestors]
+        self._predicted = self._predicted[ancestors]
+        self._gain = take(self._gain, ancestors)
+        self._rest = take(self._rest, ancestors)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Means and covariances."""
+        return {"substate/mean": self.mean, "substate/cov": self.cov}
+
+    def options(self) -> dict[str, object]:
+        """Its size."""
+        return {"substate size": int(self._mean.size)}
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """The inverse of `arrays`."""
+        m = self._mean.size
+        mean = checked(arrays, "substate/mean", self.mean.shape, "f")
+        cov = checked(arrays, "substate/cov", (None, m, m), "f")
+        if cov.shape[0] not in (1, mean.shape[0]):
+            raise InputError(f"the array substate/cov must have 1 or {mean.shape[0]} matrices")
+        self.mean, self.cov = mean.copy(), cov.copy()
+
+    def _rows(
+        self, state: np.ndarray, substate: np.ndarray, groups: Sequence[Observations]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        n, m = substate.shape
+        nus, jacs, noises = [], [], []
+        for group in groups:
+            if group.likelihood is not None and group.likelihood.kernel_id != 0:
+                raise InputError(
+                    f"{type(group.model).__name__} reads the substate: its likelihood must be Gaussian, "
+                    f"not {type(group.likelihood).__name__}"
+                )
+            nu, jacobians = linearise(
+                group.model, self.space, group.z, state[:, None, :], substate=substate[:, None, :]
+            )
+            assert jacobians.substate is not None
+            by_state = np.zeros((1, 1, 1, 1)) if jacobians.state is None else jacobians.state
+            blocks = ((by_state, self.space.dim), (jacobians.substate, m))
+            jac = np.concatenate(
+                [np.broadcast_to(block, (*nu.shape, size)) for block, size in blocks], axis=-1
+            )
+            for k in range(group.z.shape[0]):
+                nus.append(np.broadcast_to(nu[:, k], (n, nu.shape[2])).copy())
+                jacs.append(np.broadcast_to(jac[:, k], (n, *jac.shape[2:])).copy())
+                noises.append(group.cov[k])
+        return stacked(nus, jacs, noises, [None] * len(nus))
+
+
+@final
+class Marginals(Conditional):
+    """Several marginalised parts side by side; each observation goes to the part that it reads.
+
+    A substate and a map together are exact only if no observation reads both.
+    """
+
+    supplies = Part.STATE
+
+    def __init__(self, space: LieGroup, parts: Sequence[Conditional]) -> None:
+        self.space = space
+        self.parts = {part.supplies: part for part in (StateOnly(space), *parts)}
+        if len(self.parts) != len(parts) + 1:
+            raise InputError("the filter takes at most one landmark map and one Kalman substate")
+
+    def begin(self, n: int, lineage: Lineage) -> None:
+        """Begins every part."""
+        for part in self.parts.values():
+            part.begin(n, lineage)
+
+    def predict(self, transition: Transition, space: LieGroup) -> Prior:
+        """The substate's distribution where there is one."""
+        driver = self.parts.get(Part.SUBSTATE, self.parts[Part.STATE])
+        return driver.predict(transition, space)
+
+    def information(self, state: np.ndarray, groups: Sequence[Observations], prior: Prior) -> Information:
+        """Sum over the parts that were observed."""
+        total: Information | None = None
+        for supplies, routed in self._routed(groups).items():
+            if routed:
+                part = self.parts[supplies].information(state, routed, prior)
+                if total is None:
+                    total = part
+                else:
+                    total.add(part)
+        return Information.zeros(state.shape[0], self.space.dim) if total is None else total
+
+    def linearised(self, prior: Prior, groups: Sequence[Observations]) -> LineariseAt:
+        """What the observations say about the state, to be linearised wherever a proposal asks."""
+
+        def linearise_at(increment: np.ndarray) -> Information:
+            if increment is prior.mean:
+                found = self.information(prior.predicted(), groups, prior)
+                return found if prior.centred else found.charted(prior.space.right_jacobian(increment))
+            found = self.information(prior.at(increment), groups, prior)
+            return found.charted(prior.space.right_jacobian(increment)).shifted(increment - prior.mean)
+
+        return linearise_at
+
+    def correct(
+        self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]
+    ) -> LogDensities:
+        """Corrects every part."""
+        total, after_sampling = np.zeros(state.shape[0]), np.zeros(state.shape[0])
+        for supplies, routed in self._routed(groups).items():
+            densities = self.parts[supplies].correct(state, increment, routed)
+            total += densities.all
+            after_sampling += densities.after_sampling
+        return LogDensities(total, after_sampling)
+
+    def resample(self, ancestors: np.ndarray) -> None:
+        """Resamples every part."""
+        for part in self.parts.values():
+            part.resample(ancestors)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Of all parts."""
+        return {name: array for part in self.parts.values() for name, array in part.arrays().items()}
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """Of all parts."""
+        for part in self.parts.values():
+            part.restore(arrays)
+
+    def options(self) -> dict[str, object]:
+        """Of all parts."""
+        return {name: value for part in self.parts.values() for name, value in part.options().items()}
+
+    def _routed(self, groups: Sequence[Observations]) -> dict[Part, list[Observations]]:
+        routed: dict[Part, list[Observations]] = {supplies: [] for supplies in self.parts}
+        for group in groups:
+            reads = group.model.reads - {Part.STATE}
+            if len(reads) > 1:
+                raise InputError(
+                    f"{type(group.model).__name__} reads a landmark and the substate, which couples them: "
+                    "sample that part of the substate instead"
+                )
+            supplies = next(iter(reads), Part.STATE)
+            if supplies not in self.parts:
+                raise InputError(
+                    f"{type(group.model).__name__} reads a {supplies.value}, which this filter does not hold"
+                )
+            routed[supplies].append(group)
+        return routed
