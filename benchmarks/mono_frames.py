@@ -12,7 +12,7 @@ import numpy as np
 
 from benchmarks.rows import Row, Settings
 from rbpf.sensors.camera import Pinhole
-from rbpf.sensors.readers.images import ImageFrame, ImageSequence, KnownPixels, open_images, read_known_points
+from rbpf.sensors.readers import ImageFrame, ImageSequence, KnownPixels, open_images, read_known_points
 from rbpf.sensors.readers.images.sequence import Source
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.video import VideoRun, run_images

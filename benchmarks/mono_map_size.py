@@ -9,7 +9,7 @@ from benchmarks.rows import Row, Settings
 from rbpf.core.models import Records
 from rbpf.lie import SE3
 from rbpf.maps.point import Point
-from rbpf.sensors.readers.images import ImageFrame
+from rbpf.sensors.readers import ImageFrame
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.video import VideoRun, run_images
 

@@ -24,7 +24,7 @@ from rbpf.sensors.descriptors.landmark_management import LandmarkManager, NewLan
 from rbpf.sensors.descriptors.matching import MatchLimits
 from rbpf.sensors.features import Sift
 from rbpf.sensors.features.sift import SiftConfig, descriptors_from_histograms
-from rbpf.sensors.readers.images import open_stereo
+from rbpf.sensors.readers import open_stereo
 from rbpf.sensors.stereo.features import StereoFeatures, match_frames
 from rbpf.sensors.stereo.matching import StereoMatcher
 

@@ -11,8 +11,7 @@ import numpy as np
 from benchmarks.mono_frames import Decoded
 from benchmarks.rows import Row, Settings
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
-from rbpf.sensors.readers.images import open_stereo
-from rbpf.sensors.readers.images.stereo import StereoSequence
+from rbpf.sensors.readers import ImageSequence, open_stereo
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.run import run_images
 from rbpf.validation.simulation.images import Imaging, simulate_images
@@ -24,7 +23,7 @@ AIM_MS, GOAL_MS = 250.0, 100.0
 STAGES = "features", "odometry", "matching", "filter"
 
 
-def rendered(pairs: int) -> StereoSequence:
+def rendered(pairs: int) -> ImageSequence:
     """The start of the robot's tour, each second frame, with coarse texels."""
     world, imaging = TexturedLab(LabDrive(frames=pairs, every=2), texel_m=0.01), Imaging(known=0)
     with TemporaryDirectory() as folder:
@@ -32,7 +31,7 @@ def rendered(pairs: int) -> StereoSequence:
         simulate_images(world, imaging, RIG, lab, seed=0)
         sequence = open_stereo(lab)
         held = Decoded(list(sequence.frames()))
-    return StereoSequence(replace(sequence.pair, source=held), RIG)
+    return replace(sequence, source=held)
 
 
 def run(settings: Settings) -> list[Row]:
@@ -62,7 +61,7 @@ def run(settings: Settings) -> list[Row]:
     ]
 
 
-def sift_alone(sequence: StereoSequence) -> float:
+def sift_alone(sequence: ImageSequence) -> float:
     """Median seconds of a pair."""
     detector, seconds = cv2.SIFT.create(), []
     for frame in list(sequence.frames())[SETTLING::3]:

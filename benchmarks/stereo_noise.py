@@ -17,7 +17,7 @@ from benchmarks.plain_odometry import WITHIN_PX, motion
 from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.descriptors.matching import MatchLimits
-from rbpf.sensors.readers.images import StereoSequence, open_stereo
+from rbpf.sensors.readers import ImageSequence, open_stereo
 from rbpf.sensors.stereo.features import match_frames
 from rbpf.sensors.stereo.matching import StereoMatcher
 from rbpf.validation.simulation.desk_and_room import TexturedRoom
@@ -28,7 +28,7 @@ BOUNDS = 0.0, 2.0, 3.0, 4.5, 7.0, 12.0, np.inf
 FRAMES = 40
 
 
-def residuals(sequence: StereoSequence) -> tuple[np.ndarray, np.ndarray]:
+def residuals(sequence: ImageSequence) -> tuple[np.ndarray, np.ndarray]:
     """(P, 3) pixels of (u_left, v, u_right) less their prediction, and scales (P,)."""
     sensor, misses, scales = StereoMatcher(sequence.rig), [], []
     frames = [frame for frame, _ in zip(sequence.frames(), range(FRAMES), strict=False)]
@@ -49,7 +49,7 @@ def deviation(values: np.ndarray) -> float:
     return float(1.4826 * np.median(np.abs(values - np.median(values))) / np.sqrt(2.0))
 
 
-def lines(sequence: StereoSequence, name: str) -> Iterator[str]:
+def lines(sequence: ImageSequence, name: str) -> Iterator[str]:
     """One for each range of scales."""
     miss, scale = residuals(sequence)
     for low, high in pairwise(BOUNDS):

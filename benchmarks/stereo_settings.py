@@ -17,7 +17,7 @@ from rbpf.lie import SE3
 from rbpf.runs.alignment import align
 from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.features import Sift, SiftConfig
-from rbpf.sensors.readers.images import StereoSequence, open_stereo
+from rbpf.sensors.readers import ImageSequence, open_stereo
 from rbpf.sensors.stereo.features import StereoFeatures
 from rbpf.sensors.stereo.matching import PairConfig, StereoMatcher
 
@@ -35,7 +35,7 @@ SETTINGS = {
 }
 
 
-def measured(sequence: StereoSequence, sensor: StereoMatcher) -> tuple[list[StereoFeatures], np.ndarray]:
+def measured(sequence: ImageSequence, sensor: StereoMatcher) -> tuple[list[StereoFeatures], np.ndarray]:
     """Features of all pairs, and mean milliseconds of SIFT and of the matching."""
     features, seconds = [], np.zeros(2)
     for frame in sequence.frames():

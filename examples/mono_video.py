@@ -9,7 +9,7 @@ from pathlib import Path
 import tyro
 
 from rbpf.sensors.camera import Pinhole
-from rbpf.sensors.readers.images import open_images, read_known_points
+from rbpf.sensors.readers import open_images, read_known_points
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.video import run_images
 from rbpf.validation.mono import Recording, finish_mono

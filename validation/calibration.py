@@ -20,7 +20,7 @@ from rbpf.sensors.calibration.boards import Board, board_corners
 from rbpf.sensors.calibration.camera import BoardCalibration, BoardView, calibrate
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers.images.calibration import MODELS, NAME, model_of
-from rbpf.sensors.readers.images.uncalibrated import NamedImage, read_shots
+from rbpf.sensors.readers.images.video import NamedImage, read_uncalibrated
 
 FIGURES, PICTURE = "calibration.json", "calibration.png"
 MOST_SHOTS, MOST_VIEWS = 150, 40
@@ -54,7 +54,7 @@ def calibrate_images(
     Raises:
         InputError: no or too few images show the board, they differ in size, or they do not determine the camera.
     """
-    total, shots = read_shots(images, MOST_SHOTS)
+    total, shots = read_uncalibrated(images, MOST_SHOTS)
     found, empty = _Found([]), None
     for shot in _counted(shots, total, on_image):
         _require_size(found, shot, images)

@@ -9,8 +9,8 @@ from rbpf.errors import InputError
 from rbpf.runs.files import prepare_folder
 from rbpf.runs.provenance import left_out
 from rbpf.sensors.calibration.boards import Board, MarkerBoard, find_board, find_markers
-from rbpf.sensors.readers.images import ImageSequence, KnownPixels, Topics, open_images, read_known_points
-from rbpf.sensors.readers.images.topics import UNNAMED
+from rbpf.sensors.readers import ImageSequence, KnownPixels, Topics, open_images, read_known_points
+from rbpf.sensors.readers.images.sequence import UNNAMED
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.known_map import read_known_map
 from rbpf.systems.mono.video import VideoRun, first_image, run_images

@@ -7,9 +7,8 @@ from typing import Any
 
 from rbpf.runs.files import prepare_folder
 from rbpf.runs.provenance import left_out
-from rbpf.sensors.readers.images import Topics, open_stereo
-from rbpf.sensors.readers.images.stereo import StereoSequence
-from rbpf.sensors.readers.images.topics import UNNAMED
+from rbpf.sensors.readers import ImageSequence, Topics, open_stereo
+from rbpf.sensors.readers.images.sequence import UNNAMED
 from rbpf.systems.map_estimate import estimate_map
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.run import StereoRun, run_images
@@ -37,7 +36,7 @@ class StereoRecording:
     calibration: Path | None = None
     topics: Topics = UNNAMED
 
-    def open(self) -> StereoSequence:
+    def open(self) -> ImageSequence:
         """The pairs.
 
         Raises:

@@ -24,7 +24,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.recordings import filter_robot_log
 from rbpf.runs.truth import truth_at
-from rbpf.sensors.readers.log import RobotLog
+from rbpf.sensors.readers import RobotLog
 from rbpf.systems.filtering import ProposalConfig
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.mono.config import MonoConfig

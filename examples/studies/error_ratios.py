@@ -24,7 +24,8 @@ from rbpf.runs.run import Run
 from rbpf.runs.trajectory import Trajectory, associate, in_space
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureLog
-from rbpf.sensors.readers import open_log, stereo_tracks
+from rbpf.sensors.readers import open_log
+from rbpf.sensors.readers.stereo_tracks import read_stereo_tracks
 from rbpf.systems.mono.config import MonoConfig, SearchConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.stereo.config import StereoConfig
@@ -256,7 +257,7 @@ def recorded(data: Path, seeds: int) -> Iterator[ErrorRatio]:
         if (data / name).is_dir():
             yield stereo_ratio(StereoRecording(data / name), StereoConfig(), range(seeds))
     if (data / TRACKS).is_dir():
-        tracks = stereo_tracks.read(data / TRACKS)
+        tracks = read_stereo_tracks(data / TRACKS)
         yield tracks_ratio(tracks.log, StereoConfig(), range(seeds), tracks.world_from_camera)
     for name in CAMERAS:
         if (data / name).is_dir():

@@ -34,10 +34,9 @@ from examples.studies.mono_blackouts import pose_differences
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
-from rbpf.sensors.readers.images import (
+from rbpf.sensors.readers import (
     ImageSequence,
     KnownPixels,
-    StereoSequence,
     open_images,
     open_stereo,
     read_known_points,
@@ -105,7 +104,7 @@ class Outcome:
     said: str
 
 
-def usual_faults(rate_hz: float, frames: int) -> dict[str, Fault[Any]]:
+def usual_faults(rate_hz: float, frames: int) -> dict[str, Fault]:
     """The faults that the documentation reports, for a recording of about five seconds."""
     second, first = round(rate_hz), 2 * frames // 5
     return {
@@ -125,7 +124,7 @@ def usual_faults(rate_hz: float, frames: int) -> dict[str, Fault[Any]]:
 
 
 def try_mono(
-    sequence: ImageSequence, known: KnownPixels | None, config: MonoConfig, faults: Mapping[str, Fault[Any]]
+    sequence: ImageSequence, known: KnownPixels | None, config: MonoConfig, faults: Mapping[str, Fault]
 ) -> list[Outcome]:
     """The monocular system on a sequence with ground truth, undamaged first; no alignment with known points.
 
@@ -140,16 +139,14 @@ def try_mono(
     return _try_all("mono", sequence, run, faults)
 
 
-def try_stereo(
-    sequence: StereoSequence, config: StereoConfig, faults: Mapping[str, Fault[Any]]
-) -> list[Outcome]:
+def try_stereo(sequence: ImageSequence, config: StereoConfig, faults: Mapping[str, Fault]) -> list[Outcome]:
     """The stereo system on a sequence with ground truth, undamaged first; the first true camera is the world.
 
     Raises:
         InputError: the sequence has no ground truth.
     """
 
-    def run(damaged: StereoSequence) -> Told:
+    def run(damaged: ImageSequence) -> Told:
         done = run_pairs(damaged, config)
         blind = done.assumed > 0
         truth = _truth(damaged, done.stamps_ns)
@@ -160,7 +157,7 @@ def try_stereo(
 
 
 def _try_all(
-    system: str, sequence: Any, run: Callable[[Any], Told], faults: Mapping[str, Fault[Any]]
+    system: str, sequence: Any, run: Callable[[Any], Told], faults: Mapping[str, Fault]
 ) -> list[Outcome]:
     clean = judged(system, NONE, sequence, run, None)
     return [clean, *(judged(system, name, fault(sequence), run, clean) for name, fault in faults.items())]
@@ -215,7 +212,7 @@ def summarised(problems: list[str]) -> list[str]:
     return [text if count == 1 else f"{text} (x{count})" for text, count in counts.items()]
 
 
-def _truth(sequence: ImageSequence | StereoSequence, stamps_ns: np.ndarray) -> np.ndarray:
+def _truth(sequence: ImageSequence, stamps_ns: np.ndarray) -> np.ndarray:
     truth = true_path(sequence.truth, stamps_ns)
     if truth is None:
         raise InputError(f"{sequence.name} has no ground truth to judge a damaged run by")

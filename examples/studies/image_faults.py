@@ -8,17 +8,12 @@ every one of them gives the same bytes whenever and from wherever the sequence i
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import numpy as np
 
-from rbpf.errors import InputError
-from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.readers.images.sequence import ImageFrame, ImageSequence, Source
-from rbpf.sensors.readers.images.stereo import StereoSequence
 
-Sequence = TypeVar("Sequence", ImageSequence, StereoSequence)
-Fault = Callable[[Sequence], Sequence]
+Fault = Callable[[ImageSequence], ImageSequence]
 Paint = Callable[[int, np.ndarray, bool], np.ndarray]
 """Changes image (H, W) uint8 number t, of the right camera or not."""
 
@@ -75,15 +70,15 @@ class Unreadable(Source):
             yield ImageFrame(frame.stamp_ns, None, None, problem) if t in self.rows else frame
 
 
-def keep_every(step: int) -> Fault[Sequence]:
+def keep_every(step: int) -> Fault:
     """A slower camera: one image of so many."""
     return lambda sequence: _chosen(sequence, np.arange(0, len(sequence), step))
 
 
-def drop_frames(fraction: float, seed: int = 0) -> Fault[Sequence]:
+def drop_frames(fraction: float, seed: int = 0) -> Fault:
     """Loses a fraction of the images without a trace, never the first one."""
 
-    def fault(sequence: Sequence) -> Sequence:
+    def fault(sequence: ImageSequence) -> ImageSequence:
         kept = np.random.default_rng(seed).random(len(sequence)) >= fraction
         kept[0] = True
         return _chosen(sequence, np.flatnonzero(kept))
@@ -91,10 +86,10 @@ def drop_frames(fraction: float, seed: int = 0) -> Fault[Sequence]:
     return fault
 
 
-def truncate_files(fraction: float, seed: int = 0) -> Fault[Sequence]:
+def truncate_files(fraction: float, seed: int = 0) -> Fault:
     """A fraction of the images cannot be read, never the first one."""
 
-    def fault(sequence: Sequence) -> Sequence:
+    def fault(sequence: ImageSequence) -> ImageSequence:
         bad = np.random.default_rng(seed).random(len(sequence)) < fraction
         rows = frozenset((np.flatnonzero(bad[1:]) + 1).tolist())
         return _with_source(sequence, lambda source: Unreadable(source, rows))
@@ -102,12 +97,12 @@ def truncate_files(fraction: float, seed: int = 0) -> Fault[Sequence]:
     return fault
 
 
-def black_out(first: int, count: int) -> Fault[Sequence]:
+def black_out(first: int, count: int) -> Fault:
     """The light is out: images from number `first` on are black."""
     return painted(lambda t, image, _: np.zeros_like(image) if first <= t < first + count else image)
 
 
-def jump_exposure(every: int, least: float = 0.4, most: float = 1.8, seed: int = 0) -> Fault[Sequence]:
+def jump_exposure(every: int, least: float = 0.4, most: float = 1.8, seed: int = 0) -> Fault:
     """The camera's gain jumps every so many images, between these factors; the first images are as they were."""
 
     def paint(t: int, image: np.ndarray, is_right: bool) -> np.ndarray:
@@ -119,7 +114,7 @@ def jump_exposure(every: int, least: float = 0.4, most: float = 1.8, seed: int =
     return painted(paint)
 
 
-def blur_motion(length_px: int, first: int = 1, count: int | None = None) -> Fault[Sequence]:
+def blur_motion(length_px: int, first: int = 1, count: int | None = None) -> Fault:
     """Smears images along a line of this length, whose direction turns from image to image; never the first one."""
 
     def paint(t: int, image: np.ndarray, is_right: bool) -> np.ndarray:
@@ -138,7 +133,7 @@ def blur_motion(length_px: int, first: int = 1, count: int | None = None) -> Fau
     return painted(paint)
 
 
-def salt_and_pepper(fraction: float, seed: int = 0) -> Fault[Sequence]:
+def salt_and_pepper(fraction: float, seed: int = 0) -> Fault:
     """A fraction of the pixels is black or white, others in every image; not in the first one."""
 
     def paint(t: int, image: np.ndarray, is_right: bool) -> np.ndarray:
@@ -153,9 +148,7 @@ def salt_and_pepper(fraction: float, seed: int = 0) -> Fault[Sequence]:
     return painted(paint)
 
 
-def cover_view(
-    fraction: float, first: int, count: int, disparity_px: int = 12, seed: int = 0
-) -> Fault[Sequence]:
+def cover_view(fraction: float, first: int, count: int, disparity_px: int = 12, seed: int = 0) -> Fault:
     """A textured thing as high as the image and a fraction of it wide passes through the view in so many images.
 
     Args:
@@ -180,21 +173,20 @@ def cover_view(
     return painted(paint)
 
 
-def wrong_focal(factor: float) -> Fault[Sequence]:
+def wrong_focal(factor: float) -> Fault:
     """The calibration's focal lengths are so many times the right ones."""
 
-    def fault(sequence: Sequence) -> Sequence:
-        one = _images(sequence)
-        camera = replace(one.camera, fx=factor * one.camera.fx, fy=factor * one.camera.fy)
-        return _with_images(sequence, replace(one, camera=camera))
+    def fault(sequence: ImageSequence) -> ImageSequence:
+        camera = replace(sequence.camera, fx=factor * sequence.camera.fx, fy=factor * sequence.camera.fy)
+        return replace(sequence, camera=camera)
 
     return fault
 
 
-def jitter_stamps(std_s: float, seed: int = 0) -> Fault[Sequence]:
+def jitter_stamps(std_s: float, seed: int = 0) -> Fault:
     """Stamps with a random error, which stay in order; the first one is right."""
 
-    def fault(sequence: Sequence) -> Sequence:
+    def fault(sequence: ImageSequence) -> ImageSequence:
         error = 1e9 * std_s * np.random.default_rng(seed).standard_normal(len(sequence))
         error[0] = 0.0
         jittered = np.sort(
@@ -205,7 +197,7 @@ def jitter_stamps(std_s: float, seed: int = 0) -> Fault[Sequence]:
     return fault
 
 
-def painted(paint: Paint) -> Fault[Sequence]:
+def painted(paint: Paint) -> Fault:
     """Any change of single images."""
     return lambda sequence: _with_source(sequence, lambda source: Painted(source, paint))
 
@@ -216,24 +208,10 @@ def _blobs(height: int, width: int, seed: int) -> np.ndarray:
     return np.kron(squares, np.ones((8, 8), np.uint8))[:height, :width]
 
 
-def _chosen(sequence: Sequence, rows: np.ndarray, stamps_ns: np.ndarray | None = None) -> Sequence:
-    one = _images(sequence)
-    stamps = one.stamps_ns[rows] if stamps_ns is None else stamps_ns
-    return _with_images(sequence, replace(one, stamps_ns=stamps, source=Chosen(one.source, rows, stamps)))
+def _chosen(sequence: ImageSequence, rows: np.ndarray, stamps_ns: np.ndarray | None = None) -> ImageSequence:
+    stamps = sequence.stamps_ns[rows] if stamps_ns is None else stamps_ns
+    return replace(sequence, stamps_ns=stamps, source=Chosen(sequence.source, rows, stamps))
 
 
-def _with_source(sequence: Sequence, change: Callable[[Source], Source]) -> Sequence:
-    one = _images(sequence)
-    return _with_images(sequence, replace(one, source=change(one.source)))
-
-
-def _images(sequence: ImageSequence | StereoSequence) -> ImageSequence:
-    return sequence.pair if isinstance(sequence, StereoSequence) else sequence
-
-
-def _with_images(sequence: Sequence, images: ImageSequence) -> Sequence:
-    if isinstance(sequence, StereoSequence):
-        return replace(sequence, pair=images, rig=RectifiedStereo(images.camera, sequence.rig.baseline_m))
-    if isinstance(sequence, ImageSequence):
-        return images
-    raise InputError(f"expected a sequence of images or of pairs of them, got a {type(sequence).__name__}")
+def _with_source(sequence: ImageSequence, change: Callable[[Source], Source]) -> ImageSequence:
+    return replace(sequence, source=change(sequence.source))

@@ -15,7 +15,7 @@ import numpy as np
 import tyro
 
 from rbpf.sensors.camera import Pinhole
-from rbpf.sensors.readers.images import open_images
+from rbpf.sensors.readers import open_images
 from rbpf.validation.simulation.images import Imaging, Shutter
 from rbpf.validation.simulation.lab import LabDrive, TexturedLab, furnished
 from rbpf.validation.simulation.render import Renderer

@@ -28,7 +28,7 @@ from matplotlib.figure import Figure
 from rbpf.lie import SE3
 from rbpf.runs.plots import save_figures
 from rbpf.sensors.camera import Pinhole
-from rbpf.sensors.readers.images import ImageFrame, ImageSequence, KnownPixels, open_images, read_known_points
+from rbpf.sensors.readers import ImageFrame, ImageSequence, KnownPixels, open_images, read_known_points
 from rbpf.sensors.readers.images.sequence import Source
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.relocalisation import Attempt

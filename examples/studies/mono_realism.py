@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 
 from rbpf.runs.plots import save_figures
 from rbpf.sensors.camera import Pinhole
-from rbpf.sensors.readers.images import ImageFrame, open_images, read_known_points
+from rbpf.sensors.readers import ImageFrame, open_images, read_known_points
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.video import VideoRun, run_images
 from rbpf.validation.simulation.desk_and_room import TexturedDesk, TexturedRoom

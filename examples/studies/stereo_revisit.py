@@ -19,10 +19,9 @@ import tyro
 from rbpf.errors import InputError
 from rbpf.runs.plots import COLOURS, new_axes, save_figures
 from rbpf.sensors.feature_log import CameraTruth, FeatureLog
-from rbpf.sensors.readers import stereo_tracks
-from rbpf.sensors.readers.images import open_stereo
+from rbpf.sensors.readers import ImageSequence, open_stereo
 from rbpf.sensors.readers.images.sequence import ImageFrame, Source
-from rbpf.sensors.readers.images.stereo import StereoSequence
+from rbpf.sensors.readers.stereo_tracks import read_stereo_tracks
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.feature_cache import cache_features
 from rbpf.systems.stereo.run import StereoRun, run_features, run_images
@@ -43,7 +42,7 @@ class Reordered(Source):
         stamps_ns: (T,) their times.
     """
 
-    def __init__(self, sequence: StereoSequence, rows: np.ndarray, stamps_ns: np.ndarray) -> None:
+    def __init__(self, sequence: ImageSequence, rows: np.ndarray, stamps_ns: np.ndarray) -> None:
         self.images = list(sequence.frames())
         self.rows, self.stamps_ns = rows, stamps_ns
 
@@ -53,7 +52,7 @@ class Reordered(Source):
             yield replace(self.images[row], stamp_ns=stamp)
 
 
-def pairs_there_and_back(sequence: StereoSequence) -> StereoSequence:
+def pairs_there_and_back(sequence: ImageSequence) -> ImageSequence:
     """T pairs, then T − 1 backward, at an even pace.
 
     Raises:
@@ -67,7 +66,7 @@ def pairs_there_and_back(sequence: StereoSequence) -> StereoSequence:
     near = np.array([int(np.abs(truth.stamps_ns - stamp).argmin()) for stamp in sequence.stamps_ns.tolist()])
     true = CameraTruth(stamps, truth.world_from_camera[near][rows])
     source = Reordered(sequence, rows, stamps)
-    return StereoSequence(replace(sequence.pair, stamps_ns=stamps, truth=true, source=source), sequence.rig)
+    return replace(sequence, stamps_ns=stamps, truth=true, source=source)
 
 
 def log_there_and_back(log: FeatureLog) -> FeatureLog:
@@ -118,7 +117,7 @@ def recorded(data: Path, configs: Sequence[StereoConfig]) -> Iterator[list]:
         if (data / name).is_dir():
             yield from of_pairs(data / name, configs)
     if (data / TRACKS).is_dir():
-        tracks = stereo_tracks.read(data / TRACKS)
+        tracks = read_stereo_tracks(data / TRACKS)
         batch = solve_problem(tracks.log, tracks.world_from_camera, marginals=False).estimate
         truth = CameraTruth(batch.trajectory.stamps_ns, batch.world_from_body)
         yield from of_tracks(replace(tracks.log, truth=truth), configs)

@@ -15,7 +15,7 @@ import numpy as np
 from rbpf.lie import SE2, SE3
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureFrame, FeatureLog, KnownPoints
-from rbpf.sensors.readers.log import Frame, RobotLog
+from rbpf.sensors.readers import Frame, RobotLog
 from rbpf.validation.simulation.limits import check_counts, check_fractions, check_positive
 from rbpf.validation.simulation.paths import looking
 

@@ -24,7 +24,7 @@ from rbpf.lie import SE2
 from rbpf.runs.recordings import filter_robot_log
 from rbpf.runs.truth import truth_at
 from rbpf.sensors.range_bearing import RangeBearing
-from rbpf.sensors.readers.log import Frame, RobotLog
+from rbpf.sensors.readers import Frame, RobotLog
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.consistency.against_groundtruth import pose_statistics
 from rbpf.validation.consistency.own_statistics import innovation_statistics

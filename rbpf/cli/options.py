@@ -8,7 +8,7 @@ import tyro
 
 from rbpf.errors import InputError
 from rbpf.sensors.calibration.boards import Board, MarkerBoard
-from rbpf.sensors.readers.images.topics import Topics
+from rbpf.sensors.readers.images.sequence import Topics
 
 Flag = tyro.conf.FlagCreatePairsOff[bool]
 

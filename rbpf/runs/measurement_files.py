@@ -55,8 +55,7 @@ from rbpf.runs.files import whole
 from rbpf.sensors.camera import LENSES, Pinhole, RectifiedStereo
 from rbpf.sensors.feature_log import FeatureFrame, FeatureLog, KnownPoints
 from rbpf.sensors.readers.measurements import KINDS, Measurements, are_covariances, are_poses, point_dim
-from rbpf.sensors.readers.table import parse_number
-from rbpf.sensors.readers.text import line_error, quoted, read_lines
+from rbpf.sensors.readers.text import line_error, parse_number, quoted, read_lines
 
 OBSERVATIONS = "observations.csv"
 ODOMETRY = "observations_odometry.csv"

@@ -12,7 +12,7 @@ import yaml
 from rbpf import __version__
 from rbpf.errors import InputError
 from rbpf.runs.files import write_text
-from rbpf.systems.plain_yaml import read_plain_yaml
+from rbpf.sensors.readers.yaml_files import read_plain_yaml
 
 CONFIG = "config.yaml"
 LIBRARIES = "numpy", "scipy", "numba", "opencv-python-headless"

@@ -11,7 +11,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3, Array
 from rbpf.runs.alignment import Similarity
 from rbpf.runs.files import whole
-from rbpf.sensors.readers.table import read_columns
+from rbpf.sensors.readers.text import read_columns
 
 MAX_DIFFERENCE_NS = 10_000_000
 

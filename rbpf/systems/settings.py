@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import msgspec
 
 from rbpf.errors import InputError
-from rbpf.systems.plain_yaml import read_plain_yaml
+from rbpf.sensors.readers.yaml_files import read_plain_yaml
 
 HEADER = (
     "rbpf", "system", "versions", "input_sha256",

@@ -16,7 +16,7 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.sensors.features.interface import checked_image
-from rbpf.sensors.readers.images.known_points import KnownPixels
+from rbpf.sensors.readers.known_points import KnownPixels
 
 MOST = 12
 """Corners that a run starts from, spread over the board: more are nearer to each other than a search reaches."""

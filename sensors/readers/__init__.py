@@ -1,7 +1,21 @@
-"""Readers of recordings."""
+"""Readers of recordings: robot logs, image sequences of one camera or two, known points."""
 
-from rbpf.sensors.readers.log import Frame, RobotLog, Truth
-from rbpf.sensors.readers.noise import LogNoise
-from rbpf.sensors.readers.opening import open_log
+from rbpf.sensors.readers.formats import open_images, open_log, open_stereo
+from rbpf.sensors.readers.images.sequence import ImageFrame, ImageSequence, Topics
+from rbpf.sensors.readers.known_points import KnownPixels, read_known_points
+from rbpf.sensors.readers.robot_log import Frame, LogNoise, RobotLog, Truth
 
-__all__ = ["Frame", "LogNoise", "RobotLog", "Truth", "open_log"]
+__all__ = [
+    "Frame",
+    "ImageFrame",
+    "ImageSequence",
+    "KnownPixels",
+    "LogNoise",
+    "RobotLog",
+    "Topics",
+    "Truth",
+    "open_images",
+    "open_log",
+    "open_stereo",
+    "read_known_points",
+]

@@ -12,7 +12,7 @@ from rbpf.errors import InputError
 from rbpf.lie import Array, SE2Group, SE3Group
 from rbpf.sensors.range_bearing import RangeBearing, RelativePosition
 from rbpf.sensors.readers import Frame, RobotLog
-from rbpf.sensors.readers.table import LARGEST
+from rbpf.sensors.readers.text import LARGEST
 
 Kind = Literal["range_bearing", "position"]
 KINDS: dict[str, Kind] = {"range_bearing": "range_bearing", "position": "position"}

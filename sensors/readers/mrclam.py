@@ -1,4 +1,4 @@
-"""UTIAS multi-robot data sets (MRCLAM): one robot, its odometry and its sightings of fixed landmarks.
+"""UTIAS multi-robot data sets (MRCLAM): one robot, its odometry and its observations of fixed landmarks.
 
 A folder with blank-separated tables, `#` starting a comment; `Robot1` stands for any prefix:
 
@@ -11,9 +11,9 @@ A folder with blank-separated tables, `#` starting a comment; `Robot1` stands fo
 - `Robot1_Groundtruth.dat`, `Landmark_Groundtruth.dat`, if the truth is known: time [s], x [m], y [m], heading
   [rad], and subject, x [m], y [m], standard deviations of both [m].
 
-A frame is an instant at which at least one landmark was seen. The motion between two frames and its
-covariance come from `dead_reckoning`, with the standard deviations of `DEFAULT_NOISE`, as the log names none.
-A folder with several robots is read by the path of one's `..._Measurement.dat`.
+A frame is an instant at which at least one landmark was observed. The motion between two frames and its covariance come
+from `integrate`, with the standard deviations of `DEFAULT_NOISE`, as the log names none. A folder with several robots is
+read by the path of one's `..._Measurement.dat`.
 K. Y. K. Leung, Y. Halpern, T. D. Barfoot, H. H. T. Liu, "The UTIAS multi-robot cooperative localization and
 mapping dataset", IJRR 30(8), 2011.
 """
@@ -21,22 +21,24 @@ mapping dataset", IJRR 30(8), 2011.
 import logging
 from dataclasses import replace
 from pathlib import Path
+from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rbpf.errors import InputError
 from rbpf.lie import SE2, Array
-from rbpf.sensors.readers.assembly import assemble, diagonal, require_observations
-from rbpf.sensors.readers.dead_reckoning import integrate
-from rbpf.sensors.readers.log import RobotLog, Truth
-from rbpf.sensors.readers.noise import LogNoise
-from rbpf.sensors.readers.table import Table, read_columns
-
-KIND = (
-    "an MRCLAM log (a folder with Barcodes.dat and one robot's ..._Measurement.dat and ..._Odometry.dat,"
-    " or the path of that ..._Measurement.dat)"
+from rbpf.sensors.readers.robot_log import (
+    LogNoise,
+    RobotLog,
+    RobotLogFormat,
+    Truth,
+    assemble,
+    diagonal,
+    require_ranges,
 )
+from rbpf.sensors.readers.text import read_columns
+
 DEFAULT_NOISE = LogNoise(
     std_range_m=0.12, std_bearing_rad=0.02, std_speed_mps=0.02, std_turn_rate_radps=0.04, scale_odometry=1.0
 )
@@ -46,88 +48,77 @@ _SUFFIX = "_Measurement.dat"
 _log = logging.getLogger(__name__)
 
 
-def recognises(path: Path) -> bool:
-    """Whether the path is a robot's table of measurements, or a folder with one or with barcodes."""
-    if path.is_dir():
-        return (path / "Barcodes.dat").is_file() or any(path.glob(f"*{_SUFFIX}"))
-    return path.name.endswith(_SUFFIX)
+@final
+class Mrclam(RobotLogFormat):
+    """Logs of one robot of the UTIAS data sets; the path may also be the robot's table of measurements."""
 
-
-def read(path: Path, noise: LogNoise) -> RobotLog:
-    """Read the log of one robot.
-
-    Args:
-        path: the folder, or the robot's table of measurements in it.
-        noise: standard deviations in place of `DEFAULT_NOISE`.
-
-    Raises:
-        InputError: a file is missing, a line is not as described above, or there are several robots.
-    """
-    noise.require_only(DEFAULT_NOISE.given(), path, "an MRCLAM log")
-    noise = replace(DEFAULT_NOISE, **noise.given())
-    folder, prefix = _folder_and_prefix(path)
-    barcodes = _read_barcodes(folder / "Barcodes.dat")
-    stamps, frame, subjects, z = _read_sightings(folder / f"{prefix}{_SUFFIX}", barcodes)
-    delta, cov_delta = _read_motion(folder / f"{prefix}_Odometry.dat", stamps, noise)
-    cov_z = diagonal([np.full(len(z), noise.std_range_m), np.full(len(z), noise.std_bearing_rad)])
-    return RobotLog(
-        name=folder.resolve().name if path.is_dir() else f"{folder.resolve().name}_{prefix}",
-        space=SE2,
-        measurement="range_bearing",
-        robot_from_sensor=SE2.identity(),
-        frames=assemble(stamps, delta, cov_delta, frame, subjects, z, cov_z),
-        truth=_read_truth(folder / f"{prefix}_Groundtruth.dat", folder / "Landmark_Groundtruth.dat"),
+    kind = (
+        "an MRCLAM log (a folder with Barcodes.dat and one robot's ..._Measurement.dat and ..._Odometry.dat,"
+        " or the path of that ..._Measurement.dat)"
     )
 
+    def recognises(self, path: Path) -> bool:
+        if path.is_dir():
+            return (path / "Barcodes.dat").is_file() or any(path.glob(f"*{_SUFFIX}"))
+        return path.name.endswith(_SUFFIX)
 
-def _folder_and_prefix(path: Path) -> tuple[Path, str]:
-    if not path.is_dir():
-        return path.parent, path.name.removesuffix(_SUFFIX)
-    robots = sorted(file.name for file in path.glob(f"*{_SUFFIX}"))
-    if len(robots) != 1:
-        found = f"those of {len(robots)} robots; name one, such as {path / robots[0]}" if robots else "none"
-        raise InputError(f"{path}: expected {KIND}; found {found}.")
-    return path, robots[0].removesuffix(_SUFFIX)
+    def read(self, path: Path, noise: LogNoise) -> RobotLog:
+        noise.require_only(DEFAULT_NOISE.given(), path, "an MRCLAM log")
+        noise = replace(DEFAULT_NOISE, **noise.given())
+        folder, prefix = path.parent, path.name.removesuffix(_SUFFIX)
+        if path.is_dir():
+            robots = sorted(file.name for file in path.glob(f"*{_SUFFIX}"))
+            if len(robots) != 1:
+                several = (
+                    f"those of {len(robots)} robots; name one, such as {path / robots[0]}" if robots else ""
+                )
+                raise InputError(f"{path}: expected {self.kind}; found {several or 'none'}.")
+            folder, prefix = path, robots[0].removesuffix(_SUFFIX)
+        barcodes = read_columns(folder / "Barcodes.dat", ("subject", "barcode"), self.kind)
+        barcodes.require(barcodes["subject"] >= 1, "subject", "1 or more")
+        names = barcodes.names("barcode").tolist(), barcodes.names("subject").tolist()
+        subjects = dict(zip(*names, strict=True))
+        stamps, frame, landmarks, z = self._observations(folder / f"{prefix}{_SUFFIX}", subjects)
+        delta, cov_delta = self._motion(folder / f"{prefix}_Odometry.dat", stamps, noise)
+        cov_z = diagonal([np.full(len(z), noise.std_range_m), np.full(len(z), noise.std_bearing_rad)])
+        name = folder.resolve().name
+        return RobotLog(
+            name=name if path.is_dir() else f"{name}_{prefix}",
+            space=SE2,
+            measurement="range_bearing",
+            robot_from_sensor=SE2.identity(),
+            frames=assemble(stamps, delta, cov_delta, frame, landmarks, z, cov_z),
+            truth=_read_truth(folder / f"{prefix}_Groundtruth.dat", folder / "Landmark_Groundtruth.dat"),
+        )
 
+    def _observations(
+        self, path: Path, by_barcode: dict[int, int]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], Array]:
+        """Times of the frames, and each observation's frame, landmark, range and bearing."""
+        table = read_columns(path, ("time", "barcode", "range", "bearing"), self.kind)
+        require_ranges(table, "range", "bearing")
+        subjects = np.array([by_barcode.get(barcode, 0) for barcode in table.integers("barcode").tolist()])
+        kept = subjects > _LAST_ROBOT
+        unknown = np.count_nonzero(subjects == 0)
+        robots = len(kept) - np.count_nonzero(kept) - unknown
+        _log.info("%s: left out %d observations of robots and %d of unknown barcodes", path, robots, unknown)
+        if not kept.any():
+            raise InputError(f"{path}: expected observations of landmarks, found no barcode of one.")
+        stamps, frame = np.unique(table.stamps_ns()[kept], return_inverse=True)
+        return stamps, frame, subjects[kept], table.block("range", "bearing")[kept]
 
-def _read_barcodes(path: Path) -> dict[int, int]:
-    table = read_columns(path, ("subject", "barcode"), KIND)
-    table.require(table["subject"] >= 1, "subject", "1 or more")
-    return dict(zip(table.names("barcode").tolist(), table.names("subject").tolist(), strict=True))
-
-
-def _read_sightings(
-    path: Path, barcodes: dict[int, int]
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], Array]:
-    table = read_columns(path, ("time", "barcode", "range", "bearing"), KIND)
-    require_observations(table, "range", "bearing")
-    subjects = np.array([barcodes.get(barcode, 0) for barcode in table.integers("barcode").tolist()])
-    kept = subjects > _LAST_ROBOT
-    unknown = np.count_nonzero(subjects == 0)
-    robots = len(kept) - np.count_nonzero(kept) - unknown
-    _log.info("%s: left out %d sightings of robots and %d of unknown barcodes", path, robots, unknown)
-    if not kept.any():
-        raise InputError(f"{path}: expected sightings of landmarks, found no barcode of one.")
-    stamps, frame = np.unique(table.stamps_ns()[kept], return_inverse=True)
-    return stamps, frame, subjects[kept], table.block("range", "bearing")[kept]
-
-
-def _read_motion(path: Path, stamps_ns: NDArray[np.int64], noise: LogNoise) -> tuple[Array, Array]:
-    table = read_columns(path, ("time", "forward speed", "turn rate"), KIND)
-    readings_ns = table.stamps_ns()
-    _require_odometry_until(table, readings_ns, int(stamps_ns[-1]))
-    delta, cov = integrate(readings_ns, table["turn rate"], table["forward speed"], stamps_ns)
-    variance = np.square(np.array([noise.std_turn_rate_radps, noise.std_speed_mps], dtype=float))
-    return delta, noise.odometry_variance_factor() * np.einsum("tsab,s->tab", cov, variance)
-
-
-def _require_odometry_until(table: Table, readings_ns: NDArray[np.int64], last_ns: int) -> None:
-    # Holding the last reading longer than any reading was ever held would invent motion.
-    longest = int(np.diff(readings_ns).max(initial=0))
-    late = last_ns - int(readings_ns[-1])
-    if late > longest:
-        problem = f"the odometry ends {late / 1e9:.3f} s before the last sighting, expected it to last longer"
-        raise table.error(len(readings_ns) - 1, problem)
+    def _motion(self, path: Path, stamps_ns: NDArray[np.int64], noise: LogNoise) -> tuple[Array, Array]:
+        """Motion between the frames, and its covariance."""
+        table = read_columns(path, ("time", "forward speed", "turn rate"), self.kind)
+        readings_ns = table.stamps_ns()
+        # Holding the last reading longer than any reading was ever held would invent motion.
+        late = int(stamps_ns[-1]) - int(readings_ns[-1])
+        if late > int(np.diff(readings_ns).max(initial=0)):
+            ends = f"the odometry ends {late / 1e9:.3f} s before the last observation"
+            raise table.error(len(readings_ns) - 1, f"{ends}, expected it to last longer")
+        delta, cov = integrate(readings_ns, table["turn rate"], table["forward speed"], stamps_ns)
+        variance = np.square(np.array([noise.std_turn_rate_radps, noise.std_speed_mps], dtype=float))
+        return delta, noise.odometry_variance_factor() * np.einsum("tsab,s->tab", cov, variance)
 
 
 def _read_truth(path_file: Path, landmark_file: Path) -> Truth | None:
@@ -144,3 +135,52 @@ def _read_truth(path_file: Path, landmark_file: Path) -> Truth | None:
             table.require(table[column] >= 0, column, "zero or positive")
         landmarks = dict(zip(table.names("subject").tolist(), table.block("x", "y"), strict=True))
     return Truth(stamps, poses, landmarks)
+
+
+def integrate(
+    readings_ns: NDArray[np.int64], turn_rate: Array, speed: Array, instants_ns: NDArray[np.int64]
+) -> tuple[Array, Array]:
+    """Motion between consecutive instants from readings of speed and turn rate, and its covariance.
+
+    A reading holds until the next one, so that the motion over a piece of length dt is exactly
+    Exp(dt [turn rate, speed, 0]). Both carry white noise, whose standard deviations are therefore densities, per
+    root second: over a time T the heading drifts by std_turn_rate * sqrt(T), and the noise of a piece is independent
+    of that of the others,
+
+        delta = prod_k Exp(dt_k [omega_k, v_k, 0] + sqrt(dt_k) [e_omega, e_v, 0]),
+        e_omega ~ N(0, std_turn_rate^2),  e_v ~ N(0, std_speed^2).
+
+    Its covariance is sum_k G_k diag(std_turn_rate^2, std_speed^2) G_k^T dt_k with G_k the derivative in the right
+    chart. No piece slips sideways, so that the covariance of a single piece is singular.
+
+    Args:
+        readings_ns: (n,) times of the readings, in order; the robot stands still before the first.
+        turn_rate: (n,) [rad/s].
+        speed: (n,) forward [m/s].
+        instants_ns: (T,) times in strict order.
+
+    Returns:
+        delta (T - 1, 3), elements of SE(2), and their covariance (T - 1, 2, 3, 3) by unit noise of the turn rate
+        and by unit noise of the speed, in the right chart at delta.
+    """
+    if len(instants_ns) == 1:
+        return np.empty((0, 3)), np.empty((0, 2, 3, 3))
+    within = readings_ns[(readings_ns > instants_ns[0]) & (readings_ns < instants_ns[-1])]
+    edges = np.union1d(instants_ns, within)
+    dt = np.diff(edges) / 1e9
+    reading = np.searchsorted(readings_ns, edges[:-1], side="right") - 1
+    moving = np.where(reading >= 0, dt, 0.0)
+    xi = np.stack([moving * turn_rate[reading], moving * speed[reading], np.zeros_like(dt)], axis=1)
+    # The product of all motions before each piece, and of all: headings add up, then translations do.
+    motion = SE2.exp(xi)
+    chain = np.zeros((len(xi) + 1, 3))
+    chain[1:, 0] = np.cumsum(xi[:, 0])
+    chain[1:, 1:] = np.cumsum(SE2.transform(chain[:-1] * [1, 0, 0], motion[:, 1:]), axis=0)
+    bounds = np.searchsorted(edges, instants_ns)
+    start, end = bounds[:-1], bounds[1:]
+    delta = SE2.between(chain[start], chain[end])
+    # The noise of a piece of a piece is carried through the rest of its interval.
+    end_from_piece = SE2.between(chain[np.repeat(end, end - start)], chain[1:])
+    gain = np.moveaxis(SE2.adjoint(end_from_piece) @ SE2.right_jacobian(xi)[:, :, :2], 2, 1)
+    gain *= np.sqrt(dt)[:, None, None]
+    return delta, np.add.reduceat(gain[..., :, None] * gain[..., None, :], start, axis=0)

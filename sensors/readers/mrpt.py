@@ -9,7 +9,13 @@ A folder with, comma-separated under a header line:
 - `observations.csv`: step (from 0), landmark_id, range_m, yaw_rad, pitch_rad and their standard deviations.
   Yaw is positive to the left. z is (range, yaw) in the plane, where pitch must be 0, and (range, yaw, pitch)
   in space.
-- `sensor.yaml`: where the sensor sits and the sign of pitch, see `mrpt_sensor`.
+- `sensor.yaml`: where the sensor sits, and whether positive pitch is up or down:
+
+      robot_from_sensor: {x_m: 0, y_m: 0, z_m: 0, yaw_deg: 0, pitch_deg: 0, roll_deg: 0}
+      std: {range_m: 0.01, yaw_deg: 0.1}
+      positive_pitch: down
+
+  `std` is optional and for people to read: every observation brings its own standard deviations.
 - `robot_path_groundtruth.csv` and `landmarks_groundtruth.csv`, if the truth is known: step, x_m, y_m, z_m,
   yaw_rad, pitch_rad, roll_rad (world_from_robot), and id, x_m, y_m, z_m.
 
@@ -18,104 +24,121 @@ A frame is a step, its stamp the step's number: steps 0 to the last one with an 
 
 from itertools import combinations_with_replacement
 from pathlib import Path
+from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rbpf.lie import SE2, SE3, Array
-from rbpf.sensors.readers.assembly import assemble, diagonal, require_distinct, require_observations
-from rbpf.sensors.readers.covariance import planar_to_chart, read_covariances, spatial_to_chart
-from rbpf.sensors.readers.log import RobotLog, Truth
-from rbpf.sensors.readers.mrpt_sensor import read_sensor
-from rbpf.sensors.readers.noise import LogNoise, standard_deviations
-from rbpf.sensors.readers.table import Table, read_csv
-
-KIND = "an MRPT log (a folder with observations.csv, odometry.csv and sensor.yaml)"
+from rbpf.sensors.readers.robot_log import (
+    LogNoise,
+    RobotLog,
+    RobotLogFormat,
+    Truth,
+    assemble,
+    diagonal,
+    planar_to_chart,
+    read_covariances,
+    require_ranges,
+    spatial_to_chart,
+    std_column,
+)
+from rbpf.sensors.readers.text import Table, read_csv
+from rbpf.sensors.readers.yaml_files import read_yaml
 
 _POSE = ("x_m", "y_m", "z_m", "yaw_rad", "pitch_rad", "roll_rad")
 _PLANAR = ("step", "dx_m", "dy_m", "dphi_rad", "cxx", "cxy", "cxp", "cyy", "cyp", "cpp")
 _TRIANGLE = tuple(f"cov{i}{j}" for i, j in combinations_with_replacement(range(6), 2))
 _SPATIAL = ("step", "dx_m", "dy_m", "dz_m", *_POSE[3:], *_TRIANGLE)
-_SIGHTING = ("range_m", "yaw_rad", "pitch_rad", "std_range_m", "std_yaw_rad", "std_pitch_rad")
+_OBSERVATION = ("range_m", "yaw_rad", "pitch_rad", "std_range_m", "std_yaw_rad", "std_pitch_rad")
+_MOUNT = ("x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg")
+_PITCH_SIGNS = {"up": 1.0, "down": -1.0}
 
 
-def recognises(path: Path) -> bool:
-    """Whether the folder holds one of the files that make an MRPT log."""
-    return any((path / name).is_file() for name in ("observations.csv", "odometry.csv", "sensor.yaml"))
+@final
+class Mrpt(RobotLogFormat):
+    """Range-bearing logs in MRPT's tables; ranges, bearings and pitches take the standard deviations given, if any."""
+
+    kind = "an MRPT log (a folder with observations.csv, odometry.csv and sensor.yaml)"
+
+    def recognises(self, path: Path) -> bool:
+        return any((path / name).is_file() for name in ("observations.csv", "odometry.csv", "sensor.yaml"))
+
+    def read(self, path: Path, noise: LogNoise) -> RobotLog:
+        odometry = read_csv(path / "odometry.csv", [_PLANAR, _SPATIAL], self.kind)
+        table = read_csv(path / "observations.csv", [("step", "landmark_id", *_OBSERVATION)], self.kind)
+        planar = odometry.columns == _PLANAR
+        robot_from_sensor, pitch_sign = _read_sensor(path / "sensor.yaml", planar, self.kind)
+        if planar:
+            delta = SE2.normalise(np.roll(odometry.block("dx_m", "dphi_rad"), 1, axis=1))
+            cov_delta = planar_to_chart(delta, read_covariances(odometry, "cxx", "cpp"))
+        else:
+            ypr = odometry.block("yaw_rad", "roll_rad")
+            delta = SE3.from_ypr(odometry.block("dx_m", "dz_m"), *ypr.T)
+            cov_delta = spatial_to_chart(delta, ypr, read_covariances(odometry, "cov00", "cov55"))
+        cov_delta *= noise.odometry_variance_factor()
+        step, landmarks = _require_order(table, odometry)
+        z, cov_z = _measurements(table, planar, noise, path)
+        frames = step[-1] + 1
+        stamps = np.arange(frames)
+        return RobotLog(
+            name=path.resolve().name,
+            space=SE2 if planar else SE3,
+            measurement="range_bearing",
+            robot_from_sensor=robot_from_sensor,
+            frames=assemble(stamps, delta[: frames - 1], cov_delta[: frames - 1], step, landmarks, z, cov_z),
+            pitch_sign=pitch_sign,
+            truth=_read_truth(path, planar),
+        )
 
 
-def read(path: Path, noise: LogNoise) -> RobotLog:
-    """Read the log in a folder.
-
-    Args:
-        path: the folder.
-        noise: ranges, bearings and pitches take the standard deviations given here, if any.
-
-    Raises:
-        InputError: a file is missing or a line is not as described above.
-    """
-    odometry = read_csv(path / "odometry.csv", [_PLANAR, _SPATIAL], KIND)
-    sightings = read_csv(path / "observations.csv", [("step", "landmark_id", *_SIGHTING)], KIND)
-    planar = odometry.columns == _PLANAR
-    robot_from_sensor, pitch_sign = read_sensor(path / "sensor.yaml", planar, KIND)
-    delta, cov_delta = _planar_motion(odometry) if planar else _spatial_motion(odometry)
-    cov_delta *= noise.odometry_variance_factor()
-    step, landmarks = _require_order(sightings, odometry)
-    z, cov_z = _measurements(sightings, planar, noise, path)
-    frames = step[-1] + 1
-    stamps = np.arange(frames)
-    return RobotLog(
-        name=path.resolve().name,
-        space=SE2 if planar else SE3,
-        measurement="range_bearing",
-        robot_from_sensor=robot_from_sensor,
-        frames=assemble(stamps, delta[: frames - 1], cov_delta[: frames - 1], step, landmarks, z, cov_z),
-        pitch_sign=pitch_sign,
-        truth=_read_truth(path, planar),
-    )
+def _read_sensor(path: Path, planar: bool, hint: str) -> tuple[Array, float]:
+    """robot_from_sensor, (3,) in the plane, where the sensor's height is left out, else (7,); and the sign of pitch."""
+    entries = read_yaml(path, hint).entries(("robot_from_sensor", "positive_pitch"), optional=("std",))
+    mount = entries["robot_from_sensor"]
+    placed = mount.entries(_MOUNT, optional=())
+    values = np.array([placed[key].number() for key in _MOUNT])
+    yaw, pitch, roll = np.deg2rad(values[3:])
+    sign = _PITCH_SIGNS[entries["positive_pitch"].choice(tuple(_PITCH_SIGNS))]
+    if not planar:
+        return SE3.from_ypr(values[:3], yaw, pitch, roll), sign
+    if pitch or roll:
+        raise mount.error("expected pitch_deg and roll_deg to be 0, as the odometry is planar")
+    return SE2.normalise(np.array([yaw, values[0], values[1]])), sign
 
 
-def _planar_motion(odometry: Table) -> tuple[Array, Array]:
-    delta = SE2.normalise(np.roll(odometry.block("dx_m", "dphi_rad"), 1, axis=1))
-    return delta, planar_to_chart(delta, read_covariances(odometry, "cxx", "cpp"))
-
-
-def _spatial_motion(odometry: Table) -> tuple[Array, Array]:
-    ypr = odometry.block("yaw_rad", "roll_rad")
-    delta = SE3.from_ypr(odometry.block("dx_m", "dz_m"), *ypr.T)
-    return delta, spatial_to_chart(delta, ypr, read_covariances(odometry, "cov00", "cov55"))
-
-
-def _require_order(sightings: Table, odometry: Table) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _require_order(table: Table, odometry: Table) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Steps and landmarks of the observations, all of them in steps that the odometry reaches, in order."""
     counted = np.arange(1, len(odometry.rows) + 1)
     odometry.require(odometry["step"] == counted, "step", "one more than in the row before, from 1")
-    step, landmarks = sightings.integers("step"), sightings.integers("landmark_id")
+    step, landmarks = table.integers("step"), table.integers("landmark_id")
     last = counted[-1]
-    sightings.require((step >= 0) & (step <= last), "step", f"one with odometry, 0 to {last}")
+    table.require((step >= 0) & (step <= last), "step", f"one with odometry, 0 to {last}")
     ordered = np.diff(step, prepend=0) >= 0
     if not ordered.all():
         row = int(np.argmin(ordered))
         problem = f"time runs backwards from step {step[row - 1]} to {step[row]}, expected rows in order"
-        raise sightings.error(row, problem)
-    require_distinct(sightings, step, landmarks, "step")
+        raise table.error(row, problem)
+    table.require_distinct(step, landmarks, "step")
     return step, landmarks
 
 
 def _measurements(table: Table, planar: bool, noise: LogNoise, path: Path) -> tuple[Array, Array]:
+    """Measurements and their covariances."""
     applicable = ["std_range_m", "std_bearing_rad", "scale_odometry"] + ["std_pitch_rad"] * (not planar)
     noise.require_only(applicable, path, f"an MRPT log in {'the plane' if planar else 'space'}")
-    require_observations(table, "range_m", "yaw_rad")
+    require_ranges(table, "range_m", "yaw_rad")
     pitch = table["pitch_rad"]
     std = [
-        standard_deviations(table, "std_range_m", noise.std_range_m),
-        standard_deviations(table, "std_yaw_rad", noise.std_bearing_rad),
+        std_column(table, "std_range_m", noise.std_range_m),
+        std_column(table, "std_yaw_rad", noise.std_bearing_rad),
     ]
     if planar:
         table.require(pitch == 0, "pitch_rad", "0, as the odometry is planar")
         table.require(table["std_pitch_rad"] >= 0, "std_pitch_rad", "zero or positive")
         return table.block("range_m", "yaw_rad"), diagonal(std)
     table.require(np.abs(pitch) <= np.pi / 2, "pitch_rad", "in radians, within a quarter turn")
-    std.append(standard_deviations(table, "std_pitch_rad", noise.std_pitch_rad))
+    std.append(std_column(table, "std_pitch_rad", noise.std_pitch_rad))
     return table.block("range_m", "pitch_rad"), diagonal(std)
 
 
@@ -126,19 +149,17 @@ def _read_truth(path: Path, planar: bool) -> Truth | None:
     stamps, poses = np.empty(0, dtype=np.int64), np.empty((0, 3 if planar else 7))
     landmarks: dict[int, np.ndarray] = {}
     if path_file.exists():
-        stamps, poses = _read_path(read_csv(path_file, [("step", *_POSE)]), planar)
+        table = read_csv(path_file, [("step", *_POSE)])
+        stamps = table.integers("step")
+        table.require(np.diff(table["step"], prepend=-1) > 0, "step", "later than in the row before, from 0")
+        if planar:
+            for angle in ("pitch_rad", "roll_rad"):
+                table.require(table[angle] == 0, angle, "0, as the odometry is planar")
+            poses = SE2.normalise(np.stack([table["yaw_rad"], table["x_m"], table["y_m"]], axis=1))
+        else:
+            poses = SE3.from_ypr(table.block("x_m", "z_m"), *table.block("yaw_rad", "roll_rad").T)
     if landmark_file.exists():
         table = read_csv(landmark_file, [("id", *_POSE[:3])])
         positions = table.block("x_m", "y_m" if planar else "z_m")
         landmarks = dict(zip(table.names("id").tolist(), positions, strict=True))
     return Truth(stamps, poses, landmarks)
-
-
-def _read_path(table: Table, planar: bool) -> tuple[NDArray[np.int64], Array]:
-    step = table.integers("step")
-    table.require(np.diff(table["step"], prepend=-1) > 0, "step", "later than in the row before, from 0")
-    if not planar:
-        return step, SE3.from_ypr(table.block("x_m", "z_m"), *table.block("yaw_rad", "roll_rad").T)
-    for angle in ("pitch_rad", "roll_rad"):
-        table.require(table[angle] == 0, angle, "0, as the odometry is planar")
-    return step, SE2.normalise(np.stack([table["yaw_rad"], table["x_m"], table["y_m"]], axis=1))

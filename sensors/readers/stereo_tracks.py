@@ -19,8 +19,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.feature_log import FeatureFrame, FeatureLog
-from rbpf.sensors.readers.table import Table, parse_table, read_columns
-from rbpf.sensors.readers.text import line_error, read_text
+from rbpf.sensors.readers.text import Table, line_error, parse_table, read_columns, read_text
 
 CALIBRATION = ("fx", "fy", "skew", "cx", "cy", "baseline")
 ENTRIES = tuple(f"m{row}{column}" for row in range(1, 5) for column in range(1, 5))
@@ -47,12 +46,14 @@ class StereoTracks:
     world_from_camera: Array
 
 
-def read(folder: str | Path, std_px: float = 1.0, size: tuple[int, int] = KITTI_00) -> StereoTracks:
+def read_stereo_tracks(
+    folder: str | Path, std_px: float = 1.0, size: tuple[int, int] = KITTI_00
+) -> StereoTracks:
     """Read a folder of tracks.
 
     Args:
         folder: that holds the three files.
-        std_px: standard deviation of each coordinate of a sighting.
+        std_px: standard deviation of each coordinate of an observation.
         size: width and height of the images, px.
 
     Raises:
@@ -60,7 +61,7 @@ def read(folder: str | Path, std_px: float = 1.0, size: tuple[int, int] = KITTI_
     """
     folder = Path(folder)
     if not (np.isfinite(std_px) and std_px > 0.0):
-        raise InputError(f"the standard deviation of a sighting must be positive, got {std_px} px")
+        raise InputError(f"the standard deviation of an observation must be positive, got {std_px} px")
     camera = _camera(_only(folder, "VO_calibration*.txt"), size)
     path = _path(read_columns(_only(folder, "VO_camera_poses*.txt"), POSES))
     table = read_columns(_only(folder, "VO_stereo_factors*.txt"), FACTORS)
@@ -110,20 +111,10 @@ def _frames(table: Table, count: int, std_px: float) -> list[FeatureFrame]:
     table.require((steps >= 0) & (steps < count), "frame", f"that of a pose, 0 to {count - 1}")
     z = np.stack([table["u_left"], table["v"], table["u_right"]], axis=1)
     table.require(z[:, 0] > z[:, 2], "u_left", "greater than u_right")
-    _require_once(table, steps, names)
+    table.require_distinct(steps, names, "frame")
     cov = std_px**2 * np.eye(3)
     frames = []
     for step in range(count):
         rows = np.flatnonzero(steps == step)
         frames.append(FeatureFrame(step, names[rows], z[rows], np.tile(cov, (len(rows), 1, 1))))
     return frames
-
-
-def _require_once(table: Table, steps: np.ndarray, names: np.ndarray) -> None:
-    pairs = np.stack([steps, names], axis=1)
-    _, first = np.unique(pairs, axis=0, return_index=True)
-    if len(first) < len(pairs):
-        row = int(np.setdiff1d(np.arange(len(pairs)), first)[0])
-        raise table.error(
-            row, f"landmark {names[row]} comes twice in frame {steps[row]}, keep one of the two"
-        )

@@ -1,14 +1,30 @@
-"""Strict reading of text files: whatever is not as expected is named with its file and line.
+"""Strict reading of text files and tables of numbers: whatever is not as expected is named with its file and line.
 
-A file is UTF-8 text whose last line is complete.
+A file is UTF-8 text whose last line is complete. Numbers are decimal, finite and at most `LARGEST` in size, which keeps
+every product that a reader forms far from overflow.
 """
 
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from decimal import Decimal
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from rbpf.errors import InputError
+from rbpf.lie import Array
 
 MOST_BYTES = 1 << 30
 """No table of a recording is larger."""
+LARGEST = 1e12
+LATEST_S = 4e9
+
+_NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
+_TIME = re.compile(r"([+-]?\d{0,10})(?:\.(\d*))?", re.ASCII)
+_PLAIN = dict.fromkeys(map(ord, "0123456789+-.eE \t,"))
+_DIGITS_OF_SECONDS = 10
 
 
 def line_error(path: Path, line: int, problem: str) -> InputError:
@@ -21,20 +37,21 @@ def quoted(text: str) -> str:
     return repr(text if len(text) <= 40 else text[:37] + "...")
 
 
-def read_bytes(path: Path, hint: str = "") -> bytes:
+def read_bytes(path: Path, hint: str = "", most: int = MOST_BYTES) -> bytes:
     """Content of a file.
 
     Args:
         path: the file.
         hint: what is expected to lie there, for the message.
+        most: bytes that it may have.
 
     Raises:
-        InputError: the file is missing or cannot be read.
+        InputError: the file is missing, too large or cannot be read.
     """
     try:
-        if path.stat().st_size > MOST_BYTES:
+        if path.stat().st_size > most:
             raise InputError(
-                f"{path}: the file is larger than {MOST_BYTES >> 20} MiB{hint and '; expected ' + hint}."
+                f"{path}: the file is larger than {most >> 20} MiB{hint and '; expected ' + hint}."
             )
         return path.read_bytes()
     except InputError:
@@ -45,17 +62,13 @@ def read_bytes(path: Path, hint: str = "") -> bytes:
         raise InputError(f"{path}: cannot be read ({error}).") from None
 
 
-def read_text(path: Path, hint: str = "") -> str:
-    """Text of a file without a byte-order mark.
-
-    Args:
-        path: the file.
-        hint: what is expected to lie there, for the message.
+def read_text(path: Path, hint: str = "", most: int = MOST_BYTES) -> str:
+    """Text of a file without a byte-order mark; arguments as of `read_bytes`.
 
     Raises:
-        InputError: the file is missing, empty or not UTF-8.
+        InputError: as `read_bytes`, or the file is empty or not UTF-8.
     """
-    data = read_bytes(path, hint)
+    data = read_bytes(path, hint, most)
     if not data.strip():
         raise InputError(f"{path}: the file is empty{hint and '; expected ' + hint}.")
     try:
@@ -76,3 +89,288 @@ def read_lines(path: Path, hint: str = "") -> list[str]:
         problem = "the file ends inside this line; copy it again, or end the line if it is complete"
         raise line_error(path, len(lines), problem)
     return [line.removesuffix("\r") for line in lines[:-1]]
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of numbers and where they stand in their file.
+
+    Attributes:
+        path: the file.
+        columns: name of each column.
+        rows: the text of each row.
+        lines: line number of each row, from 1.
+        values: (n, len(columns)) numbers.
+    """
+
+    path: Path
+    columns: tuple[str, ...]
+    rows: list[str]
+    lines: list[int]
+    values: Array
+
+    def __getitem__(self, column: str) -> Array:
+        """(n,) numbers of a column."""
+        return self.values[:, self.columns.index(column)]
+
+    def block(self, first: str, last: str) -> Array:
+        """(n, k) numbers of the columns from `first` to `last`."""
+        return self.values[:, self.columns.index(first) : self.columns.index(last) + 1]
+
+    def error(self, row: int, problem: str) -> InputError:
+        """Error that points at a row, counted from 0."""
+        return line_error(self.path, self.lines[row], problem)
+
+    def require(self, valid: NDArray[np.bool_], column: str, expected: str) -> None:
+        """Refuse the first row where `valid` (n,) is False.
+
+        Raises:
+            InputError: names the row's line, the column, what was expected and what was found.
+        """
+        if not valid.all():
+            row = int(np.argmin(valid))
+            raise self.error(row, f"expected {column} to be {expected}, found {self[column][row]:.12g}")
+
+    def integers(self, column: str) -> NDArray[np.int64]:
+        """(n,) a column of whole numbers.
+
+        Raises:
+            InputError: a number has a fraction.
+        """
+        self.require(self[column] == np.floor(self[column]), column, "a whole number")
+        return self[column].astype(np.int64)
+
+    def names(self, column: str) -> NDArray[np.int64]:
+        """(n,) a column of whole numbers that must differ from one another.
+
+        Raises:
+            InputError: a number has a fraction or comes twice.
+        """
+        names = self.integers(column)
+        _, first = np.unique(names, return_index=True)
+        if len(first) < len(names):
+            row = int(np.setdiff1d(np.arange(len(names)), first)[0])
+            raise self.error(row, f"{column} {names[row]} comes a second time, expected it once")
+        return names
+
+    def require_distinct(self, frame: NDArray[np.int64], landmarks: NDArray[np.int64], when: str) -> None:
+        """Refuse a landmark that one frame observes twice.
+
+        Args:
+            frame: (n,) number of each row's frame.
+            landmarks: (n,) its landmark.
+            when: what the recording calls a frame.
+
+        Raises:
+            InputError: names the second line.
+        """
+        _, first = np.unique(np.stack([frame, landmarks], axis=1), axis=0, return_index=True)
+        if len(first) < len(frame):
+            row = int(np.setdiff1d(np.arange(len(frame)), first)[0])
+            again = f"landmark {landmarks[row]} comes a second time in {when} {frame[row]}"
+            raise self.error(row, f"{again}, expected it once")
+
+    def stamps_ns(self) -> NDArray[np.int64]:
+        """(n,) the first column, times in seconds, as nanoseconds; digits beyond these are dropped.
+
+        The decimal text is converted, not its rounded float.
+
+        Raises:
+            InputError: a time is no plain decimal, too large, or earlier than the one before it.
+        """
+        column = self.columns[0]
+        self.require(np.abs(self[column]) <= LATEST_S, column, f"within {LATEST_S:.0e} s of zero")
+        texts, stamps = [row.split(None, 1)[0] for row in self.rows], []
+        for row, text in enumerate(texts):
+            match = _TIME.fullmatch(text)
+            if match is None:
+                raise self.error(row, f"expected a time such as 1248444175.103, found {quoted(text)}")
+            seconds, fraction = match.groups(default="")
+            stamps.append(int(seconds + fraction[:9].ljust(9, "0")))
+        _require_order(self.path, self.lines, texts, stamps)
+        return np.array(stamps)
+
+
+def read_columns(path: Path, columns: tuple[str, ...], hint: str = "") -> Table:
+    """File of blank-separated columns; lines that start with # are comments.
+
+    Raises:
+        InputError: the file or a line is not as expected.
+    """
+    numbered = enumerate(read_lines(path, hint), 1)
+    rows = [(i, line) for i, line in numbered if not line.lstrip().startswith("#")]
+    return parse_table(path, columns, rows)
+
+
+def read_csv(path: Path, headers: Sequence[tuple[str, ...]], hint: str = "") -> Table:
+    """File of comma-separated columns under a header line.
+
+    Args:
+        path: the file.
+        headers: the headers allowed; the table's columns tell which one was found.
+        hint: what is expected to lie there, for the message.
+
+    Raises:
+        InputError: the file, its header or a line is not as expected.
+    """
+    lines = read_lines(path, hint)
+    found = tuple(name.strip() for name in lines[0].split(","))
+    if found not in headers:
+        allowed = " or ".join(repr(",".join(header)) for header in headers)
+        raise line_error(path, 1, f"expected the header {allowed}, found {quoted(lines[0])}")
+    return parse_table(path, found, enumerate(lines[1:], 2), ",")
+
+
+def parse_table(
+    path: Path, columns: tuple[str, ...], numbered: Iterable[tuple[int, str]], separator: str | None = None
+) -> Table:
+    """Numbers in numbered lines; blank lines are passed over.
+
+    Args:
+        path: the file that the lines come from.
+        columns: name of each column.
+        numbered: line number and text of each line.
+        separator: what separates columns, None for blanks.
+
+    Raises:
+        InputError: there is no row, or one has another number of columns or something that is no number.
+    """
+    filled = [(number, line) for number, line in numbered if line.strip()]
+    if not filled:
+        raise InputError(f"{path}: expected rows of {', '.join(columns)}, found none.")
+    lines, rows = [number for number, _ in filled], [line for _, line in filled]
+    # The whole file goes through NumPy's parser. Only when that refuses, or lets something suspicious through, are the
+    # lines read one by one: characters beyond those of plain numbers (nan, 0x1p3, quotes) mean something to NumPy.
+    values = None
+    if not "".join(rows).translate(_PLAIN):
+        try:
+            values = np.loadtxt(rows, comments=None, delimiter=separator, ndmin=2)
+        except ValueError:
+            values = None
+    if values is None or values.shape != (len(rows), len(columns)) or not (np.abs(values) <= LARGEST).all():
+        values = np.array([_parse_row(path, *item, columns, separator) for item in filled])
+    return Table(path, columns, rows, lines, values)
+
+
+def _parse_row(
+    path: Path, line: int, row: str, columns: tuple[str, ...], separator: str | None
+) -> list[float]:
+    fields = [field.strip() for field in row.split(separator)]
+    if len(fields) != len(columns):
+        problem = f"expected {len(columns)} columns ({', '.join(columns)}), found {len(fields)}"
+        raise line_error(path, line, problem)
+    return [parse_number(path, line, *item) for item in zip(columns, fields, strict=True)]
+
+
+def parse_number(path: Path, line: int, column: str, field: str) -> float:
+    """Number in a field.
+
+    Args:
+        path: the file.
+        line: line number, from 1.
+        column: name of the number, for the message.
+        field: the text.
+
+    Raises:
+        InputError: the text is no finite decimal number, or a larger one than `LARGEST`.
+    """
+    if not _NUMBER.fullmatch(field):
+        raise line_error(path, line, f"expected {column} to be a finite number, found {quoted(field)}")
+    value = float(field)
+    if not abs(value) <= LARGEST:
+        problem = f"expected {column} to be at most {LARGEST:.0e} in size, found {quoted(field)}"
+        raise line_error(path, line, problem)
+    return value
+
+
+@dataclass(frozen=True)
+class StampedLines:
+    """Lines that begin with a time, in order of time; equal times are allowed.
+
+    Attributes:
+        path: the file.
+        lines: line number of each, from 1.
+        stamps_ns: (T,) int64 times.
+        rests: the text after each time.
+    """
+
+    path: Path
+    lines: list[int]
+    stamps_ns: np.ndarray
+    rests: list[str]
+
+    def files(self, folder: Path) -> list[Path]:
+        """The texts as files in a folder.
+
+        Raises:
+            InputError: a line names no file.
+        """
+        for line, rest in zip(self.lines, self.rests, strict=True):
+            if not rest:
+                problem = "expected a time and the file of an image, found only a time"
+                raise line_error(self.path, line, problem)
+        return [folder / rest for rest in self.rests]
+
+    def table(self, columns: tuple[str, ...], separator: str | None = None) -> Table:
+        """The texts as numbers; columns beyond these are passed over.
+
+        Raises:
+            InputError: a line has too few columns, or something that is no number.
+        """
+        join = separator or " "
+        numbered = [
+            (line, join.join(rest.split(separator)[: len(columns)]))
+            for line, rest in zip(self.lines, self.rests, strict=True)
+        ]
+        return parse_table(self.path, columns, numbered, separator)
+
+
+def read_stamped(
+    path: Path, hint: str, separator: str | None = None, nanoseconds: bool = False
+) -> StampedLines:
+    """Lines of a time and something else; lines that start with # are comments.
+
+    Args:
+        path: the file.
+        hint: what is expected to lie there, for the message.
+        separator: what ends the time, None for blanks.
+        nanoseconds: whether times are whole nanoseconds, else they are seconds.
+
+    Raises:
+        InputError: the file is missing, holds no line, or a time is none or runs backwards.
+    """
+    numbered = [(i, line.strip()) for i, line in enumerate(read_lines(path, hint), 1)]
+    kept = [(i, line.split(separator, 1)) for i, line in numbered if line and not line.startswith("#")]
+    if not kept:
+        raise InputError(f"{path}: expected lines that begin with a time, found none.")
+    lines = [i for i, _ in kept]
+    texts = [parts[0].strip() for _, parts in kept]
+    parse = _parse_nanoseconds if nanoseconds else _parse_seconds
+    stamps = [parse(path, line, text) for line, text in zip(lines, texts, strict=True)]
+    _require_order(path, lines, texts, stamps)
+    rests = [parts[1].strip() if len(parts) > 1 else "" for _, parts in kept]
+    return StampedLines(path, lines, np.array(stamps, dtype=np.int64), rests)
+
+
+def _parse_seconds(path: Path, line: int, text: str) -> int:
+    """Nanoseconds of a decimal text in seconds; digits beyond these are dropped."""
+    whole = text.partition(".")[0]
+    long = whole.isdigit() and len(whole) > _DIGITS_OF_SECONDS
+    if long or abs(parse_number(path, line, "the time", text)) > LATEST_S:
+        problem = f"expected the time in seconds, within {LATEST_S:.0e} of zero, found {quoted(text)}"
+        raise line_error(path, line, problem)
+    return int(Decimal(text).scaleb(9))
+
+
+def _parse_nanoseconds(path: Path, line: int, text: str) -> int:
+    if not (text.isascii() and text.isdigit() and len(text) < 20 and int(text) < 2**63):
+        raise line_error(path, line, f"expected a time in whole nanoseconds, found {quoted(text)}")
+    return int(text)
+
+
+def _require_order(path: Path, lines: list[int], texts: list[str], stamps: list[int]) -> None:
+    """Refuse a time before the one it follows."""
+    for row in range(1, len(stamps)):
+        if stamps[row] < stamps[row - 1]:
+            before = f"time runs backwards from {texts[row - 1]} to {texts[row]}"
+            raise line_error(path, lines[row], f"{before}, expected lines in order of time")

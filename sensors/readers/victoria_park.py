@@ -17,20 +17,23 @@ E. Nebot, J. Guivant, Victoria Park data set, Sydney.
 import re
 from itertools import pairwise
 from pathlib import Path
+from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rbpf.errors import InputError
 from rbpf.lie import SE2
-from rbpf.sensors.readers.assembly import assemble, diagonal, require_distinct
-from rbpf.sensors.readers.covariance import planar_to_chart, read_covariances
-from rbpf.sensors.readers.log import RobotLog
-from rbpf.sensors.readers.noise import LogNoise
-from rbpf.sensors.readers.table import Table, parse_table
-from rbpf.sensors.readers.text import line_error, quoted, read_bytes, read_lines
-
-KIND = "a graph (a text file with lines ODOMETRY and LANDMARK, or a folder with one such .txt)"
+from rbpf.sensors.readers.robot_log import (
+    LogNoise,
+    RobotLog,
+    RobotLogFormat,
+    assemble,
+    diagonal,
+    planar_to_chart,
+    read_covariances,
+)
+from rbpf.sensors.readers.text import Table, line_error, parse_table, quoted, read_bytes, read_lines
 
 _COLUMNS = {
     "ODOMETRY": ("from", "to", "dx", "dy", "dtheta", "cxx", "cxy", "cxt", "cyy", "cyt", "ctt"),
@@ -39,42 +42,40 @@ _COLUMNS = {
 _KEYWORD = re.compile(rb"^(ODOMETRY|LANDMARK)\b", re.MULTILINE)
 
 
-def recognises(path: Path) -> bool:
-    """Whether the path is a graph, or a folder with at least one."""
-    return bool(_graphs(path))
+@final
+class VictoriaPark(RobotLogFormat):
+    """Planar graphs; landmark positions take the standard deviation given, if any."""
 
+    kind = "a graph (a text file with lines ODOMETRY and LANDMARK, or a folder with one such .txt)"
 
-def read(path: Path, noise: LogNoise) -> RobotLog:
-    """Read a graph.
+    def recognises(self, path: Path) -> bool:
+        return bool(_graphs(path))
 
-    Args:
-        path: the file, or a folder with exactly one.
-        noise: landmark positions take the standard deviation given here, if any.
-
-    Raises:
-        InputError: a line is not as described above, or the folder holds several graphs.
-    """
-    noise.require_only({"std_position_m", "scale_odometry"}, path, "a graph of landmark positions")
-    graphs = _graphs(path)
-    if len(graphs) != 1:
-        raise InputError(f"{path}: expected {KIND}; found {len(graphs)}; name one, such as {graphs[0]}.")
-    odometry, sightings = _read_tables(graphs[0])
-    poses = _require_chain(odometry)
-    frame, landmarks = _require_known(sightings, poses)
-    z, cov_z = sightings.block("x", "y"), read_covariances(sightings, "cxx", "cyy")
-    if noise.std_position_m is not None:
-        cov_z = diagonal([np.full(len(z), noise.std_position_m)] * 2)
-    delta = SE2.normalise(np.roll(odometry.block("dx", "dtheta"), 1, axis=1))
-    cov = planar_to_chart(delta, read_covariances(odometry, "cxx", "ctt")) * noise.odometry_variance_factor()
-    order = np.argsort(frame, kind="stable")
-    stamps = np.arange(len(poses))
-    return RobotLog(
-        name=graphs[0].stem,
-        space=SE2,
-        measurement="position",
-        robot_from_sensor=SE2.identity(),
-        frames=assemble(stamps, delta, cov, frame[order], landmarks[order], z[order], cov_z[order]),
-    )
+    def read(self, path: Path, noise: LogNoise) -> RobotLog:
+        noise.require_only({"std_position_m", "scale_odometry"}, path, "a graph of landmark positions")
+        graphs = _graphs(path)
+        if len(graphs) != 1:
+            raise InputError(
+                f"{path}: expected {self.kind}; found {len(graphs)}; name one, such as {graphs[0]}."
+            )
+        odometry, observations = _read_tables(graphs[0])
+        poses = _require_chain(odometry)
+        frame, landmarks = _require_known(observations, poses)
+        z, cov_z = observations.block("x", "y"), read_covariances(observations, "cxx", "cyy")
+        if noise.std_position_m is not None:
+            cov_z = diagonal([np.full(len(z), noise.std_position_m)] * 2)
+        delta = SE2.normalise(np.roll(odometry.block("dx", "dtheta"), 1, axis=1))
+        cov_delta = planar_to_chart(delta, read_covariances(odometry, "cxx", "ctt"))
+        cov_delta = cov_delta * noise.odometry_variance_factor()
+        order = np.argsort(frame, kind="stable")
+        stamps = np.arange(len(poses))
+        return RobotLog(
+            name=graphs[0].stem,
+            space=SE2,
+            measurement="position",
+            robot_from_sensor=SE2.identity(),
+            frames=assemble(stamps, delta, cov_delta, frame[order], landmarks[order], z[order], cov_z[order]),
+        )
 
 
 def _graphs(path: Path) -> list[Path]:
@@ -92,8 +93,8 @@ def _read_tables(path: Path) -> tuple[Table, Table]:
             lines[keyword].append((number, rest[0]))
         elif keyword:
             raise line_error(path, number, f"expected ODOMETRY or LANDMARK, found {quoted(keyword)}")
-    odometry, sightings = (parse_table(path, columns, lines[name]) for name, columns in _COLUMNS.items())
-    return odometry, sightings
+    odometry, observations = (parse_table(path, columns, lines[name]) for name, columns in _COLUMNS.items())
+    return odometry, observations
 
 
 def _require_chain(odometry: Table) -> NDArray[np.int64]:
@@ -108,11 +109,13 @@ def _require_chain(odometry: Table) -> NDArray[np.int64]:
     return np.concatenate([start[:1], stop])
 
 
-def _require_known(sightings: Table, poses: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    pose, landmarks = sightings.integers("pose"), sightings.integers("landmark")
-    sightings.require(np.isin(pose, poses), "pose", "a pose of the odometry")
-    sightings.require(~np.isin(landmarks, poses), "landmark", "a landmark's number, not a pose's")
+def _require_known(
+    observations: Table, poses: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    pose, landmarks = observations.integers("pose"), observations.integers("landmark")
+    observations.require(np.isin(pose, poses), "pose", "a pose of the odometry")
+    observations.require(~np.isin(landmarks, poses), "landmark", "a landmark's number, not a pose's")
     by_number = np.argsort(poses)
     frame = by_number[np.searchsorted(poses, pose, sorter=by_number)]
-    require_distinct(sightings, pose, landmarks, "pose")
+    observations.require_distinct(pose, landmarks, "pose")
     return frame, landmarks

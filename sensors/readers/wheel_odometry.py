@@ -21,8 +21,8 @@ from pathlib import Path
 import numpy as np
 
 from rbpf.lie import SE2, SE3
-from rbpf.sensors.readers.images.mapping import read_yaml
-from rbpf.sensors.readers.images.stamped import read_stamped
+from rbpf.sensors.readers.text import read_stamped
+from rbpf.sensors.readers.yaml_files import read_yaml
 
 NAME, MOUNT = "odometry.csv", "odometry.yaml"
 KIND = "the readings of a robot's wheels"
@@ -92,10 +92,9 @@ def read_wheel_odometry(folder: str | Path) -> WheelOdometry:
 
 
 def _read_mount(path: Path) -> np.ndarray:
-    whole = read_yaml(path, "where the camera stands on the robot")
-    entries = whole.entries()
-    whole.require_keys(entries, ("robot_from_camera",))
-    mount = entries["robot_from_camera"]
+    mount = read_yaml(path, "where the camera stands on the robot").entries(["robot_from_camera"])[
+        "robot_from_camera"
+    ]
     pose = np.array([item.number() for item in mount.items(7)])
     if abs(np.linalg.norm(pose[:4]) - 1.0) > UNIT:
         raise mount.error("expected robot_from_camera to begin with a unit quaternion")

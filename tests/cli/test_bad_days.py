@@ -14,7 +14,7 @@ from rbpf.errors import InputError
 from rbpf.runs.files import whole
 from rbpf.runs.recordings import RobotRecording, filter_recording
 from rbpf.sensors.camera import RectifiedStereo
-from rbpf.sensors.readers.images import open_images, open_stereo
+from rbpf.sensors.readers import open_images, open_stereo
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.video import run_images
 from rbpf.systems.range_bearing.config import RangeBearingConfig

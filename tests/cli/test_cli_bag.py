@@ -4,7 +4,7 @@ import sys
 
 import pytest
 
-from rbpf.sensors.readers.images import open_images, open_stereo
+from rbpf.sensors.readers import open_images, open_stereo
 from tests.cli import stereo_sequences
 from tests.cli.mono_sequences import FRAMES, run, sentence, summary
 from tests.cli.run_outputs import outputs

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rbpf.cli import main
-from rbpf.sensors.readers.images import open_images
+from rbpf.sensors.readers import open_images
 from rbpf.sensors.readers.images.calibration import read_calibration
 from tests.cli.mono_sequences import sentence
 from tests.sensors.board_pictures import BOARD, CAMERA, FISHEYE, pictures

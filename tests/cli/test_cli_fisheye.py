@@ -8,7 +8,7 @@ import pytest
 from rbpf.cli import main
 from rbpf.runs.measurement_files import read_feature_log
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
-from rbpf.sensors.readers.images import open_images, open_stereo
+from rbpf.sensors.readers import open_images, open_stereo
 from rbpf.sensors.readers.images.calibration import read_calibration
 from rbpf.validation.simulation.desk_and_room import TexturedDesk, TexturedRoom
 from rbpf.validation.simulation.images import Imaging, simulate_images

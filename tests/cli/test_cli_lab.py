@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rbpf.cli import main
-from rbpf.sensors.readers.images import open_images, read_known_points
+from rbpf.sensors.readers import open_images, read_known_points
 from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
 
 pytestmark = pytest.mark.slow

@@ -220,7 +220,7 @@ def test_the_program_starts_without_rerun_and_encoder(monkeypatch):
 
 
 def test_rendered_sequences_can_be_opened(tmp_path):
-    from rbpf.sensors.readers.images import open_images, read_known_points
+    from rbpf.sensors.readers import open_images, read_known_points
 
     arguments = ["--frames", "2", "--width", "96", "--height", "72", "--noise-std", "0"]
     for world in ("desk", "room"):

@@ -14,7 +14,7 @@ import imageio_ffmpeg
 import numpy as np
 
 from rbpf.cli import main
-from rbpf.sensors.readers.images import open_images, open_stereo
+from rbpf.sensors.readers import open_images, open_stereo
 from rbpf.validation.simulation.desk_and_room import TexturedDesk
 from rbpf.validation.simulation.images import Imaging, simulate_images
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot

@@ -18,7 +18,7 @@ from examples.studies.image_faults import (
 )
 from examples.studies.mono_blackouts import Dark, Outcome, Series, pose_differences
 from rbpf.lie import SE3
-from rbpf.sensors.readers.images import ImageSequence
+from rbpf.sensors.readers import ImageSequence
 from rbpf.systems.stereo.config import StereoConfig
 from tests.systems.plane_sequences import sequence
 from tests.systems.stereo_sequences import pairs
@@ -56,7 +56,7 @@ def test_pairs_are_damaged_in_both_images(name):
     damaged = FAULTS[name](both)
     for frame in damaged.frames():
         assert (frame.image is None) == (frame.right is None)
-    assert damaged.rig.camera == damaged.pair.camera
+    assert damaged.rig.camera == damaged.camera
     assert damaged.truth is both.truth
 
 

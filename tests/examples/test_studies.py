@@ -17,7 +17,7 @@ from examples.studies.mono_realism import measure_search, survival
 from examples.studies.stereo_revisit import log_there_and_back, pairs_there_and_back
 from rbpf.errors import InputError
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
-from rbpf.sensors.readers.images import open_stereo
+from rbpf.sensors.readers import open_stereo
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.simulation.desk_and_room import TexturedDesk
@@ -191,4 +191,4 @@ def test_pairs_come_again_in_reverse(tmp_path):
     assert not np.array_equal(poses[0], poses[2])
     assert len(list(both.frames(3))) == 2
     with pytest.raises(InputError, match="ground truth"):
-        pairs_there_and_back(replace(sequence, pair=replace(sequence.pair, truth=None)))
+        pairs_there_and_back(replace(sequence, truth=None))

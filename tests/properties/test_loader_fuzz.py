@@ -68,12 +68,12 @@ def test_sweeps(tmp_path_factory, whole):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("particles: !!python/object/apply:os.system ['touch pwned']\n", "not YAML"),
+        ("particles: !!python/object/apply:os.system ['touch pwned']\n", "line 1: expected plain values"),
         ("a: &a [x]\nb: [*a, *a]\n", "alias"),
         ("particles: !!timestamp x\n", "none of its type"),
         ("particles: 2001-99-99\n", "none of its type"),
-        ("a: " + "[" * 5000 + "\n", "none of its type|not YAML"),
-        ("#" * (2 << 20), "bytes"),
+        ("a: " + "[" * 5000 + "\n", "expected YAML"),
+        ("#" * (2 << 20), "larger than 1 MiB"),
     ],
 )
 def test_settings_run_nothing_and_unfold_into_nothing(tmp_path, text, words):

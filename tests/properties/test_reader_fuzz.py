@@ -15,8 +15,15 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.measurement_files import read_feature_log, read_robot_measurements, write_measurements
 from rbpf.runs.trajectory import Trajectory, read_kitti, read_tum, write_tum
-from rbpf.sensors.readers import open_log, stereo_tracks, text
-from rbpf.sensors.readers.images import Topics, open_images, open_stereo, read_known_points
+from rbpf.sensors.readers import (
+    Topics,
+    open_images,
+    open_log,
+    open_stereo,
+    read_known_points,
+    text,
+)
+from rbpf.sensors.readers.stereo_tracks import read_stereo_tracks
 from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
 from rbpf.validation.ply import read_ply, write_ply
 from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
@@ -139,7 +146,7 @@ RECORDINGS: dict[str, tuple[Callable[[Path], object], Read, str]] = {
     "MRCLAM": (mrclam, open_log, "*.dat"),
     "MRPT": (lambda f: simulate_robot(RobotWorld(4, 5), f, 0), open_log, "*.*"),
     "Victoria Park": (victoria, open_log, "graph.txt"),
-    "stereo tracks": (test_stereo_tracks.folder, stereo_tracks.read, "*.txt"),
+    "stereo tracks": (test_stereo_tracks.folder, read_stereo_tracks, "*.txt"),
     "wheel odometry": (test_wheel_odometry.folder, read_wheel_odometry, "odometry.*"),
     "known points": (results, lambda f: read_known_points(f / "known_points.csv"), "known_points.csv"),
     "path": (results, lambda f: read_tum(f / "path.tum"), "path.tum"),

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from rbpf.errors import InputError
 from rbpf.lie import SE2
 from rbpf.sensors.readers import LogNoise, open_log
-from rbpf.sensors.readers.dead_reckoning import integrate
+from rbpf.sensors.readers.mrclam import integrate
 from tests.readers.fuzzing import is_log_or_one_sentence, mutated, pieces, write
 
 BARCODES = "# subject barcode\n1 5\n2 14\n6 63\n7 81\n"
@@ -73,7 +73,7 @@ def test_frames_are_the_instants_with_a_landmark(tmp_path, caplog):
     assert [frame.landmarks.tolist() for frame in log.frames] == [[6, 7], [7]]
     np.testing.assert_array_equal(log.frames[0].z, [[3, 0.1], [4, -0.2]])
     np.testing.assert_allclose(log.frames[1].cov_z, [np.diag([0.12**2, 0.02**2])])
-    assert "left out 1 sightings of robots and 1 of unknown barcodes" in caplog.text
+    assert "left out 1 observations of robots and 1 of unknown barcodes" in caplog.text
 
 
 def test_odometry_is_integrated_exactly(tmp_path):
@@ -174,13 +174,13 @@ def test_a_malformed_line_is_named(tmp_path, file, line, text, expected):
 
 def test_odometry_that_ends_too_early(tmp_path):
     files = log_files() | {SEEN: "100.1 63 3 0.1\n104.7 63 3 0.1\n"}
-    message = f"{MOTION}, line 6: the odometry ends 1.700 s before the last sighting"
+    message = f"{MOTION}, line 6: the odometry ends 1.700 s before the last observation"
     with pytest.raises(InputError, match=re.escape(message)):
         opened(tmp_path, files)
 
 
 def test_a_log_without_landmarks(tmp_path):
-    with pytest.raises(InputError, match=r"Robot3_Measurement\.dat: expected sightings of landmarks"):
+    with pytest.raises(InputError, match=r"Robot3_Measurement\.dat: expected observations of landmarks"):
         opened(tmp_path, log_files() | {SEEN: "100.1 5 3 0.1\n"})
 
 
@@ -268,5 +268,5 @@ def test_sightings_of_the_recording_agree_with_the_truth(recording):
 
 @pytest.mark.real_data
 def test_the_recording_is_read_without_a_loop_over_its_rows(data_dir, monkeypatch):
-    monkeypatch.setattr("rbpf.sensors.readers.table._parse_row", None)
+    monkeypatch.setattr("rbpf.sensors.readers.text._parse_row", None)
     assert len(open_log(data_dir / "mrclam6_robot1").frames) == 1012

@@ -198,7 +198,7 @@ def test_a_singular_covariance_stays_singular(tmp_path):
             SENSOR.split("\n")[1].replace("0.5", "0.5x"),
             "expected x_m to be a finite number",
         ),
-        ("sensor.yaml", 2, SENSOR.split("\n")[1].replace("0.5", "[]"), "expected a single value"),
+        ("sensor.yaml", 2, SENSOR.split("\n")[1].replace("0.5", "[]"), "expected x_m to be a single value"),
         (
             "sensor.yaml",
             2,
@@ -209,7 +209,7 @@ def test_a_singular_covariance_stays_singular(tmp_path):
             "sensor.yaml",
             3,
             "x: 1",
-            "expected the keys robot_from_sensor, positive_pitch, each once, found 'x'",
+            "expected the keys robot_from_sensor, positive_pitch; also known: std; found 'x'",
         ),
         ("sensor.yaml", 4, "positive_pitch: left", "expected positive_pitch to be up or down, found 'left'"),
         ("sensor.yaml", 4, "positive_pitch: }", "expected YAML"),

@@ -7,7 +7,7 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.sensors.readers import stereo_tracks
+from rbpf.sensors.readers.stereo_tracks import read_stereo_tracks
 
 POSE = SE3.exp(np.array([0.1, -0.2, 0.05, 1.0, 2.0, 3.0]))
 CALIBRATION = "700.0 710.0 0.0 600.0 180.0 0.5"
@@ -33,7 +33,7 @@ def folder(tmp_path, calibration=CALIBRATION, poses=POSES, factors=FACTORS):
 
 
 def test_what_is_read(tmp_path):
-    tracks = stereo_tracks.read(folder(tmp_path), std_px=0.5, size=(1000, 400))
+    tracks = read_stereo_tracks(folder(tmp_path), std_px=0.5, size=(1000, 400))
     log, camera = tracks.log, tracks.log.camera
     one = camera.camera
     assert (one.width, one.height, one.fx, one.fy, one.cx, one.cy) == (1000, 400, 700.0, 710.0, 600.0, 180.0)
@@ -49,7 +49,7 @@ def test_what_is_read(tmp_path):
 
 
 def test_a_frame_that_sees_nothing_is_kept(tmp_path):
-    log = stereo_tracks.read(folder(tmp_path, factors=FACTORS[:2])).log
+    log = read_stereo_tracks(folder(tmp_path, factors=FACTORS[:2])).log
     assert [len(frame.landmarks) for frame in log.frames] == [2, 0]
 
 
@@ -75,7 +75,7 @@ def test_a_frame_that_sees_nothing_is_kept(tmp_path):
         ),
         (
             {"factors": [FACTORS[0], FACTORS[0]]},
-            "VO_stereo_factors.txt, line 2: landmark 7 comes twice in frame 0",
+            "VO_stereo_factors.txt, line 2: landmark 7 comes a second time in frame 0",
         ),
         (
             {"factors": ["0 7 600 620 200 1 1 1"]},
@@ -93,19 +93,19 @@ def test_a_frame_that_sees_nothing_is_kept(tmp_path):
 )
 def test_a_malformed_file_is_named(tmp_path, changed, complaint):
     with pytest.raises(InputError, match=re.escape(complaint)):
-        stereo_tracks.read(folder(tmp_path, **changed))
+        read_stereo_tracks(folder(tmp_path, **changed))
 
 
 def test_a_missing_or_second_file_is_named(tmp_path):
     with pytest.raises(
         InputError, match=r"expected one file VO_calibration\*\.txt of stereo tracks, found none"
     ):
-        stereo_tracks.read(tmp_path / "nowhere")
+        read_stereo_tracks(tmp_path / "nowhere")
     (folder(tmp_path) / "VO_calibration2.txt").write_text(CALIBRATION)
     with pytest.raises(InputError, match=r"found VO_calibration\.txt, VO_calibration2\.txt"):
-        stereo_tracks.read(tmp_path)
+        read_stereo_tracks(tmp_path)
 
 
 def test_a_senseless_deviation_is_refused(tmp_path):
     with pytest.raises(InputError, match="must be positive, got 0 px"):
-        stereo_tracks.read(folder(tmp_path), std_px=0)
+        read_stereo_tracks(folder(tmp_path), std_px=0)

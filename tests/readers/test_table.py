@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from rbpf.errors import InputError
-from rbpf.sensors.readers.noise import LogNoise
-from rbpf.sensors.readers.table import read_columns, read_csv
+from rbpf.sensors.readers import LogNoise
+from rbpf.sensors.readers.text import read_columns, read_csv
 
 COLUMNS = ("time", "x")
 

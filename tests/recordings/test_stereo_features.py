@@ -8,7 +8,7 @@ from rbpf.lie import SE3
 from rbpf.sensors.descriptors.index import DescriptorIndex, Gate
 from rbpf.sensors.descriptors.matching import MatchLimits, distances
 from rbpf.sensors.features import Sift, SiftConfig
-from rbpf.sensors.readers.images import open_stereo
+from rbpf.sensors.readers import open_stereo
 from rbpf.sensors.stereo.features import match_frames
 from rbpf.sensors.stereo.matching import PairConfig, StereoMatcher
 

@@ -7,9 +7,8 @@ import pytest
 
 from examples.studies.stereo_revisit import Reordered, pairs_there_and_back
 from rbpf.sensors.feature_log import CameraTruth
-from rbpf.sensors.readers import stereo_tracks
-from rbpf.sensors.readers.images import open_stereo
-from rbpf.sensors.readers.images.stereo import StereoSequence
+from rbpf.sensors.readers import open_stereo
+from rbpf.sensors.readers.stereo_tracks import read_stereo_tracks
 from rbpf.systems.stereo.config import MapConfig, StereoConfig
 from rbpf.systems.stereo.run import StereoRun, run_features, run_images
 from rbpf.validation.gtsam.camera import solve_features
@@ -28,8 +27,8 @@ def test_a_room_in_part(data_dir):
     sequence = open_stereo(data_dir / "stereo_zed_room1")
     rows = list(range(30))
     stamps = sequence.stamps_ns[rows]
-    part = replace(sequence.pair, stamps_ns=stamps, source=Reordered(sequence, np.array(rows), stamps))
-    run = run_images(StereoSequence(part, sequence.rig), StereoConfig(particles=100))
+    part = replace(sequence, stamps_ns=stamps, source=Reordered(sequence, np.array(rows), stamps))
+    run = run_images(part, StereoConfig(particles=100))
     found = scores(run)
     assert found["ate_rmse_m"] < 0.009
     assert 5 <= run.updated.sum() < 30  # at first the camera is at rest
@@ -74,7 +73,7 @@ def test_there_and_back_again(data_dir):
 @pytest.mark.slow
 def test_beside_the_batch(data_dir):
     """Recorded tracks, ten frames of 700: no truth, so that the batch optimum of the same pixels takes its place."""
-    tracks = stereo_tracks.read(data_dir / "gtsam_stereo_vo")
+    tracks = read_stereo_tracks(data_dir / "gtsam_stereo_vo")
     log = replace(tracks.log, frames=tracks.log.frames[:10])
     run = run_features(log, StereoConfig())
     assert run.failure is None

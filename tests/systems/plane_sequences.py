@@ -9,7 +9,7 @@ import numpy as np
 
 from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole
-from rbpf.sensors.readers.images import ImageFrame, ImageSequence, KnownPixels
+from rbpf.sensors.readers import ImageFrame, ImageSequence, KnownPixels
 from rbpf.sensors.readers.images.sequence import Source
 
 CAMERA = Pinhole(320, 240, 260.0, 260.0, 159.5, 119.5)

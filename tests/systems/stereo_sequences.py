@@ -6,11 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from rbpf.lie import SE3
-from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.feature_log import CameraTruth
-from rbpf.sensors.readers.images import ImageFrame, ImageSequence
+from rbpf.sensors.readers import ImageFrame, ImageSequence
 from rbpf.sensors.readers.images.sequence import Source
-from rbpf.sensors.readers.images.stereo import StereoSequence
 from tests.systems.plane_sequences import CAMERA, path, texture, view
 
 BASELINE_M, STEP_NS = 0.12, 66_666_666
@@ -38,13 +36,12 @@ class Pairs(Source):
 
 def pairs(
     count: int, change: Change = lambda t, frame: frame, poses: np.ndarray | None = None
-) -> StereoSequence:
+) -> ImageSequence:
     """A pair of cameras before the plane."""
     poses = path(2 * count)[::2] if poses is None else poses
     stamps = np.arange(count, dtype=np.int64) * STEP_NS
     truth = CameraTruth(stamps, poses)
-    sequence = ImageSequence("plane", CAMERA, stamps, truth, BASELINE_M, Pairs(texture(), poses, change))
-    return StereoSequence(sequence, RectifiedStereo(CAMERA, BASELINE_M))
+    return ImageSequence("plane", CAMERA, stamps, truth, BASELINE_M, Pairs(texture(), poses, change))
 
 
 def flat(frame: ImageFrame) -> ImageFrame:

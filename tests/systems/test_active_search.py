@@ -12,7 +12,7 @@ from rbpf.runs.trajectory import Trajectory
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.sensors.patches.search import cut
-from rbpf.sensors.readers.images import open_images, read_known_points
+from rbpf.sensors.readers import open_images, read_known_points
 from rbpf.systems.mono.active_search import WIDEST, RobustMotionGate, SearchResult
 from rbpf.systems.mono.config import MonoConfig, SearchConfig
 from rbpf.systems.mono.feature_table import PATCH_HALF_PX, view_change

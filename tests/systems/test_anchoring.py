@@ -13,7 +13,7 @@ from rbpf.maps.point import Point
 from rbpf.motion.odometry import Odometry, OdometryMotion
 from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
 from rbpf.sensors.range_bearing import RelativePosition
-from rbpf.sensors.readers.log import Frame
+from rbpf.sensors.readers import Frame
 
 COV_Z = np.diag([0.04, 0.09])
 LANDMARKS = np.array([[4.0, 1.0], [3.0, -2.0], [6.0, 0.5], [5.0, 3.0]])

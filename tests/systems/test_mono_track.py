@@ -11,7 +11,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.frame_log import FrameLog
 from rbpf.sensors.feature_log import FeatureFrame
-from rbpf.sensors.readers.images import ImageFrame
+from rbpf.sensors.readers import ImageFrame
 from rbpf.systems.mono.active_search import MotionFit, OutlierGate, RobustMotionGate
 from rbpf.systems.mono.config import MonoConfig, StartConfig
 from rbpf.systems.mono.feature_sensor import InverseDepthRays, UnknownDepth

@@ -3,7 +3,7 @@
 import numpy as np
 
 from rbpf.lie import SE2
-from rbpf.sensors.readers.log import Frame, RobotLog, Truth
+from rbpf.sensors.readers import Frame, RobotLog, Truth
 
 TURN_STD = 1e-4
 MOVE_STD, SEEN_STD = 0.1, 0.15

@@ -234,7 +234,7 @@ def _version():
             lambda f: (f / "config.yaml").write_text("rbpf: 99.1.0\nsystem: mono"),
             "was written by rbpf 99.1.0",
         ),
-        (lambda f: (f / "config.yaml").write_text("{"), "is not YAML"),
+        (lambda f: (f / "config.yaml").write_text("{"), "expected YAML"),
         (lambda f: (f / "observations.csv").unlink(), "holds no observations.csv"),
         (lambda f: (f / "map.npz").unlink(), "holds no map.npz"),
         (lambda f: save_arrays(f / "map.npz", {"id": np.arange(2)}), "array mean is missing"),

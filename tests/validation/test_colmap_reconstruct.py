@@ -11,7 +11,7 @@ from rbpf.runs.path_and_map import PathAndMap
 from rbpf.runs.trajectory import Trajectory
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.feature_log import CameraTruth
-from rbpf.sensors.readers.images import open_images
+from rbpf.sensors.readers import open_images
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.validation.colmap.against_colmap import compare_folder_with_colmap, compare_with_colmap
 from rbpf.validation.colmap.cloud_distance import cloud_distance

@@ -6,7 +6,7 @@ import pytest
 
 from rbpf.cli import main
 from rbpf.errors import InputError
-from rbpf.sensors.readers.noise import LogNoise
+from rbpf.sensors.readers import LogNoise
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig

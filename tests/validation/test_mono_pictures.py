@@ -5,7 +5,7 @@ import pytest
 
 from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole
-from rbpf.sensors.readers.images import open_images, read_known_points
+from rbpf.sensors.readers import open_images, read_known_points
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.video import SearchRecord, run_images
 from rbpf.validation.report.annotated import FOUND, MISSED, Caption, drawn_size

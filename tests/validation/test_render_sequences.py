@@ -12,7 +12,7 @@ import yaml
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
-from rbpf.sensors.readers.images import open_images, open_stereo
+from rbpf.sensors.readers import open_images, open_stereo
 from rbpf.sensors.readers.images.calibration import read_calibration
 from rbpf.validation.simulation import images, textured_scene
 from rbpf.validation.simulation.desk_and_room import TexturedDesk, TexturedRoom

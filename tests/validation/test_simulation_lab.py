@@ -11,7 +11,7 @@ import pytest
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
-from rbpf.sensors.readers.images import open_images
+from rbpf.sensors.readers import open_images
 from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
 from rbpf.validation.simulation import lab as lab_points
 from rbpf.validation.simulation.features import Measuring, simulate_features

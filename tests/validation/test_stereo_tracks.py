@@ -8,7 +8,7 @@ import pytest
 
 from rbpf.lie import SE3
 from rbpf.motion.stereo_odometer import Prediction, StereoOdometer, odometry_path
-from rbpf.sensors.readers import stereo_tracks
+from rbpf.sensors.readers.stereo_tracks import read_stereo_tracks
 from rbpf.validation.gtsam.camera import CameraEstimate, solve_features
 from rbpf.validation.gtsam.camera_data import sightings_of
 from rbpf.validation.gtsam.camera_graph import CameraProblem, CameraState
@@ -18,7 +18,7 @@ pytestmark = [pytest.mark.real_data, pytest.mark.slow]
 
 @pytest.fixture(scope="module")
 def tracks(data_dir):
-    return stereo_tracks.read(data_dir / "gtsam_stereo_vo")
+    return read_stereo_tracks(data_dir / "gtsam_stereo_vo")
 
 
 def first_observations(tracks):

@@ -14,7 +14,7 @@ from rbpf.runs.folder import write_summary, write_trajectory
 from rbpf.runs.recordings import filter_robot_log as run
 from rbpf.runs.results import load
 from rbpf.runs.truth import RunTruth, truth_at, write_truth
-from rbpf.sensors.readers.log import Truth
+from rbpf.sensors.readers import Truth
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.consistency.against_groundtruth import truth_errors
 from rbpf.validation.consistency.validate import COMPARISONS, validate

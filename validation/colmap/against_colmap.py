@@ -5,11 +5,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
 
+import numpy as np
+
 from rbpf.errors import InputError
 from rbpf.runs.path_and_map import PathAndMap
 from rbpf.runs.provenance import read_config
 from rbpf.runs.reading import RunFolder
-from rbpf.sensors.readers.images import ImageSequence, Topics, open_images, open_stereo
+from rbpf.sensors.readers import ImageSequence, Topics, open_images, open_stereo
 from rbpf.validation.colmap.compare import ColmapComparison, compare_with_path, compare_with_truth
 from rbpf.validation.colmap.pipeline import ReconstructionOptions
 from rbpf.validation.colmap.reconstruct import reconstruct
@@ -59,8 +61,17 @@ def _images(config: Mapping[str, Any]) -> ImageSequence:
     recording, calibration = Path(str(config["recording"])), config.get("calibration")
     topics = Topics.parse(config.get("image_topic"), config.get("truth_topic"))
     if config["system"] == "stereo":
-        return open_stereo(recording, calibration, topics=topics).pair
-    return open_images(recording, calibration, topics)
+        return open_stereo(recording, calibration, topics=topics)
+    sequence = open_images(recording, calibration, topics)
+    if not sequence.camera.lens.is_identity:
+        return sequence
+    # Where the recording is a rectified pair, of which the run saw the left images, both take part.
+    try:
+        pair = open_stereo(recording, calibration, topics=topics)
+    except InputError:
+        return sequence
+    is_same = pair.camera == sequence.camera and np.array_equal(pair.stamps_ns, sequence.stamps_ns)
+    return pair if is_same else sequence
 
 
 def compare_with_colmap(

@@ -20,8 +20,7 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.runs.reading import RunFolder
 from rbpf.sensors.feature_log import FeatureLog
-from rbpf.sensors.readers import open_log
-from rbpf.sensors.readers.log import RobotLog
+from rbpf.sensors.readers import RobotLog, open_log
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.settings import load_settings

@@ -12,7 +12,7 @@ from rbpf.lie import SE3
 from rbpf.runs.files import prepare_folder, whole
 from rbpf.runs.plots import SIGMAS
 from rbpf.sensors.camera import Pinhole
-from rbpf.sensors.readers.images import ImageFrame
+from rbpf.sensors.readers import ImageFrame
 from rbpf.systems.map_estimate import MapEstimate
 
 QUALITY = 75

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from rbpf.sensors.readers.images.stereo import StereoSequence
+from rbpf.sensors.readers import ImageSequence
 from rbpf.systems.stereo.run import StereoRun
 from rbpf.systems.stereo.seen import FEATURE, LANDMARK, NEW, TRIAL, PairSeen
 from rbpf.validation.report.annotated import (
@@ -47,7 +47,7 @@ def draw_pair(
     return annotate(image, size, caption, [(NAMES[kind], COLOURS[kind]) for kind in COLOURS], paint)
 
 
-def annotated_pairs(run: StereoRun, sequence: StereoSequence) -> Iterator[np.ndarray]:
+def annotated_pairs(run: StereoRun, sequence: ImageSequence) -> Iterator[np.ndarray]:
     """The frames (H, W, 3) uint8, as they are needed.
 
     Args:
@@ -66,7 +66,7 @@ def annotated_pairs(run: StereoRun, sequence: StereoSequence) -> Iterator[np.nda
 
 def write_annotated_pairs(
     run: StereoRun,
-    sequence: StereoSequence,
+    sequence: ImageSequence,
     path: Path,
     on_frame: Callable[[int, int], None] | None = None,
 ) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from rbpf.lie import SE3
-from rbpf.sensors.readers.images.stereo import StereoSequence
+from rbpf.sensors.readers import ImageSequence
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.stereo.run import StereoRun
 from rbpf.systems.stereo.seen import LANDMARK
@@ -21,7 +21,7 @@ from rbpf.validation.report.rerun_file import ellipsoids, log_image, log_lens, l
 from rbpf.validation.report.stereo_frames import COLOURS, NAMES
 
 
-def write_stereo_rerun(run: StereoRun, sequence: StereoSequence, mapped: MapEstimate, path: Path) -> None:
+def write_stereo_rerun(run: StereoRun, sequence: ImageSequence, mapped: MapEstimate, path: Path) -> None:
     """Writes the recording; it appears under its name when it is complete.
 
     Args:

@@ -12,8 +12,7 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.files import write_csv, write_text
-from rbpf.sensors.readers import open_log
-from rbpf.sensors.readers.log import RobotLog
+from rbpf.sensors.readers import RobotLog, open_log
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ import msgspec
 
 from rbpf import __version__
 from rbpf.errors import InputError
-from rbpf.systems.plain_yaml import read_plain_yaml
+from rbpf.sensors.readers.yaml_files import read_plain_yaml
 from rbpf.validation.sweep.systems import system_named
 
 MOST_RUNS = 100_000

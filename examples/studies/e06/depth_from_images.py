@@ -9,7 +9,7 @@ from rbpf.lie import SE3
 from rbpf.runs.plots import save_figures
 from rbpf.sensors.features import CornerDetector
 from rbpf.sensors.patches.search import cut, search, warp
-from rbpf.sensors.readers.images import ImageSequence
+from rbpf.sensors.readers import ImageSequence
 from rbpf.systems.mono.config import SearchConfig
 from rbpf.systems.mono.feature_table import PATCH_HALF_PX
 from rbpf.validation.simulation.textured_scene import cast

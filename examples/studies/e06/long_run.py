@@ -10,7 +10,7 @@ from examples.studies.e06.setting import Row, Setting, true_poses
 from examples.studies.e06.worlds import LoopOverDesk
 from rbpf.lie import SE3
 from rbpf.runs.plots import COLOURS, SIGMAS, label, outline, save_figures
-from rbpf.sensors.readers.images import ImageFrame
+from rbpf.sensors.readers import ImageFrame
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.mono.video import VideoRun, run_images
 

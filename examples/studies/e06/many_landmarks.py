@@ -11,7 +11,7 @@ from rbpf.core.models import Records
 from rbpf.lie import SE3
 from rbpf.maps.point import Point
 from rbpf.runs.plots import label, save_figures
-from rbpf.sensors.readers.images import ImageFrame
+from rbpf.sensors.readers import ImageFrame
 from rbpf.systems.mono.feature_table import PATCH_PX
 from rbpf.systems.mono.video import VideoRun, run_images
 

@@ -9,7 +9,7 @@ from examples.studies.e06.setting import Row, Setting
 from examples.studies.e06.worlds import LoopOverDesk
 from rbpf.lie import SE3
 from rbpf.runs.plots import COLOURS, label, outline, save_figures
-from rbpf.sensors.readers.images import ImageFrame
+from rbpf.sensors.readers import ImageFrame
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.mono.video import SearchRecord, VideoRun, run_images
 from rbpf.validation.report.annotated import Caption

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from rbpf.sensors.camera import Pinhole
-from rbpf.sensors.readers.images import ImageSequence, KnownPixels, open_images, read_known_points
+from rbpf.sensors.readers import ImageSequence, KnownPixels, open_images, read_known_points
 from rbpf.systems.mono.config import InverseDepthConfig, MonoConfig
 from rbpf.validation.simulation.images import Imaging, simulate_images
 from rbpf.validation.simulation.textured_scene import ImageWorld

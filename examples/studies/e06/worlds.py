@@ -6,7 +6,7 @@ import numpy as np
 
 from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole
-from rbpf.sensors.readers.images import KnownPixels
+from rbpf.sensors.readers import KnownPixels
 from rbpf.validation.simulation import textures
 from rbpf.validation.simulation.desk_and_room import TexturedDesk
 from rbpf.validation.simulation.paths import UP, Wave, eased, frame_seconds, looking, shaken

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rbpf.errors import InputError
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
-from rbpf.sensors.readers.images import open_stereo
+from rbpf.sensors.readers import open_stereo
 from rbpf.systems.stereo.config import StereoConfig, TriggerConfig
 from rbpf.systems.stereo.feature_cache import CachedSequence, cache_features
 from rbpf.validation.simulation.images import Imaging, simulate_images

@@ -29,7 +29,7 @@ from rbpf.motion.constant_velocity import MarginalVelocity, PosePrior, SampledVe
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureFrame, FeatureLog, KnownPoints
 from rbpf.sensors.features import Descriptor, Detector
-from rbpf.sensors.readers.images import ImageFrame, KnownPixels
+from rbpf.sensors.readers import ImageFrame, KnownPixels
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.mono.active_search import OutlierGate
 from rbpf.systems.mono.config import MonoConfig

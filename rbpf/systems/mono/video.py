@@ -11,7 +11,7 @@ from rbpf.core.checkpoint import checked, fitting
 from rbpf.core.filter import Filter
 from rbpf.errors import InputError
 from rbpf.sensors.feature_log import FeatureFrame
-from rbpf.sensors.readers.images import ImageFrame, ImageSequence, KnownPixels
+from rbpf.sensors.readers import ImageFrame, ImageSequence, KnownPixels
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.image_sensor import ImageSensor
 from rbpf.systems.mono.known_map import KnownMap

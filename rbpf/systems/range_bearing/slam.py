@@ -22,7 +22,7 @@ from rbpf.maps.point import Point
 from rbpf.motion.odometry import Odometry, OdometryMotion
 from rbpf.sensors.landmark_sensor import AnonymousLandmarkSensor, NamedLandmarkSensor
 from rbpf.sensors.range_bearing import RangeBearing, RelativePosition, RigidPointModel
-from rbpf.sensors.readers.log import Frame, RobotLog
+from rbpf.sensors.readers import Frame, RobotLog
 from rbpf.sensors.readers.measurements import Kind, Measurements
 from rbpf.systems.map_estimate import MapEstimate, estimate_map
 from rbpf.systems.range_bearing.config import RangeBearingConfig

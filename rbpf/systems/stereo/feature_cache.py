@@ -19,7 +19,7 @@ from rbpf.errors import InputError
 from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.feature_log import CameraTruth
 from rbpf.sensors.features import Sift
-from rbpf.sensors.readers.images.stereo import StereoSequence
+from rbpf.sensors.readers import ImageSequence
 from rbpf.sensors.stereo.features import StereoFeatures
 from rbpf.sensors.stereo.matching import StereoMatcher
 from rbpf.systems.stereo.config import StereoConfig
@@ -80,7 +80,7 @@ class CachedSequence:
 
 
 def cache_features(
-    sequence: StereoSequence,
+    sequence: ImageSequence,
     config: StereoConfig,
     folder: Path,
     on_pair: Callable[[int, int], None] | None = None,
@@ -119,7 +119,7 @@ def _file(folder: Path, first: int) -> Path:
     return folder / f"pairs_{first:06d}.npz"
 
 
-def _claim(folder: Path, sequence: StereoSequence, config: StereoConfig) -> None:
+def _claim(folder: Path, sequence: ImageSequence, config: StereoConfig) -> None:
     """Notes whose features these are, or checks that they are the sequence's."""
     stamps = sequence.stamps_ns
     ours = {

@@ -10,7 +10,7 @@ from rbpf.core.models import NULL, Belief, Part, Sensor
 from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.feature_log import CameraTruth, FeatureLog
 from rbpf.sensors.features import Sift
-from rbpf.sensors.readers.images import ImageFrame
+from rbpf.sensors.readers import ImageFrame
 from rbpf.sensors.stereo.features import StereoFeatures, match_frames
 from rbpf.sensors.stereo.matching import StereoMatcher
 from rbpf.systems.stereo.config import StereoConfig

@@ -16,7 +16,7 @@ from rbpf.lie import SE3
 from rbpf.motion.odometry import Odometry
 from rbpf.motion.stereo_motions import Known
 from rbpf.sensors.feature_log import CameraTruth, FeatureLog
-from rbpf.sensors.readers.images.stereo import StereoSequence
+from rbpf.sensors.readers import ImageSequence
 from rbpf.systems.stereo.config import StereoConfig, TriggerConfig
 from rbpf.systems.stereo.dead_reckoning import DeadReckoning, Reckoned, chained
 from rbpf.systems.stereo.delayed_update import motion_for_update
@@ -96,7 +96,7 @@ class StereoRun:
 
 
 def run_images(
-    sequence: StereoSequence | CachedSequence,
+    sequence: ImageSequence | CachedSequence,
     config: StereoConfig,
     on_frame: Callable[[int, StereoRun], None] | None = None,
     checkpoint: Path | None = None,

@@ -18,8 +18,7 @@ from pathlib import Path
 
 from rbpf.errors import InputError
 from rbpf.sensors.camera import LENSES, Pinhole
-from rbpf.sensors.readers.images.mapping import YamlValue, read_yaml
-from rbpf.sensors.readers.text import quoted
+from rbpf.sensors.readers.yaml_files import YamlValue, read_yaml
 
 NAME = "camera.yaml"
 KIND = (
@@ -84,13 +83,7 @@ def read_calibration(path: Path) -> Calibration:
     Raises:
         InputError: the file is missing or not as described above.
     """
-    whole = read_yaml(path, KIND)
-    entries = whole.entries()
-    whole.require_keys(entries, _REQUIRED)
-    for name, value in entries.items():
-        if name not in _REQUIRED + _OPTIONAL:
-            known = ", ".join(_REQUIRED + _OPTIONAL)
-            raise value.error(f"{quoted(name)} is no key of a camera, expected some of {known}")
+    entries = read_yaml(path, KIND).entries(_REQUIRED, _OPTIONAL)
     return Calibration(
         where=str(path),
         camera=_camera(entries),

@@ -4,79 +4,185 @@
   radial-tangential` with `distortion_coefficients` (k1, k2, p1, p2[, k3]) or `equidistant` with k1, k2, k3, k4, and
   `T_BS`, body_from_camera;
 - `cam0/data.csv`: time [ns] and file in `cam0/data` of each image;
-- `cam1`, if there are two cameras: its images are read only where the pair is rectified, which a logged message
-  says otherwise (`euroc_stereo`);
+- `cam1`, for stereo: the same of the right camera. Pairs that are not rectified become so by the two `sensor.yaml`;
 - `state_groundtruth_estimate0` or `vicon0`, if the truth is known: `data.csv` with time [ns], position of the
   sensor [m] and its quaternion qw, qx, qy, qz, world_from_sensor, and more columns; `sensor.yaml` with `T_BS`,
   body_from_sensor. The truth returned is world_from_camera = world_from_sensor body_from_sensor⁻¹ body_from_camera.
 
+A camera file given replaces that of `cam0`, and the pair's baseline, if it has one; the images are then taken as they
+are, and the truth stays that of the sequence's camera.
 M. Burri, J. Nikolic, P. Gohl, T. Schneider, J. Rehder, S. Omari, M. W. Achtelik, R. Siegwart, "The EuRoC micro aerial
 vehicle datasets", IJRR 35(10), 2016.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import final
 
 import numpy as np
 
+from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
+from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import CameraTruth
-from rbpf.sensors.readers.images.calibration import read_calibration
-from rbpf.sensors.readers.images.euroc_camera import AslCamera, read_camera, read_mount
-from rbpf.sensors.readers.images.euroc_stereo import read_right
-from rbpf.sensors.readers.images.files import FileImages, first_shape
-from rbpf.sensors.readers.images.sequence import ImageSequence, Source
-from rbpf.sensors.readers.images.stamped import read_stamped
-from rbpf.sensors.readers.images.truth import normalised, truth_between
+from rbpf.sensors.readers.images.calibration import Calibration, coefficients, read_calibration
+from rbpf.sensors.readers.images.decoding import FileImages, first_shape
+from rbpf.sensors.readers.images.poses import normalised, pose_of_matrix, rigid_motion_error, truth_between
+from rbpf.sensors.readers.images.rectification import (
+    Rectification,
+    RectifiedImages,
+    pair_stamps,
+    rectified_baseline,
+)
+from rbpf.sensors.readers.images.sequence import ImageFormat, ImageSequence, ReadOptions, Source
+from rbpf.sensors.readers.text import read_stamped
+from rbpf.sensors.readers.yaml_files import YamlValue, read_yaml
 
-KIND = "an EuRoC sequence in the ASL layout (mav0/cam0 with sensor.yaml and data.csv)"
-
+_CAMERA = (
+    "T_BS",
+    "resolution",
+    "camera_model",
+    "intrinsics",
+    "distortion_model",
+    "distortion_coefficients",
+)
+_LENSES = {
+    "radial-tangential": "radial-tangential",
+    "radtan": "radial-tangential",
+    "equidistant": "equidistant",
+}
 _TRUTHS = ("state_groundtruth_estimate0", "vicon0")
-_COLUMNS = ("p_x", "p_y", "p_z", "q_w", "q_x", "q_y", "q_z")
+_TRUTH_COLUMNS = ("p_x", "p_y", "p_z", "q_w", "q_x", "q_y", "q_z")
 
 
-def recognises(path: Path) -> bool:
-    """Whether the path is a folder with `mav0` or with `cam0` in it."""
-    return (path / "mav0").is_dir() or (path / "cam0").is_dir()
+@final
+class Euroc(ImageFormat):
+    """EuRoC MAV sequences in the ASL layout."""
+
+    kind = "an EuRoC sequence in the ASL layout (mav0/cam0 with sensor.yaml and data.csv)"
+    stereo_kind = (
+        "an EuRoC sequence in the ASL layout (mav0 with cam0 and cam1, each with sensor.yaml and data.csv)"
+    )
+
+    def recognises(self, path: Path) -> bool:
+        return (path / "mav0").is_dir() or (path / "cam0").is_dir()
+
+    def read(self, path: Path, options: ReadOptions) -> ImageSequence:
+        mav = _mav(path)
+        camera = AslCamera.read(mav / "cam0" / "sensor.yaml", self.kind)
+        rows = read_stamped(mav / "cam0" / "data.csv", self.kind, ",", nanoseconds=True)
+        files = rows.files(mav / "cam0" / "data")
+        used = camera.calibration
+        if options.calibration is not None:
+            used = read_calibration(options.calibration)
+        shape = first_shape(files, rows.path)
+        used.require_shape(shape, str(mav / "cam0"))
+        source = FileImages(rows.stamps_ns, shape, files)
+        return replace(_sequence(mav, camera, rows.stamps_ns, source), camera=used.camera)
+
+    def read_stereo(self, path: Path, options: ReadOptions) -> ImageSequence:
+        mav = _mav(path)
+        folders = mav / "cam0", mav / "cam1"
+        left, right = (AslCamera.read(folder / "sensor.yaml", self.stereo_kind) for folder in folders)
+        left_from_right = SE3.between(left.body_from_camera, right.body_from_camera)
+        _require_pair(left, right, left_from_right, mav)
+        listed = [
+            read_stamped(folder / "data.csv", self.stereo_kind, ",", nanoseconds=True) for folder in folders
+        ]
+        where = str(mav)
+        *rows, notes = pair_stamps(listed[0].stamps_ns, listed[1].stamps_ns, options.tolerance_s, where)
+        files = []
+        for lines, folder, chosen in zip(listed, folders, rows, strict=True):
+            paths = lines.files(folder / "data")
+            files.append([paths[row] for row in chosen])
+            left.calibration.require_shape(first_shape(files[-1], folder / "data.csv"), str(folder))
+        camera = left.calibration.camera
+        shape, stamps_ns = (camera.height, camera.width), listed[0].stamps_ns[rows[0]]
+        source: Source = FileImages(stamps_ns, shape, *files)
+        if options.calibration is not None:
+            used = read_calibration(options.calibration)
+            sequence = _sequence(mav, left, stamps_ns, source)
+            used.require_shape(shape, sequence.name)
+            baseline_m = used.baseline_m or float(np.linalg.norm(SE3.translation(left_from_right)))
+            return replace(sequence, camera=used.camera, baseline_m=baseline_m, notes=notes)
+        right_camera = right.calibration.camera
+        rectified_m = rectified_baseline(camera, right_camera, left_from_right)
+        if rectified_m is not None:
+            return replace(_sequence(mav, left, stamps_ns, source), baseline_m=rectified_m, notes=notes)
+        done = Rectification.between(camera, right_camera, left_from_right, str(folders[1] / "sensor.yaml"))
+        rotated = replace(left, body_from_camera=SE3.compose(left.body_from_camera, done.left_from_rectified))
+        note = f"{mav}: the two cameras are not rectified; their images are, by cam0 and cam1's sensor.yaml."
+        return replace(
+            _sequence(mav, rotated, stamps_ns, RectifiedImages(source, done)),
+            camera=done.rig.camera,
+            baseline_m=done.rig.baseline_m,
+            notes=(*notes, note),
+        )
 
 
-def read(path: Path, calibration: Path | None) -> ImageSequence:
-    """Open the sequence.
+@dataclass(frozen=True)
+class AslCamera:
+    """A camera and where it sits.
 
-    Args:
-        path: the folder.
-        calibration: a camera file in place of that of `cam0`, and a baseline in place of the pair's, if it has
-            one; the truth stays that of the sequence's camera.
-
-    Raises:
-        InputError: a file is missing or not as described above.
+    Attributes:
+        calibration: the camera.
+        body_from_camera: (7,) T_BS.
     """
-    mav = path / "mav0" if (path / "mav0").is_dir() else path
-    camera = read_camera(mav / "cam0" / "sensor.yaml", KIND)
-    rows = read_stamped(mav / "cam0" / "data.csv", KIND, ",", nanoseconds=True)
-    files = rows.files(mav / "cam0" / "data")
-    used = camera.calibration if calibration is None else read_calibration(calibration)
-    shape = first_shape(files, rows.path)
-    used.require_shape(shape, str(mav / "cam0"))
-    right, baseline_m = read_right(mav / "cam1", camera, used.camera, rows)
-    opened = sequence(mav, camera, rows.stamps_ns, FileImages(rows.stamps_ns, shape, files, right))
-    return replace(opened, camera=used.camera, baseline_m=baseline_m and (used.baseline_m or baseline_m))
+
+    calibration: Calibration
+    body_from_camera: Array
+
+    @classmethod
+    def read(cls, path: Path, hint: str) -> "AslCamera":
+        """Read a `sensor.yaml`.
+
+        Args:
+            path: the file.
+            hint: what is expected to lie there, for the message.
+
+        Raises:
+            InputError: the file is missing, or is no pinhole camera with radial-tangential or equidistant distortion.
+        """
+        entries = read_yaml(path, hint).entries(_CAMERA)
+        entries["camera_model"].choice(["pinhole"])
+        model = _LENSES[entries["distortion_model"].choice(list(_LENSES))]
+        width, height = entries["resolution"].items(2)
+        fx, fy, cx, cy = entries["intrinsics"].items(4)
+        camera = Pinhole(
+            width=width.size(),
+            height=height.size(),
+            fx=fx.positive(),
+            fy=fy.positive(),
+            cx=cx.number(),
+            cy=cy.number(),
+            distortion=coefficients(entries["distortion_coefficients"], model),
+            distortion_model=model,
+        )
+        return cls(Calibration(str(path), camera), _mount(entries["T_BS"]))
 
 
-def sequence(mav: Path, camera: AslCamera, stamps_ns: np.ndarray, source: Source) -> ImageSequence:
-    """Images of one camera, with its truth where there is one.
+def _mav(path: Path) -> Path:
+    return path / "mav0" if (path / "mav0").is_dir() else path
 
-    Args:
-        mav: the folder with the cameras.
-        camera: whose pose on the body says where the truth is.
-        stamps_ns: (T,) times of the images.
-        source: of the images.
 
-    Raises:
-        InputError: the truth's file is malformed, or of another time.
-    """
+def _require_pair(left: AslCamera, right: AslCamera, left_from_right: Array, mav: Path) -> None:
+    sizes = [f"{asl.calibration.camera.width}x{asl.calibration.camera.height}" for asl in (left, right)]
+    if sizes[0] != sizes[1]:
+        raise InputError(
+            f"{mav}: cam0 has {sizes[0]} and cam1 {sizes[1]} px, expected one size; scale the images of one of the two."
+        )
+    if not SE3.translation(left_from_right).any():
+        where = mav / "cam1" / "sensor.yaml"
+        raise InputError(
+            f"{where}: T_BS puts cam1 where cam0 is, a baseline of zero; give the two cameras' own."
+        )
+
+
+def _sequence(mav: Path, camera: AslCamera, stamps_ns: np.ndarray, source: Source) -> ImageSequence:
+    """Images of one camera, with its truth where there is one."""
+    folder = mav.resolve()
     return ImageSequence(
-        name=_name(mav),
+        name=folder.parent.name if folder.name == "mav0" else folder.name,
         camera=camera.calibration.camera,
         stamps_ns=stamps_ns,
         truth=_read_truth(mav, camera, stamps_ns),
@@ -85,29 +191,30 @@ def sequence(mav: Path, camera: AslCamera, stamps_ns: np.ndarray, source: Source
     )
 
 
-def _name(mav: Path) -> str:
-    folder = mav.resolve()
-    return folder.parent.name if folder.name == "mav0" else folder.name
-
-
 def _read_truth(mav: Path, camera: AslCamera, images_ns: np.ndarray) -> CameraTruth | None:
     for name in _TRUTHS:
-        file = mav / name / "data.csv"
-        if file.exists():
-            rows = read_stamped(file, "poses", ",", nanoseconds=True)
-            table = rows.table(_COLUMNS, ",")
-            xyzw = np.roll(table.block("q_w", "q_z"), -1, axis=1)
-            world_from_sensor = normalised(table, np.hstack([xyzw, table.block("p_x", "p_z")]))
-            poses = SE3.compose(
-                world_from_sensor, SE3.compose(_sensor_from_body(mav / name), camera.body_from_camera)
-            )
-            return truth_between(file, rows.stamps_ns, poses, images_ns)
+        file, mount = mav / name / "data.csv", mav / name / "sensor.yaml"
+        if not file.exists():
+            continue
+        rows = read_stamped(file, "poses", ",", nanoseconds=True)
+        table = rows.table(_TRUTH_COLUMNS, ",")
+        xyzw = np.roll(table.block("q_w", "q_z"), -1, axis=1)
+        world_from_sensor = normalised(table, np.hstack([xyzw, table.block("p_x", "p_z")]))
+        if name == _TRUTHS[0] and not mount.exists():
+            # The estimated state is the body's by definition; where a marker sits on it is not.
+            sensor_from_body = SE3.identity()
+        else:
+            hint = "a sensor.yaml with T_BS, the pose of the sensor on the body"
+            sensor_from_body = SE3.inverse(_mount(read_yaml(mount, hint).entries(["T_BS"])["T_BS"]))
+        poses = SE3.compose(world_from_sensor, SE3.compose(sensor_from_body, camera.body_from_camera))
+        return truth_between(file, rows.stamps_ns, poses, images_ns)
     return None
 
 
-def _sensor_from_body(folder: Path) -> Array:
-    file = folder / "sensor.yaml"
-    if folder.name == _TRUTHS[0] and not file.exists():
-        # The estimated state is the body's by definition; where a marker sits on it is not.
-        return SE3.identity()
-    return SE3.inverse(read_mount(file))
+def _mount(value: YamlValue) -> Array:
+    """body_from_sensor (7,) of a T_BS."""
+    numbers = [item.number() for item in value.entries(["data"])["data"].items(16)]
+    matrix = np.reshape(numbers, (4, 4))
+    if (problem := rigid_motion_error(matrix)) is not None:
+        raise value.error(f"T_BS: {problem}")
+    return pose_of_matrix(matrix)

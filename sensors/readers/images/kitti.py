@@ -6,134 +6,206 @@
 - the truth, if it is known: `poses.txt` beside it, or as distributed `../../poses/<sequence>.txt`, one line of a
   3 x 4 matrix by rows per image, world_from_camera of `image_0` [m].
 
-An image that is missing between others is a frame without an image.
+A camera file given replaces the intrinsics in `calib.txt`, and the baseline, if it has one. An image that is missing
+between others is a frame without an image.
 A. Geiger, P. Lenz, R. Urtasun, "Are we ready for autonomous driving? The KITTI vision benchmark suite", CVPR 2012.
 """
 
+from dataclasses import dataclass
 from pathlib import Path
+from typing import final
 
 import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
-from rbpf.sensors.camera import Pinhole, RectifiedStereo
+from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import CameraTruth
 from rbpf.sensors.readers.images.calibration import Calibration, read_calibration
-from rbpf.sensors.readers.images.decoding import SUFFIXES
-from rbpf.sensors.readers.images.files import FileImages, first_shape
-from rbpf.sensors.readers.images.kitti_calibration import Projections, read_projections
-from rbpf.sensors.readers.images.matrices import pose_of_matrix, rigid_motion_error
-from rbpf.sensors.readers.images.sequence import ImageSequence
-from rbpf.sensors.readers.images.stamped import read_stamped
-from rbpf.sensors.readers.table import read_columns
+from rbpf.sensors.readers.images.decoding import SUFFIXES, FileImages, first_shape
+from rbpf.sensors.readers.images.poses import pose_of_matrix, rigid_motion_error
+from rbpf.sensors.readers.images.sequence import ImageFormat, ImageSequence, ReadOptions
+from rbpf.sensors.readers.text import line_error, parse_number, read_columns, read_stamped, read_text
 
-KIND = "a KITTI odometry sequence (image_0 or image_2, calib.txt, times.txt)"
-
-PAIR_KIND = "a KITTI odometry sequence of two cameras (image_0 and image_1, calib.txt, times.txt)"
+ALIGNED_PX = 1e-2
+"""How far intrinsics of the two cameras of a pair may differ."""
 
 _PAIRS = ((0, 1), (2, 3))
 _POSE = tuple(f"m{row}{column}" for row in range(3) for column in range(4))
 
 
-def recognises(path: Path) -> bool:
-    """Whether the path is a folder with the images of a left camera."""
-    return any((path / f"image_{left}").is_dir() for left, _ in _PAIRS)
+@final
+class Kitti(ImageFormat):
+    """KITTI odometry sequences."""
+
+    kind = "a KITTI odometry sequence (image_0 or image_2, calib.txt, times.txt)"
+    stereo_kind = "a KITTI odometry sequence of two cameras (image_0 and image_1, calib.txt, times.txt)"
+
+    def recognises(self, path: Path) -> bool:
+        return any((path / f"image_{left}").is_dir() for left, _ in _PAIRS)
+
+    def read(self, path: Path, options: ReadOptions) -> ImageSequence:
+        return self._read(path, options, stereo=False)
+
+    def read_stereo(self, path: Path, options: ReadOptions) -> ImageSequence:
+        return self._read(path, options, stereo=True)
+
+    def _read(self, path: Path, options: ReadOptions, stereo: bool) -> ImageSequence:
+        left, right = next(pair for pair in _PAIRS if (path / f"image_{pair[0]}").is_dir())
+        folders = path / f"image_{left}", path / f"image_{right}"
+        if stereo and not folders[1].is_dir():
+            raise InputError(f"{folders[1]}: no such folder, expected the images of the right camera.")
+        projections = Projections.read(path / "calib.txt", self.kind)
+        rows = read_stamped(path / "times.txt", self.kind)
+        count = len(rows.lines)
+        # Files of the left camera, and of the right one.
+        files = [_files(folder, count) for folder in (folders if stereo else folders[:1])]
+        shape = first_shape(files[0], folders[0])
+        if options.calibration is not None:
+            used = read_calibration(options.calibration)
+        else:
+            used = _calibration(projections, left, shape)
+        used.require_shape(shape, str(path))
+        if stereo and (other := first_shape(files[1], folders[1])) != shape:
+            sizes = f"{shape[1]}x{shape[0]} and {other[1]}x{other[0]} px"
+            raise InputError(f"{path}: the left and right images have {sizes}, expected one size.")
+        # A sentence about each folder that does not hold an image for every time.
+        held = [sum(file.exists() for file in of_camera) for of_camera in files]
+        notes = tuple(
+            f"{folder}: {number} images for {count} times; the other pairs come without."
+            for folder, number in zip(folders, held, strict=False)
+            if stereo and number < count
+        )
+        return ImageSequence(
+            name=path.resolve().name,
+            camera=used.camera,
+            stamps_ns=rows.stamps_ns,
+            truth=_read_truth(path, projections.first_from_camera(left), rows.stamps_ns),
+            baseline_m=used.baseline_m or projections.baseline(left, right) if stereo else None,
+            source=FileImages(rows.stamps_ns, shape, *files),
+            notes=notes,
+        )
 
 
-def read(path: Path, calibration: Path | None) -> ImageSequence:
-    """Open the sequence.
+@dataclass(frozen=True)
+class Projections:
+    """The cameras' projections of `calib.txt`.
 
-    Args:
-        path: the folder.
-        calibration: a camera file in place of the intrinsics in `calib.txt`, and of the baseline, if it has one.
-
-    Raises:
-        InputError: a file is missing or not as described above.
+    Attributes:
+        path: the file.
+        matrices: number of a camera to its (3, 4) projection K [I | t].
+        lines: number of a camera to its line.
     """
-    left, right = next(pair for pair in _PAIRS if (path / f"image_{pair[0]}").is_dir())
-    projections = read_projections(path / "calib.txt", KIND)
-    rows = read_stamped(path / "times.txt", KIND)
-    files = _files(path / f"image_{left}", len(rows.lines))
-    shape = first_shape(files, path / f"image_{left}")
-    used = _calibration(projections, left, shape) if calibration is None else read_calibration(calibration)
-    used.require_shape(shape, str(path))
-    stereo = (path / f"image_{right}").is_dir()
-    baseline_m = used.baseline_m or projections.baseline(left, right) if stereo else None
-    return ImageSequence(
-        name=path.resolve().name,
-        camera=used.camera,
-        stamps_ns=rows.stamps_ns,
-        truth=_read_truth(path, projections.first_from_camera(left), rows.stamps_ns),
-        baseline_m=baseline_m,
-        source=FileImages(
-            rows.stamps_ns, shape, files, _files(path / f"image_{right}", len(files)) if stereo else None
-        ),
-    )
 
+    path: Path
+    matrices: dict[int, Array]
+    lines: dict[int, int]
 
-def read_pair(path: Path, calibration: Path | None) -> tuple[ImageSequence, RectifiedStereo, tuple[str, ...]]:
-    """The sequence, its two cameras, and what has to be said about them; as `open_stereo`."""
-    left, right = next(pair for pair in _PAIRS if (path / f"image_{pair[0]}").is_dir())
-    folders = path / f"image_{left}", path / f"image_{right}"
-    if not folders[1].is_dir():
-        raise InputError(f"{folders[1]}: no such folder, expected the images of the right camera.")
-    sequence = read(path, calibration)
-    shape = first_shape(_files(folders[1], len(sequence)), folders[1])
-    if shape != (sequence.camera.height, sequence.camera.width):
-        sizes = f"{sequence.camera.width}x{sequence.camera.height} and {shape[1]}x{shape[0]} px"
-        raise InputError(f"{path}: the left and right images have {sizes}, expected one size.")
-    assert sequence.baseline_m is not None
-    return sequence, RectifiedStereo(sequence.camera, sequence.baseline_m), _missing(folders, len(sequence))
+    @classmethod
+    def read(cls, path: Path, hint: str) -> "Projections":
+        """Read the projections; other lines are passed over.
 
+        Args:
+            path: the file.
+            hint: what is expected to lie there, for the message.
 
-def _missing(folders: tuple[Path, Path], count: int) -> tuple[str, ...]:
-    """A sentence about each folder that does not hold an image for every time."""
-    held = [sum(file.exists() for file in _files(folder, count)) for folder in folders]
-    return tuple(
-        f"{folder}: {number} images for {count} times; the other pairs come without."
-        for folder, number in zip(folders, held, strict=True)
-        if number < count
-    )
+        Raises:
+            InputError: the file is missing, or a projection is not 12 numbers.
+        """
+        matrices, lines = {}, {}
+        for number, line in enumerate(read_text(path, hint).splitlines(), 1):
+            name, _, rest = line.partition(":")
+            if name not in ("P0", "P1", "P2", "P3"):
+                continue
+            fields = rest.split()
+            if len(fields) != 12:
+                raise line_error(path, number, f"expected {name}: and 12 numbers, found {len(fields)}")
+            values = [parse_number(path, number, name, field) for field in fields]
+            matrices[int(name[1])] = np.reshape(values, (3, 4))
+            lines[int(name[1])] = number
+        return cls(path, matrices, lines)
+
+    def intrinsics(self, camera: int) -> tuple[float, float, float, float]:
+        """fx, fy, cx, cy [px].
+
+        Raises:
+            InputError: the camera is missing, or its projection is not K [I | t] with no skew.
+        """
+        matrix = self._matrix(camera)
+        fx, fy = matrix[0, 0], matrix[1, 1]
+        pinhole = np.array([[fx, 0.0, matrix[0, 2]], [0.0, fy, matrix[1, 2]], [0.0, 0.0, 1.0]])
+        if not (fx > 0.0 and fy > 0.0 and np.array_equal(matrix[:, :3], pinhole)):
+            problem = f"expected P{camera} to be fx 0 cx . 0 fy cy . 0 0 1 . with positive fx and fy"
+            raise line_error(self.path, self.lines[camera], problem)
+        return float(fx), float(fy), float(matrix[0, 2]), float(matrix[1, 2])
+
+    def first_from_camera(self, camera: int) -> Array:
+        """Pose (7,) of a camera in the frame of camera 0, to which poses refer.
+
+        Raises:
+            InputError: as `intrinsics`.
+        """
+        self.intrinsics(camera)
+        matrix = self._matrix(camera)
+        shift = -np.linalg.solve(matrix[:, :3], matrix[:, 3])
+        return np.concatenate([SE3.identity()[:4], shift])
+
+    def baseline(self, left: int, right: int) -> float:
+        """Distance [m] of the cameras of a pair.
+
+        Raises:
+            InputError: as `intrinsics`, or the pair is not rectified, or the right camera not to the right.
+        """
+        differ = np.subtract(self.intrinsics(left), self.intrinsics(right))
+        along = float((self.first_from_camera(right) - self.first_from_camera(left))[4])
+        if along == 0.0:
+            problem = f"P{right} is at the place of P{left}, a baseline of zero; give the projections of two cameras"
+            raise line_error(self.path, self.lines[right], problem)
+        if np.abs(differ).max() > ALIGNED_PX or along <= 0.0:
+            problem = f"expected P{right} to be P{left} shifted to the right, as of a rectified pair"
+            raise line_error(self.path, self.lines[right], problem)
+        return along
+
+    def _matrix(self, camera: int) -> Array:
+        if camera not in self.matrices:
+            raise InputError(f"{self.path}: expected a line `P{camera}:` and 12 numbers, found none.")
+        return self.matrices[camera]
 
 
 def _calibration(projections: Projections, left: int, shape: tuple[int, int]) -> Calibration:
     fx, fy, cx, cy = projections.intrinsics(left)
     height, width = shape
     if not (0.0 < cx < width and 0.0 < cy < height):
-        problem = (
-            f"the centre of projection ({cx:.6g}, {cy:.6g}) px lies outside the images of {width}x{height} px"
-        )
+        centre = f"the centre of projection ({cx:.6g}, {cy:.6g}) px"
+        problem = f"{centre} lies outside the images of {width}x{height} px"
         raise InputError(f"{projections.path}: {problem}; give the calibration of these images.")
     return Calibration(str(projections.path), Pinhole(width, height, fx, fy, cx, cy))
 
 
 def _files(folder: Path, count: int) -> list[Path]:
-    found = {int(file.stem): file for file in folder.iterdir() if _numbered(file)}
+    found = {
+        int(file.stem): file
+        for file in folder.iterdir()
+        if file.suffix.lower() in SUFFIXES and file.stem.isascii() and file.stem.isdigit()
+    }
     if found and max(found) >= count:
         problem = f"found image {max(found)} but {count} times in times.txt"
         raise InputError(f"{folder}: {problem}, expected one time per image; copy both from one sequence.")
     return [found.get(i, folder / f"{i:06d}.png") for i in range(count)]
 
 
-def _numbered(file: Path) -> bool:
-    return file.suffix.lower() in SUFFIXES and file.stem.isascii() and file.stem.isdigit()
-
-
 def _read_truth(path: Path, first_from_camera: Array, stamps_ns: np.ndarray) -> CameraTruth | None:
     folder = path.resolve()
     for file in (path / "poses.txt", folder.parent.parent / "poses" / f"{folder.name}.txt"):
-        if file.exists():
-            return CameraTruth(stamps_ns, SE3.compose(_read_poses(file, len(stamps_ns)), first_from_camera))
+        if not file.exists():
+            continue
+        table = read_columns(file, _POSE)
+        if len(table.lines) != len(stamps_ns):
+            problem = f"expected {len(stamps_ns)} poses, one per time in times.txt, found {len(table.lines)}"
+            raise InputError(f"{file}: {problem}; copy both from one sequence.")
+        matrices = table.values.reshape(-1, 3, 4)
+        for row, matrix in enumerate(matrices):
+            if (wrong := rigid_motion_error(matrix)) is not None:
+                raise table.error(row, wrong)
+        return CameraTruth(stamps_ns, SE3.compose(pose_of_matrix(matrices), first_from_camera))
     return None
-
-
-def _read_poses(file: Path, count: int) -> Array:
-    table = read_columns(file, _POSE)
-    if len(table.lines) != count:
-        problem = f"expected {count} poses, one per time in times.txt, found {len(table.lines)}"
-        raise InputError(f"{file}: {problem}; copy both from one sequence.")
-    matrices = table.values.reshape(-1, 3, 4)
-    for row, matrix in enumerate(matrices):
-        if (wrong := rigid_motion_error(matrix)) is not None:
-            raise table.error(row, wrong)
-    return pose_of_matrix(matrices)

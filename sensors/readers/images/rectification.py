@@ -1,8 +1,8 @@
-"""Images of two cameras that see alike, made into those of a rectified pair (OpenCV's `stereoRectify`).
+"""Two cameras side by side: which images belong together, and images made into those of a rectified pair.
 
-Without fisheye lenses the rectified image is as wide as the given ones allow. One as wide as a fisheye's would have a
-small middle and borders drawn out: there the focal length stays what it is in the middle, and what then lies outside is
-left out. A lens of 140° on images 640 px wide, f = 262 px, leaves 101°.
+Images are rectified by OpenCV's `stereoRectify`. Without fisheye lenses the rectified image is as wide as the given ones
+allow. One as wide as a fisheye's would have a small middle and borders drawn out: there the focal length stays what it is
+in the middle, and what then lies outside is left out. A lens of 140° on images 640 px wide, f = 262 px, leaves 101°.
 """
 
 from collections.abc import Iterator
@@ -21,6 +21,12 @@ BESIDE = 0.7
 
 OUTSIDE = -10.0
 """A column and a row that no image has: what is drawn from there is black."""
+
+ALIKE_PX = 1e-2
+"""How far intrinsics of a rectified pair may differ: rounding, and no more than an image can show."""
+
+ROTATED_RAD, ASIDE = 1e-4, 1e-2
+"""How far the axes of a rectified pair may be rotated, and how far off the rows the baseline may point, relative to it."""
 
 
 @final
@@ -151,3 +157,69 @@ def _moved(image: np.ndarray, maps: tuple[np.ndarray, np.ndarray]) -> np.ndarray
     import cv2
 
     return np.asarray(cv2.remap(image, *maps, cv2.INTER_LINEAR))
+
+
+def pair_stamps(
+    left_ns: np.ndarray, right_ns: np.ndarray, tolerance_s: float, where: str
+) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
+    """Pairs of images, each the other's nearest in time, in order of time.
+
+    Args:
+        left_ns: (T,) int64 times of the left camera, in order.
+        right_ns: (U,) of the right one.
+        tolerance_s: largest difference.
+        where: the recording, for messages.
+
+    Returns:
+        Rows (P,) of the left and (P,) of the right camera, and a sentence about each camera whose images are left out.
+
+    Raises:
+        InputError: no two images are near enough.
+    """
+    nearest, gap_ns = _nearest(left_ns, right_ns)
+    back, _ = _nearest(right_ns, left_ns)
+    # Of equal times the first counts for all: go there and back by time, not by row.
+    mutual = left_ns[back[nearest]] == left_ns
+    left = np.flatnonzero(mutual & (gap_ns <= round(tolerance_s * 1e9)))
+    left = left[np.unique(nearest[left], return_index=True)[1]]
+    right = nearest[left]
+    if not left.size:
+        least = f"the nearest two are {gap_ns.min() * 1e-9:.6f} s apart"
+        action = "put both on one clock, or give a larger tolerance"
+        raise InputError(
+            f"{where}: no left and right image were taken within {tolerance_s:g} s, {least}; {action}."
+        )
+    notes = [
+        f"{where}: {stamps.size - left.size} of {stamps.size} {side} images have no partner within {tolerance_s:g} s "
+        "and are left out."
+        for side, stamps in (("left", left_ns), ("right", right_ns))
+        if stamps.size > left.size
+    ]
+    return left, right, tuple(notes)
+
+
+def _nearest(stamps_ns: np.ndarray, among_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Row (T,) of the nearest time, the earlier of two, and its distance (T,) in ns."""
+    after = np.clip(np.searchsorted(among_ns, stamps_ns), 0, among_ns.size - 1)
+    before = np.maximum(after - 1, 0)
+    gap_before, gap_after = np.abs(stamps_ns - among_ns[before]), np.abs(stamps_ns - among_ns[after])
+    return np.where(gap_before <= gap_after, before, after), np.minimum(gap_before, gap_after)
+
+
+def rectified_baseline(left: Pinhole, right: Pinhole, left_from_right: Array) -> float | None:
+    """Distance [m] of the cameras of a rectified pair; None where they are not one.
+
+    They are if both have one size and one set of intrinsics, no distortion and equal axes, and the right one lies to the
+    right of the left one along the rows.
+    """
+    if (left.width, left.height) != (right.width, right.height):
+        return None
+    if not (left.lens.is_identity and right.lens.is_identity):
+        return None
+    if np.abs(left.params - right.params).max() > ALIKE_PX:
+        return None
+    along, *across = SE3.translation(left_from_right)
+    rotated = np.linalg.norm(SE3.log(left_from_right)[:3])
+    if rotated > ROTATED_RAD or along <= 0.0 or np.linalg.norm(across) > ASIDE * along:
+        return None
+    return float(along)

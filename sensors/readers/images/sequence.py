@@ -3,17 +3,22 @@
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Self, final
 
 import numpy as np
 
 from rbpf.errors import InputError
-from rbpf.sensors.camera import Pinhole
+from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.feature_log import CameraTruth
+
+TOLERANCE_S = 0.005
+"""Two images whose times differ by no more were taken together."""
 
 
 @dataclass(frozen=True)
 class ImageFrame:
-    """One image, or the place of one that could not be read.
+    """One image or a pair, or the place of one that could not be read.
 
     Attributes:
         stamp_ns: time of the image, integer nanoseconds.
@@ -36,9 +41,12 @@ class Source(ABC):
         """Images from number `start` on, each decoded when it is needed or shortly before."""
 
 
+@final
 @dataclass(frozen=True)
 class ImageSequence:
-    """A recording of a camera; nothing of it but its first image is decoded before `frames` is called.
+    """A recording of a camera or of a rectified stereo pair.
+
+    Nothing of it but its first image is decoded before `frames` is called.
 
     Attributes:
         name: short name of the recording.
@@ -47,9 +55,11 @@ class ImageSequence:
         truth: world_from_camera of the (left) camera at its own stamps, without landmarks; None where unknown.
         baseline_m: of a rectified stereo pair, None where there is one camera.
         source: where the images come from.
+        notes: one sentence for each thing that was left out or changed.
 
     Raises:
-        InputError: the stamps are no whole numbers, or one is before the one it follows.
+        InputError: the stamps are no whole numbers, or one is before the one it follows; the camera of a pair is distorted,
+            or its baseline is not positive.
     """
 
     name: str
@@ -58,9 +68,12 @@ class ImageSequence:
     truth: CameraTruth | None
     baseline_m: float | None
     source: Source
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Checks the stamps: a sequence may be made by hand."""
+        """A sequence may be made by hand."""
+        if self.baseline_m is not None:
+            RectifiedStereo(self.camera, self.baseline_m)
         stamps = np.asarray(self.stamps_ns)
         if stamps.ndim != 1 or stamps.dtype.kind not in "iu":
             raise InputError(
@@ -72,11 +85,24 @@ class ImageSequence:
     def __len__(self) -> int:
         return len(self.stamps_ns)
 
-    def frames(self, start: int = 0) -> Iterator[ImageFrame]:
-        """Images in order of time.
+    @property
+    def rig(self) -> RectifiedStereo:
+        """The two cameras of a stereo sequence.
 
-        A frame that cannot be read comes without an image and with the problem. A video that ends before its last
-        announced image ends with such a frame.
+        Raises:
+            InputError: there is one camera.
+        """
+        if self.baseline_m is None:
+            raise InputError(
+                f"{self.name}: a sequence of one camera has no stereo rig; open it by open_stereo"
+            )
+        return RectifiedStereo(self.camera, self.baseline_m)
+
+    def frames(self, start: int = 0) -> Iterator[ImageFrame]:
+        """Images, or pairs of one size, in order of time.
+
+        A frame of which an image cannot be read comes without that image and with the problem. A video that ends before
+        its last announced image ends with such a frame.
 
         Args:
             start: number of the first image, from 0.
@@ -87,3 +113,90 @@ class ImageSequence:
         if not 0 <= start < len(self):
             raise InputError(f"{self.name}: expected a start from 0 to {len(self) - 1}, got {start}.")
         return self.source.frames(start)
+
+
+@final
+@dataclass(frozen=True)
+class Topics:
+    """Names of streams in a recording that holds several, as a ROS bag does.
+
+    Attributes:
+        images: one, or a left and a right one; empty where the recording is to be asked.
+        truth: the stream of the camera's true poses; None for none.
+    """
+
+    images: tuple[str, ...] = ()
+    truth: str | None = None
+
+    @classmethod
+    def parse(cls, images: str | None = None, truth: str | None = None) -> Self:
+        """The topics of a command line or a run's config.yaml.
+
+        Args:
+            images: one name, or two with a comma between them.
+            truth: one name.
+
+        Raises:
+            InputError: there are more than two, or a name is empty.
+        """
+        names = () if images is None else tuple(name.strip() for name in images.split(","))
+        if len(names) > 2 or not all(names) or truth == "":
+            raise InputError(
+                f"expected the name of an image topic, or two as LEFT,RIGHT, got {images!r} and truth {truth!r}"
+            )
+        return cls(names, truth)
+
+    def entries(self) -> dict[str, str]:
+        """For a run's config.yaml; what `parse` takes."""
+        named = {"image_topic": ",".join(self.images), "truth_topic": self.truth}
+        return {name: value for name, value in named.items() if value}
+
+
+UNNAMED = Topics()
+
+
+@final
+@dataclass(frozen=True)
+class ReadOptions:
+    """What a caller may say about a recording.
+
+    Attributes:
+        calibration: a `camera.yaml` in place of the recording's own calibration; None for that.
+        topics: of a ROS bag, where they have to be named.
+        tolerance_s: images of two cameras whose times differ by no more belong together.
+    """
+
+    calibration: Path | None = None
+    topics: Topics = UNNAMED
+    tolerance_s: float = TOLERANCE_S
+
+
+class ImageFormat(ABC):
+    """A format of image sequences; `rbpf.sensors.readers.formats` lists all of them."""
+
+    kind: str
+    """What it is and which files make it, for messages."""
+    stereo_kind: str = ""
+    """The same of a recording of two cameras; empty where the format has one camera only."""
+    has_topics: bool = False
+    """Whether streams in it have names."""
+
+    @abstractmethod
+    def recognises(self, path: Path) -> bool:
+        """Whether a file or folder is meant to be a sequence of this format."""
+
+    @abstractmethod
+    def read(self, path: Path, options: ReadOptions) -> ImageSequence:
+        """Open the images of one camera, the left one of two.
+
+        Raises:
+            InputError: a file is missing or not as the format's module describes.
+        """
+
+    def read_stereo(self, path: Path, options: ReadOptions) -> ImageSequence:
+        """Open the images of two cameras, rectified; overridden where there is a `stereo_kind`.
+
+        Raises:
+            InputError: as `read`, or the two cameras are not one pair.
+        """
+        raise NotImplementedError

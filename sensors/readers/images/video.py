@@ -9,23 +9,52 @@ from collections.abc import Generator, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, final
 
 import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.sensors.readers.images.calibration import find_calibration
-from rbpf.sensors.readers.images.decoding import UnreadableImageError, require_shape, to_grey
-from rbpf.sensors.readers.images.files import decode_ahead
-from rbpf.sensors.readers.images.folder import DEFAULT_RATE_HZ, evenly
-from rbpf.sensors.readers.images.sequence import ImageFrame, ImageSequence, Source
+from rbpf.sensors.readers.images.decoding import (
+    Grey,
+    UnreadableImageError,
+    decode_ahead,
+    read_grey,
+    require_shape,
+    to_grey,
+)
+from rbpf.sensors.readers.images.folders import DEFAULT_RATE_HZ, evenly, list_images
+from rbpf.sensors.readers.images.sequence import ImageFormat, ImageFrame, ImageSequence, ReadOptions, Source
 
 SUFFIXES = frozenset(
     {".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts", ".ogv", ".webm", ".wmv", ".y4m"}
 )
-KIND = "a video file (.mp4, .avi, .mkv, .mov, .webm, ...) with a camera.yaml beside it"
 
 _ACTION = "convert it, or copy it again if its end is missing"
+
+
+@final
+class Video(ImageFormat):
+    """Video files."""
+
+    kind = "a video file (.mp4, .avi, .mkv, .mov, .webm, ...) with a camera.yaml beside it"
+
+    def recognises(self, path: Path) -> bool:
+        return path.is_file() and path.suffix.lower() in SUFFIXES
+
+    def read(self, path: Path, options: ReadOptions) -> ImageSequence:
+        camera = find_calibration(path.parent, options.calibration)
+        count, rate_hz, shape = video_header(path)
+        camera.require_shape(shape, str(path))
+        stamps_ns = evenly(count, camera.rate_hz or rate_hz or DEFAULT_RATE_HZ)
+        return ImageSequence(
+            name=path.stem,
+            camera=camera.camera,
+            stamps_ns=stamps_ns,
+            truth=None,
+            baseline_m=None,
+            source=VideoImages(path, stamps_ns, shape),
+        )
 
 
 @dataclass(frozen=True)
@@ -68,37 +97,8 @@ class VideoImages(Source):
             return ImageFrame(stamp, None, problem=str(error))
 
 
-def recognises(path: Path) -> bool:
-    """Whether the path is a file with the ending of a video."""
-    return path.is_file() and path.suffix.lower() in SUFFIXES
-
-
-def read(path: Path, calibration: Path | None) -> ImageSequence:
-    """Open the video.
-
-    Args:
-        path: the file.
-        calibration: a camera file in place of the one beside it.
-
-    Raises:
-        InputError: the video cannot be decoded, or the camera file is missing or does not fit.
-    """
-    camera = find_calibration(path.parent, calibration)
-    count, rate_hz, shape = video_header(path)
-    camera.require_shape(shape, str(path))
-    stamps_ns = evenly(count, camera.rate_hz or rate_hz or DEFAULT_RATE_HZ)
-    return ImageSequence(
-        name=path.stem,
-        camera=camera.camera,
-        stamps_ns=stamps_ns,
-        truth=None,
-        baseline_m=None,
-        source=VideoImages(path, stamps_ns, shape),
-    )
-
-
 def video_header(path: Path) -> tuple[int, float, tuple[int, int]]:
-    """Number of images, their rate [Hz] or 0 where it is not told, height and width.
+    """Number of images, their rate [Hz] or 0 where it is not given, height and width.
 
     Raises:
         InputError: no image can be decoded.
@@ -135,3 +135,59 @@ def opened(path: Path) -> Iterator[Any]:
         yield capture
     finally:
         capture.release()
+
+
+class NamedImage(NamedTuple):
+    """An image (H, W) of a camera that is not known yet, and what it is called in messages."""
+
+    name: str
+    image: Grey
+
+
+def read_uncalibrated(path: Path, most: int) -> tuple[int, Iterator[NamedImage]]:
+    """Up to `most` images, evenly spread, of a folder or a video; those that cannot be read are left out.
+
+    Args:
+        path: folder with images in it or in its `images`, or a video.
+        most: images that are decoded.
+
+    Returns:
+        How many there will be at most, and the images.
+
+    Raises:
+        InputError: there is nothing of that name, or no image in it.
+    """
+    video = path.is_file() and path.suffix.lower() in SUFFIXES
+    if not (video or path.is_dir()):
+        found = "is neither a folder nor a video" if path.exists() else "no such file or folder"
+        raise InputError(
+            f"{path}: {found}; expected a folder of images, or a video ({', '.join(sorted(SUFFIXES))})"
+        )
+    files = [] if video else list_images(path)
+    if not (video or files):
+        raise InputError(f"{path}: expected images in it or in its images/, found none")
+    count = video_header(path)[0] if video else len(files)
+    chosen = np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
+    if video:
+        return len(chosen), _of_video(path, set(chosen.tolist()))
+    return len(chosen), _of_files([files[k] for k in chosen])
+
+
+def _of_files(files: list[Path]) -> Iterator[NamedImage]:
+    for file in files:
+        try:
+            image = read_grey(file)
+        except UnreadableImageError:
+            continue
+        yield NamedImage(file.name, image)
+
+
+def _of_video(path: Path, chosen: set[int]) -> Iterator[NamedImage]:
+    with opened(path) as capture:
+        for index in range(max(chosen) + 1):
+            if not capture.grab():
+                return
+            if index in chosen:
+                there, image = capture.retrieve()
+                if there:
+                    yield NamedImage(f"image {index}", to_grey(path, image))

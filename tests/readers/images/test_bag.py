@@ -6,7 +6,7 @@ from rosbags.rosbag1 import Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode
 
 from rbpf.errors import InputError
-from rbpf.sensors.readers.images import Topics, bag_file, open_images
+from rbpf.sensors.readers import Topics, bag_messages, open_images
 from tests.readers.images.bags import KINDS, SIZE, STAMPS_NS, recorded, write_bag, write_pair
 from tests.readers.images.folders import grey, levels, write_camera, write_plain
 
@@ -49,7 +49,7 @@ def test_a_chunk_that_unpacks_to_more_than_there_can_be_is_refused(tmp_path, mon
     with recorded(path, packed) as bag:
         bag.info("/camera_info")
         bag.image("/image_raw", 1, np.zeros((400, 600), np.uint8))
-    monkeypatch.setattr(bag_file, "MOST_BYTES", 2 * path.stat().st_size)
+    monkeypatch.setattr(bag_messages, "MOST_BYTES", 2 * path.stat().st_size)
     with pytest.raises(InputError, match="a chunk is cut off, or larger than"):
         open_images(path)
 

@@ -7,7 +7,7 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.sensors.readers.images import Topics, open_images, open_stereo
+from rbpf.sensors.readers import Topics, open_images, open_stereo
 from tests.readers.images.bags import KINDS, SIZE, STAMPS_NS, K, recorded, write_bag, write_pair
 from tests.readers.images.folders import grey, levels, write_camera
 
@@ -94,7 +94,7 @@ def test_a_rectified_pair_of_which_all_right_images_come_last(tmp_path, kind, na
     assert sequence.rig.camera.params.tolist() == [20.0, 21.0, 11.5, 7.5, 0, 0, 0, 0, 0, 0]
     assert sequence.stamps_ns.tolist() == list(STAMPS_NS)
     assert [int(frame.right[0, 0]) for frame in sequence.frames(1)] == [120, 130]
-    assert levels(sequence.pair) == [10, 20, 30]
+    assert levels(sequence) == [10, 20, 30]
 
 
 def test_images_without_a_partner_are_left_out(tmp_path):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rbpf.errors import InputError
-from rbpf.sensors.readers.images import decoding, files, open_images
+from rbpf.sensors.readers import decoding, open_images
 from tests.readers.images.folders import (
     HEIGHT,
     SIZE,
@@ -147,7 +147,7 @@ def test_nothing_but_what_is_needed_is_decoded(tmp_path):
         frames = sequence.frames()
         next(frames)
         frames.close()
-        assert decoded.call_count <= 1 + 1 + files.AHEAD
+        assert decoded.call_count <= 1 + 1 + decoding.AHEAD
 
 
 def test_images_are_decoded_while_the_caller_is_busy():
@@ -157,12 +157,12 @@ def test_images_are_decoded_while_the_caller_is_busy():
         begun.append(index)
         return index
 
-    frames = files.decode_ahead(load, range(20))
+    frames = decoding.decode_ahead(load, range(20))
     assert next(frames) == 0
     deadline = time.monotonic() + 10.0
-    while len(begun) < files.AHEAD and time.monotonic() < deadline:
+    while len(begun) < decoding.AHEAD and time.monotonic() < deadline:
         time.sleep(0.001)
-    assert files.AHEAD <= len(begun) <= files.AHEAD + 1
+    assert decoding.AHEAD <= len(begun) <= decoding.AHEAD + 1
     assert list(frames) == list(range(1, 20))
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.sensors.readers.images import open_images
+from rbpf.sensors.readers import open_images
 from tests.readers.images.folders import (
     CAM0,
     EUROC_NS,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rbpf.errors import InputError
-from rbpf.sensors.readers.images import read_known_points
+from rbpf.sensors.readers import read_known_points
 
 HEADER = "id,u_px,v_px,x_m,y_m,z_m,sigma_m"
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rbpf.errors import InputError
-from rbpf.sensors.readers.images import ImageSequence, open_images
+from rbpf.sensors.readers import ImageSequence, open_images
 
 
 def test_nothing_there(tmp_path):

@@ -3,7 +3,7 @@
 import pytest
 
 from rbpf.errors import InputError
-from rbpf.sensors.readers.images import open_images
+from rbpf.sensors.readers import open_images
 from tests.readers.images.folders import levels, write_camera, write_images
 
 CAMERAS = "# K fx fy cx cy width height\nK 20 21 11.5 7.5 24 16\nb.jpg 1 2 3 0 0 0 1\na.jpg 4 5 6 0 0 1 0\n"

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from rbpf.lie import SE3
-from rbpf.sensors.camera import RectifiedStereo
-from rbpf.sensors.readers.images import open_images, read_known_points
+from rbpf.sensors.readers import open_images, open_stereo, read_known_points
 
 pytestmark = pytest.mark.real_data
 
@@ -21,7 +20,7 @@ pytestmark = pytest.mark.real_data
     ],
 )
 def test_a_recording(data_dir, folder, count, size, baseline_m, poses):
-    sequence = open_images(data_dir / folder)
+    sequence = (open_images if baseline_m is None else open_stereo)(data_dir / folder)
     assert sequence.name == folder
     assert len(sequence) == count
     assert (sequence.camera.width, sequence.camera.height) == size
@@ -61,8 +60,8 @@ def test_the_truth_of_the_road_runs_along_the_optical_axis(data_dir):
 def test_a_point_of_the_left_image_is_to_the_left_in_the_right_one(data_dir, folder):
     import cv2
 
-    sequence = open_images(data_dir / folder)
-    rig = RectifiedStereo(sequence.camera, sequence.baseline_m)
+    sequence = open_stereo(data_dir / folder)
+    rig = sequence.rig
     frame = next(sequence.frames())
     corners = cv2.goodFeaturesToTrack(frame.image, 150, 0.02, 15)
     found, status, _ = cv2.calcOpticalFlowPyrLK(frame.image, frame.right, corners, None, winSize=(15, 15))

@@ -7,9 +7,9 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.sensors.readers.images import open_images, open_stereo
-from rbpf.sensors.readers.images.pairing import pair_stamps
-from rbpf.sensors.readers.images.stamped import StampedLines
+from rbpf.sensors.readers import open_images, open_stereo
+from rbpf.sensors.readers.images.rectification import pair_stamps
+from rbpf.sensors.readers.text import StampedLines
 from tests.readers.images.folders import (
     CAM0,
     EUROC_NS,
@@ -216,9 +216,11 @@ def test_a_given_calibration(tmp_path):
 
 
 def test_what_is_no_stereo_sequence(tmp_path):
-    with pytest.raises(InputError, match=r"expected an EuRoC sequence .* cam0 and cam1.*; or a KITTI"):
+    with pytest.raises(
+        InputError, match=r"expected a ROS bag.*; or an EuRoC sequence .* cam0 and cam1.*; or a KITTI"
+    ):
         open_stereo(write_plain(tmp_path / "a"))
-    with pytest.raises(InputError, match="no such folder"):
+    with pytest.raises(InputError, match="no such file or folder; expected a stereo sequence"):
         open_stereo(tmp_path / "b")
 
 
@@ -234,7 +236,7 @@ def test_a_pair_that_is_not_rectified_is_rectified(tmp_path):
     assert "not rectified; their images are" in sequence.notes[0]
     assert sequence.rig.baseline_m == pytest.approx(np.hypot(0.11, 0.002))
     assert not any(sequence.rig.camera.distortion)
-    assert sequence.pair.camera == sequence.rig.camera
+    assert sequence.camera == sequence.rig.camera
     frame = next(sequence.frames())
     assert frame.image.shape == frame.right.shape == (16, 24)
     # A rectified camera keeps its place and turns towards the baseline.

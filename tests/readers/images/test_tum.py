@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rbpf.errors import InputError
-from rbpf.sensors.readers.images import open_images
+from rbpf.sensors.readers import open_images
 from tests.readers.images.folders import CAMERA, levels, write_camera, write_tum
 
 

@@ -1,4 +1,4 @@
-"""Poses of the ground truth."""
+"""Poses as files write them, matrices or quaternions, and the ground truth that they make."""
 
 from pathlib import Path
 
@@ -7,11 +7,28 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
 from rbpf.sensors.feature_log import CameraTruth
-from rbpf.sensors.readers.images.stamped import read_stamped
-from rbpf.sensors.readers.table import Table
+from rbpf.sensors.readers.text import Table, read_stamped
+
+SKEWED = 0.02
+"""How far RᵀR may be from the identity: single precision and a few digits leave less, another meaning far more."""
 
 LONGEST = 0.01
 """How far a quaternion's length may be from 1 in a file; it is then scaled to 1."""
+
+
+def rigid_motion_error(matrix: Array) -> str | None:
+    """What a matrix (3, 4) or (4, 4) lacks to be a rigid motion; None where it is one."""
+    rotation = matrix[:3, :3]
+    if np.abs(rotation.T @ rotation - np.eye(3)).max() > SKEWED or np.linalg.det(rotation) < 0.0:
+        return "expected a rotation in the first three rows and columns, found a matrix that is none"
+    if len(matrix) == 4 and np.any(matrix[3] != [0.0, 0.0, 0.0, 1.0]):
+        return "expected the last row of the matrix to be 0 0 0 1"
+    return None
+
+
+def pose_of_matrix(matrix: Array) -> Array:
+    """Pose (..., 7) of a rigid motion (..., 3, 4) or (..., 4, 4); its rotation is made exact."""
+    return SE3.normalise(SE3.from_matrix(matrix))
 
 
 def normalised(table: Table, world_from_body: Array) -> Array:

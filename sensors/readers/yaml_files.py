@@ -1,15 +1,17 @@
-"""YAML files of which every value knows its line."""
+"""YAML files of which every value knows its line; no tag of a file can construct anything that is not plain."""
 
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import yaml
 
 from rbpf.errors import InputError
-from rbpf.sensors.readers.table import parse_number
-from rbpf.sensors.readers.text import line_error, quoted, read_text
-from rbpf.sensors.readers.yaml_nodes import compose
+from rbpf.sensors.readers.text import line_error, parse_number, quoted, read_text
+
+MOST_BYTES = 1 << 20
+"""Settings and calibrations are a few kilobytes."""
 
 
 @dataclass(frozen=True)
@@ -19,7 +21,7 @@ class YamlValue:
     Attributes:
         path: the file.
         name: its key, for messages.
-        node: its text and line; no tag of the file can construct anything.
+        node: its text and line.
     """
 
     path: Path
@@ -30,31 +32,34 @@ class YamlValue:
         """Error that points at the value's line."""
         return line_error(self.path, self.node.start_mark.line + 1, problem)
 
-    def entries(self) -> dict[str, "YamlValue"]:
+    def entries(
+        self, required: Collection[str], optional: Collection[str] | None = None
+    ) -> dict[str, "YamlValue"]:
         """Values of a mapping by their keys.
 
+        Args:
+            required: keys that must be there.
+            optional: others that may be; None for any.
+
         Raises:
-            InputError: this is no mapping, or a key comes twice.
+            InputError: this is no mapping, a key comes twice or is missing, or there is another one.
         """
+        expected = f"expected the keys {', '.join(required)}"
         if not isinstance(self.node, yaml.MappingNode):
-            raise self.error(f"expected {self.name} to be a mapping such as `fx: 525`, found none")
+            raise self.error(f"{expected}, found no mapping such as `{next(iter(required))}: ...`")
         found: dict[str, YamlValue] = {}
         for key, node in self.node.value:
             name = YamlValue(self.path, "a key", key).text()
             if name in found:
                 raise YamlValue(self.path, name, key).error(f"{name} comes a second time, expected it once")
+            if optional is not None and name not in required and name not in optional:
+                others = f"; also known: {', '.join(optional)}" if optional else ""
+                raise YamlValue(self.path, name, key).error(f"{expected}{others}; found {quoted(name)}")
             found[name] = YamlValue(self.path, name, node)
-        return found
-
-    def require_keys(self, found: Collection[str], required: Collection[str]) -> None:
-        """Refuse a mapping in which a key is missing.
-
-        Raises:
-            InputError: names the key.
-        """
         for name in required:
             if name not in found:
-                raise self.error(f"expected the keys {', '.join(required)}, found no {name}")
+                raise self.error(f"{expected}, found no {name}")
+        return found
 
     def text(self) -> str:
         """A single value.
@@ -132,10 +137,40 @@ def read_yaml(path: Path, hint: str) -> YamlValue:
         hint: what is expected to lie there, for the message.
 
     Raises:
-        InputError: the file is missing, empty or no YAML.
+        InputError: the file is missing, too large, empty, or no YAML.
     """
-    text = read_text(path, hint)
+    text = read_text(path, hint, MOST_BYTES)
     if text.startswith("%YAML:"):
         # OpenCV writes this first line with a colon, which YAML does not have.
         text = "#" + text
-    return YamlValue(path, "the file", compose(path, text, hint))
+    try:
+        node = yaml.compose(text, Loader=yaml.SafeLoader)
+    except yaml.MarkedYAMLError as error:
+        line = error.problem_mark.line + 1 if error.problem_mark else 1
+        raise line_error(path, line, f"expected YAML, found a syntax error ({error.problem})") from None
+    except (yaml.YAMLError, RecursionError, ValueError, OverflowError):
+        raise InputError(f"{path}: expected YAML, found something else.") from None
+    if node is None:
+        raise InputError(f"{path}: expected {hint}, found only comments.")
+    return YamlValue(path, "the file", node)
+
+
+def read_plain_yaml(path: Path, hint: str = "settings") -> Any:
+    """What a YAML file says in plain values: mappings, lists, text, numbers, dates.
+
+    Raises:
+        InputError: as `read_yaml`, or the file refers to itself by aliases, has a tag that is not plain, or a value is
+            none of its type.
+    """
+    whole = read_yaml(path, hint)
+    text = read_text(path, hint, MOST_BYTES)
+    # A few nested aliases stand for more values than memory holds.
+    if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, yaml.SafeLoader)):
+        raise InputError(f"{path} has an alias (*name): write the values out")
+    try:
+        return yaml.SafeLoader("").construct_document(whole.node)
+    except yaml.MarkedYAMLError as error:
+        line = error.problem_mark.line + 1 if error.problem_mark else 1
+        raise line_error(path, line, f"expected plain values, found another tag ({error.problem})") from None
+    except (LookupError, TypeError, AttributeError, ArithmeticError, RecursionError, ValueError) as error:
+        raise InputError(f"{path} holds a value that is none of its type: {error}") from None

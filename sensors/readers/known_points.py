@@ -14,8 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from rbpf.errors import InputError
-from rbpf.sensors.readers.table import Table, parse_table
-from rbpf.sensors.readers.text import line_error, quoted, read_lines
+from rbpf.sensors.readers.text import Table, line_error, parse_table, quoted, read_lines
 
 COLUMNS = ("id", "u_px", "v_px", "x_m", "y_m", "z_m", "sigma_m")
 

@@ -1,0 +1,160 @@
+"""Recognises the format of a recording and opens it: another format is one file, and one line here."""
+
+import logging
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from rbpf.errors import InputError
+from rbpf.sensors.readers.images.bag import RosBag
+from rbpf.sensors.readers.images.euroc import Euroc
+from rbpf.sensors.readers.images.folders import Folder, Photos, SevenScenes, Tum
+from rbpf.sensors.readers.images.kitti import Kitti
+from rbpf.sensors.readers.images.sequence import (
+    TOLERANCE_S,
+    UNNAMED,
+    ImageFormat,
+    ImageSequence,
+    ReadOptions,
+    Topics,
+)
+from rbpf.sensors.readers.images.video import Video
+from rbpf.sensors.readers.mrclam import Mrclam
+from rbpf.sensors.readers.mrpt import Mrpt
+from rbpf.sensors.readers.robot_log import LogNoise, RobotLog, RobotLogFormat
+from rbpf.sensors.readers.text import quoted, read_bytes
+from rbpf.sensors.readers.victoria_park import VictoriaPark
+
+ROBOT_LOGS: tuple[RobotLogFormat, ...] = (Mrpt(), Mrclam(), VictoriaPark())
+"""The first that recognises a recording reads it."""
+
+IMAGES: tuple[ImageFormat, ...] = (
+    RosBag(),
+    Tum(),
+    Euroc(),
+    Kitti(),
+    SevenScenes(),
+    Photos(),
+    Video(),
+    Folder(),
+)
+"""The first that recognises a recording reads it."""
+
+_log = logging.getLogger(__name__)
+
+
+def open_log(path: str | Path, noise: LogNoise | None = None) -> RobotLog:
+    """Read a robot log of any known format: MRPT, MRCLAM or a graph such as Victoria Park.
+
+    The modules of the readers describe the formats.
+
+    Args:
+        path: the log's folder or file.
+        noise: standard deviations to use in place of the log's.
+
+    Raises:
+        InputError: nothing is there, it is of no known format, or a file of it is malformed.
+    """
+    path = _existing(path, "a robot log")
+    for one in ROBOT_LOGS:
+        if one.recognises(path):
+            return one.read(path, noise or LogNoise())
+    raise InputError(f"{path}: found {_content(path, first_line=True)}, expected {_kinds(ROBOT_LOGS)}.")
+
+
+def open_images(
+    path: str | Path, calibration: str | Path | None = None, topics: Topics = UNNAMED
+) -> ImageSequence:
+    """Open the images of one camera, in any known format; the modules of the readers describe the formats.
+
+    Args:
+        path: the sequence's folder, a video, or a ROS bag.
+        calibration: a `camera.yaml` to use in place of the sequence's own camera.
+        topics: of a ROS bag, where they have to be named.
+
+    Returns:
+        The sequence, of which only the first image has been decoded; of two cameras the left one.
+
+    Raises:
+        InputError: nothing is there, it is of no known format, no image of it can be read, or another of its files
+            is malformed; a topic is named that is not there.
+    """
+    options = ReadOptions(None if calibration is None else Path(calibration), topics)
+    return _opened(_existing(path, "an image sequence"), IMAGES, options, lambda one: one.read)
+
+
+def open_stereo(
+    path: str | Path,
+    calibration: str | Path | None = None,
+    tolerance_s: float = TOLERANCE_S,
+    topics: Topics = UNNAMED,
+) -> ImageSequence:
+    """Open the images of two cameras side by side: EuRoC ASL (`cam0`, `cam1`), KITTI (`image_0`, `image_1`), ROS bags.
+
+    Images of EuRoC and of bags are paired by their times; what has no partner is left out, which `notes` says. Images
+    that are not rectified become so by the two `sensor.yaml` or CameraInfo; the truth is then that of the rectified left
+    camera. KITTI's images are rectified and have numbers: one that is missing on either side is a pair with a problem.
+
+    Args:
+        path: its folder, or a ROS bag.
+        calibration: a `camera.yaml` of the rectified left camera, in place of the sequence's own calibration; with
+            `baseline_m`, in place of its baseline, too.
+        tolerance_s: images of two cameras whose times differ by no more belong together; KITTI's have numbers.
+        topics: of a ROS bag, where they have to be named.
+
+    Raises:
+        InputError: nothing is there, or it is no stereo sequence; a file is missing or malformed; no two images
+            belong together; the two cameras' images differ in size; the baseline is zero, or the right camera is not
+            to the right of the left one.
+    """
+    options = ReadOptions(None if calibration is None else Path(calibration), topics, tolerance_s)
+    formats = tuple(one for one in IMAGES if one.stereo_kind)
+    sequence = _opened(_existing(path, "a stereo sequence"), formats, options, lambda one: one.read_stereo)
+    for note in sequence.notes:
+        _log.warning("%s", note)
+    return sequence
+
+
+def _opened(
+    path: Path,
+    formats: tuple[ImageFormat, ...],
+    options: ReadOptions,
+    way: Callable[[ImageFormat], Callable[[Path, ReadOptions], ImageSequence]],
+) -> ImageSequence:
+    for one in formats:
+        if not one.recognises(path):
+            continue
+        if not one.has_topics and (given := options.topics.entries()):
+            name, value = next(iter(given.items()))
+            problem = f"{name.replace('_', ' ')} {value} is given, but only ROS bags have topics"
+            raise InputError(f"{path}: {problem}; leave it out.")
+        return way(one)(path, options)
+    stereo = formats is not IMAGES
+    kinds = "; or ".join(one.stereo_kind if stereo else one.kind for one in formats)
+    raise InputError(f"{path}: found {_content(path)}, expected {kinds}.")
+
+
+def _kinds(formats: Iterable[RobotLogFormat]) -> str:
+    return "; or ".join(one.kind for one in formats)
+
+
+def _existing(path: str | Path, what: str) -> Path:
+    path = Path(path)
+    try:
+        path.stat()
+    except (OSError, ValueError) as error:
+        reason = "no such file or folder" if isinstance(error, FileNotFoundError) else str(error)
+        raise InputError(f"{path}: {reason}; expected {what}.") from None
+    return path
+
+
+def _content(path: Path, first_line: bool = False) -> str:
+    """What is at a path that no format recognises."""
+    if path.is_dir():
+        names = sorted(entry.name for entry in path.iterdir())
+        if not names:
+            return "an empty folder"
+        return f"a folder with {', '.join(names[:5])}{' and more' if len(names) > 5 else ''}"
+    if first_line:
+        first = read_bytes(path)[:80].decode(errors="replace").split("\n")[0]
+        return f"a file that begins with {quoted(first)}" if first else "an empty file"
+    return f"a file that ends in {path.suffix!r}" if path.suffix else "a file"

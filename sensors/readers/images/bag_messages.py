@@ -1,0 +1,388 @@
+"""What is read of ROS bags: ROS 1 (`.bag`), and ROS 2 (a folder with `metadata.yaml`, `.mcap`, `.db3`).
+
+The library `rosbags` reads the containers. The messages that are read here have one standard definition per ROS
+version, which the library brings along: definitions that a bag carries are never compiled, so that nothing of a bag
+runs.
+
+- Images: sensor_msgs Image and CompressedImage, in the encodings of `sensor_msgs/image_encodings`: grey and colour of 8
+  bits, grey of 16, and the Bayer patterns. What a message claims is compared with its bytes before anything is made of it.
+- Cameras: sensor_msgs CameraInfo; K, D and the size. Where the last part of the topic's name says that the images are
+  rectified (`image_rect`, `image_rect_color`), which is all that a bag says about it, the camera is that of P, without
+  distortion. Of two cameras, R and P say where they are.
+- True poses: geometry_msgs PoseStamped, PoseWithCovarianceStamped, TransformStamped, nav_msgs Odometry. They are taken as
+  world_from_camera, of the camera's optical frame (x to the right, y down, z ahead). A bag whose poses are those of another
+  frame, such as `base_link`, has to be converted first; where its names show that, a logged message says so.
+"""
+
+import bz2
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from functools import partial
+from operator import attrgetter
+from pathlib import Path
+from struct import Struct
+from typing import Any, final
+
+import numpy as np
+
+from rbpf.errors import InputError
+from rbpf.lie import SE3, Array
+from rbpf.sensors.camera import Pinhole
+from rbpf.sensors.feature_log import CameraTruth
+from rbpf.sensors.readers.images.calibration import Calibration
+from rbpf.sensors.readers.images.decoding import Grey, UnreadableImageError, decode, to_grey
+from rbpf.sensors.readers.images.poses import LONGEST, pose_of_matrix, rigid_motion_error, truth_between
+
+SUFFIXES = frozenset({".bag", ".mcap", ".db3"})
+
+MOST_BYTES = 1 << 30
+"""No chunk of a bag is larger once it is unpacked."""
+
+IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+
+_LITTLE, _BIG = Struct("<4xII"), Struct(">4xII")
+"""Where a message begins with a header: after four bytes, in both versions of ROS, seconds and nanoseconds."""
+
+_LAYOUTS = {
+    "mono8": (1, np.uint8, None),
+    "8UC1": (1, np.uint8, None),
+    "mono16": (1, np.uint16, None),
+    "bgr8": (3, np.uint8, "COLOR_BGR2GRAY"),
+    "rgb8": (3, np.uint8, "COLOR_RGB2GRAY"),
+    "bgra8": (4, np.uint8, "COLOR_BGRA2GRAY"),
+    "rgba8": (4, np.uint8, "COLOR_RGBA2GRAY"),
+    **{
+        f"bayer_{pattern}{bits}": (1, kind, f"COLOR_Bayer{pattern.upper()}2GRAY")
+        for pattern in ("rggb", "bggr", "gbrg", "grbg")
+        for bits, kind in ((8, np.uint8), (16, np.uint16))
+    },
+}
+"""Encoding to channels, type of their values, and OpenCV's way to grey, None where it is grey."""
+
+_RADIAL_TANGENTIAL = "plumb_bob", "rational_polynomial"
+"""Models of distortion that begin with k1, k2, p1, p2, k3; the second one goes on with what must be zero."""
+
+_EQUIDISTANT = "equidistant", "fisheye"
+"""Models with k1, k2, k3, k4: ROS's name and OpenCV's."""
+
+_POSES = {
+    "geometry_msgs/msg/PoseStamped": "pose",
+    "geometry_msgs/msg/PoseWithCovarianceStamped": "pose.pose",
+    "nav_msgs/msg/Odometry": "pose.pose",
+    "geometry_msgs/msg/TransformStamped": "transform",
+}
+"""Where a message holds its pose."""
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class RawMessage:
+    """A message as it lies in the bag.
+
+    Attributes:
+        type: of the message, such as sensor_msgs/msg/Image.
+        data: its bytes.
+        stamp_ns: time of its header.
+    """
+
+    type: str
+    data: bytes
+    stamp_ns: int
+
+
+@final
+class Bag:
+    """An open bag.
+
+    Args:
+        path: file or folder, for messages.
+        reader: the library's.
+        types: the library's, of the bag's version of ROS.
+    """
+
+    def __init__(self, path: Path, reader: Any, types: Any) -> None:
+        self.path = path
+        self._reader, self._types = reader, types
+        self._ros1 = path.suffix == ".bag" and path.is_file()
+        # A file that was not summed up counts none at all.
+        counted = any(c.msgcount for c in reader.connections)
+        self.topics: dict[str, str] = {
+            c.topic: c.msgtype for c in reader.connections if c.msgcount or not counted
+        }
+        """Types of the topics that hold messages, by their names."""
+
+    @property
+    def name(self) -> str:
+        """Of the recording."""
+        whole = self.path.resolve()
+        return whole.stem if whole.is_file() else whole.name
+
+    def of_type(self, *types: str) -> list[str]:
+        """Topics of some types, in alphabetical order."""
+        return sorted(topic for topic, kind in self.topics.items() if kind in types)
+
+    def messages(self, topic: str) -> Iterator[RawMessage]:
+        """Messages of a topic in the order of the bag; those too short or too wrong to have a time are left out.
+
+        Raises:
+            InputError: the bag is damaged there.
+        """
+        chosen = [c for c in self._reader.connections if c.topic == topic]
+        with _refusing(self.path), closing(self._reader.messages(connections=chosen)) as found:
+            for connection, _, data in found:
+                layout = _LITTLE if self._ros1 or data[1:2] == b"\x01" else _BIG
+                if len(data) < layout.size:
+                    continue
+                seconds, nanoseconds = layout.unpack_from(data)
+                if nanoseconds < 10**9:
+                    yield RawMessage(connection.msgtype, data, int(seconds) * 10**9 + int(nanoseconds))
+
+    def message(self, raw: RawMessage) -> Any:
+        """The message with its fields by name.
+
+        Raises:
+            InputError: its bytes are no message of its type.
+        """
+        read = self._types.deserialize_ros1 if self._ros1 else self._types.deserialize_cdr
+        with _refusing(self.path):
+            return read(raw.data, raw.type)
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[Bag]:
+    """A bag, closed at the end.
+
+    Raises:
+        InputError: the library is missing, or the bag is cut off, damaged, or of another version.
+    """
+    try:
+        from rosbags import rosbag1, rosbag2
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError:
+        problem = "a ROS bag is read with the package rosbags, which is not installed"
+        raise InputError(f"{path}: {problem}: pip install 'rbpf[bags]'") from None
+    ros1 = path.suffix == ".bag" and path.is_file()
+    with _refusing(path):
+        reader: Any = rosbag1.Reader(path) if ros1 else rosbag2.Reader(path)
+        reader.open()
+    try:
+        if ros1:
+            # Packed chunks may unpack to no more than `MOST_BYTES`; the library itself takes what comes.
+            for place, chunk in reader.chunks.items():
+                if chunk.datasize > MOST_BYTES:
+                    raise InputError(f"{path}: a chunk claims to be larger than {MOST_BYTES >> 20} MiB.")
+                reader.chunks[place] = chunk._replace(decompressor=partial(_unpacked, chunk.decompressor))
+        yield Bag(path, reader, get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.LATEST))
+    finally:
+        reader.close()
+
+
+@contextmanager
+def _refusing(path: Path) -> Iterator[None]:
+    """What the library and its decompressors raise on damaged bytes, assertions among it, as one sentence."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        reason = " ".join((str(error) or type(error).__name__).split())[:200].rstrip(".")
+        action = "copy it again, or repair it with `rosbag reindex`, `ros2 bag reindex` or `mcap recover`"
+        raise InputError(f"{path}: the bag cannot be read ({reason}); {action}.") from None
+
+
+def _unpacked(unpack: Callable[[bytes], bytes], data: bytes) -> bytes:
+    from lz4.frame import LZ4FrameDecompressor
+
+    decompressor: Any
+    if data.startswith(b"BZh"):
+        decompressor = bz2.BZ2Decompressor()
+    elif data.startswith(b"\x04\x22\x4d\x18"):
+        decompressor = LZ4FrameDecompressor()
+    else:
+        return unpack(data)
+    unpacked = decompressor.decompress(data, MOST_BYTES)
+    if not decompressor.eof:
+        raise ValueError(f"a chunk is cut off, or larger than {MOST_BYTES >> 20} MiB")
+    return bytes(unpacked)
+
+
+def read_image(bag: Bag, raw: RawMessage, where: str) -> Grey:
+    """Image (H, W) of a message.
+
+    Args:
+        bag: from which it is.
+        raw: the message.
+        where: bag and topic, for messages.
+
+    Raises:
+        UnreadableImageError: it is damaged, or of an encoding that is not known.
+    """
+    import cv2
+
+    try:
+        message = bag.message(raw)
+    except InputError:
+        raise UnreadableImageError(f"{where}: a message is damaged.") from None
+    if raw.type == COMPRESSED:
+        return decode(where, np.asarray(message.data, np.uint8))
+    if message.encoding not in _LAYOUTS:
+        known = ", ".join(_LAYOUTS)
+        raise UnreadableImageError(
+            f"{where}: the encoding {message.encoding[:40]!r} is none of {known}; convert it."
+        )
+    channels, kind, conversion = _LAYOUTS[message.encoding]
+    width = message.width * channels * np.dtype(kind).itemsize
+    if not (message.height > 0 and 0 < width <= message.step):
+        raise UnreadableImageError(
+            f"{where}: {message.width}x{message.height} px in rows of {message.step} bytes."
+        )
+    if message.height * message.step != len(message.data):
+        expected = f"expected {message.height} rows of {message.step} bytes"
+        raise UnreadableImageError(f"{where}: {expected}, found {len(message.data)} bytes.")
+    rows = np.ascontiguousarray(message.data.reshape(message.height, message.step)[:, :width])
+    pixels = rows.view(np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")).astype(kind)
+    if channels > 1:
+        pixels = pixels.reshape(message.height, message.width, channels)
+    if conversion is not None:
+        pixels = np.asarray(cv2.cvtColor(pixels, getattr(cv2, conversion)))
+    return to_grey(where, pixels)
+
+
+@dataclass(frozen=True)
+class CameraInfo:
+    """A camera as its messages describe it.
+
+    Attributes:
+        calibration: the camera of the images as they are in the bag.
+        rotation: (3, 3) R, which rectifies the pair that it belongs to.
+        projection: (3, 4) P, of the camera after that rotation; its last column holds the baseline.
+        is_rectified: whether the images have been rotated so.
+    """
+
+    calibration: Calibration
+    rotation: Array
+    projection: Array
+    is_rectified: bool
+
+    @classmethod
+    def read(cls, bag: Bag, image_topic: str) -> "CameraInfo":
+        """The camera of a topic of images, from the first message about it.
+
+        Raises:
+            InputError: there is none, it is not calibrated, or its lens is of another kind.
+        """
+        named = image_topic.removesuffix("/compressed")
+        topic = f"{named.rpartition('/')[0]}/camera_info"
+        held = bag.of_type(CAMERA_INFO)
+        if topic not in held:
+            found = f"found {', '.join(held)}" if held else "found no sensor_msgs/CameraInfo"
+            raise InputError(
+                f"{bag.path}: expected the camera of {image_topic} in {topic}, {found}; give --calibration camera.yaml."
+            )
+        where = f"{bag.path}, {topic}"
+        raw = next(bag.messages(topic), None)
+        if raw is None:
+            raise InputError(f"{where}: no message can be read.")
+        message = bag.message(raw)
+        roi = message.roi
+        if max(message.binning_x, message.binning_y) > 1 or roi.x_offset or roi.y_offset:
+            problem = "the images are binned or a part of the sensor's, which K does not describe"
+            raise InputError(f"{where}: {problem}; give --calibration with the camera of these images.")
+        rotation, projection = _field(message, "R").reshape(3, 3), _field(message, "P").reshape(3, 4)
+        is_rectified = named.rpartition("/")[2].startswith("image_rect")
+        intrinsics = projection[:, :3] if is_rectified else _field(message, "K").reshape(3, 3)
+        fx, fy, cx, cy = intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+        if not (np.isfinite(intrinsics).all() and fx > 0.0 and fy > 0.0):
+            raise InputError(
+                f"{where}: the camera is not calibrated (fx {fx:g}, fy {fy:g}); give --calibration."
+            )
+        lens = {} if is_rectified else _lens(message, where)
+        try:
+            camera = Pinhole(message.width, message.height, fx, fy, cx, cy, **lens)
+        except InputError as error:
+            raise InputError(f"{where}: {error}; give --calibration.") from None
+        return cls(Calibration(where, camera), rotation, projection, is_rectified)
+
+    def rectified_from_camera(self) -> Array:
+        """R as a pose (7,).
+
+        Raises:
+            InputError: it is no rotation.
+        """
+        placed = np.column_stack([self.rotation, np.zeros(3)])
+        if not np.isfinite(placed).all() or rigid_motion_error(placed):
+            raise InputError(f"{self.calibration.where}: R is no rotation; calibrate the two as a pair.")
+        return pose_of_matrix(placed)
+
+    @property
+    def shift_m(self) -> float:
+        """How far to the right of the pair's left camera this one is, rectified; 0 where P does not say."""
+        fx, shift = self.projection[0, [0, 3]]
+        return float(-shift / fx) if fx > 0.0 and np.isfinite(shift) else 0.0
+
+
+def _field(message: Any, name: str) -> Array:
+    """Numbers that ROS 1 names with a capital letter and ROS 2 with a small one."""
+    return np.array(getattr(message, name if hasattr(message, name) else name.lower()), np.float64)
+
+
+def _lens(message: Any, where: str) -> dict[str, Any]:
+    """The camera's model of distortion and its coefficients."""
+    d, model = _field(message, "D").tolist(), message.distortion_model
+    if model in _EQUIDISTANT and len(d) == 4:
+        return {"distortion_model": "equidistant", "distortion": tuple(d)}
+    if (model in _RADIAL_TANGENTIAL or not (model or any(d))) and not any(d[5:]):
+        return {"distortion": (*d[:5], *[0.0] * 5)[:5]}
+    problem = f"the lens is {model[:40]!r} with {len(d)} coefficients"
+    expected = "expected plumb_bob with 4 or 5, or equidistant with 4"
+    raise InputError(f"{where}: {problem}, {expected}; rectify the images, or give --calibration.")
+
+
+def read_poses(bag: Bag, topic: str, images_ns: np.ndarray, camera_frame: str) -> CameraTruth:
+    """The truth that a topic holds.
+
+    Args:
+        bag: the open bag.
+        topic: of the poses.
+        images_ns: (T,) times of the images.
+        camera_frame: name of the images' frame, which the poses should be those of.
+
+    Raises:
+        InputError: there is no such topic, it holds no poses, they run backwards, or are of another clock.
+    """
+    kind = bag.topics.get(topic, "")
+    if kind not in _POSES:
+        held = bag.of_type(*_POSES)
+        found = f"found {', '.join(held)}" if held else "found none"
+        raise InputError(f"{bag.path}: expected poses in the topic {topic}, {found} with poses in the bag.")
+    where = f"{bag.path}, {topic}"
+    stamps, poses = list[int](), list[list[float]]()
+    for raw in bag.messages(topic):
+        message = bag.message(raw)
+        frame = getattr(message, "child_frame_id", "")
+        if not poses and frame and camera_frame and frame.strip("/") != camera_frame.strip("/"):
+            _log.warning(
+                "%s: the poses of %s are those of %s and are taken as those of the camera %s",
+                bag.path, topic, frame, camera_frame,
+            )  # fmt: skip
+        pose = attrgetter(_POSES[kind])(message)
+        turn = pose.orientation if hasattr(pose, "orientation") else pose.rotation
+        place = pose.position if hasattr(pose, "position") else pose.translation
+        stamps.append(raw.stamp_ns)
+        poses.append([turn.x, turn.y, turn.z, turn.w, place.x, place.y, place.z])
+    if not poses:
+        raise InputError(f"{where}: no pose can be read.")
+    stamps_ns, world_from_camera = np.array(stamps, np.int64), np.array(poses)
+    if (late := np.flatnonzero(np.diff(stamps_ns) < 0)).size:
+        raise InputError(f"{where}: the stamp of pose {late[0] + 1} is before the one it follows.")
+    length = np.linalg.norm(world_from_camera[:, :4], axis=1)
+    wrong = np.flatnonzero(~(np.abs(length - 1.0) <= LONGEST) | ~np.isfinite(world_from_camera).all(axis=1))
+    if wrong.size:
+        raise InputError(
+            f"{where}: pose {wrong[0]} has a quaternion of length {length[wrong[0]]:.6g}, expected 1."
+        )
+    return truth_between(bag.path, stamps_ns, SE3.normalise(world_from_camera), images_ns)

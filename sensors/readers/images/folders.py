@@ -1,0 +1,244 @@
+"""Images of one camera that lie in folders, and what beside them says when and from where they were taken.
+
+TUM RGB-D sequences (J. Sturm, N. Engelhard, F. Endres, W. Burgard, D. Cremers, "A benchmark for the evaluation of RGB-D
+SLAM systems", IROS 2012):
+
+- `rgb.txt`: time [s] and file of each image, `#` starting a comment;
+- `camera.yaml`: the calibration, which the distributed sequences do not bring along (`calibration` describes it);
+- `groundtruth.txt`, if the truth is known: `timestamp tx ty tz qx qy qz qw`, world_from_camera.
+
+7-Scenes sequences (J. Shotton, B. Glocker, C. Zach, S. Izadi, A. Criminisi, A. Fitzgibbon, "Scene coordinate regression
+forests for camera relocalization in RGB-D images", CVPR 2013):
+
+- `frame-000000.color.png`, ...: colour images, 30 per second, whose number is their time;
+- `frame-000000.pose.txt`, ...: 4 x 4 matrix by rows, world_from_camera [m], of the depth camera, which is taken as the
+  colour camera's. Where tracking was lost, numbers that are not finite, the truth has a gap;
+- `camera.yaml`, if the camera was calibrated. Else the nominal intrinsics of the colour camera, f = 525 px at 640 x 480;
+  the 585 px that some tools give are the depth camera's.
+
+Photos of one camera with measured poses, in `images`, and `cameras.txt`, `#` starting a comment:
+
+    K fx fy cx cy width height              # px, no distortion
+    0000.jpg tx ty tz qx qy qz qw           # world_from_camera [m], one line per photo
+
+Photos have no time: they are `1 / PHOTO_RATE_HZ` apart, in the order of their lines.
+
+Any other folder of images with a `camera.yaml`:
+
+- the images, in the folder itself or in its `images`, in the order of their names, numbers in them counted as such
+  (`2.png` before `10.png`);
+- `times.txt`, if the times are known: one per image [s]. Else the images are `rate_hz` of `camera.yaml` apart,
+  and without that a video's `DEFAULT_RATE_HZ`, which a logged message says;
+- `groundtruth.txt`, if the truth is known: as in a TUM RGB-D sequence.
+
+A camera file given replaces the recording's own.
+"""
+
+import logging
+import re
+from pathlib import Path
+from typing import final
+
+import numpy as np
+
+from rbpf.errors import InputError
+from rbpf.lie import Array
+from rbpf.sensors.camera import Pinhole
+from rbpf.sensors.feature_log import CameraTruth
+from rbpf.sensors.readers.images.calibration import NAME, Calibration, find_calibration, read_calibration
+from rbpf.sensors.readers.images.decoding import SUFFIXES, FileImages, first_shape
+from rbpf.sensors.readers.images.poses import (
+    normalised,
+    pose_of_matrix,
+    read_tum_truth,
+    rigid_motion_error,
+)
+from rbpf.sensors.readers.images.sequence import ImageFormat, ImageSequence, ReadOptions
+from rbpf.sensors.readers.text import line_error, parse_table, quoted, read_lines, read_stamped, read_text
+
+DEFAULT_RATE_HZ = 30.0
+SCENES_RATE_HZ = 30.0
+PHOTO_RATE_HZ = 1.0
+SCENES_CAMERA = Calibration("the nominal camera of 7-Scenes", Pinhole(640, 480, 525.0, 525.0, 320.0, 240.0))
+
+_SCENES_IMAGE = re.compile(r"frame-(\d+)\.color\.\w+", re.ASCII)
+_PHOTO_CAMERA = ("fx", "fy", "cx", "cy", "width", "height")
+_PHOTO_POSE = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
+_log = logging.getLogger(__name__)
+
+
+@final
+class Tum(ImageFormat):
+    """TUM RGB-D sequences."""
+
+    kind = "a TUM RGB-D sequence (rgb.txt, camera.yaml)"
+
+    def recognises(self, path: Path) -> bool:
+        return (path / "rgb.txt").is_file()
+
+    def read(self, path: Path, options: ReadOptions) -> ImageSequence:
+        rows = read_stamped(path / "rgb.txt", self.kind)
+        files = rows.files(path)
+        camera = find_calibration(path, options.calibration)
+        truth = read_tum_truth(path / "groundtruth.txt", rows.stamps_ns)
+        return _sequence(path, camera, rows.stamps_ns, files, truth, rows.path)
+
+
+@final
+class SevenScenes(ImageFormat):
+    """7-Scenes sequences."""
+
+    kind = "a 7-Scenes sequence (frame-000000.color.png, frame-000000.pose.txt, ...)"
+
+    def recognises(self, path: Path) -> bool:
+        found = path.glob("frame-*.color.*") if path.is_dir() else ()
+        return any(_SCENES_IMAGE.fullmatch(file.name) for file in found)
+
+    def read(self, path: Path, options: ReadOptions) -> ImageSequence:
+        by_number: dict[int, Path] = {}
+        for file in sorted(path.glob("frame-*.color.*")):
+            match = _SCENES_IMAGE.fullmatch(file.name)
+            if match and file.suffix.lower() in SUFFIXES:
+                number = int(match[1])
+                if number in by_number:
+                    both = f"found {by_number[number].name} and {file.name}"
+                    raise InputError(f"{path}: {both}, expected one image of each number.")
+                by_number[number] = file
+        numbers = sorted(by_number)
+        files = [by_number[number] for number in numbers]
+        known = options.calibration is not None or (path / NAME).is_file()
+        camera = find_calibration(path, options.calibration) if known else SCENES_CAMERA
+        stamps_ns = np.rint(np.array(numbers, dtype=np.int64) * (1e9 / SCENES_RATE_HZ)).astype(np.int64)
+        poses, kept = [], []
+        for stamp, file in zip(stamps_ns, files, strict=True):
+            pose_file = file.with_name(file.name.split(".")[0] + ".pose.txt")
+            pose = _scenes_pose(pose_file) if pose_file.exists() else None
+            if pose is not None:
+                poses.append(pose)
+                kept.append(stamp)
+        truth = CameraTruth(np.array(kept), np.array(poses)) if poses else None
+        return _sequence(path, camera, stamps_ns, files, truth)
+
+
+@final
+class Photos(ImageFormat):
+    """Photos of one camera with measured poses."""
+
+    kind = "photos with measured poses (cameras.txt, images/)"
+
+    def recognises(self, path: Path) -> bool:
+        return (path / "cameras.txt").is_file()
+
+    def read(self, path: Path, options: ReadOptions) -> ImageSequence:
+        file = path / "cameras.txt"
+        numbered = [(i, line.strip()) for i, line in enumerate(read_lines(file, self.kind), 1)]
+        rows = [(i, *line.partition(" ")[::2]) for i, line in numbered if line and not line.startswith("#")]
+        cameras = [(line, rest) for line, name, rest in rows if name == "K"]
+        if len(cameras) != 1:
+            expected = "expected one line `K fx fy cx cy width height`"
+            raise InputError(f"{file}: {expected}, found {len(cameras)}.")
+        given = options.calibration
+        camera = _photo_camera(file, *cameras[0]) if given is None else read_calibration(given)
+        photos = [row for row in rows if row[1] != "K"]
+        table = parse_table(file, _PHOTO_POSE, [(line, pose) for line, _, pose in photos])
+        stamps_ns = evenly(len(photos), PHOTO_RATE_HZ)
+        truth = CameraTruth(stamps_ns, normalised(table, np.roll(table.values, 4, axis=1)))
+        files = [path / "images" / name for _, name, _ in photos]
+        return _sequence(path, camera, stamps_ns, files, truth, file)
+
+
+@final
+class Folder(ImageFormat):
+    """A folder of images."""
+
+    kind = "a folder of images (in itself or in its images/) with a camera.yaml"
+
+    def recognises(self, path: Path) -> bool:
+        return path.is_dir() and ((path / NAME).is_file() or bool(list_images(path)))
+
+    def read(self, path: Path, options: ReadOptions) -> ImageSequence:
+        files = list_images(path)
+        if not files:
+            raise InputError(f"{path}: expected images in it or in its images/, found none.")
+        camera, times = find_calibration(path, options.calibration), path / "times.txt"
+        if times.exists():
+            rows = read_stamped(times, self.kind)
+            if len(rows.lines) != len(files):
+                expected = f"expected {len(files)} times, one per image"
+                raise InputError(f"{times}: {expected}, found {len(rows.lines)}.")
+            stamps_ns = rows.stamps_ns
+        else:
+            stamps_ns = evenly(len(files), camera.rate_hz or DEFAULT_RATE_HZ)
+            if camera.rate_hz is None:
+                _log.info(
+                    "%s: no times.txt and no rate_hz in %s, taken as %g Hz",
+                    path,
+                    camera.where,
+                    DEFAULT_RATE_HZ,
+                )
+        truth = read_tum_truth(path / "groundtruth.txt", stamps_ns)
+        return _sequence(path, camera, stamps_ns, files, truth)
+
+
+def list_images(path: Path) -> list[Path]:
+    """Images in the folder, or if there is none in its `images`, in the order of their names."""
+    for folder in (path, path / "images"):
+        if folder.is_dir():
+            found = [file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES]
+            if found:
+                return sorted(found, key=_natural)
+    return []
+
+
+def evenly(count: int, rate_hz: float) -> np.ndarray:
+    """(count,) int64 stamps from 0 at a rate."""
+    return np.rint(np.arange(count) * (1e9 / rate_hz)).astype(np.int64)
+
+
+def _sequence(
+    path: Path,
+    camera: Calibration,
+    stamps_ns: np.ndarray,
+    files: list[Path],
+    truth: CameraTruth | None,
+    listed: Path | None = None,
+) -> ImageSequence:
+    """Images in files of one size, which are listed in a file or lie in the folder."""
+    shape = first_shape(files, listed or path)
+    camera.require_shape(shape, str(path))
+    return ImageSequence(
+        name=path.resolve().name,
+        camera=camera.camera,
+        stamps_ns=stamps_ns,
+        truth=truth,
+        baseline_m=None,
+        source=FileImages(stamps_ns, shape, files),
+    )
+
+
+def _scenes_pose(path: Path) -> Array | None:
+    """Pose (7,) of a file; None where its numbers are not finite."""
+    fields = read_text(path, "a 4 x 4 matrix").split()
+    try:
+        matrix = np.array([float(field) for field in fields])
+    except ValueError:
+        raise InputError(f"{path}: expected 16 numbers, found {quoted(' '.join(fields))}.") from None
+    if len(matrix) != 16:
+        raise InputError(f"{path}: expected 16 numbers, found {len(matrix)}.")
+    if not np.isfinite(matrix).all():
+        return None
+    if (problem := rigid_motion_error(matrix.reshape(4, 4))) is not None:
+        raise InputError(f"{path}: {problem}.")
+    return pose_of_matrix(matrix.reshape(4, 4))
+
+
+def _photo_camera(file: Path, line: int, rest: str) -> Calibration:
+    fx, fy, cx, cy, width, height = parse_table(file, _PHOTO_CAMERA, [(line, rest)]).values[0].tolist()
+    if not (fx > 0.0 and fy > 0.0 and width > 0 and height > 0 and width % 1 == 0 and height % 1 == 0):
+        raise line_error(file, line, "expected positive fx and fy, and a whole positive width and height")
+    return Calibration(f"{file}, line {line}", Pinhole(int(width), int(height), fx, fy, cx, cy))
+
+
+def _natural(path: Path) -> tuple[list[str | int], str]:
+    parts = re.split(r"(\d+)", path.name)
+    return [int(part) if i % 2 else part for i, part in enumerate(parts)], path.name

@@ -1,0 +1,313 @@
+"""What every reader of a robot log returns: odometry, observations of landmarks and, where known, the truth.
+
+Below it stands what the readers of these logs share: the class of a format, noise that a caller puts in place of the
+log's, covariances as logs write them (upper triangles, in additive coordinates, rounded to a few digits), and frames
+from arrays.
+"""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Collection
+from dataclasses import dataclass, field, fields
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rbpf.errors import InputError
+from rbpf.lie import SE2, SE3, Array, SE2Group, SE3Group
+from rbpf.sensors.readers.text import LARGEST, Table
+
+_MAY_BE_ZERO = {"std_speed_mps", "std_turn_rate_radps", "scale_odometry"}
+
+_ROUNDING = 1e-5
+"""Of a covariance's printed digits, relative."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One filter step: the motion since the previous frame and what was then observed.
+
+    Attributes:
+        stamp_ns: time of the observations, integer nanoseconds; a log without times counts steps.
+        delta: (E,) odometry, previous_robot_from_robot; None in the first frame.
+        cov_delta: (d, d) its covariance in the right chart at `delta`; None in the first frame.
+        landmarks: (K,) integer names that the log gives the landmarks observed.
+        z: (K, p) measurements.
+        cov_z: (K, p, p) their covariance.
+    """
+
+    stamp_ns: int
+    delta: np.ndarray | None
+    cov_delta: np.ndarray | None
+    landmarks: np.ndarray
+    z: np.ndarray
+    cov_z: np.ndarray
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Ground truth of a log.
+
+    Attributes:
+        stamps_ns: (T,) times of the poses.
+        world_from_robot: (T, E) poses at these times.
+        landmarks: name of a landmark to its (D,) position in the world.
+    """
+
+    stamps_ns: np.ndarray
+    world_from_robot: np.ndarray
+    landmarks: dict[int, np.ndarray] = field(default_factory=dict)
+
+    @property
+    def poses(self) -> np.ndarray:
+        """(T, E) of the body."""
+        return self.world_from_robot
+
+
+@dataclass(frozen=True)
+class RobotLog:
+    """A recording of a robot that observes landmarks.
+
+    Attributes:
+        name: short name of the recording.
+        space: SE2 or SE3, the group of the robot's pose.
+        measurement: "range_bearing" (range, yaw[, pitch]) or "position" (point in the sensor's frame).
+        robot_from_sensor: (E,) mounting pose of the sensor.
+        pitch_sign: +1 where positive pitch points up, -1 where it points down.
+        frames: the steps in order of time.
+        truth: ground truth, None where the log has none.
+    """
+
+    name: str
+    space: SE2Group | SE3Group
+    measurement: str
+    robot_from_sensor: np.ndarray
+    frames: list[Frame]
+    pitch_sign: float = 1.0
+    truth: Truth | None = None
+
+
+@dataclass(frozen=True)
+class LogNoise:
+    """Noise of a log; None takes what the log says, or the reader's documented default where it says nothing.
+
+    Attributes:
+        std_range_m: of a measured range [m].
+        std_bearing_rad: of a measured bearing (yaw) [rad].
+        std_pitch_rad: of a measured pitch [rad].
+        std_speed_mps: of the forward speed, white noise: its density [m/s per root hertz].
+        std_turn_rate_radps: of the turn rate, white noise: its density [rad/s per root hertz].
+        std_position_m: of each coordinate of a measured position [m].
+        scale_odometry: multiplies the odometry's standard deviations.
+
+    Raises:
+        InputError: one is not finite, or negative, or zero where only a positive one makes sense.
+    """
+
+    std_range_m: float | None = None
+    std_bearing_rad: float | None = None
+    std_pitch_rad: float | None = None
+    std_speed_mps: float | None = None
+    std_turn_rate_radps: float | None = None
+    std_position_m: float | None = None
+    scale_odometry: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, value in self.given().items():
+            zero = name in _MAY_BE_ZERO
+            if not (math.isfinite(value) and abs(value) <= LARGEST and (value > 0 or (zero and value == 0))):
+                expected = f"{'zero or ' if zero else ''}positive and at most {LARGEST:.0e}"
+                raise InputError(f"LogNoise: expected {name} to be {expected}, found {value}.")
+
+    def require_only(self, applicable: Collection[str], path: Path, kind: str) -> None:
+        """Refuse what would have no effect.
+
+        Args:
+            applicable: names of the fields that the log can use.
+            path: where the log lies.
+            kind: what the log is, for the message.
+
+        Raises:
+            InputError: another field is given.
+        """
+        for name in self.given():
+            if name not in applicable:
+                choice = ", ".join(sorted(applicable))
+                raise InputError(f"{path}: {name} has no effect on {kind}; leave it out (it takes {choice}).")
+
+    def odometry_variance_factor(self) -> float:
+        """Factor of the odometry's covariance."""
+        return 1.0 if self.scale_odometry is None else self.scale_odometry**2
+
+    def given(self) -> dict[str, float]:
+        """The fields that are not None."""
+        values = {item.name: getattr(self, item.name) for item in fields(self)}
+        return {name: value for name, value in values.items() if value is not None}
+
+
+class RobotLogFormat(ABC):
+    """A format of robot logs; `rbpf.sensors.readers.formats` lists all of them."""
+
+    kind: str
+    """What it is and which files make it, for messages."""
+
+    @abstractmethod
+    def recognises(self, path: Path) -> bool:
+        """Whether a file or folder is meant to be a log of this format."""
+
+    @abstractmethod
+    def read(self, path: Path, noise: LogNoise) -> RobotLog:
+        """Read the log.
+
+        Args:
+            path: file or folder.
+            noise: standard deviations in place of the log's or of the format's defaults.
+
+        Raises:
+            InputError: a file is missing or a line is not as the format's module describes; names file and line.
+        """
+
+
+def std_column(table: Table, column: str, given: float | None) -> Array:
+    """(n,) a column of standard deviations, or the given one in its place.
+
+    Raises:
+        InputError: the column holds a negative one, or a zero and nothing is given in its place.
+    """
+    if given is None:
+        table.require(table[column] > 0, column, "positive")
+        return table[column]
+    table.require(table[column] >= 0, column, "zero or positive")
+    return np.full(len(table.rows), given)
+
+
+def diagonal(std: list[Array]) -> Array:
+    """(n, p, p) covariance of independent components from p arrays (n,) of standard deviations."""
+    return np.square(np.stack(std, axis=1))[:, :, None] * np.eye(len(std))
+
+
+def require_ranges(table: Table, distance: str, *angles: str) -> None:
+    """Refuse ranges that are not positive and angles beyond a turn, which are probably degrees.
+
+    Raises:
+        InputError: names the first line that holds one.
+    """
+    table.require(table[distance] > 0, distance, "positive")
+    for angle in angles:
+        table.require(np.abs(table[angle]) <= 2 * np.pi, angle, "in radians, within a turn")
+
+
+def read_covariances(table: Table, first: str, last: str) -> Array:
+    """Symmetric matrices (n, d, d) from the columns of their upper triangle, row by row.
+
+    A matrix that is positive semi-definite up to the rounding of its printed digits passes.
+
+    Args:
+        table: n rows.
+        first: column of the first entry.
+        last: column of the last entry.
+
+    Raises:
+        InputError: a matrix is not positive semi-definite.
+    """
+    triangle = table.block(first, last)
+    dim = int(np.sqrt(2 * triangle.shape[1]))
+    row, column = np.triu_indices(dim)
+    cov = np.empty((len(triangle), dim, dim))
+    cov[:, row, column] = cov[:, column, row] = triangle
+    # Judged on the correlations, because metres and radians differ by orders of magnitude.
+    variance = np.einsum("nii->ni", cov)
+    std = np.sqrt(np.maximum(variance, 0.0))
+    bound = std[:, :, None] * std[:, None, :] * (1.0 + _ROUNDING)
+    valid = (variance >= 0).all(1) & (np.abs(cov) <= bound).all((1, 2))
+    scale = np.where(std > 0, std, 1.0)[valid]
+    correlation = cov[valid] / scale[:, :, None] / scale[:, None, :]
+    valid[valid] = np.linalg.eigvalsh(correlation)[:, 0] >= -_ROUNDING
+    if not valid.all():
+        problem = f"expected {first} to {last} to be a covariance, found an indefinite matrix"
+        raise table.error(int(np.argmin(valid)), problem)
+    return cov
+
+
+def planar_to_chart(delta: Array, cov: Array) -> Array:
+    """Covariance of additive errors of (x, y, heading) in the right chart at delta.
+
+    delta Exp(xi) has the translation t + R v and the heading phi + omega to first order, so omega = d phi and
+    v = R^T d t.
+
+    Args:
+        delta: (n, 3) elements of SE(2).
+        cov: (n, 3, 3) covariance in the order x, y, heading.
+
+    Returns:
+        (n, 3, 3) covariance in the order omega, v.
+    """
+    jacobian = np.zeros((len(delta), 3, 3))
+    jacobian[:, 0, 2] = 1.0
+    jacobian[:, 1:, :2] = SE2.rotation(delta).mT
+    return jacobian @ cov @ jacobian.mT
+
+
+def spatial_to_chart(delta: Array, ypr: Array, cov: Array) -> Array:
+    """Covariance of additive errors of (x, y, z, yaw, pitch, roll) in the right chart at delta.
+
+    For R = Rz(yaw) Ry(pitch) Rx(roll) the body's angular rate is
+    omega = Rx^T (Ry^T e_z d yaw + e_y d pitch) + e_x d roll; the translation part is v = R^T d t.
+
+    Args:
+        delta: (n, 7) elements of SE(3).
+        ypr: (n, 3) their yaw, pitch and roll [rad].
+        cov: (n, 6, 6) covariance in the order x, y, z, yaw, pitch, roll.
+
+    Returns:
+        (n, 6, 6) covariance in the order omega, v.
+    """
+    _, pitch, roll = ypr.T
+    jacobian = np.zeros((len(delta), 6, 6))
+    jacobian[:, 0, 3] = -np.sin(pitch)
+    jacobian[:, 1, 3] = np.sin(roll) * np.cos(pitch)
+    jacobian[:, 2, 3] = np.cos(roll) * np.cos(pitch)
+    jacobian[:, 1, 4] = np.cos(roll)
+    jacobian[:, 2, 4] = -np.sin(roll)
+    jacobian[:, 0, 5] = 1.0
+    jacobian[:, 3:, :3] = SE3.rotation(delta).mT
+    return jacobian @ cov @ jacobian.mT
+
+
+def assemble(
+    stamps_ns: NDArray[np.int64],
+    delta: Array,
+    cov_delta: Array,
+    frame: NDArray[np.int64],
+    landmarks: NDArray[np.int64],
+    z: Array,
+    cov_z: Array,
+) -> list[Frame]:
+    """Frames in order.
+
+    Args:
+        stamps_ns: (T,) time of each frame.
+        delta: (T - 1, E) motion from each frame to the next.
+        cov_delta: (T - 1, d, d) its covariance.
+        frame: (S,) frame of each observation, in order.
+        landmarks: (S,) its landmark.
+        z: (S, p) its measurement.
+        cov_z: (S, p, p) its covariance.
+
+    Returns:
+        T frames; one without an observation is empty.
+    """
+    bounds = np.searchsorted(frame, np.arange(len(stamps_ns) + 1))
+    return [
+        Frame(
+            stamp_ns=int(stamps_ns[t]),
+            delta=delta[t - 1] if t else None,
+            cov_delta=cov_delta[t - 1] if t else None,
+            landmarks=landmarks[start:stop],
+            z=z[start:stop],
+            cov_z=cov_z[start:stop],
+        )
+        for t, (start, stop) in enumerate(pairwise(bounds))
+    ]
