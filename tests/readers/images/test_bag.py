@@ -6,7 +6,8 @@ from rosbags.rosbag1 import Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode
 
 from rbpf.errors import InputError
-from rbpf.sensors.readers import Topics, bag_messages, open_images
+from rbpf.sensors.readers import Topics, open_images
+from rbpf.sensors.readers.images import bag_messages
 from tests.readers.images.bags import KINDS, SIZE, STAMPS_NS, recorded, write_bag, write_pair
 from tests.readers.images.folders import grey, levels, write_camera, write_plain
 

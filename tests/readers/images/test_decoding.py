@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from rbpf.errors import InputError
-from rbpf.sensors.readers import decoding, open_images
+from rbpf.sensors.readers import open_images
+from rbpf.sensors.readers.images import decoding
 from tests.readers.images.folders import (
     HEIGHT,
     SIZE,
