@@ -66,10 +66,8 @@ def add_elsewhere(run: VideoRun, count: int) -> None:
     points = SE3.transform(pose, behind)
     n, landmark_map = filter_.n, filter_.belief().map
     mean = np.broadcast_to(points, (n, count, 3))
-    ids = landmark_map.add_records(
-        Records(mean, np.broadcast_to(1e-4 * np.eye(3), (n, count, 3, 3))), Point(3)
-    )
     source = np.zeros((count, *table.first_patch.shape[1:]), dtype=np.uint8)
     rows = table.add(source, np.zeros((count, 2)), pose)
     table.position[rows] = np.concatenate([points, np.ones((count, 1))], axis=1)
-    landmark_map.catalogue.update(zip(ids.tolist(), rows.tolist(), strict=True))
+    cov = np.broadcast_to(1e-4 * np.eye(3), (n, count, 3, 3))
+    landmark_map.add_records(Records(mean, cov), Point(3), ids=rows)

@@ -36,5 +36,4 @@ def summarise_points(filter_: Filter) -> MapEstimate:
     mean = np.einsum("n,nkd->kd", belief.weights, points)
     between = np.einsum("n,nkd,nke->kde", belief.weights, points - mean, points - mean)
     cov = np.einsum("n,nkde->kde", belief.weights, within) + between
-    names = np.array([belief.catalogue[i] for i in ids.tolist()], dtype=np.int64)
-    return MapEstimate(names, mean, gaussian.symmetrise(cov))
+    return MapEstimate(ids, mean, gaussian.symmetrise(cov))

@@ -264,13 +264,15 @@ class GivenDepths(Sensor):
         """As the sensor does, but each landmark at its own depth."""
         out = []
         for group in self.features.new_landmarks(frame, belief, observed):
-            for k, name in enumerate(group.facts):
+            for k, name in enumerate(group.ids.tolist()):
                 model = group.model
                 if name in self.depths:
                     rho = 1.0 / self.depths[name]
                     model = CameraRay(self.features.camera, (rho, DEPTH_FRACTION * rho))
                 one = slice(k, k + 1)
-                out.append(NewLandmarks(group.z[one], group.cov[one], model, group.landmark, facts=[name]))
+                out.append(
+                    NewLandmarks(group.z[one], group.cov[one], model, group.landmark, ids=group.ids[one])
+                )
         return out
 
 

@@ -25,7 +25,6 @@ from rbpf.core.models import Belief, NewLandmarks, Observations, Sensor
 from rbpf.lie import SE2, SE3
 from rbpf.runs.folder import peak_memory_mb
 from rbpf.sensors.camera import Pinhole
-from rbpf.sensors.catalogue_index import NameIndex
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.slam import MonoSlam
 from rbpf.systems.range_bearing.config import RangeBearingConfig
@@ -82,7 +81,6 @@ class Forgetting(Sensor):
         self.after = after
         self.frame = 0
         self._seen: dict[int, int] = {}
-        self._names = NameIndex()
 
     def observe(self, frame: Any, belief: Belief) -> Sequence[Observations]:
         """What the inner sensor observes."""
@@ -96,8 +94,7 @@ class Forgetting(Sensor):
         """What the inner sensor starts, after the old ones have gone."""
         new_landmarks = self.inner.new_landmarks(frame, belief, observed)
         old = [name for name, seen in self._seen.items() if self.frame - seen > self.after]
-        known = self._names.ids(belief.catalogue)
-        ids = np.array([known.get(name, name) for name in old], dtype=np.int64)
+        ids = np.array(old, dtype=np.int64)
         belief.map.remove(ids[belief.map.holds(ids)])
         for name in old:
             del self._seen[name]

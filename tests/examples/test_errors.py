@@ -204,7 +204,7 @@ def test_landmarks_start_at_the_given_depths(log, batch):
     depths = batch_depths(batch)
     done = run(replace(log, frames=log.frames[:1]), SMALL, wrapped=lambda sensor: GivenDepths(sensor, depths))
     belief = done.filter.belief()
-    rays = {name: i for i, name in belief.catalogue.items() if name in depths}
+    rays = {i: i for i in belief.map.ids.tolist() if i in depths}
     assert len(rays) > 10
     records = belief.read(np.array(list(rays.values())))
     rho = np.array([1.0 / depths[name] for name in rays])

@@ -16,7 +16,7 @@ for known in (4, 0):
     log = simulate_features(DeskWorld(frames=120), Measuring(known=known), MONO, 3)
     done = run(log, MonoConfig(particles=30))
     belief = done.filter.belief()
-    points = [i for i in belief.catalogue if belief.map.landmark_of(i).dim == 3]
+    points = np.flatnonzero([belief.map.landmark_of(i).dim == 3 for i in belief.map.ids.tolist()])
     np.savez(
         out / f"known_{known}.npz",
         mean=done.world_from_camera,
@@ -26,5 +26,5 @@ for known in (4, 0):
         nis=done.nis,
         state=done.filter.particles.state,
         log_weights=done.filter.particles.log_weights,
-        points=np.array(points),
+        points=points,
     )

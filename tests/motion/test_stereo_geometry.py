@@ -22,7 +22,7 @@ def test_points_are_seen_where_the_camera_projects_them(world):
     before, now, delta = noiseless(world, 50, np.random.default_rng(0))
     seen = see(world.camera, delta, before)
     np.testing.assert_allclose(seen.pixels, now, atol=1e-9)
-    np.testing.assert_allclose(seen.nearness, 1.0 / world.camera.locate(before)[:, 2], rtol=1e-9)
+    np.testing.assert_allclose(seen.nearness, 1.0 / world.camera.triangulate(before)[:, 2], rtol=1e-9)
     assert seen.front.all()
 
 

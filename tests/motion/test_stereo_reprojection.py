@@ -31,7 +31,7 @@ def test_the_compiled_twin(world, points):
 def test_points_behind_the_camera(points):
     matches, _ = correlated(LEAP, 30, np.random.default_rng(1))
     past = SE3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 3.0]))
-    behind = LEAP.camera.locate(matches.z_prev)[:, 2] < 2.9
+    behind = LEAP.camera.triangulate(matches.z_prev)[:, 2] < 2.9
     rows, front, _ = white_rows(matches, past, points)
     distances = squared_distances(matches, past, points)
     assert behind.any() and not front[behind].any()
@@ -45,7 +45,7 @@ def test_the_earlier_points_covariance_in_space():
     """A R⁻ Aᵀ = J_P C J_Pᵀ, with the derivatives of the camera itself."""
     matches, delta = correlated(ROAD, 20, np.random.default_rng(2))
     camera = matches.camera
-    before = camera.locate(matches.z_prev)
+    before = camera.triangulate(matches.z_prev)
     by_z = np.linalg.inv(camera.jacobian(before))
     cov_points = by_z @ matches.cov_prev @ by_z.mT
     by_point = camera.jacobian(SE3.inverse_transform(delta, before)) @ SE3.rotation(delta).T

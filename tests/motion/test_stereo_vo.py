@@ -48,7 +48,7 @@ def adjusted_by_scipy(matches: Matches, start: np.ndarray):
         off = matches.z_prev - camera.project(points), matches.z_now - camera.project(now)
         return np.concatenate([(w @ o[..., None]).ravel() for w, o in zip(whites, off, strict=True)])
 
-    begin = np.concatenate([np.zeros(6), camera.locate(matches.z_prev).ravel()])
+    begin = np.concatenate([np.zeros(6), camera.triangulate(matches.z_prev).ravel()])
     return least_squares(misses, begin, x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-12)
 
 
@@ -85,7 +85,7 @@ def test_the_other_kinds_are_scipys_least_squares(points):
     matches, delta = correlated(LEAP, 20, np.random.default_rng(2))
     ours = fit(matches, delta, VoConfig(points, rule=STRICT))
     camera, best = matches.camera, ours.x
-    before = camera.locate(matches.z_prev)
+    before = camera.triangulate(matches.z_prev)
     by_z = np.linalg.inv(camera.jacobian(before))
     by_prev = camera.jacobian(SE3.inverse_transform(best, before)) @ SE3.rotation(best).T @ by_z
     noise = by_prev @ matches.cov_prev @ by_prev.mT if points == "propagated" else 0.0

@@ -44,7 +44,7 @@ every_setting = pytest.mark.parametrize("config", SETTINGS, ids=["default", "poi
 def kinds(filter_: Filter) -> dict[int, type]:
     """Parametrisation of each landmark, by its name."""
     held = filter_.belief().map
-    return {held.catalogue[i]: type(held.landmark_of(i)) for i in held.ids.tolist()}
+    return {i: type(held.landmark_of(i)) for i in held.ids.tolist()}
 
 
 @every_setting
@@ -293,7 +293,7 @@ def test_known_points_in_the_map():
     slam = MonoSlam(FIRST.camera, replace(SMALL, known="points"), given)
     slam._begin(FIRST.frames[0])
     points, held = slam.filter, slam.filter.belief().map
-    assert [held.catalogue[i] for i in held.ids.tolist()] == given.names.tolist()
+    assert held.ids.tolist() == given.names.tolist()
     np.testing.assert_array_equal(held.read(held.ids).mean[3], given.positions)
     np.testing.assert_allclose(held.read(held.ids).cov[3], given.cov)
     assert world_of(points) is None
@@ -303,7 +303,7 @@ def test_known_points_in_the_map():
 def test_first_sightings_become_rays(mode):
     done = run(first_only(FIRST), replace(SMALL, known=mode))
     held, names = done.filter.belief().map, known(FIRST.known).names
-    rays = [held.catalogue[i] for i in held.ids.tolist() if isinstance(held.landmark_of(i), InverseDepth)]
+    rays = [i for i in held.ids.tolist() if isinstance(held.landmark_of(i), InverseDepth)]
     assert sorted(rays) == sorted(np.setdiff1d(FIRST.frames[0].landmarks, names).tolist())
 
 
@@ -351,7 +351,7 @@ def test_landmarks_in_the_known_world():
     assert len(ids) >= 3
     cloud = particle_points(done.filter, ids)
     assert cloud.shape == (20, len(ids), 3)
-    true = np.array([places[held.catalogue[i]] for i in ids])
+    true = np.array([places[i] for i in ids])
     mean = done.filter.particles.weights @ cloud.reshape(20, -1)
     assert np.median(np.linalg.norm(mean.reshape(-1, 3) - true, axis=1)) < 0.05
     raw = held.read(np.array(ids)).mean

@@ -135,7 +135,7 @@ def test_the_map_is_conditioned_on_the_paths(plane):
     means = belief.read(points).mean
     pose = plane.filter.particles.state[:, None, :7]
     seen = plane.sensor.camera.project(SE3.inverse_transform(pose, means))
-    names = [belief.catalogue[k] for k in points]
+    names = points
     measured = plane.slam.measurement.used
     which = [k for k, name in enumerate(names) if name in measured.landmarks]
     z = measured.z[[measured.landmarks.tolist().index(names[k]) for k in which]]
@@ -213,7 +213,7 @@ def test_what_the_new_map_has_not_is_not_looked_for(resampled):
     """Features that were started in frames that took no part."""
     done = run_images(sequence(40), replace(SMALL, start=StartConfig(max_frames=5, depth_std_ratio=1e-6)))
     table = done.sensor.table
-    held = set(done.filter.belief().catalogue.values())
+    held = set(done.filter.belief().map.ids.tolist())
     assert resampled and set(np.flatnonzero(table.alive).tolist()) <= held
 
 

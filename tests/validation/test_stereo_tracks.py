@@ -25,7 +25,7 @@ def first_observations(tracks):
     """Where each landmark was when it was first seen, on the guessed path."""
     points = {}
     for frame, pose in zip(tracks.log.frames, tracks.world_from_camera, strict=True):
-        places = SE3.transform(pose, tracks.log.camera.locate(frame.z))
+        places = SE3.transform(pose, tracks.log.camera.triangulate(frame.z))
         for name, place in zip(frame.landmarks.tolist(), places, strict=True):
             points.setdefault(name, place)
     return points

@@ -26,7 +26,7 @@ def test_the_motion_and_its_covariance_are_gtsams(world):
     values.insert(0, gtsam.Pose3())
     values.insert(1, gtsam.Pose3(SE3.matrix(delta)))
     order = [0, 2, 1]
-    for row, point in enumerate(camera.locate(matches.z_prev)):
+    for row, point in enumerate(camera.triangulate(matches.z_prev)):
         values.insert(100 + row, point)
         both = (0, matches.z_prev, matches.cov_prev), (1, matches.z_now, matches.cov_now)
         for pose, z, cov in both:

@@ -73,8 +73,7 @@ def fill(run: VideoRun, size: int, rng: np.random.Generator) -> None:
     records = Records(
         np.broadcast_to(points, (n, count, 3)), np.broadcast_to(STD_M**2 * np.eye(3), (n, count, 3, 3))
     )
-    ids = belief.map.add_records(records, Point(3))
-    belief.map.catalogue.update(zip(ids.tolist(), rows.tolist(), strict=True))
+    belief.map.add_records(records, Point(3), ids=rows)
 
 
 def measure_times(setting: Setting, sizes: tuple[int, ...], rounds: int) -> np.ndarray:

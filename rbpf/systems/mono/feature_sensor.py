@@ -19,12 +19,8 @@ from rbpf.maps.point import Point
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.camera.constellation import ConstellationView, MembersView
 from rbpf.sensors.camera.points import CameraModel, CameraPoint, CameraRay, EpipolarRay
-from rbpf.sensors.catalogue_index import NameIndex
 from rbpf.sensors.feature_log import FeatureFrame, KnownPoints
 from rbpf.systems.mono.config import InverseDepthConfig
-
-CONSTELLATION = -1
-"""Name of the known points' landmark in the catalogue; features have names from 0 on."""
 
 MIN_DEPTHS = 4
 """Depths that must be known in view for new features to start at them."""
@@ -186,7 +182,9 @@ class InverseDepthRays(UnknownDepth):
 
 @final
 class FeatureSensor(Sensor):
-    """Takes features with names (`FeatureFrame`), and says where the map has features, by name.
+    """Takes features with names (`FeatureFrame`), and says where the map has features.
+
+    A feature's name is its landmark's id. Members of a constellation have none of their own; its id is the first one's name.
 
     Args:
         camera: of the images.
@@ -210,24 +208,24 @@ class FeatureSensor(Sensor):
         self.fixed = fixed
         self.group = group
         self.point = CameraPoint(camera)
-        self._member = {} if group is None else {name: m for m, name in enumerate(group.names.tolist())}
-        self._names = NameIndex()
+        names = np.zeros(0, dtype=np.int64) if group is None else group.names
+        self._order = np.argsort(names)
+        self._member_names = names[self._order]
 
     def observe(self, frame: FeatureFrame, belief: Belief) -> Sequence[Observations]:
         """Groups of observations for known points, points, and features of unknown depth."""
         groups, inside = list[Observations](), self.camera.inside(frame.z)
 
         # All members of the constellation that are seen are one measurement of it.
-        names = frame.landmarks.tolist()
-        members = [k for k, name in enumerate(names) if name in self._member and inside[k]]
-        if members:
-            landmark, view = self._view(belief, np.array([self._member[names[k]] for k in members]))
+        members, ids = self.members(frame.landmarks), self._ids(belief, frame.landmarks)
+        rows = np.flatnonzero((members >= 0) & inside)
+        if rows.size:
+            landmark, view = self._view(belief, members[rows])
             cov = np.zeros((1, view.dim, view.dim))
-            for k, row in enumerate(members):
+            for k, row in enumerate(rows.tolist()):
                 cov[0, 2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = frame.cov_z[row]
-            groups.append(Observations(frame.z[members].reshape(1, -1), cov, view, ids=landmark))
+            groups.append(Observations(frame.z[rows].reshape(1, -1), cov, view, ids=landmark))
 
-        ids = self._ids(belief, frame.landmarks)
         rows = np.flatnonzero((ids >= 0) & inside)
         unknown = belief.map.are(ids[rows], self.unknown_depth.landmark)
         if (~unknown).any():
@@ -245,19 +243,14 @@ class FeatureSensor(Sensor):
     ) -> Sequence[NewLandmarks]:
         """Turns features whose depth is known by now into points; starts one for every new name."""
         belief.map.promote(self.unknown_depth.promotable(belief, observed), Point(3))
-        known = self._names.ids(belief.catalogue)
-        names = frame.landmarks.tolist()
-        new = [k for k, name in enumerate(names) if name not in known and name not in self._member]
-        if new:
-            z = frame.z[new]
-            has_ray = self.camera.inside(z) & np.isfinite(self.camera.unproject(z)).all(axis=-1)
-            new = [k for k, seen in zip(new, has_ray.tolist(), strict=True) if seen][: self.max_new_per_frame]
-        if not new:
+        is_new = (self.members(frame.landmarks) < 0) & ~belief.map.holds(frame.landmarks)
+        new = np.flatnonzero(is_new & self.camera.inside(frame.z))
+        new = new[np.isfinite(self.camera.unproject(frame.z[new])).all(axis=-1)][: self.max_new_per_frame]
+        if not new.size:
             return []
         model = self.unknown_depth.starting(self._depths(belief, observed))
-        facts = frame.landmarks[new].tolist()
-        landmark = self.unknown_depth.landmark
-        return [NewLandmarks(frame.z[new], frame.cov_z[new], model, landmark, facts=facts)]
+        z, cov, ids = frame.z[new], frame.cov_z[new], frame.landmarks[new]
+        return [NewLandmarks(z, cov, model, self.unknown_depth.landmark, ids=ids)]
 
     def project(self, belief: Belief, names: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Where features (K,) should be seen under all particles: which of them, means (k, 2), covariances (k, 2, 2)."""
@@ -325,19 +318,23 @@ class FeatureSensor(Sensor):
         ids = self._ids(belief, names)
         belief.map.remove(ids[ids >= 0])
 
+    def members(self, names: np.ndarray) -> np.ndarray:
+        """Number of features (K,) among the points of the constellation, −1 of others."""
+        if not self._order.size:
+            return np.full(names.size, -1)
+        rows = np.minimum(self._member_names.searchsorted(names), self._order.size - 1)
+        return np.where(self._member_names[rows] == names, self._order[rows], -1)
+
     def _ids(self, belief: Belief, names: np.ndarray) -> np.ndarray:
         """Landmarks (K,) of features (K,), −1 where the map has none of their own."""
-        known = self._names.ids(belief.catalogue)
-        return np.array([known.get(name, -1) for name in names.tolist()], dtype=np.int64)
+        return np.where((self.members(names) < 0) & belief.map.holds(names), names, -1)
 
     def _by_model(
         self, belief: Belief, names: np.ndarray
     ) -> list[tuple[CameraModel | GroupView, np.ndarray, np.ndarray]]:
         """Features (K,) by how they are measured: the model, which of them, and the landmarks' ids."""
-        ids, member = self._ids(belief, names), np.full(names.size, -1)
-        if self._member:
-            member = np.array([self._member.get(name, -1) for name in names.tolist()], dtype=np.int64)
-        own = np.flatnonzero((member < 0) & (ids >= 0))
+        ids, member = self._ids(belief, names), self.members(names)
+        own = np.flatnonzero(ids >= 0)
         unknown = belief.map.are(ids[own], self.unknown_depth.landmark)
         out: list[tuple[CameraModel | GroupView, np.ndarray, np.ndarray]] = []
         for model, chosen in ((self.point, own[~unknown]), (self.unknown_depth.model, own[unknown])):
@@ -352,7 +349,7 @@ class FeatureSensor(Sensor):
     def _view(self, belief: Belief, members: np.ndarray) -> tuple[np.ndarray, GroupView]:
         """The constellation's id (1,), and the camera's view of some of its members."""
         assert self.group is not None
-        landmark = self._names.ids(belief.catalogue)[CONSTELLATION]
+        landmark = int(self.group.names[0])
         if isinstance(belief.map.landmark_of(landmark), Constellation):
             view: GroupView = ConstellationView(self.camera, self.group.positions[members])
         else:
@@ -367,7 +364,7 @@ class FeatureSensor(Sensor):
             if group.ids is not None and isinstance(group.model, CameraPoint):
                 seen.append(SE3.inverse_transform(pose, belief.read_mode(group.ids).mean[0]))
         if self.group is not None:
-            landmark = self._names.ids(belief.catalogue)[CONSTELLATION]
+            landmark = int(self.group.names[0])
             known = belief.map.landmark_of(landmark)
             assert isinstance(known, Constellation | UncertainConstellation)
             points = known.in_world(belief.read_mode([landmark]))[0]

@@ -174,7 +174,7 @@ class ImageSensor(Sensor):
             records = group.model.initialise(pose[None], group.z, np.zeros((len(group.z), 2, 2)))
             const = None if records.const is None else records.const[0]
             x, w = self.features.unknown_depth.model.world_point(records.mean[0], const)
-            self.table.position[list(group.facts)] = np.concatenate([x, w], axis=-1)
+            self.table.position[group.ids] = np.concatenate([x, w], axis=-1)
         self.features.remove(belief, failing)
         frame.seconds_new_landmarks = time.perf_counter() - started
         return new_landmarks
@@ -188,7 +188,7 @@ class ImageSensor(Sensor):
             started: (F,) in which of the T frames each feature of the table was started.
         """
         table, rows = self.table, np.arange(started.size)
-        held = np.isin(rows, list(belief.catalogue.values()))
+        held = belief.map.holds(rows)
         table.alive[rows[~held]] = False  # started in a frame that did not take part
         table.first_pose[rows] = table.last_pose[rows] = path[started]
         table.last_patch[rows] = table.first_patch[rows]  # later appearances are from the old path

@@ -209,7 +209,7 @@ def estimate_mono_map(filter_: Filter, features: FeatureSensor, world: Anchored 
             ends = SE3.inverse_transform(world.mean[mode], extent[:, :3] / extent[:, 3:])
             records = unknown_depth.as_points(records)
         moments = mixture_moments(weights, *relative_points(SE3, world, records))
-        rows.append((landmark_map.catalogue.get(landmark_id, landmark_id), *moments, ends))
+        rows.append((landmark_id, *moments, ends))
     names = np.array([row[0] for row in rows], dtype=np.int64)
     order = np.argsort(names, kind="stable")
     means, covs, spans = (np.array([row[k] for row in rows]) for k in (1, 2, 3))

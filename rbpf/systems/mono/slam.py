@@ -33,7 +33,7 @@ from rbpf.sensors.readers import ImageFrame, KnownPixels
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.mono.active_search import OutlierGate
 from rbpf.systems.mono.config import MonoConfig
-from rbpf.systems.mono.feature_sensor import CONSTELLATION, FeatureSensor, InverseDepthRays, UnknownDepth
+from rbpf.systems.mono.feature_sensor import FeatureSensor, InverseDepthRays, UnknownDepth
 from rbpf.systems.mono.feature_table import directions
 from rbpf.systems.mono.image_sensor import ImageSensor, Measurement
 from rbpf.systems.mono.known_map import (
@@ -226,7 +226,8 @@ class MonoSlam(System):
 
         # 1. Is there anything to measure?
         has_images = len(sensor.table) > 0
-        if self.filter.steps and has_images != isinstance(frame, ImageFrame) and self._catalogue:
+        is_mapped = self.filter.belief().map.ids.size > 0
+        if self.filter.steps and is_mapped and has_images != isinstance(frame, ImageFrame):
             raise InputError("a run takes images or named features, not both")
         measured: Measurement | FeatureFrame
         if isinstance(frame, FeatureFrame):
@@ -397,10 +398,6 @@ class MonoSlam(System):
         for part in (self.sensor, self.screen, self.loss, self.start):
             part.restore(arrays)
 
-    @property
-    def _catalogue(self) -> dict[int, Any]:
-        return self.filter.belief().catalogue
-
     def _new_filter(self, sensor: Sensor) -> Filter:
         """A filter with an empty map; the parametrisations are named in it, so that a checkpoint can be read back."""
         config, velocity = self.config, self.config.velocity
@@ -464,7 +461,7 @@ class MonoSlam(System):
         # One landmark, placed by what the frame shows of it: the frame is not used again.
         landmark_map, group = self.filter.belief().map, constellation(start.points)
         records = constellation_records(self.camera, start, group, config.particles, np.diag(std**2))
-        landmark_map.catalogue[int(landmark_map.add_records(records, group)[0])] = CONSTELLATION
+        landmark_map.add_records(records, group, ids=start.points.names[:1])
         if isinstance(measured, FeatureFrame):
             rest = ~np.isin(measured.landmarks, start.points.names)
             measured = FeatureFrame(
@@ -477,8 +474,7 @@ class MonoSlam(System):
         landmark_map, n = self.filter.belief().map, self.config.particles
         mean = np.broadcast_to(known.positions, (n, *known.positions.shape))
         cov = np.broadcast_to(known.cov, (n, *known.cov.shape))
-        ids = landmark_map.add_records(Records(mean, cov), Point(3))
-        landmark_map.catalogue.update(zip(ids.tolist(), known.names.tolist(), strict=True))
+        landmark_map.add_records(Records(mean, cov), Point(3), ids=known.names)
 
     def _estimate(self, world: Anchored | None, report: StepReport) -> Estimate:
         """Mean and covariance of world_from_camera after a step.
@@ -596,14 +592,11 @@ class _Either(Sensor):
 def world_of(filter_: Filter) -> Anchored | None:
     """The known points' frame in each particle's own world, which starts at its first camera; None without one."""
     landmark_map = filter_.belief().map
-    first = next(
-        iter(landmark_map.catalogue), None
-    )  # it was the first landmark: no other one has to be asked
-    if first is None or landmark_map.catalogue[first] != CONSTELLATION:
+    first = landmark_map.ids[:1]  # it was the first landmark: no other one has to be asked
+    group = landmark_map.landmark_of(int(first[0])) if first.size else None
+    if not isinstance(group, Constellation | UncertainConstellation):
         return None
-    group = landmark_map.landmark_of(first)
-    assert isinstance(group, Constellation | UncertainConstellation)
-    return Anchored(*group.frame(landmark_map.read(np.array([first]))))
+    return Anchored(*group.frame(landmark_map.read(first)))
 
 
 def particle_points(filter_: Filter, ids: Sequence[int]) -> np.ndarray:

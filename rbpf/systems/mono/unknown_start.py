@@ -230,10 +230,9 @@ class UnknownStart:
             return None, False
 
         # Features that the map still holds and that enough of these frames see.
-        held = np.array(sorted(filter_.belief().catalogue.values()), dtype=np.int64)
         chosen = [frames[t] for t in steps.tolist()]
         seen_by = np.concatenate([frame.landmarks for frame in chosen])
-        names, views = np.unique(seen_by[np.isin(seen_by, held)], return_counts=True)
+        names, views = np.unique(seen_by[filter_.belief().map.holds(seen_by)], return_counts=True)
         names = names[views >= MIN_VIEWS]
         seen = self._window(chosen, names)
         sees = np.zeros((seen.stamps_ns.size, seen.feature.max(initial=-1) + 1), dtype=bool)
@@ -312,9 +311,8 @@ class UnknownStart:
             if t not in steps:
                 frame = FeatureFrame(frame.stamp_ns, frame.landmarks[:0], frame.z[:0], frame.cov_z[:0])
             new.follow(state, frame, at_rest if t <= first else None, frame.stamp_ns)
-        held = set(old.belief().catalogue.values())
-        gone = [name for name in new.belief().catalogue.values() if name not in held]
-        self.features.remove(new.belief(), np.array(gone, dtype=np.int64))
+        landmark_map = new.belief().map
+        landmark_map.remove(landmark_map.ids[~old.belief().map.holds(landmark_map.ids)])
         new.sensors = old.sensors
         return new
 
