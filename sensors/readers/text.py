@@ -37,17 +37,18 @@ def quoted(text: str) -> str:
     return repr(text if len(text) <= 40 else text[:37] + "...")
 
 
-def read_bytes(path: Path, hint: str = "", most: int = MOST_BYTES) -> bytes:
+def read_bytes(path: Path, hint: str = "", most: int | None = None) -> bytes:
     """Content of a file.
 
     Args:
         path: the file.
         hint: what is expected to lie there, for the message.
-        most: bytes that it may have.
+        most: bytes that it may have; by default `MOST_BYTES`.
 
     Raises:
         InputError: the file is missing, too large or cannot be read.
     """
+    most = MOST_BYTES if most is None else most
     try:
         if path.stat().st_size > most:
             raise InputError(
@@ -62,7 +63,7 @@ def read_bytes(path: Path, hint: str = "", most: int = MOST_BYTES) -> bytes:
         raise InputError(f"{path}: cannot be read ({error}).") from None
 
 
-def read_text(path: Path, hint: str = "", most: int = MOST_BYTES) -> str:
+def read_text(path: Path, hint: str = "", most: int | None = None) -> str:
     """Text of a file without a byte-order mark; arguments as of `read_bytes`.
 
     Raises:

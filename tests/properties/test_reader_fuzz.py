@@ -125,7 +125,7 @@ def results(folder: Path) -> None:
 
 
 def features(folder: Path) -> None:
-    log = simulate_features(DeskWorld(frames=1), Measuring(measurements=8), MONO, seed=0)
+    log = simulate_features(DeskWorld(frames=2), Measuring(measurements=8), MONO, seed=0)
     write_measurements(folder, replace(log, frames=[log.frames[0]] * 2))
 
 
