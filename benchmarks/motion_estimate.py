@@ -5,6 +5,7 @@ import numpy as np
 
 from benchmarks.rows import Row, Settings, interleaved
 from rbpf.lie import SE3
+from rbpf.motion.stereo_geometry import Matches
 from rbpf.motion.stereo_vo import MotionEstimate, estimate_motion
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 
@@ -35,7 +36,7 @@ class TwoFrames:
 
     def ours(self) -> MotionEstimate:
         """Consensus, both images of both frames, covariance."""
-        return estimate_motion(CAMERA, self.z_prev, self.z_now, self.cov, self.cov, self.rng)
+        return estimate_motion(Matches.checked(CAMERA, self.z_prev, self.z_now, self.cov, self.cov), self.rng)
 
     def peer(self) -> np.ndarray:
         """Consensus and refinement of the left image, points taken as exact, no covariance: the increment (7,)."""

@@ -14,8 +14,8 @@ from rbpf.motion.odometry import Odometry
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.stereo.features import StereoFeatures
 from rbpf.systems.stereo.config import StereoConfig
-from rbpf.systems.stereo.sensor import StereoFrame, StereoSensor
-from rbpf.systems.stereo.system import build_filter
+from rbpf.systems.stereo.landmarks import View
+from rbpf.systems.stereo.slam import StereoSlam
 
 RIG = RectifiedStereo(Pinhole(640, 480, 500.0, 500.0, 319.5, 239.5), 0.12)
 LARGE, SMALL, FEATURES, NEW = 11_000, 1_000, 100, 12
@@ -32,9 +32,8 @@ class Drive:
     def __init__(self, landmarks: int, turns: int) -> None:
         rng, config = np.random.default_rng(0), StereoConfig()
         self.rng, self.config, self.turn = rng, config, 0
-        likelihood = config.likelihood.build()
-        self.sensor = StereoSensor(RIG, config.map, config.new_landmarks, config.sift.length, likelihood)
-        self.filter = build_filter(self.sensor, config)
+        slam = StereoSlam(RIG, config)
+        self.sensor, self.filter = slam.front_end.landmarks, slam.filter
         azimuth, height = rng.uniform(-np.pi, np.pi, landmarks), rng.uniform(-1.0, 1.0, landmarks)
         away = rng.uniform(1.5, 8.0, landmarks)
         self.places = np.stack([away * np.sin(azimuth), height, away * np.cos(azimuth)], axis=1)
@@ -49,7 +48,9 @@ class Drive:
 
     def __call__(self) -> None:
         """One update."""
-        self.filter.step(StereoFrame(self.frames[self.turn]), Odometry(turned(1), np.diag(STD**2)))
+        features = self.frames[self.turn]
+        view = View(10**9 * self.turn, features, np.ones(len(features), dtype=bool))
+        self.filter.step(view, Odometry(turned(1), np.diag(STD**2)))
         self.turn += 1
 
     def _fill(self, landmarks: int) -> None:
@@ -64,8 +65,7 @@ class Drive:
         for part in np.array_split(names, max(1, landmarks // 500)):
             mean = self.places[part] + PLACE_M * self.rng.standard_normal((n, part.size, 3))
             cov = np.broadcast_to(PLACE_M**2 * np.eye(3), (n, part.size, 3, 3))
-            ids = held.add_records(Records(mean, cov), sensor.point)
-            held.catalogue.update(zip(ids.tolist(), part.tolist(), strict=True))
+            held.add_records(Records(mean, cov), sensor.landmark, ids=part)
 
     def _features(self, pose: np.ndarray) -> StereoFeatures:
         """Of landmarks in view, and of things never seen."""
@@ -98,7 +98,7 @@ def run(settings: Settings) -> list[Row]:
     contestants = {name: Drive(size, turns + 3) for name, size in (("large", LARGE), ("small", SMALL))}
     times = interleaved(contestants, turns)
     large, small = times["large"].median * 1e3, times["small"].median * 1e3
-    seen = int((contestants["large"].sensor.names >= 0).sum())
+    seen = int((contestants["large"].sensor.ids >= 0).sum())
     return [
         Row(
             f"stereo update, 400 particles, {LARGE} landmarks",

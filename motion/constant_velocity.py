@@ -22,7 +22,7 @@ POSE_AND_VELOCITY = Product(SE3, Euclidean(6))
 
 @dataclass(frozen=True)
 class PosePrior:
-    """Given as control: the body is where this law says, however it came there. The start of a run, or a kidnapping.
+    """Given as control: the body is where this distribution says, however it came there. The start, or a kidnapping.
 
     Attributes:
         mean: (7,) world_from_body.
@@ -119,20 +119,20 @@ class SampledVelocity(MotionModel):
         return Transition(np.concatenate([SE3.retract(placed, step), velocity], axis=1), factor)
 
 
-def _placed(state: np.ndarray, law: PosePrior) -> np.ndarray:
-    if law.mean.shape != (7,) or law.cov.shape != (6, 6) or not np.isfinite(law.mean).all():
+def _placed(state: np.ndarray, prior: PosePrior) -> np.ndarray:
+    if prior.mean.shape != (7,) or prior.cov.shape != (6, 6) or not np.isfinite(prior.mean).all():
         raise InputError(
-            f"a PosePrior needs a finite mean (7,) and cov (6, 6), got {law.mean} and {law.cov.shape}"
+            f"a PosePrior needs a finite mean (7,) and cov (6, 6), got {prior.mean} and {prior.cov.shape}"
         )
-    return np.broadcast_to(SE3.normalise(law.mean), state.shape).copy()
+    return np.broadcast_to(SE3.normalise(prior.mean), state.shape).copy()
 
 
-def _with_prior(factor: np.ndarray, law: PosePrior) -> np.ndarray:
-    """The pose's noise is the law's, independent of the velocity's."""
+def _with_prior(factor: np.ndarray, prior: PosePrior) -> np.ndarray:
+    """The pose's noise is the prior's, independent of the velocity's."""
     walk = np.linalg.norm(factor[6:], axis=1)
     placed = np.zeros((12, 12))
-    placed[:6, :6] = gaussian.psd_factor(law.cov)
-    placed[6:, 6:] = np.diag(walk if law.std_velocity is None else _checked(law.std_velocity))
+    placed[:6, :6] = gaussian.psd_factor(prior.cov)
+    placed[6:, 6:] = np.diag(walk if prior.std_velocity is None else _checked(prior.std_velocity))
     return placed
 
 

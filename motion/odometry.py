@@ -1,14 +1,18 @@
-"""Motion by odometry: each control is a measured increment with its covariance."""
+"""Motion by odometry, of wheels or of a camera: each control is a measured increment with its covariance."""
 
 from dataclasses import dataclass
 from typing import final
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rbpf import gaussian
 from rbpf.core.models import MotionModel, Transition
 from rbpf.errors import InputError
-from rbpf.lie import LieGroup
+from rbpf.lie import SE3, LieGroup
+
+CAMERA_PLANE = (False, True, False, True, False, True)
+"""Of [ω, v] of a camera: the turn about its y axis, which points down, and the shift along x and z."""
 
 
 @dataclass(frozen=True)
@@ -18,20 +22,52 @@ class Odometry:
     delta: np.ndarray
     cov: np.ndarray
 
+    @classmethod
+    def at_rest(cls, space: LieGroup = SE3) -> "Odometry":
+        """No motion, for certain."""
+        return cls(space.identity(), np.zeros((space.dim, space.dim)))
+
+    def then(self, later: "Odometry", space: LieGroup = SE3) -> "Odometry":
+        """One motion after another, with independent errors: C = Ad⁻¹ C₁ Ad⁻ᵀ + C₂ with Ad of the later one.
+
+        Mathematics (chain).
+        """
+        back = space.adjoint(space.inverse(later.delta))
+        cov = gaussian.symmetrise(back @ self.cov @ back.T + later.cov)
+        return Odometry(space.compose(self.delta, later.delta), cov)
+
 
 @final
 class OdometryMotion(MotionModel):
-    """x_t = x_{t−1} · delta · Exp(w), w ~ N(0, cov). Without a control the robot stands still.
+    """x_t = x_{t−1} · delta · Exp(w), w ~ N(0, cov + diag(std_added²)). Without a control the robot stands still.
 
     Args:
         space: SE2, SE3 or any group.
+        std_added: standard deviation of noise injected per step, one number or (d,) in the order of the tangent. S05 §V
+            injects some and names no figure; none is the default, for covariances are tested.
+        free: (d,) bool: the components of Log(delta) and of the noise that are kept, as `CAMERA_PLANE`, which keeps a
+            camera in the x–z plane of its first pose (S05); the others are dropped. None keeps all.
+
+    Raises:
+        InputError: std_added is negative, not finite, or neither one number nor one per component.
     """
 
-    def __init__(self, space: LieGroup) -> None:
+    def __init__(
+        self, space: LieGroup, std_added: ArrayLike = 0.0, free: tuple[bool, ...] | None = None
+    ) -> None:
+        std = np.asarray(std_added, dtype=float)
+        if std.shape not in ((), (space.dim,)) or not (np.isfinite(std).all() and (std >= 0.0).all()):
+            raise InputError(f"std_added must be one or {space.dim} numbers from 0 up, got {std_added!r}")
         self.space = space
+        self.cov_added = np.diag(np.broadcast_to(std, space.dim) ** 2)
+        self._free = None if free is None else np.diag(np.asarray(free, dtype=float))
 
     def transition(self, state: np.ndarray, control: Odometry | None, dt: float) -> Transition:
-        """The increment, the same for all particles."""
+        """The increment, the same for all particles.
+
+        Raises:
+            InputError: a shape does not fit, the increment is not finite, or its covariance is none.
+        """
         d = self.space.dim
         if control is None:
             return Transition(state, np.zeros((1, d, d)))
@@ -42,8 +78,17 @@ class OdometryMotion(MotionModel):
             )
         if not np.isfinite(control.delta).all():
             raise InputError(f"the odometry increment {control.delta} holds NaN or infinity")
+        moved = self.constrained(control)
         try:
-            factor = gaussian.psd_factor(control.cov)
+            factor = gaussian.psd_factor(moved.cov)
         except InputError as error:
             raise InputError(f"the covariance of the odometry is not one: {error}") from error
-        return Transition(self.space.compose(state, control.delta), factor[None])
+        return Transition(self.space.compose(state, moved.delta), factor[None])
+
+    def constrained(self, measured: Odometry) -> Odometry:
+        """The increment and the covariance that particles are moved by, of a measured one."""
+        cov = measured.cov + self.cov_added
+        if self._free is None:
+            return Odometry(measured.delta, cov)
+        delta = self.space.exp(self._free @ self.space.log(measured.delta))
+        return Odometry(delta, self._free @ cov @ self._free)

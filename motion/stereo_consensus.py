@@ -6,12 +6,13 @@ in space for the alignment alone.
 """
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from rbpf import gaussian
 from rbpf.lie import SE3, Array
-from rbpf.motion.stereo_geometry import Matches, homography, lens, points_from_pixels, raise_pixels
+from rbpf.motion.stereo_geometry import Matches, homography, intrinsics, points_from_pixels, times_pixels
 
 REFINEMENTS = 2
 """Gauss-Newton steps on the nine pixels of a triple."""
@@ -21,28 +22,30 @@ FARTHEST = 1e4
 
 
 @dataclass(frozen=True)
-class Draws:
-    """How many triples are tried.
+class RansacConfig:
+    """How many triples of matches are tried.
 
     Attributes:
         batch: tried at a time.
-        most: of all batches.
-        certainty: with this probability one triple without a false match is among them, given the fraction of matches
+        max_triples: of all batches.
+        confidence: with this probability one triple without a false match is among them, given the fraction of matches
             that agree with the best motion so far.
     """
 
+    RENAMED: ClassVar[dict[str, str]] = {"most": "max_triples", "certainty": "confidence"}
+
     batch: int = 32
-    most: int = 512
-    certainty: float = 0.9999
+    max_triples: int = 512
+    confidence: float = 0.9999
 
     def needed(self, fraction: float) -> float:
         """Triples that it takes where this fraction of the matches is right."""
         spoilt = 1.0 - min(fraction, 1.0 - 1e-9) ** 3
-        return float(np.log1p(-self.certainty) / np.log(spoilt)) if spoilt < 1.0 else np.inf
+        return float(np.log1p(-self.confidence) / np.log(spoilt)) if spoilt < 1.0 else np.inf
 
 
 def consensus(
-    matches: Matches, start: Array, gate: float, rng: np.random.Generator, draws: Draws | None = None
+    matches: Matches, start: Array, gate: float, rng: np.random.Generator, config: RansacConfig | None = None
 ) -> Array:
     """The motion (7,) of the lowest truncated score Σ min(d², gate).
 
@@ -53,15 +56,15 @@ def consensus(
         start: (7,) a guess of the motion; it takes part, and so does standing still.
         gate: squared distance beyond which a match does not agree.
         rng: draws the triples.
-        draws: how many.
+        config: how many.
     """
-    draws, search = draws or Draws(), _Search(matches, start)
+    config, search = config or RansacConfig(), _Search(matches, start)
     best, lowest, fraction = start, np.inf, 0.0
     motions = np.stack([start, SE3.identity()])
-    for tried in range(0, draws.most, draws.batch):
-        if tried > draws.needed(fraction):
+    for tried in range(0, config.max_triples, config.batch):
+        if tried > config.needed(fraction):
             break
-        found = search.candidates(triples(len(matches), draws.batch, rng))
+        found = search.candidates(triples(len(matches), config.batch, rng))
         motions = np.concatenate([motions, found]) if tried == 0 else found
         scores, fractions = search.scores(motions, gate)
         if scores.min() < lowest:
@@ -91,26 +94,26 @@ class _Search:
 
     def candidates(self, rows: np.ndarray) -> Array:
         """Motions (C, 7) of triples (C, 3): aligned, or the start where that is better, and refined (compiled)."""
-        from rbpf.motion.stereo_triple_kernels import propose
+        from rbpf.motion.stereo_kernels import propose
 
         matches, motions = self.matches, np.empty((len(rows), 7))
-        pixels = (matches.z_prev, matches.z_now, self.white, lens(matches.camera))
+        pixels = (matches.z_prev, matches.z_now, self.white, intrinsics(matches.camera))
         propose(rows, self.before, self.now, *pixels, self.start, REFINEMENTS, motions)
         return motions
 
     def scores(self, motions: Array, gate: float) -> tuple[Array, Array]:
         """Σ min(d², gate) (C,) of motions (C, 7) over all matches, and the fractions (C,) that agree (compiled)."""
-        from rbpf.motion import stereo_kernels
+        from rbpf.motion.stereo_kernels import scores
 
         matches = self.matches
         score, agreeing = np.empty(len(motions)), np.empty(len(motions))
         matrices = homography(matches.camera, motions)
-        stereo_kernels.scores(matrices, matches.z_prev, matches.z_now, self.white, gate, score, agreeing)
+        scores(matrices, matches.z_prev, matches.z_now, self.white, gate, score, agreeing)
         return score, agreeing / len(matches)
 
 
 def _points(matches: Matches, pixels: Array) -> Array:
     """Points (K, 3) of pixels (K, 3), those at infinity and beyond put far away."""
-    raised = raise_pixels(points_from_pixels(matches.camera), pixels)
+    raised = times_pixels(points_from_pixels(matches.camera), pixels)
     least = 1.0 / (FARTHEST * matches.camera.baseline_m)
     return raised[:, :3] / np.maximum(raised[:, 3:], least)

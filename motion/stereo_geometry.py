@@ -1,4 +1,4 @@
-"""Pixels and points of a rectified stereo pair, as matrices.
+"""Pixels of a rectified stereo pair, matches of two pairs, and their reprojection error as a function of the motion.
 
 A homogeneous point X = (x, y, z, ρ) in the left camera's frame, at (x, y, z) / ρ, and its pixels m = (u_left, v,
 u_right) are related by (m, 1) ~ Q X. A point seen at m is seen after a motion T = previous_camera_from_camera at g with
@@ -6,14 +6,36 @@ u_right) are related by (m, 1) ~ Q X. A point seen at m is seen after a motion T
     (g, 1) ~ H (m, 1),    H = Q T⁻¹ Q⁻¹,    Mathematics (vo-homography),
 
 a homography, which does not notice where infinity is: noise may well make the disparity of a far point negative.
+
+Both measurements are noisy, z⁻ = m + v⁻ and z = g(T, m) + v. About any m̂, eliminating m leaves S05 (14) as
+
+    ν = z − g(T, m̂) − A (z⁻ − m̂),   A = ∂g/∂m,   cov ν = S = R + A R⁻ Aᵀ
+
+by Mathematics (vo-innovation). A R⁻ Aᵀ is J_P C J_Pᵀ with the covariance C of the earlier point in space. `Points`
+says which m̂: by default that of least Mathematics (vo-profile).
 """
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from rbpf import gaussian
+from rbpf.errors import InputError
 from rbpf.lie import SE3, Array, skew
+
+Points = Literal["adjusted", "propagated", "exact"]
+"""What the earlier frame's points are taken for.
+
+- adjusted: unknown as well, m̂ minimises ‖z⁻ − m‖² + ‖z − g(T, m)‖², each under its covariance. The minimum over T then
+  is that of the bundle adjustment of both frames, and JᵀS⁻¹J the Schur complement of its information.
+- propagated: where they were measured, m̂ = z⁻, with their covariance in S.
+- exact: where they were measured, without error, S = R: the paper's.
+"""
+
+SWEEPS, SWEPT_PX = 10, 1e-4
+"""Of the adjustment of m̂: most of them, and the last one's change. g is nearly linear: two or three do."""
 
 
 class PinholeCamera(Protocol):
@@ -66,6 +88,34 @@ class Matches:
     cov_prev: Array
     cov_now: Array
 
+    @classmethod
+    def checked(
+        cls, camera: StereoCamera, z_prev: Array, z_now: Array, cov_prev: ArrayLike, cov_now: ArrayLike
+    ) -> "Matches":
+        """Of pixels (K, 3) and covariances (K, 3, 3), or (3, 3) for all.
+
+        Raises:
+            InputError: a shape does not fit, a number is not finite, or a covariance is not positive definite.
+        """
+        before, now = (np.ascontiguousarray(z, dtype=float) for z in (z_prev, z_now))
+        if before.shape != now.shape or before.shape[1:] != (3,):
+            raise InputError(
+                f"matches must be two (K, 3) arrays of (u_left, v, u_right), got {before.shape} and {now.shape}"
+            )
+        if not (np.isfinite(before).all() and np.isfinite(now).all()):
+            raise InputError("the pixels of the matches hold NaN or infinity: leave these matches out")
+        covs = []
+        for name, given in (("cov_prev", cov_prev), ("cov_now", cov_now)):
+            cov = np.asarray(given, dtype=float)
+            if cov.shape not in ((3, 3), (*before.shape, 3)):
+                raise InputError(f"{name} must be (3, 3) or {(*before.shape, 3)}, got {cov.shape}")
+            try:
+                gaussian.cholesky(cov)
+            except InputError as error:
+                raise InputError(f"{name} is no covariance of pixels: {error}") from error
+            covs.append(np.ascontiguousarray(np.broadcast_to(cov, (*before.shape, 3))))
+        return cls(camera, before, now, *covs)
+
     def __len__(self) -> int:
         return len(self.z_prev)
 
@@ -74,34 +124,48 @@ class Matches:
         chosen = (array[kept] for array in (self.z_prev, self.z_now, self.cov_prev, self.cov_now))
         return Matches(self.camera, *chosen)
 
+    def plausible(self, gate: float) -> np.ndarray:
+        """Which (K,) can be points in front of the camera.
+
+        Args:
+            gate: squared distance, in standard deviations, that a disparity may be below zero.
+        """
+        across = np.array([1.0, 0.0, -1.0])
+        kept = np.ones(len(self), dtype=bool)
+        for z, cov in ((self.z_prev, self.cov_prev), (self.z_now, self.cov_now)):
+            disparity, variance = z @ across, np.einsum("i,kij,j->k", across, cov, across)
+            kept &= (disparity >= 0.0) | (disparity**2 <= gate * variance)
+        return kept
+
 
 @dataclass(frozen=True)
-class Seen:
+class Reprojection:
     """Pixels after a motion, and their derivatives.
 
     Attributes:
         pixels: (…, 3) g.
         front: (…) whether the point is in front of the camera, or beyond infinity.
         by_pixels: (…, 3, 3) A = ∂g/∂m.
-        by_turn: (…, 3, 3) ∂g/∂ω, of T Exp([ω, v]).
-        by_nearness: (…, 3, 3) with ∂g/∂v = ρ · this.
-        nearness: (…) ρ of m at z = 1: the inverse depth before the motion, 1/m.
+        by_rotation: (…, 3, 3) ∂g/∂ω, of T Exp([ω, v]).
+        by_scaled_translation: (…, 3, 3) with ∂g/∂v = ρ · this.
+        inverse_depth: (…) ρ of m at z = 1: the inverse depth before the motion, 1/m.
     """
 
     pixels: Array
     front: np.ndarray
     by_pixels: Array
-    by_turn: Array
-    by_nearness: Array
-    nearness: Array
+    by_rotation: Array
+    by_scaled_translation: Array
+    inverse_depth: Array
 
     @property
     def by_motion(self) -> Array:
         """(…, 3, 6) ∂g/∂ξ, order [ω, v]: Mathematics (vo-jacobian)."""
-        return np.concatenate([self.by_turn, self.nearness[..., None, None] * self.by_nearness], axis=-1)
+        by_translation = self.inverse_depth[..., None, None] * self.by_scaled_translation
+        return np.concatenate([self.by_rotation, by_translation], axis=-1)
 
 
-def lens(camera: StereoCamera) -> Array:
+def intrinsics(camera: StereoCamera) -> Array:
     """What compiled functions take a camera for, (5,): fx, fy, cx, cy, fx · baseline."""
     one = camera.camera
     return np.array([one.fx, one.fy, one.cx, one.cy, one.fx * camera.baseline_m])
@@ -139,16 +203,16 @@ def homography(camera: StereoCamera, delta: Array) -> Array:
     return np.asarray(pixels_from_points(camera) @ moved @ points_from_pixels(camera), dtype=float)
 
 
-def raise_pixels(matrix: Array, pixels: Array) -> Array:
+def times_pixels(matrix: Array, pixels: Array) -> Array:
     """Matrices (…, 4, 4) times (m, 1), (…, k, 3) → (…, k, 4)."""
     return pixels @ matrix[..., :3].mT + matrix[..., None, :, 3]
 
 
-def see(camera: StereoCamera, delta: Array, pixels: Array) -> Seen:
+def reproject(camera: StereoCamera, delta: Array, pixels: Array) -> Reprojection:
     """Where points seen at `pixels` (…, k, 3) are seen after motions T (…, 7), broadcast over the leading axes."""
     q = pixels_from_points(camera)
     matrix = homography(camera, delta)
-    raised = raise_pixels(matrix, pixels)
+    raised = times_pixels(matrix, pixels)
     front = raised[..., 3] > 0.0
     raised = np.where(front[..., None], raised, [0.0, 0.0, 0.0, 1.0])
     depth = raised[..., 3, None]
@@ -156,7 +220,84 @@ def see(camera: StereoCamera, delta: Array, pixels: Array) -> Seen:
     # (m, 1) ~ Q X has z as its last entry, here and after the motion.
     point = raised @ points_from_pixels(camera).T
     slope = (q[:3, :3] - seen[..., None] * np.array([0.0, 0.0, 1.0])) / depth[..., None]
-    by_pixels = (matrix[..., None, :3, :3] - seen[..., None] * matrix[..., None, None, 3, :3]) / depth[
-        ..., None
-    ]
-    return Seen(seen, front, by_pixels, slope @ skew(point[..., :3]), -slope, point[..., 3])
+    by_pixels = matrix[..., None, :3, :3] - seen[..., None] * matrix[..., None, None, 3, :3]
+    by_pixels = by_pixels / depth[..., None]
+    return Reprojection(seen, front, by_pixels, slope @ skew(point[..., :3]), -slope, point[..., 3])
+
+
+@dataclass(frozen=True)
+class Innovation:
+    """ν and what goes with it.
+
+    Attributes:
+        nu: (K, 3), infinite where a point would be behind the camera.
+        cov: (K, 3, 3) S.
+        pixels: (K, 3) m̂.
+        seen: g at m̂, and its derivatives.
+    """
+
+    nu: Array
+    cov: Array
+    pixels: Array
+    seen: Reprojection
+
+
+class WhiteRows(NamedTuple):
+    """Innovations, whitened.
+
+    Attributes:
+        rows: (K, 3, 7) L⁻¹ [ν, −∂g/∂ξ] with S = L Lᵀ; zeros for a point behind the camera.
+        front: (K,) `Reprojection.front`.
+        pixels: (K, 3) m̂.
+    """
+
+    rows: Array
+    front: np.ndarray
+    pixels: Array
+
+
+def residuals(matches: Matches, delta: Array, points: Points) -> tuple[Array, Array]:
+    """Whitened residuals (3K,) and their derivative (3K, 6) by the motion, for least squares (compiled).
+
+    Infinite where a point would be behind the camera.
+    """
+    found = white_rows(matches, delta, points)
+    if not found.front.all():
+        return np.full(3 * len(matches), np.inf), np.zeros((3 * len(matches), 6))
+    flat = found.rows.reshape(-1, 7)
+    return flat[:, 0].copy(), flat[:, 1:].copy()
+
+
+def squared_distances(matches: Matches, delta: Array, points: Points) -> Array:
+    """Squared Mahalanobis distances (K,) from a motion, infinite for points behind the camera (compiled)."""
+    found = white_rows(matches, delta, points)
+    return np.where(found.front, np.square(found.rows[..., 0]).sum(axis=-1), np.inf)
+
+
+def white_rows(matches: Matches, delta: Array, points: Points) -> WhiteRows:
+    """The innovations at a motion, with m̂ as `points` says, whitened (compiled)."""
+    from rbpf.motion import stereo_kernels
+
+    count = len(matches)
+    found = WhiteRows(np.empty((count, 3, 7)), np.empty(count, dtype=bool), np.empty((count, 3)))
+    stereo_kernels.white_rows(
+        homography(matches.camera, delta),
+        intrinsics(matches.camera),
+        *(matches.z_prev, matches.z_now, matches.cov_prev, matches.cov_now),
+        points != "exact",
+        SWEEPS if points == "adjusted" else 0,
+        SWEPT_PX,
+        *found,
+    )
+    return found
+
+
+def linearised(matches: Matches, delta: Array, pixels: Array, points: Points) -> Innovation:
+    """ν at a motion (7,), linearised about m̂ = `pixels` (K, 3)."""
+    seen = reproject(matches.camera, delta, pixels)
+    off = (seen.by_pixels @ (matches.z_prev - pixels)[..., None])[..., 0]
+    nu = np.where(seen.front[:, None], matches.z_now - seen.pixels - off, np.inf)
+    cov = matches.cov_now
+    if points != "exact":
+        cov = cov + seen.by_pixels @ matches.cov_prev @ seen.by_pixels.mT
+    return Innovation(nu, cov, pixels, seen)

@@ -4,24 +4,25 @@ A consensus of triples separates true from false matches; Levenberg-Marquardt on
 agree finds the motion, and what they leave open about it is its covariance. In three respects this is not the paper's
 method, which `points="exact"` gives: the earlier points are estimated together with the motion, both images of the
 later pair count, and the covariance includes the earlier points' noise.
+
+`estimate_motion` looks at the matches alone; `VisualOdometry` starts from a prior, and joins with it what says less.
 """
 
+import math
 from dataclasses import dataclass, field, replace
-from typing import final
+from typing import ClassVar, final
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from rbpf.core.least_squares import Minimum, Rule, minimise
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
-from rbpf.motion.stereo_consensus import Draws, consensus
-from rbpf.motion.stereo_covariance import consistent_covariance, trimming
-from rbpf.motion.stereo_geometry import Matches, StereoCamera
-from rbpf.motion.stereo_matches import checked_matches, possible
-from rbpf.motion.stereo_reprojection import (
+from rbpf.motion.odometry import Odometry
+from rbpf.motion.stereo_consensus import RansacConfig, consensus
+from rbpf.motion.stereo_geometry import (
+    Innovation,
+    Matches,
     Points,
-    innovation,
     linearised,
     residuals,
     squared_distances,
@@ -37,6 +38,12 @@ REWEIGHTED = 3
 WIDE = 4.0
 """Times the gate is what agrees with the consensus of three: it is not yet the motion of all."""
 
+LEAST_KEPT = 0.05
+"""No direction keeps less of I than this in I − D: where nearly all is noise, what is left cannot be told from it."""
+
+ROUNDING = 1e-14
+"""Variances below this fraction of the largest are rounding."""
+
 
 @final
 @dataclass(frozen=True)
@@ -44,18 +51,20 @@ class VoConfig:
     """How a motion is estimated.
 
     Attributes:
-        points: what the earlier points are taken for, see `rbpf.motion.stereo_reprojection.Points`.
+        points: what the earlier points are taken for, see `rbpf.motion.stereo_geometry.Points`.
         gate: squared Mahalanobis distance beyond which a match is false; 99 % of the true ones are within, χ² with
             three degrees of freedom.
-        least_matches: fewer that agree are no motion.
-        draws: of triples.
+        min_matches: fewer that agree are no motion.
+        ransac: how many triples are tried.
         rule: when the optimiser stops; the default is a hundredth of the motion's standard deviations.
     """
 
+    RENAMED: ClassVar[dict[str, str]] = {"least_matches": "min_matches", "draws": "ransac"}
+
     points: Points = "adjusted"
     gate: float = 11.345
-    least_matches: int = 8
-    draws: Draws = field(default_factory=Draws)
+    min_matches: int = 8
+    ransac: RansacConfig = field(default_factory=RansacConfig)
     rule: Rule = field(default_factory=lambda: Rule(offset=0.01, iterations=100))
 
     def __post_init__(self) -> None:
@@ -64,8 +73,8 @@ class VoConfig:
             raise InputError(f"points must be adjusted, propagated or exact, got {self.points!r}")
         if not self.gate > 0.0:
             raise InputError(f"the gate of visual odometry must be positive, got {self.gate}")
-        if self.least_matches < 3:
-            raise InputError(f"a motion needs at least 3 matches that agree, got {self.least_matches}")
+        if self.min_matches < 3:
+            raise InputError(f"a motion needs at least 3 matches that agree, got {self.min_matches}")
 
 
 @final
@@ -79,7 +88,6 @@ class MotionEstimate:
         inliers: (K,) bool, matches that agree with it.
         rms: root mean square of the inliers' whitened residuals, 1 expected: with their degrees of freedom, and with
             what the gate cuts off made up for.
-        iterations: of the optimiser.
         failure: why no motion was found, in words; empty where one was.
         others: motions that matches far from this one agree on, as those on a thing that moves, each with its own
             inliers; false matches agree on none.
@@ -89,7 +97,6 @@ class MotionEstimate:
     cov: Array
     inliers: np.ndarray
     rms: float
-    iterations: int
     failure: str = ""
     others: tuple["MotionEstimate", ...] = ()
 
@@ -98,48 +105,45 @@ class MotionEstimate:
         """Whether there is a motion."""
         return not self.failure
 
-    @property
-    def elsewhere(self) -> int:
-        """Number of matches that agree on other motions."""
-        return int(sum(other.inliers.sum() for other in self.others))
-
 
 def estimate_motion(
-    camera: StereoCamera,
-    z_prev: Array,
-    z_now: Array,
-    cov_prev: ArrayLike,
-    cov_now: ArrayLike,
-    rng: np.random.Generator,
-    start: Array | None = None,
-    config: VoConfig | None = None,
+    matches: Matches, rng: np.random.Generator, start: Array | None = None, config: VoConfig | None = None
 ) -> MotionEstimate:
     """The motion of a rectified stereo camera between two frames.
 
     Args:
-        camera: of both frames.
-        z_prev: (K, 3) pixels (u_left, v, u_right) of the matches in the earlier frame.
-        z_now: (K, 3) pixels of the same points in the later one.
-        cov_prev: covariance of the earlier pixels [px²], (K, 3, 3), or (3, 3) for all.
-        cov_now: of the later ones.
+        matches: of the two; see `Matches.checked`.
         rng: draws the triples; the same state gives the same bytes.
         start: (7,) a guess of the increment; by default none, the camera stands still.
         config: how.
 
     Returns:
         The estimate. Where matches are too few or do not agree, its `failure` says so.
-
-    Raises:
-        InputError: a shape does not fit, a number is not finite, or a covariance is not positive definite.
     """
     config, start = config or VoConfig(), SE3.identity() if start is None else np.asarray(start, dtype=float)
-    matches = checked_matches(camera, z_prev, z_now, cov_prev, cov_now)
-    real, complaint = possible(matches, config.gate)
-    if real.sum() < config.least_matches:
-        return _failed(start, matches, f"{complaint}, {config.least_matches} are needed")
-    motion = consensus(matches.rows(real), start, config.gate, rng, config.draws)
-    found = _refined(matches, real, motion, start, config)
-    return replace(found, others=_others(matches, real, found, config, rng)) if found.found else found
+    plausible = matches.plausible(config.gate)
+    if plausible.sum() < config.min_matches:
+        there, count = f"{plausible.sum()} matches are there", len(matches)
+        if count and plausible.mean() < 0.5:
+            negative = f"{count - plausible.sum()} of {count} matches have a negative disparity"
+            there = f"{negative}: are left and right swapped? {plausible.sum()} are left"
+        return _failed(start, matches, f"{there}, {config.min_matches} are needed")
+    motion = consensus(matches.rows(plausible), start, config.gate, rng, config.ransac)
+    found = _refined(matches, plausible, motion, start, config)
+    others, left, last = list[MotionEstimate](), plausible, found
+    while last.found:
+        # Matches just outside a gate belong to the motion that was found first.
+        left = left & (_squared(matches, last.previous_camera_from_camera, config) > WIDE * config.gate)
+        if left.sum() < config.min_matches:
+            break
+        far, inliers = matches.rows(left), np.zeros(len(matches), dtype=bool)
+        motion = consensus(far, SE3.identity(), config.gate, rng, config.ransac)
+        last = _refined(far, np.ones(len(far), dtype=bool), motion, motion, config)
+        inliers[np.flatnonzero(left)[last.inliers]] = True
+        if last.found:
+            last = replace(last, inliers=inliers)
+            others.append(last)
+    return replace(found, others=tuple(others))
 
 
 def fit(matches: Matches, start: Array, config: VoConfig) -> Minimum[Array]:
@@ -154,7 +158,7 @@ def fit(matches: Matches, start: Array, config: VoConfig) -> Minimum[Array]:
         return _minimum(matches, start, config.points, config.rule)
     for _ in range(REWEIGHTED):
         # S as it is at the last motion takes the place of R, and stays while the motion is sought.
-        weighted = replace(matches, cov_now=innovation(matches, start, "propagated").cov)
+        weighted = replace(matches, cov_now=linearised(matches, start, matches.z_prev, "propagated").cov)
         found = _minimum(weighted, start, "exact", config.rule)
         start = found.x
     return found
@@ -165,50 +169,35 @@ def _minimum(matches: Matches, start: Array, points: Points, rule: Rule) -> Mini
 
 
 def _refined(
-    matches: Matches, real: np.ndarray, motion: Array, start: Array, config: VoConfig
+    matches: Matches, plausible: np.ndarray, motion: Array, start: Array, config: VoConfig
 ) -> MotionEstimate:
     """The motion of all matches that agree, from one that many agree with."""
-    agreeing, iterations = real & (_squared(matches, motion, config) <= WIDE * config.gate), 0
+    agreeing, iterations = plausible & (_squared(matches, motion, config) <= WIDE * config.gate), 0
     for _ in range(ROUNDS):
-        if agreeing.sum() < config.least_matches:
+        if agreeing.sum() < config.min_matches:
             agree = f"{agreeing.sum()} of {len(matches)} matches agree on a motion"
-            return _failed(start, matches, f"{agree}, {config.least_matches} are needed")
+            return _failed(start, matches, f"{agree}, {config.min_matches} are needed")
         inliers, part = agreeing, matches.rows(agreeing)
         found = fit(part, motion, config)
         motion, iterations = found.x, iterations + found.iterations
-        agreeing = real & (_squared(matches, motion, config) <= config.gate)
+        agreeing = plausible & (_squared(matches, motion, config) <= config.gate)
         if (agreeing == inliers).all():
             break
     if not found.converged:
         return _failed(start, matches, f"the optimiser did not converge in {iterations} iterations")
     rms = np.sqrt(trimming(config.gate) * found.squared / max(len(found.residual) - 6, 1))
-    return MotionEstimate(motion, _covariance(part, found, config), inliers, float(rms), iterations)
-
-
-def _others(
-    matches: Matches, left: np.ndarray, found: MotionEstimate, config: VoConfig, rng: np.random.Generator
-) -> tuple[MotionEstimate, ...]:
-    """Other motions that matches agree on; those just outside a gate belong to the motion that was found first."""
-    others = list[MotionEstimate]()
-    while found.found:
-        squared = _squared(matches, found.previous_camera_from_camera, config)
-        left = left & (squared > WIDE * config.gate)
-        if left.sum() < config.least_matches:
-            break
-        far, inliers = matches.rows(left), np.zeros(len(matches), dtype=bool)
-        motion = consensus(far, SE3.identity(), config.gate, rng, config.draws)
-        found = _refined(far, np.ones(len(far), dtype=bool), motion, motion, config)
-        inliers[np.flatnonzero(left)[found.inliers]] = True
-        if found.found:
-            found = replace(found, inliers=inliers)
-            others.append(found)
-    return tuple(others)
+    return MotionEstimate(motion, _covariance(part, found, config), inliers, float(rms))
 
 
 def _squared(matches: Matches, motion: Array, config: VoConfig) -> Array:
     """Squared distances (K,) of the matches from a motion; the paper's points have no noise, but their matches do."""
     points: Points = "propagated" if config.points == "exact" else config.points
     return squared_distances(matches, motion, points)
+
+
+def _failed(start: Array, matches: Matches, why: str) -> MotionEstimate:
+    nobody = np.zeros(len(matches), dtype=bool)
+    return MotionEstimate(start, np.full((6, 6), np.nan), nobody, float("nan"), why)
 
 
 def _covariance(matches: Matches, found: Minimum[Array], config: VoConfig) -> Array:
@@ -218,17 +207,173 @@ def _covariance(matches: Matches, found: Minimum[Array], config: VoConfig) -> Ar
         return trimming(config.gate) * found.cov
     pixels = white_rows(matches, found.x, "adjusted").pixels
     adjusted = linearised(matches, found.x, pixels, "adjusted")
-    return trimming(config.gate) * consistent_covariance(matches, adjusted, found.factor)
+    return trimming(config.gate) * _consistent_covariance(matches, adjusted, found.factor)
 
 
-def no_motion(found: MotionEstimate, why: str) -> MotionEstimate:
-    """An estimate taken back."""
-    nobody = np.zeros_like(found.inliers)
-    return MotionEstimate(
-        found.previous_camera_from_camera, np.full((6, 6), np.nan), nobody, float("nan"), 0, why
-    )
+def _consistent_covariance(matches: Matches, found: Innovation, factor: Array) -> Array:
+    """Covariance (6, 6) of a motion, in the right chart there.
+
+    (JᵀS⁻¹J)⁻¹ at the solution is the usual answer, and too small where points are far: the translation's derivative is
+    proportional to the inverse depth ρ̂, and the square of a noisy ρ̂ is larger than that of the true one by var ρ̂, on
+    average. With the information I = Σ JᵀS⁻¹J as found and D = Σ var ρ̂ (∂J/∂ρ)ᵀS⁻¹(∂J/∂ρ), the derivative of the
+    score is I − D while the score itself has the covariance I, because ν is independent of m̂. Hence (W. Fuller 1987,
+    §3.2)
+
+        cov = (I − D)⁻¹ I (I − D)⁻¹,    Mathematics (vo-covariance).
+
+    Args:
+        matches: that it was found from.
+        found: their innovation at the solution, points adjusted.
+        factor: (6, 6) F with F Fᵀ = I⁻¹.
+    """
+    # ρ = (u_left − u_right) / (f b), of the pixels m̂: cov m̂ = R⁻ − R⁻Aᵀ S⁻¹ A R⁻.
+    seen = found.seen
+    shift = matches.camera.camera.fx * matches.camera.baseline_m
+    across = matches.cov_prev @ (np.array([1.0, 0.0, -1.0]) / shift)
+    gain = seen.by_pixels @ across[..., None]
+    solved = np.linalg.solve(found.cov, np.concatenate([gain, seen.by_scaled_translation], axis=-1))
+    variance = (across[:, 0] - across[:, 2]) / shift - (gain * solved[..., :1]).sum(axis=(1, 2))
+    # D is zero but for the translation.
+    d = np.zeros((6, 6))
+    scaled = variance[:, None, None] * seen.by_scaled_translation
+    d[3:, 3:] = scaled.reshape(-1, 3).T @ solved[..., 1:].reshape(-1, 3)
+    noise = factor.T @ d @ factor
+    lost, axes = np.linalg.eigh(0.5 * (noise + noise.T))
+    half = factor @ axes / np.maximum(1.0 - lost, LEAST_KEPT)
+    return half @ half.T
 
 
-def _failed(start: Array, matches: Matches, why: str) -> MotionEstimate:
-    nobody = np.zeros(len(matches), dtype=bool)
-    return MotionEstimate(start, np.full((6, 6), np.nan), nobody, float("nan"), 0, why)
+def trimming(gate: float) -> float:
+    """Variance of a motion from the matches within a gate, beside that from as many that were not chosen.
+
+    Leaving out what lies beyond a gate costs true matches, and the farthest, which speak most: the rest determines the
+    motion less well than as many that were not chosen would. F₃ / F₅, the distributions of χ² with three and five
+    degrees of freedom at the gate: rejection by ν has the influence function ν within the gate, the covariance
+    E[νᵀν] / 3 = F₅ and the slope F₅ (P. Huber 1981, §4.5), for each match; the fraction F₃ of them is within. It is
+    also 3 / E[ν² | within].
+
+    Args:
+        gate: squared Mahalanobis distance; infinite for none.
+    """
+    if math.isinf(gate):
+        return 1.0
+    three = math.erf(math.sqrt(0.5 * gate)) - math.sqrt(2.0 * gate / math.pi) * math.exp(-0.5 * gate)
+    five = three - math.sqrt(2.0 * gate**3 / math.pi) * math.exp(-0.5 * gate) / 3.0
+    return three / five
+
+
+@final
+@dataclass(frozen=True)
+class MotionPrior:
+    """The motion that is expected before anything is seen: the last velocity, or standing still.
+
+    Attributes:
+        std_turn: standard deviation of the angular velocity about the expected one, rad/s.
+        std_speed: of the velocity, m/s. Both defaults are a hand-held camera's or an indoor robot's.
+        keep_velocity: whether the last velocity that was seen is expected to go on.
+    """
+
+    std_turn: float = 1.0
+    std_speed: float = 1.0
+    keep_velocity: bool = True
+
+    def __post_init__(self) -> None:
+        """Checks that the numbers make sense."""
+        if not (self.std_turn > 0.0 and self.std_speed > 0.0):
+            raise InputError(
+                f"std_turn and std_speed must be positive, got {self.std_turn} and {self.std_speed}"
+            )
+
+    def increment(self, velocity: Array, dt: float) -> Odometry:
+        """The increment expected after `dt` seconds at a velocity (6,) [ω, v]."""
+        std = dt * np.repeat([self.std_turn, self.std_speed], 3)
+        return Odometry(SE3.exp(dt * velocity), np.diag(std**2))
+
+
+@final
+@dataclass(frozen=True)
+class CandidateMotion:
+    """A motion that a group of matches agrees on.
+
+    Attributes:
+        odometry: previous_camera_from_camera and its covariance, to hand to a filter.
+        inliers: (K,) bool, the group.
+        note: in words, where the increment is not simply what the group says; empty else.
+    """
+
+    odometry: Odometry
+    inliers: np.ndarray
+    note: str
+
+
+@final
+@dataclass(frozen=True)
+class CandidateMotions:
+    """What the matches of two frames say of the camera's motion.
+
+    One candidate is the rule. Several mean that something in the view moves: which of them is the camera's is not in
+    the matches, and is for the caller to say.
+
+    Attributes:
+        prior: the motion expected before anything was seen.
+        motions: the candidates, that of the first consensus first; none where matches are too few or do not agree.
+        failure: why there is none, in words; empty where there is one.
+    """
+
+    prior: Odometry
+    motions: tuple[CandidateMotion, ...]
+    failure: str
+
+
+@final
+class VisualOdometry:
+    """Estimates the motion between two frames under a prior.
+
+    Where no motion is found there is only the prior; where the matches tell less than it in some direction (nothing
+    but far points: how far did the camera go?) both are joined, and the candidate's `note` says so.
+
+    Args:
+        config: of the estimate.
+        prior: what is expected before anything is seen.
+    """
+
+    def __init__(self, config: VoConfig | None = None, prior: MotionPrior | None = None) -> None:
+        self.config, self.prior = config or VoConfig(), prior or MotionPrior()
+
+    def candidates(
+        self, matches: Matches, velocity: Array, dt: float, rng: np.random.Generator
+    ) -> CandidateMotions:
+        """The motions over `dt` seconds that the matches may tell of.
+
+        Args:
+            matches: of the two frames.
+            velocity: (6,) [ω, v] of the camera before, rad/s, m/s.
+            dt: seconds between the frames.
+            rng: of the consensus.
+
+        Raises:
+            InputError: dt is not positive.
+        """
+        if not dt > 0.0:
+            raise InputError(f"visual odometry needs time between its frames, got {dt} s")
+        expected = self.prior.increment(velocity, dt)
+        found = estimate_motion(matches, rng, expected.delta, self.config)
+        motions = (found, *found.others) if found.found else ()
+        return CandidateMotions(expected, tuple(_joined(one, expected) for one in motions), found.failure)
+
+
+def _joined(found: MotionEstimate, expected: Odometry) -> CandidateMotion:
+    """The estimate, or in case it is the weaker one anywhere, the product of its Gaussian and the expected one."""
+    measured = Odometry(found.previous_camera_from_camera, found.cov)
+    # In units of the expected standard deviations the expected covariance is I.
+    std = np.sqrt(np.diagonal(expected.cov))
+    values, axes = np.linalg.eigh(found.cov / np.outer(std, std))
+    if values[-1] <= 1.0:
+        return CandidateMotion(measured, found.inliers, "")
+    values = np.maximum(values, ROUNDING * values[-1])
+    off = axes.T @ (SE3.local(expected.delta, measured.delta) / std)
+    half = std[:, None] * axes * np.sqrt(values / (1.0 + values))
+    joined = SE3.retract(expected.delta, std * (axes @ (off / (1.0 + values))))
+    worst = f"a standard deviation {np.sqrt(values[-1]):.1f} times the expected one"
+    note = f"the matches leave the motion open ({worst}); it is joined with the expected one"
+    return CandidateMotion(Odometry(joined, half @ half.T), found.inliers, note)

@@ -9,7 +9,6 @@ from rbpf.runs.files import prepare_folder
 from rbpf.runs.provenance import left_out
 from rbpf.sensors.readers import ImageSequence, Topics, open_stereo
 from rbpf.sensors.readers.images.sequence import UNNAMED
-from rbpf.systems.map_estimate import estimate_map
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.run import StereoRun, run_images
 from rbpf.validation.consistency.validate import report_run
@@ -99,7 +98,7 @@ def finish_stereo(
         batch: also adjust the same measurements in batch, and score the optimum.
         telling: whom to tell how far it is, and the time that the batch adjustment may take.
     """
-    mapped, telling = estimate_map(run.filter), telling or Telling()
+    mapped, telling = run.slam.map(), telling or Telling()
     sources = recording.sources() | left_out(video=video, batch=batch)
     entries = write_stereo_run(run, mapped, out, sources)
     adjust = partial(adjust_stereo, run, telling.batch_s, telling.on_iteration)

@@ -18,11 +18,9 @@ report.html              one page with all figures and pictures
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from rbpf.runs.files import prepare_folder, write_csv
 from rbpf.runs.folder import (
@@ -39,8 +37,7 @@ from rbpf.runs.trajectory import Trajectory, write_tum
 from rbpf.runs.truth import write_truth
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.stereo.run import StereoRun
-from rbpf.systems.stereo.sensor import StereoSensor
-from rbpf.validation.metrics.stereo_scores import distance_m, score_stereo, stereo_truth
+from rbpf.validation.metrics.stereo_scores import score_stereo, stereo_truth
 
 _STAGES = "features", "odometry", "matching", "filter"
 
@@ -62,10 +59,10 @@ def write_stereo_run(
     prepare_folder(out)
     write_tum(out / "trajectory.tum", Trajectory(run.stamps_ns, run.world_from_camera))
     write_tum(out / "odometry.tum", Trajectory(run.stamps_ns, run.odometry))
-    write_map(out, replace(mapped, columns=_facts(run, mapped)))
+    write_map(out, mapped)
     write_trajectory(out, run.stamps_ns, run.world_from_camera, run.cov)
     write_truth(out, stereo_truth(run))
-    write_measurements(out, run.front_end.log(run.name, run.stamps_ns, run.truth))
+    write_measurements(out, run.log())
     _write_tables(run, out)
     write_config(out, "stereo", sources, asdict(run.config))
     entries = summarise_stereo(run, mapped)
@@ -75,56 +72,23 @@ def write_stereo_run(
 
 def summarise_stereo(run: StereoRun, mapped: MapEstimate) -> dict[str, Any]:
     """The entries of summary.json."""
-    updated = run.updated.astype(bool)
-    log_evidence = run.log_evidence[updated]
+    own = run.summary()
     notes = {"problems": run.notes} if run.notes else {}
     failure = {} if run.failure is None else {"failure": run.failure}
     return {
         "system": "stereo",
         "recording": run.name,
         "frames": int(run.stamps_ns.size),
-        "frames_measured": int((run.features >= run.config.odometry.estimate.least_matches).sum()),
-        "updates": int(updated.sum()),
-        "distance_m": distance_m(run.world_from_camera),
         "particles": run.config.particles,
-        "dof": run.config.dof,
         "seed": run.config.seed,
         "ms_per_frame": milliseconds_per_frame(run.seconds),
-        "ms_per_update": milliseconds_per_frame((run.seconds_matching + run.seconds_filter)[updated]),
-        **_key_counts(run, mapped),
-        "features_per_frame": float(run.features.mean()),
-        "observations_per_update": float(run.observed[updated].mean()) if updated.any() else 0.0,
         "resamplings": int(run.resampled.sum()),
-        "ess_mean": float(run.ess[updated].mean()) if updated.any() else 0.0,
-        "log_evidence": float(log_evidence.sum()) if np.isfinite(log_evidence).all() else None,
         "nis_per_dof": nis_ratio(run.nis, run.nis_dof),
         "peak_memory_mb": peak_memory_mb(),
+        **own,
         **score_stereo(run),
         **notes,
         **failure,
-    }
-
-
-def _key_counts(run: StereoRun, mapped: MapEstimate) -> dict[str, float | int]:
-    """Keys ever started, and landmarks; all particles hold the same, as all associate alike."""
-    sensor = run.front_end.sensor
-    if not isinstance(sensor, StereoSensor):
-        return {"sift_features": 0, "landmarks_mean_per_particle": float(mapped.ids.size)}
-    return {
-        "sift_features": int(sensor.manager.next_name),
-        "landmarks_mean_per_particle": float(sensor.manager.confirmed.sum()),
-    }
-
-
-def _facts(run: StereoRun, mapped: MapEstimate) -> dict[str, np.ndarray]:
-    """How often each landmark was seen, and whether it is one or a key on trial."""
-    sensor = run.front_end.sensor
-    if not isinstance(sensor, StereoSensor):
-        return {}
-    rows = np.searchsorted(sensor.manager.names, mapped.ids)
-    return {
-        "sightings": sensor.manager.observations[rows],
-        "landmark": sensor.manager.confirmed[rows].astype(int),
     }
 
 

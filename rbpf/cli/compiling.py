@@ -96,6 +96,7 @@ def _search_patches() -> None:
 
 
 def _measure_motion() -> None:
+    from rbpf.motion.stereo_geometry import Matches
     from rbpf.motion.stereo_vo import estimate_motion
     from rbpf.sensors.camera import Pinhole, RectifiedStereo
 
@@ -103,7 +104,7 @@ def _measure_motion() -> None:
     rig = RectifiedStereo(Pinhole(640, 480, 500.0, 500.0, 319.5, 239.5), 0.12)
     before = rng.uniform([-1.0, -1.0, 2.0], [1.0, 1.0, 5.0], (40, 3))
     z_prev, z_now = rig.project(before), rig.project(before + np.array([0.02, 0.0, 0.05]))
-    estimate_motion(rig, z_prev, z_now, np.eye(3), np.eye(3), rng)
+    estimate_motion(Matches.checked(rig, z_prev, z_now, np.eye(3), np.eye(3)), rng)
 
 
 def _filter_log() -> None:

@@ -39,7 +39,8 @@ class TrackingState(StrEnum):
     PREDICTED = "predicted"
     """The frame told nothing, or not enough: the pose is the motion model's or the odometry's."""
     LOST = "lost"
-    """The camera is not where the filter believes; the pose is the last trusted one."""
+    """The frame was measured, but the map does not say where the camera is: the pose is the last trusted one, or goes on
+    from it as assumed."""
 
 
 @dataclass(frozen=True)

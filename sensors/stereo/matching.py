@@ -126,7 +126,7 @@ class StereoMatcher:
         Raises:
             InputError: the images are not of the camera's size, or they are swapped.
         """
-        self._check(left, right)
+        self.check(left, right)
         self.impulse_fraction = 0.0
         if self.config.filter_impulses:
             (left, one), (right, other) = remove_impulses(left), remove_impulses(right)
@@ -194,7 +194,12 @@ class StereoMatcher:
             match_pairs(left.descriptors, right.descriptors, (k[near], m[near]), config.limits), left, right
         )
 
-    def _check(self, left: np.ndarray, right: np.ndarray) -> None:
+    def check(self, left: np.ndarray, right: np.ndarray) -> None:
+        """Refuses images that these cameras cannot have taken.
+
+        Raises:
+            InputError: they are no (H, W) uint8, or not of the camera's size.
+        """
         left, right, camera = checked_image(left), checked_image(right), self.rig.camera
         if left.shape != right.shape:
             sizes = " and ".join(f"{image.shape[1]}x{image.shape[0]} px" for image in (left, right))

@@ -136,7 +136,7 @@ def test_a_stereo_run_is_finished_once(desk, tmp_path, monkeypatch):
     assert main(arguments) == 0
     first = (out / "trajectory.tum").read_bytes()
     (out / "trajectory.tum").unlink()
-    monkeypatch.setattr("rbpf.systems.stereo.run._frame", None)
+    monkeypatch.setattr("rbpf.systems.stereo.slam.StereoSlam.take", None)
     assert main([*arguments, "--resume"]) == 0
     assert (out / "trajectory.tum").read_bytes() == first
 

@@ -156,7 +156,7 @@ def test_a_lost_image(room, tmp_path):
     assert run(spoilt, tmp_path / "run") == 0
     entries = untimed_summary(tmp_path / "run")
     assert entries["frames"] == FRAMES and entries["frames_measured"] == FRAMES - 1
-    assert len(entries["problems"]) == 1 and entries["problems"][0].startswith("pair 4 is passed over: ")
+    assert len(entries["problems"]) == 1 and entries["problems"][0].startswith("pair 4: passed over: ")
     assert entries["ate_rmse_m"] < 0.05
 
 

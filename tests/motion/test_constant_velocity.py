@@ -1,5 +1,7 @@
 """Constant velocity driven by white-noise acceleration: E06 (5), its two sampled modes, and the start."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -17,7 +19,7 @@ from rbpf.motion.constant_velocity import (
 WALK = np.array([0.3, 0.5, 0.7, 1.1, 0.2, 0.9])
 SIGMA = np.diag(WALK**2)
 HALF = np.random.default_rng(3).normal(scale=0.2, size=(6, 8))
-LAW = PosePrior(SE3.exp(np.array([0.4, -0.2, 1.0, 3.0, -1.0, 2.0])), HALF @ HALF.T)
+PRIOR = PosePrior(SE3.exp(np.array([0.4, -0.2, 1.0, 3.0, -1.0, 2.0])), HALF @ HALF.T)
 every_time_step = pytest.mark.parametrize("dt", [1.0 / 30.0, 0.5, 2.0, 7.0])
 
 
@@ -35,19 +37,6 @@ def test_factor_of_the_walk(dt):
     factor = velocity_walk(WALK, dt)
     np.testing.assert_allclose(factor @ factor.T, covariance(dt), rtol=1e-13, atol=1e-15)
     np.testing.assert_array_equal(factor[:6, 6:], 0.0)
-
-
-def test_no_time_no_noise():
-    np.testing.assert_array_equal(velocity_walk(WALK, 0.0), np.zeros((12, 12)))
-    state = states(3)
-    for mode in ("paper", "joint"):
-        transition = SampledVelocity(WALK, mode).transition(state, None, 0.0)
-        np.testing.assert_allclose(transition.mean, state, atol=1e-15)
-        np.testing.assert_array_equal(transition.noise_factor, 0.0)
-    marginal = MarginalVelocity(WALK).transition(state[:, :7], None, 0.0)
-    assert marginal.coupling is not None
-    np.testing.assert_array_equal(marginal.coupling, 0.0)
-    np.testing.assert_array_equal(marginal.noise_factor, 0.0)
 
 
 @pytest.mark.parametrize(("first", "second"), [(0.1, 0.1), (0.02, 1.3), (2.0, 0.5)])
@@ -91,7 +80,7 @@ def test_paper_moves_the_velocity_with_the_pose(dt):
     np.testing.assert_allclose(sampled[:, 7:] - state[:, 7:], 1.5 / dt * w1, rtol=1e-7, atol=1e-9)
 
 
-def test_joint_law_in_the_chart_of_the_prediction():
+def test_joint_noise_in_the_chart_of_the_prediction():
     """Exp(δv + w₁) as Exp(δv) Exp(ε): drawn from (5), then charted, it has the covariance of the factor."""
     dt, n = 0.4, 200_000
     walk = 0.02 * WALK
@@ -108,63 +97,52 @@ def test_joint_law_in_the_chart_of_the_prediction():
     assert (np.abs(uncharted - expected) / scale).max() > 0.05
 
 
-def test_prediction_follows_the_velocity():
+@pytest.mark.parametrize("dt", [0.0, 0.7])
+def test_prediction(dt):
+    """The pose follows the velocity, and without time nothing moves; the substate is coupled to the pose by the time."""
     state = states(4)
     for mode in ("paper", "joint"):
-        mean = SampledVelocity(WALK, mode).transition(state, None, 0.7).mean
-        np.testing.assert_allclose(mean[:, :7], SE3.compose(state[:, :7], SE3.exp(0.7 * state[:, 7:])))
-        np.testing.assert_array_equal(mean[:, 7:], state[:, 7:])
-
-
-def test_velocity_as_a_substate():
-    state = states(3)[:, :7]
-    transition = MarginalVelocity(WALK).transition(state, None, 0.7)
-    np.testing.assert_array_equal(transition.mean, state)
-    np.testing.assert_array_equal(transition.coupling, 0.7 * np.eye(6)[None])
-    np.testing.assert_array_equal(transition.dynamics, np.eye(6)[None])
-    np.testing.assert_array_equal(transition.drift, np.zeros((1, 6)))
-    factor = transition.noise_factor[0]
-    np.testing.assert_allclose(factor @ factor.T, covariance(0.7), rtol=1e-13, atol=1e-15)
+        transition = SampledVelocity(WALK, mode).transition(state, None, dt)
+        moved = SE3.compose(state[:, :7], SE3.exp(dt * state[:, 7:]))
+        np.testing.assert_allclose(transition.mean[:, :7], moved, atol=1e-15)
+        np.testing.assert_array_equal(transition.mean[:, 7:], state[:, 7:])
+        assert transition.noise_factor.any() == (dt > 0.0)
+    marginal = MarginalVelocity(WALK).transition(state[:, :7], None, dt)
+    np.testing.assert_array_equal(marginal.mean, state[:, :7])
+    np.testing.assert_array_equal(marginal.coupling, dt * np.eye(6)[None])
+    np.testing.assert_array_equal(marginal.dynamics, np.eye(6)[None])
+    np.testing.assert_array_equal(marginal.drift, np.zeros((1, 6)))
+    factor = marginal.noise_factor[0]
+    np.testing.assert_allclose(factor @ factor.T, covariance(dt), rtol=1e-13, atol=1e-15)
 
 
 @pytest.mark.parametrize("dt", [0.0, 0.3])
+@pytest.mark.parametrize("std_velocity", [None, 0.3 * WALK])
 @pytest.mark.parametrize("mode", ["marginal", "joint", "paper"])
-def test_a_law_places_the_body(mode, dt):
-    """Wherever it was; the velocity is independent of the place and has walked on, or is as at the start."""
-    state, std_start = states(3), 0.5 * WALK
+def test_a_prior_places_the_body(mode, std_velocity, dt):
+    """Wherever it was; the velocity is independent of the place: as at the start, walked on, or forgotten."""
+    state, std_start, prior = states(3), 0.5 * WALK, replace(PRIOR, std_velocity=std_velocity)
     if mode == "marginal":
-        transition = MarginalVelocity(WALK).transition(state[:, :7], LAW, dt)
+        transition = MarginalVelocity(WALK).transition(state[:, :7], prior, dt)
         np.testing.assert_array_equal(transition.coupling, np.zeros((1, 6, 6)))
+        np.testing.assert_array_equal(transition.dynamics, np.eye(6)[None] * (std_velocity is None))
         of_velocity = dt * SIGMA
     else:
-        transition = SampledVelocity(WALK, mode, std_start).transition(state, LAW, dt)
-        np.testing.assert_array_equal(transition.mean[:, 7:], state[:, 7:])
+        transition = SampledVelocity(WALK, mode, std_start).transition(state, prior, dt)
+        np.testing.assert_array_equal(transition.mean[:, 7:], state[:, 7:] * (std_velocity is None))
         of_velocity = np.diag(std_start**2)
-    np.testing.assert_allclose(transition.mean[:, :7], np.repeat(LAW.mean[None], 3, axis=0), rtol=1e-14)
-    factor = transition.noise_factor[0]
-    zero = np.zeros((6, 6))
-    np.testing.assert_allclose(
-        factor @ factor.T, np.block([[LAW.cov, zero], [zero, of_velocity]]), atol=1e-14
-    )
+    if std_velocity is not None:
+        of_velocity = np.diag(std_velocity**2)
+    np.testing.assert_allclose(transition.mean[:, :7], np.repeat(PRIOR.mean[None], 3, axis=0), rtol=1e-14)
+    factor, zero = transition.noise_factor[0], np.zeros((6, 6))
+    expected = np.block([[PRIOR.cov, zero], [zero, of_velocity]])
+    np.testing.assert_allclose(factor @ factor.T, expected, atol=1e-14)
 
 
-@pytest.mark.parametrize("mode", ["marginal", "joint", "paper"])
-def test_a_law_with_a_velocity_forgets_the_old_one(mode):
-    law, state = PosePrior(LAW.mean, LAW.cov, 0.3 * WALK), states(3)
-    if mode == "marginal":
-        transition = MarginalVelocity(WALK).transition(state[:, :7], law, 0.2)
-        np.testing.assert_array_equal(transition.dynamics, np.zeros((1, 6, 6)))
-    else:
-        transition = SampledVelocity(WALK, mode, WALK).transition(state, law, 0.2)
-        np.testing.assert_array_equal(transition.mean[:, 7:], np.zeros((3, 6)))
-    factor = transition.noise_factor[0]
-    np.testing.assert_allclose((factor @ factor.T)[6:, 6:], np.diag((0.3 * WALK) ** 2), rtol=1e-13)
+FORGETTING = PosePrior(PRIOR.mean, PRIOR.cov, WALK)
 
 
-FORGETTING = PosePrior(LAW.mean, LAW.cov, WALK)
-
-
-@pytest.mark.parametrize("control", [None, LAW, FORGETTING])
+@pytest.mark.parametrize("control", [None, PRIOR, FORGETTING])
 @pytest.mark.parametrize(
     "motion", [MarginalVelocity(WALK), SampledVelocity(WALK), SampledVelocity(0.1, "paper")]
 )
@@ -172,33 +150,30 @@ def test_sound_models(motion, control):
     assert check_model(motion, example=Example(control=control)) == []
 
 
-def test_one_number_is_for_all_axes():
-    np.testing.assert_array_equal(MarginalVelocity(0.5).std_walk, np.full(6, 0.5))
-
-
 @pytest.mark.parametrize(
     "std", [np.nan, -0.1, np.array([1.0, 1.0, np.inf, 1.0, 1.0, 1.0]), np.ones(5), np.ones((2, 6))]
 )
 def test_bad_standard_deviations(std):
+    np.testing.assert_array_equal(MarginalVelocity(0.5).std_walk, np.full(6, 0.5))
     for build in (MarginalVelocity, SampledVelocity, lambda std: SampledVelocity(1.0, std_start=std)):
         with pytest.raises(InputError, match="must be one number or six, finite and not negative"):
             build(std)
 
 
 @pytest.mark.parametrize(
-    ("law", "sentence"),
+    ("mean", "cov", "sentence"),
     [
-        (PosePrior(LAW.mean[:6], LAW.cov), r"needs a finite mean \(7,\) and cov \(6, 6\)"),
-        (PosePrior(LAW.mean * np.nan, LAW.cov), r"needs a finite mean \(7,\) and cov \(6, 6\)"),
-        (PosePrior(LAW.mean, np.eye(3)), r"needs a finite mean \(7,\) and cov \(6, 6\)"),
-        (PosePrior(LAW.mean, -np.eye(6)), "negative eigenvalue"),
-        (PosePrior(LAW.mean, np.full((6, 6), np.nan)), "not finite|NaN|nan"),
+        (PRIOR.mean[:6], PRIOR.cov, r"needs a finite mean \(7,\) and cov \(6, 6\)"),
+        (PRIOR.mean * np.nan, PRIOR.cov, r"needs a finite mean \(7,\) and cov \(6, 6\)"),
+        (PRIOR.mean, np.eye(3), r"needs a finite mean \(7,\) and cov \(6, 6\)"),
+        (PRIOR.mean, -np.eye(6), "negative eigenvalue"),
+        (PRIOR.mean, np.full((6, 6), np.nan), "not finite|NaN|nan"),
     ],
 )
-def test_bad_laws(law, sentence):
+def test_bad_priors(mean, cov, sentence):
     for motion, state in ((MarginalVelocity(1.0), states(2)[:, :7]), (SampledVelocity(1.0), states(2))):
         with pytest.raises(InputError, match=sentence):
-            motion.transition(state, law, 0.0)
+            motion.transition(state, PosePrior(mean, cov), 0.0)
 
 
 def test_an_unknown_mode_of_a_sampled_velocity():

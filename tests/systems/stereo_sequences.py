@@ -6,9 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from rbpf.lie import SE3
+from rbpf.runs.run import Run, drive
 from rbpf.sensors.feature_log import CameraTruth
 from rbpf.sensors.readers import ImageFrame, ImageSequence
 from rbpf.sensors.readers.images.sequence import Source
+from rbpf.systems.stereo.config import StereoConfig
+from rbpf.systems.stereo.slam import StereoSlam
 from tests.systems.plane_sequences import CAMERA, path, texture, view
 
 BASELINE_M, STEP_NS = 0.12, 66_666_666
@@ -58,3 +61,15 @@ def missing(frame: ImageFrame) -> ImageFrame:
 def swapped(frame: ImageFrame) -> ImageFrame:
     """Left for right."""
     return ImageFrame(frame.stamp_ns, frame.right, frame.image)
+
+
+def filtered(sequence, config: StereoConfig, **options) -> Run:
+    """What stereo SLAM says of a sequence; `options` as `drive` has them."""
+    run = Run(sequence, StereoSlam(sequence.rig, config), expected=len(sequence))
+    return drive(run, stamps_ns=sequence.stamps_ns, **options)
+
+
+def errors_m(poses: np.ndarray, sequence: ImageSequence) -> np.ndarray:
+    """Of the positions (T,); the first camera is the world."""
+    true = SE3.between(sequence.truth.world_from_camera[0], sequence.truth.world_from_camera[: len(poses)])
+    return np.linalg.norm(SE3.translation(poses) - SE3.translation(true), axis=1)

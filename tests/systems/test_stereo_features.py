@@ -7,10 +7,12 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.sensors.feature_log import FeatureFrame, FeatureLog
+from rbpf.runs.run import Run, drive
+from rbpf.sensors.feature_log import FeatureLog
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig
 from rbpf.systems.stereo.config import OdometryConfig, RecoveryConfig, StereoConfig, TriggerConfig
-from rbpf.systems.stereo.run import StereoRun, run_features
+from rbpf.systems.stereo.run import run_features
+from rbpf.systems.stereo.slam import StereoSlam
 from rbpf.validation.gtsam.camera import CameraEstimate, solve_features
 from rbpf.validation.simulation.features import MONO, STEREO, Measuring, simulate_features
 from rbpf.validation.simulation.lab import LabDrive, LabWorld
@@ -35,60 +37,78 @@ def log() -> FeatureLog:
     return simulated()
 
 
-def rmse(run: StereoRun, poses: np.ndarray) -> float:
+class Named:
+    """A log as frames to drive with."""
+
+    def __init__(self, log: FeatureLog) -> None:
+        self.name, self.log = log.name, log
+
+    def frames(self, start: int = 0):
+        return iter(self.log.frames[start:])
+
+
+def filtered(log: FeatureLog, config: StereoConfig = CONFIG, **options) -> Run:
+    stamps = [frame.stamp_ns for frame in log.frames]
+    return drive(Run(Named(log), StereoSlam(log.camera, config)), stamps_ns=stamps, **options)
+
+
+def rmse(log: FeatureLog, poses: np.ndarray) -> float:
     """Of the positions; the first camera is the world."""
-    true = SE3.between(run.truth.world_from_camera[0], run.truth.world_from_camera)
+    true = SE3.between(log.truth.world_from_camera[0], log.truth.world_from_camera)
     off = SE3.translation(poses) - SE3.translation(true)
     return float(np.sqrt(np.square(off).sum(axis=1).mean()))
 
 
 def test_beside_the_batch(log):
     """The filter sees the past only, the batch all of it; the odometry forgets."""
-    run = run_features(log, CONFIG)
-    start = CameraEstimate(run.world_from_camera, {})
+    run = filtered(log)
+    start = CameraEstimate(run.log.poses, {})
     batch = solve_features(log, start, marginals=False).world_from_camera
     batch = SE3.between(batch[0], batch)
-    ours, best, alone = (rmse(run, poses) for poses in (run.world_from_camera, batch, run.odometry))
+    ours, best, alone = (rmse(log, poses) for poses in (run.log.poses, batch, run.log["odometry"]))
     assert ours < 2.5 * best
     assert ours < 0.8 * alone
-    assert np.isfinite(run.log_evidence).all()
-    assert run.filter.belief().map.ids.size > 100
+    assert np.isfinite(run.log["log_evidence"]).all()
+    assert run.system.map().ids.size > 100
 
 
-@pytest.mark.parametrize(("kind", "fraction"), [("truncated", 1.0), ("outliers", 1.0)])
-def test_the_prior_proposal(log, kind, fraction):
+def test_what_was_measured_is_told_as_it_came(log):
+    told = filtered(log).system.measurements("told", filtered(log).log)
+    for ours, theirs in zip(told.frames, log.frames, strict=True):
+        np.testing.assert_equal(vars(ours), vars(theirs))
+
+
+@pytest.mark.parametrize("kind", ["truncated", "outliers"])
+def test_the_prior_proposal(log, kind):
     """The filter is better than its odometry, by a density and by S05's truncated form, which gives no evidence.
 
     What the latter clips, a quarter of these true measurements, updates the landmarks all the same.
     """
-    config = replace(
-        CONFIG,
-        particles=400,
-        likelihood=replace(StereoConfig().likelihood, kind=kind),
-        proposal=ProposalConfig("prior"),
+    likelihood = replace(StereoConfig().likelihood, kind=kind)
+    run = filtered(
+        log, replace(CONFIG, particles=400, likelihood=likelihood, proposal=ProposalConfig("prior"))
     )
-    run = run_features(log, config)
-    assert rmse(run, run.world_from_camera) < fraction * rmse(run, run.odometry)
-    assert np.isfinite(run.log_evidence).all() == (kind == "outliers")
+    assert rmse(log, run.log.poses) < rmse(log, run.log["odometry"])
+    assert np.isfinite(run.log["log_evidence"]).all() == (kind == "outliers")
 
 
 def test_compiled_as_plain(log):
-    few = FeatureLog(log.name, log.camera, log.frames[:6], None, log.truth)
+    few = replace(log, frames=log.frames[:6])
     config = replace(CONFIG, particles=20, likelihood=LikelihoodConfig("truncated"))
-    one, other = run_features(few, config), run_features(few, replace(config, compiled=False))
-    np.testing.assert_allclose(one.world_from_camera, other.world_from_camera, atol=1e-7)
+    one, other = filtered(few, config), filtered(few, replace(config, compiled=False))
+    np.testing.assert_allclose(one.log.poses, other.log.poses, atol=1e-7)
 
 
 def test_three_degrees_of_freedom(log):
-    run = run_features(log, replace(CONFIG, dof=3))
-    np.testing.assert_allclose(run.filter.particles.state[:, 5], 0.0, atol=1e-12)
-    np.testing.assert_allclose(run.world_from_camera[:, 5], 0.0, atol=1e-12)
-    assert rmse(run, run.world_from_camera) < 0.05
+    run = filtered(log, replace(CONFIG, dof=3))
+    np.testing.assert_allclose(run.system.filter.particles.state[:, 5], 0.0, atol=1e-12)
+    np.testing.assert_allclose(run.log.poses[:, 5], 0.0, atol=1e-12)
+    assert rmse(log, run.log.poses) < 0.05
 
 
 def test_without_times(log):
     """Stamps that count frames are seconds to the odometry, and stay what they are."""
-    frames = [FeatureFrame(t, f.landmarks, f.z, f.cov_z) for t, f in enumerate(log.frames)]
+    frames = [replace(frame, stamp_ns=t) for t, frame in enumerate(log.frames)]
     run = run_features(FeatureLog("steps", log.camera, frames), CONFIG)
     np.testing.assert_array_equal(run.stamps_ns, np.arange(len(frames)))
     assert run.notes == []
@@ -98,11 +118,11 @@ def test_without_times(log):
 def test_halves_of_the_landmarks(log):
     """The map holds odd names alone, or even ones, and the odometry always the even ones."""
     for split, remainder in (("apart", 1), ("same", 0)):
-        run = run_features(log, replace(CONFIG, odometry=OdometryConfig(split=split)))
-        names = run.filter.belief().map.ids
+        run = filtered(log, replace(CONFIG, odometry=OdometryConfig(split=split)))
+        names = run.system.map().ids
         assert names.size > 50 and (names % 2 == remainder).all()
     seen = np.intersect1d(log.frames[0].landmarks, log.frames[1].landmarks)
-    assert run.agreeing[1] <= (seen % 2 == 0).sum()
+    assert run.log["agreeing"][1] <= (seen % 2 == 0).sum()
 
 
 def without_names(log: FeatureLog, first: int, count: int) -> FeatureLog:
@@ -118,10 +138,10 @@ def test_found_again_by_names(log):
     config = replace(CONFIG, likelihood=LikelihoodConfig("truncated"), proposal=ProposalConfig("prior"))
     broken, errors = without_names(log, 20, 3), []
     for used in (True, False):
-        run = run_features(broken, replace(config, recovery=RecoveryConfig(used=used)))
-        errors.append(rmse(run, run.world_from_camera))
-        assert any("found again by" in note for note in run.notes) == used
-        assert run.assumed[20:23].all() and not run.assumed[24:].any()
+        run = filtered(broken, replace(config, recovery=RecoveryConfig(used=used)))
+        errors.append(rmse(log, run.log.poses))
+        assert any("found again by" in message for message in run.messages) == used
+        assert run.log["assumed"][20:23].all() and not run.log["assumed"][24:].any()
     assert errors[0] < 0.5 * errors[1]
 
 
@@ -140,19 +160,26 @@ def test_a_thing_that_moves_through_the_view(log, count):
             cov_z=np.concatenate([one.cov_z, cov]),
         )
     config = replace(CONFIG, likelihood=StereoConfig().likelihood)
-    run, whole = run_features(replace(log, frames=frames), config), run_features(log, config)
-    assert sum("something in the view moves" in note for note in run.notes) > 10
-    assert rmse(run, run.world_from_camera) < 1.3 * rmse(whole, whole.world_from_camera)
+    run, whole = filtered(replace(log, frames=frames), config), filtered(log, config)
+    assert sum("something in the view moves" in message for message in run.messages) > 10
+    assert rmse(log, run.log.poses) < 1.3 * rmse(log, whole.log.poses)
 
 
 def test_resumed(log, tmp_path):
-    config, place = replace(CONFIG, particles=30, checkpoint_every=7), tmp_path / "checkpoint.npz"
-    few = FeatureLog(log.name, log.camera, log.frames[:20], None, log.truth)
-    whole = run_features(few, config, checkpoint=place)
-    resumed = run_features(few, config, checkpoint=place, resume=True)
-    np.testing.assert_array_equal(resumed.world_from_camera, whole.world_from_camera)
-    np.testing.assert_array_equal(resumed.odometry, whole.odometry)
-    np.testing.assert_array_equal(resumed.cov, whole.cov)
+    config, place = replace(CONFIG, particles=30), tmp_path / "checkpoint.npz"
+    few = replace(log, frames=log.frames[:20])
+    whole = filtered(few, config)
+
+    def stop(run: Run, tracked) -> None:
+        if len(run.log) == 8:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        filtered(few, config, listeners=[stop], checkpoint=place)
+    resumed = filtered(few, config, checkpoint=place, resume=True)
+    for name in ("poses", "covs"):
+        np.testing.assert_array_equal(getattr(resumed.log, name), getattr(whole.log, name))
+    np.testing.assert_array_equal(resumed.log["odometry"], whole.log["odometry"])
 
 
 def test_one_camera_is_refused():

@@ -1,13 +1,30 @@
 """Tracks: what odometry and map say is one point, told once for each pair that shows it."""
 
 import numpy as np
-import pytest
 
 from rbpf.core.models import NULL
-from rbpf.systems.stereo.tracks import Tracks
+from rbpf.systems.stereo.tracks import tracked_features
 
 NONE = np.zeros((2, 0), dtype=np.intp)
 STAMPS = np.array([10, 20, 30, 40])
+
+
+class Tracks:
+    """What a system says of four pairs, those that are not noted not measured."""
+
+    def __init__(self) -> None:
+        nothing = {"z": np.zeros((0, 3)), "cov_z": np.zeros((0, 3, 3))}
+        self.shown = [nothing | {"previous": names(), "landmarks": names()} for _ in STAMPS]
+        self.measured = np.zeros(STAMPS.size, dtype=bool)
+
+    def note(self, step, z, cov, matches, landmarks) -> None:
+        previous = np.full(len(z), NULL)
+        previous[matches[1]] = matches[0]
+        self.shown[step] = {"z": z, "cov_z": cov, "previous": previous, "landmarks": landmarks}
+        self.measured[step] = True
+
+    def frames(self):
+        return tracked_features(STAMPS, self.measured, self.shown)
 
 
 def px(*columns: float) -> tuple[np.ndarray, np.ndarray]:
@@ -23,7 +40,7 @@ def names(*values: int) -> np.ndarray:
 
 def seen(tracks: Tracks) -> list[dict[int, float]]:
     """Column of each track in each pair."""
-    return [dict(zip(f.landmarks.tolist(), f.z[:, 0].tolist(), strict=True)) for f in tracks.frames(STAMPS)]
+    return [dict(zip(f.landmarks.tolist(), f.z[:, 0].tolist(), strict=True)) for f in tracks.frames()]
 
 
 def matched(*rows: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
@@ -41,7 +58,7 @@ def test_odometry_alone_makes_tracks_and_single_sightings_are_left_out():
     assert second[name] == 11.0 and third[name] == 22.0
     other = (set(second) - {name}).pop()
     assert (second[other], third[other]) == (12.0, 21.0)
-    frame = tracks.frames(STAMPS)[0]
+    frame = tracks.frames()[0]
     np.testing.assert_array_equal(frame.cov_z[0], 4.0 * np.eye(3))
     assert frame.stamp_ns == 10
 
@@ -82,29 +99,14 @@ def test_names_of_the_map_and_other_tracks_do_not_meet():
         assert frame[0] == ten + 1.0 and frame[1] == ten + 3.0 and len(frame) == 3
 
 
-def filled(until: int, tracks: Tracks) -> Tracks:
-    rng = np.random.default_rng(3)
-    for step in range(4):
-        columns, order = 10.0 * step + np.arange(5), rng.permutation(5)
-        pairs = NONE if step == 0 else (np.arange(3), order[:3])
-        named = np.where(rng.random(5) < 0.5, rng.permutation(5), NULL)
-        if step >= until:
-            tracks.note(step, *px(*columns), pairs, named)
-    return tracks
-
-
-@pytest.mark.parametrize("until", [1, 2, 3])
-def test_resumed(until):
-    whole, part, again = filled(0, Tracks()), Tracks(), Tracks()
-    rng = np.random.default_rng(3)
-    for step in range(until):
-        columns, order = 10.0 * step + np.arange(5), rng.permutation(5)
-        pairs = NONE if step == 0 else (np.arange(3), order[:3])
-        named = np.where(rng.random(5) < 0.5, rng.permutation(5), NULL)
-        part.note(step, *px(*columns), pairs, named)
-    again.restore(part.arrays())
-    assert seen(filled(until, again)) == seen(whole)
+def test_a_pair_that_was_not_measured_is_passed_over():
+    tracks = Tracks()
+    tracks.note(0, *px(1), NONE, names(NULL))
+    tracks.note(1, *px(9), NONE, names(NULL))
+    tracks.note(2, *px(21), matched((0, 0)), names(NULL))
+    tracks.measured[1] = False
+    assert [sorted(frame.values()) for frame in seen(tracks)] == [[1.0], [], [21.0], []]
 
 
 def test_of_nothing():
-    assert [frame.landmarks.size for frame in Tracks().frames(STAMPS)] == [0, 0, 0, 0]
+    assert [frame.landmarks.size for frame in Tracks().frames()] == [0, 0, 0, 0]

@@ -9,8 +9,8 @@ import pytest
 
 from rbpf.systems.map_estimate import estimate_map
 from rbpf.systems.stereo.config import StereoConfig, TriggerConfig
-from rbpf.systems.stereo.run import StereoRun, run_images
-from rbpf.systems.stereo.seen import FEATURE, LANDMARK, NEW, TRIAL, PairSeen, Seen
+from rbpf.systems.stereo.landmarks import FeatureKind
+from rbpf.systems.stereo.run import PairSeen, StereoRun, run_images
 from rbpf.validation.report.annotated import Caption, drawn_size
 from rbpf.validation.report.rerun_file import recording
 from rbpf.validation.report.stereo_frames import COLOURS, annotated_pairs, draw_pair
@@ -31,32 +31,28 @@ def run() -> StereoRun:
 
 
 def test_what_each_feature_was(run):
-    """New keys in the first pair, on trial in the second, landmarks from the third on; as many as were counted."""
+    """New ones in the first pair, candidates in the second, landmarks from the third on; as many as were counted."""
     kinds = [np.bincount(seen.kind, minlength=4) for seen in run.seen]
     assert len(kinds) == COUNT and [len(seen.kind) for seen in run.seen] == run.features.tolist()
-    assert kinds[0][NEW] > 5 and kinds[0][LANDMARK] == kinds[0][TRIAL] == 0
-    assert kinds[1][TRIAL] > 3 and kinds[1][LANDMARK] == 0
-    np.testing.assert_array_equal([k[LANDMARK] for k in kinds], run.observed)
-    assert kinds[-1][LANDMARK] > 5
-    assert sum(k[NEW] for k in kinds) == run.front_end.sensor.manager.next_name
+    assert (
+        kinds[0][FeatureKind.NEW] > 5
+        and kinds[0][FeatureKind.LANDMARK] == kinds[0][FeatureKind.CANDIDATE] == 0
+    )
+    assert kinds[1][FeatureKind.CANDIDATE] > 3 and kinds[1][FeatureKind.LANDMARK] == 0
+    np.testing.assert_array_equal([k[FeatureKind.LANDMARK] for k in kinds], run.observed)
+    assert kinds[-1][FeatureKind.LANDMARK] > 5
+    assert sum(k[FeatureKind.NEW] for k in kinds) == run.landmarks.manager.next_name
     assert len(run.seen[BAD].kind) == 0
 
 
 def test_between_updates_all_are_features():
     rare = run_images(pairs(3), replace(CONFIG, trigger=TriggerConfig(9.0, 9.0)))
-    assert (rare.seen[2].kind == FEATURE).all() and len(rare.seen[2].kind) > 20
+    assert (rare.pair_seen(2).kind == FeatureKind.FEATURE).all() and len(rare.pair_seen(2).kind) > 20
 
 
-def test_it_comes_back_from_arrays(run):
-    restored = Seen()
-    restored.restore(run.seen.arrays())
-    assert len(restored) == len(run.seen)
-    for ours, theirs in zip(restored, run.seen, strict=True):
-        np.testing.assert_array_equal(ours.z, theirs.z)
-        np.testing.assert_array_equal(ours.kind, theirs.kind)
-
-
-@pytest.mark.parametrize("kind", [FEATURE, TRIAL, LANDMARK, NEW])
+@pytest.mark.parametrize(
+    "kind", [FeatureKind.FEATURE, FeatureKind.CANDIDATE, FeatureKind.LANDMARK, FeatureKind.NEW]
+)
 def test_a_feature_is_drawn_where_it_is(kind):
     """A cross at the left pixel, and a line as long as the disparity, at twice the size, below the caption."""
     seen = PairSeen(np.array([[60.0, 40.0, 30.0]]), np.array([kind]))
@@ -71,7 +67,7 @@ def test_frames_of_a_run(run):
     frames = list(annotated_pairs(run, sequence()))
     assert len(frames) == COUNT
     assert {frame.shape for frame in frames} == {(*drawn_size(CAMERA.width, CAMERA.height)[::-1], 3)}
-    green = [int((frame[24:] == COLOURS[LANDMARK]).all(axis=-1).sum()) for frame in frames]
+    green = [int((frame[24:] == COLOURS[FeatureKind.LANDMARK]).all(axis=-1).sum()) for frame in frames]
     assert green[0] == green[1] == green[BAD] == 0 and green[-1] > 50
     red = [int(((frame[:24, :, 0] > 120) & (frame[:24, :, 1] < 70)).sum()) for frame in frames]
     assert red[BAD] > 20 and red[0] == 0
@@ -98,7 +94,12 @@ def test_features_in_the_recording(run, tmp_path, monkeypatch):
     write_stereo_rerun(run, sequence(), estimate_map(run.filter), tmp_path / "unused.rrd")
     logged = stream.logged
     assert len(logged["time/frame"]) == COUNT and len(logged["world/camera/image"]) == COUNT
-    for kind, name in ((LANDMARK, "landmark"), (TRIAL, "on_trial"), (NEW, "new"), (FEATURE, "feature")):
+    for kind, name in (
+        (FeatureKind.LANDMARK, "landmark"),
+        (FeatureKind.CANDIDATE, "candidate"),
+        (FeatureKind.NEW, "new"),
+        (FeatureKind.FEATURE, "feature"),
+    ):
         pixels = logged[f"world/camera/image/{name}"]
         for seen, drawn in zip(run.seen, pixels, strict=True):
             xy = np.array(drawn.positions.as_arrow_array().to_pylist()).reshape(-1, 2)

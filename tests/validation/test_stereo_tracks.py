@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from rbpf.lie import SE3
-from rbpf.motion.stereo_odometer import Prediction, StereoOdometer, odometry_path
+from rbpf.motion.stereo_vo import MotionPrior
 from rbpf.sensors.readers.stereo_tracks import read_stereo_tracks
+from rbpf.systems.stereo.config import MapConfig, OdometryConfig, StereoConfig
+from rbpf.systems.stereo.slam import StereoSlam
 from rbpf.validation.gtsam.camera import CameraEstimate, solve_features
 from rbpf.validation.gtsam.camera_data import sightings_of
 from rbpf.validation.gtsam.camera_graph import CameraProblem, CameraState
@@ -61,11 +63,13 @@ def test_visual_odometry_alone(tracks):
     """Over 69 m, beside the batch solution of all measurements; the guess in the file is 0.09 m off."""
     log = tracks.log
     frames = [replace(frame, stamp_ns=100_000_000 * frame.stamp_ns) for frame in log.frames]
-    odometer = StereoOdometer(log.camera, np.random.default_rng(0), prediction=Prediction(std_speed=10.0))
-    path, steps = odometry_path(odometer, frames)
+    odometry = OdometryConfig(prior=MotionPrior(std_speed=10.0))
+    slam = StereoSlam(log.camera, StereoConfig(1, odometry=odometry, map=MapConfig(used=False)))
+    said = [slam.take(frame) for frame in frames]
+    path = np.array([one.values["odometry"] for one in said])
     solved = solve_features(log, CameraEstimate(tracks.world_from_camera, {}), marginals=False)
     batch = SE3.between(solved.world_from_camera[0], solved.world_from_camera)
     off = np.linalg.norm(path[:, 4:] - batch[:, 4:], axis=1)
-    assert not any(step.note for step in steps)
+    assert not any(one.messages for one in said)
     assert np.sqrt(np.square(off).mean()) < 0.1
     assert off[-1] < 0.2

@@ -81,7 +81,7 @@ def problem_of(run: AnyRun) -> Problem:
     if isinstance(run, MonoRun):
         return run.log
     if isinstance(run, StereoRun):
-        return run.front_end.log(run.name, run.stamps_ns, run.truth)
+        return run.log()
     return feature_log(run)
 
 

@@ -26,7 +26,7 @@ def adjust_stereo(run: StereoRun, limit_s: float | None = None, on_iteration: To
         InputError: there are too many sightings, too few pairs are connected, it takes too long, or it does not
             converge.
     """
-    log = run.front_end.log(run.name, run.stamps_ns, run.truth)
+    log = run.log()
     count = sum(frame.landmarks.size for frame in log.frames)
     if count > MOST:
         raise InputError(

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from rbpf.sensors.readers import ImageSequence
-from rbpf.systems.stereo.run import StereoRun
-from rbpf.systems.stereo.seen import FEATURE, LANDMARK, NEW, TRIAL, PairSeen
+from rbpf.systems.stereo.landmarks import FeatureKind
+from rbpf.systems.stereo.run import PairSeen, StereoRun
 from rbpf.validation.report.annotated import (
     FOUND,
     STARTED,
@@ -21,8 +21,18 @@ from rbpf.validation.report.annotated import (
 )
 from rbpf.validation.report.video_file import write_video
 
-COLOURS = {FEATURE: (150, 150, 150), TRIAL: (255, 190, 40), LANDMARK: FOUND, NEW: STARTED}
-NAMES = {FEATURE: "feature", TRIAL: "on trial", LANDMARK: "landmark", NEW: "new"}
+COLOURS = {
+    FeatureKind.FEATURE: (150, 150, 150),
+    FeatureKind.CANDIDATE: (255, 190, 40),
+    FeatureKind.LANDMARK: FOUND,
+    FeatureKind.NEW: STARTED,
+}
+NAMES = {
+    FeatureKind.FEATURE: "feature",
+    FeatureKind.CANDIDATE: "candidate",
+    FeatureKind.LANDMARK: "landmark",
+    FeatureKind.NEW: "new",
+}
 """In the order in which they are drawn."""
 
 
@@ -54,7 +64,7 @@ def annotated_pairs(run: StereoRun, sequence: ImageSequence) -> Iterator[np.ndar
         run: what was filtered.
         sequence: its images.
     """
-    camera = run.front_end.rig.camera
+    camera = run.rig.camera
     for t, (frame, seen) in enumerate(zip(sequence.frames(), run.seen, strict=False)):
         held = f"{int(run.observed[t])} landmarks" if run.updated[t] else "no update"
         text = f"pair {t}   {len(seen.kind)} features   {int(run.agreeing[t])} agree   {held}"
@@ -78,7 +88,7 @@ def write_annotated_pairs(
         path: the file.
         on_frame: called with the frames written and their number.
     """
-    camera = run.front_end.rig.camera
+    camera = run.rig.camera
     size = drawn_size(camera.width, camera.height)
     # A recording without times counts its pairs.
     write_video(annotated_pairs(run, sequence), size, run.per_stamp * run.stamps_ns, path, on_frame)

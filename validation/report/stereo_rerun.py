@@ -14,8 +14,8 @@ from typing import Any
 from rbpf.lie import SE3
 from rbpf.sensors.readers import ImageSequence
 from rbpf.systems.map_estimate import MapEstimate
+from rbpf.systems.stereo.landmarks import FeatureKind
 from rbpf.systems.stereo.run import StereoRun
-from rbpf.systems.stereo.seen import LANDMARK
 from rbpf.validation.report.annotated import FOUND
 from rbpf.validation.report.rerun_file import ellipsoids, log_image, log_lens, log_pose, log_time, recording
 from rbpf.validation.report.stereo_frames import COLOURS, NAMES
@@ -42,19 +42,19 @@ def write_stereo_rerun(run: StereoRun, sequence: ImageSequence, mapped: MapEstim
 
 
 def _log_static(rr: Any, stream: Any, run: StereoRun, mapped: MapEstimate) -> None:
-    log_lens(rr, stream, run.front_end.rig.camera)
+    log_lens(rr, stream, run.rig.camera)
     for name, poses in (("path", run.world_from_camera), ("odometry", run.odometry)):
         stream.log(f"world/{name}", rr.LineStrips3D([SE3.translation(poses)]), static=True)
     stream.log("world/map", ellipsoids(rr, mapped), static=True)
 
 
 def _log_pair(rr: Any, stream: Any, run: StereoRun, t: int) -> None:
-    at, seen = run.world_from_camera[t], run.seen[t]
+    at, seen = run.world_from_camera[t], run.pair_seen(t)
     log_pose(rr, stream, "camera", at)
     for kind, name in NAMES.items():
         pixels = rr.Points2D(seen.of(kind)[:, :2] + 0.5, colors=[COLOURS[kind]])
         stream.log(f"world/camera/image/{name.replace(' ', '_')}", pixels)
-    places = SE3.transform(at, run.front_end.rig.triangulate(seen.of(LANDMARK)))
+    places = SE3.transform(at, run.rig.triangulate(seen.of(FeatureKind.LANDMARK)))
     stream.log("world/seen", rr.Points3D(places, colors=[FOUND], radii=0.005))
     for name in ("features", "agreeing", "observed"):
         stream.log(f"plots/{name}", rr.Scalars(float(getattr(run, name)[t])))

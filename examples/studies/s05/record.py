@@ -11,8 +11,8 @@ from rbpf.lie import SE3
 from rbpf.runs.alignment import align
 from rbpf.runs.truth import poses_at
 from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
+from rbpf.systems.stereo.landmarks import DescriptorLandmarks
 from rbpf.systems.stereo.run import StereoRun
-from rbpf.systems.stereo.sensor import StereoSensor
 
 KINDS = "filter", "odometry", "wheels"
 
@@ -46,10 +46,10 @@ class Record:
         """After pair t."""
         now = time.process_time()
         self.cpu.append(now - self._clock)
-        sensor, end = sensor_of(run), run.front_end
+        sensor, shown = sensor_of(run), run.shown[t]
         if run.updated[t]:
-            seen = sensor.names >= 0
-            self.sightings.append((sensor.names[seen], t, end.for_filter().features.points[seen]))
+            seen = shown["landmarks"] >= 0
+            self.sightings.append((shown["landmarks"][seen], t, run.rig.triangulate(shown["z"][seen])))
         if t + 1 in self.due or t + 1 == run.stamps_ns.size:
             self.rows.append(Row(t + 1, int(sensor.manager.confirmed.sum()), sensor.manager.next_name))
         self._clock = time.process_time()
@@ -91,11 +91,10 @@ class Best:
     cloud: np.ndarray
 
 
-def sensor_of(run: StereoRun) -> StereoSensor:
-    """The sensor of a run over images."""
-    sensor = run.front_end.sensor
-    assert isinstance(sensor, StereoSensor)
-    return sensor
+def sensor_of(run: StereoRun) -> DescriptorLandmarks:
+    """The landmarks of a run over images."""
+    assert isinstance(run.landmarks, DescriptorLandmarks)
+    return run.landmarks
 
 
 def paths_of(run: StereoRun, images: Path) -> Paths:
@@ -113,10 +112,8 @@ def best_particle(run: StereoRun) -> Best:
     """Its map and its path, without any smoothing."""
     belief, manager = run.filter.belief(), sensor_of(run).manager
     names = manager.names[manager.confirmed]
-    by_name = {name: landmark for landmark, name in belief.catalogue.items()}
-    ids = np.array([by_name[name] for name in names.tolist()], dtype=np.int64)
     mode = belief.mode
-    places = belief.read(ids, np.array([mode])).mean[0]
+    places = belief.read(names, np.array([mode])).mean[0]
     return Best(names, places, run.filter.history.paths()[:, mode], SE3.translation(belief.state))
 
 

@@ -3,9 +3,12 @@
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
+import numpy as np
+
 from rbpf.errors import InputError
-from rbpf.motion.stereo_odometer import Prediction
-from rbpf.motion.stereo_vo import VoConfig
+from rbpf.lie import SE3
+from rbpf.motion.odometry import Odometry
+from rbpf.motion.stereo_vo import MotionPrior, VoConfig
 from rbpf.sensors.descriptors.landmark_management import NewLandmarkConfig
 from rbpf.sensors.descriptors.matching import MatchLimits
 from rbpf.sensors.features import SiftConfig
@@ -22,17 +25,19 @@ class OdometryConfig:
 
     Attributes:
         estimate: how a motion is estimated from matches.
-        prediction: what is expected before anything is seen, and assumed where nothing is.
+        prior: what is expected before anything is seen, and assumed where nothing is.
         limits: of the descriptors of two pairs.
         std_added_rad: injected per update (S05 §V), standard deviation of the turn about each axis.
         std_added_m: likewise of the shift along each axis.
         split: S05 uses each feature twice, for the odometry and for the map ("none"). To measure what that does, the
-            features can be divided by lot into two halves: one for the odometry and the other for the map ("apart"),
-            or one of them for both ("same").
+            features can be divided at random into two halves: one for the odometry and the other for the map
+            ("apart"), or one of them for both ("same").
     """
 
+    RENAMED: ClassVar[dict[str, str]] = {"prediction": "prior"}
+
     estimate: VoConfig = field(default_factory=VoConfig)
-    prediction: Prediction = field(default_factory=Prediction)
+    prior: MotionPrior = field(default_factory=MotionPrior)
     limits: MatchLimits = field(default_factory=MatchLimits)
     std_added_rad: float = 0.0
     std_added_m: float = 0.0
@@ -51,16 +56,21 @@ class MapConfig:
         slack_px: added to that expectation, standard deviation per axis.
         subsample: particles, drawn evenly from the weight, that say where a landmark is expected.
         margin_px: landmarks so far outside the image, as the heaviest particle sees it, may be in it.
-        turn_deg: a landmark is not looked for once its line of sight has turned by this since it was seen last.
-        scale: nor once it is so many times nearer or farther.
-        doubt_px: where landmarks are expected with a larger standard deviation than this, the gate lets much pass: the
+        max_turn_deg: a landmark is not looked for once its line of sight has turned by this since it was seen last.
+        max_scale_change: nor once it is so many times nearer or farther.
+        vague_px: where landmarks are expected with a larger standard deviation than this, the gate lets much pass: the
             matches must then agree on one motion …
-        agreeing: … and be so many, else none is taken, and the doubt stays.
+        min_agreeing: … and be so many, else none is taken, and the expectation stays as vague.
         depth_fraction: a feature starts a landmark if the standard deviation of its depth is below this fraction of it.
     """
 
     RENAMED: ClassVar[dict[str, str]] = {
         "depth_share": "depth_fraction",
+        "cloud": "subsample",
+        "turn_deg": "max_turn_deg",
+        "scale": "max_scale_change",
+        "doubt_px": "vague_px",
+        "agreeing": "min_agreeing",
     }
 
     used: bool = True
@@ -70,21 +80,21 @@ class MapConfig:
     slack_px: float = 1.0
     subsample: int = 32
     margin_px: float = 20.0
-    turn_deg: float = 45.0
-    scale: float = 2.0
-    doubt_px: float = 15.0
-    agreeing: int = 6
+    max_turn_deg: float = 45.0
+    max_scale_change: float = 2.0
+    vague_px: float = 15.0
+    min_agreeing: int = 6
     depth_fraction: float = 0.1
 
     def __post_init__(self) -> None:
         """Checks what no part checks itself."""
         if self.subsample < 1:
             raise InputError(f"subsample must be at least one particle, got {self.subsample}")
-        if not (self.gate > 0.0 and self.slack_px >= 0.0 and self.scale >= 1.0 and self.depth_fraction > 0.0):
-            found = f"{self.gate}, {self.slack_px}, {self.scale} and {self.depth_fraction}"
-            raise InputError(
-                f"expected gate and depth_fraction above 0, slack_px from 0 up and scale from 1 up, got {found}"
-            )
+        in_range = self.gate > 0.0 and self.slack_px >= 0.0 and self.max_scale_change >= 1.0
+        if not (in_range and self.depth_fraction > 0.0):
+            expected = "gate and depth_fraction above 0, slack_px from 0 up and max_scale_change from 1 up"
+            found = f"{self.gate}, {self.slack_px}, {self.max_scale_change} and {self.depth_fraction}"
+            raise InputError(f"expected {expected}, got {found}")
 
 
 @dataclass(frozen=True)
@@ -107,13 +117,24 @@ class TriggerConfig:
             found = f"{self.moved_m}, {self.turned_rad} and {self.frames}"
             raise InputError(f"moved_m, turned_rad and frames must not be negative, got {found}")
 
+    def reached(self, motion: Odometry, frames: int) -> bool:
+        """Whether the camera has moved enough since the last update, so many pairs ago.
+
+        By the root mean square, so that uncertainty counts as motion.
+        """
+        variance = np.diagonal(motion.cov)
+        turned, moved = SE3.log(motion.delta)[:3], SE3.translation(motion.delta)
+        far = float(moved @ moved + variance[3:].sum()) >= self.moved_m**2
+        turned_far = float(turned @ turned + variance[:3].sum()) >= self.turned_rad**2
+        return far or turned_far or (self.frames > 0 and frames >= self.frames)
+
 
 @dataclass(frozen=True)
 class RecoveryConfig:
     """What is done where the motion since the last update was only assumed, for all or part of the way.
 
-    The assumed motion's law is far wider than what the map's landmarks leave open: no particle that is drawn from it
-    comes to lie where they are seen.
+    The distribution of an assumed motion is far wider than what the map's landmarks leave open: no particle that is
+    drawn from it comes to lie where they are seen.
 
     Attributes:
         used: whether anything is done; without, such a motion moves the particles like any other, as in S05.

@@ -14,7 +14,7 @@ from typing import final
 
 import numpy as np
 
-from rbpf.core.checkpoint import load_arrays, save_arrays
+from rbpf.core.checkpoint import fitting, load_arrays, save_arrays
 from rbpf.errors import InputError
 from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.feature_log import CameraTruth
@@ -36,11 +36,13 @@ class CachedPair:
     """A pair whose features are known.
 
     Attributes:
+        stamp_ns: time of the pair.
         features: None where the pair could not be measured.
         problem: why not, or what was wrong with it all the same, in words.
         seconds: that measuring took.
     """
 
+    stamp_ns: int
     features: StereoFeatures | None
     problem: str
     seconds: float
@@ -71,7 +73,7 @@ class CachedSequence:
     def frames(self, start: int = 0) -> Iterator[CachedPair]:
         """Pairs from number `start` on."""
         for first in range(start - start % CHUNK, len(self), CHUNK):
-            pairs = _read(self.folder, first, self.rig)
+            pairs = _read(self.folder, first, self.rig, self.stamps_ns[first : first + CHUNK])
             yield from pairs[max(start - first, 0) : len(self) - first]
 
     def first(self, count: int) -> "CachedSequence":
@@ -108,7 +110,7 @@ def cache_features(
             if frame.image is not None and frame.right is not None:
                 features = sift.measure(frame.image, frame.right)
                 problem = sift.remark
-            pairs.append(CachedPair(features, problem, time.process_time() - started))
+            pairs.append(CachedPair(int(frame.stamp_ns), features, problem, time.process_time() - started))
             if on_pair is not None:
                 on_pair(first + len(pairs), total)
         _write(folder, first, pairs, config.sift.length)
@@ -154,13 +156,16 @@ def _write(folder: Path, first: int, pairs: list[CachedPair], length: int) -> No
     save_arrays(_file(folder, first), arrays)
 
 
-def _read(folder: Path, first: int, rig: RectifiedStereo) -> list[CachedPair]:
-    arrays, pairs, at = load_arrays(_file(folder, first)), [], 0
-    told = zip(arrays["count"].tolist(), arrays["problem"].tolist(), arrays["seconds"].tolist(), strict=True)
-    for count, problem, seconds in told:
-        features = None
-        if count >= 0:
-            part = (arrays[name][at : at + count] for name in KEPT)
-            features, at = StereoFeatures.measured(rig, *part), at + count
-        pairs.append(CachedPair(features, problem, seconds))
+def _read(folder: Path, first: int, rig: RectifiedStereo, stamps_ns: np.ndarray) -> list[CachedPair]:
+    path = _file(folder, first)
+    arrays, pairs, at = load_arrays(path), [], 0
+    with fitting(path):
+        # The last file of a part of a sequence holds more pairs than the part.
+        entries = (arrays[name].tolist() for name in ("count", "problem", "seconds"))
+        for stamp_ns, count, problem, seconds in zip(stamps_ns.tolist(), *entries, strict=False):
+            features = None
+            if count >= 0:
+                features = StereoFeatures.measured(rig, *(arrays[name][at : at + count] for name in KEPT))
+                at += count
+            pairs.append(CachedPair(stamp_ns, features, problem, seconds))
     return pairs

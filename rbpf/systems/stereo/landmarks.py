@@ -1,34 +1,300 @@
-"""Where a map's landmarks were seen last: facts that need not differ between particles, to find candidates by."""
+"""The map's landmarks in the features of a stereo pair, and new ones (S05 §III-B, §V).
 
+A landmark competes for a feature if it may be in view, its descriptor is like the feature's, and the particles expect
+it there. Each feature is then one landmark's, the same for all particles, or has none: a null correspondence, which
+costs all particles the same. Landmarks that have not been seen often enough are candidates: they are in the map, where
+they follow each particle's path, without a say in the particles' weights.
+
+`DescriptorLandmarks` finds landmarks by SIFT descriptors, `NamedLandmarks` by names that the recording gives.
+"""
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import final
+from enum import IntEnum
+from typing import Any, Generic, Protocol, Self, TypeVar, final
 
 import numpy as np
 
+from rbpf import gaussian
+from rbpf.core.checkpoint import checked
+from rbpf.core.models import (
+    NULL,
+    Belief,
+    Landmark,
+    Likelihood,
+    NewLandmarks,
+    Observations,
+    Part,
+    Records,
+    Sensor,
+)
+from rbpf.core.particles import Prior
+from rbpf.gaussian import symmetrise
 from rbpf.lie import SE3
+from rbpf.maps.point import Point
+from rbpf.motion.stereo_geometry import Matches
+from rbpf.motion.stereo_vo import VoConfig, estimate_motion
 from rbpf.sensors.camera import RectifiedStereo
+from rbpf.sensors.camera.points import CameraModel, StereoPoint
+from rbpf.sensors.descriptors.index import DescriptorIndex
+from rbpf.sensors.descriptors.landmark_management import LandmarkManager, NewLandmarkConfig
+from rbpf.sensors.descriptors.matching import gate_pairs, match_pairs
+from rbpf.sensors.feature_log import FeatureFrame
+from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
+from rbpf.sensors.stereo.features import StereoFeatures
 from rbpf.systems.stereo.config import MapConfig
+
+_MAP = frozenset({Part.LANDMARK})
+
+SEEN_AGAIN = 2
+"""Observations of a landmark that stands still: one that moves is not where it was seen first."""
+
+TINY = 1e-6
+"""Added to the variance of expected pixels, px²: a landmark may be known exactly."""
 
 SIGMAS = 3.0
 """The image is widened by so many standard deviations of the camera's direction."""
 
 
-@dataclass
-class _Rows:
-    """One row per landmark or candidate ever started, which is its name.
+class FeatureKind(IntEnum):
+    """What a feature of a pair is to the map."""
 
-    Attributes:
-        place: (F, 3) in the world of the heaviest particle, when it was seen last.
-        seen_from: (F, 3) where that particle's camera was then.
-    """
+    FEATURE = 0
+    """Nothing."""
+    LANDMARK = 1
+    """A landmark that weighed the particles."""
+    CANDIDATE = 2
+    """A landmark that has not been seen often enough to weigh them."""
+    NEW = 3
+    """A landmark that it started."""
 
-    place: np.ndarray
-    seen_from: np.ndarray
+
+class PairFeatures(Protocol):
+    """What a front end measures in a pair: K features, with all that tells one from another."""
+
+    @property
+    def z(self) -> np.ndarray:
+        """(K, 3) pixels (u_left, v, u_right)."""
+
+    @property
+    def cov(self) -> np.ndarray:
+        """(K, 3, 3) of their noise, px²."""
+
+    def __len__(self) -> int: ...
+
+    def take(self, rows: np.ndarray) -> Self:
+        """Some of them, by number or by mask."""
+
+
+F = TypeVar("F", bound=PairFeatures)
 
 
 @final
+@dataclass(frozen=True)
+class NamedPixels:
+    """Features whose landmarks are known.
+
+    Attributes:
+        z: (K, 3) pixels (u_left, v, u_right).
+        cov: (K, 3, 3) px².
+        names: (K,) int64 of the landmarks.
+    """
+
+    z: np.ndarray
+    cov: np.ndarray
+    names: np.ndarray
+
+    def __len__(self) -> int:
+        return self.names.size
+
+    def take(self, rows: np.ndarray) -> "NamedPixels":
+        """Some of them, by number or by mask."""
+        return NamedPixels(self.z[rows], self.cov[rows], self.names[rows])
+
+
+@dataclass(frozen=True)
+class View(Generic[F]):
+    """A pair, as the map is asked about it and as the filter is updated by it.
+
+    Attributes:
+        stamp_ns: time of the pair.
+        features: K of them.
+        free: (K,) which of them the map may use.
+        uncertain: the camera's motion was only assumed: matches with the map must agree on one motion, of landmarks
+            that were seen again before, and none are started.
+    """
+
+    stamp_ns: int
+    features: F
+    free: np.ndarray
+    uncertain: bool = False
+
+
+class Landmarks(Sensor, ABC, Generic[F]):
+    """Finds landmarks among features, and starts new ones. A subclass says how a landmark is known again.
+
+    Attributes:
+        rig: the cameras.
+        model: how a landmark is measured.
+        landmark: its parametrisation.
+        ids: (K,) landmark of each feature of the pair that the filter took last, NULL where there is none.
+        seconds: that finding them took.
+    """
+
+    rig: RectifiedStereo
+    model: CameraModel
+    landmark: Landmark
+    ids: np.ndarray
+    seconds: float = 0.0
+
+    @abstractmethod
+    def associate(self, view: View[F], belief: Belief) -> np.ndarray:
+        """Landmark (K,) of each feature, NULL where it has none."""
+
+    @abstractmethod
+    def seen_again(self) -> np.ndarray:
+        """(M,) landmarks that were found again where the map has them: these stand still, and tell a place."""
+
+    @abstractmethod
+    def expected(self, belief: Belief, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where landmarks (k,) will be measured: (k, 3) and covariance (k, 3, 3) without the measurements' noise."""
+
+    @abstractmethod
+    def kinds(self) -> np.ndarray:
+        """(K,) `FeatureKind` of each feature of the pair that the filter took last."""
+
+    def confirmed_static(self) -> np.ndarray:
+        """Rows of features of that pair that are where the map has them: they stand still. By default none is known."""
+        return np.zeros(0, dtype=np.intp)
+
+    def columns(self, ids: np.ndarray) -> dict[str, np.ndarray]:
+        """What is known of landmarks (M,) besides where they are, (M,) by name."""
+        return {}
+
+    def counts(self, held: int) -> dict[str, float | int]:
+        """Entries of summary.json: SIFT features ever started, and landmarks, of so many that the map holds."""
+        return {"sift_features": 0, "landmarks_mean_per_particle": float(held)}
+
+    def match_globally(self, view: View[F]) -> np.ndarray:
+        """Landmark (K,) of each feature, wherever it may be expected; NULL where it has none, as by default all."""
+        return np.full(len(view.features), NULL, dtype=np.int64)
+
+    def log_support(self, view: View[F], belief: Belief) -> float:
+        """How well landmarks are seen where particles expect them: a log-density, beside that of unknown things.
+
+        Candidates that were never seen again have no say: they may be of what moves.
+        """
+        ids = self.associate(view, belief)
+        rows = np.flatnonzero(np.isin(ids, self.seen_again()))
+        if not rows.size:
+            return 0.0
+        features, (mean, cov) = view.features.take(rows), self.expected(belief, ids[rows])
+        z = view.features.z[view.free]
+        return log_support(features.z - mean, features.cov + cov, z, self.rig)
+
+    @abstractmethod
+    def arrays(self) -> dict[str, np.ndarray]:
+        """For a checkpoint."""
+
+    @abstractmethod
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """The inverse of `arrays`."""
+
+
+def log_support(nu: np.ndarray, cov: np.ndarray, z: np.ndarray, rig: RectifiedStereo) -> float:
+    """Σ max(log N(ν; 0, S) − log λ, 0) of features (k,) that are taken for landmarks: each is, or is so by chance.
+
+    Args:
+        nu: (k, 3) innovations, px.
+        cov: (k, 3, 3) S, px².
+        z: (K, 3) of all features of the pair, which are λ per px³ where they may be.
+        rig: the cameras.
+    """
+    depths = max(float(np.ptp(z[:, 0] - z[:, 2])), 1.0)
+    density = len(z) / (rig.camera.width * rig.camera.height * depths)
+    return float(np.maximum(gaussian.log_density(nu, cov) - np.log(density), 0.0).sum())
+
+
+@dataclass(frozen=True)
+class Expected:
+    """K landmarks in (u_left, v, u_right), px.
+
+    Attributes:
+        mean: (K, 3) of the particles.
+        cov: (K, 3, 3) within and between particles, without the noise of a measurement.
+        within: (K, 3, 3) of the landmark in the heaviest particle, its pose given.
+        by_heaviest: (K, 3) as that particle sees them.
+    """
+
+    mean: np.ndarray
+    cov: np.ndarray
+    within: np.ndarray
+    by_heaviest: np.ndarray
+
+    @property
+    def deviation(self) -> np.ndarray:
+        """(K,) largest standard deviation along an axis."""
+        return np.sqrt(np.diagonal(self.cov, axis1=1, axis2=2).max(axis=1))
+
+    def take(self, rows: np.ndarray) -> "Expected":
+        """Some of them."""
+        return Expected(*(getattr(self, item.name)[rows] for item in fields(self)))
+
+
+@final
+@dataclass(frozen=True)
+class ParticleSubsample:
+    """A few particles, each for an equal fraction of the weight, and the heaviest one last.
+
+    Attributes:
+        rows: (n + 1,) which ones.
+        prior: their distribution before the observations.
+        middle: (7,) world_from_camera in their middle.
+        std_direction_rad: standard deviation of the camera's direction about that.
+    """
+
+    rows: np.ndarray
+    prior: Prior
+    middle: np.ndarray
+    std_direction_rad: float
+
+    @classmethod
+    def of(cls, belief: Belief, count: int) -> "ParticleSubsample":
+        """So many at most."""
+        weights = belief.weights
+        steps = (np.arange(min(count, weights.size)) + 0.5) / min(count, weights.size)
+        rows = np.minimum(np.searchsorted(np.cumsum(weights), steps), weights.size - 1)
+        rows = np.append(rows, belief.mode)
+        prior = belief.prior.take(rows)
+        state = prior.predicted()
+        middle = SE3.mean(state[:-1], np.full(rows.size - 1, 1.0 / (rows.size - 1)))
+        turns = SE3.local(middle, state[:-1])[:, :3]
+        spread = prior.spread(prior.mean)[-1, :3]
+        variance = np.square(turns).mean(axis=0) + np.square(spread).sum(axis=1)
+        return cls(rows, prior, middle, float(np.sqrt(variance.max())))
+
+    def expected(self, belief: Belief, model: CameraModel, ids: np.ndarray) -> Expected:
+        """Landmarks (K,) of the map.
+
+        What is uncertain within a particle, given its path, hardly differs between them: the heaviest one's is taken.
+        """
+        records, state = belief.read(ids, self.rows), self.prior.predicted()
+        px = model.predict(state[:, None], records.mean, records.const)
+        const = None if records.const is None else records.const[-1]
+        jac = model.jacobians(state[-1], records.mean[-1], const)
+        assert jac.state is not None and jac.landmark is not None
+        moved = jac.state @ self.prior.spread(self.prior.mean)[-1]
+        within = symmetrise(jac.landmark @ records.cov[-1] @ jac.landmark.mT)
+        mean = px[:-1].mean(axis=0)
+        off = px[:-1] - mean
+        between = np.einsum("nka,nkb->kab", off, off) / off.shape[0]
+        return Expected(mean, symmetrise(within + moved @ moved.mT + between), within, px[-1])
+
+
 class Places:
-    """A growing table of landmarks.
+    """Where landmarks were seen last: facts that need not differ between particles, to find candidates for a view by.
 
     Args:
         rig: the cameras.
@@ -38,28 +304,39 @@ class Places:
     def __init__(self, rig: RectifiedStereo, config: MapConfig) -> None:
         self.rig = rig
         self.config = config
-        self._rows = _Rows(np.zeros((0, 3)), np.zeros((0, 3)))
+        self._ids = np.zeros(0, dtype=np.int64)
+        self._place, self._seen_from = np.zeros((2, 0, 3))
 
-    def put(self, names: np.ndarray, place: np.ndarray, world_from_camera: np.ndarray) -> None:
-        """Landmarks (k,) are seen at places (k, 3) from one camera (7,)."""
-        self._reserve(int(names.max(initial=-1)) + 1)
-        self._rows.place[names] = place
-        self._rows.seen_from[names] = SE3.translation(world_from_camera)
+    def put(self, ids: np.ndarray, place: np.ndarray, world_from_camera: np.ndarray) -> None:
+        """Landmarks (k,) are seen at places (k, 3) in the world of the heaviest particle, by its camera (7,).
 
-    def in_view(self, names: np.ndarray, world_from_camera: np.ndarray, doubt_rad: float = 0.0) -> np.ndarray:
-        """Those of landmarks (M,) that a camera (7,), whose direction is in some doubt, may see and know again."""
+        Those that are new have higher numbers than those held, and ascend.
+        """
+        new = ids[ids > self._ids.max(initial=-1)]
+        room = np.zeros((new.size, 3))
+        self._ids = np.concatenate([self._ids, new])
+        self._place, self._seen_from = (np.concatenate([one, room]) for one in (self._place, self._seen_from))
+        rows = np.searchsorted(self._ids, ids)
+        self._place[rows], self._seen_from[rows] = place, SE3.translation(world_from_camera)
+
+    def remove(self, ids: np.ndarray) -> None:
+        """Forgets landmarks (k,)."""
+        kept = np.ones(self._ids.size, dtype=bool)
+        kept[np.searchsorted(self._ids, ids)] = False
+        self._ids, self._place, self._seen_from = self._ids[kept], self._place[kept], self._seen_from[kept]
+
+    def in_view(self, world_from_camera: np.ndarray, std_direction_rad: float = 0.0) -> np.ndarray:
+        """Landmarks that a camera (7,), whose direction is uncertain, may see and know again, ascending."""
         camera = self.rig.camera
-        margin = self.config.margin_px + min(SIGMAS * camera.fx * doubt_rad, 0.5 * camera.width)
-        local = SE3.inverse_transform(world_from_camera, self._rows.place[names])
-        names = names[self._in_image(local, margin)]
-        place = self._rows.place[names]
-        then = place - self._rows.seen_from[names]
-        now = place - SE3.translation(world_from_camera)
+        margin = self.config.margin_px + min(SIGMAS * camera.fx * std_direction_rad, 0.5 * camera.width)
+        rows = self._in_image(SE3.inverse_transform(world_from_camera, self._place), margin)
+        then = self._place[rows] - self._seen_from[rows]
+        now = self._place[rows] - SE3.translation(world_from_camera)
         lengths = np.linalg.norm(then, axis=1), np.linalg.norm(now, axis=1)
         cosine = (then * now).sum(axis=1) / np.maximum(lengths[0] * lengths[1], 1e-300)
         ratio = np.abs(np.log(lengths[1] / np.maximum(lengths[0], 1e-300)))
-        alike = (cosine >= np.cos(np.deg2rad(self.config.turn_deg))) & (ratio <= np.log(self.config.scale))
-        return np.asarray(names[alike])
+        alike = cosine >= np.cos(np.deg2rad(self.config.max_turn_deg))
+        return self._ids[rows[alike & (ratio <= np.log(self.config.max_scale_change))]]
 
     def _in_image(self, local: np.ndarray, margin: float) -> np.ndarray:
         """Rows of points (M, 3) in the camera's frame that are in both images, or nearly; most are far from it."""
@@ -72,17 +349,297 @@ class Places:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """For a checkpoint."""
-        return {f"places/{item.name}": getattr(self._rows, item.name) for item in fields(_Rows)}
+        return {"places/place": self._place, "places/seen_from": self._seen_from}
+
+    def restore(self, arrays: dict[str, np.ndarray], ids: np.ndarray) -> None:
+        """The inverse of `arrays`, of landmarks (M,)."""
+        self._ids = ids.copy()
+        self._place, self._seen_from = (
+            checked(arrays, f"places/{name}", (ids.size, 3), "f").copy() for name in ("place", "seen_from")
+        )
+
+
+class AssociationGate(ABC):
+    """Which landmarks a feature may be, by where they are expected; their descriptors decide among these."""
+
+    @abstractmethod
+    def pairs(self, features: StereoFeatures, expected: Expected) -> tuple[np.ndarray, np.ndarray]:
+        """Rows (C,) of features and (C,) of landmarks that may be one another."""
+
+
+@final
+class MahalanobisGate(AssociationGate):
+    """Features within a squared Mahalanobis distance, under expectation, slack and noise.
+
+    Args:
+        gate: the largest squared distance.
+        slack_px: added to the expectation, standard deviation per axis.
+    """
+
+    def __init__(self, gate: float, slack_px: float) -> None:
+        self.gate, self.slack_px = gate, slack_px
+
+    def pairs(self, features: StereoFeatures, expected: Expected) -> tuple[np.ndarray, np.ndarray]:
+        """Near in all three pixels."""
+        cov = expected.cov + self.slack_px**2 * np.eye(3)
+        return gate_pairs(features.z, features.cov, expected.mean, cov, self.gate)
+
+
+class DescriptorLandmarks(Landmarks[StereoFeatures]):
+    """Finds landmarks by their descriptors, and manages which there are.
+
+    Args:
+        rig: the cameras.
+        config: how landmarks are matched.
+        new: which features become landmarks.
+        length: of a descriptor.
+        likelihood: of an innovation.
+        gate: of the association; None for that of `config`.
+        model: how a landmark is measured; None for pixels of points in space.
+        landmark: its parametrisation; None for points in space.
+    """
+
+    def __init__(
+        self,
+        rig: RectifiedStereo,
+        config: MapConfig,
+        new: NewLandmarkConfig,
+        length: int,
+        likelihood: Likelihood,
+        gate: AssociationGate | None = None,
+        model: CameraModel | None = None,
+        landmark: Landmark | None = None,
+    ) -> None:
+        self.rig, self.config, self.likelihood = rig, config, likelihood
+        self.gate = gate or MahalanobisGate(config.gate, config.slack_px)
+        self.model, self.landmark = model or StereoPoint(rig), landmark or Point(3)
+        self.index = DescriptorIndex(length, config.limits)
+        self.manager = LandmarkManager(new, (rig.camera.width, rig.camera.height))
+        self.places = Places(rig, config)
+        self.ids = np.zeros(0, dtype=np.int64)
+
+    def observe(self, frame: View[StereoFeatures], belief: Belief) -> Sequence[Observations]:
+        """The features that are landmarks, and those that are candidates."""
+        started = time.perf_counter()
+        features = frame.features
+        self.ids = self.associate(frame, belief)
+        known = self.ids >= 0
+        weighs = known
+        if self.config.weigh != "all":
+            # With this observation they are seen often enough.
+            often = self.manager.observations + 1 >= self.manager.config.observations
+            weighs = np.isin(self.ids, self.manager.names[often])
+        groups = []
+        # A candidate is updated, and does not weigh; what is no landmark is a null correspondence for all.
+        for chosen, options in (
+            (weighs | ~known, {"log_clutter": self.likelihood.log_outlier()}),
+            (known & ~weighs, {"updates": _MAP}),
+        ):
+            if (self.ids[chosen] >= 0).any():
+                part: dict[str, Any] = {"ids": self.ids[chosen], **options}
+                z, cov = features.z[chosen], features.cov[chosen]
+                groups.append(Observations(z, cov, self.model, self.likelihood, **part))
+        self.seconds = time.perf_counter() - started
+        return groups
+
+    def new_landmarks(
+        self, frame: View[StereoFeatures], belief: Belief, observed: Sequence[Observations]
+    ) -> Sequence[NewLandmarks]:
+        """Counts what was seen, drops candidates that were not seen again, starts new ones."""
+        known = self.ids >= 0
+        seen = self.ids[known]
+        dropped = self.manager.observe(seen)
+        if dropped.size:
+            belief.map.remove(dropped)
+            self.index.store.remove(dropped)
+            self.places.remove(dropped)
+        pose = belief.state[belief.mode]
+        if seen.size:
+            self.places.put(seen, world_points(self.landmark, belief.read_mode(seen))[0], pose)
+        if frame.uncertain:
+            return []
+        rows = self._worth_a_landmark(frame, known)
+        if not rows.size:
+            return []
+        features = frame.features.take(rows)
+        # The manager counts as the map does: its numbers are the map's.
+        ids = self.manager.add(rows.size)
+        self.index.store.add(ids, features.descriptors)
+        self.places.put(ids, SE3.transform(pose, features.points), pose)
+        self.ids[rows] = ids
+        return [NewLandmarks(features.z, features.cov, self.model, self.landmark, ids=ids)]
+
+    def associate(self, view: View[StereoFeatures], belief: Belief) -> np.ndarray:
+        """By their descriptors, where the particles expect them."""
+        out = np.full(len(view.features), NULL, dtype=np.int64)
+        rows = np.flatnonzero(view.free)
+        features = view.features.take(rows)
+        subsample = ParticleSubsample.of(belief, self.config.subsample)
+        ids = self._alike(features.descriptors, subsample)
+        if view.uncertain:
+            ids = ids[np.isin(ids, self.seen_again())]
+        if not (ids.size and rows.size):
+            return out
+        expected = subsample.expected(belief, self.model, ids)
+        k, m = self.gate.pairs(features, expected)
+        store = self.index.store
+        found = match_pairs(
+            features.descriptors, store.descriptors, (k, store.rows(ids)[m]), self.config.limits
+        )
+        taken = store.ids[found.second]
+        of = np.searchsorted(ids, taken)
+        agreed = self._agreed(expected.take(of), features.take(found.first), view.uncertain)
+        out[rows[found.first[agreed]]] = taken[agreed]
+        return out
+
+    def match_globally(self, view: View[StereoFeatures]) -> np.ndarray:
+        """By their descriptors alone."""
+        out = np.full(len(view.features), NULL, dtype=np.int64)
+        rows = np.flatnonzero(view.free)
+        out[rows] = self.index.match(view.features.descriptors[rows]).ids
+        return out
+
+    def seen_again(self) -> np.ndarray:
+        return np.asarray(self.manager.names[self.manager.observations >= SEEN_AGAIN])
+
+    def expected(self, belief: Belief, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        seen = ParticleSubsample.of(belief, self.config.subsample).expected(belief, self.model, ids)
+        return seen.mean, seen.cov
+
+    def kinds(self) -> np.ndarray:
+        manager = self.manager
+        out = np.full(self.ids.size, FeatureKind.FEATURE)
+        rows = np.searchsorted(manager.names, self.ids)
+        held = np.flatnonzero(rows < manager.names.size)
+        held = held[manager.names[rows[held]] == self.ids[held]]
+        rows = rows[held]
+        out[held] = np.where(manager.confirmed[rows], FeatureKind.LANDMARK, FeatureKind.CANDIDATE)
+        out[held[manager.observations[rows] == 1]] = FeatureKind.NEW
+        return out
+
+    def columns(self, ids: np.ndarray) -> dict[str, np.ndarray]:
+        """How often each was seen, and whether it is a landmark or a candidate."""
+        rows = np.searchsorted(self.manager.names, ids)
+        confirmed = self.manager.confirmed[rows].astype(int)
+        return {"sightings": self.manager.observations[rows], "landmark": confirmed}
+
+    def counts(self, held: int) -> dict[str, float | int]:
+        """All particles hold the same, as all associate alike."""
+        landmarks = float(self.manager.confirmed.sum())
+        return {"sift_features": int(self.manager.next_name), "landmarks_mean_per_particle": landmarks}
+
+    def confirmed_static(self) -> np.ndarray:
+        return np.flatnonzero(np.isin(self.kinds(), (FeatureKind.LANDMARK, FeatureKind.CANDIDATE)))
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        return self.index.store.arrays() | self.manager.arrays() | self.places.arrays()
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """The inverse of `arrays`."""
-        self._rows = _Rows(*(arrays[f"places/{item.name}"].copy() for item in fields(_Rows)))
+        self.index.store.restore(arrays)
+        self.manager.restore(arrays)
+        self.places.restore(arrays, self.index.store.ids)
 
-    def _reserve(self, count: int) -> None:
-        room = self._rows.place.shape[0]
-        if count <= room:
-            return
-        extra = max(count, 2 * room, 64) - room
-        for item in fields(_Rows):
-            column = getattr(self._rows, item.name)
-            setattr(self._rows, item.name, np.concatenate([column, np.zeros((extra, 3))]))
+    def _alike(self, descriptors: np.ndarray, subsample: ParticleSubsample) -> np.ndarray:
+        """Landmarks that may be in view and whose descriptors come near to that of any feature, ascending.
+
+        Descriptors further away are neither taken nor forbid others by the ratio, whatever is expected where.
+        """
+        store, limits = self.index.store, self.config.limits
+        ids = self.places.in_view(subsample.middle, subsample.std_direction_rad)
+        if not ids.size or not descriptors.shape[0]:
+            return ids[:0]
+        most = limits.largest(store.length) / limits.ratio
+        near = (descriptors @ store.descriptors[store.rows(ids)].T).max(axis=0) >= 1.0 - 0.5 * most**2
+        return np.asarray(ids[near])
+
+    def _agreed(self, expected: Expected, features: StereoFeatures, uncertain: bool) -> np.ndarray:
+        """Which matches (k,) are taken: all, unless they are expected so vaguely that the gate tells little."""
+        all_of_them = np.ones(len(features), dtype=bool)
+        vague = uncertain or (len(features) and np.median(expected.deviation) > self.config.vague_px)
+        if not vague:
+            return all_of_them
+        if len(features) < self.config.min_agreeing:
+            return ~all_of_them
+        # As the heaviest particle sees them, moved by an increment of any size.
+        cov = expected.within + TINY * np.eye(3)
+        matches = Matches.checked(self.rig, expected.by_heaviest, features.z, cov, features.cov)
+        rng, config = (
+            np.random.default_rng(self.manager.frame),
+            VoConfig(min_matches=self.config.min_agreeing),
+        )
+        return estimate_motion(matches, rng, config=config).inliers
+
+    def _worth_a_landmark(self, frame: View[StereoFeatures], known: np.ndarray) -> np.ndarray:
+        """Rows of features that start landmarks: those whose depth is known well enough for a Gaussian in space."""
+        features = frame.features
+        deep = np.sqrt(features.cov_points[:, 2, 2]) <= self.config.depth_fraction * features.points[:, 2]
+        rows = np.flatnonzero(~known & deep & frame.free)
+        if not rows.size:
+            return rows
+        nearest = self.index.nearest(features.descriptors[rows])
+        px, taken = features.z[rows, :2], features.z[known, :2]
+        return rows[self.manager.select(px, features.descriptors[rows], nearest, taken)]
+
+
+def world_points(landmark: Landmark, records: Records) -> np.ndarray:
+    """Points (N, K, 3) in the world of landmarks (N, K) of any parametrisation."""
+    homogeneous = landmark.homogeneous(records.mean, records.const)
+    return np.asarray(homogeneous[..., :3] / homogeneous[..., 3:])
+
+
+@final
+class NamedLandmarks(Landmarks[NamedPixels]):
+    """Landmarks by the names that the recording gives them: known association.
+
+    Args:
+        rig: the cameras.
+        likelihood: of an innovation.
+    """
+
+    def __init__(self, rig: RectifiedStereo, likelihood: Likelihood) -> None:
+        self.rig, self.model, self.landmark = rig, StereoPoint(rig), Point(3)
+        self.ids = np.zeros(0, dtype=np.int64)
+        self._sensor = NamedLandmarkSensor(self.model, self.landmark, likelihood)
+        self._observed = self._observed_again = np.zeros(0, dtype=np.int64)
+
+    def observe(self, frame: View[NamedPixels], belief: Belief) -> Sequence[Observations]:
+        """Those that the map holds."""
+        self.ids = np.where(frame.free, frame.features.names, NULL)
+        return self._sensor.observe(_free(frame), belief)
+
+    def new_landmarks(
+        self, frame: View[NamedPixels], belief: Belief, observed: Sequence[Observations]
+    ) -> Sequence[NewLandmarks]:
+        """Those that it does not hold."""
+        names = frame.features.names[frame.free]
+        self._observed_again = np.union1d(self._observed_again, np.intersect1d(self._observed, names))
+        self._observed = np.union1d(self._observed, names)
+        return self._sensor.new_landmarks(_free(frame), belief, observed)
+
+    def associate(self, view: View[NamedPixels], belief: Belief) -> np.ndarray:
+        """By their names; where the view is uncertain, only those that were observed more than once."""
+        known = self._observed_again if view.uncertain else self._observed
+        return np.where(view.free & np.isin(view.features.names, known), view.features.names, NULL)
+
+    def seen_again(self) -> np.ndarray:
+        return self._observed_again
+
+    def expected(self, belief: Belief, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return belief.project(self.model, ids)
+
+    def kinds(self) -> np.ndarray:
+        return np.full(self.ids.size, FeatureKind.LANDMARK)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        return {"names/filtered": self._observed, "names/proven": self._observed_again}
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        self._observed, self._observed_again = (
+            checked(arrays, f"names/{name}", (None,), "i").copy() for name in ("filtered", "proven")
+        )
+
+
+def _free(view: View[NamedPixels]) -> Any:
+    """What the map may use of a view."""
+    features = view.features.take(view.free)
+    return FeatureFrame(view.stamp_ns, features.names, features.z, features.cov)

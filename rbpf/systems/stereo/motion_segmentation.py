@@ -1,65 +1,111 @@
-"""Which features of the pairs stand still: what the motion of the next pair is told by, and what the map may take."""
+"""Which of several motions is the camera's, and which features stand still, where part of the view moves.
 
-from typing import final
+Each group of matches agrees on a motion x. The probability that group h stands still, and the others move, is
+
+    P(h) ∝ (1 + n_h) · N(x_h; prior) · p(map | x_h) · B(h),    Mathematics (vo-static).
+
+Of n_h matches nothing is known, each is as likely as any other to be of what stands still. B is the group's past: what
+stood still goes on to do so, and what moved to move, but for a fraction of the matches that are mistaken, and for things
+that begin or stop. The groups' own likelihoods are the same whichever of them stands still, and so are the volumes that
+they leave open; what moves may move by as much as a camera may. That none of them stands still is one case more, as
+likely as one match more.
+
+A feature is labelled 1 if it stood still in its pair, −1 if it moved, 0 where that is not known; matches carry labels
+from one pair to the next.
+"""
 
 import numpy as np
 
-from rbpf.core.checkpoint import checked
+from rbpf import gaussian
+from rbpf.lie import SE3
+from rbpf.motion.stereo_vo import CandidateMotions
+
+STATIC, UNKNOWN, MOVING = 1, 0, -1
+"""Labels of features."""
+
+MISTAKEN = 0.1
+"""Fraction of matches: 4 and 10 % between the pairs of two recordings (how_to/stereo_features)."""
+
+CHANGES = 0.01
+"""Fraction of pairs in which a thing begins to move or stops."""
 
 
-@final
-class MotionSegmentation:
-    """Follows the features from pair to pair. Call `look`, `match`, `leave_out`, then `note`."""
+def contradicts(inliers: np.ndarray, labels: np.ndarray, hidden: bool) -> bool:
+    """Whether the matches (K,) that agree on a single motion are not those that stood still in the earlier pair.
 
-    def __init__(self) -> None:
-        self._stood = np.zeros(0, dtype=np.int8)
-        self.look()
+    Args:
+        inliers: (K,) which agree.
+        labels: (K,) of the matches in the earlier pair.
+        hidden: whether nothing in the earlier pair stood still.
+    """
+    if not labels.size:
+        return False
+    static = labels == STATIC
+    few = (static & inliers).sum() < (static & ~inliers).sum()
+    return bool(hidden or few or labels[inliers].sum() < 0)
 
-    def look(self) -> None:
-        """The next pair, of which nothing is known yet."""
-        self.matches = np.zeros((2, 0), dtype=np.intp)
-        """Rows (2, M) of the pair kept and of the pair looked at."""
-        self.moving = self.matches[1]
-        """Rows of features of the pair looked at that are of things that move."""
 
-    def match(self, first: np.ndarray, second: np.ndarray) -> None:
-        """Which rows (M,) of the pair kept are which (M,) of the pair looked at."""
-        self.matches = np.stack([first, second])
+def camera_motion(
+    candidates: CandidateMotions,
+    labels: np.ndarray,
+    hidden: bool,
+    log_support: np.ndarray,
+    prior_is_informed: bool,
+) -> int:
+    """Number of the candidate that most probably is the camera's motion; −1 where none of them is.
 
-    def before(self) -> np.ndarray:
-        """Of each match (M,) what it was in the pair kept, see `rbpf.motion.stereo_motions.Known`."""
-        return self._stood[self.matches[0]]
+    Args:
+        candidates: M motions.
+        labels: (K,) of the matches in the earlier pair.
+        hidden: whether nothing in the earlier pair stood still.
+        log_support: (M + 1,) log-density of the map's landmarks in the later pair under each candidate, and under the
+            prior alone; up to a constant. Zeros where there is no map.
+        prior_is_informed: whether the prior follows from a velocity that was measured; before, any motion is as likely.
+    """
+    groups = np.array([motion.inliers for motion in candidates.motions])
+    scores = np.array([_log_past(labels[group]) for group in (*groups, ~groups.any(axis=0))]) + log_support
+    none = scores[-1] + np.log((1.0 - CHANGES) / CHANGES) * hidden
+    scores = scores[:-1] + np.log1p((groups & (labels == UNKNOWN)).sum(axis=1))
+    plausible = scores
+    if prior_is_informed:
+        prior = candidates.prior
+        chol = gaussian.cholesky(prior.cov)
+        off = [SE3.local(prior.delta, motion.odometry.delta) for motion in candidates.motions]
+        plausible = scores - 0.5 * np.square([gaussian.solve_lower(chol, one) for one in off]).sum(axis=1)
+    best = int(np.argmax(plausible))
+    return best if scores[best] >= none else -1
 
-    def leave_out(self, moving: np.ndarray) -> None:
-        """Which matches (M,) agree on another motion than the camera's."""
-        self.moving = self.matches[1, moving]
 
-    def note(self, count: int, agree: np.ndarray, found: np.ndarray) -> None:
-        """The pair looked at is what the next one is matched with.
+def propagated(
+    count: int,
+    matches: tuple[np.ndarray, np.ndarray],
+    labels: np.ndarray,
+    inliers: np.ndarray,
+    moving: np.ndarray,
+    mapped: np.ndarray,
+) -> np.ndarray:
+    """Labels (K,) of a pair's features, from those of the pair before.
 
-        Args:
-            count: of its features.
-            agree: (M,) matches that agree with the camera's motion; where none does, all stay what they were.
-            found: rows of features that are where the map has them.
-        """
-        now = np.zeros(count, dtype=np.int8)
-        first, second = self.matches
-        if agree.any():
-            now[second[agree]] = 1
-        else:
-            now[second] = self._stood[first]
-        now[self.moving] = -1
-        now[found] = 1
-        self._stood = now
+    Args:
+        count: K.
+        matches: rows (M,) of the earlier pair and (M,) of this one.
+        labels: (M,) of the matches in the earlier pair.
+        inliers: (M,) which agree with the camera's motion; where none does, all stay what they were.
+        moving: (M,) which agree on another motion.
+        mapped: rows of features that are where the map has them.
+    """
+    out = np.full(count, UNKNOWN, dtype=np.int8)
+    if inliers.any():
+        out[matches[1][inliers]] = STATIC
+    else:
+        out[matches[1]] = labels
+    out[matches[1][moving]] = MOVING
+    out[mapped] = STATIC
+    return out
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        """For a checkpoint."""
-        return {"pair/stood": self._stood}
 
-    def restore(self, arrays: dict[str, np.ndarray], count: int) -> None:
-        """The inverse of `arrays`, of a pair of so many features.
-
-        Raises:
-            InputError: they are not what they should be.
-        """
-        self._stood = checked(arrays, "pair/stood", (count,), "i").copy()
+def _log_past(labels: np.ndarray) -> float:
+    """Log B of a group with these labels: bounded, for a thing begins or stops as a whole."""
+    odds = np.log((1.0 - MISTAKEN) / MISTAKEN) * labels.sum()
+    kept, changed = np.log1p(-CHANGES), np.log(CHANGES)
+    return float(np.logaddexp(kept, changed - odds) - np.logaddexp(kept - odds, changed))

@@ -1,98 +1,222 @@
-"""Runs stereo SLAM over a recording: odometry from pair to pair, and the filter where the camera has moved enough."""
+"""Runs stereo SLAM over a recording, and gathers what it says of every pair."""
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from rbpf.core.filter import Filter, StepReport
+from rbpf.core.checkpoint import checked, fitting
+from rbpf.core.filter import Filter
 from rbpf.core.particles import Estimate
 from rbpf.errors import InputError
-from rbpf.lie import SE3
-from rbpf.motion.odometry import Odometry
-from rbpf.motion.stereo_motions import Known
+from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.feature_log import CameraTruth, FeatureLog
 from rbpf.sensors.readers import ImageSequence
-from rbpf.systems.stereo.config import StereoConfig, TriggerConfig
-from rbpf.systems.stereo.dead_reckoning import DeadReckoning, Reckoned, chained
-from rbpf.systems.stereo.delayed_update import motion_for_update
+from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.feature_cache import CachedSequence
-from rbpf.systems.stereo.front_ends import FrontEnd, ImageFrontEnd
-from rbpf.systems.stereo.name_front_end import NameFrontEnd
-from rbpf.systems.stereo.resuming import cut, restore, save
-from rbpf.systems.stereo.seen import Seen
-from rbpf.systems.stereo.system import build_filter, build_reckoning
+from rbpf.systems.stereo.landmarks import FeatureKind, Landmarks
+from rbpf.systems.stereo.slam import StereoSlam
+from rbpf.systems.system import Tracked
+
+_SHAPES = {"world_from_camera": (7,), "cov": (6, 6), "odometry": (7,)}
+_NAMES = [
+    "features",
+    "agreeing",
+    "assumed",
+    "updated",
+    "observed",
+    "ess",
+    "resampled",
+    "log_evidence",
+    "nis",
+    "nis_dof",
+]
+_SECONDS = ("seconds", "seconds_features", "seconds_odometry", "seconds_matching", "seconds_filter")
+_PER_FRAME = (*_SHAPES, *_NAMES, *_SECONDS)
+
+
+@dataclass(frozen=True)
+class PairSeen:
+    """What one pair showed.
+
+    Attributes:
+        z: (K, 3) pixels (u_left, v, u_right) of its features.
+        kind: (K,) what each was.
+    """
+
+    z: np.ndarray
+    kind: np.ndarray
+
+    def of(self, kind: FeatureKind) -> np.ndarray:
+        """Pixels (k, 3) of one kind."""
+        return np.asarray(self.z[self.kind == kind], dtype=float)
 
 
 @dataclass
 class StereoRun:
-    """A run over T pairs.
+    """A run over T pairs; the columns of `StereoSlam` are attributes, (T, …) each.
 
     Attributes:
         name: of the recording.
         truth: where the camera really was; None where unknown.
-        config: with what settings.
-        front_end: what measures the pairs.
-        reckoning: what chains them.
-        filter: in its final state.
+        slam: in its final state.
         stamps_ns: (T,).
-        world_from_camera: (T, 7) online: filtered mean at the last update, moved on by odometry.
-        cov: (T, 6, 6) of it in the right chart at the mean, order [ω, v].
-        odometry: (T, 7) world_from_camera by odometry alone.
-        features: (T,) of each pair;  agreeing: (T,) matches that agree with the motion since the last pair.
-        assumed: (T,) pairs since the place was known last over which the motion was only assumed; 0 where it is known.
-        updated: (T,) whether the filter was updated;  observed: (T,) landmarks seen then.
-        ess: (T,) effective sample size before resampling, 0 without an update;  resampled: (T,).
-        log_evidence: (T,) increments, NaN where the likelihood is no density.
-        nis: (T,) normalised innovation squared;  nis_dof: (T,) its degrees of freedom.
-        seconds: (T,) time of the whole pair without decoding;  seconds_features: (T,) of measuring it;
-            seconds_odometry: (T,) of matching with the last one and estimating the motion.
-        seconds_matching: (T,) of finding landmarks;  seconds_filter: (T,) of the rest of the update.
+        per_stamp: nanoseconds per unit of `stamps_ns`: 1, or 10⁹ where stamps count pairs of unknown time.
         notes: what was wrong with single pairs, in words.
         failure: why it ended before the last pair, in words; None where it did not.
-        per_stamp: nanoseconds per unit of `stamps_ns`: 1, or 10⁹ where stamps count pairs of unknown time.
         frames_done: pairs so far.
-        last_update: pair at which the filter was updated last.
-        at_update: its estimate then.
-        seen: what each pair showed.
+        shown: what each pair showed, see `StereoSlam.observed`.
     """
 
     name: str
     truth: CameraTruth | None
-    config: StereoConfig
-    front_end: FrontEnd
-    reckoning: DeadReckoning
-    filter: Filter
+    slam: StereoSlam
     stamps_ns: np.ndarray
-    world_from_camera: np.ndarray
-    cov: np.ndarray
-    odometry: np.ndarray
-    features: np.ndarray
-    agreeing: np.ndarray
-    assumed: np.ndarray
-    updated: np.ndarray
-    observed: np.ndarray
-    ess: np.ndarray
-    resampled: np.ndarray
-    log_evidence: np.ndarray
-    nis: np.ndarray
-    nis_dof: np.ndarray
-    seconds: np.ndarray
-    seconds_features: np.ndarray
-    seconds_odometry: np.ndarray
-    seconds_matching: np.ndarray
-    seconds_filter: np.ndarray
+    per_stamp: int = 1
     notes: list[str] = field(default_factory=list)
     failure: str | None = None
-    per_stamp: int = 1
     frames_done: int = 0
-    last_update: int = 0
-    at_update: Estimate = field(default_factory=lambda: Estimate(SE3.identity(), np.zeros((6, 6))))
-    seen: Seen = field(default_factory=Seen)
+    shown: list[dict[str, np.ndarray]] = field(default_factory=list)
+    world_from_camera: np.ndarray = field(init=False)
+    cov: np.ndarray = field(init=False)
+    odometry: np.ndarray = field(init=False)
+    features: np.ndarray = field(init=False)
+    agreeing: np.ndarray = field(init=False)
+    assumed: np.ndarray = field(init=False)
+    updated: np.ndarray = field(init=False)
+    observed: np.ndarray = field(init=False)
+    ess: np.ndarray = field(init=False)
+    resampled: np.ndarray = field(init=False)
+    log_evidence: np.ndarray = field(init=False)
+    nis: np.ndarray = field(init=False)
+    nis_dof: np.ndarray = field(init=False)
+    seconds: np.ndarray = field(init=False)
+    seconds_features: np.ndarray = field(init=False)
+    seconds_odometry: np.ndarray = field(init=False)
+    seconds_matching: np.ndarray = field(init=False)
+    seconds_filter: np.ndarray = field(init=False)
+    _measured: list[bool] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        for name in _PER_FRAME:
+            setattr(self, name, np.zeros((self.stamps_ns.size, *_SHAPES.get(name, ()))))
+
+    @property
+    def config(self) -> StereoConfig:
+        """With what settings."""
+        return self.slam.config
+
+    @property
+    def rig(self) -> RectifiedStereo:
+        """The cameras."""
+        return self.slam.rig
+
+    @property
+    def filter(self) -> Filter:
+        """In its final state."""
+        return self.slam.filter
+
+    @property
+    def landmarks(self) -> Landmarks[Any]:
+        """What is known of the map's landmarks besides where they are."""
+        return self.slam.front_end.landmarks
+
+    @property
+    def at_update(self) -> Estimate:
+        """The estimate at the last update."""
+        return self.slam.at_update
+
+    def pair_seen(self, t: int) -> PairSeen:
+        """What pair t showed, for pictures."""
+        return PairSeen(self.shown[t]["z"].astype(np.float32), self.shown[t]["kind"])
+
+    @property
+    def seen(self) -> list[PairSeen]:
+        """What each pair showed, for pictures."""
+        return [self.pair_seen(t) for t in range(len(self.shown))]
+
+    def log(self) -> FeatureLog:
+        """The pixels that the pairs were filtered by, as tracks; of named pixels the given ones."""
+        return replace(self.slam.measurements(self.name, _Recorded(self)), truth=self.truth)
+
+    def summary(self) -> dict[str, Any]:
+        """Entries of summary.json."""
+        return self.slam.summary(_Recorded(self))
+
+    def record(self, tracked: Tracked, seconds: float) -> None:
+        """The next pair."""
+        t = self.frames_done
+        self.world_from_camera[t], self.cov[t], self.seconds[t] = tracked.pose, tracked.cov, seconds
+        for name in ("odometry", *_NAMES, *_SECONDS[1:]):
+            getattr(self, name)[t] = tracked.values[name]
+        self._measured.append(bool(tracked.values["measured"]))
+        self.notes += [f"pair {t}: {message}" for message in tracked.messages]
+        self.shown.append(dict(tracked.observed))
+        self.frames_done = t + 1
+
+    def save(self, path: Path) -> None:
+        """Writes a checkpoint of everything so far."""
+        done = self.frames_done
+        arrays = {f"progress/{name}": getattr(self, name)[:done] for name in _PER_FRAME}
+        arrays["progress/stamps_ns"] = self.stamps_ns
+        arrays["progress/notes"] = np.array(self.notes, dtype=np.str_)
+        arrays["progress/measured"] = np.array(self._measured, dtype=bool)
+        arrays["observed/counts"] = np.array([len(shown["z"]) for shown in self.shown], dtype=np.int64)
+        for ragged in StereoSlam.observed:
+            empty = np.zeros((0, *ragged.shape), dtype=ragged.kind)
+            rows = [shown[ragged.name].astype(ragged.kind) for shown in self.shown]
+            arrays[f"observed/{ragged.name}"] = np.concatenate([empty, *rows])
+        self.slam.save(path, arrays)
+
+    def load(self, path: Path) -> None:
+        """The inverse of `save`.
+
+        Raises:
+            InputError: the file is damaged, or belongs to a run over another recording or with other settings.
+        """
+        arrays = self.slam.load(path)
+        if not np.array_equal(arrays.get("progress/stamps_ns", ()), self.stamps_ns):
+            raise InputError(f"{path} belongs to a run over another recording: start without --resume")
+        with fitting(path):
+            self._measured = checked(arrays, "progress/measured", (None,), "b").tolist()
+            self.frames_done = len(self._measured)
+            for name in _PER_FRAME:
+                getattr(self, name)[: self.frames_done] = arrays[f"progress/{name}"]
+            self.notes = checked(arrays, "progress/notes", (None,), "U").tolist()
+            cuts = np.cumsum(arrays["observed/counts"])[:-1]
+            names = [ragged.name for ragged in StereoSlam.observed]
+            parts = [np.split(arrays[f"observed/{name}"], cuts) for name in names]
+            self.shown = [dict(zip(names, rows, strict=True)) for rows in zip(*parts, strict=True)]
+
+
+class _Recorded:
+    """A run as `System.measurements` and `System.summary` take it."""
+
+    def __init__(self, run: StereoRun) -> None:
+        self._run = run
+
+    @property
+    def stamps_ns(self) -> np.ndarray:
+        return self._run.stamps_ns
+
+    @property
+    def poses(self) -> np.ndarray:
+        return self._run.world_from_camera
+
+    def __len__(self) -> int:
+        return self._run.frames_done
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        return np.array(self._run._measured) if name == "measured" else getattr(self._run, name)
+
+    def observed(self, t: int) -> dict[str, np.ndarray]:
+        return self._run.shown[t]
+
+    def lost(self) -> np.ndarray:
+        return np.zeros(len(self), dtype=bool)
 
 
 def run_images(
@@ -117,11 +241,10 @@ def run_images(
     Raises:
         InputError: the first pair is refused, or the checkpoint is of another run.
     """
-    front_end = ImageFrontEnd(sequence.rig, config)
     stamps = np.asarray(sequence.stamps_ns, dtype=np.int64)
-    run = _begin(sequence.name, sequence.truth, config, front_end, stamps)
+    run = StereoRun(sequence.name, sequence.truth, StereoSlam(sequence.rig, config), stamps)
     if resume and checkpoint is not None and checkpoint.exists():
-        restore(run, checkpoint)
+        run.load(checkpoint)
     done = run.frames_done
     return _all(run, sequence.frames(done) if done < len(sequence) else iter(()), on_frame, checkpoint)
 
@@ -140,25 +263,18 @@ def run_features(
     Raises:
         InputError: the log is of one camera, or the checkpoint is of another run.
     """
+    if not isinstance(log.camera, RectifiedStereo):
+        raise InputError(
+            f"{log.name}: stereo SLAM needs a log of a rectified pair, this one is of one camera"
+        )
     stamps = np.array([frame.stamp_ns for frame in log.frames], dtype=np.int64)
-    run = _begin(log.name, log.truth, config, NameFrontEnd(log, config), stamps)
+    run = StereoRun(log.name, log.truth, StereoSlam(log.camera, config), stamps)
     if np.array_equal(stamps, np.arange(stamps.size)):
         run.per_stamp = 1_000_000_000
     if resume and checkpoint is not None and checkpoint.exists():
-        restore(run, checkpoint)
-    return _all(run, iter(log.frames[run.frames_done :]), on_frame, checkpoint)
-
-
-def _begin(
-    name: str, truth: CameraTruth | None, config: StereoConfig, front_end: FrontEnd, stamps_ns: np.ndarray
-) -> StereoRun:
-    total = stamps_ns.size
-    reckoning, filter_ = build_reckoning(front_end.rig, config), build_filter(front_end.sensor, config)
-    poses, covs, odometry = np.zeros((total, 7)), np.zeros((total, 6, 6)), np.zeros((total, 7))
-    numbers = np.zeros((15, total))
-    return StereoRun(
-        name, truth, config, front_end, reckoning, filter_, stamps_ns, poses, covs, odometry, *numbers
-    )
+        run.load(checkpoint)
+    rest = (replace(f, stamp_ns=run.per_stamp * f.stamp_ns) for f in log.frames[run.frames_done :])
+    return _all(run, rest, on_frame, checkpoint)
 
 
 def _all(
@@ -168,14 +284,15 @@ def _all(
     checkpoint: Path | None,
 ) -> StereoRun:
     for t, frame in enumerate(frames, run.frames_done):
+        started = time.perf_counter()
         try:
-            _frame(run, t, frame)
+            tracked = run.slam.take(frame)
         except InputError as error:
             if t == 0:
                 raise
             run.failure = f"pair {t} of {run.name}: {error}"
             break
-        run.frames_done = t + 1
+        run.record(tracked, time.perf_counter() - started)
         if checkpoint is not None and (t + 1) % run.config.checkpoint_every == 0:
             _keep(run, checkpoint)
         try:
@@ -187,108 +304,15 @@ def _all(
             raise
     if checkpoint is not None and run.failure is None:
         _keep(run, checkpoint)
-    cut(run)
+    run.stamps_ns = run.stamps_ns[: run.frames_done]
+    for name in _PER_FRAME:
+        setattr(run, name, getattr(run, name)[: run.frames_done])
     return run
 
 
 def _keep(run: StereoRun, checkpoint: Path) -> None:
     """Writes a checkpoint; where the disk is full the run goes on all the same, and the last one stays."""
     try:
-        save(run, checkpoint)
+        run.save(checkpoint)
     except InputError as error:
         run.notes.append(f"pair {run.frames_done - 1}: no checkpoint is kept: {error}")
-
-
-def _frame(run: StereoRun, t: int, frame: Any) -> None:
-    started = time.perf_counter()
-    count, problem = run.front_end.look(frame)
-    run.features[t], run.seconds_features[t] = count, time.perf_counter() - started
-    at, whole = _reckon(run, t, problem)
-    run.agreeing[t], run.odometry[t] = at.agreeing, at.world_from_camera
-    run.seconds_odometry[t] = time.perf_counter() - started - run.seconds_features[t]
-    if whole and (
-        run.filter.steps == 0 or triggered(at.since_update, run.config.trigger, t - run.last_update)
-    ):
-        motion = motion_for_update(run, t, at)
-        if motion is not None:
-            _update(run, t, motion, run.config.recovery.used and at.assumed > 0)
-    run.assumed[t] = 0 if run.updated[t] and run.config.recovery.used else at.assumed
-    if whole:
-        run.front_end.note(t, at.agree, bool(run.updated[t]))
-    estimate = moved_on(run.at_update, at.since_update) if not run.updated[t] else run.at_update
-    run.world_from_camera[t], run.cov[t] = estimate.mean, estimate.cov
-    run.seconds[t] = time.perf_counter() - started
-    run.seen.record(*run.front_end.seen(bool(run.updated[t])))
-
-
-def _reckon(run: StereoRun, t: int, problem: str) -> tuple[Reckoned, bool]:
-    """The motion up to pair t, and whether the pair could be measured."""
-    stamp, reckoning = run.per_stamp * int(run.stamps_ns[t]), run.reckoning
-    least, count = run.config.odometry.estimate.least_matches, int(run.features[t])
-    is_later = reckoning.is_later(stamp)
-    if count < least or not is_later:
-        few = (
-            f"it shows {count} features, {least} are needed"
-            if is_later
-            else "it has the stamp of the last one"
-        )
-        what = f"{problem}; {few}" if problem and count else problem or few
-        run.notes.append(f"pair {t} is passed over: {what}; the last velocity is assumed, widely")
-        return reckoning.assumed(stamp), False
-    if problem:
-        run.notes.append(f"pair {t}: {problem}")
-    if not reckoning.begun:
-        at = reckoning.begin(stamp)
-    else:
-        rng = np.random.default_rng([run.config.seed, t])
-        matches = run.front_end.matches()
-        known = Known(partial(_log_support, run, t), run.front_end.segmentation.before())
-        at = reckoning.measured(stamp, matches, rng, known)
-        run.front_end.segmentation.leave_out(at.moving)
-        if at.note:
-            run.notes.append(f"pair {t}: {at.note}")
-    run.front_end.keep()
-    return at, True
-
-
-def _log_support(run: StereoRun, t: int, since_update: Odometry) -> float:
-    """What the map says of a motion up to pair t."""
-    if not run.filter.steps:
-        return 0.0
-    belief = run.filter.expect(since_update, int(run.stamps_ns[t]))
-    return run.front_end.log_support(belief, run.reckoning.in_doubt)
-
-
-def triggered(motion: Odometry, config: TriggerConfig, frames: int) -> bool:
-    """Whether the camera has moved enough for an update: root mean square, so that doubt counts as motion."""
-    variance = np.diagonal(motion.cov)
-    turned, moved = SE3.log(motion.delta)[:3], SE3.translation(motion.delta)
-    far = float(moved @ moved + variance[3:].sum()) >= config.moved_m**2
-    turned_far = float(turned @ turned + variance[:3].sum()) >= config.turned_rad**2
-    return far or turned_far or (config.frames > 0 and frames >= config.frames)
-
-
-def _update(run: StereoRun, t: int, motion: Odometry, doubt: bool) -> None:
-    started = time.perf_counter()
-    control = motion if run.filter.steps else None
-    proposal = run.config.recovery.proposal.build() if doubt else None
-    report = run.filter.step(run.front_end.for_filter(doubt), control, int(run.stamps_ns[t]), proposal)
-    run.reckoning.updated()
-    run.at_update = Estimate(report.estimate.mean, report.estimate.cov)
-    run.last_update = t
-    elapsed = time.perf_counter() - started
-    run.seconds_matching[t] = run.front_end.seconds()
-    run.seconds_filter[t] = elapsed - run.seconds_matching[t]
-    _note_update(run, t, report)
-
-
-def _note_update(run: StereoRun, t: int, report: StepReport) -> None:
-    run.updated[t], run.observed[t] = True, run.front_end.observed(report)
-    run.ess[t], run.resampled[t], run.log_evidence[t] = report.ess, report.resampled, report.log_evidence
-    run.nis[t], run.nis_dof[t] = report.nis, report.rows
-
-
-def moved_on(at: Estimate, motion: Odometry) -> Estimate:
-    """An estimate after a further motion."""
-    moved = chained(Odometry(at.mean, at.cov), motion)
-    return Estimate(moved.delta, moved.cov)

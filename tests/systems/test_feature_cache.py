@@ -5,18 +5,17 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.sensors.features import SiftConfig
-from rbpf.systems.stereo import feature_cache as measured
+from rbpf.systems.stereo import feature_cache
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.feature_cache import cache_features
-from rbpf.systems.stereo.run import run_images
-from tests.systems.stereo_sequences import missing, pairs
+from tests.systems.stereo_sequences import filtered, missing, pairs
 
 CONFIG, COUNT, BAD = StereoConfig(particles=40), 7, 4
 
 
 @pytest.fixture(autouse=True)
 def small_chunks(monkeypatch):
-    monkeypatch.setattr(measured, "CHUNK", 3)
+    monkeypatch.setattr(feature_cache, "CHUNK", 3)
 
 
 def sequence():
@@ -28,11 +27,13 @@ def test_the_same_run(tmp_path):
     told = []
     kept = cache_features(sequence(), CONFIG, tmp_path, lambda done, total: told.append((done, total)))
     assert told == [(k, COUNT) for k in range(1, COUNT + 1)]
-    ours, plain = run_images(kept, CONFIG), run_images(sequence(), CONFIG)
-    for name in ("world_from_camera", "cov", "odometry", "features", "agreeing", "observed"):
-        np.testing.assert_array_equal(getattr(ours, name), getattr(plain, name))
-    assert ours.notes == plain.notes and len(ours.notes) == 1
-    assert len(kept.first(5)) == 5 and run_images(kept.first(5), CONFIG).stamps_ns.size == 5
+    ours, plain = filtered(kept, CONFIG), filtered(sequence(), CONFIG)
+    for name in ("odometry", "features", "agreeing", "observed"):
+        np.testing.assert_array_equal(ours.log[name], plain.log[name])
+    for name in ("stamps_ns", "poses", "covs"):
+        np.testing.assert_array_equal(getattr(ours.log, name), getattr(plain.log, name))
+    assert ours.messages == plain.messages and len(ours.messages) == 1
+    assert len(kept.first(5)) == 5 and len(filtered(kept.first(5), CONFIG).log) == 5
     late = list(kept.frames(COUNT - 2))
     assert len(late) == 2
     np.testing.assert_array_equal(late[1].features.descriptors, list(kept.frames())[-1].features.descriptors)
@@ -59,3 +60,13 @@ def test_features_of_another_recording_are_refused(tmp_path):
         cache_features(pairs(COUNT + 1), CONFIG, tmp_path)
     with pytest.raises(InputError, match="another recording or with other settings"):
         cache_features(sequence(), StereoConfig(sift=SiftConfig(length=128)), tmp_path)
+
+
+def test_files_that_do_not_fit_are_refused(tmp_path):
+    """As those of an earlier version."""
+    kept = cache_features(sequence(), CONFIG, tmp_path)
+    with np.load(tmp_path / "pairs_000000.npz") as arrays:
+        fewer = {name: arrays[name] for name in arrays.files if name != "descriptors"}
+    np.savez(tmp_path / "pairs_000000.npz", **fewer)
+    with pytest.raises(InputError, match="is damaged"):
+        next(kept.frames())

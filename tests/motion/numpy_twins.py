@@ -1,11 +1,29 @@
-"""The compiled proposals of triples once more, all triples at a time."""
+"""What `rbpf.motion.stereo_kernels` computes once more, all matches or all triples at a time."""
 
 import numpy as np
 
+from rbpf import gaussian
 from rbpf.lie import SE3
 from rbpf.motion.stereo_consensus import REFINEMENTS
-from rbpf.motion.stereo_geometry import homography, raise_pixels, see
-from rbpf.motion.stereo_triple_kernels import FLAT, STIFFNESS
+from rbpf.motion.stereo_geometry import SWEEPS, SWEPT_PX, homography, linearised, reproject, times_pixels
+from rbpf.motion.stereo_kernels import FLAT, STIFFNESS
+
+
+def innovation(matches, delta, points):
+    """ν at a motion (7,), with m̂ as `points` says, and L⁻¹ [ν, −∂g/∂ξ] (K, 3, 7)."""
+    found = linearised(matches, delta, matches.z_prev, points)
+    for _ in range(SWEEPS if points == "adjusted" else 0):
+        # m̂ = z⁻ + R⁻ Aᵀ S⁻¹ ν: the linearised problem's minimum.
+        nu = np.where(found.seen.front[:, None], found.nu, 0.0)
+        gained = found.seen.by_pixels.mT @ np.linalg.solve(found.cov, nu[..., None])
+        pixels = matches.z_prev + (matches.cov_prev @ gained)[..., 0]
+        change = np.abs(pixels - found.pixels)[found.seen.front].max(initial=0.0)
+        found = linearised(matches, delta, pixels, points)
+        if change <= SWEPT_PX:
+            break
+    both = np.concatenate([found.nu[..., None], -found.seen.by_motion], axis=-1)
+    both = np.where(found.seen.front[:, None, None], both, 0.0)
+    return found, gaussian.solve_lower_matrix(gaussian.cholesky(found.cov), both)
 
 
 def align(before, now):
@@ -27,7 +45,7 @@ def _unit(v):
 
 def squared_distances(search, motions, rows):
     """Of some rows (…, k) at motions (…, 7); infinite behind the camera."""
-    raised = raise_pixels(homography(search.matches.camera, motions), search.matches.z_prev[rows])
+    raised = times_pixels(homography(search.matches.camera, motions), search.matches.z_prev[rows])
     front = raised[..., 3] > 0.0
     seen = raised[..., :3] / np.where(front, raised[..., 3], 1.0)[..., None]
     return np.where(front, np.square(_white_miss(search, seen, rows)).sum(axis=-1), np.inf)
@@ -44,7 +62,7 @@ def proposed(search, rows):
     nearer = squared_distances(search, guesses, rows).sum(axis=-1).argmin(axis=0)
     motions, condition = guesses[nearer, np.arange(len(rows))], np.zeros(len(rows))
     for _ in range(REFINEMENTS):
-        seen = see(search.matches.camera, motions, search.matches.z_prev[rows])
+        seen = reproject(search.matches.camera, motions, search.matches.z_prev[rows])
         miss = _white_miss(search, seen.pixels, rows).reshape(len(rows), -1, 1)
         jac = (search.white[rows] @ seen.by_motion).reshape(len(rows), -1, 6)
         info = jac.mT @ jac

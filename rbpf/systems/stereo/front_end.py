@@ -1,0 +1,283 @@
+"""What a stereo camera's frames show: features of each pair, and which of two pairs are the same point.
+
+A front end measures a frame, which gives a `Pair`, and matches two pairs. It holds no pair itself: nothing depends on
+the order of its calls. `ImageFrontEnd` takes images, or what was measured in them earlier; `NamedFrontEnd` pixels of
+landmarks that have names.
+
+Where `odometry.split` is not "none", odometry and map use features of their own: each feature is always in the same
+half, whenever it is seen.
+"""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Generic, final
+
+import numpy as np
+
+from rbpf.core.checkpoint import checked
+from rbpf.core.models import NULL
+from rbpf.errors import InputError
+from rbpf.motion.stereo_geometry import Matches
+from rbpf.sensors.camera import RectifiedStereo
+from rbpf.sensors.feature_log import FeatureFrame
+from rbpf.sensors.features import FeatureExtractor, Sift
+from rbpf.sensors.readers import ImageFrame
+from rbpf.sensors.stereo.features import StereoFeatures, match_frames
+from rbpf.sensors.stereo.matching import StereoMatcher
+from rbpf.systems.stereo.config import StereoConfig
+from rbpf.systems.stereo.feature_cache import KEPT, CachedPair
+from rbpf.systems.stereo.landmarks import (
+    DescriptorLandmarks,
+    F,
+    FeatureKind,
+    Landmarks,
+    NamedLandmarks,
+    NamedPixels,
+    View,
+)
+from rbpf.systems.stereo.motion_segmentation import UNKNOWN
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Pair(Generic[F]):
+    """What one frame showed.
+
+    Attributes:
+        stamp_ns: its time.
+        features: K of them.
+        for_odometry: (K,) bool, which the odometry may use.
+        for_map: (K,) bool, which the map may use.
+        labels: (K,) whether each stood still, see `rbpf.systems.stereo.motion_segmentation`.
+    """
+
+    stamp_ns: int
+    features: F
+    for_odometry: np.ndarray
+    for_map: np.ndarray
+    labels: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.features)
+
+    def labelled(self, labels: np.ndarray) -> "Pair[F]":
+        """The same, once it is known what stood still."""
+        return replace(self, labels=labels)
+
+    def view(self, moving: np.ndarray | None = None, uncertain: bool = False) -> View[F]:
+        """What the map is asked about, without rows that are of things that move."""
+        free = self.for_map.copy()
+        if moving is not None:
+            free[moving] = False
+        return View(self.stamp_ns, self.features, free, uncertain)
+
+
+class FrontEnd(ABC, Generic[F]):
+    """Measures frames and matches pairs.
+
+    Attributes:
+        frames: types of the frames that it takes.
+        rig: the cameras.
+        names_landmarks: whether the frames themselves say which landmark each feature is.
+        landmarks: the map's side: finds landmarks among the features.
+    """
+
+    frames: ClassVar[tuple[type, ...]]
+    names_landmarks: ClassVar[bool] = False
+    rig: RectifiedStereo
+    landmarks: Landmarks[F]
+
+    def takes(self, frame: object) -> bool:
+        """Whether it is of such a type."""
+        return isinstance(frame, self.frames)
+
+    @abstractmethod
+    def measure(self, frame: Any) -> tuple[Pair[F], str]:
+        """What a frame shows, and in words what is wrong with it; empty where nothing is.
+
+        Raises:
+            InputError: the frame shows that the cameras are not what they should be.
+        """
+
+    def refusal(self, frame: Any) -> str:
+        """In words, why a frame cannot be one of these cameras; empty where it can. `measure` then finds nothing in it."""
+        return ""
+
+    @abstractmethod
+    def match(self, before: Pair[F], now: Pair[F]) -> tuple[np.ndarray, np.ndarray]:
+        """Rows (M,) of the earlier pair and (M,) of the later one that are the same point, as the odometry takes it."""
+
+    def matches(self, before: Pair[F], now: Pair[F], rows: tuple[np.ndarray, np.ndarray]) -> Matches:
+        """The pixels of such rows."""
+        first, second = before.features.take(rows[0]), now.features.take(rows[1])
+        return Matches.checked(self.rig, first.z, second.z, first.cov, second.cov)
+
+    def landmarks_of(self, pair: Pair[F], updated: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Landmark (K,) of each feature, NULL where there is none, and `FeatureKind` (K,) of each.
+
+        Args:
+            pair: the last one that was measured.
+            updated: whether the filter has taken it.
+        """
+        if updated:
+            return self.landmarks.ids, self.landmarks.kinds()
+        return np.full(len(pair), NULL, dtype=np.int64), np.full(len(pair), FeatureKind.FEATURE)
+
+    @abstractmethod
+    def arrays(self, pair: Pair[F]) -> dict[str, np.ndarray]:
+        """For a checkpoint: a pair."""
+
+    @abstractmethod
+    def pair_of(self, arrays: dict[str, np.ndarray]) -> Pair[F]:
+        """The inverse of `arrays`.
+
+        Raises:
+            InputError: they are not what they should be.
+        """
+
+
+class ImageFrontEnd(FrontEnd[StereoFeatures]):
+    """Features of images, SIFT by default.
+
+    Args:
+        rig: the cameras.
+        config: all settings.
+        extractor: finds and describes the keypoints of an image; None for SIFT as `config` has it.
+        landmarks: finds landmarks among the features; None for those by descriptors.
+    """
+
+    frames = (ImageFrame, CachedPair)
+
+    def __init__(
+        self,
+        rig: RectifiedStereo,
+        config: StereoConfig,
+        extractor: FeatureExtractor | None = None,
+        landmarks: Landmarks[StereoFeatures] | None = None,
+    ) -> None:
+        self.rig, self.config = rig, config
+        extractor = extractor or Sift(config.sift)
+        self.matcher = StereoMatcher(rig, extractor, config.pair)
+        likelihood, length = config.likelihood.build(), extractor.length
+        self.landmarks = landmarks or DescriptorLandmarks(
+            rig, config.map, config.new_landmarks, length, likelihood
+        )
+
+    def measure(self, frame: ImageFrame | CachedPair) -> tuple[Pair[StereoFeatures], str]:
+        """SIFT in both images, matched along the rows; or what was measured in them before.
+
+        Raises:
+            InputError: left and right image are swapped.
+        """
+        features, problem = None, frame.problem or ""
+        if isinstance(frame, CachedPair):
+            features = frame.features
+        elif frame.image is None or frame.right is None:
+            problem = problem or "an image is missing"
+        elif not (problem := self.refusal(frame)):
+            features = self.matcher.measure(frame.image, frame.right)
+            problem = self.matcher.remark
+        return self._pair(frame.stamp_ns, self._none() if features is None else features), problem
+
+    def refusal(self, frame: ImageFrame | CachedPair) -> str:
+        if isinstance(frame, CachedPair) or frame.image is None or frame.right is None:
+            return ""
+        try:
+            self.matcher.check(frame.image, frame.right)
+        except InputError as error:
+            return str(error)
+        return ""
+
+    def match(self, before: Pair[StereoFeatures], now: Pair[StereoFeatures]) -> tuple[np.ndarray, np.ndarray]:
+        """By their descriptors."""
+        found = match_frames(before.features, now.features, self.config.odometry.limits)
+        used = before.for_odometry[found.first] & now.for_odometry[found.second]
+        return found.first[used], found.second[used]
+
+    def arrays(self, pair: Pair[StereoFeatures]) -> dict[str, np.ndarray]:
+        kept = {f"pair/{name}": getattr(pair.features, name) for name in KEPT}
+        return kept | {"pair/stood": pair.labels}
+
+    def pair_of(self, arrays: dict[str, np.ndarray]) -> Pair[StereoFeatures]:
+        features = StereoFeatures.measured(self.rig, *(arrays[f"pair/{name}"].copy() for name in KEPT))
+        labels = checked(arrays, "pair/stood", (len(features),), "i").copy()
+        return self._pair(0, features).labelled(labels)
+
+    def _pair(self, stamp_ns: int, features: StereoFeatures) -> Pair[StereoFeatures]:
+        split, everything = self.config.odometry.split, np.ones(len(features), dtype=bool)
+        for_odometry, for_map = everything, everything
+        if split != "none":
+            for_odometry = split_by_descriptor(features.descriptors)
+            for_map = for_odometry if split == "same" else ~for_odometry
+        if not self.config.map.used:
+            for_map = ~everything
+        return Pair(stamp_ns, features, for_odometry, for_map, np.full(len(features), UNKNOWN, dtype=np.int8))
+
+    def _none(self) -> StereoFeatures:
+        nothing = np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0), np.zeros(0)
+        descriptors = np.zeros((0, self.matcher.extractor.length), dtype=np.float32)
+        return StereoFeatures.measured(self.rig, *nothing, descriptors)
+
+
+def split_by_descriptor(descriptors: np.ndarray) -> np.ndarray:
+    """A random half (K,), the same whenever a feature is seen: whether its first numbers outweigh its last ones."""
+    side = descriptors.shape[1] // 3
+    return np.asarray(descriptors[:, :side].sum(axis=1) > descriptors[:, -side:].sum(axis=1))
+
+
+@final
+class NamedFrontEnd(FrontEnd[NamedPixels]):
+    """Pixels of landmarks that have names: known association.
+
+    Args:
+        rig: the cameras.
+        config: all settings.
+    """
+
+    frames = (FeatureFrame,)
+    names_landmarks = True
+
+    def __init__(self, rig: RectifiedStereo, config: StereoConfig) -> None:
+        self.rig, self.config = rig, config
+        self.landmarks: NamedLandmarks = NamedLandmarks(rig, config.likelihood.build())
+
+    def measure(self, frame: FeatureFrame) -> tuple[Pair[NamedPixels], str]:
+        """Nothing is to be done."""
+        return self._pair(frame.stamp_ns, NamedPixels(frame.z, frame.cov_z, frame.landmarks)), ""
+
+    def match(self, before: Pair[NamedPixels], now: Pair[NamedPixels]) -> tuple[np.ndarray, np.ndarray]:
+        """By their names."""
+        names = before.features.names, now.features.names
+        _, first, second = np.intersect1d(*names, assume_unique=True, return_indices=True)
+        used = before.for_odometry[first]
+        return first[used], second[used]
+
+    def landmarks_of(self, pair: Pair[NamedPixels], updated: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Their names, whether the filter has taken them or not."""
+        kind = FeatureKind.LANDMARK if updated else FeatureKind.FEATURE
+        return pair.features.names, np.full(len(pair), kind)
+
+    def arrays(self, pair: Pair[NamedPixels]) -> dict[str, np.ndarray]:
+        features = pair.features
+        return {
+            "pair/names": features.names,
+            "pair/z": features.z,
+            "pair/cov": features.cov,
+            "pair/stood": pair.labels,
+        }
+
+    def pair_of(self, arrays: dict[str, np.ndarray]) -> Pair[NamedPixels]:
+        names = checked(arrays, "pair/names", (None,), "i").copy()
+        z = checked(arrays, "pair/z", (names.size, 3), "f").copy()
+        cov = checked(arrays, "pair/cov", (names.size, 3, 3), "f").copy()
+        labels = checked(arrays, "pair/stood", (names.size,), "i").copy()
+        return self._pair(0, NamedPixels(z, cov, names)).labelled(labels)
+
+    def _pair(self, stamp_ns: int, features: NamedPixels) -> Pair[NamedPixels]:
+        split, even = self.config.odometry.split, features.names % 2 == 0
+        # A point at infinity or beyond is no landmark.
+        for_map = (features.z[:, 0] > features.z[:, 2]) & self.config.map.used
+        if split != "none":
+            for_map = for_map & (even if split == "same" else ~even)
+        for_odometry = even if split != "none" else np.ones(len(features), dtype=bool)
+        return Pair(stamp_ns, features, for_odometry, for_map, np.full(len(features), UNKNOWN, dtype=np.int8))

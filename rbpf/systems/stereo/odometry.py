@@ -1,0 +1,118 @@
+"""Dead reckoning: where the camera has come by visual odometry, pair after pair, also over pairs that could not be used."""
+
+from dataclasses import dataclass, field, replace
+from typing import final
+
+import numpy as np
+
+from rbpf.core.checkpoint import checked
+from rbpf.lie import SE3
+from rbpf.motion.odometry import Odometry
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class DeadReckoning:
+    """What is known of the camera's motion at a pair, before the filter sees it.
+
+    Attributes:
+        stamp_ns: time of the last pair that was measured, from which the next one is; None before the first.
+        velocity: (6,) [ω, v] of the camera then, rad/s, m/s.
+        since_update: motion since the filter's last update.
+        world_from_camera: (7,) by odometry alone; the first camera is the world.
+        assumed: pairs since the filter's last update over which the motion was only assumed.
+        waiting: pairs since the first of these.
+        hidden: whether nothing in the pair stood still.
+        passed_over: pairs since that could not be measured.
+    """
+
+    stamp_ns: int | None = None
+    velocity: np.ndarray = field(default_factory=lambda: np.zeros(6))
+    since_update: Odometry = field(default_factory=Odometry.at_rest)
+    world_from_camera: np.ndarray = field(default_factory=SE3.identity)
+    assumed: int = 0
+    waiting: int = 0
+    hidden: bool = False
+    passed_over: int = 0
+
+    def seconds(self, stamp_ns: int) -> float:
+        """Time since the last pair that was measured; infinite before the first."""
+        return np.inf if self.stamp_ns is None else 1e-9 * (stamp_ns - self.stamp_ns)
+
+    def started(self, stamp_ns: int) -> "DeadReckoning":
+        """At the first pair that can be measured from."""
+        return replace(self, stamp_ns=stamp_ns)
+
+    def moved(
+        self,
+        stamp_ns: int,
+        step: Odometry,
+        velocity: np.ndarray,
+        is_assumed: bool = False,
+        hidden: bool = False,
+    ) -> "DeadReckoning":
+        """At a pair that was matched with the last measured one.
+
+        Args:
+            stamp_ns: its time.
+            step: the motion between the two.
+            velocity: (6,) of the camera now.
+            is_assumed: the matches did not tell the motion: `step` is what was expected.
+            hidden: whether nothing in the pair stood still.
+        """
+        missed = 1 + self.passed_over if is_assumed else 0
+        return DeadReckoning(
+            stamp_ns,
+            velocity,
+            self.since_update.then(step),
+            SE3.compose(self.world_from_camera, step.delta),
+            assumed=self.assumed + missed,
+            waiting=self.waiting + 1 if missed or self.assumed else 0,
+            hidden=hidden,
+        )
+
+    def passing_over(self) -> "DeadReckoning":
+        """After a pair that could not be measured: the next one is measured from the same pair as this one."""
+        return self if self.stamp_ns is None else replace(self, passed_over=self.passed_over + 1)
+
+    def extrapolated(self, step: Odometry) -> "DeadReckoning":
+        """What to report of a pair that was passed over, where the camera is expected to have moved by `step`."""
+        return DeadReckoning(
+            self.stamp_ns,
+            self.velocity,
+            self.since_update.then(step),
+            SE3.compose(self.world_from_camera, step.delta),
+            assumed=self.assumed + self.passed_over,
+        )
+
+    def updated(self) -> "DeadReckoning":
+        """After the filter has taken the motion up to the last measured pair."""
+        return DeadReckoning(self.stamp_ns, self.velocity, world_from_camera=self.world_from_camera)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """For a checkpoint."""
+        return {
+            "reckoning/stamp_ns": np.array([] if self.stamp_ns is None else [self.stamp_ns], dtype=np.int64),
+            "reckoning/velocity": self.velocity,
+            "reckoning/delta": self.since_update.delta,
+            "reckoning/cov": self.since_update.cov,
+            "reckoning/world_from_camera": self.world_from_camera,
+            "reckoning/missed": np.array([self.assumed, self.waiting, self.hidden, self.passed_over]),
+        }
+
+    @classmethod
+    def restored(cls, arrays: dict[str, np.ndarray]) -> "DeadReckoning":
+        """The inverse of `arrays`.
+
+        Raises:
+            InputError: they are not what they should be.
+        """
+        stamps = checked(arrays, "reckoning/stamp_ns", (None,), "i")
+        shapes = {"velocity": (6,), "delta": (7,), "cov": (6, 6), "world_from_camera": (7,)}
+        velocity, delta, cov, world = (
+            checked(arrays, f"reckoning/{name}", shape, "f").copy() for name, shape in shapes.items()
+        )
+        assumed, waiting, hidden, passed_over = checked(arrays, "reckoning/missed", (4,), "i").tolist()
+        stamp_ns = int(stamps[0]) if stamps.size else None
+        motion = Odometry(delta, cov)
+        return cls(stamp_ns, velocity, motion, world, assumed, waiting, bool(hidden), passed_over)

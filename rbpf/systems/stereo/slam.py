@@ -1,0 +1,466 @@
+"""Stereo SLAM (S05): visual odometry moves the particles, landmarks of a shared map weigh them.
+
+    slam = StereoSlam(rig, StereoConfig(particles=400))
+    for stamp_ns, left, right in source:
+        frame = slam.track(left, right, stamp_ns)     # pose, covariance, state of tracking, what was observed
+
+`StereoSlam.take` is the life of a pair, in order.
+"""
+
+import time
+from dataclasses import replace
+from typing import Any, ClassVar, NamedTuple, final
+
+import numpy as np
+
+from rbpf.core.checkpoint import checked, within
+from rbpf.core.filter import Filter, StepReport
+from rbpf.core.models import NULL, Part
+from rbpf.core.particles import Estimate
+from rbpf.errors import InputError
+from rbpf.lie import SE3
+from rbpf.maps.landmark_map import LandmarkMap
+from rbpf.motion.odometry import CAMERA_PLANE, Odometry, OdometryMotion
+from rbpf.motion.stereo_vo import CandidateMotions, VisualOdometry
+from rbpf.sensors.camera import RectifiedStereo
+from rbpf.sensors.feature_log import FeatureFrame, FeatureLog
+from rbpf.sensors.readers import ImageFrame
+from rbpf.systems.map_estimate import MapEstimate, estimate_map
+from rbpf.systems.stereo.config import StereoConfig
+from rbpf.systems.stereo.feature_cache import CachedPair
+from rbpf.systems.stereo.front_end import FrontEnd, ImageFrontEnd, NamedFrontEnd, Pair
+from rbpf.systems.stereo.motion_segmentation import camera_motion, contradicts, propagated
+from rbpf.systems.stereo.odometry import DeadReckoning
+from rbpf.systems.stereo.recovery import motion_for_update
+from rbpf.systems.stereo.tracks import tracked_features
+from rbpf.systems.system import (
+    DIAGNOSTICS,
+    ESS,
+    LOG_EVIDENCE,
+    NIS,
+    NIS_DOF,
+    RESAMPLED,
+    TIMINGS,
+    Column,
+    Ragged,
+    Recorded,
+    System,
+    Tracked,
+    TrackingState,
+)
+
+
+@final
+class StereoSlam(System):
+    """A rectified stereo camera; its first pair is the world.
+
+    What it keeps grows with the map alone, but for the particles' paths: a finite `config.lag` bounds these.
+
+    Args:
+        rig: the two cameras.
+        config: all settings.
+        front_end: measures frames, and finds landmarks in them. None chooses by the first frame: images (or what was
+            measured in them earlier), or pixels of landmarks that have names.
+    """
+
+    name: ClassVar[str] = "stereo"
+    frame_word: ClassVar[str] = "pair"
+    columns = (
+        Column("features", "features that both cameras see", kind=int, table=DIAGNOSTICS),
+        Column(
+            "agreeing", "matches that agree with the motion since the last pair", kind=int, table=DIAGNOSTICS
+        ),
+        Column(
+            "assumed",
+            "pairs since the place was known last over which the motion was only assumed; 0 where it is known",
+            kind=int,
+            table=DIAGNOSTICS,
+        ),
+        Column("updated", "whether the filter was updated", kind=bool, table=DIAGNOSTICS),
+        Column("observed", "landmarks that weighed the particles", kind=int, table=DIAGNOSTICS),
+        RESAMPLED,
+        NIS_DOF,
+        ESS,
+        LOG_EVIDENCE,
+        NIS,
+        Column("seconds_features", "time of measuring the pair", "s", table=TIMINGS, heading="features_ms"),
+        Column(
+            "seconds_odometry",
+            "time of matching with the last pair and estimating the motion",
+            "s",
+            table=TIMINGS,
+            heading="odometry_ms",
+        ),
+        Column("seconds_matching", "time of finding landmarks", "s", table=TIMINGS, heading="matching_ms"),
+        Column("seconds_filter", "time of the rest of the update", "s", table=TIMINGS, heading="filter_ms"),
+        Column("odometry", "world_from_camera by visual odometry alone", shape=(7,)),
+        Column("measured", "whether the next pair is matched with this one", kind=bool),
+    )
+    observed = (
+        Ragged("z", "pixels (u_left, v, u_right) of the features", (3,)),
+        Ragged("cov_z", "their covariance, px²", (3, 3)),
+        Ragged("kind", "what each is to the map, see `FeatureKind`", kind="int8"),
+        Ragged("landmarks", "landmark of each, −1 where there is none", kind="int64"),
+        Ragged(
+            "previous",
+            "row of the same point in the last measured pair, by odometry; −1 for none",
+            kind="int64",
+        ),
+    )
+    space = SE3
+
+    def __init__(
+        self, rig: RectifiedStereo, config: StereoConfig | None = None, front_end: FrontEnd[Any] | None = None
+    ) -> None:
+        self.rig, self.config = rig, config or StereoConfig()
+        config = self.config
+        # Each of the parts that may be exchanged is named once, here or in the front end.
+        self._front_ends: tuple[FrontEnd[Any], ...] = (
+            (ImageFrontEnd(rig, config), NamedFrontEnd(rig, config)) if front_end is None else (front_end,)
+        )
+        free = CAMERA_PLANE if config.dof == 3 else None
+        added = np.repeat([config.odometry.std_added_rad, config.odometry.std_added_m], 3)
+        self.visual_odometry = VisualOdometry(config.odometry.estimate, config.odometry.prior)
+        self._constrained = OdometryMotion(SE3, free=free).constrained
+        landmark_map = LandmarkMap(SE3, compiled=config.compiled)
+        self.front_end = self._front_ends[0]
+        landmark_map.register(self.front_end.landmarks.landmark)
+        self.filter = Filter(
+            OdometryMotion(SE3, added, free),
+            self.front_end.landmarks,
+            landmark_map,
+            config.proposal.build(),
+            config.resampling.build(),
+            config.particles,
+            np.random.default_rng(config.seed),
+            lag=config.lag,
+        )
+        self.frames = 0
+        """Pairs taken so far."""
+        self.reckoning = DeadReckoning()
+        """Where visual odometry has come."""
+        self.at_update = Estimate(SE3.identity(), np.zeros((6, 6)))
+        """The filter's estimate at its last update."""
+        self._last_update = 0
+        self._kept: Pair[Any] | None = None
+
+    def track(self, left: np.ndarray | None, right: np.ndarray | None, stamp_ns: int) -> Tracked:
+        """A pair of rectified images (H, W) uint8, taken at one time.
+
+        A pair that shows too little, of which an image is missing or that the cameras cannot have taken, or of the last
+        one's time, is passed over: its pose is predicted, and `messages` say why. The first pair decides: images of
+        another size are refused there.
+
+        Args:
+            left: image of the left camera; None where it is missing.
+            right: of the right one.
+            stamp_ns: time, integer nanoseconds.
+
+        Raises:
+            InputError: left and right are swapped, time runs backwards, no particle explains the pair, or the first
+                images are not the cameras'.
+        """
+        return self.take(ImageFrame(stamp_ns, left, right))
+
+    def take(self, frame: ImageFrame | CachedPair | FeatureFrame) -> Tracked:
+        """`track` with a frame of a recording, with features that were measured earlier, or with pixels that have names."""
+        started, messages = time.perf_counter(), list[str]()
+        front_end = self._front_end_of(frame)
+        landmarks, config = front_end.landmarks, self.config
+
+        # 1. Measure the pair: features that both cameras see.
+        pair, problem = front_end.measure(frame)
+        seconds_features = time.perf_counter() - started
+
+        # 2. How the camera has moved since the last pair that was measured; where this one tells too little, as before.
+        dt, least = self.reckoning.seconds(pair.stamp_ns), config.odometry.estimate.min_matches
+        if dt < 0.0:
+            raise InputError(
+                f"time runs backwards: a pair has the stamp {pair.stamp_ns} ns, the last one a later one"
+            )
+        measured = len(pair) >= least and dt > 0.0
+        if measured:
+            motion = self._motion_to(pair, dt)
+            messages += filter(None, (problem, motion.message))
+        else:
+            few = "it has the stamp of the last one"
+            if dt > 0.0:
+                few = f"it shows {len(pair)} features, {least} are needed"
+            why = f"{problem}; {few}" if problem and len(pair) else problem or few
+            messages.append(f"passed over: {why}; the last velocity is assumed, widely")
+            self.reckoning = self.reckoning.passing_over()
+            motion = _Motion(self._extrapolated(dt))
+        at = motion.at
+        seconds_odometry = time.perf_counter() - started - seconds_features
+
+        # 3. Update the filter if the camera has moved enough, and, where its motion was only assumed, if the map says where
+        # it has come: until then no particle moves.
+        report, seconds_filter = None, 0.0
+        due = self.filter.steps == 0 or config.trigger.reached(
+            at.since_update, self.frames - self._last_update
+        )
+        if measured:
+            self.reckoning = at
+        if measured and due:
+            uncertain = config.recovery.used and at.assumed > 0
+            control: Odometry | None = at.since_update
+            view = pair.view(motion.moving_rows, uncertain)
+            if uncertain:
+                control, message = motion_for_update(self.filter, landmarks, view, at, config)
+                messages += filter(None, (message,))
+            if control is not None:
+                begun = time.perf_counter()
+                proposal = config.recovery.proposal.build() if uncertain else None
+                report = self.filter.step(
+                    view, control if self.filter.steps else None, pair.stamp_ns, proposal
+                )
+                self.reckoning, self._last_update = at.updated(), self.frames
+                self.at_update = Estimate(report.estimate.mean, report.estimate.cov)
+                seconds_filter = time.perf_counter() - begun - landmarks.seconds
+        updated = report is not None
+
+        # 4. Remember the pair, with what stood still in it: the next one is matched with it.
+        if measured:
+            static = landmarks.confirmed_static() if updated else np.zeros(0, dtype=np.intp)
+            self._kept = pair.labelled(
+                propagated(len(pair), motion.rows, motion.labels, motion.inliers, motion.moving, static)
+            )
+        self.frames += 1
+
+        # 5. Report: between updates the odometry moves the estimate.
+        pose, cov = self.at_update.mean, self.at_update.cov
+        if not updated:
+            moved = Odometry(pose, cov).then(at.since_update)
+            pose, cov = moved.delta, moved.cov
+        assumed = 0 if updated and config.recovery.used else at.assumed
+        state = TrackingState.PREDICTED
+        if measured and not (updated and assumed):
+            state = TrackingState.LOST if assumed else TrackingState.TRACKED
+        ids, kinds = front_end.landmarks_of(pair, updated)
+        previous = np.full(len(pair), NULL, dtype=np.int64)
+        previous[motion.rows[1][motion.inliers]] = motion.rows[0][motion.inliers]
+        return Tracked(
+            pair.stamp_ns,
+            pose,
+            cov,
+            state,
+            {
+                "features": len(pair),
+                "agreeing": int(motion.inliers.sum()),
+                "assumed": assumed,
+                "updated": updated,
+                **_figures(report),
+                "seconds_features": seconds_features,
+                "seconds_odometry": seconds_odometry,
+                "seconds_matching": landmarks.seconds if updated else 0.0,
+                "seconds_filter": seconds_filter,
+                "odometry": at.world_from_camera,
+                "measured": measured,
+            },
+            {
+                "z": pair.features.z,
+                "cov_z": pair.features.cov,
+                "kind": kinds,
+                "landmarks": ids,
+                "previous": previous,
+            },
+            tuple(messages),
+        )
+
+    def map(self) -> MapEstimate:
+        """The landmarks, and the candidates; with what the front end knows of each, see `Landmarks.columns`."""
+        found = estimate_map(self.filter)
+        return replace(found, columns=self.front_end.landmarks.columns(found.ids))
+
+    def measurements(self, name: str, log: Recorded) -> FeatureLog:
+        """Every pixel that odometry or map used, once, as tracks; of pixels with names all of them."""
+        shown = [log.observed(t) for t in range(len(log))]
+        if self.front_end.names_landmarks:
+            parts = [(pair["landmarks"], pair["z"], pair["cov_z"]) for pair in shown]
+            stamped = zip(log.stamps_ns.tolist(), parts, strict=True)
+            frames = [FeatureFrame(stamp_ns, *part) for stamp_ns, part in stamped]
+        else:
+            frames = tracked_features(log.stamps_ns, log["measured"], shown)
+        return FeatureLog(name, self.rig, frames)
+
+    def summary(self, log: Recorded) -> dict[str, Any]:
+        """What the pairs showed, and the filter's figures over its updates."""
+        updated = log["updated"].astype(bool)
+        evidence = log["log_evidence"][updated]
+        milliseconds = (
+            1e3 * (log["seconds_matching"] + log["seconds_filter"])[updated] if updated.any() else 0.0
+        )
+        steps = np.diff(SE3.translation(log.poses), axis=0)
+        return {
+            "frames_measured": int((log["features"] >= self.config.odometry.estimate.min_matches).sum()),
+            "updates": int(updated.sum()),
+            "distance_m": float(np.linalg.norm(steps, axis=1).sum()),
+            "dof": self.config.dof,
+            "ms_per_update": {
+                "median": round(float(np.median(milliseconds)), 3),
+                "p95": round(float(np.percentile(milliseconds, 95)), 3),
+            },
+            **self.front_end.landmarks.counts(self.filter.belief().map.ids.size),
+            "features_per_frame": float(log["features"].mean()),
+            "observations_per_update": float(log["observed"][updated].mean()) if updated.any() else 0.0,
+            "ess_mean": float(log["ess"][updated].mean()) if updated.any() else 0.0,
+            "log_evidence": float(evidence.sum()) if np.isfinite(evidence).all() else None,
+        }
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The last measured pair, the landmarks' descriptors or names, and the odometry."""
+        kept = {} if self._kept is None else self.front_end.arrays(self._kept)
+        return {
+            **kept,
+            **self.front_end.landmarks.arrays(),
+            **self.reckoning.arrays(),
+            "stereo/frames": np.array([self.frames, self._last_update]),
+            "stereo/front_end": np.array(self._front_ends.index(self.front_end)),
+            "stereo/at_update": self.at_update.mean,
+            "stereo/cov_at_update": self.at_update.cov,
+        }
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """The inverse of `arrays`.
+
+        Raises:
+            InputError: an array is missing, or is not what it should be.
+        """
+        number = int(checked(arrays, "stereo/front_end", (), "i"))
+        if not 0 <= number < len(self._front_ends):
+            raise InputError("the checkpoint is of another kind of frames")
+        self._choose(self._front_ends[number])
+        self.frames, self._last_update = within(
+            arrays, "stereo/frames", 2, 0, np.iinfo(np.int64).max
+        ).tolist()
+        self.at_update = Estimate(
+            checked(arrays, "stereo/at_update", (7,), "f").copy(),
+            checked(arrays, "stereo/cov_at_update", (6, 6), "f").copy(),
+        )
+        self.reckoning = DeadReckoning.restored(arrays)
+        self.front_end.landmarks.restore(arrays)
+        self._kept = self.front_end.pair_of(arrays) if "pair/z" in arrays else None
+
+    def _front_end_of(self, frame: Any) -> FrontEnd[Any]:
+        """That which takes frames of this kind; the first frame chooses it, and is refused if it is not the cameras'."""
+        if not self.frames:
+            for front_end in self._front_ends:
+                if front_end.takes(frame):
+                    self._choose(front_end)
+        if not self.front_end.takes(frame):
+            kinds = " or ".join(kind.__name__ for kind in self.front_end.frames)
+            raise InputError(f"stereo SLAM is given a {type(frame).__name__}, and takes {kinds} here")
+        refusal = "" if self.frames else self.front_end.refusal(frame)
+        if refusal:
+            raise InputError(refusal)
+        return self.front_end
+
+    def _choose(self, front_end: FrontEnd[Any]) -> None:
+        self.front_end = front_end
+        self.filter.sensors = [front_end.landmarks]
+
+    def _motion_to(self, pair: Pair[Any], dt: float) -> "_Motion":
+        """The motion from the last measured pair to this one, `dt` seconds later."""
+        before, kept, stamp_ns = self.reckoning, self._kept, pair.stamp_ns
+        if kept is None:
+            return _Motion(before.started(stamp_ns))
+        rows = self.front_end.match(kept, pair)
+        matches, labels = self.front_end.matches(kept, pair, rows), kept.labels[rows[0]]
+        rng = np.random.default_rng([self.config.seed, self.frames])
+        found = self.visual_odometry.candidates(matches, before.velocity, dt, rng)
+
+        # Which of the motions that matches agree on is the camera's: one is, if the rest of what is known agrees with it.
+        chosen, failure = (0 if found.motions else -1), found.failure
+        doubted = len(found.motions) > 1 or (
+            found.motions and contradicts(found.motions[0].inliers, labels, before.hidden)
+        )
+        moving = np.zeros(len(matches), dtype=bool)
+        if doubted:
+            support, informed = self._log_support(pair, found), bool(before.velocity.any())
+            chosen = camera_motion(found, labels, before.hidden, support, informed)
+            for number, other in enumerate(found.motions):
+                moving |= other.inliers & (number != chosen)
+            many = " and ".join(str(motion.inliers.sum()) for motion in found.motions)
+            failure = f"{many} of {len(matches)} matches agree on a motion, but not the map and what stood still before"
+
+        # Where none is, what was expected is assumed.
+        if chosen < 0:
+            what = "the last velocity" if before.velocity.any() else "a camera at rest"
+            step = self._constrained(found.prior)
+            at = before.moved(stamp_ns, step, before.velocity, is_assumed=True, hidden=bool(moving.any()))
+            nobody = np.zeros(len(matches), dtype=bool)
+            return _Motion(at, rows, labels, nobody, moving, f"{failure}; {what} is assumed, widely")
+        motion, notes = found.motions[chosen], list[str]()
+        if motion.note:
+            notes.append(motion.note)
+        if moving.any():
+            count = motion.inliers.sum()
+            notes.append(
+                f"{count} of {len(matches)} matches agree on a motion and {moving.sum()} on another: something in the "
+                f"view moves, and the camera's motion is taken to be that of the {count}"
+            )
+        velocity = before.velocity
+        if self.config.odometry.prior.keep_velocity:
+            velocity = SE3.log(motion.odometry.delta) / dt
+        at = before.moved(stamp_ns, self._constrained(motion.odometry), velocity)
+        return _Motion(at, rows, labels, motion.inliers, moving, "; ".join(notes))
+
+    def _log_support(self, pair: Pair[Any], found: CandidateMotions) -> np.ndarray:
+        """What the map says (M + 1,) of each candidate, and of the prior alone."""
+        steps = [*(motion.odometry for motion in found.motions), found.prior]
+        if not self.filter.steps:
+            return np.zeros(len(steps))
+        view, before = pair.view(uncertain=self.reckoning.assumed > 0), self.reckoning.since_update
+        controls = [before.then(self._constrained(step)) for step in steps]
+        beliefs = (self.filter.expect(control, pair.stamp_ns) for control in controls)
+        return np.array([self.front_end.landmarks.log_support(view, belief) for belief in beliefs])
+
+    def _extrapolated(self, dt: float) -> DeadReckoning:
+        """Where the camera is expected at a pair that was passed over."""
+        if self.reckoning.stamp_ns is None:
+            return self.reckoning
+        expected = self.visual_odometry.prior.increment(self.reckoning.velocity, dt)
+        return self.reckoning.extrapolated(self._constrained(expected))
+
+
+_NO_ROWS, _NO_MATCHES = np.zeros(0, dtype=np.intp), np.zeros(0, dtype=bool)
+
+
+class _Motion(NamedTuple):
+    """The motion up to a pair, and what its M matches with the last measured pair say of it.
+
+    Attributes:
+        at: where the camera has come.
+        rows: (M,) of the last measured pair and (M,) of this one that are the same point.
+        labels: (M,) which stood still in the last measured pair.
+        inliers: (M,) which agree with the camera's motion.
+        moving: (M,) which agree on another one: they are of things that move.
+        message: in words, what had to be assumed; empty where nothing had.
+    """
+
+    at: DeadReckoning
+    rows: tuple[np.ndarray, np.ndarray] = (_NO_ROWS, _NO_ROWS)
+    labels: np.ndarray = np.zeros(0, dtype=np.int8)
+    inliers: np.ndarray = _NO_MATCHES
+    moving: np.ndarray = _NO_MATCHES
+    message: str = ""
+
+    @property
+    def moving_rows(self) -> np.ndarray:
+        """Rows of features of this pair that are of things that move."""
+        return self.rows[1][self.moving]
+
+
+def _figures(report: StepReport | None) -> dict[str, Any]:
+    """Values of an update; zeros without one."""
+    if report is None:
+        return {"observed": 0, "resampled": False, "nis_dof": 0, "ess": 0.0, "log_evidence": 0.0, "nis": 0.0}
+    weighed = (group.ids for group in report.groups if Part.STATE in group.updates)
+    return {
+        "observed": sum(int((ids >= 0).sum()) for ids in weighed if ids is not None),
+        "resampled": report.resampled,
+        "nis_dof": report.rows,
+        "ess": report.ess,
+        "log_evidence": report.log_evidence,
+        "nis": report.nis,
+    }

@@ -1,0 +1,127 @@
+"""Odometry as a motion model, of wheels and of a camera: composition, injected noise, fewer degrees of freedom."""
+
+import numpy as np
+import pytest
+
+from rbpf.conformance import Example, check_model
+from rbpf.core.filter import Filter
+from rbpf.errors import InputError
+from rbpf.lie import SE2, SE3, Euclidean
+from rbpf.motion.odometry import CAMERA_PLANE, Odometry, OdometryMotion
+from tests.core.scripted import Scripted
+
+N = 4
+ADDED = np.array([0.01, 0.02, 0.03, 0.1, 0.2, 0.3])
+HALF = np.random.default_rng(0).normal(scale=0.02, size=(6, 6))
+MEASURED = Odometry(SE3.exp(np.array([0.02, 0.3, -0.01, 0.1, 0.02, 0.5])), HALF @ HALF.T)
+PLANAR, OTHER = [1, 3, 5], [0, 2, 4]
+
+
+@pytest.mark.parametrize("space", [SE2, SE3, Euclidean(2)], ids=repr)
+def test_moves_every_particle_by_the_increment(space):
+    rng = np.random.default_rng(0)
+    state = space.exp(rng.normal(size=(N, space.dim)))
+    delta = space.exp(rng.normal(size=space.dim))
+    factor = rng.normal(size=(space.dim, space.dim))
+    transition = OdometryMotion(space).transition(state, Odometry(delta, factor @ factor.T), 0.1)
+    np.testing.assert_allclose(space.between(state, transition.mean), np.tile(delta, (N, 1)), atol=1e-12)
+    assert transition.noise_factor.shape == (1, space.dim, space.dim)
+    found = transition.noise_factor[0] @ transition.noise_factor[0].T
+    np.testing.assert_allclose(found, factor @ factor.T, atol=1e-12)
+    assert transition.coupling is None
+
+
+def test_without_a_control_the_robot_stands_still():
+    state = SE3.exp(np.random.default_rng(2).normal(size=(N, 6)))
+    transition = OdometryMotion(SE3, 0.1).transition(state, None, 0.1)
+    np.testing.assert_array_equal(transition.mean, state)
+    np.testing.assert_array_equal(transition.noise_factor, np.zeros((1, 6, 6)))
+
+
+@pytest.mark.parametrize("rank", [0, 1, 2])
+def test_singular_covariances(rank):
+    """As of a planar robot in space: particles spread in the range of the covariance only."""
+    rng = np.random.default_rng(rank)
+    basis = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    values = np.array([0.04, 0.01, 0.0]) * (np.arange(3) < rank)
+    cov = (basis * values) @ basis.T
+    cov = 0.5 * (cov + cov.T)
+    filter_ = Filter(OdometryMotion(SE2), Scripted(), n=3000, rng=rng)
+    delta = np.array([0.1, 1.0, 0.2])
+    report = filter_.step([], Odometry(delta, cov))
+    increment = SE2.local(np.tile(delta, (3000, 1)), filter_.particles.state)
+    np.testing.assert_allclose(increment @ basis[:, rank:], 0.0, atol=1e-7)
+    assert np.abs(increment.T @ increment / 3000 - cov).max() < 0.04 * 0.15
+    np.testing.assert_allclose(report.estimate.mean, delta, atol=1e-9)
+    np.testing.assert_allclose(report.estimate.cov, cov, atol=1e-9)
+
+
+def test_injected_noise_is_added_and_nothing_else_changes():
+    plain = OdometryMotion(SE3).constrained(MEASURED)
+    np.testing.assert_array_equal(plain.delta, MEASURED.delta)
+    np.testing.assert_array_equal(plain.cov, MEASURED.cov)
+    for std in (ADDED, 0.1):
+        found = OdometryMotion(SE3, std).constrained(MEASURED)
+        np.testing.assert_allclose(found.cov, MEASURED.cov + np.diag(np.broadcast_to(std, 6) ** 2))
+
+
+def test_three_degrees_of_freedom_drop_the_others():
+    found = OdometryMotion(SE3, 0.1, CAMERA_PLANE).constrained(MEASURED)
+    xi = SE3.log(found.delta)
+    np.testing.assert_allclose(xi[PLANAR], SE3.log(MEASURED.delta)[PLANAR], atol=1e-12)
+    np.testing.assert_allclose(xi[OTHER], 0.0, atol=1e-15)
+    expected = (MEASURED.cov + 0.01 * np.eye(6))[np.ix_(PLANAR, PLANAR)]
+    np.testing.assert_allclose(found.cov[np.ix_(PLANAR, PLANAR)], expected)
+    np.testing.assert_array_equal(found.cov[OTHER], 0.0)
+
+
+@pytest.mark.parametrize("free", [None, CAMERA_PLANE])
+def test_particles_spread_as_the_covariance_says(free):
+    model = OdometryMotion(SE3, free=free)
+    filter_ = Filter(model, Scripted(), n=4000, rng=np.random.default_rng(1))
+    expected = model.constrained(MEASURED)
+    filter_.step([], MEASURED)
+    spread = SE3.local(expected.delta, filter_.particles.state)
+    np.testing.assert_allclose(spread.T @ spread / 4000, expected.cov, atol=0.1 * np.abs(expected.cov).max())
+    if free is not None:
+        for _ in range(20):
+            filter_.step([], MEASURED)
+        state = filter_.particles.state
+        np.testing.assert_allclose(state[:, 5], 0.0, atol=1e-9)
+        np.testing.assert_allclose(state[:, [0, 2]], 0.0, atol=1e-9)
+        assert state[:, [4, 6]].std(axis=0).min() > 0.01
+
+
+@pytest.mark.parametrize("free", [None, CAMERA_PLANE])
+def test_it_is_a_sound_model(free):
+    state = SE3.exp(np.random.default_rng(3).normal(size=(5, 6)))
+    assert check_model(OdometryMotion(SE3, 0.01, free), example=Example(state, control=MEASURED)) == []
+
+
+def test_chained_covariance_against_samples():
+    rng = np.random.default_rng(0)
+    covs = [1e-6 * root @ root.T for root in np.random.default_rng(1).normal(size=(2, 6, 6))]
+    first, second = (Odometry(SE3.exp(rng.normal(size=6)), cov) for cov in covs)
+    both = first.then(second)
+    errors = [rng.multivariate_normal(np.zeros(6), motion.cov, 40_000) for motion in (first, second)]
+    moved = SE3.compose(SE3.retract(first.delta, errors[0]), SE3.retract(second.delta, errors[1]))
+    np.testing.assert_allclose(both.delta, SE3.compose(first.delta, second.delta))
+    size = np.sqrt(np.diagonal(both.cov))
+    sampled = np.cov(SE3.local(both.delta, moved).T)
+    np.testing.assert_allclose(sampled / np.outer(size, size), both.cov / np.outer(size, size), atol=0.03)
+    rest = first.then(Odometry.at_rest())
+    np.testing.assert_allclose(rest.delta, first.delta, atol=1e-15)
+    np.testing.assert_allclose(rest.cov, first.cov, atol=1e-15)
+
+
+@pytest.mark.parametrize("std", [-1.0, np.ones(3), np.nan])
+def test_wrong_noise_is_refused(std):
+    with pytest.raises(InputError, match="std_added must be one or 6 numbers from 0 up"):
+        OdometryMotion(SE3, std)
+
+
+def test_a_failed_estimate_is_refused_as_a_control():
+    with pytest.raises(InputError, match="covariance of the odometry is not one"):
+        OdometryMotion(SE3).transition(
+            SE3.identity((2,)), Odometry(SE3.identity(), np.full((6, 6), np.nan)), 0.1
+        )

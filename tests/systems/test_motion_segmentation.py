@@ -1,0 +1,154 @@
+"""Of several motions the camera's, and what stood still: each thing that is known has its say, and no more."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+
+from rbpf.lie import SE3
+from rbpf.motion.odometry import Odometry
+from rbpf.motion.stereo_vo import CandidateMotion, CandidateMotions, VisualOdometry
+from rbpf.systems.stereo.motion_segmentation import (
+    CHANGES,
+    MISTAKEN,
+    MOVING,
+    STATIC,
+    UNKNOWN,
+    camera_motion,
+    contradicts,
+    propagated,
+)
+from tests.motion.stereo_pairs import LEAP, ROOM, joined, simulate
+
+PRIOR = Odometry(SE3.identity(), np.diag(np.repeat(0.1**2, 6)))
+STILL, AWAY = (
+    Odometry(SE3.exp(np.array([0.0, 0.0, 0.0, x, 0.0, 0.0])), 1e-6 * np.eye(6)) for x in (0.0, 0.3)
+)
+
+
+def candidates(*counts: int, left: int = 5) -> CandidateMotions:
+    """Disjoint groups of so many matches that stand still and move away, and some matches that are in none."""
+    motions, first = [], 0
+    for count, odometry in zip(counts, (STILL, AWAY), strict=True):
+        rows = np.arange(sum(counts) + left)
+        motions.append(CandidateMotion(odometry, (rows >= first) & (rows < first + count), ""))
+        first += count
+    return CandidateMotions(PRIOR, tuple(motions), "")
+
+
+def chosen(found: CandidateMotions, support=(0.0, 0.0, 0.0), informed: bool = False) -> int:
+    labels = np.full(found.motions[0].inliers.size, UNKNOWN)
+    return camera_motion(found, labels, False, np.array(support), informed)
+
+
+def test_the_many_where_nothing_is_known():
+    assert chosen(candidates(20, 30)) == 1
+    assert chosen(candidates(30, 20)) == 0
+
+
+def test_a_velocity_that_was_measured():
+    """Three standard deviations are exp(4.5) = 90 to one; a group of twice as many does not make up for it."""
+    assert chosen(candidates(20, 40), informed=True) == 0
+    assert chosen(candidates(20, 40), informed=False) == 1
+    assert chosen(candidates(2, 400), informed=True) == 1
+
+
+def test_the_map_decides():
+    assert chosen(candidates(10, 200), (40.0, 0.0, 0.0)) == 0
+
+
+def test_none_of_them_is_believed_of_the_map_alone():
+    """Landmarks that no motion explains, and a wide prior does: as likely as one match more, whatever was expected."""
+    assert chosen(candidates(10, 200), (0.0, 0.0, np.log(201) + 0.1)) == -1
+    assert chosen(candidates(10, 200), (0.0, 0.0, np.log(201) - 0.1)) == 1
+    assert chosen(candidates(10, 2), informed=True) >= 0
+
+
+@pytest.mark.parametrize("marks", list(product([MOVING, UNKNOWN, STATIC], repeat=3)))
+def test_the_past_against_enumeration(marks):
+    """P(labels | stands still) / P(labels | moves), summed over whether the thing has changed since the pair before.
+
+    As the support of the map that makes it as likely as none at all, which has no past.
+    """
+    labels = np.array(marks)
+
+    def likelihood(is_static: bool) -> float:
+        right = [1.0 - MISTAKEN if (mark == STATIC) == is_static else MISTAKEN for mark in marks if mark]
+        return float(np.prod(right))
+
+    still, moved = likelihood(True), likelihood(False)
+    ratio = ((1 - CHANGES) * still + CHANGES * moved) / ((1 - CHANGES) * moved + CHANGES * still)
+    even = -np.log(ratio) - np.log1p((labels == UNKNOWN).sum())
+    found = CandidateMotions(PRIOR, (CandidateMotion(STILL, np.ones(3, dtype=bool), ""),), "")
+    for more, expected in ((1e-9, 0), (-1e-9, -1)):
+        assert camera_motion(found, labels, False, np.array([even + more, 0.0]), False) == expected
+
+
+def test_the_past_is_no_proof():
+    """A thing of 1,000 features that has stopped: bounded by how often things stop."""
+    found = CandidateMotions(PRIOR, (CandidateMotion(STILL, np.ones(1000, dtype=bool), ""),), "")
+    even = np.log((1 - CHANGES) / CHANGES)
+    for more, expected in ((1e-6, 0), (-1e-6, -1)):
+        support = np.array([even + more, 0.0])
+        assert camera_motion(found, np.full(1000, MOVING), False, support, False) == expected
+
+
+def test_when_a_single_motion_is_doubted():
+    agree = np.array([1, 1, 1, 1, 0, 0, 0], dtype=bool)
+    assert not contradicts(agree[:0], np.zeros(0), False)
+    assert not contradicts(agree, np.array([1, 1, 1, 0, 1, 0, 0]), False)
+    assert contradicts(agree, np.array([1, 0, 0, 0, 1, 1, 0]), False)
+    assert contradicts(agree, np.array([-1, -1, 0, 0, 0, 0, 0]), False)
+    assert contradicts(agree, np.zeros(7), hidden=True)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_few_that_stood_still_before(seed):
+    """A room of 20 matches and a thing of 60 that has leapt."""
+    rng = np.random.default_rng(seed)
+    room, thing = simulate(ROOM, 20, rng), simulate(LEAP, 60, rng)
+    both = joined(room.matches, thing.matches)
+    found = VisualOdometry().candidates(both, np.zeros(6), 0.1, np.random.default_rng(1))
+    labels = np.concatenate([np.full(20, STATIC), np.full(60, MOVING)])
+    for known, pair in ((np.zeros(80), thing), (labels, room)):
+        motion = found.motions[camera_motion(found, known, False, np.zeros(3), False)]
+        assert np.linalg.norm(SE3.local(motion.odometry.delta, pair.delta)) < 0.02
+
+
+def test_what_moved_before_is_not_believed_alone():
+    """A thing alone is in view that moved before; nothing says that it has stopped."""
+    matches = simulate(LEAP, 12, np.random.default_rng(0)).matches
+    found = VisualOdometry().candidates(matches, np.zeros(6), 0.1, np.random.default_rng(1))
+    labels = np.full(12, MOVING)
+    assert found.motions[0].inliers.sum() >= 10
+    assert contradicts(found.motions[0].inliers, labels, False)
+    assert camera_motion(found, labels, False, np.zeros(2), False) == -1
+
+
+def rows(*numbers: int) -> np.ndarray:
+    return np.array(numbers, dtype=np.intp)
+
+
+def mask(*numbers: int, of: int) -> np.ndarray:
+    return np.isin(np.arange(of), numbers)
+
+
+class TestLabels:
+    """A pair of five features, of which two stood still, one moved, and two are new."""
+
+    BEFORE = propagated(
+        5, (rows(0, 1, 2), rows(4, 0, 2)), np.zeros(3), mask(0, 1, of=3), mask(2, of=3), rows()
+    )
+
+    def test_they_follow_the_matches(self):
+        np.testing.assert_array_equal(self.BEFORE, [STATIC, UNKNOWN, MOVING, UNKNOWN, STATIC])
+
+    def test_where_no_motion_is_found_all_stay_what_they_were(self):
+        first, second = rows(0, 2, 3, 4), rows(3, 2, 1, 0)
+        now = propagated(4, (first, second), self.BEFORE[first], mask(of=4), mask(3, of=4), rows())
+        np.testing.assert_array_equal(now, [MOVING, UNKNOWN, MOVING, STATIC])
+
+    def test_what_the_map_has_stands_still(self):
+        first, second = rows(1, 2), rows(0, 1)
+        now = propagated(3, (first, second), self.BEFORE[first], mask(of=2), mask(0, 1, of=2), rows(1))
+        np.testing.assert_array_equal(now, [MOVING, STATIC, UNKNOWN])

@@ -1,0 +1,118 @@
+"""Which landmark a feature is: what is expected where, and whether matches that are expected vaguely agree."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rbpf.lie import SE3
+from rbpf.motion.odometry import Odometry
+from rbpf.sensors.stereo.features import StereoFeatures
+from rbpf.systems.filtering import ProposalConfig
+from rbpf.systems.stereo.config import MapConfig, StereoConfig, TriggerConfig
+from rbpf.systems.stereo.landmarks import ParticleSubsample, Places, View, log_support
+from rbpf.systems.stereo.slam import StereoSlam
+from tests.systems.stereo_sequences import pairs
+
+pytestmark = pytest.mark.usefixtures("keypoints_once")
+COUNT = 10
+CONFIG = StereoConfig(
+    particles=60,
+    trigger=TriggerConfig(0.0, 0.0),
+    likelihood=replace(StereoConfig().likelihood, kind="outliers"),
+    proposal=ProposalConfig("ekf", iterations=3),
+)
+WIDE = Odometry(SE3.identity(), np.diag(np.repeat([0.1**2, 0.2**2], 3)))
+FEW = CONFIG.map.min_agreeing - 1
+
+
+@pytest.fixture
+def slam(keypoints_once: None) -> StereoSlam:
+    """After the last pair."""
+    sequence = pairs(COUNT)
+    slam = StereoSlam(sequence.rig, CONFIG)
+    for frame in sequence.frames():
+        slam.take(frame)
+    return slam
+
+
+def view(features: StereoFeatures) -> View[StereoFeatures]:
+    return View(COUNT * 10**9, features, np.ones(len(features), dtype=bool))
+
+
+def few(slam: StereoSlam) -> StereoFeatures:
+    """Of the last pair, one fewer than must agree, all of landmarks."""
+    known = np.flatnonzero(slam.front_end.landmarks.ids >= 0)
+    return slam._kept.features.take(known[:FEW])
+
+
+def test_false_matches_do_not_agree(slam):
+    """Half of the places are wrong: those that are taken are right, and the camera is found."""
+    features, landmarks, rng = slam._kept.features, slam.front_end.landmarks, np.random.default_rng(0)
+    before, known = slam.at_update.mean, landmarks.manager.next_name
+    z, rows = features.z.copy(), rng.permutation(len(features))[: len(features) // 2]
+    z[rows] = z[np.roll(rows, 1)]
+    rest = features.cov, features.scale, features.orientation, features.descriptors
+    right = np.abs(z - features.z).max(axis=1) == 0.0
+    slam.filter.step(view(StereoFeatures.measured(slam.rig, z, *rest)), WIDE)
+    taken = (landmarks.ids >= 0) & (landmarks.ids < known)
+    assert taken.sum() > FEW
+    assert right[taken].mean() > 0.9
+    off = SE3.local(before, slam.filter.estimate().mean)
+    assert np.linalg.norm(off[:3]) < 0.01 and np.linalg.norm(off[3:]) < 0.02
+
+
+def test_too_few_are_not_taken_where_they_are_expected_vaguely(slam):
+    report = slam.filter.step(view(few(slam)), WIDE)
+    assert report.groups == []
+    spread = np.sqrt(np.diagonal(slam.filter.estimate().cov)[3:])
+    assert spread.min() > 0.1
+
+
+def test_else_few_are_enough(slam):
+    """The gate tells true from false."""
+    report = slam.filter.step(view(few(slam)), Odometry(SE3.identity(), 1e-6 * np.eye(6)))
+    assert sum((group.ids >= 0).sum() for group in report.groups) >= 3
+
+
+def test_the_subsample_speaks_for_all(slam):
+    """Its expectations against those of the belief, of all particles."""
+    belief, model = slam.filter.belief(), slam.front_end.landmarks.model
+    ids = belief.map.ids[:12]
+    subsample = ParticleSubsample.of(belief, 60)
+    found = subsample.expected(belief, model, ids)
+    mean, cov = belief.project(model, ids)
+    np.testing.assert_allclose(found.mean, mean, atol=0.05)
+    ratio = np.diagonal(found.cov, axis1=1, axis2=2) / np.diagonal(cov, axis1=1, axis2=2)
+    assert ratio.min() > 0.5 and ratio.max() < 2.0
+    assert subsample.rows[-1] == belief.mode and subsample.rows.size == 61
+
+
+def test_how_well_landmarks_are_seen():
+    """Beside the formula for one of them; a far one says nothing, and never speaks against."""
+    rig = pairs(2).rig
+    z = np.array([[10.0, 20.0, 5.0], [100.0, 90.0, 65.0], [50.0, 60.0, 44.0], [300.0, 200.0, 290.0]])
+    density = 4.0 / (320.0 * 240.0 * 30.0)
+    nu, cov = np.array([[1.0, 0.0, 0.0], [90.0, 0.0, 0.0]]), np.tile(4.0 * np.eye(3), (2, 1, 1))
+    log_normal = -0.5 * (0.25 + 3.0 * np.log(2.0 * np.pi * 4.0))
+    assert log_support(nu, cov, z, rig) == pytest.approx(log_normal - np.log(density))
+
+
+def test_what_may_be_in_view():
+    """In the image or beside it, as far as the camera's direction is uncertain; not from behind, nor from far closer."""
+    places = Places(pairs(2).rig, MapConfig())
+    ahead, beside, behind = [0.0, 0.0, 2.0], [1.6, 0.0, 2.0], [0.0, 0.0, -2.0]
+    places.put(np.array([0, 1]), np.array([ahead, beside]), SE3.identity())
+    places.put(np.array([4]), np.array([behind]), SE3.identity())
+    np.testing.assert_array_equal(places.in_view(SE3.identity()), [0])
+    np.testing.assert_array_equal(places.in_view(SE3.identity(), 0.2), [0, 1])
+    turned = SE3.exp(np.array([0.0, np.pi, 0.0, 0.0, 0.0, 0.0]))
+    np.testing.assert_array_equal(places.in_view(turned), [4])
+    for x, z, found in ((0.0, 1.1, []), (0.0, 0.9, [0]), (2.5, 0.0, [])):
+        at = SE3.compose(SE3.exp(np.array([0, 0, 0, x, 0, z])), SE3.exp(np.array([0, -x / 2.5, 0, 0, 0, 0])))
+        np.testing.assert_array_equal(np.intersect1d(places.in_view(at), [0]), found)
+    places.remove(np.array([1]))
+    np.testing.assert_array_equal(places.in_view(SE3.identity(), 0.2), [0])
+    with_new = np.array([4, 7])
+    places.put(with_new, np.array([ahead, ahead]), SE3.identity())
+    np.testing.assert_array_equal(places.in_view(SE3.identity()), [0, 4, 7])

@@ -1,0 +1,180 @@
+"""A camera whose motion was not seen is found again in its map; a thing that moves does not take it along."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from examples.studies.image_faults import blur_motion, cover_view, salt_and_pepper
+from rbpf.lie import SE3
+from rbpf.motion.odometry import Odometry
+from rbpf.motion.stereo_vo import VoConfig
+from rbpf.runs.run import Run
+from rbpf.sensors.stereo.features import StereoFeatures
+from rbpf.systems.stereo.config import RecoveryConfig, StereoConfig, TriggerConfig
+from rbpf.systems.stereo.landmarks import View
+from rbpf.systems.stereo.recovery import motion_for_update, relocalise_globally
+from rbpf.systems.stereo.slam import StereoSlam
+from rbpf.systems.system import Tracked, TrackingState
+from tests.systems.plane_sequences import texture
+from tests.systems.stereo_sequences import Pairs, errors_m, filtered, pairs
+
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("keypoints_once")]
+CONFIG = StereoConfig(particles=60)
+FIRST, BLURRED, COUNT = 10, 5, 20
+SHARP = FIRST + BLURRED
+RIGHT_M = 0.01
+
+
+def off_m(run: Run, count: int = COUNT) -> np.ndarray:
+    return errors_m(run.log.poses, pairs(count))
+
+
+def blurred(config: StereoConfig = CONFIG, **options) -> Run:
+    """Five pairs of which the odometry makes nothing: the camera is assumed 10 to 20 cm from where it is."""
+    return filtered(blur_motion(25, FIRST, BLURRED)(pairs(COUNT)), config, **options)
+
+
+@pytest.fixture(scope="module")
+def found(keypoints_once: None) -> Run:
+    return blurred()
+
+
+@pytest.fixture(scope="module")
+def settled(keypoints_once: None) -> StereoSlam:
+    """After the last of these pairs, which shows what the map has."""
+    return filtered(pairs(12), replace(CONFIG, trigger=TriggerConfig(0.0, 0.0))).system
+
+
+def test_found_again(found):
+    """It errs by more than a decimetre and says how much it may err; the first sharp pair mends it."""
+    log, error = found.log, off_m(found)
+    assert error[SHARP - 1] > 0.1
+    assert error[SHARP:].max() < RIGHT_M
+    assert not log["updated"][FIRST:SHARP].any() and log["updated"][SHARP]
+    std = np.sqrt(np.trace(log.covs[:, 3:, 3:], axis1=1, axis2=2))
+    assert std[SHARP - 1] > 0.5 * error[SHARP - 1] and std[SHARP] < RIGHT_M
+    assert (log["assumed"][FIRST:SHARP] > 0).all() and (log["assumed"][SHARP:] == 0).all()
+    assert TrackingState.TRACKED not in log.states[FIRST:SHARP]
+    assert TrackingState.LOST in log.states[FIRST:SHARP] and log.states[SHARP] is TrackingState.TRACKED
+    (said,) = [message for message in found.messages if "found again by" in message]
+    assert said.startswith(f"pair {SHARP}: the camera is found again by ")
+    assert said.endswith("pairs whose motion was only assumed")
+
+
+def test_without_recovery_it_stays_lost(found):
+    """The particles of the assumed motion alone do not come to where they should be."""
+    run = blurred(replace(CONFIG, recovery=RecoveryConfig(used=False)))
+    assert off_m(run)[-1] > 5.0 * off_m(found)[-1]
+    assert off_m(run)[-1] > 0.05
+
+
+def test_resumed_while_lost(found, tmp_path):
+    """Stopped while it is lost and taken up again: the same bytes."""
+    place = tmp_path / "checkpoint.npz"
+
+    def stop(run: Run, tracked: Tracked) -> None:
+        if len(run.log) == FIRST + 3:
+            assert tracked.values["assumed"] > 0
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        blurred(listeners=[stop], checkpoint=place)
+    run = blurred(checkpoint=place, resume=True)
+    for name in ("assumed", "updated", "observed"):
+        np.testing.assert_array_equal(run.log[name], found.log[name])
+    np.testing.assert_array_equal(run.log.poses, found.log.poses)
+    np.testing.assert_array_equal(run.log.covs, found.log.covs)
+    assert run.messages == found.messages
+
+
+def test_a_map_that_cannot_tell_yet_is_not_waited_for():
+    """The second pair is blurred, when the map has nothing that was found again; and a run without a map."""
+    run = filtered(blur_motion(25, 1, 1)(pairs(10)), CONFIG)
+    assert any("assumed" in message for message in run.messages) and run.log["updated"][2:].any()
+    alone = filtered(blur_motion(25, 4, 2)(pairs(10)), replace(CONFIG, map=replace(CONFIG.map, used=False)))
+    assert not any("not found again in the map" in message for message in alone.messages)
+
+
+def test_where_nothing_was_mapped_the_map_goes_on():
+    """After the pairs of its patience; until then no particle moves."""
+    poses = np.tile(SE3.identity(), (12, 1))
+    poses[:, 4] = 0.03 * np.arange(12)
+    poses[6:, 4] += 2.2
+    poses[6:, 5] -= 0.9
+    run = filtered(pairs(12, poses=poses), replace(CONFIG, recovery=RecoveryConfig(patience=3)))
+    np.testing.assert_array_equal(run.log["updated"][6:9], [0, 0, 1])
+    assert run.log.states[6:8] == [TrackingState.LOST] * 2
+    assert any(
+        message.startswith("pair 8: the camera is not found again in the map") for message in run.messages
+    )
+    known = run.system.front_end.landmarks.manager
+    assert known.names[known.last_observed == known.frame].size > 10
+    assert (run.log["assumed"][6:8] > 0).all() and (run.log["assumed"][8:] == 0).all()
+
+
+def view(slam: StereoSlam, seed: int = 0, mistaken: bool = False) -> View[StereoFeatures]:
+    """The last pair of `settled`, of this wall or another; half of the places are exchanged."""
+    source = Pairs(texture(seed), pairs(12).truth.world_from_camera, lambda t, frame: frame)
+    pair, _ = slam.front_end.measure(next(iter(source.frames(11))))
+    features, rng = pair.features, np.random.default_rng(0)
+    z, rows = features.z.copy(), rng.permutation(len(features))[: len(features) // 2]
+    if mistaken:
+        z[rows] = z[np.roll(rows, 1)]
+    rest = features.cov, features.scale, features.orientation, features.descriptors
+    return replace(
+        pair.view(uncertain=True),
+        stamp_ns=slam.filter.stamp_ns,
+        features=StereoFeatures.measured(slam.rig, z, *rest),
+    )
+
+
+def located(slam: StereoSlam, shown: View[StereoFeatures]):
+    rng, landmarks = np.random.default_rng(0), slam.front_end.landmarks
+    return relocalise_globally(landmarks, shown, slam.filter.belief(), VoConfig(), rng)
+
+
+@pytest.mark.parametrize(("mistaken", "least"), [(False, 20), (True, 8)])
+def test_anywhere_in_the_map(settled, mistaken, least):
+    """Whatever was expected, and though half of the places are exchanged."""
+    place = located(settled, view(settled, mistaken=mistaken))
+    assert place is not None and place[1] >= least
+    off = SE3.local(settled.at_update.mean, place[0])
+    assert np.linalg.norm(off[:3]) < 0.01 and np.linalg.norm(off[3:]) < RIGHT_M
+
+
+def test_another_wall_is_nowhere_in_the_map(settled):
+    assert located(settled, view(settled, seed=1)) is None
+
+
+def test_far_from_where_it_was_assumed(settled):
+    """The odometry was deceived by half a metre: the map says so, and the particles come there."""
+    deceived = Odometry(SE3.exp(np.array([0, 0, 0, 0.5, 0, 0])), 0.05**2 * np.eye(6))
+    at, shown = replace(settled.reckoning, since_update=deceived, assumed=1, waiting=1), view(settled)
+    landmarks, filter_ = settled.front_end.landmarks, settled.filter
+    near = landmarks.associate(shown, filter_.expect(deceived, shown.stamp_ns))
+    assert (near >= 0).sum() < CONFIG.map.min_agreeing
+    motion, message = motion_for_update(filter_, landmarks, shown, at, settled.config)
+    assert message.startswith("the camera is found again by ")
+    assert message.endswith("landmarks of the map, after 1 pair whose motion was only assumed")
+    heaviest = filter_.particles.state[filter_.belief().mode]
+    place = SE3.compose(heaviest, motion.delta)
+    np.testing.assert_allclose(place[4:], settled.at_update.mean[4:], atol=RIGHT_M)
+    np.testing.assert_array_equal(motion.cov, deceived.cov)
+
+
+@pytest.mark.parametrize(("fraction", "texture_seed"), [(1 / 3, 12), (0.5, 0)])
+def test_a_thing_that_moves_does_not_take_it_along(fraction, texture_seed):
+    """For some pairs most matches are on the thing. Nothing on it becomes a landmark that weighs."""
+    run = filtered(cover_view(fraction, 6, 8, seed=texture_seed)(pairs(14)), CONFIG)
+    said = [message for message in run.messages if "something in the view moves" in message]
+    many = [message for message in said if int(message.split()[2]) < 0.5 * int(message.split()[4])]
+    assert len(said) >= 4 and len(many) >= 2
+    assert off_m(run, 14).max() < RIGHT_M
+
+
+def test_salt_and_pepper():
+    """Said at each pair but the first, and without harm."""
+    run = filtered(salt_and_pepper(0.02)(pairs(12)), CONFIG)
+    assert sum("impulse noise" in message for message in run.messages) == 11
+    assert off_m(run, 12).max() < RIGHT_M and not run.log["assumed"].any()

@@ -1,0 +1,352 @@
+"""Stereo SLAM on pairs of images of a plane whose poses are known exactly, and what `track` promises."""
+
+from dataclasses import replace
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+from examples.studies.image_faults import cover_view
+from rbpf.errors import InputError
+from rbpf.lie import SE3
+from rbpf.runs.run import Run
+from rbpf.sensors.descriptors.landmark_management import NewLandmarkConfig
+from rbpf.sensors.feature_log import FeatureFrame
+from rbpf.sensors.readers import ImageFrame
+from rbpf.systems.stereo.config import MapConfig, OdometryConfig, StereoConfig, TriggerConfig
+from rbpf.systems.stereo.front_end import ImageFrontEnd
+from rbpf.systems.stereo.landmarks import AssociationGate, DescriptorLandmarks
+from rbpf.systems.stereo.slam import StereoSlam
+from rbpf.systems.system import Tracked, TrackingState
+from tests.systems.stereo_sequences import errors_m, filtered, flat, missing, pairs, swapped
+
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("keypoints_once")]
+CONFIG = StereoConfig(particles=60)
+ALWAYS = replace(CONFIG, trigger=TriggerConfig(0.0, 0.0))
+COUNT = 12
+STILL = np.tile(SE3.identity(), (6, 1))
+EXACT = ("poses", "covs"), ("odometry", "ess", "observed", "features", "agreeing", "updated", "assumed")
+
+
+def rms_m(poses: np.ndarray) -> float:
+    return float(np.sqrt(np.square(errors_m(poses, pairs(COUNT))).mean()))
+
+
+def assert_same(ours: Run, theirs: Run) -> None:
+    """To the last bit, with the map."""
+    for name in EXACT[0]:
+        np.testing.assert_array_equal(getattr(ours.log, name), getattr(theirs.log, name))
+    for name in EXACT[1]:
+        np.testing.assert_array_equal(ours.log[name], theirs.log[name])
+    for one, other in zip(*(vars(run.system.map()).values() for run in (ours, theirs)), strict=True):
+        np.testing.assert_equal(one, other)
+    assert ours.messages == theirs.messages
+
+
+@pytest.fixture(scope="module")
+def plain(keypoints_once: None) -> Run:
+    return filtered(pairs(COUNT), CONFIG)
+
+
+class TestPath:
+    def test_the_path(self, plain):
+        """The camera goes 17 cm; an error of the pixels of 0.1 px at 1.5 m is 0.6 mm."""
+        assert plain.messages == [] and plain.failure is None
+        assert np.linalg.norm(SE3.translation(plain.log.poses[-1])) > 0.08
+        assert rms_m(plain.log.poses) < 0.003
+        assert rms_m(plain.log["odometry"]) < 0.004
+        assert np.all(plain.log.covs[-1].diagonal() > 0.0)
+        assert set(plain.log.states) == {TrackingState.TRACKED}
+
+    def test_landmarks_are_found_again(self, plain):
+        landmarks, found = plain.system.front_end.landmarks, plain.system.map()
+        manager = landmarks.manager
+        assert manager.confirmed.sum() > 15
+        assert plain.log["observed"][3:].mean() > 10
+        assert (~manager.confirmed).sum() <= CONFIG.new_landmarks.max_candidates
+        for ids in (manager.names, landmarks.index.store.ids, landmarks.places._ids):
+            np.testing.assert_array_equal(ids, found.ids)
+        np.testing.assert_array_equal(found.columns["landmark"], manager.confirmed)
+
+    def test_the_map_is_where_the_plane_is(self, plain):
+        """Every landmark seen often lies on the plane, within a few of its own standard deviations."""
+        found = plain.system.map()
+        often = found.columns["sightings"] >= 5
+        points = SE3.transform(pairs(COUNT).truth.world_from_camera[0], found.mean[often])
+        side, down = points[:, 0] / 0.004, points[:, 1] / (0.004 * np.cos(0.35))
+        off = points[:, 2] - (1.5 + down * 0.004 * np.sin(0.35) + 0.3 * side * 0.004)
+        assert often.sum() > 10
+        assert np.median(np.abs(off)) < 0.01
+
+    def test_updates_are_triggered(self):
+        """A camera at rest is updated once; uncertainty adds up until the filter is asked again, but not at once."""
+        trigger = TriggerConfig(moved_m=0.05, turned_rad=0.05)
+        run = filtered(pairs(6, poses=STILL), replace(CONFIG, trigger=trigger))
+        np.testing.assert_array_equal(run.log["updated"], [1, 0, 0, 0, 0, 0])
+        np.testing.assert_array_equal(run.log.poses, run.log["odometry"])
+        run = filtered(pairs(6, poses=STILL), replace(CONFIG, trigger=replace(trigger, frames=2)))
+        np.testing.assert_array_equal(run.log["updated"], [1, 0, 1, 0, 1, 0])
+
+    def test_between_updates_the_odometry_moves_the_estimate(self):
+        log = filtered(pairs(COUNT), replace(CONFIG, trigger=TriggerConfig(0.03, 1.0))).log
+        assert 2 <= log["updated"].sum() < COUNT
+        last = 0
+        for t in range(COUNT):
+            if log["updated"][t]:
+                last = t
+                continue
+            moved = SE3.between(log["odometry"][last], log["odometry"][t])
+            np.testing.assert_allclose(log.poses[t], SE3.compose(log.poses[last], moved), atol=1e-12)
+            assert np.trace(log.covs[t][3:, 3:]) > np.trace(log.covs[last][3:, 3:])
+
+    def test_three_degrees_of_freedom_keep_the_plane(self):
+        run = filtered(pairs(COUNT), replace(CONFIG, dof=3))
+        for poses in (run.log.poses, run.log["odometry"], run.system.filter.particles.state):
+            np.testing.assert_allclose(poses[:, 5], 0.0, atol=1e-12)  # y
+            np.testing.assert_allclose(SE3.log(poses)[:, [0, 2]], 0.0, atol=1e-9)
+        assert np.ptp(run.log.poses[:, 4]) > 0.02
+
+    def test_without_a_map_the_particles_follow_the_odometry(self):
+        config = replace(CONFIG, particles=400, map=MapConfig(used=False))
+        run = filtered(pairs(COUNT), config)
+        assert run.system.map().ids.size == 0 and run.log["observed"].sum() == 0
+        off = SE3.translation(run.log.poses[-1]) - SE3.translation(run.log["odometry"][-1])
+        spread = np.sqrt(np.trace(run.log.covs[-1][3:, 3:]))
+        assert 0.0 < np.linalg.norm(off) < 5.0 * spread / np.sqrt(400)
+
+    def test_a_thing_that_moves_through_the_view_is_said(self, plain):
+        """It covers up to a third of the view: as long as it and the room are seen there are two motions."""
+        run = filtered(cover_view(1 / 3, 3, 8)(pairs(COUNT)), CONFIG)
+        said = [message for message in run.messages if "something in the view moves" in message]
+        assert len(said) >= 3 and all(int(message.split()[1][:-1]) in range(3, 12) for message in said)
+        assert plain.messages == []
+
+
+class TestTrack:
+    """One frame at a time, for as long as one likes."""
+
+    def test_images_one_at_a_time(self, plain):
+        """As a camera gives them, without a recording: the same bytes as a run."""
+        sequence = pairs(COUNT)
+        slam = StereoSlam(sequence.rig, CONFIG)
+        for t, frame in enumerate(sequence.frames()):
+            said = slam.track(frame.image, frame.right, frame.stamp_ns)
+            np.testing.assert_array_equal(said.pose, plain.log.poses[t])
+            np.testing.assert_array_equal(said.cov, plain.log.covs[t])
+            np.testing.assert_array_equal(said.observed["z"], plain.log.observed(t)["z"])
+            assert said.values.keys() == {column.name for column in StereoSlam.columns}
+            assert said.observed.keys() == {ragged.name for ragged in StereoSlam.observed}
+
+    @pytest.mark.parametrize("at", [0, 1, 5, 6, COUNT - 1])
+    def test_saved_and_loaded_after_any_frame(self, at, tmp_path):
+        """Also after a pair that could not be measured: the same bytes."""
+        sequence = pairs(COUNT, lambda t, frame: missing(frame) if t in (0, 5) else frame)
+        slam, said = StereoSlam(sequence.rig, CONFIG), list[Tracked]()
+        for t, frame in enumerate(sequence.frames()):
+            said.append(slam.take(frame))
+            if t == at:
+                slam.save(tmp_path / "checkpoint.npz", {"mine": np.arange(3)})
+        again = StereoSlam(sequence.rig, CONFIG)
+        np.testing.assert_array_equal(again.load(tmp_path / "checkpoint.npz")["mine"], np.arange(3))
+        for t, frame in enumerate(sequence.frames(at + 1) if at + 1 < COUNT else (), at + 1):
+            one = again.take(frame)
+            np.testing.assert_array_equal(one.pose, said[t].pose)
+            np.testing.assert_array_equal(one.cov, said[t].cov)
+            for name, values in one.observed.items():
+                np.testing.assert_array_equal(values, said[t].observed[name])
+        np.testing.assert_array_equal(again.filter.particles.state, slam.filter.particles.state)
+        np.testing.assert_array_equal(again.map().mean, slam.map().mean)
+
+    def test_a_damaged_checkpoint_is_refused(self, plain):
+        arrays = plain.system.arrays()
+        broken = {
+            "pair/stood": np.zeros(3),
+            "stereo/front_end": np.array(5),
+            "places/place": np.zeros((1, 3)),
+        }
+        for name, value in broken.items():
+            with pytest.raises(InputError):
+                StereoSlam(pairs(2).rig, CONFIG).restore(arrays | {name: value})
+
+    def test_memory_does_not_grow_with_the_pairs(self):
+        """A camera at rest: the map is soon complete, and what is kept stays as large as it is."""
+        sequence = pairs(30, poses=np.tile(SE3.identity(), (30, 1)))
+        slam, sizes = StereoSlam(sequence.rig, replace(ALWAYS, lag=5)), []
+        for frame in sequence.frames():
+            slam.take(frame)
+            landmarks = slam.front_end.landmarks
+            held = slam.arrays() | slam.filter.history.arrays()
+            features = len(landmarks.ids)
+            started = landmarks.manager.next_name
+            sizes.append(
+                (sum(array.nbytes for array in held.values()), slam.map().ids.size, features, started)
+            )
+        size, landmarks, features, started = np.array(sizes).T
+        # What a landmark, a feature, and five steps of 60 paths take; nothing else, and nothing for what was dropped.
+        per = 36 * 4 + 9 * 8, 8 * (3 + 9 + 4) + 36 * 4
+        most = per[0] * landmarks + per[1] * features + 6 * 60 * 8 * 9 + 4000
+        assert started[-1] > started[8] + 20 and (size[8:] < most[8:]).all()
+
+
+class TestBadPairs:
+    """A bad pair is survived: it keeps a predicted pose, and the next one is matched with the last good one."""
+
+    CHANGES: ClassVar = {
+        "missing": (missing, "the right image is missing"),
+        "black": (flat, "it shows 0 features"),
+        "wrong size": (
+            lambda f: ImageFrame(f.stamp_ns, f.image[:100], f.right[:100]),
+            "the camera takes 320x240 px",
+        ),
+        "two sizes": (lambda f: ImageFrame(f.stamp_ns, f.image[:100], f.right), "must be of one size"),
+        "wrong type": (lambda f: ImageFrame(f.stamp_ns, f.image.astype(float), f.right), "float64"),
+        "colour": (lambda f: ImageFrame(f.stamp_ns, np.dstack([f.image] * 3), f.right), "(240, 320, 3)"),
+        "same stamp": (
+            lambda f: replace(f, stamp_ns=f.stamp_ns - 66_666_666),
+            "it has the stamp of the last one",
+        ),
+    }
+
+    @pytest.mark.parametrize("kind", CHANGES)
+    def test_it_is_survived(self, kind, plain):
+        change, words = self.CHANGES[kind]
+        bad = filtered(pairs(COUNT, lambda t, frame: change(frame) if t == 5 else frame), CONFIG)
+        (message,) = bad.messages
+        assert bad.failure is None and message.startswith("pair 5: passed over: ") and words in message
+        assert "the last velocity is assumed, widely" in message
+        assert bad.log.states[5] is TrackingState.PREDICTED and not bad.log["updated"][5]
+        assert rms_m(bad.log.poses) < 0.006 or kind == "same stamp"
+        assert np.trace(bad.log.covs[7]) < 10.0 * np.trace(plain.log.covs[7])
+        if kind != "same stamp":
+            assert np.trace(bad.log.covs[5]) > 50.0 * np.trace(plain.log.covs[5])
+
+    def test_the_first_pairs_are_missing(self):
+        run = filtered(pairs(6, lambda t, frame: missing(frame) if t < 2 else frame), CONFIG)
+        assert run.messages[0].startswith("pair 0: passed over: the right image is missing")
+        np.testing.assert_array_equal(run.log["updated"][:3], [0, 0, 1])
+        np.testing.assert_array_equal(run.log.poses[:3], np.tile(SE3.identity(), (3, 1)))
+
+    def test_the_first_pair_has_to_be_the_cameras(self):
+        slam = StereoSlam(pairs(2).rig, CONFIG)
+        with pytest.raises(InputError, match="the camera takes 320x240 px, the images have 100x50 px"):
+            slam.track(*np.zeros((2, 50, 100), dtype=np.uint8), 0)
+        image = next(pairs(2).frames())
+        slam.take(image)
+        with pytest.raises(InputError, match="is given a FeatureFrame, and takes ImageFrame or CachedPair"):
+            slam.take(FeatureFrame(1, np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3))))
+
+    def test_too_few_matches_widen_the_motion(self):
+        """A jump to where nothing is known: the odometry says that it finds no motion, and assumes one."""
+        poses = np.tile(SE3.identity(), (4, 1))
+        poses[2:, 4] += 2.2
+        poses[2:, 5] -= 0.9
+        run = filtered(pairs(4, poses=poses), CONFIG)
+        (message,) = run.messages
+        assert message.startswith("pair 2: ") and "is assumed, widely" in message
+        assert run.failure is None
+        assert np.trace(run.log.covs[2][3:, 3:]) > 100.0 * np.trace(run.log.covs[1][3:, 3:])
+
+    def test_swapped_images(self):
+        """The first pair is refused at once; later the run ends and keeps what it has."""
+        with pytest.raises(InputError, match="seem to be swapped"):
+            filtered(pairs(3, lambda t, frame: swapped(frame)), CONFIG)
+        run = filtered(pairs(4, lambda t, frame: swapped(frame) if t == 2 else frame), CONFIG)
+        assert run.failure is not None and run.failure.startswith("pair 2 of plane: ")
+        assert "swapped" in run.failure
+        assert len(run.log) == 2
+
+
+class TestParts:
+    """What may be exchanged, and what it is given."""
+
+    @pytest.mark.parametrize("split", ["none", "apart", "same"])
+    def test_halves_of_the_features(self, split):
+        """Apart, no pixel that the odometry has is among the filter's observations; else most are."""
+        config = replace(ALWAYS, odometry=OdometryConfig(split=split))
+        sequence, shared = pairs(COUNT), list[float]()
+        end = ImageFrontEnd(sequence.rig, config)
+        used, whole = list[np.ndarray](), end.match
+
+        def noted(before, now):
+            rows = whole(before, now)
+            used.append(now.features.z[rows[1], 0])
+            return rows
+
+        end.match = noted
+        slam = StereoSlam(sequence.rig, config, end)
+        said = []
+        for frame in sequence.frames():
+            said.append(slam.take(frame))
+            seen = said[-1].observed["z"][said[-1].observed["landmarks"] >= 0, 0]
+            if used and seen.size:
+                shared.append(np.isin(seen, used[-1]).mean())
+                assert said[-1].values["observed"] <= len(seen)
+        observed = [one.values["observed"] for one in said]
+        assert len(shared) > 5 and np.mean(observed[4:]) > 3
+        assert max(shared) == 0.0 if split == "apart" else np.mean(shared) > 0.5
+        assert rms_m(np.array([one.pose for one in said])) < 0.006
+
+    def test_a_gate_of_ones_own(self):
+        """One that lets nothing pass leaves a map that nothing is found in."""
+
+        class Closed(AssociationGate):
+            def pairs(self, features, expected):
+                return np.zeros((2, 0), dtype=np.intp)
+
+        sequence = pairs(5)
+        length, likelihood = ALWAYS.sift.length, ALWAYS.likelihood.build()
+        landmarks = DescriptorLandmarks(
+            sequence.rig, ALWAYS.map, ALWAYS.new_landmarks, length, likelihood, gate=Closed()
+        )
+        slam = StereoSlam(sequence.rig, ALWAYS, ImageFrontEnd(sequence.rig, ALWAYS, landmarks=landmarks))
+        said = [slam.take(frame) for frame in sequence.frames()]
+        assert sum(one.values["observed"] for one in said) == 0 and slam.map().ids.size > 10
+
+    def test_candidates_that_are_not_seen_again_leave(self):
+        """A patience of one frame: what was not seen in the last update is gone."""
+        run = filtered(pairs(COUNT), replace(CONFIG, new_landmarks=NewLandmarkConfig(patience=1)))
+        manager = run.system.front_end.landmarks.manager
+        candidates = ~manager.confirmed
+        assert (manager.last_observed[candidates] == manager.frame).all()
+        assert manager.next_name > manager.names.size
+
+
+def test_resumed(tmp_path, plain):
+    """Stopped after any checkpoint and taken up again: the same bytes, and the same map."""
+    place = tmp_path / "checkpoint.npz"
+
+    class StopError(Exception):
+        pass
+
+    def stop(run: Run, tracked: Tracked) -> None:
+        if len(run.log) == 8:
+            raise StopError
+
+    with pytest.raises(StopError):
+        filtered(pairs(COUNT), CONFIG, listeners=[stop], checkpoint=place, every=5)
+    for _ in range(2):
+        assert_same(filtered(pairs(COUNT), CONFIG, checkpoint=place, resume=True), plain)
+
+
+def test_a_checkpoint_of_another_recording(tmp_path):
+    place = tmp_path / "checkpoint.npz"
+    filtered(pairs(2), CONFIG, checkpoint=place)
+    other = pairs(4)
+    other.stamps_ns[:] += 1
+    with pytest.raises(InputError, match="belongs to a run over another recording"):
+        filtered(other, CONFIG, checkpoint=place, resume=True)
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "message"),
+    [
+        (StereoConfig, {"particles": 0}, "particles must be at least 1"),
+        (StereoConfig, {"checkpoint_every": 0}, "checkpoint_every must be at least 1"),
+        (MapConfig, {"subsample": 0}, "subsample must be at least one particle"),
+        (MapConfig, {"gate": 0.0}, "expected gate and depth_fraction above 0"),
+        (TriggerConfig, {"moved_m": -1.0}, "must not be negative"),
+    ],
+)
+def test_bad_settings(kind, values, message):
+    with pytest.raises(InputError, match=message):
+        kind(**values)
