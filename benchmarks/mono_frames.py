@@ -11,11 +11,12 @@ import cv2
 import numpy as np
 
 from benchmarks.rows import Row, Settings
+from rbpf.runs.recordings import filter_images
+from rbpf.runs.run import Run
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers import ImageFrame, ImageSequence, KnownPixels, open_images, read_known_points
 from rbpf.sensors.readers.images.sequence import Source
 from rbpf.systems.mono.config import MonoConfig
-from rbpf.systems.mono.video import VideoRun, run_images
 from rbpf.validation.simulation.desk_and_room import TexturedDesk
 from rbpf.validation.simulation.images import Imaging, simulate_images
 
@@ -55,10 +56,10 @@ def run(settings: Settings) -> list[Row]:
 
 def figure(width: int, timed: int) -> Row:
     sequence, known = rendered(width, SETTLING + timed)
-    done = run_images(sequence, MonoConfig(particles=50), known)
+    done = filter_images(sequence, MonoConfig(particles=50), known)
     stages = {name: float(np.median(part[SETTLING:])) * 1e3 for name, part in by_stage(done).items()}
     peer = optical_flow(sequence)
-    whole = done.seconds[SETTLING:]
+    whole = done.log["seconds"][SETTLING:]
     hz, mean_hz = 1.0 / float(np.median(whole)), 1.0 / float(whole.mean())
     text = ", ".join(f"{name} {spent:.3g} ms" for name, spent in stages.items())
     return Row(
@@ -73,7 +74,7 @@ def figure(width: int, timed: int) -> Row:
         met=hz >= AIM_HZ[width],
         notes=(
             f"medians: {text}; {mean_hz:.3g} frames/s on the average, fastest frame {whole.min() * 1e3:.3g} ms; "
-            f"{done.found[SETTLING:].mean():.3g} of {done.searched[SETTLING:].mean():.3g} measurements found"
+            f"{done.log['found'][SETTLING:].mean():.3g} of {done.log['searched'][SETTLING:].mean():.3g} measurements found"
         ),
         tolerance=0.5,
     )
@@ -91,10 +92,12 @@ def optical_flow(sequence: ImageSequence) -> float:
     return float(np.median(seconds))
 
 
-def by_stage(run: VideoRun) -> dict[str, np.ndarray]:
+def by_stage(run: Run) -> dict[str, np.ndarray]:
     """Seconds of each frame (T,) by what they were spent on."""
     return {
-        "search": run.seconds_search,
-        "filter and report": run.seconds - run.seconds_search - run.seconds_new_landmarks,
-        "new_landmarks": run.seconds_new_landmarks,
+        "search": run.log["seconds_search"],
+        "filter and report": run.log["seconds"]
+        - run.log["seconds_search"]
+        - run.log["seconds_new_landmarks"],
+        "new_landmarks": run.log["seconds_new_landmarks"],
     }

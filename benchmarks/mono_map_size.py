@@ -9,9 +9,10 @@ from benchmarks.rows import Row, Settings
 from rbpf.core.models import Records
 from rbpf.lie import SE3
 from rbpf.maps.point import Point
-from rbpf.sensors.readers import ImageFrame
+from rbpf.runs.recordings import filter_images
+from rbpf.runs.run import Run
 from rbpf.systems.mono.config import MonoConfig
-from rbpf.systems.mono.video import VideoRun, run_images
+from rbpf.systems.system import Tracked
 
 WIDTH, TIMED = 320, 60
 LANDMARKS = 10_000
@@ -28,17 +29,14 @@ def run(settings: Settings) -> list[Row]:
     assert isinstance(held, Decoded)
     seconds = {}
     for more in (0, LANDMARKS):
-        spent = np.zeros(frames)
 
-        def fill(
-            t: int, _frame: ImageFrame, run: VideoRun, more: int = more, spent: np.ndarray = spent
-        ) -> None:
-            if t == 0 and more:
+        def fill(run: Run, _: Tracked, more: int = more) -> None:
+            if len(run.log) == 1 and more:
                 add_elsewhere(run, more)
-            spent[t] = run.seconds[t]
 
-        done = run_images(replace(sequence), MonoConfig(particles=50), known, fill)
-        assert not done.lost.any()
+        done = filter_images(replace(sequence), MonoConfig(particles=50), known, [fill])
+        assert not done.log.lost().any()
+        spent = done.log["seconds"]
         seconds[more] = spent[SETTLING:]
     few, many = (float(np.median(part)) for part in seconds.values())
     return [
@@ -58,9 +56,9 @@ def run(settings: Settings) -> list[Row]:
     ]
 
 
-def add_elsewhere(run: VideoRun, count: int) -> None:
+def add_elsewhere(run: Run, count: int) -> None:
     """Landmarks of which nothing is seen; the table of appearances has a row for each, as if they had been left."""
-    rng, filter_, table = np.random.default_rng(0), run.filter, run.sensor.table
+    rng, filter_, table = np.random.default_rng(0), run.system.filter, run.system.sensor.table
     pose = filter_.particles.state[0, :7]
     behind = rng.uniform([-3.0, -3.0, -BEHIND_M - 2.0], [3.0, 3.0, -BEHIND_M], (count, 3))
     points = SE3.transform(pose, behind)

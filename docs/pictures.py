@@ -11,12 +11,14 @@ from tempfile import TemporaryDirectory
 import tyro
 from PIL import Image
 
+from rbpf.runs.folder import write_run
+from rbpf.runs.plots import map_figure, save_figures
+from rbpf.runs.reading import RunFolder
+from rbpf.runs.recordings import MonoRecording, filter_recording
+from rbpf.runs.run import Run
 from rbpf.sensors.camera import Pinhole
 from rbpf.systems.mono.config import MonoConfig
-from rbpf.systems.mono.video import VideoRun
-from rbpf.validation.mono import Recording, start_mono
-from rbpf.validation.report.mono_pictures import plot_mono_run
-from rbpf.validation.report.mono_video import annotated_frames
+from rbpf.validation.report.video import annotated_frames
 from rbpf.validation.simulation.desk_and_room import TexturedDesk
 from rbpf.validation.simulation.images import Imaging, simulate_images
 
@@ -30,7 +32,7 @@ COLOURS = 64
 """Of the map's picture: lines and letters need no more."""
 
 
-def animate(run: VideoRun, path: Path) -> None:
+def animate(run: Run, path: Path) -> None:
     """Some of the annotated frames, smaller."""
     chosen = islice(annotated_frames(run), 1, 1 + EVERY * FRAMES, EVERY)
     pictures = [Image.fromarray(frame) for frame in chosen]
@@ -61,9 +63,10 @@ def main(images: Path | None = None, out: Path = Path(__file__).parent / "pictur
             images = scratch / "desk"
             camera = Pinhole(640, 480, 512.0, 512.0, 319.5, 239.5)
             simulate_images(TexturedDesk(frames=300), Imaging(), camera, images, seed=0)
-        run = start_mono(Recording(images, images / "known_points.csv"), MonoConfig())
+        run = filter_recording(MonoRecording(images, images / "known_points.csv"), MonoConfig())
         animate(run, out / "desk.webp")
-        plot_mono_run(run, run.slam.map(), scratch)
+        write_run(run, scratch / "run", {"recording": str(images)})
+        save_figures({"map.png": map_figure(RunFolder.open(scratch / "run"))}, scratch)
         shrink(scratch / "map.png", out / "map.png")
     for path in (out / "desk.webp", out / "map.png"):
         print(f"{path}: {path.stat().st_size / 1000:.0f} kB")

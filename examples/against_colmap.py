@@ -6,14 +6,14 @@ The reconstruction shares the images and the calibration with the filter and not
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from rbpf.runs.path_and_map import PathAndMap
+from rbpf.runs.recordings import MonoRecording, filter_recording
 from rbpf.sensors.camera import Pinhole
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.validation.colmap.against_colmap import compare_with_colmap
 from rbpf.validation.colmap.pipeline import ReconstructionOptions
 from rbpf.validation.export import export_colmap, export_ply
 from rbpf.validation.gtsam.batch_problem import problem_of
-from rbpf.validation.metrics.path_and_map import of_run
-from rbpf.validation.mono import Recording, start_mono
 from rbpf.validation.report.offline_pictures import plot_against_colmap
 from rbpf.validation.simulation.desk_and_room import TexturedDesk
 from rbpf.validation.simulation.images import Imaging, simulate_images
@@ -27,10 +27,10 @@ def main(quick: bool = False, out: Path = Path("out")) -> dict[str, float]:
     with TemporaryDirectory() as folder:
         desk = Path(folder) / "desk"
         simulate_images(TexturedDesk(frames=frames), Imaging(known=6), camera, desk, seed=0)
-        run = start_mono(Recording(desk, desk / "known_points.csv"), MonoConfig())
-        estimate = of_run(run)
+        run = filter_recording(MonoRecording(desk, desk / "known_points.csv"), MonoConfig())
+        estimate = PathAndMap.of_run(run)
         options = ReconstructionOptions(every=every, features=800 if quick else 4096)
-        found = compare_with_colmap(estimate, run.sequence, options)
+        found = compare_with_colmap(estimate, run.source, options)
     figures = {
         f"run: {name}": value for name, value in found.run.as_dict().items() if isinstance(value, float)
     }

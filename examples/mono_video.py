@@ -8,11 +8,11 @@ from pathlib import Path
 
 import tyro
 
+from rbpf.runs.recordings import MonoRecording, filter_images
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers import open_images, read_known_points
 from rbpf.systems.mono.config import MonoConfig
-from rbpf.systems.mono.video import run_images
-from rbpf.validation.mono import Recording, finish_mono
+from rbpf.validation.finish import finish_run
 from rbpf.validation.simulation.desk_and_room import TexturedDesk
 from rbpf.validation.simulation.images import Imaging, simulate_images
 
@@ -21,11 +21,11 @@ def slam(images: Path, known_points: Path | None, particles: int, out: Path) -> 
     """The ten lines."""
     sequence = open_images(images)
     known = None if known_points is None else read_known_points(known_points)
-    run = run_images(sequence, MonoConfig(particles=particles), known)
+    run = filter_images(sequence, MonoConfig(particles=particles), known)
     print(
-        f"the camera ended at {run.world_from_camera[-1, 4:].round(3)} m, lost in {int(run.lost.sum())} frames"
+        f"the camera ended at {run.log.poses[-1, 4:].round(3)} m, lost in {int(run.log.lost().sum())} frames"
     )
-    return finish_mono(run, Recording(images, known_points), out)
+    return finish_run(run, out, MonoRecording(images, known_points).sources())
 
 
 def render(folder: Path, frames: int, width: int) -> Path:

@@ -21,7 +21,7 @@ from rbpf.runs.reading import RunFolder
 from rbpf.runs.trajectory import write_kitti, write_tum
 from rbpf.validation.export import MODEL, export_colmap, export_ply, raised
 from rbpf.validation.gtsam.batch_problem import read_problem
-from rbpf.validation.report.rerun_file import AXIS_M, ellipsoids, log_pose, log_time, recording
+from rbpf.validation.report.rerun import AXIS_M, ellipsoids, log_pose, log_time, recording
 
 
 def export_run(run: Path, formats: Sequence[str], out: Path) -> list[Path]:

@@ -25,9 +25,13 @@ from rbpf.systems.map_estimate import MapEstimate
 from rbpf.validation.consistency.validate import report_run
 from rbpf.validation.metrics.accuracy import ate
 from rbpf.validation.metrics.scores import BATCH, score_landmarks, score_run
+from rbpf.validation.report.page import VIDEO
+from rbpf.validation.report.rerun import write_rerun
+from rbpf.validation.report.video import PICTURES, write_annotated
 
 MOST = 300_000
-"""Observations that are adjusted at once after a run: more take minutes and gigabytes, and are left to who asks for it."""
+"""Observations of a stereo pair that are adjusted at once after a run: more take minutes and gigabytes, and are left to
+who asks for it."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +75,8 @@ def finish_run(
         InputError: a file cannot be written.
     """
     callbacks = callbacks or Callbacks()
-    entries = write_run(run, out, dict(sources) | left_out(video=video, batch=batch))
+    wanted = {"video": video, "batch": batch} if run.system.name in PICTURES else {"batch": batch}
+    entries = write_run(run, out, dict(sources) | left_out(**wanted))
     (out / BATCH).unlink(missing_ok=True)
     if batch:
         try:
@@ -82,6 +87,12 @@ def finish_run(
     write_summary(out, entries)
     found = RunFolder.open(out)
     draw_run(found)
+    if video and run.system.name in PICTURES:
+        write_annotated(run, out / VIDEO, callbacks.on_frame)
+    else:
+        (out / VIDEO).unlink(missing_ok=True)
+    if rerun is not None:
+        write_rerun(run, rerun)
     verdict = report_run(out)
     return entries | {"verdict": verdict.trust, "sentences": verdict.said}
 
@@ -98,13 +109,13 @@ def add_batch(found: RunFolder, callbacks: Callbacks) -> dict[str, Any]:
         from rbpf.validation.gtsam.batch_problem import STEREO_TOLERANCE
         from rbpf.validation.gtsam.mono_batch import adjust_log
 
+        stereo = isinstance(measured.camera, RectifiedStereo)
         count = sum(frame.landmarks.size for frame in measured.frames)
-        if count > MOST:
+        if stereo and count > MOST:
             raise InputError(
                 f"the run has {count} observations, more than the {MOST} that are adjusted in batch with it: "
                 "compare it afterwards by rbpf validate RUN --against gtsam"
             )
-        stereo = isinstance(measured.camera, RectifiedStereo)
         tolerance = STEREO_TOLERANCE if stereo else None
         adjusted = adjust_log(
             measured, found.path.mean, callbacks.batch_s, callbacks.on_iteration, tolerance=tolerance

@@ -1,7 +1,6 @@
-"""What a monocular and a stereo run have in common after the filter: who is told, and the batch optimum."""
+"""The batch optimum of a stereo run."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,21 +14,6 @@ CHECKPOINT = "checkpoint.npz"
 BATCH = "batch.tum"
 
 Progress = Callable[[int, int], None]
-
-
-@dataclass(frozen=True)
-class Telling:
-    """Who is told how far the work after the filter is.
-
-    Attributes:
-        on_frame: called with the frames drawn and their number.
-        on_iteration: called with the number of an iteration of the batch adjustment and the error before it.
-        batch_s: time after which the batch adjustment is given up; None waits.
-    """
-
-    on_frame: Progress | None = None
-    on_iteration: Callable[[int, float], None] | None = None
-    batch_s: float | None = None
 
 
 def write_batch(

@@ -12,8 +12,9 @@ from rbpf.sensors.readers.images.sequence import UNNAMED
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.run import StereoRun, run_images
 from rbpf.validation.consistency.validate import report_run
+from rbpf.validation.finish import Callbacks
 from rbpf.validation.gtsam.stereo_batch import adjust_stereo, score_stereo_batch
-from rbpf.validation.image_run import CHECKPOINT, Progress, Telling, write_batch
+from rbpf.validation.image_run import CHECKPOINT, Progress, write_batch
 from rbpf.validation.report.page import VIDEO
 from rbpf.validation.report.stereo_frames import write_annotated_pairs
 from rbpf.validation.report.stereo_pictures import plot_stereo_run
@@ -83,7 +84,7 @@ def finish_stereo(
     video: bool = True,
     rerun: Path | None = None,
     batch: bool = True,
-    telling: Telling | None = None,
+    callbacks: Callbacks | None = None,
 ) -> dict[str, Any]:
     """Writes all files, pictures, video and report of a run; returns the entries of summary.json and the verdict.
 
@@ -96,16 +97,16 @@ def finish_stereo(
         video: also write the annotated video.
         rerun: file of a recording for the Rerun viewer; None writes none.
         batch: also adjust the same measurements in batch, and score the optimum.
-        telling: whom to tell how far it is, and the time that the batch adjustment may take.
+        callbacks: who is told how far it is, and the time that the batch adjustment may take.
     """
-    mapped, telling = run.slam.map(), telling or Telling()
+    mapped, callbacks = run.slam.map(), callbacks or Callbacks()
     sources = recording.sources() | left_out(video=video, batch=batch)
     entries = write_stereo_run(run, mapped, out, sources)
-    adjust = partial(adjust_stereo, run, telling.batch_s, telling.on_iteration)
+    adjust = partial(adjust_stereo, run, callbacks.batch_s, callbacks.on_iteration)
     optimum = write_batch(out, entries, adjust if batch else None, partial(score_stereo_batch, run))
     plot_stereo_run(run, mapped, out, optimum)
     if video:
-        write_annotated_pairs(run, recording.open(), out / VIDEO, telling.on_frame)
+        write_annotated_pairs(run, recording.open(), out / VIDEO, callbacks.on_frame)
     else:
         (out / VIDEO).unlink(missing_ok=True)
     if rerun is not None:

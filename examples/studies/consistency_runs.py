@@ -22,15 +22,13 @@ from rbpf.core.diagnostics import Band, ancestors_by_step, chi_square_band, coal
 from rbpf.core.filter import Filter
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.runs.recordings import filter_robot_log
+from rbpf.runs.recordings import filter_features, filter_robot_log
 from rbpf.runs.truth import truth_at
 from rbpf.sensors.readers import RobotLog
 from rbpf.systems.filtering import ProposalConfig
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.mono.config import MonoConfig
-from rbpf.systems.mono.run import run as run_mono
 from rbpf.systems.range_bearing.config import RangeBearingConfig
-from rbpf.validation.camera_map import summarise_points
 from rbpf.validation.consistency.pose_errors import whitened_errors
 from rbpf.validation.consistency.statistic import PROBABILITIES
 from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
@@ -134,18 +132,18 @@ class DeskTrial:
         """Simulates and filters."""
         log = simulate_features(self.world, self.measuring, MONO, seed)
         assert log.truth is not None
-        done = run_mono(log, replace(self.config, seed=seed))
-        true = log.truth.world_from_camera
-        errors = whitened_errors(SE3, done.world_from_camera, done.cov, true)
+        done = filter_features(log, replace(self.config, seed=seed))
+        path, true = done.log, log.truth.world_from_camera
+        errors = whitened_errors(SE3, path.poses, path.covs, true)
         return Trial(
             6,
-            np.linalg.norm(SE3.translation(done.world_from_camera) - SE3.translation(true), axis=1),
+            np.linalg.norm(SE3.translation(path.poses) - SE3.translation(true), axis=1),
             np.where(errors.ranks > 0, errors.nees, np.nan),
-            done.nis,
-            done.rows,
-            _landmark_nees(summarise_points(done.filter), log.truth.landmarks),
+            path["nis"],
+            path["nis_dof"],
+            _landmark_nees(done.system.map().points(), log.truth.landmarks),
             3,
-            *_genealogy(done.filter),
+            *_genealogy(done.system.filter),
         )
 
 

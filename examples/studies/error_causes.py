@@ -28,7 +28,7 @@ from rbpf.runs.alignment import Alignment
 from rbpf.runs.measurement_files import read_feature_log
 from rbpf.runs.plots import COLOURS, new_axes, save_figures
 from rbpf.runs.reading import RunFolder
-from rbpf.runs.recordings import filter_robot_log
+from rbpf.runs.recordings import filter_features, filter_robot_log
 from rbpf.runs.trajectory import Trajectory, in_space
 from rbpf.runs.truth import truth_at
 from rbpf.sensors.camera.points import CameraRay
@@ -38,7 +38,6 @@ from rbpf.sensors.readers.measurements import InitialEstimate
 from rbpf.systems.filtering import ProposalConfig
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor
-from rbpf.systems.mono.run import run as filter_log
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.settings import load_settings
 from rbpf.validation.gtsam import robot
@@ -187,8 +186,8 @@ def camera_causes(
     for name, (measured, settings, wrapped) in changes.items():
         on_change(name)
         more = {} if wrapped is None else {"wrapped": wrapped}
-        runs = [filter_log(measured, replace(settings, seed=seed), **more) for seed in seeds]
-        out.append(Cause(name, tuple(error(whole, run.world_from_camera) for run in runs), found))
+        runs = [filter_features(measured, replace(settings, seed=seed), **more) for seed in seeds]
+        out.append(Cause(name, tuple(error(whole, run.log.poses) for run in runs), found))
     return out
 
 

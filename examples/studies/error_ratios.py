@@ -19,7 +19,7 @@ from rbpf.lie import Array
 from rbpf.runs.alignment import Alignment
 from rbpf.runs.path_and_map import PathAndMap
 from rbpf.runs.plots import COLOURS, new_axes, save_figures
-from rbpf.runs.recordings import filter_robot_log
+from rbpf.runs.recordings import MonoRecording, filter_recording, filter_robot_log
 from rbpf.runs.run import Run
 from rbpf.runs.trajectory import Trajectory, associate, in_space
 from rbpf.sensors.camera import Pinhole
@@ -34,7 +34,6 @@ from rbpf.validation.gtsam.batch_problem import Optimum, floats_in_scale, proble
 from rbpf.validation.metrics.accuracy import ate
 from rbpf.validation.metrics.mono_scores import true_path
 from rbpf.validation.metrics.path_and_map import AnyRun, of_run
-from rbpf.validation.mono import Recording, start_mono
 from rbpf.validation.simulation.desk_and_room import TexturedDesk
 from rbpf.validation.simulation.images import Imaging, simulate_images
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
@@ -93,28 +92,18 @@ def robot_ratio(recording: Path, config: RangeBearingConfig, seeds: Sequence[int
         InputError: the recording is wrong, or has too little ground truth.
     """
     log = open_log(recording, config.noise)
-    errors = _over_seeds(lambda seed: filter_robot_log(log, _seeded(config, seed)), _robot_truth, seeds)
+    errors = _over_seeds(lambda seed: filter_robot_log(log, _seeded(config, seed)), _truth, seeds)
     return ErrorRatio(log.name, config.particles, *errors, "rigid")
 
 
-def camera_ratio(recording: Recording, config: MonoConfig, seeds: Sequence[int] = (0,)) -> ErrorRatio:
+def camera_ratio(recording: MonoRecording, config: MonoConfig, seeds: Sequence[int] = (0,)) -> ErrorRatio:
     """Filters a sequence of images with each seed, and adjusts what each measured in batch.
 
     Raises:
         InputError: the recording is wrong, or has too little ground truth.
     """
     name, known = recording.images.resolve().name, recording.known_points is not None
-
-    def truth(found: AnyRun) -> Trajectory:
-        assert not isinstance(found, Run) and hasattr(found, "sequence")
-        at = true_path(found.sequence.truth, found.stamps_ns)
-        if at is None:
-            raise InputError(
-                f"{name} has no ground truth to tell the errors by, or less than {LEAST} poses of it."
-            )
-        return Trajectory(found.stamps_ns[at.rows], at.world_from_camera)
-
-    errors = _over_seeds(lambda seed: start_mono(recording, _seeded(config, seed)), truth, seeds)
+    errors = _over_seeds(lambda seed: filter_recording(recording, _seeded(config, seed)), _truth, seeds)
     return ErrorRatio(name, config.particles, *errors, "rigid" if known else "similarity")
 
 
@@ -193,19 +182,15 @@ def _over_seeds(
         found = filtered(seed)
         estimate, problem, truth = of_run(found), problem_of(found), truth_of(found)
         alignment: Alignment = "similarity" if floats_in_scale(problem) else "rigid"
-        if optimum is None or not isinstance(found, Run):
-            optimum = _optimum(found, estimate)
+        if optimum is None or isinstance(problem, FeatureLog):
+            robust = ROBUST if isinstance(problem, FeatureLog) else None
+            optimum = solve_problem(problem, estimate.world_from_body, robust, marginals=False)
         ours.append(error_of(estimate, truth, alignment))
         batch.append(error_of(optimum.estimate, truth, alignment))
     return tuple(ours), tuple(batch)
 
 
-def _optimum(found: AnyRun, estimate: PathAndMap) -> Optimum:
-    robust = None if isinstance(found, Run) else ROBUST
-    return solve_problem(problem_of(found), estimate.world_from_body, robust, marginals=False)
-
-
-def _robot_truth(found: AnyRun) -> Trajectory:
+def _truth(found: AnyRun) -> Trajectory:
     assert isinstance(found, Run)
     if found.truth is None:
         raise InputError(f"{found.name} has no ground truth to tell the errors by, or too little.")
@@ -245,7 +230,7 @@ def simulated(folder: Path, quick: bool, seeds: int) -> Iterator[ErrorRatio]:
     desk = folder / "rendered_desk"
     simulate_images(TexturedDesk(frames=frames), Imaging(known=6), camera, desk, seed=0)
     told = MonoConfig(search=SearchConfig(noise_px=RENDERED_PX))
-    yield camera_ratio(Recording(desk, desk / "known_points.csv"), told, range(seeds))
+    yield camera_ratio(MonoRecording(desk, desk / "known_points.csv"), told, range(seeds))
 
 
 def recorded(data: Path, seeds: int) -> Iterator[ErrorRatio]:
@@ -262,7 +247,7 @@ def recorded(data: Path, seeds: int) -> Iterator[ErrorRatio]:
     for name in CAMERAS:
         if (data / name).is_dir():
             yield camera_ratio(
-                Recording(data / name, data / name / "known_points.csv"), MonoConfig(), range(seeds)
+                MonoRecording(data / name, data / name / "known_points.csv"), MonoConfig(), range(seeds)
             )
 
 

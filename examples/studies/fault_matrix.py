@@ -33,6 +33,8 @@ from examples.studies.image_faults import (
 from examples.studies.mono_blackouts import pose_differences
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.runs.recordings import filter_images
+from rbpf.runs.truth import truth_at
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.readers import (
     ImageSequence,
@@ -42,10 +44,8 @@ from rbpf.sensors.readers import (
     read_known_points,
 )
 from rbpf.systems.mono.config import MonoConfig
-from rbpf.systems.mono.video import run_images
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.run import run_images as run_pairs
-from rbpf.validation.metrics.mono_scores import true_path
 from rbpf.validation.simulation.desk_and_room import TexturedDesk
 from rbpf.validation.simulation.images import Imaging, simulate_images
 from rbpf.validation.tables import write_csv, write_table
@@ -133,8 +133,8 @@ def try_mono(
     """
 
     def run(damaged: ImageSequence) -> Told:
-        done = run_images(damaged, config, known)
-        return Told(done.stamps_ns, done.world_from_camera, done.lost, done.problems, done.failure)
+        done = filter_images(damaged, config, known)
+        return Told(done.log.stamps_ns, done.log.poses, done.log.lost(), done.messages, done.failure)
 
     return _try_all("mono", sequence, run, faults)
 
@@ -213,11 +213,11 @@ def summarised(problems: list[str]) -> list[str]:
 
 
 def _truth(sequence: ImageSequence, stamps_ns: np.ndarray) -> np.ndarray:
-    truth = true_path(sequence.truth, stamps_ns)
+    truth = None if sequence.truth is None else truth_at(SE3, sequence.truth, stamps_ns, "none")
     if truth is None:
         raise InputError(f"{sequence.name} has no ground truth to judge a damaged run by")
     rows = np.clip(np.searchsorted(truth.rows, np.arange(stamps_ns.size)), 0, truth.rows.size - 1)
-    return truth.world_from_camera[rows]
+    return truth.poses[rows]
 
 
 RIG = RectifiedStereo(Pinhole(320, 240, 250.0, 250.0, 159.5, 119.5), 0.12)

@@ -27,12 +27,14 @@ from matplotlib.figure import Figure
 
 from rbpf.lie import SE3
 from rbpf.runs.plots import save_figures
+from rbpf.runs.recordings import filter_images
+from rbpf.runs.run import Run
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers import ImageFrame, ImageSequence, KnownPixels, open_images, read_known_points
 from rbpf.sensors.readers.images.sequence import Source
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.relocalisation import Attempt
-from rbpf.systems.mono.video import VideoRun, run_images
+from rbpf.systems.system import Tracked
 from rbpf.validation.simulation.desk_and_room import TexturedDesk, TexturedRoom
 from rbpf.validation.simulation.images import Imaging, simulate_images
 from rbpf.validation.sweep.parallel import in_parallel
@@ -194,21 +196,22 @@ class _Watch:
 
     def __init__(self, job: Job) -> None:
         self.job = job
-        self.run: VideoRun | None = None
+        self.run: Run | None = None
         self.done = 0
         self.visible = 0
         self.attempts: list[Attempt] = []
 
-    def __call__(self, t: int, frame: ImageFrame, run: VideoRun) -> None:
+    def __call__(self, run: Run, _: Tracked) -> None:
         """After a frame."""
+        t = len(run.log) - 1
         job, self.run, self.done = self.job, run, t + 1
         if t == job.dark.stop - 1:
             self.visible = in_view(run, job.reference[[job.dark.start - 1, job.dark.stop]])
         if t < job.dark.stop:
             return
-        if run.slam.attempt is not None:
-            self.attempts.append(run.slam.attempt)
-        tracked = run.lost[job.dark.stop : t + 1][-job.settled - 1 :]
+        if run.system.attempt is not None:
+            self.attempts.append(run.system.attempt)
+        tracked = run.log.lost()[job.dark.stop : t + 1][-job.settled - 1 :]
         if tracked.size > job.settled and not tracked.any():
             raise _EnoughError
 
@@ -220,15 +223,15 @@ def black_out(job: Job) -> Outcome:
     # The checkpoint stays as it is.
     config = replace(job.config, checkpoint_every=job.end + 1)
     with suppress(_EnoughError):
-        run_images(dark, config, known_of(job.folder), watch, job.checkpoint, resume=True)
+        filter_images(dark, config, known_of(job.folder), [watch], job.checkpoint, resume=True)
     run, done = watch.run, watch.done
     assert run is not None
     lit = np.arange(job.dark.stop, done)
-    still_lost = run.lost[lit] == 1.0
+    still_lost = run.log.lost()[lit]
     found = lit[~np.logical_or.accumulate(still_lost[::-1])[::-1]]
     span = slice(job.dark.start - 1, done)
-    metres, degrees = pose_differences(run.world_from_camera[span], job.reference[span])
-    lost = run.seconds[lit][still_lost]
+    metres, degrees = pose_differences(run.log.poses[span], job.reference[span])
+    lost = run.log["seconds"][lit][still_lost]
     seconds = float(np.median(lost)) if lost.size else np.nan
     attempts = tuple(watch.attempts)
     return Outcome(
@@ -284,22 +287,22 @@ def even_starts(first: int, stop: int, count: int) -> list[int]:
     return np.unique(np.linspace(first, max(first, stop - 1), count).astype(int)).tolist()
 
 
-def undisturbed(sequence: ImageSequence, blackouts: Blackouts, starts: list[int], out: Path) -> VideoRun:
+def undisturbed(sequence: ImageSequence, blackouts: Blackouts, starts: list[int], out: Path) -> Run:
     """Filters everything; the states before the frames `starts` stay as `out`/TTTTT.npz."""
     out.mkdir(parents=True, exist_ok=True)
 
-    def keep(t: int, frame: ImageFrame, run: VideoRun) -> None:
-        if t + 1 in starts:
-            run.save(out / f"{t + 1:05d}.npz")
+    def keep(run: Run, _: Tracked) -> None:
+        if len(run.log) in starts:
+            run.save(out / f"{len(run.log):05d}.npz")
 
-    return run_images(sequence, blackouts.config, known_of(blackouts.folder), keep)
+    return filter_images(sequence, blackouts.config, known_of(blackouts.folder), [keep])
 
 
-def in_view(run: VideoRun, truth: np.ndarray) -> int:
+def in_view(run: Run, truth: np.ndarray) -> int:
     """Landmarks of known depth that are in view from where the camera truly is; truth (2, 7) before and after."""
-    pose = SE3.compose(run.slam.loss.trusted[0], SE3.between(truth[0], truth[1]))
-    _, points = run.slam.loss.relocaliser.known_landmarks(run.filter.belief())
-    return int(run.sensor.camera.visible(SE3.inverse_transform(pose, points)).sum())
+    pose = SE3.compose(run.system.loss.trusted[0], SE3.between(truth[0], truth[1]))
+    _, points = run.system.loss.relocaliser.known_landmarks(run.system.filter.belief())
+    return int(run.system.sensor.camera.visible(SE3.inverse_transform(pose, points)).sum())
 
 
 def nearest_truth(sequence: ImageSequence) -> np.ndarray:

@@ -17,8 +17,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from rbpf.core.diagnostics import Band, chi_square_band
+from rbpf.runs.recordings import filter_features as run
 from rbpf.systems.mono.config import MonoConfig
-from rbpf.systems.mono.run import run
 from rbpf.validation.consistency.pose_errors import PoseErrors, pose_errors
 from rbpf.validation.gtsam.camera import solve_features
 from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
@@ -45,8 +45,8 @@ def solve_and_filter(job: Job) -> tuple[float, list[PoseErrors]]:
     errors = []
     for particles in job.particles:
         done = run(log, MonoConfig(particles=particles, seed=job.seed))
-        errors.append(pose_errors(done.world_from_camera, done.cov, truth))
-    return pose_errors(batch, done.cov, truth).rmse, errors
+        errors.append(pose_errors(done.log.poses, done.log.covs, truth))
+    return pose_errors(batch, done.log.covs, truth).rmse, errors
 
 
 def draw(names: list[str], mm: np.ndarray, nees: np.ndarray, band: Band, path: Path) -> None:

@@ -21,10 +21,12 @@ import tyro
 from matplotlib.figure import Figure
 
 from rbpf.runs.plots import save_figures
+from rbpf.runs.recordings import filter_images
+from rbpf.runs.run import Run
 from rbpf.sensors.camera import Pinhole
-from rbpf.sensors.readers import ImageFrame, open_images, read_known_points
+from rbpf.sensors.readers import open_images, read_known_points
 from rbpf.systems.mono.config import MonoConfig
-from rbpf.systems.mono.video import VideoRun, run_images
+from rbpf.systems.system import Tracked
 from rbpf.validation.simulation.desk_and_room import TexturedDesk, TexturedRoom
 from rbpf.validation.simulation.images import Imaging, simulate_images
 from rbpf.validation.simulation.textured_scene import ImageWorld
@@ -122,22 +124,22 @@ def measure_search(folder: Path, config: MonoConfig, name: str | None = None) ->
     every = max(1, len(sequence) // MOST_IMAGES)
     score, found, looks = [], [], []
 
-    def note(t: int, frame: ImageFrame, run: VideoRun) -> None:
-        measurement = run.slam.measurement
+    def note(run: Run, _: Tracked) -> None:
+        measurement = run.system.measurement
         assert measurement is not None
         searched = measurement.search
         score.append(searched.score)
         found.append(searched.found.copy())
-        if t % every == 0 and frame.image is not None:
-            looks.append(_look(frame.image))
+        if (len(run.log) - 1) % every == 0 and run.frame.image is not None:
+            looks.append(_look(run.frame.image))
 
-    run = run_images(sequence, config, known, note)
-    table = run.sensor.table
+    run = filter_images(sequence, config, known, [note])
+    table = run.system.sensor.table
     noise, contrast = np.median(looks, axis=0).tolist()
     return SearchStatistics(
         name or folder.name,
-        run.stamps_ns.size,
-        int(run.lost.sum()),
+        run.log.stamps_ns.size,
+        int(run.log.lost().sum()),
         np.concatenate(score),
         np.concatenate(found),
         config.search.min_correlation,

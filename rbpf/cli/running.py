@@ -25,7 +25,7 @@ from rbpf.errors import InputError
 
 if TYPE_CHECKING:
     from rbpf.runs.run import Run
-    from rbpf.validation.image_run import Telling
+    from rbpf.validation.finish import Callbacks
 
 
 class _Failing(Protocol):
@@ -66,10 +66,11 @@ def run_range_bearing(options: Annotated[RangeBearingOptions, tyro.conf.arg(name
 @RUN.add("mono")
 def run_mono(options: Annotated[MonoOptions, tyro.conf.arg(name="")]) -> None:
     """Monocular SLAM over a sequence of images or a video (E06: active search, inverse depth, FastSLAM 2.0)."""
+    from rbpf.runs.recordings import MonoRecording, filter_recording
     from rbpf.systems.mono.config import MonoConfig
     from rbpf.systems.settings import load_settings
-    from rbpf.validation.mono import Recording, finish_mono, start_mono
-    from rbpf.validation.report.rerun_file import require_rerun
+    from rbpf.validation.finish import finish_run
+    from rbpf.validation.report.rerun import require_rerun
 
     if options.rerun is not None:
         require_rerun()
@@ -79,14 +80,14 @@ def run_mono(options: Annotated[MonoOptions, tyro.conf.arg(name="")]) -> None:
     if options.localize != (options.map is not None):
         raise InputError("a camera is found in a known map with both: --map RUN --localize")
     markers, points = given_markers(options), options.known_points
-    recording = Recording(
+    recording = MonoRecording(
         options.sequence, points, options.calibration, board, options.map, markers, given_topics(options)
     )
     _run_images(
         options,
-        lambda tell: start_mono(recording, config, options.out, options.resume, tell),
-        lambda run, telling: finish_mono(
-            run, recording, options.out, options.video, options.rerun, options.batch, telling
+        lambda tell: filter_recording(recording, config, options.out, options.resume, [listener(tell)]),
+        lambda run, callbacks: finish_run(
+            run, options.out, recording.sources(), options.video, options.rerun, options.batch, callbacks
         ),
     )
 
@@ -96,7 +97,7 @@ def run_stereo(options: Annotated[StereoOptions, tyro.conf.arg(name="")]) -> Non
     """Stereo SLAM over a sequence of pairs of images (S05: SIFT landmarks, visual odometry, 400 particles)."""
     from rbpf.systems.settings import load_settings
     from rbpf.systems.stereo.config import StereoConfig
-    from rbpf.validation.report.rerun_file import require_rerun
+    from rbpf.validation.report.rerun import require_rerun
     from rbpf.validation.stereo import StereoRecording, finish_stereo, start_stereo
 
     if options.rerun is not None:
@@ -107,8 +108,8 @@ def run_stereo(options: Annotated[StereoOptions, tyro.conf.arg(name="")]) -> Non
     _run_images(
         options,
         lambda tell: start_stereo(recording, config, options.out, options.resume, tell),
-        lambda run, telling: finish_stereo(
-            run, recording, options.out, options.video, options.rerun, options.batch, telling
+        lambda run, callbacks: finish_stereo(
+            run, recording, options.out, options.video, options.rerun, options.batch, callbacks
         ),
     )
 
@@ -142,10 +143,10 @@ def listener(tell: Told) -> Callable[["Run", object], None]:
 def _run_images(
     options: ImageRunOptions,
     start: Callable[[Told], ImageRun],
-    finish: Callable[[ImageRun, "Telling"], dict[str, Any]],
+    finish: Callable[[ImageRun, "Callbacks"], dict[str, Any]],
 ) -> None:
     """Filters, then writes everything, with a bar for each stage of the work."""
-    from rbpf.validation.image_run import Telling
+    from rbpf.validation.finish import Callbacks
 
     _prepare(options)
     with progress() as bar:
@@ -153,13 +154,13 @@ def _run_images(
             run = start(tell)
         solving = bar.add_task("batch", total=None, visible=options.batch)
         drawing = bar.add_task("drawing", total=None, visible=options.video)
-        telling = Telling(
+        callbacks = Callbacks(
             on_frame=told(bar, drawing),
             on_iteration=lambda count, _error: bar.update(solving, completed=count),
             batch_s=options.batch_limit,
         )
         with finishing():
-            entries = finish(run, telling)
+            entries = finish(run, callbacks)
     _finish(entries, options, run.failure)
 
 

@@ -4,6 +4,7 @@ trajectory.tum           online filtered mean at every frame
 trajectory.npz           the same with covariances, and the last particles, see `rbpf.runs.results`
 truth.npz                the ground truth at these frames, see `rbpf.runs.truth`
 odometry.tum             the path by odometry alone, where there is odometry
+batch.tum                batch optimum of the same measurements, of the frames that took part
 map.npz, map.csv         landmarks: id, mean, covariance (within + between particles), and what the system adds
 observations*.csv        the measurements used, see `rbpf.runs.measurement_files`
 timings.csv              milliseconds per frame and stage
@@ -14,7 +15,11 @@ summary.json             the figures
 *.png, annotated.mp4     pictures; every frame with what was looked for in it
 report.html              one page with all figures and pictures
 
-What else a system leaves stands in its `files`: of the monocular one posterior.npz, posterior.tum and known_map.npz.
+What else a system leaves stands in its `files`; of the monocular one
+
+posterior.npz            the paths (T, N, 7) of the last frame's particles, and the particles' log-weights
+posterior.tum            their weighted mean, which later frames have sharpened
+known_map.npz            the points with what they look like, for --map; see `rbpf.systems.mono.known_map`
 """
 
 import json

@@ -6,6 +6,7 @@ follow from that.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, final
 
 import numpy as np
@@ -25,10 +26,12 @@ from rbpf.systems.system import (
 
 COMMON = (
     Column("seconds", "time that the system took, without reading and decoding", "s", table=TIMINGS),
-    Column("seconds_waiting", "time until the frame was read and decoded", "s"),
     Column("state", "state of tracking, as its place in `TrackingState`", kind=int),
 )
 """Columns of every system; times are written in milliseconds."""
+
+WAITING = Column("seconds_waiting", "time until the frame was read and decoded", "s")
+"""Likewise; written where a system has a name for it (`System.waiting`)."""
 
 _STATES = list(TrackingState)
 
@@ -44,13 +47,19 @@ class FrameLog:
         space: group of the poses.
         columns: what the system says of every frame besides `COMMON`.
         ragged: what it says of what every frame showed.
+        waiting: how `WAITING` is called in timings.csv; None leaves it out there.
     """
 
     def __init__(
-        self, space: SE2Group | SE3Group, columns: Sequence[Column], ragged: Sequence[Ragged] = ()
+        self,
+        space: SE2Group | SE3Group,
+        columns: Sequence[Column],
+        ragged: Sequence[Ragged] = (),
+        waiting: str | None = None,
     ) -> None:
         self.space = space
-        self.columns = (*COMMON, *columns)
+        table = None if waiting is None else TIMINGS
+        self.columns = (*COMMON, *columns, replace(WAITING, table=table, heading=waiting))
         self.ragged = tuple(ragged)
         self._path: dict[str, list[Any]] = {"stamps_ns": [], "poses": [], "covs": []}
         self._rows: dict[str, list[Any]] = {column.name: [] for column in self.columns}
@@ -59,7 +68,7 @@ class FrameLog:
     @classmethod
     def of(cls, system: System) -> "FrameLog":
         """An empty log for a system."""
-        return cls(system.space, system.columns, system.observed)
+        return cls(system.space, system.columns, system.observed, system.waiting)
 
     def __len__(self) -> int:
         return len(self._path["stamps_ns"])
@@ -105,6 +114,10 @@ class FrameLog:
     def observed(self, t: int) -> dict[str, np.ndarray]:
         """What frame t showed, arrays by name."""
         return {name: frames[t] for name, frames in self._observed.items()}
+
+    def all_observed(self) -> list[dict[str, np.ndarray]]:
+        """What each frame showed."""
+        return [self.observed(t) for t in range(len(self))]
 
     def append(self, tracked: Tracked, seconds: float, waiting: float = 0.0) -> None:
         """The next frame."""

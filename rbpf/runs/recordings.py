@@ -1,16 +1,34 @@
 """What is filtered: a recording of a kind that a system takes, opened to the system and the source of its frames."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from rbpf.core.models import Sensor
+from rbpf.errors import InputError
 from rbpf.runs.files import CHECKPOINT, prepare_folder
 from rbpf.runs.run import Listener, Run, Source, drive
 from rbpf.runs.truth import GroundTruth, truth_at
-from rbpf.sensors.readers import RobotLog, open_log
+from rbpf.sensors.calibration.boards import Board, MarkerBoard, find_board, find_markers
+from rbpf.sensors.camera import Pinhole
+from rbpf.sensors.feature_log import FeatureLog
+from rbpf.sensors.readers import (
+    ImageSequence,
+    KnownPixels,
+    RobotLog,
+    Topics,
+    open_images,
+    open_log,
+    read_known_points,
+)
+from rbpf.sensors.readers.images.sequence import UNNAMED
+from rbpf.systems.mono.config import MonoConfig
+from rbpf.systems.mono.known_map import KnownMap, read_known_map
+from rbpf.systems.mono.relocalisation import ImageScreen
+from rbpf.systems.mono.slam import MonoSlam
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.range_bearing.slam import RangeBearingSlam
 from rbpf.systems.system import System
@@ -71,11 +89,138 @@ class RobotRecording:
         return {"recording": str(self.log)}
 
 
+@dataclass(frozen=True)
+class MonoRecording:
+    """Images of one camera, and what is known of them beforehand.
+
+    Attributes:
+        images: a sequence of any kind that `open_images` knows.
+        known_points: table of known points; None starts without any.
+        calibration: camera.yaml in place of the sequence's own camera.
+        board: chessboard that is seen in the first image; its corners are the known points, in its frame.
+        map: run folder, or its map, in which the camera is to be found; the map is not changed. None maps anew.
+        markers: board of ArUco markers of which some are seen in the first image; likewise known points.
+        topics: of a ROS bag, which images and which truth.
+
+    Raises:
+        InputError: two of known points, board, markers and map are given, or two topics of images.
+    """
+
+    images: Path
+    known_points: Path | None = None
+    calibration: Path | None = None
+    board: Board | None = None
+    map: Path | None = None
+    markers: MarkerBoard | None = None
+    topics: Topics = UNNAMED
+
+    def __post_init__(self) -> None:
+        if len(self.topics.images) > 1:
+            raise InputError(
+                f"one camera has one topic of images: give one of {' and '.join(self.topics.images)}"
+            )
+        starts = self.known_points, self.board, self.markers
+        if self.known_points is not None and self.board is not None:
+            raise InputError("a run starts from known points or from a chessboard: give one of the two")
+        if self.markers is not None and any(start is not None for start in starts[:2]):
+            raise InputError("a run starts from markers, a chessboard or known points: give one of the three")
+        if self.map is not None and any(start is not None for start in starts):
+            raise InputError(
+                "in a known map a run starts from the map: leave out known points and chessboard"
+            )
+
+    def open(self, config: MonoConfig) -> Opened:
+        """The system and the images.
+
+        Raises:
+            InputError: a file is wrong, or the board is not found in the first image.
+        """
+        known_map = None if self.map is None else read_known_map(self.map)
+        return open_mono(*self.sequence(), config, known_map)
+
+    def sequence(self) -> tuple[ImageSequence, KnownPixels | None]:
+        """The images, and the known points if there are any; errors as `open`."""
+        known = None if self.known_points is None else read_known_points(self.known_points)
+        sequence = open_images(self.images, self.calibration, self.topics)
+        if self.board is not None:
+            known = find_board(first_image(sequence), self.board)
+        if self.markers is not None:
+            known = find_markers(first_image(sequence), self.markers)
+        return sequence, known
+
+    def sources(self) -> dict[str, str | float | bool]:
+        """For config.yaml."""
+        paths = {
+            "recording": self.images,
+            "known_points": self.known_points,
+            "calibration": self.calibration,
+            "known_map": self.map,
+        }
+        found: dict[str, str | float | bool] = {
+            name: str(path) for name, path in paths.items() if path is not None
+        }
+        if self.board is not None:
+            found |= {"board": f"{self.board.columns}x{self.board.rows}", "square_m": self.board.square_m}
+        if self.markers is not None:
+            board = self.markers
+            found |= {
+                "aruco": f"{board.columns}x{board.rows}",
+                "marker_m": board.side_m,
+                "gap_m": board.gap_m,
+            }
+            found["dictionary"] = board.dictionary
+        return found | ({} if self.map is None else {"localize": True}) | self.topics.entries()
+
+
 def open_robot_log(log: RobotLog, config: RangeBearingConfig) -> Opened:
     """A robot's log in memory."""
     system = RangeBearingSlam.of_log(log, config, keep_associations=config.association == "ml")
     stamps = np.array([frame.stamp_ns for frame in log.frames], dtype=np.int64)
     return Opened(system, LogSource(log), stamps, log.truth)
+
+
+def open_mono(
+    sequence: ImageSequence, known: KnownPixels | None, config: MonoConfig, known_map: KnownMap | None = None
+) -> Opened:
+    """A sequence of images; with known points in the first one, or a known map, or without either.
+
+    Raises:
+        InputError: the first image cannot be read or shows nothing, or the known points do not determine the camera.
+    """
+    if known_map is None:
+        image, problem = ImageScreen(sequence.camera).usable(first_image(sequence))
+        if known is not None and image is None:  # the known points' pixels are those in this image
+            raise InputError(f"{sequence.name}: the first image is needed to start: {problem}")
+    system = MonoSlam(sequence.camera, config, known, known_map)
+    return Opened(system, sequence, sequence.stamps_ns, sequence.truth)
+
+
+def open_features(
+    log: FeatureLog, config: MonoConfig, wrapped: Callable[[Sensor], Sensor] | None = None
+) -> Opened:
+    """A log of one camera's named features; `wrapped` as `MonoSlam`'s.
+
+    Raises:
+        InputError: the log is of a stereo pair, or a setting does not fit.
+    """
+    if not isinstance(log.camera, Pinhole):
+        raise InputError(f"{log.name}: monocular SLAM needs a log of one camera, this is a stereo log")
+    system = MonoSlam(log.camera, config, log.known, wrapped=wrapped)
+    stamps = np.array([frame.stamp_ns for frame in log.frames], dtype=np.int64)
+    return Opened(system, LogSource(log), stamps, log.truth)
+
+
+def first_image(sequence: ImageSequence) -> np.ndarray:
+    """The image (H, W) that a run starts from.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    first = next(sequence.frames(), None)
+    if first is None or first.image is None:
+        reason = "it has no image" if first is None else first.problem
+        raise InputError(f"{sequence.name}: the first image is needed to start: {reason}")
+    return first.image
 
 
 class Recording(Protocol):
@@ -133,3 +278,34 @@ def filter_opened(
 def filter_robot_log(log: RobotLog, config: RangeBearingConfig) -> Run:
     """A robot's log in memory, filtered to its end."""
     return filter_opened(open_robot_log(log, config))
+
+
+def filter_features(
+    log: FeatureLog,
+    config: MonoConfig,
+    wrapped: Callable[[Sensor], Sensor] | None = None,
+    listeners: Iterable[Listener] = (),
+) -> Run:
+    """A log of one camera's named features, filtered to its end.
+
+    Raises:
+        InputError: as `open_features`, or a frame cannot be filtered.
+    """
+    run = filter_opened(open_features(log, config, wrapped), listeners)
+    if run.failure is not None:
+        raise InputError(run.failure)
+    return run
+
+
+def filter_images(
+    sequence: ImageSequence,
+    config: MonoConfig,
+    known: KnownPixels | None = None,
+    listeners: Iterable[Listener] = (),
+    checkpoint: Path | None = None,
+    resume: bool = False,
+    known_map: KnownMap | None = None,
+) -> Run:
+    """A sequence of images, filtered to its end; errors as `open_mono` and `drive`."""
+    opened = open_mono(sequence, known, config, known_map)
+    return filter_opened(opened, listeners, checkpoint, config.checkpoint_every, resume)

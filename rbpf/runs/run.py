@@ -20,7 +20,7 @@ from rbpf.core.checkpoint import checked, fitting
 from rbpf.errors import InputError
 from rbpf.runs.frame_log import FrameLog
 from rbpf.runs.truth import RunTruth
-from rbpf.systems.system import System, Tracked, TrackingState
+from rbpf.systems.system import System, Tracked
 
 
 class Source(Protocol):
@@ -44,6 +44,7 @@ class Run:
         truth: ground truth of the recording; None where it has none.
         expected: number of frames that the recording has; None where it is not known.
         log: one row per frame.
+        frame: the last one that was taken; None before the first.
         messages: what was worth saying of single frames, in words: "frame 12: …".
         failure: why the run ended before the recording did, in words; None where it did not.
     """
@@ -53,6 +54,7 @@ class Run:
     truth: RunTruth | None = None
     expected: int | None = None
     log: FrameLog = field(init=False)
+    frame: Any = None
     messages: list[str] = field(default_factory=list)
     failure: str | None = None
 
@@ -73,15 +75,10 @@ class Run:
         started = time.perf_counter()
         tracked = self.system.take(frame)
         seconds = time.perf_counter() - started
+        self.frame = frame
         self.messages += [f"{self.system.frame_word} {len(self.log)}: {words}" for words in tracked.messages]
         self.log.append(tracked, seconds, waiting)
         return tracked
-
-    def relocalisations(self) -> list[int]:
-        """Numbers of the frames in which the system found itself again after it had been lost."""
-        lost = np.concatenate([[False], self.log.lost()])
-        tracked = np.array([state is TrackingState.TRACKED for state in self.log.states], dtype=bool)
-        return np.flatnonzero(lost[:-1] & tracked).tolist()
 
     def save(self, path: Path) -> None:
         """Writes a checkpoint of the system and of everything gathered so far.

@@ -167,6 +167,7 @@ class System(ABC):
     Attributes:
         name: as on the command line.
         frame_word: what a frame is called in messages.
+        waiting: how the time until a frame was read and decoded is called in timings.csv; None leaves it out there.
         columns: what `Tracked.values` holds, in the order of the tables that are written.
         observed: what `Tracked.observed` holds.
         space: group of the poses.
@@ -177,6 +178,7 @@ class System(ABC):
 
     name: ClassVar[str]
     frame_word: ClassVar[str] = "frame"
+    waiting: ClassVar[str | None] = None
     columns: tuple[Column, ...]
     observed: tuple[Ragged, ...] = ()
     space: SE2Group | SE3Group

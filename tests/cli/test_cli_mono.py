@@ -14,9 +14,9 @@ from rbpf.cli import main
 from rbpf.core.filter import Filter
 from rbpf.lie import SE3
 from rbpf.runs.measurement_files import read_feature_log
+from rbpf.runs.recordings import filter_features as filter_log
 from rbpf.runs.trajectory import read_tum
 from rbpf.systems.mono.config import MonoConfig
-from rbpf.systems.mono.run import run as filter_log
 from rbpf.validation.gtsam.camera import CameraEstimate, solve_features
 from rbpf.validation.gtsam.mono_batch import ROBUST
 from tests.cli.mono_sequences import CAMERA, FRAMES, run, sentence, summary
@@ -83,10 +83,10 @@ def test_the_map_is_in_that_world_and_flags_rays(desk, finished):
 def test_the_measurements_are_those_that_the_filter_used(finished):
     """Filtered again without the images, they give the same path to the last bit."""
     log, config = read_feature_log(finished), MonoConfig(particles=8)
-    again = filter_log(log, config)
+    again = filter_log(log, config).log
     told = read_tum(finished / "trajectory.tum")
     np.testing.assert_array_equal(again.stamps_ns, told.stamps_ns)
-    np.testing.assert_allclose(again.world_from_camera, told.world_from_body, atol=1e-9)
+    np.testing.assert_allclose(again.poses, told.world_from_body, atol=1e-9)
 
 
 def test_the_batch_optimum_of_them_lies_beside(finished):
@@ -168,7 +168,7 @@ def test_a_resumed_run_is_identical(desk, finished, tmp_path, monkeypatch):
 def test_a_checkpoint_of_another_sequence_is_refused(desk, folder, tmp_path, capsys):
     assert run(desk, tmp_path / "run", "--set", "checkpoint_every=5", known=False) == 0
     assert run(folder, tmp_path / "run", "--resume", known=False) == 2
-    assert "another sequence" in sentence(capsys)
+    assert "another recording" in sentence(capsys)
 
 
 def test_it_starts_without_known_points(desk, tmp_path):
@@ -215,7 +215,7 @@ def test_a_missing_rerun_is_said_before_the_run(desk, tmp_path, monkeypatch, cap
 def test_the_program_starts_without_rerun_and_encoder(monkeypatch):
     monkeypatch.setitem(sys.modules, "rerun", None)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    for name in ("mono", "mono_rerun", "rerun_file", "mono_video"):
+    for name in ("finish", "report.rerun", "report.video"):
         assert importlib.reload(importlib.import_module(f"rbpf.validation.{name}"))
 
 

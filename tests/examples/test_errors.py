@@ -24,17 +24,16 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.folder import write_trajectory
 from rbpf.runs.measurement_files import write_measurements
+from rbpf.runs.path_and_map import PathAndMap
+from rbpf.runs.recordings import filter_features
 from rbpf.runs.trajectory import Trajectory
 from rbpf.runs.truth import RunTruth, write_truth
 from rbpf.sensors.feature_log import FeatureFrame, FeatureLog
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.mono.config import MonoConfig
-from rbpf.systems.mono.run import run
-from rbpf.systems.mono.run import run as filter_log
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.validation.gtsam.mono_batch import Batch, adjust_log
-from rbpf.validation.metrics.path_and_map import PathAndMap
 from rbpf.validation.simulation.features import MONO, STEREO, Measuring, simulate_features
 from rbpf.validation.simulation.point_worlds import DeskWorld
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
@@ -62,9 +61,9 @@ def folder(tmp_path):
     """What a monocular run leaves, as far as it is read here, of a simulated log."""
     log = simulate_features(DeskWorld(frames=25), Measuring(), MONO, 3)
     config = MonoConfig(particles=8)
-    run = filter_log(log, config)
+    run = filter_features(log, config)
     write_measurements(tmp_path, log)
-    write_trajectory(tmp_path, run.stamps_ns, run.world_from_camera, run.cov)
+    write_trajectory(tmp_path, run.log.stamps_ns, run.log.poses, run.log.covs)
     write_truth(tmp_path, RunTruth(np.arange(25), log.truth.world_from_camera))
     (tmp_path / "config.yaml").write_text("rbpf: 0\nsystem: mono\nparticles: 8\n")
     (tmp_path / "summary.json").write_text("{}")
@@ -202,8 +201,9 @@ def test_depths_are_the_true_ones(log, batch):
 
 def test_landmarks_start_at_the_given_depths(log, batch):
     depths = batch_depths(batch)
-    done = run(replace(log, frames=log.frames[:1]), SMALL, wrapped=lambda sensor: GivenDepths(sensor, depths))
-    belief = done.filter.belief()
+    one = replace(log, frames=log.frames[:1])
+    done = filter_features(one, SMALL, lambda sensor: GivenDepths(sensor, depths))
+    belief = done.system.filter.belief()
     rays = {i: i for i in belief.map.ids.tolist() if i in depths}
     assert len(rays) > 10
     records = belief.read(np.array(list(rays.values())))

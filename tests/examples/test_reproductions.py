@@ -1,7 +1,5 @@
 """The parts that reproduce the paper's figures, each against a case that can be worked out."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -18,9 +16,9 @@ from examples.studies.s05.record import Best, Paths, Record, errors
 from examples.studies.s05.sweeps import settings
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.runs.recordings import filter_images
 from rbpf.sensors.camera import Pinhole
 from rbpf.systems.mono.config import MonoConfig, SearchConfig
-from rbpf.systems.mono.video import SearchRecord, run_images
 from rbpf.validation.simulation.render import Renderer
 from rbpf.validation.simulation.textured_scene import cast
 from tests.systems.plane_sequences import known_points, sequence
@@ -36,10 +34,13 @@ def sighting(rows, found, started=0):
     k = len(rows)
     px = np.where(np.array(found, dtype=bool)[:, None], 5.0, np.nan) if k else np.zeros((0, 2))
     line = np.full((k, 2, 2), np.nan)
-    return SearchRecord(
-        np.array(rows, dtype=int), np.zeros((k, 2)), np.zeros((k, 2, 2)), px, np.zeros((k, 2, 2)), line, np.zeros((k, 4)),
-        np.arange(started), np.zeros((started, 2)),
-    )  # fmt: skip
+    return {
+        "features": np.array(rows, dtype=int),
+        "px": px,
+        "line": line,
+        "started": np.arange(started),
+        "started_px": np.zeros((started, 2)),
+    }
 
 
 def test_a_plane_is_fitted_whatever_its_pose():
@@ -70,10 +71,8 @@ def test_a_loop_is_closed_when_the_start_is_found_again():
 
 def test_distances_from_epipolar_lines():
     one = sighting([1, 2, 3], [True, False, True])
-    line = one.line.copy()
-    line[:2] = [[0.0, 0.0], [30.0, 40.0]]
-    px = np.array([[12.0 + 2.0, 16.0 - 1.5], [np.nan, np.nan], [9.0, 9.0]])
-    one = replace(one, line=line, px=px)
+    one["line"][:2] = [[0.0, 0.0], [30.0, 40.0]]
+    one["px"] = np.array([[12.0 + 2.0, 16.0 - 1.5], [np.nan, np.nan], [9.0, 9.0]])
     assert line_distances(one) == pytest.approx([2.5])
     assert line_lengths(one) == pytest.approx([50.0])
 
@@ -104,21 +103,22 @@ def test_the_likelihood_of_depth_has_its_peak_at_the_truth():
 def test_the_map_is_filled_with_landmarks_that_are_never_looked_for():
     added, held, searched = [], [], []
 
-    def watch(t, frame, run):
+    def watch(run, _):
+        t = len(run.log) - 1
         if t == 5:
-            first = len(run.sensor.table)
+            first = len(run.system.sensor.table)
             fill(run, 500, np.random.default_rng(0))
-            added.extend(range(first, len(run.sensor.table)))
-            held.append(run.filter.belief().map.ids.size)
+            added.extend(range(first, len(run.system.sensor.table)))
+            held.append(run.system.filter.belief().map.ids.size)
         elif t > 5:
-            searched.extend(run.slam.measurement.search.features.tolist())
+            searched.extend(run.system.measurement.search.features.tolist())
 
-    run = run_images(sequence(10), MonoConfig(particles=5), known_points(), watch)
+    run = filter_images(sequence(10), MonoConfig(particles=5), known_points(), [watch])
     assert held == [500]
-    assert run.filter.belief().map.ids.size >= 500
+    assert run.system.filter.belief().map.ids.size >= 500
     assert len(added) > 400 and len(searched) > 40
     assert not set(added) & set(searched)
-    assert not run.lost.any()
+    assert not run.log.lost().any()
 
 
 def test_the_poster_s_corners_are_where_the_picture_shows_them():

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
+from rbpf.runs.recordings import filter_features as run
 from rbpf.systems.mono.config import MonoConfig
-from rbpf.systems.mono.run import run
 from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
 from rbpf.validation.simulation.point_worlds import DeskWorld
 
@@ -15,16 +15,16 @@ out.mkdir()
 for known in (4, 0):
     log = simulate_features(DeskWorld(frames=120), Measuring(known=known), MONO, 3)
     done = run(log, MonoConfig(particles=30))
-    belief = done.filter.belief()
+    belief = done.system.filter.belief()
     points = np.flatnonzero([belief.map.landmark_of(i).dim == 3 for i in belief.map.ids.tolist()])
     np.savez(
         out / f"known_{known}.npz",
-        mean=done.world_from_camera,
-        cov=done.cov,
-        ess=done.ess,
-        log_evidence=done.log_evidence,
-        nis=done.nis,
-        state=done.filter.particles.state,
-        log_weights=done.filter.particles.log_weights,
+        mean=done.log.poses,
+        cov=done.log.covs,
+        ess=done.log["ess"],
+        log_evidence=done.log["log_evidence"],
+        nis=done.log["nis"],
+        state=done.system.filter.particles.state,
+        log_weights=done.system.filter.particles.log_weights,
         points=points,
     )

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 
 from rbpf.lie import SE3
+from rbpf.runs.run import Run
 from rbpf.sensors.feature_log import FeatureFrame, FeatureLog
 from rbpf.systems.mono.config import MonoConfig
-from rbpf.systems.mono.run import MonoRun
 from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
 from rbpf.validation.simulation.point_worlds import DeskWorld
 
@@ -36,13 +36,13 @@ def rows(frame: FeatureFrame, keep: np.ndarray) -> FeatureFrame:
     return replace(frame, landmarks=frame.landmarks[keep], z=frame.z[keep], cov_z=frame.cov_z[keep])
 
 
-def errors(run: MonoRun) -> np.ndarray:
+def errors(run: Run) -> np.ndarray:
     """(T, 6) of the online estimates in the charts at them."""
-    assert run.log.truth is not None
-    return SE3.local(run.world_from_camera, run.log.truth.world_from_camera)
+    truth = run.source.log.truth  # type: ignore[attr-defined]
+    return SE3.local(run.log.poses, truth.world_from_camera)
 
 
-def nees(run: MonoRun) -> np.ndarray:
+def nees(run: Run) -> np.ndarray:
     """(T,) normalised squared errors."""
-    pairs = zip(errors(run), run.cov, strict=True)
+    pairs = zip(errors(run), run.log.covs, strict=True)
     return np.array([error @ np.linalg.solve(cov, error) for error, cov in pairs])

@@ -8,6 +8,7 @@ import pytest
 from examples.studies.image_faults import cover_view
 from rbpf.core.models import Part
 from rbpf.lie import SE3
+from rbpf.runs.recordings import filter_images
 from rbpf.runs.trajectory import Trajectory
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureFrame
@@ -18,8 +19,7 @@ from rbpf.systems.mono.config import MonoConfig, SearchConfig
 from rbpf.systems.mono.feature_table import PATCH_HALF_PX, view_change
 from rbpf.systems.mono.image_sensor import ImageSensor
 from rbpf.systems.mono.slam import MonoSlam
-from rbpf.systems.mono.video import run_images
-from rbpf.validation.metrics.mono_scores import score_path
+from rbpf.validation.metrics.accuracy import ate
 from rbpf.validation.simulation.desk_and_room import TexturedDesk
 from rbpf.validation.simulation.images import Imaging, simulate_images
 from tests.systems.mono_logs import SMALL
@@ -208,8 +208,8 @@ def test_a_feature_that_may_be_anywhere_agrees_with_no_motion(fraction):
     std_px = fraction * WIDEST * SEARCH.max_radius_px / SEARCH.ellipse_sigmas
     uncertain = known_points().names.size  # the first that is no known point
 
-    def widened(t, frame, run):
-        search = run.sensor.search
+    def widened(run, _):
+        search = run.system.sensor.search
         innovations = type(search)._innovations
 
         def wider(belief, rows, px):
@@ -219,10 +219,11 @@ def test_a_feature_that_may_be_anywhere_agrees_with_no_motion(fraction):
 
         search._innovations = wider
 
-    later = run_images(sequence(6), MonoConfig(particles=5), known_points(), widened).searches[2:]
-    found = [bool(one.found[one.features == uncertain][0]) for one in later if uncertain in one.features]
+    run = filter_images(sequence(6), MonoConfig(particles=5), known_points(), [widened])
+    later = [(one["features"], np.isfinite(one["px"]).all(axis=1)) for one in run.log.all_observed()[2:]]
+    found = [bool(hits[features == uncertain][0]) for features, hits in later if uncertain in features]
     assert found and all(one == (fraction < 1.0) for one in found)
-    assert later[-1].found.sum() > 10
+    assert later[-1][1].sum() > 10
 
 
 # A thing that moves through the view: what is new on it has to prove itself before it says where the camera is.
@@ -239,19 +240,19 @@ def test_a_third_of_the_view_moves_and_the_camera_is_not_taken_along(tmp_path):
     worst = {}
     credulous = MonoConfig(search=SearchConfig(trusted_fraction=0.0))
     for name, config in (("credulous", credulous), ("usual", MonoConfig())):
-        runs = [run_images(damaged, replace(config, seed=seed), known) for seed in (0, 1)]
-        scores = [
-            score_path(recording.truth, Trajectory(run.stamps_ns, run.world_from_camera), "none")
-            for run in runs
+        runs = [filter_images(damaged, replace(config, seed=seed), known) for seed in (0, 1)]
+        stamps = recording.stamps_ns
+        paths = [
+            Trajectory(stamps, poses) for poses in (*(run.log.poses for run in runs), runs[0].truth.poses)
         ]
-        worst[name] = max(score["path_rmse_m"] for score in scores)
+        worst[name] = max(ate(path, paths[-1]).rmse for path in paths[:-1])
     assert worst["usual"] < 0.03
     assert worst["credulous"] > 2.0 * worst["usual"]
 
 
 def test_what_is_often_missed_only_updates_the_map():
-    run = run_images(sequence(12), SMALL, known_points())
-    sensor, belief, used = run.sensor, run.filter.belief(), run.slam.measurement.used
+    run = filter_images(sequence(12), SMALL, known_points())
+    sensor, belief, used = run.system.sensor, run.system.filter.belief(), run.system.measurement.used
     untrusted = [row for row in used.landmarks.tolist() if sensor.table.member[row] < 0][:3]
     assert len(untrusted) == 3
 
@@ -266,7 +267,7 @@ def test_what_is_often_missed_only_updates_the_map():
 
 
 def test_where_few_are_trusted_all_of_them_are():
-    table = run_images(sequence(12), SMALL, known_points()).sensor.table
+    table = filter_images(sequence(12), SMALL, known_points()).system.sensor.table
     rows = np.arange(8)
     assert table.trusted(rows, SEARCH.trusted_fraction).all()
     table.member[rows], table.attempts[rows], table.found[rows] = -1, 10, 2

@@ -7,11 +7,11 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.runs.recordings import filter_images
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers.images.sequence import ImageSequence, Source
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.known_map import KnownMap, read_known_map, write_known_map
-from rbpf.systems.mono.video import run_images
 from tests.systems.plane_sequences import CAMERA, known_points, path, sequence
 
 MAPPED, FRAMES = 60, 90
@@ -34,13 +34,13 @@ def from_frame(whole: ImageSequence, first: int) -> ImageSequence:
 
 @pytest.fixture(scope="module")
 def mapped() -> KnownMap:
-    run = run_images(sequence(MAPPED), MonoConfig(particles=20), known_points())
-    return run.slam.export_map(run.world_from_camera)
+    run = filter_images(sequence(MAPPED), MonoConfig(particles=20), known_points())
+    return run.system.export_map(run.log.poses)
 
 
 @pytest.fixture(scope="module")
 def localised(mapped):
-    return run_images(from_frame(sequence(FRAMES), MAPPED), MonoConfig(particles=20), mapped=mapped)
+    return filter_images(from_frame(sequence(FRAMES), MAPPED), MonoConfig(particles=20), known_map=mapped)
 
 
 def made_up(count: int = 12) -> KnownMap:
@@ -62,18 +62,18 @@ def test_the_map_is_that_of_the_run(mapped):
 
 
 def test_the_camera_is_found_at_once_and_followed(localised):
-    assert not localised.lost.any()
-    assert localised.problems[0] == "frame 0: the camera is found in the map"
-    assert localised.relocalisations == []
+    assert not localised.log.lost().any()
+    assert localised.messages[0] == "frame 0: the camera is found in the map"
+    assert np.flatnonzero(localised.log["relocalised"]).tolist() == []
     truth = path(FRAMES)[MAPPED:]
-    error = np.linalg.norm(localised.world_from_camera[:, 4:] - truth[:, 4:], axis=1)
+    error = np.linalg.norm(localised.log.poses[:, 4:] - truth[:, 4:], axis=1)
     assert np.sqrt(np.square(error).mean()) < 0.02
-    turned = np.linalg.norm(SE3.local(localised.world_from_camera, truth)[:, :3], axis=1)
+    turned = np.linalg.norm(SE3.local(localised.log.poses, truth)[:, :3], axis=1)
     assert np.sqrt(np.square(turned).mean()) < np.deg2rad(1.0)
 
 
 def test_the_map_is_not_changed_and_nothing_is_added(localised, mapped):
-    belief = localised.filter.belief()
+    belief = localised.system.filter.belief()
     ids = belief.map.ids
     assert ids.size == mapped.names.size
     records = belief.read(ids)
@@ -87,9 +87,9 @@ def test_uncertain_points_make_an_uncertain_pose(mapped):
     vague = replace(mapped, cov=mapped.cov + 0.03**2 * np.eye(3))
     stds = []
     for known in (mapped, vague):
-        run = run_images(few, MonoConfig(particles=20), mapped=known)
-        assert not run.lost[-1]
-        stds.append(np.sqrt(np.trace(run.cov[-1, 3:, 3:])))
+        run = filter_images(few, MonoConfig(particles=20), known_map=known)
+        assert not run.log.lost()[-1]
+        stds.append(np.sqrt(np.trace(run.log.covs[-1, 3:, 3:])))
     assert stds[1] > 1.5 * stds[0]
 
 
@@ -98,24 +98,24 @@ def test_a_camera_that_sees_something_else_is_lost_and_says_how_little_it_knows(
     other = replace(
         mapped, windows=np.random.default_rng(1).integers(0, 256, mapped.windows.shape, dtype=np.uint8)
     )
-    run = run_images(blank, MonoConfig(particles=20), mapped=other)
-    assert run.lost.all()
-    assert np.sqrt(run.cov[:, 3:, 3:].diagonal(axis1=1, axis2=2)).min() >= mapped.size_m
+    run = filter_images(blank, MonoConfig(particles=20), known_map=other)
+    assert run.log.lost().all()
+    assert np.sqrt(run.log.covs[:, 3:, 3:].diagonal(axis1=1, axis2=2)).min() >= mapped.size_m
 
 
 def test_a_resumed_run_has_the_same_bytes(localised, mapped, tmp_path):
     whole, config = from_frame(sequence(FRAMES), MAPPED), MonoConfig(particles=20, checkpoint_every=10)
     checkpoint = tmp_path / "checkpoint.npz"
 
-    def stop(t, _frame, _run):
-        if t == 7:
+    def stop(run, _):
+        if len(run.log) == 8:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run_images(whole, config, None, stop, checkpoint, mapped=mapped)
-    run = run_images(whole, config, None, None, checkpoint, resume=True, mapped=mapped)
-    np.testing.assert_array_equal(run.world_from_camera, localised.world_from_camera)
-    np.testing.assert_array_equal(run.cov, localised.cov)
+        filter_images(whole, config, None, [stop], checkpoint, known_map=mapped)
+    run = filter_images(whole, config, None, (), checkpoint, resume=True, known_map=mapped)
+    np.testing.assert_array_equal(run.log.poses, localised.log.poses)
+    np.testing.assert_array_equal(run.log.covs, localised.log.covs)
 
 
 FISHEYE = Pinhole(320, 240, 131.0, 131.0, 159.5, 119.5, (-0.03, 0.02, -0.012, 0.002), "equidistant")
@@ -173,7 +173,7 @@ def test_no_map_too_small_a_map_and_another_camera(tmp_path, mapped):
         read_known_map(tmp_path)
     wide = replace(mapped, camera=Pinhole(320, 240, 180.0, 180.0, 159.5, 119.5))
     with pytest.raises(InputError, match="the map was made with images of 320x240"):
-        run_images(sequence(3), MonoConfig(particles=5), mapped=wide)
+        filter_images(sequence(3), MonoConfig(particles=5), known_map=wide)
     words = "made through a lens with equidistant distortion, .* has radial-tangential distortion"
     with pytest.raises(InputError, match=words):
-        run_images(sequence(3), MonoConfig(particles=5), mapped=replace(mapped, camera=FISHEYE))
+        filter_images(sequence(3), MonoConfig(particles=5), known_map=replace(mapped, camera=FISHEYE))

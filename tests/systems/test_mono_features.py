@@ -17,10 +17,11 @@ from rbpf.lie import SE3
 from rbpf.maps.constellation import Constellation, UncertainConstellation
 from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.maps.point import Point
+from rbpf.runs.recordings import filter_features as run
+from rbpf.runs.run import Run
 from rbpf.sensors.camera.points import CameraRay, EpipolarRay
 from rbpf.sensors.feature_log import FeatureFrame, FeatureLog, KnownPoints
 from rbpf.systems.mono.config import InverseDepthConfig, MonoConfig, VelocityConfig
-from rbpf.systems.mono.run import MonoRun, run
 from rbpf.systems.mono.slam import MonoSlam, particle_points, world_of
 from rbpf.validation.simulation.features import STEREO, Measuring, simulate_features
 from rbpf.validation.simulation.point_worlds import DeskWorld
@@ -51,18 +52,20 @@ def kinds(filter_: Filter) -> dict[int, type]:
 def test_compiled_equals_numpy(config):
     log = replace(LOG, frames=LOG.frames[:6])
     one, other = (run(log, replace(config, compiled=compiled)) for compiled in (True, False))
-    np.testing.assert_allclose(one.log_evidence, other.log_evidence, atol=1e-5)
-    np.testing.assert_allclose(one.world_from_camera, other.world_from_camera, atol=1e-7)
-    np.testing.assert_allclose(one.filter.particles.state, other.filter.particles.state, atol=1e-6)
-    np.testing.assert_array_equal(one.resampled, other.resampled)
-    assert kinds(one.filter) == kinds(other.filter)
+    np.testing.assert_allclose(one.log["log_evidence"], other.log["log_evidence"], atol=1e-5)
+    np.testing.assert_allclose(one.log.poses, other.log.poses, atol=1e-7)
+    np.testing.assert_allclose(
+        one.system.filter.particles.state, other.system.filter.particles.state, atol=1e-6
+    )
+    np.testing.assert_array_equal(one.log["resampled"], other.log["resampled"])
+    assert kinds(one.system.filter) == kinds(other.system.filter)
 
 
 @every_setting
 def test_equal_seeds_give_equal_bytes(config):
     first, second, other = (run(LOG, replace(config, seed=seed)) for seed in (1, 1, 2))
-    assert same(content(first.filter), content(second.filter))
-    assert not same(content(first.filter), content(other.filter))
+    assert same(content(first.system.filter), content(second.system.filter))
+    assert not same(content(first.system.filter), content(other.system.filter))
 
 
 THREADS = """
@@ -70,7 +73,7 @@ import hashlib
 import numba
 from dataclasses import replace
 from rbpf.kernels.signature import PAIRS_PER_THREAD
-from rbpf.systems.mono.run import run
+from rbpf.runs.recordings import filter_features as run
 from tests.core.worlds import content
 from tests.systems.mono_logs import SMALL, desk
 
@@ -78,9 +81,10 @@ numba.set_num_threads({threads})
 log = desk(2, frames=4, measurements=20)
 rows = []
 config = replace(SMALL, particles=1500, known="points")
-done = run(log, config, lambda t, filter_, report: rows.append(max(len(g.z) for g in report.groups)))
+most = lambda run, _: rows.append(max(len(group.z) for group in run.system.report.groups))
+done = run(log, config, listeners=[most])
 digest = hashlib.sha256()
-for name, array in sorted(content(done.filter).items()):
+for name, array in sorted(content(done.system.filter).items()):
     digest.update(name.encode() + array.tobytes())
 print(max(rows) * 1500 >= 2 * PAIRS_PER_THREAD, digest.hexdigest())
 """
@@ -103,7 +107,8 @@ def test_threads_do_not_change_a_byte():
 def test_rays_become_points(mode):
     """All at once in all particles, when enough of the weight is ready; none in a first frame."""
     log, seen = desk(1, frames=25), []
-    done = run(log, replace(SMALL, known=mode), lambda t, filter_, report: seen.append(kinds(filter_)))
+    note = lambda run, _: seen.append(kinds(run.system.filter))  # noqa: E731
+    done = run(log, replace(SMALL, known=mode), listeners=[note])
     given = set(known(log.known).names.tolist())
     assert not any(kind is Point for name, kind in seen[0].items() if name not in given)
     promoted = [name for name, kind in seen[-1].items() if kind is Point and name not in given]
@@ -120,10 +125,11 @@ def groups_of(constrain, log=LOG) -> list[set[tuple[type, frozenset[Part]]]]:
     """Models of rays in each frame, with what they inform."""
     found = []
 
-    def record(t, filter_, report):
-        found.append({(type(g.model), g.updates) for g in report.groups if isinstance(g.model, CameraRay)})
+    def record(run, _):
+        groups = run.system.report.groups
+        found.append({(type(g.model), g.updates) for g in groups if isinstance(g.model, CameraRay)})
 
-    run(log, replace(SMALL, inverse_depth=InverseDepthConfig(constrain)), record)
+    run(log, replace(SMALL, inverse_depth=InverseDepthConfig(constrain)), listeners=[record])
     return found
 
 
@@ -155,7 +161,7 @@ def test_a_camera_at_rest_learns_no_depth(constrain):
         SMALL, inverse_depth=InverseDepthConfig(constrain, from_scene_depth=False), velocity=still
     )
     done = run(replace(LOG, frames=frames, truth=None), config)
-    held = done.filter.belief().map
+    held = done.system.filter.belief().map
     rays = [i for i in held.ids.tolist() if isinstance(held.landmark_of(i), InverseDepth)]
     assert len(rays) == len(LOG.frames[0].landmarks) - 4
     np.testing.assert_array_equal(
@@ -169,8 +175,9 @@ def test_two_frames_at_the_same_time(config):
     again = replace(LOG.frames[3], stamp_ns=LOG.frames[2].stamp_ns)
     log = replace(LOG, frames=[*LOG.frames[:3], again, *LOG.frames[4:6]], truth=None)
     states = []
-    done = run(log, config, lambda t, filter_, report: states.append(filter_.particles.state.copy()))
-    assert np.isfinite(done.log_evidence).all() and np.isfinite(done.cov).all()
+    note = lambda run, _: states.append(run.system.filter.particles.state.copy())  # noqa: E731
+    done = run(log, config, listeners=[note])
+    assert np.isfinite(done.log["log_evidence"]).all() and np.isfinite(done.log.covs).all()
     before = {state.tobytes() for state in np.round(states[2], 9) + 0.0}
     assert {state.tobytes() for state in np.round(states[3], 9) + 0.0} <= before
 
@@ -180,9 +187,9 @@ def test_an_empty_frame(config):
     """Nothing is seen: the camera goes on and grows uncertain; afterwards it is found again."""
     nothing = np.zeros(0, dtype=np.int64)
     done = run(changed(LOG, 5, lambda f: rows(f, nothing)), config)
-    volume = np.linalg.det(done.cov)
+    volume = np.linalg.det(done.log.covs)
     assert volume[5] > 10.0 * volume[4] and volume[6] < 0.1 * volume[5]
-    assert done.rows[5] == 0 and done.log_evidence[5] == pytest.approx(0.0, abs=1e-9)
+    assert done.log["nis_dof"][5] == 0 and done.log["log_evidence"][5] == pytest.approx(0.0, abs=1e-9)
     assert np.abs(errors(done)[-1]).max() < 0.1
 
 
@@ -190,8 +197,8 @@ def test_an_empty_first_frame_without_known_points():
     nothing = np.zeros(0, dtype=np.int64)
     log = changed(without_known(LOG), 0, lambda f: rows(f, nothing))
     done = run(replace(log, frames=log.frames[:3]), SMALL)
-    assert np.isfinite(done.cov).all()
-    assert len(done.filter.belief().map.ids) > 0
+    assert np.isfinite(done.log.covs).all()
+    assert len(done.system.filter.belief().map.ids) > 0
 
 
 @every_mode
@@ -214,16 +221,16 @@ def test_a_measurement_outside_the_image_is_ignored(mode):
         return replace(f, **joined)
 
     done, expected = (run(changed(LOG, 4, change), config) for change in (beside, lambda f: rows(f, there)))
-    assert same(content(done.filter), content(expected.filter))
-    np.testing.assert_array_equal(done.world_from_camera, expected.world_from_camera)
+    assert same(content(done.system.filter), content(expected.system.filter))
+    np.testing.assert_array_equal(done.log.poses, expected.log.poses)
     untouched = run(LOG, config)
-    assert not np.array_equal(done.world_from_camera[4], untouched.world_from_camera[4])
+    assert not np.array_equal(done.log.poses[4], untouched.log.poses[4])
 
 
 def scores(known_as: str, seeds: range) -> np.ndarray:
     """NEES (runs, frames)."""
 
-    def one(seed: int) -> MonoRun:
+    def one(seed: int) -> Run:
         config = MonoConfig(particles=30, seed=seed, known=known_as)
         return run(desk(100 + seed, frames=12), config)
 
@@ -255,10 +262,10 @@ def test_the_first_frame_finds_the_camera(mode, velocity):
     """Within four standard deviations of the truth, which are as small as the pixels' noise makes them."""
     config = replace(SMALL, known=mode, velocity=VelocityConfig(velocity))
     done = run(first_only(FIRST), config)
-    std = np.sqrt(np.diag(done.cov[0]))
+    std = np.sqrt(np.diag(done.log.covs[0]))
     assert (std[:3] < 0.03).all() and (std[3:] < 0.03).all() and (std > 1e-4).all()
     truth = known(FIRST.truth).world_from_camera[:1]
-    assert (np.abs(SE3.local(done.world_from_camera, truth)[0]) < 4.0 * std).all()
+    assert (np.abs(SE3.local(done.log.poses, truth)[0]) < 4.0 * std).all()
 
 
 def test_a_frame_says_the_same_in_both_modes():
@@ -266,10 +273,10 @@ def test_a_frame_says_the_same_in_both_modes():
     frame, points = (
         run(first_only(FIRST), replace(SMALL, known=mode, particles=200)) for mode in ("frame", "points")
     )
-    std = np.sqrt(np.diag(frame.cov[0]))
-    offset = SE3.local(frame.world_from_camera[0], points.world_from_camera[0]) / std
+    std = np.sqrt(np.diag(frame.log.covs[0]))
+    offset = SE3.local(frame.log.poses[0], points.log.poses[0]) / std
     assert np.abs(offset).max() < 0.5
-    ratio = np.sqrt(np.diag(points.cov[0])) / std
+    ratio = np.sqrt(np.diag(points.log.covs[0])) / std
     assert (np.abs(np.log(ratio)) < 0.3).all()
 
 
@@ -302,14 +309,14 @@ def test_known_points_in_the_map():
 @every_mode
 def test_first_sightings_become_rays(mode):
     done = run(first_only(FIRST), replace(SMALL, known=mode))
-    held, names = done.filter.belief().map, known(FIRST.known).names
+    held, names = done.system.filter.belief().map, known(FIRST.known).names
     rays = [i for i in held.ids.tolist() if isinstance(held.landmark_of(i), InverseDepth)]
     assert sorted(rays) == sorted(np.setdiff1d(FIRST.frames[0].landmarks, names).tolist())
 
 
 def test_at_most_so_many_new_landmarks():
     done = run(replace(FIRST, frames=FIRST.frames[:2]), replace(SMALL, max_new_per_frame=3))
-    assert len(done.filter.belief().map.ids) == 1 + 3 + 3
+    assert len(done.system.filter.belief().map.ids) == 1 + 3 + 3
 
 
 @every_velocity
@@ -336,23 +343,23 @@ def test_without_known_points_it_runs(velocity):
     done = run(log, replace(SMALL, velocity=VelocityConfig(velocity)))
     truth = known(log.truth).world_from_camera
     relative = SE3.between(truth[0], truth)
-    assert np.isfinite(done.log_evidence).all()
-    turned = SE3.local(done.world_from_camera, relative)[:, :3]
+    assert np.isfinite(done.log["log_evidence"]).all()
+    turned = SE3.local(done.log.poses, relative)[:, :3]
     assert np.linalg.norm(turned, axis=1).max() < 0.1
-    assert world_of(done.filter) is None
+    assert world_of(done.system.filter) is None
 
 
 def test_landmarks_in_the_known_world():
     """Points of the map where they are, though each particle has its own world."""
     log = desk(1, frames=25)
     done = run(log, SMALL)
-    held, places = done.filter.belief().map, known(log.truth).landmarks
+    held, places = done.system.filter.belief().map, known(log.truth).landmarks
     ids = [i for i in held.ids.tolist() if isinstance(held.landmark_of(i), Point)]
     assert len(ids) >= 3
-    cloud = particle_points(done.filter, ids)
+    cloud = particle_points(done.system.filter, ids)
     assert cloud.shape == (20, len(ids), 3)
     true = np.array([places[i] for i in ids])
-    mean = done.filter.particles.weights @ cloud.reshape(20, -1)
+    mean = done.system.filter.particles.weights @ cloud.reshape(20, -1)
     assert np.median(np.linalg.norm(mean.reshape(-1, 3) - true, axis=1)) < 0.05
     raw = held.read(np.array(ids)).mean
     assert np.median(np.linalg.norm(raw[0] - true, axis=1)) > 0.5

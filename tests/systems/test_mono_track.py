@@ -10,15 +10,14 @@ import pytest
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.frame_log import FrameLog
+from rbpf.runs.recordings import filter_images
 from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.sensors.readers import ImageFrame
 from rbpf.systems.mono.active_search import MotionFit, OutlierGate, RobustMotionGate
 from rbpf.systems.mono.config import MonoConfig, StartConfig
 from rbpf.systems.mono.feature_sensor import InverseDepthRays, UnknownDepth
 from rbpf.systems.mono.slam import MonoSlam
-from rbpf.systems.mono.video import run_images
 from rbpf.systems.system import Tracked, TrackingState
-from rbpf.validation.mono_posterior import posterior_paths
 from tests.core.worlds import content, same
 from tests.exactness.models import known
 from tests.systems.mono_logs import SMALL, desk, without_known
@@ -100,15 +99,15 @@ def test_a_checkpoint_after_any_frame_goes_on_with_the_same_bytes(case, tmp_path
 
 
 def test_images_from_anywhere_give_the_bytes_of_a_run_over_a_recording():
-    run = run_images(sequence(10), CONFIG)
+    run = filter_images(sequence(10), CONFIG)
     slam, log = MonoSlam(CAMERA, CONFIG), None
     log = FrameLog.of(slam)
     for frame in images(10):
         log.append(slam.track(frame.image, frame.stamp_ns), 0.0)
-    assert log.poses.tobytes() == run.world_from_camera.tobytes()
-    assert log.covs.tobytes() == run.cov.tobytes()
+    assert log.poses.tobytes() == run.log.poses.tobytes()
+    assert log.covs.tobytes() == run.log.covs.tobytes()
     for name in ("searched", "found", "ess", "log_evidence", "nis"):
-        np.testing.assert_array_equal(log[name], run.columns[name])
+        np.testing.assert_array_equal(log[name], run.log[name])
 
 
 def test_a_start_without_known_points_is_revised_and_says_so():
@@ -236,11 +235,11 @@ def test_memory_is_that_of_the_map(start):
 
 
 def test_a_lag_keeps_the_last_frames_and_changes_no_estimate():
-    whole, last = (run_images(sequence(12), replace(CONFIG, lag=lag)) for lag in (None, 5))
-    np.testing.assert_array_equal(last.world_from_camera, whole.world_from_camera)
-    assert posterior_paths(whole).shape == (12, 5, 7)
-    np.testing.assert_array_equal(posterior_paths(last), posterior_paths(whole)[-5:])
-    np.testing.assert_array_equal(last.filter.history.stamps_ns, whole.stamps_ns[-5:])
+    whole, last = (filter_images(sequence(12), replace(CONFIG, lag=lag)) for lag in (None, 5))
+    np.testing.assert_array_equal(last.log.poses, whole.log.poses)
+    assert whole.system.particle_paths().shape == (12, 5, 7)
+    np.testing.assert_array_equal(last.system.particle_paths(), whole.system.particle_paths()[-5:])
+    np.testing.assert_array_equal(last.system.filter.history.stamps_ns, whole.log.stamps_ns[-5:])
 
 
 class Cautious(OutlierGate):

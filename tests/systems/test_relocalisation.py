@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from rbpf.lie import SE3
+from rbpf.runs.recordings import filter_images
+from rbpf.runs.run import Run
 from rbpf.sensors.camera.resection import GATE, Resected, squared_distances
 from rbpf.systems.mono.config import MonoConfig, RelocalisationConfig
 from rbpf.systems.mono.relocalisation import (
@@ -23,7 +25,6 @@ from rbpf.systems.mono.relocalisation import (
     mutual_matches,
 )
 from rbpf.systems.mono.slam import MonoSlam
-from rbpf.systems.mono.video import VideoRun, run_images
 from tests.systems.plane_sequences import CAMERA, Pictures, known_points, path, sequence, texture, view
 
 START, DARK, FRAMES = 40, 20, 90
@@ -38,7 +39,7 @@ slow = pytest.mark.slow
 class Tracked(NamedTuple):
     """A run, its checkpoint after the first `START` frames, and which features lived then."""
 
-    run: VideoRun
+    run: Run
     checkpoint: Path
     alive: np.ndarray
 
@@ -48,12 +49,12 @@ def tracked(tmp_path_factory):
     """A run of all frames."""
     folder, alive = tmp_path_factory.mktemp("plane"), []
 
-    def keep(t, frame, run):
-        if t + 1 == START:
+    def keep(run, _):
+        if len(run.log) == START:
             (folder / "latest.npz").rename(folder / "start.npz")
-            alive.append(run.sensor.table.alive.copy())
+            alive.append(run.system.sensor.table.alive.copy())
 
-    run = run_images(sequence(FRAMES), CONFIG, known_points(), keep, folder / "latest.npz")
+    run = filter_images(sequence(FRAMES), CONFIG, known_points(), [keep], folder / "latest.npz")
     return Tracked(run, folder / "start.npz", alive[0])
 
 
@@ -62,25 +63,27 @@ def resumed(tracked, tmp_path, change):
     copy = tmp_path / "start.npz"
     copy.write_bytes(tracked.checkpoint.read_bytes())
     config = replace(CONFIG, checkpoint_every=10 * FRAMES)
-    return run_images(sequence(FRAMES, change), config, known_points(), None, copy, resume=True)
+    return filter_images(sequence(FRAMES, change), config, known_points(), (), copy, resume=True)
 
 
 def errors(run):
     """Distances from the true positions (T,)."""
-    truth = SE3.translation(path(FRAMES))[: len(run.world_from_camera)]
-    return np.linalg.norm(SE3.translation(run.world_from_camera) - truth, axis=1)
+    truth = SE3.translation(path(FRAMES))[: len(run.log.poses)]
+    return np.linalg.norm(SE3.translation(run.log.poses) - truth, axis=1)
 
 
 @slow
 def test_tracking_is_not_disturbed(tracked, tmp_path):
     """Nor by being broken off."""
     run = tracked.run
-    assert not run.lost.any() and not run.relocalisations and not run.problems
+    assert (
+        not run.log.lost().any() and not np.flatnonzero(run.log["relocalised"]).tolist() and not run.messages
+    )
     assert errors(run).max() < 0.05
     again = resumed(tracked, tmp_path, lambda t, image: image)
-    assert again.world_from_camera == pytest.approx(run.world_from_camera, abs=1e-9)
-    assert again.slam.loss.trusted[0] == pytest.approx(run.slam.loss.trusted[0])
-    assert again.slam.loss.stamp_ns == run.stamps_ns[-1]
+    assert again.log.poses == pytest.approx(run.log.poses, abs=1e-9)
+    assert again.system.loss.trusted[0] == pytest.approx(run.system.loss.trusted[0])
+    assert again.system.loss.stamp_ns == run.log.stamps_ns[-1]
 
 
 @slow
@@ -92,13 +95,13 @@ def test_recovers_after_a_blackout(tracked, tmp_path, how):
         return None if how == "missing" else np.zeros_like(image)
 
     run = resumed(tracked, tmp_path, dark)
-    assert run.lost[START + 3 : START + DARK].all()
-    assert not run.lost[START + DARK + 3 :].any()
-    assert len(run.relocalisations) == 1
-    assert any("lost" in problem for problem in run.problems)
-    assert sum("shows nothing" in problem for problem in run.problems) == (how == "black")
+    assert run.log.lost()[START + 3 : START + DARK].all()
+    assert not run.log.lost()[START + DARK + 3 :].any()
+    assert len(np.flatnonzero(run.log["relocalised"]).tolist()) == 1
+    assert any("lost" in problem for problem in run.messages)
+    assert sum("shows nothing" in problem for problem in run.messages) == (how == "black")
     assert errors(run)[-10:].max() < 0.03
-    assert np.trace(run.cov[START + DARK - 1][3:, 3:]) > np.trace(run.cov[START][3:, 3:])
+    assert np.trace(run.log.covs[START + DARK - 1][3:, 3:]) > np.trace(run.log.covs[START][3:, 3:])
 
 
 @slow
@@ -114,19 +117,19 @@ def test_an_unknown_place_is_not_recognised(tracked, tmp_path):
     other = Pictures(texture(seed=7), path(FRAMES), lambda t, image: image)
     images = {t: frame.image for t, frame in enumerate(other.frames(0))}
     run = resumed(tracked, tmp_path, lambda t, image: images[t] if t >= START else image)
-    assert run.lost[START + 3 :].all()
-    assert not run.relocalisations
-    last = SE3.translation(run.world_from_camera[START - 1])
-    assert np.linalg.norm(SE3.translation(run.world_from_camera[-1]) - last) < 0.1
+    assert run.log.lost()[START + 3 :].all()
+    assert not np.flatnonzero(run.log["relocalised"]).tolist()
+    last = SE3.translation(run.log.poses[START - 1])
+    assert np.linalg.norm(SE3.translation(run.log.poses[-1]) - last) < 0.1
 
 
 @slow
 def test_a_frozen_camera_is_noticed(tracked, tmp_path):
     still = view(texture(), path(FRAMES)[START])
     run = resumed(tracked, tmp_path, lambda t, image: still if START <= t < START + DARK else image)
-    assert sum("frozen" in problem for problem in run.problems) == 1
-    assert run.lost[START + DARK - 1]
-    assert not run.lost[-20:].any()
+    assert sum("frozen" in problem for problem in run.messages) == 1
+    assert run.log.lost()[START + DARK - 1]
+    assert not run.log.lost()[-20:].any()
 
 
 class Place(NamedTuple):
@@ -142,11 +145,13 @@ class Place(NamedTuple):
 @pytest.fixture(scope="module")
 def place(tracked):
     run = tracked.run
-    belief = run.filter.belief()
+    belief = run.system.filter.belief()
     truth = SE3.retract(path(FRAMES)[60], np.array([0.05, -0.1, 0.2, 0.1, -0.1, 0.15]))
-    start = SE3.compose(belief.state[belief.mode][:7], SE3.inverse(run.world_from_camera[-1]))
-    finder = Relocaliser(run.sensor, RECOVERY)
-    return Place(finder, belief, run.slam.loss.trusted[0], SE3.compose(start, truth), view(texture(), truth))
+    start = SE3.compose(belief.state[belief.mode][:7], SE3.inverse(run.log.poses[-1]))
+    finder = Relocaliser(run.system.sensor, RECOVERY)
+    return Place(
+        finder, belief, run.system.loss.trusted[0], SE3.compose(start, truth), view(texture(), truth)
+    )
 
 
 @slow
@@ -168,7 +173,7 @@ def test_what_it_is_not_found_in(place, tracked):
         attempt = place.finder.find(place.belief, image, place.near)
         assert attempt.prior is None and not attempt.certain
     assert (attempt.corners, attempt.matches) == (0, 0)
-    picky = Relocaliser(tracked.run.sensor, RelocalisationConfig(min_inliers=1000))
+    picky = Relocaliser(tracked.run.system.sensor, RelocalisationConfig(min_inliers=1000))
     assert picky.find(place.belief, place.image, place.near).prior is None
 
 

@@ -7,11 +7,13 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.runs.recordings import filter_features as run
+from rbpf.runs.recordings import filter_images
+from rbpf.runs.run import Run
 from rbpf.runs.trajectory import Trajectory
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureLog
 from rbpf.systems.mono.config import MonoConfig, StartConfig, VelocityConfig
-from rbpf.systems.mono.run import run
 from rbpf.systems.mono.slam import MonoSlam
 from rbpf.systems.mono.unknown_start import (
     DISCONNECTED,
@@ -25,7 +27,6 @@ from rbpf.systems.mono.unknown_start import (
     optimum,
     tangents,
 )
-from rbpf.systems.mono.video import VideoRun, run_images
 from rbpf.validation.metrics.accuracy import ate
 from tests.exactness.models import known
 from tests.systems.mono_logs import SMALL, changed, desk, rows, without_known
@@ -41,31 +42,34 @@ def off(done_path: np.ndarray, truth: np.ndarray, stamps_ns: np.ndarray) -> floa
     return ate(Trajectory(stamps_ns, done_path), Trajectory(stamps_ns, truth), "similarity").rmse
 
 
-def of_plane(done: VideoRun) -> float:
-    return off(done.world_from_camera, path(done.stamps_ns.size), done.stamps_ns)
+def of_plane(done: Run) -> float:
+    return off(done.log.poses, path(done.log.stamps_ns.size), done.log.stamps_ns)
 
 
 @pytest.fixture(scope="module")
-def plane() -> VideoRun:
+def plane() -> Run:
     """A textured wall that leans away: flat, so that two shapes and two motions look alike at first."""
-    return run_images(sequence(60), SMALL)
+    return filter_images(sequence(60), SMALL)
 
 
 @pytest.mark.slow
 def test_a_flat_scene_is_not_bent(plane):
-    assert plane.slam.start.over
+    assert plane.system.start.over
     resampled, bent = (
-        np.mean([of_plane(run_images(sequence(60), replace(config, seed=seed))) for seed in (1, 2)])
+        np.mean([of_plane(filter_images(sequence(60), replace(config, seed=seed))) for seed in (1, 2)])
         for config in (SMALL, NEVER)
     )
     assert resampled < 0.5 * bent and resampled < 0.012
 
 
 def test_the_world_starts_at_the_first_camera(plane):
-    np.testing.assert_allclose(plane.world_from_camera[0], SE3.identity(), atol=1e-12)
-    assert (plane.filter.history.paths()[0] == SE3.identity()).all()
-    assert plane.slam.start.arrays()["start/names"].size > 10
-    assert plane.filter.steps == 60 and plane.filter.history.stamps_ns.tolist() == plane.stamps_ns.tolist()
+    np.testing.assert_allclose(plane.log.poses[0], SE3.identity(), atol=1e-12)
+    assert (plane.system.filter.history.paths()[0] == SE3.identity()).all()
+    assert plane.system.start.arrays()["start/names"].size > 10
+    assert (
+        plane.system.filter.steps == 60
+        and plane.system.filter.history.stamps_ns.tolist() == plane.log.stamps_ns.tolist()
+    )
 
 
 @pytest.fixture
@@ -112,31 +116,27 @@ def test_frames_are_adjusted_ever_less_often(adjusted):
 def test_every_velocity_goes_on_from_the_path_that_was_drawn(velocity, resampled):
     config = replace(SMALL, velocity=VelocityConfig(velocity), particles=30)
     done = run(LOG, config)
-    assert (
-        resampled and off(done.world_from_camera, known(LOG.truth).world_from_camera, done.stamps_ns) < 0.02
-    )
+    assert resampled and off(done.log.poses, known(LOG.truth).world_from_camera, done.log.stamps_ns) < 0.02
 
 
 def test_few_of_the_frames_do_as_well(resampled):
     """Half of them at most take part; those between are on the way, and measure nothing."""
     config = replace(SMALL, start=StartConfig(max_frames=8))
     done = run(LOG, config)
-    assert (
-        resampled and off(done.world_from_camera, known(LOG.truth).world_from_camera, done.stamps_ns) < 0.02
-    )
+    assert resampled and off(done.log.poses, known(LOG.truth).world_from_camera, done.log.stamps_ns) < 0.02
 
 
 def test_the_map_is_conditioned_on_the_paths(plane):
     """A feature's place in each particle is where that particle's own path saw it."""
-    belief = plane.filter.belief()
+    belief = plane.system.filter.belief()
     ids = belief.map.ids
-    points = ids[~belief.map.are(ids, plane.slam.features.unknown_depth.landmark)].tolist()
+    points = ids[~belief.map.are(ids, plane.system.features.unknown_depth.landmark)].tolist()
     assert len(points) > 10
     means = belief.read(points).mean
-    pose = plane.filter.particles.state[:, None, :7]
-    seen = plane.sensor.camera.project(SE3.inverse_transform(pose, means))
+    pose = plane.system.filter.particles.state[:, None, :7]
+    seen = plane.system.sensor.camera.project(SE3.inverse_transform(pose, means))
     names = points
-    measured = plane.slam.measurement.used
+    measured = plane.system.measurement.used
     which = [k for k, name in enumerate(names) if name in measured.landmarks]
     z = measured.z[[measured.landmarks.tolist().index(names[k]) for k in which]]
     assert np.median(np.linalg.norm(seen[:, which] - z, axis=-1)) < 1.0
@@ -152,27 +152,25 @@ def test_frames_without_features_are_passed_over(resampled):
         changed(LOG, 3, lambda frame: rows(frame, np.arange(0))), 4, lambda frame: rows(frame, np.arange(0))
     )
     done = run(empty, SMALL)
-    assert (
-        resampled and off(done.world_from_camera, known(LOG.truth).world_from_camera, done.stamps_ns) < 0.02
-    )
+    assert resampled and off(done.log.poses, known(LOG.truth).world_from_camera, done.log.stamps_ns) < 0.02
 
 
 def assert_the_same(log: FeatureLog, *configs: MonoConfig) -> None:
-    paths = [run(log, config).world_from_camera for config in configs]
+    paths = [run(log, config).log.poses for config in configs]
     np.testing.assert_array_equal(paths[0], paths[1])
 
 
 def test_a_camera_that_was_lost_is_not_adjusted_any_more(adjusted):
     """Black images after the fourth: the start is over when it is lost, and what was kept for it is gone."""
-    done = run_images(sequence(20, lambda t, image: np.zeros_like(image) if 4 <= t < 8 else image), SMALL)
-    assert done.lost[6] and done.slam.start.over and not adjusted
-    assert not any(name.startswith("start/frames") for name in done.slam.arrays())
+    done = filter_images(sequence(20, lambda t, image: np.zeros_like(image) if 4 <= t < 8 else image), SMALL)
+    assert done.log.lost()[6] and done.system.start.over and not adjusted
+    assert not any(name.startswith("start/frames") for name in done.system.arrays())
 
 
 def test_frames_that_hang_too_little_together_are_said(monkeypatch):
     monkeypatch.setattr("rbpf.systems.mono.unknown_start.MIN_SHARED", 1000)
-    done = run_images(sequence(8), SMALL)
-    assert done.slam.start.over and done.problems == [f"frame 5: {DISCONNECTED}"]
+    done = filter_images(sequence(8), SMALL)
+    assert done.system.start.over and done.messages == [f"frame 5: {DISCONNECTED}"]
 
 
 def test_poses_between_are_on_the_way():
@@ -194,26 +192,26 @@ def test_a_start_that_shows_nothing_at_first_begins_later(resampled):
     blank = LOG
     for t in range(7):
         blank = changed(blank, t, lambda frame: rows(frame, np.arange(0)))
-    assert np.isfinite(run(blank, SMALL).world_from_camera).all() and resampled
+    assert np.isfinite(run(blank, SMALL).log.poses).all() and resampled
     resampled.clear()
     ramp = np.tile(np.linspace(60, 200, 320).astype(np.uint8), (240, 1))
-    done = run_images(sequence(24, lambda t, image: ramp if t < 8 else image), SMALL)
-    assert done.failure is None and np.isfinite(done.world_from_camera).all() and resampled
+    done = filter_images(sequence(24, lambda t, image: ramp if t < 8 else image), SMALL)
+    assert done.failure is None and np.isfinite(done.log.poses).all() and resampled
     resampled.clear()
-    done = run_images(sequence(24, lambda t, image: np.zeros_like(image) if 0 < t < 5 else image), SMALL)
+    done = filter_images(sequence(24, lambda t, image: np.zeros_like(image) if 0 < t < 5 else image), SMALL)
     assert done.failure is None
 
 
 def test_a_frame_without_an_image_is_not_what_is_resampled_after(resampled):
-    done = run_images(sequence(12, lambda t, image: None if t == 5 else image), SMALL)
+    done = filter_images(sequence(12, lambda t, image: None if t == 5 else image), SMALL)
     assert resampled[0] == 7 and done.failure is None
 
 
 def test_what_the_new_map_has_not_is_not_looked_for(resampled):
     """Features that were started in frames that took no part."""
-    done = run_images(sequence(40), replace(SMALL, start=StartConfig(max_frames=5, depth_std_ratio=1e-6)))
-    table = done.sensor.table
-    held = set(done.filter.belief().map.ids.tolist())
+    done = filter_images(sequence(40), replace(SMALL, start=StartConfig(max_frames=5, depth_std_ratio=1e-6)))
+    table = done.system.sensor.table
+    held = set(done.system.filter.belief().map.ids.tolist())
     assert resampled and set(np.flatnonzero(table.alive).tolist()) <= held
 
 
@@ -226,7 +224,7 @@ def test_where_the_lens_has_no_direction_the_start_does_not_stop(resampled):
         z = np.concatenate([frame.z, [[1.0, 1.0]]])
         frames[t] = replace(frame, landmarks=np.append(frame.landmarks, 9999), z=z, cov_z=cov)
     done = run(replace(LOG, camera=folded, frames=frames), SMALL)
-    assert resampled and np.isfinite(done.world_from_camera).all()
+    assert resampled and np.isfinite(done.log.poses).all()
 
 
 @pytest.mark.parametrize(
@@ -248,7 +246,7 @@ def test_settings_that_make_no_sense(wrong):
 )
 def test_a_damaged_checkpoint_is_refused(plane, name, damaged):
     with pytest.raises(InputError, match=name):
-        MonoSlam(CAMERA, SMALL).start.restore(plane.slam.start.arrays() | {name: damaged})
+        MonoSlam(CAMERA, SMALL).start.restore(plane.system.start.arrays() | {name: damaged})
 
 
 # The optimum: its derivatives, its minimum, and what is drawn around it.

@@ -14,10 +14,10 @@ from rbpf.lie import SE3
 from rbpf.runs.folder import write_map, write_run, write_summary, write_trajectory
 from rbpf.runs.measurement_files import write_measurements
 from rbpf.runs.path_and_map import PathAndMap
+from rbpf.runs.recordings import filter_features
 from rbpf.runs.recordings import filter_robot_log as run
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.mono.config import MonoConfig
-from rbpf.systems.mono.run import run as run_features
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.consistency.against_batch import (
     SAME,
@@ -28,7 +28,6 @@ from rbpf.validation.consistency.against_batch import (
 )
 from rbpf.validation.gtsam.batch_problem import first_steps, fit_of, problem_of, read_problem, solve_problem
 from rbpf.validation.metrics.gaussian_differences import compare_last_pose, rescaled, scale_onto
-from rbpf.validation.metrics.path_and_map import of_run
 from tests.validation.camera_scenes import scene
 from tests.validation.linear_worlds import linear_log
 
@@ -71,7 +70,7 @@ def test_monte_carlo_error_falls_with_the_particles():
 
 
 def test_the_optimum_explains_sightings_and_odometry_best(linear_run):
-    problem, filtered = problem_of(linear_run), of_run(linear_run)
+    problem, filtered = problem_of(linear_run), PathAndMap.of_run(linear_run)
     optimum = solve_problem(problem, filtered.world_from_body)
     best = fit_of(problem, optimum.estimate, optimum.estimate.landmarks.ids)
     pull = problem.space.local(problem.deltas, problem.space.between(*_pairs(optimum.estimate)))
@@ -91,8 +90,8 @@ def test_a_pose_is_compared_with_what_was_known_then(linear_run):
     problem = problem_of(linear_run)
     part = first_steps(problem, 4)
     assert len(part.stamps_ns) == 4 and len(part.deltas) == 3 and part.steps.max() == 3
-    then = solve_problem(part, of_run(linear_run).world_from_body[:4])
-    later = solve_problem(problem, of_run(linear_run).world_from_body)
+    then = solve_problem(part, PathAndMap.of_run(linear_run).world_from_body[:4])
+    later = solve_problem(problem, PathAndMap.of_run(linear_run).world_from_body)
     spread = [np.trace(one.estimate.cov_poses[3]) for one in (then, later)]
     assert spread[0] > 1.1 * spread[1]
 
@@ -113,7 +112,7 @@ def test_a_folder_tells_the_same_as_the_run(linear_run, folder):
 def test_known_points_make_one_world_of_filter_and_batch():
     log = scene(frames=8, points=20, known=6, noise_px=1.0)
     isotropic = [replace(f, cov_z=np.tile(np.eye(2), (len(f.z), 1, 1))) for f in log.frames]
-    done = run_features(replace(log, frames=isotropic), MonoConfig(particles=200))
+    done = filter_features(replace(log, frames=isotropic), MonoConfig(particles=200))
     found = compare_run(done, instants=1)
     assert found.gauge == SAME and found.scale == 1.0
     assert found.poses.dims == 6 and found.landmarks.dims == 3
@@ -247,7 +246,7 @@ def test_a_folder_that_is_no_finished_run_is_refused(folder, spoil, says):
 
 
 def test_path_and_measurements_of_different_runs_are_refused(linear_run):
-    filtered, problem = of_run(linear_run), problem_of(linear_run)
+    filtered, problem = PathAndMap.of_run(linear_run), problem_of(linear_run)
     later = replace(filtered, stamps_ns=filtered.stamps_ns + 1)
     with pytest.raises(InputError, match="do not share their time stamps"):
         compare(later, problem)

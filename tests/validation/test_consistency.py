@@ -5,9 +5,8 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.runs.recordings import filter_features
 from rbpf.systems.mono.config import MonoConfig
-from rbpf.systems.mono.run import run
-from rbpf.validation.camera_map import summarise_points
 from rbpf.validation.consistency.pose_errors import pose_errors
 from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
 from rbpf.validation.simulation.point_worlds import DeskWorld
@@ -49,8 +48,7 @@ def test_a_table_is_printed_in_columns_and_kept(tmp_path, capsys):
 
 def test_a_camera_s_map_is_told_in_the_world_of_the_known_points():
     log = simulate_features(DeskWorld(frames=150), Measuring(), MONO, seed=0)
-    filter_ = run(log, MonoConfig(particles=50)).filter
-    summary = summarise_points(filter_)
+    summary = filter_features(log, MonoConfig(particles=50)).system.map().points()
     truth = np.array([log.truth.landmarks[name] for name in summary.ids.tolist()])
     error = summary.mean - truth
     squared = np.einsum("kd,kde,ke->k", error, np.linalg.inv(summary.cov), error)

@@ -18,7 +18,6 @@ from rbpf.validation.export import MAP, PATH, colmap_model, export_colmap, expor
 from rbpf.validation.gtsam.batch_problem import problem_of
 from rbpf.validation.gtsam.camera_data import sightings_of
 from rbpf.validation.gtsam.camera_factors import evaluate_sightings
-from rbpf.validation.metrics.path_and_map import of_run
 from rbpf.validation.ply import read_ply, write_ply
 from rbpf.validation.report.colours import colours_by_sigma, standard_deviations
 from tests.validation.camera_scenes import BENT, FISHEYE, STEREO, scene
@@ -92,7 +91,7 @@ def test_a_stereo_pair_is_a_rig_whose_right_camera_sees_what_was_measured():
 
 def test_a_robot_gets_a_nominal_camera_that_looks_ahead(tmp_path):
     done = run(linear_log(steps=5), RangeBearingConfig(particles=10))
-    estimate = of_run(done)
+    estimate = PathAndMap.of_run(done)
     model = export_colmap(estimate, problem_of(done), tmp_path / "model")
     image = model.image(image_id(2))
     assert image.projection_center() == pytest.approx([*estimate.world_from_body[2, 1:], 0.0])

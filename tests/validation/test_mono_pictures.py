@@ -4,14 +4,21 @@ import numpy as np
 import pytest
 
 from rbpf.lie import SE3
+from rbpf.runs.plots import Views
+from rbpf.runs.recordings import filter_images
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers import open_images, read_known_points
 from rbpf.systems.mono.config import MonoConfig
-from rbpf.systems.mono.video import SearchRecord, run_images
-from rbpf.validation.report.annotated import FOUND, MISSED, Caption, drawn_size
-from rbpf.validation.report.mono_frames import RAY, draw_frame
-from rbpf.validation.report.mono_views import best_views
-from rbpf.validation.report.video_file import frame_rate, is_complete
+from rbpf.validation.report.video import (
+    FOUND,
+    MISSED,
+    RAY,
+    Caption,
+    draw_search,
+    drawn_size,
+    frame_rate,
+    is_complete,
+)
 from rbpf.validation.simulation.desk_and_room import TexturedDesk
 from rbpf.validation.simulation.images import Imaging, simulate_images
 
@@ -22,35 +29,43 @@ def run(tmp_path_factory):
     camera = Pinhole(240, 180, 190.0, 190.0, 119.5, 89.5)
     world = TexturedDesk(frames=40, texel_m=0.003, speed_m_s=0.6, start_s=0.2)
     simulate_images(world, Imaging(noise_std=1.0), camera, folder, seed=1)
-    return run_images(
+    return filter_images(
         open_images(folder), MonoConfig(particles=8), read_known_points(folder / "known_points.csv")
     )
 
 
+def found(sighting):
+    return np.isfinite(sighting["px"]).all(axis=1)
+
+
+def is_ray(sighting):
+    return np.isfinite(sighting["line"]).all(axis=(1, 2))
+
+
 def test_rays_are_found_on_their_epipolar_lines(run):
-    last = [sighting for sighting in run.searches[20:] if (sighting.is_ray & sighting.found).any()]
     distances = []
-    for sighting in last:
-        rows = sighting.is_ray & sighting.found
-        start, end = np.moveaxis(sighting.line[rows], 1, 0)
+    for sighting in run.log.all_observed()[20:]:
+        rows = is_ray(sighting) & found(sighting)
+        start, end = np.moveaxis(sighting["line"][rows], 1, 0)
         along = (end - start) / np.linalg.norm(end - start, axis=1, keepdims=True)
-        offset = sighting.px[rows] - start
+        offset = sighting["px"][rows] - start
         distances += np.abs(offset[:, 0] * along[:, 1] - offset[:, 1] * along[:, 0]).tolist()
     assert len(distances) > 20
     assert np.median(distances) < 1.0
 
 
 def test_places_that_were_seen_lie_in_the_known_points_world(run):
-    sighting = run.searches[-1]
-    members = sighting.found & (sighting.features < run.known.names.size)
+    sighting = run.log.all_observed()[-1]
+    known = run.system.known_points
+    members = found(sighting) & (sighting["features"] < known.names.size)
     assert members.any()
-    place = sighting.position[members, :3] / sighting.position[members, 3:]
-    assert np.abs(place - run.known.positions[sighting.features[members]]).max() < 0.02
+    place = sighting["position"][members, :3] / sighting["position"][members, 3:]
+    assert np.abs(place - known.positions[sighting["features"][members]]).max() < 0.02
 
 
 def test_the_map_covers_the_desk_within_its_own_uncertainty(run):
-    mapped = run.slam.map()
-    new = ~mapped.is_ray() & (mapped.ids >= run.known.names.size)
+    mapped = run.system.map()
+    new = ~mapped.is_ray() & (mapped.ids >= run.system.known_points.names.size)
     height, std = mapped.mean[new, 2], np.sqrt(mapped.cov[new, 2, 2])
     assert new.sum() >= 5
     assert (height + 4.0 * std > -0.005).all()  # nothing on the desk lies below its top
@@ -70,26 +85,22 @@ def test_views_find_the_vertical(vertical, down, tilt_deg):
         tilt = np.deg2rad(tilt_deg)
         forward = np.cos(tilt) * ahead - np.sin(tilt) * up
         poses.append(np.column_stack([right, np.cross(forward, right), forward, np.zeros(3)]))
-    views = best_views(SE3.from_matrix(np.array(poses)))
+    views = Views.of_camera(SE3.from_matrix(np.array(poses)))
     assert views.side[1] == vertical and views.down == down
     a, b = np.eye(3)[list(views.top)]
     assert np.allclose(np.cross(a, b), up)
 
 
 def test_a_frame_shows_hits_misses_and_lines():
-    sighting = SearchRecord(
-        features=np.array([0, 1]),
-        mean=np.array([[40.0, 30.0], [80.0, 40.0]]),
-        cov=np.tile(4.0 * np.eye(2), (2, 1, 1)),
-        px=np.array([[41.0, 30.0], [np.nan, np.nan]]),
-        cov_px=np.tile(np.eye(2), (2, 1, 1)),
-        line=np.array([[[np.nan] * 2] * 2, [[-1e9, 40.0], [1e9, 40.0]]]),
-        position=np.full((2, 4), np.nan),
-        started=np.zeros(0, dtype=int),
-        started_px=np.zeros((0, 2)),
-    )
+    sighting = {
+        "mean": np.array([[40.0, 30.0], [80.0, 40.0]]),
+        "cov": np.tile(4.0 * np.eye(2), (2, 1, 1)),
+        "px": np.array([[41.0, 30.0], [np.nan, np.nan]]),
+        "line": np.array([[[np.nan] * 2] * 2, [[-1e9, 40.0], [1e9, 40.0]]]),
+        "started_px": np.zeros((0, 2)),
+    }
     image = np.full((90, 120), 128, dtype=np.uint8)
-    picture = draw_frame(image, sighting, Caption("frame 0", ""), 120, 90)
+    picture = draw_search(image, sighting, Caption("frame 0", ""), (120, 90))
     assert picture.shape[:2] == drawn_size(120, 90)[::-1]
     below = picture[30:]
     counts = [int((below == colour).all(axis=-1).sum()) for colour in (FOUND, MISSED, RAY)]

@@ -11,10 +11,10 @@ from rbpf.systems.map_estimate import estimate_map
 from rbpf.systems.stereo.config import StereoConfig, TriggerConfig
 from rbpf.systems.stereo.landmarks import FeatureKind
 from rbpf.systems.stereo.run import PairSeen, StereoRun, run_images
-from rbpf.validation.report.annotated import Caption, drawn_size
-from rbpf.validation.report.rerun_file import recording
+from rbpf.validation.report.rerun import recording
 from rbpf.validation.report.stereo_frames import COLOURS, annotated_pairs, draw_pair
 from rbpf.validation.report.stereo_rerun import write_stereo_rerun
+from rbpf.validation.report.video import Caption, drawn_size
 from tests.systems.plane_sequences import CAMERA
 from tests.systems.stereo_sequences import missing, pairs
 

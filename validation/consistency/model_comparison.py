@@ -225,8 +225,7 @@ def _in_order(jobs: list[tuple[Any, Data]], workers: int, told: Callable[[int, i
 
 
 def _evidence(config: Config, data: Data) -> float:
-    from rbpf.runs.recordings import filter_robot_log
-    from rbpf.systems.mono.run import run as run_mono
+    from rbpf.runs.recordings import filter_features, filter_robot_log
     from rbpf.systems.stereo.run import run_features as run_stereo
 
     if isinstance(config, RangeBearingConfig):
@@ -239,6 +238,7 @@ def _evidence(config: Config, data: Data) -> float:
         if isinstance(data, RobotLog):
             return float(filter_robot_log(data, config).system.filter.log_evidence)
     elif isinstance(data, FeatureLog):
-        filtered = run_stereo(data, config) if isinstance(config, StereoConfig) else run_mono(data, config)
-        return float(filtered.filter.log_evidence)
+        if isinstance(config, StereoConfig):
+            return float(run_stereo(data, config).filter.log_evidence)
+        return float(filter_features(data, config).system.filter.log_evidence)
     raise InputError(f"a {type(config).__name__} does not filter a {type(data).__name__}")

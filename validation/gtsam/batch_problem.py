@@ -21,15 +21,12 @@ from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.feature_log import FeatureLog
 from rbpf.sensors.readers.measurements import Measurements
 from rbpf.systems.map_estimate import MapEstimate
-from rbpf.systems.mono.run import MonoRun
-from rbpf.systems.stereo.run import StereoRun
 from rbpf.validation.gtsam import camera, robot
 from rbpf.validation.gtsam.camera_data import CameraEstimate, sightings_of
 from rbpf.validation.gtsam.camera_factors import evaluate_sightings
 from rbpf.validation.gtsam.divergence import mahalanobis
 from rbpf.validation.gtsam.mono_batch import connected_frames
 from rbpf.validation.metrics.path_and_map import AnyRun
-from rbpf.validation.mono_log import feature_log
 
 Problem = Measurements | FeatureLog
 
@@ -78,11 +75,7 @@ def problem_of(run: AnyRun) -> Problem:
     """The measurements that a run in memory used."""
     if isinstance(run, Run):
         return run.system.measurements(run.name, run.log)
-    if isinstance(run, MonoRun):
-        return run.log
-    if isinstance(run, StereoRun):
-        return run.log()
-    return feature_log(run)
+    return run.log()
 
 
 def read_problem(folder: Path) -> Problem:

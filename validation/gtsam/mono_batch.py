@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, final
+from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,14 +11,9 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from rbpf.errors import InputError
-from rbpf.runs.alignment import Alignment
 from rbpf.runs.trajectory import Trajectory
 from rbpf.sensors.feature_log import FeatureLog, KnownPoints
-from rbpf.systems.mono.video import VideoRun
 from rbpf.validation.gtsam.camera import CameraEstimate, CameraSolution, solve_features
-from rbpf.validation.metrics.accuracy import ate
-from rbpf.validation.metrics.mono_scores import score_path, usual_alignment
-from rbpf.validation.mono_log import feature_log
 
 ROBUST = 1.345
 """Threshold of Huber's loss on whitened sightings, in standard deviations: a wrong match does little harm."""
@@ -57,11 +52,6 @@ class Batch:
         """The same with their stamps."""
         stamps = np.array([frame.stamp_ns for frame in self.log.frames], dtype=np.int64)
         return Trajectory(stamps, self.world_from_camera)
-
-
-def adjust_run(run: VideoRun, limit_s: float | None = None, on_iteration: Told | None = None) -> Batch:
-    """Adjusts what a run measured, from where the filter was; see `adjust_log`."""
-    return adjust_log(feature_log(run), run.world_from_camera, limit_s, on_iteration)
 
 
 def adjust_log(
@@ -126,24 +116,6 @@ def _best(
         assert problem is not None
         raise problem
     return min(found, key=lambda solution: solution.error)
-
-
-def score_batch(run: VideoRun, batch: Batch) -> dict[str, Any]:
-    """Entries of summary.json: the batch's errors, and how far the filter is from it.
-
-    Without known points scale and place are the filter's own, so that it is compared after a similarity alignment.
-    """
-    trajectory = batch.trajectory
-    scores = score_path(run.sequence.truth, trajectory, usual_alignment(run))
-    ours = Trajectory(trajectory.stamps_ns, run.world_from_camera[batch.frames])
-    how: Alignment = "none" if run.known is not None else "similarity"
-    return {
-        "batch_frames": int(batch.frames.size),
-        "batch_observations": int(sum(frame.landmarks.size for frame in batch.log.frames)),
-        "batch_error": float(batch.solution.error),
-        **{f"batch_{name}": value for name, value in scores.items()},
-        "filter_minus_batch_rmse_m": ate(ours, trajectory, how).rmse,
-    }
 
 
 def connected_frames(log: FeatureLog) -> NDArray[np.intp]:

@@ -7,10 +7,9 @@ import numpy as np
 
 from rbpf.lie import Array
 from rbpf.runs.path_and_map import PathAndMap
-from rbpf.runs.plots import COLOURS, label, new_axes, outline, save_figures
+from rbpf.runs.plots import COLOURS, Views, label, new_axes, outline, save_figures
 from rbpf.validation.colmap.compare import ColmapComparison
 from rbpf.validation.consistency.against_batch import AgainstBatch
-from rbpf.validation.report.mono_views import best_views
 
 _BINS = 20
 
@@ -70,7 +69,7 @@ def _batch_landmarks(found: AgainstBatch) -> Any:
 
 
 def _colmap_map(found: ColmapComparison, reference: PathAndMap) -> Any:
-    views = best_views(reference.trajectory.world_from_body)
+    views = Views.of_camera(reference.trajectory.world_from_body)
     figure, shown = views.axes(f"{found.reconstruction.name}: COLMAP brought onto the run")
     move = found.reference_from_colmap
     cloud, centres = (

@@ -9,7 +9,7 @@ import numpy as np
 from rbpf.sensors.readers import ImageSequence
 from rbpf.systems.stereo.landmarks import FeatureKind
 from rbpf.systems.stereo.run import PairSeen, StereoRun
-from rbpf.validation.report.annotated import (
+from rbpf.validation.report.video import (
     FOUND,
     STARTED,
     Caption,
@@ -18,8 +18,8 @@ from rbpf.validation.report.annotated import (
     cross,
     drawn_scale,
     drawn_size,
+    write_video,
 )
-from rbpf.validation.report.video_file import write_video
 
 COLOURS = {
     FeatureKind.FEATURE: (150, 150, 150),

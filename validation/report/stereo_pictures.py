@@ -7,14 +7,13 @@ import numpy as np
 
 from rbpf.lie import SE3
 from rbpf.runs.alignment import align
-from rbpf.runs.plots import COLOURS, SIGMAS, outline, save_figures, stacked_axes
+from rbpf.runs.plots import COLOURS, SIGMAS, Views, close_up, outline, save_figures, stacked_axes
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.stereo.run import StereoRun
 from rbpf.validation.gtsam.mono_batch import Batch
 from rbpf.validation.metrics.accuracy import ate
 from rbpf.validation.metrics.mono_scores import TruePath, true_path
 from rbpf.validation.metrics.stereo_scores import compared
-from rbpf.validation.report.mono_views import Views, best_views, close_up, draw_particles
 
 MAP_FRACTION = 0.9
 """The map's picture holds the path and this fraction of the points; single points far off do not make it small."""
@@ -22,7 +21,7 @@ MAP_FRACTION = 0.9
 
 def plot_stereo_run(run: StereoRun, mapped: MapEstimate, out: Path, batch: Batch | None = None) -> list[str]:
     """Draws path, map, particles, error, tracking and times; returns the file names."""
-    views, truth = best_views(run.world_from_camera), true_path(run.truth, run.stamps_ns)
+    views, truth = Views.of_camera(run.world_from_camera), true_path(run.truth, run.stamps_ns)
     figures = {
         "path.png": _path(run, views, truth, batch),
         "map.png": _map(run, mapped, views),
@@ -62,10 +61,9 @@ def _map(run: StereoRun, mapped: MapEstimate, views: Views) -> Any:
     far = np.linalg.norm(mean - middle, axis=1)
     near = far <= np.quantile(far, MAP_FRACTION) if far.size else np.zeros(0, dtype=bool)
     for axes, plane in shown:
-        chosen = list(plane)
         axes.plot(at[:, plane[0]], at[:, plane[1]], color=COLOURS["filter"], lw=1.0, label="camera")
         axes.plot(mean[:, plane[0]], mean[:, plane[1]], ".", color=COLOURS["map"], ms=2, label="landmarks")
-        ellipses = outline(mean[near][:, chosen], cov[near][:, chosen][:, :, chosen])
+        ellipses = outline(mean[near][:, plane], cov[near][:, plane][:, :, plane])
         axes.plot(ellipses[..., 0].T, ellipses[..., 1].T, color="black", lw=0.4, alpha=0.4)
         close_up(axes, plane, np.concatenate([mean[near], at]))
     shown[0][0].legend(loc="best", fontsize="small")
@@ -78,7 +76,18 @@ def _particles(run: StereoRun, views: Views) -> Any:
     at, best = SE3.translation(particles.state), run.at_update
     turn = SE3.rotation(best.mean)
     mean, cov = SE3.translation(best.mean), turn @ best.cov[3:, 3:] @ turn.T
-    draw_particles(shown, at, particles.weights, mean, cov)
+    for axes, (right, up) in shown:
+        axes.scatter(
+            at[:, right], at[:, up], s=1000 * particles.weights, color=COLOURS["filter"], alpha=0.5,
+            label="particles; area is weight",
+        )  # fmt: skip
+        chosen = [right, up]
+        ellipse = outline(mean[chosen], cov[np.ix_(chosen, chosen)])
+        axes.plot(*ellipse.T, color=COLOURS["map"], lw=1.0, label=f"{SIGMAS:g}σ of the pose")
+        axes.plot(mean[right], mean[up], "x", color=COLOURS["map"], label="mean")
+        axes.ticklabel_format(useOffset=False)
+        axes.tick_params(axis="x", labelrotation=30)
+    shown[0][0].legend(loc="best", fontsize="small")
     return figure
 
 

@@ -16,9 +16,9 @@ from rbpf.sensors.readers import ImageSequence
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.stereo.landmarks import FeatureKind
 from rbpf.systems.stereo.run import StereoRun
-from rbpf.validation.report.annotated import FOUND
-from rbpf.validation.report.rerun_file import ellipsoids, log_image, log_lens, log_pose, log_time, recording
+from rbpf.validation.report.rerun import ellipsoids, log_image, log_lens, log_pose, log_time, recording
 from rbpf.validation.report.stereo_frames import COLOURS, NAMES
+from rbpf.validation.report.video import FOUND
 
 
 def write_stereo_rerun(run: StereoRun, sequence: ImageSequence, mapped: MapEstimate, path: Path) -> None:

@@ -6,7 +6,7 @@ A new system is one function from a sequence and settings to figures, entered in
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,6 +14,9 @@ from rbpf.errors import InputError
 from rbpf.runs.truth import RunTruth
 from rbpf.systems.settings import load_settings
 from rbpf.validation.consistency.pose_errors import whitened_errors
+
+if TYPE_CHECKING:
+    from rbpf.runs.run import Run
 
 Figures = dict[str, Any]
 
@@ -51,17 +54,23 @@ def _robot_settings(pairs: Sequence[str], given: Mapping[str, Any]) -> Any:
 
 
 def _run_robot(sequence: Mapping[str, Path], pairs: Sequence[str], given: Mapping[str, Any]) -> Figures:
-    from rbpf.runs.folder import summarise
-    from rbpf.runs.path_and_map import PathAndMap
-    from rbpf.runs.recordings import filter_robot_log
-    from rbpf.sensors.readers import open_log
-    from rbpf.validation.metrics.scores import score_estimate
+    from rbpf.runs.recordings import RobotRecording, filter_recording
 
     config = _robot_settings(pairs, given)
-    run = filter_robot_log(open_log(sequence["recording"], config.noise), config)
+    return _figures(
+        filter_recording(RobotRecording(sequence["recording"]), config), config.association == "ml"
+    )
+
+
+def _figures(run: "Run", anonymous: bool = False) -> Figures:
+    """What a run's summary and scores say, without writing them; `anonymous` as `score_estimate`'s."""
+    from rbpf.runs.folder import summarise
+    from rbpf.runs.path_and_map import PathAndMap
+    from rbpf.validation.metrics.scores import score_estimate
+
     figures = summarise(run)
     if run.truth is not None:
-        figures |= score_estimate(PathAndMap.of_run(run), run.truth, config.association == "ml")
+        figures |= score_estimate(PathAndMap.of_run(run), run.truth, anonymous)
     return figures | _pose_nees(run.system.space, run.log.poses, run.log.covs, run.truth)
 
 
@@ -72,15 +81,12 @@ def _mono_settings(pairs: Sequence[str], given: Mapping[str, Any]) -> Any:
 
 
 def _run_mono(sequence: Mapping[str, Path], pairs: Sequence[str], given: Mapping[str, Any]) -> Figures:
-    from rbpf.lie import SE3
-    from rbpf.validation.metrics.mono_scores import camera_truth
-    from rbpf.validation.mono import Recording, start_mono
-    from rbpf.validation.mono_folder import summarise_camera
+    from rbpf.runs.recordings import MonoRecording, filter_recording
 
-    recording = Recording(sequence["recording"], sequence.get("known_points"), sequence.get("calibration"))
-    done = start_mono(recording, _mono_settings(pairs, given))
-    figures = summarise_camera(done, done.slam.map())
-    return figures | _pose_nees(SE3, done.world_from_camera, done.cov, camera_truth(done))
+    recording = MonoRecording(
+        sequence["recording"], sequence.get("known_points"), sequence.get("calibration")
+    )
+    return _figures(filter_recording(recording, _mono_settings(pairs, given)))
 
 
 def _stereo_settings(pairs: Sequence[str], given: Mapping[str, Any]) -> Any:

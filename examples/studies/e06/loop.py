@@ -9,8 +9,9 @@ from examples.studies.e06.setting import Row, Setting, true_poses
 from examples.studies.e06.worlds import LoopOverDesk
 from rbpf.lie import SE3
 from rbpf.runs.plots import COLOURS, SIGMAS, label, outline, save_figures
+from rbpf.runs.recordings import filter_images
+from rbpf.runs.run import Run
 from rbpf.systems.map_estimate import MapEstimate
-from rbpf.systems.mono.video import SearchRecord, VideoRun, run_images
 
 START = 15
 """Landmarks that were started in so many first frames are those of the start."""
@@ -36,12 +37,16 @@ class Closure:
     back: int
 
 
-def find_closure(frames: list[SearchRecord], first: int) -> Closure:
+def find_closure(frames: list[dict[str, np.ndarray]], first: int) -> Closure:
     """From the sightings of a run, frame by frame, for the features with rows below `first`.
 
     The absence is the longest run of frames in which none of them was found.
     """
-    seen = [np.unique(frame.features[frame.found & (frame.features < first)]) for frame in frames]
+    seen = []
+    for frame in frames:
+        features = frame["features"]
+        found = np.isfinite(frame["px"]).all(axis=1)
+        seen.append(np.unique(features[found & (features < first)]))
     seen[0] = np.arange(first)
     times = np.flatnonzero([rows.size > 0 for rows in seen])
     gaps = np.diff(times)
@@ -53,21 +58,21 @@ def find_closure(frames: list[SearchRecord], first: int) -> Closure:
     return Closure(first, again.size, left, back)
 
 
-def started_until(frames: list[SearchRecord], until: int) -> int:
+def started_until(frames: list[dict[str, np.ndarray]], until: int) -> int:
     """Number of features that were started in the first frames, the known points among them."""
-    return sum(frame.started.shape[0] for frame in frames[:until])
+    return sum(frame["started"].size for frame in frames[:until])
 
 
 def reproduce(setting: Setting) -> list[Row]:
     """Filters the loop."""
     world = LoopOverDesk(frames=150, radius_m=0.35, texel_m=0.002) if setting.quick else LoopOverDesk()
     sequence, known = setting.sequence("loop", world)
-    run = run_images(sequence, setting.config(), known)
-    mapped = run.slam.map()
-    first = started_until(run.searches, START)
-    closure = find_closure(run.searches, first)
-    truth = true_poses(sequence)[: run.stamps_ns.size]
-    error = np.linalg.norm(SE3.translation(run.world_from_camera) - SE3.translation(truth), axis=1)
+    run = filter_images(sequence, setting.config(), known)
+    mapped = run.system.map()
+    first = started_until(run.log.all_observed(), START)
+    closure = find_closure(run.log.all_observed(), first)
+    truth = true_poses(sequence)[: run.log.stamps_ns.size]
+    error = np.linalg.norm(SE3.translation(run.log.poses) - SE3.translation(truth), axis=1)
     save_figures({"figure_5.png": _draw(run, mapped, truth, error, closure)}, setting.out)
     return _rows(closure, error, truth, int((~mapped.is_ray()).sum()))
 
@@ -99,7 +104,7 @@ def _rows(closure: Closure, error: np.ndarray, truth: np.ndarray, full: int) -> 
     ]
 
 
-def _draw(run: VideoRun, mapped: MapEstimate, truth: np.ndarray, error: np.ndarray, closure: Closure) -> Any:
+def _draw(run: Run, mapped: MapEstimate, truth: np.ndarray, error: np.ndarray, closure: Closure) -> Any:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(12.0, 5.5), layout="constrained")
@@ -111,11 +116,11 @@ def _draw(run: VideoRun, mapped: MapEstimate, truth: np.ndarray, error: np.ndarr
         above.plot(*ellipse.T, color=COLOURS["map"], lw=0.6)
     above.plot(*mean[:, :2].T, ".", color="black", ms=3, label=f"landmarks, {SIGMAS:g}σ")
     above.plot(*SE3.translation(truth)[:, :2].T, color=COLOURS["truth"], lw=1.0, ls="--", label="true path")
-    above.plot(
-        *SE3.translation(run.world_from_camera)[:, :2].T, color=COLOURS["filter"], lw=1.2, label="filter"
-    )
-    if run.known is not None:
-        above.plot(*run.known.positions[:, :2].T, "+", color=COLOURS["known"], ms=9, label="known points")
+    above.plot(*SE3.translation(run.log.poses)[:, :2].T, color=COLOURS["filter"], lw=1.2, label="filter")
+    if run.system.known is not None:
+        above.plot(
+            *run.system.known.positions[:, :2].T, "+", color=COLOURS["known"], ms=9, label="known points"
+        )
     above.legend(fontsize="small")
     label(curve, "error of the position", "frame", "mm", equal=False)
     curve.plot(1e3 * error, color=COLOURS["filter"])

@@ -11,9 +11,10 @@ from rbpf.core.models import Records
 from rbpf.lie import SE3
 from rbpf.maps.point import Point
 from rbpf.runs.plots import label, save_figures
-from rbpf.sensors.readers import ImageFrame
+from rbpf.runs.recordings import filter_images
+from rbpf.runs.run import Run
 from rbpf.systems.mono.feature_table import PATCH_PX
-from rbpf.systems.mono.video import VideoRun, run_images
+from rbpf.systems.system import Tracked
 
 SIZES = 100, 300, 1000, 3000, 10_000
 AWAY_M = 2.0, 20.0
@@ -39,14 +40,15 @@ class _Watch:
         self.seconds: dict[int, list[list[float]]] = {size: [] for size in sizes}
         self._last = time.process_time()
 
-    def __call__(self, t: int, frame: ImageFrame, run: VideoRun) -> None:
+    def __call__(self, run: Run, _: Tracked) -> None:
         """After a frame."""
+        t = len(run.log) - 1
         whole = time.process_time() - self._last
         turn, since = divmod(t - WARM_UP, FRAMES)
         if 0 <= turn < len(self.sizes) and since >= SETTLE:
-            measurement = run.slam.measurement
+            measurement = run.system.measurement
             assert measurement is not None
-            search, step = float(run.seconds_search[t]), float(run.seconds[t])
+            search, step = float(run.log["seconds_search"][t]), float(run.log["seconds"][t])
             self.seconds[self.sizes[turn]].append(
                 [whole, step - search, search, measurement.search.seconds_choosing]
             )
@@ -55,9 +57,9 @@ class _Watch:
         self._last = time.process_time()
 
 
-def fill(run: VideoRun, size: int, rng: np.random.Generator) -> None:
+def fill(run: Run, size: int, rng: np.random.Generator) -> None:
     """Adds points all around but out of view, known alike to all particles, until the map holds `size` landmarks."""
-    belief, table = run.filter.belief(), run.sensor.table
+    belief, table = run.system.filter.belief(), run.system.sensor.table
     count = size - belief.map.ids.size
     if count <= 0:
         return
@@ -69,7 +71,7 @@ def fill(run: VideoRun, size: int, rng: np.random.Generator) -> None:
     direction = np.stack([side * np.cos(turn), side * np.sin(turn), along], axis=-1)
     points = SE3.transform(pose, rng.uniform(*AWAY_M, (count, 1)) * direction)
     table.position[rows] = np.concatenate([points, np.ones((count, 1))], axis=1)
-    n = run.filter.n
+    n = run.system.filter.n
     records = Records(
         np.broadcast_to(points, (n, count, 3)), np.broadcast_to(STD_M**2 * np.eye(3), (n, count, 3, 3))
     )
@@ -87,7 +89,7 @@ def measure_times(setting: Setting, sizes: tuple[int, ...], rounds: int) -> np.n
     found: dict[int, list[list[float]]] = {size: [] for size in sizes}
     for turn in range(rounds):
         watch = _Watch(sizes, np.random.default_rng(turn))
-        run_images(sequence, setting.config(), known, watch)
+        filter_images(sequence, setting.config(), known, [watch])
         for size, seconds in watch.seconds.items():
             found[size] += seconds
     return np.array([np.median(found[size], axis=0) for size in sizes])

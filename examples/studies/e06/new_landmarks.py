@@ -1,5 +1,6 @@
 """Figures 7 and 8: new landmarks on their rays in the map, and on their epipolar lines in the image."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,11 +10,11 @@ from examples.studies.e06.setting import Row, Setting
 from examples.studies.e06.worlds import LoopOverDesk
 from rbpf.lie import SE3
 from rbpf.runs.plots import COLOURS, label, outline, save_figures
-from rbpf.sensors.readers import ImageFrame
+from rbpf.runs.recordings import filter_images
+from rbpf.runs.run import Run
 from rbpf.systems.map_estimate import MapEstimate
-from rbpf.systems.mono.video import SearchRecord, VideoRun, run_images
-from rbpf.validation.report.annotated import Caption
-from rbpf.validation.report.mono_frames import draw_frame
+from rbpf.systems.system import Tracked
+from rbpf.validation.report.video import Caption, draw_search
 
 FIRST = 20
 """The frame is not looked for before this one: the camera is still at rest."""
@@ -28,26 +29,31 @@ class Shown:
 
     frame: int
     image: np.ndarray
-    sighting: SearchRecord
+    sighting: Mapping[str, np.ndarray]
     found: int
     mapped: MapEstimate
     path: np.ndarray
 
 
-def line_distances(sighting: SearchRecord) -> np.ndarray:
+def found_rays(seen: Mapping[str, np.ndarray]) -> np.ndarray:
+    """(K,) which features that were looked for were found and have no depth yet."""
+    return np.asarray(np.isfinite(seen["px"]).all(axis=1) & np.isfinite(seen["line"]).all(axis=(1, 2)))
+
+
+def line_distances(sighting: Mapping[str, np.ndarray]) -> np.ndarray:
     """Distances (K,) of the found rays from their epipolar lines, px."""
-    rows = sighting.found & sighting.is_ray
-    start, end, px = sighting.line[rows, 0], sighting.line[rows, 1], sighting.px[rows]
+    rows = found_rays(sighting)
+    start, end, px = sighting["line"][rows, 0], sighting["line"][rows, 1], sighting["px"][rows]
     along = end - start
     length = np.linalg.norm(along, axis=1)
     cross = along[:, 0] * (px - start)[:, 1] - along[:, 1] * (px - start)[:, 0]
     return np.asarray(np.abs(cross) / np.maximum(length, 1e-12))
 
 
-def line_lengths(sighting: SearchRecord) -> np.ndarray:
+def line_lengths(sighting: Mapping[str, np.ndarray]) -> np.ndarray:
     """Lengths (K,) of the epipolar lines of the found rays, px: a camera at rest sees points."""
-    rows = sighting.found & sighting.is_ray
-    return np.asarray(np.linalg.norm(sighting.line[rows, 1] - sighting.line[rows, 0], axis=1))
+    rows = found_rays(sighting)
+    return np.asarray(np.linalg.norm(sighting["line"][rows, 1] - sighting["line"][rows, 0], axis=1))
 
 
 def reproduce(setting: Setting) -> list[Row]:
@@ -58,19 +64,20 @@ def reproduce(setting: Setting) -> list[Row]:
     sequence, known = setting.sequence(name, world)
     best: list[Shown] = []
 
-    def watch(t: int, frame: ImageFrame, run: VideoRun) -> None:
-        sighting = run.searches[-1]
-        lines = int((line_lengths(sighting) > 2.0 * run.config.search.noise_px).sum())
+    def watch(run: Run, _: Tracked) -> None:
+        t, frame = len(run.log) - 1, run.frame
+        sighting = run.log.observed(t)
+        lines = int((line_lengths(sighting) > 2.0 * run.system.config.search.noise_px).sum())
         if t < FIRST or frame.image is None or (best and lines <= best[0].found):
             return
-        path = run.world_from_camera[: t + 1].copy()
-        best[:] = [Shown(t, frame.image, sighting, lines, run.slam.map(), path)]
+        path = run.log.poses[: t + 1].copy()
+        best[:] = [Shown(t, frame.image, sighting, lines, run.system.map(), path)]
 
-    run = run_images(sequence, setting.config(), known, watch)
+    run = filter_images(sequence, setting.config(), known, [watch])
     (shown,) = best
     figures = {"figure_7.png": _draw_map(shown), "figure_8.png": _draw_image(shown, run)}
     save_figures(figures, setting.out)
-    all_lines = np.concatenate([line_distances(sighting) for sighting in run.searches])
+    all_lines = np.concatenate([line_distances(sighting) for sighting in run.log.all_observed()])
     rms = float(np.sqrt(np.mean(all_lines**2)))
     return [
         Row("Fig. 7", f"landmarks on rays in the map, frame {shown.frame}", "drawn",
@@ -114,12 +121,13 @@ def _draw_map(shown: Shown) -> Any:
     return figure
 
 
-def _draw_image(shown: Shown, run: VideoRun) -> Any:
+def _draw_image(shown: Shown, run: Run) -> Any:
     from matplotlib.figure import Figure
 
-    camera = run.sequence.camera
-    text = f"frame {shown.frame}   found {int(run.found[shown.frame])} of {int(run.searched[shown.frame])}   (Fig. 8)"
-    picture = draw_frame(shown.image, shown.sighting, Caption(text, ""), camera.width, camera.height)
+    camera = run.source.camera
+    found, searched = (run.log[name][shown.frame] for name in ("found", "searched"))
+    text = f"frame {shown.frame}   found {found} of {searched}   (Fig. 8)"
+    picture = draw_search(shown.image, shown.sighting, Caption(text, ""), (camera.width, camera.height))
     figure = Figure(figsize=(picture.shape[1] / 110.0, picture.shape[0] / 110.0))
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.imshow(picture)

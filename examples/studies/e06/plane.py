@@ -10,8 +10,9 @@ from examples.studies.e06.worlds import flat_desk
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.plots import COLOURS, SIGMAS, label, outline, save_figures
+from rbpf.runs.recordings import filter_images
+from rbpf.runs.run import Run
 from rbpf.systems.map_estimate import MapEstimate
-from rbpf.systems.mono.video import VideoRun, run_images
 
 ASKED_M, GOAL_M = 0.01, 0.003
 LEAST = 4
@@ -62,9 +63,9 @@ def fit_plane(points: np.ndarray) -> Plane:
     return Plane(middle, axes, local, float(ConvexHull(local[:, :2]).volume))
 
 
-def unknown_points(run: VideoRun, mapped: MapEstimate) -> np.ndarray:
+def unknown_points(run: Run, mapped: MapEstimate) -> np.ndarray:
     """(M,) which landmarks of a map are full and were not known beforehand."""
-    known = 0 if run.known is None else run.known.names.size
+    known = 0 if run.system.known is None else run.system.known.names.size
     return np.asarray(~mapped.is_ray() & (mapped.ids >= known))
 
 
@@ -72,8 +73,8 @@ def reproduce(setting: Setting) -> list[Row]:
     """Filters 20 s over a flat desk."""
     frames = 90 if setting.quick else 600
     sequence, known = setting.sequence("flat_desk", flat_desk(frames, 0.002 if setting.quick else 0.001))
-    run = run_images(sequence, setting.config(), known)
-    mapped = run.slam.map()
+    run = filter_images(sequence, setting.config(), known)
+    mapped = run.system.map()
     full = unknown_points(run, mapped)
     plane = fit_plane(mapped.mean[full])
     save_figures({"figure_4.png": _draw(run, mapped, full, plane)}, setting.out)
@@ -88,16 +89,16 @@ def reproduce(setting: Setting) -> list[Row]:
     ]
 
 
-def _draw(run: VideoRun, mapped: MapEstimate, full: np.ndarray, plane: Plane) -> Any:
+def _draw(run: Run, mapped: MapEstimate, full: np.ndarray, plane: Plane) -> Any:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13.0, 4.5), layout="constrained")
     image, above, side = figure.subplots(1, 3)
-    frame = next(run.sequence.frames(run.stamps_ns.size // 2))
+    frame = next(run.source.frames(run.log.stamps_ns.size // 2))
     image.imshow(frame.image, cmap="gray", vmin=0, vmax=255)
     image.set(title="a view of the desk", xticks=[], yticks=[])
     cov = plane.axes @ mapped.cov[full] @ plane.axes.T
-    camera = (SE3.translation(run.world_from_camera) - plane.middle) @ plane.axes.T
+    camera = (SE3.translation(run.log.poses) - plane.middle) @ plane.axes.T
     if camera[:, 2].mean() < 0.0:
         camera[:, 2] *= -1.0
         plane.local[:, 2] *= -1.0

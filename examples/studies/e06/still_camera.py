@@ -9,9 +9,9 @@ from examples.studies.e06.worlds import StillTarget
 from rbpf.core.filter import Filter
 from rbpf.lie import SE3
 from rbpf.runs.plots import save_figures
+from rbpf.runs.recordings import filter_images
 from rbpf.systems.mono.config import InverseDepthConfig, MonoConfig
 from rbpf.systems.mono.slam import world_of
-from rbpf.systems.mono.video import run_images
 from rbpf.validation.consistency.pose_errors import pose_errors
 from rbpf.validation.simulation.images import Imaging
 
@@ -52,10 +52,12 @@ def reproduce(setting: Setting) -> list[Row]:
     for treatment in TREATMENTS:
         ray = InverseDepthConfig(pose_update=treatment, promote_std_ratio=NEVER)  # type: ignore[arg-type]
         config = MonoConfig(particles=setting.particles, seed=setting.seed, inverse_depth=ray)
-        run = run_images(sequence, config, known)
-        errors = pose_errors(run.world_from_camera[-1:], run.cov[-1:], truth)
-        pose, position = (np.sqrt(np.linalg.det(part)) for part in (run.cov[-1], run.cov[-1, 3:, 3:]))
-        cloud = camera_cloud(run.filter, np.random.default_rng(setting.seed))
+        run = filter_images(sequence, config, known)
+        errors = pose_errors(run.log.poses[-1:], run.log.covs[-1:], truth)
+        pose, position = (
+            np.sqrt(np.linalg.det(part)) for part in (run.log.covs[-1], run.log.covs[-1, 3:, 3:])
+        )
+        cloud = camera_cloud(run.system.filter, np.random.default_rng(setting.seed))
         found[treatment] = Posterior(float(pose), float(position), float(errors.nees[0]), cloud)
     save_figures({"figure_9.png": _draw(found, SE3.translation(truth)[0])}, setting.out)
     return [_row(found, treatment) for treatment in ("epipolar", "marginal")]

@@ -1,0 +1,271 @@
+"""The annotated video of a run over images: what was looked for and seen in each, drawn and encoded one after the other.
+
+A further system is one function from a run and the number of a frame to a picture, entered into `PICTURES`.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rbpf.runs.files import whole
+from rbpf.runs.plots import outline
+from rbpf.runs.run import Run
+from rbpf.sensors.readers import ImageFrame
+
+Colour = tuple[int, int, int]
+Place = Callable[[np.ndarray], list[tuple[float, float]]]
+"""Pixels (…, 2) of the image to points of the picture."""
+
+FOUND, MISSED, STARTED, TEXT = (60, 220, 60), (240, 60, 50), (90, 170, 255), (255, 255, 255)
+
+_SMALL_PX = 800
+"""Images that are narrower are drawn at twice their size: an ellipse of three pixels shows nothing."""
+
+_ARM, _BAND = 4, 24
+_LETTER_FRACTION, _SMALLEST, _LARGEST = 1.0 / 62.0, 11.0, 17.0
+"""Height of letters as a fraction of the drawn width, and its bounds, px."""
+
+
+@dataclass(frozen=True)
+class Caption:
+    """What is written above a frame.
+
+    Attributes:
+        text: figures of the frame.
+        alarm: a warning, empty where all is well.
+    """
+
+    text: str
+    alarm: str
+
+
+def drawn_size(width: int, height: int) -> tuple[int, int]:
+    """Width and height of a drawn frame, even numbers, as video needs them."""
+    scale = drawn_scale(width)
+    return scale * width + (scale * width) % 2, scale * height + _BAND + (scale * height + _BAND) % 2
+
+
+def drawn_scale(width: int) -> int:
+    """How many times an image of this width is enlarged."""
+    return 2 if width < _SMALL_PX else 1
+
+
+def annotate(
+    image: np.ndarray | None,
+    size: tuple[int, int],
+    caption: Caption,
+    legend: Sequence[tuple[str, Colour]],
+    paint: Callable[[Any, Place], None],
+) -> np.ndarray:
+    """The frame as it is shown (H, W, 3) uint8.
+
+    Args:
+        image: (height, width) uint8; None where it could not be read.
+        size: width and height of the images, px.
+        caption: what is written above.
+        legend: names and colours.
+        paint: called with PIL's drawing of the picture, and with what tells where a pixel lies in it.
+    """
+    from PIL import Image, ImageDraw, ImageFont
+
+    scale, drawn = drawn_scale(size[0]), drawn_size(*size)
+    picture = Image.new("RGB", drawn)
+    if image is not None:
+        shown = Image.fromarray(image).resize((scale * size[0], scale * size[1]), Image.Resampling.BILINEAR)
+        picture.paste(shown.convert("RGB"), (0, _BAND))
+    draw = ImageDraw.Draw(picture)
+    draw.font = ImageFont.load_default(min(max(_LETTER_FRACTION * drawn[0], _SMALLEST), _LARGEST))
+
+    def place(px: np.ndarray) -> list[tuple[float, float]]:
+        shifted = scale * (np.atleast_2d(px) + 0.5) - 0.5 + [0.0, _BAND]
+        return [(float(x), float(y)) for x, y in shifted]
+
+    paint(draw, place)
+    draw.rectangle((0, 0, drawn[0], _BAND), fill=(0, 0, 0))
+    draw.text((4, 3), caption.text, fill=TEXT)
+    end = draw.textlength(caption.text) + 16
+    draw.text((end, 3), caption.alarm, fill=MISSED)
+    _draw_legend(draw, drawn[0], legend)
+    return np.asarray(picture)
+
+
+def cross(draw: Any, at: tuple[float, float], colour: Colour) -> None:
+    """A small upright cross at a point of the picture."""
+    x, y = at
+    draw.line((x - _ARM, y, x + _ARM, y), fill=colour)
+    draw.line((x, y - _ARM, x, y + _ARM), fill=colour)
+
+
+def _draw_legend(draw: Any, width: int, legend: Sequence[tuple[str, Colour]]) -> None:
+    at = width - 6.0
+    for name, colour in reversed(legend):
+        at -= draw.textlength(name)
+        draw.text((at, 3), name, fill=colour)
+        at -= 12.0
+
+
+RAY = (255, 190, 40)
+_SEARCH_LEGEND = (("found", FOUND), ("missed", MISSED), ("epipolar line", RAY), ("new", STARTED))
+
+
+def picture_of_search(run: Run, t: int, frame: ImageFrame) -> np.ndarray:
+    """A frame of a monocular run (H, W, 3): ellipses, hits, misses and epipolar lines (E06, Figs. 7 and 8)."""
+    log = run.log
+    text = (
+        f"frame {t}   found {log['found'][t]} of {log['searched'][t]}   "
+        f"map {log['points'][t]} points, {log['rays'][t]} rays"
+    )
+    alarm = "FOUND AGAIN" if log["relocalised"][t] else "LOST" if log["lost"][t] else ""
+    alarm = f"NO IMAGE {alarm}" if frame.image is None else alarm
+    camera = run.system.camera  # type: ignore[attr-defined]
+    return draw_search(frame.image, log.observed(t), Caption(text, alarm), (camera.width, camera.height))
+
+
+def draw_search(
+    image: np.ndarray | None, seen: Mapping[str, np.ndarray], caption: Caption, size: tuple[int, int]
+) -> np.ndarray:
+    """The frame as it is shown (H, W, 3) uint8.
+
+    Args:
+        image: (height, width) uint8; None where it could not be read.
+        seen: what was looked for, see `MonoSlam.observed`.
+        caption: what is written above.
+        size: width and height of the images, px.
+    """
+    found, stroke = np.isfinite(seen["px"]).all(axis=1), drawn_scale(size[0])
+
+    def paint(draw: Any, place: Place) -> None:
+        for line in seen["line"][np.isfinite(seen["line"]).all(axis=(1, 2))]:
+            draw.line(place(_clipped(line, size)), fill=RAY, width=stroke)
+        for ellipse, hit in zip(outline(seen["mean"], seen["cov"]), found.tolist(), strict=True):
+            draw.line(place(ellipse), fill=FOUND if hit else MISSED, width=stroke)
+        for name, rows, colour in (
+            ("px", found, FOUND),
+            ("mean", ~found, MISSED),
+            ("started_px", slice(None), STARTED),
+        ):
+            for px in seen[name][rows]:
+                cross(draw, place(px)[0], colour)
+
+    return annotate(image, size, caption, _SEARCH_LEGEND, paint)
+
+
+def _clipped(line: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """A line (2, 2) without what lies more than an image's size outside: far ends may project to anywhere."""
+    start, step = line[0], line[1] - line[0]
+    low, high = -np.asarray(size, dtype=float), 2.0 * np.asarray(size, dtype=float)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ends = np.sort(np.stack([(low - start) / step, (high - start) / step]), axis=0)
+    enter = max(0.0, float(np.nanmax(np.where(step == 0.0, 0.0, ends[0]))))
+    leave = min(1.0, float(np.nanmin(np.where(step == 0.0, 1.0, ends[1]))))
+    return start + np.array([[enter], [max(enter, leave)]]) * step
+
+
+PICTURES: dict[str, Callable[[Run, int, ImageFrame], np.ndarray]] = {"mono": picture_of_search}
+"""By the system's name, how a frame is drawn."""
+
+
+def annotated_frames(run: Run) -> Iterator[np.ndarray]:
+    """The frames of a run (H, W, 3) uint8, as they are needed; its source is read once more."""
+    draw = PICTURES[run.system.name]
+    for t, frame in zip(range(len(run.log)), run.source.frames(), strict=False):
+        yield draw(run, t, frame)
+
+
+def write_annotated(run: Run, path: Path, on_frame: Callable[[int, int], None] | None = None) -> None:
+    """Writes an MP4 of all frames that were filtered; it appears under its name when it is complete.
+
+    Args:
+        run: of a system in `PICTURES`.
+        path: the file.
+        on_frame: called with the frames written and their number.
+
+    Raises:
+        InputError: the place cannot be written to, or the disk is full.
+    """
+    frames = annotated_frames(run)
+    first = next(frames)
+    size = first.shape[1], first.shape[0]
+    write_video(chain([first], frames), size, run.log.stamps_ns, path, on_frame)
+
+
+SHORTEST_S, LONGEST_S = 1.0 / 120.0, 1.0
+"""Bounds of the time per image, for sequences whose stamps say little: photos, equal stamps."""
+
+QUALITY = "23"
+"""Constant rate factor of H.264: 18 is nearly without loss, 28 poor."""
+
+ENCODING = "-preset", "veryfast", "-fflags", "+bitexact", "-flags:v", "+bitexact"
+
+
+def write_video(
+    pictures: Iterable[np.ndarray],
+    size: tuple[int, int],
+    stamps_ns: np.ndarray,
+    path: Path,
+    on_frame: Callable[[int, int], None] | None = None,
+) -> None:
+    """Writes an MP4; it appears under its name when it is complete.
+
+    Args:
+        pictures: (H, W, 3) uint8.
+        size: their width and height, even numbers.
+        stamps_ns: (T,) of the pictures; it runs as fast as these.
+        path: the file.
+        on_frame: called with the pictures written and their number.
+
+    Raises:
+        InputError: the place cannot be written to, or the disk is full.
+    """
+    import imageio_ffmpeg
+
+    with whole(path) as partial:
+        encoder = imageio_ffmpeg.write_frames(
+            str(partial),
+            size,
+            fps=frame_rate(stamps_ns),
+            codec="libx264",
+            quality=None,
+            macro_block_size=2,
+            pix_fmt_out="yuv420p",
+            output_params=["-crf", QUALITY, *ENCODING],
+            ffmpeg_log_level="error",
+        )
+        with closing(encoder):
+            encoder.send(None)
+            for t, picture in enumerate(pictures):
+                encoder.send(np.ascontiguousarray(picture))
+                if on_frame is not None:
+                    on_frame(t + 1, stamps_ns.size)
+        if not is_complete(partial):
+            # The encoder says nothing through the pipe of what went wrong behind it.
+            raise OSError("the encoder could not finish, the disk may be full")
+
+
+def is_complete(path: Path) -> bool:
+    """Whether an MP4 holds all that it announces: its boxes fill the file, and the frames' index is among them."""
+    size, place, kinds = path.stat().st_size, 0, list[bytes]()
+    with path.open("rb") as file:
+        while place + 8 <= size:
+            file.seek(place)
+            length, kind = int.from_bytes(file.read(4), "big"), file.read(4)
+            if length == 1:
+                length = int.from_bytes(file.read(8), "big")
+            if length < 8:
+                return False
+            kinds.append(kind)
+            place += length
+    return place == size and b"moov" in kinds
+
+
+def frame_rate(stamps_ns: np.ndarray) -> float:
+    """Images per second of a video that runs as fast as the recording."""
+    gaps = np.diff(stamps_ns) * 1e-9
+    gaps = gaps[gaps > 0.0]
+    typical = float(np.median(gaps)) if gaps.size else LONGEST_S
+    return round(1.0 / min(max(typical, SHORTEST_S), LONGEST_S), 3)
