@@ -101,7 +101,7 @@ class MonoOptions(ImageRunOptions):
 
     Attributes:
         sequence: images: a folder of a known kind (EuRoC, TUM RGB-D, KITTI, 7-Scenes, images with a camera.yaml), a
-            video with a camera.yaml beside it, or a ROS bag.
+            video with a camera.yaml beside it, a ROS bag, or the number of a camera at this computer, as 0.
         particles: number of particles; by default 50, or as in --config.
         known_points: table of points of known position that are seen in the first image; by default none: the world is
             the first camera's and its scale is arbitrary.

@@ -83,11 +83,17 @@ def run_mono(options: Annotated[MonoOptions, tyro.conf.arg(name="")]) -> None:
     recording = MonoRecording(
         options.sequence, points, options.calibration, board, options.map, markers, given_topics(options)
     )
+    video = options.video
+    if recording.live is not None:
+        if options.resume or options.rerun is not None:
+            raise InputError("the images of a live camera are not kept: leave out --resume and --rerun")
+        video = False
+        say("Ctrl-C ends the recording; the results are written then")
     _run_images(
         options,
         lambda tell: filter_recording(recording, config, options.out, options.resume, [listener(tell)]),
         lambda run, callbacks: finish_run(
-            run, options.out, recording.sources(), options.video, options.rerun, options.batch, callbacks
+            run, options.out, recording.sources(), video, options.rerun, options.batch, callbacks
         ),
     )
 

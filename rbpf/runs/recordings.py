@@ -24,6 +24,7 @@ from rbpf.sensors.readers import (
     open_log,
     read_known_points,
 )
+from rbpf.sensors.readers.images.live import LiveCamera, camera_number
 from rbpf.sensors.readers.images.sequence import UNNAMED
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.known_map import KnownMap, read_known_map
@@ -94,7 +95,7 @@ class MonoRecording:
     """Images of one camera, and what is known of them beforehand.
 
     Attributes:
-        images: a sequence of any kind that `open_images` knows.
+        images: a sequence of any kind that `open_images` knows, or the number of a camera at this computer.
         known_points: table of known points; None starts without any.
         calibration: camera.yaml in place of the sequence's own camera.
         board: chessboard that is seen in the first image; its corners are the known points, in its frame.
@@ -138,10 +139,24 @@ class MonoRecording:
         known_map = None if self.map is None else read_known_map(self.map)
         return open_mono(*self.sequence(), config, known_map)
 
-    def sequence(self) -> tuple[ImageSequence, KnownPixels | None]:
+    @property
+    def live(self) -> int | None:
+        """The number of the camera whose images come as they are taken; None of a recording."""
+        return camera_number(self.images)
+
+    def sequence(self) -> tuple[ImageSequence | LiveCamera, KnownPixels | None]:
         """The images, and the known points if there are any; errors as `open`."""
+        if self.live is not None and self.known_points is not None:
+            raise InputError(
+                "known points are pixels of a first image that is there already: "
+                "start a live camera from --board or --aruco, or without known points"
+            )
         known = None if self.known_points is None else read_known_points(self.known_points)
-        sequence = open_images(self.images, self.calibration, self.topics)
+        sequence: ImageSequence | LiveCamera
+        if self.live is not None:
+            sequence = LiveCamera(self.live, self.calibration)
+        else:
+            sequence = open_images(self.images, self.calibration, self.topics)
         if self.board is not None:
             known = find_board(first_image(sequence), self.board)
         if self.markers is not None:
@@ -180,7 +195,10 @@ def open_robot_log(log: RobotLog, config: RangeBearingConfig) -> Opened:
 
 
 def open_mono(
-    sequence: ImageSequence, known: KnownPixels | None, config: MonoConfig, known_map: KnownMap | None = None
+    sequence: ImageSequence | LiveCamera,
+    known: KnownPixels | None,
+    config: MonoConfig,
+    known_map: KnownMap | None = None,
 ) -> Opened:
     """A sequence of images; with known points in the first one, or a known map, or without either.
 
@@ -210,7 +228,7 @@ def open_features(
     return Opened(system, LogSource(log), stamps, log.truth)
 
 
-def first_image(sequence: ImageSequence) -> np.ndarray:
+def first_image(sequence: ImageSequence | LiveCamera) -> np.ndarray:
     """The image (H, W) that a run starts from.
 
     Raises:
