@@ -124,7 +124,8 @@ def test_times_are_told_by_stage(finished):
     table = np.genfromtxt(finished / "timings.csv", delimiter=",", names=True)
     assert table.size == FRAMES
     stages = table["search_ms"] + table["filter_ms"] + table["new_features_ms"]
-    assert np.allclose(stages, table["milliseconds"], atol=1e-3)
+    handing_over = table["milliseconds"] - stages
+    assert handing_over.min() > -1e-3 and np.median(handing_over) < 0.05
     assert (table["waiting_for_image_ms"] >= 0.0).all()
 
 

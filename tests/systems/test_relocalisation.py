@@ -107,8 +107,8 @@ def test_recovers_after_a_blackout(tracked, tmp_path, how):
 @slow
 def test_the_map_survives_the_dark(tracked, tmp_path):
     held = resumed(tracked, tmp_path, lambda t, image: np.zeros_like(image) if t >= START else image)
-    assert np.array_equal(held.sensor.table.alive, tracked.alive)
-    assert held.lost[-1]
+    assert np.array_equal(held.system.sensor.table.alive, tracked.alive)
+    assert held.log.lost()[-1]
     assert np.ptp(errors(held)[START:]) < 0.5
 
 
