@@ -7,7 +7,9 @@ import pytest
 import yaml
 
 from rbpf.cli import main
+from rbpf.runs.trajectory import associate, read_tum
 from rbpf.sensors.camera import Pinhole
+from rbpf.validation.metrics.accuracy import ate
 from rbpf.validation.simulation.desk_and_room import TexturedDesk
 from rbpf.validation.simulation.images import Imaging, simulate_images
 from tests.cli.mono_sequences import run, sentence, summary
@@ -57,6 +59,10 @@ def test_the_camera_is_found_in_the_map_of_an_earlier_run(halves, mapped, tmp_pa
     assert entries["path_rmse_m"] < 0.02
     assert entries["landmarks_partial"] == 0
     assert "batch_problem" not in entries and entries["batch_path_rmse_m"] < 0.02
+    # Filter and optimum are compared in the map's world, as the comparison of a folder does.
+    poses, batch = (read_tum(out / name) for name in ("trajectory.tum", "batch.tum"))
+    apart = ate(*associate(poses, batch, 0)).rmse
+    assert entries["filter_minus_batch_rmse_m"] == pytest.approx(apart, rel=1e-9)
     assert (mapped / "known_map.npz").read_bytes() == map_before
     with np.load(mapped / "known_map.npz") as before, np.load(out / "map.npz") as after:
         np.testing.assert_allclose(after["mean"], before["positions"], atol=1e-12)

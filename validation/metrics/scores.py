@@ -73,8 +73,7 @@ def score_run(found: RunFolder) -> dict[str, Any]:
                 entries |= {prefix + key: v for key, v in score_path(other, reference, truth).items()}
     if batch is not None:
         ours, theirs = associate(path, batch, 0)
-        summary = found.summary
-        floats = found.system == "mono" and (summary.get("known_points") == 0 or "localized" in summary)
+        floats = found.system == "mono" and found.summary.get("known_points") == 0
         apart = ate(ours, theirs, "similarity" if floats else "none")
         entries["filter_minus_batch_rmse_m"] = apart.rmse
     return entries
