@@ -6,7 +6,7 @@ STAMP := .venv/stamp
 PYTEST := $(BIN)/python -m pytest -n 2 --dist worksteal
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test check bench coverage docs clean
+.PHONY: help setup demo test slow check bench coverage docs clean
 
 help:
 	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' Makefile
@@ -30,13 +30,16 @@ demo: $(STAMP) ## simulate, filter and report into demo/
 test: $(STAMP) ## all tests
 	$(PYTEST)
 
+slow: $(STAMP) ## the tests that `make check` leaves out
+	$(PYTEST) $(COVER) -m "slow or real_data"
+
 check: $(STAMP) ## format, lint, spelling, types, import rules and the fast tests
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/typos
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(PYTEST) -m "not slow and not real_data"
+	$(PYTEST) $(COVER) -m "not slow and not real_data"
 
 bench: $(STAMP) ## run the benchmarks against their baselines
 	$(BIN)/python -m benchmarks --gate
