@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rbpf.cli import main
-from rbpf.sensors.readers import open_images, read_known_points
+from rbpf.sensors.readers import open_images, open_stereo, read_known_points
 from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
 
 pytestmark = pytest.mark.slow
@@ -20,7 +20,7 @@ def lab(out: Path, *arguments: str) -> int:
 
 def test_a_tour_can_be_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert lab(tmp_path / "lab", "--every", "1000", "--noise-std", "0") == 0
-    sequence = open_images(tmp_path / "lab")
+    sequence = open_stereo(tmp_path / "lab")
     assert sequence.truth is not None
     assert len(sequence) == 4 and sequence.baseline_m == 0.12
     assert sequence.camera.fx == 75.0

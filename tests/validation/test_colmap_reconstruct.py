@@ -11,7 +11,7 @@ from rbpf.runs.path_and_map import PathAndMap
 from rbpf.runs.trajectory import Trajectory
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.feature_log import CameraTruth
-from rbpf.sensors.readers import open_images
+from rbpf.sensors.readers import open_images, open_stereo
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.validation.colmap.against_colmap import compare_folder_with_colmap, compare_with_colmap
 from rbpf.validation.colmap.cloud_distance import cloud_distance
@@ -31,7 +31,8 @@ def rendered(folder, frames, camera=CAMERA, every=15):
     simulate_images(
         TexturedDesk(frames=frames, texel_m=0.004), Imaging(known=0, noise_std=1.0), camera, folder, seed=2
     )
-    return open_images(folder), replace(FEW, every=every)
+    opened = open_stereo if isinstance(camera, RectifiedStereo) else open_images
+    return opened(folder), replace(FEW, every=every)
 
 
 @pytest.fixture(scope="module")

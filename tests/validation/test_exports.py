@@ -55,5 +55,5 @@ def test_kitti_files_are_read_back(tmp_path, run):
 
 def test_what_is_no_run_is_refused(tmp_path, capsys):
     assert main(["export", str(tmp_path), "--format", "tum"]) == 2
-    assert "holds no config.yaml" in capsys.readouterr().err
+    assert "no config.yaml: expected the folder" in capsys.readouterr().err
     assert not (tmp_path / "export").exists()

@@ -11,7 +11,7 @@ import pytest
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
-from rbpf.sensors.readers import open_images
+from rbpf.sensors.readers import open_images, open_stereo
 from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
 from rbpf.validation.simulation import lab as lab_points
 from rbpf.validation.simulation.features import Measuring, simulate_features
@@ -192,7 +192,7 @@ def shift_px(expected: np.ndarray, image: np.ndarray, mask: np.ndarray) -> np.nd
 
 def test_texture_is_in_both_images_where_the_truth_says(rendered: Path, near: TexturedScene) -> None:
     """The left image, carried to the right one and to a later one by depth and poses from the files, fits as it is."""
-    sequence = open_images(rendered)
+    sequence = open_stereo(rendered)
     assert sequence.baseline_m == 0.12 and sequence.truth is not None
     frames = list(sequence.frames())
     left, right, later = (

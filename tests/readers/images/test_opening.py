@@ -24,7 +24,7 @@ def test_a_path_that_cannot_be(path):
 @pytest.mark.parametrize(
     ("names", "found"),
     [
-        ([], "found an empty folder, expected a TUM RGB-D sequence"),
+        ([], "found an empty folder, expected a"),
         (["b.txt", "a.csv"], "found a folder with a.csv, b.txt, expected"),
         (
             [f"{letter}.txt" for letter in "gfedcba"],
