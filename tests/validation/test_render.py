@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole
 from rbpf.validation.simulation.desk_and_room import TexturedDesk, TexturedRoom
@@ -206,21 +205,3 @@ def test_a_moving_camera_sees_the_mean_of_what_it_sees() -> None:
     mean = np.mean([renderer.image(pose) for pose in path], axis=0)
     np.testing.assert_allclose(renderer.image(path[np.random.default_rng(0).permutation(25)]), mean, atol=3.0)
     assert np.abs(renderer.image(SE3.identity()) - mean).max() > 10.0
-
-
-SQUARE = {"corner": np.zeros(3), "across": AXES[0], "down": AXES[1], "texture": noise(8)}
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"down": 2.0 * AXES[0]}, "span an area"),
-        ({"corner": np.array([0.0, np.nan, 0.0])}, "finite"),
-        ({"texture": noise(8).astype(float)}, "uint8"),
-        ({"texture": noise(8)[:1]}, "at least 2 x 2"),
-        ({"gain": -1.0}, "gain"),
-    ],
-)
-def test_impossible_rectangles_are_refused(wrong: dict, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        Rectangle(**{**SQUARE, **wrong})

@@ -99,25 +99,6 @@ def test_a_lens_spreads_an_edge_by_its_point_spread(tmp_path: Path) -> None:
     assert abs(np.sqrt(spread) - 1.5) < 0.15
 
 
-@pytest.mark.parametrize(
-    ("options", "name"),
-    [
-        ({"noise_std": -1.0}, "noise_std"),
-        ({"blur_s": np.nan}, "blur_s"),
-        ({"lens_px": -0.1}, "lens_px"),
-        ({"exposure_drift": 1.0}, "exposure_drift"),
-        ({"vignetting": -0.1}, "vignetting"),
-        ({"grid": 0}, "grid"),
-        ({"known": 3}, "known"),
-        ({"known_std_m": 0.0}, "known_std_m"),
-        ({"blackout": (0,)}, "blackout"),
-    ],
-)
-def test_bad_imaging_is_refused(options: dict, name: str) -> None:
-    with pytest.raises(InputError, match=name):
-        Imaging(**options)
-
-
 def test_what_cannot_be_done_is_refused_before_anything_is_written(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="frame 9"):
         simulate_images(

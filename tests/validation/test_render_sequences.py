@@ -1,7 +1,6 @@
 """Image sequences on disk: files, reproducibility, known points, interruption."""
 
 import csv
-import doctest
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +13,6 @@ from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.readers import open_images, open_stereo
 from rbpf.sensors.readers.images.calibration import read_calibration
-from rbpf.validation.simulation import images, textured_scene
 from rbpf.validation.simulation.desk_and_room import TexturedDesk, TexturedRoom
 from rbpf.validation.simulation.images import Imaging, simulate_images
 from rbpf.validation.simulation.render import Renderer
@@ -53,18 +51,6 @@ def states(folder: Path) -> np.ndarray:
 def truth(folder: Path) -> np.ndarray:
     """(T, 7) poses."""
     return states(folder)[:, [5, 6, 7, 4, 1, 2, 3]].astype(float)
-
-
-@pytest.mark.parametrize("world", [DESK, ROOM])
-def test_a_seed_gives_the_same_bytes(world: ImageWorld, tmp_path: Path) -> None:
-    imaging = Imaging(exposure_drift=0.2, blur_s=0.05, vignetting=0.3, known=4)
-    for name, seed in {"first": 3, "again": 3, "other": 4}.items():
-        simulate_images(world, imaging, STEREO, tmp_path / name, seed)
-    first, again, other = (contents(tmp_path / name) for name in ("first", "again", "other"))
-    assert first == again
-    assert first.keys() == other.keys()
-    different = {name for name in first if first[name] != other[name]}
-    assert {name for name in first if name.endswith(".png")} | {"known_points.csv"} <= different
 
 
 def test_the_folder_is_as_euroc_has_it(tmp_path: Path) -> None:
@@ -215,28 +201,3 @@ def test_the_path_depends_on_the_seed_and_not_on_what_is_there() -> None:
     ]
     np.testing.assert_array_equal(paths[0], paths[1])
     np.testing.assert_array_equal(paths[0], paths[2])
-
-
-@pytest.mark.parametrize("module", [images, textured_scene])
-def test_examples_in_the_docstrings_run(module: object) -> None:
-    result = doctest.testmod(module)  # type: ignore[arg-type]
-    assert result.attempted > 0 and result.failed == 0
-
-
-@pytest.mark.parametrize(
-    ("world", "options", "name"),
-    [
-        (TexturedDesk, {"frames": 1}, "frames"),
-        (TexturedDesk, {"texel_m": 0.0}, "texel_m"),
-        (TexturedDesk, {"board": (2, 5)}, "board"),
-        (TexturedDesk, {"nearest_m": 2.0, "farthest_m": 1.0}, "nearest_m"),
-        (TexturedDesk, {"things": -1}, "things"),
-        (TexturedRoom, {"size_m": (3.0, 3.0, 2.5)}, "size_m"),
-        (TexturedRoom, {"eye_m": 3.0}, "eye_m"),
-        (TexturedRoom, {"drop_deg": 90.0}, "drop_deg"),
-        (TexturedRoom, {"contrast": -1.0}, "contrast"),
-    ],
-)
-def test_bad_worlds_are_refused(world: type, options: dict, name: str) -> None:
-    with pytest.raises(InputError, match=name):
-        world(**options)

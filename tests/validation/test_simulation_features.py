@@ -1,6 +1,6 @@
 """Simulated measurements of a camera: noise, visibility, tracks, outliers."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -23,23 +23,6 @@ DESK = DeskWorld(frames=200)
 STILL = StillCamera(frames=800)
 CHANGING = LabWorld(LabDrive(frames=150, every=4), points=3000)
 EXACT = Measuring(dropout=0.0, turnover=0.0)
-
-
-def contents(log: FeatureLog) -> bytes:
-    assert log.truth is not None and log.known is not None
-    parts = [log.truth.stamps_ns, log.truth.world_from_camera, log.known.names, log.known.positions]
-    for frame in log.frames:
-        parts += [np.array(frame.stamp_ns), frame.landmarks, frame.z, frame.cov_z]
-    return b"".join(part.tobytes() for part in [*parts, *log.truth.landmarks.values()])
-
-
-@pytest.mark.parametrize("camera", CAMERAS)
-@pytest.mark.parametrize("world", [DESK, DeskWorld(frames=40, renewal=0.1)])
-def test_a_seed_gives_the_same_bytes(world: PointWorld, camera: Pinhole | RectifiedStereo) -> None:
-    measuring = Measuring(outlier_rate=0.1)
-    first, again, other = (contents(simulate_features(world, measuring, camera, seed)) for seed in (3, 3, 4))
-    assert first == again
-    assert first != other
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
@@ -226,25 +209,72 @@ def test_a_frame_without_measurements() -> None:
     assert min(len(frame.landmarks) for frame in log.frames) == 0
 
 
+@dataclass(frozen=True)
+class Line:
+    """A camera at rest that sees points on a line."""
+
+    points: int = 10
+
+    def build(self, rng: np.random.Generator) -> Scene:
+        points = np.zeros((self.points, 3))
+        points[:, 0] = rng.uniform(-1.0, 1.0, self.points)
+        points[:, 2] = 3.0
+        still = SE3.identity((2,))
+        present = np.tile([0, 2], (self.points, 1))
+        return Scene("line", np.arange(2), still, points, present, np.zeros((0, 2, 3)))
+
+
+def test_known_points_are_measured_whenever_they_are_visible() -> None:
+    log = simulate_features(DeskWorld(frames=1000, blocks=0), EXACT, MONO, seed=2)
+    assert log.known is not None and log.truth is not None
+    points = np.array([log.truth.landmarks[name] for name in log.known.names.tolist()])
+    local = SE3.inverse_transform(log.truth.world_from_camera[:, None], points)
+    visible = MONO.visible(local, margin_px=13.0)
+    measured = np.array([np.isin(log.known.names, frame.landmarks) for frame in log.frames])
+    assert visible[0].all() and not visible.all()
+    np.testing.assert_array_equal(measured, visible)
+
+
+def test_known_points_are_given_with_the_stated_error() -> None:
+    score, flat = [], []
+    for seed in range(20):
+        log = simulate_features(DeskWorld(frames=2), Measuring(known=5, known_std_m=0.02), MONO, seed)
+        assert log.known is not None and log.truth is not None
+        points = np.array([log.truth.landmarks[name] for name in log.known.names.tolist()])
+        score.append((log.known.positions - points) / 0.02)
+        np.testing.assert_allclose(log.known.cov, np.tile(4e-4 * np.eye(3), (5, 1, 1)))
+        px = MONO.project(SE3.inverse_transform(log.truth.world_from_camera[0], points))
+        flat.append(np.linalg.svd(px - px.mean(axis=0), compute_uv=False)[1])
+    n = np.size(score)
+    assert abs(np.sum(np.square(score)) - n) < 4.0 * np.sqrt(2.0 * n)
+    assert min(flat) > 100.0
+
+
+def test_exactly_known_points() -> None:
+    log = simulate_features(DeskWorld(frames=2), Measuring(known_std_m=0.0), MONO, seed=0)
+    assert log.known is not None and log.truth is not None
+    points = np.array([log.truth.landmarks[name] for name in log.known.names.tolist()])
+    np.testing.assert_array_equal(log.known.positions, points)
+    assert not log.known.cov.any()
+
+
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("world", "measuring", "message"),
     [
-        ({"noise_px": 0.0}, "noise_px must be a positive number, got 0.0"),
-        ({"noise_px": float("nan")}, "noise_px must be a positive number"),
-        ({"measurements": 0}, "measurements must be a whole number, at least 1, got 0"),
-        ({"measurements": 2.5}, "measurements must be a whole number"),
-        ({"known": -1}, "known must be a whole number, at least 0"),
-        ({"new_per_frame": -1}, "new_per_frame must be"),
-        ({"rest_frames": -1}, "rest_frames must be"),
-        ({"known_std_m": -0.1}, "known_std_m must be zero or a positive number"),
-        ({"border_px": -1.0}, "border_px must be zero"),
-        ({"outlier_rate": 1.0}, "outlier_rate must be a probability, 0 or more and below 1, got 1.0"),
-        ({"dropout": -0.1}, "dropout must be a probability"),
-        ({"turnover": float("nan")}, "turnover must be a probability"),
-        ({"farthest_m": float("inf")}, "farthest_m must be a positive number"),
-        ({"nearest_m": 9.0}, "nearest_m = 9.0 must be less than farthest_m = 8.0"),
+        (
+            DeskWorld(points=3),
+            Measuring(),
+            "first frame of the desk sees [0-3] points .* expected 4: simulate more",
+        ),
+        (DeskWorld(), Measuring(known=30), "30 known points do not fit into 25 measurements"),
+        (Line(), Measuring(known=3), "known points of the line lie on a line in the first frame"),
     ],
 )
-def test_refused_measuring(options: dict[str, float], message: str) -> None:
+def test_refused_worlds(world: PointWorld, measuring: Measuring, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        Measuring(**options)
+        simulate_features(world, measuring, MONO, seed=0)
+
+
+def test_two_known_points_cannot_be_on_a_line() -> None:
+    log = simulate_features(Line(), Measuring(known=2), MONO, seed=0)
+    assert log.known is not None and len(log.known.names) == 2

@@ -1,6 +1,5 @@
 """The simulated laboratory: plan, drives, furniture, its twin in points, and its images."""
 
-import doctest
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -8,12 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.readers import open_images, open_stereo
 from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
-from rbpf.validation.simulation import lab as lab_points
 from rbpf.validation.simulation.features import Measuring, simulate_features
 from rbpf.validation.simulation.images import Imaging, simulate_images
 from rbpf.validation.simulation.lab import (
@@ -230,24 +227,6 @@ def test_the_folder_holds_what_the_wheels_say(rendered: Path) -> None:
     assert 0.0 < apart[-1] < 0.08 * TOUR.way_m[48]
 
 
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
-
-
-@pytest.mark.slow
-def test_a_seed_gives_the_same_bytes_and_fewer_frames_their_beginning(tmp_path: Path) -> None:
-    small = RectifiedStereo(Pinhole(96, 72, 75.0, 75.0, 47.5, 35.5), 0.12)
-    for name, frames, seed in (("first", 4, 3), ("again", 4, 3), ("short", 3, 3), ("other", 4, 4)):
-        world = TexturedLab(LabDrive("turn_back", frames, every=30), texel_m=0.1)
-        imaging = Imaging(jpeg=90, known=0, exposure_drift=0.0, blur_s=0.0)  # both look at later frames
-        simulate_images(world, imaging, small, tmp_path / name, seed)
-    first, again, short, other = (contents(tmp_path / name) for name in ("first", "again", "short", "other"))
-    assert first == again
-    images = [name for name in short if name.endswith(".jpg")]
-    assert len(images) == 6 and all(short[name] == first[name] for name in images)
-    assert not any(first[name] == other[name] for name in [*images, "odometry.csv"])
-
-
 def test_images_can_be_jpeg(tmp_path: Path) -> None:
     camera = Pinhole(96, 72, 75.0, 75.0, 47.5, 35.5)
     scene = drawn()
@@ -265,35 +244,3 @@ def test_images_can_be_jpeg(tmp_path: Path) -> None:
         read[quality] = open_images(tmp_path / str(quality))
     exact, poor, good = (next(read[quality].frames()).image.astype(float) for quality in (0, 50, 95))
     assert 0.0 < np.abs(good - exact).mean() < 0.5 * np.abs(poor - exact).mean() < 5.0
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"trajectory": "walk"}, "one of tour, turn_back"),
-        ({"frames": 1}, "frames must be a whole number, at least 2"),
-        ({"frames": 4001}, "has 4000 images"),
-        ({"every": 0}, "every must be a whole number, at least 1"),
-        ({"every": 4000}, "has 1 images"),
-        ({"every": 100, "frames": 41}, "has 40 images"),
-    ],
-)
-def test_bad_drives_are_refused(options: dict, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        LabDrive(**options)
-
-
-def test_bad_worlds_and_files_are_refused() -> None:
-    for options in ({"texel_m": 0.0}, {"contrast": -1.0}):
-        with pytest.raises(InputError, match=next(iter(options))):
-            TexturedLab(**options)  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="points"):
-        LabWorld(points=0)
-    for quality in (-1, 101):
-        with pytest.raises(InputError, match="jpeg"):
-            Imaging(jpeg=quality)
-
-
-def test_the_example_in_the_docstring_runs() -> None:
-    result = doctest.testmod(lab_points)
-    assert result.attempted > 0 and result.failed == 0

@@ -36,12 +36,8 @@ class Tracker:
         self,
         known: np.ndarray,
         count: int,
-        places: int,
-        new_per_frame: int,
-        turnover: float,
-        dropout: float,
-        rest_frames: int,
-        image_px: tuple[int, int],
+        measuring: "Measuring",
+        image_px: np.ndarray,
         rng: np.random.Generator,
     ) -> None:
         """Starts before the first frame.
@@ -49,17 +45,12 @@ class Tracker:
         Args:
             known: (M,) points known beforehand.
             count: of points in the world, Q.
-            places: most measurements per frame.
-            new_per_frame: most points that enter the map per frame; the first frame takes as many as fit.
-            turnover: probability per frame that a track is lost.
-            dropout: probability per frame that a track goes on without a measurement.
-            rest_frames: a lost point is not looked for during these.
+            measuring: how many are measured, and how long.
             image_px: width and height.
             rng: generator.
         """
-        self._known, self._places, self._new = known, places, new_per_frame
-        self._turnover, self._dropout, self._rest_frames = turnover, dropout, rest_frames
-        self._cell_px = np.array(image_px) / [COLUMNS, ROWS]
+        self._known, self._measuring = known, measuring
+        self._cell_px = image_px / [COLUMNS, ROWS]
         self._rng = rng
         self._tracks = np.zeros(0, dtype=np.int64)
         self._mapped = np.zeros(count, dtype=bool)
@@ -78,27 +69,27 @@ class Tracker:
         Returns:
             (K,) int64 rows of the points to measure.
         """
-        known = self._known[visible[self._known]]
-        old = self._kept(visible)[: self._places - known.size]
+        measuring, known = self._measuring, self._known[visible[self._known]]
+        # Tracks of the last frame whose points are visible and not lost.
+        tracks = self._tracks[visible[self._tracks]]
+        lost = self._rng.random(tracks.size) < measuring.turnover
+        self._resting[tracks[lost]] = self._frame + measuring.rest_frames
+        old = tracks[~lost][: measuring.measurements - known.size]
+        # Free places go to points of the map, then to new ones.
         taken = np.concatenate([known, old])
         free = visible & self._unknown & (self._resting <= self._frame)
         free[old] = False
-        again = self._begin(free & self._mapped, taken, px, self._places - taken.size)
+        again = self._begin(free & self._mapped, taken, px, measuring.measurements - taken.size)
         taken = np.concatenate([taken, again])
-        room = self._places - taken.size
-        new = self._begin(free & ~self._mapped, taken, px, min(room, self._new) if self._frame else room)
+        room = measuring.measurements - taken.size
+        most = min(room, measuring.new_per_frame) if self._frame else room
+        new = self._begin(free & ~self._mapped, taken, px, most)
         self._mapped[new] = True
         self._tracks = np.concatenate([old, again, new])
-        measured = self._rng.random(known.size + old.size) >= (self._dropout if self._frame else 0.0)
+        dropout = measuring.dropout if self._frame else 0.0
+        measured = self._rng.random(known.size + old.size) >= dropout
         self._frame += 1
         return np.concatenate([np.concatenate([known, old])[measured], again, new])
-
-    def _kept(self, visible: np.ndarray) -> np.ndarray:
-        """Tracks of the last frame whose points are visible and not lost."""
-        tracks = self._tracks[visible[self._tracks]]
-        lost = self._rng.random(tracks.size) < self._turnover
-        self._resting[tracks[lost]] = self._frame + self._rest_frames
-        return tracks[~lost]
 
     def _begin(self, candidates: np.ndarray, taken: np.ndarray, px: np.ndarray, count: int) -> np.ndarray:
         """Up to `count` candidates (a mask), one after the other from a cell that holds fewest."""
@@ -197,17 +188,40 @@ def simulate_features(
     """
     rng = np.random.default_rng(seed)
     scene = world.build(rng)
-    known = _known(scene, measuring, camera)
+    image = camera if isinstance(camera, Pinhole) else camera.camera
+    size = np.array([image.width, image.height], dtype=float)
+    known = _known(scene, measuring, camera, size)
     scene.present[known, 1] = len(scene.stamps_ns)
-    frames = _measure(scene, measuring, camera, known, rng)
-    landmarks = dict(enumerate(scene.points))
-    truth = CameraTruth(scene.stamps_ns, scene.world_from_camera, landmarks)
-    given = _given(scene, measuring, known, rng) if known.size else None
+    tracker = Tracker(known, len(scene.points), measuring, size, rng)
+    seen = np.zeros(len(scene.points), dtype=bool)
+    frames = []
+    for frame, stamp in enumerate(scene.stamps_ns.tolist()):
+        visible, z = _view(scene, measuring, camera, frame)
+        rows = tracker.step(visible, z[:, :2])
+        noisy = z[rows] + measuring.noise_px * rng.standard_normal((rows.size, camera.dim))
+        # Outliers lie anywhere in the image; a stereo pair's disparity is positive.
+        wrong = seen[rows] & (rng.random(rows.size) < measuring.outlier_rate)
+        px = rng.uniform(0.0, size - 1.0, (int(wrong.sum()), 2))
+        if not isinstance(camera, Pinhole):
+            px = np.column_stack([px, rng.uniform(0.0, px[:, 0])])
+        noisy[wrong] = px
+        seen[rows] = True
+        keep = camera.inside(noisy)
+        cov = np.tile(measuring.noise_px**2 * np.eye(camera.dim), (int(keep.sum()), 1, 1))
+        frames.append(FeatureFrame(stamp, rows[keep], noisy[keep], cov))
+    truth = CameraTruth(scene.stamps_ns, scene.world_from_camera, dict(enumerate(scene.points)))
+    given = None
+    if known.size:
+        error = measuring.known_std_m * rng.standard_normal((known.size, 3))
+        cov = np.tile(measuring.known_std_m**2 * np.eye(3), (known.size, 1, 1))
+        given = KnownPoints(known, scene.points[known] + error, cov)
     return FeatureLog(f"simulated {scene.name}, seed {seed}", camera, frames, given, truth)
 
 
-def _known(scene: Scene, measuring: Measuring, camera: Pinhole | RectifiedStereo) -> np.ndarray:
-    """(M,) rows of the points known beforehand, visible in the first frame."""
+def _known(
+    scene: Scene, measuring: Measuring, camera: Pinhole | RectifiedStereo, size: np.ndarray
+) -> np.ndarray:
+    """(M,) rows of the points known beforehand, visible in the first frame, near an ellipse about the image's middle."""
     visible, z = _view(scene, measuring, camera, 0)
     wanted = measuring.known
     if wanted > measuring.measurements:
@@ -220,70 +234,20 @@ def _known(scene: Scene, measuring: Measuring, camera: Pinhole | RectifiedStereo
             f"the first frame of the {scene.name} sees {len(seen)} points that can be known, expected {wanted}: "
             "simulate more points, fewer known ones or another place of the camera"
         )
-    known = seen[_spread(z[seen, :2], wanted, _image_size(camera))]
-    if wanted > 2 and _flatness(z[known, :2]) < LEAST_SPREAD:
+    angle = 2.0 * np.pi * (np.arange(wanted) + 0.5) / max(wanted, 1)
+    places = size * (0.5 + RADIUS * np.stack([np.cos(angle), np.sin(angle)], axis=-1))
+    free, rows = np.ones(len(seen), dtype=bool), np.zeros(wanted, dtype=np.int64)
+    for k, place in enumerate(places):
+        distance = np.linalg.norm(z[seen, :2] - place, axis=1)
+        rows[k] = np.argmin(np.where(free, distance, np.inf))
+        free[rows[k]] = False
+    px = z[seen[rows], :2]
+    extent = np.linalg.svd(px - px.mean(axis=0), compute_uv=False) if wanted > 2 else np.ones(2)
+    if extent[1] < LEAST_SPREAD * extent[0]:
         raise InputError(
             f"the known points of the {scene.name} lie on a line in the first frame: use another seed or more points"
         )
-    return known
-
-
-def _spread(px: np.ndarray, count: int, size: np.ndarray) -> np.ndarray:
-    """(M,) rows of pixels (K, 2) nearest to places on an ellipse about the middle of the image."""
-    angle = 2.0 * np.pi * (np.arange(count) + 0.5) / max(count, 1)
-    places = size * (0.5 + RADIUS * np.stack([np.cos(angle), np.sin(angle)], axis=-1))
-    free = np.ones(len(px), dtype=bool)
-    rows = np.zeros(count, dtype=np.int64)
-    for k, place in enumerate(places):
-        rows[k] = np.argmin(np.where(free, np.linalg.norm(px - place, axis=1), np.inf))
-        free[rows[k]] = False
-    return rows
-
-
-def _flatness(px: np.ndarray) -> float:
-    """Least over greatest extent of pixels (M, 2)."""
-    extent = np.linalg.svd(px - px.mean(axis=0), compute_uv=False)
-    return float(extent[1] / extent[0])
-
-
-def _given(scene: Scene, measuring: Measuring, known: np.ndarray, rng: np.random.Generator) -> KnownPoints:
-    error = measuring.known_std_m * rng.standard_normal((known.size, 3))
-    cov = np.tile(measuring.known_std_m**2 * np.eye(3), (known.size, 1, 1))
-    return KnownPoints(known, scene.points[known] + error, cov)
-
-
-def _measure(
-    scene: Scene,
-    measuring: Measuring,
-    camera: Pinhole | RectifiedStereo,
-    known: np.ndarray,
-    rng: np.random.Generator,
-) -> list[FeatureFrame]:
-    width, height = _image_size(camera)
-    tracker = Tracker(
-        known,
-        count=len(scene.points),
-        places=measuring.measurements,
-        new_per_frame=measuring.new_per_frame,
-        turnover=measuring.turnover,
-        dropout=measuring.dropout,
-        rest_frames=measuring.rest_frames,
-        image_px=(int(width), int(height)),
-        rng=rng,
-    )
-    seen = np.zeros(len(scene.points), dtype=bool)
-    frames = []
-    for frame, stamp in enumerate(scene.stamps_ns.tolist()):
-        visible, z = _view(scene, measuring, camera, frame)
-        rows = tracker.step(visible, z[:, :2])
-        noisy = z[rows] + measuring.noise_px * rng.standard_normal((rows.size, camera.dim))
-        wrong = seen[rows] & (rng.random(rows.size) < measuring.outlier_rate)
-        noisy[wrong] = _anywhere(camera, int(wrong.sum()), rng)
-        seen[rows] = True
-        keep = camera.inside(noisy)
-        cov = np.tile(measuring.noise_px**2 * np.eye(camera.dim), (int(keep.sum()), 1, 1))
-        frames.append(FeatureFrame(stamp, rows[keep], noisy[keep], cov))
-    return frames
+    return np.asarray(seen[rows])
 
 
 def _view(
@@ -300,17 +264,3 @@ def _view(
         rows = np.flatnonzero(visible)
         visible[rows] = ~hidden(SE3.translation(pose), scene.points[rows], scene.blocks)
     return visible, camera.project(local)
-
-
-def _anywhere(camera: Pinhole | RectifiedStereo, count: int, rng: np.random.Generator) -> np.ndarray:
-    """(K, p) pixels uniform in the image; a stereo pair's disparity is positive."""
-    px = rng.uniform(0.0, _image_size(camera) - 1.0, (count, 2))
-    if isinstance(camera, Pinhole):
-        return px
-    return np.column_stack([px, rng.uniform(0.0, px[:, 0])])
-
-
-def _image_size(camera: Pinhole | RectifiedStereo) -> np.ndarray:
-    """Width and height, px."""
-    image = camera if isinstance(camera, Pinhole) else camera.camera
-    return np.array([image.width, image.height], dtype=float)

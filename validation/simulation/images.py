@@ -98,12 +98,6 @@ class Imaging:
         """Of the images' files."""
         return ".jpg" if self.jpeg else ".png"
 
-    def check_frames(self, frames: int) -> None:
-        """Refuses a blackout of frames that there are not."""
-        wrong = [frame for frame in self.blackout if not 0 <= frame < frames]
-        if wrong:
-            raise InputError(f"blackout names frame {wrong[0]}, but the frames are 0 to {frames - 1}")
-
 
 class Shutter:
     """Takes the pictures of a scene, in any order: a frame's noise depends on nothing but the seed."""
@@ -136,7 +130,10 @@ class Shutter:
         self._rates = SE3.local(poses[before], poses[after]) / lapse
         self.velocities = (SE3.translation(poses[after]) - SE3.translation(poses[before])) / lapse
         """(T, 3) of the camera in the world, m/s."""
-        self._vignette = _vignette(camera, imaging.vignetting)
+        # Factors (H, W) that fall with the square of the distance from the principal point.
+        at = np.indices((camera.height, camera.width))
+        square = (at[1] - camera.cx) ** 2 + (at[0] - camera.cy) ** 2
+        self._vignette = (1.0 - imaging.vignetting * square / square.max()).astype(np.float32)
         rows, columns = (
             (np.arange(count) + 0.5) / count * size - 0.5
             for count, size in zip(PROBES, (camera.height, camera.width), strict=True)
@@ -146,54 +143,44 @@ class Shutter:
 
     def images(self, frame: int, baseline_m: float | None = None) -> list[np.ndarray]:
         """Pictures (H, W) uint8 of a frame: one, or two with a second camera so far to the right."""
-        rng = np.random.default_rng(self._seeds[frame])
+        import cv2
+
+        rng, imaging = np.random.default_rng(self._seeds[frame]), self._imaging
         poses = self._poses(frame, rng)
         views = [poses]
         if baseline_m is not None:
             views.append(SE3.compose(poses, SE3.exp([0.0, 0.0, 0.0, baseline_m, 0.0, 0.0])))
-        return [self._develop(self._renderer.image(view), self._gain[frame], rng) for view in views]
+        pictures = []
+        for view in views:  # Grey levels of what the sensor receives.
+            light = self._renderer.image(view)
+            if imaging.lens_px > 0.0:
+                light = np.asarray(cv2.GaussianBlur(light, (0, 0), imaging.lens_px))
+            signal = light * (self._gain[frame] * self._vignette)
+            if imaging.noise_std > 0.0:
+                signal += imaging.noise_std * rng.standard_normal(signal.shape, dtype=np.float32)
+            pictures.append(np.clip(np.rint(signal), 0, 255).astype(np.uint8))
+        return pictures
 
     def _poses(self, frame: int, rng: np.random.Generator) -> np.ndarray:
         """(K, 7) poses while the shutter is open: K is a square, and as great as the motion in pixels."""
-        middle = self._scene.world_from_camera[frame]
+        middle, least = self._scene.world_from_camera[frame], self._imaging.grid
         half = 0.5 * self._imaging.blur_s * self._rates[frame]
-        travel = self._travel(middle, half)
-        if travel == 0.0:
-            return middle[None]
-        side = int(np.clip(np.ceil(np.sqrt(travel)), self._imaging.grid, max(self._imaging.grid, MOST_RAYS)))
-        # The renderer deals the rays of a pixel out in order of their columns, which must not follow the time.
-        moment = (rng.permutation(side * side) + 0.5) / (side * side)
-        return SE3.retract(middle, (2.0 * moment - 1.0)[:, None] * half)
-
-    def _travel(self, middle: np.ndarray, half: np.ndarray) -> float:
-        """Greatest distance [px] that what is seen moves from middle ⊖ half to middle ⊕ half."""
         if not half.any():
-            return 0.0
+            return middle[None]
+        # The greatest distance [px] that what is seen moves from middle ⊖ half to middle ⊕ half.
         depth, row = cast(self._scene.rectangles, middle, self._probe)
         ray = np.concatenate([self._probe, np.ones((len(self._probe), 1))], axis=1)[row >= 0]
         points = SE3.transform(middle, depth[row >= 0, None] * ray)
         local = SE3.inverse_transform(SE3.retract(middle, np.stack([-half, half])[:, None]), points)
         seen = self._camera.visible(local).all(axis=0)
         start, end = self._camera.project(local[:, seen])
-        return float(np.linalg.norm(end - start, axis=-1).max(initial=0.0))
-
-    def _develop(self, light: np.ndarray, gain: float, rng: np.random.Generator) -> np.ndarray:
-        """Grey levels (H, W) uint8 of what the sensor receives."""
-        import cv2
-
-        lens = self._imaging.lens_px
-        focused = np.asarray(cv2.GaussianBlur(light, (0, 0), lens)) if lens > 0.0 else light
-        signal = focused * (gain * self._vignette)
-        if self._imaging.noise_std > 0.0:
-            signal += self._imaging.noise_std * rng.standard_normal(signal.shape, dtype=np.float32)
-        return np.clip(np.rint(signal), 0, 255).astype(np.uint8)
-
-
-def _vignette(camera: Pinhole, fraction: float) -> np.ndarray:
-    """(H, W) float32 factors that fall with the square of the distance from the principal point."""
-    rows, columns = np.indices((camera.height, camera.width))
-    square = (columns - camera.cx) ** 2 + (rows - camera.cy) ** 2
-    return (1.0 - fraction * square / square.max()).astype(np.float32)
+        travel = float(np.linalg.norm(end - start, axis=-1).max(initial=0.0))
+        if travel == 0.0:
+            return middle[None]
+        side = int(np.clip(np.ceil(np.sqrt(travel)), least, max(least, MOST_RAYS)))
+        # The renderer deals the rays of a pixel out in order of their columns, which must not follow the time.
+        moment = (rng.permutation(side * side) + 0.5) / (side * side)
+        return SE3.retract(middle, (2.0 * moment - 1.0)[:, None] * half)
 
 
 MIDDLE = 0.15
@@ -342,32 +329,16 @@ def write_image(path: Path, image: np.ndarray, quality: int = 0) -> None:
     path.write_bytes(encoded.tobytes())
 
 
-def coded_depth(depth: np.ndarray) -> np.ndarray:
-    """A depth image (H, W) uint16 of depths [m]."""
-    steps = np.rint(DEPTH_PER_M * depth)
-    return np.where(steps <= np.iinfo(np.uint16).max, steps, 0.0).astype(np.uint16)
-
-
 def write_sensor(
     folder: Path,
     sensor: str,
+    scene: TexturedScene,
     camera: Pinhole,
     offset_m: float,
-    stamps_ns: np.ndarray,
-    comment: str,
-    suffix: str = ".png",
+    suffix: str,
 ) -> None:
-    """A sensor's folder with its calibration and its index; the images are written by others.
-
-    Args:
-        folder: of the sequence.
-        sensor: cam0, cam1 or depth0.
-        camera: its calibration.
-        offset_m: of the sensor from the body along the body's x axis.
-        stamps_ns: (T,) of the images.
-        comment: what it is, one line.
-        suffix: of the images' files.
-    """
+    """A sensor's folder (cam0, cam1 or depth0) with calibration and index; it stands so far along the body's x axis."""
+    stamps_ns = scene.stamps_ns
     place = folder / "mav0" / sensor
     (place / "data").mkdir(parents=True)
     rows = "".join(f"{stamp},{stamp}{suffix}\n" for stamp in stamps_ns.tolist())
@@ -380,7 +351,7 @@ def write_sensor(
     distortion = camera.distortion if any(camera.distortion[4:]) else camera.distortion[:4]
     lines = [
         "sensor_type: camera",
-        f"comment: {comment}",
+        f"comment: simulated {scene.name}, {sensor}",
         "T_BS:",
         "  cols: 4",
         "  rows: 4",
@@ -395,38 +366,6 @@ def write_sensor(
     if sensor.startswith("depth"):
         lines.append(f"depth_per_m: {DEPTH_PER_M}")
     (place / "sensor.yaml").write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
-def write_truth(
-    folder: Path, stamps_ns: np.ndarray, world_from_body: np.ndarray, velocities: np.ndarray
-) -> None:
-    """Ground truth: poses (T, 7) and velocities (T, 3) in the world [m/s]; there is no gyroscope: its biases are 0."""
-    place = folder / "mav0" / "state_groundtruth_estimate0"
-    place.mkdir(parents=True)
-    quat_xyzw = world_from_body[:, :4]
-    position = SE3.translation(world_from_body)
-    wxyz = np.roll(quat_xyzw, 1, axis=1)
-    table = np.concatenate([position, wxyz, velocities, np.zeros((len(stamps_ns), 6))], axis=1)
-    rows = [
-        ",".join([str(stamp), *(f"{x:.12g}" for x in row)])
-        for stamp, row in zip(stamps_ns.tolist(), table, strict=True)
-    ]
-    (place / "data.csv").write_text("\n".join([",".join(TRUTH_COLUMNS), *rows]) + "\n", encoding="utf-8")
-
-
-def write_calibration(folder: Path, camera: Pinhole, baseline_m: float | None) -> None:
-    """camera.yaml: the (left) camera, and the baseline of a stereo pair."""
-    fx, fy, cx, cy = camera.params[:4].tolist()
-    lines = [
-        f"model: {model_of(camera)}",
-        *[f"{name}: {value}" for name, value in {"fx": fx, "fy": fy, "cx": cx, "cy": cy}.items()],
-        f"width: {camera.width}",
-        f"height: {camera.height}",
-        f"distortion: {[float(x) for x in camera.distortion]}  # {', '.join(camera.lens.coefficient_names)} (OpenCV)",
-    ]
-    if baseline_m is not None:
-        lines.append(f"baseline_m: {float(baseline_m)}")
-    (folder / "camera.yaml").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 OnFrame = Callable[[int, int], None]
@@ -474,7 +413,9 @@ def simulate_images(
 
     rng = np.random.default_rng(seed)
     scene = world.build(rng)
-    imaging.check_frames(len(scene.stamps_ns))
+    if wrong := [frame for frame in imaging.blackout if not 0 <= frame < len(scene.stamps_ns)]:
+        last = len(scene.stamps_ns) - 1
+        raise InputError(f"blackout names frame {wrong[0]}, but the frames are 0 to {last}")
     left, baseline_m = (
         (camera, baseline_m) if isinstance(camera, Pinhole) else (camera.camera, camera.baseline_m)
     )
@@ -489,11 +430,32 @@ def simulate_images(
         if imaging.depth:
             sensors["depth0"] = 0.0
         for sensor, offset_m in sensors.items():
-            about = f"simulated {scene.name}, {sensor}"
             suffix = ".png" if sensor == "depth0" else imaging.suffix
-            write_sensor(partial, sensor, left, offset_m, scene.stamps_ns, about, suffix)
-        write_calibration(partial, left, baseline_m)
-        write_truth(partial, scene.stamps_ns, scene.world_from_camera, shutter.velocities)
+            write_sensor(partial, sensor, scene, left, offset_m, suffix)
+        # camera.yaml: the (left) camera, and the baseline of a stereo pair.
+        lens = ", ".join(left.lens.coefficient_names)
+        intrinsics = zip(("fx", "fy", "cx", "cy"), left.params[:4].tolist(), strict=True)
+        coefficients = [float(x) for x in left.distortion]
+        lines = [
+            f"model: {model_of(left)}",
+            *[f"{name}: {value}" for name, value in intrinsics],
+            f"width: {left.width}",
+            f"height: {left.height}",
+            f"distortion: {coefficients}  # {lens} (OpenCV)",
+            *([] if baseline_m is None else [f"baseline_m: {float(baseline_m)}"]),
+        ]
+        (partial / "camera.yaml").write_text("\n".join(lines) + "\n", encoding="utf-8")
+        # Ground truth: poses and velocities in the world [m/s]; there is no gyroscope: its biases are 0.
+        place, poses = partial / "mav0" / "state_groundtruth_estimate0", scene.world_from_camera
+        place.mkdir(parents=True)
+        wxyz, biases = np.roll(poses[:, :4], 1, axis=1), np.zeros((len(poses), 6))
+        table = np.concatenate([SE3.translation(poses), wxyz, shutter.velocities, biases], axis=1)
+        rows = [
+            ",".join([str(stamp), *(f"{x:.12g}" for x in row)])
+            for stamp, row in zip(scene.stamps_ns.tolist(), table, strict=True)
+        ]
+        text = "\n".join([",".join(TRUTH_COLUMNS), *rows]) + "\n"
+        (place / "data.csv").write_text(text, encoding="utf-8")
         if imaging.known:
             px, positions = known_corners(scene, renderer, left, imaging.known)
             per_axis = 0.0 if imaging.known_exact else imaging.known_std_m / np.sqrt(3.0)
@@ -522,20 +484,19 @@ def simulate_images(
                 write_image(image_path(partial, sensor, stamp, imaging.suffix), image, imaging.jpeg)
             if imaging.depth:
                 depth, _ = renderer.depth(scene.world_from_camera[frame])
-                write_image(image_path(partial, "depth0", stamp), coded_depth(depth))
+                steps = np.rint(DEPTH_PER_M * depth)
+                coded = np.where(steps <= np.iinfo(np.uint16).max, steps, 0.0).astype(np.uint16)
+                write_image(image_path(partial, "depth0", stamp), coded)
 
-        _in_parallel(take, len(scene.stamps_ns), on_frame)
-
-
-def _in_parallel(take: Callable[[int], None], frames: int, on_frame: OnFrame | None) -> None:
-    """Takes all frames, several at a time; reports them in order."""
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        pending = [pool.submit(take, frame) for frame in range(frames)]
-        try:
-            for done, future in enumerate(pending, start=1):
-                future.result()
-                if on_frame is not None:
-                    on_frame(done, frames)
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+        # All frames, several at a time; they are reported in order.
+        frames = len(scene.stamps_ns)
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            pending = [pool.submit(take, frame) for frame in range(frames)]
+            try:
+                for done, future in enumerate(pending, start=1):
+                    future.result()
+                    if on_frame is not None:
+                        on_frame(done, frames)
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise

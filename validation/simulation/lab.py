@@ -200,10 +200,13 @@ class Furnishing:
         self.blocks.append(box)
         self.surfaces += faces(box, side, top)
 
-    def hang(self, wall: Wall, middle: float, high: float, size: tuple[float, float], paint: Paint) -> None:
-        """A sheet (wide, high) on a wall, its middle at a place along it and above the floor."""
+    def hang(
+        self, wall: Wall, middle: float, high: float, size: tuple[float, float], deep: float = 0.0
+    ) -> None:
+        """A print (wide, high) so far before a wall, its middle at a place along it and above the floor."""
+        paint = textures.picture if self.rng.random() < 0.7 else textures.page
         wide, tall = 0.5 * size[0], 0.5 * size[1]
-        sheet = wall.sheet((middle - wide, middle + wide), HANG_M, (high - tall, high + tall))
+        sheet = wall.sheet((middle - wide, middle + wide), deep + HANG_M, (high - tall, high + tall))
         self.surfaces.append(Surface(*sheet, paint))
 
     def uniform(self, low: float, high: float) -> float:
@@ -220,7 +223,7 @@ def faces(box: Box, side: Paint, top: Paint) -> list[Surface]:
     found = [
         Surface(left, right - left, -up, side)
         for left, right, (axis, at) in zip(ring, np.roll(ring, -1, axis=0), ends, strict=True)
-        if not _at_a_wall(axis, at)
+        if min(abs(at), abs(SIZE_M[axis] - at)) >= TOUCHING_M
     ]
     if z1 < SIZE_M[2] - TOUCHING_M:
         found.append(Surface(ring[3], ring[2] - ring[3], ring[0] - ring[3], top))
@@ -246,26 +249,14 @@ def shell() -> list[tuple[Surface, float]]:
     """Outer walls, floors and ceiling, each with the size of its texels as a multiple of the others'."""
     length, width, height = SIZE_M
     ring = np.array([[0.0, width], [length, width], [length, 0.0], [0.0, 0.0]])
-    down = np.array([0.0, 0.0, -height])
-    found = []
-    for left, right in zip(ring, np.roll(ring, -1, axis=0), strict=True):
-        found.append(
-            (Surface(np.append(left, height), np.append(right - left, 0.0), down, textures.plaster), 1.0)
-        )
+    corners, sides = np.c_[ring, np.full(4, height)], np.c_[np.roll(ring, -1, axis=0) - ring, np.zeros(4)]
+    down, along = np.array([0.0, 0.0, -height]), np.array([0.0, -width, 0.0])
+    found = [(Surface(*side, down, textures.plaster), 1.0) for side in zip(corners, sides, strict=True)]
     middle = float(np.mean(PARTITION_M))
-    along = np.array([0.0, -width, 0.0])
-    for (x0, x1), paint in {(0.0, middle): textures.wood, (middle, length): textures.carpet}.items():
+    for x0, x1, paint in ((0.0, middle, textures.wood), (middle, length, textures.carpet)):
         found.append((Surface(np.array([x0, width, 0.0]), np.array([x1 - x0, 0.0, 0.0]), along, paint), 2.0))
-    ceiling = Surface(
-        np.array([length, width, height]), np.array([-length, 0.0, 0.0]), along, textures.plaster
-    )
+    ceiling = Surface(corners[1], np.array([-length, 0.0, 0.0]), along, textures.plaster)
     return [*found, (ceiling, 4.0)]
-
-
-def _at_a_wall(axis: int, at: float) -> bool:
-    """Whether a face with this coordinate touches an outer wall or that between the rooms."""
-    near = [0.0, SIZE_M[axis]]
-    return bool(np.abs(np.subtract(near, at)).min() < TOUCHING_M)
 
 
 def _along(lab: Furnishing, wall: Wall, start: float, end: float) -> None:
@@ -355,12 +346,7 @@ def _cabinet(lab: Furnishing, wall: Wall, start: float, end: float) -> None:
     for level in (0.35, 0.75):
         size = lab.uniform(0.15, 0.5), lab.uniform(0.15, 0.35)
         middle = 0.5 * (start + end) + lab.uniform(-0.05, 0.05)
-        sheet = wall.sheet(
-            (middle - 0.5 * size[0], middle + 0.5 * size[0]),
-            deep + HANG_M,
-            (level * high - 0.5 * size[1], level * high + 0.5 * size[1]),
-        )
-        lab.surfaces.append(Surface(*sheet, _print(lab)))
+        lab.hang(wall, middle, level * high, size, deep)
 
 
 def _cartons(lab: Furnishing, wall: Wall, start: float, end: float) -> None:
@@ -380,12 +366,8 @@ def _poster(lab: Furnishing, wall: Wall, start: float, end: float, high: float) 
     """A print on a wall, somewhere between two places, and a smaller one above it."""
     wide = lab.uniform(0.6, 0.95) * (end - start)
     middle = lab.uniform(start + 0.5 * wide, end - 0.5 * wide)
-    lab.hang(wall, middle, high, (wide, lab.uniform(0.35, 0.7)), _print(lab))
-    lab.hang(wall, middle, high + 0.65, (0.7 * wide, lab.uniform(0.15, 0.4)), _print(lab))
-
-
-def _print(lab: Furnishing) -> Paint:
-    return textures.picture if lab.rng.random() < 0.7 else textures.page
+    lab.hang(wall, middle, high, (wide, lab.uniform(0.35, 0.7)))
+    lab.hang(wall, middle, high + 0.65, (0.7 * wide, lab.uniform(0.15, 0.4)))
 
 
 def _island(lab: Furnishing, low: np.ndarray, high: np.ndarray) -> None:
@@ -400,7 +382,7 @@ def _island(lab: Furnishing, low: np.ndarray, high: np.ndarray) -> None:
         _desk(lab, side, along, (0.0, 0.5 * float(high[0] - low[0]) - board), rows=2)
         for place in np.linspace(along[0] + 0.6, along[1] - 0.6, 3).tolist():
             size = lab.uniform(0.25, 0.5), lab.uniform(0.2, 0.35)
-            lab.hang(side, place, 1.22, size, _print(lab))
+            lab.hang(side, place, 1.22, size)
 
 
 Trajectory = Literal["tour", "turn_back"]
@@ -436,25 +418,17 @@ class LabDrive:
             raise InputError(f"trajectory must be one of {', '.join(DRIVES)}, got {self.trajectory!r}")
         if self.frames is not None:
             check_counts(self, {"frames": 2})
-        if not 2 <= self._count <= self._most:
+        most = -(-DRIVES[self.trajectory][1] // self.every)
+        if not 2 <= (self.frames or most) <= most:
             raise InputError(
-                f"with every = {self.every} the {self.trajectory} has {self._most} images, of which at least 2 are "
+                f"with every = {self.every} the {self.trajectory} has {most} images, of which at least 2 are "
                 f"needed, got frames = {self.frames}"
             )
 
     @property
     def images(self) -> np.ndarray:
         """(T,) the frames of the trajectory that become images."""
-        return np.arange(self._count) * self.every
-
-    @property
-    def _most(self) -> int:
-        """Images of the whole trajectory."""
-        return -(-DRIVES[self.trajectory][1] // self.every)
-
-    @property
-    def _count(self) -> int:
-        return self._most if self.frames is None else self.frames
+        return np.arange(self.frames or -(-DRIVES[self.trajectory][1] // self.every)) * self.every
 
     def travelled(self) -> Travelled:
         """The robot in every frame of the trajectory up to the last image."""
@@ -546,19 +520,19 @@ class LabWorld:
         """Draws the furniture and the points."""
         lab = furnished(rng)
         surfaces = [*lab.surfaces, *(surface for surface, _ in shell())]
-        blocks = np.array(lab.blocks)
-        points = outside(lambda count: _on(surfaces, count, rng), blocks)(self.points)
-        images = self.drive.images
+        blocks, images = np.array(lab.blocks), self.drive.images
+        weight = np.array([one.area_m2 * (RICH if one.paint in PRINTED else 1.0) for one in surfaces])
+        sides = np.array([[surface.across, surface.down] for surface in surfaces])
+        corner = np.array([surface.corner for surface in surfaces])
+
+        def draw(count: int) -> np.ndarray:
+            """Positions (K, 3), uniform on each surface."""
+            row = rng.choice(len(surfaces), count, p=weight / weight.sum())
+            along = np.einsum("ks,ksx->kx", rng.random((count, 2)), sides[row])
+            return np.asarray(corner[row] + along)
+
+        points = outside(draw, blocks)(self.points)
         path = world_from_camera(self.drive.travelled().world_from_robot)[images]
         stamps = frame_stamps(int(images[-1]) + 1, RATE_HZ)[images]
         present = np.tile([0, len(images)], (self.points, 1))
         return Scene("lab", stamps, path, points, present, blocks)
-
-
-def _on(surfaces: list[Surface], count: int, rng: np.random.Generator) -> np.ndarray:
-    """Positions (K, 3), uniform on each surface."""
-    weight = np.array([surface.area_m2 * (RICH if surface.paint in PRINTED else 1.0) for surface in surfaces])
-    sides = np.array([[surface.across, surface.down] for surface in surfaces])
-    corner = np.array([surface.corner for surface in surfaces])
-    row = rng.choice(len(surfaces), count, p=weight / weight.sum())
-    return np.asarray(corner[row] + np.einsum("ks,ksx->kx", rng.random((count, 2)), sides[row]))

@@ -12,7 +12,7 @@ agree at both ends.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -160,6 +160,9 @@ class Drive:
 
     The pace is the length per second of (driven way, arm · heading): the robot slows down in bends and turns on the
     spot at pace / arm. It stops where it rests, and between driving and turning on the spot.
+
+    Attributes:
+        waypoints: (M + 1, 3) poses before each move and after the last.
     """
 
     def __init__(
@@ -179,38 +182,13 @@ class Drive:
         """
         self._length = np.array([move.length_m for move in moves])
         self._turn = np.array([move.turn_rad for move in moves])
-        fractions, ways = zip(*[_table(move, arm_m) for move in moves], strict=True)
-        self._fractions, self._ways = fractions, ways
-        self._ends = np.cumsum([way[-1] for way in ways])
-        self._starts = np.concatenate([np.asarray(start, float)[None], np.zeros((len(moves), 3))])
+        self._fractions = [_fraction_by_way(move, arm_m) for move in moves]
+        self._ends = np.cumsum([float(fraction.x[-1]) for fraction in self._fractions])
+        self.waypoints = np.concatenate([np.asarray(start, float)[None], np.zeros((len(moves), 3))])
         for k in range(len(moves)):
-            self._starts[k + 1] = SE2.compose(self._starts[k], self._within(k, np.ones(1))[0])
-        self._plan_legs(moves, seconds, ramp_s)
-
-    def __call__(self, seconds: np.ndarray) -> Travelled:
-        """Where the robot is at times (T,), which lie between 0 and the end."""
-        progress = self._progress(np.asarray(seconds, float))
-        move = np.minimum(np.searchsorted(self._ends, progress, side="right"), len(self._ends) - 1)
-        fraction = np.empty_like(progress)
-        poses = np.empty((len(progress), 3))
-        before = np.concatenate([[0.0], self._ends])
-        for k in np.unique(move).tolist():
-            rows = move == k
-            fraction[rows] = _fraction_at(self._ways[k], self._fractions[k], progress[rows] - before[k])
-            poses[rows] = SE2.compose(self._starts[k], self._within(k, fraction[rows]))
-        way = np.concatenate([[0.0], np.cumsum(self._length)])[move] + self._length[move] * fraction
-        turned = np.concatenate([[0.0], np.cumsum(self._turn)])[move] + self._turned(move, fraction)
-        return Travelled(poses, way, turned)
-
-    @property
-    def waypoints(self) -> np.ndarray:
-        """(M + 1, 3) poses before each move and after the last."""
-        return self._starts
-
-    def _plan_legs(self, moves: Sequence[Move], seconds: float, ramp_s: float) -> None:
-        """Legs between two stops: when they start, how far they are, the pace of all."""
-        spot = self._length == 0.0
-        rest = np.array([move.rest_s for move in moves])
+            self.waypoints[k + 1] = SE2.compose(self.waypoints[k], self._within(k, np.ones(1))[0])
+        # Legs between two stops: when they start, how far they are, the pace of all.
+        spot, rest = self._length == 0.0, np.array([move.rest_s for move in moves])
         first = np.flatnonzero(np.concatenate([[True], (spot[1:] != spot[:-1]) | (rest[1:] > 0.0)]))
         edges = np.concatenate([[0.0], self._ends])[np.append(first, len(moves))]
         driving = seconds - rest.sum() - ramp_s * len(first)
@@ -220,17 +198,28 @@ class Drive:
                 f"{seconds:g} s do not suffice for {len(first)} starts of {ramp_s:g} s and rests of {rest.sum():g} s: "
                 "give the robot more time"
             )
-        lasts = np.diff(edges) / self._pace + ramp_s
-        self._begins = np.cumsum(rest[first] + np.concatenate([[0.0], lasts[:-1]]))
-        self._lasts, self._edges, self._ramp_s = lasts, edges, ramp_s
+        self._lasts, self._edges, self._ramp_s = np.diff(edges) / self._pace + ramp_s, edges, ramp_s
+        self._begins = np.cumsum(rest[first] + np.concatenate([[0.0], self._lasts[:-1]]))
 
-    def _progress(self, seconds: np.ndarray) -> np.ndarray:
-        """Way (T,) in units of the pace at times (T,)."""
+    def __call__(self, seconds: np.ndarray) -> Travelled:
+        """Where the robot is at times (T,), which lie between 0 and the end."""
+        # Way in units of the pace: a leg ends as it began.
+        seconds = np.asarray(seconds, float)
         leg = np.maximum(np.searchsorted(self._begins, seconds, side="right") - 1, 0)
         time = np.clip(seconds - self._begins[leg], 0.0, self._lasts[leg])
         early = time < 0.5 * self._lasts[leg]
         done = self._pace * eased(np.where(early, time, self._lasts[leg] - time), self._ramp_s)
-        return np.where(early, self._edges[leg] + done, self._edges[leg + 1] - done)
+        progress = np.where(early, self._edges[leg] + done, self._edges[leg + 1] - done)
+        move = np.minimum(np.searchsorted(self._ends, progress, side="right"), len(self._ends) - 1)
+        fraction, poses = np.empty_like(progress), np.empty((len(progress), 3))
+        before = np.concatenate([[0.0], self._ends])
+        for k in np.unique(move).tolist():
+            rows = move == k
+            fraction[rows] = np.clip(self._fractions[k](progress[rows] - before[k]), 0.0, 1.0)
+            poses[rows] = SE2.compose(self.waypoints[k], self._within(k, fraction[rows]))
+        way = np.concatenate([[0.0], np.cumsum(self._length)])[move] + self._length[move] * fraction
+        turned = np.concatenate([[0.0], np.cumsum(self._turn)])[move] + self._turned(move, fraction)
+        return Travelled(poses, way, turned)
 
     def _turned(self, move: np.ndarray, fraction: np.ndarray) -> np.ndarray:
         """Change of heading (T,) since the start of a move."""
@@ -271,19 +260,15 @@ def along_corners(corners: Sequence[Sequence[float]], bend_m: float) -> tuple[np
         raise InputError(
             f"the corners {corners} are too near to each other or too sharp for bends of {bend_m} m"
         )
+    node, weight = np.polynomial.legendre.leggauss(NODES)
     moves = [Move(straight[0])]
     for k, angle in enumerate(turn.tolist()):
-        moves += [Move(bend_m / _tangent(angle), angle)] if angle else []
+        if angle:  # Its ends are bend_m from the corner that it rounds.
+            chord = 0.5 * weight @ np.cos(angle * (_bent(0.5 * (node + 1.0)) - 0.5))
+            moves.append(Move(bend_m / float(chord / (2.0 * np.cos(0.5 * angle))), angle))
         moves.append(Move(straight[k + 1]))
     start = np.array([heading[0], *corners[0]])
     return start, [move for move in moves if move.length_m > 0.0]
-
-
-def _tangent(turn_rad: float) -> float:
-    """Distance of a bend's ends from the corner that it rounds, as a fraction of its length."""
-    node, weight = np.polynomial.legendre.leggauss(NODES)
-    chord = 0.5 * weight @ np.cos(turn_rad * (_bent(0.5 * (node + 1.0)) - 0.5))
-    return float(chord / (2.0 * np.cos(0.5 * turn_rad)))
 
 
 def _bent(fraction: np.ndarray) -> np.ndarray:
@@ -291,23 +276,18 @@ def _bent(fraction: np.ndarray) -> np.ndarray:
     return np.asarray(fraction**3 * (10.0 - 15.0 * fraction + 6.0 * fraction**2))
 
 
-def _table(move: Move, arm_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Shares (KNOTS,) of a move and the way to them, turning included."""
+def _fraction_by_way(move: Move, arm_m: float) -> Any:
+    """The fraction of a move that is done, as a spline of the way, turning included."""
+    from scipy.interpolate import CubicSpline
+
     fraction = np.linspace(0.0, 1.0, KNOTS)
     if move.length_m == 0.0:
-        return fraction, arm_m * abs(move.turn_rad) * fraction
+        return CubicSpline(arm_m * abs(move.turn_rad) * fraction, fraction)
     node, weight = np.polynomial.legendre.leggauss(NODES)
     middle = fraction[:-1, None] + 0.5 * (node + 1.0) / (KNOTS - 1)
     turning = arm_m * move.turn_rad * 30.0 * (middle * (1.0 - middle)) ** 2
     pieces = np.hypot(move.length_m, turning) @ weight * 0.5 / (KNOTS - 1)
-    return fraction, np.concatenate([[0.0], np.cumsum(pieces)])
-
-
-def _fraction_at(way: np.ndarray, fraction: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Shares (T,) of a move for ways (T,) along it."""
-    from scipy.interpolate import CubicSpline
-
-    return np.clip(CubicSpline(way, fraction)(wanted), 0.0, 1.0)
+    return CubicSpline(np.concatenate([[0.0], np.cumsum(pieces)]), fraction)
 
 
 @dataclass(frozen=True)

@@ -72,20 +72,16 @@ def hidden(eye: np.ndarray, points: np.ndarray, blocks: np.ndarray) -> np.ndarra
     return np.asarray(((enters < leaves) & (leaves > 0.0) & (enters < 1.0 - SURFACE)).any(axis=-1))
 
 
-def inside(points: np.ndarray, blocks: np.ndarray) -> np.ndarray:
-    """Whether points (P, 3) lie within a block; (P,) bool."""
-    within = (points[:, None] > blocks[:, 0]) & (points[:, None] < blocks[:, 1])
-    return np.asarray(within.all(axis=-1).any(axis=-1))
-
-
 def outside(draw: Draw, blocks: np.ndarray) -> Draw:
     """Draws again what falls into a block."""
 
     def redraw(count: int) -> np.ndarray:
         points = draw(count)
-        while (wrong := inside(points, blocks)).any():
+        while True:
+            within = (points[:, None] > blocks[:, 0]) & (points[:, None] < blocks[:, 1])
+            if not (wrong := within.all(axis=-1).any(axis=-1)).any():
+                return points
             points[wrong] = draw(int(wrong.sum()))
-        return points
 
     return redraw
 
@@ -114,31 +110,6 @@ def populated(
         present.append(np.stack([start, end], axis=-1))
         start = end[end < frames]
     return np.concatenate(points), np.concatenate(present)
-
-
-def face_areas(box: np.ndarray, faces: list[tuple[int, int]]) -> np.ndarray:
-    """(F,) areas of faces, as `on_faces` takes them, m²."""
-    size = box[1] - box[0]
-    return np.prod(size) / size[[axis for axis, _ in faces]]
-
-
-def on_faces(
-    box: np.ndarray, faces: list[tuple[int, int]], count: int, rng: np.random.Generator
-) -> np.ndarray:
-    """Positions (K, 3), uniform by area on faces of a box.
-
-    Args:
-        box: (2, 3) least and greatest corner.
-        faces: (axis, 0 for the least or 1 for the greatest side).
-        count: K.
-        rng: generator.
-    """
-    axis, side = np.array(faces).T
-    area = face_areas(box, faces)
-    face = rng.choice(len(faces), count, p=area / area.sum())
-    points = rng.uniform(box[0], box[1], (count, 3))
-    points[np.arange(count), axis[face]] = box[side[face], axis[face]]
-    return points
 
 
 ARM_HZ = 0.2, 0.8
@@ -214,29 +185,21 @@ class DeskWorld:
 
     def build(self, rng: np.random.Generator) -> Scene:
         """Draws the points, the blocks and the path."""
-        blocks = self._blocks(rng)
-        half = np.array(self.size_m) / 2
+        size, half = np.array(self.size_m), np.array(self.size_m) / 2
+        extent = size * rng.uniform([0.04, 0.04, 0.1], [0.08, 0.08, 0.25], (self.blocks, 3))
+        middle = size * rng.uniform(-0.4, 0.4, (self.blocks, 3))
+        middle[:, 2] = extent[:, 2]
+        blocks = np.stack([middle - extent, middle + extent], axis=1)
         draw = outside(lambda count: half * [0, 0, 1] + rng.uniform(-half, half, (count, 3)), blocks)
         points, present = populated(draw, self.points, self.frames, self.renewal / self.rate_hz, rng)
-        path = self._path(rng)
-        return Scene("desk", frame_stamps(self.frames, self.rate_hz), path, points, present, blocks)
-
-    def _blocks(self, rng: np.random.Generator) -> np.ndarray:
-        """(B, 2, 3) blocks that stand on the desk."""
-        size = np.array(self.size_m)
-        half = size * rng.uniform([0.04, 0.04, 0.1], [0.08, 0.08, 0.25], (self.blocks, 3))
-        middle = size * rng.uniform(-0.4, 0.4, (self.blocks, 3))
-        middle[:, 2] = half[:, 2]
-        return np.stack([middle - half, middle + half], axis=1)
-
-    def _path(self, rng: np.random.Generator) -> np.ndarray:
-        """(T, 7) poses."""
+        # The path, slowed down, and the tremor on top.
         seconds = frame_seconds(self.frames, self.rate_hz)
         sweep = self._sweep(rng)
         bound = [np.deg2rad(self.tremor_deg)] * 3 + [self.tremor_m] * 3
         tremor = Wave.random(np.array(bound), TREMOR_HZ, rng)
         time = eased(seconds, self.start_s)
-        return shaken(slowed(sweep, seconds, self.speed_m_s, self.turn_rad_s)(time), tremor, time)
+        path = shaken(slowed(sweep, seconds, self.speed_m_s, self.turn_rad_s)(time), tremor, time)
+        return Scene("desk", frame_stamps(self.frames, self.rate_hz), path, points, present, blocks)
 
     def _sweep(self, rng: np.random.Generator) -> Callable[[np.ndarray], np.ndarray]:
         """Poses (T, 7) at times (T,), faster than a hand."""

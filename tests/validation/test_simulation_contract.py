@@ -1,0 +1,166 @@
+"""What every simulated world and option keeps: refusals in words, examples that run, bytes that follow the seed alone."""
+
+import doctest
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rbpf.errors import InputError
+from rbpf.sensors.camera import Pinhole, RectifiedStereo
+from rbpf.sensors.feature_log import FeatureLog
+from rbpf.validation.simulation import images, lab, textured_scene
+from rbpf.validation.simulation.desk_and_room import TexturedDesk, TexturedRoom
+from rbpf.validation.simulation.features import MONO, STEREO, Measuring, simulate_features
+from rbpf.validation.simulation.images import Imaging, simulate_images
+from rbpf.validation.simulation.lab import LabDrive, LabWorld, TexturedLab
+from rbpf.validation.simulation.paths import WheelOdometer
+from rbpf.validation.simulation.point_worlds import DeskWorld, PointWorld
+from rbpf.validation.simulation.textured_scene import ImageWorld, Rectangle
+
+GREY = np.full((8, 8), 128, dtype=np.uint8)
+SQUARE = {"corner": np.zeros(3), "across": np.eye(3)[0], "down": np.eye(3)[1], "texture": GREY}
+SMALL = RectifiedStereo(Pinhole(96, 72, 75.0, 75.0, 47.5, 35.5), 0.12)
+
+
+def sheet(**wrong: Any) -> Rectangle:
+    return Rectangle(**{**SQUARE, **wrong})
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "message"),
+    [
+        (DeskWorld, {"frames": 1}, "frames must be a whole number, at least 2, got 1"),
+        (DeskWorld, {"points": 0}, "points must be a whole number, at least 1, got 0"),
+        (DeskWorld, {"blocks": -1}, "blocks must be a whole number, at least 0"),
+        (DeskWorld, {"rate_hz": 0.0}, "rate_hz must be a positive number, got 0.0"),
+        (DeskWorld, {"speed_m_s": -1.0}, "speed_m_s must be a positive number"),
+        (DeskWorld, {"turn_rad_s": float("inf")}, "turn_rad_s must be a positive number"),
+        (DeskWorld, {"size_m": (1.0, 0.0, 1.0)}, "size_m must be three positive numbers"),
+        (DeskWorld, {"size_m": (1.0, float("nan"), 1.0)}, "size_m must be three positive numbers"),
+        (DeskWorld, {"nearest_m": 2.0}, "nearest_m = 2.0 must be less than farthest_m = 1.5"),
+        (DeskWorld, {"wander": -0.1}, "wander must be zero or a positive number"),
+        (DeskWorld, {"elevation_deg": 85.0}, "elevation_deg = 85.0 .* vertical"),
+        (DeskWorld, {"renewal": 1.0}, "renewal must be a probability"),
+        (LabWorld, {"points": 0}, "points"),
+        (Measuring, {"noise_px": 0.0}, "noise_px must be a positive number, got 0.0"),
+        (Measuring, {"noise_px": float("nan")}, "noise_px must be a positive number"),
+        (Measuring, {"measurements": 0}, "measurements must be a whole number, at least 1, got 0"),
+        (Measuring, {"measurements": 2.5}, "measurements must be a whole number"),
+        (Measuring, {"known": -1}, "known must be a whole number, at least 0"),
+        (Measuring, {"new_per_frame": -1}, "new_per_frame must be"),
+        (Measuring, {"rest_frames": -1}, "rest_frames must be"),
+        (Measuring, {"known_std_m": -0.1}, "known_std_m must be zero or a positive number"),
+        (Measuring, {"border_px": -1.0}, "border_px must be zero"),
+        (
+            Measuring,
+            {"outlier_rate": 1.0},
+            "outlier_rate must be a probability, 0 or more and below 1, got 1.0",
+        ),
+        (Measuring, {"dropout": -0.1}, "dropout must be a probability"),
+        (Measuring, {"turnover": float("nan")}, "turnover must be a probability"),
+        (Measuring, {"farthest_m": float("inf")}, "farthest_m must be a positive number"),
+        (Measuring, {"nearest_m": 9.0}, "nearest_m = 9.0 must be less than farthest_m = 8.0"),
+        (TexturedDesk, {"frames": 1}, "frames"),
+        (TexturedDesk, {"texel_m": 0.0}, "texel_m"),
+        (TexturedDesk, {"board": (2, 5)}, "board"),
+        (TexturedDesk, {"nearest_m": 2.0, "farthest_m": 1.0}, "nearest_m"),
+        (TexturedDesk, {"things": -1}, "things"),
+        (TexturedRoom, {"size_m": (3.0, 3.0, 2.5)}, "size_m"),
+        (TexturedRoom, {"eye_m": 3.0}, "eye_m"),
+        (TexturedRoom, {"drop_deg": 90.0}, "drop_deg"),
+        (TexturedRoom, {"contrast": -1.0}, "contrast"),
+        (TexturedLab, {"texel_m": 0.0}, "texel_m"),
+        (TexturedLab, {"contrast": -1.0}, "contrast"),
+        (LabDrive, {"trajectory": "walk"}, "one of tour, turn_back"),
+        (LabDrive, {"frames": 1}, "frames must be a whole number, at least 2"),
+        (LabDrive, {"frames": 4001}, "has 4000 images"),
+        (LabDrive, {"every": 0}, "every must be a whole number, at least 1"),
+        (LabDrive, {"every": 4000}, "has 1 images"),
+        (LabDrive, {"every": 100, "frames": 41}, "has 40 images"),
+        (WheelOdometer, {"wheelbase_m": 0.0}, "wheelbase_m"),
+        (WheelOdometer, {"slip_m": -1.0}, "slip_m"),
+        (WheelOdometer, {"scale": np.nan}, "scale"),
+        (WheelOdometer, {"inequality": 0.6}, "inequality"),
+        (Imaging, {"noise_std": -1.0}, "noise_std"),
+        (Imaging, {"blur_s": np.nan}, "blur_s"),
+        (Imaging, {"lens_px": -0.1}, "lens_px"),
+        (Imaging, {"exposure_drift": 1.0}, "exposure_drift"),
+        (Imaging, {"vignetting": -0.1}, "vignetting"),
+        (Imaging, {"grid": 0}, "grid"),
+        (Imaging, {"known": 3}, "known"),
+        (Imaging, {"known_std_m": 0.0}, "known_std_m"),
+        (Imaging, {"blackout": (0,)}, "blackout"),
+        (Imaging, {"jpeg": -1}, "jpeg"),
+        (Imaging, {"jpeg": 101}, "jpeg"),
+        (sheet, {"down": 2.0 * np.eye(3)[0]}, "span an area"),
+        (sheet, {"corner": np.array([0.0, np.nan, 0.0])}, "finite"),
+        (sheet, {"texture": GREY.astype(float)}, "uint8"),
+        (sheet, {"texture": GREY[:1]}, "at least 2 x 2"),
+        (sheet, {"gain": -1.0}, "gain"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(kind: Any, options: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        kind(**options)
+
+
+@pytest.mark.parametrize("module", [images, lab, textured_scene])
+def test_examples_in_the_docstrings_run(module: ModuleType) -> None:
+    result = doctest.testmod(module)
+    assert result.attempted > 0 and result.failed == 0
+
+
+def log_bytes(log: FeatureLog) -> bytes:
+    assert log.truth is not None and log.known is not None
+    parts = [log.truth.stamps_ns, log.truth.world_from_camera, log.known.names, log.known.positions]
+    for frame in log.frames:
+        parts += [np.array(frame.stamp_ns), frame.landmarks, frame.z, frame.cov_z]
+    return b"".join(part.tobytes() for part in [*parts, *log.truth.landmarks.values()])
+
+
+@pytest.mark.parametrize("camera", [MONO, STEREO])
+@pytest.mark.parametrize("world", [DeskWorld(frames=200), DeskWorld(frames=40, renewal=0.1)])
+def test_a_seed_gives_the_same_measurements(world: PointWorld, camera: Pinhole | RectifiedStereo) -> None:
+    measuring = Measuring(outlier_rate=0.1)
+    first, again, other = (log_bytes(simulate_features(world, measuring, camera, seed)) for seed in (3, 3, 4))
+    assert first == again
+    assert first != other
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("world", "imaging"),
+    [
+        (TexturedDesk(frames=4, texel_m=0.008), Imaging(exposure_drift=0.2, blur_s=0.05, known=4)),
+        (TexturedRoom(frames=4, texel_m=0.02), Imaging(vignetting=0.3, known=4)),
+        (TexturedLab(LabDrive("turn_back", 4, every=30), texel_m=0.1), Imaging(jpeg=90, known=0)),
+    ],
+    ids=["desk", "room", "lab"],
+)
+def test_a_seed_gives_the_same_files(world: ImageWorld, imaging: Imaging, tmp_path: Path) -> None:
+    for name, seed in {"first": 3, "again": 3, "other": 4}.items():
+        simulate_images(world, imaging, SMALL, tmp_path / name, seed)
+    first, again, other = (contents(tmp_path / name) for name in ("first", "again", "other"))
+    assert first == again
+    assert first.keys() == other.keys()
+    drawn = {name for name in first if name.endswith((".png", ".jpg"))}
+    drawn |= {"known_points.csv", "odometry.csv"} & first.keys()
+    assert len(drawn) >= 9 and not any(first[name] == other[name] for name in drawn)
+
+
+@pytest.mark.slow
+def test_a_shorter_drive_gives_the_same_beginning(tmp_path: Path) -> None:
+    for name, frames in (("whole", 4), ("short", 3)):
+        world = TexturedLab(LabDrive("turn_back", frames, every=30), texel_m=0.1)
+        imaging = Imaging(jpeg=90, known=0, exposure_drift=0.0, blur_s=0.0)  # both look at later frames
+        simulate_images(world, imaging, SMALL, tmp_path / name, 3)
+    whole, short = (contents(tmp_path / name) for name in ("whole", "short"))
+    pictures = [name for name in short if name.endswith(".jpg")]
+    assert len(pictures) == 6 and all(short[name] == whole[name] for name in pictures)
