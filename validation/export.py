@@ -21,7 +21,7 @@ from rbpf.sensors.feature_log import FeatureLog
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.validation.colmap.model import build_model
 from rbpf.validation.gtsam.batch_problem import Problem
-from rbpf.validation.gtsam.camera_data import Sightings, sightings_of
+from rbpf.validation.gtsam.observations import ObservationTable, observation_table
 from rbpf.validation.ply import write_ply
 from rbpf.validation.report.colours import colours_by_sigma, standard_deviations
 
@@ -75,7 +75,7 @@ def colmap_model(estimate: PathAndMap, problem: Problem | None) -> Any:
             f"{problem.name}: expected a pose for each frame, found {counts}; take both from one run."
         )
     return build_model(
-        _on_map(sightings_of(problem), landmarks.ids), estimate.world_from_body, landmarks.mean, colours
+        _on_map(observation_table(problem), landmarks.ids), estimate.world_from_body, landmarks.mean, colours
     )
 
 
@@ -98,14 +98,14 @@ def raised(landmarks: MapEstimate) -> MapEstimate:
     return replace(landmarks, mean=mean, cov=cov)
 
 
-def _on_map(table: Sightings, ids: NDArray[np.int64]) -> Sightings:
+def _on_map(table: ObservationTable, ids: NDArray[np.int64]) -> ObservationTable:
     """The sightings of the map's landmarks, with the places of these in the map."""
     order = np.argsort(ids, kind="stable")
     kept = np.isin(table.names, ids)[table.index]
     place = order[np.searchsorted(ids, table.names[table.index[kept]], sorter=order)]
-    return Sightings(table.camera, table.steps[kept], place, ids, table.z[kept], table.cov_z[kept])
+    return ObservationTable(table.camera, table.steps[kept], place, ids, table.z[kept], table.cov_z[kept])
 
 
-def _no_sightings(camera: Pinhole, ids: NDArray[np.int64]) -> Sightings:
+def _no_sightings(camera: Pinhole, ids: NDArray[np.int64]) -> ObservationTable:
     none = np.zeros(0, dtype=np.intp)
-    return Sightings(camera, none, none, ids, np.zeros((0, 2)), np.zeros((0, 2, 2)))
+    return ObservationTable(camera, none, none, ids, np.zeros((0, 2)), np.zeros((0, 2, 2)))

@@ -22,11 +22,11 @@ from rbpf.runs.truth import LEAST, TRUTH
 from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.feature_log import FeatureLog
 from rbpf.systems.map_estimate import MapEstimate
-from rbpf.validation.consistency.validate import report_run
 from rbpf.validation.metrics.accuracy import ate
 from rbpf.validation.metrics.scores import BATCH, score_landmarks, score_run
 from rbpf.validation.report.page import VIDEO
 from rbpf.validation.report.rerun import write_rerun
+from rbpf.validation.report.validate import report_run
 from rbpf.validation.report.video import PICTURES, write_annotated
 
 MOST = 300_000

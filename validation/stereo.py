@@ -11,7 +11,6 @@ from rbpf.sensors.readers import ImageSequence, Topics, open_stereo
 from rbpf.sensors.readers.images.sequence import UNNAMED
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.run import StereoRun, run_images
-from rbpf.validation.consistency.validate import report_run
 from rbpf.validation.finish import Callbacks
 from rbpf.validation.gtsam.stereo_batch import adjust_stereo, score_stereo_batch
 from rbpf.validation.image_run import CHECKPOINT, Progress, write_batch
@@ -19,6 +18,7 @@ from rbpf.validation.report.page import VIDEO
 from rbpf.validation.report.stereo_frames import write_annotated_pairs
 from rbpf.validation.report.stereo_pictures import plot_stereo_run
 from rbpf.validation.report.stereo_rerun import write_stereo_rerun
+from rbpf.validation.report.validate import report_run
 from rbpf.validation.stereo_folder import write_stereo_run
 
 

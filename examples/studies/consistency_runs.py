@@ -29,8 +29,7 @@ from rbpf.systems.filtering import ProposalConfig
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
-from rbpf.validation.consistency.pose_errors import whitened_errors
-from rbpf.validation.consistency.statistic import PROBABILITIES
+from rbpf.validation.consistency.statistic import PROBABILITIES, whitened_errors
 from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
 from rbpf.validation.simulation.point_worlds import DeskWorld
 from rbpf.validation.simulation.robot import RobotWorld, simulated_log

@@ -17,9 +17,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from rbpf.core.diagnostics import Band, chi_square_band
+from rbpf.lie import SE3
 from rbpf.runs.recordings import filter_features as run
 from rbpf.systems.mono.config import MonoConfig
-from rbpf.validation.consistency.pose_errors import PoseErrors, pose_errors
+from rbpf.validation.consistency.statistic import whitened_errors
 from rbpf.validation.gtsam.camera import solve_features
 from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
 from rbpf.validation.simulation.point_worlds import DeskWorld
@@ -37,16 +38,21 @@ class Job(NamedTuple):
     particles: tuple[int, ...]
 
 
-def solve_and_filter(job: Job) -> tuple[float, list[PoseErrors]]:
+def solve_and_filter(job: Job) -> tuple[float, list[tuple[float, np.ndarray]]]:
     """Error of the batch [m], and errors of the filter by number of particles."""
     log = simulate_features(DeskWorld(frames=job.frames), Measuring(), MONO, job.seed)
     truth = log.truth.world_from_camera
     batch = solve_features(log, marginals=False).world_from_camera
+
+    def rmse(path: np.ndarray) -> float:
+        return float(np.sqrt(np.square(path[:, 4:] - truth[:, 4:]).sum(axis=1).mean()))
+
     errors = []
     for particles in job.particles:
         done = run(log, MonoConfig(particles=particles, seed=job.seed))
-        errors.append(pose_errors(done.log.poses, done.log.covs, truth))
-    return pose_errors(batch, done.log.covs, truth).rmse, errors
+        nees = whitened_errors(SE3, done.log.poses, done.log.covs, truth).nees
+        errors.append((rmse(done.log.poses), nees))
+    return rmse(batch), errors
 
 
 def draw(names: list[str], mm: np.ndarray, nees: np.ndarray, band: Band, path: Path) -> None:
@@ -91,8 +97,10 @@ def main(
     jobs = map(Job, range(seeds), repeat(frames), repeat(particles))
     batch, errors = zip(*in_parallel(solve_and_filter, jobs, workers), strict=True)
 
-    mm = 1e3 * np.array([[b, *(e.rmse for e in of_seed)] for b, of_seed in zip(batch, errors, strict=True)])
-    nees = np.mean([[e.nees for e in of_seed] for of_seed in errors], axis=0)
+    mm = 1e3 * np.array(
+        [[b, *(error for error, _ in of_seed)] for b, of_seed in zip(batch, errors, strict=True)]
+    )
+    nees = np.mean([[nees for _, nees in of_seed] for of_seed in errors], axis=0)
     band = chi_square_band(6, seeds)
     names = [f"{n:,} particles" for n in particles]
     ratio = mm[:, 1 + USUAL] / mm[:, 0]

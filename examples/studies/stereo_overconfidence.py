@@ -23,7 +23,7 @@ from rbpf.sensors.feature_log import FeatureLog
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig, ResamplingConfig
 from rbpf.systems.stereo.config import OUTLIER_VOLUME_PX3, OdometryConfig, StereoConfig, TriggerConfig
 from rbpf.systems.stereo.run import run_features
-from rbpf.validation.consistency.pose_errors import whitened_errors
+from rbpf.validation.consistency.statistic import whitened_errors
 from rbpf.validation.simulation.features import STEREO, Measuring, simulate_features
 from rbpf.validation.simulation.lab import LabDrive, LabWorld
 from rbpf.validation.tables import write_table

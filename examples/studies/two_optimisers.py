@@ -25,12 +25,15 @@ from rbpf.runs.plots import new_axes, save_figures
 from rbpf.runs.reading import RunFolder
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureFrame, FeatureLog, KnownPoints
-from rbpf.validation.colmap.frames import from_colmap_pose
-from rbpf.validation.colmap.model import build_model, image_id
+from rbpf.validation.colmap.model import build_model, from_colmap_pose, image_id
 from rbpf.validation.gtsam.camera import CameraSolution, solve_features
-from rbpf.validation.gtsam.camera_data import CameraEstimate, Sightings, sightings_of
-from rbpf.validation.gtsam.camera_factors import evaluate_sightings
 from rbpf.validation.gtsam.mono_batch import connected_frames
+from rbpf.validation.gtsam.observations import (
+    CameraEstimate,
+    ObservationTable,
+    observation_table,
+    reprojection,
+)
 from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
 from rbpf.validation.simulation.point_worlds import DeskWorld
 from rbpf.validation.tables import write_table
@@ -106,7 +109,7 @@ def adjust_by_colmap(log: FeatureLog, initial: CameraEstimate) -> ColmapAdjustme
     )
     found = np.array([model.point3D(index + 1).xyz for index in range(len(points))])
     cov_poses, cov_points = _covariances(model, adjuster, table, path, found, fixed, std)
-    residuals = evaluate_sightings(table, path, found)[0] / std
+    residuals = reprojection(table, path, found)[0] / std
     names = table.names.tolist()
     return ColmapAdjustment(
         world_from_camera=path,
@@ -118,7 +121,7 @@ def adjust_by_colmap(log: FeatureLog, initial: CameraEstimate) -> ColmapAdjustme
     )
 
 
-def _checked(log: FeatureLog, initial: CameraEstimate) -> tuple[Sightings, float]:
+def _checked(log: FeatureLog, initial: CameraEstimate) -> tuple[ObservationTable, float]:
     if not isinstance(log.camera, Pinhole):
         raise InputError(
             f"{log.name} is a stereo log: COLMAP would count the row of each pair twice; adjust its left camera alone."
@@ -128,7 +131,7 @@ def _checked(log: FeatureLog, initial: CameraEstimate) -> tuple[Sightings, float
         raise InputError(
             f"{log.name}: COLMAP has no priors on points; hold {LEAST_HELD} or more of them exactly (with_held)."
         )
-    full = sightings_of(log).determined(known)
+    full = observation_table(log).determined(known)
     table = full.rows(np.isin(full.names, [*initial.landmarks, *known])[full.index])
     std = float(np.sqrt(table.cov_z[0, 0, 0]))
     if np.abs(table.cov_z - std**2 * np.eye(2)).max() > _SAME * std**2:
@@ -170,7 +173,7 @@ def _solve(adjuster: Any, name: str) -> None:
 def _covariances(
     model: Any,
     adjuster: Any,
-    table: Sightings,
+    table: ObservationTable,
     path: Array,
     points: Array,
     fixed: NDArray[np.bool_],
@@ -210,9 +213,11 @@ def _in_our_chart(joint: Array, path: Array) -> Array:
     return slope[:, None] @ joint @ np.swapaxes(slope, -1, -2)[None]
 
 
-def _marginal(table: Sightings, path: Array, points: Array, within: Array, joint: Array, std: float) -> Array:
+def _marginal(
+    table: ObservationTable, path: Array, points: Array, within: Array, joint: Array, std: float
+) -> Array:
     """P + Σ_ij G_i Σ_ij G_jᵀ of each point, where G_i = −P H_li says how it follows pose i."""
-    by_pose, by_point = evaluate_sightings(table, path, points)[1]
+    by_pose, by_point = reprojection(table, path, points)[1]
     out = np.empty_like(within)
     for index in range(len(points)):
         rows = np.flatnonzero(table.index == index)

@@ -27,9 +27,8 @@ from rbpf.sensors.range_bearing import RangeBearing
 from rbpf.sensors.readers import Frame, RobotLog
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.consistency.against_groundtruth import pose_statistics
-from rbpf.validation.consistency.own_statistics import innovation_statistics
-from rbpf.validation.consistency.pose_errors import whitened_errors
-from rbpf.validation.consistency.statistic import Statistic
+from rbpf.validation.consistency.comparison import innovation_statistics
+from rbpf.validation.consistency.statistic import Statistic, whitened_errors
 from rbpf.validation.consistency.verdict import Trust, Verdict, judge
 from rbpf.validation.simulation.robot import RobotWorld, simulated_log
 from rbpf.validation.tables import write_table

@@ -88,7 +88,9 @@ def recalibrate(options: Annotated[RecalibrateOptions, tyro.conf.arg(name="")]) 
 
     with progress() as bar:
         entries, found = from_run(
-            options.run, options.out, told(bar, bar.add_task("adjusting with other cameras", total=None))
+            options.run,
+            options.out,
+            told(bar, bar.add_task("adjusting the camera with poses and landmarks", total=None)),
         )
     focal, k1 = entries["fx"], entries["k1"]
     answer(

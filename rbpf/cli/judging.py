@@ -32,7 +32,7 @@ class ValidateOptions(Printed):
 def validate(options: Annotated[ValidateOptions, tyro.conf.arg(name="")]) -> None:
     """Compare a run with the truth or an optimum: JSON, pictures, and two sentences on top of its report."""
     from rbpf.validation.consistency.comparison import read_comparisons
-    from rbpf.validation.consistency.validate import validate as compare
+    from rbpf.validation.report.validate import validate as compare
 
     with waiting(f"comparing with {options.against} …"):
         verdict = compare(options.run, options.against, options.out)

@@ -16,7 +16,7 @@ import yaml
 from rbpf.cli import main
 from rbpf.lie import SE3
 from rbpf.runs.trajectory import read_tum
-from rbpf.validation.colmap.pipeline import ReconstructionOptions
+from rbpf.validation.colmap.reconstruct import ReconstructionOptions
 from tests.cli.run_outputs import outputs, untimed_summary
 from tests.cli.stereo_sequences import FRAMES, run
 

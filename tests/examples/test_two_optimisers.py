@@ -9,8 +9,8 @@ import pytest
 from examples.studies.two_optimisers import adjust_by_both, adjust_by_colmap, tangent_slope, with_held
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.validation.colmap.frames import from_colmap_pose
-from rbpf.validation.gtsam.camera_data import CameraEstimate, sightings_of
+from rbpf.validation.colmap.model import from_colmap_pose
+from rbpf.validation.gtsam.observations import CameraEstimate, observation_table
 from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
 from rbpf.validation.simulation.point_worlds import DeskWorld
 from tests.validation.camera_scenes import BENT, FISHEYE, PLAIN, STEREO, WHOLE, scene
@@ -110,7 +110,7 @@ def test_covariances_of_the_installed_build_have_that_tangent():
     frames = [replace(f, cov_z=np.tile(np.eye(2), (len(f.z), 1, 1))) for f in log.frames]
     names = log.known.names.tolist()
     log = with_held(replace(log, frames=frames), {name: log.truth.landmarks[name] for name in names})
-    table = sightings_of(log).determined(set(names))
+    table = observation_table(log).determined(set(names))
     found = adjust_by_colmap(log, CameraEstimate(log.truth.world_from_camera, log.truth.landmarks))
     free = [name for name in table.names.tolist() if name not in names]
 

@@ -17,7 +17,6 @@ WHOLE = replace(PLAIN, distortion=(-0.25, 0.06, 1e-3, -5e-4, 0.02))
 FISHEYE = replace(PLAIN, distortion=(-0.03, 0.02, -0.012, 0.002), distortion_model="equidistant")
 STEREO = RectifiedStereo(PLAIN, 0.15)
 FIRST = SE3.exp(np.array([0.3, -0.2, 1.1, 0.5, -0.7, 0.2]))
-ACCELERATION = np.array([0.2, 0.3, 0.1, 0.5, 0.4, 0.3])
 
 
 def scene(
@@ -27,15 +26,13 @@ def scene(
     known: int = 4,
     seed: int = 0,
     noise_px: float = 1.0,
-    drive: bool = False,
 ) -> FeatureLog:
     """A camera moves by a tenth of a metre per frame before points three metres away, of which it sees most.
 
-    With `drive` it moves as E06 (4)-(5) says, by `ACCELERATION`, every 0.1 s. Pixels are correlated; the first
-    landmarks are known to a centimetre, in correlated axes.
+    Pixels are correlated; the first landmarks are known to a centimetre, in correlated axes.
     """
     rng = np.random.default_rng(seed)
-    path = _drive(frames, rng) if drive else _walk(frames, rng)
+    path = _walk(frames, rng)
     low, high = [-1.2, -0.9, 2.4], [1.2, 0.9, 4.0]
     places = SE3.transform(path[len(path) // 2], rng.uniform(low, high, (points, 3)))
     names = rng.permutation(np.arange(100, 100 + 3 * points))[:points]
@@ -64,16 +61,6 @@ def _walk(frames: int, rng: np.random.Generator) -> Array:
     return np.array(path)
 
 
-def _drive(frames: int, rng: np.random.Generator) -> Array:
-    dt, path, velocity = 0.1, [FIRST], np.array([0.05, -0.1, 0.0, 1.2, 0.1, 0.1])
-    factor = np.linalg.cholesky([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
-    for noise in rng.normal(size=(frames - 1, 2, 6)):
-        w = factor @ noise * ACCELERATION
-        path.append(SE3.retract(path[-1], dt * velocity + w[0]))
-        velocity = velocity + w[1]
-    return np.array(path)
-
-
 def _known(names: Array, places: Array, rng: np.random.Generator) -> KnownPoints | None:
     if not len(names):
         return None
@@ -87,13 +74,12 @@ class Reference(NamedTuple):
 
     world_from_camera: Array
     landmarks: Array
-    velocities: Array
     cov_poses: Array
     cov_landmarks: Array
     error: float
 
 
-def solve_by_scipy(log: FeatureLog, velocity: Array | None = None, robust: float | None = None) -> Reference:
+def solve_by_scipy(log: FeatureLog, robust: float | None = None) -> Reference:
     """Least squares over tangents at the truth; every term is written down once more."""
     names = np.unique(np.concatenate([frame.landmarks for frame in log.frames]))
     steps = np.repeat(np.arange(len(log.frames)), [len(frame.landmarks) for frame in log.frames])
@@ -105,42 +91,29 @@ def solve_by_scipy(log: FeatureLog, velocity: Array | None = None, robust: float
         np.linalg.inv(np.linalg.cholesky(log.known.cov)),
     )
     count, split = len(log.frames), 6 * len(log.frames)
-    dt = 1e-9 * np.diff([frame.stamp_ns for frame in log.frames])
     around = np.array([log.truth.landmarks[name] for name in names.tolist()])
 
-    def parts(x: Array) -> tuple[Array, Array, Array]:
-        lead, end = x.shape[:-1], split + around.size
+    def parts(x: Array) -> tuple[Array, Array]:
+        lead = x.shape[:-1]
         path = SE3.retract(log.truth.world_from_camera, x[..., :split].reshape(*lead, -1, 6))
-        points = around + x[..., split:end].reshape(*lead, -1, 3)
-        return path, points, x[..., end:].reshape(*lead, -1, 6)
+        return path, around + x[..., split:].reshape(*lead, -1, 3)
 
     def residuals(x: Array) -> Array:
-        path, points, speeds = parts(x)
+        path, points = parts(x)
         e = log.camera.project(SE3.inverse_transform(path[..., steps, :], points[..., place, :])) - z
         e = shrunk(np.einsum("kij,...kj->...ki", whiten, e), robust)
         prior = np.einsum("kij,...kj->...ki", whiten_fixed, points[..., fixed, :] - log.known.positions)
-        moved = [] if velocity is None else [_motion(path, speeds, dt, velocity)]
-        return np.concatenate([part.reshape(*x.shape[:-1], -1) for part in (e, prior, *moved)], axis=-1)
+        return np.concatenate([part.reshape(*x.shape[:-1], -1) for part in (e, prior)], axis=-1)
 
-    speeds = np.zeros(0 if velocity is None else split)
-    x0 = np.concatenate([np.zeros(split + around.size), speeds])
+    x0 = np.zeros(split + around.size)
     found = least_squares(
         residuals, x0, lambda x: slope_of(residuals, x), x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15
     )
     slope = slope_of(residuals, found.x)
     cov = np.linalg.inv(slope.T @ slope)
-    path, points, speeds = parts(found.x)
+    path, points = parts(found.x)
     spread = slope_of(lambda x: SE3.local(path, parts(x)[0]).reshape(len(x), -1), found.x)
     spread = spread.reshape(count, 6, -1)
-    blocks = cov[split : split + around.size, split : split + around.size].reshape(
-        len(names), 3, len(names), 3
-    )
+    blocks = cov[split:, split:].reshape(len(names), 3, len(names), 3)
     cov_landmarks = np.array([blocks[i, :, i] for i in range(len(names))])
-    return Reference(path, points, speeds, spread @ cov @ spread.mT, cov_landmarks, float(found.cost))
-
-
-def _motion(path: Array, speeds: Array, dt: Array, std: Array) -> Array:
-    w1 = SE3.local(path[..., :-1, :], path[..., 1:, :]) - dt[:, None] * speeds[..., :-1, :]
-    noise = np.concatenate([w1, np.diff(speeds, axis=-2)], axis=-1)
-    covs = [np.kron([[t**3 / 3, t**2 / 2], [t**2 / 2, t]], np.diag(std**2)) for t in dt]
-    return np.einsum("tij,...tj->...ti", np.linalg.inv(np.linalg.cholesky(covs)), noise)
+    return Reference(path, points, spread @ cov @ spread.mT, cov_landmarks, float(found.cost))

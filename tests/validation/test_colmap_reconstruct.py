@@ -14,10 +14,8 @@ from rbpf.sensors.feature_log import CameraTruth
 from rbpf.sensors.readers import open_images, open_stereo
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.validation.colmap.against_colmap import compare_folder_with_colmap, compare_with_colmap
-from rbpf.validation.colmap.cloud_distance import cloud_distance
-from rbpf.validation.colmap.compare import compare_with_path, compare_with_truth
-from rbpf.validation.colmap.pipeline import ReconstructionOptions
-from rbpf.validation.colmap.reconstruct import Reconstruction, reconstruct
+from rbpf.validation.colmap.compare import cloud_distance, compare_with_path, compare_with_truth
+from rbpf.validation.colmap.reconstruct import Reconstruction, ReconstructionOptions, reconstruct
 from rbpf.validation.simulation.desk_and_room import TexturedDesk
 from rbpf.validation.simulation.images import Imaging, simulate_images
 from tests.systems import plane_sequences

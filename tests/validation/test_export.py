@@ -12,12 +12,10 @@ from rbpf.runs.path_and_map import PathAndMap
 from rbpf.runs.recordings import filter_robot_log as run
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.range_bearing.config import RangeBearingConfig
-from rbpf.validation.colmap.frames import from_colmap_pose
-from rbpf.validation.colmap.model import LEFT, RIGHT, build_model, image_id, image_name
+from rbpf.validation.colmap.model import LEFT, RIGHT, build_model, from_colmap_pose, image_id, image_name
 from rbpf.validation.export import MAP, PATH, colmap_model, export_colmap, export_ply
 from rbpf.validation.gtsam.batch_problem import problem_of
-from rbpf.validation.gtsam.camera_data import sightings_of
-from rbpf.validation.gtsam.camera_factors import evaluate_sightings
+from rbpf.validation.gtsam.observations import observation_table, reprojection
 from rbpf.validation.ply import read_ply, write_ply
 from rbpf.validation.report.colours import colours_by_sigma, standard_deviations
 from tests.validation.camera_scenes import BENT, FISHEYE, STEREO, scene
@@ -57,9 +55,9 @@ def test_a_model_read_back_by_colmap_has_our_poses_points_tracks_and_residuals(t
         assert SE3.local(pose, from_colmap_pose(image.cam_from_world())) == pytest.approx(
             np.zeros(6), abs=1e-12
         )
-    table = sightings_of(log)
+    table = observation_table(log)
     points = np.array([log.truth.landmarks[name] for name in table.names.tolist()])
-    ours = np.linalg.norm(evaluate_sightings(table, log.truth.world_from_camera, points)[0], axis=1)
+    ours = np.linalg.norm(reprojection(table, log.truth.world_from_camera, points)[0], axis=1)
     theirs = reprojection_errors(model)
     assert len(theirs) == len(ours)
     ids = estimate.landmarks.ids.tolist()
@@ -79,7 +77,7 @@ def test_landmarks_that_the_map_lacks_are_left_out():
 
 def test_a_stereo_pair_is_a_rig_whose_right_camera_sees_what_was_measured():
     log = scene(camera=STEREO, frames=3, points=8, noise_px=1e-7)
-    table = sightings_of(log)
+    table = observation_table(log)
     points = np.array([log.truth.landmarks[name] for name in table.names.tolist()])
     model = build_model(table, log.truth.world_from_camera, points)
     assert model.num_rigs() == 1 and model.num_frames() == 3 and model.num_images() == 6

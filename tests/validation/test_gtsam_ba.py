@@ -11,10 +11,8 @@ from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3
 from rbpf.sensors.readers.measurements import InitialEstimate, dead_reckoning, initial_estimate
 from rbpf.validation.gtsam.batch_problem import first_steps
-from rbpf.validation.gtsam.chart import PLANAR, SPATIAL
-from rbpf.validation.gtsam.robot import solve, solve_online
-from rbpf.validation.gtsam.robot_graph import Problem
-from rbpf.validation.gtsam.robot_optimise import CHUNK
+from rbpf.validation.gtsam.robot import CHUNK, Problem, solve, solve_online
+from rbpf.validation.gtsam.solvers import PLANAR, SPATIAL
 from tests.validation.factors import check_derivatives
 from tests.validation.joint_ekf import joint_ekf
 from tests.validation.worlds import seen, solve_by_scipy, world

@@ -7,15 +7,16 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.feature_log import KnownPoints
+from rbpf.validation.gtsam import camera_adjust as adjuster
 from rbpf.validation.gtsam.camera import CameraEstimate, solve_features
 from rbpf.validation.gtsam.camera_adjust import explain
-from rbpf.validation.gtsam.camera_data import known_by_name, sightings_of
-from rbpf.validation.gtsam.camera_factors import evaluate_sightings
 from rbpf.validation.gtsam.camera_graph import CameraProblem, CameraState
+from rbpf.validation.gtsam.observations import known_by_name, observation_table, reprojection
+from rbpf.validation.gtsam.solvers import marginals, marginals_by_schur
 from tests.validation.camera_scenes import (
-    ACCELERATION,
     BENT,
     FISHEYE,
     PLAIN,
@@ -37,20 +38,17 @@ def estimate(log, seed=5, scale=0.02):
     return CameraEstimate(moved, {n: p + scale * rng.normal(size=3) for n, p in log.truth.landmarks.items()})
 
 
-def problem_and_state(log, velocity=None):
-    table = sightings_of(log)
-    stamps = np.array([frame.stamp_ns for frame in log.frames])
-    problem = CameraProblem("scene", stamps, table, known_by_name(log.known, table.names), None, velocity)
+def problem_and_state(log):
+    table = observation_table(log)
+    problem = CameraProblem("scene", len(log.frames), table, known_by_name(log.known, table.names))
     start = estimate(log)
     points = np.array([start.landmarks[name] for name in table.names.tolist()])
-    speeds = np.random.default_rng(6).normal(size=(len(stamps), 6))
-    return problem, CameraState(start.world_from_camera, points, speeds)
+    return problem, CameraState(start.world_from_camera, points)
 
 
-@pytest.mark.parametrize("velocity", [None, ACCELERATION])
 @pytest.mark.parametrize("camera", CAMERAS)
-def test_derivatives_of_every_factor_are_those_of_its_residual(camera, velocity):
-    problem, state = problem_and_state(scene(camera, frames=3, points=6, known=0), velocity)
+def test_derivatives_of_every_factor_are_those_of_its_residual(camera):
+    problem, state = problem_and_state(scene(camera, frames=3, points=6, known=0))
     loose = np.arange(6) < 2
     graph, values = problem.graph(state, loose, state.path), problem.values(state)
     for i in range(graph.size()):
@@ -61,7 +59,7 @@ def test_derivatives_of_every_factor_are_those_of_its_residual(camera, velocity)
 def test_gtsams_factors_are_our_camera(camera):
     problem, state = problem_and_state(scene(camera, known=0))
     graph, values = problem.graph(state, np.zeros(14, dtype=bool), state.path), problem.values(state)
-    residuals, (by_pose, by_point) = evaluate_sightings(problem.table, state.path, state.points)
+    residuals, (by_pose, by_point) = reprojection(problem.table, state.path, state.points)
     order = [0, 2, 1] if camera is STEREO else [0, 1]
     for row, residual in enumerate(residuals):
         factor = graph.at(row)
@@ -79,18 +77,6 @@ def test_the_optimum_and_its_covariance_are_scipys(camera):
     assert_same(solve_features(log, estimate(log)), solve_by_scipy(log))
 
 
-def test_with_a_velocity_the_optimum_and_its_covariance_are_scipys():
-    log = scene(drive=True)
-    found, expected = (
-        solve_features(log, estimate(log), velocity=ACCELERATION),
-        solve_by_scipy(log, ACCELERATION),
-    )
-    assert_same(found, expected)
-    np.testing.assert_allclose(found.velocities, expected.velocities, atol=1e-5)
-    free = solve_features(log, estimate(log))
-    assert np.linalg.det(found.cov_poses[2]) < 0.8 * np.linalg.det(free.cov_poses[2])
-
-
 def assert_same(found, expected):
     assert found.error == pytest.approx(expected.error, rel=1e-8)
     assert np.abs(SE3.local(expected.world_from_camera, found.world_from_camera)).max() < 1e-6
@@ -106,12 +92,11 @@ def assert_same_covariances(found, expected):
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-4 * np.abs(other).max())
 
 
-@pytest.mark.parametrize("drive", [False, True])
-def test_errors_of_the_batch_are_as_large_as_it_says(drive):
+def test_errors_of_the_batch_are_as_large_as_it_says():
     squares = []
     for seed in range(40):
-        log = scene(BENT, seed=seed, drive=drive, noise_px=0.7)
-        found = solve_features(log, estimate(log), velocity=ACCELERATION if drive else None)
+        log = scene(BENT, seed=seed, noise_px=0.7)
+        found = solve_features(log, estimate(log))
         errors = SE3.local(found.world_from_camera, log.truth.world_from_camera)
         name = max(found.landmarks)
         off = found.landmarks[name] - log.truth.landmarks[name]
@@ -167,38 +152,6 @@ def test_points_known_exactly_stay_where_they_are():
     assert np.abs(SE3.local(near.world_from_camera, found.world_from_camera)).max() < 1e-4
 
 
-def test_frames_of_one_time_share_pose_and_velocity():
-    log = scene(drive=True)
-    frame = log.frames[2]
-    halves = [
-        replace(frame, landmarks=frame.landmarks[rows], z=frame.z[rows], cov_z=frame.cov_z[rows])
-        for rows in (slice(0, 6), slice(6, None))
-    ]
-    split = replace(log, frames=[*log.frames[:2], *halves, *log.frames[3:]])
-    whole = solve_features(log, estimate(log), velocity=ACCELERATION)
-    path = estimate(log).world_from_camera[[0, 1, 2, 2, 3, 4, 5]]
-    found = solve_features(split, CameraEstimate(path, {}), velocity=ACCELERATION)
-    np.testing.assert_array_equal(found.world_from_camera[2], found.world_from_camera[3])
-    np.testing.assert_array_equal(found.velocities[2], found.velocities[3])
-    np.testing.assert_array_equal(found.cov_poses[2], found.cov_poses[3])
-    kept = [0, 1, 2, 4, 5, 6]
-    assert np.abs(SE3.local(whole.world_from_camera, found.world_from_camera[kept])).max() < 1e-6
-    np.testing.assert_allclose(found.cov_poses[kept], whole.cov_poses, rtol=1e-3, atol=1e-9)
-
-
-def test_a_frame_without_sightings_follows_the_velocity():
-    log = scene(drive=True)
-    none = np.empty(0, dtype=np.int64), np.empty((0, 2)), np.empty((0, 2, 2))
-    blind = replace(log, frames=[*log.frames, replace(log.frames[-1], stamp_ns=600_000_000)])
-    blind.frames[-1] = replace(blind.frames[-1], landmarks=none[0], z=none[1], cov_z=none[2])
-    path = estimate(log).world_from_camera
-    found = solve_features(blind, CameraEstimate(path[[0, 1, 2, 3, 4, 5, 5]], {}), velocity=ACCELERATION)
-    expected = SE3.retract(found.world_from_camera[5], 0.1 * found.velocities[5])
-    assert np.abs(SE3.local(expected, found.world_from_camera[6])).max() < 1e-8
-    np.testing.assert_allclose(found.velocities[6], found.velocities[5], atol=1e-8)
-    assert np.linalg.det(found.cov_poses[6]) > np.linalg.det(found.cov_poses[5])
-
-
 def test_a_robust_loss_is_opt_in_and_is_hubers():
     log = scene(points=20)
     bad = replace(log, frames=list(log.frames))
@@ -236,4 +189,52 @@ def test_without_marginals_there_are_none():
     found = solve_features(log, estimate(log), marginals=False)
     assert found.cov_poses.shape == (0, 6, 6)
     assert found.cov_landmarks == {}
-    assert found.velocities.shape == (0, 6)
+
+
+def adjusted(camera, known: str):
+    """The optimum of a small scene, with known points as they are, exact ones, or none."""
+    log = scene(camera)
+    if known == "exact":
+        log = replace(log, known=replace(log.known, cov=np.zeros_like(log.known.cov)))
+    if known == "none":
+        log = replace(log, known=None)
+    table, names = observation_table(log), {}
+    if log.known is not None:
+        names = known_by_name(log.known, table.names)
+    problem = CameraProblem(log.name, len(log.frames), table, names)
+    start = adjuster.begin(problem, CameraEstimate(log.truth.world_from_camera, {}))
+    return adjuster.adjust(problem, start)
+
+
+@pytest.mark.parametrize(
+    ("camera", "known"),
+    [(BENT, "uncertain"), (BENT, "exact"), (STEREO, "uncertain"), (STEREO, "exact"), (STEREO, "none")],
+)
+def test_they_are_those_of_a_full_elimination(camera, known):
+    found = adjusted(camera, known)
+    problem = found.problem
+    keys = problem.pose_keys, problem.point_keys
+    assert bool(problem.held_keys) == (known != "uncertain")
+    poses, points = marginals_by_schur(found.graph, found.values, *keys, problem.held_keys, problem.name)
+    whole = marginals(found.graph, found.values, [*keys[0], *keys[1]])
+    for one, other in zip([*poses, *points], whole, strict=True):
+        scale = max(np.abs(other).max(), 1e-12)
+        np.testing.assert_allclose(one, other, atol=1e-6 * scale)
+
+
+def test_a_landmark_that_nothing_determines_is_refused():
+    """A single camera's only sighting of a point leaves its distance open."""
+    found = adjusted(STEREO, "none")
+    problem, graph = found.problem, gtsam.NonlinearFactorGraph()
+    last = problem.point_keys[-1]
+    for index in range(found.graph.size()):
+        keys = list(found.graph.at(index).keys())
+        if last not in keys:
+            graph.push_back(found.graph.at(index))
+    values = gtsam.Values(found.values)
+    weak = gtsam.noiseModel.Diagonal.Sigmas(np.array([1.0, 1.0, np.inf]))
+    graph.push_back(gtsam.PriorFactorPoint3(last, values.atPoint3(last), weak))
+    with pytest.raises(InputError, match="do not determine all poses and landmarks"):
+        marginals_by_schur(
+            graph, values, problem.pose_keys, problem.point_keys, problem.held_keys, problem.name
+        )

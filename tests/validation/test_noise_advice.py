@@ -7,8 +7,7 @@ import pytest
 
 from rbpf.core.filter import Filter
 from rbpf.runs.results import Results
-from rbpf.validation.consistency.noise_advice import noise_advice
-from rbpf.validation.consistency.own_statistics import INNOVATIONS
+from rbpf.validation.consistency.comparison import INNOVATIONS, noise_advice
 from rbpf.validation.consistency.statistic import step_ratio, variance_ratio
 from tests.validation.test_verdict import Receiver, Walk
 

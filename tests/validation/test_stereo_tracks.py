@@ -12,8 +12,8 @@ from rbpf.sensors.readers.stereo_tracks import read_stereo_tracks
 from rbpf.systems.stereo.config import MapConfig, OdometryConfig, StereoConfig
 from rbpf.systems.stereo.slam import StereoSlam
 from rbpf.validation.gtsam.camera import CameraEstimate, solve_features
-from rbpf.validation.gtsam.camera_data import sightings_of
 from rbpf.validation.gtsam.camera_graph import CameraProblem, CameraState
+from rbpf.validation.gtsam.observations import observation_table
 
 pytestmark = [pytest.mark.real_data, pytest.mark.slow]
 
@@ -41,11 +41,10 @@ def test_the_reference_figures_and_the_batch_solution(tracks):
     """
     log, points, guess = tracks.log, first_observations(tracks), tracks.world_from_camera
     assert (len(log.frames), sum(len(frame.z) for frame in log.frames), len(points)) == (77, 52544, 15638)
-    table = sightings_of(log)
-    stamps = np.array([frame.stamp_ns for frame in log.frames], dtype=np.int64)
-    problem = CameraProblem(log.name, stamps, table, {})
+    table = observation_table(log)
+    problem = CameraProblem(log.name, len(log.frames), table, {})
     places = np.array([points[name] for name in table.names.tolist()])
-    state = CameraState(guess, places, np.empty((0, 6)))
+    state = CameraState(guess, places)
     graph = problem.graph(state, np.zeros(len(places), dtype=bool), guess)
     values = problem.values(state)
     # The reference started from points in the file, which are rounded.

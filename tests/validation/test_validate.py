@@ -17,8 +17,8 @@ from rbpf.runs.truth import RunTruth, truth_at, write_truth
 from rbpf.sensors.readers import Truth
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.consistency.against_groundtruth import truth_errors
-from rbpf.validation.consistency.validate import COMPARISONS, validate
 from rbpf.validation.report.page import write_report
+from rbpf.validation.report.validate import COMPARISONS, validate
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot, simulated_log
 
 pytestmark = pytest.mark.usefixtures("plain_pictures")

@@ -15,9 +15,8 @@ from rbpf.runs.truth import truth_at
 from rbpf.sensors.range_bearing import RangeBearing
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.consistency.against_groundtruth import pose_statistics
-from rbpf.validation.consistency.own_statistics import innovation_statistics
-from rbpf.validation.consistency.pose_errors import whitened_errors
-from rbpf.validation.consistency.statistic import coverage, variance_ratio
+from rbpf.validation.consistency.comparison import innovation_statistics
+from rbpf.validation.consistency.statistic import coverage, variance_ratio, whitened_errors
 from rbpf.validation.consistency.verdict import Verdict, judge
 from rbpf.validation.simulation.robot import RobotWorld, simulated_log
 

@@ -1,6 +1,6 @@
 """A run over images beside a reconstruction of the same images by COLMAP, and the reconstruction beside the truth."""
 
-from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
@@ -13,8 +13,7 @@ from rbpf.runs.provenance import read_config
 from rbpf.runs.reading import RunFolder
 from rbpf.sensors.readers import ImageSequence, Topics, open_images, open_stereo
 from rbpf.validation.colmap.compare import ColmapComparison, compare_with_path, compare_with_truth
-from rbpf.validation.colmap.pipeline import ReconstructionOptions
-from rbpf.validation.colmap.reconstruct import reconstruct
+from rbpf.validation.colmap.reconstruct import ReconstructionOptions, reconstruct
 
 OVER_IMAGES = "mono", "stereo"
 """Systems whose runs have images."""
@@ -53,25 +52,19 @@ def compare_folder_with_colmap(folder: Path, options: ReconstructionOptions | No
         raise InputError(
             f"{folder} is a run of the system {config['system']}, which sees no images; COLMAP needs a run over images."
         )
-    sequence = _images(config)
-    return compare_with_colmap(RunFolder.open(folder).estimate, sequence, options)
-
-
-def _images(config: Mapping[str, Any]) -> ImageSequence:
     recording, calibration = Path(str(config["recording"])), config.get("calibration")
     topics = Topics.parse(config.get("image_topic"), config.get("truth_topic"))
     if config["system"] == "stereo":
-        return open_stereo(recording, calibration, topics=topics)
-    sequence = open_images(recording, calibration, topics)
-    if not sequence.camera.lens.is_identity:
-        return sequence
-    # Where the recording is a rectified pair, of which the run saw the left images, both take part.
-    try:
-        pair = open_stereo(recording, calibration, topics=topics)
-    except InputError:
-        return sequence
-    is_same = pair.camera == sequence.camera and np.array_equal(pair.stamps_ns, sequence.stamps_ns)
-    return pair if is_same else sequence
+        sequence = open_stereo(recording, calibration, topics=topics)
+    else:
+        sequence = open_images(recording, calibration, topics)
+        if sequence.camera.lens.is_identity:
+            # Where the recording is a rectified pair, of which the run saw the left images, both take part.
+            with suppress(InputError):
+                pair = open_stereo(recording, calibration, topics=topics)
+                if pair.camera == sequence.camera and np.array_equal(pair.stamps_ns, sequence.stamps_ns):
+                    sequence = pair
+    return compare_with_colmap(RunFolder.open(folder).estimate, sequence, options)
 
 
 def compare_with_colmap(

@@ -2,12 +2,16 @@
 
 COLMAP's world and scale are its own: its cameras are brought onto the reference's by the best similarity, or by the
 best rigid motion where a stereo pair gave the scale. Then one metre is the reference's.
+
+Two detectors seldom choose the same spots, so the nearest point is about as far as the cloud is sparse. The distance
+from the plane of the nearest points does not depend on that where the surface is smooth.
 """
 
 from dataclasses import dataclass
 from typing import Any, final
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
@@ -15,10 +19,44 @@ from rbpf.runs.alignment import Similarity
 from rbpf.runs.trajectory import Trajectory, associate
 from rbpf.runs.truth import poses_at
 from rbpf.sensors.feature_log import CameraTruth
-from rbpf.validation.colmap.cloud_distance import CloudDistance, cloud_distance
-from rbpf.validation.colmap.pipeline import LEAST_FRAMES
-from rbpf.validation.colmap.reconstruct import Reconstruction
+from rbpf.validation.colmap.reconstruct import LEAST_FRAMES, Reconstruction
 from rbpf.validation.metrics.accuracy import AbsoluteError, ate
+
+NEIGHBOURS = 6
+"""Points of the cloud that a plane is laid through."""
+
+LEAST_POINTS = 3
+"""Of a cloud, for a plane."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class CloudDistance:
+    """Distances from M landmarks to a cloud.
+
+    Attributes:
+        nearest_m: (M,) to the nearest point.
+        surface_m: (M,) to the plane that fits the nearest points best.
+        sigmas: (M,) the latter in the landmark's standard deviation across the plane; NaN without covariances.
+        spacing_m: median distance from the nearest points to their own nearest neighbour.
+    """
+
+    nearest_m: Array
+    surface_m: Array
+    sigmas: Array
+    spacing_m: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """Quantiles for JSON."""
+        figures = {"landmarks": len(self.nearest_m), "cloud_spacing_median_m": self.spacing_m}
+        for name in ("nearest", "surface"):
+            median, p90 = np.quantile(getattr(self, f"{name}_m"), [0.5, 0.9]).tolist()
+            figures |= {f"{name}_median_m": median, f"{name}_p90_m": p90}
+        known = self.sigmas[np.isfinite(self.sigmas)]
+        if known.size:
+            figures["surface_median_sigmas"] = float(np.median(known))
+            figures["share_within_3_sigmas"] = float((known < 3.0).mean())
+        return figures
 
 
 @final
@@ -79,28 +117,21 @@ def compare_with_path(
             f"{LEAST_FRAMES} or more for an alignment."
         )
     errors = ate(ours, theirs, "rigid" if found.metric else "similarity")
-    move, cloud = align_cameras(ours, theirs, not found.metric), None
-    if landmarks is not None and len(landmarks):
-        cloud = cloud_distance(move.transform(found.points), landmarks, cov_landmarks)
-    return ColmapComparison(
-        found, errors, move, cloud, float(np.linalg.norm(np.ptp(theirs.positions, axis=0)))
-    )
-
-
-def align_cameras(estimate: Trajectory, reference: Trajectory, with_scale: bool) -> Similarity:
-    """The similarity of the mean rotation between the cameras, and of the scale and shift that then fit the centres.
-
-    Centres on a short or straight path leave the rotation open, and points far from it would be far off.
-    """
-    mine, theirs = estimate.world_from_body, reference.world_from_body
-    turns = SE3.compose(theirs, SE3.inverse(mine))
+    # The mean rotation between the cameras, and the scale and shift that then fit the centres: centres on a short or
+    # straight path leave the rotation open, and points far from it would be far off.
+    mine, reference_poses = ours.world_from_body, theirs.world_from_body
+    turns = SE3.compose(reference_poses, SE3.inverse(mine))
     turns[:, 4:] = 0.0
     rotation = SE3.rotation(SE3.mean(turns, np.full(len(turns), 1.0 / len(turns))))
-    x, y = mine[:, 4:] @ rotation.T, theirs[:, 4:]
+    x, y = mine[:, 4:] @ rotation.T, reference_poses[:, 4:]
     dx, dy = x - x.mean(axis=0), y - y.mean(axis=0)
     square = float(np.square(dx).sum())
-    scale = float((dx * dy).sum() / square) if with_scale and square > 0.0 else 1.0
-    return Similarity(scale, rotation, y.mean(axis=0) - scale * x.mean(axis=0))
+    scale = float((dx * dy).sum() / square) if not found.metric and square > 0.0 else 1.0
+    move = Similarity(scale, rotation, y.mean(axis=0) - scale * x.mean(axis=0))
+    cloud, extent = None, float(np.linalg.norm(np.ptp(theirs.positions, axis=0)))
+    if landmarks is not None and len(landmarks):
+        cloud = cloud_distance(move.transform(found.points), landmarks, cov_landmarks)
+    return ColmapComparison(found, errors, move, cloud, extent)
 
 
 def compare_with_truth(found: Reconstruction, truth: CameraTruth | None) -> ColmapComparison:
@@ -120,3 +151,30 @@ def compare_with_truth(found: Reconstruction, truth: CameraTruth | None) -> Colm
             f"{LEAST_FRAMES} or more; its stamps must be those of the images' clock."
         )
     return compare_with_path(found, Trajectory(found.stamps_ns[rows], poses))
+
+
+def cloud_distance(cloud: Array, landmarks: Array, cov_landmarks: Array | None = None) -> CloudDistance:
+    """Distances of landmarks to a cloud.
+
+    Args:
+        cloud: (P, 3), P >= 3.
+        landmarks: (M, 3), M >= 1.
+        cov_landmarks: (M, 3, 3).
+
+    Raises:
+        InputError: the cloud or the map is too small.
+    """
+    if len(cloud) < LEAST_POINTS or not len(landmarks):
+        found = f"{len(cloud)} and {len(landmarks)}"
+        raise InputError(f"Expected {LEAST_POINTS} or more points of a cloud and a landmark, found {found}.")
+    tree = cKDTree(cloud)
+    distances, rows = tree.query(landmarks, k=min(NEIGHBOURS, len(cloud)))
+    spacing = tree.query(cloud[rows[:, 0]], k=2)[0][:, 1]
+    around = cloud[rows]
+    middle = around.mean(axis=1)
+    normal = np.linalg.svd(around - middle[:, None])[2][:, 2]
+    surface = np.abs(np.einsum("ki,ki->k", landmarks - middle, normal))
+    sigmas = np.full(len(landmarks), np.nan)
+    if cov_landmarks is not None:
+        sigmas = surface / np.sqrt(np.einsum("ki,kij,kj->k", normal, cov_landmarks, normal))
+    return CloudDistance(distances[:, 0], surface, sigmas, float(np.median(spacing)))

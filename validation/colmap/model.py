@@ -1,20 +1,71 @@
-"""A COLMAP reconstruction made of a path, a map and its sightings: cameras, images, points, tracks.
+"""COLMAP's cameras, pixels and poses in ours, and a reconstruction made of a path, a map and its observations.
 
-Image t + 1 is frame t (of a stereo pair, images 2t + 1 and 2t + 2 on one rig), point j + 1 is row j of the map.
+COLMAP writes poses as camera-from-world and puts the centre of the top-left pixel at (0.5, 0.5); here poses are
+world-from-camera and it is at (0, 0). The half pixel is added and taken away in this module and nowhere else.
+J. L. Schönberger and J.-M. Frahm, "Structure-from-motion revisited" (2016).
+
+In a reconstruction, image t + 1 is frame t (of a stereo pair, images 2t + 1 and 2t + 2 on one rig), point j + 1 is row j
+of the map.
 """
 
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from rbpf.lie import Array
-from rbpf.sensors.camera import RectifiedStereo
-from rbpf.validation.colmap.frames import HALF_PX, to_colmap_camera, to_colmap_pose
-from rbpf.validation.gtsam.camera_data import Sightings
+from rbpf.lie import SE3, Array
+from rbpf.sensors.camera import Pinhole, RectifiedStereo
+from rbpf.validation.gtsam.observations import ObservationTable
+
+HALF_PX = 0.5
+"""Added to our pixels it gives COLMAP's."""
 
 LEFT, RIGHT = 1, 2
 """Numbers of the cameras."""
+
+
+def camera_model(camera: Pinhole) -> tuple[str, list[float]]:
+    """Name and parameters of COLMAP's model that is exactly our camera.
+
+    PINHOLE without distortion; OPENCV with k1, k2, p1, p2; FULL_OPENCV, whose denominator is left at 1, with k3;
+    OPENCV_FISHEYE where it is equidistant.
+    """
+    plain = [camera.fx, camera.fy, camera.cx + HALF_PX, camera.cy + HALF_PX]
+    if camera.distortion_model == "equidistant":
+        return "OPENCV_FISHEYE", [*plain, *camera.distortion]
+    *four, k3 = camera.distortion
+    if k3:
+        return "FULL_OPENCV", [*plain, *four, k3, 0.0, 0.0, 0.0]
+    return ("OPENCV", [*plain, *four]) if any(four) else ("PINHOLE", plain)
+
+
+def to_colmap_camera(camera: Pinhole, camera_id: int = 1) -> Any:
+    """A `pycolmap.Camera` with a known focal length."""
+    import pycolmap
+
+    name, params = camera_model(camera)
+    return pycolmap.Camera(
+        model=name,
+        width=camera.width,
+        height=camera.height,
+        params=params,
+        camera_id=camera_id,
+        has_prior_focal_length=True,
+    )
+
+
+def to_colmap_pose(world_from_camera: ArrayLike) -> Any:
+    """The `pycolmap.Rigid3d` cam_from_world of a pose (7,)."""
+    import pycolmap
+
+    inverse = SE3.inverse(np.asarray(world_from_camera, dtype=float))
+    return pycolmap.Rigid3d(pycolmap.Rotation3d(inverse[:4]), inverse[4:])
+
+
+def from_colmap_pose(cam_from_world: Any) -> Array:
+    """The pose world_from_camera (7,) of a `pycolmap.Rigid3d`."""
+    inverse = np.concatenate([cam_from_world.rotation.quat, cam_from_world.translation])
+    return SE3.inverse(SE3.normalise(inverse))
 
 
 def image_name(frame: int, side: int = LEFT) -> str:
@@ -23,7 +74,7 @@ def image_name(frame: int, side: int = LEFT) -> str:
 
 
 def build_model(
-    table: Sightings, world_from_camera: Array, points: Array, colours: NDArray[np.uint8] | None = None
+    table: ObservationTable, world_from_camera: Array, points: Array, colours: NDArray[np.uint8] | None = None
 ) -> Any:
     """A `pycolmap.Reconstruction`.
 
@@ -35,98 +86,60 @@ def build_model(
     """
     import pycolmap
 
-    model = pycolmap.Reconstruction()
-    stereo = isinstance(table.camera, RectifiedStereo)
-    if isinstance(table.camera, RectifiedStereo):
-        _add_rig(model, table.camera)
+    model, camera = pycolmap.Reconstruction(), table.camera
+    stereo = isinstance(camera, RectifiedStereo)
+    sides = (LEFT, RIGHT) if stereo else (LEFT,)
+    pixels = {LEFT: table.z[:, :2], RIGHT: table.z[:, [-1, 1]]}
+    if isinstance(camera, RectifiedStereo):
+        sensors = {side: pycolmap.sensor_t(pycolmap.SensorType.CAMERA, side) for side in sides}
+        for side in sides:
+            model.add_camera(to_colmap_camera(camera.camera, side))
+        rig = pycolmap.Rig(rig_id=1)
+        rig.add_ref_sensor(sensors[LEFT])
+        # A point at depth z is baseline · f / z further left in the right image.
+        shift = np.array([-camera.baseline_m, 0.0, 0.0])
+        rig.add_sensor(sensors[RIGHT], pycolmap.Rigid3d(pycolmap.Rotation3d(), shift))
+        model.add_rig(rig)
     else:
-        model.add_camera_with_trivial_rig(to_colmap_camera(table.camera, LEFT))
-    pixels = _pixels(table)
-    for frame, pose in enumerate(world_from_camera):
-        rows = np.flatnonzero(table.steps == frame)
+        model.add_camera_with_trivial_rig(to_colmap_camera(camera, LEFT))
+    for step, pose in enumerate(world_from_camera):
+        rows = np.flatnonzero(table.steps == step)
         images = [
             pycolmap.Image(
-                name=image_name(frame, side),
-                keypoints=pixels[side - 1][rows] + HALF_PX,
+                name=image_name(step, side),
+                keypoints=pixels[side][rows] + HALF_PX,
                 camera_id=side,
-                image_id=image_id(frame, side, stereo),
+                image_id=image_id(step, side, stereo),
             )
-            for side in sides(stereo)
+            for side in sides
         ]
-        if stereo:
-            _add_pair(model, frame + 1, images, pose)
-        else:
+        if not stereo:
             model.add_image_with_trivial_frame(images[0], to_colmap_pose(pose))
-    _add_points(model, table, points, colours, stereo)
-    return model
-
-
-def sides(stereo: bool) -> tuple[int, ...]:
-    """The cameras of a frame."""
-    return (LEFT, RIGHT) if stereo else (LEFT,)
-
-
-def image_id(frame: int, side: int = LEFT, stereo: bool = False) -> int:
-    """Number of an image in a model."""
-    return 2 * frame + side if stereo else frame + 1
-
-
-def _pixels(table: Sightings) -> list[Array]:
-    if isinstance(table.camera, RectifiedStereo):
-        return [table.z[:, :2], table.z[:, [2, 1]]]
-    return [table.z]
-
-
-def _add_points(
-    model: Any, table: Sightings, points: Array, colours: NDArray[np.uint8] | None, stereo: bool
-) -> None:
-    import pycolmap
-
+            continue
+        frame = pycolmap.Frame(frame_id=step + 1, rig_id=1)
+        for image in images:
+            image.frame_id = step + 1
+            frame.add_data_id(image.data_id)
+        frame.rig_from_world = to_colmap_pose(pose)
+        model.add_frame(frame)
+        for image in images:
+            model.add_image(image)
+        model.register_frame(step + 1)
+    # Points with their tracks: an observation is its image and its place among this image's pixels.
     grey = np.full((len(points), 3), 128, dtype=np.uint8)
-    colours = grey if colours is None else colours
     tracks: list[list[Any]] = [[] for _ in points]
     places = dict[int, int]()
     for step, index in zip(table.steps.tolist(), table.index.tolist(), strict=True):
         place = places.get(step, 0)
         places[step] = place + 1
-        tracks[index] += [
-            pycolmap.TrackElement(image_id(step, side, stereo), place) for side in sides(stereo)
-        ]
-    for index, (point, colour) in enumerate(zip(points, colours, strict=True)):
-        track = pycolmap.Track(tracks[index])
+        tracks[index] += [pycolmap.TrackElement(image_id(step, side, stereo), place) for side in sides]
+    for index, (point, colour) in enumerate(zip(points, grey if colours is None else colours, strict=True)):
         model.add_point3D_with_id(index + 1, pycolmap.Point3D(xyz=point, color=colour))
-        for element in track.elements:
+        for element in tracks[index]:
             model.add_observation(index + 1, element)
+    return model
 
 
-def _add_rig(model: Any, pair: RectifiedStereo) -> None:
-    import pycolmap
-
-    for side in (LEFT, RIGHT):
-        model.add_camera(to_colmap_camera(pair.camera, side))
-    rig = pycolmap.Rig(rig_id=1)
-    rig.add_ref_sensor(_sensor(LEFT))
-    # A point at depth z is baseline · f / z further left in the right image.
-    right_from_left = pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([-pair.baseline_m, 0.0, 0.0]))
-    rig.add_sensor(_sensor(RIGHT), right_from_left)
-    model.add_rig(rig)
-
-
-def _add_pair(model: Any, frame_id: int, images: list[Any], pose: Array) -> None:
-    import pycolmap
-
-    frame = pycolmap.Frame(frame_id=frame_id, rig_id=1)
-    for image in images:
-        image.frame_id = frame_id
-        frame.add_data_id(image.data_id)
-    frame.rig_from_world = to_colmap_pose(pose)
-    model.add_frame(frame)
-    for image in images:
-        model.add_image(image)
-    model.register_frame(frame_id)
-
-
-def _sensor(camera_id: int) -> Any:
-    import pycolmap
-
-    return pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera_id)
+def image_id(frame: int, side: int = LEFT, stereo: bool = False) -> int:
+    """Number of an image in a model."""
+    return 2 * frame + side if stereo else frame + 1

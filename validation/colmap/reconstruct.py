@@ -6,6 +6,8 @@ there, and the known baseline gives the scale.
 J. L. Schönberger and J.-M. Frahm, "Structure-from-motion revisited" (2016).
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -19,16 +21,42 @@ from rbpf.lie import Array
 from rbpf.runs.trajectory import Trajectory
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers.images.sequence import ImageSequence
-from rbpf.validation.colmap.frames import from_colmap_pose
-from rbpf.validation.colmap.pipeline import (
-    LEAST_FRAMES,
-    ReconstructionOptions,
-    extract_and_match,
-    is_stereo,
-    map_images,
-    quiet,
-    write_key_frames,
-)
+from rbpf.validation.colmap.model import camera_model, from_colmap_pose
+
+LEAST_FRAMES = 3
+"""Key frames; two have no third view that tells a wrong match."""
+
+
+@final
+@dataclass(frozen=True)
+class ReconstructionOptions:
+    """How images are reconstructed.
+
+    Attributes:
+        every: every so many frames is a key frame, from the first on.
+        features: most of them per image.
+        overlap: each key frame is matched with so many that follow, and with those 2^i further on.
+        stereo: of a stereo sequence take both images, and the scale from the baseline.
+        least_angle_deg: between the rays of the two images that it begins with.
+        threads: of extraction and matching; mapping takes one, so that the same seed gives the same model.
+        seed: of RANSAC.
+    """
+
+    every: int = 5
+    features: int = 4096
+    overlap: int = 10
+    stereo: bool = True
+    least_angle_deg: float = 16.0
+    threads: int = 1
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Checks that the numbers make sense."""
+        for name in ("every", "features", "overlap", "threads"):
+            if getattr(self, name) < 1:
+                raise InputError(f"Expected {name} to be at least 1, found {getattr(self, name)}.")
+        if self.seed < 0:
+            raise InputError(f"Expected a seed of at least 0, found {self.seed}.")
 
 
 @final
@@ -108,24 +136,93 @@ def reconstruct(
 
 
 def _reconstruct(sequence: ImageSequence, options: ReconstructionOptions, folder: Path) -> Reconstruction:
-    images, database = folder / "images", folder / "database.db"
+    import pycolmap
+
+    images, models, database = folder / "images", folder / "models", folder / "database.db"
     images.mkdir(parents=True, exist_ok=True)
+    models.mkdir(exist_ok=True)
     database.unlink(missing_ok=True)
-    chosen = write_key_frames(sequence, options, images)
-    with quiet():
-        extract_and_match(sequence.camera, options, images, database, 1 + is_stereo(sequence, options))
-        model = _largest(map_images(options, images, database, folder))
+    # Key frames to files, as NUMBER_SIDE.png.
+    is_stereo, numbers = options.stereo and sequence.baseline_m is not None, []
+    for number, frame in enumerate(sequence.frames()):
+        if number % options.every or frame.image is None:
+            continue
+        for side, image in enumerate((frame.image, frame.right if is_stereo else None)):
+            if image is not None:
+                pycolmap.Bitmap.from_array(image).write(images / f"{number:06d}_{side}.png")
+        numbers.append(number)
+    if len(numbers) < LEAST_FRAMES:
+        raise InputError(
+            f"{sequence.name} has {len(numbers)} readable key frames of {len(sequence)} images, expected "
+            f"{LEAST_FRAMES} or more; choose a smaller step than every {options.every}."
+        )
+    with _quiet():
+        # SIFT of all images, and verified matches with those that follow.
+        name, params = camera_model(sequence.camera)
+        reading = pycolmap.ImageReaderOptions()
+        reading.camera_model, reading.camera_params = name, ",".join(map(repr, params))
+        extraction = pycolmap.FeatureExtractionOptions()
+        extraction.sift.max_num_features, extraction.num_threads = options.features, options.threads
+        pycolmap.extract_features(
+            database,
+            images,
+            camera_mode=pycolmap.CameraMode.SINGLE,
+            reader_options=reading,
+            extraction_options=extraction,
+            device=pycolmap.Device.cpu,
+        )
+        matching, pairing = pycolmap.FeatureMatchingOptions(), pycolmap.SequentialPairingOptions()
+        matching.num_threads = pairing.num_threads = options.threads
+        pairing.overlap = options.overlap * (1 + is_stereo)
+        verification = pycolmap.TwoViewGeometryOptions()
+        verification.ransac.random_seed = options.seed
+        pycolmap.match_sequential(
+            database,
+            matching_options=matching,
+            pairing_options=pairing,
+            verification_options=verification,
+            device=pycolmap.Device.cpu,
+        )
+        # Incremental mapping with the calibration held.
+        pycolmap.set_random_seed(options.seed)
+        how = pycolmap.IncrementalPipelineOptions()
+        how.num_threads, how.random_seed = 1, options.seed
+        how.ba_refine_focal_length = how.ba_refine_principal_point = how.ba_refine_extra_params = False
+        how.mapper.abs_pose_refine_focal_length = how.mapper.abs_pose_refine_extra_params = False
+        how.mapper.init_min_tri_angle = options.least_angle_deg
+        how.min_model_size, how.extract_colors = LEAST_FRAMES, False
+        found = dict(pycolmap.incremental_mapping(database, images, models, how)).values()
+    fitting = [model for model in found if len(_side(model, 0)) >= LEAST_FRAMES]
+    model = max(fitting, key=lambda one: (len(_side(one, 0)), one.num_points3D()), default=None)
     if model is None:
         raise InputError(
-            f"COLMAP found no reconstruction of {sequence.name} from {len(chosen)} key frames: the images share too "
+            f"COLMAP found no reconstruction of {sequence.name} from {len(numbers)} key frames: the images share too "
             "few features or the camera hardly moves between them; choose key frames closer together or farther apart."
         )
-    return _result(sequence, chosen, model)
-
-
-def _largest(models: dict[int, Any]) -> Any:
-    fitting = [model for model in models.values() if len(_side(model, 0)) >= LEAST_FRAMES]
-    return max(fitting, key=lambda model: (len(_side(model, 0)), model.num_points3D()), default=None)
+    # Of pairs, the model is brought to metres.
+    left, right = _side(model, 0), _side(model, 1)
+    both = sorted(left.keys() & right.keys())
+    metric = sequence.baseline_m is not None and bool(both)
+    if sequence.baseline_m is not None and both:
+        lengths = [np.linalg.norm(right[frame][4:] - left[frame][4:]) for frame in both]
+        scale = sequence.baseline_m / float(np.median(lengths))
+        model.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(), np.zeros(3)))
+    poses, by_id = _side(model, 0), dict(model.points3D)
+    frames = np.array(sorted(poses), dtype=np.int64)
+    points = [by_id[index] for index in sorted(by_id)]
+    return Reconstruction(
+        name=sequence.name,
+        camera=sequence.camera,
+        chosen=np.array(numbers, dtype=np.int64),
+        frames=frames,
+        stamps_ns=np.asarray(sequence.stamps_ns, dtype=np.int64)[frames],
+        world_from_camera=np.array([poses[frame] for frame in frames.tolist()]),
+        points=np.array([point.xyz for point in points]).reshape(-1, 3),
+        errors_px=np.array([point.error for point in points]),
+        track_lengths=np.array([point.track.length() for point in points], dtype=np.int64),
+        metric=metric,
+        model=model,
+    )
 
 
 def _side(model: Any, side: int) -> dict[int, Array]:
@@ -136,35 +233,14 @@ def _side(model: Any, side: int) -> dict[int, Array]:
     return {int(image.name.split("_")[0]): from_colmap_pose(image.cam_from_world()) for image in found}
 
 
-def _scale_by_baseline(sequence: ImageSequence, model: Any) -> bool:
-    """Brings the model to metres; False where no pair was found."""
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keeps COLMAP's progress off the terminal."""
     import pycolmap
 
-    left, right = _side(model, 0), _side(model, 1)
-    both = sorted(left.keys() & right.keys())
-    if sequence.baseline_m is None or not both:
-        return False
-    lengths = [np.linalg.norm(right[frame][4:] - left[frame][4:]) for frame in both]
-    scale = sequence.baseline_m / float(np.median(lengths))
-    model.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(), np.zeros(3)))
-    return True
-
-
-def _result(sequence: ImageSequence, chosen: NDArray[np.int64], model: Any) -> Reconstruction:
-    metric = _scale_by_baseline(sequence, model)
-    found, by_id = _side(model, 0), dict(model.points3D)
-    frames = np.array(sorted(found), dtype=np.int64)
-    points = [by_id[index] for index in sorted(by_id)]
-    return Reconstruction(
-        name=sequence.name,
-        camera=sequence.camera,
-        chosen=chosen,
-        frames=frames,
-        stamps_ns=np.asarray(sequence.stamps_ns, dtype=np.int64)[frames],
-        world_from_camera=np.array([found[frame] for frame in frames.tolist()]),
-        points=np.array([point.xyz for point in points]).reshape(-1, 3),
-        errors_px=np.array([point.error for point in points]),
-        track_lengths=np.array([point.track.length() for point in points], dtype=np.int64),
-        metric=metric,
-        model=model,
-    )
+    before = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = before

@@ -11,10 +11,16 @@ from rbpf.runs.reading import FilteredPath, RunFolder
 from rbpf.runs.trajectory import associate, in_space, read_tum
 from rbpf.runs.truth import RunTruth
 from rbpf.systems.map_estimate import MapEstimate
-from rbpf.validation.consistency.autocorrelation import degrees_of_freedom
 from rbpf.validation.consistency.comparison import Comparison
-from rbpf.validation.consistency.pose_errors import WhitenedErrors, whitened_errors
-from rbpf.validation.consistency.statistic import STATE_FACTOR, Statistic, coverage, variance_ratio
+from rbpf.validation.consistency.statistic import (
+    STATE_FACTOR,
+    Statistic,
+    WhitenedErrors,
+    coverage,
+    degrees_of_freedom,
+    variance_ratio,
+    whitened_errors,
+)
 from rbpf.validation.metrics.accuracy import AbsoluteError, ate, rpe
 
 NAME = "groundtruth"
@@ -37,7 +43,7 @@ class TruthErrors:
         path: filtered poses.
         truth: at the steps `truth.rows`.
         positions: errors of the aligned positions.
-        whitened: errors of the poses in units of the filter's own; None where they are not told in one world.
+        whitened: errors of the poses in units of the filter's own; None where they are not in one world.
         landmarks: the map's points whose true places are known, with (M, D) errors; None likewise.
     """
 
@@ -55,7 +61,7 @@ class LandmarkErrors:
     Attributes:
         map: M landmarks of the run.
         errors: (M, D) from the truth, m.
-        squares: (M,) normalised squared errors; an honest filter's are χ² of D.
+        squares: (M,) normalised squared errors; a consistent filter's are χ² of D.
     """
 
     map: MapEstimate
@@ -103,62 +109,20 @@ def pose_statistics(errors: WhitenedErrors) -> list[Statistic]:
     return [ratio, *(coverage(nees[full], dim, max(dof / dim, 1.0)) if full.any() else [])]
 
 
-def compare_with_truth(record: RunFolder, std_m: float = 0.0, std_rad: float = 0.0) -> Comparison:
-    """The comparison, with pictures in the run's folder; arguments and errors as `truth_errors`."""
-    from rbpf.validation.report.truth_pictures import draw_truth
-
-    errors = truth_errors(record, std_m, std_rad)
-    batch = _batch_error(record, errors)
-    accuracy = _accuracy(errors, batch)
-    figures = _figures(errors) | ({} if batch is None else {"batch_position_rmse_m": batch})
-    statistics = [] if errors.whitened is None else pose_statistics(errors.whitened)
-    return Comparison(NAME, accuracy, figures, statistics, draw_truth(record, errors))
-
-
-def _landmark_errors(found: MapEstimate, truth: RunTruth) -> LandmarkErrors | None:
-    kept = np.array([name in truth.landmarks for name in found.ids.tolist()], dtype=bool)
-    if not kept.any():
-        return None
-    found = MapEstimate(found.ids[kept], found.mean[kept], found.cov[kept])
-    true = np.array([truth.landmarks[name] for name in found.ids.tolist()])
-    error = true - found.mean
-    squares = np.einsum("md,mde,me->m", error, np.linalg.pinv(found.cov, hermitian=True), error)
-    return LandmarkErrors(found, error, squares)
-
-
-def _batch_error(record: RunFolder, errors: TruthErrors) -> float | None:
-    """Of the batch optimum's positions at the same steps, aligned in the same way; None without one."""
-    if not (record.folder / "batch.tum").is_file():
-        return None
-    rows, path = errors.truth.rows, errors.path
-    reference = in_space(path.stamps_ns[rows], errors.truth.poses)
-    batch, reference = associate(read_tum(record.folder / "batch.tum"), reference, 0)
-    return ate(batch, reference, errors.truth.alignment).rmse
-
-
-def _accuracy(errors: TruthErrors, batch: float | None) -> str:
-    at, total = errors.positions, len(errors.path.mean)
-    words = (
+def compare_with_truth(record: RunFolder, errors: TruthErrors) -> Comparison:
+    """The comparison of a run with the truth, from its `truth_errors`."""
+    path, truth, at = errors.path, errors.truth, errors.positions
+    reference = in_space(path.stamps_ns[truth.rows], truth.poses)
+    accuracy = (
         f"The path is {_metres(at.rmse)} (rms) from the truth, {_metres(at.max)} at worst, over {at.keys.size} of "
-        f"{total} steps {_HOW[errors.truth.alignment]}"
+        f"{len(path.mean)} steps {_HOW[truth.alignment]}"
     )
-    if batch is not None:
-        words += f"; the batch optimum of the same measurements is {_metres(batch)} from it"
-    return words + "."
-
-
-def _figures(errors: TruthErrors) -> dict[str, Any]:
-    path, rows = errors.path, errors.truth.rows
-    relative = rpe(
-        path.trajectory(rows),
-        in_space(path.stamps_ns[rows], errors.truth.poses),
-        alignment=errors.positions.alignment,
-    )
+    relative = rpe(path.trajectory(truth.rows), reference, alignment=at.alignment)
     figures: dict[str, Any] = {
-        "alignment": errors.truth.alignment,
-        "steps_compared": int(rows.size),
-        "position_rmse_m": errors.positions.rmse,
-        "position_max_m": errors.positions.max,
+        "alignment": truth.alignment,
+        "steps_compared": int(truth.rows.size),
+        "position_rmse_m": at.rmse,
+        "position_max_m": at.max,
         "motion_translation_rmse_m": relative.translation_rmse,
         "motion_rotation_rmse_deg": relative.rotation_rmse_deg,
     }
@@ -176,7 +140,25 @@ def _figures(errors: TruthErrors) -> dict[str, Any]:
             "landmark_nees_mean": float(errors.landmarks.squares.mean()),
             "landmark_nees_right": float(errors.landmarks.errors.shape[1]),
         }
-    return figures
+    # The batch optimum's positions at the same steps, aligned in the same way, where the run has one.
+    if (record.folder / "batch.tum").is_file():
+        batch, beside = associate(read_tum(record.folder / "batch.tum"), reference, 0)
+        rmse = ate(batch, beside, truth.alignment).rmse
+        figures["batch_position_rmse_m"] = rmse
+        accuracy += f"; the batch optimum of the same measurements is {_metres(rmse)} from it"
+    statistics = [] if errors.whitened is None else pose_statistics(errors.whitened)
+    return Comparison(NAME, f"{accuracy}.", figures, statistics)
+
+
+def _landmark_errors(found: MapEstimate, truth: RunTruth) -> LandmarkErrors | None:
+    kept = np.array([name in truth.landmarks for name in found.ids.tolist()], dtype=bool)
+    if not kept.any():
+        return None
+    found = MapEstimate(found.ids[kept], found.mean[kept], found.cov[kept])
+    true = np.array([truth.landmarks[name] for name in found.ids.tolist()])
+    error = true - found.mean
+    squares = np.einsum("md,mde,me->m", error, np.linalg.pinv(found.cov, hermitian=True), error)
+    return LandmarkErrors(found, error, squares)
 
 
 def _metres(value: float) -> str:

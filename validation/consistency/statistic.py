@@ -1,6 +1,6 @@
-"""Statistics that an honest filter keeps near a known value, and what their intervals say about it.
+"""Statistics that a consistent filter keeps near a known value, and what their intervals say about it.
 
-Most of them are a ratio r of squared errors to what the filter expects of them: 1 for an honest filter, 9 where its
+Most of them are a ratio r of squared errors to what the filter expects of them: 1 for a consistent filter, 9 where its
 standard deviations are three times too small. From ν effective degrees of freedom, the 95 % interval of r is
 
     [r ν / χ²_ν(0.975), r ν / χ²_ν(0.025)]
@@ -8,6 +8,16 @@ standard deviations are three times too small. From ν effective degrees of free
 An interval inside the statistic's zone supports the filter, one wholly outside contradicts it, and one across the
 zone's border leaves it open: there are too few independent samples. The zone says how wrong a standard deviation may be
 before it matters, the interval whether that can be told; no threshold depends on a run.
+
+Errors of a filter are alike from one step to the next, so that T steps say less than T independent ones. For a sum of
+squares of zero-mean Gaussian numbers e_t with covariances C_ts = E[e_t e_sᵀ], the mean and the variance are those of a
+scaled χ² with
+
+    ν = (Σ_t tr C_tt)² / Σ_ts ‖C_ts‖²
+
+degrees of freedom (F. Satterthwaite, "An approximate distribution of estimates of variance components", 1946). The
+covariances are estimated from the series itself, up to the first lag at which it is not correlated any more
+(C. Geyer, "Practical Markov chain Monte Carlo", 1992).
 """
 
 from collections.abc import Sequence
@@ -16,7 +26,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from rbpf.validation.consistency.autocorrelation import correlation_time
+from rbpf.lie import LieGroup
 
 LEVEL = 0.95
 """Of all intervals."""
@@ -37,12 +47,15 @@ INFORMED = 0.05
 PROBABILITIES = 0.5, 0.9, 0.95
 """Of credible regions."""
 
+_NOTHING = 1e-12
+"""Variances below this fraction of the largest, or of one, are none."""
+
 Outcome = Literal["supports", "contradicts", "leaves open"]
 
 
 @dataclass(frozen=True)
 class Statistic:
-    """One number about a filter's honesty.
+    """One number about a filter's consistenty.
 
     Attributes:
         name: what it is, in few words.
@@ -83,6 +96,81 @@ class Statistic:
         return cls(**{name: entries[name] for name in names}, high=top, zone=zone)
 
 
+@dataclass(frozen=True)
+class WhitenedErrors:
+    """Errors of T poses in units of what the filter believes, e = cov^(−1/2) Log(mean⁻¹ truth).
+
+    Attributes:
+        errors: (T, d); zero along directions that the filter holds to be known exactly.
+        ranks: (T,) how many directions are not.
+    """
+
+    errors: np.ndarray
+    ranks: np.ndarray
+
+    @property
+    def nees(self) -> np.ndarray:
+        """(T,) normalised errors squared; the mean of an consistent filter's is the rank."""
+        return np.square(self.errors).sum(axis=1)
+
+
+def whitened_errors(space: LieGroup, mean: np.ndarray, cov: np.ndarray, truth: np.ndarray) -> WhitenedErrors:
+    """Errors of estimates (T, E) with covariances (T, d, d) in the right chart, from the truth (T, E).
+
+    The symmetric root is taken, so that the axes are the chart's own at all times.
+    """
+    values, vectors = np.linalg.eigh(cov)
+    used = values > _NOTHING * np.maximum(values[:, -1:], _NOTHING)
+    scale = np.where(used, 1.0 / np.sqrt(np.where(used, values, 1.0)), 0.0)
+    along = np.einsum("tab,ta->tb", vectors, space.local(mean, truth))
+    return WhitenedErrors(np.einsum("tab,tb->ta", vectors, scale * along), used.sum(axis=1))
+
+
+def degrees_of_freedom(white: np.ndarray) -> float:
+    """Effective degrees of freedom of Σ_t |e_t|².
+
+    The mean of an consistent series is known to be zero and is not subtracted: an error that never changes its sign is one
+    sample, however long it lasts.
+
+    Args:
+        white: (T, d) errors, whitened by their own covariances.
+
+    Returns:
+        ν in [1, T·d]; 0 without any.
+    """
+    total = white.shape[0]
+    power = float(np.square(white).sum())
+    if not power > 0.0:
+        return float(white.size)
+    shared = float(np.square(white.T @ white).sum())
+    for lag in range(1, total):
+        lagged = white[:-lag].T @ white[lag:]
+        if np.trace(lagged) <= 0.0:
+            break
+        shared += 2.0 * float(np.square(lagged).sum()) * total / (total - lag)
+    return float(np.clip(total * power**2 / shared, 1.0, white.size))
+
+
+def correlation_time(series: np.ndarray) -> float:
+    """Integrated autocorrelation time of a series (T,): T of its values say as much as T / time independent ones.
+
+    Sums of neighbouring autocorrelations are added up to the first that is not positive (Geyer 1992, §3.3).
+
+    Returns:
+        At least 1; 1 for a series too short to tell.
+    """
+    centred = series - series.mean() if series.size else series
+    power = float(np.square(centred).sum())
+    if series.size < 4 or not power > 0.0:
+        return 1.0
+    spectrum = np.abs(np.fft.rfft(centred, 2 * series.size)) ** 2
+    correlation = np.fft.irfft(spectrum)[: series.size] / power
+    pairs = correlation[: series.size // 2 * 2].reshape(-1, 2).sum(axis=1)
+    negative = np.flatnonzero(pairs <= 0.0)
+    kept = pairs[: negative[0]] if negative.size else pairs
+    return max(1.0, 2.0 * float(kept.sum()) - 1.0)
+
+
 def variance_ratio(name: str, value: float, dof: float, factor: float) -> Statistic:
     """A ratio of squared errors to what was expected of them.
 
@@ -102,7 +190,7 @@ def variance_ratio(name: str, value: float, dof: float, factor: float) -> Statis
 def step_ratio(
     name: str, squares: np.ndarray, dofs: np.ndarray, factor: float = NOISE_FACTOR
 ) -> Statistic | None:
-    """Ratio of squared errors (T,), each χ² of `dofs` (T,) for an honest filter and independent from step to step.
+    """Ratio of squared errors (T,), each χ² of `dofs` (T,) for an consistent filter and independent from step to step.
 
     Where the steps are correlated, or scatter more than χ² does, they count for less. None without any.
     """
@@ -123,7 +211,7 @@ def motion_statistics(correction: np.ndarray, cov: np.ndarray) -> list[Statistic
 
     Args:
         correction: (T, r) in the motion's whitened coordinates; rows of NaN are left out.
-        cov: (T, r, r) what an honest filter expects of it.
+        cov: (T, r, r) what an consistent filter expects of it.
     """
     known = np.isfinite(correction).all(axis=1)
     correction, cov = correction[known], cov[known]

@@ -22,10 +22,9 @@ from rbpf.sensors.feature_log import FeatureLog
 from rbpf.sensors.readers.measurements import Measurements
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.validation.gtsam import camera, robot
-from rbpf.validation.gtsam.camera_data import CameraEstimate, sightings_of
-from rbpf.validation.gtsam.camera_factors import evaluate_sightings
-from rbpf.validation.gtsam.divergence import mahalanobis
 from rbpf.validation.gtsam.mono_batch import connected_frames
+from rbpf.validation.gtsam.observations import CameraEstimate, observation_table, reprojection
+from rbpf.validation.metrics.gaussian_differences import mahalanobis
 from rbpf.validation.metrics.path_and_map import AnyRun
 
 Problem = Measurements | FeatureLog
@@ -168,10 +167,10 @@ def fit_of(problem: Problem, estimate: PathAndMap, names: NDArray[np.int64]) -> 
     """
     places = estimate.landmarks.named()
     if isinstance(problem, FeatureLog):
-        table = sightings_of(problem)
+        table = observation_table(problem)
         table = table.rows(np.isin(table.names, names)[table.index])
         points = np.array([places[name] for name in table.names.tolist()]).reshape(-1, 3)
-        residuals, cov = evaluate_sightings(table, estimate.world_from_body, points)[0], table.cov_z
+        residuals, cov = reprojection(table, estimate.world_from_body, points)[0], table.cov_z
     else:
         rows, model = np.flatnonzero(np.isin(problem.landmarks, names)), problem.model()
         size = problem.z.shape[1]

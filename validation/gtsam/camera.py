@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from typing import final
 
 import numpy as np
-from numpy.typing import ArrayLike
 
+from rbpf.errors import InputError
 from rbpf.lie import Array
 from rbpf.sensors.feature_log import FeatureLog
-from rbpf.validation.gtsam.camera_data import CameraEstimate, known_by_name, sightings_of
+from rbpf.validation.gtsam.observations import CameraEstimate, known_by_name, observation_table
 
 __all__ = ["CameraEstimate", "CameraSolution", "solve_features"]
 
@@ -27,7 +27,6 @@ class CameraSolution:
     Attributes:
         world_from_camera: (T, 7) poses.
         landmarks: name of each landmark that took part to its (3,) position [m].
-        velocities: (T, 6) [omega, v] of the body [rad/s, m/s]; no rows without the velocity's noise.
         cov_poses: (T, 6, 6) marginal covariances in the right chart, order [omega, v]; no rows if not asked for.
         cov_landmarks: name to (3, 3) marginal covariance [m^2]; empty if not asked for.
         error: half the sum of squared whitened residuals, or the sum of their robust losses.
@@ -39,7 +38,6 @@ class CameraSolution:
 
     world_from_camera: Array
     landmarks: dict[int, Array]
-    velocities: Array
     cov_poses: Array
     cov_landmarks: dict[int, Array]
     error: float
@@ -52,7 +50,6 @@ def solve_features(
     initial: CameraEstimate | None = None,
     *,
     robust: float | None = None,
-    velocity: ArrayLike | None = None,
     marginals: bool = True,
     on_iteration: Callable[[float], None] | None = None,
     tolerance: float | None = None,
@@ -67,14 +64,11 @@ def solve_features(
         log: the measurements.
         initial: where to start; landmarks that it lacks are triangulated. By default it is found frame by frame,
             from four known points in the first frame, or for a stereo pair without any, from the identity.
-        robust: threshold of Huber's loss on the norm of each whitened sighting, in standard deviations (1.345 is
+        robust: threshold of Huber's loss on the norm of each whitened observation, in standard deviations (1.345 is
             usual); None takes all as Gaussian. The covariances then are those of the reweighted problem.
-        velocity: (6,) standard deviation of the white-noise acceleration [rad/s/sqrt(s), m/s/sqrt(s)] of a camera
-            that keeps its velocity, E06 (4)-(5); frames of one time then share pose and velocity. None leaves the
-            motion free.
         marginals: compute covariances.
-        on_iteration: told the error before each iteration, also of adjustments on the way to an initial estimate; what
-            it raises ends it all.
+        on_iteration: given the error before each iteration, also of adjustments on the way to an initial estimate;
+            what it raises ends it all.
         tolerance: fraction of the error that is no gain any more; by default a billionth, for which far landmarks creep
             through hundreds of iterations.
 
@@ -84,26 +78,23 @@ def solve_features(
             connect it, the known points are fewer than three or on a line, or the optimiser does not converge.
     """
     from rbpf.validation.gtsam import camera_adjust as adjuster
-    from rbpf.validation.gtsam.camera_checks import acceleration, check_problem, check_robust
     from rbpf.validation.gtsam.camera_graph import CameraProblem
     from rbpf.validation.gtsam.camera_start import from_scratch
 
-    check_robust(robust)
-    full = sightings_of(log)
+    if robust is not None and not robust > 0:
+        raise InputError(f"Expected a robust threshold above 0 standard deviations, found {robust}.")
+    full = observation_table(log)
     known = known_by_name(log.known, full.names)
-    table = full.determined(known)
-    stamps_ns = np.array([frame.stamp_ns for frame in log.frames], dtype=np.int64)
-    problem = CameraProblem(log.name, stamps_ns, table, known, robust, acceleration(velocity))
-    check_problem(problem)
-    start = adjuster.begin(problem, initial or from_scratch(log.name, stamps_ns, table, known, on_iteration))
+    problem = CameraProblem(log.name, len(log.frames), full.determined(known), known, robust)
+    adjuster.check_problem(problem)
+    start = adjuster.begin(problem, initial or from_scratch(problem, on_iteration))
     found = adjuster.adjust(problem, start, tolerance or adjuster.FINE, on_iteration)
-    adjuster.require_converged(found)
+    found.require_converged()
     cov_poses, cov_landmarks = adjuster.covariances(found) if marginals else (np.empty((0, 6, 6)), {})
     state, names = found.state, found.problem.table.names
     return CameraSolution(
         world_from_camera=state.path,
         landmarks=dict(zip(names.tolist(), state.points, strict=True)),
-        velocities=state.velocities,
         cov_poses=cov_poses,
         cov_landmarks=cov_landmarks,
         error=found.graph.error(found.values),

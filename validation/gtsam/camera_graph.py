@@ -1,15 +1,18 @@
-"""The factor graph of a camera's sightings in GTSAM.
+"""The factor graph of a camera's observations in GTSAM.
 
-    sightings:     project(T⁻¹ l) − z ~ N(0, R), Huber's loss on request
+    observations:  project(T⁻¹ l) − z ~ N(0, R), Huber's loss on request
     known points:  l ~ N(m, P), exact ones a hard constraint
     undetermined:  l ~ N(start, (d/4)² I) with d its distance, far wider than the pixels are across it
-    velocity:      E06 (4)–(5); frames of one time then share one pose and one velocity
     gauge:         without known points the first pose is held where it started; for one camera, a distance too
 
 The distance is that from the first camera to the one farthest from it at the start. The gauge only says which of many
 equal solutions is meant: it costs nothing at the optimum.
+
+GTSAM's own projection factors are taken where they are exactly our camera: Cal3DS2 has no k₃. Factors written in
+Python are evaluated all at once and handed out one by one, which makes them nearly as fast as GTSAM's.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, final
 
@@ -20,19 +23,8 @@ from numpy.typing import NDArray
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
 from rbpf.sensors.camera import RectifiedStereo
-from rbpf.validation.gtsam.camera_data import Sightings
-from rbpf.validation.gtsam.camera_factors import (
-    LANDMARK,
-    VELOCITY,
-    path_of,
-    points_of,
-    sighting_factors,
-    velocities_of,
-    velocity_factors,
-)
-from rbpf.validation.gtsam.camera_points import first_centres
-from rbpf.validation.gtsam.chart import SPATIAL
-from rbpf.validation.gtsam.solvers import noise
+from rbpf.validation.gtsam.observations import ObservationTable, Residuals, first_centres, reprojection
+from rbpf.validation.gtsam.solvers import SPATIAL, huber, noise
 
 SCALE, SOFT_SCALE = 1e-6, 1e-3
 """Standard deviation of the distance that holds the scale, as a fraction of it, at the end and on the way there.
@@ -52,12 +44,10 @@ class CameraState:
     Attributes:
         path: (T, 7) world_from_camera.
         points: (L, 3) landmarks of the table.
-        velocities: (T, 6) in the right chart, or no rows.
     """
 
     path: Array
     points: Array
-    velocities: Array
 
 
 @final
@@ -66,40 +56,31 @@ class CameraProblem:
 
     Args:
         name: of the recording.
-        stamps_ns: (T,) of the frames.
-        table: the sightings that take part.
+        frames: T, how many there are.
+        table: the observations that take part.
         known: position and covariance of known points by name.
         robust: Huber's threshold; None is Gaussian.
-        velocity: (6,) std of the white-noise acceleration; None leaves the motion free.
     """
 
     def __init__(
         self,
         name: str,
-        stamps_ns: NDArray[np.int64],
-        table: Sightings,
+        frames: int,
+        table: ObservationTable,
         known: dict[int, tuple[Array, Array]],
         robust: float | None = None,
-        velocity: Array | None = None,
     ) -> None:
-        self.name, self.table, self.known, self.robust, self.velocity = name, table, known, robust, velocity
-        self.stamps_ns, self.frames = stamps_ns, len(stamps_ns)
-        self.times, self.slots = np.unique(stamps_ns, return_inverse=True)
-        if velocity is None:
-            self.slots = np.arange(self.frames)
-        self._first = np.unique(self.slots, return_index=True)[1]
-        self.shared = self._first[self.slots]
+        self.name, self.frames, self.table, self.known, self.robust = name, frames, table, known, robust
         self.free = np.array([name not in known for name in table.names.tolist()], dtype=bool)
-        self.pose_keys = [int(gtsam.symbol("x", slot)) for slot in self.slots.tolist()]
-        self.point_keys = [int(gtsam.symbol(LANDMARK, index)) for index in range(len(table.names))]
-        self.velocity_keys = [int(gtsam.symbol(VELOCITY, slot)) for slot in self.slots.tolist()]
+        self.pose_keys = [int(gtsam.symbol("x", frame)) for frame in range(frames)]
+        self.point_keys = [int(gtsam.symbol("l", index)) for index in range(len(table.names))]
 
     def part(self, kept: NDArray[np.bool_]) -> "CameraProblem":
         """The same without some of the landmarks (L,)."""
         if kept.all():
             return self
         table = self.table.rows(kept[self.table.index])
-        return CameraProblem(self.name, self.stamps_ns, table, self.known, self.robust, self.velocity)
+        return CameraProblem(self.name, self.frames, table, self.known, self.robust)
 
     @property
     def scaled(self) -> bool:
@@ -116,7 +97,12 @@ class CameraProblem:
         return [key for name, key in pairs if name in exact]
 
     def graph(
-        self, start: CameraState, loose: NDArray[np.bool_], held: Array, scale: float = SOFT_SCALE
+        self,
+        start: CameraState,
+        loose: NDArray[np.bool_],
+        held: Array,
+        scale: float = SOFT_SCALE,
+        factors: list[Any] | None = None,
     ) -> Any:
         """All factors.
 
@@ -125,60 +111,135 @@ class CameraProblem:
             loose: (L,) landmarks that get one.
             held: (T, 7) path where the gauge holds.
             scale: its standard deviation, see `SCALE`.
+            factors: in place of those of the observations.
         """
-        graph = sighting_factors(self.table, self.pose_keys, self.point_keys, self.robust)
-        self._add_known(graph)
-        self._add_weak(graph, start, loose)
+        graph = gtsam.NonlinearFactorGraph()
+        for factor in self.observation_factors() if factors is None else factors:
+            graph.push_back(factor)
+        names = self.table.names.tolist()
+        for name, key in zip(names, self.point_keys, strict=True):
+            if name in self.known:
+                position, cov = self.known[name]
+                model = noise(cov) if cov.any() else gtsam.noiseModel.Constrained.All(3)
+                graph.push_back(gtsam.PriorFactorPoint3(key, position, model))
+        distance = np.linalg.norm(start.points - first_centres(self.table, start.path), axis=1)
+        for index in np.flatnonzero(loose).tolist():
+            model = gtsam.noiseModel.Isotropic.Sigma(3, WEAK * distance[index])
+            graph.push_back(gtsam.PriorFactorPoint3(self.point_keys[index], start.points[index], model))
         if not self.known:
-            self._add_gauge(graph, held, scale)
-        if self.velocity is not None and len(self.times) > 1:
-            keys = [self.pose_keys[i] for i in self._first], [self.velocity_keys[i] for i in self._first]
-            graph.push_back(velocity_factors(1e-9 * np.diff(self.times), self.velocity, *keys))
+            hard = gtsam.noiseModel.Constrained.All(6)
+            graph.push_back(gtsam.PriorFactorPose3(self.pose_keys[0], SPATIAL.pose(held[0]), hard))
+        if self.scaled:
+            distances = np.linalg.norm(SE3.translation(held) - SE3.translation(held[0]), axis=1)
+            far = int(np.argmax(distances))
+            if distances[far] == 0:
+                raise InputError(
+                    f"All initial poses of {self.name} are at one place, expected a path to take the scale from, "
+                    "because there are no known points."
+                )
+            model = gtsam.noiseModel.Isotropic.Sigma(1, scale * distances[far])
+            keys = self.pose_keys[0], self.pose_keys[far]
+            graph.push_back(gtsam.RangeFactorPose3(*keys, distances[far], model))
         return graph
 
     def values(self, state: CameraState) -> Any:
-        """GTSAM's values of a state; of frames that share a pose the first one's counts."""
+        """GTSAM's values of a state."""
         values = gtsam.Values()
-        for row in self._first.tolist():
-            values.insert(self.pose_keys[row], SPATIAL.pose(state.path[row]))
-            if self.velocity is not None:
-                values.insert(self.velocity_keys[row], np.asarray(state.velocities[row]))
+        for key, pose in zip(self.pose_keys, state.path, strict=True):
+            values.insert(key, SPATIAL.pose(pose))
         for key, point in zip(self.point_keys, state.points, strict=True):
             values.insert(key, np.asarray(point))
         return values
 
     def state(self, values: Any) -> CameraState:
-        """The inverse of `values`."""
-        path = SE3.normalise(path_of(values)[self.slots])
-        velocities = np.empty((0, 6))
-        if self.velocity is not None:
-            velocities = velocities_of(values)[self.slots]
-        return CameraState(path, points_of(values), velocities)
+        """The inverse of `values`; in the order of the keys, as GTSAM extracts all of a kind."""
+        rows = gtsam.utilities.extractPose3(values)
+        matrices = np.concatenate([rows[:, :9].reshape(-1, 3, 3), rows[:, 9:, None]], axis=-1)
+        points = np.asarray(gtsam.utilities.extractVectors(values, "l"))
+        return CameraState(SE3.normalise(SE3.from_matrix(matrices)), points.reshape(-1, 3))
 
-    def _add_known(self, graph: Any) -> None:
-        for name, key in zip(self.table.names.tolist(), self.point_keys, strict=True):
-            if name in self.known:
-                position, cov = self.known[name]
-                model = noise(cov) if cov.any() else gtsam.noiseModel.Constrained.All(3)
-                graph.push_back(gtsam.PriorFactorPoint3(key, position, model))
-
-    def _add_weak(self, graph: Any, start: CameraState, loose: NDArray[np.bool_]) -> None:
-        distance = np.linalg.norm(start.points - first_centres(self.table, start.path), axis=1)
-        for index in np.flatnonzero(loose).tolist():
-            model = gtsam.noiseModel.Isotropic.Sigma(3, WEAK * distance[index])
-            graph.push_back(gtsam.PriorFactorPoint3(self.point_keys[index], start.points[index], model))
-
-    def _add_gauge(self, graph: Any, path: Array, scale: float) -> None:
-        hard = gtsam.noiseModel.Constrained.All(6)
-        graph.push_back(gtsam.PriorFactorPose3(self.pose_keys[0], SPATIAL.pose(path[0]), hard))
-        if not self.scaled:
-            return
-        distances = np.linalg.norm(SE3.translation(path) - SE3.translation(path[0]), axis=1)
-        far = int(np.argmax(distances))
-        if distances[far] == 0:
-            raise InputError(
-                f"All initial poses of {self.name} are at one place, expected a path to take the scale from, because "
-                "there are no known points."
+    def observation_factors(self) -> list[Any]:
+        """One factor per row of the table, of which the residual is ours in GTSAM's order: u, right u, v of a pair."""
+        camera, z = self.table.camera, self.table.z
+        if isinstance(camera, RectifiedStereo):
+            left = camera.camera
+            pair = gtsam.Cal3_S2Stereo(left.fx, left.fy, 0.0, left.cx, left.cy, camera.baseline_m)
+            return self.factors_by_row(
+                lambda row, model, pose, point: gtsam.GenericStereoFactor3D(
+                    gtsam.StereoPoint2(z[row, 0], z[row, 2], z[row, 1]), model, pose, point, pair
+                ),
+                order=[0, 2, 1],
             )
-        model = gtsam.noiseModel.Isotropic.Sigma(1, scale * distances[far])
-        graph.push_back(gtsam.RangeFactorPose3(self.pose_keys[0], self.pose_keys[far], distances[far], model))
+        intrinsics = camera.fx, camera.fy, 0.0, camera.cx, camera.cy
+        kind: Any
+        lens: Any
+        if camera.distortion_model == "equidistant":
+            kind = gtsam.GenericProjectionFactorCal3Fisheye
+            lens = gtsam.Cal3Fisheye(*intrinsics, *camera.distortion)
+        elif camera.lens.is_identity:
+            kind, lens = gtsam.GenericProjectionFactorCal3_S2, gtsam.Cal3_S2(*intrinsics)
+        elif camera.distortion[4] == 0.0:
+            kind = gtsam.GenericProjectionFactorCal3DS2
+            lens = gtsam.Cal3DS2(*intrinsics, *camera.distortion[:4])
+        else:
+
+            def evaluate(values: Any) -> Residuals:
+                state = self.state(values)
+                return reprojection(self.table, state.path, state.points)
+
+            together = Together(evaluate)
+            return self.factors_by_row(
+                lambda row, model, pose, point: together.factor(row, [pose, point], model)
+            )
+        return self.factors_by_row(lambda row, model, pose, point: kind(z[row], model, pose, point, lens))
+
+    def factors_by_row(
+        self, make: Callable[[int, Any, int, int], Any], order: list[int] | None = None
+    ) -> list[Any]:
+        """A factor of each row of the table.
+
+        Args:
+            make: row, noise model with its loss, key of the pose and key of the landmark to a factor.
+            order: a factor's residual is ours[order]; by default ours.
+        """
+        models, out = dict[bytes, Any](), []
+        for row, (step, index) in enumerate(
+            zip(self.table.steps.tolist(), self.table.index.tolist(), strict=True)
+        ):
+            cov = self.table.cov_z[row]
+            code = cov.tobytes()
+            if code not in models:
+                models[code] = huber(noise(cov if order is None else cov[np.ix_(order, order)]), self.robust)
+            out.append(make(row, models[code], self.pose_keys[step], self.point_keys[index]))
+        return out
+
+
+@final
+class Together:
+    """Residuals of many factors, evaluated when the first of them is asked for and kept for the others.
+
+    GTSAM hands every factor the same object as long as Python holds it, as the loops of `solvers` do; an
+    optimiser that changes its values in place would be shown old residuals.
+
+    Args:
+        evaluate: values to all residuals and their Jacobians.
+    """
+
+    def __init__(self, evaluate: Callable[[Any], Residuals]) -> None:
+        self._evaluate = evaluate
+        self._held: Any = None
+        self._found: Residuals = np.empty(0), []
+
+    def factor(self, row: int, keys: list[int], model: Any) -> Any:
+        """The factor of one row."""
+
+        def error(factor: Any, values: Any, jacobians: Any) -> Array:
+            if values is not self._held:
+                self._held, self._found = values, self._evaluate(values)
+            residuals, slopes = self._found
+            if jacobians is not None:
+                for place, slope in enumerate(slopes):
+                    jacobians[place] = slope[row]
+            return residuals[row]
+
+        return gtsam.CustomFactor(model, keys, error)

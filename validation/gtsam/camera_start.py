@@ -5,8 +5,9 @@ once their parallax tells their distance. From time to time all is adjusted, bec
 """
 
 from dataclasses import replace
-from typing import final
+from typing import Any, final
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,19 +15,26 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
 from rbpf.sensors.camera import RectifiedStereo
 from rbpf.validation.gtsam.camera_adjust import adjust
-from rbpf.validation.gtsam.camera_data import CameraEstimate, Sightings
-from rbpf.validation.gtsam.camera_factors import evaluate_sightings
 from rbpf.validation.gtsam.camera_graph import CameraProblem, CameraState
-from rbpf.validation.gtsam.camera_points import (
+from rbpf.validation.gtsam.observations import (
     HUBER,
+    CameraEstimate,
+    ObservationTable,
     first_centres,
     in_front,
     parallax,
+    sigmas,
     spread,
     triangulate,
 )
-from rbpf.validation.gtsam.camera_resection import Resected, locate, resect
-from rbpf.validation.gtsam.solvers import ROUGH, OnIteration
+from rbpf.validation.gtsam.solvers import (
+    ROUGH,
+    SPATIAL,
+    OnIteration,
+    levenberg_marquardt,
+    marginals,
+    noise,
+)
 
 KNOWN = 4
 """Known points that the first frame has to see."""
@@ -35,161 +43,177 @@ PLACED = 5.0
 NEAREST = 0.2
 """Nor is it placed nearer than this fraction of the usual distance: near cameras that rest a point fits anything."""
 CAP = 4.5
-"""What one sighting of a single camera says for it at most, as a loss: one outlier must not do."""
+"""What one observation of a single camera says for it at most, as a loss: one outlier must not do."""
 GROWTH = 1.2
 """All is adjusted whenever the number of frames has grown by this factor."""
 SETTLED = 30
 """A landmark seen more often moves only when all is adjusted."""
 LOST = 10
 """As many frames in a row without three placed landmarks are the end."""
+OUTLIER = 5.0
+"""An observation farther off takes no part in a frame's pose, in standard deviations."""
 
 _EARLIEST = 8
 _MOTION = 0.1  # of a frame: rad, and metres per metre of distance to what is seen
+_FOUND = 1e-6  # fraction of the error that is no gain any more
+
+Known = dict[int, tuple[Array, Array]]
+"""Position (3,) and covariance (3, 3) by name."""
 
 
-def from_scratch(
-    name: str,
-    stamps_ns: NDArray[np.int64],
-    table: Sightings,
-    known: dict[int, tuple[Array, Array]],
-    on_iteration: OnIteration | None = None,
-) -> CameraEstimate:
+def locate(table: ObservationTable, known: Known) -> tuple[Array, Array]:
+    """Pose of a frame of which nothing is known, from four points or more; as `resect`.
+
+    COLMAP's P3P and consensus of rays; all of them then count, as in `resect`.
+
+    Raises:
+        InputError: no pose explains the points.
+    """
+    import pycolmap
+
+    # In an image without distortion: the pixels at which a plain camera would have seen the same rays.
+    camera = table.camera.camera if isinstance(table.camera, RectifiedStereo) else table.camera
+    rays, points = table.bearings(), np.array([known[name][0] for name in table.names.tolist()])
+    plain = pycolmap.Camera(model="SIMPLE_PINHOLE", width=1, height=1, params=[camera.fx, 0.0, 0.0])
+    options = pycolmap.AbsolutePoseEstimationOptions()
+    options.ransac.random_seed = 0
+    px = camera.fx * rays[:, :2] / rays[:, 2:]
+    found = pycolmap.estimate_absolute_pose(px, points[table.index], plain, options)
+    if found is None:
+        raise InputError("no pose of the first camera explains its known points; give an initial estimate.")
+    cam_from_world = found["cam_from_world"]
+    pose = np.concatenate([cam_from_world.rotation.quat, cam_from_world.translation])
+    return resect(table, known, SE3.inverse(SE3.normalise(pose)), 1e-9 * np.eye(6))
+
+
+def resect(table: ObservationTable, known: Known, near: Array, info: Array) -> tuple[Array, Array]:
+    """Pose (7,) with Huber's loss, once more without the outliers, whose pull Huber only limits; covariance (6, 6).
+
+    A weak prior stands in for what the image leaves open.
+
+    Args:
+        table: observations of one frame.
+        known: where its landmarks are.
+        near: (7,) world_from_camera, where it starts and where the prior has its mean.
+        info: (6, 6) information of the prior.
+    """
+
+    def solve(part: ObservationTable, start: Array) -> tuple[Any, Any, CameraProblem]:
+        problem = CameraProblem("", 1, part, known, HUBER)
+        points = np.array([known[name][0] for name in part.names.tolist()])
+        state = CameraState(start[None], points)
+        graph = problem.graph(state, np.zeros(len(points), dtype=bool), state.path)
+        prior = gtsam.PriorFactorPose3(
+            problem.pose_keys[0], SPATIAL.pose(near), noise(np.asarray(np.linalg.inv(info)))
+        )
+        graph.push_back(prior)
+        values, _, _ = levenberg_marquardt(graph, problem.values(state), _FOUND)
+        return graph, values, problem
+
+    graph, values, problem = solve(table, near)
+    pose = problem.state(values).path
+    points = np.array([known[name][0] for name in table.names.tolist()])
+    inlier = sigmas(table, pose, points) < OUTLIER
+    if not inlier.all() and inlier.sum() >= KNOWN:
+        graph, values, problem = solve(table.rows(inlier), pose[0])
+    return problem.state(values).path[0], marginals(graph, values, problem.pose_keys)[0]
+
+
+def from_scratch(problem: CameraProblem, on_iteration: OnIteration | None = None) -> CameraEstimate:
     """Path and landmarks from the known points, or for a stereo pair without any, from the first frame.
 
     Args:
-        name: of the recording.
-        stamps_ns: (T,) of the frames.
-        table: its sightings.
-        known: position and covariance of known points by name.
-        on_iteration: told the error before each iteration of an adjustment on the way; what it raises ends it.
+        problem: a recording.
+        on_iteration: given the error before each iteration of an adjustment on the way; what it raises ends it.
 
     Raises:
         InputError: the first frame sees fewer than four known points, a single camera has none, or the path breaks.
     """
-    growth = _Growth(name, stamps_ns, table, known, on_iteration)
-    growth.begin()
-    for step in range(1, len(stamps_ns)):
+    growth = _Growth(problem, on_iteration)
+    for step in range(problem.frames):
         growth.add(step)
-    return growth.estimate()
+    # Landmarks never placed are missing.
+    names, placed = problem.table.names.tolist(), np.flatnonzero(growth.placed).tolist()
+    return CameraEstimate(growth.path, {names[index]: growth.points[index] for index in placed})
 
 
 @final
 class _Growth:
     """A path that grows frame by frame, and the landmarks placed so far."""
 
-    def __init__(
-        self,
-        name: str,
-        stamps_ns: NDArray[np.int64],
-        table: Sightings,
-        known: dict[int, tuple[Array, Array]],
-        on_iteration: OnIteration | None,
-    ) -> None:
-        self.on_iteration = on_iteration
-        self.name, self.stamps_ns, self.table, self.known = name, stamps_ns, table, known
-        self.path = np.tile(SE3.identity(), (len(stamps_ns), 1))
-        self.blur = np.zeros(len(stamps_ns))
-        self.points = np.zeros((len(table.names), 3))
-        self.cov = np.zeros((len(table.names), 3, 3))
-        self.placed = np.isin(table.names, list(known))
-        self.fixed = self.placed.copy()
+    def __init__(self, problem: CameraProblem, on_iteration: OnIteration | None) -> None:
+        self.problem, self.on_iteration = problem, on_iteration
+        self.table, frames = problem.table, problem.frames
+        self.path = np.tile(SE3.identity(), (frames, 1))
+        self.blur = np.zeros(frames)
+        self.points = np.zeros((len(self.table.names), 3))
+        self.cov = np.zeros((len(self.table.names), 3, 3))
+        self.placed, self.fixed = ~problem.free, ~problem.free
         for index in np.flatnonzero(self.placed).tolist():
-            self.points[index], self.cov[index] = known[int(table.names[index])]
-        self.sightings = np.zeros(len(self.points), dtype=int)
+            self.points[index], self.cov[index] = problem.known[int(self.table.names[index])]
+        self.observations = np.zeros(len(self.points), dtype=int)
         self.usual = 0.0
         self.adjusted = _EARLIEST
         self.blind = 0
 
-    def begin(self) -> None:
-        """Pose of the first frame."""
-        rows = self._rows(0)
-        seen = rows[self.placed[self.table.index[rows]]]
-        if len(seen) < KNOWN and (self.known or not isinstance(self.table.camera, RectifiedStereo)):
-            raise InputError(
-                f"Frame 0 of {self.name} sees {len(seen)} known points, expected {KNOWN} or more to start from; "
-                "add known points or give an initial estimate."
-            )
-        if self.known:
-            part, points = self._part(seen)
-            self._set(0, points, locate(part, points))
-        self._place(0)
-
     def add(self, step: int) -> None:
         """Pose of the next frame, and the landmarks it adds."""
-        rows = self._rows(step)
-        seen = rows[self.placed[self.table.index[rows]]]
-        self.blind = 0 if len(seen) >= 3 else self.blind + 1
+        name, first, last = self.problem.name, *np.searchsorted(self.table.steps, [step, step + 1])
+        rows = np.arange(first, last)
+        now = self.table.index[rows]
+        seen = rows[self.placed[now]]
+        is_pair = isinstance(self.table.camera, RectifiedStereo)
+        if not step and len(seen) < KNOWN and (self.problem.known or not is_pair):
+            raise InputError(
+                f"Frame 0 of {name} sees {len(seen)} known points, expected {KNOWN} or more to start from; "
+                "add known points or give an initial estimate."
+            )
+        self.blind = 0 if len(seen) >= 3 or not step else self.blind + 1
         if self.blind == LOST:
             raise InputError(
-                f"Frames {step - LOST + 1} to {step} of {self.name} see fewer than 3 landmarks whose place is known "
+                f"Frames {step - LOST + 1} to {step} of {name} see fewer than 3 landmarks whose place is known "
                 "by then; give an initial estimate, or more known points."
             )
-        self.path[step] = self.path[step - 1]
+        # The pose, from the landmarks placed so far.
+        self.path[step] = self.path[max(step - 1, 0)]
         if len(seen):
-            part, points = self._part(seen)
-            slope = evaluate_sightings(part, self.path[step : step + 1], points)[1][1]
-            cov = slope @ self.cov[self.table.index[seen]] @ slope.mT
-            part = replace(part, cov_z=part.cov_z + cov)
-            self._set(step, points, resect(part, points, self.path[step], self._inertia(points, step)))
-        self._place(step)
+            part = self.table.rows(seen)
+            part = replace(part, steps=np.zeros_like(part.steps))
+            at = np.searchsorted(self.table.names, part.names)
+            known = dict(
+                zip(part.names.tolist(), zip(self.points[at], self.cov[at], strict=True), strict=True)
+            )
+            if step:
+                far = _MOTION * self._distance(at, step)
+                info = np.diag(np.repeat([_MOTION, far], 3) ** -2.0)
+                self.path[step], cov = resect(part, known, self.path[step], info)
+            else:
+                self.path[step], cov = locate(part, known)
+            # An error of the camera's place is one of the rays: as pixels at the distance of what it sees.
+            focal = float(np.linalg.norm(self.table.camera.jacobian(np.array([0.0, 0.0, 1.0]))[0]))
+            self.usual = self._distance(at, step)
+            self.blur[step] = (focal * np.sqrt(np.trace(cov[3:, 3:]) / 3) / self.usual) ** 2
+        # The landmarks of this frame from all frames so far, unless they are long settled.
+        self.observations[now] += 1
+        settled = self.fixed | (self.placed & (self.observations > SETTLED))
+        moving = np.isin(self.table.index[:last], now[~settled[now]])
+        if moving.any():
+            part = self._blurred(self.table.rows(np.flatnonzero(moving)))
+            points = triangulate(part, self.path)
+            good = self._good(part, self.path, points)
+            index = np.searchsorted(self.table.names, part.names[good])
+            self.points[index], self.placed[index] = points[good], True
+            self.cov[index] = spread(part, self.path, points)[good]
         if step + 1 >= GROWTH * self.adjusted:
             self.adjusted = step + 1
             self._adjust(step)
-
-    def estimate(self) -> CameraEstimate:
-        """What there is; landmarks never placed are missing."""
-        names = self.table.names.tolist()
-        landmarks = {names[i]: self.points[i] for i in np.flatnonzero(self.placed).tolist()}
-        return CameraEstimate(self.path, landmarks)
-
-    def _rows(self, step: int) -> NDArray[np.intp]:
-        first, last = np.searchsorted(self.table.steps, [step, step + 1])
-        return np.arange(first, last)
-
-    def _part(self, rows: NDArray[np.intp]) -> tuple[Sightings, Array]:
-        # Sightings of one frame, and the places of their landmarks.
-        part = self.table.rows(rows)
-        alone = replace(part, steps=np.zeros_like(part.steps))
-        return alone, self.points[np.searchsorted(self.table.names, part.names)]
-
-    def _set(self, step: int, points: Array, found: Resected) -> None:
-        # An error of the camera's place is one of the rays: as pixels at the distance of what it sees.
-        self.path[step] = found.pose
-        focal = float(np.linalg.norm(self.table.camera.jacobian(np.array([0.0, 0.0, 1.0]))[0]))
-        self.usual = self._distance(points, step)
-        fraction = np.sqrt(np.trace(found.cov[3:, 3:]) / 3) / self.usual
-        self.blur[step] = (focal * fraction) ** 2
-
-    def _distance(self, points: Array, step: int) -> float:
-        return float(np.median(np.linalg.norm(points - SE3.translation(self.path[step]), axis=1)))
-
-    def _inertia(self, points: Array, step: int) -> Array:
-        return np.diag(np.repeat([_MOTION, _MOTION * self._distance(points, step)], 3) ** -2.0)
-
-    def _place(self, step: int) -> None:
-        # Triangulates the landmarks of this frame from all frames so far, unless they are long settled.
-        now = self.table.index[self._rows(step)]
-        self.sightings[now] += 1
-        seen = np.zeros(len(self.points), dtype=bool)
-        seen[now] = True
-        last = np.searchsorted(self.table.steps, step + 1)
-        settled = self.fixed | (self.placed & (self.sightings > SETTLED))
-        rows = np.flatnonzero((seen & ~settled)[self.table.index[:last]])
-        if not rows.size:
-            return
-        part = self._blurred(self.table.rows(rows))
-        points = triangulate(part, self.path)
-        good = self._good(part, self.path, points)
-        index = np.searchsorted(self.table.names, part.names[good])
-        self.points[index], self.placed[index] = points[good], True
-        self.cov[index] = spread(part, self.path, points)[good]
 
     def _adjust(self, step: int) -> None:
         last = np.searchsorted(self.table.steps, step + 1)
         part = self.table.rows(np.flatnonzero(self.placed[self.table.index[:last]]))
         before = np.searchsorted(self.table.names, part.names)
-        problem = CameraProblem(self.name, self.stamps_ns[: step + 1], part, self.known, HUBER)
-        start = CameraState(self.path[: step + 1], self.points[before], np.empty((0, 6)))
+        problem = CameraProblem(self.problem.name, step + 1, part, self.problem.known, HUBER)
+        start = CameraState(self.path[: step + 1], self.points[before])
         found = adjust(problem, start, ROUGH, self.on_iteration)
         state, part = found.state, found.problem.table
         index = np.searchsorted(self.table.names, part.names)
@@ -201,12 +225,16 @@ class _Growth:
         free = ~self.fixed[index]
         self.cov[index[free]] = spread(part, state.path, state.points)[free]
 
-    def _good(self, part: Sightings, path: Array, points: Array) -> NDArray[np.bool_]:
+    def _distance(self, index: NDArray[np.intp], step: int) -> float:
+        """Median distance of landmarks from a frame's camera."""
+        return float(np.median(np.linalg.norm(self.points[index] - SE3.translation(self.path[step]), axis=1)))
+
+    def _good(self, part: ObservationTable, path: Array, points: Array) -> NDArray[np.bool_]:
         cap = np.inf if isinstance(part.camera, RectifiedStereo) else CAP
         distance = np.linalg.norm(points - first_centres(part, path), axis=1)
         far = distance > NEAREST * self.usual
         return far & in_front(part, path, points) & (parallax(part, path, points, cap) > PLACED)
 
-    def _blurred(self, part: Sightings) -> Sightings:
+    def _blurred(self, part: ObservationTable) -> ObservationTable:
         blur = self.blur[part.steps][:, None, None] * np.eye(part.z.shape[1])
         return replace(part, cov_z=part.cov_z + blur)

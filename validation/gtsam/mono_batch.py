@@ -83,14 +83,15 @@ def adjust_log(
         raise InputError(
             f"{log.name}: no two frames share the {LEAST} landmarks that a batch adjustment needs of each"
         )
-    part = replace(log, frames=[log.frames[t] for t in frames], known=_softened(log.known))
+    part = replace(log, frames=[log.frames[t] for t in frames], known=softened(log.known))
     watch = _Watch(limit_s, on_iteration)
     start = CameraEstimate(world_from_camera[frames], {})
     solution = _best(part, [start, None] if twice and log.known is not None else [start], watch, tolerance)
     return Batch(replace(part, known=log.known), frames, solution)
 
 
-def _softened(known: KnownPoints | None) -> KnownPoints | None:
+def softened(known: KnownPoints | None) -> KnownPoints | None:
+    """The known points, with small errors where they have none."""
     if known is None or known.cov.any():
         return known
     extent = float(np.ptp(known.positions, axis=0).max())

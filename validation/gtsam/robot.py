@@ -3,15 +3,54 @@
 The same measurements, the same models and the same noise as the filter had, without its samples and without
 its order in time: what the filter approximates.
 F. Dellaert and M. Kaess, "Factor graphs for robot perception" (2017).
+
+    start:        x₀ = the known pose, a hard constraint
+    odometry:     Log(δ_t⁻¹ x_{t−1}⁻¹ x_t) ~ N(0, Q_t)
+    observation:  h(x_t, l) − z ~ N(0, R), h and its derivatives from the filter's own observation model
+
+A singular Q_t (a robot that cannot slip sideways) is kept exactly: the residual is turned into Q_t's
+eigenvectors, and those without variance become hard constraints. A solver that starts far away would have to
+follow these constraints along a curve, therefore `Problem.graph(soft=True)` first gives them a tenth of the largest
+standard deviation of the same step.
 """
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import final
+from typing import Any, TypeVar, final
 
+import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
-from rbpf.lie import Array
+from rbpf.errors import InputError
+from rbpf.lie import Array, SE2Group
 from rbpf.sensors.readers.measurements import InitialEstimate, Measurements, initial_estimate
+from rbpf.validation.gtsam.observations import SINGULAR
+from rbpf.validation.gtsam.solvers import (
+    EXACT,
+    PLANAR,
+    ROUGH,
+    SPATIAL,
+    culprit,
+    gauss_newton,
+    huber,
+    levenberg_marquardt,
+    noise,
+)
+from rbpf.validation.gtsam.solvers import marginals as marginals_of
+
+SOFT = 0.1
+"""Standard deviation of a softened constraint as a fraction of the step's largest."""
+
+CHUNK = 50
+"""Steps that an incremental start adds at once."""
+
+MOVED = 1e-3
+"""How far a variable may be from where `solve_online` linearised it [rad, m]."""
+
+_PENALTY = 1000.0  # GTSAM's default; it counts in errors far from the optimum, where constraints are violated
+
+Result = TypeVar("Result")
 
 
 @final
@@ -50,32 +89,52 @@ def solve(
 
     Args:
         m: the measurements; nothing of them is left out.
-        robust: threshold of Huber's loss on the norm of each whitened sighting, in standard deviations (1.345
+        robust: threshold of Huber's loss on the norm of each whitened observation, in standard deviations (1.345
             is usual); None takes all as Gaussian. The covariances then are those of the reweighted problem.
         marginals: compute covariances.
-        initial: where to start; by default dead reckoning and first sightings.
+        initial: where to start; by default dead reckoning and first observations.
         incremental: start from ISAM2 instead, for recordings whose dead reckoning is far off.
 
     Raises:
-        InputError: a sighting has no noise, the measurements do not determine a variable, or the optimiser
+        InputError: an observation has no noise, the measurements do not determine a variable, or the optimiser
             does not converge.
     """
-    from rbpf.validation.gtsam import robot_optimise as optimiser
-    from rbpf.validation.gtsam.robot_graph import Problem
-
     problem = Problem(m, robust)
-    graph = problem.graph()
-    try:
-        given = None if incremental else problem.values(initial or initial_estimate(m))
-        start = optimiser.incremental(problem) if given is None else given
-        values, iterations = optimiser.optimise(problem, graph, start)
-        cov_poses, cov_landmarks = np.empty((0, m.space.dim, m.space.dim)), dict[int, Array]()
-        if marginals:
-            cov_poses, cov_landmarks = optimiser.covariances(problem, graph, values)
-    except RuntimeError as error:
-        raise optimiser.explain(problem, error) from error
+    return _explained(problem, lambda: _solve(problem, marginals, initial, incremental))
+
+
+def _solve(
+    problem: "Problem", marginals: bool, initial: InitialEstimate | None, incremental: bool
+) -> BatchSolution:
+    m, graph = problem.m, problem.graph()
+    if incremental:  # ISAM2 closes every loop from near by.
+        *_, (_, isam) = _grown(problem, CHUNK)
+        values = isam.calculateEstimate()
+    else:
+        values = problem.values(initial or initial_estimate(m))
+    # Until the error stands; hard constraints of the odometry are softened first, and then Gauss-Newton's.
+    softened = 0
+    if problem.singular:
+        near, softened, _ = levenberg_marquardt(problem.graph(soft=True), values, ROUGH)
+        values, count, converged = gauss_newton(graph, near)
+    else:
+        values, count, converged = levenberg_marquardt(graph, values, EXACT)
+    if not converged:
+        raise InputError(
+            f"The batch optimisation of {m.recording} did not converge in {count} iterations; "
+            "start it incrementally or from the filter's estimate, or ask for the robust loss."
+        )
     path, landmarks = problem.estimate(values)
-    return BatchSolution(path, dict(landmarks), cov_poses, cov_landmarks, graph.error(values), iterations)
+    cov_poses, cov_landmarks = np.empty((0, m.space.dim, m.space.dim)), dict[int, Array]()
+    if marginals:
+        poses = [problem.pose_key(step) for step in range(len(path))]
+        points = [problem.landmark_key(index) for index in range(len(problem.names))]
+        found = marginals_of(graph, values, poses + points)
+        cov_poses = np.array([problem.chart.covariance(cov) for cov in found[: len(poses)]])
+        cov_landmarks = dict(zip(problem.names.tolist(), found[len(poses) :], strict=True))
+    return BatchSolution(
+        path, dict(landmarks), cov_poses, cov_landmarks, graph.error(values), softened + count
+    )
 
 
 def solve_online(m: Measurements, robust: float | None = None) -> Array:
@@ -92,13 +151,190 @@ def solve_online(m: Measurements, robust: float | None = None) -> Array:
         (T, E) poses.
 
     Raises:
-        InputError: a sighting has no noise, or the measurements do not determine a variable.
+        InputError: an observation has no noise, or the measurements do not determine a variable.
     """
-    from rbpf.validation.gtsam import robot_optimise as optimiser
-    from rbpf.validation.gtsam.robot_graph import Problem
-
     problem = Problem(m, robust)
+    return _explained(problem, lambda: np.array([pose for pose, _ in _grown(problem, 1, MOVED)]))
+
+
+def _grown(problem: "Problem", chunk: int, moved: float | None = None) -> Iterator[tuple[Array, Any]]:
+    """The newest pose (E,), and ISAM2, after every `chunk` steps.
+
+    With `moved`, all that has moved by so much [rad, m] is linearised anew every time, else as GTSAM usually does.
+    A new pose starts by odometry from the estimate of the one before, a new landmark by its first observation.
+    """
+    params = gtsam.ISAM2Params()
+    params.setFactorization("QR")
+    if moved is not None:
+        params.relinearizeSkip = 1
+        params.setRelinearizeThreshold(moved)
+    isam, m = gtsam.ISAM2(params), problem.m
+    held = isam.getLinearizationPoint()  # while Python knows this object, no call of a factor copies it
+    pose, seen = m.start, set[int]()
+    for first in range(0, len(m.stamps_ns), chunk):
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        for step in range(first, min(first + chunk, len(m.stamps_ns))):
+            pose = m.space.compose(pose, m.deltas[step - 1]) if step else pose
+            problem.add_step(graph, step, soft=True)
+            values.insert(problem.pose_key(step), problem.chart.pose(pose))
+            for row in problem.observations(step).tolist():
+                landmark = int(problem.index[row])
+                if landmark not in seen:
+                    seen.add(landmark)
+                    values.insert(problem.landmark_key(landmark), problem.model.invert(pose, m.z[row]))
+        isam.update(graph, values)
+        if moved is not None:
+            isam.update()
+        pose = problem.chart.storage(isam.calculateEstimate(), problem.pose_key(step))
+        yield pose, isam
+    del held
+
+
+def _explained(problem: "Problem", solution: Callable[[], Result]) -> Result:
+    """What is computed, or GTSAM's complaint in words, with the variable that it names."""
     try:
-        return optimiser.online(problem)
+        return solution()
     except RuntimeError as error:
-        raise optimiser.explain(problem, error) from error
+        name, named = problem.m.recording, culprit(error)
+        if named is None:
+            raise InputError(f"GTSAM could not solve {name}: {' '.join(str(error).split())}") from error
+        letter, index = named
+        place = f"the pose of step {index}" if letter == "x" else f"landmark {problem.names[index]}"
+        raise InputError(
+            f"GTSAM could not solve {name}: "
+            f"the measurements do not determine everything near {place}; check the covariances there."
+        ) from error
+
+
+@final
+class Problem:
+    """Variables and factors of a run.
+
+    Args:
+        m: the measurements.
+        robust: Huber's threshold on the norm of a whitened observation; None is Gaussian.
+
+    Raises:
+        InputError: an observation's covariance is singular.
+    """
+
+    def __init__(self, m: Measurements, robust: float | None = None) -> None:
+        if robust is not None and not robust > 0:
+            raise InputError(f"Expected a robust threshold above 0 standard deviations, found {robust}.")
+        variances = np.linalg.eigvalsh(m.cov_z)
+        singular = variances[:, 0] <= SINGULAR * variances[:, -1]
+        if singular.any():
+            row = int(np.argmax(singular))
+            place = f"landmark {m.landmarks[row]} at step {m.steps[row]}"
+            raise InputError(
+                f"The sighting of {place} has a singular covariance, expected noise in all of it."
+            )
+        self.m, self.robust, self.model = m, robust, m.model()
+        self.chart = PLANAR if isinstance(m.space, SE2Group) else SPATIAL
+        self.names, self.index = np.unique(m.landmarks, return_inverse=True)
+        self._by_step = np.argsort(m.steps, kind="stable")
+        self._bounds = np.searchsorted(m.steps[self._by_step], np.arange(len(m.stamps_ns) + 1))
+        self._variances, self._axes = np.linalg.eigh(m.covs)
+        self._null = self._variances <= SINGULAR * self._variances.max(-1, keepdims=True, initial=0.0)
+
+    @property
+    def singular(self) -> bool:
+        """Whether any odometry has a direction without noise."""
+        return bool(self._null.any())
+
+    def pose_key(self, step: int) -> int:
+        """Key of a step's pose."""
+        return int(gtsam.symbol("x", step))
+
+    def landmark_key(self, index: int) -> int:
+        """Key of the landmark `names[index]`."""
+        return int(gtsam.symbol("l", index))
+
+    def observations(self, step: int) -> NDArray[np.intp]:
+        """Rows of the step's observations."""
+        return self._by_step[self._bounds[step] : self._bounds[step + 1]]
+
+    def graph(self, soft: bool = False) -> Any:
+        """All factors."""
+        graph = gtsam.NonlinearFactorGraph()
+        for step in range(len(self.m.stamps_ns)):
+            self.add_step(graph, step, soft)
+        return graph
+
+    def add_step(self, graph: Any, step: int, soft: bool = False) -> None:
+        """Factors of one step: its motion (the known start at step 0) and its observations."""
+        if step:
+            graph.push_back(self._odometry(step, soft))
+        else:
+            hard = gtsam.noiseModel.Constrained.All(self.m.space.dim)
+            graph.push_back(self.chart.prior(self.pose_key(0), self.chart.pose(self.m.start), hard))
+        for row in self.observations(step).tolist():
+            graph.push_back(self._observation(row))
+
+    def values(self, initial: InitialEstimate) -> Any:
+        """GTSAM's values of an estimate.
+
+        Raises:
+            InputError: it lacks a pose or a landmark.
+        """
+        shape, path = (len(self.m.stamps_ns), self.m.space.size), initial.world_from_robot
+        missing = [name for name in self.names.tolist() if name not in initial.landmarks]
+        if path.shape != shape or missing:
+            problem = f"landmark {missing[0]} is missing" if missing else f"found poses of shape {path.shape}"
+            raise InputError(f"Expected initial poses of shape {shape} and every landmark seen, {problem}.")
+        values = gtsam.Values()
+        for step, pose in enumerate(path):
+            values.insert(self.pose_key(step), self.chart.pose(pose))
+        for index, name in enumerate(self.names.tolist()):
+            values.insert(self.landmark_key(index), np.asarray(initial.landmarks[name], dtype=float))
+        return values
+
+    def estimate(self, values: Any) -> InitialEstimate:
+        """The inverse of `values`."""
+        poses = [self.chart.storage(values, self.pose_key(step)) for step in range(len(self.m.stamps_ns))]
+        points = {
+            name: np.array(self.chart.point(values, self.landmark_key(index)))
+            for index, name in enumerate(self.names.tolist())
+        }
+        return InitialEstimate(self.m.space.normalise(np.array(poses)), points)
+
+    def _odometry(self, step: int, soft: bool) -> Any:
+        variances, axes, null = (x[step - 1] for x in (self._variances, self._axes, self._null))
+        space, chart, delta = self.m.space, self.chart, self.m.deltas[step - 1]
+        if soft:
+            variances = np.where(null, SOFT**2 * variances[-1], variances)
+        keys = self.pose_key(step - 1), self.pose_key(step)
+        if not null.any() or (soft and variances[-1] > 0):
+            cov = ((axes * variances) @ axes.T)[np.ix_(chart.order, chart.order)]
+            return chart.between(*keys, chart.pose(delta), noise(cov))
+        # e = U^T Log((x delta)^-1 y):  de/dy = U^T J_r^-1,  de/dx = -U^T J_l^-1 Ad(delta^-1).
+        back = space.adjoint(space.inverse(delta))
+
+        def error(factor: Any, values: Any, jacobians: Any) -> Array:
+            before, now = (chart.storage(values, key) for key in keys)
+            e = space.local(space.compose(before, delta), now)
+            if jacobians is not None:
+                jacobians[0] = -(axes.T @ space.left_jacobian_inverse(e) @ back)[:, chart.order]
+                jacobians[1] = (axes.T @ space.right_jacobian_inverse(e))[:, chart.order]
+            return axes.T @ e
+
+        mixed = gtsam.noiseModel.Constrained.MixedSigmas(_PENALTY, np.sqrt(np.where(null, 0.0, variances)))
+        return gtsam.CustomFactor(mixed, list(keys), error)
+
+    def _observation(self, row: int) -> Any:
+        model, chart, z = self.model, self.chart, self.m.z[row]
+        pose_key, landmark_key = (
+            self.pose_key(int(self.m.steps[row])),
+            self.landmark_key(int(self.index[row])),
+        )
+
+        def error(factor: Any, values: Any, jacobians: Any) -> Array:
+            state, landmark = chart.storage(values, pose_key), chart.point(values, landmark_key)
+            if jacobians is not None:
+                by_state, by_landmark, _ = model.jacobians(state, landmark)
+                assert by_state is not None and by_landmark is not None
+                jacobians[0], jacobians[1] = by_state[:, chart.order], by_landmark
+            return -model.residual(z, model.predict(state, landmark))
+
+        loss = huber(noise(self.m.cov_z[row]), self.robust)
+        return gtsam.CustomFactor(loss, [pose_key, landmark_key], error)

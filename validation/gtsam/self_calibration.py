@@ -16,19 +16,23 @@ from rbpf.sensors.feature_log import FeatureLog
 from rbpf.sensors.readers.images.calibration import NAME
 from rbpf.validation.calibration import camera_text
 from rbpf.validation.gtsam.batch_problem import read_problem
-from rbpf.validation.gtsam.mono_batch import Batch, adjust_log
+from rbpf.validation.gtsam.mono_batch import ROBUST, Batch, adjust_log, softened
+from rbpf.validation.gtsam.observations import (
+    CameraEstimate,
+    Residuals,
+    known_by_name,
+    observation_table,
+    reprojection,
+)
 
-_AROUND = np.array([(1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1)], dtype=float)
-"""Where the error is looked at, beside the middle, for a quadratic of two variables."""
+ITERATIONS = 200
+"""Most of the adjustment."""
 
-_STEPS = np.array([[0.01, 0.02], [0.003, 0.006]])
-"""Of focal length, as a fraction, and of k1: first a coarse grid, then a fine one."""
+_STEP = 1e-6
+"""Of focal length and k1, for the residuals' derivatives by them."""
 
-ROUNDS = 4
-"""A grid follows the lowest error so often at most."""
-
-Told = Callable[[int, int], None]
-"""Told the rounds done, and the most that there can be."""
+OnRound = Callable[[int, int], None]
+"""Called with the iterations done, and the most that there can be."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +43,7 @@ class Calibrated:
         camera: the same but for them.
         batch: the optimum with it.
         std: (2,) standard deviations of the focal length, as a fraction, and of k1, with all poses and landmarks unknown;
-            NaN where the error has no lowest point nearby.
+            NaN where the measurements do not determine them.
     """
 
     camera: Pinhole
@@ -47,35 +51,71 @@ class Calibrated:
     std: np.ndarray
 
 
-def refine_calibration(log: FeatureLog, batch: Batch, told: Told | None = None) -> Calibrated:
-    """Focal length and k1 of the least error of the batch: the lowest point of quadratics, fitted again and again.
-
-    The error is half the squared misfit with the best poses and landmarks for each camera, so that the quadratic's
-    curvature is the information about the two alone.
+def refine_calibration(log: FeatureLog, batch: Batch, on_round: OnRound | None = None) -> Calibrated:
+    """Focal length and k1 adjusted together with all poses and landmarks.
 
     Args:
         log: the measurements, of one camera.
         batch: their optimum with the given camera.
-        told: called after each round.
+        on_round: called after each iteration.
 
     Raises:
         InputError: a batch adjustment fails.
     """
-    best, std, done = batch, np.full(2, np.nan), 0
-    for size in _STEPS:
-        for _ in range(ROUNDS):
-            camera = _camera(best.log)
-            solved = [best, *(_with_camera(log, best, _changed(camera, *(size * step))) for step in _AROUND)]
-            lowest, inverse = _lowest(np.array([one.solution.error for one in solved]))
-            solved.append(_with_camera(log, best, _changed(camera, *(size * lowest))))
-            best = min(solved, key=lambda one: one.solution.error)
-            std = size * np.sqrt(np.diagonal(inverse))
-            done += 1
-            if told is not None:
-                told(done, ROUNDS * len(_STEPS))
-            if np.abs(lowest).max() <= 1.0:
-                break
-    return Calibrated(_camera(best.log), best, std)
+    import gtsam
+
+    from rbpf.validation.gtsam import camera_adjust as adjuster
+    from rbpf.validation.gtsam.camera_graph import SCALE, CameraProblem, Together
+    from rbpf.validation.gtsam.solvers import levenberg_marquardt, marginals
+
+    camera = batch.log.camera
+    assert isinstance(camera, Pinhole)
+    full, path = observation_table(batch.log), batch.world_from_camera
+    known = known_by_name(softened(batch.log.known), full.names)
+    given = CameraProblem(log.name, len(path), full.determined(known), known, ROBUST)
+    found = adjuster.adjust(given, adjuster.begin(given, CameraEstimate(path, batch.solution.landmarks)))
+    problem, key = found.problem, int(gtsam.symbol("c", 0))
+
+    def changed(change: np.ndarray) -> Pinhole:
+        k1, *others = camera.distortion
+        focal = 1.0 + float(change[0])
+        lens = (k1 + float(change[1]), *others)
+        return replace(camera, fx=camera.fx * focal, fy=camera.fy * focal, distortion=lens)
+
+    def evaluate(values: Any) -> Residuals:
+        state, change = problem.state(values), values.atVector(key)
+
+        def at(change: np.ndarray) -> Residuals:
+            return reprojection(replace(problem.table, camera=changed(change)), state.path, state.points)
+
+        residuals, slopes = at(change)
+        moved = [at(change + step)[0] - at(change - step)[0] for step in _STEP * np.eye(2)]
+        return residuals, [*slopes, np.stack(moved, axis=-1) / (2.0 * _STEP)]
+
+    together, done = Together(evaluate), 0
+    factors = problem.factors_by_row(
+        lambda row, model, pose, point: together.factor(row, [pose, point, key], model)
+    )
+    graph = problem.graph(found.state, found.loose, path, SCALE, factors)
+    values = problem.values(found.state)
+    values.insert(key, np.zeros(2))
+
+    def on_iteration(_error: float) -> None:
+        nonlocal done
+        done += 1
+        if on_round is not None:
+            on_round(done, ITERATIONS)
+
+    std = np.full(2, np.nan)
+    try:
+        values, _, _ = levenberg_marquardt(graph, values, adjuster.FINE, ITERATIONS, on_iteration)
+        std = np.sqrt(np.diagonal(marginals(graph, values, [key])[0]))
+    except RuntimeError:
+        pass
+    better = adjust_near(replace(log, camera=changed(values.atVector(key))), batch)
+    best = min(batch, better, key=lambda one: one.solution.error)
+    assert isinstance(best.log.camera, Pinhole)
+    return Calibrated(best.log.camera, best, std)
 
 
 def adjust_near(log: FeatureLog, batch: Batch) -> Batch:
@@ -85,13 +125,15 @@ def adjust_near(log: FeatureLog, batch: Batch) -> Batch:
     return adjust_log(log, path, twice=False)
 
 
-def recalibrate(folder: Path, out: Path, told: Told | None = None) -> tuple[dict[str, Any], Calibrated]:
+def recalibrate(
+    folder: Path, out: Path, on_round: OnRound | None = None
+) -> tuple[dict[str, Any], Calibrated]:
     """Calibrates the camera of a finished monocular run, and writes camera.yaml.
 
     Args:
         folder: of the run.
         out: folder for camera.yaml.
-        told: called after each round.
+        on_round: called after each iteration.
 
     Returns:
         What changed, for the user, and the camera.
@@ -103,7 +145,7 @@ def recalibrate(folder: Path, out: Path, told: Told | None = None) -> tuple[dict
     if not isinstance(problem, FeatureLog) or not isinstance(problem.camera, Pinhole):
         raise InputError(f"{folder} is no run of one camera: only that can calibrate its camera")
     start = adjust_log(problem, RunFolder.open(folder).estimate.world_from_body)
-    found = refine_calibration(problem, start, told)
+    found = refine_calibration(problem, start, on_round)
     prepare_folder(out)
     about = f"focal length and k1 from what the run over {problem.name} measured"
     write_text(out / NAME, camera_text(found.camera, about))
@@ -117,38 +159,3 @@ def recalibrate(folder: Path, out: Path, told: Told | None = None) -> tuple[dict
     entries |= {name: float(value) if np.isfinite(value) else None for name, value in fractions.items()}
     entries["error_before"], entries["error_after"] = start.solution.error, found.batch.solution.error
     return entries, found
-
-
-def _camera(log: FeatureLog) -> Pinhole:
-    assert isinstance(log.camera, Pinhole)
-    return log.camera
-
-
-def _changed(camera: Pinhole, focal: float, k1: float) -> Pinhole:
-    k1_now, *others = camera.distortion
-    return replace(
-        camera,
-        fx=camera.fx * (1.0 + focal),
-        fy=camera.fy * (1.0 + focal),
-        distortion=(k1_now + k1, *others),
-    )
-
-
-def _with_camera(log: FeatureLog, batch: Batch, camera: Pinhole) -> Batch:
-    return adjust_near(replace(log, camera=camera), batch)
-
-
-def _lowest(errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where the quadratic through errors (7,), in the middle and around it, is lowest, no farther out than two steps.
-
-    Returns:
-        The place (2,) and the inverse (2, 2) of the curvature, NaN where the quadratic has no lowest point.
-    """
-    grid = np.concatenate([np.zeros((1, 2)), _AROUND])
-    a, b = grid.T
-    terms = np.stack([np.ones_like(a), a, b, 0.5 * a * a, a * b, 0.5 * b * b], axis=1)
-    _, ga, gb, haa, hab, hbb = np.linalg.lstsq(terms, errors, rcond=None)[0]
-    hessian = np.array([[haa, hab], [hab, hbb]])
-    if np.linalg.eigvalsh(hessian)[0] <= 0.0:
-        return np.asarray(2.0 * grid[np.argmin(errors)]), np.full((2, 2), np.nan)
-    return np.clip(-np.linalg.solve(hessian, [ga, gb]), -2.0, 2.0), np.linalg.inv(hessian)

@@ -1,15 +1,25 @@
-"""Optimisation loops over GTSAM's factor graphs, and marginal covariances at the optimum.
+"""GTSAM's poses in ours, optimisation loops over its factor graphs, and marginal covariances at the optimum.
+
+Pose2 has the tangent [v, ω], Pose3 [ω, v]. In GTSAM 4.3 both retract by the exponential map on the right, so
+only the order differs from ours, and a BetweenFactor's residual is Log(δ⁻¹ x⁻¹ y) with exact derivatives.
+The tests check this of the installed build.
 
 The loops are here because GTSAM's own optimisers copy all values at every call of a factor written in
 Python, a hundred times the cost; linearisation, elimination and retraction are GTSAM's.
 """
 
+import re
 from collections.abc import Callable, Iterable
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, final
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+from scipy.sparse import bsr_array, csc_array
 
+from rbpf.errors import InputError
 from rbpf.lie import Array
 
 ROUGH = 1e-4
@@ -24,6 +34,74 @@ OnIteration = Callable[[float], None]
 _DAMPING = 1e-5
 _MIN_DAMPING = 1e-10
 _MAX_DAMPING = 1e10
+
+MOST_POSES = 1_500
+"""Whose dense reduced system is taken for covariances: 9,000 unknowns, 650 MB."""
+
+_POSE, _POINT = 6, 3
+_SYMBOL = re.compile(r"\(Symbol: ([xl])(\d+)\)")
+
+
+@final
+@dataclass(frozen=True)
+class Chart:
+    """How GTSAM holds the poses of a group.
+
+    Attributes:
+        order: (d,) GTSAM's tangent is ours[order].
+        pose: our storage (E,) to GTSAM's object.
+        storage: values and key to our storage (E,).
+        point: values and key to a landmark (D,).
+        between: class of the native odometry factor.
+        prior: class of the factor that holds the start.
+    """
+
+    order: NDArray[np.intp]
+    pose: Callable[[Array], Any]
+    storage: Callable[[Any, int], Array]
+    point: Callable[[Any, int], Array]
+    between: type
+    prior: type
+
+    def covariance(self, cov: Array) -> Array:
+        """Ours of GTSAM's (d, d)."""
+        out = np.empty_like(cov)
+        out[np.ix_(self.order, self.order)] = cov
+        return out
+
+
+def _storage2(values: Any, key: int) -> Array:
+    pose = values.atPose2(key)
+    return np.array([pose.theta(), pose.x(), pose.y()])
+
+
+def _storage3(values: Any, key: int) -> Array:
+    pose = values.atPose3(key)
+    return np.concatenate([pose.rotation().toQuaternion().coeffs(), pose.translation()])
+
+
+PLANAR = Chart(
+    order=np.array([1, 2, 0]),
+    pose=lambda x: gtsam.Pose2(x[1], x[2], x[0]),
+    storage=_storage2,
+    point=gtsam.Values.atPoint2,
+    between=gtsam.BetweenFactorPose2,
+    prior=gtsam.PriorFactorPose2,
+)
+SPATIAL = Chart(
+    order=np.arange(6),
+    pose=lambda x: gtsam.Pose3(gtsam.Rot3.Quaternion(x[3], x[0], x[1], x[2]), x[4:]),
+    storage=_storage3,
+    point=gtsam.Values.atPoint3,
+    between=gtsam.BetweenFactorPose3,
+    prior=gtsam.PriorFactorPose3,
+)
+
+
+def culprit(error: RuntimeError) -> tuple[str, int] | None:
+    """Letter and number of the variable, x for a pose and l for a landmark, that a complaint of GTSAM's names."""
+    symbol = _SYMBOL.search(str(error))
+    return None if symbol is None else (symbol[1], int(symbol[2]))
 
 
 def noise(cov: Array) -> Any:
@@ -64,7 +142,13 @@ def levenberg_marquardt(
             on_iteration(error)
         linear, slack = graph.linearize(values), tolerance * max(1.0, error)
         while damping <= _MAX_DAMPING:
-            moved = _damped_step(linear, values, damping)
+            damped, zero = gtsam.GaussianFactorGraph(), values.zeroVectors()
+            damped.push_back(linear)
+            for key in values.keys():  # noqa: SIM118, no mapping
+                dim = len(zero.at(key))
+                unit, root = gtsam.noiseModel.Unit.Create(dim), np.sqrt(damping) * np.eye(dim)
+                damped.push_back(gtsam.JacobianFactor(key, root, np.zeros(dim), unit))
+            moved = _step(damped, values)
             before, after = error, graph.error(moved)
             if after <= before + slack:
                 break
@@ -105,14 +189,83 @@ def marginals(graph: Any, values: Any, keys: Iterable[int]) -> list[Array]:
     return [marginal(key) for key in keys]
 
 
-def _damped_step(linear: Any, values: Any, damping: float) -> Any:
-    damped, zero = gtsam.GaussianFactorGraph(), values.zeroVectors()
-    damped.push_back(linear)
-    for key in values.keys():  # noqa: SIM118, no mapping
-        dim = len(zero.at(key))
-        unit = gtsam.noiseModel.Unit.Create(dim)
-        damped.push_back(gtsam.JacobianFactor(key, np.sqrt(damping) * np.eye(dim), np.zeros(dim), unit))
-    return _step(damped, values)
+def marginals_by_schur(
+    graph: Any, values: Any, poses: list[int], points: list[int], held: list[int], name: str
+) -> tuple[Array, Array]:
+    """Covariances (P, 6, 6) of poses and (L, 3, 3) of points from the poses' reduced system; zero for what is held.
+
+    Landmarks see each other only through the poses. With the information matrix in blocks
+
+        H = [ H_pp  H_pl ]      S = H_pp − H_pl H_ll⁻¹ H_lp,     Σ_pp = S⁻¹
+            [ H_lp  H_ll ]      Σ_ll = H_ll⁻¹ + H_ll⁻¹ H_lp Σ_pp H_pl H_ll⁻¹
+
+    H_ll is block-diagonal, so that a landmark costs the square of the poses that see it. (B. Triggs et al., "Bundle
+    adjustment: a modern synthesis", 2000, §6.) Information squares the condition of the problem: this is for problems
+    whose scale is measured, well or badly, not for those where a stiff prior holds it.
+
+    Args:
+        graph: nonlinear factors between poses and points; no others.
+        values: the optimum.
+        poses: P keys.
+        points: L keys.
+        held: those of them that a hard constraint holds, each by itself.
+        name: of the recording.
+
+    Raises:
+        InputError: the measurements do not determine something.
+    """
+    undetermined = InputError(
+        f"The measurements of {name} do not determine all poses and landmarks, so that they have no covariance; "
+        "add known points, or leave out what is seen too seldom."
+    )
+    # The whitened Jacobian J by the free keys in ascending order, in columns of poses and of points.
+    sizes = dict.fromkeys(poses, _POSE) | dict.fromkeys(points, _POINT)
+    keys = sorted(sizes)
+    widths = [sizes[key] for key in keys]
+    free = [key for key in keys if key not in held]
+    rows, columns, entries = graph.linearize(values).sparseJacobian_()
+    kept = np.append(np.repeat(np.isin(keys, free), widths), False)  # the last column is the residual
+    inside = kept[columns.astype(int) - 1]
+    at = rows[inside].astype(int) - 1, columns[inside].astype(int) - 1
+    shape = (int(rows.max()), sum(widths))
+    jacobian = csc_array((entries[inside], at), shape=shape)[:, kept[:-1]]
+    is_pose = np.repeat([sizes[key] == _POSE for key in free], [sizes[key] for key in free])
+    of_poses, of_points = jacobian[:, is_pose], jacobian[:, ~is_pose]
+    # H_ll and its inverse by blocks, S, and S⁻¹ scaled to a diagonal of ones.
+    blocks, count = (of_points.T @ of_points).tobsr((_POINT, _POINT)), of_points.shape[1] // _POINT
+    if len(blocks.data) < count:
+        raise undetermined
+    try:
+        inverse = np.linalg.inv(blocks.data)
+    except np.linalg.LinAlgError as error:
+        raise undetermined from error
+    seen = csc_array(of_points.T @ of_poses)
+    weights = csc_array(bsr_array((inverse, blocks.indices, blocks.indptr), shape=blocks.shape) @ seen)
+    reduced = (of_poses.T @ of_poses).toarray() - (seen.T @ weights).toarray()
+    diagonal = np.diagonal(reduced)
+    if not (diagonal > 0.0).all():
+        raise undetermined
+    scale = 1.0 / np.sqrt(diagonal)
+    try:
+        factor = cho_factor(scale[:, None] * reduced * scale, lower=True)
+    except np.linalg.LinAlgError as error:
+        raise undetermined from error
+    cov = np.asarray(scale[:, None] * cho_solve(factor, np.eye(len(reduced))) * scale)
+    of_each, by_row = np.empty((count, _POINT, _POINT)), weights.tocsr()
+    for index in range(count):
+        part = by_row[_POINT * index : _POINT * (index + 1)]
+        used = np.unique(part.indices)
+        dense = part[:, used].toarray()
+        of_each[index] = inverse[index] + dense @ cov[np.ix_(used, used)] @ dense.T
+    every = np.arange(len(cov) // _POSE)
+    of_every = cov.reshape(every.size, _POSE, -1, _POSE)[every, :, every]
+    found = dict(zip((key for key in free if sizes[key] == _POSE), of_every, strict=True))
+    found |= dict(zip((key for key in free if sizes[key] == _POINT), of_each, strict=True))
+    cov_points = [found.get(key, np.zeros((_POINT, _POINT))) for key in points]
+    return (
+        np.array([found.get(key, np.zeros((_POSE, _POSE))) for key in poses]),
+        np.array(cov_points).reshape(-1, _POINT, _POINT),
+    )
 
 
 def _step(linear: Any, values: Any) -> Any:

@@ -1,4 +1,8 @@
-"""Landmarks and poses of two estimates as Gaussians in one frame, chart and gauge, and how far they are apart."""
+"""Landmarks and poses of two estimates as Gaussians in one frame, chart and gauge, and how far they are apart.
+
+The difference of the means is given in units of one's standard deviations; S. Kullback and R. Leibler (1951) and
+A. Bhattacharyya (1943) compare the whole densities, in natural units of information.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -11,13 +15,36 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
 from rbpf.runs.path_and_map import PathAndMap
 from rbpf.systems.map_estimate import MapEstimate
-from rbpf.validation.gtsam.divergence import bhattacharyya, kullback_leibler, mahalanobis, sigma_ratio
 
 COLUMNS = ("distances_m", "sigmas", "kullback_leibler", "bhattacharyya", "sigma_ratio")
 """What is told of each pair of Gaussians."""
 
 _TINY = 1e-9
 """A length, as a fraction of the path's, that is none; a variance, as a fraction of the largest, that is none."""
+
+
+def mahalanobis(delta: Array, cov: Array) -> Array:
+    """sqrt(δᵀ P⁻¹ δ) of (…, n) and (…, n, n): (…)."""
+    return np.sqrt(np.einsum("...i,...i->...", delta, _solve(cov, delta)))
+
+
+def kullback_leibler(delta: Array, cov_p: Array, cov_q: Array) -> Array:
+    """KL(p ‖ q) of Gaussians whose means differ by δ (…, n), with covariances (…, n, n) [nats]: (…)."""
+    trace = np.trace(np.linalg.solve(cov_q, cov_p), axis1=-2, axis2=-1)
+    shift = np.einsum("...i,...i->...", delta, _solve(cov_q, delta))
+    return np.asarray(0.5 * (trace + shift - delta.shape[-1] + _log_det(cov_q) - _log_det(cov_p)))
+
+
+def bhattacharyya(delta: Array, cov_p: Array, cov_q: Array) -> Array:
+    """Bhattacharyya's distance, −log ∫ √(p q); symmetric and 0 for equal Gaussians: (…)."""
+    middle = 0.5 * (cov_p + cov_q)
+    shift = np.einsum("...i,...i->...", delta, _solve(middle, delta))
+    return 0.125 * shift + 0.5 * (_log_det(middle) - 0.5 * (_log_det(cov_p) + _log_det(cov_q)))
+
+
+def sigma_ratio(cov_p: Array, cov_q: Array) -> Array:
+    """Mean standard deviation of p over that of q, (|P| / |Q|)^(1/2n): below 1 where p is the more certain: (…)."""
+    return np.asarray(np.exp(0.5 * (_log_det(cov_p) - _log_det(cov_q)) / cov_p.shape[-1]), dtype=np.float64)
 
 
 @final
@@ -169,3 +196,11 @@ def _across(moved: Array) -> Array:
 def _regular(cov: Array) -> NDArray[np.bool_]:
     values = np.linalg.eigvalsh(cov)
     return np.asarray(values[:, 0] > _TINY**2 * np.maximum(values[:, -1], np.finfo(float).tiny))
+
+
+def _solve(cov: Array, delta: Array) -> Array:
+    return np.asarray(np.linalg.solve(cov, delta[..., None])[..., 0], dtype=np.float64)
+
+
+def _log_det(cov: Array) -> Array:
+    return np.asarray(np.linalg.slogdet(cov)[1], dtype=np.float64)

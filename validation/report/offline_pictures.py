@@ -8,8 +8,18 @@ import numpy as np
 from rbpf.lie import Array
 from rbpf.runs.path_and_map import PathAndMap
 from rbpf.runs.plots import COLOURS, Views, label, new_axes, outline, save_figures
+from rbpf.runs.reading import RunFolder
+from rbpf.runs.trajectory import in_space
 from rbpf.validation.colmap.compare import ColmapComparison
 from rbpf.validation.consistency.against_batch import AgainstBatch
+from rbpf.validation.consistency.against_optimisers import BatchErrors
+from rbpf.validation.report.comparison_figures import (
+    landmark_figure,
+    map_figure,
+    nees_figure,
+    path_figure,
+    wide_axes,
+)
 
 _BINS = 20
 
@@ -105,3 +115,25 @@ def _histogram(values: Array, title: str, xlabel: str) -> Any:
     axes.axvline(float(np.median(values)), color=COLOURS["truth"], lw=0.8, ls="--", label="median")
     axes.legend(loc="best", fontsize="small")
     return figure
+
+
+def plot_against_posterior(record: RunFolder, errors: BatchErrors) -> list[str]:
+    """Paths, expected NEES, landmarks and map of a robot beside the batch posterior; returns the file names."""
+    name, path, batch = record.name, record.path, errors.batch
+    ours, theirs = path.trajectory().positions, in_space(path.stamps_ns, batch.world_from_robot).positions
+    plane, known = wide_axes(theirs), np.flatnonzero(np.isfinite(errors.poses))
+    figures = {"gtsam_path.png": path_figure(f"{name}: paths", {"batch": theirs, "filter": ours}, plane)}
+    if known.size:
+        dim = path.space.dim
+        title = f"{name}: expected NEES under the batch posterior"
+        figures["gtsam_nees.png"] = nees_figure(title, known, dim * errors.poses[known], dim)
+    if errors.sigmas.size:
+        count, dim = errors.map.mean.shape
+        title = f"{name}: landmarks against the batch optimum, in its σ"
+        figures["gtsam_landmarks.png"] = landmark_figure(title, errors.sigmas, dim)
+        mean, cov, at = np.zeros((count, 3)), np.zeros((count, 3, 3)), np.zeros((count, 3))
+        mean[:, :dim], cov[:, :dim, :dim] = errors.map.mean, errors.map.cov
+        at[:, :dim] = [batch.landmarks[i] for i in errors.map.ids.tolist()]
+        title = f"{name}: map over the batch optimum"
+        figures["gtsam_map.png"] = map_figure(title, ours, mean, cov, {"batch": at}, plane)
+    return save_figures(figures, record.folder)

@@ -12,9 +12,12 @@ from rbpf.errors import InputError
 from rbpf.runs.files import write_text
 from rbpf.runs.plots import save_figures
 from rbpf.runs.reading import RunFolder
-from rbpf.validation.consistency.comparison import Comparison, read_comparisons
-from rbpf.validation.consistency.noise_advice import noise_advice
-from rbpf.validation.consistency.own_statistics import compare_with_itself
+from rbpf.validation.consistency.comparison import (
+    Comparison,
+    compare_with_itself,
+    noise_advice,
+    read_comparisons,
+)
 from rbpf.validation.consistency.statistic import Statistic
 from rbpf.validation.consistency.verdict import Verdict, judge
 from rbpf.validation.report.comparison_figures import timings_figure

@@ -1,7 +1,5 @@
 """Pictures of a run beside the truth."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from rbpf.errors import InputError
@@ -9,6 +7,7 @@ from rbpf.lie import SE2, SE3
 from rbpf.runs.plots import save_figures
 from rbpf.runs.reading import FilteredPath, RunFolder
 from rbpf.runs.trajectory import in_space, read_tum
+from rbpf.validation.consistency.against_groundtruth import LandmarkErrors, TruthErrors
 from rbpf.validation.report.comparison_figures import (
     error_figure,
     landmark_figure,
@@ -18,11 +17,8 @@ from rbpf.validation.report.comparison_figures import (
     wide_axes,
 )
 
-if TYPE_CHECKING:
-    from rbpf.validation.consistency.against_groundtruth import LandmarkErrors, TruthErrors
 
-
-def draw_truth(record: RunFolder, errors: "TruthErrors") -> list[str]:
+def draw_truth(record: RunFolder, errors: TruthErrors) -> list[str]:
     """Draws paths, errors with the filter's 3σ, NEES, landmarks and map into the run's folder; returns their names."""
     rows, name = errors.truth.rows, record.name
     moved = errors.positions.alignment
@@ -74,7 +70,7 @@ def lost_steps(record: RunFolder) -> np.ndarray:
     return table.get("lost", np.zeros(len(record.path.mean))).astype(bool)
 
 
-def _map(title: str, path: np.ndarray, landmarks: "LandmarkErrors", plane: tuple[int, int]) -> object:
+def _map(title: str, path: np.ndarray, landmarks: LandmarkErrors, plane: tuple[int, int]) -> object:
     count, dim = landmarks.errors.shape
     mean, cov = np.zeros((count, 3)), np.zeros((count, 3, 3))
     mean[:, :dim], cov[:, :dim, :dim] = landmarks.map.mean, landmarks.map.cov

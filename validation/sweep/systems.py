@@ -13,7 +13,7 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.runs.truth import RunTruth
 from rbpf.systems.settings import load_settings
-from rbpf.validation.consistency.pose_errors import whitened_errors
+from rbpf.validation.consistency.statistic import whitened_errors
 
 if TYPE_CHECKING:
     from rbpf.runs.run import Run

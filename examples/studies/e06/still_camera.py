@@ -12,7 +12,7 @@ from rbpf.runs.plots import save_figures
 from rbpf.runs.recordings import filter_images
 from rbpf.systems.mono.config import InverseDepthConfig, MonoConfig
 from rbpf.systems.mono.slam import world_of
-from rbpf.validation.consistency.pose_errors import pose_errors
+from rbpf.validation.consistency.statistic import whitened_errors
 from rbpf.validation.simulation.images import Imaging
 
 TREATMENTS = {"off": "four points alone", "epipolar": "epipolar constraint", "marginal": "2-D marginal"}
@@ -53,7 +53,7 @@ def reproduce(setting: Setting) -> list[Row]:
         ray = InverseDepthConfig(pose_update=treatment, promote_std_ratio=NEVER)  # type: ignore[arg-type]
         config = MonoConfig(particles=setting.particles, seed=setting.seed, inverse_depth=ray)
         run = filter_images(sequence, config, known)
-        errors = pose_errors(run.log.poses[-1:], run.log.covs[-1:], truth)
+        errors = whitened_errors(SE3, run.log.poses[-1:], run.log.covs[-1:], truth)
         pose, position = (
             np.sqrt(np.linalg.det(part)) for part in (run.log.covs[-1], run.log.covs[-1, 3:, 3:])
         )

@@ -11,7 +11,7 @@ from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.feature_cache import CachedSequence
 from rbpf.systems.stereo.run import StereoRun, run_images
-from rbpf.validation.consistency.pose_errors import whitened_errors
+from rbpf.validation.consistency.statistic import whitened_errors
 from rbpf.validation.metrics.stereo_scores import stereo_truth
 
 ERROR, NEES = ("error m", "least", "most"), ("median NEES", "least NEES", "most NEES")

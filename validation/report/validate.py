@@ -4,6 +4,7 @@ A new comparison is one function from a run to a `Comparison`, entered into `COM
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from rbpf.errors import InputError
@@ -15,36 +16,46 @@ from rbpf.validation.consistency.verdict import Verdict
 from rbpf.validation.report.page import write_report
 
 Compare = Callable[[RunFolder], Comparison]
+"""With pictures in the run's folder."""
 
 
 def _groundtruth(record: RunFolder) -> Comparison:
-    from rbpf.validation.consistency.against_groundtruth import compare_with_truth
+    from rbpf.validation.consistency.against_groundtruth import compare_with_truth, truth_errors
+    from rbpf.validation.report.truth_pictures import draw_truth
 
-    return compare_with_truth(record)
+    errors = truth_errors(record)
+    return replace(compare_with_truth(record, errors), pictures=draw_truth(record, errors))
 
 
-def _range_bearing_gtsam(record: RunFolder) -> Comparison:
-    from rbpf.validation.consistency.against_gtsam import compare_with_batch
+def _robot_gtsam(record: RunFolder) -> Comparison:
+    from rbpf.validation.consistency.against_optimisers import compare_robot_with_batch
+    from rbpf.validation.report.offline_pictures import plot_against_posterior
 
-    return compare_with_batch(record)
+    comparison, errors = compare_robot_with_batch(record)
+    return replace(comparison, pictures=plot_against_posterior(record, errors))
 
 
 def _camera_gtsam(record: RunFolder) -> Comparison:
-    from rbpf.validation.consistency.offline_comparisons import compare_camera_with_batch
+    from rbpf.validation.consistency.against_optimisers import compare_camera_with_batch
+    from rbpf.validation.report.offline_pictures import plot_against_batch
 
-    return compare_camera_with_batch(record)
+    comparison, found = compare_camera_with_batch(record)
+    return replace(comparison, pictures=plot_against_batch(found, record.folder))
 
 
 def _camera_colmap(record: RunFolder) -> Comparison:
-    from rbpf.validation.consistency.offline_comparisons import compare_camera_with_colmap
+    from rbpf.validation.consistency.against_optimisers import compare_camera_with_colmap
+    from rbpf.validation.report.offline_pictures import plot_against_colmap
 
-    return compare_camera_with_colmap(record)
+    comparison, found = compare_camera_with_colmap(record)
+    pictures = plot_against_colmap(found.run, RunFolder.open(record.folder).estimate, record.folder)
+    return replace(comparison, pictures=pictures)
 
 
 ANY = "*"
 COMPARISONS: dict[str, dict[str, Compare]] = {
     "groundtruth": {ANY: _groundtruth},
-    "gtsam": {"range-bearing": _range_bearing_gtsam, "mono": _camera_gtsam, "stereo": _camera_gtsam},
+    "gtsam": {"range-bearing": _robot_gtsam, "mono": _camera_gtsam, "stereo": _camera_gtsam},
     "colmap": {"mono": _camera_colmap, "stereo": _camera_colmap},
 }
 """By what a run is compared with, then by the run's system."""
@@ -66,7 +77,16 @@ def validate(folder: Path, against: str, out: Path | None = None) -> Verdict:
     """
     record = RunFolder.open(folder)
     try:
-        comparison = _comparison(record.system, against)(record)
+        known = COMPARISONS.get(against)
+        if known is None:
+            raise InputError(f"a run is compared with {', '.join(COMPARISONS)}, not with {against}")
+        compare = known.get(record.system, known.get(ANY))
+        if compare is None:
+            able = ", ".join(sorted(known)) or "no system yet"
+            raise InputError(
+                f"a run of the system {record.system!r} cannot be compared with {against} (possible: {able})"
+            )
+        comparison = compare(record)
     except InputError as error:
         write_report(folder, [f"Not compared with {against}: {error}."])
         raise
@@ -83,16 +103,3 @@ def report_run(folder: Path) -> Verdict:
     if (folder / TRUTH).is_file():
         return validate(folder, "groundtruth")
     return write_report(folder)
-
-
-def _comparison(system: str, against: str) -> Compare:
-    known = COMPARISONS.get(against)
-    if known is None:
-        raise InputError(f"a run is compared with {', '.join(COMPARISONS)}, not with {against}")
-    compare = known.get(system, known.get(ANY))
-    if compare is None:
-        able = ", ".join(sorted(known)) or "no system yet"
-        raise InputError(
-            f"a run of the system {system!r} cannot be compared with {against} (possible: {able})"
-        )
-    return compare
