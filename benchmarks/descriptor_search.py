@@ -7,7 +7,7 @@ import numpy as np
 
 from benchmarks.patch_search import one_thread, picture
 from benchmarks.rows import Row, Settings, Timing, interleaved
-from rbpf.sensors.descriptors.index import DescriptorIndex, ExactSearch, Gate, TreeSearch
+from rbpf.sensors.descriptors import DescriptorIndex, ExactSearch, Gate, TreeSearch
 from rbpf.sensors.features import Sift, SiftConfig
 
 SIZES, FEATURES, IN_VIEW = (1000, 10_000, 40_000), 300, 600

@@ -7,8 +7,8 @@ import numpy as np
 
 from rbpf.lie import SE3
 from rbpf.sensors.camera import RectifiedStereo
-from rbpf.sensors.descriptors.matching import MatchLimits
-from rbpf.sensors.stereo.features import StereoFeatures, match_frames
+from rbpf.sensors.descriptors import MatchLimits
+from rbpf.sensors.stereo import StereoFeatures, match_frames
 
 WITHIN_PX, TRIALS, STEPS, HUBER = 2.0, 200, 12, 1.5
 

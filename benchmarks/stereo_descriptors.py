@@ -19,14 +19,19 @@ from benchmarks.plain_odometry import path
 from rbpf.core.models import NULL
 from rbpf.lie import SE3
 from rbpf.sensors.camera import RectifiedStereo
-from rbpf.sensors.descriptors.index import DescriptorIndex, DescriptorSearch, ExactSearch, Gate, TreeSearch
-from rbpf.sensors.descriptors.landmark_management import LandmarkManager, NewLandmarkConfig
-from rbpf.sensors.descriptors.matching import MatchLimits
+from rbpf.sensors.descriptors import (
+    DescriptorIndex,
+    DescriptorSearch,
+    ExactSearch,
+    Gate,
+    MatchLimits,
+    TreeSearch,
+)
 from rbpf.sensors.features import Sift
 from rbpf.sensors.features.sift import SiftConfig, descriptors_from_histograms
+from rbpf.sensors.landmark_management import LandmarkManager, NewLandmarkConfig
 from rbpf.sensors.readers import open_stereo
-from rbpf.sensors.stereo.features import StereoFeatures, match_frames
-from rbpf.sensors.stereo.matching import StereoMatcher
+from rbpf.sensors.stereo import StereoFeatures, StereoMatcher, match_frames
 
 NAMES = {"stereo_zed_room1": (1, 5, 10), "stereo_kitti_seq1": (1, 2, 3)}
 SLACK_PX, RIGHT = 2.0, 16.3

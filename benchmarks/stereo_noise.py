@@ -16,10 +16,9 @@ import numpy as np
 from benchmarks.plain_odometry import WITHIN_PX, motion
 from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
-from rbpf.sensors.descriptors.matching import MatchLimits
+from rbpf.sensors.descriptors import MatchLimits
 from rbpf.sensors.readers import ImageSequence, open_stereo
-from rbpf.sensors.stereo.features import match_frames
-from rbpf.sensors.stereo.matching import StereoMatcher
+from rbpf.sensors.stereo import StereoMatcher, match_frames
 from rbpf.validation.simulation.desk_and_room import TexturedRoom
 from rbpf.validation.simulation.images import Imaging, simulate_images
 

@@ -18,8 +18,7 @@ from rbpf.runs.alignment import align
 from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.features import Sift, SiftConfig
 from rbpf.sensors.readers import ImageSequence, open_stereo
-from rbpf.sensors.stereo.features import StereoFeatures
-from rbpf.sensors.stereo.matching import PairConfig, StereoMatcher
+from rbpf.sensors.stereo import PairConfig, StereoFeatures, StereoMatcher
 
 NAMES = "stereo_zed_room1", "stereo_kitti_seq1"
 SEEDS = 3

@@ -12,7 +12,7 @@ from rbpf.core.models import Records
 from rbpf.lie import SE3
 from rbpf.motion.odometry import Odometry
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
-from rbpf.sensors.stereo.features import StereoFeatures
+from rbpf.sensors.stereo import StereoFeatures
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.landmarks import View
 from rbpf.systems.stereo.slam import StereoSlam

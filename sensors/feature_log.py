@@ -1,6 +1,5 @@
 """What a camera saw, feature by feature: pixels of named landmarks, the landmarks known beforehand, and the truth."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from numbers import Integral
 
@@ -122,13 +121,19 @@ class FeatureLog:
         if not self.frames:
             raise InputError(f"{self.name} holds no frame, expected at least one image")
         for index, frame in enumerate(self.frames):
-            self._check_frame(index, frame)
+            where = f"frame {index} of {self.name}"
+            stamp_ns: object = frame.stamp_ns
+            if not isinstance(stamp_ns, Integral):
+                problem = f"stamp_ns must be a whole number of nanoseconds, got {stamp_ns!r}"
+                raise InputError(f"{where}: {problem}")
+            _check_names(where, "landmarks", "K", frame.landmarks)
+            shape = (len(frame.landmarks), self.camera.dim)
+            _check_numbers(where, "z", frame.z, shape)
+            _check_covariances(where, "cov_z", frame.cov_z, (*shape, self.camera.dim))
             before = self.frames[max(index - 1, 0)].stamp_ns
             if frame.stamp_ns < before:
-                raise InputError(
-                    f"frame {index} of {self.name} at {frame.stamp_ns} ns is before the frame it follows "
-                    f"({before} ns): sort the frames by time"
-                )
+                order = f"at {frame.stamp_ns} ns is before the frame it follows ({before} ns)"
+                raise InputError(f"{where} {order}: sort the frames by time")
 
     def outside(self, margin_px: float = 0.0) -> np.ndarray:
         """Measurements that are not in the image, or nearer than `margin_px` to its border.
@@ -138,25 +143,9 @@ class FeatureLog:
         Returns:
             (F, 2) int64: index of the frame, and row of its `z`.
         """
-        return np.array(list(self._outside(margin_px)), dtype=np.int64).reshape(-1, 2)
-
-    def _outside(self, margin_px: float) -> Iterator[tuple[int, int]]:
-        for index, frame in enumerate(self.frames):
-            for row in np.flatnonzero(~self.camera.inside(frame.z, margin_px)):
-                yield index, int(row)
-
-    def _check_frame(self, index: int, frame: FeatureFrame) -> None:
-        where = f"frame {index} of {self.name}"
-        _check_stamp(where, frame.stamp_ns)
-        _check_names(where, "landmarks", "K", frame.landmarks)
-        shape = (len(frame.landmarks), self.camera.dim)
-        _check_numbers(where, "z", frame.z, shape)
-        _check_covariances(where, "cov_z", frame.cov_z, (*shape, self.camera.dim))
-
-
-def _check_stamp(where: str, stamp_ns: object) -> None:
-    if not isinstance(stamp_ns, Integral):
-        raise InputError(f"{where}: stamp_ns must be a whole number of nanoseconds, got {stamp_ns!r}")
+        rows = (np.flatnonzero(~self.camera.inside(frame.z, margin_px)) for frame in self.frames)
+        found = [(index, int(row)) for index, outside in enumerate(rows) for row in outside]
+        return np.array(found, dtype=np.int64).reshape(-1, 2)
 
 
 def _check_whole(where: str, what: str, letter: str, values: np.ndarray) -> None:

@@ -124,19 +124,15 @@ class AnonymousLandmarkSensor(Sensor):
         chosen = np.zeros((belief.log_weights.size, 0), dtype=np.int64)
         if observed and observed[0].ids is not None:
             chosen = observed[0].ids
-        self._count_evidence(belief, chosen)
+        ids = belief.map.ids
+        if ids.size:
+            records = belief.read(ids)
+            expected = self.model.visible(belief.state[:, None, :], records.mean, records.const)
+            seen = (chosen[:, :, None] == ids).any(axis=1)
+            belief.map.set_log_odds(ids, self.existence.updated(belief.map.log_odds(ids), seen, expected))
         new = (chosen == NEW).any(axis=0)
         if not new.any():
             return []
         return [
             NewLandmarks(frame.z[new], frame.cov_z[new], self.model, self.landmark, chosen[:, new] == NEW)
         ]
-
-    def _count_evidence(self, belief: Belief, chosen: np.ndarray) -> None:
-        ids = belief.map.ids
-        if not ids.size:
-            return
-        records = belief.read(ids)
-        expected = self.model.visible(belief.state[:, None, :], records.mean, records.const)
-        seen = (chosen[:, :, None] == ids).any(axis=1)
-        belief.map.set_log_odds(ids, self.existence.updated(belief.map.log_odds(ids), seen, expected))

@@ -16,8 +16,7 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.runs.files import prepare_folder, write_text
 from rbpf.runs.plots import COLOURS, label, save_figures
-from rbpf.sensors.calibration.boards import Board, board_corners
-from rbpf.sensors.calibration.camera import BoardCalibration, BoardView, calibrate
+from rbpf.sensors.calibration import Board, BoardCalibration, BoardView, board_corners, calibrate
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers.images.calibration import MODELS, NAME, model_of
 from rbpf.sensors.readers.images.video import NamedImage, read_uncalibrated

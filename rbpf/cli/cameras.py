@@ -8,7 +8,7 @@ import tyro
 
 from rbpf.cli.options import Printed
 from rbpf.cli.showing import answer, progress, say, told
-from rbpf.sensors.calibration.boards import Board
+from rbpf.sensors.calibration import Board
 
 LOOSE = 0.01
 """Standard deviation of focal lengths and centre, as a fraction of the focal length, from which on a run bends."""

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import tyro
 
 from rbpf.errors import InputError
-from rbpf.sensors.calibration.boards import Board, MarkerBoard
+from rbpf.sensors.calibration import Board, MarkerBoard
 from rbpf.sensors.readers.images.sequence import Topics
 
 Flag = tyro.conf.FlagCreatePairsOff[bool]

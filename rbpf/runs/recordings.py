@@ -12,7 +12,7 @@ from rbpf.errors import InputError
 from rbpf.runs.files import CHECKPOINT, prepare_folder
 from rbpf.runs.run import Listener, Run, Source, drive
 from rbpf.runs.truth import GroundTruth, truth_at
-from rbpf.sensors.calibration.boards import Board, MarkerBoard, find_board, find_markers
+from rbpf.sensors.calibration import Board, MarkerBoard, find_board, find_markers
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureLog
 from rbpf.sensors.readers import (
@@ -24,8 +24,8 @@ from rbpf.sensors.readers import (
     open_log,
     read_known_points,
 )
-from rbpf.sensors.readers.images.live import LiveCamera, camera_number
 from rbpf.sensors.readers.images.sequence import UNNAMED
+from rbpf.sensors.readers.images.video import LiveCamera, camera_number
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.known_map import KnownMap, read_known_map
 from rbpf.systems.mono.relocalisation import ImageScreen

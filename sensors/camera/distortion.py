@@ -20,13 +20,10 @@ from rbpf.arrays import Bool, Float
 
 SETTLED, SOLVED = 1e-14, 1e-12
 """Errors of `undistort`, relative to 1 + the distance from the axis: the iteration ends, the result is accepted."""
-
 STALLED = 0.999
 """A step that leaves more of the error than this has no solution ahead."""
-
 ARMIJO = 0.25
 """Fraction of the decrease promised by the derivative that a step has to keep (L. Armijo 1966)."""
-
 ITERATIONS, HALVINGS = 60, 20
 """Of Newton's method, for both lenses, and of one of its steps."""
 
@@ -111,25 +108,23 @@ class RadialTangential:
         for _ in range(ITERATIONS):
             if not active.size:
                 break
-            uv[active], reached = self._newton(uv[active], target[active], error[active])
+            reached = error[active].copy()
+            # A step of each, halved until it stays on this side of the fold and brings the error down.
+            miss = target[active] - self.distort(uv[active])
+            step = (inverse(self.jacobian(uv[active])) @ miss[..., None])[..., 0]
+            waiting = np.arange(active.size)
+            for fraction in 0.5 ** np.arange(HALVINGS):
+                if not waiting.size:
+                    break
+                rows = active[waiting]
+                tried = uv[rows] + fraction * step[waiting]
+                misfit = self._misfit(tried, target[rows])
+                better = (misfit < (1.0 - ARMIJO * fraction) * error[rows]) & self.is_invertible(tried)
+                uv[rows[better]], reached[waiting[better]] = tried[better], misfit[better]
+                waiting = waiting[~better]
             error[active], active = reached, active[(reached > SETTLED) & (reached < STALLED * error[active])]
         found = (error <= SOLVED) & self.is_invertible(uv)
         return np.where(found[:, None], uv, np.nan)
-
-    def _newton(self, uv: np.ndarray, target: np.ndarray, error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """A step of each (K, 2), halved until it stays on this side of the fold and brings the error (K,) down."""
-        miss = target - self.distort(uv)
-        step = (inverse(self.jacobian(uv)) @ miss[..., None])[..., 0]
-        waiting = np.arange(len(uv))
-        for fraction in 0.5 ** np.arange(HALVINGS):
-            if not waiting.size:
-                break
-            tried = uv[waiting] + fraction * step[waiting]
-            reached = self._misfit(tried, target[waiting])
-            better = (reached < (1.0 - ARMIJO * fraction) * error[waiting]) & self.is_invertible(tried)
-            uv[waiting[better]], error[waiting[better]] = tried[better], reached[better]
-            waiting = waiting[~better]
-        return uv, error
 
     def _misfit(self, uv: np.ndarray, target: np.ndarray) -> np.ndarray:
         """Distance (K,) of distorted coordinates from where they should be, relative to 1 + the latter's length."""
@@ -152,10 +147,8 @@ def inverse(matrix: Float[np.ndarray, "*batch 2 2"]) -> Float[np.ndarray, "*batc
 MAX_ANGLE = np.deg2rad(75.0)
 """Largest angle from the axis that is seen, less than where `rbpf.sensors.camera.points.forward` begins to bend: (u, v)
 and its errors grow without bound towards 90°."""
-
 NEAR = 1e-16
 """Squared distance from the axis below which the lens is its own tangent, to rounding."""
-
 ANGLE_SETTLED = 1e-15
 """A step of the angle, relative to 1, that ends the iteration of `undistort`."""
 

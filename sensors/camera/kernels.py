@@ -16,7 +16,6 @@ from rbpf.sensors.camera.distortion import NEAR
 
 KIND = 9
 """Place of the lens in `Pinhole.params`, the last one: 0 radial-tangential, 1 equidistant."""
-
 Projected = tuple[float, float, float, float, float, float, float, float]
 """Pixel of a point and its Jacobian by rows: (px, py, d00, d01, d02, d10, d11, d12)."""
 
@@ -119,21 +118,16 @@ def locate(pose, point, n, place):
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _measure_equidistant(place, z0, z1, params, n, nu, across, down):
-    """As `measure`: a loop of its own, whose arc tangents would keep the other one from becoming vectors."""
-    for i in range(n):
-        x, y, depth = place[i], place[BLOCK + i], place[2 * BLOCK + i]
-        px, py, d00, d01, d02, d10, d11, d12 = project_equidistant(x, y, depth, params)
-        nu[i], nu[BLOCK + i] = z0 - px, z1 - py
-        store_by_state(d00, d01, d02, x, y, depth, across, i)
-        store_by_state(d10, d11, d12, x, y, depth, down, i)
-
-
-@njit(cache=True, error_model="numpy", inline="always")
 def measure(place, z0, z1, params, n, nu, across, down):
     """Residuals, and both rows by the state, of what lies at `place` in the camera's frame."""
     if params[KIND] != 0.0:
-        _measure_equidistant(place, z0, z1, params, n, nu, across, down)
+        # A loop of its own, whose arc tangents would keep the other one from becoming vectors.
+        for i in range(n):
+            x, y, depth = place[i], place[BLOCK + i], place[2 * BLOCK + i]
+            px, py, d00, d01, d02, d10, d11, d12 = project_equidistant(x, y, depth, params)
+            nu[i], nu[BLOCK + i] = z0 - px, z1 - py
+            store_by_state(d00, d01, d02, x, y, depth, across, i)
+            store_by_state(d10, d11, d12, x, y, depth, down, i)
         return
     camera = (
         params[0], params[1], params[2], params[3], params[4], params[5], params[6], params[7], params[8]
@@ -169,19 +163,6 @@ def camera_point(state, mean, const, z, params, n, nu, jac_state, jac_landmark):
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _measure_stereo(place, z, params, n, nu):
-    """Residuals of (u_left, v, u_right); params are fx, fy, cx, cy and the baseline."""
-    fx, fy, cx, cy, baseline = params[0], params[1], params[2], params[3], params[4]
-    z0, z1, z2 = z[0], z[1], z[2]
-    for i in range(n):
-        x, y, depth = place[i], place[BLOCK + i], place[2 * BLOCK + i]
-        gx, gy = fx / depth, fy / depth
-        nu[i] = z0 - gx * x - cx
-        nu[BLOCK + i] = z1 - gy * y - cy
-        nu[2 * BLOCK + i] = z2 - gx * (x - baseline) - cx
-
-
-@njit(cache=True, error_model="numpy", inline="always")
 def _store_pixel(place, fx, fy, baseline, n, row):
     """A row by the state, of fx (x − baseline) / z + fy y / z."""
     for i in range(n):
@@ -196,28 +177,20 @@ def stereo_point(state, mean, const, z, params, n, nu, jac_state, jac_landmark):
     pose, by_point = flat(state), flat(jac_landmark)
     left, down, right = flat(jac_state[0]), flat(jac_state[1]), flat(jac_state[2])
     locate(pose, flat(mean), n, by_point)
-    _measure_stereo(by_point, z, params, n, flat(nu))
-    _store_pixel(by_point, params[0], 0.0, 0.0, n, left)
-    _store_pixel(by_point, 0.0, params[1], 0.0, n, down)
-    _store_pixel(by_point, params[0], 0.0, params[4], n, right)
+    fx, fy, cx, cy, baseline = params[0], params[1], params[2], params[3], params[4]
+    out, z0, z1, z2 = flat(nu), z[0], z[1], z[2]
+    for i in range(n):
+        x, y, depth = by_point[i], by_point[BLOCK + i], by_point[2 * BLOCK + i]
+        gx, gy = fx / depth, fy / depth
+        out[i] = z0 - gx * x - cx
+        out[BLOCK + i] = z1 - gy * y - cy
+        out[2 * BLOCK + i] = z2 - gx * (x - baseline) - cx
+    _store_pixel(by_point, fx, 0.0, 0.0, n, left)
+    _store_pixel(by_point, 0.0, fy, 0.0, n, down)
+    _store_pixel(by_point, fx, 0.0, baseline, n, right)
     turn(pose, left, n, by_point)
     turn(pose, down, n, by_point[3 * BLOCK :])
     turn(pose, right, n, by_point[6 * BLOCK :])
-
-
-@njit(cache=True, error_model="numpy", inline="always")
-def _locate_ray(pose, ray, anchor, n, place):
-    """As `locate`, of directions R_a (u, v, 1) + ρ (t_a − t)."""
-    for i in range(n):
-        r, s = _rotation_at(pose, i), _rotation_at(anchor, i)
-        u, v, rho = ray[i], ray[BLOCK + i], ray[2 * BLOCK + i]
-        a = s[0] * u + s[1] * v + s[2] + rho * (anchor[4 * BLOCK + i] - pose[4 * BLOCK + i])
-        b = s[3] * u + s[4] * v + s[5] + rho * (anchor[5 * BLOCK + i] - pose[5 * BLOCK + i])
-        c = s[6] * u + s[7] * v + s[8] + rho * (anchor[6 * BLOCK + i] - pose[6 * BLOCK + i])
-        x = r[0] * a + r[3] * b + r[6] * c
-        y = r[1] * a + r[4] * b + r[7] * c
-        place[i], place[BLOCK + i] = x, y
-        place[2 * BLOCK + i] = clamp_depth(x, y, r[2] * a + r[5] * b + r[8] * c)
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -253,7 +226,17 @@ def _both(state, mean, const, z, params, n, nu, jac_state, jac_landmark):
     """Residual and derivatives of the full 2-D measurement."""
     pose, ray, anchor, by_ray = flat(state), flat(mean), flat(const), flat(jac_landmark)
     across, down = flat(jac_state[0]), flat(jac_state[1])
-    _locate_ray(pose, ray, anchor, n, by_ray)
+    # As `locate`, of directions R_a (u, v, 1) + ρ (t_a − t).
+    for i in range(n):
+        r, s = _rotation_at(pose, i), _rotation_at(anchor, i)
+        u, v, rho = ray[i], ray[BLOCK + i], ray[2 * BLOCK + i]
+        a = s[0] * u + s[1] * v + s[2] + rho * (anchor[4 * BLOCK + i] - pose[4 * BLOCK + i])
+        b = s[3] * u + s[4] * v + s[5] + rho * (anchor[5 * BLOCK + i] - pose[5 * BLOCK + i])
+        c = s[6] * u + s[7] * v + s[8] + rho * (anchor[6 * BLOCK + i] - pose[6 * BLOCK + i])
+        x = r[0] * a + r[3] * b + r[6] * c
+        y = r[1] * a + r[4] * b + r[7] * c
+        by_ray[i], by_ray[BLOCK + i] = x, y
+        by_ray[2 * BLOCK + i] = clamp_depth(x, y, r[2] * a + r[5] * b + r[8] * c)
     measure(by_ray, z[0], z[1], params, n, flat(nu), across, down)
     _turn_ray(pose, anchor, across, n, by_ray)
     _turn_ray(pose, anchor, down, n, by_ray[3 * BLOCK :])
@@ -297,29 +280,6 @@ def epipolar_ray(state, mean, const, z, params, n, nu, jac_state, jac_landmark):
 _FLAGS = types.Array(boolean, 1, "C")
 
 
-@njit(cache=True, error_model="numpy")
-def _is_unique(u, v, z, params, radius, slope):
-    """Whether the distortion is one-to-one up to the direction (u, v), as `Pinhole.visible` asks."""
-    along, across, down = slope[0] * z / params[0], slope[1] * z / params[0], slope[2] * z / params[1]
-    one_way = along + down > 0.0 and along * down - across * across > 0.0
-    return math.hypot(u, v) < radius and one_way
-
-
-@njit(cache=True, error_model="numpy")
-def _is_alike(place, first_pose, pose, i, least_cosine, most_scale):
-    """Whether the line of sight and the distance are nearly those of the first sighting."""
-    w = place[i, 3]
-    a, b, along = 0.0, 0.0, 0.0
-    for k in range(3):
-        then, now = place[i, k] - w * first_pose[i, 4 + k], place[i, k] - w * pose[4 + k]
-        a += then * then
-        b += now * now
-        along += then * now
-    a, b = math.sqrt(a), math.sqrt(b)
-    scale = b / max(a, 1e-300)
-    return along >= least_cosine * max(a * b, 1e-300) and 1.0 / most_scale <= scale <= most_scale
-
-
 @njit(int64(MATRIX, MATRIX, _FLAGS, VECTOR, VECTOR, VECTOR, INDICES, MATRIX), cache=True, error_model="numpy")
 def in_view(place, first_pose, alive, pose, params, limits, rows, px):
     """Fills `rows` and their pixels `px` (rows, 2); returns how many there are.
@@ -342,9 +302,150 @@ def in_view(place, first_pose, alive, pose, params, limits, rows, px):
         u, v, d00, d01, _, _, d11, _ = project(x, y, z, params)
         if not (low <= u <= right and low <= v <= bottom):
             continue
-        if not _is_unique(x / z, y / z, z, params, limits[3], (d00, d01, d11)):
+        # The distortion must be one-to-one up to there, as `Pinhole.visible` asks.
+        along, across, down = d00 * z / params[0], d01 * z / params[0], d11 * z / params[1]
+        one_way = along + down > 0.0 and along * down - across * across > 0.0
+        if not (math.hypot(x / z, y / z) < limits[3] and one_way):
             continue
-        if _is_alike(place, first_pose, pose, i, limits[4], limits[5]):
+        # Line of sight and distance must nearly be those of the first observation.
+        a, b, along = 0.0, 0.0, 0.0
+        for k in range(3):
+            then, now = place[i, k] - w * first_pose[i, 4 + k], place[i, k] - w * pose[4 + k]
+            a += then * then
+            b += now * now
+            along += then * now
+        a, b = math.sqrt(a), math.sqrt(b)
+        scale = b / max(a, 1e-300)
+        alike = along >= limits[4] * max(a * b, 1e-300)
+        if alike and 1.0 / limits[5] <= scale <= limits[5]:
             rows[count], px[count, 0], px[count, 1] = i, u, v
             count += 1
     return count
+
+
+HEADER = KIND + 1
+"""Parameters before the points: the camera's."""
+_SMALL = 1e-2
+"""θ² below which the series of the coefficients are exact to rounding with the terms kept."""
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _coefficients(square):
+    """Of Exp: a = sin θ/θ, b = (1 − cos θ)/θ², c = (θ − sin θ)/θ³, and each one's derivative by θ²/2."""
+    s = square
+    if s < _SMALL:
+        a = 1.0 - s / 6.0 * (1.0 - s / 20.0 * (1.0 - s / 42.0 * (1.0 - s / 72.0)))
+        b = 0.5 - s / 24.0 * (1.0 - s / 30.0 * (1.0 - s / 56.0 * (1.0 - s / 90.0)))
+        c = 1.0 / 6.0 - s / 120.0 * (1.0 - s / 42.0 * (1.0 - s / 72.0 * (1.0 - s / 110.0)))
+        da = -1.0 / 3.0 + s / 30.0 * (1.0 - s / 28.0 * (1.0 - s / 54.0 * (1.0 - s / 88.0)))
+        db = -1.0 / 12.0 + s / 180.0 * (1.0 - 3.0 * s / 112.0 * (1.0 - 2.0 * s / 135.0))
+        dc = -1.0 / 60.0 + s / 1260.0 * (1.0 - s / 48.0 * (1.0 - 4.0 * s / 330.0))
+        return a, b, c, da, db, dc
+    angle = math.sqrt(s)
+    sine, cosine = math.sin(angle), math.cos(angle)
+    a, b, c = sine / angle, (1.0 - cosine) / s, (angle - sine) / (s * angle)
+    return a, b, c, (cosine - a) / s, (a - 2.0 * b) / s, (b - 3.0 * c) / s
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _cross(a, b):
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _turned(k1, k2, w, x):
+    """The sum x + k1 ω × x + k2 ω × (ω × x)."""
+    once = _cross(w, x)
+    twice = _cross(w, once)
+    return (
+        x[0] + k1 * once[0] + k2 * twice[0],
+        x[1] + k1 * once[1] + k2 * twice[1],
+        x[2] + k1 * once[2] + k2 * twice[2],
+    )
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _by_turn(g, k1, k2, d1, d2, w, x):
+    """gᵀ ∂/∂ω of `_turned`, where k1 and k2 change by d1 ω and d2 ω."""
+    once = _cross(w, x)
+    twice = _cross(w, once)
+    along = d1 * (g[0] * once[0] + g[1] * once[1] + g[2] * once[2])
+    along += d2 * (g[0] * twice[0] + g[1] * twice[1] + g[2] * twice[2])
+    first = _cross(x, g)
+    second = _cross(once, g)
+    third = _cross(x, _cross(g, w))
+    return (
+        k1 * first[0] + k2 * (second[0] + third[0]) + along * w[0],
+        k1 * first[1] + k2 * (second[1] + third[1]) + along * w[1],
+        k1 * first[2] + k2 * (second[2] + third[2]) + along * w[2],
+    )
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _view(project, state, mean, const, z, params, n, nu, jac_state, jac_landmark):
+    """`constellation_view` through one kind of lens."""
+    count = z.shape[0] // 2
+    for i in range(n):
+        r = rotation(state[0, i], state[1, i], state[2, i], state[3, i])
+        s = rotation(const[0, i], const[1, i], const[2, i], const[3, i])
+        w = (mean[0, i], mean[1, i], mean[2, i])
+        shift = (mean[3, i], mean[4, i], mean[5, i])
+        a, b, c, da, db, dc = _coefficients(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
+        moved = _turned(b, c, w, shift)
+        for k in range(count):
+            first = HEADER + 3 * k
+            x = (params[first], params[first + 1], params[first + 2])
+            t = _turned(a, b, w, x)
+            p0, p1, p2 = t[0] + moved[0], t[1] + moved[1], t[2] + moved[2]
+            u0 = s[0] * p0 + s[1] * p1 + s[2] * p2 + const[4, i] - state[4, i]
+            u1 = s[3] * p0 + s[4] * p1 + s[5] * p2 + const[5, i] - state[5, i]
+            u2 = s[6] * p0 + s[7] * p1 + s[8] * p2 + const[6, i] - state[6, i]
+            c0 = r[0] * u0 + r[3] * u1 + r[6] * u2
+            c1 = r[1] * u0 + r[4] * u1 + r[7] * u2
+            depth = clamp_depth(c0, c1, r[2] * u0 + r[5] * u1 + r[8] * u2)
+            px, py, d00, d01, d02, d10, d11, d12 = project(c0, c1, depth, params)
+            nu[2 * k, i] = z[2 * k] - px
+            nu[2 * k + 1, i] = z[2 * k + 1] - py
+            for row in range(2):
+                d = (d00, d01, d02) if row == 0 else (d10, d11, d12)
+                out = 2 * k + row
+                store_by_state(d[0], d[1], d[2], c0, c1, depth, flat(jac_state[out]), i)
+                e0 = d[0] * r[0] + d[1] * r[1] + d[2] * r[2]
+                e1 = d[0] * r[3] + d[1] * r[4] + d[2] * r[5]
+                e2 = d[0] * r[6] + d[1] * r[7] + d[2] * r[8]
+                g = (
+                    e0 * s[0] + e1 * s[3] + e2 * s[6],
+                    e0 * s[1] + e1 * s[4] + e2 * s[7],
+                    e0 * s[2] + e1 * s[5] + e2 * s[8],
+                )
+                turned = _by_turn(g, a, b, da, db, w, x)
+                carried = _by_turn(g, b, c, db, dc, w, shift)
+                back = (-w[0], -w[1], -w[2])
+                by_shift = _turned(b, c, back, g)
+                for f in range(3):
+                    jac_landmark[out, f, i] = turned[f] + carried[f]
+                    jac_landmark[out, 3 + f, i] = by_shift[f]
+
+
+@observation_kernel
+def constellation_view(state, mean, const, z, params, n, nu, jac_state, jac_landmark):
+    """Pixels of several exact points of one group; params: the camera's, then the points in the group's frame."""
+    if params[KIND] == 0.0:
+        _view(project_radial, state, mean, const, z, params, n, nu, jac_state, jac_landmark)
+    else:
+        _view(project_equidistant, state, mean, const, z, params, n, nu, jac_state, jac_landmark)
+
+
+@observation_kernel
+def members_view(state, mean, const, z, params, n, nu, jac_state, jac_landmark):
+    """Pixels of several points of one record (p_1, p_2, …); params: the camera's, then which points they are."""
+    pose, points = flat(state), flat(mean)
+    jac_landmark[:, :, :n] = 0.0
+    for k in range(z.shape[0] // 2):
+        own, out = 3 * int(params[HEADER + k]), 2 * k
+        across, down = flat(jac_state[out]), flat(jac_state[out + 1])
+        by_point = flat(jac_landmark[out])[own * BLOCK :]
+        locate(pose, points[own * BLOCK :], n, by_point)
+        measure(by_point, z[out], z[out + 1], params, n, flat(nu)[out * BLOCK :], across, down)
+        turn(pose, across, n, by_point)
+        turn(pose, down, n, flat(jac_landmark[out + 1])[own * BLOCK :])

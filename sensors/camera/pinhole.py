@@ -4,11 +4,10 @@ Order of the coefficients and pixel convention are OpenCV's: the centre of the t
 is that of `rbpf.sensors.camera.distortion`.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from numbers import Integral, Real
-from typing import Any, Self, final
+from typing import Self, final
 
 import numpy as np
 
@@ -54,12 +53,24 @@ class Pinhole:
 
     def __post_init__(self) -> None:
         for name in ("width", "height"):
-            _check_size(name, getattr(self, name))
+            size = getattr(self, name)
+            if isinstance(size, bool) or not isinstance(size, Integral) or int(size) <= 0:
+                expected = "must be a positive whole number of pixels"
+                raise InputError(f"the camera's {name} {expected}, got {size!r}")
         for name in ("fx", "fy", "cx", "cy"):
             _check_finite(f"the camera's {name}", getattr(self, name))
         if not (self.fx > 0.0 and self.fy > 0.0):
             raise InputError(f"the camera's fx and fy must be positive, got {self.fx!r} and {self.fy!r} px")
-        _check_lens(LENSES, self.distortion_model, self.distortion)
+        if self.distortion_model not in LENSES:
+            known = " or ".join(LENSES)
+            raise InputError(f"the camera's distortion_model must be {known}, got {self.distortion_model!r}")
+        names = LENSES[self.distortion_model].coefficient_names
+        if np.shape(self.distortion) != (len(names),):
+            left_out = " (k3 = 0 if there are four)" if len(names) == 5 else ""
+            expected = f"the {len(names)} numbers {', '.join(names)}{left_out}"
+            raise InputError(f"the camera's distortion must be {expected}, got {self.distortion!r}")
+        for name, number in zip(names, self.distortion, strict=True):
+            _check_finite(f"the camera's {name}", number)
         # A list from a file would make the camera unhashable.
         object.__setattr__(self, "distortion", tuple(self.distortion))
 
@@ -86,10 +97,6 @@ class Pinhole:
     def lens(self) -> Lens:
         """The distortion, in normalised coordinates."""
         return LENSES[self.distortion_model](self.distortion)  # type: ignore[arg-type]  # counted when made
-
-    @cached_property
-    def _size(self) -> np.ndarray:
-        return np.array([self.width, self.height])
 
     @property
     def monotonic_radius(self) -> float:
@@ -149,7 +156,7 @@ class Pinhole:
         The image reaches half a pixel beyond the centres of its outermost pixels.
         """
         px = np.asarray(px, float)
-        past = self._size - 0.5 - margin_px
+        past = np.array([self.width, self.height]) - 0.5 - margin_px
         within = (px >= margin_px - 0.5) & (px <= past)
         return within[..., 0] & within[..., 1]
 
@@ -229,26 +236,7 @@ def _normalise(point: np.ndarray) -> np.ndarray:
     return point[..., :2] / point[..., 2:]
 
 
-def _check_size(name: str, value: object) -> None:
-    """Refuses what is no positive whole number."""
-    if isinstance(value, bool) or not isinstance(value, Integral) or int(value) <= 0:
-        raise InputError(f"the camera's {name} must be a positive whole number of pixels, got {value!r}")
-
-
 def _check_finite(what: str, value: object) -> None:
     """Refuses what is no finite number."""
     if not isinstance(value, Real) or not np.isfinite(float(value)):
         raise InputError(f"{what} must be a finite number, got {value!r}")
-
-
-def _check_lens(lenses: Mapping[str, Any], model: str, distortion: Any) -> None:
-    """Refuses another model of distortion, and another number of coefficients than it has."""
-    if model not in lenses:
-        raise InputError(f"the camera's distortion_model must be {' or '.join(lenses)}, got {model!r}")
-    names = lenses[model].coefficient_names
-    if np.shape(distortion) != (len(names),):
-        left_out = " (k3 = 0 if there are four)" if len(names) == 5 else ""
-        expected = f"the {len(names)} numbers {', '.join(names)}{left_out}"
-        raise InputError(f"the camera's distortion must be {expected}, got {distortion!r}")
-    for name, number in zip(names, distortion, strict=True):
-        _check_finite(f"the camera's {name}", number)

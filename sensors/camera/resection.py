@@ -11,7 +11,6 @@ from rbpf.sensors.camera import Pinhole
 
 FLAT = 1e-3
 """Points whose second spread is below this fraction of the first lie on a line."""
-
 TRIPLES = 20
 """Triples of points that are tried; four points have four."""
 
@@ -44,39 +43,54 @@ def resect(camera: Pinhole, points: np.ndarray, px: np.ndarray) -> np.ndarray:
         raise InputError(
             "a known point is seen where the camera's distortion has no direction: check the calibration"
         )
-    poses = _candidates(points, uv)
-    costs = [_cost(pose, points, uv) for pose in poses]
-    if not costs or not np.isfinite(min(costs)):
+    # Local optima of the reprojection error, from the solutions of the first triples of points.
+    import cv2
+
+    matrices, eye = [], np.eye(3)
+    for triple in islice(combinations(range(points.shape[0]), 3), TRIPLES):
+        for turn, shift in _p3p(points[list(triple)], uv[list(triple)]):
+            matrices.append(_matrix(*cv2.solvePnPRefineLM(points, uv, eye, None, turn.copy(), shift.copy())))
+    # Their sums of squared residuals in normalised coordinates; infinite where a point is behind the camera.
+    poses = SE3.inverse(SE3.from_matrix(np.array(matrices).reshape(-1, 4, 4)))
+    seen = SE3.inverse_transform(poses[:, None], points)
+    with np.errstate(all="ignore"):
+        costs = np.square(seen[..., :2] / seen[..., 2:] - uv).sum(axis=(1, 2))
+    costs = np.where((seen[..., 2] > 0.0).all(axis=1) & np.isfinite(costs), costs, np.inf)
+    if not costs.size or not np.isfinite(costs.min()):
         raise InputError(
             "no camera in front of the known points sees them as measured: check their names and order"
         )
     return poses[int(np.argmin(costs))]
 
 
-def _candidates(points: np.ndarray, uv: np.ndarray) -> list[np.ndarray]:
-    """Local optima of the reprojection error, from the solutions of three points each (OpenCV's P3P)."""
+def three_point_poses(
+    points: np.ndarray, uv: np.ndarray, triples: int, rng: np.random.Generator
+) -> np.ndarray:
+    """Poses world_from_camera (C, 7) of three of the points (M, 3) each, seen at uv (M, 2), drawn `triples` times."""
+    matrices = []
+    for _ in range(triples):
+        rows = rng.choice(points.shape[0], 3, replace=False)
+        if np.isfinite(uv[rows]).all():
+            matrices += [_matrix(turn, shift) for turn, shift in _p3p(points[rows], uv[rows])]
+    return SE3.inverse(SE3.from_matrix(np.array(matrices).reshape(-1, 4, 4)))
+
+
+def _p3p(points: np.ndarray, uv: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """The solutions of three points (3, 3) seen at uv (3, 2): rotation vector and translation of camera_from_world."""
     import cv2
 
-    eye, poses = np.eye(3), []
-    for triple in islice(combinations(range(points.shape[0]), 3), TRIPLES):
-        rows = list(triple)
-        _, turns, shifts = cv2.solveP3P(points[rows], uv[rows], eye, None, flags=cv2.SOLVEPNP_AP3P)
-        for turn, shift in zip(turns, shifts, strict=True):
-            if not (np.isfinite(turn).all() and np.isfinite(shift).all()):
-                continue
-            turn, shift = cv2.solvePnPRefineLM(points, uv, eye, None, turn.copy(), shift.copy())
-            camera_from_world = np.eye(4)
-            camera_from_world[:3, :3], camera_from_world[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
-            poses.append(SE3.inverse(SE3.from_matrix(camera_from_world)))
-    return poses
+    _, turns, shifts = cv2.solveP3P(points, uv, np.eye(3), None, flags=cv2.SOLVEPNP_AP3P)
+    both = zip(turns, shifts, strict=True)
+    return [(turn, shift) for turn, shift in both if np.isfinite(turn).all() and np.isfinite(shift).all()]
 
 
-def _cost(world_from_camera: np.ndarray, points: np.ndarray, uv: np.ndarray) -> float:
-    """Sum of squared residuals in normalised coordinates; infinite where a point is behind the camera."""
-    x, y, z = SE3.inverse_transform(world_from_camera, points).T
-    if not (z > 0.0).all():
-        return float("inf")
-    return float(np.square(np.stack([x / z, y / z], axis=-1) - uv).sum())
+def _matrix(turn: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """(4, 4) of a rotation vector and a translation as OpenCV gives them."""
+    import cv2
+
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
+    return matrix
 
 
 ROUNDS = 10
@@ -126,70 +140,27 @@ def resect_consensus(
     poses = three_point_poses(points, camera.unproject(px), triples, rng)
     if not poses.shape[0]:
         return None
-    errors = _errors(camera, poses, points, px)
+    errors = squared_distances(camera, poses, _exact(points, px))
     # The truncated error tells apart poses that as many points agree with (P. Torr and A. Zisserman 2000).
     pose = poses[np.minimum(errors, within_px**2).sum(axis=1).argmin()]
     return refined(camera, pose, points, px, within_px)
 
 
-def three_point_poses(
-    points: np.ndarray, uv: np.ndarray, triples: int, rng: np.random.Generator
-) -> np.ndarray:
-    """Poses world_from_camera (C, 7) of three of the points (M, 3) each, seen at uv (M, 2) (OpenCV's P3P)."""
-    import cv2
-
-    matrices = []
-    for _ in range(triples):
-        rows = rng.choice(points.shape[0], 3, replace=False)
-        if not np.isfinite(uv[rows]).all():
-            continue
-        _, turns, shifts = cv2.solveP3P(points[rows], uv[rows], np.eye(3), None, flags=cv2.SOLVEPNP_AP3P)
-        for turn, shift in zip(turns, shifts, strict=True):
-            matrix = np.eye(4)
-            matrix[:3, :3], matrix[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
-            matrices.append(matrix)
-    stacked = np.array(matrices).reshape(-1, 4, 4)
-    return SE3.inverse(SE3.from_matrix(stacked[np.isfinite(stacked).all(axis=(1, 2))]))
-
-
-def _errors(camera: Pinhole, poses: np.ndarray, points: np.ndarray, px: np.ndarray) -> np.ndarray:
-    """Squared distances (C, M) [px²] between places and projections; infinite behind a camera."""
-    seen = SE3.inverse_transform(poses[:, None], points)
-    squared = np.square(camera.project(seen) - px).sum(axis=-1)
-    return np.where((seen[..., 2] > 0.0) & np.isfinite(squared), squared, np.inf)
-
-
 def refined(
     camera: Pinhole, pose: np.ndarray, points: np.ndarray, px: np.ndarray, within_px: float
 ) -> Resected | None:
-    """The camera near a first guess that points (M, 3) within so many px of where they are seen (M, 2) agree on.
+    """`refined_on_all` of points (M, 3) that are known and agree if they are seen (M, 2) within so many px."""
+    return refined_on_all(camera, pose, _exact(points, px), (within_px**2,) * (ROUNDS + 1))
 
-    Returns:
-        None where fewer than four agree, or they do not fix the camera.
-    """
-    for last in [False] * ROUNDS + [True]:
-        squared = _errors(camera, pose[None], points, px)[0]
-        inliers = squared <= within_px**2
-        seen = SE3.inverse_transform(pose, points[inliers])
-        if inliers.sum() < 4:
-            return None
-        by_pose = np.concatenate([skew(seen), np.broadcast_to(-np.eye(3), (len(seen), 3, 3))], axis=-1)
-        jac = camera.jacobian(seen) @ by_pose
-        information = np.einsum("kpa,kpb->ab", jac, jac)
-        if np.linalg.cond(information) > 1e12:
-            return None
-        if last:
-            break
-        miss = px[inliers] - camera.project(seen)
-        pose = SE3.retract(pose, np.linalg.solve(information, np.einsum("kpa,kp->a", jac, miss)))
-    rms = np.sqrt(squared[inliers].sum() / max(2 * inliers.sum() - 6, 1))
-    return Resected(pose, information, inliers, float(rms))
+
+def _exact(points: np.ndarray, px: np.ndarray) -> "Sights":
+    return Sights(points, np.zeros_like(points), px, np.ones(len(px)))
 
 
 GATE = 9.2
 """Squared Mahalanobis distance within which a point agrees: 99 % of two dimensions."""
-WIDER = (16.0, 16.0, 4.0, 4.0, 1.0, 1.0, 1.0, 1.0)
-"""Times the gate in each round of Gauss-Newton: a first guess may be some pixels off everywhere."""
+GATES = tuple(GATE * wider for wider in (16.0, 16.0, 4.0, 4.0, 1.0, 1.0, 1.0, 1.0, 1.0))
+"""Of each round of Gauss-Newton, and of the result: a first guess may be some pixels off everywhere."""
 
 
 @dataclass(frozen=True)
@@ -219,15 +190,23 @@ def squared_distances(camera: Pinhole, poses: np.ndarray, sights: Sights) -> np.
     return _compared(camera, poses, sights)[0]
 
 
-def refined_on_all(camera: Pinhole, pose: np.ndarray, sights: Sights) -> Resected | None:
+def refined_on_all(
+    camera: Pinhole, pose: np.ndarray, sights: Sights, gates: tuple[float, ...] = GATES
+) -> Resected | None:
     """The camera near a first guess (7,) that most points agree on; its information in 1/px², `rms_px` in σ.
+
+    Args:
+        camera: of the image.
+        pose: world_from_camera, the first guess.
+        sights: the points.
+        gates: squared distance within which a point agrees, in each round of Gauss-Newton and at its end.
 
     Returns:
         None where fewer than four agree, or they do not fix the camera.
     """
-    for wider in (*WIDER, None):
+    for rounds_left in range(len(gates))[::-1]:
         squared, miss, seen, white = (array[0] for array in _compared(camera, pose[None], sights))
-        inliers = squared <= GATE * (wider or 1.0)
+        inliers = squared <= gates[-1 - rounds_left]
         if inliers.sum() < 4:
             return None
         seen, white = seen[inliers], white[inliers]
@@ -236,7 +215,7 @@ def refined_on_all(camera: Pinhole, pose: np.ndarray, sights: Sights) -> Resecte
         information = np.einsum("kpa,kpb->ab", jac, jac)
         if np.linalg.cond(information) > 1e12:
             return None
-        if wider is not None:
+        if rounds_left:
             step = np.linalg.solve(information, np.einsum("kpa,kp->a", jac, miss[inliers]))
             pose = SE3.retract(pose, step)
     rms = np.sqrt(squared[inliers].sum() / max(2 * inliers.sum() - 6, 1))

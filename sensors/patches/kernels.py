@@ -16,32 +16,27 @@ from rbpf.kernels.signature import discard_stale
 
 @njit(cache=True, error_model="numpy")
 def warp_all(sources, affines, templates):
-    """Fills templates (K, size, size) from sources (K, S, S) and affines (K, 2, 2)."""
+    """Fills templates (K, size, size) from sources (K, S, S) and affines (K, 2, 2); NaN where one leaves its source."""
+    size, middle = templates.shape[1], 0.5 * (sources.shape[1] - 1)
+    templates[:] = np.nan
     for k in range(templates.shape[0]):
-        warp_one(sources[k], affines[k], templates[k])
-
-
-@njit(cache=True, error_model="numpy")
-def warp_one(source, affine, template):
-    """One template; NaN where its support leaves the source."""
-    size, middle = template.shape[0], 0.5 * (source.shape[0] - 1)
-    template[:] = np.nan
-    a, b, c, d = affine[0, 0], affine[0, 1], affine[1, 0], affine[1, 1]
-    if not math.isfinite(a * a + b * b + c * c + d * d):
-        return
-    samples = footprint(a, b, c, d, source.shape[0])
-    reach = 0.0
-    for s in range(samples.shape[0]):
-        reach = max(reach, abs(samples[s, 0]), abs(samples[s, 1]))
-    if max(abs(a) + abs(b), abs(c) + abs(d)) * (size // 2) + reach > middle:
-        return
-    for j in range(size):
-        for i in range(size):
-            dx, dy, total = float(i - size // 2), float(j - size // 2), 0.0
-            x, y = middle + a * dx + b * dy, middle + c * dx + d * dy
-            for s in range(samples.shape[0]):
-                total += cubic(source, x + samples[s, 0], y + samples[s, 1])
-            template[j, i] = total / samples.shape[0]
+        source = sources[k]
+        a, b, c, d = affines[k, 0, 0], affines[k, 0, 1], affines[k, 1, 0], affines[k, 1, 1]
+        if not math.isfinite(a * a + b * b + c * c + d * d):
+            continue
+        samples = footprint(a, b, c, d, source.shape[0])
+        reach = 0.0
+        for s in range(samples.shape[0]):
+            reach = max(reach, abs(samples[s, 0]), abs(samples[s, 1]))
+        if max(abs(a) + abs(b), abs(c) + abs(d)) * (size // 2) + reach > middle:
+            continue
+        for j in range(size):
+            for i in range(size):
+                dx, dy, total = float(i - size // 2), float(j - size // 2), 0.0
+                x, y = middle + a * dx + b * dy, middle + c * dx + d * dy
+                for s in range(samples.shape[0]):
+                    total += cubic(source, x + samples[s, 0], y + samples[s, 1])
+                templates[k, j, i] = total / samples.shape[0]
 
 
 @njit(cache=True, error_model="numpy")
@@ -178,7 +173,12 @@ def score_ellipse(image, unit, size, centre, cov, sigmas, columns, rows, scores)
             _correlate(grey[y : y + size], unit, start, count, cross)
             _window_sums(sums[start:], size, count, window)
             _window_sums(squares[start:], size, count, window_squares)
-            _divide(cross, window, window_squares, size * size, scores[y, start : start + count])
+            # Scores from Σ unit · grey and the windows' sums, whose variance is exact.
+            n = size * size
+            for x in range(count):
+                spread = float(n) * window_squares[x] - float(window[x]) * float(window[x])
+                score = cross[x] * math.sqrt(n / max(spread, 1.0))
+                scores[y, start + x] = np.float32(min(score, 1.0)) if spread > 0.0 else np.float32(-1.0)
         _slide(image[top + y, left:], -1, sums, squares)
 
 
@@ -234,15 +234,6 @@ def _correlate(grey, unit, start, count, cross):
                 cross[x] += a * row[x] + b * row[x + 1] + c * row[x + 2] + d * row[x + 3]
 
 
-@njit(cache=True, error_model="numpy")
-def _divide(cross, sums, squares, n, out):
-    """Scores from Σ unit · grey and the windows' sums, whose variance is exact."""
-    for x in range(out.shape[0]):
-        spread = float(n) * squares[x] - float(sums[x]) * float(sums[x])
-        score = cross[x] * math.sqrt(n / max(spread, 1.0))
-        out[x] = np.float32(min(score, 1.0)) if spread > 0.0 else np.float32(-1.0)
-
-
 _EVALUATIONS = 12
 _SINGULAR = 1e-9
 """Determinant of JᵀJ over the product of its diagonal, below which the window has slopes along one line only."""
@@ -263,7 +254,14 @@ def refine(image, unit, size, column, row, found):
     that the caller wrote stay, and the covariance is NaN.
     """
     found[0], found[1], found[4:] = float(column), float(row), np.nan
-    area = _area(image, size, column, row)
+    # Grey levels around the window, the image's border repeated.
+    side = size + 2 * _MARGIN
+    area = np.empty((side, side), np.float32)
+    top, left = row - size // 2 - _MARGIN, column - size // 2 - _MARGIN
+    for j in range(side):
+        v = min(max(top + j, 0), image.shape[0] - 1)
+        for i in range(side):
+            area[j, i] = image[v, min(max(left + i, 0), image.shape[1] - 1)]
     window, w = np.empty((size + 2, size + 2), np.float32), np.empty((size, size), np.float32)
     x, y, du, dv, highest = 0.0, 0.0, 0.0, 0.0, -1.0
     uu, uv, vv = 0.0, 0.0, 0.0
@@ -283,35 +281,15 @@ def refine(image, unit, size, column, row, found):
         if max(abs(du), abs(dv)) < _SETTLED_PX:
             break
     found[0], found[1], found[2] = column + x + du, row + y + dv, highest
-    _store_cov(uu, uv, vv, highest, size * size, found)
-
-
-@njit(cache=True, error_model="numpy")
-def _store_cov(uu, uv, vv, rho, n, found):
-    """The residual's variance times (JᵀJ)⁻¹, and the interpolation's own error; NaN where noise explains the slopes.
-
-    Half of the residual is taken as the window's noise. A central difference halves its variance: a quarter of the
-    residual's square sum is what noise adds to each diagonal element of JᵀJ.
-    """
-    unexplained = max(1.0 - rho * rho, 0.0)
-    variance, uu, vv = unexplained / (n - 4), uu - 0.25 * unexplained, vv - 0.25 * unexplained
+    # The residual's variance times (JᵀJ)⁻¹, and the interpolation's own error. Half of the residual is taken as the window's
+    # noise: a central difference halves its variance, so that a quarter of the residual's square sum is what noise adds to
+    # each diagonal element of JᵀJ. Where noise explains the slopes the covariance stays NaN.
+    unexplained = max(1.0 - highest * highest, 0.0)
+    variance, uu, vv = unexplained / (size * size - 4), uu - 0.25 * unexplained, vv - 0.25 * unexplained
     determinant, least = uu * vv - uv * uv, _INTERPOLATION_PX * _INTERPOLATION_PX
     if uu > 0.0 and determinant > 0.0:
         found[4], found[5] = variance * vv / determinant + least, -variance * uv / determinant
         found[6] = variance * uu / determinant + least
-
-
-@njit(cache=True, error_model="numpy")
-def _area(image, size, column, row):
-    """Grey levels around a window, the image's border repeated."""
-    side = size + 2 * _MARGIN
-    area = np.empty((side, side), np.float32)
-    top, left = row - size // 2 - _MARGIN, column - size // 2 - _MARGIN
-    for j in range(side):
-        v = min(max(top + j, 0), image.shape[0] - 1)
-        for i in range(side):
-            area[j, i] = image[v, min(max(left + i, 0), image.shape[1] - 1)]
-    return area
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
@@ -381,7 +359,7 @@ discard_stale(Path(__file__).parent)
 
 @njit(cache=True, error_model="numpy", parallel=True)
 def search_all(image, templates, centres, covs, limits, found):
-    """Fills found (K, 7) = u, v, score, second score, cov_uu, cov_uv, cov_vv.
+    """Fills found (K, 7) = u, v, score, second score, cov_uu, cov_uv, cov_vv, of one template in one ellipse each.
 
     limits = (sigmas, most_px, least_std). What was not found keeps what the caller put there.
     """
@@ -401,7 +379,11 @@ def search_one(image, template, centre, cov, limits, found):
         return
     scores = np.full((height, width), OUTSIDE, np.float32)
     score_ellipse(image, unit, template.shape[0], centre, cov, limits[0], columns, rows, scores)
-    v, u = best(scores)
+    v, u, highest = 0, 0, scores[0, 0]
+    for y in range(height):
+        for x in range(width):
+            if scores[y, x] > highest:
+                v, u, highest = y, x, scores[y, x]
     if scores[v, u] <= -1.0:
         return
     found[2] = scores[v, u]
@@ -410,16 +392,11 @@ def search_one(image, template, centre, cov, limits, found):
     if p >= 0:
         other = np.full(found.shape[0], float(scores[p, q]))
         refine(image, unit, template.shape[0], columns[0] + q, rows[0] + p, other)
-        keep_better(found, other)
-
-
-@njit(cache=True, error_model="numpy")
-def keep_better(found, other):
-    """The better of two peaks, with the other one's score as the second."""
-    found[3] = other[2]
-    if other[2] > found[2]:
-        other[3] = found[2]
-        found[:] = other
+        # The better of two peaks, with the other one's score as the second.
+        found[3] = other[2]
+        if other[2] > found[2]:
+            other[3] = found[2]
+            found[:] = other
 
 
 @njit(cache=True, error_model="numpy")
@@ -445,34 +422,15 @@ def _clipped(centre, reach, first, last):
 
 
 @njit(cache=True, error_model="numpy")
-def best(scores):
-    """Row and column of the highest score, the first of equal ones."""
-    row, column, highest = 0, 0, scores[0, 0]
-    for y in range(scores.shape[0]):
-        for x in range(scores.shape[1]):
-            if scores[y, x] > highest:
-                row, column, highest = y, x, scores[y, x]
-    return row, column
-
-
-@njit(cache=True, error_model="numpy")
 def second(scores, row, column):
     """Row and column of the highest peak elsewhere, −1 where there is none."""
     height, width = scores.shape
     v, u, highest = -1, -1, np.float32(-1.0)
     for y in range(height):
         for x in range(width):
-            apart = max(abs(y - row), abs(x - column)) >= APART_PX
-            if scores[y, x] > highest and apart and _is_peak(scores, y, x):
+            if not (scores[y, x] > highest and max(abs(y - row), abs(x - column)) >= APART_PX):
+                continue
+            # A peak has no searched neighbour that scores higher.
+            if scores[y, x] == scores[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2].max():
                 v, u, highest = y, x, scores[y, x]
     return v, u
-
-
-@njit(cache=True, error_model="numpy")
-def _is_peak(scores, row, column):
-    """Whether no searched neighbour scores higher."""
-    for y in range(max(row - 1, 0), min(row + 2, scores.shape[0])):
-        for x in range(max(column - 1, 0), min(column + 2, scores.shape[1])):
-            if scores[y, x] > scores[row, column]:
-                return False
-    return True

@@ -129,41 +129,28 @@ def search(
     image = checked_image(image)
     templates = np.ascontiguousarray(templates, np.float32)
     centres, covs = np.ascontiguousarray(centres, float), np.ascontiguousarray(covs, float)
-    limits = (float(sigmas), float(most_px), float(least_std))
-    _check_search(templates, centres, covs, limits)
-    count = templates.shape[0]
-    found = np.full((count, 7), np.nan)
-    found[:, 2:4] = -1.0
-    pairs = _pairs(image, templates, covs, limits)
-    run_driver(search_all, pairs, image, templates, centres, covs, limits, found)
-    return PatchMatches(found[:, :2], found[:, 2], found[:, 3], found[:, [4, 5, 5, 6]].reshape(count, 2, 2))
-
-
-def _check_search(
-    templates: np.ndarray, centres: np.ndarray, covs: np.ndarray, limits: tuple[float, float, float]
-) -> None:
-    count, sigmas, most_px, _ = templates.shape[0], *limits
+    limits, count = (float(sigmas), float(most_px), float(least_std)), templates.shape[0]
     if templates.ndim != 3 or templates.shape[1] != templates.shape[2] or not _fits(templates.shape[1]):
         expected = f"(K, size, size) with an odd size from 3 to {LARGEST_SIZE}"
         raise InputError(f"templates must be {expected}, got {templates.shape}")
     if centres.shape != (count, 2) or covs.shape != (count, 2, 2):
         expected = f"centres ({count}, 2) and covs ({count}, 2, 2), one for each template"
         raise InputError(f"a search needs {expected}, got {centres.shape} and {covs.shape}")
-    if not (0.0 < sigmas < np.inf and most_px >= 0.0):
-        raise InputError(f"sigmas must be positive and most_px not negative, got {sigmas!r} and {most_px!r}")
+    if not (0.0 < limits[0] < np.inf and limits[1] >= 0.0):
+        given = f"{limits[0]!r} and {limits[1]!r}"
+        raise InputError(f"sigmas must be positive and most_px not negative, got {given}")
+    found = np.full((count, 7), np.nan)
+    found[:, 2:4] = -1.0
+    # What it costs, in the unit of `rbpf.kernels.signature`.
+    variance = np.nan_to_num(np.maximum(covs[:, [0, 1], [0, 1]], 0.0))
+    reach = np.minimum(limits[0] * np.sqrt(variance), limits[1])
+    sides = np.minimum(2.0 * reach + 1.0, image.shape[::-1])
+    products = float(sides.prod(axis=1).sum()) * templates.shape[1] ** 2
+    pairs = int(products * PAIRS_PER_PRODUCT + count * PAIRS_PER_TEMPLATE)
+    run_driver(search_all, pairs, image, templates, centres, covs, limits, found)
+    return PatchMatches(found[:, :2], found[:, 2], found[:, 3], found[:, [4, 5, 5, 6]].reshape(count, 2, 2))
 
 
 def _fits(size: int) -> bool:
     """Whether a template may have this size."""
     return 3 <= size <= LARGEST_SIZE and size % 2 == 1
-
-
-def _pairs(
-    image: np.ndarray, templates: np.ndarray, covs: np.ndarray, limits: tuple[float, float, float]
-) -> int:
-    """What a search costs, in the unit of `rbpf.kernels.signature`."""
-    variance = np.nan_to_num(np.maximum(covs[:, [0, 1], [0, 1]], 0.0))
-    reach = np.minimum(limits[0] * np.sqrt(variance), limits[1])
-    sides = np.minimum(2.0 * reach + 1.0, image.shape[::-1])
-    products = float(sides.prod(axis=1).sum()) * templates.shape[1] ** 2
-    return int(products * PAIRS_PER_PRODUCT + len(templates) * PAIRS_PER_TEMPLATE)

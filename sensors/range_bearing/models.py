@@ -13,7 +13,7 @@ from typing import final
 import numpy as np
 
 from rbpf.core.models import FusedKernel, Jacobians, ObservationModel
-from rbpf.lie import SE2Group, SE3Group
+from rbpf.lie import SE2Group, SE3Group, skew
 
 
 class RigidPointModel(ObservationModel):
@@ -71,7 +71,13 @@ class RigidPointModel(ObservationModel):
         slope = self.measure_jacobian(self.space.inverse_transform(self.robot_from_sensor, in_robot))
         slope = slope @ np.swapaxes(self.space.rotation(self.robot_from_sensor), -1, -2)
         by_landmark = slope @ np.swapaxes(self.space.rotation(state), -1, -2)
-        return Jacobians(np.concatenate([_by_rotation(slope, in_robot), -slope], axis=-1), by_landmark)
+        # ∂p/∂ω is (y, −x) in the plane and [p]× in space.
+        if in_robot.shape[-1] == 2:
+            turned = np.stack([in_robot[..., 1], -in_robot[..., 0]], axis=-1)
+            by_rotation = (slope @ turned[..., None])[..., :1]
+        else:
+            by_rotation = slope @ skew(in_robot)
+        return Jacobians(np.concatenate([by_rotation, -slope], axis=-1), by_landmark)
 
     def invert(self, state: np.ndarray, z: np.ndarray) -> np.ndarray:
         """The chain backwards."""
@@ -81,17 +87,6 @@ class RigidPointModel(ObservationModel):
     def mounting(self) -> np.ndarray:
         """Parameters of the fused kernels: rotation of the mounting pose by rows, then its translation."""
         return self._mounting
-
-
-def _by_rotation(slope: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """D ∂p/∂ω, with ∂p/∂ω = (y, −x) in the plane and [p]× in space."""
-    if point.shape[-1] == 2:
-        turned = np.stack([point[..., 1], -point[..., 0]], axis=-1)
-        return (slope @ turned[..., None])[..., :1]
-    x, y, z = (point[..., i] for i in range(3))
-    zero = np.zeros_like(x)
-    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*point.shape, 3)
-    return slope @ cross
 
 
 def wrap_angle(angle: np.ndarray) -> np.ndarray:

@@ -1,4 +1,8 @@
-"""Readers of recordings: robot logs, image sequences of one camera or two, known points."""
+"""Readers of recordings: robot logs, image sequences of one camera or two, known points.
+
+What is missing, or not as the module of a format describes it, is an InputError that names file and line in one sentence,
+from whatever function here reads it.
+"""
 
 from rbpf.sensors.readers.formats import open_images, open_log, open_stereo
 from rbpf.sensors.readers.images.sequence import ImageFrame, ImageSequence, Topics

@@ -1,7 +1,6 @@
 """Recognises the format of a recording and opens it: another format is one file, and one line here."""
 
 import logging
-from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from rbpf.errors import InputError
@@ -26,7 +25,6 @@ from rbpf.sensors.readers.victoria_park import VictoriaPark
 
 ROBOT_LOGS: tuple[RobotLogFormat, ...] = (Mrpt(), Mrclam(), VictoriaPark())
 """The first that recognises a recording reads it."""
-
 IMAGES: tuple[ImageFormat, ...] = (
     RosBag(),
     Tum(),
@@ -38,14 +36,11 @@ IMAGES: tuple[ImageFormat, ...] = (
     Folder(),
 )
 """The first that recognises a recording reads it."""
-
 _log = logging.getLogger(__name__)
 
 
 def open_log(path: str | Path, noise: LogNoise | None = None) -> RobotLog:
-    """Read a robot log of any known format: MRPT, MRCLAM or a graph such as Victoria Park.
-
-    The modules of the readers describe the formats.
+    """Read a robot log of any known format, which the modules of the readers describe.
 
     Args:
         path: the log's folder or file.
@@ -58,7 +53,8 @@ def open_log(path: str | Path, noise: LogNoise | None = None) -> RobotLog:
     for one in ROBOT_LOGS:
         if one.recognises(path):
             return one.read(path, noise or LogNoise())
-    raise InputError(f"{path}: found {_content(path, first_line=True)}, expected {_kinds(ROBOT_LOGS)}.")
+    kinds = "; or ".join(one.kind for one in ROBOT_LOGS)
+    raise InputError(f"{path}: found {_content(path, first_line=True)}, expected {kinds}.")
 
 
 def open_images(
@@ -79,7 +75,7 @@ def open_images(
             is malformed; a topic is named that is not there.
     """
     options = ReadOptions(None if calibration is None else Path(calibration), topics)
-    return _opened(_existing(path, "an image sequence"), IMAGES, options, lambda one: one.read)
+    return _opened(_existing(path, "an image sequence"), options, stereo=False)
 
 
 def open_stereo(
@@ -107,19 +103,14 @@ def open_stereo(
             to the right of the left one.
     """
     options = ReadOptions(None if calibration is None else Path(calibration), topics, tolerance_s)
-    formats = tuple(one for one in IMAGES if one.stereo_kind)
-    sequence = _opened(_existing(path, "a stereo sequence"), formats, options, lambda one: one.read_stereo)
+    sequence = _opened(_existing(path, "a stereo sequence"), options, stereo=True)
     for note in sequence.notes:
         _log.warning("%s", note)
     return sequence
 
 
-def _opened(
-    path: Path,
-    formats: tuple[ImageFormat, ...],
-    options: ReadOptions,
-    way: Callable[[ImageFormat], Callable[[Path, ReadOptions], ImageSequence]],
-) -> ImageSequence:
+def _opened(path: Path, options: ReadOptions, stereo: bool) -> ImageSequence:
+    formats = [one for one in IMAGES if one.stereo_kind or not stereo]
     for one in formats:
         if not one.recognises(path):
             continue
@@ -127,14 +118,9 @@ def _opened(
             name, value = next(iter(given.items()))
             problem = f"{name.replace('_', ' ')} {value} is given, but only ROS bags have topics"
             raise InputError(f"{path}: {problem}; leave it out.")
-        return way(one)(path, options)
-    stereo = formats is not IMAGES
+        return one.read_stereo(path, options) if stereo else one.read(path, options)
     kinds = "; or ".join(one.stereo_kind if stereo else one.kind for one in formats)
     raise InputError(f"{path}: found {_content(path)}, expected {kinds}.")
-
-
-def _kinds(formats: Iterable[RobotLogFormat]) -> str:
-    return "; or ".join(one.kind for one in formats)
 
 
 def _existing(path: str | Path, what: str) -> Path:

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from rbpf.errors import InputError
-from rbpf.sensors.readers.text import Table, line_error, parse_table, quoted, read_lines
+from rbpf.sensors.readers.text import line_error, parse_table, quoted, read_lines
 
 COLUMNS = ("id", "u_px", "v_px", "x_m", "y_m", "z_m", "sigma_m")
 
@@ -60,7 +60,22 @@ def read_known_points(path: str | Path) -> KnownPixels:
     Raises:
         InputError: the file is missing, a column is, or a line is not as described above.
     """
-    table = _read_table(Path(path))
+    path = Path(path)
+    numbered = enumerate(read_lines(path, f"a table with the columns {', '.join(COLUMNS)}"), 1)
+    rows = [(i, line) for i, line in numbered if line.strip() and not line.lstrip().startswith("#")]
+    line, header = rows[0] if rows else (1, "")
+    names = [name.strip() for name in header.split(",")]
+    if any(names.count(column) != 1 for column in COLUMNS):
+        expected = f"expected a header with the columns {','.join(COLUMNS)}, each once"
+        raise line_error(path, line, f"{expected}, found {quoted(header)}")
+    picked = []
+    for i, row in rows[1:]:
+        fields = row.split(",")
+        if len(fields) != len(names):
+            problem = f"expected {len(names)} columns as in the header, found {len(fields)}"
+            raise line_error(path, i, problem)
+        picked.append((i, ",".join(fields[names.index(column)] for column in COLUMNS)))
+    table = parse_table(path, COLUMNS, picked, ",")
     table.require(table["sigma_m"] >= 0.0, "sigma_m", "zero or positive")
     return KnownPixels(
         names=table.names("id"),
@@ -68,25 +83,3 @@ def read_known_points(path: str | Path) -> KnownPixels:
         positions=table.block("x_m", "z_m"),
         std_m=table["sigma_m"],
     )
-
-
-def _read_table(path: Path) -> Table:
-    numbered = enumerate(read_lines(path, f"a table with the columns {', '.join(COLUMNS)}"), 1)
-    rows = [(i, line) for i, line in numbered if line.strip() and not line.lstrip().startswith("#")]
-    line, header = rows[0] if rows else (1, "")
-    names = [name.strip() for name in header.split(",")]
-    for column in COLUMNS:
-        if names.count(column) != 1:
-            expected = f"expected a header with the columns {','.join(COLUMNS)}, each once"
-            raise line_error(path, line, f"{expected}, found {quoted(header)}")
-    places = [names.index(column) for column in COLUMNS]
-    picked = [(i, ",".join(_pick(path, i, row, names, places))) for i, row in rows[1:]]
-    return parse_table(path, COLUMNS, picked, ",")
-
-
-def _pick(path: Path, line: int, row: str, names: list[str], places: list[int]) -> list[str]:
-    fields = row.split(",")
-    if len(fields) != len(names):
-        problem = f"expected {len(names)} columns as in the header, found {len(fields)}"
-        raise line_error(path, line, problem)
-    return [fields[place] for place in places]

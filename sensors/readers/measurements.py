@@ -7,11 +7,9 @@ from typing import Literal, NamedTuple, final
 import numpy as np
 from numpy.typing import NDArray
 
-from rbpf import gaussian
 from rbpf.errors import InputError
 from rbpf.lie import Array, SE2Group, SE3Group
 from rbpf.sensors.range_bearing import RangeBearing, RelativePosition
-from rbpf.sensors.readers import Frame, RobotLog
 from rbpf.sensors.readers.text import LARGEST
 
 Kind = Literal["range_bearing", "position"]
@@ -67,7 +65,25 @@ class Measurements:
         if self.measurement not in KINDS or self.pitch_sign not in (-1.0, 1.0):
             expected = f"a measurement {' or '.join(KINDS)} and a pitch sign 1 or -1"
             raise InputError(f"Expected {expected}, found {self.measurement!r} and {self.pitch_sign!r}.")
-        self._require_shapes()
+        # Shapes.
+        size, dim, point = self.space.size, self.space.dim, point_dim(self.space)
+        moves, count = max(len(self.stamps_ns) - 1, 0), len(self.steps)
+        expected_shapes = {
+            "robot_from_sensor": (size,),
+            "start": (size,),
+            "stamps_ns": (moves + 1,),
+            "deltas": (moves, size),
+            "covs": (moves, dim, dim),
+            "steps": (count,),
+            "landmarks": (count,),
+            "z": (count, point),
+            "cov_z": (count, point, point),
+        }
+        for name, shape in expected_shapes.items():
+            found = getattr(self, name).shape
+            if found != shape:
+                raise InputError(f"Expected {name} of shape {shape}, found {found}.")
+        # Values.
         if ((self.steps < 0) | (self.steps >= len(self.stamps_ns))).any():
             raise InputError(f"Expected the steps of sightings from 0 to {len(self.stamps_ns) - 1}.")
         if (np.diff(self.stamps_ns) < 0).any():
@@ -85,25 +101,6 @@ class Measurements:
                     f"Expected covariances in {name}, found another matrix in row {row} (from 0)."
                 )
 
-    def _require_shapes(self) -> None:
-        size, dim, point = self.space.size, self.space.dim, point_dim(self.space)
-        moves, count = max(len(self.stamps_ns) - 1, 0), len(self.steps)
-        expected = {
-            "robot_from_sensor": (size,),
-            "start": (size,),
-            "stamps_ns": (moves + 1,),
-            "deltas": (moves, size),
-            "covs": (moves, dim, dim),
-            "steps": (count,),
-            "landmarks": (count,),
-            "z": (count, point),
-            "cov_z": (count, point, point),
-        }
-        for name, shape in expected.items():
-            found = getattr(self, name).shape
-            if found != shape:
-                raise InputError(f"Expected {name} of shape {shape}, found {found}.")
-
     def model(self) -> RangeBearing | RelativePosition:
         """The observation model, the same one that the filter uses."""
         if self.measurement == "position":
@@ -116,38 +113,6 @@ class InitialEstimate(NamedTuple):
 
     world_from_robot: Array
     landmarks: Mapping[int, Array]
-
-
-def from_log(log: RobotLog, start: Array | None = None) -> Measurements:
-    """All measurements of a log whose association is known; landmarks keep the log's names.
-
-    Args:
-        log: the recording.
-        start: (E,) known world_from_robot of the first frame; by default the origin.
-
-    Raises:
-        InputError: the log is empty, of another group, or lacks odometry.
-    """
-    if not isinstance(log.space, SE2Group | SE3Group) or log.measurement not in KINDS or not log.frames:
-        raise InputError(f"{log.name}: expected frames with sightings of {' or '.join(KINDS)} in SE2 or SE3.")
-    space = log.space
-    moves = [_odometry(log, step) for step in range(1, len(log.frames))]
-    point = point_dim(space)
-    return Measurements(
-        recording=log.name,
-        space=space,
-        measurement=KINDS[log.measurement],
-        pitch_sign=log.pitch_sign,
-        robot_from_sensor=log.robot_from_sensor,
-        start=space.identity() if start is None else start,
-        stamps_ns=np.array([frame.stamp_ns for frame in log.frames], dtype=np.int64),
-        deltas=np.array([delta for delta, _ in moves]).reshape(-1, space.size),
-        covs=gaussian.symmetrise(np.array([cov for _, cov in moves]).reshape(-1, space.dim, space.dim)),
-        steps=np.repeat(np.arange(len(log.frames)), [len(frame.z) for frame in log.frames]),
-        landmarks=_stacked(log.frames, "landmarks", ()).astype(np.int64),
-        z=_stacked(log.frames, "z", (point,)),
-        cov_z=gaussian.symmetrise(_stacked(log.frames, "cov_z", (point, point))),
-    )
 
 
 def dead_reckoning(m: Measurements) -> Array:
@@ -185,14 +150,3 @@ def are_poses(space: SE2Group | SE3Group, poses: Array) -> NDArray[np.bool_]:
     if isinstance(space, SE2Group):
         return np.ones(len(poses), dtype=bool)
     return np.abs(np.linalg.norm(poses[:, :4], axis=1) - 1.0) <= _UNIT
-
-
-def _odometry(log: RobotLog, step: int) -> tuple[Array, Array]:
-    frame = log.frames[step]
-    if frame.delta is None or frame.cov_delta is None:
-        raise InputError(f"{log.name}: frame {step} has no odometry, expected it in all after the first.")
-    return frame.delta, frame.cov_delta
-
-
-def _stacked(frames: list[Frame], field: str, shape: tuple[int, ...]) -> Array:
-    return np.concatenate([np.reshape(getattr(frame, field), (-1, *shape)) for frame in frames])

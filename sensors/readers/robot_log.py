@@ -122,12 +122,7 @@ class LogNoise:
                 raise InputError(f"LogNoise: expected {name} to be {expected}, found {value}.")
 
     def require_only(self, applicable: Collection[str], path: Path, kind: str) -> None:
-        """Refuse what would have no effect.
-
-        Args:
-            applicable: names of the fields that the log can use.
-            path: where the log lies.
-            kind: what the log is, for the message.
+        """Refuse what would have no effect on a log at a path, of a kind that takes the fields of these names.
 
         Raises:
             InputError: another field is given.
@@ -171,11 +166,7 @@ class RobotLogFormat(ABC):
 
 
 def std_column(table: Table, column: str, given: float | None) -> Array:
-    """(n,) a column of standard deviations, or the given one in its place.
-
-    Raises:
-        InputError: the column holds a negative one, or a zero and nothing is given in its place.
-    """
+    """(n,) a column of standard deviations, or the given one in its place, with which zeros pass."""
     if given is None:
         table.require(table[column] > 0, column, "positive")
         return table[column]
@@ -189,28 +180,16 @@ def diagonal(std: list[Array]) -> Array:
 
 
 def require_ranges(table: Table, distance: str, *angles: str) -> None:
-    """Refuse ranges that are not positive and angles beyond a turn, which are probably degrees.
-
-    Raises:
-        InputError: names the first line that holds one.
-    """
+    """Refuse ranges that are not positive and angles beyond a turn, which are probably degrees."""
     table.require(table[distance] > 0, distance, "positive")
     for angle in angles:
         table.require(np.abs(table[angle]) <= 2 * np.pi, angle, "in radians, within a turn")
 
 
 def read_covariances(table: Table, first: str, last: str) -> Array:
-    """Symmetric matrices (n, d, d) from the columns of their upper triangle, row by row.
+    """Symmetric matrices (n, d, d) from the columns of their upper triangle, row by row, from the first to the last entry.
 
     A matrix that is positive semi-definite up to the rounding of its printed digits passes.
-
-    Args:
-        table: n rows.
-        first: column of the first entry.
-        last: column of the last entry.
-
-    Raises:
-        InputError: a matrix is not positive semi-definite.
     """
     triangle = table.block(first, last)
     dim = int(np.sqrt(2 * triangle.shape[1]))
@@ -232,7 +211,7 @@ def read_covariances(table: Table, first: str, last: str) -> Array:
 
 
 def planar_to_chart(delta: Array, cov: Array) -> Array:
-    """Covariance of additive errors of (x, y, heading) in the right chart at delta.
+    """Covariance (n, 3, 3), order omega, v, in the right chart at delta, of additive errors of (x, y, heading).
 
     delta Exp(xi) has the translation t + R v and the heading phi + omega to first order, so omega = d phi and
     v = R^T d t.
@@ -240,9 +219,6 @@ def planar_to_chart(delta: Array, cov: Array) -> Array:
     Args:
         delta: (n, 3) elements of SE(2).
         cov: (n, 3, 3) covariance in the order x, y, heading.
-
-    Returns:
-        (n, 3, 3) covariance in the order omega, v.
     """
     jacobian = np.zeros((len(delta), 3, 3))
     jacobian[:, 0, 2] = 1.0
@@ -251,7 +227,7 @@ def planar_to_chart(delta: Array, cov: Array) -> Array:
 
 
 def spatial_to_chart(delta: Array, ypr: Array, cov: Array) -> Array:
-    """Covariance of additive errors of (x, y, z, yaw, pitch, roll) in the right chart at delta.
+    """Covariance (n, 6, 6), order omega, v, in the right chart at delta, of additive errors of position and angles.
 
     For R = Rz(yaw) Ry(pitch) Rx(roll) the body's angular rate is
     omega = Rx^T (Ry^T e_z d yaw + e_y d pitch) + e_x d roll; the translation part is v = R^T d t.
@@ -260,9 +236,6 @@ def spatial_to_chart(delta: Array, ypr: Array, cov: Array) -> Array:
         delta: (n, 7) elements of SE(3).
         ypr: (n, 3) their yaw, pitch and roll [rad].
         cov: (n, 6, 6) covariance in the order x, y, z, yaw, pitch, roll.
-
-    Returns:
-        (n, 6, 6) covariance in the order omega, v.
     """
     _, pitch, roll = ypr.T
     jacobian = np.zeros((len(delta), 6, 6))
@@ -285,7 +258,7 @@ def assemble(
     z: Array,
     cov_z: Array,
 ) -> list[Frame]:
-    """Frames in order.
+    """T frames in order, of which one without an observation is empty.
 
     Args:
         stamps_ns: (T,) time of each frame.
@@ -295,9 +268,6 @@ def assemble(
         landmarks: (S,) its landmark.
         z: (S, p) its measurement.
         cov_z: (S, p, p) its covariance.
-
-    Returns:
-        T frames; one without an observation is empty.
     """
     bounds = np.searchsorted(frame, np.arange(len(stamps_ns) + 1))
     return [

@@ -19,7 +19,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.feature_log import FeatureFrame, FeatureLog
-from rbpf.sensors.readers.text import Table, line_error, parse_table, read_columns, read_text
+from rbpf.sensors.readers.text import line_error, parse_table, read_columns, read_text
 
 CALIBRATION = ("fx", "fy", "skew", "cx", "cy", "baseline")
 ENTRIES = tuple(f"m{row}{column}" for row in range(1, 5) for column in range(1, 5))
@@ -28,7 +28,6 @@ FACTORS = ("frame", "landmark", "u_left", "u_right", "v", "x", "y", "z")
 
 KITTI_00 = (1241, 376)
 """Width and height of the images of KITTI's sequence 00, which the files do not give."""
-
 ROTATION = 1e-3
 """How far a matrix's rotation may be from one: six digits are written."""
 
@@ -62,38 +61,21 @@ def read_stereo_tracks(
     folder = Path(folder)
     if not (np.isfinite(std_px) and std_px > 0.0):
         raise InputError(f"the standard deviation of an observation must be positive, got {std_px} px")
-    camera = _camera(_only(folder, "VO_calibration*.txt"), size)
-    path = _path(read_columns(_only(folder, "VO_camera_poses*.txt"), POSES))
-    table = read_columns(_only(folder, "VO_stereo_factors*.txt"), FACTORS)
-    frames = _frames(table, len(path), std_px)
-    return StereoTracks(FeatureLog(folder.resolve().name, camera, frames), path)
-
-
-def _only(folder: Path, pattern: str) -> Path:
-    """The one file of a kind."""
-    found = sorted(folder.glob(pattern)) if folder.is_dir() else []
-    if len(found) != 1:
-        there = ", ".join(path.name for path in found) or "none"
-        raise InputError(f"{folder}: expected one file {pattern} of stereo tracks, found {there}.")
-    return found[0]
-
-
-def _camera(path: Path, size: tuple[int, int]) -> RectifiedStereo:
-    lines = read_text(path).splitlines()
-    table = parse_table(path, CALIBRATION, enumerate(lines, 1))
+    # The camera.
+    file = _only(folder, "VO_calibration*.txt")
+    table = parse_table(file, CALIBRATION, enumerate(read_text(file).splitlines(), 1))
     if len(table.lines) != 1:
         raise table.error(1, "expected one line of calibration, found another")
     fx, fy, skew, cx, cy, baseline = table.values[0].tolist()
     if skew != 0.0:
         raise table.error(0, f"expected no skew of a rectified pair, found {skew}")
     try:
-        return RectifiedStereo(Pinhole(*size, fx, fy, cx, cy), baseline)
+        camera = RectifiedStereo(Pinhole(*size, fx, fy, cx, cy), baseline)
     except InputError as error:
-        raise line_error(path, table.lines[0], str(error)) from error
+        raise line_error(file, table.lines[0], str(error)) from error
 
-
-def _path(table: Table) -> Array:
-    """Poses (T, 7)."""
+    # The path.
+    table = read_columns(_only(folder, "VO_camera_poses*.txt"), POSES)
     numbers = table.integers("frame")
     table.require(numbers == np.arange(len(numbers)), "frame", "the line's number counted from 0")
     matrices = table.block(ENTRIES[0], ENTRIES[-1]).reshape(-1, 4, 4)
@@ -103,18 +85,26 @@ def _path(table: Table) -> Array:
     wrong = (off > ROTATION) | (np.linalg.det(turn) < 0.0) | (last > 0.0)
     if wrong.any():
         raise table.error(int(np.argmax(wrong)), "expected a rotation, a translation and the row 0 0 0 1")
-    return SE3.from_matrix(matrices)
 
-
-def _frames(table: Table, count: int, std_px: float) -> list[FeatureFrame]:
+    # Who saw what.
+    table, count = read_columns(_only(folder, "VO_stereo_factors*.txt"), FACTORS), len(numbers)
     steps, names = table.integers("frame"), table.integers("landmark")
     table.require((steps >= 0) & (steps < count), "frame", f"that of a pose, 0 to {count - 1}")
     z = np.stack([table["u_left"], table["v"], table["u_right"]], axis=1)
     table.require(z[:, 0] > z[:, 2], "u_left", "greater than u_right")
     table.require_distinct(steps, names, "frame")
-    cov = std_px**2 * np.eye(3)
     frames = []
     for step in range(count):
         rows = np.flatnonzero(steps == step)
-        frames.append(FeatureFrame(step, names[rows], z[rows], np.tile(cov, (len(rows), 1, 1))))
-    return frames
+        cov = np.tile(std_px**2 * np.eye(3), (len(rows), 1, 1))
+        frames.append(FeatureFrame(step, names[rows], z[rows], cov))
+    return StereoTracks(FeatureLog(folder.resolve().name, camera, frames), SE3.from_matrix(matrices))
+
+
+def _only(folder: Path, pattern: str) -> Path:
+    """The one file of a kind."""
+    found = sorted(folder.glob(pattern)) if folder.is_dir() else []
+    if len(found) != 1:
+        there = ", ".join(path.name for path in found) or "none"
+        raise InputError(f"{folder}: expected one file {pattern} of stereo tracks, found {there}.")
+    return found[0]

@@ -22,7 +22,7 @@ LARGEST = 1e12
 LATEST_S = 4e9
 
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
-_TIME = re.compile(r"([+-]?\d{0,10})(?:\.(\d*))?", re.ASCII)
+_TIME = re.compile(r"[+-]?\d{0,10}(\.\d*)?", re.ASCII)
 _PLAIN = dict.fromkeys(map(ord, "0123456789+-.eE \t,"))
 _DIGITS_OF_SECONDS = 10
 
@@ -38,12 +38,7 @@ def quoted(text: str) -> str:
 
 
 def read_bytes(path: Path, hint: str = "", most: int | None = None) -> bytes:
-    """Content of a file.
-
-    Args:
-        path: the file.
-        hint: what is expected to lie there, for the message.
-        most: bytes that it may have; by default `MOST_BYTES`.
+    """Content of a file of at most so many bytes, or `MOST_BYTES`; `hint` is what is expected to lie there, for messages.
 
     Raises:
         InputError: the file is missing, too large or cannot be read.
@@ -64,7 +59,7 @@ def read_bytes(path: Path, hint: str = "", most: int | None = None) -> bytes:
 
 
 def read_text(path: Path, hint: str = "", most: int | None = None) -> str:
-    """Text of a file without a byte-order mark; arguments as of `read_bytes`.
+    """Text of a file without a byte-order mark.
 
     Raises:
         InputError: as `read_bytes`, or the file is empty or not UTF-8.
@@ -80,11 +75,7 @@ def read_text(path: Path, hint: str = "", most: int | None = None) -> str:
 
 
 def read_lines(path: Path, hint: str = "") -> list[str]:
-    """Lines of a file whose last line is complete, without their ends.
-
-    Raises:
-        InputError: as `read_text`, or the last line has no end.
-    """
+    """Lines of a file whose last line is complete, without their ends."""
     lines = read_text(path, hint).split("\n")
     if lines[-1]:
         problem = "the file ends inside this line; copy it again, or end the line if it is complete"
@@ -123,51 +114,26 @@ class Table:
         return line_error(self.path, self.lines[row], problem)
 
     def require(self, valid: NDArray[np.bool_], column: str, expected: str) -> None:
-        """Refuse the first row where `valid` (n,) is False.
-
-        Raises:
-            InputError: names the row's line, the column, what was expected and what was found.
-        """
+        """Refuse the first row where `valid` (n,) is False."""
         if not valid.all():
             row = int(np.argmin(valid))
             raise self.error(row, f"expected {column} to be {expected}, found {self[column][row]:.12g}")
 
     def integers(self, column: str) -> NDArray[np.int64]:
-        """(n,) a column of whole numbers.
-
-        Raises:
-            InputError: a number has a fraction.
-        """
+        """(n,) a column of whole numbers."""
         self.require(self[column] == np.floor(self[column]), column, "a whole number")
         return self[column].astype(np.int64)
 
     def names(self, column: str) -> NDArray[np.int64]:
-        """(n,) a column of whole numbers that must differ from one another.
-
-        Raises:
-            InputError: a number has a fraction or comes twice.
-        """
+        """(n,) a column of whole numbers that must differ from one another."""
         names = self.integers(column)
-        _, first = np.unique(names, return_index=True)
-        if len(first) < len(names):
-            row = int(np.setdiff1d(np.arange(len(names)), first)[0])
+        if (row := _second(names)) is not None:
             raise self.error(row, f"{column} {names[row]} comes a second time, expected it once")
         return names
 
     def require_distinct(self, frame: NDArray[np.int64], landmarks: NDArray[np.int64], when: str) -> None:
-        """Refuse a landmark that one frame observes twice.
-
-        Args:
-            frame: (n,) number of each row's frame.
-            landmarks: (n,) its landmark.
-            when: what the recording calls a frame.
-
-        Raises:
-            InputError: names the second line.
-        """
-        _, first = np.unique(np.stack([frame, landmarks], axis=1), axis=0, return_index=True)
-        if len(first) < len(frame):
-            row = int(np.setdiff1d(np.arange(len(frame)), first)[0])
+        """Refuse a landmark (n,) that one frame (n,) observes twice; `when` is what the recording calls a frame."""
+        if (row := _second(np.stack([frame, landmarks], axis=1))) is not None:
             again = f"landmark {landmarks[row]} comes a second time in {when} {frame[row]}"
             raise self.error(row, f"{again}, expected it once")
 
@@ -175,45 +141,34 @@ class Table:
         """(n,) the first column, times in seconds, as nanoseconds; digits beyond these are dropped.
 
         The decimal text is converted, not its rounded float.
-
-        Raises:
-            InputError: a time is no plain decimal, too large, or earlier than the one before it.
         """
         column = self.columns[0]
         self.require(np.abs(self[column]) <= LATEST_S, column, f"within {LATEST_S:.0e} s of zero")
         texts, stamps = [row.split(None, 1)[0] for row in self.rows], []
         for row, text in enumerate(texts):
-            match = _TIME.fullmatch(text)
-            if match is None:
+            if not _TIME.fullmatch(text):
                 raise self.error(row, f"expected a time such as 1248444175.103, found {quoted(text)}")
-            seconds, fraction = match.groups(default="")
-            stamps.append(int(seconds + fraction[:9].ljust(9, "0")))
+            stamps.append(int(Decimal(text).scaleb(9)))
         _require_order(self.path, self.lines, texts, stamps)
         return np.array(stamps)
 
 
-def read_columns(path: Path, columns: tuple[str, ...], hint: str = "") -> Table:
-    """File of blank-separated columns; lines that start with # are comments.
+def _second(values: NDArray[np.int64]) -> int | None:
+    """The first row (n,) or (n, k) that was there before; None where each is there once."""
+    _, first = np.unique(values, axis=0, return_index=True)
+    later = np.setdiff1d(np.arange(len(values)), first)
+    return int(later[0]) if later.size else None
 
-    Raises:
-        InputError: the file or a line is not as expected.
-    """
+
+def read_columns(path: Path, columns: tuple[str, ...], hint: str = "") -> Table:
+    """File of blank-separated columns; lines that start with # are comments."""
     numbered = enumerate(read_lines(path, hint), 1)
     rows = [(i, line) for i, line in numbered if not line.lstrip().startswith("#")]
     return parse_table(path, columns, rows)
 
 
 def read_csv(path: Path, headers: Sequence[tuple[str, ...]], hint: str = "") -> Table:
-    """File of comma-separated columns under a header line.
-
-    Args:
-        path: the file.
-        headers: the headers allowed; the table's columns tell which one was found.
-        hint: what is expected to lie there, for the message.
-
-    Raises:
-        InputError: the file, its header or a line is not as expected.
-    """
+    """File of comma-separated columns under one of these headers; the table's columns tell which one was found."""
     lines = read_lines(path, hint)
     found = tuple(name.strip() for name in lines[0].split(","))
     if found not in headers:
@@ -225,17 +180,7 @@ def read_csv(path: Path, headers: Sequence[tuple[str, ...]], hint: str = "") -> 
 def parse_table(
     path: Path, columns: tuple[str, ...], numbered: Iterable[tuple[int, str]], separator: str | None = None
 ) -> Table:
-    """Numbers in numbered lines; blank lines are passed over.
-
-    Args:
-        path: the file that the lines come from.
-        columns: name of each column.
-        numbered: line number and text of each line.
-        separator: what separates columns, None for blanks.
-
-    Raises:
-        InputError: there is no row, or one has another number of columns or something that is no number.
-    """
+    """Numbers in numbered lines of a file; blank lines are passed over. The separator None stands for blanks."""
     filled = [(number, line) for number, line in numbered if line.strip()]
     if not filled:
         raise InputError(f"{path}: expected rows of {', '.join(columns)}, found none.")
@@ -264,17 +209,7 @@ def _parse_row(
 
 
 def parse_number(path: Path, line: int, column: str, field: str) -> float:
-    """Number in a field.
-
-    Args:
-        path: the file.
-        line: line number, from 1.
-        column: name of the number, for the message.
-        field: the text.
-
-    Raises:
-        InputError: the text is no finite decimal number, or a larger one than `LARGEST`.
-    """
+    """Number in a field of a line, counted from 1."""
     if not _NUMBER.fullmatch(field):
         raise line_error(path, line, f"expected {column} to be a finite number, found {quoted(field)}")
     value = float(field)
@@ -301,11 +236,7 @@ class StampedLines:
     rests: list[str]
 
     def files(self, folder: Path) -> list[Path]:
-        """The texts as files in a folder.
-
-        Raises:
-            InputError: a line names no file.
-        """
+        """The texts as files in a folder."""
         for line, rest in zip(self.lines, self.rests, strict=True):
             if not rest:
                 problem = "expected a time and the file of an image, found only a time"
@@ -313,16 +244,10 @@ class StampedLines:
         return [folder / rest for rest in self.rests]
 
     def table(self, columns: tuple[str, ...], separator: str | None = None) -> Table:
-        """The texts as numbers; columns beyond these are passed over.
-
-        Raises:
-            InputError: a line has too few columns, or something that is no number.
-        """
-        join = separator or " "
-        numbered = [
-            (line, join.join(rest.split(separator)[: len(columns)]))
-            for line, rest in zip(self.lines, self.rests, strict=True)
-        ]
+        """The texts as numbers; columns beyond these are passed over."""
+        both = zip(self.lines, self.rests, strict=True)
+        cut = ((line, rest.split(separator)[: len(columns)]) for line, rest in both)
+        numbered = ((line, (separator or " ").join(fields)) for line, fields in cut)
         return parse_table(self.path, columns, numbered, separator)
 
 
@@ -335,38 +260,32 @@ def read_stamped(
         path: the file.
         hint: what is expected to lie there, for the message.
         separator: what ends the time, None for blanks.
-        nanoseconds: whether times are whole nanoseconds, else they are seconds.
-
-    Raises:
-        InputError: the file is missing, holds no line, or a time is none or runs backwards.
+        nanoseconds: whether times are whole nanoseconds, else they are seconds, whose further digits are dropped.
     """
+
+    def parse(line: int, text: str) -> int:
+        if nanoseconds:
+            if not (text.isascii() and text.isdigit() and len(text) < 20 and int(text) < 2**63):
+                problem = f"expected a time in whole nanoseconds, found {quoted(text)}"
+                raise line_error(path, line, problem)
+            return int(text)
+        whole = text.partition(".")[0]
+        long = whole.isdigit() and len(whole) > _DIGITS_OF_SECONDS
+        if long or abs(parse_number(path, line, "the time", text)) > LATEST_S:
+            problem = f"expected the time in seconds, within {LATEST_S:.0e} of zero, found {quoted(text)}"
+            raise line_error(path, line, problem)
+        return int(Decimal(text).scaleb(9))
+
     numbered = [(i, line.strip()) for i, line in enumerate(read_lines(path, hint), 1)]
     kept = [(i, line.split(separator, 1)) for i, line in numbered if line and not line.startswith("#")]
     if not kept:
         raise InputError(f"{path}: expected lines that begin with a time, found none.")
     lines = [i for i, _ in kept]
     texts = [parts[0].strip() for _, parts in kept]
-    parse = _parse_nanoseconds if nanoseconds else _parse_seconds
-    stamps = [parse(path, line, text) for line, text in zip(lines, texts, strict=True)]
+    stamps = [parse(line, text) for line, text in zip(lines, texts, strict=True)]
     _require_order(path, lines, texts, stamps)
     rests = [parts[1].strip() if len(parts) > 1 else "" for _, parts in kept]
     return StampedLines(path, lines, np.array(stamps, dtype=np.int64), rests)
-
-
-def _parse_seconds(path: Path, line: int, text: str) -> int:
-    """Nanoseconds of a decimal text in seconds; digits beyond these are dropped."""
-    whole = text.partition(".")[0]
-    long = whole.isdigit() and len(whole) > _DIGITS_OF_SECONDS
-    if long or abs(parse_number(path, line, "the time", text)) > LATEST_S:
-        problem = f"expected the time in seconds, within {LATEST_S:.0e} of zero, found {quoted(text)}"
-        raise line_error(path, line, problem)
-    return int(Decimal(text).scaleb(9))
-
-
-def _parse_nanoseconds(path: Path, line: int, text: str) -> int:
-    if not (text.isascii() and text.isdigit() and len(text) < 20 and int(text) < 2**63):
-        raise line_error(path, line, f"expected a time in whole nanoseconds, found {quoted(text)}")
-    return int(text)
 
 
 def _require_order(path: Path, lines: list[int], texts: list[str], stamps: list[int]) -> None:

@@ -58,9 +58,26 @@ class VictoriaPark(RobotLogFormat):
             raise InputError(
                 f"{path}: expected {self.kind}; found {len(graphs)}; name one, such as {graphs[0]}."
             )
-        odometry, observations = _read_tables(graphs[0])
+        path = graphs[0]
+        lines: dict[str, list[tuple[int, str]]] = {keyword: [] for keyword in _COLUMNS}
+        for number, line in enumerate(read_lines(path), 1):
+            keyword, *rest = line.split(None, 1) or [""]
+            if keyword in lines:
+                if not rest:
+                    raise line_error(path, number, f"expected numbers after {keyword}, found none")
+                lines[keyword].append((number, rest[0]))
+            elif keyword:
+                raise line_error(path, number, f"expected ODOMETRY or LANDMARK, found {quoted(keyword)}")
+        odometry, observations = (parse_table(path, _COLUMNS[name], lines[name]) for name in _COLUMNS)
         poses = _require_chain(odometry)
-        frame, landmarks = _require_known(observations, poses)
+
+        # Landmarks are seen from these poses, once from each, and have numbers of their own.
+        pose, landmarks = observations.integers("pose"), observations.integers("landmark")
+        observations.require(np.isin(pose, poses), "pose", "a pose of the odometry")
+        observations.require(~np.isin(landmarks, poses), "landmark", "a landmark's number, not a pose's")
+        by_number = np.argsort(poses)
+        frame = by_number[np.searchsorted(poses, pose, sorter=by_number)]
+        observations.require_distinct(pose, landmarks, "pose")
         z, cov_z = observations.block("x", "y"), read_covariances(observations, "cxx", "cyy")
         if noise.std_position_m is not None:
             cov_z = diagonal([np.full(len(z), noise.std_position_m)] * 2)
@@ -83,21 +100,8 @@ def _graphs(path: Path) -> list[Path]:
     return [file for file in files if file.is_file() and _KEYWORD.search(read_bytes(file))]
 
 
-def _read_tables(path: Path) -> tuple[Table, Table]:
-    lines: dict[str, list[tuple[int, str]]] = {keyword: [] for keyword in _COLUMNS}
-    for number, line in enumerate(read_lines(path), 1):
-        keyword, *rest = line.split(None, 1) or [""]
-        if keyword in lines:
-            if not rest:
-                raise line_error(path, number, f"expected numbers after {keyword}, found none")
-            lines[keyword].append((number, rest[0]))
-        elif keyword:
-            raise line_error(path, number, f"expected ODOMETRY or LANDMARK, found {quoted(keyword)}")
-    odometry, observations = (parse_table(path, columns, lines[name]) for name, columns in _COLUMNS.items())
-    return odometry, observations
-
-
 def _require_chain(odometry: Table) -> NDArray[np.int64]:
+    """Numbers (T,) of the poses, along a path without gap or loop."""
     start, stop = odometry.integers("from"), odometry.integers("to")
     for row, (before, now) in enumerate(pairwise(zip(start, stop, strict=True)), 1):
         if before[1] != now[0]:
@@ -107,15 +111,3 @@ def _require_chain(odometry: Table) -> NDArray[np.int64]:
         row = int(np.argmax(stop == start[0]))
         raise odometry.error(row, f"expected a path without loops, found a return to pose {start[0]}")
     return np.concatenate([start[:1], stop])
-
-
-def _require_known(
-    observations: Table, poses: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    pose, landmarks = observations.integers("pose"), observations.integers("landmark")
-    observations.require(np.isin(pose, poses), "pose", "a pose of the odometry")
-    observations.require(~np.isin(landmarks, poses), "landmark", "a landmark's number, not a pose's")
-    by_number = np.argsort(poses)
-    frame = by_number[np.searchsorted(poses, pose, sorter=by_number)]
-    observations.require_distinct(pose, landmarks, "pose")
-    return frame, landmarks

@@ -67,10 +67,7 @@ class WheelOdometry:
 
 
 def read_wheel_odometry(folder: str | Path) -> WheelOdometry:
-    """Reads `odometry.csv` and `odometry.yaml`.
-
-    Args:
-        folder: that holds both.
+    """Reads `odometry.csv` and `odometry.yaml` in a folder.
 
     Raises:
         InputError: a file is missing or not as described above.
@@ -88,14 +85,9 @@ def read_wheel_odometry(folder: str | Path) -> WheelOdometry:
         raise table.error(0, "expected no motion on the first line, before which there is none")
     delta = SE2.normalise(np.roll(motion[1:], 1, axis=1))
     std = np.roll(table.block(SIGMA[0], SIGMA[-1])[1:], 1, axis=1)
-    return WheelOdometry(rows.stamps_ns, delta, std, _read_mount(Path(folder) / MOUNT))
-
-
-def _read_mount(path: Path) -> np.ndarray:
-    mount = read_yaml(path, "where the camera stands on the robot").entries(["robot_from_camera"])[
-        "robot_from_camera"
-    ]
+    file = read_yaml(Path(folder) / MOUNT, "where the camera stands on the robot")
+    mount = file.entries(["robot_from_camera"])["robot_from_camera"]
     pose = np.array([item.number() for item in mount.items(7)])
     if abs(np.linalg.norm(pose[:4]) - 1.0) > UNIT:
         raise mount.error("expected robot_from_camera to begin with a unit quaternion")
-    return np.asarray(SE3.normalise(pose))
+    return WheelOdometry(rows.stamps_ns, delta, std, np.asarray(SE3.normalise(pose)))

@@ -16,7 +16,7 @@ MOST_BYTES = 1 << 20
 
 @dataclass(frozen=True)
 class YamlValue:
-    """A value in a YAML file.
+    """A value in a YAML file; whoever asks for what it is not gets an InputError that names its line.
 
     Attributes:
         path: the file.
@@ -35,14 +35,11 @@ class YamlValue:
     def entries(
         self, required: Collection[str], optional: Collection[str] | None = None
     ) -> dict[str, "YamlValue"]:
-        """Values of a mapping by their keys.
+        """Values of a mapping by their keys, each of which comes once.
 
         Args:
             required: keys that must be there.
             optional: others that may be; None for any.
-
-        Raises:
-            InputError: this is no mapping, a key comes twice or is missing, or there is another one.
         """
         expected = f"expected the keys {', '.join(required)}"
         if not isinstance(self.node, yaml.MappingNode):
@@ -62,65 +59,38 @@ class YamlValue:
         return found
 
     def text(self) -> str:
-        """A single value.
-
-        Raises:
-            InputError: it is a list or a mapping.
-        """
+        """A single value: no list and no mapping."""
         if not isinstance(self.node, yaml.ScalarNode):
             raise self.error(f"expected {self.name} to be a single value, found a list or a mapping")
         return str(self.node.value)
 
     def choice(self, allowed: Collection[str]) -> str:
-        """One of a few words.
-
-        Raises:
-            InputError: it is another one.
-        """
+        """One of a few words."""
         text = self.text()
         if text not in allowed:
             raise self.error(f"expected {self.name} to be {' or '.join(allowed)}, found {quoted(text)}")
         return text
 
     def number(self) -> float:
-        """A finite number.
-
-        Raises:
-            InputError: it is none.
-        """
+        """A finite number."""
         return parse_number(self.path, self.node.start_mark.line + 1, self.name, self.text())
 
     def positive(self) -> float:
-        """A positive number.
-
-        Raises:
-            InputError: it is none.
-        """
+        """A positive number."""
         value = self.number()
         if value <= 0.0:
             raise self.error(f"expected {self.name} to be positive, found {value:.12g}")
         return value
 
     def size(self) -> int:
-        """A positive whole number.
-
-        Raises:
-            InputError: it is none.
-        """
+        """A positive whole number."""
         value = self.positive()
         if value != int(value):
             raise self.error(f"expected {self.name} to be a whole number, found {value:.12g}")
         return int(value)
 
     def items(self, *lengths: int) -> list["YamlValue"]:
-        """Values of a list.
-
-        Args:
-            lengths: how many there may be.
-
-        Raises:
-            InputError: it is no list, or has another length.
-        """
+        """Values of a list of one of these lengths."""
         expected = f"expected {self.name} to be a list of {' or '.join(map(str, lengths))}"
         if not isinstance(self.node, yaml.SequenceNode):
             raise self.error(f"{expected}, found no list")
@@ -130,11 +100,7 @@ class YamlValue:
 
 
 def read_yaml(path: Path, hint: str) -> YamlValue:
-    """Content of a YAML file.
-
-    Args:
-        path: the file.
-        hint: what is expected to lie there, for the message.
+    """Content of a YAML file; `hint` is what is expected to lie there, for messages.
 
     Raises:
         InputError: the file is missing, too large, empty, or no YAML.

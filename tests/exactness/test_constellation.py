@@ -10,7 +10,7 @@ from rbpf.core.particles import Prior
 from rbpf.lie import SE3, skew
 from rbpf.maps.constellation import Constellation, UncertainConstellation
 from rbpf.maps.landmark_map import LandmarkMap
-from rbpf.sensors.camera.constellation import ConstellationView, MembersView
+from rbpf.sensors.camera.points import ConstellationView, MembersView
 from tests.exactness.models import Kalman
 from tests.sensors.camera_scenes import DISTORTED
 

@@ -30,7 +30,7 @@ from rbpf.validation.simulation.features import MONO, Measuring, simulate_featur
 from rbpf.validation.simulation.point_worlds import DeskWorld
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 from tests.properties.mutations import damaged
-from tests.readers import test_mrclam, test_stereo_tracks, test_victoria_park, test_wheel_odometry
+from tests.readers import small
 from tests.readers.images import bags, folders
 from tests.validation.worlds import world
 
@@ -109,14 +109,6 @@ def bag(name: str) -> tuple[Callable[[Path], object], Read, str]:
     return write, read, "**/*.*"
 
 
-def mrclam(folder: Path) -> None:
-    test_mrclam.write(folder, test_mrclam.log_files())
-
-
-def victoria(folder: Path) -> None:
-    (folder / "graph.txt").write_text(test_victoria_park.GRAPH)
-
-
 def results(folder: Path) -> None:
     write_tum(folder / "path.tum", Trajectory(np.arange(3) * 10**8, POSES))
     (folder / "path.kitti").write_text("".join(folders.matrix_row(pose) for pose in POSES))
@@ -143,11 +135,11 @@ RECORDINGS: dict[str, tuple[Callable[[Path], object], Read, str]] = {
     "ROS 2, database": bag("walk_db3"),
     "ROS 2, MCAP": bag("walk_mcap"),
     "7-Scenes": (folders.write_seven_scenes, frames, "*.txt"),
-    "MRCLAM": (mrclam, open_log, "*.dat"),
+    "MRCLAM": (lambda f: small.write(f, small.MRCLAM), open_log, "*.dat"),
     "MRPT": (lambda f: simulate_robot(RobotWorld(4, 5), f, 0), open_log, "*.*"),
-    "Victoria Park": (victoria, open_log, "graph.txt"),
-    "stereo tracks": (test_stereo_tracks.folder, read_stereo_tracks, "*.txt"),
-    "wheel odometry": (test_wheel_odometry.folder, read_wheel_odometry, "odometry.*"),
+    "Victoria Park": (lambda f: small.write(f, small.GRAPH), open_log, "graph.txt"),
+    "stereo tracks": (lambda f: small.write(f, small.TRACKS), read_stereo_tracks, "*.txt"),
+    "wheel odometry": (lambda f: small.write(f, small.WHEELS), read_wheel_odometry, "odometry.*"),
     "known points": (results, lambda f: read_known_points(f / "known_points.csv"), "known_points.csv"),
     "path": (results, lambda f: read_tum(f / "path.tum"), "path.tum"),
     "path of KITTI": (results, lambda f: read_kitti(f / "path.kitti"), "path.kitti"),

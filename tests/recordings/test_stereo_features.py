@@ -5,12 +5,10 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.sensors.descriptors.index import DescriptorIndex, Gate
-from rbpf.sensors.descriptors.matching import MatchLimits, distances
+from rbpf.sensors.descriptors import DescriptorIndex, Gate, MatchLimits, distances
 from rbpf.sensors.features import Sift, SiftConfig
 from rbpf.sensors.readers import open_stereo
-from rbpf.sensors.stereo.features import match_frames
-from rbpf.sensors.stereo.matching import PairConfig, StereoMatcher
+from rbpf.sensors.stereo import PairConfig, StereoMatcher, match_frames
 
 pytestmark = pytest.mark.real_data
 

@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 
 from rbpf.lie import SE3
-from rbpf.sensors.calibration.boards import Board
+from rbpf.sensors.calibration import Board
 from rbpf.sensors.camera import Pinhole
 from rbpf.validation.simulation.render import Renderer
 from rbpf.validation.simulation.textured_scene import Furniture

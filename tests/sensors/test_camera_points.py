@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from rbpf.conformance import Example, check_model
-from rbpf.core.linearisation import numeric_jacobians
 from rbpf.core.models import Records
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Euclidean, Product
@@ -38,25 +37,6 @@ def test_sound_where_the_state_holds_a_velocity_too(camera, seed):
     cov = np.tile(0.01 * np.eye(3), (5, 3, 1, 1))
     example = Example(state=state, landmark=Point(3), records=Records(mean, cov))
     assert check_model(CameraPoint(camera), WITH_VELOCITY, example=example) == []
-
-
-@pytest.mark.parametrize("camera", [*CAMERAS.values(), STEREO], ids=[*CAMERAS, "stereo"])
-@pytest.mark.parametrize("velocity", [False, True], ids=["pose", "pose and velocity"])
-def test_jacobians_are_the_numeric_ones(camera, velocity):
-    rays = Rays.random(seed=1)
-    state = with_velocity(rays.state) if velocity else rays.state
-    space = WITH_VELOCITY if velocity else SE3
-    cases = [(CameraPoint(camera), rays.points, None)]
-    if camera is not STEREO:
-        cases.append((CameraRay(camera), rays.mean, rays.const))
-    for model, landmark, const in cases:
-        found = known(model.jacobians(state[:, None], landmark, const))
-        expected = numeric_jacobians(model, space, state[:, None], landmark, const)
-        assert known(found.state).shape == known(expected.state).shape
-        np.testing.assert_allclose(known(found.state), known(expected.state), rtol=1e-6, atol=1e-4)
-        np.testing.assert_allclose(known(found.landmark), known(expected.landmark), rtol=1e-6, atol=1e-4)
-        if velocity:
-            np.testing.assert_array_equal(known(found.state)[..., 6:], 0.0)
 
 
 @every_camera
@@ -93,15 +73,6 @@ def test_at_infinity_only_rotation_counts(camera):
     jacobians = known(model.jacobians(rays.state[:, None], far, rays.const))
     np.testing.assert_array_equal(known(jacobians.state)[..., 3:6], 0.0)
     assert np.isfinite(known(jacobians.landmark)).all()
-
-
-@every_camera
-def test_on_the_optical_axis(camera):
-    model, identity = CameraPoint(camera), SE3.identity()
-    np.testing.assert_allclose(model.predict(identity, np.array([0.0, 0.0, 2.0])), [319.5, 239.5])
-    jacobians = known(model.jacobians(identity, np.array([0.0, 0.0, 2.0])))
-    expected = [[200.0, 0.0, 0.0], [0.0, 205.0, 0.0]]
-    np.testing.assert_allclose(known(jacobians.landmark), expected, atol=1e-11)
 
 
 @every_camera

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from rbpf.errors import InputError
 from rbpf.sensors.features import CornerDetector
 from rbpf.sensors.features.corners import WINDOW_PX
 from tests.sensors.patch_scenes import Waves
@@ -62,26 +61,6 @@ def test_corners_of_squares_and_not_their_edges():
     assert (nearest.min(axis=0) <= 2).all() and (nearest.min(axis=1) <= 2).all()
 
 
-def test_best_first_and_far_apart(image):
-    px, scores = corners(image, NONE, 40, 15.0, 16.0)
-    assert px.shape == (40, 2) and scores.shape == (40,)
-    apart = np.linalg.norm(px[:, None] - px, axis=2)[~np.eye(40, dtype=bool)]
-    assert apart.min() >= 15.0 and (np.diff(scores) <= 0.0).all()
-    assert np.array_equal(corners(image, NONE, 7, 15.0, 16.0)[0], px[:7])
-
-
-def test_away_from_what_is_occupied(image):
-    before, _ = corners(image, NONE, 20, 15.0, 16.0)
-    px, _ = corners(image, before + 0.3, 300, 15.0, 16.0)
-    assert len(px) > 20
-    assert np.linalg.norm(px[:, None] - before - 0.3, axis=2).min() >= 15.0
-
-
-def test_places_that_are_not_finite_take_no_room(image):
-    lost = np.array([[np.nan, np.nan], [np.inf, 3.0]])
-    assert np.array_equal(corners(image, lost, 20)[0], corners(image, NONE, 20)[0])
-
-
 @pytest.mark.parametrize("border_px", [0.0, 5.0, 16.0, 60.5])
 def test_inside_the_border(image, border_px):
     px, _ = corners(image, NONE, 1000, 4.0, border_px)
@@ -89,19 +68,6 @@ def test_inside_the_border(image, border_px):
     assert len(px) > 20 and px.min() >= least
     assert (px <= np.array([319, 239]) - least).all()
     assert px.min(axis=0).max() < least + 8 and (px.max(axis=0) > np.array([319, 239]) - least - 8).all()
-
-
-def test_within_a_mask(image):
-    within = np.hypot(*np.ogrid[-120:120, -160:160]) < 90.0
-    px, _ = corners(image, NONE, 1000, 4.0, 16.0, mask=within)
-    everywhere, _ = corners(image, NONE, 1000, 4.0, 16.0)
-    assert 20 < len(px) < len(everywhere)
-    assert within[px[:, 1].astype(int), px[:, 0].astype(int)].all()
-
-
-def test_the_same_image_gives_the_same_corners(image):
-    first, again = corners(image, NONE, 50), corners(image.copy(), NONE, 50)
-    assert np.array_equal(first[0], again[0]) and np.array_equal(first[1], again[1])
 
 
 def test_equal_squares_share_the_places():
@@ -125,26 +91,9 @@ def test_a_dark_image_gives_corners_once_asked_for_faint_ones():
     assert len(corners(dark, NONE, 10, 6.0, fast_threshold=3, min_score=0.2)[0]) == 8
 
 
-@pytest.mark.parametrize("level", [0, 128, 255])
-def test_a_flat_image_has_none(level):
-    px, scores = corners(np.full((100, 101), level, np.uint8), NONE, 10, min_score=0.0)
-    assert px.shape == (0, 2) and scores.shape == (0,)
-
-
 @pytest.mark.parametrize("shape", [(1, 1), (0, 0), (7, 300), (10, 10), (11, 11), (33, 33), (101, 97)])
 def test_odd_sizes(shape):
     image = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)
     px, scores = corners(image, NONE, 10, border_px=5.0)
     assert px.shape == (len(scores), 2)
     assert (len(px) > 0) == (min(shape) >= 11)
-
-
-def test_none_wanted(image):
-    assert len(corners(image, NONE, 0)[0]) == 0 and len(corners(image, NONE, -3)[0]) == 0
-
-
-def test_wrong_arguments(image):
-    with pytest.raises(InputError, match="must be grey"):
-        corners(image.astype(float), NONE, 10)
-    with pytest.raises(InputError, match=r"must be \(M, 2\)"):
-        corners(image, np.zeros(2), 10)

@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rbpf.errors import InputError
-from rbpf.sensors.descriptors import matching as descriptor_matching
-from rbpf.sensors.descriptors.matching import MatchLimits, band_pairs, gate_pairs, match_all, match_pairs
+from rbpf.sensors import descriptors as descriptor_matching
+from rbpf.sensors.descriptors import MatchLimits, band_pairs, gate_pairs, match_all, match_pairs
 
 
 def unit(rng, count, length=8):

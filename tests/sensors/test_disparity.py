@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from rbpf.sensors.stereo.matching import refine
+from rbpf.sensors.stereo import refine
 
 
 def texture(columns, lines):

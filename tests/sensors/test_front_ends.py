@@ -19,7 +19,7 @@ from rbpf.sensors.features import (
 )
 from rbpf.sensors.features.interface import WINDOW_SCALE_PX
 from rbpf.sensors.patches.search import cut
-from rbpf.sensors.stereo.matching import StereoMatcher
+from rbpf.sensors.stereo import StereoMatcher
 from tests.sensors.stereo_scenes import RIG, room, true_disparity
 
 

@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rbpf.errors import InputError
-from rbpf.sensors.descriptors.landmark_management import LandmarkManager, NewLandmarkConfig
-from rbpf.sensors.descriptors.matching import distances
+from rbpf.sensors.descriptors import distances
+from rbpf.sensors.landmark_management import LandmarkManager, NewLandmarkConfig
 from tests.sensors.test_descriptor_matching import unit
 
 SIZE = (640, 480)
@@ -111,21 +111,6 @@ def test_new_keys_spread_over_the_image():
     occupied = np.repeat(elsewhere[:1], 5, axis=0) + 15.0
     crowded = LandmarkManager(config, SIZE).select(px, unit(rng, 64, 36), np.full(64, np.inf), occupied)
     assert 60 not in crowded.tolist()
-
-
-def test_the_best_of_a_cell_comes_first():
-    px = np.tile([[10.0, 10.0]], (20, 1))
-    config = NewLandmarkConfig(max_per_frame=5, spacing_px=0.0, distinct=0.0)
-    descriptors = unit(np.random.default_rng(1), 20, 36)
-    assert LandmarkManager(config, SIZE).select(
-        px, descriptors, np.full(20, np.inf), np.zeros((0, 2))
-    ).tolist() == [
-        0,
-        1,
-        2,
-        3,
-        4,
-    ]
 
 
 def test_a_checkpoint_holds_all():

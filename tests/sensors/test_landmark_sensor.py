@@ -59,13 +59,6 @@ def test_a_name_seen_twice_in_its_first_frame_starts_one_landmark(sensor):
     assert report.new_landmarks.size == 0
 
 
-def test_an_empty_frame(sensor):
-    filter_ = filter_of(sensor)
-    report = filter_.step(Sightings(np.zeros(0, dtype=int), np.zeros((0, 2)), np.zeros((0, 2, 2))))
-    assert report.groups == []
-    assert report.new_landmarks.size == 0
-
-
 def test_a_landmark_that_was_removed_starts_anew(sensor):
     filter_ = filter_of(sensor)
     filter_.step(frame(4, 5))
@@ -73,14 +66,6 @@ def test_a_landmark_that_was_removed_starts_anew(sensor):
     report = filter_.step(frame(5, 4))
     assert ids_of(report).tolist() == [5]
     assert report.new_landmarks.tolist() == [4]
-
-
-def test_one_sensor_in_two_filters(sensor):
-    first, second = filter_of(sensor), filter_of(sensor)
-    first.step(frame(4, 5))
-    second.step(frame(5))
-    assert ids_of(first.step(frame(4))).tolist() == [4]
-    assert second.step(frame(4)).groups == []
 
 
 def test_numbers_after_loading_an_earlier_state(sensor, tmp_path):

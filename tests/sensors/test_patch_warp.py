@@ -46,11 +46,6 @@ def test_cut_between_pixels_stays_within_grey_levels():
     assert step.min() == 0 and step.max() == 255 and (np.diff(step.astype(int), axis=1) >= 0).all()
 
 
-@pytest.mark.parametrize("px", [(15.0, 15.0), (84.0, 64.0), (15.0, 64.0)])
-def test_cut_reaches_the_border(image, px):
-    assert np.array_equal(cut(image, np.array(px)), window(image, px, 31))
-
-
 @pytest.mark.parametrize(
     "px", [(14.9, 30.0), (84.1, 30.0), (40.0, 14.0), (40.0, 64.5), (np.nan, 30.0), (np.inf, 9.0)]
 )
@@ -121,10 +116,6 @@ def test_a_view_of_more_than_the_source_has_no_template(image, affine):
     assert np.isnan(templates[0]).all() and np.isfinite(templates[1]).all()
 
 
-def test_no_sources():
-    assert warp(np.zeros((0, 31, 31), np.uint8), np.zeros((0, 2, 2)), 9).shape == (0, 9, 9)
-
-
 @pytest.mark.parametrize(
     ("sources", "affines", "size", "sentence"),
     [
@@ -139,8 +130,3 @@ def test_no_sources():
 def test_wrong_arguments(sources, affines, size, sentence):
     with pytest.raises(InputError, match=sentence):
         warp(sources, affines, size)
-
-
-def test_cut_wants_grey():
-    with pytest.raises(InputError, match="convert it first"):
-        cut(np.zeros((40, 40, 3), np.uint8), np.array([20.0, 20.0]))

@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -48,13 +49,6 @@ def seen_points(camera: Pinhole) -> np.ndarray:
     return rays * rng.uniform(0.3, 30.0, (len(rays), 1))
 
 
-def border(camera: Pinhole) -> np.ndarray:
-    """Pixels along the four edges of the image."""
-    along, down = np.linspace(-0.5, camera.width - 0.5, 30), np.linspace(-0.5, camera.height - 0.5, 30)
-    edges = [(along, -0.5), (along, camera.height - 0.5), (-0.5, down), (camera.width - 0.5, down)]
-    return np.concatenate([np.stack(np.broadcast_arrays(*edge), axis=-1) for edge in edges])
-
-
 def numeric_slope(function, at: np.ndarray, step: np.ndarray) -> np.ndarray:
     """Central differences of fourth order (…, p, D), with a step (…,) per point."""
     columns = []
@@ -68,28 +62,18 @@ def numeric_slope(function, at: np.ndarray, step: np.ndarray) -> np.ndarray:
 
 class TestPinholeAgainstOpenCV:
     @PINHOLES
-    def test_projects_as_opencv(self, camera):
-        cv2 = pytest.importorskip("cv2")
+    def test_projects_as_opencv_with_its_derivative_by_the_translation(self, camera):
         points = seen_points(camera)
-        expected, _ = cv2.projectPoints(
+        px, jac = cv2.projectPoints(
             points[:, None], np.zeros(3), np.zeros(3), matrix(camera), np.array(camera.distortion)
         )
         assert len(points) > 100
-        np.testing.assert_allclose(camera.project(points), expected[:, 0], rtol=0, atol=1e-9)
-
-    @PINHOLES
-    def test_slope_is_opencvs_derivative_by_the_translation(self, camera):
-        cv2 = pytest.importorskip("cv2")
-        points = seen_points(camera)
-        _, jac = cv2.projectPoints(
-            points[:, None], np.zeros(3), np.zeros(3), matrix(camera), np.array(camera.distortion)
-        )
+        np.testing.assert_allclose(camera.project(points), px[:, 0], rtol=0, atol=1e-9)
         expected = jac[:, 3:6].reshape(-1, 2, 3)
         np.testing.assert_allclose(camera.jacobian(points), expected, rtol=1e-9, atol=1e-9)
 
     @PINHOLES
     def test_unprojects_as_opencv(self, camera):
-        cv2 = pytest.importorskip("cv2")
         px = camera.project(seen_points(camera))
         # OpenCV's fixed-point iteration diverges towards a fold.
         px = px[np.hypot(*(camera.unproject(px).T)) < 0.6]
@@ -112,14 +96,6 @@ class TestPinhole:
         np.testing.assert_allclose(camera.jacobian(points) / scale, numeric / scale, rtol=0, atol=1e-8)
 
     @every_camera
-    def test_slope_at_the_border(self, camera):
-        uv = camera.unproject(border(camera))
-        uv = uv[np.isfinite(uv[:, 0])]
-        rays = np.concatenate([uv, np.ones((len(uv), 1))], axis=1)
-        numeric = numeric_slope(camera.project, rays, np.full(len(rays), 1e-3))
-        np.testing.assert_allclose(camera.jacobian(rays) / camera.fx, numeric / camera.fx, rtol=0, atol=1e-8)
-
-    @every_camera
     def test_on_the_axis(self, camera):
         point = np.array([0.0, 0.0, 4.0])
         np.testing.assert_array_equal(camera.project(point), [camera.cx, camera.cy])
@@ -138,12 +114,6 @@ class TestPinhole:
             camera.jacobian(scale * points) * scale, camera.jacobian(points), rtol=1e-9, atol=1e-9
         )
         np.testing.assert_array_equal(camera.visible(scale * points), camera.visible(points))
-
-    @every_camera
-    def test_a_point_at_infinity_is_its_direction(self, camera):
-        direction = np.array([0.2, -0.1, 1.0])
-        far = np.array([5.0, -3.0, 2.0]) + 1e12 * direction
-        np.testing.assert_allclose(camera.project(direction), camera.project(far), rtol=0, atol=1e-8)
 
     @every_camera
     def test_round_trip_of_points(self, camera):

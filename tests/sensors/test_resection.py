@@ -1,4 +1,4 @@
-"""Where a camera is that sees known points."""
+"""Where a camera is that sees points: all known, many of them mistaken, some of uncertain depth."""
 
 import cv2
 import numpy as np
@@ -6,7 +6,16 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.sensors.camera.resection import resect
+from rbpf.sensors.camera import Pinhole
+from rbpf.sensors.camera.resection import (
+    GATE,
+    Sights,
+    refined,
+    refined_on_all,
+    resect,
+    resect_consensus,
+    squared_distances,
+)
 from tests.sensors.camera_scenes import CAMERAS, DISTORTED, PLAIN
 
 SQUARE = np.array([[-0.2, -0.2, 0.0], [0.2, -0.2, 0.0], [0.2, 0.2, 0.0], [-0.2, 0.2, 0.0]])
@@ -58,7 +67,7 @@ def test_four_points_in_general_position():
     assert np.mean(np.array(errors) < 1e-8) > 0.95
 
 
-def refined(points: np.ndarray, uv: np.ndarray, turn: np.ndarray, shift: np.ndarray) -> np.ndarray:
+def descended(points: np.ndarray, uv: np.ndarray, turn: np.ndarray, shift: np.ndarray) -> np.ndarray:
     """OpenCV's descent from one start (camera_from_world), as world_from_camera."""
     turn, shift = cv2.solvePnPRefineLM(points, uv, np.eye(3), None, turn.copy(), shift.copy())
     camera_from_world = np.eye(4)
@@ -76,7 +85,7 @@ def test_with_noise_no_pose_nearby_is_better(count):
         found = cost(PLAIN, resect(PLAIN, points, noisy), points, noisy)
         assert found <= cost(PLAIN, pose, points, noisy)
         back = SE3.matrix(SE3.inverse(pose))
-        near = refined(points, PLAIN.unproject(noisy), cv2.Rodrigues(back[:3, :3])[0], back[:3, 3:])
+        near = descended(points, PLAIN.unproject(noisy), cv2.Rodrigues(back[:3, :3])[0], back[:3, 3:])
         assert found <= 1.01 * cost(PLAIN, near, points, noisy)
 
 
@@ -88,7 +97,7 @@ def test_where_one_start_finds_a_local_optimum():
         noisy = px + 2.0 * rng.normal(size=px.shape)
         uv = PLAIN.unproject(noisy)
         _, turn, shift = cv2.solvePnP(points, uv, np.eye(3), None, flags=cv2.SOLVEPNP_SQPNP)
-        single = refined(points, uv, turn, shift)
+        single = descended(points, uv, turn, shift)
         ours = cost(PLAIN, resect(PLAIN, points, noisy), points, noisy)
         in_front = (SE3.inverse_transform(single, points)[:, 2] > 0.0).all()
         theirs = cost(PLAIN, single, points, noisy) if in_front else np.inf
@@ -133,22 +142,15 @@ def test_three_on_a_line_and_one_beside_it():
     assert cost(PLAIN, found, points, px) < 1e-14
 
 
-def found_or_refused(points: np.ndarray, px: np.ndarray) -> np.ndarray | str:
-    """The pose, or the sentence that says why there is none."""
-    try:
-        return resect(PLAIN, points, px)
-    except InputError as error:
-        return str(error)
-
-
 def test_pixels_of_other_points():
     """Where nothing in front of the camera explains the pixels there is no pose; never one that looks away."""
     rng, refused = np.random.default_rng(5), set()
     for _ in range(300):
         _, points, _ = scene(rng, PLAIN)
-        found = found_or_refused(points, rng.uniform([0.0, 0.0], [640.0, 480.0], size=(4, 2)))
-        if isinstance(found, str):
-            refused.add(found)
+        try:
+            found = resect(PLAIN, points, rng.uniform([0.0, 0.0], [640.0, 480.0], size=(4, 2)))
+        except InputError as error:
+            refused.add(str(error))
         else:
             assert (SE3.inverse_transform(found, points)[:, 2] > 0.0).all()
     (sentence,) = refused
@@ -161,3 +163,132 @@ def test_pixels_without_a_direction():
     px = np.array([[2.0, 2.0], [500.0, 100.0], [400.0, 400.0], [100.0, 300.0]])
     with pytest.raises(InputError, match="the camera's distortion has no direction: check the calibration"):
         resect(folding, SQUARE, px)
+
+
+CAMERA = Pinhole(640, 480, 500.0, 510.0, 320.0, 240.0, (-0.2, 0.05, 0.001, -0.001, 0.0))
+POSE = SE3.retract(SE3.identity(), np.array([0.2, -0.3, 0.1, 0.5, -0.2, 0.4]))
+
+
+def seen(count: int, rng: np.random.Generator, noise_px: float = 0.5) -> tuple[np.ndarray, np.ndarray]:
+    """Points in front of the camera, and where they are seen."""
+    uv = rng.uniform(-0.4, 0.4, (count, 2))
+    points = np.concatenate([uv, np.ones((count, 1))], axis=1) * rng.uniform(1.0, 4.0, (count, 1))
+    return SE3.transform(POSE, points), CAMERA.project(points) + noise_px * rng.normal(size=(count, 2))
+
+
+@pytest.mark.parametrize("mistaken", [0, 20, 40])
+def test_finds_the_camera_among_mistakes(mistaken):
+    rng = np.random.default_rng(mistaken)
+    points, px = seen(25 + mistaken, rng)
+    px[:mistaken] = rng.uniform((0, 0), (640, 480), (mistaken, 2))
+    found = resect_consensus(CAMERA, points, px, 4.0, 300, rng)
+    assert found is not None
+    assert found.inliers[mistaken:].mean() > 0.95
+    assert found.inliers[:mistaken].sum() <= 1
+    assert found.rms_px < 1.0
+    assert np.abs(SE3.log(SE3.between(POSE, found.world_from_camera))).max() < 5e-3
+
+
+def test_information_of_known_points_is_that_of_the_error():
+    errors, predicted = [], None
+    for seed in range(60):
+        points, px = seen(20, np.random.default_rng(1), 0.0)
+        px = px + 0.5 * np.random.default_rng(seed).normal(size=px.shape)
+        found = refined(CAMERA, POSE, points, px, 10.0)
+        assert found is not None
+        errors.append(SE3.log(SE3.between(POSE, found.world_from_camera)))
+        predicted = 0.25 * np.linalg.inv(found.information)
+    assert np.std(errors, axis=0) == pytest.approx(np.sqrt(np.diag(predicted)), rel=0.35)
+
+
+def test_points_on_a_line_fix_nothing():
+    along = np.linspace(0.0, 1.0, 12)[:, None]
+    camera_points = np.array([-0.5, 0.1, 2.0]) + along * np.array([1.0, 0.0, 0.5])
+    points, px = SE3.transform(POSE, camera_points), CAMERA.project(camera_points)
+    rng = np.random.default_rng(0)
+    found = resect_consensus(CAMERA, points, px, 4.0, 100, rng)
+    assert found is None or np.linalg.cond(found.information) > 1e8
+
+
+def test_nothing_agrees_with_points_behind_the_camera():
+    points, px = seen(10, np.random.default_rng(0))
+    behind = SE3.retract(POSE, np.array([0.0, np.pi, 0.0, 0.0, 0.0, 0.0]))
+    assert refined(CAMERA, behind, points, px, 4.0) is None
+
+
+NEAR = SE3.retract(SE3.identity(), np.array([0.05, -0.1, 0.1, 0.3, -0.1, 0.1]))
+START = SE3.retract(NEAR, np.array([0.01, -0.01, 0.01, 0.02, 0.01, -0.02]))
+
+
+def sights_of(
+    known: int, on_lines: int, rng: np.random.Generator, noise_px: float, wrong: bool = True
+) -> Sights:
+    """Points that a camera at the origin sees; of those on lines the depth may be wrong by up to a third."""
+    count = known + on_lines
+    uv = rng.uniform(-0.35, 0.35, (count, 2))
+    depth = rng.uniform(1.5, 2.5, (count, 1))
+    points = np.concatenate([uv, np.ones((count, 1))], axis=1) * depth
+    px = CAMERA.project(SE3.inverse_transform(NEAR, points)) + noise_px * rng.normal(size=(count, 2))
+    told = points.copy()
+    if wrong:
+        told[known:] *= 2.0 / depth[known:]
+    spread = 0.5 * told
+    spread[:known] = 0.0
+    return Sights(told, spread, px, np.full(count, max(noise_px, 0.5)))
+
+
+def test_distances_are_those_of_the_covariance():
+    sights = sights_of(5, 20, np.random.default_rng(0), 1.0)
+    seen, far = (
+        SE3.inverse_transform(START, p) for p in (sights.points, sights.points + 1e-6 * sights.spread)
+    )
+    slope = (CAMERA.project(far) - CAMERA.project(seen)) / 1e-6
+    cov = sights.std_px[:, None, None] ** 2 * np.eye(2) + slope[:, :, None] * slope[:, None]
+    miss = sights.px - CAMERA.project(seen)
+    expected = np.einsum("mp,mpq,mq->m", miss, np.linalg.inv(cov), miss)
+    assert squared_distances(CAMERA, START[None], sights)[0] == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize(("wrong", "error"), [(False, 1e-6), (True, 0.02)])
+def test_lines_fix_the_motion_and_few_points_its_length(wrong, error):
+    rng = np.random.default_rng(1)
+    sights = sights_of(4, 60, rng, 0.0, wrong)
+    sights.px[10:20] = rng.uniform((0.0, 0.0), (640.0, 480.0), (10, 2))
+    found = refined_on_all(CAMERA, START, sights)
+    assert found is not None
+    assert np.abs(SE3.log(SE3.between(NEAR, found.world_from_camera))).max() < error
+    assert found.inliers[:10].all() and found.inliers[20:].all()
+    assert found.inliers[10:20].mean() < 0.3
+
+
+def test_information_is_that_of_the_error():
+    errors, predicted = [], []
+    for seed in range(80):
+        found = refined_on_all(CAMERA, START, sights_of(8, 60, np.random.default_rng(seed), 0.7))
+        assert found is not None
+        errors.append(SE3.log(SE3.between(NEAR, found.world_from_camera)))
+        predicted.append(np.linalg.inv(found.information))
+    # Depths within a third of one another are less spread than the lines allow, and say a little more.
+    nees = np.einsum("sa,sab,sb->s", errors, np.linalg.inv(predicted), errors)
+    assert 3.0 < nees.mean() < 8.0
+
+
+def test_lines_make_the_pose_of_few_points_more_exact():
+    few, all_ = [], []
+    for seed in range(20):
+        both = sights_of(6, 80, np.random.default_rng(seed), 0.7)
+        alone = Sights(*(getattr(both, name)[:6] for name in ("points", "spread", "px", "std_px")))
+        for errors, sights in ((few, alone), (all_, both)):
+            found = refined_on_all(CAMERA, START, sights)
+            assert found is not None
+            errors.append(np.linalg.norm(SE3.log(SE3.between(NEAR, found.world_from_camera))))
+    assert np.median(all_) < 0.5 * np.median(few)
+
+
+def test_too_few_or_none_that_agree_fix_nothing():
+    sights = sights_of(3, 0, np.random.default_rng(0), 0.0)
+    assert refined_on_all(CAMERA, START, sights) is None
+    other = sights_of(0, 30, np.random.default_rng(0), 0.0)
+    other.px[:] += 400.0
+    assert refined_on_all(CAMERA, START, other) is None
+    assert (squared_distances(CAMERA, START[None], other) > GATE).all()

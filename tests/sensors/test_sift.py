@@ -85,12 +85,6 @@ def test_an_empty_histogram_is_no_division_by_zero():
     assert not descriptors_from_histograms(np.zeros((1, 128)), 36).any()
 
 
-@pytest.mark.parametrize("level", [0, 128, 255])
-def test_nothing_is_found_where_nothing_is(level):
-    points = Sift().extract(np.full((60, 80), level, dtype=np.uint8))
-    assert len(points) == 0 and points.px.shape == (0, 2) and points.descriptors.shape == (0, 36)
-
-
 def test_the_strongest_come_first_and_are_kept():
     image = room()[0][0][0]
     everything = Sift(SiftConfig(0, working_scale=1.0)).extract(image)
@@ -128,8 +122,3 @@ def test_threads_change_nothing():
 def test_settings_out_of_range(changes, message):
     with pytest.raises(InputError, match=message):
         SiftConfig(**changes)
-
-
-def test_an_image_that_is_none():
-    with pytest.raises(InputError, match="must be grey"):
-        Sift().extract(np.zeros((10, 10, 3), dtype=np.uint8))

@@ -4,12 +4,10 @@ import numpy as np
 import pytest
 
 from rbpf.conformance import check_model
-from rbpf.core.linearisation import numeric_jacobians
 from rbpf.core.models import ObservationModel
 from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
-from rbpf.sensors.camera.points import CameraPoint, StereoPoint
-from tests.exactness.models import known
+from rbpf.sensors.camera.points import StereoPoint
 from tests.sensors.camera_scenes import PLAIN, Rays
 from tests.sensors.test_camera_kernels import assert_twins, lanes
 
@@ -20,21 +18,6 @@ def test_a_sound_model():
     """With a lens so long that no step of the check's turning camera is by chance about 2π px."""
     long = RectifiedStereo(Pinhole(6400, 4800, 4000.0, 4100.0, 3199.5, 2399.5), 0.12)
     assert check_model(StereoPoint(long), SE3) == []
-
-
-def test_it_measures_what_any_camera_model_does():
-    rays = Rays.random(4, 5)
-    found, plain = StereoPoint(RIG), CameraPoint(RIG)
-    state = rays.state[:, None]
-    np.testing.assert_array_equal(found.predict(state, rays.points), plain.predict(state, rays.points))
-
-
-def test_jacobians():
-    rays, model = Rays.random(4, 5), StereoPoint(RIG)
-    at = rays.state[:, None], rays.points
-    analytic, numeric = model.jacobians(*at), numeric_jacobians(model, SE3, *at)
-    for one, other in zip(analytic[:2], numeric[:2], strict=True):
-        np.testing.assert_allclose(known(one), known(other), rtol=1e-5, atol=1e-4)
 
 
 @pytest.mark.parametrize("wide", [False, True], ids=["pose", "pose and velocity"])

@@ -7,7 +7,7 @@ import yaml
 from rbpf.lie import SE3
 from rbpf.runs.recordings import MonoRecording, filter_images
 from rbpf.runs.trajectory import Trajectory
-from rbpf.sensors.calibration.boards import Board
+from rbpf.sensors.calibration import Board
 from rbpf.sensors.camera import Pinhole
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.validation.gtsam.mono_batch import adjust_log

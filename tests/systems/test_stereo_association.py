@@ -7,7 +7,7 @@ import pytest
 
 from rbpf.lie import SE3
 from rbpf.motion.odometry import Odometry
-from rbpf.sensors.stereo.features import StereoFeatures
+from rbpf.sensors.stereo import StereoFeatures
 from rbpf.systems.filtering import ProposalConfig
 from rbpf.systems.stereo.config import MapConfig, StereoConfig, TriggerConfig
 from rbpf.systems.stereo.landmarks import ParticleSubsample, Places, View, log_support

@@ -10,7 +10,7 @@ from rbpf.lie import SE3
 from rbpf.motion.odometry import Odometry
 from rbpf.motion.stereo_vo import VoConfig
 from rbpf.runs.run import Run
-from rbpf.sensors.stereo.features import StereoFeatures
+from rbpf.sensors.stereo import StereoFeatures
 from rbpf.systems.stereo.config import RecoveryConfig, StereoConfig, TriggerConfig
 from rbpf.systems.stereo.landmarks import View
 from rbpf.systems.stereo.recovery import motion_for_update, relocalise_globally

@@ -10,8 +10,8 @@ from examples.studies.image_faults import cover_view
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.run import Run
-from rbpf.sensors.descriptors.landmark_management import NewLandmarkConfig
 from rbpf.sensors.feature_log import FeatureFrame
+from rbpf.sensors.landmark_management import NewLandmarkConfig
 from rbpf.sensors.readers import ImageFrame
 from rbpf.systems.stereo.config import MapConfig, OdometryConfig, StereoConfig, TriggerConfig
 from rbpf.systems.stereo.front_end import ImageFrontEnd

@@ -17,7 +17,7 @@ from rbpf.core.filter import Filter
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.maps.constellation import Constellation, UncertainConstellation
-from rbpf.sensors.calibration.boards import spread_rows
+from rbpf.sensors.calibration import spread_rows
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.camera.distortion import RadialTangential
 from rbpf.sensors.feature_log import KnownPoints

@@ -9,10 +9,10 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.motion.odometry import Odometry
 from rbpf.motion.stereo_vo import MotionPrior, VoConfig
-from rbpf.sensors.descriptors.landmark_management import NewLandmarkConfig
-from rbpf.sensors.descriptors.matching import MatchLimits
+from rbpf.sensors.descriptors import MatchLimits
 from rbpf.sensors.features import SiftConfig
-from rbpf.sensors.stereo.matching import PairConfig
+from rbpf.sensors.landmark_management import NewLandmarkConfig
+from rbpf.sensors.stereo import PairConfig
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig, ResamplingConfig
 
 OUTLIER_VOLUME_PX3 = 640.0 * 480.0 * 60.0

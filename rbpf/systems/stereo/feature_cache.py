@@ -20,8 +20,7 @@ from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.feature_log import CameraTruth
 from rbpf.sensors.features import Sift
 from rbpf.sensors.readers import ImageSequence
-from rbpf.sensors.stereo.features import StereoFeatures
-from rbpf.sensors.stereo.matching import StereoMatcher
+from rbpf.sensors.stereo import StereoFeatures, StereoMatcher
 from rbpf.systems.stereo.config import StereoConfig
 
 CHUNK = 100

@@ -22,8 +22,7 @@ from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.sensors.features import FeatureExtractor, Sift
 from rbpf.sensors.readers import ImageFrame
-from rbpf.sensors.stereo.features import StereoFeatures, match_frames
-from rbpf.sensors.stereo.matching import StereoMatcher
+from rbpf.sensors.stereo import StereoFeatures, StereoMatcher, match_frames
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.feature_cache import KEPT, CachedPair
 from rbpf.systems.stereo.landmarks import (

@@ -38,12 +38,11 @@ from rbpf.motion.stereo_geometry import Matches
 from rbpf.motion.stereo_vo import VoConfig, estimate_motion
 from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.camera.points import CameraModel, StereoPoint
-from rbpf.sensors.descriptors.index import DescriptorIndex
-from rbpf.sensors.descriptors.landmark_management import LandmarkManager, NewLandmarkConfig
-from rbpf.sensors.descriptors.matching import gate_pairs, match_pairs
+from rbpf.sensors.descriptors import DescriptorIndex, gate_pairs, match_pairs
 from rbpf.sensors.feature_log import FeatureFrame
+from rbpf.sensors.landmark_management import LandmarkManager, NewLandmarkConfig
 from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
-from rbpf.sensors.stereo.features import StereoFeatures
+from rbpf.sensors.stereo import StereoFeatures
 from rbpf.systems.stereo.config import MapConfig
 
 _MAP = frozenset({Part.LANDMARK})

@@ -1,43 +1,54 @@
 """ROS bags of one camera or two: `.bag` of ROS 1, and of ROS 2 a folder with `metadata.yaml`, `.mcap` or `.db3`.
 
-- the images: a topic of sensor_msgs Image or CompressedImage; where there are several, one has to be named. For stereo two:
+- The images: a topic of sensor_msgs Image or CompressedImage; where there are several, one has to be named. For stereo two:
   the left topic comes first; where none is named, the two that there are, in alphabetical order (`cam0` and `cam1`, `left`
-  and `right`);
-- the camera: sensor_msgs CameraInfo beside it (`/cam0/camera_info` for `/cam0/image_raw`), or a `camera.yaml`. Of two
-  cameras R and P say where they are, as `camera_calibration` leaves it; with a `camera.yaml` the images are taken as
-  rectified, and its `baseline_m` as the cameras' distance;
-- the truth: a topic of poses, if one is named.
+  and `right`). Encodings are those of `sensor_msgs/image_encodings`: grey and colour of 8 bits, grey of 16, and the Bayer
+  patterns. What a message claims is compared with its bytes before anything is made of it.
+- The camera: sensor_msgs CameraInfo beside it (`/cam0/camera_info` for `/cam0/image_raw`), its K, D and size, or a
+  `camera.yaml`. Where the last part of the topic's name says that the images are rectified (`image_rect`,
+  `image_rect_color`), which is all that a bag says about it, the camera is that of P, without distortion. Of two cameras R
+  and P say where they are, as `camera_calibration` leaves it; with a `camera.yaml` the images are taken as rectified, and
+  its `baseline_m` as the cameras' distance.
+- The truth: a topic of geometry_msgs PoseStamped, PoseWithCovarianceStamped, TransformStamped or nav_msgs Odometry, if one
+  is named. The poses are taken as world_from_camera, of the camera's optical frame (x to the right, y down, z ahead). A bag
+  whose poses are those of another frame, such as `base_link`, has to be converted first; where its names show that, a
+  logged message says so.
 
-`bag_messages` says what is read of each message. Times are those of the messages' headers. A bag does not say them in its
-index: the topic is gone through once as it is opened. A message that is too damaged to have a time is left out; one that
-has a time, but no image, is a frame that says so; a bag that is damaged further on is read until there.
+Times are those of the messages' headers. A bag does not say them in its index: the topic is gone through once as it is
+opened. A message that is too damaged to have a time is left out; one that has a time, but no image, is a frame that says so;
+a bag that is damaged further on is read until there.
+
+The library `rosbags` reads the containers. The messages have one standard definition per ROS version, which the library
+brings along: definitions that a bag carries are never compiled, so that nothing of a bag runs.
 """
 
+import bz2
 import logging
-from collections.abc import Generator
-from contextlib import ExitStack, closing
+from collections.abc import Callable, Generator, Iterator
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
+from operator import attrgetter
 from pathlib import Path
-from typing import final
+from struct import Struct
+from typing import Any, final
 
 import numpy as np
 
 from rbpf.errors import InputError
-from rbpf.lie import SE3
-from rbpf.sensors.camera import RectifiedStereo
-from rbpf.sensors.readers.images.bag_messages import (
-    COMPRESSED,
-    IMAGE,
-    SUFFIXES,
-    Bag,
-    CameraInfo,
-    RawMessage,
-    opened,
-    read_image,
-    read_poses,
+from rbpf.lie import SE3, Array
+from rbpf.sensors.camera import Pinhole, RectifiedStereo
+from rbpf.sensors.feature_log import CameraTruth
+from rbpf.sensors.readers.images.calibration import Calibration, read_calibration
+from rbpf.sensors.readers.images.decoding import (
+    Grey,
+    UnreadableImageError,
+    decode,
+    decode_ahead,
+    require_shape,
+    to_grey,
 )
-from rbpf.sensors.readers.images.calibration import read_calibration
-from rbpf.sensors.readers.images.decoding import Grey, UnreadableImageError, decode_ahead, require_shape
+from rbpf.sensors.readers.images.poses import LONGEST, pose_of_matrix, rigid_motion_error, truth_between
 from rbpf.sensors.readers.images.rectification import (
     Rectification,
     RectifiedImages,
@@ -46,7 +57,317 @@ from rbpf.sensors.readers.images.rectification import (
 )
 from rbpf.sensors.readers.images.sequence import ImageFormat, ImageFrame, ImageSequence, ReadOptions, Source
 
+SUFFIXES = frozenset({".bag", ".mcap", ".db3"})
+
+MOST_BYTES = 1 << 30
+"""No chunk of a bag is larger once it is unpacked."""
+IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+
+_LITTLE, _BIG = Struct("<4xII"), Struct(">4xII")
+"""Where a message begins with a header: after four bytes, in both versions of ROS, seconds and nanoseconds."""
+_LAYOUTS = {
+    "mono8": (1, np.uint8, None),
+    "8UC1": (1, np.uint8, None),
+    "mono16": (1, np.uint16, None),
+    "bgr8": (3, np.uint8, "COLOR_BGR2GRAY"),
+    "rgb8": (3, np.uint8, "COLOR_RGB2GRAY"),
+    "bgra8": (4, np.uint8, "COLOR_BGRA2GRAY"),
+    "rgba8": (4, np.uint8, "COLOR_RGBA2GRAY"),
+    **{
+        f"bayer_{pattern}{bits}": (1, kind, f"COLOR_Bayer{pattern.upper()}2GRAY")
+        for pattern in ("rggb", "bggr", "gbrg", "grbg")
+        for bits, kind in ((8, np.uint8), (16, np.uint16))
+    },
+}
+"""Encoding to channels, type of their values, and OpenCV's way to grey, None where it is grey."""
+_RADIAL_TANGENTIAL = "plumb_bob", "rational_polynomial"
+"""Models of distortion that begin with k1, k2, p1, p2, k3; the second one goes on with what must be zero."""
+_EQUIDISTANT = "equidistant", "fisheye"
+"""Models with k1, k2, k3, k4: ROS's name and OpenCV's."""
+_POSES = {
+    "geometry_msgs/msg/PoseStamped": "pose",
+    "geometry_msgs/msg/PoseWithCovarianceStamped": "pose.pose",
+    "nav_msgs/msg/Odometry": "pose.pose",
+    "geometry_msgs/msg/TransformStamped": "transform",
+}
+"""Where a message holds its pose."""
 _log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class RawMessage:
+    """A message as it lies in the bag.
+
+    Attributes:
+        type: of the message, such as sensor_msgs/msg/Image.
+        data: its bytes.
+        stamp_ns: time of its header.
+    """
+
+    type: str
+    data: bytes
+    stamp_ns: int
+
+
+@final
+class Bag:
+    """An open bag.
+
+    Args:
+        path: file or folder, for messages.
+        reader: the library's.
+        types: the library's, of the bag's version of ROS.
+    """
+
+    def __init__(self, path: Path, reader: Any, types: Any) -> None:
+        self.path = path
+        self._reader, self._types = reader, types
+        self._ros1 = path.suffix == ".bag" and path.is_file()
+        # A file that was not summed up counts none at all.
+        counted = any(c.msgcount for c in reader.connections)
+        self.topics: dict[str, str] = {
+            c.topic: c.msgtype for c in reader.connections if c.msgcount or not counted
+        }
+        """Types of the topics that hold messages, by their names."""
+
+    @property
+    def name(self) -> str:
+        """Of the recording."""
+        whole = self.path.resolve()
+        return whole.stem if whole.is_file() else whole.name
+
+    def of_type(self, *types: str) -> list[str]:
+        """Topics of some types, in alphabetical order."""
+        return sorted(topic for topic, kind in self.topics.items() if kind in types)
+
+    def messages(self, topic: str) -> Iterator[RawMessage]:
+        """Messages of a topic in the order of the bag; those too short or too wrong to have a time are left out."""
+        chosen = [c for c in self._reader.connections if c.topic == topic]
+        with _refusing(self.path), closing(self._reader.messages(connections=chosen)) as found:
+            for connection, _, data in found:
+                layout = _LITTLE if self._ros1 or data[1:2] == b"\x01" else _BIG
+                if len(data) < layout.size:
+                    continue
+                seconds, nanoseconds = layout.unpack_from(data)
+                if nanoseconds < 10**9:
+                    yield RawMessage(connection.msgtype, data, int(seconds) * 10**9 + int(nanoseconds))
+
+    def message(self, raw: RawMessage) -> Any:
+        """The message with its fields by name."""
+        read = self._types.deserialize_ros1 if self._ros1 else self._types.deserialize_cdr
+        with _refusing(self.path):
+            return read(raw.data, raw.type)
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[Bag]:
+    """A bag, closed at the end."""
+    try:
+        from rosbags import rosbag1, rosbag2
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError:
+        problem = "a ROS bag is read with the package rosbags, which is not installed"
+        raise InputError(f"{path}: {problem}: pip install 'rbpf[bags]'") from None
+    ros1 = path.suffix == ".bag" and path.is_file()
+    with _refusing(path):
+        reader: Any = rosbag1.Reader(path) if ros1 else rosbag2.Reader(path)
+        reader.open()
+    try:
+        if ros1:
+            # Packed chunks may unpack to no more than `MOST_BYTES`; the library itself takes what comes.
+            for place, chunk in reader.chunks.items():
+                if chunk.datasize > MOST_BYTES:
+                    raise InputError(f"{path}: a chunk claims to be larger than {MOST_BYTES >> 20} MiB.")
+                reader.chunks[place] = chunk._replace(decompressor=partial(_unpacked, chunk.decompressor))
+        yield Bag(path, reader, get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.LATEST))
+    finally:
+        reader.close()
+
+
+@contextmanager
+def _refusing(path: Path) -> Iterator[None]:
+    """What the library and its decompressors raise on damaged bytes, assertions among it, as one sentence."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        reason = " ".join((str(error) or type(error).__name__).split())[:200].rstrip(".")
+        action = "copy it again, or repair it with `rosbag reindex`, `ros2 bag reindex` or `mcap recover`"
+        raise InputError(f"{path}: the bag cannot be read ({reason}); {action}.") from None
+
+
+def _unpacked(unpack: Callable[[bytes], bytes], data: bytes) -> bytes:
+    from lz4.frame import LZ4FrameDecompressor
+
+    decompressor: Any
+    if data.startswith(b"BZh"):
+        decompressor = bz2.BZ2Decompressor()
+    elif data.startswith(b"\x04\x22\x4d\x18"):
+        decompressor = LZ4FrameDecompressor()
+    else:
+        return unpack(data)
+    unpacked = decompressor.decompress(data, MOST_BYTES)
+    if not decompressor.eof:
+        raise ValueError(f"a chunk is cut off, or larger than {MOST_BYTES >> 20} MiB")
+    return bytes(unpacked)
+
+
+def read_image(bag: Bag, raw: RawMessage, where: str) -> Grey:
+    """Image (H, W) of a message; `where` names it in messages.
+
+    Raises:
+        UnreadableImageError: it is damaged, or of an encoding that is not known.
+    """
+    import cv2
+
+    try:
+        message = bag.message(raw)
+    except InputError:
+        raise UnreadableImageError(f"{where}: a message is damaged.") from None
+    if raw.type == COMPRESSED:
+        return decode(where, np.asarray(message.data, np.uint8))
+    if message.encoding not in _LAYOUTS:
+        known = ", ".join(_LAYOUTS)
+        raise UnreadableImageError(
+            f"{where}: the encoding {message.encoding[:40]!r} is none of {known}; convert it."
+        )
+    channels, kind, conversion = _LAYOUTS[message.encoding]
+    width = message.width * channels * np.dtype(kind).itemsize
+    if not (message.height > 0 and 0 < width <= message.step):
+        raise UnreadableImageError(
+            f"{where}: {message.width}x{message.height} px in rows of {message.step} bytes."
+        )
+    if message.height * message.step != len(message.data):
+        expected = f"expected {message.height} rows of {message.step} bytes"
+        raise UnreadableImageError(f"{where}: {expected}, found {len(message.data)} bytes.")
+    rows = np.ascontiguousarray(message.data.reshape(message.height, message.step)[:, :width])
+    pixels = rows.view(np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")).astype(kind)
+    if channels > 1:
+        pixels = pixels.reshape(message.height, message.width, channels)
+    if conversion is not None:
+        pixels = np.asarray(cv2.cvtColor(pixels, getattr(cv2, conversion)))
+    return to_grey(where, pixels)
+
+
+@dataclass(frozen=True)
+class CameraInfo:
+    """A camera as its messages describe it.
+
+    Attributes:
+        calibration: the camera of the images as they are in the bag.
+        rotation: (3, 3) R, which rectifies the pair that it belongs to.
+        projection: (3, 4) P, of the camera after that rotation; its last column holds the baseline.
+        is_rectified: whether the images have been rotated so.
+    """
+
+    calibration: Calibration
+    rotation: Array
+    projection: Array
+    is_rectified: bool
+
+    @classmethod
+    def read(cls, bag: Bag, image_topic: str) -> "CameraInfo":
+        """The camera of a topic of images, from the first message about it."""
+        named = image_topic.removesuffix("/compressed")
+        topic = f"{named.rpartition('/')[0]}/camera_info"
+        held = bag.of_type(CAMERA_INFO)
+        if topic not in held:
+            found = f"found {', '.join(held)}" if held else "found no sensor_msgs/CameraInfo"
+            raise InputError(
+                f"{bag.path}: expected the camera of {image_topic} in {topic}, {found}; give --calibration camera.yaml."
+            )
+        where = f"{bag.path}, {topic}"
+        raw = next(bag.messages(topic), None)
+        if raw is None:
+            raise InputError(f"{where}: no message can be read.")
+        message = bag.message(raw)
+        roi = message.roi
+        if max(message.binning_x, message.binning_y) > 1 or roi.x_offset or roi.y_offset:
+            problem = "the images are binned or a part of the sensor's, which K does not describe"
+            raise InputError(f"{where}: {problem}; give --calibration with the camera of these images.")
+        rotation, projection = _field(message, "R").reshape(3, 3), _field(message, "P").reshape(3, 4)
+        is_rectified = named.rpartition("/")[2].startswith("image_rect")
+        intrinsics = projection[:, :3] if is_rectified else _field(message, "K").reshape(3, 3)
+        fx, fy, cx, cy = intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+        if not (np.isfinite(intrinsics).all() and fx > 0.0 and fy > 0.0):
+            raise InputError(
+                f"{where}: the camera is not calibrated (fx {fx:g}, fy {fy:g}); give --calibration."
+            )
+        # The model of distortion and its coefficients.
+        d, model = _field(message, "D").tolist(), message.distortion_model
+        lens: dict[str, Any] = {}
+        if not is_rectified:
+            if model in _EQUIDISTANT and len(d) == 4:
+                lens = {"distortion_model": "equidistant", "distortion": tuple(d)}
+            elif (model in _RADIAL_TANGENTIAL or not (model or any(d))) and not any(d[5:]):
+                lens = {"distortion": (*d[:5], *[0.0] * 5)[:5]}
+            else:
+                problem = f"the lens is {model[:40]!r} with {len(d)} coefficients"
+                expected = "expected plumb_bob with 4 or 5, or equidistant with 4"
+                raise InputError(
+                    f"{where}: {problem}, {expected}; rectify the images, or give --calibration."
+                )
+        try:
+            camera = Pinhole(message.width, message.height, fx, fy, cx, cy, **lens)
+        except InputError as error:
+            raise InputError(f"{where}: {error}; give --calibration.") from None
+        return cls(Calibration(where, camera), rotation, projection, is_rectified)
+
+    def rectified_from_camera(self) -> Array:
+        """R as a pose (7,)."""
+        placed = np.column_stack([self.rotation, np.zeros(3)])
+        if not np.isfinite(placed).all() or rigid_motion_error(placed):
+            raise InputError(f"{self.calibration.where}: R is no rotation; calibrate the two as a pair.")
+        return pose_of_matrix(placed)
+
+    @property
+    def shift_m(self) -> float:
+        """How far to the right of the pair's left camera this one is, rectified; 0 where P does not say."""
+        fx, shift = self.projection[0, [0, 3]]
+        return float(-shift / fx) if fx > 0.0 and np.isfinite(shift) else 0.0
+
+
+def _field(message: Any, name: str) -> Array:
+    """Numbers that ROS 1 names with a capital letter and ROS 2 with a small one."""
+    return np.array(getattr(message, name if hasattr(message, name) else name.lower()), np.float64)
+
+
+def read_poses(bag: Bag, topic: str, images_ns: np.ndarray, camera_frame: str) -> CameraTruth:
+    """The truth that a topic holds, for images at (T,) times, whose frame the poses should be those of."""
+    kind = bag.topics.get(topic, "")
+    if kind not in _POSES:
+        held = bag.of_type(*_POSES)
+        found = f"found {', '.join(held)}" if held else "found none"
+        raise InputError(f"{bag.path}: expected poses in the topic {topic}, {found} with poses in the bag.")
+    where = f"{bag.path}, {topic}"
+    stamps, poses = list[int](), list[list[float]]()
+    for raw in bag.messages(topic):
+        message = bag.message(raw)
+        frame = getattr(message, "child_frame_id", "")
+        if not poses and frame and camera_frame and frame.strip("/") != camera_frame.strip("/"):
+            _log.warning(
+                "%s: the poses of %s are those of %s and are taken as those of the camera %s",
+                bag.path, topic, frame, camera_frame,
+            )  # fmt: skip
+        pose = attrgetter(_POSES[kind])(message)
+        turn = pose.orientation if hasattr(pose, "orientation") else pose.rotation
+        place = pose.position if hasattr(pose, "position") else pose.translation
+        stamps.append(raw.stamp_ns)
+        poses.append([turn.x, turn.y, turn.z, turn.w, place.x, place.y, place.z])
+    if not poses:
+        raise InputError(f"{where}: no pose can be read.")
+    stamps_ns, world_from_camera = np.array(stamps, np.int64), np.array(poses)
+    if (late := np.flatnonzero(np.diff(stamps_ns) < 0)).size:
+        raise InputError(f"{where}: the stamp of pose {late[0] + 1} is before the one it follows.")
+    length = np.linalg.norm(world_from_camera[:, :4], axis=1)
+    wrong = np.flatnonzero(~(np.abs(length - 1.0) <= LONGEST) | ~np.isfinite(world_from_camera).all(axis=1))
+    if wrong.size:
+        raise InputError(
+            f"{where}: pose {wrong[0]} has a quaternion of length {length[wrong[0]]:.6g}, expected 1."
+        )
+    return truth_between(bag.path, stamps_ns, SE3.normalise(world_from_camera), images_ns)
 
 
 @final
@@ -76,14 +397,8 @@ class RosBag(ImageFormat):
             used.require_shape(stream.shape, f"{path}, {topic}")
             truth = topics.truth and read_poses(bag, topics.truth, stream.stamps_ns, stream.frame)
         rows = np.arange(len(stream.stamps_ns))
-        return ImageSequence(
-            name=bag.name,
-            camera=used.camera,
-            stamps_ns=stream.stamps_ns,
-            truth=truth or None,
-            baseline_m=None,
-            source=BagImages(path, stream.stamps_ns, stream.shape, (topic,), (rows,)),
-        )
+        source = BagImages(path, stream.stamps_ns, stream.shape, (topic,), (rows,))
+        return ImageSequence(bag.name, used.camera, stream.stamps_ns, truth or None, None, source)
 
     def read_stereo(self, path: Path, options: ReadOptions) -> ImageSequence:
         topics = options.topics
@@ -95,10 +410,15 @@ class RosBag(ImageFormat):
             if sizes[0] != sizes[1]:
                 raise InputError(f"{where}: the images have {sizes[0]} and {sizes[1]} px, expected one size.")
             rectification: Rectification | None = None
-            if options.calibration is not None:
-                rig = _given_rig(options.calibration, streams)
-            else:
+            if options.calibration is None:
                 rig, rectification = _rig_of_infos(bag, streams)
+            else:
+                used = read_calibration(options.calibration)
+                used.require_shape(streams[0].shape, streams[0].topic)
+                if used.baseline_m is None:
+                    expected = "expected baseline_m, the distance of the two cameras in m"
+                    raise InputError(f"{options.calibration}: {expected}.")
+                rig = RectifiedStereo(used.camera, used.baseline_m)
             left, right, notes = pair_stamps(
                 streams[0].stamps_ns, streams[1].stamps_ns, options.tolerance_s, where
             )
@@ -132,11 +452,7 @@ class ImageStream:
 
     @classmethod
     def read(cls, bag: Bag, topic: str) -> "ImageStream":
-        """Goes through a topic once, for its times and its first image.
-
-        Raises:
-            InputError: it holds no image that can be read, or the bag is damaged, or time stands still or runs backwards.
-        """
+        """Goes through a topic once, for its times and its first image."""
         where, stamps = f"{bag.path}, {topic}", list[int]()
         first: tuple[tuple[int, int], str] | None = None
         problems = []
@@ -203,14 +519,12 @@ class BagImages(Source):
         row = next(wanted, None)
         for number, raw in enumerate(bag.messages(topic)):
             if number == row:
-                yield self._read(bag, raw, f"{bag.path}, {topic}, image {number}")
+                where = f"{bag.path}, {topic}, image {number}"
+                try:
+                    yield require_shape(where, read_image(bag, raw, where), self.shape), None
+                except UnreadableImageError as error:
+                    yield None, str(error)
                 row = next(wanted, None)
-
-    def _read(self, bag: Bag, raw: RawMessage, where: str) -> tuple[Grey | None, str | None]:
-        try:
-            return require_shape(where, read_image(bag, raw, where), self.shape), None
-        except UnreadableImageError as error:
-            return None, str(error)
 
     def _next(self, streams: list[Generator[tuple[Grey | None, str | None]]], index: int) -> ImageFrame:
         images, problem = [], None
@@ -226,11 +540,7 @@ class BagImages(Source):
 
 
 def _image_topics(bag: Bag, named: tuple[str, ...], count: int) -> list[str]:
-    """The topics of images that are named, or those that there are; as many as there should be cameras, 1 or 2.
-
-    Raises:
-        InputError: a topic that is named is not there, or there are more or fewer than these and none is named.
-    """
+    """The topics of images that are named, or those that there are; as many as there should be cameras, 1 or 2."""
     held = bag.of_type(IMAGE, COMPRESSED)
     found = f"the bag's image topics are {', '.join(held)}" if held else "the bag has no topic of images"
     if missing := [topic for topic in named if topic not in held]:
@@ -240,15 +550,6 @@ def _image_topics(bag: Bag, named: tuple[str, ...], count: int) -> list[str]:
         what = "one of them with --image-topic" if count == 1 else "two of them with --image-topic LEFT,RIGHT"
         raise InputError(f"{bag.path}: {found}; name {what}." if held else f"{bag.path}: {found}.")
     return chosen
-
-
-def _given_rig(calibration: Path, streams: list[ImageStream]) -> RectifiedStereo:
-    """The rectified pair of a camera.yaml."""
-    used = read_calibration(calibration)
-    used.require_shape(streams[0].shape, streams[0].topic)
-    if used.baseline_m is None:
-        raise InputError(f"{calibration}: expected baseline_m, the distance of the two cameras in m.")
-    return RectifiedStereo(used.camera, used.baseline_m)
 
 
 def _rig_of_infos(bag: Bag, streams: list[ImageStream]) -> tuple[RectifiedStereo, Rectification | None]:

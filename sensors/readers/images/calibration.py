@@ -28,7 +28,6 @@ KIND = (
 
 MODELS = {"pinhole": "radial-tangential", "fisheye": "equidistant"}
 """What `model` may be, and the model of distortion that it means."""
-
 _REQUIRED = ("fx", "fy", "cx", "cy", "width", "height")
 _OPTIONAL = ("model", "distortion", "rate_hz", "baseline_m")
 
@@ -50,15 +49,7 @@ class Calibration:
     baseline_m: float | None = None
 
     def require_shape(self, shape: tuple[int, int], what: str) -> None:
-        """Refuse images of another size.
-
-        Args:
-            shape: height and width of the images.
-            what: the images, for the message.
-
-        Raises:
-            InputError: the sizes differ.
-        """
+        """Refuse images of another height and width; `what` they are, for the message."""
         camera = self.camera
         if shape != (camera.height, camera.width):
             found = f"the images of {what} have {shape[1]}x{shape[0]} px"
@@ -84,20 +75,21 @@ def read_calibration(path: Path) -> Calibration:
         InputError: the file is missing or not as described above.
     """
     entries = read_yaml(path, KIND).entries(_REQUIRED, _OPTIONAL)
-    return Calibration(
-        where=str(path),
-        camera=_camera(entries),
-        rate_hz=entries["rate_hz"].positive() if "rate_hz" in entries else None,
-        baseline_m=entries["baseline_m"].positive() if "baseline_m" in entries else None,
+    model = MODELS[entries["model"].choice(list(MODELS)) if "model" in entries else "pinhole"]
+    width, height = (entries[name].size() for name in ("width", "height"))
+    fx, fy = (entries[name].positive() for name in ("fx", "fy"))
+    cx, cy = (entries[name].number() for name in ("cx", "cy"))
+    given, none = entries.get("distortion"), (0.0,) * len(LENSES[model].coefficient_names)
+    lens = coefficients(given, model) if given else none
+    camera = Pinhole(width, height, fx, fy, cx, cy, lens, model)
+    rate_hz, baseline_m = (
+        entries[name].positive() if name in entries else None for name in ("rate_hz", "baseline_m")
     )
+    return Calibration(str(path), camera, rate_hz, baseline_m)
 
 
 def coefficients(value: YamlValue, model: str = "radial-tangential") -> tuple[float, ...]:
-    """Distortion of a list: k1, k2, p1, p2, k3, of which the last may be left out, or k1, k2, k3, k4 if equidistant.
-
-    Raises:
-        InputError: it is no such list.
-    """
+    """Distortion of a list: k1, k2, p1, p2, k3, of which the last may be left out, or k1, k2, k3, k4 if equidistant."""
     count = len(LENSES[model].coefficient_names)
     numbers = [item.number() for item in value.items(*sorted({4, count}))]
     return (*numbers, *[0.0] * (count - len(numbers)))
@@ -105,23 +97,4 @@ def coefficients(value: YamlValue, model: str = "radial-tangential") -> tuple[fl
 
 def model_of(camera: Pinhole) -> str:
     """What `model` is in the file of a camera."""
-    return next(
-        name for name, distortion_model in MODELS.items() if distortion_model == camera.distortion_model
-    )
-
-
-def _camera(entries: dict[str, YamlValue]) -> Pinhole:
-    model = MODELS[entries["model"].choice(list(MODELS)) if "model" in entries else "pinhole"]
-    distortion = entries.get("distortion")
-    return Pinhole(
-        width=entries["width"].size(),
-        height=entries["height"].size(),
-        fx=entries["fx"].positive(),
-        fy=entries["fy"].positive(),
-        cx=entries["cx"].number(),
-        cy=entries["cy"].number(),
-        distortion=coefficients(distortion, model)
-        if distortion
-        else (0.0,) * len(LENSES[model].coefficient_names),
-        distortion_model=model,
-    )
+    return next(name for name, distortion in MODELS.items() if distortion == camera.distortion_model)

@@ -43,20 +43,23 @@ def read_grey(path: Path) -> Grey:
 
 
 def decode(path: Path | str, data: NDArray[np.uint8]) -> Grey:
-    """Image (H, W) of the content (B,) of a file.
-
-    Args:
-        path: where it is from, for messages.
-        data: the bytes.
+    """Image (H, W) of the content (B,) of a file, which `path` names in messages.
 
     Raises:
-        UnreadableImageError: they are no complete image of a format that OpenCV knows.
+        UnreadableImageError: it is no complete image of a format that OpenCV knows.
     """
     import cv2
+    from PIL import Image
 
     if not data.size:
         raise UnreadableImageError(f"{path}: the file is empty, expected an image.")
-    _require_size(path, data)
+    # Before anything is decoded: a header may claim more pixels than Pillow takes for sane.
+    try:
+        Image.open(BytesIO(data.tobytes())).close()
+    except (Image.DecompressionBombError, Image.DecompressionBombWarning):
+        raise UnreadableImageError(f"{path}: the image claims to be larger than any camera's.") from None
+    except Exception:
+        pass
     try:
         image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
     except cv2.error as error:
@@ -93,18 +96,6 @@ def require_shape(path: Path | str, image: Grey, shape: tuple[int, int]) -> Grey
     return image
 
 
-def _require_size(path: Path | str, data: NDArray[np.uint8]) -> None:
-    """Refuses, before anything is decoded, an image whose header claims more pixels than Pillow takes for sane."""
-    from PIL import Image
-
-    try:
-        Image.open(BytesIO(data.tobytes())).close()
-    except (Image.DecompressionBombError, Image.DecompressionBombWarning):
-        raise UnreadableImageError(f"{path}: the image claims to be larger than any camera's.") from None
-    except Exception:
-        pass
-
-
 def _to_8_bits(path: Path | str, image: np.ndarray) -> Grey:
     if image.dtype == np.uint16:
         return np.rint(image * (255.0 / 65535.0)).astype(np.uint8)
@@ -134,15 +125,15 @@ class FileImages(Source):
     right: Sequence[Path | None] | None = None
 
     def frames(self, start: int) -> Generator[ImageFrame]:
-        return decode_ahead(self._load, range(start, len(self.left)))
+        def load(index: int) -> ImageFrame:
+            image, problem = self._read(self.left[index])
+            right = None
+            if self.right is not None:
+                right, other = self._read(self.right[index])
+                problem = problem or other
+            return ImageFrame(int(self.stamps_ns[index]), image, right, problem)
 
-    def _load(self, index: int) -> ImageFrame:
-        image, problem = self._read(self.left[index])
-        right = None
-        if self.right is not None:
-            right, other = self._read(self.right[index])
-            problem = problem or other
-        return ImageFrame(int(self.stamps_ns[index]), image, right, problem)
+        return decode_ahead(load, range(start, len(self.left)))
 
     def _read(self, path: Path | None) -> tuple[Grey | None, str | None]:
         if path is None:
@@ -169,11 +160,7 @@ def decode_ahead(load: Callable[[int], ImageFrame], indices: Iterable[int]) -> G
 
 
 def first_shape(paths: Sequence[Path], where: Path) -> tuple[int, int]:
-    """Height and width of the first image that can be read.
-
-    Raises:
-        InputError: none can.
-    """
+    """Height and width of the first image that can be read."""
     problems = []
     for path in paths:
         try:

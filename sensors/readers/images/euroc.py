@@ -38,14 +38,7 @@ from rbpf.sensors.readers.images.sequence import ImageFormat, ImageSequence, Rea
 from rbpf.sensors.readers.text import read_stamped
 from rbpf.sensors.readers.yaml_files import YamlValue, read_yaml
 
-_CAMERA = (
-    "T_BS",
-    "resolution",
-    "camera_model",
-    "intrinsics",
-    "distortion_model",
-    "distortion_coefficients",
-)
+_CAMERA = ["T_BS", "resolution", "camera_model", "intrinsics", "distortion_model", "distortion_coefficients"]
 _LENSES = {
     "radial-tangential": "radial-tangential",
     "radtan": "radial-tangential",
@@ -85,7 +78,13 @@ class Euroc(ImageFormat):
         folders = mav / "cam0", mav / "cam1"
         left, right = (AslCamera.read(folder / "sensor.yaml", self.stereo_kind) for folder in folders)
         left_from_right = SE3.between(left.body_from_camera, right.body_from_camera)
-        _require_pair(left, right, left_from_right, mav)
+        sizes = [f"{asl.calibration.camera.width}x{asl.calibration.camera.height}" for asl in (left, right)]
+        if sizes[0] != sizes[1]:
+            both = f"cam0 has {sizes[0]} and cam1 {sizes[1]} px, expected one size"
+            raise InputError(f"{mav}: {both}; scale the images of one of the two.")
+        if not SE3.translation(left_from_right).any():
+            problem = "T_BS puts cam1 where cam0 is, a baseline of zero; give the two cameras' own"
+            raise InputError(f"{folders[1] / 'sensor.yaml'}: {problem}.")
         listed = [
             read_stamped(folder / "data.csv", self.stereo_kind, ",", nanoseconds=True) for folder in folders
         ]
@@ -134,29 +133,15 @@ class AslCamera:
 
     @classmethod
     def read(cls, path: Path, hint: str) -> "AslCamera":
-        """Read a `sensor.yaml`.
-
-        Args:
-            path: the file.
-            hint: what is expected to lie there, for the message.
-
-        Raises:
-            InputError: the file is missing, or is no pinhole camera with radial-tangential or equidistant distortion.
-        """
+        """Read a `sensor.yaml`; `hint` is what is expected to lie there, for messages."""
         entries = read_yaml(path, hint).entries(_CAMERA)
         entries["camera_model"].choice(["pinhole"])
         model = _LENSES[entries["distortion_model"].choice(list(_LENSES))]
         width, height = entries["resolution"].items(2)
         fx, fy, cx, cy = entries["intrinsics"].items(4)
+        lens = coefficients(entries["distortion_coefficients"], model)
         camera = Pinhole(
-            width=width.size(),
-            height=height.size(),
-            fx=fx.positive(),
-            fy=fy.positive(),
-            cx=cx.number(),
-            cy=cy.number(),
-            distortion=coefficients(entries["distortion_coefficients"], model),
-            distortion_model=model,
+            width.size(), height.size(), fx.positive(), fy.positive(), cx.number(), cy.number(), lens, model
         )
         return cls(Calibration(str(path), camera), _mount(entries["T_BS"]))
 
@@ -165,30 +150,12 @@ def _mav(path: Path) -> Path:
     return path / "mav0" if (path / "mav0").is_dir() else path
 
 
-def _require_pair(left: AslCamera, right: AslCamera, left_from_right: Array, mav: Path) -> None:
-    sizes = [f"{asl.calibration.camera.width}x{asl.calibration.camera.height}" for asl in (left, right)]
-    if sizes[0] != sizes[1]:
-        raise InputError(
-            f"{mav}: cam0 has {sizes[0]} and cam1 {sizes[1]} px, expected one size; scale the images of one of the two."
-        )
-    if not SE3.translation(left_from_right).any():
-        where = mav / "cam1" / "sensor.yaml"
-        raise InputError(
-            f"{where}: T_BS puts cam1 where cam0 is, a baseline of zero; give the two cameras' own."
-        )
-
-
 def _sequence(mav: Path, camera: AslCamera, stamps_ns: np.ndarray, source: Source) -> ImageSequence:
     """Images of one camera, with its truth where there is one."""
     folder = mav.resolve()
-    return ImageSequence(
-        name=folder.parent.name if folder.name == "mav0" else folder.name,
-        camera=camera.calibration.camera,
-        stamps_ns=stamps_ns,
-        truth=_read_truth(mav, camera, stamps_ns),
-        baseline_m=None,
-        source=source,
-    )
+    name = folder.parent.name if folder.name == "mav0" else folder.name
+    truth = _read_truth(mav, camera, stamps_ns)
+    return ImageSequence(name, camera.calibration.camera, stamps_ns, truth, None, source)
 
 
 def _read_truth(mav: Path, camera: AslCamera, images_ns: np.ndarray) -> CameraTruth | None:

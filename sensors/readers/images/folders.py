@@ -138,7 +138,17 @@ class Photos(ImageFormat):
             expected = "expected one line `K fx fy cx cy width height`"
             raise InputError(f"{file}: {expected}, found {len(cameras)}.")
         given = options.calibration
-        camera = _photo_camera(file, *cameras[0]) if given is None else read_calibration(given)
+        if given is None:
+            line, rest = cameras[0]
+            numbers = parse_table(file, _PHOTO_CAMERA, [(line, rest)]).values[0].tolist()
+            fx, fy, cx, cy, width, height = numbers
+            if not (min(fx, fy, width, height) > 0.0 and width % 1 == 0 and height % 1 == 0):
+                expected = "expected positive fx and fy, and a whole positive width and height"
+                raise line_error(file, line, expected)
+            pinhole = Pinhole(int(width), int(height), fx, fy, cx, cy)
+            camera = Calibration(f"{file}, line {line}", pinhole)
+        else:
+            camera = read_calibration(given)
         photos = [row for row in rows if row[1] != "K"]
         table = parse_table(file, _PHOTO_POSE, [(line, pose) for line, _, pose in photos])
         stamps_ns = evenly(len(photos), PHOTO_RATE_HZ)
@@ -170,12 +180,8 @@ class Folder(ImageFormat):
         else:
             stamps_ns = evenly(len(files), camera.rate_hz or DEFAULT_RATE_HZ)
             if camera.rate_hz is None:
-                _log.info(
-                    "%s: no times.txt and no rate_hz in %s, taken as %g Hz",
-                    path,
-                    camera.where,
-                    DEFAULT_RATE_HZ,
-                )
+                said = "%s: no times.txt and no rate_hz in %s, taken as %g Hz"
+                _log.info(said, path, camera.where, DEFAULT_RATE_HZ)
         truth = read_tum_truth(path / "groundtruth.txt", stamps_ns)
         return _sequence(path, camera, stamps_ns, files, truth)
 
@@ -186,7 +192,8 @@ def list_images(path: Path) -> list[Path]:
         if folder.is_dir():
             found = [file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES]
             if found:
-                return sorted(found, key=_natural)
+                # Numbers in a name count as such.
+                return sorted(found, key=lambda file: (_numbered(file.name), file.name))
     return []
 
 
@@ -206,14 +213,8 @@ def _sequence(
     """Images in files of one size, which are listed in a file or lie in the folder."""
     shape = first_shape(files, listed or path)
     camera.require_shape(shape, str(path))
-    return ImageSequence(
-        name=path.resolve().name,
-        camera=camera.camera,
-        stamps_ns=stamps_ns,
-        truth=truth,
-        baseline_m=None,
-        source=FileImages(stamps_ns, shape, files),
-    )
+    source = FileImages(stamps_ns, shape, files)
+    return ImageSequence(path.resolve().name, camera.camera, stamps_ns, truth, None, source)
 
 
 def _scenes_pose(path: Path) -> Array | None:
@@ -232,13 +233,5 @@ def _scenes_pose(path: Path) -> Array | None:
     return pose_of_matrix(matrix.reshape(4, 4))
 
 
-def _photo_camera(file: Path, line: int, rest: str) -> Calibration:
-    fx, fy, cx, cy, width, height = parse_table(file, _PHOTO_CAMERA, [(line, rest)]).values[0].tolist()
-    if not (fx > 0.0 and fy > 0.0 and width > 0 and height > 0 and width % 1 == 0 and height % 1 == 0):
-        raise line_error(file, line, "expected positive fx and fy, and a whole positive width and height")
-    return Calibration(f"{file}, line {line}", Pinhole(int(width), int(height), fx, fy, cx, cy))
-
-
-def _natural(path: Path) -> tuple[list[str | int], str]:
-    parts = re.split(r"(\d+)", path.name)
-    return [int(part) if i % 2 else part for i, part in enumerate(parts)], path.name
+def _numbered(name: str) -> list[str | int]:
+    return [int(part) if i % 2 else part for i, part in enumerate(re.split(r"(\d+)", name))]

@@ -29,7 +29,6 @@ from rbpf.sensors.readers.text import line_error, parse_number, read_columns, re
 
 ALIGNED_PX = 1e-2
 """How far intrinsics of the two cameras of a pair may differ."""
-
 _PAIRS = ((0, 1), (2, 3))
 _POSE = tuple(f"m{row}{column}" for row in range(3) for column in range(4))
 
@@ -64,7 +63,13 @@ class Kitti(ImageFormat):
         if options.calibration is not None:
             used = read_calibration(options.calibration)
         else:
-            used = _calibration(projections, left, shape)
+            fx, fy, cx, cy = projections.intrinsics(left)
+            height, width = shape
+            if not (0.0 < cx < width and 0.0 < cy < height):
+                centre = f"the centre of projection ({cx:.6g}, {cy:.6g}) px"
+                problem = f"{centre} lies outside the images of {width}x{height} px"
+                raise InputError(f"{projections.path}: {problem}; give the calibration of these images.")
+            used = Calibration(str(projections.path), Pinhole(width, height, fx, fy, cx, cy))
         used.require_shape(shape, str(path))
         if stereo and (other := first_shape(files[1], folders[1])) != shape:
             sizes = f"{shape[1]}x{shape[0]} and {other[1]}x{other[0]} px"
@@ -103,15 +108,7 @@ class Projections:
 
     @classmethod
     def read(cls, path: Path, hint: str) -> "Projections":
-        """Read the projections; other lines are passed over.
-
-        Args:
-            path: the file.
-            hint: what is expected to lie there, for the message.
-
-        Raises:
-            InputError: the file is missing, or a projection is not 12 numbers.
-        """
+        """Read the projections; other lines are passed over. `hint` is what is expected to lie there, for messages."""
         matrices, lines = {}, {}
         for number, line in enumerate(read_text(path, hint).splitlines(), 1):
             name, _, rest = line.partition(":")
@@ -126,11 +123,7 @@ class Projections:
         return cls(path, matrices, lines)
 
     def intrinsics(self, camera: int) -> tuple[float, float, float, float]:
-        """fx, fy, cx, cy [px].
-
-        Raises:
-            InputError: the camera is missing, or its projection is not K [I | t] with no skew.
-        """
+        """fx, fy, cx, cy [px]."""
         matrix = self._matrix(camera)
         fx, fy = matrix[0, 0], matrix[1, 1]
         pinhole = np.array([[fx, 0.0, matrix[0, 2]], [0.0, fy, matrix[1, 2]], [0.0, 0.0, 1.0]])
@@ -140,22 +133,14 @@ class Projections:
         return float(fx), float(fy), float(matrix[0, 2]), float(matrix[1, 2])
 
     def first_from_camera(self, camera: int) -> Array:
-        """Pose (7,) of a camera in the frame of camera 0, to which poses refer.
-
-        Raises:
-            InputError: as `intrinsics`.
-        """
+        """Pose (7,) of a camera in the frame of camera 0, to which poses refer."""
         self.intrinsics(camera)
         matrix = self._matrix(camera)
         shift = -np.linalg.solve(matrix[:, :3], matrix[:, 3])
         return np.concatenate([SE3.identity()[:4], shift])
 
     def baseline(self, left: int, right: int) -> float:
-        """Distance [m] of the cameras of a pair.
-
-        Raises:
-            InputError: as `intrinsics`, or the pair is not rectified, or the right camera not to the right.
-        """
+        """Distance [m] of the cameras of a pair."""
         differ = np.subtract(self.intrinsics(left), self.intrinsics(right))
         along = float((self.first_from_camera(right) - self.first_from_camera(left))[4])
         if along == 0.0:
@@ -170,16 +155,6 @@ class Projections:
         if camera not in self.matrices:
             raise InputError(f"{self.path}: expected a line `P{camera}:` and 12 numbers, found none.")
         return self.matrices[camera]
-
-
-def _calibration(projections: Projections, left: int, shape: tuple[int, int]) -> Calibration:
-    fx, fy, cx, cy = projections.intrinsics(left)
-    height, width = shape
-    if not (0.0 < cx < width and 0.0 < cy < height):
-        centre = f"the centre of projection ({cx:.6g}, {cy:.6g}) px"
-        problem = f"{centre} lies outside the images of {width}x{height} px"
-        raise InputError(f"{projections.path}: {problem}; give the calibration of these images.")
-    return Calibration(str(projections.path), Pinhole(width, height, fx, fy, cx, cy))
 
 
 def _files(folder: Path, count: int) -> list[Path]:

@@ -11,7 +11,6 @@ from rbpf.sensors.readers.text import Table, read_stamped
 
 SKEWED = 0.02
 """How far RᵀR may be from the identity: single precision and a few digits leave less, another meaning far more."""
-
 LONGEST = 0.01
 """How far a quaternion's length may be from 1 in a file; it is then scaled to 1."""
 
@@ -32,11 +31,7 @@ def pose_of_matrix(matrix: Array) -> Array:
 
 
 def normalised(table: Table, world_from_body: Array) -> Array:
-    """Poses (T, 7) of a table with their quaternions scaled to length 1.
-
-    Raises:
-        InputError: a quaternion's length is not 1 up to rounding.
-    """
+    """Poses (T, 7) of a table with their quaternions scaled to length 1."""
     length = np.linalg.norm(world_from_body[:, :4], axis=1)
     if (wrong := np.flatnonzero(np.abs(length - 1.0) > LONGEST)).size:
         problem = f"expected a quaternion of length 1, found one of length {length[wrong[0]]:.6g}"
@@ -47,17 +42,7 @@ def normalised(table: Table, world_from_body: Array) -> Array:
 def truth_between(
     path: Path, stamps_ns: np.ndarray, world_from_camera: Array, images_ns: np.ndarray
 ) -> CameraTruth:
-    """Ground truth that lies, at least in part, in the time of the images.
-
-    Args:
-        path: the truth's file, for the message.
-        stamps_ns: (P,) times of the poses.
-        world_from_camera: (P, 7) the poses.
-        images_ns: (T,) times of the images.
-
-    Raises:
-        InputError: no pose lies between the first and the last image.
-    """
+    """Ground truth in a file, poses (P, 7) at times (P,), that lies at least in part in the time of the images (T,)."""
     if stamps_ns[-1] < images_ns[0] or stamps_ns[0] > images_ns[-1]:
         poses, images = (f"{span[0] / 1e9:.3f} to {span[-1] / 1e9:.3f} s" for span in (stamps_ns, images_ns))
         problem = f"the poses are at {poses} and the images at {images}, which is another clock"
@@ -66,11 +51,7 @@ def truth_between(
 
 
 def read_tum_truth(path: Path, images_ns: np.ndarray) -> CameraTruth | None:
-    """`timestamp tx ty tz qx qy qz qw` [s, m], world_from_camera; None where there is no such file.
-
-    Raises:
-        InputError: a line is not so, or the times are of another clock.
-    """
+    """`timestamp tx ty tz qx qy qz qw` [s, m], world_from_camera; None where there is no such file."""
     if not path.exists():
         return None
     rows = read_stamped(path, "poses")

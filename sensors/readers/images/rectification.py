@@ -18,13 +18,10 @@ from rbpf.sensors.readers.images.sequence import ImageFrame, Source
 
 BESIDE = 0.7
 """The baseline lies along the rows by this fraction of its length at least; beyond, most of the view is lost."""
-
 OUTSIDE = -10.0
 """A column and a row that no image has: what is drawn from there is black."""
-
 ALIKE_PX = 1e-2
 """How far intrinsics of a rectified pair may differ: rounding, and no more than an image can show."""
-
 ROTATED_RAD, ASIDE = 1e-4, 1e-2
 """How far the axes of a rectified pair may be rotated, and how far off the rows the baseline may point, relative to it."""
 
@@ -46,17 +43,7 @@ class Rectification:
 
     @classmethod
     def between(cls, left: Pinhole, right: Pinhole, left_from_right: Array, where: str) -> Self:
-        """Rectification of two cameras of one image size.
-
-        Args:
-            left: the first camera.
-            right: the second one.
-            left_from_right: (7,) its pose in the frame of the first.
-            where: the calibration, for messages.
-
-        Raises:
-            InputError: the second camera is not to the right of the first.
-        """
+        """Rectification of two cameras of one image size, the second at `left_from_right` (7,) in the frame of the first."""
         import cv2
 
         shift = SE3.translation(left_from_right)
@@ -110,7 +97,12 @@ class Rectification:
         rows, columns = np.mgrid[: left.height, : left.width].astype(float)
         uv = camera.unproject(np.stack([columns, rows], axis=-1))
         rays = np.concatenate([uv, np.ones((*uv.shape[:-1], 1))], axis=-1)
-        maps = tuple(_map(given, rays @ turn) for given, turn in zip((left, right), turns, strict=True))
+        # Columns and rows where a camera sees the rays; beyond the image where it does not.
+        maps = []
+        for given, turn in zip((left, right), turns, strict=True):
+            seen = rays @ turn
+            px = np.where(given.visible(seen)[..., None], given.project(seen), OUTSIDE).astype(np.float32)
+            maps.append((np.ascontiguousarray(px[..., 0]), np.ascontiguousarray(px[..., 1])))
         back = np.eye(4)
         back[:3, :3] = turns[0].T
         rig = RectifiedStereo(camera, float(np.linalg.norm(SE3.translation(left_from_right))))
@@ -118,8 +110,10 @@ class Rectification:
 
     def frame(self, frame: ImageFrame) -> ImageFrame:
         """The frame with its images rectified."""
+        import cv2
+
         left, right = (
-            None if image is None else _moved(image, maps)
+            None if image is None else np.asarray(cv2.remap(image, *maps, cv2.INTER_LINEAR))
             for image, maps in zip((frame.image, frame.right), self.maps, strict=True)
         )
         return replace(frame, image=left, right=right)
@@ -147,18 +141,6 @@ def _opencv(camera: Pinhole) -> tuple[Any, Any]:
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), np.array(camera.distortion)
 
 
-def _map(camera: Pinhole, rays: Array) -> tuple[np.ndarray, np.ndarray]:
-    """Columns and rows (H, W) float32 where a camera sees rays (H, W, 3); beyond the image where it does not."""
-    px = np.where(camera.visible(rays)[..., None], camera.project(rays), OUTSIDE).astype(np.float32)
-    return np.ascontiguousarray(px[..., 0]), np.ascontiguousarray(px[..., 1])
-
-
-def _moved(image: np.ndarray, maps: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    import cv2
-
-    return np.asarray(cv2.remap(image, *maps, cv2.INTER_LINEAR))
-
-
 def pair_stamps(
     left_ns: np.ndarray, right_ns: np.ndarray, tolerance_s: float, where: str
 ) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
@@ -172,9 +154,6 @@ def pair_stamps(
 
     Returns:
         Rows (P,) of the left and (P,) of the right camera, and a sentence about each camera whose images are left out.
-
-    Raises:
-        InputError: no two images are near enough.
     """
     nearest, gap_ns = _nearest(left_ns, right_ns)
     back, _ = _nearest(right_ns, left_ns)

@@ -3,8 +3,13 @@
 The number of images and their rate are those of the file's header, unless `camera.yaml` has `rate_hz`. A header without
 a number, or with one that the file is too small for, is counted by going through the video once. A video that ends
 before its last announced image ends with a frame that has none and says so.
+
+Beside them a camera at this computer, as a source of images that ends when it is unplugged or somebody presses Ctrl-C.
 """
 
+import signal
+import threading
+import time
 from collections.abc import Generator, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -14,7 +19,7 @@ from typing import Any, NamedTuple, final
 import numpy as np
 
 from rbpf.errors import InputError
-from rbpf.sensors.readers.images.calibration import find_calibration
+from rbpf.sensors.readers.images.calibration import find_calibration, read_calibration
 from rbpf.sensors.readers.images.decoding import (
     Grey,
     UnreadableImageError,
@@ -47,14 +52,8 @@ class Video(ImageFormat):
         count, rate_hz, shape = video_header(path)
         camera.require_shape(shape, str(path))
         stamps_ns = evenly(count, camera.rate_hz or rate_hz or DEFAULT_RATE_HZ)
-        return ImageSequence(
-            name=path.stem,
-            camera=camera.camera,
-            stamps_ns=stamps_ns,
-            truth=None,
-            baseline_m=None,
-            source=VideoImages(path, stamps_ns, shape),
-        )
+        source = VideoImages(path, stamps_ns, shape)
+        return ImageSequence(path.stem, camera.camera, stamps_ns, None, None, source)
 
 
 @dataclass(frozen=True)
@@ -87,10 +86,8 @@ class VideoImages(Source):
         stamp = int(self.stamps_ns[index])
         there, image = capture.read()
         if not there:
-            problem = (
-                f"{self.path}: the video ends after {index} of {len(self.stamps_ns)} images; those are kept."
-            )
-            return ImageFrame(stamp, None, problem=problem)
+            kept = f"the video ends after {index} of {len(self.stamps_ns)} images; those are kept"
+            return ImageFrame(stamp, None, problem=f"{self.path}: {kept}.")
         try:
             return ImageFrame(stamp, require_shape(self.path, to_grey(self.path, image), self.shape))
         except UnreadableImageError as error:
@@ -98,11 +95,7 @@ class VideoImages(Source):
 
 
 def video_header(path: Path) -> tuple[int, float, tuple[int, int]]:
-    """Number of images, their rate [Hz] or 0 where it is not given, height and width.
-
-    Raises:
-        InputError: no image can be decoded.
-    """
+    """Number of images, their rate [Hz] or 0 where it is not given, height and width."""
     import cv2
 
     with opened(path) as capture:
@@ -120,11 +113,7 @@ def video_header(path: Path) -> tuple[int, float, tuple[int, int]]:
 
 @contextmanager
 def opened(path: Path) -> Iterator[Any]:
-    """OpenCV's decoder of a video, closed at the end.
-
-    Raises:
-        InputError: it cannot be opened.
-    """
+    """OpenCV's decoder of a video, closed at the end."""
     import cv2
 
     # Other backends take the number in a name such as 000001 for a pattern of images.
@@ -145,14 +134,10 @@ class NamedImage(NamedTuple):
 
 
 def read_uncalibrated(path: Path, most: int) -> tuple[int, Iterator[NamedImage]]:
-    """Up to `most` images, evenly spread, of a folder or a video; those that cannot be read are left out.
-
-    Args:
-        path: folder with images in it or in its `images`, or a video.
-        most: images that are decoded.
+    """Up to `most` images, evenly spread, of a video or of a folder that has them in it or in its `images`.
 
     Returns:
-        How many there will be at most, and the images.
+        How many there will be at most, and those of them that can be read.
 
     Raises:
         InputError: there is nothing of that name, or no image in it.
@@ -191,3 +176,63 @@ def _of_video(path: Path, chosen: set[int]) -> Iterator[NamedImage]:
                 there, image = capture.retrieve()
                 if there:
                     yield NamedImage(f"image {index}", to_grey(path, image))
+
+
+def camera_number(path: Path) -> int | None:
+    """The number of a camera, where a recording is given as one and no file has that name."""
+    return int(str(path)) if str(path).isdecimal() and not path.exists() else None
+
+
+@final
+class LiveCamera:
+    """The images of an attached camera, each the newest one when it is asked for.
+
+    Args:
+        number: as OpenCV counts cameras, from 0.
+        calibration: its camera.yaml.
+
+    Raises:
+        InputError: there is no calibration, no such camera, or it gives images of another size.
+    """
+
+    stamps_ns = None
+    truth = None
+
+    def __init__(self, number: int, calibration: Path | None) -> None:
+        import cv2
+
+        if calibration is None:
+            raise InputError(
+                f"camera {number} needs --calibration camera.yaml; rbpf calibrate makes it from pictures of a chessboard"
+            )
+        self.name, calibrated = f"camera {number}", read_calibration(calibration)
+        self.camera = calibrated.camera
+        self._capture: Any = cv2.VideoCapture(number)
+        if not self._capture.isOpened():
+            raise InputError(f"there is no camera {number}, or another program uses it")
+        # One image in the driver's queue: what waits there would be old by the time it is filtered.
+        self._capture.set(cv2.CAP_PROP_FRAME_WIDTH, self.camera.width)
+        self._capture.set(cv2.CAP_PROP_FRAME_HEIGHT, self.camera.height)
+        self._capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
+        self._first = self._next()
+        if self._first is None or self._first.image is None:
+            raise InputError(f"{self.name} gives no image")
+        calibrated.require_shape(self._first.image.shape, self.name)
+
+    def frames(self, start: int = 0) -> Iterator[ImageFrame]:
+        """Images until the camera is gone or Ctrl-C is pressed; the first one is that which the run was started from."""
+        stopped = threading.Event()
+        in_main = threading.current_thread() is threading.main_thread()
+        before = signal.signal(signal.SIGINT, lambda *_: stopped.set()) if in_main else None
+        try:
+            frame = self._first
+            while frame is not None and not stopped.is_set():
+                yield frame
+                frame = self._next()
+        finally:
+            if in_main:
+                signal.signal(signal.SIGINT, before)
+
+    def _next(self) -> ImageFrame | None:
+        has_image, image = self._capture.read()
+        return ImageFrame(time.monotonic_ns(), to_grey(self.name, image)) if has_image else None

@@ -7,7 +7,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode
 
 from rbpf.errors import InputError
 from rbpf.sensors.readers import Topics, open_images
-from rbpf.sensors.readers.images import bag_messages
+from rbpf.sensors.readers.images import bag as bag_reader
 from tests.readers.images.bags import KINDS, SIZE, STAMPS_NS, recorded, write_bag, write_pair
 from tests.readers.images.folders import grey, levels, write_camera, write_plain
 
@@ -50,7 +50,7 @@ def test_a_chunk_that_unpacks_to_more_than_there_can_be_is_refused(tmp_path, mon
     with recorded(path, packed) as bag:
         bag.info("/camera_info")
         bag.image("/image_raw", 1, np.zeros((400, 600), np.uint8))
-    monkeypatch.setattr(bag_messages, "MOST_BYTES", 2 * path.stat().st_size)
+    monkeypatch.setattr(bag_reader, "MOST_BYTES", 2 * path.stat().st_size)
     with pytest.raises(InputError, match="a chunk is cut off, or larger than"):
         open_images(path)
 

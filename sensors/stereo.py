@@ -1,8 +1,10 @@
-"""Features of a rectified stereo pair (S05 §III-B): those of both images, matched along the rows.
+"""Features of a rectified stereo pair (S05 §III-B), those of both images matched along the rows; the left camera leads.
+
+Impulse noise, salt and pepper, is taken out before (`remove_impulses`): single corrupted pixels, which SIFT takes for blobs.
 
 A keypoint of the left image may match those of the right one that lie on its row, to the left of it by a disparity
 that a depth beyond the nearest has, at a like scale and orientation. Of these candidates the nearest descriptor is taken
-(`rbpf.sensors.descriptors.matching`), and the place in the right image is refined on grey values (`refine`): a window
+(`rbpf.sensors.descriptors`), and the place in the right image is refined on grey values (`refine`): a window
 around the left place is moved along the row of the right image until the squared difference of the two is least,
 brightness and contrast left free (Gauss-Newton; B. Lucas, T. Kanade 1981, in one dimension).
 
@@ -15,18 +17,139 @@ the error of u_left and adds that of the disparity, σ_d. Both grow with the key
 Without the refinement both places have their own error, and cov = σ_p² I.
 """
 
-from dataclasses import dataclass, field
-from typing import ClassVar, final
+from dataclasses import dataclass, field, fields
+from typing import ClassVar, NamedTuple, final
 
 import numpy as np
 
+from rbpf import gaussian
 from rbpf.errors import InputError
 from rbpf.sensors.camera import RectifiedStereo
-from rbpf.sensors.descriptors.matching import DescriptorMatches, MatchLimits, band_pairs, match_pairs
+from rbpf.sensors.descriptors import (
+    DescriptorMatches,
+    MatchLimits,
+    band_pairs,
+    gate_pairs,
+    match_all,
+    match_pairs,
+)
 from rbpf.sensors.features import Sift
 from rbpf.sensors.features.interface import FeatureExtractor, Features, checked_image
-from rbpf.sensors.stereo.features import StereoFeatures
-from rbpf.sensors.stereo.impulse_noise import remove_impulses
+
+LEAP = 40
+"""Grey levels between a corrupted pixel and all its neighbours: several times the noise of any usable image."""
+TOLERATED_FRACTION = 0.001
+"""Fraction of isolated pixels up to which an image is left as it is."""
+
+
+def remove_impulses(image: np.ndarray) -> tuple[np.ndarray, float]:
+    """An image (H, W) uint8 without corrupted pixels, and the fraction of the pixels that were replaced.
+
+    A lens spreads a point over neighbouring pixels, so that no camera sees one that differs from all its neighbours. Where
+    more pixels do than a few specks explain, those that stick out are replaced by the median of their surroundings; all
+    other pixels, and all other images, stay as they are to the byte. The dots of a pattern projector look like
+    impulses: a rig that has one should run with `pair.filter_impulses=False`.
+    """
+    import cv2
+
+    ring = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], dtype=np.uint8)
+    above = cv2.subtract(image, cv2.dilate(image, ring))
+    below = cv2.subtract(cv2.erode(image, ring), image)
+    if ((above > LEAP) | (below > LEAP)).mean() <= TOLERATED_FRACTION:
+        return image, 0.0
+    # Corrupted pixels beside one another are no peaks, but at the edge of what is around them.
+    median = cv2.medianBlur(image, 3)
+    edge = (image >= cv2.dilate(image, ring)) | (image <= cv2.erode(image, ring))
+    corrupted = edge & (cv2.absdiff(image, median) > LEAP)
+    return np.where(corrupted, median, image), float(corrupted.mean())
+
+
+@final
+@dataclass(frozen=True)
+class StereoFeatures:
+    """What a pair of images shows, of highest contrast first: the local landmarks {P^L, C^L, α, s, f} of S05 §III-B.
+
+    Attributes:
+        z: (K, 3) pixels (u_left, v, u_right).
+        cov: (K, 3, 3) of their noise, px².
+        points: (K, 3) P^L in the left camera's frame, m.
+        cov_points: (K, 3, 3) C^L, m²: `cov` through the Jacobian of the triangulation.
+        scale: (K,) of the keypoint, px.
+        orientation: (K,) of the keypoint, radians.
+        descriptors: (K, 36) or (K, 128) float32 of length 1.
+    """
+
+    z: np.ndarray
+    cov: np.ndarray
+    points: np.ndarray
+    cov_points: np.ndarray
+    scale: np.ndarray
+    orientation: np.ndarray
+    descriptors: np.ndarray
+
+    @classmethod
+    def measured(
+        cls,
+        rig: RectifiedStereo,
+        z: np.ndarray,
+        cov: np.ndarray,
+        scale: np.ndarray,
+        orientation: np.ndarray,
+        descriptors: np.ndarray,
+    ) -> "StereoFeatures":
+        """Features whose points and their covariances follow from the pixels."""
+        points = rig.triangulate(z)
+        jac = triangulate_jacobian(rig, z)
+        cov_points = gaussian.symmetrise(jac @ cov @ np.swapaxes(jac, -1, -2))
+        return cls(z, cov, points, cov_points, scale, orientation, descriptors)
+
+    def __len__(self) -> int:
+        return self.z.shape[0]
+
+    def take(self, rows: np.ndarray) -> "StereoFeatures":
+        """Some of them, by number or by mask."""
+        return StereoFeatures(*(getattr(self, item.name)[rows] for item in fields(self)))
+
+
+def triangulate_jacobian(rig: RectifiedStereo, z: np.ndarray) -> np.ndarray:
+    """∂P/∂(u_left, v, u_right) (…, 3, 3) of `RectifiedStereo.triangulate` at pixels z (…, 3), Mathematics (stereo-slope).
+
+    With disparity d = u_left − u_right, P = (fx b / d) (u, v, 1) in normalised coordinates: every pixel of d moves P
+    along its own ray by −P/d, and u_left and v turn the ray besides.
+    """
+    points = rig.triangulate(z)
+    disparity = (z[..., 0] - z[..., 2])[..., None]
+    slope = np.zeros((*points.shape, 3))
+    slope[..., 0] = -points / disparity
+    slope[..., 2] = points / disparity
+    slope[..., 0, 0] += rig.baseline_m / disparity[..., 0]
+    slope[..., 1, 1] = rig.camera.fx / rig.camera.fy * rig.baseline_m / disparity[..., 0]
+    return slope
+
+
+def match_frames(
+    before: StereoFeatures,
+    after: StereoFeatures,
+    limits: MatchLimits,
+    predicted: tuple[np.ndarray, np.ndarray] | None = None,
+    gate: float = 11.3,
+) -> DescriptorMatches:
+    """Which features of an earlier pair (rows `first`) are seen again in a later one (rows `second`).
+
+    Args:
+        before: K features of the earlier pair.
+        after: features of the later one.
+        limits: when a candidate is taken.
+        predicted: where the earlier ones should be in the later pair: (u_left, v, u_right) (K, 3), NaN for none, and
+            covariance (K, 3, 3) without the noise of the measurement; None lets all compete.
+        gate: largest squared Mahalanobis distance from there; 11.3 holds 99 % of a Gaussian.
+    """
+    if predicted is None:
+        return match_all(before.descriptors, after.descriptors, limits)
+    mean, cov = predicted
+    k, m = gate_pairs(after.z, after.cov, mean, cov, gate)
+    return match_pairs(before.descriptors, after.descriptors, (m, k), limits)
+
 
 SWAPPED, FEWER = 20, 4
 """So many matches the wrong way round, and so many times fewer the right way, are no accident."""
@@ -78,16 +201,10 @@ class PairConfig:
     disparity_per_scale: float = 0.025
 
     def __post_init__(self) -> None:
-        positive = (
-            "nearest_m",
-            "least_disparity_px",
-            "turn_rad",
-            "half_px",
-            "shift_px",
-            "place_px",
-            "disparity_px",
-        )
-        for name in positive:
+        for name in (
+            *("nearest_m", "least_disparity_px", "turn_rad", "half_px", "shift_px"),
+            *("place_px", "disparity_px"),
+        ):
             if not getattr(self, name) > 0.0:
                 raise InputError(f"{name} must be positive, got {getattr(self, name)}")
         for name in ("row_px", "row_per_scale", "place_per_scale", "disparity_per_scale"):
@@ -148,7 +265,14 @@ class StereoMatcher:
             InputError: the images are swapped.
         """
         matches = self._along_rows(left, right)
-        self._check_order(left, right, len(matches))
+        # A pair is refused whose keypoints match far better the other way round.
+        if FEWER * len(matches) < min(len(left), len(right)):
+            swapped = len(self._along_rows(right, left))
+            if swapped >= SWAPPED and swapped > FEWER * len(matches):
+                raise InputError(
+                    f"left and right image seem to be swapped: {swapped} matches have a negative disparity and "
+                    f"{len(matches)} a positive one; exchange the two cameras"
+                )
         z = np.column_stack([left.px[matches.first], right.px[matches.second, 0]])
         if self.config.refine:
             refined = refine(*images, z[:, :2], z[:, 2], self.config.half_px)
@@ -158,7 +282,10 @@ class StereoMatcher:
             z[:, 2] = refined.u
             matches, z = matches.take(good), z[good]
         far = z[:, 0] - z[:, 2] >= self.config.least_disparity_px
-        return self._features(left.take(matches.first[far]), z[far])
+        chosen, noise = left.take(matches.first[far]), self.noise(left.scale[matches.first[far]])
+        return StereoFeatures.measured(
+            self.rig, z[far], noise, chosen.scale, chosen.orientation, chosen.descriptors
+        )
 
     def noise(self, scale: np.ndarray) -> np.ndarray:
         """Covariances (K, 3, 3) of (u_left, v, u_right) of keypoints of scales (K,), px²."""
@@ -170,16 +297,6 @@ class StereoMatcher:
         shared = np.array([[1.0, 0.0, 1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 1.0]])
         return place[:, None, None] * shared + disparity[:, None, None] * np.diag([0.0, 0.0, 1.0])
 
-    def _features(self, keypoints: Features, z: np.ndarray) -> StereoFeatures:
-        return StereoFeatures.measured(
-            self.rig,
-            z,
-            self.noise(keypoints.scale),
-            keypoints.scale,
-            keypoints.orientation,
-            keypoints.descriptors,
-        )
-
     def _along_rows(self, left: Features, right: Features) -> DescriptorMatches:
         """Matches of one keypoint of each image at most; a place that has two orientations counts once."""
         config = self.config
@@ -190,8 +307,9 @@ class StereoMatcher:
         near = (disparity >= config.least_disparity_px) & (disparity <= most)
         near &= np.abs(np.log(left.scale[k] / right.scale[m])) <= np.log(config.scale_ratio)
         near &= np.cos(left.orientation[k] - right.orientation[m]) >= np.cos(config.turn_rad)
+        pairs = k[near], m[near]
         return one_per_place(
-            match_pairs(left.descriptors, right.descriptors, (k[near], m[near]), config.limits), left, right
+            match_pairs(left.descriptors, right.descriptors, pairs, config.limits), left, right
         )
 
     def check(self, left: np.ndarray, right: np.ndarray) -> None:
@@ -201,22 +319,13 @@ class StereoMatcher:
             InputError: they are no (H, W) uint8, or not of the camera's size.
         """
         left, right, camera = checked_image(left), checked_image(right), self.rig.camera
-        if left.shape != right.shape:
-            sizes = " and ".join(f"{image.shape[1]}x{image.shape[0]} px" for image in (left, right))
-            raise InputError(f"left and right image must be of one size, got {sizes}: give a rectified pair")
+        sizes = [f"{image.shape[1]}x{image.shape[0]} px" for image in (left, right)]
+        if sizes[0] != sizes[1]:
+            found = " and ".join(sizes)
+            raise InputError(f"left and right image must be of one size, got {found}: give a rectified pair")
         if left.shape != (camera.height, camera.width):
-            size = f"{left.shape[1]}x{left.shape[0]}"
-            raise InputError(f"the camera takes {camera.width}x{camera.height} px, the images have {size} px")
-
-    def _check_order(self, left: Features, right: Features, found: int) -> None:
-        """Refuses a pair whose keypoints match far better the other way round."""
-        if FEWER * found >= min(len(left), len(right)):
-            return
-        swapped = len(self._along_rows(right, left))
-        if swapped >= SWAPPED and swapped > FEWER * found:
             raise InputError(
-                f"left and right image seem to be swapped: {swapped} matches have a negative disparity and {found} "
-                "a positive one; exchange the two cameras"
+                f"the camera takes {camera.width}x{camera.height} px, the images have {sizes[0]}"
             )
 
 
@@ -237,8 +346,7 @@ _TINY = 1e-9
 
 
 @final
-@dataclass(frozen=True)
-class SubpixelMatches:
+class SubpixelMatches(NamedTuple):
     """Places in the right image.
 
     Attributes:
@@ -253,14 +361,9 @@ class SubpixelMatches:
 def refine(
     left: np.ndarray, right: np.ndarray, px: np.ndarray, u_right: np.ndarray, half_px: int = 5
 ) -> SubpixelMatches:
-    """Refines columns u_right (K,), at which places px (K, 2) of the left image are in the right one.
+    """Refines columns u_right (K,), good to a pixel or two, at which places px (K, 2) of the left image are in the right one.
 
-    Args:
-        left: (H, W) uint8.
-        right: (H, W) uint8.
-        px: (K, 2) places in the left image.
-        u_right: (K,) columns, good to a pixel or two.
-        half_px: the window has 2 half_px + 1 pixels along each side.
+    The window has 2 half_px + 1 pixels along each side; images are (H, W) uint8.
     """
     u, v = u_right.astype(float), px[:, 1]
     template = _centred(_windows(left, px[:, 0], v, half_px, half_px))

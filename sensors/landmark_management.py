@@ -12,7 +12,7 @@ from typing import ClassVar, final
 import numpy as np
 
 from rbpf.errors import InputError
-from rbpf.sensors.descriptors.matching import distances
+from rbpf.sensors.descriptors import distances
 
 DISTINCT = {36: 0.12, 128: 0.3}
 """Least distance of a new descriptor from others, by its length: descriptors of one place are mostly nearer."""
@@ -127,13 +127,20 @@ class LandmarkManager:
             taken: (L, 2) places of the features that did match.
         """
         room = min(self.config.max_per_frame, self.config.max_candidates - int((~self.confirmed).sum()))
+        distinct = self.config.distinct
+        if distinct is None:
+            distinct = DISTINCT.get(descriptors.shape[1], 0.0)
         chosen: list[int] = []
         for row in self._order(px, taken).tolist():
             if len(chosen) >= room:
                 break
-            if nearest[row] >= self._distinct(descriptors) and self._apart(
-                row, chosen, px, descriptors, taken
-            ):
+            # Far enough from what is held, and from others of the frame, in the image and in the descriptor.
+            others = np.concatenate([taken, px[chosen]])
+            if nearest[row] < distinct:
+                continue
+            if (np.square(others - px[row]).sum(axis=1) < self.config.spacing_px**2).any():
+                continue
+            if not (distances(descriptors[chosen] @ descriptors[row]) < distinct).any():
                 chosen.append(row)
         return np.array(sorted(chosen), dtype=np.int64)
 
@@ -178,19 +185,6 @@ class LandmarkManager:
     def _cell(self, px: np.ndarray) -> np.ndarray:
         column, line = np.clip(px * self.config.cells / np.array(self.size), 0, self.config.cells - 1).T
         return column.astype(np.int64) + self.config.cells * line.astype(np.int64)
-
-    def _apart(
-        self, row: int, chosen: list[int], px: np.ndarray, descriptors: np.ndarray, taken: np.ndarray
-    ) -> bool:
-        """Whether a feature is far enough from others of the frame, in the image and in its descriptor."""
-        others = np.concatenate([taken, px[chosen]])
-        if (np.square(others - px[row]).sum(axis=1) < self.config.spacing_px**2).any():
-            return False
-        return not (distances(descriptors[chosen] @ descriptors[row]) < self._distinct(descriptors)).any()
-
-    def _distinct(self, descriptors: np.ndarray) -> float:
-        given = self.config.distinct
-        return DISTINCT.get(descriptors.shape[1], 0.0) if given is None else given
 
     def _rows(self, names: np.ndarray) -> np.ndarray:
         names = np.asarray(names, dtype=np.int64)

@@ -1,0 +1,436 @@
+"""Printed boards of known size, chessboards and grids of ArUco markers: known points to start from, and the camera itself.
+
+A chessboard's frame: the first inner corner is the origin, x runs along the rows, y across them, z into the sheet. Where
+columns and rows are not both even or both odd, the first corner is the one whose square towards the board's middle is
+black; else the board looks the same upside down, and either of two corners is the first.
+
+The frame of a grid of markers: the top left corner of the first marker is the origin, x runs along the rows, y down, z
+into the sheet. Markers are numbered row by row from 0, as OpenCV's `GridBoard` prints them. A marker's pattern tells its
+number and which way up it is, so that part of the board is enough (S. Garrido-Jurado and others, 2014).
+
+The camera is that of several views of a chessboard (Z. Zhang 2000, by OpenCV): focal lengths, principal point, distortion.
+The Bayesian information criterion (G. Schwarz 1978) chooses how many coefficients of distortion are estimated: one that the
+corners do not need would bend the image where no corner was.
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from rbpf.errors import InputError
+from rbpf.lie import skew
+from rbpf.sensors.camera import Pinhole
+from rbpf.sensors.features.interface import checked_image
+from rbpf.sensors.readers.known_points import KnownPixels
+
+MOST = 12
+"""Corners that a run starts from, spread over the board: more are nearer to each other than a search reaches."""
+LEAST_SQUARE_PX = 5.0
+"""Corners nearer to each other than this cannot be told apart."""
+LEAST_SIDE_PX = 12.0
+"""Markers smaller than this are read wrongly now and then."""
+DICTIONARIES = (
+    *("4X4_50", "4X4_100", "4X4_250", "5X5_50", "5X5_100", "5X5_250", "6X6_50", "6X6_100", "6X6_250"),
+    "APRILTAG_36H11",
+)
+"""Sets of patterns of markers."""
+_SEARCHES = (0, "CALIB_CB_NORMALIZE_IMAGE", "CALIB_CB_EXHAUSTIVE")
+_CHESSBOARD_SIZE = re.compile(r"(\d{1,3})[xX×](\d{1,3})", re.ASCII)
+_MARKERS_SIZE = re.compile(r"(\d{1,2})[xX×](\d{1,2})", re.ASCII)
+
+
+@dataclass(frozen=True)
+class Board:
+    """A printed chessboard.
+
+    Attributes:
+        columns: inner corners in a row.
+        rows: inner corners in a column.
+        square_m: side of a square.
+
+    Raises:
+        InputError: there are fewer than three of either, or the squares have no size.
+    """
+
+    columns: int
+    rows: int
+    square_m: float
+
+    def __post_init__(self) -> None:
+        if min(self.columns, self.rows) < 3:
+            raise InputError(
+                f"a chessboard needs at least 3x3 inner corners, got {self.columns}x{self.rows}: count the places "
+                "where four squares meet"
+            )
+        if not 0.0 < self.square_m < np.inf:
+            raise InputError(f"the side of a chessboard's square must be positive, got {self.square_m} m")
+
+    @classmethod
+    def parse(cls, size: str, square_m: float) -> "Board":
+        """A board whose inner corners are written as 9x6.
+
+        Raises:
+            InputError: they are not.
+        """
+        found = _CHESSBOARD_SIZE.fullmatch(size.strip())
+        if found is None:
+            raise InputError(f"the size of a chessboard is its inner corners as 9x6, got {size!r}")
+        return cls(int(found[1]), int(found[2]), square_m)
+
+    @property
+    def corners(self) -> np.ndarray:
+        """(rows · columns, 3) inner corners in the board's frame, row by row, m."""
+        y, x = np.divmod(np.arange(self.rows * self.columns), self.columns)
+        return self.square_m * np.stack([x, y, np.zeros_like(x)], axis=-1).astype(float)
+
+
+def find_board(image: np.ndarray, board: Board) -> KnownPixels:
+    """Well-spread corners of a board in an image (H, W) uint8, as exact known points, named by their numbers, row by row.
+
+    Raises:
+        InputError: the board is not seen whole, or it is too small in the image.
+    """
+    image = checked_image(image)
+    px = board_corners(image, board)
+    if px is None:
+        raise InputError(
+            f"no chessboard of {board.columns}x{board.rows} inner corners is seen in the first image: it has to be "
+            "seen whole, with its white border, sharp and evenly lit"
+        )
+    side = least_side(px, board)
+    if side < LEAST_SQUARE_PX:
+        raise InputError(
+            f"the chessboard's squares are only {side:.1f} px wide in the first image: start nearer to it"
+        )
+    chosen = spread_rows(board.corners, MOST)
+    return KnownPixels(chosen, px[chosen], board.corners[chosen], np.zeros(chosen.size), own_frame=True)
+
+
+def board_corners(image: np.ndarray, board: Board, thorough: bool = True) -> np.ndarray | None:
+    """All corners (rows · columns, 2) of a board in an image (H, W) uint8, in the order of the board's frame, px.
+
+    None where the board is not seen whole. Without `thorough` a second look at images that show none is left out.
+    """
+    import cv2
+
+    for search in _SEARCHES if thorough else _SEARCHES[:2]:
+        flags = getattr(cv2, search) if isinstance(search, str) else search
+        found, px = cv2.findChessboardCornersSB(image, (board.columns, board.rows), flags=flags)
+        if found:
+            break
+    else:
+        return None
+    # To a fraction of a pixel: where the slopes of the image all point past the corner (saddle points).
+    px = np.asarray(px, dtype=np.float32).reshape(-1, 2)
+    half = int(np.clip(0.4 * least_side(px, board), 2, 11))
+    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
+    px = cv2.cornerSubPix(image, px.reshape(-1, 1, 2).copy(), (half, half), (-1, -1), criteria)
+    grid = np.asarray(px, dtype=float).reshape(board.rows, board.columns, 2)
+    # The detector gives one of several orders. Seen from the front, x, y and z into the sheet are right-handed; and the
+    # square after the first corner is the darker one of the first two.
+    across, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
+    if across[0] * down[1] - across[1] * down[0] < 0.0:
+        grid = grid[:, ::-1]
+    middles = [np.rint(grid[:2, k : k + 2].mean(axis=(0, 1))).astype(int) for k in (0, 1)]
+    if int(image[middles[0][1], middles[0][0]]) > int(image[middles[1][1], middles[1][0]]):
+        grid = grid[::-1, ::-1]
+    return grid.reshape(-1, 2)
+
+
+def least_side(px: np.ndarray, board: Board) -> float:
+    """Least distance of corners (rows · columns, 2) that are neighbours along a side of a square, px."""
+    grid = px.reshape(board.rows, board.columns, 2)
+    return min(float(np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min()) for axis in (0, 1))
+
+
+def spread_rows(points: np.ndarray, count: int) -> np.ndarray:
+    """Rows, ascending, of at most `count` points (M, D), each in turn the farthest from those chosen before it."""
+    middle = points.mean(axis=0)
+    chosen = [int(np.argmax(np.linalg.norm(points - middle, axis=1)))]
+    nearest = np.linalg.norm(points - points[chosen[0]], axis=1)
+    while len(chosen) < min(count, points.shape[0]):
+        chosen.append(int(np.argmax(nearest)))
+        nearest = np.minimum(nearest, np.linalg.norm(points - points[chosen[-1]], axis=1))
+    return np.sort(np.array(chosen, dtype=np.int64))
+
+
+@dataclass(frozen=True)
+class MarkerBoard:
+    """A printed grid of markers.
+
+    Attributes:
+        columns: markers in a row.
+        rows: markers in a column.
+        side_m: of a marker, its black border included.
+        gap_m: between two markers.
+        dictionary: of patterns, a name in `DICTIONARIES`.
+
+    Raises:
+        InputError: a number makes no sense, or the dictionary is not known or too small.
+    """
+
+    columns: int
+    rows: int
+    side_m: float
+    gap_m: float
+    dictionary: str = "4X4_50"
+
+    def __post_init__(self) -> None:
+        if min(self.columns, self.rows) < 1:
+            raise InputError(f"a board needs at least 1x1 markers, got {self.columns}x{self.rows}")
+        if not (0.0 < self.side_m < np.inf and 0.0 <= self.gap_m < np.inf):
+            raise InputError(
+                f"a marker's side must be positive and the gap not negative, got {self.side_m} m, {self.gap_m} m"
+            )
+        if self.dictionary not in DICTIONARIES:
+            raise InputError(
+                f"there is no dictionary {self.dictionary!r} of markers; known: {', '.join(DICTIONARIES)}"
+            )
+
+    @classmethod
+    def parse(cls, size: str, side_m: float, gap_m: float, dictionary: str) -> "MarkerBoard":
+        """A board whose markers are written as 5x7, columns first.
+
+        Raises:
+            InputError: they are not.
+        """
+        found = _MARKERS_SIZE.fullmatch(size.strip())
+        if found is None:
+            raise InputError(f"the size of a board of markers is their number as 5x7, got {size!r}")
+        return cls(int(found[1]), int(found[2]), side_m, gap_m, dictionary.upper())
+
+    @property
+    def corners(self) -> np.ndarray:
+        """(rows · columns, 4, 3) corners of the markers, each from its top left one clockwise, m."""
+        row, column = np.divmod(np.arange(self.rows * self.columns), self.columns)
+        origin = (self.side_m + self.gap_m) * np.stack([column, row, np.zeros_like(row)], axis=-1)
+        square = self.side_m * np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+        return origin[:, None] + square
+
+
+def find_markers(image: np.ndarray, board: MarkerBoard) -> KnownPixels:
+    """Well-spread corners of the markers seen in an image (H, W) uint8, as exact known points.
+
+    Corner k of marker i is named 4 i + k.
+
+    Raises:
+        InputError: no marker of the board is seen, or all are too small in the image.
+    """
+    import cv2
+
+    image = checked_image(image)
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    patterns = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{board.dictionary}"))
+    found, names, _ = cv2.aruco.ArucoDetector(patterns, parameters).detectMarkers(image)
+    # The board's own markers, each seen once, in the order of their numbers.
+    numbers = np.zeros(0, dtype=np.int64) if names is None else np.asarray(names).ravel().astype(np.int64)
+    px = np.array(found, dtype=float).reshape(-1, 4, 2)
+    numbers, first, count = np.unique(numbers, return_index=True, return_counts=True)
+    mine = (numbers < board.columns * board.rows) & (count == 1)
+    numbers, px = numbers[mine], px[first[mine]]
+    side = np.linalg.norm(px - np.roll(px, 1, axis=1), axis=-1).min(axis=1) if numbers.size else np.zeros(0)
+    large = side >= LEAST_SIDE_PX
+    if not large.any():
+        small = f"; {numbers.size} are seen, with sides of {side.max(initial=0.0):.0f} px: start nearer"
+        raise InputError(
+            f"no marker of a board of {board.columns}x{board.rows} from {board.dictionary} is seen large enough in the "
+            f"first image{small if numbers.size else ''}; white has to be left around each"
+        )
+    positions = board.corners[numbers[large]].reshape(-1, 3)
+    corners = (4 * numbers[large][:, None] + np.arange(4)).ravel()
+    chosen = spread_rows(positions, MOST)
+    seen = px[large].reshape(-1, 2)[chosen]
+    return KnownPixels(corners[chosen], seen, positions[chosen], np.zeros(chosen.size), own_frame=True)
+
+
+LEAST_VIEWS = 5
+"""Three determine the camera; with fewer than five no mistake is noticed."""
+MOST_UNCERTAIN = 0.02
+"""Standard deviation of the focal length, as a fraction of it, above which the views say too little."""
+LEAST_TURN = np.deg2rad(10.0)
+"""Angle between the board's normals that two views must have: from one direction, near and small is far and large."""
+OUTLYING = 4.0
+"""Views whose error is this many times the median one are left out, and …"""
+HARMLESS_PX = 0.3
+"""… those with less than this are not."""
+MODELS = {
+    "radial-tangential": (
+        (0, ("CALIB_FIX_K1", "CALIB_FIX_K2", "CALIB_FIX_K3", "CALIB_ZERO_TANGENT_DIST")),
+        (2, ("CALIB_FIX_K3", "CALIB_ZERO_TANGENT_DIST")),
+        (4, ("CALIB_FIX_K3",)),
+        (5, ()),
+    ),
+    "equidistant": (
+        (0, ("CALIB_FIX_K1", "CALIB_FIX_K2", "CALIB_FIX_K3", "CALIB_FIX_K4")),
+        (2, ("CALIB_FIX_K3", "CALIB_FIX_K4")),
+        (4, ()),
+    ),
+}
+"""Of each kind of lens: numbers of coefficients, and what OpenCV is asked to leave at zero."""
+
+
+class BoardView(NamedTuple):
+    """Corners (rows · columns, 2) of the board in one image, px, and the image's name."""
+
+    name: str
+    px: np.ndarray
+
+
+@dataclass(frozen=True)
+class BoardCalibration:
+    """A camera, and how well it explains V views of M corners.
+
+    Attributes:
+        camera: the camera.
+        std: (P,) standard deviations of fx, fy, cx, cy [px] and the lens's coefficients; 0 for one that was not needed.
+        views: those that were used.
+        residuals: (V, M, 2) where corners were found less where the camera sees them, px.
+        normals: (V, 3) of the board in the camera's frame.
+        left_out: names of views that no camera explains together with the others.
+    """
+
+    camera: Pinhole
+    std: np.ndarray
+    views: tuple[BoardView, ...]
+    residuals: np.ndarray
+    normals: np.ndarray
+    left_out: tuple[str, ...] = ()
+
+    @property
+    def rms_px(self) -> float:
+        """Reprojection error: root of the mean squared distance of the corners, px."""
+        return float(np.sqrt(np.square(self.residuals).sum(axis=-1).mean()))
+
+    @property
+    def rms_by_view_px(self) -> np.ndarray:
+        """(V,) the same for each view."""
+        return np.asarray(np.sqrt(np.square(self.residuals).sum(axis=-1).mean(axis=-1)))
+
+    @property
+    def turn_rad(self) -> float:
+        """Largest angle between the board's normals in two views."""
+        return float(np.arccos(np.clip(self.normals @ self.normals.T, -1.0, 1.0)).max())
+
+    @property
+    def covered(self) -> float:
+        """Fraction of the image, in 8 × 6 fields, in which a corner was seen."""
+        px = np.concatenate([view.px for view in self.views])
+        field = (px / [self.camera.width, self.camera.height] * [8, 6]).astype(int).clip(0, [7, 5])
+        return len(np.unique(field, axis=0)) / 48
+
+
+def calibrate(
+    views: Sequence[BoardView], board: Board, width: int, height: int, model: str = "radial-tangential"
+) -> BoardCalibration:
+    """The camera that explains the views.
+
+    Args:
+        views: of the board, all in images of one size.
+        board: what is printed.
+        width: of the images, px.
+        height: of the images, px.
+        model: of the lens's distortion, radial-tangential or equidistant.
+
+    Raises:
+        InputError: there are too few views, or they are too much alike to determine the camera.
+    """
+    used = list(views)
+    left_out: list[str] = []
+    while True:
+        if len(used) < LEAST_VIEWS:
+            agree = f" that agree ({', '.join(left_out)} did not)" if left_out else ""
+            raise InputError(
+                f"the board is found in {len(used)} images{agree}, expected at least {LEAST_VIEWS}, better 15, from "
+                "different directions: take more"
+            )
+        # The model of distortion with the least information criterion.
+        scores, fits = [], []
+        for count, fixed in MODELS[model]:
+            fit = _fitted(used, board, (width, height), model, fixed)
+            numbers, parameters = fit.residuals.size, 4 + count + 6 * len(used)
+            mean_square = max(float(np.square(fit.residuals).mean()), np.finfo(float).tiny)
+            scores.append(numbers * np.log(mean_square) + parameters * np.log(numbers))
+            fits.append(fit)
+        found = fits[int(np.argmin(scores))]
+        rms = found.rms_by_view_px
+        worst = int(rms.argmax())
+        if rms[worst] <= max(OUTLYING * float(np.median(rms)), HARMLESS_PX):
+            break
+        left_out.append(used.pop(worst).name)
+    relative_std = float((found.std[:2] / [found.camera.fx, found.camera.fy]).max())
+    if found.turn_rad < LEAST_TURN or not relative_std <= MOST_UNCERTAIN:
+        raise InputError(
+            f"the {len(used)} views show the board from too much the same direction, the focal length stays open: turn "
+            "and tilt the board, or the camera, by some 30 degrees to all sides between the images"
+        )
+    return replace(found, left_out=tuple(left_out))
+
+
+def _fitted(
+    views: Sequence[BoardView], board: Board, size: tuple[int, int], model: str, fixed: Sequence[str]
+) -> BoardCalibration:
+    """The camera of least squared error, where OpenCV leaves at zero what the flags `fixed` name.
+
+    Raises:
+        InputError: OpenCV finds none, or what it finds is no camera.
+    """
+    import cv2
+
+    corners, px = board.corners, np.array([view.px for view in views])
+    flags = sum(getattr(cv2, name) for name in fixed)
+    try:
+        if model == "equidistant":
+            flags |= cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_FIX_SKEW
+            precise = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 200, 1e-12)
+            _, matrix, distortion, turns, shifts = cv2.fisheye.calibrate(
+                [corners.reshape(1, -1, 3)] * len(px), [view.reshape(1, -1, 2) for view in px], size,
+                np.zeros((3, 3)), np.zeros((4, 1)), flags=flags, criteria=precise,
+            )  # fmt: skip
+            coefficients, std = distortion.ravel(), None
+        else:
+            seen = [view.astype(np.float32).reshape(-1, 1, 2) for view in px]
+            _, matrix, distortion, turns, shifts, std = cv2.calibrateCameraExtended(
+                [corners.astype(np.float32)] * len(px), seen, size, None, None, flags=flags
+            )[:6]
+            coefficients = np.pad(distortion.ravel()[:5], (0, max(5 - distortion.size, 0)))
+            std = std.ravel()[:9].copy()
+    except cv2.error as error:
+        raise InputError(
+            f"no camera explains the {len(views)} views ({error.err}): are they all of one flat board?"
+        ) from error
+    fx, fy, cx, cy = (float(matrix[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    camera = Pinhole(*size, fx, fy, cx, cy, tuple(coefficients.tolist()), model)
+    rotations = np.array([cv2.Rodrigues(turn)[0] for turn in turns])
+    places = corners @ rotations.mT + np.array(shifts).reshape(-1, 1, 3)
+    if std is None:
+        free = [f"CALIB_FIX_{name.upper()}" not in fixed for name in camera.lens.coefficient_names]
+        std = _deviations(camera, places, px, np.array([True] * 4 + free))
+    return BoardCalibration(camera, std, tuple(views), px - camera.project(places), rotations[..., 2])
+
+
+def _deviations(camera: Pinhole, places: np.ndarray, px: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """Standard deviations (P,) of a camera's numbers with the boards' poses unknown; 0 where they are not `free` (P,).
+
+    From the residuals' variance and derivatives, as calibrateCameraExtended has them of other lenses, of corners (V, M, 3)
+    in the camera's frame, seen at px (V, M, 2).
+    """
+    # Pixels are linear in fx, fy, cx, cy and each coefficient, so that one more of it tells the derivative.
+    k = np.array(camera.distortion)
+    more = [replace(camera, **{name: getattr(camera, name) + 1.0}) for name in ("fx", "fy", "cx", "cy")]
+    more += [replace(camera, distortion=tuple((k + unit).tolist())) for unit in np.eye(k.size)]
+    by_camera = np.stack([one.project(places) - camera.project(places) for one in more], axis=-1)[..., free]
+    turned = np.concatenate([-skew(places), np.broadcast_to(np.eye(3), (*places.shape, 3))], axis=-1)
+    by_pose = camera.jacobian(places) @ turned
+    v, m = places.shape[:2]
+    a, b = by_camera.reshape(v, 2 * m, -1), by_pose.reshape(v, 2 * m, 6)
+    shared = a.mT @ b
+    information = (a.mT @ a - shared @ np.linalg.solve(b.mT @ b, shared.mT)).sum(axis=0)
+    squared = np.square(camera.project(places) - px).sum()
+    variance = squared / (2 * v * m - 6 * v - free.sum())
+    std = np.zeros(free.size)
+    std[free] = np.sqrt(variance * np.diagonal(np.linalg.inv(information)))
+    return std

@@ -1,0 +1,491 @@
+"""Which descriptors of two sets match: distance, ratio to the next best, and preference on both sides.
+
+Descriptors are float32 rows of length 1, so that one matrix product gives all distances: |a − b|² = 2 − 2 aᵀb. Where
+pixels or a prediction leave few candidate pairs (`band_pairs`, `gate_pairs`), only those are compared (`match_pairs`),
+and only those compete in the ratio test.
+
+
+The descriptors of a map: stored once for all particles, and found again in new images (S05 §III-B, §V).
+
+Two searches stand side by side: `ExactSearch` compares every feature with every descriptor by one matrix product, which
+is what S05 did; `TreeSearch` asks a k-d tree, which S05 names as the way to go on. Where it is predicted which landmarks
+can be seen, and where, neither is needed: only the descriptors of near landmarks are compared, one by one (`Gate`).
+"""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any, final
+
+import numpy as np
+
+from rbpf.core.models import NULL
+from rbpf.errors import InputError
+
+BLOCK = 4096
+"""Columns of a product that are looked at together: a block of a few hundred rows stays in the cache."""
+LARGEST = {36: 0.25, 128: 0.55}
+"""Distances of "root" descriptors by their length: few of one place are further apart, and few of two places nearer."""
+GATHERED, PAIRS = 8, 65536
+"""Comparing a pair on its own costs as much as so many of a matrix product; pairs gathered at a time."""
+
+
+@dataclass(frozen=True)
+class MatchLimits:
+    """When a candidate is taken.
+
+    Attributes:
+        distance: the largest distance of two descriptors, at most 2; None for `LARGEST` of their length.
+        ratio: largest ratio of the distance to that of the second-best candidate (D. Lowe 2004, §7.1); 1 is no limit.
+        mutual: whether each has to be the other's nearest.
+
+    Raises:
+        InputError: a number is out of its range.
+    """
+
+    distance: float | None = None
+    ratio: float = 0.8
+    mutual: bool = True
+
+    def __post_init__(self) -> None:
+        given = self.distance is None or 0.0 < self.distance <= 2.0
+        if not (given and 0.0 < self.ratio <= 1.0):
+            expected = "a distance in (0, 2] and a ratio in (0, 1]"
+            raise InputError(f"expected {expected}, got {self.distance} and {self.ratio}")
+
+    def largest(self, length: int) -> float:
+        """Distance up to which descriptors of this length are taken."""
+        return LARGEST.get(length, 2.0) if self.distance is None else self.distance
+
+
+@final
+@dataclass(frozen=True)
+class DescriptorMatches:
+    """Pairs of descriptors, each at most once on either side, in the order of the first set.
+
+    Attributes:
+        first: (P,) rows of the first set.
+        second: (P,) rows of the second set.
+        distance: (P,) of the descriptors.
+    """
+
+    first: np.ndarray
+    second: np.ndarray
+    distance: np.ndarray
+
+    def __len__(self) -> int:
+        return self.first.size
+
+    def take(self, rows: np.ndarray) -> "DescriptorMatches":
+        """Some of them, by number or by mask."""
+        return DescriptorMatches(self.first[rows], self.second[rows], self.distance[rows])
+
+
+def match_all(first: np.ndarray, second: np.ndarray, limits: MatchLimits) -> DescriptorMatches:
+    """Matches descriptors (K, d) with descriptors (M, d), every one of which is a candidate."""
+    return decide(first, second, two_best(first, second), limits)
+
+
+def two_best(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """For each descriptor (K, d) the two best of others (M, d), by a matrix product in blocks of M.
+
+    Returns:
+        Products (K,) with the best and with the next one, −inf where there is none, and the best one's row (K,).
+    """
+    rows = np.arange(first.shape[0])
+    best, next_best = np.full((2, rows.size), -np.inf, dtype=np.float32)
+    where = np.zeros(rows.size, dtype=np.int64)
+    for start in range(0, second.shape[0], BLOCK):
+        products = first @ second[start : start + BLOCK].T
+        column = products.argmax(axis=1)
+        top = products[rows, column]
+        products[rows, column] = -np.inf
+        next_best = np.maximum(np.maximum(next_best, products.max(axis=1)), np.minimum(top, best))
+        better = top > best
+        best, where = np.where(better, top, best), np.where(better, start + column, where)
+    return best, next_best, where
+
+
+def decide(
+    first: np.ndarray,
+    second: np.ndarray,
+    best: tuple[np.ndarray, np.ndarray, np.ndarray],
+    limits: MatchLimits,
+) -> DescriptorMatches:
+    """Which of the best candidates, as `two_best` gives them, are taken."""
+    product, next_best, where = best
+    kept = np.flatnonzero(within(product, next_best, limits, first.shape[1]))
+    if limits.mutual and kept.size:
+        preferred = (first @ second[where[kept]].T).argmax(axis=0)
+        kept = kept[preferred == kept]
+    return one_each(_chosen(kept, where[kept], product[kept]))
+
+
+def match_pairs(
+    first: np.ndarray, second: np.ndarray, pairs: tuple[np.ndarray, np.ndarray], limits: MatchLimits
+) -> DescriptorMatches:
+    """Matches descriptors (K, d) with descriptors (M, d) where only some pairs are possible.
+
+    Args:
+        first: descriptors (K, d).
+        second: descriptors (M, d).
+        pairs: rows (C,) of the first and (C,) of the second set, each pair once.
+        limits: when a candidate is taken.
+    """
+    k, m = pairs
+    if not k.size:
+        return _chosen(k, m, np.zeros(0))
+    products = _products(first, second, k, m)
+    best = np.full(first.shape[0], -np.inf, dtype=np.float32)
+    np.maximum.at(best, k, products)
+    top = _first_of(k, np.flatnonzero(products == best[k]))
+    others, next_best = np.delete(np.arange(k.size), top), np.full_like(best, -np.inf)
+    np.maximum.at(next_best, k[others], products[others])
+    top = top[within(products[top], next_best[k[top]], limits, first.shape[1])]
+    if limits.mutual:
+        wanted = np.full(second.shape[0], -np.inf, dtype=np.float32)
+        np.maximum.at(wanted, m, products)
+        top = top[products[top] == wanted[m[top]]]
+    return one_each(_chosen(k[top], m[top], products[top]))
+
+
+def within(best: np.ndarray, next_best: np.ndarray, limits: MatchLimits, length: int) -> np.ndarray:
+    """Whether products (K,) of the best and of the next best candidates pass distance and ratio; −inf is none."""
+    distance, other = distances(best), distances(next_best)
+    # Two equal candidates at distance 0 are ambiguous, too.
+    near = distance <= limits.largest(length)
+    return near & ((distance < limits.ratio * other) | (limits.ratio == 1.0))
+
+
+def distances(products: np.ndarray) -> np.ndarray:
+    """Of descriptors of length 1, from their products."""
+    return np.sqrt(np.maximum(2.0 - 2.0 * products.astype(np.float64), 0.0))
+
+
+def one_each(matches: DescriptorMatches) -> DescriptorMatches:
+    """Of matches that share a row of the second set the nearest, of equally near ones the first."""
+    order = np.lexsort((matches.distance, matches.second))
+    return matches.take(np.sort(_first_of(matches.second, order)))
+
+
+def _products(first: np.ndarray, second: np.ndarray, k: np.ndarray, m: np.ndarray) -> np.ndarray:
+    """Of the descriptors of pairs (C,): all at once by a matrix product where the pairs are many, else one by one."""
+    if k.size * GATHERED > first.shape[0] * second.shape[0]:
+        return (first @ second.T)[k, m]
+    parts = [slice(start, start + PAIRS) for start in range(0, k.size, PAIRS)]
+    return np.concatenate([np.einsum("cd,cd->c", first[k[part]], second[m[part]]) for part in parts])
+
+
+def _first_of(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Of the rows those at which a value occurs first."""
+    _, first = np.unique(values[rows], return_index=True)
+    return np.asarray(rows[first])
+
+
+def _chosen(first: np.ndarray, second: np.ndarray, products: np.ndarray) -> DescriptorMatches:
+    return DescriptorMatches(first, second, distances(products))
+
+
+def band_pairs(
+    first: np.ndarray, second: np.ndarray, reach: np.ndarray | float
+) -> tuple[np.ndarray, np.ndarray]:
+    """All pairs (C,), (C,) of numbers (K,) and (M,) that differ by at most the reach (K,) or ()."""
+    order = np.argsort(second, kind="stable")
+    low = np.searchsorted(second[order], first - reach, side="left")
+    count = np.maximum(np.searchsorted(second[order], first + reach, side="right") - low, 0)
+    k = np.repeat(np.arange(first.size), count)
+    offset = np.arange(k.size) - np.repeat(np.cumsum(count) - count, count)
+    return k, order[np.repeat(low, count) + offset]
+
+
+def gate_pairs(
+    z: np.ndarray, noise: np.ndarray, mean: np.ndarray, cov: np.ndarray, gate: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """All pairs of a measurement and a prediction that are near to one another.
+
+    Args:
+        z: (K, p) places of features.
+        noise: (K, p, p) their covariances.
+        mean: (M, p) predicted places; those that are not finite are near to nothing.
+        cov: (M, p, p) their covariances, without the measurements' noise.
+        gate: largest squared Mahalanobis distance.
+
+    Returns:
+        Rows (C,) of z and (C,) of mean.
+    """
+    held = np.flatnonzero(np.isfinite(mean).all(axis=1) & np.isfinite(cov).all(axis=(1, 2)))
+    mean, cov = mean[held], cov[held]
+    widest = np.diagonal(noise, axis1=1, axis2=2).max(axis=0, initial=0.0)
+    reach = np.sqrt(gate * (np.diagonal(cov, axis1=1, axis2=2) + widest))
+    m, k = band_pairs(mean[:, 0], z[:, 0], reach[:, 0])
+    for axis in range(1, z.shape[1]):
+        near = np.abs(z[k, axis] - mean[m, axis]) <= reach[m, axis]
+        k, m = k[near], m[near]
+    near = _squared(z[k] - mean[m], noise[k] + cov[m]) <= gate
+    return k[near], held[m[near]]
+
+
+def _squared(nu: np.ndarray, cov: np.ndarray) -> np.ndarray:
+    """Squared Mahalanobis distances (C,) of (C, p) under (C, p, p), by elimination along the pairs; p is 2 or 3."""
+    nu, cov = np.ascontiguousarray(nu.T), np.ascontiguousarray(np.moveaxis(cov, 0, -1))
+    total = np.zeros(nu.shape[1])
+    for j in range(nu.shape[0]):
+        total += nu[j] ** 2 / cov[j, j]
+        factor = cov[j + 1 :, j] / cov[j, j]
+        nu[j + 1 :] -= factor * nu[j]
+        cov[j + 1 :, j + 1 :] -= factor[:, None] * cov[None, j, j + 1 :]
+    return total
+
+
+@final
+class DescriptorStore:
+    """Descriptors of landmarks, which come and go.
+
+    Args:
+        length: of a descriptor.
+    """
+
+    def __init__(self, length: int) -> None:
+        self.length = length
+        self._descriptors = np.zeros((64, length), dtype=np.float32)
+        self._ids = np.zeros(64, dtype=np.int64)
+        self._count = 0
+        self.restored = 0
+        """How often the store was filled from a checkpoint: what was built on it before is void."""
+
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def ids(self) -> np.ndarray:
+        """(M,) ascending."""
+        return self._ids[: self._count]
+
+    @property
+    def descriptors(self) -> np.ndarray:
+        """(M, d) float32, in the order of the ids."""
+        return self._descriptors[: self._count]
+
+    def add(self, ids: np.ndarray, descriptors: np.ndarray) -> None:
+        """Adds descriptors (k, d) of new landmarks (k,).
+
+        Raises:
+            InputError: the ids do not ascend beyond those held, or the descriptors have another length.
+        """
+        ids = np.asarray(ids, dtype=np.int64)
+        if descriptors.shape != (ids.size, self.length):
+            raise InputError(
+                f"descriptors must be ({ids.size}, {self.length}), one for each id, got {descriptors.shape}"
+            )
+        last = self._ids[self._count - 1 : self._count]
+        if (np.diff(np.concatenate([last, ids])) <= 0).any():
+            raise InputError(
+                "ids of new descriptors must ascend, and be above those held: take the map's own"
+            )
+        total = self._count + ids.size
+        if total > self._ids.size:
+            # Room for as many again.
+            more = max(total, 2 * self._ids.size) - self._ids.size
+            self._ids = np.pad(self._ids, (0, more))
+            self._descriptors = np.pad(self._descriptors, ((0, more), (0, 0)))
+        self._ids[self._count : total], self._descriptors[self._count : total] = ids, descriptors
+        self._count = total
+
+    def remove(self, ids: np.ndarray) -> None:
+        """Drops landmarks (k,).
+
+        Raises:
+            InputError: one is not held.
+        """
+        rows = self.rows(ids)
+        if not rows.size:
+            return
+        # What is removed is mostly young: only what follows the first of them moves.
+        start = int(rows.min())
+        kept = np.delete(np.arange(start, self._count), rows - start)
+        total = start + kept.size
+        self._ids[start:total], self._descriptors[start:total] = self._ids[kept], self._descriptors[kept]
+        self._count = total
+
+    def rows(self, ids: np.ndarray) -> np.ndarray:
+        """Rows (k,) of landmarks (k,).
+
+        Raises:
+            InputError: one is not held.
+        """
+        ids = np.asarray(ids, dtype=np.int64)
+        rows, held = self.find(ids)
+        if not held.all():
+            raise InputError(f"there is no descriptor of landmark {ids[~held][0]}")
+        return rows
+
+    def find(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rows (k,) of landmarks (k,), and whether each is held (k,); the row of one that is not means nothing."""
+        rows = np.minimum(np.searchsorted(self.ids, ids), max(self._count - 1, 0))
+        return rows, (self.ids[rows] == ids) if self._count else np.zeros(rows.shape, dtype=bool)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """For a checkpoint."""
+        return {"descriptors/ids": self.ids.copy(), "descriptors/descriptors": self.descriptors.copy()}
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """The inverse of `arrays`."""
+        self._ids, self._descriptors = (
+            arrays[f"descriptors/{name}"].copy() for name in ("ids", "descriptors")
+        )
+        self._count, self.length = self._ids.size, self._descriptors.shape[1]
+        self.restored += 1
+
+
+class DescriptorSearch(ABC):
+    """Finds the descriptors of a store that are nearest to others."""
+
+    @abstractmethod
+    def match(self, query: np.ndarray, store: DescriptorStore, limits: MatchLimits) -> DescriptorMatches:
+        """Matches descriptors (K, d) with those of the store, `second` are its rows."""
+
+
+@final
+class ExactSearch(DescriptorSearch):
+    """Compares all with all."""
+
+    def match(self, query: np.ndarray, store: DescriptorStore, limits: MatchLimits) -> DescriptorMatches:
+        return match_all(query, store.descriptors, limits)
+
+
+@final
+class TreeSearch(DescriptorSearch):
+    """Asks a k-d tree of a former state of the store, and compares with all descriptors that came since.
+
+    The tree is made anew when many descriptors have come or gone. Those that have gone are left out of its answers; as S05 §V
+    warns, they crowd it while they are there.
+
+    Args:
+        slack: a descriptor may be missed if another is at most 1 + slack times as far; 0 makes the search exact.
+        tail: fraction of the tree's descriptors that may come or go before the tree is made anew.
+        least: so many may come or go in any case.
+    """
+
+    def __init__(self, slack: float = 3.0, tail: float = 0.1, least: int = 500) -> None:
+        if not (slack >= 0.0 and tail > 0.0 and least >= 0):
+            expected = "a slack and a least of at least 0 and a positive tail"
+            raise InputError(f"a tree search needs {expected}, got {slack}, {least} and {tail}")
+        self.slack, self.tail, self.least = slack, tail, least
+        self._ids = np.zeros(0, dtype=np.int64)
+        self._tree: Any = None
+        self._built: tuple[DescriptorStore, int] | None = None
+
+    def match(self, query: np.ndarray, store: DescriptorStore, limits: MatchLimits) -> DescriptorMatches:
+        if not query.shape[0] or not len(store):
+            return match_all(query, store.descriptors, limits)
+        rows, held = store.find(self._ids)
+        young = len(store) - int(held.sum())
+        stale = young + (~held).sum() > max(self.tail * self._ids.size, self.least)
+        if stale or (store, store.restored) != self._built:
+            from scipy.spatial import cKDTree
+
+            self._ids, self._built = store.ids.copy(), (store, store.restored)
+            self._tree = cKDTree(store.descriptors, leafsize=32)
+            rows, held, young = np.arange(len(store)), np.ones(len(store), dtype=bool), 0
+        first = len(store) - young
+        best, next_best, where = two_best(query, store.descriptors[first:])
+        if held.any():
+            # The two nearest in the tree that are held still; one more is asked for in case that one of them has gone. One
+            # further away than `most` is neither taken, nor does its distance forbid another.
+            near = min(3, self._ids.size)
+            most = limits.largest(query.shape[1]) / limits.ratio * (1.0 + 1e-6)
+            distance, found = self._tree.query(
+                query, k=np.arange(1, near + 1), eps=self.slack, distance_upper_bound=most
+            )
+            there = np.isfinite(distance)
+            found = np.where(there, found, 0)
+            product = np.where(there & held[found], 1.0 - 0.5 * np.minimum(distance, 2.0) ** 2, -np.inf)
+            product = product.astype(np.float32)
+            order = np.argsort(-product, axis=1, kind="stable")
+            product, found = np.take_along_axis(product, order, 1), np.take_along_axis(found, order, 1)
+            top, second = product[:, 0], product[:, 1] if near > 1 else np.full_like(product[:, 0], -np.inf)
+            where = np.where(best > top, first + where, rows[found[:, 0]])
+            next_best = np.maximum(np.maximum(next_best, second), np.minimum(best, top))
+            best = np.maximum(best, top)
+        return decide(query, store.descriptors, (best, next_best, where), limits)
+
+
+@final
+@dataclass(frozen=True)
+class Gate:
+    """Which landmarks a prediction makes plausible for which feature.
+
+    Attributes:
+        z: (K, p) places of the features, (u, v) or (u_left, v, u_right).
+        noise: (K, p, p) their covariances.
+        ids: (V,) landmarks that should be in view; no others compete.
+        mean: (V, p) where they should be, as `Belief.project` gives it.
+        cov: (V, p, p) covariance of that, without the measurements' noise.
+        gate: largest squared Mahalanobis distance; 11.3 holds 99 % of a Gaussian in three dimensions.
+    """
+
+    z: np.ndarray
+    noise: np.ndarray
+    ids: np.ndarray
+    mean: np.ndarray
+    cov: np.ndarray
+    gate: float = 11.3
+
+
+@final
+@dataclass(frozen=True)
+class MatchedLandmarks:
+    """Landmarks of K features.
+
+    Attributes:
+        ids: (K,) the landmark of each, each landmark once; NULL where there is none.
+        distance: (K,) of the descriptors, infinite where there is none.
+    """
+
+    ids: np.ndarray
+    distance: np.ndarray
+
+
+@final
+class DescriptorIndex:
+    """The descriptors of a map and how they are found.
+
+    Args:
+        length: of a descriptor, 36 or 128.
+        limits: when a candidate is taken.
+        search: of features about which nothing is predicted; exact by default.
+    """
+
+    def __init__(
+        self, length: int, limits: MatchLimits | None = None, search: DescriptorSearch | None = None
+    ) -> None:
+        self.store = DescriptorStore(length)
+        self.limits = limits or MatchLimits()
+        self.search = search or ExactSearch()
+
+    def match(self, descriptors: np.ndarray, gate: Gate | None = None) -> MatchedLandmarks:
+        """The landmarks of features with descriptors (K, d).
+
+        Args:
+            descriptors: float32 of length 1.
+            gate: what is predicted; None lets all landmarks compete for every feature.
+
+        Raises:
+            InputError: the descriptors have another length, or the gate names a landmark that is not held.
+        """
+        if descriptors.ndim != 2 or descriptors.shape[1] != self.store.length:
+            raise InputError(f"descriptors must be (K, {self.store.length}), got {descriptors.shape}")
+        if gate is None:
+            matches = self.search.match(descriptors, self.store, self.limits)
+        else:
+            k, m = gate_pairs(gate.z, gate.noise, gate.mean, gate.cov, gate.gate)
+            rows = self.store.rows(gate.ids)
+            matches = match_pairs(descriptors, self.store.descriptors, (k, rows[m]), self.limits)
+        count = descriptors.shape[0]
+        ids, distance = np.full(count, NULL, dtype=np.int64), np.full(count, np.inf)
+        ids[matches.first] = self.store.ids[matches.second]
+        distance[matches.first] = matches.distance
+        return MatchedLandmarks(ids, distance)
+
+    def nearest(self, descriptors: np.ndarray) -> np.ndarray:
+        """Distance (K,) of each descriptor (K, d) to the nearest one held, infinite where none is."""
+        return distances(two_best(descriptors, self.store.descriptors)[0])

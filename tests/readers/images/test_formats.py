@@ -1,0 +1,550 @@
+"""Images of one camera: what each format means, and what all of them refuse."""
+
+import logging
+import subprocess
+import sys
+from dataclasses import replace
+from unittest import mock
+
+import cv2
+import numpy as np
+import pytest
+
+from rbpf.errors import InputError
+from rbpf.lie import SE3
+from rbpf.sensors.readers import ImageSequence, open_images, open_stereo
+from tests.readers.images.folders import (
+    CAM0,
+    EUROC_NS,
+    P0,
+    P1,
+    SIZE,
+    levels,
+    matrix_row,
+    sensor_yaml,
+    write_asl_truth,
+    write_camera,
+    write_euroc,
+    write_images,
+    write_kitti,
+    write_plain,
+    write_seven_scenes,
+    write_tum,
+    write_video,
+)
+from tests.readers.small import write
+
+PATH = SE3.from_ypr(np.array([[1.0, 2, 3], [2, 2, 3], [3, 3, 3]]), [0.1, 0.2, 0.3], 0.4, [1, -1, 2])
+ROAD = SE3.from_ypr(np.array([[0.0, 0, 0], [0, 0, 1], [0.1, 0, 2]]), [0.0, 0.1, 0.2], 0.0, 0.0)
+PHOTOS = "# K fx fy cx cy width height\nK 20 21 11.5 7.5 24 16\nb.jpg 1 2 3 0 0 0 1\na.jpg 4 5 6 0 0 1 0\n"
+IMAGE = np.full((16, 24, 3), 70, np.uint8)
+
+
+def write_photos(folder):
+    write_images(folder / "images", ["a.jpg", "b.jpg"])
+    return write(folder, {"cameras.txt": PHOTOS})
+
+
+def write_small_scenes(folder):
+    write_camera(write_seven_scenes(folder, size=SIZE))
+    return folder
+
+
+def write_clip(folder):
+    folder.mkdir(parents=True, exist_ok=True)
+    return write_video(folder / "walk.avi", size=SIZE)
+
+
+FORMATS = {
+    "plain": (write_plain, [0, 33_333_333, 66_666_667]),
+    "TUM": (write_tum, [1_500_000_000, 1_600_000_000, 1_700_000_000]),
+    "EuRoC": (write_euroc, list(EUROC_NS)),
+    "KITTI": (write_kitti, [0, 100_000_000, 200_000_000]),
+    "7-Scenes": (write_small_scenes, [0, 33_333_333, 133_333_333]),
+    "photos": (write_photos, [0, 1_000_000_000]),
+    "video": (write_clip, [0, 40_000_000, 80_000_000]),
+}
+every_format = pytest.mark.parametrize("name", FORMATS)
+
+
+@every_format
+def test_a_small_sequence(tmp_path, name):
+    make, stamps = FORMATS[name]
+    path = make(tmp_path / "desk")
+    sequence = open_images(path)
+    assert sequence.name == ("walk" if name == "video" else "desk")
+    assert sequence.stamps_ns.dtype == np.int64 and sequence.stamps_ns[:3].tolist() == stamps
+    camera = sequence.camera
+    assert (camera.width, camera.height, camera.cx, camera.cy) == (24, 16, 11.5, 7.5)
+    assert (camera.fx, camera.fy) == (20.0, 21.0) and sequence.baseline_m is None
+    expected = [20, 10] if name == "photos" else np.arange(5, 125, 10) if name == "video" else [10, 20, 30]
+    np.testing.assert_allclose(levels(sequence), expected, atol=3 if name == "video" else 0)
+    assert all(frame.right is None and frame.problem is None for frame in sequence.frames())
+
+
+@every_format
+def test_a_given_calibration_replaces_the_sequences_own_and_must_fit(tmp_path, name):
+    path = FORMATS[name][0](tmp_path / "desk")
+    given = open_images(path, write_camera(tmp_path, fx=33.0)).camera
+    assert given.fx == 33.0 and given.distortion == (0.0,) * 5
+    with pytest.raises(InputError, match=r"width and height are 48x16, the images of .* have 24x16 px"):
+        open_images(path, write_camera(tmp_path, width=48))
+
+
+MISSING = [
+    *((name, "camera.yaml", "no such file; expected a camera.yaml with the keys fx") for name in ("TUM", "video")),
+    ("plain", "camera.yaml", "no such file; expected a camera.yaml with the keys fx"),
+    ("EuRoC", "mav0/cam0/sensor.yaml", "no such file; expected an EuRoC sequence"),
+    ("KITTI", "calib.txt", "no such file; expected a KITTI odometry sequence"),
+    ("KITTI", "times.txt", "no such file; expected a KITTI odometry sequence"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "file", "words"), MISSING)
+def test_a_missing_file_is_named(tmp_path, name, file, words):
+    path = FORMATS[name][0](tmp_path / "desk")
+    (tmp_path / "desk" / file).unlink()
+    with pytest.raises(InputError, match=f"{file.split('/')[-1]}: {words}"):
+        open_images(path)
+
+
+S = "mav0/cam0/"
+DATA = S + "data.csv"
+TRUTH = "mav0/state_groundtruth_estimate0/data.csv"
+POSE = "frame-000001.pose.txt"
+REFUSED = [
+    ("plain", "times.txt", "0.5\n1\n", "times.txt: expected 3 times, one per image, found 2"),
+    ("plain", "camera.yaml", "fx: 1\nfx: 2\n", "line 2: fx comes a second time"),
+    ("plain", "camera.yaml", "- 1\n", "line 1: expected the keys fx, .*, found no mapping"),
+    ("plain", "camera.yaml", "a: [1\nb: 2\n", "line 2: expected YAML, found a syntax error"),
+    ("plain", "camera.yaml", "# only\n", "found only comments"),
+    ("plain", "camera.yaml", "[" * 1500, "expected YAML, found something else"),
+    ("TUM", "rgb.txt", "# nothing\n", "rgb.txt: expected lines that begin with a time, found none"),
+    ("TUM", "rgb.txt", "", "rgb.txt: the file is empty"),
+    ("TUM", "rgb.txt", "1.5\n", "rgb.txt, line 1: expected a time and the file of an image"),
+    ("TUM", "rgb.txt", "1.5 a.png\nsoon b.png\n", "rgb.txt, line 2: expected the time to be a finite number"),
+    ("TUM", "rgb.txt", "1305031102175304123 a.png\n", "rgb.txt, line 1: expected the time in seconds, within 4e.09"),
+    ("TUM", "rgb.txt", "1.5 a.png\n1.6 b.", "rgb.txt, line 2: the file ends inside this line"),
+    ("TUM", "rgb.txt", "#\n1.5 a\n1.7 b\n1.6 c\n", "rgb.txt, line 4: time runs backwards from 1.7 to 1.6"),
+    ("TUM", "groundtruth.txt", "1.5 1 2 3 0 0 1\n", "groundtruth.txt, line 1: expected 7 columns .* found 6"),
+    ("TUM", "groundtruth.txt", "1.5 1 2 3 0 0 nan 1\n", "groundtruth.txt, line 1: expected qz to be a finite number"),
+    ("TUM", "groundtruth.txt", "#\n1.5 1 2 3 0 0 1 1\n", "line 2: expected a quaternion of length 1"),
+    ("TUM", "groundtruth.txt", "99 1 2 3 0 0 0 1\n", "groundtruth.txt: the poses are at 99.000 .* which is another clock"),
+    ("TUM", "groundtruth.txt", "0 1 2 3 0 0 0 1\n", "groundtruth.txt: the poses are at 0.000 .* which is another clock"),
+    ("EuRoC", DATA, "12,12.png\n11,11.png\n", "data.csv, line 2: time runs backwards from 12 to 11"),
+    ("EuRoC", DATA, "timestamp,filename\n", "line 1: expected a time in whole nanoseconds, found 'timestamp'"),
+    ("EuRoC", DATA, "1.5,12.png\n", "data.csv, line 1: expected a time in whole nanoseconds, found '1.5'"),
+    ("EuRoC", DATA, "9999999999999999999,12.png\n", "data.csv, line 1: expected a time in whole nanoseconds"),
+    ("EuRoC", DATA, "12\n", "data.csv, line 1: expected a time and the file of an image"),
+    ("EuRoC", DATA, "12,12.png\n", "data.csv: none of 1 images can be read; the first is .*12.png: no such image"),
+    ("EuRoC", TRUTH, "0,1,2,3,1,0,0,0\n", "the poses are at 0.000 .* which is another clock"),
+    ("EuRoC", TRUTH, f"{EUROC_NS[0]},1,2,3,1,0,0\n", "data.csv, line 1: expected 7 columns .* found 6"),
+    ("EuRoC", "mav0/vicon0/data.csv", f"{EUROC_NS[0]},1,2,3,1,0,0,0\n", "vicon0/sensor.yaml: no such file; .* T_BS"),
+    ("EuRoC", S + "sensor.yaml", sensor_yaml(CAM0).replace("T_BS", "T_SB"), "expected the keys T_BS, .*, found no T_BS"),
+    ("KITTI", "calib.txt", P1, "calib.txt: expected a line `P0:` and 12 numbers, found none"),
+    ("KITTI", "calib.txt", P0.replace("20 0", "20 1"), "calib.txt, line 1: expected P0 to be fx 0 cx"),
+    ("KITTI", "calib.txt", P0.replace("11.5", "600") + P1, r"the centre of projection \(600, 7.5\) px lies outside"),
+    ("KITTI", "times.txt", "0\n0.1\n", "image_0: found image 2 but 2 times in times.txt"),
+    ("KITTI", "times.txt", "0\n0.2\n0.1\n", "times.txt, line 3: time runs backwards from 0.2 to 0.1"),
+    ("KITTI", "poses.txt", matrix_row(ROAD[0]), "poses.txt: expected 3 poses, one per time in times.txt, found 1"),
+    ("KITTI", "poses.txt", "1 2 3\n", "poses.txt, line 1: expected 12 columns"),
+    ("KITTI", "poses.txt", matrix_row(ROAD[0]) + 2 * f"{' 7' * 12}\n", "poses.txt, line 2: expected a rotation"),
+    ("7-Scenes", POSE, "1 2 3\n", f"{POSE}: expected 16 numbers, found 3"),
+    ("7-Scenes", POSE, "one " * 16, f"{POSE}: expected 16 numbers, found 'one one"),
+    ("7-Scenes", POSE, "1 " * 16, f"{POSE}: expected a rotation"),
+    ("7-Scenes", POSE, "", f"{POSE}: the file is empty; expected a 4 x 4 matrix"),
+    ("7-Scenes", "frame-000001.color.jpg", "none", "found frame-000001.color.jpg and .*, expected one image of each"),
+    ("photos", "cameras.txt", "a.jpg 4 5 6 0 0 1 0\n", "expected one line `K fx fy cx cy width height`, found 0"),
+    ("photos", "cameras.txt", PHOTOS + "K 20 21 11.5 7.5 24 16\n", "cameras.txt: expected one line `K .*`, found 2"),
+    ("photos", "cameras.txt", PHOTOS.replace("K 20", "K -20"), "cameras.txt, line 2: expected positive fx and fy"),
+    ("photos", "cameras.txt", PHOTOS.replace("24 16", "24 16.5"), "line 2: .* a whole positive width and height"),
+    ("photos", "cameras.txt", PHOTOS.replace("24 16", "48 32"), "line 2: width and height are 48x32, the images of"),
+    ("photos", "cameras.txt", PHOTOS.replace("24 16", "24"), "cameras.txt, line 2: expected 6 columns"),
+    ("photos", "cameras.txt", PHOTOS.replace("4 5 6 0 0", "4 5 6 0"), "cameras.txt, line 4: expected 7 columns"),
+    ("photos", "cameras.txt", PHOTOS.replace("0 0 1 0", "0 0 2 0"), "line 4: expected a quaternion of length 1"),
+    ("photos", "cameras.txt", "K 20 21 11.5 7.5 24 16\n", "cameras.txt: expected rows of tx, .* found none"),
+    ("video", "walk.avi", "", "walk.avi: OpenCV cannot open the video"),
+    ("video", "walk.avi", "some text\n" * 100, "walk.avi: OpenCV cannot open the video"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "file", "content", "words"), REFUSED)
+def test_a_bad_file_is_named(tmp_path, name, file, content, words):
+    path = FORMATS[name][0](tmp_path / "desk")
+    (tmp_path / "desk" / file).parent.mkdir(exist_ok=True)
+    write(tmp_path / "desk", {file: content})
+    with pytest.raises(InputError, match=words):
+        open_images(path)
+
+
+CAMERAS = [
+    ({"width": 48, "height": 32}, "camera.yaml: width and height are 48x32, the images of .* have 24x16 px"),
+    ({"fx": None}, "line 1: expected the keys fx, fy, cx, cy, width, height, found no fx"),
+    ({"fx": -1}, "line 1: expected fx to be positive, found -1"),
+    ({"fy": "wide"}, "line 2: expected fy to be a finite number, found 'wide'"),
+    ({"cx": "[1, 2]"}, "line 3: expected cx to be a single value"),
+    ({"width": 24.5}, "line 5: expected width to be a whole number, found 24.5"),
+    ({"distorsion": "[0, 0, 0, 0]"}, "line 7: expected the keys fx, .*; also known: .*; found .distorsion."),
+    ({"distortion": "[0, 0]"}, "line 7: expected distortion to be a list of 4 or 5, found 2"),
+    ({"distortion": 0}, "line 7: expected distortion to be a list of 4 or 5, found no list"),
+    ({"distortion": "[0, 0, .nan, 0]"}, r"line 7: expected distortion\[2\] to be a finite number"),
+    ({"model": "omni"}, "line 7: expected model to be pinhole or fisheye, found 'omni'"),
+    ({"model": "fisheye", "distortion": [0] * 5}, "line 8: expected distortion to be a list of 4, found 5"),
+    ({"baseline_m": -1}, "line 7: expected baseline_m to be positive, found -1"),
+    ({"rate_hz": 0}, "line 7: expected rate_hz to be positive, found 0"),
+]
+
+
+@pytest.mark.parametrize(("changes", "message"), CAMERAS)
+def test_a_camera_file_that_does_not_fit(tmp_path, changes, message):
+    with pytest.raises(InputError, match=message):
+        open_images(write_plain(tmp_path, **changes))
+
+
+def test_what_a_camera_file_may_say(tmp_path):
+    write_plain(tmp_path, distortion=[0.1, -0.2, 0.001, 0.002], rate_hz=8)
+    sequence = open_images(tmp_path)
+    assert sequence.camera.distortion == (0.1, -0.2, 0.001, 0.002, 0.0)
+    assert sequence.stamps_ns.tolist() == [0, 125_000_000, 250_000_000]
+    write_camera(tmp_path, model="pinhole", distortion=[0.1, -0.2, 0.001, 0.002, 0.3])
+    assert open_images(tmp_path).camera.distortion == (0.1, -0.2, 0.001, 0.002, 0.3)
+    write_camera(tmp_path, model="fisheye", distortion=[0.1, -0.2, 0.001, 0.002])
+    camera = open_images(tmp_path).camera
+    assert (camera.distortion_model, camera.distortion) == ("equidistant", (0.1, -0.2, 0.001, 0.002))
+    path = write_camera(tmp_path, model="fisheye")
+    assert open_images(tmp_path).camera == replace(camera, distortion=(0.0,) * 4)
+    # The first line as OpenCV writes it.
+    path.write_text("%YAML:1.0\n---\n" + path.read_text())
+    assert open_images(tmp_path).camera.fx == 20.0
+
+
+# Folders.
+
+
+def test_images_in_a_folder_are_ordered_by_the_numbers_in_their_names(tmp_path):
+    assert levels(open_images(write_plain(tmp_path / "shelf", ["2.png", "10.png", "9.png"]))) == [10, 30, 20]
+    write_images(tmp_path / "images", ["a.jpg", "b.png"])
+    write(write_camera(tmp_path).parent, {"README.md": "about\n"})
+    assert len(open_images(tmp_path)) == 2
+
+
+def test_stamps_and_truth_of_a_folder(tmp_path, caplog):
+    with caplog.at_level(logging.INFO):
+        assert open_images(write_plain(tmp_path)).truth is None
+    assert "no times.txt and no rate_hz" in caplog.text
+    write(tmp_path, {"times.txt": "# s\n0.5\n0.5\n1\n", "groundtruth.txt": "0.7 1 2 3 0 0 0 1\n"})
+    sequence = open_images(tmp_path)
+    assert sequence.stamps_ns.tolist() == [500_000_000, 500_000_000, 1_000_000_000]
+    assert sequence.truth.stamps_ns.tolist() == [700_000_000]
+
+
+def test_a_folder_without_images(tmp_path):
+    write_camera(tmp_path)
+    with pytest.raises(InputError, match="expected images in it or in its images/, found none"):
+        open_images(tmp_path)
+    write(tmp_path, {"frame-000000.color.txt": "something\n"})
+    with pytest.raises(InputError, match="expected images, found none"):
+        open_images(tmp_path)
+
+
+# TUM RGB-D.
+
+
+def test_the_truth_of_tum_keeps_its_own_times_and_its_gaps(tmp_path):
+    truth = open_images(write_tum(tmp_path)).truth
+    assert truth.stamps_ns.tolist() == [1_500_000_000, 1_700_000_000] and truth.landmarks == {}
+    np.testing.assert_array_equal(truth.world_from_camera, [[0, 0, 0, 1, 1, 2, 3], [0, 0, 1, 0, 1, 2, 4]])
+    # A quaternion of few digits is scaled to length 1.
+    truth = open_images(write_tum(tmp_path, truth=["1.5 1 2 3 0.4564 0.1000 0.3652 0.8049"])).truth
+    assert np.linalg.norm(truth.world_from_camera[0, :4]) == pytest.approx(1.0, abs=1e-15)
+    (tmp_path / "groundtruth.txt").unlink()
+    assert open_images(tmp_path).truth is None
+
+
+def test_ends_of_lines_of_another_system_comments_and_blank_lines(tmp_path):
+    write_tum(tmp_path)
+    for name in ("rgb.txt", "groundtruth.txt", "camera.yaml"):
+        text = "# a comment\n\n" + (tmp_path / name).read_text()
+        write(tmp_path, {name: text.replace("\n", "\r\n")})
+    sequence = open_images(str(tmp_path))
+    assert levels(sequence) == [10, 20, 30] and len(sequence.truth.stamps_ns) == 2
+
+
+def test_a_time_keeps_all_its_digits_and_may_come_twice(tmp_path):
+    write_tum(tmp_path, ["1305031102.175304123", "1305031102.2"], ["1.3050311021754e+09 0 0 0 0 0 0 1"])
+    sequence = open_images(tmp_path)
+    assert sequence.stamps_ns.tolist() == [1305031102175304123, 1305031102200000000]
+    assert sequence.truth.stamps_ns.tolist() == [1305031102175400000]
+    write_tum(tmp_path, ["1.5", "1.50", "1.6"])
+    assert open_images(tmp_path).stamps_ns.tolist() == [1_500_000_000, 1_500_000_000, 1_600_000_000]
+
+
+# EuRoC.
+
+
+def test_lenses_and_folders_of_euroc(tmp_path):
+    assert open_images(write_euroc(tmp_path)).camera.distortion == (-0.1, 0.01, 0.001, -0.002, 0.0)
+    camera = open_images(write_euroc(tmp_path, distortion_model="equidistant")).camera
+    assert (camera.distortion_model, camera.distortion) == ("equidistant", (-0.1, 0.01, 0.001, -0.002))
+    assert open_images(tmp_path / "mav0").name == tmp_path.name
+    (tmp_path / "mav0").rename(tmp_path / "flight")
+    assert open_images(tmp_path / "flight").name == "flight"
+    (tmp_path / "mav0").mkdir()
+    with pytest.raises(InputError, match=r"cam0/sensor.yaml: no such file; expected an EuRoC sequence"):
+        open_images(tmp_path)
+
+
+@pytest.mark.parametrize("mounted", [None, SE3.identity()])
+def test_the_estimated_state_of_euroc_becomes_the_pose_of_the_camera(tmp_path, mounted):
+    mav = write_euroc(tmp_path / "a") / "mav0"
+    write_asl_truth(mav / "vicon0", PATH[1:], EUROC_NS[1:], SE3.identity())
+    write_asl_truth(mav / "state_groundtruth_estimate0", PATH, EUROC_NS, mounted, extra=",0.1,0.2,0,0,0,0")
+    truth = open_images(tmp_path / "a").truth
+    np.testing.assert_allclose(
+        SE3.matrix(truth.world_from_camera), SE3.matrix(PATH) @ SE3.matrix(CAM0), atol=1e-12
+    )
+    assert truth.stamps_ns.tolist() == list(EUROC_NS)
+    # A calibration that is given leaves the truth of the camera.
+    given = open_images(tmp_path / "a", write_camera(tmp_path, fx=25.0)).truth
+    np.testing.assert_array_equal(truth.world_from_camera, given.world_from_camera)
+
+
+def test_a_marker_is_not_the_body(tmp_path):
+    marker = SE3.from_ypr(np.array([0.07, -0.1, 0.2]), 1.0, 0.5, -2.0)
+    world_from_marker = SE3.compose(PATH, marker)
+    write_asl_truth(write_euroc(tmp_path) / "mav0" / "vicon0", world_from_marker, EUROC_NS, marker)
+    found = SE3.matrix(open_images(tmp_path).truth.world_from_camera)
+    np.testing.assert_allclose(found, SE3.matrix(PATH) @ SE3.matrix(CAM0), atol=1e-12)
+
+
+ASL_CAMERAS = [
+    ({"camera_model": "omni"}, "expected camera_model to be pinhole, found 'omni'"),
+    (
+        {"distortion_model": "fov"},
+        "expected distortion_model to be radial-tangential or radtan or equidistant",
+    ),
+    ({"distortion_model": "equidistant", "distortion_coefficients": [0.0] * 5}, "to be a list of 4, found 5"),
+    ({"intrinsics": [20.0, 21.0, 11.5]}, "expected intrinsics to be a list of 4, found 3"),
+    ({"resolution": [48, 32]}, "width and height are 48x32, the images of .*cam0 have 24x16 px"),
+    ({"resolution": [24.5, 16]}, r"expected resolution\[0\] to be a whole number"),
+]
+
+
+@pytest.mark.parametrize(("changes", "message"), ASL_CAMERAS)
+def test_a_camera_of_euroc_that_does_not_fit(tmp_path, changes, message):
+    with pytest.raises(InputError, match=rf"cam0/sensor.yaml.*{message}"):
+        open_images(write_euroc(tmp_path, **changes))
+
+
+@pytest.mark.parametrize(
+    ("matrix", "message"),
+    [
+        (np.diag([1.0, 1.0, 2.0, 1.0]), "expected a rotation"),
+        (np.diag([1.0, 1.0, -1.0, 1.0]), "expected a rotation"),
+        (np.diag([1.0, 1.0, 1.0, 2.0]), "expected the last row of the matrix to be 0 0 0 1"),
+        (np.eye(4)[:3], "expected data to be a list of 16, found 12"),
+    ],
+)
+def test_a_mount_that_is_no_rigid_motion(tmp_path, matrix, message):
+    file = write_euroc(tmp_path) / S / "sensor.yaml"
+    own, other = (str(part.reshape(-1).tolist()) for part in (SE3.matrix(CAM0), matrix))
+    file.write_text(file.read_text().replace(own, other))
+    with pytest.raises(InputError, match=message):
+        open_images(tmp_path)
+
+
+# KITTI.
+
+
+@pytest.mark.parametrize("place", ["poses.txt", "../../poses/00.txt"])
+def test_the_truth_of_kitti_beside_the_images_or_as_distributed(tmp_path, place):
+    folder = write_kitti(tmp_path / "sequences" / "00", right=False, calib=P0)
+    (tmp_path / "poses").mkdir()
+    (folder / place).write_text("".join(map(matrix_row, ROAD)))
+    sequence = open_images(folder)
+    np.testing.assert_allclose(sequence.truth.world_from_camera, ROAD, atol=1e-12)
+    np.testing.assert_array_equal(sequence.truth.stamps_ns, sequence.stamps_ns)
+
+
+def test_the_colour_pair_has_its_own_place(tmp_path):
+    write_kitti(tmp_path)
+    for number in (0, 1):
+        (tmp_path / f"image_{number}").rename(tmp_path / f"image_{number + 2}")
+    p2, p3 = "P2: 20 0 11.5 1.2 0 21 7.5 2.1 0 0 1 0.3\n", "P3: 20 0 11.5 -9.6 0 21 7.5 2.1 0 0 1 0.3\n"
+    (tmp_path / "calib.txt").write_text(P0 + P1 + "\n" + p2 + p3 + "Tr: 1 2 3\n")
+    (tmp_path / "poses.txt").write_text("".join(map(matrix_row, ROAD)))
+    sequence = open_stereo(tmp_path)
+    shift = -np.linalg.solve([[20, 0, 11.5], [0, 21, 7.5], [0, 0, 1]], [1.2, 2.1, 0.3])
+    assert sequence.baseline_m == pytest.approx(0.54)
+    expected = SE3.transform(ROAD, np.tile(shift, (3, 1)))
+    np.testing.assert_allclose(sequence.truth.world_from_camera[:, 4:], expected, atol=1e-12)
+
+
+def test_a_missing_image_of_kitti_is_a_lost_frame(tmp_path):
+    write_images(write_kitti(tmp_path) / "image_0", ["preview.png"])
+    (tmp_path / "image_0" / "000001.png").unlink()
+    assert levels(open_images(tmp_path)) == [10, None, 30]
+
+
+# 7-Scenes and photos.
+
+
+@pytest.mark.parametrize("text", [None, "nan " * 16, "inf 0 0 0\n" * 4])
+def test_where_tracking_was_lost_the_truth_of_scenes_has_a_gap(tmp_path, text):
+    write_small_scenes(tmp_path)
+    truth = open_images(tmp_path).truth
+    expected = SE3.from_ypr(np.array([[0.0, 2, 3], [1, 2, 3], [4, 2, 3]]), [0.0, 0.1, 0.4], 0.2, 0.3)
+    np.testing.assert_allclose(truth.world_from_camera, expected, atol=1e-12)
+    (tmp_path / POSE).unlink() if text is None else (tmp_path / POSE).write_text(text)
+    sequence = open_images(tmp_path)
+    assert len(sequence) == 3 and sequence.truth.stamps_ns.tolist() == [0, 133_333_333]
+    for pose in tmp_path.glob("*.pose.txt"):
+        pose.unlink()
+    assert open_images(tmp_path).truth is None
+
+
+def test_scenes_without_a_calibration_have_the_nominal_camera(tmp_path):
+    camera = open_images(write_seven_scenes(tmp_path / "seq-01")).camera
+    assert (camera.width, camera.height, camera.fx, camera.fy) == (640, 480, 525, 525)
+    (write_small_scenes(tmp_path) / "camera.yaml").unlink()
+    with pytest.raises(InputError, match="the nominal camera of 7-Scenes: width and height are 640x480"):
+        open_images(tmp_path)
+
+
+def test_poses_of_photos_in_the_order_of_their_lines(tmp_path):
+    truth = open_images(write_photos(tmp_path)).truth
+    assert truth.stamps_ns.tolist() == [0, 1_000_000_000]
+    assert truth.world_from_camera.tolist() == [[0, 0, 0, 1, 1, 2, 3], [0, 0, 1, 0, 4, 5, 6]]
+
+
+# Videos.
+
+
+@pytest.mark.parametrize(("name", "codec"), [("000001.mp4", "mp4v"), ("walk.mkv", "MJPG")])
+def test_a_video_from_any_image_on(tmp_path, name, codec):
+    sequence = open_images(write_video(tmp_path / name, codec=codec))
+    assert sequence.name == name.split(".")[0] and len(sequence) == 12
+    np.testing.assert_allclose(levels(sequence), np.arange(12) * 10 + 5, atol=3)
+    np.testing.assert_allclose(levels(sequence, 7), np.arange(7, 12) * 10 + 5, atol=3)
+    assert [frame.stamp_ns for frame in sequence.frames(10)] == [400_000_000, 440_000_000]
+    camera = write_camera(tmp_path / "..", width=64, height=48, rate_hz=10)
+    assert open_images(tmp_path / name, camera).stamps_ns[1] == 100_000_000
+
+
+@pytest.mark.parametrize("name", ["walk.avi", "walk.mkv"])
+def test_a_video_that_ends_in_mid_frame_keeps_what_was_read_and_says_so(tmp_path, name):
+    path = write_video(tmp_path / name, count=60, size=(240, 320))
+    path.write_bytes(path.read_bytes()[: path.stat().st_size * 6 // 10])
+    *kept, last = open_images(path).frames()
+    assert 25 <= len(kept) <= 40
+    assert all(frame.image is not None and frame.problem is None for frame in kept)
+    assert last.image is None
+    assert last.problem == f"{path}: the video ends after {len(kept)} of 60 images; those are kept."
+
+
+def test_a_video_without_its_index_cannot_be_opened(tmp_path):
+    path = write_video(tmp_path / "walk.mp4", codec="mp4v")
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(InputError, match=r"walk.mp4: OpenCV cannot open the video; convert it, or copy it"):
+        open_images(path)
+
+
+class Capture:
+    """A video with a header of any kind."""
+
+    def __init__(self, images, **header):
+        self.images, self.header = iter(images), header
+
+    def isOpened(self):  # noqa: N802
+        return True
+
+    def get(self, name):
+        return self.header["count"] if name == cv2.CAP_PROP_FRAME_COUNT else self.header["rate"]
+
+    def grab(self):
+        return next(self.images, None) is not None
+
+    def read(self):
+        image = next(self.images, None)
+        return image is not None, image
+
+    def release(self):
+        self.images = iter(())
+
+
+def sequence_of(tmp_path, images, **header):
+    write(write_camera(tmp_path).parent, {"walk.avi": ""})
+    with mock.patch.object(cv2, "VideoCapture", side_effect=lambda *_: Capture(images, **header)):
+        sequence = open_images(tmp_path / "walk.avi")
+        return sequence, list(sequence.frames())
+
+
+@pytest.mark.parametrize("count", [-1.0, 0.0, float("nan")])
+def test_a_header_without_a_number_and_a_rate(tmp_path, count):
+    sequence, frames = sequence_of(tmp_path, [IMAGE] * 5, count=count, rate=0.0)
+    assert len(sequence) == 5 == len(frames)
+    assert sequence.stamps_ns[:2].tolist() == [0, 33_333_333]
+
+
+def test_images_of_a_video_of_another_size_and_depth(tmp_path):
+    _, frames = sequence_of(tmp_path, [IMAGE, IMAGE[:, :20], IMAGE], count=3.0, rate=25.0)
+    assert [frame.image is None for frame in frames] == [False, True]
+    assert "expected 24x16 px as in the camera file, found 20x16 px" in frames[1].problem
+    deep = np.full(SIZE, 65535, np.uint16)
+    _, frames = sequence_of(tmp_path, [IMAGE[..., :1], deep], count=2.0, rate=25.0)
+    assert [int(frame.image[0, 0]) for frame in frames] == [70, 255]
+    with pytest.raises(InputError, match="not one image of the video can be decoded"):
+        sequence_of(tmp_path, [], count=3.0, rate=25.0)
+
+
+# What is of no format.
+
+
+@pytest.mark.parametrize("path", ["nowhere", "\0", "x" * 5000])
+def test_nothing_there(tmp_path, path):
+    with pytest.raises(InputError, match="; expected an image sequence"):
+        open_images(tmp_path / path)
+
+
+@pytest.mark.parametrize(
+    ("names", "found"),
+    [
+        ([], "found an empty folder, expected"),
+        (["b.txt", "a.csv"], "found a folder with a.csv, b.txt, expected"),
+        (
+            [f"{letter}.txt" for letter in "gfedcba"],
+            "a folder with a.txt, b.txt, c.txt, d.txt, e.txt and more",
+        ),
+    ],
+)
+def test_a_folder_of_another_kind(tmp_path, names, found):
+    with pytest.raises(InputError, match=found) as caught:
+        open_images(write(tmp_path, dict.fromkeys(names, "something\n")))
+    for kind in ("TUM", "EuRoC", "KITTI", "7-Scenes", "photos", "video", "a folder of images"):
+        assert kind in str(caught.value)
+
+
+def test_a_file_of_another_kind(tmp_path):
+    write(tmp_path, {"0.png": "something", "list": "something"})
+    for name, found in (("0.png", "a file that ends in '.png'"), ("list", "a file")):
+        with pytest.raises(InputError, match=f"found {found}, expected"):
+            open_images(tmp_path / name)
+
+
+def test_importing_the_readers_imports_no_image_library():
+    code = "import sys, rbpf.sensors.readers.images; sys.exit('cv2' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("stamps", "words"),
+    [
+        (np.array([0.0, np.nan, 1.0]), "whole numbers"),
+        (np.array([0, 5, 4]), "image 2 is before"),
+        (np.zeros((3, 1), dtype=np.int64), "whole numbers"),
+    ],
+)
+def test_stamps_that_are_none_or_run_backwards(stamps, words):
+    """A sequence may be made by hand."""
+    with pytest.raises(InputError, match=words):
+        ImageSequence("by hand", None, stamps, None, None, None)

@@ -1,0 +1,228 @@
+"""What every reader of tables refuses: a bad line by its number, a missing file, an incomplete one, and damaged bytes."""
+
+import re
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rbpf.errors import InputError
+from rbpf.sensors.readers import open_log, read_known_points
+from rbpf.sensors.readers.stereo_tracks import read_stereo_tracks
+from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
+from tests.readers.small import GRAPH, KNOWN, MOUNT, MRCLAM, MRPT, MRPT_IN_SPACE, TRACKS, WHEELS, write
+
+FORMATS = {
+    "MRCLAM": (MRCLAM, open_log),
+    "MRPT": (MRPT, open_log),
+    "space": (MRPT_IN_SPACE, open_log),
+    "graph": (GRAPH, lambda folder: open_log(folder / "graph.txt")),
+    "tracks": (TRACKS, read_stereo_tracks),
+    "wheels": (WHEELS, read_wheel_odometry),
+    "known": (KNOWN, lambda folder: read_known_points(folder / "known_points.csv")),
+}
+every_format = pytest.mark.parametrize("name", FORMATS)
+
+LINES = """
+MRCLAM | Barcodes.dat | 3 | 3 5 | barcode 5 comes a second time
+MRCLAM | Barcodes.dat | 3 | 2 14.5 | expected barcode to be a whole number
+MRCLAM | Barcodes.dat | 3 | 0 14 | expected subject to be 1 or more
+MRCLAM | Robot3_Odometry.dat | 3 | 100.3 0.2 | expected 3 columns (time, forward speed, turn rate), found 2
+MRCLAM | Robot3_Odometry.dat | 3 | 99.9 0.2 1.0 | time runs backwards from 100.0 to 99.9
+MRCLAM | Robot3_Odometry.dat | 3 | 100.3 0.2 inf | expected turn rate to be a finite number, found 'inf'
+MRCLAM | Robot3_Measurement.dat | 4 | 100.5 14 0 0 | expected range to be positive, found 0
+MRCLAM | Robot3_Measurement.dat | 4 | 100.5 14 -2 0 | expected range to be positive, found -2
+MRCLAM | Robot3_Measurement.dat | 4 | 100.5 14 2 30 | expected bearing to be in radians, within a turn, found 30
+MRCLAM | Robot3_Measurement.dat | 4 | 99.5 14 2 0 | time runs backwards from 100.1 to 99.5
+MRCLAM | Robot3_Measurement.dat | 4 | 100.5 1e20 2 0 | expected barcode to be at most 1e+12
+MRCLAM | Robot3_Groundtruth.dat | 3 | 99.5 3 4 0 | time runs backwards from 100.0 to 99.5
+MRCLAM | Landmark_Groundtruth.dat | 3 | 6 3 4 0 0 | subject 6 comes a second time
+MRCLAM | Landmark_Groundtruth.dat | 3 | 7 3 4 0 -1 | expected std of y to be zero or positive
+MRPT | odometry.csv | 1 | step,x | expected the header
+MRPT | odometry.csv | 3 | 1,1,0,0,1,0,0,1,0,1 | expected step to be one more than in the row before
+MRPT | odometry.csv | 3 | 3,1,0,0,1,0,0,1,0,1 | expected step to be one more than in the row before
+MRPT | odometry.csv | 3 | 2,1,0,0,1,0,0,1,0 | expected 10 columns
+MRPT | odometry.csv | 3 | 2,1,,0,1,0,0,1,0,1 | expected dy_m to be a finite number, found ''
+MRPT | odometry.csv | 3 | 2,1,0,0,-1,0,0,1,0,1 | expected cxx to cpp to be a covariance
+MRPT | odometry.csv | 3 | 2,1,0,0,1,1.1,0,1,0,1 | expected cxx to cpp to be a covariance
+MRPT | odometry.csv | 3 | 2,1,0,0,0,1e-9,0,1,0,1 | expected cxx to cpp to be a covariance
+MRPT | odometry.csv | 3 | 2,1,0,0,1,0.9,-0.9,1,0.9,1 | expected cxx to cpp to be a covariance
+MRPT | observations.csv | 2 | -1,7,3,0.1,0,0.01,0.02,0 | expected step to be one with odometry, 0 to 3
+MRPT | observations.csv | 4 | 4,7,5,0.3,0,0.05,0.06,0 | expected step to be one with odometry, 0 to 3
+MRPT | observations.csv | 4 | 1e30,7,5,0.3,0,0.05,0.06,0 | expected step to be at most 1e+12
+MRPT | observations.csv | 3 | 2.5,8,4,0,0,0.03,0.04,0 | expected step to be a whole number, found 2.5
+MRPT | observations.csv | 3 | 0,7,4,0,0,0.03,0.04,0 | landmark 7 comes a second time in step 0
+MRPT | observations.csv | 3 | 3,8,4,0,0,0.03,0.04,0 | line 4: time runs backwards from step 3 to 2
+MRPT | observations.csv | 3 | 0,8,0,0,0,0.03,0.04,0 | expected range_m to be positive, found 0
+MRPT | observations.csv | 3 | 0,8,-4,0,0,0.03,0.04,0 | expected range_m to be positive, found -4
+MRPT | observations.csv | 3 | 0,8,4,57,0,0.03,0.04,0 | expected yaw_rad to be in radians
+MRPT | observations.csv | 3 | 0,8,4,0,0.1,0.03,0.04,0 | expected pitch_rad to be 0, as the odometry is planar
+MRPT | observations.csv | 3 | 0,8,4,0,0,-0.03,0.04,0 | expected std_range_m to be positive
+MRPT | observations.csv | 3 | 0,8,4,0,0,0.03,0,0 | expected std_yaw_rad to be positive
+MRPT | observations.csv | 3 | 0,8,4,0,0,0.03,0.04,-1 | expected std_pitch_rad to be zero or positive
+MRPT | sensor.yaml | 2 | robot_from_sensor: 3 | expected the keys x_m, y_m
+MRPT | sensor.yaml | 2 | robot_from_sensor: {x_m: 0} | found no y_m
+MRPT | sensor.yaml | 2 | MOUNT with x_m: 0.5x | expected x_m to be a finite number
+MRPT | sensor.yaml | 2 | MOUNT with x_m: [] | expected x_m to be a single value
+MRPT | sensor.yaml | 2 | MOUNT with roll_deg: 5 | as the odometry is planar
+MRPT | sensor.yaml | 3 | x: 1 | expected the keys robot_from_sensor, positive_pitch; also known: std; found 'x'
+MRPT | sensor.yaml | 4 | positive_pitch: left | expected positive_pitch to be up or down, found 'left'
+MRPT | sensor.yaml | 4 | positive_pitch: } | expected YAML
+MRPT | robot_path_groundtruth.csv | 3 | 0,3,4,0,0,0,0 | expected step to be later
+MRPT | robot_path_groundtruth.csv | 3 | 1,3,4,0,0,0.1,0 | expected pitch_rad to be 0
+MRPT | landmarks_groundtruth.csv | 3 | 7,1,2,3 | id 7 comes a second time
+graph | graph.txt | 2 | LANDMRK 1 2 3 -4 0.5 0.1 0.25 | expected ODOMETRY or LANDMARK, found 'LANDMRK'
+graph | graph.txt | 2 | LANDMARK | expected numbers after LANDMARK, found none
+graph | graph.txt | 2 | LANDMARK 1 2 3 -4 0.5 0.1 | expected 7 columns (pose, landmark, x, y, cxx, cxy, cyy), found 6
+graph | graph.txt | 2 | LANDMARK 1 2 3 nan 0.5 0.1 0.25 | expected y to be a finite number, found 'nan'
+graph | graph.txt | 2 | LANDMARK 1 2 3 -4 0.5 0.5 0.25 | expected cxx to cyy to be a covariance
+graph | graph.txt | 2 | LANDMARK 8 2 3 -4 0.5 0.1 0.25 | expected pose to be a pose of the odometry, found 8
+graph | graph.txt | 2 | LANDMARK 1 3 3 -4 0.5 0.1 0.25 | expected landmark to be a landmark's number, not a pose's, fo
+graph | graph.txt | 2 | LANDMARK 1 2.5 3 -4 0.5 0.1 0.25 | expected landmark to be a whole number, found 2.5
+graph | graph.txt | 5 | LANDMARK 1 2 7 8 0.5 0 0.5 | landmark 2 comes a second time in pose 1
+graph | graph.txt | 3 | ODOMETRY 2 3 1 0 0 1 0 0 0 0 1 | expected odometry from pose 1, where the one before ends, fou
+graph | graph.txt | 3 | ODOMETRY 1 1 1 0 0 1 0 0 0 0 1 | to 1 comes a second time
+graph | graph.txt | 3 | ODOMETRY 1 0 1 0 0 1 0 0 0 0 1 | expected a path without loops, found a return to pose 0
+graph | graph.txt | 3 | ODOMETRY 1 3 1 0 0 1 0 0 -1 0 1 | expected cxx to ctt to be a covariance
+graph | graph.txt | 3 | ODOMETRY 1 99999999999999999999 1 0 0 1 0 0 0 0 1 | expected to to be at most 1e+12
+tracks | VO_calibration.txt | 1 | 700.0 710.0 0.0 600.0 180.0 0.5 1 | expected 6 columns
+tracks | VO_calibration.txt | 1 | 700 710 0.1 600 180 0.5 | expected no skew
+tracks | VO_calibration.txt | 1 | 700 710 0 600 180 -0.5 | the stereo baseline must be positive
+tracks | VO_camera_poses.txt | 1 | 1 1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1 | expected frame to be the line's number
+tracks | VO_camera_poses.txt | 1 | 0 2 0 0 0 0 2 0 0 0 0 2 0 0 0 0 1 | expected a rotation
+tracks | VO_camera_poses.txt | 1 | 0 1 0 0 0 0 1 0 0 0 0 -1 0 0 0 0 1 | expected a rotation
+tracks | VO_camera_poses.txt | 1 | 0 1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 2 | expected a rotation
+tracks | VO_stereo_factors.txt | 1 | 2 7 620 600 200 0.5 0.5 17.5 | expected frame to be that of a pose
+tracks | VO_stereo_factors.txt | 2 | 0 7 620 600 200 0.5 0.5 17.5 | landmark 7 comes a second time in frame 0
+tracks | VO_stereo_factors.txt | 1 | 0 7 600 620 200 1 1 1 | expected u_left to be greater
+tracks | VO_stereo_factors.txt | 1 | 0 7 nan 620 200 1 1 1 | expected u_left to be a finite
+tracks | VO_stereo_factors.txt | 1 | 0 7.5 640 620 200 1 1 1 | expected landmark to be a whole
+wheels | odometry.csv | 4 | 150,0,0,0,0,0,0 | time runs backwards
+wheels | odometry.csv | 4 | 200,0,0,0,0,0,0 | expected a later time
+wheels | odometry.csv | 4 | 400,0,0,0,0,0 | expected 6 columns
+wheels | odometry.csv | 4 | 400,0,nan,0,0,0,0 | expected dy_m to be a finite number
+wheels | odometry.csv | 4 | 400,0,0,0,0,-1,0 | expected sigma_y_m to be zero or positive
+wheels | odometry.csv | 2 | 100,1,0,0,0,0,0 | expected no motion on the first line
+wheels | odometry.csv | 2 | 1.5,0,0,0,0,0,0 | expected a time in whole nanoseconds
+wheels | odometry.yaml | 1 | other: 1 | expected the keys robot_from_camera, found no robot_from_camera
+wheels | odometry.yaml | 1 | robot_from_camera: [0, 0, 0, 1, 0, 0] | expected robot_from_camera to be a list of 7
+wheels | odometry.yaml | 1 | robot_from_camera: [0, 0, 0, 2, 0, 0, 0] | expected robot_from_camera to begin with a unit
+known | known_points.csv | 1 | id,u_px,v_px,x_m,y_m,z_m | expected a header with the columns id,u_px,v_px,x_m,y_m
+known | known_points.csv | 1 | id,u_px,v_px,x_m,y_m,z_m,sigma_m,id | expected a header with the columns id,u_px
+known | known_points.csv | 2 | 1,2,3,4,5,6 | expected 7 columns as in the header, found 6
+known | known_points.csv | 2 | 1,2,3,4,5,6,7,8 | expected 7 columns as in the header, found 8
+known | known_points.csv | 3 | 7,2,3,4,5,6,0.1 | id 7 comes a second time
+known | known_points.csv | 2 | 1.5,2,3,4,5,6,0.1 | expected id to be a whole number, found 1.5
+known | known_points.csv | 2 | 1,2,3,4,nan,6,0.1 | expected y_m to be a finite number, found 'nan'
+known | known_points.csv | 2 | 1,2,3,4,5,6,-0.1 | expected sigma_m to be zero or positive, found -0.1
+"""
+"""Format, file, number of the line, what stands there in place of what is right, and the words about it."""
+
+FILES = [
+    ("MRCLAM", {"Robot3_Measurement.dat": "100.1 63 3 0.1\n104.7 63 3 0.1\n"},
+     "Robot3_Odometry.dat, line 6: the odometry ends 1.700 s before the last observation"),
+    ("MRCLAM", {"Robot3_Measurement.dat": "100.1 5 3 0.1\n"}, "Measurement.dat: expected observations of landmarks"),
+    ("graph", {"graph.txt": GRAPH["graph.txt"].encode() + b"\xff\n"}, "graph.txt, line 7: expected text in UTF-8"),
+    ("graph", {"graph.txt": "ODOMETRY 0 1 1 0 0 1 0 0 0 0 1\n"}, "expected rows of pose, landmark, x, y, cxx"),
+    ("graph", {"graph.txt": "LANDMARK 1 2 3 -4 0.5 0.1 0.25\n"}, "expected rows of from, to, dx, dy, dtheta"),
+    ("MRPT", {"sensor.yaml": "[" * 5000}, "sensor.yaml"),
+    ("MRPT", {"sensor.yaml": '"\\UFFFFFFFF"'}, "sensor.yaml"),
+    ("MRPT", {"sensor.yaml": f"%YAML {'1' * 5000}.1\n---\na: 1\n"}, "sensor.yaml"),
+    ("MRPT", {"sensor.yaml": "# nothing\n"}, "sensor.yaml"),
+    ("MRPT", {"sensor.yaml": "\x01"}, "sensor.yaml"),
+    ("tracks", {"VO_calibration.txt": 2 * TRACKS["VO_calibration.txt"]}, "VO_calibration.txt, line 2: expected one line"),
+    ("tracks", {"VO_calibration2.txt": "1"}, "found VO_calibration.txt, VO_calibration2.txt"),
+    ("wheels", {"odometry.csv": "# only\n"}, "odometry.csv: expected lines that begin with a time"),
+    ("known", {"known_points.csv": ""}, "known_points.csv: the file is empty; expected a table with the columns id,"),
+    ("known", {"known_points.csv": "# only\n"}, "line 1: expected a header with the columns id,u_px"),
+    ("known", {"known_points.csv": "id,u_px,v_px,x_m,y_m,z_m,sigma_m\n"}, "expected rows of id, u_px"),
+]  # fmt: skip
+"""Format, files in place of those that are right, and the words about them."""
+
+MISSING = [
+    ("MRCLAM", "Barcodes.dat", "no such file; expected an MRCLAM log"),
+    ("MRCLAM", "Robot3_Odometry.dat", "no such file; expected an MRCLAM log"),
+    ("MRCLAM", "Robot3_Measurement.dat", "expected an MRCLAM log"),
+    *(("MRPT", name, "no such file; expected an MRPT log") for name in list(MRPT)[:3]),
+    ("tracks", "VO_calibration.txt", "expected one file VO_calibration*.txt of stereo tracks, found none"),
+    ("wheels", "odometry.csv", "no such file; expected the readings of a robot's wheels"),
+    ("wheels", "odometry.yaml", "no such file"),
+]
+"""Format, the file that is not there, and the words about it."""
+
+
+def refused(name: str, folder: Path, files: dict[str, str | bytes], words: str) -> None:
+    """The files of a format, some of them replaced, are refused in one sentence that holds these words."""
+    whole, read = FORMATS[name]
+    write(folder, whole | files)
+    with pytest.raises(InputError, match=re.escape(words)) as caught:
+        read(folder)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("case", LINES.strip().split("\n"))
+def test_a_bad_line_is_named(tmp_path, case):
+    name, file, line, text, words = case.split(" | ")
+    if text.startswith("MOUNT with "):
+        key, value = text.removeprefix("MOUNT with ").split(": ")
+        text = re.sub(rf"{key}: [^,}}]*", f"{key}: {value}", MOUNT)
+    rows = FORMATS[name][0][file].split("\n")
+    rows[int(line) - 1] = text
+    place = "" if words.startswith("line") else f"line {line}: "
+    exact = not words.startswith(("found", "as the"))
+    refused(name, tmp_path, {file: "\n".join(rows)}, f"{file}, {place}{words}" if exact else words)
+
+
+@pytest.mark.parametrize(("name", "files", "words"), FILES)
+def test_a_bad_file_is_named(tmp_path, name, files, words):
+    refused(name, tmp_path, files, words)
+
+
+@every_format
+def test_a_file_that_ends_inside_a_line_is_named(tmp_path, name):
+    for file, text in FORMATS[name][0].items():
+        if not file.endswith(".yaml") and "calibration" not in file:
+            words = f"{file}, line {text.count(chr(10))}: the file ends inside this line"
+            refused(name, tmp_path, {file: text[:-2]}, words)
+
+
+@pytest.mark.parametrize(("name", "file", "words"), MISSING)
+def test_a_missing_file_is_named(tmp_path, name, file, words):
+    files, read = FORMATS[name]
+    write(tmp_path, {other: text for other, text in files.items() if other != file})
+    with pytest.raises(InputError, match=re.escape(words)) as caught:
+        read(tmp_path)
+    assert str(tmp_path) in str(caught.value)
+
+
+@pytest.fixture(scope="module")
+def scratch(tmp_path_factory):
+    return tmp_path_factory.mktemp("scratch")
+
+
+@given(name=st.sampled_from(sorted(FORMATS)), data=st.data())
+def test_a_damaged_file_is_read_or_refused_in_one_sentence(scratch, name, data):
+    """A stretch of one file is replaced by few bytes, odd numbers, or what separates the format's fields."""
+    files, read = FORMATS[name]
+    file = data.draw(st.sampled_from(sorted(files)))
+    whole = files[file].encode()
+    start = data.draw(st.integers(0, len(whole)))
+    stop = data.draw(st.integers(start, min(start + 12, len(whole))))
+    odd = [b"nan", b"-", b"1e400", b"1e-320", b"1e12", b"9" * 30, b"\n", b"0", b"-1", b" ", b",", b"#", b"{"]
+    put = data.draw(st.one_of(st.binary(max_size=6), st.sampled_from(odd)))
+    folder = write(scratch / name, files | {file: whole[:start] + put + whole[stop:]})
+    said = ""
+    try:
+        read(folder)
+    except InputError as error:
+        said = str(error)
+    assert "\n" not in said
+
+
+@given(name=st.sampled_from(sorted(FORMATS)), data=st.data(), content=st.binary(max_size=200))
+def test_garbage_is_refused(scratch, name, data, content):
+    files, read = FORMATS[name]
+    file = data.draw(st.sampled_from(sorted(name for name in files if "ruth" not in name)))
+    with pytest.raises(InputError, match=re.escape(file)):
+        read(write(scratch / name, files | {file: content}))
