@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from rbpf.errors import InputError
 from rbpf.sensors.descriptors import distances
 from rbpf.sensors.landmark_management import LandmarkManager, NewLandmarkConfig
-from tests.sensors.test_descriptor_matching import unit
+from tests.sensors.test_descriptors import unit
 
 SIZE = (640, 480)
 

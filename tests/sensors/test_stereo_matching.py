@@ -3,13 +3,24 @@
 import numpy as np
 import pytest
 
+from examples.studies.image_faults import salt_and_pepper
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.descriptors import DescriptorMatches, MatchLimits
 from rbpf.sensors.features import Features, Sift, SiftConfig
-from rbpf.sensors.stereo import PairConfig, StereoMatcher, match_frames, one_per_place, triangulate_jacobian
+from rbpf.sensors.stereo import (
+    TOLERATED_FRACTION,
+    PairConfig,
+    StereoMatcher,
+    match_frames,
+    one_per_place,
+    refine,
+    remove_impulses,
+    triangulate_jacobian,
+)
 from tests.sensors.stereo_scenes import RIG, room, true_disparity
+from tests.systems.stereo_sequences import pairs
 
 FULL = SiftConfig(features=0, working_scale=1.0)
 
@@ -183,3 +194,120 @@ def test_sizes_that_differ():
 def test_settings_out_of_range(changes, message):
     with pytest.raises(InputError, match=message):
         PairConfig(**changes)
+
+
+def texture(columns, lines):
+    """A smooth pattern that is known everywhere."""
+    rng = np.random.default_rng(5)
+    total = np.zeros(np.broadcast_shapes(columns.shape, lines.shape))
+    for _ in range(25):
+        angle, period, phase = rng.uniform(0, np.pi), rng.uniform(5, 14), rng.uniform(0, 2 * np.pi)
+        along = np.cos(angle) * columns + np.sin(angle) * lines
+        total += np.cos(2 * np.pi * along / period + phase)
+    return total
+
+
+def pair(disparity, gain=1.0, offset=0.0, noise=0.0):
+    line, column = np.mgrid[:80, :120].astype(float)
+    rng = np.random.default_rng(0)
+    left = 128 + 9 * texture(column, line)
+    right = 128 + gain * 9 * texture(column + disparity, line) + offset
+    return tuple(
+        np.clip(np.rint(image + noise * rng.standard_normal(image.shape)), 0, 255).astype(np.uint8)
+        for image in (left, right)
+    )
+
+
+PX = np.random.default_rng(3).uniform([50, 15], [100, 65], (60, 2))
+
+
+def test_a_known_disparity_is_found():
+    for disparity in (10.0, 10.25, 10.5, 13.8):
+        found = refine(*pair(disparity), PX, PX[:, 0] - disparity + 0.6)
+        np.testing.assert_allclose(found.u, PX[:, 0] - disparity, atol=0.05)
+        assert np.abs(np.mean(found.u - PX[:, 0] + disparity)) < 0.005
+        assert (found.correlation > 0.98).all()
+
+
+def test_brightness_and_contrast_do_not_matter():
+    found = refine(*pair(9.4, gain=0.6, offset=25.0), PX, PX[:, 0] - 9.0)
+    np.testing.assert_allclose(found.u, PX[:, 0] - 9.4, atol=0.05)
+
+
+def test_the_correlation_tells_right_from_wrong():
+    left, right = pair(9.4, noise=4.0)
+    assert np.median(refine(left, right, PX, PX[:, 0] - 9.0).correlation) > 0.9
+    assert np.median(refine(left, right, PX, PX[:, 0] - 31.0).correlation) < 0.6
+
+
+def test_the_window_has_to_be_in_both_images():
+    left, right = pair(9.4)
+    px = np.array([[4.0, 40.0], [12.0, 40.0], [60.0, 4.0], [60.0, 40.0], [60.0, 76.0]])
+    found = refine(left, right, px, px[:, 0] - 9.0)
+    np.testing.assert_array_equal(np.isfinite(found.u), [False, False, False, True, False])
+    np.testing.assert_array_equal(found.correlation > 0.0, np.isfinite(found.u))
+
+
+def test_without_texture_there_is_no_correlation():
+    flat = np.full((40, 60), 90, dtype=np.uint8)
+    found = refine(flat, flat, np.array([[30.0, 20.0]]), np.array([25.0]))
+    assert found.correlation[0] == 0.0 and np.isfinite(found.u[0])
+    assert refine(flat, flat, np.zeros((0, 2)), np.zeros(0)).u.shape == (0,)
+
+
+@pytest.fixture(scope="module")
+def whole():
+    return list(pairs(2).frames())
+
+
+@pytest.fixture(scope="module")
+def noisy():
+    return list(salt_and_pepper(0.02)(pairs(2)).frames())
+
+
+def test_other_images_stay_as_they_are(whole):
+    """Also with noise of 8 grey levels, with a black frame and with lines of one pixel."""
+    rng = np.random.default_rng(0)
+    lines = np.full((240, 320), 90, dtype=np.uint8)
+    lines[::7], lines[:, ::9] = 250, 5
+    noisy = np.clip(whole[0].image + rng.normal(scale=8.0, size=(240, 320)), 0, 255).astype(np.uint8)
+    for image in (whole[0].image, noisy, np.zeros((240, 320), np.uint8), lines):
+        filtered = remove_impulses(image)
+        assert filtered[0] is image and filtered[1] == 0.0
+
+
+def test_a_few_specks_stay(whole):
+    image = whole[0].image.copy()
+    rows = np.random.default_rng(0).choice(
+        image.size, int(0.8 * TOLERATED_FRACTION * image.size), replace=False
+    )
+    image.flat[rows] = 255
+    assert remove_impulses(image)[0] is image
+
+
+def test_corrupted_pixels_are_replaced(whole, noisy):
+    true, image = (np.asarray(frame.image, dtype=int) for frame in (whole[1], noisy[1]))
+    hit = np.abs(image - true) > 40
+    filtered = remove_impulses(noisy[1].image)
+    after = np.abs(filtered[0].astype(int) - true)
+    assert filtered[1] == pytest.approx(hit.mean(), abs=0.003)
+    assert np.sqrt(np.square(after[hit]).mean()) < 20.0 < 90.0 < np.abs(image - true)[hit].mean()
+    assert (filtered[0] != image)[~hit].mean() < 0.01
+
+
+def test_features_are_found_as_without(whole, noisy):
+    """Nearly all of them; of the noisy images as they are half are left."""
+    mending = StereoMatcher(pairs(2).rig)
+    plain = StereoMatcher(pairs(2).rig, config=PairConfig(filter_impulses=False))
+    clean = mending.measure(whole[1].image, whole[1].right)
+    assert mending.remark == ""
+    filtered = mending.measure(noisy[1].image, noisy[1].right)
+    assert "% of the pixels have impulse noise" in mending.remark
+    left = plain.measure(noisy[1].image, noisy[1].right)
+
+    def again(features) -> float:
+        gaps = np.linalg.norm(clean.z[:, None] - features.z[None], axis=-1)
+        return float((gaps.min(axis=1) < 1.0).mean())
+
+    assert again(filtered) > 0.7
+    assert again(left) < 0.6 * again(filtered)

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from rbpf.errors import InputError
-from rbpf.sensors.patches.kernels import APART_PX, OUTSIDE, interval, normalised, score_ellipse
-from rbpf.sensors.patches.search import search
-from tests.sensors.patch_scenes import Waves, inside_ellipse, interpolated, score_map, unit, window
+from rbpf.sensors.features import CornerDetector
+from rbpf.sensors.patches.kernels import APART_PX, OUTSIDE, footprint, interval, normalised, score_ellipse
+from rbpf.sensors.patches.search import cut, search, warp
+from tests.sensors.patch_scenes import Waves, cubic, inside_ellipse, interpolated, score_map, unit, window
 
 SHAPE = (90, 110)
 ROUND = 9.0 * np.eye(2)
@@ -242,3 +243,229 @@ def test_wrong_arguments(image, change, sentence):
 def assert_nothing(match):
     px, score, second, cov = match
     assert np.isnan(px).all() and np.isnan(cov).all() and score == -1.0 and second == -1.0
+
+
+TURN = np.array([[np.cos(0.5), -np.sin(0.5)], [np.sin(0.5), np.cos(0.5)]])
+MAPS = {
+    "same": np.eye(2),
+    "turned": TURN,
+    "upside down": -np.eye(2),
+    "larger": 0.6 * np.eye(2),
+    "smaller": 1.5 * np.eye(2),
+    "half": 2.0 * np.eye(2),
+    "third": 2.6 * np.eye(2),
+    "squeezed": np.diag([2.2, 1.0]),
+    "sheared": np.array([[1.0, 0.6], [0.0, 1.2]]),
+    "turned and smaller": 1.6 * TURN,
+}
+SAME = np.eye(2)[None]
+
+
+@pytest.fixture(scope="module")
+def picture():
+    return Waves(1).image((80, 100))
+
+
+def test_cut_at_a_whole_pixel_is_the_image(picture):
+    assert np.array_equal(cut(picture, np.array([40.0, 30.0])), window(picture, (40, 30), 31))
+
+
+def test_cut_between_pixels_is_numpys(picture):
+    v, u = np.indices((11, 11)) - 5
+    expected = np.clip(np.floor(cubic(picture, 40.3 + u, 30.8 + v) + 0.5), 0, 255)
+    assert np.array_equal(cut(picture, np.array([40.3, 30.8]), 5), expected)
+
+
+def test_cut_between_pixels_stays_within_grey_levels():
+    picture = np.zeros((40, 40), np.uint8)
+    picture[:, 20:] = 255
+    step = cut(picture, np.array([19.5, 20.0]), 4)
+    assert step.min() == 0 and step.max() == 255 and (np.diff(step.astype(int), axis=1) >= 0).all()
+
+
+@pytest.mark.parametrize(
+    "px", [(14.9, 30.0), (84.1, 30.0), (40.0, 14.0), (40.0, 64.5), (np.nan, 30.0), (np.inf, 9.0)]
+)
+def test_cut_does_not_reach_beyond(picture, px):
+    assert cut(picture, np.array(px)) is None
+
+
+@pytest.mark.parametrize("name", MAPS)
+def test_warp_equals_numpys(picture, name):
+    source, affine = window(picture, (45, 40), 61), MAPS[name]
+    v, u = np.indices((11, 11)) - 5
+    places = 30 + np.stack([u, v], axis=-1) @ affine.T
+    samples = footprint(*affine.ravel(), 61)
+    expected = np.mean([cubic(source, places[..., 0] + x, places[..., 1] + y) for x, y in samples], axis=0)
+    found = warp(source[None], affine[None])[0]
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", MAPS)
+def test_samples_make_up_for_the_larger_pixel(name):
+    """Their covariance is that of the new pixel's square in the source less that of the source's own pixel."""
+    samples = footprint(*MAPS[name].ravel(), 61)
+    values, vectors = np.linalg.eigh(MAPS[name] @ MAPS[name].T - np.eye(2))
+    expected = vectors @ np.diag(np.maximum(values, 0.0)) @ vectors.T / 12.0
+    np.testing.assert_allclose(samples.mean(axis=0), 0.0, atol=1e-12)
+    np.testing.assert_allclose(samples.T @ samples / len(samples), expected, atol=1e-6)
+    assert (
+        np.diff(np.unique(samples.round(9), axis=0), axis=0).max(initial=0.0)
+        < 2.0 * np.abs(samples).max() + 1.0
+    )
+
+
+@pytest.mark.parametrize("name", MAPS)
+def test_warp_is_what_the_other_view_shows(name):
+    """The window of one view, warped, correlates with the picture that the other view really takes.
+
+    Not fully: the blur is the lens' and stays as wide in the smaller view, where the warp only widens the pixel.
+    """
+    waves, affine = Waves(7), MAPS[name]
+    source = waves.image((61, 61))
+    seen = waves.image((41, 41), affine)
+    template = warp(source[None], affine[None])[0]
+    assert (unit(template) * unit(window(seen, (20, 20), 11))).sum() > 0.96
+
+
+def test_a_smaller_view_has_no_moire():
+    """Stripes finer than the new view's pixels turn grey instead of into broad stripes."""
+    u = np.arange(61)[None].repeat(61, axis=0)
+    stripes = np.where(u % 3 == 0, 255, 0).astype(np.uint8)
+    bare = stripes[30 - 25 : 30 + 26 : 5, 30 - 25 : 30 + 26 : 5].std()
+    averaged = warp(stripes[None], 2.9 * SAME)[0].std()
+    assert bare > 100.0 and averaged < 0.1 * bare
+
+
+@pytest.mark.parametrize(
+    "affine",
+    [
+        3.01 * np.eye(2),
+        np.diag([3.5, 1.0]),
+        np.full((2, 2), np.nan),
+        np.diag([np.inf, 1.0]),
+        1e200 * np.eye(2),
+    ],
+)
+def test_a_view_of_more_than_the_source_has_no_template(picture, affine):
+    templates = warp(np.repeat(window(picture, (45, 40), 31)[None], 2, axis=0), np.stack([affine, np.eye(2)]))
+    assert np.isnan(templates[0]).all() and np.isfinite(templates[1]).all()
+
+
+@pytest.mark.parametrize(
+    ("sources", "affines", "size", "sentence"),
+    [
+        (np.zeros((1, 31, 31)), SAME, 11, "uint8"),
+        (np.zeros((1, 30, 30), np.uint8), SAME, 11, "S odd"),
+        (np.zeros((1, 31, 33), np.uint8), SAME, 11, "S odd"),
+        (np.zeros(31, np.uint8), SAME, 11, "S odd"),
+        (np.zeros((2, 31, 31), np.uint8), SAME, 11, "one for each source"),
+        (np.zeros((1, 31, 31), np.uint8), SAME, 10, "must be odd"),
+    ],
+)
+def test_wrong_arguments_of_a_warp(sources, affines, size, sentence):
+    with pytest.raises(InputError, match=sentence):
+        warp(sources, affines, size)
+
+
+WARPED = (240, 260)
+MIDDLE = (np.array(WARPED[::-1]) - 1) / 2
+SPREAD_PX = 2.0
+COV = SPREAD_PX**2 * np.eye(2)
+WRONG_PX = 1.5
+"""A place further from the truth is a wrong match."""
+
+
+def errors(affine, blur_px=0.5, noise=2.0, seed=0, accept=0.7):
+    """Errors (k, 2) and covariances of accepted matches between two views, and how many were looked for."""
+    rng, shift = (
+        np.random.default_rng(seed),
+        np.array([0.31, -0.42]) + np.random.default_rng(seed).uniform(-1, 1, 2),
+    )
+    waves = Waves(seed, blur_px=blur_px)
+    first = waves.image(WARPED, noise=noise, rng=rng)
+    then = waves.image(WARPED, affine, shift, noise, rng)
+    px = CornerDetector().detect(first, 100, None, 12.0, 60.0).px
+    truth = MIDDLE + (px - MIDDLE - shift) @ np.linalg.inv(affine).T
+    sources = np.stack([cut(first, place, 25) for place in px])
+    templates = warp(sources, np.repeat(affine[None], len(px), axis=0))
+    guess = truth + SPREAD_PX * rng.normal(size=truth.shape)
+    matches = search(then, templates, guess, np.repeat(COV[None], len(px), axis=0))
+    found = (matches.score >= accept) & np.isfinite(matches.cov).all(axis=(1, 2))
+    return (matches.px - truth)[found], matches.cov[found], len(px)
+
+
+def turned(angle, scale=1.0):
+    return scale * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+
+@pytest.mark.parametrize(
+    "affine",
+    [
+        np.eye(2),
+        turned(0.6),
+        turned(3.0),
+        turned(0.0, 1.5),
+        turned(0.4, 0.75),
+        np.array([[1.2, 0.3], [-0.1, 0.8]]),
+    ],
+    ids=["shift", "turn", "half turn", "smaller", "turned and larger", "sheared"],
+)
+def test_known_motion_is_recovered(affine):
+    error, _, tried = errors(affine)
+    assert tried >= 30 and len(error) >= 0.95 * tried
+    wrong = np.abs(error).max(axis=1) > WRONG_PX
+    assert wrong.mean() <= 0.02
+    assert np.sqrt((error[~wrong] ** 2).mean()) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("noise", "blur_px", "hits", "std_px"),
+    [
+        (0.0, 0.5, 0.98, 0.03),
+        (3.0, 0.5, 0.98, 0.05),
+        (8.0, 0.5, 0.97, 0.10),
+        (15.0, 0.5, 0.60, 0.20),
+        (3.0, 1.0, 0.98, 0.06),
+        (3.0, 1.5, 0.97, 0.09),
+    ],
+)
+def test_hit_rate_and_accuracy_under_noise(noise, blur_px, hits, std_px):
+    """Right matches among those looked for, and their errors without bias."""
+    several = [errors(np.eye(2), blur_px, noise, seed) for seed in range(4)]
+    error, tried = np.concatenate([one[0] for one in several]), sum(one[2] for one in several)
+    right = error[np.abs(error).max(axis=1) <= WRONG_PX]
+    assert len(right) >= hits * tried and len(error) - len(right) <= 0.03 * tried
+    assert np.sqrt((right**2).mean()) < std_px
+    assert np.abs(right.mean(axis=0)).max() < 0.3 * std_px + 0.006
+
+
+@pytest.mark.parametrize("noise", [3.0, 8.0])
+def test_covariances_are_those_of_the_errors(noise):
+    """Mean normalised squared error of 2 degrees of freedom: from cautious because of the floor to a little bold."""
+    several = [errors(np.eye(2), 0.7, noise, seed) for seed in range(3)]
+    error, cov = (np.concatenate([one[part] for one in several]) for part in (0, 1))
+    good = np.abs(error).max(axis=1) <= WRONG_PX
+    squared = np.einsum("ki,kij,kj->k", error[good], np.linalg.inv(cov[good]), error[good])
+    assert good.sum() > 150 and 1.2 < squared.mean() < 3.0
+
+
+@pytest.mark.real_data
+def test_found_forth_and_back_in_real_images(data_dir):
+    """Corners of one image are found in one a few frames later, and from there back where they were."""
+    import cv2
+
+    paths = sorted((data_dir / "mono_redkitchen_a" / "rgb").glob("*.jpg"))
+    first, then = (cv2.imread(str(paths[i]), cv2.IMREAD_GRAYSCALE) for i in (0, 3))
+    px = CornerDetector().detect(first, 60, None, 25.0, 30.0).px
+    assert len(px) == 60
+    wide = np.repeat(100.0 * np.eye(2)[None], 60, axis=0)
+    forth = search(then, np.stack([window(first, place, 11) for place in px]), px, wide)
+    good = np.flatnonzero((forth.score > 0.9) & (forth.ratio < 0.9))
+    assert good.size >= 40
+    cuts = [cut(then, place, 5) for place in forth.px[good]]
+    inside = np.array([k for k, piece in enumerate(cuts) if piece is not None])
+    back = search(first, np.stack([cuts[k] for k in inside]), px[good[inside]], wide[: inside.size])
+    apart = np.linalg.norm(back.px - px[good[inside]], axis=1)
+    assert np.median(apart) < 0.05 and np.mean(apart < 0.5) > 0.9
