@@ -9,7 +9,6 @@ from rbpf.lie import SE2
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
 from rbpf.motion.odometry import OdometryMotion
-from rbpf.sensors.catalogue_index import NumberIndex
 from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
 from rbpf.sensors.range_bearing import RangeBearing
 from tests.core.scripted import ids_of
@@ -79,29 +78,3 @@ def test_numbers_after_loading_an_earlier_state(sensor, tmp_path):
     report = filter_.step(frame(6, 2, 9))
     assert ids_of(report).tolist() == [6, 9]
     assert report.new_landmarks.tolist() == [2]
-
-
-def test_numbers_follow_the_catalogue():
-    """Names as they come, ids that a removal leaves apart, more names than there was room for."""
-    numbers, catalogue = NumberIndex(), {0: 5, 1: 3}
-    np.testing.assert_array_equal(numbers.ids(catalogue, np.array([3, 5, 4])), [1, 0, -1])
-    del catalogue[0]
-    catalogue |= {7: 900, 9: 4}
-    np.testing.assert_array_equal(numbers.ids(catalogue, np.array([900, 4, 3])), [7, 9, 1])
-
-
-def test_numbers_read_only_what_is_new():
-    class Counting(dict):
-        reads = 0
-
-        def __getitem__(self, key):
-            Counting.reads += 1
-            return super().__getitem__(key)
-
-    numbers, catalogue = NumberIndex(), Counting({k: k for k in range(500)})
-    numbers.ids(catalogue, np.array([499]))
-    assert Counting.reads == 500
-    del catalogue[3]
-    catalogue[500] = 500
-    np.testing.assert_array_equal(numbers.ids(catalogue, np.array([500, 2])), [500, 2])
-    assert Counting.reads == 501
