@@ -55,7 +55,7 @@ Outcome = Literal["supports", "contradicts", "leaves open"]
 
 @dataclass(frozen=True)
 class Statistic:
-    """One number about a filter's consistenty.
+    """One number about a filter's consistency.
 
     Attributes:
         name: what it is, in few words.
