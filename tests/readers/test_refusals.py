@@ -78,7 +78,7 @@ graph | graph.txt | 2 | LANDMARK 1 2 3 -4 0.5 0.1 | expected 7 columns (pose, la
 graph | graph.txt | 2 | LANDMARK 1 2 3 nan 0.5 0.1 0.25 | expected y to be a finite number, found 'nan'
 graph | graph.txt | 2 | LANDMARK 1 2 3 -4 0.5 0.5 0.25 | expected cxx to cyy to be a covariance
 graph | graph.txt | 2 | LANDMARK 8 2 3 -4 0.5 0.1 0.25 | expected pose to be a pose of the odometry, found 8
-graph | graph.txt | 2 | LANDMARK 1 3 3 -4 0.5 0.1 0.25 | expected landmark to be a landmark's number, not a pose's, 
+graph | graph.txt | 2 | LANDMARK 1 3 3 -4 0.5 0.1 0.25 | expected landmark to be a landmark's number, not a pose's,
 graph | graph.txt | 2 | LANDMARK 1 2.5 3 -4 0.5 0.1 0.25 | expected landmark to be a whole number, found 2.5
 graph | graph.txt | 5 | LANDMARK 1 2 7 8 0.5 0 0.5 | landmark 2 comes a second time in pose 1
 graph | graph.txt | 3 | ODOMETRY 2 3 1 0 0 1 0 0 0 0 1 | expected odometry from pose 1, where the one before ends, fou
