@@ -40,7 +40,7 @@ def check_model(
         One sentence per finding: class, method, what was expected and found. Empty for a sound model.
 
     Raises:
-        InputError: the object is no model, or cannot be tried without more than was given.
+        InputError: the object is of none of these classes, or cannot be tried without more than was given.
     """
     rng, example = rng or np.random.default_rng(0), example or Example()
     space = space or getattr(model, "space", None)
@@ -83,7 +83,9 @@ def _checks(model: object, space: LieGroup | None, rng: np.random.Generator, exa
     if isinstance(model, Landmark):
         return landmark_checks(model, space, rng, example)
     if not isinstance(model, MotionModel | ObservationModel):
-        raise InputError(f"check_model takes a model of rbpf.core.models, not a {name}")
+        raise InputError(
+            f"check_model tries a MotionModel, ObservationModel, Landmark, Likelihood or Sensor; a {name} is none of these"
+        )
     if space is None:
         raise InputError(f"{name} has no attribute space: tell check_model the group of the state")
     if isinstance(model, MotionModel):

@@ -372,7 +372,7 @@ def test_what_a_check_cannot_do_without():
         Spaceless(): "Spaceless has no attribute space: tell check_model the group",
         Speed(): r"Speed reads a substate: give Example\(substate=its size\)",
         RangeBearing(SE2, max_range=0.05): "RangeBearing sees too few random landmarks",
-        7: r"takes a model of rbpf\.core\.models, not a int",
+        7: r"Landmark, Likelihood or Sensor; a int is none of these",
         Watching(): r"Watching is tried on a frame and a belief: give Example\(frame=…, belief=…\)",
     }
     for model, message in missing.items():
