@@ -351,7 +351,10 @@ class LandmarkMap(Map):
         self.catalogue = dict(zip(named.tolist(), facts, strict=True))
 
     def register(self, landmark: Landmark) -> None:
-        """Names a parametrisation before it is first used, so that a checkpoint can be read back."""
+        """Names a parametrisation before it is first used, so that a checkpoint can be read back.
+
+        The filter that saves and the one that loads name the same ones in the same order.
+        """
         self._kind(landmark)
 
     def _kind(self, landmark: Landmark) -> int:

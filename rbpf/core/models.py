@@ -621,7 +621,10 @@ class Belief:
 
 
 class Resampler(ABC):
-    """Chooses ancestors in proportion to the weights; E[number of descendants of i] = N W_i."""
+    """Chooses ancestors in proportion to the weights; E[number of descendants of i] = N W_i.
+
+    A checkpoint holds nothing of it: what it remembers from step to step is lost where a filter is loaded.
+    """
 
     @abstractmethod
     def ancestors(

@@ -52,7 +52,7 @@ class ProposalConfig:
     weights: Literal["exact", "linearised"] = "exact"
 
     def build(self) -> Proposal:
-        """The proposal."""
+        """The proposal; a subclass may make another one."""
         if self.kind == "prior":
             return PriorProposal()
         return EkfProposal(self.weights == "exact", self.iterations)
@@ -71,7 +71,7 @@ class ResamplingConfig:
     ess_threshold: float = 0.5
 
     def build(self) -> Resampler:
-        """The resampler."""
+        """The resampler; a subclass may make another one."""
         schemes: dict[str, Resampler] = {
             "systematic": Systematic(),
             "stratified": Stratified(),
