@@ -14,9 +14,9 @@ from typing import ClassVar, final
 
 import numpy as np
 
-from rbpf.core.least_squares import Minimum, Rule, minimise
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
+from rbpf.motion.least_squares import Minimum, Rule, minimise
 from rbpf.motion.odometry import Odometry
 from rbpf.motion.stereo_consensus import RansacConfig, consensus
 from rbpf.motion.stereo_geometry import (

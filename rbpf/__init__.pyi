@@ -1,7 +1,6 @@
 """Public names, by the module that defines them; `rbpf/__init__.py` imports each when it is first used."""
 
 from .conformance import check_model as check_model
-from .core.anchoring import StartAnchor as StartAnchor
 from .core.filter import Filter as Filter
 from .core.filter import StepReport as StepReport
 from .core.likelihoods import Gaussian as Gaussian
@@ -61,6 +60,7 @@ from .sensors.readers import open_images as open_images
 from .sensors.readers import open_log as open_log
 from .sensors.readers import open_stereo as open_stereo
 from .sensors.readers.images.calibration import read_calibration as read_calibration
+from .systems.anchoring import StartAnchor as StartAnchor
 from .systems.mono.config import MonoConfig as MonoConfig
 from .systems.mono.slam import MonoSlam as MonoSlam
 from .systems.range_bearing.config import RangeBearingConfig as RangeBearingConfig

@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 
 from rbpf import gaussian
-from rbpf.core.anchoring import Anchored
 from rbpf.core.filter import Filter
 from rbpf.core.models import Records
 from rbpf.lie import SE2Group
 from rbpf.sensors.range_bearing import RelativePosition
+from rbpf.systems.anchoring import Anchored
 
 
 @dataclass(frozen=True)

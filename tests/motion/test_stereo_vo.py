@@ -7,9 +7,9 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 
-from rbpf.core.least_squares import Rule
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.motion.least_squares import Rule
 from rbpf.motion.stereo_geometry import Matches
 from rbpf.motion.stereo_vo import (
     MotionEstimate,

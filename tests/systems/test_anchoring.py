@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from rbpf.core.anchoring import StartAnchor
 from rbpf.core.filter import Filter
 from rbpf.core.proposals import EkfProposal
 from rbpf.errors import InputError
@@ -14,6 +13,7 @@ from rbpf.motion.odometry import Odometry, OdometryMotion
 from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
 from rbpf.sensors.range_bearing import RelativePosition
 from rbpf.sensors.readers import Frame
+from rbpf.systems.anchoring import StartAnchor
 
 COV_Z = np.diag([0.04, 0.09])
 LANDMARKS = np.array([[4.0, 1.0], [3.0, -2.0], [6.0, 0.5], [5.0, 3.0]])

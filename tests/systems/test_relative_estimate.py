@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from rbpf.core.anchoring import Anchored, relative_estimate
 from rbpf.core.particles import Prior, mixture_estimate
 from rbpf.lie import SE2, SE3
+from rbpf.systems.anchoring import Anchored, relative_estimate
 
 every_space = pytest.mark.parametrize("space", [SE2, SE3], ids=repr)
 

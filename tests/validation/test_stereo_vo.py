@@ -4,8 +4,8 @@ import gtsam
 import numpy as np
 import pytest
 
-from rbpf.core.least_squares import Rule
 from rbpf.lie import SE3
+from rbpf.motion.least_squares import Rule
 from rbpf.motion.stereo_vo import VoConfig, fit
 from rbpf.sensors.feature_log import FeatureFrame, FeatureLog
 from rbpf.validation.gtsam.camera import CameraEstimate, solve_features

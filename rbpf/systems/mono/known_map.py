@@ -11,7 +11,6 @@ from typing import Literal
 
 import numpy as np
 
-from rbpf.core.anchoring import Anchored
 from rbpf.core.checkpoint import load_arrays, save_arrays
 from rbpf.core.filter import Filter
 from rbpf.errors import InputError
@@ -21,6 +20,7 @@ from rbpf.sensors.calibration import spread_rows
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.camera.distortion import RadialTangential
 from rbpf.sensors.feature_log import KnownPoints
+from rbpf.systems.anchoring import Anchored
 from rbpf.systems.map_estimate import MapEstimate, mixture_moments, relative_points
 from rbpf.systems.mono.feature_sensor import MIN_RHO, FeatureSensor
 from rbpf.systems.mono.feature_table import PATCH_PX, FeatureTable

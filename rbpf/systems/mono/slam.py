@@ -15,7 +15,6 @@ from typing import Any, ClassVar, final
 
 import numpy as np
 
-from rbpf.core.anchoring import Anchored, relative_estimate
 from rbpf.core.filter import Filter, StepReport
 from rbpf.core.marginals import KalmanSubstate
 from rbpf.core.models import Belief, Conditional, MotionModel, NewLandmarks, Observations, Records, Sensor
@@ -30,6 +29,7 @@ from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureFrame, FeatureLog, KnownPoints
 from rbpf.sensors.features import Descriptor, Detector
 from rbpf.sensors.readers import ImageFrame, KnownPixels
+from rbpf.systems.anchoring import Anchored, relative_estimate
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.mono.active_search import OutlierGate
 from rbpf.systems.mono.config import MonoConfig

@@ -11,7 +11,6 @@ from typing import Any, ClassVar, final
 
 import numpy as np
 
-from rbpf.core.anchoring import StartAnchor
 from rbpf.core.checkpoint import checked
 from rbpf.core.diagnostics import motion_correction
 from rbpf.core.filter import Filter, StepReport
@@ -24,6 +23,7 @@ from rbpf.sensors.landmark_sensor import AnonymousLandmarkSensor, NamedLandmarkS
 from rbpf.sensors.range_bearing import RangeBearing, RelativePosition, RigidPointModel
 from rbpf.sensors.readers import Frame, RobotLog
 from rbpf.sensors.readers.measurements import Kind, Measurements
+from rbpf.systems.anchoring import StartAnchor
 from rbpf.systems.map_estimate import MapEstimate, estimate_map
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.system import (

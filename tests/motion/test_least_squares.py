@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from rbpf.core.least_squares import Rule, minimise
 from rbpf.errors import InputError
 from rbpf.lie import SE3, skew
+from rbpf.motion.least_squares import Rule, minimise
 
 TIMES = np.linspace(0.0, 4.0, 40)
 STRICT = Rule(offset=1e-9)
