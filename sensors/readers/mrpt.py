@@ -9,12 +9,9 @@ A folder with, comma-separated under a header line:
 - `observations.csv`: step (from 0), landmark_id, range_m, yaw_rad, pitch_rad and their standard deviations.
   Yaw is positive to the left. z is (range, yaw) in the plane, where pitch must be 0, and (range, yaw, pitch)
   in space.
-- `sensor.yaml`: where the sensor sits, and whether positive pitch is up or down:
-
-      robot_from_sensor: {x_m: 0, y_m: 0, z_m: 0, yaw_deg: 0, pitch_deg: 0, roll_deg: 0}
-      std: {range_m: 0.01, yaw_deg: 0.1}
-      positive_pitch: down
-
+- `sensor.yaml`: where the sensor sits, and whether positive pitch is up or down, as in
+  `robot_from_sensor: {x_m: 0, y_m: 0, z_m: 0, yaw_deg: 0, pitch_deg: 0, roll_deg: 0}`,
+  `std: {range_m: 0.01, yaw_deg: 0.1}` and `positive_pitch: down`.
   `std` is optional and for people to read: every observation brings its own standard deviations.
 - `robot_path_groundtruth.csv` and `landmarks_groundtruth.csv`, if the truth is known: step, x_m, y_m, z_m,
   yaw_rad, pitch_rad, roll_rad (world_from_robot), and id, x_m, y_m, z_m.

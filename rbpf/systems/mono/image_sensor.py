@@ -67,7 +67,7 @@ class Measurement:
 
 @final
 class ImageSensor(Sensor):
-    """Finds the features of the map in images, and new ones. It takes `Measurement`s and fills them in.
+    """Finds the features of the map in images, and new ones. It takes a `Measurement` and fills it in.
 
     Args:
         features: what turns found features into observations and landmarks; a feature's name is its row in `table`.
