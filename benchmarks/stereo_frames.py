@@ -10,10 +10,10 @@ import numpy as np
 
 from benchmarks.mono_frames import Decoded
 from benchmarks.rows import Row, Settings
+from rbpf.runs.recordings import filter_pairs
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.readers import ImageSequence, open_stereo
 from rbpf.systems.stereo.config import StereoConfig
-from rbpf.systems.stereo.run import run_images
 from rbpf.validation.simulation.images import Imaging, simulate_images
 from rbpf.validation.simulation.lab import LabDrive, TexturedLab
 
@@ -37,13 +37,11 @@ def rendered(pairs: int) -> ImageSequence:
 def run(settings: Settings) -> list[Row]:
     """The system beside OpenCV's SIFT alone on both whole images, without matching, map or filter."""
     sequence = rendered(SETTLING + settings.repetitions(TIMED))
-    done = run_images(sequence, StereoConfig())
-    whole = 1e3 * done.seconds[SETTLING:]
+    log = filter_pairs(sequence, StereoConfig()).log
+    whole = 1e3 * log["seconds"][SETTLING:]
     plain = 1e3 * sift_alone(sequence)
     median = float(np.median(whole))
-    split = ", ".join(
-        f"{name} {1e3 * getattr(done, f'seconds_{name}')[SETTLING:].mean():.3g} ms" for name in STAGES
-    )
+    split = ", ".join(f"{name} {1e3 * log[f'seconds_{name}'][SETTLING:].mean():.3g} ms" for name in STAGES)
     return [
         Row(
             "stereo pair 640x480, 400 particles",
@@ -54,8 +52,8 @@ def run(settings: Settings) -> list[Row]:
             plain / median,
             aim=f"<= {AIM_MS:g} ms, goal {GOAL_MS:g} ms",
             met=median <= AIM_MS,
-            notes=f"means: {split}; fastest {whole.min():.3g} ms; {done.features.mean():.3g} features, "
-            f"{int(done.updated.sum())} updates in {done.seconds.size} pairs",
+            notes=f"means: {split}; fastest {whole.min():.3g} ms; {log['features'].mean():.3g} features, "
+            f"{int(log['updated'].sum())} updates in {len(log)} pairs",
             tolerance=0.5,
         )
     ]

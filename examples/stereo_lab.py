@@ -10,11 +10,12 @@ from pathlib import Path
 
 import tyro
 
+from rbpf.runs.recordings import StereoRecording, filter_recording
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.systems.stereo.config import StereoConfig
+from rbpf.validation.finish import finish_run
 from rbpf.validation.simulation.images import Imaging, simulate_images
 from rbpf.validation.simulation.lab import LabDrive, TexturedLab
-from rbpf.validation.stereo import StereoRecording, finish_stereo, start_stereo
 from rbpf.validation.tables import write_table
 
 FIGURES = (
@@ -53,8 +54,8 @@ def main(
     """
     frames, particles, width = (12, 50, 320) if quick else (frames, particles, 640)
     recording = StereoRecording(render(out / "lab", frames, width))
-    run = start_stereo(recording, StereoConfig(particles=particles), out / "run")
-    entries = finish_stereo(run, recording, out / "run")
+    run = filter_recording(recording, StereoConfig(particles=particles), out / "run")
+    entries = finish_run(run, out / "run", recording.sources())
     figures = {name: float(entries[name]) for name in FIGURES if entries.get(name) is not None}
     for name, value in figures.items():
         print(f"{name:>28} {value:.4g}")

@@ -19,7 +19,13 @@ from rbpf.lie import Array
 from rbpf.runs.alignment import Alignment
 from rbpf.runs.path_and_map import PathAndMap
 from rbpf.runs.plots import COLOURS, new_axes, save_figures
-from rbpf.runs.recordings import MonoRecording, filter_recording, filter_robot_log
+from rbpf.runs.recordings import (
+    MonoRecording,
+    StereoRecording,
+    filter_features,
+    filter_recording,
+    filter_robot_log,
+)
 from rbpf.runs.run import Run
 from rbpf.runs.trajectory import Trajectory, associate, in_space
 from rbpf.sensors.camera import Pinhole
@@ -29,15 +35,11 @@ from rbpf.sensors.readers.stereo_tracks import read_stereo_tracks
 from rbpf.systems.mono.config import MonoConfig, SearchConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.stereo.config import StereoConfig
-from rbpf.systems.stereo.run import StereoRun, run_features
 from rbpf.validation.gtsam.batch_problem import Optimum, floats_in_scale, problem_of, solve_problem
 from rbpf.validation.metrics.accuracy import ate
-from rbpf.validation.metrics.mono_scores import true_path
-from rbpf.validation.metrics.path_and_map import AnyRun, of_run
 from rbpf.validation.simulation.desk_and_room import TexturedDesk
 from rbpf.validation.simulation.images import Imaging, simulate_images
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
-from rbpf.validation.stereo import StereoRecording, start_stereo
 from rbpf.validation.tables import write_table
 
 HEADER = ("recording", "particles", "seeds", "filter_m", "least_m", "most_m", "batch_m", "ratio")
@@ -92,7 +94,7 @@ def robot_ratio(recording: Path, config: RangeBearingConfig, seeds: Sequence[int
         InputError: the recording is wrong, or has too little ground truth.
     """
     log = open_log(recording, config.noise)
-    errors = _over_seeds(lambda seed: filter_robot_log(log, _seeded(config, seed)), _truth, seeds)
+    errors = _over_seeds(lambda seed: filter_robot_log(log, _seeded(config, seed)), seeds)
     return ErrorRatio(log.name, config.particles, *errors, "rigid")
 
 
@@ -103,7 +105,7 @@ def camera_ratio(recording: MonoRecording, config: MonoConfig, seeds: Sequence[i
         InputError: the recording is wrong, or has too little ground truth.
     """
     name, known = recording.images.resolve().name, recording.known_points is not None
-    errors = _over_seeds(lambda seed: filter_recording(recording, _seeded(config, seed)), _truth, seeds)
+    errors = _over_seeds(lambda seed: filter_recording(recording, _seeded(config, seed)), seeds)
     return ErrorRatio(name, config.particles, *errors, "rigid" if known else "similarity")
 
 
@@ -114,17 +116,7 @@ def stereo_ratio(recording: StereoRecording, config: StereoConfig, seeds: Sequen
         InputError: the recording is wrong, or has too little ground truth.
     """
     name = f"{recording.pairs.resolve().name} (stereo)"
-
-    def truth(found: AnyRun) -> Trajectory:
-        assert isinstance(found, StereoRun)
-        at = true_path(found.truth, found.stamps_ns)
-        if at is None:
-            raise InputError(
-                f"{name} has no ground truth to tell the errors by, or less than {LEAST} poses of it."
-            )
-        return Trajectory(found.stamps_ns[at.rows], at.world_from_camera)
-
-    errors = _over_seeds(lambda seed: start_stereo(recording, _seeded(config, seed)), truth, seeds)
+    errors = _over_seeds(lambda seed: filter_recording(recording, _seeded(config, seed)), seeds)
     return ErrorRatio(name, config.particles, *errors, "rigid")
 
 
@@ -148,12 +140,12 @@ def tracks_ratio(
     ours, batch = [], []
     optimum: Optimum | None = None
     for seed in seeds:
-        found = run_features(log, _seeded(config, seed))
+        found = filter_features(log, _seeded(config, seed))
         if optimum is None:
-            begin = found.world_from_camera if start is None else start[: len(found.stamps_ns)]
+            begin = found.log.poses if start is None else start[: len(found.log)]
             optimum = solve_problem(problem_of(found), begin)
         path = optimum.estimate
-        off = ate(of_run(found).at(optimum.steps).trajectory, path.trajectory).rmse
+        off = ate(PathAndMap.of_run(found).at(optimum.steps).trajectory, path.trajectory).rmse
         spread = float(np.sqrt(np.trace(path.cov_poses[:, 3:, 3:], axis1=1, axis2=2).mean()))
         ours.append(float(np.hypot(off, spread)))
         batch.append(spread)
@@ -175,12 +167,12 @@ def error_of(estimate: PathAndMap, truth: Trajectory, alignment: Alignment) -> f
 
 
 def _over_seeds(
-    filtered: Callable[[int], AnyRun], truth_of: Callable[[AnyRun], Trajectory], seeds: Sequence[int]
+    filtered: Callable[[int], Run], seeds: Sequence[int]
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
     ours, batch, optimum = [], [], None
     for seed in seeds:
         found = filtered(seed)
-        estimate, problem, truth = of_run(found), problem_of(found), truth_of(found)
+        estimate, problem, truth = PathAndMap.of_run(found), problem_of(found), _truth(found)
         alignment: Alignment = "similarity" if floats_in_scale(problem) else "rigid"
         if optimum is None or isinstance(problem, FeatureLog):
             robust = ROBUST if isinstance(problem, FeatureLog) else None
@@ -190,8 +182,7 @@ def _over_seeds(
     return tuple(ours), tuple(batch)
 
 
-def _truth(found: AnyRun) -> Trajectory:
-    assert isinstance(found, Run)
+def _truth(found: Run) -> Trajectory:
     if found.truth is None:
         raise InputError(f"{found.name} has no ground truth to tell the errors by, or too little.")
     return in_space(found.log.stamps_ns[found.truth.rows], found.truth.poses)

@@ -33,7 +33,7 @@ from examples.studies.image_faults import (
 from examples.studies.mono_blackouts import pose_differences
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.runs.recordings import filter_images
+from rbpf.runs.recordings import filter_images, filter_pairs
 from rbpf.runs.truth import truth_at
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.readers import (
@@ -45,7 +45,6 @@ from rbpf.sensors.readers import (
 )
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.stereo.config import StereoConfig
-from rbpf.systems.stereo.run import run_images as run_pairs
 from rbpf.validation.simulation.desk_and_room import TexturedDesk
 from rbpf.validation.simulation.images import Imaging, simulate_images
 from rbpf.validation.tables import write_csv, write_table
@@ -147,11 +146,10 @@ def try_stereo(sequence: ImageSequence, config: StereoConfig, faults: Mapping[st
     """
 
     def run(damaged: ImageSequence) -> Told:
-        done = run_pairs(damaged, config)
-        blind = done.assumed > 0
-        truth = _truth(damaged, done.stamps_ns)
-        poses = SE3.compose(truth[0], done.world_from_camera)
-        return Told(done.stamps_ns, poses, blind, done.notes, done.failure)
+        done = filter_pairs(damaged, config)
+        log, blind = done.log, done.log["assumed"] > 0
+        poses = SE3.compose(_truth(damaged, log.stamps_ns)[0], log.poses)
+        return Told(log.stamps_ns, poses, blind, done.messages, done.failure)
 
     return _try_all("stereo", sequence, run, faults)
 

@@ -20,7 +20,8 @@ from examples.studies.s05.pictures import draw_errors, draw_maps, draw_time
 from examples.studies.s05.record import Paths, Record, best_particle, errors, paths_of
 from examples.studies.s05.sweeps import HEADER, sweep
 from rbpf.lie import SE3
-from rbpf.systems.stereo.run import StereoRun, run_images
+from rbpf.runs.recordings import filter_pairs
+from rbpf.runs.run import Run
 from rbpf.validation.tables import write_table
 
 PAPER = {191: (812, 0.62, 2109), 400: (1542, 4.02, 4194), 600: (2206, 6.87, 6264), 800: (2625, 11.48, 7674),
@@ -72,15 +73,15 @@ def main(
     drive = measured_drive(setting, told)
     due = {round(frame / setting.every): frame for frame in PAPER}
     record = Record(tuple(due))
-    run = run_images(drive, setting.config(), record)
+    run = filter_pairs(drive, setting.config(), [record])
     paths, best = paths_of(run, setting.images), best_particle(run)
     table_1(record, paths, due, out)
-    figures = errors(record, paths, best, run.updated.astype(bool))
+    figures = errors(record, paths, best, run.log["updated"])
     features = np.array([pair.seconds for pair in drive.frames()])
     figures |= times(run, features, np.array(record.cpu), setting.every)
     write_table(out / "figures.csv", ["what", "m, s"], list(figures.items()))
     draw_maps(record, paths, best, out / "maps.png")
-    draw_errors(paths, run.stamps_ns, out / "errors.png")
+    draw_errors(paths, run.log.stamps_ns, out / "errors.png")
     draw_time(run, features, out / "time.png")
     if sweep_frames:
         rows = list(sweep(drive.first(sweep_frames), setting.config(), range(sweep_seeds)))
@@ -117,14 +118,15 @@ def table_1(record: Record, paths: Paths, due: dict[int, int], out: Path) -> Non
     write_table(out / "table1.csv", header, rows)
 
 
-def times(run: StereoRun, features: np.ndarray, cpu: np.ndarray, every: int) -> dict[str, float]:
+def times(run: Run, features: np.ndarray, cpu: np.ndarray, every: int) -> dict[str, float]:
     """Means over the pairs; medians over the updates about frame 400, if the tour goes as far, and at its end."""
-    updated = run.updated.astype(bool)
-    update = 1e3 * (run.seconds_matching + run.seconds_filter)
+    log = run.log
+    updated, matching = log["updated"], 1e3 * log["seconds_matching"]
+    update = matching + 1e3 * log["seconds_filter"]
     out = {
         "pairs": float(updated.size),
         "updates": float(updated.sum()),
-        "mean seconds per pair": float((run.seconds + features).mean()),
+        "mean seconds per pair": float((log["seconds"] + features).mean()),
         "mean processor seconds per pair": float((cpu + features).mean()),
         "the paper's": PAPER_SECONDS,
         "mean ms of an update": float(update[updated].mean()),
@@ -135,8 +137,8 @@ def times(run: StereoRun, features: np.ndarray, cpu: np.ndarray, every: int) -> 
         rows = rows & updated
         if rows.any():
             out[f"median ms of an update, {name}"] = float(np.median(update[rows]))
-            out[f"of it matching, {name}"] = float(np.median(1e3 * run.seconds_matching[rows]))
-            out[f"landmarks seen in an update, {name}"] = float(np.median(run.observed[rows]))
+            out[f"of it matching, {name}"] = float(np.median(matching[rows]))
+            out[f"landmarks seen in an update, {name}"] = float(np.median(log["observed"][rows]))
     return out
 
 

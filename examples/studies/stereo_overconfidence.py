@@ -19,10 +19,10 @@ import tyro
 from matplotlib.figure import Figure
 
 from rbpf.lie import SE3
+from rbpf.runs.recordings import filter_features
 from rbpf.sensors.feature_log import FeatureLog
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig, ResamplingConfig
 from rbpf.systems.stereo.config import OUTLIER_VOLUME_PX3, OdometryConfig, StereoConfig, TriggerConfig
-from rbpf.systems.stereo.run import run_features
 from rbpf.validation.consistency.statistic import whitened_errors
 from rbpf.validation.simulation.features import STEREO, Measuring, simulate_features
 from rbpf.validation.simulation.lab import LabDrive, LabWorld
@@ -72,17 +72,17 @@ def truncated(limit: float, update_limit: float) -> LikelihoodConfig:
 
 def figures_of(log: FeatureLog, config: StereoConfig) -> Figures:
     """One run."""
-    run = run_features(log, config)
+    run = filter_features(log, config)
     assert run.truth is not None
-    true = SE3.between(run.truth.world_from_camera[0], run.truth.world_from_camera)
+    true, poses = run.truth.poses, run.log.poses
 
     def error(path: np.ndarray) -> float:
         off = SE3.translation(path) - SE3.translation(true)
         return float(np.sqrt(np.square(off).sum(axis=1).mean()))
 
     # At the start the pose is known exactly.
-    nees = whitened_errors(SE3, run.world_from_camera[1:], run.cov[1:], true[1:]).nees
-    return Figures(error(run.world_from_camera), error(run.odometry), nees)
+    nees = whitened_errors(SE3, poses[1:], run.log.covs[1:], true[1:]).nees
+    return Figures(error(poses), error(run.log["odometry"]), nees)
 
 
 def main(

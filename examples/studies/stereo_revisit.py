@@ -18,15 +18,17 @@ import tyro
 
 from rbpf.errors import InputError
 from rbpf.runs.plots import COLOURS, new_axes, save_figures
+from rbpf.runs.recordings import filter_features, filter_pairs
+from rbpf.runs.run import Run
+from rbpf.runs.trajectory import in_space
 from rbpf.sensors.feature_log import CameraTruth, FeatureLog
 from rbpf.sensors.readers import ImageSequence, open_stereo
 from rbpf.sensors.readers.images.sequence import ImageFrame, Source
 from rbpf.sensors.readers.stereo_tracks import read_stereo_tracks
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.feature_cache import cache_features
-from rbpf.systems.stereo.run import StereoRun, run_features, run_images
 from rbpf.validation.gtsam.batch_problem import solve_problem
-from rbpf.validation.metrics.stereo_scores import score_stereo
+from rbpf.validation.metrics.scores import score_path
 from rbpf.validation.simulation.features import STEREO, Measuring, simulate_features
 from rbpf.validation.simulation.lab import LabDrive, LabWorld
 from rbpf.validation.tables import write_table
@@ -129,22 +131,41 @@ def of_pairs(folder: Path, configs: Sequence[StereoConfig]) -> Iterator[list]:
     with TemporaryDirectory() as features:
         both = cache_features(pairs_there_and_back(sequence), configs[0], Path(features))
         for way, part in zip(WAYS, (both.first(len(sequence)), both), strict=True):
-            yield row(f"{sequence.name}, {way}", lambda config, part=part: run_images(part, config), configs)
+            yield row(
+                f"{sequence.name}, {way}", lambda config, part=part: filter_pairs(part, config), configs
+            )
 
 
 def of_tracks(log: FeatureLog, configs: Sequence[StereoConfig]) -> Iterator[list]:
     """Named pixels."""
     for way, part in zip(WAYS, (log, log_there_and_back(log)), strict=True):
-        yield row(f"{log.name}, {way}", lambda config, part=part: run_features(part, config), configs)
+        yield row(f"{log.name}, {way}", lambda config, part=part: filter_features(part, config), configs)
 
 
-def row(name: str, filtered: Callable[[StereoConfig], StereoRun], configs: Sequence[StereoConfig]) -> list:
+def row(name: str, filtered: Callable[[StereoConfig], Run], configs: Sequence[StereoConfig]) -> list:
     """Errors of the path after rigid alignment, and after similarity alignment."""
-    found = [score_stereo(filtered(config)) for config in configs]
+    found = [scores(filtered(config)) for config in configs]
     median = {key: float(np.median([one[key] for one in found])) for key in found[0]}
     ours = [one["ate_rmse_m"] for one in found]
     rigid = [median["vo_ate_rmse_m"], median["ate_rmse_m"], min(ours), max(ours)]
     return [name, *rigid, median["vo_ate_sim3_rmse_m"], median["ate_sim3_rmse_m"]]
+
+
+def scores(run: Run) -> dict[str, float]:
+    """Errors of the filter, and with `vo_` before them those of its odometry alone.
+
+    Raises:
+        InputError: the recording has no ground truth.
+    """
+    log, truth = run.log, run.truth
+    if truth is None:
+        raise InputError(f"{run.name} has no ground truth, or too little")
+    reference = in_space(log.stamps_ns[truth.rows], truth.poses)
+    paths = {"": log.poses, "vo_": log["odometry"]}
+    entries: dict[str, float] = {}
+    for prefix, poses in paths.items():
+        entries |= score_path(in_space(log.stamps_ns, poses), reference, truth, prefix)
+    return entries
 
 
 def picture(rows: list[list]):

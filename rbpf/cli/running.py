@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -24,17 +24,8 @@ from rbpf.cli.showing import answer, progress, say, table, told
 from rbpf.errors import InputError
 
 if TYPE_CHECKING:
+    from rbpf.runs.recordings import Recording
     from rbpf.runs.run import Run
-    from rbpf.validation.finish import Callbacks
-
-
-class _Failing(Protocol):
-    """A run that may have ended before its recording did."""
-
-    failure: str | None
-
-
-ImageRun = TypeVar("ImageRun", bound=_Failing)
 
 RUN = Commands("""Filter a recording; `rbpf run SYSTEM --help` says more.
 
@@ -66,14 +57,10 @@ def run_range_bearing(options: Annotated[RangeBearingOptions, tyro.conf.arg(name
 @RUN.add("mono")
 def run_mono(options: Annotated[MonoOptions, tyro.conf.arg(name="")]) -> None:
     """Monocular SLAM over a sequence of images or a video (E06: active search, inverse depth, FastSLAM 2.0)."""
-    from rbpf.runs.recordings import MonoRecording, filter_recording
+    from rbpf.runs.recordings import MonoRecording
     from rbpf.systems.mono.config import MonoConfig
     from rbpf.systems.settings import load_settings
-    from rbpf.validation.finish import finish_run
-    from rbpf.validation.report.rerun import require_rerun
 
-    if options.rerun is not None:
-        require_rerun()
     named = given(options, "particles", "seed")
     config = load_settings(MonoConfig, "mono", options.config, options.set, named)
     board = given_board(options.board, options.square)
@@ -89,35 +76,20 @@ def run_mono(options: Annotated[MonoOptions, tyro.conf.arg(name="")]) -> None:
             raise InputError("the images of a live camera are not kept: leave out --resume and --rerun")
         video = False
         say("Ctrl-C ends the recording; the results are written then")
-    _run_images(
-        options,
-        lambda tell: filter_recording(recording, config, options.out, options.resume, [listener(tell)]),
-        lambda run, callbacks: finish_run(
-            run, options.out, recording.sources(), video, options.rerun, options.batch, callbacks
-        ),
-    )
+    _run_images(options, recording, config, video)
 
 
 @RUN.add("stereo")
 def run_stereo(options: Annotated[StereoOptions, tyro.conf.arg(name="")]) -> None:
     """Stereo SLAM over a sequence of pairs of images (S05: SIFT landmarks, visual odometry, 400 particles)."""
+    from rbpf.runs.recordings import StereoRecording
     from rbpf.systems.settings import load_settings
     from rbpf.systems.stereo.config import StereoConfig
-    from rbpf.validation.report.rerun import require_rerun
-    from rbpf.validation.stereo import StereoRecording, finish_stereo, start_stereo
 
-    if options.rerun is not None:
-        require_rerun()
     named = given(options, "particles", "seed", "dof")
     config = load_settings(StereoConfig, "stereo", options.config, options.set, named)
     recording = StereoRecording(options.sequence, options.calibration, given_topics(options))
-    _run_images(
-        options,
-        lambda tell: start_stereo(recording, config, options.out, options.resume, tell),
-        lambda run, callbacks: finish_stereo(
-            run, recording, options.out, options.video, options.rerun, options.batch, callbacks
-        ),
-    )
+    _run_images(options, recording, config, options.video)
 
 
 def repeated(arguments: list[str]) -> list[str]:
@@ -146,27 +118,29 @@ def listener(tell: Told) -> Callable[["Run", object], None]:
     return lambda run, _: tell(len(run.log), run.expected or 0)
 
 
-def _run_images(
-    options: ImageRunOptions,
-    start: Callable[[Told], ImageRun],
-    finish: Callable[[ImageRun, "Callbacks"], dict[str, Any]],
-) -> None:
+def _run_images(options: ImageRunOptions, recording: "Recording", config: Any, video: bool) -> None:
     """Filters, then writes everything, with a bar for each stage of the work."""
-    from rbpf.validation.finish import Callbacks
+    from rbpf.runs.recordings import filter_recording
+    from rbpf.validation.finish import Callbacks, finish_run
+    from rbpf.validation.report.rerun import require_rerun
 
+    if options.rerun is not None:
+        require_rerun()
     _prepare(options)
     with progress() as bar:
         with patient(told(bar, bar.add_task("filtering", total=None))) as tell:
-            run = start(tell)
+            run = filter_recording(recording, config, options.out, options.resume, [listener(tell)])
         solving = bar.add_task("batch", total=None, visible=options.batch)
-        drawing = bar.add_task("drawing", total=None, visible=options.video)
+        drawing = bar.add_task("drawing", total=None, visible=video)
         callbacks = Callbacks(
             on_frame=told(bar, drawing),
             on_iteration=lambda count, _error: bar.update(solving, completed=count),
             batch_s=options.batch_limit,
         )
         with finishing():
-            entries = finish(run, callbacks)
+            entries = finish_run(
+                run, options.out, recording.sources(), video, options.rerun, options.batch, callbacks
+            )
     _finish(entries, options, run.failure)
 
 

@@ -185,13 +185,16 @@ def tracking_figure(found: RunFolder) -> Any:
     """What was looked for and found, effective sample size, innovations, frame by frame."""
     table = found.table("diagnostics.csv")
     counts = {name: values for name, values in table.items() if name not in _NOT_COUNTS}
-    updated = np.flatnonzero(table.get("updated", np.ones(table["step"].size)))
+    # What stands behind the column `updated` is of the update, where there was one.
+    updated, names = np.flatnonzero(table.get("updated", np.ones(table["step"].size))), list(table)
+    of_update = names[names.index("updated") :] if "updated" in names else names
     rows = (["counts"] if counts else []) + ["ess"] + (["nis"] if (table["nis_dof"] > 0).any() else [])
     figure, panels = stacked_axes(len(rows), f"{found.name}: observations and filter")
     for axes, row in zip(panels, rows, strict=True):
         if row == "counts":
             for name, values in counts.items():
-                axes.plot(table["step"], values, lw=1.0, label=name.replace("_", " "))
+                at = updated if name in of_update else np.arange(values.size)
+                axes.plot(at, values[at], lw=1.0, label=name.replace("_", " "))
             axes.set(ylabel="number", ylim=(0, None))
         elif row == "ess":
             label_ = "effective sample size"

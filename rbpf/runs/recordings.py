@@ -13,7 +13,7 @@ from rbpf.runs.files import CHECKPOINT, prepare_folder
 from rbpf.runs.run import Listener, Run, Source, drive
 from rbpf.runs.truth import GroundTruth, truth_at
 from rbpf.sensors.calibration import Board, MarkerBoard, find_board, find_markers
-from rbpf.sensors.camera import Pinhole
+from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.feature_log import FeatureLog
 from rbpf.sensors.readers import (
     ImageSequence,
@@ -22,6 +22,7 @@ from rbpf.sensors.readers import (
     Topics,
     open_images,
     open_log,
+    open_stereo,
     read_known_points,
 )
 from rbpf.sensors.readers.images.sequence import UNNAMED
@@ -32,6 +33,10 @@ from rbpf.systems.mono.relocalisation import ImageScreen
 from rbpf.systems.mono.slam import MonoSlam
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.range_bearing.slam import RangeBearingSlam
+from rbpf.systems.stereo.config import StereoConfig
+from rbpf.systems.stereo.feature_cache import CachedSequence
+from rbpf.systems.stereo.front_end import NamedFrontEnd
+from rbpf.systems.stereo.slam import StereoSlam
 from rbpf.systems.system import System
 
 
@@ -187,6 +192,37 @@ class MonoRecording:
         return found | ({} if self.map is None else {"localize": True}) | self.topics.entries()
 
 
+@dataclass(frozen=True)
+class StereoRecording:
+    """Pairs of images.
+
+    Attributes:
+        pairs: a sequence of any kind that `open_stereo` knows.
+        calibration: camera.yaml in place of the sequence's own camera.
+        topics: of a ROS bag, which images and which truth.
+    """
+
+    pairs: Path
+    calibration: Path | None = None
+    topics: Topics = UNNAMED
+
+    def open(self, config: StereoConfig) -> Opened:
+        """The system and the pairs.
+
+        Raises:
+            InputError: a file is wrong.
+        """
+        return open_pairs(open_stereo(self.pairs, self.calibration, topics=self.topics), config)
+
+    def sources(self) -> dict[str, str | float | bool]:
+        """For config.yaml."""
+        named = {"recording": self.pairs, "calibration": self.calibration}
+        found: dict[str, str | float | bool] = {
+            name: str(path) for name, path in named.items() if path is not None
+        }
+        return found | self.topics.entries()
+
+
 def open_robot_log(log: RobotLog, config: RangeBearingConfig) -> Opened:
     """A robot's log in memory."""
     system = RangeBearingSlam.of_log(log, config, keep_associations=config.association == "ml")
@@ -213,18 +249,40 @@ def open_mono(
     return Opened(system, sequence, sequence.stamps_ns, sequence.truth)
 
 
+def open_pairs(sequence: ImageSequence | CachedSequence, config: StereoConfig) -> Opened:
+    """A sequence of pairs of images, or of what was measured in them."""
+    return Opened(StereoSlam(sequence.rig, config), sequence, sequence.stamps_ns, sequence.truth)
+
+
 def open_features(
-    log: FeatureLog, config: MonoConfig, wrapped: Callable[[Sensor], Sensor] | None = None
+    log: FeatureLog, config: MonoConfig | StereoConfig, wrapped: Callable[[Sensor], Sensor] | None = None
 ) -> Opened:
-    """A log of one camera's named features; `wrapped` as `MonoSlam`'s.
+    """A log of named features, of one camera or of a rectified pair, as the settings are.
+
+    A pair's log without times, whose stamps count its frames, is taken as one frame per second.
+
+    Args:
+        log: the features.
+        config: all settings.
+        wrapped: as `MonoSlam`'s.
 
     Raises:
-        InputError: the log is of a stereo pair, or a setting does not fit.
+        InputError: the log is of other cameras, or a setting does not fit.
     """
-    if not isinstance(log.camera, Pinhole):
-        raise InputError(f"{log.name}: monocular SLAM needs a log of one camera, this is a stereo log")
-    system = MonoSlam(log.camera, config, log.known, wrapped=wrapped)
     stamps = np.array([frame.stamp_ns for frame in log.frames], dtype=np.int64)
+    system: System
+    if isinstance(config, StereoConfig):
+        if not isinstance(log.camera, RectifiedStereo):
+            raise InputError(
+                f"{log.name}: stereo SLAM needs a log of a rectified pair, this one is of one camera"
+            )
+        counted = np.array_equal(stamps, np.arange(stamps.size))
+        front_end = NamedFrontEnd(log.camera, config, ns_per_stamp=1_000_000_000 if counted else 1)
+        system = StereoSlam(log.camera, config, front_end)
+    else:
+        if not isinstance(log.camera, Pinhole):
+            raise InputError(f"{log.name}: monocular SLAM needs a log of one camera, this is a stereo log")
+        system = MonoSlam(log.camera, config, log.known, wrapped=wrapped)
     return Opened(system, LogSource(log), stamps, log.truth)
 
 
@@ -300,11 +358,11 @@ def filter_robot_log(log: RobotLog, config: RangeBearingConfig) -> Run:
 
 def filter_features(
     log: FeatureLog,
-    config: MonoConfig,
+    config: MonoConfig | StereoConfig,
     wrapped: Callable[[Sensor], Sensor] | None = None,
     listeners: Iterable[Listener] = (),
 ) -> Run:
-    """A log of one camera's named features, filtered to its end.
+    """A log of named features, filtered to its end.
 
     Raises:
         InputError: as `open_features`, or a frame cannot be filtered.
@@ -327,3 +385,14 @@ def filter_images(
     """A sequence of images, filtered to its end; errors as `open_mono` and `drive`."""
     opened = open_mono(sequence, known, config, known_map)
     return filter_opened(opened, listeners, checkpoint, config.checkpoint_every, resume)
+
+
+def filter_pairs(
+    sequence: ImageSequence | CachedSequence,
+    config: StereoConfig,
+    listeners: Iterable[Listener] = (),
+    checkpoint: Path | None = None,
+    resume: bool = False,
+) -> Run:
+    """A sequence of pairs of images, or of what was measured in them, filtered to its end; errors as `drive`."""
+    return filter_opened(open_pairs(sequence, config), listeners, checkpoint, config.checkpoint_every, resume)

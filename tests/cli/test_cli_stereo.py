@@ -89,16 +89,6 @@ def test_repeated_from_its_configuration(finished, room, tmp_path):
     assert yaml.safe_load((finished / "config.yaml").read_text())["system"] == "stereo"
 
 
-def test_resumed(finished, room, tmp_path):
-    """From the checkpoint of the sixth pair: the same bytes."""
-    out = tmp_path / "run"
-    assert run(room, out, "--set", "checkpoint_every=6") == 0
-    assert (out / "checkpoint.npz").is_file()
-    assert run(room, out, "--set", "checkpoint_every=6", "--resume") == 0
-    for name in ("trajectory.tum", "odometry.tum", "map.csv", "diagnostics.csv"):
-        assert (out / name).read_bytes() == (finished / name).read_bytes()
-
-
 def test_ctrl_c_leaves_a_run_that_resumes_to_the_same_bytes(finished, room, tmp_path):
     """A real signal to a real process, in the middle of an update; the pair is finished first."""
     arguments = ["run", "stereo", str(room), "--particles", "50", "--out", str(tmp_path / "cut")]

@@ -6,20 +6,21 @@ import numpy as np
 import pytest
 
 from examples.studies.stereo_revisit import Reordered, pairs_there_and_back
-from rbpf.sensors.feature_log import CameraTruth
+from examples.studies.stereo_revisit import scores as scores_of
+from rbpf.runs.recordings import filter_features, filter_pairs
+from rbpf.runs.run import Run
+from rbpf.runs.truth import RunTruth
 from rbpf.sensors.readers import open_stereo
 from rbpf.sensors.readers.stereo_tracks import read_stereo_tracks
 from rbpf.systems.stereo.config import MapConfig, StereoConfig
-from rbpf.systems.stereo.run import StereoRun, run_features, run_images
 from rbpf.validation.gtsam.camera import solve_features
-from rbpf.validation.metrics.stereo_scores import score_stereo
 
 pytestmark = pytest.mark.real_data
 
 
-def scores(run: StereoRun) -> dict[str, float]:
-    assert run.failure is None and run.notes == []
-    return score_stereo(run)
+def scores(run: Run) -> dict[str, float]:
+    assert run.failure is None and run.messages == []
+    return scores_of(run)
 
 
 def test_a_room_in_part(data_dir):
@@ -28,20 +29,20 @@ def test_a_room_in_part(data_dir):
     rows = list(range(30))
     stamps = sequence.stamps_ns[rows]
     part = replace(sequence, stamps_ns=stamps, source=Reordered(sequence, np.array(rows), stamps))
-    run = run_images(part, StereoConfig(particles=100))
+    run = filter_pairs(part, StereoConfig(particles=100))
     found = scores(run)
     assert found["ate_rmse_m"] < 0.009
-    assert 5 <= run.updated.sum() < 30  # at first the camera is at rest
-    assert run.observed[-1] > 20  # the map fills by 15 keys an update
+    assert 5 <= run.log["updated"].sum() < 30  # at first the camera is at rest
+    assert run.log["observed"][-1] > 20  # the map fills by 15 keys an update
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_the_room(data_dir, seed):
     """The truth is good to about a centimetre."""
-    run = run_images(open_stereo(data_dir / "stereo_zed_room1"), StereoConfig(seed=seed))
+    run = filter_pairs(open_stereo(data_dir / "stereo_zed_room1"), StereoConfig(seed=seed))
     found = scores(run)
-    assert run.stamps_ns.size == 105
+    assert len(run.log) == 105
     assert found["ate_rmse_m"] <= 0.009
     assert found["ate_rmse_m"] <= found["vo_ate_rmse_m"]
 
@@ -50,7 +51,7 @@ def test_the_room(data_dir, seed):
 def test_the_road(data_dir):
     """The median of three seeds is no worse than that of their odometry."""
     sequence = open_stereo(data_dir / "stereo_kitti_seq1")
-    found = [scores(run_images(sequence, StereoConfig(seed=seed))) for seed in range(3)]
+    found = [scores(filter_pairs(sequence, StereoConfig(seed=seed))) for seed in range(3)]
     median = {name: np.median([one[name] for one in found]) for name in found[0]}
     assert median["ate_sim3_rmse_m"] <= 0.035
     assert median["ate_rmse_m"] <= 0.25
@@ -62,11 +63,11 @@ def test_the_road(data_dir):
 def test_there_and_back_again(data_dir):
     """A path that comes back: with the map better than without, along all of it."""
     sequence = pairs_there_and_back(open_stereo(data_dir / "stereo_zed_room1"))
-    run = run_images(sequence, StereoConfig())
+    run = filter_pairs(sequence, StereoConfig())
     found = scores(run)
     assert found["ate_rmse_m"] <= 0.009
     assert found["ate_rmse_m"] < found["vo_ate_rmse_m"]
-    off = scores(run_images(sequence, StereoConfig(map=MapConfig(used=False))))
+    off = scores(filter_pairs(sequence, StereoConfig(map=MapConfig(used=False))))
     assert found["ate_rmse_m"] < off["ate_rmse_m"]
 
 
@@ -75,12 +76,10 @@ def test_beside_the_batch(data_dir):
     """Recorded tracks, ten frames of 700: no truth, so that the batch optimum of the same pixels takes its place."""
     tracks = read_stereo_tracks(data_dir / "gtsam_stereo_vo")
     log = replace(tracks.log, frames=tracks.log.frames[:10])
-    run = run_features(log, StereoConfig())
-    assert run.failure is None
+    run = filter_features(log, StereoConfig())
     batch = solve_features(log, robust=1.345, marginals=False).world_from_camera
-    truth = CameraTruth(run.stamps_ns, batch)
-    run.truth = truth
-    found = score_stereo(run)
+    run.truth = RunTruth(np.arange(len(batch)), batch)
+    found = scores_of(run)
     length = np.linalg.norm(np.diff(batch[:, 4:], axis=0), axis=1).sum()
     assert found["ate_rmse_m"] < 0.002 * length
     assert found["ate_rmse_m"] < found["vo_ate_rmse_m"]

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from rbpf.lie import SE3
-from rbpf.runs.run import Run, drive
+from rbpf.runs.recordings import filter_opened, open_pairs
+from rbpf.runs.run import Run
 from rbpf.sensors.feature_log import CameraTruth
 from rbpf.sensors.readers import ImageFrame, ImageSequence
 from rbpf.sensors.readers.images.sequence import Source
 from rbpf.systems.stereo.config import StereoConfig
-from rbpf.systems.stereo.slam import StereoSlam
 from tests.systems.plane_sequences import CAMERA, path, texture, view
 
 BASELINE_M, STEP_NS = 0.12, 66_666_666
@@ -64,9 +64,8 @@ def swapped(frame: ImageFrame) -> ImageFrame:
 
 
 def filtered(sequence, config: StereoConfig, **options) -> Run:
-    """What stereo SLAM says of a sequence; `options` as `drive` has them."""
-    run = Run(sequence, StereoSlam(sequence.rig, config), expected=len(sequence))
-    return drive(run, stamps_ns=sequence.stamps_ns, **options)
+    """What stereo SLAM says of a sequence; `options` as `filter_opened` has them."""
+    return filter_opened(open_pairs(sequence, config), **options)
 
 
 def errors_m(poses: np.ndarray, sequence: ImageSequence) -> np.ndarray:

@@ -7,12 +7,11 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.runs.run import Run, drive
+from rbpf.runs.recordings import filter_features, filter_opened, open_features
+from rbpf.runs.run import Run
 from rbpf.sensors.feature_log import FeatureLog
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig
 from rbpf.systems.stereo.config import OdometryConfig, RecoveryConfig, StereoConfig, TriggerConfig
-from rbpf.systems.stereo.run import run_features
-from rbpf.systems.stereo.slam import StereoSlam
 from rbpf.validation.gtsam.camera import CameraEstimate, solve_features
 from rbpf.validation.simulation.features import MONO, STEREO, Measuring, simulate_features
 from rbpf.validation.simulation.lab import LabDrive, LabWorld
@@ -37,19 +36,8 @@ def log() -> FeatureLog:
     return simulated()
 
 
-class Named:
-    """A log as frames to drive with."""
-
-    def __init__(self, log: FeatureLog) -> None:
-        self.name, self.log = log.name, log
-
-    def frames(self, start: int = 0):
-        return iter(self.log.frames[start:])
-
-
 def filtered(log: FeatureLog, config: StereoConfig = CONFIG, **options) -> Run:
-    stamps = [frame.stamp_ns for frame in log.frames]
-    return drive(Run(Named(log), StereoSlam(log.camera, config)), stamps_ns=stamps, **options)
+    return filter_opened(open_features(log, config), **options)
 
 
 def rmse(log: FeatureLog, poses: np.ndarray) -> float:
@@ -109,10 +97,10 @@ def test_three_degrees_of_freedom(log):
 def test_without_times(log):
     """Stamps that count frames are seconds to the odometry, and stay what they are."""
     frames = [replace(frame, stamp_ns=t) for t, frame in enumerate(log.frames)]
-    run = run_features(FeatureLog("steps", log.camera, frames), CONFIG)
-    np.testing.assert_array_equal(run.stamps_ns, np.arange(len(frames)))
-    assert run.notes == []
-    assert np.linalg.norm(SE3.translation(run.world_from_camera[-1])) > 0.3
+    run = filtered(FeatureLog("steps", log.camera, frames))
+    np.testing.assert_array_equal(run.log.stamps_ns, np.arange(len(frames)))
+    assert run.messages == []
+    assert np.linalg.norm(SE3.translation(run.log.poses[-1])) > 0.3
 
 
 def test_halves_of_the_landmarks(log):
@@ -184,4 +172,4 @@ def test_resumed(log, tmp_path):
 
 def test_one_camera_is_refused():
     with pytest.raises(InputError, match="stereo SLAM needs a log of a rectified pair"):
-        run_features(simulated(4, camera=MONO), CONFIG)
+        filter_features(simulated(4, camera=MONO), CONFIG)

@@ -7,14 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rbpf.systems.map_estimate import estimate_map
+from rbpf.runs.recordings import filter_pairs
+from rbpf.runs.run import Run
 from rbpf.systems.stereo.config import StereoConfig, TriggerConfig
 from rbpf.systems.stereo.landmarks import FeatureKind
-from rbpf.systems.stereo.run import PairSeen, StereoRun, run_images
-from rbpf.validation.report.rerun import recording
-from rbpf.validation.report.stereo_frames import COLOURS, annotated_pairs, draw_pair
-from rbpf.validation.report.stereo_rerun import write_stereo_rerun
-from rbpf.validation.report.video import Caption, drawn_size
+from rbpf.validation.report.rerun import recording, write_rerun
+from rbpf.validation.report.video import FEATURES, Caption, annotated_frames, draw_pair, drawn_size
 from tests.systems.plane_sequences import CAMERA
 from tests.systems.stereo_sequences import missing, pairs
 
@@ -26,28 +24,29 @@ def sequence():
 
 
 @pytest.fixture(scope="module")
-def run() -> StereoRun:
-    return run_images(sequence(), CONFIG)
+def run() -> Run:
+    return filter_pairs(sequence(), CONFIG)
 
 
 def test_what_each_feature_was(run):
     """New ones in the first pair, candidates in the second, landmarks from the third on; as many as were counted."""
-    kinds = [np.bincount(seen.kind, minlength=4) for seen in run.seen]
-    assert len(kinds) == COUNT and [len(seen.kind) for seen in run.seen] == run.features.tolist()
+    kinds = [np.bincount(seen["kind"], minlength=4) for seen in run.log.all_observed()]
+    assert len(kinds) == COUNT and [kind.sum() for kind in kinds] == run.log["features"].tolist()
     assert (
         kinds[0][FeatureKind.NEW] > 5
         and kinds[0][FeatureKind.LANDMARK] == kinds[0][FeatureKind.CANDIDATE] == 0
     )
     assert kinds[1][FeatureKind.CANDIDATE] > 3 and kinds[1][FeatureKind.LANDMARK] == 0
-    np.testing.assert_array_equal([k[FeatureKind.LANDMARK] for k in kinds], run.observed)
+    np.testing.assert_array_equal([k[FeatureKind.LANDMARK] for k in kinds], run.log["observed"])
     assert kinds[-1][FeatureKind.LANDMARK] > 5
-    assert sum(k[FeatureKind.NEW] for k in kinds) == run.landmarks.manager.next_name
-    assert len(run.seen[BAD].kind) == 0
+    assert sum(k[FeatureKind.NEW] for k in kinds) == run.system.front_end.landmarks.manager.next_name
+    assert kinds[BAD].sum() == 0
 
 
 def test_between_updates_all_are_features():
-    rare = run_images(pairs(3), replace(CONFIG, trigger=TriggerConfig(9.0, 9.0)))
-    assert (rare.pair_seen(2).kind == FeatureKind.FEATURE).all() and len(rare.pair_seen(2).kind) > 20
+    rare = filter_pairs(pairs(3), replace(CONFIG, trigger=TriggerConfig(9.0, 9.0)))
+    kind = rare.log.observed(2)["kind"]
+    assert (kind == FeatureKind.FEATURE).all() and len(kind) > 20
 
 
 @pytest.mark.parametrize(
@@ -55,19 +54,19 @@ def test_between_updates_all_are_features():
 )
 def test_a_feature_is_drawn_where_it_is(kind):
     """A cross at the left pixel, and a line as long as the disparity, at twice the size, below the caption."""
-    seen = PairSeen(np.array([[60.0, 40.0, 30.0]]), np.array([kind]))
+    seen = {"z": np.array([[60.0, 40.0, 30.0]]), "kind": np.array([kind])}
     picture = draw_pair(np.zeros((90, 120), dtype=np.uint8), seen, Caption("pair 0", ""), (120, 90))
     assert picture.shape[:2] == drawn_size(120, 90)[::-1]
-    rows, columns = np.nonzero((picture[24:] == COLOURS[kind]).all(axis=-1))
+    rows, columns = np.nonzero((picture[24:] == FEATURES[kind][1]).all(axis=-1))
     assert abs(np.median(rows) - 80.5) <= 1.0
     assert abs(columns.min() - 60.5) <= 2.0 and 120 <= columns.max() <= 126
 
 
 def test_frames_of_a_run(run):
-    frames = list(annotated_pairs(run, sequence()))
+    frames = list(annotated_frames(run))
     assert len(frames) == COUNT
     assert {frame.shape for frame in frames} == {(*drawn_size(CAMERA.width, CAMERA.height)[::-1], 3)}
-    green = [int((frame[24:] == COLOURS[FeatureKind.LANDMARK]).all(axis=-1).sum()) for frame in frames]
+    green = [int((frame[24:] == FEATURES[FeatureKind.LANDMARK][1]).all(axis=-1).sum()) for frame in frames]
     assert green[0] == green[1] == green[BAD] == 0 and green[-1] > 50
     red = [int(((frame[:24, :, 0] > 120) & (frame[:24, :, 1] < 70)).sum()) for frame in frames]
     assert red[BAD] > 20 and red[0] == 0
@@ -90,8 +89,8 @@ def test_features_in_the_recording(run, tmp_path, monkeypatch):
     """Every pair's features under what they were, half a pixel aside, and landmarks where the map has them."""
     rr = pytest.importorskip("rerun")
     stream = Stream()
-    monkeypatch.setattr("rbpf.validation.report.stereo_rerun.recording", lambda *_: nullcontext((rr, stream)))
-    write_stereo_rerun(run, sequence(), estimate_map(run.filter), tmp_path / "unused.rrd")
+    monkeypatch.setattr("rbpf.validation.report.rerun.recording", lambda *_: nullcontext((rr, stream)))
+    write_rerun(run, tmp_path / "unused.rrd")
     logged = stream.logged
     assert len(logged["time/frame"]) == COUNT and len(logged["world/camera/image"]) == COUNT
     for kind, name in (
@@ -101,11 +100,11 @@ def test_features_in_the_recording(run, tmp_path, monkeypatch):
         (FeatureKind.FEATURE, "feature"),
     ):
         pixels = logged[f"world/camera/image/{name}"]
-        for seen, drawn in zip(run.seen, pixels, strict=True):
+        for seen, drawn in zip(run.log.all_observed(), pixels, strict=True):
             xy = np.array(drawn.positions.as_arrow_array().to_pylist()).reshape(-1, 2)
-            np.testing.assert_allclose(xy, seen.of(kind)[:, :2] + 0.5, atol=1e-4)
+            np.testing.assert_allclose(xy, seen["z"][seen["kind"] == kind, :2] + 0.5, atol=1e-4)
     places = np.array(logged["world/seen"][-1].positions.as_arrow_array().to_pylist())
-    mapped = estimate_map(run.filter).mean
+    mapped = run.system.map().mean
     nearest = np.linalg.norm(places[:, None] - mapped, axis=2).min(axis=1)
     assert len(places) > 5 and np.median(nearest) < 0.02
 

@@ -23,6 +23,7 @@ from rbpf.errors import InputError
 from rbpf.lie import Array
 from rbpf.runs.path_and_map import PathAndMap
 from rbpf.runs.reading import RunFolder
+from rbpf.runs.run import Run
 from rbpf.validation.gtsam.batch_problem import (
     Fit,
     Optimum,
@@ -46,7 +47,6 @@ from rbpf.validation.metrics.gaussian_differences import (
     rescaled,
     scale_onto,
 )
-from rbpf.validation.metrics.path_and_map import AnyRun, of_run
 
 INSTANTS = 3
 """At how many instants poses are compared, the last one among them."""
@@ -110,9 +110,9 @@ class AgainstBatch:
         }
 
 
-def compare_run(run: AnyRun, instants: int = INSTANTS, robust: float | None = None) -> AgainstBatch:
+def compare_run(run: Run, instants: int = INSTANTS, robust: float | None = None) -> AgainstBatch:
     """A run in memory beside its batch optimum; see `compare`."""
-    return compare(of_run(run), problem_of(run), instants, robust)
+    return compare(PathAndMap.of_run(run), problem_of(run), instants, robust)
 
 
 def compare_folder(folder: Path, instants: int = INSTANTS, robust: float | None = None) -> AgainstBatch:

@@ -226,7 +226,6 @@ def _in_order(jobs: list[tuple[Any, Data]], workers: int, told: Callable[[int, i
 
 def _evidence(config: Config, data: Data) -> float:
     from rbpf.runs.recordings import filter_features, filter_robot_log
-    from rbpf.systems.stereo.run import run_features as run_stereo
 
     if isinstance(config, RangeBearingConfig):
         if isinstance(data, Path):
@@ -238,7 +237,5 @@ def _evidence(config: Config, data: Data) -> float:
         if isinstance(data, RobotLog):
             return float(filter_robot_log(data, config).system.filter.log_evidence)
     elif isinstance(data, FeatureLog):
-        if isinstance(config, StereoConfig):
-            return float(run_stereo(data, config).filter.log_evidence)
         return float(filter_features(data, config).system.filter.log_evidence)
     raise InputError(f"a {type(config).__name__} does not filter a {type(data).__name__}")

@@ -25,7 +25,6 @@ from rbpf.validation.gtsam import camera, robot
 from rbpf.validation.gtsam.mono_batch import connected_frames
 from rbpf.validation.gtsam.observations import CameraEstimate, observation_table, reprojection
 from rbpf.validation.metrics.gaussian_differences import mahalanobis
-from rbpf.validation.metrics.path_and_map import AnyRun
 
 Problem = Measurements | FeatureLog
 
@@ -70,11 +69,9 @@ class Fit:
     sightings: int
 
 
-def problem_of(run: AnyRun) -> Problem:
+def problem_of(run: Run) -> Problem:
     """The measurements that a run in memory used."""
-    if isinstance(run, Run):
-        return run.system.measurements(run.name, run.log)
-    return run.log()
+    return run.system.measurements(run.name, run.log)
 
 
 def read_problem(folder: Path) -> Problem:

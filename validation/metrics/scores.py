@@ -20,6 +20,9 @@ from rbpf.validation.metrics.matching import match_points
 
 BATCH, ODOMETRY = "batch.tum", "odometry.tum"
 
+ODOMETRY_PREFIX = {"stereo": "vo_"}
+"""How the figures of the odometry alone begin, by system; otherwise with `odometry_`."""
+
 
 def absolute_errors(estimate: Trajectory, reference: Trajectory, truth: RunTruth) -> dict[str, float]:
     """Positions after rigid and after similarity alignment, and without any where one world is shared."""
@@ -64,13 +67,9 @@ def score_run(found: RunFolder) -> dict[str, Any]:
         truth = found.truth
         entries |= score_estimate(found.estimate, truth, found.config.get("association") == "ml")
         reference = in_space(found.path.stamps_ns[truth.rows], truth.poses)
-        for name, prefix in (
-            (ODOMETRY, "vo_" if found.system == "stereo" else "odometry_"),
-            (BATCH, "batch_"),
-        ):
+        for name, prefix in ((ODOMETRY, ODOMETRY_PREFIX.get(found.system, "odometry_")), (BATCH, "batch_")):
             if (found.folder / name).is_file():
-                other = read_tum(found.folder / name)
-                entries |= {prefix + key: v for key, v in score_path(other, reference, truth).items()}
+                entries |= score_path(read_tum(found.folder / name), reference, truth, prefix)
     if batch is not None:
         ours, theirs = associate(path, batch, 0)
         floats = found.system == "mono" and found.summary.get("known_points") == 0
@@ -96,7 +95,9 @@ def score_estimate(estimate: PathAndMap, truth: RunTruth, anonymous: bool = Fals
     return entries | score_landmarks(estimate.landmarks, truth, start)
 
 
-def score_path(path: Trajectory, reference: Trajectory, truth: RunTruth) -> dict[str, float]:
+def score_path(
+    path: Trajectory, reference: Trajectory, truth: RunTruth, prefix: str = ""
+) -> dict[str, float]:
     """All figures of merit of a path whose frames are among those of a run; none where too few have a true pose."""
     try:
         estimate, reference = associate(path, reference, 0)
@@ -105,7 +106,7 @@ def score_path(path: Trajectory, reference: Trajectory, truth: RunTruth) -> dict
     entries: dict[str, float] = {}
     for merit in MERITS if len(estimate) >= LEAST else ():
         entries |= merit(estimate, reference, truth)
-    return entries
+    return {prefix + name: value for name, value in entries.items()}
 
 
 def score_landmarks(

@@ -23,7 +23,8 @@ from rbpf.runs.run import Run
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers import ImageFrame
 from rbpf.systems.map_estimate import MapEstimate
-from rbpf.validation.report.video import FOUND, MISSED, RAY, STARTED
+from rbpf.systems.stereo.landmarks import FeatureKind
+from rbpf.validation.report.video import FEATURES, FOUND, MISSED, RAY, STARTED
 
 QUALITY = 75
 """Of the JPEG images in the recording, in per cent."""
@@ -181,7 +182,22 @@ def _log_search(rr: Any, stream: Any, run: Run, seen: Mapping[str, np.ndarray], 
     stream.log("world/seen", rr.Points3D(places, colors=[FOUND], radii=0.005))
 
 
+def _log_pair(rr: Any, stream: Any, run: Run, seen: Mapping[str, np.ndarray], pose: np.ndarray) -> None:
+    """Features of the left image by what they were to the map, and where the pair itself has its landmarks."""
+    for kind, (name, colour) in FEATURES.items():
+        pixels = rr.Points2D(seen["z"][seen["kind"] == kind, :2] + 0.5, colors=[colour])
+        stream.log(f"world/camera/image/{name}", pixels)
+    rig = run.system.rig  # type: ignore[attr-defined]
+    places = SE3.transform(pose, rig.triangulate(seen["z"][seen["kind"] == FeatureKind.LANDMARK]))
+    stream.log("world/seen", rr.Points3D(places, colors=[FOUND], radii=0.005))
+
+
 DRAWN = {
     "mono": Drawn(lambda run: run.system.camera, _log_search, ("found", "lost")),  # type: ignore[attr-defined]
+    "stereo": Drawn(
+        lambda run: run.system.rig.camera,  # type: ignore[attr-defined]
+        _log_pair,
+        ("features", "agreeing", "observed"),
+    ),
 }
 """By the system's name."""

@@ -16,6 +16,7 @@ from rbpf.runs.files import whole
 from rbpf.runs.plots import outline
 from rbpf.runs.run import Run
 from rbpf.sensors.readers import ImageFrame
+from rbpf.systems.stereo.landmarks import FeatureKind
 
 Colour = tuple[int, int, int]
 Place = Callable[[np.ndarray], list[tuple[float, float]]]
@@ -166,7 +167,52 @@ def _clipped(line: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return start + np.array([[enter], [max(enter, leave)]]) * step
 
 
-PICTURES: dict[str, Callable[[Run, int, ImageFrame], np.ndarray]] = {"mono": picture_of_search}
+FEATURES: Mapping[FeatureKind, tuple[str, Colour]] = {
+    FeatureKind.FEATURE: ("feature", (150, 150, 150)),
+    FeatureKind.CANDIDATE: ("candidate", (255, 190, 40)),
+    FeatureKind.LANDMARK: ("landmark", FOUND),
+    FeatureKind.NEW: ("new", STARTED),
+}
+"""Names and colours of what a feature of a pair is to the map, in the order in which they are drawn."""
+
+
+def picture_of_pair(run: Run, t: int, frame: ImageFrame) -> np.ndarray:
+    """A frame of a stereo run (H, W, 3): the left image, with what each of its features was to the map."""
+    log = run.log
+    held = f"{log['observed'][t]} landmarks" if log["updated"][t] else "no update"
+    text = f"pair {t}   {log['features'][t]} features   {log['agreeing'][t]} agree   {held}"
+    alarm = "" if t == 0 or log["agreeing"][t] else "NO MOTION FOUND"
+    if frame.image is None or frame.right is None:
+        alarm = "NO PAIR"
+    camera = run.system.rig.camera  # type: ignore[attr-defined]
+    return draw_pair(frame.image, log.observed(t), Caption(text, alarm), (camera.width, camera.height))
+
+
+def draw_pair(
+    image: np.ndarray | None, seen: Mapping[str, np.ndarray], caption: Caption, size: tuple[int, int]
+) -> np.ndarray:
+    """A left image (H, W, 3) uint8 with its features; a line leads from each to where the right camera has it.
+
+    Args:
+        image: (height, width) uint8; None where it could not be read.
+        seen: its features, see `StereoSlam.observed`.
+        caption: what is written above.
+        size: width and height of the images, px.
+    """
+
+    def paint(draw: Any, place: Place) -> None:
+        for kind, (_, colour) in FEATURES.items():
+            for u, v, right in seen["z"][seen["kind"] == kind].tolist():
+                draw.line(place(np.array([[u, v], [right, v]])), fill=colour, width=drawn_scale(size[0]))
+                cross(draw, place(np.array([u, v]))[0], colour)
+
+    return annotate(image, size, caption, list(FEATURES.values()), paint)
+
+
+PICTURES: dict[str, Callable[[Run, int, ImageFrame], np.ndarray]] = {
+    "mono": picture_of_search,
+    "stereo": picture_of_pair,
+}
 """By the system's name, how a frame is drawn."""
 
 

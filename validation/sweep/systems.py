@@ -66,12 +66,17 @@ def _figures(run: "Run", anonymous: bool = False) -> Figures:
     """What a run's summary and scores say, without writing them; `anonymous` as `score_estimate`'s."""
     from rbpf.runs.folder import summarise
     from rbpf.runs.path_and_map import PathAndMap
-    from rbpf.validation.metrics.scores import score_estimate
+    from rbpf.runs.trajectory import in_space
+    from rbpf.validation.metrics.scores import ODOMETRY_PREFIX, score_estimate, score_path
 
-    figures = summarise(run)
-    if run.truth is not None:
-        figures |= score_estimate(PathAndMap.of_run(run), run.truth, anonymous)
-    return figures | _pose_nees(run.system.space, run.log.poses, run.log.covs, run.truth)
+    figures, log, truth = summarise(run), run.log, run.truth
+    if truth is not None:
+        figures |= score_estimate(PathAndMap.of_run(run), truth, anonymous)
+        if "odometry" in log:
+            reference = in_space(log.stamps_ns[truth.rows], truth.poses)
+            prefix = ODOMETRY_PREFIX.get(run.system.name, "odometry_")
+            figures |= score_path(in_space(log.stamps_ns, log["odometry"]), reference, truth, prefix)
+    return figures | _pose_nees(run.system.space, log.poses, log.covs, truth)
 
 
 def _mono_settings(pairs: Sequence[str], given: Mapping[str, Any]) -> Any:
@@ -96,16 +101,10 @@ def _stereo_settings(pairs: Sequence[str], given: Mapping[str, Any]) -> Any:
 
 
 def _run_stereo(sequence: Mapping[str, Path], pairs: Sequence[str], given: Mapping[str, Any]) -> Figures:
-    from rbpf.lie import SE3
-    from rbpf.systems.map_estimate import estimate_map
-    from rbpf.validation.metrics.stereo_scores import stereo_truth
-    from rbpf.validation.stereo import StereoRecording, start_stereo
-    from rbpf.validation.stereo_folder import summarise_stereo
+    from rbpf.runs.recordings import StereoRecording, filter_recording
 
     recording = StereoRecording(sequence["recording"], sequence.get("calibration"))
-    done = start_stereo(recording, _stereo_settings(pairs, given))
-    figures = summarise_stereo(done, estimate_map(done.filter))
-    return figures | _pose_nees(SE3, done.world_from_camera, done.cov, stereo_truth(done))
+    return _figures(filter_recording(recording, _stereo_settings(pairs, given)))
 
 
 def _pose_nees(space: Any, mean: np.ndarray, cov: np.ndarray, truth: RunTruth | None) -> Figures:

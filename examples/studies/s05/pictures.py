@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from examples.studies.s05.record import Best, Paths, Record
 from rbpf.lie import SE3
-from rbpf.systems.stereo.run import StereoRun
+from rbpf.runs.run import Run
 
 MIDDLE = 0.98
 """Share of the landmarks that the pictures hold along each axis."""
@@ -53,13 +53,13 @@ def draw_errors(paths: Paths, stamps_ns: np.ndarray, file: Path) -> None:
     figure.savefig(file, dpi=110)
 
 
-def draw_time(run: StereoRun, seconds_features: np.ndarray, file: Path) -> None:
+def draw_time(run: Run, seconds_features: np.ndarray, file: Path) -> None:
     """Fig. 7: milliseconds of each pair, by stage."""
     figure = Figure(figsize=(10.0, 4.0), layout="constrained")
     axes: Any = figure.subplots()
-    stages = {name: 1e3 * getattr(run, f"seconds_{name}") for name in STAGES}
+    stages = {name: 1e3 * run.log[f"seconds_{name}"] for name in STAGES}
     stages["features"] = 1e3 * seconds_features
-    axes.stackplot(np.arange(run.seconds.size), *stages.values(), labels=list(stages), lw=0, alpha=0.7)
+    axes.stackplot(np.arange(len(run.log)), *stages.values(), labels=list(stages), lw=0, alpha=0.7)
     highest = np.quantile(sum(stages.values()), 0.995)
     axes.set(xlabel="pair", ylabel="ms", ylim=(0.0, 1.2 * highest), title="time per pair")
     axes.legend(fontsize="small", loc="upper left")

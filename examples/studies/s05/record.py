@@ -9,10 +9,12 @@ import numpy as np
 
 from rbpf.lie import SE3
 from rbpf.runs.alignment import align
+from rbpf.runs.run import Run
 from rbpf.runs.truth import poses_at
 from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
 from rbpf.systems.stereo.landmarks import DescriptorLandmarks
-from rbpf.systems.stereo.run import StereoRun
+from rbpf.systems.stereo.slam import StereoSlam
+from rbpf.systems.system import Tracked
 
 KINDS = "filter", "odometry", "wheels"
 
@@ -42,16 +44,17 @@ class Record:
     cpu: list[float] = field(default_factory=list)
     _clock: float = field(default_factory=time.process_time)
 
-    def __call__(self, t: int, run: StereoRun) -> None:
-        """After pair t."""
+    def __call__(self, run: Run, tracked: Tracked) -> None:
+        """After each pair."""
         now = time.process_time()
         self.cpu.append(now - self._clock)
-        sensor, shown = sensor_of(run), run.shown[t]
-        if run.updated[t]:
+        done, shown, manager = len(run.log), tracked.observed, landmarks_of(run).manager
+        if tracked.values["updated"]:
             seen = shown["landmarks"] >= 0
-            self.sightings.append((shown["landmarks"][seen], t, run.rig.triangulate(shown["z"][seen])))
-        if t + 1 in self.due or t + 1 == run.stamps_ns.size:
-            self.rows.append(Row(t + 1, int(sensor.manager.confirmed.sum()), sensor.manager.next_name))
+            points = slam_of(run).rig.triangulate(shown["z"][seen])
+            self.sightings.append((shown["landmarks"][seen], done - 1, points))
+        if done in self.due or done == run.expected:
+            self.rows.append(Row(done, int(manager.confirmed.sum()), manager.next_name))
         self._clock = time.process_time()
 
     def places(self, path: np.ndarray, names: np.ndarray) -> np.ndarray:
@@ -91,30 +94,36 @@ class Best:
     cloud: np.ndarray
 
 
-def sensor_of(run: StereoRun) -> DescriptorLandmarks:
-    """The landmarks of a run over images."""
-    assert isinstance(run.landmarks, DescriptorLandmarks)
-    return run.landmarks
+def slam_of(run: Run) -> StereoSlam:
+    """The system of a stereo run."""
+    assert isinstance(run.system, StereoSlam)
+    return run.system
 
 
-def paths_of(run: StereoRun, images: Path) -> Paths:
+def landmarks_of(run: Run) -> DescriptorLandmarks:
+    """What is known of the landmarks of a run over images besides where they are."""
+    landmarks = slam_of(run).front_end.landmarks
+    assert isinstance(landmarks, DescriptorLandmarks)
+    return landmarks
+
+
+def paths_of(run: Run, images: Path) -> Paths:
     """All four paths at the run's pairs."""
     wheels = read_wheel_odometry(images)
     by_wheels = wheels.world_from_camera(SE3.identity())
-    _, by_wheels = poses_at(SE3, wheels.stamps_ns, by_wheels, run.stamps_ns)
-    assert run.truth is not None
-    _, true = poses_at(SE3, run.truth.stamps_ns, run.truth.world_from_camera, run.stamps_ns)
-    true, by_wheels = (SE3.between(path[0], path) for path in (true, by_wheels))
-    return Paths(true, run.world_from_camera, run.odometry, by_wheels)
+    _, by_wheels = poses_at(SE3, wheels.stamps_ns, by_wheels, run.log.stamps_ns)
+    assert run.truth is not None and run.truth.rows.size == len(run.log)
+    return Paths(run.truth.poses, run.log.poses, run.log["odometry"], SE3.between(by_wheels[0], by_wheels))
 
 
-def best_particle(run: StereoRun) -> Best:
+def best_particle(run: Run) -> Best:
     """Its map and its path, without any smoothing."""
-    belief, manager = run.filter.belief(), sensor_of(run).manager
+    filter_, manager = run.system.filter, landmarks_of(run).manager
+    belief = filter_.belief()
     names = manager.names[manager.confirmed]
     mode = belief.mode
     places = belief.read(names, np.array([mode])).mean[0]
-    return Best(names, places, run.filter.history.paths()[:, mode], SE3.translation(belief.state))
+    return Best(names, places, filter_.history.paths()[:, mode], SE3.translation(belief.state))
 
 
 def errors(record: Record, paths: Paths, best: Best, updated: np.ndarray) -> dict[str, float]:

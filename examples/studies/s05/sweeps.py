@@ -7,12 +7,12 @@ import numpy as np
 
 from examples.studies.s05.record import rms
 from rbpf.lie import SE3
+from rbpf.runs.recordings import filter_pairs
+from rbpf.runs.run import Run
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.feature_cache import CachedSequence
-from rbpf.systems.stereo.run import StereoRun, run_images
 from rbpf.validation.consistency.statistic import whitened_errors
-from rbpf.validation.metrics.stereo_scores import stereo_truth
 
 ERROR, NEES = ("error m", "least", "most"), ("median NEES", "least NEES", "most NEES")
 HEADER = ("setting", *ERROR, "at the end m", *NEES, "right", "s per pair")
@@ -44,27 +44,27 @@ def sweep(
 ) -> Iterator[list[str | float]]:
     """A row for each setting, and one for the odometry alone: medians over the seeds of the filter, least and most."""
     for name, config in settings(base).items():
-        runs = [run_images(drive, replace(config, seed=seed)) for seed in seeds]
+        runs = [filter_pairs(drive, replace(config, seed=seed)) for seed in seeds]
         off, end, nees, right, seconds = np.array([figures_of(run) for run in runs]).T
         middle = float(np.median(end)), float(np.median(seconds))
         yield [name, *_spread(off), middle[0], *_spread(nees), float(right[0]), middle[1]]
         if config == base:
-            off, end = np.array([_off(run, run.odometry) for run in runs]).T
+            off, end = np.array([_off(run, run.log["odometry"]) for run in runs]).T
             yield ["odometry alone", *_spread(off), float(np.median(end)), "", "", "", "", ""]
 
 
-def figures_of(run: StereoRun) -> Sequence[float]:
+def figures_of(run: Run) -> Sequence[float]:
     """Error of the path and of its end, median NEES of the pose, what is right, seconds by the clock."""
-    truth = stereo_truth(run)
+    log, truth = run.log, run.truth
     assert truth is not None
     rows = truth.rows[1:]
-    errors = whitened_errors(SE3, run.world_from_camera[rows], run.cov[rows], truth.poses[1:])
+    errors = whitened_errors(SE3, log.poses[rows], log.covs[rows], truth.poses[1:])
     nees, rank = float(np.median(errors.nees)), float(np.median(errors.ranks))
-    return [*_off(run, run.world_from_camera), nees, rank, float(run.seconds.mean())]
+    return [*_off(run, log.poses), nees, rank, float(log["seconds"].mean())]
 
 
-def _off(run: StereoRun, path: np.ndarray) -> Sequence[float]:
-    truth = stereo_truth(run)
+def _off(run: Run, path: np.ndarray) -> Sequence[float]:
+    truth = run.truth
     assert truth is not None
     off = SE3.translation(path[truth.rows]) - SE3.translation(truth.poses)
     return [rms(off), float(np.linalg.norm(off[-1]))]

@@ -50,7 +50,7 @@ class CachedPair:
 @final
 @dataclass(frozen=True)
 class CachedSequence:
-    """A sequence in place of which `run_images` takes its features.
+    """The features of a sequence, which are filtered in place of its images.
 
     Attributes:
         name: of the recording.

@@ -231,18 +231,20 @@ class NamedFrontEnd(FrontEnd[NamedPixels]):
     Args:
         rig: the cameras.
         config: all settings.
+        ns_per_stamp: nanoseconds per unit of the frames' stamps: 10⁹ where they count frames of unknown time.
     """
 
     frames = (FeatureFrame,)
     names_landmarks = True
 
-    def __init__(self, rig: RectifiedStereo, config: StereoConfig) -> None:
-        self.rig, self.config = rig, config
+    def __init__(self, rig: RectifiedStereo, config: StereoConfig, ns_per_stamp: int = 1) -> None:
+        self.rig, self.config, self.ns_per_stamp = rig, config, ns_per_stamp
         self.landmarks: NamedLandmarks = NamedLandmarks(rig, config.likelihood.build())
 
     def measure(self, frame: FeatureFrame) -> tuple[Pair[NamedPixels], str]:
         """Nothing is to be done."""
-        return self._pair(frame.stamp_ns, NamedPixels(frame.z, frame.cov_z, frame.landmarks)), ""
+        pixels = NamedPixels(frame.z, frame.cov_z, frame.landmarks)
+        return self._pair(self.ns_per_stamp * frame.stamp_ns, pixels), ""
 
     def match(self, before: Pair[NamedPixels], now: Pair[NamedPixels]) -> tuple[np.ndarray, np.ndarray]:
         """By their names."""

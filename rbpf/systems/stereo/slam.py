@@ -141,6 +141,8 @@ class StereoSlam(System):
         """Where visual odometry has come."""
         self.at_update = Estimate(SE3.identity(), np.zeros((6, 6)))
         """The filter's estimate at its last update."""
+        self.since_update = SE3.identity()
+        """Motion from the filter's last update to the last pair, also where it was only expected."""
         self._last_update = 0
         self._kept: Pair[Any] | None = None
 
@@ -176,7 +178,7 @@ class StereoSlam(System):
         dt, least = self.reckoning.seconds(pair.stamp_ns), config.odometry.estimate.min_matches
         if dt < 0.0:
             raise InputError(
-                f"time runs backwards: a pair has the stamp {pair.stamp_ns} ns, the last one a later one"
+                f"time runs backwards: a pair has the stamp {frame.stamp_ns} ns, the last one a later one"
             )
         measured = len(pair) >= least and dt > 0.0
         if measured:
@@ -229,9 +231,10 @@ class StereoSlam(System):
 
         # 5. Report: between updates the odometry moves the estimate.
         pose, cov = self.at_update.mean, self.at_update.cov
+        self.since_update = SE3.identity()
         if not updated:
             moved = Odometry(pose, cov).then(at.since_update)
-            pose, cov = moved.delta, moved.cov
+            pose, cov, self.since_update = moved.delta, moved.cov, at.since_update.delta
         assumed = 0 if updated and config.recovery.used else at.assumed
         state = TrackingState.PREDICTED
         if measured and not (updated and assumed):
@@ -240,7 +243,7 @@ class StereoSlam(System):
         previous = np.full(len(pair), NULL, dtype=np.int64)
         previous[motion.rows[1][motion.inliers]] = motion.rows[0][motion.inliers]
         return Tracked(
-            pair.stamp_ns,
+            frame.stamp_ns,
             pose,
             cov,
             state,
@@ -271,6 +274,10 @@ class StereoSlam(System):
         """The landmarks, and the candidates; with what the front end knows of each, see `Landmarks.columns`."""
         found = estimate_map(self.filter)
         return replace(found, columns=self.front_end.landmarks.columns(found.ids))
+
+    def particle_poses(self) -> np.ndarray:
+        """(N, 7) world_from_camera of the particles at the last pair: between updates the odometry moves them."""
+        return SE3.compose(self.filter.particles.state, self.since_update)
 
     def measurements(self, name: str, log: Recorded) -> FeatureLog:
         """Every pixel that odometry or map used, once, as tracks; of pixels with names all of them."""
@@ -318,6 +325,7 @@ class StereoSlam(System):
             "stereo/front_end": np.array(self._front_ends.index(self.front_end)),
             "stereo/at_update": self.at_update.mean,
             "stereo/cov_at_update": self.at_update.cov,
+            "stereo/since_update": self.since_update,
         }
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
@@ -337,6 +345,7 @@ class StereoSlam(System):
             checked(arrays, "stereo/at_update", (7,), "f").copy(),
             checked(arrays, "stereo/cov_at_update", (6, 6), "f").copy(),
         )
+        self.since_update = checked(arrays, "stereo/since_update", (7,), "f").copy()
         self.reckoning = DeadReckoning.restored(arrays)
         self.front_end.landmarks.restore(arrays)
         self._kept = self.front_end.pair_of(arrays) if "pair/z" in arrays else None
