@@ -12,7 +12,7 @@ from rbpf.sensors.camera import Pinhole
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.validation.colmap.against_colmap import compare_with_colmap
 from rbpf.validation.colmap.reconstruct import ReconstructionOptions
-from rbpf.validation.export import export_colmap, export_ply
+from rbpf.validation.exports import export_colmap, export_ply
 from rbpf.validation.gtsam.batch_problem import problem_of
 from rbpf.validation.report.offline_pictures import plot_against_colmap
 from rbpf.validation.simulation.desk_and_room import TexturedDesk

@@ -2,26 +2,54 @@
 
 tum      trajectory.tum: a line `time tx ty tz qx qy qz qw` per pose
 kitti    trajectory_kitti.txt: the upper 3 × 4 block of each pose's matrix, without times
-ply      map.ply and path.ply
-colmap   colmap/: a model with the tracks of what was measured, where the run left them
+ply      map.ply: landmarks, coloured by their standard deviation, which is also the property sigma_m; path.ply: positions
+         of the body, joined by lines. Binary little-endian (G. Turk, 1994), for MeshLab, CloudCompare, Blender
+colmap   colmap/: cameras, images, points (`cameras`, `images`, `points3D`, `rigs`, `frames`; .bin or .txt), with the
+         tracks of what was measured, where the run left them
 rerun    run.rrd: path and map for the Rerun viewer
 npz      run.npz: stamps_ns (T,), world_from_body (T, E), cov_poses (T, d, d); landmark_ids (M,), landmarks (M, D),
          cov_landmarks (M, D, D)
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
 
 from rbpf.core.checkpoint import save_arrays
 from rbpf.errors import InputError
-from rbpf.runs.files import prepare_folder
+from rbpf.lie import SE3, Array
+from rbpf.runs.files import prepare_folder, whole
 from rbpf.runs.measurement_files import OBSERVATIONS
 from rbpf.runs.path_and_map import PathAndMap
 from rbpf.runs.reading import RunFolder
 from rbpf.runs.trajectory import write_kitti, write_tum
-from rbpf.validation.export import MODEL, export_colmap, export_ply, raised
-from rbpf.validation.gtsam.batch_problem import read_problem
+from rbpf.sensors.camera import Pinhole
+from rbpf.sensors.feature_log import FeatureLog
+from rbpf.systems.map_estimate import MapEstimate
+from rbpf.validation.colmap.model import build_model
+from rbpf.validation.gtsam.batch_problem import Problem, read_problem
+from rbpf.validation.gtsam.observations import ObservationTable, observation_table
+from rbpf.validation.report.colours import colours_by_sigma, standard_deviations
 from rbpf.validation.report.rerun import AXIS_M, ellipsoids, log_pose, log_time, recording
+
+MAP, PATH, MODEL = "map.ply", "path.ply", "colmap"
+
+NOMINAL = Pinhole(640, 480, 500.0, 500.0, 319.5, 239.5)
+"""Camera that stands for a robot's sensor in a COLMAP model: it looks along the robot's x axis and measures nothing."""
+
+_PATH_COLOUR = np.array([[31, 119, 180]], dtype=np.uint8)
+_BODY_FROM_CAMERA = SE3.from_matrix(
+    np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0]])
+)
+
+_VERTEX = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
+_SIGMA = [("sigma_m", "<f4")]
+_EDGE = [("vertex1", "<i4"), ("vertex2", "<i4")]
+_NAMES = {"<f4": "float", "u1": "uchar", "<i4": "int"}
 
 
 def export_run(run: Path, formats: Sequence[str], out: Path) -> list[Path]:
@@ -101,3 +129,172 @@ FORMATS: dict[str, Callable[[Path, PathAndMap, Path], list[Path]]] = {
     "npz": _npz,
 }
 """How each is written."""
+
+
+def export_colmap(
+    estimate: PathAndMap, problem: Problem | None, folder: Path, kind: Literal["binary", "text"] = "binary"
+) -> Any:
+    """Writes a run as a COLMAP model and returns the `pycolmap.Reconstruction`.
+
+    The images of a camera are named by their frame. Without a camera the poses are those of `NOMINAL` on the robot.
+
+    Args:
+        estimate: the run's path and map.
+        problem: its measurements, for the camera and the tracks; None gives points without tracks.
+        folder: for the model's files.
+        kind: of the files.
+
+    Raises:
+        InputError: path and measurements are not of one run.
+    """
+    prepare_folder(folder)
+    model = colmap_model(estimate, problem)
+    if kind == "text":
+        model.write_text(folder)
+    else:
+        model.write_binary(folder)
+    return model
+
+
+def colmap_model(estimate: PathAndMap, problem: Problem | None) -> Any:
+    """The model that `export_colmap` writes."""
+    landmarks = raised(estimate.landmarks)
+    colours = colours_by_sigma(standard_deviations(estimate.landmarks.cov))
+    if not isinstance(problem, FeatureLog):
+        body = estimate.trajectory.world_from_body
+        nothing = _no_observations(NOMINAL, landmarks.ids)
+        return build_model(nothing, SE3.compose(body, _BODY_FROM_CAMERA), landmarks.mean, colours)
+    if len(problem.frames) != len(estimate.stamps_ns):
+        counts = f"{len(estimate.stamps_ns)} poses and {len(problem.frames)} frames"
+        raise InputError(
+            f"{problem.name}: expected a pose for each frame, found {counts}; take both from one run."
+        )
+    return build_model(
+        _on_map(observation_table(problem), landmarks.ids), estimate.world_from_body, landmarks.mean, colours
+    )
+
+
+def export_ply(estimate: PathAndMap, folder: Path) -> list[str]:
+    """Writes map.ply and path.ply; returns their names."""
+    prepare_folder(folder)
+    landmarks, std = raised(estimate.landmarks), standard_deviations(estimate.landmarks.cov)
+    write_ply(folder / MAP, landmarks.mean, colours_by_sigma(std), std)
+    at = estimate.trajectory.positions
+    steps = np.arange(max(len(at) - 1, 0))
+    edges = np.stack([steps, steps + 1], axis=1)
+    write_ply(folder / PATH, at, np.repeat(_PATH_COLOUR, len(at), axis=0), edges=edges)
+    return [MAP, PATH]
+
+
+def raised(landmarks: MapEstimate) -> MapEstimate:
+    """Landmarks of the plane at height 0, with no spread above it."""
+    more = (0, 3 - landmarks.mean.shape[1])
+    mean, cov = np.pad(landmarks.mean, ((0, 0), more)), np.pad(landmarks.cov, ((0, 0), more, more))
+    return replace(landmarks, mean=mean, cov=cov)
+
+
+def _on_map(table: ObservationTable, ids: NDArray[np.int64]) -> ObservationTable:
+    """The observations of the map's landmarks, with the places of these in the map."""
+    order = np.argsort(ids, kind="stable")
+    kept = np.isin(table.names, ids)[table.index]
+    place = order[np.searchsorted(ids, table.names[table.index[kept]], sorter=order)]
+    return ObservationTable(table.camera, table.steps[kept], place, ids, table.z[kept], table.cov_z[kept])
+
+
+def _no_observations(camera: Pinhole, ids: NDArray[np.int64]) -> ObservationTable:
+    none = np.zeros(0, dtype=np.intp)
+    return ObservationTable(camera, none, none, ids, np.zeros((0, 2)), np.zeros((0, 2, 2)))
+
+
+def write_ply(
+    path: Path,
+    points: Array,
+    colours: NDArray[np.uint8],
+    sigmas: Array | None = None,
+    edges: NDArray[np.int64] | None = None,
+) -> None:
+    """Writes points, and lines between them; the file appears under its name when complete.
+
+    Args:
+        path: the file.
+        points: (M, 3) [m].
+        colours: (M, 3) RGB.
+        sigmas: (M,) a further property sigma_m of each point.
+        edges: (L, 2) rows of the points that a line connects.
+
+    Raises:
+        InputError: a coordinate is not finite.
+    """
+    if not np.isfinite(points).all():
+        raise InputError(f"{path}: expected finite coordinates, found others in row {_first_bad(points)}.")
+    vertices = np.empty(len(points), dtype=_VERTEX + (_SIGMA if sigmas is not None else []))
+    for axis, name in enumerate("xyz"):
+        vertices[name] = points[:, axis]
+    for channel, name in enumerate(("red", "green", "blue")):
+        vertices[name] = colours[:, channel]
+    if sigmas is not None:
+        vertices["sigma_m"] = sigmas
+    lines = np.empty(0 if edges is None else len(edges), dtype=_EDGE)
+    if edges is not None:
+        lines["vertex1"], lines["vertex2"] = edges.T
+    with whole(path) as partial:
+        partial.write_bytes(_header(vertices, lines) + vertices.tobytes() + lines.tobytes())
+
+
+def read_ply(path: Path) -> dict[str, np.ndarray]:
+    """Elements by name as structured arrays, of a file that `write_ply` wrote.
+
+    Raises:
+        InputError: the file is missing or of another form.
+    """
+    try:
+        head, _, body = path.read_bytes().partition(b"end_header\n")
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}") from error
+    lines = head.decode("ascii", "replace").splitlines()
+    if lines[:2] != ["ply", "format binary_little_endian 1.0"]:
+        raise InputError(f"{path}: expected a binary little-endian PLY file.")
+    try:
+        return _elements(lines[2:], body)
+    except (LookupError, ValueError, TypeError, OverflowError) as error:
+        raise InputError(
+            f"{path}: expected the elements of a PLY file as its header says, found others."
+        ) from error
+
+
+def _elements(lines: list[str], body: bytes) -> dict[str, np.ndarray]:
+    """Of the lines of a header and of what follows it; nothing is allocated that the file does not hold."""
+    codes = {name: code for code, name in _NAMES.items()}
+    kinds: dict[str, tuple[int, list[tuple[str, str]]]] = {}
+    for line in lines:
+        word, *rest = line.split()
+        if word == "element":
+            kinds[rest[0]] = (int(rest[1]), [])
+        elif word == "property":
+            list(kinds.values())[-1][1].append((rest[1], codes[rest[0]]))
+    found, start = {}, 0
+    for name, (count, fields) in kinds.items():
+        if count < 0:
+            raise ValueError("a negative number of elements")
+        found[name] = np.frombuffer(body, dtype=fields, count=count, offset=start)
+        start += found[name].nbytes
+    return found
+
+
+def _header(vertices: np.ndarray, lines: np.ndarray) -> bytes:
+    rows = ["ply", "format binary_little_endian 1.0"]
+    for name, elements in (("vertex", vertices), ("edge", lines)):
+        if name == "edge" and not len(elements):
+            continue
+        rows.append(f"element {name} {len(elements)}")
+        rows += [f"property {_NAMES[code]} {field}" for field, code in _fields(elements)]
+    return "\n".join([*rows, "end_header", ""]).encode("ascii")
+
+
+def _fields(elements: np.ndarray) -> list[tuple[str, str]]:
+    names = elements.dtype.names or ()
+    return [(name, elements.dtype[name].str.replace("|", "")) for name in names]
+
+
+def _first_bad(points: Array) -> int:
+    return int(np.argmin(np.isfinite(points).all(axis=1)))

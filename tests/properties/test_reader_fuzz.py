@@ -25,7 +25,7 @@ from rbpf.sensors.readers import (
 )
 from rbpf.sensors.readers.stereo_tracks import read_stereo_tracks
 from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
-from rbpf.validation.ply import read_ply, write_ply
+from rbpf.validation.exports import read_ply, write_ply
 from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
 from rbpf.validation.simulation.point_worlds import DeskWorld
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot

@@ -13,10 +13,9 @@ from rbpf.runs.recordings import filter_robot_log as run
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.colmap.model import LEFT, RIGHT, build_model, from_colmap_pose, image_id, image_name
-from rbpf.validation.export import MAP, PATH, colmap_model, export_colmap, export_ply
+from rbpf.validation.exports import MAP, PATH, colmap_model, export_colmap, export_ply, read_ply, write_ply
 from rbpf.validation.gtsam.batch_problem import problem_of
 from rbpf.validation.gtsam.observations import observation_table, reprojection
-from rbpf.validation.ply import read_ply, write_ply
 from rbpf.validation.report.colours import colours_by_sigma, standard_deviations
 from tests.validation.camera_scenes import BENT, FISHEYE, STEREO, scene
 from tests.validation.linear_worlds import linear_log
