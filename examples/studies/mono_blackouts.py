@@ -261,7 +261,7 @@ def run_series(blackouts: Blackouts, out: Path, workers: int = 1) -> Series:
     starts = even_starts(round(blackouts.first_s * rate_hz), total - dark - within, blackouts.count)
     checkpoints = out / f"checkpoints_{blackouts.folder.name}"
     clean = undisturbed(sequence, blackouts, starts, checkpoints)
-    reference = clean.world_from_camera if sequence.truth is None else nearest_truth(sequence)
+    reference = clean.log.poses if sequence.truth is None else nearest_truth(sequence)
     jobs = [
         Job(
             blackouts.folder,
@@ -278,7 +278,7 @@ def run_series(blackouts: Blackouts, out: Path, workers: int = 1) -> Series:
     shutil.rmtree(checkpoints)
     place = SE3.translation(reference)
     way = np.array([np.linalg.norm(place[t + dark] - place[t]) for t in starts])
-    usual = pose_differences(clean.world_from_camera, reference)
+    usual = pose_differences(clean.log.poses, reference)
     return Series(blackouts.folder.name, rate_hz, blackouts.within_s, outcomes, way, *usual)
 
 
