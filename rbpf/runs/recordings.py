@@ -278,7 +278,7 @@ def open_features(
             )
         counted = np.array_equal(stamps, np.arange(stamps.size))
         front_end = NamedFrontEnd(log.camera, config, ns_per_stamp=1_000_000_000 if counted else 1)
-        system = StereoSlam(log.camera, config, front_end)
+        system = StereoSlam(log.camera, config, front_end=front_end)
     else:
         if not isinstance(log.camera, Pinhole):
             raise InputError(f"{log.name}: monocular SLAM needs a log of one camera, this is a stereo log")

@@ -15,7 +15,7 @@ from rbpf.sensors.landmark_management import NewLandmarkConfig
 from rbpf.sensors.readers import ImageFrame
 from rbpf.systems.stereo.config import MapConfig, OdometryConfig, StereoConfig, TriggerConfig
 from rbpf.systems.stereo.front_end import ImageFrontEnd
-from rbpf.systems.stereo.landmarks import AssociationGate, DescriptorLandmarks
+from rbpf.systems.stereo.landmarks import AssociationGate
 from rbpf.systems.stereo.slam import StereoSlam
 from rbpf.systems.system import Tracked, TrackingState
 from tests.systems.stereo_sequences import errors_m, filtered, flat, missing, pairs, swapped
@@ -271,7 +271,7 @@ class TestParts:
             return rows
 
         end.match = noted
-        slam = StereoSlam(sequence.rig, config, end)
+        slam = StereoSlam(sequence.rig, config, front_end=end)
         said = []
         for frame in sequence.frames():
             said.append(slam.take(frame))
@@ -292,11 +292,7 @@ class TestParts:
                 return np.zeros((2, 0), dtype=np.intp)
 
         sequence = pairs(5)
-        length, likelihood = ALWAYS.sift.length, ALWAYS.likelihood.build()
-        landmarks = DescriptorLandmarks(
-            sequence.rig, ALWAYS.map, ALWAYS.new_landmarks, length, likelihood, gate=Closed()
-        )
-        slam = StereoSlam(sequence.rig, ALWAYS, ImageFrontEnd(sequence.rig, ALWAYS, landmarks=landmarks))
+        slam = StereoSlam(sequence.rig, ALWAYS, gate=Closed())
         said = [slam.take(frame) for frame in sequence.frames()]
         assert sum(one.values["observed"] for one in said) == 0 and slam.map().ids.size > 10
 

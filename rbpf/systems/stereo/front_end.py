@@ -15,10 +15,11 @@ from typing import Any, ClassVar, Generic, final
 import numpy as np
 
 from rbpf.core.checkpoint import checked
-from rbpf.core.models import NULL
+from rbpf.core.models import NULL, Landmark
 from rbpf.errors import InputError
 from rbpf.motion.stereo_geometry import Matches
 from rbpf.sensors.camera import RectifiedStereo
+from rbpf.sensors.camera.points import CameraModel
 from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.sensors.features import FeatureExtractor, Sift
 from rbpf.sensors.readers import ImageFrame
@@ -26,6 +27,7 @@ from rbpf.sensors.stereo import StereoFeatures, StereoMatcher, match_frames
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.feature_cache import KEPT, CachedPair
 from rbpf.systems.stereo.landmarks import (
+    AssociationGate,
     DescriptorLandmarks,
     F,
     FeatureKind,
@@ -142,7 +144,10 @@ class ImageFrontEnd(FrontEnd[StereoFeatures]):
         rig: the cameras.
         config: all settings.
         extractor: finds and describes the keypoints of an image; None for SIFT as `config` has it.
-        landmarks: finds landmarks among the features; None for those by descriptors.
+        gate: which landmarks may be which feature; None for that of `config`.
+        model: how a landmark is measured; None for pixels of points in space.
+        landmark: its parametrisation; None for points in space.
+        landmarks: finds landmarks among the features; None for those by descriptors, with `gate`, `model` and `landmark`.
     """
 
     frames = (ImageFrame, CachedPair)
@@ -152,6 +157,9 @@ class ImageFrontEnd(FrontEnd[StereoFeatures]):
         rig: RectifiedStereo,
         config: StereoConfig,
         extractor: FeatureExtractor | None = None,
+        gate: AssociationGate | None = None,
+        model: CameraModel | None = None,
+        landmark: Landmark | None = None,
         landmarks: Landmarks[StereoFeatures] | None = None,
     ) -> None:
         self.rig, self.config = rig, config
@@ -159,7 +167,7 @@ class ImageFrontEnd(FrontEnd[StereoFeatures]):
         self.matcher = StereoMatcher(rig, extractor, config.pair)
         likelihood, length = config.likelihood.build(), extractor.length
         self.landmarks = landmarks or DescriptorLandmarks(
-            rig, config.map, config.new_landmarks, length, likelihood
+            rig, config.map, config.new_landmarks, length, likelihood, gate, model, landmark
         )
 
     def measure(self, frame: ImageFrame | CachedPair) -> tuple[Pair[StereoFeatures], str]:

@@ -15,7 +15,7 @@ import numpy as np
 
 from rbpf.core.checkpoint import checked, within
 from rbpf.core.filter import Filter, StepReport
-from rbpf.core.models import NULL, Part
+from rbpf.core.models import NULL, Landmark, Part
 from rbpf.core.particles import Estimate
 from rbpf.errors import InputError
 from rbpf.lie import SE3
@@ -23,12 +23,15 @@ from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.motion.odometry import CAMERA_PLANE, Odometry, OdometryMotion
 from rbpf.motion.stereo_vo import CandidateMotions, VisualOdometry
 from rbpf.sensors.camera import RectifiedStereo
+from rbpf.sensors.camera.points import CameraModel
 from rbpf.sensors.feature_log import FeatureFrame, FeatureLog
+from rbpf.sensors.features import FeatureExtractor
 from rbpf.sensors.readers import ImageFrame
 from rbpf.systems.map_estimate import MapEstimate, estimate_map
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.feature_cache import CachedPair
 from rbpf.systems.stereo.front_end import FrontEnd, ImageFrontEnd, NamedFrontEnd, Pair
+from rbpf.systems.stereo.landmarks import AssociationGate
 from rbpf.systems.stereo.motion_segmentation import camera_motion, contradicts, propagated
 from rbpf.systems.stereo.odometry import DeadReckoning
 from rbpf.systems.stereo.recovery import motion_for_update
@@ -59,6 +62,10 @@ class StereoSlam(System):
     Args:
         rig: the two cameras.
         config: all settings.
+        extractor: finds and describes the keypoints of an image; None for SIFT.
+        gate: which landmarks may be which feature; None for that of `config`.
+        model: how a landmark is measured; None for pixels of points in space.
+        landmark: its parametrisation; None for points in space.
         front_end: measures frames, and finds landmarks in them. None chooses by the first frame: images (or what was
             measured in them earlier), or pixels of landmarks that have names.
     """
@@ -110,13 +117,21 @@ class StereoSlam(System):
     space = SE3
 
     def __init__(
-        self, rig: RectifiedStereo, config: StereoConfig | None = None, front_end: FrontEnd[Any] | None = None
+        self,
+        rig: RectifiedStereo,
+        config: StereoConfig | None = None,
+        extractor: FeatureExtractor | None = None,
+        gate: AssociationGate | None = None,
+        model: CameraModel | None = None,
+        landmark: Landmark | None = None,
+        front_end: FrontEnd[Any] | None = None,
     ) -> None:
         self.rig, self.config = rig, config or StereoConfig()
         config = self.config
-        # Each of the parts that may be exchanged is named once, here or in the front end.
         self._front_ends: tuple[FrontEnd[Any], ...] = (
-            (ImageFrontEnd(rig, config), NamedFrontEnd(rig, config)) if front_end is None else (front_end,)
+            (ImageFrontEnd(rig, config, extractor, gate, model, landmark), NamedFrontEnd(rig, config))
+            if front_end is None
+            else (front_end,)
         )
         free = CAMERA_PLANE if config.dof == 3 else None
         added = np.repeat([config.odometry.std_added_rad, config.odometry.std_added_m], 3)
