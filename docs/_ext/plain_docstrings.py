@@ -38,9 +38,9 @@ def _paragraphs(lines: list[str]) -> Iterator[list[str]]:
 
 
 def _is_literal(paragraph: list[str], before: str) -> bool:
-    if any(_COLUMNS.search(line) for line in paragraph):
-        return not paragraph[0].startswith(" ")
-    return paragraph[0].startswith("    ") and not before.startswith(" ")
+    if paragraph[0].startswith("    "):
+        return not before.startswith(" ")
+    return not paragraph[0].startswith(" ") and any(_COLUMNS.search(line) for line in paragraph)
 
 
 def _escaped(line: str) -> str:
