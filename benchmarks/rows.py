@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from rbpf.core.filter import Filter
+from rbpf.maps.landmark_map import LandmarkMap
 
 GENERATIONS_BACK = 20
 
@@ -128,7 +129,9 @@ class Diversity:
         """Rate of resampling, distinct ancestors and the fraction of the map that is stored."""
         lineage = self.filter.lineage
         age = lineage.generation - self._kept[0]
-        store = self.filter.belief().map.store
+        landmark_map = self.filter.belief().map
+        assert isinstance(landmark_map, LandmarkMap)
+        store = landmark_map.store
         return (
             f"resampled {self.resampled}/{self.steps} steps, {lineage.distinct(self._kept[0])} distinct ancestors "
             f"{age} generations back, map stored/dense {store.stored_bytes / store.dense_bytes:.3f}"

@@ -15,7 +15,7 @@ import numpy as np
 import tyro
 
 from rbpf.sensors.camera import Pinhole
-from rbpf.sensors.readers import open_images
+from rbpf.sensors.readers import open_stereo
 from rbpf.validation.simulation.images import Imaging, Shutter
 from rbpf.validation.simulation.lab import LabDrive, TexturedLab, furnished
 from rbpf.validation.simulation.render import Renderer
@@ -58,7 +58,7 @@ def rendered(seed: int, noise_std: float, width: int, moments: int) -> Iterator[
 
 def recorded(folder: Path, moments: int) -> Iterator[Moment]:
     """A recording at times spread over it."""
-    sequence = open_images(folder)
+    sequence = open_stereo(folder)
     wanted = set(np.linspace(0, len(sequence) - 2, min(moments, len(sequence) - 1)).astype(int).tolist())
     for k, (frame, following) in enumerate(pairwise(sequence.frames())):
         if k in wanted and frame.right is not None:
@@ -69,7 +69,7 @@ class Sift:
     """Features of images, and which of them look alike."""
 
     def __init__(self) -> None:
-        self._sift, self._matcher = cv2.SIFT_create(nfeatures=0), cv2.BFMatcher()
+        self._sift, self._matcher = cv2.SIFT.create(nfeatures=0), cv2.BFMatcher()
 
     def features(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pixels (K, 2) and descriptors (K, 128)."""

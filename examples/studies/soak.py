@@ -23,6 +23,7 @@ from examples.studies.streams import CameraStream, RobotStream, Turnover
 from rbpf.core.filter import Filter
 from rbpf.core.models import Belief, NewLandmarks, Observations, Sensor
 from rbpf.lie import SE2, SE3
+from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.runs.folder import peak_memory_mb
 from rbpf.sensors.camera import Pinhole
 from rbpf.systems.mono.config import MonoConfig
@@ -145,6 +146,7 @@ def soak(
 
 def _window(filter_: Filter, frames: int, seconds: float, square: float) -> Window:
     landmark_map = filter_.belief().map
+    assert isinstance(landmark_map, LandmarkMap)
     return Window(
         frames=frames,
         ms_per_frame=1e3 * seconds,

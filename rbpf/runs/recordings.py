@@ -351,7 +351,7 @@ def filter_opened(
     return run
 
 
-def filter_robot_log(log: RobotLog, config: RangeBearingConfig) -> Run:
+def filter_robot_log(log: RobotLog, config: RangeBearingConfig) -> Run[RangeBearingSlam]:
     """A robot's log in memory, filtered to its end."""
     return filter_opened(open_robot_log(log, config))
 
@@ -381,7 +381,7 @@ def filter_images(
     checkpoint: Path | None = None,
     resume: bool = False,
     known_map: KnownMap | None = None,
-) -> Run:
+) -> Run[MonoSlam]:
     """A sequence of images, filtered to its end; errors as `open_mono` and `drive`."""
     opened = open_mono(sequence, known, config, known_map)
     return filter_opened(opened, listeners, checkpoint, config.checkpoint_every, resume)
@@ -393,6 +393,6 @@ def filter_pairs(
     listeners: Iterable[Listener] = (),
     checkpoint: Path | None = None,
     resume: bool = False,
-) -> Run:
+) -> Run[StereoSlam]:
     """A sequence of pairs of images, or of what was measured in them, filtered to its end; errors as `drive`."""
     return filter_opened(open_pairs(sequence, config), listeners, checkpoint, config.checkpoint_every, resume)

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
@@ -34,8 +34,11 @@ class Source(Protocol):
         """Frames from number `start` on, each with a `stamp_ns`, as the system's `take` expects them."""
 
 
+SystemT = TypeVar("SystemT", bound=System)
+
+
 @dataclass(eq=False)
-class Run:
+class Run(Generic[SystemT]):
     """What a system said of a recording.
 
     Attributes:
@@ -50,7 +53,7 @@ class Run:
     """
 
     source: Source
-    system: System
+    system: SystemT
     truth: RunTruth | None = None
     expected: int | None = None
     log: FrameLog = field(init=False)

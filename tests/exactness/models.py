@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -106,10 +106,13 @@ def single(z: np.ndarray, cov: np.ndarray | float, model: ObservationModel, **op
     return Observations(np.atleast_1d(z)[None], np.atleast_2d(cov)[None], model, **options)
 
 
-def known(array: np.ndarray | None) -> np.ndarray:
+Known = TypeVar("Known")
+
+
+def known(value: Known | None) -> Known:
     """What is there in this test, though not in every record or group."""
-    assert array is not None
-    return array
+    assert value is not None
+    return value
 
 
 @dataclass

@@ -20,6 +20,7 @@ from rbpf.motion.stereo_vo import (
     fit,
     trimming,
 )
+from rbpf.sensors.camera import RectifiedStereo
 from tests.motion.stereo_pairs import (
     CAR,
     FAR_ROAD,
@@ -46,6 +47,7 @@ def estimated(matches: Matches, seed: int = 0, **options) -> MotionEstimate:
 def adjusted_by_scipy(matches: Matches, start: np.ndarray):
     """Bundle adjustment of both frames in another parametrisation: motion and points in space, no elimination."""
     camera, count = matches.camera, len(matches)
+    assert isinstance(camera, RectifiedStereo)
     whites = [np.linalg.inv(np.linalg.cholesky(cov)) for cov in (matches.cov_prev, matches.cov_now)]
 
     def misses(x):

@@ -12,6 +12,7 @@ from rbpf.core.linearisation import information, innovation_covariance, linearis
 from rbpf.core.models import Observations, Part, Records
 from rbpf.core.particles import Information, Prior
 from rbpf.core.proposals import PriorProposal
+from rbpf.core.resampling import EssTriggered, Systematic
 from rbpf.lie import SE3
 from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.maps.landmark_map import LandmarkMap
@@ -146,7 +147,14 @@ def far_off(camera, model, compiled: bool) -> np.ndarray:
     start[2, 6] = 2.0
     held = LandmarkMap(SE3, compiled=compiled)
     filter_ = Filter(
-        OdometryMotion(SE3), Scripted(), held, PriorProposal(), n=3, rng=np.random.default_rng(0), start=start
+        OdometryMotion(SE3),
+        Scripted(),
+        held,
+        PriorProposal(),
+        EssTriggered(Systematic(), 0.0),
+        3,
+        np.random.default_rng(0),
+        start,
     )
     if isinstance(model, CameraPoint):
         mean, landmark = np.broadcast_to(points, (3, 4, 3)), Point(3)
@@ -161,7 +169,6 @@ def far_off(camera, model, compiled: bool) -> np.ndarray:
         landmark = InverseDepth()
     ids = held.add_records(records, landmark)
     groups = [Observations(z, np.tile(np.eye(2), (4, 1, 1)), model, ids=ids)]
-    filter_.resampler.threshold = 0.0
     filter_.step(Frame(groups), Odometry(SE3.identity(), 1e-12 * np.eye(6)))
     records = held.read(ids)
     assert np.isfinite(records.mean).all() and np.isfinite(records.cov).all()

@@ -187,15 +187,15 @@ def _log_pair(rr: Any, stream: Any, run: Run, seen: Mapping[str, np.ndarray], po
     for kind, (name, colour) in FEATURES.items():
         pixels = rr.Points2D(seen["z"][seen["kind"] == kind, :2] + 0.5, colors=[colour])
         stream.log(f"world/camera/image/{name}", pixels)
-    rig = run.system.rig  # type: ignore[attr-defined]
+    rig = run.system.rig
     places = SE3.transform(pose, rig.triangulate(seen["z"][seen["kind"] == FeatureKind.LANDMARK]))
     stream.log("world/seen", rr.Points3D(places, colors=[FOUND], radii=0.005))
 
 
 DRAWN = {
-    "mono": Drawn(lambda run: run.system.camera, _log_search, ("found", "lost")),  # type: ignore[attr-defined]
+    "mono": Drawn(lambda run: run.system.camera, _log_search, ("found", "lost")),
     "stereo": Drawn(
-        lambda run: run.system.rig.camera,  # type: ignore[attr-defined]
+        lambda run: run.system.rig.camera,
         _log_pair,
         ("features", "agreeing", "observed"),
     ),

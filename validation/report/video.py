@@ -123,7 +123,7 @@ def picture_of_search(run: Run, t: int, frame: ImageFrame) -> np.ndarray:
     )
     alarm = "FOUND AGAIN" if log["relocalised"][t] else "LOST" if log["lost"][t] else ""
     alarm = f"NO IMAGE {alarm}" if frame.image is None else alarm
-    camera = run.system.camera  # type: ignore[attr-defined]
+    camera = run.system.camera
     return draw_search(frame.image, log.observed(t), Caption(text, alarm), (camera.width, camera.height))
 
 
@@ -184,7 +184,7 @@ def picture_of_pair(run: Run, t: int, frame: ImageFrame) -> np.ndarray:
     alarm = "" if t == 0 or log["agreeing"][t] else "NO MOTION FOUND"
     if frame.image is None or frame.right is None:
         alarm = "NO PAIR"
-    camera = run.system.rig.camera  # type: ignore[attr-defined]
+    camera = run.system.rig.camera
     return draw_pair(frame.image, log.observed(t), Caption(text, alarm), (camera.width, camera.height))
 
 

@@ -63,7 +63,7 @@ def _rows(run: Run, cpu: np.ndarray) -> list[Row]:
             f"{held} ({points} points, {rays} rays)", float(held), held >= LANDMARKS),
         Row("Fig. 6", "observations per frame", f"{LEAST} to {MOST}",
             f"mean {found:.1f}, {within:.0%} of the frames within", found, LEAST <= found <= MOST),
-        Row("Fig. 6", f"fraction of frames under 33 ms ({run.source.camera.width} px wide)", "all (30 Hz)",
+        Row("Fig. 6", f"fraction of frames under 33 ms ({run.system.camera.width} px wide)", "all (30 Hz)",
             f"{fraction:.1%}; {median}; {own}", fraction, fraction == 1.0),
         Row("Fig. 6", "frames in which the camera was lost", "none told", f"{lost}", float(lost), lost == 0),
     ]  # fmt: skip

@@ -124,7 +124,7 @@ def _draw_map(shown: Shown) -> Any:
 def _draw_image(shown: Shown, run: Run) -> Any:
     from matplotlib.figure import Figure
 
-    camera = run.source.camera
+    camera = run.system.camera
     found, searched = (run.log[name][shown.frame] for name in ("found", "searched"))
     text = f"frame {shown.frame}   found {found} of {searched}   (Fig. 8)"
     picture = draw_search(shown.image, shown.sighting, Caption(text, ""), (camera.width, camera.height))
