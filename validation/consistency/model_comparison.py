@@ -13,7 +13,6 @@ carry, with s for its error.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -124,6 +123,8 @@ def compare_evidence(
         InputError: the configurations are of different systems, do not fit the data, or one has no evidence because
             its likelihood is not a density.
     """
+    from joblib import Parallel, delayed
+
     if type(config_a) is not type(config_b):
         raise InputError(
             "two configurations of different systems do not explain the same data: compare two of one"
@@ -132,9 +133,25 @@ def compare_evidence(
         raise InputError(f"log-evidences are compared over 2 seeds or more, got {len(seeds)}")
     for name, config in (("first", config_a), ("second", config_b)):
         _require_density(config, name)
-    _require_same_data(config_a, config_b)
+    # What moves the particles of a stereo filter is given, not explained: both must be given the same.
+    if isinstance(config_a, StereoConfig) and isinstance(config_b, StereoConfig):
+        if config_a.odometry.split != "apart" or config_b.odometry.split != "apart":
+            raise InputError(
+                "by default stereo odometry moves the particles by the very pixels that the map then explains, so that "
+                "an evidence would count them twice; set odometry.split to apart in both configurations"
+            )
+        for name in ("odometry", "trigger", "dof"):
+            if getattr(config_a, name) != getattr(config_b, name):
+                raise InputError(
+                    f"two stereo configurations that differ in {name} do not explain the same data: what odometry says "
+                    "is given to the filter, and differs between them"
+                )
     jobs = [(replace(config, seed=seed), data) for config in (config_a, config_b) for seed in seeds]
-    logs = _in_order(jobs, workers, on_run or (lambda _done, _total: None))
+    logs: list[float] = []
+    for value in Parallel(n_jobs=workers, return_as="generator")(delayed(_evidence)(*job) for job in jobs):
+        logs.append(value)
+        if on_run is not None:
+            on_run(len(logs), len(jobs))
     return evidence_difference(logs[: len(seeds)], logs[len(seeds) :])
 
 
@@ -190,38 +207,11 @@ def _require_density(config: Config, name: str) -> None:
     )
 
 
-def _require_same_data(config_a: Config, config_b: Config) -> None:
-    """What moves the particles of a stereo filter is given, not explained: both must be given the same."""
-    if not (isinstance(config_a, StereoConfig) and isinstance(config_b, StereoConfig)):
-        return
-    if config_a.odometry.split != "apart" or config_b.odometry.split != "apart":
-        raise InputError(
-            "by default stereo odometry moves the particles by the very pixels that the map then explains, so that "
-            "an evidence would count them twice; set odometry.split to apart in both configurations"
-        )
-    for name in ("odometry", "trigger", "dof"):
-        if getattr(config_a, name) != getattr(config_b, name):
-            raise InputError(
-                f"two stereo configurations that differ in {name} do not explain the same data: what odometry says "
-                "is given to the filter, and differs between them"
-            )
-
-
 def _config_of(record: RunFolder) -> RangeBearingConfig | StereoConfig:
     path = record.folder / "config.yaml"
     if record.system == "stereo":
         return load_settings(StereoConfig, "stereo", path, (), {})
     return load_settings(RangeBearingConfig, "range-bearing", path, (), {})
-
-
-def _in_order(jobs: list[tuple[Any, Data]], workers: int, told: Callable[[int, int], None]) -> list[float]:
-    from joblib import Parallel, delayed
-
-    found = []
-    for value in Parallel(n_jobs=workers, return_as="generator")(delayed(_evidence)(*job) for job in jobs):
-        found.append(value)
-        told(len(found), len(jobs))
-    return found
 
 
 def _evidence(config: Config, data: Data) -> float:

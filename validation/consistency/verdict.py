@@ -79,7 +79,8 @@ def judge(accuracy: str, statistics: Sequence[Statistic], independent: Sequence[
             if len(against) > 1
             else ""
         )
-        daring = [s for s in against if _claims_too_much(s)]
+        # Those that say that it errs more than it claims.
+        daring = [s for s in against if (s.high < s.zone[0]) == (s.kind == "share")]
         worst = max(daring or against, key=_distance)
         leaning: Leaning = "over-confident" if daring else "cautious"
         return Verdict(accuracy, "do not trust", described(worst) + more, leaning)
@@ -88,7 +89,12 @@ def judge(accuracy: str, statistics: Sequence[Statistic], independent: Sequence[
     if support:
         return Verdict(accuracy, "trust", described(support[0]))
     if judging:
-        reason = f"{described(judging[0])}; {_why_open(judging[0])}"
+        first = judging[0]
+        zone = first.zone if first.kind != "ratio" else tuple(map(_root, first.zone))
+        reason = (
+            f"{described(first)}; the run is worth only {first.samples:.0f} independent samples of it, too few to say "
+            f"that this lies within {_number(max(zone[0], 0.0))} to {_number(zone[1])}, or that it does not"
+        )
     elif statistics:
         reason = (
             "nothing contradicts it, but a filter that agrees with itself can still be on a wrong path; compare it "
@@ -111,34 +117,18 @@ def described(statistic: Statistic) -> str:
         return f"{statistic.name}: {100 * value:.0f} % ({100 * low:.0f} to {100 * high:.0f})"
     times, least, most = (_number(_root(ratio)) for ratio in (value, low, high))
     found = f"errors are {times} times as large as it claims ({least} to {most}, where 1 is right)"
-    return f"{statistic.name}: {found}, {_side(value)}"
+    if value <= 0.0:
+        side = "far too large"
+    elif abs(np.log(_root(value))) <= np.log(1.1):
+        side = "right within a tenth"
+    else:
+        side = f"too {'small' if value > 1.0 else 'large'}"
+    return f"{statistic.name}: {found}, its standard deviations are {side}"
 
 
 def _root(ratio: float) -> float:
     """Of variances to one of standard deviations, which is what a reader thinks in."""
     return float(np.sqrt(max(ratio, 0.0)))
-
-
-def _side(ratio: float) -> str:
-    if ratio <= 0.0:
-        return "its standard deviations are far too large"
-    if abs(np.log(_root(ratio))) <= np.log(1.1):
-        return "its standard deviations are right within a tenth"
-    return f"its standard deviations are too {'small' if ratio > 1.0 else 'large'}"
-
-
-def _why_open(statistic: Statistic) -> str:
-    zone = statistic.zone if statistic.kind != "ratio" else tuple(map(_root, statistic.zone))
-    return (
-        f"the run is worth only {statistic.samples:.0f} independent samples of it, too few to say that this lies "
-        f"within {_number(max(zone[0], 0.0))} to {_number(zone[1])}, or that it does not"
-    )
-
-
-def _claims_too_much(statistic: Statistic) -> bool:
-    """Whether one that contradicts the filter says that it errs more than it claims."""
-    below = statistic.high < statistic.zone[0]
-    return below if statistic.kind == "share" else not below
 
 
 def _distance(statistic: Statistic) -> float:

@@ -9,7 +9,7 @@ from rbpf.validation.simulation import textures
 from rbpf.validation.simulation.limits import check_counts, check_not_negative, check_positive
 from rbpf.validation.simulation.paths import Wave, eased, frame_seconds, looking, shaken
 from rbpf.validation.simulation.point_worlds import DeskWorld
-from rbpf.validation.simulation.textured_scene import Chessboard, Furniture, TexturedScene, apart, stamps_ns
+from rbpf.validation.simulation.textured_scene import Furniture, TexturedScene, apart, stamps_ns
 
 SHEET_M = 0.0001
 """Sheets of paper lie this much above each other."""
@@ -96,11 +96,43 @@ class TexturedDesk:
     def build(self, rng: np.random.Generator) -> TexturedScene:
         """Draws the textures, the things and the path."""
         path = self._walk().build(rng).world_from_camera
+        # What is round the desk's top.
+        x, y = 0.5 * np.array(self.size_m)
+        room = np.array([[-x - 2.0, -y - 2.5, -DESK_M], [x + 2.0, y + 0.01, 2.6 - DESK_M]])
+        around = Furniture(rng, COARSE * self.texel_m, self.contrast)
+        around.shell(room, textures.wallpaper, textures.carpet, textures.plaster)
+        block = (*self.size_m, DESK_M - SHEET_M)
+        around.box(np.array([0.0, 0.0, -DESK_M]), 0.0, block, textures.wood, textures.wood)
+        for fraction in (0.5 + (np.arange(4) - 1.5) * 0.35 * x / (x + 2.0)).tolist():
+            size = (rng.uniform(0.25, 0.5, 2) * x).tolist()
+            around.hang(room, 0, (fraction, rng.uniform(0.45, 0.55)), size, textures.picture)
+        # The top, papers, and the chessboard on top of them.
         desk = Furniture(rng, self.texel_m, self.contrast)
-        room = self._room(rng)
-        board = self._lay(desk, rng)
-        self._stand(desk, rng)
-        rectangles = room.rectangles + desk.rectangles
+        desk.flat(np.zeros(3), 0.0, self.size_m, textures.wood)
+        for k in range(self.papers):
+            sheet, paint = PAPERS[k % len(PAPERS)]
+            middle = rng.uniform(-0.45, 0.45, 2) * self.size_m
+            desk.flat(np.array([*middle, (k + 1) * SHEET_M]), rng.uniform(-np.pi, np.pi), sheet, paint)
+        board, taken = [], []
+        if self.board is not None:
+            top = np.array([0.0, 0.0, (self.papers + 1) * SHEET_M])
+            board.append(desk.board(top, self.board, self.square_m))
+            reach = 0.5 * self.square_m * float(np.hypot(*self.board)) + BOARD_CLEAR_M
+            taken.append((np.zeros(2), reach))
+
+        def draw() -> tuple[np.ndarray, float]:
+            return rng.uniform(-0.42, 0.42, 2) * self.size_m, rng.uniform(0.06, 0.16)
+
+        # Books and boxes.
+        for middle, radius in apart(draw, self.things, taken):
+            foot, yaw = np.array([*middle, 0.0]), rng.uniform(-np.pi, np.pi)
+            turn = rng.uniform(0.6, 1.0)
+            is_book = rng.random() < BOOKS
+            height = rng.uniform(0.02, 0.06) if is_book else rng.uniform(0.06, HIGHEST_M)
+            extent = (2.0 * radius * np.cos(turn), 2.0 * radius * np.sin(turn), height)
+            prints = (textures.picture, textures.edges_of_pages) if is_book else (textures.carton,) * 2
+            desk.box(foot, yaw, extent, *prints)
+        rectangles = around.rectangles + desk.rectangles
         return TexturedScene("desk", stamps_ns(self.frames, self.rate_hz), path, rectangles, board)
 
     def _walk(self) -> DeskWorld:
@@ -120,50 +152,6 @@ class TexturedDesk:
             turn_rad_s=self.turn_rad_s,
             start_s=self.start_s,
         )
-
-    def _room(self, rng: np.random.Generator) -> Furniture:
-        """What is round the desk's top."""
-        x, y = 0.5 * np.array(self.size_m)
-        room = np.array([[-x - 2.0, -y - 2.5, -DESK_M], [x + 2.0, y + 0.01, 2.6 - DESK_M]])
-        furniture = Furniture(rng, COARSE * self.texel_m, self.contrast)
-        furniture.shell(room, textures.wallpaper, textures.carpet, textures.plaster)
-        block = (*self.size_m, DESK_M - SHEET_M)
-        furniture.box(np.array([0.0, 0.0, -DESK_M]), 0.0, block, textures.wood, textures.wood)
-        middle = (0.5 + (np.arange(4) - 1.5) * 0.35 * x / (x + 2.0)).tolist()
-        for fraction in middle:
-            size = (rng.uniform(0.25, 0.5, 2) * x).tolist()
-            furniture.hang(room, 0, (fraction, rng.uniform(0.45, 0.55)), size, textures.picture)
-        return furniture
-
-    def _lay(self, desk: Furniture, rng: np.random.Generator) -> list[Chessboard]:
-        """The top, papers, and the chessboard on top of them."""
-        desk.flat(np.zeros(3), 0.0, self.size_m, textures.wood)
-        for k in range(self.papers):
-            size, paint = PAPERS[k % len(PAPERS)]
-            middle = rng.uniform(-0.45, 0.45, 2) * self.size_m
-            desk.flat(np.array([*middle, (k + 1) * SHEET_M]), rng.uniform(-np.pi, np.pi), size, paint)
-        if self.board is None:
-            return []
-        return [desk.board(np.array([0.0, 0.0, (self.papers + 1) * SHEET_M]), self.board, self.square_m)]
-
-    def _stand(self, desk: Furniture, rng: np.random.Generator) -> None:
-        """Books and boxes."""
-        taken = []
-        if self.board is not None:
-            reach = 0.5 * self.square_m * float(np.hypot(*self.board)) + BOARD_CLEAR_M
-            taken.append((np.zeros(2), reach))
-
-        def draw() -> tuple[np.ndarray, float]:
-            return rng.uniform(-0.42, 0.42, 2) * self.size_m, rng.uniform(0.06, 0.16)
-
-        for middle, radius in apart(draw, self.things, taken):
-            foot, yaw = np.array([*middle, 0.0]), rng.uniform(-np.pi, np.pi)
-            turn = rng.uniform(0.6, 1.0)
-            is_book = rng.random() < BOOKS
-            height = rng.uniform(0.02, 0.06) if is_book else rng.uniform(0.06, HIGHEST_M)
-            size = (2.0 * radius * np.cos(turn), 2.0 * radius * np.sin(turn), height)
-            prints = (textures.picture, textures.edges_of_pages) if is_book else (textures.carton,) * 2
-            desk.box(foot, yaw, size, *prints)
 
 
 SHAKE_HZ = 0.3, 1.5
@@ -230,7 +218,17 @@ class TexturedRoom:
 
     def build(self, rng: np.random.Generator) -> TexturedScene:
         """Draws the textures, the things and the path."""
-        path = self._path(rng)
+        # Walked in a circle, looking outwards, with a hand that shakes.
+        time = eased(frame_seconds(self.frames, self.rate_hz), self.start_s)
+        turn = self.speed_m_s * time / self.radius_m
+        level = np.full_like(turn, self.eye_m)
+        eye = np.stack([self.radius_m * np.cos(turn), self.radius_m * np.sin(turn), level], axis=-1)
+        heading = turn + 0.5 * np.pi - np.deg2rad(self.gaze_deg)
+        drop = np.full_like(turn, -np.tan(np.deg2rad(self.drop_deg)))
+        bound = np.array([np.deg2rad(self.shake_deg)] * 3 + [self.shake_m] * 3)
+        direction = np.stack([np.cos(heading), np.sin(heading), drop], axis=-1)
+        path = shaken(looking(eye, direction), Wave.random(bound, SHAKE_HZ, rng), time)
+        # The room, and pictures on its walls.
         half = 0.5 * np.array(self.size_m[:2])
         room = np.array([[*-half, 0.0], [*half, self.size_m[2]]])
         furniture = Furniture(rng, self.texel_m, self.contrast)
@@ -239,12 +237,6 @@ class TexturedRoom:
             for k in range(self.pictures):
                 place = ((k + rng.uniform(0.35, 0.65)) / self.pictures, rng.uniform(0.3, 0.55))
                 furniture.hang(room, wall, place, rng.uniform(0.35, 0.8, 2).tolist(), textures.picture)
-        self._stand(furniture, half, rng)
-        stamps = stamps_ns(self.frames, self.rate_hz)
-        return TexturedScene("room", stamps, path, furniture.rectangles)
-
-    def _stand(self, furniture: Furniture, half: np.ndarray, rng: np.random.Generator) -> None:
-        """Boxes along the walls."""
 
         def draw() -> tuple[np.ndarray, float]:
             radius = rng.uniform(0.2, 0.5 * ALONG_M)
@@ -253,20 +245,11 @@ class TexturedRoom:
             place[wall] = np.copysign(half[wall] - radius, place[wall])
             return place, radius
 
+        # Boxes along the walls.
         for middle, radius in apart(draw, self.things, []):
             side = radius * np.sqrt(2.0)
             size = (side, side, rng.uniform(0.3, 0.6 * self.size_m[2]))
             foot, yaw = np.array([*middle, 0.0]), rng.uniform(-0.5, 0.5)
             furniture.box(foot, yaw, size, textures.carton, textures.carton)
-
-    def _path(self, rng: np.random.Generator) -> np.ndarray:
-        """(T, 7) poses."""
-        time = eased(frame_seconds(self.frames, self.rate_hz), self.start_s)
-        turn = self.speed_m_s * time / self.radius_m
-        level = np.full_like(turn, self.eye_m)
-        eye = np.stack([self.radius_m * np.cos(turn), self.radius_m * np.sin(turn), level], axis=-1)
-        heading = turn + 0.5 * np.pi - np.deg2rad(self.gaze_deg)
-        drop = np.full_like(turn, -np.tan(np.deg2rad(self.drop_deg)))
-        bound = [np.deg2rad(self.shake_deg)] * 3 + [self.shake_m] * 3
-        direction = np.stack([np.cos(heading), np.sin(heading), drop], axis=-1)
-        return shaken(looking(eye, direction), Wave.random(np.array(bound), SHAKE_HZ, rng), time)
+        stamps = stamps_ns(self.frames, self.rate_hz)
+        return TexturedScene("room", stamps, path, furniture.rectangles)

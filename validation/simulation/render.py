@@ -9,6 +9,8 @@ from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole
 from rbpf.validation.simulation.textured_scene import Rectangle, rays_to_sides, sides
 
+SIDES = "corner", "across", "down"
+
 NEAR_M = 1e-3
 """What is nearer to the camera's plane is not seen."""
 
@@ -36,7 +38,14 @@ class Renderer:
         px = np.stack([columns, rows], axis=-1)
         self._uv = camera.unproject(px)
         self._slope = np.ascontiguousarray(camera.unproject_jacobian(px)).reshape(*px.shape[:2], 4)
-        self._tiles = _tile_bounds(self._uv, self._slope, raster_kernel.TILE)
+        # Least and greatest u and v (J, I, 4) of the pixels in each tile, out to their borders.
+        reach = 0.5 * np.abs(self._slope).reshape(*self._uv.shape[:2], 2, 2).sum(axis=-1)
+        around, side = np.concatenate([self._uv - reach, self._uv + reach], axis=-1), raster_kernel.TILE
+        tops, lefts = range(0, camera.height, side), range(0, camera.width, side)
+        tiles = [
+            _extent(around[y : y + side, x : x + side].reshape(1, -1, 2))[0] for y in tops for x in lefts
+        ]
+        self._tiles = np.array(tiles).reshape(len(tops), len(lefts), 4)
         self._view = _extent(self._tiles.reshape(1, -1, 2, 2).swapaxes(2, 3).reshape(1, -1, 2))[0]
         self._sides = sides(rectangles)
         sheets = {id(r.texture): r.texture for r in rectangles}
@@ -44,7 +53,9 @@ class Renderer:
         self._sheet = np.array([place[id(r.texture)] for r in rectangles], dtype=np.int64)
         self._gain = np.array([r.gain for r in rectangles])
         self._levels, self._texels = _packed([_pyramid(texture) for texture in sheets.values()])
-        self._corners = np.array([_corners(r) for r in rectangles])
+        corner, across, down = (np.array([getattr(r, side) for r in rectangles]) for side in SIDES)
+        # (S, 4, 3) in order round each rectangle.
+        self._corners = np.stack([corner, corner + across, corner + across + down, corner + down], axis=1)
 
     def image(self, world_from_camera: np.ndarray) -> np.ndarray:
         """Grey levels (H, W) float32 of a picture taken at poses (7,), or (K, 7) of a moving camera.
@@ -120,21 +131,6 @@ def _extent(uv: np.ndarray) -> np.ndarray:
     low = np.where(np.isnan(uv), np.inf, uv).min(axis=1)
     high = np.where(np.isnan(uv), -np.inf, uv).max(axis=1)
     return np.stack([low[:, 0], high[:, 0], low[:, 1], high[:, 1]], axis=-1)
-
-
-def _tile_bounds(uv: np.ndarray, slope: np.ndarray, side: int) -> np.ndarray:
-    """(J, I, 4) least and greatest u and v of the pixels in each tile, out to their borders."""
-    reach = 0.5 * np.abs(slope).reshape(*uv.shape[:2], 2, 2).sum(axis=-1)
-    around = np.concatenate([uv - reach, uv + reach], axis=-1)
-    rows, columns = range(0, uv.shape[0], side), range(0, uv.shape[1], side)
-    tiles = [_extent(around[y : y + side, x : x + side].reshape(1, -1, 2))[0] for y in rows for x in columns]
-    return np.array(tiles).reshape(len(rows), len(columns), 4)
-
-
-def _corners(rectangle: Rectangle) -> np.ndarray:
-    """(4, 3) in order round the rectangle."""
-    corner, across, down = rectangle.corner, rectangle.across, rectangle.down
-    return np.array([corner, corner + across, corner + across + down, corner + down])
 
 
 def _pyramid(texture: np.ndarray) -> list[np.ndarray]:
