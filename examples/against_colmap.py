@@ -6,7 +6,7 @@ The reconstruction shares the images and the calibration with the filter and not
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from rbpf.runs.path_and_map import PathAndMap
+from rbpf.runs.reading import PathAndMap
 from rbpf.runs.recordings import MonoRecording, filter_recording
 from rbpf.sensors.camera import Pinhole
 from rbpf.systems.mono.config import MonoConfig

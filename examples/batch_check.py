@@ -11,7 +11,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from rbpf.runs.path_and_map import PathAndMap
+from rbpf.runs.reading import PathAndMap
 from rbpf.runs.recordings import RobotRecording, filter_recording
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.gtsam.robot import solve

@@ -24,8 +24,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
 from rbpf.runs.files import prepare_folder, whole
 from rbpf.runs.measurement_files import OBSERVATIONS
-from rbpf.runs.path_and_map import PathAndMap
-from rbpf.runs.reading import RunFolder
+from rbpf.runs.reading import PathAndMap, RunFolder
 from rbpf.runs.trajectory import write_kitti, write_tum
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureLog

@@ -17,8 +17,8 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.lie import Array
 from rbpf.runs.alignment import Alignment
-from rbpf.runs.path_and_map import PathAndMap
 from rbpf.runs.plots import COLOURS, new_axes, save_figures
+from rbpf.runs.reading import PathAndMap
 from rbpf.runs.recordings import (
     MonoRecording,
     StereoRecording,

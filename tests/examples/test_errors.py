@@ -24,7 +24,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.folder import write_trajectory
 from rbpf.runs.measurement_files import write_measurements
-from rbpf.runs.path_and_map import PathAndMap
+from rbpf.runs.reading import PathAndMap
 from rbpf.runs.recordings import filter_features
 from rbpf.runs.trajectory import Trajectory
 from rbpf.runs.truth import RunTruth, write_truth

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rbpf.runs.path_and_map import PathAndMap
+from rbpf.runs.reading import PathAndMap
 from rbpf.runs.recordings import filter_robot_log as run
 from rbpf.sensors.readers import open_log
 from rbpf.systems.range_bearing.config import RangeBearingConfig

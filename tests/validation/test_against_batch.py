@@ -13,7 +13,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.folder import write_map, write_run, write_summary, write_trajectory
 from rbpf.runs.measurement_files import write_measurements
-from rbpf.runs.path_and_map import PathAndMap
+from rbpf.runs.reading import PathAndMap
 from rbpf.runs.recordings import filter_features
 from rbpf.runs.recordings import filter_robot_log as run
 from rbpf.systems.map_estimate import MapEstimate

@@ -7,7 +7,7 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.runs.path_and_map import PathAndMap
+from rbpf.runs.reading import PathAndMap
 from rbpf.runs.trajectory import Trajectory
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.feature_log import CameraTruth

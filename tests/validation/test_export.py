@@ -8,7 +8,7 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.runs.path_and_map import PathAndMap
+from rbpf.runs.reading import PathAndMap
 from rbpf.runs.recordings import filter_robot_log as run
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.range_bearing.config import RangeBearingConfig

@@ -8,9 +8,8 @@ from typing import Any, final
 import numpy as np
 
 from rbpf.errors import InputError
-from rbpf.runs.path_and_map import PathAndMap
 from rbpf.runs.provenance import read_config
-from rbpf.runs.reading import RunFolder
+from rbpf.runs.reading import PathAndMap, RunFolder
 from rbpf.sensors.readers import ImageSequence, Topics, open_images, open_stereo
 from rbpf.validation.colmap.compare import ColmapComparison, compare_with_path, compare_with_truth
 from rbpf.validation.colmap.reconstruct import ReconstructionOptions, reconstruct

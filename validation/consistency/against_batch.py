@@ -21,8 +21,7 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import Array
-from rbpf.runs.path_and_map import PathAndMap
-from rbpf.runs.reading import RunFolder
+from rbpf.runs.reading import PathAndMap, RunFolder
 from rbpf.runs.run import Run
 from rbpf.validation.gtsam.batch_problem import (
     Fit,

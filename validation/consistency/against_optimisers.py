@@ -15,8 +15,7 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.runs.measurement_files import read_robot_measurements
-from rbpf.runs.path_and_map import PathAndMap
-from rbpf.runs.reading import FilteredPath, RunFolder
+from rbpf.runs.reading import FilteredPath, PathAndMap, RunFolder
 from rbpf.runs.trajectory import in_space
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.validation.colmap.against_colmap import AgainstColmap, compare_folder_with_colmap

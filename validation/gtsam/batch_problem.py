@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rbpf.errors import InputError
 from rbpf.lie import Array
 from rbpf.runs.measurement_files import OBSERVATIONS, read_measurements
-from rbpf.runs.path_and_map import PathAndMap
+from rbpf.runs.reading import PathAndMap
 from rbpf.runs.run import Run
 from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.feature_log import FeatureLog

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
-from rbpf.runs.path_and_map import PathAndMap
+from rbpf.runs.reading import PathAndMap
 from rbpf.systems.map_estimate import MapEstimate
 
 COLUMNS = ("distances_m", "sigmas", "kullback_leibler", "bhattacharyya", "sigma_ratio")

@@ -10,8 +10,7 @@ from typing import Any
 
 from rbpf.errors import InputError
 from rbpf.runs.alignment import Similarity
-from rbpf.runs.path_and_map import PathAndMap
-from rbpf.runs.reading import RunFolder
+from rbpf.runs.reading import PathAndMap, RunFolder
 from rbpf.runs.trajectory import Trajectory, associate, in_space, read_tum
 from rbpf.runs.truth import LEAST, TRUTH, RunTruth
 from rbpf.systems.map_estimate import MapEstimate

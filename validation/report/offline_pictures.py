@@ -6,9 +6,8 @@ from typing import Any
 import numpy as np
 
 from rbpf.lie import Array
-from rbpf.runs.path_and_map import PathAndMap
 from rbpf.runs.plots import COLOURS, Views, label, new_axes, outline, save_figures
-from rbpf.runs.reading import RunFolder
+from rbpf.runs.reading import PathAndMap, RunFolder
 from rbpf.runs.trajectory import in_space
 from rbpf.validation.colmap.compare import ColmapComparison
 from rbpf.validation.consistency.against_batch import AgainstBatch

@@ -65,7 +65,7 @@ def _run_robot(sequence: Mapping[str, Path], pairs: Sequence[str], given: Mappin
 def _figures(run: "Run", anonymous: bool = False) -> Figures:
     """What a run's summary and scores say, without writing them; `anonymous` as `score_estimate`'s."""
     from rbpf.runs.folder import summarise
-    from rbpf.runs.path_and_map import PathAndMap
+    from rbpf.runs.reading import PathAndMap
     from rbpf.runs.trajectory import in_space
     from rbpf.validation.metrics.scores import ODOMETRY_PREFIX, score_estimate, score_path
 
