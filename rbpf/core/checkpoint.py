@@ -53,8 +53,12 @@ def save_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
         raise InputError(f"{path} cannot be written: {reason}") from error
 
 
-def load_arrays(path: Path) -> dict[str, np.ndarray]:
+def load_arrays(path: Path, only: str | None = None) -> dict[str, np.ndarray]:
     """Reads every array of an `.npz` that `save_arrays` wrote; they may be written to.
+
+    Args:
+        path: of the file.
+        only: name of the one array to read; the result is empty where there is none of this name.
 
     Raises:
         InputError: the file is missing, cut off or not an archive of plain arrays.
@@ -64,7 +68,9 @@ def load_arrays(path: Path) -> dict[str, np.ndarray]:
             members = archive.infolist()
             if sum(info.file_size for info in members) > os.fstat(file.fileno()).st_size:
                 raise ValueError("the members are larger than the file")
-            return {info.filename.removesuffix(".npy"): _array(archive, info) for info in members}
+            named = {info.filename.removesuffix(".npy"): info for info in members}
+            wanted = named if only is None else {only} & named.keys()
+            return {name: _array(archive, named[name]) for name in wanted}
     except FileNotFoundError as error:
         raise InputError(f"{path} does not exist") from error
     except (

@@ -1,6 +1,7 @@
 """Where a run comes from: config.yaml with versions, settings and a digest of the input, to repeat it from."""
 
 import hashlib
+import json
 import platform
 from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
@@ -46,6 +47,9 @@ _FLAGS = ("localize",)
 _MADE = "video", "batch"
 """What a run makes besides its data, unless it is told not to."""
 _CHUNK = 1 << 20
+
+FREE = ("checkpoint_every",)
+"""Settings that cannot change the results: a run may go on with others. All else must be the same."""
 
 
 class Origin(NamedTuple):
@@ -131,6 +135,65 @@ def digest_of(sources: Mapping[str, Path], without: Path | None = None) -> str |
             whole.update(f"{relative}\n{file.stat().st_size}\n".encode())
             _add(whole, file)
     return whole.hexdigest()
+
+
+def decisive_settings(settings: Mapping[str, Any]) -> dict[str, str]:
+    """Settings that decide the results, as JSON text by name, those of groups with dots; without `FREE`."""
+    found: dict[str, str] = {}
+    for name, value in settings.items():
+        if isinstance(value, Mapping):
+            found |= {f"{name}.{inner}": text for inner, text in decisive_settings(value).items()}
+        elif name not in FREE:
+            found[name] = json.dumps(value, default=str)
+    return found
+
+
+def decisive_inputs(sources: Mapping[str, Any], out: Path) -> dict[str, str]:
+    """What a run reads, as text by name: the content of files, whatever they are called, and all else as it was given.
+
+    Args:
+        sources: what the run reads, by name; `recording` is one of them.
+        out: the run's folder; a recording that is itself this folder changes with the run, and is left out.
+
+    Raises:
+        InputError: a file cannot be read.
+    """
+    found: dict[str, str] = {}
+    for name, value in sources.items():
+        path = Path(str(value))
+        if name not in _FILES:
+            found[name] = json.dumps(value)
+        elif path.resolve() != out.resolve():
+            digest = digest_of({name: path}, out)
+            found[name] = f"{value}" if digest is None else f"content of SHA-256 {digest}"
+    return found
+
+
+def require_same(path: Path, before: Mapping[str, str], now: Mapping[str, str]) -> None:
+    """Refuses to go on with a run with something else than it was begun with.
+
+    Args:
+        path: of the checkpoint, for the message.
+        before: what the run was begun with, as text by name.
+        now: what it is to go on with.
+
+    Raises:
+        InputError: names the first that differs, and both values.
+    """
+    for name in [*before, *(name for name in now if name not in before)]:
+        was, given = (_shown(values.get(name)) for values in (before, now))
+        if before.get(name) != now.get(name):
+            raise InputError(
+                f"{path} belongs to a run with {name} = {was}, this one has {given}: go on with the same settings and "
+                "the same recording, or start without --resume"
+            )
+
+
+def _shown(value: str | None) -> str:
+    """As a message says it: digests are cut short."""
+    if value is None:
+        return "nothing"
+    return f"{value[:31]}…" if value.startswith("content of SHA-256 ") else value
 
 
 def read_origin(config: Path) -> Origin:

@@ -1,6 +1,6 @@
 """What is filtered: a recording of a kind that a system takes, opened to the system and the source of its frames."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -10,6 +10,7 @@ import numpy as np
 from rbpf.core.models import Sensor
 from rbpf.errors import InputError
 from rbpf.runs.files import CHECKPOINT, prepare_folder
+from rbpf.runs.provenance import decisive_inputs
 from rbpf.runs.run import Listener, Run, Source, drive
 from rbpf.runs.truth import GroundTruth, truth_at
 from rbpf.sensors.calibration import Board, MarkerBoard, find_board, find_markers
@@ -329,10 +330,11 @@ def filter_recording(
         InputError: the recording or a setting is wrong, or the checkpoint is of another run.
     """
     opened = recording.open(config)
-    if out is not None:
-        prepare_folder(out)
-    checkpoint = None if out is None else out / CHECKPOINT
-    return filter_opened(opened, listeners, checkpoint, config.checkpoint_every, resume)
+    if out is None:
+        return filter_opened(opened, listeners)
+    prepare_folder(out)
+    inputs = decisive_inputs(recording.sources(), out)
+    return filter_opened(opened, listeners, out / CHECKPOINT, config.checkpoint_every, resume, inputs)
 
 
 def filter_opened(
@@ -341,11 +343,13 @@ def filter_opened(
     checkpoint: Path | None = None,
     every: int = 500,
     resume: bool = False,
+    inputs: Mapping[str, str] | None = None,
 ) -> Run:
-    """Takes all frames of an opened recording; see `drive`. The run then knows the truth at its frames."""
+    """Takes all frames of an opened recording; see `drive`, and `Run` for `inputs`. It then knows the truth at them."""
     system, source, stamps_ns, truth = opened
     expected = None if stamps_ns is None else len(stamps_ns)
-    run = drive(Run(source, system, expected=expected), listeners, checkpoint, every, resume, stamps_ns)
+    run = Run(source, system, expected=expected, inputs=inputs or {})
+    drive(run, listeners, checkpoint, every, resume, stamps_ns)
     if truth is not None:
         run.truth = truth_at(system.space, truth, run.log.stamps_ns, system.gauge)
     return run

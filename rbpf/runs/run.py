@@ -8,17 +8,19 @@ Whoever wants to follow a run while it is made (a progress bar, a live view, a p
 the run and what `track` returned, after each frame.
 """
 
+import json
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
-from rbpf.core.checkpoint import checked, fitting
+from rbpf.core.checkpoint import checked, fitting, load_arrays
 from rbpf.errors import InputError
 from rbpf.runs.frame_log import FrameLog
+from rbpf.runs.provenance import decisive_settings, require_same
 from rbpf.runs.truth import RunTruth
 from rbpf.systems.system import System, Tracked
 
@@ -35,6 +37,8 @@ class Source(Protocol):
 
 
 SystemT = TypeVar("SystemT", bound=System)
+_BEGUN = "log/begun"
+"""Entry of a checkpoint: what the run was begun with."""
 
 
 @dataclass(eq=False)
@@ -46,6 +50,7 @@ class Run(Generic[SystemT]):
         system: as it is now.
         truth: ground truth of the recording; None where it has none.
         expected: number of frames that the recording has; None where it is not known.
+        inputs: what is read, as text by name, see `rbpf.runs.provenance.decisive_inputs`; empty where nobody says.
         log: one row per frame.
         frame: the last one that was taken; None before the first.
         messages: what was worth saying of single frames, in words: "frame 12: …".
@@ -56,6 +61,7 @@ class Run(Generic[SystemT]):
     system: SystemT
     truth: RunTruth | None = None
     expected: int | None = None
+    inputs: Mapping[str, str] = field(default_factory=dict)
     log: FrameLog = field(init=False)
     frame: Any = None
     messages: list[str] = field(default_factory=list)
@@ -89,16 +95,30 @@ class Run(Generic[SystemT]):
         Raises:
             InputError: the file cannot be written.
         """
-        messages = {"log/messages": np.array(self.messages, dtype=np.str_)}
-        self.system.save(path, self.log.arrays() | messages)
+        settings = decisive_settings(asdict(self.system.config))
+        begun = json.dumps({"settings": settings, "inputs": dict(self.inputs)})
+        told = {"log/messages": np.array(self.messages, dtype=np.str_), _BEGUN: np.array(begun)}
+        self.system.save(path, self.log.arrays() | told)
 
     def load(self, path: Path) -> None:
         """Goes on from a checkpoint.
 
         Raises:
-            InputError: the file is missing or damaged, or belongs to a run of another kind or with other settings.
+            InputError: the file is missing or damaged, or belongs to a run of another kind, with other settings or
+                over other input.
         """
+        # Before anything else is read, so that the message names the setting and not an array that does not fit.
+        found = load_arrays(path, only=f"extra/{_BEGUN}")
+        if found:
+            with fitting(path):
+                begun = json.loads(str(checked(found, f"extra/{_BEGUN}", (), "U")))
+                settings, inputs = dict(begun["settings"]), dict(begun["inputs"])
+            require_same(path, settings, decisive_settings(asdict(self.system.config)))
+            if inputs and self.inputs:
+                require_same(path, inputs, self.inputs)
         arrays = self.system.load(path)
+        if not found:
+            raise InputError(f"{path} does not say what run it belongs to: start without --resume")
         with fitting(path):
             self.log.restore(arrays)
             self.messages = checked(arrays, "log/messages", (None,), "U").tolist()

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 
@@ -60,6 +61,14 @@ def run(log, out, *arguments):
     return main(
         ["run", "range-bearing", str(log), "--out", str(out), "--particles", "30", "--no-batch", *arguments]
     )
+
+
+@pytest.fixture(scope="module")
+def began(log, tmp_path_factory):
+    """The folder of a run; not to be written to."""
+    out = tmp_path_factory.mktemp("began") / "run"
+    assert run(log, out) == 0
+    return out
 
 
 def test_a_run_leaves_everything(log, tmp_path):
@@ -190,3 +199,46 @@ def test_a_checkpoint_of_other_settings_is_refused(log, tmp_path, capsys):
     assert run(log, tmp_path, "--set", "checkpoint_every=10") == 0
     assert run(log, tmp_path, "--set", "checkpoint_every=10", "--resume", "--particles", "31") == 2
     assert "particles" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        (["--seed", "5"], "seed = 0, this one has 5"),
+        (["--particles", "31"], "particles = 30, this one has 31"),
+        (["--association", "ml"], 'association = "known", this one has "ml"'),
+        (["--set", "noise.std_range_m=5"], "noise.std_range_m = null, this one has 5.0"),
+        (["--set", "likelihood.kind=outliers"], 'likelihood.kind = "gaussian", this one has "outliers"'),
+        (["--set", "anchor_every=0"], "anchor_every = 10, this one has 0"),
+        (["--set", "lag=3"], "lag = null, this one has 3"),
+    ],
+)
+def test_a_run_goes_on_with_the_settings_that_it_began_with(began, log, tmp_path, capsys, changed, message):
+    shutil.copytree(began, tmp_path / "run")
+    before = outputs(tmp_path / "run")
+    assert run(log, tmp_path / "run", *changed, "--resume") == 2
+    assert message in " ".join(capsys.readouterr().err.split())
+    assert outputs(tmp_path / "run") == before
+
+
+def test_a_run_goes_on_over_the_recording_that_it_began_with(began, log, tmp_path, capsys):
+    """The same stamps, another content."""
+    other = tmp_path / "other"
+    shutil.copytree(log, other)
+    table = (other / "observations.csv").read_text().splitlines()
+    cells = table[-1].split(",")
+    table[-1] = ",".join([*cells[:2], "4.25", *cells[3:]])
+    (other / "observations.csv").write_text("\n".join(table) + "\n")
+    shutil.copytree(began, tmp_path / "run")
+    assert run(other, tmp_path / "run", "--resume") == 2
+    assert "recording = content of SHA-256 " in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_run_goes_on_with_what_cannot_change_its_results(began, log, tmp_path):
+    """Other checkpoints, other threads, another place of the same recording."""
+    shutil.copytree(began, tmp_path / "run")
+    shutil.copytree(log, tmp_path / "moved")
+    changed = ["--set", "checkpoint_every=7", "--threads", "1", "--resume"]
+    assert run(tmp_path / "moved", tmp_path / "run", *changed) == 0
+    for name in ("trajectory.tum", "map.csv", "diagnostics.csv"):
+        assert (tmp_path / "run" / name).read_bytes() == (began / name).read_bytes()

@@ -166,10 +166,14 @@ def test_a_resumed_run_is_identical(desk, finished, tmp_path, monkeypatch):
     assert again == whole
 
 
-def test_a_checkpoint_of_another_sequence_is_refused(desk, folder, tmp_path, capsys):
+def test_a_checkpoint_of_another_run_is_refused(desk, folder, tmp_path, capsys):
     assert run(desk, tmp_path / "run", "--set", "checkpoint_every=5", known=False) == 0
     assert run(folder, tmp_path / "run", "--resume", known=False) == 2
-    assert "another recording" in sentence(capsys)
+    assert "recording = content of SHA-256 " in sentence(capsys)
+    assert run(desk, tmp_path / "run", "--resume") == 2
+    assert "known_points = nothing, this one has content of " in sentence(capsys)
+    assert run(desk, tmp_path / "run", "--set", "search.measurements=7", "--resume", known=False) == 2
+    assert "search.measurements = " in sentence(capsys)
 
 
 def test_it_starts_without_known_points(desk, tmp_path):
