@@ -44,7 +44,8 @@ def demo(options: Annotated[DemoOptions, tyro.conf.arg(name="")]) -> None:
     if not (images / "known_points.csv").is_file():
         simulate_desk(ImagesOptions(out=images, frames=options.frames))
     known = images / "known_points.csv"
-    run_mono(MonoOptions(sequence=images, known_points=known, out=options.out / "run", json=options.json))
+    out = options.out / "run"
+    run_mono(MonoOptions(sequence=images, known_points=known, out=out, overwrite=True, json=options.json))
 
 
 APP.add_group("run", RUN)
@@ -60,10 +61,20 @@ APP.add("doctor")(installed.doctor)
 APP.add("completion")(installed.completion)
 
 
+def _require_filled(arguments: list[str]) -> None:
+    """Refuses a name that is empty, which would stand for the folder one is in."""
+    for before, word in zip(["", *arguments], arguments, strict=False):
+        option, equals, value = word.partition("=")
+        if not word or (option.startswith("--") and equals and not value):
+            named = before if not word else option
+            raise InputError(f"{named} is empty" if named.startswith("--") else "an argument is empty")
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Parses the command line, runs the command; bad input becomes one sentence and exit code 2."""
     try:
         given = sys.argv[1:] if arguments is None else arguments
+        _require_filled(given)
         expanded = repeated(list(given))
         APP.require_known(expanded, PROGRAM)
         APP.cli(prog=PROGRAM, description=_DESCRIPTION, args=expanded)

@@ -35,21 +35,24 @@ class RunOptions(Printed):
     """Of every `rbpf run`.
 
     Attributes:
-        out: folder for the results.
+        out: folder for the results; by default run, or run-2, run-3, … where there are runs already. With --resume or
+            --overwrite the last of them.
         particles: number of particles.
         seed: of the random generators; by default 0, or as in --config.
         config: YAML file of settings, such as a former run's config.yaml; by default the system's own.
         set: a setting as key=value, such as resampling.scheme=residual; may be given several times.
         resume: go on from the checkpoint in the results' folder, if there is one.
+        overwrite: write over the run that lies in the results' folder.
         threads: threads of the kernels; by default all.
     """
 
-    out: Path = Path("run")
+    out: Where = None
     particles: Whole = None
     seed: Whole = None
     config: Where = None
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     resume: Flag = False
+    overwrite: Flag = False
     threads: Whole = None
 
 

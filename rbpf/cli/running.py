@@ -1,6 +1,7 @@
 """`rbpf run`: one function per system, and the same run again."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -43,15 +44,15 @@ def run_range_bearing(options: Annotated[RangeBearingOptions, tyro.conf.arg(name
 
     named = given(options, "particles", "seed", "association")
     config = load_settings(RangeBearingConfig, "range-bearing", options.config, options.set, named)
-    _prepare(options)
-    with progress() as bar, patient(told(bar, bar.add_task("filtering", total=None))) as tell:
-        recording = RobotRecording(options.log)
-        run = filter_recording(recording, config, options.out, options.resume, [listener(tell)])
-    if options.batch:
-        say("solving the batch problem with the same measurements …")
-    with finishing():
-        entries = finish_run(run, options.out, recording.sources(), batch=options.batch)
-    _finish(entries, options, run.failure)
+    with _prepared(options) as out:
+        with progress() as bar, patient(told(bar, bar.add_task("filtering", total=None))) as tell:
+            recording = RobotRecording(options.log)
+            run = filter_recording(recording, config, out, options.resume, [listener(tell)])
+        if options.batch:
+            say("solving the batch problem with the same measurements …")
+        with finishing():
+            entries = finish_run(run, out, recording.sources(), batch=options.batch)
+    _finish(entries, options, out, run.failure)
 
 
 @RUN.add("mono")
@@ -102,6 +103,7 @@ def repeated(arguments: list[str]) -> list[str]:
         return arguments
     if len(arguments) < 3:
         raise InputError("--from takes the config.yaml of a run: rbpf run --from RUN/config.yaml")
+    from rbpf.runs.files import numbered
     from rbpf.runs.provenance import read_origin
 
     config = Path(arguments[2])
@@ -109,7 +111,10 @@ def repeated(arguments: list[str]) -> list[str]:
     options = ["--config", str(origin.config)]
     for name, value in origin.sources.items():
         options += [f"--{name}", value] if value else [f"--{name}"]
-    out = [] if "--out" in arguments else ["--out", str(origin.config.parent) + "-again"]
+    out = []
+    if not any(word.partition("=")[0] == "--out" for word in arguments):
+        last = "--resume" in arguments or "--overwrite" in arguments
+        out = ["--out", str(numbered(Path(f"{origin.config.parent}-again"), last))]
     return ["run", origin.system, origin.recording, *options, *out, *arguments[3:]]
 
 
@@ -126,10 +131,9 @@ def _run_images(options: ImageRunOptions, recording: "Recording", config: Any, v
 
     if options.rerun is not None:
         require_rerun()
-    _prepare(options)
-    with progress() as bar:
+    with _prepared(options) as out, progress() as bar:
         with patient(told(bar, bar.add_task("filtering", total=None))) as tell:
-            run = filter_recording(recording, config, options.out, options.resume, [listener(tell)])
+            run = filter_recording(recording, config, out, options.resume, [listener(tell)])
         solving = bar.add_task("batch", total=None, visible=options.batch)
         drawing = bar.add_task("drawing", total=None, visible=video)
         callbacks = Callbacks(
@@ -139,21 +143,41 @@ def _run_images(options: ImageRunOptions, recording: "Recording", config: Any, v
         )
         with finishing():
             entries = finish_run(
-                run, options.out, recording.sources(), video, options.rerun, options.batch, callbacks
+                run, out, recording.sources(), video, options.rerun, options.batch, callbacks
             )
-    _finish(entries, options, run.failure)
+    _finish(entries, options, out, run.failure)
 
 
-def _prepare(options: RunOptions) -> None:
-    """Threads as asked for, and compiled kernels."""
+@contextmanager
+def _prepared(options: RunOptions) -> Iterator[Path]:
+    """Threads as asked for, compiled kernels, and the folder for the results, which nobody else writes to.
+
+    Raises:
+        InputError: the folder holds a run that is neither to be resumed nor written over, or cannot be written to.
+    """
+    from rbpf.runs.files import holds_run, numbered, own_folder
+
+    if options.resume and options.overwrite:
+        raise InputError(
+            "a run goes on with --resume or begins again with --overwrite: leave out one of them"
+        )
+    kept = options.resume or options.overwrite
+    out = numbered(Path("run"), last=kept) if options.out is None else options.out
     use_threads(options.threads)
-    compile_kernels()
+    with own_folder(out):
+        if holds_run(out) and not kept:
+            raise InputError(
+                f"{out} holds a run already: name another folder with --out, go on with --resume, or write over it "
+                "with --overwrite"
+            )
+        compile_kernels()
+        yield out
 
 
-def _finish(entries: dict[str, Any], options: RunOptions, failure: str | None) -> None:
-    result = entries | {"out": str(options.out)}
+def _finish(entries: dict[str, Any], options: RunOptions, out: Path, failure: str | None) -> None:
+    result = entries | {"out": str(out)}
     shown = {name: value for name, value in entries.items() if name != "sentences"}
-    where = f"results, pictures and report.html are in {options.out}"
+    where = f"results, pictures and report.html are in {out}"
     answer(result, options.json, table(shown), *entries["sentences"], where)
     if failure is not None:
-        raise InputError(f"{failure}; what was computed before it is in {options.out}")
+        raise InputError(f"{failure}; what was computed before it is in {out}")

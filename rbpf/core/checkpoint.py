@@ -16,6 +16,7 @@ import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
@@ -40,7 +41,7 @@ def save_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
     """
     temporary = path.with_name(path.name + ".partial")
     try:
-        with open(temporary, "wb") as file:
+        with open_new(temporary) as file:
             np.savez(file, allow_pickle=False, **arrays)
             file.flush()
             # Else a power cut after the renaming could leave neither the old file nor the new one.
@@ -51,6 +52,17 @@ def save_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
             temporary.unlink(missing_ok=True)
         reason = error.strerror if isinstance(error, OSError) and error.strerror else error
         raise InputError(f"{path} cannot be written: {reason}") from error
+
+
+def open_new(path: Path) -> BinaryIO:
+    """A file that was not there before, to be written: what bears the name, a link to another file too, is removed.
+
+    Raises:
+        OSError: the place cannot be written to.
+    """
+    path.unlink(missing_ok=True)
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+    return os.fdopen(os.open(path, flags, 0o666), "wb")
 
 
 def load_arrays(path: Path, only: str | None = None) -> dict[str, np.ndarray]:

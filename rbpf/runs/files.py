@@ -1,17 +1,23 @@
 """Files that a run leaves: whole or not there at all; tables, maps and summaries."""
 
 import csv
+import errno
+import fcntl
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from io import StringIO
+from itertools import count
 from pathlib import Path
 from typing import Any
 
+from rbpf.core.checkpoint import open_new
 from rbpf.errors import InputError
 
 CHECKPOINT, SUMMARY, TRAJECTORY, MAP = "checkpoint.npz", "summary.json", "trajectory.npz", "map.npz"
 POSTERIOR = "posterior.npz"
+LOCK = ".lock"
+"""In a run's folder while somebody writes there; with the number of that process."""
 VERSION = 1
 """Of trajectory.npz."""
 
@@ -27,6 +33,7 @@ def whole(path: Path) -> Iterator[Path]:
     """
     temporary = path.with_name(f"{path.stem}.partial{path.suffix}")
     try:
+        open_new(temporary).close()
         yield temporary
         os.replace(temporary, path)
     except OSError as error:
@@ -49,6 +56,76 @@ def prepare_folder(out: Path) -> None:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"cannot make the folder {out} for the results: {error.strerror}") from error
+
+
+def holds_run(out: Path) -> bool:
+    """Whether a run, finished or not, lies in a folder."""
+    return any((out / name).exists() for name in (CHECKPOINT, TRAJECTORY, SUMMARY))
+
+
+def numbered(out: Path, last: bool = False) -> Path:
+    """The first of `run`, `run-2`, `run-3`, … that holds no run; with `last` the one before it, if there is one."""
+    before = out
+    for number in count(2):
+        place = out if number == 2 else out.with_name(f"{out.name}-{number - 1}")
+        if not holds_run(place):
+            break
+        before = place
+    return before if last else place
+
+
+@contextmanager
+def own_folder(out: Path) -> Iterator[None]:
+    """A run's folder, made where it does not exist, in which nobody else writes meanwhile.
+
+    A folder that is made here and in which nothing stays is removed again. The lock is the system's, so that a process
+    that was killed holds none; where the file system knows no locks there is none.
+
+    Raises:
+        InputError: the folder cannot be made or written to, or another process writes there.
+    """
+    missing = [place for place in (out, *out.parents) if not place.exists()]
+    prepare_folder(out)
+    try:
+        file = _locked(out / LOCK)
+        try:
+            yield
+        finally:
+            with suppress(OSError):
+                (out / LOCK).unlink()
+            os.close(file)
+    finally:
+        with suppress(OSError):
+            for place in missing:
+                place.rmdir()
+
+
+def _locked(path: Path) -> int:
+    """The descriptor of a file that this process holds the lock of."""
+    while True:
+        try:
+            file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
+        except OSError as error:
+            raise InputError(f"{path.parent} cannot be written to: {error.strerror}") from error
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            who = os.read(file, 20).decode(errors="replace").strip()
+            os.close(file)
+            raise InputError(
+                f"another run, process {who}, writes to {path.parent}: wait for it, or name another folder with --out"
+            ) from None
+        except OSError as error:
+            if error.errno not in (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS):
+                os.close(file)
+                raise InputError(f"{path.parent} cannot be locked: {error.strerror}") from error
+        # Whoever held it before may have removed it meanwhile: then another one can make a new file of this name.
+        with suppress(OSError):
+            if os.path.samestat(os.fstat(file), os.stat(path, follow_symlinks=False)):
+                os.ftruncate(file, 0)
+                os.write(file, f"{os.getpid()}\n".encode())
+                return file
+        os.close(file)
 
 
 def write_text(path: Path, text: str) -> None:

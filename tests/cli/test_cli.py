@@ -11,6 +11,8 @@ import pytest
 import yaml
 
 from rbpf.cli import main
+from rbpf.core.checkpoint import save_arrays
+from rbpf.runs.files import numbered, own_folder, write_text
 from tests.cli.run_outputs import outputs
 
 FILES = {
@@ -242,3 +244,65 @@ def test_a_run_goes_on_with_what_cannot_change_its_results(began, log, tmp_path)
     assert run(tmp_path / "moved", tmp_path / "run", *changed) == 0
     for name in ("trajectory.tum", "map.csv", "diagnostics.csv"):
         assert (tmp_path / "run" / name).read_bytes() == (began / name).read_bytes()
+
+
+def test_a_run_is_written_over_only_where_that_is_asked_for(began, log, tmp_path, capsys):
+    shutil.copytree(began, tmp_path / "run")
+    before = outputs(tmp_path / "run")
+    assert run(log, tmp_path / "run", "--seed", "9") == 2
+    assert "holds a run already" in " ".join(capsys.readouterr().err.split())
+    assert outputs(tmp_path / "run") == before
+    assert run(log, tmp_path / "run", "--resume", "--overwrite") == 2
+    assert run(log, tmp_path / "run", "--seed", "9", "--overwrite") == 0
+    assert outputs(tmp_path / "run") != before
+
+
+def test_folders_of_runs_are_numbered(tmp_path):
+    for name in ("run", "run-2", "run-3"):
+        assert numbered(tmp_path / "run") == tmp_path / name
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "checkpoint.npz").touch()
+        assert numbered(tmp_path / "run", last=True) == tmp_path / name
+    assert numbered(tmp_path / "other", last=True) == tmp_path / "other"
+
+
+def test_a_refused_run_leaves_no_folder(tmp_path):
+    assert run(tmp_path / "no log", tmp_path / "deep" / "run") == 2
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_one_run_at_a_time_writes_to_a_folder(log, tmp_path, capsys):
+    with own_folder(tmp_path / "run"):
+        assert run(log, tmp_path / "run") == 2
+        assert f"another run, process {os.getpid()}, writes to" in " ".join(capsys.readouterr().err.split())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_lock_of_a_killed_run_is_taken_over(tmp_path):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / ".lock").write_text("1\n")
+    with own_folder(tmp_path / "run"):
+        assert (tmp_path / "run" / ".lock").read_text() == f"{os.getpid()}\n"
+    assert list((tmp_path / "run").iterdir()) == []
+
+
+def test_a_folder_that_cannot_be_written_to_is_noticed_before_filtering(log, monkeypatch, capsys):
+    monkeypatch.setattr("rbpf.systems.range_bearing.slam.RangeBearingSlam.take", None)
+    assert run(log, "/proc/self") == 2
+    assert "/proc/self cannot be written to" in " ".join(capsys.readouterr().err.split())
+
+
+def test_an_empty_name_is_refused(log, capsys):
+    for words in (["--out", ""], ["--out="]):
+        assert main(["run", "range-bearing", str(log), *words]) == 2
+        assert "--out is empty" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("write", [write_text, lambda path, _: save_arrays(path, {"a": np.zeros(1)})])
+def test_a_link_under_a_temporary_name_is_not_followed(tmp_path, write):
+    victim = tmp_path / "victim"
+    victim.write_text("mine")
+    for name in ("map.partial.npz", "map.npz.partial"):
+        (tmp_path / name).symlink_to(victim)
+    write(tmp_path / "map.npz", "text")
+    assert victim.read_text() == "mine" and (tmp_path / "map.npz").is_file()
