@@ -6,7 +6,7 @@ has a kernel, else in NumPy.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -234,13 +234,12 @@ class RowEngine:
             else:
                 self._information_compiled(kernel, batch, group, state, prior, total)
         for rows in plan.joint:
-            nu, jac, records, noise, log_factor = self._joint(rows, groups, state, prior)
+            nu, jac, records, noise, log_factor, used = self._joint(rows, groups, state, prior)
             jac_map = jac[..., self.space.dim :]
             cov = gaussian.symmetrise(jac_map @ records.cov[:, 0] @ np.swapaxes(jac_map, -1, -2)) + noise
             jac_state = jac[..., : self.space.dim]
-            total.add(
-                linearisation.information(nu[:, None], jac_state[:, None], cov[:, None], GAUSSIAN, prior)
-            )
+            found = linearisation.information(nu[:, None], jac_state[:, None], cov[:, None], GAUSSIAN, prior)
+            total.add(replace(found, rows=used))
             total.log_factor += log_factor
             literal = np.repeat(
                 [not _likelihood(groups[row.group]).normalised for row in rows],
@@ -308,8 +307,8 @@ class RowEngine:
             total.vector,
             total.quad,
             total.log_det,
+            total.rows,
         )
-        total.rows += batch.ks.size * group.model.dim
 
     def _correct_compiled(
         self,
@@ -401,14 +400,14 @@ class RowEngine:
 
     def _joint(
         self, rows: list[Row], groups: Sequence[Observations], state: np.ndarray, prior: Prior | None = None
-    ) -> tuple[np.ndarray, np.ndarray, Records, np.ndarray, np.ndarray]:
-        """Stacked ν (N, Σp), [H J], the landmark's records, R and the log-density of rows taken as outliers.
+    ) -> tuple[np.ndarray, np.ndarray, Records, np.ndarray, np.ndarray, np.ndarray]:
+        """Stacked ν (N, Σp), [H J], the landmark's records, R, the log-density of rows taken as outliers, and rows used (N,).
 
         With a prior, rows whose likelihood is not Gaussian pass its gate or take no part.
         """
         _, records = self._read(np.array([rows[0].landmark]))
         nus, jacs, noises, masks = [], [], [], []
-        log_factor = np.zeros(state.shape[0])
+        log_factor, used = np.zeros(state.shape[0]), np.zeros(state.shape[0])
         for row in rows:
             group = groups[row.group]
             z = group.z[row.k : row.k + 1]
@@ -424,8 +423,9 @@ class RowEngine:
             jacs.append(np.concatenate([jac.state[:, 0], jac.landmark[:, 0]], axis=-1))
             noises.append(group.cov[row.k])
             masks.append(mask)
+            used += group.model.dim * (1.0 if mask is None else mask.reshape(-1))
         nu, jac_all, noise = linearisation.stacked(nus, jacs, noises, masks)
-        return nu, jac_all, records, noise, log_factor
+        return nu, jac_all, records, noise, log_factor, used
 
     def _correct_joint(
         self, rows: list[Row], groups: Sequence[Observations], state: np.ndarray, log_density: np.ndarray
@@ -440,7 +440,7 @@ class RowEngine:
                 batch = Batch(row.group, np.array([row.k]), np.array([row.landmark]), mask)
                 self._correct_once(batch, np.zeros(1, dtype=np.int64), groups[row.group], state, log_density)
             return
-        nu, jac, records, noise, _ = self._joint(rows, groups, state)
+        nu, jac, records, noise, _, _ = self._joint(rows, groups, state)
         jac_map = jac[:, None, :, self.space.dim :]
         mean, cov, log_terms = linearisation.updated(
             nu[:, None], jac_map, records.mean, records.cov, noise[:, None], GAUSSIAN

@@ -58,8 +58,10 @@ class StepReport:
         ess: effective sample size before resampling.
         resampled: whether the particles were resampled.
         log_evidence: log p(z_t | z_1:t−1), Mathematics (evidence-increment); NaN where a likelihood is not a density.
-        nis: weighted mean squared Mahalanobis distance of the joint innovation, NaN without a linearised one.
-        rows: its degrees of freedom.
+        nis: normalised innovation squared, NaN without a linearised one: the squared Mahalanobis distance of the joint
+            innovation of the rows that took part, a weighted mean over the particles.
+        rows: its degrees of freedom, the weighted mean of the number of those rows. A row takes no part in a particle
+            that does not associate it with a known landmark, or that the likelihood gates as an outlier.
         groups: the observations that were used.
         first_observations: what landmarks were started from.
         new_landmarks: their ids, in that order.
@@ -71,7 +73,7 @@ class StepReport:
     resampled: bool
     log_evidence: float
     nis: float
-    rows: int
+    rows: float
     groups: Sequence[Observations]
     first_observations: Sequence[NewLandmarks]
     new_landmarks: np.ndarray
@@ -220,7 +222,7 @@ class Filter:
             resampled=ancestors is not None,
             log_evidence=evidence,
             nis=float("nan") if proposed.nis is None else float((weights * proposed.nis).sum()),
-            rows=proposed.rows,
+            rows=0.0 if proposed.rows is None else mean_count(proposed.rows, weights),
             groups=groups,
             first_observations=first_observations,
             new_landmarks=new_landmarks,
@@ -380,6 +382,11 @@ class Filter:
                 born.append(new_landmarks)
             first = end
         return born, np.concatenate(ids)
+
+
+def mean_count(counts: np.ndarray, weights: np.ndarray) -> float:
+    """Weighted mean of whole numbers (N,); exact where all are the same."""
+    return float(counts[0] + (weights * (counts - counts[0])).sum())
 
 
 def checked_transition(transition: Transition, state: np.ndarray, space: LieGroup, what: str) -> Transition:

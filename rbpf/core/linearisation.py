@@ -125,7 +125,8 @@ def information(
     log_det = np.zeros(n)
     if likelihood.normalised:
         log_det = ((gaussian.log_det(chol) + p * np.log(2.0 * np.pi)) * use).sum(axis=1)
-    return Information(info, vector, np.square(white_nu).sum(axis=(1, 2)), log_det, log_factor, k * p)
+    rows = p * use.sum(axis=1, dtype=float)
+    return Information(info, vector, np.square(white_nu).sum(axis=(1, 2)), log_det, log_factor, rows)
 
 
 def log_normaliser(cov: np.ndarray, rows: np.ndarray) -> np.ndarray:

@@ -140,7 +140,7 @@ class Information:
         quad: (N,) Σ νᵀS⁻¹ν.
         log_det: (N,) Σ log|2πS|.
         log_factor: (N,) log-densities that do not depend on the increment: clutter, new landmarks.
-        rows: number of scalar measurements.
+        rows: (N,) number of scalar measurements that took part in the sums, gated and unassociated ones left out.
     """
 
     info: Float[np.ndarray, "N d d"]
@@ -148,12 +148,12 @@ class Information:
     quad: Float[np.ndarray, " N"]
     log_det: Float[np.ndarray, " N"]
     log_factor: Float[np.ndarray, " N"]
-    rows: int = 0
+    rows: Float[np.ndarray, " N"]
 
     @classmethod
     def zeros(cls, n: int, dim: int) -> "Information":
         """No observations."""
-        return cls(np.zeros((n, dim, dim)), np.zeros((n, dim)), np.zeros(n), np.zeros(n), np.zeros(n))
+        return cls(np.zeros((n, dim, dim)), np.zeros((n, dim)), *np.zeros((4, n)))
 
     @classmethod
     def of_parts(cls, parts: list["Information"]) -> "Information":
@@ -166,14 +166,13 @@ class Information:
             np.concatenate([part.quad for part in parts]),
             np.concatenate([part.log_det for part in parts]),
             np.concatenate([part.log_factor for part in parts]),
-            parts[0].rows,
+            np.concatenate([part.rows for part in parts]),
         )
 
     def add(self, other: "Information") -> None:
         """Adds independent observations, in place."""
-        for name in ("info", "vector", "quad", "log_det", "log_factor"):
+        for name in ("info", "vector", "quad", "log_det", "log_factor", "rows"):
             getattr(self, name).__iadd__(getattr(other, name))
-        self.rows += other.rows
 
     def charted(self, jacobian: Float[np.ndarray, "#N d d"]) -> "Information":
         """The same for a perturbation δ of the chart's coordinates, where the state moves by J δ; J (N, d, d)."""
@@ -197,14 +196,14 @@ class Proposed:
         root: (N or 1, r, r) upper triangular; the covariance of u is root rootᵀ.
         log_w1: (N,) look-ahead weight.
         nis: (N,) squared Mahalanobis distance of the joint innovation, None where nothing was linearised.
-        rows: number of scalar measurements behind it.
+        rows: (N,) number of scalar measurements behind it, those that took part in each particle.
     """
 
     mean: Float[np.ndarray, "#N r"]
     root: Float[np.ndarray, "#N r r"]
     log_w1: Float[np.ndarray, " N"]
     nis: Float[np.ndarray, " N"] | None = None
-    rows: int = 0
+    rows: Float[np.ndarray, " N"] | None = None
 
     def sample(
         self, ancestors: Int[np.ndarray, " M"], rng: np.random.Generator

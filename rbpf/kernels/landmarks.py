@@ -57,6 +57,7 @@ from rbpf.kernels.signature import (
         MATRIX,
         VECTOR,
         VECTOR,
+        VECTOR,
     ),
     parallel=True,
     cache=True,
@@ -81,8 +82,11 @@ def refine(
     vector,
     quad,
     log_det,
+    rows,
 ):
     """Adds Σ HᵀS⁻¹H, Σ HᵀS⁻¹ν, Σ νᵀS⁻¹ν and Σ log|2πS| over the observations, S = J P Jᵀ + R; see docs/mathematics.md.
+
+    `rows` (N,) counts the scalar measurements that entered these sums.
 
     `address` is that of the model's kernel. `state` (N, E) holds the linearisation points; observation k reads slab
     `slabs[k]` of `pool` (slabs, fields, N) at the rows `maps[which[k]]`; `mask` (K, N) or (0, 0) says which particles
@@ -137,6 +141,7 @@ def refine(
                 pivots = 0
         for i in range(count):
             quad[start + i] += sum_quad[i]
+            rows[start + i] += used[i] * p
             log_det[start + i] += penalty[i]
             if kernel_id != 1:
                 log_det[start + i] += sum_log[i] + used[i] * p * math.log(2.0 * math.pi)

@@ -78,7 +78,7 @@ LOG_EVIDENCE = Column(
     table=DIAGNOSTICS,
 )
 NIS = Column("nis", "normalised innovation squared; NaN without a linearised innovation", table=DIAGNOSTICS)
-NIS_DOF = Column("nis_dof", "its degrees of freedom", kind=int, table=DIAGNOSTICS)
+NIS_DOF = Column("nis_dof", "its degrees of freedom, a weighted mean over the particles", table=DIAGNOSTICS)
 
 
 @dataclass(frozen=True)

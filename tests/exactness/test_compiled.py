@@ -77,7 +77,7 @@ def test_refinement_and_update(space, which, likelihood, kind, rng):
     one, other = (refined(prior, held.information(scene.state, [group], prior)) for held in maps)
     for name in ("mean", "root", "log_w1", "nis"):
         np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=TOLERANCE, atol=TOLERANCE)
-    assert one.rows == other.rows
+    np.testing.assert_array_equal(one.rows, other.rows)
 
     zero = np.zeros((PARTICLES, space.dim))
     one_density, other_density = (held.correct(scene.state, zero, [group]) for held in maps)
