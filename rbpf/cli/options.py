@@ -247,6 +247,7 @@ class LogOptions(Printed):
         spatial: six degrees of freedom instead of three.
         steps: number of steps, one a second.
         landmarks: number of landmarks.
+        unnamed: the log does not say which landmark was observed.
     """
 
     out: Path
@@ -254,6 +255,7 @@ class LogOptions(Printed):
     spatial: Flag = False
     steps: int = 200
     landmarks: int = 60
+    unnamed: Flag = False
 
 
 def given(options: object, *names: str) -> dict[str, object]:

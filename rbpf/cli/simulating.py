@@ -27,7 +27,8 @@ def simulate_range_bearing(options: Annotated[LogOptions, tyro.conf.arg(name="")
     """A log of a robot among landmarks, with ground truth."""
     from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 
-    simulate_robot(RobotWorld(options.steps, options.landmarks, options.spatial), options.out, options.seed)
+    world = RobotWorld(options.steps, options.landmarks, options.spatial, unnamed=options.unnamed)
+    simulate_robot(world, options.out, options.seed)
     answer({"out": str(options.out), "steps": options.steps}, options.json, f"wrote {options.out}")
 
 

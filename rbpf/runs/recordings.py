@@ -26,8 +26,9 @@ from rbpf.sensors.readers import (
     open_stereo,
     read_known_points,
 )
-from rbpf.sensors.readers.images.sequence import UNNAMED
+from rbpf.sensors.readers.images.sequence import UNNAMED as NO_TOPICS
 from rbpf.sensors.readers.images.video import LiveCamera, camera_number
+from rbpf.sensors.readers.robot_log import UNNAMED
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.known_map import KnownMap, read_known_map
 from rbpf.systems.mono.relocalisation import ImageScreen
@@ -119,7 +120,7 @@ class MonoRecording:
     board: Board | None = None
     map: Path | None = None
     markers: MarkerBoard | None = None
-    topics: Topics = UNNAMED
+    topics: Topics = NO_TOPICS
 
     def __post_init__(self) -> None:
         if len(self.topics.images) > 1:
@@ -205,7 +206,7 @@ class StereoRecording:
 
     pairs: Path
     calibration: Path | None = None
-    topics: Topics = UNNAMED
+    topics: Topics = NO_TOPICS
 
     def open(self, config: StereoConfig) -> Opened:
         """The system and the pairs.
@@ -225,7 +226,15 @@ class StereoRecording:
 
 
 def open_robot_log(log: RobotLog, config: RangeBearingConfig) -> Opened:
-    """A robot's log in memory."""
+    """A robot's log in memory.
+
+    Raises:
+        InputError: landmarks are to be known by their names, and some have none.
+    """
+    if config.association == "known" and any((frame.landmarks == UNNAMED).any() for frame in log.frames):
+        raise InputError(
+            f"{log.name} has observations without a landmark's name: filter it with --association ml"
+        )
     system = RangeBearingSlam.of_log(log, config, keep_associations=config.association == "ml")
     stamps = np.array([frame.stamp_ns for frame in log.frames], dtype=np.int64)
     return Opened(system, LogSource(log), stamps, log.truth)

@@ -7,8 +7,9 @@ A folder with, comma-separated under a header line:
   the upper triangle cov00 to cov55. Row t moves the robot from step t - 1 to step t, in the frame of t - 1.
   The header tells the plane from space. Rotations are Rz(yaw) Ry(pitch) Rx(roll).
 - `observations.csv`: step (from 0), landmark_id, range_m, yaw_rad, pitch_rad and their standard deviations.
-  Yaw is positive to the left. z is (range, yaw) in the plane, where pitch must be 0, and (range, yaw, pitch)
-  in space.
+  Without the column landmark_id, or where it is -1, it is not known which landmark was observed: for
+  `--association ml`. Yaw is positive to the left. z is (range, yaw) in the plane, where pitch must be 0,
+  and (range, yaw, pitch) in space.
 - `sensor.yaml`: where the sensor sits, and whether positive pitch is up or down, as in
   `robot_from_sensor: {x_m: 0, y_m: 0, z_m: 0, yaw_deg: 0, pitch_deg: 0, roll_deg: 0}`,
   `std: {range_m: 0.01, yaw_deg: 0.1}` and `positive_pitch: down`.
@@ -28,6 +29,7 @@ from numpy.typing import NDArray
 
 from rbpf.lie import SE2, SE3, Array
 from rbpf.sensors.readers.robot_log import (
+    UNNAMED,
     LogNoise,
     RobotLog,
     RobotLogFormat,
@@ -48,6 +50,7 @@ _PLANAR = ("step", "dx_m", "dy_m", "dphi_rad", "cxx", "cxy", "cxp", "cyy", "cyp"
 _TRIANGLE = tuple(f"cov{i}{j}" for i, j in combinations_with_replacement(range(6), 2))
 _SPATIAL = ("step", "dx_m", "dy_m", "dz_m", *_POSE[3:], *_TRIANGLE)
 _OBSERVATION = ("range_m", "yaw_rad", "pitch_rad", "std_range_m", "std_yaw_rad", "std_pitch_rad")
+_OBSERVATIONS = [("step", "landmark_id", *_OBSERVATION), ("step", *_OBSERVATION)]
 _MOUNT = ("x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg")
 _PITCH_SIGNS = {"up": 1.0, "down": -1.0}
 
@@ -63,7 +66,7 @@ class Mrpt(RobotLogFormat):
 
     def read(self, path: Path, noise: LogNoise) -> RobotLog:
         odometry = read_csv(path / "odometry.csv", [_PLANAR, _SPATIAL], self.kind)
-        table = read_csv(path / "observations.csv", [("step", "landmark_id", *_OBSERVATION)], self.kind)
+        table = read_csv(path / "observations.csv", _OBSERVATIONS, self.kind)
         planar = odometry.columns == _PLANAR
         robot_from_sensor, pitch_sign = _read_sensor(path / "sensor.yaml", planar, self.kind)
         if planar:
@@ -108,7 +111,9 @@ def _require_order(table: Table, odometry: Table) -> tuple[NDArray[np.int64], ND
     """Steps and landmarks of the observations, all of them in steps that the odometry reaches, in order."""
     counted = np.arange(1, len(odometry.rows) + 1)
     odometry.require(odometry["step"] == counted, "step", "one more than in the row before, from 1")
-    step, landmarks = table.integers("step"), table.integers("landmark_id")
+    step = table.integers("step")
+    named = "landmark_id" in table.columns
+    landmarks = table.integers("landmark_id") if named else np.full(len(step), UNNAMED)
     last = counted[-1]
     table.require((step >= 0) & (step <= last), "step", f"one with odometry, 0 to {last}")
     ordered = np.diff(step, prepend=0) >= 0
@@ -116,7 +121,11 @@ def _require_order(table: Table, odometry: Table) -> tuple[NDArray[np.int64], ND
         row = int(np.argmin(ordered))
         problem = f"time runs backwards from step {step[row - 1]} to {step[row]}, expected rows in order"
         raise table.error(row, problem)
-    table.require_distinct(step, landmarks, "step")
+    # Those without a name may be many in a step; each counts as one of its own here.
+    apart = np.where(landmarks == UNNAMED, UNNAMED - 1 - np.arange(len(step)), landmarks)
+    if named:
+        table.require(landmarks >= UNNAMED, "landmark_id", f"{UNNAMED} or the number of a landmark")
+    table.require_distinct(step, apart, "step")
     return step, landmarks
 
 

@@ -21,6 +21,9 @@ from rbpf.sensors.readers.text import LARGEST, Table
 
 _MAY_BE_ZERO = {"std_speed_mps", "std_turn_rate_radps", "scale_odometry"}
 
+UNNAMED = -1
+"""In place of a landmark's name where it is not known which one was observed."""
+
 _ROUNDING = 1e-5
 """Of a covariance's printed digits, relative."""
 
@@ -33,7 +36,7 @@ class Frame:
         stamp_ns: time of the observations, integer nanoseconds; a log without times counts steps.
         delta: (E,) odometry, previous_robot_from_robot; None in the first frame.
         cov_delta: (d, d) its covariance in the right chart at `delta`; None in the first frame.
-        landmarks: (K,) integer names that the log gives the landmarks observed.
+        landmarks: (K,) integer names that the log gives the landmarks observed, `UNNAMED` where it gives none.
         z: (K, p) measurements.
         cov_z: (K, p, p) their covariance.
     """

@@ -13,6 +13,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.files import write_csv, write_text
 from rbpf.sensors.readers import RobotLog, open_log
+from rbpf.sensors.readers.robot_log import UNNAMED
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,7 @@ class RobotWorld:
         std_angle_deg: noise of yaw and pitch.
         std_translation_m: noise of the odometry per step and axis.
         std_rotation_deg: likewise.
+        unnamed: the log does not say which landmark was observed.
     """
 
     steps: int = 200
@@ -46,6 +48,7 @@ class RobotWorld:
     std_angle_deg: float = 0.3
     std_translation_m: float = 0.03
     std_rotation_deg: float = 0.3
+    unnamed: bool = False
 
     def __post_init__(self) -> None:
         """Checks that there is something to simulate."""
@@ -115,7 +118,7 @@ def simulate_robot(world: RobotWorld, folder: Path, seed: int) -> None:
         seen = near & (np.abs(z[:, 1]) <= view) & (np.abs(z[:, 2]) <= view)
         noisy = z[seen] + std * rng.standard_normal((int(seen.sum()), 3))
         rows.extend(
-            [t, i + 1, *row, *std]
+            [t, UNNAMED if world.unnamed else i + 1, *row, *std]
             for i, row in zip(np.flatnonzero(seen).tolist(), noisy.tolist(), strict=True)
         )
     header = ["step", "landmark_id", "range_m", "yaw_rad", "pitch_rad"]
