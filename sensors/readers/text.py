@@ -5,6 +5,7 @@ every product that a reader forms far from overflow.
 """
 
 import re
+from codecs import BOM_UTF8
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
@@ -62,10 +63,10 @@ def read_text(path: Path, hint: str = "", most: int | None = None) -> str:
     """Text of a file without a byte-order mark.
 
     Raises:
-        InputError: as `read_bytes`, or the file is empty or not UTF-8.
+        InputError: as `read_bytes`, or the file is empty, but for a byte-order mark, or not UTF-8.
     """
     data = read_bytes(path, hint, most)
-    if not data.strip():
+    if not data.removeprefix(BOM_UTF8).strip():
         raise InputError(f"{path}: the file is empty{hint and '; expected ' + hint}.")
     try:
         return data.decode("utf-8-sig")

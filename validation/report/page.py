@@ -156,7 +156,13 @@ def _draw_timings(record: RunFolder, problems: list[str]) -> None:
 
 
 def _images(folder: Path, names: list[str]) -> list[tuple[str, str]]:
-    there = [name for name in names if (folder / name).is_file()]
+    # A link may show what its maker must not see of the disk of whoever opens the run.
+    inside = folder.resolve()
+    there = [
+        name
+        for name in names
+        if (folder / name).is_file() and (folder / name).resolve().is_relative_to(inside)
+    ]
     return [(Path(name).stem, base64.b64encode((folder / name).read_bytes()).decode()) for name in there]
 
 
