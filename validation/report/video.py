@@ -272,7 +272,7 @@ def write_video(
 
     with whole(path) as partial:
         encoder = imageio_ffmpeg.write_frames(
-            str(partial),
+            str(partial.absolute()),
             size,
             fps=frame_rate(stamps_ns),
             codec="libx264",

@@ -7,6 +7,7 @@ before its last announced image ends with a frame that has none and says so.
 Beside them a camera at this computer, as a source of images that ends when it is unplugged or somebody presses Ctrl-C.
 """
 
+import os
 import signal
 import threading
 import time
@@ -117,7 +118,14 @@ def opened(path: Path) -> Iterator[Any]:
     import cv2
 
     # Other backends take the number in a name such as 000001 for a pattern of images.
-    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    # An absolute path is never taken for a URL, and no file may send the decoder to another one over the network.
+    name = str(path.absolute())
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        raise InputError(f"{name!a}: a video's name must be text in UTF-8; rename the file.") from None
+    os.environ.setdefault("OPENCV_FFMPEG_CAPTURE_OPTIONS", "protocol_whitelist;file")
+    capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG)
     try:
         if not capture.isOpened():
             raise InputError(f"{path}: OpenCV cannot open the video; {_ACTION}.")
