@@ -1,5 +1,6 @@
 """The command line: thin, one function per command."""
 
+import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,6 +8,7 @@ from typing import Annotated
 
 import tyro
 
+from rbpf import __version__
 from rbpf.cli import cameras, exporting, installed, judging
 from rbpf.cli.commands import Commands
 from rbpf.cli.options import ImagesOptions, MonoOptions, Printed
@@ -74,13 +76,21 @@ def main(arguments: list[str] | None = None) -> int:
     """Parses the command line, runs the command; bad input becomes one sentence and exit code 2."""
     try:
         given = sys.argv[1:] if arguments is None else arguments
+        if list(given) == ["--version"]:
+            print(f"{PROGRAM} {__version__}", flush=True)
+            return 0
         _require_filled(given)
         expanded = repeated(list(given))
         APP.require_known(expanded, PROGRAM)
         APP.cli(prog=PROGRAM, description=_DESCRIPTION, args=expanded)
+        sys.stdout.flush()  # so that a broken pipe is noticed here
     except InputError as error:
         print(f"{PROGRAM}: {error}", file=sys.stderr)
         return BAD_INPUT
+    except BrokenPipeError:
+        # Whoever read has seen enough; what Python would still write at its end goes nowhere.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
     except OSError as error:
         print(
             f"{PROGRAM}: {error}; what was finished is kept, --resume goes on from the last checkpoint",
