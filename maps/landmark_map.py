@@ -2,12 +2,12 @@
 
 from collections.abc import Sequence
 from operator import is_
-from typing import Any, final
+from typing import final
 
 import numpy as np
 
 from rbpf import gaussian
-from rbpf.core.checkpoint import checked, within
+from rbpf.core.checkpoint import within
 from rbpf.core.genealogy import Lineage
 from rbpf.core.likelihoods import Gaussian
 from rbpf.core.linearisation import innovation_covariance, linearise
@@ -49,7 +49,6 @@ class LandmarkMap(Map):
         self.evidence = evidence
         self.compiled = compiled
         self.layouts: list[Layout] = []
-        self.catalogue: dict[int, Any] = {}
         self._planned: tuple[Sequence[Observations], Plan] | None = None
 
     def begin(self, n: int, lineage: Lineage) -> None:
@@ -79,10 +78,7 @@ class LandmarkMap(Map):
     def add(self, new_landmarks: NewLandmarks, state: np.ndarray) -> np.ndarray:
         records = new_landmarks.model.initialise(state, new_landmarks.z, new_landmarks.cov)
         log_odds = None if new_landmarks.mask is None else np.where(new_landmarks.mask, 0.0, -np.inf)
-        ids = self.add_records(records, new_landmarks.landmark, log_odds, new_landmarks.ids)
-        for landmark, fact in zip(ids.tolist(), new_landmarks.facts, strict=False):
-            self.catalogue[landmark] = fact
-        return ids
+        return self.add_records(records, new_landmarks.landmark, log_odds, new_landmarks.ids)
 
     def add_records(
         self,
@@ -117,8 +113,6 @@ class LandmarkMap(Map):
         self._known(ids)
         self._planned = None
         self.store.remove(ids)
-        for landmark in ids.tolist():
-            self.catalogue.pop(landmark, None)
 
     def promote(self, ids: Sequence[int] | np.ndarray, to: Landmark | None = None) -> None:
         self._planned = None
@@ -310,18 +304,8 @@ class LandmarkMap(Map):
         self.store.compact()
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Columns and kinds; the catalogue's facts must be numbers or text to be saved."""
-        ids = self.ids
-        fact_ids = [i for i in ids.tolist() if i in self.catalogue]
-        facts = [self.catalogue[i] for i in fact_ids]
-        plain = all(isinstance(fact, str | int | float | np.generic) for fact in facts)
-        if not plain or len({type(fact) for fact in facts}) > 1:
-            raise InputError("facts in the catalogue can be saved if all are numbers or all are text")
-        return self.store.arrays() | {
-            "map/kinds": self.store.columns.kinds(ids),
-            "map/fact_ids": np.array(fact_ids, dtype=np.int64),
-            "map/facts": np.array(facts),
-        }
+        """Columns and kinds."""
+        return self.store.arrays() | {"map/kinds": self.store.columns.kinds(self.ids)}
 
     def options(self) -> dict[str, object]:
         """Whether there are log-odds, and the parametrisations in the order of their numbers."""
@@ -344,11 +328,6 @@ class LandmarkMap(Map):
         if not np.array_equal(sizes, self.store.columns.fields[:count]):
             raise InputError("the landmarks' records have other sizes than their parametrisations")
         self.store.columns.kind[:count] = kinds
-        named = checked(arrays, "map/fact_ids", (None,), "i")
-        if not self.store.columns.held(named).all():
-            raise InputError("the array map/fact_ids names a landmark that the map does not hold")
-        facts = checked(arrays, "map/facts", (named.size,), "iufbU").tolist()
-        self.catalogue = dict(zip(named.tolist(), facts, strict=True))
 
     def register(self, landmark: Landmark) -> None:
         """Names a parametrisation before it is first used, so that a checkpoint can be read back.

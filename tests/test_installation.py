@@ -95,7 +95,7 @@ def test_an_installed_package_simulates_and_reports(built, kind, finished, tmp_p
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(site), *lower])}
     where = run([str(python), "-c", "import rbpf; print(rbpf.__file__)"], cwd=tmp_path, env=environment)
     assert Path(where.strip()) == site / "rbpf" / "__init__.py"
-    rbpf = [str(python), "-m", "rbpf.cli"]
+    rbpf = [str(python), "-m", "rbpf"]
     run([*rbpf, "simulate", "range-bearing", "--out", "log", "--steps", "8"], cwd=tmp_path, env=environment)
     assert (tmp_path / "log" / "odometry.csv").is_file()
     report = finished / "report.html"

@@ -102,7 +102,7 @@ def run_command(arguments: Sequence[str], most_bytes: int | None = None) -> Ende
         arguments: of the command.
         most_bytes: size that no file may pass; None is unlimited.
     """
-    program = ["-m", "rbpf.cli"] if most_bytes is None else ["-c", LIMITED, str(most_bytes)]
+    program = ["-m", "rbpf"] if most_bytes is None else ["-c", LIMITED, str(most_bytes)]
     done = subprocess.run([sys.executable, *program, *arguments], capture_output=True, text=True, check=False)
     lines = [line for line in done.stderr.splitlines() if line.startswith("rbpf: ")]
     return Ended(done.returncode, lines[-1] if lines else "", "Traceback" in done.stderr)
@@ -123,7 +123,7 @@ def kill_and_resume(
     checkpoint = out / "checkpoint.npz"
     for _ in range(kills):
         before = checkpoint.stat().st_mtime_ns if checkpoint.exists() else 0
-        command = [sys.executable, "-m", "rbpf.cli", *arguments, "--resume"]
+        command = [sys.executable, "-m", "rbpf", *arguments, "--resume"]
         process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
         while process.poll() is None and not (checkpoint.exists() and checkpoint.stat().st_mtime_ns > before):
             time.sleep(0.01)

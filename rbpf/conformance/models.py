@@ -233,12 +233,9 @@ def sensor_checks(sensor: Sensor, example: Example) -> list[Check]:
         for new_landmarks in called(sensor.new_landmarks, example.frame, belief, groups, repeat=False):
             require_type(f"{name}, for a group,", new_landmarks, NewLandmarks)
             measurements(name, new_landmarks)
-            k, facts = new_landmarks.z.shape[0], len(new_landmarks.facts)
+            k = new_landmarks.z.shape[0]
             if new_landmarks.mask is not None:
                 require_shape(f"{name}: mask", new_landmarks.mask, (n, k))
-            require(
-                facts in (0, k), f"{name} gives {facts} facts for {k} landmarks, expected one each or none"
-            )
             if new_landmarks.ids is not None:
                 require_shape(f"{name}: ids", new_landmarks.ids, (k,))
                 taken = new_landmarks.ids[belief.map.holds(new_landmarks.ids)].tolist()

@@ -11,10 +11,10 @@ C components, p measurement, r noise rank. A method that is not abstract is a ho
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -143,7 +143,6 @@ class NewLandmarks:
         landmark: the parametrisation.
         mask: (N, K) which particles take them as new; None is all.
         ids: (K,) numbers from 0 up by which the sensor knows them, none of them in use; None lets the map number them.
-        facts: per landmark, what the catalogue remembers of it (a descriptor, the log's own name).
     """
 
     z: Float[np.ndarray, "K p"]
@@ -151,7 +150,6 @@ class NewLandmarks:
     model: "ObservationModel"
     landmark: "Landmark"
     mask: Bool[np.ndarray, "N K"] | None = None
-    facts: Sequence[Any] = field(default_factory=tuple)
     ids: Int[np.ndarray, " K"] | None = None
 
 
@@ -416,7 +414,6 @@ class Map(Conditional):
 
     supplies = Part.LANDMARK
     evidence: bool
-    catalogue: dict[int, Any]
 
     @property
     @abstractmethod
@@ -574,11 +571,6 @@ class Belief:
         if not isinstance(held, Map):
             raise InputError("this sensor needs a landmark map: give the filter a LandmarkMap")
         return held
-
-    @property
-    def catalogue(self) -> dict[int, Any]:
-        """Facts about landmarks that do not differ between particles: names, patches, descriptors, counters."""
-        return self.map.catalogue
 
     def read(
         self,

@@ -71,7 +71,7 @@ def estimate_map(filter_: Filter, anchored: Anchored | None = None) -> MapEstima
             points, within = relative_points(filter_.space, anchored, records)
         own = weights * held / fraction
         mean, cov = mixture_moments(own, points, within)
-        names.append(landmark_map.catalogue.get(int(landmark_id), int(landmark_id)))
+        names.append(int(landmark_id))
         means.append(mean)
         covs.append(cov)
     dim = 2 if isinstance(filter_.space, SE2Group) else 3

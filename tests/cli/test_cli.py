@@ -143,7 +143,7 @@ def test_a_resumed_run_is_identical(log, tmp_path, association, monkeypatch):
 @pytest.mark.slow
 def test_threads_change_no_byte(log, tmp_path):
     for threads in ("1", "2"):
-        command = [sys.executable, "-m", "rbpf.cli", "run", "range-bearing", str(log), "--no-batch"]
+        command = [sys.executable, "-m", "rbpf", "run", "range-bearing", str(log), "--no-batch"]
         command += ["--particles", "3000", "--threads", threads, "--out", str(tmp_path / threads)]
         environment = {**os.environ, "NUMBA_NUM_THREADS": "2"}
         subprocess.run(command, check=True, env=environment, capture_output=True)

@@ -187,7 +187,7 @@ def test_the_doctor_finds_everything_here_and_what_is_missing(capsys, monkeypatc
 def test_the_first_compilation_is_announced(log, tmp_path):
     """In an empty cache; what is compiled there is not waited for."""
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
-    command = [sys.executable, "-u", "-m", "rbpf.cli", *quick(log, tmp_path / "run")]
+    command = [sys.executable, "-u", "-m", "rbpf", *quick(log, tmp_path / "run")]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment)
     try:
         assert process.stderr is not None

@@ -38,7 +38,7 @@ def test_threads_change_no_byte_of_a_run_over_images(recordings, tmp_path, syste
     for threads in ("1", "2"):
         libraries = {f"{name}_NUM_THREADS": threads for name in ("OPENBLAS", "OMP", "MKL")}
         environment = {**os.environ, **libraries, "NUMBA_NUM_THREADS": "2"}
-        command = [sys.executable, "-m", "rbpf.cli", "run", system, *recordings[system], "--threads", threads]
+        command = [sys.executable, "-m", "rbpf", "run", system, *recordings[system], "--threads", threads]
         command += ["--out", str(tmp_path / threads)]
         subprocess.run(command, check=True, env=environment, capture_output=True)
     one, two = outputs(tmp_path / "1"), outputs(tmp_path / "2")

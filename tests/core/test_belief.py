@@ -119,12 +119,10 @@ def test_innovations_of_every_pair(rng):
         np.testing.assert_allclose(cov[i, k, m], within + moved @ moved.T + noise[k], atol=1e-12)
 
 
-def test_weights_mode_and_catalogue(rng):
+def test_weights_and_mode(rng):
     belief, records = belief_of(prior_of(SE2, rng, centred=True), 2, rng, np.array(AHEAD_2D["ahead"]))
     assert belief.weights.sum() == pytest.approx(1.0)
     assert belief.weights[belief.mode] == belief.weights.max()
-    belief.map.catalogue[1] = "oak"
-    assert belief.catalogue == {1: "oak"}
     np.testing.assert_array_equal(belief.read([1, 2]).mean, records.mean[:, 1:])
 
 

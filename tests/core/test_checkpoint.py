@@ -10,7 +10,6 @@ from rbpf.core.filter import Filter
 from rbpf.core.marginals import KalmanSubstate
 from rbpf.core.models import (
     MotionModel,
-    NewLandmarks,
     ObservationModel,
     Observations,
     Part,
@@ -20,12 +19,7 @@ from rbpf.core.models import (
 from rbpf.core.proposals import PriorProposal
 from rbpf.core.resampling import EssTriggered, Residual
 from rbpf.errors import InputError
-from rbpf.lie import SE2, Euclidean
-from rbpf.maps.landmark_map import LandmarkMap
-from rbpf.maps.point import Point
-from rbpf.motion.odometry import OdometryMotion
-from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
-from rbpf.sensors.range_bearing import RangeBearing
+from rbpf.lie import Euclidean
 from tests.core.worlds import STEP_NS, Recipe, World, content, drive, planar_world, same
 
 STEPS = 30
@@ -175,40 +169,6 @@ def test_arrays_of_the_caller_come_back(world, tmp_path):
     found = Recipe(n=15).build().load(tmp_path / "run.npz")
     assert found.keys() == extra.keys()
     assert all(np.array_equal(found[name], extra[name]) for name in extra)
-
-
-def test_catalogue_comes_back_with_its_types(world, tmp_path):
-    for names in ([3, 5], ["left", "right"], [1.5, 2.5]):
-        landmark_map = LandmarkMap(SE2)
-        filter_ = Filter(
-            OdometryMotion(SE2), NamedLandmarkSensor(RangeBearing(SE2), Point(2)), landmark_map, n=3
-        )
-        landmark_map.register(Point(2))
-        new_landmarks = replace(first_births(world), facts=names)
-        landmark_map.add(new_landmarks, filter_.particles.state)
-        filter_.save(tmp_path / "run.npz")
-        before = dict(landmark_map.catalogue)
-        filter_.load(tmp_path / "run.npz")
-        assert landmark_map.catalogue == before
-        assert [type(fact) for fact in landmark_map.catalogue.values()] == [type(fact) for fact in names]
-
-
-def first_births(world: World) -> NewLandmarks:
-    frame = world.frames[0]
-    return NewLandmarks(frame.z[:2], frame.cov_z[:2], RangeBearing(SE2), Point(2))
-
-
-@pytest.mark.parametrize(
-    "facts", [[1, "a"], [(1, 2), (3, 4)], [np.zeros(2), np.zeros(3)], [{"a": 1}, {"b": 2}]]
-)
-def test_facts_that_a_file_cannot_hold_are_refused_when_saving(facts, world, tmp_path):
-    filter_ = Recipe(n=3).build()
-    filter_.belief().map.add(replace(first_births(world), facts=facts), filter_.particles.state)
-    with pytest.raises(
-        InputError, match="facts in the catalogue can be saved if all are numbers or all are text"
-    ):
-        filter_.save(tmp_path / "run.npz")
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_no_pickle_is_written(world, tmp_path):

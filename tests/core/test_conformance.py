@@ -514,7 +514,6 @@ NEW: dict[str, Any] = {
     r": mask has shape \(2,\), expected \(40, 2\)": replace(STARTED, mask=np.ones(2, dtype=bool)),
     r": ids has shape \(1,\), expected \(2,\)": replace(STARTED, ids=np.array([7])),
     r" starts landmarks \[2\], which the map holds already": replace(STARTED, ids=np.array([2, 7])),
-    " gives 1 facts for 2 landmarks, expected one each or none": replace(STARTED, facts=["oak"]),
 }
 # fmt: on
 

@@ -157,7 +157,7 @@ def test_the_compiled_refinement_equals_its_numpy_twin(space, rng):
             prior = scene.prior(rank, shared)
             quad, log_det, log_factor = rng.normal(size=(3, 40))
             info, vector = random_covs(rng, (40,), d, 3.0), rng.normal(size=(40, d))
-            terms = Information(info, vector, quad, log_det, log_factor, rows=7)
+            terms = Information(info, vector, quad, log_det, log_factor, rows=np.full(log_det.shape, 7.0))
             ours, twin = refined(prior, terms), refined_in_numpy(prior, terms)
             for name in ("mean", "root", "log_w1", "nis"):
                 np.testing.assert_allclose(

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 DATA = Path(os.environ.get("RBPF_DATA", "../shared/data")).resolve()
-RBPF = [sys.executable, "-m", "rbpf.cli"]
+RBPF = [sys.executable, "-m", "rbpf"]
 TIMES = ("ms_per_", "peak_memory", "seconds", "_ms", "milliseconds")
 MONO_FEATURES = Path(__file__).with_name("run_named_features.py")
 

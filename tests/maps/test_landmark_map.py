@@ -73,16 +73,6 @@ def test_more_landmarks_than_first_reserved():
     np.testing.assert_array_equal(landmark_map.read(np.array([149])).mean[:, 0], records.mean[:, 149])
 
 
-def test_a_removed_landmark_leaves_the_catalogue():
-    landmark_map, _ = filled()
-    new_landmarks = NewLandmarks(
-        np.ones((2, 2)), np.repeat(np.eye(2)[None], 2, 0), RangeBearing(SE2), Point(2), facts=["a", "b"]
-    )
-    landmark_map.add(new_landmarks, SE2.identity((N,)))
-    landmark_map.remove(np.array([0]))
-    assert landmark_map.catalogue == {1: "b"}
-
-
 def test_a_ring_promotes_to_its_moments():
     rng = np.random.default_rng(2)
     landmark_map, _ = filled()

@@ -1,7 +1,0 @@
-"""`python -m rbpf.cli`."""
-
-import sys
-
-from rbpf.cli import main
-
-sys.exit(main())
