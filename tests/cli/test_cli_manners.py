@@ -152,7 +152,7 @@ def test_a_run_is_repeated_from_its_config(log, tmp_path, capsys):
     assert outputs(tmp_path / "a") == outputs(tmp_path / "a-again")
     assert not (tmp_path / "a-again" / "batch.tum").exists()
     assert main([*again, "--batch"]) == 0
-    assert (tmp_path / "a-again" / "batch.tum").exists()
+    assert (tmp_path / "a-again-2" / "batch.tum").exists()
     capsys.readouterr()
     path = next(log.glob("observations.csv"))
     before = path.read_text()
