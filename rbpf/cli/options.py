@@ -35,8 +35,8 @@ class RunOptions(Printed):
     """Of every `rbpf run`.
 
     Attributes:
-        out: folder for the results; by default run, or run-2, run-3, … where there are runs already. With --resume or
-            --overwrite the last of them.
+        out: folder for the results; by default run, or run-2, run-3, … where there are runs already; the last of them to
+            resume or to overwrite.
         particles: number of particles.
         seed: of the random generators; by default 0, or as in --config.
         config: YAML file of settings, such as a former run's config.yaml; by default the system's own.

@@ -29,7 +29,7 @@ def test_a_rendered_board_is_what_a_run_starts_from(tmp_path, capsys):
     truth = np.loadtxt(tmp_path / "desk" / "mav0" / "state_groundtruth_estimate0" / "data.csv", delimiter=",")
     where = SE3.inverse_transform(np.array(entry["world_from_board"]), truth[0, 1:4])
     assert np.linalg.norm(first[4:] - where) < 0.01 * np.linalg.norm(where)
-    assert run(tmp_path / "desk", tmp_path / "run", "--board", "9x6", "--square", "0.04", known=False) == 2
+    assert run(tmp_path / "desk", tmp_path / "other", "--board", "9x6", "--square", "0.04", known=False) == 2
     assert "no chessboard of 9x6 inner corners" in sentence(capsys)
 
 
@@ -85,7 +85,7 @@ def test_markers_are_what_a_run_starts_from(tmp_path, capsys):
     assert main(again) == 0
     repeated = (tmp_path / "run-again" / "trajectory.tum").read_bytes()
     assert repeated == (tmp_path / "run" / "trajectory.tum").read_bytes()
-    assert run(folder, tmp_path / "run", *board, "--dictionary", "6x6_50", known=False) == 2
+    assert run(folder, tmp_path / "other", *board, "--dictionary", "6x6_50", known=False) == 2
     assert "no marker of a board of 5x4 from 6X6_50" in " ".join(sentence(capsys).split())
 
 
