@@ -277,7 +277,8 @@ def test_two_runs_have_no_evidence_to_compare(finished, capsys):
 
 
 def test_no_stereo_sequence(tmp_path, capsys):
-    assert run(tmp_path, tmp_path / "run") == 2
+    (tmp_path / "empty").mkdir()
+    assert run(tmp_path / "empty", tmp_path / "run") == 2
     said = " ".join(capsys.readouterr().err.split())
     assert "found an empty folder, expected a ROS bag" in said and "or an EuRoC sequence" in said
     assert "or a KITTI odometry sequence of two cameras" in said
