@@ -1,4 +1,4 @@
-"""Beside MRPT's EKF-SLAM (`kf-slam`) on a log that MRPT simulates: the same sightings, associations known.
+"""Beside MRPT's EKF-SLAM (`kf-slam`) on a log that MRPT simulates: the same observations, associations known.
 
 An EKF over all landmarks is not a particle filter: this row says what a step costs and how good the map is where
 both apply, on few landmarks.
@@ -130,7 +130,7 @@ def run(settings: Settings) -> list[Row]:
             theirs.median * 1e3,
             theirs.median / spent.median,
             notes=(
-                f"{N} particles, {seen:.0f} sightings per step; mean error of the map: {error * 1e3:.1f} mm, "
+                f"{N} particles, {seen:.0f} observations per step; mean error of the map: {error * 1e3:.1f} mm, "
                 f"kf-slam {theirs_error(output[-1]) * 1e3:.1f} mm"
             ),
             tolerance=0.5,

@@ -100,7 +100,7 @@ class Run:
         world: what it sees; consumed by this run alone.
         n: particles.
         steps: how many there will be.
-        model: of the sightings; by default the built-in one.
+        model: of the observations; by default the built-in one.
         compiled: use the fused kernels.
     """
 

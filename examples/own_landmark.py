@@ -1,7 +1,7 @@
 """A landmark parametrisation of one's own: bearing-only mapping in the plane by inverse range.
 
 A bearing says nothing about distance, and a Gaussian in (x, y) cannot hold that. A Gaussian in (bearing,
-inverse range) as seen from the pose of the first sighting can: E06 (12)-(13) in the plane. The anchor pose
+inverse range) as seen from the pose of the first observation can: E06 (12)-(13) in the plane. The anchor pose
 is a constant of the record. Store, filter and sensor stay as they are; what has been located well enough
 turns into a point.
 """

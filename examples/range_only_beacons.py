@@ -20,7 +20,7 @@ BEACONS = np.array([[6.0, 5.0], [-4.0, 6.0], [3.0, -5.0], [10.0, -1.0], [-5.0, -
 
 
 class Range(ObservationModel):
-    """z = (distance,) to a beacon [m]; a first sighting starts a ring around the robot."""
+    """z = (distance,) to a beacon [m]; a first observation starts a ring around the robot."""
 
     dim = 1
 

@@ -5,7 +5,7 @@ measured once (OUT/features, five minutes; an interrupted run goes on where it w
 --frames shortens the tour, --every thins it out, --sweep filters its first pairs with other settings.
 
 The map of the best particle is its own. The maps that odometry alone builds, visual or of the wheels, have the filter's
-sightings, averaged along its path: they differ from one another by the paths only. Errors are those of places of
+observations, averaged along its path: they differ from one another by the paths only. Errors are those of places of
 landmarks as the true path would have them, in metres, first in the world of the first camera, then after a rigid
 alignment.
 """

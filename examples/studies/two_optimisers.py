@@ -273,7 +273,7 @@ class TwoOptima:
 def adjust_by_both(log: FeatureLog, world_from_camera: Array) -> TwoOptima:
     """Adjusts a log by both optimisers, from the same poses.
 
-    Landmarks that the sightings do not determine are left out of both.
+    Landmarks that the observations do not determine are left out of both.
 
     Args:
         log: of one camera, all pixels with the same isotropic noise.

@@ -2,7 +2,7 @@
 
 A robot drives round among landmarks, several times with other noise. The filter is told the right things, or one thing
 wrongly: the noise of its sensor or of its odometry three times too large or too small, an odometer with a bias of one
-of its standard deviations, a fifth of the sightings under wrong names, or derivatives of the measured angle by the
+of its standard deviations, a fifth of the observations under wrong names, or derivatives of the measured angle by the
 landmark with the wrong sign. The table counts the verdicts: what can be said from the innovations alone, and what with
 the truth beside. Innovations find every one of these faults, but they never earn "trust": particles that agree on a
 wrong path explain what they see. With the truth beside, a run of a few hundred steps may be too short to tell.
@@ -35,7 +35,7 @@ from rbpf.validation.tables import write_table
 
 
 def scale_sensor_noise(log: RobotLog, factor: float) -> RobotLog:
-    """Claims standard deviations of all sightings that are `factor` times the right ones."""
+    """Claims standard deviations of all observations that are `factor` times the right ones."""
     return _changed(log, lambda frame: replace(frame, cov_z=factor**2 * frame.cov_z))
 
 
@@ -63,7 +63,7 @@ def bias_odometry(log: RobotLog, sigmas: float) -> RobotLog:
 
 
 def swap_names(log: RobotLog, fraction: float, rng: np.random.Generator) -> RobotLog:
-    """Gives a fraction of the sightings the name of another landmark, one that is not seen in the same step."""
+    """Gives a fraction of the observations the name of another landmark, one that is not seen in the same step."""
     every = np.unique(np.concatenate([frame.landmarks for frame in log.frames]))
 
     def change(frame: Frame) -> Frame:

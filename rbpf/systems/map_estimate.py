@@ -53,7 +53,7 @@ def estimate_map(filter_: Filter, anchored: Anchored | None = None) -> MapEstima
 
     Args:
         filter_: holds a map of point landmarks.
-        anchored: the start in each particle's world; the map is then told relative to it.
+        anchored: the start in each particle's world; the map is then reported relative to it.
     """
     belief = filter_.belief()
     landmark_map, weights = belief.map, belief.weights

@@ -37,7 +37,7 @@ class TrackingState(StrEnum):
     TRACKED = "tracked"
     """The frame was measured and agrees with the map."""
     PREDICTED = "predicted"
-    """The frame told nothing, or not enough: the pose is the motion model's or the odometry's."""
+    """The frame gave no information, or not enough: the pose is the motion model's or the odometry's."""
     LOST = "lost"
     """The frame was measured, but the map does not say where the camera is: the pose is the last trusted one, or goes on
     from it as assumed."""

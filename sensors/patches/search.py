@@ -1,4 +1,4 @@
-"""Image patches of landmarks: cut at the first sighting, warped to the predicted view, searched for (E06 §4.1).
+"""Image patches of landmarks: cut at the first observation, warped to the predicted view, searched for (E06 §4.1).
 
 Pixels are (column, row), with the centre of the top-left one at (0, 0). Images are grey, (H, W) uint8.
 """

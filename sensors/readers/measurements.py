@@ -22,7 +22,7 @@ _UNIT = 1e-6
 @final
 @dataclass(frozen=True, eq=False)
 class Measurements:
-    """Odometry, and sightings of landmarks whose association is settled; T steps, K sightings.
+    """Odometry, and observations of landmarks whose association is settled; T steps, K observations.
 
     Attributes:
         recording: short name of the recording, one line.
@@ -34,7 +34,7 @@ class Measurements:
         stamps_ns: (T,) time of each step, integer nanoseconds.
         deltas: (T - 1, E) odometry, previous_robot_from_robot of the steps from 1 on.
         covs: (T - 1, d, d) their covariance in the right chart there, order [omega, v]; may be singular.
-        steps: (K,) the step of each sighting.
+        steps: (K,) the step of each observation.
         landmarks: (K,) the map's name of the landmark seen.
         z: (K, p) what was measured.
         cov_z: (K, p, p) covariance of its noise.
@@ -85,7 +85,7 @@ class Measurements:
                 raise InputError(f"Expected {name} of shape {shape}, found {found}.")
         # Values.
         if ((self.steps < 0) | (self.steps >= len(self.stamps_ns))).any():
-            raise InputError(f"Expected the steps of sightings from 0 to {len(self.stamps_ns) - 1}.")
+            raise InputError(f"Expected the steps of observations from 0 to {len(self.stamps_ns) - 1}.")
         if (np.diff(self.stamps_ns) < 0).any():
             raise InputError("Expected the stamps of the steps in order of time.")
         for name in ("robot_from_sensor", "start", "deltas", "covs", "z", "cov_z"):
@@ -124,7 +124,7 @@ def dead_reckoning(m: Measurements) -> Array:
 
 
 def initial_estimate(m: Measurements) -> InitialEstimate:
-    """Dead reckoning, and every landmark where its first sighting from there puts it."""
+    """Dead reckoning, and every landmark where its first observation from there puts it."""
     path, model = dead_reckoning(m), m.model()
     by_step = np.argsort(m.steps, kind="stable")
     names, first = np.unique(m.landmarks[by_step], return_index=True)

@@ -180,7 +180,7 @@ def scene():
     names, record = np.arange(10) * 3 + 1, Record(due=(4,))
     for t in range(12):
         seen = rng.permutation(10)[:6]
-        record.sightings.append((names[seen], t, SE3.inverse_transform(true[t], places[seen])))
+        record.observations.append((names[seen], t, SE3.inverse_transform(true[t], places[seen])))
     return true, places, names, record
 
 

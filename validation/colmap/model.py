@@ -79,7 +79,7 @@ def build_model(
     """A `pycolmap.Reconstruction`.
 
     Args:
-        table: sightings of T frames; the right pixel of a stereo pair becomes an observation of its own.
+        table: observations of T frames; the right pixel of a stereo pair becomes an observation of its own.
         world_from_camera: (T, 7) of the (left) camera.
         points: (L, 3), in the order of the table's names.
         colours: (L, 3) RGB; by default grey.

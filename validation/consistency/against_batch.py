@@ -1,6 +1,6 @@
 """A run beside the batch optimum of the same measurements: path, map, covariances, likelihood.
 
-Frame and chart. Both are told in the run's own world. A pose's covariance is carried from the chart at the filter's
+Frame and chart. Both are given in the run's own world. A pose's covariance is carried from the chart at the filter's
 pose to that at the optimum's: with δ = Log(T_b⁻¹ T_f), P ← J_r⁻¹(δ) P J_r⁻ᵀ(δ).
 
 What is conditioned on what. The map and the last pose know the same measurements in filter and batch. An earlier online
@@ -76,7 +76,7 @@ class AgainstBatch:
         path: distances of the filter's online positions from the optimum's, per step, without alignment.
         landmarks: Gaussians of the map.
         poses: Gaussians of the poses at a few instants; none where the covariances are not known.
-        fit_filter: of the sightings of landmarks that both have, by the filter's online poses and its last map.
+        fit_filter: of the observations of landmarks that both have, by the filter's online poses and its last map.
         fit_batch: by the optimum.
     """
 

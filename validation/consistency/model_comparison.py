@@ -203,7 +203,7 @@ def _require_density(config: Config, name: str) -> None:
         return
     raise InputError(
         f"the {name} configuration has no evidence: its likelihood {config.likelihood.kind!r} is not a density "
-        "(it does not integrate to one); use gaussian, or outliers for sightings that may be wrong"
+        "(it does not integrate to one); use gaussian, or outliers for observations that may be wrong"
     )
 
 

@@ -56,12 +56,12 @@ class Optimum:
 @final
 @dataclass(frozen=True)
 class Fit:
-    """How well a path and a map explain sightings.
+    """How well a path and a map explain observations.
 
     Attributes:
         log_likelihood: Σ log N(z − h(x̂, m̂); 0, R) [nats].
         rms_sigmas: root of the mean square whitened residual per measured number.
-        sightings: how many took part.
+        sightings: how many observations took part; the name is that of the key in the file.
     """
 
     log_likelihood: float
@@ -155,7 +155,7 @@ def robot_optimum(problem: Measurements, found: robot.BatchSolution) -> Optimum:
 
 
 def fit_of(problem: Problem, estimate: PathAndMap, names: NDArray[np.int64]) -> Fit:
-    """How likely the sightings of the named landmarks are, of the estimate's own poses and landmarks.
+    """How likely the observations of the named landmarks are, of the estimate's own poses and landmarks.
 
     Args:
         problem: T steps.

@@ -16,7 +16,7 @@ from rbpf.sensors.feature_log import FeatureLog, KnownPoints
 from rbpf.validation.gtsam.camera import CameraEstimate, CameraSolution, solve_features
 
 ROBUST = 1.345
-"""Threshold of Huber's loss on whitened sightings, in standard deviations: a wrong match does little harm."""
+"""Threshold of Huber's loss on whitened observations, in standard deviations: a wrong match does little harm."""
 
 LEAST = 4
 """Landmarks known, or seen in other frames too, that a frame needs to take part: three leave several poses."""

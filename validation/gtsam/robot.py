@@ -227,7 +227,7 @@ class Problem:
             row = int(np.argmax(singular))
             place = f"landmark {m.landmarks[row]} at step {m.steps[row]}"
             raise InputError(
-                f"The sighting of {place} has a singular covariance, expected noise in all of it."
+                f"The observation of {place} has a singular covariance, expected noise in all of it."
             )
         self.m, self.robust, self.model = m, robust, m.model()
         self.chart = PLANAR if isinstance(m.space, SE2Group) else SPATIAL

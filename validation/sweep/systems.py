@@ -108,7 +108,7 @@ def _run_stereo(sequence: Mapping[str, Path], pairs: Sequence[str], given: Mappi
 
 
 def _pose_nees(space: Any, mean: np.ndarray, cov: np.ndarray, truth: RunTruth | None) -> Figures:
-    """Mean over the steps, of d degrees of freedom; nothing where the truth is not told in the filter's world."""
+    """Mean over the steps, of d degrees of freedom; nothing where the truth is not given in the filter's world."""
     if truth is None or truth.alignment != "none":
         return {}
     errors = whitened_errors(space, mean[truth.rows], cov[truth.rows], truth.poses)

@@ -1,4 +1,4 @@
-"""How likely each depth of a landmark is after some sightings, on a grid, without any linearisation (figure 2)."""
+"""How likely each depth of a landmark is after some observations, on a grid, without any linearisation (figure 2)."""
 
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -13,12 +13,12 @@ SHOWN = 1, 2, 3, 5, 10
 COLOURS = ("tab:blue", "tab:orange", "tab:green", "tab:red", "tab:purple")
 
 
-class Sightings(NamedTuple):
-    """What each depth of a grid predicts for K later sightings.
+class Prediction(NamedTuple):
+    """What each depth of a grid predicts for K later observations.
 
     Attributes:
         px: (G, 2K), of the ray through the first pixel.
-        chol: (G, 2K, 2K) of the covariance, with the first sighting's own noise.
+        chol: (G, 2K, 2K) of the covariance, with the first observation's own noise.
     """
 
     px: np.ndarray
@@ -31,16 +31,16 @@ class Passing:
 
     Attributes:
         camera: that sees it.
-        poses: (K, 7) first_camera_from_camera of the later sightings.
-        std_px: noise of each sighting, per axis.
+        poses: (K, 7) first_camera_from_camera of the later observations.
+        std_px: noise of each observation, per axis.
     """
 
     camera: Pinhole
     poses: np.ndarray
     std_px: float
 
-    def predict(self, first_px: np.ndarray, rho: np.ndarray) -> Sightings:
-        """Sightings of points at inverse depths (G,) on the ray through the first pixel (2,)."""
+    def predict(self, first_px: np.ndarray, rho: np.ndarray) -> Prediction:
+        """Observations of points at inverse depths (G,) on the ray through the first pixel (2,)."""
         ray, count = CameraRay(self.camera), 2 * len(self.poses)
         uv = np.broadcast_to(self.camera.unproject(first_px[None]), (len(rho), 2))
         landmark = np.concatenate([uv, rho[:, None]], axis=1)[:, None]
@@ -50,13 +50,13 @@ class Passing:
         slope = slopes[..., :2].reshape(len(rho), -1, 2)
         moved = slope @ (self.std_px * self.camera.unproject_jacobian(first_px[None])[0])
         cov = moved @ np.swapaxes(moved, 1, 2) + self.std_px**2 * np.eye(count)
-        return Sightings(px.reshape(len(rho), -1), np.linalg.cholesky(cov))
+        return Prediction(px.reshape(len(rho), -1), np.linalg.cholesky(cov))
 
     def log_likelihoods(self, first_px: np.ndarray, rho: np.ndarray, z: np.ndarray) -> np.ndarray:
-        """Of inverse depths (G,) after each of the K sightings, (K, R, G), for R repetitions of the pixels (R, 2K).
+        """Of inverse depths (G,) after each of the K observations, (K, R, G), for R repetitions of the pixels (R, 2K).
 
         The first rows of a Cholesky factor are the factor of the first rows: one solution serves any number of
-        sightings.
+        observations.
         """
         expected = self.predict(first_px, rho)
         white = np.linalg.solve(expected.chol, np.moveaxis(z[:, None] - expected.px, 0, -1))
@@ -91,7 +91,7 @@ def draw_curves(curves: dict[str, tuple[np.ndarray, list[Shape]]], true_depth_m:
     """The first repetition's curves, over depth and over inverse depth: grids (G,) and shapes by name of the axis.
 
     Args:
-        curves: "depth [m]" and "inverse depth [1/m]", each with a shape for every number of sightings.
+        curves: "depth [m]" and "inverse depth [1/m]", each with a shape for every number of observations.
         true_depth_m: where the truth is marked.
     """
     from matplotlib.figure import Figure
@@ -99,9 +99,13 @@ def draw_curves(curves: dict[str, tuple[np.ndarray, list[Shape]]], true_depth_m:
     figure = Figure(figsize=(11.0, 4.5), layout="constrained")
     limits = {"depth [m]": (0.0, 4.0 * true_depth_m), "inverse depth [1/m]": (0.0, 2.6 / true_depth_m)}
     for axes, (name, (grid, shapes)) in zip(figure.subplots(1, 2), curves.items(), strict=True):
-        for colour, sightings in zip(COLOURS, SHOWN, strict=True):
+        for colour, observations in zip(COLOURS, SHOWN, strict=True):
             _draw_curve(
-                axes, grid, shapes[sightings - 1], colour, f"{sightings} sighting{'s' * (sightings > 1)}"
+                axes,
+                grid,
+                shapes[observations - 1],
+                colour,
+                f"{observations} observation{'s' * (observations > 1)}",
             )
         true = true_depth_m if name.startswith("depth") else 1.0 / true_depth_m
         axes.axvline(true, color="black", lw=0.8, ls="--", label="truth")

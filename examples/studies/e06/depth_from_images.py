@@ -20,7 +20,7 @@ FEATURES = 40
 AROUND_PX = 4.0
 """A feature is looked for within three times this of where it was last."""
 EARLY = 1
-"""Sightings after which the paper's estimates of depth are far from Gaussian."""
+"""Observations after which the paper's estimates of depth are far from Gaussian."""
 
 
 def follow(sequence: ImageSequence, count: int, config: SearchConfig) -> tuple[np.ndarray, np.ndarray]:
@@ -63,14 +63,14 @@ def reproduce(setting: Setting) -> list[Row]:
     shown = {name: (grid, shapes[chosen]) for name, (grid, shapes) in curves.items()}
     save_figures({"figure_2.png": draw_curves(shown, float(distance[chosen]))}, setting.out)
     medians = np.median(divergence, axis=1), np.median(skewness, axis=1)
-    header = ["sightings", "KL depth", "KL inverse", "skewness depth", "skewness inverse"]
+    header = ["observations", "KL depth", "KL inverse", "skewness depth", "skewness inverse"]
     table = np.concatenate(medians).T.tolist()
     write_csv(setting.out / "figure_2.csv", header, [[k, *line] for k, line in enumerate(table, start=1)])
     return _rows(*medians, px.shape[0])
 
 
 Curves = dict[str, tuple[np.ndarray, list[list[Shape]]]]
-"""Grids by name of the axis, and the shapes for each feature and number of sightings."""
+"""Grids by name of the axis, and the shapes for each feature and number of observations."""
 
 
 def _curves(passing: Passing, px: np.ndarray, track: np.ndarray, cells: int) -> Curves:
@@ -87,7 +87,7 @@ def _curves(passing: Passing, px: np.ndarray, track: np.ndarray, cells: int) -> 
 
 
 def _figures(curves: Curves, name: str) -> np.ndarray:
-    """One of a shape's figures by axis, feature and number of sightings (2, F, K)."""
+    """One of a shape's figures by axis, feature and number of observations (2, F, K)."""
     return np.array(
         [[[getattr(shape, name)[0] for shape in one] for one in shapes] for _, shapes in curves.values()]
     )
@@ -97,10 +97,10 @@ def _rows(divergence: np.ndarray, skewness: np.ndarray, count: int) -> list[Row]
     early, last = EARLY - 1, divergence.shape[1]
     ratio = float(divergence[0, early] / divergence[1, early])
     return [
-        Row("Fig. 2", f"{count} features, first sighting: divergence of depth and inverse depth from Gaussians [nat]",
+        Row("Fig. 2", f"{count} features, first observation: divergence of depth and inverse depth from Gaussians [nat]",
             "highly non-Gaussian; nearly Gaussian", f"{divergence[0, early]:.2g} and {divergence[1, early]:.2g}", ratio,
             ratio > 10.0),
-        Row("Fig. 2", f"skewness of depth after 1 and {last} sightings; of inverse depth", "heavy tail, then a bell",
+        Row("Fig. 2", f"skewness of depth after 1 and {last} observations; of inverse depth", "heavy tail, then a bell",
             f"{skewness[0, early]:.2f}, {skewness[0, -1]:.2f}; {skewness[1, early]:.3f}, {skewness[1, -1]:.3f}",
             float(skewness[0, early])),
     ]  # fmt: skip

@@ -38,7 +38,7 @@ class Closure:
 
 
 def find_closure(frames: list[dict[str, np.ndarray]], first: int) -> Closure:
-    """From the sightings of a run, frame by frame, for the features with rows below `first`.
+    """From the observations of a run, frame by frame, for the features with rows below `first`.
 
     The absence is the longest run of frames in which none of them was found.
     """

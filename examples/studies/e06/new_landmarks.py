@@ -25,11 +25,11 @@ NEAR_M = 1.5
 
 @dataclass
 class Shown:
-    """The frame in which most landmarks without depth were seen to move: image, sightings, map, path so far."""
+    """The frame in which most landmarks without depth were seen to move: image, observations, map, path so far."""
 
     frame: int
     image: np.ndarray
-    sighting: Mapping[str, np.ndarray]
+    observation: Mapping[str, np.ndarray]
     found: int
     mapped: MapEstimate
     path: np.ndarray
@@ -40,20 +40,20 @@ def found_rays(seen: Mapping[str, np.ndarray]) -> np.ndarray:
     return np.asarray(np.isfinite(seen["px"]).all(axis=1) & np.isfinite(seen["line"]).all(axis=(1, 2)))
 
 
-def line_distances(sighting: Mapping[str, np.ndarray]) -> np.ndarray:
+def line_distances(observation: Mapping[str, np.ndarray]) -> np.ndarray:
     """Distances (K,) of the found rays from their epipolar lines, px."""
-    rows = found_rays(sighting)
-    start, end, px = sighting["line"][rows, 0], sighting["line"][rows, 1], sighting["px"][rows]
+    rows = found_rays(observation)
+    start, end, px = observation["line"][rows, 0], observation["line"][rows, 1], observation["px"][rows]
     along = end - start
     length = np.linalg.norm(along, axis=1)
     cross = along[:, 0] * (px - start)[:, 1] - along[:, 1] * (px - start)[:, 0]
     return np.asarray(np.abs(cross) / np.maximum(length, 1e-12))
 
 
-def line_lengths(sighting: Mapping[str, np.ndarray]) -> np.ndarray:
+def line_lengths(observation: Mapping[str, np.ndarray]) -> np.ndarray:
     """Lengths (K,) of the epipolar lines of the found rays, px: a camera at rest sees points."""
-    rows = found_rays(sighting)
-    return np.asarray(np.linalg.norm(sighting["line"][rows, 1] - sighting["line"][rows, 0], axis=1))
+    rows = found_rays(observation)
+    return np.asarray(np.linalg.norm(observation["line"][rows, 1] - observation["line"][rows, 0], axis=1))
 
 
 def reproduce(setting: Setting) -> list[Row]:
@@ -66,18 +66,18 @@ def reproduce(setting: Setting) -> list[Row]:
 
     def watch(run: Run, _: Tracked) -> None:
         t, frame = len(run.log) - 1, run.frame
-        sighting = run.log.observed(t)
-        lines = int((line_lengths(sighting) > 2.0 * run.system.config.search.noise_px).sum())
+        observation = run.log.observed(t)
+        lines = int((line_lengths(observation) > 2.0 * run.system.config.search.noise_px).sum())
         if t < FIRST or frame.image is None or (best and lines <= best[0].found):
             return
         path = run.log.poses[: t + 1].copy()
-        best[:] = [Shown(t, frame.image, sighting, lines, run.system.map(), path)]
+        best[:] = [Shown(t, frame.image, observation, lines, run.system.map(), path)]
 
     run = filter_images(sequence, setting.config(), known, [watch])
     (shown,) = best
     figures = {"figure_7.png": _draw_map(shown), "figure_8.png": _draw_image(shown, run)}
     save_figures(figures, setting.out)
-    all_lines = np.concatenate([line_distances(sighting) for sighting in run.log.all_observed()])
+    all_lines = np.concatenate([line_distances(observation) for observation in run.log.all_observed()])
     rms = float(np.sqrt(np.mean(all_lines**2)))
     return [
         Row("Fig. 7", f"landmarks on rays in the map, frame {shown.frame}", "drawn",
@@ -127,7 +127,7 @@ def _draw_image(shown: Shown, run: Run) -> Any:
     camera = run.system.camera
     found, searched = (run.log[name][shown.frame] for name in ("found", "searched"))
     text = f"frame {shown.frame}   found {found} of {searched}   (Fig. 8)"
-    picture = draw_search(shown.image, shown.sighting, Caption(text, ""), (camera.width, camera.height))
+    picture = draw_search(shown.image, shown.observation, Caption(text, ""), (camera.width, camera.height))
     figure = Figure(figsize=(picture.shape[1] / 110.0, picture.shape[0] / 110.0))
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.imshow(picture)

@@ -1,4 +1,4 @@
-"""What a run over the drive leaves: rows of Table I, sightings, and the paths and maps that follow from them."""
+"""What a run over the drive leaves: rows of Table I, observations, and the paths and maps that follow from them."""
 
 import time
 from dataclasses import dataclass, field
@@ -34,13 +34,13 @@ class Record:
     Attributes:
         due: pairs after which a row of the table is due.
         rows: of the table.
-        sightings: name (k,), pair, points (k, 3) in the camera.
+        observations: name (k,), pair, points (k, 3) in the camera.
         cpu: (T,) processor time of each pair, its features not included.
     """
 
     due: tuple[int, ...]
     rows: list[Row] = field(default_factory=list)
-    sightings: list[tuple[np.ndarray, int, np.ndarray]] = field(default_factory=list)
+    observations: list[tuple[np.ndarray, int, np.ndarray]] = field(default_factory=list)
     cpu: list[float] = field(default_factory=list)
     _clock: float = field(default_factory=time.process_time)
 
@@ -52,7 +52,7 @@ class Record:
         if tracked.values["updated"]:
             seen = shown["landmarks"] >= 0
             points = slam_of(run).rig.triangulate(shown["z"][seen])
-            self.sightings.append((shown["landmarks"][seen], done - 1, points))
+            self.observations.append((shown["landmarks"][seen], done - 1, points))
         if done in self.due or done == run.expected:
             self.rows.append(Row(done, int(manager.confirmed.sum()), manager.next_name))
         self._clock = time.process_time()
@@ -60,7 +60,7 @@ class Record:
     def places(self, path: np.ndarray, names: np.ndarray) -> np.ndarray:
         """Mean places (M, 3) of landmarks (M,), ascending, along a path (T, 7)."""
         total, count = np.zeros((names.size, 3)), np.zeros(names.size)
-        for seen, t, points in self.sightings:
+        for seen, t, points in self.observations:
             row = np.minimum(np.searchsorted(names, seen), names.size - 1)
             held = names[row] == seen
             np.add.at(total, row[held], SE3.transform(path[t], points[held]))

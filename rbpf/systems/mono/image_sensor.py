@@ -210,7 +210,7 @@ class ImageSensor(Sensor):
         self.bad_frames = int(arrays["search/bad_frames"])
 
     def _too_little(self, search: SearchResult, recognised: bool) -> bool:
-        """Whether so little agrees that it may be chance. Once lost, more has to agree: the camera may be anywhere.
+        """Whether so little agrees that it may be chance. Once lost, more has to agree: the pose prior is wide.
 
         Only features whose whole ellipse was searched tell something then: in a larger one something alike is found by
         chance, or what is there is missed. Of a place that was recognised beyond doubt it is enough that it can be

@@ -52,7 +52,7 @@ class KnownMap:
             a motion, "similarity" up to a motion and a scale.
         names: (K,) int64.
         positions: (K, 3);  cov: (K, 3, 3) of them, within + between particles.
-        windows: (K, S, S) uint8 around the first sightings.
+        windows: (K, S, S) uint8 around the first observations.
         first_px: (K, 2) where those were.
         first_pose: (K, 7) world_from_camera then.
         views: (V, 7) world_from_camera of the run, far from each other.

@@ -16,13 +16,13 @@ class AssociationConfig:
     """Unknown association.
 
     Attributes:
-        accept_probability: of the χ² gate within which a landmark may explain a sighting.
-        isolate_probability: of the χ² gate beyond which a sighting may start a landmark.
-        new_density: of first sightings, in inverse measurement units (1/(m·rad), 1/(m·rad²) or 1/mᵈ).
+        accept_probability: of the χ² gate within which a landmark may explain an observation.
+        isolate_probability: of the χ² gate beyond which an observation may start a landmark.
+        new_density: of first observations, in inverse measurement units (1/(m·rad), 1/(m·rad²) or 1/mᵈ).
         clutter_density: of clutter, same units.
         max_range_m: beyond it a landmark is not expected to be seen; None is unlimited.
         half_field_of_view_deg: likewise in yaw.
-        hit: added to a landmark's log-odds by a sighting.
+        hit: added to a landmark's log-odds by an observation.
         miss: subtracted where it was expected and not seen.
         drop: log-odds below which a landmark is deleted.
     """
