@@ -41,12 +41,12 @@ class Callbacks:
     Attributes:
         on_frame: called with the frames drawn and their number.
         on_iteration: called with the number of an iteration of the batch adjustment and the error before it.
-        batch_s: time after which the batch adjustment is given up; None waits.
+        most_iterations: of the batch adjustment, after which it is given up; see `adjust_log`.
     """
 
     on_frame: Callable[[int, int], None] | None = None
     on_iteration: Callable[[int, float], None] | None = None
-    batch_s: float | None = None
+    most_iterations: int | None = None
 
 
 def finish_run(
@@ -101,7 +101,7 @@ def add_batch(found: RunFolder, callbacks: Callbacks) -> dict[str, Any]:
     """Solves for the batch optimum of a run's measurements, writes batch.tum, and returns its entries of summary.json.
 
     Raises:
-        InputError: there are too many observations, too few frames are connected, it takes too long, or it does not
+        InputError: there are too many observations, too few frames are connected, it takes too many iterations, or it does not
             converge.
     """
     measured = found.measurements
@@ -118,7 +118,7 @@ def add_batch(found: RunFolder, callbacks: Callbacks) -> dict[str, Any]:
             )
         tolerance = STEREO_TOLERANCE if stereo else None
         adjusted = adjust_log(
-            measured, found.path.mean, callbacks.batch_s, callbacks.on_iteration, tolerance=tolerance
+            measured, found.path.mean, callbacks.most_iterations, callbacks.on_iteration, tolerance=tolerance
         )
         write_tum(found.folder / BATCH, adjusted.trajectory)
         return {

@@ -85,7 +85,8 @@ class ImageRunOptions(RunOptions):
         truth_topic: of a ROS bag, the topic of the camera's true poses; by default none.
         rerun: also write a recording (.rrd) for the Rerun viewer; by default none.
         batch: also adjust the same measurements in batch with GTSAM.
-        batch_limit: seconds after which the batch adjustment is given up; the run's results stay.
+        batch_limit: iterations after which the batch adjustment is given up, the run's results stay; by default so many
+            that thirty million sightings are linearised.
         video: write the annotated video.
     """
 
@@ -94,7 +95,7 @@ class ImageRunOptions(RunOptions):
     truth_topic: Text = None
     rerun: Where = None
     batch: bool = True
-    batch_limit: float = 300.0
+    batch_limit: Whole = None
     video: bool = True
 
 

@@ -139,7 +139,7 @@ def _run_images(options: ImageRunOptions, recording: "Recording", config: Any, v
         callbacks = Callbacks(
             on_frame=told(bar, drawing),
             on_iteration=lambda count, _error: bar.update(solving, completed=count),
-            batch_s=options.batch_limit,
+            most_iterations=options.batch_limit,
         )
         with finishing():
             entries = finish_run(

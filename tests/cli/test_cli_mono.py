@@ -115,7 +115,7 @@ def test_the_posterior_over_paths(finished):
 
 def test_a_batch_that_takes_too_long_is_given_up_and_all_else_is_there(desk, tmp_path):
     assert run(desk, tmp_path, "--batch", "--batch-limit", "0") == 0
-    assert "given up after 0 s" in summary(tmp_path)["batch_problem"]
+    assert "given up after 0 iterations" in summary(tmp_path)["batch_problem"]
     names = {path.name for path in tmp_path.iterdir()}
     assert names == FILES - {"batch.tum"}
 

@@ -9,7 +9,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.feature_log import FeatureFrame, FeatureLog
 from rbpf.validation.gtsam.camera import solve_features
-from rbpf.validation.gtsam.mono_batch import ROBUST, adjust_log, connected_frames
+from rbpf.validation.gtsam.mono_batch import ROBUST, WORK, adjust_log, connected_frames, most_iterations
 from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
 from rbpf.validation.simulation.point_worlds import DeskWorld
 from tests.exactness.models import known
@@ -84,10 +84,11 @@ def test_a_landmark_of_one_frame_connects_nothing(log):
         adjust_log(lonely, rough(log))
 
 
-def test_it_tells_how_far_it_is_and_gives_up_in_time(log):
+def test_it_tells_how_far_it_is_and_gives_up_after_so_much_work(log):
     told = []
     adjust_log(log, rough(log), on_iteration=lambda count, error: told.append((count, error)))
     counts, errors = zip(*told, strict=True)
     assert counts == tuple(range(1, len(told) + 1)) and errors[0] > 2.0 * errors[-1]
-    with pytest.raises(InputError, match="given up after 0 s: allow more with --batch-limit"):
-        adjust_log(log, rough(log), limit_s=0.0)
+    with pytest.raises(InputError, match="given up after 3 iterations: allow more with --batch-limit"):
+        adjust_log(log, rough(log), most=3)
+    assert most_iterations(log) * sum(frame.landmarks.size for frame in log.frames) <= WORK

@@ -1,6 +1,5 @@
 """The batch adjustment of the measurements that a run over images used: what the filter could have known at best."""
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import final
@@ -23,6 +22,13 @@ LEAST = 4
 
 EXACT = 1e-4
 """Known points without errors get one of this fraction of their extent: constraints take GTSAM many times as long."""
+
+WORK = 30_000_000
+"""Sightings that are linearised, over all iterations, before an adjustment is given up: some minutes of work. Work is
+counted and not the time, so that a result does not depend on what else the machine does."""
+
+LEAST_ITERATIONS = 100
+"""That are allowed however many sightings there are."""
 
 Told = Callable[[int, float], None]
 """Told the number of an iteration and the error before it."""
@@ -57,7 +63,7 @@ class Batch:
 def adjust_log(
     log: FeatureLog,
     world_from_camera: np.ndarray,
-    limit_s: float | None = None,
+    most: int | None = None,
     on_iteration: Told | None = None,
     twice: bool = True,
     tolerance: float | None = None,
@@ -70,13 +76,13 @@ def adjust_log(
     Args:
         log: T frames of one camera.
         world_from_camera: (T, 7) poses to start from.
-        limit_s: time after which it is given up; None waits.
+        most: iterations, over both starts, after which it is given up; by default `most_iterations`.
         on_iteration: told how far it is.
         twice: also start from the known points alone; not needed near the optimum.
         tolerance: see `solve_features`.
 
     Raises:
-        InputError: too few frames are connected, it takes too long, or it does not converge.
+        InputError: too few frames are connected, it takes too many iterations, or it does not converge.
     """
     frames = connected_frames(log)
     if frames.size < 2:
@@ -84,10 +90,15 @@ def adjust_log(
             f"{log.name}: no two frames share the {LEAST} landmarks that a batch adjustment needs of each"
         )
     part = replace(log, frames=[log.frames[t] for t in frames], known=softened(log.known))
-    watch = _Watch(limit_s, on_iteration)
+    watch = _Watch(most_iterations(part) if most is None else most, on_iteration)
     start = CameraEstimate(world_from_camera[frames], {})
     solution = _best(part, [start, None] if twice and log.known is not None else [start], watch, tolerance)
     return Batch(replace(part, known=log.known), frames, solution)
+
+
+def most_iterations(log: FeatureLog) -> int:
+    """Iterations that the adjustment of a log may take."""
+    return max(LEAST_ITERATIONS, WORK // max(sum(frame.landmarks.size for frame in log.frames), 1))
 
 
 def softened(known: KnownPoints | None) -> KnownPoints | None:
@@ -159,17 +170,16 @@ def _with_the_first(
 
 @final
 class _Watch:
-    """Counts iterations, and stops them when time is up."""
+    """Counts iterations, and stops them when there have been enough."""
 
-    def __init__(self, limit_s: float | None, told: Told | None) -> None:
-        self.limit_s, self.told, self.count = limit_s, told, 0
-        self.started = time.perf_counter()
+    def __init__(self, most: int, told: Told | None) -> None:
+        self.most, self.told, self.count = most, told, 0
 
     def __call__(self, error: float) -> None:
         self.count += 1
         if self.told is not None:
             self.told(self.count, error)
-        if self.limit_s is not None and time.perf_counter() - self.started > self.limit_s:
+        if self.count > self.most:
             raise InputError(
-                f"the batch adjustment was given up after {self.limit_s:g} s: allow more with --batch-limit"
+                f"the batch adjustment was given up after {self.most} iterations: allow more with --batch-limit"
             )
