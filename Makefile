@@ -2,6 +2,8 @@
 PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/stamp
+# Bytecode is kept: without it every process compiles the sources and the tests anew, which takes most of its start.
+unexport PYTHONDONTWRITEBYTECODE
 # Each process takes a stretch of the tests, so that what a module prepares is prepared once, and helps when it is done.
 PYTEST := $(BIN)/python -m pytest -n 2 --dist worksteal
 

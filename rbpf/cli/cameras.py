@@ -8,7 +8,6 @@ import tyro
 
 from rbpf.cli.options import Printed
 from rbpf.cli.showing import answer, progress, say, told
-from rbpf.sensors.calibration import Board
 
 LOOSE = 0.01
 """Standard deviation of focal lengths and centre, as a fraction of the focal length, from which on a run bends."""
@@ -35,6 +34,7 @@ class CalibrateOptions(Printed):
 
 def calibrate(options: Annotated[CalibrateOptions, tyro.conf.arg(name="")]) -> None:
     """Find the camera's focal lengths, centre and distortion from pictures of a chessboard, and write camera.yaml."""
+    from rbpf.sensors.calibration import Board
     from rbpf.validation.calibration import PICTURE, calibrate_images, write_calibration
 
     board = Board.parse(options.board, options.square)

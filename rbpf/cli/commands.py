@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from difflib import get_close_matches
+from functools import wraps
 from typing import Any, TypeVar
 
 from tyro.extras import SubcommandApp
@@ -16,17 +17,31 @@ class Commands(SubcommandApp):
 
     Args:
         help: what the group is for.
+        first: called before each command of the group.
     """
 
-    def __init__(self, help: str | None = None) -> None:
+    def __init__(self, help: str | None = None, first: Callable[[], object] | None = None) -> None:
         super().__init__()
         self.__doc__ = help
         self._groups: dict[str, Commands | None] = {}
+        self._first = first
 
     def add(self, name: str) -> Callable[[Function], Function]:
         """Makes a function a command of this name."""
         self._groups[name] = None
-        return self.command(name=name)
+        if self._first is None:
+            return self.command(name=name)
+        first = self._first
+
+        def after(function: Any) -> Any:
+            @wraps(function)
+            def called(*arguments: Any, **named: Any) -> Any:
+                first()
+                return function(*arguments, **named)
+
+            return self.command(name=name)(called)
+
+        return after
 
     def add_group(self, name: str, group: "Commands") -> None:
         """Makes a group of commands a command of this name."""

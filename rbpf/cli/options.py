@@ -2,13 +2,15 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from rbpf.errors import InputError
-from rbpf.sensors.calibration import Board, MarkerBoard
-from rbpf.sensors.readers.images.sequence import Topics
+
+if TYPE_CHECKING:
+    from rbpf.sensors.calibration import Board, MarkerBoard
+    from rbpf.sensors.readers.images.sequence import Topics
 
 Flag = tyro.conf.FlagCreatePairsOff[bool]
 
@@ -265,12 +267,14 @@ def given(options: object, *names: str) -> dict[str, object]:
     return {name: value for name, value in values.items() if value is not None}
 
 
-def given_topics(options: ImageRunOptions) -> Topics:
+def given_topics(options: ImageRunOptions) -> "Topics":
     """The topics of `--image-topic` and `--truth-topic`."""
+    from rbpf.sensors.readers.images.sequence import Topics
+
     return Topics.parse(options.image_topic, options.truth_topic)
 
 
-def given_markers(options: MonoOptions) -> MarkerBoard | None:
+def given_markers(options: MonoOptions) -> "MarkerBoard | None":
     """The board of `--aruco` and `--marker`.
 
     Raises:
@@ -282,10 +286,12 @@ def given_markers(options: MonoOptions) -> MarkerBoard | None:
         raise InputError(
             "a board of markers needs their number and their side: --aruco 5x7 --marker 0.04 --gap 0.01"
         )
+    from rbpf.sensors.calibration import MarkerBoard
+
     return MarkerBoard.parse(options.aruco, options.marker, options.gap, options.dictionary)
 
 
-def given_board(size: str | None, square_m: float | None) -> Board | None:
+def given_board(size: str | None, square_m: float | None) -> "Board | None":
     """The chessboard of `--board` and `--square`.
 
     Raises:
@@ -297,4 +303,6 @@ def given_board(size: str | None, square_m: float | None) -> Board | None:
         raise InputError(
             "a chessboard needs both its inner corners and the side of its squares: --board 9x6 --square 0.024"
         )
+    from rbpf.sensors.calibration import Board
+
     return Board.parse(size, square_m)

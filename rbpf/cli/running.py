@@ -28,10 +28,13 @@ if TYPE_CHECKING:
     from rbpf.runs.recordings import Recording
     from rbpf.runs.run import Run
 
-RUN = Commands("""Filter a recording; `rbpf run SYSTEM --help` says more.
+RUN = Commands(
+    """Filter a recording; `rbpf run SYSTEM --help` says more.
 
 `rbpf run --from RUN/config.yaml [--out NEW]` repeats a run: the same recording, the same settings, the same bytes.
-It is refused when the recording has changed. Further options are those of the run's system.""")
+It is refused when the recording has changed. Further options are those of the run's system.""",
+    compile_kernels,
+)
 
 
 @RUN.add("range-bearing")
@@ -150,7 +153,7 @@ def _run_images(options: ImageRunOptions, recording: "Recording", config: Any, v
 
 @contextmanager
 def _prepared(options: RunOptions) -> Iterator[Path]:
-    """Threads as asked for, compiled kernels, and the folder for the results, which nobody else writes to.
+    """Threads as asked for, and the folder for the results, which nobody else writes to.
 
     Raises:
         InputError: the folder holds a run that is neither to be resumed nor written over, or cannot be written to.
@@ -170,7 +173,6 @@ def _prepared(options: RunOptions) -> Iterator[Path]:
                 f"{out} holds a run already: name another folder with --out, go on with --resume, or write over it "
                 "with --overwrite"
             )
-        compile_kernels()
         yield out
 
 

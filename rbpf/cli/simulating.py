@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 FOCAL_FRACTION = {ImagesOptions: 0.8, LabOptions: 0.78125}
 """Focal length by default, as a fraction of the images' width."""
 
-SIMULATE = Commands("Make a recording of a world whose truth is known.")
+SIMULATE = Commands("Make a recording of a world whose truth is known.", compile_kernels)
 
 
 @SIMULATE.add("range-bearing")
@@ -69,7 +69,6 @@ def _render(world: "ImageWorld", options: ImagesOptions | LabOptions) -> None:
 
     camera = _camera(options)
     imaging = _imaging(options)
-    compile_kernels()
     with progress() as bar:
         task = bar.add_task("rendering", total=options.frames)
         simulate_images(

@@ -81,30 +81,34 @@ def test_without_json_nothing_is_on_standard_output(log, tmp_path, capsys):
 
 def test_bad_input_is_exit_code_2_and_a_fault_is_1(log, tmp_path):
     def code(*arguments, prelude=""):
-        program = f"import sys; {prelude}\nfrom rbpf.cli import main; sys.exit(main())"
-        return subprocess.run([sys.executable, "-c", program, *arguments], capture_output=True, text=True)
+        program = [sys.executable, "-c", f"{prelude}\n{_MAIN}", *arguments]
+        return subprocess.run(program, capture_output=True, text=True)
 
     refused = code("report", str(tmp_path / "nothing"))
     assert refused.returncode == 2 and refused.stderr.count("\n") == 1 and "Traceback" not in refused.stderr
     assert code("no-such-command").returncode == 2
     assert code("report").returncode == 2
-    broken = code(
-        "report",
-        "x",
-        prelude="import rbpf.validation.report.page as r; r.write_report = lambda folder: 1 / 0",
-    )
+    prelude = "import rbpf.validation.report.page as r; r.write_report = lambda folder: 1 / 0"
+    broken = code("report", "x", prelude=prelude)
     assert broken.returncode == 1 and "ZeroDivisionError" in broken.stderr
 
 
-@pytest.mark.slow
+@pytest.fixture(scope="module")
+def longer(tmp_path_factory):
+    """A log that is filtered for a second or two, its run from beginning to end, and what says how to run it."""
+    folder = tmp_path_factory.mktemp("longer")
+    assert main(["simulate", "range-bearing", "--out", str(folder / "log"), "--steps", "600"]) == 0
+    words = ["run", "range-bearing", str(folder / "log")]
+    words += ["--particles", "300", "--no-batch", "--set", "checkpoint_every=100000", "--out"]
+    assert main([*words, str(folder / "whole")]) == 0
+    return outputs(folder / "whole"), words
+
+
 @pytest.mark.parametrize("after", [0.0, 0.4])
-def test_ctrl_c_leaves_a_run_that_resumes_to_the_same_bytes(tmp_path, after):
+def test_ctrl_c_leaves_a_run_that_resumes_to_the_same_bytes(longer, tmp_path, after):
     """A real signal to a real process, at two moments."""
-    log = tmp_path / "log"
-    assert main(["simulate", "range-bearing", "--out", str(log), "--steps", "1500"]) == 0
-    arguments = ["--particles", "300", "--no-batch", "--set", "checkpoint_every=100000"]
-    whole = ["run", "range-bearing", str(log), "--out", str(tmp_path / "whole"), *arguments]
-    cut = ["run", "range-bearing", str(log), "--out", str(tmp_path / "cut"), *arguments]
+    whole, words = longer
+    cut = [*words, str(tmp_path / "cut")]
     process = subprocess.Popen(
         [sys.executable, "-c", _STOPPABLE, *cut], stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )
@@ -115,18 +119,19 @@ def test_ctrl_c_leaves_a_run_that_resumes_to_the_same_bytes(tmp_path, after):
     _, error = process.communicate(timeout=120)
     assert process.returncode == 130, error
     said = re.search(
-        r"stopped after (\d+) of 1500; the same command with --resume goes on", " ".join(error.split())
+        r"stopped after (\d+) of 600; the same command with --resume goes on", " ".join(error.split())
     )
-    assert said is not None and 5 <= int(said[1]) < 1500
+    assert said is not None and 5 <= int(said[1]) < 600
     assert (tmp_path / "cut" / "checkpoint.npz").exists()
     assert not (tmp_path / "cut" / "summary.json").exists()
-    assert main(whole) == 0
     assert main([*cut, "--resume"]) == 0
-    assert outputs(tmp_path / "whole") == outputs(tmp_path / "cut")
+    assert outputs(tmp_path / "cut") == whole
 
 
-_STOPPABLE = """
-import sys
+_MAIN = "import sys; from rbpf.cli import main; sys.exit(main())"
+
+_STOPPABLE = (
+    """
 from rbpf.core.filter import Filter
 step = Filter.step
 def told(self, *arguments):
@@ -134,9 +139,9 @@ def told(self, *arguments):
         print("filtering", flush=True)
     return step(self, *arguments)
 Filter.step = told
-from rbpf.cli import main
-sys.exit(main())
 """
+    + _MAIN
+)
 
 
 def test_a_run_is_repeated_from_its_config(log, tmp_path, capsys):
@@ -183,19 +188,16 @@ def test_the_doctor_finds_everything_here_and_what_is_missing(capsys, monkeypatc
     assert "batch optimum: needed, and broken here" in err
 
 
-@pytest.mark.slow
-def test_the_first_compilation_is_announced(log, tmp_path):
-    """In an empty cache; what is compiled there is not waited for."""
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
-    command = [sys.executable, "-u", "-m", "rbpf", *quick(log, tmp_path / "run")]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment)
-    try:
-        assert process.stderr is not None
-        first = process.stderr.readline()
-    finally:
-        process.kill()
-        process.communicate()
-    assert "compiling" in first and "done once" in first
+def test_the_first_compilation_is_announced_before_it_begins(log, tmp_path):
+    """In an empty cache, by a process that ends with its first word."""
+    cache = tmp_path / "cache"
+    program = f"import os, rbpf.cli.compiling as c; c.say = lambda words: (print(words, flush=True), os._exit(0))\n{_MAIN}"
+    done = subprocess.run(
+        [sys.executable, "-c", program, *quick(log, tmp_path / "run")],
+        capture_output=True, text=True, check=True, env={**os.environ, "NUMBA_CACHE_DIR": str(cache)},
+    )  # fmt: skip
+    assert "compiling" in done.stdout and "done once" in done.stdout
+    assert not list(cache.rglob("*.nb?"))
 
 
 def test_the_program_has_one_entry():
