@@ -3,6 +3,7 @@
 `kernel_id` and `params` name the compiled twin in `rbpf.kernels.gate`.
 """
 
+from copy import copy
 from typing import final
 
 import numpy as np
@@ -61,6 +62,19 @@ class TruncatedMahalanobis(Likelihood):
     def inlier(self, nu: np.ndarray, cov: np.ndarray) -> np.ndarray:
         """Within the limit for updates."""
         return squared_mahalanobis(nu, cov) <= self.params[1]
+
+    def predicted_inlier(self, nu: np.ndarray, cov: np.ndarray, predictive: np.ndarray) -> np.ndarray:
+        """Within the limit for updates; for the look-ahead, as probable as an outlier."""
+        if self.kernel_id == 1:
+            return self.inlier(nu, predictive)
+        log_ratio = gaussian.log_det(gaussian.cholesky(predictive)) - gaussian.log_det(gaussian.cholesky(cov))
+        return squared_mahalanobis(nu, predictive) + log_ratio <= self.params[0]
+
+    def of_look_ahead(self) -> Likelihood:
+        """Whose inliers at the prediction are those that T_l does not bound, Mathematics (truncated-look-ahead)."""
+        weighing = copy(self)
+        weighing.kernel_id = 3
+        return weighing
 
     def log_outlier(self) -> float:
         """−T_l/2."""

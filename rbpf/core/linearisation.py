@@ -148,8 +148,7 @@ def gated(
     The gate is at the prediction: its covariance is S + H Q Hᵀ.
     """
     spread = jac_state @ prior.factor[:, None]
-    cov = cov + spread @ np.swapaxes(spread, -1, -2)
-    inlier = likelihood.inlier(nu, cov)
+    inlier = likelihood.predicted_inlier(nu, cov, cov + spread @ np.swapaxes(spread, -1, -2))
     seen = np.ones_like(inlier) if mask is None else mask.reshape(inlier.shape)
     used = seen & inlier
     return used, likelihood.log_inlier() * used.sum(axis=1) + likelihood.log_outlier() * (seen & ~inlier).sum(

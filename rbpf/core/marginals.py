@@ -4,6 +4,7 @@ A landmark map is a further part, `rbpf.maps.LandmarkMap`.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import final
 
 import numpy as np
@@ -13,7 +14,16 @@ from rbpf.core.checkpoint import checked
 from rbpf.core.genealogy import Lineage
 from rbpf.core.likelihoods import Gaussian
 from rbpf.core.linearisation import information, linearise, stacked
-from rbpf.core.models import Conditional, LineariseAt, LogDensities, Observations, Part, Transition
+from rbpf.core.models import (
+    NEW,
+    NULL,
+    Conditional,
+    LineariseAt,
+    LogDensities,
+    Observations,
+    Part,
+    Transition,
+)
 from rbpf.core.particles import Information, Prior, take
 from rbpf.errors import InputError
 from rbpf.kernels.increment import conditioned
@@ -257,12 +267,21 @@ class Marginals(Conditional):
 
     def linearised(self, prior: Prior, groups: Sequence[Observations]) -> LineariseAt:
         """What the observations say about the state, to be linearised wherever a proposal asks."""
+        weighing = [_for_look_ahead(group) for group in groups]
+        is_other = any(one is not other for one, other in zip(weighing, groups, strict=True))
+
+        def told_at(state: np.ndarray) -> Information:
+            found = self.information(state, groups, prior)
+            if is_other:
+                others = self.information(state, weighing, prior), _all_outliers(weighing, found)
+                found = replace(found, otherwise=tuple(other for other in others if other is not None))
+            return found
 
         def linearise_at(increment: np.ndarray) -> Information:
             if increment is prior.mean:
-                found = self.information(prior.predicted(), groups, prior)
+                found = told_at(prior.predicted())
                 return found if prior.centred else found.charted(prior.space.right_jacobian(increment))
-            found = self.information(prior.at(increment), groups, prior)
+            found = told_at(prior.at(increment))
             return found.charted(prior.space.right_jacobian(increment)).shifted(increment - prior.mean)
 
         return linearise_at
@@ -312,3 +331,27 @@ class Marginals(Conditional):
                 )
             routed[supplies].append(group)
         return routed
+
+
+def _for_look_ahead(group: Observations) -> Observations:
+    """The group itself where what may move the state weighs it, too."""
+    likelihood = None if group.likelihood is None else group.likelihood.of_look_ahead()
+    return group if likelihood is group.likelihood else replace(group, likelihood=likelihood)
+
+
+def _all_outliers(groups: Sequence[Observations], like: Information) -> Information | None:
+    """All measurements as outliers, where the likelihoods allow it."""
+    weigh = [group for group in groups if Part.STATE in group.updates]
+    if any(group.likelihood is None or group.likelihood.kernel_id != 3 for group in weigh):
+        return None
+    nothing = Information.zeros(like.quad.size, like.vector.shape[1])
+    for group in weigh:
+        ids = np.zeros(group.z.shape[0]) if group.ids is None else group.ids
+        assert group.likelihood is not None
+        for chosen, log_density in (
+            (ids >= 0, group.likelihood.log_outlier()),
+            (ids == NEW, group.log_new),
+            (ids == NULL, group.log_clutter),
+        ):
+            nothing.log_factor += chosen.sum(axis=-1) * log_density
+    return nothing

@@ -314,6 +314,19 @@ class Likelihood(ABC):
         """Whether the observation may move the state and the landmark, (…) bool; by default always."""
         return np.ones(nu.shape[:-1], dtype=bool)
 
+    def predicted_inlier(
+        self,
+        nu: Float[np.ndarray, "*#batch p"],
+        cov: Float[np.ndarray, "*#batch p p"],
+        predictive: Float[np.ndarray, "*#batch p p"],
+    ) -> Bool[np.ndarray, "*batch"]:
+        """`inlier` before the state is sampled, whose spread makes S the `predictive` covariance S + H Q Hᵀ."""
+        return self.inlier(nu, predictive)
+
+    def of_look_ahead(self) -> "Likelihood":
+        """What the look-ahead weight takes for inliers, where it is not what may move the state; by default the same."""
+        return self
+
     def log_inlier(self) -> float:
         """What an inlier's Gaussian log-density is increased by: log(1−ε) with outliers, else 0."""
         return 0.0

@@ -141,6 +141,7 @@ class Information:
         log_det: (N,) Σ log|2πS|.
         log_factor: (N,) log-densities that do not depend on the increment: clutter, new landmarks.
         rows: (N,) number of scalar measurements that took part in the sums, gated and unassociated ones left out.
+        otherwise: the same with other choices of outliers, which bound the look-ahead weight from below.
     """
 
     info: Float[np.ndarray, "N d d"]
@@ -149,6 +150,7 @@ class Information:
     log_det: Float[np.ndarray, " N"]
     log_factor: Float[np.ndarray, " N"]
     rows: Float[np.ndarray, " N"]
+    otherwise: "tuple[Information, ...]" = ()
 
     @classmethod
     def zeros(cls, n: int, dim: int) -> "Information":
@@ -178,13 +180,15 @@ class Information:
         """The same for a perturbation δ of the chart's coordinates, where the state moves by J δ; J (N, d, d)."""
         turned = np.swapaxes(jacobian, -1, -2)
         vector = (turned @ self.vector[..., None])[..., 0]
-        return replace(self, info=turned @ self.info @ jacobian, vector=vector)
+        otherwise = tuple(other.charted(jacobian) for other in self.otherwise)
+        return replace(self, info=turned @ self.info @ jacobian, vector=vector, otherwise=otherwise)
 
     def shifted(self, offset: Float[np.ndarray, "#N d"]) -> "Information":
         """The same relative to a point `offset` (N, d) before the one linearised at: ν + H·offset."""
         moved = np.einsum("nab,nb->na", self.info, offset)
         quad = self.quad + (offset * (2.0 * self.vector + moved)).sum(axis=1)
-        return replace(self, vector=self.vector + moved, quad=quad)
+        otherwise = tuple(other.shifted(offset) for other in self.otherwise)
+        return replace(self, vector=self.vector + moved, quad=quad, otherwise=otherwise)
 
 
 @dataclass(frozen=True)

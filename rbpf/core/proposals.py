@@ -54,11 +54,13 @@ class EkfProposal(Proposal):
 
 
 def refined(prior: Prior, information: Information) -> Proposed:
-    """The refined Gaussian and the joint marginal weight of each particle."""
+    """The refined Gaussian and the joint marginal weight of each particle, the largest for any choice of outliers."""
     n, rank = prior.base.shape[0], prior.factor.shape[2]
     mean, root = np.empty((n, rank)), np.empty((n, rank, rank))
     log_w1, nis = np.empty(n), np.empty(n)
     said = information.info, information.vector, information.quad, information.log_det
     run_driver(posterior, n, *said, np.ascontiguousarray(prior.factor), mean, root, log_w1, nis)
     log_w1 += information.log_factor
+    for other in information.otherwise:
+        np.maximum(log_w1, refined(prior, other).log_w1, out=log_w1)
     return Proposed(mean, root, log_w1, nis, information.rows)

@@ -1,8 +1,8 @@
 """Likelihoods inside the kernels: which lanes take an observation as an inlier, and at what log-density.
 
 Forms: 0 Gaussian, 1 truncated Mahalanobis (parameter 0: T_l, parameter 1: limit of updates), 2 Gaussian with outliers
-(parameter 0: log(1−ε), parameter 1: log ε/V). `weight` is 1 where the lane uses the observation and 0
-where it is left out.
+(parameter 0: log(1−ε), parameter 1: log ε/V), 3 the truncated one for the look-ahead weight. `weight` is 1 where the lane
+uses the observation and 0 where it is left out.
 """
 
 import math
@@ -44,6 +44,15 @@ def accept_predicted(kernel_id, params, nu, jac_state, total, factor, start, cou
     cholesky(spread, count, scale)
     whiten_vector(spread, count, white)
     add_squares(white, count, squared)
+    if kernel_id == 3:
+        # d² + log|S + H Q Hᵀ|/|S|, so that it is as probable as an outlier at the limit.
+        for i in range(count):
+            squared[i] -= 2.0 * math.log(scale[i])
+            scale[i] = 1.0
+        spread[:, :, :count] = total[:, :, :count]
+        cholesky(spread, count, scale)
+        for i in range(count):
+            squared[i] += 2.0 * math.log(scale[i])
     for i in range(count):
         if weight[i] == 0.0:
             continue
@@ -58,7 +67,7 @@ def accept_predicted(kernel_id, params, nu, jac_state, total, factor, start, cou
 @njit(cache=True, error_model="numpy")
 def outlier_log_density(kernel_id, params):
     """Log-density that an observation gets where it is taken as an outlier."""
-    return -0.5 * params[0] if kernel_id == 1 else params[1]
+    return params[1] if kernel_id == 2 else -0.5 * params[0]
 
 
 @njit(cache=True, error_model="numpy")
@@ -70,8 +79,8 @@ def gaussian_log_density(squared, scale, p):
 @njit(cache=True, error_model="numpy")
 def is_inlier(kernel_id, params, squared, scale, p):
     """Whether the inlier's term is at least the outlier's; of the truncated kernel_id, whether it is within the limit."""
-    if kernel_id == 1:
-        return squared <= params[1]
+    if kernel_id == 1 or kernel_id == 3:
+        return squared <= params[1 if kernel_id == 1 else 0]
     return kernel_id == 0 or gaussian_log_density(squared, scale, p) + params[0] >= params[1]
 
 

@@ -143,7 +143,7 @@ def refine(
             quad[start + i] += sum_quad[i]
             rows[start + i] += used[i] * p
             log_det[start + i] += penalty[i]
-            if kernel_id != 1:
+            if kernel_id == 0 or kernel_id == 2:
                 log_det[start + i] += sum_log[i] + used[i] * p * math.log(2.0 * math.pi)
             for a in range(dim):
                 vector[start + i, a] += sum_vector[a, i]

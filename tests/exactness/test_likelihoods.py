@@ -5,6 +5,7 @@ import pytest
 
 from rbpf.core.filter import Filter
 from rbpf.core.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobis
+from rbpf.core.marginals import Marginals
 from rbpf.core.models import NULL, NewLandmarks, ObservationModel, Observations, Records
 from rbpf.core.proposals import EkfProposal, PriorProposal, refined
 from rbpf.errors import InputError
@@ -146,6 +147,49 @@ def test_two_sightings_of_a_certain_landmark_weigh_like_two_landmarks(likelihood
     ]
     np.testing.assert_allclose(proposals[0].mean, proposals[1].mean, atol=1e-9)
     np.testing.assert_allclose(proposals[0].log_w1, proposals[1].log_w1, atol=1e-9)
+
+
+def looked_ahead(z: np.ndarray, likelihood: TruncatedMahalanobis, noise: float) -> float:
+    """Log w₁ of measurements z (K,) of the first coordinate of a state N(0, 1)."""
+    motion = LinearMotion(np.eye(1), np.eye(1))
+    group = Observations(
+        z[:, None],
+        np.full((z.size, 1, 1), noise),
+        LinearObservation(by_state=[[1.0]]),
+        likelihood,
+    )
+    parts = Marginals(motion.space, [])
+    prior = parts.predict(motion.transition(np.zeros((1, 1)), None, 1.0), motion.space)
+    return float(EkfProposal().propose(prior, parts.linearised(prior, [group])).log_w1[0])
+
+
+def integrated(z: np.ndarray, noise: float) -> float:
+    """Log ∫ N(x; 0, 1) Π exp(−½ min(4, (z − x)²/R)) dx."""
+    grid = np.linspace(-12.0, 12.0, 24_001)
+    logs = -0.5 * np.minimum(4.0, (z[:, None] - grid) ** 2 / noise).sum(axis=0) - 0.5 * grid**2
+    return float(np.log(np.trapezoid(np.exp(logs), grid) / np.sqrt(2.0 * np.pi)))
+
+
+@pytest.mark.parametrize("noise", [0.1, 1.0, 10.0])
+def test_the_look_ahead_weight_is_truncated_where_the_likelihood_is(noise):
+    """The integral of the truncated likelihood over the prior is between w₁ and 2 w₁, at any distance."""
+    far = np.linspace(0.0, 8.0, 81) * np.sqrt(1.0 + noise)
+    for likelihood in (TRUNCATED, TruncatedMahalanobis(4.0, 16.3)):
+        log_w1 = np.array([looked_ahead(np.array([z]), likelihood, noise) for z in far])
+        exact = np.array([integrated(np.array([z]), noise) for z in far])
+        assert (np.diff(log_w1) <= 1e-12).all()
+        assert (log_w1 <= exact + 1e-9).all() and (exact <= log_w1 + np.log(2.0)).all()
+
+
+def test_the_look_ahead_weight_of_several_rows_is_a_bound(rng):
+    """Rows that agree, that contradict one another, and outliers: never above the integral, nor below all outliers."""
+    for _ in range(300):
+        z, noise = (
+            rng.normal(scale=rng.choice([0.5, 2.0, 8.0]), size=rng.integers(1, 7)),
+            10.0 ** rng.normal(),
+        )
+        log_w1 = looked_ahead(z, TruncatedMahalanobis(4.0, 16.3), noise)
+        assert -2.0 * z.size - 1e-12 <= log_w1 <= integrated(z, noise) + 1e-9
 
 
 class Along(ObservationModel):
