@@ -48,6 +48,13 @@ def plain_pictures() -> Iterator[None]:
     They still depend on what they show, so that runs can be compared by their bytes. Who asks for a run whose
     pictures are looked at does without this fixture.
     """
+    with pytest.MonkeyPatch.context() as patch:
+        paint_plainly(patch)
+        yield
+
+
+def paint_plainly(patch: pytest.MonkeyPatch) -> None:
+    """See `plain_pictures`; for a process of one's own."""
     from matplotlib.figure import Figure
 
     savefig = Figure.savefig
@@ -61,9 +68,7 @@ def plain_pictures() -> Iterator[None]:
                 legend.remove()
         savefig(figure, path, format=options.get("format"), dpi=30)
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Figure, "savefig", plain)
-        yield
+    patch.setattr(Figure, "savefig", plain)
 
 
 @pytest.fixture(scope="module")

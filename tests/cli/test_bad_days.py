@@ -146,7 +146,7 @@ def test_killed_at_random_moments_and_resumed(desk, tmp_path):
     every = ["--set", "checkpoint_every=2"]
     assert main(command(desk, tmp_path / "whole", *every)) == 0
     out = tmp_path / "killed"
-    ended = kill_and_resume(command(desk, out, *every), out, 3, np.random.default_rng(1), longest_s=0.5)
+    ended = kill_and_resume(command(desk, out, *every), out, 2, np.random.default_rng(1), longest_s=0.5)
     assert ended.code == 0 and not ended.traceback
     for name in ("trajectory.tum", "map.csv", "diagnostics.csv", "observations.csv"):
         assert (out / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()

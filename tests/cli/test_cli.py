@@ -3,8 +3,6 @@
 import json
 import os
 import shutil
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -138,16 +136,6 @@ def test_a_resumed_run_is_identical(log, tmp_path, association, monkeypatch):
     assert not (tmp_path / "cut" / "summary.json").exists()
     assert run(log, tmp_path / "cut", *arguments, "--resume") == 0
     assert outputs(tmp_path / "whole") == outputs(tmp_path / "cut")
-
-
-@pytest.mark.slow
-def test_threads_change_no_byte(log, tmp_path):
-    for threads in ("1", "2"):
-        command = [sys.executable, "-m", "rbpf", "run", "range-bearing", str(log), "--no-batch"]
-        command += ["--particles", "3000", "--threads", threads, "--out", str(tmp_path / threads)]
-        environment = {**os.environ, "NUMBA_NUM_THREADS": "2"}
-        subprocess.run(command, check=True, env=environment, capture_output=True)
-    assert outputs(tmp_path / "1") == outputs(tmp_path / "2")
 
 
 @pytest.mark.parametrize(
