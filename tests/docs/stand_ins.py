@@ -20,6 +20,7 @@ from rbpf.validation.simulation.images import Imaging, simulate_images
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 from tests.cli.mono_sequences import CAMERA as DESK_CAMERA
 from tests.cli.mono_sequences import render_desk
+from tests.cli.stereo_sequences import render_room
 from tests.readers.images.bags import film_images, film_pairs, recorded
 from tests.sensors.board_pictures import CAMERA, FISHEYE, pictures
 
@@ -27,7 +28,7 @@ SHORTER = {
     ("simulate", "range-bearing"): ["--steps", "20", "--landmarks", "20"],
     ("simulate", "desk"): ["--frames", "8", "--width", "480", "--height", "360"],
     ("simulate", "room"): ["--frames", "4", "--width", "160", "--height", "120"],
-    ("simulate", "lab"): ["--frames", "3", "--width", "160", "--height", "120"],
+    ("simulate", "lab"): ["--frames", "3", "--width", "160", "--height", "120", "--texel-m", "0.02"],
 }
 """Added to a command that would render or simulate for minutes."""
 
@@ -109,8 +110,7 @@ class Shelf:
         simulate_robot(RobotWorld(steps=20, landmarks=20), path, seed=0)
 
     def _pairs(self, path: Path) -> None:
-        small = ["--frames", "4", "--width", "320", "--height", "240", "--noise-std", "2"]
-        assert main(["simulate", "lab", "--out", str(path), *small]) == 0
+        render_room(path)
 
     def _phone(self, path: Path) -> None:
         _film(_images(self.get("desk")), path)
