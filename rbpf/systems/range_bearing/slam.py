@@ -283,12 +283,11 @@ class RangeBearingSlam(System):
         With names, one that comes a second time in its first frame is not used; without, it is the best particle's.
         """
         if self.config.association == "known":
-            listed, known = names.tolist(), self._names
-            used = [
-                name if name in known or name not in listed[:k] else NULL for k, name in enumerate(listed)
-            ]
-            self._names |= set(listed)
-            return np.array(used, dtype=np.int64)
+            again = np.ones(names.size, dtype=bool)
+            again[np.unique(names, return_index=True)[1]] = False
+            new = np.array([name not in self._names for name in names.tolist()], dtype=bool)
+            self._names |= set(names.tolist())
+            return np.where(new & again, NULL, names)
         ids = _ids_with_new(report, len(names))
         return ids[self.filter.belief().mode if len(ids) > 1 else 0]
 
