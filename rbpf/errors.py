@@ -1,4 +1,12 @@
-"""Errors that a user can act on."""
+"""Errors that a user can act on, and names as they may be shown."""
+
+
+def printable(text: str) -> str:
+    """A text, such as the name of a file, on one line and in UTF-8: what cannot be shown is written as an escape."""
+    shown = (
+        c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode("ascii") for c in text
+    )
+    return "".join(shown)
 
 
 class InputError(ValueError):
@@ -7,3 +15,6 @@ class InputError(ValueError):
     The message is one sentence that names the place, says what was expected and what to do.
     The command line prints it and exits with code 2, without a traceback.
     """
+
+    def __str__(self) -> str:
+        return printable(super().__str__())

@@ -2,6 +2,7 @@
 
 import os
 import sys
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -11,8 +12,10 @@ import tyro
 from rbpf import __version__
 from rbpf.cli import cameras, exporting, installed, judging
 from rbpf.cli.commands import Commands
+from rbpf.cli.compiling import require_threads
 from rbpf.cli.options import ImagesOptions, MonoOptions, Printed
 from rbpf.cli.running import RUN, repeated, run_mono
+from rbpf.cli.showing import say
 from rbpf.cli.simulating import SIMULATE, simulate_desk
 from rbpf.errors import InputError
 
@@ -72,32 +75,47 @@ def _require_filled(arguments: list[str]) -> None:
             raise InputError(f"{named} is empty" if named.startswith("--") else "an argument is empty")
 
 
+def _require_streams(wanted: bool) -> None:
+    """Gives what was closed (`>&-`) back, leading nowhere: else the next file that is opened would take its place.
+
+    Raises:
+        InputError: standard output is closed, and a result is `wanted` there.
+    """
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            with suppress(OSError):
+                os.open(os.devnull, os.O_RDWR)
+            setattr(sys, name, open(os.devnull, "w" if number else "r", encoding="utf-8"))  # noqa: SIM115
+            if number == 1 and wanted:
+                raise InputError("standard output is closed: --json has nowhere to write to")
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Parses the command line, runs the command; bad input becomes one sentence and exit code 2."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        given = sys.argv[1:] if arguments is None else arguments
-        if list(given) == ["--version"]:
+        _require_streams("--json" in given)
+        if given == ["--version"]:
             print(f"{PROGRAM} {__version__}", flush=True)
             return 0
         _require_filled(given)
-        expanded = repeated(list(given))
+        require_threads()
+        expanded = repeated(given)
         APP.require_known(expanded, PROGRAM)
         APP.cli(prog=PROGRAM, description=_DESCRIPTION, args=expanded)
         sys.stdout.flush()  # so that a broken pipe is noticed here
     except InputError as error:
-        print(f"{PROGRAM}: {error}", file=sys.stderr)
+        say(f"{PROGRAM}: {error}")
         return BAD_INPUT
     except BrokenPipeError:
         # Whoever read has seen enough; what Python would still write at its end goes nowhere.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as error:
-        print(
-            f"{PROGRAM}: {error}; what was finished is kept, --resume goes on from the last checkpoint",
-            file=sys.stderr,
-        )
+        kept = "; what was finished is kept, --resume goes on from the last checkpoint"
+        say(f"{PROGRAM}: {error}{kept if given[:1] == ['run'] else ''}")
         return BAD_INPUT
     except KeyboardInterrupt as stopped:
-        print(f"{PROGRAM}: {stopped or 'stopped'}", file=sys.stderr)
+        say(f"{PROGRAM}: {str(stopped) or 'stopped'}")
         return STOPPED
     return 0

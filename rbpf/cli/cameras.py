@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import tyro
 
 from rbpf.cli.options import Printed
-from rbpf.cli.showing import answer, progress, say, told
+from rbpf.cli.showing import answer, progress, say
 
 LOOSE = 0.01
 """Standard deviation of focal lengths and centre, as a fraction of the focal length, from which on a run bends."""
@@ -42,7 +42,7 @@ def calibrate(options: Annotated[CalibrateOptions, tyro.conf.arg(name="")]) -> N
         found, looked_at = calibrate_images(
             options.images,
             board,
-            told(bar, bar.add_task("looking for the board", total=None)),
+            bar("looking for the board"),
             options.model,
         )
     entries = write_calibration(found, board, looked_at, options.out)
@@ -90,7 +90,7 @@ def recalibrate(options: Annotated[RecalibrateOptions, tyro.conf.arg(name="")]) 
         entries, found = from_run(
             options.run,
             options.out,
-            told(bar, bar.add_task("adjusting the camera with poses and landmarks", total=None)),
+            bar("adjusting the camera with poses and landmarks"),
         )
     focal, k1 = entries["fx"], entries["k1"]
     answer(

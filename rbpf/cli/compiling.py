@@ -62,11 +62,22 @@ def compile_kernels(every: bool = False) -> list[str]:
     if work:
         work += [_search_patches, _measure_motion, _filter_log]
         with progress() as bar:
-            task = bar.add_task("compiling" if missing else "trying the kernels", total=len(work))
-            for part in work:
+            tell = bar("compiling" if missing else "trying the kernels")
+            tell(0, len(work))
+            for done, part in enumerate(work, 1):
                 part()
-                bar.advance(task)
+                tell(done, len(work))
     return missing
+
+
+def require_threads() -> None:
+    """Refuses a number of threads in the environment with which no kernel can run.
+
+    Raises:
+        InputError: it is less than one.
+    """
+    if numba.config.NUMBA_NUM_THREADS < 1:
+        raise InputError(f"NUMBA_NUM_THREADS must be at least 1, got {numba.config.NUMBA_NUM_THREADS}")
 
 
 def use_threads(threads: int | None) -> None:

@@ -52,7 +52,7 @@ def doctor(options: Annotated[DoctorOptions, tyro.conf.arg(name="")]) -> None:
     lines = {part.name: f"{marks[part.needed, part.works]}: {part.says}" for part in tried}
     known = {name: number or "missing" for name, number in libraries.items()}
     kernels = f"{len(kernel_modules()) - len(missing)} of {len(kernel_modules())} compiled"
-    answer(entries, options.json, table({**found, **known, **lines, "kernels": kernels}, 26))
+    answer(entries, options.json, *table({**found, **known, **lines, "kernels": kernels}, 26))
     if broken:
         raise InputError(f"{', '.join(part.name for part in broken)}: needed, and broken here; see above")
 

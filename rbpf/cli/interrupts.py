@@ -2,13 +2,11 @@
 
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-from rbpf.cli.showing import say
-
-Told = Callable[[int, int], None]
+from rbpf.cli.showing import Told, say
 
 
 class StoppedError(KeyboardInterrupt):
@@ -29,11 +27,11 @@ def patient(tell: Told) -> Iterator[Told]:
         asked.set()
         say("stopping after this frame; Ctrl-C again stops at once …")
 
-    def listening(done: int, total: int) -> None:
+    def listening(done: int, total: int | None) -> None:
         tell(done, total)
         if asked.is_set():
             raise StoppedError(
-                f"stopped after {done} of {total}; the same command with --resume goes on from there"
+                f"stopped after {done} of {total or 'an unknown number'}; the same command with --resume goes on from there"
             )
 
     if threading.current_thread() is not threading.main_thread():

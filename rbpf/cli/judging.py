@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from rbpf.cli.options import Printed, Text, Where
-from rbpf.cli.showing import answer, progress, told, waiting
+from rbpf.cli.showing import answer, progress, waiting
 from rbpf.errors import InputError
 
 if TYPE_CHECKING:
@@ -92,8 +92,7 @@ def sweep(options: Annotated[SweepOptions, tyro.conf.arg(name="")]) -> None:
         raise InputError(f"--workers must be at least 1, or -1 for one per core, got {options.workers}")
     jobs = read_plan(options.config)
     with progress() as bar:
-        task = bar.add_task("running", total=len(jobs))
-        rows = run_all(jobs, options.out, options.workers, options.scheduler, told(bar, task))
+        rows = run_all(jobs, options.out, options.workers, options.scheduler, bar("running"))
     failures = [row["failure"] for row in rows if "failure" in row]
     path = options.out / TABLE
     entries = {"runs": len(rows), "failed": len(failures), "table": str(path)}
@@ -125,8 +124,7 @@ def compare(options: Annotated[CompareOptions, tyro.conf.arg(name="")]) -> None:
 
     a, b = options.run_a, options.run_b
     with progress() as bar:
-        task = bar.add_task("filtering", total=2 * options.seeds)
-        found = compare_runs(a, b, options.seeds, options.workers, told(bar, task))
+        found = compare_runs(a, b, options.seeds, options.workers, bar("filtering"))
     sentence = found.sentence(str(a), str(b))
     entries = {"difference": found.difference, "error": found.error, "sentence": sentence}
     answer(entries, options.json, sentence)

@@ -9,7 +9,7 @@ import tyro
 
 from rbpf.cli.commands import Commands
 from rbpf.cli.compiling import compile_kernels, use_threads
-from rbpf.cli.interrupts import Told, finishing, patient
+from rbpf.cli.interrupts import finishing, patient
 from rbpf.cli.options import (
     ImageRunOptions,
     MonoOptions,
@@ -21,7 +21,7 @@ from rbpf.cli.options import (
     given_markers,
     given_topics,
 )
-from rbpf.cli.showing import answer, progress, say, table, told
+from rbpf.cli.showing import Told, answer, progress, say
 from rbpf.errors import InputError
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def run_range_bearing(options: Annotated[RangeBearingOptions, tyro.conf.arg(name
     named = given(options, "particles", "seed", "association")
     config = load_settings(RangeBearingConfig, "range-bearing", options.config, options.set, named)
     with _prepared(options) as out:
-        with progress() as bar, patient(told(bar, bar.add_task("filtering", total=None))) as tell:
+        with progress() as bar, patient(bar("filtering")) as tell:
             recording = RobotRecording(options.log)
             run = filter_recording(recording, config, out, options.resume, [listener(tell)])
         if options.batch:
@@ -135,13 +135,12 @@ def _run_images(options: ImageRunOptions, recording: "Recording", config: Any, v
     if options.rerun is not None:
         require_rerun()
     with _prepared(options) as out, progress() as bar:
-        with patient(told(bar, bar.add_task("filtering", total=None))) as tell:
+        with patient(bar("filtering")) as tell:
             run = filter_recording(recording, config, out, options.resume, [listener(tell)])
-        solving = bar.add_task("batch", total=None, visible=options.batch)
-        drawing = bar.add_task("drawing", total=None, visible=video)
+        solving = bar("batch")
         callbacks = Callbacks(
-            on_frame=told(bar, drawing),
-            on_iteration=lambda count, _error: bar.update(solving, completed=count),
+            on_frame=bar("drawing"),
+            on_iteration=lambda count, _error: solving(count, None),
             most_iterations=options.batch_limit,
         )
         with finishing():
@@ -178,8 +177,9 @@ def _prepared(options: RunOptions) -> Iterator[Path]:
 
 def _finish(entries: dict[str, Any], options: RunOptions, out: Path, failure: str | None) -> None:
     result = entries | {"out": str(out)}
-    shown = {name: value for name, value in entries.items() if name != "sentences"}
-    where = f"results, pictures and report.html are in {out}"
-    answer(result, options.json, table(shown), *entries["sentences"], where)
+    problems = entries.get("problems", ())
+    odd = [f"{len(problems)} remarks on single frames, the first: {problems[0]}"] if problems else []
+    where = f"pictures and report.html are in {out}, all figures in its summary.json"
+    answer(result, options.json, *entries["sentences"], *odd, where)
     if failure is not None:
         raise InputError(f"{failure}; what was computed before it is in {out}")

@@ -12,25 +12,28 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
-    TaskID,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
 
+from rbpf.errors import printable
+
 CONSOLE = Console(stderr=True)
 
-_MOST_LINES = 4
-"""Of a list in a table on the terminal."""
+Told = Callable[[int, int | None], None]
+"""Something that is told how many are done, and of how many; None where that is not known."""
 
 
-def told(bar: Progress, task: TaskID) -> Callable[[int, int], None]:
-    """Something that is told how many are done, and of how many."""
-    return lambda done, total: bar.update(task, completed=done, total=total)
+@contextmanager
+def progress() -> Iterator[Callable[[str], Told]]:
+    """Bars with the time that has passed and an estimate of what is left, each shown from the first time that it is told.
 
+    What is refused before anything is done has no bar.
 
-def progress() -> Progress:
-    """A bar with the time that has passed and an estimate of what is left."""
+    Yields:
+        Makes a bar of what is done, and returns what is to be told how much is done, and of how much.
+    """
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -39,7 +42,23 @@ def progress() -> Progress:
         TextColumn("left:"),
         TimeRemainingColumn(),
     )
-    return Progress(*columns, console=CONSOLE)
+    bars = Progress(*columns, console=CONSOLE)
+
+    def bar(what: str) -> Told:
+        task = bars.add_task(what, start=False, visible=False)
+
+        def tell(done: int, total: int | None) -> None:
+            bars.start()
+            bars.start_task(task)
+            bars.update(task, completed=done, total=total or None, visible=True)
+
+        return tell
+
+    try:
+        yield bar
+    finally:
+        if bars.live.is_started:
+            bars.stop()
 
 
 @contextmanager
@@ -50,8 +69,10 @@ def waiting(what: str) -> Iterator[None]:
 
 
 def say(sentence: str) -> None:
-    """A sentence, on standard error."""
-    CONSOLE.print(sentence, highlight=False, soft_wrap=True)
+    """A sentence, on standard error, whatever names are in it; it is broken between words, and on a terminal alone."""
+    CONSOLE.print(
+        printable(sentence), highlight=False, markup=False, emoji=False, soft_wrap=not CONSOLE.is_terminal
+    )
 
 
 def answer(entries: Mapping[str, Any], as_json: bool, *sentences: str) -> None:
@@ -63,17 +84,9 @@ def answer(entries: Mapping[str, Any], as_json: bool, *sentences: str) -> None:
         say(sentence)
 
 
-def table(entries: Mapping[str, Any], width: int = 34) -> str:
-    """Names and values, one a line; of a long list the beginning, one item a line."""
-    lines = []
-    for name, value in entries.items():
-        shown = [str(item) for item in value] if isinstance(value, list) else [_shown(value)]
-        hidden = len(shown) - _MOST_LINES
-        if hidden > 0:
-            shown[_MOST_LINES:] = [f"… and {hidden} more, in summary.json"]
-        lines += [f"{name:>{width}}  {shown[0]}"] if shown else []
-        lines += [f"{'':>{width}}  {line}" for line in shown[1:]]
-    return "\n".join(lines)
+def table(entries: Mapping[str, Any], width: int) -> list[str]:
+    """Names and values, one a line."""
+    return [f"{name:>{width}}  {_shown(value)}" for name, value in entries.items()]
 
 
 def _shown(value: object) -> str:

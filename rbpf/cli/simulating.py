@@ -8,7 +8,7 @@ import tyro
 from rbpf.cli.commands import Commands
 from rbpf.cli.compiling import compile_kernels
 from rbpf.cli.options import ImagesOptions, LabOptions, LogOptions, RenderOptions, given_board
-from rbpf.cli.showing import answer, megabytes, progress, told
+from rbpf.cli.showing import answer, megabytes, progress
 from rbpf.errors import InputError
 
 if TYPE_CHECKING:
@@ -70,9 +70,8 @@ def _render(world: "ImageWorld", options: ImagesOptions | LabOptions) -> None:
     camera = _camera(options)
     imaging = _imaging(options)
     with progress() as bar:
-        task = bar.add_task("rendering", total=options.frames)
         simulate_images(
-            world, imaging, camera, options.out, options.seed, told(bar, task), options.baseline_m
+            world, imaging, camera, options.out, options.seed, bar("rendering"), options.baseline_m
         )
     size = megabytes(options.out)
     answer(

@@ -346,6 +346,11 @@ def shade(axes: Any, lost: np.ndarray) -> None:
 def save_figures(figures: Mapping[str, Any], out: Path) -> list[str]:
     """Saves figures by file name, each whole or not at all; returns the names."""
     for name, figure in figures.items():
+        # A name with dollars in it is no formula; the numbers at logarithmic axes are.
+        for axes in figure.axes:
+            legend = axes.get_legend()
+            for text in (axes.title, *(() if legend is None else legend.get_texts())):
+                text.set_parse_math(False)
         with whole(out / name) as temporary:
             figure.savefig(temporary, format="png", dpi=110, bbox_inches="tight")
     return list(figures)

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rbpf.core.checkpoint import checked, fitting, load_arrays
-from rbpf.errors import InputError
+from rbpf.errors import InputError, printable
 from rbpf.lie import SE2, SE3, Array, SE2Group, SE3Group
 from rbpf.runs.files import MAP, TRAJECTORY, VERSION
 from rbpf.runs.measurement_files import read_measurements
@@ -140,7 +140,7 @@ class RunFolder:
     @property
     def name(self) -> str:
         """Of the recording."""
-        return str(self.summary.get("recording", self.folder.name))
+        return printable(str(self.summary.get("recording", self.folder.name)))
 
     @cached_property
     def path(self) -> FilteredPath:

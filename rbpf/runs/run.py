@@ -18,7 +18,7 @@ from typing import Any, Generic, Protocol, TypeVar
 import numpy as np
 
 from rbpf.core.checkpoint import checked, fitting, load_arrays
-from rbpf.errors import InputError
+from rbpf.errors import InputError, printable
 from rbpf.runs.frame_log import FrameLog
 from rbpf.runs.provenance import decisive_settings, require_same
 from rbpf.runs.truth import RunTruth
@@ -73,7 +73,7 @@ class Run(Generic[SystemT]):
     @property
     def name(self) -> str:
         """Of the recording."""
-        return self.source.name
+        return printable(self.source.name)
 
     def take(self, frame: Any, waiting: float = 0.0) -> Tracked:
         """Gives the system a frame and keeps what it says; `waiting` is the time [s] that the frame took to arrive.
@@ -85,7 +85,8 @@ class Run(Generic[SystemT]):
         tracked = self.system.take(frame)
         seconds = time.perf_counter() - started
         self.frame = frame
-        self.messages += [f"{self.system.frame_word} {len(self.log)}: {words}" for words in tracked.messages]
+        place = f"{self.system.frame_word} {len(self.log)}"
+        self.messages += [f"{place}: {printable(words)}" for words in tracked.messages]
         self.log.append(tracked, seconds, waiting)
         return tracked
 

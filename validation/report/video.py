@@ -117,10 +117,9 @@ _SEARCH_LEGEND = (("found", FOUND), ("missed", MISSED), ("epipolar line", RAY), 
 def picture_of_search(run: Run, t: int, frame: ImageFrame) -> np.ndarray:
     """A frame of a monocular run (H, W, 3): ellipses, hits, misses and epipolar lines (E06, Figs. 7 and 8)."""
     log = run.log
-    text = (
-        f"frame {t}   found {log['found'][t]} of {log['searched'][t]}   "
-        f"map {log['points'][t]} points, {log['rays'][t]} rays"
-    )
+    found, searched = log["found"][t], log["searched"][t]
+    seen = f"found {found} of {searched}" if searched else f"starts from {found} points" if found else ""
+    text = f"frame {t}   {seen}   map {log['points'][t]} points, {log['rays'][t]} rays"
     alarm = "FOUND AGAIN" if log["relocalised"][t] else "LOST" if log["lost"][t] else ""
     alarm = f"NO IMAGE {alarm}" if frame.image is None else alarm
     camera = run.system.camera
