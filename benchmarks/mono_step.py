@@ -4,12 +4,11 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from benchmarks.rows import Row, Settings, interleaved
+from examples.studies.point_worlds import MONO, DeskWorld, Measuring, simulate_features
 from rbpf.core.filter import Filter
 from rbpf.sensors.feature_log import FeatureFrame, FeatureLog
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.slam import MonoSlam
-from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
-from rbpf.validation.simulation.point_worlds import DeskWorld
 
 AIM_MS = 1.0
 SETTLING = 100

@@ -18,14 +18,14 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
+from examples.studies.point_worlds import STEREO, LabWorld, Measuring, simulate_features
 from rbpf.lie import SE3
 from rbpf.runs.recordings import filter_features
 from rbpf.sensors.feature_log import FeatureLog
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig, ResamplingConfig
 from rbpf.systems.stereo.config import OUTLIER_VOLUME_PX3, OdometryConfig, StereoConfig, TriggerConfig
 from rbpf.validation.consistency.statistic import whitened_errors
-from rbpf.validation.simulation.features import STEREO, Measuring, simulate_features
-from rbpf.validation.simulation.lab import LabDrive, LabWorld
+from rbpf.validation.simulation.lab import LabDrive
 from rbpf.validation.tables import write_table
 
 DIM = 6

@@ -16,6 +16,7 @@ from typing import final
 import numpy as np
 import tyro
 
+from examples.studies.point_worlds import STEREO, LabWorld, Measuring, simulate_features
 from rbpf.errors import InputError
 from rbpf.runs.plots import COLOURS, new_axes, save_figures
 from rbpf.runs.recordings import filter_features, filter_pairs
@@ -29,8 +30,7 @@ from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.feature_cache import cache_features
 from rbpf.validation.gtsam.batch_problem import solve_problem
 from rbpf.validation.metrics.scores import score_path
-from rbpf.validation.simulation.features import STEREO, Measuring, simulate_features
-from rbpf.validation.simulation.lab import LabDrive, LabWorld
+from rbpf.validation.simulation.lab import LabDrive
 from rbpf.validation.tables import write_table
 
 

@@ -18,6 +18,7 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
+from examples.studies.point_worlds import MONO, DeskWorld, Measuring, simulate_features
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
 from rbpf.runs.measurement_files import read_feature_log
@@ -34,8 +35,6 @@ from rbpf.validation.gtsam.observations import (
     observation_table,
     reprojection,
 )
-from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
-from rbpf.validation.simulation.point_worlds import DeskWorld
 from rbpf.validation.tables import write_table
 
 LEAST_HELD = 3

@@ -20,6 +20,7 @@ from examples.studies.error_causes import (
     scaled_noise,
 )
 from examples.studies.error_ratios import HEADER, ErrorRatio, error_of, robot_ratio, tracks_ratio
+from examples.studies.point_worlds import MONO, STEREO, DeskWorld, Measuring, simulate_features
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.folder import write_trajectory
@@ -34,8 +35,6 @@ from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.validation.gtsam.mono_batch import Batch, adjust_log
-from rbpf.validation.simulation.features import MONO, STEREO, Measuring, simulate_features
-from rbpf.validation.simulation.point_worlds import DeskWorld
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 from tests.exactness.models import known
 from tests.systems.mono_logs import SMALL

@@ -14,6 +14,7 @@ from examples.studies.consistency_runs import (
     run_trials,
 )
 from examples.studies.mono_realism import measure_search, survival
+from examples.studies.point_worlds import STEREO, DeskWorld, LabWorld, Measuring, simulate_features
 from examples.studies.stereo_revisit import log_there_and_back, pairs_there_and_back
 from rbpf.errors import InputError
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
@@ -21,10 +22,8 @@ from rbpf.sensors.readers import open_stereo
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.simulation.desk_and_room import TexturedDesk
-from rbpf.validation.simulation.features import STEREO, Measuring, simulate_features
 from rbpf.validation.simulation.images import Imaging, simulate_images
-from rbpf.validation.simulation.lab import LabDrive, LabWorld, TexturedLab
-from rbpf.validation.simulation.point_worlds import DeskWorld
+from rbpf.validation.simulation.lab import LabDrive, TexturedLab
 from rbpf.validation.simulation.robot import RobotWorld
 
 

@@ -6,13 +6,12 @@ import numpy as np
 import pycolmap
 import pytest
 
+from examples.studies.point_worlds import MONO, DeskWorld, Measuring, simulate_features
 from examples.studies.two_optimisers import adjust_by_both, adjust_by_colmap, tangent_slope, with_held
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.validation.colmap.model import from_colmap_pose
 from rbpf.validation.gtsam.observations import CameraEstimate, observation_table
-from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
-from rbpf.validation.simulation.point_worlds import DeskWorld
 from tests.validation.camera_scenes import BENT, FISHEYE, PLAIN, STEREO, WHOLE, scene
 
 POSES, COVARIANCES = 1e-4, 0.05

@@ -27,7 +27,7 @@ import numpy as np
 DATA = Path(os.environ.get("RBPF_DATA", "../shared/data")).resolve()
 RBPF = [sys.executable, "-m", "rbpf"]
 TIMES = ("ms_per_", "peak_memory", "seconds", "_ms", "milliseconds")
-MONO_FEATURES = Path(__file__).with_name("run_named_features.py")
+MONO_FEATURES = "tests.golden.run_named_features"
 
 
 def rbpf(*words: Any) -> None:
@@ -106,7 +106,7 @@ def cases(work: Path) -> dict[str, Callable[[Path], None]]:
         "mono_real": lambda out: rbpf(
             *mono, kitchen, "--known-points", kitchen / "known_points.csv", "--no-video", "--out", out
         ),
-        "mono_features": lambda out: subprocess.run([sys.executable, MONO_FEATURES, out], check=True),
+        "mono_features": lambda out: subprocess.run([sys.executable, "-m", MONO_FEATURES, out], check=True),
         "stereo_rendered": lambda out: rbpf(*stereo, pairs, "--no-video", "--out", out),
         "stereo_resumed": lambda out: interrupted(
             out, *stereo, pairs, "--particles", 50, "--set", "checkpoint_every=5", "--no-video", "--no-batch"

@@ -5,10 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
+from examples.studies.point_worlds import MONO, DeskWorld, Measuring, simulate_features
 from rbpf.runs.recordings import filter_features as run
 from rbpf.systems.mono.config import MonoConfig
-from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
-from rbpf.validation.simulation.point_worlds import DeskWorld
 
 out = Path(sys.argv[1])
 out.mkdir()

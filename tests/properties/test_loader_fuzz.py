@@ -11,6 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from examples.studies.point_worlds import MONO as CAMERA
 from rbpf.core.checkpoint import _digest, load_arrays, save_arrays
 from rbpf.errors import InputError
 from rbpf.lie import SE3
@@ -22,7 +23,6 @@ from rbpf.systems.settings import load_settings
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.validation.consistency.comparison import read_comparisons
 from rbpf.validation.report.page import write_report
-from rbpf.validation.simulation.features import MONO as CAMERA
 from rbpf.validation.sweep.plan import read_plan
 from rbpf.validation.sweep.sweep import read_rows
 from tests.core.worlds import Recipe, content, drive, planar_world, same

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from examples.studies.point_worlds import MONO, DeskWorld, Measuring, simulate_features
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.measurement_files import read_feature_log, read_robot_measurements, write_measurements
@@ -26,8 +27,6 @@ from rbpf.sensors.readers import (
 from rbpf.sensors.readers.stereo_tracks import read_stereo_tracks
 from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
 from rbpf.validation.exports import read_ply, write_ply
-from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
-from rbpf.validation.simulation.point_worlds import DeskWorld
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 from tests.properties.mutations import damaged
 from tests.readers import small

@@ -5,19 +5,19 @@ from dataclasses import replace
 
 import numpy as np
 
+from examples.studies.point_worlds import MONO, DeskWorld, Measuring, simulate_features
 from rbpf.lie import SE3
 from rbpf.runs.run import Run
 from rbpf.sensors.feature_log import FeatureFrame, FeatureLog
 from rbpf.systems.mono.config import MonoConfig
-from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
-from rbpf.validation.simulation.point_worlds import DeskWorld
+from rbpf.validation.simulation.paths import HandHeld
 
 SMALL = MonoConfig(particles=20)
 
 
 def desk(seed: int = 0, frames: int = 8, measurements: int = 12, **options: float) -> FeatureLog:
     """A hand-held camera over a desk, ten images a second."""
-    world = DeskWorld(frames=frames, rate_hz=10.0, points=60, blocks=0, start_s=0.1)
+    world = DeskWorld(frames=frames, rate_hz=10.0, points=60, blocks=0, hand=HandHeld(start_s=0.1))
     measuring = Measuring(measurements=measurements, new_per_frame=2, **options)
     return simulate_features(world, measuring, MONO, seed)
 

@@ -1,5 +1,7 @@
 """A run that starts from a rendered chessboard: its corners look alike, and are told apart all the same."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import yaml
@@ -12,7 +14,7 @@ from rbpf.sensors.camera import Pinhole
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.validation.gtsam.mono_batch import adjust_log
 from rbpf.validation.metrics.accuracy import ate
-from rbpf.validation.simulation.desk_and_room import TexturedDesk
+from rbpf.validation.simulation.desk_and_room import OVER_DESK, TexturedDesk
 from rbpf.validation.simulation.images import Imaging, simulate_images
 
 CAMERA = Pinhole(320, 240, 256.0, 256.0, 159.5, 119.5)
@@ -25,7 +27,12 @@ pytestmark = pytest.mark.slow
 def started(tmp_path_factory):
     """The run, and the true poses in the board's frame."""
     folder = tmp_path_factory.mktemp("board") / "desk"
-    world = TexturedDesk(frames=60, board=(8, 5), square_m=0.06, speed_m_s=0.6, turn_rad_s=1.0, start_s=0.3)
+    world = TexturedDesk(
+        frames=60,
+        board=(8, 5),
+        square_m=0.06,
+        hand=replace(OVER_DESK, speed_m_s=0.6, turn_rad_s=1.0, start_s=0.3),
+    )
     imaging = Imaging(noise_std=1.0, blur_s=0.0, exposure_drift=0.0, vignetting=0.0, known=0)
     simulate_images(world, imaging, CAMERA, folder, seed=0)
     sequence, known = MonoRecording(folder, board=BOARD).sequence()

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from examples.studies.point_worlds import STEREO, DeskWorld, Measuring, simulate_features
 from rbpf.core.filter import Filter
 from rbpf.core.models import Part
 from rbpf.errors import InputError
@@ -23,8 +24,6 @@ from rbpf.sensors.camera.points import CameraRay, EpipolarRay
 from rbpf.sensors.feature_log import FeatureFrame, FeatureLog, KnownPoints
 from rbpf.systems.mono.config import InverseDepthConfig, MonoConfig, VelocityConfig
 from rbpf.systems.mono.slam import MonoSlam, particle_points, world_of
-from rbpf.validation.simulation.features import STEREO, Measuring, simulate_features
-from rbpf.validation.simulation.point_worlds import DeskWorld
 from tests.core.worlds import content, same
 from tests.exactness.models import known
 from tests.systems.mono_logs import SMALL, changed, desk, errors, nees, rows, without_known

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from examples.studies.point_worlds import MONO, STEREO, LabWorld, Measuring, simulate_features
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.recordings import filter_features, filter_opened, open_features
@@ -13,8 +14,7 @@ from rbpf.sensors.feature_log import FeatureLog
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig
 from rbpf.systems.stereo.config import OdometryConfig, RecoveryConfig, StereoConfig, TriggerConfig
 from rbpf.validation.gtsam.camera import CameraEstimate, solve_features
-from rbpf.validation.simulation.features import MONO, STEREO, Measuring, simulate_features
-from rbpf.validation.simulation.lab import LabDrive, LabWorld
+from rbpf.validation.simulation.lab import LabDrive
 
 pytestmark = pytest.mark.slow
 

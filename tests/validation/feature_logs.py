@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from examples.studies.point_worlds import Scene
 from rbpf.lie import SE3
 from rbpf.sensors.feature_log import FeatureLog
-from rbpf.validation.simulation.point_worlds import Scene
 
 
 def truth(log: FeatureLog, frame: int) -> np.ndarray:

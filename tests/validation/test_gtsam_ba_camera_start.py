@@ -6,6 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from examples.studies.point_worlds import MONO, DeskWorld, Measuring, simulate_features
+from examples.studies.point_worlds import STEREO as PAIR
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole
@@ -13,9 +15,6 @@ from rbpf.sensors.feature_log import FeatureFrame, KnownPoints
 from rbpf.validation.gtsam.camera import CameraEstimate, solve_features
 from rbpf.validation.gtsam.camera_start import locate
 from rbpf.validation.gtsam.observations import ObservationTable
-from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
-from rbpf.validation.simulation.features import STEREO as PAIR
-from rbpf.validation.simulation.point_worlds import DeskWorld
 from tests.validation.camera_scenes import BENT, PLAIN, STEREO, WHOLE, scene
 
 pytestmark = pytest.mark.slow

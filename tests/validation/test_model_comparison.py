@@ -4,6 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from examples.studies.point_worlds import MONO, STEREO, DeskWorld, Measuring, simulate_features
 from rbpf.cli import main
 from rbpf.errors import InputError
 from rbpf.sensors.readers import LogNoise
@@ -12,8 +13,6 @@ from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.stereo.config import OdometryConfig, StereoConfig, TriggerConfig
 from rbpf.validation.consistency.model_comparison import compare_evidence, evidence_difference
-from rbpf.validation.simulation.features import MONO, STEREO, Measuring, simulate_features
-from rbpf.validation.simulation.point_worlds import DeskWorld
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot, simulated_log
 
 pytestmark = pytest.mark.slow

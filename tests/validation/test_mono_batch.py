@@ -5,13 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from examples.studies.point_worlds import MONO, DeskWorld, Measuring, simulate_features
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.feature_log import FeatureFrame, FeatureLog
 from rbpf.validation.gtsam.camera import solve_features
 from rbpf.validation.gtsam.mono_batch import ROBUST, WORK, adjust_log, connected_frames, most_iterations
-from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
-from rbpf.validation.simulation.point_worlds import DeskWorld
 from tests.exactness.models import known
 
 pytestmark = pytest.mark.slow

@@ -1,5 +1,7 @@
 """Views, annotated frames and sightings of runs over images."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -19,7 +21,7 @@ from rbpf.validation.report.video import (
     frame_rate,
     is_complete,
 )
-from rbpf.validation.simulation.desk_and_room import TexturedDesk
+from rbpf.validation.simulation.desk_and_room import OVER_DESK, TexturedDesk
 from rbpf.validation.simulation.images import Imaging, simulate_images
 
 
@@ -27,7 +29,7 @@ from rbpf.validation.simulation.images import Imaging, simulate_images
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("rendered") / "desk"
     camera = Pinhole(240, 180, 190.0, 190.0, 119.5, 89.5)
-    world = TexturedDesk(frames=40, texel_m=0.003, speed_m_s=0.6, start_s=0.2)
+    world = TexturedDesk(frames=40, texel_m=0.003, hand=replace(OVER_DESK, speed_m_s=0.6, start_s=0.2))
     simulate_images(world, Imaging(noise_std=1.0), camera, folder, seed=1)
     return filter_images(
         open_images(folder), MonoConfig(particles=8), read_known_points(folder / "known_points.csv")

@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from examples.studies.point_worlds import MONO, DeskWorld, Measuring, simulate_features
 from rbpf.validation.gtsam.mono_batch import adjust_log
 from rbpf.validation.gtsam.self_calibration import refine_calibration
-from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
-from rbpf.validation.simulation.point_worlds import DeskWorld
 from tests.exactness.models import known
 
 pytestmark = pytest.mark.slow

@@ -8,16 +8,24 @@ from typing import Any
 import numpy as np
 import pytest
 
+from examples.studies import point_worlds
+from examples.studies.point_worlds import (
+    MONO,
+    STEREO,
+    DeskWorld,
+    LabWorld,
+    Measuring,
+    PointWorld,
+    simulate_features,
+)
 from rbpf.errors import InputError
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.feature_log import FeatureLog
-from rbpf.validation.simulation import images, lab, textured_scene
+from rbpf.validation.simulation import images, textured_scene
 from rbpf.validation.simulation.desk_and_room import TexturedDesk, TexturedRoom
-from rbpf.validation.simulation.features import MONO, STEREO, Measuring, simulate_features
 from rbpf.validation.simulation.images import Imaging, simulate_images
-from rbpf.validation.simulation.lab import LabDrive, LabWorld, TexturedLab
-from rbpf.validation.simulation.paths import WheelOdometer
-from rbpf.validation.simulation.point_worlds import DeskWorld, PointWorld
+from rbpf.validation.simulation.lab import LabDrive, TexturedLab
+from rbpf.validation.simulation.paths import HandHeld, WheelOdometer
 from rbpf.validation.simulation.textured_scene import ImageWorld, Rectangle
 
 GREY = np.full((8, 8), 128, dtype=np.uint8)
@@ -36,13 +44,13 @@ def sheet(**wrong: Any) -> Rectangle:
         (DeskWorld, {"points": 0}, "points must be a whole number, at least 1, got 0"),
         (DeskWorld, {"blocks": -1}, "blocks must be a whole number, at least 0"),
         (DeskWorld, {"rate_hz": 0.0}, "rate_hz must be a positive number, got 0.0"),
-        (DeskWorld, {"speed_m_s": -1.0}, "speed_m_s must be a positive number"),
-        (DeskWorld, {"turn_rad_s": float("inf")}, "turn_rad_s must be a positive number"),
+        (HandHeld, {"speed_m_s": -1.0}, "speed_m_s must be a positive number"),
+        (HandHeld, {"turn_rad_s": float("inf")}, "turn_rad_s must be a positive number"),
         (DeskWorld, {"size_m": (1.0, 0.0, 1.0)}, "size_m must be three positive numbers"),
         (DeskWorld, {"size_m": (1.0, float("nan"), 1.0)}, "size_m must be three positive numbers"),
-        (DeskWorld, {"nearest_m": 2.0}, "nearest_m = 2.0 must be less than farthest_m = 1.5"),
-        (DeskWorld, {"wander": -0.1}, "wander must be zero or a positive number"),
-        (DeskWorld, {"elevation_deg": 85.0}, "elevation_deg = 85.0 .* vertical"),
+        (HandHeld, {"nearest_m": 2.0}, "nearest_m = 2.0 must be less than farthest_m = 1.5"),
+        (HandHeld, {"wander": -0.1}, "wander must be zero or a positive number"),
+        (HandHeld, {"elevation_deg": 85.0}, "elevation_deg = 85.0 .* vertical"),
         (DeskWorld, {"renewal": 1.0}, "renewal must be a probability"),
         (LabWorld, {"points": 0}, "points"),
         (Measuring, {"noise_px": 0.0}, "noise_px must be a positive number, got 0.0"),
@@ -66,7 +74,7 @@ def sheet(**wrong: Any) -> Rectangle:
         (TexturedDesk, {"frames": 1}, "frames"),
         (TexturedDesk, {"texel_m": 0.0}, "texel_m"),
         (TexturedDesk, {"board": (2, 5)}, "board"),
-        (TexturedDesk, {"nearest_m": 2.0, "farthest_m": 1.0}, "nearest_m"),
+        (TexturedDesk, {"size_m": (2.0, 0.0)}, "size_m"),
         (TexturedDesk, {"things": -1}, "things"),
         (TexturedRoom, {"size_m": (3.0, 3.0, 2.5)}, "size_m"),
         (TexturedRoom, {"eye_m": 3.0}, "eye_m"),
@@ -107,7 +115,7 @@ def test_what_makes_no_sense_is_refused(kind: Any, options: dict[str, Any], mess
         kind(**options)
 
 
-@pytest.mark.parametrize("module", [images, lab, textured_scene])
+@pytest.mark.parametrize("module", [images, point_worlds, textured_scene])
 def test_examples_in_the_docstrings_run(module: ModuleType) -> None:
     result = doctest.testmod(module)
     assert result.attempted > 0 and result.failed == 0

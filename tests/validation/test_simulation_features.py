@@ -6,13 +6,21 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from examples.studies.point_worlds import (
+    MONO,
+    STEREO,
+    DeskWorld,
+    LabWorld,
+    Measuring,
+    PointWorld,
+    Scene,
+    simulate_features,
+)
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.feature_log import FeatureLog
-from rbpf.validation.simulation.features import MONO, STEREO, Measuring, simulate_features
-from rbpf.validation.simulation.lab import LabDrive, LabWorld
-from rbpf.validation.simulation.point_worlds import DeskWorld, PointWorld, Scene
+from rbpf.validation.simulation.lab import LabDrive
 from tests.validation.feature_logs import StillCamera, errors, likely, sightings, truth
 
 CAMERAS = [MONO, STEREO]

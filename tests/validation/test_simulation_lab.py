@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from examples.studies.point_worlds import LabWorld, Measuring, simulate_features
 from rbpf.lie import SE2, SE3
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.readers import open_images, open_stereo
 from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
-from rbpf.validation.simulation.features import Measuring, simulate_features
 from rbpf.validation.simulation.images import Imaging, simulate_images
 from rbpf.validation.simulation.lab import (
     DOOR_M,
@@ -21,7 +21,6 @@ from rbpf.validation.simulation.lab import (
     ROBOT_FROM_CAMERA,
     SIZE_M,
     LabDrive,
-    LabWorld,
     TexturedLab,
     furnished,
     world_from_camera,

@@ -6,17 +6,19 @@ from functools import cache
 import numpy as np
 import pytest
 
-from rbpf.lie import SE3
-from rbpf.sensors.feature_log import FeatureLog
-from rbpf.validation.simulation.features import MONO, Measuring, simulate_features
-from rbpf.validation.simulation.paths import Wave, eased, looking, slowed, speeds
-from rbpf.validation.simulation.point_worlds import (
+from examples.studies.point_worlds import (
+    MONO,
     DeskWorld,
+    Measuring,
     PointWorld,
     Scene,
     hidden,
     populated,
+    simulate_features,
 )
+from rbpf.lie import SE3
+from rbpf.sensors.feature_log import FeatureLog
+from rbpf.validation.simulation.paths import HandHeld, Wave, eased, looking, slowed, speeds
 
 DESK = DeskWorld()
 SEEDS = range(4)
@@ -46,7 +48,7 @@ def test_paths_are_those_of_a_hand(seed: int) -> None:
     scene = built(world, seed)
     turn, speed = speeds(scene.world_from_camera, scene.stamps_ns * 1e-9)
     assert 0.1 < turn.max() < 0.9
-    assert 0.5 * world.speed_m_s < speed.max() < world.speed_m_s + 0.4
+    assert 0.5 * world.hand.speed_m_s < speed.max() < world.hand.speed_m_s + 0.4
     _, acceleration, jerk = derivatives(world, seed)
     assert acceleration.max() < 4.0
     assert jerk.max() < 30.0
@@ -71,14 +73,14 @@ def test_the_camera_is_held_still_at_first() -> None:
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_desk_is_seen_from_its_distance(seed: int) -> None:
-    world = DeskWorld(wander=0.0, wrist_deg=0.0, tremor_m=0.0, tremor_deg=0.0)
+    world = DeskWorld(hand=HandHeld(wander=0.0, wrist_deg=0.0, tremor_m=0.0, tremor_deg=0.0))
     scene = built(world, seed)
     middle = SE3.inverse_transform(scene.world_from_camera, [0.0, 0.0, 0.5])
     assert (middle[:, 2] > 1.0).all() and (middle[:, 2] < 1.5).all()
     np.testing.assert_allclose(middle[:, :2], 0.0, atol=1e-12)
     turn, speed = speeds(scene.world_from_camera, scene.stamps_ns * 1e-9)
     # The limits are kept between the images of the path before it is slowed down.
-    assert turn.max() < 1.01 * world.turn_rad_s and speed.max() < 1.01 * world.speed_m_s
+    assert turn.max() < 1.01 * world.hand.turn_rad_s and speed.max() < 1.01 * world.hand.speed_m_s
 
 
 @pytest.mark.parametrize("seed", SEEDS)

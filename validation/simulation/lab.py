@@ -1,8 +1,8 @@
-"""A laboratory, to take pictures of from a robot with a stereo camera (S05 §V), or as a world of points.
+"""A laboratory, to take pictures of from a robot with a stereo camera (S05 §V).
 
 Its plan: two rooms of 18 m × 10 m together, a door between them, and the ways of a robot through them. Its furniture:
 shelves, tables, cabinets and cartons along the walls, tables in the middle, posters; all boxes are parallel to the walls,
-so that what is hidden is known exactly for images and for points alike.
+so that what is hidden is known exactly.
 
 The world's z axis points up; x runs along the longer side from the corner of the first room, the floor is z = 0.
 """
@@ -18,7 +18,6 @@ from rbpf.lie import SE3
 from rbpf.validation.simulation import textures
 from rbpf.validation.simulation.limits import check_counts, check_not_negative, check_positive
 from rbpf.validation.simulation.paths import Drive, Move, Travelled, WheelOdometer, along_corners
-from rbpf.validation.simulation.point_worlds import Scene, frame_stamps, outside
 from rbpf.validation.simulation.textured_scene import Furniture, TexturedScene, stamps_ns
 from rbpf.validation.simulation.textures import Paint
 
@@ -174,11 +173,6 @@ class Surface:
     across: np.ndarray
     down: np.ndarray
     paint: Paint
-
-    @property
-    def area_m2(self) -> float:
-        """Area."""
-        return float(np.linalg.norm(np.cross(self.across, self.down)))
 
 
 @dataclass
@@ -487,52 +481,3 @@ class TexturedLab:
         stamps = stamps_ns(int(images[-1]) + 1, RATE_HZ)
         odometry = self.odometer.measure(travelled, stamps, ROBOT_FROM_CAMERA, slip)
         return TexturedScene("lab", stamps[images], path, rectangles, odometry=odometry)
-
-
-PRINTED = {textures.picture, textures.page, textures.carton, textures.spines}
-RICH = 20.0
-"""What is printed has so many times as many points per area as what is painted, of wood or a carpet."""
-
-
-@dataclass(frozen=True)
-class LabWorld:
-    """Points on all that can be seen in the `TexturedLab`; the same seed furnishes both alike.
-
-    All boxes hide what is behind them. Measure it with any camera:
-
-        >>> from rbpf.validation.simulation.features import STEREO, Measuring, simulate_features
-        >>> log = simulate_features(LabWorld(LabDrive(frames=3), points=3000), Measuring(known=0), STEREO, seed=0)
-        >>> len(log.frames), log.frames[0].z.shape
-        (3, (25, 3))
-
-    Attributes:
-        drive: of the robot that carries the camera.
-        points: number of points.
-    """
-
-    drive: LabDrive = field(default_factory=LabDrive)
-    points: int = 12000
-
-    def __post_init__(self) -> None:
-        check_counts(self, {"points": 1})
-
-    def build(self, rng: np.random.Generator) -> Scene:
-        """Draws the furniture and the points."""
-        lab = furnished(rng)
-        surfaces = [*lab.surfaces, *(surface for surface, _ in shell())]
-        blocks, images = np.array(lab.blocks), self.drive.images
-        weight = np.array([one.area_m2 * (RICH if one.paint in PRINTED else 1.0) for one in surfaces])
-        sides = np.array([[surface.across, surface.down] for surface in surfaces])
-        corner = np.array([surface.corner for surface in surfaces])
-
-        def draw(count: int) -> np.ndarray:
-            """Positions (K, 3), uniform on each surface."""
-            row = rng.choice(len(surfaces), count, p=weight / weight.sum())
-            along = np.einsum("ks,ksx->kx", rng.random((count, 2)), sides[row])
-            return np.asarray(corner[row] + along)
-
-        points = outside(draw, blocks)(self.points)
-        path = world_from_camera(self.drive.travelled().world_from_robot)[images]
-        stamps = frame_stamps(int(images[-1]) + 1, RATE_HZ)[images]
-        present = np.tile([0, len(images)], (self.points, 1))
-        return Scene("lab", stamps, path, points, present, blocks)

@@ -20,7 +20,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3
 from rbpf.runs.files import write_csv, write_text
 from rbpf.sensors.readers.wheel_odometry import MOTION, MOUNT, NAME, SIGMA, WheelOdometry
-from rbpf.validation.simulation.limits import check_not_negative, check_positive
+from rbpf.validation.simulation.limits import check_not_negative, check_order, check_positive
 
 UP = np.array([0.0, 0.0, 1.0])
 TERMS = 3
@@ -64,6 +64,11 @@ class Wave:
 def frame_seconds(frames: int, rate_hz: float) -> np.ndarray:
     """(T,) times of the frames, the first at 0 [s]."""
     return np.arange(frames) / rate_hz
+
+
+def frame_stamps(frames: int, rate_hz: float) -> np.ndarray:
+    """(T,) int64 nanoseconds of the frames, the first at 0."""
+    return np.round(np.arange(frames) * 1e9 / rate_hz).astype(np.int64)
 
 
 def eased(seconds: np.ndarray, start_s: float) -> np.ndarray:
@@ -116,6 +121,85 @@ def slowed(
 def shaken(world_from_camera: np.ndarray, wave: Wave, seconds: np.ndarray) -> np.ndarray:
     """Poses (T, 7) moved by a wave of six channels, [rotation, translation] in the camera's frame."""
     return SE3.retract(world_from_camera, wave(seconds))
+
+
+ARM_HZ = 0.2, 0.8
+WRIST_HZ = 0.8, 2.0
+"""Before the path is slowed down to the speed of a hand, to about a third."""
+
+TREMOR_HZ = 1.0, 3.0
+
+RISE = 0.25
+"""How far the camera goes up and down about the point looked at, as a fraction of how far it goes to the side."""
+
+
+@dataclass(frozen=True)
+class HandHeld:
+    """A camera in a hand moves over a desk and looks at the things on it; it is held still at first.
+
+    The point looked at, the middle of the things' box at first, wanders over the desk, and the camera about that point.
+    The path is slowed down until neither `speed_m_s` nor `turn_rad_s` is passed; the hand's tremor comes on top.
+
+    Attributes:
+        nearest_m: least distance of the camera from the point that it looks at.
+        farthest_m: greatest distance.
+        elevation_deg: the camera looks down at this angle, on the average.
+        sweep_deg: greatest turn about the point looked at to either side; a quarter as much up and down.
+        wander: greatest shift of the point looked at, as a fraction of the box's size.
+        wrist_deg: greatest rotation by the wrist, per axis.
+        speed_m_s: highest speed.
+        turn_rad_s: highest rate of turn.
+        tremor_m: greatest displacement by the hand's tremor, per axis.
+        tremor_deg: greatest rotation by it, per axis.
+        start_s: the camera reaches its pace after this time.
+    """
+
+    nearest_m: float = 1.0
+    farthest_m: float = 1.5
+    elevation_deg: float = 55.0
+    sweep_deg: float = 40.0
+    wander: float = 0.3
+    wrist_deg: float = 10.0
+    speed_m_s: float = 0.3
+    turn_rad_s: float = 0.5
+    tremor_m: float = 0.002
+    tremor_deg: float = 0.3
+    start_s: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_positive(self, "nearest_m", "farthest_m", "speed_m_s", "turn_rad_s")
+        check_not_negative(self, "sweep_deg", "wander", "wrist_deg", "tremor_m", "tremor_deg", "start_s")
+        check_order(self, "nearest_m", "farthest_m")
+        steepest = abs(self.elevation_deg) + RISE * self.sweep_deg
+        if not steepest < 90.0:
+            raise InputError(
+                f"elevation_deg = {self.elevation_deg} and sweep_deg = {self.sweep_deg} let the camera look along the "
+                "vertical, where it has no upright pose: lessen one of them"
+            )
+
+    def poses(self, seconds: np.ndarray, size_m: Sequence[float], rng: np.random.Generator) -> np.ndarray:
+        """(T, 7) at times (T,), over a box of a size (x, y, z) with its base on z = 0 and its middle over the origin."""
+        turn = np.deg2rad(self.sweep_deg) * np.array([1.0, RISE])
+        reach = 0.5 * (self.farthest_m - self.nearest_m)
+        arm = Wave.random(np.array([*(0.5 * self.wander * np.array(size_m)), *turn, reach]), ARM_HZ, rng)
+        start = arm(np.zeros(1))[:, :3] - [0.0, 0.0, 0.5 * size_m[2]]
+        wrist = Wave.random(np.deg2rad([self.wrist_deg] * 3 + [0.0] * 3), WRIST_HZ, rng)
+        bound = [np.deg2rad(self.tremor_deg)] * 3 + [self.tremor_m] * 3
+        tremor = Wave.random(np.array(bound), TREMOR_HZ, rng)
+
+        def sweep(time: np.ndarray) -> np.ndarray:
+            """Faster than a hand."""
+            wave = arm(time)
+            side, rise = wave[:, 3], np.deg2rad(self.elevation_deg) + wave[:, 4]
+            away = np.stack(
+                [np.sin(side) * np.cos(rise), -np.cos(side) * np.cos(rise), np.sin(rise)], axis=-1
+            )
+            distance = 0.5 * (self.nearest_m + self.farthest_m) + wave[:, 5:]
+            target = wave[:, :3] - start
+            return shaken(looking(target + distance * away, -away), wrist, time)
+
+        time = eased(seconds, self.start_s)
+        return shaken(slowed(sweep, seconds, self.speed_m_s, self.turn_rad_s)(time), tremor, time)
 
 
 KNOTS = 257

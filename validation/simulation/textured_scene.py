@@ -26,7 +26,7 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.readers.wheel_odometry import WheelOdometry
-from rbpf.validation.simulation.point_worlds import frame_stamps
+from rbpf.validation.simulation.paths import frame_stamps
 from rbpf.validation.simulation.textures import Paint, chessboard, faded
 
 EPOCH_NS = 1_400_000_000_000_000_000

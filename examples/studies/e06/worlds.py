@@ -8,8 +8,8 @@ from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers import KnownPixels
 from rbpf.validation.simulation import textures
-from rbpf.validation.simulation.desk_and_room import TexturedDesk
-from rbpf.validation.simulation.paths import UP, Wave, eased, frame_seconds, looking, shaken
+from rbpf.validation.simulation.desk_and_room import OVER_DESK, TexturedDesk
+from rbpf.validation.simulation.paths import UP, HandHeld, Wave, eased, frame_seconds, looking, shaken
 from rbpf.validation.simulation.textured_scene import Rectangle, TexturedScene, stamps_ns
 
 RATE_HZ = 30.0
@@ -25,10 +25,7 @@ def flat_desk(frames: int, texel_m: float) -> TexturedDesk:
         size_m=(4.0, 4.0),
         papers=160,
         things=0,
-        nearest_m=0.6,
-        farthest_m=0.85,
-        wander=0.06,
-        elevation_deg=55.0,
+        hand=HandHeld(nearest_m=0.6, farthest_m=0.85, wander=0.06),
         texel_m=texel_m,
     )
 
@@ -88,7 +85,9 @@ class SidewaysDesk:
 
     def build(self, rng: np.random.Generator) -> TexturedScene:
         """Draws desk and path."""
-        desk = TexturedDesk(frames=2, nearest_m=1.6, farthest_m=1.9, texel_m=self.texel_m).build(rng)
+        desk = TexturedDesk(
+            frames=2, hand=replace(OVER_DESK, nearest_m=1.6, farthest_m=1.9), texel_m=self.texel_m
+        ).build(rng)
         shift = np.arange(self.frames)[:, None] * np.array([0.0, 0.0, 0.0, *self.step_m])
         poses = SE3.retract(np.tile(desk.world_from_camera[0], (self.frames, 1)), shift)
         return replace(desk, stamps_ns=stamps_ns(self.frames, RATE_HZ), world_from_camera=poses)

@@ -1,10 +1,15 @@
-"""Simulates what a camera measures of a world of points, feature by feature, as a `FeatureLog` with ground truth.
+"""Worlds of points, and what a camera measures of them feature by feature: a `FeatureLog` with ground truth.
 
-A measurement is the true point's projection plus Gaussian noise, or an outlier. Points are hidden by opaque blocks, by
-distance and by the image's border. Which of the visible ones are measured is up to a tracker with a fixed budget.
+    log = simulate_features(DeskWorld(frames=300), Measuring(), MONO, seed=0)
+
+A measurement is the true point's projection plus Gaussian noise, or an outlier. Points come and go; they are hidden by
+opaque blocks, by distance and by the image's border. Which of the visible ones are measured is up to a tracker with a
+fixed budget. Names are right, noise is known, and it is a hundred times faster than taking pictures.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 
@@ -12,6 +17,8 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.feature_log import CameraTruth, FeatureFrame, FeatureLog, KnownPoints
+from rbpf.validation.simulation import textures
+from rbpf.validation.simulation.lab import RATE_HZ, LabDrive, furnished, shell, world_from_camera
 from rbpf.validation.simulation.limits import (
     check_counts,
     check_fractions,
@@ -19,7 +26,189 @@ from rbpf.validation.simulation.limits import (
     check_order,
     check_positive,
 )
-from rbpf.validation.simulation.point_worlds import PointWorld, Scene, hidden
+from rbpf.validation.simulation.paths import HandHeld, frame_seconds, frame_stamps
+
+SURFACE = 1e-6
+"""Fraction of the line of sight that may lie in a block: a point on a block's face is seen from the front."""
+
+Draw = Callable[[int], np.ndarray]
+"""Draws that many positions (K, 3) in the world."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A world with everything random about it drawn.
+
+    Attributes:
+        name: of the world.
+        stamps_ns: (T,) int64 times of the frames.
+        world_from_camera: (T, 7) true poses at these times.
+        points: (Q, 3) in the world, m.
+        present: (Q, 2) int64, the frame in which a point appears and the one in which it is gone for good.
+        blocks: (B, 2, 3) least and greatest corner of opaque boxes, m.
+    """
+
+    name: str
+    stamps_ns: np.ndarray
+    world_from_camera: np.ndarray
+    points: np.ndarray
+    present: np.ndarray
+    blocks: np.ndarray
+
+
+class PointWorld(Protocol):
+    """What can be simulated."""
+
+    def build(self, rng: np.random.Generator) -> Scene:
+        """Draws everything random about the world."""
+        ...
+
+
+def hidden(eye: np.ndarray, points: np.ndarray, blocks: np.ndarray) -> np.ndarray:
+    """Whether a block stands between the eye (3,) and points (P, 3), by the slab method; (P,) bool."""
+    around = np.concatenate([eye[None], points])
+    near = (blocks[:, 0] <= around.max(axis=0)) & (blocks[:, 1] >= around.min(axis=0))
+    low, high = np.moveaxis(blocks[near.all(axis=1)] - eye, 1, 0)
+    enters, leaves = np.full((2, len(points), len(low)), [[[-np.inf]], [[np.inf]]])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for axis in range(3):
+            ray = (points[:, axis] - eye[axis])[:, None]
+            ends = low[:, axis] / ray, high[:, axis] / ray
+            np.maximum(enters, np.minimum(*ends), out=enters)
+            np.minimum(leaves, np.maximum(*ends), out=leaves)
+    return np.asarray(((enters < leaves) & (leaves > 0.0) & (enters < 1.0 - SURFACE)).any(axis=-1))
+
+
+def outside(draw: Draw, blocks: np.ndarray) -> Draw:
+    """Draws again what falls into a block."""
+
+    def redraw(count: int) -> np.ndarray:
+        points = draw(count)
+        while True:
+            within = (points[:, None] > blocks[:, 0]) & (points[:, None] < blocks[:, 1])
+            if not (wrong := within.all(axis=-1).any(axis=-1)).any():
+                return points
+            points[wrong] = draw(int(wrong.sum()))
+
+    return redraw
+
+
+def populated(
+    draw: Draw, count: int, frames: int, renewal: float, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points of which one appears elsewhere whenever one disappears for good.
+
+    Args:
+        draw: the places.
+        count: of points at any time.
+        frames: of the recording.
+        renewal: probability per frame that a point disappears.
+        rng: generator.
+
+    Returns:
+        Positions (Q, 3) and frames (Q, 2), as in `Scene`; the first `count` are there in the first frame.
+    """
+    points, present = [], []
+    start = np.zeros(count, dtype=np.int64)
+    while start.size:
+        life = rng.geometric(renewal, start.size) if renewal > 0.0 else frames
+        end = np.minimum(start + life, frames)
+        points.append(draw(start.size))
+        present.append(np.stack([start, end], axis=-1))
+        start = end[end < frames]
+    return np.concatenate(points), np.concatenate(present)
+
+
+@dataclass(frozen=True)
+class DeskWorld:
+    """Points over a desk, seen by a camera in a hand.
+
+    Attributes:
+        frames: number of images.
+        rate_hz: images per second.
+        points: number of points at any time, uniform in a box with its base on z = 0 and its middle over the origin.
+        size_m: of the box along x, y, z.
+        hand: that moves the camera.
+        blocks: number of opaque things on the desk.
+        renewal: fraction of the points that disappear for good per second; others appear elsewhere.
+    """
+
+    frames: int = 1000
+    rate_hz: float = 30.0
+    points: int = 300
+    size_m: tuple[float, float, float] = (2.0, 2.0, 1.0)
+    hand: HandHeld = field(default_factory=HandHeld)
+    blocks: int = 3
+    renewal: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_counts(self, {"frames": 2, "points": 1, "blocks": 0})
+        check_positive(self, "rate_hz")
+        check_fractions(self, "renewal")
+        if not all(0.0 < size < np.inf for size in self.size_m):
+            raise InputError(f"size_m must be three positive numbers, got {self.size_m}")
+
+    def build(self, rng: np.random.Generator) -> Scene:
+        """Draws the points, the blocks and the path."""
+        size, half = np.array(self.size_m), np.array(self.size_m) / 2
+        extent = size * rng.uniform([0.04, 0.04, 0.1], [0.08, 0.08, 0.25], (self.blocks, 3))
+        middle = size * rng.uniform(-0.4, 0.4, (self.blocks, 3))
+        middle[:, 2] = extent[:, 2]
+        blocks = np.stack([middle - extent, middle + extent], axis=1)
+        draw = outside(lambda count: half * [0, 0, 1] + rng.uniform(-half, half, (count, 3)), blocks)
+        points, present = populated(draw, self.points, self.frames, self.renewal / self.rate_hz, rng)
+        path = self.hand.poses(frame_seconds(self.frames, self.rate_hz), self.size_m, rng)
+        return Scene("desk", frame_stamps(self.frames, self.rate_hz), path, points, present, blocks)
+
+
+PRINTED = {textures.picture, textures.page, textures.carton, textures.spines}
+RICH = 20.0
+"""What is printed has so many times as many points per area as what is painted, of wood or a carpet."""
+
+
+@dataclass(frozen=True)
+class LabWorld:
+    """Points on all that can be seen in the `TexturedLab`; the same seed furnishes both alike.
+
+    All boxes hide what is behind them. Measure it with any camera:
+
+        >>> log = simulate_features(LabWorld(LabDrive(frames=3), points=3000), Measuring(known=0), STEREO, seed=0)
+        >>> len(log.frames), log.frames[0].z.shape
+        (3, (25, 3))
+
+    Attributes:
+        drive: of the robot that carries the camera.
+        points: number of points.
+    """
+
+    drive: LabDrive = field(default_factory=LabDrive)
+    points: int = 12000
+
+    def __post_init__(self) -> None:
+        check_counts(self, {"points": 1})
+
+    def build(self, rng: np.random.Generator) -> Scene:
+        """Draws the furniture and the points."""
+        lab = furnished(rng)
+        surfaces = [*lab.surfaces, *(surface for surface, _ in shell())]
+        blocks, images = np.array(lab.blocks), self.drive.images
+        area_m2 = np.array([np.linalg.norm(np.cross(one.across, one.down)) for one in surfaces])
+        weight = area_m2 * np.array([RICH if one.paint in PRINTED else 1.0 for one in surfaces])
+        sides = np.array([[surface.across, surface.down] for surface in surfaces])
+        corner = np.array([surface.corner for surface in surfaces])
+
+        def draw(count: int) -> np.ndarray:
+            """Positions (K, 3), uniform on each surface."""
+            row = rng.choice(len(surfaces), count, p=weight / weight.sum())
+            along = np.einsum("ks,ksx->kx", rng.random((count, 2)), sides[row])
+            return np.asarray(corner[row] + along)
+
+        points = outside(draw, blocks)(self.points)
+        path = world_from_camera(self.drive.travelled().world_from_robot)[images]
+        stamps = frame_stamps(int(images[-1]) + 1, RATE_HZ)[images]
+        present = np.tile([0, len(images)], (self.points, 1))
+        return Scene("lab", stamps, path, points, present, blocks)
+
 
 COLUMNS, ROWS = 5, 4
 """Cells of the image: new tracks begin where the cells hold fewest."""
