@@ -7,6 +7,7 @@ from typing import final
 import numpy as np
 
 from rbpf import gaussian
+from rbpf.arrays import numbers
 from rbpf.core.checkpoint import within
 from rbpf.core.genealogy import Lineage
 from rbpf.core.likelihoods import Gaussian
@@ -29,7 +30,7 @@ from rbpf.kernels.landmarks import gather, linearise_one, project
 from rbpf.lie import LieGroup
 from rbpf.maps.layout import Layout
 from rbpf.maps.point import Point
-from rbpf.maps.rows import BOTH, MAP, STATE, Plan, RowEngine, by_use, make_plan, require_apart
+from rbpf.maps.rows import BOTH, MAP, STATE, Plan, RowEngine, by_use, fused_kernel, make_plan, require_apart
 from rbpf.maps.store import ALL, SharedStore
 
 
@@ -76,7 +77,9 @@ class LandmarkMap(Map):
         return self.store.columns.kinds(ids) == self._kind(landmark)
 
     def add(self, new_landmarks: NewLandmarks, state: np.ndarray) -> np.ndarray:
-        records = new_landmarks.model.initialise(state, new_landmarks.z, new_landmarks.cov)
+        name = type(new_landmarks.model).__name__
+        z, cov = numbers(new_landmarks.z, f"z of {name}"), numbers(new_landmarks.cov, f"cov of {name}")
+        records = new_landmarks.model.initialise(state, z, cov)
         log_odds = None if new_landmarks.mask is None else np.where(new_landmarks.mask, 0.0, -np.inf)
         return self.add_records(records, new_landmarks.landmark, log_odds, new_landmarks.ids)
 
@@ -163,7 +166,7 @@ class LandmarkMap(Map):
         records = self.read(ids, slice(particle, particle + 1))
         mean = records.mean[0]
         const = None if records.const is None else records.const[0]
-        kernel = model.kernel() if self.compiled else None
+        kernel = fused_kernel(model) if self.compiled else None
         if kernel is None or records.log_weights is not None:
             nu, jac = linearise(model, self.space, z, state[None], mean, const)
             return nu, jac, records
@@ -192,7 +195,7 @@ class LandmarkMap(Map):
         self, model: ObservationModel, ids: np.ndarray, belief: Belief
     ) -> tuple[np.ndarray, np.ndarray]:
         prior, weights = belief.prior, belief.weights
-        kernel = model.kernel() if self.is_compiled(model, ids) else None
+        kernel = fused_kernel(model) if self.is_compiled(model, ids) else None
         if kernel is not None:
             # Relative to the particle of highest weight, so that angles need not be wrapped.
             landmark, k, p = self._layout_of(int(ids[0])).landmark, ids.size, model.dim

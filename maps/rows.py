@@ -11,10 +11,21 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from rbpf import gaussian
+from rbpf.arrays import numbers
 from rbpf.core import linearisation
 from rbpf.core.likelihoods import Gaussian
 from rbpf.core.linearisation import linearise
-from rbpf.core.models import NEW, NULL, FusedKernel, Likelihood, LogDensities, Observations, Part, Records
+from rbpf.core.models import (
+    NEW,
+    NULL,
+    FusedKernel,
+    Likelihood,
+    LogDensities,
+    ObservationModel,
+    Observations,
+    Part,
+    Records,
+)
 from rbpf.core.particles import Information, Prior
 from rbpf.errors import InputError
 from rbpf.kernels.landmarks import refine, update
@@ -268,7 +279,7 @@ class RowEngine:
     def _kernel(self, group: Observations) -> FusedKernel | None:
         if not self.compiled or (group.likelihood is not None and group.likelihood.kernel_id < 0):
             return None
-        return group.model.kernel()
+        return fused_kernel(group.model)
 
     def _sizes(self, column: int) -> np.ndarray:
         landmark = self.layout_of(column).landmark
@@ -300,7 +311,7 @@ class RowEngine:
             group.cov[batch.ks],
             mask,
             likelihood.kernel_id,
-            likelihood.params,
+            numbers(likelihood.params, "the params of a likelihood"),
             np.ascontiguousarray(prior.factor),
             self._sizes(int(batch.ids[0])),
             total.info,
@@ -335,7 +346,7 @@ class RowEngine:
             group.cov[batch.ks],
             _NO_MASK if batch.mask is None else np.ascontiguousarray(batch.mask.T),
             likelihood.kernel_id,
-            likelihood.params,
+            numbers(likelihood.params, "the params of a likelihood"),
             self._sizes(int(batch.ids[0])),
             log_density,
         )
@@ -469,6 +480,16 @@ class RowEngine:
         columns[0, end : end + mean.shape[1]] = (joint - total[:, None]).T
         self._write(ids, columns, new_mean[:, None], new_cov[:, None])
         return total
+
+
+def fused_kernel(model: ObservationModel) -> FusedKernel | None:
+    """A model's kernel, its constants as the drivers take them."""
+    kernel = model.kernel()
+    if kernel is None:
+        return None
+    return FusedKernel(
+        kernel.function, numbers(kernel.params, f"the params of {type(model).__name__}'s kernel")
+    )
 
 
 def _spans(n: int, k: int) -> list[slice]:

@@ -1,4 +1,4 @@
-"""Shapes of arrays in signatures: `Float[np.ndarray, "N K p"]`, `Like[ArrayLike, "... E"]`.
+"""Shapes of arrays in signatures: `Float[np.ndarray, "N K p"]`, `Like[ArrayLike, "... E"]`; arrays as kernels take them.
 
 For a type checker, and at run time, these are `typing.Annotated`: an array with a string that says its axes. The tests
 import jaxtyping (P. Kidger) before the package, get its types here, and check every call against them; the package
@@ -13,6 +13,11 @@ import sys
 from typing import TYPE_CHECKING
 from typing import Annotated as Like
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rbpf.errors import InputError
+
 if TYPE_CHECKING or "jaxtyping" not in sys.modules:
     from typing import Annotated as Bool
     from typing import Annotated as Float
@@ -20,4 +25,16 @@ if TYPE_CHECKING or "jaxtyping" not in sys.modules:
 else:
     from jaxtyping import Bool, Float, Int
 
-__all__ = ["Bool", "Float", "Int", "Like"]
+__all__ = ["Bool", "Float", "Int", "Like", "numbers"]
+
+
+def numbers(array: ArrayLike, what: str) -> NDArray[np.float64]:
+    """What a user's code gave, as kernels take it: float64 of this machine, in C order, writable; copied only where it is not.
+
+    Raises:
+        InputError: they are no real numbers.
+    """
+    given = np.asarray(array)
+    if given.dtype.kind not in "fiub":
+        raise InputError(f"{what} must hold real numbers, got {given.dtype}")
+    return np.require(given, np.float64, "CW")

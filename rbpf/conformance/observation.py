@@ -137,8 +137,8 @@ def check_kernel(model: ObservationModel, scene: Scene) -> None:
     require_type(name, fused, FusedKernel, type(None))
     if fused is None or scene.landmark is None:
         return
-    plain = isinstance(fused.params, np.ndarray) and fused.params.dtype == float and fused.params.ndim == 1
-    require(plain, f"{name} gives params that are not one axis of float64 numbers")
+    plain = isinstance(fused.params, np.ndarray) and fused.params.dtype.kind in "fiub"
+    require(plain and fused.params.ndim == 1, f"{name} gives params that are not one axis of numbers")
     lanes = scene.lanes()
     analytic = model.jacobians(*lanes.args)
     twin = analytic or numeric_jacobians(model, lanes.space, *lanes.args)
@@ -168,7 +168,14 @@ def _run(
     parts = lanes.state, lanes.landmark, lanes.const
     inputs = [np.zeros((0, BLOCK)) if part is None else np.ascontiguousarray(part[rows].T) for part in parts]
     try:
-        call_kernel(fused.function.address, *inputs, np.array(z), fused.params, count, *outputs)
+        call_kernel(
+            fused.function.address,
+            *inputs,
+            np.array(z, dtype=float),
+            np.array(fused.params, dtype=float),
+            count,
+            *outputs,
+        )
     except AttributeError as error:
         raise FindingError(f"{name} gives no fused kernel: decorate it with @observation_kernel") from error
     for what, array, output in zip(_OUTPUTS, guarded, outputs, strict=True):

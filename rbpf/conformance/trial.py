@@ -229,6 +229,7 @@ def require_shape(what: str, array: Any, *allowed: tuple[int | None, ...]) -> No
     )
     expected = " or ".join(str(shape).replace("None", "any") for shape in allowed)
     require(fits, f"{what} has shape {array.shape}, expected {expected}")
+    require(array.dtype.kind in "fiub", f"{what} holds {array.dtype}, expected real numbers")
     require(np.isfinite(array).all(), f"{what} holds NaN or infinity, expected finite numbers")
 
 

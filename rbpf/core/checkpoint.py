@@ -29,6 +29,7 @@ LONGEST_HEADER = 1 << 16
 """Bytes of an array's header; NumPy's own are of about a hundred."""
 
 _MAGIC = b"\x93NUMPY"
+NOT_PLAIN = "it must hold truth values, numbers or text"
 _PLAIN = re.compile(r"[<>|][biufU]\d{1,9}")
 """Types of arrays that are read: truth values, numbers, text."""
 
@@ -37,8 +38,15 @@ def save_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
     """Writes an `.npz` under a temporary name, then renames it.
 
     Raises:
-        InputError: the place cannot be written to or is full, or an array holds Python objects.
+        InputError: the place cannot be written to or is full, or an array is none that `load_arrays` reads.
     """
+    for name, array in arrays.items():
+        try:
+            _require_plain(np.asarray(array))
+        except ValueError as error:
+            raise InputError(f"{path} cannot be written: the array {name}: {error}") from error
+        if "\0" in name:
+            raise InputError(f"{path} cannot be written: the name {name!r} of an array holds a zero")
     temporary = path.with_name(path.name + ".partial")
     try:
         with open_new(temporary) as file:
@@ -232,7 +240,7 @@ def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
     entries = ast.literal_eval(data[first:start].decode("latin1").strip())
     descr, is_fortran, shape = (entries[name] for name in ("descr", "fortran_order", "shape"))
     if not (isinstance(descr, str) and _PLAIN.fullmatch(descr) and isinstance(shape, tuple)):
-        raise ValueError("a member holds something else than plain numbers or text")
+        raise ValueError(NOT_PLAIN)
     if not all(type(size) is int for size in shape):
         raise ValueError("a member's shape is none")
     dtype = np.dtype(descr)
@@ -240,13 +248,22 @@ def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
         raise ValueError("a member has another size than its header claims")
     # The numbers: no bit pattern that is no truth value or no text.
     flat = np.frombuffer(data, dtype, offset=start)
+    _require_plain(flat)
+    return flat.reshape(shape, order="F" if is_fortran else "C").copy(order="K")
+
+
+def _require_plain(array: np.ndarray) -> None:
+    """Raises a ValueError unless it is an array that files of this module hold."""
+    dtype = array.dtype
+    if not _PLAIN.fullmatch(dtype.str) or dtype.kind not in "biufU":
+        raise ValueError(f"{NOT_PLAIN}, it is of {dtype}")
+    flat = np.ravel(array)
     if dtype.kind == "b" and flat.size and flat.view(np.uint8).max() > 1:
         raise ValueError("a truth value is none")
     if dtype.kind == "U" and flat.size and dtype.itemsize:
         codes = flat.view(dtype.byteorder.replace("|", "=") + "u4")
         if codes.max() > 0x10FFFF or ((codes >= 0xD800) & (codes < 0xE000)).any():
             raise ValueError("a text holds what is no character")
-    return flat.reshape(shape, order="F" if is_fortran else "C").copy(order="K")
 
 
 def _digest(arrays: dict[str, np.ndarray]) -> str:

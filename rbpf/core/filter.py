@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from rbpf import gaussian
+from rbpf.arrays import numbers
 from rbpf.core.checkpoint import checked, fitting, read_checkpoint, write_checkpoint
 from rbpf.core.genealogy import History, Lineage
 from rbpf.core.marginals import Marginals
@@ -355,7 +356,7 @@ class Filter:
     def _predict(self, control: object, dt: float) -> Prior:
         transition = self.motion.transition(self.particles.state, control, dt)
         what = f"step {self.steps}: {type(self.motion).__name__}.transition"
-        checked_transition(transition, self.particles.state, self.space, what)
+        transition = checked_transition(transition, self.particles.state, self.space, what)
         return self.marginals.predict(transition, self.space)
 
     def _observe(self, frame: object, belief: Belief) -> list[Observations]:
@@ -390,11 +391,13 @@ def mean_count(counts: np.ndarray, weights: np.ndarray) -> float:
 
 
 def checked_transition(transition: Transition, state: np.ndarray, space: LieGroup, what: str) -> Transition:
-    """A transition of the states (N, E).
+    """A transition of the states (N, E), its arrays as the kernels take them.
 
     Raises:
         InputError: its mean or noise factor has the wrong shape, or is not finite.
     """
+    given = {name: array for name, array in vars(transition).items() if array is not None}
+    transition = Transition(**{name: numbers(array, f"{what}: {name}") for name, array in given.items()})
     mean, factor, n = transition.mean, transition.noise_factor, state.shape[0]
     rows = space.dim + (0 if transition.coupling is None else transition.coupling.shape[-1])
     fits = factor.ndim == 3 and factor.shape[0] in (1, n) and factor.shape[1] == rows
@@ -409,12 +412,19 @@ def checked_transition(transition: Transition, state: np.ndarray, space: LieGrou
 
 
 def checked_observations(group: Observations) -> Observations:
-    """A group of observations.
+    """A group of observations, its arrays as the kernels take them.
 
     Raises:
         InputError: z or cov has the wrong shape, or is not finite, or a cov is no covariance.
     """
-    name, count, p = type(group.model).__name__, group.z.shape[0], group.model.dim
+    name, ids = type(group.model).__name__, group.ids
+    group = replace(
+        group,
+        z=numbers(group.z, f"z of {name}"),
+        cov=numbers(group.cov, f"cov of {name}"),
+        ids=np.require(ids, np.int64, "CW") if ids is not None and ids.dtype.kind in "iu" else ids,
+    )
+    count, p = group.z.shape[0], group.model.dim
     if group.z.shape != (count, p) or group.cov.shape != (count, p, p):
         raise InputError(
             f"{name} measures {p} numbers: expected z (K, {p}) and cov (K, {p}, {p}), "
@@ -428,7 +438,7 @@ def checked_observations(group: Observations) -> Observations:
     if Part.STATE not in updates and Part.LANDMARK not in group.model.reads:
         raise InputError(f"{name} reads no landmark: its observations must inform Part.STATE")
     # The usual case, found out quickly: all is finite and the covariances are positive definite.
-    if are_sound(*(np.ascontiguousarray(array, dtype=float) for array in (group.z, group.cov))):
+    if are_sound(group.z, group.cov):
         return group
     if not (np.isfinite(group.z).all() and np.isfinite(group.cov).all()):
         raise InputError(f"a measurement of {name} or its covariance is not finite")
@@ -445,7 +455,8 @@ def checked_ancestors(ancestors: np.ndarray, n: int, resampler: object) -> np.nd
     Raises:
         InputError: one is missing, or is no particle.
     """
-    if ancestors.shape != (n,) or ancestors.min() < 0 or ancestors.max() >= n:
+    whole = ancestors.dtype.kind in "iu"
+    if not whole or ancestors.shape != (n,) or ancestors.min() < 0 or ancestors.max() >= n:
         name = type(resampler).__name__
         raise InputError(f"{name} must return {n} ancestors in 0..{n - 1}, got {ancestors}")
     return ancestors
@@ -461,4 +472,4 @@ def checked_start(start: np.ndarray, n: int, space: LieGroup) -> np.ndarray:
     if start.shape not in ((size,), (n, size)) or not np.isfinite(start).all():
         what = f"start must be ({size},) or ({n}, {size}) finite numbers"
         raise InputError(f"{what}, got {start.shape}: {start.tolist()}")
-    return np.array(np.broadcast_to(start, (n, size)))
+    return np.array(np.broadcast_to(start, (n, size)), order="C")

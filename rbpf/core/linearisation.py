@@ -7,6 +7,7 @@ d increment, D landmark. `mask` (N, K) says which particles took an observation;
 import numpy as np
 
 from rbpf import gaussian
+from rbpf.arrays import numbers
 from rbpf.core.models import STEP, Jacobians, Likelihood, ObservationModel, Part
 from rbpf.core.particles import Information, Prior
 from rbpf.errors import InputError
@@ -73,6 +74,8 @@ def linearise(
     """
     nu = model.innovation(z, state, landmark, const, substate)
     parts = (state, landmark, substate)
+    if nu.dtype != np.float64:
+        nu = numbers(nu, f"{type(model).__name__}.predict or its residual")
     expected = (*np.broadcast_shapes(*(part.shape[:-1] for part in parts if part is not None)), model.dim)
     if nu.shape != np.broadcast_shapes(expected, z.shape):
         raise InputError(f"{type(model).__name__}.predict returned shape {nu.shape}, expected {expected}")
@@ -84,6 +87,8 @@ def linearise(
     for block, size in zip(jacobians, sizes, strict=True):
         # A constant block may come without its leading axes.
         try:
+            if block is not None and block.dtype != np.float64:
+                block = numbers(block, f"{type(model).__name__}.jacobians")
             blocks.append(None if block is None else np.broadcast_to(block, (*expected, size)))
         except ValueError as error:
             shape = None if block is None else block.shape

@@ -10,6 +10,7 @@ from typing import final
 import numpy as np
 
 from rbpf import gaussian
+from rbpf.arrays import numbers
 from rbpf.core.checkpoint import checked
 from rbpf.core.genealogy import Lineage
 from rbpf.core.likelihoods import Gaussian
@@ -97,8 +98,8 @@ class KalmanSubstate(Conditional):
 
     def __init__(self, space: LieGroup, mean: np.ndarray, cov: np.ndarray) -> None:
         self.space = space
-        self._mean = np.asarray(mean, dtype=float)
-        self._cov = np.asarray(cov, dtype=float)
+        self._mean = numbers(mean, "the mean of a substate").copy()
+        self._cov = numbers(cov, "the cov of a substate").copy()
         if self._cov.shape != (self._mean.size, self._mean.size):
             raise InputError(
                 f"a substate with mean {self._mean.shape} needs a square cov of that size, got {self._cov.shape}"
@@ -132,7 +133,7 @@ class KalmanSubstate(Conditional):
         self._increment_mean = means[:, :d]
         self._predicted = means[:, d:] + transition.drift
         # Joint covariance of (ε, s), then s | ε by its gain and rest; compiled where cov(ε) is definite.
-        parts = stack, self.cov, np.ascontiguousarray(transition.noise_factor, dtype=float)
+        parts = stack, self.cov, transition.noise_factor
         n = max(part.shape[0] for part in parts)
         joint, factor = np.empty((n, d + m, d + m)), np.empty((n, d, d))
         self._gain, self._rest = np.empty((n, m, d)), np.empty((n, m, m))

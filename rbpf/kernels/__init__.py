@@ -5,8 +5,35 @@ runs along particles and compiles to vector instructions. Lanes never mix: the r
 the number of threads. The docstrings of the drivers give the mathematics; `rbpf.core.linearisation` is their NumPy twin.
 """
 
+import atexit
+import os
+import shutil
+import tempfile
+import warnings
 from pathlib import Path
+
+import numba
+from numba import njit
 
 from rbpf.kernels.signature import discard_stale
 
 discard_stale(Path(__file__).parent)
+
+
+def _use_a_cache() -> None:
+    """Where nothing compiled can be kept, a folder of this process takes it, so that everything runs all the same."""
+    try:
+        njit(cache=True)(_use_a_cache)
+    except RuntimeError:
+        folder = tempfile.mkdtemp(prefix="rbpf-kernels-")
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+        # In the environment, too: Numba reads it again, and processes that are started from here use the same folder.
+        os.environ["NUMBA_CACHE_DIR"] = numba.config.CACHE_DIR = folder
+        warnings.warn(
+            "compiled kernels cannot be kept, since no folder for them can be written to: they are compiled anew in every "
+            "run, which takes some minutes; set NUMBA_CACHE_DIR to a folder that can be written to",
+            stacklevel=2,
+        )
+
+
+_use_a_cache()

@@ -427,7 +427,7 @@ def kernels() -> dict[str, Kerneled]:
     outside = rf"Kerneled.kernel writes outside jac_landmark, which has shape \(2, 2, {BLOCK}\)"
     return {
         "Kerneled.kernel gives no fused kernel: decorate it with @observation_kernel": Kerneled(plain),
-        "Kerneled.kernel gives params that are not one axis of float64": Kerneled(sound, np.arange(6)),
+        "Kerneled.kernel gives params that are not one axis of numbers": Kerneled(sound, np.zeros((2, 3))),
         r"Kerneled.kernel: nu differs from residual\(z, predict\): expected": Kerneled(wrong_sign),
         "Kerneled.kernel leaves entries of nu unfilled": Kerneled(half_filled),
         outside: Kerneled(beyond_the_end),

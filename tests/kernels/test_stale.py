@@ -1,5 +1,11 @@
 import os
+import shutil
+from pathlib import Path
 
+import numba
+import pytest
+
+from rbpf import kernels
 from rbpf.kernels.signature import discard_stale
 
 
@@ -34,3 +40,17 @@ def test_a_copy_that_another_process_has_just_deleted(tmp_path, monkeypatch):
     (tmp_path / "__pycache__").mkdir()
     (tmp_path / "__pycache__" / "a.f-1.py311.nbi").symlink_to(tmp_path / "gone")
     discard_stale(tmp_path)
+
+
+def test_where_no_folder_can_be_written_to_kernels_run_all_the_same(monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "")
+    monkeypatch.setattr(numba.config, "CACHE_DIR", "")
+    monkeypatch.setattr(numba.config, "CACHE_LOCATOR_CLASSES", "UserProvidedCacheLocator")
+    with pytest.raises(RuntimeError, match="no locator available"):
+        numba.njit(cache=True)(discard_stale)
+    with pytest.warns(UserWarning, match="compiled anew in every run, .* set NUMBA_CACHE_DIR to a folder"):
+        kernels._use_a_cache()
+    folder = Path(os.environ["NUMBA_CACHE_DIR"])
+    doubled = numba.njit("int64(int64)", cache=True)(lambda x: 2 * x)
+    assert doubled(3) == 6 and list(folder.rglob("*.nbi"))
+    shutil.rmtree(folder)
