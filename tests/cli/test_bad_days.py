@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from examples.studies.file_faults import FILE_FAULTS, damaged_copy, kill_and_resume, run_command
+from examples.studies.file_faults import FILE_FAULTS, damaged_copy, kill_and_resume
 from rbpf.cli import main
 from rbpf.errors import InputError
 from rbpf.runs.files import whole
@@ -141,7 +141,6 @@ def test_a_stereo_run_is_finished_once(desk, tmp_path, monkeypatch):
     assert (out / "trajectory.tum").read_bytes() == first
 
 
-@pytest.mark.slow
 def test_killed_at_random_moments_and_resumed(desk, tmp_path):
     every = ["--set", "checkpoint_every=2"]
     assert main(command(desk, tmp_path / "whole", *every)) == 0
@@ -150,12 +149,6 @@ def test_killed_at_random_moments_and_resumed(desk, tmp_path):
     assert ended.code == 0 and not ended.traceback
     for name in ("trajectory.tum", "map.csv", "diagnostics.csv", "observations.csv"):
         assert (out / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
-
-
-@pytest.mark.slow
-def test_a_full_disk_in_a_process_of_its_own(desk, tmp_path):
-    ended = run_command(command(desk, tmp_path / "run"), most_bytes=20_000)
-    assert ended.code == 2 and not ended.traceback and "cannot be written: File too large" in ended.said
 
 
 def test_a_damaged_checkpoint_leaves_the_results(desk, tmp_path, capsys):

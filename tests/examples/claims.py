@@ -144,7 +144,7 @@ def reproduce_e06(figures: dict[str, float]) -> None:
     assert of("epipolar lines longer than 2 px") >= 3
     assert of("distance of what is found from its epipolar line") < 3.0
     assert of("epipolar constraint against none") < 0.5
-    assert of("first sighting: divergence") > 5.0  # half the resolution sees half the parallax
+    assert of("first observation: divergence") > 5.0  # half the resolution sees half the parallax
 
 
 def reproduce_s05(figures: dict[str, float]) -> None:

@@ -93,9 +93,10 @@ def test_what_is_held_is_counted_once():
 @pytest.mark.parametrize("lag", [50, None])
 def test_a_long_run(lag):
     """With a lag neither memory nor error grows, nor the time by half; without one the memory is seen to grow."""
-    stream = RobotStream(Turnover(renewal=0.002), 0)
-    filter_, step = robot_steps(stream, RangeBearingConfig(particles=10, lag=lag), forget=300)
-    windows = list(soak(stream, filter_, step, 6000, 300))
+    renewal, steps = (0.004, 3000) if lag is None else (0.002, 6000)
+    stream = RobotStream(Turnover(renewal=renewal), 0)
+    filter_, step = robot_steps(stream, RangeBearingConfig(particles=10, lag=lag), forget=steps // 20)
+    windows = list(soak(stream, filter_, step, steps, steps // 20))
     settled = windows[4:]
     held, times, errors = (
         np.array([getattr(window, name) for window in settled])
