@@ -1,4 +1,4 @@
-"""Features found in a map's descriptors: by a matrix product, by a k-d tree, near their predicted places; on one thread."""
+"""Features found in a map's descriptors: by a matrix product, or near their predicted places; on one thread."""
 
 from collections.abc import Callable
 
@@ -7,7 +7,7 @@ import numpy as np
 
 from benchmarks.patch_search import one_thread, picture
 from benchmarks.rows import Row, Settings, Timing, interleaved
-from rbpf.sensors.descriptors import DescriptorIndex, ExactSearch, Gate, TreeSearch
+from rbpf.sensors.descriptors import MatchLimits, gate_pairs, match_all, match_pairs
 from rbpf.sensors.features import Sift, SiftConfig
 
 SIZES, FEATURES, IN_VIEW = (1000, 10_000, 40_000), 300, 600
@@ -36,34 +36,29 @@ class Map:
         query = descriptors[seen] + NOISE * rng.standard_normal((FEATURES, LENGTH)).astype(np.float32)
         query[:absent] = np.abs(rng.standard_normal((absent, LENGTH)))
         self.query = (query / np.linalg.norm(query, axis=1, keepdims=True)).astype(np.float32)
-        self.exact, self.tree = (
-            DescriptorIndex(LENGTH, search=search) for search in (ExactSearch(), TreeSearch())
-        )
-        for index in (self.exact, self.tree):
-            index.store.add(np.arange(count), descriptors)
-        ids = np.union1d(seen, rng.permutation(count)[: IN_VIEW - FEATURES])
+        self.ids = np.union1d(seen, rng.permutation(count)[: IN_VIEW - FEATURES])
         mean = rng.uniform([0, 0, 0], [640, 480, 640], (count, 3))
-        cov = np.tile(25.0 * np.eye(3), (ids.size, 1, 1))
+        cov = np.tile(25.0 * np.eye(3), (self.ids.size, 1, 1))
         z = mean[seen] + rng.standard_normal((FEATURES, 3))
-        self.gate = Gate(z, np.tile(np.eye(3), (FEATURES, 1, 1)), ids, mean[ids], cov)
+        self.gate = z, np.tile(np.eye(3), (FEATURES, 1, 1)), mean[self.ids], cov, 11.3
         self.matcher = cv2.BFMatcher(cv2.NORM_L2)
 
     def contestants(self) -> dict[str, Callable[[], object]]:
         """By name."""
         return {
-            "exact": lambda: self.exact.match(self.query),
-            "tree": lambda: self.tree.match(self.query),
-            "gated": lambda: self.exact.match(self.query, self.gate),
+            "exact": lambda: match_all(self.query, self.descriptors, MatchLimits()),
+            "gated": self.gated,
             "peer": lambda: self.matcher.knnMatch(self.query, self.descriptors, 2),
         }
 
-    def agreement(self) -> float:
-        """Share of features about which the tree says what the exact search says."""
-        return float(np.mean(self.exact.match(self.query).ids == self.tree.match(self.query).ids))
+    def gated(self) -> object:
+        """Compares a feature with the landmarks that are predicted near it."""
+        k, m = gate_pairs(*self.gate)
+        return match_pairs(self.query, self.descriptors, (k, self.ids[m]), MatchLimits())
 
 
 def run(settings: Settings) -> list[Row]:
-    """Two rows for each size of the map, and one for the largest with a gate."""
+    """One row for each size of the map, and one for the largest with a gate."""
     descriptors, rows = real_descriptors(max(SIZES)), []
     with one_thread():
         for size in SIZES:
@@ -71,8 +66,6 @@ def run(settings: Settings) -> list[Row]:
             times = interleaved(task.contestants(), settings.repetitions(15))
             peer = "cv2.BFMatcher.knnMatch"
             rows.append(row(f"descriptors of a map of {size}, exact", times, "exact", "peer", peer))
-            notes = f"{100 * task.agreement():.1f} % of the features as by the exact search"
-            rows.append(row(f"descriptors of a map of {size}, tree", times, "tree", "exact", "exact", notes))
     notes = f"{IN_VIEW} landmarks in view, predicted to 5 px"
     rows.append(row(f"descriptors of a map of {max(SIZES)}, gated", times, "gated", "exact", "exact", notes))
     return rows

@@ -59,7 +59,7 @@ class Drive:
         names = sensor.manager.add(landmarks)
         table = np.column_stack([names, np.full(landmarks, 5), np.zeros(landmarks, dtype=np.int64)])
         sensor.manager.restore({"key_manager/table": table, "key_manager/counters": np.array([0, landmarks])})
-        sensor.index.store.add(names, self.descriptors)
+        sensor.store.add(names, self.descriptors)
         sensor.places.put(names, self.places, SE3.identity())
         held = self.filter.belief().map
         for part in np.array_split(names, max(1, landmarks // 500)):

@@ -4,17 +4,12 @@ Descriptors are float32 rows of length 1, so that one matrix product gives all d
 pixels or a prediction leave few candidate pairs (`band_pairs`, `gate_pairs`), only those are compared (`match_pairs`),
 and only those compete in the ratio test.
 
-
-The descriptors of a map: stored once for all particles, and found again in new images (S05 §III-B, §V).
-
-Two searches stand side by side: `ExactSearch` compares every feature with every descriptor by one matrix product, which
-is what S05 did; `TreeSearch` asks a k-d tree, which S05 names as the way to go on. Where it is predicted which landmarks
-can be seen, and where, neither is needed: only the descriptors of near landmarks are compared, one by one (`Gate`).
+The descriptors of a map are stored once for all particles, and found again in new images (S05 §III-B, §V): compared with all
+by one matrix product, or one by one with those of the landmarks that a prediction puts near.
 """
 
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, final
+from typing import final
 
 import numpy as np
 
@@ -82,7 +77,12 @@ class DescriptorMatches:
 
 def match_all(first: np.ndarray, second: np.ndarray, limits: MatchLimits) -> DescriptorMatches:
     """Matches descriptors (K, d) with descriptors (M, d), every one of which is a candidate."""
-    return decide(first, second, two_best(first, second), limits)
+    product, next_best, where = two_best(first, second)
+    kept = np.flatnonzero(within(product, next_best, limits, first.shape[1]))
+    if limits.mutual and kept.size:
+        preferred = (first @ second[where[kept]].T).argmax(axis=0)
+        kept = kept[preferred == kept]
+    return one_each(_chosen(kept, where[kept], product[kept]))
 
 
 def two_best(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -103,21 +103,6 @@ def two_best(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndar
         better = top > best
         best, where = np.where(better, top, best), np.where(better, start + column, where)
     return best, next_best, where
-
-
-def decide(
-    first: np.ndarray,
-    second: np.ndarray,
-    best: tuple[np.ndarray, np.ndarray, np.ndarray],
-    limits: MatchLimits,
-) -> DescriptorMatches:
-    """Which of the best candidates, as `two_best` gives them, are taken."""
-    product, next_best, where = best
-    kept = np.flatnonzero(within(product, next_best, limits, first.shape[1]))
-    if limits.mutual and kept.size:
-        preferred = (first @ second[where[kept]].T).argmax(axis=0)
-        kept = kept[preferred == kept]
-    return one_each(_chosen(kept, where[kept], product[kept]))
 
 
 def match_pairs(
@@ -249,8 +234,6 @@ class DescriptorStore:
         self._descriptors = np.zeros((64, length), dtype=np.float32)
         self._ids = np.zeros(64, dtype=np.int64)
         self._count = 0
-        self.restored = 0
-        """How often the store was filled from a checkpoint: what was built on it before is void."""
 
     def __len__(self) -> int:
         return self._count
@@ -333,159 +316,20 @@ class DescriptorStore:
             arrays[f"descriptors/{name}"].copy() for name in ("ids", "descriptors")
         )
         self._count, self.length = self._ids.size, self._descriptors.shape[1]
-        self.restored += 1
 
-
-class DescriptorSearch(ABC):
-    """Finds the descriptors of a store that are nearest to others."""
-
-    @abstractmethod
-    def match(self, query: np.ndarray, store: DescriptorStore, limits: MatchLimits) -> DescriptorMatches:
-        """Matches descriptors (K, d) with those of the store, `second` are its rows."""
-
-
-@final
-class ExactSearch(DescriptorSearch):
-    """Compares all with all."""
-
-    def match(self, query: np.ndarray, store: DescriptorStore, limits: MatchLimits) -> DescriptorMatches:
-        return match_all(query, store.descriptors, limits)
-
-
-@final
-class TreeSearch(DescriptorSearch):
-    """Asks a k-d tree of a former state of the store, and compares with all descriptors that came since.
-
-    The tree is made anew when many descriptors have come or gone. Those that have gone are left out of its answers; as S05 §V
-    warns, they crowd it while they are there.
-
-    Args:
-        slack: a descriptor may be missed if another is at most 1 + slack times as far; 0 makes the search exact.
-        tail: fraction of the tree's descriptors that may come or go before the tree is made anew.
-        least: so many may come or go in any case.
-    """
-
-    def __init__(self, slack: float = 3.0, tail: float = 0.1, least: int = 500) -> None:
-        if not (slack >= 0.0 and tail > 0.0 and least >= 0):
-            expected = "a slack and a least of at least 0 and a positive tail"
-            raise InputError(f"a tree search needs {expected}, got {slack}, {least} and {tail}")
-        self.slack, self.tail, self.least = slack, tail, least
-        self._ids = np.zeros(0, dtype=np.int64)
-        self._tree: Any = None
-        self._built: tuple[DescriptorStore, int] | None = None
-
-    def match(self, query: np.ndarray, store: DescriptorStore, limits: MatchLimits) -> DescriptorMatches:
-        if not query.shape[0] or not len(store):
-            return match_all(query, store.descriptors, limits)
-        rows, held = store.find(self._ids)
-        young = len(store) - int(held.sum())
-        stale = young + (~held).sum() > max(self.tail * self._ids.size, self.least)
-        if stale or (store, store.restored) != self._built:
-            from scipy.spatial import cKDTree
-
-            self._ids, self._built = store.ids.copy(), (store, store.restored)
-            self._tree = cKDTree(store.descriptors, leafsize=32)
-            rows, held, young = np.arange(len(store)), np.ones(len(store), dtype=bool), 0
-        first = len(store) - young
-        best, next_best, where = two_best(query, store.descriptors[first:])
-        if held.any():
-            # The two nearest in the tree that are held still; one more is asked for in case that one of them has gone. One
-            # further away than `most` is neither taken, nor does its distance forbid another.
-            near = min(3, self._ids.size)
-            most = limits.largest(query.shape[1]) / limits.ratio * (1.0 + 1e-6)
-            distance, found = self._tree.query(
-                query, k=np.arange(1, near + 1), eps=self.slack, distance_upper_bound=most
-            )
-            there = np.isfinite(distance)
-            found = np.where(there, found, 0)
-            product = np.where(there & held[found], 1.0 - 0.5 * np.minimum(distance, 2.0) ** 2, -np.inf)
-            product = product.astype(np.float32)
-            order = np.argsort(-product, axis=1, kind="stable")
-            product, found = np.take_along_axis(product, order, 1), np.take_along_axis(found, order, 1)
-            top, second = product[:, 0], product[:, 1] if near > 1 else np.full_like(product[:, 0], -np.inf)
-            where = np.where(best > top, first + where, rows[found[:, 0]])
-            next_best = np.maximum(np.maximum(next_best, second), np.minimum(best, top))
-            best = np.maximum(best, top)
-        return decide(query, store.descriptors, (best, next_best, where), limits)
-
-
-@final
-@dataclass(frozen=True)
-class Gate:
-    """Which landmarks a prediction makes plausible for which feature.
-
-    Attributes:
-        z: (K, p) places of the features, (u, v) or (u_left, v, u_right).
-        noise: (K, p, p) their covariances.
-        ids: (V,) landmarks that should be in view; no others compete.
-        mean: (V, p) where they should be, as `Belief.project` gives it.
-        cov: (V, p, p) covariance of that, without the measurements' noise.
-        gate: largest squared Mahalanobis distance; 11.3 holds 99 % of a Gaussian in three dimensions.
-    """
-
-    z: np.ndarray
-    noise: np.ndarray
-    ids: np.ndarray
-    mean: np.ndarray
-    cov: np.ndarray
-    gate: float = 11.3
-
-
-@final
-@dataclass(frozen=True)
-class MatchedLandmarks:
-    """Landmarks of K features.
-
-    Attributes:
-        ids: (K,) the landmark of each, each landmark once; NULL where there is none.
-        distance: (K,) of the descriptors, infinite where there is none.
-    """
-
-    ids: np.ndarray
-    distance: np.ndarray
-
-
-@final
-class DescriptorIndex:
-    """The descriptors of a map and how they are found.
-
-    Args:
-        length: of a descriptor, 36 or 128.
-        limits: when a candidate is taken.
-        search: of features about which nothing is predicted; exact by default.
-    """
-
-    def __init__(
-        self, length: int, limits: MatchLimits | None = None, search: DescriptorSearch | None = None
-    ) -> None:
-        self.store = DescriptorStore(length)
-        self.limits = limits or MatchLimits()
-        self.search = search or ExactSearch()
-
-    def match(self, descriptors: np.ndarray, gate: Gate | None = None) -> MatchedLandmarks:
-        """The landmarks of features with descriptors (K, d).
-
-        Args:
-            descriptors: float32 of length 1.
-            gate: what is predicted; None lets all landmarks compete for every feature.
+    def match(self, descriptors: np.ndarray, limits: MatchLimits) -> np.ndarray:
+        """The landmark (K,) of each feature with a descriptor (K, d), each landmark once; NULL where there is none.
 
         Raises:
-            InputError: the descriptors have another length, or the gate names a landmark that is not held.
+            InputError: the descriptors have another length.
         """
-        if descriptors.ndim != 2 or descriptors.shape[1] != self.store.length:
-            raise InputError(f"descriptors must be (K, {self.store.length}), got {descriptors.shape}")
-        if gate is None:
-            matches = self.search.match(descriptors, self.store, self.limits)
-        else:
-            k, m = gate_pairs(gate.z, gate.noise, gate.mean, gate.cov, gate.gate)
-            rows = self.store.rows(gate.ids)
-            matches = match_pairs(descriptors, self.store.descriptors, (k, rows[m]), self.limits)
-        count = descriptors.shape[0]
-        ids, distance = np.full(count, NULL, dtype=np.int64), np.full(count, np.inf)
-        ids[matches.first] = self.store.ids[matches.second]
-        distance[matches.first] = matches.distance
-        return MatchedLandmarks(ids, distance)
+        if descriptors.ndim != 2 or descriptors.shape[1] != self.length:
+            raise InputError(f"descriptors must be (K, {self.length}), got {descriptors.shape}")
+        matches = match_all(descriptors, self.descriptors, limits)
+        ids = np.full(descriptors.shape[0], NULL, dtype=np.int64)
+        ids[matches.first] = self.ids[matches.second]
+        return ids
 
     def nearest(self, descriptors: np.ndarray) -> np.ndarray:
         """Distance (K,) of each descriptor (K, d) to the nearest one held, infinite where none is."""
-        return distances(two_best(descriptors, self.store.descriptors)[0])
+        return distances(two_best(descriptors, self.descriptors)[0])

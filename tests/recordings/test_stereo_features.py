@@ -5,7 +5,7 @@ import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.sensors.descriptors import DescriptorIndex, Gate, MatchLimits, distances
+from rbpf.sensors.descriptors import MatchLimits, distances, gate_pairs, match_all, match_pairs
 from rbpf.sensors.features import Sift, SiftConfig
 from rbpf.sensors.readers import open_stereo
 from rbpf.sensors.stereo import PairConfig, StereoMatcher, match_frames
@@ -109,16 +109,14 @@ def test_longer_keys_err_less(recording, features):
 
 def test_a_prediction_finds_landmarks_more_surely(recording, features):
     rig = recording[1]
-    index = DescriptorIndex(36)
-    before, after = features[0], features[2]
-    index.store.add(np.arange(len(before)), before.descriptors)
+    before, after, limits = features[0], features[2], MatchLimits()
     mean = expected(recording, 0, 2, before.points)
-    seen = np.flatnonzero(rig.inside(mean))
-    gate = Gate(after.z, after.cov, seen, mean[seen], np.tile(9.0 * np.eye(3), (seen.size, 1, 1)))
+    seen = np.where(rig.inside(mean)[:, None], mean, np.nan)
+    pairs = gate_pairs(after.z, after.cov, seen, np.tile(9.0 * np.eye(3), (len(seen), 1, 1)), 11.3)
+    one, other = after.descriptors, before.descriptors
     fractions = []
-    for found in (index.match(after.descriptors), index.match(after.descriptors, gate)):
-        rows = np.flatnonzero(found.ids >= 0)
-        error = np.abs(after.z[rows] - mean[found.ids[rows]]).max(axis=1)
+    for found in (match_all(one, other, limits), match_pairs(one, other, pairs, limits)):
+        error = np.abs(after.z[found.first] - mean[found.second]).max(axis=1)
         fractions.append(((error < 4.0).sum(), np.mean(error < 4.0)))
     (free, free_fraction), (gated, gated_fraction) = fractions
     assert gated >= free and gated_fraction > free_fraction and gated_fraction > 0.85

@@ -38,7 +38,7 @@ from rbpf.motion.stereo_geometry import Matches
 from rbpf.motion.stereo_vo import VoConfig, estimate_motion
 from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.camera.points import CameraModel, StereoPoint
-from rbpf.sensors.descriptors import DescriptorIndex, gate_pairs, match_pairs
+from rbpf.sensors.descriptors import DescriptorStore, gate_pairs, match_pairs
 from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.sensors.landmark_management import LandmarkManager, NewLandmarkConfig
 from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
@@ -412,7 +412,7 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         self.rig, self.config, self.likelihood = rig, config, likelihood
         self.gate = gate or MahalanobisGate(config.gate, config.slack_px)
         self.model, self.landmark = model or StereoPoint(rig), landmark or Point(3)
-        self.index = DescriptorIndex(length, config.limits)
+        self.store = DescriptorStore(length)
         self.manager = LandmarkManager(new, (rig.camera.width, rig.camera.height))
         self.places = Places(rig, config)
         self.ids = np.zeros(0, dtype=np.int64)
@@ -450,7 +450,7 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         dropped = self.manager.observe(seen)
         if dropped.size:
             belief.map.remove(dropped)
-            self.index.store.remove(dropped)
+            self.store.remove(dropped)
             self.places.remove(dropped)
         pose = belief.state[belief.mode]
         if seen.size:
@@ -463,7 +463,7 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         features = frame.features.take(rows)
         # The manager counts as the map does: its numbers are the map's.
         ids = self.manager.add(rows.size)
-        self.index.store.add(ids, features.descriptors)
+        self.store.add(ids, features.descriptors)
         self.places.put(ids, SE3.transform(pose, features.points), pose)
         self.ids[rows] = ids
         return [NewLandmarks(features.z, features.cov, self.model, self.landmark, ids=ids)]
@@ -481,7 +481,7 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
             return out
         expected = subsample.expected(belief, self.model, ids)
         k, m = self.gate.pairs(features, expected)
-        store = self.index.store
+        store = self.store
         found = match_pairs(
             features.descriptors, store.descriptors, (k, store.rows(ids)[m]), self.config.limits
         )
@@ -495,7 +495,7 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         """By their descriptors alone."""
         out = np.full(len(view.features), NULL, dtype=np.int64)
         rows = np.flatnonzero(view.free)
-        out[rows] = self.index.match(view.features.descriptors[rows]).ids
+        out[rows] = self.store.match(view.features.descriptors[rows], self.config.limits)
         return out
 
     def seen_again(self) -> np.ndarray:
@@ -531,19 +531,19 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         return np.flatnonzero(np.isin(self.kinds(), (FeatureKind.LANDMARK, FeatureKind.CANDIDATE)))
 
     def arrays(self) -> dict[str, np.ndarray]:
-        return self.index.store.arrays() | self.manager.arrays() | self.places.arrays()
+        return self.store.arrays() | self.manager.arrays() | self.places.arrays()
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        self.index.store.restore(arrays)
+        self.store.restore(arrays)
         self.manager.restore(arrays)
-        self.places.restore(arrays, self.index.store.ids)
+        self.places.restore(arrays, self.store.ids)
 
     def _alike(self, descriptors: np.ndarray, subsample: ParticleSubsample) -> np.ndarray:
         """Landmarks that may be in view and whose descriptors come near to that of any feature, ascending.
 
         Descriptors further away are neither taken nor forbid others by the ratio, whatever is expected where.
         """
-        store, limits = self.index.store, self.config.limits
+        store, limits = self.store, self.config.limits
         ids = self.places.in_view(subsample.middle, subsample.std_direction_rad)
         if not ids.size or not descriptors.shape[0]:
             return ids[:0]
@@ -575,7 +575,7 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         rows = np.flatnonzero(~known & deep & frame.free)
         if not rows.size:
             return rows
-        nearest = self.index.nearest(features.descriptors[rows])
+        nearest = self.store.nearest(features.descriptors[rows])
         px, taken = features.z[rows, :2], features.z[known, :2]
         return rows[self.manager.select(px, features.descriptors[rows], nearest, taken)]
 
