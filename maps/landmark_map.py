@@ -6,8 +6,6 @@ from typing import final
 
 import numpy as np
 
-from rbpf import gaussian
-from rbpf.arrays import numbers
 from rbpf.core.checkpoint import within
 from rbpf.core.genealogy import Lineage
 from rbpf.core.likelihoods import Gaussian
@@ -28,6 +26,7 @@ from rbpf.core.particles import Information, Prior
 from rbpf.errors import InputError
 from rbpf.kernels.landmarks import gather, linearise_one, project
 from rbpf.lie import LieGroup
+from rbpf.maps.any_map import checked_new_ids, expected, first_records, projected
 from rbpf.maps.layout import Layout
 from rbpf.maps.point import Point
 from rbpf.maps.rows import BOTH, MAP, STATE, Plan, RowEngine, by_use, fused_kernel, make_plan, require_apart
@@ -77,9 +76,7 @@ class LandmarkMap(Map):
         return self.store.columns.kinds(ids) == self._kind(landmark)
 
     def add(self, new_landmarks: NewLandmarks, state: np.ndarray) -> np.ndarray:
-        name = type(new_landmarks.model).__name__
-        z, cov = numbers(new_landmarks.z, f"z of {name}"), numbers(new_landmarks.cov, f"cov of {name}")
-        records = new_landmarks.model.initialise(state, z, cov)
+        records = first_records(new_landmarks, state)
         log_odds = None if new_landmarks.mask is None else np.where(new_landmarks.mask, 0.0, -np.inf)
         return self.add_records(records, new_landmarks.landmark, log_odds, new_landmarks.ids)
 
@@ -95,22 +92,11 @@ class LandmarkMap(Map):
         kind = self._kind(landmark)
         columns = self.layouts[kind].pack(records, log_odds)
         count = columns.shape[0]
-        if ids is None:
-            ids = np.arange(self.store.next_id, self.store.next_id + count)
-        else:
-            ids = np.asarray(ids)
-            if ids.shape != (count,) or ids.dtype.kind not in "iu" or (ids < 0).any():
-                raise InputError(
-                    f"ids of {count} new landmarks must be as many whole numbers from 0 up, got {ids}"
-                )
-            numbers, times = np.unique(ids, return_counts=True)
-            taken = numbers[self.holds(numbers) | (times > 1)]
-            if taken.size:
-                raise InputError(f"a new landmark needs an id of its own: {taken[0]} is in use")
+        ids = checked_new_ids(ids, count, self.store.next_id, self.holds)
         for column, landmark_id in zip(columns, ids.tolist(), strict=True):
             self.store.add(column, landmark_id)
         self.store.columns.kind[self.store.columns.rows(ids)] = kind
-        return ids.astype(np.int64)
+        return ids
 
     def remove(self, ids: np.ndarray) -> None:
         self._known(ids)
@@ -181,7 +167,7 @@ class LandmarkMap(Map):
     def predictions(
         self, model: ObservationModel, z: np.ndarray, cov: np.ndarray, ids: np.ndarray, belief: Belief
     ) -> tuple[np.ndarray, np.ndarray]:
-        predicted, within = self._predicted(model, self.read(ids), belief)
+        predicted, within = expected(model, self.read(ids), belief)
         return model.residual(z[:, None, :], predicted[:, None]), within[:, None] + cov[:, None]
 
     def is_compiled(self, model: ObservationModel, ids: np.ndarray) -> bool:
@@ -219,26 +205,7 @@ class LandmarkMap(Map):
                 cov,
             )
             return anchor + mean, cov
-        predicted, within = self._predicted(model, self.read(ids), belief)
-        mode = predicted[belief.mode]
-        offset = model.residual(predicted, mode)
-        by_particle = weights[:, None, None]
-        mean = (by_particle * offset).sum(axis=0)
-        spread = offset - mean
-        between = spread[..., :, None] * spread[..., None, :]
-        return mode + mean, (by_particle[..., None] * (within + between)).sum(axis=0)
-
-    def _predicted(
-        self, model: ObservationModel, records: Records, belief: Belief
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """What each particle expects to measure of landmarks (N, K, p), and J P Jᵀ + H Q Hᵀ (N, K, p, p)."""
-        prior, state = belief.prior, belief.state[:, None, :]
-        predicted = model.predict(state, records.mean, records.const)
-        _, jac = linearise(model, prior.space, predicted, state, records.mean, records.const)
-        assert jac.state is not None and jac.landmark is not None
-        moved = jac.state @ prior.spread(prior.mean)[:, None]
-        within = jac.landmark @ records.cov @ np.swapaxes(jac.landmark, -1, -2)
-        return predicted, gaussian.symmetrise(within + moved @ np.swapaxes(moved, -1, -2))
+        return projected(model, self.read(ids), belief)
 
     def log_odds(self, ids: np.ndarray) -> np.ndarray:
         if not self.evidence:

@@ -26,6 +26,7 @@ from .core.models import Sensor as Sensor
 from .core.models import Transition as Transition
 from .core.proposals import EkfProposal as EkfProposal
 from .core.proposals import PriorProposal as PriorProposal
+from .core.resampling import Consolidation as Consolidation
 from .core.resampling import EssTriggered as EssTriggered
 from .core.resampling import Multinomial as Multinomial
 from .core.resampling import Residual as Residual
@@ -39,6 +40,7 @@ from .lie import SE2 as SE2
 from .lie import SE3 as SE3
 from .lie import Euclidean as Euclidean
 from .lie import Product as Product
+from .maps.joint_map import JointMap as JointMap
 from .maps.landmark_map import LandmarkMap as LandmarkMap
 from .maps.point import AnchoredPoint as AnchoredPoint
 from .maps.point import MixturePoint as MixturePoint

@@ -42,7 +42,7 @@ from rbpf.core.particles import (
     uniform_log_weights,
 )
 from rbpf.core.proposals import EkfProposal
-from rbpf.core.resampling import EssTriggered, Systematic
+from rbpf.core.resampling import Consolidation, EssTriggered, Systematic
 from rbpf.errors import InputError
 from rbpf.kernels.increment import are_sound
 from rbpf.lie import LieGroup
@@ -57,7 +57,7 @@ class StepReport:
         mixture: what the estimate summarises: the refined mixture before sampling, with its log-weights; after a
             proposal that did not look at the observations, the weighted samples.
         ess: effective sample size before resampling.
-        resampled: whether the particles were resampled.
+        resampled: whether the particles were resampled or consolidated before they moved.
         log_evidence: log p(z_t | z_1:t−1), Mathematics (evidence-increment); NaN where a likelihood is not a density.
         nis: normalised innovation squared, NaN without a linearised one: the squared Mahalanobis distance of the joint
             innovation of the rows that took part, a weighted mean over the particles.
@@ -99,6 +99,8 @@ class Filter:
         start: (E,) or (N, E) initial state; by default the identity.
         lag: steps of trajectory kept, None keeps all.
         clouds: keep whole clouds, for backward simulation.
+        consolidation: when a conditional that can takes in what the particles differ by; they are then never resampled.
+            Paths are not kept across it: ask for a lag of one step. States are in a frame of the conditional's choice.
     """
 
     def __init__(
@@ -113,6 +115,7 @@ class Filter:
         start: np.ndarray | None = None,
         lag: int | None = None,
         clouds: bool = False,
+        consolidation: Consolidation | None = None,
     ) -> None:
         if n < 1:
             raise InputError(f"a filter needs at least one particle, got {n}")
@@ -125,6 +128,8 @@ class Filter:
         self.marginals = Marginals(self.space, parts)
         self.proposal = proposal or EkfProposal()
         self.resampler = resampler or EssTriggered(Systematic())
+        self.consolidation = consolidation
+        self._age = 0
         self.rng = rng or np.random.default_rng()
         origin = self.space.identity() if start is None else np.asarray(start, dtype=float)
         state = checked_start(origin, n, self.space)
@@ -155,6 +160,8 @@ class Filter:
     ) -> StepReport:
         """Predicts, observes, refines, weighs, resamples, samples, corrects and updates; then starts landmarks.
 
+        Where there is a consolidation, it takes the place of resampling; it comes after the step, too, when it is due.
+
         Args:
             frame: what the sensors observe.
             control: what the motion model moves by.
@@ -178,8 +185,22 @@ class Filter:
         mixture: tuple[Prior, Proposed | None, np.ndarray] = (prior, proposed, log_weights)
         weights = np.exp(log_weights)
 
+        # Consolidate what was known before if the particles no longer stand for what they are about to see, and begin anew:
+        # what was observed holds in any frame.
+        ancestors, consolidated = None, False
+        if self.consolidation is None:
+            ancestors = self.resampler.ancestors(weights, self.rng)
+        elif self._age and self.consolidation.is_due(0, weights):
+            self._consolidate()
+            consolidated = True
+            prior = self._predict(control, dt)
+            proposed = proposal.propose(prior, self.marginals.linearised(prior, groups))
+            log_weights, look_ahead = reweight(
+                self.particles.log_weights, proposed.log_w1, f"step {self.steps}"
+            )
+            mixture, weights = (prior, proposed, log_weights), np.exp(log_weights)
+
         # Resample if it is time: descendants inherit by ancestor, and so do associations of their own.
-        ancestors = self.resampler.ancestors(weights, self.rng)
         if ancestors is not None:
             log_weights = uniform_log_weights(self.n)
             self.lineage.advance(checked_ancestors(ancestors, self.n, self.resampler))
@@ -194,7 +215,10 @@ class Filter:
 
         # Sample one state for each descendant from its parent's Gaussian, and update what is marginalised.
         parents = np.arange(self.n) if ancestors is None else ancestors
-        whitened, log_ratio = proposed.sample(parents, self.rng)
+        balance = None
+        if self.consolidation is not None:
+            balance = weights, self.space.local(prior.base[0], prior.base)
+        whitened, log_ratio = proposed.sample(parents, self.rng, balance)
         increment = prior.mean + np.einsum("nar,nr->na", prior.factor, whitened)
         state = prior.at(increment)
         densities = self.marginals.correct(state, increment, groups)
@@ -216,11 +240,15 @@ class Filter:
         evidence = look_ahead + correction if normalised else float("nan")
         self.log_evidence += evidence
         self._end(stamp_ns)
+        if self.consolidation is not None:
+            self._age += 1
+            if self.consolidation.is_due(self._age, self.particles.weights):
+                self._consolidate()
         return StepReport(
             stamp_ns=stamp_ns,
             mixture=mixture,
             ess=effective_sample_size(weights),
-            resampled=ancestors is not None,
+            resampled=ancestors is not None or consolidated,
             log_evidence=evidence,
             nis=float("nan") if proposed.nis is None else float((weights * proposed.nis).sum()),
             rows=0.0 if proposed.rows is None else mean_count(proposed.rows, weights),
@@ -276,6 +304,7 @@ class Filter:
             "filter/numbers": np.array([self.steps, -1 if self.stamp_ns is None else self.stamp_ns]),
             "filter/started": np.array(self.stamp_ns is not None),
             "filter/log_evidence": np.array(self.log_evidence),
+            **({} if self.consolidation is None else {"filter/age": np.array(self._age)}),
             **self.lineage.arrays(),
             **self.history.arrays(),
             **self.marginals.arrays(),
@@ -309,6 +338,8 @@ class Filter:
                 raise InputError(f"the array filter/numbers counts {steps} steps")
             self.steps, self.stamp_ns = steps, stamp if checked(arrays, "filter/started", (), "b") else None
             self.log_evidence = float(checked(arrays, "filter/log_evidence", (), "f"))
+            if self.consolidation is not None:
+                self._age = int(checked(arrays, "filter/age", (), "i"))
             self.rng.bit_generator.state = rng_state
         return {
             name.removeprefix("extra/"): array for name, array in arrays.items() if name.startswith("extra/")
@@ -325,6 +356,7 @@ class Filter:
             "conditional": [type(part).__name__ for part in self.marginals.parts.values()],
             "lag": self.history.lag,
             "clouds": self.history.clouds,
+            "consolidation": None if self.consolidation is None else repr(self.consolidation),
             **self.marginals.options(),
             "random generator": type(self.rng.bit_generator).__name__,
         }
@@ -366,6 +398,10 @@ class Filter:
         ]
         self._ends = list(accumulate(len(groups) for groups in observed))
         return [group for groups in observed for group in groups]
+
+    def _consolidate(self) -> None:
+        self.particles = self.marginals.consolidate(self.particles)
+        self._age = 0
 
     def _end(self, stamp_ns: int) -> None:
         self.steps += 1

@@ -25,7 +25,7 @@ from rbpf.core.models import (
     Part,
     Transition,
 )
-from rbpf.core.particles import Information, Prior, take
+from rbpf.core.particles import Information, Particles, Prior, take
 from rbpf.errors import InputError
 from rbpf.kernels.increment import conditioned
 from rbpf.lie import LieGroup
@@ -241,7 +241,11 @@ class Marginals(Conditional):
     def __init__(self, space: LieGroup, parts: Sequence[Conditional]) -> None:
         self.space = space
         self.parts = {part.supplies: part for part in (StateOnly(space), *parts)}
-        if len(self.parts) != len(parts) + 1:
+        self._holder = dict(self.parts)
+        for part in parts:
+            self._holder |= dict.fromkeys(part.also, part)
+        held = sum(1 + len(part.also - {Part.STATE}) for part in parts)
+        if len(self._holder) != held + 1:
             raise InputError("the filter takes at most one landmark map and one Kalman substate")
 
     def begin(self, n: int, lineage: Lineage) -> None:
@@ -251,7 +255,7 @@ class Marginals(Conditional):
 
     def predict(self, transition: Transition, space: LieGroup) -> Prior:
         """The substate's distribution where there is one."""
-        driver = self.parts.get(Part.SUBSTATE, self.parts[Part.STATE])
+        driver = self._holder.get(Part.SUBSTATE, self._holder[Part.STATE])
         return driver.predict(transition, space)
 
     def information(self, state: np.ndarray, groups: Sequence[Observations], prior: Prior) -> Information:
@@ -259,11 +263,11 @@ class Marginals(Conditional):
         total: Information | None = None
         for supplies, routed in self._routed(groups).items():
             if routed:
-                part = self.parts[supplies].information(state, routed, prior)
+                found = self.parts[supplies].information(state, routed, prior)
                 if total is None:
-                    total = part
+                    total = found
                 else:
-                    total.add(part)
+                    total.add(found)
         return Information.zeros(state.shape[0], self.space.dim) if total is None else total
 
     def linearised(self, prior: Prior, groups: Sequence[Observations]) -> LineariseAt:
@@ -303,6 +307,15 @@ class Marginals(Conditional):
         for part in self.parts.values():
             part.resample(ancestors)
 
+    def consolidate(self, particles: Particles) -> Particles:
+        """By the one part that there is: Gaussians apart from one another lack the correlation that the particles show."""
+        parts = [part for part in self.parts.values() if not isinstance(part, StateOnly)]
+        if len(parts) != 1:
+            raise InputError(
+                f"particles are consolidated into one Gaussian: give the filter one conditional, not {len(parts)}"
+            )
+        return parts[0].consolidate(particles)
+
     def arrays(self) -> dict[str, np.ndarray]:
         """Of all parts."""
         return {name: array for part in self.parts.values() for name, array in part.arrays().items()}
@@ -320,17 +333,18 @@ class Marginals(Conditional):
         routed: dict[Part, list[Observations]] = {supplies: [] for supplies in self.parts}
         for group in groups:
             reads = group.model.reads - {Part.STATE}
-            if len(reads) > 1:
+            holders = {self._holder.get(part) for part in reads or {Part.STATE}}
+            if len(holders) > 1:
                 raise InputError(
                     f"{type(group.model).__name__} reads a landmark and the substate, which couples them: "
-                    "sample that part of the substate instead"
+                    "sample that part of the substate instead, or hold both in a JointMap"
                 )
-            supplies = next(iter(reads), Part.STATE)
-            if supplies not in self.parts:
+            holder = holders.pop()
+            if holder is None:
                 raise InputError(
-                    f"{type(group.model).__name__} reads a {supplies.value}, which this filter does not hold"
+                    f"{type(group.model).__name__} reads a {next(iter(reads)).value}, which this filter does not hold"
                 )
-            routed[supplies].append(group)
+            routed[holder.supplies].append(group)
         return routed
 
 

@@ -21,7 +21,7 @@ import numpy as np
 from rbpf import gaussian
 from rbpf.arrays import Bool, Float, Int
 from rbpf.core.genealogy import Lineage
-from rbpf.core.particles import Information, Prior, Proposed
+from rbpf.core.particles import Information, Particles, Prior, Proposed
 from rbpf.errors import InputError
 from rbpf.kernels.signature import ObservationKernel
 from rbpf.lie import LieGroup
@@ -369,6 +369,8 @@ class Conditional(ABC):
     """What is marginalised: Gaussian given the sampled states. A landmark map, a Kalman substate."""
 
     supplies: Part
+    also: frozenset[Part] = frozenset()
+    """What it supplies besides."""
 
     @abstractmethod
     def begin(self, n: int, lineage: Lineage) -> None:
@@ -404,6 +406,22 @@ class Conditional(ABC):
     @abstractmethod
     def resample(self, ancestors: Int[np.ndarray, " N"]) -> None:
         """Every particle i becomes a copy of particle ancestors[i]; `lineage` has been advanced."""
+
+    def consolidate(self, particles: Particles) -> Particles:
+        """Takes in what the particles differ by, in place of resampling: they begin anew, all alike.
+
+        The posterior keeps its mean and covariance; what was a weighted sample becomes a part of the one Gaussian.
+
+        Args:
+            particles: after a step.
+
+        Returns:
+            The same number of particles, of equal states and weights.
+
+        Raises:
+            InputError: this part has a Gaussian of its own in every particle, which is what resampling is for.
+        """
+        raise InputError(f"{type(self).__name__} cannot take in what the particles differ by: resample them")
 
     @abstractmethod
     def arrays(self) -> dict[str, np.ndarray]:

@@ -210,14 +210,45 @@ class Proposed:
     rows: Float[np.ndarray, " N"] | None = None
 
     def sample(
-        self, ancestors: Int[np.ndarray, " M"], rng: np.random.Generator
+        self,
+        ancestors: Int[np.ndarray, " M"],
+        rng: np.random.Generator,
+        balance: tuple[Float[np.ndarray, " M"], Float[np.ndarray, "M d"]] | None = None,
     ) -> tuple[Float[np.ndarray, "M r"], Float[np.ndarray, " M"]]:
-        """One u per descendant (N, r), and log p(u) − log q(u) (N,)."""
+        """One u per descendant (N, r), and log p(u) − log q(u) (N,); `balanced` by weights and what is apart already."""
         noise = rng.standard_normal((ancestors.size, self.mean.shape[1]))
+        if balance is not None:
+            noise = balanced(noise, *balance)
         root = take(self.root, ancestors)
         u = take(self.mean, ancestors) + np.einsum("nab,nb->na", root, noise)
         log_root = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
         return u, 0.5 * (noise * noise - u * u).sum(axis=1) + log_root
+
+
+def balanced(
+    noise: Float[np.ndarray, "N r"], weights: Float[np.ndarray, " N"], apart: Float[np.ndarray, "N d"]
+) -> Float[np.ndarray, "N r"]:
+    """Standard normal draws (N, r) with exactly the moments that independent draws have on average.
+
+    Their weighted mean is 0, their weighted covariance (1 − ΣW²) I, and they are uncorrelated with what the particles
+    differ by already. So the moments of a sample are those of its Gaussian, and who goes on from the moments does not
+    take over the chance of the draws (second-order exact sampling, D. Pham 2001). Where there are too few particles the
+    draws stay as they are.
+
+    Args:
+        noise: independent draws.
+        weights: (N,) normalised.
+        apart: (N, d) what the particles differ by, up to a constant.
+    """
+    left = 1.0 - float(np.square(weights).sum())
+    if left * effective_sample_size(weights) <= 2.0 * noise.shape[1] + apart.shape[1] + 1.0:
+        return noise if left > 0.0 else np.zeros_like(noise)
+    column = weights[:, None]
+    noise, apart = noise - weights @ noise, apart - weights @ apart
+    inverse = np.linalg.pinv((column * apart).T @ apart, hermitian=True)
+    noise = noise - apart @ (inverse @ ((column * apart).T @ noise))
+    chol = np.linalg.cholesky((column * noise).T @ noise / left)
+    return np.linalg.solve(chol, noise.T).T
 
 
 @dataclass(frozen=True)

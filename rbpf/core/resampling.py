@@ -4,6 +4,7 @@ R. Douc, O. Cappé, E. Moulines, "Comparison of resampling schemes for particle 
 ascending order, so that what is gathered by them is read forwards.
 """
 
+from dataclasses import dataclass
 from typing import final
 
 import numpy as np
@@ -90,3 +91,33 @@ class EssTriggered(Resampler):
         if effective_sample_size(weights) >= self.threshold * weights.size * (1.0 - _ROUNDING):
             return None
         return self.scheme.ancestors(weights, rng)
+
+
+@final
+@dataclass(frozen=True)
+class Consolidation:
+    """When what the particles differ by is taken into what is marginalised, in place of resampling.
+
+    Attributes:
+        window: steps after which that is done at the latest; a sampled window of dozens degenerates in itself.
+        threshold: fraction of N below which the effective sample size calls for it earlier.
+    """
+
+    window: int = 5
+    threshold: float = 0.5
+
+    def __post_init__(self) -> None:
+        """Checks the numbers.
+
+        Raises:
+            InputError: one is out of its range.
+        """
+        if self.window < 1 or not 0.0 <= self.threshold <= 1.0:
+            raise InputError(
+                f"a window has 1, 2, … steps and a threshold in [0, 1], got {self.window}, {self.threshold}"
+            )
+
+    def is_due(self, age: int, weights: np.ndarray) -> bool:
+        """After `age` steps, with weights (N,)."""
+        enough = self.threshold * weights.size * (1.0 - _ROUNDING)
+        return age >= self.window or effective_sample_size(weights) < enough

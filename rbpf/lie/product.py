@@ -77,6 +77,24 @@ class Euclidean(LieGroup):
     ) -> Float[np.ndarray, "*batch {self.dim} {self.dim}"]:
         return self._unit_matrices(np.shape(xi)[:-1])
 
+    def inverse_transform(
+        self, a: Like[ArrayLike, "*#batch {self.size}"], p: Like[ArrayLike, "*#batch {self.size}"]
+    ) -> Float[np.ndarray, "*batch {self.size}"]:
+        """Points p seen from a: the group is that of translations."""
+        return self.local(a, p)
+
+    def transform(
+        self, a: Like[ArrayLike, "*#batch {self.size}"], p: Like[ArrayLike, "*#batch {self.size}"]
+    ) -> Float[np.ndarray, "*batch {self.size}"]:
+        """The inverse of `inverse_transform`."""
+        return self.compose(a, p)
+
+    def rotation(
+        self, a: Like[ArrayLike, "*#batch {self.size}"]
+    ) -> Float[np.ndarray, "*batch {self.size} {self.size}"]:
+        """None: unit matrices (…, n, n)."""
+        return self._unit_matrices(np.shape(a)[:-1])
+
     def _unit_matrices(self, shape: tuple[int, ...]) -> Array:
         return np.broadcast_to(np.eye(self.dim), (*shape, self.dim, self.dim)).copy()
 

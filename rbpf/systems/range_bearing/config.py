@@ -57,10 +57,15 @@ class RangeBearingConfig:
         particles: number of particles.
         seed: of the only random generator.
         association: landmarks named by the log, or by maximum likelihood in each particle.
+        map: every particle's own landmarks, each of them a Gaussian given the whole sampled path (particles), or one
+            Gaussian of all landmarks and the frame, given the last few steps (joint): an uncertainty that stays true.
+        window: of a joint map: steps sampled, at most, before they are taken into it; fewer where the effective sample
+            size falls below the threshold of resampling, which does not take place.
         compiled: run the fused kernels; false runs their NumPy twins.
-        lag: steps of trajectory kept for smoothing, None keeps all.
+        lag: steps of trajectory kept for smoothing, None keeps all; with a joint map one.
         checkpoint_every: steps between checkpoints.
-        anchor_every: steps between re-estimations of where the known start lies in each particle's world; 0 never.
+        anchor_every: steps between re-estimations of where the known start lies in each particle's world; 0 never. A
+            joint map needs none: it knows its frame's place.
         noise: standard deviations that replace the log's own.
         proposal: where particles are sampled.
         resampling: when and how.
@@ -71,6 +76,8 @@ class RangeBearingConfig:
     particles: int = 100
     seed: int = 0
     association: Literal["known", "ml"] = "known"
+    map: Literal["particles", "joint"] = "particles"
+    window: int = 5
     compiled: bool = True
     lag: int | None = None
     checkpoint_every: int = 500
@@ -89,3 +96,9 @@ class RangeBearingConfig:
             raise InputError(f"checkpoint_every must be at least 1, got {self.checkpoint_every}")
         if self.anchor_every < 0:
             raise InputError(f"anchor_every must not be negative, got {self.anchor_every}")
+        if self.map == "joint" and (self.association != "known" or self.likelihood.kind != "gaussian"):
+            raise InputError(
+                "map=joint takes association=known and likelihood.kind=gaussian: map=particles takes all"
+            )
+        if self.window < 1:
+            raise InputError(f"window must be at least 1, got {self.window}")

@@ -15,7 +15,9 @@ from rbpf.core.checkpoint import checked
 from rbpf.core.diagnostics import motion_correction
 from rbpf.core.filter import Filter, StepReport
 from rbpf.core.models import NEW, NULL, Sensor
+from rbpf.core.resampling import Consolidation
 from rbpf.lie import SE2, SE2Group, SE3Group
+from rbpf.maps.joint_map import JointMap
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
 from rbpf.motion.odometry import Odometry, OdometryMotion
@@ -74,20 +76,25 @@ class RangeBearingSlam(System):
         self.robot_from_sensor = space.identity() if robot_from_sensor is None else robot_from_sensor
         self.model = self._model()
         self.point = Point(2 if isinstance(space, SE2Group) else 3)
-        landmark_map = LandmarkMap(space, evidence=config.association == "ml", compiled=config.compiled)
-        landmark_map.register(self.point)
+        self.joint = JointMap(space) if config.map == "joint" else None
+        own = LandmarkMap(space, evidence=config.association == "ml", compiled=config.compiled)
+        own.register(self.point)
         sensor = self._sensor()
         self.filter = Filter(
             OdometryMotion(space),
             sensor if wrapped is None else wrapped(sensor),
-            landmark_map,
+            self.joint or own,
             config.proposal.build(),
             config.resampling.build(),
             config.particles,
             np.random.default_rng(config.seed),
-            lag=config.lag,
+            lag=1 if self.joint else config.lag,
+            consolidation=Consolidation(config.window, config.resampling.ess_threshold)
+            if self.joint
+            else None,
         )
-        self.anchor = StartAnchor(self.filter, config.anchor_every) if config.anchor_every else None
+        anchored = config.anchor_every and self.joint is None
+        self.anchor = StartAnchor(self.filter, config.anchor_every) if anchored else None
         self._names: set[int] = set()
         self._odometry = space.identity()
         self._associations = _Associations(self.filter) if keep_associations else None
@@ -154,7 +161,7 @@ class RangeBearingSlam(System):
             self._odometry = self.space.compose(self._odometry, odometry.delta)
 
         # Poses are reported relative to where the start lies in each particle's world, as far as that is known by now.
-        estimate = report.estimate
+        estimate = self.joint.estimate(self.filter.particles) if self.joint else report.estimate
         if self.anchor is not None:
             estimate = self.anchor.state_estimate(self.anchor.after_step(report, odometry))
 
@@ -192,7 +199,14 @@ class RangeBearingSlam(System):
 
     def map(self) -> MapEstimate:
         """The landmarks, relative to the start in each particle's world."""
+        if self.joint is not None:
+            return MapEstimate(self.joint.ids, *self.joint.in_world(self.filter.particles))
         return estimate_map(self.filter, None if self.anchor is None else self.anchor.estimate())
+
+    def particle_poses(self) -> np.ndarray:
+        """(N, E) world_from_robot of the particles as they are now."""
+        state = self.filter.particles.state
+        return state if self.joint is None else self.joint.world(state)
 
     def measurements(self, name: str, log: Recorded) -> Measurements:
         """The odometry, and every observation that updated a landmark or started one."""
@@ -222,11 +236,12 @@ class RangeBearingSlam(System):
         )
 
     def summary(self, log: Recorded) -> dict[str, Any]:
-        """How much was observed and kept, and how far the particles have forgotten the past."""
+        """How much was observed and kept, and how far the particles have forgotten the past, if they sample it."""
+        distinct = {"ancestors_of_first_generation": self.filter.history.distinct_first()}
         return {
             "landmarks": int(self.map().ids.size),
             "observations": int(sum((ids >= 0).sum() for ids in self._final(log))),
-            "ancestors_of_first_generation": self.filter.history.distinct_first(),
+            **({} if self.joint else distinct),
             "map_share_of_dense": round(self.filter.belief().map.stored_fraction, 4),
         }
 

@@ -1,0 +1,62 @@
+"""What every map does alike: numbers for new landmarks, and what the particles expect to measure of the ones they hold."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from rbpf import gaussian
+from rbpf.arrays import numbers
+from rbpf.core.linearisation import linearise
+from rbpf.core.models import Belief, NewLandmarks, ObservationModel, Records
+from rbpf.errors import InputError
+
+
+def expected(model: ObservationModel, records: Records, belief: Belief) -> tuple[np.ndarray, np.ndarray]:
+    """What each particle expects to measure of landmarks (N, K, p), and J P Jᵀ + H Q Hᵀ (N, K, p, p)."""
+    prior, state = belief.prior, belief.state[:, None, :]
+    predicted = model.predict(state, records.mean, records.const)
+    _, jac = linearise(model, prior.space, predicted, state, records.mean, records.const)
+    assert jac.state is not None and jac.landmark is not None
+    moved = jac.state @ prior.spread(prior.mean)[:, None]
+    within = jac.landmark @ records.cov @ np.swapaxes(jac.landmark, -1, -2)
+    return predicted, gaussian.symmetrise(within + moved @ np.swapaxes(moved, -1, -2))
+
+
+def projected(model: ObservationModel, records: Records, belief: Belief) -> tuple[np.ndarray, np.ndarray]:
+    """The moments (K, p), (K, p, p) of all particles' expectations together, see `Belief.project`."""
+    predicted, within = expected(model, records, belief)
+    # Relative to the particle of highest weight, so that angles need not be wrapped.
+    mode = predicted[belief.mode]
+    offset = model.residual(predicted, mode)
+    by_particle = belief.weights[:, None, None]
+    mean = (by_particle * offset).sum(axis=0)
+    spread = offset - mean
+    between = spread[..., :, None] * spread[..., None, :]
+    return mode + mean, (by_particle[..., None] * (within + between)).sum(axis=0)
+
+
+def checked_new_ids(
+    ids: np.ndarray | None, count: int, next_id: int, holds: Callable[[np.ndarray], np.ndarray]
+) -> np.ndarray:
+    """Numbers (K,) of `count` new landmarks; None numbers them from `next_id` on.
+
+    Raises:
+        InputError: one is no whole number from 0 up, comes twice or is in use.
+    """
+    if ids is None:
+        return np.arange(next_id, next_id + count)
+    ids = np.asarray(ids)
+    if ids.shape != (count,) or ids.dtype.kind not in "iu" or (ids < 0).any():
+        raise InputError(f"ids of {count} new landmarks must be as many whole numbers from 0 up, got {ids}")
+    numbers, times = np.unique(ids, return_counts=True)
+    taken = numbers[holds(numbers) | (times > 1)]
+    if taken.size:
+        raise InputError(f"a new landmark needs an id of its own: {taken[0]} is in use")
+    return ids.astype(np.int64)
+
+
+def first_records(new_landmarks: NewLandmarks, state: np.ndarray) -> Records:
+    """Estimates (N, K, …) of landmarks that are started at states (N, E)."""
+    name = type(new_landmarks.model).__name__
+    z, cov = numbers(new_landmarks.z, f"z of {name}"), numbers(new_landmarks.cov, f"cov of {name}")
+    return new_landmarks.model.initialise(state, z, cov)

@@ -1,0 +1,494 @@
+"""A map whose landmarks, with the frame that they are told in, are one Gaussian given a short sampled window of the path.
+
+A filter that samples its whole path forgets: resampling leaves all particles one past, and how the old map is bent, which
+nothing near the robot shows, is sampled once and never again (T. Bailey, J. Nieto and E. Nebot 2006). Here only the last
+few steps are sampled: the state y of a particle is the pose in a frame F, and
+
+    (ξ, s, l_1 … l_M) | y_1:t  ~  N(μ_i, P),        world_from_F = G Exp(ξ),
+
+with the substate s (a velocity, where there is one) and the landmarks in F. Each particle has means of its own; the
+covariance is the same for all, for it depends on the path in the second order only. `consolidate` ends a window: F moves to
+the robot, and what the particles differ by becomes a part of P, Mathematics (consolidation). Lineage: C. Brooks and
+T. Bailey 2008 (HybridSLAM), E. Eade and T. Drummond 2007 (coalesced observations).
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple, final
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from rbpf import gaussian
+from rbpf.core.checkpoint import checked, within
+from rbpf.core.genealogy import Lineage
+from rbpf.core.linearisation import linearise
+from rbpf.core.models import (
+    NEW,
+    NULL,
+    Belief,
+    Jacobians,
+    Landmark,
+    LogDensities,
+    Map,
+    NewLandmarks,
+    ObservationModel,
+    Observations,
+    Part,
+    Records,
+    Transition,
+)
+from rbpf.core.particles import Estimate, Information, Particles, Prior, take, uniform_log_weights
+from rbpf.errors import InputError
+from rbpf.lie import Euclidean, LieGroup, SE2Group, SE3Group, skew
+from rbpf.maps.any_map import checked_new_ids, expected, first_records, projected
+from rbpf.maps.point import Point
+
+
+class _Rows(NamedTuple):
+    """All rows of a step: ν (N, R), H (N, R, d), and what all particles share: J (R, c) of columns (c,), S = L Lᵀ."""
+
+    nu: np.ndarray
+    by_state: np.ndarray
+    by_marginal: np.ndarray
+    columns: np.ndarray
+    chol: np.ndarray
+    log_factor: float
+
+    @property
+    def log_det(self) -> float:
+        """log|2πS|."""
+        return 2.0 * float(np.log(np.diagonal(self.chol)).sum()) + self.nu.shape[1] * float(
+            np.log(2.0 * np.pi)
+        )
+
+
+@final
+class JointMap(Map):
+    """Points, the frame's pose and a substate as one Gaussian; give the filter a `Consolidation` with it.
+
+    The motion, and what is observed of landmarks, must not change when the whole world is moved, as it is with odometry and
+    sensors on the robot. An observation of the state alone, as a position fix, is of its pose in the world. Landmarks are
+    associated alike in all particles, likelihoods are Gaussian, and all observations update state and landmarks.
+
+    Args:
+        space: SE2 or SE3 with `Point(2)` or `Point(3)`; Euclidean(n), whose points are vectors (n,).
+        substate: mean (m,) and covariance (m, m) of what drives the motion (`Transition.coupling`), told in the robot's
+            frame; None has none. It may be observed together with a landmark.
+
+    Attributes:
+        mean: (N, d + m + M D) of ξ, s and the landmarks.
+        cov: (d + m + M D, …), common to all particles.
+        origin: (E,) G.
+    """
+
+    evidence = False
+
+    def __init__(
+        self,
+        space: SE2Group | SE3Group | Euclidean,
+        substate: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> None:
+        self.space = space
+        self.point = Point(
+            2 if isinstance(space, SE2Group) else 3 if isinstance(space, SE3Group) else space.dim
+        )
+        mean, cov = (np.zeros(0), np.zeros((0, 0))) if substate is None else map(np.asarray, substate)
+        if cov.shape != (mean.size, mean.size):
+            raise InputError(f"a substate with mean {mean.shape} needs a square cov, got {cov.shape}")
+        gaussian.psd_factor(cov)
+        self._substate = mean, cov
+        self._first = space.dim + mean.size
+        self.also = frozenset({Part.STATE, Part.SUBSTATE} if mean.size else {Part.STATE})
+
+    def begin(self, n: int, lineage: Lineage) -> None:
+        """No landmark; the frame is the world's."""
+        d = self.space.dim
+        self.n = n
+        self.origin = self.space.identity()
+        self.mean = np.zeros((n, self._first))
+        self.cov = np.zeros((self._first, self._first))
+        self.mean[:, d:], self.cov[d:, d:] = self._substate
+        self._ids = np.zeros(0, dtype=np.int64)
+        self._next_id = 0
+        self._gain: np.ndarray | None = None
+
+    def predict(self, transition: Transition, space: LieGroup) -> Prior:
+        """Joint distribution of the increment ε and all that is held, kept as (ξ, s, l) | ε; without a substate as it is."""
+        coupling, dynamics, drift = transition.coupling, transition.dynamics, transition.drift
+        d, m = space.dim, self._first - space.dim
+        if not m:
+            return Map.predict(self, transition, space)
+        sizes = [None if block is None else block.shape[1:] for block in (coupling, dynamics, drift)]
+        if coupling is None or dynamics is None or drift is None or sizes != [(d, m), (m, m), (m,)]:
+            raise InputError(
+                f"the substate has {m} numbers: the motion model must give coupling (·, {d}, {m}), dynamics "
+                f"(·, {m}, {m}) and drift (·, {m}), not {sizes}"
+            )
+        here = slice(d, self._first)
+        substate = self.mean[:, here, None]
+        self._increment_mean = (coupling @ substate)[..., 0]
+        self._predicted = self.mean.copy()
+        self._predicted[:, here] = (dynamics @ substate)[..., 0] + drift
+        # What particles may differ by here changes the covariance in the second order.
+        B, A, L = (block.mean(axis=0) for block in (coupling, dynamics, transition.noise_factor))
+        noise = L @ L.T
+        increment = gaussian.symmetrise(B @ self.cov[here, here] @ B.T) + noise[:d, :d]
+        cross = self.cov[:, here] @ B.T
+        cov = self.cov.copy()
+        cov[here] = A @ cov[here]
+        cov[:, here] = cov[:, here] @ A.T
+        cov[here, here] += noise[d:, d:]
+        cross[here] = A @ cross[here] + noise[d:, :d]
+        self._gain = cross @ np.linalg.pinv(increment, hermitian=True)
+        self._rest = gaussian.symmetrise(cov - self._gain @ increment @ self._gain.T)
+        factor = gaussian.psd_factor(increment)[None]
+        return Prior(space, transition.mean, self._increment_mean, factor, centred=False)
+
+    def information(self, state: np.ndarray, groups: Sequence[Observations], prior: Prior) -> Information:
+        """What all rows say together: they are correlated through the landmarks."""
+        increment = None if self._gain is None else self.space.local(prior.base, state)
+        mean, cov = self._given(increment)
+        rows = self._rows(state, mean, cov, groups)
+        by_state = rows.by_state
+        if increment is not None and self._gain is not None:
+            slope = self._gain[rows.columns] @ self.space.right_jacobian_inverse(increment)
+            by_state = by_state + rows.by_marginal @ slope
+        n, count, d = by_state.shape
+        white = _whitened(rows.chol, np.concatenate([rows.nu[..., None], by_state], axis=2))
+        nu, by_state = white[..., 0], white[..., 1:]
+        turned = np.swapaxes(by_state, 1, 2)
+        total = Information.zeros(n, d)
+        total.info += turned @ by_state
+        total.vector += (turned @ nu[..., None])[..., 0]
+        total.quad += np.square(nu).sum(axis=1)
+        total.log_det += rows.log_det
+        total.log_factor += rows.log_factor
+        total.rows += count
+        return total
+
+    def correct(
+        self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]
+    ) -> LogDensities:
+        """Log p(z | x), and one Kalman update by all rows: one gain, one covariance, the particles' own innovations."""
+        self.mean, self.cov = self._given(increment)
+        self._gain = None
+        if not groups:
+            return LogDensities(np.zeros(self.n), np.zeros(self.n))
+        rows = self._rows(state, self.mean, self.cov, groups)
+        nu = _whitened(rows.chol, rows.nu[..., None])[..., 0]
+        total = rows.log_factor - 0.5 * (np.square(nu).sum(axis=1) + rows.log_det)
+        slope = rows.by_marginal @ self.cov[rows.columns]
+        half = solve_triangular(rows.chol, slope, lower=True, check_finite=False)
+        self.mean = self.mean + nu @ half
+        self.cov = gaussian.symmetrise(self.cov - half.T @ half)
+        return LogDensities(total, np.zeros_like(total))
+
+    def resample(self, ancestors: np.ndarray) -> None:
+        """Copies means; the covariance is everyone's."""
+        self.mean = self.mean[ancestors]
+        if self._gain is not None:
+            self._predicted = self._predicted[ancestors]
+            self._increment_mean = take(self._increment_mean, ancestors)
+
+    def consolidate(self, particles: Particles) -> Particles:
+        """Ends the window: the frame moves to the robot; what the particles differ by enters the common covariance."""
+        self.origin, mean, self.cov = self._consolidated(particles)
+        self.mean = np.repeat(mean[None], self.n, axis=0)
+        return Particles(self.space.identity((self.n,)), uniform_log_weights(self.n))
+
+    def estimate(self, particles: Particles) -> Estimate:
+        """The robot's pose in the world: the samples' spread, and the frame's uncertainty."""
+        d, weights, world = self.space.dim, particles.weights, self.world(particles.state)
+        origin, turn = self.space.mean(world, weights), self._turn(particles)
+        within = turn @ self.cov[:d, :d] @ turn.T
+        between = _spread(self.space.local(origin, world), weights)
+        return Estimate(origin, gaussian.symmetrise(within + between))
+
+    def in_world(self, particles: Particles) -> tuple[np.ndarray, np.ndarray]:
+        """The landmarks in the world, means (M, D) and covariances (M, D, D), in the order of `ids`."""
+        origin, mean, cov = self._consolidated(particles)
+        d, dim = self.space.dim, self.point.dim
+        points, M = mean[self._first :].reshape(-1, dim), self._ids.size
+        # p = G Exp(ξ) l: ∂p/∂ξ = R [l's turn | I], ∂p/∂l = R.
+        slope = np.concatenate([self._by_turn(points), np.broadcast_to(np.eye(dim), (M, dim, dim))], axis=-1)
+        own = self._first + np.arange(M * dim).reshape(M, dim)
+        columns = np.concatenate([np.broadcast_to(np.arange(d), (M, d)), own], axis=1)
+        blocks = cov[columns[:, :, None], columns[:, None, :]]
+        by_both = np.concatenate([slope, np.broadcast_to(np.eye(dim), (M, dim, dim))], axis=-1)
+        by_both = self.space.rotation(origin) @ by_both
+        covs = gaussian.symmetrise(by_both @ blocks @ np.swapaxes(by_both, -1, -2))
+        return self.space.transform(origin, points), covs
+
+    def world(self, state: np.ndarray) -> np.ndarray:
+        """World_from_robot (N, E) of the particles, without what is uncertain about each one's frame."""
+        frame = self.space.retract(self.origin, self.mean[:, : self.space.dim])
+        return self.space.compose(frame, state)
+
+    def _consolidated(self, particles: Particles) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """World_from_frame, mean and covariance of the Gaussian in a frame at the robot, Mathematics (consolidation)."""
+        space, weights, state = self.space, particles.weights, particles.state
+        d, dim, n = space.dim, self.point.dim, self.mean.shape[1]
+        world = self.world(state)
+        origin = space.mean(world, weights)
+        # Every particle's means as seen from its own robot.
+        points = self.mean[:, self._first :].reshape(self.n, -1, dim)
+        seen = space.inverse_transform(state[:, None], points).reshape(self.n, -1)
+        moved = np.concatenate([space.local(origin, world), self.mean[:, d : self._first], seen], axis=1)
+        mean = weights @ moved
+        mean[:d] = 0.0  # the mean of all worlds is the origin
+        # The covariance that they had, turned with the mean: T P Tᵀ with T = diag(Ad J_r, I, Rᵀ, Rᵀ, …).
+        turn, back = self._turn(particles), space.rotation(space.mean(state, weights)).T
+
+        def turned(rows: np.ndarray) -> np.ndarray:
+            seen = back @ rows[self._first :].reshape(-1, dim, n)
+            return np.concatenate([turn @ rows[:d], rows[d : self._first], seen.reshape(-1, n)])
+
+        return origin, mean, gaussian.symmetrise(turned(turned(self.cov).T) + _spread(moved, weights))
+
+    def _turn(self, particles: Particles) -> np.ndarray:
+        """How the robot's pose moves with ξ: G Exp(ξ + dξ) y = G Exp(ξ) y Exp(Ad(y⁻¹) J_r(ξ) dξ), (d, d) at the means."""
+        centre = self.space.mean(particles.state, particles.weights)
+        frame = particles.weights @ self.mean[:, : self.space.dim]
+        return self.space.adjoint(self.space.inverse(centre)) @ self.space.right_jacobian(frame)
+
+    def _given(self, increment: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+        """Means (N, n) given increments (N, d), and the covariance; a substate has been seen through the increment."""
+        if self._gain is None or increment is None:
+            return self.mean, self.cov
+        return self._predicted + (increment - self._increment_mean) @ self._gain.T, self._rest
+
+    def _rows(
+        self, state: np.ndarray, mean: np.ndarray, cov: np.ndarray, groups: Sequence[Observations]
+    ) -> _Rows:
+        """Linearises all groups at the particles' own means; Jacobians by what is held are averaged over the particles."""
+        d, n = self.space.dim, mean.shape[1]
+        nus, by_states = [np.zeros((self.n, 0))], [np.zeros((self.n, 0, d))]
+        by_marginal, noises, log_factor = [np.zeros((0, n))], list[np.ndarray](), 0.0
+        for group in groups:
+            model, z, noise, ids = group.model, group.z, group.cov, self._checked_ids(group)
+            at, landmarks, substate = state[:, None], None, None
+            columns = np.zeros((z.shape[0], 0), dtype=np.int64)
+            if ids is not None:
+                log_factor += group.log_new * int((ids == NEW).sum()) + group.log_clutter * int(
+                    (ids == NULL).sum()
+                )
+                z, noise, ids = z[ids >= 0], noise[ids >= 0], ids[ids >= 0]
+                columns = self._columns(ids)
+                landmarks = mean[:, columns]
+            if Part.SUBSTATE in model.reads:
+                substate = mean[:, None, d : self._first]
+            in_world = model.reads == frozenset({Part.STATE})
+            if in_world:
+                frame = self.space.retract(self.origin, mean[:, :d])
+                at = self.space.compose(frame, state)[:, None]
+            nu, jac = linearise(model, self.space, z, at, landmarks, None, substate)
+            count, p = z.shape
+            block = np.zeros((count, p, n))
+            if jac.landmark is not None:
+                np.put_along_axis(
+                    block, np.repeat(columns[:, None], p, axis=1), jac.landmark.mean(axis=0), axis=2
+                )
+            if jac.substate is not None:
+                block[..., d : self._first] = jac.substate.mean(axis=0)
+            if in_world and jac.state is not None:
+                # world_from_robot = G Exp(ξ) y moves by Ad(y⁻¹) J_r(ξ) dξ.
+                turn = self.space.adjoint(self.space.inverse(state)) @ self.space.right_jacobian(mean[:, :d])
+                block[..., :d] = (jac.state @ turn[:, None]).mean(axis=0)
+            by_state = np.zeros((1, 1, 1, d)) if jac.state is None else jac.state
+            nus.append(np.broadcast_to(nu, (self.n, count, p)).reshape(self.n, -1))
+            by_states.append(np.broadcast_to(by_state, (self.n, count, p, d)).reshape(self.n, -1, d))
+            by_marginal.append(block.reshape(-1, n))
+            noises.extend(noise)
+        slope = np.concatenate(by_marginal)
+        used = np.flatnonzero(slope.any(axis=0))
+        slope = slope[:, used]
+        innovation = gaussian.symmetrise(slope @ cov[np.ix_(used, used)] @ slope.T)
+        end = 0
+        for noise in noises:
+            rows = slice(end, end := end + noise.shape[0])
+            innovation[rows, rows] += noise
+        chol = gaussian.cholesky(innovation) if end else innovation
+        return _Rows(
+            np.concatenate(nus, axis=1), np.concatenate(by_states, axis=1), slope, used, chol, log_factor
+        )
+
+    def _checked_ids(self, group: Observations) -> np.ndarray | None:
+        """Landmarks (K,) of a group, None where it reads none.
+
+        Raises:
+            InputError: the particles associate differently, a landmark is not held, or the likelihood is not Gaussian.
+        """
+        name, ids = type(group.model).__name__, group.ids
+        if group.likelihood is not None and group.likelihood.kernel_id != 0:
+            raise InputError(
+                f"a joint map takes Gaussian likelihoods, {name} has {type(group.likelihood).__name__}"
+            )
+        if group.updates != frozenset({Part.STATE, Part.LANDMARK}):
+            raise InputError(f"a joint map's observations update state and landmarks, {name}'s do not")
+        if Part.LANDMARK not in group.model.reads:
+            return None
+        if ids is None or ids.shape != (group.z.shape[0],):
+            shape = None if ids is None else ids.shape
+            raise InputError(
+                f"a joint map takes one association for all particles: {name} needs ids ({group.z.shape[0]},), "
+                f"got {shape}"
+            )
+        return ids
+
+    def _columns(self, ids: np.ndarray) -> np.ndarray:
+        """Places (K, D) of landmarks in the means.
+
+        Raises:
+            InputError: the map does not hold one of them.
+        """
+        order = np.argsort(self._ids)
+        held = self.holds(ids)
+        if not held.all():
+            raise InputError(f"the map holds no landmark {np.asarray(ids)[~held][0]}")
+        rows = order[np.searchsorted(self._ids, ids, sorter=order)]
+        return self._first + rows[:, None] * self.point.dim + np.arange(self.point.dim)
+
+    @property
+    def ids(self) -> np.ndarray:
+        return self._ids
+
+    @property
+    def stored_fraction(self) -> float:
+        size = self._ids.size * self.point.dim * (self.point.dim + 3) // 2
+        return (self.mean.nbytes + self.cov.nbytes) / max(8 * self.n * size, 1)
+
+    def holds(self, ids: np.ndarray) -> np.ndarray:
+        return np.isin(ids, self._ids)
+
+    def landmark_of(self, landmark_id: int) -> Landmark:
+        self._columns(np.array([landmark_id]))
+        return self.point
+
+    def are(self, ids: np.ndarray, landmark: Landmark) -> np.ndarray:
+        return self.holds(ids) & self._is_point(landmark)
+
+    def read(self, ids: np.ndarray, particles: np.ndarray | slice = slice(None)) -> Records:
+        columns = self._columns(np.asarray(ids))
+        mean = self.mean[particles][:, columns]
+        blocks = self.cov[columns[:, :, None], columns[:, None, :]]
+        return Records(mean, np.broadcast_to(blocks, (*mean.shape, mean.shape[-1])))
+
+    def add(self, new_landmarks: NewLandmarks, state: np.ndarray) -> np.ndarray:
+        if new_landmarks.mask is not None and not new_landmarks.mask.all():
+            raise InputError("a joint map's landmarks are in all particles")
+        records = first_records(new_landmarks, state)
+        return self.add_records(records, new_landmarks.landmark, None, new_landmarks.ids)
+
+    def add_records(
+        self,
+        records: Records,
+        landmark: Landmark,
+        log_odds: np.ndarray | None = None,
+        ids: np.ndarray | None = None,
+    ) -> np.ndarray:
+        if log_odds is not None or not self._is_point(landmark):
+            raise InputError(
+                f"a joint map of {self.space} holds Point({self.point.dim}) in all particles, "
+                f"not {type(landmark).__name__}"
+            )
+        if not (np.isfinite(records.mean).all() and np.isfinite(records.cov).all()):
+            raise InputError("a new landmark has a mean or covariance that is not finite")
+        count, size = records.mean.shape[1], self.mean.shape[1]
+        ids = checked_new_ids(ids, count, self._next_id, self.holds)
+        # Given the path, what is new owes its error to its own measurement alone.
+        mean = np.broadcast_to(records.mean, (self.n, count, self.point.dim)).reshape(self.n, -1)
+        self.mean = np.concatenate([self.mean, mean], axis=1)
+        cov = np.zeros((self.mean.shape[1],) * 2)
+        cov[:size, :size] = self.cov
+        self._ids = np.concatenate([self._ids, ids])
+        self._next_id = max(self._next_id, int(ids.max(initial=-1)) + 1)
+        columns = self._columns(ids)
+        cov[columns[:, :, None], columns[:, None, :]] = records.cov.mean(axis=0)
+        self.cov = cov
+        return ids
+
+    def remove(self, ids: np.ndarray) -> None:
+        gone = self._columns(ids).ravel()
+        self.mean = np.delete(self.mean, gone, axis=1)
+        self.cov = np.delete(np.delete(self.cov, gone, axis=0), gone, axis=1)
+        self._ids = self._ids[~np.isin(self._ids, ids)]
+
+    def promote(self, ids: Sequence[int] | np.ndarray, to: Landmark | None = None) -> None:
+        raise InputError("a joint map's landmarks are single Gaussian points already")
+
+    def log_odds(self, ids: np.ndarray) -> np.ndarray:
+        return np.zeros((self.n, ids.size))
+
+    def set_log_odds(self, ids: np.ndarray, log_odds: np.ndarray) -> None:
+        raise InputError("a joint map keeps no log-odds")
+
+    def innovations(
+        self, model: ObservationModel, z: np.ndarray, ids: np.ndarray, state: np.ndarray, particle: int
+    ) -> tuple[np.ndarray, Jacobians, Records]:
+        records = self.read(ids, slice(particle, particle + 1))
+        nu, jac = linearise(model, self.space, z, state[None], records.mean[0])
+        return nu, jac, records
+
+    def predictions(
+        self, model: ObservationModel, z: np.ndarray, cov: np.ndarray, ids: np.ndarray, belief: Belief
+    ) -> tuple[np.ndarray, np.ndarray]:
+        predicted, inside = expected(model, self.read(ids), belief)
+        return model.residual(z[:, None, :], predicted[:, None]), inside[:, None] + cov[:, None]
+
+    def project(
+        self, model: ObservationModel, ids: np.ndarray, belief: Belief
+    ) -> tuple[np.ndarray, np.ndarray]:
+        return projected(model, self.read(ids), belief)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Means, the covariance, the frame and the landmarks' ids."""
+        named = {"mean": self.mean, "cov": self.cov, "origin": self.origin, "ids": self._ids}
+        return {f"joint/{name}": array for name, array in named.items()} | {
+            "joint/next": np.array([self._next_id])
+        }
+
+    def options(self) -> dict[str, object]:
+        """Size of the substate."""
+        return {"joint substate": self._first - self.space.dim}
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """The inverse of `arrays`.
+
+        Raises:
+            InputError: an array is missing, or is not what it should be.
+        """
+        self._ids = within(arrays, "joint/ids", None, 0, np.iinfo(np.int64).max)
+        self._next_id = int(within(arrays, "joint/next", 1, 0, np.iinfo(np.int64).max)[0])
+        if np.unique(self._ids).size < self._ids.size or self._ids.max(initial=-1) >= self._next_id:
+            raise InputError("the array joint/ids names a landmark twice, or one that was never started")
+        size = self._first + self._ids.size * self.point.dim
+        self.mean = checked(arrays, "joint/mean", (self.n, size), "f").copy()
+        self.cov = checked(arrays, "joint/cov", (size, size), "f").copy()
+        self.origin = checked(arrays, "joint/origin", (self.space.size,), "f").copy()
+
+    def _by_turn(self, points: np.ndarray) -> np.ndarray:
+        """∂(Exp(ω) l)/∂ω (M, D, ·) at points (M, D): nothing for translations, a column in the plane, −[l]× in space."""
+        if isinstance(self.space, SE3Group):
+            return -skew(points)
+        columns = np.stack([-points[:, 1:2], points[:, :1]], axis=1)
+        return columns if isinstance(self.space, SE2Group) else columns[..., :0]
+
+    def _is_point(self, landmark: Landmark) -> bool:
+        return isinstance(landmark, Point) and landmark.dim == self.point.dim
+
+
+def _whitened(chol: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """L⁻¹ of rows (N, R, k), with one L (R, R) for all."""
+    n, count, k = rows.shape
+    flat = rows.transpose(1, 0, 2).reshape(count, -1)
+    if not count:
+        return rows
+    solved = solve_triangular(chol, flat, lower=True, check_finite=False)
+    return np.asarray(solved).reshape(count, n, k).transpose(1, 0, 2)
+
+
+def _spread(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Covariance (k, k) that weighted values (N, k) are a sample of: Σ W δδᵀ / (1 − ΣW²); of one particle, zero."""
+    offset = values - weights @ values
+    left = 1.0 - float(np.square(weights).sum())
+    return (weights[:, None] * offset).T @ offset / left if left > 0.0 else np.zeros((values.shape[1],) * 2)

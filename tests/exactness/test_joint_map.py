@@ -1,0 +1,318 @@
+"""The joint map against the Kalman filter: the same Gaussian, whenever the particles are consolidated."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.linalg import block_diag
+
+from rbpf.core.filter import Filter
+from rbpf.core.genealogy import Lineage
+from rbpf.core.likelihoods import TruncatedMahalanobis
+from rbpf.core.marginals import KalmanSubstate
+from rbpf.core.models import NewLandmarks, Observations, Part, Records
+from rbpf.core.particles import Particles, balanced
+from rbpf.core.proposals import PriorProposal
+from rbpf.core.resampling import Consolidation
+from rbpf.errors import InputError
+from rbpf.lie import SE2, SE3, Euclidean
+from rbpf.maps.joint_map import JointMap
+from rbpf.maps.landmark_map import LandmarkMap
+from rbpf.maps.point import Point
+from rbpf.motion.odometry import Odometry, OdometryMotion
+from rbpf.sensors.range_bearing import RelativePosition
+from tests.exactness.models import Frame, Kalman, LinearMotion, LinearObservation, Relative, Scripted
+from tests.exactness.slam import NOISE, LinearSlam
+from tests.exactness.test_linear_slam import STEP, Q, Walk
+
+EVERY_STEP = (Consolidation(window=1), Consolidation(window=9, threshold=1.0))
+TURN = 0.7
+
+
+def plane(consolidation, n=12, seed=0) -> Filter:
+    rng = np.random.default_rng(seed)
+    return Filter(
+        Walk(), Scripted(), JointMap(Euclidean(2)), None, None, n, rng, lag=1, consolidation=consolidation
+    )
+
+
+def told(filter_: Filter) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Mean of pose and landmarks in the world, and their covariances one by one."""
+    joint = filter_.belief().map
+    assert isinstance(joint, JointMap)
+    pose = joint.estimate(filter_.particles)
+    points, covs = joint.in_world(filter_.particles)
+    turn = joint.space.rotation(pose.mean)
+    return np.concatenate([pose.mean[-2:], points.ravel()]), [turn @ pose.cov[-2:, -2:] @ turn.T, *covs]
+
+
+def assert_same(filter_: Filter, kalman: Kalman, moving: int = 2, rtol: float = 1e-7) -> None:
+    mean, covs = told(filter_)
+    np.testing.assert_allclose(mean, np.delete(kalman.mean, np.s_[2:moving]), rtol, rtol)
+    for place, cov in zip([0, *range(moving, kalman.mean.size, 2)], covs, strict=True):
+        np.testing.assert_allclose(cov, kalman.cov[place : place + 2, place : place + 2], rtol, rtol)
+    assert filter_.log_evidence == pytest.approx(kalman.log_evidence, abs=10 * rtol)
+
+
+@pytest.fixture(scope="module")
+def world() -> LinearSlam:
+    return LinearSlam(np.eye(2), Q, STEP, Kalman(np.zeros(2), np.zeros((2, 2))), np.eye(2), seed=31)
+
+
+@pytest.mark.parametrize("consolidation", EVERY_STEP, ids=repr)
+@pytest.mark.parametrize("n", [10, 50])
+def test_consolidated_before_every_step_it_is_the_kalman_filter(world, consolidation, n):
+    filter_ = plane(consolidation, n)
+    for frame in world.frames(Relative()):
+        filter_.step(frame)
+    assert_same(filter_, world.kalman)
+
+
+@pytest.mark.parametrize(
+    "consolidation",
+    [Consolidation(2), Consolidation(3, 0.0), Consolidation(9, 0.9), Consolidation(9, 0.0)],
+    ids=repr,
+)
+@pytest.mark.parametrize("proposal", [None, PriorProposal()], ids=["ekf", "prior"])
+def test_whatever_the_trigger_it_comes_to_the_kalman_filter(world, consolidation, proposal):
+    filter_ = plane(consolidation, 6000)
+    for frame in world.frames(Relative()):
+        filter_.step(frame, proposal=proposal)
+    assert_same(filter_, world.kalman, rtol=0.06)
+
+
+def test_few_particles_stray_by_chance_not_to_one_side(world):
+    """Their mean over many runs is the exact one, where a window is longer than a step."""
+    runs = []
+    for seed in range(300):
+        filter_ = plane(Consolidation(3), 30, seed)
+        for frame in world.frames(Relative()):
+            filter_.step(frame)
+        runs.append(
+            np.append(told(filter_)[0] - world.kalman.mean, filter_.log_evidence - world.kalman.log_evidence)
+        )
+    runs = np.array(runs)
+    assert np.abs(runs.mean(axis=0) / (runs.std(axis=0) / np.sqrt(len(runs)))).max() < 3.5
+    assert (runs[:, :-1].std(axis=0) < 0.2 * np.sqrt(np.diag(world.kalman.cov))).all()
+
+
+def test_a_turned_robot_whose_heading_is_known():
+    c, s = np.cos(TURN), np.sin(TURN)
+    turned = np.array([[c, -s], [s, c]])
+    start = Kalman(np.array([1.0, -2.0]), np.zeros((2, 2)))
+    world = LinearSlam(np.eye(2), turned @ Q @ turned.T, turned @ STEP, start, turned, seed=32)
+    filter_ = Filter(
+        OdometryMotion(SE2), Scripted(), JointMap(SE2), n=12, start=np.array([TURN, 1.0, -2.0]), lag=1,
+        consolidation=Consolidation(1), rng=np.random.default_rng(0),
+    )  # fmt: skip
+    odometry = Odometry(np.append(0.0, STEP), block_diag(0.0, Q))
+    for frame in world.frames(RelativePosition(SE2)):
+        filter_.step(frame, odometry)
+    assert_same(filter_, world.kalman)
+
+
+class Doppler(Relative):
+    """Where a landmark will be seen a moment later: it reads the velocity, too."""
+
+    reads = frozenset({Part.STATE, Part.LANDMARK, Part.SUBSTATE})
+
+    def predict(self, state, landmark=None, const=None, substate=None):
+        return landmark - state - 0.5 * substate
+
+
+def test_a_velocity_a_fix_and_what_reads_velocity_and_landmark_together():
+    factor = np.array([[0.3, 0.0, 0.0], [0.0, 0.3, 0.0], [0.1, 0.0, 0.2], [0.0, 0.05, 0.2]])
+    motion = LinearMotion(np.eye(2), factor, 0.7 * np.eye(2), 0.9 * np.eye(2), np.array([0.1, 0.0]))
+    F, noise, drift = motion.joint()
+    kalman = Kalman(np.array([0.0, 0.0, 0.6, 0.2]), np.diag([0.0, 0.0, 0.3, 0.2]))
+    joint = JointMap(motion.space, (kalman.mean[2:], kalman.cov[2:, 2:]))
+    filter_ = Filter(
+        motion, Scripted(), joint, n=12, lag=1, consolidation=Consolidation(1), rng=np.random.default_rng(1)
+    )
+    rng, unit, fix = np.random.default_rng(5), np.eye(2), LinearObservation(np.eye(2))
+    covs = NOISE[None]
+    for t in range(6):
+        z = rng.normal(size=(3, 2))
+        still = np.zeros((kalman.mean.size - 4,) * 2)
+        kalman.predict(
+            block_diag(F, np.eye(len(still))),
+            block_diag(noise, still),
+            np.append(drift, np.zeros(len(still))),
+        )
+        groups = [Observations(z[2:], covs, fix)] if t % 3 == 2 else []
+        if groups:
+            kalman.update(z[2], np.eye(2, kalman.mean.size), NOISE)
+        if t:
+            ids = np.zeros(1, dtype=np.int64)
+            groups += [
+                Observations(z[:1], covs, Relative(), ids=ids),
+                Observations(z[1:2], covs, Doppler(), ids=ids),
+            ]
+            kalman.update(z[0], np.hstack([-unit, 0 * unit, unit]), NOISE)
+            kalman.update(z[1], np.hstack([-unit, -0.5 * unit, unit]), NOISE)
+        else:
+            kalman.augment(z[0], np.eye(2, 4), NOISE)
+        filter_.step(Frame(groups, [] if t else [NewLandmarks(z[:1], covs, Relative(), Point(2))]))
+    assert_same(filter_, kalman, moving=4)
+    np.testing.assert_allclose(joint.mean[:, 2:4], np.tile(kalman.mean[2:4], (12, 1)), 1e-7)
+    np.testing.assert_allclose(joint.cov[2:4, 2:4], kalman.cov[2:4, 2:4], 1e-7)
+
+
+def test_the_order_of_sensors_and_landmarks_does_not_matter(world):
+    """A group apiece, and all of them in the opposite order."""
+    ends = []
+    for order in (1, -1):
+        filter_ = plane(Consolidation(2), 20, seed=3)
+        for frame in world.frames(Relative()):
+            apart = [
+                replace(group, z=group.z[k : k + 1], cov=group.cov[k : k + 1], ids=group.ids[k : k + 1])
+                for group in frame.groups
+                for k in range(group.z.shape[0])
+            ]
+            filter_.step(Frame(apart[::order], frame.new_landmarks))
+        ends.append((*told(filter_), filter_.log_evidence))
+    for first, second in zip(*ends, strict=True):
+        np.testing.assert_allclose(first, second, 1e-9, 1e-12)
+
+
+def held(space, n: int, landmarks: int, seed: int = 4) -> tuple[JointMap, Particles]:
+    """A map in the middle of a window: its particles differ, and everything is correlated."""
+    rng = np.random.default_rng(seed)
+    joint, dim = JointMap(space), 2 if space is SE2 else 3
+    joint.begin(n, Lineage(n))
+    mean = rng.normal(size=(n, landmarks, dim)) * 0.02 + 3 * rng.normal(size=(landmarks, dim))
+    joint.add_records(Records(mean, np.broadcast_to(np.eye(dim), (*mean.shape, dim))), joint.point)
+    joint.mean[:, : space.dim] = 0.02 * rng.normal(size=(n, space.dim))
+    root = 0.05 * rng.normal(size=joint.cov.shape)
+    joint.cov, joint.origin = root @ root.T, space.exp(rng.normal(size=space.dim))
+    state = space.retract(space.exp(0.4 * rng.normal(size=space.dim)), 0.02 * rng.normal(size=(n, space.dim)))
+    weights = rng.uniform(0.5, 1.5, n)
+    return joint, Particles(state, np.log(weights / weights.sum()))
+
+
+@pytest.mark.parametrize("space", [SE2, SE3], ids=repr)
+def test_what_is_told_of_the_world_is_the_gaussian_carried_over(space):
+    """Of one particle: the covariance by numeric derivatives of the pose and the points by everything held."""
+    joint, particles = held(space, 1, 3)
+    state, d, step = particles.state[0], space.dim, 1e-6
+
+    def carried(mean: np.ndarray) -> np.ndarray:
+        frame = space.retract(joint.origin, mean[:d])
+        points = space.transform(frame, mean[d:].reshape(3, -1))
+        return np.append(space.local(pose.mean, space.compose(frame, state)), points)
+
+    pose = joint.estimate(particles)
+    points, covs = joint.in_world(particles)
+    np.testing.assert_allclose(carried(joint.mean[0]), np.append(np.zeros(d), points), atol=1e-12)
+    steps = step * np.eye(joint.mean.shape[1])
+    jac = np.array([carried(joint.mean[0] + e) - carried(joint.mean[0] - e) for e in steps]).T / (2 * step)
+    cov = jac @ joint.cov @ jac.T
+    np.testing.assert_allclose(pose.cov, cov[:d, :d], atol=1e-8)
+    for k, own in enumerate(covs):
+        at = slice(d + k * joint.point.dim, d + (k + 1) * joint.point.dim)
+        np.testing.assert_allclose(own, cov[at, at], atol=1e-8)
+
+
+@pytest.mark.parametrize("landmarks", [0, 3])
+@pytest.mark.parametrize("space", [SE2, SE3], ids=repr)
+def test_consolidation_changes_nothing_that_is_told(space, landmarks):
+    joint, particles = held(space, 20, landmarks)
+    before = joint.estimate(particles), joint.in_world(particles)
+    particles = joint.consolidate(particles)
+    assert (particles.state == space.identity()).all() and (joint.mean == joint.mean[0]).all()
+    after = joint.estimate(particles), joint.in_world(particles)
+    for first, second in zip(
+        (before[0].mean, before[0].cov, *before[1]), (after[0].mean, after[0].cov, *after[1]), strict=True
+    ):
+        np.testing.assert_allclose(first, second, atol=1e-12)
+    assert np.linalg.eigvalsh(joint.cov).min() > -1e-12
+
+
+def test_particles_of_weight_zero_count_for_nothing():
+    joint, particles = held(SE2, 20, 3)
+    log_weights = np.concatenate([particles.log_weights[:15], np.full(5, -np.inf)])
+    log_weights -= np.log(np.exp(log_weights).sum())
+    alone = held(SE2, 20, 3)[0]
+    alone.mean, alone.n = alone.mean[:15], 15
+    joint.consolidate(Particles(particles.state, log_weights))
+    alone.consolidate(Particles(particles.state[:15], log_weights[:15]))
+    np.testing.assert_allclose(joint.mean[0], alone.mean[0], atol=1e-12)
+    np.testing.assert_allclose(joint.cov, alone.cov, atol=1e-12)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_hardly_any_particles(world, n):
+    """They stray, but everything stays finite; what one particle lacks is the uncertainty of the path."""
+    filter_ = plane(Consolidation(2), n)
+    for frame in world.frames(Relative()):
+        filter_.step(frame)
+    mean, covs = told(filter_)
+    assert np.isfinite(mean).all() and np.isfinite(filter_.log_evidence)
+    assert np.linalg.eigvalsh(covs).min() >= (0.0 if n == 1 else 1e-6) - 1e-12
+    assert np.abs(mean - world.kalman.mean).max() < 6 * np.sqrt(world.kalman.cov.diagonal().max())
+
+
+def test_draws_have_the_moments_of_independent_ones():
+    rng = np.random.default_rng(0)
+    weights = rng.uniform(0.2, 1.0, 30)
+    weights /= weights.sum()
+    apart = rng.normal(size=(30, 2))
+    noise = balanced(rng.normal(size=(30, 4)), weights, apart)
+    np.testing.assert_allclose(weights @ noise, 0.0, atol=1e-14)
+    np.testing.assert_allclose((weights[:, None] * apart).T @ noise, 0.0, atol=1e-14)
+    expected = (1.0 - np.square(weights).sum()) * np.eye(4)
+    np.testing.assert_allclose((weights[:, None] * noise).T @ noise, expected, atol=1e-13)
+
+
+def test_a_checkpoint_in_the_middle_of_a_window(world, tmp_path):
+    frames = world.frames(Relative())
+    whole, second = plane(Consolidation(3), seed=1), plane(Consolidation(3), seed=2)
+    for frame in frames[:2]:
+        whole.step(frame)
+    whole.save(tmp_path / "half.npz")
+    second.load(tmp_path / "half.npz")
+    for filter_ in (whole, second):
+        for frame in frames[2:]:
+            filter_.step(frame)
+    assert second.log_evidence == whole.log_evidence
+    for name, array in whole.belief().map.arrays().items():
+        assert array.tobytes() == second.belief().map.arrays()[name].tobytes()
+    with pytest.raises(InputError, match="consolidation"):
+        plane(Consolidation(4)).load(tmp_path / "half.npz")
+
+
+def test_a_landmark_that_is_dropped_leaves_the_rest_as_it_is():
+    joint, particles = held(SE3, 10, 4)
+    joint.remove(np.array([1]))
+    kept = held(SE3, 10, 4)[0].in_world(particles)
+    np.testing.assert_array_equal(joint.ids, [0, 2, 3])
+    for whole, rest in zip(kept, joint.in_world(particles), strict=True):
+        np.testing.assert_allclose(whole[[0, 2, 3]], rest, atol=1e-12)
+
+
+def test_what_a_joint_map_does_not_take(world):
+    z, covs, one = np.zeros((1, 2)), NOISE[None], np.zeros(1, dtype=np.int64)
+    group = Observations(z, covs, Relative(), ids=one)
+    first = Frame([], [NewLandmarks(z, covs, Relative(), Point(2))])
+    refused = {
+        "takes Gaussian likelihoods": replace(group, likelihood=TruncatedMahalanobis()),
+        "one association for all particles": replace(group, ids=np.zeros((12, 1), dtype=np.int64)),
+        "update state and landmarks": replace(group, updates=frozenset({Part.STATE})),
+        "holds no landmark 7": replace(group, ids=one + 7),
+    }
+    for words, wrong in refused.items():
+        filter_ = plane(Consolidation(1))
+        filter_.step(first)
+        with pytest.raises(InputError, match=words):
+            filter_.step(Frame([wrong]))
+    with pytest.raises(InputError, match=r"holds Point\(2\)"):
+        plane(Consolidation(1)).step(Frame([], [NewLandmarks(z, covs, Relative(), Point(3))]))
+    space = Euclidean(2)
+    substate = KalmanSubstate(space, np.zeros(2), np.eye(2))
+    with pytest.raises(InputError, match="LandmarkMap cannot take in"):
+        Filter(Walk(), Scripted(), LandmarkMap(space), n=5, consolidation=Consolidation(1)).step(Frame())
+    two = Filter(Walk(), Scripted(), [JointMap(space), substate], n=5, consolidation=Consolidation(1))
+    with pytest.raises(InputError, match="one conditional, not 2"):
+        two._consolidate()
+    with pytest.raises(InputError, match="a window has"):
+        Consolidation(window=0)
