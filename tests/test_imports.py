@@ -5,6 +5,8 @@ import pkgutil
 import subprocess
 import sys
 
+import pytest
+
 import rbpf
 
 HEAVY = ("gtsam", "pycolmap", "cv2")
@@ -12,6 +14,8 @@ FREE_TO_NEED_THEM = ("rbpf.validation", "rbpf.cli")
 
 IMPORTED = """
 import sys
+
+import pytest
 before = set(sys.modules)
 {statement}
 top = {{name.split(".")[0] for name in set(sys.modules) - before}}
@@ -57,6 +61,7 @@ def test_the_public_names_need_neither_pictures_nor_what_only_tests_use():
     assert not imported_by("from rbpf import *") & unwanted
 
 
+@pytest.mark.slow
 def test_everything_but_validation_imports_without_optimisers_and_image_processing():
     modules = modules_that_need_no_heavy_import()
     assert {"rbpf.sensors", "rbpf.motion", "rbpf.maps", "rbpf.systems"} <= set(modules)

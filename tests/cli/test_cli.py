@@ -117,6 +117,7 @@ def test_config_repeats_the_run(log, tmp_path):
     assert outputs(tmp_path / "a") == outputs(tmp_path / "b")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("association", ["known", "ml"])
 def test_a_resumed_run_is_identical(log, tmp_path, association, monkeypatch):
     arguments = ("--association", association, "--set", "checkpoint_every=15")

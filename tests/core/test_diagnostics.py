@@ -60,11 +60,13 @@ def mean_nees(claimed: float) -> float:
     return total / RUNS
 
 
+@pytest.mark.slow
 def test_an_honest_filter_stays_in_the_band():
     band = chi_square_band(dof=2, runs=RUNS)
     assert band.low < mean_nees(STD_FIX) < band.high
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("claimed", "side"), [(0.5 * STD_FIX, "high"), (2.5 * STD_FIX, "low")])
 def test_a_dishonest_filter_leaves_it(claimed, side):
     band = chi_square_band(dof=2, runs=RUNS)

@@ -1,6 +1,7 @@
 """A filter with a fixed lag runs for ever in the same memory."""
 
 import numpy as np
+import pytest
 
 from rbpf.core.filter import Filter
 from rbpf.lie import SE2
@@ -15,6 +16,7 @@ STEPS, N = 3000, 12
 POINTS = np.array([[3.0, 0.0], [0.0, 4.0], [-5.0, -1.0], [2.0, -3.0]])
 
 
+@pytest.mark.slow
 def test_constant_memory_with_a_lag():
     """The robot stands among four landmarks, of which it sees each one in turn."""
     rng = np.random.default_rng(0)

@@ -67,6 +67,7 @@ def test_rows_count_by_the_weight_of_the_particles_that_use_them(outcome, compil
     assert found.nis == pytest.approx(one.nis * fraction, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_a_filter_that_is_right_has_a_ratio_of_one_whatever_is_gated_or_split():
     """Measurements of a known landmark, some of which are wrong; half of the particles take its twin."""
     rng, steps = np.random.default_rng(5), 600

@@ -103,6 +103,7 @@ def test_the_exact_velocity_given_the_path():
     assert filter_.lineage.generation == 0
 
 
+@pytest.mark.slow
 def test_evidence_and_moments_are_the_joint_kalman_filters():
     """Before sampling they are exact in the first moving step; later ones in the mean over runs."""
     z = measurements(1)

@@ -97,6 +97,7 @@ def test_single_steps_neither_begin_nor_end_overconfidence(nees, expected):
     assert left_for_good(nees, 2.0) == expected
 
 
+@pytest.mark.slow
 def test_a_robot_that_is_told_three_times_too_little_noise_is_overconfident():
     from examples.studies.verdict import scale_sensor_noise
 
@@ -173,6 +174,7 @@ def test_pixels_come_again_in_reverse():
     assert log_there_and_back(replace(log, truth=None)).truth is None
 
 
+@pytest.mark.slow
 def test_pairs_come_again_in_reverse(tmp_path):
     rig = RectifiedStereo(Pinhole(80, 60, 62.5, 62.5, 39.5, 29.5), 0.12)
     world, imaging = TexturedLab(LabDrive(frames=3), texel_m=0.05), Imaging(known=0)

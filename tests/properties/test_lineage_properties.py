@@ -27,6 +27,7 @@ class Composed:
         self.rows[self.now] = np.arange(ancestors.size)
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 2**32 - 1))
 def test_rows_are_composed_ancestors(seed):
     rng = np.random.default_rng(seed)

@@ -140,6 +140,7 @@ class Trial:
         return met
 
 
+@pytest.mark.slow
 @given(n=st.integers(1, 9), seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=40)
 def test_reads_like_copies(n, seed):

@@ -66,6 +66,7 @@ def test_rendered_boards_give_the_fisheye_that_rendered_them():
     assert calibrate(views, BOARD, *SIZE).rms_px > 0.5
 
 
+@pytest.mark.slow
 def test_errors_of_a_fisheye_are_those_that_the_standard_deviations_tell():
     normalised = []
     for seed in range(10):

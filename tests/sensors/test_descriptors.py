@@ -177,6 +177,7 @@ def filled(descriptors):
     return store
 
 
+@pytest.mark.slow
 @given(
     st.lists(
         st.tuples(st.integers(0, 90), st.lists(st.integers(0, 200), max_size=30, unique=True)), max_size=6

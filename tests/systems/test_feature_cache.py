@@ -22,6 +22,7 @@ def sequence():
     return pairs(COUNT, lambda t, frame: missing(frame) if t == BAD else frame)
 
 
+@pytest.mark.slow
 def test_the_same_run(tmp_path):
     """To the last bit, with what was wrong with a pair; a part of it, and from the middle on."""
     told = []

@@ -91,6 +91,7 @@ def test_the_first_image_shows_that_points_are_uncertain_across_the_line_of_sigh
     np.testing.assert_allclose(fractions[2], ISOTROPIC, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_points_with_errors_along_the_line_of_sight_place_the_camera_honestly():
     """The squared error of their frame is what its covariance says, 6, but for the least fraction across the line."""
     rng, nees = np.random.default_rng(5), []

@@ -93,6 +93,7 @@ def test_uncertain_points_make_an_uncertain_pose(mapped):
     assert stds[1] > 1.5 * stds[0]
 
 
+@pytest.mark.slow
 def test_a_camera_that_sees_something_else_is_lost_and_says_how_little_it_knows(mapped):
     blank = from_frame(sequence(MAPPED + 4, lambda _t, image: image // 4 + 100), MAPPED)
     other = replace(

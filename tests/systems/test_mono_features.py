@@ -236,6 +236,7 @@ def scores(known_as: str, seeds: range) -> np.ndarray:
     return np.array([nees(one(seed)) for seed in seeds])
 
 
+@pytest.mark.slow
 def test_the_stated_uncertainty():
     """Mean NEES, 6 if consistent: near it as a frame; separate landmarks lose what the frame keeps together."""
     frame, points = (scores(mode, range(24)) for mode in ("frame", "points"))

@@ -99,6 +99,7 @@ def resampled(monkeypatch) -> list[int]:
     return done
 
 
+@pytest.mark.slow
 def test_frames_are_adjusted_ever_less_often(adjusted):
     config = StartConfig(first_adjustment=5, growth=1.5, depth_std_ratio=1e-6)
     run(LOG, replace(SMALL, start=config))
@@ -112,6 +113,7 @@ def test_frames_are_adjusted_ever_less_often(adjusted):
     assert adjusted == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("velocity", ["marginal", "joint", "paper"])
 def test_every_velocity_goes_on_from_the_path_that_was_drawn(velocity, resampled):
     config = replace(SMALL, velocity=VelocityConfig(velocity), particles=30)
@@ -147,6 +149,7 @@ def test_nothing_is_resampled_when_frames_have_too_little_in_common():
     assert_the_same(apart, NEVER, SMALL)
 
 
+@pytest.mark.slow
 def test_frames_without_features_are_passed_over(resampled):
     empty = changed(
         changed(LOG, 3, lambda frame: rows(frame, np.arange(0))), 4, lambda frame: rows(frame, np.arange(0))
@@ -187,6 +190,7 @@ def test_poses_between_are_on_the_way():
     np.testing.assert_allclose(both[0], both[1], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_start_that_shows_nothing_at_first_begins_later(resampled):
     """Logs and videos alike: a lens cap is no loss of a camera that has seen nothing yet."""
     blank = LOG
@@ -215,6 +219,7 @@ def test_what_the_new_map_has_not_is_not_looked_for(resampled):
     assert resampled and set(np.flatnonzero(table.alive).tolist()) <= held
 
 
+@pytest.mark.slow
 def test_where_the_lens_has_no_direction_the_start_does_not_stop(resampled):
     folded = replace(known(LOG.camera), distortion=(-0.25, 0.0, 0.0, 0.0, 0.0))
     frames = list(LOG.frames)

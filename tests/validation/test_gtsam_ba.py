@@ -117,6 +117,7 @@ def test_the_joint_ekf_ends_where_the_batch_does_if_the_noise_is_small(dim):
     assert filtered.log_evidence == pytest.approx(solve_by_scipy(m).log_evidence, abs=0.05)
 
 
+@pytest.mark.slow
 def test_a_robust_loss_is_opt_in_and_is_hubers():
     m = world(2, "range_bearing")
     z = m.z.copy()

@@ -37,6 +37,7 @@ def test_nothing_is_advised_where_nothing_contradicts():
     assert noise_advice(record("mono"), []) == ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("claimed", [4.0, 0.25])
 def test_a_filter_of_fixes_is_told_its_noise(claimed):
     """Fixes of 1 m on a walk of 1 m per step; advice that is followed again and again ends near the truth."""

@@ -77,6 +77,7 @@ def blocked(log: FeatureLog, scene: Scene) -> int:
     return count
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "world", [DeskWorld(frames=60, blocks=8), LabWorld(LabDrive(frames=6, every=100), points=2000)]
 )

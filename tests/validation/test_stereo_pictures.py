@@ -85,6 +85,7 @@ class Stream:
         self.logged.setdefault(f"time/{name}", []).append(time)
 
 
+@pytest.mark.slow
 def test_features_in_the_recording(run, tmp_path, monkeypatch):
     """Every pair's features under what they were, half a pixel aside, and landmarks where the map has them."""
     rr = pytest.importorskip("rerun")
