@@ -37,4 +37,4 @@ def numbers(array: ArrayLike, what: str) -> NDArray[np.float64]:
     given = np.asarray(array)
     if given.dtype.kind not in "fiub":
         raise InputError(f"{what} must hold real numbers, got {given.dtype}")
-    return np.require(given, np.float64, "CW")
+    return np.require(given, np.float64, ["C", "W"])

@@ -458,7 +458,7 @@ def checked_observations(group: Observations) -> Observations:
         group,
         z=numbers(group.z, f"z of {name}"),
         cov=numbers(group.cov, f"cov of {name}"),
-        ids=np.require(ids, np.int64, "CW") if ids is not None and ids.dtype.kind in "iu" else ids,
+        ids=np.require(ids, np.int64, ["C", "W"]) if ids is not None and ids.dtype.kind in "iu" else ids,
     )
     count, p = group.z.shape[0], group.model.dim
     if group.z.shape != (count, p) or group.cov.shape != (count, p, p):
