@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rbpf.sensors.readers.images.part import Chosen
 from rbpf.sensors.readers.images.sequence import ImageFrame, ImageSequence, Source
 
 Fault = Callable[[ImageSequence], ImageSequence]
@@ -33,27 +34,6 @@ class Painted(Source):
                 for image, is_right in ((frame.image, False), (frame.right, True))
             )
             yield replace(frame, image=left, right=right)
-
-
-@dataclass(frozen=True)
-class Chosen(Source):
-    """Some images of another source, and what they say of their time."""
-
-    source: Source
-    rows: np.ndarray
-    stamps_ns: np.ndarray
-
-    def frames(self, start: int) -> Iterator[ImageFrame]:
-        """From number `start` on."""
-        wanted = dict(zip(self.rows[start:].tolist(), self.stamps_ns[start:].tolist(), strict=True))
-        if not wanted:
-            return
-        first = int(self.rows[start])
-        for row, frame in enumerate(self.source.frames(first), first):
-            if row in wanted:
-                yield replace(frame, stamp_ns=wanted[row])
-            if row == self.rows[-1]:
-                return
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from rbpf.errors import InputError
 
 if TYPE_CHECKING:
     from rbpf.sensors.calibration import Board, MarkerBoard
+    from rbpf.sensors.readers.images.part import Part
     from rbpf.sensors.readers.images.sequence import Topics
 
 Flag = tyro.conf.FlagCreatePairsOff[bool]
@@ -82,7 +83,12 @@ class ImageRunOptions(RunOptions):
     """Of every run over images.
 
     Attributes:
-        calibration: camera.yaml in place of the sequence's own; by default that one is read.
+        calibration: camera.yaml in place of the sequence's own, of the images before they are resized; by default that one
+            is read.
+        start: use the images from so many seconds after the first on.
+        end: use the images until so many seconds after the first; by default all.
+        every: of these use each so many-th.
+        resize: make the images smaller, to this width in px, and the calibration with them; by default they stay as they are.
         image_topic: of a ROS bag, the topic of the images, or LEFT,RIGHT; by default those that the bag has.
         truth_topic: of a ROS bag, the topic of the camera's true poses; by default none.
         rerun: also write a recording (.rrd) for the Rerun viewer; by default none.
@@ -93,6 +99,10 @@ class ImageRunOptions(RunOptions):
     """
 
     calibration: Where = None
+    start: float = 0.0
+    end: Real = None
+    every: int = 1
+    resize: Whole = None
     image_topic: Text = None
     truth_topic: Text = None
     rerun: Where = None
@@ -272,6 +282,13 @@ def given_topics(options: ImageRunOptions) -> "Topics":
     from rbpf.sensors.readers.images.sequence import Topics
 
     return Topics.parse(options.image_topic, options.truth_topic)
+
+
+def given_part(options: ImageRunOptions) -> "Part":
+    """The part of `--start`, `--end`, `--every` and `--resize`."""
+    from rbpf.sensors.readers.images.part import Part
+
+    return Part(options.start, options.end, options.every, options.resize)
 
 
 def given_markers(options: MonoOptions) -> "MarkerBoard | None":

@@ -19,6 +19,7 @@ from rbpf.cli.options import (
     given,
     given_board,
     given_markers,
+    given_part,
     given_topics,
 )
 from rbpf.cli.showing import Told, answer, progress, say
@@ -72,7 +73,14 @@ def run_mono(options: Annotated[MonoOptions, tyro.conf.arg(name="")]) -> None:
         raise InputError("a camera is found in a known map with both: --map RUN --localize")
     markers, points = given_markers(options), options.known_points
     recording = MonoRecording(
-        options.sequence, points, options.calibration, board, options.map, markers, given_topics(options)
+        options.sequence,
+        points,
+        options.calibration,
+        board,
+        options.map,
+        markers,
+        given_topics(options),
+        given_part(options),
     )
     video = options.video
     if recording.live is not None:
@@ -92,7 +100,9 @@ def run_stereo(options: Annotated[StereoOptions, tyro.conf.arg(name="")]) -> Non
 
     named = given(options, "particles", "seed", "dof")
     config = load_settings(StereoConfig, "stereo", options.config, options.set, named)
-    recording = StereoRecording(options.sequence, options.calibration, given_topics(options))
+    recording = StereoRecording(
+        options.sequence, options.calibration, given_topics(options), given_part(options)
+    )
     _run_images(options, recording, config, options.video)
 
 

@@ -29,6 +29,9 @@ _OPTIONS = {
     "gap_m": "gap",
     "image_topic": "image-topic",
     "truth_topic": "truth-topic",
+    "start_s": "start",
+    "end_s": "end",
+    "resize_px": "resize",
 }
 _NAMED = (
     "known_points",
@@ -42,6 +45,10 @@ _NAMED = (
     "known_map",
     "image_topic",
     "truth_topic",
+    "start_s",
+    "end_s",
+    "every",
+    "resize_px",
 )
 _FLAGS = ("localize",)
 _MADE = "video", "batch"

@@ -1,7 +1,7 @@
 """What is filtered: a recording of a kind that a system takes, opened to the system and the source of its frames."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -19,6 +19,7 @@ from rbpf.sensors.feature_log import FeatureLog
 from rbpf.sensors.readers import (
     ImageSequence,
     KnownPixels,
+    Part,
     RobotLog,
     Topics,
     open_images,
@@ -26,6 +27,7 @@ from rbpf.sensors.readers import (
     open_stereo,
     read_known_points,
 )
+from rbpf.sensors.readers.images.part import WHOLE
 from rbpf.sensors.readers.images.sequence import UNNAMED as NO_TOPICS
 from rbpf.sensors.readers.images.video import LiveCamera, camera_number
 from rbpf.sensors.readers.robot_log import UNNAMED
@@ -109,6 +111,7 @@ class MonoRecording:
         map: run folder, or its map, in which the camera is to be found; the map is not changed. None maps anew.
         markers: board of ArUco markers of which some are seen in the first image; likewise known points.
         topics: of a ROS bag, which images and which truth.
+        part: which of the images, and in which size; known points are those of the first of them, in the recording's pixels.
 
     Raises:
         InputError: two of known points, board, markers and map are given, or two topics of images.
@@ -121,6 +124,7 @@ class MonoRecording:
     map: Path | None = None
     markers: MarkerBoard | None = None
     topics: Topics = NO_TOPICS
+    part: Part = WHOLE
 
     def __post_init__(self) -> None:
         if len(self.topics.images) > 1:
@@ -161,9 +165,18 @@ class MonoRecording:
         known = None if self.known_points is None else read_known_points(self.known_points)
         sequence: ImageSequence | LiveCamera
         if self.live is not None:
+            if self.part != WHOLE:
+                raise InputError(
+                    "of a live camera all images are used, as they are: leave out start, end, every and resize"
+                )
             sequence = LiveCamera(self.live, self.calibration)
         else:
-            sequence = open_images(self.images, self.calibration, self.topics)
+            sequence = whole = open_images(self.images, self.calibration, self.topics)
+            if self.part != WHOLE:
+                sequence = self.part.apply(whole)
+            if known is not None and sequence.camera != whole.camera:
+                before, now = ((c.width, c.height) for c in (whole.camera, sequence.camera))
+                known = replace(known, px=(known.px + 0.5) * (np.array(now) / before) - 0.5)
         if self.board is not None:
             known = find_board(first_image(sequence), self.board)
         if self.markers is not None:
@@ -191,7 +204,8 @@ class MonoRecording:
                 "gap_m": board.gap_m,
             }
             found["dictionary"] = board.dictionary
-        return found | ({} if self.map is None else {"localize": True}) | self.topics.entries()
+        localize = {} if self.map is None else {"localize": True}
+        return found | localize | self.topics.entries() | self.part.entries()
 
 
 @dataclass(frozen=True)
@@ -202,11 +216,13 @@ class StereoRecording:
         pairs: a sequence of any kind that `open_stereo` knows.
         calibration: camera.yaml in place of the sequence's own camera.
         topics: of a ROS bag, which images and which truth.
+        part: which of the pairs, and in which size.
     """
 
     pairs: Path
     calibration: Path | None = None
     topics: Topics = NO_TOPICS
+    part: Part = WHOLE
 
     def open(self, config: StereoConfig) -> Opened:
         """The system and the pairs.
@@ -214,7 +230,9 @@ class StereoRecording:
         Raises:
             InputError: a file is wrong.
         """
-        return open_pairs(open_stereo(self.pairs, self.calibration, topics=self.topics), config)
+        return open_pairs(
+            open_stereo(self.pairs, self.calibration, topics=self.topics, part=self.part), config
+        )
 
     def sources(self) -> dict[str, str | float | bool]:
         """For config.yaml."""
@@ -222,7 +240,7 @@ class StereoRecording:
         found: dict[str, str | float | bool] = {
             name: str(path) for name, path in named.items() if path is not None
         }
-        return found | self.topics.entries()
+        return found | self.topics.entries() | self.part.entries()
 
 
 def open_robot_log(log: RobotLog, config: RangeBearingConfig) -> Opened:

@@ -4,7 +4,7 @@ Order of the coefficients and pixel convention are OpenCV's: the centre of the t
 is that of `rbpf.sensors.camera.distortion`.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from numbers import Integral, Real
 from typing import Self, final
@@ -86,6 +86,33 @@ class Pinhole:
         count = len(LENSES[model].coefficient_names) if model in LENSES else 0
         fx, fy, cx, cy, *distortion = (float(number) for number in params)
         return cls(width, height, fx, fy, cx, cy, tuple(distortion[:count]), model)
+
+    def resized(self, width: int, height: int) -> Self:
+        """The camera of its images in another size: the centre of the first pixel stays at (0, 0)."""
+        x, y = width / self.width, height / self.height
+        centre = x * (self.cx + 0.5) - 0.5, y * (self.cy + 0.5) - 0.5
+        return replace(
+            self, width=width, height=height, fx=x * self.fx, fy=y * self.fy, cx=centre[0], cy=centre[1]
+        )
+
+    def turned(self, quarters: int) -> Self:
+        """The camera of its images turned clockwise by so many quarters of a turn."""
+        camera = self
+        for _ in range(quarters % 4):
+            c, lens = camera, camera.distortion
+            if len(lens) == 5:  # the tangential part turns with the axes; what depends on the radius stays
+                lens = (lens[0], lens[1], lens[3], -lens[2], lens[4])
+            camera = replace(
+                c,
+                width=c.height,
+                height=c.width,
+                fx=c.fy,
+                fy=c.fx,
+                cx=c.height - 1 - c.cy,
+                cy=c.cx,
+                distortion=lens,
+            )
+        return camera
 
     @cached_property
     def params(self) -> Float[np.ndarray, "10"]:

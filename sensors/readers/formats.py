@@ -8,6 +8,7 @@ from rbpf.sensors.readers.images.bag import RosBag
 from rbpf.sensors.readers.images.euroc import Euroc
 from rbpf.sensors.readers.images.folders import Folder, Photos, SevenScenes, Tum
 from rbpf.sensors.readers.images.kitti import Kitti
+from rbpf.sensors.readers.images.part import WHOLE, Part
 from rbpf.sensors.readers.images.sequence import (
     TOLERANCE_S,
     UNNAMED,
@@ -58,7 +59,7 @@ def open_log(path: str | Path, noise: LogNoise | None = None) -> RobotLog:
 
 
 def open_images(
-    path: str | Path, calibration: str | Path | None = None, topics: Topics = UNNAMED
+    path: str | Path, calibration: str | Path | None = None, topics: Topics = UNNAMED, part: Part = WHOLE
 ) -> ImageSequence:
     """Open the images of one camera, in any known format; the modules of the readers describe the formats.
 
@@ -66,6 +67,7 @@ def open_images(
         path: the sequence's folder, a video, or a ROS bag.
         calibration: a `camera.yaml` to use in place of the sequence's own camera.
         topics: of a ROS bag, where they have to be named.
+        part: which of its images, and in which size.
 
     Returns:
         The sequence, of which only the first image has been decoded; of two cameras the left one.
@@ -75,7 +77,7 @@ def open_images(
             is malformed; a topic is named that is not there.
     """
     options = ReadOptions(None if calibration is None else Path(calibration), topics)
-    return _opened(_existing(path, "an image sequence"), options, stereo=False)
+    return _opened(_existing(path, "an image sequence"), options, part, stereo=False)
 
 
 def open_stereo(
@@ -83,6 +85,7 @@ def open_stereo(
     calibration: str | Path | None = None,
     tolerance_s: float = TOLERANCE_S,
     topics: Topics = UNNAMED,
+    part: Part = WHOLE,
 ) -> ImageSequence:
     """Open the images of two cameras side by side: EuRoC ASL (`cam0`, `cam1`), KITTI (`image_0`, `image_1`), ROS bags.
 
@@ -96,6 +99,7 @@ def open_stereo(
             `baseline_m`, in place of its baseline, too.
         tolerance_s: images of two cameras whose times differ by no more belong together; KITTI's have numbers.
         topics: of a ROS bag, where they have to be named.
+        part: which of its pairs, and in which size.
 
     Raises:
         InputError: nothing is there, or it is no stereo sequence; a file is missing or malformed; no two images
@@ -103,13 +107,10 @@ def open_stereo(
             to the right of the left one.
     """
     options = ReadOptions(None if calibration is None else Path(calibration), topics, tolerance_s)
-    sequence = _opened(_existing(path, "a stereo sequence"), options, stereo=True)
-    for note in sequence.notes:
-        _log.warning("%s", note)
-    return sequence
+    return _opened(_existing(path, "a stereo sequence"), options, part, stereo=True)
 
 
-def _opened(path: Path, options: ReadOptions, stereo: bool) -> ImageSequence:
+def _opened(path: Path, options: ReadOptions, part: Part, stereo: bool) -> ImageSequence:
     formats = [one for one in IMAGES if one.stereo_kind or not stereo]
     for one in formats:
         if not one.recognises(path):
@@ -118,7 +119,10 @@ def _opened(path: Path, options: ReadOptions, stereo: bool) -> ImageSequence:
             name, value = next(iter(given.items()))
             problem = f"{name.replace('_', ' ')} {value} is given, but only ROS bags have topics"
             raise InputError(f"{path}: {problem}; leave it out.")
-        return one.read_stereo(path, options) if stereo else one.read(path, options)
+        sequence = one.read_stereo(path, options) if stereo else one.read(path, options)
+        for note in sequence.notes:
+            _log.warning("%s", note)
+        return sequence if part == WHOLE else part.apply(sequence)
     kinds = "; or ".join(one.stereo_kind if stereo else one.kind for one in formats)
     raise InputError(f"{path}: found {_content(path)}, expected {kinds}.")
 

@@ -311,3 +311,16 @@ class TestRectifiedStereo:
 def test_a_wrong_stereo_pair_is_refused(camera, baseline, message):
     with pytest.raises(InputError, match=f"^{re.escape(message)}$"):
         RectifiedStereo(camera, baseline)
+
+
+@every_camera
+def test_the_camera_of_turned_and_of_smaller_images_sees_the_same_there(camera):
+    """A quarter of a turn clockwise moves column and row (u, v) to (h − 1 − v, u), and the world about the axis."""
+    points, turn = seen_points(camera), np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    px = camera.project(points)
+    turned = np.stack([camera.height - 1 - px[:, 1], px[:, 0]], axis=1)
+    np.testing.assert_allclose(camera.turned(1).project(points @ turn.T), turned, atol=1e-9)
+    np.testing.assert_allclose(camera.turned(3).turned(1).params, camera.params, atol=1e-9)
+    smaller = camera.resized(camera.width // 2, camera.height // 2)
+    scale = np.array([smaller.width / camera.width, smaller.height / camera.height])
+    np.testing.assert_allclose(smaller.project(points), scale * (px + 0.5) - 0.5, atol=1e-9)

@@ -10,7 +10,7 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.runs.provenance import read_config
 from rbpf.runs.reading import PathAndMap, RunFolder
-from rbpf.sensors.readers import ImageSequence, Topics, open_images, open_stereo
+from rbpf.sensors.readers import ImageSequence, Part, Topics, open_images, open_stereo
 from rbpf.validation.colmap.compare import ColmapComparison, compare_with_path, compare_with_truth
 from rbpf.validation.colmap.reconstruct import ReconstructionOptions, reconstruct
 
@@ -52,15 +52,15 @@ def compare_folder_with_colmap(folder: Path, options: ReconstructionOptions | No
             f"{folder} is a run of the system {config['system']}, which sees no images; COLMAP needs a run over images."
         )
     recording, calibration = Path(str(config["recording"])), config.get("calibration")
-    topics = Topics.parse(config.get("image_topic"), config.get("truth_topic"))
+    topics, part = Topics.parse(config.get("image_topic"), config.get("truth_topic")), Part.of(config)
     if config["system"] == "stereo":
-        sequence = open_stereo(recording, calibration, topics=topics)
+        sequence = open_stereo(recording, calibration, topics=topics, part=part)
     else:
-        sequence = open_images(recording, calibration, topics)
+        sequence = open_images(recording, calibration, topics, part)
         if sequence.camera.lens.is_identity:
             # Where the recording is a rectified pair, of which the run saw the left images, both take part.
             with suppress(InputError):
-                pair = open_stereo(recording, calibration, topics=topics)
+                pair = open_stereo(recording, calibration, topics=topics, part=part)
                 if pair.camera == sequence.camera and np.array_equal(pair.stamps_ns, sequence.stamps_ns):
                     sequence = pair
     return compare_with_colmap(RunFolder.open(folder).estimate, sequence, options)

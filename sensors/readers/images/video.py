@@ -1,8 +1,11 @@
 """Video files that OpenCV's FFmpeg can decode, with a `camera.yaml` beside the video or given.
 
-The number of images and their rate are those of the file's header, unless `camera.yaml` has `rate_hz`. A header without
-a number, or with one that the file is too small for, is counted by going through the video once. A video that ends
-before its last announced image ends with a frame that has none and says so.
+Each image has the time that the video says, unless `camera.yaml` has `rate_hz`: a phone's images are not evenly spread. To
+know them the video is gone through once as it is opened. Times that are those of the header's rate to a millisecond are the
+rate's; then a video that ends before the last image that its header announces ends with a frame that has none and says so.
+
+A video is turned as it says itself, as viewers do, and `camera.yaml` is that of the images as they are shown. One of the
+images as they are stored, which is noticed by its width and height, is turned with them.
 
 Beside them a camera at this computer, as a source of images that ends when it is unplugged or somebody presses Ctrl-C.
 """
@@ -13,7 +16,7 @@ import threading
 import time
 from collections.abc import Generator, Iterator
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, final
 
@@ -36,6 +39,8 @@ SUFFIXES = frozenset(
     {".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts", ".ogv", ".webm", ".wmv", ".y4m"}
 )
 
+_ROUNDING_NS = 1_000_000
+"""Containers round times to milliseconds."""
 _ACTION = "convert it, or copy it again if its end is missing"
 
 
@@ -49,12 +54,16 @@ class Video(ImageFormat):
         return path.is_file() and path.suffix.lower() in SUFFIXES
 
     def read(self, path: Path, options: ReadOptions) -> ImageSequence:
-        camera = find_calibration(path.parent, options.calibration)
-        count, rate_hz, shape = video_header(path)
-        camera.require_shape(shape, str(path))
-        stamps_ns = evenly(count, camera.rate_hz or rate_hz or DEFAULT_RATE_HZ)
-        source = VideoImages(path, stamps_ns, shape)
-        return ImageSequence(path.stem, camera.camera, stamps_ns, None, None, source)
+        calibration = find_calibration(path.parent, options.calibration)
+        found = read_header(path)
+        stamps_ns, camera = found.stamps_ns, calibration.camera
+        if calibration.rate_hz is not None:
+            stamps_ns = evenly(len(stamps_ns), calibration.rate_hz)
+        if found.quarters % 2 and found.shape == (camera.width, camera.height) != found.shape[::-1]:
+            calibration = replace(calibration, camera=camera.turned(found.quarters))
+        calibration.require_shape(found.shape, str(path))
+        source = VideoImages(path, stamps_ns, found.shape)
+        return ImageSequence(path.stem, calibration.camera, stamps_ns, None, None, source)
 
 
 @dataclass(frozen=True)
@@ -95,21 +104,46 @@ class VideoImages(Source):
             return ImageFrame(stamp, None, problem=str(error))
 
 
-def video_header(path: Path) -> tuple[int, float, tuple[int, int]]:
-    """Number of images, their rate [Hz] or 0 where it is not given, height and width."""
+class Header(NamedTuple):
+    """What a video says of itself.
+
+    Attributes:
+        stamps_ns: (T,) int64 times of its images, from 0.
+        shape: height and width of its first image.
+        quarters: quarters of a turn, clockwise, by which the stored images are turned.
+    """
+
+    stamps_ns: np.ndarray
+    shape: tuple[int, int]
+    quarters: int
+
+
+def read_header(path: Path) -> Header:
+    """The times, size and direction of a video's images.
+
+    Raises:
+        InputError: it cannot be opened, or no image of it can be decoded.
+    """
     import cv2
 
     with opened(path) as capture:
-        count, rate_hz = capture.get(cv2.CAP_PROP_FRAME_COUNT), capture.get(cv2.CAP_PROP_FPS)
+        announced, rate_hz = capture.get(cv2.CAP_PROP_FRAME_COUNT), capture.get(cv2.CAP_PROP_FPS)
+        turned = capture.get(cv2.CAP_PROP_ORIENTATION_META)
         there, image = capture.read()
         if not there:
             raise InputError(f"{path}: not one image of the video can be decoded; {_ACTION}.")
-        # A header may claim what it likes; no image takes less than a byte.
-        if not 0 < count <= path.stat().st_size:
-            count = 1
-            while capture.grab():
-                count += 1
-    return int(count), rate_hz if 0.0 < rate_hz < np.inf else 0.0, image.shape[:2]
+        times_ms = [capture.get(cv2.CAP_PROP_POS_MSEC)]
+        while capture.grab():
+            times_ms.append(capture.get(cv2.CAP_PROP_POS_MSEC))
+    shape, quarters = image.shape[:2], round(turned / 90.0) if np.isfinite(turned) else 0
+    rate_hz = rate_hz if 0.0 < rate_hz < np.inf else DEFAULT_RATE_HZ
+    own_ns = np.rint(np.nan_to_num(np.array(times_ms) - times_ms[0]) * 1e6).astype(np.int64)
+    even_ns = evenly(own_ns.size, rate_hz)
+    if (np.diff(own_ns) > 0).all() and np.abs(own_ns - even_ns).max() > _ROUNDING_NS:
+        return Header(own_ns, shape, quarters)
+    # A header may announce what it likes; no image takes less than a byte.
+    count = int(announced) if 0 < announced <= path.stat().st_size else own_ns.size
+    return Header(evenly(count, rate_hz), shape, quarters)
 
 
 @contextmanager
@@ -159,7 +193,7 @@ def read_uncalibrated(path: Path, most: int) -> tuple[int, Iterator[NamedImage]]
     files = [] if video else list_images(path)
     if not (video or files):
         raise InputError(f"{path}: expected images in it or in its images/, found none")
-    count = video_header(path)[0] if video else len(files)
+    count = len(read_header(path).stamps_ns) if video else len(files)
     chosen = np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
     if video:
         return len(chosen), _of_video(path, set(chosen.tolist()))

@@ -7,12 +7,14 @@ from dataclasses import replace
 from unittest import mock
 
 import cv2
+import imageio_ffmpeg
 import numpy as np
 import pytest
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.sensors.readers import ImageSequence, open_images, open_stereo
+from rbpf.sensors.readers import ImageSequence, Part, open_images, open_stereo
+from rbpf.sensors.readers.images.calibration import read_calibration
 from tests.readers.images.folders import (
     CAM0,
     EUROC_NS,
@@ -442,6 +444,73 @@ def test_a_video_that_ends_in_mid_frame_keeps_what_was_read_and_says_so(tmp_path
     assert last.problem == f"{path}: the video ends after {len(kept)} of 60 images; those are kept."
 
 
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory):
+    """Makes a video of 20 dark images, the first pixels of which are bright, by FFmpeg with these options."""
+    folder = tmp_path_factory.mktemp("filmed")
+    image = np.full((48, 64), 40, np.uint8)
+    image[:4, :4] = 255
+    for t in range(20):
+        cv2.imwrite(str(folder / f"{t:02d}.png"), image)
+
+    def make(source, name, *options):
+        command = [
+            imageio_ffmpeg.get_ffmpeg_exe(),
+            "-loglevel",
+            "error",
+            *source.split(),
+            *options,
+            str(folder / name),
+        ]
+        subprocess.run(command, check=True)
+        return folder / name
+
+    h264 = ["-c:v", "libx264", "-pix_fmt", "yuv420p"]
+    return make, f"-framerate 10 -i {folder}/%02d.png", h264
+
+
+@pytest.mark.parametrize("name", ["uneven.mp4", "uneven.mkv"])
+def test_images_that_are_not_evenly_spread_have_the_times_that_the_video_says(filmed, name):
+    make, images, h264 = filmed
+    uneven = ["-vf", "setpts='(N+N*N/10)/10/TB'", "-fps_mode", "vfr", "-enc_time_base", "1:1000"]
+    path = make(images, name, *uneven, *h264)
+    write_camera(path.parent, width=64, height=48)
+    sequence = open_images(path)
+    n = np.arange(20)
+    # FFmpeg puts them on the images' grid of 0.1 s.
+    np.testing.assert_allclose(sequence.stamps_ns * 1e-9, np.floor(n + n * n / 10) / 10, atol=1e-3)
+    frames = list(sequence.frames(5))
+    assert [frame.stamp_ns for frame in frames] == sequence.stamps_ns[5:].tolist()
+    assert all(frame.problem is None for frame in frames)
+    (given := path.parent / f"given-{name}").mkdir()
+    evenly = write_camera(given, width=64, height=48, rate_hz=10)
+    assert np.unique(np.diff(open_images(path, evenly).stamps_ns)).tolist() == [100_000_000]
+
+
+@pytest.mark.parametrize(
+    ("degrees", "corner"), [("-90", "upper right"), ("180", "lower right"), ("90", "lower left")]
+)
+def test_a_turned_video_is_turned_and_a_calibration_of_what_is_stored_with_it(filmed, degrees, corner):
+    make, images, h264 = filmed
+    upright = make(images, f"upright{degrees}.mp4", *h264)
+    path = make(f"-display_rotation {degrees} -i {upright}", f"turned{degrees}.mp4", "-c", "copy")
+    for name in ("stored", "shown"):
+        (path.parent / name).mkdir(exist_ok=True)
+    stored = write_camera(path.parent / "stored", width=64, height=48)
+    camera, (first, *_) = open_images(path, stored).camera, open_images(path, stored).frames()
+    rows, columns = (
+        (slice(-2, None) if "lower" in corner else slice(2)),
+        (slice(-2, None) if "right" in corner else slice(2)),
+    )
+    assert first.image.shape == (camera.height, camera.width) and first.image[rows, columns].min() > 200
+    if degrees == "180":  # nothing tells whether the calibration is of the images as they are shown
+        assert camera == read_calibration(stored).camera
+        return
+    assert camera == read_calibration(stored).camera.turned(1 if degrees == "-90" else 3)
+    shown = write_camera(path.parent / "shown", width=48, height=64)
+    assert open_images(path, shown).camera == read_calibration(shown).camera
+
+
 def test_a_video_without_its_index_cannot_be_opened(tmp_path):
     path = write_video(tmp_path / "walk.mp4", codec="mp4v")
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
@@ -495,6 +564,51 @@ def test_images_of_a_video_of_another_size_and_depth(tmp_path):
     assert [int(frame.image[0, 0]) for frame in frames] == [70, 255]
     with pytest.raises(InputError, match="not one image of the video can be decoded"):
         sequence_of(tmp_path, [], count=3.0, rate=25.0)
+
+
+# Parts.
+
+
+def test_part_of_a_recording(tmp_path):
+    """Images of 10, 20, … grey levels at 0, 0.1, … s, of which every second from 0.15 to 0.65 s, half as large."""
+    folder = write_plain(tmp_path, [f"{k}.png" for k in range(10)], rate_hz=10)
+    whole, part = open_images(folder), Part(0.15, 0.65, 2, whole_width := SIZE[1] // 2)
+    sequence = open_images(folder, part=part)
+    assert sequence.stamps_ns.tolist() == [200_000_000, 400_000_000, 600_000_000]
+    assert levels(sequence) == [levels(whole)[k] for k in (2, 4, 6)] and levels(sequence, 2) == [
+        levels(whole)[6]
+    ]
+    frames = list(sequence.frames())
+    assert [frame.stamp_ns for frame in frames] == sequence.stamps_ns.tolist()
+    assert (
+        frames[0].image.shape
+        == (sequence.camera.height, sequence.camera.width)
+        == (SIZE[0] // 2, whole_width)
+    )
+    assert sequence.camera == whole.camera.resized(whole_width, SIZE[0] // 2)
+    assert Part.of({"rbpf": "1", **part.entries()}) == part and Part().entries() == {}
+    # A pair is of the same cameras, as far apart, and its parts are as old.
+    pair = write_kitti(tmp_path / "pair")
+    assert open_stereo(pair, part=Part(every=2)).baseline_m == open_stereo(pair).baseline_m
+    assert len(open_stereo(pair, part=Part(every=2))) == (len(open_stereo(pair)) + 1) // 2
+
+
+@pytest.mark.parametrize(
+    ("numbers", "said"),
+    [
+        ({"start_s": -1.0}, "start is -1 s"),
+        ({"start_s": float("nan")}, "start is nan s"),
+        ({"start_s": 2.0, "end_s": 2.0}, "end is 2 s: expected more than the start, 2 s"),
+        ({"end_s": float("nan")}, "end is nan s"),
+        ({"every": 0}, "at least 1, got 0"),
+        ({"resize_px": 0}, "at least 1, got 0"),
+        ({"resize_px": 10_000}, "are not made larger"),
+        ({"start_s": 60.0}, "no image is left from 60 s on: the recording is 0.067 s long"),
+    ],
+)
+def test_a_part_that_there_is_not_is_refused(tmp_path, numbers, said):
+    with pytest.raises(InputError, match=said):
+        open_images(write_plain(tmp_path), part=Part(**numbers))
 
 
 # What is of no format.

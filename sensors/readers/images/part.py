@@ -1,0 +1,111 @@
+"""Part of a recording of images: from one time to another, every so many-th of them, smaller."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
+from math import isfinite
+from typing import Any, Self, final
+
+import numpy as np
+
+from rbpf.errors import InputError
+from rbpf.sensors.readers.images.sequence import ImageFrame, ImageSequence, Source
+
+
+@final
+@dataclass(frozen=True)
+class Part:
+    """Which images of a recording are used, and in which size.
+
+    Attributes:
+        start_s: the first is the first one so long after the recording's first, s.
+        end_s: the last is the last one no longer after it, s; None for the recording's.
+        every: of these each so many-th.
+        resize_px: width that they are made smaller to, px; the height follows. None leaves them as they are.
+
+    Raises:
+        InputError: a number is out of its range.
+    """
+
+    start_s: float = 0.0
+    end_s: float | None = None
+    every: int = 1
+    resize_px: int | None = None
+
+    def __post_init__(self) -> None:
+        end_s, width = self.end_s, self.resize_px
+        if not (isfinite(self.start_s) and self.start_s >= 0.0):
+            raise InputError(f"a recording is used from its start on or later: start is {self.start_s:g} s")
+        if end_s is not None and not end_s > self.start_s:
+            raise InputError(f"end is {end_s:g} s: expected more than the start, {self.start_s:g} s")
+        if (least := min(self.every, 1 if width is None else width)) < 1:
+            raise InputError(f"every and resize must be at least 1, got {least}")
+
+    @classmethod
+    def of(cls, entries: Mapping[str, Any]) -> Self:
+        """The part that a run's config.yaml names."""
+        return cls(**{name: entries[name] for name in asdict(WHOLE) if name in entries})
+
+    def entries(self) -> dict[str, float]:
+        """For a run's config.yaml; what `of` takes."""
+        return {name: value for name, value in asdict(self).items() if value != getattr(WHOLE, name)}
+
+    def apply(self, sequence: ImageSequence) -> ImageSequence:
+        """The part of a sequence, with its camera; the images keep their times.
+
+        Raises:
+            InputError: no image is left, or they would become larger.
+        """
+        stamps, camera = np.asarray(sequence.stamps_ns), sequence.camera
+        after_s = (stamps - stamps[:1]) * 1e-9
+        end_s = np.inf if self.end_s is None else self.end_s
+        rows = np.flatnonzero((after_s >= self.start_s) & (after_s <= end_s))[:: self.every]
+        if not rows.size:
+            long = f"the recording is {after_s[-1] if len(after_s) else 0.0:.3f} s long"
+            raise InputError(f"{sequence.name}: no image is left from {self.start_s:g} s on: {long}")
+        width = camera.width if self.resize_px is None else self.resize_px
+        if width > camera.width:
+            raise InputError(f"images of {camera.width} px are not made larger: resize is {width} px")
+        if width < camera.width:
+            camera = camera.resized(width, max(round(width * camera.height / camera.width), 1))
+        source = Chosen(sequence.source, rows, stamps[rows], (camera.height, camera.width))
+        return replace(sequence, camera=camera, stamps_ns=stamps[rows], source=source)
+
+
+WHOLE = Part()
+
+
+@final
+@dataclass(frozen=True)
+class Chosen(Source):
+    """Some images of another source.
+
+    Attributes:
+        source: of all of them.
+        rows: (T,) which.
+        stamps_ns: (T,) their times.
+        shape: height and width that they are made smaller to; None leaves them as they are.
+    """
+
+    source: Source
+    rows: np.ndarray
+    stamps_ns: np.ndarray
+    shape: tuple[int, int] | None = None
+
+    def frames(self, start: int) -> Iterator[ImageFrame]:
+        wanted = dict(zip(self.rows[start:].tolist(), self.stamps_ns[start:].tolist(), strict=True))
+        if not wanted:
+            return
+        first = int(self.rows[start])
+        for row, frame in enumerate(self.source.frames(first), first):
+            if row in wanted:
+                image, right = self._smaller(frame.image), self._smaller(frame.right)
+                yield replace(frame, stamp_ns=wanted[row], image=image, right=right)
+            if row == self.rows[-1]:
+                return
+
+    def _smaller(self, image: np.ndarray | None) -> np.ndarray | None:
+        if image is None or self.shape is None or image.shape == self.shape:
+            return image
+        import cv2
+
+        return np.asarray(cv2.resize(image, self.shape[::-1], interpolation=cv2.INTER_AREA))
