@@ -14,8 +14,6 @@ FREE_TO_NEED_THEM = ("rbpf.validation", "rbpf.cli")
 
 IMPORTED = """
 import sys
-
-import pytest
 before = set(sys.modules)
 {statement}
 top = {{name.split(".")[0] for name in set(sys.modules) - before}}
