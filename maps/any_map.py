@@ -7,7 +7,7 @@ import numpy as np
 from rbpf import gaussian
 from rbpf.arrays import numbers
 from rbpf.core.linearisation import linearise
-from rbpf.core.models import Belief, NewLandmarks, ObservationModel, Records
+from rbpf.core.models import Belief, ObservationModel, Records
 from rbpf.errors import InputError
 
 
@@ -55,8 +55,7 @@ def checked_new_ids(
     return ids.astype(np.int64)
 
 
-def first_records(new_landmarks: NewLandmarks, state: np.ndarray) -> Records:
-    """Estimates (N, K, …) of landmarks that are started at states (N, E)."""
-    name = type(new_landmarks.model).__name__
-    z, cov = numbers(new_landmarks.z, f"z of {name}"), numbers(new_landmarks.cov, f"cov of {name}")
-    return new_landmarks.model.initialise(state, z, cov)
+def first_records(model: ObservationModel, z: np.ndarray, cov: np.ndarray, state: np.ndarray) -> Records:
+    """Estimates (N, K, …) of landmarks that are started by measurements z (K, p), cov (K, p, p) at states (N, E)."""
+    name = type(model).__name__
+    return model.initialise(state, numbers(z, f"z of {name}"), numbers(cov, f"cov of {name}"))

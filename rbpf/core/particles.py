@@ -26,8 +26,8 @@ class Particles:
         log_weights: (N,) normalised.
     """
 
-    state: np.ndarray
-    log_weights: np.ndarray
+    state: Float[np.ndarray, "N E"]
+    log_weights: Float[np.ndarray, " N"]
 
     @property
     def n(self) -> int:
