@@ -11,6 +11,9 @@ import yaml
 from rbpf.cli import main
 from rbpf.core.checkpoint import save_arrays
 from rbpf.runs.files import numbered, own_folder, write_text
+from rbpf.runs.recordings import open_robot_log
+from rbpf.sensors.readers import open_log
+from rbpf.systems.range_bearing.config import RangeBearingConfig
 from tests.cli.run_outputs import outputs
 
 FILES = {
@@ -84,6 +87,37 @@ def test_a_run_leaves_everything(log, tmp_path):
     with np.load(tmp_path / "run" / "map.npz") as archive:
         assert archive["mean"].shape == (summary["landmarks"], 2)
         assert (np.linalg.eigvalsh(archive["cov"]) > 0).all()
+
+
+def test_a_joint_map_leaves_the_same_files_and_resumes(log, tmp_path):
+    """Everything a run leaves; what was interrupted in the middle of a window goes on with the same bytes."""
+    settings = ["--set", "map=joint", "--set", "window=4"]
+    assert run(log, tmp_path / "whole", *settings) == 0
+    assert {path.name for path in (tmp_path / "whole").iterdir()} == FILES
+    summary = json.loads((tmp_path / "whole" / "summary.json").read_text())
+    assert summary.keys() >= REQUIRED
+    assert summary["path_rmse_m"] < summary["odometry_path_rmse_m"]
+    with np.load(tmp_path / "whole" / "map.npz") as archive:
+        assert (np.linalg.eigvalsh(archive["cov"]) > 0).all()
+    config = RangeBearingConfig(map="joint", window=4, particles=30)
+    opened = open_robot_log(open_log(log), config)
+    for t, frame in enumerate(opened.source.frames()):
+        tracked = opened.system.take(frame)
+        if t == 17:
+            opened.system.save(tmp_path / "half.npz")
+    again = open_robot_log(open_log(log), config)
+    again.system.load(tmp_path / "half.npz")
+    for frame in again.source.frames(18):
+        resumed = again.system.take(frame)
+    assert tracked.pose.tobytes() == resumed.pose.tobytes()
+    assert tracked.cov.tobytes() == resumed.cov.tobytes()
+
+
+@pytest.mark.parametrize("pair", ["association=ml", "likelihood.kind=outliers", "window=0"])
+def test_what_a_joint_map_does_not_take_is_said(log, tmp_path, capsys, pair):
+    assert run(log, tmp_path / "run", "--set", "map=joint", "--set", pair) == 2
+    assert ("window must be" if "window" in pair else "map=joint takes") in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
 
 
 def test_the_batch_optimum_stands_beside(log, tmp_path):

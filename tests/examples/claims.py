@@ -74,6 +74,11 @@ def gps_fix(figures: dict[str, float]) -> None:
     assert figures["share_within_3_sigma"] > 0.95
 
 
+def joint_map(figures: dict[str, float]) -> None:
+    assert 0.6 < figures["joint, 20 particles, window 1"] < 1.6
+    assert figures["joint, 20 particles, window 1"] < 1.25 * figures["joint EKF"]
+
+
 def lab_images(figures: dict[str, dict[str, float]]) -> None:
     clear, dim = figures.values()
     assert dim["share matched, left to right"] < 0.9 * clear["share matched, left to right"]

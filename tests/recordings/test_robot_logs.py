@@ -32,6 +32,22 @@ def test_planar_simulated_log(data_dir):
     assert landmarks <= 0.0045
 
 
+def test_joint_map_of_simulated_logs(data_dir):
+    """As good as a joint EKF on the same logs, which has paths of 0.0049 and 0.0123 m and landmarks of 0.0030 and 0.0043 m."""
+    for name, path, landmarks in (("mrpt_kf_slam_2d", 0.0046, 0.0030), ("mrpt_kf_slam_6d", 0.0125, 0.0050)):
+        found = mean_scores(data_dir / name, 2, "map=joint", "particles=50")
+        assert found[0] <= path
+        assert found[2] <= landmarks
+
+
+def test_joint_map_of_a_robot_with_motion_capture(data_dir):
+    paths = [
+        mean_scores(data_dir / "mrclam6_robot1", 1, "map=joint", "particles=50", f"window={w}")[1]
+        for w in (1, 5)
+    ]
+    assert max(paths) <= 0.26
+
+
 def test_the_refined_proposal_beats_the_bootstrap_one(data_dir):
     folder = data_dir / "mrpt_kf_slam_2d"
     refined = mean_scores(folder, 4, "anchor_every=0")[2]

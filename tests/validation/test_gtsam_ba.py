@@ -7,6 +7,7 @@ import gtsam
 import numpy as np
 import pytest
 
+from examples.studies.joint_ekf import joint_ekf
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3
 from rbpf.sensors.readers.measurements import InitialEstimate, dead_reckoning, initial_estimate
@@ -14,7 +15,6 @@ from rbpf.validation.gtsam.batch_problem import first_steps
 from rbpf.validation.gtsam.robot import CHUNK, Problem, solve, solve_online
 from rbpf.validation.gtsam.solvers import PLANAR, SPATIAL
 from tests.validation.factors import check_derivatives
-from tests.validation.joint_ekf import joint_ekf
 from tests.validation.worlds import seen, solve_by_scipy, world
 
 CHARTS = [(SE2, PLANAR), (SE3, SPATIAL)]

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
+from examples.studies.joint_ekf import joint_ekf
 from rbpf.lie import SE2
 from rbpf.runs.alignment import align
 from rbpf.sensors.readers import open_log
 from rbpf.sensors.readers.measurements import initial_estimate
 from rbpf.validation.gtsam.robot import Problem, solve
 from rbpf.validation.metrics.accuracy import landmark_errors
-from tests.validation.joint_ekf import joint_ekf
 from tests.validation.log_measurements import from_log
 
 

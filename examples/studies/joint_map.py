@@ -1,0 +1,207 @@
+"""Does an uncertainty stay true after loops? The joint map beside particles with maps of their own, and beside a joint EKF.
+
+Simulated: a robot drives its loops among landmarks in the plane, and every filter sees the same logs. NEES per degree of
+freedom is 1 for an honest filter; a loop's error persists, so that one run is hardly more than one sample of it: what counts
+is the mean over the runs beside the EKF's, with its standard error. Recorded: logs with a truth, several seeds of the filter.
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from matplotlib.figure import Figure
+
+from examples.studies.consistency_runs import Consistency, RobotTrial, Trial, run_trials
+from examples.studies.joint_ekf import joint_ekf
+from rbpf.runs.reading import PathAndMap
+from rbpf.runs.recordings import filter_robot_log
+from rbpf.runs.truth import truth_at
+from rbpf.sensors.readers import RobotLog, open_log
+from rbpf.systems.range_bearing.config import RangeBearingConfig
+from rbpf.validation.consistency.statistic import whitened_errors
+from rbpf.validation.metrics.scores import score_estimate
+from rbpf.validation.simulation.robot import RobotWorld, simulated_log
+from rbpf.validation.tables import write_table
+
+JOINT = RangeBearingConfig(map="joint")
+RECORDINGS = ("mrpt_kf_slam_2d", "mrpt_kf_slam_6d", "mrclam6_robot1")
+
+
+def loops(steps: int, std_rotation_deg: float = 0.3) -> RobotWorld:
+    """Two rounds of 50 m in the plane, a dozen landmarks in view; an odometry that loses its heading as told."""
+    return RobotWorld(
+        steps=steps, landmarks=100, radius_m=8.0, laps=2.0, extent_m=12.0, max_range_m=4.5, half_field_of_view_deg=180.0,
+        std_range_m=0.05, std_angle_deg=1.0, std_translation_m=0.02, std_rotation_deg=std_rotation_deg,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class EkfTrial:
+    """The joint EKF on the logs of a world; call it with a seed."""
+
+    world: RobotWorld
+
+    def __call__(self, seed: int) -> Trial:
+        """Simulates and filters."""
+        log = simulated_log(self.world, seed)
+        return of_ekf(log)
+
+
+def of_ekf(log: RobotLog) -> Trial:
+    """One Gaussian of pose and landmarks, linearised once per step."""
+    done = filter_robot_log(log, replace(JOINT, particles=1, window=1))
+    found = joint_ekf(done.system.measurements(log.name, done.log))
+    assert log.truth is not None
+    truth = truth_at(log.space, log.truth, done.log.stamps_ns, "first frame")
+    assert truth is not None
+    errors = whitened_errors(log.space, found.world_from_robot, found.cov_poses, truth.poses)
+    landmarks = []
+    for name, point in found.landmarks.items():
+        error = point - truth.landmarks[name]
+        landmarks.append(error @ np.linalg.solve(found.cov_landmarks[name], error))
+    nothing, dim = np.full(len(errors.nees), np.nan), log.space.dim
+    shift = log.space.translation(found.world_from_robot) - log.space.translation(truth.poses)
+    return Trial(
+        dim, np.linalg.norm(shift, axis=1), np.where(errors.ranks > 0, errors.nees, np.nan), nothing, nothing,
+        np.array(landmarks), shift.shape[1], nothing, None, found.log_evidence,
+    )  # fmt: skip
+
+
+def simulated(
+    world: RobotWorld, runs: int, particles: tuple[int, ...], windows: tuple[int, ...], workers: int
+) -> dict[str, Consistency]:
+    """All filters on the same logs."""
+    trials: dict[str, Any] = {"joint EKF": EkfTrial(world)}
+    for n in particles:
+        for window in windows:
+            trials[f"joint, {n} particles, window {window}"] = RobotTrial(
+                world, replace(JOINT, particles=n, window=window)
+            )
+        trials[f"particles, {n}"] = RobotTrial(world, RangeBearingConfig(particles=n))
+    return {name: run_trials(trial, range(runs), workers) for name, trial in trials.items()}
+
+
+def rows_of(world: str, found: dict[str, Consistency]) -> list[list[str | int | float]]:
+    """A line per filter: evidence and error beside the EKF's of the same run."""
+    ekf, rows = found["joint EKF"].trials, list[list[str | int | float]]()
+    for name, consistency in found.items():
+        evidence = [
+            own.log_evidence - other.log_evidence for own, other in zip(consistency.trials, ekf, strict=True)
+        ]
+        inside = consistency.coverage(0.95)
+        rows.append([
+            world, name, len(evidence), consistency.pose_nees.value, consistency.pose_nees.error,
+            100.0 * inside.value, 100.0 * inside.error, consistency.landmark_nees.value,
+            consistency.position_rmse.value, float(np.mean(evidence)),
+        ])  # fmt: skip
+    return rows
+
+
+def recorded(
+    folder: Path, seeds: int, configs: dict[str, RangeBearingConfig]
+) -> list[list[str | int | float]]:
+    """Per recording and filter: mean and spread over the seeds, metres."""
+    rows = list[list[str | int | float]]()
+    for recording in RECORDINGS:
+        log = open_log(folder / recording)
+        aligned = "mrclam" in recording
+        names = (
+            ("ate_rmse_m", "landmark_error_aligned_mean_m")
+            if aligned
+            else ("path_rmse_m", "landmark_error_mean_m")
+        )
+        for name, config in configs.items():
+            errors, evidence, speed = [], [], []
+            for seed in range(seeds):
+                done = filter_robot_log(log, replace(config, seed=seed))
+                scores = score_estimate(PathAndMap.of_run(done), done.truth, False)
+                errors.append([scores[key] for key in names])
+                evidence.append(float(done.log["log_evidence"].sum()))
+                speed.append(1e3 * float(np.median(done.log["seconds"])))
+            mean, spread = np.mean(errors, axis=0), np.ptp(errors, axis=0)
+            rows.append(
+                [
+                    recording,
+                    name,
+                    seeds,
+                    mean[0],
+                    spread[0],
+                    mean[1],
+                    spread[1],
+                    float(np.ptp(evidence)),
+                    min(speed),
+                ]
+            )
+    return rows
+
+
+def draw(found: dict[str, Consistency], out: Path) -> None:
+    """The mean NEES over time, of all filters."""
+    figure = Figure(figsize=(9.0, 5.0), layout="constrained")
+    axes = figure.subplots()
+    first = next(iter(found.values()))
+    band = first.band()
+    axes.axhspan(
+        band.low / first.dim, band.high / first.dim, color="tab:green", alpha=0.25, label="95 % band"
+    )
+    for name, consistency in found.items():
+        axes.plot(consistency.mean_nees / first.dim, lw=1.0, label=name)
+    axes.set(xlabel="step", ylabel="NEES / d", yscale="log", title=f"mean of {len(first.trials)} runs")
+    axes.legend(fontsize="small")
+    axes.grid(alpha=0.3)
+    figure.savefig(out / "joint_map.png", dpi=110)
+
+
+def main(
+    runs: int = 10,
+    steps: int = 400,
+    particles: tuple[int, ...] = (50, 250),
+    windows: tuple[int, ...] = (1, 5),
+    recordings: Path | None = None,
+    seeds: int = 3,
+    workers: int = 1,
+    out: Path = Path("demo/joint_map"),
+    quick: bool = False,
+) -> dict[str, float]:
+    """Prints the tables, with the mean NEES of every filter's poses as the result.
+
+    Args:
+        runs: simulated logs, seeds 0, 1, ….
+        steps: of each.
+        particles: numbers of them.
+        windows: of the joint map.
+        recordings: folder of the recorded logs; None leaves them out.
+        seeds: of the filter on each recording, 0, 1, ….
+        workers: processes.
+        out: folder for picture and tables.
+        quick: one short log and few particles.
+    """
+    if quick:
+        runs, steps, particles, windows = 2, 120, (20,), (1,)
+    out.mkdir(parents=True, exist_ok=True)
+    found = simulated(loops(steps), runs, particles, windows, workers)
+    rows = rows_of("0.3° per step", found)
+    if not quick:
+        rows += rows_of("2° per step", simulated(loops(steps, 2.0), runs, particles[:1], windows, workers))
+    header = [
+        "heading noise", "filter", "runs", "NEES / d", "± s.e.", "in 95 % [%]", "± s.e.", "landmarks", "path [m]",
+        "log-evidence − EKF",
+    ]  # fmt: skip
+    write_table(out / "joint_map.csv", header, rows)
+    if recordings is not None:
+        configs = {f"joint, 50, window {w}": replace(JOINT, particles=50, window=w) for w in windows}
+        configs["particles, 100"] = RangeBearingConfig()
+        header = [
+            "recording", "filter", "seeds", "path [m]", "range", "landmarks [m]", "range", "log-evidence, range",
+            "ms per step",
+        ]  # fmt: skip
+        write_table(out / "joint_map_recordings.csv", header, recorded(recordings, seeds, configs))
+    draw(found, out)
+    print(f"picture and tables in {out}")
+    return {str(row[1]): float(row[3]) for row in rows if row[0] == "0.3° per step"}
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
