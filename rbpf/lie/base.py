@@ -11,6 +11,15 @@ from rbpf.arrays import Float, Like
 
 Array = NDArray[np.float64]
 
+States = Like[ArrayLike, "*#batch {self.size}"]
+"""Points of a manifold (..., E), as they are given."""
+Tangents = Like[ArrayLike, "*#batch {self.dim}"]
+"""Tangent vectors (..., d), as they are given."""
+StateArray = Float[np.ndarray, "*batch {self.size}"]
+TangentArray = Float[np.ndarray, "*batch {self.dim}"]
+TangentMatrix = Float[np.ndarray, "*batch {self.dim} {self.dim}"]
+"""Results: (..., E), (..., d) and (..., d, d)."""
+
 _MEAN_ITERATIONS = 50
 _MEAN_TOLERANCE = 1e-14
 
@@ -37,71 +46,23 @@ class Manifold(ABC):
 
     @abstractmethod
     def identity(self, shape: tuple[int, ...] = ()) -> Float[np.ndarray, "*shape {self.size}"]:
-        """Origin of the space, repeated.
-
-        Args:
-            shape: Leading axes.
-
-        Returns:
-            (*shape, E).
-        """
+        """Origin of the space, (*shape, E)."""
 
     @abstractmethod
-    def retract(
-        self, x: Like[ArrayLike, "*#batch {self.size}"], xi: Like[ArrayLike, "*#batch {self.dim}"]
-    ) -> Float[np.ndarray, "*batch {self.size}"]:
-        """Point reached from x along xi.
-
-        Args:
-            x: (..., E).
-            xi: (..., d), in the chart at x.
-
-        Returns:
-            (..., E).
-        """
+    def retract(self, x: States, xi: Tangents) -> StateArray:
+        """Point reached from x along xi, in the chart at x."""
 
     @abstractmethod
-    def local(
-        self, x: Like[ArrayLike, "*#batch {self.size}"], y: Like[ArrayLike, "*#batch {self.size}"]
-    ) -> Float[np.ndarray, "*batch {self.dim}"]:
-        """Coordinates of y in the chart at x; the inverse of `retract`.
-
-        Args:
-            x: (..., E).
-            y: (..., E).
-
-        Returns:
-            (..., d).
-        """
+    def local(self, x: States, y: States) -> TangentArray:
+        """Coordinates of y in the chart at x; the inverse of `retract`."""
 
     @abstractmethod
-    def normalise(self, x: Like[ArrayLike, "*#batch {self.size}"]) -> Float[np.ndarray, "*batch {self.size}"]:
-        """Nearest valid storage: unit quaternion, wrapped angle.
-
-        Args:
-            x: (..., E).
-
-        Returns:
-            (..., E).
-        """
+    def normalise(self, x: States) -> StateArray:
+        """Nearest valid storage: unit quaternion, wrapped angle."""
 
     @final
-    def interpolate(
-        self,
-        a: Like[ArrayLike, "*#batch {self.size}"],
-        b: Like[ArrayLike, "*#batch {self.size}"],
-        s: Like[ArrayLike, "*#batch"],
-    ) -> Float[np.ndarray, "*batch {self.size}"]:
-        """Point at the fraction s of the geodesic from a to b.
-
-        Args:
-            a: (..., E), reached at s = 0.
-            b: (..., E), reached at s = 1.
-            s: (...), also outside [0, 1].
-
-        Returns:
-            (..., E).
-        """
+    def interpolate(self, a: States, b: States, s: Like[ArrayLike, "*#batch"]) -> StateArray:
+        """Point at the fraction s of the geodesic from a, at 0, to b, at 1; s may lie outside [0, 1]."""
         return self.retract(a, np.asarray(s, dtype=float)[..., None] * self.local(a, b))
 
     @final
@@ -112,14 +73,7 @@ class Manifold(ABC):
 
         Gauss-Newton from the heaviest point. It is unique where the points lie within a quarter
         turn of one another; a wider cloud gives the stationary point next to its heaviest member.
-        The sum runs in the order of the rows, so equal input gives equal bytes.
-
-        Args:
-            x: (N, E).
-            weights: (N,), summing to one.
-
-        Returns:
-            (E,).
+        The sum runs in the order of the rows, so equal input gives equal bytes. The weights sum to one.
         """
         points = np.asarray(x, dtype=float)
         column = np.asarray(weights, dtype=float)[:, None]
@@ -136,70 +90,52 @@ class LieGroup(Manifold):
     """A manifold with a smooth group operation; the chart at x is xi -> x Exp(xi)."""
 
     @abstractmethod
-    def exp(self, xi: Like[ArrayLike, "*#batch {self.dim}"]) -> Float[np.ndarray, "*batch {self.size}"]:
+    def exp(self, xi: Tangents) -> StateArray:
         """Exponential map, (..., d) -> (..., E)."""
 
     @abstractmethod
-    def log(self, x: Like[ArrayLike, "*#batch {self.size}"]) -> Float[np.ndarray, "*batch {self.dim}"]:
+    def log(self, x: States) -> TangentArray:
         """Logarithm, (..., E) -> (..., d), with the rotation angle in [0, pi]."""
 
     @abstractmethod
-    def compose(
-        self, a: Like[ArrayLike, "*#batch {self.size}"], b: Like[ArrayLike, "*#batch {self.size}"]
-    ) -> Float[np.ndarray, "*batch {self.size}"]:
+    def compose(self, a: States, b: States) -> StateArray:
         """Group product a b, (..., E) and (..., E) -> (..., E)."""
 
     @abstractmethod
-    def inverse(self, a: Like[ArrayLike, "*#batch {self.size}"]) -> Float[np.ndarray, "*batch {self.size}"]:
+    def inverse(self, a: States) -> StateArray:
         """Group inverse, (..., E) -> (..., E)."""
 
     @abstractmethod
-    def adjoint(
-        self, a: Like[ArrayLike, "*#batch {self.size}"]
-    ) -> Float[np.ndarray, "*batch {self.dim} {self.dim}"]:
+    def adjoint(self, a: States) -> TangentMatrix:
         """Ad_a with a Exp(xi) = Exp(Ad_a xi) a, (..., E) -> (..., d, d)."""
 
     @abstractmethod
-    def left_jacobian(
-        self, xi: Like[ArrayLike, "*#batch {self.dim}"]
-    ) -> Float[np.ndarray, "*batch {self.dim} {self.dim}"]:
+    def left_jacobian(self, xi: Tangents) -> TangentMatrix:
         """J_l with Exp(xi + delta) = Exp(J_l delta) Exp(xi) to first order, (..., d) -> (..., d, d)."""
 
     @abstractmethod
-    def left_jacobian_inverse(
-        self, xi: Like[ArrayLike, "*#batch {self.dim}"]
-    ) -> Float[np.ndarray, "*batch {self.dim} {self.dim}"]:
+    def left_jacobian_inverse(self, xi: Tangents) -> TangentMatrix:
         """Inverse of `left_jacobian`, (..., d) -> (..., d, d); singular at an angle of 2 pi."""
 
     @final
-    def right_jacobian(
-        self, xi: Like[ArrayLike, "*#batch {self.dim}"]
-    ) -> Float[np.ndarray, "*batch {self.dim} {self.dim}"]:
+    def right_jacobian(self, xi: Tangents) -> TangentMatrix:
         """J_r with Exp(xi + delta) = Exp(xi) Exp(J_r delta) to first order, (..., d) -> (..., d, d)."""
         return self.left_jacobian(-np.asarray(xi, dtype=float))
 
     @final
-    def right_jacobian_inverse(
-        self, xi: Like[ArrayLike, "*#batch {self.dim}"]
-    ) -> Float[np.ndarray, "*batch {self.dim} {self.dim}"]:
+    def right_jacobian_inverse(self, xi: Tangents) -> TangentMatrix:
         """Inverse of `right_jacobian`, (..., d) -> (..., d, d); singular at an angle of 2 pi."""
         return self.left_jacobian_inverse(-np.asarray(xi, dtype=float))
 
     @final
-    def between(
-        self, a: Like[ArrayLike, "*#batch {self.size}"], b: Like[ArrayLike, "*#batch {self.size}"]
-    ) -> Float[np.ndarray, "*batch {self.size}"]:
+    def between(self, a: States, b: States) -> StateArray:
         """Product a^-1 b, (..., E) and (..., E) -> (..., E)."""
         return self.compose(self.inverse(a), b)
 
-    def retract(
-        self, x: Like[ArrayLike, "*#batch {self.size}"], xi: Like[ArrayLike, "*#batch {self.dim}"]
-    ) -> Float[np.ndarray, "*batch {self.size}"]:
+    def retract(self, x: States, xi: Tangents) -> StateArray:
         """Product x Exp(xi); see `Manifold.retract`. A group may fuse the two steps for speed."""
         return self.compose(x, self.exp(xi))
 
-    def local(
-        self, x: Like[ArrayLike, "*#batch {self.size}"], y: Like[ArrayLike, "*#batch {self.size}"]
-    ) -> Float[np.ndarray, "*batch {self.dim}"]:
+    def local(self, x: States, y: States) -> TangentArray:
         """Log(x^-1 y); see `Manifold.local`. A group may fuse the two steps for speed."""
         return self.log(self.between(x, y))

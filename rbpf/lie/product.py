@@ -7,9 +7,9 @@ from typing import final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbpf.arrays import Float, Like
+from rbpf.arrays import Float
 from rbpf.errors import InputError
-from rbpf.lie.base import Array, LieGroup, join
+from rbpf.lie.base import Array, LieGroup, StateArray, States, TangentArray, TangentMatrix, Tangents, join
 
 
 @final
@@ -35,46 +35,34 @@ class Euclidean(LieGroup):
     def identity(self, shape: tuple[int, ...] = ()) -> Float[np.ndarray, "*shape {self.size}"]:
         return np.zeros((*shape, self.size))
 
-    def exp(self, xi: Like[ArrayLike, "*#batch {self.dim}"]) -> Float[np.ndarray, "*batch {self.size}"]:
+    def exp(self, xi: Tangents) -> StateArray:
         return np.array(xi, dtype=float)
 
-    def log(self, x: Like[ArrayLike, "*#batch {self.size}"]) -> Float[np.ndarray, "*batch {self.dim}"]:
+    def log(self, x: States) -> TangentArray:
         return np.array(x, dtype=float)
 
-    def compose(
-        self, a: Like[ArrayLike, "*#batch {self.size}"], b: Like[ArrayLike, "*#batch {self.size}"]
-    ) -> Float[np.ndarray, "*batch {self.size}"]:
+    def compose(self, a: States, b: States) -> StateArray:
         return np.asarray(a, dtype=float) + np.asarray(b, dtype=float)
 
-    def inverse(self, a: Like[ArrayLike, "*#batch {self.size}"]) -> Float[np.ndarray, "*batch {self.size}"]:
+    def inverse(self, a: States) -> StateArray:
         return -np.asarray(a, dtype=float)
 
-    def retract(
-        self, x: Like[ArrayLike, "*#batch {self.size}"], xi: Like[ArrayLike, "*#batch {self.dim}"]
-    ) -> Float[np.ndarray, "*batch {self.size}"]:
+    def retract(self, x: States, xi: Tangents) -> StateArray:
         return self.compose(x, xi)
 
-    def local(
-        self, x: Like[ArrayLike, "*#batch {self.size}"], y: Like[ArrayLike, "*#batch {self.size}"]
-    ) -> Float[np.ndarray, "*batch {self.dim}"]:
+    def local(self, x: States, y: States) -> TangentArray:
         return np.asarray(y, dtype=float) - np.asarray(x, dtype=float)
 
-    def normalise(self, x: Like[ArrayLike, "*#batch {self.size}"]) -> Float[np.ndarray, "*batch {self.size}"]:
+    def normalise(self, x: States) -> StateArray:
         return np.array(x, dtype=float)
 
-    def adjoint(
-        self, a: Like[ArrayLike, "*#batch {self.size}"]
-    ) -> Float[np.ndarray, "*batch {self.dim} {self.dim}"]:
+    def adjoint(self, a: States) -> TangentMatrix:
         return self._unit_matrices(np.shape(a)[:-1])
 
-    def left_jacobian(
-        self, xi: Like[ArrayLike, "*#batch {self.dim}"]
-    ) -> Float[np.ndarray, "*batch {self.dim} {self.dim}"]:
+    def left_jacobian(self, xi: Tangents) -> TangentMatrix:
         return self._unit_matrices(np.shape(xi)[:-1])
 
-    def left_jacobian_inverse(
-        self, xi: Like[ArrayLike, "*#batch {self.dim}"]
-    ) -> Float[np.ndarray, "*batch {self.dim} {self.dim}"]:
+    def left_jacobian_inverse(self, xi: Tangents) -> TangentMatrix:
         return self._unit_matrices(np.shape(xi)[:-1])
 
     def inverse_transform(
@@ -127,12 +115,12 @@ class Product(LieGroup):
     def __repr__(self) -> str:
         return f"Product({', '.join(map(repr, self.groups))})"
 
-    def split(self, x: Like[ArrayLike, "*#batch {self.size}"]) -> list[Array]:
+    def split(self, x: States) -> list[Array]:
         """Views of the factors' storages: (..., E) -> one (..., E_i) per factor."""
         array = np.asarray(x, dtype=float)
         return [array[..., part] for part in self._storage]
 
-    def split_tangent(self, xi: Like[ArrayLike, "*#batch {self.dim}"]) -> list[Array]:
+    def split_tangent(self, xi: Tangents) -> list[Array]:
         """Views of the factors' tangents: (..., d) -> one (..., d_i) per factor."""
         array = np.asarray(xi, dtype=float)
         return [array[..., part] for part in self._tangent]
@@ -144,52 +132,40 @@ class Product(LieGroup):
     def identity(self, shape: tuple[int, ...] = ()) -> Float[np.ndarray, "*shape {self.size}"]:
         return join([group.identity(shape) for group in self.groups])
 
-    def exp(self, xi: Like[ArrayLike, "*#batch {self.dim}"]) -> Float[np.ndarray, "*batch {self.size}"]:
+    def exp(self, xi: Tangents) -> StateArray:
         parts = zip(self.groups, self.split_tangent(xi), strict=True)
         return join([group.exp(part) for group, part in parts])
 
-    def log(self, x: Like[ArrayLike, "*#batch {self.size}"]) -> Float[np.ndarray, "*batch {self.dim}"]:
+    def log(self, x: States) -> TangentArray:
         return join([group.log(part) for group, part in zip(self.groups, self.split(x), strict=True)])
 
-    def compose(
-        self, a: Like[ArrayLike, "*#batch {self.size}"], b: Like[ArrayLike, "*#batch {self.size}"]
-    ) -> Float[np.ndarray, "*batch {self.size}"]:
+    def compose(self, a: States, b: States) -> StateArray:
         parts = zip(self.groups, self.split(a), self.split(b), strict=True)
         return join([group.compose(left, right) for group, left, right in parts])
 
-    def inverse(self, a: Like[ArrayLike, "*#batch {self.size}"]) -> Float[np.ndarray, "*batch {self.size}"]:
+    def inverse(self, a: States) -> StateArray:
         parts = zip(self.groups, self.split(a), strict=True)
         return join([group.inverse(part) for group, part in parts])
 
-    def retract(
-        self, x: Like[ArrayLike, "*#batch {self.size}"], xi: Like[ArrayLike, "*#batch {self.dim}"]
-    ) -> Float[np.ndarray, "*batch {self.size}"]:
+    def retract(self, x: States, xi: Tangents) -> StateArray:
         parts = zip(self.groups, self.split(x), self.split_tangent(xi), strict=True)
         return join([group.retract(point, step) for group, point, step in parts])
 
-    def local(
-        self, x: Like[ArrayLike, "*#batch {self.size}"], y: Like[ArrayLike, "*#batch {self.size}"]
-    ) -> Float[np.ndarray, "*batch {self.dim}"]:
+    def local(self, x: States, y: States) -> TangentArray:
         parts = zip(self.groups, self.split(x), self.split(y), strict=True)
         return join([group.local(origin, point) for group, origin, point in parts])
 
-    def normalise(self, x: Like[ArrayLike, "*#batch {self.size}"]) -> Float[np.ndarray, "*batch {self.size}"]:
+    def normalise(self, x: States) -> StateArray:
         parts = zip(self.groups, self.split(x), strict=True)
         return join([group.normalise(part) for group, part in parts])
 
-    def adjoint(
-        self, a: Like[ArrayLike, "*#batch {self.size}"]
-    ) -> Float[np.ndarray, "*batch {self.dim} {self.dim}"]:
+    def adjoint(self, a: States) -> TangentMatrix:
         return self._block_diagonal(self.split(a), [group.adjoint for group in self.groups])
 
-    def left_jacobian(
-        self, xi: Like[ArrayLike, "*#batch {self.dim}"]
-    ) -> Float[np.ndarray, "*batch {self.dim} {self.dim}"]:
+    def left_jacobian(self, xi: Tangents) -> TangentMatrix:
         return self._block_diagonal(self.split_tangent(xi), [group.left_jacobian for group in self.groups])
 
-    def left_jacobian_inverse(
-        self, xi: Like[ArrayLike, "*#batch {self.dim}"]
-    ) -> Float[np.ndarray, "*batch {self.dim} {self.dim}"]:
+    def left_jacobian_inverse(self, xi: Tangents) -> TangentMatrix:
         functions = [group.left_jacobian_inverse for group in self.groups]
         return self._block_diagonal(self.split_tangent(xi), functions)
 

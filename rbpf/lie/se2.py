@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rbpf.arrays import Float, Like
-from rbpf.lie.base import Array, LieGroup
+from rbpf.lie.base import Array, LieGroup, StateArray, States, TangentArray, TangentMatrix, Tangents
 
 Complex = NDArray[np.complex128]
 
@@ -34,94 +34,76 @@ class SE2Group(LieGroup):
     def identity(self, shape: tuple[int, ...] = ()) -> Float[np.ndarray, "*shape 3"]:
         return np.zeros((*shape, 3))
 
-    def exp(self, xi: Like[ArrayLike, "*#batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+    def exp(self, xi: Tangents) -> StateArray:
         xi = _contiguous(xi)
         half = 0.5 * xi[..., 0]
         return _pack(_wrap(xi[..., 0]), _sinc(half) * _phasor(half) * _planar(xi))
 
-    def log(self, x: Like[ArrayLike, "*#batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+    def log(self, x: States) -> TangentArray:
         x = _contiguous(x)
         angle = _wrap(x[..., 0])
         half = 0.5 * angle
         return _pack(angle, _phasor(-half) * _planar(x) / _sinc(half))
 
-    def compose(
-        self, a: Like[ArrayLike, "*#batch 3"], b: Like[ArrayLike, "*#batch 3"]
-    ) -> Float[np.ndarray, "*batch 3"]:
+    def compose(self, a: States, b: States) -> StateArray:
         a, b = _contiguous(a), _contiguous(b)
         return _pack(_wrap(a[..., 0] + b[..., 0]), _planar(a) + _phasor(a[..., 0]) * _planar(b))
 
-    def inverse(self, a: Like[ArrayLike, "*#batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+    def inverse(self, a: States) -> StateArray:
         a = _contiguous(a)
         return _pack(_wrap(-a[..., 0]), -_phasor(-a[..., 0]) * _planar(a))
 
-    def retract(
-        self, x: Like[ArrayLike, "*#batch 3"], xi: Like[ArrayLike, "*#batch 3"]
-    ) -> Float[np.ndarray, "*batch 3"]:
+    def retract(self, x: States, xi: Tangents) -> StateArray:
         # The rotations exp(i theta) and exp(i omega / 2) of the increment are one.
         x, xi = _contiguous(x), _contiguous(xi)
         half = 0.5 * xi[..., 0]
         step = _sinc(half) * _phasor(x[..., 0] + half) * _planar(xi)
         return _pack(_wrap(x[..., 0] + xi[..., 0]), _planar(x) + step)
 
-    def local(
-        self, x: Like[ArrayLike, "*#batch 3"], y: Like[ArrayLike, "*#batch 3"]
-    ) -> Float[np.ndarray, "*batch 3"]:
+    def local(self, x: States, y: States) -> TangentArray:
         x, y = _contiguous(x), _contiguous(y)
         angle = _wrap(y[..., 0] - x[..., 0])
         half = 0.5 * angle
         return _pack(angle, _phasor(-x[..., 0] - half) * (_planar(y) - _planar(x)) / _sinc(half))
 
-    def normalise(self, x: Like[ArrayLike, "*#batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+    def normalise(self, x: States) -> StateArray:
         x = _contiguous(x)
         return _pack(_wrap(x[..., 0]), _planar(x))
 
-    def adjoint(self, a: Like[ArrayLike, "*#batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:
+    def adjoint(self, a: States) -> TangentMatrix:
         a = _contiguous(a)
         return _block(_phasor(a[..., 0]), -1j * _planar(a))
 
-    def left_jacobian(self, xi: Like[ArrayLike, "*#batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:
+    def left_jacobian(self, xi: Tangents) -> TangentMatrix:
         xi = _contiguous(xi)
         half = 0.5 * xi[..., 0]
         return _block(_sinc(half) * _phasor(half), _coupling(xi))
 
-    def left_jacobian_inverse(self, xi: Like[ArrayLike, "*#batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:
+    def left_jacobian_inverse(self, xi: Tangents) -> TangentMatrix:
         xi = _contiguous(xi)
         half = 0.5 * xi[..., 0]
         inverse = _phasor(-half) / _sinc(half)
         return _block(inverse, -inverse * _coupling(xi))
 
-    def transform(
-        self, a: Like[ArrayLike, "*#batch 3"], p: Like[ArrayLike, "*#batch 2"]
-    ) -> Float[np.ndarray, "*batch 2"]:
-        """World points of body points.
-
-        Args:
-            a: (..., 3), world_from_body.
-            p: (..., 2), in the body's frame [m].
-
-        Returns:
-            (..., 2), in the world [m].
-        """
+    def transform(self, a: States, p: Like[ArrayLike, "*#batch 2"]) -> Float[np.ndarray, "*batch 2"]:
+        """World points [m] of body points, with a = world_from_body."""
         a, p = _contiguous(a), np.asarray(p, dtype=float)
         return _pair(_planar(a) + _phasor(a[..., 0]) * (p[..., 0] + 1j * p[..., 1]))
 
-    def inverse_transform(
-        self, a: Like[ArrayLike, "*#batch 3"], p: Like[ArrayLike, "*#batch 2"]
-    ) -> Float[np.ndarray, "*batch 2"]:
-        """Body points of world points; arguments as in `transform`, the frames of p exchanged."""
+    def inverse_transform(self, a: States, p: Like[ArrayLike, "*#batch 2"]) -> Float[np.ndarray, "*batch 2"]:
+        """Body points of world points, the inverse of `transform`."""
         a, p = _contiguous(a), np.asarray(p, dtype=float)
         return _pair(_phasor(-a[..., 0]) * (p[..., 0] + 1j * p[..., 1] - _planar(a)))
 
-    def translation(self, a: Like[ArrayLike, "*#batch 3"]) -> Float[np.ndarray, "*batch 2"]:
+    def translation(self, a: States) -> Float[np.ndarray, "*batch 2"]:
         """View of the translation, (..., 3) -> (..., 2)."""
         return np.asarray(a, dtype=float)[..., 1:]
 
-    def rotation(self, a: Like[ArrayLike, "*#batch 3"]) -> Float[np.ndarray, "*batch 2 2"]:
+    def rotation(self, a: States) -> Float[np.ndarray, "*batch 2 2"]:
         """Rotation matrix, (..., 3) -> (..., 2, 2)."""
         return _matrix(_phasor(_contiguous(a)[..., 0]))
 
-    def matrix(self, a: Like[ArrayLike, "*#batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:
+    def matrix(self, a: States) -> Float[np.ndarray, "*batch 3 3"]:
         """Homogeneous matrix, (..., 3) -> (..., 3, 3)."""
         a = _contiguous(a)
         out = np.zeros((*a.shape[:-1], 3, 3))

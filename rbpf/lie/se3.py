@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from rbpf.arrays import Float, Like
 from rbpf.errors import InputError
 from rbpf.kernels import se3 as kernels
-from rbpf.lie.base import Array, LieGroup, join
+from rbpf.lie.base import Array, LieGroup, StateArray, States, TangentArray, TangentMatrix, Tangents, join
 
 
 @final
@@ -27,73 +27,55 @@ class SE3Group(LieGroup):
         out[..., 3] = 1.0
         return out
 
-    def exp(self, xi: Like[ArrayLike, "*#batch 6"]) -> Float[np.ndarray, "*batch 7"]:
+    def exp(self, xi: Tangents) -> StateArray:
         return _one(kernels.exp, xi, 6, (7,))
 
-    def log(self, x: Like[ArrayLike, "*#batch 7"]) -> Float[np.ndarray, "*batch 6"]:
+    def log(self, x: States) -> TangentArray:
         return _one(kernels.log, x, 7, (6,))
 
-    def compose(
-        self, a: Like[ArrayLike, "*#batch 7"], b: Like[ArrayLike, "*#batch 7"]
-    ) -> Float[np.ndarray, "*batch 7"]:
+    def compose(self, a: States, b: States) -> StateArray:
         return _two(kernels.compose, a, b, 7, 7)
 
-    def inverse(self, a: Like[ArrayLike, "*#batch 7"]) -> Float[np.ndarray, "*batch 7"]:
+    def inverse(self, a: States) -> StateArray:
         return _one(kernels.inverse, a, 7, (7,))
 
-    def retract(
-        self, x: Like[ArrayLike, "*#batch 7"], xi: Like[ArrayLike, "*#batch 6"]
-    ) -> Float[np.ndarray, "*batch 7"]:
+    def retract(self, x: States, xi: Tangents) -> StateArray:
         return _two(kernels.retract, x, xi, 6, 7)
 
-    def local(
-        self, x: Like[ArrayLike, "*#batch 7"], y: Like[ArrayLike, "*#batch 7"]
-    ) -> Float[np.ndarray, "*batch 6"]:
+    def local(self, x: States, y: States) -> TangentArray:
         return _two(kernels.local, x, y, 7, 6)
 
-    def normalise(self, x: Like[ArrayLike, "*#batch 7"]) -> Float[np.ndarray, "*batch 7"]:
+    def normalise(self, x: States) -> StateArray:
         out = np.array(x, dtype=float)
         out[..., :4] /= np.sqrt(np.square(out[..., :4]).sum(axis=-1, keepdims=True))
         return out
 
-    def adjoint(self, a: Like[ArrayLike, "*#batch 7"]) -> Float[np.ndarray, "*batch 6 6"]:
+    def adjoint(self, a: States) -> TangentMatrix:
         return _one(kernels.adjoint, a, 7, (6, 6))
 
-    def left_jacobian(self, xi: Like[ArrayLike, "*#batch 6"]) -> Float[np.ndarray, "*batch 6 6"]:
+    def left_jacobian(self, xi: Tangents) -> TangentMatrix:
         return _one(kernels.left_jacobian, xi, 6, (6, 6))
 
-    def left_jacobian_inverse(self, xi: Like[ArrayLike, "*#batch 6"]) -> Float[np.ndarray, "*batch 6 6"]:
+    def left_jacobian_inverse(self, xi: Tangents) -> TangentMatrix:
         return _one(kernels.left_jacobian_inverse, xi, 6, (6, 6))
 
-    def transform(
-        self, a: Like[ArrayLike, "*#batch 7"], p: Like[ArrayLike, "*#batch 3"]
-    ) -> Float[np.ndarray, "*batch 3"]:
-        """World points of body points.
-
-        Args:
-            a: (..., 7), world_from_body.
-            p: (..., 3), in the body's frame [m].
-
-        Returns:
-            (..., 3), in the world [m].
-        """
+    def transform(self, a: States, p: Like[ArrayLike, "*#batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+        """World points [m] of body points, with a = world_from_body."""
         return _two(kernels.transform, a, p, 3, 3)
 
-    def inverse_transform(
-        self, a: Like[ArrayLike, "*#batch 7"], p: Like[ArrayLike, "*#batch 3"]
-    ) -> Float[np.ndarray, "*batch 3"]:
-        """Body points of world points; arguments as in `transform`, the frames of p exchanged."""
+    def inverse_transform(self, a: States, p: Like[ArrayLike, "*#batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+        """Body points of world points, the inverse of `transform`."""
         return _two(kernels.inverse_transform, a, p, 3, 3)
 
-    def translation(self, a: Like[ArrayLike, "*#batch 7"]) -> Float[np.ndarray, "*batch 3"]:
+    def translation(self, a: States) -> Float[np.ndarray, "*batch 3"]:
         """View of the translation, (..., 7) -> (..., 3)."""
         return np.asarray(a, dtype=float)[..., 4:]
 
-    def rotation(self, a: Like[ArrayLike, "*#batch 7"]) -> Float[np.ndarray, "*batch 3 3"]:
+    def rotation(self, a: States) -> Float[np.ndarray, "*batch 3 3"]:
         """Rotation matrix, (..., 7) -> (..., 3, 3)."""
         return _one(kernels.rotations, a, 7, (3, 3))
 
-    def matrix(self, a: Like[ArrayLike, "*#batch 7"]) -> Float[np.ndarray, "*batch 4 4"]:
+    def matrix(self, a: States) -> Float[np.ndarray, "*batch 4 4"]:
         """Homogeneous matrix, (..., 7) -> (..., 4, 4)."""
         a = np.asarray(a, dtype=float)
         out = np.zeros((*a.shape[:-1], 4, 4))
@@ -114,17 +96,7 @@ class SE3Group(LieGroup):
         pitch: Like[ArrayLike, "*#batch"],
         roll: Like[ArrayLike, "*#batch"],
     ) -> Float[np.ndarray, "*batch 7"]:
-        """Element with the rotation Rz(yaw) Ry(pitch) Rx(roll).
-
-        Args:
-            t: (..., 3), translation [m].
-            yaw: (...) [rad].
-            pitch: (...) [rad].
-            roll: (...) [rad].
-
-        Returns:
-            (..., 7).
-        """
+        """Element with the translation t [m] and the rotation Rz(yaw) Ry(pitch) Rx(roll) [rad]."""
         (cz, sz), (cy, sy), (cx, sx) = (_half_angle(angle) for angle in (yaw, pitch, roll))
         x = cz * cy * sx - sz * sy * cx
         y = cz * sy * cx + sz * cy * sx
@@ -134,7 +106,7 @@ class SE3Group(LieGroup):
         return join([quat, np.asarray(t, dtype=float)])
 
     def ypr(
-        self, a: Like[ArrayLike, "*#batch 7"]
+        self, a: States
     ) -> tuple[Float[np.ndarray, "*batch"], Float[np.ndarray, "*batch"], Float[np.ndarray, "*batch"]]:
         """Yaw, pitch and roll [rad], each (...); at a pitch of +-pi/2 only yaw -+ roll is defined."""
         rotation = self.rotation(a)
