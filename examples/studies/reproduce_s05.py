@@ -15,12 +15,12 @@ from pathlib import Path
 import numpy as np
 import tyro
 
+from examples.studies.feature_cache import filter_cached
 from examples.studies.s05.drive import Setting, measured_drive
 from examples.studies.s05.pictures import draw_errors, draw_maps, draw_time
 from examples.studies.s05.record import Paths, Record, best_particle, errors, paths_of
 from examples.studies.s05.sweeps import HEADER, sweep
 from rbpf.lie import SE3
-from rbpf.runs.recordings import filter_pairs
 from rbpf.runs.run import Run
 from rbpf.validation.tables import write_table
 
@@ -73,7 +73,7 @@ def main(
     drive = measured_drive(setting, told)
     due = {round(frame / setting.every): frame for frame in PAPER}
     record = Record(tuple(due))
-    run = filter_pairs(drive, setting.config(), [record])
+    run = filter_cached(drive, setting.config(), [record])
     paths, best = paths_of(run, setting.images), best_particle(run)
     table_1(record, paths, due, out)
     figures = errors(record, paths, best, run.log["updated"])

@@ -16,10 +16,11 @@ from typing import final
 import numpy as np
 import tyro
 
+from examples.studies.feature_cache import cache_features, filter_cached
 from examples.studies.point_worlds import STEREO, LabWorld, Measuring, simulate_features
 from rbpf.errors import InputError
 from rbpf.runs.plots import COLOURS, new_axes, save_figures
-from rbpf.runs.recordings import filter_features, filter_pairs
+from rbpf.runs.recordings import filter_features
 from rbpf.runs.run import Run
 from rbpf.runs.trajectory import in_space
 from rbpf.sensors.feature_log import CameraTruth, FeatureLog
@@ -27,7 +28,6 @@ from rbpf.sensors.readers import ImageSequence, open_stereo
 from rbpf.sensors.readers.images.sequence import ImageFrame, Source
 from rbpf.sensors.readers.stereo_tracks import read_stereo_tracks
 from rbpf.systems.stereo.config import StereoConfig
-from rbpf.systems.stereo.feature_cache import cache_features
 from rbpf.validation.gtsam.batch_problem import solve_problem
 from rbpf.validation.metrics.scores import score_path
 from rbpf.validation.simulation.lab import LabDrive
@@ -132,7 +132,7 @@ def of_pairs(folder: Path, configs: Sequence[StereoConfig]) -> Iterator[list]:
         both = cache_features(pairs_there_and_back(sequence), configs[0], Path(features))
         for way, part in zip(WAYS, (both.first(len(sequence)), both), strict=True):
             yield row(
-                f"{sequence.name}, {way}", lambda config, part=part: filter_pairs(part, config), configs
+                f"{sequence.name}, {way}", lambda config, part=part: filter_cached(part, config), configs
             )
 
 

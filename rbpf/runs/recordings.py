@@ -38,7 +38,6 @@ from rbpf.systems.mono.slam import MonoSlam
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.range_bearing.slam import RangeBearingSlam
 from rbpf.systems.stereo.config import StereoConfig
-from rbpf.systems.stereo.feature_cache import CachedSequence
 from rbpf.systems.stereo.front_end import NamedFrontEnd
 from rbpf.systems.stereo.slam import StereoSlam
 from rbpf.systems.system import System
@@ -277,8 +276,8 @@ def open_mono(
     return Opened(system, sequence, sequence.stamps_ns, sequence.truth)
 
 
-def open_pairs(sequence: ImageSequence | CachedSequence, config: StereoConfig) -> Opened:
-    """A sequence of pairs of images, or of what was measured in them."""
+def open_pairs(sequence: ImageSequence, config: StereoConfig) -> Opened:
+    """A sequence of pairs of images."""
     return Opened(StereoSlam(sequence.rig, config), sequence, sequence.stamps_ns, sequence.truth)
 
 
@@ -419,11 +418,11 @@ def filter_images(
 
 
 def filter_pairs(
-    sequence: ImageSequence | CachedSequence,
+    sequence: ImageSequence,
     config: StereoConfig,
     listeners: Iterable[Listener] = (),
     checkpoint: Path | None = None,
     resume: bool = False,
 ) -> Run[StereoSlam]:
-    """A sequence of pairs of images, or of what was measured in them, filtered to its end; errors as `drive`."""
+    """A sequence of pairs of images, filtered to its end; errors as `drive`."""
     return filter_opened(open_pairs(sequence, config), listeners, checkpoint, config.checkpoint_every, resume)

@@ -230,7 +230,7 @@ class TestBadPairs:
             slam.track(*np.zeros((2, 50, 100), dtype=np.uint8), 0)
         image = next(pairs(2).frames())
         slam.take(image)
-        with pytest.raises(InputError, match="is given a FeatureFrame, and takes ImageFrame or CachedPair"):
+        with pytest.raises(InputError, match="is given a FeatureFrame, and takes ImageFrame"):
             slam.take(FeatureFrame(1, np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3))))
 
     def test_too_few_matches_widen_the_motion(self):

@@ -4,11 +4,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from examples.studies.feature_cache import CachedSequence, cache_features
 from rbpf.errors import InputError
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.readers import open_stereo
 from rbpf.systems.stereo.config import StereoConfig, TriggerConfig
-from rbpf.systems.stereo.feature_cache import CachedSequence, cache_features
 from rbpf.validation.simulation.images import Imaging, simulate_images
 from rbpf.validation.simulation.lab import LabDrive, TexturedLab
 

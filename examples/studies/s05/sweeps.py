@@ -5,13 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from examples.studies.feature_cache import CachedSequence, filter_cached
 from examples.studies.s05.record import rms
 from rbpf.lie import SE3
-from rbpf.runs.recordings import filter_pairs
 from rbpf.runs.run import Run
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig
 from rbpf.systems.stereo.config import StereoConfig
-from rbpf.systems.stereo.feature_cache import CachedSequence
 from rbpf.validation.consistency.statistic import whitened_errors
 
 ERROR, NEES = ("error m", "least", "most"), ("median NEES", "least NEES", "most NEES")
@@ -44,7 +43,7 @@ def sweep(
 ) -> Iterator[list[str | float]]:
     """A row for each setting, and one for the odometry alone: medians over the seeds of the filter, least and most."""
     for name, config in settings(base).items():
-        runs = [filter_pairs(drive, replace(config, seed=seed)) for seed in seeds]
+        runs = [filter_cached(drive, replace(config, seed=seed)) for seed in seeds]
         off, end, nees, right, seconds = np.array([figures_of(run) for run in runs]).T
         middle = float(np.median(end)), float(np.median(seconds))
         yield [name, *_spread(off), middle[0], *_spread(nees), float(right[0]), middle[1]]

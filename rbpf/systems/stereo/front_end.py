@@ -1,8 +1,8 @@
 """What a stereo camera's frames show: features of each pair, and which of two pairs are the same point.
 
 A front end measures a frame, which gives a `Pair`, and matches two pairs. It holds no pair itself: nothing depends on
-the order of its calls. `ImageFrontEnd` takes images, or what was measured in them earlier; `NamedFrontEnd` pixels of
-landmarks that have names.
+the order of its calls. `ImageFrontEnd` takes images; `NamedFrontEnd` pixels of landmarks that
+have names.
 
 Where `odometry.split` is not "none", odometry and map use features of their own: each feature is always in the same
 half, whenever it is seen.
@@ -25,7 +25,6 @@ from rbpf.sensors.features import FeatureExtractor, Sift
 from rbpf.sensors.readers import ImageFrame
 from rbpf.sensors.stereo import StereoFeatures, StereoMatcher, match_frames
 from rbpf.systems.stereo.config import StereoConfig
-from rbpf.systems.stereo.feature_cache import KEPT, CachedPair
 from rbpf.systems.stereo.landmarks import (
     AssociationGate,
     DescriptorLandmarks,
@@ -37,6 +36,9 @@ from rbpf.systems.stereo.landmarks import (
     View,
 )
 from rbpf.systems.stereo.motion_segmentation import UNKNOWN
+
+KEPT = ("z", "cov", "scale", "orientation", "descriptors")
+"""What the rest of `StereoFeatures` follows from."""
 
 
 @final
@@ -150,7 +152,7 @@ class ImageFrontEnd(FrontEnd[StereoFeatures]):
         landmarks: finds landmarks among the features; None for those by descriptors, with `gate`, `model` and `landmark`.
     """
 
-    frames = (ImageFrame, CachedPair)
+    frames = (ImageFrame,)
 
     def __init__(
         self,
@@ -170,24 +172,27 @@ class ImageFrontEnd(FrontEnd[StereoFeatures]):
             rig, config.map, config.new_landmarks, length, likelihood, gate, model, landmark
         )
 
-    def measure(self, frame: ImageFrame | CachedPair) -> tuple[Pair[StereoFeatures], str]:
-        """SIFT in both images, matched along the rows; or what was measured in them before.
+    def measure(self, frame: Any) -> tuple[Pair[StereoFeatures], str]:
+        features, problem = self.features_of(frame)
+        return self._pair(frame.stamp_ns, self._none() if features is None else features), problem
+
+    def features_of(self, frame: Any) -> tuple[StereoFeatures | None, str]:
+        """Features of both images, matched along the rows, None where there are none; and what is wrong, in words.
 
         Raises:
             InputError: left and right image are swapped.
         """
-        features, problem = None, frame.problem or ""
-        if isinstance(frame, CachedPair):
-            features = frame.features
-        elif frame.image is None or frame.right is None:
-            problem = problem or "an image is missing"
-        elif not (problem := self.refusal(frame)):
-            features = self.matcher.measure(frame.image, frame.right)
-            problem = self.matcher.remark
-        return self._pair(frame.stamp_ns, self._none() if features is None else features), problem
+        if frame.image is None or frame.right is None:
+            return None, frame.problem or "an image is missing"
+        refusal = self.refusal(frame)
+        return (
+            (None, refusal)
+            if refusal
+            else (self.matcher.measure(frame.image, frame.right), self.matcher.remark)
+        )
 
-    def refusal(self, frame: ImageFrame | CachedPair) -> str:
-        if isinstance(frame, CachedPair) or frame.image is None or frame.right is None:
+    def refusal(self, frame: Any) -> str:
+        if frame.image is None or frame.right is None:
             return ""
         try:
             self.matcher.check(frame.image, frame.right)

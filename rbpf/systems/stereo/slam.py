@@ -29,7 +29,6 @@ from rbpf.sensors.features import FeatureExtractor
 from rbpf.sensors.readers import ImageFrame
 from rbpf.systems.map_estimate import MapEstimate, estimate_map
 from rbpf.systems.stereo.config import StereoConfig
-from rbpf.systems.stereo.feature_cache import CachedPair
 from rbpf.systems.stereo.front_end import FrontEnd, ImageFrontEnd, NamedFrontEnd, Pair
 from rbpf.systems.stereo.landmarks import AssociationGate
 from rbpf.systems.stereo.motion_segmentation import camera_motion, contradicts, propagated
@@ -66,8 +65,8 @@ class StereoSlam(System):
         gate: which landmarks may be which feature; None for that of `config`.
         model: how a landmark is measured; None for pixels of points in space.
         landmark: its parametrisation; None for points in space.
-        front_end: measures frames, and finds landmarks in them. None chooses by the first frame: images (or what was
-            measured in them earlier), or pixels of landmarks that have names.
+        front_end: measures frames, and finds landmarks in them. None chooses by the first frame: images, or pixels
+            of landmarks that have names.
     """
 
     name: ClassVar[str] = "stereo"
@@ -179,8 +178,8 @@ class StereoSlam(System):
         """
         return self.take(ImageFrame(stamp_ns, left, right))
 
-    def take(self, frame: ImageFrame | CachedPair | FeatureFrame) -> Tracked:
-        """`track` with a frame of a recording, with features that were measured earlier, or with pixels that have names."""
+    def take(self, frame: Any) -> Tracked:
+        """`track` with a frame of a recording, an `ImageFrame`, or with pixels that have names, a `FeatureFrame`."""
         started, messages = time.perf_counter(), list[str]()
         front_end = self._front_end_of(frame)
         landmarks, config = front_end.landmarks, self.config

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from examples.studies import feature_cache
+from examples.studies.feature_cache import cache_features, filter_cached
 from rbpf.errors import InputError
 from rbpf.sensors.features import SiftConfig
-from rbpf.systems.stereo import feature_cache
 from rbpf.systems.stereo.config import StereoConfig
-from rbpf.systems.stereo.feature_cache import cache_features
 from tests.systems.stereo_sequences import filtered, missing, pairs
 
 CONFIG, COUNT, BAD = StereoConfig(particles=40), 7, 4
@@ -28,13 +28,13 @@ def test_the_same_run(tmp_path):
     told = []
     kept = cache_features(sequence(), CONFIG, tmp_path, lambda done, total: told.append((done, total)))
     assert told == [(k, COUNT) for k in range(1, COUNT + 1)]
-    ours, plain = filtered(kept, CONFIG), filtered(sequence(), CONFIG)
+    ours, plain = filter_cached(kept, CONFIG), filtered(sequence(), CONFIG)
     for name in ("odometry", "features", "agreeing", "observed"):
         np.testing.assert_array_equal(ours.log[name], plain.log[name])
     for name in ("stamps_ns", "poses", "covs"):
         np.testing.assert_array_equal(getattr(ours.log, name), getattr(plain.log, name))
     assert ours.messages == plain.messages and len(ours.messages) == 1
-    assert len(kept.first(5)) == 5 and len(filtered(kept.first(5), CONFIG).log) == 5
+    assert len(kept.first(5)) == 5 and len(filter_cached(kept.first(5), CONFIG).log) == 5
     late = list(kept.frames(COUNT - 2))
     assert len(late) == 2
     np.testing.assert_array_equal(late[1].features.descriptors, list(kept.frames())[-1].features.descriptors)

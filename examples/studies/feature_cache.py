@@ -1,33 +1,35 @@
 """Features of a sequence of pairs, measured once and kept in files, to be filtered as often as one likes.
 
 Decoding and SIFT take most of a pair's time, and depend on no setting of the filter. `cache_features` goes on where it
-was interrupted: what it keeps are chunks of pairs, each a file that appears when it is complete.
+was interrupted: what it keeps are chunks of pairs, each a file that appears when it is complete. `filter_cached`
+filters them: a front end of its own, `CachedFrontEnd`, hands the features to the system.
 """
 
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass
 from itertools import islice
 from pathlib import Path
-from typing import final
+from typing import Any, final
 
 import numpy as np
 
 from rbpf.core.checkpoint import fitting, load_arrays, save_arrays
 from rbpf.errors import InputError
+from rbpf.runs.recordings import Opened, filter_opened
+from rbpf.runs.run import Listener, Run
 from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.feature_log import CameraTruth
 from rbpf.sensors.features import Sift
 from rbpf.sensors.readers import ImageSequence
 from rbpf.sensors.stereo import StereoFeatures, StereoMatcher
 from rbpf.systems.stereo.config import StereoConfig
+from rbpf.systems.stereo.front_end import KEPT, ImageFrontEnd
+from rbpf.systems.stereo.slam import StereoSlam
 
 CHUNK = 100
 """Pairs in a file."""
-
-KEPT = ("z", "cov", "scale", "orientation", "descriptors")
-"""What the rest of `StereoFeatures` follows from."""
 
 
 @dataclass(frozen=True)
@@ -114,6 +116,26 @@ def cache_features(
                 on_pair(first + len(pairs), total)
         _write(folder, first, pairs, config.sift.length)
     return CachedSequence(sequence.name, sequence.rig, sequence.stamps_ns, sequence.truth, folder)
+
+
+class CachedFrontEnd(ImageFrontEnd):
+    """Takes pairs whose features are known, in place of images."""
+
+    frames = (CachedPair,)
+
+    def features_of(self, frame: Any) -> tuple[StereoFeatures | None, str]:
+        return frame.features, frame.problem
+
+    def refusal(self, frame: Any) -> str:
+        return ""
+
+
+def filter_cached(
+    sequence: CachedSequence, config: StereoConfig, listeners: Iterable[Listener] = ()
+) -> Run[StereoSlam]:
+    """A sequence whose features are known, filtered to its end."""
+    system = StereoSlam(sequence.rig, config, front_end=CachedFrontEnd(sequence.rig, config))
+    return filter_opened(Opened(system, sequence, sequence.stamps_ns, sequence.truth), listeners)
 
 
 def _file(folder: Path, first: int) -> Path:
