@@ -21,19 +21,8 @@ FLAT = 1e-12
 def white_rows(matrix, camera, z_prev, z_now, cov_prev, cov_now, noisy, sweeps, swept, rows, front, best):
     """Fills rows (K, 3, 7) with L⁻¹ [ν, −∂g/∂ξ], front (K,) and best (K, 3) with m̂; zeros for a point behind.
 
-    Args:
-        matrix: (4, 4) H.
-        camera: (5,) fx, fy, cx, cy, fx · baseline.
-        z_prev: (K, 3).
-        z_now: (K, 3).
-        cov_prev: (K, 3, 3).
-        cov_now: (K, 3, 3).
-        noisy: whether the earlier pixels' noise is in S.
-        sweeps: of the adjustment of m̂, 0 for none.
-        swept: change of m̂ that ends them.
-        rows: to fill.
-        front: to fill.
-        best: to fill.
+    Of pixels z (K, 3) with covariances (K, 3, 3), the matrix H (4, 4) and the `camera` (fx, fy, cx, cy, fx · baseline).
+    `noisy`: the earlier pixels' noise is in S. m̂ is adjusted in `sweeps`, until it changes by less than `swept`.
     """
     pixels, seen, slope = np.empty(3), np.empty(3), np.empty((3, 3))
     chol, gain, gained = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
@@ -68,14 +57,7 @@ def white_rows(matrix, camera, z_prev, z_now, cov_prev, cov_now, noisy, sweeps, 
 def scores(matrices, z_prev, z_now, white, gate, score, agreeing):
     """Fills score (C,) with Σ min(d², gate) over the matches and agreeing (C,) with how many have d² ≤ gate.
 
-    Args:
-        matrices: (C, 4, 4) H.
-        z_prev: (K, 3).
-        z_now: (K, 3).
-        white: (K, 3, 3) W with d² = ‖W (z − g)‖².
-        gate: on d².
-        score: to fill.
-        agreeing: to fill.
+    Of matrices H (C, 4, 4), pixels z (K, 3) and `white` W (K, 3, 3), with d² = ‖W (z − g)‖².
     """
     miss = np.empty(3)
     for c in range(matrices.shape[0]):
@@ -176,19 +158,8 @@ def _whiten(chol, row):
 def propose(rows, before, now, z_prev, z_now, white, camera, start, steps, motions):
     """Fills motions (C, 7) with what triples of matches, `rows` (C, 3), propose.
 
-    A triple's points are aligned; the better of this and `start` on the triple's pixels is refined by Gauss-Newton.
-
-    Args:
-        rows: (C, 3).
-        before: (K, 3) points in the earlier camera's frame.
-        now: (K, 3) in the later one's.
-        z_prev: (K, 3) pixels.
-        z_now: (K, 3).
-        white: (K, 3, 3) W with d² = ‖W (z − g)‖².
-        camera: (5,) fx, fy, cx, cy, fx · baseline.
-        start: (7,).
-        steps: of Gauss-Newton.
-        motions: to fill.
+    A triple's points, of those `before` and `now` (K, 3), are aligned; the better of this and `start` (7,) on the triple's
+    pixels z (K, 3) is refined by some `steps` of Gauss-Newton. `white` and `camera` as above.
     """
     row, vector, info = np.empty((3, 6)), np.empty(6), np.empty((6, 6))
     guess = ((start[0], start[1], start[2], start[3]), (start[4], start[5], start[6]))

@@ -36,54 +36,21 @@ from rbpf.kernels.signature import (
     kernel_at,
 )
 
+RECORDS = CUBE, INDICES, INDICES, INDEX_MATRIX
+OBSERVED = MATRIX, CUBE, MASK, int64, VECTOR
+"""Types of (pool, slabs, which, maps) and of (z, noise, mask, kernel_id, kernel_params), see `refine`."""
+
 
 @njit(
-    void(
-        int64,
-        VECTOR,
-        MATRIX,
-        CUBE,
-        INDICES,
-        INDICES,
-        INDEX_MATRIX,
-        MATRIX,
-        CUBE,
-        MASK,
-        int64,
-        VECTOR,
-        CUBE,
-        INDICES,
-        CUBE,
-        MATRIX,
-        VECTOR,
-        VECTOR,
-        VECTOR,
-    ),
+    void(int64, VECTOR, MATRIX, *RECORDS, *OBSERVED, CUBE, INDICES, CUBE, MATRIX, VECTOR, VECTOR, VECTOR),
     parallel=True,
     cache=True,
     error_model="numpy",
 )
 def refine(
-    address,
-    params,
-    state,
-    pool,
-    slabs,
-    which,
-    maps,
-    z,
-    noise,
-    mask,
-    kernel_id,
-    kernel_params,
-    factor,
-    sizes,
-    info,
-    vector,
-    quad,
-    log_det,
-    rows,
-):
+    address, params, state, pool, slabs, which, maps, z, noise, mask, kernel_id, kernel_params, factor, sizes,
+    info, vector, quad, log_det, rows,
+):  # fmt: skip
     """Adds Σ HᵀS⁻¹H, Σ HᵀS⁻¹ν, Σ νᵀS⁻¹ν and Σ log|2πS| over the observations, S = J P Jᵀ + R; see docs/mathematics.md.
 
     `rows` (N,) counts the scalar measurements that entered these sums.
@@ -168,44 +135,15 @@ def _store_record(pool, slab, source, rows, start, count, mean, cov):
 
 
 @njit(
-    void(
-        int64,
-        VECTOR,
-        MATRIX,
-        CUBE,
-        INDICES,
-        INDICES,
-        INDEX_MATRIX,
-        INDICES,
-        MATRIX,
-        CUBE,
-        MASK,
-        int64,
-        VECTOR,
-        INDICES,
-        VECTOR,
-    ),
+    void(int64, VECTOR, MATRIX, *RECORDS, INDICES, *OBSERVED, INDICES, VECTOR),
     parallel=True,
     cache=True,
     error_model="numpy",
 )
 def update(
-    address,
-    params,
-    state,
-    pool,
-    slabs,
-    which,
-    maps,
-    targets,
-    z,
-    noise,
-    mask,
-    kernel_id,
-    kernel_params,
-    sizes,
+    address, params, state, pool, slabs, which, maps, targets, z, noise, mask, kernel_id, kernel_params, sizes,
     log_density,
-):
+):  # fmt: skip
     """Adds Σ log p(z | x) to `log_density` (N,) and writes the updated landmarks to the slabs `targets`.
 
     Given the sampled pose, each landmark is an independent EKF: with S = J P Jᵀ + R = L Lᵀ, A = L⁻¹ J P and
@@ -318,21 +256,7 @@ def _add_between(weights, offset, mean, cov):
 
 
 @njit(
-    void(
-        int64,
-        VECTOR,
-        MATRIX,
-        CUBE,
-        INDICES,
-        INDICES,
-        INDEX_MATRIX,
-        MATRIX,
-        VECTOR,
-        CUBE,
-        INDICES,
-        MATRIX,
-        CUBE,
-    ),
+    void(int64, VECTOR, MATRIX, *RECORDS, MATRIX, VECTOR, CUBE, INDICES, MATRIX, CUBE),
     cache=True,
     error_model="numpy",
 )

@@ -8,6 +8,8 @@ from numba import float64, int64, njit, void
 from rbpf.kernels.se3 import exp_pair, multiply, rotation, turned
 from rbpf.kernels.signature import CUBE, MATRIX, READ_ONLY, READ_ONLY_CUBE
 
+_GIVEN = READ_ONLY_CUBE, READ_ONLY_CUBE, READ_ONLY, READ_ONLY_CUBE, READ_ONLY
+
 
 @njit(cache=True, error_model="numpy")
 def _jacobian(q, jac):
@@ -103,23 +105,7 @@ def _spread(slope, cov, out):
             out[e, f] = out[f, e] = total
 
 
-@njit(
-    void(
-        READ_ONLY_CUBE,
-        READ_ONLY_CUBE,
-        READ_ONLY,
-        READ_ONLY_CUBE,
-        READ_ONLY,
-        int64,
-        float64,
-        MATRIX,
-        CUBE,
-        CUBE,
-        CUBE,
-    ),
-    cache=True,
-    error_model="numpy",
-)
+@njit(void(*_GIVEN, int64, float64, MATRIX, CUBE, CUBE, CUBE), cache=True, error_model="numpy")
 def rigid_fit(world, cov, shape, weight, start, rounds, settled, frame, slope, cov_fit, cov_frame):
     """Fills `frame` (N, 7) with the motions T that take the `shape` k (M, 3) to the points p (N, M, 3) `world`.
 

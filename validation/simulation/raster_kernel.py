@@ -28,14 +28,14 @@ _GAINS = types.Array(float64, 1, "C")
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _span(a: float, b: float, c: float, tile: np.ndarray) -> tuple[float, float]:
+def _span(a, b, c, tile):
     """Least and greatest of a u + b v + c over a tile (umin, umax, vmin, vmax)."""
     p, q, r, s = a * tile[0], a * tile[1], b * tile[2], b * tile[3]
     return min(p, q) + min(r, s) + c, max(p, q) + max(r, s) + c
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _cover(m: np.ndarray, tile: np.ndarray) -> tuple[float, float]:
+def _cover(m, tile):
     """Greatest 1/z of a rectangle within a tile, 0 if it is not hit there; least 1/z if it fills the tile, else 0.
 
     A ray hits where s, t, w - s and w - t are not negative. All are linear in (u, v), so that their least and greatest
@@ -56,7 +56,7 @@ def _cover(m: np.ndarray, tile: np.ndarray) -> tuple[float, float]:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _strip(bounds: np.ndarray, tiles: np.ndarray, found: np.ndarray) -> int:
+def _strip(bounds, tiles, found):
     """Rectangles whose bounds (umin, umax, vmin, vmax) meet a row of tiles between top and bottom; how many."""
     low, high, count = tiles[:, 2].min(), tiles[:, 3].max(), 0
     for r in range(bounds.shape[0]):
@@ -67,14 +67,7 @@ def _strip(bounds: np.ndarray, tiles: np.ndarray, found: np.ndarray) -> int:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _candidates(
-    h: np.ndarray,
-    bounds: np.ndarray,
-    strip: np.ndarray,
-    tile: np.ndarray,
-    chosen: np.ndarray,
-    nearest: np.ndarray,
-) -> int:
+def _candidates(h, bounds, strip, tile, chosen, nearest):
     """Rectangles of a strip that may be seen in a tile; how many. One behind another that fills the tile is not."""
     count, front = 0, 0.0
     u0, u1, v0, v1 = tile[0], tile[1], tile[2], tile[3]
@@ -94,16 +87,7 @@ def _candidates(
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _nearest(
-    h: np.ndarray,
-    chosen: np.ndarray,
-    count: int,
-    u: np.ndarray,
-    v: np.ndarray,
-    n: int,
-    near: np.ndarray,
-    row: np.ndarray,
-) -> None:
+def _nearest(h, chosen, count, u, v, n, near, row):
     """For each of n rays the greatest 1/z of a hit and its rectangle; 0 and -1 where there is none.
 
     The loop over the rays has no branch and no division, so that it compiles to vector instructions.
@@ -125,7 +109,7 @@ def _nearest(
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _bilinear(texels: np.ndarray, start: int, height: int, width: int, s: float, t: float) -> float:
+def _bilinear(texels, start, height, width, s, t):
     """A level of a texture at the fractions (s, t); round it lies a border of one texel, equal to its outermost texels."""
     x, y = s * width + 0.5, t * height + 0.5
     i, j = int(x), int(y)
@@ -138,9 +122,7 @@ def _bilinear(texels: np.ndarray, start: int, height: int, width: int, s: float,
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _footprint(
-    h: np.ndarray, s: float, t: float, w: float, slope: np.ndarray, width: int, height: int
-) -> float:
+def _footprint(h, s, t, w, slope, width, height):
     """How many texels a pixel covers, along the longer side unless it is very elongated."""
     su, sv = (h[0, 0] - s * h[2, 0]) / w * width, (h[0, 1] - s * h[2, 1]) / w * width
     tu, tv = (h[1, 0] - t * h[2, 0]) / w * height, (h[1, 1] - t * h[2, 1]) / w * height
@@ -152,7 +134,7 @@ def _footprint(
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _detail(footprint: float, last: int) -> float:
+def _detail(footprint, last):
     """Level of detail: that whose texels are nearest in size to the footprint, and the way to the next as its fraction.
 
     From one level to the next the texels double in size, and the fraction rises evenly with the footprint.
@@ -165,7 +147,7 @@ def _detail(footprint: float, last: int) -> float:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _filtered(texels: np.ndarray, levels: np.ndarray, sheet: int, s: float, t: float, detail: float) -> float:
+def _filtered(texels, levels, sheet, s, t, detail):
     """A texture between two of its levels."""
     k = int(detail)
     between = detail - k
@@ -178,9 +160,7 @@ def _filtered(texels: np.ndarray, levels: np.ndarray, sheet: int, s: float, t: f
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _rays(
-    uv: np.ndarray, slope: np.ndarray, y0: int, x0: int, shift: np.ndarray, u: np.ndarray, v: np.ndarray
-) -> int:
+def _rays(uv, slope, y0, x0, shift, u, v):
     """Rays of a tile's pixels, shifted by a part of a pixel; how many."""
     n, a, b = 0, shift[0], shift[1]
     for y in range(y0, min(y0 + TILE, uv.shape[0])):
@@ -197,21 +177,7 @@ def _rays(
     error_model="numpy",
     nogil=True,
 )
-def expose(
-    h: np.ndarray,
-    bounds: np.ndarray,
-    moment: np.ndarray,
-    sheet: np.ndarray,
-    gain: np.ndarray,
-    uv: np.ndarray,
-    slope: np.ndarray,
-    tiles: np.ndarray,
-    shifts: np.ndarray,
-    spacing: float,
-    levels: np.ndarray,
-    texels: np.ndarray,
-    light: np.ndarray,
-) -> None:
+def expose(h, bounds, moment, sheet, gain, uv, slope, tiles, shifts, spacing, levels, texels, light):
     """Fills `light` (H, W) with the mean of what a pixel's rays see: one per shift (px), each at its moment's pose.
 
     A ray that leaves the world sees 0. The size of a pixel on a rectangle is worked out once for all its rays.
@@ -263,15 +229,7 @@ def expose(
     error_model="numpy",
     nogil=True,
 )
-def trace(
-    h: np.ndarray,
-    bounds: np.ndarray,
-    uv: np.ndarray,
-    slope: np.ndarray,
-    tiles: np.ndarray,
-    inverse_depth: np.ndarray,
-    rows: np.ndarray,
-) -> None:
+def trace(h, bounds, uv, slope, tiles, inverse_depth, rows):
     """Inverse depth and rectangle (H, W) at the pixels' centres; 0 and -1 where the ray leaves the world."""
     side, centre = TILE * TILE, np.zeros(2)
     chosen, row = np.empty(bounds.shape[0], np.int64), np.empty(side, np.int64)
