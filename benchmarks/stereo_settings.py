@@ -14,7 +14,7 @@ import numpy as np
 
 from benchmarks.plain_odometry import path
 from rbpf.lie import SE3
-from rbpf.runs.alignment import align
+from rbpf.runs.trajectory import align
 from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.features import Sift, SiftConfig
 from rbpf.sensors.readers import ImageSequence, open_stereo

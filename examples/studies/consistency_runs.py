@@ -18,6 +18,7 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
+from examples.studies.parallel import in_parallel
 from examples.studies.point_worlds import MONO, DeskWorld, Measuring, simulate_features
 from rbpf.core.diagnostics import Band, ancestors_by_step, chi_square_band, coalescence_steps
 from rbpf.core.filter import Filter
@@ -32,7 +33,6 @@ from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.consistency.statistic import PROBABILITIES, whitened_errors
 from rbpf.validation.simulation.robot import RobotWorld, simulated_log
-from rbpf.validation.sweep.parallel import in_parallel
 from rbpf.validation.tables import write_csv, write_table
 
 

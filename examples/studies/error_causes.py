@@ -24,12 +24,11 @@ from matplotlib.figure import Figure
 from rbpf.core.models import Belief, NewLandmarks, Observations, Sensor
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.runs.alignment import Alignment
 from rbpf.runs.measurement_files import read_feature_log
 from rbpf.runs.plots import COLOURS, new_axes, save_figures
 from rbpf.runs.reading import RunFolder
 from rbpf.runs.recordings import filter_features, filter_robot_log
-from rbpf.runs.trajectory import Trajectory, in_space
+from rbpf.runs.trajectory import Alignment, Trajectory, in_space
 from rbpf.runs.truth import truth_at
 from rbpf.sensors.camera.points import CameraRay
 from rbpf.sensors.feature_log import FeatureFrame, FeatureLog

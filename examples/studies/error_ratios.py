@@ -16,7 +16,6 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import Array
-from rbpf.runs.alignment import Alignment
 from rbpf.runs.plots import COLOURS, new_axes, save_figures
 from rbpf.runs.reading import PathAndMap
 from rbpf.runs.recordings import (
@@ -27,7 +26,7 @@ from rbpf.runs.recordings import (
     filter_robot_log,
 )
 from rbpf.runs.run import Run
-from rbpf.runs.trajectory import Trajectory, associate, in_space
+from rbpf.runs.trajectory import Alignment, Trajectory, associate, in_space
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureLog
 from rbpf.sensors.readers import open_log

@@ -25,6 +25,7 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
+from examples.studies.parallel import in_parallel
 from rbpf.lie import SE3
 from rbpf.runs.plots import save_figures
 from rbpf.runs.recordings import filter_images
@@ -37,7 +38,6 @@ from rbpf.systems.mono.relocalisation import Attempt
 from rbpf.systems.system import Tracked
 from rbpf.validation.simulation.desk_and_room import TexturedDesk, TexturedRoom
 from rbpf.validation.simulation.images import Imaging, simulate_images
-from rbpf.validation.sweep.parallel import in_parallel
 from rbpf.validation.tables import Cell, write_csv, write_table
 
 SETTLED_S = 1.0

@@ -16,6 +16,7 @@ import tyro
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
+from examples.studies.parallel import in_parallel
 from examples.studies.point_worlds import MONO, DeskWorld, Measuring, simulate_features
 from rbpf.core.diagnostics import Band, chi_square_band
 from rbpf.lie import SE3
@@ -23,7 +24,6 @@ from rbpf.runs.recordings import filter_features as run
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.validation.consistency.statistic import whitened_errors
 from rbpf.validation.gtsam.camera import solve_features
-from rbpf.validation.sweep.parallel import in_parallel
 from rbpf.validation.tables import write_csv, write_table
 
 USUAL = 1  # which of the numbers of particles is compared with the batch

@@ -19,6 +19,7 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
+from examples.studies.parallel import in_parallel
 from examples.studies.streams import CameraStream, RobotStream, Turnover
 from rbpf.core.filter import Filter
 from rbpf.core.models import Belief, NewLandmarks, Observations, Sensor
@@ -30,7 +31,6 @@ from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.slam import MonoSlam
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.range_bearing.slam import RangeBearingSlam
-from rbpf.validation.sweep.parallel import in_parallel
 from rbpf.validation.tables import write_csv, write_table
 
 Step = Callable[[Any, int], np.ndarray]

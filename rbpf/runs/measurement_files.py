@@ -133,8 +133,8 @@ def _robot_texts(m: Measurements) -> dict[str, str]:
     }
     observed = np.stack([m.steps, m.stamps_ns[m.steps], m.landmarks], axis=1)
     moves = np.stack([np.arange(1, len(m.stamps_ns)), m.stamps_ns[1:]], axis=1)
-    numbers = np.concatenate([m.z, _lower(m.cov_z)], axis=1)
-    odometry = np.concatenate([m.deltas, _lower(m.covs)], axis=1)
+    numbers = np.concatenate([m.z, gaussian.pack(m.cov_z)], axis=1)
+    odometry = np.concatenate([m.deltas, gaussian.pack(m.covs)], axis=1)
     return {
         OBSERVATIONS: _text(OBSERVATIONS, m.recording, header, _observed(_axes(m.space)), observed, numbers),
         ODOMETRY: _text(ODOMETRY, m.recording, {"space": repr(m.space)}, _moves(m.space), moves, odometry),
@@ -204,7 +204,7 @@ def _read_robot(folder: Path, seen: "_Table") -> Measurements:
     moved.require(integers[:, 0] == np.arange(1, len(integers) + 1), "one row per step, from step 1 in order")
     stamps = np.concatenate([[seen.whole("start_stamp_ns")], integers[:, 1]])
     moved.require(np.diff(stamps) >= 0, "stamps in order of time")
-    deltas, covs = numbers[:, : space.size], _symmetric(numbers[:, space.size :], space.dim)
+    deltas, covs = numbers[:, : space.size], gaussian.unpack(numbers[:, space.size :], space.dim)
     moved.require(are_poses(space, deltas), "an increment that begins with a quaternion of length 1")
     moved.require(are_covariances(covs), _COVARIANCE)
 
@@ -214,7 +214,7 @@ def _read_robot(folder: Path, seen: "_Table") -> Measurements:
     seen.require(inside, f"a step from 0 to {len(stamps) - 1}, the last one in {ODOMETRY}")
     seen.require(stamp == stamps[steps], f"the stamp that {ODOMETRY} gives this step")
     p = point_dim(space)
-    cov_z = _symmetric(numbers[:, p:], p)
+    cov_z = gaussian.unpack(numbers[:, p:], p)
     seen.require(are_covariances(cov_z), _COVARIANCE)
     return Measurements(
         recording=seen.text("recording"),
@@ -296,18 +296,6 @@ def _triangle(count: int) -> list[str]:
 
 def _joined(numbers: Array, separator: str) -> str:
     return separator.join(map(repr, numbers.tolist()))
-
-
-def _lower(cov: Array) -> Array:
-    row, column = np.tril_indices(cov.shape[-1])
-    return cov[:, row, column]
-
-
-def _symmetric(triangle: Array, dim: int) -> Array:
-    row, column = np.tril_indices(dim)
-    cov = np.empty((len(triangle), dim, dim))
-    cov[:, row, column] = cov[:, column, row] = triangle
-    return cov
 
 
 @final

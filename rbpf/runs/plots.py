@@ -19,10 +19,9 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.runs.alignment import align, fit
 from rbpf.runs.files import whole
 from rbpf.runs.reading import FilteredPath, RunFolder
-from rbpf.runs.trajectory import associate, in_space, read_tum
+from rbpf.runs.trajectory import align, associate, fit, in_space, read_tum
 from rbpf.runs.truth import TRUTH
 from rbpf.sensors.feature_log import FeatureLog
 

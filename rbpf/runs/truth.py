@@ -14,7 +14,7 @@ import numpy as np
 from rbpf.core.checkpoint import checked, fitting, load_arrays, save_arrays
 from rbpf.errors import InputError
 from rbpf.lie import SE2Group, SE3Group
-from rbpf.runs.alignment import Alignment
+from rbpf.runs.trajectory import Alignment
 from rbpf.sensors.range_bearing import RelativePosition
 from rbpf.systems.system import Gauge
 

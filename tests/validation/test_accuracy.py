@@ -8,8 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.runs.alignment import Similarity
-from rbpf.runs.trajectory import Trajectory, associate, read_kitti, read_tum
+from rbpf.runs.trajectory import Similarity, Trajectory, associate, read_kitti, read_tum
 from rbpf.validation.metrics.accuracy import ate, landmark_errors, rpe
 
 FRAMES, METRES = metrics.Unit.frames, metrics.Unit.meters

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.runs.alignment import Similarity, align, fit
+from rbpf.runs.trajectory import Similarity, align, fit
 
 SEEDS = st.integers(0, 2**32 - 1)
 

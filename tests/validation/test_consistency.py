@@ -3,12 +3,12 @@ import csv
 import numpy as np
 import pytest
 
+from examples.studies.parallel import in_parallel
 from examples.studies.point_worlds import MONO, DeskWorld, Measuring, simulate_features
 from rbpf.lie import SE3
 from rbpf.runs.recordings import filter_features
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.validation.consistency.statistic import whitened_errors
-from rbpf.validation.sweep.parallel import in_parallel
 from rbpf.validation.tables import write_table
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from examples.studies.joint_ekf import joint_ekf
 from rbpf.lie import SE2
-from rbpf.runs.alignment import align
+from rbpf.runs.trajectory import align
 from rbpf.sensors.readers import open_log
 from rbpf.sensors.readers.measurements import initial_estimate
 from rbpf.validation.gtsam.robot import Problem, solve

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3
-from rbpf.runs.alignment import Similarity
-from rbpf.runs.trajectory import Trajectory, associate
+from rbpf.runs.trajectory import Similarity, Trajectory, associate
 
 MS = 1_000_000
 

@@ -15,8 +15,7 @@ from scipy.spatial import cKDTree
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
-from rbpf.runs.alignment import Similarity
-from rbpf.runs.trajectory import Trajectory, associate
+from rbpf.runs.trajectory import Similarity, Trajectory, associate
 from rbpf.runs.truth import poses_at
 from rbpf.sensors.feature_log import CameraTruth
 from rbpf.validation.colmap.reconstruct import LEAST_FRAMES, Reconstruction

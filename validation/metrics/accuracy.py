@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
-from rbpf.runs.alignment import Alignment, Similarity, fit
-from rbpf.runs.trajectory import Trajectory
+from rbpf.runs.trajectory import Alignment, Similarity, Trajectory, fit
 
 Unit = Literal["frames", "metres"]
 

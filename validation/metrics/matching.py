@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from rbpf.runs.alignment import Similarity, align
+from rbpf.runs.trajectory import Similarity, align
 
 _ROUNDS = 5
 

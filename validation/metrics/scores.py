@@ -9,9 +9,8 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from rbpf.errors import InputError
-from rbpf.runs.alignment import Similarity
 from rbpf.runs.reading import PathAndMap, RunFolder
-from rbpf.runs.trajectory import Trajectory, associate, in_space, read_tum
+from rbpf.runs.trajectory import Similarity, Trajectory, associate, in_space, read_tum
 from rbpf.runs.truth import LEAST, TRUTH, RunTruth
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.validation.metrics.accuracy import ate, landmark_errors, rpe

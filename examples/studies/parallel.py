@@ -10,7 +10,7 @@ Result = TypeVar("Result")
 
 
 def in_parallel(function: Callable[[Job], Result], jobs: Iterable[Job], workers: int) -> list[Result]:
-    """RunFolder of a function of the top level of its module, in the order of the jobs.
+    """Results of a function of the top level of its module, in the order of the jobs.
 
     Args:
         function: of one job; function, jobs and results must be picklable.
