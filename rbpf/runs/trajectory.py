@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3, Array
-from rbpf.runs.files import whole
+from rbpf.runs.files import write_text
 from rbpf.sensors.readers.text import read_columns
 
 MAX_DIFFERENCE_NS = 10_000_000
@@ -261,7 +261,7 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
     """
     rows = zip(trajectory.stamps_ns.tolist(), trajectory.world_from_body.tolist(), strict=True)
     lines = [_tum_line(stamp_ns, numbers) for stamp_ns, numbers in rows]
-    _write_whole(path, ["# " + " ".join(TUM_COLUMNS) + "\n", *lines])
+    write_text(path, "".join(["# " + " ".join(TUM_COLUMNS) + "\n", *lines]))
 
 
 def write_kitti(path: Path, trajectory: Trajectory) -> None:
@@ -272,7 +272,7 @@ def write_kitti(path: Path, trajectory: Trajectory) -> None:
         trajectory: what to write; its times are lost.
     """
     rows = SE3.matrix(trajectory.world_from_body)[:, :3].reshape(-1, 12).tolist()
-    _write_whole(path, [" ".join(map(repr, row)) + "\n" for row in rows])
+    write_text(path, "".join(" ".join(map(repr, row)) + "\n" for row in rows))
 
 
 def read_kitti(path: Path) -> Trajectory:
@@ -288,11 +288,6 @@ def read_kitti(path: Path) -> Trajectory:
         problem = "expected a rotation matrix in columns 1-3, 5-7 and 9-11, found one that is not orthonormal"
         raise table.error(int(np.argmax(wrong)), problem)
     return Trajectory(np.arange(len(matrices)), SE3.from_matrix(matrices))
-
-
-def _write_whole(path: Path, lines: list[str]) -> None:
-    with whole(path) as partial:
-        partial.write_text("".join(lines), encoding="utf-8")
 
 
 def _tum_line(stamp_ns: int, pose: list[float]) -> str:

@@ -15,8 +15,11 @@ import numpy as np
 from rbpf import gaussian
 from rbpf.core.models import FusedKernel, Jacobians, ObservationModel, Records
 from rbpf.errors import InputError
-from rbpf.lie import SE3
+from rbpf.lie import SE3, Array
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
+
+Given = Array | None
+"""What a model may read, see `ObservationModel`."""
 
 MIN_DEPTH_FRACTION = 0.2
 """Least fraction of its length by which a direction points clamp_depth: what is behind the camera projects far outside."""
@@ -27,13 +30,13 @@ class Camera(Protocol):
 
     dim: int
 
-    def project(self, point: np.ndarray) -> np.ndarray:
+    def project(self, point: Array) -> Array:
         """(…, 3) in the camera's frame → (…, p) px."""
 
-    def jacobian(self, point: np.ndarray) -> np.ndarray:
+    def jacobian(self, point: Array) -> Array:
         """Its derivative (…, p, 3)."""
 
-    def visible(self, point: np.ndarray, margin_px: float = 0.0) -> np.ndarray:
+    def visible(self, point: Array, margin_px: float = 0.0) -> np.ndarray:
         """Whether it is in the image (…)."""
 
 
@@ -51,40 +54,28 @@ class CameraModel(ObservationModel):
         self.dim = camera.dim
 
     @abstractmethod
-    def world_point(self, landmark: np.ndarray, const: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    def world_point(self, landmark: Array, const: Given) -> tuple[Array, Array]:
         """Homogeneous world point: x (…, 3) and w (…, 1)."""
 
     @abstractmethod
-    def world_point_jacobian(
-        self, landmark: np.ndarray, const: np.ndarray | None
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def world_point_jacobian(self, landmark: Array, const: Given) -> tuple[Array, Array]:
         """Derivatives of x (…, 3, D) and w (…, 1, D) by the landmark."""
 
-    def in_camera(
-        self, state: np.ndarray, landmark: np.ndarray, const: np.ndarray | None = None
-    ) -> np.ndarray:
+    def in_camera(self, state: Array, landmark: Array, const: Given = None) -> Array:
         """Direction (…, 3) from the camera, in its frame; the point itself where w = 1."""
         x, w = self.world_point(landmark, const)
         position = SE3.translation(state[..., :7])
         return SE3.inverse_transform(state[..., :7], x + (1.0 - w) * position)
 
     def predict(
-        self,
-        state: np.ndarray,
-        landmark: np.ndarray | None = None,
-        const: np.ndarray | None = None,
-        substate: np.ndarray | None = None,
-    ) -> np.ndarray:
+        self, state: Array, landmark: Given = None, const: Given = None, substate: Given = None
+    ) -> Array:
         """E06 (7)–(9) with distortion."""
         assert landmark is not None
         return self.camera.project(clamp_depth(self.in_camera(state, landmark, const)))
 
     def jacobians(
-        self,
-        state: np.ndarray,
-        landmark: np.ndarray | None = None,
-        const: np.ndarray | None = None,
-        substate: np.ndarray | None = None,
+        self, state: Array, landmark: Given = None, const: Given = None, substate: Given = None
     ) -> Jacobians:
         """∂z/∂ξ = D [[c]× | −w I] and ∂z/∂b = D Rᵀ(∂x/∂b − t ∂w/∂b), with D the camera's slope."""
         assert landmark is not None
@@ -99,7 +90,7 @@ class CameraModel(ObservationModel):
         turned = np.swapaxes(SE3.rotation(state[..., :7]), -1, -2) @ moved
         return Jacobians(by_state, slope @ turned)
 
-    def visible(self, state: np.ndarray, landmark: np.ndarray, const: np.ndarray | None = None) -> np.ndarray:
+    def visible(self, state: Array, landmark: Array, const: Given = None) -> np.ndarray:
         """Whether it is in front of the camera and in the image."""
         return self.camera.visible(self.in_camera(state, landmark, const), self.margin_px)
 
@@ -107,13 +98,11 @@ class CameraModel(ObservationModel):
 class CameraPoint(CameraModel):
     """A world point in metres (E06 §3.2): two numbers from one camera, three from a stereo pair."""
 
-    def world_point(self, landmark: np.ndarray, const: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    def world_point(self, landmark: Array, const: Given) -> tuple[Array, Array]:
         """The point, w = 1."""
         return landmark, np.ones((*landmark.shape[:-1], 1))
 
-    def world_point_jacobian(
-        self, landmark: np.ndarray, const: np.ndarray | None
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def world_point_jacobian(self, landmark: Array, const: Given) -> tuple[Array, Array]:
         """Identity and zero."""
         return np.eye(3), np.zeros((1, 3))
 
@@ -144,23 +133,21 @@ class CameraRay(CameraModel):
         self.pinhole = camera
         self.rho = rho
 
-    def world_point(self, landmark: np.ndarray, const: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    def world_point(self, landmark: Array, const: Given) -> tuple[Array, Array]:
         """The ray: x = R_a (u, v, 1) + q t_a, w = q."""
         assert const is not None
         ray = np.concatenate([landmark[..., :2], np.ones((*landmark.shape[:-1], 1))], axis=-1)
         rho, position = landmark[..., 2:], SE3.translation(const)
         return SE3.transform(const, ray) + (rho - 1.0) * position, rho
 
-    def world_point_jacobian(
-        self, landmark: np.ndarray, const: np.ndarray | None
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def world_point_jacobian(self, landmark: Array, const: Given) -> tuple[Array, Array]:
         """First two columns of R_a, and t_a."""
         assert const is not None
         turned = SE3.rotation(const)[..., :2]
         dx = np.concatenate([turned, SE3.translation(const)[..., None]], axis=-1)
         return dx, np.array([[0.0, 0.0, 1.0]])
 
-    def initialise(self, state: np.ndarray, z: np.ndarray, cov: np.ndarray) -> Records:
+    def initialise(self, state: Array, z: Array, cov: Array) -> Records:
         """The ray through z from each particle's own camera, with the prior inverse depth."""
         n, k = state.shape[0], z.shape[0]
         uv, slope = self.pinhole.unproject(z), self.pinhole.unproject_jacobian(z)
@@ -207,11 +194,7 @@ class EpipolarRay(CameraRay):
         self.least_px = least_px
 
     def jacobians(
-        self,
-        state: np.ndarray,
-        landmark: np.ndarray | None = None,
-        const: np.ndarray | None = None,
-        substate: np.ndarray | None = None,
+        self, state: Array, landmark: Given = None, const: Given = None, substate: Given = None
     ) -> Jacobians:
         """Those of the ray, projected on n̂."""
         by_state, by_landmark, _ = super().jacobians(state, landmark, const)
@@ -220,13 +203,8 @@ class EpipolarRay(CameraRay):
         return Jacobians(across @ by_state, across @ by_landmark)
 
     def innovation(
-        self,
-        z: np.ndarray,
-        state: np.ndarray,
-        landmark: np.ndarray | None = None,
-        const: np.ndarray | None = None,
-        substate: np.ndarray | None = None,
-    ) -> np.ndarray:
+        self, z: Array, state: Array, landmark: Given = None, const: Given = None, substate: Given = None
+    ) -> Array:
         """n̂ y."""
         assert landmark is not None
         _, by_landmark, _ = super().jacobians(state, landmark, const)
@@ -240,7 +218,7 @@ class EpipolarRay(CameraRay):
 
         return FusedKernel(epipolar_ray, np.append(self.pinhole.params, self.least_px / self.rho[1]))
 
-    def _across(self, by_rho: np.ndarray) -> np.ndarray:
+    def _across(self, by_rho: Array) -> Array:
         """n̂ n̂ᵀ (…, 2, 2), or the identity where ∂h/∂q (…, 2) is too short to have a direction."""
         squared = np.square(by_rho).sum(axis=-1)[..., None, None]
         has_line = np.sqrt(squared) * self.rho[1] >= self.least_px
@@ -264,11 +242,11 @@ class StereoPoint(CameraPoint):
         super().__init__(rig, margin_px)
         self.rig = rig
 
-    def invert(self, state: np.ndarray, z: np.ndarray) -> np.ndarray:
+    def invert(self, state: Array, z: Array) -> Array:
         """S05 (4); NaN without disparity."""
         return SE3.transform(state[..., :7], self.rig.triangulate(z))
 
-    def initialise(self, state: np.ndarray, z: np.ndarray, cov: np.ndarray) -> Records:
+    def initialise(self, state: Array, z: Array, cov: Array) -> Records:
         """Points (N, K, 3) with R C^L Rᵀ, S05 (4) and (7)."""
         local = self.rig.triangulate(z)
         by_pixel = np.linalg.inv(self.rig.jacobian(local))
@@ -283,7 +261,7 @@ class StereoPoint(CameraPoint):
         return FusedKernel(stereo_point, np.append(self.rig.camera.params[:4], self.rig.baseline_m))
 
 
-def clamp_depth(direction: np.ndarray) -> np.ndarray:
+def clamp_depth(direction: Array) -> Array:
     """Directions (…, 3) with the depth kept positive, so that what lies behind the camera projects far outside."""
     length = np.sqrt(np.square(direction).sum(axis=-1))
     depth = np.maximum(direction[..., 2], MIN_DEPTH_FRACTION * length)
@@ -305,37 +283,27 @@ class PointsView(ObservationModel):
         self.dim = 2 * count
 
     @abstractmethod
-    def in_world(self, landmark: np.ndarray, const: np.ndarray | None) -> np.ndarray:
+    def in_world(self, landmark: Array, const: Given) -> Array:
         """The points (…, m, 3) in the world."""
 
     @abstractmethod
-    def slopes(
-        self, state: np.ndarray, landmark: np.ndarray, const: np.ndarray | None
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def slopes(self, state: Array, landmark: Array, const: Given) -> tuple[Array, Array]:
         """∂z/∂state (…, m, 2, d) and ∂z/∂landmark (…, m, 2, D) of each point."""
 
-    def in_camera(self, state: np.ndarray, landmark: np.ndarray, const: np.ndarray | None) -> np.ndarray:
+    def in_camera(self, state: Array, landmark: Array, const: Given) -> Array:
         """The points (…, m, 3) in the camera's frame."""
         return SE3.inverse_transform(state[..., None, :7], self.in_world(landmark, const))
 
     def predict(
-        self,
-        state: np.ndarray,
-        landmark: np.ndarray | None = None,
-        const: np.ndarray | None = None,
-        substate: np.ndarray | None = None,
-    ) -> np.ndarray:
+        self, state: Array, landmark: Given = None, const: Given = None, substate: Given = None
+    ) -> Array:
         """Every point by E06 (7)–(9)."""
         assert landmark is not None
         px = self.camera.project(clamp_depth(self.in_camera(state, landmark, const)))
         return px.reshape(*px.shape[:-2], self.dim)
 
     def jacobians(
-        self,
-        state: np.ndarray,
-        landmark: np.ndarray | None = None,
-        const: np.ndarray | None = None,
-        substate: np.ndarray | None = None,
+        self, state: Array, landmark: Given = None, const: Given = None, substate: Given = None
     ) -> Jacobians:
         """Those of each point, one below the other."""
         assert landmark is not None
@@ -343,7 +311,7 @@ class PointsView(ObservationModel):
         shape = (*by_state.shape[:-3], self.dim)
         return Jacobians(by_state.reshape(*shape, -1), by_landmark.reshape(*shape, -1))
 
-    def visible(self, state: np.ndarray, landmark: np.ndarray, const: np.ndarray | None = None) -> np.ndarray:
+    def visible(self, state: Array, landmark: Array, const: Given = None) -> np.ndarray:
         """Whether all of its points are in the image."""
         return np.asarray(self.camera.visible(self.in_camera(state, landmark, const)).all(axis=-1))
 
@@ -362,14 +330,12 @@ class MembersView(PointsView):
         self.places = places
         self._point = CameraPoint(camera)
 
-    def in_world(self, landmark: np.ndarray, const: np.ndarray | None) -> np.ndarray:
+    def in_world(self, landmark: Array, const: Given) -> Array:
         """The points (…, m, 3) in the world."""
         points = landmark.reshape(*landmark.shape[:-1], -1, 3)
         return np.asarray(points[..., self.places, :])
 
-    def slopes(
-        self, state: np.ndarray, landmark: np.ndarray, const: np.ndarray | None
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def slopes(self, state: Array, landmark: Array, const: Given) -> tuple[Array, Array]:
         """Those of a `CameraPoint`; a pixel depends on its own point alone."""
         by_state, by_point, _ = self._point.jacobians(state[..., None, :], self.in_world(landmark, const))
         assert by_state is not None and by_point is not None
@@ -385,7 +351,7 @@ class MembersView(PointsView):
         return FusedKernel(members_view, self._params)
 
     @cached_property
-    def _params(self) -> np.ndarray:
+    def _params(self) -> Array:
         """The camera's, then which points: asked for several times in a step."""
         return np.concatenate([self.camera.params, self.places])
 
@@ -401,18 +367,16 @@ class ConstellationView(PointsView):
         points: (m, 3) k_m of the points that are seen, in the group's frame.
     """
 
-    def __init__(self, camera: Pinhole, points: np.ndarray) -> None:
+    def __init__(self, camera: Pinhole, points: Array) -> None:
         super().__init__(camera, points.shape[0])
         self.points = points
 
-    def in_world(self, landmark: np.ndarray, const: np.ndarray | None) -> np.ndarray:
+    def in_world(self, landmark: Array, const: Given) -> Array:
         """The points (…, m, 3) in the world."""
         assert const is not None
         return SE3.transform(SE3.retract(const, landmark)[..., None, :], self.points)
 
-    def slopes(
-        self, state: np.ndarray, landmark: np.ndarray, const: np.ndarray | None
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def slopes(self, state: Array, landmark: Array, const: Given) -> tuple[Array, Array]:
         """∂z/∂state = D [[c]× | −I]; ∂z/∂ξ = D R [−[k]× | I] J_r(ξ), with R = R_cᵀ R_G Exp(ξ)."""
         assert const is not None
         direction = clamp_depth(self.in_camera(state, landmark, const))
@@ -434,6 +398,6 @@ class ConstellationView(PointsView):
         return FusedKernel(constellation_view, self._params)
 
     @cached_property
-    def _params(self) -> np.ndarray:
+    def _params(self) -> Array:
         """The camera's, then (x, y, z) of each point: asked for several times in a step."""
         return np.concatenate([self.camera.params, self.points.ravel()])
