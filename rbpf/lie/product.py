@@ -14,17 +14,9 @@ from rbpf.lie.base import Array, LieGroup, StateArray, States, TangentArray, Tan
 
 @final
 class Euclidean(LieGroup):
-    """The vector space R^n; storage and tangent are the vector itself."""
+    """The vector space R^n, n >= 0; storage and tangent are the vector itself."""
 
     def __init__(self, n: int) -> None:
-        """Space of n dimensions.
-
-        Args:
-            n: Dimension, at least 0.
-
-        Raises:
-            InputError: n is negative.
-        """
         if n < 0:
             raise InputError(f"Euclidean(n) needs n >= 0, got n = {n}.")
         self.size = self.dim = n
@@ -65,21 +57,15 @@ class Euclidean(LieGroup):
     def left_jacobian_inverse(self, xi: Tangents) -> TangentMatrix:
         return self._unit_matrices(np.shape(xi)[:-1])
 
-    def inverse_transform(
-        self, a: Like[ArrayLike, "*#batch {self.size}"], p: Like[ArrayLike, "*#batch {self.size}"]
-    ) -> Float[np.ndarray, "*batch {self.size}"]:
+    def inverse_transform(self, a: States, p: States) -> StateArray:
         """Points p seen from a: the group is that of translations."""
         return self.local(a, p)
 
-    def transform(
-        self, a: Like[ArrayLike, "*#batch {self.size}"], p: Like[ArrayLike, "*#batch {self.size}"]
-    ) -> Float[np.ndarray, "*batch {self.size}"]:
+    def transform(self, a: States, p: States) -> StateArray:
         """The inverse of `inverse_transform`."""
         return self.compose(a, p)
 
-    def rotation(
-        self, a: Like[ArrayLike, "*#batch {self.size}"]
-    ) -> Float[np.ndarray, "*batch {self.size} {self.size}"]:
+    def rotation(self, a: States) -> Float[np.ndarray, "*batch {self.size} {self.size}"]:
         """None: unit matrices (…, n, n)."""
         return self._unit_matrices(np.shape(a)[:-1])
 
@@ -92,18 +78,10 @@ class Product(LieGroup):
     """G_1 x G_2 x ...: storages and tangents follow one another in the order of the factors.
 
     Attributes:
-        groups: The factors.
+        groups: The factors, at least one.
     """
 
     def __init__(self, *groups: LieGroup) -> None:
-        """Product of the given groups.
-
-        Args:
-            *groups: At least one.
-
-        Raises:
-            InputError: No group is given.
-        """
         if not groups:
             raise InputError("Product(*groups) needs at least one group, got none.")
         self.groups = groups
