@@ -5,7 +5,7 @@ from typing import Protocol, final
 
 import numpy as np
 
-from rbpf.core.association import ExistenceModel, Gates, associate
+from rbpf.core.likelihoods import ExistenceModel, Gates, associate
 from rbpf.core.models import (
     NEW,
     Belief,

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
-from rbpf.core.association import ExistenceModel, Gates, associate
+from rbpf.core.likelihoods import ExistenceModel, Gates, associate
 from rbpf.core.models import NEW, NULL
 
 GATES = Gates(accept=9.0, isolate=25.0, log_new=-6.0, log_clutter=-8.0)

@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from rbpf.core.association import ExistenceModel, Gates
 from rbpf.core.filter import Filter, StepReport
+from rbpf.core.likelihoods import ExistenceModel, Gates
 from rbpf.lie import SE2
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point

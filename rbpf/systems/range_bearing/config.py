@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from rbpf.core.association import ExistenceModel, Gates
+from rbpf.core.likelihoods import ExistenceModel, Gates
 from rbpf.errors import InputError
 from rbpf.sensors.readers import LogNoise
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig, ResamplingConfig
