@@ -99,12 +99,6 @@ def minimise(
 ) -> Minimum[State]:
     """The minimum of ½‖ε(x)‖² that is reached from x.
 
-    Args:
-        evaluate: whitened residuals and their derivative.
-        x: where to start.
-        retract: moves x along a tangent vector (d,); `np.add` in a vector space.
-        rule: when to stop.
-
     Raises:
         InputError: there are fewer residuals than unknowns, or at the start they or their derivative are not finite
             or the derivative is zero.

@@ -47,16 +47,11 @@ class RansacConfig:
 def consensus(
     matches: Matches, start: Array, gate: float, rng: np.random.Generator, config: RansacConfig | None = None
 ) -> Array:
-    """The motion (7,) of the lowest truncated score Σ min(d², gate).
+    """The motion (7,) of the lowest truncated score Σ min(d², gate), from triples that `rng` draws.
+
+    `start` is a guess of the motion; it takes part, and so does standing still.
 
     The distances d are Mahalanobis', under the sum of both frames' covariances: enough to tell motions apart.
-
-    Args:
-        matches: three or more.
-        start: (7,) a guess of the motion; it takes part, and so does standing still.
-        gate: squared distance beyond which a match does not agree.
-        rng: draws the triples.
-        config: how many.
     """
     config, search = config or RansacConfig(), _Search(matches, start)
     best, lowest, fraction = start, np.inf, 0.0

@@ -147,13 +147,7 @@ def estimate_motion(
 
 
 def fit(matches: Matches, start: Array, config: VoConfig) -> Minimum[Array]:
-    """The motion (7,) of least reprojection error near a start, all matches taken as true.
-
-    Args:
-        matches: three or more.
-        start: (7,).
-        config: how.
-    """
+    """The motion (7,) of least reprojection error near a start, all matches taken as true."""
     if config.points != "propagated":
         return _minimum(matches, start, config.points, config.rule)
     for _ in range(REWEIGHTED):
@@ -211,7 +205,7 @@ def _covariance(matches: Matches, found: Minimum[Array], config: VoConfig) -> Ar
 
 
 def _consistent_covariance(matches: Matches, found: Innovation, factor: Array) -> Array:
-    """Covariance (6, 6) of a motion, in the right chart there.
+    """Covariance (6, 6) of a motion, in the right chart there; `factor` is F with F Fᵀ = I⁻¹.
 
     (JᵀS⁻¹J)⁻¹ at the solution is the usual answer, and too small where points are far: the translation's derivative is
     proportional to the inverse depth ρ̂, and the square of a noisy ρ̂ is larger than that of the true one by var ρ̂, on
@@ -220,11 +214,6 @@ def _consistent_covariance(matches: Matches, found: Innovation, factor: Array) -
     §3.2)
 
         cov = (I − D)⁻¹ I (I − D)⁻¹,    Mathematics (vo-covariance).
-
-    Args:
-        matches: that it was found from.
-        found: their innovation at the solution, points adjusted.
-        factor: (6, 6) F with F Fᵀ = I⁻¹.
     """
     # ρ = (u_left − u_right) / (f b), of the pixels m̂: cov m̂ = R⁻ − R⁻Aᵀ S⁻¹ A R⁻.
     seen = found.seen
@@ -327,14 +316,10 @@ class CandidateMotions:
 
 @final
 class VisualOdometry:
-    """Estimates the motion between two frames under a prior.
+    """Estimates the motion between two frames, under a prior of what is expected before anything is seen.
 
     Where no motion is found there is only the prior; where the matches tell less than it in some direction (nothing
     but far points: how far did the camera go?) both are joined, and the candidate's `note` says so.
-
-    Args:
-        config: of the estimate.
-        prior: what is expected before anything is seen.
     """
 
     def __init__(self, config: VoConfig | None = None, prior: MotionPrior | None = None) -> None:
@@ -343,13 +328,7 @@ class VisualOdometry:
     def candidates(
         self, matches: Matches, velocity: Array, dt: float, rng: np.random.Generator
     ) -> CandidateMotions:
-        """The motions over `dt` seconds that the matches may tell of.
-
-        Args:
-            matches: of the two frames.
-            velocity: (6,) [ω, v] of the camera before, rad/s, m/s.
-            dt: seconds between the frames.
-            rng: of the consensus.
+        """The motions over `dt` seconds that the matches may tell of, after a velocity (6,) [ω, v], rad/s, m/s.
 
         Raises:
             InputError: dt is not positive.

@@ -56,12 +56,7 @@ from rbpf.systems.system import DIAGNOSTICS, TIMINGS
 
 
 def write_run(run: Run, out: Path, sources: Mapping[str, str | float | bool]) -> dict[str, Any]:
-    """Writes all data files of a run.
-
-    Args:
-        run: what was filtered.
-        out: the run's folder.
-        sources: what it was filtered from, for config.yaml; `recording` is one of them.
+    """Writes all data files of a run; `sources` says what was filtered, for config.yaml: `recording` and what else was read.
 
     Returns:
         The entries of summary.json.
@@ -167,15 +162,10 @@ def write_trajectory(
     corrections: tuple[np.ndarray, np.ndarray] | None = None,
     particles: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> None:
-    """trajectory.npz: what the report and comparisons are made of, see `rbpf.runs.results`.
+    """trajectory.npz: poses (T, E), covariances (T, d, d), and what `rbpf.runs.reading` says of them.
 
-    Args:
-        out: the run's folder.
-        stamps_ns: (T,).
-        mean: (T, E).
-        cov: (T, d, d).
-        corrections: (T, r) of the motions and their covariances (T, r, r); None where the system reports none.
-        particles: poses (N, E) of the last frame's particles, and their weights (N,).
+    Corrections of the motions (T, r) and their covariances (T, r, r) are None where the system reports none; of the last
+    frame's particles poses (N, E) and weights (N,).
     """
     steps = len(mean)
     correction, cov_correction = corrections or (np.zeros((steps, 0)), np.zeros((steps, 0, 0)))

@@ -83,10 +83,6 @@ _INT64 = np.iinfo(np.int64)
 def write_measurements(folder: Path, m: Measurements | FeatureLog) -> None:
     """Writes the files; they appear under their names when all are complete, and those of a former run are replaced.
 
-    Args:
-        folder: the run's folder.
-        m: of a robot, or of one camera or a rectified pair.
-
     Raises:
         InputError: the folder is missing or cannot be written to, or the disk is full.
     """

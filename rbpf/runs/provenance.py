@@ -93,14 +93,7 @@ def require_own_version(config: Mapping[str, Any], folder: Path) -> None:
 
 
 def write_config(out: Path, system: str, sources: Mapping[str, Any], settings: Mapping[str, Any]) -> None:
-    """Writes config.yaml: everything that is needed to repeat a run.
-
-    Args:
-        out: the run's folder.
-        system: its name.
-        sources: what the run read, by name; `recording` is one of them.
-        settings: of the system.
-    """
+    """Writes config.yaml: everything that is needed to repeat a run; `recording` is one of its sources."""
     digest = digest_of({name: Path(str(sources[name])) for name in _FILES if name in sources}, out)
     head = {"rbpf": __version__, "system": system, **sources}
     if digest is not None:
@@ -177,12 +170,7 @@ def decisive_inputs(sources: Mapping[str, Any], out: Path) -> dict[str, str]:
 
 
 def require_same(path: Path, before: Mapping[str, str], now: Mapping[str, str]) -> None:
-    """Refuses to go on with a run with something else than it was begun with.
-
-    Args:
-        path: of the checkpoint, for the message.
-        before: what the run was begun with, as text by name.
-        now: what it is to go on with.
+    """Refuses to go on with a run (`path` is its checkpoint) with something else than it was begun with, as text by name.
 
     Raises:
         InputError: names the first that differs, and both values.

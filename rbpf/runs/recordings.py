@@ -288,11 +288,6 @@ def open_features(
 
     A pair's log without times, whose stamps count its frames, is taken as one frame per second.
 
-    Args:
-        log: the features.
-        config: all settings.
-        wrapped: as `MonoSlam`'s.
-
     Raises:
         InputError: the log is of other cameras, or a setting does not fit.
     """

@@ -252,10 +252,6 @@ def read_tum(path: Path) -> Trajectory:
 def write_tum(path: Path, trajectory: Trajectory) -> None:
     """Write a trajectory in TUM format, with every digit; the file appears under its name when complete.
 
-    Args:
-        path: the file; one that is there is replaced.
-        trajectory: what to write.
-
     Raises:
         InputError: the place cannot be written to, or the disk is full.
     """
@@ -265,12 +261,7 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
 
 
 def write_kitti(path: Path, trajectory: Trajectory) -> None:
-    """Write a trajectory in KITTI format, with every digit; the file appears under its name when complete.
-
-    Args:
-        path: the file; one that is there is replaced.
-        trajectory: what to write; its times are lost.
-    """
+    """Write a trajectory in KITTI format, with every digit and without times; the file appears when it is complete."""
     rows = SE3.matrix(trajectory.world_from_body)[:, :3].reshape(-1, 12).tolist()
     write_text(path, "".join(" ".join(map(repr, row)) + "\n" for row in rows))
 

@@ -22,14 +22,7 @@ Projected = tuple[float, float, float, float, float, float, float, float]
 
 @njit(cache=True, error_model="numpy", inline="always")
 def project(x: float, y: float, z: float, params: np.ndarray) -> Projected:
-    """Pixel of a point and its Jacobian.
-
-    Args:
-        x: to the right, in the camera's frame.
-        y: down.
-        z: forward; 0 divides as the caller's error model says.
-        params: (10,) `Pinhole.params`.
-    """
+    """Pixel of a point (right, down, forward) and its Jacobian, of `Pinhole.params`; z = 0 divides as the error model says."""
     if params[KIND] == 0.0:
         return project_radial(x, y, z, params)
     return project_equidistant(x, y, z, params)

@@ -16,15 +16,10 @@ TRIPLES = 20
 
 
 def resect(camera: Pinhole, points: np.ndarray, px: np.ndarray) -> np.ndarray:
-    """Pose world_from_camera (7,) of least reprojection error.
+    """Pose world_from_camera (7,) of least reprojection error of points (M, 3) in the world, seen at px (M, 2).
 
     Every solution of the first triples of points is refined on all of them, because few points have several local
     optima and a single start may find the wrong one.
-
-    Args:
-        camera: of the image.
-        points: (M, 3) in the world, metres.
-        px: (M, 2) where they are seen.
 
     Raises:
         InputError: there are fewer than four points, they lie on a line, or no pose in front of them explains them.
@@ -122,15 +117,7 @@ def resect_consensus(
     triples: int,
     rng: np.random.Generator,
 ) -> Resected | None:
-    """The camera that most points agree with, refined on these.
-
-    Args:
-        camera: of the image.
-        points: (M, 3) in the world.
-        px: (M, 2) where they may be seen.
-        within_px: a point agrees if it is seen as near to its projection.
-        triples: of points that are tried.
-        rng: draws them.
+    """The camera that most points (M, 3) agree with, refined on these; they agree if seen at px (M, 2) `within_px`.
 
     Returns:
         None where fewer than four agree, or they do not fix the camera.

@@ -153,12 +153,7 @@ def compare_with_truth(found: Reconstruction, truth: CameraTruth | None) -> Colm
 
 
 def cloud_distance(cloud: Array, landmarks: Array, cov_landmarks: Array | None = None) -> CloudDistance:
-    """Distances of landmarks to a cloud.
-
-    Args:
-        cloud: (P, 3), P >= 3.
-        landmarks: (M, 3), M >= 1.
-        cov_landmarks: (M, 3, 3).
+    """Distances of landmarks (M, 3), of covariances (M, 3, 3), to a cloud (P, 3).
 
     Raises:
         InputError: the cloud or the map is too small.

@@ -155,13 +155,7 @@ def robot_optimum(problem: Measurements, found: robot.BatchSolution) -> Optimum:
 
 
 def fit_of(problem: Problem, estimate: PathAndMap, names: NDArray[np.int64]) -> Fit:
-    """How likely the observations of the named landmarks are, of the estimate's own poses and landmarks.
-
-    Args:
-        problem: T steps.
-        estimate: T poses, and the named landmarks among its own.
-        names: (L,) of the landmarks that count.
-    """
+    """How likely the observations of the named landmarks are, of the estimate's own poses and landmarks."""
     places = estimate.landmarks.named()
     if isinstance(problem, FeatureLog):
         table = observation_table(problem)

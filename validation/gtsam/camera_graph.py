@@ -220,9 +220,6 @@ class Together:
 
     GTSAM hands every factor the same object as long as Python holds it, as the loops of `solvers` do; an
     optimiser that changes its values in place would be shown old residuals.
-
-    Args:
-        evaluate: values to all residuals and their Jacobians.
     """
 
     def __init__(self, evaluate: Callable[[Any], Residuals]) -> None:

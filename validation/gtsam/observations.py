@@ -164,10 +164,6 @@ def sigmas(table: ObservationTable, path: Array, points: Array) -> Array:
 def triangulate(table: ObservationTable, path: Array) -> Array:
     """Huber's estimate from the distances to the rays, each taken in pixels of its image.
 
-    Args:
-        table: observations.
-        path: (T, 7) poses.
-
     Returns:
         (L, 3) positions; anywhere near its rays where a landmark has no parallax.
     """

@@ -143,10 +143,6 @@ def solve_online(m: Measurements, robust: float | None = None) -> Array:
     By ISAM2 (M. Kaess et al., 2012), which linearises anew what has moved; directions without noise are given a tenth
     of the step's largest standard deviation.
 
-    Args:
-        m: the measurements.
-        robust: as for `solve`.
-
     Returns:
         (T, E) poses.
 
@@ -208,11 +204,7 @@ def _explained(problem: "Problem", solution: Callable[[], Result]) -> Result:
 
 @final
 class Problem:
-    """Variables and factors of a run.
-
-    Args:
-        m: the measurements.
-        robust: Huber's threshold on the norm of a whitened observation; None is Gaussian.
+    """Variables and factors of a run; see `solve`.
 
     Raises:
         InputError: an observation's covariance is singular.

@@ -52,12 +52,7 @@ class Calibrated:
 
 
 def refine_calibration(log: FeatureLog, batch: Batch, on_round: OnRound | None = None) -> Calibrated:
-    """Focal length and k1 adjusted together with all poses and landmarks.
-
-    Args:
-        log: the measurements, of one camera.
-        batch: their optimum with the given camera.
-        on_round: called after each iteration.
+    """Focal length and k1 adjusted together with all poses and landmarks, from the optimum with the given camera.
 
     Raises:
         InputError: a batch adjustment fails.
@@ -128,12 +123,7 @@ def adjust_near(log: FeatureLog, batch: Batch) -> Batch:
 def recalibrate(
     folder: Path, out: Path, on_round: OnRound | None = None
 ) -> tuple[dict[str, Any], Calibrated]:
-    """Calibrates the camera of a finished monocular run, and writes camera.yaml.
-
-    Args:
-        folder: of the run.
-        out: folder for camera.yaml.
-        on_round: called after each iteration.
+    """Calibrates the camera of a finished monocular run, and writes camera.yaml into the folder `out`.
 
     Returns:
         What changed, for the user, and the camera.

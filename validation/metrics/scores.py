@@ -77,13 +77,7 @@ def score_run(found: RunFolder) -> dict[str, Any]:
 
 
 def score_estimate(estimate: PathAndMap, truth: RunTruth, anonymous: bool = False) -> dict[str, float]:
-    """Errors of path and landmarks.
-
-    Args:
-        estimate: a pose for every frame of a run, and its map.
-        truth: at the run's frames.
-        anonymous: the landmarks have no names; see `score_landmarks`.
-    """
+    """Errors of a path with a pose for every frame, and of its map; `anonymous` landmarks have no names."""
     reference = in_space(estimate.stamps_ns[truth.rows], truth.poses)
     ours = estimate.at(truth.rows).trajectory
     entries: dict[str, float] = {}

@@ -110,15 +110,6 @@ class Shutter:
         renderer: Renderer,
         rng: np.random.Generator,
     ) -> None:
-        """Draws how the exposure drifts.
-
-        Args:
-            scene: the world.
-            imaging: the options.
-            camera: of each picture.
-            renderer: of the same.
-            rng: generator.
-        """
         self._scene, self._imaging, self._camera, self._renderer = scene, imaging, camera, renderer
         frames = np.arange(len(scene.stamps_ns))
         seconds = 1e-9 * (scene.stamps_ns - scene.stamps_ns[0])
@@ -205,13 +196,7 @@ LEAST_SPREAD = 0.05
 def known_corners(
     scene: TexturedScene, renderer: Renderer, camera: Pinhole, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Strong corners spread over the middle of the first image; the first few of them spread as well as all.
-
-    Args:
-        scene: the world.
-        renderer: of its pictures.
-        camera: that takes them.
-        count: how many, M.
+    """`count` strong corners spread over the middle of the first image; the first few of them spread as well as all.
 
     Returns:
         Pixels (M, 2) in the first image, and positions (M, 3) in the world, m.
@@ -310,13 +295,7 @@ def image_path(folder: Path, sensor: str, stamp_ns: int, suffix: str = ".png") -
 
 
 def write_image(path: Path, image: np.ndarray, quality: int = 0) -> None:
-    """A file of an image (H, W) uint8 or uint16; its folder has to be there.
-
-    Args:
-        path: with the suffix .png or .jpg.
-        image: grey levels.
-        quality: of a JPEG file, 1 to 100.
-    """
+    """A .png or .jpg file of an image (H, W) uint8 or uint16, a JPEG of a quality of 1 to 100; its folder has to be there."""
     import cv2
 
     how = [cv2.IMWRITE_JPEG_QUALITY, quality]

@@ -42,13 +42,7 @@ class Wave:
 
     @classmethod
     def random(cls, bound: np.ndarray, band_hz: tuple[float, float], rng: np.random.Generator) -> Self:
-        """Frequencies log-uniform in the band; all terms have the same speed.
-
-        Args:
-            bound: (C,) that the signals never pass.
-            band_hz: lowest and highest frequency.
-            rng: generator.
-        """
+        """Signals within bounds (C,); frequencies log-uniform in the band; all terms have the same speed."""
         shape = (len(bound), TERMS)
         frequency = np.exp(rng.uniform(np.log(band_hz[0]), np.log(band_hz[1]), shape))
         fraction = 1.0 / frequency
@@ -83,12 +77,7 @@ def eased(seconds: np.ndarray, start_s: float) -> np.ndarray:
 
 
 def looking(eye: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Poses world_from_camera (T, 7) of an upright camera.
-
-    Args:
-        eye: (T, 3) position, m.
-        direction: (T, 3) of the optical axis in the world, not vertical, of any length.
-    """
+    """Poses world_from_camera (T, 7) of an upright camera at (T, 3) [m] that looks along directions (T, 3), not vertical."""
     forward = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
     right = np.cross(forward, UP)
     right /= np.linalg.norm(right, axis=-1, keepdims=True)
@@ -105,14 +94,7 @@ def speeds(world_from_camera: np.ndarray, seconds: np.ndarray) -> tuple[np.ndarr
 def slowed(
     path: Callable[[np.ndarray], np.ndarray], seconds: np.ndarray, speed_m_s: float, turn_rad_s: float
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """The path, as slow as it takes that neither limit is passed.
-
-    Args:
-        path: poses (T, 7) at times (T,).
-        seconds: (T,) times at which it will be read, at least two.
-        speed_m_s: highest speed.
-        turn_rad_s: highest rate of turn.
-    """
+    """The path, poses (T, 7) at times (T,), as slow as it takes that neither limit is passed at the `seconds` (T,)."""
     turn, speed = speeds(path(seconds), seconds)
     pace = min(1.0, 1.0 / max(float(turn.max()) / turn_rad_s, float(speed.max()) / speed_m_s))
     return lambda time: path(pace * time)
@@ -414,14 +396,7 @@ class WheelOdometer:
         robot_from_camera: np.ndarray,
         rng: np.random.Generator,
     ) -> WheelOdometry:
-        """Readings of a drive.
-
-        Args:
-            travelled: the robot at T times.
-            stamps_ns: (T,) int64 these times.
-            robot_from_camera: (7,) passed on.
-            rng: generator of the slip; more times leave the first readings as they are.
-        """
+        """Readings of a drive at T times; more times leave the first readings as they are."""
         side = 0.5 * self.wheelbase_m * np.array([-1.0, 1.0])
         way = np.diff(travelled.way_m[:, None] + travelled.heading_rad[:, None] * side, axis=0)
         counted = way * (1.0 + self.scale + 0.5 * self.inequality * np.array([-1.0, 1.0]))

@@ -23,13 +23,6 @@ class Renderer:
     """
 
     def __init__(self, rectangles: Sequence[Rectangle], camera: Pinhole, grid: int = 2) -> None:
-        """Prepares what does not change from picture to picture.
-
-        Args:
-            rectangles: what there is to see.
-            camera: the camera, distorted or not.
-            grid: rays per pixel along each side.
-        """
         from rbpf.validation.simulation import raster_kernel
 
         self._kernel = raster_kernel

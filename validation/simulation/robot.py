@@ -62,13 +62,7 @@ class RobotWorld:
 
 
 def simulate_robot(world: RobotWorld, folder: Path, seed: int) -> None:
-    """Writes a log.
-
-    Args:
-        world: what to simulate.
-        folder: created where it does not exist; files of that name are replaced.
-        seed: of the only random generator.
-    """
+    """Writes a log into a folder, created where it does not exist; files of that name are replaced."""
     rng = np.random.default_rng(seed)
     folder.mkdir(parents=True, exist_ok=True)
     # True poses (T, 7), starting at the origin, and landmarks in a box around the circle's centre: in the plane z = 0

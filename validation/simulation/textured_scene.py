@@ -137,12 +137,7 @@ def sides(rectangles: Sequence[Rectangle]) -> np.ndarray:
 
 
 def rays_to_sides(sides: np.ndarray, world_from_camera: np.ndarray) -> np.ndarray:
-    """H (R, 3, 3): a ray (u, v, 1) meets a rectangle at (s, t, 1)/z = H (u, v, 1); 0 if the camera is in its plane.
-
-    Args:
-        sides: (R, 3, 3) of the rectangles.
-        world_from_camera: (7,) pose.
-    """
+    """H (R, 3, 3): a ray (u, v, 1) meets a rectangle at (s, t, 1)/z = H (u, v, 1); 0 if the camera is in its plane."""
     rotation = SE3.matrix(world_from_camera)[:3, :3]
     seen_from = np.zeros((3, 3))
     seen_from[2] = world_from_camera[4:]
@@ -155,12 +150,7 @@ def rays_to_sides(sides: np.ndarray, world_from_camera: np.ndarray) -> np.ndarra
 def cast(
     rectangles: Sequence[Rectangle], world_from_camera: np.ndarray, uv: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What single rays meet first: the same as a whole picture's depth, for a few pixels.
-
-    Args:
-        rectangles: R of them.
-        world_from_camera: (7,) pose.
-        uv: (K, 2) normalised coordinates, `Pinhole.unproject` of pixels.
+    """What single rays (u, v) (K, 2) meet first: the same as a whole picture's depth, for a few pixels.
 
     Returns:
         Depth z (K,) in the camera's frame [m], infinite where there is nothing; row (K,) of the rectangle, then -1.
@@ -190,16 +180,9 @@ BOARD_TEXELS = 40
 
 
 class Furniture:
-    """Collects rectangles, each with a texture of its own."""
+    """Collects rectangles, each with a texture of its own: `texel_m` is the side of a texel, `contrast` a factor."""
 
     def __init__(self, rng: np.random.Generator, texel_m: float, contrast: float) -> None:
-        """Starts with nothing.
-
-        Args:
-            rng: generator.
-            texel_m: side of a texel on all that is built.
-            contrast: of all textures, a factor.
-        """
         self.rectangles: list[Rectangle] = []
         self._rng, self._texel_m, self._contrast = rng, texel_m, contrast
 
@@ -268,13 +251,7 @@ def apart(
     count: int,
     taken: list[tuple[np.ndarray, float]],
 ) -> list[tuple[np.ndarray, float]]:
-    """Places of up to `count` things that do not touch: (2,) middles and radii; those that find no place are left out.
-
-    Args:
-        draw: a middle and a radius.
-        count: most of them.
-        taken: places where nothing may stand.
-    """
+    """Places (middle (2,), radius) of up to `count` things that touch neither each other nor what is taken."""
     found: list[tuple[np.ndarray, float]] = []
     for _ in range(MOST_TRIES):
         if len(found) == count:

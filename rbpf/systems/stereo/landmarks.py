@@ -205,11 +205,7 @@ class Landmarks(Sensor, ABC, Generic[F]):
 def log_support(nu: np.ndarray, cov: np.ndarray, z: np.ndarray, rig: RectifiedStereo) -> float:
     """Σ max(log N(ν; 0, S) − log λ, 0) of features (k,) that are taken for landmarks: each is, or is so by chance.
 
-    Args:
-        nu: (k, 3) innovations, px.
-        cov: (k, 3, 3) S, px².
-        z: (K, 3) of all features of the pair, which are λ per px³ where they may be.
-        rig: the cameras.
+    Of innovations ν (k, 3) and S (k, 3, 3), px; the pair's features z (K, 3) are λ per px³ where they may be.
     """
     depths = max(float(np.ptp(z[:, 0] - z[:, 2])), 1.0)
     density = len(z) / (rig.camera.width * rig.camera.height * depths)
@@ -293,12 +289,7 @@ class ParticleSubsample:
 
 
 class Places:
-    """Where landmarks were seen last: facts that need not differ between particles, to find candidates for a view by.
-
-    Args:
-        rig: the cameras.
-        config: how far a landmark may be from how it was seen.
-    """
+    """Where landmarks were seen last: facts that need not differ between particles, to find candidates for a view by."""
 
     def __init__(self, rig: RectifiedStereo, config: MapConfig) -> None:
         self.rig = rig
@@ -588,12 +579,7 @@ def world_points(landmark: Landmark, records: Records) -> np.ndarray:
 
 @final
 class NamedLandmarks(Landmarks[NamedPixels]):
-    """Landmarks by the names that the recording gives them: known association.
-
-    Args:
-        rig: the cameras.
-        likelihood: of an innovation.
-    """
+    """Landmarks by the names that the recording gives them: known association."""
 
     def __init__(self, rig: RectifiedStereo, likelihood: Likelihood) -> None:
         self.rig, self.model, self.landmark = rig, StereoPoint(rig), Point(3)

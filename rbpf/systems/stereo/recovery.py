@@ -41,13 +41,6 @@ def motion_for_update(
     A map that has not got so far that it could say where the camera is, is not waited for. A place that is found far
     from where the camera was assumed to go takes the place of the assumed mean: something has deceived the odometry.
     Its covariance stays, and leaves the rest to each particle's own map.
-
-    Args:
-        filter_: as it was at the last update.
-        landmarks: of its map.
-        view: the pair, uncertain.
-        at: the motion since the last update.
-        config: all settings.
     """
     motion, least = at.since_update, config.map.min_agreeing
     if landmarks.seen_again().size < least:
@@ -76,13 +69,6 @@ def relocalise_globally(
     Appearance alone mistakes some features, so that the matches must agree on one place. The consensus is that of
     visual odometry; the map takes the place of the earlier pair, as a camera would see it that stands far enough back
     to have all matched landmarks before it.
-
-    Args:
-        landmarks: of the map.
-        view: the pair.
-        belief: where the landmarks are.
-        config: of the consensus; `min_matches` are needed.
-        rng: draws the triples.
 
     Returns:
         world_from_camera (7,) in the world of the heaviest particle, and the number of landmarks that agree; None where

@@ -20,12 +20,9 @@ LEAST = 2
 def tracked_features(
     stamps_ns: np.ndarray, measured: Iterable[bool], observed: Iterable[Mapping[str, np.ndarray]]
 ) -> list[FeatureFrame]:
-    """The observations of each pair; a track of the map has the map's name, others follow on.
+    """The observations of each of T pairs; a track of the map has the map's name, others follow on.
 
-    Args:
-        stamps_ns: (T,) of the pairs.
-        measured: (T,) column of `StereoSlam`.
-        observed: (T,) what each pair showed, `StereoSlam.observed`.
+    `measured` is the column of `StereoSlam`, `observed` what each pair showed.
     """
     tracks = _Tracks()
     for step, (is_measured, shown) in enumerate(zip(measured, observed, strict=True)):
