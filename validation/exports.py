@@ -240,46 +240,6 @@ def write_ply(
         partial.write_bytes(_header(vertices, lines) + vertices.tobytes() + lines.tobytes())
 
 
-def read_ply(path: Path) -> dict[str, np.ndarray]:
-    """Elements by name as structured arrays, of a file that `write_ply` wrote.
-
-    Raises:
-        InputError: the file is missing or of another form.
-    """
-    try:
-        head, _, body = path.read_bytes().partition(b"end_header\n")
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}") from error
-    lines = head.decode("ascii", "replace").splitlines()
-    if lines[:2] != ["ply", "format binary_little_endian 1.0"]:
-        raise InputError(f"{path}: expected a binary little-endian PLY file.")
-    try:
-        return _elements(lines[2:], body)
-    except (LookupError, ValueError, TypeError, OverflowError) as error:
-        raise InputError(
-            f"{path}: expected the elements of a PLY file as its header says, found others."
-        ) from error
-
-
-def _elements(lines: list[str], body: bytes) -> dict[str, np.ndarray]:
-    """Of the lines of a header and of what follows it; nothing is allocated that the file does not hold."""
-    codes = {name: code for code, name in _NAMES.items()}
-    kinds: dict[str, tuple[int, list[tuple[str, str]]]] = {}
-    for line in lines:
-        word, *rest = line.split()
-        if word == "element":
-            kinds[rest[0]] = (int(rest[1]), [])
-        elif word == "property":
-            list(kinds.values())[-1][1].append((rest[1], codes[rest[0]]))
-    found, start = {}, 0
-    for name, (count, fields) in kinds.items():
-        if count < 0:
-            raise ValueError("a negative number of elements")
-        found[name] = np.frombuffer(body, dtype=fields, count=count, offset=start)
-        start += found[name].nbytes
-    return found
-
-
 def _header(vertices: np.ndarray, lines: np.ndarray) -> bytes:
     rows = ["ply", "format binary_little_endian 1.0"]
     for name, elements in (("vertex", vertices), ("edge", lines)):

@@ -26,7 +26,6 @@ from rbpf.sensors.readers import (
 )
 from rbpf.sensors.readers.stereo_tracks import read_stereo_tracks
 from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
-from rbpf.validation.exports import read_ply, write_ply
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 from tests.properties.mutations import damaged
 from tests.readers import small
@@ -112,7 +111,6 @@ def results(folder: Path) -> None:
     write_tum(folder / "path.tum", Trajectory(np.arange(3) * 10**8, POSES))
     (folder / "path.kitti").write_text("".join(folders.matrix_row(pose) for pose in POSES))
     (folder / "known_points.csv").write_text(KNOWN)
-    write_ply(folder / "map.ply", POSES[:, 4:], np.zeros((3, 3), np.uint8))
 
 
 def features(folder: Path) -> None:
@@ -142,7 +140,6 @@ RECORDINGS: dict[str, tuple[Callable[[Path], object], Read, str]] = {
     "known points": (results, lambda f: read_known_points(f / "known_points.csv"), "known_points.csv"),
     "path": (results, lambda f: read_tum(f / "path.tum"), "path.tum"),
     "path of KITTI": (results, lambda f: read_kitti(f / "path.kitti"), "path.kitti"),
-    "PLY": (results, lambda f: read_ply(f / "map.ply"), "map.ply"),
     "features": (features, read_feature_log, "observations*.csv"),
     "measurements": (lambda f: write_measurements(f, world(2, "position")), read_robot_measurements, "*.csv"),
 }

@@ -9,7 +9,7 @@ import pytest
 from rbpf.cli import main
 from rbpf.lie import SE3
 from rbpf.runs.results import load
-from rbpf.runs.trajectory import read_kitti, read_tum, write_kitti
+from rbpf.runs.trajectory import read_kitti, read_tum
 
 pytestmark = pytest.mark.slow
 
@@ -44,13 +44,6 @@ def test_all_formats_hold_the_run(run, tmp_path, capsys):
     assert model.num_points3D() == estimate.landmarks.ids.size and model.num_images() == len(poses)
     assert (tmp_path / "map.ply").read_bytes().startswith(b"ply")
     assert (tmp_path / "run.rrd").read_bytes()[:4] == b"RRF2"
-
-
-def test_kitti_files_are_read_back(tmp_path, run):
-    trajectory = load(run).estimate.trajectory
-    write_kitti(tmp_path / "poses.txt", trajectory)
-    again = read_kitti(tmp_path / "poses.txt")
-    assert np.abs(SE3.local(again.world_from_body, trajectory.world_from_body)).max() < 1e-9
 
 
 def test_what_is_no_run_is_refused(tmp_path, capsys):
