@@ -244,12 +244,12 @@ def camera_ray(state, mean, const, z, params, n, nu, jac_state, jac_landmark):
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _take_out(along, least, n, first, second):
-    """From vectors (first, second) their part along ∂h/∂ρ, (2, BLOCK) flat, where that is as long as √`least`."""
+def _take_out(along, n, first, second):
+    """From vectors (first, second) their part along ∂h/∂ρ, (2, BLOCK) flat."""
     for i in range(n):
         a, b = along[i], along[BLOCK + i]
         squared = a * a + b * b
-        fraction = 1.0 / squared if squared >= least else 0.0
+        fraction = 1.0 / squared if squared > 0.0 else 0.0
         part = fraction * (a * first[i] + b * second[i])
         first[i] -= a * part
         second[i] -= b * part
@@ -257,17 +257,16 @@ def _take_out(along, least, n, first, second):
 
 @observation_kernel
 def epipolar_ray(state, mean, const, z, params, n, nu, jac_state, jac_landmark):
-    """Inverse depth, across the epipolar line only; params: the camera's, then the least |∂h/∂q| in px per 1/m."""
+    """Inverse depth, across the epipolar line only; params are the camera's."""
     _both(state, mean, const, z, params, n, nu, jac_state, jac_landmark)
-    least = params[KIND + 1] * params[KIND + 1]
     along = np.empty(2 * BLOCK)
     for i in range(n):
         along[i], along[BLOCK + i] = jac_landmark[0, 2, i], jac_landmark[1, 2, i]
-    _take_out(along, least, n, nu[0], nu[1])
+    _take_out(along, n, nu[0], nu[1])
     for k in range(6):
-        _take_out(along, least, n, jac_state[0, k], jac_state[1, k])
+        _take_out(along, n, jac_state[0, k], jac_state[1, k])
     for k in range(3):
-        _take_out(along, least, n, jac_landmark[0, k], jac_landmark[1, k])
+        _take_out(along, n, jac_landmark[0, k], jac_landmark[1, k])
 
 
 _FLAGS = types.Array(boolean, 1, "C")

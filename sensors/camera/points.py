@@ -171,27 +171,9 @@ class EpipolarRay(CameraRay):
 
     y = n̂ᵀ(z − h(b̂)) with n̂ ⟂ ∂h/∂q, which the limit P_qq → ∞ of the 2-D marginal is. It is handed on as the
     2-D residual n̂ y with noise R: across the line it is y's, along the line a constant that no particle can change,
-    provided that R is a multiple of the identity. Where the camera has hardly moved sideways there is no epipolar line
-    and depth does not matter: the full residual is used.
-
-    Args:
-        camera: of the images.
-        rho: see `CameraRay`.
-        least_px: the landmark has an epipolar line once a change of q by its first standard deviation moves it by this.
-        margin_px: see `CameraModel`.
+    provided that R is a multiple of the identity. It is for features that are displaced in all particles: a camera that
+    has not moved sideways has no epipolar line, and is given the full residual.
     """
-
-    def __init__(
-        self,
-        camera: Pinhole,
-        rho: tuple[float, float] = (1.0, 0.5),
-        least_px: float = 1.0,
-        margin_px: float = 0.0,
-    ) -> None:
-        super().__init__(camera, rho, margin_px)
-        if not least_px > 0.0:
-            raise InputError(f"least_px must be positive, got {least_px}")
-        self.least_px = least_px
 
     def jacobians(
         self, state: Array, landmark: Given = None, const: Given = None, substate: Given = None
@@ -216,14 +198,14 @@ class EpipolarRay(CameraRay):
         """Compiled."""
         from rbpf.sensors.camera.kernels import epipolar_ray
 
-        return FusedKernel(epipolar_ray, np.append(self.pinhole.params, self.least_px / self.rho[1]))
+        return FusedKernel(epipolar_ray, self.pinhole.params)
 
-    def _across(self, by_rho: Array) -> Array:
-        """n̂ n̂ᵀ (…, 2, 2), or the identity where ∂h/∂q (…, 2) is too short to have a direction."""
+    @staticmethod
+    def _across(by_rho: Array) -> Array:
+        """n̂ n̂ᵀ (…, 2, 2), or the identity where ∂h/∂q (…, 2) is 0."""
         squared = np.square(by_rho).sum(axis=-1)[..., None, None]
-        has_line = np.sqrt(squared) * self.rho[1] >= self.least_px
-        along = by_rho[..., :, None] * by_rho[..., None, :] / np.where(has_line, squared, 1.0)
-        return np.eye(2) - np.where(has_line, along, 0.0)
+        along = by_rho[..., :, None] * by_rho[..., None, :]
+        return np.eye(2) - along / np.where(squared > 0.0, squared, 1.0)
 
 
 @final

@@ -69,18 +69,6 @@ def test_points(camera, moved, wide):
     assert_twins(CameraPoint(camera), Z, state, points, None)
 
 
-@every_camera
-def test_rays_on_either_side_of_the_threshold(camera):
-    """Some have an epipolar line and some have none."""
-    state, mean, _, const = lanes(3, 0.01, False)
-    model = EpipolarRay(camera, rho=(0.6, 0.2), least_px=1.0)
-    by_rho = known(known(CameraRay(camera).jacobians(state, mean, const)).landmark)[..., 2]
-    lengths = np.linalg.norm(by_rho, axis=-1) * 0.2
-    assert 5 < (lengths > 1.0).sum() < 26
-    assert np.abs(lengths - 1.0).min() > 1e-9
-    assert_twins(model, Z, state, mean, const)
-
-
 def test_both_keep_the_same_depth_in_front():
     assert kernels.MIN_DEPTH_FRACTION == points.MIN_DEPTH_FRACTION
 

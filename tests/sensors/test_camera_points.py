@@ -139,9 +139,3 @@ def test_a_camera_without_a_twin_has_no_kernel():
 def test_bad_prior(rho):
     with pytest.raises(InputError, match="prior of the inverse depth needs a positive mean and deviation"):
         CameraRay(PLAIN, rho)
-
-
-@pytest.mark.parametrize("least_px", [0.0, -1.0, np.nan])
-def test_bad_threshold(least_px):
-    with pytest.raises(InputError, match="least_px must be positive"):
-        EpipolarRay(PLAIN, least_px=least_px)

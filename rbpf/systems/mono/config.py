@@ -54,8 +54,8 @@ class InverseDepthConfig:
         depth_parallax_px: depth is measured once a change of ρ by its first standard deviation moves the image by this.
             Before, the parallax says more of the error of the sampled pose than of depth, and the prior of ρ, which does
             not change as long as depth is not measured, would count anew in every frame.
-        epipolar_parallax_px: likewise, from where on there is an epipolar line; well below the noise of a measurement,
-            since what depth moves below it is not modelled and stays the same from frame to frame.
+        epipolar_parallax_px: likewise, from where on there is an epipolar line. Before, the 2-D marginal counts, with a
+            prior of ρ so wide that it hardly does.
     """
 
     RENAMED: ClassVar[dict[str, str]] = {
@@ -76,7 +76,7 @@ class InverseDepthConfig:
     promote_std_ratio: float = 0.1
     promote_weight: float = 0.95
     depth_parallax_px: float = 10.0
-    epipolar_parallax_px: float = 0.3
+    epipolar_parallax_px: float = 3.0
 
 
 @dataclass(frozen=True)

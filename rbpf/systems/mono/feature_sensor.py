@@ -34,6 +34,10 @@ MIN_DEPTHS = 4
 MIN_SCALED = 3
 """Points that must be seen for the scale to be theirs: so many determine the camera's pose."""
 
+WIDENED = 3.0
+"""Times the standard deviation that the prior of depth has, which a young ray's image is given along its line on top: the
+same prior comes again in every frame, so that in a frame it counts a tenth."""
+
 MIN_RHO = 0.02
 """Inverse depth below which a ray is reported as if it ended there, 1/m: at 50 m."""
 
@@ -110,7 +114,7 @@ class InverseDepthRays(UnknownDepth):
         self.camera, self.config = camera, config
         self.landmark = InverseDepth(config.promote_std_ratio)
         self.model = CameraRay(camera, rho)
-        self.epipolar = EpipolarRay(camera, rho, config.epipolar_parallax_px)
+        self.epipolar = EpipolarRay(camera, rho)
 
     def starting(self, depths: np.ndarray) -> CameraModel:
         """At the median inverse depth of the points in view, where there are enough of them.
@@ -128,26 +132,37 @@ class InverseDepthRays(UnknownDepth):
     def observations(
         self, belief: Belief, z: np.ndarray, cov: np.ndarray, ids: np.ndarray, scaled: bool
     ) -> list[Observations]:
-        """Epipolar constraint, 2-D marginal, or an update of depth alone, as `InverseDepthConfig.pose_update` says."""
+        """Epipolar constraint, 2-D marginal, or an update of depth alone, as `InverseDepthConfig.pose_update` says.
+
+        Which of them is decided for a feature, not for a particle: the density of what was measured is one in all
+        particles, continuous in the pose. Decided by each particle's own parallax, it rewards motion that did not happen.
+        """
         # Depth is measured where it moves the image in the particle of highest weight, E06 §5.1, last paragraph.
         state, mode = belief.state[belief.mode], belief.mode
         _, jac, _ = belief.map.innovations(self.model, np.zeros((ids.size, 2)), ids, state, mode)
         assert jac.landmark is not None
-        by_rho = np.sqrt(np.square(jac.landmark[..., 2]).sum(axis=-1))
-        parallax = by_rho * self.config.std_per_m >= self.config.depth_parallax_px
+        by_depth = self.config.std_per_m * jac.landmark[..., 2]
+        squared = np.square(by_depth).sum(axis=-1)
+        measured = squared >= self.config.depth_parallax_px**2
+        has_line = squared >= self.config.epipolar_parallax_px**2
 
-        def group(model: CameraRay, rows: np.ndarray, updates: frozenset[Part]) -> list[Observations]:
+        def group(
+            model: CameraRay, rows: np.ndarray, updates: frozenset[Part], noise: np.ndarray = cov
+        ) -> list[Observations]:
             if not rows.any():
                 return []
-            return [Observations(z[rows], cov[rows], model, ids=ids[rows], updates=updates)]
+            return [Observations(z[rows], noise[rows], model, ids=ids[rows], updates=updates)]
 
-        if self.config.pose_update == "marginal":
-            without_parallax = self.epipolar if scaled else self.model
-            return group(self.model, parallax, _BOTH) + group(without_parallax, ~parallax, _STATE)
-        of_depth = group(self.model, parallax, _MAP)
+        depth, young = group(self.model, measured, _MAP), ~has_line
         if self.config.pose_update == "off":
-            return of_depth
-        return group(self.epipolar, np.ones_like(parallax), _STATE) + of_depth
+            return depth
+        if self.config.pose_update == "marginal":
+            depth = group(self.model, measured, _BOTH)
+            if not scaled:
+                return depth + group(self.model, ~measured, _STATE)
+            young, has_line = young & ~measured, has_line & ~measured
+        widened = cov + WIDENED**2 * by_depth[:, :, None] * by_depth[:, None, :]
+        return depth + group(self.model, young, _STATE, widened) + group(self.epipolar, has_line, _STATE)
 
     def promotable(self, belief: Belief, observed: Sequence[Observations]) -> np.ndarray:
         """Whose inverse depth is known to `promote_std_ratio` in `promote_weight` of the particles' weight."""
