@@ -128,26 +128,12 @@ def test_the_batch_optimum_stands_beside(log, tmp_path):
 
 
 def test_config_repeats_the_run(log, tmp_path):
-    assert (
-        run(log, tmp_path / "a", "--set", "proposal.iterations=1", "--set", "resampling.scheme=residual") == 0
-    )
+    changed = ["--set", "proposal.iterations=1", "--set", "resampling.scheme=residual"]
+    assert run(log, tmp_path / "a", *changed) == 0
     config = tmp_path / "a" / "config.yaml"
     assert yaml.safe_load(config.read_text())["resampling"]["scheme"] == "residual"
-    assert (
-        main(
-            [
-                "run",
-                "range-bearing",
-                str(log),
-                "--out",
-                str(tmp_path / "b"),
-                "--no-batch",
-                "--config",
-                str(config),
-            ]
-        )
-        == 0
-    )
+    words = ["run", "range-bearing", str(log), "--out", str(tmp_path / "b"), "--no-batch"]
+    assert main([*words, "--config", str(config)]) == 0
     assert outputs(tmp_path / "a") == outputs(tmp_path / "b")
 
 

@@ -8,7 +8,6 @@ import sys
 import cv2
 import numpy as np
 import pytest
-import yaml
 
 from rbpf.cli import main
 from rbpf.core.filter import Filter
@@ -139,13 +138,6 @@ def test_the_video_has_every_frame(finished):
     assert frames[0].shape[1] == 2 * CAMERA.width
     green = (frames[8][..., 1].astype(int) - frames[8][..., 2] > 60).sum()
     assert green > 200
-
-
-def test_config_repeats_the_run(desk, finished, tmp_path):
-    config = yaml.safe_load((finished / "config.yaml").read_text())
-    assert config["system"] == "mono" and config["known_points"].endswith("known_points.csv")
-    assert run(desk, tmp_path, "--video", "--config", str(finished / "config.yaml")) == 0
-    assert outputs(tmp_path) == outputs(finished)
 
 
 def test_a_resumed_run_is_identical(desk, finished, tmp_path, monkeypatch):

@@ -81,14 +81,6 @@ def test_it_follows_the_camera(finished):
     assert entries["ate_rmse_m"] < 0.01 and entries["vo_ate_rmse_m"] < 0.01
 
 
-def test_repeated_from_its_configuration(finished, room, tmp_path):
-    assert run(room, tmp_path / "again", "--config", str(finished / "config.yaml")) == 0
-    for name in ("trajectory.tum", "odometry.tum", "map.csv", "diagnostics.csv"):
-        assert (tmp_path / "again" / name).read_bytes() == (finished / name).read_bytes()
-    assert untimed_summary(tmp_path / "again") == untimed_summary(finished)
-    assert yaml.safe_load((finished / "config.yaml").read_text())["system"] == "stereo"
-
-
 def test_ctrl_c_leaves_a_run_that_resumes_to_the_same_bytes(finished, room, tmp_path):
     """A real signal to a real process, in the middle of an update; the pair is finished first."""
     arguments = ["run", "stereo", str(room), "--particles", "50", "--out", str(tmp_path / "cut")]

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import yaml
 
 from rbpf.cli import main
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
@@ -33,9 +34,9 @@ def recordings(tmp_path_factory):
     desk = folder / "desk"
     known = ["--known-points", str(desk / "known_points.csv")]
     return {
-        "mono": [str(desk), *known, "--particles", "900", "--no-video", "--no-batch"],
+        "mono": [str(desk), *known, "--particles", "900", "--no-batch"],
         "range-bearing": [str(folder / "log"), "--particles", "3000", "--no-batch"],
-        "stereo": [str(folder / "room"), "--particles", "600", "--no-batch"],
+        "stereo": [str(folder / "room"), "--particles", "600", "--no-video", "--no-batch"],
     }
 
 
@@ -75,7 +76,12 @@ def test_threads_change_no_byte(threaded, system):
 @pytest.mark.parametrize("system", ["mono", "stereo"])
 def test_a_run_over_images_is_repeated_from_its_config(recordings, tmp_path, system):
     assert main(["run", system, *recordings[system], "--seed", "7", "--out", str(tmp_path / "a")]) == 0
-    again = ["run", "--from", str(tmp_path / "a" / "config.yaml"), "--out", str(tmp_path / "b")]
+    config = tmp_path / "a" / "config.yaml"
+    entries = yaml.safe_load(config.read_text())
+    assert entries["system"] == system and (
+        system == "stereo" or entries["known_points"].endswith("points.csv")
+    )
+    again = ["run", "--from", str(config), "--out", str(tmp_path / "b")]
     assert main(again) == 0
-    assert (tmp_path / "b" / "annotated.mp4").exists() == (system == "stereo")
+    assert (tmp_path / "b" / "annotated.mp4").exists() == (system == "mono")
     assert outputs(tmp_path / "a") == outputs(tmp_path / "b")
