@@ -1,10 +1,9 @@
 """Driver: rigid motions that fit a shape to points, each weighed by what is known of its place in the shape."""
 
-import math
-
 import numpy as np
 from numba import float64, int64, njit, void
 
+from rbpf.kernels.dense import factor, solve
 from rbpf.kernels.se3 import exp_pair, multiply, rotation, turned
 from rbpf.kernels.signature import CUBE, MATRIX, READ_ONLY, READ_ONLY_CUBE
 
@@ -41,30 +40,6 @@ def _linearise(quat, shift, world, shape, weight, weighed, info, vector):
 
 
 @njit(cache=True, error_model="numpy")
-def _factor(matrix):
-    """Replaces the lower triangle by its Cholesky factor."""
-    for a in range(6):
-        for b in range(a + 1):
-            rest = matrix[a, b]
-            for c in range(b):
-                rest -= matrix[a, c] * matrix[b, c]
-            matrix[a, b] = math.sqrt(rest) if a == b else rest / matrix[b, b]
-
-
-@njit(cache=True, error_model="numpy")
-def _solve(chol, vector):
-    """Replaces a vector (6,) by the solution of L Lᵀ x = vector."""
-    for a in range(6):
-        for b in range(a):
-            vector[a] -= chol[a, b] * vector[b]
-        vector[a] /= chol[a, a]
-    for a in range(5, -1, -1):
-        for b in range(a + 1, 6):
-            vector[a] -= chol[b, a] * vector[b]
-        vector[a] /= chol[a, a]
-
-
-@njit(cache=True, error_model="numpy")
 def _by_points(back, weighed, chol, slope):
     """Fills the fit's derivative by the points (6, 3M), −Λ⁻¹ JᵀW Rᵀ, with `back` the entries of Rᵀ by rows."""
     for m in range(weighed.shape[0]):
@@ -72,7 +47,7 @@ def _by_points(back, weighed, chol, slope):
             column, u, v, w = slope[:, 3 * m + f], back[f], back[3 + f], back[6 + f]
             for e in range(6):
                 column[e] = -(weighed[m, e, 0] * u + weighed[m, e, 1] * v + weighed[m, e, 2] * w)
-            _solve(chol, column)
+            solve(chol, column)
 
 
 @njit(cache=True, error_model="numpy")
@@ -82,7 +57,7 @@ def _invert(chol, inverse):
         column = inverse[:, f]
         column[:] = 0.0
         column[f] = 1.0
-        _solve(chol, column)
+        solve(chol, column)
     for e in range(6):
         for f in range(e):
             inverse[e, f] = inverse[f, e]
@@ -121,8 +96,8 @@ def rigid_fit(world, cov, shape, weight, start, rounds, settled, frame, slope, c
         shift = (start[0, 4], start[0, 5], start[0, 6])
         for _ in range(rounds):
             _linearise(quat, shift, world[i], shape, weight, weighed, info, step)
-            _factor(info)
-            _solve(info, step)
+            factor(info)
+            solve(info, step)
             turn, way = exp_pair((-step[0], -step[1], -step[2]), (-step[3], -step[4], -step[5]))
             way = turned(quat, way)
             quat, shift = multiply(quat, turn), (shift[0] + way[0], shift[1] + way[1], shift[2] + way[2])

@@ -1,57 +1,26 @@
 """Driver: a Gaussian unknown fitted to measurements of which some are wrong."""
 
-import math
-
 import numpy as np
 from numba import float64, int64, njit, void
 
+from rbpf.kernels import dense
 from rbpf.kernels.signature import CUBE, MATRIX, VECTOR
-
-
-@njit(cache=True, error_model="numpy")
-def _cholesky(matrix):
-    """Replaces the lower triangle by its Cholesky factor."""
-    for j in range(matrix.shape[0]):
-        for k in range(j):
-            matrix[j, j] -= matrix[j, k] * matrix[j, k]
-        matrix[j, j] = math.sqrt(matrix[j, j])
-        for i in range(j + 1, matrix.shape[0]):
-            for k in range(j):
-                matrix[i, j] -= matrix[i, k] * matrix[j, k]
-            matrix[i, j] /= matrix[j, j]
-
-
-@njit(cache=True, error_model="numpy")
-def _solve_lower(factor, vector):
-    for j in range(vector.size):
-        for k in range(j):
-            vector[j] -= factor[j, k] * vector[k]
-        vector[j] /= factor[j, j]
-
-
-@njit(cache=True, error_model="numpy")
-def _solve_upper(factor, vector):
-    """By the transposed factor."""
-    for j in range(vector.size - 1, -1, -1):
-        for k in range(j + 1, vector.size):
-            vector[j] -= factor[k, j] * vector[k]
-        vector[j] /= factor[j, j]
 
 
 @njit(cache=True, error_model="numpy")
 def _whiten(nu, jac, cov, factor, white_nu, white_jac):
     """L⁻¹ν and L⁻¹H F of one measurement."""
     chol = cov.copy()
-    _cholesky(chol)
+    dense.factor(chol)
     white_nu[:] = nu
-    _solve_lower(chol, white_nu)
+    dense.solve_lower(chol, white_nu)
     for r in range(factor.shape[1]):
         for a in range(nu.size):
             total = 0.0
             for e in range(factor.shape[0]):
                 total += jac[a, e] * factor[e, r]
             white_jac[a, r] = total
-        _solve_lower(chol, white_jac[:, r])
+        dense.solve_lower(chol, white_jac[:, r])
 
 
 @njit(cache=True, error_model="numpy")
@@ -68,9 +37,8 @@ def _fit(white_nu, white_jac, weight, info, u):
                     info[r, s] += scaled * row[s]
     for r in range(u.size):
         info[r, r] += 1.0
-    _cholesky(info)
-    _solve_lower(info, u)
-    _solve_upper(info, u)
+    dense.factor(info)
+    dense.solve(info, u)
 
 
 @njit(cache=True, error_model="numpy")
