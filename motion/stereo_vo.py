@@ -68,7 +68,6 @@ class VoConfig:
     rule: Rule = field(default_factory=lambda: Rule(offset=0.01, iterations=100))
 
     def __post_init__(self) -> None:
-        """Checks that the numbers make sense."""
         if self.points not in ("adjusted", "propagated", "exact"):
             raise InputError(f"points must be adjusted, propagated or exact, got {self.points!r}")
         if not self.gate > 0.0:
@@ -267,7 +266,6 @@ class MotionPrior:
     keep_velocity: bool = True
 
     def __post_init__(self) -> None:
-        """Checks that the numbers make sense."""
         if not (self.std_turn > 0.0 and self.std_speed > 0.0):
             raise InputError(
                 f"std_turn and std_speed must be positive, got {self.std_turn} and {self.std_speed}"

@@ -159,7 +159,6 @@ class CameraRay(CameraModel):
         return Records(np.broadcast_to(mean, (n, k, 3)), np.broadcast_to(full, (n, k, 3, 3)), anchor)
 
     def kernel(self) -> FusedKernel | None:
-        """Compiled."""
         from rbpf.sensors.camera.kernels import camera_ray
 
         return FusedKernel(camera_ray, self.pinhole.params)
@@ -195,7 +194,6 @@ class EpipolarRay(CameraRay):
         return (self._across(by_landmark[..., 2]) @ nu[..., None])[..., 0]
 
     def kernel(self) -> FusedKernel | None:
-        """Compiled."""
         from rbpf.sensors.camera.kernels import epipolar_ray
 
         return FusedKernel(epipolar_ray, self.pinhole.params)
@@ -237,7 +235,6 @@ class StereoPoint(CameraPoint):
         return Records(mean, gaussian.symmetrise(turned @ cov @ np.swapaxes(turned, -1, -2)))
 
     def kernel(self) -> FusedKernel | None:
-        """Compiled."""
         from rbpf.sensors.camera.kernels import stereo_point
 
         return FusedKernel(stereo_point, np.append(self.rig.camera.params[:4], self.rig.baseline_m))
@@ -327,7 +324,6 @@ class MembersView(PointsView):
         return by_state, by_landmark
 
     def kernel(self) -> FusedKernel | None:
-        """Compiled."""
         from rbpf.sensors.camera.kernels import members_view
 
         return FusedKernel(members_view, self._params)
@@ -374,7 +370,6 @@ class ConstellationView(PointsView):
         return by_state, by_frame @ SE3.right_jacobian(landmark)[..., None, :, :]
 
     def kernel(self) -> FusedKernel | None:
-        """Compiled."""
         from rbpf.sensors.camera.kernels import constellation_view
 
         return FusedKernel(constellation_view, self._params)

@@ -51,7 +51,6 @@ class ReconstructionOptions:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Checks that the numbers make sense."""
         for name in ("every", "features", "overlap", "threads"):
             if getattr(self, name) < 1:
                 raise InputError(f"Expected {name} to be at least 1, found {getattr(self, name)}.")

@@ -170,7 +170,6 @@ class TexturedRoom:
     contrast: float = 1.0
 
     def __post_init__(self) -> None:
-        """Checks that there is something to see, and room to walk."""
         check_counts(self, {"frames": 2, "pictures": 0, "things": 0})
         check_positive(self, "rate_hz", "radius_m", "eye_m", "speed_m_s", "texel_m")
         check_not_negative(self, "shake_m", "shake_deg", "start_s", "contrast")

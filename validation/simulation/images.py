@@ -79,7 +79,6 @@ class Imaging:
     known_exact: bool = False
 
     def __post_init__(self) -> None:
-        """Checks that the numbers make sense."""
         check_counts(self, {"grid": 1, "known": 0, "jpeg": 0})
         if self.jpeg > 100:
             raise InputError(f"jpeg must be a quality of 1 to 100, or 0 for PNG, got {self.jpeg}")

@@ -51,7 +51,6 @@ class RobotWorld:
     unnamed: bool = False
 
     def __post_init__(self) -> None:
-        """Checks that there is something to simulate."""
         if self.steps < 2 or self.landmarks < 1:
             raise InputError(
                 f"a simulation needs at least 2 steps and 1 landmark, got {self.steps}, {self.landmarks}"
