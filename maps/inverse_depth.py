@@ -40,3 +40,15 @@ class InverseDepth(Landmark):
         """Whether q is positive and well known, (N, K): then depth is nearly Gaussian too (Fig. 2)."""
         rho, std = records.mean[..., 2], np.sqrt(records.cov[..., 2, 2])
         return (rho > 0.0) & (std <= self.ready_ratio * rho)
+
+    def promote(self, records: Records) -> Records:
+        """The unscented transform where the point is ready, else the first order about an inverse depth of σ or more.
+
+        Sigma points of a particle that is not ready come near q = 0: far away, or behind the camera.
+        """
+        ready, std = self.ready(records)[..., None], np.sqrt(records.cov[..., 2, 2])
+        mean = records.mean.copy()
+        mean[..., 2:] = np.where(ready, mean[..., 2:], np.maximum(mean[..., 2:], std[..., None]))
+        shrink = np.where(ready, 1.0, 1e-4)[..., None]
+        found = super().promote(Records(mean, shrink**2 * records.cov, records.const))
+        return Records(found.mean, found.cov / shrink**2)

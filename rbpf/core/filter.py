@@ -149,7 +149,7 @@ class Filter:
     def expect(self, control: object = None, stamp_ns: int | None = None) -> Belief:
         """What `step` would tell the sensors, for looking at a frame before it is filtered; no particle moves."""
         _, dt = self._clock(stamp_ns)
-        return Belief(self.particles.log_weights, self._predict(control, dt), self.marginals.parts)
+        return Belief(self.particles.log_weights, self._predict(control, dt), self.marginals.parts, self.rng)
 
     def step(
         self,
@@ -176,7 +176,9 @@ class Filter:
         # Predict, and observe given the prediction.
         stamp_ns, dt = self._clock(stamp_ns)
         prior = self._predict(control, dt)
-        groups = self._observe(frame, Belief(self.particles.log_weights, prior, self.marginals.parts))
+        groups = self._observe(
+            frame, Belief(self.particles.log_weights, prior, self.marginals.parts, self.rng)
+        )
 
         # Refine, and weigh by the look-ahead w₁.
         proposal = proposal or self.proposal
@@ -274,7 +276,7 @@ class Filter:
         state = checked_start(np.asarray(state, dtype=float), self.n, self.space)
         prior, log_weights = self._predict(control, dt), self.particles.log_weights
         groups = self._observe(
-            frame, Belief(log_weights, Prior.exactly(self.space, state), self.marginals.parts)
+            frame, Belief(log_weights, Prior.exactly(self.space, state), self.marginals.parts, self.rng)
         )
         densities = self.marginals.correct(state, self.space.local(prior.base, state), groups)
         self.particles = Particles(state, log_weights)
@@ -290,7 +292,7 @@ class Filter:
     def belief(self) -> Belief:
         """The particles as they are, for reading the map."""
         here = Prior.exactly(self.space, self.particles.state)
-        return Belief(self.particles.log_weights, here, self.marginals.parts)
+        return Belief(self.particles.log_weights, here, self.marginals.parts, self.rng)
 
     def save(self, path: Path | str, extra: dict[str, np.ndarray] | None = None) -> None:
         """Writes a checkpoint from which `load` goes on as if nothing had happened, with arrays of the caller's.

@@ -11,7 +11,7 @@ C components, p measurement, r noise rank. A method that is not abstract is a ho
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from functools import cached_property
 from typing import Generic, NamedTuple, TypeVar
@@ -570,11 +570,13 @@ class Belief:
         log_weights: (N,) normalised.
         prior: distribution of each particle's increment; after the update its factor is zero.
         parts: what is marginalised, by what it supplies.
+        rng: the filter's, for a sensor that draws.
     """
 
     log_weights: Float[np.ndarray, " N"]
     prior: Prior
     parts: Mapping[Part, Conditional]
+    rng: np.random.Generator = field(default_factory=np.random.default_rng)
 
     @cached_property
     def state(self) -> Float[np.ndarray, "N E"]:

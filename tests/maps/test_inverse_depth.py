@@ -88,6 +88,18 @@ def test_promotion_is_the_law_of_the_point(fraction):
     assert np.linalg.norm(found.mean[0, 0] - mean) < 0.1 * naive
 
 
+@pytest.mark.parametrize("q", [-0.3, 0.0, 0.02, 0.4])
+def test_a_particle_that_is_not_ready_keeps_its_line_of_sight(q):
+    """Its point lies ahead where it was seen, as uncertain along the ray as far away at most: the particle can live on."""
+    std = 0.2
+    cov = np.diag([1e-3, 1e-3, std]) ** 2
+    found = LANDMARK.promote(Records(np.array([[[0.3, -0.2, q]]]), cov[None, None], ANCHOR[None, None]))
+    point = SE3.inverse_transform(ANCHOR, found.mean[0, 0])
+    np.testing.assert_allclose(point, np.array([0.3, -0.2, 1.0]) / max(q, std), rtol=1e-6)
+    turned = SE3.rotation(ANCHOR).T @ found.cov[0, 0] @ SE3.rotation(ANCHOR)
+    np.testing.assert_allclose(np.sqrt(turned[2, 2]), std / max(q, std) ** 2, rtol=1e-4)
+
+
 def test_all_particles_are_promoted_at_once():
     """Each by its own transform; other landmarks and the number of the landmark stay."""
     n, records = 5, scattered(5, 3, 0.02)

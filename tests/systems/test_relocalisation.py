@@ -2,21 +2,25 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
 import pytest
 
 from rbpf.lie import SE3
+from rbpf.motion.constant_velocity import PosePrior
 from rbpf.runs.recordings import filter_images
 from rbpf.runs.run import Run
 from rbpf.sensors.camera.resection import GATE, Resected, squared_distances
 from rbpf.systems.mono.config import MonoConfig, RelocalisationConfig
 from rbpf.systems.mono.relocalisation import (
     MIN_VIEW_CORNERS,
+    Attempt,
     Candidates,
     LastView,
     Relocaliser,
+    TrackingLoss,
     describe_corners,
     is_confirmed,
     is_convincing,
@@ -154,9 +158,30 @@ def place(tracked):
     )
 
 
+def test_the_spread_of_worlds_is_carried_to_the_pose_found():
+    """Worlds W_i = T₀ Exp(ξ_i) T₀⁻¹ about the last trusted pose T₀, by samples: the pose found is W_i T₁."""
+    loss = TrackingLoss(SimpleNamespace(camera=None), MonoConfig())
+    trusted, found = (
+        SE3.exp(np.array([0.5, -0.3, 0.8, 1.0, 2.0, -1.0])),
+        SE3.exp(np.array([-0.2, 1.4, 0.1, -1, 3, 0])),
+    )
+    half = 1e-3 * np.random.default_rng(0).normal(size=(6, 6))
+    loss._trusted = trusted, half @ half.T
+    attempt = Attempt(9, prior=PosePrior(found, 1e-8 * np.eye(6)))
+    loss.relocaliser = SimpleNamespace(find=lambda *_: attempt)
+    prior = loss.prior(SimpleNamespace(belief=lambda: None, steps=1), GREY).pose
+    xi = np.random.default_rng(1).normal(size=(100_000, 6)) @ half.T
+    poses = SE3.compose(SE3.retract(trusted, xi), SE3.compose(SE3.inverse(trusted), found))
+    expected = np.cov(SE3.log(SE3.between(found, poses)).T) + 1e-8 * np.eye(6)
+    np.testing.assert_array_equal(prior.mean, found)
+    np.testing.assert_allclose(prior.cov, expected, atol=0.03 * np.abs(expected).max())
+
+
 @slow
 def test_the_pose_found_is_right_and_its_covariance_fair(place):
+    before = place.belief.rng.bit_generator.state
     attempt = place.finder.find(place.belief, place.image, place.near)
+    assert place.belief.rng.bit_generator.state != before  # it draws from the filter's generator
     assert attempt.prior is not None
     assert RECOVERY.min_inliers <= attempt.agreeing <= attempt.landmarks
     error = SE3.log(SE3.between(place.truth, attempt.prior.mean))

@@ -228,7 +228,9 @@ class TrackingLoss:
                 attempt = self.relocaliser.find(belief, image, view)
             if attempt.prior is not None:
                 found = attempt.prior
-                prior = PosePrior(found.mean, found.cov + cov, self.std_velocity)
+                # How far a particle's world is from the heaviest one's, in the chart of the pose that was found in that.
+                moved = SE3.adjoint(SE3.between(found.mean, pose))
+                prior = PosePrior(found.mean, found.cov + moved @ cov @ moved.T, self.std_velocity)
                 return LostPrior(prior, attempt.certain, attempt)
         std = np.repeat([self.config.search_std_rad, self.config.search_std_m], 3)
         return LostPrior(PosePrior(pose, cov + np.diag(std**2), self.std_velocity), False, attempt)
@@ -324,7 +326,7 @@ class Relocaliser:
         attempt = replace(attempt, matches=pairs[0].size, matched=0 if again is None else int(again[0].size))
 
         # A pose that most of them agree with, and then all that is seen around it.
-        rough = self._consensus(points[pairs[0]], self.refine_px(candidates, pairs, near), view)
+        rough = self._consensus(points[pairs[0]], self.refine_px(candidates, pairs, near), view, belief.rng)
         if rough is None:
             return attempt
         if last is not None and again is not None:
@@ -398,13 +400,13 @@ class Relocaliser:
         matches = search(candidates.image, templates, at, cov, sigmas=sigmas, most_px=most_px)
         return np.where((matches.score >= MIN_CORRELATION)[:, None], matches.px, at)
 
-    def _consensus(self, points: np.ndarray, places: np.ndarray, view: Sights | None) -> np.ndarray | None:
+    def _consensus(
+        self, points: np.ndarray, places: np.ndarray, view: Sights | None, rng: np.random.Generator
+    ) -> np.ndarray | None:
         """The pose (7,) of three landmarks (M, 3) that most of them agree with, and the corners of the last view."""
         config, camera = self.config, self.camera
         if points.shape[0] < 3:
             return None
-        # Drawn anew for each image: a run that is resumed draws the same.
-        rng = np.random.default_rng(points.shape[0])
         if view is not None:
             poses = three_point_poses(points, camera.unproject(places), config.p3p_samples, rng)
             if poses.shape[0]:

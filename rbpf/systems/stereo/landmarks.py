@@ -478,7 +478,7 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         )
         taken = store.ids[found.second]
         of = np.searchsorted(ids, taken)
-        agreed = self._agreed(expected.take(of), features.take(found.first), view.uncertain)
+        agreed = self._agreed(expected.take(of), features.take(found.first), view.uncertain, belief.rng)
         out[rows[found.first[agreed]]] = taken[agreed]
         return out
 
@@ -542,7 +542,9 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         near = (descriptors @ store.descriptors[store.rows(ids)].T).max(axis=0) >= 1.0 - 0.5 * most**2
         return np.asarray(ids[near])
 
-    def _agreed(self, expected: Expected, features: StereoFeatures, uncertain: bool) -> np.ndarray:
+    def _agreed(
+        self, expected: Expected, features: StereoFeatures, uncertain: bool, rng: np.random.Generator
+    ) -> np.ndarray:
         """Which matches (k,) are taken: all, unless they are expected so vaguely that the gate tells little."""
         all_of_them = np.ones(len(features), dtype=bool)
         vague = uncertain or (len(features) and np.median(expected.deviation) > self.config.vague_px)
@@ -553,10 +555,7 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         # As the heaviest particle sees them, moved by an increment of any size.
         cov = expected.within + TINY * np.eye(3)
         matches = Matches.checked(self.rig, expected.by_heaviest, features.z, cov, features.cov)
-        rng, config = (
-            np.random.default_rng(self.manager.frame),
-            VoConfig(min_matches=self.config.min_agreeing),
-        )
+        config = VoConfig(min_matches=self.config.min_agreeing)
         return estimate_motion(matches, rng, config=config).inliers
 
     def _worth_a_landmark(self, frame: View[StereoFeatures], known: np.ndarray) -> np.ndarray:

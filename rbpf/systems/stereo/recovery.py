@@ -49,8 +49,7 @@ def motion_for_update(
     belief = filter_.expect(motion, view.stamp_ns)
     count = int((landmarks.associate(view, belief) != NULL).sum())
     if count < least:
-        rng = np.random.default_rng(filter_.steps)
-        place = relocalise_globally(landmarks, view, belief, config.odometry.estimate, rng)
+        place = relocalise_globally(landmarks, view, belief, config.odometry.estimate, filter_.rng)
         if place is not None:
             count, heaviest = place[1], filter_.particles.state[belief.mode]
             motion = Odometry(SE3.between(heaviest, place[0]), motion.cov)
