@@ -84,6 +84,8 @@ def load_arrays(path: Path, only: str | None = None) -> dict[str, np.ndarray]:
         InputError: the file is missing, cut off or not an archive of plain arrays.
     """
     try:
+        if not os.path.isfile(path) and os.path.exists(path):
+            raise ValueError("a pipe would be waited for, a device read without end")
         with open(path, "rb") as file, zipfile.ZipFile(file) as archive:
             members = archive.infolist()
             if sum(info.file_size for info in members) > os.fstat(file.fileno()).st_size:

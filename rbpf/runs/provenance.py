@@ -53,6 +53,7 @@ _NAMED = (
 _FLAGS = ("localize",)
 _MADE = "video", "batch"
 """What a run makes besides its data, unless it is told not to."""
+_INSTRUCTIONS = "sse4.2", "avx", "avx2", "fma", "avx512f", "neon", "sve"
 _CHUNK = 1 << 20
 
 FREE = ("checkpoint_every",)
@@ -108,14 +109,27 @@ def left_out(**wanted: bool) -> dict[str, bool]:
 
 
 def library_versions() -> dict[str, str]:
-    """Python, and the libraries that compute."""
-    found = {"python": platform.python_version()}
+    """Python, the libraries that compute, and the processor's instructions that they choose among."""
+    found = {"python": platform.python_version(), "instructions": instruction_set()}
     for name in LIBRARIES:
         try:
             found[name] = version(name)
         except PackageNotFoundError:
             continue
     return found
+
+
+def instruction_set() -> str:
+    """The processor, and which of its vector instructions compiled kernels, BLAS and OpenCV may use.
+
+    Sums are rounded in another order on another one: the same run is then the same to the 12th digit at first, no more.
+    """
+    import numba
+    from llvmlite import binding
+
+    features = binding.get_host_cpu_features()
+    found = [name for name in _INSTRUCTIONS if features.get(name)]
+    return " ".join([numba.config.CPU_NAME or binding.get_host_cpu_name(), *found])
 
 
 def digest_of(sources: Mapping[str, Path], without: Path | None = None) -> str | None:

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
+from stat import S_ISDIR, S_ISREG
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,11 +47,16 @@ def read_bytes(path: Path, hint: str = "", most: int | None = None) -> bytes:
     """
     most = MOST_BYTES if most is None else most
     try:
-        if path.stat().st_size > most:
+        status = path.stat()
+        if not S_ISREG(status.st_mode):  # a pipe would be waited for, a device read without end
+            kind = "a folder" if S_ISDIR(status.st_mode) else "a device or a pipe"
+            raise InputError(f"{path}: cannot be read: it is {kind}, no file{hint and '; expected ' + hint}.")
+        if status.st_size > most:
             raise InputError(
                 f"{path}: the file is larger than {most >> 20} MiB{hint and '; expected ' + hint}."
             )
-        return path.read_bytes()
+        with path.open("rb") as file:
+            return file.read(status.st_size)
     except InputError:
         raise
     except FileNotFoundError:

@@ -14,6 +14,7 @@ import yaml
 
 from rbpf.cli import APP, main
 from rbpf.cli.compiling import cached, compile_kernels, kernel_modules
+from rbpf.runs.provenance import instruction_set
 from tests.cli.run_outputs import outputs
 
 pytestmark = pytest.mark.slow
@@ -149,6 +150,7 @@ def test_a_run_is_repeated_from_its_config(log, tmp_path, capsys):
     config = tmp_path / "a" / "config.yaml"
     entries = yaml.safe_load(config.read_text())
     assert entries["versions"]["numpy"] == np.__version__ and len(entries["input_sha256"]) == 64
+    assert entries["versions"]["instructions"] == instruction_set() and instruction_set()
     assert entries["batch"] is False
     again = ["run", "--from", str(config)]
     assert main([*again, "--out", str(tmp_path / "b")]) == 0

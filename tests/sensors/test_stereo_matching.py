@@ -151,6 +151,21 @@ def test_limits_of_the_disparity():
     assert disparity.max() <= 260.0 * 0.12 / 2.0 + 2.0
 
 
+@pytest.mark.parametrize(("beyond", "doubted"), [(0.0, False), (0.1, True)])
+def test_cameras_that_cannot_have_taken_the_pair_are_noticed(beyond, doubted):
+    """The right image is shifted, as by a camera that is turned, until a tenth of the points lies beyond infinity."""
+    left, right = room()[0][0]
+    features = measured()
+    disparity = features.z[:, 0] - features.z[:, 2]
+    shift = int(np.quantile(disparity, beyond)) + 2 if beyond else 0
+    matcher = StereoMatcher(RIG, Sift(FULL))
+    assert matcher.doubt == ""
+    matcher.measure(left, np.roll(right, shift, axis=1))
+    assert (
+        "have a negative disparity, which no point in space has: check the calibration" in matcher.doubt
+    ) is doubted
+
+
 def test_swapped_images_are_noticed():
     left, right = room()[0][0]
     with pytest.raises(InputError, match=r"seem to be swapped: \d+ matches have a negative disparity"):

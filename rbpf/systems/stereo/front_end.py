@@ -106,6 +106,10 @@ class FrontEnd(ABC, Generic[F]):
         """In words, why a frame cannot be one of these cameras; empty where it can. `measure` then finds nothing in it."""
         return ""
 
+    def doubt(self) -> str:
+        """In words, why the frame that was measured last does not look like one of these cameras; empty where it does."""
+        return ""
+
     @abstractmethod
     def match(self, before: Pair[F], now: Pair[F]) -> tuple[np.ndarray, np.ndarray]:
         """Rows (M,) of the earlier pair and (M,) of the later one that are the same point, as the odometry takes it."""
@@ -199,6 +203,9 @@ class ImageFrontEnd(FrontEnd[StereoFeatures]):
         except InputError as error:
             return str(error)
         return ""
+
+    def doubt(self) -> str:
+        return self.matcher.doubt
 
     def match(self, before: Pair[StereoFeatures], now: Pair[StereoFeatures]) -> tuple[np.ndarray, np.ndarray]:
         """By their descriptors."""

@@ -51,6 +51,9 @@ from rbpf.systems.system import (
     TrackingState,
 )
 
+DOUBTED = 10
+"""Pairs at the beginning that are asked whether they look like these cameras' at all."""
+
 
 @final
 class StereoSlam(System):
@@ -197,7 +200,8 @@ class StereoSlam(System):
         measured = len(pair) >= least and dt > 0.0
         if measured:
             motion = self._motion_to(pair, dt)
-            messages += filter(None, (problem, motion.message))
+            doubt = front_end.doubt() if self.frames < DOUBTED else ""
+            messages += filter(None, (problem, doubt, motion.message))
         else:
             few = "it has the stamp of the last one"
             if dt > 0.0:

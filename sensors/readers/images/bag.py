@@ -214,8 +214,8 @@ def _unpacked(unpack: Callable[[bytes], bytes], data: bytes) -> bytes:
     return bytes(unpacked)
 
 
-def read_image(bag: Bag, raw: RawMessage, where: str) -> Grey:
-    """Image (H, W) of a message; `where` names it in messages.
+def read_image(bag: Bag, raw: RawMessage, where: str, shape: tuple[int, int] | None = None) -> Grey:
+    """Image (H, W) of a message, which `where` names in messages; of this height and width, if they are given.
 
     Raises:
         UnreadableImageError: it is damaged, or of an encoding that is not known.
@@ -227,7 +227,7 @@ def read_image(bag: Bag, raw: RawMessage, where: str) -> Grey:
     except InputError:
         raise UnreadableImageError(f"{where}: a message is damaged.") from None
     if raw.type == COMPRESSED:
-        return decode(where, np.asarray(message.data, np.uint8))
+        return decode(where, np.asarray(message.data, np.uint8), shape)
     if message.encoding not in _LAYOUTS:
         known = ", ".join(_LAYOUTS)
         raise UnreadableImageError(
@@ -521,7 +521,7 @@ class BagImages(Source):
             if number == row:
                 where = f"{bag.path}, {topic}, image {number}"
                 try:
-                    yield require_shape(where, read_image(bag, raw, where), self.shape), None
+                    yield require_shape(where, read_image(bag, raw, where, self.shape), self.shape), None
                 except UnreadableImageError as error:
                     yield None, str(error)
                 row = next(wanted, None)

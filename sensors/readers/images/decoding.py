@@ -17,56 +17,76 @@ from numpy.typing import NDArray
 
 from rbpf.errors import InputError
 from rbpf.sensors.readers.images.sequence import ImageFrame, Source
+from rbpf.sensors.readers.text import read_bytes
 
 Grey = NDArray[np.uint8]
 
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".webp"})
 
 
+_PNG = b"\x89PNG\r\n\x1a\n"
+
+
 class UnreadableImageError(Exception):
     """An image that is missing or damaged; its text is the sentence for `ImageFrame.problem`."""
 
 
-def read_grey(path: Path) -> Grey:
-    """Image of a file, (H, W).
+def read_grey(path: Path, shape: tuple[int, int] | None = None) -> Grey:
+    """Image of a file, (H, W); of this height and width, if they are given.
 
     Raises:
-        UnreadableImageError: the file is missing, or is no complete image of a format that OpenCV knows.
+        UnreadableImageError: the file is missing, is no complete image of a format that OpenCV knows, or has another size.
     """
     try:
-        data = np.fromfile(path, dtype=np.uint8)
-    except FileNotFoundError:
-        raise UnreadableImageError(f"{path}: no such image.") from None
-    except (OSError, ValueError) as error:
-        raise UnreadableImageError(f"{path}: the image cannot be read ({error}).") from None
-    return decode(path, data)
+        data = read_bytes(path)
+    except InputError as error:
+        raise UnreadableImageError(str(error)) from None
+    return decode(path, np.frombuffer(data, dtype=np.uint8), shape)
 
 
-def decode(path: Path | str, data: NDArray[np.uint8]) -> Grey:
-    """Image (H, W) of the content (B,) of a file, which `path` names in messages.
-
-    Raises:
-        UnreadableImageError: it is no complete image of a format that OpenCV knows.
-    """
+def decode(path: Path | str, data: NDArray[np.uint8], shape: tuple[int, int] | None = None) -> Grey:
+    """Image (H, W) of the content (B,) of a file, which `path` names in messages; raises as `read_grey`."""
     import cv2
     from PIL import Image
 
     if not data.size:
         raise UnreadableImageError(f"{path}: the file is empty, expected an image.")
-    # Before anything is decoded: a header may claim more pixels than Pillow takes for sane.
+    # Before anything is decoded, which makes room for all that a header claims: the pixels of a damaged one may be more than
+    # the camera has, or than Pillow takes for sane, and a part of a PNG file longer than the file.
+    damaged = UnreadableImageError(f"{path}: the file is damaged, incomplete or no image.")
+    content = data.tobytes()
     try:
-        Image.open(BytesIO(data.tobytes())).close()
+        with Image.open(BytesIO(content)) as header:
+            width, height = header.size
     except (Image.DecompressionBombError, Image.DecompressionBombWarning):
         raise UnreadableImageError(f"{path}: the image claims to be larger than any camera's.") from None
     except Exception:
-        pass
+        raise damaged from None
+    if shape is not None and width * height != shape[0] * shape[1]:  # a photo may be turned
+        raise _other_size(path, (height, width), shape)
+    if not _png_fits(content):
+        raise damaged
     try:
         image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
     except cv2.error as error:
         raise UnreadableImageError(f"{path}: the image cannot be decoded ({error.err}).") from None
     if image is None:
-        raise UnreadableImageError(f"{path}: the file is damaged, incomplete or no image.")
-    return _to_8_bits(path, image)
+        raise damaged
+    grey = _to_8_bits(path, image)
+    return grey if shape is None else require_shape(path, grey, shape)
+
+
+def _png_fits(content: bytes) -> bool:
+    """Whether no part of a PNG file claims to reach beyond its end."""
+    if not content.startswith(_PNG):
+        return True
+    at = len(_PNG)
+    while at + 8 <= len(content):
+        end, kind = at + 12 + int.from_bytes(content[at : at + 4], "big"), content[at + 4 : at + 8]
+        if end > len(content) or kind == b"IEND":
+            return end <= len(content)
+        at = end
+    return True
 
 
 def to_grey(path: Path | str, image: np.ndarray) -> Grey:
@@ -89,11 +109,13 @@ def require_shape(path: Path | str, image: Grey, shape: tuple[int, int]) -> Grey
         UnreadableImageError: it has another size.
     """
     if image.shape != shape:
-        found = f"found {image.shape[1]}x{image.shape[0]} px"
-        raise UnreadableImageError(
-            f"{path}: expected {shape[1]}x{shape[0]} px as in the camera file, {found}."
-        )
+        raise _other_size(path, image.shape[:2], shape)
     return image
+
+
+def _other_size(path: Path | str, found: tuple[int, int], shape: tuple[int, int]) -> UnreadableImageError:
+    expected = f"expected {shape[1]}x{shape[0]} px as in the camera file"
+    return UnreadableImageError(f"{path}: {expected}, found {found[1]}x{found[0]} px.")
 
 
 def _to_8_bits(path: Path | str, image: np.ndarray) -> Grey:
@@ -139,7 +161,7 @@ class FileImages(Source):
         if path is None:
             return None, "The second camera has no image of this time."
         try:
-            return require_shape(path, read_grey(path), self.shape), None
+            return read_grey(path, self.shape), None
         except UnreadableImageError as error:
             return None, str(error)
 

@@ -1,15 +1,20 @@
 """Images one after the other: lazily, in grey, and around those that cannot be read."""
 
+import os
 import time
+import zlib
+from pathlib import Path
 from unittest import mock
 
 import cv2
 import numpy as np
 import pytest
 
+from rbpf.core.checkpoint import load_arrays
 from rbpf.errors import InputError
 from rbpf.sensors.readers import open_images
 from rbpf.sensors.readers.images import decoding
+from rbpf.sensors.readers.yaml_files import read_plain_yaml
 from tests.readers.images.folders import (
     HEIGHT,
     SIZE,
@@ -67,7 +72,7 @@ def test_an_image_that_ends_too_early_is_not_half_of_one(tmp_path, suffix):
 @pytest.mark.parametrize(
     ("content", "problem"),
     [
-        (None, "no such image"),
+        (None, "no such file"),
         (b"", "the file is empty, expected an image"),
         (b"\x89PNG\r\n\x1a\n", "the file is damaged, incomplete or no image"),
         (b"some text", "the file is damaged, incomplete or no image"),
@@ -81,6 +86,38 @@ def test_a_run_survives_an_image_that_is_missing_or_none(tmp_path, content, prob
     assert levels(sequence) == [10, None, 30]
     assert lost.problem == f"{tmp_path / '1.png'}: {problem}."
     assert lost.stamp_ns == sequence.stamps_ns[1]
+
+
+@pytest.mark.parametrize("damage", ["a part", "the size"])
+def test_an_image_that_claims_more_than_it_has_takes_no_memory(tmp_path, damage):
+    """A PNG of a few bytes, of which a part claims 4 GiB, or whose header 8,000 x 8,000 pixels."""
+    write_plain(tmp_path)
+    path = tmp_path / "1.png"
+    content = bytearray(path.read_bytes())
+    if damage == "a part":
+        content[33:37] = b"\xff\xff\xff\xf0"
+    else:
+        content[16:24] = (8_000).to_bytes(4, "big") * 2
+        content[29:33] = zlib.crc32(bytes(content[12:29])).to_bytes(4, "big")
+    path.write_bytes(bytes(content))
+    with mock.patch.object(cv2, "imdecode", side_effect=cv2.imdecode) as decoded:
+        problem = list(open_images(tmp_path).frames())[1].problem
+    assert decoded.call_count == 3  # the first one twice, and the third
+    assert problem is not None and ("damaged" if damage == "a part" else "found 8000x8000 px") in problem
+
+
+def test_pipes_and_devices_are_no_files(tmp_path):
+    """They would be waited for, or read without end."""
+    write_plain(tmp_path)
+    for name in ("1.png", "pipe.yaml", "pipe.npz"):
+        (tmp_path / name).unlink(missing_ok=True)
+        os.mkfifo(tmp_path / name)
+    assert "it is a device or a pipe, no file" in list(open_images(tmp_path).frames())[1].problem
+    for path in (tmp_path / "pipe.yaml", Path("/dev/zero")):
+        with pytest.raises(InputError, match="it is a device or a pipe, no file"):
+            read_plain_yaml(path)
+    with pytest.raises(InputError, match="not a complete archive"):
+        load_arrays(tmp_path / "pipe.npz")
 
 
 def test_an_image_that_is_a_folder(tmp_path):
