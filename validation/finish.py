@@ -94,7 +94,7 @@ def finish_run(
     if rerun is not None:
         write_rerun(run, rerun)
     verdict = report_run(out)
-    return entries | {"verdict": verdict.trust, "sentences": verdict.said}
+    return entries | {"verdict": verdict.trust, "sentences": [*entries.get("remarks", ()), *verdict.said]}
 
 
 def add_batch(found: RunFolder, callbacks: Callbacks) -> dict[str, Any]:

@@ -52,7 +52,10 @@ from rbpf.runs.run import Run
 from rbpf.runs.trajectory import Trajectory, in_space, write_tum
 from rbpf.runs.truth import write_truth
 from rbpf.systems.map_estimate import MapEstimate
-from rbpf.systems.system import DIAGNOSTICS, TIMINGS
+from rbpf.systems.system import DIAGNOSTICS, TIMINGS, TrackingState
+
+STILL = 0.01
+"""A path that reaches no further than this fraction of the distance of what is seen tells hardly anything of its depth."""
 
 
 def write_run(run: Run, out: Path, sources: Mapping[str, str | float | bool]) -> dict[str, Any]:
@@ -106,9 +109,33 @@ def summarise(run: Run) -> dict[str, Any]:
         "nis_per_dof": nis_ratio(log["nis"], log["nis_dof"]),
         "peak_memory_mb": peak_memory_mb(),
         **run.system.summary(log),
+        **({"remarks": found} if (found := remarks(run)) else {}),
         **({"problems": run.messages} if run.messages else {}),
         **({} if run.failure is None else {"failure": run.failure}),
     }
+
+
+def remarks(run: Run) -> list[str]:
+    """Sentences that come before all figures of a run: nothing was measured, or nothing moved."""
+    log, landmarks = run.log, run.system.map()
+    seen = [state in (TrackingState.TRACKED, TrackingState.INITIALISING) for state in log.states]
+    if not any(seen):
+        frames = f"the {len(log)} {run.system.frame_word}s"
+        return [
+            f"None of {frames} could be measured: the path is what was assumed, and nothing was seen of it."
+        ]
+    at = in_space(log.stamps_ns, log.poses).positions[:, : landmarks.mean.shape[1]]
+    if len(log) < 2 or not len(landmarks.ids):
+        return []
+    reach = float(np.linalg.norm(at - at[0], axis=1).max())
+    distance = float(np.median(np.linalg.norm(landmarks.mean - at[0], axis=1)))
+    if reach > STILL * distance:
+        return []
+    depth = ", from which no depth can be measured" if run.system.gauge == "similarity" else ""
+    return [
+        f"It stood still, or nearly: the path stays within {100 * reach / distance:.2g} % of the landmarks' median "
+        f"distance from where it begins{depth}."
+    ]
 
 
 def write_summary(out: Path, entries: Mapping[str, Any]) -> None:
