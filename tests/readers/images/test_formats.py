@@ -138,7 +138,7 @@ REFUSED = [
     ("EuRoC", DATA, "1.5,12.png\n", "data.csv, line 1: expected a time in whole nanoseconds, found '1.5'"),
     ("EuRoC", DATA, "9999999999999999999,12.png\n", "data.csv, line 1: expected a time in whole nanoseconds"),
     ("EuRoC", DATA, "12\n", "data.csv, line 1: expected a time and the file of an image"),
-    ("EuRoC", DATA, "12,12.png\n", "data.csv: none of 1 images can be read; the first is .*12.png: no such image"),
+    ("EuRoC", DATA, "12,12.png\n", "data.csv: none of 1 images can be read; the first is .*12.png: no such file"),
     ("EuRoC", TRUTH, "0,1,2,3,1,0,0,0\n", "the poses are at 0.000 .* which is another clock"),
     ("EuRoC", TRUTH, f"{EUROC_NS[0]},1,2,3,1,0,0\n", "data.csv, line 1: expected 7 columns .* found 6"),
     ("EuRoC", "mav0/vicon0/data.csv", f"{EUROC_NS[0]},1,2,3,1,0,0,0\n", "vicon0/sensor.yaml: no such file; .* T_BS"),

@@ -242,7 +242,7 @@ def test_a_missing_image_of_a_pair_that_is_rectified(tmp_path):
     (tmp_path / "mav0" / "cam1" / "data" / f"{EUROC_NS[1]}.png").unlink()
     frames = list(open_stereo(tmp_path).frames())
     assert [frame.right is None for frame in frames] == [False, True, False]
-    assert "no such image" in frames[1].problem
+    assert "no such file" in frames[1].problem
 
 
 LEFT = Pinhole(160, 120, 110.0, 112.0, 80.0, 58.0, (-0.2, 0.05, 1e-3, -5e-4, 0.0))
