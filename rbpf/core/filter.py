@@ -36,6 +36,7 @@ from rbpf.core.particles import (
     Particles,
     Prior,
     Proposed,
+    SecondWeight,
     effective_sample_size,
     mixture_estimate,
     reweight,
@@ -54,8 +55,9 @@ class StepReport:
 
     Attributes:
         stamp_ns: time of the step.
-        mixture: what the estimate summarises: the refined mixture before sampling, with its log-weights; after a
-            proposal that did not look at the observations, the weighted samples.
+        mixture: the refined mixture before sampling, with its log-weights; after a proposal that did not look at the
+            observations, the weighted samples.
+        second: the samples, with their weights before and after the second weight; None where the mixture is made of them.
         ess: effective sample size before resampling.
         resampled: whether the particles were resampled or consolidated before they moved.
         log_evidence: log p(z_t | z_1:t−1), Mathematics (evidence-increment); NaN where a likelihood is not a density.
@@ -70,6 +72,7 @@ class StepReport:
 
     stamp_ns: int
     mixture: tuple[Prior, Proposed | None, np.ndarray]
+    second: SecondWeight | None
     ess: float
     resampled: bool
     log_evidence: float
@@ -81,8 +84,8 @@ class StepReport:
 
     @cached_property
     def estimate(self) -> Estimate:
-        """Mean and covariance of the state."""
-        return mixture_estimate(*self.mixture)
+        """Mean and covariance of the state by both weights, Mathematics (summary)."""
+        return mixture_estimate(*self.mixture, self.second)
 
 
 class Filter:
@@ -231,10 +234,12 @@ class Filter:
             # A parent of weight zero that was not resampled keeps it, whatever its second factor is.
             log_w1 = proposed.log_w1[parents]
             log_w2 = densities.all + log_ratio - np.where(log_w1 == -np.inf, 0.0, log_w1)
+        log_before = log_weights
         log_weights, correction = reweight(log_weights, log_w2, f"step {self.steps}")
         self.particles = Particles(state, log_weights)
+        second: SecondWeight | None = SecondWeight(state, log_before, log_weights)
         if proposed.nis is None:
-            mixture = (Prior.exactly(self.space, state), None, log_weights)
+            mixture, second = (Prior.exactly(self.space, state), None, log_weights), None
 
         # Start landmarks, and report.
         first_observations, new_landmarks = self._start_landmarks(frame, groups)
@@ -249,6 +254,7 @@ class Filter:
         return StepReport(
             stamp_ns=stamp_ns,
             mixture=mixture,
+            second=second,
             ess=effective_sample_size(weights),
             resampled=ancestors is not None or consolidated,
             log_evidence=evidence,

@@ -16,6 +16,9 @@ from rbpf.arrays import Float, Int
 from rbpf.errors import InputError
 from rbpf.lie import LieGroup
 
+NOTHING_MOVED = 1e-12
+"""χ² below which weights differ by rounding alone."""
+
 
 @dataclass
 class Particles:
@@ -252,6 +255,34 @@ def balanced(
 
 
 @dataclass(frozen=True)
+class SecondWeight:
+    """What the second weight w₂ says of the states that were sampled, Mathematics (summary).
+
+    Attributes:
+        state: (N, E) sampled.
+        log_before: (N,) normalised log-weights that they were sampled with.
+        log_after: (N,) those after w₂.
+    """
+
+    state: Float[np.ndarray, "N E"]
+    log_before: Float[np.ndarray, " N"]
+    log_after: Float[np.ndarray, " N"]
+
+    @cached_property
+    def trust(self) -> float:
+        """Fraction χ² / (χ² + Σ W²), of which χ² = Σ W²/V − 1 is how far w₂ moved the weights from V to W.
+
+        No mean moves by more than √χ² standard deviations by w₂, and that of the samples errs by √(Σ W²) of them.
+        """
+        held = np.isfinite(self.log_after)
+        after, before = self.log_after[held], self.log_before[held]
+        moved = float(np.exp(2.0 * after - before).sum()) - 1.0
+        if moved < NOTHING_MOVED:
+            return 0.0
+        return moved / (moved + float(np.exp(2.0 * after).sum()))
+
+
+@dataclass(frozen=True)
 class Estimate:
     """A Gaussian summary of the state.
 
@@ -264,18 +295,31 @@ class Estimate:
     cov: Float[np.ndarray, "d d"]
 
 
-def mixture_estimate(prior: Prior, proposed: Proposed | None, log_weights: np.ndarray) -> Estimate:
-    """Summary of the refined mixture before sampling, or of the prior's states where nothing was proposed."""
-    weights = np.exp(log_weights)
-    factor = prior.factor
-    centres = prior.predicted()
+def mixture_estimate(
+    prior: Prior,
+    proposed: Proposed | None,
+    log_weights: Float[np.ndarray, " N"],
+    second: SecondWeight | None = None,
+) -> Estimate:
+    """Summary of the refined mixture before sampling, or of the prior's states where nothing was proposed.
+
+    The covariance within a particle at δ in the chart of the mean is carried there by J_r⁻¹(δ), to first order.
+    With a second weight, the fraction `SecondWeight.trust` of the mixture is what was sampled, with its final weights.
+    """
+    weights, factor, centres = np.exp(log_weights), prior.factor, prior.predicted()
     if proposed is not None:
         increment = prior.mean + np.einsum("nar,nr->na", factor, proposed.mean)
         centres = prior.at(increment)
         factor = prior.spread(increment) @ proposed.root
+    n, trust = weights.size, 0.0 if second is None else second.trust
+    if second is not None and trust > 0.0:
+        centres = np.concatenate([centres, second.state])
+        weights = np.concatenate([(1.0 - trust) * weights, trust * np.exp(second.log_after)])
     mean = prior.space.mean(centres, weights)
     spread = prior.space.local(mean, centres)
     between = np.einsum("n,na,nb->ab", weights, spread, spread)
-    fraction = weights if factor.shape[0] > 1 else np.ones(1)
-    within = np.einsum("n,nar,nbr->ab", fraction, factor, factor)
+    if not factor.any():
+        return Estimate(mean, gaussian.symmetrise(between))
+    factor = prior.space.right_jacobian_inverse(spread[:n]) @ factor
+    within = np.einsum("n,nar,nbr->ab", weights[:n], factor, factor)
     return Estimate(mean, gaussian.symmetrise(within + between))

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from examples.studies.point_worlds import STEREO, DeskWorld, Measuring, simulate_features
-from rbpf.core.filter import Filter
+from rbpf.core.filter import Filter, StepReport
 from rbpf.core.genealogy import Lineage
 from rbpf.core.models import Belief, NewLandmarks, Part
-from rbpf.core.particles import Prior
+from rbpf.core.particles import Estimate, Prior, mixture_estimate
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.maps.constellation import Constellation, UncertainConstellation
@@ -246,6 +246,22 @@ def test_an_empty_frame(config):
     assert volume[5] > 10.0 * volume[4] and volume[6] < 0.1 * volume[5]
     assert done.log["nis_dof"][5] == 0 and done.log["log_evidence"][5] == pytest.approx(0.0, abs=1e-9)
     assert np.abs(errors(done)[-1]).max() < 0.1
+
+
+def test_what_is_reported_moves_nothing(monkeypatch):
+    """The start without known points adjusts the first frames; it begins where the filter is, not where it is said to be."""
+    log = replace(without_known(LOG), frames=LOG.frames[:9])  # the ninth comes after an adjustment
+    plain = run(log, SMALL)
+
+    def elsewhere(report):
+        found = mixture_estimate(*report.mixture)
+        return Estimate(found.mean + np.repeat([0.0, 0.1e-9 * report.stamp_ns], [4, 3]), found.cov)
+
+    monkeypatch.setattr(StepReport, "estimate", property(elsewhere))
+    moved = run(log, SMALL)
+    assert not np.array_equal(moved.log.poses, plain.log.poses)
+    assert moved.system.start.arrays()["start/steps"].size > 0
+    assert same(content(moved.system.filter), content(plain.system.filter))
 
 
 def test_an_empty_first_frame_without_known_points():

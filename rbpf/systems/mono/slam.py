@@ -18,7 +18,7 @@ import numpy as np
 from rbpf.core.filter import Filter, StepReport
 from rbpf.core.marginals import KalmanSubstate
 from rbpf.core.models import Belief, Conditional, MotionModel, NewLandmarks, Observations, Records, Sensor
-from rbpf.core.particles import Estimate
+from rbpf.core.particles import Estimate, mixture_estimate
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.maps.constellation import Constellation, UncertainConstellation
@@ -280,7 +280,9 @@ class MonoSlam(System):
         if not self.start.over:
             seen = measured.features if isinstance(measured, Measurement) else measured
             is_lost = sensor.lost and len(sensor.table) > 0
-            resampled, words = self.start.after_frame(self.filter, seen, pose, not sensor.bad_frames, is_lost)
+            # From where the adjustment starts: the mixture before sampling, which no noise of a few particles moves.
+            near = mixture_estimate(*report.mixture).mean[:7]
+            resampled, words = self.start.after_frame(self.filter, seen, near, not sensor.bad_frames, is_lost)
             if resampled is not None:
                 self.filter = resampled.filter
                 revision = Revision(resampled.stamps_ns, resampled.poses, resampled.covs)

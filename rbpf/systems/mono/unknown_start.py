@@ -118,7 +118,7 @@ class UnknownStart:
         Args:
             filter_: after its step; a new one has its sensors and its random generator.
             seen: what was measured in the frame.
-            pose: (7,) world_from_camera that was reported.
+            pose: (7,) world_from_camera as the filter predicts and refines it: an adjustment starts from there.
             usable: whether the frame may be the last of an adjustment.
             lost: whether the camera is lost: then there will be no adjustment any more.
 
