@@ -61,10 +61,19 @@ def test_a_likelihood_that_is_no_density_is_refused_with_the_reason():
 
 
 def test_monocular_configurations_are_compared_on_features():
-    log = simulate_features(DeskWorld(frames=25), Measuring(), MONO, 0)
-    slow = replace(MonoConfig(), velocity=replace(MonoConfig().velocity, walk_m_s=0.001, walk_rad_s=0.001))
-    found = compare_evidence(MonoConfig(), slow, log, range(2))
+    log, usual = (
+        simulate_features(DeskWorld(frames=25), Measuring(), MONO, 0),
+        MonoConfig(max_new_per_frame=0),
+    )
+    slow = replace(usual, velocity=replace(usual.velocity, walk_m_s=0.001, walk_rad_s=0.001))
+    found = compare_evidence(usual, slow, log, range(2))
     assert found.difference > 0.0
+    for pair in (
+        (usual, replace(usual, max_new_per_frame=1)),
+        (MonoConfig(), MonoConfig(max_new_per_frame=1)),
+    ):
+        with pytest.raises(InputError, match="who starts fewer explains more; set max_new_per_frame to 0"):
+            compare_evidence(*pair, log, range(2))
 
 
 APART = StereoConfig(
@@ -100,7 +109,9 @@ def test_what_does_not_belong_together_is_refused():
     with pytest.raises(InputError, match="different systems"):
         compare_evidence(CONFIG, MonoConfig(), log, range(2))
     with pytest.raises(InputError, match="does not filter"):
-        compare_evidence(MonoConfig(), MonoConfig(), log, range(2))
+        compare_evidence(MonoConfig(max_new_per_frame=0), MonoConfig(max_new_per_frame=0), log, range(2))
+    with pytest.raises(InputError, match="set the same association"):
+        compare_evidence(CONFIG, replace(CONFIG, association="ml"), log, range(2))
     with pytest.raises(InputError, match="2 seeds"):
         compare_evidence(CONFIG, CONFIG, log, [1])
     with pytest.raises(InputError, match="recording's path"):

@@ -120,8 +120,8 @@ def compare_evidence(
         on_run: called with the runs done and their number.
 
     Raises:
-        InputError: the configurations are of different systems, do not fit the data, or one has no evidence because
-            its likelihood is not a density.
+        InputError: the configurations are of different systems, differ in what is data, do not fit the data, or one has no
+            evidence: its likelihood is not a density, or what it measures is not counted once.
     """
     from joblib import Parallel, delayed
 
@@ -133,6 +133,19 @@ def compare_evidence(
         raise InputError(f"log-evidences are compared over 2 seeds or more, got {len(seeds)}")
     for name, config in (("first", config_a), ("second", config_b)):
         _require_density(config, name)
+    # What is told of landmarks must be the same, and must be counted once.
+    for config in (config_a, config_b):
+        if isinstance(config, MonoConfig) and config.max_new_per_frame > 0:
+            raise InputError(
+                "a monocular filter that starts features has no evidence: of one whose depth is unknown, the pose and the "
+                "depth are told different parts of a measurement, and a first sighting counts nothing, so that who starts "
+                "fewer explains more; set max_new_per_frame to 0 in both configurations, on a log with known points"
+            )
+    if getattr(config_a, "association", None) != getattr(config_b, "association", None):
+        raise InputError(
+            "a filter that is given the landmarks' names and one that is not do not explain the same data: set the "
+            "same association in both configurations"
+        )
     # What moves the particles of a stereo filter is given, not explained: both must be given the same.
     if isinstance(config_a, StereoConfig) and isinstance(config_b, StereoConfig):
         if config_a.odometry.split != "apart" or config_b.odometry.split != "apart":
