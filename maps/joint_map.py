@@ -19,7 +19,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from rbpf import gaussian
-from rbpf.core.checkpoint import checked, within
+from rbpf.core import schema
 from rbpf.core.genealogy import Lineage
 from rbpf.core.linearisation import linearise
 from rbpf.core.models import (
@@ -60,6 +60,9 @@ class _Rows(NamedTuple):
         return 2.0 * float(np.log(np.diagonal(self.chol)).sum()) + self.nu.shape[1] * float(
             np.log(2.0 * np.pi)
         )
+
+
+_NAMED = {"ids": schema.integers("landmarks", least=0), "next": schema.integers(1, least=0)}
 
 
 @final
@@ -452,19 +455,18 @@ class JointMap(Map):
         return {"joint substate": self._first - self.space.dim}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """The inverse of `arrays`.
-
-        Raises:
-            InputError: an array is missing, or is not what it should be.
-        """
-        self._ids = within(arrays, "joint/ids", None, 0, np.iinfo(np.int64).max)
-        self._next_id = int(within(arrays, "joint/next", 1, 0, np.iinfo(np.int64).max)[0])
+        """The inverse of `arrays`; errors as `rbpf.core.schema.read`."""
+        found = schema.read(arrays, _NAMED, "joint/")
+        self._ids, self._next_id = found["ids"], int(found["next"][0])
         if np.unique(self._ids).size < self._ids.size or self._ids.max(initial=-1) >= self._next_id:
             raise InputError("the array joint/ids names a landmark twice, or one that was never started")
         size = self._first + self._ids.size * self.point.dim
-        self.mean = checked(arrays, "joint/mean", (self.n, size), "f").copy()
-        self.cov = checked(arrays, "joint/cov", (size, size), "f").copy()
-        self.origin = checked(arrays, "joint/origin", (self.space.size,), "f").copy()
+        held = {
+            "mean": schema.numbers("n", "size"),
+            "cov": schema.numbers("size", "size"),
+            "origin": schema.elements(self.space),
+        }
+        self.mean, self.cov, self.origin = schema.read(arrays, held, "joint/", n=self.n, size=size).values()
 
     def _by_turn(self, points: np.ndarray) -> np.ndarray:
         """∂(Exp(ω) l)/∂ω (M, D, ·) at points (M, D): nothing for translations, a column in the plane, −[l]× in space."""

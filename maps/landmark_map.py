@@ -6,7 +6,6 @@ from typing import final
 
 import numpy as np
 
-from rbpf.core.checkpoint import within
 from rbpf.core.genealogy import Lineage
 from rbpf.core.likelihoods import Gaussian
 from rbpf.core.linearisation import innovation_covariance, linearise
@@ -23,6 +22,7 @@ from rbpf.core.models import (
     Records,
 )
 from rbpf.core.particles import Information, Prior
+from rbpf.core.schema import integers, read_one
 from rbpf.errors import InputError
 from rbpf.kernels.landmarks import gather, linearise_one, project
 from rbpf.lie import LieGroup
@@ -293,7 +293,8 @@ class LandmarkMap(Map):
         """
         self.store.restore(arrays)
         count = self.store.columns.count
-        kinds = within(arrays, "map/kinds", count, 0, len(self.layouts))
+        entry = integers("landmarks", least=0, below="kinds")
+        kinds = read_one(arrays, "map/kinds", entry, landmarks=count, kinds=len(self.layouts))
         sizes = np.array([layout.fields for layout in self.layouts], dtype=np.int64)[kinds]
         if not np.array_equal(sizes, self.store.columns.fields[:count]):
             raise InputError("the landmarks' records have other sizes than their parametrisations")

@@ -11,13 +11,24 @@ from typing import final
 
 import numpy as np
 
-from rbpf.core.checkpoint import checked, within
-from rbpf.core.genealogy import Lineage, Schedule
+from rbpf.core.genealogy import DUE, Lineage, Schedule
+from rbpf.core.schema import integers, numbers, read, read_one
 from rbpf.errors import InputError
+from rbpf.ranges import require_memory
 
 ALL = slice(None)
-MOST_FIELDS = 1 << 20
-"""No record is longer."""
+
+_TABLES = {
+    "ids": integers("landmarks", least=0, below="ids"),
+    "fields": integers("landmarks", least=1),
+    "generation": integers("landmarks", least=0, below="generations"),
+    "due": DUE,
+}
+_HOT = {"data": numbers("fields", "n", values="log")}
+_COLD = {
+    "kept": integers("kept", least=0, below="n", ascending=True),
+    "data": numbers("fields", "kept", values="log"),
+}
 
 HOT_FRACTION = 0.75
 """A column with fewer surviving rows than this fraction of the particles gives its dense slab back."""
@@ -127,11 +138,10 @@ class Columns:
         """Holds the columns (M,) and no others; their tables have to be filled again.
 
         Raises:
-            InputError: an id comes twice, or one is not between 0 and `next_id`.
+            InputError: an id comes twice.
         """
-        ids = checked({"ids": ids}, "ids", (None,), "i").astype(np.int64)
-        if np.unique(ids).size < ids.size or (ids.size and not 0 <= ids.min() <= ids.max() < next_id):
-            raise InputError(f"the landmarks' ids are not different numbers from 0 to {next_id - 1}")
+        if np.unique(ids).size < ids.size:
+            raise InputError("a landmark's id comes twice")
         room = max(_FIRST_ROWS, 2 * ids.size)
         for name, table in self._tables().items():
             setattr(self, name, np.zeros(room, dtype=table.dtype))
@@ -154,7 +164,7 @@ class Pool:
     """
 
     def __init__(self, fields: int, n: int) -> None:
-        self.data = np.zeros((_FIRST_SLABS, fields, n))
+        self.data = self._slabs(_FIRST_SLABS, fields, n)
         self._free = list(range(_FIRST_SLABS - 1, -1, -1))
 
     @property
@@ -166,7 +176,7 @@ class Pool:
         """Free slabs, (count,) int; the pool doubles where there are too few."""
         while len(self._free) < count:
             old = self.data.shape[0]
-            self.data = np.concatenate([self.data, np.zeros_like(self.data)])
+            self.data = np.concatenate([self.data, self._slabs(*self.data.shape)])
             self._free = list(range(2 * old - 1, old - 1, -1)) + self._free
         taken = self._free[: -count - 1 : -1]
         del self._free[len(self._free) - count :]
@@ -175,6 +185,10 @@ class Pool:
     def give(self, slabs: np.ndarray) -> None:
         """Returns slabs."""
         self._free.extend(slabs.tolist())
+
+    def _slabs(self, count: int, fields: int, n: int) -> np.ndarray:
+        require_memory(8.0 * count * fields * n, f"{count} landmarks of {fields} numbers in {n} particles")
+        return np.zeros((count, fields, n))
 
 
 @dataclass
@@ -389,28 +403,27 @@ class SharedStore:
         Raises:
             InputError: an array is missing, or is not what it should be.
         """
-        next_id = int(checked(arrays, "store/size", (), "i"))
-        self.columns.restore(checked(arrays, "store/ids", (None,), "i"), next_id)
+        next_id = int(read_one(arrays, "store/size", integers(least=0)))
+        sizes = {"generations": self.lineage.generation + 1, "ids": next_id, "n": self.n}
+        found = read(arrays, _TABLES, "store/", **sizes)
+        self.columns.restore(found["ids"], next_id)
         count = self.columns.count
-        self.columns.fields[:count] = within(arrays, "store/fields", count, 1, MOST_FIELDS)
-        now = self.lineage.generation
-        self.columns.generation[:count] = within(arrays, "store/generation", count, 0, now + 1)
+        self.columns.fields[:count], self.columns.generation[:count] = found["fields"], found["generation"]
         for row, column in enumerate(self.ids.tolist()):
             self._members.setdefault(int(self.columns.generation[row]), set()).add(column)
         for generation in self._members:
             self.lineage.take_up(generation)
         for row, column in enumerate(self.ids.tolist()):
-            name, fields = f"store/{column}", int(self.columns.fields[row])
-            if f"{name}/kept" not in arrays:
-                self._fill(row, checked(arrays, f"{name}/data", (fields, self.n), "f"))
+            name, sizes["fields"] = f"store/{column}/", int(self.columns.fields[row])
+            if f"{name}kept" not in arrays:
+                self._fill(row, read(arrays, _HOT, name, **sizes)["data"])
                 continue
-            kept = within(arrays, f"{name}/kept", None, 0, self.n)
-            data = checked(arrays, f"{name}/data", (fields, kept.size), "f").copy()
+            cold = Cold(*read(arrays, _COLD, name, **sizes).values())
             alive = self.lineage.survivors(int(self.columns.generation[row]))
-            if (np.diff(kept) <= 0).any() or np.setdiff1d(alive, kept).size:
-                raise InputError(f"the array {name}/kept does not hold the particles that have descendants")
-            self._cold[column] = Cold(kept, data)
-        self._schedule = Schedule.of(arrays["store/due"])
+            if np.setdiff1d(alive, cold.kept).size:
+                raise InputError(f"the array {name}kept lacks particles that have descendants")
+            self._cold[column] = cold
+        self._schedule = Schedule.of(found["due"])
 
     def _pool(self, row: int) -> Pool:
         fields = int(self.columns.fields[row])

@@ -14,12 +14,13 @@ holds several of them.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Annotated, Generic, TypeVar
 
 import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import Array
+from rbpf.ranges import NotNegative, Positive, Range, Ranged
 
 State = TypeVar("State")
 
@@ -40,7 +41,7 @@ STUCK = 1e8
 
 
 @dataclass(frozen=True)
-class Rule:
+class Rule(Ranged):
     """When to stop, and how to begin.
 
     Attributes:
@@ -50,9 +51,9 @@ class Rule:
         damping: the first λ, as a fraction of the largest singular value.
     """
 
-    offset: float = 1e-6
-    iterations: int = 50
-    damping: float = 1e-4
+    offset: Positive = 1e-6
+    iterations: Annotated[int, Range(ge=1, le=100000)] = 50
+    damping: NotNegative = 1e-4
 
 
 @dataclass(frozen=True)

@@ -6,13 +6,14 @@ in space for the alignment alone.
 """
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
 from rbpf import gaussian
 from rbpf.lie import SE3, Array
 from rbpf.motion.stereo_geometry import Matches, homography, intrinsics, points_from_pixels, times_pixels
+from rbpf.ranges import Probability, Range, Ranged
 
 REFINEMENTS = 2
 """Gauss-Newton steps on the nine pixels of a triple."""
@@ -22,7 +23,7 @@ FARTHEST = 1e4
 
 
 @dataclass(frozen=True)
-class RansacConfig:
+class RansacConfig(Ranged):
     """How many triples of matches are tried.
 
     Attributes:
@@ -34,9 +35,9 @@ class RansacConfig:
 
     RENAMED: ClassVar[dict[str, str]] = {"most": "max_triples", "certainty": "confidence"}
 
-    batch: int = 32
-    max_triples: int = 512
-    confidence: float = 0.9999
+    batch: Annotated[int, Range(ge=1, le=10000)] = 32
+    max_triples: Annotated[int, Range(ge=1, le=1000000)] = 512
+    confidence: Probability = 0.9999
 
     def needed(self, fraction: float) -> float:
         """Triples that it takes where this fraction of the matches is right."""

@@ -10,7 +10,7 @@ later pair count, and the covariance includes the earlier points' noise.
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, final
+from typing import Annotated, ClassVar, final
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from rbpf.motion.stereo_geometry import (
     squared_distances,
     white_rows,
 )
+from rbpf.ranges import Positive, Range, Ranged
 
 ROUNDS = 5
 """Of optimising and choosing anew which matches agree; it ends when they stay the same."""
@@ -47,7 +48,7 @@ ROUNDING = 1e-14
 
 @final
 @dataclass(frozen=True)
-class VoConfig:
+class VoConfig(Ranged):
     """How a motion is estimated.
 
     Attributes:
@@ -62,18 +63,10 @@ class VoConfig:
     RENAMED: ClassVar[dict[str, str]] = {"least_matches": "min_matches", "draws": "ransac"}
 
     points: Points = "adjusted"
-    gate: float = 11.345
-    min_matches: int = 8
+    gate: Annotated[float, Range(gt=0.0, le=math.inf)] = 11.345
+    min_matches: Annotated[int, Range(ge=3)] = 8
     ransac: RansacConfig = field(default_factory=RansacConfig)
     rule: Rule = field(default_factory=lambda: Rule(offset=0.01, iterations=100))
-
-    def __post_init__(self) -> None:
-        if self.points not in ("adjusted", "propagated", "exact"):
-            raise InputError(f"points must be adjusted, propagated or exact, got {self.points!r}")
-        if not self.gate > 0.0:
-            raise InputError(f"the gate of visual odometry must be positive, got {self.gate}")
-        if self.min_matches < 3:
-            raise InputError(f"a motion needs at least 3 matches that agree, got {self.min_matches}")
 
 
 @final
@@ -252,7 +245,7 @@ def trimming(gate: float) -> float:
 
 @final
 @dataclass(frozen=True)
-class MotionPrior:
+class MotionPrior(Ranged):
     """The motion that is expected before anything is seen: the last velocity, or standing still.
 
     Attributes:
@@ -261,15 +254,9 @@ class MotionPrior:
         keep_velocity: whether the last velocity that was seen is expected to go on.
     """
 
-    std_turn: float = 1.0
-    std_speed: float = 1.0
+    std_turn: Positive = 1.0
+    std_speed: Positive = 1.0
     keep_velocity: bool = True
-
-    def __post_init__(self) -> None:
-        if not (self.std_turn > 0.0 and self.std_speed > 0.0):
-            raise InputError(
-                f"std_turn and std_speed must be positive, got {self.std_turn} and {self.std_speed}"
-            )
 
     def increment(self, velocity: Array, dt: float) -> Odometry:
         """The increment expected after `dt` seconds at a velocity (6,) [ω, v]."""

@@ -9,23 +9,29 @@ by one matrix product, or one by one with those of the landmarks that a predicti
 """
 
 from dataclasses import dataclass
-from typing import final
+from typing import Annotated, final
 
 import numpy as np
 
 from rbpf.core.models import NULL
+from rbpf.core.schema import integers, numbers, read
 from rbpf.errors import InputError
+from rbpf.ranges import Range, Ranged
 
 BLOCK = 4096
 """Columns of a product that are looked at together: a block of a few hundred rows stays in the cache."""
 LARGEST = {36: 0.25, 128: 0.55}
 """Distances of "root" descriptors by their length: few of one place are further apart, and few of two places nearer."""
+_KEPT = {
+    "ids": integers("landmarks", least=0, ascending=True),
+    "descriptors": numbers("landmarks", "length", dtype=np.float32),
+}
 GATHERED, PAIRS = 8, 65536
 """Comparing a pair on its own costs as much as so many of a matrix product; pairs gathered at a time."""
 
 
 @dataclass(frozen=True)
-class MatchLimits:
+class MatchLimits(Ranged):
     """When a candidate is taken.
 
     Attributes:
@@ -37,15 +43,9 @@ class MatchLimits:
         InputError: a number is out of its range.
     """
 
-    distance: float | None = None
-    ratio: float = 0.8
+    distance: Annotated[float | None, Range(gt=0.0, le=2.0)] = None
+    ratio: Annotated[float, Range(gt=0.0, le=1.0)] = 0.8
     mutual: bool = True
-
-    def __post_init__(self) -> None:
-        given = self.distance is None or 0.0 < self.distance <= 2.0
-        if not (given and 0.0 < self.ratio <= 1.0):
-            expected = "a distance in (0, 2] and a ratio in (0, 1]"
-            raise InputError(f"expected {expected}, got {self.distance} and {self.ratio}")
 
     def largest(self, length: int) -> float:
         """Distance up to which descriptors of this length are taken."""
@@ -311,11 +311,9 @@ class DescriptorStore:
         return {"descriptors/ids": self.ids.copy(), "descriptors/descriptors": self.descriptors.copy()}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """The inverse of `arrays`."""
-        self._ids, self._descriptors = (
-            arrays[f"descriptors/{name}"].copy() for name in ("ids", "descriptors")
-        )
-        self._count, self.length = self._ids.size, self._descriptors.shape[1]
+        """The inverse of `arrays`; errors as `rbpf.core.schema.read`."""
+        self._ids, self._descriptors = read(arrays, _KEPT, "descriptors/", length=self.length).values()
+        self._count = self._ids.size
 
     def match(self, descriptors: np.ndarray, limits: MatchLimits) -> np.ndarray:
         """The landmark (K,) of each feature with a descriptor (K, d), each landmark once; NULL where there is none.

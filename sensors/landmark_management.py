@@ -7,19 +7,23 @@ whole numbers that are never used again.
 """
 
 from dataclasses import dataclass
-from typing import ClassVar, final
+from typing import Annotated, ClassVar, final
 
 import numpy as np
 
+from rbpf.core.schema import integers, read
 from rbpf.errors import InputError
+from rbpf.ranges import Count, CountOrNone, NotNegative, Range, Ranged
 from rbpf.sensors.descriptors import distances
 
 DISTINCT = {36: 0.12, 128: 0.3}
 """Least distance of a new descriptor from others, by its length: descriptors of one place are mostly nearer."""
 
+_KEPT = {"table": integers("landmarks", 3, least=0), "counters": integers(2, least=0)}
+
 
 @dataclass(frozen=True)
-class NewLandmarkConfig:
+class NewLandmarkConfig(Ranged):
     """Which features become landmarks, and how long candidates are kept.
 
     Attributes:
@@ -41,23 +45,13 @@ class NewLandmarkConfig:
         "waiting": "max_candidates",
     }
 
-    max_per_frame: int = 15
-    distinct: float | None = None
-    spacing_px: float = 10.0
-    cells: int = 6
-    patience: int = 3
-    observations: int = 3
-    max_candidates: int = 60
-
-    def __post_init__(self) -> None:
-        for name in ("cells", "patience", "observations"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name} must be at least 1, got {getattr(self, name)}")
-        for name in ("max_per_frame", "spacing_px", "max_candidates"):
-            if not getattr(self, name) >= 0:
-                raise InputError(f"{name} must not be negative, got {getattr(self, name)}")
-        if self.distinct is not None and not 0.0 <= self.distinct <= 2.0:
-            raise InputError(f"distinct must be a distance from 0 to 2, got {self.distinct}")
+    max_per_frame: CountOrNone = 15
+    distinct: Annotated[float | None, Range(ge=0.0, le=2.0)] = None
+    spacing_px: NotNegative = 10.0
+    cells: Annotated[int, Range(ge=1, le=1000)] = 6
+    patience: Count = 3
+    observations: Count = 3
+    max_candidates: CountOrNone = 60
 
 
 @final
@@ -168,9 +162,11 @@ class LandmarkManager:
         }
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """The inverse of `arrays`."""
-        self._table = arrays["key_manager/table"].copy()
-        self.frame, self.next_name = (int(x) for x in arrays["key_manager/counters"])
+        """The inverse of `arrays`; errors as `rbpf.core.schema.read`."""
+        found = read(arrays, _KEPT, "key_manager/")
+        self._table, (self.frame, self.next_name) = found["table"], found["counters"].tolist()
+        if (np.diff(self.names, append=self.next_name) <= 0).any():
+            raise InputError("the names of the landmarks that are counted do not ascend below the next one")
 
     def _order(self, px: np.ndarray, taken: np.ndarray) -> np.ndarray:
         """Rows of features, those of the emptiest cells first, in each cell in their order."""

@@ -18,12 +18,13 @@ Without the refinement both places have their own error, and cov = σ_p² I.
 """
 
 from dataclasses import dataclass, field, fields
-from typing import ClassVar, NamedTuple, final
+from typing import Annotated, ClassVar, NamedTuple, final
 
 import numpy as np
 
 from rbpf import gaussian
 from rbpf.errors import InputError
+from rbpf.ranges import NotNegative, Positive, Range, Ranged, Ratio
 from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.descriptors import (
     DescriptorMatches,
@@ -158,7 +159,7 @@ IMPOSSIBLE, FRACTION = 5, 0.03
 
 
 @dataclass(frozen=True)
-class PairConfig:
+class PairConfig(Ranged):
     """How the two images are matched, and how exact the result is.
 
     Attributes:
@@ -185,36 +186,22 @@ class PairConfig:
 
     RENAMED: ClassVar[dict[str, str]] = {"mend": "filter_impulses"}
 
-    row_px: float = 1.0
-    row_per_scale: float = 0.25
-    nearest_m: float = 0.3
-    least_disparity_px: float = 1.0
-    scale_ratio: float = 1.5
-    turn_rad: float = 0.35
+    row_px: NotNegative = 1.0
+    row_per_scale: NotNegative = 0.25
+    nearest_m: Positive = 0.3
+    least_disparity_px: Positive = 1.0
+    scale_ratio: Ratio = 1.5
+    turn_rad: Annotated[float, Range(gt=0.0, le=7.0)] = 0.35
     limits: MatchLimits = field(default_factory=MatchLimits)
     filter_impulses: bool = True
     refine: bool = True
-    half_px: int = 5
-    least_correlation: float = 0.8
-    shift_px: float = 2.0
-    place_px: float = 0.25
-    place_per_scale: float = 0.02
-    disparity_px: float = 0.1
-    disparity_per_scale: float = 0.025
-
-    def __post_init__(self) -> None:
-        for name in (
-            *("nearest_m", "least_disparity_px", "turn_rad", "half_px", "shift_px"),
-            *("place_px", "disparity_px"),
-        ):
-            if not getattr(self, name) > 0.0:
-                raise InputError(f"{name} must be positive, got {getattr(self, name)}")
-        for name in ("row_px", "row_per_scale", "place_per_scale", "disparity_per_scale"):
-            if not getattr(self, name) >= 0.0:
-                raise InputError(f"{name} must not be negative, got {getattr(self, name)}")
-        if not (self.scale_ratio >= 1.0 and self.least_correlation <= 1.0):
-            found = f"{self.scale_ratio} and {self.least_correlation}"
-            raise InputError(f"scale_ratio must be at least 1 and least_correlation at most 1, got {found}")
+    half_px: Annotated[int, Range(ge=1, le=100)] = 5
+    least_correlation: Annotated[float, Range(ge=-1.0, le=1.0)] = 0.8
+    shift_px: Positive = 2.0
+    place_px: Positive = 0.25
+    place_per_scale: NotNegative = 0.02
+    disparity_px: Positive = 0.1
+    disparity_per_scale: NotNegative = 0.025
 
 
 @final

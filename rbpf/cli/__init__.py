@@ -18,6 +18,7 @@ from rbpf.cli.running import RUN, repeated, run_mono
 from rbpf.cli.showing import say
 from rbpf.cli.simulating import SIMULATE, simulate_desk
 from rbpf.errors import InputError
+from rbpf.ranges import MOST, Range
 
 PROGRAM = "rbpf"
 BAD_INPUT, STOPPED = 2, 130
@@ -39,7 +40,7 @@ class DemoOptions(Printed):
     """
 
     out: Path = Path("demo")
-    frames: int = 240
+    frames: Annotated[int, Range(ge=2, le=MOST)] = 240
 
 
 @APP.add("demo")

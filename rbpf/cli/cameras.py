@@ -8,6 +8,7 @@ import tyro
 
 from rbpf.cli.options import Printed
 from rbpf.cli.showing import answer, progress, say
+from rbpf.ranges import Positive
 
 LOOSE = 0.01
 """Standard deviation of focal lengths and centre, as a fraction of the focal length, from which on a run bends."""
@@ -27,7 +28,7 @@ class CalibrateOptions(Printed):
 
     images: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="IMAGES")]
     board: str
-    square: float
+    square: Positive
     model: Literal["pinhole", "fisheye"] = "pinhole"
     out: Path = Path("calibration")
 

@@ -9,6 +9,7 @@ import tyro
 from rbpf.cli.options import Printed, Text, Where
 from rbpf.cli.showing import answer, progress, waiting
 from rbpf.errors import InputError
+from rbpf.ranges import Count, Range
 
 if TYPE_CHECKING:
     from rbpf.validation.consistency.verdict import Verdict
@@ -78,7 +79,7 @@ class SweepOptions(Printed):
 
     config: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CONFIG")]
     out: Path = Path("sweep")
-    workers: int = -1
+    workers: Annotated[int, Range(ge=-1, le=4096)] = -1
     scheduler: Text = None
 
 
@@ -114,8 +115,8 @@ class CompareOptions(Printed):
 
     run_a: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN_A")]
     run_b: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN_B")]
-    seeds: int = 5
-    workers: int = -1
+    seeds: Count = 5
+    workers: Annotated[int, Range(ge=-1, le=4096)] = -1
 
 
 def compare(options: Annotated[CompareOptions, tyro.conf.arg(name="")]) -> None:

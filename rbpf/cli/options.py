@@ -7,6 +7,17 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from rbpf.errors import InputError
+from rbpf.ranges import (
+    MOST,
+    Count,
+    CountOrNone,
+    Fraction,
+    NotNegative,
+    Range,
+    Seed,
+    SettingError,
+    check_ranges,
+)
 
 if TYPE_CHECKING:
     from rbpf.sensors.calibration import Board, MarkerBoard
@@ -18,8 +29,13 @@ Flag = tyro.conf.FlagCreatePairsOff[bool]
 # What is None unless it is given: the help says in words what that means.
 Whole = Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="")]
 Real = Annotated[float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="")]
+WholeCount = Annotated[Whole, Range(ge=1, le=MOST)]
+RealPositive = Annotated[Real, Range(gt=0.0)]
 Text = Annotated[str | None, tyro.conf.arg(metavar="STR", help_behavior_hint="")]
 Where = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
+
+MOST_PX = 1 << 15
+"""Of a side of an image."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,6 +47,17 @@ class Printed:
     """
 
     json: Flag = False
+
+    def __post_init__(self) -> None:
+        """Checks the ranges that are declared at the options.
+
+        Raises:
+            InputError: with the option as it is given on the command line.
+        """
+        try:
+            check_ranges(self)
+        except SettingError as error:
+            raise InputError(f"--{error.name.replace('_', '-')} {error.words}") from error
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,13 +77,13 @@ class RunOptions(Printed):
     """
 
     out: Where = None
-    particles: Whole = None
-    seed: Whole = None
+    particles: WholeCount = None
+    seed: Annotated[Whole, Range(ge=0, le=2**63 - 1)] = None
     config: Where = None
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     resume: Flag = False
     overwrite: Flag = False
-    threads: Whole = None
+    threads: Annotated[Whole, Range(ge=1, le=4096)] = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,7 +98,7 @@ class RangeBearingOptions(RunOptions):
     """
 
     log: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="LOG")]
-    particles: Whole = None
+    particles: WholeCount = None
     association: Annotated[
         Literal["known", "ml"] | None, tyro.conf.arg(metavar="{known,ml}", help_behavior_hint="")
     ] = None
@@ -99,15 +126,15 @@ class ImageRunOptions(RunOptions):
     """
 
     calibration: Where = None
-    start: float = 0.0
+    start: NotNegative = 0.0
     end: Real = None
-    every: int = 1
-    resize: Whole = None
+    every: Count = 1
+    resize: Annotated[Whole, Range(ge=1, le=MOST_PX)] = None
     image_topic: Text = None
     truth_topic: Text = None
     rerun: Where = None
     batch: bool = True
-    batch_limit: Whole = None
+    batch_limit: WholeCount = None
     video: bool = True
 
 
@@ -134,13 +161,13 @@ class MonoOptions(ImageRunOptions):
     """
 
     sequence: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="IMAGES")]
-    particles: Whole = None
+    particles: WholeCount = None
     known_points: Where = None
     board: Text = None
-    square: Real = None
+    square: RealPositive = None
     aruco: Text = None
-    marker: Real = None
-    gap: float = 0.01
+    marker: RealPositive = None
+    gap: NotNegative = 0.01
     dictionary: str = "4x4_50"
     map: Where = None
     localize: Flag = False
@@ -158,7 +185,7 @@ class StereoOptions(ImageRunOptions):
     """
 
     sequence: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PAIRS")]
-    particles: Whole = None
+    particles: WholeCount = None
     dof: Annotated[Literal[3, 6] | None, tyro.conf.arg(metavar="{3,6}", help_behavior_hint="")] = None
 
 
@@ -188,24 +215,24 @@ class RenderOptions(Printed):
     """
 
     out: Path
-    seed: int = 0
-    width: int = 640
-    height: int = 480
-    focal_px: Real = None
+    seed: Seed = 0
+    width: Annotated[int, Range(ge=2, le=MOST_PX)] = 640
+    height: Annotated[int, Range(ge=2, le=MOST_PX)] = 480
+    focal_px: RealPositive = None
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
     fisheye: tuple[float, float, float, float] | None = None
     baseline_m: Real = None
-    known: int = 6
-    noise_std: float = 3.0
-    blur_s: float = 0.01
-    exposure_drift: float = 0.15
-    vignetting: float = 0.2
-    contrast: float = 1.0
+    known: CountOrNone = 6
+    noise_std: NotNegative = 3.0
+    blur_s: NotNegative = 0.01
+    exposure_drift: Fraction = 0.15
+    vignetting: Fraction = 0.2
+    contrast: NotNegative = 1.0
     blackout: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="INT INT", help_behavior_hint="")] = (
         None
     )
     depth: Flag = False
-    jpeg: int = 0
+    jpeg: Annotated[int, Range(ge=0, le=100)] = 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -219,10 +246,10 @@ class ImagesOptions(RenderOptions):
         square: side of its squares, m; by default none.
     """
 
-    frames: int = 300
-    focal_px: Real = None
+    frames: Annotated[int, Range(ge=2, le=MOST)] = 300
+    focal_px: RealPositive = None
     board: Text = None
-    square: Real = None
+    square: RealPositive = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -239,15 +266,15 @@ class LabOptions(RenderOptions):
     """
 
     trajectory: Literal["tour", "turn_back"] = "tour"
-    frames: Whole = None
-    every: int = 1
-    focal_px: Real = None
+    frames: WholeCount = None
+    every: Count = 1
+    focal_px: RealPositive = None
     baseline_m: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = 0.12
-    noise_std: float = 8.0
-    blur_s: float = 0.0
-    exposure_drift: float = 0.0
-    vignetting: float = 0.0
-    texel_m: float = 0.003
+    noise_std: NotNegative = 8.0
+    blur_s: NotNegative = 0.0
+    exposure_drift: Fraction = 0.0
+    vignetting: Fraction = 0.0
+    texel_m: Annotated[float, Range(ge=1e-4, le=1.0)] = 0.003
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -264,10 +291,10 @@ class LogOptions(Printed):
     """
 
     out: Path
-    seed: int = 0
+    seed: Seed = 0
     spatial: Flag = False
-    steps: int = 200
-    landmarks: int = 60
+    steps: Annotated[int, Range(ge=2, le=MOST)] = 200
+    landmarks: Count = 60
     unnamed: Flag = False
 
 

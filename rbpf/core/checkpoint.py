@@ -112,45 +112,6 @@ def load_arrays(path: Path, only: str | None = None) -> dict[str, np.ndarray]:
         raise InputError(f"{path} is damaged or cut off: it is not a complete archive of arrays") from error
 
 
-def checked(
-    arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int | None, ...], kinds: str
-) -> np.ndarray:
-    """One of the arrays of a file.
-
-    Args:
-        arrays: of the file.
-        name: of the array.
-        shape: that it must have; None where any size will do.
-        kinds: letters of the types that it may have, as `dtype.kind` gives them.
-
-    Raises:
-        InputError: it is missing, or is not as expected.
-    """
-    array = arrays.get(name)
-    if array is None:
-        raise InputError(f"the array {name} is missing")
-    fits = len(array.shape) == len(shape) and all(
-        wanted is None or size == wanted for size, wanted in zip(array.shape, shape, strict=True)
-    )
-    if not fits or array.dtype.kind not in kinds:
-        raise InputError(f"the array {name} must be {shape} of kind {kinds}, got {array.shape} {array.dtype}")
-    return array
-
-
-def within(
-    arrays: Mapping[str, np.ndarray], name: str, size: int | None, least: int, stop: int
-) -> np.ndarray:
-    """One of the arrays of a file: whole numbers (size,) from `least` to before `stop`.
-
-    Raises:
-        InputError: it is missing, or is not as expected.
-    """
-    array = checked(arrays, name, (size,), "i")
-    if array.size and not least <= array.min() <= array.max() < stop:
-        raise InputError(f"the array {name} must hold numbers from {least} to {stop - 1}")
-    return array.astype(np.int64)
-
-
 @contextmanager
 def fitting(path: Path) -> Iterator[None]:
     """Around the reading of a checkpoint's arrays: those that do not fit together make one clear sentence.

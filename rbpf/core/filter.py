@@ -16,7 +16,8 @@ import numpy as np
 
 from rbpf import gaussian
 from rbpf.arrays import numbers
-from rbpf.core.checkpoint import checked, fitting, read_checkpoint, write_checkpoint
+from rbpf.core import schema
+from rbpf.core.checkpoint import fitting, read_checkpoint, write_checkpoint
 from rbpf.core.genealogy import History, Lineage
 from rbpf.core.marginals import Marginals
 from rbpf.core.models import (
@@ -47,6 +48,7 @@ from rbpf.core.resampling import Consolidation, EssTriggered, Systematic
 from rbpf.errors import InputError
 from rbpf.kernels.increment import are_sound
 from rbpf.lie import LieGroup
+from rbpf.ranges import require_memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +90,13 @@ class StepReport:
         return mixture_estimate(*self.mixture, self.second)
 
 
+_FILTER = {
+    "numbers": schema.integers(2),
+    "started": schema.truths(),
+    "log_evidence": schema.numbers(values="any"),
+}
+
+
 class Filter:
     """N weighted trajectories, each with its own marginalised part.
 
@@ -124,6 +133,8 @@ class Filter:
             raise InputError(f"a filter needs at least one particle, got {n}")
         if lag is not None and lag < 1:
             raise InputError(f"a fixed lag keeps at least one step, got {lag}")
+        # Ancestry, states, and a few matrices of the state's size in each particle.
+        require_memory(8.0 * n * (40 + 4 * motion.space.dim**2), f"a filter of {n} particles")
         self.motion = motion
         self.space = motion.space
         self.sensors = [sensors] if isinstance(sensors, Sensor) else list(sensors)
@@ -331,23 +342,28 @@ class Filter:
         """
         arrays, rng_state = read_checkpoint(Path(path), self._fingerprint())
         with self._unchanged_by_failure(), fitting(Path(path)):
-            state = checked(arrays, "particles/state", self.particles.state.shape, "f")
-            log_weights = checked(arrays, "particles/log_weights", (self.n,), "f")
+            state = schema.read_one(arrays, "particles/state", schema.elements(self.space, "n"), n=self.n)
+            log_weights = schema.read_one(
+                arrays, "particles/log_weights", schema.numbers("n", values="log"), n=self.n
+            )
+            if abs(np.logaddexp.reduce(log_weights)) > 1e-6:
+                raise InputError("the particles' weights do not sum to 1")
+            counted = schema.read(arrays, _FILTER, "filter/")
             lineage = Lineage(self.n)
             lineage.restore(arrays)
             history = History(lineage, self.history.lag, self.history.clouds)
-            history.restore(arrays)
+            history.restore(arrays, self.particles.state.shape[1])
             self.lineage, self.history = lineage, history
             self.marginals.begin(self.n, lineage)
             self.marginals.restore(arrays)
-            self.particles = Particles(state.copy(), log_weights.copy())
-            steps, stamp = checked(arrays, "filter/numbers", (2,), "i").tolist()
+            self.particles = Particles(state, log_weights)
+            steps, stamp = counted["numbers"].tolist()
             if steps < 0:
                 raise InputError(f"the array filter/numbers counts {steps} steps")
-            self.steps, self.stamp_ns = steps, stamp if checked(arrays, "filter/started", (), "b") else None
-            self.log_evidence = float(checked(arrays, "filter/log_evidence", (), "f"))
+            self.steps, self.stamp_ns = steps, stamp if counted["started"] else None
+            self.log_evidence = float(counted["log_evidence"])
             if self.consolidation is not None:
-                self._age = int(checked(arrays, "filter/age", (), "i"))
+                self._age = int(schema.read_one(arrays, "filter/age", schema.integers(least=0)))
             self.rng.bit_generator.state = rng_state
         return {
             name.removeprefix("extra/"): array for name, array in arrays.items() if name.startswith("extra/")

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from rbpf.arrays import Int
-from rbpf.core.checkpoint import checked, within
+from rbpf.core.schema import integers, numbers, read, read_one
 from rbpf.errors import InputError
 from rbpf.kernels import forest
 
@@ -19,8 +19,22 @@ _FIRST_CHECK = 4
 """Age in generations at which a block is first looked through for dead rows; it then grows by a quarter each time."""
 
 
-MOST_GENERATIONS = 1 << 40
-"""No run resamples so often."""
+DUE = integers("due", 2, least=0)
+"""Of a `Schedule`."""
+
+_FOREST = {
+    "parent": integers("nodes", least=-1, below="nodes"),
+    "children": integers("nodes", least=0),
+    "generation": integers("nodes", least=-1, below="generations"),
+    "row": integers("nodes", least=0, below="n"),
+    "leaves": integers("n", least=0, below="nodes"),
+    "free": integers("free", least=0, below="nodes"),
+}
+_BLOCK = {
+    "kept": integers("kept", least=0, below="n", ascending=True),
+    "stamps_ns": integers("steps"),
+    "states": numbers("steps", "kept", "size"),
+}
 
 
 class Lineage:
@@ -142,16 +156,11 @@ class Lineage:
         Raises:
             InputError: an array is missing, or they are no forest. Compiled code would follow them anywhere.
         """
-        size = checked(arrays, "lineage/parent", (None,), "i").size
-        now, n_free = within(arrays, "lineage/now", 2, 0, MOST_GENERATIONS).tolist()
-        within(arrays, "lineage/free", None, 0, max(size, 1))
-        self._allocate(size)
-        self._parent = within(arrays, "lineage/parent", size, -1, size)
-        self._children = within(arrays, "lineage/children", size, 0, 2 * size + 2)
-        self._generation = within(arrays, "lineage/generation", size, -1, now + 1)
-        self._row = within(arrays, "lineage/row", size, 0, self.n)
-        self._leaves = within(arrays, "lineage/leaves", self.n, 0, size)
-        self._free = arrays["lineage/free"].astype(np.int64)
+        now, n_free = read_one(arrays, "lineage/now", integers(2, least=0)).tolist()
+        found = read(arrays, _FOREST, "lineage/", n=self.n, generations=now + 1)
+        self._allocate(len(found["parent"]))
+        for name, array in found.items():
+            setattr(self, f"_{name}", array)
         self.generation, self._n_free = now, n_free
         self._require_forest()
         self._retained.clear()
@@ -191,8 +200,7 @@ class Lineage:
 
     def _make_room(self) -> None:
         """Splices chains that nobody needs out of the forest, and doubles it where that is not enough."""
-        needed = np.zeros(self.generation + 1, dtype=np.bool_)
-        needed[[g for g in self._retained if g <= self.generation]] = True
+        needed = np.isin(self._generation, list(self._retained))
         self._mark += 1
         self._n_free = forest.splice(
             self._parent,
@@ -347,28 +355,20 @@ class History:
         out["history/due"] = self._schedule.array()
         return out
 
-    def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """The inverse of `arrays`.
-
-        Raises:
-            InputError: an array is missing, or is not what it should be.
-        """
+    def restore(self, arrays: dict[str, np.ndarray], size: int | None = None) -> None:
+        """The inverse of `arrays`, of states of so many numbers; errors as `rbpf.core.schema.read`."""
         self.blocks, self._by_generation = [], {}
-        self._schedule = Schedule.of(checked(arrays, "history/due", (None, 2), "i"))
-        generations = checked(arrays, "history/generations", (None,), "i").tolist()
+        self._schedule = Schedule.of(read_one(arrays, "history/due", DUE))
+        generations = read_one(arrays, "history/generations", integers("blocks", ascending=True)).tolist()
+        shape = ("steps", "n") if self.clouds else (0,)
+        block = {**_BLOCK, "log_weights": numbers(*shape, values="log")}
+        sizes = {"n": self.lineage.n} | ({} if size is None else {"size": size})
         for number, generation in enumerate(generations):
             self.lineage.take_up(generation)
-            name, n = f"history/{number}", self.lineage.n
-            kept = within(arrays, f"{name}/kept", None, 0, n)
-            stamps = checked(arrays, f"{name}/stamps_ns", (None,), "i").tolist()
-            states = checked(arrays, f"{name}/states", (len(stamps), kept.size, None), "f")
-            weights = checked(arrays, f"{name}/log_weights", (len(stamps), n) if self.clouds else (0,), "f")
-            alive = self.lineage.survivors(generation)
-            if not stamps or (np.diff(kept) <= 0).any() or np.setdiff1d(alive, kept).size:
-                raise InputError(f"the array {name}/kept does not hold the particles that have descendants")
-            block = PathBlock(generation, kept, stamps, list(states.copy()), list(weights.copy()))
-            self.blocks.append(block)
-            self._by_generation[generation] = block
-        if (np.diff(generations) <= 0).any():
-            raise InputError("the generations of the history do not ascend")
+            kept, stamps, states, log_weights = read(arrays, block, f"history/{number}/", **sizes).values()
+            if not stamps.size or np.setdiff1d(self.lineage.survivors(generation), kept).size:
+                raise InputError(f"the array history/{number}/kept lacks particles that have descendants")
+            past = PathBlock(generation, kept, stamps.tolist(), list(states), list(log_weights))
+            self.blocks.append(past)
+            self._by_generation[generation] = past
         self._steps = self.stamps_ns.size

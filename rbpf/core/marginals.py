@@ -11,7 +11,7 @@ import numpy as np
 
 from rbpf import gaussian
 from rbpf.arrays import numbers
-from rbpf.core.checkpoint import checked
+from rbpf.core import schema
 from rbpf.core.genealogy import Lineage
 from rbpf.core.likelihoods import Gaussian
 from rbpf.core.linearisation import information, linearise, stacked
@@ -31,6 +31,7 @@ from rbpf.kernels.increment import conditioned
 from rbpf.lie import LieGroup
 
 GAUSSIAN = Gaussian()
+_SUBSTATE = {"mean": schema.numbers("n", "m"), "cov": schema.numbers("covs", "m", "m")}
 
 
 @final
@@ -194,13 +195,11 @@ class KalmanSubstate(Conditional):
         return {"substate size": int(self._mean.size)}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """The inverse of `arrays`."""
-        m = self._mean.size
-        mean = checked(arrays, "substate/mean", self.mean.shape, "f")
-        cov = checked(arrays, "substate/cov", (None, m, m), "f")
-        if cov.shape[0] not in (1, mean.shape[0]):
-            raise InputError(f"the array substate/cov must have 1 or {mean.shape[0]} matrices")
-        self.mean, self.cov = mean.copy(), cov.copy()
+        """The inverse of `arrays`; errors as `rbpf.core.schema.read`."""
+        n, m = self.mean.shape
+        self.mean, self.cov = schema.read(arrays, _SUBSTATE, "substate/", n=n, m=m).values()
+        if len(self.cov) not in (1, n):
+            raise InputError(f"the array substate/cov must have 1 or {n} matrices")
 
     def _rows(
         self, state: np.ndarray, substate: np.ndarray, groups: Sequence[Observations]

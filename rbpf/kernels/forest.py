@@ -59,13 +59,13 @@ def rows_at(parent, generation, row, leaves, wanted, found, stamp, mark):
 
 @njit(cache=True)
 def splice(parent, children, generation, free, n_free, leaves, needed, stamp, mark):
-    """Removes nodes with a single child whose generation nobody needs; returns the free-list's length."""
+    """Removes nodes with a single child that are not needed themselves; returns the free-list's length."""
     for i in range(leaves.size):
         node = leaves[i]
         while node >= 0 and stamp[node] != mark:
             stamp[node] = mark
             above = parent[node]
-            while above >= 0 and children[above] == 1 and not needed[generation[above]]:
+            while above >= 0 and children[above] == 1 and not needed[above]:
                 free[n_free] = above
                 n_free += 1
                 generation[above] = -1

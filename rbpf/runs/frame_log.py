@@ -11,7 +11,7 @@ from typing import Any, final
 
 import numpy as np
 
-from rbpf.core.checkpoint import checked
+from rbpf.core.schema import elements, integers, numbers, read, split
 from rbpf.errors import InputError
 from rbpf.lie import SE2Group, SE3Group
 from rbpf.systems.system import (
@@ -180,27 +180,29 @@ class FrameLog:
         return out
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """The inverse of `arrays`, into an empty log of the same system.
-
-        Raises:
-            InputError: an array is missing, or is not what it should be.
-        """
-        found = dict(arrays)
-        total = checked(found, "log/stamps_ns", (None,), "i").size
-        self._path["stamps_ns"] = found["log/stamps_ns"].tolist()
-        self._path["poses"] = list(checked(found, "log/poses", (total, self.space.size), "f").copy())
+        """The inverse of `arrays`, into an empty log of the same system; errors as `rbpf.core.schema.read`."""
         dim = self.space.dim
-        self._path["covs"] = list(checked(found, "log/covs", (total, dim, dim), "f").copy())
-        for column in self.columns:
-            values = checked(found, f"log/{column.name}", (total, *column.shape), "fiub")
-            self._rows[column.name] = values.tolist() if not column.shape else list(values.copy())
+        path = {
+            "stamps_ns": integers("frames"),
+            "poses": elements(self.space, "frames"),
+            "covs": numbers("frames", dim, dim),
+        }
+        columns = {
+            column.name: numbers("frames", *column.shape, dtype=column.kind, values="any")
+            for column in self.columns
+        }
+        columns["state"] = integers("frames", least=0, below="states")
+        found = read(arrays, path | columns, "log/", states=len(_STATES))
+        for held in (self._path, self._rows):
+            held |= {
+                name: list(found[name]) if found[name].ndim > 1 else found[name].tolist() for name in held
+            }
         for field in self.ragged:
-            counts = checked(found, f"observed/{field.name}/counts", (total,), "i")
-            rows = checked(found, f"observed/{field.name}", (None, *field.shape), "fiub")
-            if (counts < 0).any() or counts.sum() != len(rows):
-                raise InputError(
-                    f"the array observed/{field.name} has {len(rows)} rows, expected {counts.sum()}"
-                )
-            self._observed[field.name] = (
-                np.split(rows.astype(field.kind), np.cumsum(counts)[:-1]) if total else []
-            )
+            entries = {
+                f"{field.name}/counts": integers("frames", least=0),
+                field.name: numbers("rows", *field.shape, dtype=field.kind, values="any"),
+            }
+            counts, rows = read(arrays, entries, "observed/", frames=len(self)).values()
+            if field.per and counts.tolist() != [len(each) for each in self._observed[field.per]]:
+                raise InputError(f"the array observed/{field.name} has other rows than observed/{field.per}")
+            self._observed[field.name] = split(rows, counts.tolist(), f"observed/{field.name}")

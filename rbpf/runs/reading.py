@@ -18,7 +18,8 @@ from typing import Any, Self, final
 import numpy as np
 from numpy.typing import NDArray
 
-from rbpf.core.checkpoint import checked, fitting, load_arrays
+from rbpf.core.checkpoint import fitting, load_arrays
+from rbpf.core.schema import integers, numbers, read
 from rbpf.errors import InputError, printable
 from rbpf.lie import SE2, SE3, Array, SE2Group, SE3Group
 from rbpf.runs.files import MAP, TRAJECTORY, VERSION
@@ -33,6 +34,21 @@ from rbpf.systems.map_estimate import MapEstimate
 
 MOST_BYTES = 1 << 30
 """No file of a run folder is larger."""
+
+_PATH = {
+    "stamps_ns": integers("frames"),
+    "mean": numbers("frames", "size"),
+    "cov": numbers("frames", "dim", "dim"),
+    "correction": numbers("frames", "r", values="any"),
+    "cov_correction": numbers("frames", "r", "r", values="any"),
+}
+_MAP = {
+    "id": integers("landmarks"),
+    "mean": numbers("landmarks", "axes", values="any"),
+    "cov": numbers("landmarks", "axes", "axes", values="any"),
+    "ray_ends": numbers("landmarks", 2, 3, values="any"),
+}
+_PARTICLES = {"particles": numbers("particles", "size"), "weights": numbers("particles", least=0)}
 
 
 @final
@@ -160,20 +176,12 @@ class RunFolder:
             raise InputError(f"{file} has version {version}, this program reads version {VERSION}; {again}")
         try:
             with fitting(file):
-                stamps = checked(arrays, "stamps_ns", (None,), "i")
-                mean = checked(arrays, "mean", (stamps.size, None), "f")
-                dim = {SE2.size: SE2.dim, SE3.size: SE3.dim}.get(mean.shape[1])
-                if dim is None:
-                    raise InputError(
-                        f"the array mean must have poses in the plane or in space, got {mean.shape}"
-                    )
-                cov = checked(arrays, "cov", (stamps.size, dim, dim), "f")
-                correction = checked(arrays, "correction", (stamps.size, None), "f")
-                shape = stamps.size, *2 * correction.shape[1:]
-                cov_correction = checked(arrays, "cov_correction", shape, "f")
+                found = FilteredPath(**read(arrays, _PATH))
+                if found.mean.shape[1] not in (SE2.size, SE3.size) or found.cov.shape[1] != found.space.dim:
+                    raise InputError("the poses are neither in the plane nor in space")
         except InputError as error:
             raise InputError(f"{file} does not hold the poses of a run ({error}); {again}") from error
-        return FilteredPath(stamps, mean, cov, correction, cov_correction)
+        return found
 
     @property
     def trajectory(self) -> Trajectory:
@@ -202,17 +210,14 @@ class RunFolder:
             raise InputError(f"{self.folder} holds no {MAP}: expected the folder of a finished run.")
         arrays = load_arrays(file)
         with fitting(file):
-            ids = checked(arrays, "id", (None,), "iu")
-            mean = checked(arrays, "mean", (ids.size, None), "f")
-            if mean.shape[1] not in (2, 3):
-                raise InputError(
-                    f"the array mean must have points in the plane or in space, got {mean.shape}"
-                )
-            cov = checked(arrays, "cov", (ids.size, mean.shape[1], mean.shape[1]), "f")
-            ends = checked(arrays, "ray_ends", (ids.size, 2, 3), "f") if "ray_ends" in arrays else None
-            more = [name for name in arrays if name not in ("id", "mean", "cov", "ray_ends")]
-            columns = {name: checked(arrays, name, (ids.size,), "iubf") for name in more}
-        return MapEstimate(ids, mean, cov, columns, ends)
+            more = [name for name in arrays if name not in _MAP]
+            columns = {name: numbers("landmarks", values="any", dtype=arrays[name].dtype) for name in more}
+            held = {name: entry for name, entry in _MAP.items() if name in arrays or name != "ray_ends"}
+            found = read(arrays, held | columns)
+            if found["mean"].shape[1] not in (2, 3):
+                raise InputError("the points are neither in the plane nor in space")
+        ids, mean, cov = (found.pop(name) for name in ("id", "mean", "cov"))
+        return MapEstimate(ids, mean, cov, ray_ends=found.pop("ray_ends", None), columns=found)
 
     @cached_property
     def particles(self) -> tuple[np.ndarray, np.ndarray]:
@@ -224,8 +229,8 @@ class RunFolder:
         file = self.folder / TRAJECTORY
         arrays = load_arrays(file)
         with fitting(file):
-            poses = checked(arrays, "particles", (None, self.path.mean.shape[1]), "f")
-            return poses, checked(arrays, "weights", (len(poses),), "f")
+            poses, weights = read(arrays, _PARTICLES, size=self.path.mean.shape[1]).values()
+        return poses, weights
 
     @cached_property
     def measurements(self) -> FeatureLog | Measurements:

@@ -17,7 +17,8 @@ from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
-from rbpf.core.checkpoint import checked, fitting, load_arrays
+from rbpf.core.checkpoint import fitting, load_arrays
+from rbpf.core.schema import read_one, text
 from rbpf.errors import InputError, printable
 from rbpf.runs.frame_log import FrameLog
 from rbpf.runs.provenance import decisive_settings, require_same
@@ -112,7 +113,7 @@ class Run(Generic[SystemT]):
         found = load_arrays(path, only=f"extra/{_BEGUN}")
         if found:
             with fitting(path):
-                begun = json.loads(str(checked(found, f"extra/{_BEGUN}", (), "U")))
+                begun = json.loads(str(read_one(found, f"extra/{_BEGUN}", text())))
                 settings, inputs = dict(begun["settings"]), dict(begun["inputs"])
             require_same(path, settings, decisive_settings(asdict(self.system.config)))
             if inputs and self.inputs:
@@ -122,7 +123,7 @@ class Run(Generic[SystemT]):
             raise InputError(f"{path} does not say what run it belongs to: start without --resume")
         with fitting(path):
             self.log.restore(arrays)
-            self.messages = checked(arrays, "log/messages", (None,), "U").tolist()
+            self.messages = read_one(arrays, "log/messages", text("messages")).tolist()
 
 
 Listener = Callable[[Run, Tracked], None]

@@ -11,7 +11,8 @@ from typing import Protocol
 
 import numpy as np
 
-from rbpf.core.checkpoint import checked, fitting, load_arrays, save_arrays
+from rbpf.core.checkpoint import fitting, load_arrays, save_arrays
+from rbpf.core.schema import integers, numbers, read, text
 from rbpf.errors import InputError
 from rbpf.lie import SE2Group, SE3Group
 from rbpf.runs.trajectory import Alignment
@@ -26,6 +27,13 @@ LONGEST_GAP_NS = 500_000_000
 LEAST = 3
 """Frames with a true pose that a comparison needs."""
 
+_TRUTH = {
+    "rows": integers("rows", least=0, below="steps"),
+    "poses": numbers("rows", "size"),
+    "alignment": text(),
+    "ids": integers("landmarks"),
+    "landmarks": numbers("landmarks", ""),
+}
 _ALIGNMENTS: dict[str, Alignment] = {"none": "none", "rigid": "rigid", "similarity": "similarity"}
 
 
@@ -132,13 +140,10 @@ def read_truth(folder: Path, steps: int, size: int) -> RunTruth:
         )
     arrays = load_arrays(path)
     with fitting(path):
-        rows = checked(arrays, "rows", (None,), "i")
-        poses = checked(arrays, "poses", (rows.size, None), "f")
-        alignment = _ALIGNMENTS[str(checked(arrays, "alignment", (), "U"))]
-        ids = checked(arrays, "ids", (None,), "i")
-        landmarks = dict(zip(ids.tolist(), checked(arrays, "landmarks", (ids.size, None), "f"), strict=True))
-    if poses.shape[1] != size or (rows.size and not 0 <= rows.min() <= rows.max() < steps):
-        raise InputError(f"{path} belongs to another run than {folder / 'trajectory.npz'}")
+        # Of another run than trajectory.npz, it does not fit either.
+        rows, poses, named, ids, points = read(arrays, _TRUTH, steps=steps, size=size).values()
+        alignment = _ALIGNMENTS[str(named)]
+        landmarks = dict(zip(ids.tolist(), points, strict=True))
     if not rows.size:
         raise InputError(f"{folder}: no step of the run has the time of a true pose")
     return RunTruth(rows, poses, landmarks, alignment)

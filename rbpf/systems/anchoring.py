@@ -25,6 +25,7 @@ from rbpf.core.linearisation import information, innovation_covariance, linearis
 from rbpf.core.models import Landmark, LineariseAt, NewLandmarks, ObservationModel, Records
 from rbpf.core.particles import Estimate, Information, Prior, mixture_estimate
 from rbpf.core.proposals import EkfProposal
+from rbpf.core.schema import elements, integers, numbers, read, read_one
 from rbpf.errors import InputError
 from rbpf.lie import LieGroup
 
@@ -188,17 +189,33 @@ class StartAnchor:
 
     def restore(self, arrays: dict[str, np.ndarray], model: ObservationModel, landmark: Landmark) -> None:
         """The inverse of `arrays`; all first observations must have been of one model and parametrisation."""
-        lineage = self._filter.lineage
-        for number in range(int(arrays["anchor/groups"])):
-            ids, z, cov = (arrays[f"anchor/{number}/{name}"].copy() for name in ("ids", "z", "cov"))
-            self._seen.append((ids, NewLandmarks(z, cov, model, landmark)))
+        lineage, space, sizes = self._filter.lineage, self._filter.space, {"n": self._filter.n}
+        seen = {
+            "ids": integers("seen", least=0),
+            "z": numbers("seen", model.dim),
+            "cov": numbers("seen", model.dim, model.dim),
+        }
+        for number in range(int(read_one(arrays, "anchor/groups", integers(least=0)))):
+            found = read(arrays, seen, f"anchor/{number}/")
+            self._seen.append((found["ids"], NewLandmarks(found["z"], found["cov"], model, landmark)))
         if "anchor/second" in arrays:
-            values = (arrays[f"anchor/{name}"].copy() for name in ("state", "delta", "factor"))
-            self._second = _FirstMotion(int(arrays["anchor/second"]), *values)
+            second = {
+                "second": integers(),
+                "state": elements(space, "n"),
+                "delta": elements(space),
+                "factor": numbers(space.dim, "rank"),
+            }
+            generation, *parts = read(arrays, second, "anchor/", **sizes).values()
+            self._second = _FirstMotion(int(generation), *parts)
             lineage.take_up(self._second.generation)
         if "anchor/latest" in arrays:
-            anchored = Anchored(arrays["anchor/latest_mean"].copy(), arrays["anchor/latest_factor"].copy())
-            self._latest = (int(arrays["anchor/latest"]), anchored)
+            latest = {
+                "latest": integers(),
+                "latest_mean": elements(space, "n"),
+                "latest_factor": numbers("n", space.dim, space.dim),
+            }
+            generation, *parts = read(arrays, latest, "anchor/", **sizes).values()
+            self._latest = int(generation), Anchored(*parts)
             lineage.take_up(self._latest[0])
 
     def _without_first_frame(

@@ -1,16 +1,17 @@
 """Settings of the filter that every system has: likelihood, proposal, resampling."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 from rbpf.core.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobis
 from rbpf.core.models import Likelihood, Proposal, Resampler
 from rbpf.core.proposals import EkfProposal, PriorProposal
 from rbpf.core.resampling import EssTriggered, Multinomial, Residual, Stratified, Systematic
+from rbpf.ranges import Fraction, Positive, Probability, Range, Ranged
 
 
 @dataclass(frozen=True)
-class LikelihoodConfig:
+class LikelihoodConfig(Ranged):
     """Likelihood of an innovation.
 
     Attributes:
@@ -23,10 +24,10 @@ class LikelihoodConfig:
     """
 
     kind: Literal["gaussian", "truncated", "outliers"] = "gaussian"
-    truncation: float = 4.0
-    update_limit: float = 16.3
-    outlier_rate: float = 0.02
-    outlier_volume: float = 60.0
+    truncation: Positive = 4.0
+    update_limit: Positive = 16.3
+    outlier_rate: Probability = 0.02
+    outlier_volume: Annotated[float, Range(gt=0.0, le=1e18)] = 60.0
 
     def build(self) -> Likelihood:
         """The likelihood."""
@@ -38,7 +39,7 @@ class LikelihoodConfig:
 
 
 @dataclass(frozen=True)
-class ProposalConfig:
+class ProposalConfig(Ranged):
     """Where particles are sampled and how they are weighted.
 
     Attributes:
@@ -48,7 +49,7 @@ class ProposalConfig:
     """
 
     kind: Literal["ekf", "prior"] = "ekf"
-    iterations: int = 3
+    iterations: Annotated[int, Range(ge=1, le=1000)] = 3
     weights: Literal["exact", "linearised"] = "exact"
 
     def build(self) -> Proposal:
@@ -59,7 +60,7 @@ class ProposalConfig:
 
 
 @dataclass(frozen=True)
-class ResamplingConfig:
+class ResamplingConfig(Ranged):
     """When and how particles are resampled.
 
     Attributes:
@@ -68,7 +69,7 @@ class ResamplingConfig:
     """
 
     scheme: Literal["systematic", "stratified", "residual", "multinomial"] = "systematic"
-    ess_threshold: float = 0.5
+    ess_threshold: Fraction = 0.5
 
     def build(self) -> Resampler:
         """The resampler; a subclass may make another one."""

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import msgspec
 
 from rbpf.errors import InputError
+from rbpf.ranges import SettingError
 from rbpf.sensors.readers.yaml_files import read_plain_yaml
 
 HEADER = (
@@ -47,7 +48,12 @@ def load_settings(
     try:
         return msgspec.convert(_over(asdict(kind()), values), kind, strict=False)
     except msgspec.ValidationError as error:
-        raise InputError(f"settings: {error}") from error
+        # "Expected `int`, got `str` - at `$.search.measurements`", or a range's own words and the group's place.
+        words, _, place = str(error).partition(" - at `$")
+        path = place.rstrip("`").lstrip(".")
+        if isinstance(error.__cause__, SettingError):
+            path, words = f"{path}.{error.__cause__.name}".lstrip("."), error.__cause__.words
+        raise InputError(f"settings: {path} {words}".replace(" Expected", ": expected")) from error
 
 
 def _read(path: Path, expected: str) -> dict[str, Any]:

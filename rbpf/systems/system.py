@@ -18,11 +18,15 @@ from typing import Any, ClassVar, Literal, Protocol
 import numpy as np
 
 from rbpf.arrays import Float, Int
+from rbpf.core.checkpoint import fitting
 from rbpf.core.filter import Filter
 from rbpf.lie import SE2Group, SE3Group
 from rbpf.sensors.feature_log import FeatureLog
 from rbpf.sensors.readers.measurements import Measurements
 from rbpf.systems.map_estimate import MapEstimate
+
+MAP_IDS = "map/ids"
+"""Under this name `System.restore` is given the ids (M,) of the landmarks that the restored map holds."""
 
 Gauge = Literal["none", "first frame", "rigid", "similarity"]
 """What a system's world has in common with the ground truth's: it is the same one; it begins at the first frame's pose;
@@ -90,12 +94,14 @@ class Ragged:
         meaning: one sentence.
         shape: of one row.
         kind: NumPy type that it is kept in.
+        per: name of another array that has as many rows in each frame; None where no other has.
     """
 
     name: str
     meaning: str
     shape: tuple[int, ...] = ()
     kind: str = "float64"
+    per: str | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,5 +250,6 @@ class System(ABC):
             InputError: the file is missing or damaged, or belongs to another system or other settings.
         """
         arrays = self.filter.load(path)
-        self.restore(arrays)
+        with fitting(Path(path)):
+            self.restore(arrays | {MAP_IDS: self.filter.belief().map.ids})
         return arrays

@@ -13,11 +13,11 @@ two descriptors the Bhattacharyya coefficient of two histograms (R. ArandjeloviÄ
 """
 
 from dataclasses import dataclass
-from typing import Any, Literal, final
+from typing import Annotated, Any, Literal, final
 
 import numpy as np
 
-from rbpf.errors import InputError
+from rbpf.ranges import CountOrNone, NotNegative, Range, Ranged
 from rbpf.sensors.features.interface import Descriptor, FeatureExtractor, Features, Keypoints, checked_image
 
 LENGTHS = (36, 128)
@@ -27,7 +27,7 @@ _SIGMA = 1.6
 
 
 @dataclass(frozen=True)
-class SiftConfig:
+class SiftConfig(Ranged):
     """Settings of the detector and of the descriptors.
 
     Attributes:
@@ -44,26 +44,13 @@ class SiftConfig:
         InputError: a number is out of its range.
     """
 
-    features: int = 1000
-    working_scale: float = 0.5
-    contrast: float = 0.04
-    edge: float = 10.0
-    layers: int = 3
+    features: CountOrNone = 1000
+    working_scale: Annotated[float, Range(gt=0.0, le=1.0)] = 0.5
+    contrast: NotNegative = 0.04
+    edge: Annotated[float, Range(gt=1.0)] = 10.0
+    layers: Annotated[int, Range(ge=1, le=20)] = 3
     length: Literal[36, 128] = 36
     norm: Literal["root", "sift"] = "root"
-
-    def __post_init__(self) -> None:
-        if self.features < 0:
-            raise InputError(f"features must be a number of keypoints, or 0 for all, got {self.features}")
-        if not 0.0 < self.working_scale <= 1.0:
-            raise InputError(f"working_scale must be above 0 and at most 1, got {self.working_scale}")
-        if not (self.contrast >= 0.0 and self.edge > 1.0 and self.layers >= 1):
-            expected = "contrast of at least 0, edge above 1 and at least one layer"
-            raise InputError(f"expected {expected}, got {self.contrast}, {self.edge} and {self.layers}")
-        if self.length not in LENGTHS:
-            raise InputError(f"a descriptor has 36 or 128 entries, got length {self.length}")
-        if self.norm not in ("root", "sift"):
-            raise InputError(f'norm must be "root" or "sift", got {self.norm!r}')
 
 
 @final

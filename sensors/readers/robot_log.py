@@ -5,7 +5,6 @@ log's, covariances as logs write them (upper triangles, in additive coordinates,
 from arrays.
 """
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Collection
 from dataclasses import dataclass, field, fields
@@ -17,9 +16,8 @@ from numpy.typing import NDArray
 
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3, Array, SE2Group, SE3Group
-from rbpf.sensors.readers.text import LARGEST, Table
-
-_MAY_BE_ZERO = {"std_speed_mps", "std_turn_rate_radps", "scale_odometry"}
+from rbpf.ranges import NotNegative, Positive, Ranged
+from rbpf.sensors.readers.text import Table
 
 UNNAMED = -1
 """In place of a landmark's name where it is not known which one was observed."""
@@ -93,7 +91,7 @@ class RobotLog:
 
 
 @dataclass(frozen=True)
-class LogNoise:
+class LogNoise(Ranged):
     """Noise of a log; None takes what the log says, or the reader's documented default where it says nothing.
 
     Attributes:
@@ -109,20 +107,13 @@ class LogNoise:
         InputError: one is not finite, or negative, or zero where only a positive one makes sense.
     """
 
-    std_range_m: float | None = None
-    std_bearing_rad: float | None = None
-    std_pitch_rad: float | None = None
-    std_speed_mps: float | None = None
-    std_turn_rate_radps: float | None = None
-    std_position_m: float | None = None
-    scale_odometry: float | None = None
-
-    def __post_init__(self) -> None:
-        for name, value in self.given().items():
-            zero = name in _MAY_BE_ZERO
-            if not (math.isfinite(value) and abs(value) <= LARGEST and (value > 0 or (zero and value == 0))):
-                expected = f"{'zero or ' if zero else ''}positive and at most {LARGEST:.0e}"
-                raise InputError(f"LogNoise: expected {name} to be {expected}, found {value}.")
+    std_range_m: Positive | None = None
+    std_bearing_rad: Positive | None = None
+    std_pitch_rad: Positive | None = None
+    std_speed_mps: NotNegative | None = None
+    std_turn_rate_radps: NotNegative | None = None
+    std_position_m: Positive | None = None
+    scale_odometry: NotNegative | None = None
 
     def require_only(self, applicable: Collection[str], path: Path, kind: str) -> None:
         """Refuse what would have no effect on a log at a path, of a kind that takes the fields of these names.

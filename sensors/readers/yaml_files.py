@@ -10,6 +10,8 @@ import yaml
 from rbpf.errors import InputError
 from rbpf.sensors.readers.text import line_error, parse_number, quoted, read_text
 
+DEEPEST = 20
+"""Lists and mappings within each other."""
 MOST_BYTES = 1 << 20
 """Settings and calibrations are a few kilobytes."""
 
@@ -110,10 +112,24 @@ def read_yaml(path: Path, hint: str) -> YamlValue:
         # OpenCV writes this first line with a colon, which YAML does not have.
         text = "#" + text
     try:
+        # Before anything is built: a few nested aliases stand for more values than memory holds, and what is nested
+        # thousands deep takes minutes.
+        depth = 0
+        for event in yaml.parse(text, yaml.SafeLoader):
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            line = event.start_mark.line + 1
+            if depth > DEEPEST:
+                raise line_error(
+                    path, line, f"expected values, found more than {DEEPEST} nested lists or mappings"
+                )
+            if isinstance(event, yaml.AliasEvent):
+                raise line_error(path, line, "found an alias (*name): write the values out")
         node = yaml.compose(text, Loader=yaml.SafeLoader)
     except yaml.MarkedYAMLError as error:
         line = error.problem_mark.line + 1 if error.problem_mark else 1
         raise line_error(path, line, f"expected YAML, found a syntax error ({error.problem})") from None
+    except InputError:
+        raise
     except (yaml.YAMLError, RecursionError, ValueError, OverflowError):
         raise InputError(f"{path}: expected YAML, found something else.") from None
     if node is None:
@@ -129,10 +145,7 @@ def read_plain_yaml(path: Path, hint: str = "settings") -> Any:
             none of its type.
     """
     whole = read_yaml(path, hint)
-    text = read_text(path, hint, MOST_BYTES)
-    # A few nested aliases stand for more values than memory holds.
-    if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, yaml.SafeLoader)):
-        raise InputError(f"{path} has an alias (*name): write the values out")
+    _require_plain(whole)
     try:
         return yaml.SafeLoader("").construct_document(whole.node)
     except yaml.MarkedYAMLError as error:
@@ -140,3 +153,13 @@ def read_plain_yaml(path: Path, hint: str = "settings") -> Any:
         raise line_error(path, line, f"expected plain values, found another tag ({error.problem})") from None
     except (LookupError, TypeError, AttributeError, ArithmeticError, RecursionError, ValueError) as error:
         raise InputError(f"{path} holds a value that is none of its type: {error}") from None
+
+
+def _require_plain(value: YamlValue) -> None:
+    """Refuses keys that come twice."""
+    if isinstance(value.node, yaml.MappingNode):
+        for inner in value.entries(()).values():
+            _require_plain(inner)
+    elif isinstance(value.node, yaml.SequenceNode):
+        for number, node in enumerate(value.node.value):
+            _require_plain(YamlValue(value.path, f"{value.name}[{number}]", node))

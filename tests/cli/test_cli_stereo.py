@@ -171,7 +171,7 @@ def test_swapped_on_the_way(room, tmp_path, capsys):
     [
         (["--set", "particle=3"], "there is no setting particle"),
         (["--set", "likelihood.kind=uniform"], "settings: "),
-        (["--set", "map.gate=-1"], "expected gate and depth_fraction above 0"),
+        (["--set", "map.gate=-1"], "map.gate must be above 0"),
         (["--dof", "5"], ""),
     ],
 )

@@ -157,12 +157,6 @@ def test_pairs_within_a_gate(seed, dim):
     assert sorted(zip(*(rows.tolist() for rows in found), strict=True)) == expected
 
 
-@pytest.mark.parametrize(("changes", "found"), [({"distance": 0.0}, "0.0"), ({"ratio": 1.2}, "1.2")])
-def test_limits_out_of_range(changes, found):
-    with pytest.raises(InputError, match=found):
-        MatchLimits(**changes)
-
-
 LIMITS = MatchLimits(0.3, 0.8)
 
 

@@ -363,20 +363,3 @@ def test_threads_change_nothing():
         cv2.setNumThreads(before)
     for name in ("px", "scale", "orientation", "score", "descriptors"):
         assert getattr(found[0], name).tobytes() == getattr(found[1], name).tobytes()
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"features": -1}, "features"),
-        ({"working_scale": 0.0}, "working_scale"),
-        ({"working_scale": 1.5}, "working_scale"),
-        ({"contrast": -0.1}, "contrast"),
-        ({"layers": 0}, "layer"),
-        ({"length": 64}, "36 or 128"),
-        ({"norm": "l1"}, "norm"),
-    ],
-)
-def test_settings_out_of_range(changes, message):
-    with pytest.raises(InputError, match=message):
-        SiftConfig(**changes)

@@ -196,21 +196,6 @@ def test_sizes_that_differ():
         StereoMatcher(RIG, Sift(FULL)).measure(left[:, :300], right[:, :300])
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"nearest_m": 0.0}, "nearest_m"),
-        ({"row_px": -1.0}, "row_px"),
-        ({"disparity_px": 0.0}, "disparity_px"),
-        ({"scale_ratio": 0.9}, "scale_ratio"),
-        ({"least_correlation": 1.1}, "least_correlation"),
-    ],
-)
-def test_settings_out_of_range(changes, message):
-    with pytest.raises(InputError, match=message):
-        PairConfig(**changes)
-
-
 def texture(columns, lines):
     """A smooth pattern that is known everywhere."""
     rng = np.random.default_rng(5)

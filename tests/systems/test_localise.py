@@ -145,8 +145,8 @@ def test_the_kind_of_lens_is_told_of_a_fisheye_camera_alone(tmp_path):
     ("change", "words"),
     [
         ({"version": np.array(9)}, "no map of this version"),
-        ({"positions": np.zeros((12, 2))}, "expected positions of shape"),
-        ({"positions": np.full((12, 3), np.nan)}, "expected positions of shape"),
+        ({"positions": np.zeros((12, 2))}, "positions must hold numbers of shape"),
+        ({"positions": np.full((12, 3), np.nan)}, "positions must hold finite numbers"),
         ({"cov": np.tile(-np.eye(3), (12, 1, 1))}, "none less than zero"),
         ({"alignment": np.array("upside down")}, "is damaged"),
         ({"camera": np.array([-1.0, 1, 1, 1, 0, 0, 0, 0, 0])}, "must be positive"),

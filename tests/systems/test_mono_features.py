@@ -498,8 +498,3 @@ def test_a_negative_name():
     log = changed(FIRST, 1, lambda f: replace(f, landmarks=-1 - np.arange(len(f.landmarks))))
     with pytest.raises(InputError, match="a landmark has a negative name"):
         run(log, SMALL)
-
-
-def test_no_particles():
-    with pytest.raises(InputError, match="particles must be at least 1, got 0"):
-        MonoConfig(particles=0)

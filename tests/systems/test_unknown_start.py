@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.recordings import filter_features as run
 from rbpf.runs.recordings import filter_images
@@ -14,7 +13,6 @@ from rbpf.runs.trajectory import Trajectory
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureLog
 from rbpf.systems.mono.config import MonoConfig, StartConfig, VelocityConfig
-from rbpf.systems.mono.slam import MonoSlam
 from rbpf.systems.mono.unknown_start import (
     DISCONNECTED,
     SCALE_STD,
@@ -30,7 +28,7 @@ from rbpf.systems.mono.unknown_start import (
 from rbpf.validation.metrics.accuracy import ate
 from tests.exactness.models import known
 from tests.systems.mono_logs import SMALL, changed, desk, rows, without_known
-from tests.systems.plane_sequences import CAMERA, path, sequence
+from tests.systems.plane_sequences import path, sequence
 
 LOG = without_known(desk(frames=30))
 NEVER = replace(SMALL, start=StartConfig(batch_adjust=False))
@@ -230,28 +228,6 @@ def test_where_the_lens_has_no_direction_the_start_does_not_stop(resampled):
         frames[t] = replace(frame, landmarks=np.append(frame.landmarks, 9999), z=z, cov_z=cov)
     done = run(replace(LOG, camera=folded, frames=frames), SMALL)
     assert resampled and np.isfinite(done.log.poses).all()
-
-
-@pytest.mark.parametrize(
-    "wrong", [{"first_adjustment": 2}, {"max_frames": 0}, {"growth": 1.0}, {"growth": float("nan")}]
-)
-def test_settings_that_make_no_sense(wrong):
-    with pytest.raises(InputError, match=f"start.{next(iter(wrong))}"):
-        StartConfig(**wrong)
-
-
-@pytest.mark.parametrize(
-    ("name", "damaged"),
-    [
-        ("start/progress", np.zeros(3, dtype=np.int64)),
-        ("start/path", np.zeros((2, 7))),
-        ("start/inverse", np.zeros(1)),
-        ("start/names", np.zeros(2)),
-    ],
-)
-def test_a_damaged_checkpoint_is_refused(plane, name, damaged):
-    with pytest.raises(InputError, match=name):
-        MonoSlam(CAMERA, SMALL).start.restore(plane.system.start.arrays() | {name: damaged})
 
 
 # The optimum: its derivatives, its minimum, and what is drawn around it.

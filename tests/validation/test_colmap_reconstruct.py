@@ -190,14 +190,6 @@ def test_images_without_features_cannot_be_reconstructed():
         reconstruct(dark, FEW)
 
 
-@pytest.mark.parametrize(
-    "change", [{"every": 0}, {"features": 0}, {"overlap": 0}, {"threads": 0}, {"seed": -1}]
-)
-def test_options_that_make_no_sense_are_refused(change):
-    with pytest.raises(InputError, match=next(iter(change))):
-        ReconstructionOptions(**change)
-
-
 def test_a_run_without_images_is_refused(tmp_path):
     from rbpf import __version__
 

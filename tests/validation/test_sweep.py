@@ -113,7 +113,7 @@ def test_a_run_that_is_not_possible_does_not_stop_the_others(config, tmp_path, c
         ({"seeds": []}, "seeds is empty"),
         ({"seeds": "many"}, "seeds"),
         ({"seeds": [1, 1]}, "same run twice"),
-        ({"particles": [0]}, "particles must be at least 1"),
+        ({"particles": [0]}, "particles must be a whole number, at least 1"),
         ({"options": {}}, "options is empty"),
         ({"options": {"a": {"proposal.order": 1}}}, "proposal.order"),
         ({"settings": {"proposal.iterations": "two"}}, "iterations"),

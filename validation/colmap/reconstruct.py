@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from rbpf.errors import InputError
 from rbpf.lie import Array
+from rbpf.ranges import Angle, Count, Ranged, Seed
 from rbpf.runs.trajectory import Trajectory
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers.images.sequence import ImageSequence
@@ -29,7 +30,7 @@ LEAST_FRAMES = 3
 
 @final
 @dataclass(frozen=True)
-class ReconstructionOptions:
+class ReconstructionOptions(Ranged):
     """How images are reconstructed.
 
     Attributes:
@@ -42,20 +43,13 @@ class ReconstructionOptions:
         seed: of RANSAC.
     """
 
-    every: int = 5
-    features: int = 4096
-    overlap: int = 10
+    every: Count = 5
+    features: Count = 4096
+    overlap: Count = 10
     stereo: bool = True
-    least_angle_deg: float = 16.0
-    threads: int = 1
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        for name in ("every", "features", "overlap", "threads"):
-            if getattr(self, name) < 1:
-                raise InputError(f"Expected {name} to be at least 1, found {getattr(self, name)}.")
-        if self.seed < 0:
-            raise InputError(f"Expected a seed of at least 0, found {self.seed}.")
+    least_angle_deg: Angle = 16.0
+    threads: Count = 1
+    seed: Seed = 0
 
 
 @final

@@ -1,16 +1,16 @@
 """Every setting of monocular SLAM, with its default, its unit and what it does."""
 
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 
-from rbpf.errors import InputError
+from rbpf.ranges import Angle, Count, CountOrNone, Fraction, NotNegative, Positive, Range, Ranged, Ratio, Seed
 from rbpf.systems.filtering import ProposalConfig, ResamplingConfig
 
 
 @dataclass(frozen=True)
-class VelocityConfig:
+class VelocityConfig(Ranged):
     """Constant velocity, E06 §3.1.
 
     Attributes:
@@ -22,10 +22,10 @@ class VelocityConfig:
     """
 
     mode: Literal["marginal", "joint", "paper"] = "marginal"
-    walk_rad_s: float = 3.0
-    walk_m_s: float = 1.5
-    start_rad_s: float = 0.5
-    start_m_s: float = 0.5
+    walk_rad_s: NotNegative = 3.0
+    walk_m_s: NotNegative = 1.5
+    start_rad_s: NotNegative = 0.5
+    start_m_s: NotNegative = 0.5
 
     def walk_std(self) -> np.ndarray:
         """Standard deviation (6,) of the velocity's walk in one second, (rad/s, m/s)/√s."""
@@ -37,7 +37,7 @@ class VelocityConfig:
 
 
 @dataclass(frozen=True)
-class InverseDepthConfig:
+class InverseDepthConfig(Ranged):
     """Features whose depth is not known yet: rays with an inverse depth, E06 §5.
 
     Attributes:
@@ -70,17 +70,17 @@ class InverseDepthConfig:
     }
 
     pose_update: Literal["epipolar", "marginal", "off"] = "marginal"
-    mean_per_m: float = 0.8
-    std_per_m: float = 0.6
+    mean_per_m: Positive = 0.8
+    std_per_m: Positive = 0.6
     from_scene_depth: bool = True
-    promote_std_ratio: float = 0.1
-    promote_weight: float = 0.95
-    depth_parallax_px: float = 10.0
-    epipolar_parallax_px: float = 3.0
+    promote_std_ratio: Positive = 0.1
+    promote_weight: Fraction = 0.95
+    depth_parallax_px: Positive = 10.0
+    epipolar_parallax_px: Positive = 3.0
 
 
 @dataclass(frozen=True)
-class StartConfig:
+class StartConfig(Ranged):
     """A start without known points: the first frames are adjusted in batch, and the particles resampled from the result.
 
     Attributes:
@@ -101,24 +101,14 @@ class StartConfig:
     }
 
     batch_adjust: bool = True
-    first_adjustment: int = 6
-    growth: float = 1.25
-    max_frames: int = 60
-    depth_std_ratio: float = 0.03
-
-    def __post_init__(self) -> None:
-        """Checks what would never end, or never begin."""
-        if self.first_adjustment < 3 or self.max_frames < 3:
-            raise InputError(
-                "start.first_adjustment and start.max_frames must be at least 3, got "
-                f"{self.first_adjustment}, {self.max_frames}"
-            )
-        if not 1.0 < self.growth < float("inf"):
-            raise InputError(f"start.growth must be above 1 and finite, got {self.growth}")
+    first_adjustment: Annotated[int, Range(ge=3)] = 6
+    growth: Annotated[float, Range(gt=1.0, le=100.0)] = 1.25
+    max_frames: Annotated[int, Range(ge=3)] = 60
+    depth_std_ratio: Positive = 0.03
 
 
 @dataclass(frozen=True)
-class SearchConfig:
+class SearchConfig(Ranged):
     """Active search in images, E06 §4.1.
 
     Attributes:
@@ -167,32 +157,32 @@ class SearchConfig:
         "regained": "recovered_features",
     }
 
-    measurements: int = 25
-    noise_px: float = 1.0
-    template_px: int = 11
-    min_correlation: float = 0.8
-    ellipse_sigmas: float = 3.0
-    max_radius_px: float = 40.0
-    min_in_view: int = 35
-    new_per_frame: int = 3
-    gate_chi2: float = 9.2
-    spacing_px: float = 20.0
-    border_px: float = 8.0
-    max_turn_deg: float = 50.0
-    max_scale_change: float = 2.0
-    appearance_turn_deg: float = 10.0
-    appearance_scale_change: float = 1.15
-    min_attempts: int = 10
-    max_failure_ratio: float = 0.5
-    trusted_fraction: float = 0.6
-    lost_fraction: float = 0.25
-    lost_frames: int = 3
-    recovered_fraction: float = 0.5
-    recovered_features: int = 6
+    measurements: Count = 25
+    noise_px: Positive = 1.0
+    template_px: Annotated[int, Range(ge=3, le=21, odd=True)] = 11
+    min_correlation: Annotated[float, Range(ge=-1.0, le=1.0)] = 0.8
+    ellipse_sigmas: Positive = 3.0
+    max_radius_px: Annotated[float, Range(gt=0.0, le=10000.0)] = 40.0
+    min_in_view: CountOrNone = 35
+    new_per_frame: CountOrNone = 3
+    gate_chi2: Positive = 9.2
+    spacing_px: NotNegative = 20.0
+    border_px: NotNegative = 8.0
+    max_turn_deg: Angle = 50.0
+    max_scale_change: Ratio = 2.0
+    appearance_turn_deg: Angle = 10.0
+    appearance_scale_change: Ratio = 1.15
+    min_attempts: Count = 10
+    max_failure_ratio: Fraction = 0.5
+    trusted_fraction: Fraction = 0.6
+    lost_fraction: Fraction = 0.25
+    lost_frames: Count = 3
+    recovered_fraction: Fraction = 0.5
+    recovered_features: CountOrNone = 6
 
 
 @dataclass(frozen=True)
-class RelocalisationConfig:
+class RelocalisationConfig(Ranged):
     """Tracking loss: the pose prior while the camera is lost, and how it is found in the map again.
 
     Attributes:
@@ -235,27 +225,27 @@ class RelocalisationConfig:
         "inflation": "std_inflation",
     }
 
-    drift_rad_s: float = 0.25
-    drift_m_s: float = 0.25
-    search_std_rad: float = 0.05
-    search_std_m: float = 0.05
-    max_corners: int = 500
-    spacing_px: float = 6.0
-    descriptor_ratio: float = 0.9
-    depth_std_ratio: float = 0.3
-    match_radius_px: float = 15.0
-    inlier_px: float = 4.0
-    p3p_samples: int = 300
-    min_inliers: int = 8
-    min_inliers_with_last_view: int = 5
-    certain_inliers: int = 12
-    min_inlier_fraction: float = 0.25
-    min_spread: float = 0.03
-    std_inflation: float = 3.0
+    drift_rad_s: NotNegative = 0.25
+    drift_m_s: NotNegative = 0.25
+    search_std_rad: NotNegative = 0.05
+    search_std_m: NotNegative = 0.05
+    max_corners: Count = 500
+    spacing_px: NotNegative = 6.0
+    descriptor_ratio: Fraction = 0.9
+    depth_std_ratio: Positive = 0.3
+    match_radius_px: Positive = 15.0
+    inlier_px: Positive = 4.0
+    p3p_samples: Annotated[int, Range(ge=1, le=100000)] = 300
+    min_inliers: Annotated[int, Range(ge=4)] = 8
+    min_inliers_with_last_view: Annotated[int, Range(ge=4)] = 5
+    certain_inliers: Annotated[int, Range(ge=4)] = 12
+    min_inlier_fraction: Fraction = 0.25
+    min_spread: NotNegative = 0.03
+    std_inflation: Positive = 3.0
 
 
 @dataclass(frozen=True)
-class MonoConfig:
+class MonoConfig(Ranged):
     """Monocular SLAM.
 
     Attributes:
@@ -284,15 +274,15 @@ class MonoConfig:
         "recovery": "relocalisation",
     }
 
-    particles: int = 50
-    seed: int = 0
+    particles: Count = 50
+    seed: Seed = 0
     compiled: bool = True
-    start_std_m: float = 1.0
-    start_std_rad: float = 0.5
+    start_std_m: NotNegative = 1.0
+    start_std_rad: NotNegative = 0.5
     known: Literal["frame", "points"] = "frame"
-    max_new_per_frame: int = 1000
-    lag: int | None = None
-    checkpoint_every: int = 500
+    max_new_per_frame: CountOrNone = 1000
+    lag: Count | None = None
+    checkpoint_every: Count = 500
     velocity: VelocityConfig = field(default_factory=VelocityConfig)
     inverse_depth: InverseDepthConfig = field(default_factory=InverseDepthConfig)
     start: StartConfig = field(default_factory=StartConfig)
@@ -300,10 +290,3 @@ class MonoConfig:
     relocalisation: RelocalisationConfig = field(default_factory=RelocalisationConfig)
     proposal: ProposalConfig = field(default_factory=lambda: ProposalConfig(iterations=1))
     resampling: ResamplingConfig = field(default_factory=ResamplingConfig)
-
-    def __post_init__(self) -> None:
-        """Checks what no part checks itself."""
-        if self.particles < 1:
-            raise InputError(f"particles must be at least 1, got {self.particles}")
-        if self.checkpoint_every < 1:
-            raise InputError(f"checkpoint_every must be at least 1, got {self.checkpoint_every}")

@@ -7,7 +7,7 @@ from typing import final
 
 import numpy as np
 
-from rbpf.core.checkpoint import checked
+from rbpf.core.schema import grey, integers, numbers, poses, read, truths
 from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole
 
@@ -23,18 +23,18 @@ ENOUGH_TRUSTED = 6
 
 _OFFSETS = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 
-_COLUMNS: dict[str, tuple[type, tuple[int, ...]]] = {
-    "first_patch": (np.uint8, (PATCH_PX, PATCH_PX)),
-    "last_patch": (np.uint8, (PATCH_PX, PATCH_PX)),
-    "first_px": (np.float64, (2,)),
-    "first_pose": (np.float64, (7,)),
-    "last_pose": (np.float64, (7,)),
-    "position": (np.float64, (4,)),
-    "attempts": (np.int64, ()),
-    "found": (np.int64, ()),
-    "missed": (np.int64, ()),
-    "alive": (np.bool_, ()),
-    "member": (np.int64, ()),
+_COLUMNS = {
+    "first_patch": grey("features", PATCH_PX, PATCH_PX),
+    "last_patch": grey("features", PATCH_PX, PATCH_PX),
+    "first_px": numbers("features", 2),
+    "first_pose": poses("features"),
+    "last_pose": poses("features"),
+    "position": numbers("features", 4),
+    "attempts": integers("features", least=0),
+    "found": integers("features", least=0),
+    "missed": integers("features", least=0),
+    "alive": truths("features"),
+    "member": integers("features", least=-1, below="members"),
 }
 
 
@@ -69,9 +69,7 @@ class FeatureTable:
     member: np.ndarray
 
     def __init__(self) -> None:
-        self._room: dict[str, np.ndarray] = {
-            name: np.zeros((0, *shape), dtype) for name, (dtype, shape) in _COLUMNS.items()
-        }
+        self._room: dict[str, np.ndarray] = {name: entry.empty() for name, entry in _COLUMNS.items()}
         self._use(0)
 
     def __len__(self) -> int:
@@ -129,17 +127,10 @@ class FeatureTable:
         """For a checkpoint."""
         return {f"features/{name}": getattr(self, name) for name in _COLUMNS}
 
-    def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """The inverse of `arrays`.
-
-        Raises:
-            InputError: an array is missing, or is not what it should be.
-        """
-        count = checked(arrays, "features/alive", (None,), "b").size
-        for name, (dtype, shape) in _COLUMNS.items():
-            kind = np.dtype(dtype).kind
-            self._room[name] = checked(arrays, f"features/{name}", (count, *shape), kind).astype(dtype)
-        self._use(count)
+    def restore(self, arrays: dict[str, np.ndarray], members: int) -> None:
+        """The inverse of `arrays`, for a constellation of so many points; errors as `rbpf.core.schema.read`."""
+        self._room = read(arrays, _COLUMNS, "features/", members=members)
+        self._use(len(self._room["alive"]))
 
     def _use(self, count: int) -> None:
         for name, column in self._room.items():

@@ -8,6 +8,7 @@ from typing import final
 import numpy as np
 
 from rbpf.core.models import Belief, NewLandmarks, Observations, Part, Sensor
+from rbpf.core.schema import integers, read_one
 from rbpf.lie import SE3
 from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.sensors.features import CornerDetector, Descriptor, Detector, Sift, SiftConfig
@@ -206,8 +207,9 @@ class ImageSensor(Sensor):
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """The inverse of `arrays`."""
-        self.table.restore(arrays)
-        self.bad_frames = int(arrays["search/bad_frames"])
+        group = self.features.group
+        self.table.restore(arrays, 0 if group is None else group.names.size)
+        self.bad_frames = int(read_one(arrays, "search/bad_frames", integers(least=0)))
 
     def _too_little(self, search: SearchResult, recognised: bool) -> bool:
         """Whether so little agrees that it may be chance. Once lost, more has to agree: the pose prior is wide.

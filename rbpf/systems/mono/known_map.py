@@ -11,8 +11,9 @@ from typing import Literal
 
 import numpy as np
 
-from rbpf.core.checkpoint import load_arrays, save_arrays
+from rbpf.core.checkpoint import fitting, load_arrays, save_arrays
 from rbpf.core.filter import Filter
+from rbpf.core.schema import grey, integers, numbers, poses, read, text
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.maps.constellation import Constellation, UncertainConstellation
@@ -39,6 +40,18 @@ RAY_SIGMAS = 2.0
 FOCAL_FRACTION = 0.02
 """How far the focal lengths of two cameras may differ for one to recognise what the other has seen."""
 
+_SCHEMA = {
+    "camera": numbers(10),
+    "image_size": integers(2, least=1, below=1 << 16),
+    "alignment": text(),
+    "names": integers("points", least=0),
+    "positions": numbers("points", 3),
+    "cov": numbers("points", 3, 3),
+    "windows": grey("points", PATCH_PX, PATCH_PX),
+    "first_px": numbers("points", 2),
+    "first_pose": poses("points"),
+    "views": poses("views"),
+}
 _ALIGNMENTS: dict[str, Alignment] = {"none": "none", "rigid": "rigid", "similarity": "similarity"}
 
 
@@ -139,10 +152,8 @@ def read_known_map(path: Path) -> KnownMap:
     version = arrays.get("version", np.zeros(()))
     if version.shape or version.dtype.kind != "i" or int(version) != VERSION:
         raise InputError(f"{path} is no map of this version of the program: map again")
-    try:
+    with fitting(path):
         found = _parsed(arrays)
-    except (LookupError, ValueError, TypeError, AttributeError) as error:
-        raise InputError(f"{path} is damaged: {' '.join(str(error).split())}") from error
     if found.names.size < LEAST:
         raise InputError(
             f"{path} holds {found.names.size} points of known depth, expected at least {LEAST}: map for longer"
@@ -151,29 +162,14 @@ def read_known_map(path: Path) -> KnownMap:
 
 
 def _parsed(arrays: dict[str, np.ndarray]) -> KnownMap:
-    count, views = arrays["names"].size, arrays["views"].shape[0]
-    if arrays["camera"].shape == (9,):
+    if "camera" in arrays and arrays["camera"].shape == (9,):
         arrays = arrays | {"camera": np.append(arrays["camera"], RadialTangential.kind)}
-    shapes = {
-        "camera": (10,), "image_size": (2,), "names": (count,), "positions": (count, 3), "cov": (count, 3, 3),
-        "windows": (count, PATCH_PX, PATCH_PX), "first_px": (count, 2), "first_pose": (count, 7), "views": (views, 7),
-    }  # fmt: skip
-    for name, shape in shapes.items():
-        array = arrays[name]
-        kind = {"names": "i", "image_size": "i", "windows": "u"}.get(name, "f")
-        if array.shape != shape or array.dtype.kind != kind or not np.isfinite(array).all():
-            raise ValueError(
-                f"expected {name} of shape {shape}, finite, found {array.shape} of {array.dtype}"
-            )
-    if not views or (np.linalg.eigvalsh(arrays["cov"]) < 0.0).any():
-        raise ValueError("expected views, and covariances that are none less than zero")
-    width, height = (int(value) for value in arrays["image_size"])
-    camera = Pinhole.from_params(width, height, arrays["camera"])
-    alignment = _ALIGNMENTS[str(arrays["alignment"])]
-    rest = (
-        arrays[name] for name in ("names", "positions", "cov", "windows", "first_px", "first_pose", "views")
-    )
-    return KnownMap(camera, alignment, *rest)
+    found = read(arrays, _SCHEMA)
+    if not len(found["views"]) or (np.linalg.eigvalsh(found["cov"]) < 0.0).any():
+        raise InputError("expected views, and covariances that are none less than zero")
+    params, size, alignment = (found.pop(name) for name in ("camera", "image_size", "alignment"))
+    camera = Pinhole.from_params(*size.tolist(), params)
+    return KnownMap(camera, _ALIGNMENTS[str(alignment)], **found)
 
 
 def estimate_mono_map(filter_: Filter, features: FeatureSensor, world: Anchored | None) -> MapEstimate:

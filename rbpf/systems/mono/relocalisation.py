@@ -15,6 +15,8 @@ from rbpf import gaussian
 from rbpf.core.filter import Filter
 from rbpf.core.models import Belief
 from rbpf.core.particles import Particles, Prior, mixture_estimate
+from rbpf.core.schema import grey, integers, numbers, poses, read, truths
+from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.motion.constant_velocity import PosePrior
 from rbpf.sensors.camera import Pinhole
@@ -72,6 +74,23 @@ MIN_VIEW_CORNERS = 30
 MIN_VIEW_FRACTION = 0.8
 """Of the corners of the last view that are found again, so many must show the motion that the map shows."""
 
+_SCREEN = {"last": grey("", ""), "repeats": integers(least=0), "was_unusable": truths()}
+_LOSS = {
+    "pose": poses(),
+    "cov": numbers(6, 6),
+    "stamp_ns": integers(),
+    "image": grey("", ""),
+    "mode": poses(),
+    "never_found": truths(),
+}
+
+
+def _image(array: np.ndarray, camera: Pinhole) -> np.ndarray | None:
+    """An image of a checkpoint, None where it is empty."""
+    if array.shape not in ((0, 0), (camera.height, camera.width)):
+        raise InputError(f"an image has shape {array.shape}, the camera's is {camera.height, camera.width}")
+    return array if array.size else None
+
 
 @final
 class ImageScreen:
@@ -121,9 +140,9 @@ class ImageScreen:
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """The inverse of `arrays`."""
-        last = arrays["screen/last"]
-        self._last = last if last.size else None
-        self._repeats, self._was_unusable = int(arrays["screen/repeats"]), bool(arrays["screen/was_unusable"])
+        found = read(arrays, _SCREEN, "screen/")
+        self._last = _image(found["last"], self.camera)
+        self._repeats, self._was_unusable = int(found["repeats"]), bool(found["was_unusable"])
 
 
 @dataclass(frozen=True)
@@ -256,12 +275,11 @@ class TrackingLoss:
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """The inverse of `arrays`."""
-        self._trusted, self._particles = (arrays["loss/pose"], arrays["loss/cov"]), None
-        self.stamp_ns = int(arrays["loss/stamp_ns"])
-        image = arrays["loss/image"]
-        self._image, self._view = image if image.size else None, None
-        self._mode = arrays["loss/mode"]
-        self.never_found = bool(arrays["loss/never_found"])
+        found = read(arrays, _LOSS, "loss/")
+        self._trusted, self._particles = (found["pose"], found["cov"]), None
+        self.stamp_ns, self._mode = int(found["stamp_ns"]), found["mode"]
+        self._image, self._view = _image(found["image"], self.sensor.camera), None
+        self.never_found = bool(found["never_found"])
 
 
 @dataclass(frozen=True)

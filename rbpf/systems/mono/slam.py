@@ -124,14 +124,24 @@ class MonoSlam(System):
     )
     observed = (
         Ragged("features", "features that were looked for", kind="int64"),
-        Ragged("mean", "their predicted places, px", (2,)),
-        Ragged("cov", "covariance of these, with the noise of the measurement, px²", (2, 2)),
-        Ragged("px", "where each was found, px; NaN where not", (2,)),
-        Ragged("cov_px", "covariance of the noise of px, px²", (2, 2)),
-        Ragged("line", "ends of the epipolar line of one whose depth is unknown, px; else NaN", (2, 2)),
-        Ragged("position", "homogeneous point in the reported world; NaN where it was not found", (4,)),
+        Ragged("mean", "their predicted places, px", (2,), per="features"),
+        Ragged("cov", "covariance of these, with the noise of the measurement, px²", (2, 2), per="features"),
+        Ragged("px", "where each was found, px; NaN where not", (2,), per="features"),
+        Ragged("cov_px", "covariance of the noise of px, px²", (2, 2), per="features"),
+        Ragged(
+            "line",
+            "ends of the epipolar line of one whose depth is unknown, px; else NaN",
+            (2, 2),
+            per="features",
+        ),
+        Ragged(
+            "position",
+            "homogeneous point in the reported world; NaN where it was not found",
+            (4,),
+            per="features",
+        ),
         Ragged("started", "features that were started", kind="int64"),
-        Ragged("started_px", "where, px", (2,)),
+        Ragged("started_px", "where, px", (2,), per="started"),
     )
     space = SE3
 
@@ -399,6 +409,12 @@ class MonoSlam(System):
         """The inverse of `arrays`."""
         for part in (self.sensor, self.screen, self.loss, self.start):
             part.restore(arrays)
+        table, landmark_map = self.sensor.table, self.filter.belief().map
+        own = np.flatnonzero(table.alive & (table.member < 0))
+        if not landmark_map.holds(own).all():
+            raise InputError("a feature of the table is alive and not in the map")
+        if len(table) and landmark_map.ids.max(initial=-1) >= len(table):
+            raise InputError("a landmark of the map is not in the table of features")
 
     def _new_filter(self, sensor: Sensor) -> Filter:
         """A filter with an empty map; the parametrisations are named in it, so that a checkpoint can be read back."""

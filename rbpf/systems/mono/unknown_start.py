@@ -25,9 +25,10 @@ from typing import final
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, cholesky, solve_triangular
 
-from rbpf.core.checkpoint import checked, within
 from rbpf.core.filter import Filter
 from rbpf.core.particles import Prior, mixture_estimate, uniform_log_weights
+from rbpf.core.schema import integers, numbers, poses, read, split
+from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.motion.constant_velocity import PosePrior
 from rbpf.sensors.camera import Pinhole
@@ -60,10 +61,24 @@ MAX_STEPS, MIN_GAIN = 30, 1e-4
 DAMPING, DAMPING_FACTOR, MAX_DAMPING = 1e-3, 5.0, 1e8
 """Of Levenberg's and Marquardt's method: at first, its change after a step, and where there is no way down."""
 
-MAX_FEATURES = 1 << 20
-"""No frame shows more."""
-
 TINY = np.finfo(float).tiny
+
+_LAST = {
+    "progress": integers(2, least=0),
+    "names": integers("features", least=0, ascending=True),
+    "steps": integers("steps", least=0, ascending=True),
+    "path": poses("steps"),
+    "direction": numbers("features", 3),
+    "inverse": numbers("features"),
+}
+_FRAMES = {
+    "stamps_ns": integers("frames"),
+    "counts": integers("frames", least=0),
+    "names": integers("seen", least=0),
+    "px": numbers("seen", 2),
+    "cov_px": numbers("seen", 2, 2),
+    "path": poses("frames"),
+}
 
 
 @dataclass(frozen=True)
@@ -186,35 +201,25 @@ class UnknownStart:
         return out
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """The inverse of `arrays`.
-
-        Raises:
-            InputError: they are not what they should be.
-        """
-        over, self._next = checked(arrays, "start/progress", (2,), "i").tolist()
+        """The inverse of `arrays`; errors as `rbpf.core.schema.read`."""
+        last = read(arrays, _LAST, "start/")
+        over, self._next = last["progress"].tolist()
         self.over = bool(over)
-        names = checked(arrays, "start/names", (None,), "i")
-        steps = checked(arrays, "start/steps", (None,), "i")
-        structure = Structure(
-            checked(arrays, "start/path", (steps.size, 7), "f"),
-            checked(arrays, "start/direction", (names.size, 3), "f"),
-            checked(arrays, "start/inverse", (names.size,), "f"),
-        )
+        names, steps = last["names"], last["steps"]
+        structure = Structure(last["path"], last["direction"], last["inverse"])
         self._last = (names, steps, structure) if names.size else None
         self._frames, self._path = [], []
-        if "start/frames/stamps_ns" not in arrays:
-            return
-        stamps = checked(arrays, "start/frames/stamps_ns", (None,), "i")
-        counts = within(arrays, "start/frames/counts", stamps.size, 0, MAX_FEATURES)
-        total = int(counts.sum())
-        columns = (
-            checked(arrays, "start/frames/names", (total,), "i"),
-            checked(arrays, "start/frames/px", (total, 2), "f"),
-            checked(arrays, "start/frames/cov_px", (total, 2, 2), "f"),
-        )
-        parts = zip(*(np.split(column, np.cumsum(counts)[:-1]) for column in columns), strict=True)
-        self._frames = [FeatureFrame(t, *part) for t, part in zip(stamps.tolist(), parts, strict=True)]
-        self._path = list(checked(arrays, "start/frames/path", (stamps.size, 7), "f"))
+        if "start/frames/stamps_ns" in arrays:
+            held = read(arrays, _FRAMES, "start/frames/")
+            columns = held["names"], held["px"], held["cov_px"]
+            parts = zip(
+                *(split(column, held["counts"].tolist(), "start/frames") for column in columns), strict=True
+            )
+            stamps = held["stamps_ns"].tolist()
+            self._frames = [FeatureFrame(t, *part) for t, part in zip(stamps, parts, strict=True)]
+            self._path = list(held["path"])
+        if not self.over and names.size and not (steps.size and steps[-1] < len(self._frames)):
+            raise InputError("the last adjustment of the start is of frames that are not there")
 
     def _adjusted(
         self, filter_: Filter, frames: Sequence[FeatureFrame], path: np.ndarray
@@ -250,7 +255,11 @@ class UnknownStart:
         inverse_depth, velocity = self.config.inverse_depth, self.config.velocity
         rho = inverse_depth.mean_per_m, inverse_depth.std_per_m
         expected = Expected(rho, velocity.start_std(), velocity.walk_std())
-        best = min((optimum(seen, expected, start) for start in starts), key=lambda each: each.cost)
+        found = [optimum(seen, expected, start) for start in starts]
+        found = [each for each in found if np.isfinite(each.cost) and np.isfinite(each.information).all()]
+        if not found:
+            return None, True
+        best = min(found, key=lambda each: each.cost)
         self._last = names, steps, best.structure
 
         relative = best.std_inverse() / np.maximum(best.structure.inverse, TINY)
@@ -431,7 +440,7 @@ def optimum(seen: Window, expected: Expected, start: Structure) -> Optimum:
         information, vector = now.normal_equations()
         while True:
             ahead = None
-            with suppress(LinAlgError):
+            with suppress(LinAlgError, ValueError):  # ValueError where it is not finite
                 factor = cho_factor(information + damping * np.diag(np.diag(information)))
                 ahead = Linearised(seen, expected, now.at.moved(np.asarray(cho_solve(factor, vector))))
             if ahead is not None and ahead.cost < now.cost:

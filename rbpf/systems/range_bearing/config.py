@@ -1,18 +1,29 @@
 """Every setting of a range-bearing run, with its default, its unit and what it does."""
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
 from rbpf.core.likelihoods import ExistenceModel, Gates
 from rbpf.errors import InputError
+from rbpf.ranges import (
+    Count,
+    CountOrNone,
+    NotNegative,
+    Positive,
+    Probability,
+    Range,
+    Ranged,
+    Seed,
+    check_ranges,
+)
 from rbpf.sensors.readers import LogNoise
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig, ResamplingConfig
 
 
 @dataclass(frozen=True)
-class AssociationConfig:
+class AssociationConfig(Ranged):
     """Unknown association.
 
     Attributes:
@@ -27,14 +38,14 @@ class AssociationConfig:
         drop: log-odds below which a landmark is deleted.
     """
 
-    accept_probability: float = 0.999
-    isolate_probability: float = 0.999999
-    new_density: float = 1e-3
-    clutter_density: float = 1e-4
-    max_range_m: float | None = None
-    half_field_of_view_deg: float = 180.0
-    hit: float = 1.0
-    miss: float = 0.0
+    accept_probability: Probability = 0.999
+    isolate_probability: Probability = 0.999999
+    new_density: Positive = 1e-3
+    clutter_density: Positive = 1e-4
+    max_range_m: Positive | None = None
+    half_field_of_view_deg: Annotated[float, Range(gt=0.0, le=180.0)] = 180.0
+    hit: NotNegative = 1.0
+    miss: NotNegative = 0.0
     drop: float = -2.0
 
     def gates(self, dim: int) -> Gates:
@@ -73,15 +84,15 @@ class RangeBearingConfig:
         unknown: settings of unknown association.
     """
 
-    particles: int = 100
-    seed: int = 0
+    particles: Count = 100
+    seed: Seed = 0
     association: Literal["known", "ml"] = "known"
     map: Literal["particles", "joint"] = "particles"
-    window: int = 5
+    window: Count = 5
     compiled: bool = True
-    lag: int | None = None
-    checkpoint_every: int = 500
-    anchor_every: int = 10
+    lag: Count | None = None
+    checkpoint_every: Count = 500
+    anchor_every: CountOrNone = 10
     noise: LogNoise = field(default_factory=LogNoise)
     proposal: ProposalConfig = field(default_factory=ProposalConfig)
     resampling: ResamplingConfig = field(default_factory=ResamplingConfig)
@@ -89,16 +100,9 @@ class RangeBearingConfig:
     unknown: AssociationConfig = field(default_factory=AssociationConfig)
 
     def __post_init__(self) -> None:
-        """Checks what no part checks itself."""
-        if self.particles < 1:
-            raise InputError(f"particles must be at least 1, got {self.particles}")
-        if self.checkpoint_every < 1:
-            raise InputError(f"checkpoint_every must be at least 1, got {self.checkpoint_every}")
-        if self.anchor_every < 0:
-            raise InputError(f"anchor_every must not be negative, got {self.anchor_every}")
+        """Checks the ranges, and what goes together."""
+        check_ranges(self)
         if self.map == "joint" and (self.association != "known" or self.likelihood.kind != "gaussian"):
             raise InputError(
                 "map=joint takes association=known and likelihood.kind=gaussian: map=particles takes all"
             )
-        if self.window < 1:
-            raise InputError(f"window must be at least 1, got {self.window}")

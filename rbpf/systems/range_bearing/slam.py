@@ -11,11 +11,12 @@ from typing import Any, ClassVar, final
 
 import numpy as np
 
-from rbpf.core.checkpoint import checked
 from rbpf.core.diagnostics import motion_correction
 from rbpf.core.filter import Filter, StepReport
 from rbpf.core.models import NEW, NULL, Sensor
 from rbpf.core.resampling import Consolidation
+from rbpf.core.schema import elements, integers, read, read_one, split
+from rbpf.errors import InputError
 from rbpf.lie import SE2, SE2Group, SE3Group
 from rbpf.maps.joint_map import JointMap
 from rbpf.maps.landmark_map import LandmarkMap
@@ -119,8 +120,8 @@ class RangeBearingSlam(System):
             Ragged(
                 "landmarks", "name of each observation's landmark, −1 where it was not used", kind="int64"
             ),
-            Ragged("z", "measurements", (p,)),
-            Ragged("cov_z", "their covariance", (p, p)),
+            Ragged("z", "measurements", (p,), per="landmarks"),
+            Ragged("cov_z", "their covariance", (p, p), per="landmarks"),
         )
 
     @classmethod
@@ -268,8 +269,8 @@ class RangeBearingSlam(System):
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """The inverse of `arrays`."""
-        self._names = set(arrays["names"].tolist())
-        self._odometry = checked(arrays, "odometry", (self.space.size,), "f").copy()
+        self._names = set(read_one(arrays, "names", integers("names")).tolist())
+        self._odometry = read_one(arrays, "odometry", elements(self.space))
         if self._associations is not None:
             self._associations.restore(arrays)
         if self.anchor is not None:
@@ -316,6 +317,9 @@ class Observed:
     cov_z: np.ndarray
 
 
+_ASSOCIATIONS = {"shapes": integers("steps", 3, least=0), "ids": integers("ids", least=NULL)}
+
+
 def _ids_with_new(report: StepReport, count: int) -> np.ndarray:
     """Ids (N or 1, K) of a step's observations in every particle; what was new has the ids that it got."""
     ids = np.full((1, count), NULL)
@@ -360,10 +364,12 @@ class _Associations:
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """The inverse of `arrays`."""
-        first = 0
-        for generation, n, k in arrays["associations/shapes"].tolist():
-            ids = arrays["associations/ids"][first : first + n * k].reshape(n, k)
-            first += n * k
+        found = read(arrays, _ASSOCIATIONS, "associations/")
+        shapes = found["shapes"].tolist()
+        if any(n not in (1, self._filter.n) for _, n, _ in shapes):
+            raise InputError("the associations of a step are not those of one or of all particles")
+        flat = split(found["ids"], [n * k for _, n, k in shapes], "associations/ids")
+        for (generation, n, k), ids in zip(shapes, flat, strict=True):
             if n > 1:
                 self._filter.lineage.take_up(generation)
-            self._steps.append((generation, ids.copy()))
+            self._steps.append((generation, ids.reshape(n, k)))

@@ -1,14 +1,14 @@
 """Every setting of stereo SLAM, with its default, its unit and what it does."""
 
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 
-from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.motion.odometry import Odometry
 from rbpf.motion.stereo_vo import MotionPrior, VoConfig
+from rbpf.ranges import Angle, Count, CountOrNone, NotNegative, Positive, Range, Ranged, Ratio, Seed
 from rbpf.sensors.descriptors import MatchLimits
 from rbpf.sensors.features import SiftConfig
 from rbpf.sensors.landmark_management import NewLandmarkConfig
@@ -20,7 +20,7 @@ OUTLIER_VOLUME_PX3 = 640.0 * 480.0 * 60.0
 
 
 @dataclass(frozen=True)
-class OdometryConfig:
+class OdometryConfig(Ranged):
     """Motion from pair to pair (S05 §III-C), and its noise as the filter takes it.
 
     Attributes:
@@ -39,13 +39,13 @@ class OdometryConfig:
     estimate: VoConfig = field(default_factory=VoConfig)
     prior: MotionPrior = field(default_factory=MotionPrior)
     limits: MatchLimits = field(default_factory=MatchLimits)
-    std_added_rad: float = 0.0
-    std_added_m: float = 0.0
+    std_added_rad: NotNegative = 0.0
+    std_added_m: NotNegative = 0.0
     split: Literal["none", "apart", "same"] = "none"
 
 
 @dataclass(frozen=True)
-class MapConfig:
+class MapConfig(Ranged):
     """Which features of a pair are landmarks of the map.
 
     Attributes:
@@ -76,29 +76,19 @@ class MapConfig:
     used: bool = True
     weigh: Literal["landmarks", "all"] = "landmarks"
     limits: MatchLimits = field(default_factory=MatchLimits)
-    gate: float = 11.3
-    slack_px: float = 1.0
-    subsample: int = 32
+    gate: Positive = 11.3
+    slack_px: NotNegative = 1.0
+    subsample: Count = 32
     margin_px: float = 20.0
-    max_turn_deg: float = 45.0
-    max_scale_change: float = 2.0
-    vague_px: float = 15.0
-    min_agreeing: int = 6
-    depth_fraction: float = 0.1
-
-    def __post_init__(self) -> None:
-        """Checks what no part checks itself."""
-        if self.subsample < 1:
-            raise InputError(f"subsample must be at least one particle, got {self.subsample}")
-        in_range = self.gate > 0.0 and self.slack_px >= 0.0 and self.max_scale_change >= 1.0
-        if not (in_range and self.depth_fraction > 0.0):
-            expected = "gate and depth_fraction above 0, slack_px from 0 up and max_scale_change from 1 up"
-            found = f"{self.gate}, {self.slack_px}, {self.max_scale_change} and {self.depth_fraction}"
-            raise InputError(f"expected {expected}, got {found}")
+    max_turn_deg: Angle = 45.0
+    max_scale_change: Ratio = 2.0
+    vague_px: NotNegative = 15.0
+    min_agreeing: Annotated[int, Range(ge=3)] = 6
+    depth_fraction: Positive = 0.1
 
 
 @dataclass(frozen=True)
-class TriggerConfig:
+class TriggerConfig(Ranged):
     """The filter is updated only when the camera has moved enough since the last update (S05 §IV).
 
     Attributes:
@@ -107,15 +97,9 @@ class TriggerConfig:
         frames: … or, having moved at all or not, after so many pairs; 0 for never.
     """
 
-    moved_m: float = 0.02
-    turned_rad: float = 0.02
-    frames: int = 0
-
-    def __post_init__(self) -> None:
-        """Checks what no part checks itself."""
-        if not (self.moved_m >= 0.0 and self.turned_rad >= 0.0 and self.frames >= 0):
-            found = f"{self.moved_m}, {self.turned_rad} and {self.frames}"
-            raise InputError(f"moved_m, turned_rad and frames must not be negative, got {found}")
+    moved_m: NotNegative = 0.02
+    turned_rad: NotNegative = 0.02
+    frames: CountOrNone = 0
 
     def reached(self, motion: Odometry, frames: int) -> bool:
         """Whether the camera has moved enough since the last update, so many pairs ago.
@@ -130,7 +114,7 @@ class TriggerConfig:
 
 
 @dataclass(frozen=True)
-class RecoveryConfig:
+class RecoveryConfig(Ranged):
     """What is done where the motion since the last update was only assumed, for all or part of the way.
 
     The distribution of an assumed motion is far wider than what the map's landmarks leave open: no particle that is
@@ -144,17 +128,12 @@ class RecoveryConfig:
     """
 
     used: bool = True
-    patience: int = 60
+    patience: CountOrNone = 60
     proposal: ProposalConfig = field(default_factory=lambda: ProposalConfig("ekf", iterations=5))
-
-    def __post_init__(self) -> None:
-        """Checks what no part checks itself."""
-        if self.patience < 0:
-            raise InputError(f"patience must not be negative, got {self.patience}")
 
 
 @dataclass(frozen=True)
-class StereoConfig:
+class StereoConfig(Ranged):
     """A run of stereo SLAM.
 
     Attributes:
@@ -178,12 +157,12 @@ class StereoConfig:
 
     RENAMED: ClassVar[dict[str, str]] = {"keys": "new_landmarks"}
 
-    particles: int = 400
-    seed: int = 0
+    particles: Count = 400
+    seed: Seed = 0
     dof: Literal[3, 6] = 6
     compiled: bool = True
-    lag: int | None = None
-    checkpoint_every: int = 500
+    lag: Count | None = None
+    checkpoint_every: Count = 500
     sift: SiftConfig = field(default_factory=SiftConfig)
     pair: PairConfig = field(default_factory=PairConfig)
     odometry: OdometryConfig = field(default_factory=OdometryConfig)
@@ -196,10 +175,3 @@ class StereoConfig:
     proposal: ProposalConfig = field(default_factory=lambda: ProposalConfig("prior"))
     recovery: RecoveryConfig = field(default_factory=RecoveryConfig)
     resampling: ResamplingConfig = field(default_factory=ResamplingConfig)
-
-    def __post_init__(self) -> None:
-        """Checks what no part checks itself."""
-        if self.particles < 1:
-            raise InputError(f"particles must be at least 1, got {self.particles}")
-        if self.checkpoint_every < 1:
-            raise InputError(f"checkpoint_every must be at least 1, got {self.checkpoint_every}")

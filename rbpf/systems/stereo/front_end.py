@@ -14,8 +14,8 @@ from typing import Any, ClassVar, Generic, final
 
 import numpy as np
 
-from rbpf.core.checkpoint import checked
 from rbpf.core.models import NULL, Landmark
+from rbpf.core.schema import integers, numbers, read
 from rbpf.errors import InputError
 from rbpf.motion.stereo_geometry import Matches
 from rbpf.sensors.camera import RectifiedStereo
@@ -35,9 +35,23 @@ from rbpf.systems.stereo.landmarks import (
     NamedPixels,
     View,
 )
-from rbpf.systems.stereo.motion_segmentation import UNKNOWN
+from rbpf.systems.stereo.motion_segmentation import MOVING, STATIC, UNKNOWN
 
-KEPT = ("z", "cov", "scale", "orientation", "descriptors")
+_LABELS = {"stood": integers("features", least=MOVING, below=STATIC + 1, dtype=np.int8)}
+_NAMED = {
+    "z": numbers("features", 3),
+    "cov": numbers("features", 3, 3),
+    "names": integers("features", least=0),
+    **_LABELS,
+}
+
+KEPT = {
+    "z": numbers("features", 3),
+    "cov": numbers("features", 3, 3),
+    "scale": numbers("features"),
+    "orientation": numbers("features"),
+    "descriptors": numbers("features", "length", dtype=np.float32),
+}
 """What the rest of `StereoFeatures` follows from."""
 
 
@@ -218,9 +232,9 @@ class ImageFrontEnd(FrontEnd[StereoFeatures]):
         return kept | {"pair/stood": pair.labels}
 
     def pair_of(self, arrays: dict[str, np.ndarray]) -> Pair[StereoFeatures]:
-        features = StereoFeatures.measured(self.rig, *(arrays[f"pair/{name}"].copy() for name in KEPT))
-        labels = checked(arrays, "pair/stood", (len(features),), "i").copy()
-        return self._pair(0, features).labelled(labels)
+        found = read(arrays, KEPT | _LABELS, "pair/", length=self.matcher.extractor.length)
+        features = StereoFeatures.measured(self.rig, *(found[name] for name in KEPT))
+        return self._pair(0, features).labelled(found["stood"])
 
     def _pair(self, stamp_ns: int, features: StereoFeatures) -> Pair[StereoFeatures]:
         split, everything = self.config.odometry.split, np.ones(len(features), dtype=bool)
@@ -288,10 +302,7 @@ class NamedFrontEnd(FrontEnd[NamedPixels]):
         }
 
     def pair_of(self, arrays: dict[str, np.ndarray]) -> Pair[NamedPixels]:
-        names = checked(arrays, "pair/names", (None,), "i").copy()
-        z = checked(arrays, "pair/z", (names.size, 3), "f").copy()
-        cov = checked(arrays, "pair/cov", (names.size, 3, 3), "f").copy()
-        labels = checked(arrays, "pair/stood", (names.size,), "i").copy()
+        z, cov, names, labels = read(arrays, _NAMED, "pair/").values()
         return self._pair(0, NamedPixels(z, cov, names)).labelled(labels)
 
     def _pair(self, stamp_ns: int, features: NamedPixels) -> Pair[NamedPixels]:

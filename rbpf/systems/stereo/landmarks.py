@@ -18,7 +18,6 @@ from typing import Any, Generic, Protocol, Self, TypeVar, final
 import numpy as np
 
 from rbpf import gaussian
-from rbpf.core.checkpoint import checked
 from rbpf.core.models import (
     NULL,
     Belief,
@@ -31,6 +30,8 @@ from rbpf.core.models import (
     Sensor,
 )
 from rbpf.core.particles import Prior
+from rbpf.core.schema import integers, numbers, read
+from rbpf.errors import InputError
 from rbpf.gaussian import symmetrise
 from rbpf.lie import SE3
 from rbpf.maps.point import Point
@@ -44,6 +45,7 @@ from rbpf.sensors.landmark_management import LandmarkManager, NewLandmarkConfig
 from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
 from rbpf.sensors.stereo import StereoFeatures
 from rbpf.systems.stereo.config import MapConfig
+from rbpf.systems.system import MAP_IDS
 
 _MAP = frozenset({Part.LANDMARK})
 
@@ -55,6 +57,12 @@ TINY = 1e-6
 
 SIGMAS = 3.0
 """The image is widened by so many standard deviations of the camera's direction."""
+
+_PLACES = {"place": numbers("landmarks", 3), "seen_from": numbers("landmarks", 3)}
+_NAMES = {
+    "filtered": integers("filtered", least=0, ascending=True, refers=MAP_IDS),
+    "proven": integers("proven", least=0, ascending=True, refers=MAP_IDS),
+}
 
 
 class FeatureKind(IntEnum):
@@ -342,11 +350,9 @@ class Places:
         return {"places/place": self._place, "places/seen_from": self._seen_from}
 
     def restore(self, arrays: dict[str, np.ndarray], ids: np.ndarray) -> None:
-        """The inverse of `arrays`, of landmarks (M,)."""
-        self._ids = ids.copy()
-        self._place, self._seen_from = (
-            checked(arrays, f"places/{name}", (ids.size, 3), "f").copy() for name in ("place", "seen_from")
-        )
+        """The inverse of `arrays`, of landmarks (M,); errors as `rbpf.core.schema.read`."""
+        found = read(arrays, _PLACES, "places/", landmarks=ids.size)
+        self._ids, self._place, self._seen_from = ids.copy(), found["place"], found["seen_from"]
 
 
 class AssociationGate(ABC):
@@ -525,8 +531,11 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         return self.store.arrays() | self.manager.arrays() | self.places.arrays()
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        read(arrays, {"descriptors/ids": integers("landmarks", refers=MAP_IDS)})
         self.store.restore(arrays)
         self.manager.restore(arrays)
+        if not np.array_equal(self.store.ids, self.manager.names):
+            raise InputError("the landmarks that have descriptors are not those that are counted")
         self.places.restore(arrays, self.store.ids)
 
     def _alike(self, descriptors: np.ndarray, subsample: ParticleSubsample) -> np.ndarray:
@@ -618,9 +627,7 @@ class NamedLandmarks(Landmarks[NamedPixels]):
         return {"names/filtered": self._observed, "names/proven": self._observed_again}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        self._observed, self._observed_again = (
-            checked(arrays, f"names/{name}", (None,), "i").copy() for name in ("filtered", "proven")
-        )
+        self._observed, self._observed_again = read(arrays, _NAMES, "names/").values()
 
 
 def _free(view: View[NamedPixels]) -> Any:

@@ -5,9 +5,18 @@ from typing import final
 
 import numpy as np
 
-from rbpf.core.checkpoint import checked
+from rbpf.core.schema import integers, numbers, poses, read
 from rbpf.lie import SE3
 from rbpf.motion.odometry import Odometry
+
+_RECKONING = {
+    "stamp_ns": integers("stamps"),
+    "velocity": numbers(6),
+    "delta": poses(),
+    "cov": numbers(6, 6),
+    "world_from_camera": poses(),
+    "missed": integers(4, least=0),
+}
 
 
 @final
@@ -102,17 +111,9 @@ class DeadReckoning:
 
     @classmethod
     def restored(cls, arrays: dict[str, np.ndarray]) -> "DeadReckoning":
-        """The inverse of `arrays`.
-
-        Raises:
-            InputError: they are not what they should be.
-        """
-        stamps = checked(arrays, "reckoning/stamp_ns", (None,), "i")
-        shapes = {"velocity": (6,), "delta": (7,), "cov": (6, 6), "world_from_camera": (7,)}
-        velocity, delta, cov, world = (
-            checked(arrays, f"reckoning/{name}", shape, "f").copy() for name, shape in shapes.items()
-        )
-        assumed, waiting, hidden, passed_over = checked(arrays, "reckoning/missed", (4,), "i").tolist()
+        """The inverse of `arrays`; errors as `rbpf.core.schema.read`."""
+        stamps, velocity, delta, cov, world, missed = read(arrays, _RECKONING, "reckoning/").values()
+        assumed, waiting, hidden, passed_over = missed.tolist()
         stamp_ns = int(stamps[0]) if stamps.size else None
         motion = Odometry(delta, cov)
         return cls(stamp_ns, velocity, motion, world, assumed, waiting, bool(hidden), passed_over)

@@ -13,10 +13,10 @@ from typing import Any, ClassVar, NamedTuple, final
 
 import numpy as np
 
-from rbpf.core.checkpoint import checked, within
 from rbpf.core.filter import Filter, StepReport
 from rbpf.core.models import NULL, Landmark, Part
 from rbpf.core.particles import Estimate
+from rbpf.core.schema import integers, numbers, poses, read
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.maps.landmark_map import LandmarkMap
@@ -53,6 +53,14 @@ from rbpf.systems.system import (
 
 DOUBTED = 10
 """Pairs at the beginning that are asked whether they look like these cameras' at all."""
+
+_STEREO = {
+    "frames": integers(2, least=0),
+    "front_end": integers(least=0, below="front_ends"),
+    "at_update": poses(),
+    "cov_at_update": numbers(6, 6),
+    "since_update": poses(),
+}
 
 
 @final
@@ -107,13 +115,14 @@ class StereoSlam(System):
     )
     observed = (
         Ragged("z", "pixels (u_left, v, u_right) of the features", (3,)),
-        Ragged("cov_z", "their covariance, px²", (3, 3)),
-        Ragged("kind", "what each is to the map, see `FeatureKind`", kind="int8"),
-        Ragged("landmarks", "landmark of each, −1 where there is none", kind="int64"),
+        Ragged("cov_z", "their covariance, px²", (3, 3), per="z"),
+        Ragged("kind", "what each is to the map, see `FeatureKind`", kind="int8", per="z"),
+        Ragged("landmarks", "landmark of each, −1 where there is none", kind="int64", per="z"),
         Ragged(
             "previous",
             "row of the same point in the last measured pair, by odometry; −1 for none",
             kind="int64",
+            per="z",
         ),
     )
     space = SE3
@@ -347,23 +356,12 @@ class StereoSlam(System):
         }
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """The inverse of `arrays`.
-
-        Raises:
-            InputError: an array is missing, or is not what it should be.
-        """
-        number = int(checked(arrays, "stereo/front_end", (), "i"))
-        if not 0 <= number < len(self._front_ends):
-            raise InputError("the checkpoint is of another kind of frames")
-        self._choose(self._front_ends[number])
-        self.frames, self._last_update = within(
-            arrays, "stereo/frames", 2, 0, np.iinfo(np.int64).max
-        ).tolist()
-        self.at_update = Estimate(
-            checked(arrays, "stereo/at_update", (7,), "f").copy(),
-            checked(arrays, "stereo/cov_at_update", (6, 6), "f").copy(),
-        )
-        self.since_update = checked(arrays, "stereo/since_update", (7,), "f").copy()
+        """The inverse of `arrays`; errors as `rbpf.core.schema.read`."""
+        found = read(arrays, _STEREO, "stereo/", front_ends=len(self._front_ends))
+        self._choose(self._front_ends[int(found["front_end"])])
+        self.frames, self._last_update = found["frames"].tolist()
+        self.at_update = Estimate(found["at_update"], found["cov_at_update"])
+        self.since_update = found["since_update"]
         self.reckoning = DeadReckoning.restored(arrays)
         self.front_end.landmarks.restore(arrays)
         self._kept = self.front_end.pair_of(arrays) if "pair/z" in arrays else None

@@ -11,6 +11,7 @@ import numpy as np
 
 from rbpf import gaussian
 from rbpf.core.models import NULL
+from rbpf.errors import InputError
 from rbpf.sensors.feature_log import FeatureFrame
 
 LEAST = 2
@@ -93,6 +94,10 @@ class _Tracks:
     def _continued(self, before: np.ndarray) -> np.ndarray:
         """Tracks of rows of the last pair; those that have none yet begin there."""
         tracks, numbers = self._last
+        if before.max(initial=-1) >= tracks.size:
+            raise InputError(
+                "the run's log is damaged: a feature follows one that the pair before it has not"
+            )
         fresh = before[tracks[before] < 0]
         tracks[fresh] = self._begin(fresh.size)
         self._append(self._step, tracks[fresh], numbers[fresh])

@@ -1,0 +1,156 @@
+"""Ranges of settings and options, declared at the field and checked when the object is made.
+
+    @dataclass(frozen=True)
+    class Config(Ranged):
+        noise_px: Positive = 1.0
+        cells: Annotated[int, Range(ge=1, le=1000)] = 6
+
+Every number has a range: where none is declared, no number is infinite or larger than `LARGEST`.
+"""
+
+import math
+import os
+from dataclasses import dataclass
+from functools import cache
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+from rbpf.errors import InputError
+
+LARGEST = 1e9
+"""Of any number of which no range says otherwise: larger ones are slips, and their squares spoil what they enter."""
+
+MOST = 10**7
+"""Particles, landmarks or images: more than any machine holds."""
+
+
+@dataclass(frozen=True)
+class Range:
+    """What a number may be.
+
+    Attributes:
+        ge: its lowest value.
+        gt: what it is above.
+        le: its highest value.
+        lt: what it is below.
+        odd: whether it must be odd.
+    """
+
+    ge: float = -LARGEST
+    gt: float = -math.inf
+    le: float = LARGEST
+    lt: float = math.inf
+    odd: bool = False
+
+    def holds(self, value: float) -> bool:
+        """Whether a number is in it; NaN is not."""
+        inside = self.ge <= value <= self.le and self.gt < value < self.lt
+        return inside and (not self.odd or value % 2 == 1)
+
+    def words(self) -> str:
+        """In words."""
+        low = f"above {self.gt:.12g}" if self.gt >= self.ge else f"at least {self.ge:.12g}"
+        high = f" and below {self.lt:.12g}" if self.lt <= self.le else f" and at most {self.le:.12g}"
+        return f"{'odd, ' if self.odd else ''}{low}{'' if math.isinf(self.le) else high}"
+
+
+ANY = Range()
+Positive = Annotated[float, Range(gt=0.0)]
+NotNegative = Annotated[float, Range(ge=0.0)]
+Fraction = Annotated[float, Range(ge=0.0, le=1.0)]
+Rate = Annotated[float, Range(ge=0.0, lt=1.0)]
+Probability = Annotated[float, Range(gt=0.0, lt=1.0)]
+Ratio = Annotated[float, Range(ge=1.0)]
+"""Of the larger to the smaller."""
+Angle = Annotated[float, Range(ge=0.0, le=180.0)]
+"""Degrees."""
+Count = Annotated[int, Range(ge=1, le=MOST)]
+CountOrNone = Annotated[int, Range(ge=0, le=MOST)]
+Seed = Annotated[int, Range(ge=0, le=2**63 - 1)]
+
+
+class Ranged:
+    """A dataclass whose fields are checked by what is declared of them."""
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
+
+
+class SettingError(InputError):
+    """A field has a value that it cannot have.
+
+    Attributes:
+        name: of the field.
+        words: what it must be, and what it is.
+    """
+
+    def __init__(self, name: str, words: str) -> None:
+        super().__init__(f"{name} {words}")
+        self.name, self.words = name, words
+
+
+def check_ranges(settings: Any) -> None:
+    """Refuses a dataclass of which a field has another type than declared, or a number that is out of its range.
+
+    Raises:
+        SettingError: with the field's name, its value and what it may be.
+    """
+    for name, hint in _hints(type(settings)).items():
+        value = getattr(settings, name)
+        expected = _expected(hint, value, ANY)
+        if expected is not None:
+            raise SettingError(name, f"must be {expected}, got {value!r}")
+
+
+def require_memory(size: float, what: str) -> None:
+    """Refuses what does not fit into the machine's memory, before it is allocated.
+
+    Args:
+        size: bytes.
+        what: needs them, for the message.
+
+    Raises:
+        InputError: the machine has less.
+    """
+    memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    if size > memory:
+        raise InputError(
+            f"{what} would take {size / 1e9:.1f} GB of memory, this machine has {memory / 1e9:.1f} GB: take fewer particles"
+        )
+
+
+@cache
+def _hints(kind: type) -> dict[str, Any]:
+    hints = get_type_hints(kind, include_extras=True)
+    return {name: hints[name] for name in kind.__dataclass_fields__ if name in hints}
+
+
+def _expected(hint: Any, value: Any, allowed: Range) -> str | None:
+    """What a value should be, in words; None where it is that, or where nothing is known of the type."""
+    if get_origin(hint) is Annotated:
+        hint, *notes = get_args(hint)
+        allowed = next((note for note in notes if isinstance(note, Range)), allowed)
+    origin = get_origin(hint)
+    if origin in (Union, UnionType):
+        found = [_expected(kind, value, allowed) for kind in get_args(hint)]
+        words = [each for each in found if each is not None]
+        return None if len(words) < len(found) else words[0]
+    if origin is Literal:
+        choices = get_args(hint)
+        return None if any(value == choice for choice in choices) else " or ".join(map(repr, choices))
+    if origin is tuple and isinstance(value, tuple):
+        kinds = [kind for kind in get_args(hint) if kind is not Ellipsis]
+        found = [_expected(kinds[min(k, len(kinds) - 1)], each, allowed) for k, each in enumerate(value)]
+        return next((f"numbers, each {words}" for words in found if words is not None), None)
+    if hint is NoneType:
+        return None if value is None else "none"
+    if hint is bool:
+        return None if isinstance(value, bool | np.bool_) else "true or false"
+    if hint in (int, float):
+        kinds_ = (int, np.integer) if hint is int else (int, float, np.integer, np.floating)
+        fits = isinstance(value, kinds_) and not isinstance(value, bool)
+        what = "a whole number, " if hint is int else ""
+        return None if fits and allowed.holds(value) else f"{what}{allowed.words()}"
+    return None

@@ -1,0 +1,146 @@
+"""Every number among settings and options has a range, declared at its field; what is beyond is one sentence."""
+
+import math
+from dataclasses import fields, is_dataclass
+from typing import Any, get_args, get_type_hints
+
+import pytest
+
+from rbpf.cli import DemoOptions, main, options
+from rbpf.cli.cameras import CalibrateOptions
+from rbpf.cli.judging import CompareOptions, SweepOptions
+from rbpf.core.filter import Filter
+from rbpf.errors import InputError
+from rbpf.lie import SE2
+from rbpf.maps.point import Point
+from rbpf.maps.store import Pool
+from rbpf.motion.odometry import OdometryMotion
+from rbpf.ranges import ANY, Range
+from rbpf.sensors.landmark_sensor import NamedLandmarkSensor
+from rbpf.sensors.range_bearing import RangeBearing
+from rbpf.systems.mono.config import MonoConfig
+from rbpf.systems.range_bearing.config import RangeBearingConfig
+from rbpf.systems.settings import load_settings
+from rbpf.systems.stereo.config import StereoConfig
+from rbpf.validation.colmap.reconstruct import ReconstructionOptions
+from rbpf.validation.simulation.robot import RobotWorld
+
+SYSTEMS = {"mono": MonoConfig, "stereo": StereoConfig, "range-bearing": RangeBearingConfig}
+
+
+def leaves(hint: Any) -> list[Any]:
+    """The types and the notes that a type is made of."""
+    return [hint, *(leaf for part in get_args(hint) for leaf in leaves(part))] if get_args(hint) else [hint]
+
+
+def numbers(kind: type, prefix: str = "") -> list[tuple[str, type, Range]]:
+    """Every number of a dataclass and of its groups: its dotted name, int or float, and its range."""
+    found = []
+    hints = get_type_hints(kind, include_extras=True)
+    for item in fields(kind):
+        parts = leaves(hints[item.name])
+        declared = [part for part in parts if isinstance(part, Range)]
+        number = next((part for part in parts if part in (int, float)), None)
+        if number is not None:
+            found.append((prefix + item.name, number, declared[0] if declared else ANY))
+        elif is_dataclass(item.default_factory):
+            found += numbers(item.default_factory, f"{prefix}{item.name}.")
+    return found
+
+
+EVERY = [(system, *number) for system, kind in SYSTEMS.items() for number in numbers(kind)]
+SIMULATED = (RobotWorld, ReconstructionOptions)
+
+
+def beyond(number: type, allowed: Range) -> list[float]:
+    """Numbers below a range and above it."""
+    step = 1 if number is int else 1e-6
+    low = allowed.gt if allowed.gt >= allowed.ge else allowed.ge - max(step, abs(allowed.ge) * 1e-6)
+    high = allowed.lt if allowed.lt <= allowed.le else allowed.le + max(step, abs(allowed.le) * 1e-6)
+    found = [low, high][: 1 if math.isinf(high) else 2]
+    return [int(value) for value in found] if number is int else found
+
+
+def test_all_of_them_are_looked_at():
+    assert len(EVERY) > 140
+    assert ("stereo", "odometry.estimate.ransac.batch", int) in [entry[:3] for entry in EVERY]
+
+
+@pytest.mark.parametrize(("system", "name", "number", "allowed"), EVERY)
+def test_a_number_that_is_out_of_its_range(system, name, number, allowed):
+    """Through the door that files and --set take; the message has the setting's name, and the value."""
+    limits = beyond(number, allowed)
+    for value in [*limits, "one", "nan", "-inf", *(["inf"] if len(limits) > 1 else [])]:
+        with pytest.raises(InputError, match=rf"^settings: {name}\b.* got ") as caught:
+            load_settings(SYSTEMS[system], system, None, [f"{name}={value}"], {})
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        *(
+            each
+            for each in vars(options).values()
+            if is_dataclass(each) and each.__module__ == options.__name__
+        ),
+        *(DemoOptions, CalibrateOptions, SweepOptions, CompareOptions),
+    ],
+)
+def test_every_number_on_the_command_line_has_a_range(kind):
+    free = {
+        "distortion",
+        "fisheye",
+        "baseline_m",
+        "blackout",
+    }  # judged by the camera and the simulation that take them
+    assert {name for name, _, allowed in numbers(kind) if allowed == ANY} <= free
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["run", "mono", "images", "--seed", "-1"], "--seed must be a whole number, at least 0"),
+        (
+            ["run", "stereo", "pairs", "--particles", "1000000000000"],
+            "--particles must be .* at most 10000000, got 1",
+        ),
+        (["run", "stereo", "pairs", "--batch-limit", "nan"], "--batch-limit must be at least 0 .*, got nan"),
+        (["simulate", "lab", "--out", "lab", "--texel-m", "0"], "--texel-m must be at least 0.0001"),
+        (["simulate", "range-bearing", "--out", "log", "--seed", "-1"], "--seed must be"),
+        (["compare", "a", "b", "--seeds", "0"], "--seeds must be"),
+    ],
+)
+def test_an_option_that_is_out_of_its_range(capsys, arguments, words):
+    assert main(arguments) == 2
+    said = capsys.readouterr().err
+    with pytest.raises(InputError, match=words):
+        raise InputError(said)
+    assert said.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("particles: 3\nseed: 1\nparticles: 4\n", "line 3: particles comes a second time"),
+        ("search:\n  noise_px: 3\n  noise_px: 4\n", "line 3: noise_px comes a second time"),
+        ("\n".join(" " * depth + "a:" for depth in range(1200)), "line 21: .* nested"),
+        ("a: " + "[" * 400_000, "line 1: .* nested"),
+        ("- " * 400_000, "line 1: .* nested"),
+        ("{a: " * 200_000, "line 1: .* nested"),
+    ],
+)
+def test_settings_that_say_a_thing_twice_or_are_nested(tmp_path, text, words):
+    (tmp_path / "config.yaml").write_text(text)
+    with pytest.raises(InputError, match=words):
+        load_settings(MonoConfig, "mono", tmp_path / "config.yaml", (), {})
+
+
+def test_memory_is_estimated_before_it_is_taken():
+    sensor = NamedLandmarkSensor(RangeBearing(SE2), Point(2))
+    with pytest.raises(
+        InputError, match=r"a filter of 10{12} particles would take .* GB of memory, this machine has"
+    ):
+        Filter(OdometryMotion(SE2), sensor, n=10**12)
+    with pytest.raises(InputError, match=r"32 landmarks of 16 numbers in 10{10} particles would take"):
+        Pool(16, 10**10)
