@@ -127,7 +127,7 @@ class ImageRunOptions(RunOptions):
 
     calibration: Where = None
     start: NotNegative = 0.0
-    end: Real = None
+    end: RealPositive = None
     every: Count = 1
     resize: Annotated[Whole, Range(ge=1, le=MOST_PX)] = None
     image_topic: Text = None
