@@ -22,7 +22,7 @@ def main(quick: bool = False, out: Path = Path("out")) -> dict[str, float]:
         simulate_robot(RobotWorld(steps=60 if quick else 200, landmarks=30), Path(folder), seed=0)
         for particles in (10, 300):
             run = filter_recording(RobotRecording(Path(folder)), RangeBearingConfig(particles=particles))
-            found = compare_run(run, instants=1)
+            found = compare_run(run)
             told = found.landmarks.as_dict()
             names = "distances_m", "sigmas", "kullback_leibler", "sigma_ratio"
             rows.append((particles, found.path.rmse, *(told[f"{name}_median"] for name in names)))

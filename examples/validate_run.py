@@ -1,7 +1,7 @@
 """Is this run good, and does it know how good? A run's folder against the truth and against its batch optimum.
 
 The same as `rbpf validate RUN --against groundtruth` and `--against gtsam`: each comparison leaves a JSON file, its
-pictures, and two sentences on top of RUN/report.html.
+pictures, and the two lights on top of RUN/report.html.
 """
 
 from pathlib import Path

@@ -9,24 +9,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from rbpf.errors import InputError
 from rbpf.runs.folder import write_run, write_summary
 from rbpf.runs.plots import draw_run
 from rbpf.runs.provenance import left_out
 from rbpf.runs.reading import RunFolder
 from rbpf.runs.run import Run
-from rbpf.runs.trajectory import in_space, write_tum
+from rbpf.runs.trajectory import write_tum
 from rbpf.runs.truth import LEAST, TRUTH
 from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.feature_log import FeatureLog
-from rbpf.systems.map_estimate import MapEstimate
-from rbpf.validation.metrics.accuracy import ate
-from rbpf.validation.metrics.scores import BATCH, score_landmarks, score_run
+from rbpf.validation.consistency.comparison import clear_comparisons
+from rbpf.validation.metrics.scores import BATCH, is_anonymous, score_landmarks, score_run
 from rbpf.validation.report.page import VIDEO
 from rbpf.validation.report.rerun import write_rerun
-from rbpf.validation.report.validate import report_run
+from rbpf.validation.report.validate import compare_gtsam, report_run
 from rbpf.validation.report.video import PICTURES, write_annotated
 
 MOST = 300_000
@@ -78,6 +75,7 @@ def finish_run(
     wanted = {"video": video, "batch": batch} if run.system.name in PICTURES else {"batch": batch}
     entries = write_run(run, out, dict(sources) | left_out(**wanted))
     (out / BATCH).unlink(missing_ok=True)
+    clear_comparisons(out)
     if batch:
         try:
             entries |= add_batch(RunFolder.open(out), callbacks)
@@ -94,51 +92,41 @@ def finish_run(
     if rerun is not None:
         write_rerun(run, rerun)
     verdict = report_run(out)
-    return entries | {"verdict": verdict.trust, "sentences": [*entries.get("remarks", ()), *verdict.said]}
+    said = [*entries.get("remarks", ()), *verdict.said]
+    return entries | {"path_grade": verdict.path.grade, "verdict": verdict.trust, "sentences": said}
 
 
 def add_batch(found: RunFolder, callbacks: Callbacks) -> dict[str, Any]:
-    """Solves for the batch optimum of a run's measurements, writes batch.tum, and returns its entries of summary.json.
+    """Solves for the batch optimum of a run's measurements, writes batch.tum and the comparison with it.
+
+    Returns:
+        Entries of summary.json.
 
     Raises:
-        InputError: there are too many observations, too few frames are connected, it takes too many iterations, or it does not
-            converge.
+        InputError: there are too many observations, too few frames are connected, it takes too many iterations, or it
+            does not converge.
     """
-    measured = found.measurements
-    if isinstance(measured, FeatureLog):
-        from rbpf.validation.gtsam.batch_problem import STEREO_TOLERANCE
-        from rbpf.validation.gtsam.mono_batch import adjust_log
+    from rbpf.validation.consistency.against_optimisers import solve_run
 
-        stereo = isinstance(measured.camera, RectifiedStereo)
+    measured = found.measurements
+    if isinstance(measured, FeatureLog) and isinstance(measured.camera, RectifiedStereo):
         count = sum(frame.landmarks.size for frame in measured.frames)
-        if stereo and count > MOST:
+        if count > MOST:
             raise InputError(
                 f"the run has {count} observations, more than the {MOST} that are adjusted in batch with it: "
                 "compare it afterwards by rbpf validate RUN --against gtsam"
             )
-        tolerance = STEREO_TOLERANCE if stereo else None
-        adjusted = adjust_log(
-            measured, found.path.mean, callbacks.most_iterations, callbacks.on_iteration, tolerance=tolerance
-        )
-        write_tum(found.folder / BATCH, adjusted.trajectory)
-        return {
-            "batch_frames": int(adjusted.frames.size),
-            "batch_observations": int(sum(frame.landmarks.size for frame in adjusted.log.frames)),
-            "batch_error": float(adjusted.solution.error),
-        }
-    from rbpf.validation.gtsam.batch_problem import AFAR
-    from rbpf.validation.gtsam.robot import solve
-
-    solution = solve(measured, marginals=False, incremental=len(measured.stamps_ns) > AFAR)
-    write_tum(found.folder / BATCH, in_space(measured.stamps_ns, solution.world_from_robot))
-    entries: dict[str, Any] = {"batch_error": float(solution.error)}
-    if (found.folder / TRUTH).is_file() and found.truth.rows.size >= LEAST:
-        ids = np.array(list(solution.landmarks), dtype=np.int64)
-        means = np.array(list(solution.landmarks.values())).reshape(ids.size, -1)
-        dim = found.map.mean.shape[1]
-        points = MapEstimate(ids, means.reshape(-1, dim), np.zeros((ids.size, dim, dim)))
-        reference = in_space(found.path.stamps_ns[found.truth.rows], found.truth.poses)
-        ours = found.trajectory.at(found.truth.rows)
-        start = ate(ours, reference, "rigid").alignment if found.config.get("association") == "ml" else None
-        entries |= {f"batch_{name}": v for name, v in score_landmarks(points, found.truth, start).items()}
-    return entries
+    optimum = solve_run(found, callbacks.most_iterations, callbacks.on_iteration)
+    write_tum(found.folder / BATCH, optimum.estimate.trajectory)
+    entries: dict[str, Any] = {"batch_error": float(optimum.error)}
+    if isinstance(optimum.problem, FeatureLog):
+        entries["batch_frames"] = int(optimum.steps.size)
+        entries["batch_observations"] = int(sum(frame.landmarks.size for frame in optimum.problem.frames))
+    elif (found.folder / TRUTH).is_file() and found.truth.rows.size >= LEAST:
+        scores = score_landmarks(optimum.estimate, found.truth, is_anonymous(found))
+        entries |= {f"batch_{name}": v for name, v in scores.items()}
+    try:
+        figures = compare_gtsam(found, optimum).figures
+    except InputError as error:  # too short, or its camera stays where it began
+        return entries | {"batch_problem": str(error)}
+    return entries | {"filter_minus_batch_rmse_m": figures["filter_minus_batch_rmse_m"]}

@@ -1,35 +1,43 @@
-"""Does the verdict notice what is wrong? Deliberate faults in range-bearing SLAM, judged with and without the truth.
+"""Does the verdict tell the truth? Runs whose fault is known, judged as a run judges itself, and with the truth beside.
 
-A robot drives round among landmarks, several times with other noise. The filter is told the right things, or one thing
-wrongly: the noise of its sensor or of its odometry three times too large or too small, an odometer with a bias of one
-of its standard deviations, a fifth of the observations under wrong names, or derivatives of the measured angle by the
-landmark with the wrong sign. The table counts the verdicts: what can be said from the innovations alone, and what with
-the truth beside. Innovations find every one of these faults, but they never earn "trust": particles that agree on a
-wrong path explain what they see. With the truth beside, a run of a few hundred steps may be too short to tell.
+A robot drives round among landmarks. In eight runs the filter is told one thing wrongly: the noise of its sensor or of its
+odometry too large or too small, an odometer with a bias of one of its standard deviations, a fifth of the sightings under
+wrong names, or derivatives of the measured angle by the landmark with the wrong sign. In two nothing is wrong, and in two
+nothing but that few particles go round in loops, so that they share one past. The last one is a camera without known
+points, whose scale is arbitrary. A run without truth is judged by its innovations and by the batch posterior of its
+measurements. Beside the verdicts stands what they are about: how many poses lie in the 95 % region, and how many times
+larger than claimed the errors of poses and landmarks are; those of the camera in the world of its first pose, which a
+simulation knows exactly.
 """
 
-from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from unittest import mock
 
 import numpy as np
 import tyro
-from matplotlib.figure import Figure
 
+from examples.studies.point_worlds import MONO, DeskWorld, Measuring, simulate_features
 from rbpf.core.models import Jacobians
-from rbpf.lie import SE2
-from rbpf.runs.recordings import filter_robot_log
-from rbpf.runs.truth import truth_at
+from rbpf.lie import SE2, SE3
+from rbpf.runs.folder import write_run
+from rbpf.runs.reading import RunFolder
+from rbpf.runs.recordings import filter_features, filter_robot_log
+from rbpf.runs.run import Run
+from rbpf.runs.truth import RunTruth, write_truth
 from rbpf.sensors.range_bearing import RangeBearing
 from rbpf.sensors.readers import Frame, RobotLog
+from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
-from rbpf.validation.consistency.against_groundtruth import pose_statistics
-from rbpf.validation.consistency.comparison import innovation_statistics
-from rbpf.validation.consistency.statistic import Statistic, whitened_errors
-from rbpf.validation.consistency.verdict import Trust, Verdict, judge
+from rbpf.validation.consistency.against_groundtruth import LANDMARKS, NEES, compare_with_truth, truth_errors
+from rbpf.validation.consistency.against_optimisers import compare_with_batch
+from rbpf.validation.consistency.comparison import compare_with_itself
+from rbpf.validation.consistency.statistic import STATE_FACTOR
+from rbpf.validation.consistency.verdict import Verdict
+from rbpf.validation.report.page import verdict_of
 from rbpf.validation.simulation.robot import RobotWorld, simulated_log
 from rbpf.validation.tables import write_table
 
@@ -79,21 +87,6 @@ def _changed(log: RobotLog, change: Callable[[Frame], Frame]) -> RobotLog:
     return replace(log, frames=[change(frame) for frame in log.frames])
 
 
-RIGHT, JACOBIAN = "nothing", "wrong derivative"
-Fault = Callable[[RobotLog, np.random.Generator], RobotLog]
-FAULTS: dict[str, Fault] = {
-    RIGHT: lambda log, rng: log,
-    "sensor noise × 3": lambda log, rng: scale_sensor_noise(log, 3.0),
-    "sensor noise ÷ 3": lambda log, rng: scale_sensor_noise(log, 1.0 / 3.0),
-    "odometry noise × 3": lambda log, rng: scale_odometry_noise(log, 3.0),
-    "odometry noise ÷ 3": lambda log, rng: scale_odometry_noise(log, 1.0 / 3.0),
-    "odometer bias of 1 σ": lambda log, rng: bias_odometry(log, 1.0),
-    "20 % wrong names": lambda log, rng: swap_names(log, 0.2, rng),
-    JACOBIAN: lambda log, rng: log,
-}
-COLOURS: dict[Trust, str] = {"trust": "tab:green", "cannot tell": "tab:orange", "do not trust": "tab:red"}
-
-
 @contextmanager
 def wrong_derivative() -> Iterator[None]:
     """The measured angle's derivative by the landmark has the wrong sign."""
@@ -109,70 +102,133 @@ def wrong_derivative() -> Iterator[None]:
         yield
 
 
-def judged(log: RobotLog, given: RobotLog, config: RangeBearingConfig) -> tuple[Verdict, Verdict]:
-    """Verdicts on a run over `given`, without the truth and with that of `log`."""
-    done = filter_robot_log(given, config).log
-    own = innovation_statistics(done["nis"], done["nis_dof"], done["correction"], done["cov_correction"])
-    truth = truth_at(log.space, log.truth, done.stamps_ns, "first frame")
-    errors = whitened_errors(log.space, done.poses, done.covs, truth.poses)
-    beside: list[Statistic] = pose_statistics(errors)
-    names = [statistic.name for statistic in beside]
-    return judge("", own), judge("", [*beside, *own], names)
+Fault = Callable[[RobotLog], RobotLog]
+
+LAP, SHORT = RobotWorld(steps=120, landmarks=80), RobotWorld(steps=60, landmarks=80, laps=1.0)
+LOOPS = RobotWorld(steps=300, landmarks=150, radius_m=15.0, extent_m=22.0)
 
 
-def main(
-    runs: int = 8,
-    steps: int = 200,
+@dataclass(frozen=True)
+class Case:
+    """A run of which is known what is wrong with it.
+
+    Attributes:
+        name: what is.
+        run: makes it.
+        wrong: whether anything is.
+    """
+
+    name: str
+    run: Callable[[], Run]
+    wrong: bool = True
+
+
+def robot(
+    fault: Fault = lambda log: log,
     particles: int = 500,
-    out: Path = Path("demo/verdict"),
-    quick: bool = False,
-) -> dict[str, float]:
-    """Counts the verdicts for every fault.
+    world: RobotWorld = LAP,
+    seed: int = 0,
+    derivative: bool = False,
+) -> Callable[[], Run]:
+    """A robot's run."""
+    config = RangeBearingConfig(particles=particles, seed=seed, compiled=not derivative)
+
+    def run() -> Run:
+        with wrong_derivative() if derivative else nullcontext():
+            return filter_robot_log(fault(simulated_log(world, seed)), config)
+
+    return run
+
+
+def camera_without_known_points() -> Run:
+    """A camera in a hand over a desk, of which nothing is known beforehand."""
+    log = simulate_features(DeskWorld(frames=120), Measuring(), MONO, 0)
+    return filter_features(replace(log, known=None), MonoConfig(particles=100))
+
+
+CASES = (
+    Case("sensor noise × 3", robot(lambda log: scale_sensor_noise(log, 3.0))),
+    Case("sensor noise × 2", robot(lambda log: scale_sensor_noise(log, 2.0))),
+    Case("sensor noise ÷ 3", robot(lambda log: scale_sensor_noise(log, 1.0 / 3.0))),
+    Case("odometry noise × 3", robot(lambda log: scale_odometry_noise(log, 3.0))),
+    Case("odometry noise ÷ 3", robot(lambda log: scale_odometry_noise(log, 1.0 / 3.0))),
+    Case("odometer bias of 1 σ", robot(lambda log: bias_odometry(log, 1.0))),
+    Case("20 % wrong names", robot(lambda log: swap_names(log, 0.2, np.random.default_rng(0)))),
+    Case("wrong derivative", robot(derivative=True, particles=200)),
+    Case("nothing", robot(particles=1000, world=SHORT), wrong=False),
+    Case("nothing, another world", robot(particles=1000, world=SHORT, seed=1), wrong=False),
+    Case("30 particles in loops of 94 m", robot(particles=30, world=LOOPS), wrong=False),
+    Case("the same in another world", robot(particles=30, world=LOOPS, seed=1), wrong=False),
+    Case("camera without known points", camera_without_known_points, wrong=False),
+)
+
+
+def judged(run: Run, folder: Path) -> tuple[Verdict, Verdict, dict[str, float]]:
+    """Verdicts on a run without the truth and with it, and what the truth says of it."""
+    write_run(run, folder, {"recording": str(folder)})
+    record = RunFolder.open(folder)
+    own = [compare_with_batch(record)[0], compare_with_itself(record)]
+    beside = compare_with_truth(record, truth_errors(record))
+    verdicts = verdict_of(record, own), verdict_of(record, [beside, *own])
+    if record.truth.alignment != "none":
+        write_truth(folder, from_first_pose(record))
+        beside = compare_with_truth(record, truth_errors(RunFolder.open(folder)))
+    return *verdicts, {statistic.name: statistic.value for statistic in beside.statistics}
+
+
+def from_first_pose(record: RunFolder) -> RunTruth:
+    """A truth that is exact, in the world that begins with the run's first pose, and in the run's scale."""
+    truth, ours = record.truth, record.path.mean[record.truth.rows]
+    begin = SE3.compose(ours[0], SE3.inverse(truth.poses[0]))
+    poses = SE3.compose(begin, truth.poses)
+    out, true = ours[:, 4:] - ours[0, 4:], poses[:, 4:] - ours[0, 4:]
+    scale = float((out * true).sum() / np.square(true).sum())
+    poses[:, 4:] = ours[0, 4:] + scale * true
+    moved = {name: SE3.transform(begin, point) for name, point in truth.landmarks.items()}
+    points = {name: ours[0, 4:] + scale * (point - ours[0, 4:]) for name, point in moved.items()}
+    return RunTruth(truth.rows, poses, points)
+
+
+def is_right(case: Case, verdict: Verdict, found: Mapping[str, float]) -> bool:
+    """Whether a verdict is true of a run.
+
+    What is wrong with a model makes a run that is not to be trusted, whatever its errors. Otherwise it is so where poses or
+    landmarks err more than `STATE_FACTOR` times what is claimed. A side that is named must be that of the errors.
 
     Args:
-        runs: recordings for each fault.
-        steps: of each recording.
-        particles: of the filter.
-        out: folder for picture and table.
-        quick: two recordings and few particles.
+        case: of the run.
+        verdict: on it.
+        found: what the truth says of it.
     """
-    runs, particles = (2, 200) if quick else (runs, particles)
-    counts: dict[tuple[str, str], Counter[str]] = {}
-    for name, fault in FAULTS.items():
-        config = RangeBearingConfig(particles=particles, compiled=name != JACOBIAN)
-        for seed in range(runs):
-            log = simulated_log(RobotWorld(steps=steps), seed)
-            with wrong_derivative() if name == JACOBIAN else nullcontext():
-                given = fault(log, np.random.default_rng(seed))
-                verdicts = judged(log, given, replace(config, seed=seed))
-            for how, verdict in zip(("innovations", "truth"), verdicts, strict=True):
-                counts.setdefault((name, how), Counter())[verdict.trust] += 1
-                if seed == 0:
-                    print(f"{name}, by the {how}: {verdict.sentences[1]}")
-    header = ["what is wrong", "judged by", *COLOURS]
-    rows = [[name, how, *(count[trust] for trust in COLOURS)] for (name, how), count in counts.items()]
+    most = max(np.sqrt(found[name]) for name in (NEES, LANDMARKS) if name in found)
+    aside = {"over-confident": most > 1.0, "cautious": most < 1.0, "": True}[verdict.leaning]
+    distrusted = verdict.trust == "do not trust"
+    return bool(aside and distrusted == (case.wrong or most > STATE_FACTOR))
+
+
+def main(out: Path = Path("demo/verdict"), quick: bool = False) -> dict[str, bool]:
+    """Prints the table of the verdicts.
+
+    Args:
+        out: folder for the table.
+        quick: only three of the cases.
+    """
+    rows, right = [], {}
+    for case in CASES[2:10:3] if quick else CASES:
+        with TemporaryDirectory() as folder:
+            alone, beside, found = judged(case.run(), Path(folder))
+        print(f"{case.name}: {alone.sentences[1]} With the truth: {beside.sentences[1]}")
+        told = [f"{verdict.trust} {verdict.leaning}".strip() for verdict in (alone, beside)]
+        inside = found.get("poses inside the 95 % region", float("nan"))
+        ratios = [float(np.sqrt(found.get(name, float("nan")))) for name in (NEES, LANDMARKS)]
+        right[case.name] = all(is_right(case, verdict, found) for verdict in (alone, beside))
+        rows.append([case.name, 100.0 * inside, *ratios, *told, "yes" if right[case.name] else "no"])
+    header = [
+        "what is wrong", "in the 95 % region, %", "poses, × claimed", "landmarks, × claimed", "as a run judges itself",
+        "with the truth", "right",
+    ]  # fmt: skip
     write_table(out / "verdicts.csv", header, rows)
-    draw(counts, runs, out / "verdicts.png")
-    return {
-        f"{name}, {how}, {trust}": count[trust] / runs
-        for (name, how), count in counts.items()
-        for trust in COLOURS
-    }
-
-
-def draw(counts: dict[tuple[str, str], Counter[str]], runs: int, path: Path) -> None:
-    """Stacked shares of the verdicts."""
-    figure = Figure(figsize=(12.0, 4.5), layout="constrained")
-    for axes, how in zip(figure.subplots(1, 2, sharey=True), ("innovations", "truth"), strict=True):
-        names = [name for name, by in counts if by == how][::-1]
-        left = np.zeros(len(names))
-        for trust, colour in COLOURS.items():
-            fraction = np.array([counts[name, how][trust] / runs for name in names])
-            axes.barh(names, fraction, left=left, color=colour, label=trust)
-            left += fraction
-        axes.set(title=f"judged by the {how}", xlabel=f"fraction of {runs} runs", xlim=(0.0, 1.0))
-        axes.legend(fontsize="small", loc="lower right")
-    figure.savefig(path, dpi=110)
+    return right
 
 
 if __name__ == "__main__":

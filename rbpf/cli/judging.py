@@ -31,7 +31,7 @@ class ValidateOptions(Printed):
 
 
 def validate(options: Annotated[ValidateOptions, tyro.conf.arg(name="")]) -> None:
-    """Compare a run with the truth or an optimum: JSON, pictures, and two sentences on top of its report."""
+    """Compare a run with the truth or an optimum: JSON, pictures, and the two lights on top of its report."""
     from rbpf.validation.consistency.comparison import read_comparisons
     from rbpf.validation.report.validate import validate as compare
 
@@ -39,7 +39,9 @@ def validate(options: Annotated[ValidateOptions, tyro.conf.arg(name="")]) -> Non
         verdict = compare(options.run, options.against, options.out)
     # The page's first sentence is about the truth where there is one; who asked for another comparison wants that one.
     asked = [c.accuracy for c in read_comparisons(options.run) if c.against == options.against]
-    _tell(verdict, options.run, options.json, *(found for found in asked if found not in verdict.accuracy))
+    _tell(
+        verdict, options.run, options.json, *(found for found in asked if found not in verdict.path.sentence)
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +64,12 @@ def report(options: Annotated[ReportOptions, tyro.conf.arg(name="")]) -> None:
 
 def _tell(verdict: "Verdict", run: Path, as_json: bool, *first: str) -> None:
     page, said = run / "report.html", [*first, *verdict.said]
-    entries = {"trust": verdict.trust, "sentences": said, "report": str(page)}
+    entries = {
+        "path_grade": verdict.path.grade,
+        "trust": verdict.trust,
+        "sentences": said,
+        "report": str(page),
+    }
     answer(entries, as_json, *said, f"the page is {page}")
 
 

@@ -1,17 +1,18 @@
 """Pictures of a run of any system, from its folder, drawn without a screen: one set for all.
 
-path.png        the path beside the truth, the odometry and the batch optimum, in the run's own world
+path.png        the path beside the truth, the odometry and the batch optimum
 map.png         landmarks with 3σ ellipses, rays, known points
 particles.png   the last frame's particles
 error.png       error of the position along the truth's axes beside what the filter itself believes
 tracking.png    what was looked for and found, effective sample size, innovations (a robot's: ess.png)
 timings.png     time per frame by stage
 
+All are drawn in one world, the truth's where the recording has one (`World`).
 A further figure of every run is one function from `RunFolder` to a matplotlib figure, entered into `FIGURES`.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +22,10 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.files import whole
 from rbpf.runs.reading import FilteredPath, RunFolder
-from rbpf.runs.trajectory import align, associate, fit, in_space, read_tum
-from rbpf.runs.truth import TRUTH
+from rbpf.runs.trajectory import Alignment, Similarity, Trajectory, associate, fit, in_space, read_tum
+from rbpf.runs.truth import LEAST, TRUTH
 from rbpf.sensors.feature_log import FeatureLog
+from rbpf.systems.map_estimate import MapEstimate
 
 SIGMAS = 3.0
 COLOURS = {
@@ -64,14 +66,14 @@ def draw_run(found: RunFolder) -> list[str]:
 
 def path_figure(found: RunFolder) -> Any:
     """The path, beside what there is to compare it with."""
-    views, path = Views.of(found), found.trajectory
-    figure, shown = views.axes(f"{found.name}: path")
-    curves = []
-    if (found.folder / TRUTH).is_file():
-        curves.append(("truth", *truth_in_world(found), "--"))
+    world = World.of(found)
+    path = world.of_filter(found)
+    figure, shown = Views.of(found.system, path).axes(f"{found.name}: path in {world.name}")
+    curves = [] if world.truth is None else [("truth", world.truth.positions, "truth", "--")]
     for name, label_ in (("odometry", "odometry alone"), ("batch", "batch optimum")):
         if (found.folder / f"{name}.tum").is_file():
-            curves.append((name, read_tum(found.folder / f"{name}.tum").positions, label_, "-"))
+            moved = world.brought(read_tum(found.folder / f"{name}.tum"))
+            curves.append((name, moved.positions, label_, "-"))
     lost = lost_frames(found)
     for axes, (right, up) in shown:
         for name, at, label_, style in (*curves, ("filter", path.positions, "filter", "-")):
@@ -86,10 +88,11 @@ def path_figure(found: RunFolder) -> Any:
 
 def map_figure(found: RunFolder) -> Any:
     """Path and map: points with 3σ ellipses, rays, known points."""
-    views, landmarks, at = Views.of(found), found.map, found.trajectory.positions
-    figure, shown = views.axes(f"{found.name}: map with {SIGMAS:g}σ ellipses")
-    points, more = landmarks.points(), (0, 3 - landmarks.mean.shape[1])
-    mean, cov = np.pad(points.mean, ((0, 0), more)), np.pad(points.cov, ((0, 0), more, more))
+    world = World.of(found)
+    path, motion = world.of_filter(found), world.motion(found.trajectory)
+    figure, shown = Views.of(found.system, path).axes(f"{found.name}: {SIGMAS:g}σ map in {world.name}")
+    landmarks, at = moved_map(found.map, motion), path.positions
+    mean, cov = landmarks.points().in_space()
     middle = np.median(np.concatenate([mean, at]), axis=0)
     far = np.linalg.norm(mean - middle, axis=1)
     near = far <= np.quantile(far, MAP_FRACTION) if far.size else np.zeros(0, dtype=bool)
@@ -106,7 +109,7 @@ def map_figure(found: RunFolder) -> Any:
             lines = axes.plot(ends[..., right].T, ends[..., up].T, color=COLOURS["map"], lw=0.7, alpha=0.7)
             lines[0].set_label("rays (depth not known yet)")
         if known is not None:
-            places = known.positions
+            places = motion.transform(known.positions)
             axes.plot(
                 places[:, right], places[:, up], "+", color=COLOURS["known"], ms=9, label="known points"
             )
@@ -118,10 +121,13 @@ def map_figure(found: RunFolder) -> Any:
 def particles_figure(found: RunFolder) -> Any:
     """Particles of the last frame, and mean and covariance of the position."""
     poses, weights = found.particles
-    views, path = Views.of(found), found.path
-    figure, shown = views.axes(f"{found.name}: {len(poses)} particles at the last frame")
-    at = in_space(np.zeros(len(poses), dtype=np.int64), poses).positions
-    mean, cov = path.trajectory().positions[-1], position_covariances(path)[-1]
+    world = World.of(found)
+    path, motion = world.of_filter(found), world.motion(found.trajectory)
+    title = f"{found.name}: {len(poses)} particles at the last frame"
+    figure, shown = Views.of(found.system, path).axes(title)
+    at = motion.transform(in_space(np.zeros(len(poses), dtype=np.int64), poses).positions)
+    turn = motion.scale * motion.rotation
+    mean, cov = path.positions[-1], turn @ position_covariances(found.path)[-1] @ turn.T
     for axes, (right, up) in shown:
         axes.scatter(
             at[:, right], at[:, up], s=1000 * weights, color=COLOURS["filter"], alpha=0.5,
@@ -150,7 +156,7 @@ def error_figure(found: RunFolder) -> Any | None:
     cov = turned @ position_covariances(path)[rows] @ turned.T
     band = SIGMAS * np.sqrt(np.maximum(np.einsum("taa->ta", cov), 0.0))
     used = [axis for axis in range(3) if error[:, axis].any() or band[:, axis].any()] or [0]
-    name = "no alignment" if how == "none" else f"after the {how} alignment"
+    name = "no alignment" if how == "none" else f"after a {how} alignment of each"
     unit, word = (1e3, "mm") if np.abs(error).max(initial=0.0) < 1.0 else (1.0, "m")
     figure, panels = stacked_axes(len(used), f"{found.name}: error of the position, {name}")
     batch = None
@@ -242,15 +248,53 @@ FIGURES: Mapping[str, Callable[[RunFolder], Any | None]] = {
 }
 
 
-def truth_in_world(found: RunFolder) -> tuple[np.ndarray, str]:
-    """True positions (R, 3) in the run's own world, and what was done to them, for the legend."""
-    truth, path = found.truth, found.path
-    true = in_space(path.stamps_ns[truth.rows], truth.poses).positions
-    if truth.alignment == "none":
-        return true, "truth"
-    back = align(true, path.trajectory(truth.rows).positions, with_scale=truth.alignment == "similarity")
-    words = "moved and scaled" if truth.alignment == "similarity" else "moved"
-    return back.transform(true), f"truth, {words} onto the filter"
+@dataclass(frozen=True)
+class World:
+    """The world in which all pictures of a run are drawn: the truth's where the recording has one, else the run's own.
+
+    Attributes:
+        name: in words.
+        alignment: by which filter, odometry and batch are brought there, each by its own.
+        truth: at the frames that have one; None without.
+    """
+
+    name: str = "the run's own world"
+    alignment: Alignment = "none"
+    truth: Trajectory | None = None
+
+    @classmethod
+    def of(cls, found: RunFolder) -> "World":
+        """Of a run."""
+        if not (found.folder / TRUTH).is_file():
+            return cls()
+        truth = found.truth
+        how = "" if truth.alignment == "none" else f", {truth.alignment} alignment"
+        reference = in_space(found.path.stamps_ns[truth.rows], truth.poses)
+        return cls(f"the truth's world{how}", truth.alignment, reference)
+
+    def motion(self, estimate: Trajectory) -> Similarity:
+        """What brings an estimate here; nothing moves one that has too few frames with a true pose."""
+        if self.truth is not None and self.alignment != "none":
+            ours, true = associate(estimate, self.truth, 0)
+            if len(ours) >= LEAST:
+                return fit(self.alignment, ours.positions, true.positions)
+        return Similarity(1.0, np.eye(3), np.zeros(3))
+
+    def brought(self, estimate: Trajectory) -> Trajectory:
+        """An estimate, here."""
+        return estimate.transformed(self.motion(estimate))
+
+    def of_filter(self, found: RunFolder) -> Trajectory:
+        """The filtered path, here."""
+        return self.brought(found.trajectory)
+
+
+def moved_map(found: MapEstimate, motion: Similarity) -> MapEstimate:
+    """A map by a similarity; one of the plane by what that does there."""
+    motion = motion.in_dimension(found.mean.shape[1])
+    turn = motion.scale * motion.rotation
+    ends = None if found.ray_ends is None else motion.transform(found.ray_ends)
+    return replace(found, mean=motion.transform(found.mean), cov=turn @ found.cov @ turn.T, ray_ends=ends)
 
 
 def position_covariances(path: FilteredPath) -> np.ndarray:
@@ -265,12 +309,19 @@ def position_covariances(path: FilteredPath) -> np.ndarray:
 
 
 def lost_frames(found: RunFolder) -> np.ndarray:
-    """(T,) bool: where the run's own diagnostics say that it was lost."""
+    """(T,) bool: where the run's own diagnostics say that it was lost, or that its motion was only assumed."""
     try:
         table = found.table("diagnostics.csv")
     except InputError:
         table = {}
-    return table.get("lost", np.zeros(len(found.path.mean))).astype(bool)
+    return table.get("lost", table.get("assumed", np.zeros(len(found.path.mean)))) > 0
+
+
+def tracking_losses(found: RunFolder) -> tuple[int | None, int]:
+    """In how many frames a run was lost, and their number; None of a system that cannot be."""
+    table = found.table("diagnostics.csv")
+    able = "lost" in table or "assumed" in table
+    return (int(lost_frames(found).sum()) if able else None), len(found.path.mean)
 
 
 @dataclass(frozen=True)
@@ -288,13 +339,12 @@ class Views:
     down: bool = False
 
     @classmethod
-    def of(cls, found: RunFolder) -> "Views":
-        """For a run: of a robot z is up, of a camera what its images' rows are square to."""
-        if found.path.space.dim == 3:
-            return cls((0, 1), None)
-        if found.system == "range-bearing":
-            return cls((0, 1), (0, 2))
-        return cls.of_camera(found.path.mean)
+    def of(cls, system: str, path: Trajectory) -> "Views":
+        """For a path of a system: of a robot z is up, of a camera what its images' rows are square to."""
+        if system == "range-bearing":
+            flat = not np.ptp(path.positions[:, 2]) > 0.0
+            return cls((0, 1), None if flat else (0, 2))
+        return cls.of_camera(path.world_from_body)
 
     @classmethod
     def of_camera(cls, world_from_camera: np.ndarray) -> "Views":

@@ -43,6 +43,10 @@ class Similarity:
         x = np.asarray(points, dtype=float)
         return self.scale * np.einsum("ij,...j->...i", self.rotation, x) + self.translation
 
+    def in_dimension(self, dim: int) -> "Similarity":
+        """The same for points of the plane z = 0 where `dim` is 2, of a similarity that keeps that plane."""
+        return Similarity(self.scale, self.rotation[:dim, :dim], self.translation[:dim], self.unique)
+
     def transform_poses(self, world_from_body: Array) -> Array:
         """Poses (..., 7) in the estimate's world, as poses in the reference's; only for D = 3."""
         motion = np.column_stack([self.rotation, self.translation])
@@ -93,6 +97,11 @@ class Trajectory:
     def positions(self) -> Array:
         """(T, 3) positions of the body in the world [m]."""
         return self.world_from_body[:, 4:]
+
+    @property
+    def spread(self) -> float:
+        """Root mean square distance of the positions from their centre [m]."""
+        return float(np.sqrt(np.square(self.positions - self.positions.mean(axis=0)).sum(axis=1).mean()))
 
     def at(self, rows: NDArray[np.intp]) -> "Trajectory":
         """The poses of some rows, in order of time."""

@@ -39,6 +39,11 @@ class MapEstimate:
         """(M,) bool, whether the depth is not known yet."""
         return np.asarray(self.columns.get("ray", np.zeros(self.ids.size))) != 0
 
+    def in_space(self, rows: np.ndarray | slice = slice(None)) -> tuple[np.ndarray, np.ndarray]:
+        """Positions (M, 3) and covariances (M, 3, 3) of some rows; a map of the plane lies at z = 0."""
+        more = 0, 3 - self.mean.shape[1]
+        return np.pad(self.mean[rows], ((0, 0), more)), np.pad(self.cov[rows], ((0, 0), more, more))
+
     def points(self) -> "MapEstimate":
         """The landmarks that are points."""
         if "ray" not in self.columns:

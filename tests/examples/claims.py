@@ -206,11 +206,8 @@ def validate_run(figures: dict[str, str]) -> None:
     assert set(figures.values()) <= {"trust", "cannot tell"}
 
 
-def verdict(figures: dict[str, float]) -> None:
-    assert figures["nothing, innovations, do not trust"] == 0.0
-    assert figures["nothing, truth, do not trust"] == 0.0
-    for name, fraction in figures.items():
-        assert name.startswith("nothing") or not name.endswith(", do not trust") or fraction == 1.0
+def verdict(figures: dict[str, bool]) -> None:
+    assert figures and all(figures.values())
 
 
 def target_tracking(figures: dict[str, dict[str, float]]) -> None:

@@ -11,7 +11,6 @@ from examples.studies.joint_ekf import joint_ekf
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3
 from rbpf.sensors.readers.measurements import InitialEstimate, dead_reckoning, initial_estimate
-from rbpf.validation.gtsam.batch_problem import first_steps
 from rbpf.validation.gtsam.robot import CHUNK, Problem, solve, solve_online
 from rbpf.validation.gtsam.solvers import PLANAR, SPATIAL
 from tests.validation.factors import check_derivatives
@@ -144,6 +143,15 @@ def test_any_start_near_by_leads_to_the_same_optimum():
     for found in (solve(m, initial=InitialEstimate(moved, points)), solve(m, incremental=True)):
         assert found.error == pytest.approx(expected.error, rel=1e-9)
         assert np.abs(SE3.local(expected.world_from_robot, found.world_from_robot)).max() < 1e-6
+
+
+def first_steps(m, count):
+    """What had been measured after so many steps."""
+    rows = m.steps < count
+    kept = {name: getattr(m, name)[rows] for name in ("steps", "landmarks", "z", "cov_z")}
+    return replace(
+        m, stamps_ns=m.stamps_ns[:count], deltas=m.deltas[: count - 1], covs=m.covs[: count - 1], **kept
+    )
 
 
 @pytest.mark.parametrize("singular", [False, True])

@@ -9,7 +9,9 @@ from rbpf.validation.consistency.statistic import (
     correlation_time,
     coverage,
     degrees_of_freedom,
+    map_ratio,
     motion_statistics,
+    posterior_ratio,
     step_ratio,
     variance_ratio,
 )
@@ -163,3 +165,42 @@ def test_a_series_too_short_or_constant_has_no_correlation_time_of_its_own():
     assert correlation_time(np.array([1.0, 2.0])) == 1.0
     assert correlation_time(np.full(50, 2.0)) == 1.0
     assert correlation_time(np.zeros(0)) == 1.0
+
+
+def test_a_filter_that_is_exact_is_what_the_posterior_expects():
+    """A random walk with fixes: the Kalman filter's online estimates beside the smoother's of all fixes."""
+    rng, steps = np.random.default_rng(0), 400
+    truth = np.cumsum(rng.normal(size=steps))
+    fixes = truth + rng.normal(size=steps)
+    mean, var = np.zeros(steps), np.zeros(steps)
+    before, spread = 0.0, 0.0
+    for t in range(steps):
+        prior = spread + 1.0
+        gain = prior / (prior + 1.0)
+        before, spread = before + gain * (fixes[t] - before), (1.0 - gain) * prior
+        mean[t], var[t] = before, spread
+    smooth, smooth_var = mean.copy(), var.copy()
+    for t in range(steps - 2, -1, -1):
+        gain = var[t] / (var[t] + 1.0)
+        smooth[t] += gain * (smooth[t + 1] - mean[t])
+        smooth_var[t] += gain**2 * (smooth_var[t + 1] - var[t] - 1.0)
+    posterior, delta = smooth_var[:, None, None], (smooth - mean)[:, None]
+    for factor, outcome in ((1.0, "supports"), (1 / 9, "contradicts"), (9.0, "contradicts")):
+        found = posterior_ratio("x", factor * var[:, None, None], posterior, delta)
+        assert found.value == pytest.approx(1.0 / factor, rel=0.1)
+        assert found.outcome == outcome
+    last = posterior_ratio("x", var[-1:, None, None], posterior[-1:], delta[-1:], same_data=True)
+    assert last.low == last.value == last.high == pytest.approx(1.0)
+    assert posterior_ratio("x", np.zeros((3, 2, 2)), np.zeros((3, 2, 2)), np.ones((3, 2))) is None
+
+
+def test_a_map_that_is_turned_is_one_error_however_many_landmarks_it_has():
+    rng = np.random.default_rng(1)
+    places = rng.uniform(-5.0, 5.0, size=(200, 2))
+    turned = 0.3 * places[:, ::-1] * [1.0, -1.0]
+    own = rng.normal(size=(200, 2))
+    assert map_ratio("x", places, turned).samples == pytest.approx(6.0, rel=0.01)
+    assert map_ratio("x", places, own).samples > 300.0
+    assert map_ratio("x", places, 3.0 * own).outcome == "contradicts"
+    assert map_ratio("x", places, own).outcome == "supports"
+    assert map_ratio("x", places, 2.0 * turned + 0.1 * own).outcome == "leaves open"

@@ -55,8 +55,8 @@ def page(folder) -> str:
 def test_a_finished_run_has_its_verdict_on_top(finished):
     text = page(finished)
     top = text[text.index('class="verdict') : text.index("<h2>")]
-    assert "from the truth" in top
-    assert "uncertainty" in top
+    assert top.count('class="verdict ') == 2 and "<b>Path: fair</b>" in top and "<b>Uncertainty: " in top
+    assert "from the truth" in top and "Pictures are in the truth&#39;s world." in top
     assert text.count("data:image/png;base64,") >= 9
     assert "http" not in text.replace("http-equiv", "")
     entries = json.loads((finished / "validation_groundtruth.json").read_text())
@@ -68,7 +68,8 @@ def test_errors_are_those_of_the_run_itself(finished):
     errors = truth_errors(record)
     summary = record.summary
     assert errors.positions.rmse == pytest.approx(summary["path_rmse_m"])
-    landmark = np.linalg.norm(errors.landmarks.errors, axis=1).mean()
+    assert errors.positions.rmse == pytest.approx(summary["position_rmse_m"])
+    landmark = np.linalg.norm(errors.landmarks.map.mean - errors.landmarks.truth, axis=1).mean()
     assert landmark == pytest.approx(summary["landmark_error_mean_m"])
     path, truth = record.path, record.truth
     last = path.space.local(path.mean[-1], truth.poses[-1])
@@ -84,9 +85,9 @@ def test_gtsam_stands_beside(run_folder, tmp_path, capsys):
     residuals = next(s for s in entries["statistics"] if s["name"].startswith("residuals"))
     assert 0.7 < residuals["value"] < 1.3
     figures = entries["figures"]
-    assert figures["landmarks_count"] == figures["landmarks_compared"]
+    assert figures["landmarks_count"] > 10
     assert 0.0 < figures["landmarks_kullback_leibler_median"] < 5.0
-    assert 0.0 < figures["poses_bhattacharyya_median"] < 5.0 and figures["poses_count"] == 3
+    assert 0.0 < figures["poses_bhattacharyya_median"] < 5.0 and figures["poses_count"] == 1
     assert 0.5 < figures["landmarks_sigma_ratio_median"] < 1.5
     assert figures["batch_log_likelihood"] > figures["filter_log_likelihood"] - 5.0
     assert "Against gtsam" in page(run_folder)
@@ -178,17 +179,18 @@ def test_a_damaged_comparison_is_said_on_the_page(run_folder):
     assert page(run_folder).count('class="problem"') == 2
 
 
-def test_a_run_without_truth_is_compared_with_the_batch_optimum_that_it_found_or_with_nothing(run_folder):
+def test_a_run_without_truth_is_judged_by_the_batch_posterior_that_it_found_or_by_nothing(run_folder):
     (run_folder / "truth.npz").unlink()
     (run_folder / "validation_groundtruth.json").unlink()
-    summary = json.loads((run_folder / "summary.json").read_text())
-    apart = 1e3 * summary.pop("filter_minus_batch_rmse_m")
+    apart = 1e3 * json.loads((run_folder / "summary.json").read_text())["filter_minus_batch_rmse_m"]
     verdict = write_report(run_folder)
-    assert "from the truth is not known" in verdict.accuracy
-    assert f"it is {apart:.3g} mm (rms) from the batch optimum" in verdict.accuracy
+    assert f"is {apart:.3g} mm (rms) from the batch optimum" in verdict.path.sentence
+    assert "from the truth is not known" in verdict.path.sentence and verdict.path.grade == "good"
+    assert "against the batch optimum: " in verdict.reason and verdict.trust != "cannot tell"
+    (run_folder / "validation_gtsam.json").unlink()
+    verdict = write_report(run_folder)
+    assert "compared with nothing" in verdict.path.sentence and verdict.path.grade == "not known"
     assert verdict.trust in ("cannot tell", "do not trust")
-    (run_folder / "summary.json").write_text(json.dumps(summary))
-    assert "compared with nothing" in write_report(run_folder).accuracy
 
 
 def test_a_further_comparison_is_one_function(run_folder, monkeypatch):

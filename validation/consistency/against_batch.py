@@ -3,9 +3,9 @@
 Frame and chart. Both are given in the run's own world. A pose's covariance is carried from the chart at the filter's
 pose to that at the optimum's: with δ = Log(T_b⁻¹ T_f), P ← J_r⁻¹(δ) P J_r⁻ᵀ(δ).
 
-What is conditioned on what. The map and the last pose know the same measurements in filter and batch. An earlier online
-pose knows its past only, the optimum's also its future: poses are therefore compared, at a few instants, with the
-optimum of what had been measured until then.
+What is conditioned on what. The map and the last pose know the same measurements in filter and batch, and are compared as
+Gaussians. An earlier online pose knows its past only, the optimum's also its future: of it the squared error is told that
+the optimum's posterior expects, see `rbpf.validation.consistency.statistic.posterior_ratio`.
 
 Gauge. One camera without known points does not measure the scale: the filter's is its prior's, the batch's is held.
 Both begin at the same first pose; the filter is scaled about it, so that its path fits the optimum's best, and
@@ -23,11 +23,11 @@ from rbpf.errors import InputError
 from rbpf.lie import Array
 from rbpf.runs.reading import PathAndMap, RunFolder
 from rbpf.runs.run import Run
+from rbpf.validation.consistency.statistic import Statistic, posterior_ratio
 from rbpf.validation.gtsam.batch_problem import (
     Fit,
     Optimum,
     Problem,
-    first_steps,
     fit_of,
     floats_in_scale,
     name_of,
@@ -39,19 +39,17 @@ from rbpf.validation.gtsam.batch_problem import (
 from rbpf.validation.metrics.accuracy import AbsoluteError, ate
 from rbpf.validation.metrics.gaussian_differences import (
     Differences,
+    across_of,
+    away_from_first,
     compare_last_pose,
     compare_maps,
-    joined,
     no_differences,
+    projected,
     rescaled,
     scale_onto,
 )
 
-INSTANTS = 3
-"""At how many instants poses are compared, the last one among them."""
-
-MOST_ITERATIONS = 150
-"""Of the batch at an earlier instant; where landmarks are still too far off to settle, that instant is left out."""
+POSES, LANDMARKS = "poses against the batch optimum", "landmarks against the batch optimum"
 
 LEAST_STEPS = 3
 """Of a run that is compared."""
@@ -75,7 +73,7 @@ class AgainstBatch:
         optimum: the batch.
         path: distances of the filter's online positions from the optimum's, per step, without alignment.
         landmarks: Gaussians of the map.
-        poses: Gaussians of the poses at a few instants; none where the covariances are not known.
+        poses: Gaussians of the last pose; none where the covariances are not known.
         fit_filter: of the observations of landmarks that both have, by the filter's online poses and its last map.
         fit_batch: by the optimum.
     """
@@ -90,6 +88,49 @@ class AgainstBatch:
     poses: Differences
     fit_filter: Fit
     fit_batch: Fit
+
+    @property
+    def floats(self) -> bool:
+        """Whether only what a change of scale does not move is compared."""
+        return self.gauge == SCALED
+
+    @property
+    def ours(self) -> PathAndMap:
+        """The filter at the steps of the optimum."""
+        return self.filter.at(self.optimum.steps)
+
+    def statistics(self) -> list[Statistic]:
+        """Whether poses and landmarks are as far from the truth, by the batch's posterior, as the filter says."""
+        cov, cov_batch, delta = self.pose_errors()
+        ours, theirs = self.ours.landmarks, self.optimum.estimate.landmarks
+        _, rows, others = np.intersect1d(ours.ids, theirs.ids, return_indices=True)
+        found = ours.cov[rows], theirs.cov[others], theirs.mean[others] - ours.mean[rows]
+        if self.floats and rows.size:
+            basis = across_of(theirs.mean[others] - self.optimum.estimate.world_from_body[0, 4:])
+            found = projected(basis, found[0]), projected(basis, found[1]), projected(basis, found[2])
+        known = np.isfinite(found[1]).all(axis=(1, 2))
+        own, batch, apart = (values[known] for values in found)
+        pair = (
+            posterior_ratio(POSES, cov, cov_batch, delta),
+            posterior_ratio(LANDMARKS, own, batch, apart, same_data=True),
+        )
+        return [statistic for statistic in pair if statistic is not None]
+
+    def pose_errors(self) -> tuple[Array, Array, Array]:
+        """Of B steps the filter's covariances (B, d, d), the batch's, and its poses from the filter's (B, d).
+
+        All in the chart at the filter's poses; none where the optimum has no covariances.
+        """
+        ours, theirs = self.ours, self.optimum.estimate
+        delta = ours.space.local(ours.world_from_body, theirs.world_from_body)
+        if not (len(theirs.cov_poses) and len(ours.cov_poses)):
+            return ours.cov_poses[:0], ours.cov_poses[:0], delta[:0]
+        carry = ours.space.right_jacobian_inverse(delta)
+        covs = ours.cov_poses, np.asarray(carry @ theirs.cov_poses @ carry.mT)
+        if self.floats:
+            basis = across_of(away_from_first(ours))
+            covs, delta = (projected(basis, covs[0]), projected(basis, covs[1])), projected(basis, delta)
+        return *covs, delta
 
     def as_dict(self) -> dict[str, Any]:
         """Everything for JSON."""
@@ -109,24 +150,23 @@ class AgainstBatch:
         }
 
 
-def compare_run(run: Run, instants: int = INSTANTS, robust: float | None = None) -> AgainstBatch:
+def compare_run(run: Run, robust: float | None = None) -> AgainstBatch:
     """A run in memory beside its batch optimum; see `compare`."""
-    return compare(PathAndMap.of_run(run), problem_of(run), instants, robust)
+    return compare(PathAndMap.of_run(run), problem_of(run), robust)
 
 
-def compare_folder(folder: Path, instants: int = INSTANTS, robust: float | None = None) -> AgainstBatch:
+def compare_folder(folder: Path, robust: float | None = None) -> AgainstBatch:
     """A run folder beside its batch optimum; see `compare`.
 
     Raises:
         InputError: also if the folder is not that of a finished run of this version.
     """
-    return compare(RunFolder.open(folder).estimate, read_problem(folder), instants, robust)
+    return compare(RunFolder.open(folder).estimate, read_problem(folder), robust)
 
 
 def compare(
     filtered: PathAndMap,
     problem: Problem,
-    instants: int = INSTANTS,
     robust: float | None = None,
     optimum: Optimum | None = None,
 ) -> AgainstBatch:
@@ -135,9 +175,8 @@ def compare(
     Args:
         filtered: T poses, one per step of the problem.
         problem: the measurements.
-        instants: at how many poses are compared, each with a batch of its own; 0 compares none.
         robust: Huber's threshold of the batch in standard deviations; None takes all as Gaussian, as the filter does.
-        optimum: of the whole problem, with covariances, where it is known already.
+        optimum: of the problem, where it is known already.
 
     Raises:
         InputError: path and measurements are not of one run, or the batch cannot be solved.
@@ -159,38 +198,12 @@ def compare(
         optimum=optimum,
         path=ate(ours.trajectory, optimum.estimate.trajectory),
         landmarks=compare_maps(ours, optimum.estimate, floats),
-        poses=_compare_poses(filtered, problem, optimum, instants, robust),
+        poses=compare_last_pose(ours, optimum.estimate, int(optimum.steps[-1]), floats)
+        if len(ours.cov_poses) and len(optimum.estimate.cov_poses)
+        else no_differences(filtered.space.dim),
         fit_filter=fit_of(optimum.problem, ours, shared),
         fit_batch=fit_of(optimum.problem, optimum.estimate, shared),
     )
-
-
-def _compare_poses(
-    filtered: PathAndMap, problem: Problem, optimum: Optimum, instants: int, robust: float | None
-) -> Differences:
-    """Online poses beside the last ones of the optima of what had been measured until then."""
-    floats, last = floats_in_scale(problem), int(optimum.steps[-1])
-    start = filtered.world_from_body.copy()
-    start[optimum.steps] = optimum.estimate.world_from_body  # nearer than the filter's own path
-    if not len(filtered.cov_poses) or instants < 1:
-        return no_differences(filtered.space.dim)
-    parts = []
-    for step in np.unique(np.linspace(0, last, instants + 1).astype(int)[1:]).tolist():
-        then = optimum if step == last else _until(problem, step, start, robust)
-        if then is not None and int(then.steps[-1]) == step:
-            ours = filtered.at(then.steps)
-            scale = scale_onto(ours, then.estimate, name_of(problem)) if floats else 1.0
-            parts.append(compare_last_pose(rescaled(ours, scale), then.estimate, step, floats))
-    return joined(parts, filtered.space.dim)
-
-
-def _until(problem: Problem, step: int, start: Array, robust: float | None) -> Optimum | None:
-    """The optimum of what had been measured until then; None where so little does not determine one."""
-    try:
-        part = first_steps(problem, step + 1)
-        return solve_problem(part, start[: step + 1], robust, most_iterations=MOST_ITERATIONS)
-    except InputError:
-        return None
 
 
 def _require_one_run(filtered: PathAndMap, problem: Problem) -> None:

@@ -1,14 +1,24 @@
-"""A run against the ground truth of its recording: errors, and whether they are as large as the filter says."""
+"""A run against the ground truth of its recording: errors, and whether they are as large as the filter says.
 
-from dataclasses import dataclass
+Gauge. A run that lives in the truth's world is compared with it as it is. Otherwise the truth is brought into the run's
+world, where the filter's covariances are told: by the rigid motion (after the scale that fits the positions, where the
+recording's is arbitrary) under which the truth is most likely by these covariances. The error that is left is then the
+least that any choice of the world leaves, and is taken for what it is: it can contradict the filter, and supports it only
+if it would also do so without the degrees of freedom that were fitted. Where the scale is arbitrary, errors are counted
+across the line from the first pose, which a change of scale does not move.
+"""
+
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from rbpf.errors import InputError
 from rbpf.lie import SE2
-from rbpf.runs.reading import FilteredPath, RunFolder
-from rbpf.runs.trajectory import associate, in_space, read_tum
+from rbpf.runs.plots import moved_map
+from rbpf.runs.reading import FilteredPath, PathAndMap, RunFolder
+from rbpf.runs.trajectory import Similarity, align, associate, in_space, read_tum
 from rbpf.runs.truth import RunTruth
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.validation.consistency.comparison import Comparison
@@ -18,13 +28,19 @@ from rbpf.validation.consistency.statistic import (
     WhitenedErrors,
     coverage,
     degrees_of_freedom,
+    inverse_roots,
+    map_ratio,
     variance_ratio,
     whitened_errors,
 )
 from rbpf.validation.metrics.accuracy import AbsoluteError, ate, rpe
+from rbpf.validation.metrics.gaussian_differences import across_of, away_from_first, projected
+from rbpf.validation.metrics.scores import is_anonymous
 
 NAME = "groundtruth"
-NEES = "poses against the truth"
+NEES, LANDMARKS = "poses against the truth", "landmarks against the truth"
+
+NO_LANDMARKS = MapEstimate(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
 LEAST = 3
 """Steps with a true pose that a comparison needs."""
 
@@ -43,30 +59,37 @@ class TruthErrors:
         path: filtered poses.
         truth: at the steps `truth.rows`.
         positions: errors of the aligned positions.
-        whitened: errors of the poses in units of the filter's own; None where they are not in one world.
-        landmarks: the map's points whose true places are known, with (M, D) errors; None likewise.
+        whitened: errors of the poses in units of the filter's own.
+        fitted: parameters of the motion that brought the truth into the run's world; 0 where it is there.
+        landmarks: the map's points whose true places are known; None without any.
     """
 
     path: FilteredPath
     truth: RunTruth
     positions: AbsoluteError
-    whitened: WhitenedErrors | None
+    whitened: WhitenedErrors
+    fitted: int
     landmarks: "LandmarkErrors | None"
 
 
 @dataclass(frozen=True)
 class LandmarkErrors:
-    """Landmarks in units of the filter's own deviations.
+    """M landmarks beside their true places.
 
     Attributes:
-        map: M landmarks of the run.
-        errors: (M, D) from the truth, m.
-        squares: (M,) normalised squared errors; a consistent filter's are χ² of D.
+        map: the run's, moved into the truth's world as the path is.
+        truth: (M, D) true places.
+        white: (M, d) errors in units of the filter's own; d is one less than D where the scale is arbitrary.
     """
 
     map: MapEstimate
-    errors: np.ndarray
-    squares: np.ndarray
+    truth: np.ndarray
+    white: np.ndarray
+
+    @property
+    def squares(self) -> np.ndarray:
+        """(M,) normalised squared errors; a consistent filter's are χ² of d."""
+        return np.square(self.white).sum(axis=1)
 
 
 def truth_errors(record: RunFolder, std_m: float = 0.0, std_rad: float = 0.0) -> TruthErrors:
@@ -87,26 +110,67 @@ def truth_errors(record: RunFolder, std_m: float = 0.0, std_rad: float = 0.0) ->
         )
     reference = in_space(path.stamps_ns[truth.rows], truth.poses)
     positions = ate(path.trajectory(truth.rows), reference, truth.alignment)
-    whitened = landmarks = None
+    turns = 1 if path.space.dim == SE2.dim else 3
+    own = np.repeat([std_rad**2, std_m**2], [turns, path.space.dim - turns])
+    mean, cov = path.mean[truth.rows], path.cov[truth.rows] + np.diag(own)
     if truth.alignment == "none":
-        turns = 1 if path.space.dim == SE2.dim else 3
-        own = np.repeat([std_rad**2, std_m**2], [turns, path.space.dim - turns])
-        cov = path.cov[truth.rows] + np.diag(own)
-        whitened = whitened_errors(path.space, path.mean[truth.rows], cov, truth.poses)
-        landmarks = _landmark_errors(record.map.points(), truth)
-    return TruthErrors(path, truth, positions, whitened, landmarks)
+        whitened, moved, fitted = whitened_errors(path.space, mean, cov, truth.poses), truth, 0
+    else:
+        whitened, moved, fitted = _in_gauge(path, mean, cov, truth)
+    landmarks = None if is_anonymous(record) else _landmark_errors(record, moved, positions.alignment)
+    return TruthErrors(path, truth, positions, whitened, fitted, landmarks)
 
 
-def pose_statistics(errors: WhitenedErrors) -> list[Statistic]:
-    """NEES of the poses and coverage of their credible regions; none where all poses are held to be exact."""
+def _in_gauge(
+    path: FilteredPath, mean: np.ndarray, cov: np.ndarray, truth: RunTruth
+) -> tuple[WhitenedErrors, RunTruth, int]:
+    """Errors where the truth has been brought into the run's world, that truth, and how many parameters were fitted."""
+    space, across = path.space, truth.alignment == "similarity"
+    true, ours = (in_space(path.stamps_ns[truth.rows], poses) for poses in (truth.poses, mean))
+    start = align(true.positions, ours.positions, with_scale=across)
+    if space.dim == SE2.dim:
+        plane = start.in_dimension(2)
+        turned = np.array([np.arctan2(plane.rotation[1, 0], plane.rotation[0, 0]), *plane.translation])
+        moved = space.compose(turned, truth.poses)
+    else:
+        plane, moved = start, start.transform_poses(truth.poses)
+    basis = np.broadcast_to(np.eye(space.dim), cov.shape)
+    if across:
+        estimate = PathAndMap(path.stamps_ns, path.mean, path.cov, NO_LANDMARKS)
+        basis = across_of(away_from_first(estimate)[truth.rows])
+    roots, ranks = inverse_roots(projected(basis, cov))
+
+    def errors(motion: np.ndarray) -> np.ndarray:
+        there = space.local(mean, space.compose(space.exp(motion), moved))
+        return np.einsum("tab,tb->ta", roots, projected(basis, there))
+
+    motion = least_squares(lambda x: errors(x).ravel(), np.zeros(space.dim), method="lm").x
+    turn = space.exp(motion)
+    landmarks = {
+        name: space.transform(turn, plane.transform(point)) for name, point in truth.landmarks.items()
+    }
+    there = RunTruth(truth.rows, space.compose(turn, moved), landmarks, truth.alignment)
+    return WhitenedErrors(errors(motion), ranks), there, space.dim
+
+
+def pose_statistics(errors: WhitenedErrors, fitted: int = 0) -> list[Statistic]:
+    """NEES of the poses and coverage of their credible regions; none where all poses are held to be exact.
+
+    Args:
+        errors: of the poses.
+        fitted: parameters that were fitted to make them small: the upper end of the interval is raised by what that takes
+            away from errors that are worth so few degrees of freedom.
+    """
     known = errors.ranks > 0
     if not known.any():
         return []
     dim = errors.errors.shape[1]
     dof, nees = degrees_of_freedom(errors.errors[known]), errors.nees[known]
     ratio = variance_ratio(NEES, float(nees.sum() / errors.ranks[known].sum()), dof, STATE_FACTOR)
+    ratio = replace(ratio, high=ratio.high * (1.0 + fitted / dof))
     full = errors.ranks[known] == dim
-    return [ratio, *(coverage(nees[full], dim, max(dof / dim, 1.0)) if full.any() else [])]
+    samples = max(dof**2 / (dof + fitted) / dim, 1.0)
+    return [ratio, *(coverage(nees[full], dim, samples) if full.any() else [])]
 
 
 def compare_with_truth(record: RunFolder, errors: TruthErrors) -> Comparison:
@@ -123,42 +187,50 @@ def compare_with_truth(record: RunFolder, errors: TruthErrors) -> Comparison:
         "steps_compared": int(truth.rows.size),
         "position_rmse_m": at.rmse,
         "position_max_m": at.max,
+        "path_spread_m": reference.spread,
         "motion_translation_rmse_m": relative.translation_rmse,
         "motion_rotation_rmse_deg": relative.rotation_rmse_deg,
     }
-    if errors.whitened is not None:
-        nees, known = errors.whitened.nees, errors.whitened.ranks > 0
-        figures |= {
-            "pose_nees_mean": float(nees[known].mean()) if known.any() else 0.0,
-            "pose_nees_median": float(np.median(nees[known])) if known.any() else 0.0,
-            "pose_nees_right": float(errors.whitened.ranks[known].mean()) if known.any() else 0.0,
-        }
+    nees, known = errors.whitened.nees, errors.whitened.ranks > 0
+    statistics = pose_statistics(errors.whitened, errors.fitted)
+    figures |= {
+        "pose_nees_mean": float(nees[known].mean()) if known.any() else 0.0,
+        "pose_nees_median": float(np.median(nees[known])) if known.any() else 0.0,
+        "pose_nees_right": float(errors.whitened.ranks[known].mean()) if known.any() else 0.0,
+    }
     if errors.landmarks is not None:
+        found = errors.landmarks
         figures |= {
-            "landmarks_compared": int(errors.landmarks.squares.size),
-            "landmark_rmse_m": float(np.sqrt(np.square(errors.landmarks.errors).sum(axis=1).mean())),
-            "landmark_nees_mean": float(errors.landmarks.squares.mean()),
-            "landmark_nees_right": float(errors.landmarks.errors.shape[1]),
+            "landmarks_compared": len(found.truth),
+            "landmark_rmse_m": float(np.sqrt(np.square(found.map.mean - found.truth).sum(axis=1).mean())),
+            "landmark_nees_mean": float(found.squares.mean()),
+            "landmark_nees_right": float(found.white.shape[1]),
         }
+        statistics.append(map_ratio(LANDMARKS, found.truth, found.white))
     # The batch optimum's positions at the same steps, aligned in the same way, where the run has one.
     if (record.folder / "batch.tum").is_file():
         batch, beside = associate(read_tum(record.folder / "batch.tum"), reference, 0)
         rmse = ate(batch, beside, truth.alignment).rmse
         figures["batch_position_rmse_m"] = rmse
         accuracy += f"; the batch optimum of the same measurements is {_metres(rmse)} from it"
-    statistics = [] if errors.whitened is None else pose_statistics(errors.whitened)
     return Comparison(NAME, f"{accuracy}.", figures, statistics)
 
 
-def _landmark_errors(found: MapEstimate, truth: RunTruth) -> LandmarkErrors | None:
-    kept = np.array([name in truth.landmarks for name in found.ids.tolist()], dtype=bool)
+def _landmark_errors(record: RunFolder, truth: RunTruth, world: Similarity) -> LandmarkErrors | None:
+    """Landmarks beside a truth in the run's world; none of those that the filter holds to be exact."""
+    found = record.map.points()
+    regular = np.linalg.eigvalsh(found.cov)[:, 0] > 0.0
+    kept = np.array([name in truth.landmarks for name in found.ids.tolist()], dtype=bool) & regular
     if not kept.any():
         return None
     found = MapEstimate(found.ids[kept], found.mean[kept], found.cov[kept])
-    true = np.array([truth.landmarks[name] for name in found.ids.tolist()])
-    error = true - found.mean
-    squares = np.einsum("md,mde,me->m", error, np.linalg.pinv(found.cov, hermitian=True), error)
-    return LandmarkErrors(found, error, squares)
+    delta, cov = np.array([truth.landmarks[name] for name in found.ids.tolist()]) - found.mean, found.cov
+    if truth.alignment == "similarity":
+        basis = across_of(found.mean - record.path.mean[0, 4:])
+        delta, cov = projected(basis, delta), projected(basis, cov)
+    moved = moved_map(found, world)
+    true = np.array([record.truth.landmarks[name] for name in found.ids.tolist()])
+    return LandmarkErrors(moved, true, np.einsum("mab,mb->ma", inverse_roots(cov)[0], delta))
 
 
 def _metres(value: float) -> str:

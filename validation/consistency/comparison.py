@@ -1,6 +1,7 @@
 """Comparisons of a run with something else, in memory and in JSON; and what a run says about itself by its innovations."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from rbpf.runs.files import write_text
 from rbpf.runs.reading import RunFolder
 from rbpf.validation.consistency.statistic import Statistic, motion_statistics, step_ratio
 
-INNOVATIONS = "innovations of the measurements"
+INNOVATIONS, RESIDUALS = "innovations of the measurements", "residuals of the batch optimum"
 
 SETTINGS = {"mono": ("search", "noise_px")}
 """By system, where its configuration holds the one standard deviation of all measurements, px."""
@@ -126,6 +127,12 @@ def compare_with_itself(record: RunFolder) -> Comparison:
     return Comparison("itself", "", figures, statistics)
 
 
+def independent_names(comparisons: Sequence[Comparison]) -> list[str]:
+    """Names of the statistics that compare poses or landmarks with what the filter did not compute itself."""
+    found = [s.name for comparison in comparisons if comparison.accuracy for s in comparison.statistics]
+    return [name for name in found if name != RESIDUALS]
+
+
 def noise_advice(record: RunFolder, statistics: list[Statistic]) -> str:
     """One sentence where innovations contradict the stated noise, with the noise that would make them right; else empty.
 
@@ -133,10 +140,11 @@ def noise_advice(record: RunFolder, statistics: list[Statistic]) -> str:
     σ √r (R. K. Mehra, "On the identification of variances and adaptive Kalman filtering", 1970, in its simplest form:
     the noise of the measurements is taken to dominate what the filter expects). It is a hint for the next run, not an
     estimate: errors that repeat from step to step, such as a known point that is given a little beside itself, are in
-    no innovation.
+    no innovation. Nothing is advised that would make a filter claim more which claims too much already.
     """
+    daring = any(s.kind == "ratio" and s.low > s.zone[1] for s in statistics)
     found = [s for s in statistics if s.name == INNOVATIONS and s.outcome == "contradicts"]
-    if not found or found[0].value <= 0.0:
+    if not found or found[0].value <= 0.0 or (daring and found[0].value < 1.0):
         return ""
     factor = float(found[0].value) ** 0.5
     how = f"standard deviations of the measurements {factor:.2g} times as large"

@@ -21,7 +21,7 @@ covariances are estimated from the series itself, up to the first lag at which i
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -119,11 +119,16 @@ def whitened_errors(space: LieGroup, mean: np.ndarray, cov: np.ndarray, truth: n
 
     The symmetric root is taken, so that the axes are the chart's own at all times.
     """
+    roots, ranks = inverse_roots(cov)
+    return WhitenedErrors(np.einsum("tab,tb->ta", roots, space.local(mean, truth)), ranks)
+
+
+def inverse_roots(cov: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Symmetric P^(−1/2) (T, d, d) of covariances, zero along directions without variance, and their ranks (T,)."""
     values, vectors = np.linalg.eigh(cov)
     used = values > _NOTHING * np.maximum(values[:, -1:], _NOTHING)
     scale = np.where(used, 1.0 / np.sqrt(np.where(used, values, 1.0)), 0.0)
-    along = np.einsum("tab,ta->tb", vectors, space.local(mean, truth))
-    return WhitenedErrors(np.einsum("tab,tb->ta", vectors, scale * along), used.sum(axis=1))
+    return (vectors * scale[:, None, :]) @ vectors.mT, used.sum(axis=1)
 
 
 def degrees_of_freedom(white: np.ndarray) -> float:
@@ -185,6 +190,64 @@ def variance_ratio(name: str, value: float, dof: float, factor: float) -> Statis
     tail = 0.5 * (1.0 - LEVEL)
     low, high = (value * dof / bound for bound in chi2.ppf([1.0 - tail, tail], dof))
     return Statistic(name, value, float(low), float(high), (factor**-2, factor**2), dof)
+
+
+def posterior_ratio(
+    name: str, cov: np.ndarray, cov_posterior: np.ndarray, delta: np.ndarray, same_data: bool = False
+) -> Statistic | None:
+    """The squared errors that a posterior expects of a filter's T estimates, over what the filter claims.
+
+    Where a better posterior N(m_b, P_b) is as good as the truth, an estimate m_f that claims P_f has the expected
+    normalised squared error tr P_f⁻¹ (P_b + δ δᵀ), δ = m_b − m_f: the rank of P_f for a filter that lost nothing. An
+    online estimate knows less than the posterior of all measurements, so that its δ is random, of covariance
+    P_f − P_b; the interval is that of this part. Where both know the same, as of a map, no part is random, and the median
+    over the estimates is told: a few landmarks of which the filter has a prior and the posterior has none, or that hang on
+    a false match, say nothing of the others. None without any estimate that is uncertain.
+
+    Args:
+        name: of the statistic.
+        cov: (T, d, d) P_f.
+        cov_posterior: (T, d, d) P_b in the same chart.
+        delta: (T, d).
+        same_data: both know the same measurements.
+    """
+    roots, ranks = inverse_roots(cov)
+    total = int(ranks.sum())
+    if not total:
+        return None
+    claimed = np.einsum("tab,tbc,tca->t", roots, cov_posterior, roots)
+    white = np.einsum("tab,tb->ta", roots, delta)
+    if same_data:
+        each = ((claimed + np.square(white).sum(axis=1)) / np.maximum(ranks, 1))[ranks > 0]
+        value = float(np.median(each))
+        return Statistic(name, value, value, value, (STATE_FACTOR**-2, STATE_FACTOR**2), float(each.size))
+    fixed, white = float(claimed.sum()) / total, white[ranks > 0]
+    apart = float(np.square(white).sum()) / total
+    found = variance_ratio(name, apart, max(degrees_of_freedom(white), 1.0), STATE_FACTOR)
+    return replace(found, value=fixed + apart, low=fixed + found.low, high=fixed + found.high)
+
+
+def map_ratio(name: str, positions: np.ndarray, white: np.ndarray) -> Statistic:
+    """Ratio of the squared errors of a map's landmarks to what was expected of them.
+
+    Neighbours err together: a map that is turned by a wrong heading is one error, however many landmarks it has. What an
+    affine field of displacements explains of the errors, k = d (d + 1) parameters, is therefore taken as one block, and
+    the rest as another (Satterthwaite over both).
+
+    Args:
+        name: of the statistic.
+        positions: (M, D).
+        white: (M, d) errors in units of the filter's.
+    """
+    value = float(np.square(white).mean())
+    design = np.column_stack([np.ones(len(positions)), positions - positions.mean(axis=0)])
+    fitted = design @ np.linalg.lstsq(design, white, rcond=None)[0]
+    count = min(design.shape[1] * white.shape[1], white.size)
+    smooth, rest = float(np.square(fitted).sum()), float(np.square(white - fitted).sum())
+    dof = (
+        (smooth + rest) ** 2 / (smooth**2 / count + rest**2 / max(white.size - count, 1)) if value else count
+    )
+    return variance_ratio(name, value, max(dof, 1.0), STATE_FACTOR)
 
 
 def step_ratio(

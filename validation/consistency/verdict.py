@@ -1,11 +1,18 @@
-"""Two sentences about a run in plain words: how good it is, and whether its uncertainty can be trusted.
+"""Two lights on a run, each with a sentence: how good its path is, and whether its uncertainty can be believed.
+
+They are independent: a path as good as the best may claim ten times too little, and a poor one may know how poor it is.
+
+The first compares the error with the path's own size: the root mean square distance of the true positions from their
+centre, which is the error of an estimate that stays there. It is *good* up to 3 %, *fair* up to 10 %, *poor* above, and
+never better than the frames that were lost allow.
 
 The second follows from the statistics of `rbpf.validation.consistency.statistic` alone:
 
 - do not trust: one of them contradicts the filter. It is *over-confident* if one of these says that errors are larger
-  than claimed, or biased; otherwise it is *cautious*: its uncertainty is larger than needed, which misleads whoever
-  weighs it against something else, but leaves nobody nearer to a wall than he was told;
-- trust: none contradicts, and one that compares its poses with something else (truth, batch optimum) supports it;
+  than claimed, or biased. It is *cautious*, its uncertainty larger than needed, if all say so and one of them compares
+  poses or landmarks with the truth or the batch posterior. Innovations that are too small show that the noise is not
+  the stated one, and not more: they do not see a past that the particles have forgotten, nor errors that repeat;
+- trust: none contradicts, and one that compares poses or landmarks with something else supports it;
 - cannot tell: otherwise. The run is too short or too much alike from step to step, or there is nothing to compare it
   with: good innovations alone do not show that the particles follow the right path.
 """
@@ -22,6 +29,11 @@ Trust = Literal["trust", "do not trust", "cannot tell"]
 
 Leaning = Literal["over-confident", "cautious", ""]
 
+Grade = Literal["good", "fair", "poor", "not known"]
+
+GRADES: tuple[tuple[Grade, float, float], ...] = (("good", 0.03, 0.05), ("fair", 0.1, 0.25))
+"""Grades of a path, with the largest error as a fraction of its spread, and the largest fraction of lost frames."""
+
 _LEANINGS: dict[Leaning, str] = {
     "over-confident": "it claims to know more than it does (over-confident); ",
     "cautious": "it is larger than needed (cautious, not over-confident); ",
@@ -36,18 +48,56 @@ _OPENINGS: dict[Trust, str] = {
 
 
 @dataclass(frozen=True)
+class PathGrade:
+    """How good a path is.
+
+    Attributes:
+        grade: the light.
+        sentence: how far it is from what, and how many frames were lost.
+    """
+
+    grade: Grade = "not known"
+    sentence: str = "How far the path is from the right one is not known: the run was compared with nothing."
+
+
+def grade_path(
+    accuracy: str, error_m: float | None, spread_m: float | None, lost: int | None = None, frames: int = 0
+) -> PathGrade:
+    """The grade of a path.
+
+    Args:
+        accuracy: how far it is from what, one sentence.
+        error_m: root mean square of it; None where it is not known.
+        spread_m: root mean square distance of what it is compared with from its centre.
+        lost: frames in which the system was lost; None where it cannot be.
+        frames: of the run.
+    """
+    gone = 0.0 if lost is None else lost / max(frames, 1)
+    by_loss = next((name for name, _, most in GRADES if gone <= most), "poor")
+    grade: Grade = "poor" if by_loss == "poor" else "not known"
+    said = [accuracy]
+    if error_m is not None and spread_m:
+        fraction = error_m / spread_m
+        grade = next((name for name, least, most in GRADES if fraction <= least and gone <= most), "poor")
+        said.append(f"That is {100 * fraction:.2g} % of its spread about its centre: {grade}.")
+    if lost is not None:
+        said.append(f"{lost or 'None'} of {frames} frames {'was' if lost == 1 else 'were'} lost.")
+    return PathGrade(grade, " ".join(said))
+
+
+@dataclass(frozen=True)
 class Verdict:
     """What a reader has to know.
 
     Attributes:
-        accuracy: how good the run is, one sentence.
+        path: how good the path is.
         trust: whether its uncertainty can be trusted.
         reason: why, half a sentence.
-        leaning: to which side the uncertainty is wrong, where it is not to be trusted.
+        leaning: to which side the uncertainty is wrong, where it is not to be trusted and that is known.
         advice: what to try next, a sentence; empty where there is nothing to say.
     """
 
-    accuracy: str
+    path: PathGrade
     trust: Trust
     reason: str
     leaning: Leaning = ""
@@ -55,23 +105,26 @@ class Verdict:
 
     @property
     def said(self) -> list[str]:
-        """Both sentences, and the advice if there is any."""
+        """What is said of path and uncertainty, and the advice if there is any."""
         return [text for text in (*self.sentences, self.advice) if text]
 
     @property
     def sentences(self) -> tuple[str, str]:
-        """Both, each with its full stop."""
-        return self.accuracy, f"{_OPENINGS[self.trust]}: {_LEANINGS[self.leaning]}{self.reason}."
+        """Of the path and of its uncertainty, each with its full stop."""
+        return self.path.sentence, f"{_OPENINGS[self.trust]}: {_LEANINGS[self.leaning]}{self.reason}."
 
 
-def judge(accuracy: str, statistics: Sequence[Statistic], independent: Sequence[str] = ()) -> Verdict:
+def judge(
+    statistics: Sequence[Statistic], independent: Sequence[str] = (), path: PathGrade | None = None
+) -> Verdict:
     """The verdict.
 
     Args:
-        accuracy: how good the run is, one sentence.
         statistics: all that there are.
-        independent: names of those that compare the poses with something the filter did not compute itself.
+        independent: names of those that compare poses or landmarks with something the filter did not compute itself.
+        path: how good it is.
     """
+    path = path or PathGrade()
     against = [s for s in statistics if s.outcome == "contradicts"]
     if against:
         more = (
@@ -79,15 +132,21 @@ def judge(accuracy: str, statistics: Sequence[Statistic], independent: Sequence[
             if len(against) > 1
             else ""
         )
-        # Those that say that it errs more than it claims.
+        # Those that say that it errs more than it claims; else those that may say that it errs less.
         daring = [s for s in against if (s.high < s.zone[0]) == (s.kind == "share")]
-        worst = max(daring or against, key=_distance)
-        leaning: Leaning = "over-confident" if daring else "cautious"
-        return Verdict(accuracy, "do not trust", described(worst) + more, leaning)
+        witnesses = [s for s in against if s.name in independent]
+        worst = max(daring or witnesses or against, key=_distance)
+        if daring or witnesses:
+            leaning: Leaning = "over-confident" if daring else "cautious"
+            return Verdict(path, "do not trust", described(worst) + more, leaning)
+        reason = (
+            f"{described(worst)}{more}; the noise is not the stated one, and to which side the poses err "
+        )
+        return Verdict(path, "do not trust", f"{reason}innovations do not tell")
     judging = [s for s in statistics if s.name in independent]
     support = [s for s in judging if s.outcome == "supports"]
     if support:
-        return Verdict(accuracy, "trust", described(support[0]))
+        return Verdict(path, "trust", described(support[0]))
     if judging:
         first = judging[0]
         zone = first.zone if first.kind != "ratio" else tuple(map(_root, first.zone))
@@ -102,7 +161,7 @@ def judge(accuracy: str, statistics: Sequence[Statistic], independent: Sequence[
         )
     else:
         reason = "nothing in the run says how large its errors are beside what it claims"
-    return Verdict(accuracy, "cannot tell", reason)
+    return Verdict(path, "cannot tell", reason)
 
 
 def described(statistic: Statistic) -> str:
@@ -121,6 +180,8 @@ def described(statistic: Statistic) -> str:
         side = "far too large"
     elif abs(np.log(_root(value))) <= np.log(1.1):
         side = "right within a tenth"
+    elif statistic.outcome == "supports":
+        side = f"right within a factor of {_number(_root(statistic.zone[1]))}"
     else:
         side = f"too {'small' if value > 1.0 else 'large'}"
     return f"{statistic.name}: {found}, its standard deviations are {side}"

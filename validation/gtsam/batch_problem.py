@@ -3,9 +3,7 @@
 Range-bearing measurements are those of `rbpf.sensors.readers.measurements`, a camera's are a `FeatureLog`.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from itertools import count
+from dataclasses import dataclass
 from pathlib import Path
 from typing import final
 
@@ -21,9 +19,9 @@ from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.feature_log import FeatureLog
 from rbpf.sensors.readers.measurements import Measurements
 from rbpf.systems.map_estimate import MapEstimate
-from rbpf.validation.gtsam import camera, robot
-from rbpf.validation.gtsam.mono_batch import connected_frames
-from rbpf.validation.gtsam.observations import CameraEstimate, observation_table, reprojection
+from rbpf.validation.gtsam import robot
+from rbpf.validation.gtsam.mono_batch import Told, adjust_log
+from rbpf.validation.gtsam.observations import observation_table, reprojection
 from rbpf.validation.metrics.gaussian_differences import mahalanobis
 
 Problem = Measurements | FeatureLog
@@ -42,7 +40,8 @@ class Optimum:
 
     Attributes:
         problem: what was solved: the part that hangs together.
-        estimate: path and map with marginal covariances; only landmarks that the measurements determine.
+        estimate: path and map with marginal covariances; only landmarks that the measurements determine. Where not all
+            are determined, poses have no covariances and those of landmarks are NaN.
         steps: (B,) steps of the run that took part, one per pose.
         error: half the sum of squared whitened residuals, or the sum of their robust losses.
     """
@@ -108,26 +107,13 @@ def floats_in_scale(problem: Problem) -> bool:
     )
 
 
-def first_steps(problem: Problem, count: int) -> Problem:
-    """What had been measured after so many steps."""
-    if isinstance(problem, FeatureLog):
-        return replace(problem, frames=problem.frames[:count])
-    rows = problem.steps < count
-    return replace(
-        problem,
-        stamps_ns=problem.stamps_ns[:count],
-        deltas=problem.deltas[: count - 1],
-        covs=problem.covs[: count - 1],
-        **{name: getattr(problem, name)[rows] for name in ("steps", "landmarks", "z", "cov_z")},
-    )
-
-
 def solve_problem(
     problem: Problem,
     start: Array,
     robust: float | None = None,
+    most: int | None = None,
+    on_iteration: Told | None = None,
     marginals: bool = True,
-    most_iterations: int | None = None,
 ) -> Optimum:
     """GTSAM's optimum.
 
@@ -135,20 +121,16 @@ def solve_problem(
         problem: T steps.
         start: (T, E) poses of the filter, where a camera's adjustment begins; a robot's begins with its odometry.
         robust: Huber's threshold in standard deviations; None takes all as Gaussian, as the filter does.
+        most: iterations of a camera's adjustment, after which it is given up; by default `most_iterations`.
+        on_iteration: told how far a camera's adjustment is.
         marginals: compute covariances; without them the optimum has no poses' and NaN as landmarks'.
-        most_iterations: of a camera's adjustment, after which it is given up; None goes on as long as there is a gain.
 
     Raises:
         InputError: the measurements do not determine everything, or the optimiser does not converge.
     """
     if isinstance(problem, FeatureLog):
-        return _solve_camera(problem, start, robust, marginals, most_iterations)
+        return _solve_camera(problem, start, robust, most, on_iteration, marginals)
     found = robot.solve(problem, robust, marginals, incremental=len(problem.stamps_ns) > AFAR)
-    return robot_optimum(problem, found)
-
-
-def robot_optimum(problem: Measurements, found: robot.BatchSolution) -> Optimum:
-    """A robot's batch solution in the form that runs of all systems share."""
     points = _summary(list(found.landmarks), found.landmarks, found.cov_landmarks, problem.z.shape[1])
     estimate = PathAndMap(problem.stamps_ns, found.world_from_robot, found.cov_poses, points)
     return Optimum(problem, estimate, np.arange(len(problem.stamps_ns)), found.error)
@@ -175,37 +157,20 @@ def fit_of(problem: Problem, estimate: PathAndMap, names: NDArray[np.int64]) -> 
 
 
 def _solve_camera(
-    log: FeatureLog, start: Array, robust: float | None, marginals: bool, most: int | None
+    log: FeatureLog,
+    start: Array,
+    robust: float | None,
+    most: int | None,
+    told: Told | None,
+    marginals: bool,
 ) -> Optimum:
-    steps = connected_frames(log)
-    if len(steps) < 2:
-        raise InputError(f"{log.name}: no two frames share enough landmarks for a batch adjustment.")
-    part = replace(log, frames=[log.frames[step] for step in steps.tolist()])
-    begin = CameraEstimate(start[steps], {})
     tolerance = STEREO_TOLERANCE if isinstance(log.camera, RectifiedStereo) else None
-    found = camera.solve_features(
-        part,
-        begin,
-        robust=robust,
-        marginals=marginals,
-        tolerance=tolerance,
-        on_iteration=None if most is None else _counted(log.name, most),
-    )
+    batch = adjust_log(log, start, most, told, tolerance=tolerance, robust=robust, marginals=marginals)
+    found, stamps = batch.solution, stamps_of(batch.log)
     names = sorted(found.landmarks.keys() - set(found.undetermined))
     points = _summary(names, found.landmarks, found.cov_landmarks, 3)
-    estimate = PathAndMap(stamps_of(part), found.world_from_camera, found.cov_poses, points)
-    return Optimum(part, estimate, steps, found.error)
-
-
-def _counted(name: str, most: int) -> Callable[[float], None]:
-    """Gives an adjustment up after so many iterations."""
-    counter = count(1)
-
-    def watch(_error: float) -> None:
-        if next(counter) > most:
-            raise InputError(f"The batch adjustment of {name} did not converge in {most} iterations.")
-
-    return watch
+    estimate = PathAndMap(stamps, found.world_from_camera, found.cov_poses, points)
+    return Optimum(batch.log, estimate, batch.frames, found.error)
 
 
 def _summary(names: list[int], means: dict[int, Array], covs: dict[int, Array], dim: int) -> MapEstimate:

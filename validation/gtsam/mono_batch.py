@@ -1,6 +1,7 @@
 """The batch adjustment of the measurements that a run over images used: what the filter could have known at best."""
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import final
 
@@ -67,6 +68,8 @@ def adjust_log(
     on_iteration: Told | None = None,
     twice: bool = True,
     tolerance: float | None = None,
+    robust: float | None = ROBUST,
+    marginals: bool = False,
 ) -> Batch:
     """Adjusts all frames that the first one is connected with through landmarks.
 
@@ -80,6 +83,8 @@ def adjust_log(
         on_iteration: told how far it is.
         twice: also start from the known points alone; not needed near the optimum.
         tolerance: see `solve_features`.
+        robust: see `solve_features`.
+        marginals: compute covariances too; where the measurements do not determine all of them, the solution has none.
 
     Raises:
         InputError: too few frames are connected, it takes too many iterations, or it does not converge.
@@ -92,7 +97,12 @@ def adjust_log(
     part = replace(log, frames=[log.frames[t] for t in frames], known=softened(log.known))
     watch = _Watch(most_iterations(part) if most is None else most, on_iteration)
     start = CameraEstimate(world_from_camera[frames], {})
-    solution = _best(part, [start, None] if twice and log.known is not None else [start], watch, tolerance)
+    starts = [start, None] if twice and log.known is not None else [start]
+    solution = _best(part, starts, watch, tolerance, robust)
+    if marginals:
+        best = CameraEstimate(solution.world_from_camera, solution.landmarks)
+        with suppress(InputError):
+            solution = solve_features(part, best, robust=robust, on_iteration=watch, tolerance=tolerance)
     return Batch(replace(part, known=log.known), frames, solution)
 
 
@@ -110,7 +120,11 @@ def softened(known: KnownPoints | None) -> KnownPoints | None:
 
 
 def _best(
-    log: FeatureLog, starts: Sequence[CameraEstimate | None], watch: "_Watch", tolerance: float | None
+    log: FeatureLog,
+    starts: Sequence[CameraEstimate | None],
+    watch: "_Watch",
+    tolerance: float | None,
+    robust: float | None,
 ) -> CameraSolution:
     """The solution of least error; a start that leads nowhere is passed over, if another one does not."""
     found: list[CameraSolution] = []
@@ -119,7 +133,7 @@ def _best(
         try:
             found.append(
                 solve_features(
-                    log, start, robust=ROBUST, marginals=False, on_iteration=watch, tolerance=tolerance
+                    log, start, robust=robust, marginals=False, on_iteration=watch, tolerance=tolerance
                 )
             )
         except InputError as error:

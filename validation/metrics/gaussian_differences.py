@@ -4,7 +4,6 @@ The difference of the means is given in units of one's standard deviations; S. K
 A. Bhattacharyya (1943) compare the whole densities, in natural units of information.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, final
 
@@ -101,6 +100,8 @@ def compare_maps(ours: PathAndMap, other: PathAndMap, across: bool) -> Differenc
         across: compare across the line from the first camera only, where the scale is not measured.
     """
     shared, rows, others = np.intersect1d(ours.landmarks.ids, other.landmarks.ids, return_indices=True)
+    known = np.isfinite(other.landmarks.cov[others]).all(axis=(1, 2))
+    shared, rows, others = shared[known], rows[known], others[known]
     delta = ours.landmarks.mean[rows] - other.landmarks.mean[others]
     covs = ours.landmarks.cov[rows], other.landmarks.cov[others]
     moved = other.landmarks.mean[others] - other.world_from_body[0, 4:] if across else None
@@ -114,19 +115,15 @@ def compare_last_pose(ours: PathAndMap, other: PathAndMap, step: int, across: bo
     carry = space.right_jacobian_inverse(delta)
     covs = (carry @ ours.cov_poses[-1] @ carry.T)[None], other.cov_poses[-1][None]
     distances = np.linalg.norm(ours.trajectory.positions[-1:] - other.trajectory.positions[-1:], axis=1)
-    moved = None
-    if across:
-        away = SE3.translation(theirs) - SE3.translation(other.world_from_body[0])
-        moved = np.concatenate([np.zeros(3), SE3.rotation(theirs).T @ away])[None]
+    moved = away_from_first(other)[-1:] if across else None
     return _differences(np.array([step]), distances, delta[None], covs, moved)
 
 
-def joined(parts: Sequence[Differences], dims: int) -> Differences:
-    """Rows of several, one after the other."""
-    if not parts:
-        return no_differences(dims)
-    rows = {name: np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS}
-    return Differences(np.concatenate([part.keys for part in parts]), **rows, dims=parts[0].dims)
+def away_from_first(estimate: PathAndMap) -> Array:
+    """(T, 6) how a change of scale about the first pose of SE(3) moves each, in the chart there."""
+    poses = estimate.world_from_body
+    along = SE3.rotation(poses).mT @ (poses[:, 4:] - poses[0, 4:])[..., None]
+    return np.concatenate([np.zeros((len(poses), 3)), along[..., 0]], axis=1)
 
 
 def no_differences(dims: int) -> Differences:
@@ -171,10 +168,8 @@ def _differences(
     keys: NDArray[np.int64], distances: Array, delta: Array, covs: tuple[Array, Array], moved: Array | None
 ) -> Differences:
     if moved is not None:
-        basis = _across(moved)
-        delta = np.einsum("kni,kn->ki", basis, delta)
-        covs = covs[0] @ basis, covs[1] @ basis
-        covs = basis.mT @ covs[0], basis.mT @ covs[1]
+        basis = across_of(moved)
+        delta, covs = projected(basis, delta), (projected(basis, covs[0]), projected(basis, covs[1]))
     kept = _regular(covs[0]) & _regular(covs[1])
     delta, ours, theirs = delta[kept], covs[0][kept], covs[1][kept]
     return Differences(
@@ -188,9 +183,16 @@ def _differences(
     )
 
 
-def _across(moved: Array) -> Array:
+def across_of(moved: Array) -> Array:
     """Orthonormal bases (K, n, n-1) of what is perpendicular to vectors (K, n)."""
     return np.linalg.svd(moved[:, None, :])[2][:, 1:].mT
+
+
+def projected(basis: Array, values: Array) -> Array:
+    """Vectors (K, n) or covariances (K, n, n) in bases (K, n, m)."""
+    if values.ndim == 2:
+        return np.einsum("kni,kn->ki", basis, values)
+    return np.asarray(basis.mT @ values @ basis)
 
 
 def _regular(cov: Array) -> NDArray[np.bool_]:

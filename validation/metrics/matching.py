@@ -20,16 +20,9 @@ def match_points(
     true = np.array([truth[name][: points.shape[1]] for name in names])
     if not len(points) or not names:
         return {}
-    moved = points if start is None else _moved(start, points)
+    moved = points if start is None else start.in_dimension(points.shape[1]).transform(points)
     for _ in range(_ROUNDS):
         distance = np.linalg.norm(moved[:, None] - true[None], axis=-1)
         rows, columns = linear_sum_assignment(distance)
         moved = align(points[rows], true[columns]).transform(points)
     return {names[column]: points[row] for row, column in zip(rows, columns, strict=True)}
-
-
-def _moved(similarity: Similarity, points: np.ndarray) -> np.ndarray:
-    """Points (M, D) by a similarity in space; those of the plane lie at height 0."""
-    dim = points.shape[1]
-    raised = np.concatenate([points, np.zeros((len(points), 3 - dim))], axis=1)
-    return similarity.transform(raised)[:, :dim]

@@ -10,9 +10,8 @@ from typing import Any
 
 from rbpf.errors import InputError
 from rbpf.runs.reading import PathAndMap, RunFolder
-from rbpf.runs.trajectory import Similarity, Trajectory, associate, in_space, read_tum
+from rbpf.runs.trajectory import Trajectory, associate, fit, in_space, read_tum
 from rbpf.runs.truth import LEAST, TRUTH, RunTruth
-from rbpf.systems.map_estimate import MapEstimate
 from rbpf.validation.metrics.accuracy import ate, landmark_errors, rpe
 from rbpf.validation.metrics.matching import match_points
 
@@ -23,10 +22,11 @@ ODOMETRY_PREFIX = {"stereo": "vo_"}
 
 
 def absolute_errors(estimate: Trajectory, reference: Trajectory, truth: RunTruth) -> dict[str, float]:
-    """Positions after rigid and after similarity alignment, and without any where one world is shared."""
-    similar = ate(estimate, reference, "similarity")
-    own = {"path_rmse_m": ate(estimate, reference).rmse} if truth.alignment == "none" else {}
+    """Positions in the world of the report, after rigid and after similarity alignment."""
+    similar, reported = ate(estimate, reference, "similarity"), ate(estimate, reference, truth.alignment).rmse
+    own = {"path_rmse_m": reported} if truth.alignment == "none" else {}
     return {
+        "position_rmse_m": reported,
         "ate_rmse_m": ate(estimate, reference, "rigid").rmse,
         "ate_sim3_rmse_m": similar.rmse,
         "sim3_scale": similar.alignment.scale,
@@ -59,21 +59,19 @@ def score_run(found: RunFolder) -> dict[str, Any]:
     Those of the odometry begin with `odometry_` (in a stereo run with `vo_`), those of the optimum with `batch_`.
     """
     entries: dict[str, Any] = {}
-    path = found.trajectory
-    batch = read_tum(found.folder / BATCH) if (found.folder / BATCH).is_file() else None
     if (found.folder / TRUTH).is_file() and found.truth.rows.size >= LEAST:
         truth = found.truth
-        entries |= score_estimate(found.estimate, truth, found.config.get("association") == "ml")
+        entries |= {"alignment": truth.alignment} | score_estimate(found.estimate, truth, is_anonymous(found))
         reference = in_space(found.path.stamps_ns[truth.rows], truth.poses)
         for name, prefix in ((ODOMETRY, ODOMETRY_PREFIX.get(found.system, "odometry_")), (BATCH, "batch_")):
             if (found.folder / name).is_file():
                 entries |= score_path(read_tum(found.folder / name), reference, truth, prefix)
-    if batch is not None:
-        ours, theirs = associate(path, batch, 0)
-        floats = found.system == "mono" and found.summary.get("known_points") == 0
-        apart = ate(ours, theirs, "similarity" if floats else "none")
-        entries["filter_minus_batch_rmse_m"] = apart.rmse
     return entries
+
+
+def is_anonymous(found: RunFolder) -> bool:
+    """Whether the ids of a run's landmarks are its own, and not the recording's names."""
+    return found.config.get("association") == "ml"
 
 
 def score_estimate(estimate: PathAndMap, truth: RunTruth, anonymous: bool = False) -> dict[str, float]:
@@ -83,8 +81,7 @@ def score_estimate(estimate: PathAndMap, truth: RunTruth, anonymous: bool = Fals
     entries: dict[str, float] = {}
     for merit in MERITS:
         entries |= merit(ours, reference, truth)
-    start = ate(ours, reference, "rigid").alignment if anonymous else None
-    return entries | score_landmarks(estimate.landmarks, truth, start)
+    return entries | score_landmarks(estimate, truth, anonymous)
 
 
 def score_path(
@@ -101,25 +98,25 @@ def score_path(
     return {prefix + name: value for name, value in entries.items()}
 
 
-def score_landmarks(
-    points: MapEstimate, truth: RunTruth, start: Similarity | None = None
-) -> dict[str, float]:
-    """Mean errors of landmarks whose true places are known, without and with an alignment of their own.
+def score_landmarks(estimate: PathAndMap, truth: RunTruth, anonymous: bool = False) -> dict[str, float]:
+    """Mean errors of landmarks whose true places are known, moved as the path is, and with an alignment of their own.
 
     Args:
-        points: landmarks that are points.
+        estimate: a pose for every frame of a run, and its map.
         truth: with the true places by name.
-        start: where the filter gave the landmarks no names, an alignment of the path: each landmark is then scored as
-            the true one nearest to it, one to one.
+        anonymous: the filter gave the landmarks no names: each is scored as the true one nearest to it, one to one.
     """
+    points = estimate.landmarks
     if not truth.landmarks or not points.ids.size:
         return {}
-    estimate = points.named() if start is None else match_points(points.mean, truth.landmarks, start)
+    ours = estimate.at(truth.rows).trajectory
+    reference = in_space(ours.stamps_ns, truth.poses)
+    start = ate(ours, reference, "rigid").alignment if anonymous else None
+    names = points.named() if start is None else match_points(points.mean, truth.landmarks, start)
+    moved = fit(truth.alignment, ours.positions, reference.positions).in_dimension(points.mean.shape[1])
     try:
-        own, aligned = (
-            landmark_errors(estimate, truth.landmarks),
-            landmark_errors(estimate, truth.landmarks, "rigid"),
-        )
+        own = landmark_errors(names, truth.landmarks, moved)
+        aligned = landmark_errors(names, truth.landmarks, "rigid")
     except InputError:  # no landmark is in both
         return {}
     return {"landmark_error_mean_m": own.mean, "landmark_error_aligned_mean_m": aligned.mean}

@@ -37,42 +37,6 @@ def path_figure(title: str, curves: Mapping[str, np.ndarray], plane: tuple[int, 
     return figure
 
 
-def error_figure(title: str, rows: np.ndarray, errors: np.ndarray, std: np.ndarray, lost: np.ndarray) -> Any:
-    """Errors of the position along the world's axes, beside what the filter itself believes.
-
-    Args:
-        title: of the figure.
-        rows: (R,) steps.
-        errors: (R, 3) m.
-        std: (R, 3) the filter's own standard deviations, m.
-        lost: (R,) bool, where the filter said that it was lost.
-    """
-    from matplotlib.figure import Figure
-
-    used = [axis for axis in range(3) if errors[:, axis].any() or std[:, axis].any()] or [0]
-    figure = Figure(figsize=(9.0, 1.5 + 1.7 * len(used)), layout="constrained")
-    unit, name = (1e3, "mm") if np.abs(errors).max(initial=0.0) < 1.0 else (1.0, "m")
-    panels = list(figure.subplots(len(used), 1, sharex=True, squeeze=False)[:, 0])
-    for axes, axis in zip(panels, used, strict=True):
-        band = SIGMAS * unit * std[:, axis]
-        axes.fill_between(
-            rows, -band, band, color=COLOURS["filter"], alpha=0.2, lw=0, label=f"{SIGMAS:g}σ of the filter"
-        )
-        axes.plot(rows, unit * errors[:, axis], color=COLOURS["filter"], lw=1.0, label="error")
-        axes.axhline(0.0, color=COLOURS["truth"], lw=0.5)
-        axes.set_ylabel(f"{'xyz'[axis]} [{name}]")
-        axes.grid(alpha=0.3)
-        if lost.any():
-            axes.fill_between(
-                rows, 0, 1, where=lost, transform=axes.get_xaxis_transform(), color=COLOURS["map"], alpha=0.15,
-                lw=0, label="lost",
-            )  # fmt: skip
-    panels[0].set_title(title)
-    panels[0].legend(loc="best", fontsize="small", ncols=3)
-    panels[-1].set_xlabel("step")
-    return figure
-
-
 def nees_figure(title: str, rows: np.ndarray, nees: np.ndarray, dim: int) -> Any:
     """Normalised squared errors (R,) of one run over the steps, with the band of an honest filter."""
     from matplotlib.figure import Figure
@@ -126,8 +90,8 @@ def map_figure(
     for name, points in other.items():
         axes.plot(*points[:, chosen].T, "+", color=COLOURS[name], ms=7, label=f"landmarks: {name}")
     axes.plot(*mean[:, chosen].T, ".", color=COLOURS["map"], ms=3, label=f"landmarks: filter, {SIGMAS:g}σ")
-    for ellipse in outline(mean[:, chosen], cov[:, chosen][:, :, chosen]):
-        axes.plot(*ellipse.T, color=COLOURS["map"], lw=0.7)
+    ellipses = outline(mean[:, chosen], cov[:, chosen][:, :, chosen])
+    axes.plot(ellipses[..., 0].T, ellipses[..., 1].T, color=COLOURS["map"], lw=0.7)
     label(axes, title, f"{'xyz'[chosen[0]]} [m]", f"{'xyz'[chosen[1]]} [m]", equal=True)
     shown = np.concatenate(
         [path[:, chosen], *(points[:, chosen] for points in other.values()), mean[:, chosen]]
@@ -136,19 +100,6 @@ def map_figure(
     margin = 0.15 * max(float((high - low).max()), 1e-3)
     axes.set_xlim(low[0] - margin, high[0] + margin)
     axes.set_ylim(low[1] - margin, high[1] + margin)
-    axes.set_aspect("equal", adjustable="box")
-    axes.legend(fontsize="small")
-    return figure
-
-
-def timings_figure(title: str, stages: Mapping[str, np.ndarray]) -> Any:
-    """Milliseconds per step (T,) by stage, one over the other; steps that compile run out of the picture."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9.0, 4.0), layout="constrained")
-    axes, total = figure.subplots(), np.sum(list(stages.values()), axis=0)
-    axes.stackplot(np.arange(total.size), *stages.values(), labels=list(stages), alpha=0.7, lw=0)
-    label(axes, title, "step", "ms", equal=False)
-    axes.set_ylim(0.0, 3.0 * max(float(np.median(total)), 1e-3))
+    axes.set_aspect("equal", adjustable="datalim")
     axes.legend(fontsize="small")
     return figure

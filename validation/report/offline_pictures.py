@@ -6,12 +6,11 @@ from typing import Any
 import numpy as np
 
 from rbpf.lie import Array
-from rbpf.runs.plots import COLOURS, Views, label, new_axes, outline, save_figures
-from rbpf.runs.reading import PathAndMap, RunFolder
-from rbpf.runs.trajectory import in_space
+from rbpf.runs.plots import COLOURS, Views, World, moved_map, new_axes, save_figures
+from rbpf.runs.reading import PathAndMap
 from rbpf.validation.colmap.compare import ColmapComparison
 from rbpf.validation.consistency.against_batch import AgainstBatch
-from rbpf.validation.consistency.against_optimisers import BatchErrors
+from rbpf.validation.consistency.statistic import inverse_roots
 from rbpf.validation.report.comparison_figures import (
     landmark_figure,
     map_figure,
@@ -23,13 +22,37 @@ from rbpf.validation.report.comparison_figures import (
 _BINS = 20
 
 
-def plot_against_batch(found: AgainstBatch, out: Path) -> list[str]:
-    """Map of both, distance of the paths over time, and the landmarks' Gaussians; returns the file names."""
-    figures = {
-        "gtsam_map.png": _batch_map(found),
-        "gtsam_path.png": _batch_path(found),
-        "gtsam_landmarks.png": _batch_landmarks(found),
-    }
+def plot_against_batch(found: AgainstBatch, out: Path, world: World | None = None) -> list[str]:
+    """Paths, expected NEES, landmarks and map beside the batch posterior; returns the file names.
+
+    Args:
+        found: the comparison.
+        out: folder for the pictures.
+        world: in which they are drawn; by default the filter's own.
+    """
+    name, theirs, ours, world = found.name, found.optimum.estimate, found.ours, world or World()
+    both = {"batch": theirs.trajectory, "filter": found.filter.trajectory}
+    motions = {which: world.motion(path) for which, path in both.items()}
+    paths = {which: motions[which].transform(path.positions) for which, path in both.items()}
+    plane = wide_axes(paths["batch"])
+    figures = {"gtsam_path.png": path_figure(f"{name}: paths in {world.name}", paths, plane)}
+    cov, cov_batch, delta = found.pose_errors()
+    if len(cov):
+        roots, ranks = inverse_roots(cov)
+        nees = np.einsum("tab,tbc,tca->t", roots, cov_batch + delta[:, :, None] * delta[:, None], roots)
+        title, known = f"{name}: expected NEES under the batch posterior", ranks == cov.shape[-1]
+        figures["gtsam_nees.png"] = nees_figure(title, found.optimum.steps[known], nees[known], cov.shape[-1])
+    if len(found.landmarks):
+        title = f"{name}: landmarks against the batch optimum"
+        figures["gtsam_landmarks.png"] = landmark_figure(
+            title, np.square(found.landmarks.sigmas), found.landmarks.dims
+        )
+        rows = np.isin(ours.landmarks.ids, found.landmarks.keys)
+        mean, cov = moved_map(ours.landmarks, motions["filter"]).in_space(rows)
+        there = np.isin(theirs.landmarks.ids, found.landmarks.keys)
+        batch = moved_map(theirs.landmarks, motions["batch"]).in_space(there)[0]
+        title = f"{name}: map over the batch optimum, in {world.name}"
+        figures["gtsam_map.png"] = map_figure(title, paths["filter"], mean, cov, {"batch": batch}, plane)
     return save_figures(figures, out)
 
 
@@ -43,38 +66,6 @@ def plot_against_colmap(found: ColmapComparison, reference: PathAndMap, out: Pat
             "distance [m]",
         )
     return save_figures(figures, out)
-
-
-def _batch_map(found: AgainstBatch) -> Any:
-    figure, axes = new_axes(f"{found.name}: filter and batch with 3σ ellipses, seen from above")
-    for name, estimate in (("batch", found.optimum.estimate), ("filter", found.filter)):
-        at, points = estimate.trajectory.positions, estimate.landmarks
-        axes.plot(at[:, 0], at[:, 1], color=COLOURS[name], lw=1.2, label=name)
-        for ellipse in outline(points.mean[:, :2], points.cov[:, :2, :2]):
-            axes.plot(*ellipse.T, color=COLOURS[name], lw=0.7)
-    axes.legend(loc="best", fontsize="small")
-    return figure
-
-
-def _batch_path(found: AgainstBatch) -> Any:
-    figure, axes = new_axes(
-        f"{found.name}: online filter beside the batch optimum", "distance [m]", "step", equal=False
-    )
-    axes.plot(found.optimum.steps, found.path.distances, color=COLOURS["filter"], lw=1.0)
-    return figure
-
-
-def _batch_landmarks(found: AgainstBatch) -> Any:
-    from matplotlib.figure import Figure
-
-    figure, gaussians = Figure(figsize=(9.0, 4.0)), found.landmarks
-    left, right = figure.subplots(1, 2)
-    label(left, f"{found.name}: landmarks off the optimum", "σ of the filter", "landmarks", equal=False)
-    label(right, "standard deviation, filter over optimum", "ratio (1 is honest)", "", equal=False)
-    for axes, values in ((left, gaussians.sigmas), (right, gaussians.sigma_ratio)):
-        axes.hist(values, bins=_BINS, color=COLOURS["filter"])
-    right.axvline(1.0, color=COLOURS["truth"], lw=0.8, ls="--")
-    return figure
 
 
 def _colmap_map(found: ColmapComparison, reference: PathAndMap) -> Any:
@@ -114,25 +105,3 @@ def _histogram(values: Array, title: str, xlabel: str) -> Any:
     axes.axvline(float(np.median(values)), color=COLOURS["truth"], lw=0.8, ls="--", label="median")
     axes.legend(loc="best", fontsize="small")
     return figure
-
-
-def plot_against_posterior(record: RunFolder, errors: BatchErrors) -> list[str]:
-    """Paths, expected NEES, landmarks and map of a robot beside the batch posterior; returns the file names."""
-    name, path, batch = record.name, record.path, errors.batch
-    ours, theirs = path.trajectory().positions, in_space(path.stamps_ns, batch.world_from_robot).positions
-    plane, known = wide_axes(theirs), np.flatnonzero(np.isfinite(errors.poses))
-    figures = {"gtsam_path.png": path_figure(f"{name}: paths", {"batch": theirs, "filter": ours}, plane)}
-    if known.size:
-        dim = path.space.dim
-        title = f"{name}: expected NEES under the batch posterior"
-        figures["gtsam_nees.png"] = nees_figure(title, known, dim * errors.poses[known], dim)
-    if errors.sigmas.size:
-        count, dim = errors.map.mean.shape
-        title = f"{name}: landmarks against the batch optimum, in its σ"
-        figures["gtsam_landmarks.png"] = landmark_figure(title, errors.sigmas, dim)
-        mean, cov, at = np.zeros((count, 3)), np.zeros((count, 3, 3)), np.zeros((count, 3))
-        mean[:, :dim], cov[:, :dim, :dim] = errors.map.mean, errors.map.cov
-        at[:, :dim] = [batch.landmarks[i] for i in errors.map.ids.tolist()]
-        title = f"{name}: map over the batch optimum"
-        figures["gtsam_map.png"] = map_figure(title, ours, mean, cov, {"batch": at}, plane)
-    return save_figures(figures, record.folder)

@@ -10,23 +10,23 @@ from typing import Any
 
 from rbpf.errors import InputError
 from rbpf.runs.files import write_text
-from rbpf.runs.plots import save_figures
+from rbpf.runs.plots import World, tracking_losses
 from rbpf.runs.reading import RunFolder
 from rbpf.validation.consistency.comparison import (
     Comparison,
     compare_with_itself,
+    independent_names,
     noise_advice,
     read_comparisons,
 )
 from rbpf.validation.consistency.statistic import Statistic
-from rbpf.validation.consistency.verdict import Verdict, judge
-from rbpf.validation.report.comparison_figures import timings_figure
+from rbpf.validation.consistency.verdict import PathGrade, Verdict, grade_path, judge
 
 PAGE = "report.html"
 VIDEO = "annotated.mp4"
-TIMINGS = "timings.png"
 
-_NO_ACCURACY = "How far the path is from the right one is not known: the run was compared with nothing."
+_SAME = {"groundtruth_path.png": "path.png", "groundtruth_error.png": "error.png"}
+"""Pictures of a comparison that show what one of the run's own does."""
 
 
 @dataclass(frozen=True)
@@ -55,46 +55,42 @@ def write_report(folder: Path, problems: list[str] | None = None) -> Verdict:
     """
     record, problems = RunFolder.open(folder), list(problems or ())
     comparisons = _comparisons(record, problems)
-    verdict = replace(verdict_of(comparisons, _beside_own_batch(record)), advice=_advice(record, comparisons))
-    _draw_timings(record, problems)
+    verdict = verdict_of(record, comparisons)
     drawn = {name for comparison in comparisons for name in comparison.pictures}
+    drawn |= {own for name, own in _SAME.items() if name in drawn}
     own = [path.name for path in sorted(folder.glob("*.png")) if path.name not in drawn]
+    try:
+        world = World.of(record)
+    except InputError:
+        world = World()  # the truth is damaged, which is said among the problems
     sections = [_section(folder, comparison) for comparison in comparisons]
     sections.append(Section("The run", entries=_flat(record.summary), images=_images(folder, own)))
     video = VIDEO if (folder / VIDEO).is_file() else None
     page = _template().render(
-        title=record.name, verdict=verdict, problems=problems, sections=sections, video=video
+        title=record.name, verdict=verdict, world=world, problems=problems, sections=sections, video=video
     )
     write_text(folder / PAGE, page)
     return verdict
 
 
-def verdict_of(comparisons: list[Comparison], otherwise: str = _NO_ACCURACY) -> Verdict:
-    """The verdict from all comparisons of a run, its own statistics among them.
-
-    Args:
-        comparisons: of the run.
-        otherwise: how good the run is, where none of them says it.
-    """
-    others = [comparison for comparison in comparisons if comparison.accuracy]
-    accuracy = " ".join(comparison.accuracy for comparison in others[:1]) or otherwise
-    independent = [statistic.name for comparison in others for statistic in comparison.statistics]
-    return judge(accuracy, [s for comparison in comparisons for s in comparison.statistics], independent)
-
-
-def _beside_own_batch(record: RunFolder) -> str:
-    """How good a run is that was compared with nothing, from the batch optimum that it found itself."""
-    apart = record.summary.get("filter_minus_batch_rmse_m")
-    if not isinstance(apart, float):
-        return _NO_ACCURACY
-    return (
-        f"How far the path is from the truth is not known; it is {1e3 * apart:.3g} mm (rms) from the batch optimum of "
-        "the same measurements."
-    )
-
-
-def _advice(record: RunFolder, comparisons: list[Comparison]) -> str:
-    return noise_advice(record, [s for comparison in comparisons for s in comparison.statistics])
+def verdict_of(record: RunFolder, comparisons: list[Comparison]) -> Verdict:
+    """The verdict on a run from all its comparisons, the truth's first and its own statistics among them."""
+    statistics = [statistic for comparison in comparisons for statistic in comparison.statistics]
+    by_name = {comparison.against: comparison for comparison in comparisons if comparison.accuracy}
+    accuracy, figures, key = PathGrade().sentence, {}, "position_rmse_m"
+    if "groundtruth" in by_name:
+        accuracy, figures = by_name["groundtruth"].accuracy, by_name["groundtruth"].figures
+    elif by_name:
+        best = by_name.get("gtsam", next(iter(by_name.values())))
+        accuracy = f"{best.accuracy} How far it is from the truth is not known."
+        figures, key = best.figures, "filter_minus_batch_rmse_m"
+    try:
+        lost, frames = tracking_losses(record)
+    except InputError:
+        lost, frames = None, 0
+    path = grade_path(accuracy, figures.get(key), figures.get("path_spread_m"), lost, frames)
+    verdict = judge(statistics, independent_names(comparisons), path)
+    return replace(verdict, advice=noise_advice(record, statistics))
 
 
 def _comparisons(record: RunFolder, problems: list[str]) -> list[Comparison]:
@@ -139,20 +135,6 @@ def _row(statistic: Statistic) -> dict[str, str]:
         "samples": f"{statistic.samples:.0f}",
         "outcome": statistic.outcome,
     }
-
-
-def _draw_timings(record: RunFolder, problems: list[str]) -> None:
-    """Times per step, where the run has not drawn them itself."""
-    if (record.folder / TIMINGS).is_file():
-        return
-    try:
-        table = record.table("timings.csv")
-    except InputError as error:
-        problems.append(f"{error}.")
-        return
-    if "milliseconds" in table:
-        title = f"{record.name}: time per step"
-        save_figures({TIMINGS: timings_figure(title, {"filter": table["milliseconds"]})}, record.folder)
 
 
 def _images(folder: Path, names: list[str]) -> list[tuple[str, str]]:

@@ -6,14 +6,19 @@ A new comparison is one function from a run to a `Comparison`, entered into `COM
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rbpf.errors import InputError
 from rbpf.runs.files import prepare_folder
+from rbpf.runs.plots import World
 from rbpf.runs.reading import RunFolder
 from rbpf.runs.truth import TRUTH
-from rbpf.validation.consistency.comparison import Comparison, clear_comparisons, write_comparison
+from rbpf.validation.consistency.comparison import Comparison, write_comparison
 from rbpf.validation.consistency.verdict import Verdict
 from rbpf.validation.report.page import write_report
+
+if TYPE_CHECKING:
+    from rbpf.validation.gtsam.batch_problem import Optimum
 
 Compare = Callable[[RunFolder], Comparison]
 """With pictures in the run's folder."""
@@ -27,20 +32,19 @@ def _groundtruth(record: RunFolder) -> Comparison:
     return replace(compare_with_truth(record, errors), pictures=draw_truth(record, errors))
 
 
-def _robot_gtsam(record: RunFolder) -> Comparison:
-    from rbpf.validation.consistency.against_optimisers import compare_robot_with_batch
-    from rbpf.validation.report.offline_pictures import plot_against_posterior
+def compare_gtsam(record: RunFolder, optimum: "Optimum | None" = None) -> Comparison:
+    """A run beside the batch posterior, from its optimum where it is known: written into its folder, with pictures.
 
-    comparison, errors = compare_robot_with_batch(record)
-    return replace(comparison, pictures=plot_against_posterior(record, errors))
-
-
-def _camera_gtsam(record: RunFolder) -> Comparison:
-    from rbpf.validation.consistency.against_optimisers import compare_camera_with_batch
+    Raises:
+        InputError: see `compare_with_batch`.
+    """
+    from rbpf.validation.consistency.against_optimisers import compare_with_batch
     from rbpf.validation.report.offline_pictures import plot_against_batch
 
-    comparison, found = compare_camera_with_batch(record)
-    return replace(comparison, pictures=plot_against_batch(found, record.folder))
+    comparison, found = compare_with_batch(record, optimum)
+    comparison = replace(comparison, pictures=plot_against_batch(found, record.folder, World.of(record)))
+    write_comparison(record.folder, comparison)
+    return comparison
 
 
 def _camera_colmap(record: RunFolder) -> Comparison:
@@ -55,7 +59,7 @@ def _camera_colmap(record: RunFolder) -> Comparison:
 ANY = "*"
 COMPARISONS: dict[str, dict[str, Compare]] = {
     "groundtruth": {ANY: _groundtruth},
-    "gtsam": {"range-bearing": _robot_gtsam, "mono": _camera_gtsam, "stereo": _camera_gtsam},
+    "gtsam": dict.fromkeys(("range-bearing", "mono", "stereo"), compare_gtsam),
     "colmap": {"mono": _camera_colmap, "stereo": _camera_colmap},
 }
 """By what a run is compared with, then by the run's system."""
@@ -99,7 +103,6 @@ def validate(folder: Path, against: str, out: Path | None = None) -> Verdict:
 
 def report_run(folder: Path) -> Verdict:
     """The page of a run that has just finished: compared with the truth where its recording has one."""
-    clear_comparisons(folder)
     if (folder / TRUTH).is_file():
         return validate(folder, "groundtruth")
     return write_report(folder)
