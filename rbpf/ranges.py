@@ -10,7 +10,8 @@ Every number has a range: where none is declared, no number is infinite or large
 
 import math
 import os
-from dataclasses import dataclass
+from collections.abc import Hashable
+from dataclasses import dataclass, fields
 from functools import cache
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -97,7 +98,8 @@ def check_ranges(settings: Any) -> None:
     Raises:
         SettingError: with the field's name, its value and what it may be.
     """
-    for name, hint in _hints(type(settings)).items():
+    kind: Hashable = type(settings)
+    for name, hint in _hints(kind).items():
         value = getattr(settings, name)
         expected = _expected(hint, value, ANY)
         if expected is not None:
@@ -122,9 +124,9 @@ def require_memory(size: float, what: str) -> None:
 
 
 @cache
-def _hints(kind: type) -> dict[str, Any]:
+def _hints(kind: Any) -> dict[str, Any]:
     hints = get_type_hints(kind, include_extras=True)
-    return {name: hints[name] for name in kind.__dataclass_fields__ if name in hints}
+    return {field.name: hints[field.name] for field in fields(kind) if field.name in hints}
 
 
 def _expected(hint: Any, value: Any, allowed: Range) -> str | None:

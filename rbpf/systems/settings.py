@@ -50,10 +50,10 @@ def load_settings(
     except msgspec.ValidationError as error:
         # "Expected `int`, got `str` - at `$.search.measurements`", or a range's own words and the group's place.
         words, _, place = str(error).partition(" - at `$")
-        path = place.rstrip("`").lstrip(".")
+        name = place.rstrip("`").lstrip(".")
         if isinstance(error.__cause__, SettingError):
-            path, words = f"{path}.{error.__cause__.name}".lstrip("."), error.__cause__.words
-        raise InputError(f"settings: {path} {words}".replace(" Expected", ": expected")) from error
+            name, words = f"{name}.{error.__cause__.name}".lstrip("."), error.__cause__.words
+        raise InputError(f"settings: {name} {words}".replace(" Expected", ": expected")) from error
 
 
 def _read(path: Path, expected: str) -> dict[str, Any]:

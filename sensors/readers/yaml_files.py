@@ -117,7 +117,7 @@ def read_yaml(path: Path, hint: str) -> YamlValue:
         depth = 0
         for event in yaml.parse(text, yaml.SafeLoader):
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-            line = event.start_mark.line + 1
+            line = event.start_mark.line + 1 if event.start_mark else 1
             if depth > DEEPEST:
                 raise line_error(
                     path, line, f"expected values, found more than {DEEPEST} nested lists or mappings"

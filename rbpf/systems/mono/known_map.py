@@ -168,7 +168,8 @@ def _parsed(arrays: dict[str, np.ndarray]) -> KnownMap:
     if not len(found["views"]) or (np.linalg.eigvalsh(found["cov"]) < 0.0).any():
         raise InputError("expected views, and covariances that are none less than zero")
     params, size, alignment = (found.pop(name) for name in ("camera", "image_size", "alignment"))
-    camera = Pinhole.from_params(*size.tolist(), params)
+    width, height = size.tolist()
+    camera = Pinhole.from_params(width, height, params)
     return KnownMap(camera, _ALIGNMENTS[str(alignment)], **found)
 
 
