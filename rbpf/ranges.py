@@ -10,7 +10,6 @@ Every number has a range: where none is declared, no number is infinite or large
 
 import math
 import os
-from collections.abc import Hashable
 from dataclasses import dataclass, fields
 from functools import cache
 from types import NoneType, UnionType
@@ -98,7 +97,7 @@ def check_ranges(settings: Any) -> None:
     Raises:
         SettingError: with the field's name, its value and what it may be.
     """
-    kind: Hashable = type(settings)
+    kind: Any = type(settings)
     for name, hint in _hints(kind).items():
         value = getattr(settings, name)
         expected = _expected(hint, value, ANY)
