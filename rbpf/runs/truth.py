@@ -140,7 +140,8 @@ def read_truth(folder: Path, steps: int, size: int) -> RunTruth:
         )
     arrays = load_arrays(path)
     with fitting(path):
-        # Of another run than trajectory.npz, it does not fit either.
+        if arrays["rows"].size and arrays["rows"].max() >= steps:
+            raise InputError(f"it is of another run, this one has {steps} steps; run the recording again")
         rows, poses, named, ids, points = read(arrays, _TRUTH, steps=steps, size=size).values()
         alignment = _ALIGNMENTS[str(named)]
         landmarks = dict(zip(ids.tolist(), points, strict=True))
