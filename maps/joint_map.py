@@ -43,6 +43,9 @@ from rbpf.lie import Euclidean, LieGroup, SE2Group, SE3Group, skew
 from rbpf.maps.any_map import checked_new_ids, expected, first_records, projected
 from rbpf.maps.point import Point
 
+LARGEST = 6000
+"""Coordinates of all landmarks; their covariance then takes 0.3 GB, and a step copies it."""
+
 
 class _Rows(NamedTuple):
     """All rows of a step: ν (N, R), H (N, R, d), and what all particles share: J (R, c) of columns (c,), S = L Lᵀ."""
@@ -398,6 +401,11 @@ class JointMap(Map):
             raise InputError("a new landmark has a mean or covariance that is not finite")
         count, size = records.mean.shape[1], self.mean.shape[1]
         ids = checked_new_ids(ids, count, self._next_id, self.holds)
+        if size + count * self.point.dim > LARGEST:
+            most = (LARGEST - self._first) // self.point.dim
+            raise InputError(
+                f"a joint map holds at most {most} landmarks: keep maps of the particles' own (map=particles)"
+            )
         # Given the path, what is new owes its error to its own measurement alone.
         mean = np.broadcast_to(records.mean, (self.n, count, self.point.dim)).reshape(self.n, -1)
         self.mean = np.concatenate([self.mean, mean], axis=1)

@@ -10,8 +10,8 @@ from rbpf.core.filter import Filter
 from rbpf.core.genealogy import Lineage
 from rbpf.core.likelihoods import TruncatedMahalanobis
 from rbpf.core.marginals import KalmanSubstate
-from rbpf.core.models import NewLandmarks, Observations, Part, Records
-from rbpf.core.particles import Particles, balanced
+from rbpf.core.models import Belief, NewLandmarks, Observations, Part, Records
+from rbpf.core.particles import Particles, Prior, balanced
 from rbpf.core.proposals import PriorProposal
 from rbpf.core.resampling import Consolidation
 from rbpf.errors import InputError
@@ -288,6 +288,44 @@ def test_a_landmark_that_is_dropped_leaves_the_rest_as_it_is():
     np.testing.assert_array_equal(joint.ids, [0, 2, 3])
     for whole, rest in zip(kept, joint.in_world(particles), strict=True):
         np.testing.assert_allclose(whole[[0, 2, 3]], rest, atol=1e-12)
+
+
+def test_sensors_read_it_as_any_map():
+    """With the same Gaussians a map of the particles' own says the same."""
+    joint, particles = held(SE2, 15, 3)
+    own, model, rng = LandmarkMap(SE2, compiled=False), RelativePosition(SE2), np.random.default_rng(2)
+    own.begin(15, Lineage(15))
+    own.add_records(joint.read(joint.ids), Point(2))
+    prior = Prior(SE2, particles.state, np.zeros((1, 3)), 0.1 * np.eye(3)[None])
+    belief = Belief(particles.log_weights, prior, {})
+    z, cov = rng.normal(size=(2, 2)), np.repeat(NOISE[None], 2, axis=0)
+    pairs = [(joint.read(joint.ids[1:], slice(3)), own.read(own.ids[1:], slice(3)))]
+    for first, second in pairs:
+        np.testing.assert_allclose(first.mean, second.mean, 1e-12)
+        np.testing.assert_allclose(first.cov, second.cov, 1e-12)
+    for name, arguments in {
+        "predictions": (model, z, cov, joint.ids, belief),
+        "project": (model, joint.ids, belief),
+    }.items():
+        for first, second in zip(
+            getattr(joint, name)(*arguments), getattr(own, name)(*arguments), strict=True
+        ):
+            np.testing.assert_allclose(first, second, atol=1e-12)
+    nu, jac, _ = joint.innovations(model, z, joint.ids[:2], particles.state[4], 4)
+    expected, same, _ = own.innovations(model, z, own.ids[:2], particles.state[4], 4)
+    np.testing.assert_allclose(nu, expected, atol=1e-12)
+    np.testing.assert_allclose(jac.landmark, same.landmark, atol=1e-12)
+    assert joint.are(np.array([0, 9]), Point(2)).tolist() == [True, False]
+    assert joint.landmark_of(2).dim == 2
+    assert joint.stored_fraction < 1.0
+
+
+def test_more_landmarks_than_a_covariance_can_hold():
+    joint, _ = held(SE2, 2, 1)
+    many = Records(np.zeros((2, 3000, 2)), np.broadcast_to(np.eye(2), (2, 3000, 2, 2)))
+    with pytest.raises(InputError, match="at most 2998 landmarks"):
+        joint.add_records(many, Point(2))
+    assert joint.ids.size == 1
 
 
 def test_what_a_joint_map_does_not_take(world):
