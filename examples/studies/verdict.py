@@ -24,6 +24,7 @@ from examples.studies.point_worlds import MONO, DeskWorld, Measuring, simulate_f
 from rbpf.core.models import Jacobians
 from rbpf.lie import SE2, SE3
 from rbpf.runs.folder import write_run
+from rbpf.runs.plots import new_axes, save_figures
 from rbpf.runs.reading import RunFolder
 from rbpf.runs.recordings import filter_features, filter_robot_log
 from rbpf.runs.run import Run
@@ -207,10 +208,10 @@ def is_right(case: Case, verdict: Verdict, found: Mapping[str, float]) -> bool:
 
 
 def main(out: Path = Path("demo/verdict"), quick: bool = False) -> dict[str, bool]:
-    """Prints the table of the verdicts.
+    """Prints the verdicts, and leaves their table and a picture of the errors that they are about.
 
     Args:
-        out: folder for the table.
+        out: folder for the table and the picture.
         quick: only three of the cases.
     """
     rows, right = [], {}
@@ -228,6 +229,15 @@ def main(out: Path = Path("demo/verdict"), quick: bool = False) -> dict[str, boo
         "with the truth", "right",
     ]  # fmt: skip
     write_table(out / "verdicts.csv", header, rows)
+    figure, axes = new_axes("How many times larger than claimed the errors are", "", "times", equal=False)
+    places = np.arange(len(rows))
+    for column, what, marker in ((2, "poses", "o"), (3, "landmarks", "s")):
+        axes.plot([row[column] for row in rows], places, marker, label=what)
+    axes.axvline(1.0, color="0.6", lw=1.0)
+    axes.set_xscale("log")
+    axes.set_yticks(places, [f"{row[0]}: {row[4]}" for row in rows])
+    axes.legend()
+    save_figures({"verdicts.png": figure}, out)
     return right
 
 

@@ -71,7 +71,7 @@ def test_sweeps(tmp_path_factory, whole):
         ("a: &a [x]\nb: [*a, *a]\n", "alias"),
         ("particles: !!timestamp x\n", "none of its type"),
         ("particles: 2001-99-99\n", "none of its type"),
-        ("a: " + "[" * 5000 + "\n", "expected YAML"),
+        ("a: " + "[" * 5000 + "\n", "nested lists"),
         ("#" * (2 << 20), "larger than 1 MiB"),
     ],
 )

@@ -187,7 +187,7 @@ def still_log(seed: int, frames: int) -> FeatureLog:
     return FeatureLog("still", camera, seen, known_points)
 
 
-@pytest.mark.parametrize("at_mm", [0.0, 1.25, 5.0])
+@pytest.mark.parametrize("at_mm", [0.0, 1.0, 5.0])
 @pytest.mark.parametrize("constrain", ["epipolar", "marginal"])
 @pytest.mark.parametrize("compiled", [True, False])
 def test_what_rays_say_changes_smoothly_with_the_pose(compiled, constrain, at_mm):
@@ -215,10 +215,12 @@ def test_what_rays_say_changes_smoothly_with_the_pose(compiled, constrain, at_mm
 
 
 def test_a_camera_at_rest_stays():
-    """Root mean square of the estimate's error in the particles' own world, over 60 frames of eight recordings."""
-    squares = []
+    """RMS error in the particles' own world, after 60 frames of eight recordings; lines begin late."""
+    squares, late = [], InverseDepthConfig(epipolar_parallax_px=3.0)
     for seed in range(8):
-        filter_ = run(still_log(seed, 60), MonoConfig(seed=seed, max_new_per_frame=30)).system.filter
+        filter_ = run(
+            still_log(seed, 60), MonoConfig(seed=seed, max_new_per_frame=30, inverse_depth=late)
+        ).system.filter
         paths = SE3.translation(filter_.history.paths()[..., :7])
         squares.append(np.square(np.einsum("tnk,n->tk", paths, filter_.particles.weights)[-1]).sum())
     assert np.sqrt(np.mean(squares)) < 4e-3

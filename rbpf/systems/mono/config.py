@@ -55,7 +55,7 @@ class InverseDepthConfig(Ranged):
             Before, the parallax says more of the error of the sampled pose than of depth, and the prior of ρ, which does
             not change as long as depth is not measured, would count anew in every frame.
         epipolar_parallax_px: likewise, from where on there is an epipolar line. Before, the 2-D marginal counts, with a
-            prior of ρ so wide that it hardly does.
+            prior of ρ so wide that it hardly does. More holds a camera at rest better, and follows what moves by itself.
     """
 
     RENAMED: ClassVar[dict[str, str]] = {
@@ -76,7 +76,7 @@ class InverseDepthConfig(Ranged):
     promote_std_ratio: Positive = 0.1
     promote_weight: Fraction = 0.95
     depth_parallax_px: Positive = 10.0
-    epipolar_parallax_px: Positive = 3.0
+    epipolar_parallax_px: Positive = 0.3
 
 
 @dataclass(frozen=True)
