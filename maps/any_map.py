@@ -9,6 +9,9 @@ from rbpf.arrays import numbers
 from rbpf.core.linearisation import linearise
 from rbpf.core.models import Belief, ObservationModel, Records
 from rbpf.errors import InputError
+from rbpf.kernels.landmarks import linearise_all
+from rbpf.lie import LieGroup
+from rbpf.maps.rows import fused_kernel
 
 
 def expected(model: ObservationModel, records: Records, belief: Belief) -> tuple[np.ndarray, np.ndarray]:
@@ -59,3 +62,29 @@ def first_records(model: ObservationModel, z: np.ndarray, cov: np.ndarray, state
     """Estimates (N, K, …) of landmarks that are started by measurements z (K, p), cov (K, p, p) at states (N, E)."""
     name = type(model).__name__
     return model.initialise(state, numbers(z, f"z of {name}"), numbers(cov, f"cov of {name}"))
+
+
+def linearised(
+    model: ObservationModel,
+    space: LieGroup,
+    z: np.ndarray,
+    state: np.ndarray,
+    mean: np.ndarray,
+    const: np.ndarray | None,
+    compiled: bool,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """ν (N, K, p), ∂z/∂state (N, K, p, d) and ∂z/∂landmark (N, K, p, D) of landmarks (N, K, D) at states (N, E).
+
+    By the model's kernel where it has one and `compiled` allows it, else in NumPy.
+    """
+    (n, k, dim), p = mean.shape, z.shape[1]
+    kernel = fused_kernel(model) if compiled else None
+    if kernel is None:
+        nu, jac = linearise(model, space, z, state[:, None], mean, const)
+        assert jac.state is not None and jac.landmark is not None
+        return nu, jac.state, jac.landmark
+    held = np.empty((n, k, 0)) if const is None else np.broadcast_to(const, (n, *const.shape[1:]))
+    nu, by_state, by_landmark = np.empty((n, k, p)), np.empty((n, k, p, space.dim)), np.empty((n, k, p, dim))
+    arrays = (np.require(array, np.float64, ["C", "W"]) for array in (state, mean, held, z))
+    linearise_all(kernel.function.address, kernel.params, *arrays, nu, by_state, by_landmark)
+    return nu, by_state, by_landmark

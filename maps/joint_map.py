@@ -40,7 +40,7 @@ from rbpf.core.models import (
 from rbpf.core.particles import Estimate, Information, Particles, Prior, take, uniform_log_weights
 from rbpf.errors import InputError
 from rbpf.lie import Euclidean, LieGroup, SE2Group, SE3Group, skew
-from rbpf.maps.any_map import checked_new_ids, expected, first_records, projected
+from rbpf.maps.any_map import checked_new_ids, expected, first_records, linearised, projected
 from rbpf.maps.point import Point
 
 LARGEST = 6000
@@ -80,6 +80,7 @@ class JointMap(Map):
         space: SE2 or SE3 with `Point(2)` or `Point(3)`; Euclidean(n), whose points are vectors (n,).
         substate: mean (m,) and covariance (m, m) of what drives the motion (`Transition.coupling`), told in the robot's
             frame; None has none. It may be observed together with a landmark.
+        compiled: use the models' fused kernels where they have one.
 
     Attributes:
         mean: (N, d + m + M D) of ξ, s and the landmarks.
@@ -93,8 +94,10 @@ class JointMap(Map):
         self,
         space: SE2Group | SE3Group | Euclidean,
         substate: tuple[np.ndarray, np.ndarray] | None = None,
+        compiled: bool = True,
     ) -> None:
         self.space = space
+        self.compiled = compiled
         self.point = Point(
             2 if isinstance(space, SE2Group) else 3 if isinstance(space, SE3Group) else space.dim
         )
@@ -114,7 +117,7 @@ class JointMap(Map):
         self.mean = np.zeros((n, self._first))
         self.cov = np.zeros((self._first, self._first))
         self.mean[:, d:], self.cov[d:, d:] = self._substate
-        self._ids = np.zeros(0, dtype=np.int64)
+        self._places = dict[int, int]()
         self._next_id = 0
         self._gain: np.ndarray | None = None
 
@@ -214,7 +217,7 @@ class JointMap(Map):
         """The landmarks in the world, means (M, D) and covariances (M, D, D), in the order of `ids`."""
         origin, mean, cov = self._consolidated(particles)
         d, dim = self.space.dim, self.point.dim
-        points, M = mean[self._first :].reshape(-1, dim), self._ids.size
+        points, M = mean[self._first :].reshape(-1, dim), len(self._places)
         # p = G Exp(ξ) l: ∂p/∂ξ = R [l's turn | I], ∂p/∂l = R.
         slope = np.concatenate([self._by_turn(points), np.broadcast_to(np.eye(dim), (M, dim, dim))], axis=-1)
         own = self._first + np.arange(M * dim).reshape(M, dim)
@@ -287,7 +290,11 @@ class JointMap(Map):
             if in_world:
                 frame = self.space.retract(self.origin, mean[:, :d])
                 at = self.space.compose(frame, state)[:, None]
-            nu, jac = linearise(model, self.space, z, at, landmarks, None, substate)
+            if landmarks is None or substate is not None or not self.compiled:
+                nu, jac = linearise(model, self.space, z, at, landmarks, None, substate)
+            else:
+                nu, *found = linearised(model, self.space, z, state, landmarks, None, True)
+                jac = Jacobians(*found)
             count, p = z.shape
             block = np.zeros((count, p, n))
             if jac.landmark is not None:
@@ -347,24 +354,24 @@ class JointMap(Map):
         Raises:
             InputError: the map does not hold one of them.
         """
-        order = np.argsort(self._ids)
-        held = self.holds(ids)
-        if not held.all():
-            raise InputError(f"the map holds no landmark {np.asarray(ids)[~held][0]}")
-        rows = order[np.searchsorted(self._ids, ids, sorter=order)]
+        places = self._places
+        try:
+            rows = np.array([places[landmark] for landmark in np.asarray(ids).tolist()], dtype=np.int64)
+        except KeyError as error:
+            raise InputError(f"the map holds no landmark {error.args[0]}") from error
         return self._first + rows[:, None] * self.point.dim + np.arange(self.point.dim)
 
     @property
     def ids(self) -> np.ndarray:
-        return self._ids
+        return np.array(list(self._places), dtype=np.int64)
 
     @property
     def stored_fraction(self) -> float:
-        size = self._ids.size * self.point.dim * (self.point.dim + 3) // 2
+        size = len(self._places) * self.point.dim * (self.point.dim + 3) // 2
         return (self.mean.nbytes + self.cov.nbytes) / max(8 * self.n * size, 1)
 
     def holds(self, ids: np.ndarray) -> np.ndarray:
-        return np.isin(ids, self._ids)
+        return np.array([landmark in self._places for landmark in np.asarray(ids).tolist()], dtype=bool)
 
     def landmark_of(self, landmark_id: int) -> Landmark:
         self._columns(np.array([landmark_id]))
@@ -411,7 +418,7 @@ class JointMap(Map):
         self.mean = np.concatenate([self.mean, mean], axis=1)
         cov = np.zeros((self.mean.shape[1],) * 2)
         cov[:size, :size] = self.cov
-        self._ids = np.concatenate([self._ids, ids])
+        self._places |= {landmark: len(self._places) + k for k, landmark in enumerate(ids.tolist())}
         self._next_id = max(self._next_id, int(ids.max(initial=-1)) + 1)
         columns = self._columns(ids)
         cov[columns[:, :, None], columns[:, None, :]] = records.cov.mean(axis=0)
@@ -422,7 +429,8 @@ class JointMap(Map):
         gone = self._columns(ids).ravel()
         self.mean = np.delete(self.mean, gone, axis=1)
         self.cov = np.delete(np.delete(self.cov, gone, axis=0), gone, axis=1)
-        self._ids = self._ids[~np.isin(self._ids, ids)]
+        kept = [landmark for landmark in self._places if landmark not in set(np.asarray(ids).tolist())]
+        self._places = {landmark: row for row, landmark in enumerate(kept)}
 
     def promote(self, ids: Sequence[int] | np.ndarray, to: Landmark | None = None) -> None:
         raise InputError("a joint map's landmarks are single Gaussian points already")
@@ -453,7 +461,7 @@ class JointMap(Map):
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Means, the covariance, the frame and the landmarks' ids."""
-        named = {"mean": self.mean, "cov": self.cov, "origin": self.origin, "ids": self._ids}
+        named = {"mean": self.mean, "cov": self.cov, "origin": self.origin, "ids": self.ids}
         return {f"joint/{name}": array for name, array in named.items()} | {
             "joint/next": np.array([self._next_id])
         }
@@ -465,10 +473,11 @@ class JointMap(Map):
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """The inverse of `arrays`; errors as `rbpf.core.schema.read`."""
         found = schema.read(arrays, _NAMED, "joint/")
-        self._ids, self._next_id = found["ids"], int(found["next"][0])
-        if np.unique(self._ids).size < self._ids.size or self._ids.max(initial=-1) >= self._next_id:
+        ids, self._next_id = found["ids"], int(found["next"][0])
+        if np.unique(ids).size < ids.size or ids.max(initial=-1) >= self._next_id:
             raise InputError("the array joint/ids names a landmark twice, or one that was never started")
-        size = self._first + self._ids.size * self.point.dim
+        self._places = {landmark: row for row, landmark in enumerate(ids.tolist())}
+        size = self._first + ids.size * self.point.dim
         held = {
             "mean": schema.numbers("n", "size"),
             "cov": schema.numbers("size", "size"),

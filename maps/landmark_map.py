@@ -24,9 +24,9 @@ from rbpf.core.models import (
 from rbpf.core.particles import Information, Prior
 from rbpf.core.schema import integers, read_one
 from rbpf.errors import InputError
-from rbpf.kernels.landmarks import gather, linearise_one, project
+from rbpf.kernels.landmarks import gather, project
 from rbpf.lie import LieGroup
-from rbpf.maps.any_map import checked_new_ids, expected, first_records, projected
+from rbpf.maps.any_map import checked_new_ids, expected, first_records, linearised, projected
 from rbpf.maps.layout import Layout
 from rbpf.maps.point import Point
 from rbpf.maps.rows import BOTH, MAP, STATE, Plan, RowEngine, by_use, fused_kernel, make_plan, require_apart
@@ -150,19 +150,14 @@ class LandmarkMap(Map):
         self, model: ObservationModel, z: np.ndarray, ids: np.ndarray, state: np.ndarray, particle: int
     ) -> tuple[np.ndarray, Jacobians, Records]:
         records = self.read(ids, slice(particle, particle + 1))
-        mean = records.mean[0]
-        const = None if records.const is None else records.const[0]
-        kernel = fused_kernel(model) if self.compiled else None
-        if kernel is None or records.log_weights is not None:
+        if records.log_weights is not None:
+            mean, const = records.mean[0], None if records.const is None else records.const[0]
             nu, jac = linearise(model, self.space, z, state[None], mean, const)
             return nu, jac, records
-        # What `linearise` gives, by the model's kernel.
-        nu = np.empty(z.shape)
-        jac_state, jac_map = np.empty((*z.shape, self.space.dim)), np.empty((*z.shape, mean.shape[1]))
-        const = np.empty((z.shape[0], 0)) if const is None else const
-        arrays = (np.ascontiguousarray(array, dtype=float) for array in (state, mean, const, z))
-        linearise_one(kernel.function.address, kernel.params, *arrays, nu, jac_state, jac_map)
-        return nu, Jacobians(jac_state, jac_map), records
+        nu, by_state, by_landmark = linearised(
+            model, self.space, z, state[None], records.mean, records.const, self.compiled
+        )
+        return nu[0], Jacobians(by_state[0], by_landmark[0]), records
 
     def predictions(
         self, model: ObservationModel, z: np.ndarray, cov: np.ndarray, ids: np.ndarray, belief: Belief

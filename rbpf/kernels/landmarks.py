@@ -328,24 +328,31 @@ def call_kernel(address, state, mean, const, z, params, n, nu, jac_state, jac_la
 
 
 @njit(
-    void(int64, VECTOR, VECTOR, MATRIX, MATRIX, MATRIX, MATRIX, CUBE, CUBE),
+    void(int64, VECTOR, MATRIX, CUBE, CUBE, MATRIX, CUBE, HYPERCUBE, HYPERCUBE),
     cache=True,
     error_model="numpy",
 )
-def linearise_one(address, params, state, mean, const, z, nu, jac_state, jac_landmark):
-    """Fills `nu` (K, p), `jac_state` (K, p, d) and `jac_landmark` (K, p, D) of one particle's K landmarks.
+def linearise_all(address, params, state, mean, const, z, nu, jac_state, jac_landmark):
+    """Fills `nu` (N, K, p), `jac_state` (N, K, p, d) and `jac_landmark` (N, K, p, D) of K landmarks in N particles.
 
-    Its state is (E,), the landmarks are `mean` (K, D) and `const` (K, A), measured as `z` (K, p).
+    The states are (N, E), the landmarks `mean` (N, K, D) and `const` (N, K, A), measured as `z` (K, p).
     """
     kernel = kernel_at(address)
-    count, p = nu.shape
-    x = np.empty((state.size, BLOCK))
-    lane_mean, lane_const = np.empty((mean.shape[1], BLOCK)), np.empty((const.shape[1], BLOCK))
+    particles, count, p = nu.shape
+    x = np.empty((state.shape[1], BLOCK))
+    lane_mean, lane_const = np.empty((mean.shape[2], BLOCK)), np.empty((const.shape[2], BLOCK))
     lane_nu = np.empty((p, BLOCK))
-    by_state = np.zeros((p, jac_state.shape[2], BLOCK))
-    by_landmark = np.empty((p, jac_landmark.shape[2], BLOCK))
-    x[:, 0] = state
-    for k in range(count):
-        lane_mean[:, 0], lane_const[:, 0] = mean[k], const[k]
-        kernel(x, lane_mean, lane_const, z[k], params, 1, lane_nu, by_state, by_landmark)
-        nu[k], jac_state[k], jac_landmark[k] = lane_nu[:, 0], by_state[:, :, 0], by_landmark[:, :, 0]
+    by_state = np.zeros((p, jac_state.shape[3], BLOCK))
+    by_landmark = np.empty((p, jac_landmark.shape[3], BLOCK))
+    for first in range(0, particles, BLOCK):
+        n = min(BLOCK, particles - first)
+        for i in range(n):
+            x[:, i] = state[first + i]
+        for k in range(count):
+            for i in range(n):
+                lane_mean[:, i], lane_const[:, i] = mean[first + i, k], const[first + i, k]
+            kernel(x, lane_mean, lane_const, z[k], params, n, lane_nu, by_state, by_landmark)
+            for i in range(n):
+                nu[first + i, k] = lane_nu[:, i]
+                jac_state[first + i, k] = by_state[:, :, i]
+                jac_landmark[first + i, k] = by_landmark[:, :, i]

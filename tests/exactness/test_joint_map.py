@@ -20,7 +20,7 @@ from rbpf.maps.joint_map import JointMap
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
 from rbpf.motion.odometry import Odometry, OdometryMotion
-from rbpf.sensors.range_bearing import RelativePosition
+from rbpf.sensors.range_bearing import RangeBearing, RelativePosition
 from tests.exactness.models import Frame, Kalman, LinearMotion, LinearObservation, Relative, Scripted
 from tests.exactness.slam import NOISE, LinearSlam
 from tests.exactness.test_linear_slam import STEP, Q, Walk
@@ -43,7 +43,8 @@ def told(filter_: Filter) -> tuple[np.ndarray, list[np.ndarray]]:
     pose = joint.estimate(filter_.particles)
     points, covs = joint.in_world(filter_.particles)
     turn = joint.space.rotation(pose.mean)
-    return np.concatenate([pose.mean[-2:], points.ravel()]), [turn @ pose.cov[-2:, -2:] @ turn.T, *covs]
+    dim = joint.point.dim
+    return np.concatenate([pose.mean[-dim:], points.ravel()]), [turn @ pose.cov[-dim:, -dim:] @ turn.T, *covs]
 
 
 def assert_same(filter_: Filter, kalman: Kalman, moving: int = 2, rtol: float = 1e-7) -> None:
@@ -173,6 +174,29 @@ def test_the_order_of_sensors_and_landmarks_does_not_matter(world):
         ends.append((*told(filter_), filter_.log_evidence))
     for first, second in zip(*ends, strict=True):
         np.testing.assert_allclose(first, second, 1e-9, 1e-12)
+
+
+@pytest.mark.parametrize(("space", "dim"), [(SE2, 2), (SE3, 3)], ids=["plane", "space"])
+def test_the_kernel_does_what_numpy_does(space, dim):
+    """More particles than a block of lanes has, a last block that is not full."""
+    rng, model, ends = np.random.default_rng(6), RangeBearing(space), []
+    control = Odometry(
+        space.retract(space.identity(), 0.1 * rng.normal(size=space.dim)), 1e-3 * np.eye(space.dim)
+    )
+    frames = [rng.normal([4.0, 0.3, 0.1][:dim], 0.05, size=(5, dim)) for _ in range(4)]
+    covs, ids = np.repeat(1e-3 * np.eye(dim)[None], 5, axis=0), np.arange(5)
+    for compiled in (True, False):
+        filter_ = Filter(
+            OdometryMotion(space), Scripted(), JointMap(space, compiled=compiled), n=70, lag=1,
+            rng=np.random.default_rng(0), consolidation=Consolidation(2),
+        )  # fmt: skip
+        for t, z in enumerate(frames):
+            groups = [Observations(z, covs, model, ids=ids)] if t else []
+            born = [] if t else [NewLandmarks(z, covs, model, Point(dim))]
+            filter_.step(Frame(groups, born), control if t else None)
+        ends.append((*told(filter_), filter_.log_evidence))
+    for first, second in zip(*ends, strict=True):
+        np.testing.assert_allclose(first, second, 1e-8, 1e-10)
 
 
 def held(space, n: int, landmarks: int, seed: int = 4) -> tuple[JointMap, Particles]:

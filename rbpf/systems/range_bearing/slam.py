@@ -77,7 +77,7 @@ class RangeBearingSlam(System):
         self.robot_from_sensor = space.identity() if robot_from_sensor is None else robot_from_sensor
         self.model = self._model()
         self.point = Point(2 if isinstance(space, SE2Group) else 3)
-        self.joint = JointMap(space) if config.map == "joint" else None
+        self.joint = JointMap(space, compiled=config.compiled) if config.map == "joint" else None
         own = LandmarkMap(space, evidence=config.association == "ml", compiled=config.compiled)
         own.register(self.point)
         sensor = self._sensor()
