@@ -40,13 +40,9 @@ NAMES = (
 def main() -> int:
     """Runs, prints, writes results.json where all were run; 1 where the gate finds a regression."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
-    parser.add_argument(
-        "names", nargs="*", metavar="name", help=f"any of: {', '.join(NAMES)}; by default all"
-    )
+    parser.add_argument("names", nargs="*", metavar="name", help=f"any of: {', '.join(NAMES)}; by default all")
     parser.add_argument("--quick", action="store_true", help="fewer repetitions")
-    parser.add_argument(
-        "--gate", action="store_true", help="compare with baseline.json, exit 1 on a regression"
-    )
+    parser.add_argument("--gate", action="store_true", help="compare with baseline.json, exit 1 on a regression")
     parser.add_argument("--record", action="store_true", help="write baseline.json from this run")
     arguments = parser.parse_args()
     unknown = sorted(set(arguments.names) - set(NAMES))

@@ -171,17 +171,13 @@ def run(settings: Settings) -> list[Row]:
     if not present:
         raise SkippedError("neither particles nor stonesoup is installed")
     data = simulate(np.random.default_rng(0))
-    agreement = (
-        evidence_agreement(data, settings.repetitions(30)) if "particles" in present else "no peer's evidence"
-    )
+    agreement = evidence_agreement(data, settings.repetitions(30)) if "particles" in present else "no peer's evidence"
     return [row for n in SIZES for row in figures(n, data, present, settings, agreement)]
 
 
 def evidence_agreement(data: np.ndarray, runs: int, n: int = 1_000) -> str:
     """Mean log-evidence of ours and of `particles` over some seeds."""
-    logs = np.array(
-        [[evidence(kind, n, data, seed) for seed in range(runs)] for kind in (OurRun, ParticlesRun)]
-    )
+    logs = np.array([[evidence(kind, n, data, seed) for seed in range(runs)] for kind in (OurRun, ParticlesRun)])
     error = np.sqrt(logs.var(axis=1, ddof=1).sum() / runs)
     gap = logs[0].mean() - logs[1].mean()
     if abs(gap) > 4.0 * error:

@@ -96,8 +96,6 @@ def by_stage(run: Run) -> dict[str, np.ndarray]:
     """Seconds of each frame (T,) by what they were spent on."""
     return {
         "search": run.log["seconds_search"],
-        "filter and report": run.log["seconds"]
-        - run.log["seconds_search"]
-        - run.log["seconds_new_landmarks"],
+        "filter and report": run.log["seconds"] - run.log["seconds_search"] - run.log["seconds_new_landmarks"],
         "new_landmarks": run.log["seconds_new_landmarks"],
     }

@@ -26,8 +26,7 @@ class TwoFrames:
         now = SE3.inverse_transform(INCREMENT, before)
         seen = np.flatnonzero(CAMERA.visible(before) & CAMERA.visible(now))[:MATCHES]
         self.z_prev, self.z_now = (
-            CAMERA.project(points[seen]) + NOISE_PX * self.rng.normal(size=(MATCHES, 3))
-            for points in (before, now)
+            CAMERA.project(points[seen]) + NOISE_PX * self.rng.normal(size=(MATCHES, 3)) for points in (before, now)
         )
         false = np.flatnonzero(self.rng.random(MATCHES) < FALSE)
         self.z_now[false] = self.z_now[np.roll(false, 1)]

@@ -25,9 +25,7 @@ class Particle:
 class PlainFastSlam:
     """Planar range-bearing FastSLAM 2.0 of n particles that know points (M, 2) with a standard deviation."""
 
-    def __init__(
-        self, start: np.ndarray, points: np.ndarray, std: float, n: int, rng: np.random.Generator
-    ) -> None:
+    def __init__(self, start: np.ndarray, points: np.ndarray, std: float, n: int, rng: np.random.Generator) -> None:
         cov = std**2 * np.eye(2)
         self.particles = [
             Particle(start.copy(), [p.copy() for p in points], [cov.copy() for _ in points]) for _ in range(n)
@@ -40,8 +38,7 @@ class PlainFastSlam:
         root_q = np.linalg.cholesky(frame.control.cov)
         predicted = [moved(particle.pose, frame.control.delta) for particle in self.particles]
         proposals = [
-            refined(pose, particle, frame, root_q)
-            for pose, particle in zip(predicted, self.particles, strict=True)
+            refined(pose, particle, frame, root_q) for pose, particle in zip(predicted, self.particles, strict=True)
         ]
         log_w1 = np.array([proposal[2] for proposal in proposals])
         self.log_weights = normalised(self.log_weights + log_w1)
@@ -90,9 +87,7 @@ def moved(pose: np.ndarray, delta: np.ndarray) -> np.ndarray:
     )
 
 
-def linearised(
-    pose: np.ndarray, point: np.ndarray, z: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def linearised(pose: np.ndarray, point: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Innovation, and the Jacobians by a right perturbation of the pose and by the landmark."""
     c, s = math.cos(pose[0]), math.sin(pose[0])
     dx, dy = point - pose[1:]

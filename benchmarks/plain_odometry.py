@@ -43,9 +43,7 @@ def motion(rig: RectifiedStereo, before: StereoFeatures, after: StereoFeatures) 
     return refined(rig, before.take(rows), after.take(rows), SE3.from_matrix(first)), rows.size
 
 
-def refined(
-    rig: RectifiedStereo, before: StereoFeatures, after: StereoFeatures, pose: np.ndarray
-) -> np.ndarray:
+def refined(rig: RectifiedStereo, before: StereoFeatures, after: StereoFeatures, pose: np.ndarray) -> np.ndarray:
     """The motion of least squared error in both images, the earlier points' error included; large ones count less."""
     for _ in range(STEPS):
         turn = SE3.rotation(pose)

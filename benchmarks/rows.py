@@ -59,10 +59,7 @@ class Row:
 
     def plain(self) -> dict[str, Any]:
         """For a JSON file."""
-        return {
-            key: value.item() if isinstance(value, np.generic) else value
-            for key, value in asdict(self).items()
-        }
+        return {key: value.item() if isinstance(value, np.generic) else value for key, value in asdict(self).items()}
 
 
 @dataclass(frozen=True)

@@ -68,8 +68,7 @@ def shortened(recording: Recording, length: int) -> Recording:
     return replace(
         recording,
         features=[
-            replace(f, descriptors=descriptors_from_histograms(f.descriptors**2, length))
-            for f in recording.features
+            replace(f, descriptors=descriptors_from_histograms(f.descriptors**2, length)) for f in recording.features
         ],
     )
 

@@ -38,9 +38,7 @@ class Drive:
         away = rng.uniform(1.5, 8.0, landmarks)
         self.places = np.stack([away * np.sin(azimuth), height, away * np.cos(azimuth)], axis=1)
         descriptors = np.abs(rng.standard_normal((landmarks, config.sift.length)))
-        self.descriptors = (descriptors / np.linalg.norm(descriptors, axis=1, keepdims=True)).astype(
-            np.float32
-        )
+        self.descriptors = (descriptors / np.linalg.norm(descriptors, axis=1, keepdims=True)).astype(np.float32)
         self._fill(landmarks)
         self.frames = [self._features(turned(turn)) for turn in range(1, turns + SETTLING + 1)]
         for _ in range(SETTLING):
@@ -75,9 +73,7 @@ class Drive:
         seen = rng.permutation(seen)[: FEATURES - NEW - 28]
         fresh = FEATURES - seen.size
         other = np.abs(rng.standard_normal((fresh, length)))
-        descriptors = np.concatenate(
-            [self.descriptors[seen] + KEY * rng.standard_normal((seen.size, length)), other]
-        )
+        descriptors = np.concatenate([self.descriptors[seen] + KEY * rng.standard_normal((seen.size, length)), other])
         descriptors = (descriptors / np.linalg.norm(descriptors, axis=1, keepdims=True)).astype(np.float32)
         spread = rng.uniform([-1.5, -1.0, 3.0], [1.5, 1.0, 6.0], (fresh, 3))
         z = RIG.project(np.concatenate([local[seen], spread]))

@@ -47,11 +47,7 @@ def called_once(trees: dict[str, ast.Module]) -> tuple[int, int]:
     named, defined = Counter(), []
     for module, tree in trees.items():
         for node in ast.walk(tree):
-            if (
-                isinstance(node, ast.FunctionDef)
-                and node.name.startswith("_")
-                and not node.name.startswith("__")
-            ):
+            if isinstance(node, ast.FunctionDef) and node.name.startswith("_") and not node.name.startswith("__"):
                 if not any(isinstance(d, ast.Name) and d.id == "njit" for d in node.decorator_list):
                     defined.append((module, node.name))
             elif isinstance(node, ast.Name):
@@ -138,17 +134,14 @@ def measure(root: Path) -> dict[str, object]:
             if parts[depth] != "__init__.py":
                 entries["/".join(parts[:depth])].add(parts[depth])
     once, private = called_once(trees)
-    comments = sum(
-        line.lstrip().startswith("#") for path in package for line in path.read_text("utf-8").splitlines()
-    )
+    comments = sum(line.lstrip().startswith("#") for path in package for line in path.read_text("utf-8").splitlines())
     groups = circles({m: imported - packages for m, imported in graph.items()})
     return {
         "lines of the package": sum(lines[path] for path in package),
         "files of the package": len(package),
         "lines of the tests": sum(lines[path] for path in tests),
         "files of the tests": len(tests),
-        "lines of examples, benchmarks and docs": sum(lines.values())
-        - sum(lines[path] for path in (*package, *tests)),
+        "lines of examples, benchmarks and docs": sum(lines.values()) - sum(lines[path] for path in (*package, *tests)),
         "lines that are comments": comments,
         "private functions": private,
         "private functions named once": once,

@@ -38,9 +38,7 @@ def draw_vessel(path: Path) -> None:
     truth, measurements = target_tracking.simulate(np.random.default_rng(0))
     filters: dict[str, Any] = {
         "bootstrap, all five numbers sampled": target_tracking.bootstrap(np.random.default_rng(100)),
-        "turn rate and speed marginalised": target_tracking.marginalised(
-            np.random.default_rng(100), EkfProposal()
-        ),
+        "turn rate and speed marginalised": target_tracking.marginalised(np.random.default_rng(100), EkfProposal()),
     }
     figure = Figure(figsize=(7.0, 3.2), layout="constrained")
     axes = figure.subplots()

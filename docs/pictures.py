@@ -38,9 +38,7 @@ def animate(run: Run, path: Path) -> None:
     pictures = [Image.fromarray(frame) for frame in chosen]
     size = WIDTH, round(WIDTH * pictures[0].height / pictures[0].width)
     small = [picture.resize(size, Image.Resampling.LANCZOS) for picture in pictures]
-    small[0].save(
-        path, save_all=True, append_images=small[1:], duration=EVERY * 33, loop=0, quality=QUALITY, method=6
-    )
+    small[0].save(path, save_all=True, append_images=small[1:], duration=EVERY * 33, loop=0, quality=QUALITY, method=6)
 
 
 def shrink(source: Path, path: Path) -> None:

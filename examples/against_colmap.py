@@ -31,9 +31,7 @@ def main(quick: bool = False, out: Path = Path("out")) -> dict[str, float]:
         estimate = PathAndMap.of_run(run)
         options = ReconstructionOptions(every=every, features=800 if quick else 4096)
         found = compare_with_colmap(estimate, run.source, options)
-    figures = {
-        f"run: {name}": value for name, value in found.run.as_dict().items() if isinstance(value, float)
-    }
+    figures = {f"run: {name}": value for name, value in found.run.as_dict().items() if isinstance(value, float)}
     if found.truth is not None:
         figures["COLMAP's own error [m]"] = found.truth.path.rmse
     write_table(out / "against_colmap.csv", ("figure", "value"), list(figures.items()))

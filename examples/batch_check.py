@@ -46,10 +46,7 @@ def main() -> dict[str, float]:
     difference = summary.mean - points
     figures["from_batch"] = float(np.linalg.norm(difference, axis=1).mean())
     print(f"the filter's landmarks are {figures['from_batch']:.3f} m from the optimum's")
-    spread = [
-        np.trace(cov) / np.trace(batch.cov_landmarks[name])
-        for name, cov in zip(names, summary.cov, strict=True)
-    ]
+    spread = [np.trace(cov) / np.trace(batch.cov_landmarks[name]) for name, cov in zip(names, summary.cov, strict=True)]
     figures["sigma_ratio"] = float(np.sqrt(np.median(spread)))
     print(f"and their standard deviations {figures['sigma_ratio']:.2f} times the optimum's (1 is honest)")
     return figures

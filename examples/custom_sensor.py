@@ -36,9 +36,7 @@ class LampSensor(ObservationModel):
         return SE2.transform(state, np.exp(-0.5 * z[..., 1:]) * direction)
 
 
-def simulate(
-    rng: np.random.Generator, steps: int = 200
-) -> tuple[list[SimpleNamespace], np.ndarray, np.ndarray]:
+def simulate(rng: np.random.Generator, steps: int = 200) -> tuple[list[SimpleNamespace], np.ndarray, np.ndarray]:
     """Frames of a robot that drives twice round a circle, its true poses (T, 3), and the lamps (M, 2)."""
     lamps = rng.uniform([-8.0, -4.0], [8.0, 12.0], (40, 2))
     increment = SE2.exp(4 * np.pi / (steps - 1) * np.array([1.0, 4.0, 0.0]))

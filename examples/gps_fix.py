@@ -39,9 +39,7 @@ class PositionReceiver(Sensor):
         return [Observations(z=frame[None], cov=self.cov, model=self.model)]
 
 
-def simulate(
-    rng: np.random.Generator, steps: int = 200
-) -> list[tuple[np.ndarray, Odometry | None, np.ndarray | None]]:
+def simulate(rng: np.random.Generator, steps: int = 200) -> list[tuple[np.ndarray, Odometry | None, np.ndarray | None]]:
     """True pose, odometry and fix of every step; the robot starts at the origin, facing 2 rad to the left."""
     pose, out = np.array([2.0, 0.0, 0.0]), []
     for t in range(steps):

@@ -22,9 +22,7 @@ def slam(images: Path, known_points: Path | None, particles: int, out: Path) -> 
     sequence = open_images(images)
     known = None if known_points is None else read_known_points(known_points)
     run = filter_images(sequence, MonoConfig(particles=particles), known)
-    print(
-        f"the camera ended at {run.log.poses[-1, 4:].round(3)} m, lost in {int(run.log.lost().sum())} frames"
-    )
+    print(f"the camera ended at {run.log.poses[-1, 4:].round(3)} m, lost in {int(run.log.lost().sum())} frames")
     return finish_run(run, out, MonoRecording(images, known_points).sources())
 
 

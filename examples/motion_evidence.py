@@ -106,8 +106,7 @@ def main(
     for name, turn_rate in TURN_RATES.items():
         measurements = simulate(np.random.default_rng(7), turn_rate, steps)
         with_rate, without = (
-            np.array([log_evidence(measurements, model, particles, seed) for seed in range(seeds)])
-            for model in MODELS
+            np.array([log_evidence(measurements, model, particles, seed) for seed in range(seeds)]) for model in MODELS
         )
         curves[name] = with_rate - without
         found[name] = evidence_difference(with_rate[:, -1], without[:, -1])

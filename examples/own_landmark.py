@@ -64,9 +64,7 @@ class Bearing(ObservationModel):
         return Records(np.tile(mean, (n, 1, 1)), np.tile(variances, (n, 1, 1, 1)), anchors)
 
 
-def simulate(
-    rng: np.random.Generator, steps: int = 150
-) -> tuple[list[SimpleNamespace], np.ndarray, np.ndarray]:
+def simulate(rng: np.random.Generator, steps: int = 150) -> tuple[list[SimpleNamespace], np.ndarray, np.ndarray]:
     """Frames of a robot on a circle, its true poses (T, 3), and the landmarks (M, 2)."""
     points = 10.0 * rng.uniform(-1.0, 1.0, (30, 2)) + np.array([0.0, 3.0])
     increment = SE2.exp(2 * np.pi / (steps - 1) * np.array([1.0, 3.0, 0.0]))
@@ -87,9 +85,7 @@ def simulate(
 
 def main() -> dict[str, float]:
     """Checks both classes, runs the filter, and prints how many landmarks were located and how well."""
-    findings = check_model(InverseRange(), SE2) + check_model(
-        Bearing(), SE2, example=Example(landmark=InverseRange())
-    )
+    findings = check_model(InverseRange(), SE2) + check_model(Bearing(), SE2, example=Example(landmark=InverseRange()))
     print("check_model:", "; ".join(findings) or "InverseRange and Bearing are sound")
     frames, truth, points = simulate(np.random.default_rng(5))
     point_map = LandmarkMap(SE2)
@@ -111,9 +107,7 @@ def main() -> dict[str, float]:
         "map": float(np.median(distances)),
         "path": float(np.mean(errors)),
     }
-    print(
-        f"{len(located)} of {point_map.ids.size} landmarks became points, median error {figures['map']:.2f} m"
-    )
+    print(f"{len(located)} of {point_map.ids.size} landmarks became points, median error {figures['map']:.2f} m")
     print(f"mean position error of the robot: {figures['path']:.2f} m after a way of 19 m")
     return figures
 

@@ -49,9 +49,7 @@ def main(
     asked = SweepFile("range-bearing", ["log"], list(particles), seeds, OPTIONS)
     rows = sweep(plan(asked, out), out, workers, scheduler)
     errors = {
-        (option, n): [
-            1e3 * row["path_rmse_m"] for row in rows if (row["option"], row["particles"]) == (option, n)
-        ]
+        (option, n): [1e3 * row["path_rmse_m"] for row in rows if (row["option"], row["particles"]) == (option, n)]
         for option in OPTIONS
         for n in particles
     }

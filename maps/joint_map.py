@@ -60,9 +60,7 @@ class _Rows(NamedTuple):
     @property
     def log_det(self) -> float:
         """log|2πS|."""
-        return 2.0 * float(np.log(np.diagonal(self.chol)).sum()) + self.nu.shape[1] * float(
-            np.log(2.0 * np.pi)
-        )
+        return 2.0 * float(np.log(np.diagonal(self.chol)).sum()) + self.nu.shape[1] * float(np.log(2.0 * np.pi))
 
 
 _NAMED = {"ids": schema.integers("landmarks", least=0), "next": schema.integers(1, least=0)}
@@ -98,9 +96,7 @@ class JointMap(Map):
     ) -> None:
         self.space = space
         self.compiled = compiled
-        self.point = Point(
-            2 if isinstance(space, SE2Group) else 3 if isinstance(space, SE3Group) else space.dim
-        )
+        self.point = Point(2 if isinstance(space, SE2Group) else 3 if isinstance(space, SE3Group) else space.dim)
         mean, cov = (np.zeros(0), np.zeros((0, 0))) if substate is None else map(np.asarray, substate)
         if cov.shape != (mean.size, mean.size):
             raise InputError(f"a substate with mean {mean.shape} needs a square cov, got {cov.shape}")
@@ -175,9 +171,7 @@ class JointMap(Map):
         total.rows += count
         return total
 
-    def correct(
-        self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]
-    ) -> LogDensities:
+    def correct(self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]) -> LogDensities:
         """Log p(z | x), and one Kalman update by all rows: one gain, one covariance, the particles' own innovations."""
         self.mean, self.cov = self._given(increment)
         self._gain = None
@@ -266,9 +260,7 @@ class JointMap(Map):
             return self.mean, self.cov
         return self._predicted + (increment - self._increment_mean) @ self._gain.T, self._rest
 
-    def _rows(
-        self, state: np.ndarray, mean: np.ndarray, cov: np.ndarray, groups: Sequence[Observations]
-    ) -> _Rows:
+    def _rows(self, state: np.ndarray, mean: np.ndarray, cov: np.ndarray, groups: Sequence[Observations]) -> _Rows:
         """Linearises all groups at the particles' own means; Jacobians by what is held are averaged over the particles."""
         d, n = self.space.dim, mean.shape[1]
         nus, by_states = [np.zeros((self.n, 0))], [np.zeros((self.n, 0, d))]
@@ -278,9 +270,7 @@ class JointMap(Map):
             at, landmarks, substate = state[:, None], None, None
             columns = np.zeros((z.shape[0], 0), dtype=np.int64)
             if ids is not None:
-                log_factor += group.log_new * int((ids == NEW).sum()) + group.log_clutter * int(
-                    (ids == NULL).sum()
-                )
+                log_factor += group.log_new * int((ids == NEW).sum()) + group.log_clutter * int((ids == NULL).sum())
                 z, noise, ids = z[ids >= 0], noise[ids >= 0], ids[ids >= 0]
                 columns = self._columns(ids)
                 landmarks = mean[:, columns]
@@ -298,9 +288,7 @@ class JointMap(Map):
             count, p = z.shape
             block = np.zeros((count, p, n))
             if jac.landmark is not None:
-                np.put_along_axis(
-                    block, np.repeat(columns[:, None], p, axis=1), jac.landmark.mean(axis=0), axis=2
-                )
+                np.put_along_axis(block, np.repeat(columns[:, None], p, axis=1), jac.landmark.mean(axis=0), axis=2)
             if jac.substate is not None:
                 block[..., d : self._first] = jac.substate.mean(axis=0)
             if in_world and jac.state is not None:
@@ -321,9 +309,7 @@ class JointMap(Map):
             rows = slice(end, end := end + noise.shape[0])
             innovation[rows, rows] += noise
         chol = gaussian.cholesky(innovation) if end else innovation
-        return _Rows(
-            np.concatenate(nus, axis=1), np.concatenate(by_states, axis=1), slope, used, chol, log_factor
-        )
+        return _Rows(np.concatenate(nus, axis=1), np.concatenate(by_states, axis=1), slope, used, chol, log_factor)
 
     def _checked_ids(self, group: Observations) -> np.ndarray | None:
         """Landmarks (K,) of a group, None where it reads none.
@@ -333,9 +319,7 @@ class JointMap(Map):
         """
         name, ids = type(group.model).__name__, group.ids
         if group.likelihood is not None and group.likelihood.kernel_id != 0:
-            raise InputError(
-                f"a joint map takes Gaussian likelihoods, {name} has {type(group.likelihood).__name__}"
-            )
+            raise InputError(f"a joint map takes Gaussian likelihoods, {name} has {type(group.likelihood).__name__}")
         if group.updates != frozenset({Part.STATE, Part.LANDMARK}):
             raise InputError(f"a joint map's observations update state and landmarks, {name}'s do not")
         if Part.LANDMARK not in group.model.reads:
@@ -454,17 +438,13 @@ class JointMap(Map):
         predicted, inside = expected(model, self.read(ids), belief)
         return model.residual(z[:, None, :], predicted[:, None]), inside[:, None] + cov[:, None]
 
-    def project(
-        self, model: ObservationModel, ids: np.ndarray, belief: Belief
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def project(self, model: ObservationModel, ids: np.ndarray, belief: Belief) -> tuple[np.ndarray, np.ndarray]:
         return projected(model, self.read(ids), belief)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Means, the covariance, the frame and the landmarks' ids."""
         named = {"mean": self.mean, "cov": self.cov, "origin": self.origin, "ids": self.ids}
-        return {f"joint/{name}": array for name, array in named.items()} | {
-            "joint/next": np.array([self._next_id])
-        }
+        return {f"joint/{name}": array for name, array in named.items()} | {"joint/next": np.array([self._next_id])}
 
     def options(self) -> dict[str, object]:
         """Size of the substate."""

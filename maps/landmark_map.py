@@ -172,9 +172,7 @@ class LandmarkMap(Map):
         plain = self._layout_of(int(ids[0])).landmark.components == 1
         return plain and self.store.is_warm(ids) and model.kernel() is not None
 
-    def project(
-        self, model: ObservationModel, ids: np.ndarray, belief: Belief
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def project(self, model: ObservationModel, ids: np.ndarray, belief: Belief) -> tuple[np.ndarray, np.ndarray]:
         prior, weights = belief.prior, belief.weights
         kernel = fused_kernel(model) if self.is_compiled(model, ids) else None
         if kernel is not None:
@@ -224,9 +222,7 @@ class LandmarkMap(Map):
         for_state = [group for group in groups if Part.STATE in group.updates]
         return self._engine.information(self._plan(for_state), state, for_state, prior)
 
-    def correct(
-        self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]
-    ) -> LogDensities:
+    def correct(self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]) -> LogDensities:
         """Log p(z | x) and the landmarks' Kalman updates at the sampled states."""
         uses = by_use(groups)
         require_apart(uses[STATE], uses[BOTH])
@@ -250,9 +246,7 @@ class LandmarkMap(Map):
             found = self._engine.information(plan, state, groups, Prior.exactly(self.space, state))
             return found.log_factor - 0.5 * (found.quad + found.log_det)
         if plan.joint:
-            raise InputError(
-                "a landmark observed twice in a step needs a Gaussian likelihood to be left as it is"
-            )
+            raise InputError("a landmark observed twice in a step needs a Gaussian likelihood to be left as it is")
         total = plan.log_factor.copy()
         for batch in plan.batches:
             group, records = groups[batch.group], self.read(batch.ids)

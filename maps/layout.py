@@ -52,9 +52,7 @@ class Layout:
         if (records.log_weights is None) != (components == 1):
             raise InputError(f"{name} needs log_weights exactly if it has several components")
         if (records.const is None) != (self.landmark.constants == 0):
-            raise InputError(
-                f"{name} has {self.landmark.constants} constants per landmark: give them in Records.const"
-            )
+            raise InputError(f"{name} has {self.landmark.constants} constants per landmark: give them in Records.const")
         body = np.concatenate([records.mean, gaussian.pack(records.cov)], axis=-1)
         body = body.reshape(n, k, self.landmark.components * self.gaussian_fields)
         parts = [body]
@@ -66,9 +64,7 @@ class Layout:
             parts.append(np.zeros((n, k, 1)) if log_odds is None else log_odds[..., None])
         columns = np.concatenate(parts, axis=-1)
         if not np.isfinite(body).all():
-            raise InputError(
-                f"a new {type(self.landmark).__name__} has a mean or covariance that is not finite"
-            )
+            raise InputError(f"a new {type(self.landmark).__name__} has a mean or covariance that is not finite")
         return np.ascontiguousarray(np.moveaxis(columns, 0, -1))
 
     def unpack(self, columns: np.ndarray) -> Records:

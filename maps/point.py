@@ -73,9 +73,7 @@ class MixturePoint(Landmark):
         heaviest = records.log_weights.argmax(axis=-1)[..., None, None]
         mean = np.take_along_axis(records.mean, heaviest, axis=2)
         cov = np.take_along_axis(records.cov, heaviest[..., None], axis=2)
-        offset = gaussian.solve_lower(
-            gaussian.cholesky(np.broadcast_to(cov, records.cov.shape)), records.mean - mean
-        )
+        offset = gaussian.solve_lower(gaussian.cholesky(np.broadcast_to(cov, records.cov.shape)), records.mean - mean)
         near = np.square(offset).sum(axis=-1) <= self.reach**2
         return (np.exp(records.log_weights) * near).sum(axis=-1) >= self.dominant
 

@@ -155,9 +155,7 @@ def _checked_ids(group: Observations, n: int, kinds: Kinds) -> np.ndarray:
     if ids.shape not in ((count,), (n, count)):
         raise InputError(f"ids of {count} measurements must be ({count},) or ({n}, {count}), got {ids.shape}")
     if ids.dtype.kind != "i" or (ids.size and ids.min() < NEW):
-        raise InputError(
-            f"ids of {type(group.model).__name__} must be integers: landmarks, NULL = -1 or NEW = -2"
-        )
+        raise InputError(f"ids of {type(group.model).__name__} must be integers: landmarks, NULL = -1 or NEW = -2")
     named = ids[ids >= 0]
     held = kinds(named) >= 0
     if not held.all():
@@ -177,9 +175,7 @@ def _rows(number: int, ids: np.ndarray) -> list[Row]:
                 rows.append(Row(number, k, first, None))
             continue
         rows.extend(
-            Row(number, k, int(landmark), column == landmark)
-            for landmark in np.unique(column)
-            if landmark >= 0
+            Row(number, k, int(landmark), column == landmark) for landmark in np.unique(column) if landmark >= 0
         )
     return rows
 
@@ -200,10 +196,7 @@ def require_apart(weigh: Sequence[Observations], both: Sequence[Observations]) -
     """
     if not weigh or not both:
         return
-    seen = [
-        np.concatenate([np.ravel(group.ids) for group in part if group.ids is not None])
-        for part in (weigh, both)
-    ]
+    seen = [np.concatenate([np.ravel(group.ids) for group in part if group.ids is not None]) for part in (weigh, both)]
     shared = np.intersect1d(seen[0][seen[0] >= 0], seen[1])
     if shared.size:
         raise InputError(
@@ -223,17 +216,13 @@ PAIRS_AT_ONCE = 8192
 class RowEngine:
     """Linearises and updates the columns of a store."""
 
-    def __init__(
-        self, space: LieGroup, store: SharedStore, layout_of: Callable[[int], Layout], compiled: bool
-    ) -> None:
+    def __init__(self, space: LieGroup, store: SharedStore, layout_of: Callable[[int], Layout], compiled: bool) -> None:
         self.space = space
         self.store = store
         self.layout_of = layout_of
         self.compiled = compiled
 
-    def information(
-        self, plan: Plan, state: np.ndarray, groups: Sequence[Observations], prior: Prior
-    ) -> Information:
+    def information(self, plan: Plan, state: np.ndarray, groups: Sequence[Observations], prior: Prior) -> Information:
         """Information of all rows but those of mixtures, about a right perturbation of the states (N, E)."""
         total = Information.zeros(state.shape[0], self.space.dim)
         total.log_factor += plan.log_factor
@@ -363,9 +352,7 @@ class RowEngine:
         for column, records in zip(ids.tolist(), columns, strict=True):
             self.store.replace(column, records)
 
-    def _information_numpy(
-        self, batch: Batch, group: Observations, state: np.ndarray, prior: Prior
-    ) -> Information:
+    def _information_numpy(self, batch: Batch, group: Observations, state: np.ndarray, prior: Prior) -> Information:
         _, records = self._read(batch.ids)
         z, noise = group.z[batch.ks], group.cov[batch.ks]
         parts = []
@@ -379,9 +366,7 @@ class RowEngine:
             parts.append(linearisation.information(nu, jac.state, cov, likelihood, prior.take(part), mask))
         return Information.of_parts(parts)
 
-    def _correct_numpy(
-        self, batch: Batch, group: Observations, state: np.ndarray, log_density: np.ndarray
-    ) -> None:
+    def _correct_numpy(self, batch: Batch, group: Observations, state: np.ndarray, log_density: np.ndarray) -> None:
         pending = np.arange(batch.ids.size)
         while pending.size:
             _, first = np.unique(batch.ids[pending], return_index=True)
@@ -396,9 +381,7 @@ class RowEngine:
         means, covs = [], []
         for part in _spans(state.shape[0], ks.size):
             mean, cov, const = _taken(records, part)
-            nu, jac = linearise(
-                group.model, self.space, group.z[ks], state[part, None], mean, const, by=_BY_LANDMARK
-            )
+            nu, jac = linearise(group.model, self.space, group.z[ks], state[part, None], mean, const, by=_BY_LANDMARK)
             assert jac.landmark is not None
             mask = None if batch.mask is None else batch.mask[part][:, rows]
             mean, cov, log_terms = linearisation.updated(
@@ -487,9 +470,7 @@ def fused_kernel(model: ObservationModel) -> FusedKernel | None:
     kernel = model.kernel()
     if kernel is None:
         return None
-    return FusedKernel(
-        kernel.function, numbers(kernel.params, f"the params of {type(model).__name__}'s kernel")
-    )
+    return FusedKernel(kernel.function, numbers(kernel.params, f"the params of {type(model).__name__}'s kernel"))
 
 
 def _spans(n: int, k: int) -> list[slice]:

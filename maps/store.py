@@ -275,9 +275,7 @@ class SharedStore:
         # Columns that were compacted together share one array of writers.
         found: dict[int, np.ndarray] = {}
         slabs = self.columns.slab[at].tolist()
-        for k, (column, generation, slab) in enumerate(
-            zip(columns.tolist(), generations, slabs, strict=True)
-        ):
+        for k, (column, generation, slab) in enumerate(zip(columns.tolist(), generations, slabs, strict=True)):
             if slab >= 0:
                 pool[slab].take(rows[generation], axis=1, out=out[k], mode="clip")
                 continue
@@ -360,9 +358,7 @@ class SharedStore:
                         self._cold[column] = Cold(alive, cold.data.take(rows, axis=1))
                     elif cold is None and alive.size <= HOT_FRACTION * self.n:
                         pool = self._pool(row)
-                        self._cold[column] = Cold(
-                            alive, pool.data[self.columns.slab[row]].take(alive, axis=1)
-                        )
+                        self._cold[column] = Cold(alive, pool.data[self.columns.slab[row]].take(alive, axis=1))
                         pool.give(self.columns.slab[row : row + 1])
                         self.columns.slab[row] = -1
             if alive.size > 1:

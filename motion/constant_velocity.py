@@ -121,9 +121,7 @@ class SampledVelocity(MotionModel):
 
 def _placed(state: np.ndarray, prior: PosePrior) -> np.ndarray:
     if prior.mean.shape != (7,) or prior.cov.shape != (6, 6) or not np.isfinite(prior.mean).all():
-        raise InputError(
-            f"a PosePrior needs a finite mean (7,) and cov (6, 6), got {prior.mean} and {prior.cov.shape}"
-        )
+        raise InputError(f"a PosePrior needs a finite mean (7,) and cov (6, 6), got {prior.mean} and {prior.cov.shape}")
     return np.broadcast_to(SE3.normalise(prior.mean), state.shape).copy()
 
 

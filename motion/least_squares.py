@@ -95,9 +95,7 @@ class Minimum(Generic[State]):
         return self.factor @ self.factor.T
 
 
-def minimise(
-    evaluate: Evaluate[State], x: State, retract: Retract[State], rule: Rule | None = None
-) -> Minimum[State]:
+def minimise(evaluate: Evaluate[State], x: State, retract: Retract[State], rule: Rule | None = None) -> Minimum[State]:
     """The minimum of ½‖ε(x)‖² that is reached from x.
 
     Raises:

@@ -52,9 +52,7 @@ class OdometryMotion(MotionModel):
         InputError: std_added is negative, not finite, or neither one number nor one per component.
     """
 
-    def __init__(
-        self, space: LieGroup, std_added: ArrayLike = 0.0, free: tuple[bool, ...] | None = None
-    ) -> None:
+    def __init__(self, space: LieGroup, std_added: ArrayLike = 0.0, free: tuple[bool, ...] | None = None) -> None:
         std = np.asarray(std_added, dtype=float)
         if std.shape not in ((), (space.dim,)) or not (np.isfinite(std).all() and (std >= 0.0).all()):
             raise InputError(f"std_added must be one or {space.dim} numbers from 0 up, got {std_added!r}")

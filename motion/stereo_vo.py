@@ -154,9 +154,7 @@ def _minimum(matches: Matches, start: Array, points: Points, rule: Rule) -> Mini
     return minimise(lambda motion: residuals(matches, motion, points), start, SE3.retract, rule)
 
 
-def _refined(
-    matches: Matches, plausible: np.ndarray, motion: Array, start: Array, config: VoConfig
-) -> MotionEstimate:
+def _refined(matches: Matches, plausible: np.ndarray, motion: Array, start: Array, config: VoConfig) -> MotionEstimate:
     """The motion of all matches that agree, from one that many agree with."""
     agreeing, iterations = plausible & (_squared(matches, motion, config) <= WIDE * config.gate), 0
     for _ in range(ROUNDS):
@@ -310,9 +308,7 @@ class VisualOdometry:
     def __init__(self, config: VoConfig | None = None, prior: MotionPrior | None = None) -> None:
         self.config, self.prior = config or VoConfig(), prior or MotionPrior()
 
-    def candidates(
-        self, matches: Matches, velocity: Array, dt: float, rng: np.random.Generator
-    ) -> CandidateMotions:
+    def candidates(self, matches: Matches, velocity: Array, dt: float, rng: np.random.Generator) -> CandidateMotions:
         """The motions over `dt` seconds that the matches may tell of, after a velocity (6,) [ω, v], rad/s, m/s.
 
         Raises:

@@ -3,9 +3,7 @@
 
 def printable(text: str) -> str:
     """A text, such as the name of a file, on one line and in UTF-8: what cannot be shown is written as an escape."""
-    shown = (
-        c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode("ascii") for c in text
-    )
+    shown = (c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode("ascii") for c in text)
     return "".join(shown)
 
 

@@ -102,9 +102,7 @@ def find_board(image: np.ndarray, board: Board) -> KnownPixels:
         )
     side = least_side(px, board)
     if side < LEAST_SQUARE_PX:
-        raise InputError(
-            f"the chessboard's squares are only {side:.1f} px wide in the first image: start nearer to it"
-        )
+        raise InputError(f"the chessboard's squares are only {side:.1f} px wide in the first image: start nearer to it")
     chosen = spread_rows(board.corners, MOST)
     return KnownPixels(chosen, px[chosen], board.corners[chosen], np.zeros(chosen.size), own_frame=True)
 
@@ -186,9 +184,7 @@ class MarkerBoard:
                 f"a marker's side must be positive and the gap not negative, got {self.side_m} m, {self.gap_m} m"
             )
         if self.dictionary not in DICTIONARIES:
-            raise InputError(
-                f"there is no dictionary {self.dictionary!r} of markers; known: {', '.join(DICTIONARIES)}"
-            )
+            raise InputError(f"there is no dictionary {self.dictionary!r} of markers; known: {', '.join(DICTIONARIES)}")
 
     @classmethod
     def parse(cls, size: str, side_m: float, gap_m: float, dictionary: str) -> "MarkerBoard":

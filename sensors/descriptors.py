@@ -170,9 +170,7 @@ def _chosen(first: np.ndarray, second: np.ndarray, products: np.ndarray) -> Desc
     return DescriptorMatches(first, second, distances(products))
 
 
-def band_pairs(
-    first: np.ndarray, second: np.ndarray, reach: np.ndarray | float
-) -> tuple[np.ndarray, np.ndarray]:
+def band_pairs(first: np.ndarray, second: np.ndarray, reach: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
     """All pairs (C,), (C,) of numbers (K,) and (M,) that differ by at most the reach (K,) or ()."""
     order = np.argsort(second, kind="stable")
     low = np.searchsorted(second[order], first - reach, side="left")
@@ -261,9 +259,7 @@ class DescriptorStore:
             )
         last = self._ids[self._count - 1 : self._count]
         if (np.diff(np.concatenate([last, ids])) <= 0).any():
-            raise InputError(
-                "ids of new descriptors must ascend, and be above those held: take the map's own"
-            )
+            raise InputError("ids of new descriptors must ascend, and be above those held: take the map's own")
         total = self._count + ids.size
         if total > self._ids.size:
             # Room for as many again.

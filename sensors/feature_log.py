@@ -84,9 +84,7 @@ class CameraTruth:
         _check_whole(where, "stamps_ns", "T", self.stamps_ns)
         _check_numbers(where, "world_from_camera", self.world_from_camera, (len(self.stamps_ns), 7))
         if (late := np.flatnonzero(np.diff(self.stamps_ns) < 0)).size:
-            raise InputError(
-                f"{where}: stamp {late[0] + 1} is before the one it follows, sort the poses by time"
-            )
+            raise InputError(f"{where}: stamp {late[0] + 1} is before the one it follows, sort the poses by time")
         length = np.linalg.norm(self.world_from_camera[:, :4], axis=1)
         if (wrong := np.flatnonzero(np.abs(length - 1.0) > UNIT)).size:
             found = f"pose {wrong[0]} has a quaternion of length {length[wrong[0]]:.9g}"
@@ -159,9 +157,7 @@ def _check_names(where: str, what: str, letter: str, names: np.ndarray) -> None:
     _check_whole(where, what, letter, names)
     unique, counts = np.unique(names, return_counts=True)
     if (counts > 1).any():
-        raise InputError(
-            f"{where}: landmark {unique[np.argmax(counts > 1)]} comes twice, keep one of the two"
-        )
+        raise InputError(f"{where}: landmark {unique[np.argmax(counts > 1)]} comes twice, keep one of the two")
 
 
 def _check_numbers(where: str, what: str, values: np.ndarray, shape: tuple[int, ...]) -> None:

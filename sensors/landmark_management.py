@@ -109,9 +109,7 @@ class LandmarkManager:
         self._table = self._table[~overdue]
         return dropped
 
-    def select(
-        self, px: np.ndarray, descriptors: np.ndarray, nearest: np.ndarray, taken: np.ndarray
-    ) -> np.ndarray:
+    def select(self, px: np.ndarray, descriptors: np.ndarray, nearest: np.ndarray, taken: np.ndarray) -> np.ndarray:
         """Rows (k,) of those features of a frame that are worth a new candidate, in their order.
 
         Args:

@@ -39,9 +39,7 @@ class NamedLandmarkSensor(Sensor):
         likelihood: of the innovation, None is Gaussian.
     """
 
-    def __init__(
-        self, model: ObservationModel, landmark: Landmark, likelihood: Likelihood | None = None
-    ) -> None:
+    def __init__(self, model: ObservationModel, landmark: Landmark, likelihood: Likelihood | None = None) -> None:
         self.model = model
         self.landmark = landmark
         self.likelihood = likelihood
@@ -112,9 +110,7 @@ class AnonymousLandmarkSensor(Sensor):
             chosen = np.full((belief.log_weights.size, frame.z.shape[0]), NEW)
         gates = self.gates
         return [
-            Observations(
-                frame.z, frame.cov_z, self.model, self.likelihood, chosen, gates.log_new, gates.log_clutter
-            )
+            Observations(frame.z, frame.cov_z, self.model, self.likelihood, chosen, gates.log_new, gates.log_clutter)
         ]
 
     def new_landmarks(
@@ -133,6 +129,4 @@ class AnonymousLandmarkSensor(Sensor):
         new = (chosen == NEW).any(axis=0)
         if not new.any():
             return []
-        return [
-            NewLandmarks(frame.z[new], frame.cov_z[new], self.model, self.landmark, chosen[:, new] == NEW)
-        ]
+        return [NewLandmarks(frame.z[new], frame.cov_z[new], self.model, self.landmark, chosen[:, new] == NEW)]

@@ -302,9 +302,7 @@ class StereoMatcher:
             matches, z = matches.take(good), z[good]
         far = z[:, 0] - z[:, 2] >= self.config.least_disparity_px
         chosen, noise = left.take(matches.first[far]), self.noise(left.scale[matches.first[far]])
-        return StereoFeatures.measured(
-            self.rig, z[far], noise, chosen.scale, chosen.orientation, chosen.descriptors
-        )
+        return StereoFeatures.measured(self.rig, z[far], noise, chosen.scale, chosen.orientation, chosen.descriptors)
 
     def noise(self, scale: np.ndarray) -> np.ndarray:
         """Covariances (K, 3, 3) of (u_left, v, u_right) of keypoints of scales (K,), px²."""
@@ -327,9 +325,7 @@ class StereoMatcher:
         near &= np.abs(np.log(left.scale[k] / right.scale[m])) <= np.log(config.scale_ratio)
         near &= np.cos(left.orientation[k] - right.orientation[m]) >= np.cos(config.turn_rad)
         pairs = k[near], m[near]
-        return one_per_place(
-            match_pairs(left.descriptors, right.descriptors, pairs, config.limits), left, right
-        )
+        return one_per_place(match_pairs(left.descriptors, right.descriptors, pairs, config.limits), left, right)
 
     def check(self, left: np.ndarray, right: np.ndarray) -> None:
         """Refuses images that these cameras cannot have taken.
@@ -343,9 +339,7 @@ class StereoMatcher:
             found = " and ".join(sizes)
             raise InputError(f"left and right image must be of one size, got {found}: give a rectified pair")
         if left.shape != (camera.height, camera.width):
-            raise InputError(
-                f"the camera takes {camera.width}x{camera.height} px, the images have {sizes[0]}"
-            )
+            raise InputError(f"the camera takes {camera.width}x{camera.height} px, the images have {sizes[0]}")
 
 
 def one_per_place(matches: DescriptorMatches, left: Features, right: Features) -> DescriptorMatches:

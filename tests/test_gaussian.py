@@ -18,9 +18,7 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(20052)
 
 
-def covariances(
-    rng: np.random.Generator, shape: tuple[int, ...], n: int, rank: int | None = None
-) -> np.ndarray:
+def covariances(rng: np.random.Generator, shape: tuple[int, ...], n: int, rank: int | None = None) -> np.ndarray:
     """Random covariances, of full rank unless told otherwise."""
     half = rng.normal(size=(*shape, n, n + 2 if rank is None else rank))
     return gaussian.symmetrise(np.einsum("...ir,...jr->...ij", half, half))
@@ -193,9 +191,7 @@ def test_condition_on_a_singular_quantity():
     # b is the first component of a, twice, and a constant.
     cov = np.array([[2.0, 0.6], [0.6, 1.0]])
     pick = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 0.0]])
-    posterior = gaussian.condition(
-        [0.0, 0.0], [0.0, 0.0, 7.0], cov, cov @ pick.T, pick @ cov @ pick.T, [3.0, 3.0, 7.0]
-    )
+    posterior = gaussian.condition([0.0, 0.0], [0.0, 0.0, 7.0], cov, cov @ pick.T, pick @ cov @ pick.T, [3.0, 3.0, 7.0])
     np.testing.assert_allclose(posterior.mean, [3.0, 0.9], atol=1e-12)
     np.testing.assert_allclose(posterior.cov, [[0.0, 0.0], [0.0, 0.82]], atol=1e-12)
 
@@ -206,9 +202,7 @@ def test_condition_leaves_null_directions_out(rng):
         design, truth = rng.normal(size=(5, 2)), rng.normal(size=2)
         contradiction = np.linalg.svd(design / np.linalg.norm(design, axis=1, keepdims=True))[0][:, 2]
         reading = design @ truth + contradiction * np.linalg.norm(design, axis=1)
-        posterior = gaussian.condition(
-            np.zeros(2), np.zeros(5), np.eye(2), design.T, design @ design.T, reading
-        )
+        posterior = gaussian.condition(np.zeros(2), np.zeros(5), np.eye(2), design.T, design @ design.T, reading)
         np.testing.assert_allclose(posterior.mean, truth, atol=1e-8)
         np.testing.assert_allclose(posterior.cov, np.zeros((2, 2)), atol=1e-12)
 

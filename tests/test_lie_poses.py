@@ -96,9 +96,7 @@ def test_points_and_matrices(group, n, rng):
     assert world.shape == (6, 4, n)
     rotation, translation = group.rotation(a), group.translation(a)
     np.testing.assert_allclose(world, np.einsum("nlij,lj->nli", rotation, points) + translation, atol=1e-14)
-    np.testing.assert_allclose(
-        group.inverse_transform(a, world), np.broadcast_to(points, world.shape), atol=1e-14
-    )
+    np.testing.assert_allclose(group.inverse_transform(a, world), np.broadcast_to(points, world.shape), atol=1e-14)
     np.testing.assert_allclose(
         group.matrix(group.inverse(a)) @ group.matrix(a), group.matrix(group.identity((6, 1))), atol=1e-14
     )

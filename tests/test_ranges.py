@@ -79,11 +79,7 @@ def test_a_number_that_is_out_of_its_range(system, name, number, allowed):
 @pytest.mark.parametrize(
     "kind",
     [
-        *(
-            each
-            for each in vars(options).values()
-            if is_dataclass(each) and each.__module__ == options.__name__
-        ),
+        *(each for each in vars(options).values() if is_dataclass(each) and each.__module__ == options.__name__),
         *(DemoOptions, CalibrateOptions, SweepOptions, CompareOptions),
     ],
 )
@@ -138,9 +134,7 @@ def test_settings_that_say_a_thing_twice_or_are_nested(tmp_path, text, words):
 
 def test_memory_is_estimated_before_it_is_taken():
     sensor = NamedLandmarkSensor(RangeBearing(SE2), Point(2))
-    with pytest.raises(
-        InputError, match=r"a filter of 10{12} particles would take .* GB of memory, this machine has"
-    ):
+    with pytest.raises(InputError, match=r"a filter of 10{12} particles would take .* GB of memory, this machine has"):
         Filter(OdometryMotion(SE2), sensor, n=10**12)
     with pytest.raises(InputError, match=r"32 landmarks of 16 numbers in 10{10} particles would take"):
         Pool(16, 10**10)

@@ -31,9 +31,7 @@ def public_functions():
             if isinstance(value, FunctionType):
                 yield f"{module.__name__}.{name}", value
             elif inspect.isclass(value):
-                methods = [
-                    member for key, member in vars(value).items() if key == "__init__" or key[0] != "_"
-                ]
+                methods = [member for key, member in vars(value).items() if key == "__init__" or key[0] != "_"]
                 yield from (
                     (f"{value.__qualname__}.{method.__name__}", method)
                     for method in methods

@@ -179,8 +179,7 @@ def _draw_image(axes: Any, found: BoardCalibration) -> None:
     length = 0.02 * found.camera.width
     enlarged = length / max(found.rms_px, np.finfo(float).eps)
     title = (
-        f"{len(found.views)} views, reprojection error {found.rms_px:.3f} px; "
-        f"residuals enlarged {enlarged:.0f} times"
+        f"{len(found.views)} views, reprojection error {found.rms_px:.3f} px; residuals enlarged {enlarged:.0f} times"
     )
     label(axes, title, "u [px]", "v [px]", equal=False)
     axes.set_aspect("equal")

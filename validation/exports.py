@@ -41,9 +41,7 @@ NOMINAL = Pinhole(640, 480, 500.0, 500.0, 319.5, 239.5)
 """Camera that stands for a robot's sensor in a COLMAP model: it looks along the robot's x axis and measures nothing."""
 
 _PATH_COLOUR = np.array([[31, 119, 180]], dtype=np.uint8)
-_BODY_FROM_CAMERA = SE3.from_matrix(
-    np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0]])
-)
+_BODY_FROM_CAMERA = SE3.from_matrix(np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0]]))
 
 _VERTEX = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
 _SIGMA = [("sigma_m", "<f4")]
@@ -165,9 +163,7 @@ def colmap_model(estimate: PathAndMap, problem: Problem | None) -> Any:
         return build_model(nothing, SE3.compose(body, _BODY_FROM_CAMERA), landmarks.mean, colours)
     if len(problem.frames) != len(estimate.stamps_ns):
         counts = f"{len(estimate.stamps_ns)} poses and {len(problem.frames)} frames"
-        raise InputError(
-            f"{problem.name}: expected a pose for each frame, found {counts}; take both from one run."
-        )
+        raise InputError(f"{problem.name}: expected a pose for each frame, found {counts}; take both from one run.")
     return build_model(
         _on_map(observation_table(problem), landmarks.ids), estimate.world_from_body, landmarks.mean, colours
     )

@@ -46,9 +46,7 @@ def machine() -> dict[str, Any]:
 
 def versions() -> dict[str, str | None]:
     """Of what the package requires; None for what is missing."""
-    names = [
-        re.split(r"[^\w.-]", line, maxsplit=1)[0] for line in requires("rbpf") or () if "extra ==" not in line
-    ]
+    names = [re.split(r"[^\w.-]", line, maxsplit=1)[0] for line in requires("rbpf") or () if "extra ==" not in line]
     return {name: _version(name) for name in names}
 
 
@@ -62,11 +60,7 @@ def _tried(name: str, extra: str, probe: Callable[[], str]) -> Part:
         return Part(name, True, not extra, probe())
     except Exception as error:  # whatever a broken library raises as it is loaded
         reason = " ".join(f"{type(error).__name__}: {error}".split())
-        remedy = (
-            f"pip install 'rbpf[{extra}]'"
-            if extra
-            else "install the package again: pip install --force-reinstall"
-        )
+        remedy = f"pip install 'rbpf[{extra}]'" if extra else "install the package again: pip install --force-reinstall"
         return Part(name, False, not extra, f"{reason}; {remedy}")
 
 
@@ -82,9 +76,7 @@ def _compiler() -> str:
     folder = Path(numba.config.CACHE_DIR or Path(__file__).resolve().parents[1] / "sensors" / "__pycache__")
     folder.mkdir(parents=True, exist_ok=True)
     if not os.access(folder, os.W_OK):
-        raise PermissionError(
-            f"{folder} cannot be written to, kernels are compiled anew: set NUMBA_CACHE_DIR"
-        )
+        raise PermissionError(f"{folder} cannot be written to, kernels are compiled anew: set NUMBA_CACHE_DIR")
     return f"Numba {numba.__version__}, {numba.config.NUMBA_NUM_THREADS} threads, cache writable"
 
 

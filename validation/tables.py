@@ -23,9 +23,7 @@ def write_table(path: Path, header: Sequence[str], rows: Sequence[Sequence[Cell]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     for line in lines:
         first = line[0].ljust(widths[0])
-        print(
-            "  ".join([first, *(cell.rjust(width) for cell, width in zip(line[1:], widths[1:], strict=True))])
-        )
+        print("  ".join([first, *(cell.rjust(width) for cell, width in zip(line[1:], widths[1:], strict=True))]))
 
 
 def _text(cell: Cell, digits: int) -> str:

@@ -104,17 +104,13 @@ class Examples(SphinxDirective):
 
 def _groups(name: str, config: Any) -> list[tuple[str, Any]]:
     inner = [(item.name, getattr(config, item.name)) for item in fields(config)]
-    nested = [
-        group for key, value in inner if is_dataclass(value) for group in _groups(f"{name}{key}.", value)
-    ]
+    nested = [group for key, value in inner if is_dataclass(value) for group in _groups(f"{name}{key}.", value)]
     return [(name, config), *nested]
 
 
 def _table(name: str, config: Any) -> list[nodes.Node]:
     meanings = _attributes(type(config))
-    rows = [
-        (f"{name}{item.name}", getattr(config, item.name), meanings[item.name]) for item in fields(config)
-    ]
+    rows = [(f"{name}{item.name}", getattr(config, item.name), meanings[item.name]) for item in fields(config)]
     table = nodes.table(classes=["settings"])
     group = nodes.tgroup(cols=3)
     table += group

@@ -89,9 +89,7 @@ class RobotTrial:
         errors = whitened_errors(log.space, path.poses, path.covs, truth.poses)
         return Trial(
             log.space.dim,
-            np.linalg.norm(
-                path.poses[:, -found.mean.shape[1] :] - truth.poses[:, -found.mean.shape[1] :], axis=1
-            ),
+            np.linalg.norm(path.poses[:, -found.mean.shape[1] :] - truth.poses[:, -found.mean.shape[1] :], axis=1),
             np.where(errors.ranks > 0, errors.nees, np.nan),
             path["nis"],
             path["nis_dof"],
@@ -193,9 +191,7 @@ class Consistency:
         """
         shapes = {(trial.dim, trial.nees.size) for trial in self.trials}
         if len(shapes) != 1:
-            raise InputError(
-                f"a test of consistency takes one or more runs of one kind and length, got {len(shapes)}"
-            )
+            raise InputError(f"a test of consistency takes one or more runs of one kind and length, got {len(shapes)}")
 
     @property
     def dim(self) -> int:
@@ -252,9 +248,7 @@ class Consistency:
 
     def ancestors(self, age: int) -> float:
         """Mean number of particles `age` steps before the end that still have descendants at the end."""
-        return float(
-            np.mean([trial.ancestors[max(trial.ancestors.size - 1 - age, 0)] for trial in self.trials])
-        )
+        return float(np.mean([trial.ancestors[max(trial.ancestors.size - 1 - age, 0)] for trial in self.trials]))
 
     def entries(self) -> dict[str, Any]:
         """All figures by name, for a table."""
@@ -334,9 +328,7 @@ def desk_trials(frames: int, particles: tuple[int, ...]) -> tuple[Trials, Trials
         "start sampled (known points as landmarks)": replace(base, known="points"),
         "three linearisations": replace(base, proposal=ProposalConfig(iterations=3)),
         "linearised weights": replace(base, proposal=ProposalConfig(weights="linearised", iterations=1)),
-        "epipolar constraint": replace(
-            base, inverse_depth=replace(base.inverse_depth, pose_update="epipolar")
-        ),
+        "epipolar constraint": replace(base, inverse_depth=replace(base.inverse_depth, pose_update="epipolar")),
     }
     sizes = {f"{n} particles": DeskTrial(world, MonoConfig(particles=n)) for n in particles}
     return sizes, {name: DeskTrial(world, config) for name, config in changed.items()}
@@ -346,9 +338,7 @@ def draw_curves(axes: Any, system: str, found: dict[str, Consistency]) -> None:
     """Mean NEES per degree of freedom over time."""
     first = next(iter(found.values()))
     band, dim = first.band(), first.dim
-    axes.axhspan(
-        band.low / dim, band.high / dim, color="tab:green", alpha=0.25, label="95 % band, honest filter"
-    )
+    axes.axhspan(band.low / dim, band.high / dim, color="tab:green", alpha=0.25, label="95 % band, honest filter")
     for name, consistency in found.items():
         start = consistency.overconfident_from
         (line,) = axes.plot(consistency.mean_nees / dim, lw=1.1, label=name)
@@ -371,9 +361,7 @@ def draw_remedies(axes: Any, found: dict[str, Consistency]) -> None:
     for shift, what, colour in ((0.12, "pose_nees", "tab:blue"), (-0.12, "landmark_nees", "tab:red")):
         means = [getattr(consistency, what) for consistency in found.values()]
         values, errors = [mean.value for mean in means], [2.0 * mean.error for mean in means]
-        axes.errorbar(
-            values, places + shift, xerr=errors, fmt="o", color=colour, label=what.replace("_nees", "s")
-        )
+        axes.errorbar(values, places + shift, xerr=errors, fmt="o", color=colour, label=what.replace("_nees", "s"))
     axes.axvline(1.0, color="tab:green", lw=1.0)
     axes.set_yticks(places, list(found))
     axes.set(xlabel="NEES / d, ± 2 standard errors", xscale="log")

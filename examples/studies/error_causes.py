@@ -268,9 +268,7 @@ class GivenDepths(Sensor):
                     rho = 1.0 / self.depths[name]
                     model = CameraRay(self.features.camera, (rho, DEPTH_FRACTION * rho))
                 one = slice(k, k + 1)
-                out.append(
-                    NewLandmarks(group.z[one], group.cov[one], model, group.landmark, ids=group.ids[one])
-                )
+                out.append(NewLandmarks(group.z[one], group.cov[one], model, group.landmark, ids=group.ids[one]))
         return out
 
 

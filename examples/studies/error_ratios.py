@@ -159,15 +159,11 @@ def error_of(estimate: PathAndMap, truth: Trajectory, alignment: Alignment) -> f
     """
     ours, theirs = associate(estimate.trajectory, truth, 0)
     if len(ours) < LEAST:
-        raise InputError(
-            f"path and truth share {len(ours)} time stamps, expected {LEAST} or more to align them."
-        )
+        raise InputError(f"path and truth share {len(ours)} time stamps, expected {LEAST} or more to align them.")
     return ate(ours, theirs, alignment).rmse
 
 
-def _over_seeds(
-    filtered: Callable[[int], Run], seeds: Sequence[int]
-) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def _over_seeds(filtered: Callable[[int], Run], seeds: Sequence[int]) -> tuple[tuple[float, ...], tuple[float, ...]]:
     ours, batch, optimum = [], [], None
     for seed in seeds:
         found = filtered(seed)
@@ -236,9 +232,7 @@ def recorded(data: Path, seeds: int) -> Iterator[ErrorRatio]:
         yield tracks_ratio(tracks.log, StereoConfig(), range(seeds), tracks.world_from_camera)
     for name in CAMERAS:
         if (data / name).is_dir():
-            yield camera_ratio(
-                MonoRecording(data / name, data / name / "known_points.csv"), MonoConfig(), range(seeds)
-            )
+            yield camera_ratio(MonoRecording(data / name, data / name / "known_points.csv"), MonoConfig(), range(seeds))
 
 
 def picture(found: list[ErrorRatio]):

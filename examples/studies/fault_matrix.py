@@ -154,16 +154,12 @@ def try_stereo(sequence: ImageSequence, config: StereoConfig, faults: Mapping[st
     return _try_all("stereo", sequence, run, faults)
 
 
-def _try_all(
-    system: str, sequence: Any, run: Callable[[Any], Told], faults: Mapping[str, Fault]
-) -> list[Outcome]:
+def _try_all(system: str, sequence: Any, run: Callable[[Any], Told], faults: Mapping[str, Fault]) -> list[Outcome]:
     clean = judged(system, NONE, sequence, run, None)
     return [clean, *(judged(system, name, fault(sequence), run, clean) for name, fault in faults.items())]
 
 
-def judged(
-    system: str, fault: str, damaged: Any, run: Callable[[Any], Told], clean: Outcome | None
-) -> Outcome:
+def judged(system: str, fault: str, damaged: Any, run: Callable[[Any], Told], clean: Outcome | None) -> Outcome:
     """Runs one damaged sequence.
 
     Args:
@@ -231,9 +227,7 @@ COLOURS = {
 MACHINE = ["fault", "exit code", "traceback", "what is said"]
 
 
-def main(
-    frames: int = 150, kills: int = 5, out: Path = Path("demo/faults"), quick: bool = False
-) -> dict[str, float]:
+def main(frames: int = 150, kills: int = 5, out: Path = Path("demo/faults"), quick: bool = False) -> dict[str, float]:
     """Renders, damages, runs and prints both tables.
 
     Args:
@@ -247,14 +241,10 @@ def main(
     if not desk.exists():
         simulate_images(TexturedDesk(frames=frames, texel_m=0.003), Imaging(), RIG, desk, seed=1)
     outcomes = of_images(desk, quick)
-    cells = [
-        [o.system, o.fault, o.verdict, o.lost, 1e3 * o.rmse_m, 1e3 * o.last_m, o.last_deg] for o in outcomes
-    ]
+    cells = [[o.system, o.fault, o.verdict, o.lost, 1e3 * o.rmse_m, 1e3 * o.last_m, o.last_deg] for o in outcomes]
     header = ["system", "fault", "outcome", "frames lost", "error [mm]", "at the end [mm]", "[deg]"]
     write_table(out / "images.csv", header, cells)
-    write_csv(
-        out / "said.csv", ["system", "fault", "what is said"], [[o.system, o.fault, o.said] for o in outcomes]
-    )
+    write_csv(out / "said.csv", ["system", "fault", "what is said"], [[o.system, o.fault, o.said] for o in outcomes])
     draw(outcomes, out / "faults.png")
     machine = of_machine(desk, out, kills, quick)
     write_table(
@@ -294,9 +284,7 @@ def of_machine(desk: Path, out: Path, kills: int, quick: bool) -> dict[str, Ende
     ended["undisturbed"] = run_command([*command(desk, out / "whole"), *every])
     for limit in [20_000] if quick else [20_000, 200_000, 2_000_000]:
         ended[f"no file beyond {limit // 1000} kB"] = run_command(command(desk, out / f"full_{limit}"), limit)
-    killed = kill_and_resume(
-        [*command(desk, out / "killed"), *every], out / "killed", kills, np.random.default_rng(0)
-    )
+    killed = kill_and_resume([*command(desk, out / "killed"), *every], out / "killed", kills, np.random.default_rng(0))
     return ended | {f"killed {kills} times (SIGKILL) and resumed": killed}
 
 

@@ -155,9 +155,7 @@ def _claim(folder: Path, sequence: ImageSequence, config: StereoConfig) -> None:
     if not note.exists():
         note.write_text(json.dumps(ours, indent=2) + "\n", encoding="utf-8")
     elif json.loads(note.read_text(encoding="utf-8")) != ours:
-        raise InputError(
-            f"{folder} holds features of another recording or with other settings: choose another folder"
-        )
+        raise InputError(f"{folder} holds features of another recording or with other settings: choose another folder")
 
 
 def _write(folder: Path, first: int, pairs: list[CachedPair], length: int) -> None:

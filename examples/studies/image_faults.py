@@ -169,9 +169,7 @@ def jitter_stamps(std_s: float, seed: int = 0) -> Fault:
     def fault(sequence: ImageSequence) -> ImageSequence:
         error = 1e9 * std_s * np.random.default_rng(seed).standard_normal(len(sequence))
         error[0] = 0.0
-        jittered = np.sort(
-            np.maximum(sequence.stamps_ns + np.rint(error).astype(np.int64), sequence.stamps_ns[0])
-        )
+        jittered = np.sort(np.maximum(sequence.stamps_ns + np.rint(error).astype(np.int64), sequence.stamps_ns[0]))
         return _chosen(sequence, np.arange(len(sequence)), jittered)
 
     return fault

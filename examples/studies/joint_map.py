@@ -87,9 +87,7 @@ def rows_of(world: str, found: dict[str, Consistency]) -> list[list[str | int | 
     """A line per filter: evidence and error beside the EKF's of the same run."""
     ekf, rows = found["joint EKF"].trials, list[list[str | int | float]]()
     for name, consistency in found.items():
-        evidence = [
-            own.log_evidence - other.log_evidence for own, other in zip(consistency.trials, ekf, strict=True)
-        ]
+        evidence = [own.log_evidence - other.log_evidence for own, other in zip(consistency.trials, ekf, strict=True)]
         inside = consistency.coverage(0.95)
         rows.append([
             world, name, len(evidence), consistency.pose_nees.value, consistency.pose_nees.error,
@@ -99,19 +97,13 @@ def rows_of(world: str, found: dict[str, Consistency]) -> list[list[str | int | 
     return rows
 
 
-def recorded(
-    folder: Path, seeds: int, configs: dict[str, RangeBearingConfig]
-) -> list[list[str | int | float]]:
+def recorded(folder: Path, seeds: int, configs: dict[str, RangeBearingConfig]) -> list[list[str | int | float]]:
     """Per recording and filter: mean and spread over the seeds, metres."""
     rows = list[list[str | int | float]]()
     for recording in RECORDINGS:
         log = open_log(folder / recording)
         aligned = "mrclam" in recording
-        names = (
-            ("ate_rmse_m", "landmark_error_aligned_mean_m")
-            if aligned
-            else ("path_rmse_m", "landmark_error_mean_m")
-        )
+        names = ("ate_rmse_m", "landmark_error_aligned_mean_m") if aligned else ("path_rmse_m", "landmark_error_mean_m")
         for name, config in configs.items():
             errors, evidence, speed = [], [], []
             for seed in range(seeds):
@@ -143,9 +135,7 @@ def draw(found: dict[str, Consistency], out: Path) -> None:
     axes = figure.subplots()
     first = next(iter(found.values()))
     band = first.band()
-    axes.axhspan(
-        band.low / first.dim, band.high / first.dim, color="tab:green", alpha=0.25, label="95 % band"
-    )
+    axes.axhspan(band.low / first.dim, band.high / first.dim, color="tab:green", alpha=0.25, label="95 % band")
     for name, consistency in found.items():
         axes.plot(consistency.mean_nees / first.dim, lw=1.0, label=name)
     axes.set(xlabel="step", ylabel="NEES / d", yscale="log", title=f"mean of {len(first.trials)} runs")

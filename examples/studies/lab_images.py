@@ -43,9 +43,7 @@ class Moment:
 
 def rendered(seed: int, noise_std: float, width: int, moments: int) -> Iterator[Moment]:
     """The laboratory at times spread over the tour, as `rbpf simulate lab --noise-std` renders it."""
-    camera = Pinhole(
-        width, 3 * width // 4, 0.78125 * width, 0.78125 * width, 0.5 * width - 0.5, 0.375 * width - 0.5
-    )
+    camera = Pinhole(width, 3 * width // 4, 0.78125 * width, 0.78125 * width, 0.5 * width - 0.5, 0.375 * width - 0.5)
     rng = np.random.default_rng(seed)
     scene = TexturedLab(texel_m=1.92 / width).build(rng)
     renderer = Renderer(scene.rectangles, camera)
@@ -142,9 +140,7 @@ def draw_plan(file: Path, seed: int) -> None:
     figure, axes = plt.subplots(figsize=(9.0, 5.6), layout="constrained")
     for low, high in furnished(np.random.default_rng(seed)).blocks:
         grey = 0.3 + 0.5 * min(low[2] / 2.0, 1.0)
-        axes.add_patch(
-            plt.Rectangle(low[:2], *(high - low)[:2], facecolor=str(grey), edgecolor="none", alpha=0.7)
-        )
+        axes.add_patch(plt.Rectangle(low[:2], *(high - low)[:2], facecolor=str(grey), edgecolor="none", alpha=0.7))
     for trajectory in ("tour", "turn_back"):
         theta, x, y = LabDrive(trajectory).travelled().world_from_robot.T
         axes.plot(x, y, linewidth=1.2, label=trajectory)
@@ -180,17 +176,13 @@ def main(
     out.mkdir(parents=True, exist_ok=True)
     names = list(next(iter(table.values())))
     with open(out / "lab_images.csv", "w", newline="", encoding="utf-8") as file:
-        csv.writer(file).writerows(
-            [["", *table], *([name, *(t[name] for t in table.values())] for name in names)]
-        )
+        csv.writer(file).writerows([["", *table], *([name, *(t[name] for t in table.values())] for name in names)])
     print(f"{'':>42}" + "".join(f"{title:>18}" for title in table))
     for name in names:
         print(f"{name:>42}" + "".join(f"{entries[name]:18.3g}" for entries in table.values()))
     draw_plan(out / "plan.png", seed)
     views = [moment.left for moment in rendered(seed, noise_std[-1], width, 3 if quick else 6)]
-    cv2.imwrite(
-        str(out / "views.png"), np.vstack([np.hstack(views[k : k + 3]) for k in range(0, len(views), 3)])
-    )
+    cv2.imwrite(str(out / "views.png"), np.vstack([np.hstack(views[k : k + 3]) for k in range(0, len(views), 3)]))
     return table
 
 

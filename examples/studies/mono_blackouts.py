@@ -234,9 +234,7 @@ def black_out(job: Job) -> Outcome:
     lost = run.log["seconds"][lit][still_lost]
     seconds = float(np.median(lost)) if lost.size else np.nan
     attempts = tuple(watch.attempts)
-    return Outcome(
-        job.dark, int(found[0]) if found.size else -1, watch.visible, metres, degrees, seconds, attempts
-    )
+    return Outcome(job.dark, int(found[0]) if found.size else -1, watch.visible, metres, degrees, seconds, attempts)
 
 
 def run_series(blackouts: Blackouts, out: Path, workers: int = 1) -> Series:
@@ -254,9 +252,7 @@ def run_series(blackouts: Blackouts, out: Path, workers: int = 1) -> Series:
     """
     sequence = open_images(blackouts.folder)
     rate_hz = 1e9 / float(np.median(np.diff(sequence.stamps_ns)))
-    dark, within, settled = (
-        round(seconds * rate_hz) for seconds in (blackouts.dark_s, blackouts.within_s, SETTLED_S)
-    )
+    dark, within, settled = (round(seconds * rate_hz) for seconds in (blackouts.dark_s, blackouts.within_s, SETTLED_S))
     total = len(sequence)
     starts = even_starts(round(blackouts.first_s * rate_hz), total - dark - within, blackouts.count)
     checkpoints = out / f"checkpoints_{blackouts.folder.name}"
@@ -373,9 +369,7 @@ def draw(all_series: list[Series]) -> Figure:
                 over_way.plot(way, series.seconds(one), "o", color=colour, ms=4)
             else:
                 over_way.axvline(way, color=colour, lw=0.8, ls=":")
-        over_time.set(
-            title=series.name, xlabel="time since the light went out [s]", ylabel="error of position [m]"
-        )
+        over_time.set(title=series.name, xlabel="time since the light went out [s]", ylabel="error of position [m]")
         over_way.set(xlabel="way in the dark [m] (dotted: not found again)", ylabel="time to recovery [s]")
         for axes in (over_time, over_way):
             axes.grid(alpha=0.3)

@@ -62,9 +62,7 @@ def draw(names: list[str], mm: np.ndarray, nees: np.ndarray, band: Band, path: P
     upper.axhline(band.expected, color="tab:green", lw=0.8)
     for name, curve in zip(names, nees, strict=True):
         upper.plot(curve, lw=0.9, label=name)
-    upper.set(
-        title=f"NEES of the pose, mean of {len(mm)} recordings", xlabel="frame", ylabel="NEES", yscale="log"
-    )
+    upper.set(title=f"NEES of the pose, mean of {len(mm)} recordings", xlabel="frame", ylabel="NEES", yscale="log")
     ticks = [2, 4, 6, 10, 20, 50]
     upper.set_yticks(ticks, [f"{tick}" for tick in ticks])
     upper.yaxis.set_minor_formatter(NullFormatter())
@@ -73,9 +71,7 @@ def draw(names: list[str], mm: np.ndarray, nees: np.ndarray, band: Band, path: P
     lower.bar(seeds, mm[:, 0], width=0.7, color="0.85", label="batch adjustment")
     for place, name in enumerate(names):
         lower.plot(seeds + 0.2 * (place - 1), mm[:, 1 + place], "o", ms=5, label=name)
-    lower.set(
-        title="Error of the position without alignment", xlabel="recording", ylabel="RMS [mm]", xticks=seeds
-    )
+    lower.set(title="Error of the position without alignment", xlabel="recording", ylabel="RMS [mm]", xticks=seeds)
     lower.legend(fontsize="small")
     figure.savefig(path, dpi=110)
 
@@ -96,9 +92,7 @@ def main(
     jobs = map(Job, range(seeds), repeat(frames), repeat(particles))
     batch, errors = zip(*in_parallel(solve_and_filter, jobs, workers), strict=True)
 
-    mm = 1e3 * np.array(
-        [[b, *(error for error, _ in of_seed)] for b, of_seed in zip(batch, errors, strict=True)]
-    )
+    mm = 1e3 * np.array([[b, *(error for error, _ in of_seed)] for b, of_seed in zip(batch, errors, strict=True)])
     nees = np.mean([[nees for _, nees in of_seed] for of_seed in errors], axis=0)
     band = chi_square_band(6, seeds)
     names = [f"{n:,} particles" for n in particles]
@@ -110,9 +104,7 @@ def main(
     print(f"worst recording: {int(ratio.argmax())}, {ratio.max():.2f} times the batch")
     inside = ((nees >= band.low) & (nees <= band.high)).mean(axis=1)
     for name, curve, fraction in zip(names, nees, inside, strict=True):
-        print(
-            f"{name}: NEES {np.median(curve):.1f} (median over the frames), {fraction:.0%} of the frames in the band"
-        )
+        print(f"{name}: NEES {np.median(curve):.1f} (median over the frames), {fraction:.0%} of the frames in the band")
     write_csv(out / "nees.csv", ["frame", *names], [[t, *nees[:, t].tolist()] for t in range(frames)])
     draw(names, mm, nees, band, out / "mono_desk.png")
     print(f"picture and tables in {out}")

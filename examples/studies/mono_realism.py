@@ -265,9 +265,7 @@ def main(
         survival = one.survival(max(TOLD))[list(TOLD)].tolist()
         fractions = one.share_found, one.share_unlike, one.share_astray
         quantiles = [float(np.quantile(alike, q)) for q in (0.5, 0.1)]
-        rows.append(
-            [one.name, one.frames, one.lost, *fractions, *quantiles, *survival, one.noise, one.contrast]
-        )
+        rows.append([one.name, one.frames, one.lost, *fractions, *quantiles, *survival, one.noise, one.contrast])
     write_table(out / "realism.csv", header, rows)
     save_figures({"mono_realism.png": draw(found)}, out)
     print(f"picture and table in {out}")

@@ -407,16 +407,12 @@ def simulate_features(
     return FeatureLog(f"simulated {scene.name}, seed {seed}", camera, frames, given, truth)
 
 
-def _known(
-    scene: Scene, measuring: Measuring, camera: Pinhole | RectifiedStereo, size: np.ndarray
-) -> np.ndarray:
+def _known(scene: Scene, measuring: Measuring, camera: Pinhole | RectifiedStereo, size: np.ndarray) -> np.ndarray:
     """(M,) rows of the points known beforehand, visible in the first frame, near an ellipse about the image's middle."""
     visible, z = _view(scene, measuring, camera, 0)
     wanted = measuring.known
     if wanted > measuring.measurements:
-        raise InputError(
-            f"{wanted} known points do not fit into {measuring.measurements} measurements per frame"
-        )
+        raise InputError(f"{wanted} known points do not fit into {measuring.measurements} measurements per frame")
     seen = np.flatnonzero(visible)
     if len(seen) < wanted:
         raise InputError(

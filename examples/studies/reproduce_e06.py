@@ -72,13 +72,9 @@ def main(
     setting = Setting(out, width, particles, seed, quick)
     rows = [row for figure in wanted for row in FIGURES[figure](setting)]
     header = ["figure", "what", "paper", "ours", "as asked"]
-    write_table(
-        out / "table.csv", header, [[row.figure, row.what, row.paper, row.ours, row.verdict] for row in rows]
-    )
+    write_table(out / "table.csv", header, [[row.figure, row.what, row.paper, row.ours, row.verdict] for row in rows])
     short = sum(row.met is False for row in rows)
-    print(
-        f"{short} of {sum(row.met is not None for row in rows)} comparisons fall short; pictures and table in {out}"
-    )
+    print(f"{short} of {sum(row.met is not None for row in rows)} comparisons fall short; pictures and table in {out}")
     return {f"{row.figure}: {row.what}": row.value for row in rows}
 
 

@@ -89,9 +89,7 @@ class Forgetting(Sensor):
         self._seen.update(dict.fromkeys(frame.landmarks.tolist(), self.frame))
         return self.inner.observe(frame, belief)
 
-    def new_landmarks(
-        self, frame: Any, belief: Belief, observed: Sequence[Observations]
-    ) -> Sequence[NewLandmarks]:
+    def new_landmarks(self, frame: Any, belief: Belief, observed: Sequence[Observations]) -> Sequence[NewLandmarks]:
         """What the inner sensor starts, after the old ones have gone."""
         new_landmarks = self.inner.new_landmarks(frame, belief, observed)
         old = [name for name, seen in self._seen.items() if self.frame - seen > self.after]
@@ -120,9 +118,7 @@ def robot_steps(stream: RobotStream, config: RangeBearingConfig, forget: int = 6
     return slam.filter, lambda frame, _: slam.take(frame).pose[1:]
 
 
-def soak(
-    stream: CameraStream | RobotStream, filter_: Filter, step: Step, frames: int, every: int
-) -> Iterator[Window]:
+def soak(stream: CameraStream | RobotStream, filter_: Filter, step: Step, frames: int, every: int) -> Iterator[Window]:
     """Filters a stream; one window for every so many frames.
 
     Args:
@@ -209,9 +205,7 @@ def run(job: Job) -> list[Window]:
     turnover, windows = Turnover(), list[Window]()
     if job.system == "camera":
         camera = CameraStream(turnover, seed=0)
-        done = soak(
-            camera, *camera_steps(camera, MonoConfig(job.particles, lag=job.lag)), job.frames, job.every
-        )
+        done = soak(camera, *camera_steps(camera, MonoConfig(job.particles, lag=job.lag)), job.frames, job.every)
     else:
         robot = RobotStream(turnover, seed=0)
         config = RangeBearingConfig(job.particles, lag=job.lag)
@@ -254,15 +248,11 @@ def main(
     jobs = [Job(system, frames, every, particles, lag, out) for system in SYSTEMS]
     columns, figures, rows = {}, {}, []
     for system, windows in zip(SYSTEMS, in_parallel(run, jobs, workers), strict=True):
-        columns[system] = dict(
-            zip(COLUMNS, np.array([astuple(w) for w in windows], dtype=float).T, strict=True)
-        )
+        columns[system] = dict(zip(COLUMNS, np.array([astuple(w) for w in windows], dtype=float).T, strict=True))
         last = windows[-1]
         for name in ("ms_per_frame", "resident_mb", "held_kb", "nodes", "error_m"):
             figures[f"{system}, {name}"] = growth(columns[system][name])
-        grown = [
-            figures[f"{system}, {name}"] for name in ("ms_per_frame", "resident_mb", "held_kb", "error_m")
-        ]
+        grown = [figures[f"{system}, {name}"] for name in ("ms_per_frame", "resident_mb", "held_kb", "error_m")]
         rows.append([system, last.frames, last.started, last.landmarks, *grown])
     header = ["stream", "frames", "landmarks ever", "at the end"]
     write_table(out / "growth.csv", [*header, "time x", "memory x", "held x", "error x"], rows)

@@ -92,9 +92,7 @@ HEADER = ("recording", "odometry", "filter", "least", "most", "Sim(3): odometry"
 WAYS = "there", "there and back"
 
 
-def main(
-    quick: bool = False, out: Path = Path("out"), seeds: int = 5, particles: int = 400
-) -> dict[str, float]:
+def main(quick: bool = False, out: Path = Path("out"), seeds: int = 5, particles: int = 400) -> dict[str, float]:
     """Prints a table in metres, medians over the seeds, and writes it to a folder; `quick` simulates a short path."""
     out.mkdir(parents=True, exist_ok=True)
     configs = [StereoConfig(particles, seed) for seed in range(1 if quick else seeds)]
@@ -131,9 +129,7 @@ def of_pairs(folder: Path, configs: Sequence[StereoConfig]) -> Iterator[list]:
     with TemporaryDirectory() as features:
         both = cache_features(pairs_there_and_back(sequence), configs[0], Path(features))
         for way, part in zip(WAYS, (both.first(len(sequence)), both), strict=True):
-            yield row(
-                f"{sequence.name}, {way}", lambda config, part=part: filter_cached(part, config), configs
-            )
+            yield row(f"{sequence.name}, {way}", lambda config, part=part: filter_cached(part, config), configs)
 
 
 def of_tracks(log: FeatureLog, configs: Sequence[StereoConfig]) -> Iterator[list]:

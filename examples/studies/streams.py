@@ -134,9 +134,7 @@ class CameraStream(_Stream):
         """The camera's frame t: it goes round in 20 s, nearer and farther."""
         s = t / CAMERA_HZ
         turn = 2.0 * np.pi * s / 20.0
-        eye = np.array(
-            [0.45 * np.sin(turn), -0.8 + 0.2 * np.cos(0.7 * turn), 1.0 + 0.15 * np.sin(1.3 * turn)]
-        )
+        eye = np.array([0.45 * np.sin(turn), -0.8 + 0.2 * np.cos(0.7 * turn), 1.0 + 0.15 * np.sin(1.3 * turn)])
         at = np.array([0.15 * np.sin(0.9 * turn), 0.1 * np.sin(0.6 * turn), 0.0])
         pose = looking(eye[None], (at - eye)[None])[0]
         local = SE3.inverse_transform(pose, self._points.places)

@@ -103,9 +103,7 @@ def adjust_by_colmap(log: FeatureLog, initial: CameraEstimate) -> ColmapAdjustme
     fixed = np.isin(table.names, list(held))
     adjuster = _adjuster(model, np.flatnonzero(fixed) + 1)
     _solve(adjuster, log.name)
-    path = np.array(
-        [from_colmap_pose(model.image(image_id(t)).cam_from_world()) for t in range(len(log.frames))]
-    )
+    path = np.array([from_colmap_pose(model.image(image_id(t)).cam_from_world()) for t in range(len(log.frames))])
     found = np.array([model.point3D(index + 1).xyz for index in range(len(points))])
     cov_poses, cov_points = _covariances(model, adjuster, table, path, found, fixed, std)
     residuals = reprojection(table, path, found)[0] / std
@@ -134,9 +132,7 @@ def _checked(log: FeatureLog, initial: CameraEstimate) -> tuple[ObservationTable
     table = full.rows(np.isin(full.names, [*initial.landmarks, *known])[full.index])
     std = float(np.sqrt(table.cov_z[0, 0, 0]))
     if np.abs(table.cov_z - std**2 * np.eye(2)).max() > _SAME * std**2:
-        raise InputError(
-            f"{log.name}: COLMAP takes all pixels as equally certain, found different covariances."
-        )
+        raise InputError(f"{log.name}: COLMAP takes all pixels as equally certain, found different covariances.")
     return table, std
 
 
@@ -164,9 +160,7 @@ def _solve(adjuster: Any, name: str) -> None:
 
     summary = adjuster.solve()
     if summary.termination_type != pycolmap.BundleAdjustmentTerminationType.CONVERGENCE:
-        raise InputError(
-            f"COLMAP's bundle adjustment of {name} did not converge; start it from a better estimate."
-        )
+        raise InputError(f"COLMAP's bundle adjustment of {name} did not converge; start it from a better estimate.")
 
 
 def _covariances(
@@ -198,10 +192,7 @@ def _covariances(
             joint[j, i] = joint[i, j].T
     joint = std**2 * _in_our_chart(joint, path)
     within = np.array(
-        [
-            np.zeros((3, 3)) if held else std**2 * found.get_point_cov(index + 1)
-            for index, held in enumerate(fixed)
-        ]
+        [np.zeros((3, 3)) if held else std**2 * found.get_point_cov(index + 1) for index, held in enumerate(fixed)]
     )
     return joint[np.arange(count), np.arange(count)], _marginal(table, path, points, within, joint, std)
 
@@ -212,9 +203,7 @@ def _in_our_chart(joint: Array, path: Array) -> Array:
     return slope[:, None] @ joint @ np.swapaxes(slope, -1, -2)[None]
 
 
-def _marginal(
-    table: ObservationTable, path: Array, points: Array, within: Array, joint: Array, std: float
-) -> Array:
+def _marginal(table: ObservationTable, path: Array, points: Array, within: Array, joint: Array, std: float) -> Array:
     """P + Σ_ij G_i Σ_ij G_jᵀ of each point, where G_i = −P H_li says how it follows pose i."""
     by_pose, by_point = reprojection(table, path, points)[1]
     out = np.empty_like(within)
@@ -318,9 +307,7 @@ def _held(log: FeatureLog, settled: dict[int, Array]) -> dict[int, Array]:
     candidates = often[: max(len(often) // 2, LEAST_HELD)]
     chosen = candidates[:1]
     while len(chosen) < min(HELD, len(candidates)):
-        gaps = [
-            min(np.linalg.norm(settled[name] - settled[other]) for other in chosen) for name in candidates
-        ]
+        gaps = [min(np.linalg.norm(settled[name] - settled[other]) for other in chosen) for name in candidates]
         chosen.append(candidates[int(np.argmax(gaps))])
     return {name: settled[name] for name in chosen}
 
@@ -357,9 +344,7 @@ def _cross(v: Array) -> Array:
     return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*v.shape, 3)
 
 
-def main(
-    run: Path | None = None, out: Path = Path("demo/two_optimisers"), quick: bool = False
-) -> dict[str, float]:
+def main(run: Path | None = None, out: Path = Path("demo/two_optimisers"), quick: bool = False) -> dict[str, float]:
     """Adjusts a run's observations twice and prints the greatest differences.
 
     Args:

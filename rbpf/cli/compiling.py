@@ -56,9 +56,7 @@ def compile_kernels(every: bool = False) -> list[str]:
     missing = [name for name in modules if not cached(name)]
     if missing:
         say(f"compiling {len(missing)} of {len(modules)} kernels: this takes some minutes and is done once …")
-    work: list[Callable[[], object]] = [
-        partial(import_module, name) for name in (modules if every else missing)
-    ]
+    work: list[Callable[[], object]] = [partial(import_module, name) for name in (modules if every else missing)]
     if work:
         work += [_search_patches, _measure_motion, _filter_log]
         with progress() as bar:

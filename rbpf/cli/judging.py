@@ -39,9 +39,7 @@ def validate(options: Annotated[ValidateOptions, tyro.conf.arg(name="")]) -> Non
         verdict = compare(options.run, options.against, options.out)
     # The page's first sentence is about the truth where there is one; who asked for another comparison wants that one.
     asked = [c.accuracy for c in read_comparisons(options.run) if c.against == options.against]
-    _tell(
-        verdict, options.run, options.json, *(found for found in asked if found not in verdict.path.sentence)
-    )
+    _tell(verdict, options.run, options.json, *(found for found in asked if found not in verdict.path.sentence))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -228,9 +228,7 @@ class RenderOptions(Printed):
     exposure_drift: Fraction = 0.15
     vignetting: Fraction = 0.2
     contrast: NotNegative = 1.0
-    blackout: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="INT INT", help_behavior_hint="")] = (
-        None
-    )
+    blackout: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="INT INT", help_behavior_hint="")] = None
     depth: Flag = False
     jpeg: Annotated[int, Range(ge=0, le=100)] = 0
 
@@ -327,9 +325,7 @@ def given_markers(options: MonoOptions) -> "MarkerBoard | None":
     if options.aruco is None and options.marker is None:
         return None
     if options.aruco is None or options.marker is None:
-        raise InputError(
-            "a board of markers needs their number and their side: --aruco 5x7 --marker 0.04 --gap 0.01"
-        )
+        raise InputError("a board of markers needs their number and their side: --aruco 5x7 --marker 0.04 --gap 0.01")
     from rbpf.sensors.calibration import MarkerBoard
 
     return MarkerBoard.parse(options.aruco, options.marker, options.gap, options.dictionary)

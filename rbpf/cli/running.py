@@ -100,9 +100,7 @@ def run_stereo(options: Annotated[StereoOptions, tyro.conf.arg(name="")]) -> Non
 
     named = given(options, "particles", "seed", "dof")
     config = load_settings(StereoConfig, "stereo", options.config, options.set, named)
-    recording = StereoRecording(
-        options.sequence, options.calibration, given_topics(options), given_part(options)
-    )
+    recording = StereoRecording(options.sequence, options.calibration, given_topics(options), given_part(options))
     _run_images(options, recording, config, options.video)
 
 
@@ -154,9 +152,7 @@ def _run_images(options: ImageRunOptions, recording: "Recording", config: Any, v
             most_iterations=options.batch_limit,
         )
         with finishing():
-            entries = finish_run(
-                run, out, recording.sources(), video, options.rerun, options.batch, callbacks
-            )
+            entries = finish_run(run, out, recording.sources(), video, options.rerun, options.batch, callbacks)
     _finish(entries, options, out, run.failure)
 
 
@@ -170,9 +166,7 @@ def _prepared(options: RunOptions) -> Iterator[Path]:
     from rbpf.runs.files import holds_run, numbered, own_folder
 
     if options.resume and options.overwrite:
-        raise InputError(
-            "a run goes on with --resume or begins again with --overwrite: leave out one of them"
-        )
+        raise InputError("a run goes on with --resume or begins again with --overwrite: leave out one of them")
     kept = options.resume or options.overwrite
     out = numbered(Path("run"), last=kept) if options.out is None else options.out
     use_threads(options.threads)

@@ -70,9 +70,7 @@ def waiting(what: str) -> Iterator[None]:
 
 def say(sentence: str) -> None:
     """A sentence, on standard error, whatever names are in it; it is broken between words, and on a terminal alone."""
-    CONSOLE.print(
-        printable(sentence), highlight=False, markup=False, emoji=False, soft_wrap=not CONSOLE.is_terminal
-    )
+    CONSOLE.print(printable(sentence), highlight=False, markup=False, emoji=False, soft_wrap=not CONSOLE.is_terminal)
 
 
 def answer(entries: Mapping[str, Any], as_json: bool, *sentences: str) -> None:

@@ -70,9 +70,7 @@ def _render(world: "ImageWorld", options: ImagesOptions | LabOptions) -> None:
     camera = _camera(options)
     imaging = _imaging(options)
     with progress() as bar:
-        simulate_images(
-            world, imaging, camera, options.out, options.seed, bar("rendering"), options.baseline_m
-        )
+        simulate_images(world, imaging, camera, options.out, options.seed, bar("rendering"), options.baseline_m)
     size = megabytes(options.out)
     answer(
         {"out": str(options.out), "megabytes": round(size, 1)},

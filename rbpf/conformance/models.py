@@ -44,9 +44,7 @@ STD = 0.1
 """Of random estimates of landmarks, in the parametrisation's units."""
 
 
-def motion_checks(
-    model: MotionModel, space: LieGroup, rng: np.random.Generator, example: Example
-) -> list[Check]:
+def motion_checks(model: MotionModel, space: LieGroup, rng: np.random.Generator, example: Example) -> list[Check]:
     """Shapes, membership of the group, and independence of the particles."""
     name, states = named(model.transition), example.states(space, rng)
 

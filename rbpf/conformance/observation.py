@@ -97,9 +97,7 @@ def check_cut(model: ObservationModel, scene: Scene) -> None:
         alone = (step[:-2] < 0.5) & (step[2:] < 0.5)
         jumps = alone & (np.abs(step[1:-1] - 2 * np.pi) < 0.5)
         where = np.flatnonzero(jumps.reshape(-1, model.dim).any(axis=0)).tolist()
-        require(
-            not where, f"{named(model.residual)} jumps by 2π in component {where}: wrap angles to [−π, π)"
-        )
+        require(not where, f"{named(model.residual)} jumps by 2π in component {where}: wrap angles to [−π, π)")
 
 
 def check_visible(model: ObservationModel, scene: Scene) -> None:
@@ -153,9 +151,7 @@ def check_kernel(model: ObservationModel, scene: Scene) -> None:
             require_close(what, getattr(found, block), expected, tolerance)
 
 
-def _run(
-    name: str, fused: FusedKernel, lanes: Scene, z: np.ndarray, count: int
-) -> tuple[np.ndarray, Jacobians]:
+def _run(name: str, fused: FusedKernel, lanes: Scene, z: np.ndarray, count: int) -> tuple[np.ndarray, Jacobians]:
     """ν (count, p) and the Jacobians of the first lanes, each written between two guards."""
     assert lanes.landmark is not None
     shapes = ((z.size, BLOCK), (z.size, lanes.space.dim, BLOCK), (z.size, lanes.landmark.shape[-1], BLOCK))

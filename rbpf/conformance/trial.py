@@ -67,9 +67,7 @@ class Scene:
     substate: np.ndarray | None = None
 
     @classmethod
-    def draw(
-        cls, model: ObservationModel, space: LieGroup, rng: np.random.Generator, example: Example
-    ) -> "Scene":
+    def draw(cls, model: ObservationModel, space: LieGroup, rng: np.random.Generator, example: Example) -> "Scene":
         """Random states and, around the origin, landmarks that are visible from them.
 
         Raises:

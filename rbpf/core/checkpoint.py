@@ -156,9 +156,7 @@ def write_checkpoint(
     save_arrays(path, {"header": np.array(json.dumps(header)), **arrays})
 
 
-def read_checkpoint(
-    path: Path, fingerprint: Mapping[str, object]
-) -> tuple[dict[str, np.ndarray], dict[str, object]]:
+def read_checkpoint(path: Path, fingerprint: Mapping[str, object]) -> tuple[dict[str, np.ndarray], dict[str, object]]:
     """The arrays of a checkpoint, and the state of the random generator.
 
     Raises:
@@ -170,15 +168,11 @@ def read_checkpoint(
         version, digest, rng_state = header["version"], header["digest"], header["rng"]
         expected = dict(header["fingerprint"])
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            f"{path} is not a checkpoint of rbpf: its header is missing or unreadable"
-        ) from error
+        raise InputError(f"{path} is not a checkpoint of rbpf: its header is missing or unreadable") from error
     if version != VERSION:
         raise InputError(f"{path} has checkpoint version {version}, this program reads version {VERSION}")
     if digest != _digest(arrays):
-        raise InputError(
-            f"{path} is damaged: its content does not match its digest; use an earlier checkpoint"
-        )
+        raise InputError(f"{path} is damaged: its content does not match its digest; use an earlier checkpoint")
     for name, value in expected.items():
         if fingerprint.get(name) != value:
             raise InputError(

@@ -190,9 +190,7 @@ class Filter:
         # Predict, and observe given the prediction.
         stamp_ns, dt = self._clock(stamp_ns)
         prior = self._predict(control, dt)
-        groups = self._observe(
-            frame, Belief(self.particles.log_weights, prior, self.marginals.parts, self.rng)
-        )
+        groups = self._observe(frame, Belief(self.particles.log_weights, prior, self.marginals.parts, self.rng))
 
         # Refine, and weigh by the look-ahead w₁.
         proposal = proposal or self.proposal
@@ -211,9 +209,7 @@ class Filter:
             consolidated = True
             prior = self._predict(control, dt)
             proposed = proposal.propose(prior, self.marginals.linearised(prior, groups))
-            log_weights, look_ahead = reweight(
-                self.particles.log_weights, proposed.log_w1, f"step {self.steps}"
-            )
+            log_weights, look_ahead = reweight(self.particles.log_weights, proposed.log_w1, f"step {self.steps}")
             mixture, weights = (prior, proposed, log_weights), np.exp(log_weights)
 
         # Resample if it is time: descendants inherit by ancestor, and so do associations of their own.
@@ -223,9 +219,7 @@ class Filter:
             self.marginals.resample(ancestors)
             prior = prior.take(ancestors)
             groups = [
-                replace(group, ids=group.ids[ancestors])
-                if group.ids is not None and group.ids.ndim == 2
-                else group
+                replace(group, ids=group.ids[ancestors]) if group.ids is not None and group.ids.ndim == 2 else group
                 for group in groups
             ]
 
@@ -343,9 +337,7 @@ class Filter:
         arrays, rng_state = read_checkpoint(Path(path), self._fingerprint())
         with self._unchanged_by_failure(), fitting(Path(path)):
             state = schema.read_one(arrays, "particles/state", schema.elements(self.space, "n"), n=self.n)
-            log_weights = schema.read_one(
-                arrays, "particles/log_weights", schema.numbers("n", values="log"), n=self.n
-            )
+            log_weights = schema.read_one(arrays, "particles/log_weights", schema.numbers("n", values="log"), n=self.n)
             if abs(np.logaddexp.reduce(log_weights)) > 1e-6:
                 raise InputError("the particles' weights do not sum to 1")
             counted = schema.read(arrays, _FILTER, "filter/")
@@ -365,9 +357,7 @@ class Filter:
             if self.consolidation is not None:
                 self._age = int(schema.read_one(arrays, "filter/age", schema.integers(least=0)))
             self.rng.bit_generator.state = rng_state
-        return {
-            name.removeprefix("extra/"): array for name, array in arrays.items() if name.startswith("extra/")
-        }
+        return {name.removeprefix("extra/"): array for name, array in arrays.items() if name.startswith("extra/")}
 
     def _fingerprint(self) -> dict[str, object]:
         """What must agree between the filter that saved and the one that loads."""
@@ -404,9 +394,7 @@ class Filter:
         if stamp_ns is None:
             stamp_ns = 0 if previous is None else previous + 1_000_000_000
         if previous is not None and stamp_ns < previous:
-            raise InputError(
-                f"time runs backwards: step {self.steps} has stamp {stamp_ns} ns after {previous} ns"
-            )
+            raise InputError(f"time runs backwards: step {self.steps} has stamp {stamp_ns} ns after {previous} ns")
         return int(stamp_ns), 0.0 if previous is None else (stamp_ns - previous) * 1e-9
 
     def _predict(self, control: object, dt: float) -> Prior:
@@ -416,10 +404,7 @@ class Filter:
         return self.marginals.predict(transition, self.space)
 
     def _observe(self, frame: object, belief: Belief) -> list[Observations]:
-        observed = [
-            [checked_observations(group) for group in sensor.observe(frame, belief)]
-            for sensor in self.sensors
-        ]
+        observed = [[checked_observations(group) for group in sensor.observe(frame, belief)] for sensor in self.sensors]
         self._ends = list(accumulate(len(groups) for groups in observed))
         return [group for groups in observed for group in groups]
 
@@ -432,9 +417,7 @@ class Filter:
         self.stamp_ns = stamp_ns
         self.history.record(stamp_ns, self.particles.state, self.particles.log_weights)
 
-    def _start_landmarks(
-        self, frame: object, groups: list[Observations]
-    ) -> tuple[list[NewLandmarks], np.ndarray]:
+    def _start_landmarks(self, frame: object, groups: list[Observations]) -> tuple[list[NewLandmarks], np.ndarray]:
         belief = self.belief()
         born, ids, first = list[NewLandmarks](), [np.zeros(0, dtype=np.int64)], 0
         for sensor, end in zip(self.sensors, self._ends, strict=True):

@@ -51,9 +51,7 @@ class TruncatedMahalanobis(Likelihood):
 
     def __init__(self, limit: float = 4.0, update_limit: float | None = None) -> None:
         if not limit > 0:
-            raise InputError(
-                f"the limit T_l of a truncated Mahalanobis likelihood must be positive, got {limit}"
-            )
+            raise InputError(f"the limit T_l of a truncated Mahalanobis likelihood must be positive, got {limit}")
         update_limit = limit if update_limit is None else update_limit
         if not update_limit >= limit:
             raise InputError(

@@ -156,9 +156,7 @@ def gated(
     inlier = likelihood.predicted_inlier(nu, cov, cov + spread @ np.swapaxes(spread, -1, -2))
     seen = np.ones_like(inlier) if mask is None else mask.reshape(inlier.shape)
     used = seen & inlier
-    return used, likelihood.log_inlier() * used.sum(axis=1) + likelihood.log_outlier() * (seen & ~inlier).sum(
-        axis=1
-    )
+    return used, likelihood.log_inlier() * used.sum(axis=1) + likelihood.log_outlier() * (seen & ~inlier).sum(axis=1)
 
 
 def updated(

@@ -56,9 +56,7 @@ class StateOnly(Conditional):
             total.add(information(nu, jacobians.state, cov, group.likelihood or GAUSSIAN, prior))
         return total
 
-    def correct(
-        self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]
-    ) -> LogDensities:
+    def correct(self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]) -> LogDensities:
         """Σ log p(z | x); there is nothing to update."""
         total = np.zeros(state.shape[0])
         for group in groups:
@@ -160,9 +158,7 @@ class KalmanSubstate(Conditional):
         cov = gaussian.symmetrise(jac_sub @ self._rest @ np.swapaxes(jac_sub, -1, -2)) + noise
         return information(nu[:, None], jac_state[:, None], cov[:, None], GAUSSIAN, prior)
 
-    def correct(
-        self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]
-    ) -> LogDensities:
+    def correct(self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]) -> LogDensities:
         """Conditions on the increment, then on the observations."""
         self.mean, self.cov = self.given(increment), self._rest
         total = np.zeros(state.shape[0])
@@ -218,9 +214,7 @@ class KalmanSubstate(Conditional):
             assert jacobians.substate is not None
             by_state = np.zeros((1, 1, 1, 1)) if jacobians.state is None else jacobians.state
             blocks = ((by_state, self.space.dim), (jacobians.substate, m))
-            jac = np.concatenate(
-                [np.broadcast_to(block, (*nu.shape, size)) for block, size in blocks], axis=-1
-            )
+            jac = np.concatenate([np.broadcast_to(block, (*nu.shape, size)) for block, size in blocks], axis=-1)
             for k in range(group.z.shape[0]):
                 nus.append(np.broadcast_to(nu[:, k], (n, nu.shape[2])).copy())
                 jacs.append(np.broadcast_to(jac[:, k], (n, *jac.shape[2:])).copy())
@@ -290,9 +284,7 @@ class Marginals(Conditional):
 
         return linearise_at
 
-    def correct(
-        self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]
-    ) -> LogDensities:
+    def correct(self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]) -> LogDensities:
         """Corrects every part."""
         total, after_sampling = np.zeros(state.shape[0]), np.zeros(state.shape[0])
         for supplies, routed in self._routed(groups).items():

@@ -343,9 +343,7 @@ class Sensor(ABC, Generic[Frame]):
     def observe(self, frame: Frame, belief: "Belief") -> Sequence[Observations]:
         """Groups of observations of known landmarks (or of none)."""
 
-    def new_landmarks(
-        self, frame: Frame, belief: "Belief", observed: Sequence[Observations]
-    ) -> Sequence[NewLandmarks]:
+    def new_landmarks(self, frame: Frame, belief: "Belief", observed: Sequence[Observations]) -> Sequence[NewLandmarks]:
         """What starts landmarks, given the updated belief and what this sensor observed, ids of the descendants."""
         return ()
 
@@ -383,15 +381,11 @@ class Conditional(ABC):
             InputError: the motion model needs a substate.
         """
         if transition.coupling is not None and transition.coupling.shape[-1]:
-            raise InputError(
-                "the motion model drives a substate: give the filter a KalmanSubstate to hold it"
-            )
+            raise InputError("the motion model drives a substate: give the filter a KalmanSubstate to hold it")
         return Prior(space, transition.mean, np.zeros((1, space.dim)), transition.noise_factor)
 
     @abstractmethod
-    def information(
-        self, state: Float[np.ndarray, "N E"], groups: Sequence[Observations], prior: Prior
-    ) -> Information:
+    def information(self, state: Float[np.ndarray, "N E"], groups: Sequence[Observations], prior: Prior) -> Information:
         """What the groups say about a right perturbation of the states (N, E)."""
 
     @abstractmethod
@@ -469,9 +463,7 @@ class Map(Conditional):
         """Which landmarks (K,) of the map have this parametrisation, (K,) bool."""
 
     @abstractmethod
-    def read(
-        self, ids: Int[np.ndarray, " K"], particles: Int[np.ndarray, " n"] | slice = slice(None)
-    ) -> Records:
+    def read(self, ids: Int[np.ndarray, " K"], particles: Int[np.ndarray, " n"] | slice = slice(None)) -> Records:
         """Estimates (N, K, …) of landmarks that share one parametrisation, in all or some particles.
 
         Raises:
@@ -652,7 +644,5 @@ class Resampler(ABC):
     """
 
     @abstractmethod
-    def ancestors(
-        self, weights: Float[np.ndarray, " N"], rng: np.random.Generator
-    ) -> Int[np.ndarray, " N"] | None:
+    def ancestors(self, weights: Float[np.ndarray, " N"], rng: np.random.Generator) -> Int[np.ndarray, " N"] | None:
         """(N,) normalised weights → (N,) ancestors, or None for no resampling in this step."""

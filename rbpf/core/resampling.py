@@ -80,9 +80,7 @@ class EssTriggered(Resampler):
 
     def __init__(self, scheme: Resampler, threshold: float = 0.5) -> None:
         if not 0 <= threshold <= 1:
-            raise InputError(
-                f"the threshold of the effective sample size must lie in [0, 1], got {threshold}"
-            )
+            raise InputError(f"the threshold of the effective sample size must lie in [0, 1], got {threshold}")
         self.scheme = scheme
         self.threshold = threshold
 

@@ -91,9 +91,7 @@ def text(*shape: int | str) -> Entry:
     return Entry(np.str_, shape)
 
 
-def read(
-    arrays: Mapping[str, np.ndarray], schema: Schema, prefix: str = "", **sizes: int
-) -> dict[str, np.ndarray]:
+def read(arrays: Mapping[str, np.ndarray], schema: Schema, prefix: str = "", **sizes: int) -> dict[str, np.ndarray]:
     """The arrays of a schema, without the prefix of their names; copies, of the schema's types.
 
     Args:
@@ -153,9 +151,7 @@ def _read(arrays: Mapping[str, np.ndarray], name: str, entry: Entry, sizes: dict
     if wanted.kind == "i":
         least = -(2**62) if entry.least is None else entry.least
         below = 2**62 if below is None else below
-        _require(
-            (array >= least) & (array < below), array, name, f"whole numbers from {least} to {below - 1}"
-        )
+        _require((array >= least) & (array < below), array, name, f"whole numbers from {least} to {below - 1}")
     elif entry.least is not None:
         _require(array >= entry.least, array, name, f"numbers of at least {entry.least:g}")
     if entry.ascending:

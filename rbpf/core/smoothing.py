@@ -53,9 +53,7 @@ def backward_simulation(
         InputError: the history holds no clouds, or the motion has a substate or singular noise.
     """
     if not history.clouds or history.lag is not None:
-        raise InputError(
-            "backward simulation needs whole clouds: build the filter with clouds=True and no lag"
-        )
+        raise InputError("backward simulation needs whole clouds: build the filter with clouds=True and no lag")
     clouds = [states for block in history.blocks for states in block.states]
     log_weights = [weights for block in history.blocks for weights in block.log_weights]
     stamps = history.stamps_ns
@@ -63,9 +61,7 @@ def backward_simulation(
     paths = [clouds[-1][chosen]]
     for t in range(len(clouds) - 2, -1, -1):
         control = None if controls is None else controls[t + 1]
-        log_density = _transition_log_density(
-            motion, clouds[t], paths[0], control, (stamps[t + 1] - stamps[t]) * 1e-9
-        )
+        log_density = _transition_log_density(motion, clouds[t], paths[0], control, (stamps[t + 1] - stamps[t]) * 1e-9)
         paths.insert(0, clouds[t][_draw(log_weights[t] + log_density, rng)])
     return _summary(motion.space, stamps, np.array(paths), np.full(count, 1.0 / count))
 

@@ -137,9 +137,7 @@ def psd_factor(cov: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch 
     return factor
 
 
-def solve_lower(
-    chol: Like[ArrayLike, "*#batch n n"], b: Like[ArrayLike, "*#batch n"]
-) -> Float[np.ndarray, "*batch n"]:
+def solve_lower(chol: Like[ArrayLike, "*#batch n n"], b: Like[ArrayLike, "*#batch n"]) -> Float[np.ndarray, "*batch n"]:
     """Solve chol x = b by forward substitution.
 
     Args:

@@ -196,9 +196,7 @@ def add_gram(matrix, sign, count, total):
             m = packed(e, f)
             if p == 2:
                 for i in range(count):
-                    total[m, i] += sign * (
-                        matrix[0, e, i] * matrix[0, f, i] + matrix[1, e, i] * matrix[1, f, i]
-                    )
+                    total[m, i] += sign * (matrix[0, e, i] * matrix[0, f, i] + matrix[1, e, i] * matrix[1, f, i])
             elif p == 3:
                 for i in range(count):
                     total[m, i] += sign * (
@@ -227,9 +225,7 @@ def add_transposed_product(matrix, vector, count, total):
         elif p == 3:
             for i in range(count):
                 total[e, i] += (
-                    matrix[0, e, i] * vector[0, i]
-                    + matrix[1, e, i] * vector[1, i]
-                    + matrix[2, e, i] * vector[2, i]
+                    matrix[0, e, i] * vector[0, i] + matrix[1, e, i] * vector[1, i] + matrix[2, e, i] * vector[2, i]
                 )
         else:
             for a in range(p):

@@ -67,9 +67,7 @@ def refine(
         start = block * BLOCK
         count = min(BLOCK, n_particles - start)
         kernel = kernel_at(address)
-        x, mean, cov, const, nu, jac_state, jac_map, cross, total = workspace(
-            size, p, dim, dim_map, size_const
-        )
+        x, mean, cov, const, nu, jac_state, jac_map, cross, total = workspace(size, p, dim, dim_map, size_const)
         weight = np.ones(BLOCK)
         scale = np.ones(BLOCK)
         sum_info = np.zeros((dim * (dim + 1) // 2, BLOCK))
@@ -88,9 +86,7 @@ def refine(
             if partial:
                 for i in range(count):
                     weight[i] = 1.0 if mask.shape[0] == 0 or mask[k, start + i] else 0.0
-                accept_predicted(
-                    kernel_id, kernel_params, nu, jac_state, total, factor, start, count, weight, penalty
-                )
+                accept_predicted(kernel_id, kernel_params, nu, jac_state, total, factor, start, count, weight, penalty)
                 leave_out(weight, count, nu, jac_state, total)
             cholesky(total, count, scale)
             whiten_vector(total, count, nu)
@@ -157,9 +153,7 @@ def update(
         start = block * BLOCK
         count = min(BLOCK, n_particles - start)
         kernel = kernel_at(address)
-        x, mean, cov, const, nu, jac_state, jac_map, cross, total = workspace(
-            size, p, dim, dim_map, size_const
-        )
+        x, mean, cov, const, nu, jac_state, jac_map, cross, total = workspace(size, p, dim, dim_map, size_const)
         weight = np.ones(BLOCK)
         scale = np.ones(BLOCK)
         squared = np.zeros(BLOCK)
@@ -197,9 +191,7 @@ def update(
                 for i in range(count):
                     if weight[i] != 0.0:
                         sum_log[i] += log_likelihood(kernel_id, kernel_params, squared[i], scale[i], p)
-                        weight[i] = (
-                            1.0 if is_inlier(kernel_id, kernel_params, squared[i], scale[i], p) else 0.0
-                        )
+                        weight[i] = 1.0 if is_inlier(kernel_id, kernel_params, squared[i], scale[i], p) else 0.0
                         rejected = rejected or weight[i] == 0.0
             whiten_matrix(total, count, cross)
             if rejected:
@@ -270,9 +262,7 @@ def project(address, params, state, pool, slabs, which, maps, anchor, weights, f
     n_particles, size = state.shape
     p = anchor.shape[1]
     dim, dim_map, size_const = sizes[0], sizes[1], sizes[2]
-    x, record, packed_cov, const, nu, jac_state, jac_map, cross, total = workspace(
-        size, p, dim, dim_map, size_const
-    )
+    x, record, packed_cov, const, nu, jac_state, jac_map, cross, total = workspace(size, p, dim, dim_map, size_const)
     column = np.empty((p, BLOCK))
     offset = np.empty((p, n_particles))
     nothing = np.zeros((p, p))

@@ -52,9 +52,7 @@ def _distances(white_nu, white_jac, u, squared):
             squared[k] += left * left
 
 
-@njit(
-    void(MATRIX, CUBE, CUBE, MATRIX, int64, float64, VECTOR, VECTOR, MATRIX), cache=True, error_model="numpy"
-)
+@njit(void(MATRIX, CUBE, CUBE, MATRIX, int64, float64, VECTOR, VECTOR, MATRIX), cache=True, error_model="numpy")
 def robust_fit(nu, jac, cov, factor, rounds, scale, squared, u, info):
     """Fills `squared` (K,) with the Mahalanobis distances that a robust fit leaves, `u` (r,) with the fit.
 

@@ -121,9 +121,7 @@ def _half_angle(angle: ArrayLike) -> tuple[Array, Array]:
     return np.asarray(np.cos(half)), np.asarray(np.sin(half))
 
 
-def _one(
-    function: Callable[[Array, Array], None], x: ArrayLike, size: int, out_shape: tuple[int, ...]
-) -> Array:
+def _one(function: Callable[[Array, Array], None], x: ArrayLike, size: int, out_shape: tuple[int, ...]) -> Array:
     """A function of rows, (..., size) -> (..., *out_shape)."""
     x = np.asarray(x, dtype=float)
     _require_size(x, size)

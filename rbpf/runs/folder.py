@@ -121,9 +121,7 @@ def remarks(run: Run) -> list[str]:
     seen = [state in (TrackingState.TRACKED, TrackingState.INITIALISING) for state in log.states]
     if not any(seen):
         frames = f"the {len(log)} {run.system.frame_word}s"
-        return [
-            f"None of {frames} could be measured: the path is what was assumed, and nothing was seen of it."
-        ]
+        return [f"None of {frames} could be measured: the path is what was assumed, and nothing was seen of it."]
     at = in_space(log.stamps_ns, log.poses).positions[:, : landmarks.mean.shape[1]]
     if len(log) < 2 or not len(landmarks.ids):
         return []
@@ -140,9 +138,7 @@ def remarks(run: Run) -> list[str]:
 
 def write_summary(out: Path, entries: Mapping[str, Any]) -> None:
     """summary.json; numbers that are not finite become null, which JSON has."""
-    plain = {
-        name: None if isinstance(v, float) and not math.isfinite(v) else v for name, v in entries.items()
-    }
+    plain = {name: None if isinstance(v, float) and not math.isfinite(v) else v for name, v in entries.items()}
     write_text(out / SUMMARY, json.dumps(plain, indent=2, allow_nan=False) + "\n")
 
 

@@ -161,9 +161,7 @@ class FrameLog:
         try:
             import pandas
         except ImportError as error:
-            raise InputError(
-                "a data frame needs pandas, which is not installed: pip install pandas"
-            ) from error
+            raise InputError("a data frame needs pandas, which is not installed: pip install pandas") from error
         scalars = {column.name: self[column.name] for column in self.columns if not column.shape}
         poses = {f"pose_{i}": values for i, values in enumerate(self.poses.T)}
         return pandas.DataFrame({"stamp_ns": self.stamps_ns, **poses, **scalars})
@@ -188,15 +186,12 @@ class FrameLog:
             "covs": numbers("frames", dim, dim),
         }
         columns = {
-            column.name: numbers("frames", *column.shape, dtype=column.kind, values="any")
-            for column in self.columns
+            column.name: numbers("frames", *column.shape, dtype=column.kind, values="any") for column in self.columns
         }
         columns["state"] = integers("frames", least=0, below="states")
         found = read(arrays, path | columns, "log/", states=len(_STATES))
         for held in (self._path, self._rows):
-            held |= {
-                name: list(found[name]) if found[name].ndim > 1 else found[name].tolist() for name in held
-            }
+            held |= {name: list(found[name]) if found[name].ndim > 1 else found[name].tolist() for name in held}
         for field in self.ragged:
             entries = {
                 f"{field.name}/counts": integers("frames", least=0),

@@ -140,9 +140,7 @@ def _robot_texts(m: Measurements) -> dict[str, str]:
 def _camera_texts(log: FeatureLog) -> dict[str, str]:
     stamps = np.array([frame.stamp_ns for frame in log.frames], dtype=np.int64)
     steps = np.repeat(np.arange(stamps.size), [frame.landmarks.size for frame in log.frames])
-    names, z, cov = (
-        np.concatenate([getattr(f, part) for f in log.frames]) for part in ("landmarks", "z", "cov_z")
-    )
+    names, z, cov = (np.concatenate([getattr(f, part) for f in log.frames]) for part in ("landmarks", "z", "cov_z"))
     header = _camera_header(log.camera)
     columns = _observed(_PIXELS[header["measurement"]])
     rows = np.stack([steps, stamps[steps], names], axis=1)
@@ -240,9 +238,7 @@ def _read_camera_log(folder: Path, seen: "_Table", kind: str) -> FeatureLog:
 
     integers, numbers = seen.body(_observed(_PIXELS[kind]), 3)
     steps = integers[:, 0]
-    seen.require(
-        (steps >= 0) & (steps < stamps.size), f"a step from 0 to {stamps.size - 1}, the last in {FRAMES}"
-    )
+    seen.require((steps >= 0) & (steps < stamps.size), f"a step from 0 to {stamps.size - 1}, the last in {FRAMES}")
     seen.require(integers[:, 1] == stamps[steps], f"the stamp that {FRAMES} gives this step")
     seen.require(np.diff(steps, prepend=0) >= 0, "steps in order")
     cuts = np.searchsorted(steps, np.arange(1, stamps.size))
@@ -380,9 +376,7 @@ class _Table:
     def require_same(self, key: str, other: "_Table") -> None:
         """Refuses a named value that another of the run's files has otherwise."""
         if self.text(key) != other.text(key):
-            found = (
-                f"expected {key} {other.text(key)} as in {other.path.name}, found {quoted(self.text(key))}"
-            )
+            found = f"expected {key} {other.text(key)} as in {other.path.name}, found {quoted(self.text(key))}"
             raise self.header_error(key, f"{found}; take both files from one run")
 
     def header_error(self, key: str, problem: str) -> InputError:

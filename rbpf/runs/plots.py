@@ -58,9 +58,7 @@ def draw_run(found: RunFolder) -> list[str]:
     for name, draw in FIGURES.items():
         figure = draw(found)
         if figure is not None:
-            figures["ess.png" if name == "tracking.png" and found.system == "range-bearing" else name] = (
-                figure
-            )
+            figures["ess.png" if name == "tracking.png" and found.system == "range-bearing" else name] = figure
     return save_figures(figures, found.folder)
 
 
@@ -110,9 +108,7 @@ def map_figure(found: RunFolder) -> Any:
             lines[0].set_label("rays (depth not known yet)")
         if known is not None:
             places = motion.transform(known.positions)
-            axes.plot(
-                places[:, right], places[:, up], "+", color=COLOURS["known"], ms=9, label="known points"
-            )
+            axes.plot(places[:, right], places[:, up], "+", color=COLOURS["known"], ms=9, label="known points")
         close_up(axes, plane, np.concatenate([mean[near], at]))
     shown[0][0].legend(loc="best", fontsize="small")
     return figure

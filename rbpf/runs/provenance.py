@@ -80,9 +80,7 @@ def read_config(folder: Path) -> dict[str, Any]:
         raise InputError(f"{folder} holds no config.yaml: expected the folder that `rbpf run` leaves.")
     config = read_plain_yaml(path)
     if not isinstance(config, dict) or "rbpf" not in config or "system" not in config:
-        raise InputError(
-            f"{path}: expected the settings of a run with its version and system, found other content."
-        )
+        raise InputError(f"{path}: expected the settings of a run with its version and system, found other content.")
     return {str(name): value for name, value in config.items()}
 
 
@@ -222,9 +220,7 @@ def read_origin(config: Path) -> Origin:
     files = {name: Path(str(entries[name])) for name in _FILES if name in entries}
     for name, path in files.items():
         if not path.exists():
-            raise InputError(
-                f"{config}: its {name} {path} is not there: repeat from the folder the run was started in"
-            )
+            raise InputError(f"{config}: its {name} {path} is not there: repeat from the folder the run was started in")
     if "input_sha256" in entries and digest_of(files, config.parent) != entries["input_sha256"]:
         raise InputError(
             f"{entries['recording']} has changed since the run of {config}: it cannot be repeated; to use its settings "

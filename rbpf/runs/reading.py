@@ -143,9 +143,7 @@ class RunFolder:
             raise InputError(f"{folder}: expected the folder of a run, there is no such folder")
         for name in ("config.yaml", "summary.json"):
             if not (folder / name).is_file():
-                raise InputError(
-                    f"{folder} has no {name}: expected the folder that a finished `rbpf run` left"
-                )
+                raise InputError(f"{folder} has no {name}: expected the folder that a finished `rbpf run` left")
         return cls(folder, read_config(folder), _summary(folder / "summary.json"))
 
     @property
@@ -167,9 +165,7 @@ class RunFolder:
         """
         file, again = self.folder / TRAJECTORY, f"repeat the run with --config {self.folder / 'config.yaml'}"
         if not file.is_file():
-            raise InputError(
-                f"{self.folder} has no {file.name}: it was left by another version of rbpf; {again}"
-            )
+            raise InputError(f"{self.folder} has no {file.name}: it was left by another version of rbpf; {again}")
         arrays = load_arrays(file)
         version = arrays.get("version", np.array(0))
         if version.shape or version.dtype.kind != "i" or int(version) != VERSION:

@@ -127,18 +127,14 @@ class MonoRecording:
 
     def __post_init__(self) -> None:
         if len(self.topics.images) > 1:
-            raise InputError(
-                f"one camera has one topic of images: give one of {' and '.join(self.topics.images)}"
-            )
+            raise InputError(f"one camera has one topic of images: give one of {' and '.join(self.topics.images)}")
         starts = self.known_points, self.board, self.markers
         if self.known_points is not None and self.board is not None:
             raise InputError("a run starts from known points or from a chessboard: give one of the two")
         if self.markers is not None and any(start is not None for start in starts[:2]):
             raise InputError("a run starts from markers, a chessboard or known points: give one of the three")
         if self.map is not None and any(start is not None for start in starts):
-            raise InputError(
-                "in a known map a run starts from the map: leave out known points and chessboard"
-            )
+            raise InputError("in a known map a run starts from the map: leave out known points and chessboard")
 
     def open(self, config: MonoConfig) -> Opened:
         """The system and the images.
@@ -190,9 +186,7 @@ class MonoRecording:
             "calibration": self.calibration,
             "known_map": self.map,
         }
-        found: dict[str, str | float | bool] = {
-            name: str(path) for name, path in paths.items() if path is not None
-        }
+        found: dict[str, str | float | bool] = {name: str(path) for name, path in paths.items() if path is not None}
         if self.board is not None:
             found |= {"board": f"{self.board.columns}x{self.board.rows}", "square_m": self.board.square_m}
         if self.markers is not None:
@@ -229,16 +223,12 @@ class StereoRecording:
         Raises:
             InputError: a file is wrong.
         """
-        return open_pairs(
-            open_stereo(self.pairs, self.calibration, topics=self.topics, part=self.part), config
-        )
+        return open_pairs(open_stereo(self.pairs, self.calibration, topics=self.topics, part=self.part), config)
 
     def sources(self) -> dict[str, str | float | bool]:
         """For config.yaml."""
         named = {"recording": self.pairs, "calibration": self.calibration}
-        found: dict[str, str | float | bool] = {
-            name: str(path) for name, path in named.items() if path is not None
-        }
+        found: dict[str, str | float | bool] = {name: str(path) for name, path in named.items() if path is not None}
         return found | self.topics.entries() | self.part.entries()
 
 
@@ -249,9 +239,7 @@ def open_robot_log(log: RobotLog, config: RangeBearingConfig) -> Opened:
         InputError: landmarks are to be known by their names, and some have none.
     """
     if config.association == "known" and any((frame.landmarks == UNNAMED).any() for frame in log.frames):
-        raise InputError(
-            f"{log.name} has observations without a landmark's name: filter it with --association ml"
-        )
+        raise InputError(f"{log.name} has observations without a landmark's name: filter it with --association ml")
     system = RangeBearingSlam.of_log(log, config, keep_associations=config.association == "ml")
     stamps = np.array([frame.stamp_ns for frame in log.frames], dtype=np.int64)
     return Opened(system, LogSource(log), stamps, log.truth)
@@ -295,9 +283,7 @@ def open_features(
     system: System
     if isinstance(config, StereoConfig):
         if not isinstance(log.camera, RectifiedStereo):
-            raise InputError(
-                f"{log.name}: stereo SLAM needs a log of a rectified pair, this one is of one camera"
-            )
+            raise InputError(f"{log.name}: stereo SLAM needs a log of a rectified pair, this one is of one camera")
         counted = np.array_equal(stamps, np.arange(stamps.size))
         front_end = NamedFrontEnd(log.camera, config, ns_per_stamp=1_000_000_000 if counted else 1)
         system = StereoSlam(log.camera, config, front_end=front_end)

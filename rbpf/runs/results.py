@@ -31,9 +31,7 @@ class Results(RunFolder):
         try:
             import pandas
         except ImportError as error:
-            raise InputError(
-                "a data frame needs pandas, which is not installed: pip install pandas"
-            ) from error
+            raise InputError("a data frame needs pandas, which is not installed: pip install pandas") from error
         position = dict(zip(("x_m", "y_m", "z_m"), self.trajectory.positions.T, strict=True))
         columns = {"stamp_ns": self.path.stamps_ns, **position}
         for name in ("diagnostics.csv", "timings.csv"):
@@ -51,9 +49,7 @@ class Results(RunFolder):
     def _repr_html_(self) -> str:
         """For notebooks: the run's main figures."""
         rows = [("system", self.system), ("recording", self.name), *self._figures()]
-        cells = "".join(
-            f"<tr><th>{escape(name)}</th><td>{escape(str(value))}</td></tr>" for name, value in rows
-        )
+        cells = "".join(f"<tr><th>{escape(name)}</th><td>{escape(str(value))}</td></tr>" for name, value in rows)
         return f"<table><caption>{escape(str(self.folder))}</caption>{cells}</table>"
 
     def _figures(self) -> list[tuple[str, str]]:

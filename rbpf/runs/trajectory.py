@@ -79,9 +79,7 @@ class Trajectory:
             raise InputError(f"Expected finite poses in a trajectory, found another in row {row} (from 0).")
         if (np.diff(self.stamps_ns) < 0).any():
             row = int(np.argmax(np.diff(self.stamps_ns) < 0)) + 1
-            raise InputError(
-                f"Expected a trajectory in order of time, row {row} (from 0) is before the last one."
-            )
+            raise InputError(f"Expected a trajectory in order of time, row {row} (from 0) is before the last one.")
 
     @classmethod
     def from_planar(cls, stamps_ns: NDArray[np.int64], world_from_body: ArrayLike) -> Self:
@@ -208,9 +206,7 @@ def fit(alignment: Alignment | Similarity, estimate_points: Array, reference_poi
 def _checked(estimate_points: ArrayLike, reference_points: ArrayLike) -> tuple[Array, Array]:
     x, y = np.asarray(estimate_points, dtype=float), np.asarray(reference_points, dtype=float)
     if x.shape != y.shape or x.ndim != 2 or x.shape[1] not in (2, 3) or not len(x):
-        raise InputError(
-            f"Expected two arrays of N >= 1 points in 2-D or 3-D, found shapes {x.shape} and {y.shape}."
-        )
+        raise InputError(f"Expected two arrays of N >= 1 points in 2-D or 3-D, found shapes {x.shape} and {y.shape}.")
     if not (np.isfinite(x).all() and np.isfinite(y).all()):
         raise InputError("Expected points with finite coordinates to align.")
     return x, y
@@ -251,9 +247,7 @@ def read_tum(path: Path) -> Trajectory:
     wrong = np.abs(length - 1.0) > UNIT_TOLERANCE
     if wrong.any():
         row = int(np.argmax(wrong))
-        raise table.error(
-            row, f"expected a quaternion qx qy qz qw of length 1, found length {length[row]:.6g}"
-        )
+        raise table.error(row, f"expected a quaternion qx qy qz qw of length 1, found length {length[row]:.6g}")
     poses = np.concatenate([quat_xyzw, table.block("tx", "tz")], axis=1)
     return Trajectory(table.stamps_ns(), SE3.normalise(poses))
 

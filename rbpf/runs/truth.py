@@ -65,9 +65,7 @@ class RunTruth:
     alignment: Alignment = "none"
 
 
-def truth_at(
-    space: SE2Group | SE3Group, truth: GroundTruth, stamps_ns: np.ndarray, gauge: Gauge
-) -> RunTruth | None:
+def truth_at(space: SE2Group | SE3Group, truth: GroundTruth, stamps_ns: np.ndarray, gauge: Gauge) -> RunTruth | None:
     """The truth at a run's frames; None where fewer than `LEAST` have a true pose.
 
     Args:

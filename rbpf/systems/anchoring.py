@@ -110,9 +110,7 @@ class StartAnchor:
             delta = filter_.space.between(self._start, transition.mean[0])
             generation = filter_.lineage.generation
             filter_.lineage.retain(generation)
-            self._second = _FirstMotion(
-                generation, filter_.particles.state.copy(), delta, transition.noise_factor[0]
-            )
+            self._second = _FirstMotion(generation, filter_.particles.state.copy(), delta, transition.noise_factor[0])
         if self._latest is None or steps % self._every == 0 or steps <= 3:
             anchored, lineage = self.estimate(), self._filter.lineage
             if self._latest is not None:
@@ -146,9 +144,7 @@ class StartAnchor:
             if held.any():
                 records = landmark_map.read(ids[held])
                 present = ~np.isneginf(landmark_map.log_odds(ids[held]))
-                groups.append(
-                    self._without_first_frame(records, first.model, first.z[held], first.cov[held], present)
-                )
+                groups.append(self._without_first_frame(records, first.model, first.z[held], first.cov[held], present))
         proposed = self._proposal.propose(prior, _linearised_first_frame(prior, groups))
         mean = prior.at(np.einsum("nar,nr->na", prior.factor, proposed.mean))
         # A square factor (N, d, d), also of noise of lower rank.
@@ -229,9 +225,7 @@ class StartAnchor:
         explained = innovation_covariance(jac.landmark, records.cov, np.zeros_like(cov_z))
         chol = np.broadcast_to(gaussian.cholesky(cov_z), explained.shape)
         half = gaussian.solve_lower_matrix(chol, explained)
-        fraction = np.linalg.eigvalsh(
-            gaussian.symmetrise(gaussian.solve_lower_matrix(chol, np.swapaxes(half, -1, -2)))
-        )
+        fraction = np.linalg.eigvalsh(gaussian.symmetrise(gaussian.solve_lower_matrix(chol, np.swapaxes(half, -1, -2))))
         use = present & (fraction[..., -1] < _MOST_OF_ALL)
         left = np.where(use[..., None, None], cov_z - explained, np.eye(z.shape[1]))
         gain = records.cov @ np.swapaxes(jac.landmark, -1, -2) @ gaussian.inverse(left)

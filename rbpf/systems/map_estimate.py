@@ -87,9 +87,7 @@ def estimate_map(filter_: Filter, anchored: Anchored | None = None) -> MapEstima
     )
 
 
-def mixture_moments(
-    weights: np.ndarray, points: np.ndarray, within: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def mixture_moments(weights: np.ndarray, points: np.ndarray, within: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean (D,) and covariance (D, D) of Gaussians (N, D), (N, D, D) of weights (N,): within + between."""
     mean = (weights[:, None] * points).sum(axis=0)
     spread = points - mean

@@ -222,9 +222,7 @@ class Equidistant:
             before, angle = angle, np.where((ahead >= low) & (ahead <= high), ahead, 0.5 * (low + high))
             if not (np.abs(angle - before) > ANGLE_SETTLED).any():
                 break
-        uv = (
-            target * np.where(length > 0.0, np.tan(angle) / np.where(length > 0.0, length, 1.0), 1.0)[:, None]
-        )
+        uv = target * np.where(length > 0.0, np.tan(angle) / np.where(length > 0.0, length, 1.0), 1.0)[:, None]
         return np.where((within & self.is_invertible(uv))[:, None], uv, np.nan)
 
     def _scale_and_bend(self, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

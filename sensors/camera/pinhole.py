@@ -91,9 +91,7 @@ class Pinhole:
         """The camera of its images in another size: the centre of the first pixel stays at (0, 0)."""
         x, y = width / self.width, height / self.height
         centre = x * (self.cx + 0.5) - 0.5, y * (self.cy + 0.5) - 0.5
-        return replace(
-            self, width=width, height=height, fx=x * self.fx, fy=y * self.fy, cx=centre[0], cy=centre[1]
-        )
+        return replace(self, width=width, height=height, fx=x * self.fx, fy=y * self.fy, cx=centre[0], cy=centre[1])
 
     def turned(self, quarters: int) -> Self:
         """The camera of its images turned clockwise by so many quarters of a turn."""
@@ -187,9 +185,7 @@ class Pinhole:
         within = (px >= margin_px - 0.5) & (px <= past)
         return within[..., 0] & within[..., 1]
 
-    def visible(
-        self, point: Float[np.ndarray, "*batch 3"], margin_px: float = 0.0
-    ) -> Bool[np.ndarray, "*batch"]:
+    def visible(self, point: Float[np.ndarray, "*batch 3"], margin_px: float = 0.0) -> Bool[np.ndarray, "*batch"]:
         """Whether points (…, 3) are seen (…): in front of the camera, not folded back, and inside the image."""
         with np.errstate(all="ignore"):
             seen = self.lens.is_invertible(_normalise(point)) & self.inside(self.project(point), margin_px)
@@ -245,9 +241,7 @@ class RectifiedStereo:
         px = np.asarray(px, float)
         return self.camera.inside(px[..., :2], margin_px) & self.camera.inside(px[..., [2, 1]], margin_px)
 
-    def visible(
-        self, point: Float[np.ndarray, "*batch 3"], margin_px: float = 0.0
-    ) -> Bool[np.ndarray, "*batch"]:
+    def visible(self, point: Float[np.ndarray, "*batch 3"], margin_px: float = 0.0) -> Bool[np.ndarray, "*batch"]:
         """Whether points (…, 3) are seen in both images (…)."""
         right = self._from_right(point)
         return self.camera.visible(point, margin_px) & self.camera.visible(right, margin_px)

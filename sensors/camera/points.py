@@ -67,16 +67,12 @@ class CameraModel(ObservationModel):
         position = SE3.translation(state[..., :7])
         return SE3.inverse_transform(state[..., :7], x + (1.0 - w) * position)
 
-    def predict(
-        self, state: Array, landmark: Given = None, const: Given = None, substate: Given = None
-    ) -> Array:
+    def predict(self, state: Array, landmark: Given = None, const: Given = None, substate: Given = None) -> Array:
         """E06 (7)–(9) with distortion."""
         assert landmark is not None
         return self.camera.project(clamp_depth(self.in_camera(state, landmark, const)))
 
-    def jacobians(
-        self, state: Array, landmark: Given = None, const: Given = None, substate: Given = None
-    ) -> Jacobians:
+    def jacobians(self, state: Array, landmark: Given = None, const: Given = None, substate: Given = None) -> Jacobians:
         """∂z/∂ξ = D [[c]× | −w I] and ∂z/∂b = D Rᵀ(∂x/∂b − t ∂w/∂b), with D the camera's slope."""
         assert landmark is not None
         direction = clamp_depth(self.in_camera(state, landmark, const))
@@ -124,9 +120,7 @@ class CameraRay(CameraModel):
         margin_px: see `CameraModel`.
     """
 
-    def __init__(
-        self, camera: Pinhole, rho: tuple[float, float] = (1.0, 0.5), margin_px: float = 0.0
-    ) -> None:
+    def __init__(self, camera: Pinhole, rho: tuple[float, float] = (1.0, 0.5), margin_px: float = 0.0) -> None:
         super().__init__(camera, margin_px)
         if not (np.isfinite(rho).all() and min(rho) > 0.0):
             raise InputError(f"the prior of the inverse depth needs a positive mean and deviation, got {rho}")
@@ -174,9 +168,7 @@ class EpipolarRay(CameraRay):
     has not moved sideways has no epipolar line, and is given the full residual.
     """
 
-    def jacobians(
-        self, state: Array, landmark: Given = None, const: Given = None, substate: Given = None
-    ) -> Jacobians:
+    def jacobians(self, state: Array, landmark: Given = None, const: Given = None, substate: Given = None) -> Jacobians:
         """Those of the ray, projected on n̂."""
         by_state, by_landmark, _ = super().jacobians(state, landmark, const)
         assert by_state is not None and by_landmark is not None
@@ -273,17 +265,13 @@ class PointsView(ObservationModel):
         """The points (…, m, 3) in the camera's frame."""
         return SE3.inverse_transform(state[..., None, :7], self.in_world(landmark, const))
 
-    def predict(
-        self, state: Array, landmark: Given = None, const: Given = None, substate: Given = None
-    ) -> Array:
+    def predict(self, state: Array, landmark: Given = None, const: Given = None, substate: Given = None) -> Array:
         """Every point by E06 (7)–(9)."""
         assert landmark is not None
         px = self.camera.project(clamp_depth(self.in_camera(state, landmark, const)))
         return px.reshape(*px.shape[:-2], self.dim)
 
-    def jacobians(
-        self, state: Array, landmark: Given = None, const: Given = None, substate: Given = None
-    ) -> Jacobians:
+    def jacobians(self, state: Array, landmark: Given = None, const: Given = None, substate: Given = None) -> Jacobians:
         """Those of each point, one below the other."""
         assert landmark is not None
         by_state, by_landmark = self.slopes(state, landmark, const)
@@ -362,9 +350,7 @@ class ConstellationView(PointsView):
         by_state = np.zeros((*slope.shape[:-1], 6 + state.shape[-1] - 7))
         by_state[..., :3], by_state[..., 3:6] = np.cross(slope, direction[..., None, :]), -slope
         frame = SE3.retract(const, landmark)
-        turned = (
-            slope @ (np.swapaxes(SE3.rotation(state[..., :7]), -1, -2) @ SE3.rotation(frame))[..., None, :, :]
-        )
+        turned = slope @ (np.swapaxes(SE3.rotation(state[..., :7]), -1, -2) @ SE3.rotation(frame))[..., None, :, :]
         # a·(ω × k) = −(a × k)·ω
         by_frame = np.concatenate([-np.cross(turned, self.points[:, None, :]), turned], axis=-1)
         return by_state, by_frame @ SE3.right_jacobian(landmark)[..., None, :, :]

@@ -25,19 +25,13 @@ def resect(camera: Pinhole, points: np.ndarray, px: np.ndarray) -> np.ndarray:
         InputError: there are fewer than four points, they lie on a line, or no pose in front of them explains them.
     """
     if points.shape[0] < 4:
-        raise InputError(
-            f"a start from known points needs at least four that are seen, got {points.shape[0]}"
-        )
+        raise InputError(f"a start from known points needs at least four that are seen, got {points.shape[0]}")
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     if spread[1] <= FLAT * spread[0]:
-        raise InputError(
-            "the known points lie on a line: add one beside it, the camera could turn around them"
-        )
+        raise InputError("the known points lie on a line: add one beside it, the camera could turn around them")
     uv = camera.unproject(px)
     if not np.isfinite(uv).all():
-        raise InputError(
-            "a known point is seen where the camera's distortion has no direction: check the calibration"
-        )
+        raise InputError("a known point is seen where the camera's distortion has no direction: check the calibration")
     # Local optima of the reprojection error, from the solutions of the first triples of points.
     import cv2
 
@@ -52,15 +46,11 @@ def resect(camera: Pinhole, points: np.ndarray, px: np.ndarray) -> np.ndarray:
         costs = np.square(seen[..., :2] / seen[..., 2:] - uv).sum(axis=(1, 2))
     costs = np.where((seen[..., 2] > 0.0).all(axis=1) & np.isfinite(costs), costs, np.inf)
     if not costs.size or not np.isfinite(costs.min()):
-        raise InputError(
-            "no camera in front of the known points sees them as measured: check their names and order"
-        )
+        raise InputError("no camera in front of the known points sees them as measured: check their names and order")
     return poses[int(np.argmin(costs))]
 
 
-def three_point_poses(
-    points: np.ndarray, uv: np.ndarray, triples: int, rng: np.random.Generator
-) -> np.ndarray:
+def three_point_poses(points: np.ndarray, uv: np.ndarray, triples: int, rng: np.random.Generator) -> np.ndarray:
     """Poses world_from_camera (C, 7) of three of the points (M, 3) each, seen at uv (M, 2), drawn `triples` times."""
     matrices = []
     for _ in range(triples):
@@ -133,9 +123,7 @@ def resect_consensus(
     return refined(camera, pose, points, px, within_px)
 
 
-def refined(
-    camera: Pinhole, pose: np.ndarray, points: np.ndarray, px: np.ndarray, within_px: float
-) -> Resected | None:
+def refined(camera: Pinhole, pose: np.ndarray, points: np.ndarray, px: np.ndarray, within_px: float) -> Resected | None:
     """`refined_on_all` of points (M, 3) that are known and agree if they are seen (M, 2) within so many px."""
     return refined_on_all(camera, pose, _exact(points, px), (within_px**2,) * (ROUNDS + 1))
 

@@ -31,9 +31,7 @@ class CornerDetector(Detector):
         self.fast_threshold = fast_threshold
         self.min_score = min_score
 
-    def candidates(
-        self, image: np.ndarray, margin_px: int, mask: np.ndarray | None
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def candidates(self, image: np.ndarray, margin_px: int, mask: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         import cv2
 
         from rbpf.sensors.features.kernels import peaks

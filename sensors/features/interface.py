@@ -80,9 +80,7 @@ class Detector(ABC):
     """What `candidates` needs of the image around a keypoint."""
 
     @abstractmethod
-    def candidates(
-        self, image: np.ndarray, margin_px: int, mask: np.ndarray | None
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def candidates(self, image: np.ndarray, margin_px: int, mask: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """Local maxima of the detector's response.
 
         Args:

@@ -114,9 +114,7 @@ class Sift(FeatureExtractor, Descriptor):
 
             config = self.config
             # Without the precise scaling every pixel is a quarter off.
-            self._opencv = cv2.SIFT.create(
-                config.features, config.layers, config.contrast, config.edge, _SIGMA, True
-            )
+            self._opencv = cv2.SIFT.create(config.features, config.layers, config.contrast, config.edge, _SIGMA, True)
         return self._opencv
 
 

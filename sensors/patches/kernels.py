@@ -404,9 +404,7 @@ def interval(centre, cov, limits, shape, size):
     """First and last column and row of the whole pixels to search; empty where the last is before the first."""
     sigmas, most, half = limits[0], limits[1], size // 2
     uu, _, vv = ellipse(cov, sigmas)
-    if not (
-        math.isfinite(uu) and math.isfinite(vv) and math.isfinite(centre[0]) and math.isfinite(centre[1])
-    ):
+    if not (math.isfinite(uu) and math.isfinite(vv) and math.isfinite(centre[0]) and math.isfinite(centre[1])):
         return (0, -1), (0, -1)
     across, down = min(sigmas * math.sqrt(uu), most), min(sigmas * math.sqrt(vv), most)
     columns = _clipped(centre[0], across, half, shape[1] - 1 - half)

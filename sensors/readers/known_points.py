@@ -49,9 +49,7 @@ class KnownPixels:
             if np.shape(values) != shape or not np.isfinite(values).all():
                 raise InputError(f"{name} of {count} known points must be {shape} finite numbers")
         if (np.asarray(self.std_m) < 0.0).any():
-            raise InputError(
-                "the standard deviation of a known point is negative: std_m must be zero or more"
-            )
+            raise InputError("the standard deviation of a known point is negative: std_m must be zero or more")
 
 
 def read_known_points(path: str | Path) -> KnownPixels:

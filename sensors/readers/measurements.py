@@ -97,9 +97,7 @@ class Measurements:
             valid = are_covariances(getattr(self, name))
             if not valid.all():
                 row = int(np.argmin(valid))
-                raise InputError(
-                    f"Expected covariances in {name}, found another matrix in row {row} (from 0)."
-                )
+                raise InputError(f"Expected covariances in {name}, found another matrix in row {row} (from 0).")
 
     def model(self) -> RangeBearing | RelativePosition:
         """The observation model, the same one that the filter uses."""

@@ -69,9 +69,7 @@ class Mrclam(RobotLogFormat):
         if path.is_dir():
             robots = sorted(file.name for file in path.glob(f"*{_SUFFIX}"))
             if len(robots) != 1:
-                several = (
-                    f"those of {len(robots)} robots; name one, such as {path / robots[0]}" if robots else ""
-                )
+                several = f"those of {len(robots)} robots; name one, such as {path / robots[0]}" if robots else ""
                 raise InputError(f"{path}: expected {self.kind}; found {several or 'none'}.")
             folder, prefix = path, robots[0].removesuffix(_SUFFIX)
         barcodes = read_columns(folder / "Barcodes.dat", ("subject", "barcode"), self.kind)

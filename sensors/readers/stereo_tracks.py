@@ -45,9 +45,7 @@ class StereoTracks:
     world_from_camera: Array
 
 
-def read_stereo_tracks(
-    folder: str | Path, std_px: float = 1.0, size: tuple[int, int] = KITTI_00
-) -> StereoTracks:
+def read_stereo_tracks(folder: str | Path, std_px: float = 1.0, size: tuple[int, int] = KITTI_00) -> StereoTracks:
     """Read a folder of tracks.
 
     Args:

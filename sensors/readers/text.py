@@ -52,9 +52,7 @@ def read_bytes(path: Path, hint: str = "", most: int | None = None) -> bytes:
             kind = "a folder" if S_ISDIR(status.st_mode) else "a device or a pipe"
             raise InputError(f"{path}: cannot be read: it is {kind}, no file{hint and '; expected ' + hint}.")
         if status.st_size > most:
-            raise InputError(
-                f"{path}: the file is larger than {most >> 20} MiB{hint and '; expected ' + hint}."
-            )
+            raise InputError(f"{path}: the file is larger than {most >> 20} MiB{hint and '; expected ' + hint}.")
         with path.open("rb") as file:
             return file.read(status.st_size)
     except InputError:
@@ -205,9 +203,7 @@ def parse_table(
     return Table(path, columns, rows, lines, values)
 
 
-def _parse_row(
-    path: Path, line: int, row: str, columns: tuple[str, ...], separator: str | None
-) -> list[float]:
+def _parse_row(path: Path, line: int, row: str, columns: tuple[str, ...], separator: str | None) -> list[float]:
     fields = [field.strip() for field in row.split(separator)]
     if len(fields) != len(columns):
         problem = f"expected {len(columns)} columns ({', '.join(columns)}), found {len(fields)}"
@@ -258,9 +254,7 @@ class StampedLines:
         return parse_table(self.path, columns, numbered, separator)
 
 
-def read_stamped(
-    path: Path, hint: str, separator: str | None = None, nanoseconds: bool = False
-) -> StampedLines:
+def read_stamped(path: Path, hint: str, separator: str | None = None, nanoseconds: bool = False) -> StampedLines:
     """Lines of a time and something else; lines that start with # are comments.
 
     Args:

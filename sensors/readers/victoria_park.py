@@ -55,9 +55,7 @@ class VictoriaPark(RobotLogFormat):
         noise.require_only({"std_position_m", "scale_odometry"}, path, "a graph of landmark positions")
         graphs = _graphs(path)
         if len(graphs) != 1:
-            raise InputError(
-                f"{path}: expected {self.kind}; found {len(graphs)}; name one, such as {graphs[0]}."
-            )
+            raise InputError(f"{path}: expected {self.kind}; found {len(graphs)}; name one, such as {graphs[0]}.")
         path = graphs[0]
         lines: dict[str, list[tuple[int, str]]] = {keyword: [] for keyword in _COLUMNS}
         for number, line in enumerate(read_lines(path), 1):

@@ -34,9 +34,7 @@ class YamlValue:
         """Error that points at the value's line."""
         return line_error(self.path, self.node.start_mark.line + 1, problem)
 
-    def entries(
-        self, required: Collection[str], optional: Collection[str] | None = None
-    ) -> dict[str, "YamlValue"]:
+    def entries(self, required: Collection[str], optional: Collection[str] | None = None) -> dict[str, "YamlValue"]:
         """Values of a mapping by their keys, each of which comes once.
 
         Args:
@@ -119,9 +117,7 @@ def read_yaml(path: Path, hint: str) -> YamlValue:
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
             line = event.start_mark.line + 1 if event.start_mark else 1
             if depth > DEEPEST:
-                raise line_error(
-                    path, line, f"expected values, found more than {DEEPEST} nested lists or mappings"
-                )
+                raise line_error(path, line, f"expected values, found more than {DEEPEST} nested lists or mappings")
             if isinstance(event, yaml.AliasEvent):
                 raise line_error(path, line, "found an alias (*name): write the values out")
         node = yaml.compose(text, Loader=yaml.SafeLoader)

@@ -15,9 +15,7 @@ FRAMES = 16
 
 def render_desk(folder: Path) -> Path:
     """A desk, EuRoC ASL."""
-    simulate_images(
-        TexturedDesk(frames=FRAMES, texel_m=0.003), Imaging(noise_std=1.0), CAMERA, folder, seed=1
-    )
+    simulate_images(TexturedDesk(frames=FRAMES, texel_m=0.003), Imaging(noise_std=1.0), CAMERA, folder, seed=1)
     return folder
 
 
@@ -37,9 +35,7 @@ def run(sequence, out, *arguments, known=True, video=False):
     given = ["--known-points", str(points)] if known and points.exists() else []
     shown = [] if "--video" in arguments else ["--no-video"]
     shown += [] if {"--video", "--batch"} & set(arguments) else ["--no-batch"]
-    return main(
-        ["run", "mono", str(sequence), *given, "--out", str(out), "--particles", "8", *shown, *arguments]
-    )
+    return main(["run", "mono", str(sequence), *given, "--out", str(out), "--particles", "8", *shown, *arguments])
 
 
 def summary(out):

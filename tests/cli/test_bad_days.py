@@ -103,10 +103,7 @@ def test_no_room_for_checkpoints(desk, tmp_path):
         with full_disk(1000):
             done = run()
         assert len(done.log) == FRAMES and done.failure is None
-        assert (
-            sum("no checkpoint is kept" in words and "File too large" in words for words in done.messages)
-            == 4
-        )
+        assert sum("no checkpoint is kept" in words and "File too large" in words for words in done.messages) == 4
         assert place.read_bytes() == b"the last one"
         assert [path.name for path in tmp_path.iterdir()] == ["checkpoint.npz"]
 

@@ -54,16 +54,12 @@ REQUIRED = {
 @pytest.fixture(scope="module")
 def log(tmp_path_factory):
     folder = tmp_path_factory.mktemp("simulated") / "log"
-    assert (
-        main(["simulate", "range-bearing", "--out", str(folder), "--steps", "40", "--landmarks", "30"]) == 0
-    )
+    assert main(["simulate", "range-bearing", "--out", str(folder), "--steps", "40", "--landmarks", "30"]) == 0
     return folder
 
 
 def run(log, out, *arguments):
-    return main(
-        ["run", "range-bearing", str(log), "--out", str(out), "--particles", "30", "--no-batch", *arguments]
-    )
+    return main(["run", "range-bearing", str(log), "--out", str(out), "--particles", "30", "--no-batch", *arguments])
 
 
 @pytest.fixture(scope="module")

@@ -75,9 +75,7 @@ def test_two_topics_are_not_one_camera(as_bag, tmp_path, capsys):
 
 
 def test_times_that_run_backwards_are_refused(as_bag, tmp_path, capsys):
-    path = as_bag(
-        KINDS[0], lambda k, shot: shot | ({"stamp": 1, "received": shot["stamp"]} if k == 5 else {})
-    )
+    path = as_bag(KINDS[0], lambda k, shot: shot | ({"stamp": 1, "received": shot["stamp"]} if k == 5 else {}))
     assert "the stamp of image" in refused(capsys, path, tmp_path / "run")
 
 

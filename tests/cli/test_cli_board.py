@@ -67,9 +67,7 @@ def test_markers_are_what_a_run_starts_from(tmp_path, capsys):
         corners = np.array([[0.0, 0, 0], [across, 0, 0], [across, 0.3, 0], [0, 0.3, 0]]) - at
         metres = texels / across
         drawn = 20 + metres * (corners + at)[:, :2] - 0.5
-        homography = cv2.getPerspectiveTransform(
-            drawn.astype(np.float32), camera.project(corners).astype(np.float32)
-        )
+        homography = cv2.getPerspectiveTransform(drawn.astype(np.float32), camera.project(corners).astype(np.float32))
         image = cv2.warpPerspective(sheet, homography, (320, 240), flags=cv2.INTER_AREA, borderValue=190)
         noise = np.random.default_rng(t).normal(0.0, 1.0, image.shape)
         cv2.imwrite(str(folder / f"{t}.png"), np.clip(cv2.GaussianBlur(image, (0, 0), 0.8) + noise, 0, 255))
@@ -90,7 +88,5 @@ def test_markers_are_what_a_run_starts_from(tmp_path, capsys):
 
 
 def test_a_room_has_no_board(tmp_path, capsys):
-    assert (
-        main(["simulate", "room", "--out", str(tmp_path / "room"), "--board", "9x6", "--square", "0.02"]) == 2
-    )
+    assert main(["simulate", "room", "--out", str(tmp_path / "room"), "--board", "9x6", "--square", "0.02"]) == 2
     assert "a room has no chessboard" in sentence(capsys)

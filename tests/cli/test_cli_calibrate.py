@@ -85,9 +85,7 @@ def test_a_video_is_as_good(tmp_path, capsys):
 def test_a_camera_that_is_not_known_well_is_said_to_be(images, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("rbpf.cli.cameras.LOOSE", 1e-5)
     assert calibrate(images, tmp_path / "out") == 0
-    assert "0.0 % of its focal length only, and a run with it will bend" in " ".join(
-        capsys.readouterr().err.split()
-    )
+    assert "0.0 % of its focal length only, and a run with it will bend" in " ".join(capsys.readouterr().err.split())
 
 
 def blank(folder):

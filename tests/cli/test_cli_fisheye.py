@@ -25,9 +25,7 @@ EDGE = np.deg2rad(55.0)
 @pytest.fixture(scope="module")
 def wide(tmp_path_factory):
     folder = tmp_path_factory.mktemp("rendered") / "wide"
-    simulate_images(
-        TexturedDesk(frames=FRAMES, texel_m=0.003), Imaging(noise_std=1.0), CAMERA, folder, seed=1
-    )
+    simulate_images(TexturedDesk(frames=FRAMES, texel_m=0.003), Imaging(noise_std=1.0), CAMERA, folder, seed=1)
     return folder
 
 
@@ -48,9 +46,7 @@ def test_one_camera_is_as_near_to_the_truth_as_a_pinhole(finished):
     log = read_feature_log(finished)
     assert log.camera == CAMERA
     uv = CAMERA.unproject(np.concatenate([frame.z for frame in log.frames]))
-    assert (np.arctan(np.hypot(*uv.T)) > EDGE).sum() > FRAMES, (
-        "nothing was measured where only a fisheye sees"
-    )
+    assert (np.arctan(np.hypot(*uv.T)) > EDGE).sum() > FRAMES, "nothing was measured where only a fisheye sees"
 
 
 def test_its_run_is_validated_and_calibrates_its_camera(finished, tmp_path, capsys):

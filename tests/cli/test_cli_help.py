@@ -124,7 +124,5 @@ def test_shells_complete_commands(tmp_path, capsys, shell):
     if program is None:
         pytest.skip(f"{shell} is not installed")
     ask = [program, *(["-f"] if shell == "zsh" else []), "-c", ASKS[shell].format(script)]
-    found = subprocess.run(
-        ask, capture_output=True, text=True, check=False, env=os.environ | {"HOME": str(tmp_path)}
-    )
+    found = subprocess.run(ask, capture_output=True, text=True, check=False, env=os.environ | {"HOME": str(tmp_path)})
     assert {"calibrate", "_tyro_rbpf"} & set(found.stdout.split()), found.stderr

@@ -42,9 +42,7 @@ def quick(log, out, *arguments):
     ]
 
 
-@pytest.mark.parametrize(
-    "arguments", ["nonsense", "nonsense --help", "run nonsense --help", "simulate nonsense -h"]
-)
+@pytest.mark.parametrize("arguments", ["nonsense", "nonsense --help", "run nonsense --help", "simulate nonsense -h"])
 def test_a_command_that_there_is_not_is_named_even_where_help_is_asked_for(arguments, capsys):
     assert main(arguments.split()) == 2
     out, err = capsys.readouterr()
@@ -119,9 +117,7 @@ def test_ctrl_c_leaves_a_run_that_resumes_to_the_same_bytes(longer, tmp_path, af
     process.send_signal(signal.SIGINT)
     _, error = process.communicate(timeout=120)
     assert process.returncode == 130, error
-    said = re.search(
-        r"stopped after (\d+) of 600; the same command with --resume goes on", " ".join(error.split())
-    )
+    said = re.search(r"stopped after (\d+) of 600; the same command with --resume goes on", " ".join(error.split()))
     assert said is not None and 5 <= int(said[1]) < 600
     assert (tmp_path / "cut" / "checkpoint.npz").exists()
     assert not (tmp_path / "cut" / "summary.json").exists()
@@ -193,7 +189,9 @@ def test_the_doctor_finds_everything_here_and_what_is_missing(capsys, monkeypatc
 def test_the_first_compilation_is_announced_before_it_begins(log, tmp_path):
     """In an empty cache, by a process that ends with its first word."""
     cache = tmp_path / "cache"
-    program = f"import os, rbpf.cli.compiling as c; c.say = lambda words: (print(words, flush=True), os._exit(0))\n{_MAIN}"
+    program = (
+        f"import os, rbpf.cli.compiling as c; c.say = lambda words: (print(words, flush=True), os._exit(0))\n{_MAIN}"
+    )
     done = subprocess.run(
         [sys.executable, "-c", program, *quick(log, tmp_path / "run")],
         capture_output=True, text=True, check=True, env={**os.environ, "NUMBA_CACHE_DIR": str(cache)},

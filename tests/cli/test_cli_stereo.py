@@ -93,9 +93,7 @@ def test_ctrl_c_leaves_a_run_that_resumes_to_the_same_bytes(finished, room, tmp_
     process.send_signal(signal.SIGINT)
     _, error = process.communicate("go on\n", timeout=120)
     assert process.returncode == 130, error
-    said = re.search(
-        rf"stopped after (\d) of {FRAMES}; the same command with --resume", " ".join(error.split())
-    )
+    said = re.search(rf"stopped after (\d) of {FRAMES}; the same command with --resume", " ".join(error.split()))
     assert said is not None and 3 <= int(said[1]) < FRAMES
     assert {path.name for path in (tmp_path / "cut").iterdir()} == {"checkpoint.npz"}
     assert main([*arguments, "--resume"]) == 0

@@ -33,9 +33,7 @@ def check(out: Path) -> None:
     for name in names:
         image = cv2.imread(str(out / name))
         assert image.shape[0] > 350 and image.shape[1] > 600, name
-        edge = np.concatenate(
-            [image[:2].ravel(), image[-2:].ravel(), image[:, :2].ravel(), image[:, -2:].ravel()]
-        )
+        edge = np.concatenate([image[:2].ravel(), image[-2:].ravel(), image[:, :2].ravel(), image[:, -2:].ravel()])
         assert (edge == 255).all(), name
         assert 0.005 < (image < 200).any(axis=-1).mean() < 0.7, name
     shown_once = names - {"path.png", "error.png"}  # the comparison with the truth has both

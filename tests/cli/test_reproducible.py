@@ -78,9 +78,7 @@ def test_a_run_over_images_is_repeated_from_its_config(recordings, tmp_path, sys
     assert main(["run", system, *recordings[system], "--seed", "7", "--out", str(tmp_path / "a")]) == 0
     config = tmp_path / "a" / "config.yaml"
     entries = yaml.safe_load(config.read_text())
-    assert entries["system"] == system and (
-        system == "stereo" or entries["known_points"].endswith("points.csv")
-    )
+    assert entries["system"] == system and (system == "stereo" or entries["known_points"].endswith("points.csv"))
     again = ["run", "--from", str(config), "--out", str(tmp_path / "b")]
     assert main(again) == 0
     assert (tmp_path / "b" / "annotated.mp4").exists() == (system == "mono")

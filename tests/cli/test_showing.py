@@ -30,9 +30,7 @@ def test_an_option_that_there_is_not_is_named(words, said, capsys):
     assert out == "" and err.startswith("rbpf: ") and said in err and err.count("\n") == 1
 
 
-@pytest.mark.parametrize(
-    "name", ["no[/a]where", "no[red]where", "no\nwhere", "no\udcffwhere", "no:cat:where"]
-)
+@pytest.mark.parametrize("name", ["no[/a]where", "no[red]where", "no\nwhere", "no\udcffwhere", "no:cat:where"])
 def test_names_are_shown_as_they_are_on_one_line(name, capsys):
     """What a terminal, or UTF-8, cannot show is an escape; a bracket is no markup; nothing refused begins a bar."""
     assert main(["report", name]) == 2

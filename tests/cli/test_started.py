@@ -15,9 +15,7 @@ def test_its_version(capsys):
 
 
 def test_python_m():
-    done = subprocess.run(
-        [sys.executable, "-m", "rbpf", "--version"], capture_output=True, text=True, check=True
-    )
+    done = subprocess.run([sys.executable, "-m", "rbpf", "--version"], capture_output=True, text=True, check=True)
     assert done.stdout == f"rbpf {__version__}\n"
 
 

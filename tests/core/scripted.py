@@ -21,9 +21,7 @@ class Scripted(Sensor):
 def seen(model: ObservationModel, z, cov=None, **options) -> list[Observations]:
     """One group; its covariances are identities unless told."""
     z = np.array(z, dtype=float)
-    cov = (
-        np.broadcast_to(np.eye(z.shape[-1]), (*z.shape, z.shape[-1])) if cov is None else np.array(cov, float)
-    )
+    cov = np.broadcast_to(np.eye(z.shape[-1]), (*z.shape, z.shape[-1])) if cov is None else np.array(cov, float)
     return [Observations(z, cov, model, **options)]
 
 
@@ -58,9 +56,7 @@ class Polar(ObservationModel):
 
     def predict(self, state, landmark=None, const=None, substate=None):
         point = SE2.inverse_transform(state, landmark)
-        return np.stack(
-            [np.hypot(point[..., 0], point[..., 1]), np.arctan2(point[..., 1], point[..., 0])], axis=-1
-        )
+        return np.stack([np.hypot(point[..., 0], point[..., 1]), np.arctan2(point[..., 1], point[..., 0])], axis=-1)
 
     def residual(self, z, predicted):
         difference = z - predicted

@@ -112,9 +112,7 @@ class TestExistence:
     model = ExistenceModel(hit=1.0, miss=0.5, limit=3.0, drop=-1.0)
 
     def after(self, log_odds, seen, expected) -> float:
-        return float(
-            self.model.updated(np.array([[log_odds]]), np.array([[seen]]), np.array([[expected]]))[0, 0]
-        )
+        return float(self.model.updated(np.array([[log_odds]]), np.array([[seen]]), np.array([[expected]]))[0, 0])
 
     def test_counting(self):
         assert self.after(0.0, seen=True, expected=True) == 1.0

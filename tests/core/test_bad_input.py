@@ -223,9 +223,7 @@ class TestModels:
             return Walk(noise_factor=np.eye(1 + m)[None], **parts)
 
         held = {"conditional": KalmanSubstate(LINE, np.zeros(1), np.eye(1))}
-        fails(
-            on_a_line(**held), "must give coupling, dynamics and drift: the filter has a Kalman substate", []
-        )
+        fails(on_a_line(**held), "must give coupling, dynamics and drift: the filter has a Kalman substate", [])
         fails(on_a_line(driving(1)), "drives a substate: give the filter a KalmanSubstate", [])
         match = r"the substate has 1 numbers: expected coupling \(·, 1, 1\)"
         fails(on_a_line(driving(2), **held), match, [])

@@ -65,9 +65,7 @@ AHEAD_3D = np.array([[3.0, 1.0, 0.5], [2.0, -2.0, -1.0], [4.0, 0.0, 0.3]])
 
 @pytest.mark.parametrize("centred", [True, False], ids=["centred", "driven"])
 @pytest.mark.parametrize("ahead", AHEAD_2D.values(), ids=AHEAD_2D.keys())
-@pytest.mark.parametrize(
-    "model", [RangeBearing(SE2), RelativePosition(SE2)], ids=["range-bearing", "position"]
-)
+@pytest.mark.parametrize("model", [RangeBearing(SE2), RelativePosition(SE2)], ids=["range-bearing", "position"])
 def test_projection_in_the_plane(model, ahead, centred, rng):
     belief, records = belief_of(prior_of(SE2, rng, centred), 2, rng, np.array(ahead))
     check_projection(model, belief, records, rng)

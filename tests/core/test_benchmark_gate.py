@@ -14,9 +14,7 @@ def test_what_got_worse_or_has_no_baseline_is_told(tmp_path):
     better = [row("fast", 9.0), row("small", 0.1, higher=False)]
     assert regressions(path, better, partial=True) == []
     assert regressions(path, better, partial=False) == ["left: no figure in this run"]
-    worse = regressions(
-        path, [row("fast", 1.0), row("small", 4.0, higher=False), row("new", 1.0)], partial=True
-    )
+    worse = regressions(path, [row("fast", 1.0), row("small", 4.0, higher=False), row("new", 1.0)], partial=True)
     assert [sentence.split(":")[0] for sentence in worse] == ["new", "fast", "small"]
     assert "no baseline" in worse[0] and "-50%" in worse[1] and "+100%" in worse[2]
 

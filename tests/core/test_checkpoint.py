@@ -28,9 +28,7 @@ RECIPES = {
     "unknown": Recipe(n=15, known=False),
     "lag": Recipe(n=15, options={"lag": 7}),
     "clouds": Recipe(n=15, options={"clouds": True}),
-    "bootstrap": Recipe(
-        n=15, options={"proposal": PriorProposal(), "resampler": EssTriggered(Residual(), 1.0)}
-    ),
+    "bootstrap": Recipe(n=15, options={"proposal": PriorProposal(), "resampler": EssTriggered(Residual(), 1.0)}),
     "numpy": Recipe(n=15, compiled=False),
 }
 
@@ -100,9 +98,7 @@ def test_before_the_first_step(world, tmp_path):
     assert same(content(resumed), content(uninterrupted))
 
 
-@pytest.mark.parametrize(
-    "generator", [np.random.PCG64DXSM, np.random.MT19937, np.random.Philox, np.random.SFC64]
-)
+@pytest.mark.parametrize("generator", [np.random.PCG64DXSM, np.random.MT19937, np.random.Philox, np.random.SFC64])
 def test_every_random_generator(generator, tmp_path):
     filter_ = Recipe(n=5).build()
     filter_.rng = np.random.Generator(generator(3))

@@ -160,9 +160,7 @@ def changed(file: Path, path: Path, **fields: object) -> Path:
 
 
 def test_another_version(file, target, tmp_path):
-    refused(
-        target, changed(file, tmp_path / "new.npz", version=2), "has checkpoint version 2, this program reads"
-    )
+    refused(target, changed(file, tmp_path / "new.npz", version=2), "has checkpoint version 2, this program reads")
 
 
 def test_an_array_is_missing_or_too_many(file, target, tmp_path):
@@ -214,9 +212,7 @@ def test_another_filter(file, filter_, match):
 
 
 def test_landmarks_that_were_not_registered(file):
-    filter_ = Filter(
-        OdometryMotion(SE2), NamedLandmarkSensor(RangeBearing(SE2), Point(2)), LandmarkMap(SE2), n=4
-    )
+    filter_ = Filter(OdometryMotion(SE2), NamedLandmarkSensor(RangeBearing(SE2), Point(2)), LandmarkMap(SE2), n=4)
     refused(filter_, file, "landmark kind 0 = .*this one has None.*register its landmarks")
 
 

@@ -147,9 +147,7 @@ SOUND: list[tuple[Any, Any, Example | None]] = [
 ]
 
 
-@pytest.mark.parametrize(
-    ("model", "space", "example"), SOUND, ids=[type(model).__name__ for model, *_ in SOUND]
-)
+@pytest.mark.parametrize(("model", "space", "example"), SOUND, ids=[type(model).__name__ for model, *_ in SOUND])
 def test_sound_models(model, space, example):
     assert check_model(model, space, example=example) == []
     require_sound(model, space, example=example)

@@ -28,12 +28,8 @@ def frames(rng: np.random.Generator) -> list[Frame]:
 def followed(states: np.ndarray, seen: list[Frame]) -> tuple[Filter, np.ndarray]:
     """A filter that has followed states (T, N, 2), and the log-likelihoods (T, N) of what was seen."""
     motion = LinearMotion(np.eye(2), 0.1 * np.eye(2))
-    filter_ = Filter(
-        motion, Scripted(), LandmarkMap(Euclidean(2)), n=states.shape[1], rng=np.random.default_rng(0)
-    )
-    return filter_, np.array(
-        [filter_.follow(state, frame) for state, frame in zip(states, seen, strict=True)]
-    )
+    filter_ = Filter(motion, Scripted(), LandmarkMap(Euclidean(2)), n=states.shape[1], rng=np.random.default_rng(0))
+    return filter_, np.array([filter_.follow(state, frame) for state, frame in zip(states, seen, strict=True)])
 
 
 def test_the_map_is_that_of_each_given_path():

@@ -21,9 +21,7 @@ def test_constant_memory_with_a_lag():
     """The robot stands among four landmarks, of which it sees each one in turn."""
     rng = np.random.default_rng(0)
     model = RangeBearing(SE2)
-    filter_ = Filter(
-        OdometryMotion(SE2), NamedLandmarkSensor(model, Point(2)), LandmarkMap(SE2), n=N, rng=rng, lag=20
-    )
+    filter_ = Filter(OdometryMotion(SE2), NamedLandmarkSensor(model, Point(2)), LandmarkMap(SE2), n=N, rng=rng, lag=20)
     control = Odometry(np.zeros(3), np.diag(STD_ODOMETRY**2))
     sizes, errors = [], []
     for t in range(STEPS):

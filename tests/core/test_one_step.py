@@ -26,9 +26,7 @@ class Listening(NamedLandmarkSensor):  # type: ignore[misc]
 def started(proposal) -> tuple[Filter, Listening]:
     """A filter after all frames but the last."""
     sensor = Listening(RangeBearing(SE2), Point(2))
-    filter_ = Filter(
-        OdometryMotion(SE2), sensor, LandmarkMap(SE2), proposal, n=20, rng=np.random.default_rng(0)
-    )
+    filter_ = Filter(OdometryMotion(SE2), sensor, LandmarkMap(SE2), proposal, n=20, rng=np.random.default_rng(0))
     for t in range(5):
         filter_.step(WORLD.frames[t], WORLD.controls[t], t * STEP_NS)
     return filter_, sensor

@@ -17,11 +17,7 @@ DRAWS = 4000
 def weight_vectors() -> st.SearchStrategy[np.ndarray]:
     """Normalised weights with zeros, equal ones and many orders of magnitude."""
     one = st.one_of(st.just(0.0), st.just(1.0), st.floats(-300.0, 0.0).map(lambda e: 10.0**e))
-    return (
-        st.lists(one, min_size=1, max_size=40)
-        .filter(lambda w: sum(w) > 0)
-        .map(lambda w: np.array(w) / sum(w))
-    )
+    return st.lists(one, min_size=1, max_size=40).filter(lambda w: sum(w) > 0).map(lambda w: np.array(w) / sum(w))
 
 
 def counts(scheme, weights: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -118,9 +114,7 @@ def test_all_weight_on_one(scheme, at):
     assert scheme.ancestors(weights, np.random.default_rng(0)).tolist() == [at] * 7
 
 
-@pytest.mark.parametrize(
-    "scheme", [Systematic(), Stratified(), Residual()], ids=lambda scheme: type(scheme).__name__
-)
+@pytest.mark.parametrize("scheme", [Systematic(), Stratified(), Residual()], ids=lambda scheme: type(scheme).__name__)
 def test_equal_weights_keep_every_particle(scheme):
     rng = np.random.default_rng(3)
     for n in range(1, 400):

@@ -44,9 +44,7 @@ SOUND = {
 
 
 def test_what_fits_is_copied():
-    found = read(
-        {f"a/{name}": array for name, array in SOUND.items()} | {"map": SOUND["map"]}, SCHEMA, "a/", members=5
-    )
+    found = read({f"a/{name}": array for name, array in SOUND.items()} | {"map": SOUND["map"]}, SCHEMA, "a/", members=5)
     assert list(found) == list(SCHEMA)
     for name, array in found.items():
         np.testing.assert_array_equal(array, SOUND[name])

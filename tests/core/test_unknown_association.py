@@ -80,9 +80,7 @@ def single(landmark_map: LandmarkMap) -> Filter:
     """Five particles that are never resampled."""
     sensor = anonymous(RangeBearing(SE2, max_range=MAX_RANGE - 0.5))
     never = EssTriggered(Systematic(), 0.0)
-    return Filter(
-        OdometryMotion(SE2), sensor, landmark_map, resampler=never, n=5, rng=np.random.default_rng(0)
-    )
+    return Filter(OdometryMotion(SE2), sensor, landmark_map, resampler=never, n=5, rng=np.random.default_rng(0))
 
 
 def one_sighting(distance: float = 3.0, bearing: float = 0.2) -> Sightings:

@@ -90,9 +90,7 @@ def drive(form, fused):
     held = LandmarkMap(SE2, compiled=fused)
     substate = KalmanSubstate(SE2, form(np.zeros(1)), form(np.eye(1)))
     start = form(np.zeros((N, 3)))
-    filter_ = Filter(
-        Moved(form), Scripted(), [held, substate], n=N, rng=np.random.default_rng(1), start=start
-    )
+    filter_ = Filter(Moved(form), Scripted(), [held, substate], n=N, rng=np.random.default_rng(1), start=start)
     points, pose = np.array([[4.0, 1.0], [3.0, -2.0], [6.0, 0.5]]), np.zeros(3)
     for step in range(6):
         pose = SE2.retract(pose, np.array([0.1, 0.5, 0.0]))

@@ -193,9 +193,7 @@ def _images(sequence: Path) -> list[np.ndarray]:
 def _film(frames: Sequence[np.ndarray], path: Path) -> None:
     """The images as a video of 30 frames per second."""
     height, width = frames[0].shape[:2]
-    writer = imageio_ffmpeg.write_frames(
-        os.fspath(path), (width, height), fps=30, quality=9, macro_block_size=1
-    )
+    writer = imageio_ffmpeg.write_frames(os.fspath(path), (width, height), fps=30, quality=9, macro_block_size=1)
     writer.send(None)
     for frame in frames:
         writer.send(np.ascontiguousarray(frame))

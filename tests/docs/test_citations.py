@@ -52,9 +52,7 @@ def test_every_numbered_equation_is_cited_by_the_code():
 
 def test_every_equation_of_a_paper_that_the_code_cites_is_listed():
     cited = {path.name: cited_equations(path.read_text(encoding="utf-8")) for path in SOURCES}
-    assert {
-        name: found - listed_equations() for name, found in cited.items() if found - listed_equations()
-    } == {}
+    assert {name: found - listed_equations() for name, found in cited.items() if found - listed_equations()} == {}
 
 
 def test_the_page_cites_no_equation_that_it_does_not_list():

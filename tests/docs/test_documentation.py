@@ -121,9 +121,7 @@ def check_extras(command: list[str], where: str) -> None:
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_a_page_has_no_block_of_an_unknown_kind(page):
     assert {block.language for block in blocks(page)} <= LANGUAGES
-    indented = [
-        line for line in page.read_text(encoding="utf-8").splitlines() if line.startswith("    rbpf ")
-    ]
+    indented = [line for line in page.read_text(encoding="utf-8").splitlines() if line.startswith("    rbpf ")]
     assert not indented, "a command that is not between fences is not run"
 
 

@@ -50,9 +50,7 @@ class LinearObservation(ObservationModel):
 
     def __init__(self, by_state=None, by_substate=None):
         matrices = {Part.STATE: by_state, Part.SUBSTATE: by_substate}
-        self.matrices = {
-            part: np.atleast_2d(matrix) for part, matrix in matrices.items() if matrix is not None
-        }
+        self.matrices = {part: np.atleast_2d(matrix) for part, matrix in matrices.items() if matrix is not None}
         self.reads = frozenset(self.matrices)
         self.dim = next(iter(self.matrices.values())).shape[0]
 
@@ -63,9 +61,7 @@ class LinearObservation(ObservationModel):
     def joint_matrix(self, motion: LinearMotion) -> np.ndarray:
         """H of (x, s) together."""
         sizes = {Part.STATE: motion.space.dim, Part.SUBSTATE: len(motion.joint()[0]) - motion.space.dim}
-        return np.hstack(
-            [self.matrices.get(part, np.zeros((self.dim, size))) for part, size in sizes.items()]
-        )
+        return np.hstack([self.matrices.get(part, np.zeros((self.dim, size))) for part, size in sizes.items()])
 
     def jacobians(self, state, landmark=None, const=None, substate=None):
         return Jacobians(state=self.matrices.get(Part.STATE), substate=self.matrices.get(Part.SUBSTATE))

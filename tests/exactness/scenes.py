@@ -36,9 +36,7 @@ class Scene:
     @classmethod
     def random(cls, space: SE2Group | SE3Group, rng: np.random.Generator, n: int = 6, k: int = 4) -> "Scene":
         dim = 2 if space is SE2 else 3
-        state = space.retract(
-            space.exp(rng.normal(size=space.dim)), rng.normal(scale=0.1, size=(n, space.dim))
-        )
+        state = space.retract(space.exp(rng.normal(size=space.dim)), rng.normal(scale=0.1, size=(n, space.dim)))
         landmarks = rng.normal(scale=5.0, size=(k, dim)) + 3.0
         mean = landmarks + rng.normal(scale=0.2, size=(n, k, dim))
         return cls(space, state, Records(mean, random_covs(rng, (n, k), dim, 0.2)), rng)
@@ -53,16 +51,12 @@ class Scene:
         held.add_records(self.records, Point(self.records.mean.shape[-1]))
         return held
 
-    def observe(
-        self, model: ObservationModel, ids: np.ndarray, noise: float = 0.1, **options
-    ) -> Observations:
+    def observe(self, model: ObservationModel, ids: np.ndarray, noise: float = 0.1, **options) -> Observations:
         """Measurements of landmarks (K,) or (N, K) as the first particle believes them, with noise."""
         rows = ids if ids.ndim == 1 else np.abs(ids).max(axis=0)
         z = model.predict(self.state[0], self.records.mean[0, rows])
         z = z + self.rng.normal(scale=noise, size=z.shape)
-        return Observations(
-            z, random_covs(self.rng, (len(rows),), model.dim, noise), model, ids=ids, **options
-        )
+        return Observations(z, random_covs(self.rng, (len(rows),), model.dim, noise), model, ids=ids, **options)
 
     def prior(self, rank: int, shared: bool) -> Prior:
         """Centred at the particles, with noise of a rank that may fall short of the dimension."""

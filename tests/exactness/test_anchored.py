@@ -101,9 +101,7 @@ def test_constants_follow_their_particle(compiled):
     numbered = np.arange(PARTICLES, dtype=float)[:, None, None] * np.ones((1, 4, 3))
     model = RangeBearing(SE2)
     held = LandmarkMap(SE2, compiled=compiled)
-    filter_ = Filter(
-        OdometryMotion(SE2), Scripted(), held, None, Systematic(), PARTICLES, np.random.default_rng(6)
-    )
+    filter_ = Filter(OdometryMotion(SE2), Scripted(), held, None, Systematic(), PARTICLES, np.random.default_rng(6))
     held.add_records(Records(records.mean, records.cov, numbered), AnchoredPoint(SE2))
     filter_.lineage.retain(0)
     for _ in range(6):

@@ -47,9 +47,7 @@ def with_outliers(group: Observations) -> Observations:
     z = group.z.copy()
     z[1] += 0.9
     z[2] += 0.25
-    return Observations(
-        z, group.cov, group.model, group.likelihood, group.ids, group.log_new, group.log_clutter
-    )
+    return Observations(z, group.cov, group.model, group.likelihood, group.ids, group.log_new, group.log_clutter)
 
 
 def associations(kind: str, rng: np.random.Generator) -> np.ndarray:
@@ -79,9 +77,7 @@ def test_refinement_and_update(space, which, likelihood, kind, rng):
     for each in (group, replace(group, likelihood=likelihood.of_look_ahead())):
         one, other = (refined(prior, held.information(scene.state, [each], prior)) for held in maps)
         for name in ("mean", "root", "log_w1", "nis"):
-            np.testing.assert_allclose(
-                getattr(one, name), getattr(other, name), rtol=TOLERANCE, atol=TOLERANCE
-            )
+            np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=TOLERANCE, atol=TOLERANCE)
         np.testing.assert_array_equal(one.rows, other.rows)
 
     zero = np.zeros((PARTICLES, space.dim))
@@ -101,9 +97,7 @@ def test_refinement_and_update(space, which, likelihood, kind, rng):
 def test_particles_taken_in_parts_are_those_taken_together(space, which, kind, rng, monkeypatch):
     scene = Scene.random(space, rng, n=PARTICLES, k=6)
     group = with_outliers(
-        scene.observe(
-            sensors(space, rng)[which], associations(kind, rng), likelihood=GaussianWithOutliers(0.05, 300.0)
-        )
+        scene.observe(sensors(space, rng)[which], associations(kind, rng), likelihood=GaussianWithOutliers(0.05, 300.0))
     )
     prior = scene.prior(space.dim, shared=kind == "shared")
     found = []
@@ -133,13 +127,9 @@ def drive(space, which: int, likelihood, proposal, compiled: bool) -> Filter:
     model = sensors(space, rng)[which]
     landmarks = rng.normal(scale=4.0, size=(8, dim)) + 6.0
     noise, cov = random_covs(rng, (8,), dim, 0.05), 0.003 * np.eye(space.dim)
-    delta = space.exp(
-        np.array([0.1, 0.4, 0.0]) if space is SE2 else np.array([0.05, 0.0, 0.1, 0.4, 0.0, 0.0])
-    )
+    delta = space.exp(np.array([0.1, 0.4, 0.0]) if space is SE2 else np.array([0.05, 0.0, 0.1, 0.4, 0.0, 0.0]))
     held = LandmarkMap(space, compiled=compiled)
-    filter_ = Filter(
-        OdometryMotion(space), Scripted(), held, proposal, n=PARTICLES, rng=np.random.default_rng(7)
-    )
+    filter_ = Filter(OdometryMotion(space), Scripted(), held, proposal, n=PARTICLES, rng=np.random.default_rng(7))
     truth = space.identity()
     for step in range(10):
         truth = space.compose(truth, delta)

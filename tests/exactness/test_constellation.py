@@ -38,8 +38,7 @@ class World:
         steps = rng.normal(scale=[0.05, 0.05, 0.05, 0.2, 0.2, 0.2], size=(len(SEEN), 6))
         self.path = SE3.exp(steps)
         self.views = [
-            MembersView(DISTORTED, seen) if errors else ConstellationView(DISTORTED, POINTS[seen])
-            for seen in SEEN
+            MembersView(DISTORTED, seen) if errors else ConstellationView(DISTORTED, POINTS[seen]) for seen in SEEN
         ]
         self.z = [
             view.predict(pose, self.true, self.given) + NOISE_PX * rng.standard_normal(view.dim)

@@ -130,10 +130,7 @@ def test_for_the_landmarks_alone(space, proposal, compiled):
 @every_space
 def test_compiled_equals_numpy(space):
     world, frames = scene(space, seed=2)
-    mixed = [
-        [replace(groups[0], updates=use)]
-        for groups, use in zip(frames, (STATE, MAP, STATE, MAP), strict=True)
-    ]
+    mixed = [[replace(groups[0], updates=use)] for groups, use in zip(frames, (STATE, MAP, STATE, MAP), strict=True)]
     one, other = (run(world, mixed, compiled)[0] for compiled in (True, False))
     np.testing.assert_allclose(one.particles.state, other.particles.state, atol=1e-9)
     np.testing.assert_allclose(one.particles.log_weights, other.particles.log_weights, atol=1e-7)
@@ -163,9 +160,7 @@ def test_density_does_not_depend_on_what_is_updated(likelihood, compiled):
 )
 def test_what_cannot_be_informed(updates):
     world, (groups, *_) = scene(SE2)
-    with pytest.raises(
-        InputError, match=r"of RangeBearing inform a frozenset of Part\.STATE, Part\.LANDMARK or both"
-    ):
+    with pytest.raises(InputError, match=r"of RangeBearing inform a frozenset of Part\.STATE, Part\.LANDMARK or both"):
         run(world, [[replace(groups[0], updates=updates)]])
 
 

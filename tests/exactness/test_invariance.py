@@ -62,9 +62,7 @@ def run(space, likelihood, compiled: bool, orders: np.random.Generator | None) -
         truth = space.compose(truth, increment)
         groups = []
         for model, seen in zip(models, (np.arange(5), np.arange(3, 7)), strict=True):
-            z = model.predict(truth, landmarks[seen]) + rng.multivariate_normal(
-                np.zeros(dim), noise[0], seen.size
-            )
+            z = model.predict(truth, landmarks[seen]) + rng.multivariate_normal(np.zeros(dim), noise[0], seen.size)
             z[1] += 0.8 * (step == 3)
             order = np.arange(seen.size) if orders is None else orders.permutation(seen.size)
             groups.append(Observations(z[order], noise[seen][order], model, likelihood, seen[order]))
@@ -117,9 +115,7 @@ def test_the_order_of_particles_does_not_matter(proposal, compiled):
     landmarks, model = rng.normal(scale=4.0, size=(4, 2)) + 5.0, sensors(SE2, rng)[0]
     R, cov = np.tile(0.01 * np.eye(2), (4, 1, 1)), 0.01 * np.eye(3)
     z = model.predict(SE2.identity(), landmarks) + rng.normal(scale=0.1, size=(5, 4, 2))
-    ids = np.where(
-        rng.random((5, PARTICLES, 4)) < 0.8, np.arange(4), rng.choice([NEW, NULL], (5, PARTICLES, 4))
-    )
+    ids = np.where(rng.random((5, PARTICLES, 4)) < 0.8, np.arange(4), rng.choice([NEW, NULL], (5, PARTICLES, 4)))
     filters = []
     for place in (np.arange(PARTICLES), order):
         held = LandmarkMap(SE2, compiled=compiled)

@@ -31,9 +31,7 @@ TURN = 0.7
 
 def plane(consolidation, n=12, seed=0) -> Filter:
     rng = np.random.default_rng(seed)
-    return Filter(
-        Walk(), Scripted(), JointMap(Euclidean(2)), None, None, n, rng, lag=1, consolidation=consolidation
-    )
+    return Filter(Walk(), Scripted(), JointMap(Euclidean(2)), None, None, n, rng, lag=1, consolidation=consolidation)
 
 
 def told(filter_: Filter) -> tuple[np.ndarray, list[np.ndarray]]:
@@ -89,9 +87,7 @@ def test_few_particles_stray_by_chance_not_to_one_side(world):
         filter_ = plane(Consolidation(3), 30, seed)
         for frame in world.frames(Relative()):
             filter_.step(frame)
-        runs.append(
-            np.append(told(filter_)[0] - world.kalman.mean, filter_.log_evidence - world.kalman.log_evidence)
-        )
+        runs.append(np.append(told(filter_)[0] - world.kalman.mean, filter_.log_evidence - world.kalman.log_evidence))
     runs = np.array(runs)
     assert np.abs(runs.mean(axis=0) / (runs.std(axis=0) / np.sqrt(len(runs)))).max() < 3.5
     assert (runs[:, :-1].std(axis=0) < 0.2 * np.sqrt(np.diag(world.kalman.cov))).all()
@@ -180,9 +176,7 @@ def test_the_order_of_sensors_and_landmarks_does_not_matter(world):
 def test_the_kernel_does_what_numpy_does(space, dim):
     """More particles than a block of lanes has, a last block that is not full."""
     rng, model, ends = np.random.default_rng(6), RangeBearing(space), []
-    control = Odometry(
-        space.retract(space.identity(), 0.1 * rng.normal(size=space.dim)), 1e-3 * np.eye(space.dim)
-    )
+    control = Odometry(space.retract(space.identity(), 0.1 * rng.normal(size=space.dim)), 1e-3 * np.eye(space.dim))
     frames = [rng.normal([4.0, 0.3, 0.1][:dim], 0.05, size=(5, dim)) for _ in range(4)]
     covs, ids = np.repeat(1e-3 * np.eye(dim)[None], 5, axis=0), np.arange(5)
     for compiled in (True, False):
@@ -331,9 +325,7 @@ def test_sensors_read_it_as_any_map():
         "predictions": (model, z, cov, joint.ids, belief),
         "project": (model, joint.ids, belief),
     }.items():
-        for first, second in zip(
-            getattr(joint, name)(*arguments), getattr(own, name)(*arguments), strict=True
-        ):
+        for first, second in zip(getattr(joint, name)(*arguments), getattr(own, name)(*arguments), strict=True):
             np.testing.assert_allclose(first, second, atol=1e-12)
     nu, jac, _ = joint.innovations(model, z, joint.ids[:2], particles.state[4], 4)
     expected, same, _ = own.innovations(model, z, own.ids[:2], particles.state[4], 4)

@@ -13,9 +13,7 @@ from tests.exactness.models import Frame, Kalman, LinearMotion, LinearObservatio
 
 TOLERANCE = 1e-9
 PROPOSALS = [PriorProposal(), EkfProposal(), EkfProposal(exact=False), EkfProposal(iterations=3)]
-every_proposal = pytest.mark.parametrize(
-    "proposal", PROPOSALS, ids=["prior", "ekf", "linearised", "iterated"]
-)
+every_proposal = pytest.mark.parametrize("proposal", PROPOSALS, ids=["prior", "ekf", "linearised", "iterated"])
 
 
 @pytest.fixture

@@ -56,9 +56,7 @@ def test_what_is_clipped_may_update_all_the_same(rng):
 
 
 @pytest.mark.parametrize("p", [1, 2])
-@pytest.mark.parametrize(
-    "likelihood", [GaussianWithOutliers(0.2, 1.0), Gaussian()], ids=["outliers", "gaussian"]
-)
+@pytest.mark.parametrize("likelihood", [GaussianWithOutliers(0.2, 1.0), Gaussian()], ids=["outliers", "gaussian"])
 def test_densities_integrate_to_one_over_the_measurement_space(likelihood, p, rng):
     """Outliers are uniform over what the sensor can return: here a cube of side 30 about the prediction."""
     side, points = 30.0, 601
@@ -95,9 +93,7 @@ def test_without_a_density_there_is_no_evidence(proposal):
     assert np.isnan(filter_.log_evidence)
     if isinstance(proposal, PriorProposal) and not report.resampled:
         gained = before - 0.5 * np.minimum(4.0, (0.4 - filter_.particles.state[:, 0]) ** 2 / 0.3)
-        np.testing.assert_allclose(
-            filter_.particles.log_weights, gained - np.log(np.exp(gained).sum()), atol=1e-12
-        )
+        np.testing.assert_allclose(filter_.particles.log_weights, gained - np.log(np.exp(gained).sum()), atol=1e-12)
 
 
 def held_landmarks(cov: np.ndarray, n: int = 8) -> LandmarkMap:
@@ -118,9 +114,7 @@ def test_a_null_match_costs_half_the_limit(rng):
     group = Observations(z, R, Relative(), TRUNCATED, ids, log_clutter=TRUNCATED.log_outlier())
     alone = Observations(z[:1], R[:1], Relative(), TRUNCATED, ids[:1])
     zero = np.zeros((8, 2))
-    with_null, without = (
-        held_landmarks(0.1 * np.eye(2)).correct(state, zero, [g]).all for g in (group, alone)
-    )
+    with_null, without = (held_landmarks(0.1 * np.eye(2)).correct(state, zero, [g]).all for g in (group, alone))
     np.testing.assert_allclose(with_null, without - 2.0, atol=1e-12)
 
 
@@ -142,9 +136,7 @@ def test_two_sightings_of_a_certain_landmark_weigh_like_two_landmarks(likelihood
     zero = np.zeros((8, 2))
     densities = [held_landmarks(certain).correct(state, zero, groups).all for groups in (twice, once)]
     np.testing.assert_allclose(densities[0], densities[1], atol=1e-9)
-    proposals = [
-        refined(prior, held_landmarks(certain).information(state, groups, prior)) for groups in (twice, once)
-    ]
+    proposals = [refined(prior, held_landmarks(certain).information(state, groups, prior)) for groups in (twice, once)]
     np.testing.assert_allclose(proposals[0].mean, proposals[1].mean, atol=1e-9)
     np.testing.assert_allclose(proposals[0].log_w1, proposals[1].log_w1, atol=1e-9)
 

@@ -56,11 +56,7 @@ def position_filter(proposal, resampler, n, rng) -> Filter:
 )
 def test_fastslam_agrees_with_the_joint_kalman_filter(world, proposal, resampler, stream):
     frames = world.frames(Relative())
-    agree(
-        *unnormalised_errors(
-            lambda rng: position_filter(proposal, resampler, 60, rng), frames, world.kalman, stream
-        )
-    )
+    agree(*unnormalised_errors(lambda rng: position_filter(proposal, resampler, 60, rng), frames, world.kalman, stream))
 
 
 def test_many_particles_come_close_in_a_single_run(world):

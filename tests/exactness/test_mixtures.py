@@ -103,9 +103,7 @@ def test_on_a_known_path_the_components_are_enumerated_exactly(frames):
         for i, c in enumerate(choice):
             at = slice(2 + 2 * i, 4 + 2 * i)
             np.testing.assert_allclose(records.mean[:, i, c], np.tile(kalman.mean[at], (3, 1)), atol=1e-9)
-            np.testing.assert_allclose(
-                records.cov[:, i, c], np.tile(kalman.cov[at, at], (3, 1, 1)), atol=1e-9
-            )
+            np.testing.assert_allclose(records.cov[:, i, c], np.tile(kalman.cov[at, at], (3, 1, 1)), atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -117,9 +115,7 @@ def test_evidence_and_component_weights_are_unbiased(frames, proposal, resampler
     """In a linear model E06's weight w₂ := p(late observations | x) is exact as well."""
     exact = enumerate_components(frames, Q)
     total = np.logaddexp.reduce([kalman.log_evidence for kalman in exact.values()])
-    posterior = np.array(
-        [[sum(np.exp(k.log_evidence - total) for c, k in exact.items() if c[i] == 0)] for i in (0, 1)]
-    )
+    posterior = np.array([[sum(np.exp(k.log_evidence - total) for c, k in exact.items() if c[i] == 0)] for i in (0, 1)])
     log_ratio, components = [], []
     for seed in range(SEEDS):
         filter_ = build(proposal, resampler, 80, np.linalg.cholesky(Q), np.random.default_rng([stream, seed]))
@@ -212,9 +208,7 @@ def test_a_range_only_beacon_becomes_a_point():
         if promoted_at is not None:
             np.testing.assert_array_equal(density.after_sampling, 0.0)
             continue
-        before = (
-            np.logaddexp.reduce([kalman.log_evidence for kalman in bank]) if t > 1 else np.log(components)
-        )
+        before = np.logaddexp.reduce([kalman.log_evidence for kalman in bank]) if t > 1 else np.log(components)
         for kalman in bank:
             offset = kalman.mean - path[t]
             H = (offset / np.linalg.norm(offset))[None]

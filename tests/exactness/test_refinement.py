@@ -25,9 +25,7 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(2006)
 
 
-def rows_of(
-    scene: Scene, groups: list[Observations], particle: int
-) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+def rows_of(scene: Scene, groups: list[Observations], particle: int) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """ν, [H J] over (pose, all landmarks) and R of each measurement that a particle takes as known."""
     d, (_, k, dim) = scene.space.dim, scene.records.mean.shape
     rows = []
@@ -45,9 +43,7 @@ def rows_of(
     return rows
 
 
-def sequential(
-    scene: Scene, groups: list[Observations], prior: Prior, rng: np.random.Generator
-) -> list[Kalman]:
+def sequential(scene: Scene, groups: list[Observations], prior: Prior, rng: np.random.Generator) -> list[Kalman]:
     """One EKF per particle over (increment, all landmarks), told the rows in random order."""
     kalmans = []
     for i in range(scene.n):
@@ -61,9 +57,7 @@ def sequential(
     return kalmans
 
 
-def assert_equal(
-    prior: Prior, proposed: Proposed, kalmans: list[Kalman], log_factor: np.ndarray | float = 0.0
-) -> None:
+def assert_equal(prior: Prior, proposed: Proposed, kalmans: list[Kalman], log_factor: np.ndarray | float = 0.0) -> None:
     d = prior.space.dim
     mean = np.einsum("nar,nr->na", prior.factor, proposed.mean)
     root = prior.factor @ proposed.root
@@ -98,10 +92,7 @@ def test_a_landmark_seen_by_two_sensors_is_handled_jointly(space, compiled, rng)
     proposed = refined(prior, scene.map(compiled).information(scene.state, groups, prior))
     assert_equal(prior, proposed, sequential(scene, groups, prior, rng))
 
-    apart = [
-        refined(prior, scene.map(compiled).information(scene.state, [group], prior)).log_w1
-        for group in groups
-    ]
+    apart = [refined(prior, scene.map(compiled).information(scene.state, [group], prior)).log_w1 for group in groups]
     assert (np.abs(proposed.log_w1 - sum(apart)) > 1e-3).all()
 
 
@@ -142,9 +133,7 @@ def test_each_particle_uses_its_own_associations(space, compiled, rng):
     assert_equal(prior, proposed, sequential(scene, groups, prior, rng), log_factor)
 
     densities = scene.map(compiled).correct(scene.state, np.zeros((scene.n, space.dim)), groups)
-    expected = [
-        kalman.log_evidence for kalman in sequential(scene, groups, Prior.exactly(space, scene.state), rng)
-    ]
+    expected = [kalman.log_evidence for kalman in sequential(scene, groups, Prior.exactly(space, scene.state), rng)]
     np.testing.assert_allclose(densities.all, np.array(expected) + log_factor, atol=TOLERANCE)
 
 
@@ -160,9 +149,7 @@ def test_the_compiled_refinement_equals_its_numpy_twin(space, rng):
             terms = Information(info, vector, quad, log_det, log_factor, rows=np.full(log_det.shape, 7.0))
             ours, twin = refined(prior, terms), refined_in_numpy(prior, terms)
             for name in ("mean", "root", "log_w1", "nis"):
-                np.testing.assert_allclose(
-                    getattr(ours, name), getattr(twin, name), rtol=TOLERANCE, atol=TOLERANCE
-                )
+                np.testing.assert_allclose(getattr(ours, name), getattr(twin, name), rtol=TOLERANCE, atol=TOLERANCE)
             assert (ours.rows == 7).all() and (twin.rows == 7).all()
 
 
@@ -172,17 +159,14 @@ def test_terms_linearised_elsewhere_stay_in_the_priors_chart(space, rng):
     scene = Scene.random(space, rng, n=3)
     d, model = space.dim, sensors(space, rng)[0]
     group = scene.observe(model, np.array([0, 2]))
-    prior = Prior(
-        space, scene.state, rng.normal(scale=0.2, size=(3, d)), scene.prior(d, False).factor, centred=False
-    )
+    prior = Prior(space, scene.state, rng.normal(scale=0.2, size=(3, d)), scene.prior(d, False).factor, centred=False)
     at = prior.mean + rng.normal(scale=0.2, size=(3, d))
     held = scene.map()
     marginals = Marginals(space, [held])
     for increment in (prior.mean, at):
         proposed = refined(prior, marginals.linearised(prior, [group])(increment))
         kalmans = [
-            _chart_ekf(scene, group, prior.factor[i], scene.state[i], prior.mean[i], increment[i], i)
-            for i in range(3)
+            _chart_ekf(scene, group, prior.factor[i], scene.state[i], prior.mean[i], increment[i], i) for i in range(3)
         ]
         mean = np.einsum("nar,nr->na", prior.factor, proposed.mean)
         np.testing.assert_allclose(mean, [kalman.mean[:d] for kalman in kalmans], atol=1e-6)

@@ -93,8 +93,7 @@ def test_ancestral_paths_are_unbiased(measured, proposal, stream):
 @pytest.mark.parametrize("lag", [1, 3, STEPS])
 def test_a_fixed_lag_keeps_the_last_steps_of_the_same_paths(measured, lag):
     whole, short = (
-        run(measured[0], 50, np.random.default_rng(3), lag=kept, resampler=Systematic())
-        for kept in (None, lag)
+        run(measured[0], 50, np.random.default_rng(3), lag=kept, resampler=Systematic()) for kept in (None, lag)
     )
     assert whole.lineage.generation > 1
     full, part = (ancestral_smoothing(f.space, f.history, f.particles.weights) for f in (whole, short))

@@ -109,9 +109,7 @@ def exact() -> float:
         squared = ((z - position) ** 2).sum(axis=1) / 0.15 + (s - speed) ** 2 / 0.1
         weights = np.exp(-0.5 * squared) / (2 * np.pi * 0.15 * np.sqrt(2 * np.pi * 0.1))
         total += float(np.log(weights.mean()))
-        chosen = np.searchsorted(np.cumsum(weights) / weights.sum(), (np.arange(n) + rng.random()) / n).clip(
-            max=n - 1
-        )
+        chosen = np.searchsorted(np.cumsum(weights) / weights.sum(), (np.arange(n) + rng.random()) / n).clip(max=n - 1)
         theta, position, speed = theta[chosen], position[chosen], speed[chosen]
     return total
 
@@ -121,12 +119,8 @@ def runs(exact) -> dict[str, np.ndarray]:
     """Log-evidence over the exact one; the last also refines its proposal."""
     return {
         "sampled": log_ratios(lambda rng: sampled(PriorProposal(), rng), frames(Part.STATE), exact, 1, 300),
-        "marginalised": log_ratios(
-            lambda rng: marginalised(PriorProposal(), rng), frames(Part.SUBSTATE), exact, 2
-        ),
-        "refined": log_ratios(
-            lambda rng: marginalised(EkfProposal(), rng), frames(Part.SUBSTATE), exact, 3, 300
-        ),
+        "marginalised": log_ratios(lambda rng: marginalised(PriorProposal(), rng), frames(Part.SUBSTATE), exact, 2),
+        "refined": log_ratios(lambda rng: marginalised(EkfProposal(), rng), frames(Part.SUBSTATE), exact, 3, 300),
     }
 
 

@@ -58,9 +58,7 @@ class World:
         resampler = TRIGGERS[trigger](RESAMPLERS[scheme])
         return Filter(self.motion, Scripted(), self.marginalised(), PROPOSALS[proposal], resampler, 80, rng)
 
-    def log_ratios(
-        self, proposal: str, trigger: str, scheme: str, stream: int, seeds: int = SEEDS
-    ) -> np.ndarray:
+    def log_ratios(self, proposal: str, trigger: str, scheme: str, stream: int, seeds: int = SEEDS) -> np.ndarray:
         build = partial(self.build, proposal, trigger, scheme)
         return log_ratios(build, self.frames, self.log_evidence, stream, seeds)
 
@@ -113,28 +111,20 @@ def test_state_only_evidence_is_unbiased(position_alone, proposal, trigger, sche
 
 @some_schedules
 @pytest.mark.parametrize("proposal", ["prior", "ekf"])
-def test_evidence_with_a_kalman_substate_is_unbiased(
-    driven_by_acceleration, proposal, trigger, scheme, stream
-):
+def test_evidence_with_a_kalman_substate_is_unbiased(driven_by_acceleration, proposal, trigger, scheme, stream):
     assert_unbiased(driven_by_acceleration.log_ratios(proposal, trigger, scheme, stream))
 
 
 @some_schedules
-def test_evidence_is_unbiased_under_iteration(
-    position_alone, driven_by_acceleration, trigger, scheme, stream
-):
+def test_evidence_is_unbiased_under_iteration(position_alone, driven_by_acceleration, trigger, scheme, stream):
     world = driven_by_acceleration if trigger == "triggered" else position_alone
     assert_unbiased(world.log_ratios("iterated", trigger, scheme, stream))
 
 
 @every_schedule
-def test_in_a_linear_model_iterating_changes_nothing(
-    position_alone, driven_by_acceleration, trigger, scheme, stream
-):
+def test_in_a_linear_model_iterating_changes_nothing(position_alone, driven_by_acceleration, trigger, scheme, stream):
     for world in (position_alone, driven_by_acceleration):
-        once, often = (
-            world.log_ratios(proposal, trigger, scheme, stream, 4) for proposal in ("ekf", "iterated")
-        )
+        once, often = (world.log_ratios(proposal, trigger, scheme, stream, 4) for proposal in ("ekf", "iterated"))
         np.testing.assert_allclose(often, once, atol=1e-9)
 
 
@@ -142,10 +132,7 @@ def test_in_a_linear_model_iterating_changes_nothing(
 def test_the_trigger_resamples_now_and_then(position_alone, driven_by_acceleration, proposal):
     """Else the tests above would not tell it from always or never."""
     for world in (position_alone, driven_by_acceleration):
-        filters = [
-            world.build(proposal, "triggered", "systematic", np.random.default_rng(seed))
-            for seed in range(20)
-        ]
+        filters = [world.build(proposal, "triggered", "systematic", np.random.default_rng(seed)) for seed in range(20)]
         reports = [[filter_.step(frame).resampled for frame in world.frames] for filter_ in filters]
         assert 0.1 < np.mean(reports) < 0.9
 

@@ -197,9 +197,7 @@ def moments(filter_: Filter) -> np.ndarray:
     place = SE3.exp(np.array([0.1, -0.1, 0.2, 0.3, 0.1, -0.1]))
     error = SE3.local(place, filter_.particles.state[:, :7])
     weights = filter_.particles.weights
-    return np.concatenate(
-        [weights @ error, np.einsum("n,na,nb->ab", weights, error, error)[np.triu_indices(6)]]
-    )
+    return np.concatenate([weights @ error, np.einsum("n,na,nb->ab", weights, error, error)[np.triu_indices(6)]])
 
 
 def test_sampled_and_marginal_velocity_have_one_law():

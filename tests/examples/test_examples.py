@@ -12,9 +12,7 @@ from tests.examples import claims
 
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
-STUDIES = [
-    path for path in sorted((ROOT / "examples" / "studies").glob("*.py")) if "def main(" in path.read_text()
-]
+STUDIES = [path for path in sorted((ROOT / "examples" / "studies").glob("*.py")) if "def main(" in path.read_text()]
 LONGEST_SENSOR = 40
 
 

@@ -99,9 +99,7 @@ def test_something_passes_through_the_view(whole):
     fraction = [(a != b).mean() for a, b in zip(before, after, strict=True)]
     assert fraction[1] == 0.0 and fraction[10] == 0.0
     assert max(fraction) == pytest.approx(1 / 3, abs=0.02)
-    middle = [
-        np.flatnonzero((a != b).any(axis=0)).mean() for a, b in zip(before[2:10], after[2:10], strict=True)
-    ]
+    middle = [np.flatnonzero((a != b).any(axis=0)).mean() for a, b in zip(before[2:10], after[2:10], strict=True)]
     assert (np.diff(middle) > 0.0).all()
 
 

@@ -92,9 +92,7 @@ def test_the_likelihood_of_depth_has_its_peak_at_the_truth():
     poses = np.tile(SE3.identity(), (5, 1))
     poses[:, 4] = 0.05 * np.arange(1, 6)
     passing, first = Passing(CAMERA, poses, 1.0), np.array([300.0, 250.0])
-    z = CAMERA.project(
-        SE3.inverse_transform(poses, 1.7 * np.append(CAMERA.unproject(first[None])[0], 1.0)[None])
-    )
+    z = CAMERA.project(SE3.inverse_transform(poses, 1.7 * np.append(CAMERA.unproject(first[None])[0], 1.0)[None]))
     rho = np.linspace(0.1, 2.0, 1901)
     curves = passing.log_likelihoods(first, rho, z.reshape(1, -1))
     assert 1.0 / rho[curves[-1, 0].argmax()] == pytest.approx(1.7, rel=2e-3)
@@ -153,9 +151,7 @@ def test_features_are_followed_to_where_they_truly_are(tmp_path):
     scene = world.build(np.random.default_rng(setting.seed))
     uv = setting.camera.unproject(px)
     depth, _ = cast(scene.rectangles, scene.world_from_camera[0], uv)
-    points = SE3.transform(
-        scene.world_from_camera[0], depth[:, None] * np.column_stack([uv, np.ones(len(uv))])
-    )
+    points = SE3.transform(scene.world_from_camera[0], depth[:, None] * np.column_stack([uv, np.ones(len(uv))]))
     seen = setting.camera.project(SE3.inverse_transform(scene.world_from_camera[1:, None], points))
     away = np.linalg.norm(np.moveaxis(seen, 0, 1) - track, axis=-1)
     assert np.isfinite(away).mean() > 0.7

@@ -21,8 +21,7 @@ def test_the_same_seed_gives_the_same_stream(kind):
         np.testing.assert_array_equal(a.frame.z, b.frame.z)
         np.testing.assert_array_equal(a.frame.landmarks, b.frame.landmarks)
     assert any(
-        a.frame.z.shape != b.frame.z.shape or (a.frame.z != b.frame.z).any()
-        for a, b in zip(one, third, strict=True)
+        a.frame.z.shape != b.frame.z.shape or (a.frame.z != b.frame.z).any() for a, b in zip(one, third, strict=True)
     )
 
 
@@ -99,8 +98,7 @@ def test_a_long_run(lag):
     windows = list(soak(stream, filter_, step, steps, steps // 20))
     settled = windows[4:]
     held, times, errors = (
-        np.array([getattr(window, name) for window in settled])
-        for name in ("held_kb", "ms_per_frame", "error_m")
+        np.array([getattr(window, name) for window in settled]) for name in ("held_kb", "ms_per_frame", "error_m")
     )
     assert windows[-1].started > 4 * windows[-1].landmarks
     if lag is None:

@@ -97,8 +97,7 @@ def plus(world_from_camera, delta):
 def test_the_slope_between_the_tangents_is_that_of_numeric_derivatives():
     pose, step = SE3.exp(np.array([0.4, -1.2, 0.7, 3.0, -2.0, 0.5])), 1e-5
     columns = [
-        (SE3.local(pose, plus(pose, step * e)) - SE3.local(pose, plus(pose, -step * e))) / (2 * step)
-        for e in np.eye(6)
+        (SE3.local(pose, plus(pose, step * e)) - SE3.local(pose, plus(pose, -step * e))) / (2 * step) for e in np.eye(6)
     ]
     assert tangent_slope(pose) == pytest.approx(np.stack(columns, axis=-1), abs=1e-8)
 
@@ -123,9 +122,7 @@ def test_covariances_of_the_installed_build_have_that_tangent():
         return (log.camera.project(local) - table.z).ravel()
 
     size, step = 18 + 3 * len(free), 1e-5
-    slope = np.stack(
-        [(residuals(step * e) - residuals(-step * e)) / (2 * step) for e in np.eye(size)], axis=-1
-    )
+    slope = np.stack([(residuals(step * e) - residuals(-step * e)) / (2 * step) for e in np.eye(size)], axis=-1)
     assert np.abs(slope.T @ residuals(np.zeros(size))).max() < 1e-3, "not an optimum"
     cov = np.linalg.inv(slope.T @ slope)
     for frame in range(3):

@@ -140,9 +140,7 @@ def digests_of(folder: Path) -> dict[str, str]:
         if path.suffix == ".npz":
             with np.load(path, allow_pickle=False) as arrays:
                 content = {
-                    name: digest(
-                        str(arrays[name].shape).encode() + np.ascontiguousarray(arrays[name]).tobytes()
-                    )
+                    name: digest(str(arrays[name].shape).encode() + np.ascontiguousarray(arrays[name]).tobytes())
                     for name in arrays.files
                     if name != "header" and not any(word in name for word in TIMES)
                 }

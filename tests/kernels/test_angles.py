@@ -92,9 +92,7 @@ def test_arctan2_of_a_small_angle_keeps_its_digits(rng):
 def test_arctan2_on_the_axes_the_diagonals_and_at_the_limits():
     values = (0.0, -0.0, 1.0, -1.0, 5e-324, -5e-324, 8e307, -8e307, np.inf, -np.inf)
     cases = [
-        (y, x)
-        for y, x in product(values, values)
-        if not (np.isinf(y) and np.isinf(x)) and not (y == 0.0 and x == 0.0)
+        (y, x) for y, x in product(values, values) if not (np.isinf(y) and np.isinf(x)) and not (y == 0.0 and x == 0.0)
     ]
     y, x = np.array(cases).T
     found, expected = arctan2_of(y, x), np.arctan2(y, x)

@@ -56,9 +56,7 @@ def test_as_a_dictionary(edits):
         np.testing.assert_array_equal(columns.slab[rows], 3 * ids)
         asked = np.arange(-2, next_id + 3)
         np.testing.assert_array_equal(columns.held(asked), [column in model for column in asked.tolist()])
-        np.testing.assert_array_equal(
-            columns.kinds(asked), [model.get(column, -1) for column in asked.tolist()]
-        )
+        np.testing.assert_array_equal(columns.kinds(asked), [model.get(column, -1) for column in asked.tolist()])
 
 
 def test_memory_follows_what_is_held():

@@ -40,9 +40,7 @@ def test_homogeneous_is_the_point():
     records = scattered(4, 3, 0.01)
     world = LANDMARK.homogeneous(records.mean, records.const)
     np.testing.assert_array_equal(world[..., 3], records.mean[..., 2])
-    np.testing.assert_allclose(
-        world[..., :3] / world[..., 3:], euclidean(records.mean, records.const), atol=1e-12
-    )
+    np.testing.assert_allclose(world[..., :3] / world[..., 3:], euclidean(records.mean, records.const), atol=1e-12)
 
 
 def test_at_infinity_only_the_direction_is_left():

@@ -53,9 +53,7 @@ def test_kinds_side_by_side_follow_their_particles():
         found = landmark_map.read(which)
         np.testing.assert_array_equal(found.mean, expected.mean[row])
         np.testing.assert_array_equal(found.cov, expected.cov[row])
-    assert np.array_equal(
-        np.asarray(landmark_map.read(ids[1]).log_weights), np.asarray(mixture.log_weights)[row]
-    )
+    assert np.array_equal(np.asarray(landmark_map.read(ids[1]).log_weights), np.asarray(mixture.log_weights)[row])
     assert np.array_equal(np.asarray(landmark_map.read(ids[2]).const), np.asarray(anchors.const)[row])
     assert isinstance(landmark_map.landmark_of(2), MixturePoint)
     with pytest.raises(InputError, match="one parametrisation at a time"):

@@ -31,9 +31,7 @@ class Anything(ObservationModel):
 
 def group(ids, **options) -> Observations:
     ids = np.array(ids)
-    return Observations(
-        np.zeros((ids.shape[-1], 1)), np.ones((ids.shape[-1], 1, 1)), Anything(), ids=ids, **options
-    )
+    return Observations(np.zeros((ids.shape[-1], 1)), np.ones((ids.shape[-1], 1, 1)), Anything(), ids=ids, **options)
 
 
 def rows_of(plan: Plan) -> list[Row]:

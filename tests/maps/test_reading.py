@@ -84,9 +84,7 @@ def test_projections_equal_numpys(n, shared):
     rng = np.random.default_rng(2)
     landmark_map, _, points, rays = grown(n, rng)
     factor = 0.01 * rng.normal(size=(1 if shared else n, 6, 6))
-    prior = Prior(
-        SE3, SE3.exp(0.02 * rng.normal(size=(n, 6))), 0.01 * rng.normal(size=(n, 6)), factor, centred=False
-    )
+    prior = Prior(SE3, SE3.exp(0.02 * rng.normal(size=(n, 6))), 0.01 * rng.normal(size=(n, 6)), factor, centred=False)
     weights = rng.uniform(size=n)
     belief = Belief(np.log(weights / weights.sum()), prior, {Part.LANDMARK: landmark_map})
     for model, ids in ((CameraPoint(CAMERA), points[-2:]), (CameraRay(CAMERA), rays[-2:])):

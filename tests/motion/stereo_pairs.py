@@ -34,9 +34,7 @@ class Pair(NamedTuple):
     delta: np.ndarray
 
 
-def noiseless(
-    world: World, count: int, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def noiseless(world: World, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pixels (K, 3) of both frames and the increment (7,); the depths are uniform, the pixels fill the image."""
     camera, delta = world.camera, SE3.exp(np.array(world.xi))
     depth = rng.uniform(world.nearest_m, world.farthest_m, (6 * count, 1))

@@ -57,8 +57,7 @@ def test_variance_that_the_pose_leaves_to_the_velocity(dt):
     np.testing.assert_allclose(rest[6:] @ rest[6:].T, schur, rtol=1e-10, atol=1e-14)
     np.testing.assert_allclose(schur, dt * SIGMA / 4, rtol=1e-10, atol=1e-14)
     joint, paper = (
-        SampledVelocity(WALK, mode).transition(states(1), None, dt).noise_factor[0]
-        for mode in ("joint", "paper")
+        SampledVelocity(WALK, mode).transition(states(1), None, dt).noise_factor[0] for mode in ("joint", "paper")
     )
     dropped = joint @ joint.T - paper @ paper.T
     np.testing.assert_allclose(dropped[6:, 6:], dt * SIGMA / 4, rtol=1e-9, atol=1e-13)
@@ -143,9 +142,7 @@ FORGETTING = PosePrior(PRIOR.mean, PRIOR.cov, WALK)
 
 
 @pytest.mark.parametrize("control", [None, PRIOR, FORGETTING])
-@pytest.mark.parametrize(
-    "motion", [MarginalVelocity(WALK), SampledVelocity(WALK), SampledVelocity(0.1, "paper")]
-)
+@pytest.mark.parametrize("motion", [MarginalVelocity(WALK), SampledVelocity(WALK), SampledVelocity(0.1, "paper")])
 def test_sound_models(motion, control):
     assert check_model(motion, example=Example(control=control)) == []
 

@@ -75,9 +75,7 @@ def test_on_a_manifold():
         return miss, turned.reshape(-1, 6)
 
     ours = minimise(function, SE3.identity(), SE3.retract, STRICT)
-    theirs = least_squares(
-        lambda xi: function(SE3.retract(truth, xi))[0], np.zeros(6), xtol=1e-15, ftol=1e-15
-    )
+    theirs = least_squares(lambda xi: function(SE3.retract(truth, xi))[0], np.zeros(6), xtol=1e-15, ftol=1e-15)
     np.testing.assert_allclose(SE3.local(truth, ours.x), theirs.x, atol=1e-7)
 
 

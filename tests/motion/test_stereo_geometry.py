@@ -25,9 +25,7 @@ worlds = pytest.mark.parametrize("world", [ROAD, LEAP], ids=["road", "leap"])
 
 
 def numeric(function, at, step):
-    columns = [
-        (function(at + step * unit) - function(at - step * unit)) / (2.0 * step) for unit in np.eye(len(at))
-    ]
+    columns = [(function(at + step * unit) - function(at - step * unit)) / (2.0 * step) for unit in np.eye(len(at))]
     return np.stack(columns, axis=-1)
 
 
@@ -132,9 +130,7 @@ def test_the_earlier_points_covariance_in_space():
     cov_points = by_z @ matches.cov_prev @ by_z.mT
     by_point = camera.jacobian(SE3.inverse_transform(delta, before)) @ SE3.rotation(delta).T
     expected = matches.cov_now + by_point @ cov_points @ by_point.mT
-    np.testing.assert_allclose(
-        linearised(matches, delta, matches.z_prev, "propagated").cov, expected, rtol=1e-8
-    )
+    np.testing.assert_allclose(linearised(matches, delta, matches.z_prev, "propagated").cov, expected, rtol=1e-8)
     np.testing.assert_array_equal(linearised(matches, delta, matches.z_prev, "exact").cov, matches.cov_now)
 
 

@@ -64,9 +64,7 @@ def adjusted_by_scipy(matches: Matches, start: np.ndarray):
 @pytest.mark.parametrize("world", [ROAD, ROOM, LEAP], ids=["road", "room", "leap"])
 def test_without_noise_the_motion_is_exact(world, points):
     before, now, delta = noiseless(world, 40, np.random.default_rng(0))
-    found = estimated(
-        Matches.checked(world.camera, before, now, COV, COV), config=VoConfig(points, rule=STRICT)
-    )
+    found = estimated(Matches.checked(world.camera, before, now, COV, COV), config=VoConfig(points, rule=STRICT))
     np.testing.assert_allclose(SE3.local(delta, found.previous_camera_from_camera), 0.0, atol=1e-7)
     assert found.found and found.inliers.all() and found.rms < 1e-4
 
@@ -353,9 +351,7 @@ class TestVisualOdometry:
     def test_points_in_one_place_are_joined_with_the_expected_motion(self):
         z = np.tile(HAND.project(np.array([0.1, 0.1, 3.0])), (20, 1))
         matches = Matches.checked(HAND, z, z, COV, COV)
-        (motion,) = (
-            VisualOdometry().candidates(matches, np.zeros(6), self.DT, np.random.default_rng(0)).motions
-        )
+        (motion,) = VisualOdometry().candidates(matches, np.zeros(6), self.DT, np.random.default_rng(0)).motions
         assert motion.note
         assert np.linalg.eigvalsh(motion.odometry.cov).min() > 0.0
         assert (np.sqrt(np.diagonal(motion.odometry.cov)) <= self.DT + 1e-12).all()

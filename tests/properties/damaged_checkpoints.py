@@ -163,9 +163,7 @@ def main(name: str, folder: Path, most: int) -> None:
     arrays = load_arrays(path)
     header = json.loads(str(arrays.pop("header")))
     # Of many arrays of one kind the first two are enough.
-    names = [
-        name for name in sorted(arrays) if name.split("/")[1:2] < ["2"] or not name.split("/")[1].isdigit()
-    ]
+    names = [name for name in sorted(arrays) if name.split("/")[1:2] < ["2"] or not name.split("/")[1].isdigit()]
     every = [(key, *damage) for key in names for damage in damages(arrays[key], rng)]
     for k in rng.permutation(len(every))[:most]:
         key, words, value = every[k]

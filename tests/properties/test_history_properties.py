@@ -104,9 +104,7 @@ def test_a_fixed_lag_takes_constant_memory(rate):
         history.record(t, np.zeros((n, 3)), np.zeros(n))
         if t % 20 == 0:
             arrays = lineage.arrays() | history.arrays()
-            sizes.append(
-                (history.stored_states, len(history.blocks), len(arrays["history/due"]), lineage.nodes)
-            )
+            sizes.append((history.stored_states, len(history.blocks), len(arrays["history/due"]), lineage.nodes))
     states, blocks, due, nodes = np.max(sizes, axis=0)
     assert states <= lag * n
     assert blocks <= lag + 1

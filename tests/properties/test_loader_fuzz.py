@@ -30,9 +30,7 @@ from tests.properties.mutations import damaged
 pytestmark = pytest.mark.slow
 
 FEW = settings(max_examples=60, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
-SETTINGS = (
-    b"rbpf: 0.1.0\nsystem: mono\nparticles: 20\nray:\n  constrain: marginal\nsearch: {measurements: 25}\n"
-)
+SETTINGS = b"rbpf: 0.1.0\nsystem: mono\nparticles: 20\nray:\n  constrain: marginal\nsearch: {measurements: 25}\n"
 SWEEP = b"system: range-bearing\nsequences: [log]\nparticles: [10]\nseeds: 2\noptions: {plain: {}}\n"
 RECIPE = Recipe(n=4)
 
@@ -263,9 +261,7 @@ def test_an_archive_that_unfolds_is_refused(tmp_path):
 @given(
     st.dictionaries(
         st.text("abc/", min_size=1, max_size=5),
-        st.sampled_from(
-            [np.arange(6.0).reshape(2, 3), np.array(3), np.array("é"), np.zeros((0, 2)), np.array([True])]
-        ),
+        st.sampled_from([np.arange(6.0).reshape(2, 3), np.array(3), np.array("é"), np.zeros((0, 2)), np.array([True])]),
     )
 )
 def test_what_is_saved_is_loaded(tmp_path_factory, arrays):

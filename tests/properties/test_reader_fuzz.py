@@ -48,9 +48,9 @@ def frames(path: Path) -> object:
 def seen(path: Path) -> object:
     """What a camera sees and where."""
     camera = open_images(path).camera
-    return camera.unproject(
-        camera.project(np.array([[0.1, 0.2, 1.0], [3.0, 2.0, 1.0]]))
-    ), camera.field_of_view_mask(2.0)
+    return camera.unproject(camera.project(np.array([[0.1, 0.2, 1.0], [3.0, 2.0, 1.0]]))), camera.field_of_view_mask(
+        2.0
+    )
 
 
 def pairs(path: Path) -> object:
@@ -216,9 +216,7 @@ def test_an_image_that_claims_to_be_huge_is_not_decoded(tmp_path):
     folders.write_plain(tmp_path)
     size = (60_000).to_bytes(4, "big") * 2 + bytes([8, 0, 0, 0, 0])
     chunk = b"IHDR" + size
-    header = (
-        b"\x89PNG\r\n\x1a\n" + len(size).to_bytes(4, "big") + chunk + zlib.crc32(chunk).to_bytes(4, "big")
-    )
+    header = b"\x89PNG\r\n\x1a\n" + len(size).to_bytes(4, "big") + chunk + zlib.crc32(chunk).to_bytes(4, "big")
     (tmp_path / "1.png").write_bytes(header + (80).to_bytes(4, "big") + b"IDAT" + b"\0" * 84)
     problem = list(open_images(tmp_path).frames())[1].problem
     assert problem is not None and "larger than any camera's" in problem

@@ -128,9 +128,7 @@ def test_mrpt_in_space(tmp_path):
 
     # The covariance by a numeric Jacobian.
     middle, step = element(DELTA_6D), 1e-6 * np.eye(6)
-    columns = [
-        SE3.local(middle, element(DELTA_6D + e)) - SE3.local(middle, element(DELTA_6D - e)) for e in step
-    ]
+    columns = [SE3.local(middle, element(DELTA_6D + e)) - SE3.local(middle, element(DELTA_6D - e)) for e in step]
     jacobian = np.stack(columns, axis=1) / 2e-6
     np.testing.assert_allclose(log.frames[1].delta, middle)
     np.testing.assert_allclose(log.frames[1].cov_delta, jacobian @ COV_6D @ jacobian.T, rtol=1e-7, atol=1e-8)

@@ -41,10 +41,7 @@ def test_joint_map_of_simulated_logs(data_dir):
 
 
 def test_joint_map_of_a_robot_with_motion_capture(data_dir):
-    paths = [
-        mean_scores(data_dir / "mrclam6_robot1", 1, "map=joint", "particles=50", f"window={w}")[1]
-        for w in (1, 5)
-    ]
+    paths = [mean_scores(data_dir / "mrclam6_robot1", 1, "map=joint", "particles=50", f"window={w}")[1] for w in (1, 5)]
     assert max(paths) <= 0.26
 
 

@@ -58,9 +58,7 @@ def test_rendered_boards_give_the_fisheye_that_rendered_them():
     # Corners so near and so tilted have small common errors, which the standard deviations know nothing of.
     assert (np.abs(result.camera.params - FISHEYE.params)[:4] < 0.5).all()
     angle, around = np.meshgrid(np.deg2rad(np.arange(0.0, 66.0, 5.0)), np.linspace(0.0, 6.3, 12))
-    rays = np.stack(
-        [np.tan(angle) * np.cos(around), np.tan(angle) * np.sin(around), np.ones_like(angle)], axis=-1
-    )
+    rays = np.stack([np.tan(angle) * np.cos(around), np.tan(angle) * np.sin(around), np.ones_like(angle)], axis=-1)
     assert np.linalg.norm(result.camera.project(rays) - FISHEYE.project(rays), axis=-1).max() < 0.5
     # Its middle is a pinhole's with barrel distortion, its borders are not.
     assert calibrate(views, BOARD, *SIZE).rms_px > 0.5

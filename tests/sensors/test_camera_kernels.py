@@ -85,14 +85,10 @@ def test_exact_constellations(angle, camera, wide):
     view = ConstellationView(camera, np.random.default_rng(6).normal(scale=0.3, size=(3, 3)))
     n = 31
     axis = rng.normal(size=(n, 3))
-    xi = np.concatenate(
-        [angle * axis / np.linalg.norm(axis, axis=1, keepdims=True), rng.normal(size=(n, 3))], axis=1
-    )
+    xi = np.concatenate([angle * axis / np.linalg.norm(axis, axis=1, keepdims=True), rng.normal(size=(n, 3))], axis=1)
     const = SE3.exp(rng.normal(size=(n, 6)))
     state = in_front(SE3.retract(const, xi), rng)
-    in_camera = SE3.inverse_transform(
-        state[:, None], SE3.transform(SE3.retract(const, xi)[:, None], view.points)
-    )
+    in_camera = SE3.inverse_transform(state[:, None], SE3.transform(SE3.retract(const, xi)[:, None], view.points))
     assert (in_camera[..., 2] > 0.5).mean() > 0.9
     z = np.tile(Z, 3) + 10.0 * rng.normal(size=6)
     assert_twins(view, z, with_velocity(state) if wide else state, xi, const, 1e-9)
@@ -107,9 +103,7 @@ def test_uncertain_constellations(camera, wide):
     state = in_front(frame, rng)
     z = np.tile(Z, 3) + 10.0 * rng.normal(size=6)
     view = MembersView(camera, np.array([3, 0, 2]))
-    assert_twins(
-        view, z, with_velocity(state) if wide else state, points.reshape(n, 12), np.zeros((n, 0)), 1e-9
-    )
+    assert_twins(view, z, with_velocity(state) if wide else state, points.reshape(n, 12), np.zeros((n, 0)), 1e-9)
 
 
 def in_front(frame: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -123,9 +123,7 @@ def test_a_ray_starts_through_its_first_sighting(camera, kind):
     np.testing.assert_array_equal(records.mean[..., 2], 0.7)
     np.testing.assert_allclose(records.cov[..., 2, 2], 0.09)
     np.testing.assert_array_equal(records.cov[..., 2, :2], 0.0)
-    by_landmark = known(
-        known(CameraRay(camera).jacobians(state[0], records.mean[0], records.const[0])).landmark
-    )
+    by_landmark = known(known(CameraRay(camera).jacobians(state[0], records.mean[0], records.const[0])).landmark)
     carried = by_landmark @ records.cov[0] @ np.swapaxes(by_landmark, -1, -2)
     np.testing.assert_allclose(carried, cov, rtol=1e-8, atol=1e-9)
 

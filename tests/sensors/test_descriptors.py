@@ -172,11 +172,7 @@ def filled(descriptors):
 
 
 @pytest.mark.slow
-@given(
-    st.lists(
-        st.tuples(st.integers(0, 90), st.lists(st.integers(0, 200), max_size=30, unique=True)), max_size=6
-    )
-)
+@given(st.lists(st.tuples(st.integers(0, 90), st.lists(st.integers(0, 200), max_size=30, unique=True)), max_size=6))
 def test_the_store_holds_what_a_dictionary_would(steps):
     rng, store, held, last = np.random.default_rng(0), DescriptorStore(4), {}, 0
     for count, gone in steps:

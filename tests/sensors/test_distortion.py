@@ -164,10 +164,7 @@ def test_the_circle_in_which_it_sees():
     for corner in np.array([[-11.0, -11.0], [-11.0, 11.0], [11.0, -11.0], [11.0, 11.0]]):
         assert np.isfinite(camera.unproject(px + corner)).all()
     assert replace(camera, width=300, height=300, cx=150.0, cy=150.0).field_of_view_mask(16.0) is None
-    assert (
-        Pinhole(640, 480, 320.0, 320.0, 320.0, 240.0, (-0.25, 0.0, 0.0, 0.0, 0.0)).field_of_view_mask(16.0)
-        is None
-    )
+    assert Pinhole(640, 480, 320.0, 320.0, 320.0, 240.0, (-0.25, 0.0, 0.0, 0.0, 0.0)).field_of_view_mask(16.0) is None
 
 
 def test_a_lens_that_folds_back_is_seen_up_to_there():
@@ -177,15 +174,11 @@ def test_a_lens_that_folds_back_is_seen_up_to_there():
     camera = Pinhole(900, 900, 262.0, 262.0, 450.0, 450.0, FOLDING_LENS, "equidistant")
     assert camera.visible(ray(fold - 1e-6)) and not camera.visible(ray(fold + 1e-6))
     reach = 262.0 * fold * (1.0 - 0.3 * fold**2)
-    px = np.array(
-        [[450.0 + 0.999 * reach, 450.0], [450.0 + 1.001 * reach, 450.0], [np.nan, 1.0], [np.inf, 1.0]]
-    )
+    px = np.array([[450.0 + 0.999 * reach, 450.0], [450.0 + 1.001 * reach, 450.0], [np.nan, 1.0], [np.inf, 1.0]])
     np.testing.assert_array_equal(np.isfinite(camera.unproject(px))[:, 0], [True, False, False, False])
 
 
-@pytest.mark.parametrize(
-    "coefficients", [(0.0, 0.0, 0.0, 1e-300), (0.0, 0.0, 0.0, -0.01), (0.2, -0.3, 0.1, 0.0)]
-)
+@pytest.mark.parametrize("coefficients", [(0.0, 0.0, 0.0, 1e-300), (0.0, 0.0, 0.0, -0.01), (0.2, -0.3, 0.1, 0.0)])
 def test_it_rises_up_to_the_widest_angle(coefficients):
     lens = Equidistant(coefficients)
     angle = np.linspace(0.0, lens.max_angle * (1.0 - 1e-6), 2001)
@@ -209,7 +202,5 @@ def test_every_visible_direction_of_a_fisheye_comes_back(coefficients, fraction,
 
 
 def test_a_rectified_pair_has_no_fisheye_lens():
-    with pytest.raises(
-        InputError, match=r"has equidistant distortion \(0.0, 0.0, 0.0, 0.0\): rectify the images"
-    ):
+    with pytest.raises(InputError, match=r"has equidistant distortion \(0.0, 0.0, 0.0, 0.0\): rectify the images"):
         RectifiedStereo(FISHEYES["ideal"], 0.1)

@@ -127,9 +127,7 @@ def test_without_baseline_it_is_the_full_residual():
 
 def far_off(camera, model, compiled: bool) -> np.ndarray:
     """Weights of three particles after a frame: one where the camera is, one that looks back, one at a point."""
-    points = SE3.transform(
-        SE3.identity(), np.array([[0.2, 0.1, 2.0], [-0.3, 0.2, 3.0], [0.1, -0.4, 2.5], [0, 0, 4.0]])
-    )
+    points = SE3.transform(SE3.identity(), np.array([[0.2, 0.1, 2.0], [-0.3, 0.2, 3.0], [0.1, -0.4, 2.5], [0, 0, 4.0]]))
     z = CameraPoint(camera).predict(SE3.identity(), points)
     start = np.stack([SE3.identity(), SE3.exp(np.array([0.0, np.pi, 0.0, 0.0, 0.0, 0.0])), SE3.identity()])
     start[2, 6] = 2.0

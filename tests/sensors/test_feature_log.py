@@ -50,9 +50,7 @@ class TestFeatureLog:
             log()
 
     def test_out_of_order(self):
-        with refused(
-            "frame 2 of walk at 4 ns is before the frame it follows (5 ns): sort the frames by time"
-        ):
+        with refused("frame 2 of walk at 4 ns is before the frame it follows (5 ns): sort the frames by time"):
             log(frame(0, 1), frame(5, 1), frame(4, 1))
 
     @pytest.mark.parametrize(

@@ -318,9 +318,7 @@ def test_pooling_treats_a_mirror_image_alike():
         return cells[..., -np.arange(turns) % turns].reshape(descriptors.shape)
 
     histograms = np.random.default_rng(1).random((4, 128))
-    np.testing.assert_allclose(
-        pooled(mirrored(histograms, 4, 8)), mirrored(pooled(histograms), 3, 4), atol=1e-12
-    )
+    np.testing.assert_allclose(pooled(mirrored(histograms, 4, 8)), mirrored(pooled(histograms), 3, 4), atol=1e-12)
 
 
 @pytest.mark.parametrize("length", [36, 128])

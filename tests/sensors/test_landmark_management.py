@@ -104,9 +104,7 @@ def test_new_keys_spread_over_the_image():
     elsewhere = np.array([[600.0, 450.0], [20.0, 460.0], [620.0, 20.0], [320.0, 240.0]])
     px = np.concatenate([corner, elsewhere])
     config = NewLandmarkConfig(max_per_frame=6, spacing_px=0.0, distinct=0.0)
-    chosen = LandmarkManager(config, SIZE).select(
-        px, unit(rng, 64, 36), np.full(64, np.inf), np.zeros((0, 2))
-    )
+    chosen = LandmarkManager(config, SIZE).select(px, unit(rng, 64, 36), np.full(64, np.inf), np.zeros((0, 2)))
     assert set(range(60, 64)) <= set(chosen.tolist()) and chosen.size == 6
     occupied = np.repeat(elsewhere[:1], 5, axis=0) + 15.0
     crowded = LandmarkManager(config, SIZE).select(px, unit(rng, 64, 36), np.full(64, np.inf), occupied)

@@ -20,9 +20,7 @@ def image():
 
 def one(image, template, centre, cov=ROUND, **options):
     """The match of a single template."""
-    matches = search(
-        image, np.asarray(template)[None], np.array([centre], float), np.array([cov], float), **options
-    )
+    matches = search(image, np.asarray(template)[None], np.array([centre], float), np.array([cov], float), **options)
     return matches.px[0], matches.score[0], matches.second[0], matches.cov[0]
 
 
@@ -96,9 +94,7 @@ def test_covariance_is_the_residual_over_the_slopes(image):
     slopes = [(around[1:-1, 2:] - around[1:-1, :-2]) / 2, (around[2:, 1:-1] - around[:-2, 1:-1]) / 2]
     jac = np.stack([(s - s.mean() - ((s - s.mean()) * w).sum() * w).ravel() / norm for s in slopes], axis=1)
     residual = 1.0 - score**2
-    expected = residual / (121 - 4) * np.linalg.inv(
-        jac.T @ jac - 0.25 * residual * np.eye(2)
-    ) + 0.02**2 * np.eye(2)
+    expected = residual / (121 - 4) * np.linalg.inv(jac.T @ jac - 0.25 * residual * np.eye(2)) + 0.02**2 * np.eye(2)
     np.testing.assert_allclose(cov, expected, rtol=0.02, atol=1e-6)
 
 
@@ -133,9 +129,7 @@ def test_brightness_and_contrast_do_not_matter():
     waves = Waves(4, contrast=25.0)
     template = window(waves.image(SHAPE), (50, 40), 11)
     for mean, gain in ((128.0, 1.0), (70.0, 0.5), (180.0, 1.6)):
-        px, score, _, _ = one(
-            waves.image(SHAPE, shift=(0.3, 0.4), mean=mean, gain=gain), template, (50.0, 40.0)
-        )
+        px, score, _, _ = one(waves.image(SHAPE, shift=(0.3, 0.4), mean=mean, gain=gain), template, (50.0, 40.0))
         np.testing.assert_allclose(px, (49.7, 39.6), atol=0.05)
         assert score > 0.97
     image = waves.image(SHAPE)
@@ -170,9 +164,7 @@ def test_nothing_is_found_without_a_place_to_look(image, centre, cov):
 
 @pytest.mark.parametrize("variance", [1e6, 1e100, 1e300])
 def test_a_huge_covariance_searches_the_whole_image(image, variance):
-    px, score, _, _ = one(
-        image, window(image, (8, 80), 11), (90.0, 10.0), variance * np.eye(2), most_px=np.inf
-    )
+    px, score, _, _ = one(image, window(image, (8, 80), 11), (90.0, 10.0), variance * np.eye(2), most_px=np.inf)
     np.testing.assert_allclose(px, (8, 80), atol=1e-3)
     assert score > 0.9999
 
@@ -283,9 +275,7 @@ def test_cut_between_pixels_stays_within_grey_levels():
     assert step.min() == 0 and step.max() == 255 and (np.diff(step.astype(int), axis=1) >= 0).all()
 
 
-@pytest.mark.parametrize(
-    "px", [(14.9, 30.0), (84.1, 30.0), (40.0, 14.0), (40.0, 64.5), (np.nan, 30.0), (np.inf, 9.0)]
-)
+@pytest.mark.parametrize("px", [(14.9, 30.0), (84.1, 30.0), (40.0, 14.0), (40.0, 64.5), (np.nan, 30.0), (np.inf, 9.0)])
 def test_cut_does_not_reach_beyond(picture, px):
     assert cut(picture, np.array(px)) is None
 
@@ -310,10 +300,7 @@ def test_samples_make_up_for_the_larger_pixel(name):
     expected = vectors @ np.diag(np.maximum(values, 0.0)) @ vectors.T / 12.0
     np.testing.assert_allclose(samples.mean(axis=0), 0.0, atol=1e-12)
     np.testing.assert_allclose(samples.T @ samples / len(samples), expected, atol=1e-6)
-    assert (
-        np.diff(np.unique(samples.round(9), axis=0), axis=0).max(initial=0.0)
-        < 2.0 * np.abs(samples).max() + 1.0
-    )
+    assert np.diff(np.unique(samples.round(9), axis=0), axis=0).max(initial=0.0) < 2.0 * np.abs(samples).max() + 1.0
 
 
 @pytest.mark.parametrize("name", MAPS)

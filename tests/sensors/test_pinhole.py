@@ -186,9 +186,7 @@ class TestPinhole:
 class TestVisible:
     @every_camera
     def test_behind_and_beside_the_camera(self, camera):
-        behind = np.array(
-            [[0.0, 0.0, -1.0], [0.1, -0.2, -3.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -0.0]]
-        )
+        behind = np.array([[0.0, 0.0, -1.0], [0.1, -0.2, -3.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -0.0]])
         assert not camera.visible(behind).any()
         assert not camera.visible(np.array([np.nan, 0.0, 1.0]))
         assert camera.visible(np.array([0.0, 0.0, 1e-9]))
@@ -284,9 +282,7 @@ class TestRectifiedStereo:
 
     def test_visible_in_both_images(self):
         # 0.6 m to the left at 1 m: u_left is 4.5, u_right is −58.5.
-        points = np.array(
-            [[-0.6, 0.0, 1.0], [-0.4, 0.0, 1.0], [0.0, 0.0, -1.0], [0.7, 0.0, 1.0], [0.0, 0.6, 1.0]]
-        )
+        points = np.array([[-0.6, 0.0, 1.0], [-0.4, 0.0, 1.0], [0.0, 0.0, -1.0], [0.7, 0.0, 1.0], [0.0, 0.6, 1.0]])
         np.testing.assert_array_equal(STEREO.visible(points), [False, True, False, False, False])
         assert STEREO.camera.visible(points[0])
         assert not STEREO.camera.visible(points[3])

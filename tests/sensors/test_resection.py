@@ -109,9 +109,7 @@ def test_where_one_start_finds_a_local_optimum():
 @pytest.mark.parametrize("tilt", [0.0, 0.3, -0.8])
 def test_planar_target(tilt):
     """A square seen from the front and from the side, which has a second local optimum."""
-    pose = SE3.compose(
-        SE3.exp(np.array([0.1, tilt, 0.2, 0.0, 0.0, 0.0])), SE3.exp(np.array([0, 0, 0, 0.1, 0.0, -2.0]))
-    )
+    pose = SE3.compose(SE3.exp(np.array([0.1, tilt, 0.2, 0.0, 0.0, 0.0])), SE3.exp(np.array([0, 0, 0, 0.1, 0.0, -2.0])))
     px = PLAIN.project(SE3.inverse_transform(pose, SQUARE))
     assert distance(resect(PLAIN, SQUARE, px), pose) < 1e-7
     noisy = px + np.random.default_rng(1).normal(scale=0.3, size=px.shape)
@@ -220,9 +218,7 @@ NEAR = SE3.retract(SE3.identity(), np.array([0.05, -0.1, 0.1, 0.3, -0.1, 0.1]))
 START = SE3.retract(NEAR, np.array([0.01, -0.01, 0.01, 0.02, 0.01, -0.02]))
 
 
-def sights_of(
-    known: int, on_lines: int, rng: np.random.Generator, noise_px: float, wrong: bool = True
-) -> Sights:
+def sights_of(known: int, on_lines: int, rng: np.random.Generator, noise_px: float, wrong: bool = True) -> Sights:
     """Points that a camera at the origin sees; of those on lines the depth may be wrong by up to a third."""
     count = known + on_lines
     uv = rng.uniform(-0.35, 0.35, (count, 2))
@@ -239,9 +235,7 @@ def sights_of(
 
 def test_distances_are_those_of_the_covariance():
     sights = sights_of(5, 20, np.random.default_rng(0), 1.0)
-    seen, far = (
-        SE3.inverse_transform(START, p) for p in (sights.points, sights.points + 1e-6 * sights.spread)
-    )
+    seen, far = (SE3.inverse_transform(START, p) for p in (sights.points, sights.points + 1e-6 * sights.spread))
     slope = (CAMERA.project(far) - CAMERA.project(seen)) / 1e-6
     cov = sights.std_px[:, None, None] ** 2 * np.eye(2) + slope[:, :, None] * slope[:, None]
     miss = sights.px - CAMERA.project(seen)

@@ -70,9 +70,7 @@ def test_points_and_covariances_follow_from_the_pixels():
     features = measured()
     np.testing.assert_array_equal(features.points, RIG.triangulate(features.z))
     jac = triangulate_jacobian(RIG, features.z)
-    np.testing.assert_allclose(
-        features.cov_points, jac @ features.cov @ jac.swapaxes(1, 2), rtol=1e-9, atol=1e-15
-    )
+    np.testing.assert_allclose(features.cov_points, jac @ features.cov @ jac.swapaxes(1, 2), rtol=1e-9, atol=1e-15)
     depth = features.points[:, 2]
     near, far = np.argmin(depth), np.argmax(depth)
     assert features.cov_points[far, 2, 2] > 4.0 * features.cov_points[near, 2, 2]
@@ -161,9 +159,7 @@ def test_cameras_that_cannot_have_taken_the_pair_are_noticed(beyond, doubted):
     matcher = StereoMatcher(RIG, Sift(FULL))
     assert matcher.doubt == ""
     matcher.measure(left, np.roll(right, shift, axis=1))
-    assert (
-        "have a negative disparity, which no point in space has: check the calibration" in matcher.doubt
-    ) is doubted
+    assert ("have a negative disparity, which no point in space has: check the calibration" in matcher.doubt) is doubted
 
 
 def test_swapped_images_are_noticed():
@@ -278,9 +274,7 @@ def test_other_images_stay_as_they_are(whole):
 
 def test_a_few_specks_stay(whole):
     image = whole[0].image.copy()
-    rows = np.random.default_rng(0).choice(
-        image.size, int(0.8 * TOLERATED_FRACTION * image.size), replace=False
-    )
+    rows = np.random.default_rng(0).choice(image.size, int(0.8 * TOLERATED_FRACTION * image.size), replace=False)
     image.flat[rows] = 255
     assert remove_impulses(image)[0] is image
 

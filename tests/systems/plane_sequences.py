@@ -77,14 +77,10 @@ def sequence(
 
 def known_points() -> KnownPixels:
     """Eight points of the plane that the first image shows."""
-    px = np.array(
-        [[60, 50], [250, 60], [70, 190], [240, 180], [160, 120], [110, 100], [200, 70], [150, 200]], float
-    )
+    px = np.array([[60, 50], [250, 60], [70, 190], [240, 180], [160, 120], [110, 100], [200, 70], [150, 200]], float)
     uv = CAMERA.unproject(px)
     rays = np.concatenate([uv, np.ones((len(px), 1))], axis=-1)
     corner, side, down = on_plane(np.array([[500.0, 500.0], [501.0, 500.0], [500.0, 501.0]]))
     normal = np.cross(side - corner, down - corner)
     points = rays * (normal @ corner / (rays @ normal))[:, None]
-    return KnownPixels(
-        np.arange(len(px)), px, points, np.full(len(px), 0.002 * np.sqrt(3.0))
-    )  # 2 mm per axis
+    return KnownPixels(np.arange(len(px)), px, points, np.full(len(px), 0.002 * np.sqrt(3.0)))  # 2 mm per axis

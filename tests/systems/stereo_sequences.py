@@ -37,9 +37,7 @@ class Pairs(Source):
             yield self.change(t, ImageFrame(t * STEP_NS, *images))
 
 
-def pairs(
-    count: int, change: Change = lambda t, frame: frame, poses: np.ndarray | None = None
-) -> ImageSequence:
+def pairs(count: int, change: Change = lambda t, frame: frame, poses: np.ndarray | None = None) -> ImageSequence:
     """A pair of cameras before the plane."""
     poses = path(2 * count)[::2] if poses is None else poses
     stamps = np.arange(count, dtype=np.int64) * STEP_NS

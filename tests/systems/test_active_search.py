@@ -242,9 +242,7 @@ def test_a_third_of_the_view_moves_and_the_camera_is_not_taken_along(tmp_path):
     for name, config in (("credulous", credulous), ("usual", MonoConfig())):
         runs = [filter_images(damaged, replace(config, seed=seed), known) for seed in range(3)]
         stamps = recording.stamps_ns
-        paths = [
-            Trajectory(stamps, poses) for poses in (*(run.log.poses for run in runs), runs[0].truth.poses)
-        ]
+        paths = [Trajectory(stamps, poses) for poses in (*(run.log.poses for run in runs), runs[0].truth.poses)]
         worst[name] = max(ate(path, paths[-1]).rmse for path in paths[:-1])
     assert worst["usual"] < 0.03
     assert worst["credulous"] > 2.0 * worst["usual"]

@@ -27,9 +27,7 @@ def frame(rng, pose, stamp_ns):
 
 def started(n, seed, every=1):
     sensor = NamedLandmarkSensor(RelativePosition(SE2), Point(2))
-    filter_ = Filter(
-        OdometryMotion(SE2), sensor, LandmarkMap(SE2), EkfProposal(), n=n, rng=np.random.default_rng(seed)
-    )
+    filter_ = Filter(OdometryMotion(SE2), sensor, LandmarkMap(SE2), EkfProposal(), n=n, rng=np.random.default_rng(seed))
     return filter_, StartAnchor(filter_, every)
 
 
@@ -43,9 +41,7 @@ def drive(steps, n=50, seed=0, every=1):
     for t in range(steps):
         control = None
         if t:
-            pose = SE2.retract(
-                SE2.compose(pose, CONTROL.delta), np.sqrt(np.diag(CONTROL.cov)) * rng.standard_normal(3)
-            )
+            pose = SE2.retract(SE2.compose(pose, CONTROL.delta), np.sqrt(np.diag(CONTROL.cov)) * rng.standard_normal(3))
             control = CONTROL
         report = filter_.step(frame(rng, pose, t * 10**9), control, t * 10**9)
         anchored = anchor.after_step(report, control)

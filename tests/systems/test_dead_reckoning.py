@@ -88,9 +88,7 @@ def test_time_has_to_pass():
     slam_.take(first)
     slam_.take(second)
     again = slam_.take(second)
-    assert again.messages == (
-        "passed over: it has the stamp of the last one; the last velocity is assumed, widely",
-    )
+    assert again.messages == ("passed over: it has the stamp of the last one; the last velocity is assumed, widely",)
     with pytest.raises(InputError, match="time runs backwards"):
         slam_.take(first)
 

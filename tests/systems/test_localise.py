@@ -96,9 +96,7 @@ def test_uncertain_points_make_an_uncertain_pose(mapped):
 @pytest.mark.slow
 def test_a_camera_that_sees_something_else_is_lost_and_says_how_little_it_knows(mapped):
     blank = from_frame(sequence(MAPPED + 4, lambda _t, image: image // 4 + 100), MAPPED)
-    other = replace(
-        mapped, windows=np.random.default_rng(1).integers(0, 256, mapped.windows.shape, dtype=np.uint8)
-    )
+    other = replace(mapped, windows=np.random.default_rng(1).integers(0, 256, mapped.windows.shape, dtype=np.uint8))
     run = filter_images(blank, MonoConfig(particles=20), known_map=other)
     assert run.log.lost().all()
     assert np.sqrt(run.log.covs[:, 3:, 3:].diagonal(axis1=1, axis2=2)).min() >= mapped.size_m

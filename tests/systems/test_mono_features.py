@@ -58,9 +58,7 @@ def test_compiled_equals_numpy(config):
     one, other = (run(log, replace(config, compiled=compiled)) for compiled in (True, False))
     np.testing.assert_allclose(one.log["log_evidence"], other.log["log_evidence"], atol=1e-5)
     np.testing.assert_allclose(one.log.poses, other.log.poses, atol=1e-7)
-    np.testing.assert_allclose(
-        one.system.filter.particles.state, other.system.filter.particles.state, atol=1e-6
-    )
+    np.testing.assert_allclose(one.system.filter.particles.state, other.system.filter.particles.state, atol=1e-6)
     np.testing.assert_array_equal(one.log["resampled"], other.log["resampled"])
     assert kinds(one.system.filter) == kinds(other.system.filter)
 
@@ -160,16 +158,12 @@ def test_a_camera_at_rest_learns_no_depth(constrain):
     """The same image again and again."""
     frames = [replace(LOG.frames[0], stamp_ns=LOG.frames[0].stamp_ns + t * 10**8) for t in range(8)]
     still = VelocityConfig(walk_rad_s=1e-3, walk_m_s=1e-3, start_rad_s=1e-3, start_m_s=1e-3)
-    config = replace(
-        SMALL, inverse_depth=InverseDepthConfig(constrain, from_scene_depth=False), velocity=still
-    )
+    config = replace(SMALL, inverse_depth=InverseDepthConfig(constrain, from_scene_depth=False), velocity=still)
     done = run(replace(LOG, frames=frames, truth=None), config)
     held = done.system.filter.belief().map
     rays = [i for i in held.ids.tolist() if isinstance(held.landmark_of(i), InverseDepth)]
     assert len(rays) == len(LOG.frames[0].landmarks) - 4
-    np.testing.assert_array_equal(
-        held.read(np.array(rays)).cov[..., 2, 2], InverseDepthConfig().std_per_m ** 2
-    )
+    np.testing.assert_array_equal(held.read(np.array(rays)).cov[..., 2, 2], InverseDepthConfig().std_per_m ** 2)
 
 
 def still_log(seed: int, frames: int) -> FeatureLog:
@@ -180,8 +174,7 @@ def still_log(seed: int, frames: int) -> FeatureLog:
     z = np.concatenate([camera.project(corners), px])
     cov = np.tile(0.09 * np.eye(2), (29, 1, 1))
     seen = [
-        FeatureFrame(int(t * 1e9 / 30), np.arange(29), z + rng.normal(0.0, 0.3, z.shape), cov)
-        for t in range(frames)
+        FeatureFrame(int(t * 1e9 / 30), np.arange(29), z + rng.normal(0.0, 0.3, z.shape), cov) for t in range(frames)
     ]
     known_points = KnownPoints(np.arange(4), corners, np.tile(1e-6 * np.eye(3), (4, 1, 1)))
     return FeatureLog("still", camera, seen, known_points)
@@ -209,9 +202,7 @@ def test_what_rays_say_changes_smoothly_with_the_pose(compiled, constrain, at_mm
     groups = rays.observations(belief, z, frame.cov_z[4:], ids, scaled=True)
     density = held.correct(displaced, np.zeros((n, 6)), groups).all
     assert np.abs(np.diff(density[1:])).max() < 0.3  # 0.01 mm apart
-    assert np.abs(np.diff(density[:2])).max() < (
-        0.3 if at_mm < 5.0 else 30.0
-    )  # no line where nothing has moved
+    assert np.abs(np.diff(density[:2])).max() < (0.3 if at_mm < 5.0 else 30.0)  # no line where nothing has moved
 
 
 def test_a_camera_at_rest_stays():
@@ -344,9 +335,7 @@ def test_the_first_frame_finds_the_camera(mode, velocity):
 
 def test_a_frame_says_the_same_in_both_modes():
     """The law of the first pose is a matter of the known points, not of what stands for them."""
-    frame, points = (
-        run(first_only(FIRST), replace(SMALL, known=mode, particles=200)) for mode in ("frame", "points")
-    )
+    frame, points = (run(first_only(FIRST), replace(SMALL, known=mode, particles=200)) for mode in ("frame", "points"))
     std = np.sqrt(np.diag(frame.log.covs[0]))
     offset = SE3.local(frame.log.poses[0], points.log.poses[0]) / std
     assert np.abs(offset).max() < 0.5

@@ -89,9 +89,7 @@ def test_a_checkpoint_after_any_frame_goes_on_with_the_same_bytes(case, tmp_path
             assert mine.pose.tobytes() == theirs.pose.tobytes() and mine.cov.tobytes() == theirs.cov.tobytes()
             assert (mine.state, mine.messages) == (theirs.state, theirs.messages)
             assert (mine.revision is None) == (theirs.revision is None)
-            assert all(
-                mine.observed[name].tobytes() == theirs.observed[name].tobytes() for name in mine.observed
-            )
+            assert all(mine.observed[name].tobytes() == theirs.observed[name].tobytes() for name in mine.observed)
         assert same(content(again.filter), content(slam.filter))
         mine, theirs = again.arrays(), slam.arrays()
         assert mine.keys() == theirs.keys()
@@ -159,9 +157,7 @@ def test_a_driver_may_write_all_images_into_the_same_memory():
         buffer[:] = frame.image
         tracked = slam.track(buffer, frame.stamp_ns)
     assert not tracked.messages
-    assert (
-        tracked.pose.tobytes() == tracked_all(MonoSlam(CAMERA, CONFIG, KNOWN), images(10))[-1].pose.tobytes()
-    )
+    assert tracked.pose.tobytes() == tracked_all(MonoSlam(CAMERA, CONFIG, KNOWN), images(10))[-1].pose.tobytes()
 
 
 def test_stamps_that_stand_still_or_run_backwards():
@@ -258,9 +254,7 @@ class Near(UnknownDepth):
     """Inverse depth with a prior of its own, by composition."""
 
     def __init__(self) -> None:
-        self.usual = InverseDepthRays(
-            CAMERA, replace(CONFIG.inverse_depth, mean_per_m=2.0, from_scene_depth=False)
-        )
+        self.usual = InverseDepthRays(CAMERA, replace(CONFIG.inverse_depth, mean_per_m=2.0, from_scene_depth=False))
         self.landmark, self.model = self.usual.landmark, self.usual.model
 
     def starting(self, depths):

@@ -21,9 +21,7 @@ from rbpf.systems.stereo.motion_segmentation import (
 from tests.motion.stereo_pairs import LEAP, ROOM, joined, simulate
 
 PRIOR = Odometry(SE3.identity(), np.diag(np.repeat(0.1**2, 6)))
-STILL, AWAY = (
-    Odometry(SE3.exp(np.array([0.0, 0.0, 0.0, x, 0.0, 0.0])), 1e-6 * np.eye(6)) for x in (0.0, 0.3)
-)
+STILL, AWAY = (Odometry(SE3.exp(np.array([0.0, 0.0, 0.0, x, 0.0, 0.0])), 1e-6 * np.eye(6)) for x in (0.0, 0.3))
 
 
 def candidates(*counts: int, left: int = 5) -> CandidateMotions:
@@ -136,9 +134,7 @@ def mask(*numbers: int, of: int) -> np.ndarray:
 class TestLabels:
     """A pair of five features, of which two stood still, one moved, and two are new."""
 
-    BEFORE = propagated(
-        5, (rows(0, 1, 2), rows(4, 0, 2)), np.zeros(3), mask(0, 1, of=3), mask(2, of=3), rows()
-    )
+    BEFORE = propagated(5, (rows(0, 1, 2), rows(4, 0, 2)), np.zeros(3), mask(0, 1, of=3), mask(2, of=3), rows())
 
     def test_they_follow_the_matches(self):
         np.testing.assert_array_equal(self.BEFORE, [STATIC, UNKNOWN, MOVING, UNKNOWN, STATIC])

@@ -80,9 +80,7 @@ def errors(run):
 def test_tracking_is_not_disturbed(tracked, tmp_path):
     """Nor by being broken off."""
     run = tracked.run
-    assert (
-        not run.log.lost().any() and not np.flatnonzero(run.log["relocalised"]).tolist() and not run.messages
-    )
+    assert not run.log.lost().any() and not np.flatnonzero(run.log["relocalised"]).tolist() and not run.messages
     assert errors(run).max() < 0.05
     again = resumed(tracked, tmp_path, lambda t, image: image)
     assert again.log.poses == pytest.approx(run.log.poses, abs=1e-9)
@@ -153,9 +151,7 @@ def place(tracked):
     truth = SE3.retract(path(FRAMES)[60], np.array([0.05, -0.1, 0.2, 0.1, -0.1, 0.15]))
     start = SE3.compose(belief.state[belief.mode][:7], SE3.inverse(run.log.poses[-1]))
     finder = Relocaliser(run.system.sensor, RECOVERY)
-    return Place(
-        finder, belief, run.system.loss.trusted[0], SE3.compose(start, truth), view(texture(), truth)
-    )
+    return Place(finder, belief, run.system.loss.trusted[0], SE3.compose(start, truth), view(texture(), truth))
 
 
 def test_the_spread_of_worlds_is_carried_to_the_pose_found():
@@ -270,9 +266,7 @@ def test_corners_are_found_again_on_their_lines(last, motion):
     assert right.mean() > 0.9
     sharp = last.refine_px(image, rows, sights, there)
     # Across its line: what is left of the depth is along it.
-    before, after = (
-        np.median(squared_distances(CAMERA, there[None], s)[0] * s.std_px**2) for s in (sights, sharp)
-    )
+    before, after = (np.median(squared_distances(CAMERA, there[None], s)[0] * s.std_px**2) for s in (sights, sharp))
     assert after < 0.5 * before
     assert (squared_distances(CAMERA, there[None], sharp)[0][right] <= GATE).mean() > 0.8
 

@@ -73,9 +73,7 @@ def test_the_prior_proposal(log, kind):
     What the latter clips, a quarter of these true measurements, updates the landmarks all the same.
     """
     likelihood = replace(StereoConfig().likelihood, kind=kind)
-    run = filtered(
-        log, replace(CONFIG, particles=400, likelihood=likelihood, proposal=ProposalConfig("prior"))
-    )
+    run = filtered(log, replace(CONFIG, particles=400, likelihood=likelihood, proposal=ProposalConfig("prior")))
     assert rmse(log, run.log.poses) < rmse(log, run.log["odometry"])
     assert np.isfinite(run.log["log_evidence"]).all() == (kind == "outliers")
 

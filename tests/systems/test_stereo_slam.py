@@ -165,9 +165,7 @@ class TestTrack:
             held = slam.arrays() | slam.filter.history.arrays()
             features = len(landmarks.ids)
             started = landmarks.manager.next_name
-            sizes.append(
-                (sum(array.nbytes for array in held.values()), slam.map().ids.size, features, started)
-            )
+            sizes.append((sum(array.nbytes for array in held.values()), slam.map().ids.size, features, started))
         size, landmarks, features, started = np.array(sizes).T
         # What a landmark, a feature, and five steps of 60 paths take; nothing else, and nothing for what was dropped.
         per = 36 * 4 + 9 * 8, 8 * (3 + 9 + 4) + 36 * 4

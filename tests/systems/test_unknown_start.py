@@ -175,9 +175,7 @@ def test_frames_that_hang_too_little_together_are_said(monkeypatch):
 
 
 def test_poses_between_are_on_the_way():
-    ends = SE3.retract(
-        SE3.identity(), np.array([[0.0] * 6, [0.0, 0.0, 0.4, 1.0, 0.0, 0.0], [0.2, 0, 0, 0, 0, 0]])
-    )
+    ends = SE3.retract(SE3.identity(), np.array([[0.0] * 6, [0.0, 0.0, 0.4, 1.0, 0.0, 0.0], [0.2, 0, 0, 0, 0, 0]]))
     times = np.array([0, 10, 30])
     found = between(times, ends[None], np.array([-5, 0, 5, 10, 20, 30, 40]))
     assert found.shape == (7, 1, 7)

@@ -45,17 +45,13 @@ def scene(
         )
         z = camera.project(local) + np.einsum("kij,kj->ki", factor, rng.normal(size=(len(seen), camera.dim)))
         images.append(FeatureFrame(100_000_000 * step, names[seen], z, factor @ factor.mT))
-    truth = CameraTruth(
-        np.array([f.stamp_ns for f in images]), path, dict(zip(names.tolist(), places, strict=True))
-    )
+    truth = CameraTruth(np.array([f.stamp_ns for f in images]), path, dict(zip(names.tolist(), places, strict=True)))
     return FeatureLog("small scene", camera, images, _known(names[:known], places[:known], rng), truth)
 
 
 def _walk(frames: int, rng: np.random.Generator) -> Array:
     path = [FIRST]
-    for turn, shift in zip(
-        rng.normal(scale=0.03, size=(frames - 1, 3)), rng.normal(size=(frames - 1, 3)), strict=True
-    ):
+    for turn, shift in zip(rng.normal(scale=0.03, size=(frames - 1, 3)), rng.normal(size=(frames - 1, 3)), strict=True):
         step = np.array([0.1, 0.02, 0.03]) + 0.02 * shift
         path.append(SE3.retract(path[-1], np.concatenate([turn, step])))
     return np.array(path)

@@ -44,9 +44,7 @@ class StillCamera:
 
     def build(self, rng: np.random.Generator) -> Scene:
         depth = rng.uniform(1.0, 6.0, (self.points, 1))
-        points = depth * np.concatenate(
-            [rng.uniform(-0.45, 0.45, (self.points, 2)), np.ones_like(depth)], axis=1
-        )
+        points = depth * np.concatenate([rng.uniform(-0.45, 0.45, (self.points, 2)), np.ones_like(depth)], axis=1)
         present = np.tile([0, self.frames], (self.points, 1))
         stamps = np.arange(self.frames) * 10**8
         path = SE3.identity((self.frames,))

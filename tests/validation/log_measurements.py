@@ -25,9 +25,7 @@ def from_log(log: RobotLog, start: Array | None = None) -> Measurements:
         start=space.identity() if start is None else start,
         stamps_ns=np.array([frame.stamp_ns for frame in log.frames], dtype=np.int64),
         deltas=np.array([frame.delta for frame in moves]).reshape(-1, space.size),
-        covs=gaussian.symmetrise(
-            np.array([frame.cov_delta for frame in moves]).reshape(-1, space.dim, space.dim)
-        ),
+        covs=gaussian.symmetrise(np.array([frame.cov_delta for frame in moves]).reshape(-1, space.dim, space.dim)),
         steps=np.repeat(np.arange(len(log.frames)), [len(frame.z) for frame in log.frames]),
         landmarks=stacked("landmarks", ()).astype(np.int64),
         z=stacked("z", (point,)),

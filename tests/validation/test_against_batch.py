@@ -131,9 +131,7 @@ def test_without_known_points_neither_the_scale_nor_its_uncertainty_matters(std_
     log, estimate = camera_problem()
     first = estimate.world_from_body[0, 4:]
     out = estimate.landmarks.mean - first
-    points = replace(
-        estimate.landmarks, cov=estimate.landmarks.cov + std_scale**2 * out[:, :, None] * out[:, None]
-    )
+    points = replace(estimate.landmarks, cov=estimate.landmarks.cov + std_scale**2 * out[:, :, None] * out[:, None])
     along = SE3.rotation(estimate.world_from_body).mT @ (estimate.world_from_body[:, 4:] - first)[..., None]
     covs = estimate.cov_poses.copy()
     covs[:, 3:, 3:] += std_scale**2 * along @ along.mT
@@ -191,9 +189,7 @@ def test_a_run_over_images_is_read_from_its_folder(tmp_path):
     log, estimate = camera_problem()
     write_measurements(tmp_path, log)
     steps = len(estimate.stamps_ns)
-    write_trajectory(
-        tmp_path, estimate.stamps_ns, estimate.world_from_body, np.tile(np.eye(6), (steps, 1, 1))
-    )
+    write_trajectory(tmp_path, estimate.stamps_ns, estimate.world_from_body, np.tile(np.eye(6), (steps, 1, 1)))
     write_summary(tmp_path, {})
     rays = np.arange(len(estimate.landmarks.ids)) < 2
     write_map(tmp_path, replace(estimate.landmarks, columns={"ray": rays.astype(int)}))

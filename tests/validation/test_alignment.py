@@ -105,9 +105,7 @@ def test_poses_move_as_the_points_of_their_body_do():
     world_from_body = SE3.exp(rng.normal(size=(4, 6)))
     body_points = rng.normal(size=(4, 3))
     after = SE3.transform(moved.transform_poses(world_from_body), 2.5 * body_points)
-    np.testing.assert_allclose(
-        after, moved.transform(SE3.transform(world_from_body, body_points)), atol=1e-12
-    )
+    np.testing.assert_allclose(after, moved.transform(SE3.transform(world_from_body, body_points)), atol=1e-12)
 
 
 def test_fit_keeps_a_similarity_that_is_given_and_none_changes_nothing():

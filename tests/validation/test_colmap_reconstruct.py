@@ -26,9 +26,7 @@ FEW = ReconstructionOptions(every=1, features=800)
 
 def rendered(folder, frames, camera=CAMERA, every=15):
     """Frames of a desk, far enough apart to be key frames."""
-    simulate_images(
-        TexturedDesk(frames=frames, texel_m=0.004), Imaging(known=0, noise_std=1.0), camera, folder, seed=2
-    )
+    simulate_images(TexturedDesk(frames=frames, texel_m=0.004), Imaging(known=0, noise_std=1.0), camera, folder, seed=2)
     opened = open_stereo if isinstance(camera, RectifiedStereo) else open_images
     return opened(folder), replace(FEW, every=every)
 
@@ -138,9 +136,7 @@ def test_a_straight_path_does_not_let_the_cloud_roll_about_it():
     reference = Trajectory(ours.stamps_ns, poses)
     shaken = poses + np.pad(rng.normal(scale=1e-3, size=(8, 3)), ((0, 0), (4, 0)))
     turn = SE3.exp(np.array([0.5, -1.0, 0.3, 1.0, 2.0, 3.0]))
-    world = replace(
-        ours, world_from_camera=SE3.compose(turn, shaken), points=SE3.transform(turn, ours.points)
-    )
+    world = replace(ours, world_from_camera=SE3.compose(turn, shaken), points=SE3.transform(turn, ours.points))
     moved = compare_with_path(world, reference, ours.points)
     by_cameras, by_centres = (
         np.linalg.norm(move.transform(world.points) - ours.points, axis=1).max()

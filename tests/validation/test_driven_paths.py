@@ -41,9 +41,7 @@ def test_it_goes_where_it_faces(drive: Drive) -> None:
     np.testing.assert_allclose(wrapped, 1.0, atol=1e-9)
     for axis, part in enumerate((np.cos(theta), np.sin(theta)), start=1):
         gone = cumulative_trapezoid(part, path.way_m, initial=0.0)
-        np.testing.assert_allclose(
-            path.world_from_robot[:, axis] - path.world_from_robot[0, axis], gone, atol=1e-6
-        )
+        np.testing.assert_allclose(path.world_from_robot[:, axis] - path.world_from_robot[0, axis], gone, atol=1e-6)
     assert (np.diff(path.way_m) >= -1e-12).all()
 
 

@@ -63,9 +63,7 @@ def test_a_model_read_back_by_colmap_has_our_poses_points_tracks_and_residuals(t
     assert model.num_images() == 5 and model.num_points3D() == 12
     for t, pose in enumerate(log.truth.world_from_camera):
         image = model.find_image_with_name(image_name(t))
-        assert SE3.local(pose, from_colmap_pose(image.cam_from_world())) == pytest.approx(
-            np.zeros(6), abs=1e-12
-        )
+        assert SE3.local(pose, from_colmap_pose(image.cam_from_world())) == pytest.approx(np.zeros(6), abs=1e-12)
     table = observation_table(log)
     points = np.array([log.truth.landmarks[name] for name in table.names.tolist()])
     ours = np.linalg.norm(reprojection(table, log.truth.world_from_camera, points)[0], axis=1)
@@ -141,7 +139,5 @@ def test_bad_input_is_refused(tmp_path):
     with pytest.raises(InputError, match="4 poses and 3 frames"):
         colmap_model(estimate_of(log), shorter)
     with pytest.raises(InputError, match="row 1"):
-        write_ply(
-            tmp_path / "a.ply", np.array([[0, 0, 0], [0, np.nan, 0.0]]), np.zeros((2, 3), dtype=np.uint8)
-        )
+        write_ply(tmp_path / "a.ply", np.array([[0, 0, 0], [0, np.nan, 0.0]]), np.zeros((2, 3), dtype=np.uint8))
     assert not list(tmp_path.iterdir())

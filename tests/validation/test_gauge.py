@@ -26,9 +26,7 @@ from rbpf.validation.metrics.scores import score_landmarks
 from rbpf.validation.simulation.robot import RobotWorld, simulated_log
 
 STEPS = 200
-AWAY = Similarity(
-    2.5, SE3.rotation(SE3.exp(np.array([[0.4, -0.7, 1.1, 0, 0, 0]])))[0], np.array([3.0, -1.0, 7.0])
-)
+AWAY = Similarity(2.5, SE3.rotation(SE3.exp(np.array([[0.4, -0.7, 1.1, 0, 0, 0]])))[0], np.array([3.0, -1.0, 7.0]))
 
 
 @pytest.fixture(scope="module")

@@ -79,9 +79,7 @@ def test_the_optimum_and_its_covariance_are_scipys(dim, kind, singular, noise):
     assert np.abs(m.space.local(expected.world_from_robot, found.world_from_robot)).max() < 1e-6 * noise
     names = sorted(found.landmarks)
     assert names == np.unique(m.landmarks).tolist()
-    np.testing.assert_allclose(
-        [found.landmarks[name] for name in names], expected.landmarks, atol=1e-6 * noise
-    )
+    np.testing.assert_allclose([found.landmarks[name] for name in names], expected.landmarks, atol=1e-6 * noise)
     assert_same_covariances(found.cov_poses, expected.cov_poses)
     assert_same_covariances([found.cov_landmarks[name] for name in names], expected.cov_landmarks)
 
@@ -128,8 +126,7 @@ def test_a_robust_loss_is_opt_in_and_is_hubers():
     # SciPy's numeric derivatives stop a little short of the kinked loss' minimum.
     assert np.abs(SE2.local(expected.world_from_robot, robust.world_from_robot)).max() < 1e-4
     off = [
-        np.linalg.norm(s.landmarks[int(m.landmarks[5])] - clean.landmarks[int(m.landmarks[5])])
-        for s in (plain, robust)
+        np.linalg.norm(s.landmarks[int(m.landmarks[5])] - clean.landmarks[int(m.landmarks[5])]) for s in (plain, robust)
     ]
     assert off[0] > 5 * off[1]
 
@@ -149,9 +146,7 @@ def first_steps(m, count):
     """What had been measured after so many steps."""
     rows = m.steps < count
     kept = {name: getattr(m, name)[rows] for name in ("steps", "landmarks", "z", "cov_z")}
-    return replace(
-        m, stamps_ns=m.stamps_ns[:count], deltas=m.deltas[: count - 1], covs=m.covs[: count - 1], **kept
-    )
+    return replace(m, stamps_ns=m.stamps_ns[:count], deltas=m.deltas[: count - 1], covs=m.covs[: count - 1], **kept)
 
 
 @pytest.mark.parametrize("singular", [False, True])
@@ -223,9 +218,7 @@ def test_bad_input_is_refused_in_words():
     with pytest.raises(InputError, match=re.escape("every landmark seen, landmark 7 is missing")):
         solve(
             m,
-            initial=InitialEstimate(
-                start.world_from_robot, {k: v for k, v in start.landmarks.items() if k != 7}
-            ),
+            initial=InitialEstimate(start.world_from_robot, {k: v for k, v in start.landmarks.items() if k != 7}),
         )
     with pytest.raises(InputError, match=re.escape("found poses of shape (3, 3)")):
         solve(m, initial=InitialEstimate(start.world_from_robot[:3], start.landmarks))

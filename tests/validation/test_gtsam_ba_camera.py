@@ -114,9 +114,7 @@ def test_without_known_points_the_first_pose_and_the_scale_are_held(camera):
     log = scene(camera, known=0)
     start = estimate(log)
     found = solve_features(log, start)
-    np.testing.assert_allclose(
-        SE3.local(start.world_from_camera[0], found.world_from_camera[0]), 0, atol=1e-9
-    )
+    np.testing.assert_allclose(SE3.local(start.world_from_camera[0], found.world_from_camera[0]), 0, atol=1e-9)
     np.testing.assert_array_equal(found.cov_poses[0], np.zeros((6, 6)))
     far = int(np.argmax(_distances(start.world_from_camera)))
     held, kept = _distances(found.world_from_camera)[far], _distances(start.world_from_camera)[far]
@@ -140,9 +138,7 @@ def _distances(path):
 
 def test_points_known_exactly_stay_where_they_are():
     log = scene()
-    exact = replace(
-        log, known=KnownPoints(log.known.names, log.known.positions, np.zeros_like(log.known.cov))
-    )
+    exact = replace(log, known=KnownPoints(log.known.names, log.known.positions, np.zeros_like(log.known.cov)))
     found = solve_features(exact, CameraEstimate(log.truth.world_from_camera, {}))
     tight = replace(log, known=KnownPoints(log.known.names, log.known.positions, 1e-6 * log.known.cov))
     near = solve_features(tight, estimate(log))
@@ -235,6 +231,4 @@ def test_a_landmark_that_nothing_determines_is_refused():
     weak = gtsam.noiseModel.Diagonal.Sigmas(np.array([1.0, 1.0, np.inf]))
     graph.push_back(gtsam.PriorFactorPoint3(last, values.atPoint3(last), weak))
     with pytest.raises(InputError, match="do not determine all poses and landmarks"):
-        marginals_by_schur(
-            graph, values, problem.pose_keys, problem.point_keys, problem.held_keys, problem.name
-        )
+        marginals_by_schur(graph, values, problem.pose_keys, problem.point_keys, problem.held_keys, problem.name)

@@ -73,13 +73,9 @@ def test_a_camera_is_located_from_four_points_of_a_plane(turn):
         pose = SE3.compose(away, np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, -0.8]))
         z = PLAIN.project(SE3.inverse_transform(pose, SQUARE)) + 0.1 * rng.normal(size=(4, 2))
         places = np.arange(4)
-        table = ObservationTable(
-            PLAIN, np.zeros(4, dtype=int), places, places, z, np.tile(0.01 * np.eye(2), (4, 1, 1))
-        )
+        table = ObservationTable(PLAIN, np.zeros(4, dtype=int), places, places, z, np.tile(0.01 * np.eye(2), (4, 1, 1)))
         assert (
-            np.abs(
-                SE3.local(pose, locate(table, {k: (p, np.zeros((3, 3))) for k, p in enumerate(SQUARE)})[0])
-            ).max()
+            np.abs(SE3.local(pose, locate(table, {k: (p, np.zeros((3, 3))) for k, p in enumerate(SQUARE)})[0])).max()
             < 0.02
         )
 
@@ -110,9 +106,7 @@ def test_a_stereo_pair_places_a_landmark_seen_once():
     once = shown(log, 2, np.array([7]), STEREO.project(point)[None])
     found = solve_features(once, true_start(log))
     assert found.undetermined == []
-    np.testing.assert_allclose(
-        SE3.inverse_transform(found.world_from_camera[2], found.landmarks[7]), point, atol=1e-6
-    )
+    np.testing.assert_allclose(SE3.inverse_transform(found.world_from_camera[2], found.landmarks[7]), point, atol=1e-6)
 
 
 def test_a_star_keeps_its_direction_and_helps_the_rotation():
@@ -160,9 +154,7 @@ def test_singular_noise_is_refused():
     cov_z = log.frames[1].cov_z.copy()
     cov_z[2] = np.diag([1.0, 0.0])
     frames = [log.frames[0], replace(log.frames[1], cov_z=cov_z), *log.frames[2:]]
-    with pytest.raises(
-        InputError, match=f"landmark {log.frames[1].landmarks[2]} in frame 1 of small scene is not"
-    ):
+    with pytest.raises(InputError, match=f"landmark {log.frames[1].landmarks[2]} in frame 1 of small scene is not"):
         solve_features(replace(log, frames=frames), true_start(log))
 
 
@@ -178,9 +170,7 @@ def test_a_frame_with_too_few_landmarks_is_refused():
 @pytest.mark.parametrize(("known", "whom"), [(4, "the known points"), (0, "frame 0")])
 def test_frames_apart_are_refused(known, whom):
     log = scene(known=known)
-    frames = [
-        replace(frame, landmarks=frame.landmarks + 1000 * (step > 2)) for step, frame in enumerate(log.frames)
-    ]
+    frames = [replace(frame, landmarks=frame.landmarks + 1000 * (step > 2)) for step, frame in enumerate(log.frames)]
     with pytest.raises(InputError, match=f"Frame 3 of small scene shares no landmark, .* with {whom}"):
         solve_features(replace(log, frames=frames), true_start(log))
 
@@ -206,9 +196,7 @@ def test_a_threshold_that_makes_no_sense_is_refused():
 def test_an_unusable_estimate_is_refused():
     log = scene(known=0)
     path, points = log.truth.world_from_camera, log.truth.landmarks
-    with pytest.raises(
-        InputError, match=re.escape("shape (6, 7), one for each frame of small scene, found (3, 7)")
-    ):
+    with pytest.raises(InputError, match=re.escape("shape (6, 7), one for each frame of small scene, found (3, 7)")):
         solve_features(log, CameraEstimate(path[:3], points))
     with pytest.raises(InputError, match="All initial poses of small scene are at one place"):
         solve_features(log, CameraEstimate(np.tile(path[:1], (6, 1)), points))

@@ -76,9 +76,7 @@ def test_monocular_configurations_are_compared_on_features():
             compare_evidence(*pair, log, range(2))
 
 
-APART = StereoConfig(
-    particles=60, odometry=OdometryConfig(split="apart"), likelihood=LikelihoodConfig(kind="gaussian")
-)
+APART = StereoConfig(particles=60, odometry=OdometryConfig(split="apart"), likelihood=LikelihoodConfig(kind="gaussian"))
 
 
 def test_stereo_configurations_are_compared_on_what_odometry_has_not_used():

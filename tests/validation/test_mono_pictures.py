@@ -31,9 +31,7 @@ def run(tmp_path_factory):
     camera = Pinhole(240, 180, 190.0, 190.0, 119.5, 89.5)
     world = TexturedDesk(frames=40, texel_m=0.003, hand=replace(OVER_DESK, speed_m_s=0.6, start_s=0.2))
     simulate_images(world, Imaging(noise_std=1.0), camera, folder, seed=1)
-    return filter_images(
-        open_images(folder), MonoConfig(particles=8), read_known_points(folder / "known_points.csv")
-    )
+    return filter_images(open_images(folder), MonoConfig(particles=8), read_known_points(folder / "known_points.csv"))
 
 
 def found(sighting):

@@ -147,9 +147,7 @@ def test_two_views_show_the_same_grey_levels(world: ImageWorld) -> None:
     ray = np.concatenate([DISTORTED.unproject(px), np.ones((120, 160, 1))], axis=-1)
     point = SE3.inverse_transform(second, SE3.transform(first, depth[..., None] * ray))
     other = DISTORTED.project(point)
-    far = map_coordinates(
-        renderer.depth(second)[0], np.moveaxis(other[..., ::-1], -1, 0), order=1, mode="nearest"
-    )
+    far = map_coordinates(renderer.depth(second)[0], np.moveaxis(other[..., ::-1], -1, 0), order=1, mode="nearest")
     same = DISTORTED.visible(point, 2.0) & (np.abs(far / point[..., 2] - 1.0) < 0.01)
     there = map_coordinates(renderer.image(second), np.moveaxis(other[..., ::-1], -1, 0), order=3)
     here = renderer.image(first)

@@ -101,9 +101,7 @@ def test_a_lens_spreads_an_edge_by_its_point_spread(tmp_path: Path) -> None:
 
 def test_what_cannot_be_done_is_refused_before_anything_is_written(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="frame 9"):
-        simulate_images(
-            TexturedDesk(frames=4, texel_m=0.01), Imaging(blackout=(9,)), CAMERA, tmp_path / "run", 0
-        )
+        simulate_images(TexturedDesk(frames=4, texel_m=0.01), Imaging(blackout=(9,)), CAMERA, tmp_path / "run", 0)
     with pytest.raises(InputError, match="corners that can be known"):
         simulate_images(GreyWall(), Imaging(), CAMERA, tmp_path / "run", 0)
     assert not any(tmp_path.iterdir())

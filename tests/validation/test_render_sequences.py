@@ -30,11 +30,7 @@ ROOM = TexturedRoom(frames=4, texel_m=0.02)
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    return {
-        str(path.relative_to(folder)): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
 def pictures(folder: Path, sensor: str = "cam0") -> np.ndarray:
@@ -114,9 +110,7 @@ def test_a_baseline_that_is_none(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("exact", [True, False])
 @pytest.mark.parametrize("world", [DESK, ROOM])
-def test_known_points_are_corners_seen_in_the_first_image(
-    world: ImageWorld, exact: bool, tmp_path: Path
-) -> None:
+def test_known_points_are_corners_seen_in_the_first_image(world: ImageWorld, exact: bool, tmp_path: Path) -> None:
     imaging = Imaging(known=8, known_std_m=0.02, known_exact=exact, noise_std=1.0, depth=True)
     simulate_images(world, imaging, CAMERA, tmp_path / "run", 1)
     table = np.genfromtxt(tmp_path / "run" / "known_points.csv", delimiter=",", names=True)
@@ -152,9 +146,7 @@ def test_a_chessboard_is_found_where_its_file_says(tmp_path: Path) -> None:
     (about,) = yaml.safe_load((tmp_path / "run" / "chessboard.yaml").read_text())
     size = about["columns"], about["rows"]
     assert size == (6, 4)
-    found, corners = cv2.findChessboardCornersSB(
-        cv2.resize(pictures(tmp_path / "run")[0], None, fx=4, fy=4), size
-    )
+    found, corners = cv2.findChessboardCornersSB(cv2.resize(pictures(tmp_path / "run")[0], None, fx=4, fy=4), size)
     assert found
     y, x = np.divmod(np.arange(24), 6)
     local = about["square_m"] * np.stack([x, y, 0 * x], axis=-1)

@@ -24,9 +24,7 @@ from rbpf.validation.simulation.lab import LabDrive
 from tests.validation.feature_logs import StillCamera, errors, likely, sightings, truth
 
 CAMERAS = [MONO, STEREO]
-FISHEYE = replace(
-    MONO, fx=262.0, fy=262.0, distortion=(-0.03, 0.02, -0.012, 0.002), distortion_model="equidistant"
-)
+FISHEYE = replace(MONO, fx=262.0, fy=262.0, distortion=(-0.03, 0.02, -0.012, 0.002), distortion_model="equidistant")
 DESK = DeskWorld(frames=200)
 STILL = StillCamera(frames=800)
 CHANGING = LabWorld(LabDrive(frames=150, every=4), points=3000)
@@ -49,9 +47,7 @@ def test_measurements_are_projections_with_the_stated_noise(
         np.testing.assert_allclose(frame.cov_z, np.tile(0.49 * np.eye(camera.dim), (len(frame.z), 1, 1)))
 
 
-@pytest.mark.parametrize(
-    "camera", [*CAMERAS, replace(MONO, distortion=(-0.28, 0.07, 2e-4, 2e-5, 0.0)), FISHEYE]
-)
+@pytest.mark.parametrize("camera", [*CAMERAS, replace(MONO, distortion=(-0.28, 0.07, 2e-4, 2e-5, 0.0)), FISHEYE])
 @pytest.mark.parametrize("world", [DESK, CHANGING])
 def test_only_what_is_visible_is_measured(world: PointWorld, camera: Pinhole | RectifiedStereo) -> None:
     measuring = Measuring(nearest_m=0.7, farthest_m=5.0)
@@ -158,10 +154,7 @@ def test_no_outlier_begins_a_landmark() -> None:
     log = simulate_features(CHANGING, Measuring(outlier_rate=0.5), MONO, seed=0)
     seen = sightings(log)
     residual = [f.z - MONO.project(truth(log, t)) for t, f in enumerate(log.frames)]
-    begun = [
-        residual[frames[0]][log.frames[frames[0]].landmarks.tolist().index(name)]
-        for name, frames in seen.items()
-    ]
+    begun = [residual[frames[0]][log.frames[frames[0]].landmarks.tolist().index(name)] for name, frames in seen.items()]
     assert len(begun) > 100
     assert np.abs(begun).max() < 6.0
 

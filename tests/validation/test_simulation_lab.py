@@ -160,9 +160,7 @@ def rendered(near: TexturedScene, tmp_path_factory: pytest.TempPathFactory) -> P
     return folder
 
 
-def warped(
-    image: np.ndarray, pose: np.ndarray, other: np.ndarray, renderer: Renderer
-) -> tuple[np.ndarray, np.ndarray]:
+def warped(image: np.ndarray, pose: np.ndarray, other: np.ndarray, renderer: Renderer) -> tuple[np.ndarray, np.ndarray]:
     """An image taken at a pose as it would look from another, and a mask of where both see one and the same plane."""
     depth, rows = renderer.depth(other)
     px = np.stack(np.meshgrid(np.arange(320.0), np.arange(240.0)), axis=-1)
@@ -191,9 +189,7 @@ def test_texture_is_in_both_images_where_the_truth_says(rendered: Path, near: Te
     sequence = open_stereo(rendered)
     assert sequence.baseline_m == 0.12 and sequence.truth is not None
     frames = list(sequence.frames())
-    left, right, later = (
-        np.asarray(image, float) for image in (frames[0].image, frames[0].right, frames[8].image)
-    )
+    left, right, later = (np.asarray(image, float) for image in (frames[0].image, frames[0].right, frames[8].image))
     renderer = Renderer(near.rectangles, CAMERA)
     first, last = sequence.truth.world_from_camera[[0, 8]]
     beside = SE3.compose(first, SE3.exp([0.0, 0.0, 0.0, 0.12, 0.0, 0.0]))
@@ -204,13 +200,9 @@ def test_texture_is_in_both_images_where_the_truth_says(rendered: Path, near: Te
         assert mask.mean() > 0.1
         assert np.abs(shift_px(expected, image, mask > 0)).max() < most
         # The measure itself: half a pixel is told from none.
-        half = cv2.warpAffine(
-            image, np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.0]]), (320, 240), flags=cv2.INTER_CUBIC
-        )
+        half = cv2.warpAffine(image, np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.0]]), (320, 240), flags=cv2.INTER_CUBIC)
         assert abs(shift_px(expected, half, mask > 0)[0] - 0.5) < 0.15
-        parts = [
-            shift_px(expected, image, (mask > 0) & (np.indices(mask.shape)[1] // 64 == k)) for k in range(5)
-        ]
+        parts = [shift_px(expected, image, (mask > 0) & (np.indices(mask.shape)[1] // 64 == k)) for k in range(5)]
         assert np.abs(parts).max() < most + 0.02
 
 
@@ -229,9 +221,7 @@ def test_the_folder_holds_what_the_wheels_say(rendered: Path) -> None:
 def test_images_can_be_jpeg(tmp_path: Path) -> None:
     camera = Pinhole(96, 72, 75.0, 75.0, 47.5, 35.5)
     scene = drawn()
-    two = replace(
-        scene, stamps_ns=scene.stamps_ns[:2], world_from_camera=scene.world_from_camera[:2], odometry=None
-    )
+    two = replace(scene, stamps_ns=scene.stamps_ns[:2], world_from_camera=scene.world_from_camera[:2], odometry=None)
     read = {}
     for quality in (0, 50, 95):
         imaging = Imaging(jpeg=quality, known=0, depth=True)

@@ -68,9 +68,7 @@ def test_without_innovations_there_is_no_statistic():
     assert motion_statistics(np.full((4, 2), np.nan), np.full((4, 2, 2), np.nan)) == []
 
 
-def corrections(
-    steps: int, bias: np.ndarray, scale: float, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
+def corrections(steps: int, bias: np.ndarray, scale: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """û = K (b + s w) + noise of the measurements, of a filter that expects N(0, K), K = I − M⁻¹."""
     info = rng.uniform(0.2, 5.0, size=(steps, 3, 1)) * np.eye(3)
     gain = info / (1.0 + info + 1e-300)

@@ -32,10 +32,7 @@ def test_what_each_feature_was(run):
     """New ones in the first pair, candidates in the second, landmarks from the third on; as many as were counted."""
     kinds = [np.bincount(seen["kind"], minlength=4) for seen in run.log.all_observed()]
     assert len(kinds) == COUNT and [kind.sum() for kind in kinds] == run.log["features"].tolist()
-    assert (
-        kinds[0][FeatureKind.NEW] > 5
-        and kinds[0][FeatureKind.LANDMARK] == kinds[0][FeatureKind.CANDIDATE] == 0
-    )
+    assert kinds[0][FeatureKind.NEW] > 5 and kinds[0][FeatureKind.LANDMARK] == kinds[0][FeatureKind.CANDIDATE] == 0
     assert kinds[1][FeatureKind.CANDIDATE] > 3 and kinds[1][FeatureKind.LANDMARK] == 0
     np.testing.assert_array_equal([k[FeatureKind.LANDMARK] for k in kinds], run.log["observed"])
     assert kinds[-1][FeatureKind.LANDMARK] > 5
@@ -49,9 +46,7 @@ def test_between_updates_all_are_features():
     assert (kind == FeatureKind.FEATURE).all() and len(kind) > 20
 
 
-@pytest.mark.parametrize(
-    "kind", [FeatureKind.FEATURE, FeatureKind.CANDIDATE, FeatureKind.LANDMARK, FeatureKind.NEW]
-)
+@pytest.mark.parametrize("kind", [FeatureKind.FEATURE, FeatureKind.CANDIDATE, FeatureKind.LANDMARK, FeatureKind.NEW])
 def test_a_feature_is_drawn_where_it_is(kind):
     """A cross at the left pixel, and a line as long as the disparity, at twice the size, below the caption."""
     seen = {"z": np.array([[60.0, 40.0, 30.0]]), "kind": np.array([kind])}

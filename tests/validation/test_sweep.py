@@ -151,9 +151,7 @@ def test_a_run_keeps_its_key_only_while_it_is_the_same(config):
     assert [job.key for job in read_plan(config)] == [job.key for job in jobs]
     file = SweepFile("range-bearing", ["log"], seeds=[5])
     (one,) = plan(file, config.parent)
-    (other,) = plan(
-        SweepFile("range-bearing", ["log"], seeds=[5], settings={"anchor_every": 3}), config.parent
-    )
+    (other,) = plan(SweepFile("range-bearing", ["log"], seeds=[5], settings={"anchor_every": 3}), config.parent)
     assert one.key != other.key
     assert one.given == {"seed": 5}
 
@@ -162,9 +160,7 @@ def test_a_run_keeps_its_key_only_while_it_is_the_same(config):
 def test_a_cluster_of_two_workers_gives_the_same_table(config, tmp_path):
     distributed = pytest.importorskip("distributed")
     jobs = read_plan(config)[:4]
-    with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
-    ) as cluster:
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster:
         rows = sweep(jobs, tmp_path / "cluster", scheduler=cluster.scheduler_address)
     assert steady(rows) == steady(sweep(jobs, tmp_path / "alone", workers=1))
 

@@ -139,9 +139,7 @@ def spoil_measurements(folder):
         (lambda folder: None, "colmap", "cannot be compared with colmap"),
     ],
 )
-def test_what_cannot_be_compared_is_one_sentence_and_the_report_is_written(
-    run_folder, spoil, against, message, capsys
-):
+def test_what_cannot_be_compared_is_one_sentence_and_the_report_is_written(run_folder, spoil, against, message, capsys):
     (run_folder / "validation_groundtruth.json").unlink()
     spoil(run_folder)
     (run_folder / "report.html").unlink()

@@ -140,9 +140,7 @@ def compare_with_truth(found: Reconstruction, truth: CameraTruth | None) -> Colm
         InputError: there is no truth, or too little of it.
     """
     if truth is None:
-        raise InputError(
-            f"{found.name} has no ground truth to compare with; compare with a run's path instead."
-        )
+        raise InputError(f"{found.name} has no ground truth to compare with; compare with a run's path instead.")
     rows, poses = poses_at(SE3, truth.stamps_ns, truth.world_from_camera, found.stamps_ns)
     if len(rows) < LEAST_FRAMES:
         raise InputError(

@@ -220,9 +220,7 @@ def _reconstruct(sequence: ImageSequence, options: ReconstructionOptions, folder
 
 def _side(model: Any, side: int) -> dict[int, Array]:
     """Poses (7,) by frame, of the left (0) or right (1) images."""
-    found = [
-        image for image in model.images.values() if image.has_pose and image.name.endswith(f"_{side}.png")
-    ]
+    found = [image for image in model.images.values() if image.has_pose and image.name.endswith(f"_{side}.png")]
     return {int(image.name.split("_")[0]): from_colmap_pose(image.cam_from_world()) for image in found}
 
 

@@ -55,9 +55,7 @@ LEAST_STEPS = 3
 """Of a run that is compared."""
 
 SAME = "one world: nothing to fix"
-SCALED = (
-    "the filter scaled about the first camera onto the optimum; densities across the line from that camera"
-)
+SCALED = "the filter scaled about the first camera onto the optimum; densities across the line from that camera"
 
 
 @final
@@ -209,10 +207,6 @@ def compare(
 def _require_one_run(filtered: PathAndMap, problem: Problem) -> None:
     stamps, name = stamps_of(problem), name_of(problem)
     if len(stamps) != len(filtered.stamps_ns) or (stamps != filtered.stamps_ns).any():
-        raise InputError(
-            f"{name}: path and measurements do not share their time stamps; take both from one run."
-        )
+        raise InputError(f"{name}: path and measurements do not share their time stamps; take both from one run.")
     if len(stamps) < LEAST_STEPS:
-        raise InputError(
-            f"{name} has {len(stamps)} steps, expected {LEAST_STEPS} or more to compare with a batch."
-        )
+        raise InputError(f"{name} has {len(stamps)} steps, expected {LEAST_STEPS} or more to compare with a batch.")

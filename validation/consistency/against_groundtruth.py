@@ -146,9 +146,7 @@ def _in_gauge(
 
     motion = least_squares(lambda x: errors(x).ravel(), np.zeros(space.dim), method="lm").x
     turn = space.exp(motion)
-    landmarks = {
-        name: space.transform(turn, plane.transform(point)) for name, point in truth.landmarks.items()
-    }
+    landmarks = {name: space.transform(turn, plane.transform(point)) for name, point in truth.landmarks.items()}
     there = RunTruth(truth.rows, space.compose(turn, moved), landmarks, truth.alignment)
     return WhitenedErrors(errors(motion), ranks), there, space.dim
 

@@ -56,9 +56,7 @@ def compare_with_batch(record: RunFolder, optimum: Optimum | None = None) -> tup
         if residuals > 0:
             value = 2.0 * found.optimum.error / residuals
             statistics.insert(0, variance_ratio(RESIDUALS, value, residuals, NOISE_FACTOR))
-    accuracy = (
-        f"The path is {1e3 * found.path.rmse:.3g} mm (rms) from the batch optimum of the same measurements"
-    )
+    accuracy = f"The path is {1e3 * found.path.rmse:.3g} mm (rms) from the batch optimum of the same measurements"
     return Comparison(GTSAM, f"{accuracy}.", figures | _densities(found), statistics), found
 
 

@@ -79,9 +79,7 @@ class EvidenceDifference:
         found = f"{both}, difference {difference:.1f} ± {error:.1f}"
         if abs(difference) <= CLEAR * error:
             if self.spread > NOISY:
-                return (
-                    f"Too random to tell ({found}, {self.spread:.1f} from seed to seed): use more particles."
-                )
+                return f"Too random to tell ({found}, {self.spread:.1f} from seed to seed): use more particles."
             return f"{name_a} and {name_b} explain the recording equally well ({found})."
         return f"{better} explains the recording better than {worse} ({found})."
 
@@ -126,9 +124,7 @@ def compare_evidence(
     from joblib import Parallel, delayed
 
     if type(config_a) is not type(config_b):
-        raise InputError(
-            "two configurations of different systems do not explain the same data: compare two of one"
-        )
+        raise InputError("two configurations of different systems do not explain the same data: compare two of one")
     if len(seeds) < 2:
         raise InputError(f"log-evidences are compared over 2 seeds or more, got {len(seeds)}")
     for name, config in (("first", config_a), ("second", config_b)):
@@ -190,13 +186,9 @@ def compare_runs(
                 "settings do not explain the same data; compare them on a FeatureLog by compare_evidence"
             )
         if record.system != "range-bearing":
-            raise InputError(
-                f"{record.folder}: runs of the system {record.system!r} cannot be compared by evidence"
-            )
+            raise InputError(f"{record.folder}: runs of the system {record.system!r} cannot be compared by evidence")
     if len({record.config.get("recording") for record in records}) > 1:
-        raise InputError(
-            f"{run_a} and {run_b} are runs over different recordings: evidences say nothing about them"
-        )
+        raise InputError(f"{run_a} and {run_b} are runs over different recordings: evidences say nothing about them")
     configs = [_config_of(record) for record in records]
     recording = Path(str(records[0].config["recording"]))
     return compare_evidence(configs[0], configs[1], recording, range(seeds), workers, on_run)
@@ -234,9 +226,7 @@ def _evidence(config: Config, data: Data) -> float:
         if isinstance(data, Path):
             data = open_log(data, config.noise)
         elif config.noise.given():
-            raise InputError(
-                "a log that was read already has its noise: give the recording's path to change it"
-            )
+            raise InputError("a log that was read already has its noise: give the recording's path to change it")
         if isinstance(data, RobotLog):
             return float(filter_robot_log(data, config).system.filter.log_evidence)
     elif isinstance(data, FeatureLog):

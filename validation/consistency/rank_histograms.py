@@ -115,9 +115,7 @@ def plot_ranks(ranks: Ranks, out: Path, name: str = "ranks.png") -> list[str]:
     for axes, title, counts, p in columns:
         axes.stairs(counts, edges, fill=True, color=COLOURS["filter"])
         axes.axhspan(*ranks.band(), color=COLOURS["known"], alpha=0.25, label="95 % of the bins, if right")
-        axes.set(
-            title=f"{title} (p = {p:.2g})", xlabel="posterior fraction below the truth", ylabel="simulations"
-        )
+        axes.set(title=f"{title} (p = {p:.2g})", xlabel="posterior fraction below the truth", ylabel="simulations")
         axes.set_ylim(bottom=0.0)
         axes.legend(loc="lower center", fontsize="small")
     return save_figures({name: figure}, out)

@@ -244,15 +244,11 @@ def map_ratio(name: str, positions: np.ndarray, white: np.ndarray) -> Statistic:
     fitted = design @ np.linalg.lstsq(design, white, rcond=None)[0]
     count = min(design.shape[1] * white.shape[1], white.size)
     smooth, rest = float(np.square(fitted).sum()), float(np.square(white - fitted).sum())
-    dof = (
-        (smooth + rest) ** 2 / (smooth**2 / count + rest**2 / max(white.size - count, 1)) if value else count
-    )
+    dof = (smooth + rest) ** 2 / (smooth**2 / count + rest**2 / max(white.size - count, 1)) if value else count
     return variance_ratio(name, value, max(dof, 1.0), STATE_FACTOR)
 
 
-def step_ratio(
-    name: str, squares: np.ndarray, dofs: np.ndarray, factor: float = NOISE_FACTOR
-) -> Statistic | None:
+def step_ratio(name: str, squares: np.ndarray, dofs: np.ndarray, factor: float = NOISE_FACTOR) -> Statistic | None:
     """Ratio of squared errors (T,), each χ² of `dofs` (T,) for an consistent filter and independent from step to step.
 
     Where the steps are correlated, or scatter more than χ² does, they count for less. None without any.
@@ -305,9 +301,7 @@ def _bias(correction: np.ndarray, cov: np.ndarray, excess: float) -> Statistic |
     worst = int(np.argmax(lows)) if lows.any() else int(np.argmax(np.abs(along) + margin * std))
     size = float(np.abs(along[worst]))
     top = float((np.abs(along) + margin * std).max())
-    return Statistic(
-        "bias of the motion", size, float(lows[worst]), top, (-np.inf, BIAS), len(correction), "bias"
-    )
+    return Statistic("bias of the motion", size, float(lows[worst]), top, (-np.inf, BIAS), len(correction), "bias")
 
 
 def coverage(
@@ -334,9 +328,7 @@ def coverage(
         zone = (float(chi2.cdf(bound / STATE_FACTOR**2, dim)), float(chi2.cdf(bound * STATE_FACTOR**2, dim)))
         name = f"poses inside the {100 * probability:g} % region"
         out.append(
-            Statistic(
-                name, fraction, low, high, (zone[0], zone[1] if zone[1] < 0.999 else 1.0), samples, "share"
-            )
+            Statistic(name, fraction, low, high, (zone[0], zone[1] if zone[1] < 0.999 else 1.0), samples, "share")
         )
     return out
 

@@ -114,9 +114,7 @@ class Verdict:
         return self.path.sentence, f"{_OPENINGS[self.trust]}: {_LEANINGS[self.leaning]}{self.reason}."
 
 
-def judge(
-    statistics: Sequence[Statistic], independent: Sequence[str] = (), path: PathGrade | None = None
-) -> Verdict:
+def judge(statistics: Sequence[Statistic], independent: Sequence[str] = (), path: PathGrade | None = None) -> Verdict:
     """The verdict.
 
     Args:
@@ -127,11 +125,7 @@ def judge(
     path = path or PathGrade()
     against = [s for s in statistics if s.outcome == "contradicts"]
     if against:
-        more = (
-            f" ({len(against) - 1} more of {len(statistics)} statistics contradict it)"
-            if len(against) > 1
-            else ""
-        )
+        more = f" ({len(against) - 1} more of {len(statistics)} statistics contradict it)" if len(against) > 1 else ""
         # Those that say that it errs more than it claims; else those that may say that it errs less.
         daring = [s for s in against if (s.high < s.zone[0]) == (s.kind == "share")]
         witnesses = [s for s in against if s.name in independent]
@@ -139,9 +133,7 @@ def judge(
         if daring or witnesses:
             leaning: Leaning = "over-confident" if daring else "cautious"
             return Verdict(path, "do not trust", described(worst) + more, leaning)
-        reason = (
-            f"{described(worst)}{more}; the noise is not the stated one, and to which side the poses err "
-        )
+        reason = f"{described(worst)}{more}; the noise is not the stated one, and to which side the poses err "
         return Verdict(path, "do not trust", f"{reason}innovations do not tell")
     judging = [s for s in statistics if s.name in independent]
     support = [s for s in judging if s.outcome == "supports"]

@@ -80,9 +80,7 @@ def read_problem(folder: Path) -> Problem:
         InputError: there are none, or a file is malformed.
     """
     if not (folder / OBSERVATIONS).exists():
-        raise InputError(
-            f"{folder} holds no {OBSERVATIONS}: expected the folder of a finished run of this version."
-        )
+        raise InputError(f"{folder} holds no {OBSERVATIONS}: expected the folder of a finished run of this version.")
     return read_measurements(folder)
 
 
@@ -100,11 +98,7 @@ def stamps_of(problem: Problem) -> NDArray[np.int64]:
 
 def floats_in_scale(problem: Problem) -> bool:
     """Whether nothing in the measurements tells the scale: one camera and no known points."""
-    return (
-        isinstance(problem, FeatureLog)
-        and problem.known is None
-        and not isinstance(problem.camera, RectifiedStereo)
-    )
+    return isinstance(problem, FeatureLog) and problem.known is None and not isinstance(problem.camera, RectifiedStereo)
 
 
 def solve_problem(

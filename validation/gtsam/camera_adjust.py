@@ -62,9 +62,7 @@ def check_problem(problem: CameraProblem) -> None:
     ends = np.concatenate([table.index + problem.frames, known])
     starts = np.concatenate([table.steps, np.repeat(known[:1], len(known))])
     size = problem.frames + len(table.names)
-    _, piece = connected_components(
-        csr_array((np.ones(len(ends)), (starts, ends)), shape=(size, size)), False
-    )
+    _, piece = connected_components(csr_array((np.ones(len(ends)), (starts, ends)), shape=(size, size)), False)
     first = piece[known[0]] if known.size else piece[0]
     if (apart := np.flatnonzero(piece[: problem.frames] != first)).size:
         raise InputError(
@@ -74,9 +72,7 @@ def check_problem(problem: CameraProblem) -> None:
     if problem.known:
         positions = np.array([position for position, _ in problem.known.values()])
         if len(positions) < LEAST:
-            raise InputError(
-                f"{name} sees {len(positions)} known points, expected {LEAST} or more, or none at all."
-            )
+            raise InputError(f"{name} sees {len(positions)} known points, expected {LEAST} or more, or none at all.")
         spread = np.linalg.svd(positions - positions.mean(0), compute_uv=False)
         if spread[1] <= LINE * spread[0]:
             raise InputError(f"The known points that {name} sees lie on a line; add one beside it.")

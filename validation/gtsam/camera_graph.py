@@ -188,14 +188,10 @@ class CameraProblem:
                 return reprojection(self.table, state.path, state.points)
 
             together = Together(evaluate)
-            return self.factors_by_row(
-                lambda row, model, pose, point: together.factor(row, [pose, point], model)
-            )
+            return self.factors_by_row(lambda row, model, pose, point: together.factor(row, [pose, point], model))
         return self.factors_by_row(lambda row, model, pose, point: kind(z[row], model, pose, point, lens))
 
-    def factors_by_row(
-        self, make: Callable[[int, Any, int, int], Any], order: list[int] | None = None
-    ) -> list[Any]:
+    def factors_by_row(self, make: Callable[[int, Any, int, int], Any], order: list[int] | None = None) -> list[Any]:
         """A factor of each row of the table.
 
         Args:
@@ -203,9 +199,7 @@ class CameraProblem:
             order: a factor's residual is ours[order]; by default ours.
         """
         models, out = dict[bytes, Any](), []
-        for row, (step, index) in enumerate(
-            zip(self.table.steps.tolist(), self.table.index.tolist(), strict=True)
-        ):
+        for row, (step, index) in enumerate(zip(self.table.steps.tolist(), self.table.index.tolist(), strict=True)):
             cov = self.table.cov_z[row]
             code = cov.tobytes()
             if code not in models:

@@ -103,9 +103,7 @@ def resect(table: ObservationTable, known: Known, near: Array, info: Array) -> t
         points = np.array([known[name][0] for name in part.names.tolist()])
         state = CameraState(start[None], points)
         graph = problem.graph(state, np.zeros(len(points), dtype=bool), state.path)
-        prior = gtsam.PriorFactorPose3(
-            problem.pose_keys[0], SPATIAL.pose(near), noise(np.asarray(np.linalg.inv(info)))
-        )
+        prior = gtsam.PriorFactorPose3(problem.pose_keys[0], SPATIAL.pose(near), noise(np.asarray(np.linalg.inv(info))))
         graph.push_back(prior)
         values, _, _ = levenberg_marquardt(graph, problem.values(state), _FOUND)
         return graph, values, problem
@@ -180,9 +178,7 @@ class _Growth:
             part = self.table.rows(seen)
             part = replace(part, steps=np.zeros_like(part.steps))
             at = np.searchsorted(self.table.names, part.names)
-            known = dict(
-                zip(part.names.tolist(), zip(self.points[at], self.cov[at], strict=True), strict=True)
-            )
+            known = dict(zip(part.names.tolist(), zip(self.points[at], self.cov[at], strict=True), strict=True))
             if step:
                 far = _MOTION * self._distance(at, step)
                 info = np.diag(np.repeat([_MOTION, far], 3) ** -2.0)

@@ -91,9 +91,7 @@ def adjust_log(
     """
     frames = connected_frames(log)
     if frames.size < 2:
-        raise InputError(
-            f"{log.name}: no two frames share the {LEAST} landmarks that a batch adjustment needs of each"
-        )
+        raise InputError(f"{log.name}: no two frames share the {LEAST} landmarks that a batch adjustment needs of each")
     part = replace(log, frames=[log.frames[t] for t in frames], known=softened(log.known))
     watch = _Watch(most_iterations(part) if most is None else most, on_iteration)
     start = CameraEstimate(world_from_camera[frames], {})
@@ -132,9 +130,7 @@ def _best(
     for start in starts:
         try:
             found.append(
-                solve_features(
-                    log, start, robust=robust, marginals=False, on_iteration=watch, tolerance=tolerance
-                )
+                solve_features(log, start, robust=robust, marginals=False, on_iteration=watch, tolerance=tolerance)
             )
         except InputError as error:
             problem = error
@@ -175,9 +171,7 @@ def _with_the_first(
     ends = np.concatenate([index, of_group]) + frames
     starts = np.concatenate([steps, frames + np.repeat(of_group[:1], of_group.size)])
     size = frames + known.size
-    _, piece = connected_components(
-        csr_array((np.ones(ends.size), (starts, ends)), shape=(size, size)), False
-    )
+    _, piece = connected_components(csr_array((np.ones(ends.size), (starts, ends)), shape=(size, size)), False)
     anchor = frames + of_group[0] if of_group.size else steps[0]
     return np.asarray(piece[:frames] == piece[anchor])
 

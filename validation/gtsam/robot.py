@@ -103,9 +103,7 @@ def solve(
     return _explained(problem, lambda: _solve(problem, marginals, initial, incremental))
 
 
-def _solve(
-    problem: "Problem", marginals: bool, initial: InitialEstimate | None, incremental: bool
-) -> BatchSolution:
+def _solve(problem: "Problem", marginals: bool, initial: InitialEstimate | None, incremental: bool) -> BatchSolution:
     m, graph = problem.m, problem.graph()
     if incremental:  # ISAM2 closes every loop from near by.
         *_, (_, isam) = _grown(problem, CHUNK)
@@ -132,9 +130,7 @@ def _solve(
         found = marginals_of(graph, values, poses + points)
         cov_poses = np.array([problem.chart.covariance(cov) for cov in found[: len(poses)]])
         cov_landmarks = dict(zip(problem.names.tolist(), found[len(poses) :], strict=True))
-    return BatchSolution(
-        path, dict(landmarks), cov_poses, cov_landmarks, graph.error(values), softened + count
-    )
+    return BatchSolution(path, dict(landmarks), cov_poses, cov_landmarks, graph.error(values), softened + count)
 
 
 def solve_online(m: Measurements, robust: float | None = None) -> Array:
@@ -218,9 +214,7 @@ class Problem:
         if singular.any():
             row = int(np.argmax(singular))
             place = f"landmark {m.landmarks[row]} at step {m.steps[row]}"
-            raise InputError(
-                f"The observation of {place} has a singular covariance, expected noise in all of it."
-            )
+            raise InputError(f"The observation of {place} has a singular covariance, expected noise in all of it.")
         self.m, self.robust, self.model = m, robust, m.model()
         self.chart = PLANAR if isinstance(m.space, SE2Group) else SPATIAL
         self.names, self.index = np.unique(m.landmarks, return_inverse=True)

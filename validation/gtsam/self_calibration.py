@@ -88,9 +88,7 @@ def refine_calibration(log: FeatureLog, batch: Batch, on_round: OnRound | None =
         return residuals, [*slopes, np.stack(moved, axis=-1) / (2.0 * _STEP)]
 
     together, done = Together(evaluate), 0
-    factors = problem.factors_by_row(
-        lambda row, model, pose, point: together.factor(row, [pose, point, key], model)
-    )
+    factors = problem.factors_by_row(lambda row, model, pose, point: together.factor(row, [pose, point, key], model))
     graph = problem.graph(found.state, found.loose, path, SCALE, factors)
     values = problem.values(found.state)
     values.insert(key, np.zeros(2))
@@ -120,9 +118,7 @@ def adjust_near(log: FeatureLog, batch: Batch) -> Batch:
     return adjust_log(log, path, twice=False)
 
 
-def recalibrate(
-    folder: Path, out: Path, on_round: OnRound | None = None
-) -> tuple[dict[str, Any], Calibrated]:
+def recalibrate(folder: Path, out: Path, on_round: OnRound | None = None) -> tuple[dict[str, Any], Calibrated]:
     """Calibrates the camera of a finished monocular run, and writes camera.yaml into the folder `out`.
 
     Returns:

@@ -83,9 +83,7 @@ class RelativeError:
         return _rms(self.rotations_deg)
 
 
-def ate(
-    estimate: Trajectory, reference: Trajectory, alignment: Alignment | Similarity = "none"
-) -> AbsoluteError:
+def ate(estimate: Trajectory, reference: Trajectory, alignment: Alignment | Similarity = "none") -> AbsoluteError:
     """Absolute trajectory error, the distance of each position from the true one.
 
     Args:
@@ -151,9 +149,7 @@ def landmark_errors(
     """
     names = sorted(estimate.keys() & truth.keys())
     if not names:
-        raise InputError(
-            f"None of the {len(estimate)} estimated landmarks is among the {len(truth)} true ones."
-        )
+        raise InputError(f"None of the {len(estimate)} estimated landmarks is among the {len(truth)} true ones.")
     found, true = (np.array([points[name] for name in names], dtype=float) for points in (estimate, truth))
     applied = fit(alignment, found, true)
     return AbsoluteError(np.array(names), _norm(applied.transform(found) - true), applied)
@@ -162,9 +158,7 @@ def landmark_errors(
 def _require_pairs(estimate: Trajectory, reference: Trajectory) -> None:
     if len(estimate) != len(reference) or not len(estimate):
         counts = f"{len(estimate)} and {len(reference)}"
-        raise InputError(
-            f"Expected as many estimated as true poses, found {counts}; pair them with associate."
-        )
+        raise InputError(f"Expected as many estimated as true poses, found {counts}; pair them with associate.")
 
 
 def _pair_ends(positions: Array, delta: float, unit: Unit) -> NDArray[np.intp]:

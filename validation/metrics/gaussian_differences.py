@@ -80,9 +80,7 @@ class Differences:
             if len(self):
                 figures[f"{name}_median"] = float(np.median(values))
                 figures[f"{name}_p90"] = float(np.quantile(values, 0.9))
-        return (
-            figures | {"keys": self.keys.tolist()} | {name: getattr(self, name).tolist() for name in COLUMNS}
-        )
+        return figures | {"keys": self.keys.tolist()} | {name: getattr(self, name).tolist() for name in COLUMNS}
 
 
 def figures_of(name: str, differences: Differences) -> dict[str, Any]:
@@ -141,9 +139,7 @@ def scale_onto(ours: PathAndMap, other: PathAndMap, name: str) -> float:
     mine, theirs = (one.trajectory.positions - one.trajectory.positions[0] for one in (ours, other))
     square = float(np.square(mine).sum())
     if square <= _TINY**2:
-        raise InputError(
-            f"The gauge of {name} is not observable: the camera of the run stays where it began."
-        )
+        raise InputError(f"The gauge of {name} is not observable: the camera of the run stays where it began.")
     return float((mine * theirs).sum() / square)
 
 

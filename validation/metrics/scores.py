@@ -36,9 +36,7 @@ def absolute_errors(estimate: Trajectory, reference: Trajectory, truth: RunTruth
 
 def relative_errors(estimate: Trajectory, reference: Trajectory, truth: RunTruth) -> dict[str, float]:
     """Motion from one scored frame to the next; after the similarity alignment where the scale is not measured."""
-    relative = rpe(
-        estimate, reference, alignment="similarity" if truth.alignment == "similarity" else "rigid"
-    )
+    relative = rpe(estimate, reference, alignment="similarity" if truth.alignment == "similarity" else "rigid")
     return {
         "rpe_translation_rmse_m": relative.translation_rmse,
         "rpe_rotation_rmse_deg": relative.rotation_rmse_deg,
@@ -84,9 +82,7 @@ def score_estimate(estimate: PathAndMap, truth: RunTruth, anonymous: bool = Fals
     return entries | score_landmarks(estimate, truth, anonymous)
 
 
-def score_path(
-    path: Trajectory, reference: Trajectory, truth: RunTruth, prefix: str = ""
-) -> dict[str, float]:
+def score_path(path: Trajectory, reference: Trajectory, truth: RunTruth, prefix: str = "") -> dict[str, float]:
     """All figures of merit of a path whose frames are among those of a run; none where too few have a true pose."""
     try:
         estimate, reference = associate(path, reference, 0)

@@ -43,9 +43,7 @@ def nees_figure(title: str, rows: np.ndarray, nees: np.ndarray, dim: int) -> Any
 
     figure = Figure(figsize=(9.0, 4.0), layout="constrained")
     axes, band = figure.subplots(), chi_square_band(dim)
-    axes.axhspan(
-        band.low, band.high, color="tab:green", alpha=0.2, label="95 % band of an honest filter, each step"
-    )
+    axes.axhspan(band.low, band.high, color="tab:green", alpha=0.2, label="95 % band of an honest filter, each step")
     axes.axhline(band.expected, color="tab:green", lw=0.8, label=f"its mean, {dim}")
     shown = np.maximum(nees, _LOWEST * band.low)
     axes.plot(rows, shown, color=COLOURS["filter"], lw=1.0, label="NEES of the pose")
@@ -93,9 +91,7 @@ def map_figure(
     ellipses = outline(mean[:, chosen], cov[:, chosen][:, :, chosen])
     axes.plot(ellipses[..., 0].T, ellipses[..., 1].T, color=COLOURS["map"], lw=0.7)
     label(axes, title, f"{'xyz'[chosen[0]]} [m]", f"{'xyz'[chosen[1]]} [m]", equal=True)
-    shown = np.concatenate(
-        [path[:, chosen], *(points[:, chosen] for points in other.values()), mean[:, chosen]]
-    )
+    shown = np.concatenate([path[:, chosen], *(points[:, chosen] for points in other.values()), mean[:, chosen]])
     low, high = np.quantile(shown, [0.5 * (1.0 - CLOSE), 0.5 * (1.0 + CLOSE)], axis=0)
     margin = 0.15 * max(float((high - low).max()), 1e-3)
     axes.set_xlim(low[0] - margin, high[0] + margin)

@@ -44,9 +44,7 @@ def plot_against_batch(found: AgainstBatch, out: Path, world: World | None = Non
         figures["gtsam_nees.png"] = nees_figure(title, found.optimum.steps[known], nees[known], cov.shape[-1])
     if len(found.landmarks):
         title = f"{name}: landmarks against the batch optimum"
-        figures["gtsam_landmarks.png"] = landmark_figure(
-            title, np.square(found.landmarks.sigmas), found.landmarks.dims
-        )
+        figures["gtsam_landmarks.png"] = landmark_figure(title, np.square(found.landmarks.sigmas), found.landmarks.dims)
         rows = np.isin(ours.landmarks.ids, found.landmarks.keys)
         mean, cov = moved_map(ours.landmarks, motions["filter"]).in_space(rows)
         there = np.isin(theirs.landmarks.ids, found.landmarks.keys)
@@ -80,14 +78,10 @@ def _colmap_map(found: ColmapComparison, reference: PathAndMap) -> Any:
     cloud = cloud[((cloud >= low) & (cloud <= high)).all(axis=1)]
     at, points = reference.trajectory.positions, reference.landmarks.mean
     for axes, (right, up) in shown:
-        axes.plot(
-            cloud[:, right], cloud[:, up], ".", color=COLOURS["odometry"], ms=1.5, label="COLMAP's points"
-        )
+        axes.plot(cloud[:, right], cloud[:, up], ".", color=COLOURS["odometry"], ms=1.5, label="COLMAP's points")
         axes.plot(points[:, right], points[:, up], ".", color=COLOURS["map"], ms=4, label="landmarks")
         axes.plot(at[:, right], at[:, up], color=COLOURS["filter"], lw=1.2, label="filter")
-        axes.plot(
-            centres[:, right], centres[:, up], "+", color=COLOURS["batch"], ms=6, label="COLMAP's key frames"
-        )
+        axes.plot(centres[:, right], centres[:, up], "+", color=COLOURS["batch"], ms=6, label="COLMAP's key frames")
     shown[0][0].legend(loc="best", fontsize="small")
     return figure
 

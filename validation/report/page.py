@@ -140,11 +140,7 @@ def _row(statistic: Statistic) -> dict[str, str]:
 def _images(folder: Path, names: list[str]) -> list[tuple[str, str]]:
     # A link may show what its maker must not see of the disk of whoever opens the run.
     inside = folder.resolve()
-    there = [
-        name
-        for name in names
-        if (folder / name).is_file() and (folder / name).resolve().is_relative_to(inside)
-    ]
+    there = [name for name in names if (folder / name).is_file() and (folder / name).resolve().is_relative_to(inside)]
     return [(Path(name).stem, base64.b64encode((folder / name).read_bytes()).decode()) for name in there]
 
 

@@ -72,9 +72,7 @@ def write_rerun(run: Run, path: Path) -> None:
         log_map(rr, stream, run.system.map())
         known = getattr(run.system, "known_points", None)
         if known is not None:
-            stream.log(
-                "world/known_points", rr.Points3D(known.positions, colors=[FOUND], radii=0.01), static=True
-            )
+            stream.log("world/known_points", rr.Points3D(known.positions, colors=[FOUND], radii=0.01), static=True)
         for t, frame in zip(range(len(log)), run.source.frames(), strict=False):
             log_time(stream, t, int(stamps[t] - stamps[0]))
             log_image(rr, stream, frame)

@@ -25,7 +25,5 @@ def draw_truth(record: RunFolder, errors: TruthErrors) -> list[str]:
         ours, (mean, cov) = world.of_filter(record).positions, found.map.in_space()
         true = np.pad(found.truth, ((0, 0), (0, 3 - found.truth.shape[1])))
         title = f"{name}: map over the truth, in {world.name}"
-        figures["groundtruth_map.png"] = map_figure(
-            title, ours, mean, cov, {"truth": true}, wide_axes(ours[rows])
-        )
+        figures["groundtruth_map.png"] = map_figure(title, ours, mean, cov, {"truth": true}, wide_axes(ours[rows]))
     return plots.save_figures(figures, record.folder)

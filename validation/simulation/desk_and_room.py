@@ -73,9 +73,7 @@ class TexturedDesk:
         check_positive(self, "rate_hz", "square_m", "texel_m")
         check_not_negative(self, "contrast")
         if self.board is not None and not (len(self.board) == 2 and min(self.board) >= 3):
-            raise InputError(
-                f"board must be two numbers of squares, at least 3 each, or None, got {self.board}"
-            )
+            raise InputError(f"board must be two numbers of squares, at least 3 each, or None, got {self.board}")
         if not all(0.0 < size < np.inf for size in self.size_m):
             raise InputError(f"size_m must be two positive numbers, got {self.size_m}")
 
@@ -180,9 +178,7 @@ class TexturedRoom:
                 f"than eye_m = {self.eye_m}"
             )
         if not (abs(self.drop_deg) < 80.0 and np.isfinite(self.gaze_deg)):
-            raise InputError(
-                f"drop_deg = {self.drop_deg} must be below 80, and gaze_deg = {self.gaze_deg} a number"
-            )
+            raise InputError(f"drop_deg = {self.drop_deg} must be below 80, and gaze_deg = {self.gaze_deg} a number")
 
     def build(self, rng: np.random.Generator) -> TexturedScene:
         """Draws the textures, the things and the path."""

@@ -394,9 +394,7 @@ def simulate_images(
     if wrong := [frame for frame in imaging.blackout if not 0 <= frame < len(scene.stamps_ns)]:
         last = len(scene.stamps_ns) - 1
         raise InputError(f"blackout names frame {wrong[0]}, but the frames are 0 to {last}")
-    left, baseline_m = (
-        (camera, baseline_m) if isinstance(camera, Pinhole) else (camera.camera, camera.baseline_m)
-    )
+    left, baseline_m = (camera, baseline_m) if isinstance(camera, Pinhole) else (camera.camera, camera.baseline_m)
     if baseline_m is not None and not baseline_m > 0.0:
         raise InputError(f"the stereo baseline must be positive, got {baseline_m!r} m")
     renderer = Renderer(scene.rectangles, left, imaging.grid)
@@ -447,8 +445,7 @@ def simulate_images(
             # Poses as [qx, qy, qz, qw, x, y, z].
             names = ("columns", "rows", "square_m")
             boards = [
-                {name: getattr(board, name) for name in names}
-                | {"world_from_board": board.world_from_board.tolist()}
+                {name: getattr(board, name) for name in names} | {"world_from_board": board.world_from_board.tolist()}
                 for board in scene.boards
             ]
             text = yaml.safe_dump(boards, sort_keys=False)

@@ -194,9 +194,7 @@ class Furnishing:
         self.blocks.append(box)
         self.surfaces += faces(box, side, top)
 
-    def hang(
-        self, wall: Wall, middle: float, high: float, size: tuple[float, float], deep: float = 0.0
-    ) -> None:
+    def hang(self, wall: Wall, middle: float, high: float, size: tuple[float, float], deep: float = 0.0) -> None:
         """A print (wide, high) so far before a wall, its middle at a place along it and above the floor."""
         paint = textures.picture if self.rng.random() < 0.7 else textures.page
         wide, tall = 0.5 * size[0], 0.5 * size[1]
@@ -283,9 +281,7 @@ def _shelf(lab: Furnishing, wall: Wall, start: float, end: float) -> None:
         _row(lab, wall, inner, deep, low, top - BOARD_M)
 
 
-def _row(
-    lab: Furnishing, wall: Wall, along: tuple[float, float], deep: float, low: float, top: float
-) -> None:
+def _row(lab: Furnishing, wall: Wall, along: tuple[float, float], deep: float, low: float, top: float) -> None:
     """Books and boxes side by side on a board, with gaps."""
     place = along[0] + lab.uniform(0.0, 0.1)
     while place + 0.15 < along[1]:
@@ -314,9 +310,7 @@ def _table(lab: Furnishing, wall: Wall, start: float, end: float) -> None:
         _poster(lab, wall, left, right, lab.uniform(1.45, 1.75))
 
 
-def _desk(
-    lab: Furnishing, wall: Wall, along: tuple[float, float], deep: tuple[float, float], rows: int = 1
-) -> None:
+def _desk(lab: Furnishing, wall: Wall, along: tuple[float, float], deep: tuple[float, float], rows: int = 1) -> None:
     """A table's top, legs, and rows of things on it."""
     lab.add(wall.box(along, deep, (TABLE_M - TOP_M, TABLE_M)), textures.wood, textures.wood)
     for left in (along[0], along[1] - LEG_M):
@@ -381,9 +375,7 @@ def _island(lab: Furnishing, low: np.ndarray, high: np.ndarray) -> None:
 
 Trajectory = Literal["tour", "turn_back"]
 
-ROBOT_FROM_CAMERA = SE3.from_matrix(
-    np.array([[0.0, 0.0, 1.0, 0.1], [-1.0, 0.0, 0.0, 0.06], [0.0, -1.0, 0.0, 1.0]])
-)
+ROBOT_FROM_CAMERA = SE3.from_matrix(np.array([[0.0, 0.0, 1.0, 0.1], [-1.0, 0.0, 0.0, 0.06], [0.0, -1.0, 0.0, 1.0]]))
 """(7,) the left camera looks forwards, 1 m above the floor, from a little before and to the left of the wheels' middle;
 the robot's frame has x forwards, y to the left, z up, its origin between the wheels on the floor."""
 

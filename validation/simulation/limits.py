@@ -40,6 +40,4 @@ def check_fractions(options: object, *names: str) -> None:
 def check_order(options: object, low: str, high: str) -> None:
     """Refuses an empty interval."""
     if not getattr(options, low) < getattr(options, high):
-        raise InputError(
-            f"{low} = {getattr(options, low)!r} must be less than {high} = {getattr(options, high)!r}"
-        )
+        raise InputError(f"{low} = {getattr(options, low)!r} must be less than {high} = {getattr(options, high)!r}")

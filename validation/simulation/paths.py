@@ -173,9 +173,7 @@ class HandHeld:
             """Faster than a hand."""
             wave = arm(time)
             side, rise = wave[:, 3], np.deg2rad(self.elevation_deg) + wave[:, 4]
-            away = np.stack(
-                [np.sin(side) * np.cos(rise), -np.cos(side) * np.cos(rise), np.sin(rise)], axis=-1
-            )
+            away = np.stack([np.sin(side) * np.cos(rise), -np.cos(side) * np.cos(rise), np.sin(rise)], axis=-1)
             distance = 0.5 * (self.nearest_m + self.farthest_m) + wave[:, 5:]
             target = wave[:, :3] - start
             return shaken(looking(target + distance * away, -away), wrist, time)
@@ -231,9 +229,7 @@ class Drive:
         waypoints: (M + 1, 3) poses before each move and after the last.
     """
 
-    def __init__(
-        self, start: np.ndarray, moves: Sequence[Move], seconds: float, arm_m: float, ramp_s: float
-    ) -> None:
+    def __init__(self, start: np.ndarray, moves: Sequence[Move], seconds: float, arm_m: float, ramp_s: float) -> None:
         """Plans the drive.
 
         Args:
@@ -298,9 +294,7 @@ class Drive:
         heading = self._turn[k] * _bent(at)
         step = 0.5 * self._length[k] * fraction[:, None] * weight
         turned = self._turned(np.full(len(fraction), k), fraction)
-        return np.stack(
-            [turned, (step * np.cos(heading)).sum(axis=1), (step * np.sin(heading)).sum(axis=1)], axis=-1
-        )
+        return np.stack([turned, (step * np.cos(heading)).sum(axis=1), (step * np.sin(heading)).sum(axis=1)], axis=-1)
 
 
 def along_corners(corners: Sequence[Sequence[float]], bend_m: float) -> tuple[np.ndarray, list[Move]]:
@@ -323,9 +317,7 @@ def along_corners(corners: Sequence[Sequence[float]], bend_m: float) -> tuple[np
     bends = np.where(turn != 0.0, bend_m, 0.0)
     straight = length - np.append(0.0, bends) - np.append(bends, 0.0)
     if (straight < 0.0).any() or (np.abs(turn) > 0.9 * np.pi).any():
-        raise InputError(
-            f"the corners {corners} are too near to each other or too sharp for bends of {bend_m} m"
-        )
+        raise InputError(f"the corners {corners} are too near to each other or too sharp for bends of {bend_m} m")
     node, weight = np.polynomial.legendre.leggauss(NODES)
     moves = [Move(straight[0])]
     for k, angle in enumerate(turn.tolist()):

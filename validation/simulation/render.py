@@ -35,9 +35,7 @@ class Renderer:
         reach = 0.5 * np.abs(self._slope).reshape(*self._uv.shape[:2], 2, 2).sum(axis=-1)
         around, side = np.concatenate([self._uv - reach, self._uv + reach], axis=-1), raster_kernel.TILE
         tops, lefts = range(0, camera.height, side), range(0, camera.width, side)
-        tiles = [
-            _extent(around[y : y + side, x : x + side].reshape(1, -1, 2))[0] for y in tops for x in lefts
-        ]
+        tiles = [_extent(around[y : y + side, x : x + side].reshape(1, -1, 2))[0] for y in tops for x in lefts]
         self._tiles = np.array(tiles).reshape(len(tops), len(lefts), 4)
         self._view = _extent(self._tiles.reshape(1, -1, 2, 2).swapaxes(2, 3).reshape(1, -1, 2))[0]
         self._sides = sides(rectangles)
@@ -136,9 +134,7 @@ def _pyramid(texture: np.ndarray) -> list[np.ndarray]:
     levels = [texture]
     while min(levels[-1].shape) > 1:
         height, width = levels[-1].shape
-        levels.append(
-            np.asarray(cv2.resize(levels[-1], (width // 2, height // 2), interpolation=cv2.INTER_AREA))
-        )
+        levels.append(np.asarray(cv2.resize(levels[-1], (width // 2, height // 2), interpolation=cv2.INTER_AREA)))
     return levels
 
 

@@ -52,9 +52,7 @@ class RobotWorld:
 
     def __post_init__(self) -> None:
         if self.steps < 2 or self.landmarks < 1:
-            raise InputError(
-                f"a simulation needs at least 2 steps and 1 landmark, got {self.steps}, {self.landmarks}"
-            )
+            raise InputError(f"a simulation needs at least 2 steps and 1 landmark, got {self.steps}, {self.landmarks}")
         for name in ("radius_m", "extent_m", "max_range_m", "std_range_m", "std_angle_deg"):
             if not getattr(self, name) > 0:
                 raise InputError(f"{name} must be positive, got {getattr(self, name)}")
@@ -68,9 +66,7 @@ def simulate_robot(world: RobotWorld, folder: Path, seed: int) -> None:
     # unless spatial.
     phase = 2 * np.pi * world.laps * np.arange(world.steps) / (world.steps - 1)
     wave = np.sin(3 * phase) if world.spatial else np.zeros_like(phase)
-    position = np.stack(
-        [world.radius_m * np.sin(phase), world.radius_m * (1 - np.cos(phase)), 0.5 * wave], axis=-1
-    )
+    position = np.stack([world.radius_m * np.sin(phase), world.radius_m * (1 - np.cos(phase)), 0.5 * wave], axis=-1)
     truth = SE3.from_ypr(position, phase, 0.1 * wave, 0.2 * wave)
     size = np.array([world.extent_m, world.extent_m, 2.0 if world.spatial else 0.0])
     points = [0.0, world.radius_m, 0.0] + rng.uniform(-1, 1, (world.landmarks, 3)) * size
@@ -104,9 +100,7 @@ def simulate_robot(world: RobotWorld, folder: Path, seed: int) -> None:
     rows: list[list[float]] = []
     for t, pose in enumerate(truth):
         x, y, h = SE3.inverse_transform(pose, points).T
-        z = np.stack(
-            [np.sqrt(x * x + y * y + h * h), np.arctan2(y, x), np.arctan2(h, np.hypot(x, y))], axis=-1
-        )
+        z = np.stack([np.sqrt(x * x + y * y + h * h), np.arctan2(y, x), np.arctan2(h, np.hypot(x, y))], axis=-1)
         near = (z[:, 0] <= world.max_range_m) & (z[:, 0] > 0.2)
         seen = near & (np.abs(z[:, 1]) <= view) & (np.abs(z[:, 2]) <= view)
         noisy = z[seen] + std * rng.standard_normal((int(seen.sum()), 3))

@@ -216,9 +216,7 @@ class Furniture:
         self.sheet(ring[0] - height, ring[1] - ring[0], ring[3] - ring[0], floor)
         self.sheet(ring[3], ring[2] - ring[3], ring[0] - ring[3], ceiling)
 
-    def hang(
-        self, room: np.ndarray, wall: int, place: Sequence[float], size: Sequence[float], paint: Paint
-    ) -> None:
+    def hang(self, room: np.ndarray, wall: int, place: Sequence[float], size: Sequence[float], paint: Paint) -> None:
         """A picture (wide, high) on a wall of a room.
 
         Args:

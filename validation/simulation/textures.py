@@ -166,9 +166,7 @@ def _scatter(
         draw(image, place, radius, float(np.clip(level, 0.0, 255.0)), rng)
 
 
-def _polygon(
-    image: np.ndarray, place: np.ndarray, radius: float, level: float, rng: np.random.Generator
-) -> None:
+def _polygon(image: np.ndarray, place: np.ndarray, radius: float, level: float, rng: np.random.Generator) -> None:
     """Three to six corners about a place (column, row)."""
     import cv2
 
@@ -179,9 +177,7 @@ def _polygon(
     cv2.fillPoly(image, [fixed], level, cv2.LINE_AA, FINE)
 
 
-def _disc(
-    image: np.ndarray, place: np.ndarray, radius: float, level: float, rng: np.random.Generator
-) -> None:
+def _disc(image: np.ndarray, place: np.ndarray, radius: float, level: float, rng: np.random.Generator) -> None:
     """An ellipse about a place (column, row)."""
     import cv2
 

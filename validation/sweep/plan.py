@@ -101,9 +101,7 @@ def plan(file: SweepFile, folder: Path, where: str = "the sweep") -> list[Job]:
     """All runs of a sweep; paths are taken from a folder. Errors as `read_plan`."""
     system = system_named(file.system)
     sequences = [_sequence(given, system.fields, folder, where) for given in file.sequences]
-    seeds: Sequence[int] = (
-        range(file.seeds) if isinstance(file.seeds, int) else file.seeds
-    )  # a range takes no room
+    seeds: Sequence[int] = range(file.seeds) if isinstance(file.seeds, int) else file.seeds  # a range takes no room
     for what, values in (("sequences", sequences), ("seeds", seeds), ("options", list(file.options))):
         if not values:
             raise InputError(f"{where}: {what} is empty, name at least one")
@@ -112,9 +110,7 @@ def plan(file: SweepFile, folder: Path, where: str = "the sweep") -> list[Job]:
         raise InputError(f"{where} asks for more than {MOST_RUNS} runs: ask for fewer")
     jobs = [
         Job(file.system, sequence, name, _pairs(file.settings | option), particles, seed)
-        for sequence, (name, option), particles, seed in product(
-            sequences, file.options.items(), sizes, seeds
-        )
+        for sequence, (name, option), particles, seed in product(sequences, file.options.items(), sizes, seeds)
     ]
     for job in {(job.option, job.particles): job for job in jobs}.values():
         _checked(job, where)
@@ -136,9 +132,7 @@ def _converted(path: Path, values: Any) -> SweepFile:
     known = SweepFile.__dataclass_fields__
     unknown = sorted(str(name) for name in values if name not in known)
     if unknown:
-        raise InputError(
-            f"{path}: there is no entry {unknown[0]!r} in a sweep; known here: {', '.join(known)}"
-        )
+        raise InputError(f"{path}: there is no entry {unknown[0]!r} in a sweep; known here: {', '.join(known)}")
     try:
         return msgspec.convert(values, SweepFile)
     except msgspec.ValidationError as error:

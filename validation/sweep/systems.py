@@ -57,9 +57,7 @@ def _run_robot(sequence: Mapping[str, Path], pairs: Sequence[str], given: Mappin
     from rbpf.runs.recordings import RobotRecording, filter_recording
 
     config = _robot_settings(pairs, given)
-    return _figures(
-        filter_recording(RobotRecording(sequence["recording"]), config), config.association == "ml"
-    )
+    return _figures(filter_recording(RobotRecording(sequence["recording"]), config), config.association == "ml")
 
 
 def _figures(run: "Run", anonymous: bool = False) -> Figures:
@@ -88,9 +86,7 @@ def _mono_settings(pairs: Sequence[str], given: Mapping[str, Any]) -> Any:
 def _run_mono(sequence: Mapping[str, Path], pairs: Sequence[str], given: Mapping[str, Any]) -> Figures:
     from rbpf.runs.recordings import MonoRecording, filter_recording
 
-    recording = MonoRecording(
-        sequence["recording"], sequence.get("known_points"), sequence.get("calibration")
-    )
+    recording = MonoRecording(sequence["recording"], sequence.get("known_points"), sequence.get("calibration"))
     return _figures(filter_recording(recording, _mono_settings(pairs, given)))
 
 

@@ -110,9 +110,7 @@ def draw_curves(curves: dict[str, tuple[np.ndarray, list[Shape]]], true_depth_m:
         true = true_depth_m if name.startswith("depth") else 1.0 / true_depth_m
         axes.axvline(true, color="black", lw=0.8, ls="--", label="truth")
         quantity = name.split(" [")[0]
-        axes.set(
-            title=f"likelihood of {quantity}", xlabel=name, ylabel="relative to its peak", xlim=limits[name]
-        )
+        axes.set(title=f"likelihood of {quantity}", xlabel=name, ylabel="relative to its peak", xlim=limits[name])
         axes.legend(fontsize="small")
     return figure
 

@@ -79,18 +79,14 @@ def _curves(passing: Passing, px: np.ndarray, track: np.ndarray, cells: int) -> 
     pairs = list(zip(px, track.reshape(len(px), 1, -1), strict=True))
 
     def shapes(grid: np.ndarray, inverse: np.ndarray) -> list[list[Shape]]:
-        return [
-            [shape_of(grid, one) for one in passing.log_likelihoods(first, inverse, z)] for first, z in pairs
-        ]
+        return [[shape_of(grid, one) for one in passing.log_likelihoods(first, inverse, z)] for first, z in pairs]
 
     return {"depth [m]": (depth, shapes(depth, 1.0 / depth)), "inverse depth [1/m]": (rho, shapes(rho, rho))}
 
 
 def _figures(curves: Curves, name: str) -> np.ndarray:
     """One of a shape's figures by axis, feature and number of observations (2, F, K)."""
-    return np.array(
-        [[[getattr(shape, name)[0] for shape in one] for one in shapes] for _, shapes in curves.values()]
-    )
+    return np.array([[[getattr(shape, name)[0] for shape in one] for one in shapes] for _, shapes in curves.values()])
 
 
 def _rows(divergence: np.ndarray, skewness: np.ndarray, count: int) -> list[Row]:

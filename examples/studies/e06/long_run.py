@@ -83,9 +83,7 @@ def _draw(run: Run, mapped: MapEstimate, truth: np.ndarray, cpu: np.ndarray) -> 
     rows[1].plot(frames, run.log["found"], color=COLOURS["known"], lw=0.6, label="observations")
     rows[1].axhspan(LEAST, MOST, color="0.5", alpha=0.15, label="the paper's 20 to 30")
     rows[2].plot(frames[WARM_UP:], 1e3 * run.log["seconds"][WARM_UP:], ".", ms=1.5, label="time on the clock")
-    rows[2].plot(
-        frames[WARM_UP:], 1e3 * cpu[WARM_UP:], ".", ms=1.0, alpha=0.5, label="processor time, all threads"
-    )
+    rows[2].plot(frames[WARM_UP:], 1e3 * cpu[WARM_UP:], ".", ms=1.0, alpha=0.5, label="processor time, all threads")
     rows[2].axhline(1e3 * FRAME_S, color=COLOURS["map"], ls="--", lw=0.8, label="30 Hz")
     high = float(np.quantile(1e3 * run.log["seconds"][WARM_UP:], 0.995))
     rows[2].set(xlabel="frame", ylabel="ms", ylim=(0.0, max(40.0, 1.2 * high)))
@@ -98,9 +96,7 @@ def _draw(run: Run, mapped: MapEstimate, truth: np.ndarray, cpu: np.ndarray) -> 
 def _draw_map(axes: Any, run: Run, mapped: MapEstimate, truth: np.ndarray) -> None:
     full = ~mapped.is_ray()
     mean, cov = mapped.mean[full], mapped.cov[full]
-    label(
-        axes, f"map from above: {full.sum()} points with {SIGMAS:g}σ (Fig. 6)", "x [m]", "y [m]", equal=True
-    )
+    label(axes, f"map from above: {full.sum()} points with {SIGMAS:g}σ (Fig. 6)", "x [m]", "y [m]", equal=True)
     for ellipse in outline(mean[:, :2], cov[:, :2, :2]):
         axes.plot(*ellipse.T, color=COLOURS["map"], lw=0.4)
     axes.plot(*mean[:, :2].T, ".", color="black", ms=2)

@@ -118,9 +118,7 @@ def _draw(run: Run, mapped: MapEstimate, truth: np.ndarray, error: np.ndarray, c
     above.plot(*SE3.translation(truth)[:, :2].T, color=COLOURS["truth"], lw=1.0, ls="--", label="true path")
     above.plot(*SE3.translation(run.log.poses)[:, :2].T, color=COLOURS["filter"], lw=1.2, label="filter")
     if run.system.known is not None:
-        above.plot(
-            *run.system.known.positions[:, :2].T, "+", color=COLOURS["known"], ms=9, label="known points"
-        )
+        above.plot(*run.system.known.positions[:, :2].T, "+", color=COLOURS["known"], ms=9, label="known points")
     above.legend(fontsize="small")
     label(curve, "error of the position", "frame", "mm", equal=False)
     curve.plot(1e3 * error, color=COLOURS["filter"])

@@ -49,9 +49,7 @@ class _Watch:
             measurement = run.system.measurement
             assert measurement is not None
             search, step = float(run.log["seconds_search"][t]), float(run.log["seconds"][t])
-            self.seconds[self.sizes[turn]].append(
-                [whole, step - search, search, measurement.search.seconds_choosing]
-            )
+            self.seconds[self.sizes[turn]].append([whole, step - search, search, measurement.search.seconds_choosing])
         if since == FRAMES - 1 and turn + 1 < len(self.sizes):
             fill(run, self.sizes[turn + 1], self.rng)
         self._last = time.process_time()
@@ -72,9 +70,7 @@ def fill(run: Run, size: int, rng: np.random.Generator) -> None:
     points = SE3.transform(pose, rng.uniform(*AWAY_M, (count, 1)) * direction)
     table.position[rows] = np.concatenate([points, np.ones((count, 1))], axis=1)
     n = run.system.filter.n
-    records = Records(
-        np.broadcast_to(points, (n, count, 3)), np.broadcast_to(STD_M**2 * np.eye(3), (n, count, 3, 3))
-    )
+    records = Records(np.broadcast_to(points, (n, count, 3)), np.broadcast_to(STD_M**2 * np.eye(3), (n, count, 3, 3)))
     belief.map.add_records(records, Point(3), ids=rows)
 
 
@@ -127,9 +123,7 @@ def _draw(sizes: np.ndarray, times: np.ndarray) -> Any:
     figure = Figure(figsize=(7.0, 4.5), layout="constrained")
     axes = figure.subplots()
     label(axes, "time per frame (Fig. 3)", "landmarks in the map", "ms, median", equal=False)
-    for column, name in enumerate(
-        ("whole frame, processor time", "filter", "search", "choice of what to look for")
-    ):
+    for column, name in enumerate(("whole frame, processor time", "filter", "search", "choice of what to look for")):
         axes.plot(sizes, times[:, column], "o-", label=name)
     axes.axhline(1e3 / 30.0, color="0.5", ls="--", lw=0.8, label="30 Hz")
     axes.set(xscale="log", ylim=(0.0, None))

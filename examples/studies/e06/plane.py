@@ -54,9 +54,7 @@ def fit_plane(points: np.ndarray) -> Plane:
     from scipy.spatial import ConvexHull
 
     if len(points) < LEAST:
-        raise InputError(
-            f"a plane is fitted to at least {LEAST} landmarks of known depth, the map has {len(points)}"
-        )
+        raise InputError(f"a plane is fitted to at least {LEAST} landmarks of known depth, the map has {len(points)}")
     middle = points.mean(axis=0)
     axes = np.linalg.svd(points - middle, full_matrices=False)[2]
     local = (points - middle) @ axes.T
@@ -82,9 +80,7 @@ def reproduce(setting: Setting) -> list[Row]:
     what = f"{int(full.sum())} landmarks of a flat desk after {seconds} s, {plane.area_m2:.2f} m²"
     millimetres = f"rms {1e3 * plane.rms_m:.1f} mm, worst {1e3 * plane.worst_m:.1f} mm"
     return [
-        Row(
-            "Fig. 4", what, "coplanar to within 1 cm, 1 m²", millimetres, plane.rms_m, plane.rms_m <= ASKED_M
-        ),
+        Row("Fig. 4", what, "coplanar to within 1 cm, 1 m²", millimetres, plane.rms_m, plane.rms_m <= ASKED_M),
         Row("Fig. 4", "the same, our own goal", "3 mm", millimetres, plane.rms_m, plane.rms_m <= GOAL_M),
     ]
 

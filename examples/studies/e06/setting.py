@@ -79,9 +79,7 @@ class Setting:
         imaging = imaging or Imaging()
         folder = self.out / "sequences" / f"{name}_{self.camera.width}"
         if not folder.exists():
-            simulate_images(
-                world, replace(imaging, grid=1) if self.quick else imaging, self.camera, folder, self.seed
-            )
+            simulate_images(world, replace(imaging, grid=1) if self.quick else imaging, self.camera, folder, self.seed)
         points = folder / "known_points.csv"
         return open_images(folder), read_known_points(points) if points.exists() else None
 
@@ -89,11 +87,7 @@ class Setting:
 def true_poses(sequence: ImageSequence) -> np.ndarray:
     """(T, 7) world_from_camera of a sequence's images, of those whose truth is at the same instants or near."""
     assert sequence.truth is not None
-    after = np.searchsorted(sequence.truth.stamps_ns, sequence.stamps_ns).clip(
-        1, sequence.truth.stamps_ns.size - 1
-    )
+    after = np.searchsorted(sequence.truth.stamps_ns, sequence.stamps_ns).clip(1, sequence.truth.stamps_ns.size - 1)
     stamps = sequence.truth.stamps_ns
-    nearer = np.where(
-        sequence.stamps_ns - stamps[after - 1] < stamps[after] - sequence.stamps_ns, after - 1, after
-    )
+    nearer = np.where(sequence.stamps_ns - stamps[after - 1] < stamps[after] - sequence.stamps_ns, after - 1, after)
     return np.asarray(sequence.truth.world_from_camera[nearer])

@@ -54,9 +54,7 @@ def reproduce(setting: Setting) -> list[Row]:
         config = MonoConfig(particles=setting.particles, seed=setting.seed, inverse_depth=ray)
         run = filter_images(sequence, config, known)
         errors = whitened_errors(SE3, run.log.poses[-1:], run.log.covs[-1:], truth)
-        pose, position = (
-            np.sqrt(np.linalg.det(part)) for part in (run.log.covs[-1], run.log.covs[-1, 3:, 3:])
-        )
+        pose, position = (np.sqrt(np.linalg.det(part)) for part in (run.log.covs[-1], run.log.covs[-1, 3:, 3:]))
         cloud = camera_cloud(run.system.filter, np.random.default_rng(setting.seed))
         found[treatment] = Posterior(float(pose), float(position), float(errors.nees[0]), cloud)
     save_figures({"figure_9.png": _draw(found, SE3.translation(truth)[0])}, setting.out)
@@ -67,7 +65,9 @@ def _row(found: dict[str, Posterior], treatment: str) -> Row:
     off, here = found["off"], found[treatment]
     fraction = here.pose / off.pose
     sigma = [1e3 * np.cbrt(one.position) for one in (off, here)]
-    ours = f"pose volume x {fraction:.2g}; σ {sigma[0]:.0f} to {sigma[1]:.0f} mm; NEES {off.nees:.1f} and {here.nees:.1f}"
+    ours = (
+        f"pose volume x {fraction:.2g}; σ {sigma[0]:.0f} to {sigma[1]:.0f} mm; NEES {off.nees:.1f} and {here.nees:.1f}"
+    )
     return Row("Fig. 9", f"camera at rest, {TREATMENTS[treatment]} against none", "far better constrained", ours, fraction,
                fraction < 0.5)  # fmt: skip
 

@@ -52,9 +52,7 @@ class LoopOverDesk:
 
     def build(self, rng: np.random.Generator) -> TexturedScene:
         """Draws desk and path."""
-        desk = TexturedDesk(frames=2, size_m=(3.5, 3.5), papers=120, things=24, texel_m=self.texel_m).build(
-            rng
-        )
+        desk = TexturedDesk(frames=2, size_m=(3.5, 3.5), papers=120, things=24, texel_m=self.texel_m).build(rng)
         stamps = stamps_ns(self.frames, RATE_HZ)
         return replace(desk, name="loop", stamps_ns=stamps, world_from_camera=self._path(rng))
 
@@ -123,9 +121,7 @@ class StillTarget:
         for angle, depth in zip(around, rng.permutation(np.linspace(1.2, 5.0, self.sheets)), strict=True):
             middle = depth * np.array([1.0, 0.38 * np.cos(angle), 0.28 * np.sin(angle)])
             size = 0.12 * depth, 0.1 * depth
-            sheets.append(
-                self._facing(middle, rng.uniform(-30, 30), size, 0.0015 * depth, textures.picture, rng)
-            )
+            sheets.append(self._facing(middle, rng.uniform(-30, 30), size, 0.0015 * depth, textures.picture, rng))
         poster = self._poster(rng)
         path = looking(np.zeros((self.frames, 3)), np.tile([1.0, 0.0, 0.0], (self.frames, 1)))
         return TexturedScene("target", stamps_ns(self.frames, RATE_HZ), path, [wall, *sheets, poster])

@@ -89,7 +89,5 @@ def measured_drive(
         have = f"{setting.images} has {len(sequence)} pairs, {setting.frames} are asked for"
         raise InputError(f"{have}: delete it, or take another --out")
     features = setting.out / "features"
-    whole = cache_features(
-        sequence, setting.config(), features, lambda done, total: told("measured", done, total)
-    )
+    whole = cache_features(sequence, setting.config(), features, lambda done, total: told("measured", done, total))
     return whole.first(setting.frames)

@@ -38,9 +38,7 @@ def settings(base: StereoConfig) -> dict[str, StereoConfig]:
     return out
 
 
-def sweep(
-    drive: CachedSequence, base: StereoConfig, seeds: Sequence[int] = (0,)
-) -> Iterator[list[str | float]]:
+def sweep(drive: CachedSequence, base: StereoConfig, seeds: Sequence[int] = (0,)) -> Iterator[list[str | float]]:
     """A row for each setting, and one for the odometry alone: medians over the seeds of the filter, least and most."""
     for name, config in settings(base).items():
         runs = [filter_cached(drive, replace(config, seed=seed)) for seed in seeds]

@@ -185,9 +185,7 @@ class ActiveSearch:
 
         table, camera, config = self.table, self.camera, self.config
         of_image = (camera.width, camera.height, config.border_px, camera.monotonic_radius)
-        limits = np.array(
-            [*of_image, np.cos(np.deg2rad(config.max_turn_deg)), config.max_scale_change], dtype=float
-        )
+        limits = np.array([*of_image, np.cos(np.deg2rad(config.max_turn_deg)), config.max_scale_change], dtype=float)
         rows, px = np.empty(len(table), dtype=np.int64), np.empty((len(table), 2))
         columns = (table.position, table.first_pose, table.alive)
         count = in_view(*columns, np.ascontiguousarray(pose), camera.params, limits, rows, px)
@@ -204,9 +202,7 @@ class ActiveSearch:
         best_first = order[np.lexsort((-worth[order], rank))]
         return np.asarray(rows[best_first[: config.measurements]]), px
 
-    def templates(
-        self, rows: np.ndarray, patches: np.ndarray, poses: np.ndarray, pose: np.ndarray
-    ) -> np.ndarray:
+    def templates(self, rows: np.ndarray, patches: np.ndarray, poses: np.ndarray, pose: np.ndarray) -> np.ndarray:
         """Templates of features (K,) as they look from a pose, of patches (F, S, S) that were seen from poses (F, 7)."""
         affines = patch_affines(self.camera, self.table.position[rows], poses[rows], pose)
         return warp(patches[rows], affines, self.config.template_px)
@@ -216,15 +212,11 @@ class ActiveSearch:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Place (K, 2), score (K,), whether that is a match (K,), and whether another place is much alike (K,)."""
         config = self.config
-        matches = search(
-            image, templates, mean, cov, sigmas=config.ellipse_sigmas, most_px=config.max_radius_px
-        )
+        matches = search(image, templates, mean, cov, sigmas=config.ellipse_sigmas, most_px=config.max_radius_px)
         accepted = (matches.score >= config.min_correlation) & self.camera.inside(matches.px)
         return matches.px, matches.score, accepted, matches.ratio >= AMBIGUOUS
 
-    def _agreeing(
-        self, image: np.ndarray, belief: Belief, templates: np.ndarray, result: SearchResult
-    ) -> SearchResult:
+    def _agreeing(self, image: np.ndarray, belief: Belief, templates: np.ndarray, result: SearchResult) -> SearchResult:
         """Only matches that agree with one motion; what was mistaken is looked for again where the motion puts it."""
         hits = np.flatnonzero(result.found)
         which, nu, jac, cov = self._innovations(belief, result.features[hits], result.px[hits])

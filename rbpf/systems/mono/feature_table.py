@@ -75,9 +75,7 @@ class FeatureTable:
     def __len__(self) -> int:
         return len(self.alive)
 
-    def add(
-        self, patches: np.ndarray, px: np.ndarray, pose: np.ndarray, member: np.ndarray | int = -1
-    ) -> np.ndarray:
+    def add(self, patches: np.ndarray, px: np.ndarray, pose: np.ndarray, member: np.ndarray | int = -1) -> np.ndarray:
         """Starts k features seen at px (k, 2) from poses (7,) or (k, 7), with patches (k, S, S); returns their rows."""
         first, count = len(self), len(self) + px.shape[0]
         room = len(self._room["alive"])
@@ -163,17 +161,13 @@ def patch_affines(
     centre = SE3.translation(world_from_camera)
     world_rays = SE3.transform(world_from_camera, rays) - centre
     with np.errstate(divide="ignore", invalid="ignore"):
-        depth = (normal * (point - centre)).sum(axis=-1)[:, None] / (normal[:, None] * world_rays).sum(
-            axis=-1
-        )
+        depth = (normal * (point - centre)).sum(axis=-1)[:, None] / (normal[:, None] * world_rays).sum(axis=-1)
     on_patch = centre + depth[..., None] * world_rays
     first = camera.project(SE3.inverse_transform(first_pose[:, None], on_patch))
     return np.stack([first[:, 0] - first[:, 1], first[:, 2] - first[:, 3]], axis=-1) / 2.0
 
 
-def view_change(
-    position: np.ndarray, one_pose: np.ndarray, other_pose: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def view_change(position: np.ndarray, one_pose: np.ndarray, other_pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Between two cameras, of each feature: cosine (K,) of the lines of sight, and ratio (K,) of the distances.
 
     Args:
@@ -181,9 +175,7 @@ def view_change(
         one_pose: (7,) or (K, 7) world_from_camera.
         other_pose: likewise.
     """
-    one, other = (
-        position[:, :3] - position[:, 3:] * SE3.translation(pose) for pose in (one_pose, other_pose)
-    )
+    one, other = (position[:, :3] - position[:, 3:] * SE3.translation(pose) for pose in (one_pose, other_pose))
     far, near = np.linalg.norm(one, axis=-1), np.linalg.norm(other, axis=-1)
     with np.errstate(divide="ignore", invalid="ignore"):
         return (one * other).sum(axis=-1) / (far * near), far / near

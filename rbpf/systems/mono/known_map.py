@@ -212,9 +212,7 @@ def estimate_mono_map(filter_: Filter, features: FeatureSensor, world: Anchored 
     means, covs, spans = (np.array([row[k] for row in rows]) for k in (1, 2, 3))
     spans = spans.reshape(-1, 2, 3)[order]
     columns = {"ray": np.isfinite(spans).all(axis=(1, 2)).astype(int)}
-    return MapEstimate(
-        names[order], means.reshape(-1, 3)[order], covs.reshape(-1, 3, 3)[order], columns, spans
-    )
+    return MapEstimate(names[order], means.reshape(-1, 3)[order], covs.reshape(-1, 3, 3)[order], columns, spans)
 
 
 def known_map_of(

@@ -100,9 +100,7 @@ def located_points(camera: Pinhole, known: KnownPixels, noise_px: float) -> tupl
     squared, dof = float(np.square(residual).sum()), residual.size - 6
     excess = squared / dof - noise_px**2 if squared > chi2.ppf(NOISE_PROBABILITY, dof) * noise_px**2 else 0.0
     seen = excess * (local[:, 2] / camera.fx) ** 2
-    var_across = np.clip(seen, (TRIANGULATED * known.std_m) ** 2, (ISOTROPIC * known.std_m) ** 2)[
-        :, None, None
-    ]
+    var_across = np.clip(seen, (TRIANGULATED * known.std_m) ** 2, (ISOTROPIC * known.std_m) ** 2)[:, None, None]
     line = SE3.rotation(pose) @ (local / np.linalg.norm(local, axis=1, keepdims=True))[..., None]
     along = line @ np.swapaxes(line, -1, -2)
     var_along = known.std_m[:, None, None] ** 2 - 2.0 * var_across

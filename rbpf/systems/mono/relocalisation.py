@@ -312,9 +312,7 @@ class Relocaliser:
         self.config = config
         self._described: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None = None
 
-    def find(
-        self, belief: Belief, image: np.ndarray, near: np.ndarray, last: "LastView | None" = None
-    ) -> Attempt:
+    def find(self, belief: Belief, image: np.ndarray, near: np.ndarray, last: "LastView | None" = None) -> Attempt:
         """Where the camera must be, if enough of the map's landmarks with known depth are seen.
 
         Args:
@@ -483,9 +481,7 @@ class LastView:
         self.descriptors = sensor.descriptor.describe(image, keypoints.take(known))
         """(K, d)."""
 
-    def match(
-        self, descriptors: np.ndarray, px: np.ndarray, landmarks: np.ndarray
-    ) -> tuple[np.ndarray, Sights] | None:
+    def match(self, descriptors: np.ndarray, px: np.ndarray, landmarks: np.ndarray) -> tuple[np.ndarray, Sights] | None:
         """Its corners (P,) and where another image shows them; None where there are too few.
 
         Args:
@@ -545,9 +541,7 @@ def known_sights(points: np.ndarray, px: np.ndarray, inlier_px: float) -> Sights
     return Sights(points, np.zeros_like(points), px, np.full(len(px), inlier_px / np.sqrt(GATE)))
 
 
-def image_corners(
-    sensor: ImageSensor, image: np.ndarray, config: RelocalisationConfig, border_px: float
-) -> Keypoints:
+def image_corners(sensor: ImageSensor, image: np.ndarray, config: RelocalisationConfig, border_px: float) -> Keypoints:
     """The best corners of an image, inside the lens' circle."""
     mask = sensor.camera.field_of_view_mask(border_px)
     return sensor.detector.detect(image, config.max_corners, None, config.spacing_px, border_px, mask)

@@ -441,9 +441,7 @@ class MonoSlam(System):
             lag=config.lag,
         )
 
-    def _begin(
-        self, measured: Measurement | FeatureFrame
-    ) -> tuple[Measurement | FeatureFrame, PosePrior | None]:
+    def _begin(self, measured: Measurement | FeatureFrame) -> tuple[Measurement | FeatureFrame, PosePrior | None]:
         """What is measured in the first frame, and the camera's pose: the origin, unless known points are the world."""
         known, config = self.known, self.config
         if self.known_map is not None:
@@ -454,9 +452,7 @@ class MonoSlam(System):
         # What the frame shows of the known points.
         if isinstance(measured, Measurement):
             if not isinstance(known, KnownPixels):
-                raise InputError(
-                    "known points without pixels are those of named features: images need KnownPixels"
-                )
+                raise InputError("known points without pixels are those of named features: images need KnownPixels")
             assert self._start is not None and measured.image is not None
             start = self._start
             require_texture(measured.image, known)
@@ -464,9 +460,7 @@ class MonoSlam(System):
             measured.known_px = known.px
         else:
             if not isinstance(known, KnownPoints):
-                raise InputError(
-                    "known points with pixels are those of an image: named features need KnownPoints"
-                )
+                raise InputError("known points with pixels are those of an image: named features need KnownPoints")
             start = KnownStart.from_frame(self.camera, known, measured)
 
         std = np.repeat([config.start_std_rad, config.start_std_m], 3)
@@ -482,9 +476,7 @@ class MonoSlam(System):
         landmark_map.add_records(records, group, ids=start.points.names[:1])
         if isinstance(measured, FeatureFrame):
             rest = ~np.isin(measured.landmarks, start.points.names)
-            measured = FeatureFrame(
-                measured.stamp_ns, measured.landmarks[rest], measured.z[rest], measured.cov_z[rest]
-            )
+            measured = FeatureFrame(measured.stamp_ns, measured.landmarks[rest], measured.z[rest], measured.cov_z[rest])
         return measured, PosePrior(SE3.identity(), np.zeros((6, 6)))
 
     def _add_points(self, known: KnownPoints) -> None:
@@ -536,9 +528,7 @@ class MonoSlam(System):
     ) -> dict[str, np.ndarray]:
         """Of `observed`, in the heaviest particle."""
         if isinstance(measured, FeatureFrame):
-            nowhere = {
-                each.name: np.full((len(measured.z), *each.shape), np.nan) for each in self.observed[1:-2]
-            }
+            nowhere = {each.name: np.full((len(measured.z), *each.shape), np.nan) for each in self.observed[1:-2]}
             seen = {"features": measured.landmarks, "px": measured.z, "cov_px": measured.cov_z}
             return self._nothing() | nowhere | seen
         belief, table, search = self.filter.belief(), self.sensor.table, measured.search
@@ -573,14 +563,10 @@ class MonoSlam(System):
         """Before the first image that can be used: the camera is somewhere around the place that the known points say."""
         assert self._start is not None
         std = np.repeat([self.config.start_std_rad, self.config.start_std_m], 3)
-        values = {column.name: column.kind(0) for column in self.columns} | {
-            "ess": float(self.config.particles)
-        }
+        values = {column.name: column.kind(0) for column in self.columns} | {"ess": float(self.config.particles)}
         messages = [*messages, "the run starts with the first image that shows the known points"]
         pose, cov = self._start.world_from_camera, np.diag(std**2)
-        return Tracked(
-            stamp_ns, pose, cov, TrackingState.INITIALISING, values, self._nothing(), tuple(messages)
-        )
+        return Tracked(stamp_ns, pose, cov, TrackingState.INITIALISING, values, self._nothing(), tuple(messages))
 
 
 @final

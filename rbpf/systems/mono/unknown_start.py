@@ -212,9 +212,7 @@ class UnknownStart:
         if "start/frames/stamps_ns" in arrays:
             held = read(arrays, _FRAMES, "start/frames/")
             columns = held["names"], held["px"], held["cov_px"]
-            parts = zip(
-                *(split(column, held["counts"].tolist(), "start/frames") for column in columns), strict=True
-            )
+            parts = zip(*(split(column, held["counts"].tolist(), "start/frames") for column in columns), strict=True)
             stamps = held["stamps_ns"].tolist()
             self._frames = [FeatureFrame(t, *part) for t, part in zip(stamps, parts, strict=True)]
             self._path = list(held["path"])
@@ -300,9 +298,7 @@ class UnknownStart:
         position[now] = np.concatenate([structure.direction, structure.inverse[:, None]], axis=1)[then]
         return _structure(whole, position)
 
-    def _along(
-        self, paths: np.ndarray, steps: set[int], old: Filter, frames: Sequence[FeatureFrame]
-    ) -> Filter:
+    def _along(self, paths: np.ndarray, steps: set[int], old: Filter, frames: Sequence[FeatureFrame]) -> Filter:
         """A filter that has followed paths (T, N, 7), measuring in the frames that they were drawn from."""
         new = self.new_filter()
         new.rng, new.log_evidence = old.rng, old.log_evidence
@@ -503,9 +499,7 @@ class Linearised:
         by_feature = np.concatenate([along, -turned @ SE3.translation(pose)[:, :, None]], axis=2)
 
         # What was seen, each observation with its loss's weight.
-        of_pose, of_feature = (
-            np.swapaxes(self.weight[:, None, None] * by, 1, 2) for by in (by_pose, by_feature)
-        )
+        of_pose, of_feature = (np.swapaxes(self.weight[:, None, None] * by, 1, 2) for by in (by_pose, by_feature))
         each = np.arange(frames), np.arange(features)
         of_poses[each[0], :, each[0]] = _summed(of_pose @ by_pose, seen.frame, frames)
         of_features[each[1], :, each[1]] = _summed(of_feature @ by_feature, seen.feature, features)

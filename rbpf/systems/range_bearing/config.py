@@ -103,6 +103,4 @@ class RangeBearingConfig:
         """Checks the ranges, and what goes together."""
         check_ranges(self)
         if self.map == "joint" and (self.association != "known" or self.likelihood.kind != "gaussian"):
-            raise InputError(
-                "map=joint takes association=known and likelihood.kind=gaussian: map=particles takes all"
-            )
+            raise InputError("map=joint takes association=known and likelihood.kind=gaussian: map=particles takes all")

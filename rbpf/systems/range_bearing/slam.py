@@ -90,9 +90,7 @@ class RangeBearingSlam(System):
             config.particles,
             np.random.default_rng(config.seed),
             lag=1 if self.joint else config.lag,
-            consolidation=Consolidation(config.window, config.resampling.ess_threshold)
-            if self.joint
-            else None,
+            consolidation=Consolidation(config.window, config.resampling.ess_threshold) if self.joint else None,
         )
         anchored = config.anchor_every and self.joint is None
         self.anchor = StartAnchor(self.filter, config.anchor_every) if anchored else None
@@ -117,9 +115,7 @@ class RangeBearingSlam(System):
             Column("cov_delta", "its covariance in the right chart", "rad² and m²", shape=(d, d)),
         )
         self.observed = (
-            Ragged(
-                "landmarks", "name of each observation's landmark, −1 where it was not used", kind="int64"
-            ),
+            Ragged("landmarks", "name of each observation's landmark, −1 where it was not used", kind="int64"),
             Ragged("z", "measurements", (p,), per="landmarks"),
             Ragged("cov_z", "their covariance", (p, p), per="landmarks"),
         )

@@ -203,11 +203,7 @@ class ImageFrontEnd(FrontEnd[StereoFeatures]):
         if frame.image is None or frame.right is None:
             return None, frame.problem or "an image is missing"
         refusal = self.refusal(frame)
-        return (
-            (None, refusal)
-            if refusal
-            else (self.matcher.measure(frame.image, frame.right), self.matcher.remark)
-        )
+        return (None, refusal) if refusal else (self.matcher.measure(frame.image, frame.right), self.matcher.remark)
 
     def refusal(self, frame: Any) -> str:
         if frame.image is None or frame.right is None:

@@ -479,9 +479,7 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         expected = subsample.expected(belief, self.model, ids)
         k, m = self.gate.pairs(features, expected)
         store = self.store
-        found = match_pairs(
-            features.descriptors, store.descriptors, (k, store.rows(ids)[m]), self.config.limits
-        )
+        found = match_pairs(features.descriptors, store.descriptors, (k, store.rows(ids)[m]), self.config.limits)
         taken = store.ids[found.second]
         of = np.searchsorted(ids, taken)
         agreed = self._agreed(expected.take(of), features.take(found.first), view.uncertain, belief.rng)

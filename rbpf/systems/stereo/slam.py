@@ -84,9 +84,7 @@ class StereoSlam(System):
     frame_word: ClassVar[str] = "pair"
     columns = (
         Column("features", "features that both cameras see", kind=int, table=DIAGNOSTICS),
-        Column(
-            "agreeing", "matches that agree with the motion since the last pair", kind=int, table=DIAGNOSTICS
-        ),
+        Column("agreeing", "matches that agree with the motion since the last pair", kind=int, table=DIAGNOSTICS),
         Column(
             "assumed",
             "pairs since the place was known last over which the motion was only assumed; 0 where it is known",
@@ -203,9 +201,7 @@ class StereoSlam(System):
         # 2. How the camera has moved since the last pair that was measured; where this one tells too little, as before.
         dt, least = self.reckoning.seconds(pair.stamp_ns), config.odometry.estimate.min_matches
         if dt < 0.0:
-            raise InputError(
-                f"time runs backwards: a pair has the stamp {frame.stamp_ns} ns, the last one a later one"
-            )
+            raise InputError(f"time runs backwards: a pair has the stamp {frame.stamp_ns} ns, the last one a later one")
         measured = len(pair) >= least and dt > 0.0
         if measured:
             motion = self._motion_to(pair, dt)
@@ -225,9 +221,7 @@ class StereoSlam(System):
         # 3. Update the filter if the camera has moved enough, and, where its motion was only assumed, if the map says where
         # it has come: until then no particle moves.
         report, seconds_filter = None, 0.0
-        due = self.filter.steps == 0 or config.trigger.reached(
-            at.since_update, self.frames - self._last_update
-        )
+        due = self.filter.steps == 0 or config.trigger.reached(at.since_update, self.frames - self._last_update)
         if measured:
             self.reckoning = at
         if measured and due:
@@ -240,9 +234,7 @@ class StereoSlam(System):
             if control is not None:
                 begun = time.perf_counter()
                 proposal = config.recovery.proposal.build() if uncertain else None
-                report = self.filter.step(
-                    view, control if self.filter.steps else None, pair.stamp_ns, proposal
-                )
+                report = self.filter.step(view, control if self.filter.steps else None, pair.stamp_ns, proposal)
                 self.reckoning, self._last_update = at.updated(), self.frames
                 self.at_update = Estimate(report.estimate.mean, report.estimate.cov)
                 seconds_filter = time.perf_counter() - begun - landmarks.seconds
@@ -321,9 +313,7 @@ class StereoSlam(System):
         """What the pairs showed, and the filter's figures over its updates."""
         updated = log["updated"].astype(bool)
         evidence = log["log_evidence"][updated]
-        milliseconds = (
-            1e3 * (log["seconds_matching"] + log["seconds_filter"])[updated] if updated.any() else 0.0
-        )
+        milliseconds = 1e3 * (log["seconds_matching"] + log["seconds_filter"])[updated] if updated.any() else 0.0
         steps = np.diff(SE3.translation(log.poses), axis=0)
         return {
             "frames_measured": int((log["features"] >= self.config.odometry.estimate.min_matches).sum()),

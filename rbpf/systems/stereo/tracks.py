@@ -95,9 +95,7 @@ class _Tracks:
         """Tracks of rows of the last pair; those that have none yet begin there."""
         tracks, numbers = self._last
         if before.max(initial=-1) >= tracks.size:
-            raise InputError(
-                "the run's log is damaged: a feature follows one that the pair before it has not"
-            )
+            raise InputError("the run's log is damaged: a feature follows one that the pair before it has not")
         fresh = before[tracks[before] < 0]
         tracks[fresh] = self._begin(fresh.size)
         self._append(self._step, tracks[fresh], numbers[fresh])

@@ -126,9 +126,7 @@ class Bag:
         self._ros1 = path.suffix == ".bag" and path.is_file()
         # A file that was not summed up counts none at all.
         counted = any(c.msgcount for c in reader.connections)
-        self.topics: dict[str, str] = {
-            c.topic: c.msgtype for c in reader.connections if c.msgcount or not counted
-        }
+        self.topics: dict[str, str] = {c.topic: c.msgtype for c in reader.connections if c.msgcount or not counted}
         """Types of the topics that hold messages, by their names."""
 
     @property
@@ -230,15 +228,11 @@ def read_image(bag: Bag, raw: RawMessage, where: str, shape: tuple[int, int] | N
         return decode(where, np.asarray(message.data, np.uint8), shape)
     if message.encoding not in _LAYOUTS:
         known = ", ".join(_LAYOUTS)
-        raise UnreadableImageError(
-            f"{where}: the encoding {message.encoding[:40]!r} is none of {known}; convert it."
-        )
+        raise UnreadableImageError(f"{where}: the encoding {message.encoding[:40]!r} is none of {known}; convert it.")
     channels, kind, conversion = _LAYOUTS[message.encoding]
     width = message.width * channels * np.dtype(kind).itemsize
     if not (message.height > 0 and 0 < width <= message.step):
-        raise UnreadableImageError(
-            f"{where}: {message.width}x{message.height} px in rows of {message.step} bytes."
-        )
+        raise UnreadableImageError(f"{where}: {message.width}x{message.height} px in rows of {message.step} bytes.")
     if message.height * message.step != len(message.data):
         expected = f"expected {message.height} rows of {message.step} bytes"
         raise UnreadableImageError(f"{where}: {expected}, found {len(message.data)} bytes.")
@@ -292,9 +286,7 @@ class CameraInfo:
         intrinsics = projection[:, :3] if is_rectified else _field(message, "K").reshape(3, 3)
         fx, fy, cx, cy = intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
         if not (np.isfinite(intrinsics).all() and fx > 0.0 and fy > 0.0):
-            raise InputError(
-                f"{where}: the camera is not calibrated (fx {fx:g}, fy {fy:g}); give --calibration."
-            )
+            raise InputError(f"{where}: the camera is not calibrated (fx {fx:g}, fy {fy:g}); give --calibration.")
         # The model of distortion and its coefficients.
         d, model = _field(message, "D").tolist(), message.distortion_model
         lens: dict[str, Any] = {}
@@ -306,9 +298,7 @@ class CameraInfo:
             else:
                 problem = f"the lens is {model[:40]!r} with {len(d)} coefficients"
                 expected = "expected plumb_bob with 4 or 5, or equidistant with 4"
-                raise InputError(
-                    f"{where}: {problem}, {expected}; rectify the images, or give --calibration."
-                )
+                raise InputError(f"{where}: {problem}, {expected}; rectify the images, or give --calibration.")
         try:
             camera = Pinhole(message.width, message.height, fx, fy, cx, cy, **lens)
         except InputError as error:
@@ -364,9 +354,7 @@ def read_poses(bag: Bag, topic: str, images_ns: np.ndarray, camera_frame: str) -
     length = np.linalg.norm(world_from_camera[:, :4], axis=1)
     wrong = np.flatnonzero(~(np.abs(length - 1.0) <= LONGEST) | ~np.isfinite(world_from_camera).all(axis=1))
     if wrong.size:
-        raise InputError(
-            f"{where}: pose {wrong[0]} has a quaternion of length {length[wrong[0]]:.6g}, expected 1."
-        )
+        raise InputError(f"{where}: pose {wrong[0]} has a quaternion of length {length[wrong[0]]:.6g}, expected 1.")
     return truth_between(bag.path, stamps_ns, SE3.normalise(world_from_camera), images_ns)
 
 
@@ -381,9 +369,7 @@ class RosBag(ImageFormat):
     def recognises(self, path: Path) -> bool:
         if path.is_file():
             return path.suffix in SUFFIXES
-        return (path / "metadata.yaml").is_file() and any(
-            SUFFIXES & set(file.suffixes) for file in path.iterdir()
-        )
+        return (path / "metadata.yaml").is_file() and any(SUFFIXES & set(file.suffixes) for file in path.iterdir())
 
     def read(self, path: Path, options: ReadOptions) -> ImageSequence:
         topics = options.topics
@@ -419,9 +405,7 @@ class RosBag(ImageFormat):
                     expected = "expected baseline_m, the distance of the two cameras in m"
                     raise InputError(f"{options.calibration}: {expected}.")
                 rig = RectifiedStereo(used.camera, used.baseline_m)
-            left, right, notes = pair_stamps(
-                streams[0].stamps_ns, streams[1].stamps_ns, options.tolerance_s, where
-            )
+            left, right, notes = pair_stamps(streams[0].stamps_ns, streams[1].stamps_ns, options.tolerance_s, where)
             stamps_ns = streams[0].stamps_ns[left]
             truth = topics.truth and read_poses(bag, topics.truth, stamps_ns, streams[0].frame)
         source: Source = BagImages(path, stamps_ns, streams[0].shape, tuple(names), (left, right))
@@ -559,9 +543,7 @@ def _rig_of_infos(bag: Bag, streams: list[ImageStream]) -> tuple[RectifiedStereo
         info.calibration.require_shape(stream.shape, f"{bag.path}, {stream.topic}")
     if left.is_rectified != right.is_rectified:
         topics = " and ".join(stream.topic for stream in streams)
-        raise InputError(
-            f"{bag.path}: of {topics} one is rectified and the other is not; give two of a kind."
-        )
+        raise InputError(f"{bag.path}: of {topics} one is rectified and the other is not; give two of a kind.")
     apart = right.shift_m - left.shift_m
     if apart <= 0.0:
         problem = f"P puts the right camera {apart:g} m to the right of the left one"

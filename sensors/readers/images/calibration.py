@@ -54,9 +54,7 @@ class Calibration:
         if shape != (camera.height, camera.width):
             found = f"the images of {what} have {shape[1]}x{shape[0]} px"
             action = "give the calibration of these images, or scale fx, fy, cx and cy with them"
-            raise InputError(
-                f"{self.where}: width and height are {camera.width}x{camera.height}, {found}; {action}."
-            )
+            raise InputError(f"{self.where}: width and height are {camera.width}x{camera.height}, {found}; {action}.")
 
 
 def find_calibration(folder: Path, given: Path | None) -> Calibration:
@@ -82,9 +80,7 @@ def read_calibration(path: Path) -> Calibration:
     given, none = entries.get("distortion"), (0.0,) * len(LENSES[model].coefficient_names)
     lens = coefficients(given, model) if given else none
     camera = Pinhole(width, height, fx, fy, cx, cy, lens, model)
-    rate_hz, baseline_m = (
-        entries[name].positive() if name in entries else None for name in ("rate_hz", "baseline_m")
-    )
+    rate_hz, baseline_m = (entries[name].positive() if name in entries else None for name in ("rate_hz", "baseline_m"))
     return Calibration(str(path), camera, rate_hz, baseline_m)
 
 

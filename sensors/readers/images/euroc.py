@@ -53,9 +53,7 @@ class Euroc(ImageFormat):
     """EuRoC MAV sequences in the ASL layout."""
 
     kind = "an EuRoC sequence in the ASL layout (mav0/cam0 with sensor.yaml and data.csv)"
-    stereo_kind = (
-        "an EuRoC sequence in the ASL layout (mav0 with cam0 and cam1, each with sensor.yaml and data.csv)"
-    )
+    stereo_kind = "an EuRoC sequence in the ASL layout (mav0 with cam0 and cam1, each with sensor.yaml and data.csv)"
 
     def recognises(self, path: Path) -> bool:
         return (path / "mav0").is_dir() or (path / "cam0").is_dir()
@@ -85,9 +83,7 @@ class Euroc(ImageFormat):
         if not SE3.translation(left_from_right).any():
             problem = "T_BS puts cam1 where cam0 is, a baseline of zero; give the two cameras' own"
             raise InputError(f"{folders[1] / 'sensor.yaml'}: {problem}.")
-        listed = [
-            read_stamped(folder / "data.csv", self.stereo_kind, ",", nanoseconds=True) for folder in folders
-        ]
+        listed = [read_stamped(folder / "data.csv", self.stereo_kind, ",", nanoseconds=True) for folder in folders]
         where = str(mav)
         *rows, notes = pair_stamps(listed[0].stamps_ns, listed[1].stamps_ns, options.tolerance_s, where)
         files = []

@@ -39,9 +39,7 @@ def normalised(table: Table, world_from_body: Array) -> Array:
     return SE3.normalise(world_from_body)
 
 
-def truth_between(
-    path: Path, stamps_ns: np.ndarray, world_from_camera: Array, images_ns: np.ndarray
-) -> CameraTruth:
+def truth_between(path: Path, stamps_ns: np.ndarray, world_from_camera: Array, images_ns: np.ndarray) -> CameraTruth:
     """Ground truth in a file, poses (P, 7) at times (P,), that lies at least in part in the time of the images (T,)."""
     if stamps_ns[-1] < images_ns[0] or stamps_ns[0] > images_ns[-1]:
         poses, images = (f"{span[0] / 1e9:.3f} to {span[-1] / 1e9:.3f} s" for span in (stamps_ns, images_ns))

@@ -165,9 +165,7 @@ def pair_stamps(
     if not left.size:
         least = f"the nearest two are {gap_ns.min() * 1e-9:.6f} s apart"
         action = "put both on one clock, or give a larger tolerance"
-        raise InputError(
-            f"{where}: no left and right image were taken within {tolerance_s:g} s, {least}; {action}."
-        )
+        raise InputError(f"{where}: no left and right image were taken within {tolerance_s:g} s, {least}; {action}.")
     notes = [
         f"{where}: {stamps.size - left.size} of {stamps.size} {side} images have no partner within {tolerance_s:g} s "
         "and are left out."

@@ -76,9 +76,7 @@ class ImageSequence:
             RectifiedStereo(self.camera, self.baseline_m)
         stamps = np.asarray(self.stamps_ns)
         if stamps.ndim != 1 or stamps.dtype.kind not in "iu":
-            raise InputError(
-                f"{self.name}: stamps_ns must be (T,) whole numbers, got {stamps.shape} {stamps.dtype}"
-            )
+            raise InputError(f"{self.name}: stamps_ns must be (T,) whole numbers, got {stamps.shape} {stamps.dtype}")
         if (late := np.flatnonzero(np.diff(stamps) < 0)).size:
             raise InputError(f"{self.name}: the stamp of image {late[0] + 1} is before the one it follows")
 
@@ -93,9 +91,7 @@ class ImageSequence:
             InputError: there is one camera.
         """
         if self.baseline_m is None:
-            raise InputError(
-                f"{self.name}: a sequence of one camera has no stereo rig; open it by open_stereo"
-            )
+            raise InputError(f"{self.name}: a sequence of one camera has no stereo rig; open it by open_stereo")
         return RectifiedStereo(self.camera, self.baseline_m)
 
     def frames(self, start: int = 0) -> Iterator[ImageFrame]:

@@ -35,9 +35,7 @@ from rbpf.sensors.readers.images.decoding import (
 from rbpf.sensors.readers.images.folders import DEFAULT_RATE_HZ, evenly, list_images
 from rbpf.sensors.readers.images.sequence import ImageFormat, ImageFrame, ImageSequence, ReadOptions, Source
 
-SUFFIXES = frozenset(
-    {".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts", ".ogv", ".webm", ".wmv", ".y4m"}
-)
+SUFFIXES = frozenset({".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts", ".ogv", ".webm", ".wmv", ".y4m"})
 
 _ROUNDING_NS = 1_000_000
 """Containers round times to milliseconds."""
@@ -187,9 +185,7 @@ def read_uncalibrated(path: Path, most: int) -> tuple[int, Iterator[NamedImage]]
     video = path.is_file() and path.suffix.lower() in SUFFIXES
     if not (video or path.is_dir()):
         found = "is neither a folder nor a video" if path.exists() else "no such file or folder"
-        raise InputError(
-            f"{path}: {found}; expected a folder of images, or a video ({', '.join(sorted(SUFFIXES))})"
-        )
+        raise InputError(f"{path}: {found}; expected a folder of images, or a video ({', '.join(sorted(SUFFIXES))})")
     files = [] if video else list_images(path)
     if not (video or files):
         raise InputError(f"{path}: expected images in it or in its images/, found none")

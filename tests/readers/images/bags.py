@@ -55,18 +55,14 @@ class Recorder:
 
     def compressed(self, topic, stamp, data, format="png"):
         """Bytes of a file."""
-        self.add(
-            topic, stamp, "sensor_msgs/msg/CompressedImage", format=format, data=np.frombuffer(data, np.uint8)
-        )
+        self.add(topic, stamp, "sensor_msgs/msg/CompressedImage", format=format, data=np.frombuffer(data, np.uint8))
 
     def info(self, topic, stamp=STAMPS_NS[0], size=SIZE, **changes):
         """A camera; its matrices are by rows."""
         k = changes.get("k", K)
         given = {"d": (0.1, 0.01, 0.001, 0.002, 0.0), "k": k, "r": np.eye(3).reshape(-1), "binning": 1,
                  "p": (*k[:3], 0.0, *k[3:6], 0.0, *k[6:], 0.0), "model": "plumb_bob"} | changes  # fmt: skip
-        roi = self.make(
-            "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
-        )
+        roi = self.make("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
         matrices = {name.upper() if self.ros1 else name: np.array(given[name], float) for name in "dkrp"}
         self.add(
             topic, stamp, "sensor_msgs/msg/CameraInfo", height=size[0], width=size[1], roi=roi,

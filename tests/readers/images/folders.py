@@ -96,9 +96,7 @@ def write_asl_truth(folder, world_from_sensor, stamps, body_from_sensor=None, ex
     if body_from_sensor is not None:
         (folder / "sensor.yaml").write_text(sensor_yaml(body_from_sensor, camera=False))
     lines = ["#timestamp, p_RS_R_x [m], ..."]
-    for stamp, (qx, qy, qz, qw, *position) in zip(
-        stamps, np.asarray(world_from_sensor).tolist(), strict=True
-    ):
+    for stamp, (qx, qy, qz, qw, *position) in zip(stamps, np.asarray(world_from_sensor).tolist(), strict=True):
         lines.append(",".join(map(str, [stamp, *position, qw, qx, qy, qz])) + extra)
     (folder / "data.csv").write_text("\n".join(lines) + "\n")
 

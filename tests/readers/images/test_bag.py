@@ -178,9 +178,7 @@ def test_times_that_run_backwards(tmp_path, kind):
         bag.info("/camera_info")
         for received, stamp in enumerate((5, 7, 6)):
             fields = {"height": 1, "width": 1, "encoding": "mono8", "is_bigendian": 0, "step": 1}
-            bag.add(
-                "/image_raw", stamp, "sensor_msgs/msg/Image", received, data=np.zeros(1, np.uint8), **fields
-            )
+            bag.add("/image_raw", stamp, "sensor_msgs/msg/Image", received, data=np.zeros(1, np.uint8), **fields)
     with pytest.raises(InputError, match="/image_raw: the stamp of image 2 is before the one it follows"):
         open_images(tmp_path / kind, write_camera(tmp_path))
 
@@ -313,9 +311,7 @@ def test_a_rectified_image_has_the_camera_of_the_projection(tmp_path):
 def test_without_a_camera_one_has_to_be_given(tmp_path):
     with recorded(tmp_path / "walk.bag") as bag:
         bag.image("/cam/image_raw", 1, grey(10, SIZE))
-    with pytest.raises(
-        InputError, match="expected the camera of /cam/image_raw in /cam/camera_info, found no"
-    ):
+    with pytest.raises(InputError, match="expected the camera of /cam/image_raw in /cam/camera_info, found no"):
         open_images(tmp_path / "walk.bag")
     camera = write_camera(tmp_path, fx=22.0)
     assert open_images(tmp_path / "walk.bag", camera).camera.fx == 22.0
@@ -415,9 +411,7 @@ def test_truth_from_every_message_that_holds_a_pose(tmp_path, kind, message):
             bag.pose("/truth", stamp, pose, message)
     truth = open_images(path, topics=TRUTH).truth
     assert truth.stamps_ns.tolist() == list(STAMPS_NS)
-    np.testing.assert_allclose(
-        SE3.between(truth.world_from_camera, poses), np.tile(SE3.identity(), (3, 1)), atol=1e-12
-    )
+    np.testing.assert_allclose(SE3.between(truth.world_from_camera, poses), np.tile(SE3.identity(), (3, 1)), atol=1e-12)
 
 
 def test_poses_of_another_frame_are_said(tmp_path, caplog):
@@ -427,9 +421,7 @@ def test_poses_of_another_frame_are_said(tmp_path, caplog):
         bag.pose("/truth", 1, SE3.identity(), "nav_msgs/msg/Odometry", child="base_link")
     with caplog.at_level(logging.WARNING):
         open_images(tmp_path / "walk.bag", topics=TRUTH)
-    assert (
-        "the poses of /truth are those of base_link and are taken as those of the camera cam" in caplog.text
-    )
+    assert "the poses of /truth are those of base_link and are taken as those of the camera cam" in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -138,9 +138,7 @@ def test_an_image_of_another_size_is_lost(tmp_path):
 def test_floating_point_images_are_refused(tmp_path):
     write_plain(tmp_path, ["0.png"])
     write_image(tmp_path / "1.tiff", np.ones(SIZE, np.float32))
-    assert (
-        "expected 8 or 16 bits per channel, found float32" in list(open_images(tmp_path).frames())[1].problem
-    )
+    assert "expected 8 or 16 bits per channel, found float32" in list(open_images(tmp_path).frames())[1].problem
 
 
 def test_the_first_image_that_can_be_read_tells_the_size(tmp_path):
@@ -153,9 +151,7 @@ def test_no_image_can_be_read(tmp_path):
     write_plain(tmp_path)
     for name in ("0.png", "1.png", "2.png"):
         (tmp_path / name).write_bytes(b"none")
-    with pytest.raises(
-        InputError, match=r"none of 3 images can be read; the first is .*0.png: the file is damaged"
-    ):
+    with pytest.raises(InputError, match=r"none of 3 images can be read; the first is .*0.png: the file is damaged"):
         open_images(tmp_path)
 
 

@@ -302,9 +302,7 @@ def test_the_estimated_state_of_euroc_becomes_the_pose_of_the_camera(tmp_path, m
     write_asl_truth(mav / "vicon0", PATH[1:], EUROC_NS[1:], SE3.identity())
     write_asl_truth(mav / "state_groundtruth_estimate0", PATH, EUROC_NS, mounted, extra=",0.1,0.2,0,0,0,0")
     truth = open_images(tmp_path / "a").truth
-    np.testing.assert_allclose(
-        SE3.matrix(truth.world_from_camera), SE3.matrix(PATH) @ SE3.matrix(CAM0), atol=1e-12
-    )
+    np.testing.assert_allclose(SE3.matrix(truth.world_from_camera), SE3.matrix(PATH) @ SE3.matrix(CAM0), atol=1e-12)
     assert truth.stamps_ns.tolist() == list(EUROC_NS)
     # A calibration that is given leaves the truth of the camera.
     given = open_images(tmp_path / "a", write_camera(tmp_path, fx=25.0)).truth
@@ -487,9 +485,7 @@ def test_images_that_are_not_evenly_spread_have_the_times_that_the_video_says(fi
     assert np.unique(np.diff(open_images(path, evenly).stamps_ns)).tolist() == [100_000_000]
 
 
-@pytest.mark.parametrize(
-    ("degrees", "corner"), [("-90", "upper right"), ("180", "lower right"), ("90", "lower left")]
-)
+@pytest.mark.parametrize(("degrees", "corner"), [("-90", "upper right"), ("180", "lower right"), ("90", "lower left")])
 def test_a_turned_video_is_turned_and_a_calibration_of_what_is_stored_with_it(filmed, degrees, corner):
     make, images, h264 = filmed
     upright = make(images, f"upright{degrees}.mp4", *h264)
@@ -575,16 +571,10 @@ def test_part_of_a_recording(tmp_path):
     whole, part = open_images(folder), Part(0.15, 0.65, 2, whole_width := SIZE[1] // 2)
     sequence = open_images(folder, part=part)
     assert sequence.stamps_ns.tolist() == [200_000_000, 400_000_000, 600_000_000]
-    assert levels(sequence) == [levels(whole)[k] for k in (2, 4, 6)] and levels(sequence, 2) == [
-        levels(whole)[6]
-    ]
+    assert levels(sequence) == [levels(whole)[k] for k in (2, 4, 6)] and levels(sequence, 2) == [levels(whole)[6]]
     frames = list(sequence.frames())
     assert [frame.stamp_ns for frame in frames] == sequence.stamps_ns.tolist()
-    assert (
-        frames[0].image.shape
-        == (sequence.camera.height, sequence.camera.width)
-        == (SIZE[0] // 2, whole_width)
-    )
+    assert frames[0].image.shape == (sequence.camera.height, sequence.camera.width) == (SIZE[0] // 2, whole_width)
     assert sequence.camera == whole.camera.resized(whole_width, SIZE[0] // 2)
     assert Part.of({"rbpf": "1", **part.entries()}) == part and Part().entries() == {}
     # A pair is of the same cameras, as far apart, and its parts are as old.

@@ -198,16 +198,12 @@ def test_a_given_calibration(tmp_path):
     bent = write_camera(tmp_path, distortion=[0.1, 0, 0, 0])
     with pytest.raises(InputError, match="rectify the images"):
         open_stereo(tmp_path / "a", bent)
-    with pytest.raises(
-        InputError, match=r"has equidistant distortion \(0.0, 0.0, 0.0, 0.0\): rectify the images"
-    ):
+    with pytest.raises(InputError, match=r"has equidistant distortion \(0.0, 0.0, 0.0, 0.0\): rectify the images"):
         open_stereo(tmp_path / "a", write_camera(tmp_path, model="fisheye"))
 
 
 def test_what_is_no_stereo_sequence(tmp_path):
-    with pytest.raises(
-        InputError, match=r"expected a ROS bag.*; or an EuRoC sequence .* cam0 and cam1.*; or a KITTI"
-    ):
+    with pytest.raises(InputError, match=r"expected a ROS bag.*; or an EuRoC sequence .* cam0 and cam1.*; or a KITTI"):
         open_stereo(write_plain(tmp_path / "a"))
     with pytest.raises(InputError, match="no such file or folder; expected a stereo sequence"):
         open_stereo(tmp_path / "b")
@@ -273,9 +269,7 @@ def test_rectified_cameras_see_a_point_on_one_row(left, right):
     ):
         # The map at the rectified place names the place in the image as it was taken.
         place = rectified[inside][:, [column, 1]].astype(np.float32)
-        given = np.column_stack(
-            [cv2.remap(part, place[:, :1], place[:, 1:], cv2.INTER_LINEAR)[:, 0] for part in maps]
-        )
+        given = np.column_stack([cv2.remap(part, place[:, :1], place[:, 1:], cv2.INTER_LINEAR)[:, 0] for part in maps])
         np.testing.assert_allclose(given, camera.project(where[inside]), atol=0.1)
 
 
