@@ -96,6 +96,6 @@ def map_figure(
     margin = 0.15 * max(float((high - low).max()), 1e-3)
     axes.set_xlim(low[0] - margin, high[0] + margin)
     axes.set_ylim(low[1] - margin, high[1] + margin)
-    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_aspect("equal", adjustable="box")
     axes.legend(fontsize="small")
     return figure
