@@ -18,7 +18,7 @@ def test_names_and_values_stand_one_a_line():
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ("run mono --partcles", "`rbpf run mono` has no option --partcles: did you mean --particles?"),
+        ("run mono --particle-count", "`rbpf run mono` has no option --particle-count: did you mean --particles?"),
         ("run mono x --known_pints=a", "has no option --known-pints: did you mean --known-points?"),
         ("run stereo x --no-vdeo", "did you mean --no-video?"),
         ("export x --xyz", "`rbpf export` has no option --xyz: there are --help, --json, --format, --out"),
