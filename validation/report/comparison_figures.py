@@ -93,9 +93,9 @@ def map_figure(
     label(axes, title, f"{'xyz'[chosen[0]]} [m]", f"{'xyz'[chosen[1]]} [m]", equal=True)
     shown = np.concatenate([path[:, chosen], *(points[:, chosen] for points in other.values()), mean[:, chosen]])
     low, high = np.quantile(shown, [0.5 * (1.0 - CLOSE), 0.5 * (1.0 + CLOSE)], axis=0)
-    margin = 0.15 * max(float((high - low).max()), 1e-3)
-    axes.set_xlim(low[0] - margin, high[0] + margin)
-    axes.set_ylim(low[1] - margin, high[1] + margin)
+    middle, half = 0.5 * (low + high), 0.65 * max(float((high - low).max()), 1e-3)
+    axes.set_xlim(middle[0] - half, middle[0] + half)
+    axes.set_ylim(middle[1] - half, middle[1] + half)
     axes.set_aspect("equal", adjustable="box")
     axes.legend(fontsize="small")
     return figure
