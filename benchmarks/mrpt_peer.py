@@ -89,16 +89,7 @@ def run(settings: Settings) -> list[Row]:
         (folder / "simulation.ini").write_text(SIMULATION)
         (folder / "ekf_slam.ini").write_text(EKF_SLAM)
         call(folder, "simul-landmarks", "simulation.ini")
-        call(
-            folder,
-            "rawlog-edit",
-            "-w",
-            "--list-range-bearing",
-            "-i",
-            "log.rawlog",
-            "--text-file-output",
-            "z.txt",
-        )
+        call(folder, "rawlog-edit", "-w", "--list-range-bearing", "-i", "log.rawlog", "--text-file-output", "z.txt")
         turns = settings.repetitions(6)
         frames, landmarks = read(folder)
         output: list[str] = []

@@ -113,13 +113,7 @@ def run(settings: Settings) -> list[Row]:
     return [
         row(name, match, searched, AIM_SEARCH_MS, f"places to a fraction of a pixel; {warped}"),
         row("patch search, 320x240", "cv2.matchTemplate", everywhere, AIM_WHOLE_MS, "one template"),
-        row(
-            f"{CORNERS} corners of 640x480",
-            "cv2.goodFeaturesToTrack",
-            chosen,
-            AIM_CORNERS_MS,
-            "smoothed noise",
-        ),
+        row(f"{CORNERS} corners of 640x480", "cv2.goodFeaturesToTrack", chosen, AIM_CORNERS_MS, "smoothed noise"),
     ]
 
 

@@ -78,13 +78,7 @@ def exp_se2(xi: np.ndarray) -> np.ndarray:
 
 def moved(pose: np.ndarray, delta: np.ndarray) -> np.ndarray:
     c, s = math.cos(pose[0]), math.sin(pose[0])
-    return np.array(
-        [
-            pose[0] + delta[0],
-            pose[1] + c * delta[1] - s * delta[2],
-            pose[2] + s * delta[1] + c * delta[2],
-        ]
-    )
+    return np.array([pose[0] + delta[0], pose[1] + c * delta[1] - s * delta[2], pose[2] + s * delta[1] + c * delta[2]])
 
 
 def linearised(pose: np.ndarray, point: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -80,10 +80,7 @@ class Timing:
 
 
 def interleaved(
-    contestants: dict[str, Callable[[], Any]],
-    repetitions: int,
-    calls: dict[str, int] | None = None,
-    warm_up: int = 2,
+    contestants: dict[str, Callable[[], Any]], repetitions: int, calls: dict[str, int] | None = None, warm_up: int = 2
 ) -> dict[str, Timing]:
     """Times the contestants in turn, so that a change of the machine's load falls on all of them alike.
 

@@ -18,10 +18,7 @@ def run(settings: Settings) -> list[Row]:
     """In a process of its own, beside what the numbers of all estimates take."""
     turns = settings.repetitions(6)
     told = subprocess.run(
-        [sys.executable, "-m", "benchmarks.stereo_memory", str(turns)],
-        capture_output=True,
-        text=True,
-        check=True,
+        [sys.executable, "-m", "benchmarks.stereo_memory", str(turns)], capture_output=True, text=True, check=True
     ).stdout
     peak, before, landmarks, particles = json.loads(told.splitlines()[-1])
     floor = 8.0 * NUMBERS * landmarks * particles / 2**20

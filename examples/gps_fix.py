@@ -59,11 +59,7 @@ def main() -> dict[str, float]:
     guesses = np.zeros((PARTICLES, 3))
     guesses[:, 0] = np.linspace(-np.pi, np.pi, PARTICLES, endpoint=False)
     filter_ = Filter(
-        OdometryMotion(SE2),
-        PositionReceiver(STD_FIX),
-        n=PARTICLES,
-        rng=np.random.default_rng(0),
-        start=guesses,
+        OdometryMotion(SE2), PositionReceiver(STD_FIX), n=PARTICLES, rng=np.random.default_rng(0), start=guesses
     )
     errors, sigmas = [], []
     for t, (true_pose, control, fix) in enumerate(simulate(np.random.default_rng(1))):

@@ -85,11 +85,7 @@ def draw(curves: dict[str, np.ndarray], path: Path) -> None:
 
 
 def main(
-    steps: int = 40,
-    particles: int = 500,
-    seeds: int = 8,
-    out: Path = Path("demo/motion_evidence"),
-    quick: bool = False,
+    steps: int = 40, particles: int = 500, seeds: int = 8, out: Path = Path("demo/motion_evidence"), quick: bool = False
 ) -> dict[str, EvidenceDifference]:
     """Compares both models on both recordings.
 

@@ -38,12 +38,7 @@ def filtered(log: RobotLog, proposal: Proposal) -> tuple[float, float]:
     assert log.truth is not None
     sensor = NamedLandmarkSensor(RangeBearing(log.space, log.robot_from_sensor), Point(2))
     filter_ = Filter(
-        OdometryMotion(log.space),
-        sensor,
-        LandmarkMap(log.space),
-        proposal,
-        n=100,
-        rng=np.random.default_rng(0),
+        OdometryMotion(log.space), sensor, LandmarkMap(log.space), proposal, n=100, rng=np.random.default_rng(0)
     )
     errors, sizes = [], []
     for frame, true_pose in zip(log.frames, log.truth.world_from_robot, strict=True):

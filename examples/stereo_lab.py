@@ -18,14 +18,7 @@ from rbpf.validation.simulation.images import Imaging, simulate_images
 from rbpf.validation.simulation.lab import LabDrive, TexturedLab
 from rbpf.validation.tables import write_table
 
-FIGURES = (
-    "ate_rmse_m",
-    "vo_ate_rmse_m",
-    "landmarks_mean_per_particle",
-    "updates",
-    "distance_m",
-    "lost_frames",
-)
+FIGURES = ("ate_rmse_m", "vo_ate_rmse_m", "landmarks_mean_per_particle", "updates", "distance_m", "lost_frames")
 
 
 def render(folder: Path, frames: int, width: int) -> Path:
@@ -39,10 +32,7 @@ def render(folder: Path, frames: int, width: int) -> Path:
 
 
 def main(
-    frames: int = 240,
-    particles: int = 400,
-    out: Path = Path("demo/stereo_lab"),
-    quick: bool = False,
+    frames: int = 240, particles: int = 400, out: Path = Path("demo/stereo_lab"), quick: bool = False
 ) -> dict[str, float]:
     """Renders, filters, and prints the main figures.
 

@@ -18,11 +18,7 @@ from rbpf.validation.tables import write_table
 
 
 def main(
-    steps: int = 200,
-    particles: int = 500,
-    seed: int = 1,
-    out: Path = Path("demo/validate_run"),
-    quick: bool = False,
+    steps: int = 200, particles: int = 500, seed: int = 1, out: Path = Path("demo/validate_run"), quick: bool = False
 ) -> dict[str, str]:
     """Simulates, filters, compares and prints what was found.
 

@@ -45,9 +45,7 @@ class Constellation(Landmark):
     def started(self, n: int, world_from_group: np.ndarray, cov: np.ndarray) -> Records:
         """First records (n, 1, …): the frame at world_from_group (7,), covariance (6, 6) in the right chart there."""
         return Records(
-            np.zeros((n, 1, 6)),
-            np.broadcast_to(cov, (n, 1, 6, 6)),
-            np.broadcast_to(world_from_group, (n, 1, 7)),
+            np.zeros((n, 1, 6)), np.broadcast_to(cov, (n, 1, 6, 6)), np.broadcast_to(world_from_group, (n, 1, 7))
         )
 
     def frame(self, records: Records) -> tuple[np.ndarray, np.ndarray]:

@@ -377,11 +377,7 @@ class JointMap(Map):
         return self.add_records(records, new_landmarks.landmark, None, new_landmarks.ids)
 
     def add_records(
-        self,
-        records: Records,
-        landmark: Landmark,
-        log_odds: np.ndarray | None = None,
-        ids: np.ndarray | None = None,
+        self, records: Records, landmark: Landmark, log_odds: np.ndarray | None = None, ids: np.ndarray | None = None
     ) -> np.ndarray:
         if log_odds is not None or not self._is_point(landmark):
             raise InputError(

@@ -81,11 +81,7 @@ class LandmarkMap(Map):
         return self.add_records(records, new_landmarks.landmark, log_odds, new_landmarks.ids)
 
     def add_records(
-        self,
-        records: Records,
-        landmark: Landmark,
-        log_odds: np.ndarray | None = None,
-        ids: np.ndarray | None = None,
+        self, records: Records, landmark: Landmark, log_odds: np.ndarray | None = None, ids: np.ndarray | None = None
     ) -> np.ndarray:
         if log_odds is not None and not self.evidence:
             raise InputError("landmarks of some particles only need a map with evidence=True")

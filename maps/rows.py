@@ -311,12 +311,7 @@ class RowEngine:
         )
 
     def _correct_compiled(
-        self,
-        kernel: FusedKernel,
-        batch: Batch,
-        group: Observations,
-        state: np.ndarray,
-        log_density: np.ndarray,
+        self, kernel: FusedKernel, batch: Batch, group: Observations, state: np.ndarray, log_density: np.ndarray
     ) -> None:
         access, targets = self.store.rewrite(batch.ids)
         likelihood = group.likelihood or GAUSSIAN

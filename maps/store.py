@@ -25,10 +25,7 @@ _TABLES = {
     "due": DUE,
 }
 _HOT = {"data": numbers("fields", "n", values="log")}
-_COLD = {
-    "kept": integers("kept", least=0, below="n", ascending=True),
-    "data": numbers("fields", "kept", values="log"),
-}
+_COLD = {"kept": integers("kept", least=0, below="n", ascending=True), "data": numbers("fields", "kept", values="log")}
 
 HOT_FRACTION = 0.75
 """A column with fewer surviving rows than this fraction of the particles gives its dense slab back."""

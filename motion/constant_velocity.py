@@ -92,10 +92,7 @@ class SampledVelocity(MotionModel):
     space = POSE_AND_VELOCITY
 
     def __init__(
-        self,
-        std_walk: np.ndarray,
-        mode: Literal["paper", "joint"] = "joint",
-        std_start: np.ndarray | float = 0.0,
+        self, std_walk: np.ndarray, mode: Literal["paper", "joint"] = "joint", std_start: np.ndarray | float = 0.0
     ) -> None:
         self.std_walk = _checked(std_walk)
         self.std_start = _checked(std_start)

@@ -175,12 +175,7 @@ def pixels_from_points(camera: StereoCamera) -> Array:
     """Q (4, 4)."""
     one, shift = camera.camera, camera.camera.fx * camera.baseline_m
     return np.array(
-        [
-            [one.fx, 0.0, one.cx, 0.0],
-            [0.0, one.fy, one.cy, 0.0],
-            [one.fx, 0.0, one.cx, -shift],
-            [0.0, 0.0, 1.0, 0.0],
-        ]
+        [[one.fx, 0.0, one.cx, 0.0], [0.0, one.fy, one.cy, 0.0], [one.fx, 0.0, one.cx, -shift], [0.0, 0.0, 1.0, 0.0]]
     )
 
 

@@ -154,10 +154,7 @@ class LandmarkManager:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """For a checkpoint."""
-        return {
-            "key_manager/table": self._table.copy(),
-            "key_manager/counters": np.array([self.frame, self.next_name]),
-        }
+        return {"key_manager/table": self._table.copy(), "key_manager/counters": np.array([self.frame, self.next_name])}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """The inverse of `arrays`; errors as `rbpf.core.schema.read`."""

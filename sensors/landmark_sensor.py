@@ -6,16 +6,7 @@ from typing import Protocol, final
 import numpy as np
 
 from rbpf.core.likelihoods import ExistenceModel, Gates, associate
-from rbpf.core.models import (
-    NEW,
-    Belief,
-    Landmark,
-    Likelihood,
-    NewLandmarks,
-    ObservationModel,
-    Observations,
-    Sensor,
-)
+from rbpf.core.models import NEW, Belief, Landmark, Likelihood, NewLandmarks, ObservationModel, Observations, Sensor
 from rbpf.errors import InputError
 
 

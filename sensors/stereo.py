@@ -26,14 +26,7 @@ from rbpf import gaussian
 from rbpf.errors import InputError
 from rbpf.ranges import NotNegative, Positive, Range, Ranged, Ratio
 from rbpf.sensors.camera import RectifiedStereo
-from rbpf.sensors.descriptors import (
-    DescriptorMatches,
-    MatchLimits,
-    band_pairs,
-    gate_pairs,
-    match_all,
-    match_pairs,
-)
+from rbpf.sensors.descriptors import DescriptorMatches, MatchLimits, band_pairs, gate_pairs, match_all, match_pairs
 from rbpf.sensors.features import Sift
 from rbpf.sensors.features.interface import FeatureExtractor, Features, checked_image
 
@@ -215,10 +208,7 @@ class StereoMatcher:
     """
 
     def __init__(
-        self,
-        rig: RectifiedStereo,
-        extractor: FeatureExtractor | None = None,
-        config: PairConfig | None = None,
+        self, rig: RectifiedStereo, extractor: FeatureExtractor | None = None, config: PairConfig | None = None
     ) -> None:
         self.rig = rig
         self.extractor = extractor or Sift()

@@ -232,11 +232,7 @@ def test_covariance_stays_semidefinite_over_thousands_of_updates(rng):
 @pytest.mark.parametrize("kappa", [None, 0.0, 1.5])
 def test_unscented_transform_is_exact_for_affine_maps(n, kappa, rng):
     linear, offset = rng.normal(size=(4, n)), rng.normal(size=4)
-    for cov in (
-        covariances(rng, (7,), n),
-        covariances(rng, (7,), n, rank=max(1, n - 1)),
-        np.zeros((7, n, n)),
-    ):
+    for cov in (covariances(rng, (7,), n), covariances(rng, (7,), n, rank=max(1, n - 1)), np.zeros((7, n, n))):
         mean = rng.normal(size=(7, n))
         image = gaussian.unscented_transform(lambda x: x @ linear.T + offset, mean, cov, kappa)
         np.testing.assert_allclose(image.mean, mean @ linear.T + offset, atol=1e-11)

@@ -345,12 +345,7 @@ def draw_curves(axes: Any, system: str, found: dict[str, Consistency]) -> None:
         if start is not None:
             axes.axvline(start, color=line.get_color(), lw=0.8, ls=":")
     runs = len(first.trials)
-    axes.set(
-        title=f"{system}: NEES of the pose, mean of {runs} runs",
-        xlabel="step",
-        ylabel="NEES / d",
-        yscale="log",
-    )
+    axes.set(title=f"{system}: NEES of the pose, mean of {runs} runs", xlabel="step", ylabel="NEES / d", yscale="log")
     axes.grid(alpha=0.3)
     axes.legend(fontsize="small")
 

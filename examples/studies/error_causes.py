@@ -102,10 +102,7 @@ def robot_causes(
     stamps = np.array([frame.stamp_ns for frame in log.frames], dtype=np.int64)
 
     def error(poses: np.ndarray) -> float:
-        ours, true = (
-            in_space(stamps[truth.rows], poses[truth.rows]),
-            in_space(stamps[truth.rows], truth.poses),
-        )
+        ours, true = (in_space(stamps[truth.rows], poses[truth.rows]), in_space(stamps[truth.rows], truth.poses))
         return ate(ours, true, "rigid").rmse
 
     runs = [filter_robot_log(log, replace(config, seed=seed)) for seed in seeds]

@@ -18,13 +18,7 @@ from rbpf.errors import InputError
 from rbpf.lie import Array
 from rbpf.runs.plots import COLOURS, new_axes, save_figures
 from rbpf.runs.reading import PathAndMap
-from rbpf.runs.recordings import (
-    MonoRecording,
-    StereoRecording,
-    filter_features,
-    filter_recording,
-    filter_robot_log,
-)
+from rbpf.runs.recordings import MonoRecording, StereoRecording, filter_features, filter_recording, filter_robot_log
 from rbpf.runs.run import Run
 from rbpf.runs.trajectory import Alignment, Trajectory, associate, in_space
 from rbpf.sensors.camera import Pinhole

@@ -36,13 +36,7 @@ from rbpf.lie import SE3
 from rbpf.runs.recordings import filter_images, filter_pairs
 from rbpf.runs.truth import truth_at
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
-from rbpf.sensors.readers import (
-    ImageSequence,
-    KnownPixels,
-    open_images,
-    open_stereo,
-    read_known_points,
-)
+from rbpf.sensors.readers import ImageSequence, KnownPixels, open_images, open_stereo, read_known_points
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.validation.simulation.desk_and_room import TexturedDesk
@@ -247,11 +241,7 @@ def main(frames: int = 150, kills: int = 5, out: Path = Path("demo/faults"), qui
     write_csv(out / "said.csv", ["system", "fault", "what is said"], [[o.system, o.fault, o.said] for o in outcomes])
     draw(outcomes, out / "faults.png")
     machine = of_machine(desk, out, kills, quick)
-    write_table(
-        out / "machine.csv",
-        MACHINE,
-        [[name, e.code, str(e.traceback), e.said] for name, e in machine.items()],
-    )
+    write_table(out / "machine.csv", MACHINE, [[name, e.code, str(e.traceback), e.said] for name, e in machine.items()])
     same = same_path(out / "whole", out / "killed")
     print(f"the killed run's path is {'' if same else 'not '}that of the undisturbed one, to the byte")
     print(f"tables and picture in {out}")
@@ -291,18 +281,7 @@ def of_machine(desk: Path, out: Path, kills: int, quick: bool) -> dict[str, Ende
 def command(folder: Path, out: Path) -> list[str]:
     """`rbpf run mono` without what takes long."""
     known = ["--known-points", str(folder / "known_points.csv")]
-    return [
-        "run",
-        "mono",
-        str(folder),
-        *known,
-        "--out",
-        str(out),
-        "--particles",
-        "20",
-        "--no-video",
-        "--no-batch",
-    ]
+    return ["run", "mono", str(folder), *known, "--out", str(out), "--particles", "20", "--no-video", "--no-batch"]
 
 
 def same_path(whole: Path, resumed: Path) -> bool:

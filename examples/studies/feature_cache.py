@@ -83,10 +83,7 @@ class CachedSequence:
 
 
 def cache_features(
-    sequence: ImageSequence,
-    config: StereoConfig,
-    folder: Path,
-    on_pair: Callable[[int, int], None] | None = None,
+    sequence: ImageSequence, config: StereoConfig, folder: Path, on_pair: Callable[[int, int], None] | None = None
 ) -> CachedSequence:
     """Measures what is not in `folder` yet.
 

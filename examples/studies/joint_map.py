@@ -114,17 +114,7 @@ def recorded(folder: Path, seeds: int, configs: dict[str, RangeBearingConfig]) -
                 speed.append(1e3 * float(np.median(done.log["seconds"])))
             mean, spread = np.mean(errors, axis=0), np.ptp(errors, axis=0)
             rows.append(
-                [
-                    recording,
-                    name,
-                    seeds,
-                    mean[0],
-                    spread[0],
-                    mean[1],
-                    spread[1],
-                    float(np.ptp(evidence)),
-                    min(speed),
-                ]
+                [recording, name, seeds, mean[0], spread[0], mean[1], spread[1], float(np.ptp(evidence)), min(speed)]
             )
     return rows
 

@@ -415,17 +415,7 @@ def main(
     for folder in sequences or simulated(out, frames, quick):
         plan = Blackouts(folder, config, blackouts, first_s, dark_s, within_s)
         all_series.append(run_series(plan, out, workers))
-    header = [
-        "sequence",
-        "blackouts",
-        "rightly",
-        "late",
-        "wrongly",
-        "not",
-        "share",
-        "share in view",
-        "median [s]",
-    ]
+    header = ["sequence", "blackouts", "rightly", "late", "wrongly", "not", "share", "share in view", "median [s]"]
     write_table(out / "summary.csv", header, [line(series) for series in all_series])
     rows = [details(series, number) for series in all_series for number in range(len(series.outcomes))]
     header = [

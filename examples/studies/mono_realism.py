@@ -223,11 +223,7 @@ def draw(found: list[SearchStatistics]) -> Figure:
     for one in found:
         style = "-" if "rendered" not in one.name else "--" if "perfect" not in one.name else ":"
         curve.plot(one.survival(WATCHED), style, label=one.name)
-    curve.set(
-        xlabel="frames in which it was looked for",
-        ylabel="fraction of features not dropped",
-        ylim=(0.0, 1.02),
-    )
+    curve.set(xlabel="frames in which it was looked for", ylabel="fraction of features not dropped", ylim=(0.0, 1.02))
     curve.grid(alpha=0.3)
     curve.legend(fontsize="small")
     return figure

@@ -222,12 +222,7 @@ class Tracker:
     """
 
     def __init__(
-        self,
-        known: np.ndarray,
-        count: int,
-        measuring: "Measuring",
-        image_px: np.ndarray,
-        rng: np.random.Generator,
+        self, known: np.ndarray, count: int, measuring: "Measuring", image_px: np.ndarray, rng: np.random.Generator
     ) -> None:
         """Starts before the first frame.
 

@@ -20,15 +20,7 @@ from pathlib import Path
 
 import tyro
 
-from examples.studies.e06 import (
-    depth_from_images,
-    long_run,
-    loop,
-    many_landmarks,
-    new_landmarks,
-    plane,
-    still_camera,
-)
+from examples.studies.e06 import depth_from_images, long_run, loop, many_landmarks, new_landmarks, plane, still_camera
 from examples.studies.e06.setting import Row, Setting
 from rbpf.errors import InputError
 from rbpf.validation.tables import write_table

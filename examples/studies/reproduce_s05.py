@@ -98,16 +98,7 @@ def told(what: str, done: int, total: int) -> None:
 def table_1(record: Record, paths: Paths, due: dict[int, int], out: Path) -> None:
     """Ours, beside the paper's; `due` has its frame for a number of pairs."""
     lengths = np.linalg.norm(np.diff(SE3.translation(paths.wheels), axis=0), axis=1)
-    header = [
-        "pairs",
-        "paper's frame",
-        "landmarks",
-        "paper's",
-        "distance m",
-        "paper's",
-        "SIFT features",
-        "paper's",
-    ]
+    header = ["pairs", "paper's frame", "landmarks", "paper's", "distance m", "paper's", "SIFT features", "paper's"]
     rows = []
     for row in record.rows:
         frame = due.get(row.pairs, "")

@@ -29,12 +29,7 @@ from rbpf.sensors.feature_log import FeatureFrame, FeatureLog, KnownPoints
 from rbpf.validation.colmap.model import build_model, from_colmap_pose, image_id
 from rbpf.validation.gtsam.camera import CameraSolution, solve_features
 from rbpf.validation.gtsam.mono_batch import connected_frames
-from rbpf.validation.gtsam.observations import (
-    CameraEstimate,
-    ObservationTable,
-    observation_table,
-    reprojection,
-)
+from rbpf.validation.gtsam.observations import CameraEstimate, ObservationTable, observation_table, reprojection
 from rbpf.validation.tables import write_table
 
 LEAST_HELD = 3
@@ -164,13 +159,7 @@ def _solve(adjuster: Any, name: str) -> None:
 
 
 def _covariances(
-    model: Any,
-    adjuster: Any,
-    table: ObservationTable,
-    path: Array,
-    points: Array,
-    fixed: NDArray[np.bool_],
-    std: float,
+    model: Any, adjuster: Any, table: ObservationTable, path: Array, points: Array, fixed: NDArray[np.bool_], std: float
 ) -> tuple[Array, Array]:
     """Marginals (T, 6, 6) and (L, 3, 3). COLMAP's of a point takes all poses as exact: theirs is carried over to it."""
     import pycolmap

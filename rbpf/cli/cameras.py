@@ -40,12 +40,7 @@ def calibrate(options: Annotated[CalibrateOptions, tyro.conf.arg(name="")]) -> N
 
     board = Board.parse(options.board, options.square)
     with progress() as bar:
-        found, looked_at = calibrate_images(
-            options.images,
-            board,
-            bar("looking for the board"),
-            options.model,
-        )
+        found, looked_at = calibrate_images(options.images, board, bar("looking for the board"), options.model)
     entries = write_calibration(found, board, looked_at, options.out)
     camera, std = found.camera, found.std
     left_out = f", {len(found.left_out)} left out" if found.left_out else ""
@@ -88,11 +83,7 @@ def recalibrate(options: Annotated[RecalibrateOptions, tyro.conf.arg(name="")]) 
     from rbpf.validation.gtsam.self_calibration import recalibrate as from_run
 
     with progress() as bar:
-        entries, found = from_run(
-            options.run,
-            options.out,
-            bar("adjusting the camera with poses and landmarks"),
-        )
+        entries, found = from_run(options.run, options.out, bar("adjusting the camera with poses and landmarks"))
     focal, k1 = entries["fx"], entries["k1"]
     answer(
         entries | {"out": str(options.out)},

@@ -43,12 +43,7 @@ def doctor(options: Annotated[DoctorOptions, tyro.conf.arg(name="")]) -> None:
         "kernels_missing": missing,
         "works": not broken,
     }
-    marks = {
-        (True, True): "works",
-        (True, False): "BROKEN",
-        (False, True): "works",
-        (False, False): "not installed",
-    }
+    marks = {(True, True): "works", (True, False): "BROKEN", (False, True): "works", (False, False): "not installed"}
     lines = {part.name: f"{marks[part.needed, part.works]}: {part.says}" for part in tried}
     known = {name: number or "missing" for name, number in libraries.items()}
     kernels = f"{len(kernel_modules()) - len(missing)} of {len(kernel_modules())} compiled"

@@ -62,12 +62,7 @@ def report(options: Annotated[ReportOptions, tyro.conf.arg(name="")]) -> None:
 
 def _tell(verdict: "Verdict", run: Path, as_json: bool, *first: str) -> None:
     page, said = run / "report.html", [*first, *verdict.said]
-    entries = {
-        "path_grade": verdict.path.grade,
-        "trust": verdict.trust,
-        "sentences": said,
-        "report": str(page),
-    }
+    entries = {"path_grade": verdict.path.grade, "trust": verdict.trust, "sentences": said, "report": str(page)}
     answer(entries, as_json, *said, f"the page is {page}")
 
 

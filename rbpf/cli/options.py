@@ -7,17 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from rbpf.errors import InputError
-from rbpf.ranges import (
-    MOST,
-    Count,
-    CountOrNone,
-    Fraction,
-    NotNegative,
-    Range,
-    Seed,
-    SettingError,
-    check_ranges,
-)
+from rbpf.ranges import MOST, Count, CountOrNone, Fraction, NotNegative, Range, Seed, SettingError, check_ranges
 
 if TYPE_CHECKING:
     from rbpf.sensors.calibration import Board, MarkerBoard

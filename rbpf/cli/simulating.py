@@ -72,11 +72,7 @@ def _render(world: "ImageWorld", options: ImagesOptions | LabOptions) -> None:
     with progress() as bar:
         simulate_images(world, imaging, camera, options.out, options.seed, bar("rendering"), options.baseline_m)
     size = megabytes(options.out)
-    answer(
-        {"out": str(options.out), "megabytes": round(size, 1)},
-        options.json,
-        f"wrote {options.out}, {size:.0f} MB",
-    )
+    answer({"out": str(options.out), "megabytes": round(size, 1)}, options.json, f"wrote {options.out}, {size:.0f} MB")
 
 
 def _camera(options: ImagesOptions | LabOptions) -> "Pinhole":

@@ -6,13 +6,7 @@ the answer with what `rbpf.core.models` promises: shapes, numeric derivatives, t
 
 import numpy as np
 
-from rbpf.conformance.models import (
-    groups_of,
-    landmark_checks,
-    likelihood_checks,
-    motion_checks,
-    sensor_checks,
-)
+from rbpf.conformance.models import groups_of, landmark_checks, likelihood_checks, motion_checks, sensor_checks
 from rbpf.conformance.observation import observation_checks
 from rbpf.conformance.trial import Check, Example, Scene, run
 from rbpf.core.models import Landmark, Likelihood, MotionModel, ObservationModel, Sensor
@@ -23,10 +17,7 @@ __all__ = ["Example", "check_model", "require_sound"]
 
 
 def check_model(
-    model: object,
-    space: LieGroup | None = None,
-    rng: np.random.Generator | None = None,
-    example: Example | None = None,
+    model: object, space: LieGroup | None = None, rng: np.random.Generator | None = None, example: Example | None = None
 ) -> list[str]:
     """What is wrong with a MotionModel, ObservationModel, Landmark, Likelihood or Sensor.
 
@@ -61,10 +52,7 @@ def check_model(
 
 
 def require_sound(
-    model: object,
-    space: LieGroup | None = None,
-    rng: np.random.Generator | None = None,
-    example: Example | None = None,
+    model: object, space: LieGroup | None = None, rng: np.random.Generator | None = None, example: Example | None = None
 ) -> None:
     """As `check_model`, but raises.
 

@@ -36,19 +36,8 @@ _OUTPUTS = ("nu", "jac_state", "jac_landmark")
 
 def observation_checks(model: ObservationModel, scene: Scene, landmark: Landmark | None) -> list[Check]:
     """All checks, each to be run by itself after the first."""
-    checks = (
-        check_predict,
-        check_residual,
-        check_cut,
-        check_visible,
-        check_jacobians,
-        check_kernel,
-        check_invert,
-    )
-    return [
-        *(partial(check, model, scene) for check in checks),
-        partial(check_initialise, model, scene, landmark),
-    ]
+    checks = (check_predict, check_residual, check_cut, check_visible, check_jacobians, check_kernel, check_invert)
+    return [*(partial(check, model, scene) for check in checks), partial(check_initialise, model, scene, landmark)]
 
 
 def check_predict(model: ObservationModel, scene: Scene) -> None:

@@ -131,10 +131,7 @@ def fitting(path: Path) -> Iterator[None]:
 
 
 def write_checkpoint(
-    path: Path,
-    arrays: dict[str, np.ndarray],
-    fingerprint: Mapping[str, object],
-    rng_state: Mapping[str, object],
+    path: Path, arrays: dict[str, np.ndarray], fingerprint: Mapping[str, object], rng_state: Mapping[str, object]
 ) -> None:
     """Saves arrays with what they belong to; the file appears under its name only when it is complete.
 
@@ -147,12 +144,7 @@ def write_checkpoint(
     Raises:
         InputError: see `save_arrays`.
     """
-    header = {
-        "version": VERSION,
-        "fingerprint": fingerprint,
-        "rng": _jsonable(rng_state),
-        "digest": _digest(arrays),
-    }
+    header = {"version": VERSION, "fingerprint": fingerprint, "rng": _jsonable(rng_state), "digest": _digest(arrays)}
     save_arrays(path, {"header": np.array(json.dumps(header)), **arrays})
 
 

@@ -90,11 +90,7 @@ class StepReport:
         return mixture_estimate(*self.mixture, self.second)
 
 
-_FILTER = {
-    "numbers": schema.integers(2),
-    "started": schema.truths(),
-    "log_evidence": schema.numbers(values="any"),
-}
+_FILTER = {"numbers": schema.integers(2), "started": schema.truths(), "log_evidence": schema.numbers(values="any")}
 
 
 class Filter:
@@ -166,11 +162,7 @@ class Filter:
         return Belief(self.particles.log_weights, self._predict(control, dt), self.marginals.parts, self.rng)
 
     def step(
-        self,
-        frame: object,
-        control: object = None,
-        stamp_ns: int | None = None,
-        proposal: Proposal | None = None,
+        self, frame: object, control: object = None, stamp_ns: int | None = None, proposal: Proposal | None = None
     ) -> StepReport:
         """Predicts, observes, refines, weighs, resamples, samples, corrects and updates; then starts landmarks.
 

@@ -15,16 +15,7 @@ from rbpf.core import schema
 from rbpf.core.genealogy import Lineage
 from rbpf.core.likelihoods import Gaussian
 from rbpf.core.linearisation import information, linearise, stacked
-from rbpf.core.models import (
-    NEW,
-    NULL,
-    Conditional,
-    LineariseAt,
-    LogDensities,
-    Observations,
-    Part,
-    Transition,
-)
+from rbpf.core.models import NEW, NULL, Conditional, LineariseAt, LogDensities, Observations, Part, Transition
 from rbpf.core.particles import Information, Particles, Prior, take
 from rbpf.errors import InputError
 from rbpf.kernels.increment import conditioned

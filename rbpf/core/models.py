@@ -390,10 +390,7 @@ class Conditional(ABC):
 
     @abstractmethod
     def correct(
-        self,
-        state: Float[np.ndarray, "N E"],
-        increment: Float[np.ndarray, "N d"],
-        groups: Sequence[Observations],
+        self, state: Float[np.ndarray, "N E"], increment: Float[np.ndarray, "N d"], groups: Sequence[Observations]
     ) -> LogDensities:
         """Log p(z | x) at the sampled states, and the update by the same observations."""
 
@@ -598,9 +595,7 @@ class Belief:
         return held
 
     def read(
-        self,
-        ids: Sequence[int] | Int[np.ndarray, " K"],
-        particles: Int[np.ndarray, " n"] | slice = slice(None),
+        self, ids: Sequence[int] | Int[np.ndarray, " K"], particles: Int[np.ndarray, " n"] | slice = slice(None)
     ) -> Records:
         """Estimates (N, K, …) of landmarks of one parametrisation, in all particles or in the rows named."""
         return self.map.read(np.asarray(ids, dtype=np.int64), particles)

@@ -126,10 +126,7 @@ class Prior:
     def take(self, ancestors: Int[np.ndarray, " N"] | slice) -> "Prior":
         """Those of the ancestors."""
         return replace(
-            self,
-            base=self.base[ancestors],
-            mean=take(self.mean, ancestors),
-            factor=take(self.factor, ancestors),
+            self, base=self.base[ancestors], mean=take(self.mean, ancestors), factor=take(self.factor, ancestors)
         )
 
 
@@ -296,10 +293,7 @@ class Estimate:
 
 
 def mixture_estimate(
-    prior: Prior,
-    proposed: Proposed | None,
-    log_weights: Float[np.ndarray, " N"],
-    second: SecondWeight | None = None,
+    prior: Prior, proposed: Proposed | None, log_weights: Float[np.ndarray, " N"], second: SecondWeight | None = None
 ) -> Estimate:
     """Summary of the refined mixture before sampling, or of the prior's states where nothing was proposed.
 

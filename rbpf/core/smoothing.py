@@ -31,11 +31,7 @@ def ancestral_smoothing(space: LieGroup, history: History, weights: np.ndarray) 
 
 
 def backward_simulation(
-    motion: MotionModel,
-    history: History,
-    count: int,
-    rng: np.random.Generator,
-    controls: list[object] | None = None,
+    motion: MotionModel, history: History, count: int, rng: np.random.Generator, controls: list[object] | None = None
 ) -> Smoothed:
     """p(x_t | z_1:T) from `count` trajectories drawn backwards through stored clouds.
 

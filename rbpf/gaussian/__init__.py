@@ -6,14 +6,7 @@ L L^T = covariance. A result may lie in memory entry by entry, so that what is c
 along the batch: code that insists on C order takes its `numpy.ascontiguousarray`.
 """
 
-from rbpf.gaussian.distributions import (
-    Gaussian,
-    Transformed,
-    condition,
-    log_density,
-    sample,
-    unscented_transform,
-)
+from rbpf.gaussian.distributions import Gaussian, Transformed, condition, log_density, sample, unscented_transform
 from rbpf.gaussian.matrices import (
     cholesky,
     inverse,

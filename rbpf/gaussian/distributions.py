@@ -8,16 +8,7 @@ from numpy.typing import ArrayLike
 
 from rbpf.arrays import Float, Like
 from rbpf.errors import InputError
-from rbpf.gaussian.matrices import (
-    Array,
-    cholesky,
-    generalised_inverse,
-    gram,
-    log_det,
-    product,
-    psd_factor,
-    solve_lower,
-)
+from rbpf.gaussian.matrices import Array, cholesky, generalised_inverse, gram, log_det, product, psd_factor, solve_lower
 
 _LOG_2PI = float(np.log(2.0 * np.pi))
 

@@ -203,11 +203,7 @@ def conditioned(stack, cov, noise, joint, factor, gain, rest):
     half = np.empty(stack.shape[1:])
     definite = True
     for j in range(joint.shape[0]):
-        of_stack, of_cov, of_noise = (
-            min(j, stack.shape[0] - 1),
-            min(j, cov.shape[0] - 1),
-            min(j, noise.shape[0] - 1),
-        )
+        of_stack, of_cov, of_noise = (min(j, stack.shape[0] - 1), min(j, cov.shape[0] - 1), min(j, noise.shape[0] - 1))
         _joint(stack[of_stack], cov[of_cov], noise[of_noise], half, joint[j])
         definite = _cholesky(joint[j], factor[j]) and definite
         if definite:

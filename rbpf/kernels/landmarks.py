@@ -248,9 +248,7 @@ def _add_between(weights, offset, mean, cov):
 
 
 @njit(
-    void(int64, VECTOR, MATRIX, *RECORDS, MATRIX, VECTOR, CUBE, INDICES, MATRIX, CUBE),
-    cache=True,
-    error_model="numpy",
+    void(int64, VECTOR, MATRIX, *RECORDS, MATRIX, VECTOR, CUBE, INDICES, MATRIX, CUBE), cache=True, error_model="numpy"
 )
 def project(address, params, state, pool, slabs, which, maps, anchor, weights, factor, sizes, mean, cov):
     """Fills `mean` (K, p), relative to `anchor` (K, p), and `cov` (K, p, p) = within + between particles.
@@ -306,22 +304,14 @@ def gather(pool, slabs, which, maps, mean, cov, const):
                 const[i, k, a] = slab[first_const + a, row]
 
 
-@njit(
-    void(int64, MATRIX, MATRIX, MATRIX, VECTOR, VECTOR, int64, MATRIX, CUBE, CUBE),
-    cache=True,
-    error_model="numpy",
-)
+@njit(void(int64, MATRIX, MATRIX, MATRIX, VECTOR, VECTOR, int64, MATRIX, CUBE, CUBE), cache=True, error_model="numpy")
 def call_kernel(address, state, mean, const, z, params, n, nu, jac_state, jac_landmark):
     """Runs the kernel at `address` on the lanes 0..n-1 of a block; arguments as in `rbpf.kernels.signature`."""
     kernel = kernel_at(address)
     kernel(state, mean, const, z, params, n, nu, jac_state, jac_landmark)
 
 
-@njit(
-    void(int64, VECTOR, MATRIX, CUBE, CUBE, MATRIX, CUBE, HYPERCUBE, HYPERCUBE),
-    cache=True,
-    error_model="numpy",
-)
+@njit(void(int64, VECTOR, MATRIX, CUBE, CUBE, MATRIX, CUBE, HYPERCUBE, HYPERCUBE), cache=True, error_model="numpy")
 def linearise_all(address, params, state, mean, const, z, nu, jac_state, jac_landmark):
     """Fills `nu` (N, K, p), `jac_state` (N, K, p, d) and `jac_landmark` (N, K, p, D) of K landmarks in N particles.
 

@@ -123,11 +123,7 @@ def turned(q, p):
     u = (q[0], q[1], q[2])
     twice = cross(u, (p[0] + p[0], p[1] + p[1], p[2] + p[2]))
     across = cross(u, twice)
-    return (
-        p[0] + q[3] * twice[0] + across[0],
-        p[1] + q[3] * twice[1] + across[1],
-        p[2] + q[3] * twice[2] + across[2],
-    )
+    return (p[0] + q[3] * twice[0] + across[0], p[1] + q[3] * twice[1] + across[1], p[2] + q[3] * twice[2] + across[2])
 
 
 @njit(cache=True, error_model="numpy")

@@ -14,15 +14,4 @@ from rbpf.lie.se3 import SE3Group, skew
 SE2 = SE2Group()
 SE3 = SE3Group()
 
-__all__ = [
-    "SE2",
-    "SE3",
-    "Array",
-    "Euclidean",
-    "LieGroup",
-    "Manifold",
-    "Product",
-    "SE2Group",
-    "SE3Group",
-    "skew",
-]
+__all__ = ["SE2", "SE3", "Array", "Euclidean", "LieGroup", "Manifold", "Product", "SE2Group", "SE3Group", "skew"]

@@ -36,16 +36,7 @@ import numpy as np
 from rbpf import gaussian
 from rbpf.core.checkpoint import save_arrays
 from rbpf.lie import SE3
-from rbpf.runs.files import (
-    MAP,
-    POSTERIOR,
-    SUMMARY,
-    TRAJECTORY,
-    VERSION,
-    prepare_folder,
-    write_csv,
-    write_text,
-)
+from rbpf.runs.files import MAP, POSTERIOR, SUMMARY, TRAJECTORY, VERSION, prepare_folder, write_csv, write_text
 from rbpf.runs.measurement_files import write_measurements
 from rbpf.runs.provenance import write_config
 from rbpf.runs.run import Run
@@ -159,10 +150,7 @@ def write_map(out: Path, found: MapEstimate) -> None:
 def milliseconds_per_frame(seconds: np.ndarray) -> dict[str, float]:
     """Median and 95th percentile of times (T,) [s], in ms."""
     milliseconds = seconds * 1e3
-    return {
-        "median": round(float(np.median(milliseconds)), 3),
-        "p95": round(float(np.percentile(milliseconds, 95)), 3),
-    }
+    return {"median": round(float(np.median(milliseconds)), 3), "p95": round(float(np.percentile(milliseconds, 95)), 3)}
 
 
 def nis_ratio(nis: np.ndarray, dof: np.ndarray) -> float | None:

@@ -14,15 +14,7 @@ import numpy as np
 from rbpf.core.schema import elements, integers, numbers, read, split
 from rbpf.errors import InputError
 from rbpf.lie import SE2Group, SE3Group
-from rbpf.systems.system import (
-    DIAGNOSTICS,
-    TIMINGS,
-    Column,
-    Ragged,
-    System,
-    Tracked,
-    TrackingState,
-)
+from rbpf.systems.system import DIAGNOSTICS, TIMINGS, Column, Ragged, System, Tracked, TrackingState
 
 COMMON = (
     Column("seconds", "time that the system took, without reading and decoding", "s", table=TIMINGS),

@@ -173,12 +173,7 @@ def _camera_header(camera: Pinhole | RectifiedStereo) -> dict[str, str]:
 
 
 def _text(
-    name: str,
-    recording: str,
-    header: Mapping[str, str],
-    columns: list[str],
-    integers: np.ndarray,
-    numbers: np.ndarray,
+    name: str, recording: str, header: Mapping[str, str], columns: list[str], integers: np.ndarray, numbers: np.ndarray
 ) -> str:
     lines = [f"# {_TITLES[name]}", f"# recording: {recording}"]
     lines += [f"# {key}: {value}" for key, value in header.items()]

@@ -166,13 +166,7 @@ def error_figure(found: RunFolder) -> Any | None:
         label_ = f"{SIGMAS:g}σ of the filter"
         axes.fill_between(rows, low, high, color=COLOURS["filter"], alpha=0.2, lw=0, label=label_)
         if batch is not None:
-            axes.plot(
-                at_batch,
-                unit * batch_error[:, axis],
-                color=COLOURS["batch"],
-                lw=1.0,
-                label="error of the batch",
-            )
+            axes.plot(at_batch, unit * batch_error[:, axis], color=COLOURS["batch"], lw=1.0, label="error of the batch")
         axes.plot(rows, unit * error[:, axis], color=COLOURS["filter"], lw=1.0, label="error of the filter")
         axes.axhline(0.0, color="black", lw=0.5)
         axes.set_ylabel(f"{'xyz'[axis]} [{word}]")

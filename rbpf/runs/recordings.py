@@ -191,11 +191,7 @@ class MonoRecording:
             found |= {"board": f"{self.board.columns}x{self.board.rows}", "square_m": self.board.square_m}
         if self.markers is not None:
             board = self.markers
-            found |= {
-                "aruco": f"{board.columns}x{board.rows}",
-                "marker_m": board.side_m,
-                "gap_m": board.gap_m,
-            }
+            found |= {"aruco": f"{board.columns}x{board.rows}", "marker_m": board.side_m, "gap_m": board.gap_m}
             found["dictionary"] = board.dictionary
         localize = {} if self.map is None else {"localize": True}
         return found | localize | self.topics.entries() | self.part.entries()
@@ -318,11 +314,7 @@ class Recording(Protocol):
 
 
 def filter_recording(
-    recording: Recording,
-    config: Any,
-    out: Path | None = None,
-    resume: bool = False,
-    listeners: Iterable[Listener] = (),
+    recording: Recording, config: Any, out: Path | None = None, resume: bool = False, listeners: Iterable[Listener] = ()
 ) -> Run:
     """Filters a recording to its end.
 

@@ -47,11 +47,7 @@ class Anchored:
 
 
 def relative_estimate(
-    space: LieGroup,
-    anchored: Anchored,
-    state: np.ndarray,
-    log_weights: np.ndarray,
-    origin: np.ndarray | None = None,
+    space: LieGroup, anchored: Anchored, state: np.ndarray, log_weights: np.ndarray, origin: np.ndarray | None = None
 ) -> Estimate:
     """Mean and covariance of states (N, E) relative to the anchored frame, origin · x_0⁻¹ · x.
 

@@ -81,9 +81,7 @@ def estimate_map(filter_: Filter, anchored: Anchored | None = None) -> MapEstima
         covs.append(cov)
     dim = 2 if isinstance(filter_.space, SE2Group) else 3
     return MapEstimate(
-        np.array(names, dtype=np.int64),
-        np.array(means).reshape(-1, dim),
-        np.array(covs).reshape(-1, dim, dim),
+        np.array(names, dtype=np.int64), np.array(means).reshape(-1, dim), np.array(covs).reshape(-1, dim, dim)
     )
 
 

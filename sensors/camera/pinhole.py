@@ -101,14 +101,7 @@ class Pinhole:
             if len(lens) == 5:  # the tangential part turns with the axes; what depends on the radius stays
                 lens = (lens[0], lens[1], lens[3], -lens[2], lens[4])
             camera = replace(
-                c,
-                width=c.height,
-                height=c.width,
-                fx=c.fy,
-                fy=c.fx,
-                cx=c.height - 1 - c.cy,
-                cy=c.cx,
-                distortion=lens,
+                c, width=c.height, height=c.width, fx=c.fy, fy=c.fx, cx=c.height - 1 - c.cy, cy=c.cx, distortion=lens
             )
         return camera
 

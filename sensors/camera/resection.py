@@ -100,12 +100,7 @@ class Resected:
 
 
 def resect_consensus(
-    camera: Pinhole,
-    points: np.ndarray,
-    px: np.ndarray,
-    within_px: float,
-    triples: int,
-    rng: np.random.Generator,
+    camera: Pinhole, points: np.ndarray, px: np.ndarray, within_px: float, triples: int, rng: np.random.Generator
 ) -> Resected | None:
     """The camera that most points (M, 3) agree with, refined on these; they agree if seen at px (M, 2) `within_px`.
 

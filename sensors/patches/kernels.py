@@ -89,12 +89,7 @@ def cubic(image, x, y):
 def weights(t):
     """Catmull-Rom weights of the samples at −1, 0, 1, 2 for a place t in 0..1."""
     s = 1.0 - t
-    return (
-        -0.5 * t * s * s,
-        1.0 + t * t * (1.5 * t - 2.5),
-        1.0 + s * s * (1.5 * s - 2.5),
-        -0.5 * s * t * t,
-    )
+    return (-0.5 * t * s * s, 1.0 + t * t * (1.5 * t - 2.5), 1.0 + s * s * (1.5 * s - 2.5), -0.5 * s * t * t)
 
 
 @njit(cache=True, error_model="numpy")

@@ -187,10 +187,7 @@ class RelativePosition(RigidPointModel):
     """
 
     def __init__(
-        self,
-        space: SE2Group | SE3Group,
-        robot_from_sensor: np.ndarray | None = None,
-        max_range: float = np.inf,
+        self, space: SE2Group | SE3Group, robot_from_sensor: np.ndarray | None = None, max_range: float = np.inf
     ) -> None:
         super().__init__(space, robot_from_sensor)
         self.dim = 2 if isinstance(space, SE2Group) else 3

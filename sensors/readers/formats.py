@@ -9,14 +9,7 @@ from rbpf.sensors.readers.images.euroc import Euroc
 from rbpf.sensors.readers.images.folders import Folder, Photos, SevenScenes, Tum
 from rbpf.sensors.readers.images.kitti import Kitti
 from rbpf.sensors.readers.images.part import WHOLE, Part
-from rbpf.sensors.readers.images.sequence import (
-    TOLERANCE_S,
-    UNNAMED,
-    ImageFormat,
-    ImageSequence,
-    ReadOptions,
-    Topics,
-)
+from rbpf.sensors.readers.images.sequence import TOLERANCE_S, UNNAMED, ImageFormat, ImageSequence, ReadOptions, Topics
 from rbpf.sensors.readers.images.video import Video
 from rbpf.sensors.readers.mrclam import Mrclam
 from rbpf.sensors.readers.mrpt import Mrpt
@@ -26,16 +19,7 @@ from rbpf.sensors.readers.victoria_park import VictoriaPark
 
 ROBOT_LOGS: tuple[RobotLogFormat, ...] = (Mrpt(), Mrclam(), VictoriaPark())
 """The first that recognises a recording reads it."""
-IMAGES: tuple[ImageFormat, ...] = (
-    RosBag(),
-    Tum(),
-    Euroc(),
-    Kitti(),
-    SevenScenes(),
-    Photos(),
-    Video(),
-    Folder(),
-)
+IMAGES: tuple[ImageFormat, ...] = (RosBag(), Tum(), Euroc(), Kitti(), SevenScenes(), Photos(), Video(), Folder())
 """The first that recognises a recording reads it."""
 _log = logging.getLogger(__name__)
 

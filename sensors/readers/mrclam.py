@@ -28,15 +28,7 @@ from numpy.typing import NDArray
 
 from rbpf.errors import InputError
 from rbpf.lie import SE2, Array
-from rbpf.sensors.readers.robot_log import (
-    LogNoise,
-    RobotLog,
-    RobotLogFormat,
-    Truth,
-    assemble,
-    diagonal,
-    require_ranges,
-)
+from rbpf.sensors.readers.robot_log import LogNoise, RobotLog, RobotLogFormat, Truth, assemble, diagonal, require_ranges
 from rbpf.sensors.readers.text import read_columns
 
 DEFAULT_NOISE = LogNoise(

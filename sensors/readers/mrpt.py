@@ -135,10 +135,7 @@ def _measurements(table: Table, planar: bool, noise: LogNoise, path: Path) -> tu
     noise.require_only(applicable, path, f"an MRPT log in {'the plane' if planar else 'space'}")
     require_ranges(table, "range_m", "yaw_rad")
     pitch = table["pitch_rad"]
-    std = [
-        std_column(table, "std_range_m", noise.std_range_m),
-        std_column(table, "std_yaw_rad", noise.std_bearing_rad),
-    ]
+    std = [std_column(table, "std_range_m", noise.std_range_m), std_column(table, "std_yaw_rad", noise.std_bearing_rad)]
     if planar:
         table.require(pitch == 0, "pitch_rad", "0, as the odometry is planar")
         table.require(table["std_pitch_rad"] >= 0, "std_pitch_rad", "zero or positive")

@@ -56,10 +56,7 @@ def test_its_run_is_validated_and_calibrates_its_camera(finished, tmp_path, caps
     told = json.loads(capsys.readouterr().out)
     camera = read_calibration(tmp_path / "out" / "camera.yaml").camera
     assert camera.distortion_model == "equidistant" and camera.distortion[1:] == CAMERA.distortion[1:]
-    assert told["k1"] == {
-        "before": CAMERA.distortion[0],
-        "after": pytest.approx(camera.distortion[0], abs=1e-8),
-    }
+    assert told["k1"] == {"before": CAMERA.distortion[0], "after": pytest.approx(camera.distortion[0], abs=1e-8)}
     assert abs(camera.fx / CAMERA.fx - 1.0) < 0.02
 
 

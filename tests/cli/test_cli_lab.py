@@ -33,18 +33,7 @@ def test_a_tour_can_be_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
 
 
 def test_options_reach_the_images(tmp_path: Path) -> None:
-    options = [
-        "--trajectory",
-        "turn_back",
-        "--frames",
-        "3",
-        "--known",
-        "0",
-        "--jpeg",
-        "80",
-        "--focal-px",
-        "60",
-    ]
+    options = ["--trajectory", "turn_back", "--frames", "3", "--known", "0", "--jpeg", "80", "--focal-px", "60"]
     assert lab(tmp_path / "mono", *options, "--baseline-m", "None") == 0
     sequence = open_images(tmp_path / "mono")
     assert len(sequence) == 3 and sequence.camera.fx == 60.0 and sequence.baseline_m is None

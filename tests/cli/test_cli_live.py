@@ -39,16 +39,7 @@ def test_a_camera_is_filtered_until_it_is_gone(desk, tmp_path, monkeypatch):
     images = [frame.image for frame in open_images(desk).frames()]
     monkeypatch.setattr(cv2, "VideoCapture", lambda number: Player(images))
     out = tmp_path / "run"
-    command = [
-        "run",
-        "mono",
-        "0",
-        "--calibration",
-        str(desk / "camera.yaml"),
-        "--out",
-        str(out),
-        "--no-batch",
-    ]
+    command = ["run", "mono", "0", "--calibration", str(desk / "camera.yaml"), "--out", str(out), "--no-batch"]
     assert main(command) == 0
     assert np.loadtxt(out / "trajectory.tum").shape == (len(images), 8)
     assert yaml.safe_load((out / "config.yaml").read_text())["recording"] == "0"

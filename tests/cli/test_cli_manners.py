@@ -29,17 +29,7 @@ def log(tmp_path_factory):
 
 def quick(log, out, *arguments):
     """Arguments of a short run."""
-    return [
-        "run",
-        "range-bearing",
-        str(log),
-        "--out",
-        str(out),
-        "--particles",
-        "20",
-        "--no-batch",
-        *arguments,
-    ]
+    return ["run", "range-bearing", str(log), "--out", str(out), "--particles", "20", "--no-batch", *arguments]
 
 
 @pytest.mark.parametrize("arguments", ["nonsense", "nonsense --help", "run nonsense --help", "simulate nonsense -h"])

@@ -11,14 +11,7 @@ from tests.cli import mono_sequences, stereo_sequences
 
 pytestmark = pytest.mark.slow
 
-PICTURES = {
-    "path.png",
-    "map.png",
-    "particles.png",
-    "timings.png",
-    "groundtruth_path.png",
-    "groundtruth_nees.png",
-}
+PICTURES = {"path.png", "map.png", "particles.png", "timings.png", "groundtruth_path.png", "groundtruth_nees.png"}
 
 
 @pytest.fixture(scope="module")

@@ -80,7 +80,4 @@ def test_no_threads_at_all_are_refused(monkeypatch, capsys):
 def test_a_closed_standard_output_is_refused_where_a_result_is_wanted_there(tmp_path):
     words = f"'{sys.executable}' -m rbpf report '{tmp_path}'"
     found = subprocess.run(f"{words} --json >&-", shell=True, stderr=subprocess.PIPE, text=True)
-    assert (found.returncode, found.stderr) == (
-        2,
-        "rbpf: standard output is closed: --json has nowhere to write to\n",
-    )
+    assert (found.returncode, found.stderr) == (2, "rbpf: standard output is closed: --json has nowhere to write to\n")

@@ -73,9 +73,7 @@ def test_no_landmark_explains_two(seed, m, k):
 
 
 @pytest.mark.parametrize(
-    ("distance", "expected"),
-    [(2.9, 0), (3.1, NULL), (4.9, NULL), (5.1, NEW)],
-    ids=["in", "out", "near", "far"],
+    ("distance", "expected"), [(2.9, 0), (3.1, NULL), (4.9, NULL), (5.1, NEW)], ids=["in", "out", "near", "far"]
 )
 def test_gates(distance, expected):
     nu = np.array([distance, 0.0]).reshape(1, 1, 1, 2)

@@ -208,10 +208,7 @@ class TestModels:
             ({"noise_factor": np.ones((1, 2, 1))}, r"noise_factor \(1, 2, 1\)"),
             ({"noise_factor": np.ones((N - 1, 1, 1))}, r"noise_factor \(5, 1, 1\)"),
             ({"noise_factor": np.full((1, 1, 1), np.nan)}, "Walk.transition returned NaN or infinity: check"),
-            (
-                {"mean": np.full((N, 1), np.inf)},
-                "Walk.transition returned NaN or infinity: check the control",
-            ),
+            ({"mean": np.full((N, 1), np.inf)}, "Walk.transition returned NaN or infinity: check the control"),
         ],
     )
     def test_transitions_of_wrong_shape(self, given, match):

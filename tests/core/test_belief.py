@@ -56,10 +56,7 @@ def draw(belief: Belief, records: Records, rng: np.random.Generator) -> tuple[np
 
 
 # In the second one the bearings lie on both sides of the cut.
-AHEAD_2D = {
-    "ahead": [[3.0, 1.0], [2.0, -2.0], [4.0, 0.0]],
-    "behind": [[-3.0, 0.0], [-2.0, 0.01], [-4.0, -0.01]],
-}
+AHEAD_2D = {"ahead": [[3.0, 1.0], [2.0, -2.0], [4.0, 0.0]], "behind": [[-3.0, 0.0], [-2.0, 0.01], [-4.0, -0.01]]}
 AHEAD_3D = np.array([[3.0, 1.0, 0.5], [2.0, -2.0, -1.0], [4.0, 0.0, 0.3]])
 
 

@@ -8,14 +8,7 @@ import pytest
 
 from rbpf.core.filter import Filter
 from rbpf.core.marginals import KalmanSubstate
-from rbpf.core.models import (
-    MotionModel,
-    ObservationModel,
-    Observations,
-    Part,
-    Sensor,
-    Transition,
-)
+from rbpf.core.models import MotionModel, ObservationModel, Observations, Part, Sensor, Transition
 from rbpf.core.proposals import PriorProposal
 from rbpf.core.resampling import EssTriggered, Residual
 from rbpf.errors import InputError

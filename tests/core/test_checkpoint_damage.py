@@ -192,19 +192,13 @@ def other(**options) -> Filter:
         (lambda: other(lag=5), "lag = None, this one has 5"),
         (lambda: other(clouds=True), "clouds = False, this one has True"),
         (lambda: other(conditional=LandmarkMap(SE2, evidence=True)), "evidence = False, this one has True"),
-        (
-            lambda: other(landmark=Point(3)),
-            r"landmark kind 0 = Point \(2, 0, 1\), this one has Point \(3, 0, 1\)",
-        ),
+        (lambda: other(landmark=Point(3)), r"landmark kind 0 = Point \(2, 0, 1\), this one has Point \(3, 0, 1\)"),
         (lambda: other(landmark=MixturePoint(4)), r"this one has MixturePoint \(2, 0, 4\)"),
         (
             lambda: other(conditional=[LandmarkMap(SE2), KalmanSubstate(SE2, np.zeros(1), np.eye(1))]),
             "conditional = .*this one has .*KalmanSubstate",
         ),
-        (
-            lambda: other(rng=np.random.Generator(np.random.MT19937(0))),
-            "random generator = PCG64, this one has MT",
-        ),
+        (lambda: other(rng=np.random.Generator(np.random.MT19937(0))), "random generator = PCG64, this one has MT"),
     ],
 )
 def test_another_filter(file, filter_, match):

@@ -118,8 +118,7 @@ class StudentT(Likelihood):
 
 
 NEAR = Example(
-    state=np.zeros((2, 3)),
-    records=Records(np.full((2, 3, 2), 0.03), np.broadcast_to(np.eye(2), (2, 3, 2, 2))),
+    state=np.zeros((2, 3)), records=Records(np.full((2, 3, 2), 0.03), np.broadcast_to(np.eye(2), (2, 3, 2, 2)))
 )
 SOUND: list[tuple[Any, Any, Example | None]] = [
     (OdometryMotion(SE2), None, None),

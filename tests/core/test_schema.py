@@ -3,18 +3,7 @@
 import numpy as np
 import pytest
 
-from rbpf.core.schema import (
-    elements,
-    grey,
-    integers,
-    numbers,
-    poses,
-    read,
-    read_one,
-    split,
-    text,
-    truths,
-)
+from rbpf.core.schema import elements, grey, integers, numbers, poses, read, read_one, split, text, truths
 from rbpf.errors import InputError
 from rbpf.lie import SE2
 
@@ -59,11 +48,7 @@ def test_what_fits_is_copied():
         ("px", np.ones((2, 2), dtype=int), r"px must hold numbers"),
         ("px", np.full((2, 2), np.nan), r"px must hold finite numbers, got nan at 0, 0"),
         ("px", np.full((2, 2), -1e31), r"px must hold finite numbers"),
-        (
-            "member",
-            np.zeros(3, dtype=int),
-            r"member must hold whole numbers of shape \(features = 2\), got \(3,\)",
-        ),
+        ("member", np.zeros(3, dtype=int), r"member must hold whole numbers of shape \(features = 2\), got \(3,\)"),
         ("member", np.array([0, 5]), "member must hold whole numbers from -1 to 4, got 5 at 1"),
         ("member", np.array([-2, 0]), "member must hold whole numbers from -1 to 4, got -2 at 0"),
         ("ids", np.array([3, 3]), "ids must hold ascending numbers, got 3 at 1"),

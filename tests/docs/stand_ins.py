@@ -65,7 +65,7 @@ NAMES_OF_PAGE = {
 BEFORE = {
     "docs/how_to/compare.md": [
         ["run", "mono", "desk", "--known-points", "desk/known_points.csv", "--out", "out/mono", "--no-video"]
-    ],
+    ]
 }
 """Commands that a page takes as done."""
 

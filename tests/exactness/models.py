@@ -159,11 +159,7 @@ def smooth(path: Sequence[Moments], F: np.ndarray, Q: np.ndarray, inputs: np.nda
 
 
 def log_ratios(
-    build: Callable[[np.random.Generator], Filter],
-    frames: Sequence[Any],
-    exact: float,
-    stream: int,
-    seeds: int = SEEDS,
+    build: Callable[[np.random.Generator], Filter], frames: Sequence[Any], exact: float, stream: int, seeds: int = SEEDS
 ) -> np.ndarray:
     """Log-evidence of one run per seed over the exact one; `stream` keeps tests' random numbers apart."""
 

@@ -27,12 +27,7 @@ every_sensor = pytest.mark.parametrize(
 )
 every_likelihood = pytest.mark.parametrize(
     "likelihood",
-    [
-        Gaussian(),
-        TruncatedMahalanobis(4.0),
-        TruncatedMahalanobis(4.0, 9.0),
-        GaussianWithOutliers(0.05, 300.0),
-    ],
+    [Gaussian(), TruncatedMahalanobis(4.0), TruncatedMahalanobis(4.0, 9.0), GaussianWithOutliers(0.05, 300.0)],
     ids=lambda x: type(x).__name__,
 )
 

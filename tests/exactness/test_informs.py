@@ -43,11 +43,7 @@ def scene(space, seed: int = 0) -> tuple[Scene, list[list[Observations]]]:
 
 
 def run(
-    scene: Scene,
-    frames: Sequence[Sequence[Observations]],
-    compiled: bool = True,
-    proposal=None,
-    threshold: float = 0.6,
+    scene: Scene, frames: Sequence[Sequence[Observations]], compiled: bool = True, proposal=None, threshold: float = 0.6
 ) -> tuple[Filter, list[StepReport]]:
     held = LandmarkMap(scene.space, compiled=compiled)
     filter_ = Filter(

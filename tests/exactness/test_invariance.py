@@ -132,8 +132,7 @@ def test_the_order_of_particles_does_not_matter(proposal, compiled):
         filter_.step(Frame((), [NewLandmarks(z[0], R, model, Point(2))]), Odometry(SE2.identity(), cov))
         reports = [
             filter_.step(
-                Frame([Observations(z[t], R, model, None, ids[t][place], -3.0, -4.0)]),
-                Odometry(SE2.identity(), cov),
+                Frame([Observations(z[t], R, model, None, ids[t][place], -3.0, -4.0)]), Odometry(SE2.identity(), cov)
             )
             for t in range(1, 5)
         ]

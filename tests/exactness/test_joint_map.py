@@ -68,9 +68,7 @@ def test_consolidated_before_every_step_it_is_the_kalman_filter(world, consolida
 
 
 @pytest.mark.parametrize(
-    "consolidation",
-    [Consolidation(2), Consolidation(3, 0.0), Consolidation(9, 0.9), Consolidation(9, 0.0)],
-    ids=repr,
+    "consolidation", [Consolidation(2), Consolidation(3, 0.0), Consolidation(9, 0.9), Consolidation(9, 0.0)], ids=repr
 )
 @pytest.mark.parametrize("proposal", [None, PriorProposal()], ids=["ekf", "prior"])
 def test_whatever_the_trigger_it_comes_to_the_kalman_filter(world, consolidation, proposal):
@@ -132,19 +130,14 @@ def test_a_velocity_a_fix_and_what_reads_velocity_and_landmark_together():
         z = rng.normal(size=(3, 2))
         still = np.zeros((kalman.mean.size - 4,) * 2)
         kalman.predict(
-            block_diag(F, np.eye(len(still))),
-            block_diag(noise, still),
-            np.append(drift, np.zeros(len(still))),
+            block_diag(F, np.eye(len(still))), block_diag(noise, still), np.append(drift, np.zeros(len(still)))
         )
         groups = [Observations(z[2:], covs, fix)] if t % 3 == 2 else []
         if groups:
             kalman.update(z[2], np.eye(2, kalman.mean.size), NOISE)
         if t:
             ids = np.zeros(1, dtype=np.int64)
-            groups += [
-                Observations(z[:1], covs, Relative(), ids=ids),
-                Observations(z[1:2], covs, Doppler(), ids=ids),
-            ]
+            groups += [Observations(z[:1], covs, Relative(), ids=ids), Observations(z[1:2], covs, Doppler(), ids=ids)]
             kalman.update(z[0], np.hstack([-unit, 0 * unit, unit]), NOISE)
             kalman.update(z[1], np.hstack([-unit, -0.5 * unit, unit]), NOISE)
         else:

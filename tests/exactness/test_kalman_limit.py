@@ -38,13 +38,7 @@ def test_everything_marginalised_is_a_kalman_filter(proposal, rank, rng):
     kalman = Kalman(rng.normal(size=3), np.diag([0.5, 1.0, 2.0]))
     models = [LinearObservation(by_substate=rng.normal(size=(p, 3))) for p in (2, 1)]
     filter_ = Filter(
-        motion,
-        Scripted(),
-        KalmanSubstate(motion.space, kalman.mean, kalman.cov),
-        proposal,
-        Systematic(),
-        n=5,
-        rng=rng,
+        motion, Scripted(), KalmanSubstate(motion.space, kalman.mean, kalman.cov), proposal, Systematic(), n=5, rng=rng
     )
     F, Q, drift = motion.joint()
     for _ in range(12):
@@ -66,11 +60,7 @@ def test_everything_marginalised_is_a_kalman_filter(proposal, rank, rng):
 @every_proposal
 def test_a_state_without_noise_leaves_a_kalman_filter_of_the_substate(proposal, rng):
     motion = LinearMotion(
-        np.eye(1),
-        np.vstack([np.zeros((1, 2)), 0.4 * np.eye(2)]),
-        np.zeros((1, 2)),
-        0.9 * np.eye(2),
-        np.ones(2),
+        np.eye(1), np.vstack([np.zeros((1, 2)), 0.4 * np.eye(2)]), np.zeros((1, 2)), 0.9 * np.eye(2), np.ones(2)
     )
     G, C = rng.normal(size=(2, 1)), rng.normal(size=(2, 2))
     model, fix = LinearObservation(G, C), LinearObservation(by_state=np.eye(1))

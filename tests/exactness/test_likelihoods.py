@@ -144,12 +144,7 @@ def test_two_sightings_of_a_certain_landmark_weigh_like_two_landmarks(likelihood
 def looked_ahead(z: np.ndarray, likelihood: TruncatedMahalanobis, noise: float) -> float:
     """Log w₁ of measurements z (K,) of the first coordinate of a state N(0, 1)."""
     motion = LinearMotion(np.eye(1), np.eye(1))
-    group = Observations(
-        z[:, None],
-        np.full((z.size, 1, 1), noise),
-        LinearObservation(by_state=[[1.0]]),
-        likelihood,
-    )
+    group = Observations(z[:, None], np.full((z.size, 1, 1), noise), LinearObservation(by_state=[[1.0]]), likelihood)
     parts = Marginals(motion.space, [])
     prior = parts.predict(motion.transition(np.zeros((1, 1)), None, 1.0), motion.space)
     return float(EkfProposal().propose(prior, parts.linearised(prior, [group])).log_w1[0])
@@ -176,10 +171,7 @@ def test_the_look_ahead_weight_is_truncated_where_the_likelihood_is(noise):
 def test_the_look_ahead_weight_of_several_rows_is_a_bound(rng):
     """Rows that agree, that contradict one another, and outliers: never above the integral, nor below all outliers."""
     for _ in range(300):
-        z, noise = (
-            rng.normal(scale=rng.choice([0.5, 2.0, 8.0]), size=rng.integers(1, 7)),
-            10.0 ** rng.normal(),
-        )
+        z, noise = (rng.normal(scale=rng.choice([0.5, 2.0, 8.0]), size=rng.integers(1, 7)), 10.0 ** rng.normal())
         log_w1 = looked_ahead(z, TruncatedMahalanobis(4.0, 16.3), noise)
         assert -2.0 * z.size - 1e-12 <= log_w1 <= integrated(z, noise) + 1e-9
 

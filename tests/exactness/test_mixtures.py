@@ -44,8 +44,7 @@ def add_landmarks(held: LandmarkMap, n: int) -> None:
     """The three landmarks, the same in n particles."""
     log_weights = np.log(np.tile(WEIGHTS, (n, 1, 1)))
     held.add_records(
-        Records(np.tile(MEANS, (n, 1, 1, 1)), np.tile(COVS, (n, 1, 1, 1, 1)), None, log_weights),
-        MixturePoint(2),
+        Records(np.tile(MEANS, (n, 1, 1, 1)), np.tile(COVS, (n, 1, 1, 1, 1)), None, log_weights), MixturePoint(2)
     )
     held.add_records(Records(np.tile(POINT_MEAN, (n, 1, 1)), np.tile(POINT_COV, (n, 1, 1, 1))), Point(2))
 

@@ -63,12 +63,7 @@ def moved(state: np.ndarray, xi: np.ndarray) -> np.ndarray:
     forward, left = a * u - b * v, b * u + a * v
     c, s = np.cos(state[..., 0]), np.sin(state[..., 0])
     return np.stack(
-        [
-            state[..., 0] + omega,
-            state[..., 1] + c * forward - s * left,
-            state[..., 2] + s * forward + c * left,
-        ],
-        axis=-1,
+        [state[..., 0] + omega, state[..., 1] + c * forward - s * left, state[..., 2] + s * forward + c * left], axis=-1
     )
 
 

@@ -210,13 +210,7 @@ def test_sampled_and_marginal_velocity_have_one_law():
     velocity = part._mean + std * rng.standard_normal((n, 6))
     start = np.concatenate([SE3.identity((n,)), velocity], axis=1)
     joint = Filter(
-        SampledVelocity(walk),
-        Scripted(),
-        (),
-        PriorProposal(),
-        n=n,
-        rng=np.random.default_rng(13),
-        start=start,
+        SampledVelocity(walk), Scripted(), (), PriorProposal(), n=n, rng=np.random.default_rng(13), start=start
     )
     for stamp in (0, 200_000_000, 500_000_000, 600_000_000):
         for filter_ in (marginal, joint):

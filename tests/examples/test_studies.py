@@ -5,14 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from examples.studies.consistency_runs import (
-    Consistency,
-    DeskTrial,
-    RobotTrial,
-    Trial,
-    left_for_good,
-    run_trials,
-)
+from examples.studies.consistency_runs import Consistency, DeskTrial, RobotTrial, Trial, left_for_good, run_trials
 from examples.studies.mono_realism import measure_search, survival
 from examples.studies.point_worlds import STEREO, DeskWorld, LabWorld, Measuring, simulate_features
 from examples.studies.stereo_revisit import log_there_and_back, pairs_there_and_back
@@ -84,14 +77,7 @@ def test_leaving_for_good_is_what_the_definition_says():
         (np.where(np.arange(40) >= 35, 5.0, 1.0), None),
         (np.where(np.arange(40) >= 1, 5.0, np.nan), 1),
     ],
-    ids=[
-        "never",
-        "at 20",
-        "with one step back",
-        "one step out",
-        "too late to tell",
-        "after a start known exactly",
-    ],
+    ids=["never", "at 20", "with one step back", "one step out", "too late to tell", "after a start known exactly"],
 )
 def test_single_steps_neither_begin_nor_end_overconfidence(nees, expected):
     assert left_for_good(nees, 2.0) == expected
@@ -128,18 +114,7 @@ def test_survival_is_that_of_kaplan_and_meier():
     watched = [6, 9, 10, 11, 17, 19, 20, 25, 32, 32, 34, 35]
     lengths = np.array(ended + watched)
     curve = survival(lengths, np.arange(lengths.size) < len(ended), 35)
-    known = {
-        0: 1.0,
-        5: 1.0,
-        6: 0.857,
-        7: 0.807,
-        10: 0.753,
-        13: 0.690,
-        16: 0.627,
-        22: 0.538,
-        23: 0.448,
-        35: 0.448,
-    }
+    known = {0: 1.0, 5: 1.0, 6: 0.857, 7: 0.807, 10: 0.753, 13: 0.690, 16: 0.627, 22: 0.538, 23: 0.448, 35: 0.448}
     assert {week: curve[week] for week in known} == pytest.approx(known, abs=5e-4)
 
 

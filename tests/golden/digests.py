@@ -66,20 +66,7 @@ def cases(work: Path) -> dict[str, Callable[[Path], None]]:
     """What is run, by name."""
     desk, pairs, plane, space = work / "desk", work / "pairs", work / "plane", work / "space"
     rbpf("simulate", "desk", "--frames", 45, "--width", 320, "--height", 240, "--out", desk)
-    rbpf(
-        "simulate",
-        "desk",
-        "--frames",
-        20,
-        "--baseline-m",
-        0.1,
-        "--width",
-        320,
-        "--height",
-        240,
-        "--out",
-        pairs,
-    )
+    rbpf("simulate", "desk", "--frames", 20, "--baseline-m", 0.1, "--width", 320, "--height", 240, "--out", pairs)
     rbpf("simulate", "range-bearing", "--steps", 80, "--out", plane)
     rbpf("simulate", "range-bearing", "--steps", 60, "--spatial", "--out", space)
     kitchen = beginning("mono_redkitchen_a", 60, work)

@@ -22,10 +22,7 @@ def filled(columns: Columns, ids: list[int | None]) -> list[int]:
 
 
 @given(
-    st.lists(
-        st.tuples(st.integers(0, 90), st.integers(0, 90), st.integers(0, 2**32 - 1), st.booleans()),
-        max_size=8,
-    )
+    st.lists(st.tuples(st.integers(0, 90), st.integers(0, 90), st.integers(0, 2**32 - 1), st.booleans()), max_size=8)
 )
 def test_as_a_dictionary(edits):
     """Ids that are counted up, and ids of the caller's in any order."""

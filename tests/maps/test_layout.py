@@ -99,16 +99,8 @@ WEIGHTS = np.zeros((3, 2, 2))
         (Free(2, constants=4), GOOD, "Free has 4 constants per landmark: give them in Records.const"),
         (Free(2), Records(GOOD.mean, GOOD.cov, np.zeros((3, 2, 1))), "Free has 0 constants per landmark"),
         (Free(2), Records(GOOD.mean, GOOD.cov, None, WEIGHTS), "needs log_weights exactly if it has several"),
-        (
-            Free(2),
-            Records(GOOD.mean * np.nan, GOOD.cov),
-            "a new Free has a mean or covariance that is not finite",
-        ),
-        (
-            Free(2),
-            Records(GOOD.mean, GOOD.cov * np.inf),
-            "a new Free has a mean or covariance that is not finite",
-        ),
+        (Free(2), Records(GOOD.mean * np.nan, GOOD.cov), "a new Free has a mean or covariance that is not finite"),
+        (Free(2), Records(GOOD.mean, GOOD.cov * np.inf), "a new Free has a mean or covariance that is not finite"),
     ],
 )
 def test_records_that_do_not_fit(landmark, records, match):

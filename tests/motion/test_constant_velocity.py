@@ -8,13 +8,7 @@ import pytest
 from rbpf.conformance import Example, check_model
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.motion.constant_velocity import (
-    POSE_AND_VELOCITY,
-    MarginalVelocity,
-    PosePrior,
-    SampledVelocity,
-    velocity_walk,
-)
+from rbpf.motion.constant_velocity import POSE_AND_VELOCITY, MarginalVelocity, PosePrior, SampledVelocity, velocity_walk
 
 WALK = np.array([0.3, 0.5, 0.7, 1.1, 0.2, 0.9])
 SIGMA = np.diag(WALK**2)

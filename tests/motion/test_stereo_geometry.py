@@ -48,9 +48,7 @@ def test_derivatives(world):
     seen = reproject(world.camera, delta, before)
     for row, pixels in enumerate(before):
         by_motion = numeric(
-            lambda xi, z=pixels: reproject(world.camera, SE3.retract(delta, xi), z[None]).pixels[0],
-            np.zeros(6),
-            1e-5,
+            lambda xi, z=pixels: reproject(world.camera, SE3.retract(delta, xi), z[None]).pixels[0], np.zeros(6), 1e-5
         )
         by_pixels = numeric(lambda z: reproject(world.camera, delta, z[None]).pixels[0], pixels, 1e-3)
         np.testing.assert_allclose(seen.by_motion[row], by_motion, atol=1e-4 * np.abs(by_motion).max())

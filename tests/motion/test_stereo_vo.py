@@ -11,15 +11,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.motion.least_squares import Rule
 from rbpf.motion.stereo_geometry import Matches
-from rbpf.motion.stereo_vo import (
-    MotionEstimate,
-    MotionPrior,
-    VisualOdometry,
-    VoConfig,
-    estimate_motion,
-    fit,
-    trimming,
-)
+from rbpf.motion.stereo_vo import MotionEstimate, MotionPrior, VisualOdometry, VoConfig, estimate_motion, fit, trimming
 from rbpf.sensors.camera import RectifiedStereo
 from tests.motion.stereo_pairs import (
     CAR,
@@ -206,12 +198,7 @@ class TestDegenerate:
         (np.zeros((5, 3)), np.zeros((4, 3)), COV, r"got \(5, 3\) and \(4, 3\)"),
         (np.zeros((5, 3)), np.full((5, 3), np.nan), COV, "NaN or infinity"),
         (np.zeros((5, 3)), np.zeros((5, 3)), np.ones((3, 3)), "cov_prev is no covariance of pixels"),
-        (
-            np.zeros((5, 3)),
-            np.zeros((5, 3)),
-            np.ones(3),
-            r"cov_prev must be \(3, 3\) or \(5, 3, 3\), got \(3,\)",
-        ),
+        (np.zeros((5, 3)), np.zeros((5, 3)), np.ones(3), r"cov_prev must be \(3, 3\) or \(5, 3, 3\), got \(3,\)"),
     ],
 )
 def test_wrong_input_is_refused(z_prev, z_now, cov, complaint):

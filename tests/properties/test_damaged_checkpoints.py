@@ -16,14 +16,7 @@ DAMAGES = 60
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_a_damaged_checkpoint_is_refused_or_gone_on_from(tmp_path, name):
-    command = [
-        sys.executable,
-        "-m",
-        "tests.properties.damaged_checkpoints",
-        name,
-        str(tmp_path),
-        str(DAMAGES),
-    ]
+    command = [sys.executable, "-m", "tests.properties.damaged_checkpoints", name, str(tmp_path), str(DAMAGES)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     told = [json.loads(line) for line in done.stdout.splitlines()]
     assert done.returncode == 0, (told[-1:], done.stderr[-2000:])

@@ -92,12 +92,7 @@ def run(tmp_path_factory) -> Path:
     simulate_robot(RobotWorld(steps=5, landmarks=8), folder / "log", seed=0)
     out = folder / "out"
     recording = RobotRecording(folder / "log")
-    finish_run(
-        filter_recording(recording, RangeBearingConfig(particles=4), out),
-        out,
-        recording.sources(),
-        batch=False,
-    )
+    finish_run(filter_recording(recording, RangeBearingConfig(particles=4), out), out, recording.sources(), batch=False)
     return out
 
 

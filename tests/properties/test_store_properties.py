@@ -118,17 +118,7 @@ class Trial:
     def run(self, steps: int) -> set[str]:
         """Random operations; returns which ones met records that are shared, compacted or both."""
         met = set()
-        names = [
-            "add",
-            "remove",
-            "replace",
-            "rewrite",
-            "rewrite",
-            "access",
-            "resample",
-            "resample",
-            "save_and_restore",
-        ]
+        names = ["add", "remove", "replace", "rewrite", "rewrite", "access", "resample", "resample", "save_and_restore"]
         for _ in range(steps):
             name = str(self.rng.choice(names if self.copies.columns else ["add"]))
             arrays = self.store.arrays()

@@ -21,14 +21,7 @@ class Waves:
         self.blur_px = blur_px
 
     def image(
-        self,
-        shape,
-        affine=((1.0, 0.0), (0.0, 1.0)),
-        shift=(0.0, 0.0),
-        noise=0.0,
-        rng=None,
-        mean=128.0,
-        gain=1.0,
+        self, shape, affine=((1.0, 0.0), (0.0, 1.0)), shift=(0.0, 0.0), noise=0.0, rng=None, mean=128.0, gain=1.0
     ):
         """(H, W) uint8."""
         middle = (np.array(shape[::-1]) - 1) / 2

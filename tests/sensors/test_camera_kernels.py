@@ -9,14 +9,7 @@ from rbpf.core.models import ObservationModel
 from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole, RectifiedStereo, kernels, points
 from rbpf.sensors.camera.kernels import in_view, project
-from rbpf.sensors.camera.points import (
-    CameraPoint,
-    CameraRay,
-    ConstellationView,
-    EpipolarRay,
-    MembersView,
-    StereoPoint,
-)
+from rbpf.sensors.camera.points import CameraPoint, CameraRay, ConstellationView, EpipolarRay, MembersView, StereoPoint
 from rbpf.systems.mono.feature_table import directions
 from tests.exactness.models import known
 from tests.sensors.camera_scenes import CAMERAS, DISTORTED, PLAIN, Rays, compiled, with_velocity
@@ -30,11 +23,7 @@ def assert_twins(model, z, state, mean, const, tolerance=1e-10):
     """Relative to the largest number of each result: differences of large numbers are no better than these."""
     nu, by_state, by_landmark = compiled(model, z, state, mean, const)
     jacobians = known(model.jacobians(state, mean, const))
-    expected = (
-        model.innovation(z, state, mean, const),
-        known(jacobians.state)[..., :6],
-        known(jacobians.landmark),
-    )
+    expected = (model.innovation(z, state, mean, const), known(jacobians.state)[..., :6], known(jacobians.landmark))
     for found, plain in zip((nu, by_state, by_landmark), expected, strict=True):
         assert np.isfinite(plain).all()
         np.testing.assert_allclose(found, plain, rtol=tolerance, atol=tolerance * np.abs(plain).max())

@@ -8,14 +8,7 @@ from hypothesis import strategies as st
 from rbpf.core.models import NULL
 from rbpf.errors import InputError
 from rbpf.sensors import descriptors as descriptor_matching
-from rbpf.sensors.descriptors import (
-    DescriptorStore,
-    MatchLimits,
-    band_pairs,
-    gate_pairs,
-    match_all,
-    match_pairs,
-)
+from rbpf.sensors.descriptors import DescriptorStore, MatchLimits, band_pairs, gate_pairs, match_all, match_pairs
 
 
 def unit(rng, count, length=8):

@@ -186,11 +186,7 @@ def test_it_rises_up_to_the_widest_angle(coefficients):
     assert (np.diff(reach) > 0.0).all()
 
 
-@given(
-    coefficients=st.tuples(*[st.floats(-0.2, 0.2)] * 4),
-    fraction=st.floats(0.0, 0.98),
-    around=st.floats(0.0, 6.3),
-)
+@given(coefficients=st.tuples(*[st.floats(-0.2, 0.2)] * 4), fraction=st.floats(0.0, 0.98), around=st.floats(0.0, 6.3))
 def test_every_visible_direction_of_a_fisheye_comes_back(coefficients, fraction, around):
     lens = Equidistant(coefficients)
     camera = Pinhole(8000, 8000, 262.0, 262.0, 4000.0, 4000.0, coefficients, "equidistant")

@@ -67,10 +67,7 @@ class TestFeatureLog:
             ({"cov_z": np.eye(2)}, "cov_z must be (2, 2, 2) float64, got (2, 2) float64"),
             ({"cov_z": np.full((2, 2, 2), np.inf)}, "cov_z must be finite, entry (0, 0, 0) is inf"),
             ({"cov_z": np.stack([np.eye(2), np.diag([1.0, -1.0])])}, "cov_z is no covariance: "),
-            (
-                {"cov_z": np.stack([np.eye(2), np.array([[1.0, 0.5], [0.0, 1.0]])])},
-                "cov_z is no covariance: ",
-            ),
+            ({"cov_z": np.stack([np.eye(2), np.array([[1.0, 0.5], [0.0, 1.0]])])}, "cov_z is no covariance: "),
         ],
     )
     def test_a_wrong_frame_is_named(self, wrong, message):
@@ -131,10 +128,7 @@ class TestCameraTruth:
         [
             ({"stamps_ns": np.array([0.0, 1.0, 2.0])}, "stamps_ns must be (T,) int64, got (3,) float64"),
             ({"stamps_ns": np.array([0, 1])}, "world_from_camera must be (2, 7) float64, got (3, 7) float64"),
-            (
-                {"stamps_ns": np.array([0, 5, 4])},
-                "stamp 2 is before the one it follows, sort the poses by time",
-            ),
+            ({"stamps_ns": np.array([0, 5, 4])}, "stamp 2 is before the one it follows, sort the poses by time"),
             ({"world_from_camera": poses * np.nan}, "world_from_camera must be finite, entry (0, 0) is nan"),
             (
                 {"world_from_camera": poses * [1, 1, 1, 2, 1, 1, 1]},

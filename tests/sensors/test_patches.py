@@ -327,13 +327,7 @@ def test_a_smaller_view_has_no_moire():
 
 @pytest.mark.parametrize(
     "affine",
-    [
-        3.01 * np.eye(2),
-        np.diag([3.5, 1.0]),
-        np.full((2, 2), np.nan),
-        np.diag([np.inf, 1.0]),
-        1e200 * np.eye(2),
-    ],
+    [3.01 * np.eye(2), np.diag([3.5, 1.0]), np.full((2, 2), np.nan), np.diag([np.inf, 1.0]), 1e200 * np.eye(2)],
 )
 def test_a_view_of_more_than_the_source_has_no_template(picture, affine):
     templates = warp(np.repeat(window(picture, (45, 40), 31)[None], 2, axis=0), np.stack([affine, np.eye(2)]))
@@ -366,10 +360,7 @@ WRONG_PX = 1.5
 
 def errors(affine, blur_px=0.5, noise=2.0, seed=0, accept=0.7):
     """Errors (k, 2) and covariances of accepted matches between two views, and how many were looked for."""
-    rng, shift = (
-        np.random.default_rng(seed),
-        np.array([0.31, -0.42]) + np.random.default_rng(seed).uniform(-1, 1, 2),
-    )
+    rng, shift = (np.random.default_rng(seed), np.array([0.31, -0.42]) + np.random.default_rng(seed).uniform(-1, 1, 2))
     waves = Waves(seed, blur_px=blur_px)
     first = waves.image(WARPED, noise=noise, rng=rng)
     then = waves.image(WARPED, affine, shift, noise, rng)
@@ -389,14 +380,7 @@ def turned(angle, scale=1.0):
 
 @pytest.mark.parametrize(
     "affine",
-    [
-        np.eye(2),
-        turned(0.6),
-        turned(3.0),
-        turned(0.0, 1.5),
-        turned(0.4, 0.75),
-        np.array([[1.2, 0.3], [-0.1, 0.8]]),
-    ],
+    [np.eye(2), turned(0.6), turned(3.0), turned(0.0, 1.5), turned(0.4, 0.75), np.array([[1.2, 0.3], [-0.1, 0.8]])],
     ids=["shift", "turn", "half turn", "smaller", "turned and larger", "sheared"],
 )
 def test_known_motion_is_recovered(affine):

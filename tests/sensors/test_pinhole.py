@@ -227,10 +227,7 @@ FIVE = "the camera's distortion must be the 5 numbers k1, k2, p1, p2, k3 (k3 = 0
         ({"cx": "320"}, "the camera's cx must be a finite number, got '320'"),
         ({"distortion": (0.1, 0.0, 0.0, 0.0)}, f"{FIVE}(0.1, 0.0, 0.0, 0.0)"),
         ({"distortion": None}, f"{FIVE}None"),
-        (
-            {"distortion": (0.0, 0.0, 0.0, 0.0, float("inf"))},
-            "the camera's k3 must be a finite number, got inf",
-        ),
+        ({"distortion": (0.0, 0.0, 0.0, 0.0, float("inf"))}, "the camera's k3 must be a finite number, got inf"),
         ({"distortion": (0.0, 0.0, "x", 0.0, 0.0)}, "the camera's p1 must be a finite number, got 'x'"),
         (
             {"distortion_model": "fov"},

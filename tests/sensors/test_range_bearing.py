@@ -139,8 +139,4 @@ def test_visible():
 
 def test_visible_positions():
     model = RelativePosition(SE2, np.array([0.0, 1.0, 0.0]), max_range=2.0)
-    assert model.visible(np.zeros(3), np.array([[2.9, 0.0], [3.1, 0.0], [-1.1, 0.0]])).tolist() == [
-        True,
-        False,
-        False,
-    ]
+    assert model.visible(np.zeros(3), np.array([[2.9, 0.0], [3.1, 0.0], [-1.1, 0.0]])).tolist() == [True, False, False]

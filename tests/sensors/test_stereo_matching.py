@@ -81,14 +81,11 @@ def test_the_jacobian_of_the_triangulation():
     z = np.array([[320.0, 100.0, 300.0], [50.0, 470.0, 47.0], [600.0, 10.0, 500.0]])
     step = 1e-4
     numeric = np.stack(
-        [(rig.triangulate(z + step * e) - rig.triangulate(z - step * e)) / (2 * step) for e in np.eye(3)],
-        axis=-1,
+        [(rig.triangulate(z + step * e) - rig.triangulate(z - step * e)) / (2 * step) for e in np.eye(3)], axis=-1
     )
     np.testing.assert_allclose(triangulate_jacobian(rig, z), numeric, rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(
-        triangulate_jacobian(rig, z) @ rig.jacobian(rig.triangulate(z)),
-        np.tile(np.eye(3), (3, 1, 1)),
-        atol=1e-9,
+        triangulate_jacobian(rig, z) @ rig.jacobian(rig.triangulate(z)), np.tile(np.eye(3), (3, 1, 1)), atol=1e-9
     )
 
 

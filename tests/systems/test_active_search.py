@@ -69,10 +69,7 @@ def test_a_later_appearance_is_found_where_the_first_is_not(wall, monkeypatch):
     sensor, points = wall
     there = around(35.0)
     image, rows = view(texture(), there), np.arange(len(points))
-    px, cov = (
-        CAMERA.project(SE3.inverse_transform(there, points)),
-        np.tile(4.0 * np.eye(2), (len(points), 1, 1)),
-    )
+    px, cov = (CAMERA.project(SE3.inverse_transform(there, points)), np.tile(4.0 * np.eye(2), (len(points), 1, 1)))
     search = sensor.search
     monkeypatch.setattr(search, "choose", lambda pose: (rows, px))
     monkeypatch.setattr(sensor.features, "project", lambda belief, rows: (rows, px, cov - search._noise()))

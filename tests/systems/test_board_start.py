@@ -28,10 +28,7 @@ def started(tmp_path_factory):
     """The run, and the true poses in the board's frame."""
     folder = tmp_path_factory.mktemp("board") / "desk"
     world = TexturedDesk(
-        frames=60,
-        board=(8, 5),
-        square_m=0.06,
-        hand=replace(OVER_DESK, speed_m_s=0.6, turn_rad_s=1.0, start_s=0.3),
+        frames=60, board=(8, 5), square_m=0.06, hand=replace(OVER_DESK, speed_m_s=0.6, turn_rad_s=1.0, start_s=0.3)
     )
     imaging = Imaging(noise_std=1.0, blur_s=0.0, exposure_drift=0.0, vignetting=0.0, known=0)
     simulate_images(world, imaging, CAMERA, folder, seed=0)

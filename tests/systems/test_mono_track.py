@@ -55,10 +55,7 @@ CASES = {
     "separate points": (lambda: MonoSlam(CAMERA, replace(CONFIG, known="points"), KNOWN), lambda: images(8)),
     "nothing known": (lambda: MonoSlam(CAMERA, CONFIG), lambda: images(12)),
     "lost and found": (lambda: MonoSlam(CAMERA, CONFIG, KNOWN), lambda: images(18, blinking)),
-    "waiting": (
-        lambda: MonoSlam(CAMERA, CONFIG, KNOWN),
-        lambda: images(4, lambda t, i: None if t < 2 else i),
-    ),
+    "waiting": (lambda: MonoSlam(CAMERA, CONFIG, KNOWN), lambda: images(4, lambda t, i: None if t < 2 else i)),
     "in a map": (None, lambda: images(46)[40:]),
     "named features": (lambda: MonoSlam(LOG.camera, SMALL, LOG.known), lambda: LOG.frames),
     "named, nothing known": (

@@ -121,9 +121,7 @@ def view(slam: StereoSlam, seed: int = 0, mistaken: bool = False) -> View[Stereo
         z[rows] = z[np.roll(rows, 1)]
     rest = features.cov, features.scale, features.orientation, features.descriptors
     return replace(
-        pair.view(uncertain=True),
-        stamp_ns=slam.filter.stamp_ns,
-        features=StereoFeatures.measured(slam.rig, z, *rest),
+        pair.view(uncertain=True), stamp_ns=slam.filter.stamp_ns, features=StereoFeatures.measured(slam.rig, z, *rest)
     )
 
 

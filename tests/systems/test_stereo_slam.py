@@ -179,17 +179,11 @@ class TestBadPairs:
     CHANGES: ClassVar = {
         "missing": (missing, "the right image is missing"),
         "black": (flat, "it shows 0 features"),
-        "wrong size": (
-            lambda f: ImageFrame(f.stamp_ns, f.image[:100], f.right[:100]),
-            "the camera takes 320x240 px",
-        ),
+        "wrong size": (lambda f: ImageFrame(f.stamp_ns, f.image[:100], f.right[:100]), "the camera takes 320x240 px"),
         "two sizes": (lambda f: ImageFrame(f.stamp_ns, f.image[:100], f.right), "must be of one size"),
         "wrong type": (lambda f: ImageFrame(f.stamp_ns, f.image.astype(float), f.right), "float64"),
         "colour": (lambda f: ImageFrame(f.stamp_ns, np.dstack([f.image] * 3), f.right), "(240, 320, 3)"),
-        "same stamp": (
-            lambda f: replace(f, stamp_ns=f.stamp_ns - 66_666_666),
-            "it has the stamp of the last one",
-        ),
+        "same stamp": (lambda f: replace(f, stamp_ns=f.stamp_ns - 66_666_666), "it has the stamp of the last one"),
     }
 
     @pytest.mark.parametrize("kind", CHANGES)

@@ -82,10 +82,7 @@ def solve_by_scipy(log: FeatureLog, robust: float | None = None) -> Reference:
     place = np.searchsorted(names, np.concatenate([frame.landmarks for frame in log.frames]))
     z = np.concatenate([frame.z for frame in log.frames])
     whiten = np.linalg.inv(np.linalg.cholesky(np.concatenate([frame.cov_z for frame in log.frames])))
-    fixed, whiten_fixed = (
-        np.searchsorted(names, log.known.names),
-        np.linalg.inv(np.linalg.cholesky(log.known.cov)),
-    )
+    fixed, whiten_fixed = (np.searchsorted(names, log.known.names), np.linalg.inv(np.linalg.cholesky(log.known.cov)))
     count, split = len(log.frames), 6 * len(log.frames)
     around = np.array([log.truth.landmarks[name] for name in names.tolist()])
 

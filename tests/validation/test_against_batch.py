@@ -19,13 +19,7 @@ from rbpf.runs.recordings import filter_robot_log as run
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
-from rbpf.validation.consistency.against_batch import (
-    SAME,
-    SCALED,
-    compare,
-    compare_folder,
-    compare_run,
-)
+from rbpf.validation.consistency.against_batch import SAME, SCALED, compare, compare_folder, compare_run
 from rbpf.validation.gtsam.batch_problem import fit_of, problem_of, read_problem, solve_problem
 from rbpf.validation.metrics.gaussian_differences import compare_last_pose, rescaled, scale_onto
 from tests.validation.camera_scenes import scene
@@ -213,10 +207,7 @@ def _version():
         (lambda f: shutil.rmtree(f), "there is no such folder"),
         (lambda f: (f / "config.yaml").unlink(), "has no config.yaml"),
         (lambda f: (f / "config.yaml").write_text("a: 1"), "expected the settings of a run"),
-        (
-            lambda f: (f / "config.yaml").write_text("rbpf: 99.1.0\nsystem: mono"),
-            "was written by rbpf 99.1.0",
-        ),
+        (lambda f: (f / "config.yaml").write_text("rbpf: 99.1.0\nsystem: mono"), "was written by rbpf 99.1.0"),
         (lambda f: (f / "config.yaml").write_text("{"), "expected YAML"),
         (lambda f: (f / "observations.csv").unlink(), "holds no observations.csv"),
         (lambda f: (f / "map.npz").unlink(), "holds no map.npz"),

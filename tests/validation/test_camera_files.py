@@ -52,12 +52,7 @@ def test_reading_gives_back_the_same_bits(tmp_path, known, camera):
     ("name", "old", "new", "words"),
     [
         (OBSERVATIONS, "# rbpf observations 1", "# rbpf observations 9", "expected '# rbpf observations 1'"),
-        (
-            OBSERVATIONS,
-            "# measurement: pinhole",
-            "# measurement: range_bearing",
-            "expected measurement to be pinhole",
-        ),
+        (OBSERVATIONS, "# measurement: pinhole", "# measurement: range_bearing", "expected measurement to be pinhole"),
         (OBSERVATIONS, "# size: 640 480", "# size: 640", "expected 2 numbers for size"),
         (OBSERVATIONS, "\n3,", "\n4,", "expected a step from 0 to 3"),
         (OBSERVATIONS, "# rows: 12", "# rows: 13", "expected 13 rows"),
@@ -97,11 +92,7 @@ def test_a_damaged_file_of_pairs_is_named(tmp_path, old, new, words):
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        (
-            "# lens: equidistant",
-            "# lens: fov",
-            "expected lens to be radial-tangential or equidistant, found 'fov'",
-        ),
+        ("# lens: equidistant", "# lens: fov", "expected lens to be radial-tangential or equidistant, found 'fov'"),
         ("# lens: equidistant", "# lens: radial-tangential", "expected 9 numbers for camera, found 8"),
     ],
 )

@@ -7,12 +7,7 @@ import pytest
 
 from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole
-from rbpf.validation.colmap.model import (
-    HALF_PX,
-    from_colmap_pose,
-    to_colmap_camera,
-    to_colmap_pose,
-)
+from rbpf.validation.colmap.model import HALF_PX, from_colmap_pose, to_colmap_camera, to_colmap_pose
 from tests.validation.camera_scenes import BENT, FISHEYE, PLAIN, WHOLE
 
 

@@ -5,12 +5,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import multivariate_normal, norm
 
-from rbpf.validation.metrics.gaussian_differences import (
-    bhattacharyya,
-    kullback_leibler,
-    mahalanobis,
-    sigma_ratio,
-)
+from rbpf.validation.metrics.gaussian_differences import bhattacharyya, kullback_leibler, mahalanobis, sigma_ratio
 
 RNG = np.random.default_rng(5)
 

@@ -16,12 +16,7 @@ from rbpf.runs.trajectory import Similarity, read_tum, write_tum
 from rbpf.runs.truth import RunTruth, write_truth
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.range_bearing.config import RangeBearingConfig
-from rbpf.validation.consistency.against_groundtruth import (
-    LANDMARKS,
-    NEES,
-    compare_with_truth,
-    truth_errors,
-)
+from rbpf.validation.consistency.against_groundtruth import LANDMARKS, NEES, compare_with_truth, truth_errors
 from rbpf.validation.metrics.scores import score_landmarks
 from rbpf.validation.simulation.robot import RobotWorld, simulated_log
 

@@ -216,10 +216,7 @@ def test_bad_input_is_refused_in_words():
         solve(m, robust=0.0)
     start = initial_estimate(m)
     with pytest.raises(InputError, match=re.escape("every landmark seen, landmark 7 is missing")):
-        solve(
-            m,
-            initial=InitialEstimate(start.world_from_robot, {k: v for k, v in start.landmarks.items() if k != 7}),
-        )
+        solve(m, initial=InitialEstimate(start.world_from_robot, {k: v for k, v in start.landmarks.items() if k != 7}))
     with pytest.raises(InputError, match=re.escape("found poses of shape (3, 3)")):
         solve(m, initial=InitialEstimate(start.world_from_robot[:3], start.landmarks))
 

@@ -16,15 +16,7 @@ from rbpf.validation.gtsam.camera_adjust import explain
 from rbpf.validation.gtsam.camera_graph import CameraProblem, CameraState
 from rbpf.validation.gtsam.observations import known_by_name, observation_table, reprojection
 from rbpf.validation.gtsam.solvers import marginals, marginals_by_schur
-from tests.validation.camera_scenes import (
-    BENT,
-    FISHEYE,
-    PLAIN,
-    STEREO,
-    WHOLE,
-    scene,
-    solve_by_scipy,
-)
+from tests.validation.camera_scenes import BENT, FISHEYE, PLAIN, STEREO, WHOLE, scene, solve_by_scipy
 from tests.validation.factors import check_derivatives
 
 CAMERAS = [PLAIN, BENT, WHOLE, FISHEYE, STEREO]

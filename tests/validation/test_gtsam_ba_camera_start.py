@@ -49,10 +49,7 @@ def test_the_same_optimum_is_found_from_scratch(camera):
 
 @pytest.mark.parametrize(
     ("camera", "known", "outliers"),
-    [
-        (MONO, 4, 0.0),
-        *(pytest.param(*case, marks=pytest.mark.slow) for case in ((MONO, 6, 0.1), (PAIR, 0, 0.0))),
-    ],
+    [(MONO, 4, 0.0), *(pytest.param(*case, marks=pytest.mark.slow) for case in ((MONO, 6, 0.1), (PAIR, 0, 0.0)))],
 )
 def test_a_camera_that_rests_at_first_is_followed(camera, known, outliers):
     measuring = Measuring(known=known, outlier_rate=outliers)

@@ -36,10 +36,7 @@ def exact_errors(m, log, path, landmarks):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("folder", "batch", "filtered"),
-    [
-        ("mrpt_kf_slam_2d", (0.0040, 0.0026), (0.0049, 0.0030)),
-        ("mrpt_kf_slam_6d", (0.0102, 0.0042), (0.0123, 0.0043)),
-    ],
+    [("mrpt_kf_slam_2d", (0.0040, 0.0026), (0.0049, 0.0030)), ("mrpt_kf_slam_6d", (0.0102, 0.0042), (0.0123, 0.0043))],
 )
 def test_simulated_recordings_give_the_errors_of_the_reference(data_dir, folder, batch, filtered):
     log = opened(data_dir / folder)

@@ -202,11 +202,7 @@ def small_log():
     values = {"landmarks": np.array([5]), "z": np.array([[2.0, 0.5]]), "cov_z": np.diag([0.01, 0.02])[None]}
     empty = {"landmarks": np.empty(0, int), "z": np.empty((0, 2)), "cov_z": np.empty((0, 2, 2))}
     move = {"delta": np.array([0.5, 1.0, 0.0]), "cov_delta": np.diag([0.01, 0.02, 0.03])}
-    frames = [
-        Frame(7, None, None, **empty),
-        Frame(9, **move, **values),
-        Frame(12, **move, **empty),
-    ]
+    frames = [Frame(7, None, None, **empty), Frame(9, **move, **values), Frame(12, **move, **empty)]
     return RobotLog("small", SE2, "range_bearing", np.array([0.0, 0.1, 0.2]), frames)
 
 

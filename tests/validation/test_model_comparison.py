@@ -61,17 +61,11 @@ def test_a_likelihood_that_is_no_density_is_refused_with_the_reason():
 
 
 def test_monocular_configurations_are_compared_on_features():
-    log, usual = (
-        simulate_features(DeskWorld(frames=25), Measuring(), MONO, 0),
-        MonoConfig(max_new_per_frame=0),
-    )
+    log, usual = (simulate_features(DeskWorld(frames=25), Measuring(), MONO, 0), MonoConfig(max_new_per_frame=0))
     slow = replace(usual, velocity=replace(usual.velocity, walk_m_s=0.001, walk_rad_s=0.001))
     found = compare_evidence(usual, slow, log, range(2))
     assert found.difference > 0.0
-    for pair in (
-        (usual, replace(usual, max_new_per_frame=1)),
-        (MonoConfig(), MonoConfig(max_new_per_frame=1)),
-    ):
+    for pair in ((usual, replace(usual, max_new_per_frame=1)), (MonoConfig(), MonoConfig(max_new_per_frame=1))):
         with pytest.raises(InputError, match="who starts fewer explains more; set max_new_per_frame to 0"):
             compare_evidence(*pair, log, range(2))
 
@@ -128,11 +122,7 @@ def test_a_filter_too_random_to_tell_says_so():
 @pytest.mark.slow
 def test_runs_are_compared_by_their_folders(tmp_path, capsys):
     simulate_robot(RobotWorld(steps=20), tmp_path / "log", seed=0)
-    for name, setting in (
-        ("a", "anchor_every=0"),
-        ("b", "noise.std_range_m=0.2"),
-        ("c", "likelihood.kind=truncated"),
-    ):
+    for name, setting in (("a", "anchor_every=0"), ("b", "noise.std_range_m=0.2"), ("c", "likelihood.kind=truncated")):
         arguments = ["--out", str(tmp_path / name), "--particles", "50", "--no-batch", "--set", setting]
         assert main(["run", "range-bearing", str(tmp_path / "log"), *arguments]) == 0
     capsys.readouterr()

@@ -11,16 +11,7 @@ from rbpf.runs.recordings import filter_images
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers import open_images, read_known_points
 from rbpf.systems.mono.config import MonoConfig
-from rbpf.validation.report.video import (
-    FOUND,
-    MISSED,
-    RAY,
-    Caption,
-    draw_search,
-    drawn_size,
-    frame_rate,
-    is_complete,
-)
+from rbpf.validation.report.video import FOUND, MISSED, RAY, Caption, draw_search, drawn_size, frame_rate, is_complete
 from rbpf.validation.simulation.desk_and_room import OVER_DESK, TexturedDesk
 from rbpf.validation.simulation.images import Imaging, simulate_images
 

@@ -9,15 +9,7 @@ import numpy as np
 import pytest
 
 from examples.studies import point_worlds
-from examples.studies.point_worlds import (
-    MONO,
-    STEREO,
-    DeskWorld,
-    LabWorld,
-    Measuring,
-    PointWorld,
-    simulate_features,
-)
+from examples.studies.point_worlds import MONO, STEREO, DeskWorld, LabWorld, Measuring, PointWorld, simulate_features
 from rbpf.errors import InputError
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.feature_log import FeatureLog
@@ -62,11 +54,7 @@ def sheet(**wrong: Any) -> Rectangle:
         (Measuring, {"rest_frames": -1}, "rest_frames must be"),
         (Measuring, {"known_std_m": -0.1}, "known_std_m must be zero or a positive number"),
         (Measuring, {"border_px": -1.0}, "border_px must be zero"),
-        (
-            Measuring,
-            {"outlier_rate": 1.0},
-            "outlier_rate must be a probability, 0 or more and below 1, got 1.0",
-        ),
+        (Measuring, {"outlier_rate": 1.0}, "outlier_rate must be a probability, 0 or more and below 1, got 1.0"),
         (Measuring, {"dropout": -0.1}, "dropout must be a probability"),
         (Measuring, {"turnover": float("nan")}, "turnover must be a probability"),
         (Measuring, {"farthest_m": float("inf")}, "farthest_m must be a positive number"),

@@ -263,11 +263,7 @@ def test_exactly_known_points() -> None:
 @pytest.mark.parametrize(
     ("world", "measuring", "message"),
     [
-        (
-            DeskWorld(points=3),
-            Measuring(),
-            "first frame of the desk sees [0-3] points .* expected 4: simulate more",
-        ),
+        (DeskWorld(points=3), Measuring(), "first frame of the desk sees [0-3] points .* expected 4: simulate more"),
         (DeskWorld(), Measuring(known=30), "30 known points do not fit into 25 measurements"),
         (Line(), Measuring(known=3), "known points of the line lie on a line in the first frame"),
     ],

@@ -74,10 +74,7 @@ def test_the_tour_comes_back_to_places_in_the_same_and_the_opposite_direction() 
     near = np.hypot(x[:, None] - x, y[:, None] - y) < 0.05
     later = np.subtract.outer(np.arange(len(x)), np.arange(len(x))) > 60
     turned = np.cos(theta[:, None] - theta)
-    again, back = (
-        (near & later & (turned > 0.99)).sum(axis=1) > 0,
-        (near & later & (turned < -0.99)).sum(axis=1) > 0,
-    )
+    again, back = ((near & later & (turned > 0.99)).sum(axis=1) > 0, (near & later & (turned < -0.99)).sum(axis=1) > 0)
     # Metres of the tour where the robot has been before, facing the same way and the opposite one.
     way = 10.0 * TOUR.way_m[-1] / 4000.0
     assert again.sum() * way > 8.0 and back.sum() * way > 8.0

@@ -156,13 +156,7 @@ def test_a_path_is_slowed_down_and_never_sped_up(limits: tuple[float, float], pa
 def test_blocks_hide_from_behind_and_show_their_faces() -> None:
     block = np.array([[[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]])
     eye = np.array([-1.0, 0.5, 0.4])
-    behind, before, beside, front, back = (
-        [2, 0.5, 0.5],
-        [-0.1, 0.5, 0.5],
-        [2, 3, 0.5],
-        [0, 0.7, 0.3],
-        [1, 0.7, 0.3],
-    )
+    behind, before, beside, front, back = ([2, 0.5, 0.5], [-0.1, 0.5, 0.5], [2, 3, 0.5], [0, 0.7, 0.3], [1, 0.7, 0.3])
     points = np.array([behind, before, beside, front, back, [-3.0, 0.5, 0.4]])
     assert hidden(eye, points, block).tolist() == [True, False, False, False, True, False]
 

@@ -29,15 +29,7 @@ def finished(tmp_path_factory, plain_pictures):
     """A finished run."""
     folder = tmp_path_factory.mktemp("validated")
     simulate_robot(RobotWorld(steps=40, landmarks=30), folder / "log", seed=0)
-    arguments = [
-        "run",
-        "range-bearing",
-        str(folder / "log"),
-        "--out",
-        str(folder / "run"),
-        "--particles",
-        "60",
-    ]
+    arguments = ["run", "range-bearing", str(folder / "log"), "--out", str(folder / "run"), "--particles", "60"]
     assert main(arguments) == 0
     return folder / "run"
 

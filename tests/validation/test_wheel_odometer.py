@@ -56,11 +56,7 @@ def test_slip_is_as_great_as_stated() -> None:
 
 
 def test_a_seed_gives_the_same_readings_and_a_shorter_drive_their_beginning() -> None:
-    whole, again, short = (
-        measured(WheelOdometer()),
-        measured(WheelOdometer()),
-        measured(WheelOdometer(), frames=50),
-    )
+    whole, again, short = (measured(WheelOdometer()), measured(WheelOdometer()), measured(WheelOdometer(), frames=50))
     np.testing.assert_array_equal(whole.delta, again.delta)
     np.testing.assert_array_equal(whole.delta[:49], short.delta)
     assert (measured(WheelOdometer(), seed=1).delta != whole.delta).all(axis=1).mean() > 0.9

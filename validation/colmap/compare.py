@@ -93,10 +93,7 @@ class ColmapComparison:
 
 
 def compare_with_path(
-    found: Reconstruction,
-    reference: Trajectory,
-    landmarks: Array | None = None,
-    cov_landmarks: Array | None = None,
+    found: Reconstruction, reference: Trajectory, landmarks: Array | None = None, cov_landmarks: Array | None = None
 ) -> ColmapComparison:
     """COLMAP beside a filter's path and, if given, its map.
 

@@ -107,9 +107,7 @@ class Reconstruction:
 
 
 def reconstruct(
-    sequence: ImageSequence,
-    options: ReconstructionOptions | None = None,
-    folder: Path | None = None,
+    sequence: ImageSequence, options: ReconstructionOptions | None = None, folder: Path | None = None
 ) -> Reconstruction:
     """Reconstructs a sequence of images from scratch.
 

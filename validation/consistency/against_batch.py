@@ -163,10 +163,7 @@ def compare_folder(folder: Path, robust: float | None = None) -> AgainstBatch:
 
 
 def compare(
-    filtered: PathAndMap,
-    problem: Problem,
-    robust: float | None = None,
-    optimum: Optimum | None = None,
+    filtered: PathAndMap, problem: Problem, robust: float | None = None, optimum: Optimum | None = None
 ) -> AgainstBatch:
     """A filter's path and map beside the batch optimum of the same measurements.
 

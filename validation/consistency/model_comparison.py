@@ -165,11 +165,7 @@ def compare_evidence(
 
 
 def compare_runs(
-    run_a: Path,
-    run_b: Path,
-    seeds: int = 5,
-    workers: int = 1,
-    on_run: Callable[[int, int], None] | None = None,
+    run_a: Path, run_b: Path, seeds: int = 5, workers: int = 1, on_run: Callable[[int, int], None] | None = None
 ) -> EvidenceDifference:
     """The same for the settings of two finished runs over one recording, which are repeated with several seeds.
 

@@ -151,12 +151,7 @@ def fit_of(problem: Problem, estimate: PathAndMap, names: NDArray[np.int64]) -> 
 
 
 def _solve_camera(
-    log: FeatureLog,
-    start: Array,
-    robust: float | None,
-    most: int | None,
-    told: Told | None,
-    marginals: bool,
+    log: FeatureLog, start: Array, robust: float | None, most: int | None, told: Told | None, marginals: bool
 ) -> Optimum:
     tolerance = STEREO_TOLERANCE if isinstance(log.camera, RectifiedStereo) else None
     batch = adjust_log(log, start, most, told, tolerance=tolerance, robust=robust, marginals=marginals)

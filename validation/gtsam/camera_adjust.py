@@ -141,10 +141,7 @@ def begin(problem: CameraProblem, start: CameraEstimate) -> CameraState:
 
 
 def adjust(
-    problem: CameraProblem,
-    start: CameraState,
-    tolerance: float = FINE,
-    on_iteration: OnIteration | None = None,
+    problem: CameraProblem, start: CameraState, tolerance: float = FINE, on_iteration: OnIteration | None = None
 ) -> Adjusted:
     """Levenberg-Marquardt; a few rough steps at a time, until it is clear which landmarks are undetermined.
 

@@ -27,14 +27,7 @@ from rbpf.validation.gtsam.observations import (
     spread,
     triangulate,
 )
-from rbpf.validation.gtsam.solvers import (
-    ROUGH,
-    SPATIAL,
-    OnIteration,
-    levenberg_marquardt,
-    marginals,
-    noise,
-)
+from rbpf.validation.gtsam.solvers import ROUGH, SPATIAL, OnIteration, levenberg_marquardt, marginals, noise
 
 KNOWN = 4
 """Known points that the first frame has to see."""

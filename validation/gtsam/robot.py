@@ -309,10 +309,7 @@ class Problem:
 
     def _observation(self, row: int) -> Any:
         model, chart, z = self.model, self.chart, self.m.z[row]
-        pose_key, landmark_key = (
-            self.pose_key(int(self.m.steps[row])),
-            self.landmark_key(int(self.index[row])),
-        )
+        pose_key, landmark_key = (self.pose_key(int(self.m.steps[row])), self.landmark_key(int(self.index[row])))
 
         def error(factor: Any, values: Any, jacobians: Any) -> Array:
             state, landmark = chart.storage(values, pose_key), chart.point(values, landmark_key)

@@ -17,13 +17,7 @@ from rbpf.sensors.readers.images.calibration import NAME
 from rbpf.validation.calibration import camera_text
 from rbpf.validation.gtsam.batch_problem import read_problem
 from rbpf.validation.gtsam.mono_batch import ROBUST, Batch, adjust_log, softened
-from rbpf.validation.gtsam.observations import (
-    CameraEstimate,
-    Residuals,
-    known_by_name,
-    observation_table,
-    reprojection,
-)
+from rbpf.validation.gtsam.observations import CameraEstimate, Residuals, known_by_name, observation_table, reprojection
 
 ITERATIONS = 200
 """Most of the adjustment."""

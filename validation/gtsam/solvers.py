@@ -118,11 +118,7 @@ def huber(base: Any, threshold: float | None) -> Any:
 
 
 def levenberg_marquardt(
-    graph: Any,
-    values: Any,
-    tolerance: float,
-    iterations: int = ITERATIONS,
-    on_iteration: OnIteration | None = None,
+    graph: Any, values: Any, tolerance: float, iterations: int = ITERATIONS, on_iteration: OnIteration | None = None
 ) -> tuple[Any, int, bool]:
     """Damped Gauss-Newton.
 

@@ -11,13 +11,7 @@ from rbpf.runs.reading import PathAndMap
 from rbpf.validation.colmap.compare import ColmapComparison
 from rbpf.validation.consistency.against_batch import AgainstBatch
 from rbpf.validation.consistency.statistic import inverse_roots
-from rbpf.validation.report.comparison_figures import (
-    landmark_figure,
-    map_figure,
-    nees_figure,
-    path_figure,
-    wide_axes,
-)
+from rbpf.validation.report.comparison_figures import landmark_figure, map_figure, nees_figure, path_figure, wide_axes
 
 _BINS = 20
 
@@ -70,10 +64,7 @@ def _colmap_map(found: ColmapComparison, reference: PathAndMap) -> Any:
     views = Views.of_camera(reference.trajectory.world_from_body)
     figure, shown = views.axes(f"{found.reconstruction.name}: COLMAP brought onto the run")
     move = found.reference_from_colmap
-    cloud, centres = (
-        move.transform(found.reconstruction.points),
-        move.transform(found.reconstruction.path.positions),
-    )
+    cloud, centres = (move.transform(found.reconstruction.points), move.transform(found.reconstruction.path.positions))
     low, high = _box(reference.landmarks.mean, reference.trajectory.positions)
     cloud = cloud[((cloud >= low) & (cloud <= high)).all(axis=1)]
     at, points = reference.trajectory.positions, reference.landmarks.mean

@@ -192,10 +192,6 @@ def _log_pair(rr: Any, stream: Any, run: Run, seen: Mapping[str, np.ndarray], po
 
 DRAWN = {
     "mono": Drawn(lambda run: run.system.camera, _log_search, ("found", "lost")),
-    "stereo": Drawn(
-        lambda run: run.system.rig.camera,
-        _log_pair,
-        ("features", "agreeing", "observed"),
-    ),
+    "stereo": Drawn(lambda run: run.system.rig.camera, _log_pair, ("features", "agreeing", "observed")),
 }
 """By the system's name."""

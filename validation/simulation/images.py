@@ -23,12 +23,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.readers.images.calibration import model_of
-from rbpf.validation.simulation.limits import (
-    check_counts,
-    check_fractions,
-    check_not_negative,
-    check_positive,
-)
+from rbpf.validation.simulation.limits import check_counts, check_fractions, check_not_negative, check_positive
 from rbpf.validation.simulation.paths import Wave, write_wheel_odometry
 from rbpf.validation.simulation.render import Renderer
 from rbpf.validation.simulation.textured_scene import ImageWorld, TexturedScene, cast
@@ -102,12 +97,7 @@ class Shutter:
     """Takes the pictures of a scene, in any order: a frame's noise depends on nothing but the seed."""
 
     def __init__(
-        self,
-        scene: TexturedScene,
-        imaging: Imaging,
-        camera: Pinhole,
-        renderer: Renderer,
-        rng: np.random.Generator,
+        self, scene: TexturedScene, imaging: Imaging, camera: Pinhole, renderer: Renderer, rng: np.random.Generator
     ) -> None:
         self._scene, self._imaging, self._camera, self._renderer = scene, imaging, camera, renderer
         frames = np.arange(len(scene.stamps_ns))
@@ -308,12 +298,7 @@ def write_image(path: Path, image: np.ndarray, quality: int = 0) -> None:
 
 
 def write_sensor(
-    folder: Path,
-    sensor: str,
-    scene: TexturedScene,
-    camera: Pinhole,
-    offset_m: float,
-    suffix: str,
+    folder: Path, sensor: str, scene: TexturedScene, camera: Pinhole, offset_m: float, suffix: str
 ) -> None:
     """A sensor's folder (cam0, cam1 or depth0) with calibration and index; it stands so far along the body's x axis."""
     stamps_ns = scene.stamps_ns

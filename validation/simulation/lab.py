@@ -422,10 +422,7 @@ class LabDrive:
         return drive()(np.arange(self.images[-1] + 1) / RATE_HZ)
 
 
-DRIVES = {
-    "tour": (tour, TOUR_FRAMES),
-    "turn_back": (turn_back, TURN_BACK_FRAMES),
-}
+DRIVES = {"tour": (tour, TOUR_FRAMES), "turn_back": (turn_back, TURN_BACK_FRAMES)}
 """A drive and its number of frames, by name."""
 
 

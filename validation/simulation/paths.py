@@ -382,11 +382,7 @@ class WheelOdometer:
                 raise InputError(f"{name} must be between -0.5 and 0.5, got {getattr(self, name)!r}")
 
     def measure(
-        self,
-        travelled: Travelled,
-        stamps_ns: np.ndarray,
-        robot_from_camera: np.ndarray,
-        rng: np.random.Generator,
+        self, travelled: Travelled, stamps_ns: np.ndarray, robot_from_camera: np.ndarray, rng: np.random.Generator
     ) -> WheelOdometry:
         """Readings of a drive at T times; more times leave the first readings as they are."""
         side = 0.5 * self.wheelbase_m * np.array([-1.0, 1.0])

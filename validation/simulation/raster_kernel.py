@@ -183,11 +183,7 @@ def expose(h, bounds, moment, sheet, gain, uv, slope, tiles, shifts, spacing, le
     A ray that leaves the world sees 0. The size of a pixel on a rectangle is worked out once for all its rays.
     """
     side = TILE * TILE
-    chosen, row, sized = (
-        np.empty(bounds.shape[1], np.int64),
-        np.empty(side, np.int64),
-        np.empty(side, np.int64),
-    )
+    chosen, row, sized = (np.empty(bounds.shape[1], np.int64), np.empty(side, np.int64), np.empty(side, np.int64))
     u, v, near, detail, total = np.empty(side), np.empty(side), np.empty(side), np.empty(side), np.empty(side)
     nearest, strips = np.empty(bounds.shape[1]), np.empty(bounds.shape[:2], np.int64)
     met = np.empty(bounds.shape[0], np.int64)
@@ -223,12 +219,7 @@ def expose(h, bounds, moment, sheet, gain, uv, slope, tiles, shifts, spacing, le
                 light[j * TILE + p // columns, i * TILE + p % columns] = total[p] / shifts.shape[0]
 
 
-@njit(
-    void(_CUBE, _MATRIX, _CUBE, _CUBE, _CUBE, _MATRIX, _ROW_IMAGE),
-    cache=True,
-    error_model="numpy",
-    nogil=True,
-)
+@njit(void(_CUBE, _MATRIX, _CUBE, _CUBE, _CUBE, _MATRIX, _ROW_IMAGE), cache=True, error_model="numpy", nogil=True)
 def trace(h, bounds, uv, slope, tiles, inverse_depth, rows):
     """Inverse depth and rectangle (H, W) at the pixels' centres; 0 and -1 where the ray leaves the world."""
     side, centre = TILE * TILE, np.zeros(2)

@@ -245,9 +245,7 @@ class Furniture:
 
 
 def apart(
-    draw: Callable[[], tuple[np.ndarray, float]],
-    count: int,
-    taken: list[tuple[np.ndarray, float]],
+    draw: Callable[[], tuple[np.ndarray, float]], count: int, taken: list[tuple[np.ndarray, float]]
 ) -> list[tuple[np.ndarray, float]]:
     """Places (middle (2,), radius) of up to `count` things that touch neither each other nor what is taken."""
     found: list[tuple[np.ndarray, float]] = []

@@ -150,11 +150,7 @@ def chessboard(squares: Shape, texels: int, margin: int) -> np.ndarray:
 
 
 def _scatter(
-    image: np.ndarray,
-    rng: np.random.Generator,
-    per_texel: float,
-    size: tuple[float, float],
-    contrast: float,
+    image: np.ndarray, rng: np.random.Generator, per_texel: float, size: tuple[float, float], contrast: float
 ) -> None:
     """Draws polygons and discs at random, most of them small, each so much brighter or darker than what it covers."""
     for _ in range(rng.poisson(per_texel * image.size)):

@@ -101,11 +101,7 @@ def draw_curves(curves: dict[str, tuple[np.ndarray, list[Shape]]], true_depth_m:
     for axes, (name, (grid, shapes)) in zip(figure.subplots(1, 2), curves.items(), strict=True):
         for colour, observations in zip(COLOURS, SHOWN, strict=True):
             _draw_curve(
-                axes,
-                grid,
-                shapes[observations - 1],
-                colour,
-                f"{observations} observation{'s' * (observations > 1)}",
+                axes, grid, shapes[observations - 1], colour, f"{observations} observation{'s' * (observations > 1)}"
             )
         true = true_depth_m if name.startswith("depth") else 1.0 / true_depth_m
         axes.axvline(true, color="black", lw=0.8, ls="--", label="truth")

@@ -94,13 +94,7 @@ def _draw_map(shown: Shown) -> Any:
 
     figure = Figure(figsize=(7.5, 7.0), layout="constrained")
     axes = figure.subplots()
-    label(
-        axes,
-        f"map at frame {shown.frame}: new landmarks on their rays (Fig. 7)",
-        "x [m]",
-        "y [m]",
-        equal=True,
-    )
+    label(axes, f"map at frame {shown.frame}: new landmarks on their rays (Fig. 7)", "x [m]", "y [m]", equal=True)
     full, rays = ~shown.mapped.is_ray(), shown.mapped.is_ray()
     mean, cov = shown.mapped.mean[full], shown.mapped.cov[full]
     camera = SE3.translation(shown.path)

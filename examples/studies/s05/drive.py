@@ -77,12 +77,7 @@ def measured_drive(
         world = TexturedLab(LabDrive(frames=setting.frames, every=setting.every), texel_m=setting.texel_m)
         imaging = Imaging(noise_std=NOISE_STD, known=0)
         simulate_images(
-            world,
-            imaging,
-            rig,
-            setting.images,
-            setting.seed,
-            lambda done, total: told("rendered", done, total),
+            world, imaging, rig, setting.images, setting.seed, lambda done, total: told("rendered", done, total)
         )
     sequence = open_stereo(setting.images)
     if len(sequence) < setting.frames:

@@ -139,11 +139,7 @@ class ActiveSearch:
     """
 
     def __init__(
-        self,
-        features: FeatureSensor,
-        table: FeatureTable,
-        config: SearchConfig,
-        gate: OutlierGate | None = None,
+        self, features: FeatureSensor, table: FeatureTable, config: SearchConfig, gate: OutlierGate | None = None
     ) -> None:
         self.features, self.camera = features, features.camera
         self.table, self.config = table, config

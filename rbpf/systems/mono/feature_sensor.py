@@ -17,14 +17,7 @@ from rbpf.maps.constellation import Constellation, UncertainConstellation
 from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.maps.point import Point
 from rbpf.sensors.camera import Pinhole
-from rbpf.sensors.camera.points import (
-    CameraModel,
-    CameraPoint,
-    CameraRay,
-    ConstellationView,
-    EpipolarRay,
-    MembersView,
-)
+from rbpf.sensors.camera.points import CameraModel, CameraPoint, CameraRay, ConstellationView, EpipolarRay, MembersView
 from rbpf.sensors.feature_log import FeatureFrame, KnownPoints
 from rbpf.systems.mono.config import InverseDepthConfig
 

@@ -161,11 +161,7 @@ def constellation(points: KnownPoints) -> Constellation | UncertainConstellation
 
 
 def constellation_records(
-    camera: Pinhole,
-    start: KnownStart,
-    group: Constellation | UncertainConstellation,
-    n: int,
-    cov_frame: np.ndarray,
+    camera: Pinhole, start: KnownStart, group: Constellation | UncertainConstellation, n: int, cov_frame: np.ndarray
 ) -> Records:
     """Known points after the first image, whose camera is the world: records (n, 1, …).
 

@@ -463,11 +463,7 @@ class LastView:
     """
 
     def __init__(
-        self,
-        sensor: ImageSensor,
-        image: np.ndarray,
-        world_from_camera: np.ndarray,
-        config: RelocalisationConfig,
+        self, sensor: ImageSensor, image: np.ndarray, world_from_camera: np.ndarray, config: RelocalisationConfig
     ) -> None:
         self.camera = camera = sensor.camera
         self.world_from_camera = world_from_camera

@@ -36,13 +36,7 @@ from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.feature_sensor import FeatureSensor, InverseDepthRays, UnknownDepth
 from rbpf.systems.mono.feature_table import directions
 from rbpf.systems.mono.image_sensor import ImageSensor, Measurement
-from rbpf.systems.mono.known_map import (
-    NAME,
-    KnownMap,
-    estimate_mono_map,
-    known_map_arrays,
-    known_map_of,
-)
+from rbpf.systems.mono.known_map import NAME, KnownMap, estimate_mono_map, known_map_arrays, known_map_of
 from rbpf.systems.mono.known_start import KnownStart, constellation, constellation_records, require_texture
 from rbpf.systems.mono.relocalisation import Attempt, ImageScreen, TrackingLoss
 from rbpf.systems.mono.unknown_start import UnknownStart
@@ -128,18 +122,8 @@ class MonoSlam(System):
         Ragged("cov", "covariance of these, with the noise of the measurement, px²", (2, 2), per="features"),
         Ragged("px", "where each was found, px; NaN where not", (2,), per="features"),
         Ragged("cov_px", "covariance of the noise of px, px²", (2, 2), per="features"),
-        Ragged(
-            "line",
-            "ends of the epipolar line of one whose depth is unknown, px; else NaN",
-            (2, 2),
-            per="features",
-        ),
-        Ragged(
-            "position",
-            "homogeneous point in the reported world; NaN where it was not found",
-            (4,),
-            per="features",
-        ),
+        Ragged("line", "ends of the epipolar line of one whose depth is unknown, px; else NaN", (2, 2), per="features"),
+        Ragged("position", "homogeneous point in the reported world; NaN where it was not found", (4,), per="features"),
         Ragged("started", "features that were started", kind="int64"),
         Ragged("started_px", "where, px", (2,), per="started"),
     )

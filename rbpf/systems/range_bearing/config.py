@@ -7,17 +7,7 @@ import numpy as np
 
 from rbpf.core.likelihoods import ExistenceModel, Gates
 from rbpf.errors import InputError
-from rbpf.ranges import (
-    Count,
-    CountOrNone,
-    NotNegative,
-    Positive,
-    Probability,
-    Range,
-    Ranged,
-    Seed,
-    check_ranges,
-)
+from rbpf.ranges import Count, CountOrNone, NotNegative, Positive, Probability, Range, Ranged, Seed, check_ranges
 from rbpf.sensors.readers import LogNoise
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig, ResamplingConfig
 

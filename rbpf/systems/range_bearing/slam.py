@@ -104,11 +104,7 @@ class RangeBearingSlam(System):
             LOG_EVIDENCE,
             NIS,
             NIS_DOF,
-            Column(
-                "correction",
-                "what the observations say about the motion, in its whitened coordinates",
-                shape=(d,),
-            ),
+            Column("correction", "what the observations say about the motion, in its whitened coordinates", shape=(d,)),
             Column("cov_correction", "what a consistent filter expects of the correction", shape=(d, d)),
             Column("odometry", "world_from_robot by odometry alone", shape=(e,)),
             Column("delta", "odometry, previous_robot_from_robot; NaN in the first frame", shape=(e,)),

@@ -290,12 +290,7 @@ class NamedFrontEnd(FrontEnd[NamedPixels]):
 
     def arrays(self, pair: Pair[NamedPixels]) -> dict[str, np.ndarray]:
         features = pair.features
-        return {
-            "pair/names": features.names,
-            "pair/z": features.z,
-            "pair/cov": features.cov,
-            "pair/stood": pair.labels,
-        }
+        return {"pair/names": features.names, "pair/z": features.z, "pair/cov": features.cov, "pair/stood": pair.labels}
 
     def pair_of(self, arrays: dict[str, np.ndarray]) -> Pair[NamedPixels]:
         z, cov, names, labels = read(arrays, _NAMED, "pair/").values()

@@ -18,17 +18,7 @@ from typing import Any, Generic, Protocol, Self, TypeVar, final
 import numpy as np
 
 from rbpf import gaussian
-from rbpf.core.models import (
-    NULL,
-    Belief,
-    Landmark,
-    Likelihood,
-    NewLandmarks,
-    Observations,
-    Part,
-    Records,
-    Sensor,
-)
+from rbpf.core.models import NULL, Belief, Landmark, Likelihood, NewLandmarks, Observations, Part, Records, Sensor
 from rbpf.core.particles import Prior
 from rbpf.core.schema import integers, numbers, read
 from rbpf.errors import InputError

@@ -46,11 +46,7 @@ def contradicts(inliers: np.ndarray, labels: np.ndarray, hidden: bool) -> bool:
 
 
 def camera_motion(
-    candidates: CandidateMotions,
-    labels: np.ndarray,
-    hidden: bool,
-    log_support: np.ndarray,
-    prior_is_informed: bool,
+    candidates: CandidateMotions, labels: np.ndarray, hidden: bool, log_support: np.ndarray, prior_is_informed: bool
 ) -> int:
     """Number of the candidate that most probably is the camera's motion; −1 where none of them is.
 

@@ -53,12 +53,7 @@ class DeadReckoning:
         return replace(self, stamp_ns=stamp_ns)
 
     def moved(
-        self,
-        stamp_ns: int,
-        step: Odometry,
-        velocity: np.ndarray,
-        is_assumed: bool = False,
-        hidden: bool = False,
+        self, stamp_ns: int, step: Odometry, velocity: np.ndarray, is_assumed: bool = False, hidden: bool = False
     ) -> "DeadReckoning":
         """At a pair that was matched with the last measured one.
 

@@ -279,13 +279,7 @@ class StereoSlam(System):
                 "odometry": at.world_from_camera,
                 "measured": measured,
             },
-            {
-                "z": pair.features.z,
-                "cov_z": pair.features.cov,
-                "kind": kinds,
-                "landmarks": ids,
-                "previous": previous,
-            },
+            {"z": pair.features.z, "cov_z": pair.features.cov, "kind": kinds, "landmarks": ids, "previous": previous},
             tuple(messages),
         )
 

@@ -49,12 +49,7 @@ from rbpf.sensors.readers.images.decoding import (
     to_grey,
 )
 from rbpf.sensors.readers.images.poses import LONGEST, pose_of_matrix, rigid_motion_error, truth_between
-from rbpf.sensors.readers.images.rectification import (
-    Rectification,
-    RectifiedImages,
-    pair_stamps,
-    rectified_baseline,
-)
+from rbpf.sensors.readers.images.rectification import Rectification, RectifiedImages, pair_stamps, rectified_baseline
 from rbpf.sensors.readers.images.sequence import ImageFormat, ImageFrame, ImageSequence, ReadOptions, Source
 
 SUFFIXES = frozenset({".bag", ".mcap", ".db3"})

@@ -28,22 +28,13 @@ from rbpf.sensors.feature_log import CameraTruth
 from rbpf.sensors.readers.images.calibration import Calibration, coefficients, read_calibration
 from rbpf.sensors.readers.images.decoding import FileImages, first_shape
 from rbpf.sensors.readers.images.poses import normalised, pose_of_matrix, rigid_motion_error, truth_between
-from rbpf.sensors.readers.images.rectification import (
-    Rectification,
-    RectifiedImages,
-    pair_stamps,
-    rectified_baseline,
-)
+from rbpf.sensors.readers.images.rectification import Rectification, RectifiedImages, pair_stamps, rectified_baseline
 from rbpf.sensors.readers.images.sequence import ImageFormat, ImageSequence, ReadOptions, Source
 from rbpf.sensors.readers.text import read_stamped
 from rbpf.sensors.readers.yaml_files import YamlValue, read_yaml
 
 _CAMERA = ["T_BS", "resolution", "camera_model", "intrinsics", "distortion_model", "distortion_coefficients"]
-_LENSES = {
-    "radial-tangential": "radial-tangential",
-    "radtan": "radial-tangential",
-    "equidistant": "equidistant",
-}
+_LENSES = {"radial-tangential": "radial-tangential", "radtan": "radial-tangential", "equidistant": "equidistant"}
 _TRUTHS = ("state_groundtruth_estimate0", "vicon0")
 _TRUTH_COLUMNS = ("p_x", "p_y", "p_z", "q_w", "q_x", "q_y", "q_z")
 

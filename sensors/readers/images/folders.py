@@ -47,12 +47,7 @@ from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import CameraTruth
 from rbpf.sensors.readers.images.calibration import NAME, Calibration, find_calibration, read_calibration
 from rbpf.sensors.readers.images.decoding import SUFFIXES, FileImages, first_shape
-from rbpf.sensors.readers.images.poses import (
-    normalised,
-    pose_of_matrix,
-    read_tum_truth,
-    rigid_motion_error,
-)
+from rbpf.sensors.readers.images.poses import normalised, pose_of_matrix, read_tum_truth, rigid_motion_error
 from rbpf.sensors.readers.images.sequence import ImageFormat, ImageSequence, ReadOptions
 from rbpf.sensors.readers.text import line_error, parse_table, quoted, read_lines, read_stamped, read_text
 

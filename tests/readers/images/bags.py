@@ -78,9 +78,7 @@ class Recorder:
             transform = self.make("geometry_msgs/msg/Transform", translation=place, rotation=turn)
             return self.add(topic, stamp, kind, frame="world", child_frame_id=child, transform=transform)
         told = self.make(
-            "geometry_msgs/msg/Pose",
-            position=self.make("geometry_msgs/msg/Point", x=x, y=y, z=z),
-            orientation=turn,
+            "geometry_msgs/msg/Pose", position=self.make("geometry_msgs/msg/Point", x=x, y=y, z=z), orientation=turn
         )
         more = {}
         if kind != "geometry_msgs/msg/PoseStamped":

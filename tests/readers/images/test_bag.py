@@ -194,8 +194,7 @@ def test_times_that_were_never_set(tmp_path):
 def test_several_topics_of_images_have_to_be_named(tmp_path):
     path = write_pair(tmp_path / "walk.bag")
     with pytest.raises(
-        InputError,
-        match=r"image topics are /left/image_rect, /right/image_rect; name one of them with --image-topic",
+        InputError, match=r"image topics are /left/image_rect, /right/image_rect; name one of them with --image-topic"
     ):
         open_images(path)
     assert levels(open_images(path, topics=Topics(("/right/image_rect",)))) == [110, 120, 130]

@@ -15,16 +15,7 @@ from rbpf.errors import InputError
 from rbpf.sensors.readers import open_images
 from rbpf.sensors.readers.images import decoding
 from rbpf.sensors.readers.yaml_files import read_plain_yaml
-from tests.readers.images.folders import (
-    HEIGHT,
-    SIZE,
-    WIDTH,
-    grey,
-    levels,
-    write_image,
-    write_images,
-    write_plain,
-)
+from tests.readers.images.folders import HEIGHT, SIZE, WIDTH, grey, levels, write_image, write_images, write_plain
 
 
 def only_frame(folder):

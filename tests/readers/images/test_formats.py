@@ -319,10 +319,7 @@ def test_a_marker_is_not_the_body(tmp_path):
 
 ASL_CAMERAS = [
     ({"camera_model": "omni"}, "expected camera_model to be pinhole, found 'omni'"),
-    (
-        {"distortion_model": "fov"},
-        "expected distortion_model to be radial-tangential or radtan or equidistant",
-    ),
+    ({"distortion_model": "fov"}, "expected distortion_model to be radial-tangential or radtan or equidistant"),
     ({"distortion_model": "equidistant", "distortion_coefficients": [0.0] * 5}, "to be a list of 4, found 5"),
     ({"intrinsics": [20.0, 21.0, 11.5]}, "expected intrinsics to be a list of 4, found 3"),
     ({"resolution": [48, 32]}, "width and height are 48x32, the images of .*cam0 have 24x16 px"),
@@ -452,14 +449,7 @@ def filmed(tmp_path_factory):
         cv2.imwrite(str(folder / f"{t:02d}.png"), image)
 
     def make(source, name, *options):
-        command = [
-            imageio_ffmpeg.get_ffmpeg_exe(),
-            "-loglevel",
-            "error",
-            *source.split(),
-            *options,
-            str(folder / name),
-        ]
+        command = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", *source.split(), *options, str(folder / name)]
         subprocess.run(command, check=True)
         return folder / name
 
@@ -615,10 +605,7 @@ def test_nothing_there(tmp_path, path):
     [
         ([], "found an empty folder, expected"),
         (["b.txt", "a.csv"], "found a folder with a.csv, b.txt, expected"),
-        (
-            [f"{letter}.txt" for letter in "gfedcba"],
-            "a folder with a.txt, b.txt, c.txt, d.txt, e.txt and more",
-        ),
+        ([f"{letter}.txt" for letter in "gfedcba"], "a folder with a.txt, b.txt, c.txt, d.txt, e.txt and more"),
     ],
 )
 def test_a_folder_of_another_kind(tmp_path, names, found):

@@ -36,8 +36,7 @@ def test_a_recording(data_dir, folder, count, size, baseline_m, poses):
 
 
 @pytest.mark.parametrize(
-    ("folder", "tolerance_px"),
-    [("mono_redkitchen_a", 3.0), ("stereo_zed_room1", 3.0), ("mono_robot_lateral", 1.0)],
+    ("folder", "tolerance_px"), [("mono_redkitchen_a", 3.0), ("stereo_zed_room1", 3.0), ("mono_robot_lateral", 1.0)]
 )
 def test_known_points_are_seen_where_the_table_says(data_dir, folder, tolerance_px):
     sequence = open_images(data_dir / folder)

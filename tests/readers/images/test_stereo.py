@@ -84,10 +84,7 @@ def test_images_without_a_partner_are_left_out_and_named(tmp_path, caplog):
         sequence = open_stereo(tmp_path)
     assert sequence.stamps_ns.tolist() == [EUROC_NS[0], EUROC_NS[2]]
     assert levels(sequence) == [(10, 100), (30, 110)]
-    assert [
-        "1 of 3 left images have no partner" in sequence.notes[0],
-        "1 of 3 right" in sequence.notes[1],
-    ] == [
+    assert ["1 of 3 left images have no partner" in sequence.notes[0], "1 of 3 right" in sequence.notes[1]] == [
         True,
         True,
     ]
@@ -251,9 +248,7 @@ WIDE_RIGHT = Pinhole(160, 120, 65.0, 65.5, 78.0, 61.0, (0.0, 0.0, 0.0, 0.0), "eq
 
 
 @pytest.mark.parametrize(
-    ("left", "right"),
-    [(LEFT, RIGHT), (WIDE_LEFT, WIDE_RIGHT), (LEFT, WIDE_RIGHT)],
-    ids=["narrow", "wide", "mixed"],
+    ("left", "right"), [(LEFT, RIGHT), (WIDE_LEFT, WIDE_RIGHT), (LEFT, WIDE_RIGHT)], ids=["narrow", "wide", "mixed"]
 )
 def test_rectified_cameras_see_a_point_on_one_row(left, right):
     done = Rectification.between(left, right, APART, "here")
