@@ -169,6 +169,7 @@ class LandmarkMap(Map):
         return plain and self.store.is_warm(ids) and model.kernel() is not None
 
     def project(self, model: ObservationModel, ids: np.ndarray, belief: Belief) -> tuple[np.ndarray, np.ndarray]:
+        self._known(ids)
         prior, weights = belief.prior, belief.weights
         kernel = fused_kernel(model) if self.is_compiled(model, ids) else None
         if kernel is not None:

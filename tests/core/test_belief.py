@@ -7,13 +7,12 @@ from rbpf.core.genealogy import Lineage
 from rbpf.core.marginals import Marginals
 from rbpf.core.models import Belief, Records
 from rbpf.core.particles import Prior, Proposed, mixture_estimate
-from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3, LieGroup, SE2Group, SE3Group
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
 from rbpf.sensors.range_bearing import RangeBearing, RelativePosition
 
-N, K, DRAWS = 12, 3, 400_000
+N, K, DRAWS = 12, 3, 100_000
 STD = 0.01
 
 
@@ -86,16 +85,6 @@ def check_projection(model, belief: Belief, records: Records, rng: np.random.Gen
     assert (np.abs(cov - expected) < 0.02 * scale).all()
 
 
-def test_the_pose_uncertainty_counts(rng):
-    """Without it the covariance would be far too small: H Q Hᵀ is the larger part here."""
-    prior = prior_of(SE2, rng, centred=True, scale=0.1)
-    belief, _ = belief_of(prior, 2, rng, np.array(AHEAD_2D["ahead"]))
-    certain = Belief(belief.log_weights, Prior.exactly(SE2, prior.base), belief.parts)
-    with_pose = belief.project(RangeBearing(SE2), np.arange(K))[1]
-    without = certain.project(RangeBearing(SE2), np.arange(K))[1]
-    assert (np.linalg.eigvalsh(with_pose - without) > 0).all()
-
-
 def test_innovations_of_every_pair(rng):
     belief, records = belief_of(prior_of(SE2, rng, centred=True), 2, rng, np.array(AHEAD_2D["behind"]))
     model = RangeBearing(SE2)
@@ -112,19 +101,6 @@ def test_innovations_of_every_pair(rng):
         moved = by_state @ belief.prior.factor[i]
         within = by_landmark @ records.cov[i, (2, 0)[m]] @ by_landmark.T
         np.testing.assert_allclose(cov[i, k, m], within + moved @ moved.T + noise[k], atol=1e-12)
-
-
-def test_weights_and_mode(rng):
-    belief, records = belief_of(prior_of(SE2, rng, centred=True), 2, rng, np.array(AHEAD_2D["ahead"]))
-    assert belief.weights.sum() == pytest.approx(1.0)
-    assert belief.weights[belief.mode] == belief.weights.max()
-    np.testing.assert_array_equal(belief.read([1, 2]).mean, records.mean[:, 1:])
-
-
-def test_a_landmark_that_is_not_there(rng):
-    belief, _ = belief_of(prior_of(SE2, rng, centred=True), 2, rng, np.array(AHEAD_2D["ahead"]))
-    with pytest.raises(InputError, match="the map holds no landmark 7"):
-        belief.project(RangeBearing(SE2), np.array([7]))
 
 
 @pytest.mark.parametrize("centred", [True, False], ids=["centred", "driven"])
@@ -144,12 +120,3 @@ def test_estimate_is_the_moments_of_the_refined_mixture(space, centred, rng):
     std = np.sqrt(np.diag(expected))
     assert (np.abs(offset.mean(axis=0)) < 0.05 * std).all()
     assert (np.abs(estimate.cov - expected) < 0.04 * np.outer(std, std)).all()
-
-
-def test_estimate_of_exact_states(rng):
-    state = SE2.retract(SE2.identity((N,)), 0.1 * rng.normal(size=(N, 3)))
-    weights = rng.dirichlet(np.ones(N))
-    estimate = mixture_estimate(Prior.exactly(SE2, state), None, np.log(weights))
-    offset = SE2.local(estimate.mean, state)
-    np.testing.assert_allclose(weights @ offset, 0.0, atol=1e-14)
-    np.testing.assert_allclose(estimate.cov, np.einsum("n,na,nb->ab", weights, offset, offset), atol=1e-14)

@@ -7,7 +7,6 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from tests.core.worlds import Recipe, content, drive, planar_world, same
@@ -62,9 +61,3 @@ def test_equal_seeds_give_equal_bytes(recipe):
         drive(filter_, world)
     assert same(content(first), content(second))
     assert not same(content(first), content(other))
-
-
-def test_the_global_random_state_is_not_touched():
-    np.random.seed(5)  # noqa: NPY002
-    drive(Recipe().build(), planar_world(5))
-    assert np.random.random() == np.random.RandomState(5).random()  # noqa: NPY002

@@ -123,17 +123,6 @@ def test_for_the_landmarks_alone(space, proposal, compiled):
     assert np.abs(landmarks(alone).mean - world.records.mean).max() > 1e-3
 
 
-@every_space
-def test_compiled_equals_numpy(space):
-    world, frames = scene(space, seed=2)
-    mixed = [[replace(groups[0], updates=use)] for groups, use in zip(frames, (STATE, MAP, STATE, MAP), strict=True)]
-    one, other = (run(world, mixed, compiled)[0] for compiled in (True, False))
-    np.testing.assert_allclose(one.particles.state, other.particles.state, atol=1e-9)
-    np.testing.assert_allclose(one.particles.log_weights, other.particles.log_weights, atol=1e-7)
-    assert one.log_evidence == pytest.approx(other.log_evidence, abs=1e-7)
-    np.testing.assert_allclose(landmarks(one).mean, landmarks(other).mean, atol=1e-9)
-
-
 @every_path
 @pytest.mark.parametrize(
     "likelihood",

@@ -7,15 +7,14 @@ import pytest
 
 from rbpf.core.filter import Filter
 from rbpf.core.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobis
-from rbpf.core.marginals import KalmanSubstate
 from rbpf.core.models import NEW, NULL, NewLandmarks, Observations
 from rbpf.core.proposals import EkfProposal, PriorProposal
 from rbpf.core.resampling import EssTriggered, Systematic
-from rbpf.lie import SE2, SE3, Euclidean
+from rbpf.lie import SE2, SE3
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
 from rbpf.motion.odometry import Odometry, OdometryMotion
-from tests.exactness.models import Frame, LinearMotion, LinearObservation, Relative, Scripted, single
+from tests.exactness.models import Frame, Scripted
 from tests.exactness.scenes import random_covs, sensors
 
 PARTICLES = 40
@@ -89,22 +88,6 @@ def test_the_order_of_observations_does_not_matter(space, likelihood, compiled):
         np.testing.assert_allclose(other, one, atol=TOLERANCE)
 
 
-def test_the_order_of_measurements_that_read_a_substate_does_not_matter():
-    motion = LinearMotion(np.eye(1), 0.4 * np.eye(2), np.eye(1), np.eye(1), np.zeros(1))
-    model = LinearObservation([[1.0], [0.2]], [[0.3], [1.0]])
-    rng = np.random.default_rng(3)
-    z, cov = rng.normal(size=(5, 4, 2)), random_covs(rng, (4,), 2, 0.5)
-    ends = []
-    for order in (np.arange(4), np.array([2, 0, 3, 1])):
-        substate = KalmanSubstate(motion.space, np.zeros(1), np.eye(1))
-        filter_ = Filter(motion, Scripted(), substate, n=PARTICLES, rng=np.random.default_rng(1))
-        for measured in z:
-            filter_.step(Frame([Observations(measured[order], cov[order], model)]))
-        ends.append((filter_.particles.state, filter_.particles.log_weights, substate.mean, substate.cov))
-    for one, other in zip(*ends, strict=True):
-        np.testing.assert_allclose(one, other, atol=1e-8)
-
-
 @compiled_or_not
 @pytest.mark.parametrize("proposal", [PriorProposal(), EkfProposal()], ids=["prior", "ekf"])
 def test_the_order_of_particles_does_not_matter(proposal, compiled):
@@ -146,27 +129,3 @@ def test_the_order_of_particles_does_not_matter(proposal, compiled):
         assert theirs.ess == pytest.approx(ours.ess, rel=TOLERANCE)
         np.testing.assert_allclose(theirs.estimate.mean, ours.estimate.mean, atol=TOLERANCE)
         np.testing.assert_allclose(theirs.estimate.cov, ours.estimate.cov, atol=TOLERANCE)
-
-
-def test_the_order_of_groups_does_not_matter():
-    """A position fix, a landmark and another fix, in any order."""
-    space = Euclidean(2)
-    fix = LinearObservation(np.eye(2))
-    ends = []
-    for order in ((0, 1, 2), (2, 0, 1), (1, 2, 0)):
-        held = LandmarkMap(space)
-        motion = LinearMotion(np.eye(2), 0.3 * np.eye(2))
-        filter_ = Filter(motion, Scripted(), held, n=PARTICLES, rng=np.random.default_rng(8))
-        R = 0.2 * np.eye(2)
-        filter_.step(Frame((), [NewLandmarks(np.array([[2.0, 1.0]]), R[None], Relative(), Point(2))]))
-        for z in np.random.default_rng(9).normal(scale=0.4, size=(4, 3, 2)):
-            groups = [
-                single(z[0], R, fix),
-                single(z[1] + [2.0, 1.0], R, Relative(), ids=held.ids),
-                single(z[2], 3 * R, fix),
-            ]
-            filter_.step(Frame([groups[i] for i in order]))
-        ends.append((filter_.particles.state, filter_.particles.log_weights, held.read(held.ids).mean))
-    for other in ends[1:]:
-        for value, expected in zip(other, ends[0], strict=True):
-            np.testing.assert_allclose(value, expected, atol=TOLERANCE)

@@ -148,23 +148,6 @@ def test_a_velocity_a_fix_and_what_reads_velocity_and_landmark_together():
     np.testing.assert_allclose(joint.cov[2:4, 2:4], kalman.cov[2:4, 2:4], 1e-7)
 
 
-def test_the_order_of_sensors_and_landmarks_does_not_matter(world):
-    """A group apiece, and all of them in the opposite order."""
-    ends = []
-    for order in (1, -1):
-        filter_ = plane(Consolidation(2), 20, seed=3)
-        for frame in world.frames(Relative()):
-            apart = [
-                replace(group, z=group.z[k : k + 1], cov=group.cov[k : k + 1], ids=group.ids[k : k + 1])
-                for group in frame.groups
-                for k in range(group.z.shape[0])
-            ]
-            filter_.step(Frame(apart[::order], frame.new_landmarks))
-        ends.append((*told(filter_), filter_.log_evidence))
-    for first, second in zip(*ends, strict=True):
-        np.testing.assert_allclose(first, second, 1e-9, 1e-12)
-
-
 @pytest.mark.parametrize(("space", "dim"), [(SE2, 2), (SE3, 3)], ids=["plane", "space"])
 def test_the_kernel_does_what_numpy_does(space, dim):
     """More particles than a block of lanes has, a last block that is not full."""

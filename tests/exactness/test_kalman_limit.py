@@ -5,10 +5,8 @@ import pytest
 
 from rbpf.core.filter import Filter
 from rbpf.core.marginals import KalmanSubstate
-from rbpf.core.models import Transition
 from rbpf.core.proposals import EkfProposal, PriorProposal
 from rbpf.core.resampling import EssTriggered, Systematic
-from rbpf.lie import Euclidean
 from tests.exactness.models import Frame, Kalman, LinearMotion, LinearObservation, Scripted, single
 
 TOLERANCE = 1e-9
@@ -108,18 +106,3 @@ def test_a_sampled_trajectory_is_an_exact_measurement_of_the_substate(proposal, 
             np.testing.assert_allclose(substate.mean[i], kalman.mean, atol=TOLERANCE)
             np.testing.assert_allclose(substate.cov[i], kalman.cov, atol=TOLERANCE)
         before = after
-
-
-def test_the_marginal_prior_of_the_increment_has_the_substates_covariance(rng):
-    motion = random_motion(rng, 2, 2, 4)
-    substate = KalmanSubstate(Euclidean(2), np.ones(2), np.diag([0.5, 2.0]))
-    filter_ = Filter(motion, Scripted(), substate, n=3, rng=rng)
-    transition = motion.transition(filter_.particles.state, None, 0.0)
-    assert isinstance(transition, Transition)
-    prior = substate.predict(transition, motion.space)
-    F, Q, drift = motion.joint()
-    kalman = Kalman(np.array([0.0, 0.0, 1.0, 1.0]), np.diag([0.0, 0.0, 0.5, 2.0]))
-    kalman.predict(F, Q, drift)
-    np.testing.assert_allclose(prior.mean, np.tile(kalman.mean[:2], (3, 1)), atol=TOLERANCE)
-    cov = prior.factor @ np.swapaxes(prior.factor, -1, -2)
-    np.testing.assert_allclose(cov, kalman.cov[None, :2, :2], atol=TOLERANCE)

@@ -148,25 +148,6 @@ def test_mixtures_take_no_part_in_the_refinement(frames):
     assert (densities.all != densities.after_sampling).all()
 
 
-def test_promotion_keeps_the_mixtures_moments(frames):
-    filter_ = build(EkfProposal(), Systematic(), 4, np.linalg.cholesky(Q), np.random.default_rng(2))
-    for frame in frames[:2]:
-        filter_.step(frame)
-    held = filter_.belief().map
-    before = held.read(np.array([1]))
-    weights = np.exp(before.log_weights)[:, 0, :, None]
-    mean = (weights * before.mean[:, 0]).sum(axis=1)
-    spread = before.mean[:, 0] - mean[:, None]
-    cov = (weights[..., None] * (before.cov[:, 0] + spread[..., :, None] * spread[..., None, :])).sum(axis=1)
-    held.promote(np.array([1]))
-    after = held.read(np.array([1, 2]))
-    assert isinstance(held.landmark_of(1), Point)
-    assert after.log_weights is None
-    np.testing.assert_allclose(after.mean[:, 0], mean, atol=1e-12)
-    np.testing.assert_allclose(after.cov[:, 0], cov, atol=1e-12)
-    assert np.isfinite(filter_.step(frames[2]).log_evidence)
-
-
 class Range(ObservationModel):
     """z = distance to a beacon + v."""
 
@@ -174,17 +155,6 @@ class Range(ObservationModel):
 
     def predict(self, state, landmark=None, const=None, substate=None):
         return np.linalg.norm(landmark - state, axis=-1, keepdims=True)
-
-
-def test_a_ring_has_the_moments_of_a_circle():
-    records = ring(np.array([[1.0, 2.0]]), np.array([4.0]), 0.1, 32)
-    assert records.log_weights is not None
-    assert np.exp(records.log_weights).sum() == pytest.approx(1.0)
-    offset = records.mean[0, 0] - np.array([1.0, 2.0])
-    np.testing.assert_allclose(np.hypot(*offset.T), 4.0, rtol=1e-12)
-    for direction, cov in zip(offset / 4.0, records.cov[0, 0], strict=True):
-        assert direction @ cov @ direction == pytest.approx(0.01)
-        assert np.sqrt(np.linalg.eigvalsh(cov)[1]) == pytest.approx(4.0 * np.sin(np.pi / 32))
 
 
 def test_a_range_only_beacon_becomes_a_point():

@@ -4,15 +4,14 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
-from rbpf import gaussian
 from rbpf.core.linearisation import linearise
 from rbpf.core.marginals import Marginals
 from rbpf.core.models import NEW, NULL, Observations
-from rbpf.core.particles import Information, Prior, Proposed
+from rbpf.core.particles import Prior, Proposed
 from rbpf.core.proposals import refined
 from rbpf.lie import SE2, SE3
 from tests.exactness.models import Kalman, known
-from tests.exactness.scenes import Scene, random_covs, sensors
+from tests.exactness.scenes import Scene, sensors
 
 TOLERANCE = 1e-9
 every_space = pytest.mark.parametrize("space", [SE2, SE3], ids=repr)
@@ -138,22 +137,6 @@ def test_each_particle_uses_its_own_associations(space, compiled, rng):
 
 
 @every_space
-def test_the_compiled_refinement_equals_its_numpy_twin(space, rng):
-    scene = Scene.random(space, rng, n=40)
-    d = space.dim
-    for rank in (0, 1, d, d + 2):
-        for shared in (True, False):
-            prior = scene.prior(rank, shared)
-            quad, log_det, log_factor = rng.normal(size=(3, 40))
-            info, vector = random_covs(rng, (40,), d, 3.0), rng.normal(size=(40, d))
-            terms = Information(info, vector, quad, log_det, log_factor, rows=np.full(log_det.shape, 7.0))
-            ours, twin = refined(prior, terms), refined_in_numpy(prior, terms)
-            for name in ("mean", "root", "log_w1", "nis"):
-                np.testing.assert_allclose(getattr(ours, name), getattr(twin, name), rtol=TOLERANCE, atol=TOLERANCE)
-            assert (ours.rows == 7).all() and (twin.rows == 7).all()
-
-
-@every_space
 def test_terms_linearised_elsewhere_stay_in_the_priors_chart(space, rng):
     """At any increment ε₀: ν = z − g(ε₀) + G (ε₀ − μ), with g the measurement by the chart's coordinates."""
     scene = Scene.random(space, rng, n=3)
@@ -197,16 +180,3 @@ def test_observing_nothing_leaves_the_prior(rng):
     np.testing.assert_array_equal(proposed.mean, 0.0)
     np.testing.assert_array_equal(proposed.root, np.tile(np.eye(2), (scene.n, 1, 1)))
     np.testing.assert_array_equal(proposed.log_w1, 0.0)
-
-
-def refined_in_numpy(prior: Prior, terms: Information) -> Proposed:
-    """Twin of `rbpf.core.proposals.refined`."""
-    rank = prior.factor.shape[2]
-    matrix = np.eye(rank) + np.einsum("nar,nab,nbs->nrs", prior.factor, terms.info, prior.factor)
-    linear = np.einsum("nar,na->nr", prior.factor, terms.vector)
-    chol = np.linalg.cholesky(gaussian.symmetrise(matrix))
-    root = np.swapaxes(np.linalg.inv(chol), -1, -2)
-    white = np.einsum("nba,nb->na", root, linear)
-    nis = terms.quad - np.square(white).sum(axis=1)
-    log_w1 = -0.5 * (nis + terms.log_det + gaussian.log_det(chol)) + terms.log_factor
-    return Proposed(np.einsum("nab,nb->na", root, white), root, log_w1, nis, terms.rows)

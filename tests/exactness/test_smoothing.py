@@ -90,18 +90,6 @@ def test_ancestral_paths_are_unbiased(measured, proposal, stream):
     assert deviation(np.array(second)[:, :, rows, columns], 0.0) <= 4.0
 
 
-@pytest.mark.parametrize("lag", [1, 3, STEPS])
-def test_a_fixed_lag_keeps_the_last_steps_of_the_same_paths(measured, lag):
-    whole, short = (
-        run(measured[0], 50, np.random.default_rng(3), lag=kept, resampler=Systematic()) for kept in (None, lag)
-    )
-    assert whole.lineage.generation > 1
-    full, part = (ancestral_smoothing(f.space, f.history, f.particles.weights) for f in (whole, short))
-    np.testing.assert_array_equal(part.stamps_ns, full.stamps_ns[-lag:])
-    np.testing.assert_array_equal(part.mean, full.mean[-lag:])
-    np.testing.assert_array_equal(part.cov, full.cov[-lag:])
-
-
 def test_backward_simulation_agrees_with_the_exact_smoother(measured, stream):
     """Consistent, not unbiased: its error falls like 1/N. It spreads less than coalescing ancestry."""
     frames, _, exact = measured

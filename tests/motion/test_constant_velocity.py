@@ -33,15 +33,6 @@ def test_factor_of_the_walk(dt):
     np.testing.assert_array_equal(factor[:6, 6:], 0.0)
 
 
-@pytest.mark.parametrize(("first", "second"), [(0.1, 0.1), (0.02, 1.3), (2.0, 0.5)])
-def test_two_time_steps_are_one(first, second):
-    """F Q(dt₁) Fᵀ + Q(dt₂) = Q(dt₁ + dt₂), where F carries the velocity over dt₂."""
-    one, two = velocity_walk(WALK, first), velocity_walk(WALK, second)
-    carry = np.block([[np.eye(6), second * np.eye(6)], [np.zeros((6, 6)), np.eye(6)]])
-    both = carry @ one @ one.T @ carry.T + two @ two.T
-    np.testing.assert_allclose(both, covariance(first + second), rtol=1e-13, atol=1e-15)
-
-
 @every_time_step
 def test_variance_that_the_pose_leaves_to_the_velocity(dt):
     """The last six columns: Schur complement of (5), δΣ/4, which the paper's mode drops."""

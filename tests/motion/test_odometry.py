@@ -118,8 +118,3 @@ def test_chained_covariance_against_samples():
 def test_wrong_noise_is_refused(std):
     with pytest.raises(InputError, match="std_added must be one or 6 numbers from 0 up"):
         OdometryMotion(SE3, std)
-
-
-def test_a_failed_estimate_is_refused_as_a_control():
-    with pytest.raises(InputError, match="covariance of the odometry is not one"):
-        OdometryMotion(SE3).transition(SE3.identity((2,)), Odometry(SE3.identity(), np.full((6, 6), np.nan)), 0.1)
