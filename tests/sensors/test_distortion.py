@@ -8,20 +8,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rbpf.errors import InputError
-from rbpf.sensors.camera import Pinhole, RectifiedStereo
+from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.camera.distortion import MAX_ANGLE, Equidistant
 from rbpf.sensors.camera.points import MIN_DEPTH_FRACTION
 from tests.sensors.test_pinhole import FISHEYES, matrix, seen_points
 
 FOLDING = Pinhole(640, 480, 320.0, 320.0, 320.0, 240.0, (-0.25, 0.0, 0.0, 0.0, 0.0))
-
-
-def test_radius_of_one_coefficient():
-    assert FOLDING.monotonic_radius == pytest.approx(np.sqrt(4.0 / 3.0), rel=1e-15)
-    assert Pinhole(640, 480, 300.0, 300.0, 320.0, 240.0).monotonic_radius == np.inf
-    pincushion = Pinhole(640, 480, 300.0, 300.0, 320.0, 240.0, (0.25, 0.12, -0.003, 0.004, 0.05))
-    assert pincushion.monotonic_radius == np.inf
 
 
 @pytest.mark.parametrize("k3", [0.0, 1e-300, -1e-300, -0.05, -3.0])
@@ -137,13 +129,6 @@ def test_distorts_and_unprojects_as_opencv(camera):
     np.testing.assert_allclose(uv, expected, rtol=0, atol=1e-8)
 
 
-def test_the_ideal_lens_is_the_angle():
-    camera = FISHEYES["ideal"]
-    angles = np.linspace(0.0, 1.3, 20)
-    away = np.linalg.norm(camera.project(ray(angles)) - [camera.cx, camera.cy], axis=1)
-    np.testing.assert_allclose(away, camera.fx * angles, rtol=0, atol=1e-10)
-
-
 def test_it_sees_75_degrees_from_the_axis_and_no_more():
     camera = Pinhole(2000, 2000, 262.0, 262.0, 1000.0, 1000.0, (0.0, 0.0, 0.0, 0.0), "equidistant")
     near, beyond = ray(np.deg2rad(74.99)), ray(np.deg2rad([75.01, 80.0, 89.9, 90.0, 100.0]))
@@ -195,8 +180,3 @@ def test_every_visible_direction_of_a_fisheye_comes_back(coefficients, fraction,
     again = np.append(camera.unproject(camera.project(seen)), 1.0)
     least = np.linalg.svd(camera.jacobian(again)[:, :2], compute_uv=False)[-1] / camera.fx
     np.testing.assert_allclose(again, seen / seen[2], rtol=0, atol=1e-11 / least)
-
-
-def test_a_rectified_pair_has_no_fisheye_lens():
-    with pytest.raises(InputError, match=r"has equidistant distortion \(0.0, 0.0, 0.0, 0.0\): rectify the images"):
-        RectifiedStereo(FISHEYES["ideal"], 0.1)

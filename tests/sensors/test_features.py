@@ -1,7 +1,5 @@
 """What every detector, descriptor and extractor keeps: those of the package, and one that a user might write."""
 
-from itertools import product
-
 import cv2
 import numpy as np
 import pytest
@@ -60,9 +58,10 @@ DESCRIPTORS = {
     "sift 36": Sift(SiftConfig(working_scale=1.0)),
     "grey": Grey(),
 }
-EXTRACTORS: dict[str, FeatureExtractor] = {"sift": Sift()} | {
-    f"{one} and {other}": Extractor(DETECTORS[one], DESCRIPTORS[other])
-    for one, other in product(DETECTORS, DESCRIPTORS)
+EXTRACTORS: dict[str, FeatureExtractor] = {
+    "sift": Sift(),
+    "corners and sift": Extractor(DETECTORS["corners"], DESCRIPTORS["sift 36"]),
+    "harris and grey": Extractor(DETECTORS["harris"], DESCRIPTORS["grey"]),
 }
 
 
@@ -169,12 +168,6 @@ def test_a_stereo_pair_is_matched_with_any_extractor(extractor):
     assert error.size > 20 and np.median(np.abs(error)) < 0.3
 
 
-def test_keypoints_made_by_hand():
-    found = Keypoints.at(np.array([[1, 2], [3, 4]]), score=np.array([2.0, 1.0]))
-    assert len(found) == 2 and found.scale.tolist() == [WINDOW_SCALE_PX] * 2
-    assert found.take(np.array([False, True])).score.tolist() == [1.0]
-
-
 NONE = np.zeros((0, 2))
 
 
@@ -214,12 +207,6 @@ def test_scores_equal_numpys(image):
     np.testing.assert_allclose(scores, [texture(image, place) for place in px], rtol=1e-4)
 
 
-def test_none_is_beside_a_better_one(image):
-    px, scores = corners(image[:120, :140], NONE, 10**6, 0.0, 16.0)
-    beside = np.abs(px[:, None] - px).max(axis=2) == 1.0
-    assert len(px) > 100 and not (beside & (scores[:, None] != scores)).any()
-
-
 def test_corners_of_squares_and_not_their_edges():
     origins = [(30, 30), (90, 60)]
     px, scores = corners(squares(origins), NONE, 8, 6.0, 10.0)
@@ -229,7 +216,7 @@ def test_corners_of_squares_and_not_their_edges():
     assert (nearest.min(axis=0) <= 2).all() and (nearest.min(axis=1) <= 2).all()
 
 
-@pytest.mark.parametrize("border_px", [0.0, 5.0, 16.0, 60.5])
+@pytest.mark.parametrize("border_px", [0.0, 16.0, 60.5])
 def test_inside_the_border(image, border_px):
     px, _ = corners(image, NONE, 1000, 4.0, border_px)
     least = max(border_px, CornerDetector.margin_px)
@@ -238,28 +225,13 @@ def test_inside_the_border(image, border_px):
     assert px.min(axis=0).max() < least + 8 and (px.max(axis=0) > np.array([319, 239]) - least - 8).all()
 
 
-def test_equal_squares_share_the_places():
-    """Where scores tie there is still one corner for each, at the same place of each."""
-    origins = np.array([(90, 30), (30, 30), (30, 70)])
-    px, scores = corners(squares(origins), NONE, 3, 20.0, 10.0)
-    np.testing.assert_allclose(scores, scores[0], rtol=1e-5)
-    assert sorted(map(tuple, px - px.min(axis=0))) == [(0.0, 0.0), (0.0, 40.0), (60.0, 0.0)]
-
-
-def test_the_threshold_on_texture(image):
-    _, scores = corners(image, NONE, 1000, 5.0, 16.0, min_score=0.0)
-    middle = float(np.median(scores))
-    _, rich = corners(image, NONE, 1000, 5.0, 16.0, min_score=middle)
-    assert scores.min() < middle <= rich.min()
-
-
 def test_a_dark_image_gives_corners_once_asked_for_faint_ones():
     dark = squares([(30, 30), (90, 60)], level=8)
     assert len(corners(dark, NONE, 10)[0]) == 0
     assert len(corners(dark, NONE, 10, 6.0, fast_threshold=3, min_score=0.2)[0]) == 8
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (0, 0), (7, 300), (10, 10), (11, 11), (33, 33), (101, 97)])
+@pytest.mark.parametrize("shape", [(0, 0), (7, 300), (10, 10), (11, 11), (101, 97)])
 def test_odd_sizes(shape):
     image = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)
     px, scores = corners(image, NONE, 10, border_px=5.0)
@@ -312,15 +284,6 @@ def test_pooling_adds_what_it_says():
     np.testing.assert_allclose(pooled(histograms), expected.reshape(5, 36), atol=1e-12)
 
 
-def test_pooling_treats_a_mirror_image_alike():
-    def mirrored(descriptors, side, turns):
-        cells = descriptors.reshape(-1, side, side, turns)[:, ::-1]
-        return cells[..., -np.arange(turns) % turns].reshape(descriptors.shape)
-
-    histograms = np.random.default_rng(1).random((4, 128))
-    np.testing.assert_allclose(pooled(mirrored(histograms, 4, 8)), mirrored(pooled(histograms), 3, 4), atol=1e-12)
-
-
 @pytest.mark.parametrize("length", [36, 128])
 def test_products_of_keys(length):
     histograms = np.random.default_rng(2).integers(0, 256, (6, 128)).astype(np.float32)
@@ -335,19 +298,7 @@ def test_products_of_keys(length):
     np.testing.assert_allclose(root @ root.T, bhattacharyya, atol=1e-6)
     cosine = plain @ plain.T / np.linalg.norm(plain, axis=1)[:, None] / np.linalg.norm(plain, axis=1)
     np.testing.assert_allclose(sift @ sift.T, cosine, atol=1e-6)
-
-
-def test_an_empty_histogram_is_no_division_by_zero():
-    assert not descriptors_from_histograms(np.zeros((1, 128)), 36).any()
-
-
-def test_the_strongest_come_first_and_are_kept():
-    image = room()[0][0][0]
-    everything = Sift(SiftConfig(0, working_scale=1.0)).extract(image)
-    assert (np.diff(everything.score) <= 0.0).all() and len(everything) > 100
-    some = Sift(SiftConfig(50, working_scale=1.0)).extract(image)
-    assert len(some) == 50
-    np.testing.assert_array_equal(some.score, everything.score[:50])
+    assert not descriptors_from_histograms(np.zeros((1, 128)), length).any()
 
 
 def test_threads_change_nothing():

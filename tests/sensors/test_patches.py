@@ -37,7 +37,7 @@ def kernel_map(image, template, centre, cov, sigmas, most_px):
     return scores
 
 
-@pytest.mark.parametrize("size", [3, 5, 11, 13, 21])
+@pytest.mark.parametrize("size", [3, 11, 13])
 @pytest.mark.parametrize(
     ("centre", "cov", "sigmas", "most_px"),
     [
@@ -117,14 +117,6 @@ def is_peak(scores, v, u, best):
     return apart and scores[v, u] == scores[v - 1 : v + 2, u - 1 : u + 2].max()
 
 
-def test_of_equal_scores_the_first_row_wins():
-    tile = Waves(3).image((30, 30))
-    image = np.tile(tile, (3, 3))
-    px, _, second, _ = one(image, window(image, (45, 45), 11), (45.0, 45.0), 1e6 * np.eye(2), most_px=np.inf)
-    np.testing.assert_allclose(px, (15, 15), atol=1e-3)
-    assert second == pytest.approx(1.0, abs=1e-6)
-
-
 def test_brightness_and_contrast_do_not_matter():
     waves = Waves(4, contrast=25.0)
     template = window(waves.image(SHAPE), (50, 40), 11)
@@ -151,7 +143,6 @@ def test_a_template_without_contrast_is_not_searched(image):
         ((50.0, np.inf), ROUND),
         ((1e300, 40.0), ROUND),
         ((50.0, -30.0), ROUND),
-        ((50.0, 40.0), [[np.nan, 0.0], [0.0, 1.0]]),
         ((50.0, 40.0), [[1.0, np.nan], [np.nan, 1.0]]),
         ((50.0, 40.0), [[np.inf, 0.0], [0.0, 1.0]]),
         ((50.0, 40.0), [[-1.0, 0.0], [0.0, 1.0]]),
@@ -160,13 +151,6 @@ def test_a_template_without_contrast_is_not_searched(image):
 )
 def test_nothing_is_found_without_a_place_to_look(image, centre, cov):
     assert_nothing(one(image, window(image, (50, 40), 11), centre, cov))
-
-
-@pytest.mark.parametrize("variance", [1e6, 1e100, 1e300])
-def test_a_huge_covariance_searches_the_whole_image(image, variance):
-    px, score, _, _ = one(image, window(image, (8, 80), 11), (90.0, 10.0), variance * np.eye(2), most_px=np.inf)
-    np.testing.assert_allclose(px, (8, 80), atol=1e-3)
-    assert score > 0.9999
 
 
 @pytest.mark.parametrize("px", [(5, 5), (104, 5), (5, 84), (104, 84)])
@@ -268,13 +252,6 @@ def test_cut_between_pixels_is_numpys(picture):
     assert np.array_equal(cut(picture, np.array([40.3, 30.8]), 5), expected)
 
 
-def test_cut_between_pixels_stays_within_grey_levels():
-    picture = np.zeros((40, 40), np.uint8)
-    picture[:, 20:] = 255
-    step = cut(picture, np.array([19.5, 20.0]), 4)
-    assert step.min() == 0 and step.max() == 255 and (np.diff(step.astype(int), axis=1) >= 0).all()
-
-
 @pytest.mark.parametrize("px", [(14.9, 30.0), (84.1, 30.0), (40.0, 14.0), (40.0, 64.5), (np.nan, 30.0), (np.inf, 9.0)])
 def test_cut_does_not_reach_beyond(picture, px):
     assert cut(picture, np.array(px)) is None
@@ -314,15 +291,6 @@ def test_warp_is_what_the_other_view_shows(name):
     seen = waves.image((41, 41), affine)
     template = warp(source[None], affine[None])[0]
     assert (unit(template) * unit(window(seen, (20, 20), 11))).sum() > 0.96
-
-
-def test_a_smaller_view_has_no_moire():
-    """Stripes finer than the new view's pixels turn grey instead of into broad stripes."""
-    u = np.arange(61)[None].repeat(61, axis=0)
-    stripes = np.where(u % 3 == 0, 255, 0).astype(np.uint8)
-    bare = stripes[30 - 25 : 30 + 26 : 5, 30 - 25 : 30 + 26 : 5].std()
-    averaged = warp(stripes[None], 2.9 * SAME)[0].std()
-    assert bare > 100.0 and averaged < 0.1 * bare
 
 
 @pytest.mark.parametrize(
@@ -380,8 +348,8 @@ def turned(angle, scale=1.0):
 
 @pytest.mark.parametrize(
     "affine",
-    [np.eye(2), turned(0.6), turned(3.0), turned(0.0, 1.5), turned(0.4, 0.75), np.array([[1.2, 0.3], [-0.1, 0.8]])],
-    ids=["shift", "turn", "half turn", "smaller", "turned and larger", "sheared"],
+    [np.eye(2), turned(3.0), turned(0.0, 1.5), turned(0.4, 0.75), np.array([[1.2, 0.3], [-0.1, 0.8]])],
+    ids=["shift", "half turn", "smaller", "turned and larger", "sheared"],
 )
 def test_known_motion_is_recovered(affine):
     error, _, tried = errors(affine)
@@ -392,15 +360,7 @@ def test_known_motion_is_recovered(affine):
 
 
 @pytest.mark.parametrize(
-    ("noise", "blur_px", "hits", "std_px"),
-    [
-        (0.0, 0.5, 0.98, 0.03),
-        (3.0, 0.5, 0.98, 0.05),
-        (8.0, 0.5, 0.97, 0.10),
-        (15.0, 0.5, 0.60, 0.20),
-        (3.0, 1.0, 0.98, 0.06),
-        (3.0, 1.5, 0.97, 0.09),
-    ],
+    ("noise", "blur_px", "hits", "std_px"), [(3.0, 0.5, 0.98, 0.05), (15.0, 0.5, 0.60, 0.20), (3.0, 1.5, 0.97, 0.09)]
 )
 def test_hit_rate_and_accuracy_under_noise(noise, blur_px, hits, std_px):
     """Right matches among those looked for, and their errors without bias."""

@@ -11,6 +11,7 @@ from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers import ImageFrame, ImageSequence, KnownPixels
 from rbpf.sensors.readers.images.sequence import Source
+from rbpf.systems.mono.known_map import KnownMap
 
 CAMERA = Pinhole(320, 240, 260.0, 260.0, 159.5, 119.5)
 TEXEL_M, DEPTH_M, TILT = 0.004, 1.5, 0.35
@@ -84,3 +85,13 @@ def known_points() -> KnownPixels:
     normal = np.cross(side - corner, down - corner)
     points = rays * (normal @ corner / (rays @ normal))[:, None]
     return KnownPixels(np.arange(len(px)), px, points, np.full(len(px), 0.002 * np.sqrt(3.0)))  # 2 mm per axis
+
+
+def made_up_map(count: int = 12) -> KnownMap:
+    """The map of an earlier run that there never was."""
+    rng = np.random.default_rng(0)
+    return KnownMap(
+        CAMERA, "none", np.arange(count), rng.normal(size=(count, 3)), np.tile(0.01 * np.eye(3), (count, 1, 1)),
+        rng.integers(0, 256, (count, 31, 31), dtype=np.uint8), rng.uniform(0, 200, (count, 2)),
+        np.tile(SE3.identity(), (count, 1)), np.tile(SE3.identity(), (3, 1)),
+    )  # fmt: skip

@@ -91,18 +91,11 @@ def test_law_of_the_start_equals_the_joint_gaussian():
 
 def test_it_lowers_the_error_of_the_pose():
     raw, moved = [], []
-    for seed in range(12):
-        filter_, anchor, anchored, pose = drive(30, n=20, seed=seed)
+    for seed in range(5):
+        filter_, anchor, anchored, pose = drive(20, n=20, seed=seed)
         raw.append(np.linalg.norm(filter_.estimate().mean[1:] - pose[1:]))
         moved.append(np.linalg.norm(anchor.state_estimate(anchored).mean[1:] - pose[1:]))
     assert np.mean(moved) < np.mean(raw)
-
-
-def test_in_between_descendants_inherit():
-    filter_, anchor, anchored, _ = drive(27, every=10)
-    assert filter_.steps == 27
-    generation, kept = anchor._latest
-    np.testing.assert_array_equal(anchored.mean, kept.mean[filter_.lineage.rows(generation)])
 
 
 def test_landmarks_seen_only_at_the_start_say_nothing_about_it():

@@ -9,7 +9,6 @@ from rbpf.motion.odometry import Odometry
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.systems.stereo.config import MapConfig, StereoConfig, TriggerConfig
-from rbpf.systems.stereo.odometry import DeadReckoning
 from rbpf.systems.stereo.slam import StereoSlam
 from rbpf.systems.system import Tracked, TrackingState
 
@@ -91,35 +90,6 @@ def test_time_has_to_pass():
     assert again.messages == ("passed over: it has the stamp of the last one; the last velocity is assumed, widely",)
     with pytest.raises(InputError, match="time runs backwards"):
         slam_.take(first)
-
-
-def test_before_the_first_pair_nothing_moves():
-    said = slam().take(frames(1, missing=(0,))[0])
-    np.testing.assert_array_equal(said.pose, SE3.identity())
-    assert said.values["assumed"] == 0 and said.state is TrackingState.PREDICTED
-
-
-def reckoned() -> DeadReckoning:
-    motion = Odometry(SE3.exp(STEP), 1e-4 * np.eye(6))
-    at = DeadReckoning().started(0).moved(SECOND, motion, STEP)
-    return at.passing_over().moved(3 * SECOND, motion, STEP, is_assumed=True, hidden=True).passing_over()
-
-
-def test_an_assumed_motion_counts_what_was_passed_over():
-    at = reckoned()
-    assert (at.assumed, at.waiting, at.hidden, at.passed_over) == (2, 1, True, 1)
-    assert at.extrapolated(Odometry.at_rest()).assumed == 3
-    found = at.moved(4 * SECOND, Odometry.at_rest(), STEP)
-    assert (found.assumed, found.waiting, found.hidden) == (2, 2, False)
-    assert found.updated().assumed == 0
-
-
-def test_state_is_kept():
-    one = reckoned()
-    two = DeadReckoning.restored(one.arrays())
-    for first, second in zip(one.arrays().values(), two.arrays().values(), strict=True):
-        np.testing.assert_array_equal(first, second)
-    assert DeadReckoning.restored(DeadReckoning().arrays()).stamp_ns is None
 
 
 def test_what_triggers():

@@ -1,11 +1,6 @@
 """Named features through the monocular system: starts, rays and points, equal bytes, what a frame may hold."""
 
-import hashlib
-import os
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -28,12 +23,11 @@ from rbpf.sensors.camera.points import CameraRay, EpipolarRay
 from rbpf.sensors.feature_log import FeatureFrame, FeatureLog, KnownPoints
 from rbpf.systems.mono.config import InverseDepthConfig, MonoConfig, VelocityConfig
 from rbpf.systems.mono.feature_sensor import InverseDepthRays
-from rbpf.systems.mono.slam import MonoSlam, particle_points, world_of
+from rbpf.systems.mono.slam import MonoSlam, particle_points
 from tests.core.worlds import content, same
 from tests.exactness.models import known
 from tests.systems.mono_logs import SMALL, changed, desk, errors, nees, rows, without_known
 
-ROOT = Path(__file__).resolve().parents[2]
 LOG, FIRST = desk(2, frames=10), desk()
 every_mode = pytest.mark.parametrize("mode", ["frame", "points"])
 every_constraint = pytest.mark.parametrize("constrain", ["epipolar", "marginal", "off"])
@@ -63,48 +57,6 @@ def test_compiled_equals_numpy(config):
     assert kinds(one.system.filter) == kinds(other.system.filter)
 
 
-@every_setting
-def test_equal_seeds_give_equal_bytes(config):
-    first, second, other = (run(LOG, replace(config, seed=seed)) for seed in (1, 1, 2))
-    assert same(content(first.system.filter), content(second.system.filter))
-    assert not same(content(first.system.filter), content(other.system.filter))
-
-
-THREADS = """
-import hashlib
-import numba
-from dataclasses import replace
-from rbpf.kernels.signature import PAIRS_PER_THREAD
-from rbpf.runs.recordings import filter_features as run
-from tests.core.worlds import content
-from tests.systems.mono_logs import SMALL, desk
-
-numba.set_num_threads({threads})
-log = desk(2, frames=4, measurements=20)
-rows = []
-config = replace(SMALL, particles=1500, known="points")
-most = lambda run, _: rows.append(max(len(group.z) for group in run.system.report.groups))
-done = run(log, config, listeners=[most])
-digest = hashlib.sha256()
-for name, array in sorted(content(done.system.filter).items()):
-    digest.update(name.encode() + array.tobytes())
-print(max(rows) * 1500 >= 2 * PAIRS_PER_THREAD, digest.hexdigest())
-"""
-
-
-@pytest.mark.slow
-def test_threads_do_not_change_a_byte():
-    environment = {**os.environ, "NUMBA_NUM_THREADS": "2", "PYTHONPATH": str(ROOT)}
-    outputs = []
-    for threads in (1, 2):
-        command = [sys.executable, "-c", THREADS.format(threads=threads)]
-        done = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stderr
-        outputs.append(done.stdout.split())
-    assert outputs[0] == outputs[1]
-    assert outputs[0][0] == "True" and len(outputs[0][1]) == 2 * hashlib.sha256().digest_size
-
-
 @every_mode
 def test_rays_become_points(mode):
     """All at once in all particles, when enough of the weight is ready; none in a first frame."""
@@ -112,7 +64,8 @@ def test_rays_become_points(mode):
     note = lambda run, _: seen.append(kinds(run.system.filter))  # noqa: E731
     done = run(log, replace(SMALL, known=mode), listeners=[note])
     given = set(known(log.known).names.tolist())
-    assert not any(kind is Point for name, kind in seen[0].items() if name not in given)
+    first = {name for name, kind in seen[0].items() if kind is InverseDepth}
+    assert first == set(log.frames[0].landmarks.tolist()) - given
     promoted = [name for name, kind in seen[-1].items() if kind is Point and name not in given]
     assert len(promoted) >= 3
     for name in promoted:
@@ -145,12 +98,8 @@ def test_how_rays_are_used():
     assert set().union(*off) == {(CameraRay, landmark)}
     assert epipolar[1] == marginal[1] == {(CameraRay, state)} and off[1] == set()
     assert epipolar[2] == marginal[2] == {(EpipolarRay, state)}
-
-
-def test_without_points_the_prior_of_depth_holds_the_scale():
-    """Young rays then constrain the pose by the marginal, where their prior counts."""
-    found = groups_of("marginal", without_known(LOG))
-    assert found[1] == {(CameraRay, frozenset({Part.STATE}))}
+    # Without known points the prior of depth holds the scale: the marginal, where it counts.
+    assert groups_of("marginal", without_known(LOG))[1] == {(CameraRay, state)}
 
 
 @every_constraint
@@ -206,11 +155,11 @@ def test_what_rays_say_changes_smoothly_with_the_pose(compiled, constrain, at_mm
 
 
 def test_a_camera_at_rest_stays():
-    """RMS error in the particles' own world, after 60 frames of eight recordings; lines begin late."""
+    """RMS error in the particles' own world, after 50 frames of four recordings; lines begin late."""
     squares, late = [], InverseDepthConfig(epipolar_parallax_px=3.0)
-    for seed in range(8):
+    for seed in range(4):
         filter_ = run(
-            still_log(seed, 60), MonoConfig(seed=seed, max_new_per_frame=30, inverse_depth=late)
+            still_log(seed, 50), MonoConfig(seed=seed, max_new_per_frame=30, inverse_depth=late)
         ).system.filter
         paths = SE3.translation(filter_.history.paths()[..., :7])
         squares.append(np.square(np.einsum("tnk,n->tk", paths, filter_.particles.weights)[-1]).sum())
@@ -255,14 +204,6 @@ def test_what_is_reported_moves_nothing(monkeypatch):
     assert not np.array_equal(moved.log.poses, plain.log.poses)
     assert moved.system.start.arrays()["start/steps"].size > 0
     assert same(content(moved.system.filter), content(plain.system.filter))
-
-
-def test_an_empty_first_frame_without_known_points():
-    nothing = np.zeros(0, dtype=np.int64)
-    log = changed(without_known(LOG), 0, lambda f: rows(f, nothing))
-    done = run(replace(log, frames=log.frames[:3]), SMALL)
-    assert np.isfinite(done.log.covs).all()
-    assert len(done.system.filter.belief().map.ids) > 0
 
 
 @every_mode
@@ -343,43 +284,11 @@ def test_a_frame_says_the_same_in_both_modes():
     assert (np.abs(np.log(ratio)) < 0.3).all()
 
 
-def started(log: FeatureLog, config: MonoConfig) -> Filter:
-    """After the first frame."""
-    slam = MonoSlam(log.camera, config, log.known)
-    slam.take(log.frames[0])
-    return slam.filter
-
-
-def test_known_points_in_the_map():
-    given = known(FIRST.known)
-    none_new = replace(SMALL, max_new_per_frame=0)
-    frame = started(FIRST, none_new)
-    (landmark,) = frame.belief().map.ids.tolist()
-    assert isinstance(frame.belief().map.landmark_of(landmark), UncertainConstellation)
-    exact = replace(FIRST, known=replace(given, cov=np.zeros((4, 3, 3))))
-    rigid = started(exact, none_new).belief().map
-    assert isinstance(rigid.landmark_of(int(rigid.ids[0])), Constellation)
-    assert world_of(frame) is not None
-    slam = MonoSlam(FIRST.camera, replace(SMALL, known="points"), given)
-    slam._begin(FIRST.frames[0])
-    points, held = slam.filter, slam.filter.belief().map
-    assert held.ids.tolist() == given.names.tolist()
-    np.testing.assert_array_equal(held.read(held.ids).mean[3], given.positions)
-    np.testing.assert_allclose(held.read(held.ids).cov[3], given.cov)
-    assert world_of(points) is None
-
-
-@every_mode
-def test_first_sightings_become_rays(mode):
-    done = run(first_only(FIRST), replace(SMALL, known=mode))
-    held, names = done.system.filter.belief().map, known(FIRST.known).names
-    rays = [i for i in held.ids.tolist() if isinstance(held.landmark_of(i), InverseDepth)]
-    assert sorted(rays) == sorted(np.setdiff1d(FIRST.frames[0].landmarks, names).tolist())
-
-
-def test_at_most_so_many_new_landmarks():
-    done = run(replace(FIRST, frames=FIRST.frames[:2]), replace(SMALL, max_new_per_frame=3))
-    assert len(done.system.filter.belief().map.ids) == 1 + 3 + 3
+def test_known_points_are_one_landmark_and_new_ones_are_counted():
+    for cov, kind in ((known(FIRST.known).cov, UncertainConstellation), (np.zeros((4, 3, 3)), Constellation)):
+        log = replace(first_only(FIRST), known=replace(known(FIRST.known), cov=cov))
+        held = kinds(run(log, replace(SMALL, max_new_per_frame=3)).system.filter)
+        assert list(held.values()) == [kind] + 3 * [InverseDepth]
 
 
 @every_velocity
@@ -399,19 +308,6 @@ def test_without_known_points_the_first_camera_is_the_world(velocity):
         np.testing.assert_allclose(filter_.particles.state[:, 7:].std(axis=0), expected, rtol=0.1)
 
 
-@every_velocity
-def test_without_known_points_it_runs(velocity):
-    """The scale is that of the prior of depth; directions are right."""
-    log = without_known(FIRST)
-    done = run(log, replace(SMALL, velocity=VelocityConfig(velocity)))
-    truth = known(log.truth).world_from_camera
-    relative = SE3.between(truth[0], truth)
-    assert np.isfinite(done.log["log_evidence"]).all()
-    turned = SE3.local(done.log.poses, relative)[:, :3]
-    assert np.linalg.norm(turned, axis=1).max() < 0.1
-    assert world_of(done.system.filter) is None
-
-
 def test_landmarks_in_the_known_world():
     """Points of the map where they are, though each particle has its own world."""
     log = desk(1, frames=25)
@@ -428,64 +324,60 @@ def test_landmarks_in_the_known_world():
     assert np.median(np.linalg.norm(raw[0] - true, axis=1)) > 0.5
 
 
-def test_a_stereo_log():
-    log = simulate_features(DeskWorld(frames=2, points=60), Measuring(), STEREO, 0)
-    with pytest.raises(InputError, match="needs a log of one camera, this is a stereo log"):
-        run(log, SMALL)
+def seeing(count: int) -> FeatureLog:
+    """As many of the four known points in the first frame."""
+    hidden = known(FIRST.known).names[count:]
+    return changed(FIRST, 0, lambda frame: rows(frame, ~np.isin(frame.landmarks, hidden)))
 
 
-@every_mode
-@pytest.mark.parametrize("count", [0, 3])
-def test_too_few_known_points(mode, count):
-    """Of those that are given, only those that the first frame sees count."""
-    names = known(FIRST.known).names
-    hidden = changed(FIRST, 0, lambda f: rows(f, ~np.isin(f.landmarks, names[count:])))
-    with pytest.raises(InputError, match=f"needs at least four that are seen, got {count}"):
-        run(hidden, replace(SMALL, known=mode))
-
-
-@every_mode
-def test_one_known_point_outside_the_image(mode):
-    """Beyond the border it is no measurement: not of the start either."""
-    names = known(FIRST.known).names
+def one_outside(log: FeatureLog) -> FeatureLog:
+    """Beyond the border a known point is no measurement: not of the start either."""
 
     def moved(frame: FeatureFrame) -> FeatureFrame:
         z = frame.z.copy()
-        z[frame.landmarks == names[0]] = [5000.0, -3000.0]
+        z[frame.landmarks == known(log.known).names[0]] = [5000.0, -3000.0]
         return replace(frame, z=z)
 
-    with pytest.raises(InputError, match="needs at least four that are seen, got 3"):
-        run(changed(FIRST, 0, moved), replace(SMALL, known=mode))
-    five = desk(0, known=5)
-    names = known(five.known).names
-    done = run(first_only(changed(five, 0, moved)), replace(SMALL, known=mode))
-    assert np.abs(errors(done)[0]).max() < 0.1
+    return changed(log, 0, moved)
+
+
+def on_a_line() -> FeatureLog:
+    given = known(FIRST.known)
+    line = given.positions[0] + np.outer(np.arange(4.0), given.positions[1] - given.positions[0])
+    return replace(FIRST, known=KnownPoints(given.names, line, given.cov))
 
 
 @every_mode
-def test_known_points_on_a_line(mode):
-    given = known(FIRST.known)
-    line = given.positions[0] + np.outer(np.arange(4.0), given.positions[1] - given.positions[0])
-    log = replace(FIRST, known=KnownPoints(given.names, line, given.cov))
-    with pytest.raises(InputError, match="the known points lie on a line"):
+@pytest.mark.parametrize(
+    ("log", "words"),
+    [
+        (seeing(0), "needs at least four that are seen, got 0"),
+        (seeing(3), "needs at least four that are seen, got 3"),
+        (one_outside(FIRST), "needs at least four that are seen, got 3"),
+        (on_a_line(), "the known points lie on a line"),
+        (
+            changed(FIRST, 1, lambda f: replace(f, landmarks=-1 - np.arange(len(f.landmarks)))),
+            "a landmark has a negative name",
+        ),
+        (
+            simulate_features(DeskWorld(frames=2, points=60), Measuring(), STEREO, 0),
+            "needs a log of one camera, this is a stereo log",
+        ),
+    ],
+    ids=["none", "three", "outside", "line", "negative", "stereo"],
+)
+def test_logs_that_are_refused(log, words, mode):
+    with pytest.raises(InputError, match=words):
         run(log, replace(SMALL, known=mode))
 
 
-def test_more_known_points_than_a_group_has_errors_for():
+def test_more_known_points_than_needed():
+    """One may be outside the image; of those with errors of their own there may be twelve."""
+    done = run(first_only(one_outside(desk(0, known=5))), SMALL)
+    assert np.abs(errors(done)[0]).max() < 0.1
     log = desk(known=13, measurements=30)
     with pytest.raises(InputError, match="13 known points have errors of their own: give at most 12"):
         MonoSlam(log.camera, SMALL, log.known)
     exact = replace(known(log.known), cov=np.zeros((13, 3, 3)))
     done = run(first_only(replace(log, known=exact)), SMALL)
     assert np.abs(errors(done)[0]).max() < 0.05
-
-
-def test_a_name_that_comes_twice():
-    with pytest.raises(InputError, match=r"frame 2 of .*: landmark 7 comes twice"):
-        changed(FIRST, 2, lambda f: replace(f, landmarks=np.full(len(f.landmarks), 7)))
-
-
-def test_a_negative_name():
-    log = changed(FIRST, 1, lambda f: replace(f, landmarks=-1 - np.arange(len(f.landmarks))))
-    with pytest.raises(InputError, match="a landmark has a negative name"):
-        run(log, SMALL)

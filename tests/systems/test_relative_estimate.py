@@ -63,11 +63,3 @@ def test_another_name_for_the_frame(space):
     named = relative_estimate(space, anchored, state, log_weights, origin)
     np.testing.assert_allclose(named.mean, space.compose(origin, plain.mean), atol=1e-12)
     np.testing.assert_allclose(named.cov, plain.cov, atol=1e-12)
-
-
-@every_space
-def test_particles_at_zero_weight_do_not_count(space):
-    anchored, state, relative, _ = draw(space, 3, 0.3)
-    log_weights = np.array([0.0, -np.inf, -np.inf])
-    found = relative_estimate(space, anchored, state, log_weights)
-    np.testing.assert_allclose(found.mean, relative[0], atol=1e-12)

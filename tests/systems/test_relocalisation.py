@@ -26,7 +26,6 @@ from rbpf.systems.mono.relocalisation import (
     is_convincing,
     match_by_ratio,
     most_agree,
-    mutual_matches,
 )
 from rbpf.systems.mono.slam import MonoSlam
 from tests.systems.plane_sequences import CAMERA, Pictures, known_points, path, sequence, texture, view
@@ -277,14 +276,6 @@ def test_where_the_last_view_is_not_seen_again(last):
     assert matched(last, GREY) is None
     assert matched(last, view(texture(), HERE), np.array([[0.0, 0.0, -3.0]])) is None
     assert matched(LastView(SENSOR, GREY, HERE, RECOVERY), view(texture(), HERE)) is None
-
-
-def test_pairs_are_the_most_alike_both_ways():
-    alike = np.array([[0.9, 0.1, 0.0], [0.95, 0.2, 0.1], [0.1, 0.8, 0.79]])
-    px = np.array([[0.0, 0.0], [50.0, 0.0], [100.0, 0.0]])
-    assert [pair.tolist() for pair in mutual_matches(alike, px)] == [[1], [0]]
-    px[2] = [55.0, 0.0]  # the rival of the third is the same thing
-    assert [pair.tolist() for pair in mutual_matches(alike, px)] == [[1, 2], [0, 1]]
 
 
 def test_few_landmarks_are_enough_where_most_corners_agree():

@@ -8,7 +8,7 @@ from rbpf.errors import InputError
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
-from rbpf.systems.settings import HEADER, load_settings
+from rbpf.systems.settings import load_settings
 from rbpf.systems.stereo.config import StereoConfig
 
 
@@ -32,12 +32,6 @@ def test_a_group_can_be_nothing():
         StereoConfig, "stereo", None, ["new_landmarks.distinct=0.2"], {"new_landmarks": {"distinct": None}}
     )
     assert found.new_landmarks.distinct is None and found.new_landmarks.patience == 3
-
-
-def test_what_a_config_says_of_its_run_is_no_setting_of_any_system():
-    """Else a setting of that name would be passed over when the file is read back."""
-    for config in (MonoConfig(), StereoConfig(), RangeBearingConfig()):
-        assert not set(HEADER) & {item.name for item in fields(config)}
 
 
 def renamed(kind: type, prefix: str = "") -> list[tuple[str, str]]:

@@ -62,13 +62,6 @@ def test_found_again(found):
     assert said.endswith("pairs whose motion was only assumed")
 
 
-def test_without_recovery_it_stays_lost(found):
-    """The particles of the assumed motion alone do not come to where they should be."""
-    run = blurred(replace(CONFIG, recovery=RecoveryConfig(used=False)))
-    assert off_m(run)[-1] > 5.0 * off_m(found)[-1]
-    assert off_m(run)[-1] > 0.05
-
-
 def test_resumed_while_lost(found, tmp_path):
     """Stopped while it is lost and taken up again: the same bytes."""
     place = tmp_path / "checkpoint.npz"

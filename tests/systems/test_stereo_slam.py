@@ -6,7 +6,6 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from examples.studies.image_faults import cover_view
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.run import Run
@@ -107,13 +106,6 @@ class TestPath:
         spread = np.sqrt(np.trace(run.log.covs[-1][3:, 3:]))
         assert 0.0 < np.linalg.norm(off) < 5.0 * spread / np.sqrt(400)
 
-    def test_a_thing_that_moves_through_the_view_is_said(self, plain):
-        """It covers up to a third of the view: as long as it and the room are seen there are two motions."""
-        run = filtered(cover_view(1 / 3, 3, 8)(pairs(COUNT)), CONFIG)
-        said = [message for message in run.messages if "something in the view moves" in message]
-        assert len(said) >= 3 and all(int(message.split()[1][:-1]) in range(3, 12) for message in said)
-        assert plain.messages == []
-
 
 class TestTrack:
     """One frame at a time, for as long as one likes."""
@@ -130,30 +122,29 @@ class TestTrack:
             assert said.values.keys() == {column.name for column in StereoSlam.columns}
             assert said.observed.keys() == {ragged.name for ragged in StereoSlam.observed}
 
-    @pytest.mark.parametrize("at", [0, 1, 5, 6, COUNT - 1])
-    def test_saved_and_loaded_after_any_frame(self, at, tmp_path):
+    def test_saved_and_loaded_after_any_frame(self, tmp_path):
         """Also after a pair that could not be measured: the same bytes."""
         sequence = pairs(COUNT, lambda t, frame: missing(frame) if t in (0, 5) else frame)
         slam, said = StereoSlam(sequence.rig, CONFIG), list[Tracked]()
         for t, frame in enumerate(sequence.frames()):
             said.append(slam.take(frame))
-            if t == at:
-                slam.save(tmp_path / "checkpoint.npz", {"mine": np.arange(3)})
-        again = StereoSlam(sequence.rig, CONFIG)
-        np.testing.assert_array_equal(again.load(tmp_path / "checkpoint.npz")["mine"], np.arange(3))
-        for t, frame in enumerate(sequence.frames(at + 1) if at + 1 < COUNT else (), at + 1):
-            one = again.take(frame)
-            np.testing.assert_array_equal(one.pose, said[t].pose)
-            np.testing.assert_array_equal(one.cov, said[t].cov)
-            for name, values in one.observed.items():
-                np.testing.assert_array_equal(values, said[t].observed[name])
-            for name, value in one.values.items():
-                if not name.startswith("seconds"):
-                    np.testing.assert_array_equal(value, said[t].values[name])
-            assert one.messages == said[t].messages and one.state == said[t].state
-        np.testing.assert_array_equal(again.particle_poses(), slam.particle_poses())
-        for ours, theirs in zip(vars(again.map()).values(), vars(slam.map()).values(), strict=True):
-            np.testing.assert_equal(ours, theirs)
+            slam.save(tmp_path / f"{t}.npz", {"mine": np.arange(t)})
+        for at in (0, 5, 6, 9):
+            again = StereoSlam(sequence.rig, CONFIG)
+            np.testing.assert_array_equal(again.load(tmp_path / f"{at}.npz")["mine"], np.arange(at))
+            for t, frame in enumerate(sequence.frames(at + 1), at + 1):
+                one = again.take(frame)
+                np.testing.assert_array_equal(one.pose, said[t].pose)
+                np.testing.assert_array_equal(one.cov, said[t].cov)
+                for name, values in one.observed.items():
+                    np.testing.assert_array_equal(values, said[t].observed[name])
+                for name, value in one.values.items():
+                    if not name.startswith("seconds"):
+                        np.testing.assert_array_equal(value, said[t].values[name])
+                assert one.messages == said[t].messages and one.state == said[t].state
+            np.testing.assert_array_equal(again.particle_poses(), slam.particle_poses())
+            for ours, theirs in zip(vars(again.map()).values(), vars(slam.map()).values(), strict=True):
+                np.testing.assert_equal(ours, theirs)
 
     def test_memory_does_not_grow_with_the_pairs(self):
         """A camera at rest: the map is soon complete, and what is kept stays as large as it is."""
@@ -186,18 +177,20 @@ class TestBadPairs:
         "same stamp": (lambda f: replace(f, stamp_ns=f.stamp_ns - 66_666_666), "it has the stamp of the last one"),
     }
 
-    @pytest.mark.parametrize("kind", CHANGES)
-    def test_it_is_survived(self, kind, plain):
-        change, words = self.CHANGES[kind]
-        bad = filtered(pairs(COUNT, lambda t, frame: change(frame) if t == 5 else frame), CONFIG)
-        (message,) = bad.messages
-        assert bad.failure is None and message.startswith("pair 5: passed over: ") and words in message
-        assert "the last velocity is assumed, widely" in message
-        assert bad.log.states[5] is TrackingState.PREDICTED and not bad.log["updated"][5]
-        assert rms_m(bad.log.poses) < 0.006 or kind == "same stamp"
-        assert np.trace(bad.log.covs[7]) < 10.0 * np.trace(plain.log.covs[7])
-        if kind != "same stamp":
-            assert np.trace(bad.log.covs[5]) > 50.0 * np.trace(plain.log.covs[5])
+    def test_they_are_survived(self):
+        """One of each kind, two good ones between them."""
+        bad = dict(zip(range(4, 4 + 3 * len(self.CHANGES), 3), self.CHANGES.items(), strict=True))
+        count = max(bad) + 3
+        run = filtered(pairs(count, lambda t, frame: bad[t][1][0](frame) if t in bad else frame), CONFIG)
+        assert run.failure is None and len(run.messages) == len(bad)
+        for message, (t, (kind, (_, words))) in zip(run.messages, bad.items(), strict=True):
+            assert message.startswith(f"pair {t}: passed over: ") and words in message
+            assert "the last velocity is assumed, widely" in message
+            assert run.log.states[t] is TrackingState.PREDICTED and not run.log["updated"][t]
+            spread = np.trace(run.log.covs, axis1=1, axis2=2)
+            assert spread[t + 2] < 10.0 * spread[t - 1]
+            assert kind == "same stamp" or spread[t] > 50.0 * spread[t - 1]
+        assert errors_m(run.log.poses, pairs(count))[:-3].max() < 0.01
 
     def test_the_first_pairs_are_missing(self):
         run = filtered(pairs(6, lambda t, frame: missing(frame) if t < 2 else frame), CONFIG)

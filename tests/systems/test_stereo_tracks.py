@@ -91,14 +91,6 @@ def test_what_one_pair_shows_twice_is_not_joined():
     assert [frame[7] for frame in found[:3]] == [1.0, 11.0, 21.0]
 
 
-def test_names_of_the_map_and_other_tracks_do_not_meet():
-    tracks = Tracks()
-    tracks.note(0, *px(1, 2, 3), NONE, names(0, NULL, 1))
-    tracks.note(1, *px(11, 12, 13), matched((0, 0), (1, 1), (2, 2)), names(0, NULL, 1))
-    for frame, ten in zip(seen(tracks)[:2], (0.0, 10.0), strict=True):
-        assert frame[0] == ten + 1.0 and frame[1] == ten + 3.0 and len(frame) == 3
-
-
 def test_a_pair_that_was_not_measured_is_passed_over():
     tracks = Tracks()
     tracks.note(0, *px(1), NONE, names(NULL))
@@ -106,7 +98,3 @@ def test_a_pair_that_was_not_measured_is_passed_over():
     tracks.note(2, *px(21), matched((0, 0)), names(NULL))
     tracks.measured[1] = False
     assert [sorted(frame.values()) for frame in seen(tracks)] == [[1.0], [], [21.0], []]
-
-
-def test_of_nothing():
-    assert [frame.landmarks.size for frame in Tracks().frames()] == [0, 0, 0, 0]

@@ -21,9 +21,7 @@ from rbpf.systems.mono.unknown_start import (
     Structure,
     UnknownStart,
     Window,
-    between,
     optimum,
-    tangents,
 )
 from rbpf.validation.metrics.accuracy import ate
 from tests.exactness.models import known
@@ -147,15 +145,6 @@ def test_nothing_is_resampled_when_frames_have_too_little_in_common():
     assert_the_same(apart, NEVER, SMALL)
 
 
-@pytest.mark.slow
-def test_frames_without_features_are_passed_over(resampled):
-    empty = changed(
-        changed(LOG, 3, lambda frame: rows(frame, np.arange(0))), 4, lambda frame: rows(frame, np.arange(0))
-    )
-    done = run(empty, SMALL)
-    assert resampled and off(done.log.poses, known(LOG.truth).world_from_camera, done.log.stamps_ns) < 0.02
-
-
 def assert_the_same(log: FeatureLog, *configs: MonoConfig) -> None:
     paths = [run(log, config).log.poses for config in configs]
     np.testing.assert_array_equal(paths[0], paths[1])
@@ -172,18 +161,6 @@ def test_frames_that_hang_too_little_together_are_said(monkeypatch):
     monkeypatch.setattr("rbpf.systems.mono.unknown_start.MIN_SHARED", 1000)
     done = filter_images(sequence(8), SMALL)
     assert done.system.start.over and done.messages == [f"frame 5: {DISCONNECTED}"]
-
-
-def test_poses_between_are_on_the_way():
-    ends = SE3.retract(SE3.identity(), np.array([[0.0] * 6, [0.0, 0.0, 0.4, 1.0, 0.0, 0.0], [0.2, 0, 0, 0, 0, 0]]))
-    times = np.array([0, 10, 30])
-    found = between(times, ends[None], np.array([-5, 0, 5, 10, 20, 30, 40]))
-    assert found.shape == (7, 1, 7)
-    np.testing.assert_allclose(found[[0, 1, 3, 5, 6], 0], ends[[0, 0, 1, 2, 2]], atol=1e-12)
-    half = SE3.log(SE3.between(ends[0], found[2, 0]))
-    np.testing.assert_allclose(half, [0.0, 0.0, 0.2, 0.5, 0.0, 0.0], atol=1e-12)
-    both = SE3.log(SE3.between(found[3, 0], found[4, 0])), SE3.log(SE3.between(found[4, 0], found[5, 0]))
-    np.testing.assert_allclose(both[0], both[1], atol=1e-9)
 
 
 @pytest.mark.slow
@@ -330,9 +307,3 @@ def test_what_is_behind_the_camera_does_not_stop_it():
     started = Linearised(window, EXPECTED, Structure(turned, truth.direction, truth.inverse))
     found = optimum(window, EXPECTED, started.at)
     assert np.isfinite(found.cost) and found.cost < started.cost
-
-
-def test_tangents_are_across():
-    direction = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.6, 0.0, 0.8]])
-    frames = np.concatenate([direction[..., None], tangents(direction)], axis=-1)
-    np.testing.assert_allclose(np.swapaxes(frames, 1, 2) @ frames, np.tile(np.eye(3), (3, 1, 1)), atol=1e-12)
