@@ -55,14 +55,6 @@ def test_corners_are_found_to_a_tenth_of_a_pixel_in_the_board_s_own_order(turn_d
     assert not found.std_m.any()
 
 
-def test_a_board_that_looks_the_same_upside_down_is_still_right_handed():
-    board = Board(7, 5, 0.03)
-    image, px = seen(board, view(200.0))
-    found = find_board(image, board)
-    errors = [np.abs(found.px - order[found.names]).max() for order in (px, px[::-1])]
-    assert min(errors) < 0.1
-
-
 def test_the_chosen_corners_hold_the_outer_ones_and_are_apart():
     chosen = spread_rows(BOARD.corners, MOST)
     assert {0, 8, 45, 53} <= set(chosen.tolist()) and chosen.size == MOST

@@ -91,13 +91,6 @@ def test_behind_the_camera_is_finite_and_far_outside(camera, point):
     assert np.linalg.norm(px) >= 0.99 * 400.0 * side / MIN_DEPTH_FRACTION
 
 
-def test_visible_keeps_a_margin():
-    model = CameraPoint(PLAIN, margin_px=10.0)
-    at = [PLAIN.unproject(np.array(px)) for px in ([8.0, 200.0], [12.0, 200.0], [320.0, 476.0])]
-    points = np.array([[*uv, 1.0] for uv in at])
-    assert model.visible(SE3.identity(), points).tolist() == [False, True, False]
-
-
 @every_camera
 @pytest.mark.parametrize("kind", [CameraRay, EpipolarRay])
 def test_a_ray_starts_through_its_first_sighting(camera, kind):

@@ -49,14 +49,6 @@ def test_a_point_beyond_a_second_fold_is_not_visible():
     assert np.isnan(camera.unproject(camera.project(ray))).all()
 
 
-def test_unproject_finds_the_direction_on_this_side_of_the_fold():
-    px = FOLDING.project(np.array([[1.9, 0.0, 1.0], [0.0, -1.5, 1.0]]))
-    uv = FOLDING.unproject(px)
-    assert (np.hypot(*uv.T) < FOLDING.monotonic_radius).all()
-    rays = np.concatenate([uv, np.ones((2, 1))], axis=1)
-    np.testing.assert_allclose(FOLDING.project(rays), px, rtol=0, atol=1e-9)
-
-
 def test_pixels_beyond_the_fold_have_no_direction():
     radius = FOLDING.monotonic_radius
     reach = FOLDING.fx * radius * (1.0 - 0.25 * radius**2)

@@ -216,21 +216,6 @@ def test_corners_of_squares_and_not_their_edges():
     assert (nearest.min(axis=0) <= 2).all() and (nearest.min(axis=1) <= 2).all()
 
 
-@pytest.mark.parametrize("border_px", [0.0, 16.0, 60.5])
-def test_inside_the_border(image, border_px):
-    px, _ = corners(image, NONE, 1000, 4.0, border_px)
-    least = max(border_px, CornerDetector.margin_px)
-    assert len(px) > 20 and px.min() >= least
-    assert (px <= np.array([319, 239]) - least).all()
-    assert px.min(axis=0).max() < least + 8 and (px.max(axis=0) > np.array([319, 239]) - least - 8).all()
-
-
-def test_a_dark_image_gives_corners_once_asked_for_faint_ones():
-    dark = squares([(30, 30), (90, 60)], level=8)
-    assert len(corners(dark, NONE, 10)[0]) == 0
-    assert len(corners(dark, NONE, 10, 6.0, fast_threshold=3, min_score=0.2)[0]) == 8
-
-
 @pytest.mark.parametrize("shape", [(0, 0), (7, 300), (10, 10), (11, 11), (101, 97)])
 def test_odd_sizes(shape):
     image = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)

@@ -81,17 +81,6 @@ def test_the_jacobian_of_the_triangulation():
     )
 
 
-def test_the_noise_of_a_keypoint():
-    config = PairConfig(place_px=0.3, place_per_scale=0.1, disparity_px=0.2, disparity_per_scale=0.05)
-    noise = StereoMatcher(RIG, config=config).noise(np.array([0.0, 4.0]))
-    np.testing.assert_allclose(noise[0], [[0.09, 0, 0.09], [0, 0.09, 0], [0.09, 0, 0.13]])
-    place, disparity = 0.09 + 0.16, 0.04 + 0.04
-    across = np.array([1.0, 0.0, -1.0])
-    assert noise[1, 0, 0] == pytest.approx(place) and across @ noise[1] @ across == pytest.approx(disparity)
-    apart = StereoMatcher(RIG, config=PairConfig(place_px=0.3, place_per_scale=0.0, refine=False))
-    np.testing.assert_allclose(apart.noise(np.array([5.0]))[0], 0.09 * np.eye(3))
-
-
 def test_a_feature_is_seen_again_where_the_motion_takes_it():
     _, _, poses = room()
     first, second = measured(0), measured(1)

@@ -65,24 +65,6 @@ def see_again_from(sensor: ImageSensor, points: np.ndarray, pose: np.ndarray) ->
             sensor.table.last_patch[row], sensor.table.last_pose[row] = patch, pose
 
 
-def test_a_later_appearance_is_found_where_the_first_is_not(wall, monkeypatch):
-    sensor, points = wall
-    there = around(35.0)
-    image, rows = view(texture(), there), np.arange(len(points))
-    px, cov = (CAMERA.project(SE3.inverse_transform(there, points)), np.tile(4.0 * np.eye(2), (len(points), 1, 1)))
-    search = sensor.search
-    monkeypatch.setattr(search, "choose", lambda pose: (rows, px))
-    monkeypatch.setattr(sensor.features, "project", lambda belief, rows: (rows, px, cov - search._noise()))
-    monkeypatch.setattr(search, "_agreeing", lambda image, belief, templates, result: result)
-    only_first = search.run(image, Seen(there))
-    see_again_from(sensor, points, around(20.0))
-    both = search.run(image, Seen(there))
-    first = only_first.found
-    assert both.found[first].all() and (both.px[first] == only_first.px[first]).all()
-    assert both.found.sum() >= first.sum() + 10
-    assert np.median(np.linalg.norm(both.px[both.found] - px[both.found], axis=1)) < 1.0
-
-
 def test_the_nearest_appearance_is_chosen(wall):
     sensor, points = wall
     see_again_from(sensor, points, around(30.0))
@@ -91,13 +73,6 @@ def test_the_nearest_appearance_is_chosen(wall):
         patches, poses = table.nearest_appearance(rows, table.position, around(degrees))
         assert (patches == (table.last_patch if later else table.first_patch)).all()
         assert (poses == (table.last_pose if later else table.first_pose)).all()
-
-
-class Seen:
-    """All of a belief that is read here."""
-
-    def __init__(self, pose: np.ndarray) -> None:
-        self.state, self.mode = pose[None], 0
 
 
 def test_appearances_are_renewed_when_they_have_changed_and_are_in_the_checkpoint(wall):
@@ -217,14 +192,14 @@ def test_a_feature_that_may_be_anywhere_agrees_with_no_motion(fraction):
 def test_a_third_of_the_view_moves_and_the_camera_is_not_taken_along(tmp_path):
     """It crosses the view in two seconds; features on it are taken for near ones at rest, if they are trusted at once."""
     camera = Pinhole(320, 240, 250.0, 250.0, 159.5, 119.5)
-    simulate_images(TexturedDesk(frames=150, texel_m=0.003), Imaging(), camera, tmp_path / "desk", seed=1)
+    simulate_images(TexturedDesk(frames=120, texel_m=0.003), Imaging(), camera, tmp_path / "desk", seed=1)
     recording = open_images(tmp_path / "desk")
     known = read_known_points(tmp_path / "desk" / "known_points.csv")
     damaged = cover_view(1 / 3, 60, 60)(recording)
     worst = {}
     credulous = MonoConfig(search=SearchConfig(trusted_fraction=0.0))
     for name, config in (("credulous", credulous), ("usual", MonoConfig())):
-        runs = [filter_images(damaged, replace(config, seed=seed), known) for seed in range(3)]
+        runs = [filter_images(damaged, replace(config, seed=seed), known) for seed in range(2)]
         stamps = recording.stamps_ns
         paths = [Trajectory(stamps, poses) for poses in (*(run.log.poses for run in runs), runs[0].truth.poses)]
         worst[name] = max(ate(path, paths[-1]).rmse for path in paths[:-1])

@@ -274,16 +274,6 @@ def test_the_first_frame_finds_the_camera(mode, velocity):
     assert (np.abs(SE3.local(done.log.poses, truth)[0]) < 4.0 * std).all()
 
 
-def test_a_frame_says_the_same_in_both_modes():
-    """The law of the first pose is a matter of the known points, not of what stands for them."""
-    frame, points = (run(first_only(FIRST), replace(SMALL, known=mode, particles=200)) for mode in ("frame", "points"))
-    std = np.sqrt(np.diag(frame.log.covs[0]))
-    offset = SE3.local(frame.log.poses[0], points.log.poses[0]) / std
-    assert np.abs(offset).max() < 0.5
-    ratio = np.sqrt(np.diag(points.log.covs[0])) / std
-    assert (np.abs(np.log(ratio)) < 0.3).all()
-
-
 def test_known_points_are_one_landmark_and_new_ones_are_counted():
     for cov, kind in ((known(FIRST.known).cov, UncertainConstellation), (np.zeros((4, 3, 3)), Constellation)):
         log = replace(first_only(FIRST), known=replace(known(FIRST.known), cov=cov))

@@ -17,14 +17,12 @@ from rbpf.systems.mono.config import MonoConfig, RelocalisationConfig
 from rbpf.systems.mono.relocalisation import (
     MIN_VIEW_CORNERS,
     Attempt,
-    Candidates,
     LastView,
     Relocaliser,
     TrackingLoss,
     describe_corners,
     is_confirmed,
     is_convincing,
-    match_by_ratio,
     most_agree,
 )
 from rbpf.systems.mono.slam import MonoSlam
@@ -88,19 +86,16 @@ def test_tracking_is_not_disturbed(tracked, tmp_path):
 
 
 @slow
-@pytest.mark.parametrize("how", ["black", "missing"])
-def test_recovers_after_a_blackout(tracked, tmp_path, how):
+def test_recovers_after_a_blackout(tracked, tmp_path):
     def dark(t, image):
-        if not START <= t < START + DARK:
-            return image
-        return None if how == "missing" else np.zeros_like(image)
+        return np.zeros_like(image) if START <= t < START + DARK else image
 
     run = resumed(tracked, tmp_path, dark)
     assert run.log.lost()[START + 3 : START + DARK].all()
     assert not run.log.lost()[START + DARK + 3 :].any()
     assert len(np.flatnonzero(run.log["relocalised"]).tolist()) == 1
     assert any("lost" in problem for problem in run.messages)
-    assert sum("shows nothing" in problem for problem in run.messages) == (how == "black")
+    assert sum("shows nothing" in problem for problem in run.messages) == 1
     assert errors(run)[-10:].max() < 0.03
     assert np.trace(run.log.covs[START + DARK - 1][3:, 3:]) > np.trace(run.log.covs[START][3:, 3:])
 
@@ -197,38 +192,12 @@ def test_what_it_is_not_found_in(place, tracked):
     assert picky.find(place.belief, place.image, place.near).prior is None
 
 
-@slow
-def test_patches_say_more_exactly_than_corners_where_landmarks_are(place):
-    rows, points = place.finder.known_landmarks(place.belief)
-    seen = CAMERA.project(SE3.inverse_transform(place.truth, points))
-    px = SENSOR.detector.detect(place.image, 500, None, 6.0, 16.0).px
-    away = np.linalg.norm(seen[:, None] - px, axis=-1)
-    near = np.flatnonzero(away.min(axis=1) < 6.0)
-    pairs = near, away[near].argmin(axis=1)
-    assert near.size >= 15
-    sharp = place.finder.refine_px(Candidates(place.image, rows, points, px), pairs, place.near)
-    before, after = (np.linalg.norm(at - seen[near], axis=1) for at in (px[pairs[1]], sharp))
-    assert np.median(after) < min(0.7 * np.median(before), 1.5)
-
-
 def test_inliers_on_a_line_do_not_convince():
     rng, along = np.random.default_rng(0), np.linspace(30.0, 290.0, 20)
     line = np.stack([along, 0.5 * along + rng.normal(size=20)], axis=-1)
     found = Resected(SE3.identity(), np.eye(6), np.ones(20, dtype=bool), 1.0)
     assert not is_convincing(found, line, CAMERA.width, RECOVERY)
     assert is_convincing(found, rng.uniform(0, 240, (20, 2)), CAMERA.width, RECOVERY)
-
-
-def test_matches_must_be_like_nothing_else():
-    away = np.array([[0.1, 0.5, 0.6], [0.5, 0.2, 0.19], [0.6, 0.5, 0.5]])
-    points, px = np.eye(3), np.array([[0.0, 0.0], [50.0, 0.0], [100.0, 0.0]])
-    landmark, corner = match_by_ratio(away, points, px, 0.8)
-    assert (landmark.tolist(), corner.tolist()) == ([0], [0])
-    # Two names for one landmark, and two corners at one place, are no rivals.
-    landmark, corner = match_by_ratio(away, points, px * [0.01, 1.0], 0.8)
-    assert 1 in landmark
-    landmark, corner = match_by_ratio(np.array([[0.1, 0.5], [0.1, 0.6]]), np.zeros((2, 3)), px[:2], 0.8)
-    assert (landmark.size, corner.tolist()) == (1, [0])
 
 
 # The last view before the loss.
