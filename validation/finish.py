@@ -38,7 +38,7 @@ class Callbacks:
     Attributes:
         on_frame: called with the frames drawn and their number.
         on_iteration: called with the number of an iteration of the batch adjustment and the error before it.
-        most_iterations: of the batch adjustment, after which it is given up; see `adjust_log`.
+        most_iterations: of the batch adjustment, after which it is given up; see `solve_problem`.
     """
 
     on_frame: Callable[[int, int], None] | None = None

@@ -40,8 +40,8 @@ from rbpf.systems.mono.feature_sensor import FeatureSensor
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.settings import load_settings
 from rbpf.validation.gtsam import robot
-from rbpf.validation.gtsam.batch_problem import AFAR
-from rbpf.validation.gtsam.mono_batch import Batch, adjust_log
+from rbpf.validation.gtsam.batch_problem import AFAR, Optimum, solve_problem
+from rbpf.validation.gtsam.observations import HUBER
 from rbpf.validation.gtsam.self_calibration import adjust_near, refine_calibration
 from rbpf.validation.metrics.accuracy import ate
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
@@ -143,29 +143,30 @@ def camera_causes(
     path = record.path
     config = load_settings(MonoConfig, "mono", folder / "config.yaml", (), {})
     whole = np.arange(len(path.mean))
-    batch = adjust_log(log, path.mean)
+    adjusted = partial(solve_problem, log, path.mean, HUBER, marginals=False)
+    batch = adjusted()
     try:
         truth = record.truth
         rows, poses = truth.rows, truth.poses
     except InputError:
-        rows, poses = batch.frames, batch.world_from_camera
+        rows, poses = batch.steps, batch.estimate.world_from_body
 
     def error(frames: np.ndarray, world_from_camera: np.ndarray) -> float:
         _, ours, theirs = np.intersect1d(frames, rows, return_indices=True)
         mine, true = (Trajectory(np.arange(ours.size), p) for p in (world_from_camera[ours], poses[theirs]))
         return ate(mine, true, alignment).rmse
 
-    found = error(batch.frames, batch.world_from_camera)
+    found = error(batch.steps, batch.estimate.world_from_body)
     clean = agreeing_matches(log, batch)
     calibrated = refine_calibration(log, batch)
     out = [Cause(AS_IT_IS, (error(whole, path.mean),), found)]
     for name, one in {
         BATCH: batch,
-        FROM_FILTER: adjust_log(log, path.mean, twice=False),
+        FROM_FILTER: adjusted(twice=False),
         "batch, perfect associations": adjust_near(clean, batch),
         "batch, other calibration": calibrated.batch,
     }.items():
-        out.append(Cause(name, (error(one.frames, one.world_from_camera),), found))
+        out.append(Cause(name, (error(one.steps, one.estimate.world_from_body),), found))
     given = partial(GivenDepths, depths=batch_depths(batch))
     changes: dict[str, tuple[FeatureLog, MonoConfig, Any]] = {
         "same measurements": (log, config, None),
@@ -205,35 +206,35 @@ def scaled_noise(log: FeatureLog, factor: float) -> FeatureLog:
     return replace(log, frames=frames)
 
 
-def reprojection_errors(batch: Batch) -> list[np.ndarray]:
+def reprojection_errors(batch: Optimum) -> list[np.ndarray]:
     """Distance of each match from the reprojection of its landmark, by frame (K,), px; NaN without a landmark."""
-    camera, points, out = batch.log.camera, batch.solution.landmarks, []
+    assert isinstance(batch.problem, FeatureLog)
+    camera, points, out = batch.problem.camera, batch.estimate.landmarks.named(), []
     nowhere = np.full(3, np.nan)
-    for frame, pose in zip(batch.log.frames, batch.world_from_camera, strict=True):
+    for frame, pose in zip(batch.problem.frames, batch.estimate.world_from_body, strict=True):
         world = np.array([points.get(name, nowhere) for name in frame.landmarks.tolist()]).reshape(-1, 3)
         seen = camera.project(SE3.inverse_transform(pose, world))
         out.append(np.linalg.norm(seen - frame.z, axis=1))
     return out
 
 
-def agreeing_matches(log: FeatureLog, batch: Batch) -> FeatureLog:
+def agreeing_matches(log: FeatureLog, batch: Optimum) -> FeatureLog:
     """The log without the matches that the batch shows to be wrong."""
     frames = list(log.frames)
-    for t, error in zip(batch.frames.tolist(), reprojection_errors(batch), strict=True):
+    for t, error in zip(batch.steps.tolist(), reprojection_errors(batch), strict=True):
         frame, kept = frames[t], ~(error > WRONG_PX)
         frames[t] = FeatureFrame(frame.stamp_ns, frame.landmarks[kept], frame.z[kept], frame.cov_z[kept])
     return replace(log, frames=frames)
 
 
-def batch_depths(batch: Batch) -> dict[int, float]:
+def batch_depths(batch: Optimum) -> dict[int, float]:
     """Depth of each landmark in the camera that saw it first, by name, m; without those that the batch leaves open."""
-    undetermined = set(batch.solution.undetermined)
-    depths: dict[int, float] = {}
-    for frame, pose in zip(batch.log.frames, batch.world_from_camera, strict=True):
+    assert isinstance(batch.problem, FeatureLog)
+    points, depths = batch.estimate.landmarks.named(), dict[int, float]()
+    for frame, pose in zip(batch.problem.frames, batch.estimate.world_from_body, strict=True):
         for name in frame.landmarks.tolist():
-            if name not in depths and name not in undetermined and name in batch.solution.landmarks:
-                depth = SE3.inverse_transform(pose, batch.solution.landmarks[name])[2]
-                depths[name] = float(depth)
+            if name not in depths and name in points:
+                depths[name] = float(SE3.inverse_transform(pose, points[name])[2])
     return {name: depth for name, depth in depths.items() if depth > 0.0}
 
 

@@ -9,23 +9,17 @@ fixed budget. Names are right, noise is known, and it is a hundred times faster 
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Annotated, Protocol
 
 import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.ranges import MOST, Count, CountOrNone, NotNegative, Positive, Range, Ranged, Rate, check_ranges
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.feature_log import CameraTruth, FeatureFrame, FeatureLog, KnownPoints
 from rbpf.validation.simulation import textures
 from rbpf.validation.simulation.lab import RATE_HZ, LabDrive, furnished, shell, world_from_camera
-from rbpf.validation.simulation.limits import (
-    check_counts,
-    check_fractions,
-    check_not_negative,
-    check_order,
-    check_positive,
-)
 from rbpf.validation.simulation.paths import HandHeld, frame_seconds, frame_stamps
 
 SURFACE = 1e-6
@@ -120,7 +114,7 @@ def populated(
 
 
 @dataclass(frozen=True)
-class DeskWorld:
+class DeskWorld(Ranged):
     """Points over a desk, seen by a camera in a hand.
 
     Attributes:
@@ -133,20 +127,13 @@ class DeskWorld:
         renewal: fraction of the points that disappear for good per second; others appear elsewhere.
     """
 
-    frames: int = 1000
-    rate_hz: float = 30.0
-    points: int = 300
-    size_m: tuple[float, float, float] = (2.0, 2.0, 1.0)
+    frames: Annotated[int, Range(ge=2, le=MOST)] = 1000
+    rate_hz: Positive = 30.0
+    points: Count = 300
+    size_m: tuple[Positive, Positive, Positive] = (2.0, 2.0, 1.0)
     hand: HandHeld = field(default_factory=HandHeld)
-    blocks: int = 3
-    renewal: float = 0.0
-
-    def __post_init__(self) -> None:
-        check_counts(self, {"frames": 2, "points": 1, "blocks": 0})
-        check_positive(self, "rate_hz")
-        check_fractions(self, "renewal")
-        if not all(0.0 < size < np.inf for size in self.size_m):
-            raise InputError(f"size_m must be three positive numbers, got {self.size_m}")
+    blocks: CountOrNone = 3
+    renewal: Rate = 0.0
 
     def build(self, rng: np.random.Generator) -> Scene:
         """Draws the points, the blocks and the path."""
@@ -167,7 +154,7 @@ RICH = 20.0
 
 
 @dataclass(frozen=True)
-class LabWorld:
+class LabWorld(Ranged):
     """Points on all that can be seen in the `TexturedLab`; the same seed furnishes both alike.
 
     All boxes hide what is behind them. Measure it with any camera:
@@ -182,10 +169,7 @@ class LabWorld:
     """
 
     drive: LabDrive = field(default_factory=LabDrive)
-    points: int = 12000
-
-    def __post_init__(self) -> None:
-        check_counts(self, {"points": 1})
+    points: Count = 12000
 
     def build(self, rng: np.random.Generator) -> Scene:
         """Draws the furniture and the points."""
@@ -329,27 +313,24 @@ class Measuring:
         occlusion: whether blocks hide what is behind them.
     """
 
-    noise_px: float = 1.0
-    measurements: int = 25
-    known: int = 4
-    known_std_m: float = 0.001
-    new_per_frame: int = 3
-    outlier_rate: float = 0.0
-    dropout: float = 0.02
-    turnover: float = 0.005
-    rest_frames: int = 15
-    border_px: float = 8.0
-    nearest_m: float = 0.2
-    farthest_m: float = 8.0
+    noise_px: Positive = 1.0
+    measurements: Count = 25
+    known: CountOrNone = 4
+    known_std_m: NotNegative = 0.001
+    new_per_frame: CountOrNone = 3
+    outlier_rate: Rate = 0.0
+    dropout: Rate = 0.02
+    turnover: Rate = 0.005
+    rest_frames: CountOrNone = 15
+    border_px: NotNegative = 8.0
+    nearest_m: NotNegative = 0.2
+    farthest_m: Positive = 8.0
     occlusion: bool = True
 
     def __post_init__(self) -> None:
-        """Checks that the numbers make sense."""
-        check_counts(self, {"measurements": 1, "known": 0, "new_per_frame": 0, "rest_frames": 0})
-        check_positive(self, "noise_px", "farthest_m")
-        check_not_negative(self, "known_std_m", "border_px", "nearest_m")
-        check_fractions(self, "outlier_rate", "dropout", "turnover")
-        check_order(self, "nearest_m", "farthest_m")
+        check_ranges(self)
+        if not self.nearest_m < self.farthest_m:
+            raise InputError(f"nearest_m = {self.nearest_m} must be less than farthest_m = {self.farthest_m}")
 
 
 def simulate_features(

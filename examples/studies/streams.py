@@ -13,10 +13,10 @@ from typing import NamedTuple
 import numpy as np
 
 from rbpf.lie import SE2, SE3
+from rbpf.ranges import Count, Ranged, Rate
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureFrame, FeatureLog, KnownPoints
 from rbpf.sensors.readers import Frame, RobotLog
-from rbpf.validation.simulation.limits import check_counts, check_fractions, check_positive
 from rbpf.validation.simulation.paths import looking
 
 CAMERA = Pinhole(320, 240, 260.0, 260.0, 159.5, 119.5)
@@ -29,7 +29,7 @@ CAMERA_HZ, ROBOT_HZ = 30.0, 10.0
 
 
 @dataclass(frozen=True)
-class Turnover:
+class Turnover(Ranged):
     """How many points there are, and how fast they are replaced.
 
     Attributes:
@@ -38,14 +38,9 @@ class Turnover:
         renewal: probability per frame that a point is replaced.
     """
 
-    points: int = 60
-    measurements: int = 12
-    renewal: float = 0.0005
-
-    def __post_init__(self) -> None:
-        """Checks that there is something to see."""
-        check_counts(self, {"points": 1, "measurements": 1})
-        check_fractions(self, "renewal")
+    points: Count = 60
+    measurements: Count = 12
+    renewal: Rate = 0.0005
 
 
 class Seen(NamedTuple):
@@ -166,7 +161,6 @@ class RobotStream(_Stream):
         radius_m: float = 5.0,
     ) -> None:
         self.radius_m = radius_m
-        check_positive(self, "radius_m")
         self._std_odometry, self._std_z = np.array(std_odometry), np.array(std_z)
         self._rng = np.random.default_rng(seed)
         self._points = _Points(self._draw(turnover.points), turnover.points // 5, turnover)

@@ -27,8 +27,8 @@ from rbpf.runs.reading import RunFolder
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureFrame, FeatureLog, KnownPoints
 from rbpf.validation.colmap.model import build_model, from_colmap_pose, image_id
+from rbpf.validation.gtsam.batch_problem import connected_frames
 from rbpf.validation.gtsam.camera import CameraSolution, solve_features
-from rbpf.validation.gtsam.mono_batch import connected_frames
 from rbpf.validation.gtsam.observations import CameraEstimate, ObservationTable, observation_table, reprojection
 from rbpf.validation.tables import write_table
 

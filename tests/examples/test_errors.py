@@ -34,7 +34,8 @@ from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.stereo.config import StereoConfig
-from rbpf.validation.gtsam.mono_batch import Batch, adjust_log
+from rbpf.validation.gtsam.batch_problem import Optimum, solve_problem
+from rbpf.validation.gtsam.observations import HUBER
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 from tests.exactness.models import known
 from tests.systems.mono_logs import SMALL
@@ -158,8 +159,8 @@ def log() -> FeatureLog:
 
 
 @pytest.fixture(scope="module")
-def batch(log) -> Batch:
-    return adjust_log(log, known(log.truth).world_from_camera)
+def batch(log) -> Optimum:
+    return solve_problem(log, known(log.truth).world_from_camera, HUBER, marginals=False)
 
 
 def test_the_wrong_matches_are_found_and_no_others(log, batch):
@@ -175,7 +176,8 @@ def test_the_wrong_matches_are_found_and_no_others(log, batch):
             wrong[t] = frame.landmarks[row]
         frames.append(FeatureFrame(frame.stamp_ns, frame.landmarks, z, frame.cov_z))
     spoilt = replace(log, frames=frames)
-    clean = agreeing_matches(spoilt, adjust_log(spoilt, batch.world_from_camera))
+    found = solve_problem(spoilt, batch.estimate.world_from_body, HUBER, marginals=False)
+    clean = agreeing_matches(spoilt, found)
     for t, (left, all_) in enumerate(zip(clean.frames, log.frames, strict=True)):
         gone = np.setdiff1d(all_.landmarks, left.landmarks).tolist()
         assert gone == ([wrong[t]] if t in wrong else [])

@@ -10,10 +10,8 @@ from scipy.stats import chi2
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.feature_log import KnownPoints
-from rbpf.validation.gtsam import camera_adjust as adjuster
-from rbpf.validation.gtsam.camera import CameraEstimate, solve_features
-from rbpf.validation.gtsam.camera_adjust import explain
-from rbpf.validation.gtsam.camera_graph import CameraProblem, CameraState
+from rbpf.validation.gtsam.camera import CameraEstimate, begin, solve_features
+from rbpf.validation.gtsam.camera_graph import CameraProblem, CameraState, adjust
 from rbpf.validation.gtsam.observations import known_by_name, observation_table, reprojection
 from rbpf.validation.gtsam.solvers import marginals, marginals_by_schur
 from tests.validation.camera_scenes import BENT, FISHEYE, PLAIN, STEREO, WHOLE, scene, solve_by_scipy
@@ -168,7 +166,7 @@ def test_what_gtsam_cannot_solve_is_named():
         values.insert(key, np.zeros(3))
     with pytest.raises(RuntimeError) as raised:
         gtsam.GaussNewtonOptimizer(singular, values).optimize()
-    message = str(explain(problem, raised.value))
+    message = str(problem.explained(raised.value))
     assert any(f"everything near landmark {name};" in message for name in problem.table.names[3:5])
 
 
@@ -190,8 +188,8 @@ def adjusted(camera, known: str):
     if log.known is not None:
         names = known_by_name(log.known, table.names)
     problem = CameraProblem(log.name, len(log.frames), table, names)
-    start = adjuster.begin(problem, CameraEstimate(log.truth.world_from_camera, {}))
-    return adjuster.adjust(problem, start)
+    start = begin(problem, CameraEstimate(log.truth.world_from_camera, {}))
+    return adjust(problem, start)
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,8 @@ from rbpf.validation.colmap.reconstruct import ReconstructionOptions
 from rbpf.validation.consistency.against_batch import AgainstBatch, compare
 from rbpf.validation.consistency.comparison import RESIDUALS, Comparison
 from rbpf.validation.consistency.statistic import NOISE_FACTOR, variance_ratio
-from rbpf.validation.gtsam.batch_problem import Optimum, read_problem, solve_problem
-from rbpf.validation.gtsam.mono_batch import ROBUST, Told
+from rbpf.validation.gtsam.batch_problem import Optimum, Told, read_problem, solve_problem
+from rbpf.validation.gtsam.observations import HUBER
 from rbpf.validation.metrics.gaussian_differences import figures_of
 
 GTSAM, COLMAP = "gtsam", "colmap"
@@ -33,7 +33,7 @@ def solve_run(record: RunFolder, most: int | None = None, on_iteration: Told | N
             batch problem; or the optimiser does not converge.
     """
     problem = read_problem(record.folder)
-    robust = ROBUST if isinstance(problem, FeatureLog) else None
+    robust = HUBER if isinstance(problem, FeatureLog) else None
     return solve_problem(problem, record.path.mean, robust, most, on_iteration)
 
 

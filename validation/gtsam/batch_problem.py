@@ -3,7 +3,11 @@
 Range-bearing measurements are those of `rbpf.sensors.readers.measurements`, a camera's are a `FeatureLog`.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import final
 
@@ -16,15 +20,31 @@ from rbpf.runs.measurement_files import OBSERVATIONS, read_measurements
 from rbpf.runs.reading import PathAndMap
 from rbpf.runs.run import Run
 from rbpf.sensors.camera import RectifiedStereo
-from rbpf.sensors.feature_log import FeatureLog
+from rbpf.sensors.feature_log import FeatureLog, KnownPoints
 from rbpf.sensors.readers.measurements import Measurements
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.validation.gtsam import robot
-from rbpf.validation.gtsam.mono_batch import Told, adjust_log
-from rbpf.validation.gtsam.observations import observation_table, reprojection
+from rbpf.validation.gtsam.camera import CameraEstimate, solve_features
+from rbpf.validation.gtsam.observations import in_one_piece, observation_table, reprojection
 from rbpf.validation.metrics.gaussian_differences import mahalanobis
 
 Problem = Measurements | FeatureLog
+
+Told = Callable[[int, float], None]
+"""Told the number of an iteration and the error before it."""
+
+LEAST = 4
+"""Landmarks known, or seen in other frames too, that a frame needs to take part: three leave several poses."""
+
+EXACT = 1e-4
+"""Known points without errors get one of this fraction of their extent: constraints take GTSAM many times as long."""
+
+WORK = 30_000_000
+"""Observations that are linearised, over all iterations, before an adjustment is given up: some minutes of work. Work is
+counted and not the time, so that a result does not depend on what else the machine does."""
+
+LEAST_ITERATIONS = 100
+"""That are allowed however many observations there are."""
 
 STEREO_TOLERANCE = 1e-6
 """Of a pair's batch: far landmarks creep; ten times as exact moves a path of 60 m by less than a millimetre."""
@@ -108,22 +128,26 @@ def solve_problem(
     most: int | None = None,
     on_iteration: Told | None = None,
     marginals: bool = True,
+    twice: bool = True,
 ) -> Optimum:
-    """GTSAM's optimum.
+    """GTSAM's optimum: of a robot's run, or of all frames of a camera's that landmarks connect with the first one.
 
     Args:
         problem: T steps.
         start: (T, E) poses of the filter, where a camera's adjustment begins; a robot's begins with its odometry.
         robust: Huber's threshold in standard deviations; None takes all as Gaussian, as the filter does.
-        most: iterations of a camera's adjustment, after which it is given up; by default `most_iterations`.
+        most: iterations of a camera's adjustment, after which it is given up; by default as many as `WORK` allows.
         on_iteration: told how far a camera's adjustment is.
         marginals: compute covariances; without them the optimum has no poses' and NaN as landmarks'.
+        twice: start a camera's adjustment from its known points alone, too, and take the better optimum, so that it does
+            not hang on where the filter went; not needed near the optimum.
 
     Raises:
-        InputError: the measurements do not determine everything, or the optimiser does not converge.
+        InputError: the measurements do not determine everything, too few frames are connected, it takes too many
+            iterations, or it does not converge.
     """
     if isinstance(problem, FeatureLog):
-        return _solve_camera(problem, start, robust, most, on_iteration, marginals)
+        return _solve_camera(problem, start, robust, most, on_iteration, marginals, twice)
     found = robot.solve(problem, robust, marginals, incremental=len(problem.stamps_ns) > AFAR)
     points = _summary(list(found.landmarks), found.landmarks, found.cov_landmarks, problem.z.shape[1])
     estimate = PathAndMap(problem.stamps_ns, found.world_from_robot, found.cov_poses, points)
@@ -151,15 +175,82 @@ def fit_of(problem: Problem, estimate: PathAndMap, names: NDArray[np.int64]) -> 
 
 
 def _solve_camera(
-    log: FeatureLog, start: Array, robust: float | None, most: int | None, told: Told | None, marginals: bool
+    log: FeatureLog,
+    path: Array,
+    robust: float | None,
+    most: int | None,
+    told: Told | None,
+    marginals: bool,
+    twice: bool,
 ) -> Optimum:
+    frames = connected_frames(log)
+    if frames.size < 2:
+        raise InputError(f"{log.name}: no two frames share the {LEAST} landmarks that a batch adjustment needs of each")
+    part = replace(log, frames=[log.frames[t] for t in frames], known=softened(log.known))
+    size = sum(frame.landmarks.size for frame in part.frames)
+    limit = max(LEAST_ITERATIONS, WORK // max(size, 1)) if most is None else most
+    iterations = count(1)
+
+    def watch(error: float) -> None:
+        done = next(iterations)
+        if told is not None:
+            told(done, error)
+        if done > limit:
+            raise InputError(
+                f"the batch adjustment was given up after {limit} iterations: allow more with --batch-limit"
+            )
+
     tolerance = STEREO_TOLERANCE if isinstance(log.camera, RectifiedStereo) else None
-    batch = adjust_log(log, start, most, told, tolerance=tolerance, robust=robust, marginals=marginals)
-    found, stamps = batch.solution, stamps_of(batch.log)
+    solve = partial(solve_features, part, robust=robust, on_iteration=watch, tolerance=tolerance)
+    # A start that leads nowhere is passed over, if another one does not.
+    solutions, problems = [], []
+    first = CameraEstimate(path[frames], {})
+    for start in [first, None] if twice and log.known is not None else [first]:
+        try:
+            solutions.append(solve(start, marginals=False))
+        except InputError as error:
+            problems.append(error)
+    if not solutions:
+        raise problems[-1]
+    found = min(solutions, key=lambda solution: solution.error)
+    if marginals:
+        with suppress(InputError):  # where not all is determined, there are none
+            found = solve(CameraEstimate(found.world_from_camera, found.landmarks))
     names = sorted(found.landmarks.keys() - set(found.undetermined))
     points = _summary(names, found.landmarks, found.cov_landmarks, 3)
-    estimate = PathAndMap(stamps, found.world_from_camera, found.cov_poses, points)
-    return Optimum(batch.log, estimate, batch.frames, found.error)
+    part = replace(part, known=log.known)
+    return Optimum(
+        part, PathAndMap(stamps_of(part), found.world_from_camera, found.cov_poses, points), frames, found.error
+    )
+
+
+def softened(known: KnownPoints | None) -> KnownPoints | None:
+    """The known points, with small errors where they have none."""
+    if known is None or known.cov.any():
+        return known
+    extent = float(np.ptp(known.positions, axis=0).max())
+    return replace(known, cov=np.tile((EXACT * extent) ** 2 * np.eye(3), (known.names.size, 1, 1)))
+
+
+def connected_frames(log: FeatureLog) -> NDArray[np.intp]:
+    """Numbers (B,) of the frames that can be adjusted together with the first one, or with most of the others.
+
+    Each sees `LEAST` landmarks that are known or seen in another of them, and they are connected by these.
+    """
+    counts = np.array([frame.landmarks.size for frame in log.frames])
+    steps = np.repeat(np.arange(counts.size), counts)
+    names, index = np.unique(np.concatenate([f.landmarks for f in log.frames]), return_inverse=True)
+    known = np.isin(names, () if log.known is None else log.known.names)
+    kept = np.ones(counts.size, dtype=bool)
+    while True:
+        rows = kept[steps]
+        shared = known | (np.bincount(index[rows], minlength=names.size) > 1)
+        rows &= shared[index]
+        enough = np.bincount(steps[rows], minlength=counts.size) >= LEAST
+        now = kept & enough & in_one_piece(steps[rows], index[rows], counts.size, known)
+        if (now == kept).all() or not now.any():
+            return np.flatnonzero(now)
+        kept = now
 
 
 def _summary(names: list[int], means: dict[int, Array], covs: dict[int, Array], dim: int) -> MapEstimate:

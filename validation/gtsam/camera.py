@@ -14,9 +14,26 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.lie import Array
 from rbpf.sensors.feature_log import FeatureLog
-from rbpf.validation.gtsam.observations import CameraEstimate, known_by_name, observation_table
+from rbpf.validation.gtsam.camera_graph import FINE, CameraProblem, CameraState, adjust, covariances
+from rbpf.validation.gtsam.camera_start import from_scratch
+from rbpf.validation.gtsam.observations import (
+    CameraEstimate,
+    in_camera,
+    in_front,
+    in_one_piece,
+    known_by_name,
+    observation_table,
+    place,
+    triangulate,
+)
 
 __all__ = ["CameraEstimate", "CameraSolution", "solve_features"]
+
+LEAST = 3
+"""Landmarks that fix a pose, and points that fix a frame."""
+
+LINE = 1e-3
+"""Known points whose spread across a line is below this fraction of that along it lie on it."""
 
 
 @final
@@ -77,20 +94,16 @@ def solve_features(
             estimate, the estimate puts a landmark behind its camera, a frame sees too few landmarks or none that
             connect it, the known points are fewer than three or on a line, or the optimiser does not converge.
     """
-    from rbpf.validation.gtsam import camera_adjust as adjuster
-    from rbpf.validation.gtsam.camera_graph import CameraProblem
-    from rbpf.validation.gtsam.camera_start import from_scratch
-
     if robust is not None and not robust > 0:
         raise InputError(f"Expected a robust threshold above 0 standard deviations, found {robust}.")
     full = observation_table(log)
     known = known_by_name(log.known, full.names)
     problem = CameraProblem(log.name, len(log.frames), full.determined(known), known, robust)
-    adjuster.check_problem(problem)
-    start = adjuster.begin(problem, initial or from_scratch(problem, on_iteration))
-    found = adjuster.adjust(problem, start, tolerance or adjuster.FINE, on_iteration)
+    _check(problem)
+    start = begin(problem, initial or from_scratch(problem, on_iteration))
+    found = adjust(problem, start, tolerance or FINE, on_iteration)
     found.require_converged()
-    cov_poses, cov_landmarks = adjuster.covariances(found) if marginals else (np.empty((0, 6, 6)), {})
+    cov_poses, cov_landmarks = covariances(found) if marginals else (np.empty((0, 6, 6)), {})
     state, names = found.state, found.problem.table.names
     return CameraSolution(
         world_from_camera=state.path,
@@ -101,3 +114,56 @@ def solve_features(
         iterations=found.iterations,
         undetermined=sorted({*full.names.tolist()} - {*names[~found.loose].tolist()}),
     )
+
+
+def _check(problem: CameraProblem) -> None:
+    """Refuses too few observations of a frame, frames apart, or known points that do not fix the world's frame."""
+    table, name = problem.table, problem.name
+    counts = np.bincount(table.steps, minlength=problem.frames)
+    if (few := np.flatnonzero(counts < LEAST)).size:
+        raise InputError(
+            f"Frame {few[0]} of {name} sees {counts[few[0]]} landmarks that are known or seen from elsewhere "
+            f"too, expected {LEAST} or more; leave the frame out."
+        )
+    piece = in_one_piece(table.steps, table.index, problem.frames, ~problem.free)
+    if (apart := np.flatnonzero(~piece)).size:
+        raise InputError(
+            f"Frame {apart[0]} of {name} shares no landmark, directly or through others, with "
+            f"{'the known points' if problem.known else 'frame 0'}; leave it out."
+        )
+    if problem.known:
+        positions = np.array([position for position, _ in problem.known.values()])
+        if len(positions) < LEAST:
+            raise InputError(f"{name} sees {len(positions)} known points, expected {LEAST} or more, or none at all.")
+        spread = np.linalg.svd(positions - positions.mean(0), compute_uv=False)
+        if spread[1] <= LINE * spread[0]:
+            raise InputError(f"The known points that {name} sees lie on a line; add one beside it.")
+
+
+def begin(problem: CameraProblem, start: CameraEstimate) -> CameraState:
+    """A state near an estimate: its landmarks, known points, and the others triangulated from its poses.
+
+    Landmarks that come out behind a camera are placed on their first rays.
+
+    Raises:
+        InputError: the path is none of the log's frames, or a landmark has no place in front of its cameras.
+    """
+    table, path = problem.table, np.asarray(start.world_from_camera, dtype=float)
+    if path.shape != (problem.frames, 7) or not np.isfinite(path).all():
+        raise InputError(
+            f"Expected finite initial poses of shape {(problem.frames, 7)}, one for each frame of "
+            f"{problem.name}, found {path.shape}."
+        )
+    given = {name: mean for name, (mean, _) in problem.known.items()} | start.landmarks
+    points = triangulate(table, path)
+    rows = [index for index, name in enumerate(table.names.tolist()) if name in given]
+    points[rows] = np.array([given[int(table.names[row])] for row in rows]).reshape(-1, 3)
+    points = place(table, path, points, ~in_front(table, path, points))
+    behind = np.flatnonzero(in_camera(table, path, points)[:, 2] <= 0)
+    if behind.size:
+        row = behind[0]
+        raise InputError(
+            f"Landmark {table.names[table.index[row]]} lies behind the camera in frame {table.steps[row]} of "
+            f"{problem.name}, which measured it; start from another estimate."
+        )
+    return CameraState(path, points)

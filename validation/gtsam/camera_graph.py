@@ -1,4 +1,4 @@
-"""The factor graph of a camera's observations in GTSAM.
+"""The factor graph of a camera's observations in GTSAM, and its optimisation.
 
     observations:  project(T⁻¹ l) − z ~ N(0, R), Huber's loss on request
     known points:  l ~ N(m, P), exact ones a hard constraint
@@ -13,8 +13,8 @@ Python are evaluated all at once and handed out one by one, which makes them nea
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, final
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, final
 
 import gtsam
 import numpy as np
@@ -23,8 +23,28 @@ from numpy.typing import NDArray
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
 from rbpf.sensors.camera import RectifiedStereo
-from rbpf.validation.gtsam.observations import ObservationTable, Residuals, first_centres, reprojection
-from rbpf.validation.gtsam.solvers import SPATIAL, huber, noise
+from rbpf.validation.gtsam.observations import (
+    ObservationTable,
+    Residuals,
+    collapsed,
+    first_centres,
+    is_open,
+    place,
+    reprojection,
+)
+from rbpf.validation.gtsam.solvers import (
+    ITERATIONS,
+    MOST_POSES,
+    ROUGH,
+    SPATIAL,
+    OnIteration,
+    explained,
+    huber,
+    levenberg_marquardt,
+    marginals,
+    marginals_by_schur,
+    noise,
+)
 
 SCALE, SOFT_SCALE = 1e-6, 1e-3
 """Standard deviation of the distance that holds the scale, as a fraction of it, at the end and on the way there.
@@ -32,8 +52,14 @@ SCALE, SOFT_SCALE = 1e-6, 1e-3
 Nothing else speaks of the scale, but a hard one could only be followed along a curve.
 """
 
+FINE = 1e-9
+"""A gain of this fraction of the error is none; landmarks without much parallax would creep on for ever."""
+
 WEAK = 0.25
 """Standard deviation of an undetermined landmark's prior, as a fraction of its distance."""
+
+_ROUNDS = 10
+_FEW = 8
 
 
 @final
@@ -158,6 +184,11 @@ class CameraProblem:
         points = np.asarray(gtsam.utilities.extractVectors(values, "l"))
         return CameraState(SE3.normalise(SE3.from_matrix(matrices)), points.reshape(-1, 3))
 
+    def explained(self, error: RuntimeError) -> InputError:
+        """GTSAM's complaint in words, with the variable that it names."""
+        advice = "check the measurements there, or add known points"
+        return explained(error, self.name, "frame", self.table.names, advice)
+
     def observation_factors(self) -> list[Any]:
         """One factor per row of the table, of which the residual is ours in GTSAM's order: u, right u, v of a pair."""
         camera, z = self.table.camera, self.table.z
@@ -234,3 +265,96 @@ class Together:
             return residuals[row]
 
         return gtsam.CustomFactor(model, keys, error)
+
+
+class Adjusted(NamedTuple):
+    """An optimum.
+
+    Attributes:
+        problem: of which it is one, without the landmarks that had to be left out.
+        values: GTSAM's.
+        graph: the factors there.
+        loose: (L,) landmarks with a weak prior.
+        iterations: in all.
+        converged: whether it is one.
+    """
+
+    problem: CameraProblem
+    values: Any
+    graph: Any
+    loose: NDArray[np.bool_]
+    iterations: int
+    converged: bool
+
+    @property
+    def state(self) -> CameraState:
+        """The optimum in our storage."""
+        return self.problem.state(self.values)
+
+    def require_converged(self) -> None:
+        """Refuses an optimum that is none."""
+        if not self.converged:
+            raise InputError(
+                f"The batch adjustment of {self.problem.name} did not converge in {self.iterations} iterations; "
+                "start it from a better estimate, or ask for the robust loss."
+            )
+
+
+def adjust(
+    problem: CameraProblem, start: CameraState, tolerance: float = FINE, on_iteration: OnIteration | None = None
+) -> Adjusted:
+    """Levenberg-Marquardt; a few rough steps at a time, until it is clear which landmarks are undetermined.
+
+    Those whose distance is open get a weak prior. One that an outlier has drawn into its camera is left out: there
+    it would explain any pixel, and hold up all others.
+
+    Raises:
+        InputError: the measurements do not determine a variable.
+    """
+
+    def run(graph: Any, state: CameraState, tolerance: float) -> tuple[Any, int, bool]:
+        most = _FEW if tolerance == ROUGH else ITERATIONS
+        try:
+            return levenberg_marquardt(graph, problem.values(state), tolerance, most, on_iteration)
+        except RuntimeError as error:
+            raise problem.explained(error) from error
+
+    state, weak, total, loose = start, start, 0, np.zeros(len(start.points), dtype=bool)
+    for round_ in range(_ROUNDS):
+        kept = ~(problem.free & collapsed(problem.table, state.path, state.points))
+        problem, loose = problem.part(kept), loose[kept]
+        state, weak = (replace(one, points=one.points[kept]) for one in (state, weak))
+        now = problem.free & is_open(problem.table, state.path, state.points)
+        # The first judgement may be the start's fault; later ones only add, so that it comes to an end.
+        now = now if round_ < 2 else now | loose
+        settled = round_ > 0 and kept.all() and bool((now == loose).all())
+        if not settled:
+            weak = replace(state, points=place(problem.table, state.path, state.points, now))
+            state, loose = weak, now
+        graph = problem.graph(weak, loose, start.path)
+        values, count, converged = run(graph, state, tolerance if settled else ROUGH)
+        state, total = problem.state(values), total + count
+        if settled and converged:
+            break
+    done = bool(settled and converged)
+    if problem.scaled:  # The same with the scale held as tightly as the covariances need it.
+        graph = problem.graph(weak, loose, start.path, SCALE)
+        values, count, converged = run(graph, state, tolerance)
+        total, done = total + count, done and converged
+    return Adjusted(problem, values, graph, loose, total, done)
+
+
+def covariances(found: Adjusted) -> tuple[Array, dict[int, Array]]:
+    """Marginal covariances of all poses (T, 6, 6) in the right chart, and of all landmarks, each (3, 3)."""
+    problem = found.problem
+    poses, points, names = problem.pose_keys, problem.point_keys, problem.table.names.tolist()
+    if not problem.scaled and len(poses) <= MOST_POSES:
+        of_poses, of_points = marginals_by_schur(
+            found.graph, found.values, poses, points, problem.held_keys, problem.name
+        )
+        return of_poses, dict(zip(names, of_points, strict=True))
+    try:
+        blocks = marginals(found.graph, found.values, [*poses, *points])
+    except RuntimeError as error:
+        raise problem.explained(error) from error
+    return np.array(blocks[: len(poses)]), dict(zip(names, blocks[len(poses) :], strict=True))

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
 from rbpf.sensors.camera import RectifiedStereo
-from rbpf.validation.gtsam.camera_adjust import adjust
-from rbpf.validation.gtsam.camera_graph import CameraProblem, CameraState
+from rbpf.validation.gtsam.camera_graph import CameraProblem, CameraState, adjust
 from rbpf.validation.gtsam.observations import (
     HUBER,
     CameraEstimate,

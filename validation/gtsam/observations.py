@@ -10,6 +10,7 @@ from typing import final
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
@@ -110,6 +111,26 @@ def observation_table(log: FeatureLog) -> ObservationTable:
         where = f"landmark {names[index[bad[0]]]} in frame {steps[bad[0]]}"
         raise InputError(f"The covariance of {where} of {log.name} is not positive definite.")
     return ObservationTable(log.camera, steps, index, names, z, cov_z)
+
+
+def in_one_piece(steps: Index, index: Index, frames: int, known: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which frames (T,) landmarks connect with the known ones (L,), else with the first frame that sees any.
+
+    Args:
+        steps: (K,) frame of each observation.
+        index: (K,) its landmark.
+        frames: T.
+        known: (L,) which landmarks are known beforehand.
+    """
+    if not steps.size:
+        return np.zeros(frames, dtype=bool)
+    of_group = np.flatnonzero(known)
+    ends = np.concatenate([index, of_group]) + frames
+    starts = np.concatenate([steps, frames + np.repeat(of_group[:1], of_group.size)])
+    size = frames + known.size
+    _, piece = connected_components(csr_array((np.ones(ends.size), (starts, ends)), shape=(size, size)), False)
+    anchor = frames + of_group[0] if of_group.size else steps[0]
+    return np.asarray(piece[:frames] == piece[anchor])
 
 
 def known_by_name(known: KnownPoints | None, names: NDArray[np.int64]) -> dict[int, tuple[Array, Array]]:

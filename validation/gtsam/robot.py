@@ -14,9 +14,10 @@ follow these constraints along a curve, therefore `Problem.graph(soft=True)` fir
 standard deviation of the same step.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, TypeVar, final
+from typing import Any, final
 
 import gtsam
 import numpy as np
@@ -31,7 +32,7 @@ from rbpf.validation.gtsam.solvers import (
     PLANAR,
     ROUGH,
     SPATIAL,
-    culprit,
+    explained,
     gauss_newton,
     huber,
     levenberg_marquardt,
@@ -49,8 +50,6 @@ MOVED = 1e-3
 """How far a variable may be from where `solve_online` linearised it [rad, m]."""
 
 _PENALTY = 1000.0  # GTSAM's default; it counts in errors far from the optimum, where constraints are violated
-
-Result = TypeVar("Result")
 
 
 @final
@@ -100,37 +99,34 @@ def solve(
             does not converge.
     """
     problem = Problem(m, robust)
-    return _explained(problem, lambda: _solve(problem, marginals, initial, incremental))
-
-
-def _solve(problem: "Problem", marginals: bool, initial: InitialEstimate | None, incremental: bool) -> BatchSolution:
-    m, graph = problem.m, problem.graph()
-    if incremental:  # ISAM2 closes every loop from near by.
-        *_, (_, isam) = _grown(problem, CHUNK)
-        values = isam.calculateEstimate()
-    else:
-        values = problem.values(initial or initial_estimate(m))
-    # Until the error stands; hard constraints of the odometry are softened first, and then Gauss-Newton's.
-    softened = 0
-    if problem.singular:
-        near, softened, _ = levenberg_marquardt(problem.graph(soft=True), values, ROUGH)
-        values, count, converged = gauss_newton(graph, near)
-    else:
-        values, count, converged = levenberg_marquardt(graph, values, EXACT)
-    if not converged:
-        raise InputError(
-            f"The batch optimisation of {m.recording} did not converge in {count} iterations; "
-            "start it incrementally or from the filter's estimate, or ask for the robust loss."
-        )
-    path, landmarks = problem.estimate(values)
-    cov_poses, cov_landmarks = np.empty((0, m.space.dim, m.space.dim)), dict[int, Array]()
-    if marginals:
-        poses = [problem.pose_key(step) for step in range(len(path))]
-        points = [problem.landmark_key(index) for index in range(len(problem.names))]
-        found = marginals_of(graph, values, poses + points)
-        cov_poses = np.array([problem.chart.covariance(cov) for cov in found[: len(poses)]])
-        cov_landmarks = dict(zip(problem.names.tolist(), found[len(poses) :], strict=True))
-    return BatchSolution(path, dict(landmarks), cov_poses, cov_landmarks, graph.error(values), softened + count)
+    with _explaining(problem):
+        graph = problem.graph()
+        if incremental:  # ISAM2 closes every loop from near by.
+            *_, (_, isam) = _grown(problem, CHUNK)
+            values = isam.calculateEstimate()
+        else:
+            values = problem.values(initial or initial_estimate(m))
+        # Until the error stands; hard constraints of the odometry are softened first, and then Gauss-Newton's.
+        softened = 0
+        if problem.singular:
+            near, softened, _ = levenberg_marquardt(problem.graph(soft=True), values, ROUGH)
+            values, count, converged = gauss_newton(graph, near)
+        else:
+            values, count, converged = levenberg_marquardt(graph, values, EXACT)
+        if not converged:
+            raise InputError(
+                f"The batch optimisation of {m.recording} did not converge in {count} iterations; "
+                "start it incrementally or from the filter's estimate, or ask for the robust loss."
+            )
+        path, landmarks = problem.estimate(values)
+        cov_poses, cov_landmarks = np.empty((0, m.space.dim, m.space.dim)), dict[int, Array]()
+        if marginals:
+            poses = [problem.pose_key(step) for step in range(len(path))]
+            points = [problem.landmark_key(index) for index in range(len(problem.names))]
+            found = marginals_of(graph, values, poses + points)
+            cov_poses = np.array([problem.chart.covariance(cov) for cov in found[: len(poses)]])
+            cov_landmarks = dict(zip(problem.names.tolist(), found[len(poses) :], strict=True))
+        return BatchSolution(path, dict(landmarks), cov_poses, cov_landmarks, graph.error(values), softened + count)
 
 
 def solve_online(m: Measurements, robust: float | None = None) -> Array:
@@ -146,7 +142,8 @@ def solve_online(m: Measurements, robust: float | None = None) -> Array:
         InputError: an observation has no noise, or the measurements do not determine a variable.
     """
     problem = Problem(m, robust)
-    return _explained(problem, lambda: np.array([pose for pose, _ in _grown(problem, 1, MOVED)]))
+    with _explaining(problem):
+        return np.array([pose for pose, _ in _grown(problem, 1, MOVED)])
 
 
 def _grown(problem: "Problem", chunk: int, moved: float | None = None) -> Iterator[tuple[Array, Any]]:
@@ -182,20 +179,14 @@ def _grown(problem: "Problem", chunk: int, moved: float | None = None) -> Iterat
     del held
 
 
-def _explained(problem: "Problem", solution: Callable[[], Result]) -> Result:
-    """What is computed, or GTSAM's complaint in words, with the variable that it names."""
+@contextmanager
+def _explaining(problem: "Problem") -> Iterator[None]:
+    """GTSAM's complaints in words."""
     try:
-        return solution()
+        yield
     except RuntimeError as error:
-        name, named = problem.m.recording, culprit(error)
-        if named is None:
-            raise InputError(f"GTSAM could not solve {name}: {' '.join(str(error).split())}") from error
-        letter, index = named
-        place = f"the pose of step {index}" if letter == "x" else f"landmark {problem.names[index]}"
-        raise InputError(
-            f"GTSAM could not solve {name}: "
-            f"the measurements do not determine everything near {place}; check the covariances there."
-        ) from error
+        advice = "check the covariances there"
+        raise explained(error, problem.m.recording, "the pose of step", problem.names, advice) from error
 
 
 @final

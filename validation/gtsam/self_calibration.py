@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import gtsam
 import numpy as np
 
 from rbpf.errors import InputError
@@ -15,9 +16,18 @@ from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureLog
 from rbpf.sensors.readers.images.calibration import NAME
 from rbpf.validation.calibration import camera_text
-from rbpf.validation.gtsam.batch_problem import read_problem
-from rbpf.validation.gtsam.mono_batch import ROBUST, Batch, adjust_log, softened
-from rbpf.validation.gtsam.observations import CameraEstimate, Residuals, known_by_name, observation_table, reprojection
+from rbpf.validation.gtsam.batch_problem import Optimum, read_problem, softened, solve_problem
+from rbpf.validation.gtsam.camera import begin
+from rbpf.validation.gtsam.camera_graph import FINE, SCALE, CameraProblem, Together, adjust
+from rbpf.validation.gtsam.observations import (
+    HUBER,
+    CameraEstimate,
+    Residuals,
+    known_by_name,
+    observation_table,
+    reprojection,
+)
+from rbpf.validation.gtsam.solvers import levenberg_marquardt, marginals
 
 ITERATIONS = 200
 """Most of the adjustment."""
@@ -41,28 +51,21 @@ class Calibrated:
     """
 
     camera: Pinhole
-    batch: Batch
+    batch: Optimum
     std: np.ndarray
 
 
-def refine_calibration(log: FeatureLog, batch: Batch, on_round: OnRound | None = None) -> Calibrated:
+def refine_calibration(log: FeatureLog, batch: Optimum, on_round: OnRound | None = None) -> Calibrated:
     """Focal length and k1 adjusted together with all poses and landmarks, from the optimum with the given camera.
 
     Raises:
         InputError: a batch adjustment fails.
     """
-    import gtsam
-
-    from rbpf.validation.gtsam import camera_adjust as adjuster
-    from rbpf.validation.gtsam.camera_graph import SCALE, CameraProblem, Together
-    from rbpf.validation.gtsam.solvers import levenberg_marquardt, marginals
-
-    camera = batch.log.camera
-    assert isinstance(camera, Pinhole)
-    full, path = observation_table(batch.log), batch.world_from_camera
-    known = known_by_name(softened(batch.log.known), full.names)
-    given = CameraProblem(log.name, len(path), full.determined(known), known, ROBUST)
-    found = adjuster.adjust(given, adjuster.begin(given, CameraEstimate(path, batch.solution.landmarks)))
+    assert isinstance(batch.problem, FeatureLog) and isinstance(batch.problem.camera, Pinhole)
+    camera, full, path = batch.problem.camera, observation_table(batch.problem), batch.estimate.world_from_body
+    known = known_by_name(softened(batch.problem.known), full.names)
+    given = CameraProblem(log.name, len(path), full.determined(known), known, HUBER)
+    found = adjust(given, begin(given, CameraEstimate(path, batch.estimate.landmarks.named())))
     problem, key = found.problem, int(gtsam.symbol("c", 0))
 
     def changed(change: np.ndarray) -> Pinhole:
@@ -95,21 +98,21 @@ def refine_calibration(log: FeatureLog, batch: Batch, on_round: OnRound | None =
 
     std = np.full(2, np.nan)
     try:
-        values, _, _ = levenberg_marquardt(graph, values, adjuster.FINE, ITERATIONS, on_iteration)
+        values, _, _ = levenberg_marquardt(graph, values, FINE, ITERATIONS, on_iteration)
         std = np.sqrt(np.diagonal(marginals(graph, values, [key])[0]))
     except RuntimeError:
         pass
     better = adjust_near(replace(log, camera=changed(values.atVector(key))), batch)
-    best = min(batch, better, key=lambda one: one.solution.error)
-    assert isinstance(best.log.camera, Pinhole)
-    return Calibrated(best.log.camera, best, std)
+    best = min(batch, better, key=lambda one: one.error)
+    assert isinstance(best.problem, FeatureLog) and isinstance(best.problem.camera, Pinhole)
+    return Calibrated(best.problem.camera, best, std)
 
 
-def adjust_near(log: FeatureLog, batch: Batch) -> Batch:
+def adjust_near(log: FeatureLog, batch: Optimum) -> Optimum:
     """The optimum of a log that is nearly the batch's, from the batch's."""
     path = np.tile(SE3.identity(), (len(log.frames), 1))
-    path[batch.frames] = batch.world_from_camera
-    return adjust_log(log, path, twice=False)
+    path[batch.steps] = batch.estimate.world_from_body
+    return solve_problem(log, path, HUBER, marginals=False, twice=False)
 
 
 def recalibrate(folder: Path, out: Path, on_round: OnRound | None = None) -> tuple[dict[str, Any], Calibrated]:
@@ -124,7 +127,7 @@ def recalibrate(folder: Path, out: Path, on_round: OnRound | None = None) -> tup
     problem = read_problem(folder)
     if not isinstance(problem, FeatureLog) or not isinstance(problem.camera, Pinhole):
         raise InputError(f"{folder} is no run of one camera: only that can calibrate its camera")
-    start = adjust_log(problem, RunFolder.open(folder).estimate.world_from_body)
+    start = solve_problem(problem, RunFolder.open(folder).estimate.world_from_body, HUBER, marginals=False)
     found = refine_calibration(problem, start, on_round)
     prepare_folder(out)
     about = f"focal length and k1 from what the run over {problem.name} measured"
@@ -137,5 +140,5 @@ def recalibrate(folder: Path, out: Path, on_round: OnRound | None = None) -> tup
     }
     fractions = {"std_focal_share": found.std[0], "std_k1": found.std[1]}
     entries |= {name: float(value) if np.isfinite(value) else None for name, value in fractions.items()}
-    entries["error_before"], entries["error_after"] = start.solution.error, found.batch.solution.error
+    entries["error_before"], entries["error_after"] = start.error, found.batch.error
     return entries, found

@@ -98,10 +98,22 @@ SPATIAL = Chart(
 )
 
 
-def culprit(error: RuntimeError) -> tuple[str, int] | None:
-    """Letter and number of the variable, x for a pose and l for a landmark, that a complaint of GTSAM's names."""
+def explained(error: RuntimeError, name: str, pose: str, landmarks: NDArray[np.int64], advice: str) -> InputError:
+    """GTSAM's complaint about a recording in words, with the variable that it names.
+
+    Args:
+        error: GTSAM's.
+        name: of the recording.
+        pose: what the recording calls the step of a pose.
+        landmarks: names of those that the keys count.
+        advice: what to do.
+    """
     symbol = _SYMBOL.search(str(error))
-    return None if symbol is None else (symbol[1], int(symbol[2]))
+    if symbol is None:
+        return InputError(f"GTSAM could not solve {name}: {' '.join(str(error).split())}")
+    where = f"landmark {landmarks[int(symbol[2])]}" if symbol[1] == "l" else f"{pose} {symbol[2]}"
+    problem = f"the measurements do not determine everything near {where}"
+    return InputError(f"GTSAM could not solve {name}: {problem}; {advice}.")
 
 
 def noise(cov: Array) -> Any:

@@ -1,12 +1,13 @@
 """A textured desk with things on it, and a textured room, to take pictures of. The world's z axis points up."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from rbpf.errors import InputError
+from rbpf.ranges import MOST, CountOrNone, NotNegative, Positive, Range, Ranged, check_ranges
 from rbpf.validation.simulation import textures
-from rbpf.validation.simulation.limits import check_counts, check_not_negative, check_positive
 from rbpf.validation.simulation.paths import HandHeld, Wave, eased, frame_seconds, looking, shaken
 from rbpf.validation.simulation.textured_scene import Furniture, TexturedScene, apart, stamps_ns
 
@@ -39,7 +40,7 @@ BOARD_CLEAR_M = 0.15
 
 
 @dataclass(frozen=True)
-class TexturedDesk:
+class TexturedDesk(Ranged):
     """A desk at a wall, with papers, books and boxes on it, seen by a camera in a hand that is held still at first.
 
     The middle of the desk's top is the origin; the wall is beyond its edge at the greatest y.
@@ -57,25 +58,16 @@ class TexturedDesk:
         contrast: of all textures but the chessboard's; 1 is rich, 0.1 poor.
     """
 
-    frames: int = 300
-    rate_hz: float = 30.0
-    size_m: tuple[float, float] = (2.0, 2.0)
-    papers: int = 42
-    things: int = 16
-    board: tuple[int, int] | None = None
-    square_m: float = 0.03
+    frames: Annotated[int, Range(ge=2, le=MOST)] = 300
+    rate_hz: Positive = 30.0
+    size_m: tuple[Positive, Positive] = (2.0, 2.0)
+    papers: CountOrNone = 42
+    things: CountOrNone = 16
+    board: Annotated[tuple[int, int] | None, Range(ge=3, le=1000)] = None
+    square_m: Positive = 0.03
     hand: HandHeld = OVER_DESK
-    texel_m: float = 0.001
-    contrast: float = 1.0
-
-    def __post_init__(self) -> None:
-        check_counts(self, {"frames": 2, "papers": 0, "things": 0})
-        check_positive(self, "rate_hz", "square_m", "texel_m")
-        check_not_negative(self, "contrast")
-        if self.board is not None and not (len(self.board) == 2 and min(self.board) >= 3):
-            raise InputError(f"board must be two numbers of squares, at least 3 each, or None, got {self.board}")
-        if not all(0.0 < size < np.inf for size in self.size_m):
-            raise InputError(f"size_m must be two positive numbers, got {self.size_m}")
+    texel_m: Positive = 0.001
+    contrast: NotNegative = 1.0
 
     def build(self, rng: np.random.Generator) -> TexturedScene:
         """Draws the textures, the things and the path."""
@@ -151,34 +143,30 @@ class TexturedRoom:
         contrast: of all textures; 1 is rich, 0.1 poor.
     """
 
-    frames: int = 600
-    rate_hz: float = 30.0
+    frames: Annotated[int, Range(ge=2, le=MOST)] = 600
+    rate_hz: Positive = 30.0
     size_m: tuple[float, float, float] = (6.0, 5.0, 2.6)
-    pictures: int = 5
-    things: int = 14
-    radius_m: float = 1.0
-    eye_m: float = 1.4
+    pictures: CountOrNone = 5
+    things: CountOrNone = 14
+    radius_m: Positive = 1.0
+    eye_m: Positive = 1.4
     gaze_deg: float = 60.0
-    drop_deg: float = 10.0
-    speed_m_s: float = 0.4
-    shake_m: float = 0.03
-    shake_deg: float = 3.0
-    start_s: float = 1.0
-    texel_m: float = 0.0025
-    contrast: float = 1.0
+    drop_deg: Annotated[float, Range(gt=-80.0, lt=80.0)] = 10.0
+    speed_m_s: Positive = 0.4
+    shake_m: NotNegative = 0.03
+    shake_deg: NotNegative = 3.0
+    start_s: NotNegative = 1.0
+    texel_m: Positive = 0.0025
+    contrast: NotNegative = 1.0
 
     def __post_init__(self) -> None:
-        check_counts(self, {"frames": 2, "pictures": 0, "things": 0})
-        check_positive(self, "rate_hz", "radius_m", "eye_m", "speed_m_s", "texel_m")
-        check_not_negative(self, "shake_m", "shake_deg", "start_s", "contrast")
+        check_ranges(self)
         floor = 2.0 * (self.radius_m + ALONG_M)
-        if not all(np.greater(self.size_m, [floor, floor, self.eye_m]) & np.isfinite(self.size_m)):
+        if not all(np.greater(self.size_m, [floor, floor, self.eye_m])):
             raise InputError(
                 f"size_m = {self.size_m} must be more than {floor:g} x {floor:g} m, which the walk takes, and higher "
                 f"than eye_m = {self.eye_m}"
             )
-        if not (abs(self.drop_deg) < 80.0 and np.isfinite(self.gaze_deg)):
-            raise InputError(f"drop_deg = {self.drop_deg} must be below 80, and gaze_deg = {self.gaze_deg} a number")
 
     def build(self, rng: np.random.Generator) -> TexturedScene:
         """Draws the textures, the things and the path."""

@@ -16,14 +16,15 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.ranges import CountOrNone, NotNegative, Positive, Range, Rate, check_ranges
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.readers.images.calibration import model_of
-from rbpf.validation.simulation.limits import check_counts, check_fractions, check_not_negative, check_positive
 from rbpf.validation.simulation.paths import Wave, write_wheel_odometry
 from rbpf.validation.simulation.render import Renderer
 from rbpf.validation.simulation.textured_scene import ImageWorld, TexturedScene, cast
@@ -60,26 +61,21 @@ class Imaging:
         known_exact: leave the positions without their error.
     """
 
-    noise_std: float = 3.0
-    exposure_drift: float = 0.15
-    lens_px: float = 0.5
-    blur_s: float = 0.01
-    vignetting: float = 0.2
+    noise_std: NotNegative = 3.0
+    exposure_drift: Rate = 0.15
+    lens_px: NotNegative = 0.5
+    blur_s: NotNegative = 0.01
+    vignetting: Rate = 0.2
     blackout: Sequence[int] = ()
-    grid: int = 2
+    grid: Annotated[int, Range(ge=1, le=64)] = 2
     depth: bool = False
-    jpeg: int = 0
-    known: int = 6
-    known_std_m: float = 0.001
+    jpeg: Annotated[int, Range(ge=0, le=100)] = 0
+    known: CountOrNone = 6
+    known_std_m: Positive = 0.001
     known_exact: bool = False
 
     def __post_init__(self) -> None:
-        check_counts(self, {"grid": 1, "known": 0, "jpeg": 0})
-        if self.jpeg > 100:
-            raise InputError(f"jpeg must be a quality of 1 to 100, or 0 for PNG, got {self.jpeg}")
-        check_not_negative(self, "noise_std", "lens_px", "blur_s")
-        check_fractions(self, "exposure_drift", "vignetting")
-        check_positive(self, "known_std_m")
+        check_ranges(self)
         if 0 < self.known < 4:
             raise InputError(f"known must be at least 4 points, or 0 for none, got {self.known}")
         if self.known and 0 in self.blackout:

@@ -9,14 +9,14 @@ The world's z axis points up; x runs along the longer side from the corner of th
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.ranges import MOST, Count, NotNegative, Positive, Range, Ranged, check_ranges
 from rbpf.validation.simulation import textures
-from rbpf.validation.simulation.limits import check_counts, check_not_negative, check_positive
 from rbpf.validation.simulation.paths import Drive, Move, Travelled, WheelOdometer, along_corners
 from rbpf.validation.simulation.textured_scene import Furniture, TexturedScene, stamps_ns
 from rbpf.validation.simulation.textures import Paint
@@ -395,15 +395,11 @@ class LabDrive:
     """
 
     trajectory: Trajectory = "tour"
-    frames: int | None = None
-    every: int = 1
+    frames: Annotated[int | None, Range(ge=2, le=MOST)] = None
+    every: Count = 1
 
     def __post_init__(self) -> None:
-        check_counts(self, {"every": 1})
-        if self.trajectory not in DRIVES:
-            raise InputError(f"trajectory must be one of {', '.join(DRIVES)}, got {self.trajectory!r}")
-        if self.frames is not None:
-            check_counts(self, {"frames": 2})
+        check_ranges(self)
         most = -(-DRIVES[self.trajectory][1] // self.every)
         if not 2 <= (self.frames or most) <= most:
             raise InputError(
@@ -434,7 +430,7 @@ def world_from_camera(world_from_robot: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class TexturedLab:
+class TexturedLab(Ranged):
     """Two rooms of 18 m × 10 m together, with shelves, tables, cabinets, cartons and posters.
 
     Attributes:
@@ -446,12 +442,8 @@ class TexturedLab:
 
     drive: LabDrive = LabDrive()
     odometer: WheelOdometer = field(default_factory=WheelOdometer)
-    texel_m: float = 0.003
-    contrast: float = 1.0
-
-    def __post_init__(self) -> None:
-        check_positive(self, "texel_m")
-        check_not_negative(self, "contrast")
+    texel_m: Positive = 0.003
+    contrast: NotNegative = 1.0
 
     def build(self, rng: np.random.Generator) -> TexturedScene:
         """Draws the furniture, the textures and the odometer's slip; the drive is always the same.

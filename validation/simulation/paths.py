@@ -12,15 +12,15 @@ agree at both ends.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
 import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3
+from rbpf.ranges import NotNegative, Positive, Range, Ranged, check_ranges
 from rbpf.runs.files import write_csv, write_text
 from rbpf.sensors.readers.wheel_odometry import MOTION, MOUNT, NAME, SIGMA, WheelOdometry
-from rbpf.validation.simulation.limits import check_not_negative, check_order, check_positive
 
 UP = np.array([0.0, 0.0, 1.0])
 TERMS = 3
@@ -136,22 +136,22 @@ class HandHeld:
         start_s: the camera reaches its pace after this time.
     """
 
-    nearest_m: float = 1.0
-    farthest_m: float = 1.5
+    nearest_m: Positive = 1.0
+    farthest_m: Positive = 1.5
     elevation_deg: float = 55.0
-    sweep_deg: float = 40.0
-    wander: float = 0.3
-    wrist_deg: float = 10.0
-    speed_m_s: float = 0.3
-    turn_rad_s: float = 0.5
-    tremor_m: float = 0.002
-    tremor_deg: float = 0.3
-    start_s: float = 1.0
+    sweep_deg: NotNegative = 40.0
+    wander: NotNegative = 0.3
+    wrist_deg: NotNegative = 10.0
+    speed_m_s: Positive = 0.3
+    turn_rad_s: Positive = 0.5
+    tremor_m: NotNegative = 0.002
+    tremor_deg: NotNegative = 0.3
+    start_s: NotNegative = 1.0
 
     def __post_init__(self) -> None:
-        check_positive(self, "nearest_m", "farthest_m", "speed_m_s", "turn_rad_s")
-        check_not_negative(self, "sweep_deg", "wander", "wrist_deg", "tremor_m", "tremor_deg", "start_s")
-        check_order(self, "nearest_m", "farthest_m")
+        check_ranges(self)
+        if not self.nearest_m < self.farthest_m:
+            raise InputError(f"nearest_m = {self.nearest_m} must be less than farthest_m = {self.farthest_m}")
         steepest = abs(self.elevation_deg) + RISE * self.sweep_deg
         if not steepest < 90.0:
             raise InputError(
@@ -348,8 +348,12 @@ def _fraction_by_way(move: Move, arm_m: float) -> Any:
     return CubicSpline(np.concatenate([[0.0], np.cumsum(pieces)]), fraction)
 
 
+Error = Annotated[float, Range(gt=-0.5, lt=0.5)]
+"""As a fraction of what is right."""
+
+
 @dataclass(frozen=True)
-class WheelOdometer:
+class WheelOdometer(Ranged):
     """Two driven wheels side by side, whose turns are counted.
 
     Wrong diameters and a wrong distance between the wheels err the same way all the time (J. Borenstein, L. Feng,
@@ -363,23 +367,13 @@ class WheelOdometer:
         inequality: the right one reports so much more than the left one, as a fraction: a drift of the heading.
         wheelbase_error: the robot takes the distance between its wheels for so much greater, as a fraction.
         slip_m: standard deviation of a wheel's error after 1 m, in m; it grows with the root of the way.
-
-    Raises:
-        InputError: a number makes no sense.
     """
 
-    wheelbase_m: float = 0.4
-    scale: float = 0.01
-    inequality: float = 0.002
-    wheelbase_error: float = 0.02
-    slip_m: float = 0.004
-
-    def __post_init__(self) -> None:
-        check_positive(self, "wheelbase_m")
-        check_not_negative(self, "slip_m")
-        for name in ("scale", "inequality", "wheelbase_error"):
-            if not abs(getattr(self, name)) < 0.5:
-                raise InputError(f"{name} must be between -0.5 and 0.5, got {getattr(self, name)!r}")
+    wheelbase_m: Positive = 0.4
+    scale: Error = 0.01
+    inequality: Error = 0.002
+    wheelbase_error: Error = 0.02
+    slip_m: NotNegative = 0.004
 
     def measure(
         self, travelled: Travelled, stamps_ns: np.ndarray, robot_from_camera: np.ndarray, rng: np.random.Generator

@@ -6,18 +6,19 @@ The folder has the layout of `rbpf.sensors.readers.mrpt`: odometry, observations
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Annotated
 
 import numpy as np
 
-from rbpf.errors import InputError
 from rbpf.lie import SE3
+from rbpf.ranges import MOST, Angle, Count, NotNegative, Positive, Range, Ranged
 from rbpf.runs.files import write_csv, write_text
 from rbpf.sensors.readers import RobotLog, open_log
 from rbpf.sensors.readers.robot_log import UNNAMED
 
 
 @dataclass(frozen=True)
-class RobotWorld:
+class RobotWorld(Ranged):
     """A robot that drives in a circle (planar) or along a tilted, waving loop (in space) among random landmarks.
 
     Attributes:
@@ -36,26 +37,19 @@ class RobotWorld:
         unnamed: the log does not say which landmark was observed.
     """
 
-    steps: int = 200
-    landmarks: int = 60
+    steps: Annotated[int, Range(ge=2, le=MOST)] = 200
+    landmarks: Count = 60
     spatial: bool = False
-    radius_m: float = 5.0
+    radius_m: Positive = 5.0
     laps: float = 2.0
-    extent_m: float = 9.0
-    max_range_m: float = 6.0
-    half_field_of_view_deg: float = 60.0
-    std_range_m: float = 0.02
-    std_angle_deg: float = 0.3
-    std_translation_m: float = 0.03
-    std_rotation_deg: float = 0.3
+    extent_m: Positive = 9.0
+    max_range_m: Positive = 6.0
+    half_field_of_view_deg: Angle = 60.0
+    std_range_m: Positive = 0.02
+    std_angle_deg: Positive = 0.3
+    std_translation_m: NotNegative = 0.03
+    std_rotation_deg: NotNegative = 0.3
     unnamed: bool = False
-
-    def __post_init__(self) -> None:
-        if self.steps < 2 or self.landmarks < 1:
-            raise InputError(f"a simulation needs at least 2 steps and 1 landmark, got {self.steps}, {self.landmarks}")
-        for name in ("radius_m", "extent_m", "max_range_m", "std_range_m", "std_angle_deg"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"{name} must be positive, got {getattr(self, name)}")
 
 
 def simulate_robot(world: RobotWorld, folder: Path, seed: int) -> None:
