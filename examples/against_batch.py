@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 from rbpf.runs.recordings import RobotRecording, filter_recording
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.consistency.against_batch import compare_run
-from rbpf.validation.report.offline_pictures import plot_against_batch
+from rbpf.validation.report.comparison_pictures import plot_against_batch
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 from rbpf.validation.tables import write_table
 

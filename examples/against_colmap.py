@@ -14,7 +14,7 @@ from rbpf.validation.colmap.against_colmap import compare_with_colmap
 from rbpf.validation.colmap.reconstruct import ReconstructionOptions
 from rbpf.validation.exports import export_colmap, export_ply
 from rbpf.validation.gtsam.batch_problem import problem_of
-from rbpf.validation.report.offline_pictures import plot_against_colmap
+from rbpf.validation.report.comparison_pictures import plot_against_colmap
 from rbpf.validation.simulation.desk_and_room import TexturedDesk
 from rbpf.validation.simulation.images import Imaging, simulate_images
 from rbpf.validation.tables import write_table

@@ -32,7 +32,6 @@ from rbpf.systems.map_estimate import MapEstimate
 from rbpf.validation.colmap.model import build_model
 from rbpf.validation.gtsam.batch_problem import Problem, read_problem
 from rbpf.validation.gtsam.observations import ObservationTable, observation_table
-from rbpf.validation.report.colours import colours_by_sigma, standard_deviations
 from rbpf.validation.report.rerun import AXIS_M, ellipsoids, log_pose, log_time, recording
 
 MAP, PATH, MODEL = "map.ply", "path.ply", "colmap"
@@ -40,6 +39,8 @@ MAP, PATH, MODEL = "map.ply", "path.ply", "colmap"
 NOMINAL = Pinhole(640, 480, 500.0, 500.0, 319.5, 239.5)
 """Camera that stands for a robot's sensor in a COLMAP model: it looks along the robot's x axis and measures nothing."""
 
+_STOPS = np.array([[13, 8, 135], [126, 3, 168], [204, 71, 120], [248, 149, 64], [240, 249, 33]], dtype=float)
+_QUANTILES = 0.05, 0.95
 _PATH_COLOUR = np.array([[31, 119, 180]], dtype=np.uint8)
 _BODY_FROM_CAMERA = SE3.from_matrix(np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0]]))
 
@@ -50,15 +51,12 @@ _NAMES = {"<f4": "float", "u1": "uchar", "<i4": "int"}
 
 
 def export_run(run: Path, formats: Sequence[str], out: Path) -> list[Path]:
-    """Writes a run in other formats.
+    """Writes a run in other formats; returns the files.
 
     Args:
         run: folder that `rbpf run` left.
         formats: names in `FORMATS`.
         out: folder for the files.
-
-    Returns:
-        What was written.
 
     Raises:
         InputError: it is no run folder, a format is not known, or its library is not installed.
@@ -79,10 +77,6 @@ def _tum(_run: Path, estimate: PathAndMap, out: Path) -> list[Path]:
 def _kitti(_run: Path, estimate: PathAndMap, out: Path) -> list[Path]:
     write_kitti(out / "trajectory_kitti.txt", estimate.trajectory)
     return [out / "trajectory_kitti.txt"]
-
-
-def _ply(_run: Path, estimate: PathAndMap, out: Path) -> list[Path]:
-    return [out / name for name in export_ply(estimate, out)]
 
 
 def _colmap(run: Path, estimate: PathAndMap, out: Path) -> list[Path]:
@@ -120,7 +114,7 @@ def _rerun(run: Path, estimate: PathAndMap, out: Path) -> list[Path]:
 FORMATS: dict[str, Callable[[Path, PathAndMap, Path], list[Path]]] = {
     "tum": _tum,
     "kitti": _kitti,
-    "ply": _ply,
+    "ply": lambda _run, estimate, out: [out / name for name in export_ply(estimate, out)],
     "colmap": _colmap,
     "rerun": _rerun,
     "npz": _npz,
@@ -158,15 +152,19 @@ def colmap_model(estimate: PathAndMap, problem: Problem | None) -> Any:
     landmarks = raised(estimate.landmarks)
     colours = colours_by_sigma(standard_deviations(estimate.landmarks.cov))
     if not isinstance(problem, FeatureLog):
-        body = estimate.trajectory.world_from_body
-        nothing = _no_observations(NOMINAL, landmarks.ids)
-        return build_model(nothing, SE3.compose(body, _BODY_FROM_CAMERA), landmarks.mean, colours)
+        none = np.zeros(0, dtype=np.intp)
+        nothing = ObservationTable(NOMINAL, none, none, landmarks.ids, np.zeros((0, 2)), np.zeros((0, 2, 2)))
+        poses = SE3.compose(estimate.trajectory.world_from_body, _BODY_FROM_CAMERA)
+        return build_model(nothing, poses, landmarks.mean, colours)
     if len(problem.frames) != len(estimate.stamps_ns):
         counts = f"{len(estimate.stamps_ns)} poses and {len(problem.frames)} frames"
         raise InputError(f"{problem.name}: expected a pose for each frame, found {counts}; take both from one run.")
-    return build_model(
-        _on_map(observation_table(problem), landmarks.ids), estimate.world_from_body, landmarks.mean, colours
-    )
+    # The observations of the map's landmarks, with the places of these in the map.
+    table, ids = observation_table(problem), landmarks.ids
+    order, kept = np.argsort(ids, kind="stable"), np.isin(table.names, ids)[table.index]
+    place = order[np.searchsorted(ids, table.names[table.index[kept]], sorter=order)]
+    shown = ObservationTable(table.camera, table.steps[kept], place, ids, table.z[kept], table.cov_z[kept])
+    return build_model(shown, estimate.world_from_body, landmarks.mean, colours)
 
 
 def export_ply(estimate: PathAndMap, folder: Path) -> list[str]:
@@ -188,17 +186,24 @@ def raised(landmarks: MapEstimate) -> MapEstimate:
     return replace(landmarks, mean=mean, cov=cov)
 
 
-def _on_map(table: ObservationTable, ids: NDArray[np.int64]) -> ObservationTable:
-    """The observations of the map's landmarks, with the places of these in the map."""
-    order = np.argsort(ids, kind="stable")
-    kept = np.isin(table.names, ids)[table.index]
-    place = order[np.searchsorted(ids, table.names[table.index[kept]], sorter=order)]
-    return ObservationTable(table.camera, table.steps[kept], place, ids, table.z[kept], table.cov_z[kept])
+def standard_deviations(cov: Array) -> Array:
+    """Root of the mean variance per axis of covariances (…, n, n) [m]: (…)."""
+    return np.sqrt(np.trace(cov, axis1=-2, axis2=-1) / cov.shape[-1])
 
 
-def _no_observations(camera: Pinhole, ids: NDArray[np.int64]) -> ObservationTable:
-    none = np.zeros(0, dtype=np.intp)
-    return ObservationTable(camera, none, none, ids, np.zeros((0, 2)), np.zeros((0, 2, 2)))
+def colours_by_sigma(std: Array) -> NDArray[np.uint8]:
+    """RGB (M, 3) of standard deviations (M,): dark blue (certain) to yellow (uncertain), on a logarithmic scale.
+
+    It reaches from their 5 % to their 95 % quantile.
+    """
+    if not len(std):
+        return np.zeros((0, 3), dtype=np.uint8)
+    logs = np.log(np.maximum(std, np.finfo(float).tiny))
+    low, high = np.quantile(logs, _QUANTILES)
+    fraction = np.clip((logs - low) / max(float(high - low), np.finfo(float).tiny), 0.0, 1.0)
+    at = fraction * (len(_STOPS) - 1)
+    stops = np.arange(len(_STOPS))
+    return np.stack([np.interp(at, stops, channel) for channel in _STOPS.T], axis=-1).round().astype(np.uint8)
 
 
 def write_ply(
@@ -221,7 +226,8 @@ def write_ply(
         InputError: a coordinate is not finite.
     """
     if not np.isfinite(points).all():
-        raise InputError(f"{path}: expected finite coordinates, found others in row {_first_bad(points)}.")
+        row = int(np.argmin(np.isfinite(points).all(axis=1)))
+        raise InputError(f"{path}: expected finite coordinates, found others in row {row}.")
     vertices = np.empty(len(points), dtype=_VERTEX + (_SIGMA if sigmas is not None else []))
     for axis, name in enumerate("xyz"):
         vertices[name] = points[:, axis]
@@ -232,24 +238,11 @@ def write_ply(
     lines = np.empty(0 if edges is None else len(edges), dtype=_EDGE)
     if edges is not None:
         lines["vertex1"], lines["vertex2"] = edges.T
+    header = ["ply", "format binary_little_endian 1.0"]
+    for name, elements in (("vertex", vertices), *([("edge", lines)] if len(lines) else [])):
+        header.append(f"element {name} {len(elements)}")
+        kinds = ((field, elements.dtype[field].str.replace("|", "")) for field in elements.dtype.names or ())
+        header += [f"property {_NAMES[kind]} {field}" for field, kind in kinds]
+    text = "\n".join([*header, "end_header", ""])
     with whole(path) as partial:
-        partial.write_bytes(_header(vertices, lines) + vertices.tobytes() + lines.tobytes())
-
-
-def _header(vertices: np.ndarray, lines: np.ndarray) -> bytes:
-    rows = ["ply", "format binary_little_endian 1.0"]
-    for name, elements in (("vertex", vertices), ("edge", lines)):
-        if name == "edge" and not len(elements):
-            continue
-        rows.append(f"element {name} {len(elements)}")
-        rows += [f"property {_NAMES[code]} {field}" for field, code in _fields(elements)]
-    return "\n".join([*rows, "end_header", ""]).encode("ascii")
-
-
-def _fields(elements: np.ndarray) -> list[tuple[str, str]]:
-    names = elements.dtype.names or ()
-    return [(name, elements.dtype[name].str.replace("|", "")) for name in names]
-
-
-def _first_bad(points: Array) -> int:
-    return int(np.argmin(np.isfinite(points).all(axis=1)))
+        partial.write_bytes(text.encode("ascii") + vertices.tobytes() + lines.tobytes())

@@ -89,19 +89,12 @@ def _images() -> str:
     return f"OpenCV {cv2.__version__}, with SIFT and video"
 
 
-def _gtsam() -> str:
+def _gtsam() -> None:
     gtsam = import_module("gtsam")
     graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
     graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(), gtsam.noiseModel.Unit.Create(6)))
     start.insert(0, gtsam.Pose3())
     gtsam.LevenbergMarquardtOptimizer(graph, start).optimize()
-    return f"GTSAM {_version('gtsam')}"
-
-
-def _colmap() -> str:
-    pycolmap = import_module("pycolmap")
-    pycolmap.Reconstruction()
-    return f"pycolmap {pycolmap.__version__}"
 
 
 def _ffmpeg() -> str:
@@ -110,37 +103,34 @@ def _ffmpeg() -> str:
     return path
 
 
-def _pictures() -> str:
-    figure = import_module("matplotlib.figure").Figure()
-    figure.canvas.draw()
-    return f"Matplotlib {_version('matplotlib')}"
+def _loaded(name: str, distribution: str, probe: Callable[[], object]) -> Callable[[], str]:
+    """A probe that says the version of a distribution."""
+
+    def say() -> str:
+        probe()
+        return f"{name} {version(distribution)}"
+
+    return say
 
 
-def _rerun() -> str:
-    import_module("rerun")
-    return f"rerun-sdk {_version('rerun-sdk')}"
-
-
-def _bags() -> str:
-    import_module("rosbags.rosbag1")
-    import_module("rosbags.rosbag2")
-    return f"rosbags {_version('rosbags')}"
-
-
-def _cluster() -> str:
-    import_module("distributed")
-    return f"Dask {_version('dask')}"
+def _bags() -> None:
+    for part in ("rosbag1", "rosbag2"):
+        import_module(f"rosbags.{part}")
 
 
 _PROBES: tuple[tuple[str, str, Callable[[], str]], ...] = (
     ("compiled kernels", "", _compiler),
     ("images and video", "", _images),
-    ("batch optimum", "", _gtsam),
-    ("reconstruction", "", _colmap),
+    ("batch optimum", "", _loaded("GTSAM", "gtsam", _gtsam)),
+    ("reconstruction", "", _loaded("pycolmap", "pycolmap", lambda: import_module("pycolmap").Reconstruction())),
     ("annotated video", "", _ffmpeg),
-    ("pictures", "", _pictures),
-    ("Rerun recordings", "viewing", _rerun),
-    ("ROS bags", "bags", _bags),
-    ("sweeps on a cluster", "cluster", _cluster),
+    (
+        "pictures",
+        "",
+        _loaded("Matplotlib", "matplotlib", lambda: import_module("matplotlib.figure").Figure().canvas.draw()),
+    ),
+    ("Rerun recordings", "viewing", _loaded("rerun-sdk", "rerun-sdk", lambda: import_module("rerun"))),
+    ("ROS bags", "bags", _loaded("rosbags", "rosbags", _bags)),
+    ("sweeps on a cluster", "cluster", _loaded("Dask", "dask", lambda: import_module("distributed"))),
 )
 """What it does, the extra that it comes with, how it is tried."""

@@ -13,10 +13,18 @@ from rbpf.runs.recordings import filter_robot_log as run
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.colmap.model import LEFT, RIGHT, build_model, from_colmap_pose, image_id, image_name
-from rbpf.validation.exports import MAP, PATH, colmap_model, export_colmap, export_ply, write_ply
+from rbpf.validation.exports import (
+    MAP,
+    PATH,
+    colmap_model,
+    colours_by_sigma,
+    export_colmap,
+    export_ply,
+    standard_deviations,
+    write_ply,
+)
 from rbpf.validation.gtsam.batch_problem import problem_of
 from rbpf.validation.gtsam.observations import observation_table, reprojection
-from rbpf.validation.report.colours import colours_by_sigma, standard_deviations
 from tests.validation.camera_scenes import BENT, FISHEYE, STEREO, scene
 from tests.validation.linear_worlds import linear_log
 

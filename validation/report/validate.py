@@ -26,7 +26,7 @@ Compare = Callable[[RunFolder], Comparison]
 
 def _groundtruth(record: RunFolder) -> Comparison:
     from rbpf.validation.consistency.against_groundtruth import compare_with_truth, truth_errors
-    from rbpf.validation.report.truth_pictures import draw_truth
+    from rbpf.validation.report.comparison_pictures import draw_truth
 
     errors = truth_errors(record)
     return replace(compare_with_truth(record, errors), pictures=draw_truth(record, errors))
@@ -39,7 +39,7 @@ def compare_gtsam(record: RunFolder, optimum: "Optimum | None" = None) -> Compar
         InputError: see `compare_with_batch`.
     """
     from rbpf.validation.consistency.against_optimisers import compare_with_batch
-    from rbpf.validation.report.offline_pictures import plot_against_batch
+    from rbpf.validation.report.comparison_pictures import plot_against_batch
 
     comparison, found = compare_with_batch(record, optimum)
     comparison = replace(comparison, pictures=plot_against_batch(found, record.folder, World.of(record)))
@@ -49,7 +49,7 @@ def compare_gtsam(record: RunFolder, optimum: "Optimum | None" = None) -> Compar
 
 def _camera_colmap(record: RunFolder) -> Comparison:
     from rbpf.validation.consistency.against_optimisers import compare_camera_with_colmap
-    from rbpf.validation.report.offline_pictures import plot_against_colmap
+    from rbpf.validation.report.comparison_pictures import plot_against_colmap
 
     comparison, found = compare_camera_with_colmap(record)
     pictures = plot_against_colmap(found.run, RunFolder.open(record.folder).estimate, record.folder)

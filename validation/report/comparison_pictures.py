@@ -1,0 +1,194 @@
+"""Pictures of a run beside the truth, its batch optimum and COLMAP's reconstruction, and the figures that they share."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rbpf.core.diagnostics import chi_square_band
+from rbpf.runs import plots
+from rbpf.runs.plots import COLOURS, SIGMAS, Views, World, label, moved_map, new_axes, outline, save_figures
+from rbpf.runs.reading import PathAndMap, RunFolder
+from rbpf.validation.colmap.compare import ColmapComparison
+from rbpf.validation.consistency.against_batch import AgainstBatch
+from rbpf.validation.consistency.against_groundtruth import TruthErrors
+from rbpf.validation.consistency.statistic import inverse_roots
+
+CLOSE = 0.95
+"""A map's picture holds this fraction of its landmarks; single ones far off do not make it small."""
+
+_LOWEST = 0.01
+"""NEES below this fraction of the band are drawn there."""
+
+
+def draw_truth(record: RunFolder, errors: TruthErrors) -> list[str]:
+    """Draws paths, errors with the filter's 3σ, NEES, landmarks and map into the run's folder; returns their names."""
+    rows, name, white = errors.truth.rows, record.name, errors.whitened
+    world = plots.World.of(record)
+    known, dim = white.ranks > 0, white.errors.shape[1]
+    figures = {
+        "groundtruth_path.png": plots.path_figure(record),
+        "groundtruth_error.png": plots.error_figure(record),
+        "groundtruth_nees.png": nees_figure(f"{name}: NEES", rows[known], white.nees[known], dim),
+    }
+    if errors.landmarks is not None:
+        found = errors.landmarks
+        title = f"{name}: landmarks against the truth"
+        figures["groundtruth_landmarks.png"] = landmark_figure(title, found.squares, found.white.shape[1])
+        ours, (mean, cov) = world.of_filter(record).positions, found.map.in_space()
+        true = np.pad(found.truth, ((0, 0), (0, 3 - found.truth.shape[1])))
+        title = f"{name}: map over the truth, in {world.name}"
+        figures["groundtruth_map.png"] = map_figure(title, ours, mean, cov, {"truth": true}, wide_axes(ours[rows]))
+    return plots.save_figures(figures, record.folder)
+
+
+def plot_against_batch(found: AgainstBatch, out: Path, world: World | None = None) -> list[str]:
+    """Paths, expected NEES, landmarks and map beside the batch posterior; returns the file names.
+
+    Args:
+        found: the comparison.
+        out: folder for the pictures.
+        world: in which they are drawn; by default the filter's own.
+    """
+    name, theirs, ours, world = found.name, found.optimum.estimate, found.ours, world or World()
+    both = {"batch": theirs.trajectory, "filter": found.filter.trajectory}
+    motions = {which: world.motion(path) for which, path in both.items()}
+    paths = {which: motions[which].transform(path.positions) for which, path in both.items()}
+    plane = wide_axes(paths["batch"])
+    figures = {"gtsam_path.png": path_figure(f"{name}: paths in {world.name}", paths, plane)}
+    cov, cov_batch, delta = found.pose_errors()
+    if len(cov):
+        roots, ranks = inverse_roots(cov)
+        nees = np.einsum("tab,tbc,tca->t", roots, cov_batch + delta[:, :, None] * delta[:, None], roots)
+        title, known = f"{name}: expected NEES under the batch posterior", ranks == cov.shape[-1]
+        figures["gtsam_nees.png"] = nees_figure(title, found.optimum.steps[known], nees[known], cov.shape[-1])
+    if len(found.landmarks):
+        title = f"{name}: landmarks against the batch optimum"
+        figures["gtsam_landmarks.png"] = landmark_figure(title, np.square(found.landmarks.sigmas), found.landmarks.dims)
+        rows = np.isin(ours.landmarks.ids, found.landmarks.keys)
+        mean, cov = moved_map(ours.landmarks, motions["filter"]).in_space(rows)
+        there = np.isin(theirs.landmarks.ids, found.landmarks.keys)
+        batch = moved_map(theirs.landmarks, motions["batch"]).in_space(there)[0]
+        title = f"{name}: map over the batch optimum, in {world.name}"
+        figures["gtsam_map.png"] = map_figure(title, paths["filter"], mean, cov, {"batch": batch}, plane)
+    return save_figures(figures, out)
+
+
+def plot_against_colmap(found: ColmapComparison, reference: PathAndMap, out: Path) -> list[str]:
+    """Both maps and paths in the reference's world, and the landmarks' nearest distances; returns the file names."""
+    figures = {"colmap_map.png": _colmap_map(found, reference)}
+    if found.cloud is not None:
+        title = f"{found.reconstruction.name}: landmarks to the surface of COLMAP's points"
+        figure, axes = new_axes(title, "landmarks", "distance [m]", equal=False)
+        axes.hist(found.cloud.surface_m, bins=20, color=COLOURS["filter"])
+        axes.axvline(float(np.median(found.cloud.surface_m)), color=COLOURS["truth"], lw=0.8, ls="--", label="median")
+        axes.legend(loc="best", fontsize="small")
+        figures["colmap_cloud.png"] = figure
+    return save_figures(figures, out)
+
+
+def _colmap_map(found: ColmapComparison, reference: PathAndMap) -> Any:
+    views = Views.of_camera(reference.trajectory.world_from_body)
+    figure, shown = views.axes(f"{found.reconstruction.name}: COLMAP brought onto the run")
+    move = found.reference_from_colmap
+    cloud, centres = (move.transform(found.reconstruction.points), move.transform(found.reconstruction.path.positions))
+    at, points = reference.trajectory.positions, reference.landmarks.mean
+    # What is shown: the map and the path, and a tenth more; COLMAP's far points would make it small.
+    everything = np.concatenate([points, at])
+    margin = 0.1 * np.ptp(everything, axis=0)
+    low, high = everything.min(axis=0) - margin, everything.max(axis=0) + margin
+    cloud = cloud[((cloud >= low) & (cloud <= high)).all(axis=1)]
+    for axes, (right, up) in shown:
+        axes.plot(cloud[:, right], cloud[:, up], ".", color=COLOURS["odometry"], ms=1.5, label="COLMAP's points")
+        axes.plot(points[:, right], points[:, up], ".", color=COLOURS["map"], ms=4, label="landmarks")
+        axes.plot(at[:, right], at[:, up], color=COLOURS["filter"], lw=1.2, label="filter")
+        axes.plot(centres[:, right], centres[:, up], "+", color=COLOURS["batch"], ms=6, label="COLMAP's key frames")
+    shown[0][0].legend(loc="best", fontsize="small")
+    return figure
+
+
+def wide_axes(positions: np.ndarray) -> tuple[int, int]:
+    """The two axes, in their order, along which positions (T, 3) extend most."""
+    first, second = sorted(np.argsort(-np.ptp(positions, axis=0), kind="stable")[:2].tolist())
+    return first, second
+
+
+def path_figure(title: str, curves: Mapping[str, np.ndarray], plane: tuple[int, int]) -> Any:
+    """Paths (T, 3) by name, in a plane of the world."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.0, 6.0), layout="constrained")
+    axes = figure.subplots()
+    right, up = plane
+    for name, at in curves.items():
+        style = "--" if name == "truth" else "-"
+        axes.plot(at[:, right], at[:, up], style, color=COLOURS[name], lw=1.2, label=name)
+        axes.plot(at[0, right], at[0, up], "o", color=COLOURS[name], ms=4)
+    label(axes, title, f"{'xyz'[right]} [m]", f"{'xyz'[up]} [m]", equal=True)
+    axes.legend(fontsize="small")
+    return figure
+
+
+def nees_figure(title: str, rows: np.ndarray, nees: np.ndarray, dim: int) -> Any:
+    """Normalised squared errors (R,) of one run over the steps, with the band of an honest filter."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.0, 4.0), layout="constrained")
+    axes, band = figure.subplots(), chi_square_band(dim)
+    axes.axhspan(band.low, band.high, color="tab:green", alpha=0.2, label="95 % band of an honest filter, each step")
+    axes.axhline(band.expected, color="tab:green", lw=0.8, label=f"its mean, {dim}")
+    shown = np.maximum(nees, _LOWEST * band.low)
+    axes.plot(rows, shown, color=COLOURS["filter"], lw=1.0, label="NEES of the pose")
+    label(axes, title, "step", "NEES", equal=False)
+    axes.set_yscale("log")
+    axes.set_ylim(bottom=0.8 * min(float(shown.min(initial=band.low)), 0.5 * band.low))
+    axes.legend(fontsize="small")
+    return figure
+
+
+def landmark_figure(title: str, squares: np.ndarray, dim: int) -> Any:
+    """Distances of landmarks (M,) in σ, in order, beside those that an honest filter's would have."""
+    from matplotlib.figure import Figure
+    from scipy.stats import chi2
+
+    figure = Figure(figsize=(7.0, 5.0), layout="constrained")
+    axes, count = figure.subplots(), squares.size
+    places = np.arange(1, count + 1)
+    right = np.sqrt(chi2.ppf((places - 0.5) / count, dim))
+    axes.plot(places, np.sqrt(np.sort(squares)), ".", color=COLOURS["map"], label="landmarks, in order")
+    axes.plot(places, right, color="tab:green", lw=1.0, label="independent landmarks of an honest filter")
+    label(axes, title, "landmark", "distance [σ of the filter]", equal=False)
+    axes.set_ylim(bottom=0.0)
+    axes.legend(fontsize="small")
+    return figure
+
+
+def map_figure(
+    title: str,
+    path: np.ndarray,
+    mean: np.ndarray,
+    cov: np.ndarray,
+    other: Mapping[str, np.ndarray],
+    plane: tuple[int, int],
+) -> Any:
+    """A map's points (M, 3) with ellipses from (M, 3, 3), over others' by name, in a plane of the world."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.0, 6.0), layout="constrained")
+    axes, chosen = figure.subplots(), list(plane)
+    axes.plot(*path[:, chosen].T, color=COLOURS["filter"], lw=0.8, alpha=0.6, label="path of the filter")
+    for name, points in other.items():
+        axes.plot(*points[:, chosen].T, "+", color=COLOURS[name], ms=7, label=f"landmarks: {name}")
+    axes.plot(*mean[:, chosen].T, ".", color=COLOURS["map"], ms=3, label=f"landmarks: filter, {SIGMAS:g}σ")
+    ellipses = outline(mean[:, chosen], cov[:, chosen][:, :, chosen])
+    axes.plot(ellipses[..., 0].T, ellipses[..., 1].T, color=COLOURS["map"], lw=0.7)
+    label(axes, title, f"{'xyz'[chosen[0]]} [m]", f"{'xyz'[chosen[1]]} [m]", equal=True)
+    shown = np.concatenate([path[:, chosen], *(points[:, chosen] for points in other.values()), mean[:, chosen]])
+    low, high = np.quantile(shown, [0.5 * (1.0 - CLOSE), 0.5 * (1.0 + CLOSE)], axis=0)
+    middle, half = 0.5 * (low + high), 0.65 * max(float((high - low).max()), 1e-3)
+    axes.set_xlim(middle[0] - half, middle[0] + half)
+    axes.set_ylim(middle[1] - half, middle[1] + half)
+    axes.set_aspect("equal", adjustable="box")
+    axes.legend(fontsize="small")
+    return figure
