@@ -4,7 +4,7 @@ Beside the table there are a plan of the laboratory with the robot's way, and a 
 """
 
 import csv
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -99,7 +99,7 @@ def smooth_part(px: np.ndarray, disparity: np.ndarray, rows: np.ndarray, width: 
     return np.asarray(design @ factors)
 
 
-def statistics(moments: Iterator[Moment]) -> dict[str, float]:
+def statistics(moments: Iterable[Moment]) -> dict[str, float]:
     """Means over all moments; the differences of rows and disparities pooled."""
     sift, counts = Sift(), []
     rows, rest, disparity = [], [], []
@@ -171,7 +171,8 @@ def main(
         quick: few small images.
     """
     width, moments = (320, 3) if quick else (640, moments)
-    table = {f"lab, noise {std:g}": statistics(rendered(seed, std, width, moments)) for std in noise_std}
+    taken = {f"lab, noise {std:g}": list(rendered(seed, std, width, moments)) for std in noise_std}
+    table = {name: statistics(pictures) for name, pictures in taken.items()}
     table |= {folder.name: statistics(recorded(folder, moments)) for folder in beside}
     out.mkdir(parents=True, exist_ok=True)
     names = list(next(iter(table.values())))
@@ -181,7 +182,8 @@ def main(
     for name in names:
         print(f"{name:>42}" + "".join(f"{entries[name]:18.3g}" for entries in table.values()))
     draw_plan(out / "plan.png", seed)
-    views = [moment.left for moment in rendered(seed, noise_std[-1], width, 3 if quick else 6)]
+    last = next(reversed(taken.values()))
+    views = [moment.left for moment in last[:: max(moments // 6, 1)][: 3 if quick else 6]]
     cv2.imwrite(str(out / "views.png"), np.vstack([np.hstack(views[k : k + 3]) for k in range(0, len(views), 3)]))
     return table
 

@@ -254,8 +254,12 @@ def _read_camera(table: "_Table", kind: str) -> Pinhole | RectifiedStereo:
     width, height = table.numbers("size", 2).tolist()
     lens = table.choice("lens", tuple(LENSES)) if "lens" in table.header else PLAIN
     fx, fy, cx, cy, *distortion = table.numbers("camera", 4 + len(LENSES[lens].coefficient_names)).tolist()
-    camera = Pinhole(int(width), int(height), fx, fy, cx, cy, tuple(distortion), lens)
-    return RectifiedStereo(camera, float(table.numbers("baseline", 1)[0])) if kind == "stereo" else camera
+    baseline = table.numbers("baseline", 1) if kind == "stereo" else None
+    try:
+        camera = Pinhole(int(width), int(height), fx, fy, cx, cy, tuple(distortion), lens)
+        return camera if baseline is None else RectifiedStereo(camera, float(baseline[0]))
+    except InputError as error:  # which does not know where the numbers are from
+        raise InputError(f"{table.path}: {error}") from None
 
 
 def _read_pose(table: "_Table", key: str, space: SE2Group | SE3Group) -> Array:

@@ -2,13 +2,12 @@
 
 import json
 import resource
-import shutil
 from contextlib import contextmanager
 
 import numpy as np
 import pytest
 
-from examples.studies.file_faults import FILE_FAULTS, damaged_copy, kill_and_resume
+from examples.studies.file_faults import FILE_FAULTS, damaged_copy
 from rbpf.cli import main
 from rbpf.errors import InputError
 from rbpf.runs.files import whole
@@ -91,11 +90,15 @@ def test_results_on_a_full_disk(desk, tmp_path, capsys, most_bytes):
 
 def test_no_room_for_checkpoints(desk, tmp_path):
     """The runs go on to the end and say it; the old checkpoint stays."""
-    place = tmp_path / "checkpoint.npz"
+    place = tmp_path / "run" / "checkpoint.npz"
+    place.parent.mkdir()
+    simulate_robot(RobotWorld(steps=FRAMES, landmarks=10), tmp_path / "log", seed=0)
     mono, stereo = MonoConfig(particles=8, checkpoint_every=5), StereoConfig(particles=20, checkpoint_every=5)
+    robot = RangeBearingConfig(particles=5, checkpoint_every=5)
     runs = {
         "mono": lambda: filter_images(open_images(desk), mono, checkpoint=place),
         "stereo": lambda: filter_pairs(open_stereo(desk), stereo, checkpoint=place),
+        "range-bearing": lambda: filter_recording(RobotRecording(tmp_path / "log"), robot, place.parent),
     }
     for run in runs.values():
         run()  # compiles what is not yet, which needs room as well
@@ -105,16 +108,7 @@ def test_no_room_for_checkpoints(desk, tmp_path):
         assert len(done.log) == FRAMES and done.failure is None
         assert sum("no checkpoint is kept" in words and "File too large" in words for words in done.messages) == 4
         assert place.read_bytes() == b"the last one"
-        assert [path.name for path in tmp_path.iterdir()] == ["checkpoint.npz"]
-
-
-def test_no_room_for_checkpoints_of_a_robot(tmp_path):
-    simulate_robot(RobotWorld(steps=12, landmarks=10), tmp_path / "log", seed=0)
-    with full_disk(1000):
-        config = RangeBearingConfig(particles=5, checkpoint_every=5)
-        done = filter_recording(RobotRecording(tmp_path / "log"), config, tmp_path)
-    assert done.system.filter.steps == 12
-    assert len(done.messages) == 3 and all("no checkpoint is kept" in words for words in done.messages)
+        assert [path.name for path in place.parent.iterdir()] == ["checkpoint.npz"]
 
 
 def test_a_place_that_cannot_be_written_to(tmp_path):
@@ -136,28 +130,3 @@ def test_a_stereo_run_is_finished_once(desk, tmp_path, monkeypatch):
     monkeypatch.setattr("rbpf.systems.stereo.slam.StereoSlam.take", None)
     assert main([*arguments, "--resume"]) == 0
     assert (out / "trajectory.tum").read_bytes() == first
-
-
-def test_killed_at_random_moments_and_resumed(desk, tmp_path):
-    every = ["--set", "checkpoint_every=2"]
-    assert main(command(desk, tmp_path / "whole", *every)) == 0
-    out = tmp_path / "killed"
-    ended = kill_and_resume(command(desk, out, *every), out, 2, np.random.default_rng(1), longest_s=0.5)
-    assert ended.code == 0 and not ended.traceback
-    for name in ("trajectory.tum", "map.csv", "diagnostics.csv", "observations.csv"):
-        assert (out / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
-
-
-def test_a_damaged_checkpoint_leaves_the_results(desk, tmp_path, capsys):
-    out = tmp_path / "run"
-    assert main(command(desk, out)) == 0
-    before = {path.name: path.read_bytes() for path in out.iterdir()}
-    checkpoint = out / "checkpoint.npz"
-    checkpoint.write_bytes(checkpoint.read_bytes()[:-700])
-    capsys.readouterr()
-    assert main(command(desk, out, "--resume")) == 2
-    assert "checkpoint.npz is damaged or cut off" in said(capsys)
-    assert {path.name: path.read_bytes() for path in out.iterdir() if path != checkpoint} == {
-        name: data for name, data in before.items() if name != "checkpoint.npz"
-    }
-    shutil.rmtree(out)

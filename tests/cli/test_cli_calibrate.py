@@ -68,20 +68,6 @@ def test_a_fisheye_is_written_for_the_readers(tmp_path, capsys):
     assert open_images(folder, tmp_path / "out" / "camera.yaml").camera == camera
 
 
-@pytest.mark.slow
-def test_a_video_is_as_good(tmp_path, capsys):
-    path = tmp_path / "board.avi"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"FFV1"), 5.0, (CAMERA.width, CAMERA.height))
-    for image in pictures():
-        writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
-    writer.release()
-    assert calibrate(path, tmp_path / "out") == 0
-    camera = read_calibration(tmp_path / "out" / "camera.yaml").camera
-    np.testing.assert_allclose(camera.params[:4], CAMERA.params[:4], atol=1.0)
-    said = capsys.readouterr().err
-    assert "reprojection error" in said and "will bend" not in said
-
-
 def test_a_camera_that_is_not_known_well_is_said_to_be(images, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("rbpf.cli.cameras.LOOSE", 1e-5)
     assert calibrate(images, tmp_path / "out") == 0

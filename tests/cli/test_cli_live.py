@@ -7,7 +7,6 @@ import yaml
 
 from rbpf.cli import main
 from rbpf.sensors.readers import open_images
-from tests.cli.mono_sequences import render_desk
 
 
 class Player:
@@ -26,13 +25,6 @@ class Player:
     def read(self):
         image = next(self.given, None)
         return (False, None) if image is None else (True, cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
-
-
-@pytest.fixture(scope="module")
-def desk(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("live") / "desk"
-    render_desk(folder)
-    return folder
 
 
 def test_a_camera_is_filtered_until_it_is_gone(desk, tmp_path, monkeypatch):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
-from rbpf.cli import APP, main
+from rbpf.cli import main
 from rbpf.cli.compiling import cached, compile_kernels, kernel_modules
 from rbpf.runs.provenance import instruction_set
 from tests.cli.run_outputs import outputs
@@ -86,16 +86,15 @@ def test_bad_input_is_exit_code_2_and_a_fault_is_1(log, tmp_path):
 def longer(tmp_path_factory):
     """A log that is filtered for a second or two, its run from beginning to end, and what says how to run it."""
     folder = tmp_path_factory.mktemp("longer")
-    assert main(["simulate", "range-bearing", "--out", str(folder / "log"), "--steps", "600"]) == 0
+    assert main(["simulate", "range-bearing", "--out", str(folder / "log"), "--steps", "300"]) == 0
     words = ["run", "range-bearing", str(folder / "log")]
     words += ["--particles", "300", "--no-batch", "--set", "checkpoint_every=100000", "--out"]
     assert main([*words, str(folder / "whole")]) == 0
     return outputs(folder / "whole"), words
 
 
-@pytest.mark.parametrize("after", [0.0, 0.4])
-def test_ctrl_c_leaves_a_run_that_resumes_to_the_same_bytes(longer, tmp_path, after):
-    """A real signal to a real process, at two moments."""
+def test_ctrl_c_leaves_a_run_that_resumes_to_the_same_bytes(longer, tmp_path):
+    """A real signal to a real process, at whatever moment."""
     whole, words = longer
     cut = [*words, str(tmp_path / "cut")]
     process = subprocess.Popen(
@@ -103,12 +102,12 @@ def test_ctrl_c_leaves_a_run_that_resumes_to_the_same_bytes(longer, tmp_path, af
     )
     assert process.stdout is not None
     assert process.stdout.readline() == "filtering\n"
-    time.sleep(after)
+    time.sleep(0.2)
     process.send_signal(signal.SIGINT)
     _, error = process.communicate(timeout=120)
     assert process.returncode == 130, error
-    said = re.search(r"stopped after (\d+) of 600; the same command with --resume goes on", " ".join(error.split()))
-    assert said is not None and 5 <= int(said[1]) < 600
+    said = re.search(r"stopped after (\d+) of 300; the same command with --resume goes on", " ".join(error.split()))
+    assert said is not None and 5 <= int(said[1]) < 300
     assert (tmp_path / "cut" / "checkpoint.npz").exists()
     assert not (tmp_path / "cut" / "summary.json").exists()
     assert main([*cut, "--resume"]) == 0
@@ -188,7 +187,3 @@ def test_the_first_compilation_is_announced_before_it_begins(log, tmp_path):
     )  # fmt: skip
     assert "compiling" in done.stdout and "done once" in done.stdout
     assert not list(cache.rglob("*.nb?"))
-
-
-def test_the_program_has_one_entry():
-    assert APP.cli is not None

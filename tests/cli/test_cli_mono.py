@@ -15,6 +15,7 @@ from rbpf.lie import SE3
 from rbpf.runs.measurement_files import read_feature_log
 from rbpf.runs.recordings import filter_features as filter_log
 from rbpf.runs.trajectory import read_tum
+from rbpf.sensors.readers.images.calibration import read_calibration
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.validation.gtsam.camera import CameraEstimate, solve_features
 from rbpf.validation.gtsam.observations import HUBER
@@ -222,18 +223,6 @@ def test_the_program_starts_without_rerun_and_encoder(monkeypatch):
         assert importlib.reload(importlib.import_module(f"rbpf.validation.{name}"))
 
 
-def test_rendered_sequences_can_be_opened(tmp_path):
-    from rbpf.sensors.readers import open_images, read_known_points
-
-    arguments = ["--frames", "2", "--width", "96", "--height", "72", "--noise-std", "0"]
-    for world in ("desk", "room"):
-        out = tmp_path / world
-        assert main(["simulate", world, "--out", str(out), *arguments]) == 0
-        sequence = open_images(out)
-        assert len(sequence) == 2 and sequence.camera.width == 96
-        assert read_known_points(out / "known_points.csv").names.size == 6
-
-
 def test_a_run_is_compared_with_its_batch_optimum_afterwards(finished, tmp_path):
     """From the files in the folder alone, with the figures that the run itself had."""
     folder = tmp_path / "run"
@@ -245,3 +234,13 @@ def test_a_run_is_compared_with_its_batch_optimum_afterwards(finished, tmp_path)
     assert written["figures"]["landmarks_count"] > 0
     assert all((folder / name).is_file() for name in written["pictures"]) and written["pictures"]
     assert "Against gtsam" in (folder / "report.html").read_text()
+
+
+def test_a_run_calibrates_its_camera(finished, tmp_path, capsys):
+    assert main(["recalibrate", str(finished), "--out", str(tmp_path / "out"), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    camera = read_calibration(tmp_path / "out" / "camera.yaml").camera
+    assert told["fx"] == {"before": CAMERA.fx, "after": pytest.approx(camera.fx, abs=1e-6)}
+    assert told["k1"]["after"] == pytest.approx(camera.distortion[0], abs=1e-8)
+    assert told["error_after"] <= told["error_before"]
+    assert (camera.width, camera.height, camera.cx) == (CAMERA.width, CAMERA.height, CAMERA.cx)

@@ -3,8 +3,6 @@
 import subprocess
 import sys
 
-import pytest
-
 from rbpf import __version__
 from rbpf.cli import main
 
@@ -19,9 +17,8 @@ def test_python_m():
     assert done.stdout == f"rbpf {__version__}\n"
 
 
-@pytest.mark.parametrize("words", [["--version"], ["completion", "bash"]])
-def test_a_broken_pipe_ends_quietly(words):
-    command = [sys.executable, "-m", "rbpf", *words]
+def test_a_broken_pipe_ends_quietly():
+    command = [sys.executable, "-m", "rbpf", "completion", "bash"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         process.stdout.close()
         error = process.stderr.read().decode()

@@ -18,7 +18,7 @@ LONGEST_SENSOR = 40
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", [*EXAMPLES, *STUDIES], ids=lambda path: path.stem)
-def test_example_shows_what_it_promises(path, capsys, monkeypatch, tmp_path):
+def test_example_shows_what_it_promises(path, capsys, monkeypatch, tmp_path, plain_pictures):
     monkeypatch.syspath_prepend(path.parent)
     main = importlib.import_module(path.stem if path in EXAMPLES else f"examples.studies.{path.stem}").main
     draws = "quick" in inspect.signature(main).parameters

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from examples.studies.fault_matrix import summarised, try_stereo, usual_faults
+from examples.studies.fault_matrix import try_stereo, usual_faults
 from examples.studies.image_faults import (
     black_out,
     blur_motion,
@@ -16,8 +16,7 @@ from examples.studies.image_faults import (
     salt_and_pepper,
     truncate_files,
 )
-from examples.studies.mono_blackouts import Dark, Outcome, Series, pose_differences
-from rbpf.lie import SE3
+from examples.studies.mono_blackouts import Dark, Outcome, Series
 from rbpf.sensors.readers import ImageSequence
 from rbpf.systems.stereo.config import StereoConfig
 from tests.systems.plane_sequences import sequence
@@ -103,11 +102,6 @@ def test_something_passes_through_the_view(whole):
     assert (np.diff(middle) > 0.0).all()
 
 
-def test_the_same_sentence_is_told_once():
-    said = ["frame 3: it is dark", "frame 4: it is dark", "pair 7 of lab: cut", "frame 9: found again"]
-    assert summarised(said) == ["it is dark (x2)", "cut", "found again"]
-
-
 @pytest.mark.slow
 def test_verdicts_on_pairs():
     """A dark half second is recovered from; everything dark from the third pair on is not, and is said."""
@@ -156,13 +150,3 @@ def test_the_pose_is_judged_when_it_has_settled(series):
 def test_the_light_goes_out_and_on():
     images = [frame.image.max() for frame in Dark(sequence(10).source, range(3, 5), 7).frames(2)]
     assert [bool(level) for level in images] == [True, False, False, True, True]
-
-
-def test_differences_of_poses():
-    turn, shift = np.deg2rad(30.0), 0.4
-    pose = SE3.exp([0.3, -0.2, 0.5, 1.0, 2.0, 3.0])
-    moved = SE3.compose(
-        SE3.exp([0.0, 0.0, 0.0, shift, 0.0, 0.0]), SE3.compose(pose, SE3.exp([0.0, turn, 0.0, 0, 0, 0]))
-    )
-    metres, degrees = pose_differences(moved[None], pose[None])
-    assert (metres[0], degrees[0]) == pytest.approx((shift, 30.0))

@@ -4,24 +4,12 @@ import numpy as np
 import pytest
 
 from examples.studies.e06.depth_curves import Passing, shape_of
-from examples.studies.e06.depth_from_images import follow
 from examples.studies.e06.loop import AWAY, find_closure, started_until
-from examples.studies.e06.many_landmarks import fill
 from examples.studies.e06.new_landmarks import line_distances, line_lengths
 from examples.studies.e06.plane import fit_plane
-from examples.studies.e06.setting import Setting
-from examples.studies.e06.worlds import LoopOverDesk, SidewaysDesk, StillTarget
-from examples.studies.s05.drive import Setting as Drive
 from examples.studies.s05.record import Best, Paths, Record, errors
-from examples.studies.s05.sweeps import settings
-from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.runs.recordings import filter_images
 from rbpf.sensors.camera import Pinhole
-from rbpf.systems.mono.config import MonoConfig, SearchConfig
-from rbpf.validation.simulation.render import Renderer
-from rbpf.validation.simulation.textured_scene import cast
-from tests.systems.plane_sequences import known_points, sequence
 
 cv2 = pytest.importorskip("cv2")
 
@@ -98,66 +86,6 @@ def test_the_likelihood_of_depth_has_its_peak_at_the_truth():
     assert 1.0 / rho[curves[-1, 0].argmax()] == pytest.approx(1.7, rel=2e-3)
 
 
-def test_the_map_is_filled_with_landmarks_that_are_never_looked_for():
-    added, held, searched = [], [], []
-
-    def watch(run, _):
-        t = len(run.log) - 1
-        if t == 5:
-            first = len(run.system.sensor.table)
-            fill(run, 500, np.random.default_rng(0))
-            added.extend(range(first, len(run.system.sensor.table)))
-            held.append(run.system.filter.belief().map.ids.size)
-        elif t > 5:
-            searched.extend(run.system.measurement.search.features.tolist())
-
-    run = filter_images(sequence(10), MonoConfig(particles=5), known_points(), [watch])
-    assert held == [500]
-    assert run.system.filter.belief().map.ids.size >= 500
-    assert len(added) > 400 and len(searched) > 40
-    assert not set(added) & set(searched)
-    assert not run.log.lost().any()
-
-
-def test_the_poster_s_corners_are_where_the_picture_shows_them():
-    world = StillTarget(frames=2)
-    scene = world.build(np.random.default_rng(0))
-    image = Renderer(scene.rectangles, CAMERA).image(scene.world_from_camera[0])
-    known = world.known(CAMERA, 0.0, 0.0, np.random.default_rng(1))
-    found = cv2.cornerSubPix(
-        np.clip(image, 0, 255).astype(np.uint8), known.px.astype(np.float32)[:, None] + 1.0, (5, 5), (-1, -1),
-        (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 50, 1e-3),
-    )  # fmt: skip
-    assert np.abs(found[:, 0] - known.px).max() < 0.4
-    normal = np.linalg.svd(known.positions - known.positions.mean(axis=0))[1]
-    assert normal[2] == pytest.approx(0.0, abs=1e-12)
-
-
-def test_the_loop_comes_back_and_the_sideways_camera_goes_straight():
-    path = LoopOverDesk(frames=200, texel_m=0.02).build(np.random.default_rng(0)).world_from_camera
-    places = SE3.translation(path)
-    assert np.linalg.norm(places - places[0], axis=1).max() > 1.2
-    assert np.linalg.norm(places[150:] - places[0], axis=1).min() < 0.1
-    straight = SidewaysDesk(texel_m=0.02).build(np.random.default_rng(0)).world_from_camera
-    steps = SE3.between(straight[:-1], straight[1:])
-    assert SE3.translation(steps) == pytest.approx(np.tile([0.02, 0.0, 0.004], (10, 1)), abs=1e-12)
-
-
-def test_features_are_followed_to_where_they_truly_are(tmp_path):
-    world = SidewaysDesk(frames=4, texel_m=0.002)
-    setting = Setting(tmp_path, quick=True)
-    sequence, _ = setting.sequence("sideways", world)
-    px, track = follow(sequence, 12, SearchConfig())
-    scene = world.build(np.random.default_rng(setting.seed))
-    uv = setting.camera.unproject(px)
-    depth, _ = cast(scene.rectangles, scene.world_from_camera[0], uv)
-    points = SE3.transform(scene.world_from_camera[0], depth[:, None] * np.column_stack([uv, np.ones(len(uv))]))
-    seen = setting.camera.project(SE3.inverse_transform(scene.world_from_camera[1:, None], points))
-    away = np.linalg.norm(np.moveaxis(seen, 0, 1) - track, axis=-1)
-    assert np.isfinite(away).mean() > 0.7
-    assert np.nanmedian(away) < 0.5
-
-
 def path(count: int, rng: np.random.Generator, noise: float) -> np.ndarray:
     steps = np.zeros((count, 6))
     steps[:, 1], steps[:, 5] = 0.1, 0.2
@@ -203,13 +131,3 @@ def test_errors_of_maps_and_paths(scene):
     assert found["map, odometry"] > found["map, odometry, aligned"] > 0.005
     length = np.linalg.norm(true[-1, 4:])
     assert found["end, odometry"] == pytest.approx(0.05 * length)
-
-
-def test_sweeps_change_one_thing(tmp_path):
-    base = Drive(tmp_path).config()
-    assert base.dof == 3 and base.particles == 400
-    for name, config in settings(base).items():
-        changed = [item for item in vars(base) if getattr(config, item) != getattr(base, item)]
-        assert len(changed) == (0 if name == "as it is" else 2 if name.startswith("refined") else 1), name
-    with pytest.raises(InputError, match="dof must be 3 or 6"):
-        Drive(tmp_path, dof=4).config()

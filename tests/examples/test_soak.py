@@ -92,7 +92,7 @@ def test_what_is_held_is_counted_once():
 @pytest.mark.parametrize("lag", [50, None])
 def test_a_long_run(lag):
     """With a lag neither memory nor error grows, nor the time by half; without one the memory is seen to grow."""
-    renewal, steps = (0.004, 3000) if lag is None else (0.002, 6000)
+    renewal, steps = (0.008, 1500) if lag is None else (0.006, 2000)
     stream = RobotStream(Turnover(renewal=renewal), 0)
     filter_, step = robot_steps(stream, RangeBearingConfig(particles=10, lag=lag), forget=steps // 20)
     windows = list(soak(stream, filter_, step, steps, steps // 20))
@@ -112,9 +112,9 @@ def test_a_long_run(lag):
 
 @pytest.mark.slow
 def test_a_long_monocular_run():
-    stream = CameraStream(Turnover(renewal=0.002), 0)
-    filter_, step = camera_steps(stream, MonoConfig(particles=10, lag=50), forget=300)
-    windows = list(soak(stream, filter_, step, 2400, 300))
+    stream = CameraStream(Turnover(renewal=0.004), 0)
+    filter_, step = camera_steps(stream, MonoConfig(particles=10, lag=50), forget=150)
+    windows = list(soak(stream, filter_, step, 1200, 150))
     held = np.array([window.held_kb for window in windows[2:]])
     assert windows[-1].started > 2 * windows[-1].landmarks
     assert held.max() < 1.1 * held.min()

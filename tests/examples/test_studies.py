@@ -5,19 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from examples.studies.consistency_runs import Consistency, DeskTrial, RobotTrial, Trial, left_for_good, run_trials
+from examples.studies.consistency_runs import Consistency, DeskTrial, Trial, left_for_good, run_trials
 from examples.studies.mono_realism import measure_search, survival
 from examples.studies.point_worlds import STEREO, DeskWorld, LabWorld, Measuring, simulate_features
-from examples.studies.stereo_revisit import log_there_and_back, pairs_there_and_back
-from rbpf.errors import InputError
-from rbpf.sensors.camera import Pinhole, RectifiedStereo
-from rbpf.sensors.readers import open_stereo
+from examples.studies.stereo_revisit import log_there_and_back
+from rbpf.sensors.camera import Pinhole
 from rbpf.systems.mono.config import MonoConfig
-from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.simulation.desk_and_room import TexturedDesk
 from rbpf.validation.simulation.images import Imaging, simulate_images
-from rbpf.validation.simulation.lab import LabDrive, TexturedLab
-from rbpf.validation.simulation.robot import RobotWorld
+from rbpf.validation.simulation.lab import LabDrive
 
 
 def honest(rng: np.random.Generator, scale: float = 1.0, steps: int = 60) -> Trial:
@@ -65,34 +61,6 @@ def test_leaving_for_good_is_what_the_definition_says():
     for _ in range(200):
         mean = rng.normal(size=50).cumsum() * 0.3 + rng.normal(size=50)
         assert left_for_good(mean, 0.5) == by_definition(mean, 0.5)
-
-
-@pytest.mark.parametrize(
-    ("nees", "expected"),
-    [
-        (np.ones(40), None),
-        (np.where(np.arange(40) >= 20, 5.0, 1.0), 20),
-        (np.where((np.arange(40) >= 20) & (np.arange(40) != 30), 5.0, 1.0), 20),
-        (np.where(np.arange(40) == 10, 5.0, 1.0), None),
-        (np.where(np.arange(40) >= 35, 5.0, 1.0), None),
-        (np.where(np.arange(40) >= 1, 5.0, np.nan), 1),
-    ],
-    ids=["never", "at 20", "with one step back", "one step out", "too late to tell", "after a start known exactly"],
-)
-def test_single_steps_neither_begin_nor_end_overconfidence(nees, expected):
-    assert left_for_good(nees, 2.0) == expected
-
-
-@pytest.mark.slow
-def test_a_robot_that_is_told_three_times_too_little_noise_is_overconfident():
-    from examples.studies.verdict import scale_sensor_noise
-
-    trial = RobotTrial(RobotWorld(steps=50), RangeBearingConfig(particles=50))
-    good = run_trials(trial, range(3))
-    bad = run_trials(replace(trial, spoil=lambda log, rng: scale_sensor_noise(log, 1 / 3)), range(3))
-    assert good.pose_nees.value < 4.0 < bad.pose_nees.value
-    assert 0.8 < good.nis.value < 1.3 < 5.0 < bad.nis.value
-    assert bad.overconfident_from is not None
 
 
 def test_a_desk_trial_counts_points_and_ancestors():
@@ -147,24 +115,3 @@ def test_pixels_come_again_in_reverse():
         np.testing.assert_array_equal(both.truth.world_from_camera[t], log.truth.world_from_camera[row])
     np.testing.assert_array_equal(both.truth.stamps_ns, np.arange(7))
     assert log_there_and_back(replace(log, truth=None)).truth is None
-
-
-@pytest.mark.slow
-def test_pairs_come_again_in_reverse(tmp_path):
-    rig = RectifiedStereo(Pinhole(80, 60, 62.5, 62.5, 39.5, 29.5), 0.12)
-    world, imaging = TexturedLab(LabDrive(frames=3), texel_m=0.05), Imaging(known=0)
-    simulate_images(world, imaging, rig, tmp_path / "lab", seed=0)
-    sequence = open_stereo(tmp_path / "lab")
-    before, both = list(sequence.frames()), pairs_there_and_back(sequence)
-    after = list(both.frames())
-    step = int(np.median(np.diff(sequence.stamps_ns)))
-    assert [frame.stamp_ns for frame in after] == [t * step for t in range(5)]
-    for frame, row in zip(after, [0, 1, 2, 1, 0], strict=True):
-        np.testing.assert_array_equal(frame.image, before[row].image)
-        np.testing.assert_array_equal(frame.right, before[row].right)
-    poses = both.truth.world_from_camera
-    np.testing.assert_array_equal(poses, poses[::-1])
-    assert not np.array_equal(poses[0], poses[2])
-    assert len(list(both.frames(3))) == 2
-    with pytest.raises(InputError, match="ground truth"):
-        pairs_there_and_back(replace(sequence, truth=None))

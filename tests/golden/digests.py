@@ -17,7 +17,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -27,7 +26,6 @@ import numpy as np
 DATA = Path(os.environ.get("RBPF_DATA", "../shared/data")).resolve()
 RBPF = [sys.executable, "-m", "rbpf"]
 TIMES = ("ms_per_", "peak_memory", "seconds", "_ms", "milliseconds")
-MONO_FEATURES = "tests.golden.run_named_features"
 
 
 def rbpf(*words: Any) -> None:
@@ -62,48 +60,35 @@ def beginning(name: str, frames: int, folder: Path) -> Path:
     return target
 
 
-def cases(work: Path) -> dict[str, Callable[[Path], None]]:
-    """What is run, by name."""
+def cases(work: Path) -> dict[str, tuple[Any, ...]]:
+    """What is run, by name; a run whose name ends in `resumed` is interrupted once."""
     desk, pairs, plane, space = work / "desk", work / "pairs", work / "plane", work / "space"
     rbpf("simulate", "desk", "--frames", 45, "--width", 320, "--height", 240, "--out", desk)
     rbpf("simulate", "desk", "--frames", 20, "--baseline-m", 0.1, "--width", 320, "--height", 240, "--out", pairs)
     rbpf("simulate", "range-bearing", "--steps", 80, "--out", plane)
     rbpf("simulate", "range-bearing", "--steps", 60, "--spatial", "--out", space)
     kitchen = beginning("mono_redkitchen_a", 60, work)
-    mono, stereo, robot = ("run", "mono"), ("run", "stereo"), ("run", "range-bearing")
-    known = ("--known-points", desk / "known_points.csv")
-
-    def localise(out: Path) -> None:
-        rbpf(*mono, desk, *known, "--no-video", "--no-batch", "--out", work / "mapped")
-        rbpf(*mono, desk, "--map", work / "mapped", "--localize", "--no-video", "--no-batch", "--out", out)
-
+    mono, stereo, robot = ("run", "mono"), ("run", "stereo", "--no-video"), ("run", "range-bearing")
+    known = ("--known-points", desk / "known_points.csv", "--no-video")
+    few = ("--particles", 50, "--no-batch")
+    rbpf(*mono, desk, *known, "--no-batch", "--out", work / "mapped")
     return {
-        "robot_plane": lambda out: rbpf(*robot, plane, "--out", out),
-        "robot_space": lambda out: rbpf(*robot, space, "--out", out),
-        "robot_unknown": lambda out: rbpf(*robot, plane, "--association", "ml", "--out", out),
-        "robot_resumed": lambda out: interrupted(out, *robot, plane, "--set", "checkpoint_every=10"),
-        "robot_real": lambda out: rbpf(*robot, DATA / "mrpt_kf_slam_6d", "--out", out),
-        "mono_known": lambda out: rbpf(*mono, desk, *known, "--no-video", "--out", out),
-        "mono_points": lambda out: rbpf(*mono, desk, *known, "--set", "known=points", "--no-video", "--out", out),
-        "mono_unknown": lambda out: rbpf(*mono, desk, "--no-video", "--no-batch", "--out", out),
-        "mono_resumed": lambda out: interrupted(
-            out, *mono, desk, *known, "--set", "checkpoint_every=10", "--no-video", "--no-batch"
-        ),
-        "mono_localised": localise,
-        "mono_real": lambda out: rbpf(
-            *mono, kitchen, "--known-points", kitchen / "known_points.csv", "--no-video", "--out", out
-        ),
-        "mono_features": lambda out: subprocess.run([sys.executable, "-m", MONO_FEATURES, out], check=True),
-        "stereo_rendered": lambda out: rbpf(*stereo, pairs, "--no-video", "--out", out),
-        "stereo_resumed": lambda out: interrupted(
-            out, *stereo, pairs, "--particles", 50, "--set", "checkpoint_every=5", "--no-video", "--no-batch"
-        ),
-        "stereo_real": lambda out: rbpf(
-            *stereo, DATA / "stereo_kitti_seq1", "--particles", 100, "--no-video", "--no-batch", "--out", out
-        ),
-        "stereo_refined": lambda out: rbpf(
-            *stereo, pairs, "--particles", 50, "--set", "proposal.kind=ekf", "--set", "likelihood.kind=outliers",
-            "--dof", 3, "--no-video", "--no-batch", "--out", out,
+        "robot_plane": (*robot, plane),
+        "robot_space": (*robot, space),
+        "robot_unknown": (*robot, plane, "--association", "ml"),
+        "robot_resumed": (*robot, plane, "--set", "checkpoint_every=10"),
+        "robot_real": (*robot, DATA / "mrpt_kf_slam_6d"),
+        "mono_known": (*mono, desk, *known),
+        "mono_points": (*mono, desk, *known, "--set", "known=points"),
+        "mono_unknown": (*mono, desk, "--no-video", "--no-batch"),
+        "mono_resumed": (*mono, desk, *known, "--set", "checkpoint_every=10", "--no-batch"),
+        "mono_localised": (*mono, desk, "--map", work / "mapped", "--localize", "--no-video", "--no-batch"),
+        "mono_real": (*mono, kitchen, "--known-points", kitchen / "known_points.csv", "--no-video"),
+        "stereo_rendered": (*stereo, pairs),
+        "stereo_resumed": (*stereo, pairs, *few, "--set", "checkpoint_every=5"),
+        "stereo_real": (*stereo, DATA / "stereo_kitti_seq1", "--particles", 100, "--no-batch"),
+        "stereo_refined": (
+            *stereo, pairs, *few, "--dof", 3, "--set", "proposal.kind=ekf", "--set", "likelihood.kind=outliers"
         ),
     }  # fmt: skip
 
@@ -147,12 +132,15 @@ def all_digests(only: list[str]) -> dict[str, dict[str, str]]:
     """Of all cases, two at a time."""
     with tempfile.TemporaryDirectory() as name, ThreadPoolExecutor(2) as pool:
         work = Path(name)
-        chosen = {case: run for case, run in cases(work).items() if not only or case in only}
+        chosen = {case: words for case, words in cases(work).items() if not only or case in only}
 
         def one(case: str) -> dict[str, str]:
-            started = time.monotonic()
-            chosen[case](work / case)
-            found = digests_of(work / case)
+            started, out = time.monotonic(), work / case
+            if case.endswith("resumed"):
+                interrupted(out, *chosen[case])
+            else:
+                rbpf(*chosen[case], "--out", out)
+            found = digests_of(out)
             print(f"{case}: {len(found)} digests, {time.monotonic() - started:.0f} s", file=sys.stderr)
             return found
 

@@ -38,11 +38,10 @@ def aligned_in_evo(
     return reference, theirs
 
 
-@pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("alignment", ["none", "rigid", "similarity"])
-def test_absolute_error_is_that_of_evo(wander, seed, alignment):
-    truth = wander(150, seed)
-    estimate = disturbed(truth, seed)
+def test_absolute_error_is_that_of_evo(wander, alignment):
+    truth = wander(150, 0)
+    estimate = disturbed(truth, 0)
     evo_ape = metrics.APE(TRANSLATION)
     evo_ape.process_data(aligned_in_evo(estimate, truth, alignment))
     found = ate(estimate, truth, alignment)
@@ -52,14 +51,13 @@ def test_absolute_error_is_that_of_evo(wander, seed, alignment):
         assert getattr(found, statistic) == pytest.approx(theirs, rel=1e-9)
 
 
-@pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("alignment", ["none", "similarity"])
 @pytest.mark.parametrize(
     ("delta", "unit", "evo_unit"), [(1, "frames", FRAMES), (7, "frames", FRAMES), (2.5, "metres", METRES)]
 )
-def test_relative_error_is_that_of_evo(wander, seed, alignment, delta, unit, evo_unit):
-    truth = wander(150, seed)
-    estimate = disturbed(truth, seed)
+def test_relative_error_is_that_of_evo(wander, alignment, delta, unit, evo_unit):
+    truth = wander(150, 1)
+    estimate = disturbed(truth, 1)
     found = rpe(estimate, truth, delta, unit, alignment)
     for relation, ours in ((TRANSLATION, found.translations), (ANGLE_DEG, found.rotations_deg)):
         evo_rpe = metrics.RPE(relation, delta, evo_unit)

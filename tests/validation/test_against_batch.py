@@ -1,13 +1,13 @@
 """A run beside its batch optimum: where both must agree, the gauge, and what a folder must hold."""
 
 import json
-import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import yaml
 
+from rbpf import __version__
 from rbpf.core.checkpoint import save_arrays
 from rbpf.errors import InputError
 from rbpf.lie import SE3
@@ -21,7 +21,7 @@ from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.consistency.against_batch import SAME, SCALED, compare, compare_folder, compare_run
 from rbpf.validation.gtsam.batch_problem import fit_of, problem_of, read_problem, solve_problem
-from rbpf.validation.metrics.gaussian_differences import compare_last_pose, rescaled, scale_onto
+from rbpf.validation.metrics.gaussian_differences import compare_last_pose
 from tests.validation.camera_scenes import scene
 from tests.validation.linear_worlds import linear_log
 
@@ -48,17 +48,6 @@ def test_in_a_linear_world_the_filter_is_the_batch_within_monte_carlo_error(line
     assert found.poses.keys.tolist() == [11]
     assert found.scale == 1.0 and found.gauge == SAME
     assert found.fit_batch.sightings == found.fit_filter.sightings == len(found.optimum.problem.z)
-
-
-def test_monte_carlo_error_falls_with_the_particles():
-    def spread(particles):
-        ratios = [
-            compare_run(run(linear_log(), RangeBearingConfig(particles=particles, seed=seed, anchor_every=0)))
-            for seed in range(3)
-        ]
-        return np.mean([np.abs(np.log(found.landmarks.sigma_ratio)).mean() for found in ratios])
-
-    assert spread(1000) < 0.6 * spread(30)
 
 
 def test_the_optimum_explains_sightings_and_odometry_best(linear_run):
@@ -143,17 +132,6 @@ def test_without_known_points_neither_the_scale_nor_its_uncertainty_matters(std_
     assert found.poses.sigma_ratio[-1] == pytest.approx(1.0, rel=1e-3)
 
 
-def test_the_scale_of_a_path_is_found_and_applied():
-    _, estimate = camera_problem()
-    ours = scaled_by(estimate, 2.5)
-    assert scale_onto(ours, estimate, "here") == pytest.approx(0.4)
-    back = rescaled(ours, 0.4)
-    for name in ("world_from_body", "cov_poses"):
-        assert getattr(back, name) == pytest.approx(getattr(estimate, name))
-    for name in ("mean", "cov"):
-        assert getattr(back.landmarks, name) == pytest.approx(getattr(estimate.landmarks, name))
-
-
 def test_a_covariance_is_carried_to_the_chart_at_the_other_pose():
     _, estimate = camera_problem()
     far = np.array([0.4, -0.3, 0.5, 0.2, 0.1, -0.3])
@@ -187,7 +165,7 @@ def test_a_run_over_images_is_read_from_its_folder(tmp_path):
     write_summary(tmp_path, {})
     rays = np.arange(len(estimate.landmarks.ids)) < 2
     write_map(tmp_path, replace(estimate.landmarks, columns={"ray": rays.astype(int)}))
-    config = {"rbpf": _version(), "system": "mono", "recording": "somewhere"}
+    config = {"rbpf": __version__, "system": "mono", "recording": "somewhere"}
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(config))
     assert len(read_problem(tmp_path).frames) == len(log.frames)
     found = compare_folder(tmp_path)
@@ -195,22 +173,12 @@ def test_a_run_over_images_is_read_from_its_folder(tmp_path):
     assert len(found.landmarks) == len(rays) - 2
 
 
-def _version():
-    from rbpf import __version__
-
-    return __version__
-
-
 @pytest.mark.parametrize(
     ("spoil", "says"),
     [
-        (lambda f: shutil.rmtree(f), "there is no such folder"),
         (lambda f: (f / "config.yaml").unlink(), "has no config.yaml"),
-        (lambda f: (f / "config.yaml").write_text("a: 1"), "expected the settings of a run"),
         (lambda f: (f / "config.yaml").write_text("rbpf: 99.1.0\nsystem: mono"), "was written by rbpf 99.1.0"),
         (lambda f: (f / "config.yaml").write_text("{"), "expected YAML"),
-        (lambda f: (f / "observations.csv").unlink(), "holds no observations.csv"),
-        (lambda f: (f / "map.npz").unlink(), "holds no map.npz"),
         (lambda f: save_arrays(f / "map.npz", {"id": np.arange(2)}), "array mean is missing"),
     ],
 )

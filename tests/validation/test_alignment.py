@@ -38,10 +38,9 @@ def test_recovers_a_known_similarity(seed, dim, with_scale):
     np.testing.assert_allclose(found.translation, truth.translation, atol=1e-7)
 
 
-@pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("mirrored", [False, True])
-def test_no_rotation_found_by_search_is_closer(seed, mirrored):
-    rng = np.random.default_rng(seed)
+def test_no_rotation_found_by_search_is_closer(mirrored):
+    rng = np.random.default_rng(0)
     x = rng.normal(size=(6, 3))
     y = x * [1.0, 1.0, -1.0 if mirrored else 1.0] + rng.normal(scale=0.3, size=(6, 3))
     found = align(x, y, with_scale=True)

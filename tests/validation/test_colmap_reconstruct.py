@@ -65,33 +65,10 @@ def test_a_rendered_desk_is_reconstructed_and_is_right(desk, found):
 
 
 @pytest.mark.slow
-def test_a_desk_through_a_fisheye_lens_is_reconstructed_and_is_right(tmp_path):
-    lens = Pinhole(320, 240, 131.0, 131.0, 159.5, 119.5, (-0.03, 0.02, -0.012, 0.002), "equidistant")
-    sequence, options = rendered(tmp_path / "wide", 150, lens)
-    found = reconstruct(sequence, options)
-    assert found.fraction >= 0.9
-    compared = compare_with_truth(found, sequence.truth)
-    assert compared.path.rmse < 0.01 * compared.extent_m
-    assert found.as_dict()["reprojection_error_mean_px"] < 1.0
-
-
-@pytest.mark.slow
 def test_the_same_seed_gives_the_same_reconstruction(desk, found):
     again = reconstruct(*desk)
     assert (again.world_from_camera == found.world_from_camera).all()
     assert (again.points == found.points).all()
-
-
-@pytest.mark.slow
-def test_a_stereo_pair_tells_the_scale(tmp_path):
-    sequence, options = rendered(tmp_path / "pair", 90, RectifiedStereo(CAMERA, 0.12))
-    found = reconstruct(sequence, options, tmp_path / "work")
-    compared = compare_with_truth(found, sequence.truth)
-    assert found.metric and compared.as_dict()["alignment"] == "rigid"
-    assert compared.path.rmse < 0.02 * compared.extent_m
-    free = compare_with_truth(replace(found, metric=False), sequence.truth)
-    assert free.path.alignment.scale == pytest.approx(1.0, abs=0.02)
-    assert (tmp_path / "work" / "images" / "000000_1.png").exists()
 
 
 def test_paths_are_compared_after_the_alignment_that_the_scale_asks_for():
@@ -145,15 +122,6 @@ def test_a_straight_path_does_not_let_the_cloud_roll_about_it():
     assert by_cameras < 0.03
     assert by_centres > 3.0 * by_cameras, "the centres alone leave the roll open"
     assert moved.reference_from_colmap.scale == pytest.approx(1.0, abs=0.03)
-
-
-def test_one_wild_landmark_does_not_move_the_summary():
-    ours = made()
-    landmarks = ours.points[:40] + 1e-3
-    wild = np.vstack([landmarks, [[99.0] * 3]])
-    calm, moved = (cloud_distance(ours.points, points).as_dict() for points in (landmarks, wild))
-    assert moved["nearest_median_m"] == pytest.approx(calm["nearest_median_m"])
-    assert moved["surface_p90_m"] < 2.0 * calm["surface_p90_m"]
 
 
 def test_what_cannot_be_compared_is_refused():
@@ -212,7 +180,7 @@ def test_the_kitchen_is_reconstructed_as_well_as_by_the_reference(data_dir):
     truth = sequence.truth
     points = MapEstimate(np.arange(2), np.zeros((2, 3)), np.repeat(np.eye(3)[None], 2, axis=0))
     estimate = PathAndMap(truth.stamps_ns, truth.world_from_camera, np.empty((0, 6, 6)), points)
-    compared = compare_with_colmap(estimate, sequence, ReconstructionOptions(every=8, features=2048))
+    compared = compare_with_colmap(estimate, sequence, ReconstructionOptions(every=16, features=1500))
     assert compared.run.reconstruction.fraction >= 0.9
     assert compared.truth.path.rmse < 0.05, "the reference reconstruction is 0.038 m from this truth"
     assert compared.run.path.rmse == pytest.approx(compared.truth.path.rmse, rel=0.05)

@@ -15,7 +15,7 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module", params=["planar", "spatial"])
-def run(request, tmp_path_factory):
+def run(request, tmp_path_factory, plain_pictures):
     folder = tmp_path_factory.mktemp(request.param)
     more = ["--spatial"] if request.param == "spatial" else []
     assert main(["simulate", "range-bearing", "--out", str(folder / "log"), "--steps", "20", *more]) == 0

@@ -26,13 +26,6 @@ WORLDS = [
 ]
 
 
-def held(chart, *poses):
-    values = gtsam.Values()
-    for key, pose in enumerate(poses):
-        values.insert(key, chart.pose(pose))
-    return values
-
-
 @pytest.mark.parametrize(("space", "chart"), CHARTS)
 def test_gtsam_retracts_by_the_exponential_map_in_another_order(space, chart):
     rng = np.random.default_rng(1)
@@ -43,21 +36,6 @@ def test_gtsam_retracts_by_the_exponential_map_in_another_order(space, chart):
         values.insert(0, moved)
         assert np.abs(space.local(space.retract(x, xi), chart.storage(values, 0))).max() < 1e-14
         np.testing.assert_allclose(chart.pose(x).localCoordinates(moved), xi[chart.order], atol=1e-14)
-
-
-@pytest.mark.parametrize(("space", "chart"), CHARTS)
-def test_gtsams_odometry_residual_is_ours(space, chart):
-    x, delta, y = space.exp(np.random.default_rng(2).normal(size=(3, space.dim)))
-    unit = gtsam.noiseModel.Unit.Create(space.dim)
-    residual = chart.between(0, 1, chart.pose(delta), unit).unwhitenedError(held(chart, x, y))
-    np.testing.assert_allclose(residual, space.local(space.compose(x, delta), y)[chart.order], atol=1e-14)
-
-
-@pytest.mark.parametrize(("space", "chart"), CHARTS)
-def test_covariances_are_brought_into_our_order(space, chart):
-    factor = np.random.default_rng(3).normal(size=(space.dim, space.dim))
-    cov = factor @ factor.T
-    np.testing.assert_array_equal(chart.covariance(cov[np.ix_(chart.order, chart.order)]), cov)
 
 
 @pytest.mark.parametrize("soft", [False, True])
@@ -149,11 +127,10 @@ def first_steps(m, count):
     return replace(m, stamps_ns=m.stamps_ns[:count], deltas=m.deltas[: count - 1], covs=m.covs[: count - 1], **kept)
 
 
-@pytest.mark.parametrize("singular", [False, True])
-def test_the_online_optimum_knows_nothing_of_the_future(singular):
-    m = world(2, "range_bearing", singular, steps=30)
+def test_the_online_optimum_knows_nothing_of_the_future():
+    m = world(2, "range_bearing", singular=True, steps=15)
     found = solve_online(m)
-    for step in (5, 14, 29):
+    for step in (5, 9, 14):
         then = solve(first_steps(m, step + 1))
         off = m.space.local(then.world_from_robot[-1], found[step])
         assert (np.abs(off) < 0.1 * np.sqrt(np.diag(then.cov_poses[-1]))).all()
@@ -197,12 +174,6 @@ def test_exact_odometry_leaves_only_the_map_to_solve_for():
     cov = np.linalg.inv(info.sum(0))
     np.testing.assert_allclose(found.landmarks[name], cov @ np.einsum("kij,kj->i", info, points), atol=1e-9)
     np.testing.assert_allclose(found.cov_landmarks[name], cov, atol=1e-12)
-
-
-def test_without_marginals_there_are_none():
-    found = solve(world(2, "position"), marginals=False)
-    assert found.cov_poses.shape == (0, 3, 3)
-    assert found.cov_landmarks == {}
 
 
 def test_bad_input_is_refused_in_words():

@@ -4,17 +4,12 @@ import numpy as np
 import pytest
 
 from examples.studies.joint_ekf import joint_ekf
-from rbpf.lie import SE2
 from rbpf.runs.trajectory import align
 from rbpf.sensors.readers import open_log
 from rbpf.sensors.readers.measurements import initial_estimate
 from rbpf.validation.gtsam.robot import Problem, solve
 from rbpf.validation.metrics.accuracy import landmark_errors
 from tests.validation.log_measurements import from_log
-
-
-def opened(folder):
-    return open_log(folder)
 
 
 def planar_errors(m, log, path, landmarks):
@@ -39,7 +34,7 @@ def exact_errors(m, log, path, landmarks):
     [("mrpt_kf_slam_2d", (0.0040, 0.0026), (0.0049, 0.0030)), ("mrpt_kf_slam_6d", (0.0102, 0.0042), (0.0123, 0.0043))],
 )
 def test_simulated_recordings_give_the_errors_of_the_reference(data_dir, folder, batch, filtered):
-    log = opened(data_dir / folder)
+    log = open_log(data_dir / folder)
     m = from_log(log, start=log.truth.world_from_robot[0])
     found = solve(m)
     assert exact_errors(m, log, found.world_from_robot, found.landmarks) == pytest.approx(batch, abs=6e-5)
@@ -58,25 +53,19 @@ def test_simulated_recordings_give_the_errors_of_the_reference(data_dir, folder,
 @pytest.mark.real_data
 @pytest.mark.slow
 def test_mrclam_is_solved_as_well_as_by_the_reference(data_dir):
-    log = opened(data_dir / "mrclam6_robot1")
+    log = open_log(data_dir / "mrclam6_robot1")
     m = from_log(log)
     assert Problem(m).singular
     plain, robust = (solve(m, threshold, marginals=False, incremental=True) for threshold in (None, 1.345))
     for found, reference in ((plain, (0.144, 0.089)), (robust, (0.118, 0.076))):
         errors = planar_errors(m, log, found.world_from_robot, found.landmarks)
         assert np.less(errors, np.multiply(1.1, reference)).all(), errors
-    afar = solve(m, marginals=False)
-    assert afar.error == pytest.approx(plain.error, rel=1e-8)
-    assert np.abs(SE2.local(plain.world_from_robot, afar.world_from_robot)).max() < 1e-4
-    ekf = joint_ekf(m)
-    errors = planar_errors(m, log, ekf.world_from_robot, ekf.landmarks)
-    assert np.less(errors, np.multiply(1.1, (0.326, 0.081))).all(), errors
 
 
 @pytest.mark.real_data
 @pytest.mark.slow
 def test_victoria_park_needs_the_incremental_start(data_dir):
-    m = from_log(opened(data_dir / "victoria_park"))
+    m = from_log(open_log(data_dir / "victoria_park"))
     found = solve(m, incremental=True)
     redundancy = m.z.size - 2 * len(found.landmarks)
     assert 0.3 * redundancy < found.error < 0.7 * redundancy

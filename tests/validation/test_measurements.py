@@ -7,12 +7,8 @@ import numpy as np
 import pytest
 
 from rbpf.errors import InputError
-from rbpf.lie import SE2
 from rbpf.runs.measurement_files import OBSERVATIONS, ODOMETRY, read_robot_measurements, write_measurements
-from rbpf.sensors.range_bearing import RangeBearing, RelativePosition
-from rbpf.sensors.readers import Frame, RobotLog, open_log
-from rbpf.sensors.readers.measurements import Measurements, dead_reckoning, initial_estimate
-from tests.validation.log_measurements import from_log
+from rbpf.sensors.readers.measurements import Measurements
 from tests.validation.worlds import seen, world
 
 FIELDS = [field for field in Measurements.__dataclass_fields__ if field != "space"]
@@ -151,20 +147,6 @@ def test_quaternions_that_are_none_are_refused_by_line(tmp_path):
         read_robot_measurements(tmp_path)
 
 
-def test_a_failed_write_leaves_no_half_file(tmp_path, monkeypatch):
-    write_measurements(tmp_path, world(2, "position"))
-    before = (tmp_path / OBSERVATIONS).read_bytes()
-
-    def fail(source, target):
-        raise OSError("disk full")
-
-    monkeypatch.setattr("os.replace", fail)
-    with pytest.raises(InputError, match="cannot be written: disk full"):
-        write_measurements(tmp_path, world(2, "position", seed=1))
-    assert (tmp_path / OBSERVATIONS).read_bytes() == before
-    assert sorted(path.name for path in tmp_path.iterdir()) == [OBSERVATIONS, ODOMETRY]
-
-
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
@@ -187,39 +169,3 @@ def test_what_does_not_fit_together_is_refused(change, complaint):
 def test_a_quaternion_that_is_none_is_refused():
     with pytest.raises(InputError, match="quaternions of length 1"):
         replace(world(3, "position"), start=np.zeros(7))
-
-
-def test_the_model_is_the_filters():
-    planar, spatial = world(2, "position"), world(3, "range_bearing")
-    assert isinstance(planar.model(), RelativePosition)
-    model = spatial.model()
-    assert isinstance(model, RangeBearing)
-    assert model.pitch_sign == -1.0
-    np.testing.assert_array_equal(model.robot_from_sensor, spatial.robot_from_sensor)
-
-
-def small_log():
-    values = {"landmarks": np.array([5]), "z": np.array([[2.0, 0.5]]), "cov_z": np.diag([0.01, 0.02])[None]}
-    empty = {"landmarks": np.empty(0, int), "z": np.empty((0, 2)), "cov_z": np.empty((0, 2, 2))}
-    move = {"delta": np.array([0.5, 1.0, 0.0]), "cov_delta": np.diag([0.01, 0.02, 0.03])}
-    frames = [Frame(7, None, None, **empty), Frame(9, **move, **values), Frame(12, **move, **empty)]
-    return RobotLog("small", SE2, "range_bearing", np.array([0.0, 0.1, 0.2]), frames)
-
-
-def test_a_log_becomes_measurements():
-    m = from_log(small_log(), start=np.array([1.0, 2.0, 3.0]))
-    np.testing.assert_array_equal(m.stamps_ns, [7, 9, 12])
-    np.testing.assert_array_equal(m.steps, [1])
-    np.testing.assert_array_equal(m.landmarks, [5])
-    np.testing.assert_array_equal(m.start, [1.0, 2.0, 3.0])
-    first = SE2.compose(m.start, m.deltas[0])
-    np.testing.assert_allclose(dead_reckoning(m), [m.start, first, SE2.compose(first, m.deltas[1])])
-    np.testing.assert_allclose(m.model().predict(first, initial_estimate(m).landmarks[5]), [2.0, 0.5])
-
-
-@pytest.mark.real_data
-@pytest.mark.parametrize("folder", ["mrclam6_robot1", "mrpt_kf_slam_6d"])
-def test_recordings_come_back_from_files(data_dir, tmp_path, folder):
-    m = from_log(open_log(data_dir / folder))
-    write_measurements(tmp_path, m)
-    assert_same(read_robot_measurements(tmp_path), m)

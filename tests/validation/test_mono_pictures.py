@@ -1,66 +1,11 @@
 """Views, annotated frames and sightings of runs over images."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from rbpf.lie import SE3
 from rbpf.runs.plots import Views
-from rbpf.runs.recordings import filter_images
-from rbpf.sensors.camera import Pinhole
-from rbpf.sensors.readers import open_images, read_known_points
-from rbpf.systems.mono.config import MonoConfig
 from rbpf.validation.report.video import FOUND, MISSED, RAY, Caption, draw_search, drawn_size, frame_rate, is_complete
-from rbpf.validation.simulation.desk_and_room import OVER_DESK, TexturedDesk
-from rbpf.validation.simulation.images import Imaging, simulate_images
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("rendered") / "desk"
-    camera = Pinhole(240, 180, 190.0, 190.0, 119.5, 89.5)
-    world = TexturedDesk(frames=40, texel_m=0.003, hand=replace(OVER_DESK, speed_m_s=0.6, start_s=0.2))
-    simulate_images(world, Imaging(noise_std=1.0), camera, folder, seed=1)
-    return filter_images(open_images(folder), MonoConfig(particles=8), read_known_points(folder / "known_points.csv"))
-
-
-def found(sighting):
-    return np.isfinite(sighting["px"]).all(axis=1)
-
-
-def is_ray(sighting):
-    return np.isfinite(sighting["line"]).all(axis=(1, 2))
-
-
-def test_rays_are_found_on_their_epipolar_lines(run):
-    distances = []
-    for sighting in run.log.all_observed()[20:]:
-        rows = is_ray(sighting) & found(sighting)
-        start, end = np.moveaxis(sighting["line"][rows], 1, 0)
-        along = (end - start) / np.linalg.norm(end - start, axis=1, keepdims=True)
-        offset = sighting["px"][rows] - start
-        distances += np.abs(offset[:, 0] * along[:, 1] - offset[:, 1] * along[:, 0]).tolist()
-    assert len(distances) > 20
-    assert np.median(distances) < 1.0
-
-
-def test_places_that_were_seen_lie_in_the_known_points_world(run):
-    sighting = run.log.all_observed()[-1]
-    known = run.system.known_points
-    members = found(sighting) & (sighting["features"] < known.names.size)
-    assert members.any()
-    place = sighting["position"][members, :3] / sighting["position"][members, 3:]
-    assert np.abs(place - known.positions[sighting["features"][members]]).max() < 0.02
-
-
-def test_the_map_covers_the_desk_within_its_own_uncertainty(run):
-    mapped = run.system.map()
-    new = ~mapped.is_ray() & (mapped.ids >= run.system.known_points.names.size)
-    height, std = mapped.mean[new, 2], np.sqrt(mapped.cov[new, 2, 2])
-    assert new.sum() >= 5
-    assert (height + 4.0 * std > -0.005).all()  # nothing on the desk lies below its top
-    assert (height - 4.0 * std < 0.255).all()  # nor above its highest thing
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from rbpf.core.filter import Filter
 from rbpf.runs.results import Results
 from rbpf.validation.consistency.comparison import INNOVATIONS, noise_advice
 from rbpf.validation.consistency.statistic import step_ratio, variance_ratio
-from tests.validation.test_verdict import Receiver, Walk
+from tests.validation.fixes import Receiver, Walk
 
 
 def record(system: str, **config: object) -> Results:

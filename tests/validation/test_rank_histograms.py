@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from rbpf.core.filter import Filter
-from rbpf.core.models import MotionModel, ObservationModel, Observations, Part, Sensor, Transition
 from rbpf.errors import InputError
-from rbpf.lie import Euclidean
 from rbpf.validation.consistency.rank_histograms import calibrate, plot_ranks
+from tests.validation.fixes import Receiver, Walk
 
 FIXES = 4
 
@@ -68,37 +67,13 @@ def test_few_samples_are_no_bias():
     assert (calibrate(simulate, few, ("x", "y"), runs=600).p_values() > 0.01).all()
 
 
-class Still(MotionModel):
-    """A place that stays, but for a jitter too small to matter."""
-
-    space = Euclidean(2)
-
-    def transition(self, state, control, dt):
-        return Transition(state, 1e-3 * np.eye(2)[None])
-
-
-class Fix(ObservationModel):
-    """The place itself."""
-
-    dim, reads = 2, frozenset({Part.STATE})
-
-    def predict(self, state, landmark=None, const=None, substate=None):
-        return state
-
-
-class Receiver(Sensor):
-    """Fixes with noise 1."""
-
-    def observe(self, frame, belief):
-        return [Observations(frame[None], np.eye(2)[None], Fix())]
-
-
 def test_a_filter_of_ones_own_model_is_calibrated():
     """Any model that can simulate: here a filter whose particles start at the prior."""
 
     def infer(fixes, rng):
         start = rng.normal(size=(800, 2))
-        filter_ = Filter(Still(), Receiver(), n=800, rng=rng, start=start)
+        still = Walk(variance=1e-3)  # a jitter too small to matter
+        filter_ = Filter(still, Receiver(1.0), n=800, rng=rng, start=start)
         for fix in fixes:
             filter_.step(fix)
         return filter_.particles.state, filter_.particles.weights

@@ -8,7 +8,7 @@ import pytest
 from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole
 from rbpf.validation.simulation.desk_and_room import TexturedDesk, TexturedRoom
-from rbpf.validation.simulation.render import Renderer, rotated_grid
+from rbpf.validation.simulation.render import Renderer
 from rbpf.validation.simulation.textured_scene import Chessboard, ImageWorld, Rectangle, TexturedScene, cast
 from rbpf.validation.simulation.textures import clouds, grey_levels
 
@@ -55,7 +55,7 @@ def test_corners_are_seen_where_opencv_projects_them(camera: Pinhole) -> None:
     around = np.stack(np.meshgrid(np.arange(-5.0, 6.0), np.arange(-5.0, 6.0)), axis=-1)
     within = np.stack(np.meshgrid(*[(np.arange(9) - 4.0) / 9.0] * 2), axis=-1)
     matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
-    for pose in scene.world_from_camera[[0, -1]]:
+    for pose in scene.world_from_camera[-1:]:
         image = renderer.image(pose)
         points = SE3.inverse_transform(pose, board.corners)
         project = cv2.fisheye.projectPoints if camera.distortion_model == "equidistant" else cv2.projectPoints
@@ -88,10 +88,9 @@ def test_depth_is_that_of_the_plane(camera: Pinhole) -> None:
 
 @pytest.mark.parametrize("camera", [CAMERA, DISTORTED, FISHEYE])
 @pytest.mark.parametrize("size", [0.1, 1.0])
-@pytest.mark.parametrize("seed", range(2))
-def test_the_nearest_of_many_rectangles_is_seen(camera: Pinhole, seed: int, size: float) -> None:
+def test_the_nearest_of_many_rectangles_is_seen(camera: Pinhole, size: float) -> None:
     """Also of those that reach behind the camera; the reference casts each ray at each rectangle."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     reach = size * np.array([[4.0], [1.5], [1.5]])
     places = reach * rng.uniform(-1.0, 1.0, (150, 3, 3))
     sheets = [Rectangle(corner, across, down, noise(8)) for corner, across, down in places]
@@ -123,23 +122,11 @@ def test_pixels_without_a_ray_and_rays_without_a_rectangle_are_black() -> None:
     assert image[0, 0] == 0.0 and image[60, 80] == 255.0
 
 
-def test_disparity_is_focal_length_times_baseline_over_depth() -> None:
-    camera = replace(CAMERA, fx=120.0, fy=120.0)
-    wall = facing(2.0, 8.0, noise(400))
-    renderer = Renderer([wall], camera)
-    right = SE3.exp([0.0, 0.0, 0.0, 0.15, 0.0, 0.0])
-    disparity = round(camera.fx * 0.15 / 2.0)
-    left_image, right_image = renderer.image(SE3.identity()), renderer.image(right)
-    assert left_image.std() > 5.0
-    np.testing.assert_allclose(right_image[:, :-disparity], left_image[:, disparity:], atol=1e-3)
-
-
-@pytest.mark.parametrize("world", [DESK, ROOM])
-def test_two_views_show_the_same_grey_levels(world: ImageWorld) -> None:
+def test_two_views_show_the_same_grey_levels() -> None:
     """The second picture, read where the first one's points are in it, is the first one."""
     from scipy.ndimage import map_coordinates
 
-    scene = drawn(world)
+    scene = drawn(ROOM)
     renderer = Renderer(scene.rectangles, DISTORTED)
     first, second = scene.world_from_camera[[0, -1]]
     depth, _ = renderer.depth(first)
@@ -184,17 +171,6 @@ def test_an_edge_covers_its_share_of_the_pixel(grid: int) -> None:
         row = Renderer([sheet], CAMERA, grid).image(SE3.identity())[60]
         assert row[79] == 200.0 and row[81] == 0.0
         assert abs(row[80] / 200.0 - fraction) <= 0.5 / rays + 1e-6
-
-
-@pytest.mark.parametrize("side", [1, 2, 3, 8])
-def test_rays_are_spread_over_the_pixel(side: int) -> None:
-    """Each of the n² columns and rows of the pixel has one ray, and no two are near each other."""
-    place = rotated_grid(side) + 0.5
-    cells = np.sort((place * side * side).astype(int), axis=0)
-    np.testing.assert_array_equal(cells, np.tile(np.arange(side * side)[:, None], 2))
-    np.testing.assert_allclose(place.mean(axis=0), 0.5)
-    apart = np.linalg.norm(place[:, None] - place, axis=-1)
-    assert (apart[~np.eye(side * side, dtype=bool)] > 1.0 / side).all()
 
 
 def test_a_moving_camera_sees_the_mean_of_what_it_sees() -> None:

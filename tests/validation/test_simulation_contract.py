@@ -82,7 +82,7 @@ def log_bytes(log: FeatureLog) -> bytes:
 
 
 @pytest.mark.parametrize("camera", [MONO, STEREO])
-@pytest.mark.parametrize("world", [DeskWorld(frames=200), DeskWorld(frames=40, renewal=0.1)])
+@pytest.mark.parametrize("world", [DeskWorld(frames=20), DeskWorld(frames=20, renewal=0.1)])
 def test_a_seed_gives_the_same_measurements(world: PointWorld, camera: Pinhole | RectifiedStereo) -> None:
     measuring = Measuring(outlier_rate=0.1)
     first, again, other = (log_bytes(simulate_features(world, measuring, camera, seed)) for seed in (3, 3, 4))
@@ -98,9 +98,9 @@ def contents(folder: Path) -> dict[str, bytes]:
 @pytest.mark.parametrize(
     ("world", "imaging"),
     [
-        (TexturedDesk(frames=4, texel_m=0.008), Imaging(exposure_drift=0.2, blur_s=0.05, known=4)),
-        (TexturedRoom(frames=4, texel_m=0.02), Imaging(vignetting=0.3, known=4)),
-        (TexturedLab(LabDrive("turn_back", 4, every=30), texel_m=0.1), Imaging(jpeg=90, known=0)),
+        (TexturedDesk(frames=3, texel_m=0.02), Imaging(exposure_drift=0.2, blur_s=0.05, known=4)),
+        (TexturedRoom(frames=3, texel_m=0.05), Imaging(vignetting=0.3, known=4)),
+        (TexturedLab(LabDrive("turn_back", 4, every=30), texel_m=0.5), Imaging(jpeg=90, known=0)),
     ],
     ids=["desk", "room", "lab"],
 )
@@ -112,13 +112,13 @@ def test_a_seed_gives_the_same_files(world: ImageWorld, imaging: Imaging, tmp_pa
     assert first.keys() == other.keys()
     drawn = {name for name in first if name.endswith((".png", ".jpg"))}
     drawn |= {"known_points.csv", "odometry.csv"} & first.keys()
-    assert len(drawn) >= 9 and not any(first[name] == other[name] for name in drawn)
+    assert len(drawn) >= 7 and not any(first[name] == other[name] for name in drawn)
 
 
 @pytest.mark.slow
 def test_a_shorter_drive_gives_the_same_beginning(tmp_path: Path) -> None:
     for name, frames in (("whole", 4), ("short", 3)):
-        world = TexturedLab(LabDrive("turn_back", frames, every=30), texel_m=0.1)
+        world = TexturedLab(LabDrive("turn_back", frames, every=30), texel_m=0.5)
         imaging = Imaging(jpeg=90, known=0, exposure_drift=0.0, blur_s=0.0)  # both look at later frames
         simulate_images(world, imaging, SMALL, tmp_path / name, 3)
     whole, short = (contents(tmp_path / name) for name in ("whole", "short"))

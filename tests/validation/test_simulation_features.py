@@ -1,7 +1,6 @@
 """Simulated measurements of a camera: noise, visibility, tracks, outliers."""
 
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -19,7 +18,6 @@ from examples.studies.point_worlds import (
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
-from rbpf.sensors.feature_log import FeatureLog
 from rbpf.validation.simulation.lab import LabDrive
 from tests.validation.feature_logs import StillCamera, errors, likely, sightings, truth
 
@@ -58,80 +56,6 @@ def test_only_what_is_visible_is_measured(world: PointWorld, camera: Pinhole | R
         assert camera.visible(points, margin_px=8.0).all()
         distance = np.linalg.norm(points, axis=1)
         assert ((distance >= 0.7) & (distance <= 5.0)).all()
-
-
-def blocked(log: FeatureLog, scene: Scene) -> int:
-    """Number of measurements through a block, told from 500 places along each line of sight."""
-    assert log.truth is not None
-    along = np.linspace(0.0, 0.999, 500)[:, None, None]
-    count = 0
-    for pose, frame in zip(log.truth.world_from_camera, log.frames, strict=True):
-        points = np.array([log.truth.landmarks[name] for name in frame.landmarks.tolist()])
-        places = (pose[4:] + along * (points - pose[4:]))[..., None, :]
-        within = ((places > scene.blocks[:, 0]) & (places < scene.blocks[:, 1])).all(axis=-1)
-        count += int(within.any(axis=(0, 2)).sum())
-    return count
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "world", [DeskWorld(frames=60, blocks=8), LabWorld(LabDrive(frames=6, every=100), points=2000)]
-)
-def test_blocks_hide_what_is_behind_them(world: PointWorld) -> None:
-    scene = world.build(np.random.default_rng(2))
-    assert blocked(simulate_features(world, Measuring(), MONO, seed=2), scene) == 0
-    assert blocked(simulate_features(world, Measuring(occlusion=False), MONO, seed=2), scene) > 20
-
-
-@pytest.mark.parametrize("places", [6, 25])
-def test_the_budget_is_kept_and_used(places: int) -> None:
-    log = simulate_features(DESK, replace(EXACT, measurements=places), MONO, seed=0)
-    assert {len(frame.landmarks) for frame in log.frames} == {places}
-
-
-def test_few_landmarks_enter_the_map_after_the_first_frame() -> None:
-    log = simulate_features(CHANGING, Measuring(new_per_frame=1), MONO, seed=0)
-    begins = np.bincount([frames[0] for frames in sightings(log).values()])
-    assert begins[0] == 25
-    assert begins[1:].max() == 1
-    assert begins[1:].sum() > 50
-
-
-def test_new_landmarks_are_spread_over_the_image() -> None:
-    log = simulate_features(DESK, Measuring(), MONO, seed=0)
-    column, row = (log.frames[0].z // [160.0, 160.0]).T
-    assert len(set(zip(column, row, strict=True))) == 12
-
-
-def test_tracks_go_on_while_the_point_is_visible() -> None:
-    world = DeskWorld(frames=200, blocks=0)
-    log = simulate_features(world, replace(EXACT, known=0), MONO, seed=0)
-    assert log.known is None and log.truth is not None
-    ended = 0
-    for t, (before, after) in enumerate(pairwise(log.frames), start=1):
-        gone = np.setdiff1d(before.landmarks, after.landmarks)
-        points = np.array([log.truth.landmarks[name] for name in gone.tolist()]).reshape(-1, 3)
-        local = SE3.inverse_transform(log.truth.world_from_camera[t], points)
-        assert not MONO.visible(local, margin_px=13.0).any()
-        ended += len(gone)
-    assert ended > 10
-
-
-def test_landmarks_that_come_back_go_before_new_ones() -> None:
-    measuring = replace(EXACT, known=0)
-    log = simulate_features(DeskWorld(frames=600, blocks=0), measuring, MONO, seed=0)
-    seen = sightings(log)
-    assert log.truth is not None
-    again = 0
-    for t, frame in enumerate(log.frames[1:], start=1):
-        new = [name for name in frame.landmarks.tolist() if seen[name][0] == t]
-        old = [name for name, frames in seen.items() if frames[0] < t and name not in frame.landmarks]
-        again += sum(name not in log.frames[t - 1].landmarks for name in frame.landmarks) - len(new)
-        if new and old:
-            points = np.array([log.truth.landmarks[name] for name in old])
-            local = SE3.inverse_transform(log.truth.world_from_camera[t], points)
-            assert not MONO.visible(local, margin_px=13.0).any()
-    assert again > 10
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
@@ -195,22 +119,6 @@ def test_points_that_are_gone_stay_gone() -> None:
     assert {int(row.sum()) for row in there} == {world.points}
 
 
-def test_disparity_tells_the_depth() -> None:
-    log = simulate_features(DESK, Measuring(), STEREO, seed=0)
-    z = np.concatenate([frame.z for frame in log.frames])
-    depth = np.concatenate([truth(log, t)[:, 2] for t in range(len(log.frames))])
-    disparity = z[:, 0] - z[:, 2]
-    assert (disparity > 0.0).all()
-    error = disparity - 400.0 * 0.12 / depth
-    assert abs(error.mean()) < 4.0 * np.sqrt(2.0 / error.size)
-    assert error.std() == pytest.approx(np.sqrt(2.0), rel=0.05)
-
-
-def test_a_frame_without_measurements() -> None:
-    log = simulate_features(DeskWorld(frames=300, points=2), replace(EXACT, known=0), MONO, seed=1)
-    assert min(len(frame.landmarks) for frame in log.frames) == 0
-
-
 @dataclass(frozen=True)
 class Line:
     """A camera at rest that sees points on a line."""
@@ -252,14 +160,6 @@ def test_known_points_are_given_with_the_stated_error() -> None:
     assert min(flat) > 100.0
 
 
-def test_exactly_known_points() -> None:
-    log = simulate_features(DeskWorld(frames=2), Measuring(known_std_m=0.0), MONO, seed=0)
-    assert log.known is not None and log.truth is not None
-    points = np.array([log.truth.landmarks[name] for name in log.known.names.tolist()])
-    np.testing.assert_array_equal(log.known.positions, points)
-    assert not log.known.cov.any()
-
-
 @pytest.mark.parametrize(
     ("world", "measuring", "message"),
     [
@@ -271,8 +171,3 @@ def test_exactly_known_points() -> None:
 def test_refused_worlds(world: PointWorld, measuring: Measuring, message: str) -> None:
     with pytest.raises(InputError, match=message):
         simulate_features(world, measuring, MONO, seed=0)
-
-
-def test_two_known_points_cannot_be_on_a_line() -> None:
-    log = simulate_features(Line(), Measuring(known=2), MONO, seed=0)
-    assert log.known is not None and len(log.known.names) == 2

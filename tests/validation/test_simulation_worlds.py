@@ -6,19 +6,10 @@ from functools import cache
 import numpy as np
 import pytest
 
-from examples.studies.point_worlds import (
-    MONO,
-    DeskWorld,
-    Measuring,
-    PointWorld,
-    Scene,
-    hidden,
-    populated,
-    simulate_features,
-)
+from examples.studies.point_worlds import MONO, DeskWorld, Measuring, PointWorld, Scene, hidden, simulate_features
 from rbpf.lie import SE3
 from rbpf.sensors.feature_log import FeatureLog
-from rbpf.validation.simulation.paths import HandHeld, Wave, eased, looking, slowed, speeds
+from rbpf.validation.simulation.paths import HandHeld, looking, slowed, speeds
 
 DESK = DeskWorld()
 SEEDS = range(4)
@@ -63,14 +54,6 @@ def test_paths_are_smooth() -> None:
         assert fine.max() < 1.3 * coarse.max() + 0.05
 
 
-def test_the_camera_is_held_still_at_first() -> None:
-    world = DESK
-    scene = built(world, 0)
-    turn, speed = speeds(scene.world_from_camera, scene.stamps_ns * 1e-9)
-    assert speed[0] < 0.001 and turn[0] < 0.001
-    assert speed[60:].max() > 0.1
-
-
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_desk_is_seen_from_its_distance(seed: int) -> None:
     world = DeskWorld(hand=HandHeld(wander=0.0, wrist_deg=0.0, tremor_m=0.0, tremor_deg=0.0))
@@ -113,29 +96,6 @@ def test_neither_camera_nor_points_are_in_a_block(seed: int) -> None:
         assert not within.all(axis=-1).any()
 
 
-def test_frames_are_stamped_at_their_rate() -> None:
-    stamps = built(DeskWorld(frames=61), 0).stamps_ns
-    assert stamps.dtype == np.int64
-    assert stamps[[0, 1, 30, 60]].tolist() == [0, 33_333_333, 1_000_000_000, 2_000_000_000]
-
-
-def test_a_wave_stays_within_its_bound() -> None:
-    wave = Wave.random(np.array([0.5, 0.0]), (0.2, 1.0), np.random.default_rng(0))
-    signal = wave(np.linspace(0.0, 500.0, 20_000))
-    assert 0.4 < np.abs(signal[:, 0]).max() <= 0.5
-    assert not signal[:, 1].any()
-
-
-def test_the_start_is_eased() -> None:
-    seconds = np.linspace(0.0, 4.0, 4001)
-    time = eased(seconds, 2.0)
-    pace = np.diff(time) / 0.001
-    assert pace[0] < 1e-6 and (np.diff(pace) > -1e-9).all()
-    np.testing.assert_allclose(pace[2000:], 1.0)
-    assert time[-1] == pytest.approx(3.0)
-    np.testing.assert_array_equal(eased(seconds, 0.0), seconds)
-
-
 def test_a_camera_looks_at_what_it_should() -> None:
     eye, target = np.array([[1.0, -2.0, 0.5]]), np.array([-0.3, 1.0, 0.2])
     pose = looking(eye, target - eye)
@@ -159,10 +119,3 @@ def test_blocks_hide_from_behind_and_show_their_faces() -> None:
     behind, before, beside, front, back = ([2, 0.5, 0.5], [-0.1, 0.5, 0.5], [2, 3, 0.5], [0, 0.7, 0.3], [1, 0.7, 0.3])
     points = np.array([behind, before, beside, front, back, [-3.0, 0.5, 0.4]])
     assert hidden(eye, points, block).tolist() == [True, False, False, False, True, False]
-
-
-def test_points_without_renewal_stay() -> None:
-    rng = np.random.default_rng(0)
-    points, present = populated(lambda count: rng.random((count, 3)), 5, 40, 0.0, rng)
-    assert points.shape == (5, 3)
-    assert present.tolist() == [[0, 40]] * 5

@@ -23,6 +23,12 @@ def tracks(data_dir):
     return read_stereo_tracks(data_dir / "gtsam_stereo_vo")
 
 
+@pytest.fixture(scope="module")
+def solved(tracks):
+    start = CameraEstimate(tracks.world_from_camera, first_observations(tracks))
+    return solve_features(tracks.log, start, marginals=False)
+
+
 def first_observations(tracks):
     """Where each landmark was when it was first seen, on the guessed path."""
     points = {}
@@ -33,7 +39,7 @@ def first_observations(tracks):
     return points
 
 
-def test_the_reference_figures_and_the_batch_solution(tracks):
+def test_the_reference_figures_and_the_batch_solution(tracks, solved):
     """Half the squared error 90342.1 → 7399.0, 0.306 px per residual.
 
     `solve_features` adds weak priors for what has no parallax, 342 landmarks here; they change the path by less than
@@ -52,13 +58,12 @@ def test_the_reference_figures_and_the_batch_solution(tracks):
     best = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
     assert graph.error(best) == pytest.approx(7399.0, abs=0.1)
     assert np.sqrt(2.0 * graph.error(best) / (3 * 52544)) == pytest.approx(0.306, abs=5e-4)
-    solved = solve_features(log, CameraEstimate(guess, points), marginals=False)
     assert solved.error == pytest.approx(7399.0, rel=2e-3)
     theirs = gtsam.utilities.extractPose3(best)[:, 9:]
     np.testing.assert_allclose(solved.world_from_camera[:, 4:], theirs, atol=2e-4)
 
 
-def test_visual_odometry_alone(tracks):
+def test_visual_odometry_alone(tracks, solved):
     """Over 69 m, beside the batch solution of all measurements; the guess in the file is 0.09 m off."""
     log = tracks.log
     frames = [replace(frame, stamp_ns=100_000_000 * frame.stamp_ns) for frame in log.frames]
@@ -66,7 +71,6 @@ def test_visual_odometry_alone(tracks):
     slam = StereoSlam(log.camera, StereoConfig(1, odometry=odometry, map=MapConfig(used=False)))
     said = [slam.take(frame) for frame in frames]
     path = np.array([one.values["odometry"] for one in said])
-    solved = solve_features(log, CameraEstimate(tracks.world_from_camera, {}), marginals=False)
     batch = SE3.between(solved.world_from_camera[0], solved.world_from_camera)
     off = np.linalg.norm(path[:, 4:] - batch[:, 4:], axis=1)
     assert not any(one.messages for one in said)

@@ -7,8 +7,6 @@ import pytest
 from rbpf.lie import SE3
 from rbpf.motion.least_squares import Rule
 from rbpf.motion.stereo_vo import VoConfig, fit
-from rbpf.sensors.feature_log import FeatureFrame, FeatureLog
-from rbpf.validation.gtsam.camera import CameraEstimate, solve_features
 from tests.motion.stereo_pairs import LEAP, ROAD, ROOM, correlated
 
 STRICT = VoConfig(rule=Rule(offset=1e-7, iterations=100))
@@ -44,20 +42,3 @@ def test_the_motion_and_its_covariance_are_gtsams(world):
     np.testing.assert_allclose(SE3.local(theirs, ours.x) / std, 0.0, atol=1e-3)
     np.testing.assert_allclose(0.5 * ours.squared, graph.error(best), rtol=1e-8)
     np.testing.assert_allclose(ours.cov / np.outer(std, std), cov / np.outer(std, std), atol=2e-3)
-
-
-@all_worlds
-def test_the_motion_is_that_of_the_batch_solution_of_two_frames(world):
-    """The same, through what checks a whole recording."""
-    matches, delta = correlated(world, 40, np.random.default_rng(1))
-    names = np.arange(40)
-    frames = [
-        FeatureFrame(0, names, matches.z_prev, matches.cov_prev),
-        FeatureFrame(1, names, matches.z_now, matches.cov_now),
-    ]
-    start = CameraEstimate(np.stack([SE3.identity(), delta]), {})
-    solved = solve_features(FeatureLog("two frames", matches.camera, frames), start)
-    ours = fit(matches, SE3.identity(), STRICT)
-    std = np.sqrt(np.diagonal(ours.cov))
-    off = SE3.local(SE3.between(*solved.world_from_camera), ours.x)
-    np.testing.assert_allclose(off / std, 0.0, atol=0.02)

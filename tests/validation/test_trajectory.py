@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3
-from rbpf.runs.trajectory import Similarity, Trajectory, associate
+from rbpf.runs.trajectory import Trajectory, associate
 
 MS = 1_000_000
 
@@ -101,13 +101,6 @@ def test_planar_poses_become_turns_about_z():
     np.testing.assert_allclose(trajectory.positions, [[1.0, 2.0, 0.0], [-4.0, 0.5, 0.0]])
     inside = SE3.matrix(trajectory.world_from_body)[:, :2][:, :, [0, 1, 3]]
     np.testing.assert_allclose(inside, SE2.matrix(planar)[:, :2], atol=1e-15)
-
-
-def test_a_similarity_moves_the_positions_and_keeps_the_times():
-    trajectory = at_times([0, 10, 20])
-    moved = trajectory.transformed(Similarity(3.0, np.eye(3), np.array([1.0, 0.0, 0.0])))
-    np.testing.assert_allclose(moved.positions[:, 0], [1.0, 4.0, 7.0])
-    np.testing.assert_array_equal(moved.stamps_ns, trajectory.stamps_ns)
 
 
 @pytest.mark.parametrize(

@@ -5,17 +5,12 @@ import shutil
 
 import numpy as np
 import pytest
-import yaml
 
 from rbpf.cli import main
 from rbpf.core.checkpoint import load_arrays, save_arrays
-from rbpf.errors import InputError
-from rbpf.runs.folder import write_summary, write_trajectory
-from rbpf.runs.recordings import filter_robot_log as run
 from rbpf.runs.results import load
 from rbpf.runs.truth import RunTruth, truth_at, write_truth
 from rbpf.sensors.readers import Truth
-from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.consistency.against_groundtruth import truth_errors
 from rbpf.validation.report.page import write_report
 from rbpf.validation.report.validate import COMPARISONS, validate
@@ -211,24 +206,3 @@ def test_the_truth_is_told_from_the_first_pose():
     late = Truth(truth.stamps_ns[5:], truth.world_from_robot[5:])
     assert truth_at(log.space, late, stamps, "first frame").alignment == "rigid"
     assert truth_at(log.space, Truth(truth.stamps_ns[-2:], truth.poses[-2:]), stamps, "first frame") is None
-
-
-def test_path_and_truth_survive_the_files(tmp_path):
-    log = simulated_log(RobotWorld(steps=15), 0)
-    finished = run(log, RangeBearingConfig(particles=10))
-    done = finished.log
-    write_trajectory(tmp_path, done.stamps_ns, done.poses, done.covs)
-    write_truth(tmp_path, finished.truth)
-    write_summary(tmp_path, {})
-    (tmp_path / "config.yaml").write_text("rbpf: 1\nsystem: range-bearing\n")
-    path = load(tmp_path).path
-    np.testing.assert_array_equal(path.cov, done.covs)
-    truth = load(tmp_path).truth
-    np.testing.assert_array_equal(truth.poses, finished.truth.poses)
-    write_truth(tmp_path, None)
-    with pytest.raises(InputError, match="no ground truth"):
-        _ = load(tmp_path).truth
-
-
-def test_settings_of_the_run_are_still_readable(finished):
-    assert yaml.safe_load((finished / "config.yaml").read_text())["system"] == "range-bearing"
