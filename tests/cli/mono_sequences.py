@@ -45,6 +45,14 @@ def summary(out):
 def sentence(capsys):
     """What was said last, which must be one line."""
     error = capsys.readouterr().err
+    assert "Traceback" not in error
     said = error[error.index("rbpf: ") :]
     assert said.count("\n") == 1
     return said
+
+
+def refused(capsys, sequence, out, *arguments):
+    """The one sentence with which a run is refused."""
+    assert run(sequence, out, *map(str, arguments)) == 2
+    assert not (out / "summary.json").exists()
+    return sentence(capsys)

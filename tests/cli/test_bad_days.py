@@ -20,7 +20,7 @@ from rbpf.systems.stereo.config import StereoConfig
 from rbpf.validation.simulation.desk_and_room import TexturedDesk
 from rbpf.validation.simulation.images import Imaging, simulate_images
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
-from tests.cli.mono_sequences import CAMERA, FRAMES
+from tests.cli.mono_sequences import CAMERA, FRAMES, sentence
 
 pytestmark = pytest.mark.slow
 
@@ -53,15 +53,6 @@ def command(desk, out, *more):
     return ["run", "mono", str(desk), *known, "--out", str(out), *more]
 
 
-def said(capsys):
-    """The one sentence of a command that failed."""
-    error = capsys.readouterr().err
-    assert "Traceback" not in error
-    sentence = error[error.index("rbpf: ") :]
-    assert sentence.count("\n") == 1
-    return sentence
-
-
 @pytest.mark.parametrize("name", sorted(FILE_FAULTS))
 def test_damaged_files(desk, tmp_path, capsys, name):
     copy = damaged_copy(desk, FILE_FAULTS[name], tmp_path / "copy")
@@ -70,7 +61,7 @@ def test_damaged_files(desk, tmp_path, capsys, name):
         entries = json.loads((tmp_path / "run" / "summary.json").read_text())
         assert code == 0 and entries["frames_tracked"] == FRAMES and "frame 8" in entries["problems"][0]
     else:
-        assert code == 2 and str(copy) in said(capsys)
+        assert code == 2 and str(copy) in sentence(capsys)
         assert not (tmp_path / "run" / "summary.json").exists()
 
 
@@ -80,7 +71,7 @@ def test_results_on_a_full_disk(desk, tmp_path, capsys, most_bytes):
     out = tmp_path / "run"
     with full_disk(most_bytes):
         assert main(command(desk, out)) == 2
-    assert "cannot be written: File too large" in said(capsys)
+    assert "cannot be written: File too large" in sentence(capsys)
     assert not list(out.glob("*.partial*"))
     for path in out.glob("*.npz"):
         np.load(path).close()

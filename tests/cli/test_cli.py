@@ -10,10 +10,14 @@ import yaml
 
 from rbpf.cli import main
 from rbpf.core.checkpoint import save_arrays
+from rbpf.errors import InputError
 from rbpf.runs.files import numbered, own_folder, write_text
-from rbpf.runs.recordings import open_robot_log
+from rbpf.runs.reading import RunFolder
+from rbpf.runs.recordings import RobotRecording, open_robot_log
 from rbpf.sensors.readers import open_log
 from rbpf.systems.range_bearing.config import RangeBearingConfig
+from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
+from tests.cli.mono_sequences import sentence
 from tests.cli.run_outputs import outputs
 
 STEPS = 20
@@ -145,10 +149,7 @@ def test_a_resumed_run_is_identical(log, tmp_path, association, monkeypatch):
 )
 def test_bad_settings_are_one_sentence(log, tmp_path, capsys, arguments, message):
     assert run(log, tmp_path / "run", *arguments) == 2
-    error = capsys.readouterr().err
-    assert message in error
-    sentence = error[error.index("rbpf: ") :]
-    assert sentence.count("\n") == 1
+    assert message in sentence(capsys)
     assert not list((tmp_path / "run").glob("*"))
 
 
@@ -281,3 +282,34 @@ def test_a_link_under_a_temporary_name_is_not_followed(tmp_path, write):
         (tmp_path / name).symlink_to(victim)
     write(tmp_path / "map.npz", "text")
     assert victim.read_text() == "mine" and (tmp_path / "map.npz").is_file()
+
+
+@pytest.fixture
+def unnamed(tmp_path):
+    simulate_robot(RobotWorld(12, 10, unnamed=True), tmp_path / "log", 0)
+    return tmp_path / "log"
+
+
+@pytest.mark.parametrize("column", [True, False])
+def test_unnamed_observations_are_those_of_the_named_log(unnamed, tmp_path, column):
+    simulate_robot(RobotWorld(12, 10), tmp_path / "named", 0)
+    if not column:
+        table = unnamed / "observations.csv"
+        rows = [line.split(",") for line in table.read_text().splitlines()]
+        table.write_text("".join(",".join([row[0], *row[2:]]) + "\n" for row in rows))
+    for frame, named in zip(open_log(unnamed).frames, open_log(tmp_path / "named").frames, strict=True):
+        assert (frame.landmarks == -1).all() and frame.landmarks.size == named.landmarks.size
+        np.testing.assert_array_equal(frame.z, named.z)
+
+
+def test_names_are_needed_where_the_association_is_known(unnamed):
+    with pytest.raises(InputError, match="without a landmark's name: filter it with --association ml"):
+        RobotRecording(unnamed).open(RangeBearingConfig())
+
+
+def test_an_unnamed_log_is_filtered(tmp_path):
+    words = ["--steps", "12", "--landmarks", "10", "--unnamed"]
+    assert main(["simulate", "range-bearing", "--out", str(tmp_path / "log"), *words]) == 0
+    assert run(tmp_path / "log", tmp_path / "run", "--association", "ml") == 0
+    found = RunFolder.open(tmp_path / "run")
+    assert found.summary["landmarks"] == len(found.map.mean) > 3

@@ -6,7 +6,7 @@ import pytest
 
 from rbpf.sensors.readers import open_images, open_stereo
 from tests.cli import stereo_sequences
-from tests.cli.mono_sequences import run, sentence
+from tests.cli.mono_sequences import refused, run
 from tests.cli.run_outputs import outputs
 from tests.readers.images.bags import KINDS, film_images, film_pairs, recorded
 
@@ -49,12 +49,6 @@ def test_a_stereo_bag_gives_the_bytes_of_its_folder(room, tmp_path):
     assert stereo_sequences.run(tmp_path / KINDS[0], tmp_path / "bag", *quick) == 0
     for name in ("trajectory.tum", "map.csv"):
         assert (tmp_path / "folder" / name).read_bytes() == (tmp_path / "bag" / name).read_bytes()
-
-
-def refused(capsys, path, out, *arguments):
-    assert run(path, out, *arguments) == 2
-    assert not (out / "summary.json").exists()
-    return sentence(capsys)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -8,6 +8,7 @@ import pytest
 from rbpf.cli import main
 from rbpf.sensors.readers import open_images, open_stereo, read_known_points
 from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
+from tests.cli.mono_sequences import sentence
 
 pytestmark = pytest.mark.slow
 
@@ -53,7 +54,5 @@ def test_bad_options_are_one_sentence(
     arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert lab(tmp_path / "lab", *arguments) == 2
-    error = capsys.readouterr().err
-    said = error[error.index("rbpf: ") :]
-    assert message in said and said.count("\n") == 1
+    assert message in sentence(capsys)
     assert not (tmp_path / "lab").exists()

@@ -2,12 +2,12 @@
 
 import importlib
 import json
-import shutil
 import sys
 
 import cv2
 import numpy as np
 import pytest
+import yaml
 
 from rbpf.cli import main
 from rbpf.core.filter import Filter
@@ -15,6 +15,7 @@ from rbpf.lie import SE3
 from rbpf.runs.measurement_files import read_feature_log
 from rbpf.runs.recordings import filter_features as filter_log
 from rbpf.runs.trajectory import read_tum
+from rbpf.sensors.readers import open_images
 from rbpf.sensors.readers.images.calibration import read_calibration
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.validation.gtsam.camera import CameraEstimate, solve_features
@@ -223,19 +224,6 @@ def test_the_program_starts_without_rerun_and_encoder(monkeypatch):
         assert importlib.reload(importlib.import_module(f"rbpf.validation.{name}"))
 
 
-def test_a_run_is_compared_with_its_batch_optimum_afterwards(finished, tmp_path):
-    """From the files in the folder alone, with the figures that the run itself had."""
-    folder = tmp_path / "run"
-    shutil.copytree(finished, folder)
-    assert main(["validate", str(folder), "--against", "gtsam"]) == 0
-    written = json.loads((folder / "validation_gtsam.json").read_text())
-    apart = json.loads((folder / "summary.json").read_text())["filter_minus_batch_rmse_m"]
-    assert written["figures"]["filter_minus_batch_rmse_m"] == pytest.approx(apart, rel=1e-3)
-    assert written["figures"]["landmarks_count"] > 0
-    assert all((folder / name).is_file() for name in written["pictures"]) and written["pictures"]
-    assert "Against gtsam" in (folder / "report.html").read_text()
-
-
 def test_a_run_calibrates_its_camera(finished, tmp_path, capsys):
     assert main(["recalibrate", str(finished), "--out", str(tmp_path / "out"), "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
@@ -244,3 +232,48 @@ def test_a_run_calibrates_its_camera(finished, tmp_path, capsys):
     assert told["k1"]["after"] == pytest.approx(camera.distortion[0], abs=1e-8)
     assert told["error_after"] <= told["error_before"]
     assert (camera.width, camera.height, camera.cx) == (CAMERA.width, CAMERA.height, CAMERA.cx)
+
+
+class Player:
+    """What cv2.VideoCapture shows of a camera: a folder's images, then it is unplugged."""
+
+    def __init__(self, images):
+        self.images = images
+        self.given = iter(images)
+
+    def isOpened(self):  # noqa: N802
+        return True
+
+    def set(self, *_):
+        return True
+
+    def read(self):
+        image = next(self.given, None)
+        return (False, None) if image is None else (True, cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+
+
+def test_a_camera_is_filtered_until_it_is_gone(desk, tmp_path, monkeypatch):
+    images = [frame.image for frame in open_images(desk).frames()]
+    monkeypatch.setattr(cv2, "VideoCapture", lambda number: Player(images))
+    out = tmp_path / "run"
+    command = ["run", "mono", "0", "--calibration", str(desk / "camera.yaml"), "--out", str(out), "--no-batch"]
+    assert main(command) == 0
+    assert np.loadtxt(out / "trajectory.tum").shape == (len(images), 8)
+    assert yaml.safe_load((out / "config.yaml").read_text())["recording"] == "0"
+    assert not (out / "annotated.mp4").exists()
+    assert main(["run", "--from", str(out)]) == 2  # those images are gone
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ([], "needs --calibration"),
+        (["--calibration", "camera.yaml", "--resume"], "leave out --resume"),
+        (["--calibration", "camera.yaml", "--known-points", "known_points.csv"], "--board or --aruco"),
+        (["--calibration", "camera.yaml"], "there is no camera 0"),
+    ],
+)
+def test_what_a_camera_cannot_do(options, words, desk, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(desk)
+    assert main(["run", "mono", "0", *options, "--out", str(tmp_path / "run")]) == 2
+    assert words in " ".join(capsys.readouterr().err.split())

@@ -1,37 +1,20 @@
 """Bad images, calibrations and tables: one clear sentence where the run stops, a note where it goes on."""
 
-import json
 import re
 
 import cv2
 import numpy as np
 import pytest
 
-from rbpf.cli import main
-from tests.cli.mono_sequences import FRAMES
+from tests.cli.mono_sequences import FRAMES, refused, run, summary
 
 pytestmark = pytest.mark.slow
-
-
-def run(folder, out, *arguments):
-    short = ["--particles", "8", "--no-video", "--no-batch"]
-    return main(["run", "mono", str(folder), "--out", str(out), *short, *map(str, arguments)])
-
-
-def refused(capsys, folder, out, *arguments):
-    """The one sentence with which a run is refused."""
-    assert run(folder, out, *arguments) == 2
-    error = capsys.readouterr().err
-    said = error[error.index("rbpf: ") :]
-    assert said.count("\n") == 1
-    assert not (out / "summary.json").exists()
-    return said
 
 
 def survived(folder, out, *arguments):
     """The summary of a run that went on to the last frame."""
     assert run(folder, out, *arguments) == 0
-    entries = json.loads((out / "summary.json").read_text())
+    entries = summary(out)
     assert entries["frames"] == FRAMES
     return entries
 
@@ -84,7 +67,7 @@ def test_a_video_that_ends_in_mid_frame_keeps_what_it_showed(desk, tmp_path):
     video.write_bytes(whole.read_bytes()[: int(0.7 * whole.stat().st_size)])
     (tmp_path / "camera.yaml").write_text((desk / "camera.yaml").read_text())
     assert run(video, tmp_path / "run") == 0
-    entries = json.loads((tmp_path / "run" / "summary.json").read_text())
+    entries = summary(tmp_path / "run")
     assert 5 <= entries["frames"] < FRAMES
     assert any("the video ends after" in note for note in entries["problems"])
 

@@ -6,6 +6,7 @@ import sys
 import numba
 import pytest
 
+from rbpf import __version__
 from rbpf.cli import main
 from rbpf.cli.showing import progress, table
 
@@ -81,3 +82,21 @@ def test_a_closed_standard_output_is_refused_where_a_result_is_wanted_there(tmp_
     words = f"'{sys.executable}' -m rbpf report '{tmp_path}'"
     found = subprocess.run(f"{words} --json >&-", shell=True, stderr=subprocess.PIPE, text=True)
     assert (found.returncode, found.stderr) == (2, "rbpf: standard output is closed: --json has nowhere to write to\n")
+
+
+def test_its_version(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"rbpf {__version__}\n"
+
+
+def test_python_m():
+    done = subprocess.run([sys.executable, "-m", "rbpf", "--version"], capture_output=True, text=True, check=True)
+    assert done.stdout == f"rbpf {__version__}\n"
+
+
+def test_a_broken_pipe_ends_quietly():
+    command = [sys.executable, "-m", "rbpf", "completion", "bash"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        process.stdout.close()
+        error = process.stderr.read().decode()
+    assert process.returncode == 0 and error == ""

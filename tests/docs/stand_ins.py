@@ -104,7 +104,7 @@ class Shelf:
 
     def _longer(self, path: Path) -> None:
         """Long enough for a map in which a camera can be found."""
-        simulate_images(TexturedDesk(frames=120), Imaging(jpeg=90), DESK_CAMERA, path, seed=3)
+        simulate_images(TexturedDesk(frames=120, texel_m=0.002), Imaging(jpeg=90), DESK_CAMERA, path, seed=3)
 
     def _log(self, path: Path) -> None:
         simulate_robot(RobotWorld(steps=20, landmarks=20), path, seed=0)

@@ -9,9 +9,7 @@ from examples.studies.fault_matrix import try_stereo, usual_faults
 from examples.studies.image_faults import (
     black_out,
     blur_motion,
-    cover_view,
     drop_frames,
-    jump_exposure,
     keep_every,
     salt_and_pepper,
     truncate_files,
@@ -76,12 +74,6 @@ def test_darkness_is_where_it_is_said(whole):
     assert dark == [3 <= t < 7 for t in range(FRAMES)]
 
 
-def test_exposure_scales_the_grey_levels(whole):
-    before, after = images(whole), images(jump_exposure(4, 0.5, 0.5001)(whole))
-    np.testing.assert_array_equal(after[3], before[3])
-    np.testing.assert_allclose(after[5], 0.5 * before[5].astype(float), atol=0.6)
-
-
 def test_blur_is_the_mean_along_a_line(whole):
     """The direction of image 0 would be along the rows; that of others turns. A point becomes a line of its length."""
     image = np.zeros((41, 41), np.uint8)
@@ -91,15 +83,6 @@ def test_blur_is_the_mean_along_a_line(whole):
     assert after.sum() == pytest.approx(255.0, abs=9.0)
     rows, columns = np.nonzero(after)
     assert np.hypot(np.ptp(rows), np.ptp(columns)) == pytest.approx(8.0, abs=1.5)
-
-
-def test_something_passes_through_the_view(whole):
-    before, after = images(whole), images(cover_view(1 / 3, 2, 8)(whole))
-    fraction = [(a != b).mean() for a, b in zip(before, after, strict=True)]
-    assert fraction[1] == 0.0 and fraction[10] == 0.0
-    assert max(fraction) == pytest.approx(1 / 3, abs=0.02)
-    middle = [np.flatnonzero((a != b).any(axis=0)).mean() for a, b in zip(before[2:10], after[2:10], strict=True)]
-    assert (np.diff(middle) > 0.0).all()
 
 
 @pytest.mark.slow

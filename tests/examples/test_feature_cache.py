@@ -61,13 +61,3 @@ def test_features_of_another_recording_are_refused(tmp_path):
         cache_features(pairs(COUNT + 1), CONFIG, tmp_path)
     with pytest.raises(InputError, match="another recording or with other settings"):
         cache_features(sequence(), StereoConfig(sift=SiftConfig(length=128)), tmp_path)
-
-
-def test_files_that_do_not_fit_are_refused(tmp_path):
-    """As those of an earlier version."""
-    kept = cache_features(sequence(), CONFIG, tmp_path)
-    with np.load(tmp_path / "pairs_000000.npz") as arrays:
-        fewer = {name: arrays[name] for name in arrays.files if name != "descriptors"}
-    np.savez(tmp_path / "pairs_000000.npz", **fewer)
-    with pytest.raises(InputError, match="is damaged"):
-        next(kept.frames())

@@ -1,6 +1,6 @@
 """Numeric derivatives and robust weights that the tests of batch optimisers compare with."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
@@ -18,3 +18,9 @@ def shrunk(whitened: np.ndarray, robust: float | None) -> np.ndarray:
     norm = np.linalg.norm(whitened, axis=-1, keepdims=True)
     beyond = np.maximum(norm, robust)
     return whitened * np.sqrt(robust * (2 * beyond - robust)) / beyond
+
+
+def assert_same_covariances(found: Iterable[np.ndarray], expected: Iterable[np.ndarray], tolerance: float) -> None:
+    """One by one, each up to a fraction of its largest entry."""
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=tolerance, atol=tolerance * np.abs(other).max())

@@ -20,7 +20,7 @@ from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.consistency.against_batch import SAME, SCALED, compare, compare_folder, compare_run
-from rbpf.validation.gtsam.batch_problem import fit_of, problem_of, read_problem, solve_problem
+from rbpf.validation.gtsam.batch_problem import problem_of, read_problem, solve_problem
 from rbpf.validation.metrics.gaussian_differences import compare_last_pose
 from tests.validation.camera_scenes import scene
 from tests.validation.linear_worlds import linear_log
@@ -48,23 +48,6 @@ def test_in_a_linear_world_the_filter_is_the_batch_within_monte_carlo_error(line
     assert found.poses.keys.tolist() == [11]
     assert found.scale == 1.0 and found.gauge == SAME
     assert found.fit_batch.sightings == found.fit_filter.sightings == len(found.optimum.problem.z)
-
-
-def test_the_optimum_explains_sightings_and_odometry_best(linear_run):
-    problem, filtered = problem_of(linear_run), PathAndMap.of_run(linear_run)
-    optimum = solve_problem(problem, filtered.world_from_body)
-    best = fit_of(problem, optimum.estimate, optimum.estimate.landmarks.ids)
-    pull = problem.space.local(problem.deltas, problem.space.between(*_pairs(optimum.estimate)))
-    moved = 0.5 * np.einsum("ti,tij,tj->", pull, np.linalg.inv(problem.covs), pull)
-    size = problem.z.size
-    sighted = 0.5 * best.rms_sigmas**2 * size
-    assert sighted + moved == pytest.approx(optimum.error, rel=1e-6)
-    log_norm = 0.5 * np.linalg.slogdet(2 * np.pi * problem.cov_z)[1].sum()
-    assert best.log_likelihood == pytest.approx(-sighted - log_norm)
-
-
-def _pairs(estimate):
-    return estimate.world_from_body[:-1], estimate.world_from_body[1:]
 
 
 def test_a_folder_tells_the_same_as_the_run(linear_run, folder):

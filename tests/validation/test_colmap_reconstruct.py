@@ -1,4 +1,4 @@
-"""Reconstructions from scratch: rendered worlds, photos with measured poses, a kitchen; and those that must fail."""
+"""COLMAP's pixels and poses in ours; reconstructions of rendered worlds, photos and a kitchen; and those that must fail."""
 
 from dataclasses import replace
 
@@ -15,10 +15,12 @@ from rbpf.sensors.readers import open_images, open_stereo
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.validation.colmap.against_colmap import compare_folder_with_colmap, compare_with_colmap
 from rbpf.validation.colmap.compare import cloud_distance, compare_with_path, compare_with_truth
+from rbpf.validation.colmap.model import HALF_PX, from_colmap_pose, to_colmap_camera, to_colmap_pose
 from rbpf.validation.colmap.reconstruct import Reconstruction, ReconstructionOptions, reconstruct
 from rbpf.validation.simulation.desk_and_room import TexturedDesk
 from rbpf.validation.simulation.images import Imaging, simulate_images
 from tests.systems import plane_sequences
+from tests.validation.camera_scenes import BENT, FISHEYE, PLAIN, WHOLE
 
 CAMERA = Pinhole(320, 240, 260.0, 260.0, 159.5, 119.5)
 FEW = ReconstructionOptions(every=1, features=800)
@@ -184,3 +186,21 @@ def test_the_kitchen_is_reconstructed_as_well_as_by_the_reference(data_dir):
     assert compared.run.reconstruction.fraction >= 0.9
     assert compared.truth.path.rmse < 0.05, "the reference reconstruction is 0.038 m from this truth"
     assert compared.run.path.rmse == pytest.approx(compared.truth.path.rmse, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("camera", "model"), [(PLAIN, "PINHOLE"), (BENT, "OPENCV"), (WHOLE, "FULL_OPENCV"), (FISHEYE, "OPENCV_FISHEYE")]
+)
+def test_the_simplest_model_that_fits_projects_as_we_do_but_for_half_a_pixel(camera, model):
+    points = np.random.default_rng(0).uniform([-0.6, -0.5, 1.0], [0.6, 0.5, 2.0], (50, 3))
+    theirs = to_colmap_camera(camera)
+    assert theirs.model_name == model
+    assert theirs.img_from_cam(points) - HALF_PX == pytest.approx(camera.project(points), abs=1e-9)
+
+
+def test_a_pose_survives_both_ways_and_means_the_same():
+    pose = SE3.exp(np.array([0.4, -1.2, 0.7, 3.0, -2.0, 0.5]))
+    theirs = to_colmap_pose(pose)
+    point = np.array([0.3, 4.0, -1.0])
+    assert theirs * point == pytest.approx(SE3.inverse_transform(pose, point))
+    assert SE3.local(pose, from_colmap_pose(theirs)) == pytest.approx(np.zeros(6), abs=1e-12)

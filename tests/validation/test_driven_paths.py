@@ -74,15 +74,6 @@ def test_a_turn_on_the_spot_and_a_rest_leave_the_place() -> None:
     np.testing.assert_allclose(path.world_from_robot[0], 0.0, atol=1e-12)
 
 
-def test_bends_are_slower_than_straights() -> None:
-    drive = driven([Move(3.0), Move(1.0, np.pi / 2), Move(3.0)])
-    path = drive(np.linspace(0.0, 40.0, 4001))
-    speed, turn = np.diff(path.way_m) / 0.01, np.diff(path.heading_rad) / 0.01
-    pace = np.hypot(speed, 0.5 * turn)[200:-200]
-    np.testing.assert_allclose(pace, pace.mean(), rtol=1e-3)
-    assert speed[200:-200].min() < 0.8 * speed.max()
-
-
 @pytest.mark.parametrize(
     ("corners", "bend_m"), [(CORNERS, 1.6), ([(0.0, 0.0), (1.0, 0.0), (0.0, 0.0)], 0.1)], ids=["near", "back"]
 )

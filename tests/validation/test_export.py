@@ -9,24 +9,11 @@ import pytest
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.reading import PathAndMap
-from rbpf.runs.recordings import filter_robot_log as run
 from rbpf.systems.map_estimate import MapEstimate
-from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.colmap.model import LEFT, RIGHT, build_model, from_colmap_pose, image_id, image_name
-from rbpf.validation.exports import (
-    MAP,
-    PATH,
-    colmap_model,
-    colours_by_sigma,
-    export_colmap,
-    export_ply,
-    standard_deviations,
-    write_ply,
-)
-from rbpf.validation.gtsam.batch_problem import problem_of
+from rbpf.validation.exports import MAP, PATH, colmap_model, export_colmap, export_ply, write_ply
 from rbpf.validation.gtsam.observations import observation_table, reprojection
 from tests.validation.camera_scenes import BENT, FISHEYE, STEREO, scene
-from tests.validation.linear_worlds import linear_log
 
 
 def estimate_of(log, names=None):
@@ -83,15 +70,6 @@ def test_a_model_read_back_by_colmap_has_our_poses_points_tracks_and_residuals(t
         assert theirs[key] == pytest.approx(ours[row], abs=1e-9)
 
 
-def test_landmarks_that_the_map_lacks_are_left_out():
-    log = scene(frames=4, points=12)
-    some = sorted(log.truth.landmarks)[::2]
-    model = colmap_model(estimate_of(log, some), log)
-    assert model.num_points3D() == len(some)
-    seen = sum(int(np.isin(frame.landmarks, some).sum()) for frame in log.frames)
-    assert model.compute_num_observations() == seen
-
-
 def test_a_stereo_pair_is_a_rig_whose_right_camera_sees_what_was_measured():
     log = scene(camera=STEREO, frames=3, points=8, noise_px=1e-7)
     table = observation_table(log)
@@ -102,18 +80,6 @@ def test_a_stereo_pair_is_a_rig_whose_right_camera_sees_what_was_measured():
     left, right = (model.image(image_id(1, side, True)) for side in (LEFT, RIGHT))
     gap = from_colmap_pose(right.cam_from_world())[4:] - from_colmap_pose(left.cam_from_world())[4:]
     assert np.linalg.norm(gap) == pytest.approx(STEREO.baseline_m)
-
-
-def test_a_robot_gets_a_nominal_camera_that_looks_ahead(tmp_path):
-    done = run(linear_log(steps=5), RangeBearingConfig(particles=10))
-    estimate = PathAndMap.of_run(done)
-    model = export_colmap(estimate, problem_of(done), tmp_path / "model")
-    image = model.image(image_id(2))
-    assert image.projection_center() == pytest.approx([*estimate.world_from_body[2, 1:], 0.0])
-    heading = estimate.world_from_body[2, 0]
-    assert image.viewing_direction() == pytest.approx([np.cos(heading), np.sin(heading), 0.0], abs=1e-9)
-    assert export_ply(estimate, tmp_path) == [MAP, PATH]
-    assert read_ply(tmp_path / MAP)["vertex"]["z"] == pytest.approx(np.zeros(5))
 
 
 def test_maps_and_paths_are_whole_ply_files(tmp_path):
@@ -130,15 +96,6 @@ def test_maps_and_paths_are_whole_ply_files(tmp_path):
     reread = pycolmap.Reconstruction()
     reread.import_PLY(tmp_path / MAP)
     assert reread.num_points3D() == 10
-
-
-def test_colours_tell_the_certain_from_the_uncertain():
-    colours = colours_by_sigma(np.geomspace(1e-3, 1.0, 9)).astype(int)
-    assert (np.diff(colours.sum(axis=1)) > 0).all()
-    assert (colours[0], colours[-1]) == (pytest.approx([13, 8, 135]), pytest.approx([240, 249, 33]))
-    assert colours_by_sigma(np.full(3, 0.1)).shape == (3, 3)
-    assert colours_by_sigma(np.zeros(0)).shape == (0, 3)
-    assert standard_deviations(np.diag([1.0, 4.0, 4.0])) == pytest.approx(np.sqrt(3.0))
 
 
 def test_bad_input_is_refused(tmp_path):

@@ -16,6 +16,7 @@ from rbpf.validation.gtsam.observations import known_by_name, observation_table,
 from rbpf.validation.gtsam.solvers import marginals, marginals_by_schur
 from tests.validation.camera_scenes import BENT, FISHEYE, PLAIN, STEREO, WHOLE, scene, solve_by_scipy
 from tests.validation.factors import check_derivatives
+from tests.validation.numeric import assert_same_covariances
 
 CAMERAS = [PLAIN, BENT, WHOLE, FISHEYE, STEREO]
 
@@ -72,14 +73,9 @@ def assert_same(found, expected):
     assert np.abs(SE3.local(expected.world_from_camera, found.world_from_camera)).max() < 1e-6
     names = sorted(found.landmarks)
     np.testing.assert_allclose([found.landmarks[name] for name in names], expected.landmarks, atol=2e-6)
-    assert_same_covariances(found.cov_poses, expected.cov_poses)
-    assert_same_covariances([found.cov_landmarks[name] for name in names], expected.cov_landmarks)
+    assert_same_covariances(found.cov_poses, expected.cov_poses, 1e-4)
+    assert_same_covariances([found.cov_landmarks[name] for name in names], expected.cov_landmarks, 1e-4)
     assert found.undetermined == []
-
-
-def assert_same_covariances(found, expected):
-    for one, other in zip(found, expected, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-4 * np.abs(other).max())
 
 
 def test_errors_of_the_batch_are_as_large_as_it_says():

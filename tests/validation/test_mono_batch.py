@@ -1,4 +1,4 @@
-"""The batch adjustment beside a run over images: which frames take part, what it finds, when it gives up."""
+"""The batch adjustment beside a run over images: which frames take part, what it finds, when it gives up; its camera."""
 
 from dataclasses import replace
 from typing import Any
@@ -13,6 +13,7 @@ from rbpf.sensors.feature_log import FeatureFrame, FeatureLog
 from rbpf.validation.gtsam.batch_problem import Optimum, connected_frames, solve_problem
 from rbpf.validation.gtsam.camera import solve_features
 from rbpf.validation.gtsam.observations import HUBER
+from rbpf.validation.gtsam.self_calibration import refine_calibration
 from tests.exactness.models import known
 
 pytestmark = pytest.mark.slow
@@ -92,3 +93,17 @@ def test_it_tells_how_far_it_is_and_gives_up_after_so_much_work(log):
     assert counts == tuple(range(1, len(told) + 1)) and errors[0] > 2.0 * errors[-1]
     with pytest.raises(InputError, match="given up after 3 iterations: allow more with --batch-limit"):
         adjusted(log, rough(log), most=3)
+
+
+def test_a_wrong_focal_length_and_distortion_are_mended():
+    log = simulate_features(DeskWorld(frames=30), Measuring(noise_px=0.3), MONO, 5)
+    camera, rounds = log.camera, []
+    wrong = replace(camera, fx=0.96 * camera.fx, fy=0.96 * camera.fy, distortion=(-0.02, 0.0, 0.0, 0.0, 0.0))
+    spoilt = replace(log, camera=wrong)
+    start = solve_problem(spoilt, known(log.truth).world_from_camera, HUBER, marginals=False)
+    refined = refine_calibration(spoilt, start, lambda done, most: rounds.append(done))
+    assert refined.batch.error < start.error
+    off = np.array([refined.camera.fx / camera.fx - 1.0, refined.camera.distortion[0]])
+    assert (np.abs(off) < [0.012, 0.007]).all()
+    assert (np.abs(off) < 4.0 * refined.std).all() and (refined.std < 0.02).all()
+    assert rounds == list(range(1, len(rounds) + 1))

@@ -113,14 +113,3 @@ def test_a_seed_gives_the_same_files(world: ImageWorld, imaging: Imaging, tmp_pa
     drawn = {name for name in first if name.endswith((".png", ".jpg"))}
     drawn |= {"known_points.csv", "odometry.csv"} & first.keys()
     assert len(drawn) >= 7 and not any(first[name] == other[name] for name in drawn)
-
-
-@pytest.mark.slow
-def test_a_shorter_drive_gives_the_same_beginning(tmp_path: Path) -> None:
-    for name, frames in (("whole", 4), ("short", 3)):
-        world = TexturedLab(LabDrive("turn_back", frames, every=30), texel_m=0.5)
-        imaging = Imaging(jpeg=90, known=0, exposure_drift=0.0, blur_s=0.0)  # both look at later frames
-        simulate_images(world, imaging, SMALL, tmp_path / name, 3)
-    whole, short = (contents(tmp_path / name) for name in ("whole", "short"))
-    pictures = [name for name in short if name.endswith(".jpg")]
-    assert len(pictures) == 6 and all(short[name] == whole[name] for name in pictures)

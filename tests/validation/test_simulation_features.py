@@ -18,23 +18,64 @@ from examples.studies.point_worlds import (
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
+from rbpf.sensors.feature_log import FeatureLog
 from rbpf.validation.simulation.lab import LabDrive
-from tests.validation.feature_logs import StillCamera, errors, likely, sightings, truth
+
+
+def truth(log: FeatureLog, frame: int) -> np.ndarray:
+    """True places (K, 3), in the camera's frame, of what a frame measures."""
+    assert log.truth is not None
+    world = [log.truth.landmarks[name] for name in log.frames[frame].landmarks.tolist()]
+    return SE3.inverse_transform(log.truth.world_from_camera[frame], np.array(world).reshape(-1, 3))
+
+
+def errors(log: FeatureLog) -> np.ndarray:
+    """(n, p) measured minus projected pixels."""
+    return np.concatenate([f.z - log.camera.project(truth(log, t)) for t, f in enumerate(log.frames)])
+
+
+def sightings(log: FeatureLog) -> dict[int, list[int]]:
+    """Frames in which each landmark was measured."""
+    seen: dict[int, list[int]] = {}
+    for t, frame in enumerate(log.frames):
+        for name in frame.landmarks.tolist():
+            seen.setdefault(name, []).append(t)
+    return seen
+
+
+def likely(successes: float, trials: int, probability: float) -> bool:
+    """Within four standard deviations of a binomial distribution."""
+    return abs(successes - trials * probability) < 4.0 * np.sqrt(trials * probability * (1.0 - probability))
+
+
+@dataclass(frozen=True)
+class StillCamera:
+    """A world of points in view of a camera at rest."""
+
+    frames: int = 10
+    points: int = 20
+
+    def build(self, rng: np.random.Generator) -> Scene:
+        depth = rng.uniform(1.0, 6.0, (self.points, 1))
+        points = depth * np.concatenate([rng.uniform(-0.45, 0.45, (self.points, 2)), np.ones_like(depth)], axis=1)
+        present = np.tile([0, self.frames], (self.points, 1))
+        stamps = np.arange(self.frames) * 10**8
+        path = SE3.identity((self.frames,))
+        return Scene("still camera", stamps, path, points, present, np.zeros((0, 2, 3)))
+
 
 CAMERAS = [MONO, STEREO]
 FISHEYE = replace(MONO, fx=262.0, fy=262.0, distortion=(-0.03, 0.02, -0.012, 0.002), distortion_model="equidistant")
+BENT = replace(MONO, distortion=(-0.28, 0.07, 2e-4, 2e-5, 0.0))
 DESK = DeskWorld(frames=200)
-STILL = StillCamera(frames=800)
-CHANGING = LabWorld(LabDrive(frames=150, every=4), points=3000)
+STILL = StillCamera(frames=400)
+CHANGING = LabWorld(LabDrive(frames=60, every=10), points=3000)
 EXACT = Measuring(dropout=0.0, turnover=0.0)
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
-@pytest.mark.parametrize("world", [DESK, CHANGING])
-def test_measurements_are_projections_with_the_stated_noise(
-    world: PointWorld, camera: Pinhole | RectifiedStereo
-) -> None:
-    log = simulate_features(world, Measuring(noise_px=0.7), camera, seed=0)
+def test_measurements_are_projections_with_the_stated_noise(camera: Pinhole | RectifiedStereo) -> None:
+    log = simulate_features(DESK, Measuring(noise_px=0.7), camera, seed=0)
     score = errors(log) / 0.7
     n = score.size
     assert n > 5000
@@ -45,8 +86,7 @@ def test_measurements_are_projections_with_the_stated_noise(
         np.testing.assert_allclose(frame.cov_z, np.tile(0.49 * np.eye(camera.dim), (len(frame.z), 1, 1)))
 
 
-@pytest.mark.parametrize("camera", [*CAMERAS, replace(MONO, distortion=(-0.28, 0.07, 2e-4, 2e-5, 0.0)), FISHEYE])
-@pytest.mark.parametrize("world", [DESK, CHANGING])
+@pytest.mark.parametrize(("world", "camera"), [(DESK, MONO), (CHANGING, STEREO), (CHANGING, BENT), (DESK, FISHEYE)])
 def test_only_what_is_visible_is_measured(world: PointWorld, camera: Pinhole | RectifiedStereo) -> None:
     measuring = Measuring(nearest_m=0.7, farthest_m=5.0)
     log = simulate_features(world, measuring, camera, seed=1)
@@ -74,15 +114,6 @@ def test_share_and_place_of_outliers(camera: Pinhole | RectifiedStereo) -> None:
         assert (z[:, 2] <= z[:, 0]).all()
 
 
-def test_no_outlier_begins_a_landmark() -> None:
-    log = simulate_features(CHANGING, Measuring(outlier_rate=0.5), MONO, seed=0)
-    seen = sightings(log)
-    residual = [f.z - MONO.project(truth(log, t)) for t, f in enumerate(log.frames)]
-    begun = [residual[frames[0]][log.frames[frames[0]].landmarks.tolist().index(name)] for name, frames in seen.items()]
-    assert len(begun) > 100
-    assert np.abs(begun).max() < 6.0
-
-
 def test_share_of_missed_measurements() -> None:
     log = simulate_features(STILL, replace(EXACT, dropout=0.2), MONO, seed=0)
     counts = [len(frame.landmarks) for frame in log.frames]
@@ -103,12 +134,12 @@ def test_a_lost_track_rests_and_is_taken_up_again() -> None:
 
 
 def test_points_that_are_gone_stay_gone() -> None:
-    world = DeskWorld(frames=600, renewal=0.1)
+    world = DeskWorld(frames=200, renewal=0.1)
     scene = world.build(np.random.default_rng(5))
     log = simulate_features(world, Measuring(), MONO, seed=5)
     assert log.known is not None and log.truth is not None
     renewed = len(log.truth.landmarks) - world.points
-    assert abs(renewed - 600) < 4.0 * np.sqrt(600)
+    assert abs(renewed - 200) < 4.0 * np.sqrt(200)
     seen = sightings(log)
     assert max(seen) >= world.points
     for name, frames in seen.items():

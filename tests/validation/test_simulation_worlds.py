@@ -12,7 +12,7 @@ from rbpf.sensors.feature_log import FeatureLog
 from rbpf.validation.simulation.paths import HandHeld, looking, slowed, speeds
 
 DESK = DeskWorld()
-SEEDS = range(4)
+SEEDS = range(2)
 
 
 def built(world: PointWorld, seed: int) -> Scene:
@@ -64,18 +64,6 @@ def test_a_desk_is_seen_from_its_distance(seed: int) -> None:
     turn, speed = speeds(scene.world_from_camera, scene.stamps_ns * 1e-9)
     # The limits are kept between the images of the path before it is slowed down.
     assert turn.max() < 1.01 * world.hand.turn_rad_s and speed.max() < 1.01 * world.hand.speed_m_s
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_a_desk_is_swept(seed: int) -> None:
-    world = DeskWorld()
-    scene = built(world, seed)
-    assert (np.ptp(scene.world_from_camera[:, 4:], axis=0) > 0.2).all()
-    assert np.linalg.norm(np.ptp(scene.world_from_camera[:, 4:], axis=0)) > 0.6
-    forward = SE3.rotation(scene.world_from_camera)[:, :, 2]
-    assert np.degrees(np.arccos((forward @ forward[0]).min())) > 20.0
-    assert (np.abs(scene.points - [0.0, 0.0, 0.5]) <= [1.0, 1.0, 0.5]).all()
-    assert scene.points.shape == (300, 3)
 
 
 def test_the_desk_stays_in_view() -> None:

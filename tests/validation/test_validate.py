@@ -12,8 +12,7 @@ from rbpf.runs.results import load
 from rbpf.runs.truth import RunTruth, truth_at, write_truth
 from rbpf.sensors.readers import Truth
 from rbpf.validation.consistency.against_groundtruth import truth_errors
-from rbpf.validation.report.page import write_report
-from rbpf.validation.report.validate import COMPARISONS, validate
+from rbpf.validation.report.page import _images, write_report
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot, simulated_log
 
 pytestmark = pytest.mark.usefixtures("plain_pictures")
@@ -178,18 +177,6 @@ def test_a_run_without_truth_is_judged_by_the_batch_posterior_that_it_found_or_b
     assert verdict.trust in ("cannot tell", "do not trust")
 
 
-def test_a_further_comparison_is_one_function(run_folder, monkeypatch):
-    from rbpf.validation.consistency.comparison import Comparison
-
-    def reconstruction(record):
-        return Comparison("colmap", f"{record.name} is good.", {"ate_m": 0.01})
-
-    monkeypatch.setitem(COMPARISONS["colmap"], "range-bearing", reconstruction)
-    validate(run_folder, "colmap")
-    assert "Against colmap" in page(run_folder)
-    assert json.loads((run_folder / "validation_colmap.json").read_text())["figures"] == {"ate_m": 0.01}
-
-
 def test_the_truth_is_told_from_the_first_pose():
     log = simulated_log(RobotWorld(steps=20), 0)
     moved = log.space.retract(log.space.identity(), np.array([0.5, 3.0, -2.0]))
@@ -206,3 +193,13 @@ def test_the_truth_is_told_from_the_first_pose():
     late = Truth(truth.stamps_ns[5:], truth.world_from_robot[5:])
     assert truth_at(log.space, late, stamps, "first frame").alignment == "rigid"
     assert truth_at(log.space, Truth(truth.stamps_ns[-2:], truth.poses[-2:]), stamps, "first frame") is None
+
+
+def test_a_link_that_points_outside_is_not_embedded(tmp_path):
+    (tmp_path / "secret").write_bytes(b"secret")
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "own.png").write_bytes(b"own")
+    (run / "evil.png").symlink_to(tmp_path / "secret")
+    (run / "again.png").symlink_to("own.png")
+    assert [name for name, _ in _images(run, ["own.png", "evil.png", "again.png"])] == ["own", "again"]

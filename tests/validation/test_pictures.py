@@ -1,18 +1,30 @@
-"""What a stereo run keeps of each pair, and the frames that are drawn from it."""
+"""What runs over images keep of each frame, and the frames, views and videos that are drawn of it."""
 
-from contextlib import nullcontext
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 
+from rbpf.lie import SE3
+from rbpf.runs.plots import Views
 from rbpf.runs.recordings import filter_pairs
 from rbpf.runs.run import Run
 from rbpf.systems.stereo.config import StereoConfig, TriggerConfig
 from rbpf.systems.stereo.landmarks import FeatureKind
-from rbpf.validation.report.rerun import recording, write_rerun
-from rbpf.validation.report.video import FEATURES, Caption, annotated_frames, draw_pair, drawn_size
+from rbpf.validation.report.rerun import recording
+from rbpf.validation.report.video import (
+    FEATURES,
+    FOUND,
+    MISSED,
+    RAY,
+    Caption,
+    annotated_frames,
+    draw_pair,
+    draw_search,
+    drawn_size,
+    frame_rate,
+    is_complete,
+)
 from tests.systems.plane_sequences import CAMERA
 from tests.systems.stereo_sequences import missing, pairs
 
@@ -67,46 +79,66 @@ def test_frames_of_a_run(run):
     assert red[BAD] > 20 and red[0] == 0
 
 
-class Stream:
-    """Keeps what is logged for the viewer."""
-
-    def __init__(self) -> None:
-        self.logged: dict[str, list[Any]] = {}
-
-    def log(self, place: str, what: Any, static: bool = False) -> None:
-        self.logged.setdefault(place, []).append(what)
-
-    def set_time(self, name: str, **time: float) -> None:
-        self.logged.setdefault(f"time/{name}", []).append(time)
-
-
 @pytest.mark.slow
-def test_features_in_the_recording(run, tmp_path, monkeypatch):
-    """Every pair's features under what they were, half a pixel aside, and landmarks where the map has them."""
-    rr = pytest.importorskip("rerun")
-    stream = Stream()
-    monkeypatch.setattr("rbpf.validation.report.rerun.recording", lambda *_: nullcontext((rr, stream)))
-    write_rerun(run, tmp_path / "unused.rrd")
-    logged = stream.logged
-    assert len(logged["time/frame"]) == COUNT and len(logged["world/camera/image"]) == COUNT
-    for kind, name in (
-        (FeatureKind.LANDMARK, "landmark"),
-        (FeatureKind.CANDIDATE, "candidate"),
-        (FeatureKind.NEW, "new"),
-        (FeatureKind.FEATURE, "feature"),
-    ):
-        pixels = logged[f"world/camera/image/{name}"]
-        for seen, drawn in zip(run.log.all_observed(), pixels, strict=True):
-            xy = np.array(drawn.positions.as_arrow_array().to_pylist()).reshape(-1, 2)
-            np.testing.assert_allclose(xy, seen["z"][seen["kind"] == kind, :2] + 0.5, atol=1e-4)
-    places = np.array(logged["world/seen"][-1].positions.as_arrow_array().to_pylist())
-    mapped = run.system.map().mean
-    nearest = np.linalg.norm(places[:, None] - mapped, axis=2).min(axis=1)
-    assert len(places) > 5 and np.median(nearest) < 0.02
-
-
 def test_a_recording_that_fails_leaves_nothing(tmp_path):
     pytest.importorskip("rerun")
     with pytest.raises(ZeroDivisionError), recording(tmp_path / "x.rrd", "x"):
         raise ZeroDivisionError
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("vertical", "down", "tilt_deg"), [(2, False, 50.0), (2, False, 0.0), (1, True, 10.0), (0, False, 30.0)]
+)
+def test_views_find_the_vertical(vertical, down, tilt_deg):
+    up = np.eye(3)[vertical] * (-1.0 if down else 1.0)
+    first = np.eye(3)[(vertical + 1) % 3]
+    poses = []
+    for heading in np.deg2rad(np.linspace(-25.0, 25.0, 9)):
+        ahead = np.cos(heading) * first + np.sin(heading) * np.cross(up, first)
+        right = np.cross(ahead, up)
+        tilt = np.deg2rad(tilt_deg)
+        forward = np.cos(tilt) * ahead - np.sin(tilt) * up
+        poses.append(np.column_stack([right, np.cross(forward, right), forward, np.zeros(3)]))
+    views = Views.of_camera(SE3.from_matrix(np.array(poses)))
+    assert views.side[1] == vertical and views.down == down
+    a, b = np.eye(3)[list(views.top)]
+    assert np.allclose(np.cross(a, b), up)
+
+
+def test_a_frame_shows_hits_misses_and_lines():
+    sighting = {
+        "mean": np.array([[40.0, 30.0], [80.0, 40.0]]),
+        "cov": np.tile(4.0 * np.eye(2), (2, 1, 1)),
+        "px": np.array([[41.0, 30.0], [np.nan, np.nan]]),
+        "line": np.array([[[np.nan] * 2] * 2, [[-1e9, 40.0], [1e9, 40.0]]]),
+        "started_px": np.zeros((0, 2)),
+    }
+    image = np.full((90, 120), 128, dtype=np.uint8)
+    picture = draw_search(image, sighting, Caption("frame 0", ""), (120, 90))
+    assert picture.shape[:2] == drawn_size(120, 90)[::-1]
+    below = picture[30:]
+    counts = [int((below == colour).all(axis=-1).sum()) for colour in (FOUND, MISSED, RAY)]
+    assert min(counts[:2]) > 30 and counts[2] > 200
+
+
+def test_equal_stamps_still_have_a_rate():
+    assert frame_rate(np.arange(5) * 33_333_333) == pytest.approx(30.0, abs=0.01)
+    assert frame_rate(np.zeros(5, dtype=np.int64)) == 1.0
+    assert frame_rate(np.array([0])) == 1.0
+
+
+def test_a_video_that_the_encoder_could_not_finish_is_seen(tmp_path):
+    import imageio_ffmpeg
+
+    path = tmp_path / "a.mp4"
+    encoder = imageio_ffmpeg.write_frames(str(path), (64, 48), ffmpeg_log_level="error")
+    encoder.send(None)
+    for grey in (0, 100, 200):
+        encoder.send(np.full((48, 64, 3), grey, np.uint8))
+    encoder.close()
+    data = path.read_bytes()
+    assert is_complete(path)
+    for length in (0, 5, 40, len(data) // 2, len(data) - 1):
+        path.write_bytes(data[:length])
+        assert not is_complete(path)
