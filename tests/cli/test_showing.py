@@ -89,11 +89,6 @@ def test_its_version(capsys):
     assert capsys.readouterr().out == f"rbpf {__version__}\n"
 
 
-def test_python_m():
-    done = subprocess.run([sys.executable, "-m", "rbpf", "--version"], capture_output=True, text=True, check=True)
-    assert done.stdout == f"rbpf {__version__}\n"
-
-
 def test_a_broken_pipe_ends_quietly():
     command = [sys.executable, "-m", "rbpf", "completion", "bash"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
