@@ -149,6 +149,8 @@ SWAPPED, FEWER = 20, 4
 """So many matches the wrong way round, and so many times fewer the right way, are no accident."""
 IMPOSSIBLE, FRACTION = 5, 0.03
 """So many matches the wrong way round, and such a fraction of all, are no accident either: of KITTI's it is below 0.01."""
+REMEMBERED = 0.9
+"""Of the matches that were counted, what still counts a pair later: some ten pairs decide."""
 
 
 @dataclass(frozen=True)
@@ -197,6 +199,14 @@ class PairConfig(Ranged):
     disparity_per_scale: NotNegative = 0.025
 
 
+def calibration_doubt(wrong: float, matches: float) -> str:
+    """In words, why matches, so many of them of negative disparity, are not of such cameras; empty where they may be."""
+    if wrong < IMPOSSIBLE or wrong <= FRACTION * matches:
+        return ""
+    fraction = f"{100.0 * wrong / matches:.0f} % of the matches"
+    return f"{fraction} have a negative disparity, which no point in space has: check the calibration"
+
+
 @final
 class StereoMatcher:
     """Measures pairs of images.
@@ -234,30 +244,24 @@ class StereoMatcher:
         return found
 
     @property
-    def doubt(self) -> str:
-        """In words, why the last pair does not look like one of these cameras; empty where it does.
+    def impossible(self) -> tuple[int, int]:
+        """Matches of the last pair whose disparity is negative, as good as the others, and all of its matches.
 
-        Nothing is further away than infinity: matches of negative disparity, as good as the others, are those of cameras
-        that are turned or shifted against each other.
+        Nothing is further away than infinity: such are those of cameras that are turned or shifted against each other.
         """
         if self._last is None:
-            return ""
+            return 0, 0
         images, left, right, count = self._last
         matches = self._along_rows(right, left)
         px, u = left.px[matches.second], right.px[matches.first, 0]
-        if self.config.refine:
+        if self.config.refine and len(matches):
             refined = refine(*images, px, u, self.config.half_px)
             good = (np.abs(refined.u - u) <= self.config.shift_px) & (
                 refined.correlation >= self.config.least_correlation
             )
             px, u = px[good], refined.u[good]
         wrong = int((px[:, 0] - u <= -self.config.least_disparity_px).sum())
-        if wrong < IMPOSSIBLE or wrong <= FRACTION * (wrong + count):
-            return ""
-        return (
-            f"{wrong} of {wrong + count} matches have a negative disparity, which no point in space has: check the "
-            "calibration"
-        )
+        return wrong, wrong + count
 
     @property
     def remark(self) -> str:

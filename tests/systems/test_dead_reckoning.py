@@ -35,6 +35,35 @@ def slam(dof: int = 6, **options) -> StereoSlam:
 NEVER = {"trigger": TriggerConfig(9.0, 9.0)}
 
 
+def test_every_draw_comes_from_the_filters_generator(monkeypatch):
+    """Also those of the odometry, between updates."""
+    one, recorded, states = slam(**NEVER), frames(), []
+    monkeypatch.setattr(np.random, "default_rng", None)
+    for frame in recorded:
+        one.take(frame)
+        states.append(one.filter.rng.bit_generator.state["state"]["state"])
+    assert len(set(states[1:])) == 3
+
+
+def test_cameras_that_begin_to_disagree_are_noticed_once(monkeypatch, tmp_path):
+    """A twentieth of the matches has a negative disparity from pair 20 on; a checkpoint knows what was said."""
+    one, again = slam(**NEVER), slam(**NEVER)
+    said = {}
+    for t, frame in enumerate(frames(40)):
+        monkeypatch.setattr(one.front_end, "impossible", lambda t=t: (0 if t < 20 else 10, 200), raising=False)
+        said[t] = [words for words in one.take(frame).messages if "check the calibration" in words]
+        if t == 30:
+            one.save(tmp_path / "checkpoint.npz")
+    (first,) = (t for t, words in said.items() if words)
+    assert 20 < first <= 30
+    assert said[first] == [
+        "3 % of the matches have a negative disparity, which no point in space has: check the calibration"
+    ]
+    again.load(tmp_path / "checkpoint.npz")
+    monkeypatch.setattr(again.front_end, "impossible", lambda: (10, 200), raising=False)
+    assert again.take(frames(32)[31]).messages == ()
+
+
 def test_over_a_missing_pair():
     """Exact pixels: the motion is found, whether in two steps or in one over the missing pair."""
     for missing in ((), (1,)):

@@ -120,9 +120,9 @@ class FrontEnd(ABC, Generic[F]):
         """In words, why a frame cannot be one of these cameras; empty where it can. `measure` then finds nothing in it."""
         return ""
 
-    def doubt(self) -> str:
-        """In words, why the frame that was measured last does not look like one of these cameras; empty where it does."""
-        return ""
+    def impossible(self) -> tuple[int, int]:
+        """Matches within the frame that was measured last which no point in space has, and all of them."""
+        return 0, 0
 
     @abstractmethod
     def match(self, before: Pair[F], now: Pair[F]) -> tuple[np.ndarray, np.ndarray]:
@@ -214,8 +214,8 @@ class ImageFrontEnd(FrontEnd[StereoFeatures]):
             return str(error)
         return ""
 
-    def doubt(self) -> str:
-        return self.matcher.doubt
+    def impossible(self) -> tuple[int, int]:
+        return self.matcher.impossible
 
     def match(self, before: Pair[StereoFeatures], now: Pair[StereoFeatures]) -> tuple[np.ndarray, np.ndarray]:
         """By their descriptors."""

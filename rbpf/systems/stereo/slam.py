@@ -16,7 +16,7 @@ import numpy as np
 from rbpf.core.filter import Filter, StepReport
 from rbpf.core.models import NULL, Landmark, Part
 from rbpf.core.particles import Estimate
-from rbpf.core.schema import integers, numbers, poses, read
+from rbpf.core.schema import integers, numbers, poses, read, truths
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.maps.landmark_map import LandmarkMap
@@ -27,6 +27,7 @@ from rbpf.sensors.camera.points import CameraModel
 from rbpf.sensors.feature_log import FeatureFrame, FeatureLog
 from rbpf.sensors.features import FeatureExtractor
 from rbpf.sensors.readers import ImageFrame
+from rbpf.sensors.stereo import REMEMBERED, calibration_doubt
 from rbpf.systems.map_estimate import MapEstimate, estimate_map
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.front_end import FrontEnd, ImageFrontEnd, NamedFrontEnd, Pair
@@ -51,15 +52,14 @@ from rbpf.systems.system import (
     TrackingState,
 )
 
-DOUBTED = 10
-"""Pairs at the beginning that are asked whether they look like these cameras' at all."""
-
 _STEREO = {
     "frames": integers(2, least=0),
     "front_end": integers(least=0, below="front_ends"),
     "at_update": poses(),
     "cov_at_update": numbers(6, 6),
     "since_update": poses(),
+    "impossible": numbers(2),
+    "doubted": truths(),
 }
 
 
@@ -169,6 +169,8 @@ class StereoSlam(System):
         """Motion from the filter's last update to the last pair, also where it was only expected."""
         self._last_update = 0
         self._kept: Pair[Any] | None = None
+        # Matches that no point in space has, and all, of the last pairs; whether that was said.
+        self._impossible, self._doubted = np.zeros(2), False
 
     def track(self, left: np.ndarray | None, right: np.ndarray | None, stamp_ns: int) -> Tracked:
         """A pair of rectified images (H, W) uint8, taken at one time.
@@ -205,7 +207,9 @@ class StereoSlam(System):
         measured = len(pair) >= least and dt > 0.0
         if measured:
             motion = self._motion_to(pair, dt)
-            doubt = front_end.doubt() if self.frames < DOUBTED else ""
+            self._impossible = REMEMBERED * self._impossible + front_end.impossible()
+            doubt = "" if self._doubted else calibration_doubt(*self._impossible)
+            self._doubted |= bool(doubt)
             messages += filter(None, (problem, doubt, motion.message))
         else:
             few = "it has the stamp of the last one"
@@ -337,6 +341,8 @@ class StereoSlam(System):
             "stereo/at_update": self.at_update.mean,
             "stereo/cov_at_update": self.at_update.cov,
             "stereo/since_update": self.since_update,
+            "stereo/impossible": self._impossible,
+            "stereo/doubted": np.array(self._doubted),
         }
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
@@ -346,6 +352,7 @@ class StereoSlam(System):
         self.frames, self._last_update = found["frames"].tolist()
         self.at_update = Estimate(found["at_update"], found["cov_at_update"])
         self.since_update = found["since_update"]
+        self._impossible, self._doubted = found["impossible"], bool(found["doubted"])
         self.reckoning = DeadReckoning.restored(arrays)
         self.front_end.landmarks.restore(arrays)
         self._kept = self.front_end.pair_of(arrays) if "pair/z" in arrays else None
@@ -375,8 +382,7 @@ class StereoSlam(System):
             return _Motion(before.started(stamp_ns))
         rows = self.front_end.match(kept, pair)
         matches, labels = self.front_end.matches(kept, pair, rows), kept.labels[rows[0]]
-        rng = np.random.default_rng([self.config.seed, self.frames])
-        found = self.visual_odometry.candidates(matches, before.velocity, dt, rng)
+        found = self.visual_odometry.candidates(matches, before.velocity, dt, self.filter.rng)
 
         # Which of the motions that matches agree on is the camera's: one is, if the rest of what is known agrees with it.
         chosen, failure = (0 if found.motions else -1), found.failure
