@@ -106,7 +106,7 @@ def add_batch(found: RunFolder, callbacks: Callbacks) -> dict[str, Any]:
         InputError: there are too many observations, too few frames are connected, it takes too many iterations, or it
             does not converge.
     """
-    from rbpf.validation.consistency.against_optimisers import solve_run
+    from rbpf.validation.consistency.against_batch import solve_run
 
     measured = found.measurements
     if isinstance(measured, FeatureLog) and isinstance(measured.camera, RectifiedStereo):

@@ -33,8 +33,8 @@ from rbpf.sensors.range_bearing import RangeBearing
 from rbpf.sensors.readers import Frame, RobotLog
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
+from rbpf.validation.consistency.against_batch import compare_with_batch
 from rbpf.validation.consistency.against_groundtruth import LANDMARKS, NEES, compare_with_truth, truth_errors
-from rbpf.validation.consistency.against_optimisers import compare_with_batch
 from rbpf.validation.consistency.comparison import compare_with_itself
 from rbpf.validation.consistency.statistic import STATE_FACTOR
 from rbpf.validation.consistency.verdict import Verdict

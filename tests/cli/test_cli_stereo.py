@@ -187,7 +187,7 @@ def test_a_run_is_compared_with_its_batch_optimum_afterwards(finished, tmp_path)
 def test_a_run_is_compared_with_a_reconstruction(finished, tmp_path, monkeypatch, capsys):
     """The baseline tells the scale; so few pairs must all be key frames, and begin with a smaller angle."""
     near = ReconstructionOptions(every=1, features=800, least_angle_deg=4.0)
-    monkeypatch.setattr("rbpf.validation.consistency.against_optimisers.ReconstructionOptions", lambda: near)
+    monkeypatch.setattr("rbpf.validation.colmap.reconstruct.ReconstructionOptions", lambda: near)
     folder = shutil.copytree(finished, tmp_path / "run")
     assert main(["validate", str(folder), "--against", "colmap"]) == 0
     assert "(rms) from COLMAP's reconstruction" in " ".join(capsys.readouterr().err.split())

@@ -17,7 +17,6 @@ from rbpf.validation.report.video import (
     FOUND,
     MISSED,
     RAY,
-    Caption,
     annotated_frames,
     draw_pair,
     draw_search,
@@ -62,7 +61,7 @@ def test_between_updates_all_are_features():
 def test_a_feature_is_drawn_where_it_is(kind):
     """A cross at the left pixel, and a line as long as the disparity, at twice the size, below the caption."""
     seen = {"z": np.array([[60.0, 40.0, 30.0]]), "kind": np.array([kind])}
-    picture = draw_pair(np.zeros((90, 120), dtype=np.uint8), seen, Caption("pair 0", ""), (120, 90))
+    picture = draw_pair(np.zeros((90, 120), dtype=np.uint8), seen, ("pair 0", ""), (120, 90))
     assert picture.shape[:2] == drawn_size(120, 90)[::-1]
     rows, columns = np.nonzero((picture[24:] == FEATURES[kind][1]).all(axis=-1))
     assert abs(np.median(rows) - 80.5) <= 1.0
@@ -115,7 +114,7 @@ def test_a_frame_shows_hits_misses_and_lines():
         "started_px": np.zeros((0, 2)),
     }
     image = np.full((90, 120), 128, dtype=np.uint8)
-    picture = draw_search(image, sighting, Caption("frame 0", ""), (120, 90))
+    picture = draw_search(image, sighting, ("frame 0", ""), (120, 90))
     assert picture.shape[:2] == drawn_size(120, 90)[::-1]
     below = picture[30:]
     counts = [int((below == colour).all(axis=-1).sum()) for colour in (FOUND, MISSED, RAY)]

@@ -23,11 +23,14 @@ from rbpf.errors import InputError
 from rbpf.lie import Array
 from rbpf.runs.reading import PathAndMap, RunFolder
 from rbpf.runs.run import Run
-from rbpf.validation.consistency.statistic import Statistic, posterior_ratio
+from rbpf.sensors.feature_log import FeatureLog
+from rbpf.validation.consistency.comparison import RESIDUALS, Comparison
+from rbpf.validation.consistency.statistic import NOISE_FACTOR, Statistic, posterior_ratio, variance_ratio
 from rbpf.validation.gtsam.batch_problem import (
     Fit,
     Optimum,
     Problem,
+    Told,
     fit_of,
     floats_in_scale,
     name_of,
@@ -36,6 +39,7 @@ from rbpf.validation.gtsam.batch_problem import (
     solve_problem,
     stamps_of,
 )
+from rbpf.validation.gtsam.observations import HUBER
 from rbpf.validation.metrics.accuracy import AbsoluteError, ate
 from rbpf.validation.metrics.gaussian_differences import (
     Differences,
@@ -43,6 +47,7 @@ from rbpf.validation.metrics.gaussian_differences import (
     away_from_first,
     compare_last_pose,
     compare_maps,
+    figures_of,
     no_differences,
     projected,
     rescaled,
@@ -176,8 +181,11 @@ def compare(
     Raises:
         InputError: path and measurements are not of one run, or the batch cannot be solved.
     """
-    name = name_of(problem)
-    _require_one_run(filtered, problem)
+    name, stamps = name_of(problem), stamps_of(problem)
+    if len(stamps) != len(filtered.stamps_ns) or (stamps != filtered.stamps_ns).any():
+        raise InputError(f"{name}: path and measurements do not share their time stamps; take both from one run.")
+    if len(stamps) < LEAST_STEPS:
+        raise InputError(f"{name} has {len(stamps)} steps, expected {LEAST_STEPS} or more to compare with a batch.")
     if optimum is None:
         optimum = solve_problem(problem, filtered.world_from_body, robust)
     floats = floats_in_scale(problem)
@@ -201,9 +209,41 @@ def compare(
     )
 
 
-def _require_one_run(filtered: PathAndMap, problem: Problem) -> None:
-    stamps, name = stamps_of(problem), name_of(problem)
-    if len(stamps) != len(filtered.stamps_ns) or (stamps != filtered.stamps_ns).any():
-        raise InputError(f"{name}: path and measurements do not share their time stamps; take both from one run.")
-    if len(stamps) < LEAST_STEPS:
-        raise InputError(f"{name} has {len(stamps)} steps, expected {LEAST_STEPS} or more to compare with a batch.")
+def solve_run(record: RunFolder, most: int | None = None, on_iteration: Told | None = None) -> Optimum:
+    """The batch optimum of a run's measurements: with Huber's loss for matches in images, which hold false ones.
+
+    `most` and `on_iteration` as of `solve_problem`.
+
+    Raises:
+        InputError: as of `solve_problem`, or the run's measurements are missing, damaged, or another run's.
+    """
+    problem = read_problem(record.folder)
+    robust = HUBER if isinstance(problem, FeatureLog) else None
+    return solve_problem(problem, record.path.mean, robust, most, on_iteration)
+
+
+def compare_with_batch(record: RunFolder, optimum: Optimum | None = None) -> tuple[Comparison, AgainstBatch]:
+    """A run beside the batch posterior of the same measurements, from `solve_run` where it is known; errors as that."""
+    problem = read_problem(record.folder)
+    found = compare(record.estimate, problem, optimum=optimum or solve_run(record))
+    figures: dict[str, Any] = {
+        "gauge": found.gauge,
+        "scale": found.scale,
+        "filter_minus_batch_rmse_m": found.path.rmse,
+        "filter_minus_batch_max_m": found.path.max,
+        "path_spread_m": found.optimum.estimate.trajectory.spread,
+        "batch_error": found.optimum.error,
+    }
+    statistics = found.statistics()
+    if not isinstance(problem, FeatureLog):
+        residuals = problem.z.size - found.optimum.estimate.landmarks.mean.size
+        figures["batch_error_right"] = 0.5 * residuals
+        if residuals > 0:
+            value = 2.0 * found.optimum.error / residuals
+            statistics.insert(0, variance_ratio(RESIDUALS, value, residuals, NOISE_FACTOR))
+    accuracy = f"The path is {1e3 * found.path.rmse:.3g} mm (rms) from the batch optimum of the same measurements"
+    # Single numbers of the Gaussians for the page; the rows behind them are `AgainstBatch.as_dict`'s.
+    figures |= figures_of("landmarks", found.landmarks) | figures_of("poses", found.poses)
+    for name, fit in (("filter", found.fit_filter), ("batch", found.fit_batch)):
+        figures |= {f"{name}_{key}": value for key, value in asdict(fit).items()}
+    return Comparison("gtsam", f"{accuracy}.", figures, statistics), found

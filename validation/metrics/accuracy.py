@@ -84,13 +84,9 @@ class RelativeError:
 
 
 def ate(estimate: Trajectory, reference: Trajectory, alignment: Alignment | Similarity = "none") -> AbsoluteError:
-    """Absolute trajectory error, the distance of each position from the true one.
+    """Absolute trajectory error, the distance of each of T positions from the true one of the same row (see `associate`).
 
-    Args:
-        estimate: T poses.
-        reference: the T poses that belong to them (`associate` pairs by time; recordings without times pair
-            by row as they are).
-        alignment: fitted to all T positions before, or a similarity to apply.
+    An alignment is fitted to all positions before, or a similarity applied.
 
     Raises:
         InputError: the lengths differ or are 0, or the alignment is unknown.
@@ -120,29 +116,25 @@ def rpe(
         alignment: as for `ate`; a rigid one changes nothing, a similarity the scale.
 
     Raises:
-        InputError: the lengths differ or are 0, `delta` or `unit` is not as expected, or the trajectory is
-            shorter than one pair.
+        InputError: the lengths differ or are 0, `delta` or `unit` is not as expected, or the path is shorter than a pair.
     """
     _require_pairs(estimate, reference)
     moved = estimate.transformed(fit(alignment, estimate.positions, reference.positions))
     ends = _pair_ends(moved.positions, delta, unit)
     if len(ends) < 2:
         raise InputError(f"Expected a trajectory longer than {delta:g} {unit}; choose a shorter delta.")
-    first, second = ends[:-1], ends[1:]
-    error = SE3.between(_motion(reference, first, second), _motion(moved, first, second))
-    angles = _norm(SE3.log(error)[:, :3])
-    return RelativeError(np.stack([first, second], axis=1), _norm(SE3.translation(error)), np.degrees(angles))
+    pairs = np.stack([ends[:-1], ends[1:]], axis=1)
+    motions = (SE3.between(*np.swapaxes(path.world_from_body[pairs], 0, 1)) for path in (reference, moved))
+    error = SE3.between(*motions)
+    return RelativeError(pairs, _norm(SE3.translation(error)), np.degrees(_norm(SE3.log(error)[:, :3])))
 
 
 def landmark_errors(
     estimate: Mapping[int, Array], truth: Mapping[int, Array], alignment: Alignment | Similarity = "none"
 ) -> AbsoluteError:
-    """Distances of the landmarks that both maps have, ordered by name.
+    """Distances of the landmarks (D,) [m] that two maps have by name, in order of the names.
 
-    Args:
-        estimate: name of a landmark to its (D,) position, D = 2 or 3 [m].
-        truth: the same for the true map.
-        alignment: fitted to the common landmarks before, or a similarity to apply (a trajectory's, say).
+    A similarity is fitted to the common landmarks before, or a given one applied.
 
     Raises:
         InputError: no landmark is in both maps, or the alignment is unknown.
@@ -164,14 +156,10 @@ def _require_pairs(estimate: Trajectory, reference: Trajectory) -> None:
 def _pair_ends(positions: Array, delta: float, unit: Unit) -> NDArray[np.intp]:
     if unit not in ("frames", "metres"):
         raise InputError(f"Expected the unit frames or metres, found {unit!r}.")
-    if unit == "metres":
-        return _ends_by_path(positions, delta)
-    if delta < 1 or delta != int(delta):
-        raise InputError(f"Expected delta to be a whole number of frames, at least 1, found {delta:g}.")
-    return np.arange(0, len(positions), int(delta))
-
-
-def _ends_by_path(positions: Array, delta: float) -> NDArray[np.intp]:
+    if unit == "frames":
+        if delta < 1 or delta != int(delta):
+            raise InputError(f"Expected delta to be a whole number of frames, at least 1, found {delta:g}.")
+        return np.arange(0, len(positions), int(delta))
     if not delta > 0.0:
         raise InputError(f"Expected delta to be a positive number of metres, found {delta:g}.")
     path = np.concatenate([[0.0], np.cumsum(_norm(np.diff(positions, axis=0)))])
@@ -179,10 +167,6 @@ def _ends_by_path(positions: Array, delta: float) -> NDArray[np.intp]:
     while (end := int(np.searchsorted(path, path[ends[-1]] + delta))) < len(path):
         ends.append(end)
     return np.array(ends)
-
-
-def _motion(trajectory: Trajectory, first: NDArray[np.intp], second: NDArray[np.intp]) -> Array:
-    return SE3.between(trajectory.world_from_body[first], trajectory.world_from_body[second])
 
 
 def _norm(vectors: Array) -> Array:

@@ -8,14 +8,18 @@ alignment otherwise. A further figure of merit of all runs is one function from 
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
 from rbpf.errors import InputError
 from rbpf.runs.reading import PathAndMap, RunFolder
-from rbpf.runs.trajectory import Trajectory, associate, fit, in_space, read_tum
+from rbpf.runs.trajectory import Similarity, Trajectory, align, associate, fit, in_space, read_tum
 from rbpf.runs.truth import LEAST, TRUTH, RunTruth
 from rbpf.validation.metrics.accuracy import ate, landmark_errors, rpe
-from rbpf.validation.metrics.matching import match_points
 
 BATCH, ODOMETRY = "batch.tum", "odometry.tum"
+
+_ROUNDS = 5
 
 ODOMETRY_PREFIX = {"stereo": "vo_"}
 """How the figures of the odometry alone begin, by system; otherwise with `odometry_`."""
@@ -92,6 +96,22 @@ def score_path(path: Trajectory, reference: Trajectory, truth: RunTruth, prefix:
     for merit in MERITS if len(estimate) >= LEAST else ():
         entries |= merit(estimate, reference, truth)
     return {prefix + name: value for name, value in entries.items()}
+
+
+def match_points(points: np.ndarray, truth: dict[int, np.ndarray], start: Similarity) -> dict[int, np.ndarray]:
+    """Names estimated points (M, D) by the true points, one to one, nearest in sum after a rigid alignment.
+
+    The alignment, at first a path's in space, and the matching are repeated in turn, as in iterated closest points; the
+    points are returned as they were.
+    """
+    names = list(truth)
+    true = np.array([truth[name][: points.shape[1]] for name in names])
+    moved = start.in_dimension(points.shape[1]).transform(points)
+    for _ in range(_ROUNDS):
+        distance = np.linalg.norm(moved[:, None] - true[None], axis=-1)
+        rows, columns = linear_sum_assignment(distance)
+        moved = align(points[rows], true[columns]).transform(points)
+    return {names[column]: points[row] for row, column in zip(rows, columns, strict=True)}
 
 
 def score_landmarks(estimate: PathAndMap, truth: RunTruth, anonymous: bool = False) -> dict[str, float]:

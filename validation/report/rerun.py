@@ -10,6 +10,7 @@ plots/…                        figures over the frames
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,6 @@ from rbpf.runs.files import prepare_folder, whole
 from rbpf.runs.plots import SIGMAS, outline
 from rbpf.runs.run import Run
 from rbpf.sensors.camera import Pinhole
-from rbpf.sensors.readers import ImageFrame
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.stereo.landmarks import FeatureKind
 from rbpf.validation.report.video import FEATURES, FOUND, MISSED, RAY, STARTED
@@ -52,11 +52,7 @@ def require_rerun() -> Any:
 
 
 def write_rerun(run: Run, path: Path) -> None:
-    """Writes the recording of a run over images; it appears under its name when it is complete.
-
-    Args:
-        run: what was filtered; its source is read once more.
-        path: the file, .rrd.
+    """Writes the recording (.rrd) of a run over images, whose source is read once more.
 
     Raises:
         InputError: Rerun is not installed, or the file cannot be written.
@@ -65,17 +61,31 @@ def write_rerun(run: Run, path: Path) -> None:
     stamps, poses = log.stamps_ns, log.poses
     plotted = {name: log[name] for name in draw.plots}
     with recording(path, run.name) as (rr, stream):
-        log_lens(rr, stream, draw.camera(run))
+        # Rerun's pixels start at a corner, not at a centre.
+        camera = draw.camera(run)
+        lens = rr.Pinhole(
+            focal_length=[camera.fx, camera.fy],
+            principal_point=[camera.cx + 0.5, camera.cy + 0.5],
+            resolution=[camera.width, camera.height],
+            camera_xyz=rr.ViewCoordinates.RDF,
+            image_plane_distance=AXIS_M,
+        )
+        stream.log("world/camera", lens, static=True)
         stream.log("world/path", rr.LineStrips3D([SE3.translation(poses)]), static=True)
         if "odometry" in log:
             stream.log("world/odometry", rr.LineStrips3D([SE3.translation(log["odometry"])]), static=True)
-        log_map(rr, stream, run.system.map())
+        found = run.system.map()
+        stream.log("world/map/points", ellipsoids(rr, found.points()), static=True)
+        if found.ray_ends is not None and found.is_ray().any():
+            rays = rr.LineStrips3D(found.ray_ends[found.is_ray()], colors=[RAY])
+            stream.log("world/map/rays", rays, static=True)
         known = getattr(run.system, "known_points", None)
         if known is not None:
             stream.log("world/known_points", rr.Points3D(known.positions, colors=[FOUND], radii=0.01), static=True)
         for t, frame in zip(range(len(log)), run.source.frames(), strict=False):
             log_time(stream, t, int(stamps[t] - stamps[0]))
-            log_image(rr, stream, frame)
+            if frame.image is not None:
+                stream.log("world/camera/image", rr.Image(frame.image).compress(jpeg_quality=QUALITY))
             log_pose(rr, stream, "camera", poses[t])
             draw.seen(rr, stream, run, log.observed(t), poses[t])
             for name, values in plotted.items():
@@ -84,15 +94,7 @@ def write_rerun(run: Run, path: Path) -> None:
 
 @contextmanager
 def recording(path: Path, name: str) -> Iterator[tuple[Any, Any]]:
-    """The package and a stream into a file, which appears under its name when it is complete.
-
-    Args:
-        path: the file, .rrd.
-        name: of the recording.
-
-    Raises:
-        InputError: Rerun is not installed, or the file cannot be written.
-    """
+    """The package and a stream into a file (.rrd); the file appears when it is complete. Errors as of `write_rerun`."""
     rr = require_rerun()
     prepare_folder(path.parent)
     with whole(path) as partial, rr.RecordingStream("rbpf", recording_id=name) as stream:
@@ -101,42 +103,16 @@ def recording(path: Path, name: str) -> Iterator[tuple[Any, Any]]:
         stream.flush()
 
 
-def log_lens(rr: Any, stream: Any, camera: Pinhole) -> None:
-    """The camera's; Rerun's pixels start at a corner, not at a centre."""
-    lens = rr.Pinhole(
-        focal_length=[camera.fx, camera.fy],
-        principal_point=[camera.cx + 0.5, camera.cy + 0.5],
-        resolution=[camera.width, camera.height],
-        camera_xyz=rr.ViewCoordinates.RDF,
-        image_plane_distance=AXIS_M,
-    )
-    stream.log("world/camera", lens, static=True)
-
-
 def log_time(stream: Any, t: int, after_ns: int) -> None:
     """Number of a frame and time since the first one [ns]; what is logged next belongs to it."""
     stream.set_time("frame", sequence=t)
     stream.set_time("time", duration=1e-9 * float(after_ns))
 
 
-def log_image(rr: Any, stream: Any, frame: ImageFrame) -> None:
-    """A frame's image, if it has one."""
-    if frame.image is not None:
-        stream.log("world/camera/image", rr.Image(frame.image).compress(jpeg_quality=QUALITY))
-
-
 def log_pose(rr: Any, stream: Any, name: str, pose: np.ndarray) -> None:
     """Where a camera or a robot is in the world, (7,)."""
     turned = rr.Quaternion(xyzw=pose[:4])
     stream.log(f"world/{name}", rr.Transform3D(translation=SE3.translation(pose), quaternion=turned))
-
-
-def log_map(rr: Any, stream: Any, found: MapEstimate) -> None:
-    """Points with 3σ ellipsoids, and rays."""
-    stream.log("world/map/points", ellipsoids(rr, found.points()), static=True)
-    if found.ray_ends is not None and found.is_ray().any():
-        rays = rr.LineStrips3D(found.ray_ends[found.is_ray()], colors=[RAY])
-        stream.log("world/map/rays", rays, static=True)
 
 
 def ellipsoids(rr: Any, landmarks: MapEstimate) -> Any:
@@ -153,16 +129,13 @@ def ellipsoids(rr: Any, landmarks: MapEstimate) -> Any:
     )
 
 
+@dataclass(frozen=True)
 class Drawn:
     """What is particular to a system: its camera, what a frame showed, and which figures are plotted."""
 
-    def __init__(
-        self,
-        camera: Callable[[Run], Pinhole],
-        seen: Callable[[Any, Any, Run, Mapping[str, np.ndarray], np.ndarray], None],
-        plots: tuple[str, ...],
-    ) -> None:
-        self.camera, self.seen, self.plots = camera, seen, plots
+    camera: Callable[[Run], Pinhole]
+    seen: Callable[[Any, Any, Run, Mapping[str, np.ndarray], np.ndarray], None]
+    plots: tuple[str, ...]
 
 
 def _log_search(rr: Any, stream: Any, run: Run, seen: Mapping[str, np.ndarray], pose: np.ndarray) -> None:

@@ -20,6 +20,9 @@ from rbpf.validation.report.page import write_report
 if TYPE_CHECKING:
     from rbpf.validation.gtsam.batch_problem import Optimum
 
+KEY_FRAMES = 60
+"""Most of a run that COLMAP reconstructs: matching takes minutes for so many, and grows faster than they do."""
+
 Compare = Callable[[RunFolder], Comparison]
 """With pictures in the run's folder."""
 
@@ -38,7 +41,7 @@ def compare_gtsam(record: RunFolder, optimum: "Optimum | None" = None) -> Compar
     Raises:
         InputError: see `compare_with_batch`.
     """
-    from rbpf.validation.consistency.against_optimisers import compare_with_batch
+    from rbpf.validation.consistency.against_batch import compare_with_batch
     from rbpf.validation.report.comparison_pictures import plot_against_batch
 
     comparison, found = compare_with_batch(record, optimum)
@@ -48,12 +51,20 @@ def compare_gtsam(record: RunFolder, optimum: "Optimum | None" = None) -> Compar
 
 
 def _camera_colmap(record: RunFolder) -> Comparison:
-    from rbpf.validation.consistency.against_optimisers import compare_camera_with_colmap
+    """A run over images beside COLMAP's reconstruction of every n-th."""
+    from rbpf.validation.colmap.against_colmap import compare_folder_with_colmap
+    from rbpf.validation.colmap.reconstruct import ReconstructionOptions
     from rbpf.validation.report.comparison_pictures import plot_against_colmap
 
-    comparison, found = compare_camera_with_colmap(record)
-    pictures = plot_against_colmap(found.run, RunFolder.open(record.folder).estimate, record.folder)
-    return replace(comparison, pictures=pictures)
+    usual = ReconstructionOptions()
+    every = max(usual.every, -(-len(record.path.mean) // KEY_FRAMES))
+    found = compare_folder_with_colmap(record.folder, replace(usual, every=every))
+    figures = {f"run_{name}": value for name, value in found.run.as_dict().items()}
+    if found.truth is not None:
+        figures |= {f"truth_{name}": value for name, value in found.truth.as_dict().items()}
+    accuracy = f"The path is {1e3 * found.run.path.rmse:.3g} mm (rms) from COLMAP's reconstruction of the same images."
+    pictures = plot_against_colmap(found.run, record.estimate, record.folder)
+    return Comparison("colmap", accuracy, figures, pictures=pictures)
 
 
 ANY = "*"
@@ -66,15 +77,12 @@ COMPARISONS: dict[str, dict[str, Compare]] = {
 
 
 def validate(folder: Path, against: str, out: Path | None = None) -> Verdict:
-    """Compares a run, writes `validation_AGAINST.json` and the pictures, and builds the report again.
+    """Compares a run, writes `validation_AGAINST.json` and the pictures, and builds the report again; returns the verdict.
 
     Args:
         folder: of the run.
         against: a name in `COMPARISONS`.
         out: a further folder for the JSON.
-
-    Returns:
-        The verdict on the run.
 
     Raises:
         InputError: the comparison is not possible; the report is written all the same, and says why.

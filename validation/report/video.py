@@ -5,7 +5,6 @@ A further system is one function from a run and the number of a frame to a pictu
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -32,17 +31,8 @@ _LETTER_FRACTION, _SMALLEST, _LARGEST = 1.0 / 62.0, 11.0, 17.0
 """Height of letters as a fraction of the drawn width, and its bounds, px."""
 
 
-@dataclass(frozen=True)
-class Caption:
-    """What is written above a frame.
-
-    Attributes:
-        text: figures of the frame.
-        alarm: a warning, empty where all is well.
-    """
-
-    text: str
-    alarm: str
+Caption = tuple[str, str]
+"""Figures of a frame and a warning, empty where all is well: what is written above it."""
 
 
 def drawn_size(width: int, height: int) -> tuple[int, int]:
@@ -63,7 +53,7 @@ def annotate(
     legend: Sequence[tuple[str, Colour]],
     paint: Callable[[Any, Place], None],
 ) -> np.ndarray:
-    """The frame as it is shown (H, W, 3) uint8.
+    """The frame (H, W, 3) uint8 as it is shown.
 
     Args:
         image: (height, width) uint8; None where it could not be read.
@@ -88,10 +78,14 @@ def annotate(
 
     paint(draw, place)
     draw.rectangle((0, 0, drawn[0], _BAND), fill=(0, 0, 0))
-    draw.text((4, 3), caption.text, fill=TEXT)
-    end = draw.textlength(caption.text) + 16
-    draw.text((end, 3), caption.alarm, fill=MISSED)
-    _draw_legend(draw, drawn[0], legend)
+    text, alarm = caption
+    draw.text((4, 3), text, fill=TEXT)
+    draw.text((draw.textlength(text) + 16, 3), alarm, fill=MISSED)
+    at = drawn[0] - 6.0
+    for name, colour in reversed(legend):
+        at -= draw.textlength(name)
+        draw.text((at, 3), name, fill=colour)
+        at -= 12.0
     return np.asarray(picture)
 
 
@@ -100,14 +94,6 @@ def cross(draw: Any, at: tuple[float, float], colour: Colour) -> None:
     x, y = at
     draw.line((x - _ARM, y, x + _ARM, y), fill=colour)
     draw.line((x, y - _ARM, x, y + _ARM), fill=colour)
-
-
-def _draw_legend(draw: Any, width: int, legend: Sequence[tuple[str, Colour]]) -> None:
-    at = width - 6.0
-    for name, colour in reversed(legend):
-        at -= draw.textlength(name)
-        draw.text((at, 3), name, fill=colour)
-        at -= 12.0
 
 
 RAY = (255, 190, 40)
@@ -123,20 +109,13 @@ def picture_of_search(run: Run, t: int, frame: ImageFrame) -> np.ndarray:
     alarm = "FOUND AGAIN" if log["relocalised"][t] else "LOST" if log["lost"][t] else ""
     alarm = f"NO IMAGE {alarm}" if frame.image is None else alarm
     camera = run.system.camera
-    return draw_search(frame.image, log.observed(t), Caption(text, alarm), (camera.width, camera.height))
+    return draw_search(frame.image, log.observed(t), (text, alarm), (camera.width, camera.height))
 
 
 def draw_search(
     image: np.ndarray | None, seen: Mapping[str, np.ndarray], caption: Caption, size: tuple[int, int]
 ) -> np.ndarray:
-    """The frame as it is shown (H, W, 3) uint8.
-
-    Args:
-        image: (height, width) uint8; None where it could not be read.
-        seen: what was looked for, see `MonoSlam.observed`.
-        caption: what is written above.
-        size: width and height of the images, px.
-    """
+    """The frame (H, W, 3) uint8 of a size (width, height), with what was looked for in it, see `MonoSlam.observed`."""
     found, stroke = np.isfinite(seen["px"]).all(axis=1), drawn_scale(size[0])
 
     def paint(draw: Any, place: Place) -> None:
@@ -184,19 +163,15 @@ def picture_of_pair(run: Run, t: int, frame: ImageFrame) -> np.ndarray:
     if frame.image is None or frame.right is None:
         alarm = "NO PAIR"
     camera = run.system.rig.camera
-    return draw_pair(frame.image, log.observed(t), Caption(text, alarm), (camera.width, camera.height))
+    return draw_pair(frame.image, log.observed(t), (text, alarm), (camera.width, camera.height))
 
 
 def draw_pair(
     image: np.ndarray | None, seen: Mapping[str, np.ndarray], caption: Caption, size: tuple[int, int]
 ) -> np.ndarray:
-    """A left image (H, W, 3) uint8 with its features; a line leads from each to where the right camera has it.
+    """A left image (H, W, 3) uint8 of a size (width, height) with its features, see `StereoSlam.observed`.
 
-    Args:
-        image: (height, width) uint8; None where it could not be read.
-        seen: its features, see `StereoSlam.observed`.
-        caption: what is written above.
-        size: width and height of the images, px.
+    A line leads from each to where the right camera has it.
     """
 
     def paint(draw: Any, place: Place) -> None:
@@ -223,16 +198,7 @@ def annotated_frames(run: Run) -> Iterator[np.ndarray]:
 
 
 def write_annotated(run: Run, path: Path, on_frame: Callable[[int, int], None] | None = None) -> None:
-    """Writes an MP4 of all frames that were filtered; it appears under its name when it is complete.
-
-    Args:
-        run: of a system in `PICTURES`.
-        path: the file.
-        on_frame: called with the frames written and their number.
-
-    Raises:
-        InputError: the place cannot be written to, or the disk is full.
-    """
+    """Writes an MP4 of all frames that were filtered of a run of a system in `PICTURES`; see `write_video`."""
     frames = annotated_frames(run)
     first = next(frames)
     size = first.shape[1], first.shape[0]

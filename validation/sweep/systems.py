@@ -6,17 +6,20 @@ A new system is one function from a sequence and settings to figures, entered in
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
+from typing import Any
 
 from rbpf.errors import InputError
-from rbpf.runs.truth import RunTruth
+from rbpf.runs.folder import summarise
+from rbpf.runs.reading import PathAndMap
+from rbpf.runs.recordings import MonoRecording, Recording, RobotRecording, StereoRecording, filter_recording
+from rbpf.runs.run import Run
+from rbpf.runs.trajectory import in_space
+from rbpf.systems.mono.config import MonoConfig
+from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.settings import load_settings
+from rbpf.systems.stereo.config import StereoConfig
 from rbpf.validation.consistency.statistic import whitened_errors
-
-if TYPE_CHECKING:
-    from rbpf.runs.run import Run
+from rbpf.validation.metrics.scores import ODOMETRY_PREFIX, score_estimate, score_path
 
 Figures = dict[str, Any]
 
@@ -47,26 +50,8 @@ def system_named(name: str) -> SweepSystem:
     return SYSTEMS[name]
 
 
-def _robot_settings(pairs: Sequence[str], given: Mapping[str, Any]) -> Any:
-    from rbpf.systems.range_bearing.config import RangeBearingConfig
-
-    return load_settings(RangeBearingConfig, "range-bearing", None, pairs, given)
-
-
-def _run_robot(sequence: Mapping[str, Path], pairs: Sequence[str], given: Mapping[str, Any]) -> Figures:
-    from rbpf.runs.recordings import RobotRecording, filter_recording
-
-    config = _robot_settings(pairs, given)
-    return _figures(filter_recording(RobotRecording(sequence["recording"]), config), config.association == "ml")
-
-
-def _figures(run: "Run", anonymous: bool = False) -> Figures:
+def _figures(run: Run, anonymous: bool = False) -> Figures:
     """What a run's summary and scores say, without writing them; `anonymous` as `score_estimate`'s."""
-    from rbpf.runs.folder import summarise
-    from rbpf.runs.reading import PathAndMap
-    from rbpf.runs.trajectory import in_space
-    from rbpf.validation.metrics.scores import ODOMETRY_PREFIX, score_estimate, score_path
-
     figures, log, truth = summarise(run), run.log, run.truth
     if truth is not None:
         figures |= score_estimate(PathAndMap.of_run(run), truth, anonymous)
@@ -74,46 +59,30 @@ def _figures(run: "Run", anonymous: bool = False) -> Figures:
             reference = in_space(log.stamps_ns[truth.rows], truth.poses)
             prefix = ODOMETRY_PREFIX.get(run.system.name, "odometry_")
             figures |= score_path(in_space(log.stamps_ns, log["odometry"]), reference, truth, prefix)
-    return figures | _pose_nees(run.system.space, log.poses, log.covs, truth)
+    if truth is not None and truth.alignment == "none":
+        # Mean over the steps, of d degrees of freedom; nothing where the truth is not given in the filter's world.
+        errors = whitened_errors(run.system.space, log.poses[truth.rows], log.covs[truth.rows], truth.poses)
+        if (known := errors.ranks > 0).any():
+            figures["pose_nees_mean"] = float(errors.nees[known].mean())
+    return figures
 
 
-def _mono_settings(pairs: Sequence[str], given: Mapping[str, Any]) -> Any:
-    from rbpf.systems.mono.config import MonoConfig
+def _system(name: str, config: type, recording: Callable[..., Recording], *fields: str) -> SweepSystem:
+    """A system of `rbpf run`, of which a recording is made from the paths of some fields."""
 
-    return load_settings(MonoConfig, "mono", None, pairs, given)
+    def settings(pairs: Sequence[str], given: Mapping[str, Any]) -> Any:
+        return load_settings(config, name, None, pairs, given)
 
+    def run(sequence: Mapping[str, Path], pairs: Sequence[str], given: Mapping[str, Any]) -> Figures:
+        chosen = settings(pairs, given)
+        filtered = filter_recording(recording(*(sequence.get(field) for field in fields)), chosen)
+        return _figures(filtered, getattr(chosen, "association", "") == "ml")
 
-def _run_mono(sequence: Mapping[str, Path], pairs: Sequence[str], given: Mapping[str, Any]) -> Figures:
-    from rbpf.runs.recordings import MonoRecording, filter_recording
-
-    recording = MonoRecording(sequence["recording"], sequence.get("known_points"), sequence.get("calibration"))
-    return _figures(filter_recording(recording, _mono_settings(pairs, given)))
-
-
-def _stereo_settings(pairs: Sequence[str], given: Mapping[str, Any]) -> Any:
-    from rbpf.systems.stereo.config import StereoConfig
-
-    return load_settings(StereoConfig, "stereo", None, pairs, given)
-
-
-def _run_stereo(sequence: Mapping[str, Path], pairs: Sequence[str], given: Mapping[str, Any]) -> Figures:
-    from rbpf.runs.recordings import StereoRecording, filter_recording
-
-    recording = StereoRecording(sequence["recording"], sequence.get("calibration"))
-    return _figures(filter_recording(recording, _stereo_settings(pairs, given)))
-
-
-def _pose_nees(space: Any, mean: np.ndarray, cov: np.ndarray, truth: RunTruth | None) -> Figures:
-    """Mean over the steps, of d degrees of freedom; nothing where the truth is not given in the filter's world."""
-    if truth is None or truth.alignment != "none":
-        return {}
-    errors = whitened_errors(space, mean[truth.rows], cov[truth.rows], truth.poses)
-    known = errors.ranks > 0
-    return {"pose_nees_mean": float(errors.nees[known].mean())} if known.any() else {}
+    return SweepSystem(fields, settings, run)
 
 
 SYSTEMS = {
-    "range-bearing": SweepSystem(("recording",), _robot_settings, _run_robot),
-    "mono": SweepSystem(("recording", "known_points", "calibration"), _mono_settings, _run_mono),
-    "stereo": SweepSystem(("recording", "calibration"), _stereo_settings, _run_stereo),
+    "range-bearing": _system("range-bearing", RangeBearingConfig, RobotRecording, "recording"),
+    "mono": _system("mono", MonoConfig, MonoRecording, "recording", "known_points", "calibration"),
+    "stereo": _system("stereo", StereoConfig, StereoRecording, "recording", "calibration"),
 }

@@ -14,7 +14,7 @@ from rbpf.runs.recordings import filter_images
 from rbpf.runs.run import Run
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.system import Tracked
-from rbpf.validation.report.video import Caption, draw_search
+from rbpf.validation.report.video import draw_search
 
 FIRST = 20
 """The frame is not looked for before this one: the camera is still at rest."""
@@ -121,7 +121,7 @@ def _draw_image(shown: Shown, run: Run) -> Any:
     camera = run.system.camera
     found, searched = (run.log[name][shown.frame] for name in ("found", "searched"))
     text = f"frame {shown.frame}   found {found} of {searched}   (Fig. 8)"
-    picture = draw_search(shown.image, shown.observation, Caption(text, ""), (camera.width, camera.height))
+    picture = draw_search(shown.image, shown.observation, (text, ""), (camera.width, camera.height))
     figure = Figure(figsize=(picture.shape[1] / 110.0, picture.shape[0] / 110.0))
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.imshow(picture)
