@@ -6,8 +6,7 @@ calibration.png    where corners were found, and by how much the camera misses t
 """
 
 import json
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,21 +18,13 @@ from rbpf.runs.plots import COLOURS, label, save_figures
 from rbpf.sensors.calibration import Board, BoardCalibration, BoardView, board_corners, calibrate
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.readers.images.calibration import MODELS, NAME, model_of
-from rbpf.sensors.readers.images.video import NamedImage, read_uncalibrated
+from rbpf.sensors.readers.images.video import read_uncalibrated
 
 FIGURES, PICTURE = "calibration.json", "calibration.png"
 MOST_SHOTS, MOST_VIEWS = 150, 40
 """Images that are looked at, and views that take part; more change nothing but the time."""
 
 _INTRINSICS = "fx", "fy", "cx", "cy"
-
-
-@dataclass
-class _Found:
-    views: list[BoardView]
-    width: int = 0
-    height: int = 0
-    looked_at: int = 0
 
 
 def calibrate_images(
@@ -54,25 +45,48 @@ def calibrate_images(
         InputError: no or too few images show the board, they differ in size, or they do not determine the camera.
     """
     total, shots = read_uncalibrated(images, MOST_SHOTS)
-    found, empty = _Found([]), None
-    for shot in _counted(shots, total, on_image):
-        _require_size(found, shot, images)
-        px = board_corners(shot.image, board, thorough=not found.views)
-        found.looked_at += 1
+    views, size, looked_at, empty = list[BoardView](), (0, 0), 0, None
+    for looked_at, shot in enumerate(shots, 1):
+        found = shot.image.shape[1], shot.image.shape[0]
+        if looked_at == 1:
+            size = found
+        elif found != size:
+            raise InputError(
+                f"{images}: {shot.name} has {found[0]}x{found[1]} px, the images before it {size[0]}x{size[1]}: "
+                "calibrate with images of one camera in one setting, all upright or all on their side"
+            )
+        px = board_corners(shot.image, board, thorough=not views)
         if px is not None:
-            found.views.append(BoardView(shot.name, px))
+            views.append(BoardView(shot.name, px))
         elif empty is None:
             empty = shot.image
-    if not found.views:
-        raise InputError(_nothing(images, board, found.looked_at, empty))
-    views = _spread(found.views)
-    return calibrate(views, board, found.width, found.height, MODELS[model]), found.looked_at
+        if on_image is not None:
+            on_image(looked_at, total)
+    if not views:
+        raise InputError(_nothing(images, board, looked_at, empty))
+    rows = np.unique(np.linspace(0, len(views) - 1, min(len(views), MOST_VIEWS)).round().astype(int))
+    return calibrate([views[row] for row in rows], board, *size, MODELS[model]), looked_at
 
 
 def write_calibration(found: BoardCalibration, board: Board, looked_at: int, out: Path) -> dict[str, Any]:
     """Writes the three files; returns the entries of calibration.json."""
     prepare_folder(out)
-    entries = summarise_calibration(found, board, looked_at)
+    names = (*_INTRINSICS, *found.camera.lens.coefficient_names)
+    entries = {
+        "board": f"{board.columns}x{board.rows}",
+        "square_m": board.square_m,
+        "images": looked_at,
+        "views": len(found.views),
+        "views_left_out": list(found.left_out),
+        "width": found.camera.width,
+        "height": found.camera.height,
+        "model": model_of(found.camera),
+        **dict(zip(names, found.camera.params[: len(names)].tolist(), strict=True)),
+        "std": dict(zip(names, found.std.tolist(), strict=True)),
+        "reprojection_rms_px": found.rms_px,
+        "worst_view_rms_px": float(found.rms_by_view_px.max()),
+        "image_covered": found.covered,
+    }
     save_figures({PICTURE: _draw(found)}, out)
     write_text(out / FIGURES, json.dumps(entries, indent=2, allow_nan=False) + "\n")
     about = f"from {len(found.views)} views of a chessboard; reprojection error {found.rms_px:.3f} px"
@@ -91,46 +105,6 @@ def camera_text(camera: Pinhole, about: str) -> str:
         f"distortion: [{', '.join(f'{value:.8f}' for value in camera.distortion)}]",
     ]
     return "\n".join(lines) + "\n"
-
-
-def summarise_calibration(found: BoardCalibration, board: Board, looked_at: int) -> dict[str, Any]:
-    """The entries of calibration.json."""
-    names = (*_INTRINSICS, *found.camera.lens.coefficient_names)
-    return {
-        "board": f"{board.columns}x{board.rows}",
-        "square_m": board.square_m,
-        "images": looked_at,
-        "views": len(found.views),
-        "views_left_out": list(found.left_out),
-        "width": found.camera.width,
-        "height": found.camera.height,
-        "model": model_of(found.camera),
-        **dict(zip(names, found.camera.params[: len(names)].tolist(), strict=True)),
-        "std": dict(zip(names, found.std.tolist(), strict=True)),
-        "reprojection_rms_px": found.rms_px,
-        "worst_view_rms_px": float(found.rms_by_view_px.max()),
-        "image_covered": found.covered,
-    }
-
-
-def _counted(
-    shots: Iterator[NamedImage], total: int, on_image: Callable[[int, int], None] | None
-) -> Iterator[NamedImage]:
-    for number, shot in enumerate(shots, 1):
-        yield shot
-        if on_image is not None:
-            on_image(number, total)
-
-
-def _require_size(found: _Found, shot: NamedImage, images: Path) -> None:
-    height, width = shot.image.shape
-    if not found.looked_at:
-        found.width, found.height = width, height
-    elif (width, height) != (found.width, found.height):
-        raise InputError(
-            f"{images}: {shot.name} has {width}x{height} px, the images before it {found.width}x{found.height}: "
-            "calibrate with images of one camera in one setting, all upright or all on their side"
-        )
 
 
 def _nothing(images: Path, board: Board, looked_at: int, empty: np.ndarray | None) -> str:
@@ -153,18 +127,26 @@ def _nothing(images: Path, board: Board, looked_at: int, empty: np.ndarray | Non
     )
 
 
-def _spread(views: list[BoardView]) -> list[BoardView]:
-    rows = np.unique(np.linspace(0, len(views) - 1, min(len(views), MOST_VIEWS)).round().astype(int))
-    return [views[row] for row in rows]
-
-
 def _draw(found: BoardCalibration) -> Any:
     """Corners with residuals, enlarged; the residuals; the error of each view."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13.0, 8.0), layout="constrained")
     axes: Any = figure.subplot_mosaic([["image", "residuals"], ["image", "views"]], width_ratios=[1.7, 1.0])
-    _draw_image(axes["image"], found)
+    image = axes["image"]
+    px = np.concatenate([view.px for view in found.views])
+    length = 0.02 * found.camera.width
+    enlarged = length / max(found.rms_px, np.finfo(float).eps)
+    title = (
+        f"{len(found.views)} views, reprojection error {found.rms_px:.3f} px; residuals enlarged {enlarged:.0f} times"
+    )
+    label(image, title, "u [px]", "v [px]", equal=False)
+    image.set_aspect("equal")
+    image.plot(*px.T, ".", markersize=3, color=COLOURS["truth"])
+    shift = enlarged * found.residuals.reshape(-1, 2)
+    image.quiver(*px.T, *shift.T, angles="xy", scale_units="xy", scale=1.0, width=0.001, color=COLOURS["map"])
+    image.set(xlim=(-0.5, found.camera.width - 0.5), ylim=(found.camera.height - 0.5, -0.5))
+    image.plot(found.camera.cx, found.camera.cy, "+", markersize=14, color=COLOURS["known"])
     residuals = found.residuals.reshape(-1, 2)
     label(axes["residuals"], "residuals of all corners", "u [px]", "v [px]", equal=True)
     axes["residuals"].plot(*residuals.T, ".", markersize=2, color=COLOURS["filter"])
@@ -172,19 +154,3 @@ def _draw(found: BoardCalibration) -> Any:
     axes["views"].bar(np.arange(len(found.views)), found.rms_by_view_px, color=COLOURS["filter"])
     axes["views"].axhline(found.rms_px, color=COLOURS["batch"])
     return figure
-
-
-def _draw_image(axes: Any, found: BoardCalibration) -> None:
-    px = np.concatenate([view.px for view in found.views])
-    length = 0.02 * found.camera.width
-    enlarged = length / max(found.rms_px, np.finfo(float).eps)
-    title = (
-        f"{len(found.views)} views, reprojection error {found.rms_px:.3f} px; residuals enlarged {enlarged:.0f} times"
-    )
-    label(axes, title, "u [px]", "v [px]", equal=False)
-    axes.set_aspect("equal")
-    axes.plot(*px.T, ".", markersize=3, color=COLOURS["truth"])
-    shift = enlarged * found.residuals.reshape(-1, 2)
-    axes.quiver(*px.T, *shift.T, angles="xy", scale_units="xy", scale=1.0, width=0.001, color=COLOURS["map"])
-    axes.set(xlim=(-0.5, found.camera.width - 0.5), ylim=(found.camera.height - 0.5, -0.5))
-    axes.plot(found.camera.cx, found.camera.cy, "+", markersize=14, color=COLOURS["known"])

@@ -93,12 +93,7 @@ class LandmarkErrors:
 
 
 def truth_errors(record: RunFolder, std_m: float = 0.0, std_rad: float = 0.0) -> TruthErrors:
-    """Errors of a run.
-
-    Args:
-        record: the run.
-        std_m: standard deviation of the true positions themselves, per axis.
-        std_rad: likewise of the true rotations.
+    """Errors of a run; the truth's own standard deviations per axis are `std_m` and `std_rad`.
 
     Raises:
         InputError: the run has no truth, or too little.
@@ -154,10 +149,8 @@ def _in_gauge(
 def pose_statistics(errors: WhitenedErrors, fitted: int = 0) -> list[Statistic]:
     """NEES of the poses and coverage of their credible regions; none where all poses are held to be exact.
 
-    Args:
-        errors: of the poses.
-        fitted: parameters that were fitted to make them small: the upper end of the interval is raised by what that takes
-            away from errors that are worth so few degrees of freedom.
+    `fitted` parameters were chosen to make the errors small: the upper end of the interval is raised by what that takes
+    away from errors that are worth so few degrees of freedom.
     """
     known = errors.ranks > 0
     if not known.any():

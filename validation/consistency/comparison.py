@@ -96,11 +96,8 @@ def innovation_statistics(
     Without truth they find wrong noise of sensors and of the odometry, its bias, wrong associations and gross errors of
     a model. They do not find a filter whose particles agree on a wrong path that explains the measurements.
 
-    Args:
-        nis: (T,) normalised innovation squared.
-        nis_dof: (T,) its degrees of freedom.
-        correction: (T, r), see `rbpf.core.diagnostics.Correction`; r = 0 where the system does not tell them.
-        cov_correction: (T, r, r).
+    `nis` (T,) with its degrees of freedom; corrections (T, r), (T, r, r) are those of `rbpf.core.diagnostics.Correction`,
+    r = 0 where the system does not tell them.
     """
     innovations = step_ratio(INNOVATIONS, nis, nis_dof)
     motion = motion_statistics(correction, cov_correction) if correction.shape[1] else []

@@ -132,16 +132,10 @@ def inverse_roots(cov: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def degrees_of_freedom(white: np.ndarray) -> float:
-    """Effective degrees of freedom of Σ_t |e_t|².
+    """Effective degrees of freedom ν of Σ_t |e_t|², of errors (T, d) whitened by their own covariances; 0 without any.
 
-    The mean of an consistent series is known to be zero and is not subtracted: an error that never changes its sign is one
+    The mean of a consistent series is known to be zero and is not subtracted: an error that never changes its sign is one
     sample, however long it lasts.
-
-    Args:
-        white: (T, d) errors, whitened by their own covariances.
-
-    Returns:
-        ν in [1, T·d]; 0 without any.
     """
     total = white.shape[0]
     power = float(np.square(white).sum())
@@ -157,12 +151,9 @@ def degrees_of_freedom(white: np.ndarray) -> float:
 
 
 def correlation_time(series: np.ndarray) -> float:
-    """Integrated autocorrelation time of a series (T,): T of its values say as much as T / time independent ones.
+    """Integrated autocorrelation time of a series (T,), at least 1: T of its values say as much as T / time independent ones.
 
     Sums of neighbouring autocorrelations are added up to the first that is not positive (Geyer 1992, §3.3).
-
-    Returns:
-        At least 1; 1 for a series too short to tell.
     """
     centred = series - series.mean() if series.size else series
     power = float(np.square(centred).sum())
@@ -177,13 +168,9 @@ def correlation_time(series: np.ndarray) -> float:
 
 
 def variance_ratio(name: str, value: float, dof: float, factor: float) -> Statistic:
-    """A ratio of squared errors to what was expected of them.
+    """A ratio r of squared errors to what was expected of them, of `dof` effective degrees of freedom ν.
 
-    Args:
-        name: of the statistic.
-        value: r.
-        dof: ν, effective degrees of freedom.
-        factor: standard deviations may be wrong by this, either way.
+    Standard deviations may be wrong by the factor, either way.
     """
     from scipy.stats import chi2
 
@@ -309,11 +296,7 @@ def coverage(
 ) -> list[Statistic]:
     """How often the truth lies in the credible region of a probability, for each of some.
 
-    Args:
-        nees: (T,) normalised squared errors.
-        dim: degrees of freedom of one.
-        samples: how many independent ones they are worth.
-        probabilities: of the regions.
+    From normalised squared errors (T,) of `dim` degrees of freedom each, which are worth so many independent samples.
     """
     from scipy.stats import beta, chi2
 

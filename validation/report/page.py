@@ -41,20 +41,26 @@ class Section:
 
 
 def write_report(folder: Path, problems: list[str] | None = None) -> Verdict:
-    """Builds `report.html` of a run from the files in its folder.
+    """Builds `report.html` of a run from the files in its folder; returns the verdict that stands on top.
 
-    Args:
-        folder: of the run.
-        problems: what else has to be said, one sentence each.
-
-    Returns:
-        The verdict that stands on top.
+    `problems` are what else has to be said, one sentence each.
 
     Raises:
         InputError: the folder is not that of a run.
     """
+    from jinja2 import Environment, PackageLoader, select_autoescape
+
     record, problems = RunFolder.open(folder), list(problems or ())
-    comparisons = _comparisons(record, problems)
+    # Comparisons in the folder, the truth's first, and the run's own statistics.
+    comparisons: list[Comparison] = []
+    try:
+        comparisons = sorted(read_comparisons(folder), key=lambda c: (c.against != "groundtruth", c.against))
+    except InputError as error:
+        problems.append(f"{error}.")
+    try:
+        comparisons.append(compare_with_itself(record))
+    except InputError as error:
+        problems.append(f"{error}.")
     verdict = verdict_of(record, comparisons)
     drawn = {name for comparison in comparisons for name in comparison.pictures}
     drawn |= {own for name, own in _SAME.items() if name in drawn}
@@ -63,10 +69,22 @@ def write_report(folder: Path, problems: list[str] | None = None) -> Verdict:
         world = World.of(record)
     except InputError:
         world = World()  # the truth is damaged, which is said among the problems
-    sections = [_section(folder, comparison) for comparison in comparisons]
+    titles = {"groundtruth": "Against the ground truth", "itself": "Innovations"}
+    sections = [
+        Section(
+            titles.get(comparison.against, f"Against {comparison.against}"),
+            comparison.accuracy,
+            [_row(statistic) for statistic in comparison.statistics],
+            [] if comparison.against == "itself" else _flat(comparison.figures),
+            _images(folder, comparison.pictures),
+        )
+        for comparison in comparisons
+    ]
     sections.append(Section("The run", entries=_flat(record.summary), images=_images(folder, own)))
     video = VIDEO if (folder / VIDEO).is_file() else None
-    page = _template().render(
+    loader = PackageLoader("rbpf.validation.report", "templates")
+    template = Environment(loader=loader, autoescape=select_autoescape()).get_template(PAGE)
+    page = template.render(
         title=record.name, verdict=verdict, world=world, problems=problems, sections=sections, video=video
     )
     write_text(folder / PAGE, page)
@@ -93,31 +111,6 @@ def verdict_of(record: RunFolder, comparisons: list[Comparison]) -> Verdict:
     return replace(verdict, advice=noise_advice(record, statistics))
 
 
-def _comparisons(record: RunFolder, problems: list[str]) -> list[Comparison]:
-    """Those in the folder, the truth's first, and the run's own statistics."""
-    found: list[Comparison] = []
-    try:
-        found = sorted(read_comparisons(record.folder), key=lambda c: (c.against != "groundtruth", c.against))
-    except InputError as error:
-        problems.append(f"{error}.")
-    try:
-        found.append(compare_with_itself(record))
-    except InputError as error:
-        problems.append(f"{error}.")
-    return found
-
-
-def _section(folder: Path, comparison: Comparison) -> Section:
-    titles = {"groundtruth": "Against the ground truth", "itself": "Innovations"}
-    return Section(
-        titles.get(comparison.against, f"Against {comparison.against}"),
-        comparison.accuracy,
-        [_row(statistic) for statistic in comparison.statistics],
-        [] if comparison.against == "itself" else _flat(comparison.figures),
-        _images(folder, comparison.pictures),
-    )
-
-
 def _row(statistic: Statistic) -> dict[str, str]:
     unit = 100.0 if statistic.kind == "share" else 1.0
     sign = " %" if statistic.kind == "share" else ""
@@ -142,13 +135,6 @@ def _images(folder: Path, names: list[str]) -> list[tuple[str, str]]:
     inside = folder.resolve()
     there = [name for name in names if (folder / name).is_file() and (folder / name).resolve().is_relative_to(inside)]
     return [(Path(name).stem, base64.b64encode((folder / name).read_bytes()).decode()) for name in there]
-
-
-def _template() -> Any:
-    from jinja2 import Environment, PackageLoader, select_autoescape
-
-    loader = PackageLoader("rbpf.validation.report", "templates")
-    return Environment(loader=loader, autoescape=select_autoescape()).get_template(PAGE)
 
 
 def _flat(entries: dict[str, Any]) -> list[tuple[str, str]]:
