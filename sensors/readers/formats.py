@@ -25,11 +25,9 @@ _log = logging.getLogger(__name__)
 
 
 def open_log(path: str | Path, noise: LogNoise | None = None) -> RobotLog:
-    """Read a robot log of any known format, which the modules of the readers describe.
+    """Read a robot log, a folder or a file, of any known format, which the modules of the readers describe.
 
-    Args:
-        path: the log's folder or file.
-        noise: standard deviations to use in place of the log's.
+    `noise` are standard deviations to use in place of the log's.
 
     Raises:
         InputError: nothing is there, it is of no known format, or a file of it is malformed.
@@ -45,16 +43,13 @@ def open_log(path: str | Path, noise: LogNoise | None = None) -> RobotLog:
 def open_images(
     path: str | Path, calibration: str | Path | None = None, topics: Topics = UNNAMED, part: Part = WHOLE
 ) -> ImageSequence:
-    """Open the images of one camera, in any known format; the modules of the readers describe the formats.
+    """Open the images of one camera, of two cameras the left one, in any known format: a folder, a video, or a ROS bag.
 
     Args:
-        path: the sequence's folder, a video, or a ROS bag.
+        path: of the sequence; only its first image is decoded.
         calibration: a `camera.yaml` to use in place of the sequence's own camera.
         topics: of a ROS bag, where they have to be named.
         part: which of its images, and in which size.
-
-    Returns:
-        The sequence, of which only the first image has been decoded; of two cameras the left one.
 
     Raises:
         InputError: nothing is there, it is of no known format, no image of it can be read, or another of its files
@@ -81,14 +76,13 @@ def open_stereo(
         path: its folder, or a ROS bag.
         calibration: a `camera.yaml` of the rectified left camera, in place of the sequence's own calibration; with
             `baseline_m`, in place of its baseline, too.
-        tolerance_s: images of two cameras whose times differ by no more belong together; KITTI's have numbers.
-        topics: of a ROS bag, where they have to be named.
-        part: which of its pairs, and in which size.
+        tolerance_s: images of two cameras whose times differ by no more belong together.
+        topics: as of `open_images`.
+        part: likewise.
 
     Raises:
-        InputError: nothing is there, or it is no stereo sequence; a file is missing or malformed; no two images
-            belong together; the two cameras' images differ in size; the baseline is zero, or the right camera is not
-            to the right of the left one.
+        InputError: as of `open_images`, no two images belong together, the two cameras' images differ in size, the baseline
+            is zero, or the right camera is not to the right of the left one.
     """
     options = ReadOptions(None if calibration is None else Path(calibration), topics, tolerance_s)
     return _opened(_existing(path, "a stereo sequence"), options, part, stereo=True)

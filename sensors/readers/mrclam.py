@@ -134,8 +134,7 @@ def integrate(
 
     A reading holds until the next one, so that the motion over a piece of length dt is exactly
     Exp(dt [turn rate, speed, 0]). Both carry white noise, whose standard deviations are therefore densities, per
-    root second: over a time T the heading drifts by std_turn_rate * sqrt(T), and the noise of a piece is independent
-    of that of the others,
+    root second, and the noise of a piece is independent of that of the others,
 
         delta = prod_k Exp(dt_k [omega_k, v_k, 0] + sqrt(dt_k) [e_omega, e_v, 0]),
         e_omega ~ N(0, std_turn_rate^2),  e_v ~ N(0, std_speed^2).

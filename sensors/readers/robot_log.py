@@ -116,11 +116,7 @@ class LogNoise(Ranged):
     scale_odometry: NotNegative | None = None
 
     def require_only(self, applicable: Collection[str], path: Path, kind: str) -> None:
-        """Refuse what would have no effect on a log at a path, of a kind that takes the fields of these names.
-
-        Raises:
-            InputError: another field is given.
-        """
+        """Refuse what would have no effect on a log at a path, of a kind that takes the fields of these names."""
         for name in self.given():
             if name not in applicable:
                 choice = ", ".join(sorted(applicable))
@@ -148,11 +144,7 @@ class RobotLogFormat(ABC):
 
     @abstractmethod
     def read(self, path: Path, noise: LogNoise) -> RobotLog:
-        """Read the log.
-
-        Args:
-            path: file or folder.
-            noise: standard deviations in place of the log's or of the format's defaults.
+        """Read the log in a file or folder, with standard deviations in place of the log's or of the format's defaults.
 
         Raises:
             InputError: a file is missing or a line is not as the format's module describes; names file and line.
@@ -205,14 +197,9 @@ def read_covariances(table: Table, first: str, last: str) -> Array:
 
 
 def planar_to_chart(delta: Array, cov: Array) -> Array:
-    """Covariance (n, 3, 3), order omega, v, in the right chart at delta, of additive errors of (x, y, heading).
+    """Covariances (n, 3, 3), order omega, v, in the right chart at delta (n, 3), of additive errors (x, y, heading) (n, 3, 3).
 
-    delta Exp(xi) has the translation t + R v and the heading phi + omega to first order, so omega = d phi and
-    v = R^T d t.
-
-    Args:
-        delta: (n, 3) elements of SE(2).
-        cov: (n, 3, 3) covariance in the order x, y, heading.
+    delta Exp(xi) has the translation t + R v and the heading phi + omega to first order, so omega = d phi and v = R^T d t.
     """
     jacobian = np.zeros((len(delta), 3, 3))
     jacobian[:, 0, 2] = 1.0
@@ -221,15 +208,11 @@ def planar_to_chart(delta: Array, cov: Array) -> Array:
 
 
 def spatial_to_chart(delta: Array, ypr: Array, cov: Array) -> Array:
-    """Covariance (n, 6, 6), order omega, v, in the right chart at delta, of additive errors of position and angles.
+    """Covariances (n, 6, 6), order omega, v, in the right chart at delta (n, 7), of additive errors of position and angles.
 
-    For R = Rz(yaw) Ry(pitch) Rx(roll) the body's angular rate is
-    omega = Rx^T (Ry^T e_z d yaw + e_y d pitch) + e_x d roll; the translation part is v = R^T d t.
-
-    Args:
-        delta: (n, 7) elements of SE(3).
-        ypr: (n, 3) their yaw, pitch and roll [rad].
-        cov: (n, 6, 6) covariance in the order x, y, z, yaw, pitch, roll.
+    For R = Rz(yaw) Ry(pitch) Rx(roll), `ypr` (n, 3) [rad], the body's angular rate is
+    omega = Rx^T (Ry^T e_z d yaw + e_y d pitch) + e_x d roll; the translation part is v = R^T d t. `cov` (n, 6, 6) is in the
+    order x, y, z, yaw, pitch, roll.
     """
     _, pitch, roll = ypr.T
     jacobian = np.zeros((len(delta), 6, 6))

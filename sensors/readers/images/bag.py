@@ -26,18 +26,18 @@ import bz2
 import logging
 from collections.abc import Callable, Generator, Iterator
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
 from struct import Struct
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
-from rbpf.sensors.camera import Pinhole, RectifiedStereo
+from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import CameraTruth
 from rbpf.sensors.readers.images.calibration import Calibration, read_calibration
 from rbpf.sensors.readers.images.decoding import (
@@ -49,7 +49,7 @@ from rbpf.sensors.readers.images.decoding import (
     to_grey,
 )
 from rbpf.sensors.readers.images.poses import LONGEST, pose_of_matrix, rigid_motion_error, truth_between
-from rbpf.sensors.readers.images.rectification import Rectification, RectifiedImages, pair_stamps, rectified_baseline
+from rbpf.sensors.readers.images.rectification import pair_stamps, rectified
 from rbpf.sensors.readers.images.sequence import ImageFormat, ImageFrame, ImageSequence, ReadOptions, Source
 
 SUFFIXES = frozenset({".bag", ".mcap", ".db3"})
@@ -90,15 +90,8 @@ _POSES = {
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class RawMessage:
-    """A message as it lies in the bag.
-
-    Attributes:
-        type: of the message, such as sensor_msgs/msg/Image.
-        data: its bytes.
-        stamp_ns: time of its header.
-    """
+class RawMessage(NamedTuple):
+    """A message as it lies in the bag: its type such as sensor_msgs/msg/Image, its bytes, the time of its header."""
 
     type: str
     data: bytes
@@ -390,27 +383,30 @@ class RosBag(ImageFormat):
             sizes = [f"{stream.shape[1]}x{stream.shape[0]}" for stream in streams]
             if sizes[0] != sizes[1]:
                 raise InputError(f"{where}: the images have {sizes[0]} and {sizes[1]} px, expected one size.")
-            rectification: Rectification | None = None
+            pair, baseline_m = None, None
             if options.calibration is None:
-                rig, rectification = _rig_of_infos(bag, streams)
+                pair = _pair_of_infos(bag, streams)
+                camera, baseline_m = pair.left.calibration.camera, pair.apart_m if pair.left.is_rectified else None
             else:
                 used = read_calibration(options.calibration)
                 used.require_shape(streams[0].shape, streams[0].topic)
                 if used.baseline_m is None:
                     expected = "expected baseline_m, the distance of the two cameras in m"
                     raise InputError(f"{options.calibration}: {expected}.")
-                rig = RectifiedStereo(used.camera, used.baseline_m)
+                camera, baseline_m = used.camera, used.baseline_m
             left, right, notes = pair_stamps(streams[0].stamps_ns, streams[1].stamps_ns, options.tolerance_s, where)
             stamps_ns = streams[0].stamps_ns[left]
             truth = topics.truth and read_poses(bag, topics.truth, stamps_ns, streams[0].frame)
-        source: Source = BagImages(path, stamps_ns, streams[0].shape, tuple(names), (left, right))
-        if rectification is not None:
-            source = RectifiedImages(source, rectification)
-            notes += (f"{path}: the two cameras are not rectified; their images are, by the two CameraInfo.",)
-        if truth and rectification is not None:
-            rotated = SE3.compose(truth.world_from_camera, rectification.left_from_rectified)
-            truth = replace(truth, world_from_camera=rotated)
-        return ImageSequence(bag.name, rig.camera, stamps_ns, truth or None, rig.baseline_m, source, notes)
+        source = BagImages(path, stamps_ns, streams[0].shape, tuple(names), (left, right))
+        sequence = ImageSequence(bag.name, camera, stamps_ns, truth or None, baseline_m, source, notes)
+        if pair is None or baseline_m is not None:
+            return sequence
+        # The right camera in the frame of the left one, by way of the rectified frames.
+        aside = np.array([0.0, 0.0, 0.0, 1.0, pair.apart_m, 0.0, 0.0])
+        from_left, from_right = (info.rectified_from_camera() for info in (pair.left, pair.right))
+        left_from_right = SE3.compose(SE3.inverse(from_left), SE3.compose(aside, from_right))
+        note = f"{path}: the two cameras are not rectified; their images are, by the two CameraInfo."
+        return rectified(sequence, pair.right.calibration.camera, left_from_right, pair.right.calibration.where, note)
 
 
 @dataclass(frozen=True)
@@ -531,8 +527,15 @@ def _image_topics(bag: Bag, named: tuple[str, ...], count: int) -> list[str]:
     return chosen
 
 
-def _rig_of_infos(bag: Bag, streams: list[ImageStream]) -> tuple[RectifiedStereo, Rectification | None]:
-    """The pair of two CameraInfo, and how its images are rectified, None where they are."""
+class InfoPair(NamedTuple):
+    """The two CameraInfo of a pair, and how far the right camera is to the right of the left one."""
+
+    left: CameraInfo
+    right: CameraInfo
+    apart_m: float
+
+
+def _pair_of_infos(bag: Bag, streams: list[ImageStream]) -> InfoPair:
     left, right = (CameraInfo.read(bag, stream.topic) for stream in streams)
     for info, stream in ((left, streams[0]), (right, streams[1])):
         info.calibration.require_shape(stream.shape, f"{bag.path}, {stream.topic}")
@@ -544,16 +547,4 @@ def _rig_of_infos(bag: Bag, streams: list[ImageStream]) -> tuple[RectifiedStereo
         problem = f"P puts the right camera {apart:g} m to the right of the left one"
         action = "exchange the topics (--image-topic LEFT,RIGHT), or calibrate the two as a pair"
         raise InputError(f"{right.calibration.where}: {problem}; {action}.")
-    cameras = left.calibration.camera, right.calibration.camera
-    if left.is_rectified:
-        return RectifiedStereo(cameras[0], apart), None
-    # The right camera in the frame of the left one, by way of the rectified frames.
-    aside = np.array([0.0, 0.0, 0.0, 1.0, apart, 0.0, 0.0])
-    left_from_right = SE3.compose(
-        SE3.inverse(left.rectified_from_camera()), SE3.compose(aside, right.rectified_from_camera())
-    )
-    baseline_m = rectified_baseline(*cameras, left_from_right)
-    if baseline_m is not None:
-        return RectifiedStereo(cameras[0], baseline_m), None
-    rectification = Rectification.between(*cameras, left_from_right, right.calibration.where)
-    return rectification.rig, rectification
+    return InfoPair(left, right, apart)

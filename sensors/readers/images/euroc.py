@@ -28,7 +28,7 @@ from rbpf.sensors.feature_log import CameraTruth
 from rbpf.sensors.readers.images.calibration import Calibration, coefficients, read_calibration
 from rbpf.sensors.readers.images.decoding import FileImages, first_shape
 from rbpf.sensors.readers.images.poses import normalised, pose_of_matrix, rigid_motion_error, truth_between
-from rbpf.sensors.readers.images.rectification import Rectification, RectifiedImages, pair_stamps, rectified_baseline
+from rbpf.sensors.readers.images.rectification import pair_stamps, rectified
 from rbpf.sensors.readers.images.sequence import ImageFormat, ImageSequence, ReadOptions, Source
 from rbpf.sensors.readers.text import read_stamped
 from rbpf.sensors.readers.yaml_files import YamlValue, read_yaml
@@ -84,36 +84,21 @@ class Euroc(ImageFormat):
             left.calibration.require_shape(first_shape(files[-1], folder / "data.csv"), str(folder))
         camera = left.calibration.camera
         shape, stamps_ns = (camera.height, camera.width), listed[0].stamps_ns[rows[0]]
-        source: Source = FileImages(stamps_ns, shape, *files)
+        source = FileImages(stamps_ns, shape, *files)
+        sequence = replace(_sequence(mav, left, stamps_ns, source), notes=notes)
         if options.calibration is not None:
             used = read_calibration(options.calibration)
-            sequence = _sequence(mav, left, stamps_ns, source)
             used.require_shape(shape, sequence.name)
             baseline_m = used.baseline_m or float(np.linalg.norm(SE3.translation(left_from_right)))
-            return replace(sequence, camera=used.camera, baseline_m=baseline_m, notes=notes)
-        right_camera = right.calibration.camera
-        rectified_m = rectified_baseline(camera, right_camera, left_from_right)
-        if rectified_m is not None:
-            return replace(_sequence(mav, left, stamps_ns, source), baseline_m=rectified_m, notes=notes)
-        done = Rectification.between(camera, right_camera, left_from_right, str(folders[1] / "sensor.yaml"))
-        rotated = replace(left, body_from_camera=SE3.compose(left.body_from_camera, done.left_from_rectified))
+            return replace(sequence, camera=used.camera, baseline_m=baseline_m)
         note = f"{mav}: the two cameras are not rectified; their images are, by cam0 and cam1's sensor.yaml."
-        return replace(
-            _sequence(mav, rotated, stamps_ns, RectifiedImages(source, done)),
-            camera=done.rig.camera,
-            baseline_m=done.rig.baseline_m,
-            notes=(*notes, note),
-        )
+        file = str(folders[1] / "sensor.yaml")
+        return rectified(sequence, right.calibration.camera, left_from_right, file, note)
 
 
 @dataclass(frozen=True)
 class AslCamera:
-    """A camera and where it sits.
-
-    Attributes:
-        calibration: the camera.
-        body_from_camera: (7,) T_BS.
-    """
+    """A camera and where it sits, `body_from_camera` (7,), which is T_BS."""
 
     calibration: Calibration
     body_from_camera: Array

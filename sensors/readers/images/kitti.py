@@ -94,13 +94,7 @@ class Kitti(ImageFormat):
 
 @dataclass(frozen=True)
 class Projections:
-    """The cameras' projections of `calib.txt`.
-
-    Attributes:
-        path: the file.
-        matrices: number of a camera to its (3, 4) projection K [I | t].
-        lines: number of a camera to its line.
-    """
+    """The cameras' projections of `calib.txt`: (3, 4) K [I | t], and the line of each, by the camera's number."""
 
     path: Path
     matrices: dict[int, Array]

@@ -14,7 +14,7 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
-from rbpf.sensors.readers.images.sequence import ImageFrame, Source
+from rbpf.sensors.readers.images.sequence import ImageFrame, ImageSequence, Source
 
 BESIDE = 0.7
 """The baseline lies along the rows by this fraction of its length at least; beyond, most of the view is lost."""
@@ -53,59 +53,31 @@ class Rectification:
                 f"{where}: the right camera is at ({x}, {y}, {z}) m from the left one, expected it to the right, "
                 "along the rows; exchange the two, or correct T_BS."
             )
-        if "equidistant" in (left.distortion_model, right.distortion_model):
-            return cls._between_wide(left, right, left_from_right)
         right_from_left, size = SE3.inverse(left_from_right), (left.width, left.height)
-        turns = cv2.stereoRectify(
-            *_opencv(left),
-            *_opencv(right),
-            size,
-            SE3.rotation(right_from_left),
-            SE3.translation(right_from_left)[:, None],
-            flags=cv2.CALIB_ZERO_DISPARITY,
-            alpha=0,
-        )[:4]
-        projection, beside = turns[2], turns[3]
-        fx, fy, cx, cy = projection[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
-        camera = Pinhole(left.width, left.height, fx, fy, cx, cy)
+        motion = SE3.rotation(right_from_left), SE3.translation(right_from_left)[:, None]
+        if "equidistant" in (left.distortion_model, right.distortion_model):
+            # Turned as OpenCV does, which depends on the two poses alone, and drawn by our own lenses.
+            fx, fy, cx, cy = np.mean([left.params[:4], right.params[:4]], axis=0).tolist()
+            camera = Pinhole(*size, 0.5 * (fx + fy), 0.5 * (fx + fy), cx, cy)
+            same = (*_opencv(camera), *_opencv(camera))
+            turns = cv2.stereoRectify(*same, size, *motion, flags=cv2.CALIB_ZERO_DISPARITY)[:2]
+            rows, columns = np.mgrid[: left.height, : left.width].astype(float)
+            uv = camera.unproject(np.stack([columns, rows], axis=-1))
+            rays = np.concatenate([uv, np.ones((*uv.shape[:-1], 1))], axis=-1)
+            maps = [_drawn(given, rays @ turn) for given, turn in zip((left, right), turns, strict=True)]
+            rig = RectifiedStereo(camera, float(np.linalg.norm(shift)))
+        else:
+            both = (*_opencv(left), *_opencv(right))
+            found = cv2.stereoRectify(*both, size, *motion, flags=cv2.CALIB_ZERO_DISPARITY, alpha=0)
+            turns, projections = found[:2], found[2:4]
+            fx, fy, cx, cy = projections[0][[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+            maps = [
+                cv2.initUndistortRectifyMap(*_opencv(given), turn, target, size, cv2.CV_32FC1)
+                for given, turn, target in zip((left, right), turns, projections, strict=True)
+            ]
+            rig = RectifiedStereo(Pinhole(*size, fx, fy, cx, cy), -float(projections[1][0, 3]) / fx)
         back = np.eye(4)
         back[:3, :3] = turns[0].T
-        maps = tuple(
-            cv2.initUndistortRectifyMap(*_opencv(given), turn, target, size, cv2.CV_32FC1)
-            for given, turn, target in ((left, turns[0], projection), (right, turns[1], beside))
-        )
-        rig = RectifiedStereo(camera, -float(beside[0, 3]) / fx)
-        return cls(rig, SE3.from_matrix(back), (maps[0], maps[1]))
-
-    @classmethod
-    def _between_wide(cls, left: Pinhole, right: Pinhole, left_from_right: Array) -> Self:
-        """As `between`; turned as OpenCV does, which depends on the two poses alone, and drawn by our own lenses."""
-        import cv2
-
-        fx, fy, cx, cy = np.mean([left.params[:4], right.params[:4]], axis=0).tolist()
-        focal = 0.5 * (fx + fy)
-        camera = Pinhole(left.width, left.height, focal, focal, cx, cy)
-        right_from_left = SE3.inverse(left_from_right)
-        turns = cv2.stereoRectify(
-            *_opencv(camera),
-            *_opencv(camera),
-            (left.width, left.height),
-            SE3.rotation(right_from_left),
-            SE3.translation(right_from_left)[:, None],
-            flags=cv2.CALIB_ZERO_DISPARITY,
-        )[:2]
-        rows, columns = np.mgrid[: left.height, : left.width].astype(float)
-        uv = camera.unproject(np.stack([columns, rows], axis=-1))
-        rays = np.concatenate([uv, np.ones((*uv.shape[:-1], 1))], axis=-1)
-        # Columns and rows where a camera sees the rays; beyond the image where it does not.
-        maps = []
-        for given, turn in zip((left, right), turns, strict=True):
-            seen = rays @ turn
-            px = np.where(given.visible(seen)[..., None], given.project(seen), OUTSIDE).astype(np.float32)
-            maps.append((np.ascontiguousarray(px[..., 0]), np.ascontiguousarray(px[..., 1])))
-        back = np.eye(4)
-        back[:3, :3] = turns[0].T
-        rig = RectifiedStereo(camera, float(np.linalg.norm(SE3.translation(left_from_right))))
         return cls(rig, SE3.from_matrix(back), (maps[0], maps[1]))
 
     def frame(self, frame: ImageFrame) -> ImageFrame:
@@ -136,9 +108,46 @@ class RectifiedImages(Source):
         return map(self.rectification.frame, self.source.frames(start))
 
 
+def rectified(sequence: ImageSequence, right: Pinhole, left_from_right: Array, where: str, note: str) -> ImageSequence:
+    """The pairs of a sequence of the left camera rectified, and its truth; its images as they are where they are that.
+
+    Args:
+        sequence: pairs of images.
+        right: the second camera.
+        left_from_right: (7,) where it is.
+        where: its calibration, for messages.
+        note: what is said if images are rectified.
+
+    Raises:
+        InputError: the right camera is not to the right of the left one.
+    """
+    baseline_m = rectified_baseline(sequence.camera, right, left_from_right)
+    if baseline_m is not None:
+        return replace(sequence, baseline_m=baseline_m)
+    done = Rectification.between(sequence.camera, right, left_from_right, where)
+    truth = sequence.truth
+    if truth is not None:
+        turned = SE3.compose(truth.world_from_camera, done.left_from_rectified)
+        truth = replace(truth, world_from_camera=turned)
+    return replace(
+        sequence,
+        camera=done.rig.camera,
+        truth=truth,
+        baseline_m=done.rig.baseline_m,
+        source=RectifiedImages(sequence.source, done),
+        notes=(*sequence.notes, note),
+    )
+
+
 def _opencv(camera: Pinhole) -> tuple[Any, Any]:
     fx, fy, cx, cy = camera.params[:4]
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), np.array(camera.distortion)
+
+
+def _drawn(camera: Pinhole, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Columns and rows where a camera sees points (H, W, 3); beyond the image where it does not."""
+    px = np.where(camera.visible(seen)[..., None], camera.project(seen), OUTSIDE).astype(np.float32)
+    return np.ascontiguousarray(px[..., 0]), np.ascontiguousarray(px[..., 1])
 
 
 def pair_stamps(

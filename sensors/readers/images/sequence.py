@@ -95,13 +95,10 @@ class ImageSequence:
         return RectifiedStereo(self.camera, self.baseline_m)
 
     def frames(self, start: int = 0) -> Iterator[ImageFrame]:
-        """Images, or pairs of one size, in order of time.
+        """Images, or pairs of one size, in order of time, from number `start` on.
 
         A frame of which an image cannot be read comes without that image and with the problem. A video that ends before
         its last announced image ends with such a frame.
-
-        Args:
-            start: number of the first image, from 0.
 
         Raises:
             InputError: there is no image of that number.
@@ -126,11 +123,7 @@ class Topics:
 
     @classmethod
     def parse(cls, images: str | None = None, truth: str | None = None) -> Self:
-        """The topics of a command line or a run's config.yaml.
-
-        Args:
-            images: one name, or two with a comma between them.
-            truth: one name.
+        """The topics of a command line or a run's config.yaml: one name or two with a comma between them, and the truth's.
 
         Raises:
             InputError: there are more than two, or a name is empty.
