@@ -38,18 +38,12 @@ DICTIONARIES = (
 )
 """Sets of patterns of markers."""
 _SEARCHES = (0, "CALIB_CB_NORMALIZE_IMAGE", "CALIB_CB_EXHAUSTIVE")
-_CHESSBOARD_SIZE = re.compile(r"(\d{1,3})[xX×](\d{1,3})", re.ASCII)
-_MARKERS_SIZE = re.compile(r"(\d{1,2})[xX×](\d{1,2})", re.ASCII)
+_SIZE = re.compile(r"(\d{1,3})[xX×](\d{1,3})", re.ASCII)
 
 
 @dataclass(frozen=True)
 class Board:
-    """A printed chessboard.
-
-    Attributes:
-        columns: inner corners in a row.
-        rows: inner corners in a column.
-        square_m: side of a square.
+    """A printed chessboard, by its inner corners in a row and in a column, and the side of its squares.
 
     Raises:
         InputError: there are fewer than three of either, or the squares have no size.
@@ -70,12 +64,8 @@ class Board:
 
     @classmethod
     def parse(cls, size: str, square_m: float) -> "Board":
-        """A board whose inner corners are written as 9x6.
-
-        Raises:
-            InputError: they are not.
-        """
-        found = _CHESSBOARD_SIZE.fullmatch(size.strip())
+        """A board whose inner corners are written as 9x6, else an `InputError`."""
+        found = _SIZE.fullmatch(size.strip())
         if found is None:
             raise InputError(f"the size of a chessboard is its inner corners as 9x6, got {size!r}")
         return cls(int(found[1]), int(found[2]), square_m)
@@ -157,14 +147,9 @@ def spread_rows(points: np.ndarray, count: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class MarkerBoard:
-    """A printed grid of markers.
+    """A printed grid of markers of a dictionary in `DICTIONARIES`, `gap_m` apart.
 
-    Attributes:
-        columns: markers in a row.
-        rows: markers in a column.
-        side_m: of a marker, its black border included.
-        gap_m: between two markers.
-        dictionary: of patterns, a name in `DICTIONARIES`.
+    A marker's `side_m` includes its black border.
 
     Raises:
         InputError: a number makes no sense, or the dictionary is not known or too small.
@@ -188,12 +173,8 @@ class MarkerBoard:
 
     @classmethod
     def parse(cls, size: str, side_m: float, gap_m: float, dictionary: str) -> "MarkerBoard":
-        """A board whose markers are written as 5x7, columns first.
-
-        Raises:
-            InputError: they are not.
-        """
-        found = _MARKERS_SIZE.fullmatch(size.strip())
+        """A board whose markers are written as 5x7, columns first, else an `InputError`."""
+        found = _SIZE.fullmatch(size.strip())
         if found is None:
             raise InputError(f"the size of a board of markers is their number as 5x7, got {size!r}")
         return cls(int(found[1]), int(found[2]), side_m, gap_m, dictionary.upper())
@@ -322,14 +303,9 @@ class BoardCalibration:
 def calibrate(
     views: Sequence[BoardView], board: Board, width: int, height: int, model: str = "radial-tangential"
 ) -> BoardCalibration:
-    """The camera that explains the views.
+    """The camera that explains the views of a board, all in images of one size [px].
 
-    Args:
-        views: of the board, all in images of one size.
-        board: what is printed.
-        width: of the images, px.
-        height: of the images, px.
-        model: of the lens's distortion, radial-tangential or equidistant.
+    Its lens's distortion is radial-tangential or equidistant.
 
     Raises:
         InputError: there are too few views, or they are too much alike to determine the camera.

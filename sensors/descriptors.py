@@ -108,14 +108,7 @@ def two_best(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndar
 def match_pairs(
     first: np.ndarray, second: np.ndarray, pairs: tuple[np.ndarray, np.ndarray], limits: MatchLimits
 ) -> DescriptorMatches:
-    """Matches descriptors (K, d) with descriptors (M, d) where only some pairs are possible.
-
-    Args:
-        first: descriptors (K, d).
-        second: descriptors (M, d).
-        pairs: rows (C,) of the first and (C,) of the second set, each pair once.
-        limits: when a candidate is taken.
-    """
+    """Matches descriptors (K, d) with descriptors (M, d) where only pairs (C,), (C,) of their rows are possible, each once."""
     k, m = pairs
     if not k.size:
         return _chosen(k, m, np.zeros(0))
@@ -221,11 +214,7 @@ def _squared(nu: np.ndarray, cov: np.ndarray) -> np.ndarray:
 
 @final
 class DescriptorStore:
-    """Descriptors of landmarks, which come and go.
-
-    Args:
-        length: of a descriptor.
-    """
+    """Descriptors of a length, of landmarks that come and go."""
 
     def __init__(self, length: int) -> None:
         self.length = length

@@ -134,12 +134,9 @@ class FeatureLog:
                 raise InputError(f"{where} {order}: sort the frames by time")
 
     def outside(self, margin_px: float = 0.0) -> np.ndarray:
-        """Measurements that are not in the image, or nearer than `margin_px` to its border.
+        """Measurements that are not in the image, or nearer than `margin_px` to its border: (F, 2) frame and row of its `z`.
 
         A log may hold them, because a predicted or noisy pixel can be there: the caller drops or refuses them.
-
-        Returns:
-            (F, 2) int64: index of the frame, and row of its `z`.
         """
         rows = (np.flatnonzero(~self.camera.inside(frame.z, margin_px)) for frame in self.frames)
         found = [(index, int(row)) for index, outside in enumerate(rows) for row in outside]

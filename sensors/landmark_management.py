@@ -56,11 +56,9 @@ class NewLandmarkConfig(Ranged):
 
 @final
 class LandmarkManager:
-    """Counts observations of landmarks and candidates, frame by frame. Call `observe`, then `select`, then `add`.
+    """Counts observations of landmarks and candidates, frame by frame, in images of a size (width, height) [px].
 
-    Args:
-        config: settings.
-        size: width and height of the image, px.
+    Call `observe`, then `select`, then `add`.
     """
 
     def __init__(self, config: NewLandmarkConfig, size: tuple[int, int]) -> None:
@@ -92,10 +90,7 @@ class LandmarkManager:
         return self.observations >= self.config.observations
 
     def observe(self, names: np.ndarray) -> np.ndarray:
-        """Begins a frame in which descriptors (k,), each once, were seen again.
-
-        Returns:
-            Names (j,) of descriptors that are dropped.
+        """Begins a frame in which descriptors (k,), each once, were seen again; returns names (j,) of those that are dropped.
 
         Raises:
             InputError: a landmark is not held.

@@ -41,8 +41,8 @@ def remove_impulses(image: np.ndarray) -> tuple[np.ndarray, float]:
 
     A lens spreads a point over neighbouring pixels, so that no camera sees one that differs from all its neighbours. Where
     more pixels do than a few specks explain, those that stick out are replaced by the median of their surroundings; all
-    other pixels, and all other images, stay as they are to the byte. The dots of a pattern projector look like
-    impulses: a rig that has one should run with `pair.filter_impulses=False`.
+    others stay as they are to the byte. The dots of a pattern projector look like impulses: a rig that has one should run
+    with `pair.filter_impulses=False`.
     """
     import cv2
 
@@ -253,14 +253,9 @@ class StereoMatcher:
             return 0, 0
         images, left, right, count = self._last
         matches = self._along_rows(right, left)
-        px, u = left.px[matches.second], right.px[matches.first, 0]
-        if self.config.refine and len(matches):
-            refined = refine(*images, px, u, self.config.half_px)
-            good = (np.abs(refined.u - u) <= self.config.shift_px) & (
-                refined.correlation >= self.config.least_correlation
-            )
-            px, u = px[good], refined.u[good]
-        wrong = int((px[:, 0] - u <= -self.config.least_disparity_px).sum())
+        px = left.px[matches.second]
+        good, u = self._refined(images, px, right.px[matches.first, 0])
+        wrong = int((px[good, 0] - u[good] <= -self.config.least_disparity_px).sum())
         return wrong, wrong + count
 
     @property
@@ -287,16 +282,21 @@ class StereoMatcher:
                     f"{len(matches)} a positive one; exchange the two cameras"
                 )
         z = np.column_stack([left.px[matches.first], right.px[matches.second, 0]])
-        if self.config.refine:
-            refined = refine(*images, z[:, :2], z[:, 2], self.config.half_px)
-            good = (np.abs(refined.u - z[:, 2]) <= self.config.shift_px) & (
-                refined.correlation >= self.config.least_correlation
-            )
-            z[:, 2] = refined.u
-            matches, z = matches.take(good), z[good]
+        good, z[:, 2] = self._refined(images, z[:, :2], z[:, 2])
+        matches, z = matches.take(good), z[good]
         far = z[:, 0] - z[:, 2] >= self.config.least_disparity_px
         chosen, noise = left.take(matches.first[far]), self.noise(left.scale[matches.first[far]])
         return StereoFeatures.measured(self.rig, z[far], noise, chosen.scale, chosen.orientation, chosen.descriptors)
+
+    def _refined(
+        self, images: tuple[np.ndarray, np.ndarray], px: np.ndarray, u: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Which places px (K, 2) of the left image are found near columns u (K,) of the right one, and where."""
+        config = self.config
+        if not (config.refine and u.size):
+            return np.ones(u.size, dtype=bool), u
+        found = refine(*images, px, u, config.half_px)
+        return (np.abs(found.u - u) <= config.shift_px) & (found.correlation >= config.least_correlation), found.u
 
     def noise(self, scale: np.ndarray) -> np.ndarray:
         """Covariances (K, 3, 3) of (u_left, v, u_right) of keypoints of scales (K,), px²."""

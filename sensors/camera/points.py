@@ -68,7 +68,6 @@ class CameraModel(ObservationModel):
         return SE3.inverse_transform(state[..., :7], x + (1.0 - w) * position)
 
     def predict(self, state: Array, landmark: Given = None, const: Given = None, substate: Given = None) -> Array:
-        """E06 (7)–(9) with distortion."""
         assert landmark is not None
         return self.camera.project(clamp_depth(self.in_camera(state, landmark, const)))
 
@@ -87,7 +86,6 @@ class CameraModel(ObservationModel):
         return Jacobians(by_state, slope @ turned)
 
     def visible(self, state: Array, landmark: Array, const: Given = None) -> np.ndarray:
-        """Whether it is in front of the camera and in the image."""
         return self.camera.visible(self.in_camera(state, landmark, const), self.margin_px)
 
 
@@ -95,15 +93,12 @@ class CameraPoint(CameraModel):
     """A world point in metres (E06 §3.2): two numbers from one camera, three from a stereo pair."""
 
     def world_point(self, landmark: Array, const: Given) -> tuple[Array, Array]:
-        """The point, w = 1."""
         return landmark, np.ones((*landmark.shape[:-1], 1))
 
     def world_point_jacobian(self, landmark: Array, const: Given) -> tuple[Array, Array]:
-        """Identity and zero."""
         return np.eye(3), np.zeros((1, 3))
 
     def kernel(self) -> FusedKernel | None:
-        """Compiled for a pinhole camera."""
         from rbpf.sensors.camera.kernels import camera_point
 
         if not isinstance(self.camera, Pinhole):

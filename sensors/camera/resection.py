@@ -163,16 +163,10 @@ def squared_distances(camera: Pinhole, poses: np.ndarray, sights: Sights) -> np.
 def refined_on_all(
     camera: Pinhole, pose: np.ndarray, sights: Sights, gates: tuple[float, ...] = GATES
 ) -> Resected | None:
-    """The camera near a first guess (7,) that most points agree on; its information in 1/px², `rms_px` in σ.
+    """The camera near a first guess world_from_camera (7,) that most points agree on.
 
-    Args:
-        camera: of the image.
-        pose: world_from_camera, the first guess.
-        sights: the points.
-        gates: squared distance within which a point agrees, in each round of Gauss-Newton and at its end.
-
-    Returns:
-        None where fewer than four agree, or they do not fix the camera.
+    Its information is in 1/px², `rms_px` in σ. `gates` are the squared distances within which a point agrees, in each
+    round of Gauss-Newton and at its end. None where fewer than four agree, or they do not fix the camera.
     """
     for rounds_left in range(len(gates))[::-1]:
         squared, miss, seen, white = (array[0] for array in _compared(camera, pose[None], sights))

@@ -181,14 +181,9 @@ class FeatureExtractor(ABC):
 
 @final
 class Extractor(FeatureExtractor):
-    """Any detector with any descriptor.
+    """Any detector with any descriptor: at most `count` keypoints of an image.
 
-    Args:
-        detector: finds the keypoints.
-        descriptor: describes them.
-        count: keypoints of an image at most.
-        spacing_px: their least distance.
-        border_px: their least distance from the image's border.
+    They are `spacing_px` from each other and `border_px` from the image's border.
     """
 
     def __init__(

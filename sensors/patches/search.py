@@ -65,15 +65,13 @@ def cut(image: np.ndarray, px: np.ndarray, half: int = 15) -> np.ndarray | None:
 def warp(sources: np.ndarray, affines: np.ndarray, size: int = 11) -> np.ndarray:
     """Templates (K, size, size) float32: windows as another view would see them.
 
-    Where the new view is smaller, each pixel gathers all the source pixels that it covers.
+    Where the new view is smaller, each pixel gathers all the source pixels that it covers. NaN where the new view shows
+    what the source does not, or the affine map is not finite.
 
     Args:
         sources: (K, S, S) uint8, from `cut`.
         affines: (K, 2, 2), source offset [px] by offset in the new view [px]: 2 I for a view of half the size.
         size: odd.
-
-    Returns:
-        The templates; NaN where the new view shows what the source does not, or the affine map is not finite.
 
     Raises:
         InputError: a shape or type is another one, or a size is even.

@@ -13,7 +13,10 @@ from typing import final
 import numpy as np
 
 from rbpf.core.models import FusedKernel, Jacobians, ObservationModel
-from rbpf.lie import SE2Group, SE3Group, skew
+from rbpf.lie import Array, SE2Group, SE3Group, skew
+
+Given = Array | None
+"""What a model may read, see `ObservationModel`."""
 
 
 class RigidPointModel(ObservationModel):
@@ -26,7 +29,7 @@ class RigidPointModel(ObservationModel):
         robot_from_sensor: (E,) mounting pose, fixed from then on; by default the robot's origin.
     """
 
-    def __init__(self, space: SE2Group | SE3Group, robot_from_sensor: np.ndarray | None = None) -> None:
+    def __init__(self, space: SE2Group | SE3Group, robot_from_sensor: Array | None = None) -> None:
         self.space = space
         mounting = space.identity() if robot_from_sensor is None else robot_from_sensor
         self.robot_from_sensor = np.array(mounting, dtype=float)
@@ -35,36 +38,23 @@ class RigidPointModel(ObservationModel):
         self._mounting = np.concatenate([rotation.ravel(), space.translation(self.robot_from_sensor)])
 
     @abstractmethod
-    def measure(self, point: np.ndarray) -> np.ndarray:
+    def measure(self, point: Array) -> Array:
         """Z (…, p) of points (…, D) in the sensor's frame."""
 
     @abstractmethod
-    def measure_jacobian(self, point: np.ndarray) -> np.ndarray:
+    def measure_jacobian(self, point: Array) -> Array:
         """∂z/∂point (…, p, D)."""
 
     @abstractmethod
-    def locate(self, z: np.ndarray) -> np.ndarray:
+    def locate(self, z: Array) -> Array:
         """The point (…, D) in the sensor's frame that is measured as z (…, p)."""
 
-    def predict(
-        self,
-        state: np.ndarray,
-        landmark: np.ndarray | None = None,
-        const: np.ndarray | None = None,
-        substate: np.ndarray | None = None,
-    ) -> np.ndarray:
-        """The chain above."""
+    def predict(self, state: Array, landmark: Given = None, const: Given = None, substate: Given = None) -> Array:
         assert landmark is not None
         in_robot = self.space.inverse_transform(state, landmark)
         return self.measure(self.space.inverse_transform(self.robot_from_sensor, in_robot))
 
-    def jacobians(
-        self,
-        state: np.ndarray,
-        landmark: np.ndarray | None = None,
-        const: np.ndarray | None = None,
-        substate: np.ndarray | None = None,
-    ) -> Jacobians:
+    def jacobians(self, state: Array, landmark: Given = None, const: Given = None, substate: Given = None) -> Jacobians:
         """∂z/∂ξ = D [−ω × p | −I] and ∂z/∂landmark = D Rᵀ, with D taken to the robot's frame."""
         assert landmark is not None
         in_robot = self.space.inverse_transform(state, landmark)
@@ -79,17 +69,16 @@ class RigidPointModel(ObservationModel):
             by_rotation = slope @ skew(in_robot)
         return Jacobians(np.concatenate([by_rotation, -slope], axis=-1), by_landmark)
 
-    def invert(self, state: np.ndarray, z: np.ndarray) -> np.ndarray:
-        """The chain backwards."""
+    def invert(self, state: Array, z: Array) -> Array:
         in_robot = self.space.transform(self.robot_from_sensor, self.locate(z))
         return self.space.transform(state, in_robot)
 
-    def mounting(self) -> np.ndarray:
+    def mounting(self) -> Array:
         """Parameters of the fused kernels: rotation of the mounting pose by rows, then its translation."""
         return self._mounting
 
 
-def wrap_angle(angle: np.ndarray) -> np.ndarray:
+def wrap_angle(angle: Array) -> Array:
     """The same angle in [−π, π)."""
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
@@ -111,7 +100,7 @@ class RangeBearing(RigidPointModel):
     def __init__(
         self,
         space: SE2Group | SE3Group,
-        robot_from_sensor: np.ndarray | None = None,
+        robot_from_sensor: Array | None = None,
         pitch_sign: float = 1.0,
         max_range: float = np.inf,
         half_field_of_view: float = np.pi,
@@ -122,8 +111,7 @@ class RangeBearing(RigidPointModel):
         self.max_range = max_range
         self.half_field_of_view = half_field_of_view
 
-    def measure(self, point: np.ndarray) -> np.ndarray:
-        """(…, D) → (…, D)."""
+    def measure(self, point: Array) -> Array:
         flat = np.hypot(point[..., 0], point[..., 1])
         yaw = np.arctan2(point[..., 1], point[..., 0])
         if self.dim == 2:
@@ -131,8 +119,7 @@ class RangeBearing(RigidPointModel):
         pitch = self.pitch_sign * np.arctan2(point[..., 2], flat)
         return np.stack([np.hypot(flat, point[..., 2]), yaw, pitch], axis=-1)
 
-    def measure_jacobian(self, point: np.ndarray) -> np.ndarray:
-        """∂(range, yaw[, pitch])/∂point."""
+    def measure_jacobian(self, point: Array) -> Array:
         x, y = point[..., 0], point[..., 1]
         flat2 = x * x + y * y
         if self.dim == 2:
@@ -147,8 +134,7 @@ class RangeBearing(RigidPointModel):
         rows += [-x * tilt, -y * tilt, self.pitch_sign * flat / distance2]
         return np.stack(rows, axis=-1).reshape(*point.shape, 3)
 
-    def locate(self, z: np.ndarray) -> np.ndarray:
-        """(…, p) → (…, D)."""
+    def locate(self, z: Array) -> Array:
         distance, yaw = z[..., 0], z[..., 1]
         if self.dim == 2:
             return np.stack([distance * np.cos(yaw), distance * np.sin(yaw)], axis=-1)
@@ -156,19 +142,16 @@ class RangeBearing(RigidPointModel):
         height = self.pitch_sign * distance * np.sin(z[..., 2])
         return np.stack([flat * np.cos(yaw), flat * np.sin(yaw), height], axis=-1)
 
-    def residual(self, z: np.ndarray, predicted: np.ndarray) -> np.ndarray:
-        """Angles wrapped."""
+    def residual(self, z: Array, predicted: Array) -> Array:
         difference = z - predicted
         difference[..., 1:] = wrap_angle(difference[..., 1:])
         return difference
 
-    def visible(self, state: np.ndarray, landmark: np.ndarray, const: np.ndarray | None = None) -> np.ndarray:
-        """Within range and field of view."""
+    def visible(self, state: Array, landmark: Array, const: Array | None = None) -> Array:
         z = self.predict(state, landmark)
         return (z[..., 0] <= self.max_range) & (np.abs(z[..., 1]) <= self.half_field_of_view)
 
     def kernel(self) -> FusedKernel:
-        """The compiled twin."""
         from rbpf.sensors.range_bearing import kernels as compiled
 
         if self.dim == 2:
@@ -187,30 +170,25 @@ class RelativePosition(RigidPointModel):
     """
 
     def __init__(
-        self, space: SE2Group | SE3Group, robot_from_sensor: np.ndarray | None = None, max_range: float = np.inf
+        self, space: SE2Group | SE3Group, robot_from_sensor: Array | None = None, max_range: float = np.inf
     ) -> None:
         super().__init__(space, robot_from_sensor)
         self.dim = 2 if isinstance(space, SE2Group) else 3
         self.max_range = max_range
 
-    def measure(self, point: np.ndarray) -> np.ndarray:
-        """The point itself."""
+    def measure(self, point: Array) -> Array:
         return point
 
-    def measure_jacobian(self, point: np.ndarray) -> np.ndarray:
-        """The identity."""
+    def measure_jacobian(self, point: Array) -> Array:
         return np.broadcast_to(np.eye(self.dim), (*point.shape, self.dim))
 
-    def locate(self, z: np.ndarray) -> np.ndarray:
-        """The point itself."""
+    def locate(self, z: Array) -> Array:
         return z
 
-    def visible(self, state: np.ndarray, landmark: np.ndarray, const: np.ndarray | None = None) -> np.ndarray:
-        """Within range."""
+    def visible(self, state: Array, landmark: Array, const: Array | None = None) -> Array:
         return np.linalg.norm(self.predict(state, landmark), axis=-1) <= self.max_range
 
     def kernel(self) -> FusedKernel:
-        """The compiled twin."""
         from rbpf.sensors.range_bearing import kernels as compiled
 
         function = compiled.position_planar if self.dim == 2 else compiled.position_spatial

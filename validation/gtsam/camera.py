@@ -39,14 +39,14 @@ LINE = 1e-3
 @final
 @dataclass(frozen=True, eq=False)
 class CameraSolution:
-    """Most probable path and map, with covariances from the Gauss-Newton Hessian there.
+    """Most probable path and map; covariances and error as those of `robot.BatchSolution`.
 
     Attributes:
         world_from_camera: (T, 7) poses.
         landmarks: name of each landmark that took part to its (3,) position [m].
-        cov_poses: (T, 6, 6) marginal covariances in the right chart, order [omega, v]; no rows if not asked for.
-        cov_landmarks: name to (3, 3) marginal covariance [m^2]; empty if not asked for.
-        error: half the sum of squared whitened residuals, or the sum of their robust losses.
+        cov_poses: (T, 6, 6).
+        cov_landmarks: name to (3, 3).
+        error: of the residuals.
         iterations: of the optimiser.
         undetermined: names of the landmarks whose place the measurements do not tell, ascending: those seen in one
             frame by a single camera, and those that an outlier has drawn into its camera, which are both left out,

@@ -112,9 +112,7 @@ def resect(table: ObservationTable, known: Known, near: Array, info: Array) -> t
 def from_scratch(problem: CameraProblem, on_iteration: OnIteration | None = None) -> CameraEstimate:
     """Path and landmarks from the known points, or for a stereo pair without any, from the first frame.
 
-    Args:
-        problem: a recording.
-        on_iteration: given the error before each iteration of an adjustment on the way; what it raises ends it.
+    `on_iteration` is given the error before each iteration of an adjustment on the way; what it raises ends it.
 
     Raises:
         InputError: the first frame sees fewer than four known points, a single camera has none, or the path breaks.

@@ -60,12 +60,10 @@ class BatchSolution:
     Attributes:
         world_from_robot: (T, E) poses.
         landmarks: name of each landmark to its (D,) position.
-        cov_poses: (T, d, d) marginal covariances in the right chart, order [omega, v]; no rows if not asked
-            for.
+        cov_poses: (T, d, d) marginal covariances in the right chart, order [omega, v]; no rows if not asked for.
         cov_landmarks: name of each landmark to its (D, D) marginal covariance; empty if not asked for.
-        error: half the sum of squared whitened residuals, or the sum of their robust losses. Where the noise
-            is right it is about half the number of measured scalars less half that of the landmarks'
-            coordinates; far more tells of a wrong optimum, noise or association.
+        error: half the sum of squared whitened residuals, or the sum of their robust losses. Where the noise is right
+            about half the number of measured scalars less half that of the landmarks' coordinates.
         iterations: of the optimiser.
     """
 
@@ -133,13 +131,7 @@ def solve_online(m: Measurements, robust: float | None = None) -> Array:
     """The last pose of the optimum of what had been measured until then, step after step: what no filter can do better.
 
     By ISAM2 (M. Kaess et al., 2012), which linearises anew what has moved; directions without noise are given a tenth
-    of the step's largest standard deviation.
-
-    Returns:
-        (T, E) poses.
-
-    Raises:
-        InputError: an observation has no noise, or the measurements do not determine a variable.
+    of the step's largest standard deviation. Poses (T, E); errors as of `solve`.
     """
     problem = Problem(m, robust)
     with _explaining(problem):

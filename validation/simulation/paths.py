@@ -230,14 +230,9 @@ class Drive:
     """
 
     def __init__(self, start: np.ndarray, moves: Sequence[Move], seconds: float, arm_m: float, ramp_s: float) -> None:
-        """Plans the drive.
+        """Plans the drive from a pose (3,) world_from_robot.
 
-        Args:
-            start: (3,) world_from_robot at first.
-            moves: in order, at least one.
-            seconds: for all of them.
-            arm_m: turning by one radian counts as driving this far.
-            ramp_s: time to reach the pace from rest, and to come to rest.
+        `seconds` are for all moves; turning by one radian counts as driving `arm_m`; the pace is reached in `ramp_s`.
 
         Raises:
             InputError: the time does not suffice for the rests and for starting and stopping.
@@ -298,14 +293,9 @@ class Drive:
 
 
 def along_corners(corners: Sequence[Sequence[float]], bend_m: float) -> tuple[np.ndarray, list[Move]]:
-    """Moves along a polyline with rounded corners.
+    """Pose (3,) at the start and moves along a polyline (K, 2) [m] with rounded corners.
 
-    Args:
-        corners: (K, 2) of the polyline, at least two, m.
-        bend_m: a bend begins this far before its corner and ends as far behind it.
-
-    Returns:
-        (3,) pose at the start, and the moves.
+    A bend begins `bend_m` before its corner and ends as far behind it.
 
     Raises:
         InputError: a side is too short for its bends, or the way turns back in a corner.

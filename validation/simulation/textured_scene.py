@@ -217,14 +217,10 @@ class Furniture:
         self.sheet(ring[3], ring[2] - ring[3], ring[0] - ring[3], ceiling)
 
     def hang(self, room: np.ndarray, wall: int, place: Sequence[float], size: Sequence[float], paint: Paint) -> None:
-        """A picture (wide, high) on a wall of a room.
+        """A picture (wide, high) [m] on a wall of a room (2, 3), its least and greatest corner.
 
-        Args:
-            room: (2, 3) least and greatest corner.
-            wall: 0 to 3, those at the greatest y and x, then at the least y and x.
-            place: of its middle, as fractions of the wall from the left and from the top.
-            size: m.
-            paint: draws it.
+        Walls 0 to 3 are those at the greatest y and x, then at the least y and x; `place` is that of the picture's middle, as
+        fractions of the wall from the left and from the top.
         """
         (x0, y0, z0), (x1, y1, z1) = room
         left, right = np.roll(np.array([[x0, y1], [x1, y1], [x1, y0], [x0, y0]]), -wall, axis=0)[:2]

@@ -105,10 +105,8 @@ class VideoImages(Source):
 class Header(NamedTuple):
     """What a video says of itself.
 
-    Attributes:
-        stamps_ns: (T,) int64 times of its images, from 0.
-        shape: height and width of its first image.
-        quarters: quarters of a turn, clockwise, by which the stored images are turned.
+    Times (T,) int64 ns of its images, from 0; height and width of the first; quarters of a turn, clockwise, by which the
+    stored images are turned.
     """
 
     stamps_ns: np.ndarray
@@ -174,10 +172,7 @@ class NamedImage(NamedTuple):
 
 
 def read_uncalibrated(path: Path, most: int) -> tuple[int, Iterator[NamedImage]]:
-    """Up to `most` images, evenly spread, of a video or of a folder that has them in it or in its `images`.
-
-    Returns:
-        How many there will be at most, and those of them that can be read.
+    """Up to `most` images, evenly spread, of a video or of a folder that has them in it or in its `images`, and how many.
 
     Raises:
         InputError: there is nothing of that name, or no image in it.
