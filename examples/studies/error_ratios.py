@@ -14,6 +14,7 @@ from typing import Any, final
 
 import numpy as np
 
+from examples.studies.stereo_tracks import read_stereo_tracks
 from rbpf.errors import InputError
 from rbpf.lie import Array
 from rbpf.runs.plots import COLOURS, new_axes, save_figures
@@ -24,7 +25,6 @@ from rbpf.runs.trajectory import Alignment, Trajectory, associate, in_space
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureLog
 from rbpf.sensors.readers import open_log
-from rbpf.sensors.readers.stereo_tracks import read_stereo_tracks
 from rbpf.systems.mono.config import MonoConfig, SearchConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.stereo.config import StereoConfig

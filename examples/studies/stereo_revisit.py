@@ -18,6 +18,7 @@ import tyro
 
 from examples.studies.feature_cache import cache_features, filter_cached
 from examples.studies.point_worlds import STEREO, LabWorld, Measuring, simulate_features
+from examples.studies.stereo_tracks import read_stereo_tracks
 from rbpf.errors import InputError
 from rbpf.runs.plots import COLOURS, new_axes, save_figures
 from rbpf.runs.recordings import filter_features
@@ -26,7 +27,6 @@ from rbpf.runs.trajectory import in_space
 from rbpf.sensors.feature_log import CameraTruth, FeatureLog
 from rbpf.sensors.readers import ImageSequence, open_stereo
 from rbpf.sensors.readers.images.sequence import ImageFrame, Source
-from rbpf.sensors.readers.stereo_tracks import read_stereo_tracks
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.validation.gtsam.batch_problem import solve_problem
 from rbpf.validation.metrics.scores import score_path

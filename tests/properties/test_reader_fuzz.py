@@ -12,12 +12,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from examples.studies.point_worlds import MONO, DeskWorld, Measuring, simulate_features
+from examples.studies.stereo_tracks import read_stereo_tracks
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.measurement_files import read_feature_log, read_robot_measurements, write_measurements
 from rbpf.runs.trajectory import Trajectory, read_kitti, read_tum, write_tum
 from rbpf.sensors.readers import Topics, open_images, open_log, open_stereo, read_known_points, text
-from rbpf.sensors.readers.stereo_tracks import read_stereo_tracks
 from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 from tests.properties.mutations import damaged

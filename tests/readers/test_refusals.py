@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from examples.studies.stereo_tracks import read_stereo_tracks
 from rbpf.errors import InputError
 from rbpf.sensors.readers import open_log, read_known_points
-from rbpf.sensors.readers.stereo_tracks import read_stereo_tracks
 from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
 from tests.readers.small import GRAPH, KNOWN, MOUNT, MRCLAM, MRPT, MRPT_IN_SPACE, TRACKS, WHEELS, write
 

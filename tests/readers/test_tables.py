@@ -5,10 +5,10 @@ import re
 import numpy as np
 import pytest
 
+from examples.studies.stereo_tracks import read_stereo_tracks
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.readers import open_log, read_known_points
-from rbpf.sensors.readers.stereo_tracks import read_stereo_tracks
 from rbpf.sensors.readers.text import read_columns, read_csv
 from rbpf.sensors.readers.wheel_odometry import WheelOdometry, read_wheel_odometry
 from rbpf.validation.simulation.paths import write_wheel_odometry

@@ -7,11 +7,11 @@ import pytest
 
 from examples.studies.stereo_revisit import Reordered, pairs_there_and_back
 from examples.studies.stereo_revisit import scores as scores_of
+from examples.studies.stereo_tracks import read_stereo_tracks
 from rbpf.runs.recordings import filter_features, filter_pairs
 from rbpf.runs.run import Run
 from rbpf.runs.truth import RunTruth
 from rbpf.sensors.readers import open_stereo
-from rbpf.sensors.readers.stereo_tracks import read_stereo_tracks
 from rbpf.systems.stereo.config import MapConfig, StereoConfig
 from rbpf.validation.gtsam.camera import solve_features
 
