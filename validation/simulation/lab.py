@@ -9,7 +9,7 @@ The world's z axis points up; x runs along the longer side from the corner of th
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 
@@ -50,11 +50,8 @@ AWAY_DEG, AWAY_S = 140.0, 5.0
 class Wall:
     """A wall that furniture stands against.
 
-    Attributes:
-        axis: along which it runs, 0 for x and 1 for y.
-        at_m: its coordinate along the other axis.
-        inwards: +1 or -1, the direction into the room along that axis.
-        free_m: (K, 2) intervals along the wall where something may stand.
+    It runs along an axis, 0 for x and 1 for y, at a coordinate of the other one, along which +1 or -1 leads into the room;
+    something may stand in the intervals `free_m` (K, 2) along it.
     """
 
     axis: int
@@ -158,16 +155,8 @@ HANG_M = 0.01
 """Posters are this far from what they hang on."""
 
 
-@dataclass(frozen=True)
-class Surface:
-    """A flat parallelogram that can be seen, as `Rectangle` has it.
-
-    Attributes:
-        corner: (3,) top left, m.
-        across: (3,) to the top right, m.
-        down: (3,) to the bottom left, m.
-        paint: of its texture.
-    """
+class Surface(NamedTuple):
+    """A flat parallelogram that can be seen, as `Rectangle` has it, and the paint of its texture."""
 
     corner: np.ndarray
     across: np.ndarray
@@ -177,13 +166,7 @@ class Surface:
 
 @dataclass
 class Furnishing:
-    """Collects what stands and hangs in the laboratory.
-
-    Attributes:
-        rng: generator of all sizes and places.
-        blocks: opaque boxes.
-        surfaces: what can be seen of them, and posters.
-    """
+    """Collects what stands and hangs in the laboratory: opaque boxes, and what can be seen of them, and posters."""
 
     rng: np.random.Generator
     blocks: list[Box] = field(default_factory=list)

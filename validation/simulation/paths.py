@@ -28,13 +28,7 @@ TERMS = 3
 
 @dataclass(frozen=True)
 class Wave:
-    """C smooth random signals around zero, each a sum of sinusoids: Σ a_k sin(2π f_k t + φ_k).
-
-    Attributes:
-        amplitude: (C, K), a_k; their sum bounds the signal.
-        frequency_hz: (C, K), f_k.
-        phase: (C, K), φ_k [rad].
-    """
+    """C smooth random signals around zero, sums of sinusoids Σ a_k sin(2π f_k t + φ_k), |.| ≤ Σ a_k; parameters are (C, K)."""
 
     amplitude: np.ndarray
     frequency_hz: np.ndarray
@@ -191,13 +185,7 @@ NODES = 24
 
 @dataclass(frozen=True)
 class Move:
-    """A part of a drive.
-
-    Attributes:
-        length_m: way of the middle between the wheels, forwards.
-        turn_rad: change of the heading, positive to the left.
-        rest_s: stands still for so long before it.
-    """
+    """A part of a drive: forwards so far, turning to the left by so much, after standing still for so long."""
 
     length_m: float = 0.0
     turn_rad: float = 0.0
@@ -206,12 +194,9 @@ class Move:
 
 @dataclass(frozen=True)
 class Travelled:
-    """Where a robot is and how far it went, at T times.
+    """Where a robot is at T times, elements (T, 3) of SE(2), and how far it drove and turned since the start (T,).
 
-    Attributes:
-        world_from_robot: (T, 3) elements of SE(2).
-        way_m: (T,) length driven since the start.
-        heading_rad: (T,) turned since the start, whole turns included.
+    The heading includes whole turns.
     """
 
     world_from_robot: np.ndarray

@@ -96,13 +96,9 @@ class TexturedScene:
 
 @dataclass(frozen=True)
 class Chessboard:
-    """A printed chessboard, as OpenCV counts its corners.
+    """A printed chessboard, as OpenCV counts its inner corners along its x (columns) and y axis (rows).
 
-    Attributes:
-        columns: inner corners along the board's x axis.
-        rows: inner corners along its y axis.
-        square_m: side of a square.
-        world_from_board: (7,) pose; the first inner corner is the origin, x runs across, y down, z into the sheet.
+    Of `world_from_board` (7,) the first inner corner is the origin, x runs across, y down, z into the sheet.
     """
 
     columns: int
