@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from examples.studies.joint_ekf import joint_ekf
+from examples.studies.stereo_tracks import read_stereo_tracks
 from rbpf import gaussian
 from rbpf.lie import SE3, Array
 from rbpf.motion.stereo_vo import MotionPrior
 from rbpf.runs.trajectory import align
 from rbpf.sensors.readers import RobotLog, open_log
 from rbpf.sensors.readers.measurements import KINDS, Measurements, initial_estimate, point_dim
-from rbpf.sensors.readers.stereo_tracks import read_stereo_tracks
 from rbpf.systems.stereo.config import MapConfig, OdometryConfig, StereoConfig
 from rbpf.systems.stereo.slam import StereoSlam
 from rbpf.validation.gtsam.camera import CameraEstimate, solve_features
