@@ -150,21 +150,6 @@ def test_points_that_are_gone_stay_gone() -> None:
     assert {int(row.sum()) for row in there} == {world.points}
 
 
-@dataclass(frozen=True)
-class Line:
-    """A camera at rest that sees points on a line."""
-
-    points: int = 10
-
-    def build(self, rng: np.random.Generator) -> Scene:
-        points = np.zeros((self.points, 3))
-        points[:, 0] = rng.uniform(-1.0, 1.0, self.points)
-        points[:, 2] = 3.0
-        still = SE3.identity((2,))
-        present = np.tile([0, 2], (self.points, 1))
-        return Scene("line", np.arange(2), still, points, present, np.zeros((0, 2, 3)))
-
-
 def test_known_points_are_measured_whenever_they_are_visible() -> None:
     log = simulate_features(DeskWorld(frames=1000, blocks=0), EXACT, MONO, seed=2)
     assert log.known is not None and log.truth is not None
@@ -196,7 +181,6 @@ def test_known_points_are_given_with_the_stated_error() -> None:
     [
         (DeskWorld(points=3), Measuring(), "first frame of the desk sees [0-3] points .* expected 4: simulate more"),
         (DeskWorld(), Measuring(known=30), "30 known points do not fit into 25 measurements"),
-        (Line(), Measuring(known=3), "known points of the line lie on a line in the first frame"),
     ],
 )
 def test_refused_worlds(world: PointWorld, measuring: Measuring, message: str) -> None:
