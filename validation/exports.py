@@ -4,13 +4,15 @@ tum      trajectory.tum: a line `time tx ty tz qx qy qz qw` per pose
 kitti    trajectory_kitti.txt: the upper 3 × 4 block of each pose's matrix, without times
 ply      map.ply: landmarks, coloured by their standard deviation, which is also the property sigma_m; path.ply: positions
          of the body, joined by lines. Binary little-endian (G. Turk, 1994), for MeshLab, CloudCompare, Blender
-colmap   colmap/: cameras, images, points (`cameras`, `images`, `points3D`, `rigs`, `frames`; .bin or .txt), with the
-         tracks of what was measured, where the run left them
+colmap   colmap/sparse/0: cameras, images, points and their errors (`cameras`, `images`, `points3D`, `rigs`, `frames`; .bin
+         or .txt), with the tracks of what was measured, where the run left them; colmap/images: links to the recording's
+         images, or the images of a video or a bag, rectified or resized ones, as PNG files
 rerun    run.rrd: path and map for the Rerun viewer
 npz      run.npz: stamps_ns (T,), world_from_body (T, E), cov_poses (T, d, d); landmark_ids (M,), landmarks (M, D),
          cov_landmarks (M, D, D)
 """
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -24,15 +26,19 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
 from rbpf.runs.files import prepare_folder, whole
 from rbpf.runs.measurement_files import OBSERVATIONS
+from rbpf.runs.provenance import read_config
 from rbpf.runs.reading import PathAndMap, RunFolder
 from rbpf.runs.trajectory import write_kitti, write_tum
 from rbpf.sensors.camera import Pinhole
 from rbpf.sensors.feature_log import FeatureLog
 from rbpf.systems.map_estimate import MapEstimate
+from rbpf.validation.colmap.images import OVER_IMAGES, Names, lay_out, recorded_images
 from rbpf.validation.colmap.model import build_model
 from rbpf.validation.gtsam.batch_problem import Problem, read_problem
 from rbpf.validation.gtsam.observations import ObservationTable, observation_table
 from rbpf.validation.report.rerun import AXIS_M, ellipsoids, log_pose, log_time, recording
+
+_log = logging.getLogger(__name__)
 
 MAP, PATH, MODEL = "map.ply", "path.ply", "colmap"
 
@@ -81,7 +87,13 @@ def _kitti(_run: Path, estimate: PathAndMap, out: Path) -> list[Path]:
 
 def _colmap(run: Path, estimate: PathAndMap, out: Path) -> list[Path]:
     problem = read_problem(run) if (run / OBSERVATIONS).exists() else None
-    export_colmap(estimate, problem, out / MODEL)
+    names: Names | None = None
+    if (config := read_config(run))["system"] in OVER_IMAGES:
+        try:
+            names = lay_out(recorded_images(config), out / MODEL / "images", len(estimate.stamps_ns))
+        except InputError as error:
+            _log.warning("%s: the images of the run are not exported: %s", run, error)
+    export_colmap(estimate, problem, out / MODEL / "sparse" / "0", names=names)
     return [out / MODEL]
 
 
@@ -123,23 +135,29 @@ FORMATS: dict[str, Callable[[Path, PathAndMap, Path], list[Path]]] = {
 
 
 def export_colmap(
-    estimate: PathAndMap, problem: Problem | None, folder: Path, kind: Literal["binary", "text"] = "binary"
+    estimate: PathAndMap,
+    problem: Problem | None,
+    folder: Path,
+    kind: Literal["binary", "text"] = "binary",
+    names: Names | None = None,
 ) -> Any:
     """Writes a run as a COLMAP model and returns the `pycolmap.Reconstruction`.
 
-    The images of a camera are named by their frame. Without a camera the poses are those of `NOMINAL` on the robot.
+    Without `names` the images of a camera are named by their frame. Without a camera the poses are those of `NOMINAL` on the
+    robot.
 
     Args:
         estimate: the run's path and map.
         problem: its measurements, for the camera and the tracks; None gives points without tracks.
         folder: for the model's files.
         kind: of the files.
+        names: of the images, as `lay_out` gives them; images that it lacks are left out.
 
     Raises:
         InputError: path and measurements are not of one run.
     """
     prepare_folder(folder)
-    model = colmap_model(estimate, problem)
+    model = colmap_model(estimate, problem, names)
     if kind == "text":
         model.write_text(folder)
     else:
@@ -147,7 +165,7 @@ def export_colmap(
     return model
 
 
-def colmap_model(estimate: PathAndMap, problem: Problem | None) -> Any:
+def colmap_model(estimate: PathAndMap, problem: Problem | None, names: Names | None = None) -> Any:
     """The model that `export_colmap` writes."""
     landmarks = raised(estimate.landmarks)
     colours = colours_by_sigma(standard_deviations(estimate.landmarks.cov))
@@ -164,7 +182,7 @@ def colmap_model(estimate: PathAndMap, problem: Problem | None) -> Any:
     order, kept = np.argsort(ids, kind="stable"), np.isin(table.names, ids)[table.index]
     place = order[np.searchsorted(ids, table.names[table.index[kept]], sorter=order)]
     shown = ObservationTable(table.camera, table.steps[kept], place, ids, table.z[kept], table.cov_z[kept])
-    return build_model(shown, estimate.world_from_body, landmarks.mean, colours)
+    return build_model(shown, estimate.world_from_body, landmarks.mean, colours, names)
 
 
 def export_ply(estimate: PathAndMap, folder: Path) -> list[str]:

@@ -5,15 +5,22 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 import pytest
+from PIL import Image
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.reading import PathAndMap
+from rbpf.sensors.camera import Pinhole
+from rbpf.sensors.readers import ImageSequence, Part
+from rbpf.sensors.readers.images.decoding import FileImages
 from rbpf.systems.map_estimate import MapEstimate
+from rbpf.validation.colmap.images import lay_out
 from rbpf.validation.colmap.model import LEFT, RIGHT, build_model, from_colmap_pose, image_id, image_name
 from rbpf.validation.exports import MAP, PATH, colmap_model, export_colmap, export_ply, write_ply
 from rbpf.validation.gtsam.observations import observation_table, reprojection
 from tests.validation.camera_scenes import BENT, FISHEYE, STEREO, scene
+
+SMALL = Pinhole(64, 48, 50.0, 50.0, 31.5, 23.5)
 
 
 def estimate_of(log, names=None):
@@ -106,3 +113,29 @@ def test_bad_input_is_refused(tmp_path):
     with pytest.raises(InputError, match="row 1"):
         write_ply(tmp_path / "a.ply", np.array([[0, 0, 0], [0, np.nan, 0.0]]), np.zeros((2, 3), dtype=np.uint8))
     assert not list(tmp_path.iterdir())
+
+
+def test_a_multi_view_stereo_tool_finds_the_images_of_a_run(tmp_path):
+    # A folder of six images, the third of which cannot be read; then every second one, and these made smaller.
+    files = [tmp_path / f"photo {t}.png" for t in range(6)]
+    rng = np.random.default_rng(0)
+    for file in files:
+        Image.fromarray(rng.integers(0, 255, (SMALL.height, SMALL.width, 3), dtype=np.uint8)).save(file)
+    log = scene(camera=SMALL, frames=6, points=12)
+    stamps = np.array([frame.stamp_ns for frame in log.frames])
+    source = FileImages(stamps, (SMALL.height, SMALL.width), files)
+    whole = ImageSequence("six", SMALL, stamps, None, None, source)
+    files[2].unlink()
+    for part, expected in ((Part(), "photo 5.png"), (Part(resize_px=32), "000005.png")):
+        out = tmp_path / f"run with {expected}"
+        names = lay_out(part.apply(whole), out / "images", 6)
+        assert names[5, LEFT] == expected and len(names) == 5
+        assert (out / "images" / expected).is_symlink() == (part.resize_px is None)
+        model = export_colmap(estimate_of(log), log, out / "sparse", names=names)
+        assert model.compute_mean_reprojection_error() > 0.0 and model.num_images() == 5
+        pycolmap.undistort_images(out / "dense", out / "sparse", out / "images")
+        assert {path.name for path in (out / "dense" / "images").iterdir()} == set(names.values())
+    assert lay_out(Part(every=2).apply(whole), tmp_path / "half", 6) == {
+        (0, LEFT): "photo 0.png",
+        (2, LEFT): "photo 4.png",
+    }

@@ -40,7 +40,7 @@ def test_all_formats_hold_the_run(run, tmp_path, capsys):
         np.testing.assert_array_equal(archive["world_from_body"], estimate.world_from_body)
         np.testing.assert_array_equal(archive["landmarks"], estimate.landmarks.mean)
         np.testing.assert_array_equal(archive["cov_landmarks"], estimate.landmarks.cov)
-    model = pycolmap.Reconstruction(tmp_path / "colmap")
+    model = pycolmap.Reconstruction(tmp_path / "colmap" / "sparse" / "0")
     assert model.num_points3D() == estimate.landmarks.ids.size and model.num_images() == len(poses)
     assert (tmp_path / "map.ply").read_bytes().startswith(b"ply")
     assert (tmp_path / "run.rrd").read_bytes()[:4] == b"RRF2"

@@ -10,12 +10,10 @@ import numpy as np
 from rbpf.errors import InputError
 from rbpf.runs.provenance import read_config
 from rbpf.runs.reading import PathAndMap, RunFolder
-from rbpf.sensors.readers import ImageSequence, Part, Topics, open_images, open_stereo
+from rbpf.sensors.readers import ImageSequence
 from rbpf.validation.colmap.compare import ColmapComparison, compare_with_path, compare_with_truth
+from rbpf.validation.colmap.images import OVER_IMAGES, recorded_images
 from rbpf.validation.colmap.reconstruct import ReconstructionOptions, reconstruct
-
-OVER_IMAGES = "mono", "stereo"
-"""Systems whose runs have images."""
 
 
 @final
@@ -51,18 +49,13 @@ def compare_folder_with_colmap(folder: Path, options: ReconstructionOptions | No
         raise InputError(
             f"{folder} is a run of the system {config['system']}, which sees no images; COLMAP needs a run over images."
         )
-    recording, calibration = Path(str(config["recording"])), config.get("calibration")
-    topics, part = Topics.parse(config.get("image_topic"), config.get("truth_topic")), Part.of(config)
-    if config["system"] == "stereo":
-        sequence = open_stereo(recording, calibration, topics=topics, part=part)
-    else:
-        sequence = open_images(recording, calibration, topics, part)
-        if sequence.camera.lens.is_identity:
-            # Where the recording is a rectified pair, of which the run saw the left images, both take part.
-            with suppress(InputError):
-                pair = open_stereo(recording, calibration, topics=topics, part=part)
-                if pair.camera == sequence.camera and np.array_equal(pair.stamps_ns, sequence.stamps_ns):
-                    sequence = pair
+    sequence = recorded_images(config)
+    if config["system"] == "mono" and sequence.camera.lens.is_identity:
+        # Where the recording is a rectified pair, of which the run saw the left images, both take part.
+        with suppress(InputError):
+            pair = recorded_images({**config, "system": "stereo"})
+            if pair.camera == sequence.camera and np.array_equal(pair.stamps_ns, sequence.stamps_ns):
+                sequence = pair
     return compare_with_colmap(RunFolder.open(folder).estimate, sequence, options)
 
 

@@ -8,6 +8,7 @@ In a reconstruction, image t + 1 is frame t (of a stereo pair, images 2t + 1 and
 of the map.
 """
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -74,7 +75,11 @@ def image_name(frame: int, side: int = LEFT) -> str:
 
 
 def build_model(
-    table: ObservationTable, world_from_camera: Array, points: Array, colours: NDArray[np.uint8] | None = None
+    table: ObservationTable,
+    world_from_camera: Array,
+    points: Array,
+    colours: NDArray[np.uint8] | None = None,
+    names: Mapping[tuple[int, int], str] | None = None,
 ) -> Any:
     """A `pycolmap.Reconstruction`.
 
@@ -83,6 +88,7 @@ def build_model(
         world_from_camera: (T, 7) of the (left) camera.
         points: (L, 3), in the order of the table's names.
         colours: (L, 3) RGB; by default grey.
+        names: of the images, by frame and side; others are left out. By default all, as `image_name` calls them.
     """
     import pycolmap
 
@@ -106,15 +112,17 @@ def build_model(
         rows = np.flatnonzero(table.steps == step)
         images = [
             pycolmap.Image(
-                name=image_name(step, side),
+                name=image_name(step, side) if names is None else names[step, side],
                 keypoints=pixels[side][rows] + HALF_PX,
                 camera_id=side,
                 image_id=image_id(step, side, stereo),
             )
             for side in sides
+            if names is None or (step, side) in names
         ]
-        if not stereo:
-            model.add_image_with_trivial_frame(images[0], to_colmap_pose(pose))
+        if not stereo or not images:
+            for image in images:
+                model.add_image_with_trivial_frame(image, to_colmap_pose(pose))
             continue
         frame = pycolmap.Frame(frame_id=step + 1, rig_id=1)
         for image in images:
@@ -132,11 +140,16 @@ def build_model(
     for step, index in zip(table.steps.tolist(), table.index.tolist(), strict=True):
         place = places.get(step, 0)
         places[step] = place + 1
-        tracks[index] += [pycolmap.TrackElement(image_id(step, side, stereo), place) for side in sides]
+        tracks[index] += [
+            pycolmap.TrackElement(image_id(step, side, stereo), place)
+            for side in sides
+            if names is None or (step, side) in names
+        ]
     for index, (point, colour) in enumerate(zip(points, grey if colours is None else colours, strict=True)):
         model.add_point3D_with_id(index + 1, pycolmap.Point3D(xyz=point, color=colour))
         for element in tracks[index]:
             model.add_observation(index + 1, element)
+    model.update_point_3d_errors()
     return model
 
 
