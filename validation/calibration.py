@@ -30,7 +30,7 @@ _INTRINSICS = "fx", "fy", "cx", "cy"
 def calibrate_images(
     images: Path, board: Board, on_image: Callable[[int, int], None] | None = None, model: str = "pinhole"
 ) -> tuple[BoardCalibration, int]:
-    """The camera that took pictures of a board.
+    """The camera that took pictures of a board, and how many images were looked at.
 
     Args:
         images: folder of images, or a video.
@@ -38,28 +38,25 @@ def calibrate_images(
         on_image: called with the images looked at and their number.
         model: of the camera, as in camera.yaml: pinhole or fisheye.
 
-    Returns:
-        The calibration, and how many images were looked at.
-
     Raises:
         InputError: no or too few images show the board, they differ in size, or they do not determine the camera.
     """
     total, shots = read_uncalibrated(images, MOST_SHOTS)
     views, size, looked_at, empty = list[BoardView](), (0, 0), 0, None
-    for looked_at, shot in enumerate(shots, 1):
-        found = shot.image.shape[1], shot.image.shape[0]
+    for looked_at, (name, image) in enumerate(shots, 1):
+        found = image.shape[1], image.shape[0]
         if looked_at == 1:
             size = found
         elif found != size:
             raise InputError(
-                f"{images}: {shot.name} has {found[0]}x{found[1]} px, the images before it {size[0]}x{size[1]}: "
+                f"{images}: {name} has {found[0]}x{found[1]} px, the images before it {size[0]}x{size[1]}: "
                 "calibrate with images of one camera in one setting, all upright or all on their side"
             )
-        px = board_corners(shot.image, board, thorough=not views)
+        px = board_corners(image, board, thorough=not views)
         if px is not None:
-            views.append(BoardView(shot.name, px))
+            views.append(BoardView(name, px))
         elif empty is None:
-            empty = shot.image
+            empty = image
         if on_image is not None:
             on_image(looked_at, total)
     if not views:

@@ -141,17 +141,11 @@ def export_colmap(
     kind: Literal["binary", "text"] = "binary",
     names: Names | None = None,
 ) -> Any:
-    """Writes a run as a COLMAP model and returns the `pycolmap.Reconstruction`.
+    """Writes a run as a COLMAP model, binary or text, and returns the `pycolmap.Reconstruction`.
 
-    Without `names` the images of a camera are named by their frame. Without a camera the poses are those of `NOMINAL` on the
-    robot.
-
-    Args:
-        estimate: the run's path and map.
-        problem: its measurements, for the camera and the tracks; None gives points without tracks.
-        folder: for the model's files.
-        kind: of the files.
-        names: of the images, as `lay_out` gives them; images that it lacks are left out.
+    Without `names`, as `lay_out` gives them, the images of a camera are named by their frame; those that it lacks are left
+    out. Without a camera the poses are those of `NOMINAL` on the robot; without a problem, which has the camera and the
+    tracks, points have no tracks.
 
     Raises:
         InputError: path and measurements are not of one run.
@@ -231,14 +225,9 @@ def write_ply(
     sigmas: Array | None = None,
     edges: NDArray[np.int64] | None = None,
 ) -> None:
-    """Writes points, and lines between them; the file appears under its name when complete.
+    """Writes points (M, 3) [m] with colours (M, 3), and lines between them; the file appears when complete.
 
-    Args:
-        path: the file.
-        points: (M, 3) [m].
-        colours: (M, 3) RGB.
-        sigmas: (M,) a further property sigma_m of each point.
-        edges: (L, 2) rows of the points that a line connects.
+    `sigmas` (M,) are a further property sigma_m of each point, `edges` (L, 2) rows of the points that a line connects.
 
     Raises:
         InputError: a coordinate is not finite.

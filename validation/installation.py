@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
@@ -17,13 +18,9 @@ TIMEOUT_S = 30
 
 
 class Part(NamedTuple):
-    """Something that the program does with a library.
+    """Something that the program does with a library: whether it works, and whether every installation needs it.
 
-    Attributes:
-        name: what it does.
-        works: whether it was tried and worked.
-        needed: whether it belongs to every installation; else it comes with an extra of the package.
-        says: version or path; where it does not work, why, and what to do.
+    `says` is a version or path; where it does not work, why, and what to do.
     """
 
     name: str
@@ -47,7 +44,11 @@ def machine() -> dict[str, Any]:
 def versions() -> dict[str, str | None]:
     """Of what the package requires; None for what is missing."""
     names = [re.split(r"[^\w.-]", line, maxsplit=1)[0] for line in requires("rbpf") or () if "extra ==" not in line]
-    return {name: _version(name) for name in names}
+    found: dict[str, str | None] = dict.fromkeys(names)
+    for name in names:
+        with suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found
 
 
 def parts() -> list[Part]:
@@ -62,13 +63,6 @@ def _tried(name: str, extra: str, probe: Callable[[], str]) -> Part:
         reason = " ".join(f"{type(error).__name__}: {error}".split())
         remedy = f"pip install 'rbpf[{extra}]'" if extra else "install the package again: pip install --force-reinstall"
         return Part(name, False, not extra, f"{reason}; {remedy}")
-
-
-def _version(name: str) -> str | None:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return None
 
 
 def _compiler() -> str:

@@ -147,7 +147,7 @@ class RangeBearing(RigidPointModel):
         difference[..., 1:] = wrap_angle(difference[..., 1:])
         return difference
 
-    def visible(self, state: Array, landmark: Array, const: Array | None = None) -> Array:
+    def visible(self, state: Array, landmark: Array, const: Array | None = None) -> np.ndarray:
         z = self.predict(state, landmark)
         return (z[..., 0] <= self.max_range) & (np.abs(z[..., 1]) <= self.half_field_of_view)
 
@@ -185,7 +185,7 @@ class RelativePosition(RigidPointModel):
     def locate(self, z: Array) -> Array:
         return z
 
-    def visible(self, state: Array, landmark: Array, const: Array | None = None) -> Array:
+    def visible(self, state: Array, landmark: Array, const: Array | None = None) -> np.ndarray:
         return np.linalg.norm(self.predict(state, landmark), axis=-1) <= self.max_range
 
     def kernel(self) -> FusedKernel:

@@ -209,8 +209,10 @@ def _require_density(config: Config, name: str) -> None:
 
 
 def _config_of(record: RunFolder) -> RangeBearingConfig | StereoConfig:
-    kind = StereoConfig if record.system == "stereo" else RangeBearingConfig
-    return load_settings(kind, record.system, record.folder / "config.yaml", (), {})
+    path = record.folder / "config.yaml"
+    if record.system == "stereo":
+        return load_settings(StereoConfig, "stereo", path, (), {})
+    return load_settings(RangeBearingConfig, "range-bearing", path, (), {})
 
 
 def _evidence(config: Config, data: Data) -> float:

@@ -69,8 +69,8 @@ def grade_path(
         accuracy: how far it is from what, one sentence.
         error_m: root mean square of it; None where it is not known.
         spread_m: root mean square distance of what it is compared with from its centre.
-        lost: frames in which the system was lost; None where it cannot be.
-        frames: of the run.
+        lost: frames of the run in which the system was lost; None where it cannot be.
+        frames: how many the run has.
     """
     gone = 0.0 if lost is None else lost / max(frames, 1)
     by_loss = next((name for name, _, most in GRADES if gone <= most), "poor")

@@ -116,11 +116,7 @@ def observation_table(log: FeatureLog) -> ObservationTable:
 def in_one_piece(steps: Index, index: Index, frames: int, known: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Which frames (T,) landmarks connect with the known ones (L,), else with the first frame that sees any.
 
-    Args:
-        steps: (K,) frame of each observation.
-        index: (K,) its landmark.
-        frames: T.
-        known: (L,) which landmarks are known beforehand.
+    Observations (K,) are by their frame and by their landmark's row.
     """
     if not steps.size:
         return np.zeros(frames, dtype=bool)

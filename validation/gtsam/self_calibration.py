@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -41,13 +42,10 @@ OnRound = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Calibrated:
-    """A camera whose focal length and k1 explain the measurements best.
+    """A camera whose focal length and k1 explain the measurements best, and the optimum with it.
 
-    Attributes:
-        camera: the same but for them.
-        batch: the optimum with it.
-        std: (2,) standard deviations of the focal length, as a fraction, and of k1, with all poses and landmarks unknown;
-            NaN where the measurements do not determine them.
+    `std` (2,) are standard deviations of the focal length, as a fraction, and of k1, with all poses and landmarks unknown;
+    NaN where the measurements do not determine them.
     """
 
     camera: Pinhole
@@ -84,21 +82,16 @@ def refine_calibration(log: FeatureLog, batch: Optimum, on_round: OnRound | None
         moved = [at(change + step)[0] - at(change - step)[0] for step in _STEP * np.eye(2)]
         return residuals, [*slopes, np.stack(moved, axis=-1) / (2.0 * _STEP)]
 
-    together, done = Together(evaluate), 0
+    together = Together(evaluate)
     factors = problem.factors_by_row(lambda row, model, pose, point: together.factor(row, [pose, point, key], model))
     graph = problem.graph(found.state, found.loose, path, SCALE, factors)
     values = problem.values(found.state)
     values.insert(key, np.zeros(2))
 
-    def on_iteration(_error: float) -> None:
-        nonlocal done
-        done += 1
-        if on_round is not None:
-            on_round(done, ITERATIONS)
-
-    std = np.full(2, np.nan)
+    done = count(1)
+    tell, std = on_round or (lambda _done, _most: None), np.full(2, np.nan)
     try:
-        values, _, _ = levenberg_marquardt(graph, values, FINE, ITERATIONS, on_iteration)
+        values, _, _ = levenberg_marquardt(graph, values, FINE, ITERATIONS, lambda _error: tell(next(done), ITERATIONS))
         std = np.sqrt(np.diagonal(marginals(graph, values, [key])[0]))
     except RuntimeError:
         pass
@@ -116,10 +109,7 @@ def adjust_near(log: FeatureLog, batch: Optimum) -> Optimum:
 
 
 def recalibrate(folder: Path, out: Path, on_round: OnRound | None = None) -> tuple[dict[str, Any], Calibrated]:
-    """Calibrates the camera of a finished monocular run, and writes camera.yaml into the folder `out`.
-
-    Returns:
-        What changed, for the user, and the camera.
+    """Calibrates the camera of a finished monocular run; writes camera.yaml into `out`; returns what changed, and the camera.
 
     Raises:
         InputError: the folder holds no run of one camera, or what it measured cannot be adjusted.

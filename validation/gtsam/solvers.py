@@ -101,12 +101,8 @@ SPATIAL = Chart(
 def explained(error: RuntimeError, name: str, pose: str, landmarks: NDArray[np.int64], advice: str) -> InputError:
     """GTSAM's complaint about a recording in words, with the variable that it names.
 
-    Args:
-        error: GTSAM's.
-        name: of the recording.
-        pose: what the recording calls the step of a pose.
-        landmarks: names of those that the keys count.
-        advice: what to do.
+    The step of a pose is called `pose` in the recording, `landmarks` are the names of those that the keys count; `advice`
+    says what to do.
     """
     symbol = _SYMBOL.search(str(error))
     if symbol is None:

@@ -183,8 +183,7 @@ def known_corners(
 ) -> tuple[np.ndarray, np.ndarray]:
     """`count` strong corners spread over the middle of the first image; the first few of them spread as well as all.
 
-    Returns:
-        Pixels (M, 2) in the first image, and positions (M, 3) in the world, m.
+    Pixels (M, 2) in the first image, and positions (M, 3) in the world, m.
 
     Raises:
         InputError: there are too few, or they lie on a line.

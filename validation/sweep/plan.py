@@ -108,22 +108,22 @@ def plan(file: SweepFile, folder: Path, where: str = "the sweep") -> list[Job]:
     sizes: list[int | None] = list(file.particles) or [None]
     if len(sequences) * len(sizes) * len(seeds) * len(file.options) > MOST_RUNS:
         raise InputError(f"{where} asks for more than {MOST_RUNS} runs: ask for fewer")
+    settings = {
+        name: tuple(f"{key}={'null' if value is None else value}" for key, value in (file.settings | option).items())
+        for name, option in file.options.items()
+    }
     jobs = [
-        Job(file.system, sequence, name, _pairs(file.settings | option), particles, seed)
-        for sequence, (name, option), particles, seed in product(sequences, file.options.items(), sizes, seeds)
+        Job(file.system, sequence, name, settings[name], particles, seed)
+        for sequence, name, particles, seed in product(sequences, file.options, sizes, seeds)
     ]
     for job in {(job.option, job.particles): job for job in jobs}.values():
-        _checked(job, where)
+        try:
+            system.check(job.settings, job.given)
+        except InputError as error:
+            raise InputError(f"{where}, option {job.option!r}: {error}") from error
     if len({job.key for job in jobs}) < len(jobs):
         raise InputError(f"{where} asks for the same run twice: two options, seeds or sequences are alike")
     return jobs
-
-
-def _checked(job: Job, where: str) -> None:
-    try:
-        system_named(job.system).check(job.settings, job.given)
-    except InputError as error:
-        raise InputError(f"{where}, option {job.option!r}: {error}") from error
 
 
 def _converted(path: Path, values: Any) -> SweepFile:
@@ -151,7 +151,3 @@ def _sequence(
         if not path.exists():
             raise InputError(f"{where}: there is no sequence {path}")
     return tuple((name, str(path.resolve())) for name, path in sorted(paths.items()))
-
-
-def _pairs(settings: Mapping[str, Value]) -> tuple[str, ...]:
-    return tuple(f"{name}={'null' if value is None else value}" for name, value in settings.items())

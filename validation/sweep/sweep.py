@@ -32,7 +32,9 @@ def sweep(
     scheduler: str | None = None,
     on_run: Callable[[int, int], None] | None = None,
 ) -> list[Row]:
-    """Runs what is not done yet and writes the table.
+    """Runs what is not done yet and writes the table; returns the rows in the order of the jobs.
+
+    A run that was not possible has its `failure` in words.
 
     Args:
         jobs: of `rbpf.validation.sweep.plan.read_plan`.
@@ -40,9 +42,6 @@ def sweep(
         workers: processes of this machine; −1 for one per core.
         scheduler: address of a Dask scheduler, whose workers run the jobs instead; they need the same paths.
         on_run: called with the runs done and their number.
-
-    Returns:
-        The rows in the order of the jobs. A run that was not possible has its `failure` in words.
 
     Raises:
         InputError: the folder cannot be written, a former row is damaged or no scheduler answers.

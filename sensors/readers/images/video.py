@@ -15,7 +15,7 @@ import signal
 import threading
 import time
 from collections.abc import Generator, Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, final
@@ -164,15 +164,10 @@ def opened(path: Path) -> Iterator[Any]:
         capture.release()
 
 
-class NamedImage(NamedTuple):
-    """An image (H, W) of a camera that is not known yet, and what it is called in messages."""
-
-    name: str
-    image: Grey
-
-
-def read_uncalibrated(path: Path, most: int) -> tuple[int, Iterator[NamedImage]]:
+def read_uncalibrated(path: Path, most: int) -> tuple[int, Iterator[tuple[str, Grey]]]:
     """Up to `most` images, evenly spread, of a video or of a folder that has them in it or in its `images`, and how many.
+
+    Each comes with what it is called in messages; those that cannot be read are left out.
 
     Raises:
         InputError: there is nothing of that name, or no image in it.
@@ -186,21 +181,16 @@ def read_uncalibrated(path: Path, most: int) -> tuple[int, Iterator[NamedImage]]
         raise InputError(f"{path}: expected images in it or in its images/, found none")
     count = len(read_header(path).stamps_ns) if video else len(files)
     chosen = np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
-    if video:
-        return len(chosen), _of_video(path, set(chosen.tolist()))
-    return len(chosen), _of_files([files[k] for k in chosen])
+    return len(chosen), _of_video(path, set(chosen.tolist())) if video else _of_files([files[k] for k in chosen])
 
 
-def _of_files(files: list[Path]) -> Iterator[NamedImage]:
+def _of_files(files: list[Path]) -> Iterator[tuple[str, Grey]]:
     for file in files:
-        try:
-            image = read_grey(file)
-        except UnreadableImageError:
-            continue
-        yield NamedImage(file.name, image)
+        with suppress(UnreadableImageError):
+            yield file.name, read_grey(file)
 
 
-def _of_video(path: Path, chosen: set[int]) -> Iterator[NamedImage]:
+def _of_video(path: Path, chosen: set[int]) -> Iterator[tuple[str, Grey]]:
     with opened(path) as capture:
         for index in range(max(chosen) + 1):
             if not capture.grab():
@@ -208,7 +198,7 @@ def _of_video(path: Path, chosen: set[int]) -> Iterator[NamedImage]:
             if index in chosen:
                 there, image = capture.retrieve()
                 if there:
-                    yield NamedImage(f"image {index}", to_grey(path, image))
+                    yield f"image {index}", to_grey(path, image)
 
 
 def camera_number(path: Path) -> int | None:
