@@ -18,7 +18,6 @@ from rbpf.sensors.descriptors import distances
 
 DISTINCT = {36: 0.12, 128: 0.3}
 """Least distance of a new descriptor from others, by its length: descriptors of one place are mostly nearer."""
-
 _KEPT = {"table": integers("landmarks", 3, least=0), "counters": integers(2, least=0)}
 
 

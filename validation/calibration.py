@@ -23,7 +23,6 @@ from rbpf.sensors.readers.images.video import read_uncalibrated
 FIGURES, PICTURE = "calibration.json", "calibration.png"
 MOST_SHOTS, MOST_VIEWS = 150, 40
 """Images that are looked at, and views that take part; more change nothing but the time."""
-
 _INTRINSICS = "fx", "fy", "cx", "cy"
 
 

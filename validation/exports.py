@@ -44,7 +44,6 @@ MAP, PATH, MODEL = "map.ply", "path.ply", "colmap"
 
 NOMINAL = Pinhole(640, 480, 500.0, 500.0, 319.5, 239.5)
 """Camera that stands for a robot's sensor in a COLMAP model: it looks along the robot's x axis and measures nothing."""
-
 _STOPS = np.array([[13, 8, 135], [126, 3, 168], [204, 71, 120], [248, 149, 64], [240, 249, 33]], dtype=float)
 _QUANTILES = 0.05, 0.95
 _PATH_COLOUR = np.array([[31, 119, 180]], dtype=np.uint8)

@@ -20,7 +20,6 @@ from rbpf.sensors.camera import Pinhole, RectifiedStereo
 
 Given = Array | None
 """What a model may read, see `ObservationModel`."""
-
 MIN_DEPTH_FRACTION = 0.2
 """Least fraction of its length by which a direction points clamp_depth: what is behind the camera projects far outside."""
 

@@ -21,7 +21,6 @@ from rbpf.sensors.readers.text import Table
 
 UNNAMED = -1
 """In place of a landmark's name where it is not known which one was observed."""
-
 _ROUNDING = 1e-5
 """Of a covariance's printed digits, relative."""
 

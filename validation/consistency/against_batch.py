@@ -58,7 +58,6 @@ POSES, LANDMARKS = "poses against the batch optimum", "landmarks against the bat
 
 LEAST_STEPS = 3
 """Of a run that is compared."""
-
 SAME = "one world: nothing to fix"
 SCALED = "the filter scaled about the first camera onto the optimum; densities across the line from that camera"
 

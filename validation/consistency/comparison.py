@@ -17,7 +17,6 @@ INNOVATIONS, RESIDUALS = "innovations of the measurements", "residuals of the ba
 
 SETTINGS = {"mono": ("search", "noise_px")}
 """By system, where its configuration holds the one standard deviation of all measurements, px."""
-
 _PREFIX = "validation_"
 
 

@@ -27,10 +27,8 @@ from rbpf.systems.stereo.config import StereoConfig
 
 NOISY = 3.0
 """Spread s of log Ẑ over the seeds beyond which its law is not used."""
-
 CLEAR = 2.0
 """A difference of this many of its errors is one."""
-
 Config = RangeBearingConfig | MonoConfig | StereoConfig
 Data = Path | RobotLog | FeatureLog
 

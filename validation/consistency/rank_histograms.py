@@ -22,10 +22,8 @@ from rbpf.lie import Array
 
 Simulate = Callable[[np.random.Generator], tuple[Array, Any]]
 """Parameters (d,) from the prior, and data from them."""
-
 Infer = Callable[[Any, np.random.Generator], tuple[Array, Array]]
 """Of data: samples (N, d) of the posterior, and their weights (N,)."""
-
 LEAST = 20
 """Simulations that tell anything."""
 

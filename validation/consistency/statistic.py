@@ -30,26 +30,19 @@ from rbpf.lie import LieGroup
 
 LEVEL = 0.95
 """Of all intervals."""
-
 STATE_FACTOR = 2.0
 """The standard deviations of poses and landmarks may be wrong by this: they rest on few independent samples."""
-
 NOISE_FACTOR = 1.1
 """Those of measurements and motions: they rest on thousands, and an error in them is repeated in every step."""
-
 BIAS = 0.25
 """A motion's bias per step may have this many of its standard deviations: over 16 steps it adds up to as much as the
 noise does."""
-
 INFORMED = 0.05
 """A direction of the motion that the observations inform by less than this fraction is left out."""
-
 PROBABILITIES = 0.5, 0.9, 0.95
 """Of credible regions."""
-
 _NOTHING = 1e-12
 """Variances below this fraction of the largest, or of one, are none."""
-
 Outcome = Literal["supports", "contradicts", "leaves open"]
 
 

@@ -32,23 +32,17 @@ Problem = Measurements | FeatureLog
 
 Told = Callable[[int, float], None]
 """Told the number of an iteration and the error before it."""
-
 LEAST = 4
 """Landmarks known, or seen in other frames too, that a frame needs to take part: three leave several poses."""
-
 EXACT = 1e-4
 """Known points without errors get one of this fraction of their extent: constraints take GTSAM many times as long."""
-
 WORK = 30_000_000
 """Observations that are linearised, over all iterations, before an adjustment is given up: some minutes of work. Work is
 counted and not the time, so that a result does not depend on what else the machine does."""
-
 LEAST_ITERATIONS = 100
 """That are allowed however many observations there are."""
-
 STEREO_TOLERANCE = 1e-6
 """Of a pair's batch: far landmarks creep; ten times as exact moves a path of 60 m by less than a millimetre."""
-
 AFAR = 300
 """Steps from which on a robot's batch is begun incrementally."""
 

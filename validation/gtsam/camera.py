@@ -31,7 +31,6 @@ __all__ = ["CameraEstimate", "CameraSolution", "solve_features"]
 
 LEAST = 3
 """Landmarks that fix a pose, and points that fix a frame."""
-
 LINE = 1e-3
 """Known points whose spread across a line is below this fraction of that along it lie on it."""
 

@@ -44,7 +44,6 @@ LOST = 10
 """As many frames in a row without three placed landmarks are the end."""
 OUTLIER = 5.0
 """An observation farther off takes no part in a frame's pose, in standard deviations."""
-
 _EARLIEST = 8
 _MOTION = 0.1  # of a frame: rad, and metres per metre of distance to what is seen
 _FOUND = 1e-6  # fraction of the error that is no gain any more

@@ -42,13 +42,10 @@ from rbpf.validation.gtsam.solvers import marginals as marginals_of
 
 SOFT = 0.1
 """Standard deviation of a softened constraint as a fraction of the step's largest."""
-
 CHUNK = 50
 """Steps that an incremental start adds at once."""
-
 MOVED = 1e-3
 """How far a variable may be from where `solve_online` linearised it [rad, m]."""
-
 _PENALTY = 1000.0  # GTSAM's default; it counts in errors far from the optimum, where constraints are violated
 
 

@@ -32,10 +32,8 @@ from rbpf.validation.gtsam.solvers import levenberg_marquardt, marginals
 
 ITERATIONS = 200
 """Most of the adjustment."""
-
 _STEP = 1e-6
 """Of focal length and k1, for the residuals' derivatives by them."""
-
 OnRound = Callable[[int, int], None]
 """Called with the iterations done, and the most that there can be."""
 

@@ -28,7 +28,6 @@ EXACT = 1e-11
 """The same near by."""
 ITERATIONS = 200
 """Most of them."""
-
 OnIteration = Callable[[float], None]
 
 _DAMPING = 1e-5
@@ -37,7 +36,6 @@ _MAX_DAMPING = 1e10
 
 MOST_POSES = 1_500
 """Whose dense reduced system is taken for covariances: 9,000 unknowns, 650 MB."""
-
 _POSE, _POINT = 6, 3
 _SYMBOL = re.compile(r"\(Symbol: ([xl])(\d+)\)")
 

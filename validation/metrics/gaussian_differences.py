@@ -17,7 +17,6 @@ from rbpf.systems.map_estimate import MapEstimate
 
 COLUMNS = ("distances_m", "sigmas", "kullback_leibler", "bhattacharyya", "sigma_ratio")
 """What is told of each pair of Gaussians."""
-
 _TINY = 1e-9
 """A length, as a fraction of the path's, that is none; a variance, as a fraction of the largest, that is none."""
 

@@ -17,7 +17,6 @@ from rbpf.validation.consistency.statistic import inverse_roots
 
 CLOSE = 0.95
 """A map's picture holds this fraction of its landmarks; single ones far off do not make it small."""
-
 _LOWEST = 0.01
 """NEES below this fraction of the band are drawn there."""
 

@@ -28,10 +28,8 @@ from rbpf.validation.report.video import FEATURES, FOUND, MISSED, RAY, STARTED
 
 QUALITY = 75
 """Of the JPEG images in the recording, in per cent."""
-
 AXIS_M = 0.1
 """Length of the camera's drawn image plane from its centre."""
-
 NEAREST = 0.02
 """Homogeneous weight below which a point that was seen counts as at infinity and is left out, 1/m."""
 

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
 KEY_FRAMES = 60
 """Most of a run that COLMAP reconstructs: matching takes minutes for so many, and grows faster than they do."""
-
 Compare = Callable[[RunFolder], Comparison]
 """With pictures in the run's folder."""
 

@@ -20,12 +20,10 @@ from rbpf.systems.stereo.landmarks import FeatureKind
 Colour = tuple[int, int, int]
 Place = Callable[[np.ndarray], list[tuple[float, float]]]
 """Pixels (…, 2) of the image to points of the picture."""
-
 FOUND, MISSED, STARTED, TEXT = (60, 220, 60), (240, 60, 50), (90, 170, 255), (255, 255, 255)
 
 _SMALL_PX = 800
 """Images that are narrower are drawn at twice their size: an ellipse of three pixels shows nothing."""
-
 _ARM, _BAND = 4, 24
 _LETTER_FRACTION, _SMALLEST, _LARGEST = 1.0 / 62.0, 11.0, 17.0
 """Height of letters as a fraction of the drawn width, and its bounds, px."""
@@ -207,10 +205,8 @@ def write_annotated(run: Run, path: Path, on_frame: Callable[[int, int], None] |
 
 SHORTEST_S, LONGEST_S = 1.0 / 120.0, 1.0
 """Bounds of the time per image, for sequences whose stamps say little: photos, equal stamps."""
-
 QUALITY = "23"
 """Constant rate factor of H.264: 18 is nearly without loss, 28 poor."""
-
 ENCODING = "-preset", "veryfast", "-fflags", "+bitexact", "-flags:v", "+bitexact"
 
 

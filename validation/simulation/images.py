@@ -33,7 +33,6 @@ DRIFT_HZ = 0.1, 0.5
 
 PROBES = 12, 16
 """Rows and columns of pixels at which the motion during an exposure is measured."""
-
 MOST_RAYS = 8
 """Along each side of a pixel: more than 64 px of motion during an exposure is rendered with gaps."""
 
@@ -161,19 +160,14 @@ class Shutter:
 
 MIDDLE = 0.15
 """The corners keep this fraction of the image's size from its border: they stay in view when the camera begins to move."""
-
 FLAT = 0.025
 """All within this fraction of the image's width of a corner lies in one plane: its patch can be warped."""
-
 THICK_M, PARALLEL = 0.005, 0.01
 """Sheets nearer to each other than this, with normals nearer than this [rad], lie in one plane."""
-
 CANDIDATES, QUALITY = 300, 0.01
 """Most corners to look for, and the least quality of one, as a fraction of the best (J. Shi, C. Tomasi 1994)."""
-
 STRONGEST = 0.5
 """Fraction of the corners found that are strong enough, if they are as many as asked for."""
-
 LEAST_SPREAD = 0.05
 """Corners are on a line if they extend, in the image, less than this fraction of their length to the side."""
 
@@ -236,7 +230,6 @@ def known_corners(
 
 DEPTH_PER_M = 5000.0
 """Of a depth image, as TUM's RGB-D recordings have it: out to 13 m."""
-
 COMPRESSION = 1
 """Of PNG files, 0 to 9: noise does not become much smaller by trying harder."""
 

@@ -23,22 +23,16 @@ from rbpf.validation.simulation.textures import Paint
 
 SIZE_M = 18.0, 10.0, 2.8
 """Of both rooms together."""
-
 PARTITION_M = 9.9, 10.1
 """Where the wall between the rooms begins and ends along x."""
-
 DOOR_M, LINTEL_M = (4.2, 5.8), 2.1
 """Where the door begins and ends along y, and its height."""
-
 JAMB_M = 0.3
 """Nothing stands nearer to the door than this."""
-
 CORNER_M = 0.95
 """The walls along y stay free so far from the rooms' corners, where the furniture of the others stands."""
-
 BEND_M, ARM_M, RAMP_S = 1.1, 0.5, 1.0
 """How the robot drives: see `Drive`."""
-
 TOUR_FRAMES, TURN_BACK_FRAMES = 4000, 600
 RATE_HZ = 15.0
 
@@ -139,16 +133,12 @@ def turn_back() -> Drive:
 
 Box = np.ndarray
 """(2, 3) least and greatest corner."""
-
 ABOVE_M = 0.9
 """What hangs higher than this is seen from below as well."""
-
 TOUCHING_M = 0.002
 """Faces nearer to a wall than this are not seen."""
-
 BOARD_M, TOP_M, LEG_M, BACK_M = 0.025, 0.04, 0.05, 0.01
 """Thickness of a shelf's boards, of a table's top, of its legs, and of what things lean against."""
-
 TABLE_M = 0.74
 
 HANG_M = 0.01

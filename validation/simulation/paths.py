@@ -102,7 +102,6 @@ def shaken(world_from_camera: np.ndarray, wave: Wave, seconds: np.ndarray) -> np
 ARM_HZ = 0.2, 0.8
 WRIST_HZ = 0.8, 2.0
 """Before the path is slowed down to the speed of a hand, to about a third."""
-
 TREMOR_HZ = 1.0, 3.0
 
 RISE = 0.25
@@ -178,7 +177,6 @@ class HandHeld:
 
 KNOTS = 257
 """Of the table that gives the fraction of a bend for the way along it."""
-
 NODES = 24
 """Of the Gauss-Legendre rule that integrates a position along a bend: exact to the last digits up to half a turn."""
 

@@ -164,13 +164,10 @@ def cast(
 
 LIGHT = np.array([0.3, -0.5, 0.8]) / np.linalg.norm([0.3, -0.5, 0.8])
 """Direction to the lamp."""
-
 DIRECT = 0.25
 """Fraction of the light that comes from there."""
-
 MOST_TRIES = 1000
 """Places drawn for things that do not touch."""
-
 BOARD_TEXELS = 40
 """Per square of a chessboard; its white margin is one square wide."""
 

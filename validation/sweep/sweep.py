@@ -21,7 +21,6 @@ ROWS = "rows.jsonl"
 TABLE = "table.csv"
 SECONDS = 20
 """That a scheduler may take to answer."""
-
 Row = dict[str, Any]
 
 
