@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from examples.studies.rank_histograms import calibrate, plot_ranks
 from rbpf.core.filter import Filter
 from rbpf.errors import InputError
-from rbpf.validation.consistency.rank_histograms import calibrate, plot_ranks
 from tests.validation.fixes import Receiver, Walk
 
 FIXES = 4
