@@ -187,11 +187,11 @@ def test_images_are_swept_with_their_known_points(tmp_path):
 
 
 def test_pairs_of_images_are_swept(tmp_path):
-    """With and without the map: the same odometry, another filter."""
+    """With and without the map: odometry that differs by its draws alone, another filter."""
     render_room(tmp_path / "room")
     options = {"map": {}, "no map": {"map.used": False}}
     file = SweepFile("stereo", ["room"], [20], options=options)
     mapped, alone = sweep(plan(file, tmp_path), tmp_path / "out", workers=1)
-    assert mapped["vo_ate_rmse_m"] == alone["vo_ate_rmse_m"] > 0.0
+    assert mapped["vo_ate_rmse_m"] == pytest.approx(alone["vo_ate_rmse_m"], rel=1e-3) and alone["vo_ate_rmse_m"] > 0.0
     assert mapped["landmarks_mean_per_particle"] > 0 == alone["landmarks_mean_per_particle"]
     assert mapped["pose_nees_mean"] > 0.0
