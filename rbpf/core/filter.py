@@ -62,7 +62,8 @@ class StepReport:
         second: the samples, with their weights before and after the second weight; None where the mixture is made of them.
         ess: effective sample size before resampling.
         resampled: whether the particles were resampled or consolidated before they moved.
-        log_evidence: log p(z_t | z_1:t−1), Mathematics (evidence-increment); NaN where a likelihood is not a density.
+        log_evidence: log p(z_t | z_1:t−1), Mathematics (evidence-increment); NaN where a likelihood is not a density, or where
+            observations of landmarks updated only the state or only the landmarks: that is no density of what was measured.
         nis: normalised innovation squared, NaN without a linearised one: the squared Mahalanobis distance of the joint
             innovation of the rows that took part, a weighted mean over the particles.
         rows: its degrees of freedom, the weighted mean of the number of those rows. A row takes no part in a particle
@@ -240,8 +241,7 @@ class Filter:
 
         # Start landmarks, and report.
         first_observations, new_landmarks = self._start_landmarks(frame, groups)
-        normalised = all(group.likelihood is None or group.likelihood.normalised for group in groups)
-        evidence = look_ahead + correction if normalised else float("nan")
+        evidence = look_ahead + correction if all(map(is_explained, groups)) else float("nan")
         self.log_evidence += evidence
         self._end(stamp_ns)
         if self.consolidation is not None:
@@ -418,6 +418,12 @@ class Filter:
                 born.append(new_landmarks)
             first = end
         return born, np.concatenate(ids)
+
+
+def is_explained(group: Observations) -> bool:
+    """Whether the weights take in the density of a group's measurements given all before: each counts, and once."""
+    whole = Part.LANDMARK not in group.model.reads or len(group.updates) == 2
+    return whole and (group.likelihood is None or group.likelihood.normalised)
 
 
 def mean_count(counts: np.ndarray, weights: np.ndarray) -> float:

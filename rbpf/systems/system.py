@@ -76,7 +76,7 @@ TIMINGS = "timings.csv"
 ESS = Column("ess", "effective sample size before resampling", table=DIAGNOSTICS)
 RESAMPLED = Column("resampled", "whether the particles were resampled", kind=bool, table=DIAGNOSTICS)
 LOG_EVIDENCE = Column(
-    "log_evidence", "increment of the log-evidence; NaN where a likelihood is no density", "nat", table=DIAGNOSTICS
+    "log_evidence", "increment of the log-evidence; NaN where it is not defined", "nat", table=DIAGNOSTICS
 )
 NIS = Column("nis", "normalised innovation squared; NaN without a linearised innovation", table=DIAGNOSTICS)
 NIS_DOF = Column("nis_dof", "its degrees of freedom, a weighted mean over the particles", table=DIAGNOSTICS)

@@ -77,9 +77,9 @@ def test_one_group_for_each_is_one_group_for_both(space, proposal, compiled):
     assert both.lineage.generation == parted.lineage.generation > 0
     np.testing.assert_allclose(parted.particles.state, both.particles.state, atol=1e-9)
     np.testing.assert_allclose(parted.particles.log_weights, both.particles.log_weights, atol=1e-7)
-    for one, other in zip(reports, others, strict=True):
-        assert other.log_evidence == pytest.approx(one.log_evidence, abs=1e-7)
-        assert other.rows == one.rows
+    # The parts of a measurement are no density of it, whatever they add up to.
+    assert np.isfinite(both.log_evidence) and np.isnan([other.log_evidence for other in others]).all()
+    assert [other.rows for other in others] == [one.rows for one in reports]
     np.testing.assert_allclose(landmarks(parted).mean, landmarks(both).mean, atol=1e-9)
     np.testing.assert_allclose(landmarks(parted).cov, landmarks(both).cov, atol=1e-11)
 
@@ -88,14 +88,14 @@ def test_one_group_for_each_is_one_group_for_both(space, proposal, compiled):
 @every_proposal
 @every_space
 def test_for_the_state_alone(space, proposal, compiled):
-    """Weights and evidence of the first step are those of a group for both; no landmark changes by a bit."""
+    """The weights of the first step are those of a group for both, no landmark changes by a bit; evidence there is none."""
     world, (groups, *_) = scene(space)
-    both, (report,) = run(world, [groups], compiled, proposal)
+    both, _ = run(world, [groups], compiled, proposal)
     alone, (other,) = run(world, [split(*groups)[:1]], compiled, proposal)
     assert np.ptp(alone.particles.log_weights) > 0.0 or alone.lineage.generation > 0
     np.testing.assert_allclose(alone.particles.log_weights, both.particles.log_weights, atol=1e-9)
     np.testing.assert_allclose(alone.particles.state, both.particles.state, atol=1e-12)
-    assert other.log_evidence == pytest.approx(report.log_evidence, abs=1e-9)
+    assert np.isnan(other.log_evidence) and np.isnan(alone.log_evidence)
     ancestors = np.arange(PARTICLES) if alone.lineage.generation == 0 else None
     if ancestors is not None:
         np.testing.assert_array_equal(landmarks(alone).mean, world.records.mean)
@@ -111,11 +111,11 @@ def test_for_the_landmarks_alone(space, proposal, compiled):
     """Particles move and weigh as without a measurement, to the bit; landmarks as with one for both there."""
     world, (groups, *_) = scene(space)
     alone, (report,) = run(world, [split(*groups)[1:]], compiled, proposal)
-    nothing, (empty,) = run(world, [[]], compiled, proposal)
+    nothing, _ = run(world, [[]], compiled, proposal)
     assert alone.particles.state.tobytes() == nothing.particles.state.tobytes()
     assert alone.particles.log_weights.tobytes() == nothing.particles.log_weights.tobytes()
-    assert report.log_evidence == empty.log_evidence == pytest.approx(0.0, abs=1e-12)
-    assert report.rows == 0
+    assert nothing.log_evidence == pytest.approx(0.0, abs=1e-12)
+    assert np.isnan(report.log_evidence) and report.rows == 0
     expected = world.map(compiled)
     expected.correct(alone.particles.state, np.zeros((PARTICLES, space.dim)), groups)
     np.testing.assert_array_equal(landmarks(alone).mean, expected.read(expected.ids).mean)
