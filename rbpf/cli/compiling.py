@@ -1,12 +1,12 @@
 """Compiled kernels: which there are, whether they are in the cache, and compiling them with a word of warning."""
 
+import os
 from collections.abc import Callable
 from functools import partial
 from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import numba
 import numpy as np
 
 import rbpf
@@ -33,6 +33,8 @@ def _has_own(source: str) -> bool:
 def cached(module: str) -> bool:
     """Whether a compiled copy of a module's functions is in Numba's cache."""
     name = module.rpartition(".")[2]
+    import numba
+
     if numba.config.CACHE_DIR:
         return any(Path(numba.config.CACHE_DIR).glob(f"*/{name}.*.nbi"))
     source = _ROOT.joinpath(*module.split(".")[1:]).resolve()
@@ -69,13 +71,14 @@ def compile_kernels(every: bool = False) -> list[str]:
 
 
 def require_threads() -> None:
-    """Refuses a number of threads in the environment with which no kernel can run.
+    """Refuses a number of threads in the environment with which Numba cannot be imported, or would run what it likes.
 
     Raises:
-        InputError: it is less than one.
+        InputError: it is no whole number from 1 up.
     """
-    if numba.config.NUMBA_NUM_THREADS < 1:
-        raise InputError(f"NUMBA_NUM_THREADS must be at least 1, got {numba.config.NUMBA_NUM_THREADS}")
+    threads = os.environ.get("NUMBA_NUM_THREADS", "1")
+    if not (threads.isdecimal() and int(threads) >= 1):
+        raise InputError(f"the environment's NUMBA_NUM_THREADS must be a whole number from 1 up, got {threads!r}")
 
 
 def use_threads(threads: int | None) -> None:
@@ -86,6 +89,8 @@ def use_threads(threads: int | None) -> None:
     """
     if threads is None:
         return
+    import numba
+
     if not 1 <= threads <= numba.config.NUMBA_NUM_THREADS:
         raise InputError(f"--threads must lie in 1..{numba.config.NUMBA_NUM_THREADS}, got {threads}")
     numba.set_num_threads(threads)

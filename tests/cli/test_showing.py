@@ -1,9 +1,9 @@
 """What the command line writes on the terminal, and what it says of words that it does not know."""
 
+import os
 import subprocess
 import sys
 
-import numba
 import pytest
 
 from rbpf import __version__
@@ -71,10 +71,13 @@ def test_only_a_run_that_fails_is_told_of_resume(monkeypatch, capsys):
     assert "--resume goes on" in capsys.readouterr().err
 
 
-def test_no_threads_at_all_are_refused(monkeypatch, capsys):
-    monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", 0)
-    assert main(["report", "x"]) == 2
-    assert "NUMBA_NUM_THREADS must be at least 1, got 0" in capsys.readouterr().err
+def test_no_threads_at_all_are_refused():
+    """In a process of its own: Numba cannot even be imported with them."""
+    environment = {**os.environ, "NUMBA_NUM_THREADS": "0"}
+    words = [sys.executable, "-m", "rbpf", "report", "x"]
+    done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr == "rbpf: the environment's NUMBA_NUM_THREADS must be a whole number from 1 up, got '0'\n"
 
 
 @pytest.mark.slow

@@ -18,6 +18,7 @@ from rbpf.validation.colmap.images import lay_out
 from rbpf.validation.colmap.model import LEFT, RIGHT, build_model, from_colmap_pose, image_id, image_name
 from rbpf.validation.exports import MAP, PATH, colmap_model, export_colmap, export_ply, write_ply
 from rbpf.validation.gtsam.observations import observation_table, reprojection
+from rbpf.validation.report.rerun import recording
 from tests.validation.camera_scenes import BENT, FISHEYE, STEREO, scene
 
 SMALL = Pinhole(64, 48, 50.0, 50.0, 31.5, 23.5)
@@ -139,3 +140,13 @@ def test_a_multi_view_stereo_tool_finds_the_images_of_a_run(tmp_path):
         (0, LEFT): "photo 0.png",
         (2, LEFT): "photo 4.png",
     }
+
+
+def test_names_that_are_no_text_reach_rerun_in_part(tmp_path):
+    """Of a recording's name what cannot be read is replaced; of a file's it is refused, before anything is written."""
+    with recording(tmp_path / "run.rrd", "log\udcff") as (_, stream):
+        assert stream.get_recording_id() == "log?"
+    assert (tmp_path / "run.rrd").stat().st_size > 0
+    with pytest.raises(InputError, match="no path that is not UTF-8"), recording(tmp_path / "run\udcff.rrd", "log"):
+        pass
+    assert [file.name for file in tmp_path.iterdir()] == ["run.rrd"]

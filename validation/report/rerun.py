@@ -94,8 +94,13 @@ def write_rerun(run: Run, path: Path) -> None:
 def recording(path: Path, name: str) -> Iterator[tuple[Any, Any]]:
     """The package and a stream into a file (.rrd); the file appears when it is complete. Errors as of `write_rerun`."""
     rr = require_rerun()
+    try:
+        str(path).encode()
+    except UnicodeEncodeError as error:
+        raise InputError(f"{path}: Rerun writes to no path that is not UTF-8: choose another name") from error
     prepare_folder(path.parent)
-    with whole(path) as partial, rr.RecordingStream("rbpf", recording_id=name) as stream:
+    readable = name.encode(errors="replace").decode()  # bytes of a file's name that are no UTF-8
+    with whole(path) as partial, rr.RecordingStream("rbpf", recording_id=readable) as stream:
         stream.save(str(partial))
         yield rr, stream
         stream.flush()
