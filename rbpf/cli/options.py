@@ -77,7 +77,22 @@ class RunOptions(Printed):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RangeBearingOptions(RunOptions):
+class PartOptions(RunOptions):
+    """Of every run over a recording, of which a part may be used.
+
+    Attributes:
+        start: use the frames from so many seconds after the first on; of a log without times, steps.
+        end: use the frames until so many seconds after the first; by default all.
+        every: of these use each so many-th.
+    """
+
+    start: NotNegative = 0.0
+    end: RealPositive = None
+    every: Count = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class RangeBearingOptions(PartOptions):
     """Options of `rbpf run range-bearing`.
 
     Attributes:
@@ -96,15 +111,12 @@ class RangeBearingOptions(RunOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ImageRunOptions(RunOptions):
+class ImageRunOptions(PartOptions):
     """Of every run over images.
 
     Attributes:
         calibration: camera.yaml in place of the sequence's own, of the images before they are resized; by default that one
             is read.
-        start: use the images from so many seconds after the first on.
-        end: use the images until so many seconds after the first; by default all.
-        every: of these use each so many-th.
         resize: make the images smaller, to this width in px, and the calibration with them; by default they stay as they are.
         image_topic: of a ROS bag, the topic of the images, or LEFT,RIGHT; by default those that the bag has.
         truth_topic: of a ROS bag, the topic of the camera's true poses; by default none.
@@ -116,9 +128,6 @@ class ImageRunOptions(RunOptions):
     """
 
     calibration: Where = None
-    start: NotNegative = 0.0
-    end: RealPositive = None
-    every: Count = 1
     resize: Annotated[Whole, Range(ge=1, le=MOST_PX)] = None
     image_topic: Text = None
     truth_topic: Text = None
@@ -299,11 +308,12 @@ def given_topics(options: ImageRunOptions) -> "Topics":
     return Topics.parse(options.image_topic, options.truth_topic)
 
 
-def given_part(options: ImageRunOptions) -> "Part":
-    """The part of `--start`, `--end`, `--every` and `--resize`."""
+def given_part(options: PartOptions) -> "Part":
+    """The part of `--start`, `--end`, `--every` and, of images, `--resize`."""
     from rbpf.sensors.readers.images.part import Part
 
-    return Part(options.start, options.end, options.every, options.resize)
+    resize = options.resize if isinstance(options, ImageRunOptions) else None
+    return Part(options.start, options.end, options.every, resize)
 
 
 def given_markers(options: MonoOptions) -> "MarkerBoard | None":

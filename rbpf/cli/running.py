@@ -50,7 +50,7 @@ def run_range_bearing(options: Annotated[RangeBearingOptions, tyro.conf.arg(name
     config = load_settings(RangeBearingConfig, "range-bearing", options.config, options.set, named)
     with _prepared(options) as out:
         with progress() as bar, patient(bar("filtering")) as tell:
-            recording = RobotRecording(options.log)
+            recording = RobotRecording(options.log, given_part(options))
             run = filter_recording(recording, config, out, options.resume, [listener(tell)])
         if options.batch:
             say("solving the batch problem with the same measurements …")

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from rbpf.core.models import Sensor
 from rbpf.errors import InputError
+from rbpf.motion.odometry import Odometry
 from rbpf.runs.files import CHECKPOINT, prepare_folder
 from rbpf.runs.provenance import decisive_inputs
 from rbpf.runs.run import Listener, Run, Source, drive
@@ -81,9 +83,11 @@ class RobotRecording:
 
     Attributes:
         log: folder or file of a known kind.
+        part: which of its frames.
     """
 
     log: Path
+    part: Part = WHOLE
 
     def open(self, config: RangeBearingConfig) -> Opened:
         """The system and the log's frames.
@@ -91,11 +95,11 @@ class RobotRecording:
         Raises:
             InputError: the log or a setting is wrong.
         """
-        return open_robot_log(open_log(self.log, config.noise), config)
+        return open_robot_log(part_of_log(open_log(self.log, config.noise), self.part), config)
 
     def sources(self) -> dict[str, str | float | bool]:
         """For config.yaml."""
-        return {"recording": str(self.log)}
+        return {"recording": str(self.log)} | self.part.entries()
 
 
 @dataclass(frozen=True)
@@ -226,6 +230,27 @@ class StereoRecording:
         named = {"recording": self.pairs, "calibration": self.calibration}
         found: dict[str, str | float | bool] = {name: str(path) for name, path in named.items() if path is not None}
         return found | self.topics.entries() | self.part.entries()
+
+
+def part_of_log(log: RobotLog, part: Part) -> RobotLog:
+    """Some frames of a robot's log; the odometry between two of them is composed of that between all in between.
+
+    Raises:
+        InputError: no frame is left.
+    """
+    if part == WHOLE:
+        return log
+    stamps = np.array([frame.stamp_ns for frame in log.frames])
+    counted = np.array_equal(stamps, np.arange(len(stamps)))
+    rows = part.rows(stamps if counted else (stamps - stamps[0]) * 1e-9, f"{log.name}: no frame is left").tolist()
+    frames = [replace(log.frames[rows[0]], delta=None, cov_delta=None)]
+    for before, row in pairwise(rows):
+        moved = Odometry.at_rest(log.space)
+        for frame in log.frames[before + 1 : row + 1]:
+            assert frame.delta is not None and frame.cov_delta is not None
+            moved = moved.then(Odometry(frame.delta, frame.cov_delta), log.space)
+        frames.append(replace(log.frames[row], delta=moved.delta, cov_delta=moved.cov))
+    return replace(log, frames=frames)
 
 
 def open_robot_log(log: RobotLog, config: RangeBearingConfig) -> Opened:

@@ -18,8 +18,9 @@ import numpy as np
 
 from rbpf.errors import InputError
 from rbpf.runs.reading import RunFolder
+from rbpf.runs.recordings import RobotRecording, filter_features, filter_recording, filter_robot_log
 from rbpf.sensors.feature_log import FeatureLog
-from rbpf.sensors.readers import RobotLog, open_log
+from rbpf.sensors.readers import Part, RobotLog
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.settings import load_settings
@@ -30,7 +31,7 @@ NOISY = 3.0
 CLEAR = 2.0
 """A difference of this many of its errors is one."""
 Config = RangeBearingConfig | MonoConfig | StereoConfig
-Data = Path | RobotLog | FeatureLog
+Data = Path | RobotRecording | RobotLog | FeatureLog
 
 
 @dataclass(frozen=True)
@@ -86,14 +87,17 @@ def evidence_difference(logs_a: Sequence[float], logs_b: Sequence[float]) -> Evi
     """From log-evidences of any filters, one per seed.
 
     Raises:
-        InputError: there are fewer than two of either, or one is no number: the likelihood is not a density.
+        InputError: there are fewer than two of either, or one is no number: it is not defined.
     """
     pair = np.asarray(logs_a, dtype=float), np.asarray(logs_b, dtype=float)
     for name, logs in zip(("first", "second"), pair, strict=True):
         if logs.size < 2:
             raise InputError("log-evidences are compared over 2 seeds or more, which tell their error")
         if not np.isfinite(logs).all():
-            raise InputError(f"the {name} filter has no evidence: one of its likelihoods is not a density")
+            raise InputError(
+                f"the {name} filter has no evidence: one of its likelihoods is not a density, or some observations updated "
+                "only the particles or only the map"
+            )
     return EvidenceDifference(*pair)
 
 
@@ -181,11 +185,13 @@ def compare_runs(
             )
         if record.system != "range-bearing":
             raise InputError(f"{record.folder}: runs of the system {record.system!r} cannot be compared by evidence")
-    if len({record.config.get("recording") for record in records}) > 1:
-        raise InputError(f"{run_a} and {run_b} are runs over different recordings: evidences say nothing about them")
+    one, other = (RobotRecording(Path(str(record.config["recording"])), Part.of(record.config)) for record in records)
+    if one != other:
+        raise InputError(
+            f"{run_a} and {run_b} are runs over different recordings, or parts of one: evidences say nothing about them"
+        )
     configs = [_config_of(record) for record in records]
-    recording = Path(str(records[0].config["recording"]))
-    return compare_evidence(configs[0], configs[1], recording, range(seeds), workers, on_run)
+    return compare_evidence(configs[0], configs[1], one, range(seeds), workers, on_run)
 
 
 def _log_evidence(logs: np.ndarray) -> tuple[float, float]:
@@ -214,12 +220,12 @@ def _config_of(record: RunFolder) -> RangeBearingConfig | StereoConfig:
 
 
 def _evidence(config: Config, data: Data) -> float:
-    from rbpf.runs.recordings import filter_features, filter_robot_log
-
     if isinstance(config, RangeBearingConfig):
         if isinstance(data, Path):
-            data = open_log(data, config.noise)
-        elif config.noise.given():
+            data = RobotRecording(data)
+        if isinstance(data, RobotRecording):
+            return float(filter_recording(data, config).system.filter.log_evidence)
+        if config.noise.given():
             raise InputError("a log that was read already has its noise: give the recording's path to change it")
         if isinstance(data, RobotLog):
             return float(filter_robot_log(data, config).system.filter.log_evidence)

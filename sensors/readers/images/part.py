@@ -1,4 +1,4 @@
-"""Part of a recording of images: from one time to another, every so many-th of them, smaller."""
+"""Part of a recording: from one time to another, every so many-th of its frames, images smaller."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
@@ -14,7 +14,7 @@ from rbpf.sensors.readers.images.sequence import ImageFrame, ImageSequence, Sour
 @final
 @dataclass(frozen=True)
 class Part:
-    """Which images of a recording are used, and in which size.
+    """Which frames of a recording are used, and images in which size.
 
     Attributes:
         start_s: the first is the first one so long after the recording's first, s.
@@ -56,12 +56,7 @@ class Part:
             InputError: no image is left, or they would become larger.
         """
         stamps, camera = np.asarray(sequence.stamps_ns), sequence.camera
-        after_s = (stamps - stamps[:1]) * 1e-9
-        end_s = np.inf if self.end_s is None else self.end_s
-        rows = np.flatnonzero((after_s >= self.start_s) & (after_s <= end_s))[:: self.every]
-        if not rows.size:
-            long = f"the recording is {after_s[-1] if len(after_s) else 0.0:.3f} s long"
-            raise InputError(f"{sequence.name}: no image is left from {self.start_s:g} s on: {long}")
+        rows = self.rows((stamps - stamps[:1]) * 1e-9, f"{sequence.name}: no image is left")
         width = camera.width if self.resize_px is None else self.resize_px
         if width > camera.width:
             raise InputError(f"images of {camera.width} px are not made larger: resize is {width} px")
@@ -69,6 +64,19 @@ class Part:
             camera = camera.resized(width, max(round(width * camera.height / camera.width), 1))
         source = Chosen(sequence.source, rows, stamps[rows], (camera.height, camera.width))
         return replace(sequence, camera=camera, stamps_ns=stamps[rows], source=source)
+
+    def rows(self, after_s: np.ndarray, problem: str) -> np.ndarray:
+        """Numbers of the frames used, of all (T,) that come so long after the first, s.
+
+        Raises:
+            InputError: none is left, with the problem as its beginning.
+        """
+        end_s = np.inf if self.end_s is None else self.end_s
+        rows = np.flatnonzero((after_s >= self.start_s) & (after_s <= end_s))[:: self.every]
+        if not rows.size:
+            long = f"the recording is {after_s[-1] if len(after_s) else 0.0:.3f} s long"
+            raise InputError(f"{problem} from {self.start_s:g} s on: {long}")
+        return rows
 
 
 WHOLE = Part()
