@@ -133,6 +133,11 @@ class FeatureLog:
                 order = f"at {frame.stamp_ns} ns is before the frame it follows ({before} ns)"
                 raise InputError(f"{where} {order}: sort the frames by time")
 
+    @property
+    def stamps_ns(self) -> np.ndarray:
+        """(T,) int64 times of the frames."""
+        return np.array([frame.stamp_ns for frame in self.frames], dtype=np.int64)
+
     def outside(self, margin_px: float = 0.0) -> np.ndarray:
         """Measurements that are not in the image, or nearer than `margin_px` to its border: (F, 2) frame and row of its `z`.
 

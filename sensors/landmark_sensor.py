@@ -22,12 +22,8 @@ class LandmarkFrame(Protocol):
 class NamedLandmarkSensor(Sensor):
     """Known association: each observation carries the landmark's number, which is its id in the map.
 
-    A number that the map does not hold starts a landmark. Names that are text have to be numbered by the caller.
-
-    Args:
-        model: how a landmark is measured.
-        landmark: its parametrisation.
-        likelihood: of the innovation, None is Gaussian.
+    A number that the map does not hold starts a landmark. Names that are text have to be numbered by the caller. Without a
+    likelihood that of the innovation is Gaussian.
     """
 
     def __init__(self, model: ObservationModel, landmark: Landmark, likelihood: Likelihood | None = None) -> None:

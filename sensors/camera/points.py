@@ -8,7 +8,7 @@ c = Rᵀ(x − w t), moves by −ω × c − w v. Where the state holds more tha
 
 from abc import abstractmethod
 from functools import cached_property
-from typing import Protocol, final
+from typing import final
 
 import numpy as np
 
@@ -24,30 +24,13 @@ MIN_DEPTH_FRACTION = 0.2
 """Least fraction of its length by which a direction points clamp_depth: what is behind the camera projects far outside."""
 
 
-class Camera(Protocol):
-    """What `CameraPoint` needs of a camera; `Pinhole` and `RectifiedStereo` are two."""
-
-    dim: int
-
-    def project(self, point: Array) -> Array:
-        """(…, 3) in the camera's frame → (…, p) px."""
-
-    def jacobian(self, point: Array) -> Array:
-        """Its derivative (…, p, 3)."""
-
-    def visible(self, point: Array, margin_px: float = 0.0) -> np.ndarray:
-        """Whether it is in the image (…)."""
-
-
 class CameraModel(ObservationModel):
     """The chain from a landmark to pixels; a subclass says where the landmark lies.
 
-    Args:
-        camera: of the images.
-        margin_px: a landmark this near to the border is not expected to be seen.
+    A landmark nearer to the border than `margin_px` is not expected to be seen.
     """
 
-    def __init__(self, camera: Camera, margin_px: float = 0.0) -> None:
+    def __init__(self, camera: Pinhole | RectifiedStereo, margin_px: float = 0.0) -> None:
         self.camera = camera
         self.margin_px = margin_px
         self.dim = camera.dim
@@ -108,10 +91,7 @@ class CameraPoint(CameraModel):
 class CameraRay(CameraModel):
     """A landmark `InverseDepth` (u, v, q), anchored at world_from_anchor: its 2-D measurement (E06 §5.1).
 
-    Args:
-        camera: of the images.
-        rho: (2,) inverse depth of a landmark just started: mean and standard deviation, 1/m.
-        margin_px: see `CameraModel`.
+    `rho` (2,) is the inverse depth of a landmark just started: mean and standard deviation, 1/m.
     """
 
     def __init__(self, camera: Pinhole, rho: tuple[float, float] = (1.0, 0.5), margin_px: float = 0.0) -> None:
@@ -198,10 +178,6 @@ class StereoPoint(CameraPoint):
 
     S05 (4)–(7) compares points in space, with C^L from the pixels' noise; here pixels are compared, which is the same
     to first order and stays Gaussian where the point is far.
-
-    Args:
-        rig: the two cameras.
-        margin_px: see `CameraModel`.
     """
 
     def __init__(self, rig: RectifiedStereo, margin_px: float = 0.0) -> None:
@@ -237,10 +213,6 @@ class PointsView(ObservationModel):
     """The pixels of m points that one landmark holds together, one after the other: z (2m,).
 
     Where the state holds more than world_from_camera, the pose comes first.
-
-    Args:
-        camera: of the image.
-        count: m.
     """
 
     def __init__(self, camera: Pinhole, count: int) -> None:
@@ -279,12 +251,7 @@ class PointsView(ObservationModel):
 
 @final
 class MembersView(PointsView):
-    """The pixels of m points of an `UncertainConstellation` (p_1, p_2, …), one after the other: z (2m,).
-
-    Args:
-        camera: of the image.
-        places: (m,) which of the landmark's points are seen.
-    """
+    """The pixels of those of an `UncertainConstellation`'s points (p_1, p_2, …) at `places` (m,), one after the other: z (2m,)."""
 
     def __init__(self, camera: Pinhole, places: np.ndarray) -> None:
         super().__init__(camera, places.size)
@@ -318,13 +285,9 @@ class MembersView(PointsView):
 
 @final
 class ConstellationView(PointsView):
-    """The pixels of m exact points of a `Constellation`, one after the other: z (2m,).
+    """The pixels of m exact points of a `Constellation`, `points` (m, 3) in the group's frame, one after the other: z (2m,).
 
     The landmark is ξ with constant G: point m lies at G Exp(ξ) k_m.
-
-    Args:
-        camera: of the image.
-        points: (m, 3) k_m of the points that are seen, in the group's frame.
     """
 
     def __init__(self, camera: Pinhole, points: Array) -> None:

@@ -84,12 +84,10 @@ ROUNDS = 10
 
 @dataclass(frozen=True)
 class Resected:
-    """A camera, and the points that say so.
+    """A camera world_from_camera (7,), and the points that say so, `inliers` (M,).
 
     Attributes:
-        world_from_camera: (7,).
         information: (6, 6) JᵀJ of the inliers' pixels at it, right chart, order [ω, v], 1/px².
-        inliers: (M,) bool.
         rms_px: of the inliers, per axis, with their degrees of freedom.
     """
 
@@ -135,13 +133,9 @@ GATES = tuple(GATE * wider for wider in (16.0, 16.0, 4.0, 4.0, 1.0, 1.0, 1.0, 1.
 
 @dataclass(frozen=True)
 class Sights:
-    """M points and where they may be seen.
+    """M points (M, 3) in the world and where they may be seen, px (M, 2) with `std_px` (M,) per axis.
 
-    Attributes:
-        points: (M, 3) in the world.
-        spread: (M, 3) standard deviation of each along one direction; zero where it is known.
-        px: (M, 2).
-        std_px: (M,) of the place in the image, per axis.
+    `spread` (M, 3) is the standard deviation of each point along one direction; zero where it is known.
     """
 
     points: np.ndarray

@@ -23,10 +23,7 @@ class RigidPointModel(ObservationModel):
     """A sensor mounted on a robot that measures points; a subclass says what is measured in the sensor's frame.
 
     A landmark's mean is taken as a world point and its constants are not read: anchored ones need a model of their own.
-
-    Args:
-        space: SE2 or SE3, of world_from_robot.
-        robot_from_sensor: (E,) mounting pose, fixed from then on; by default the robot's origin.
+    The mounting pose robot_from_sensor (E,) in SE2 or SE3 is fixed from then on; by default the robot's origin.
     """
 
     def __init__(self, space: SE2Group | SE3Group, robot_from_sensor: Array | None = None) -> None:
@@ -87,14 +84,8 @@ def wrap_angle(angle: Array) -> Array:
 class RangeBearing(RigidPointModel):
     """z = (range, yaw) in the plane, (range, yaw, pitch) in space; metres and radians.
 
-    The point is r (cos yaw cos pitch, sin yaw cos pitch, ± sin pitch), x forward, y left, z up.
-
-    Args:
-        space: SE2 or SE3.
-        robot_from_sensor: (E,) mounting pose.
-        pitch_sign: +1 where positive pitch points up, −1 where it points down.
-        max_range: metres, for `visible`.
-        half_field_of_view: of yaw, radians, for `visible`.
+    The point is r (cos yaw cos pitch, sin yaw cos pitch, ± sin pitch), x forward, y left, z up, with the sign `pitch_sign`.
+    It is visible up to `max_range` and at yaws up to `half_field_of_view`.
     """
 
     def __init__(
@@ -161,13 +152,7 @@ class RangeBearing(RigidPointModel):
 
 @final
 class RelativePosition(RigidPointModel):
-    """z = the point in the sensor's frame, metres.
-
-    Args:
-        space: SE2 or SE3.
-        robot_from_sensor: (E,) mounting pose.
-        max_range: metres, for `visible`.
-    """
+    """z = the point in the sensor's frame, metres; visible up to `max_range`."""
 
     def __init__(
         self, space: SE2Group | SE3Group, robot_from_sensor: Array | None = None, max_range: float = np.inf

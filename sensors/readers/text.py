@@ -90,15 +90,7 @@ def read_lines(path: Path, hint: str = "") -> list[str]:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of numbers and where they stand in their file.
-
-    Attributes:
-        path: the file.
-        columns: name of each column.
-        rows: the text of each row.
-        lines: line number of each row, from 1.
-        values: (n, len(columns)) numbers.
-    """
+    """Rows of numbers (n, c) in named columns, with the text of each and its line in their file, from 1."""
 
     path: Path
     columns: tuple[str, ...]
@@ -224,13 +216,9 @@ def parse_number(path: Path, line: int, column: str, field: str) -> float:
 
 @dataclass(frozen=True)
 class StampedLines:
-    """Lines that begin with a time, in order of time; equal times are allowed.
+    """Lines of a file that begin with a time, in order of time; equal times are allowed.
 
-    Attributes:
-        path: the file.
-        lines: line number of each, from 1.
-        stamps_ns: (T,) int64 times.
-        rests: the text after each time.
+    Each has its number from 1, its time in `stamps_ns` (T,), and the text after it.
     """
 
     path: Path

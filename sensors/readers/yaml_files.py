@@ -18,13 +18,7 @@ MOST_BYTES = 1 << 20
 
 @dataclass(frozen=True)
 class YamlValue:
-    """A value in a YAML file; whoever asks for what it is not gets an InputError that names its line.
-
-    Attributes:
-        path: the file.
-        name: its key, for messages.
-        node: its text and line.
-    """
+    """A value in a YAML file, and its key; whoever asks for what it is not gets an InputError that names its line."""
 
     path: Path
     name: str
@@ -35,12 +29,7 @@ class YamlValue:
         return line_error(self.path, self.node.start_mark.line + 1, problem)
 
     def entries(self, required: Collection[str], optional: Collection[str] | None = None) -> dict[str, "YamlValue"]:
-        """Values of a mapping by their keys, each of which comes once.
-
-        Args:
-            required: keys that must be there.
-            optional: others that may be; None for any.
-        """
+        """Values of a mapping by their keys, each once: those that must be there and others that may be, None for any."""
         expected = f"expected the keys {', '.join(required)}"
         if not isinstance(self.node, yaml.MappingNode):
             raise self.error(f"{expected}, found no mapping such as `{next(iter(required))}: ...`")

@@ -37,7 +37,6 @@ from rbpf.validation.gtsam.batch_problem import (
     problem_of,
     read_problem,
     solve_problem,
-    stamps_of,
 )
 from rbpf.validation.gtsam.observations import HUBER
 from rbpf.validation.metrics.accuracy import AbsoluteError, ate
@@ -180,7 +179,7 @@ def compare(
     Raises:
         InputError: path and measurements are not of one run, or the batch cannot be solved.
     """
-    name, stamps = name_of(problem), stamps_of(problem)
+    name, stamps = name_of(problem), problem.stamps_ns
     if len(stamps) != len(filtered.stamps_ns) or (stamps != filtered.stamps_ns).any():
         raise InputError(f"{name}: path and measurements do not share their time stamps; take both from one run.")
     if len(stamps) < LEAST_STEPS:

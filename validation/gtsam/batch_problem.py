@@ -103,13 +103,6 @@ def name_of(problem: Problem) -> str:
     return problem.name if isinstance(problem, FeatureLog) else problem.recording
 
 
-def stamps_of(problem: Problem) -> NDArray[np.int64]:
-    """(T,) times of the steps."""
-    if isinstance(problem, FeatureLog):
-        return np.array([frame.stamp_ns for frame in problem.frames], dtype=np.int64)
-    return problem.stamps_ns
-
-
 def floats_in_scale(problem: Problem) -> bool:
     """Whether nothing in the measurements tells the scale: one camera and no known points."""
     return isinstance(problem, FeatureLog) and problem.known is None and not isinstance(problem.camera, RectifiedStereo)
@@ -214,7 +207,7 @@ def _solve_camera(
     points = _summary(names, found.landmarks, found.cov_landmarks, 3)
     part = replace(part, known=log.known)
     return Optimum(
-        part, PathAndMap(stamps_of(part), found.world_from_camera, found.cov_poses, points), frames, found.error
+        part, PathAndMap(part.stamps_ns, found.world_from_camera, found.cov_poses, points), frames, found.error
     )
 
 

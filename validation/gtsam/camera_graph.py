@@ -62,12 +62,7 @@ _FEW = 8
 @final
 @dataclass(frozen=True, eq=False)
 class CameraState:
-    """A point in the space of all variables.
-
-    Attributes:
-        path: (T, 7) world_from_camera.
-        points: (L, 3) landmarks of the table.
-    """
+    """A point in the space of all variables: world_from_camera (T, 7), and the landmarks of the table (L, 3)."""
 
     path: Array
     points: Array
@@ -75,15 +70,7 @@ class CameraState:
 
 @final
 class CameraProblem:
-    """Variables and factors of a recording.
-
-    Args:
-        name: of the recording.
-        frames: T, how many there are.
-        table: the observations that take part.
-        known: position and covariance of known points by name.
-        robust: Huber's threshold; None is Gaussian.
-    """
+    """Variables and factors of a recording of `frames` images; known points have a position and a covariance."""
 
     def __init__(
         self,
@@ -265,12 +252,12 @@ class Together:
 
 
 class Adjusted(NamedTuple):
-    """An optimum.
+    """An optimum, with the factors there.
 
     Attributes:
         problem: of which it is one, without the landmarks that had to be left out.
         values: GTSAM's.
-        graph: the factors there.
+        graph: likewise.
         loose: (L,) landmarks with a weak prior.
         iterations: in all.
         converged: whether it is one.

@@ -39,12 +39,7 @@ _NONE = 1e-200  # information of a landmark behind its cameras
 @final
 @dataclass(frozen=True, eq=False)
 class CameraEstimate:
-    """Where to start from.
-
-    Attributes:
-        world_from_camera: (T, 7) poses.
-        landmarks: name to (3,) position [m]; those that it lacks are triangulated from the poses.
-    """
+    """Where to start from: poses (T, 7), positions (3,) [m] by name; those that lack are triangulated from the poses."""
 
     world_from_camera: Array
     landmarks: dict[int, Array]

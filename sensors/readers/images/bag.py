@@ -100,13 +100,7 @@ class RawMessage(NamedTuple):
 
 @final
 class Bag:
-    """An open bag.
-
-    Args:
-        path: file or folder, for messages.
-        reader: the library's.
-        types: the library's, of the bag's version of ROS.
-    """
+    """An open bag, by the library's reader and the types of the bag's version of ROS."""
 
     def __init__(self, path: Path, reader: Any, types: Any) -> None:
         self.path = path
@@ -411,13 +405,9 @@ class RosBag(ImageFormat):
 
 @dataclass(frozen=True)
 class ImageStream:
-    """A topic of images.
+    """A topic of images: times (T,) of its messages' headers, not decreasing, height and width of the first that can be read.
 
-    Attributes:
-        topic: its name.
-        stamps_ns: (T,) int64 times of the headers of its messages, not decreasing.
-        shape: height and width of the first image that can be read.
-        frame: name of the camera's frame.
+    `frame` is the name of the camera's frame.
     """
 
     topic: str
@@ -459,14 +449,9 @@ class ImageStream:
 @final
 @dataclass(frozen=True)
 class BagImages(Source):
-    """Images of one topic, or pairs of two.
+    """Images of one topic, or pairs of two with the left camera's first, of a height and width, at times (T,).
 
-    Attributes:
-        path: the bag.
-        stamps_ns: (T,) int64 times.
-        shape: height and width that every image must have.
-        topics: of the (left) camera, and of the right one if there are two.
-        rows: for each topic, (T,) the number of the message that is the image, increasing.
+    For each topic `rows` (T,) are the numbers of the messages that are the images, increasing.
     """
 
     path: Path

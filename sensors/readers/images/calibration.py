@@ -34,13 +34,9 @@ _OPTIONAL = ("model", "distortion", "rate_hz", "baseline_m")
 
 @dataclass(frozen=True)
 class Calibration:
-    """A camera and where it stands.
+    """A camera and the file that says so, for messages.
 
-    Attributes:
-        where: the file, for messages.
-        camera: the camera.
-        rate_hz: images per second, None where the file does not say.
-        baseline_m: of a rectified pair, None where the file does not say.
+    `rate_hz`, images per second, and `baseline_m`, of a rectified pair, are None where the file does not say.
     """
 
     where: str

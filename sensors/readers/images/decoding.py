@@ -132,13 +132,9 @@ AHEAD = 4
 
 @dataclass(frozen=True)
 class FileImages(Source):
-    """One file per image.
+    """One file per image of a height and width, at times (T,).
 
-    Attributes:
-        stamps_ns: (T,) int64 times.
-        shape: height and width that every image must have.
-        left: T files.
-        right: T files of the second camera, None where an image has no partner; None without a second camera.
+    Of a second camera None stands where an image has no partner; without one `right` is None.
     """
 
     stamps_ns: np.ndarray

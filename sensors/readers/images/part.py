@@ -85,14 +85,7 @@ WHOLE = Part()
 @final
 @dataclass(frozen=True)
 class Chosen(Source):
-    """Some images of another source.
-
-    Attributes:
-        source: of all of them.
-        rows: (T,) which.
-        stamps_ns: (T,) their times.
-        shape: height and width that they are made smaller to; None leaves them as they are.
-    """
+    """Some images of another source: rows (T,) and their times; `shape` is what they are made smaller to, None as they are."""
 
     source: Source
     rows: np.ndarray

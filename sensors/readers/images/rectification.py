@@ -94,12 +94,7 @@ class Rectification:
 @final
 @dataclass(frozen=True)
 class RectifiedImages(Source):
-    """Images of another source, rectified.
-
-    Attributes:
-        source: of the images as they were taken.
-        rectification: how they are changed.
-    """
+    """Images of another source, rectified."""
 
     source: Source
     rectification: Rectification

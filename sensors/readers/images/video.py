@@ -66,13 +66,7 @@ class Video(ImageFormat):
 
 @dataclass(frozen=True)
 class VideoImages(Source):
-    """The images of a video.
-
-    Attributes:
-        path: the file.
-        stamps_ns: (T,) int64 times.
-        shape: height and width of its first image.
-    """
+    """The images of a video at times (T,), of the height and width of its first image."""
 
     path: Path
     stamps_ns: np.ndarray
