@@ -251,7 +251,7 @@ class PointsView(ObservationModel):
 
 @final
 class MembersView(PointsView):
-    """The pixels of those of an `UncertainConstellation`'s points (p_1, p_2, …) at `places` (m,), one after the other: z (2m,)."""
+    """The pixels of the points (p_1, p_2, …) of an `UncertainConstellation` at `places` (m,), one after the other: z (2m,)."""
 
     def __init__(self, camera: Pinhole, places: np.ndarray) -> None:
         super().__init__(camera, places.size)
