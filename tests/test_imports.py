@@ -54,6 +54,7 @@ def test_importing_the_package_imports_hardly_anything_else():
     assert imported_by("import rbpf") == {"rbpf", "lazy_loader"}
 
 
+@pytest.mark.slow
 def test_the_public_names_need_neither_pictures_nor_what_only_tests_use():
     unwanted = {"matplotlib", "PIL", "rich", "tyro", "joblib", "jaxtyping", "pytest", "rerun", *HEAVY}
     assert not imported_by("from rbpf import *") & unwanted

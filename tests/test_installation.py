@@ -77,12 +77,12 @@ def hand_over_compiled_kernels(site: Path) -> None:
     for inside, folder in FOLDERS.items():
         for source in (ROOT / folder).rglob("*.py"):
             copy = site / inside / source.relative_to(ROOT / folder)
-            compiled = [*(source.parent / "__pycache__").glob(f"{source.stem}.*.nb?")]
-            if compiled and copy.is_file():
-                shutil.copystat(source, copy)
-                (copy.parent / "__pycache__").mkdir(exist_ok=True)
-                for path in compiled:
-                    shutil.copy2(path, copy.parent / "__pycache__")
+            if copy.is_file():
+                shutil.copystat(source, copy)  # of all of them: copies older than any kernel's source are discarded
+        for path in (ROOT / folder).rglob("*.nb?"):
+            place = site / inside / path.relative_to(ROOT / folder)
+            place.parent.mkdir(exist_ok=True)
+            shutil.copy2(path, place)
 
 
 @pytest.fixture(scope="module")

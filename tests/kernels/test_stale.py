@@ -35,13 +35,6 @@ def test_a_cache_folder_of_its_own_is_looked_at(tmp_path, monkeypatch):
     assert not old.exists()
 
 
-def test_a_copy_that_another_process_has_just_deleted(tmp_path, monkeypatch):
-    monkeypatch.setattr("rbpf.kernels.signature.numba.config.CACHE_DIR", "")
-    (tmp_path / "__pycache__").mkdir()
-    (tmp_path / "__pycache__" / "a.f-1.py311.nbi").symlink_to(tmp_path / "gone")
-    discard_stale(tmp_path)
-
-
 def test_where_no_folder_can_be_written_to_kernels_run_all_the_same(monkeypatch):
     monkeypatch.setenv("NUMBA_CACHE_DIR", "")
     monkeypatch.setattr(numba.config, "CACHE_DIR", "")

@@ -209,10 +209,6 @@ def test_noise_that_has_no_effect_is_refused(tmp_path, files, kind, names):
             open_log(tmp_path, LogNoise(**{name: 1.0}))
 
 
-def test_noise_of_the_odometry_may_vanish():
-    assert LogNoise(std_speed_mps=0.0, scale_odometry=0.0).odometry_variance_factor() == 0
-
-
 RECORDINGS = {
     "mrclam6_robot1": (1012, 1534, 15, 2.06),
     "mrpt_kf_slam_2d": (250, 3607, 70, 0.681),
@@ -229,18 +225,6 @@ def truth_at_frames(log):
     seconds, known = (stamps - truth.stamps_ns[0]) / 1e9, (truth.stamps_ns - truth.stamps_ns[0]) / 1e9
     columns = [np.unwrap(truth.world_from_robot[:, 0]), *truth.world_from_robot.T[1:]]
     return np.stack([np.interp(seconds, known, column) for column in columns], axis=1)
-
-
-def sightings(log):
-    """What is measured less what the truth says (S, p), and the standard deviations."""
-    parts = []
-    for world_from_robot, frame in zip(truth_at_frames(log), log.frames, strict=True):
-        points = np.array([log.truth.landmarks[name] for name in frame.landmarks.tolist()])
-        x, y, *up = log.space.inverse_transform(world_from_robot, points).T
-        predicted = [np.sqrt(x**2 + y**2 + sum(h**2 for h in up)), np.arctan2(y, x)]
-        predicted += [log.pitch_sign * np.arctan2(h, np.hypot(x, y)) for h in up]
-        parts.append((frame.z - np.stack(predicted, axis=1), np.sqrt(np.einsum("kii->ki", frame.cov_z))))
-    return tuple(np.concatenate(part) for part in zip(*parts, strict=True))
 
 
 @pytest.mark.real_data
@@ -275,21 +259,3 @@ def test_counts_and_dead_reckoning_of_recordings(data_dir, folder):
         nees = np.einsum("ta,ta->t", errors, np.linalg.solve(covs, errors[..., None])[..., 0])
         assert nees.mean() == pytest.approx(log.space.dim, abs=3 * np.sqrt(2 * log.space.dim / len(nees)))
     assert np.sqrt(np.mean(offset**2)) == pytest.approx(rmse, abs=5e-3 if rmse == 2.06 else 5e-4)
-
-
-@pytest.mark.real_data
-@pytest.mark.parametrize("folder", ["mrpt_kf_slam_2d", "mrpt_kf_slam_6d"])
-def test_sightings_agree_with_the_truth_within_their_noise(data_dir, folder):
-    residual, std = sightings(open_log(data_dir / folder))
-    np.testing.assert_allclose((residual / std).std(0), 1.0, atol=0.05)
-    np.testing.assert_allclose((residual / std).mean(0), 0.0, atol=0.06)
-
-
-@pytest.mark.real_data
-def test_sightings_of_mrclam_agree_with_the_truth_and_are_read_without_a_loop(data_dir, monkeypatch):
-    monkeypatch.setattr("rbpf.sensors.readers.text._parse_row", None)
-    residual, _ = sightings(open_log(data_dir / "mrclam6_robot1"))
-    centre = np.median(residual, axis=0)
-    robust = 1.4826 * np.median(np.abs(residual - centre), axis=0)
-    np.testing.assert_allclose(centre, [0.038, 0.0], atol=2e-3)
-    np.testing.assert_allclose(robust, [0.079, 0.011], atol=1e-3)

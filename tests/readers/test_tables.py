@@ -44,15 +44,12 @@ ROWS = [
     ("2", "expected 2 columns (time, x), found 1"),
     ("2 3 4", "expected 2 columns (time, x), found 3"),
     ("2 nan", "expected x to be a finite number, found 'nan'"),
-    ("2 inf", "expected x to be a finite number, found 'inf'"),
     ("2 0x1p3", "finite number, found '0x1p3'"),
     ("2 1_000", "finite number, found '1_000'"),
     ("2 1,5", "finite number, found '1,5'"),
     ("2 ٣", "finite number"),
-    ("2 --3", "finite number, found '--3'"),
     ("2 5 # five", "found 4"),
     ("2 1e999", "expected x to be at most 1e+12 in size"),
-    ("2 " + "9" * 400, "expected x to be at most 1e+12 in size"),
     ("2 \x00", "finite number"),
 ]
 
@@ -67,6 +64,7 @@ def test_a_malformed_row_is_named(tmp_path, second_line, expected):
 TEXTS = [
     (b"", "table.dat: the file is empty"),
     (b" \n\n", "table.dat: the file is empty"),
+    (b"\xef\xbb\xbf\n", "table.dat: the file is empty"),
     (b"# only\n", "expected rows of time, x, found none"),
     (b"1 2\n\xff\xfe\n", "table.dat, line 2: expected text in UTF-8"),
     (b"1.5 0\n1.499 0\n", "line 2: time runs backwards from 1.5 to 1.499"),
@@ -79,13 +77,6 @@ TEXTS = [
 def test_a_file_that_is_no_table_is_named(tmp_path, text, message):
     with pytest.raises(InputError, match=re.escape(message)):
         table(tmp_path, text).stamps_ns()
-
-
-def test_a_missing_file_and_a_folder_in_its_place(tmp_path):
-    with pytest.raises(InputError, match=r"none\.dat: no such file; expected the log of a robot\."):
-        read_columns(tmp_path / "none.dat", COLUMNS, "the log of a robot")
-    with pytest.raises(InputError, match="cannot be read"):
-        read_columns(tmp_path, COLUMNS)
 
 
 def test_whole_and_distinct_numbers(tmp_path):

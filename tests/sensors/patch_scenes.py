@@ -2,8 +2,6 @@
 
 import numpy as np
 
-SAME = ((1.0, 0.0), (0.0, 1.0))
-
 
 class Waves:
     """A sum of plane waves; a pixel gathers its own square of it, seen through a Gaussian blur.

@@ -9,12 +9,10 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3, Euclidean, Product
 from rbpf.maps.inverse_depth import InverseDepth
 from rbpf.maps.point import Point
-from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.camera.points import MIN_DEPTH_FRACTION, CameraPoint, CameraRay, EpipolarRay
 from tests.exactness.models import known
 from tests.sensors.camera_scenes import CAMERAS, PLAIN, Rays, with_velocity
 
-STEREO = RectifiedStereo(PLAIN, 0.12)
 WITH_VELOCITY = Product(SE3, Euclidean(6))
 every_camera = pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
 

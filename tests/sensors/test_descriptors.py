@@ -131,11 +131,6 @@ def test_pairs_within_a_gate(seed, dim):
 LIMITS = MatchLimits(0.3, 0.8)
 
 
-def seen_again(rng, descriptors, noise=0.02):
-    changed = descriptors + noise * rng.standard_normal(descriptors.shape).astype(np.float32)
-    return changed / np.linalg.norm(changed, axis=1, keepdims=True)
-
-
 def filled(descriptors):
     store = DescriptorStore(descriptors.shape[1])
     store.add(np.arange(len(descriptors)), descriptors)
@@ -177,19 +172,6 @@ def test_what_a_store_refuses():
     assert store.ids.tolist() == [2, 5, 6]
 
 
-def test_features_find_their_landmarks_or_none():
-    rng = np.random.default_rng(1)
-    descriptors = unit(rng, 400, 36)
-    store = filled(descriptors)
-    wanted = rng.permutation(400)[:50]
-    query = np.concatenate([seen_again(rng, descriptors[wanted]), unit(rng, 30, 36)])
-    found = store.match(query, LIMITS)
-    np.testing.assert_array_equal(found[:50], wanted)
-    assert (found[50:] == NULL).all()
-    exact = np.linalg.norm(query[:50].astype(float) - descriptors[wanted], axis=1)
-    np.testing.assert_allclose(store.nearest(query[:50]), exact, atol=1e-3)
-
-
 def test_an_empty_map():
     store = DescriptorStore(36)
     descriptors = unit(np.random.default_rng(5), 4, 36)
@@ -211,13 +193,3 @@ def test_the_gate_decides_between_landmarks_that_look_alike():
     for place, landmarks in ((z, [2]), (z + 50.0, [])):
         pairs = gate_pairs(place, noise, mean, cov, 11.3)
         assert match_pairs(descriptor, three, pairs, LIMITS).second.tolist() == landmarks
-
-
-def test_a_checkpoint_holds_all():
-    descriptors = unit(np.random.default_rng(8), 70, 36)
-    store, again = filled(descriptors), DescriptorStore(36)
-    store.remove(np.array([3, 60]))
-    again.restore(store.arrays())
-    again.add(np.array([70]), descriptors[:1])
-    assert again.ids.tolist() == [*store.ids.tolist(), 70]
-    np.testing.assert_array_equal(again.descriptors[:68], store.descriptors)

@@ -104,16 +104,6 @@ def test_limit_of_the_marginal_with_unknown_depth(camera):
     np.testing.assert_allclose(again.info, limit.info, rtol=1e-7, atol=1e-9 * scale_info)
 
 
-def test_quadratic_form_of_the_limit():
-    """νᵀS⁻¹ν: along the line nothing is added, so that weights compare particles rightly."""
-    rays = Rays.random(seed=6)
-    z = measured(rays, PLAIN)
-    one = terms(EpipolarRay(PLAIN), rays, z, 0.25)
-    limit, finite = (terms(CameraRay(PLAIN), rays, z, var_q) for var_q in (1e5, 0.1))
-    np.testing.assert_allclose(one.quad, limit.quad, rtol=1e-4)
-    assert np.abs(finite.quad - limit.quad).max() > 1.0
-
-
 def test_without_baseline_it_is_the_full_residual():
     rays = Rays.random(seed=7, moved=0.0)
     turned = replace(rays, const=np.repeat(rays.state[:, None], 5, axis=1))

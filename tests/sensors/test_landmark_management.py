@@ -97,21 +97,6 @@ def test_new_keys_spread_over_the_image():
     assert 60 not in crowded.tolist()
 
 
-def test_a_checkpoint_holds_all():
-    manager, again = LandmarkManager(NewLandmarkConfig(), SIZE), LandmarkManager(NewLandmarkConfig(), SIZE)
-    manager.observe(np.zeros(0, dtype=np.int64))
-    manager.add(5)
-    manager.observe(np.array([1, 3]))
-    manager.remove(np.array([0]))
-    again.restore(manager.arrays())
-    for each in (manager, again):
-        each.observe(np.array([4]))
-    assert again.names.tolist() == manager.names.tolist() == [1, 2, 3, 4]
-    np.testing.assert_array_equal(again.observations, manager.observations)
-    np.testing.assert_array_equal(again.last_observed, manager.last_observed)
-    assert again.add(1).tolist() == manager.add(1).tolist() == [5]
-
-
 def test_what_is_refused():
     manager = LandmarkManager(NewLandmarkConfig(), SIZE)
     with pytest.raises(InputError, match="no landmark named 0"):

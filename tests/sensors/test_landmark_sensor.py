@@ -66,15 +66,3 @@ def test_a_landmark_that_was_removed_starts_anew(sensor):
     report = filter_.step(frame(5, 4))
     assert ids_of(report).tolist() == [5]
     assert report.new_landmarks.tolist() == [4]
-
-
-def test_numbers_after_loading_an_earlier_state(sensor, tmp_path):
-    filter_ = filter_of(sensor)
-    filter_.step(frame(9))
-    filter_.save(tmp_path / "run.npz")
-    filter_.step(frame(2))
-    filter_.load(tmp_path / "run.npz")
-    filter_.step(frame(6))
-    report = filter_.step(frame(6, 2, 9))
-    assert ids_of(report).tolist() == [6, 9]
-    assert report.new_landmarks.tolist() == [2]

@@ -71,19 +71,6 @@ def test_scores_of_extreme_grey_levels_equal_numpys(low_high):
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
-def test_place_is_the_maximum_between_pixels(image):
-    """No place a little aside correlates better with the window that NumPy interpolates."""
-    template = interpolated(Waves(1).image(SHAPE, shift=(0.37, -0.21)), (60, 45), 11)
-    px, score, _, _ = one(image, template, (61.0, 44.0))
-
-    def rho(place):
-        return (unit(interpolated(image, place, 11)) * unit(template)).sum()
-
-    assert score == pytest.approx(rho(px), abs=1e-4)
-    for aside in ((0.05, 0.0), (-0.05, 0.0), (0.0, 0.05), (0.0, -0.05)):
-        assert rho(px + aside) < rho(px)
-
-
 def test_covariance_is_the_residual_over_the_slopes(image):
     noisy = Waves(1).image(SHAPE, noise=5.0, rng=np.random.default_rng(2))
     template = window(noisy, (60, 45), 11)
@@ -168,18 +155,6 @@ def test_a_place_on_a_slope_has_no_covariance():
     px, score, _, cov = one(image, window(image, (50, 40), 11), (47.0, 40.0), np.zeros((2, 2)))
     assert 0.0 < score < 0.95 and np.isnan(cov).all()
     assert np.array_equal(px, np.rint(px)) and abs(px[0] - 47.0) <= 1.0
-
-
-def test_many_at_once_equal_one_by_one(image):
-    rng = np.random.default_rng(5)
-    places = rng.integers(12, 78, (40, 2))
-    templates = np.stack([window(image, place, 11) for place in places]).astype(np.float32)
-    centres, covs = places + rng.normal(size=(40, 2)), np.tile(ROUND, (40, 1, 1))
-    together = search(image, templates, centres, covs)
-    for k in range(40):
-        single = one(image, templates[k], centres[k])
-        expected = (together.px[k], together.score[k], together.second[k], together.cov[k])
-        assert all(np.array_equal(a, b, equal_nan=True) for a, b in zip(single, expected, strict=True))
 
 
 def test_a_view_of_an_image_and_none_to_look_for(image):
@@ -380,23 +355,3 @@ def test_covariances_are_those_of_the_errors(noise):
     good = np.abs(error).max(axis=1) <= WRONG_PX
     squared = np.einsum("ki,kij,kj->k", error[good], np.linalg.inv(cov[good]), error[good])
     assert good.sum() > 150 and 1.2 < squared.mean() < 3.0
-
-
-@pytest.mark.real_data
-def test_found_forth_and_back_in_real_images(data_dir):
-    """Corners of one image are found in one a few frames later, and from there back where they were."""
-    import cv2
-
-    paths = sorted((data_dir / "mono_redkitchen_a" / "rgb").glob("*.jpg"))
-    first, then = (cv2.imread(str(paths[i]), cv2.IMREAD_GRAYSCALE) for i in (0, 3))
-    px = CornerDetector().detect(first, 60, None, 25.0, 30.0).px
-    assert len(px) == 60
-    wide = np.repeat(100.0 * np.eye(2)[None], 60, axis=0)
-    forth = search(then, np.stack([window(first, place, 11) for place in px]), px, wide)
-    good = np.flatnonzero((forth.score > 0.9) & (forth.ratio < 0.9))
-    assert good.size >= 40
-    cuts = [cut(then, place, 5) for place in forth.px[good]]
-    inside = np.array([k for k, piece in enumerate(cuts) if piece is not None])
-    back = search(first, np.stack([cuts[k] for k in inside]), px[good[inside]], wide[: inside.size])
-    apart = np.linalg.norm(back.px - px[good[inside]], axis=1)
-    assert np.median(apart) < 0.05 and np.mean(apart < 0.5) > 0.9

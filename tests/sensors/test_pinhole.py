@@ -103,15 +103,6 @@ class TestPinhole:
             np.testing.assert_array_equal(camera.visible(scale * points), camera.visible(points))
 
     @every_camera
-    def test_round_trip_of_points(self, camera):
-        points = seen_points(camera)
-        uv = points[:, :2] / points[:, 2:]
-        # Close to a fold pixels hardly tell directions apart; the pixels of the next test do come back.
-        uv = uv[np.hypot(*uv.T) < 0.95 * camera.monotonic_radius]
-        rays = np.concatenate([uv, np.ones((len(uv), 1))], axis=1)
-        np.testing.assert_allclose(camera.unproject(camera.project(rays)), uv, rtol=0, atol=1e-12)
-
-    @every_camera
     def test_round_trip_of_pixels(self, camera):
         axes = np.linspace(-0.5, camera.width - 0.5, 53), np.linspace(-0.5, camera.height - 0.5, 41)
         px = np.stack(np.meshgrid(*axes), axis=-1)
@@ -160,13 +151,6 @@ class TestVisible:
         assert not camera.inside(np.array([[9.4, 100.0], [100.0, 469.6]]), margin_px=10.0).any()
         assert camera.inside(np.array([-5.0, 10.0]), margin_px=-5.0)
         assert not camera.inside(np.array([np.nan, 10.0]))
-
-    @every_camera
-    def test_margin(self, camera):
-        points = seen_points(camera)
-        near = ~camera.inside(camera.project(points), 25.0)
-        np.testing.assert_array_equal(camera.visible(points, margin_px=25.0), ~near)
-        assert near.any()
 
 
 GOOD = {"width": 640, "height": 480, "fx": 500.0, "fy": 500.0, "cx": 320.0, "cy": 240.0}

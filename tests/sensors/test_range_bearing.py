@@ -57,32 +57,11 @@ def test_invert_undoes_predict_and_jacobians_are_the_numeric_ones(model, scene):
         np.testing.assert_allclose(np.asarray(found), np.asarray(expected), rtol=1e-6, atol=1e-8 * near)
 
 
-@every_model
-def test_broadcasting(model):
-    rng = np.random.default_rng(0)
-    states = model.space.exp(rng.normal(size=(5, 1, model.space.dim)))
-    landmarks = 4.0 * rng.normal(size=(5, 7, model.dim))
-    whole = model.predict(states, landmarks)
-    jacobians = model.jacobians(states, landmarks)
-    assert whole.shape == (5, 7, model.dim)
-    for i, k in np.ndindex(5, 7):
-        np.testing.assert_allclose(model.predict(states[i, 0], landmarks[i, k]), whole[i, k], atol=1e-13)
-        one = model.jacobians(states[i, 0], landmarks[i, k])
-        np.testing.assert_allclose(jacobians.state[i, k], one.state, atol=1e-12)
-        np.testing.assert_allclose(jacobians.landmark[i, k], one.landmark, atol=1e-12)
-
-
 def test_planar_measurement_by_hand():
     # Robot at (1, 2) looking along +y; the point is 3 m ahead and 4 m to the left.
     pose = np.array([np.pi / 2, 1.0, 2.0])
     z = RangeBearing(SE2).predict(pose, np.array([-3.0, 5.0]))
     np.testing.assert_allclose(z, [5.0, np.arctan2(4.0, 3.0)])
-
-
-@pytest.mark.parametrize(("sign", "pitch"), [(1.0, np.pi / 4), (-1.0, -np.pi / 4)])
-def test_spatial_measurement_by_hand(sign, pitch):
-    z = RangeBearing(SE3, pitch_sign=sign).predict(SE3.identity(), np.array([1.0, 1.0, np.sqrt(2.0)]))
-    np.testing.assert_allclose(z, [2.0, np.pi / 4, pitch])
 
 
 def test_covariance_of_a_first_estimate():

@@ -10,7 +10,6 @@ from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.descriptors import MatchLimits
 from rbpf.sensors.features import Sift, SiftConfig
 from rbpf.sensors.stereo import (
-    TOLERATED_FRACTION,
     PairConfig,
     StereoMatcher,
     calibration_doubt,
@@ -227,13 +226,6 @@ def test_other_images_stay_as_they_are(whole):
     for image in (whole[0].image, noisy, np.zeros((240, 320), np.uint8), lines):
         filtered = remove_impulses(image)
         assert filtered[0] is image and filtered[1] == 0.0
-
-
-def test_a_few_specks_stay(whole):
-    image = whole[0].image.copy()
-    rows = np.random.default_rng(0).choice(image.size, int(0.8 * TOLERATED_FRACTION * image.size), replace=False)
-    image.flat[rows] = 255
-    assert remove_impulses(image)[0] is image
 
 
 def test_corrupted_pixels_are_replaced(whole, noisy):

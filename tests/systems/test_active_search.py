@@ -130,15 +130,6 @@ def test_without_outliers_it_is_near_the_posterior_of_a_linear_model():
     assert not fit.increment[4:].any() and not fit.cov[4:].any()
 
 
-def test_outliers_stay_far_off_and_do_not_move_it():
-    nu, jac, cov, factor, motion = matches(1)
-    wrong = np.arange(20) < 6
-    nu[wrong] += 25.0
-    fit = fit_motion(nu, jac, cov, factor, ALL)
-    assert (fit.squared[wrong] > 50.0).all() and (fit.squared[~wrong] < 15.0).all()
-    assert (np.abs(fit.increment - motion) < 5.0 * np.sqrt(np.diag(fit.cov))).all()
-
-
 def test_a_majority_that_is_not_trusted_is_judged_by_the_trusted_ones():
     """Twelve that move together, as on a thing that passes, against eight that are known to be at rest."""
     nu, jac, cov, factor, motion = matches(3)

@@ -89,15 +89,6 @@ def test_law_of_the_start_equals_the_joint_gaussian():
         np.testing.assert_allclose(factor @ factor.T, np.linalg.inv(info), atol=1e-9)
 
 
-def test_it_lowers_the_error_of_the_pose():
-    raw, moved = [], []
-    for seed in range(5):
-        filter_, anchor, anchored, pose = drive(20, n=20, seed=seed)
-        raw.append(np.linalg.norm(filter_.estimate().mean[1:] - pose[1:]))
-        moved.append(np.linalg.norm(anchor.state_estimate(anchored).mean[1:] - pose[1:]))
-    assert np.mean(moved) < np.mean(raw)
-
-
 def test_landmarks_seen_only_at_the_start_say_nothing_about_it():
     filter_, anchor = started(5, 0)
     rng = np.random.default_rng(0)

@@ -13,12 +13,11 @@ from rbpf.motion.constant_velocity import PosePrior
 from rbpf.runs.recordings import filter_images
 from rbpf.runs.run import Run
 from rbpf.sensors.camera.resection import GATE, Resected, squared_distances
-from rbpf.systems.mono.config import MonoConfig, RelocalisationConfig
+from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.mono.relocalisation import (
     MIN_VIEW_CORNERS,
     Attempt,
     LastView,
-    Relocaliser,
     TrackingLoss,
     describe_corners,
     is_confirmed,
@@ -128,26 +127,6 @@ def test_a_frozen_camera_is_noticed(tracked, tmp_path):
     assert not run.log.lost()[-20:].any()
 
 
-class Place(NamedTuple):
-    """What is known when a camera is looked for in the tracked run's map, and an image from a known pose in its world."""
-
-    finder: Relocaliser
-    belief: object
-    near: np.ndarray
-    truth: np.ndarray
-    image: np.ndarray
-
-
-@pytest.fixture(scope="module")
-def place(tracked):
-    run = tracked.run
-    belief = run.system.filter.belief()
-    truth = SE3.retract(path(FRAMES)[60], np.array([0.05, -0.1, 0.2, 0.1, -0.1, 0.15]))
-    start = SE3.compose(belief.state[belief.mode][:7], SE3.inverse(run.log.poses[-1]))
-    finder = Relocaliser(run.system.sensor, RECOVERY)
-    return Place(finder, belief, run.system.loss.trusted[0], SE3.compose(start, truth), view(texture(), truth))
-
-
 def test_the_spread_of_worlds_is_carried_to_the_pose_found():
     """Worlds W_i = T₀ Exp(ξ_i) T₀⁻¹ about the last trusted pose T₀, by samples: the pose found is W_i T₁."""
     loss = TrackingLoss(SimpleNamespace(camera=None), MonoConfig())
@@ -165,31 +144,6 @@ def test_the_spread_of_worlds_is_carried_to_the_pose_found():
     expected = np.cov(SE3.log(SE3.between(found, poses)).T) + 1e-8 * np.eye(6)
     np.testing.assert_array_equal(prior.mean, found)
     np.testing.assert_allclose(prior.cov, expected, atol=0.03 * np.abs(expected).max())
-
-
-@slow
-def test_the_pose_found_is_right_and_its_covariance_fair(place):
-    before = place.belief.rng.bit_generator.state
-    attempt = place.finder.find(place.belief, place.image, place.near)
-    assert place.belief.rng.bit_generator.state != before  # it draws from the filter's generator
-    assert attempt.prior is not None
-    assert RECOVERY.min_inliers <= attempt.agreeing <= attempt.landmarks
-    error = SE3.log(SE3.between(place.truth, attempt.prior.mean))
-    assert np.abs(error).max() < 0.03
-    assert (np.abs(error) < 4.0 * np.sqrt(np.diag(attempt.prior.cov)) + 0.01).all()
-
-
-@slow
-def test_what_it_is_not_found_in(place, tracked):
-    """Two copies of the map side by side, noise, and grey."""
-    half = view(texture(), path(FRAMES)[-1])[:, :160]
-    noise = np.random.default_rng(0).integers(0, 255, (240, 320)).astype(np.uint8)
-    for image in (np.hstack([half, half]), noise, GREY):
-        attempt = place.finder.find(place.belief, image, place.near)
-        assert attempt.prior is None and not attempt.certain
-    assert (attempt.corners, attempt.matches) == (0, 0)
-    picky = Relocaliser(tracked.run.system.sensor, RelocalisationConfig(min_inliers=1000))
-    assert picky.find(place.belief, place.image, place.near).prior is None
 
 
 def test_inliers_on_a_line_do_not_convince():

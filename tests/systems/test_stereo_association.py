@@ -9,8 +9,8 @@ from rbpf.lie import SE3
 from rbpf.motion.odometry import Odometry
 from rbpf.sensors.stereo import StereoFeatures
 from rbpf.systems.filtering import ProposalConfig
-from rbpf.systems.stereo.config import MapConfig, StereoConfig, TriggerConfig
-from rbpf.systems.stereo.landmarks import ParticleSubsample, Places, View, log_support
+from rbpf.systems.stereo.config import StereoConfig, TriggerConfig
+from rbpf.systems.stereo.landmarks import ParticleSubsample, View, log_support
 from rbpf.systems.stereo.slam import StereoSlam
 from tests.systems.stereo_sequences import pairs
 
@@ -96,23 +96,3 @@ def test_how_well_landmarks_are_seen():
     nu, cov = np.array([[1.0, 0.0, 0.0], [90.0, 0.0, 0.0]]), np.tile(4.0 * np.eye(3), (2, 1, 1))
     log_normal = -0.5 * (0.25 + 3.0 * np.log(2.0 * np.pi * 4.0))
     assert log_support(nu, cov, z, rig) == pytest.approx(log_normal - np.log(density))
-
-
-def test_what_may_be_in_view():
-    """In the image or beside it, as far as the camera's direction is uncertain; not from behind, nor from far closer."""
-    places = Places(pairs(2).rig, MapConfig())
-    ahead, beside, behind = [0.0, 0.0, 2.0], [1.6, 0.0, 2.0], [0.0, 0.0, -2.0]
-    places.put(np.array([0, 1]), np.array([ahead, beside]), SE3.identity())
-    places.put(np.array([4]), np.array([behind]), SE3.identity())
-    np.testing.assert_array_equal(places.in_view(SE3.identity()), [0])
-    np.testing.assert_array_equal(places.in_view(SE3.identity(), 0.2), [0, 1])
-    turned = SE3.exp(np.array([0.0, np.pi, 0.0, 0.0, 0.0, 0.0]))
-    np.testing.assert_array_equal(places.in_view(turned), [4])
-    for x, z, found in ((0.0, 1.1, []), (0.0, 0.9, [0]), (2.5, 0.0, [])):
-        at = SE3.compose(SE3.exp(np.array([0, 0, 0, x, 0, z])), SE3.exp(np.array([0, -x / 2.5, 0, 0, 0, 0])))
-        np.testing.assert_array_equal(np.intersect1d(places.in_view(at), [0]), found)
-    places.remove(np.array([1]))
-    np.testing.assert_array_equal(places.in_view(SE3.identity(), 0.2), [0])
-    with_new = np.array([4, 7])
-    places.put(with_new, np.array([ahead, ahead]), SE3.identity())
-    np.testing.assert_array_equal(places.in_view(SE3.identity()), [0, 4, 7])

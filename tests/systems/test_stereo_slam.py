@@ -10,7 +10,6 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.runs.run import Run
 from rbpf.sensors.feature_log import FeatureFrame
-from rbpf.sensors.landmark_management import NewLandmarkConfig
 from rbpf.sensors.readers import ImageFrame
 from rbpf.systems.stereo.config import MapConfig, OdometryConfig, StereoConfig, TriggerConfig
 from rbpf.systems.stereo.front_end import ImageFrontEnd
@@ -245,11 +244,3 @@ class TestParts:
         slam = StereoSlam(sequence.rig, ALWAYS, gate=Closed())
         said = [slam.take(frame) for frame in sequence.frames()]
         assert sum(one.values["observed"] for one in said) == 0 and slam.map().ids.size > 10
-
-    def test_candidates_that_are_not_seen_again_leave(self):
-        """A patience of one frame: what was not seen in the last update is gone."""
-        run = filtered(pairs(COUNT), replace(CONFIG, new_landmarks=NewLandmarkConfig(patience=1)))
-        manager = run.system.front_end.landmarks.manager
-        candidates = ~manager.confirmed
-        assert (manager.last_observed[candidates] == manager.frame).all()
-        assert manager.next_name > manager.names.size

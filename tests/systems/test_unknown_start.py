@@ -11,8 +11,7 @@ from rbpf.runs.recordings import filter_images
 from rbpf.runs.run import Run
 from rbpf.runs.trajectory import Trajectory
 from rbpf.sensors.camera import Pinhole
-from rbpf.sensors.feature_log import FeatureLog
-from rbpf.systems.mono.config import MonoConfig, StartConfig, VelocityConfig
+from rbpf.systems.mono.config import StartConfig, VelocityConfig
 from rbpf.systems.mono.unknown_start import SCALE_STD, Expected, Linearised, Structure, UnknownStart, Window, optimum
 from rbpf.validation.metrics.accuracy import ate
 from tests.exactness.models import known
@@ -21,7 +20,6 @@ from tests.systems.plane_sequences import path, sequence
 
 LOG = without_known(desk(frames=30))
 NEVER = replace(SMALL, start=StartConfig(batch_adjust=False))
-SECOND = 1_000_000_000
 
 
 def off(done_path: np.ndarray, truth: np.ndarray, stamps_ns: np.ndarray) -> float:
@@ -108,13 +106,6 @@ def test_every_velocity_goes_on_from_the_path_that_was_drawn(velocity, resampled
     assert resampled and off(done.log.poses, known(LOG.truth).world_from_camera, done.log.stamps_ns) < 0.02
 
 
-def test_few_of_the_frames_do_as_well(resampled):
-    """Half of them at most take part; those between are on the way, and measure nothing."""
-    config = replace(SMALL, start=StartConfig(max_frames=8))
-    done = run(LOG, config)
-    assert resampled and off(done.log.poses, known(LOG.truth).world_from_camera, done.log.stamps_ns) < 0.02
-
-
 def test_the_map_is_conditioned_on_the_paths(plane):
     """A feature's place in each particle is where that particle's own path saw it."""
     belief = plane.system.filter.belief()
@@ -133,12 +124,7 @@ def test_the_map_is_conditioned_on_the_paths(plane):
 
 def test_nothing_is_resampled_when_frames_have_too_little_in_common():
     apart = changed(LOG, 3, lambda frame: rows(frame, np.arange(2)))
-    assert_the_same(apart, NEVER, SMALL)
-
-
-def assert_the_same(log: FeatureLog, *configs: MonoConfig) -> None:
-    paths = [run(log, config).log.poses for config in configs]
-    np.testing.assert_array_equal(paths[0], paths[1])
+    np.testing.assert_array_equal(run(apart, NEVER).log.poses, run(apart, SMALL).log.poses)
 
 
 def test_a_camera_that_was_lost_is_not_adjusted_any_more(adjusted):

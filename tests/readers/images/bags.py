@@ -69,14 +69,14 @@ class Recorder:
             distortion_model=given["model"], binning_x=given["binning"], binning_y=given["binning"], **matrices,
         )  # fmt: skip
 
-    def pose(self, topic, stamp, pose, kind="geometry_msgs/msg/PoseStamped", child="cam"):
+    def pose(self, topic, stamp, pose, kind="geometry_msgs/msg/PoseStamped", child="cam", received=None):
         """A pose (7,), by any of the messages that hold one."""
         qx, qy, qz, qw, x, y, z = map(float, pose)
         turn = self.make("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw)
         if kind == "geometry_msgs/msg/TransformStamped":
             place = self.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
             transform = self.make("geometry_msgs/msg/Transform", translation=place, rotation=turn)
-            return self.add(topic, stamp, kind, frame="world", child_frame_id=child, transform=transform)
+            return self.add(topic, stamp, kind, received, frame="world", child_frame_id=child, transform=transform)
         told = self.make(
             "geometry_msgs/msg/Pose", position=self.make("geometry_msgs/msg/Point", x=x, y=y, z=z), orientation=turn
         )
@@ -88,7 +88,7 @@ class Recorder:
             twist = self.make("geometry_msgs/msg/Twist", linear=still, angular=still)
             twist = self.make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=np.zeros(36))
             more = {"child_frame_id": child, "twist": twist}
-        return self.add(topic, stamp, kind, frame="world", pose=told, **more)
+        return self.add(topic, stamp, kind, received, frame="world", pose=told, **more)
 
 
 @contextmanager

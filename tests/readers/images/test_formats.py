@@ -2,7 +2,6 @@
 
 import logging
 import subprocess
-import sys
 from dataclasses import replace
 from unittest import mock
 
@@ -122,25 +121,18 @@ REFUSED = [
     ("plain", "camera.yaml", "# only\n", "found only comments"),
     ("plain", "camera.yaml", "[" * 1500, "more than 20 nested"),
     ("TUM", "rgb.txt", "# nothing\n", "rgb.txt: expected lines that begin with a time, found none"),
-    ("TUM", "rgb.txt", "", "rgb.txt: the file is empty"),
     ("TUM", "rgb.txt", "1.5\n", "rgb.txt, line 1: expected a time and the file of an image"),
-    ("TUM", "rgb.txt", "1.5 a.png\nsoon b.png\n", "rgb.txt, line 2: expected the time to be a finite number"),
     ("TUM", "rgb.txt", "1305031102175304123 a.png\n", "rgb.txt, line 1: expected the time in seconds, within 4e.09"),
     ("TUM", "rgb.txt", "1.5 a.png\n1.6 b.", "rgb.txt, line 2: the file ends inside this line"),
     ("TUM", "rgb.txt", "#\n1.5 a\n1.7 b\n1.6 c\n", "rgb.txt, line 4: time runs backwards from 1.7 to 1.6"),
     ("TUM", "groundtruth.txt", "1.5 1 2 3 0 0 1\n", "groundtruth.txt, line 1: expected 7 columns .* found 6"),
-    ("TUM", "groundtruth.txt", "1.5 1 2 3 0 0 nan 1\n", "groundtruth.txt, line 1: expected qz to be a finite number"),
     ("TUM", "groundtruth.txt", "#\n1.5 1 2 3 0 0 1 1\n", "line 2: expected a quaternion of length 1"),
     ("TUM", "groundtruth.txt", "99 1 2 3 0 0 0 1\n", "groundtruth.txt: the poses are at 99.000 .* which is another clock"),
-    ("TUM", "groundtruth.txt", "0 1 2 3 0 0 0 1\n", "groundtruth.txt: the poses are at 0.000 .* which is another clock"),
     ("EuRoC", DATA, "12,12.png\n11,11.png\n", "data.csv, line 2: time runs backwards from 12 to 11"),
     ("EuRoC", DATA, "timestamp,filename\n", "line 1: expected a time in whole nanoseconds, found 'timestamp'"),
-    ("EuRoC", DATA, "1.5,12.png\n", "data.csv, line 1: expected a time in whole nanoseconds, found '1.5'"),
-    ("EuRoC", DATA, "9999999999999999999,12.png\n", "data.csv, line 1: expected a time in whole nanoseconds"),
     ("EuRoC", DATA, "12\n", "data.csv, line 1: expected a time and the file of an image"),
     ("EuRoC", DATA, "12,12.png\n", "data.csv: none of 1 images can be read; the first is .*12.png: no such file"),
     ("EuRoC", TRUTH, "0,1,2,3,1,0,0,0\n", "the poses are at 0.000 .* which is another clock"),
-    ("EuRoC", TRUTH, f"{EUROC_NS[0]},1,2,3,1,0,0\n", "data.csv, line 1: expected 7 columns .* found 6"),
     ("EuRoC", "mav0/vicon0/data.csv", f"{EUROC_NS[0]},1,2,3,1,0,0,0\n", "vicon0/sensor.yaml: no such file; .* T_BS"),
     ("EuRoC", S + "sensor.yaml", sensor_yaml(CAM0).replace("T_BS", "T_SB"), "expected the keys T_BS, .*, found no T_BS"),
     ("KITTI", "calib.txt", P1, "calib.txt: expected a line `P0:` and 12 numbers, found none"),
@@ -149,24 +141,16 @@ REFUSED = [
     ("KITTI", "times.txt", "0\n0.1\n", "image_0: found image 2 but 2 times in times.txt"),
     ("KITTI", "times.txt", "0\n0.2\n0.1\n", "times.txt, line 3: time runs backwards from 0.2 to 0.1"),
     ("KITTI", "poses.txt", matrix_row(ROAD[0]), "poses.txt: expected 3 poses, one per time in times.txt, found 1"),
-    ("KITTI", "poses.txt", "1 2 3\n", "poses.txt, line 1: expected 12 columns"),
     ("KITTI", "poses.txt", matrix_row(ROAD[0]) + 2 * f"{' 7' * 12}\n", "poses.txt, line 2: expected a rotation"),
     ("7-Scenes", POSE, "1 2 3\n", f"{POSE}: expected 16 numbers, found 3"),
-    ("7-Scenes", POSE, "one " * 16, f"{POSE}: expected 16 numbers, found 'one one"),
     ("7-Scenes", POSE, "1 " * 16, f"{POSE}: expected a rotation"),
-    ("7-Scenes", POSE, "", f"{POSE}: the file is empty; expected a 4 x 4 matrix"),
     ("7-Scenes", "frame-000001.color.jpg", "none", "found frame-000001.color.jpg and .*, expected one image of each"),
     ("photos", "cameras.txt", "a.jpg 4 5 6 0 0 1 0\n", "expected one line `K fx fy cx cy width height`, found 0"),
-    ("photos", "cameras.txt", PHOTOS + "K 20 21 11.5 7.5 24 16\n", "cameras.txt: expected one line `K .*`, found 2"),
     ("photos", "cameras.txt", PHOTOS.replace("K 20", "K -20"), "cameras.txt, line 2: expected positive fx and fy"),
-    ("photos", "cameras.txt", PHOTOS.replace("24 16", "24 16.5"), "line 2: .* a whole positive width and height"),
     ("photos", "cameras.txt", PHOTOS.replace("24 16", "48 32"), "line 2: width and height are 48x32, the images of"),
-    ("photos", "cameras.txt", PHOTOS.replace("24 16", "24"), "cameras.txt, line 2: expected 6 columns"),
-    ("photos", "cameras.txt", PHOTOS.replace("4 5 6 0 0", "4 5 6 0"), "cameras.txt, line 4: expected 7 columns"),
     ("photos", "cameras.txt", PHOTOS.replace("0 0 1 0", "0 0 2 0"), "line 4: expected a quaternion of length 1"),
     ("photos", "cameras.txt", "K 20 21 11.5 7.5 24 16\n", "cameras.txt: expected rows of tx, .* found none"),
     ("video", "walk.avi", "", "walk.avi: OpenCV cannot open the video"),
-    ("video", "walk.avi", "some text\n" * 100, "walk.avi: OpenCV cannot open the video"),
 ]  # fmt: skip
 
 
@@ -183,13 +167,9 @@ CAMERAS = [
     ({"width": 48, "height": 32}, "camera.yaml: width and height are 48x32, the images of .* have 24x16 px"),
     ({"fx": None}, "line 1: expected the keys fx, fy, cx, cy, width, height, found no fx"),
     ({"fx": -1}, "line 1: expected fx to be positive, found -1"),
-    ({"fy": "wide"}, "line 2: expected fy to be a finite number, found 'wide'"),
-    ({"cx": "[1, 2]"}, "line 3: expected cx to be a single value"),
     ({"width": 24.5}, "line 5: expected width to be a whole number, found 24.5"),
     ({"distorsion": "[0, 0, 0, 0]"}, "line 7: expected the keys fx, .*; also known: .*; found .distorsion."),
     ({"distortion": "[0, 0]"}, "line 7: expected distortion to be a list of 4 or 5, found 2"),
-    ({"distortion": 0}, "line 7: expected distortion to be a list of 4 or 5, found no list"),
-    ({"distortion": "[0, 0, .nan, 0]"}, r"line 7: expected distortion\[2\] to be a finite number"),
     ({"model": "omni"}, "line 7: expected model to be pinhole or fisheye, found 'omni'"),
     ({"model": "fisheye", "distortion": [0] * 5}, "line 8: expected distortion to be a list of 4, found 5"),
     ({"baseline_m": -1}, "line 7: expected baseline_m to be positive, found -1"),
@@ -263,24 +243,6 @@ def test_the_truth_of_tum_keeps_its_own_times_and_its_gaps(tmp_path):
     assert open_images(tmp_path).truth is None
 
 
-def test_ends_of_lines_of_another_system_comments_and_blank_lines(tmp_path):
-    write_tum(tmp_path)
-    for name in ("rgb.txt", "groundtruth.txt", "camera.yaml"):
-        text = "# a comment\n\n" + (tmp_path / name).read_text()
-        write(tmp_path, {name: text.replace("\n", "\r\n")})
-    sequence = open_images(str(tmp_path))
-    assert levels(sequence) == [10, 20, 30] and len(sequence.truth.stamps_ns) == 2
-
-
-def test_a_time_keeps_all_its_digits_and_may_come_twice(tmp_path):
-    write_tum(tmp_path, ["1305031102.175304123", "1305031102.2"], ["1.3050311021754e+09 0 0 0 0 0 0 1"])
-    sequence = open_images(tmp_path)
-    assert sequence.stamps_ns.tolist() == [1305031102175304123, 1305031102200000000]
-    assert sequence.truth.stamps_ns.tolist() == [1305031102175400000]
-    write_tum(tmp_path, ["1.5", "1.50", "1.6"])
-    assert open_images(tmp_path).stamps_ns.tolist() == [1_500_000_000, 1_500_000_000, 1_600_000_000]
-
-
 # EuRoC.
 
 
@@ -321,9 +283,7 @@ ASL_CAMERAS = [
     ({"camera_model": "omni"}, "expected camera_model to be pinhole, found 'omni'"),
     ({"distortion_model": "fov"}, "expected distortion_model to be radial-tangential or radtan or equidistant"),
     ({"distortion_model": "equidistant", "distortion_coefficients": [0.0] * 5}, "to be a list of 4, found 5"),
-    ({"intrinsics": [20.0, 21.0, 11.5]}, "expected intrinsics to be a list of 4, found 3"),
     ({"resolution": [48, 32]}, "width and height are 48x32, the images of .*cam0 have 24x16 px"),
-    ({"resolution": [24.5, 16]}, r"expected resolution\[0\] to be a whole number"),
 ]
 
 
@@ -336,7 +296,6 @@ def test_a_camera_of_euroc_that_does_not_fit(tmp_path, changes, message):
 @pytest.mark.parametrize(
     ("matrix", "message"),
     [
-        (np.diag([1.0, 1.0, 2.0, 1.0]), "expected a rotation"),
         (np.diag([1.0, 1.0, -1.0, 1.0]), "expected a rotation"),
         (np.diag([1.0, 1.0, 1.0, 2.0]), "expected the last row of the matrix to be 0 0 0 1"),
         (np.eye(4)[:3], "expected data to be a list of 16, found 12"),
@@ -428,9 +387,8 @@ def test_a_video_from_any_image_on(tmp_path, name, codec):
     assert open_images(tmp_path / name, camera).stamps_ns[1] == 100_000_000
 
 
-@pytest.mark.parametrize("name", ["walk.avi", "walk.mkv"])
-def test_a_video_that_ends_in_mid_frame_keeps_what_was_read_and_says_so(tmp_path, name):
-    path = write_video(tmp_path / name, count=60, size=(240, 320))
+def test_a_video_that_ends_in_mid_frame_keeps_what_was_read_and_says_so(tmp_path):
+    path = write_video(tmp_path / "walk.mkv", count=60, size=(240, 320))
     path.write_bytes(path.read_bytes()[: path.stat().st_size * 6 // 10])
     *kept, last = open_images(path).frames()
     assert 25 <= len(kept) <= 40
@@ -497,13 +455,6 @@ def test_a_turned_video_is_turned_and_a_calibration_of_what_is_stored_with_it(fi
     assert open_images(path, shown).camera == read_calibration(shown).camera
 
 
-def test_a_video_without_its_index_cannot_be_opened(tmp_path):
-    path = write_video(tmp_path / "walk.mp4", codec="mp4v")
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    with pytest.raises(InputError, match=r"walk.mp4: OpenCV cannot open the video; convert it, or copy it"):
-        open_images(path)
-
-
 class Capture:
     """A video with a header of any kind."""
 
@@ -541,17 +492,6 @@ def test_a_header_without_a_number_and_a_rate(tmp_path, count):
     assert sequence.stamps_ns[:2].tolist() == [0, 33_333_333]
 
 
-def test_images_of_a_video_of_another_size_and_depth(tmp_path):
-    _, frames = sequence_of(tmp_path, [IMAGE, IMAGE[:, :20], IMAGE], count=3.0, rate=25.0)
-    assert [frame.image is None for frame in frames] == [False, True]
-    assert "expected 24x16 px as in the camera file, found 20x16 px" in frames[1].problem
-    deep = np.full(SIZE, 65535, np.uint16)
-    _, frames = sequence_of(tmp_path, [IMAGE[..., :1], deep], count=2.0, rate=25.0)
-    assert [int(frame.image[0, 0]) for frame in frames] == [70, 255]
-    with pytest.raises(InputError, match="not one image of the video can be decoded"):
-        sequence_of(tmp_path, [], count=3.0, rate=25.0)
-
-
 # Parts.
 
 
@@ -577,11 +517,8 @@ def test_part_of_a_recording(tmp_path):
     ("numbers", "said"),
     [
         ({"start_s": -1.0}, "start is -1 s"),
-        ({"start_s": float("nan")}, "start is nan s"),
         ({"start_s": 2.0, "end_s": 2.0}, "end is 2 s: expected more than the start, 2 s"),
-        ({"end_s": float("nan")}, "end is nan s"),
         ({"every": 0}, "at least 1, got 0"),
-        ({"resize_px": 0}, "at least 1, got 0"),
         ({"resize_px": 10_000}, "are not made larger"),
         ({"start_s": 60.0}, "no image is left from 60 s on: the recording is 0.067 s long"),
     ],
@@ -620,11 +557,6 @@ def test_a_file_of_another_kind(tmp_path):
     for name, found in (("0.png", "a file that ends in '.png'"), ("list", "a file")):
         with pytest.raises(InputError, match=f"found {found}, expected"):
             open_images(tmp_path / name)
-
-
-def test_importing_the_readers_imports_no_image_library():
-    code = "import sys, rbpf.sensors.readers.images; sys.exit('cv2' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 @pytest.mark.parametrize(
