@@ -183,7 +183,7 @@ def test_a_feature_that_may_be_anywhere_agrees_with_no_motion(fraction):
 def test_a_third_of_the_view_moves_and_the_camera_is_not_taken_along(tmp_path):
     """It crosses the view in two seconds; features on it are taken for near ones at rest, if they are trusted at once."""
     camera = Pinhole(320, 240, 250.0, 250.0, 159.5, 119.5)
-    simulate_images(TexturedDesk(frames=120, texel_m=0.003), Imaging(), camera, tmp_path / "desk", seed=1)
+    simulate_images(TexturedDesk(frames=150, texel_m=0.003), Imaging(), camera, tmp_path / "desk", seed=1)
     recording = open_images(tmp_path / "desk")
     known = read_known_points(tmp_path / "desk" / "known_points.csv")
     damaged = cover_view(1 / 3, 60, 60)(recording)

@@ -300,7 +300,9 @@ def test_without_a_camera_one_has_to_be_given(tmp_path):
 # Two cameras.
 
 
-@pytest.mark.parametrize(("kind", "names"), zip(KINDS, [("/left", "/right"), ("/cam0", "/cam1")] * 2, strict=False))
+@pytest.mark.parametrize(
+    ("kind", "names"), list(zip(KINDS, [("/left", "/right"), ("/cam0", "/cam1")] * 2, strict=False))
+)
 def test_a_rectified_pair_of_which_all_right_images_come_last(tmp_path, kind, names):
     sequence = open_stereo(write_pair(tmp_path / kind, names))
     assert (sequence.rig.baseline_m, sequence.notes) == (pytest.approx(0.12), ())
@@ -368,7 +370,7 @@ def test_a_camera_file_needs_the_baseline(tmp_path):
 # The truth.
 
 
-@pytest.mark.parametrize(("kind", "message"), zip([*KINDS, KINDS[0]], POSES, strict=True))
+@pytest.mark.parametrize(("kind", "message"), list(zip([*KINDS, KINDS[0]], POSES, strict=True)))
 def test_truth_from_every_message_that_holds_a_pose(tmp_path, kind, message):
     poses = SE3.exp(np.linspace(0.0, 1.0, 18).reshape(3, 6))
     path = tmp_path / kind
