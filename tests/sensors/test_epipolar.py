@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from rbpf.core.filter import Filter
-from rbpf.core.genealogy import Lineage
 from rbpf.core.likelihoods import Gaussian
 from rbpf.core.linearisation import information, innovation_covariance, linearise
-from rbpf.core.models import Observations, Part, Records
+from rbpf.core.models import Observations, Records
 from rbpf.core.particles import Information, Prior
 from rbpf.core.proposals import PriorProposal
 from rbpf.core.resampling import EssTriggered, Systematic
@@ -159,31 +158,3 @@ def test_a_particle_that_looks_elsewhere_loses_its_weight(kind, compiled, camera
     little = 1e-4 if kind is EpipolarRay else 1e-12
     assert weights[0] > 1.0 - little
     assert 0.0 <= weights[1] < little and 0.0 <= weights[2] < little
-
-
-def test_only_the_state_learns_from_the_constraint():
-    """Handed to the filter as in §5.2: the epipolar part for the state, all of it for the depth."""
-    rays = Rays.random(n=6, seed=8)
-    z, cov = measured(rays, PLAIN), np.tile(R, (5, 1, 1))
-    records = Records(rays.mean, covariances(rays, 0.04), rays.const)
-    results = []
-    for parts in (("across",), ("depth",), ("across", "depth")):
-        held = LandmarkMap(SE3)
-        held.begin(6, Lineage(6))
-        ids = held.add_records(records, InverseDepth())
-        groups = {
-            "across": Observations(z, cov, EpipolarRay(PLAIN), ids=ids, updates=frozenset({Part.STATE})),
-            "depth": Observations(z, cov, CameraRay(PLAIN), ids=ids, updates=frozenset({Part.LANDMARK})),
-        }
-        chosen = [groups[name] for name in parts]
-        prior = Prior.exactly(SE3, rays.state)
-        found = held.information(rays.state, chosen, prior)
-        density = held.correct(rays.state, np.zeros((6, 6)), chosen).all
-        results.append((found.info, density, held.read(ids).mean))
-    (info, density, untouched), (nothing, none, depth), both = results
-    np.testing.assert_array_equal(untouched, records.mean)
-    np.testing.assert_array_equal(nothing, 0.0)
-    np.testing.assert_array_equal(none, 0.0)
-    assert np.ptp(density) > 0.1 and np.abs(depth - records.mean).max() > 1e-3
-    for one, other in zip(both, (info, density, depth), strict=True):
-        np.testing.assert_array_equal(one, other)

@@ -16,7 +16,6 @@ from rbpf.systems.stereo.motion_segmentation import (
     UNKNOWN,
     camera_motion,
     contradicts,
-    propagated,
 )
 from tests.motion.stereo_pairs import LEAP, ROOM, joined, simulate
 
@@ -107,30 +106,3 @@ def test_the_few_that_stood_still_before(seed):
     for known, pair in ((np.zeros(80), thing), (labels, room)):
         motion = found.motions[camera_motion(found, known, False, np.zeros(3), False)]
         assert np.linalg.norm(SE3.local(motion.odometry.delta, pair.delta)) < 0.02
-
-
-def rows(*numbers: int) -> np.ndarray:
-    return np.array(numbers, dtype=np.intp)
-
-
-def mask(*numbers: int, of: int) -> np.ndarray:
-    return np.isin(np.arange(of), numbers)
-
-
-class TestLabels:
-    """A pair of five features, of which two stood still, one moved, and two are new."""
-
-    BEFORE = propagated(5, (rows(0, 1, 2), rows(4, 0, 2)), np.zeros(3), mask(0, 1, of=3), mask(2, of=3), rows())
-
-    def test_they_follow_the_matches(self):
-        np.testing.assert_array_equal(self.BEFORE, [STATIC, UNKNOWN, MOVING, UNKNOWN, STATIC])
-
-    def test_where_no_motion_is_found_all_stay_what_they_were(self):
-        first, second = rows(0, 2, 3, 4), rows(3, 2, 1, 0)
-        now = propagated(4, (first, second), self.BEFORE[first], mask(of=4), mask(3, of=4), rows())
-        np.testing.assert_array_equal(now, [MOVING, UNKNOWN, MOVING, STATIC])
-
-    def test_what_the_map_has_stands_still(self):
-        first, second = rows(1, 2), rows(0, 1)
-        now = propagated(3, (first, second), self.BEFORE[first], mask(of=2), mask(0, 1, of=2), rows(1))
-        np.testing.assert_array_equal(now, [MOVING, STATIC, UNKNOWN])
