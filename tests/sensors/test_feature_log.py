@@ -51,14 +51,10 @@ class TestFeatureLog:
         [
             ({"stamp_ns": 1.5}, "stamp_ns must be a whole number of nanoseconds, got 1.5"),
             ({"landmarks": np.array([1.0, 2.0])}, "landmarks must be (K,) int64, got (2,) float64"),
-            ({"landmarks": np.array([[1, 2]])}, "landmarks must be (K,) int64, got (1, 2) int64"),
             ({"landmarks": [1, 2]}, "landmarks must be (K,) int64, got a list"),
             ({"landmarks": np.array([7, 7])}, "landmark 7 comes twice, keep one of the two"),
             ({"landmarks": np.array([1, 2, 3])}, "z must be (3, 2) float64, got (2, 2) float64"),
-            ({"z": np.zeros((2, 2), dtype=int)}, "z must be (2, 2) float64, got (2, 2) int64"),
             ({"z": np.array([[1.0, 2.0], [np.nan, 4.0]])}, "z must be finite, entry (1, 0) is nan"),
-            ({"cov_z": np.eye(2)}, "cov_z must be (2, 2, 2) float64, got (2, 2) float64"),
-            ({"cov_z": np.full((2, 2, 2), np.inf)}, "cov_z must be finite, entry (0, 0, 0) is inf"),
             ({"cov_z": np.stack([np.eye(2), np.diag([1.0, -1.0])])}, "cov_z is no covariance: "),
             ({"cov_z": np.stack([np.eye(2), np.array([[1.0, 0.5], [0.0, 1.0]])])}, "cov_z is no covariance: "),
         ],
@@ -89,10 +85,8 @@ class TestKnownPoints:
         ("wrong", "message"),
         [
             ({"names": np.array([4, 4])}, "landmark 4 comes twice, keep one of the two"),
-            ({"names": np.array([4.0, 2.0])}, "names must be (M,) int64, got (2,) float64"),
             ({"positions": np.zeros((2, 2))}, "positions must be (2, 3) float64, got (2, 2) float64"),
             ({"positions": np.full((2, 3), np.inf)}, "positions must be finite, entry (0, 0) is inf"),
-            ({"cov": np.zeros((3, 3))}, "cov must be (2, 3, 3) float64, got (3, 3) float64"),
             ({"cov": np.tile(-np.eye(3), (2, 1, 1))}, "cov is no covariance: "),
         ],
     )

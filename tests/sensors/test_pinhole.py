@@ -154,6 +154,7 @@ class TestVisible:
 
 
 GOOD = {"width": 640, "height": 480, "fx": 500.0, "fy": 500.0, "cx": 320.0, "cy": 240.0}
+FOUR = "the camera's distortion must be the 4 numbers k1, k2, k3, k4, got "
 FIVE = "the camera's distortion must be the 5 numbers k1, k2, p1, p2, k3 (k3 = 0 if there are four), got "
 
 
@@ -161,26 +162,19 @@ FIVE = "the camera's distortion must be the 5 numbers k1, k2, p1, p2, k3 (k3 = 0
     ("wrong", "message"),
     [
         ({"width": 0}, "the camera's width must be a positive whole number of pixels, got 0"),
-        ({"height": -480}, "the camera's height must be a positive whole number of pixels, got -480"),
         ({"width": 640.0}, "the camera's width must be a positive whole number of pixels, got 640.0"),
-        ({"height": True}, "the camera's height must be a positive whole number of pixels, got True"),
         ({"fx": 0.0}, "the camera's fx and fy must be positive, got 0.0 and 500.0 px"),
-        ({"fy": -1.0}, "the camera's fx and fy must be positive, got 500.0 and -1.0 px"),
         ({"fx": float("inf")}, "the camera's fx must be a finite number, got inf"),
         ({"cy": float("nan")}, "the camera's cy must be a finite number, got nan"),
         ({"cx": "320"}, "the camera's cx must be a finite number, got '320'"),
         ({"distortion": (0.1, 0.0, 0.0, 0.0)}, f"{FIVE}(0.1, 0.0, 0.0, 0.0)"),
-        ({"distortion": None}, f"{FIVE}None"),
         ({"distortion": (0.0, 0.0, 0.0, 0.0, float("inf"))}, "the camera's k3 must be a finite number, got inf"),
         ({"distortion": (0.0, 0.0, "x", 0.0, 0.0)}, "the camera's p1 must be a finite number, got 'x'"),
         (
             {"distortion_model": "fov"},
             "the camera's distortion_model must be radial-tangential or equidistant, got 'fov'",
         ),
-        (
-            {"distortion_model": "equidistant"},
-            "the camera's distortion must be the 4 numbers k1, k2, k3, k4, got (0.0, 0.0, 0.0, 0.0, 0.0)",
-        ),
+        ({"distortion_model": "equidistant"}, f"{FOUR}(0.0, 0.0, 0.0, 0.0, 0.0)"),
         (
             {"distortion_model": "equidistant", "distortion": (0.0, 0.0, 0.0, float("nan"))},
             "the camera's k4 must be a finite number, got nan",
@@ -195,6 +189,10 @@ def test_a_wrong_camera_is_refused(wrong, message):
 CAMERA = Pinhole(640, 480, 525.0, 520.0, 319.5, 239.5)
 STEREO = RectifiedStereo(CAMERA, 0.12)
 DISTORTED = Pinhole(640, 480, 320.0, 320.0, 320.0, 240.0, (-0.25, 0.0, 0.0, 0.0, 0.0))
+
+
+BENT = "the camera of a rectified stereo pair has"
+RECTIFY = "rectify the images and give the camera of the rectified ones"
 
 
 class TestRectifiedStereo:
@@ -235,20 +233,9 @@ class TestRectifiedStereo:
     ("camera", "baseline", "message"),
     [
         (CAMERA, 0.0, "the stereo baseline must be positive, got 0.0 m"),
-        (CAMERA, -0.1, "the stereo baseline must be positive, got -0.1 m"),
         (CAMERA, float("nan"), "the stereo baseline must be a finite number, got nan"),
-        (
-            DISTORTED,
-            0.1,
-            "the camera of a rectified stereo pair has radial-tangential distortion (-0.25, 0.0, 0.0, 0.0, 0.0): "
-            "rectify the images and give the camera of the rectified ones",
-        ),
-        (
-            FISHEYES["ideal"],
-            0.1,
-            "the camera of a rectified stereo pair has equidistant distortion (0.0, 0.0, 0.0, 0.0): "
-            "rectify the images and give the camera of the rectified ones",
-        ),
+        (DISTORTED, 0.1, f"{BENT} radial-tangential distortion (-0.25, 0.0, 0.0, 0.0, 0.0): {RECTIFY}"),
+        (FISHEYES["ideal"], 0.1, f"{BENT} equidistant distortion (0.0, 0.0, 0.0, 0.0): {RECTIFY}"),
     ],
 )
 def test_a_wrong_stereo_pair_is_refused(camera, baseline, message):
