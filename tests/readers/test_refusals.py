@@ -4,8 +4,6 @@ import re
 from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from examples.studies.stereo_tracks import read_stereo_tracks
 from rbpf.errors import InputError
@@ -164,35 +162,3 @@ def test_a_missing_file_is_named(tmp_path, name, file, words):
     with pytest.raises(InputError, match=re.escape(words)) as caught:
         read(tmp_path)
     assert str(tmp_path) in str(caught.value)
-
-
-@pytest.fixture(scope="module")
-def scratch(tmp_path_factory):
-    return tmp_path_factory.mktemp("scratch")
-
-
-@given(name=st.sampled_from(sorted(FORMATS)), data=st.data())
-def test_a_damaged_file_is_read_or_refused_in_one_sentence(scratch, name, data):
-    """A stretch of one file is replaced by few bytes, odd numbers, or what separates the format's fields."""
-    files, read = FORMATS[name]
-    file = data.draw(st.sampled_from(sorted(files)))
-    whole = files[file].encode()
-    start = data.draw(st.integers(0, len(whole)))
-    stop = data.draw(st.integers(start, min(start + 12, len(whole))))
-    odd = [b"nan", b"-", b"1e400", b"1e-320", b"1e12", b"9" * 30, b"\n", b"0", b"-1", b" ", b",", b"#", b"{"]
-    put = data.draw(st.one_of(st.binary(max_size=6), st.sampled_from(odd)))
-    folder = write(scratch / name, files | {file: whole[:start] + put + whole[stop:]})
-    said = ""
-    try:
-        read(folder)
-    except InputError as error:
-        said = str(error)
-    assert "\n" not in said
-
-
-@given(name=st.sampled_from(sorted(FORMATS)), data=st.data(), content=st.binary(max_size=200))
-def test_garbage_is_refused(scratch, name, data, content):
-    files, read = FORMATS[name]
-    file = data.draw(st.sampled_from(sorted(name for name in files if "ruth" not in name)))
-    with pytest.raises(InputError, match=re.escape(file)):
-        read(write(scratch / name, files | {file: content}))
