@@ -122,63 +122,49 @@ def test_malformed_sightings_are_refused_by_line(tmp_path, old, new, complaint):
         read_robot_measurements(tmp_path)
 
 
-def spoiled(path, line, column, value):
-    lines = path.read_text().splitlines()
+@pytest.mark.parametrize(
+    ("dim", "name", "line", "column", "value", "complaint"),
+    [
+        (2, OBSERVATIONS, 13, 4, "nan", "expected z1 to be a finite number, found 'nan'"),
+        (2, OBSERVATIONS, 13, 3, "", "expected z0 to be a finite number, found ''"),
+        (2, OBSERVATIONS, 13, 5, "-0.1", "expected a positive semi-definite covariance"),
+        (2, OBSERVATIONS, 13, 6, "9.0", "expected a positive semi-definite covariance"),
+        (2, ODOMETRY, 8, 0, "4", "expected one row per step, from step 1 in order"),
+        (2, ODOMETRY, 8, 1, "17", "expected stamps in order of time"),
+        (2, ODOMETRY, 8, 2, "inf", "expected d0 to be a finite number"),
+        (2, ODOMETRY, 8, -1, "-0.1", "expected a positive semi-definite covariance"),
+        (3, ODOMETRY, 7, 5, "3.0", "expected an increment that begins with a quaternion"),
+    ],
+)
+def test_malformed_numbers_are_refused_by_line(tmp_path, dim, name, line, column, value, complaint):
+    write_measurements(tmp_path, world(dim, "position"))
+    lines = (tmp_path / name).read_text().splitlines()
     fields = lines[line - 1].split(",")
     fields[column] = value
     lines[line - 1] = ",".join(fields)
-    path.write_text("\n".join([*lines, ""]))
-
-
-@pytest.mark.parametrize(
-    ("name", "line", "column", "value", "complaint"),
-    [
-        (OBSERVATIONS, 13, 4, "nan", "line 13: expected z1 to be a finite number, found 'nan'"),
-        (OBSERVATIONS, 13, 3, "", "line 13: expected z0 to be a finite number, found ''"),
-        (OBSERVATIONS, 13, 5, "-0.1", "line 13: expected a positive semi-definite covariance"),
-        (OBSERVATIONS, 13, 6, "9.0", "line 13: expected a positive semi-definite covariance"),
-        (ODOMETRY, 8, 0, "4", "line 8: expected one row per step, from step 1 in order"),
-        (ODOMETRY, 8, 1, "17", "line 8: expected stamps in order of time"),
-        (ODOMETRY, 8, 2, "inf", "line 8: expected d0 to be a finite number"),
-        (ODOMETRY, 8, -1, "-0.1", "line 8: expected a positive semi-definite covariance"),
-    ],
-)
-def test_malformed_numbers_are_refused_by_line(tmp_path, name, line, column, value, complaint):
-    write_measurements(tmp_path, world(2, "position"))
-    spoiled(tmp_path / name, line, column, value)
-    with pytest.raises(InputError, match=re.escape(str(tmp_path / name)) + ", " + complaint):
-        read_robot_measurements(tmp_path)
-
-
-def test_quaternions_that_are_none_are_refused_by_line(tmp_path):
-    write_measurements(tmp_path, world(3, "position"))
-    spoiled(tmp_path / ODOMETRY, 7, 5, "3.0")
-    with pytest.raises(InputError, match="line 7: expected an increment that begins with a quaternion"):
+    (tmp_path / name).write_text("\n".join([*lines, ""]))
+    with pytest.raises(InputError, match=re.escape(str(tmp_path / name)) + f", line {line}: {complaint}"):
         read_robot_measurements(tmp_path)
 
 
 @pytest.mark.parametrize(
-    ("change", "complaint"),
+    ("dim", "change", "complaint"),
     [
-        ({"recording": "two\nlines"}, "name on one line"),
-        ({"recording": ""}, "name on one line"),
-        ({"measurement": "bearing"}, "a measurement range_bearing or position"),
-        ({"pitch_sign": 0.5}, "a pitch sign 1 or -1"),
-        ({"start": np.zeros(7)}, re.escape("start of shape (3,), found (7,)")),
-        ({"start": np.array([0.0, np.inf, 0.0])}, "finite numbers .* in start"),
-        ({"stamps_ns": np.arange(7)[::-1]}, "order of time"),
-        ({"steps": np.full(33, 7)}, "from 0 to 6"),
-        ({"covs": np.tile(np.diag([1.0, -1.0, 1.0]), (6, 1, 1))}, "covariances in covs, .* row 0"),
+        (2, {"recording": "two\nlines"}, "name on one line"),
+        (2, {"recording": ""}, "name on one line"),
+        (2, {"measurement": "bearing"}, "a measurement range_bearing or position"),
+        (2, {"pitch_sign": 0.5}, "a pitch sign 1 or -1"),
+        (2, {"start": np.zeros(7)}, re.escape("start of shape (3,), found (7,)")),
+        (2, {"start": np.array([0.0, np.inf, 0.0])}, "finite numbers .* in start"),
+        (2, {"stamps_ns": np.arange(7)[::-1]}, "order of time"),
+        (2, {"steps": np.full(33, 7)}, "from 0 to 6"),
+        (2, {"covs": np.tile(np.diag([1.0, -1.0, 1.0]), (6, 1, 1))}, "covariances in covs, .* row 0"),
+        (3, {"start": np.zeros(7)}, "quaternions of length 1"),
     ],
 )
-def test_what_does_not_fit_together_is_refused(change, complaint):
+def test_what_does_not_fit_together_is_refused(dim, change, complaint):
     with pytest.raises(InputError, match=complaint):
-        replace(world(2, "position"), **change)
-
-
-def test_a_quaternion_that_is_none_is_refused():
-    with pytest.raises(InputError, match="quaternions of length 1"):
-        replace(world(3, "position"), start=np.zeros(7))
+        replace(world(dim, "position"), **change)
 
 
 CAMERA = Pinhole(640, 480, 512.1, 511.9, 319.4, 239.6, (0.1, -0.05, 1e-3, -2e-3, 0.01))
