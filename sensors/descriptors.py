@@ -176,7 +176,7 @@ def band_pairs(first: np.ndarray, second: np.ndarray, reach: np.ndarray | float)
 def gate_pairs(
     z: np.ndarray, noise: np.ndarray, mean: np.ndarray, cov: np.ndarray, gate: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """All pairs of a measurement and a prediction that are near to one another.
+    """Rows (C,) of measurements and (C,) of predictions that are near to one another.
 
     Args:
         z: (K, p) places of features.
@@ -184,9 +184,6 @@ def gate_pairs(
         mean: (M, p) predicted places; those that are not finite are near to nothing.
         cov: (M, p, p) their covariances, without the measurements' noise.
         gate: largest squared Mahalanobis distance.
-
-    Returns:
-        Rows (C,) of z and (C,) of mean.
     """
     held = np.flatnonzero(np.isfinite(mean).all(axis=1) & np.isfinite(cov).all(axis=(1, 2)))
     mean, cov = mean[held], cov[held]

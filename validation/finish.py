@@ -35,10 +35,8 @@ who asks for it."""
 class Callbacks:
     """Who is told how far the work after the filter is.
 
-    Attributes:
-        on_frame: called with the frames drawn and their number.
-        on_iteration: called with the number of an iteration of the batch adjustment and the error before it.
-        most_iterations: of the batch adjustment, after which it is given up; see `solve_problem`.
+    `on_frame` gets the frames drawn and their number, `on_iteration` the number of an iteration of the batch adjustment and
+    the error before it; after `most_iterations` it is given up, see `solve_problem`.
     """
 
     on_frame: Callable[[int, int], None] | None = None

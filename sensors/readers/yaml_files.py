@@ -126,8 +126,7 @@ def read_plain_yaml(path: Path, hint: str = "settings") -> Any:
     """What a YAML file says in plain values: mappings, lists, text, numbers, dates.
 
     Raises:
-        InputError: as `read_yaml`, or the file refers to itself by aliases, has a tag that is not plain, or a value is
-            none of its type.
+        InputError: as `read_yaml`, a key comes twice, a tag is not plain, or a value is none of its type.
     """
     whole = read_yaml(path, hint)
     _require_plain(whole)

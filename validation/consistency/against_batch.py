@@ -157,11 +157,7 @@ def compare_run(run: Run, robust: float | None = None) -> AgainstBatch:
 
 
 def compare_folder(folder: Path, robust: float | None = None) -> AgainstBatch:
-    """A run folder beside its batch optimum; see `compare`.
-
-    Raises:
-        InputError: also if the folder is not that of a finished run of this version.
-    """
+    """A run folder beside its batch optimum; see `compare`. The folder must be that of a finished run of this version."""
     return compare(RunFolder.open(folder).estimate, read_problem(folder), robust)
 
 

@@ -115,12 +115,9 @@ class Verdict:
 
 
 def judge(statistics: Sequence[Statistic], independent: Sequence[str] = (), path: PathGrade | None = None) -> Verdict:
-    """The verdict.
+    """The verdict from all statistics.
 
-    Args:
-        statistics: all that there are.
-        independent: names of those that compare poses or landmarks with something the filter did not compute itself.
-        path: how good it is.
+    `independent` names those that compare poses or landmarks with something the filter did not compute itself.
     """
     path = path or PathGrade()
     against = [s for s in statistics if s.outcome == "contradicts"]

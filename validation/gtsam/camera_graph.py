@@ -114,14 +114,10 @@ class CameraProblem:
         scale: float = SOFT_SCALE,
         factors: list[Any] | None = None,
     ) -> Any:
-        """All factors.
+        """All factors, or others than those of the observations.
 
-        Args:
-            start: where weak priors hold.
-            loose: (L,) landmarks that get one.
-            held: (T, 7) path where the gauge holds.
-            scale: its standard deviation, see `SCALE`.
-            factors: in place of those of the observations.
+        Weak priors hold the `loose` landmarks (L,) where they are in `start`; the gauge holds at the path `held` (T, 7), and
+        the scale with a standard deviation as `SCALE` has it.
         """
         graph = gtsam.NonlinearFactorGraph()
         for factor in self.observation_factors() if factors is None else factors:
@@ -207,11 +203,9 @@ class CameraProblem:
         return self.factors_by_row(lambda row, model, pose, point: kind(z[row], model, pose, point, lens))
 
     def factors_by_row(self, make: Callable[[int, Any, int, int], Any], order: list[int] | None = None) -> list[Any]:
-        """A factor of each row of the table.
+        """A factor of each row of the table, made of row, noise model with its loss, key of the pose and key of the landmark.
 
-        Args:
-            make: row, noise model with its loss, key of the pose and key of the landmark to a factor.
-            order: a factor's residual is ours[order]; by default ours.
+        A factor's residual is ours[order]; by default ours.
         """
         models, out = dict[bytes, Any](), []
         for row, (step, index) in enumerate(zip(self.table.steps.tolist(), self.table.index.tolist(), strict=True)):

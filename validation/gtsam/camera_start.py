@@ -80,13 +80,8 @@ def locate(table: ObservationTable, known: Known) -> tuple[Array, Array]:
 def resect(table: ObservationTable, known: Known, near: Array, info: Array) -> tuple[Array, Array]:
     """Pose (7,) with Huber's loss, once more without the outliers, whose pull Huber only limits; covariance (6, 6).
 
-    A weak prior stands in for what the image leaves open.
-
-    Args:
-        table: observations of one frame.
-        known: where its landmarks are.
-        near: (7,) world_from_camera, where it starts and where the prior has its mean.
-        info: (6, 6) information of the prior.
+    From observations of one frame and where its landmarks are. A weak prior stands in for what the image leaves open: it
+    has its mean at `near` (7,) world_from_camera, where it starts, and the information (6, 6).
     """
 
     def solve(part: ObservationTable, start: Array) -> tuple[Any, Any, CameraProblem]:

@@ -126,7 +126,7 @@ def huber(base: Any, threshold: float | None) -> Any:
 def levenberg_marquardt(
     graph: Any, values: Any, tolerance: float, iterations: int = ITERATIONS, on_iteration: OnIteration | None = None
 ) -> tuple[Any, int, bool]:
-    """Damped Gauss-Newton.
+    """Damped Gauss-Newton; returns the values, the number of iterations, and whether it converged.
 
     Args:
         graph: nonlinear factors.
@@ -134,9 +134,6 @@ def levenberg_marquardt(
         tolerance: it ends when a step gains less than this fraction of the error.
         iterations: most of them.
         on_iteration: told the error before each iteration; what it raises ends the optimisation.
-
-    Returns:
-        The values, the number of iterations, and whether it converged.
     """
     error, damping = graph.error(values), _DAMPING
     for count in range(1, iterations + 1):
@@ -205,13 +202,7 @@ def marginals_by_schur(
     adjustment: a modern synthesis", 2000, §6.) Information squares the condition of the problem: this is for problems
     whose scale is measured, well or badly, not for those where a stiff prior holds it.
 
-    Args:
-        graph: nonlinear factors between poses and points; no others.
-        values: the optimum.
-        poses: P keys.
-        points: L keys.
-        held: those of them that a hard constraint holds, each by itself.
-        name: of the recording.
+    The graph of a recording has factors between P poses and L points alone; some of them hard constraints hold by themselves.
 
     Raises:
         InputError: the measurements do not determine something.
@@ -261,13 +252,11 @@ def marginals_by_schur(
         of_each[index] = inverse[index] + dense @ cov[np.ix_(used, used)] @ dense.T
     every = np.arange(len(cov) // _POSE)
     of_every = cov.reshape(every.size, _POSE, -1, _POSE)[every, :, every]
-    found = dict(zip((key for key in free if sizes[key] == _POSE), of_every, strict=True))
-    found |= dict(zip((key for key in free if sizes[key] == _POINT), of_each, strict=True))
-    cov_points = [found.get(key, np.zeros((_POINT, _POINT))) for key in points]
-    return (
-        np.array([found.get(key, np.zeros((_POSE, _POSE))) for key in poses]),
-        np.array(cov_points).reshape(-1, _POINT, _POINT),
-    )
+    cov_poses, cov_points = np.zeros((len(poses), _POSE, _POSE)), np.zeros((len(points), _POINT, _POINT))
+    # The columns are in the order of the keys.
+    for out, given, covs in ((cov_poses, poses, of_every), (cov_points, points, of_each)):
+        out[[row for row in np.argsort(given).tolist() if given[row] not in held]] = covs
+    return cov_poses, cov_points
 
 
 def _step(linear: Any, values: Any) -> Any:

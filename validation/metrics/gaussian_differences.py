@@ -89,12 +89,9 @@ def figures_of(name: str, differences: Differences) -> dict[str, Any]:
 
 
 def compare_maps(ours: PathAndMap, other: PathAndMap, across: bool) -> Differences:
-    """The landmarks that both estimates have; those that one of them holds exactly are left out.
+    """The landmarks that both estimates of one world have; those that one of them holds exactly are left out.
 
-    Args:
-        ours: the filter's.
-        other: the optimum's, of the same world.
-        across: compare across the line from the first camera only, where the scale is not measured.
+    Where the scale is not measured they are compared `across` the line from the first camera only.
     """
     shared, rows, others = np.intersect1d(ours.landmarks.ids, other.landmarks.ids, return_indices=True)
     known = np.isfinite(other.landmarks.cov[others]).all(axis=(1, 2))

@@ -117,10 +117,8 @@ def match_points(points: np.ndarray, truth: dict[int, np.ndarray], start: Simila
 def score_landmarks(estimate: PathAndMap, truth: RunTruth, anonymous: bool = False) -> dict[str, float]:
     """Mean errors of landmarks whose true places are known, moved as the path is, and with an alignment of their own.
 
-    Args:
-        estimate: a pose for every frame of a run, and its map.
-        truth: with the true places by name.
-        anonymous: the filter gave the landmarks no names: each is scored as the true one nearest to it, one to one.
+    The estimate has a pose for every frame of the run. Landmarks to which the filter gave no names (`anonymous`) are each
+    scored as the true one nearest to it, one to one.
     """
     points = estimate.landmarks
     if not truth.landmarks or not points.ids.size:

@@ -43,12 +43,9 @@ def draw_truth(record: RunFolder, errors: TruthErrors) -> list[str]:
 
 
 def plot_against_batch(found: AgainstBatch, out: Path, world: World | None = None) -> list[str]:
-    """Paths, expected NEES, landmarks and map beside the batch posterior; returns the file names.
+    """Paths, expected NEES, landmarks and map beside the batch posterior, drawn in a world, by default the filter's own.
 
-    Args:
-        found: the comparison.
-        out: folder for the pictures.
-        world: in which they are drawn; by default the filter's own.
+    Writes PNG files into the folder and returns their names.
     """
     name, theirs, ours, world = found.name, found.optimum.estimate, found.ours, world or World()
     both = {"batch": theirs.trajectory, "filter": found.filter.trajectory}

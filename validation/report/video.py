@@ -217,11 +217,11 @@ def write_video(
     path: Path,
     on_frame: Callable[[int, int], None] | None = None,
 ) -> None:
-    """Writes an MP4; it appears under its name when it is complete.
+    """Writes an MP4 of pictures (H, W, 3) uint8; it appears under its name when it is complete.
 
     Args:
-        pictures: (H, W, 3) uint8.
-        size: their width and height, even numbers.
+        pictures: of one size.
+        size: width and height, even numbers.
         stamps_ns: (T,) of the pictures; it runs as fast as these.
         path: the file.
         on_frame: called with the pictures written and their number.

@@ -148,16 +148,10 @@ def _drawn(camera: Pinhole, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def pair_stamps(
     left_ns: np.ndarray, right_ns: np.ndarray, tolerance_s: float, where: str
 ) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Pairs of images, each the other's nearest in time, in order of time.
+    """Pairs of images, each the other's nearest in time and within the tolerance, in order of time.
 
-    Args:
-        left_ns: (T,) int64 times of the left camera, in order.
-        right_ns: (U,) of the right one.
-        tolerance_s: largest difference.
-        where: the recording, for messages.
-
-    Returns:
-        Rows (P,) of the left and (P,) of the right camera, and a sentence about each camera whose images are left out.
+    Rows (P,) of the left camera's times (T,) and (P,) of the right one's (U,), both in order, and a sentence about each camera
+    whose images are left out.
     """
     nearest, gap_ns = _nearest(left_ns, right_ns)
     back, _ = _nearest(right_ns, left_ns)
