@@ -41,10 +41,9 @@ def projected(model: ObservationModel, records: Records, belief: Belief) -> tupl
 def checked_new_ids(
     ids: np.ndarray | None, count: int, next_id: int, holds: Callable[[np.ndarray], np.ndarray]
 ) -> np.ndarray:
-    """Numbers (K,) of `count` new landmarks; None numbers them from `next_id` on.
+    """Numbers (K,) of `count` new landmarks, from `next_id` on where none are given.
 
-    Raises:
-        InputError: one is no whole number from 0 up, comes twice or is in use.
+    Raises InputError: not new, not whole.
     """
     if ids is None:
         return np.arange(next_id, next_id + count)
@@ -73,10 +72,7 @@ def linearised(
     const: np.ndarray | None,
     compiled: bool,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """ν (N, K, p), ∂z/∂state (N, K, p, d) and ∂z/∂landmark (N, K, p, D) of landmarks (N, K, D) at states (N, E).
-
-    By the model's kernel where it has one and `compiled` allows it, else in NumPy.
-    """
+    """ν (N, K, p), ∂z/∂state (N, K, p, d), ∂z/∂landmark (N, K, p, D) of landmarks (N, K, D) at states (N, E)."""
     (n, k, dim), p = mean.shape, z.shape[1]
     kernel = fused_kernel(model) if compiled else None
     if kernel is None:

@@ -37,7 +37,6 @@ class Constellation(Landmark):
         self.points = points.tolist()
 
     def homogeneous(self, mean: np.ndarray, const: np.ndarray | None = None) -> np.ndarray:
-        """The origin of the group's frame, (…, 6), (…, 7) → (…, 4)."""
         assert const is not None
         origin = SE3.translation(SE3.retract(const, mean))
         return np.concatenate([origin, np.ones((*origin.shape[:-1], 1))], axis=-1)
@@ -93,7 +92,6 @@ class UncertainConstellation(Landmark):
         self._info_points = np.linalg.inv(cov_points + LEAST * np.eye(3)).tolist()
 
     def homogeneous(self, mean: np.ndarray, const: np.ndarray | None = None) -> np.ndarray:
-        """The points' centre (…, 3M) → (…, 4)."""
         centre = self._points_of(mean).mean(axis=-2)
         return np.concatenate([centre, np.ones((*centre.shape[:-1], 1))], axis=-1)
 

@@ -29,7 +29,7 @@ class InverseDepth(Landmark):
         self.ready_ratio = ready_ratio
 
     def homogeneous(self, mean: np.ndarray, const: np.ndarray | None = None) -> np.ndarray:
-        """(…, 3), (…, 7) → (…, 4): (R (u, v, 1) + q t, q); no division, so that q may be 0."""
+        """(R (u, v, 1) + q t, q): no division, so that q may be 0."""
         assert const is not None
         ray = np.concatenate([mean[..., :2], np.ones((*mean.shape[:-1], 1))], axis=-1)
         turned = SE3.transform(const, ray) - SE3.translation(const)

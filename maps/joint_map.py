@@ -1,4 +1,4 @@
-"""A map whose landmarks, with the frame that they are told in, are one Gaussian given a short sampled window of the path.
+"""A map whose landmarks, with the frame that they are expressed in, are one Gaussian given a short sampled window of the path.
 
 A filter that samples its whole path forgets: resampling leaves all particles one past, and how the old map is bent, which
 nothing near the robot shows, is sampled once and never again (T. Bailey, J. Nieto and E. Nebot 2006). Here only the last
@@ -19,7 +19,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from rbpf import gaussian
-from rbpf.core import schema
+from rbpf.core import checkpoint
 from rbpf.core.genealogy import Lineage
 from rbpf.core.linearisation import linearise
 from rbpf.core.models import (
@@ -63,7 +63,7 @@ class _Rows(NamedTuple):
         return 2.0 * float(np.log(np.diagonal(self.chol)).sum()) + self.nu.shape[1] * float(np.log(2.0 * np.pi))
 
 
-_NAMED = {"ids": schema.integers("landmarks", least=0), "next": schema.integers(1, least=0)}
+_NAMED = {"ids": checkpoint.integers("landmarks", least=0), "next": checkpoint.integers(1, least=0)}
 
 
 @final
@@ -76,7 +76,7 @@ class JointMap(Map):
 
     Args:
         space: SE2 or SE3 with `Point(2)` or `Point(3)`; Euclidean(n), whose points are vectors (n,).
-        substate: mean (m,) and covariance (m, m) of what drives the motion (`Transition.coupling`), told in the robot's
+        substate: mean (m,) and covariance (m, m) of what drives the motion (`Transition.coupling`), expressed in the robot's
             frame; None has none. It may be observed together with a landmark.
         compiled: use the models' fused kernels where they have one.
 
@@ -106,7 +106,6 @@ class JointMap(Map):
         self.also = frozenset({Part.STATE, Part.SUBSTATE} if mean.size else {Part.STATE})
 
     def begin(self, n: int, lineage: Lineage) -> None:
-        """No landmark; the frame is the world's."""
         d = self.space.dim
         self.n = n
         self.origin = self.space.identity()
@@ -150,7 +149,6 @@ class JointMap(Map):
         return Prior(space, transition.mean, self._increment_mean, factor, centred=False)
 
     def information(self, state: np.ndarray, groups: Sequence[Observations], prior: Prior) -> Information:
-        """What all rows say together: they are correlated through the landmarks."""
         increment = None if self._gain is None else self.space.local(prior.base, state)
         mean, cov = self._given(increment)
         rows = self._rows(state, mean, cov, groups)
@@ -187,7 +185,6 @@ class JointMap(Map):
         return LogDensities(total, np.zeros_like(total))
 
     def resample(self, ancestors: np.ndarray) -> None:
-        """Copies means; the covariance is everyone's."""
         self.mean = self.mean[ancestors]
         if self._gain is not None:
             self._predicted = self._predicted[ancestors]
@@ -312,11 +309,7 @@ class JointMap(Map):
         return _Rows(np.concatenate(nus, axis=1), np.concatenate(by_states, axis=1), slope, used, chol, log_factor)
 
     def _checked_ids(self, group: Observations) -> np.ndarray | None:
-        """Landmarks (K,) of a group, None where it reads none.
-
-        Raises:
-            InputError: the particles associate differently, a landmark is not held, or the likelihood is not Gaussian.
-        """
+        """Landmarks (K,) of a group, None where it reads none; refused where particles associate differently."""
         name, ids = type(group.model).__name__, group.ids
         if group.likelihood is not None and group.likelihood.kernel_id != 0:
             raise InputError(f"a joint map takes Gaussian likelihoods, {name} has {type(group.likelihood).__name__}")
@@ -333,11 +326,7 @@ class JointMap(Map):
         return ids
 
     def _columns(self, ids: np.ndarray) -> np.ndarray:
-        """Places (K, D) of landmarks in the means.
-
-        Raises:
-            InputError: the map does not hold one of them.
-        """
+        """Places (K, D) of landmarks in the means. Raises InputError: the map does not hold one of them."""
         places = self._places
         try:
             rows = np.array([places[landmark] for landmark in np.asarray(ids).tolist()], dtype=np.int64)
@@ -438,28 +427,25 @@ class JointMap(Map):
         return projected(model, self.read(ids), belief)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Means, the covariance, the frame and the landmarks' ids."""
         named = {"mean": self.mean, "cov": self.cov, "origin": self.origin, "ids": self.ids}
         return {f"joint/{name}": array for name, array in named.items()} | {"joint/next": np.array([self._next_id])}
 
     def options(self) -> dict[str, object]:
-        """Size of the substate."""
         return {"joint substate": self._first - self.space.dim}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """The inverse of `arrays`; errors as `rbpf.core.schema.read`."""
-        found = schema.read(arrays, _NAMED, "joint/")
+        found = checkpoint.read(arrays, _NAMED, "joint/")
         ids, self._next_id = found["ids"], int(found["next"][0])
         if np.unique(ids).size < ids.size or ids.max(initial=-1) >= self._next_id:
             raise InputError("the array joint/ids names a landmark twice, or one that was never started")
         self._places = {landmark: row for row, landmark in enumerate(ids.tolist())}
         size = self._first + ids.size * self.point.dim
         held = {
-            "mean": schema.numbers("n", "size"),
-            "cov": schema.numbers("size", "size"),
-            "origin": schema.elements(self.space),
+            "mean": checkpoint.numbers("n", "size"),
+            "cov": checkpoint.numbers("size", "size"),
+            "origin": checkpoint.elements(self.space),
         }
-        self.mean, self.cov, self.origin = schema.read(arrays, held, "joint/", n=self.n, size=size).values()
+        self.mean, self.cov, self.origin = checkpoint.read(arrays, held, "joint/", n=self.n, size=size).values()
 
     def _by_turn(self, points: np.ndarray) -> np.ndarray:
         """∂(Exp(ω) l)/∂ω (M, D, ·) at points (M, D): nothing for translations, a column in the plane, −[l]× in space."""

@@ -6,6 +6,7 @@ from typing import final
 
 import numpy as np
 
+from rbpf.core.checkpoint import integers, read_one
 from rbpf.core.genealogy import Lineage
 from rbpf.core.likelihoods import Gaussian
 from rbpf.core.linearisation import innovation_covariance, linearise
@@ -22,7 +23,6 @@ from rbpf.core.models import (
     Records,
 )
 from rbpf.core.particles import Information, Prior
-from rbpf.core.schema import integers, read_one
 from rbpf.errors import InputError
 from rbpf.kernels.landmarks import gather, project
 from rbpf.lie import LieGroup
@@ -52,7 +52,6 @@ class LandmarkMap(Map):
         self._planned: tuple[Sequence[Observations], Plan] | None = None
 
     def begin(self, n: int, lineage: Lineage) -> None:
-        """An empty map."""
         self.n = n
         self.store = SharedStore(n, lineage)
         self._engine = RowEngine(self.space, self.store, self._layout_of, self.compiled)
@@ -220,7 +219,6 @@ class LandmarkMap(Map):
         return self._engine.information(self._plan(for_state), state, for_state, prior)
 
     def correct(self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]) -> LogDensities:
-        """Log p(z | x) and the landmarks' Kalman updates at the sampled states."""
         uses = by_use(groups)
         require_apart(uses[STATE], uses[BOTH])
         log_density, after_sampling = np.zeros(self.n), np.zeros(self.n)
@@ -260,7 +258,6 @@ class LandmarkMap(Map):
         self.store.compact()
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Columns and kinds."""
         return self.store.arrays() | {"map/kinds": self.store.columns.kinds(self.ids)}
 
     def options(self) -> dict[str, object]:
@@ -272,11 +269,7 @@ class LandmarkMap(Map):
         return {"evidence": self.evidence, **kinds}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """The inverse of `arrays`; the parametrisations must have been registered in the same order.
-
-        Raises:
-            InputError: an array is missing, or is not what it should be.
-        """
+        """The inverse of `arrays`; the parametrisations must have been registered in the same order."""
         self.store.restore(arrays)
         count = self.store.columns.count
         entry = integers("landmarks", least=0, below="kinds")

@@ -1,8 +1,7 @@
 """How a landmark's estimate lies in a record of fixed size.
 
-A record holds, per component, the mean (D) and the covariance's lower triangle by rows (D(D+1)/2); then the
-components' log-weights where there are several; then the constants (A); then, where the map keeps them, the
-log-odds that the landmark exists.
+Per component the mean (D) and the covariance's lower triangle by rows (D(D+1)/2); the components' log-weights where there are
+several; the constants (A); where the map keeps them, the log-odds that the landmark exists.
 """
 
 from dataclasses import dataclass
@@ -37,8 +36,7 @@ class Layout:
     def pack(self, records: Records, log_odds: np.ndarray | None = None) -> np.ndarray:
         """Records of K landmarks as columns (K, fields, N).
 
-        Raises:
-            InputError: the shapes do not fit the parametrisation, or a number is not finite.
+        Raises InputError: the shapes do not fit, or a number is not finite.
         """
         n, k = records.mean.shape[:2]
         dim, components = self.landmark.dim, self.landmark.components

@@ -11,27 +11,18 @@ from rbpf.lie import SE2Group, SE3Group
 
 @final
 class Point(Landmark):
-    """A world point (x, y[, z]) in metres, E06 (6).
-
-    Args:
-        dim: 2 or 3.
-    """
+    """A world point (x, y[, z]) in metres, E06 (6), in 2 or 3 dimensions."""
 
     def __init__(self, dim: int = 3) -> None:
         self.dim = dim
 
     def homogeneous(self, mean: np.ndarray, const: np.ndarray | None = None) -> np.ndarray:
-        """(…, D) → (…, D+1)."""
         return np.concatenate([mean, np.ones((*mean.shape[:-1], 1))], axis=-1)
 
 
 @final
 class AnchoredPoint(Landmark):
-    """A point in the frame of an anchor, which is the record's constant: world_from_anchor (E,).
-
-    Args:
-        space: SE2 or SE3.
-    """
+    """A point in the frame of an anchor in SE2 or SE3, which is the record's constant: world_from_anchor (E,)."""
 
     def __init__(self, space: SE2Group | SE3Group) -> None:
         self.space = space
@@ -39,7 +30,6 @@ class AnchoredPoint(Landmark):
         self.constants = space.size
 
     def homogeneous(self, mean: np.ndarray, const: np.ndarray | None = None) -> np.ndarray:
-        """(…, D) in the anchor's frame → (…, D+1) in the world."""
         assert const is not None
         world = self.space.transform(const, mean)
         return np.concatenate([world, np.ones((*world.shape[:-1], 1))], axis=-1)
@@ -64,11 +54,9 @@ class MixturePoint(Landmark):
         self.reach = reach
 
     def homogeneous(self, mean: np.ndarray, const: np.ndarray | None = None) -> np.ndarray:
-        """(…, D) → (…, D+1)."""
         return np.concatenate([mean, np.ones((*mean.shape[:-1], 1))], axis=-1)
 
     def ready(self, records: Records) -> np.ndarray:
-        """Whether one component dominates, with those that have come to the same place, (N, K)."""
         assert records.log_weights is not None
         heaviest = records.log_weights.argmax(axis=-1)[..., None, None]
         mean = np.take_along_axis(records.mean, heaviest, axis=2)
@@ -79,16 +67,10 @@ class MixturePoint(Landmark):
 
 
 def ring(centre: np.ndarray, radius: np.ndarray, std_radius: float, components: int) -> Records:
-    """Gaussians along a circle, for a beacon whose range alone was measured.
+    """Gaussians along a circle, for a beacon whose range alone was measured; neighbours overlap at one standard deviation.
 
-    Args:
-        centre: (N, 2) positions of the sensor.
-        radius: (K,) ranges, metres.
-        std_radius: of the ranges, metres.
-        components: C; neighbours overlap at one standard deviation along the circle.
-
-    Returns:
-        Records with means (N, K, C, 2), covariances (N, K, C, 2, 2) and equal weights.
+    Centres (N, 2) of the sensor and ranges (K,), metres, with the deviation `std_radius`, give records with means
+    (N, K, C, 2), covariances (N, K, C, 2, 2) and equal weights.
     """
     angle = 2 * np.pi * np.arange(components) / components
     along = np.stack([np.cos(angle), np.sin(angle)], axis=-1)

@@ -81,16 +81,10 @@ class Plan:
 
 
 def make_plan(groups: Sequence[Observations], n: int, kinds: Kinds, plain: np.ndarray) -> Plan:
-    """Sorts the rows of all groups.
+    """Sorts the rows of all groups, which read a landmark.
 
-    Args:
-        groups: observations that read a landmark.
-        n: particles.
-        kinds: landmarks (K,) → numbers (K,) of their parametrisations, -1 where the map holds none.
-        plain: (kinds,) whether that parametrisation has a single component.
-
-    Raises:
-        InputError: ids are missing, have a wrong shape, or name a landmark that the map does not hold.
+    `kinds` gives landmarks (K,) the numbers (K,) of their parametrisations, -1 where the map holds none; `plain` (kinds,)
+    says whether one has a single component. Raises InputError: ids are missing, of a wrong shape, or of no landmark held.
     """
     plan = Plan(np.zeros(n))
     named = [_checked_ids(group, n, kinds) for group in groups]
@@ -189,11 +183,7 @@ def by_use(groups: Sequence[Observations]) -> dict[frozenset[Part], list[Observa
 
 
 def require_apart(weigh: Sequence[Observations], both: Sequence[Observations]) -> None:
-    """Rows of one landmark are correlated through it; those that do not update it cannot be stacked with others.
-
-    Raises:
-        InputError: a landmark is in both.
-    """
+    """Rows of one landmark are correlated through it; those that do not update it cannot be stacked with others."""
     if not weigh or not both:
         return
     seen = [np.concatenate([np.ravel(group.ids) for group in part if group.ids is not None]) for part in (weigh, both)]

@@ -11,8 +11,8 @@ from typing import final
 
 import numpy as np
 
+from rbpf.core.checkpoint import integers, numbers, read, read_one
 from rbpf.core.genealogy import DUE, Lineage, Schedule
-from rbpf.core.schema import integers, numbers, read, read_one
 from rbpf.errors import InputError
 from rbpf.ranges import require_memory
 
@@ -40,9 +40,8 @@ _FIRST_SLABS = 32
 class Columns:
     """Tables of columns, which come and go, in the order in which they came.
 
-    Memory and time follow the columns that are held, not those that ever were: a filter may run for ever in a world
-    that changes. Row r of every table is the column with the r-th id. Ids are the caller's, or counted up from the
-    largest that was ever used.
+    Memory and time follow the columns that are held, not those that ever were: a filter may run for ever in a world that
+    changes. Row r of every table is the column with the r-th id. Ids are the caller's, or counted up from the largest used.
     """
 
     def __init__(self) -> None:
@@ -62,7 +61,6 @@ class Columns:
 
     @property
     def ids(self) -> np.ndarray:
-        """(M,) of the columns held, in the order in which they were added."""
         return self._ids[: self.count]
 
     def rows(self, ids: np.ndarray) -> np.ndarray:
@@ -132,11 +130,7 @@ class Columns:
         self._ascending = self._ascending or not count
 
     def restore(self, ids: np.ndarray, next_id: int) -> None:
-        """Holds the columns (M,) and no others; their tables have to be filled again.
-
-        Raises:
-            InputError: an id comes twice.
-        """
+        """Holds the columns (M,) and no others; their tables have to be filled again. An id that comes twice is refused."""
         if np.unique(ids).size < ids.size:
             raise InputError("a landmark's id comes twice")
         room = max(_FIRST_ROWS, 2 * ids.size)
@@ -153,12 +147,7 @@ class Columns:
 
 
 class Pool:
-    """Dense slabs (slabs, fields, N) of equal record size, recycled through a free list.
-
-    Args:
-        fields: numbers per record.
-        n: particles.
-    """
+    """Dense slabs (slabs, fields, N) of equal record size, recycled through a free list."""
 
     def __init__(self, fields: int, n: int) -> None:
         self.data = self._slabs(_FIRST_SLABS, fields, n)
@@ -180,7 +169,6 @@ class Pool:
         return np.array(taken, dtype=np.int64)
 
     def give(self, slabs: np.ndarray) -> None:
-        """Returns slabs."""
         self._free.extend(slabs.tolist())
 
     def _slabs(self, count: int, fields: int, n: int) -> np.ndarray:
@@ -207,12 +195,7 @@ class Access:
 
 
 class SharedStore:
-    """Columns of records in N particles.
-
-    Args:
-        n: particles.
-        lineage: their ancestry.
-    """
+    """Columns of records in n particles, shared along their lineage."""
 
     def __init__(self, n: int, lineage: Lineage) -> None:
         self.n = n
@@ -231,11 +214,9 @@ class SharedStore:
 
     @property
     def next_id(self) -> int:
-        """One more than the largest id that was ever used."""
         return self.columns.next_id
 
     def __contains__(self, column: object) -> bool:
-        """Whether a column is alive."""
         return isinstance(column, int | np.integer) and bool(self.columns.held(np.array([column]))[0])
 
     def add(self, records: np.ndarray, column: int | None = None) -> int:
@@ -393,8 +374,7 @@ class SharedStore:
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """The inverse of `arrays`, into an empty store.
 
-        Raises:
-            InputError: an array is missing, or is not what it should be.
+        Raises InputError: an array is missing, or is not what it should be.
         """
         next_id = int(read_one(arrays, "store/size", integers(least=0)))
         sizes = {"generations": self.lineage.generation + 1, "ids": next_id, "n": self.n}

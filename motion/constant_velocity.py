@@ -38,11 +38,8 @@ class PosePrior:
 def velocity_walk(std_walk: np.ndarray, dt: float) -> np.ndarray:
     """Factor L (12, 12) of E06 (5), Q = L Lᵀ, Mathematics (velocity-factor); its first six columns move the pose.
 
-    The last six columns carry the variance δΣ/4 that the velocity keeps once the pose is given.
-
-    Args:
-        std_walk: (6,) σ of E06 (4): the velocity's random walk in one second, (rad/s, m/s)/√s.
-        dt: δ, seconds.
+    The last six carry the variance δΣ/4 that the velocity keeps once the pose is given. `std_walk` (6,) is σ of E06 (4), the
+    velocity's random walk in one second, (rad/s, m/s)/√s; `dt` is δ, seconds.
     """
     sigma = np.diag(std_walk)
     factor = np.zeros((12, 12))

@@ -28,10 +28,7 @@ class Odometry:
         return cls(space.identity(), np.zeros((space.dim, space.dim)))
 
     def then(self, later: "Odometry", space: LieGroup = SE3) -> "Odometry":
-        """One motion after another, with independent errors: C = Ad⁻¹ C₁ Ad⁻ᵀ + C₂ with Ad of the later one.
-
-        Mathematics (chain).
-        """
+        """One motion after another, with independent errors: C = Ad⁻¹ C₁ Ad⁻ᵀ + C₂ of the later one, Mathematics (chain)."""
         back = space.adjoint(space.inverse(later.delta))
         cov = gaussian.symmetrise(back @ self.cov @ back.T + later.cov)
         return Odometry(space.compose(self.delta, later.delta), cov)
@@ -47,9 +44,6 @@ class OdometryMotion(MotionModel):
             injects some and names no figure; none is the default, for covariances are tested.
         free: (d,) bool: the components of Log(delta) and of the noise that are kept, as `CAMERA_PLANE`, which keeps a
             camera in the x–z plane of its first pose (S05); the others are dropped. None keeps all.
-
-    Raises:
-        InputError: std_added is negative, not finite, or neither one number nor one per component.
     """
 
     def __init__(self, space: LieGroup, std_added: ArrayLike = 0.0, free: tuple[bool, ...] | None = None) -> None:
@@ -61,11 +55,7 @@ class OdometryMotion(MotionModel):
         self._free = None if free is None else np.diag(np.asarray(free, dtype=float))
 
     def transition(self, state: np.ndarray, control: Odometry | None, dt: float) -> Transition:
-        """The increment, the same for all particles.
-
-        Raises:
-            InputError: a shape does not fit, the increment is not finite, or its covariance is none.
-        """
+        """The increment, the same for all particles; refused is one that is not finite, or whose covariance is none."""
         d = self.space.dim
         if control is None:
             return Transition(state, np.zeros((1, d, d)))

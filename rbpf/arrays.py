@@ -1,9 +1,8 @@
 """Shapes of arrays in signatures: `Float[np.ndarray, "N K p"]`, `Like[ArrayLike, "... E"]`; arrays as kernels take them.
 
-For a type checker, and at run time, these are `typing.Annotated`: an array with a string that says its axes. The tests
-import jaxtyping (P. Kidger) before the package, get its types here, and check every call against them; the package
-needs no jaxtyping. The strings are in its notation: a letter is an axis, the same letter the same length in one
-call; `...` and `*name` any number of axes; `#` in front of an axis says that it may be 1.
+For a type checker, and at run time, these are `typing.Annotated`. The tests import jaxtyping (P. Kidger) before the
+package, get its types here, and check every call against them. The strings are in its notation: a letter is an axis, the
+same letter the same length in one call; `...` and `*name` any number of axes; `#` in front of an axis: it may be 1.
 
 Letters: N particles, K observations, E state storage, d its tangent, m linear substate, D landmark, A its constants,
 C components, p measurement, r noise rank.
@@ -29,11 +28,7 @@ __all__ = ["Bool", "Float", "Int", "Like", "numbers"]
 
 
 def numbers(array: ArrayLike, what: str) -> NDArray[np.float64]:
-    """What a user's code gave, as kernels take it: float64 of this machine, in C order, writable; copied only where it is not.
-
-    Raises:
-        InputError: they are no real numbers.
-    """
+    """Float64 of this machine, in C order, writable; copied only where it is not. Raises InputError: no real numbers."""
     given = np.asarray(array)
     if given.dtype.kind not in "fiub":
         raise InputError(f"{what} must hold real numbers, got {given.dtype}")

@@ -28,15 +28,7 @@ MOST = 10**7
 
 @dataclass(frozen=True)
 class Range:
-    """What a number may be.
-
-    Attributes:
-        ge: its lowest value.
-        gt: what it is above.
-        le: its highest value.
-        lt: what it is below.
-        odd: whether it must be odd.
-    """
+    """What a number may be: at least `ge`, above `gt`, at most `le`, below `lt`, perhaps odd."""
 
     ge: float = -LARGEST
     gt: float = -math.inf
@@ -50,7 +42,6 @@ class Range:
         return inside and (not self.odd or value % 2 == 1)
 
     def words(self) -> str:
-        """In words."""
         low = f"above {self.gt:.12g}" if self.gt >= self.ge else f"at least {self.ge:.12g}"
         high = f" and below {self.lt:.12g}" if self.lt <= self.le else f" and at most {self.le:.12g}"
         return f"{'odd, ' if self.odd else ''}{low}{'' if math.isinf(self.le) else high}"
@@ -79,12 +70,7 @@ class Ranged:
 
 
 class SettingError(InputError):
-    """A field has a value that it cannot have.
-
-    Attributes:
-        name: of the field.
-        words: what it must be, and what it is.
-    """
+    """A field, by its name, has a value that it cannot have; `words` say what it must be, and what it is."""
 
     def __init__(self, name: str, words: str) -> None:
         super().__init__(f"{name} {words}")
@@ -92,11 +78,7 @@ class SettingError(InputError):
 
 
 def check_ranges(settings: Any) -> None:
-    """Refuses a dataclass of which a field has another type than declared, or a number that is out of its range.
-
-    Raises:
-        SettingError: with the field's name, its value and what it may be.
-    """
+    """Refuses, by a SettingError, a field of another type than declared, or a number that is out of its range."""
     kind: Any = type(settings)
     for name, hint in _hints(kind).items():
         value = getattr(settings, name)
@@ -106,15 +88,7 @@ def check_ranges(settings: Any) -> None:
 
 
 def require_memory(size: float, what: str) -> None:
-    """Refuses what does not fit into the machine's memory, before it is allocated.
-
-    Args:
-        size: bytes.
-        what: needs them, for the message.
-
-    Raises:
-        InputError: the machine has less.
-    """
+    """Refuses what would take more bytes than the machine has, before it is allocated; `what` needs them, for the message."""
     memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     if size > memory:
         raise InputError(

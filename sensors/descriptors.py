@@ -13,8 +13,8 @@ from typing import Annotated, final
 
 import numpy as np
 
+from rbpf.core.checkpoint import integers, numbers, read
 from rbpf.core.models import NULL
-from rbpf.core.schema import integers, numbers, read
 from rbpf.errors import InputError
 from rbpf.ranges import Range, Ranged
 
@@ -293,7 +293,7 @@ class DescriptorStore:
         return {"descriptors/ids": self.ids.copy(), "descriptors/descriptors": self.descriptors.copy()}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """The inverse of `arrays`; errors as `rbpf.core.schema.read`."""
+        """The inverse of `arrays`; errors as `rbpf.core.checkpoint.read`."""
         self._ids, self._descriptors = read(arrays, _KEPT, "descriptors/", length=self.length).values()
         self._count = self._ids.size
 

@@ -11,7 +11,7 @@ from typing import Annotated, ClassVar, final
 
 import numpy as np
 
-from rbpf.core.schema import integers, read
+from rbpf.core.checkpoint import integers, read
 from rbpf.errors import InputError
 from rbpf.ranges import Count, CountOrNone, NotNegative, Range, Ranged
 from rbpf.sensors.descriptors import distances
@@ -151,7 +151,7 @@ class LandmarkManager:
         return {"key_manager/table": self._table.copy(), "key_manager/counters": np.array([self.frame, self.next_name])}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """The inverse of `arrays`; errors as `rbpf.core.schema.read`."""
+        """The inverse of `arrays`; errors as `rbpf.core.checkpoint.read`."""
         found = read(arrays, _KEPT, "key_manager/")
         self._table, (self.frame, self.next_name) = found["table"], found["counters"].tolist()
         if (np.diff(self.names, append=self.next_name) <= 0).any():

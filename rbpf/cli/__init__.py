@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 
 from rbpf import __version__
-from rbpf.cli import cameras, exporting, installed, judging
+from rbpf.cli import cameras, installed, judging
 from rbpf.cli.commands import Commands
 from rbpf.cli.compiling import require_threads
 from rbpf.cli.options import ImagesOptions, MonoOptions, Printed
@@ -60,7 +60,7 @@ APP.add("calibrate")(cameras.calibrate)
 APP.add("recalibrate")(cameras.recalibrate)
 APP.add("validate")(judging.validate)
 APP.add("report")(judging.report)
-APP.add("export")(exporting.export)
+APP.add("export")(judging.export)
 APP.add("sweep")(judging.sweep)
 APP.add("compare")(judging.compare)
 APP.add("doctor")(installed.doctor)
@@ -77,11 +77,7 @@ def _require_filled(arguments: list[str]) -> None:
 
 
 def _require_streams(wanted: bool) -> None:
-    """Gives what was closed (`>&-`) back, leading nowhere: else the next file that is opened would take its place.
-
-    Raises:
-        InputError: standard output is closed, and a result is `wanted` there.
-    """
+    """Gives what was closed (`>&-`) back, leading nowhere: else the next file that is opened would take its place."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:
             with suppress(OSError):

@@ -15,12 +15,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 class Commands(SubcommandApp):
-    """Commands, and groups of them, by name.
-
-    Args:
-        help: what the group is for.
-        first: called before each command of the group.
-    """
+    """Commands, and groups of them, by name; `first` is called before each command of the group."""
 
     def __init__(self, help: str | None = None, first: Callable[[], object] | None = None) -> None:
         super().__init__()
@@ -50,16 +45,7 @@ class Commands(SubcommandApp):
         self.command(group, name=name)
 
     def require_known(self, arguments: list[str], before: str) -> None:
-        """Refuses the name of a command or of an option that there is not.
-
-        Args:
-            arguments: as given.
-            before: the words that led here, for the message.
-
-        Raises:
-            InputError: the first argument names no command of this group, or the next ones none of that one's, or an
-                option that the command does not have.
-        """
+        """Refuses the name of a command or of an option that there is not; `before` are the words that led here."""
         if not arguments or arguments[0].startswith("-"):
             return
         name = arguments[0].replace("_", "-")

@@ -42,15 +42,9 @@ def cached(module: str) -> bool:
 
 
 def compile_kernels(every: bool = False) -> list[str]:
-    """Compiles what is not in the cache, with a word and a bar; with `every`, loads and tries all of them.
+    """Compiles what is not in the cache, with a word and a bar, and returns those modules; `every` also loads and tries all.
 
     Some are compiled as they are loaded, others at their first call: nothing is left that would be announced again.
-
-    Args:
-        every: also load and call those that are in the cache, which finds out whether they work.
-
-    Returns:
-        The modules that were compiled.
     """
     import rbpf.kernels  # noqa: F401  (discards copies that are older than their sources)
 
@@ -62,31 +56,23 @@ def compile_kernels(every: bool = False) -> list[str]:
     if work:
         work += [_search_patches, _measure_motion, _filter_log]
         with progress() as bar:
-            tell = bar("compiling" if missing else "trying the kernels")
-            tell(0, len(work))
+            report = bar("compiling" if missing else "trying the kernels")
+            report(0, len(work))
             for done, part in enumerate(work, 1):
                 part()
-                tell(done, len(work))
+                report(done, len(work))
     return missing
 
 
 def require_threads() -> None:
-    """Refuses a number of threads in the environment with which Numba cannot be imported, or would run what it likes.
-
-    Raises:
-        InputError: it is no whole number from 1 up.
-    """
+    """Refuses a number of threads in the environment with which Numba cannot be imported, or would run what it likes."""
     threads = os.environ.get("NUMBA_NUM_THREADS", "1")
     if not (threads.isdecimal() and int(threads) >= 1):
         raise InputError(f"the environment's NUMBA_NUM_THREADS must be a whole number from 1 up, got {threads!r}")
 
 
 def use_threads(threads: int | None) -> None:
-    """Sets the number of threads of the kernels; None leaves all.
-
-    Raises:
-        InputError: the machine does not have so many.
-    """
+    """Sets the number of threads of the kernels; None leaves all."""
     if threads is None:
         return
     import numba

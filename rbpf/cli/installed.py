@@ -32,7 +32,11 @@ def doctor(options: Annotated[DoctorOptions, tyro.conf.arg(name="")]) -> None:
 
     found, tried = machine(), parts()
     libraries = versions()
-    compiled = _compile() if options.compile else {}
+    compiled: dict[str, float] = {}
+    if options.compile:
+        started = time.perf_counter()
+        compile_kernels(every=True)
+        compiled = {"kernels_seconds": round(time.perf_counter() - started, 1)}
     missing = [name for name in kernel_modules() if not cached(name)]
     broken = [part for part in tried if part.needed and not part.works]
     entries = {
@@ -50,12 +54,6 @@ def doctor(options: Annotated[DoctorOptions, tyro.conf.arg(name="")]) -> None:
     answer(entries, options.json, *table({**found, **known, **lines, "kernels": kernels}, 26))
     if broken:
         raise InputError(f"{', '.join(part.name for part in broken)}: needed, and broken here; see above")
-
-
-def _compile() -> dict[str, float]:
-    started = time.perf_counter()
-    compile_kernels(every=True)
-    return {"kernels_seconds": round(time.perf_counter() - started, 1)}
 
 
 _ZSH = (

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-from rbpf.cli.showing import Told, say
+from rbpf.cli.showing import OnProgress, say
 
 
 class StoppedError(KeyboardInterrupt):
@@ -14,8 +14,8 @@ class StoppedError(KeyboardInterrupt):
 
 
 @contextmanager
-def patient(tell: Told) -> Iterator[Told]:
-    """What a run is to tell its progress to, in place of `tell`: after Ctrl-C it stops the run at the next frame.
+def patient(report: OnProgress) -> Iterator[OnProgress]:
+    """What a run reports its progress to, in place of `report`: after Ctrl-C it stops the run at the next frame.
 
     A second Ctrl-C stops it at once, without a checkpoint of its own.
     """
@@ -28,7 +28,7 @@ def patient(tell: Told) -> Iterator[Told]:
         say("stopping after this frame; Ctrl-C again stops at once …")
 
     def listening(done: int, total: int | None) -> None:
-        tell(done, total)
+        report(done, total)
         if asked.is_set():
             raise StoppedError(
                 f"stopped after {done} of {total or 'an unknown number'}; the same command with --resume goes on from there"

@@ -1,4 +1,4 @@
-"""Commands about finished runs: compare them with something, build their page, sweep over settings."""
+"""Commands about finished runs: compare them with something, build their page, export them, sweep over settings."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +13,8 @@ from rbpf.ranges import Count, Range
 
 if TYPE_CHECKING:
     from rbpf.validation.consistency.verdict import Verdict
+
+Format = Literal["tum", "kitti", "ply", "colmap", "rerun", "npz"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +41,7 @@ def validate(options: Annotated[ValidateOptions, tyro.conf.arg(name="")]) -> Non
         verdict = compare(options.run, options.against, options.out)
     # The page's first sentence is about the truth where there is one; who asked for another comparison wants that one.
     asked = [c.accuracy for c in read_comparisons(options.run) if c.against == options.against]
-    _tell(verdict, options.run, options.json, *(found for found in asked if found not in verdict.path.sentence))
+    _answer(verdict, options.run, options.json, *(found for found in asked if found not in verdict.path.sentence))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,13 +59,38 @@ def report(options: Annotated[ReportOptions, tyro.conf.arg(name="")]) -> None:
     """Build the report of a run again, from the files in its folder."""
     from rbpf.validation.report.page import write_report
 
-    _tell(write_report(options.run), options.run, options.json)
+    _answer(write_report(options.run), options.run, options.json)
 
 
-def _tell(verdict: "Verdict", run: Path, as_json: bool, *first: str) -> None:
+def _answer(verdict: "Verdict", run: Path, as_json: bool, *first: str) -> None:
     page, said = run / "report.html", [*first, *verdict.said]
     entries = {"path_grade": verdict.path.grade, "trust": verdict.trust, "sentences": said, "report": str(page)}
     answer(entries, as_json, *said, f"the page is {page}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportOptions(Printed):
+    """Options of `rbpf export`.
+
+    Attributes:
+        run: folder that `rbpf run` left.
+        format: one or several: trajectory as TUM or KITTI, map and path as PLY, a COLMAP model, a Rerun recording,
+            everything as one NumPy archive.
+        out: folder for the files; by default RUN/export.
+    """
+
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
+    format: tuple[Format, ...]
+    out: Where = None
+
+
+def export(options: Annotated[ExportOptions, tyro.conf.arg(name="")]) -> None:
+    """Write a run in the formats of other programs."""
+    from rbpf.validation.exports import export_run
+
+    out = options.out or options.run / "export"
+    paths = [str(path) for path in export_run(options.run, options.format, out)]
+    answer({"files": paths}, options.json, *(f"wrote {path}" for path in paths))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,7 +136,7 @@ class CompareOptions(Printed):
     Attributes:
         run_a: folder that `rbpf run` left.
         run_b: another one of the same recording.
-        seeds: runs of each, from which the error is told.
+        seeds: runs of each, from which the error is estimated.
         workers: processes; -1 is one per core.
     """
 

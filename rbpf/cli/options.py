@@ -39,11 +39,6 @@ class Printed:
     json: Flag = False
 
     def __post_init__(self) -> None:
-        """Checks the ranges that are declared at the options.
-
-        Raises:
-            InputError: with the option as it is given on the command line.
-        """
         try:
             check_ranges(self)
         except SettingError as error:
@@ -317,11 +312,7 @@ def given_part(options: PartOptions) -> "Part":
 
 
 def given_markers(options: MonoOptions) -> "MarkerBoard | None":
-    """The board of `--aruco` and `--marker`.
-
-    Raises:
-        InputError: one of the two is missing or makes no sense.
-    """
+    """The board of `--aruco` and `--marker`."""
     if options.aruco is None and options.marker is None:
         return None
     if options.aruco is None or options.marker is None:
@@ -332,11 +323,7 @@ def given_markers(options: MonoOptions) -> "MarkerBoard | None":
 
 
 def given_board(size: str | None, square_m: float | None) -> "Board | None":
-    """The chessboard of `--board` and `--square`.
-
-    Raises:
-        InputError: one of the two is missing or makes no sense.
-    """
+    """The chessboard of `--board` and `--square`."""
     if size is None and square_m is None:
         return None
     if size is None or square_m is None:

@@ -22,7 +22,7 @@ from rbpf.cli.options import (
     given_part,
     given_topics,
 )
-from rbpf.cli.showing import Told, answer, progress, say
+from rbpf.cli.showing import OnProgress, answer, progress, say
 from rbpf.errors import InputError
 
 if TYPE_CHECKING:
@@ -49,9 +49,9 @@ def run_range_bearing(options: Annotated[RangeBearingOptions, tyro.conf.arg(name
     named = given(options, "particles", "seed", "association")
     config = load_settings(RangeBearingConfig, "range-bearing", options.config, options.set, named)
     with _prepared(options) as out:
-        with progress() as bar, patient(bar("filtering")) as tell:
+        with progress() as bar, patient(bar("filtering")) as report:
             recording = RobotRecording(options.log, given_part(options))
-            run = filter_recording(recording, config, out, options.resume, [listener(tell)])
+            run = filter_recording(recording, config, out, options.resume, [listener(report)])
         if options.batch:
             say("solving the batch problem with the same measurements …")
         with finishing():
@@ -105,11 +105,7 @@ def run_stereo(options: Annotated[StereoOptions, tyro.conf.arg(name="")]) -> Non
 
 
 def repeated(arguments: list[str]) -> list[str]:
-    """`run --from RUN/config.yaml …` as the command that the run was started with, and its settings.
-
-    Raises:
-        InputError: the file does not tell a run, or its recording has changed.
-    """
+    """`run --from RUN/config.yaml …` as the command that the run was started with, and its settings."""
     if arguments[:1] != ["run"] or "--from" not in arguments[:2]:
         return arguments
     if len(arguments) < 3:
@@ -129,9 +125,9 @@ def repeated(arguments: list[str]) -> list[str]:
     return ["run", origin.system, origin.recording, *options, *out, *arguments[3:]]
 
 
-def listener(tell: Told) -> Callable[["Run", object], None]:
-    """What follows a run and tells how many frames are done, and of how many."""
-    return lambda run, _: tell(len(run.log), run.expected or 0)
+def listener(report: OnProgress) -> Callable[["Run", object], None]:
+    """What follows a run and reports how many frames are done, and of how many."""
+    return lambda run, _: report(len(run.log), run.expected or 0)
 
 
 def _run_images(options: ImageRunOptions, recording: "Recording", config: Any, video: bool) -> None:
@@ -143,8 +139,8 @@ def _run_images(options: ImageRunOptions, recording: "Recording", config: Any, v
     if options.rerun is not None:
         require_rerun()
     with _prepared(options) as out, progress() as bar:
-        with patient(bar("filtering")) as tell:
-            run = filter_recording(recording, config, out, options.resume, [listener(tell)])
+        with patient(bar("filtering")) as report:
+            run = filter_recording(recording, config, out, options.resume, [listener(report)])
         solving = bar("batch")
         callbacks = Callbacks(
             on_frame=bar("drawing"),
@@ -158,11 +154,7 @@ def _run_images(options: ImageRunOptions, recording: "Recording", config: Any, v
 
 @contextmanager
 def _prepared(options: RunOptions) -> Iterator[Path]:
-    """Threads as asked for, and the folder for the results, which nobody else writes to.
-
-    Raises:
-        InputError: the folder holds a run that is neither to be resumed nor written over, or cannot be written to.
-    """
+    """Threads as asked for, and the folder for the results, which nobody else writes to."""
     from rbpf.runs.files import holds_run, numbered, own_folder
 
     if options.resume and options.overwrite:

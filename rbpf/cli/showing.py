@@ -14,38 +14,25 @@ from rbpf.errors import printable
 
 CONSOLE = Console(stderr=True)
 
-Told = Callable[[int, int | None], None]
-"""Something that is told how many are done, and of how many; None where that is not known."""
+OnProgress = Callable[[int, int | None], None]
+"""Called with how many are done, and of how many; None where that is not known."""
 
 
 @contextmanager
-def progress() -> Iterator[Callable[[str], Told]]:
-    """Bars with the time that has passed and an estimate of what is left, each shown from the first time that it is told.
+def progress() -> Iterator[Callable[[str], OnProgress]]:
+    """Makes bars by name: each a callback for what is done, shown from its first call."""
+    done, left = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()), (TextColumn("left:"), TimeRemainingColumn())
+    bars = Progress(TextColumn("{task.description}"), *done, *left, console=CONSOLE)
 
-    What is refused before anything is done has no bar.
-
-    Yields:
-        Makes a bar of what is done, and returns what is to be told how much is done, and of how much.
-    """
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left:"),
-        TimeRemainingColumn(),
-    )
-    bars = Progress(*columns, console=CONSOLE)
-
-    def bar(what: str) -> Told:
+    def bar(what: str) -> OnProgress:
         task = bars.add_task(what, start=False, visible=False)
 
-        def tell(done: int, total: int | None) -> None:
+        def report(done: int, total: int | None) -> None:
             bars.start()
             bars.start_task(task)
             bars.update(task, completed=done, total=total or None, visible=True)
 
-        return tell
+        return report
 
     try:
         yield bar
@@ -56,7 +43,7 @@ def progress() -> Iterator[Callable[[str], Told]]:
 
 @contextmanager
 def waiting(what: str) -> Iterator[None]:
-    """A line with a turning mark, for work that cannot tell how far it is."""
+    """A line with a turning mark, for work that cannot report how far it is."""
     with CONSOLE.status(what):
         yield
 

@@ -54,11 +54,7 @@ def check_model(
 def require_sound(
     model: object, space: LieGroup | None = None, rng: np.random.Generator | None = None, example: Example | None = None
 ) -> None:
-    """As `check_model`, but raises.
-
-    Raises:
-        InputError: something is wrong; the message holds all findings.
-    """
+    """As `check_model`, but raises. Raises InputError: something is wrong; the message holds all findings."""
     findings = check_model(model, space, rng, example)
     if findings:
         raise InputError("; ".join(findings))

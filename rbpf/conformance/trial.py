@@ -50,15 +50,7 @@ class Example:
 
 @dataclass(frozen=True)
 class Scene:
-    """Arguments of an observation model.
-
-    Attributes:
-        space: group of the state.
-        state: (N, 1, E).
-        landmark: (N, K, D).
-        const: (N, K, A), the landmarks' constants.
-        substate: (N, 1, m).
-    """
+    """Arguments of an observation model: state (N, 1, E), landmark (N, K, D), const (N, K, A), substate (N, 1, m)."""
 
     space: LieGroup
     state: np.ndarray
@@ -68,11 +60,7 @@ class Scene:
 
     @classmethod
     def draw(cls, model: ObservationModel, space: LieGroup, rng: np.random.Generator, example: Example) -> "Scene":
-        """Random states and, around the origin, landmarks that are visible from them.
-
-        Raises:
-            InputError: the size of the substate is not known, or too few random landmarks are visible.
-        """
+        """Random states and, around the origin, landmarks that are visible from them. Raises InputError: too few are."""
         scene = cls(space, example.states(space, rng)[:, None, :])
         if Part.SUBSTATE in model.reads:
             if example.substate < 1:
@@ -99,7 +87,6 @@ class Scene:
 
     @property
     def args(self) -> tuple[Any, ...]:
-        """In the order of `ObservationModel.predict`."""
         return self.state, self.landmark, self.const, self.substate
 
     @property

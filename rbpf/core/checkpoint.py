@@ -1,4 +1,4 @@
-"""Files of named plain arrays, and checkpoints: arrays with a header and a digest that a damaged file cannot keep.
+"""Files of named plain arrays; checkpoints, arrays with a header and a digest; and what the arrays of a file must be.
 
 A file is a NumPy `.npz` archive, never pickled, and read without trusting a header. What a header claims is compared with
 the file's own size before anything is allocated: members are stored as they are, uncompressed, so that no file unfolds into
@@ -13,14 +13,16 @@ import math
 import os
 import re
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO, Literal
 
 import numpy as np
 
 from rbpf.errors import InputError
+from rbpf.lie import SE3, LieGroup
 
 VERSION = 1
 """Of the format of checkpoints."""
@@ -29,17 +31,18 @@ LONGEST_HEADER = 1 << 16
 """Bytes of an array's header; NumPy's own are of about a hundred."""
 
 _MAGIC = b"\x93NUMPY"
+UNREADABLE = (
+    OSError, ValueError, LookupError, ArithmeticError, AttributeError, TypeError, RuntimeError, EOFError, MemoryError,
+    SyntaxError, zipfile.BadZipFile,
+)  # fmt: skip
+"""What a file that is cut off, damaged or made up can raise, read by zipfile and NumPy."""
 NOT_PLAIN = "it must hold truth values, numbers or text"
 _PLAIN = re.compile(r"[<>|][biufU]\d{1,9}")
 """Types of arrays that are read: truth values, numbers, text."""
 
 
 def save_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Writes an `.npz` under a temporary name, then renames it.
-
-    Raises:
-        InputError: the place cannot be written to or is full, or an array is none that `load_arrays` reads.
-    """
+    """Writes an `.npz`, whole or not at all. Raises InputError: the place is full or forbidden, or an array is not plain."""
     for name, array in arrays.items():
         try:
             _require_plain(np.asarray(array))
@@ -63,25 +66,16 @@ def save_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
 
 
 def open_new(path: Path) -> BinaryIO:
-    """A file that was not there before, to be written: what bears the name, a link to another file too, is removed.
-
-    Raises:
-        OSError: the place cannot be written to.
-    """
+    """A file that was not there before, to be written: what bears the name, a link to another file too, is removed."""
     path.unlink(missing_ok=True)
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
     return os.fdopen(os.open(path, flags, 0o666), "wb")
 
 
 def load_arrays(path: Path, only: str | None = None) -> dict[str, np.ndarray]:
-    """Reads every array of an `.npz` that `save_arrays` wrote; they may be written to.
+    """Reads all arrays of an `.npz` that `save_arrays` wrote, or the one called `only` if there is one; all writable.
 
-    Args:
-        path: of the file.
-        only: name of the one array to read; the result is empty where there is none of this name.
-
-    Raises:
-        InputError: the file is missing, cut off or not an archive of plain arrays.
+    Raises InputError: the file is missing, cut off or not an archive of plain arrays.
     """
     try:
         if not os.path.isfile(path) and os.path.exists(path):
@@ -95,30 +89,13 @@ def load_arrays(path: Path, only: str | None = None) -> dict[str, np.ndarray]:
             return {name: _array(archive, named[name]) for name in wanted}
     except FileNotFoundError as error:
         raise InputError(f"{path} does not exist") from error
-    except (
-        OSError,
-        ValueError,
-        EOFError,
-        KeyError,
-        zipfile.BadZipFile,
-        NotImplementedError,
-        AttributeError,
-        TypeError,
-        RuntimeError,
-        MemoryError,
-        SyntaxError,
-        OverflowError,
-    ) as error:
+    except UNREADABLE as error:
         raise InputError(f"{path} is damaged or cut off: it is not a complete archive of arrays") from error
 
 
 @contextmanager
 def fitting(path: Path) -> Iterator[None]:
-    """Around the reading of a checkpoint's arrays: those that do not fit together make one clear sentence.
-
-    Raises:
-        InputError: an array is missing, or is not what it should be.
-    """
+    """Around the reading of a checkpoint's arrays: one InputError says in a sentence that they do not fit together."""
     try:
         yield
     except InputError as error:
@@ -133,27 +110,13 @@ def fitting(path: Path) -> Iterator[None]:
 def write_checkpoint(
     path: Path, arrays: dict[str, np.ndarray], fingerprint: Mapping[str, object], rng_state: Mapping[str, object]
 ) -> None:
-    """Saves arrays with what they belong to; the file appears under its name only when it is complete.
-
-    Args:
-        path: of the file.
-        arrays: by name.
-        fingerprint: what must agree between who saves and who loads; plain values by name.
-        rng_state: of the random generator.
-
-    Raises:
-        InputError: see `save_arrays`.
-    """
-    header = {"version": VERSION, "fingerprint": fingerprint, "rng": _jsonable(rng_state), "digest": _digest(arrays)}
-    save_arrays(path, {"header": np.array(json.dumps(header)), **arrays})
+    """Saves arrays with what they belong to: plain values by name that must agree between who saves and who loads."""
+    header = {"version": VERSION, "fingerprint": fingerprint, "rng": rng_state, "digest": _digest(arrays)}
+    save_arrays(path, {"header": np.array(json.dumps(header, default=lambda value: value.tolist())), **arrays})
 
 
 def read_checkpoint(path: Path, fingerprint: Mapping[str, object]) -> tuple[dict[str, np.ndarray], dict[str, object]]:
-    """The arrays of a checkpoint, and the state of the random generator.
-
-    Raises:
-        InputError: the file is missing, damaged, of another version or of another filter.
-    """
+    """The arrays, and the state of the random generator. Raises InputError: missing, damaged, of another version or filter."""
     arrays = load_arrays(path)
     try:
         header = json.loads(str(arrays.pop("header")))
@@ -224,9 +187,170 @@ def _digest(arrays: dict[str, np.ndarray]) -> str:
     return digest.hexdigest()
 
 
-def _jsonable(value: object) -> object:
-    if isinstance(value, dict):
-        return {name: _jsonable(item) for name, item in value.items()}
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    return int(value) if isinstance(value, np.integer) else value
+# What the arrays of a file must be: declared once for each state, checked before anything follows an index or a size.
+#
+#     FEATURES = {"px": numbers("features", 2), "member": integers("features", least=-1, below="members")}
+#     found = read(arrays, FEATURES, "features/", members=5)
+#
+# A size that has a name is the same wherever the name comes: the first array that has it says what it is, or the caller.
+
+LARGEST = 1e30
+"""No number is larger, so that squares stay finite."""
+
+_WORDS = {"f": "numbers", "i": "whole numbers", "u": "whole numbers", "b": "truth values", "U": "text"}
+_CLOSE = 1e-6
+"""Quaternions of poses are of unit length up to this."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What one array must be.
+
+    Attributes:
+        dtype: that it is read as.
+        shape: sizes, or names of sizes; "" for any.
+        least: its lowest value.
+        below: above its highest value; a number, or the name of a size.
+        values: "finite"; "log" also takes −∞; "any" also +∞ and NaN.
+        space: group whose elements the last axis holds; None for plain numbers.
+        ascending: each value is above the one before.
+        refers: name of an array of the same file that holds all of its values.
+    """
+
+    dtype: type
+    shape: tuple[int | str, ...]
+    least: float | None = None
+    below: int | str | None = None
+    values: Literal["finite", "log", "any"] = "finite"
+    space: LieGroup | None = None
+    ascending: bool = False
+    refers: str | None = None
+
+    def empty(self, **sizes: int) -> np.ndarray:
+        """An array without rows."""
+        shape = [sizes[size] if isinstance(size, str) else size for size in self.shape[1:]]
+        return np.zeros((0, *shape), self.dtype)
+
+
+Schema = Mapping[str, Entry]
+
+
+def numbers(*shape: int | str, **options: Any) -> Entry:
+    """Floating-point numbers, see `Entry`."""
+    return Entry(**{"dtype": np.float64, "shape": shape, **options})
+
+
+def integers(*shape: int | str, **options: Any) -> Entry:
+    """Whole numbers, see `Entry`."""
+    return Entry(**{"dtype": np.int64, "shape": shape, **options})
+
+
+def truths(*shape: int | str) -> Entry:
+    """Truth values."""
+    return Entry(np.bool_, shape)
+
+
+def grey(*shape: int | str) -> Entry:
+    """Grey levels of images."""
+    return Entry(np.uint8, shape)
+
+
+def elements(space: LieGroup, *shape: int | str) -> Entry:
+    """Elements (…, E) of a group."""
+    return Entry(np.float64, (*shape, space.size), space=space)
+
+
+def poses(*shape: int | str) -> Entry:
+    """Elements (…, 7) of SE(3)."""
+    return elements(SE3, *shape)
+
+
+def text(*shape: int | str) -> Entry:
+    """Text."""
+    return Entry(np.str_, shape)
+
+
+def read(arrays: Mapping[str, np.ndarray], schema: Schema, prefix: str = "", **sizes: int) -> dict[str, np.ndarray]:
+    """The arrays of a schema, without the prefix of their names; copies, of the schema's types.
+
+    Args:
+        arrays: of a file.
+        schema: what they must be; in this order sizes get their names.
+        prefix: of their names in the file.
+        sizes: that are known beforehand.
+
+    Raises:
+        InputError: one is missing, or is not what it should be.
+    """
+    sizes = dict(sizes)
+    return {name: _read(arrays, prefix + name, entry, sizes) for name, entry in schema.items()}
+
+
+def read_one(arrays: Mapping[str, np.ndarray], name: str, entry: Entry, **sizes: int) -> np.ndarray:
+    """One array; errors as `read`."""
+    return _read(arrays, name, entry, sizes)
+
+
+def split(rows: np.ndarray, counts: Sequence[int], name: str) -> list[np.ndarray]:
+    """The rows of an array as so many each. Raises InputError: there are not as many rows."""
+    if sum(counts) != len(rows):
+        raise InputError(f"the array {name} has {len(rows)} rows, expected {sum(counts)}")
+    return np.split(rows, np.cumsum(counts)[:-1]) if len(counts) else []
+
+
+def _read(arrays: Mapping[str, np.ndarray], name: str, entry: Entry, sizes: dict[str, int]) -> np.ndarray:
+    array = arrays.get(name)
+    if array is None:
+        raise InputError(f"the array {name} is missing")
+    # Type and shape; a size that is named for the first time is what it is here.
+    wanted = np.dtype(entry.dtype)
+    kinds = {"i": "iu", "f": "fiub" if entry.values == "any" else "f"}.get(wanted.kind, wanted.kind)
+    fits = array.dtype.kind in kinds and array.ndim == len(entry.shape)
+    if fits:
+        for size, expected in zip(array.shape, entry.shape, strict=True):
+            if isinstance(expected, str) and expected:
+                expected = sizes.setdefault(expected, size)
+            fits = fits and expected in ("", size)
+    if not fits:
+        shape = ", ".join(_sized(expected, sizes) for expected in entry.shape)
+        raise InputError(
+            f"the array {name} must hold {_WORDS[wanted.kind]} of shape ({shape}), got {array.shape} {array.dtype}"
+        )
+    if wanted.kind == "f" and entry.values != "any":
+        is_right = np.abs(array) <= LARGEST
+        if entry.values == "log":
+            is_right |= np.isneginf(array)
+        _require(is_right, array, name, "finite numbers")
+    # What is followed: indices, counts, ranges.
+    below = sizes[entry.below] if isinstance(entry.below, str) else entry.below
+    if wanted.kind == "i":
+        least = -(2**62) if entry.least is None else entry.least
+        below = 2**62 if below is None else below
+        _require((array >= least) & (array < below), array, name, f"whole numbers from {least} to {below - 1}")
+    elif entry.least is not None:
+        _require(array >= entry.least, array, name, f"numbers of at least {entry.least:g}")
+    if entry.ascending:
+        _require(np.diff(array, prepend=array[:1] - 1) > 0, array, name, "ascending numbers")
+    if entry.refers is not None:
+        held = np.isin(array, arrays.get(entry.refers, array[:0]))
+        _require(held, array, name, f"what {entry.refers} holds")
+    space = entry.space
+    if space is not None and space.size > space.dim:
+        with np.errstate(all="ignore"):
+            off = np.abs(space.normalise(array) - array)
+        _require(off <= _CLOSE, array, name, "poses, of unit quaternions")
+    return array.astype(wanted) if wanted.kind != "U" else array
+
+
+def _require(is_right: np.ndarray, array: np.ndarray, name: str, words: str) -> None:
+    """Refuses an array whose rows are not all right, with the first that is not."""
+    if not np.all(is_right):
+        row = tuple(int(i) for i in np.argwhere(~np.asarray(is_right))[0])
+        where = f" at {', '.join(map(str, row))}" if row else ""
+        raise InputError(f"the array {name} must hold {words}, got {array[row].tolist()}{where}")
+
+
+def _sized(expected: int | str, sizes: Mapping[str, int]) -> str:
+    if isinstance(expected, int):
+        return str(expected)
+    return f"{expected} = {sizes[expected]}" if expected in sizes else expected or "any"

@@ -1,24 +1,12 @@
-"""Numbers that tell whether a filter is healthy: effective sample size, NIS, NEES, ancestor diversity."""
+"""Numbers that tell whether a filter is healthy: NEES and its band, ancestors, corrections of the motion."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from rbpf.core.genealogy import History, Lineage
-from rbpf.core.particles import Estimate, Prior, Proposed, effective_sample_size
+from rbpf.core.genealogy import History
+from rbpf.core.particles import Estimate, Prior, Proposed
 from rbpf.lie import LieGroup
-
-__all__ = [
-    "Band",
-    "Correction",
-    "ancestor_diversity",
-    "ancestors_by_step",
-    "chi_square_band",
-    "coalescence_steps",
-    "effective_sample_size",
-    "motion_correction",
-    "nees",
-]
 
 
 @dataclass(frozen=True)
@@ -31,39 +19,21 @@ class Band:
 
 
 def nees(space: LieGroup, estimate: Estimate, truth: np.ndarray) -> float:
-    """Normalised estimation error squared eᵀP⁺e, e = Log(mean⁻¹ truth); its mean is d for a consistent filter.
-
-    Args:
-        space: group of the state.
-        estimate: mean and covariance in the chart at the mean.
-        truth: (E,).
-    """
+    """Normalised estimation error squared eᵀP⁺e, e = Log(mean⁻¹ truth), truth (E,); its mean is d for a consistent filter."""
     error = space.local(estimate.mean, truth)
     return float(error @ np.linalg.pinv(estimate.cov, hermitian=True) @ error)
 
 
 def chi_square_band(dof: float, runs: int = 1, probability: float = 0.95) -> Band:
-    """Band of the mean over independent runs of a χ² variable (Bar-Shalom, Li, Kirubarajan 2001, §5.4).
+    """Band of the mean over `runs` independent χ² variables of `dof` degrees of freedom each.
 
-    Args:
-        dof: degrees of freedom of one run.
-        runs: how many were averaged.
-        probability: that a consistent filter stays inside.
+    A consistent filter stays inside with the given probability (Bar-Shalom, Li, Kirubarajan 2001, §5.4).
     """
     from scipy.stats import chi2
 
     tail = 0.5 * (1.0 - probability)
     low, high = chi2.ppf([tail, 1.0 - tail], dof * runs) / runs
     return Band(float(low), float(dof), float(high))
-
-
-def ancestor_diversity(lineage: Lineage, ages: list[int]) -> dict[int, int]:
-    """Distinct ancestors of the present particles, by age in resamplings.
-
-    Ages whose generation is no longer kept are left out.
-    """
-    wanted = {age: lineage.generation - age for age in ages}
-    return {age: lineage.distinct(g) for age, g in wanted.items() if lineage.is_retained(g)}
 
 
 def ancestors_by_step(history: History) -> np.ndarray:

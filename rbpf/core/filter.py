@@ -16,8 +16,7 @@ import numpy as np
 
 from rbpf import gaussian
 from rbpf.arrays import numbers
-from rbpf.core import schema
-from rbpf.core.checkpoint import fitting, read_checkpoint, write_checkpoint
+from rbpf.core import checkpoint
 from rbpf.core.genealogy import History, Lineage
 from rbpf.core.marginals import Marginals
 from rbpf.core.models import (
@@ -91,7 +90,11 @@ class StepReport:
         return mixture_estimate(*self.mixture, self.second)
 
 
-_FILTER = {"numbers": schema.integers(2), "started": schema.truths(), "log_evidence": schema.numbers(values="any")}
+_FILTER = {
+    "numbers": checkpoint.integers(2),
+    "started": checkpoint.truths(),
+    "log_evidence": checkpoint.numbers(values="any"),
+}
 
 
 class Filter:
@@ -154,11 +157,10 @@ class Filter:
 
     @property
     def n(self) -> int:
-        """Number of particles."""
         return self.particles.n
 
     def expect(self, control: object = None, stamp_ns: int | None = None) -> Belief:
-        """What `step` would tell the sensors, for looking at a frame before it is filtered; no particle moves."""
+        """The belief that `step` would give the sensors, for looking at a frame before it is filtered; no particle moves."""
         _, dt = self._clock(stamp_ns)
         return Belief(self.particles.log_weights, self._predict(control, dt), self.marginals.parts, self.rng)
 
@@ -176,9 +178,9 @@ class Filter:
             proposal: of this step, where the filter's own would not do.
 
         Raises:
-            InputError: time runs backwards, shapes do not fit, or no particle explains the observations. If the
-                error is about what came in before the particles are weighed (time, control, measurements), the
-                filter is as it was before the step; otherwise it stands between two steps: `load` a checkpoint.
+            InputError: time runs backwards, shapes do not fit, or no particle explains the observations. If the error is about
+                what came in before the particles are weighed (time, control, measurements), the filter is as it was;
+                otherwise it stands between two steps: `load` a checkpoint.
         """
         # Predict, and observe given the prediction.
         stamp_ns, dt = self._clock(stamp_ns)
@@ -267,13 +269,8 @@ class Filter:
     ) -> np.ndarray:
         """A step along given states (E,) or (N, E): what is marginalised is conditioned on them, p(m | x_0:t, z_1:t).
 
-        Mapping with known poses, or the maps of paths that were drawn elsewhere. The weights stay as they are.
-
-        Returns:
-            (N,) log-likelihood of the observations.
-
-        Raises:
-            InputError: see `step`, which has the same arguments.
+        Mapping with known poses, or the maps of paths that were drawn elsewhere. The weights stay as they are. Arguments and
+        errors as `step`; returns the log-likelihood (N,) of the observations.
         """
         stamp_ns, dt = self._clock(stamp_ns)
         state = checked_start(np.asarray(state, dtype=float), self.n, self.space)
@@ -298,11 +295,7 @@ class Filter:
         return Belief(self.particles.log_weights, here, self.marginals.parts, self.rng)
 
     def save(self, path: Path | str, extra: dict[str, np.ndarray] | None = None) -> None:
-        """Writes a checkpoint from which `load` goes on as if nothing had happened, with arrays of the caller's.
-
-        Raises:
-            InputError: the file cannot be written.
-        """
+        """A checkpoint from which `load` goes on as if nothing had happened, with arrays of the caller's."""
         arrays = {
             "particles/state": self.particles.state,
             "particles/log_weights": self.particles.log_weights,
@@ -315,24 +308,22 @@ class Filter:
             **self.marginals.arrays(),
             **{f"extra/{name}": array for name, array in (extra or {}).items()},
         }
-        write_checkpoint(Path(path), arrays, self._fingerprint(), self.rng.bit_generator.state)
+        checkpoint.write_checkpoint(Path(path), arrays, self._fingerprint(), self.rng.bit_generator.state)
 
     def load(self, path: Path | str) -> dict[str, np.ndarray]:
-        """Continues from a checkpoint; this filter must have been built with the same models and options.
+        """Continues from a checkpoint, in a filter built with the same models and options; returns the `extra` arrays.
 
-        Returns:
-            The `extra` arrays that were saved.
-
-        Raises:
-            InputError: the file is missing, damaged, or belongs to another filter.
+        Raises InputError: the file is missing, damaged, or belongs to another filter.
         """
-        arrays, rng_state = read_checkpoint(Path(path), self._fingerprint())
-        with self._unchanged_by_failure(), fitting(Path(path)):
-            state = schema.read_one(arrays, "particles/state", schema.elements(self.space, "n"), n=self.n)
-            log_weights = schema.read_one(arrays, "particles/log_weights", schema.numbers("n", values="log"), n=self.n)
+        arrays, rng_state = checkpoint.read_checkpoint(Path(path), self._fingerprint())
+        with self._unchanged_by_failure(), checkpoint.fitting(Path(path)):
+            state = checkpoint.read_one(arrays, "particles/state", checkpoint.elements(self.space, "n"), n=self.n)
+            log_weights = checkpoint.read_one(
+                arrays, "particles/log_weights", checkpoint.numbers("n", values="log"), n=self.n
+            )
             if abs(np.logaddexp.reduce(log_weights)) > 1e-6:
                 raise InputError("the particles' weights do not sum to 1")
-            counted = schema.read(arrays, _FILTER, "filter/")
+            counted = checkpoint.read(arrays, _FILTER, "filter/")
             lineage = Lineage(self.n)
             lineage.restore(arrays)
             history = History(lineage, self.history.lag, self.history.clouds)
@@ -347,7 +338,7 @@ class Filter:
             self.steps, self.stamp_ns = steps, stamp if counted["started"] else None
             self.log_evidence = float(counted["log_evidence"])
             if self.consolidation is not None:
-                self._age = int(schema.read_one(arrays, "filter/age", schema.integers(least=0)))
+                self._age = int(checkpoint.read_one(arrays, "filter/age", checkpoint.integers(least=0)))
             self.rng.bit_generator.state = rng_state
         return {name.removeprefix("extra/"): array for name, array in arrays.items() if name.startswith("extra/")}
 
@@ -432,11 +423,7 @@ def mean_count(counts: np.ndarray, weights: np.ndarray) -> float:
 
 
 def checked_transition(transition: Transition, state: np.ndarray, space: LieGroup, what: str) -> Transition:
-    """A transition of the states (N, E), its arrays as the kernels take them.
-
-    Raises:
-        InputError: its mean or noise factor has the wrong shape, or is not finite.
-    """
+    """A transition as the kernels take it. Raises InputError: mean or noise factor has the wrong shape, or is not finite."""
     given = {name: array for name, array in vars(transition).items() if array is not None}
     transition = Transition(**{name: numbers(array, f"{what}: {name}") for name, array in given.items()})
     mean, factor, n = transition.mean, transition.noise_factor, state.shape[0]
@@ -453,11 +440,7 @@ def checked_transition(transition: Transition, state: np.ndarray, space: LieGrou
 
 
 def checked_observations(group: Observations) -> Observations:
-    """A group of observations, its arrays as the kernels take them.
-
-    Raises:
-        InputError: z or cov has the wrong shape, or is not finite, or a cov is no covariance.
-    """
+    """A group as the kernels take it. Raises InputError: z or cov has the wrong shape, is not finite, or is no covariance."""
     name, ids = type(group.model).__name__, group.ids
     group = replace(
         group,
@@ -491,11 +474,7 @@ def checked_observations(group: Observations) -> Observations:
 
 
 def checked_ancestors(ancestors: np.ndarray, n: int, resampler: object) -> np.ndarray:
-    """Ancestors (N,) of a resampler.
-
-    Raises:
-        InputError: one is missing, or is no particle.
-    """
+    """Ancestors (N,) of a resampler. Raises InputError: one is missing, or is no particle."""
     whole = ancestors.dtype.kind in "iu"
     if not whole or ancestors.shape != (n,) or ancestors.min() < 0 or ancestors.max() >= n:
         name = type(resampler).__name__
@@ -504,11 +483,7 @@ def checked_ancestors(ancestors: np.ndarray, n: int, resampler: object) -> np.nd
 
 
 def checked_start(start: np.ndarray, n: int, space: LieGroup) -> np.ndarray:
-    """States (N, E) from one for all particles or one each.
-
-    Raises:
-        InputError: the shape is another one, or a number is not finite.
-    """
+    """States (N, E) from one for all particles or one each. Raises InputError: another shape, or not finite."""
     size = space.size
     if start.shape not in ((size,), (n, size)) or not np.isfinite(start).all():
         what = f"start must be ({size},) or ({n}, {size}) finite numbers"

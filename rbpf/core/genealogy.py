@@ -1,8 +1,7 @@
 """Who descends from whom: the lineage of the particles, and their paths along it.
 
-Ancestry changes only where particles are resampled. Each resampling starts a generation; whatever is stored per
-particle (poses, landmarks) is stored per generation, by the row of the particle that wrote it, and read back
-through `Lineage.rows`. Resampling therefore copies nothing but ancestor indices.
+Each resampling starts a generation; whatever is stored per particle (poses, landmarks) is stored per generation, by the
+row of the particle that wrote it, and read back through `Lineage.rows`. Resampling copies nothing but ancestor indices.
 """
 
 from collections import Counter
@@ -11,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from rbpf.arrays import Int
-from rbpf.core.schema import integers, numbers, read, read_one
+from rbpf.core.checkpoint import integers, numbers, read, read_one
 from rbpf.errors import InputError
 from rbpf.kernels import forest
 
@@ -38,13 +37,7 @@ _BLOCK = {
 
 
 class Lineage:
-    """The forest of ancestors of N particles.
-
-    A generation that somebody stores rows of must be kept by `retain` until `release`.
-
-    Args:
-        n: number of particles.
-    """
+    """The forest of ancestors of n particles; a generation that somebody stores rows of is kept by `retain` to `release`."""
 
     def __init__(self, n: int) -> None:
         self.n = n
@@ -54,8 +47,7 @@ class Lineage:
         self._oldest = 0
         self._allocate(4 * n)
         self._leaves = np.arange(n)
-        self._generation[:n] = 0
-        self._row[:n] = np.arange(n)
+        self._generation[:n], self._row[:n] = 0, np.arange(n)
         self._children[:n] = 1
         self._free = np.arange(4 * n - 1, n - 1, -1)
         self._n_free = self._free.size
@@ -69,7 +61,6 @@ class Lineage:
 
     @property
     def nodes(self) -> int:
-        """Number of nodes held."""
         return self._parent.size - self._n_free
 
     def advance(self, ancestors: Int[np.ndarray, " N"]) -> None:
@@ -77,17 +68,8 @@ class Lineage:
         if self._n_free < self.n:
             self._make_room()
         self.generation += 1
-        self._n_free = forest.advance(
-            self._parent,
-            self._children,
-            self._generation,
-            self._row,
-            self._free,
-            self._n_free,
-            self._leaves,
-            np.ascontiguousarray(ancestors, dtype=np.int64),
-            self.generation,
-        )
+        nodes = self._parent, self._children, self._generation, self._row, self._free, self._n_free, self._leaves
+        self._n_free = forest.advance(*nodes, np.ascontiguousarray(ancestors, dtype=np.int64), self.generation)
         self._cache.clear()
 
     def rows(self, generation: int) -> Int[np.ndarray, " N"]:
@@ -133,11 +115,7 @@ class Lineage:
             self._members[generation] = self._leaves.copy()
 
     def take_up(self, generation: int) -> None:
-        """`retain`, for a generation that a checkpoint says was kept.
-
-        Raises:
-            InputError: the ancestry does not reach back to it, or it has not come yet.
-        """
+        """`retain` of a generation that a checkpoint says was kept. Raises InputError: the ancestry does not hold it."""
         if not self._oldest <= generation <= self.generation:
             raise InputError(f"the ancestry does not hold generation {generation}")
         self.retain(generation)
@@ -164,8 +142,7 @@ class Lineage:
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """The inverse of `arrays`; what is stored per generation must be taken up again.
 
-        Raises:
-            InputError: an array is missing, or they are no forest. Compiled code would follow them anywhere.
+        Raises InputError: an array is missing, or they are no forest. Compiled code would follow them anywhere.
         """
         now, n_free = read_one(arrays, "lineage/now", integers(2, least=0)).tolist()
         found = read(arrays, _FOREST, "lineage/", n=self.n, generations=now + 1)
@@ -213,17 +190,8 @@ class Lineage:
         """Splices chains that nobody needs out of the forest, and doubles it where that is not enough."""
         needed = np.isin(self._generation, list(self._retained))
         self._mark += 1
-        self._n_free = forest.splice(
-            self._parent,
-            self._children,
-            self._generation,
-            self._free,
-            self._n_free,
-            self._leaves,
-            needed,
-            self._stamp,
-            self._mark,
-        )
+        nodes = self._parent, self._children, self._generation, self._free, self._n_free, self._leaves
+        self._n_free = forest.splice(*nodes, needed, self._stamp, self._mark)
         old = self._parent.size
         if self._n_free >= old // 2:
             return
@@ -248,7 +216,6 @@ class Schedule:
         self.due.setdefault(now + max(_FIRST_CHECK, (now - generation) // 4), set()).add(generation)
 
     def pop(self, now: int) -> list[int]:
-        """Generations to look through now."""
         return sorted(self.due.pop(now, ()))
 
     def array(self) -> np.ndarray:
@@ -338,7 +305,6 @@ class History:
 
     @property
     def stored_states(self) -> int:
-        """Number of states held, of T·N without sharing."""
         return sum(len(block.states) * block.kept.size for block in self.blocks)
 
     def distinct_first(self) -> int:
@@ -367,7 +333,7 @@ class History:
         return out
 
     def restore(self, arrays: dict[str, np.ndarray], size: int | None = None) -> None:
-        """The inverse of `arrays`, of states of so many numbers; errors as `rbpf.core.schema.read`."""
+        """The inverse of `arrays`, of states of so many numbers; errors as `rbpf.core.checkpoint.read`."""
         self.blocks, self._by_generation = [], {}
         self._schedule = Schedule.of(read_one(arrays, "history/due", DUE))
         generations = read_one(arrays, "history/generations", integers("blocks", ascending=True)).tolist()

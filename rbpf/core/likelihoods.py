@@ -1,11 +1,8 @@
 """Likelihoods of an innovation, and the association that maximises them.
 
-Gaussian, truncated Mahalanobis (S05 (6)), Gaussian with outliers; `kernel_id` and `params` name the compiled twin in
-`rbpf.kernels.gate`.
-
-Maximum-likelihood association is per particle: each measurement is explained by a landmark within the gate, by a new landmark
-(only where nothing known is near), or by clutter; no landmark explains two. Costs, Mathematics (association-cost), are
-negative log-densities in the measurement's units, so that the choice and the particle's weight speak of the same thing.
+Association is per particle: each measurement is explained by a landmark within the gate, by a new landmark (only where
+nothing known is near), or by clutter; no landmark explains two. Costs, Mathematics (association-cost), are negative
+log-densities in the measurement's units, so that the choice and the particle's weight speak of the same thing.
 """
 
 from copy import copy
@@ -30,7 +27,6 @@ class Gaussian(Likelihood):
         self.params = np.zeros(1)
 
     def log_density(self, nu: np.ndarray, cov: np.ndarray) -> np.ndarray:
-        """(…, p), (…, p, p) → (…)."""
         return gaussian.log_density(nu, cov)
 
 
@@ -61,11 +57,9 @@ class TruncatedMahalanobis(Likelihood):
         self.params = np.array([limit, update_limit], dtype=float)
 
     def log_density(self, nu: np.ndarray, cov: np.ndarray) -> np.ndarray:
-        """(…, p), (…, p, p) → (…)."""
         return -0.5 * np.minimum(self.params[0], squared_mahalanobis(nu, cov))
 
     def inlier(self, nu: np.ndarray, cov: np.ndarray) -> np.ndarray:
-        """Within the limit for updates."""
         return squared_mahalanobis(nu, cov) <= self.params[1]
 
     def predicted_inlier(self, nu: np.ndarray, cov: np.ndarray, predictive: np.ndarray) -> np.ndarray:
@@ -82,7 +76,6 @@ class TruncatedMahalanobis(Likelihood):
         return weighing
 
     def log_outlier(self) -> float:
-        """−T_l/2."""
         return -0.5 * float(self.params[0])
 
 
@@ -103,7 +96,6 @@ class GaussianWithOutliers(Likelihood):
         self.params = np.array([np.log1p(-rate), np.log(rate / volume)])
 
     def log_density(self, nu: np.ndarray, cov: np.ndarray) -> np.ndarray:
-        """(…, p), (…, p, p) → (…)."""
         return np.logaddexp(gaussian.log_density(nu, cov) + self.params[0], self.params[1])
 
     def inlier(self, nu: np.ndarray, cov: np.ndarray) -> np.ndarray:
@@ -111,11 +103,9 @@ class GaussianWithOutliers(Likelihood):
         return gaussian.log_density(nu, cov) + self.params[0] >= self.params[1]
 
     def log_inlier(self) -> float:
-        """log(1−ε)."""
         return float(self.params[0])
 
     def log_outlier(self) -> float:
-        """Log ε/V."""
         return float(self.params[1])
 
 

@@ -1,7 +1,6 @@
 """Observations linearised: Jacobians on the manifold, and the plain NumPy twins of the compiled drivers.
 
-The twins also serve models without a kernel, and rows that are stacked. Shapes: N particles, K observations, p rows,
-d increment, D landmark. `mask` (N, K) says which particles took an observation; None is all.
+Shapes: N particles, K observations, p rows, d increment, D landmark. `mask` (N, K): who took an observation; None is all.
 """
 
 import numpy as np
@@ -67,10 +66,7 @@ def linearise(
 ) -> tuple[np.ndarray, Jacobians]:
     """Innovation (N, K, p) and Jacobians at states (N, 1, E), landmarks (N, K, D), substates (N, 1, m).
 
-    Numeric Jacobians by a part that `by` does not name are left out.
-
-    Raises:
-        InputError: a prediction or a Jacobian has the wrong shape.
+    Numeric Jacobians by a part that `by` does not name are left out. Raises InputError: a result has the wrong shape.
     """
     nu = model.innovation(z, state, landmark, const, substate)
     parts = (state, landmark, substate)
@@ -170,8 +166,8 @@ def updated(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Kalman updates of landmarks at sampled states, and each observation's log p(z | x).
 
-    Given ν (N, K, p), J (N, K, p, D), means (N, K, D), covariances (N, K, D, D) and R (K, p, p), returns the new
-    means and covariances and log-densities (N, K).
+    ν (N, K, p), J (N, K, p, D), means (N, K, D), covariances (N, K, D, D), R (K, p, p) → new means, covariances and
+    log-densities (N, K).
     """
     cov = innovation_covariance(jac, cov_map, noise)
     use = likelihood.inlier(nu, cov)
@@ -191,8 +187,8 @@ def stacked(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rows of several observations that share a landmark or a substate as one observation per particle.
 
-    Given ν (N, p_j), J (N, p_j, c) and R_j (p_j, p_j), returns ν (N, Σp), J (N, Σp, c) and R (N, Σp, Σp). A row that
-    a particle did not take says nothing there.
+    ν (N, p_j), J (N, p_j, c), R_j (p_j, p_j) → ν (N, Σp), J (N, Σp, c), R (N, Σp, Σp). A row that a particle did not take
+    says nothing there.
     """
     n = nus[0].shape[0]
     sizes = [nu.shape[1] for nu in nus]

@@ -1,7 +1,4 @@
-"""What is marginalised: a Kalman-filtered substate, nothing (observations of the state alone), and several parts side by side.
-
-A landmark map is a further part, `rbpf.maps.LandmarkMap`.
-"""
+"""What is marginalised, besides a map: a Kalman-filtered substate, nothing (`StateOnly`), and several parts side by side."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -11,7 +8,7 @@ import numpy as np
 
 from rbpf import gaussian
 from rbpf.arrays import numbers
-from rbpf.core import schema
+from rbpf.core import checkpoint
 from rbpf.core.genealogy import Lineage
 from rbpf.core.likelihoods import Gaussian
 from rbpf.core.linearisation import information, linearise, stacked
@@ -22,12 +19,12 @@ from rbpf.kernels.increment import conditioned
 from rbpf.lie import LieGroup
 
 GAUSSIAN = Gaussian()
-_SUBSTATE = {"mean": schema.numbers("n", "m"), "cov": schema.numbers("covs", "m", "m")}
+_SUBSTATE = {"mean": checkpoint.numbers("n", "m"), "cov": checkpoint.numbers("covs", "m", "m")}
 
 
 @final
 class StateOnly(Conditional):
-    """Observations that read the sampled state and nothing else, as a position fix."""
+    """Observations that read the sampled state and nothing else, as a position fix: S = R, and nothing is stored."""
 
     supplies = Part.STATE
 
@@ -38,7 +35,6 @@ class StateOnly(Conditional):
         """Nothing is stored."""
 
     def information(self, state: np.ndarray, groups: Sequence[Observations], prior: Prior) -> Information:
-        """S = R."""
         total = Information.zeros(state.shape[0], self.space.dim)
         for group in groups:
             nu, jacobians = linearise(group.model, self.space, group.z, state[:, None, :])
@@ -48,7 +44,6 @@ class StateOnly(Conditional):
         return total
 
     def correct(self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]) -> LogDensities:
-        """Σ log p(z | x); there is nothing to update."""
         total = np.zeros(state.shape[0])
         for group in groups:
             nu = group.model.innovation(group.z, state[:, None, :])
@@ -60,7 +55,6 @@ class StateOnly(Conditional):
         """Nothing is stored."""
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Nothing is stored."""
         return {}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
@@ -97,7 +91,6 @@ class KalmanSubstate(Conditional):
         gaussian.psd_factor(self._cov)
 
     def begin(self, n: int, lineage: Lineage) -> None:
-        """Every particle starts with the initial distribution."""
         self.mean = np.repeat(self._mean[None], n, axis=0)
         self.cov = self._cov[None]
 
@@ -150,7 +143,6 @@ class KalmanSubstate(Conditional):
         return information(nu[:, None], jac_state[:, None], cov[:, None], GAUSSIAN, prior)
 
     def correct(self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]) -> LogDensities:
-        """Conditions on the increment, then on the observations."""
         self.mean, self.cov = self.given(increment), self._rest
         total = np.zeros(state.shape[0])
         if groups:
@@ -167,24 +159,20 @@ class KalmanSubstate(Conditional):
         return LogDensities(total, np.zeros_like(total))
 
     def resample(self, ancestors: np.ndarray) -> None:
-        """Copies small arrays; what all particles share stays."""
         self._increment_mean = self._increment_mean[ancestors]
         self._predicted = self._predicted[ancestors]
         self._gain = take(self._gain, ancestors)
         self._rest = take(self._rest, ancestors)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Means and covariances."""
         return {"substate/mean": self.mean, "substate/cov": self.cov}
 
     def options(self) -> dict[str, object]:
-        """Its size."""
         return {"substate size": int(self._mean.size)}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """The inverse of `arrays`; errors as `rbpf.core.schema.read`."""
         n, m = self.mean.shape
-        self.mean, self.cov = schema.read(arrays, _SUBSTATE, "substate/", n=n, m=m).values()
+        self.mean, self.cov = checkpoint.read(arrays, _SUBSTATE, "substate/", n=n, m=m).values()
         if len(self.cov) not in (1, n):
             raise InputError(f"the array substate/cov must have 1 or {n} matrices")
 
@@ -233,17 +221,14 @@ class Marginals(Conditional):
             raise InputError("the filter takes at most one landmark map and one Kalman substate")
 
     def begin(self, n: int, lineage: Lineage) -> None:
-        """Begins every part."""
         for part in self.parts.values():
             part.begin(n, lineage)
 
     def predict(self, transition: Transition, space: LieGroup) -> Prior:
-        """The substate's distribution where there is one."""
         driver = self._holder.get(Part.SUBSTATE, self._holder[Part.STATE])
         return driver.predict(transition, space)
 
     def information(self, state: np.ndarray, groups: Sequence[Observations], prior: Prior) -> Information:
-        """Sum over the parts that were observed."""
         total: Information | None = None
         for supplies, routed in self._routed(groups).items():
             if routed:
@@ -259,7 +244,7 @@ class Marginals(Conditional):
         weighing = [_for_look_ahead(group) for group in groups]
         is_other = any(one is not other for one, other in zip(weighing, groups, strict=True))
 
-        def told_at(state: np.ndarray) -> Information:
+        def information_at(state: np.ndarray) -> Information:
             found = self.information(state, groups, prior)
             if is_other:
                 others = self.information(state, weighing, prior), _all_outliers(weighing, found)
@@ -268,15 +253,14 @@ class Marginals(Conditional):
 
         def linearise_at(increment: np.ndarray) -> Information:
             if increment is prior.mean:
-                found = told_at(prior.predicted())
+                found = information_at(prior.predicted())
                 return found if prior.centred else found.charted(prior.space.right_jacobian(increment))
-            found = told_at(prior.at(increment))
+            found = information_at(prior.at(increment))
             return found.charted(prior.space.right_jacobian(increment)).shifted(increment - prior.mean)
 
         return linearise_at
 
     def correct(self, state: np.ndarray, increment: np.ndarray, groups: Sequence[Observations]) -> LogDensities:
-        """Corrects every part."""
         total, after_sampling = np.zeros(state.shape[0]), np.zeros(state.shape[0])
         for supplies, routed in self._routed(groups).items():
             densities = self.parts[supplies].correct(state, increment, routed)
@@ -285,7 +269,6 @@ class Marginals(Conditional):
         return LogDensities(total, after_sampling)
 
     def resample(self, ancestors: np.ndarray) -> None:
-        """Resamples every part."""
         for part in self.parts.values():
             part.resample(ancestors)
 
@@ -299,16 +282,13 @@ class Marginals(Conditional):
         return parts[0].consolidate(particles)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Of all parts."""
         return {name: array for part in self.parts.values() for name, array in part.arrays().items()}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """Of all parts."""
         for part in self.parts.values():
             part.restore(arrays)
 
     def options(self) -> dict[str, object]:
-        """Of all parts."""
         return {name: value for part in self.parts.values() for name, value in part.options().items()}
 
     def _routed(self, groups: Sequence[Observations]) -> dict[Part, list[Observations]]:

@@ -34,6 +34,16 @@ Control = TypeVar("Control", contravariant=True)
 Frame = TypeVar("Frame", contravariant=True)
 """What a sensor takes, as an image."""
 
+States = Float[np.ndarray, "*#batch E"]
+Means = Float[np.ndarray, "*#batch D"] | None
+Constants = Float[np.ndarray, "*#batch A"] | None
+Substates = Float[np.ndarray, "*#batch m"] | None
+"""What is observed, with leading axes that broadcast: states, landmarks, their constants and substates."""
+Measured = Float[np.ndarray, "*#batch p"]
+Result = Float[np.ndarray, "*batch p"]
+Covariances = Float[np.ndarray, "*#batch p p"]
+Ids = Int[np.ndarray, " K"]
+
 NULL = -1
 """An observation that a particle takes as clutter."""
 NEW = -2
@@ -55,9 +65,7 @@ class Part(Enum):
 class Transition:
     """p(x_t, s_t | x_{t-1}, s_{t-1}, u_t): ε = B s + w₁ in the right chart at `mean`; s_t = A s + b + w₂.
 
-    Mathematics (substate).
-
-    Arrays may have a first axis of length 1 where they do not differ between particles.
+    Mathematics (substate). Arrays may have a first axis of length 1 where they do not differ between particles.
 
     Attributes:
         mean: (N, E) chart's origin, x_t = mean · Exp(ε).
@@ -150,7 +158,7 @@ class NewLandmarks:
     model: "ObservationModel"
     landmark: "Landmark"
     mask: Bool[np.ndarray, "N K"] | None = None
-    ids: Int[np.ndarray, " K"] | None = None
+    ids: Ids | None = None
 
 
 class LogDensities(NamedTuple):
@@ -178,20 +186,12 @@ class ObservationModel(ABC):
 
     @abstractmethod
     def predict(
-        self,
-        state: Float[np.ndarray, "*#batch E"],
-        landmark: Float[np.ndarray, "*#batch D"] | None = None,
-        const: Float[np.ndarray, "*#batch A"] | None = None,
-        substate: Float[np.ndarray, "*#batch m"] | None = None,
-    ) -> Float[np.ndarray, "*batch p"]:
+        self, state: States, landmark: Means = None, const: Constants = None, substate: Substates = None
+    ) -> Result:
         """h: plain NumPy that broadcasts over leading axes; (…, E), (…, D), (…, A), (…, m) → (…, p)."""
 
     def jacobians(
-        self,
-        state: Float[np.ndarray, "*#batch E"],
-        landmark: Float[np.ndarray, "*#batch D"] | None = None,
-        const: Float[np.ndarray, "*#batch A"] | None = None,
-        substate: Float[np.ndarray, "*#batch m"] | None = None,
+        self, state: States, landmark: Means = None, const: Constants = None, substate: Substates = None
     ) -> Jacobians | None:
         """Analytic derivatives, in the right chart at the state; None asks for numeric ones.
 
@@ -199,35 +199,23 @@ class ObservationModel(ABC):
         """
         return None
 
-    def residual(
-        self, z: Float[np.ndarray, "*#batch p"], predicted: Float[np.ndarray, "*#batch p"]
-    ) -> Float[np.ndarray, "*batch p"]:
+    def residual(self, z: Measured, predicted: Measured) -> Result:
         """Z − h (…, p); override to wrap angles."""
         return z - predicted
 
     def innovation(
-        self,
-        z: Float[np.ndarray, "*#batch p"],
-        state: Float[np.ndarray, "*#batch E"],
-        landmark: Float[np.ndarray, "*#batch D"] | None = None,
-        const: Float[np.ndarray, "*#batch A"] | None = None,
-        substate: Float[np.ndarray, "*#batch m"] | None = None,
+        self, z: Measured, state: States, landmark: Means = None, const: Constants = None, substate: Substates = None
     ) -> Float[np.ndarray, "... p"]:
         """ν (…, p): residual(z, predict(…)); override, with `jacobians`, for a constraint g(z, x, l) = 0 on z."""
         return self.residual(z, self.predict(state, landmark, const, substate))
 
     def visible(
-        self,
-        state: Float[np.ndarray, "*#batch E"],
-        landmark: Float[np.ndarray, "*#batch D"],
-        const: Float[np.ndarray, "*#batch A"] | None = None,
+        self, state: States, landmark: Float[np.ndarray, "*#batch D"], const: Constants = None
     ) -> Bool[np.ndarray, "*batch"]:
         """Whether the sensor could see the landmark (…), bool; by default always."""
         return np.ones(np.broadcast_shapes(state.shape[:-1], landmark.shape[:-1]), dtype=bool)
 
-    def invert(
-        self, state: Float[np.ndarray, "*#batch E"], z: Float[np.ndarray, "*#batch p"]
-    ) -> Float[np.ndarray, "*batch D"]:
+    def invert(self, state: States, z: Measured) -> Float[np.ndarray, "*batch D"]:
         """The landmark (…, D) that would be measured as z (…, p) from the state, for `initialise`."""
         raise InputError(
             f"{type(self).__name__} cannot start landmarks: override invert(state, z) or initialise(state, z, cov)"
@@ -284,7 +272,7 @@ class Landmark(ABC):
             world = self.homogeneous(mean, const)
             return world[..., :-1] / world[..., -1:]
 
-        mean, cov, _ = gaussian.unscented_transform(point, records.mean, records.cov)
+        mean, cov = gaussian.unscented_transform(point, records.mean, records.cov)
         if records.log_weights is None:
             return Records(mean, cov)
         weights = np.exp(records.log_weights)[..., None]
@@ -303,23 +291,14 @@ class Likelihood(ABC):
     params: np.ndarray = np.zeros(1)
 
     @abstractmethod
-    def log_density(
-        self, nu: Float[np.ndarray, "*#batch p"], cov: Float[np.ndarray, "*#batch p p"]
-    ) -> Float[np.ndarray, "*batch"]:
+    def log_density(self, nu: Measured, cov: Covariances) -> Float[np.ndarray, "*batch"]:
         """(…, p), (…, p, p) → (…)."""
 
-    def inlier(
-        self, nu: Float[np.ndarray, "*#batch p"], cov: Float[np.ndarray, "*#batch p p"]
-    ) -> Bool[np.ndarray, "*batch"]:
+    def inlier(self, nu: Measured, cov: Covariances) -> Bool[np.ndarray, "*batch"]:
         """Whether the observation may move the state and the landmark, (…) bool; by default always."""
         return np.ones(nu.shape[:-1], dtype=bool)
 
-    def predicted_inlier(
-        self,
-        nu: Float[np.ndarray, "*#batch p"],
-        cov: Float[np.ndarray, "*#batch p p"],
-        predictive: Float[np.ndarray, "*#batch p p"],
-    ) -> Bool[np.ndarray, "*batch"]:
+    def predicted_inlier(self, nu: Measured, cov: Covariances, predictive: Covariances) -> Bool[np.ndarray, "*batch"]:
         """`inlier` before the state is sampled, whose spread makes S the `predictive` covariance S + H Q Hᵀ."""
         return self.inlier(nu, predictive)
 
@@ -375,11 +354,7 @@ class Conditional(ABC):
         """Makes room for n particles whose ancestry `lineage` keeps."""
 
     def predict(self, transition: Transition, space: LieGroup) -> Prior:
-        """Distribution of the increment; only a substate that drives the motion changes it.
-
-        Raises:
-            InputError: the motion model needs a substate.
-        """
+        """Distribution of the increment, which only a substate changes. Raises InputError: the motion needs one."""
         if transition.coupling is not None and transition.coupling.shape[-1]:
             raise InputError("the motion model drives a substate: give the filter a KalmanSubstate to hold it")
         return Prior(space, transition.mean, np.zeros((1, space.dim)), transition.noise_factor)
@@ -399,18 +374,10 @@ class Conditional(ABC):
         """Every particle i becomes a copy of particle ancestors[i]; `lineage` has been advanced."""
 
     def consolidate(self, particles: Particles) -> Particles:
-        """Takes in what the particles differ by, in place of resampling: they begin anew, all alike.
+        """Takes in what the particles differ by, after a step, in place of resampling: they begin anew, all alike.
 
-        The posterior keeps its mean and covariance; what was a weighted sample becomes a part of the one Gaussian.
-
-        Args:
-            particles: after a step.
-
-        Returns:
-            The same number of particles, of equal states and weights.
-
-        Raises:
-            InputError: this part has a Gaussian of its own in every particle, which is what resampling is for.
+        The posterior keeps its mean and covariance; what was a weighted sample becomes a part of the one Gaussian. Raises
+        InputError: this part has a Gaussian of its own in every particle, which is what resampling is for.
         """
         raise InputError(f"{type(self).__name__} cannot take in what the particles differ by: resample them")
 
@@ -430,8 +397,7 @@ class Conditional(ABC):
 class Map(Conditional):
     """Landmarks, given the sampled states: what sensors ask of it and do to it. `rbpf.maps.LandmarkMap` is one.
 
-    Attributes:
-        evidence: whether it keeps, per particle, the log-odds that each landmark exists.
+    `evidence` says whether it keeps, per particle, the log-odds that each landmark exists.
     """
 
     supplies = Part.LANDMARK
@@ -448,7 +414,7 @@ class Map(Conditional):
         """Memory of the records, as a fraction of what separate copies for all particles would take."""
 
     @abstractmethod
-    def holds(self, ids: Int[np.ndarray, " K"]) -> Bool[np.ndarray, " K"]:
+    def holds(self, ids: Ids) -> Bool[np.ndarray, " K"]:
         """Which of some ids (K,) are those of landmarks held, (K,) bool."""
 
     @abstractmethod
@@ -456,24 +422,16 @@ class Map(Conditional):
         """The parametrisation of a landmark."""
 
     @abstractmethod
-    def are(self, ids: Int[np.ndarray, " K"], landmark: Landmark) -> Bool[np.ndarray, " K"]:
+    def are(self, ids: Ids, landmark: Landmark) -> Bool[np.ndarray, " K"]:
         """Which landmarks (K,) of the map have this parametrisation, (K,) bool."""
 
     @abstractmethod
-    def read(self, ids: Int[np.ndarray, " K"], particles: Int[np.ndarray, " n"] | slice = slice(None)) -> Records:
-        """Estimates (N, K, …) of landmarks that share one parametrisation, in all or some particles.
-
-        Raises:
-            InputError: the map does not hold one of them, or their parametrisations differ.
-        """
+    def read(self, ids: Ids, particles: Int[np.ndarray, " n"] | slice = slice(None)) -> Records:
+        """Estimates (N, K, …), in all or some particles. Raises InputError: a landmark is not held, or their kinds differ."""
 
     @abstractmethod
-    def add(self, new_landmarks: NewLandmarks, state: Float[np.ndarray, "N E"]) -> Int[np.ndarray, " K"]:
-        """Starts landmarks at the states (N, E); returns their ids (K,).
-
-        Raises:
-            InputError: see `add_records`.
-        """
+    def add(self, new_landmarks: NewLandmarks, state: Float[np.ndarray, "N E"]) -> Ids:
+        """Starts landmarks at the states (N, E); returns their ids (K,). Raises InputError: see `add_records`."""
 
     @abstractmethod
     def add_records(
@@ -481,9 +439,9 @@ class Map(Conditional):
         records: Records,
         landmark: Landmark,
         log_odds: Float[np.ndarray, "N K"] | None = None,
-        ids: Int[np.ndarray, " K"] | None = None,
-    ) -> Int[np.ndarray, " K"]:
-        """Adds landmarks whose estimates (N, K, …) are known.
+        ids: Ids | None = None,
+    ) -> Ids:
+        """Adds landmarks whose estimates (N, K, …) are known; returns their ids (K,).
 
         Args:
             records: the estimates.
@@ -491,43 +449,32 @@ class Map(Conditional):
             log_odds: (N, K) that they exist, for a map with evidence.
             ids: (K,) that they shall have; by default numbers that no landmark had before.
 
-        Returns:
-            Their ids (K,).
-
         Raises:
             InputError: an id is no number from 0 up, comes twice or is in use, or the shapes do not fit.
         """
 
     @abstractmethod
-    def remove(self, ids: Int[np.ndarray, " K"]) -> None:
-        """Drops landmarks (K,) from all particles.
-
-        Raises:
-            InputError: the map does not hold one of them.
-        """
+    def remove(self, ids: Ids) -> None:
+        """Drops landmarks (K,) from all particles. Raises InputError: the map does not hold one of them."""
 
     @abstractmethod
-    def promote(self, ids: Sequence[int] | Int[np.ndarray, " K"], to: Landmark | None = None) -> None:
+    def promote(self, ids: Sequence[int] | Ids, to: Landmark | None = None) -> None:
         """Turns landmarks into single Gaussian points in all particles at once, by their own `promote`."""
 
     @abstractmethod
-    def log_odds(self, ids: Int[np.ndarray, " K"]) -> Float[np.ndarray, "N K"]:
+    def log_odds(self, ids: Ids) -> Float[np.ndarray, "N K"]:
         """(N, K) log-odds that the landmarks exist; −inf where a particle does not hold one."""
 
     @abstractmethod
-    def set_log_odds(self, ids: Int[np.ndarray, " K"], log_odds: Float[np.ndarray, "N K"]) -> None:
-        """Overwrites log-odds (N, K); a landmark at −inf in every particle is removed.
-
-        Raises:
-            InputError: the map keeps none.
-        """
+    def set_log_odds(self, ids: Ids, log_odds: Float[np.ndarray, "N K"]) -> None:
+        """Overwrites log-odds (N, K), if the map keeps some; a landmark at −inf in every particle is removed."""
 
     @abstractmethod
     def innovations(
         self,
         model: ObservationModel,
         z: Float[np.ndarray, "K p"],
-        ids: Int[np.ndarray, " K"],
+        ids: Ids,
         state: Float[np.ndarray, " E"],
         particle: int,
     ) -> tuple[Float[np.ndarray, "K p"], Jacobians, Records]:
@@ -546,7 +493,7 @@ class Map(Conditional):
 
     @abstractmethod
     def project(
-        self, model: ObservationModel, ids: Int[np.ndarray, " K"], belief: "Belief"
+        self, model: ObservationModel, ids: Ids, belief: "Belief"
     ) -> tuple[Float[np.ndarray, "K p"], Float[np.ndarray, "K p p"]]:
         """See `Belief.project`."""
 
@@ -584,28 +531,22 @@ class Belief:
 
     @property
     def map(self) -> Map:
-        """The landmark map.
-
-        Raises:
-            InputError: the filter holds none.
-        """
+        """The landmark map. Raises InputError: the filter holds none."""
         held = self.parts.get(Part.LANDMARK)
         if not isinstance(held, Map):
             raise InputError("this sensor needs a landmark map: give the filter a LandmarkMap")
         return held
 
-    def read(
-        self, ids: Sequence[int] | Int[np.ndarray, " K"], particles: Int[np.ndarray, " n"] | slice = slice(None)
-    ) -> Records:
+    def read(self, ids: Sequence[int] | Ids, particles: Int[np.ndarray, " n"] | slice = slice(None)) -> Records:
         """Estimates (N, K, …) of landmarks of one parametrisation, in all particles or in the rows named."""
         return self.map.read(np.asarray(ids, dtype=np.int64), particles)
 
-    def read_mode(self, ids: Sequence[int] | Int[np.ndarray, " K"]) -> Records:
+    def read_mode(self, ids: Sequence[int] | Ids) -> Records:
         """Estimates (1, K, …) in the particle of highest weight alone."""
         return self.read(ids, slice(self.mode, self.mode + 1))
 
     def innovations(
-        self, model: ObservationModel, z: Float[np.ndarray, "K p"], ids: Int[np.ndarray, " K"]
+        self, model: ObservationModel, z: Float[np.ndarray, "K p"], ids: Ids
     ) -> tuple[Float[np.ndarray, "K p"], Float[np.ndarray, "K p d"], Float[np.ndarray, "K p p"]]:
         """Of K measurements in the particle of highest weight: ν (K, p), ∂z/∂state (K, p, d) and J P Jᵀ (K, p, p)."""
         nu, jac, records = self.map.innovations(model, z, ids, self.state[self.mode], self.mode)
@@ -622,9 +563,7 @@ class Belief:
         """Innovations ν (N, K, M, p) of K measurements against M landmarks, and S + H Q Hᵀ (N, K, M, p, p)."""
         return self.map.predictions(model, z, cov, ids, self)
 
-    def project(
-        self, model: ObservationModel, ids: Int[np.ndarray, " K"]
-    ) -> tuple[Float[np.ndarray, "K p"], Float[np.ndarray, "K p p"]]:
+    def project(self, model: ObservationModel, ids: Ids) -> tuple[Float[np.ndarray, "K p"], Float[np.ndarray, "K p p"]]:
         """Where landmarks will be measured: mean (K, p) and covariance (K, p, p) under all particles (E06 §4.1).
 
         The covariance is within + between particles, H Q Hᵀ included, without the measurement's own noise.

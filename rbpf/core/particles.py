@@ -16,30 +16,25 @@ from rbpf.arrays import Float, Int
 from rbpf.errors import InputError
 from rbpf.lie import LieGroup
 
+SUMMED = "info", "vector", "quad", "log_det", "log_factor", "rows"
+"""Fields of `Information` that add up over independent observations."""
 NOTHING_MOVED = 1e-12
 """χ² below which weights differ by rounding alone."""
 
 
 @dataclass
 class Particles:
-    """N weighted states.
-
-    Attributes:
-        state: (N, E).
-        log_weights: (N,) normalised.
-    """
+    """N states (N, E) and their normalised log-weights (N,)."""
 
     state: Float[np.ndarray, "N E"]
     log_weights: Float[np.ndarray, " N"]
 
     @property
     def n(self) -> int:
-        """Number of particles."""
         return self.state.shape[0]
 
     @property
     def weights(self) -> np.ndarray:
-        """(N,) summing to one."""
         return np.exp(self.log_weights)
 
 
@@ -49,11 +44,7 @@ def uniform_log_weights(n: int) -> np.ndarray:
 
 
 def reweight(log_weights: np.ndarray, log_factors: np.ndarray, what: str) -> tuple[np.ndarray, float]:
-    """Normalised log-weights after multiplication, and log Σ W·factor.
-
-    Raises:
-        InputError: a factor is NaN or +∞, or all products are zero.
-    """
+    """Normalised log-weights times factors, and log Σ W·factor. Raises InputError: a factor is NaN or +∞, or all are zero."""
     with np.errstate(invalid="ignore"):  # from a weight of zero times an infinite factor, which is refused
         joint = log_weights + log_factors
     high = joint.max()
@@ -162,18 +153,11 @@ class Information:
         """The same observations, of particles that were taken in several parts."""
         if len(parts) == 1:
             return parts[0]
-        return cls(
-            np.concatenate([part.info for part in parts]),
-            np.concatenate([part.vector for part in parts]),
-            np.concatenate([part.quad for part in parts]),
-            np.concatenate([part.log_det for part in parts]),
-            np.concatenate([part.log_factor for part in parts]),
-            np.concatenate([part.rows for part in parts]),
-        )
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in SUMMED))
 
     def add(self, other: "Information") -> None:
         """Adds independent observations, in place."""
-        for name in ("info", "vector", "quad", "log_det", "log_factor", "rows"):
+        for name in SUMMED:
             getattr(self, name).__iadd__(getattr(other, name))
 
     def charted(self, jacobian: Float[np.ndarray, "#N d d"]) -> "Information":
@@ -228,17 +212,12 @@ class Proposed:
 def balanced(
     noise: Float[np.ndarray, "N r"], weights: Float[np.ndarray, " N"], apart: Float[np.ndarray, "N d"]
 ) -> Float[np.ndarray, "N r"]:
-    """Standard normal draws (N, r) with exactly the moments that independent draws have on average.
+    """Standard normal draws (N, r) with exactly the moments that independent draws `noise` have on average.
 
     Their weighted mean is 0, their weighted covariance (1 − ΣW²) I, and they are uncorrelated with what the particles
-    differ by already. So the moments of a sample are those of its Gaussian, and who goes on from the moments does not
-    take over the chance of the draws (second-order exact sampling, D. Pham 2001). Where there are too few particles the
-    draws stay as they are.
-
-    Args:
-        noise: independent draws.
-        weights: (N,) normalised.
-        apart: (N, d) what the particles differ by, up to a constant.
+    differ by already, `apart` (N, d). So the moments of a sample are those of its Gaussian, and who goes on from the moments
+    does not take over the chance of the draws (second-order exact sampling, D. Pham 2001). Where there are too few particles
+    the draws stay as they are.
     """
     left = 1.0 - float(np.square(weights).sum())
     if left * effective_sample_size(weights) <= 2.0 * noise.shape[1] + apart.shape[1] + 1.0:
@@ -281,12 +260,7 @@ class SecondWeight:
 
 @dataclass(frozen=True)
 class Estimate:
-    """A Gaussian summary of the state.
-
-    Attributes:
-        mean: (E,) weighted Fréchet mean.
-        cov: (d, d) in the right chart at the mean, within + between particles.
-    """
+    """A Gaussian: weighted Fréchet mean (E,), cov (d, d) in the right chart there, within + between particles."""
 
     mean: Float[np.ndarray, " E"]
     cov: Float[np.ndarray, "d d"]

@@ -23,7 +23,6 @@ class PriorProposal(Proposal):
     """The bootstrap filter's: q is the motion model, w₁ = 1, w₂ = p(z | x) (S05 §II-A)."""
 
     def propose(self, prior: Prior, linearise: LineariseAt) -> Proposed:
-        """N(0, I) for every particle."""
         n, rank = prior.base.shape[0], prior.factor.shape[2]
         return Proposed(np.zeros((1, rank)), np.eye(rank)[None], np.zeros(n))
 
@@ -44,7 +43,6 @@ class EkfProposal(Proposal):
         self.iterations = iterations
 
     def propose(self, prior: Prior, linearise: LineariseAt) -> Proposed:
-        """Linearises at the prior's mean, then at the refined means."""
         at = prior.mean
         for iteration in range(self.iterations):
             proposed = refined(prior, linearise(at))

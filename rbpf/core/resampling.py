@@ -1,7 +1,6 @@
 """Resampling: four unbiased schemes, and a wrapper that resamples only when the weights have degenerated.
 
-R. Douc, O. Cappé, E. Moulines, "Comparison of resampling schemes for particle filtering" (2005). Ancestors come in
-ascending order, so that what is gathered by them is read forwards.
+R. Douc, O. Cappé, E. Moulines 2005. Ancestors come in ascending order, so that what is gathered by them is read forwards.
 """
 
 from dataclasses import dataclass
@@ -29,7 +28,6 @@ class Systematic(Resampler):
     """One uniform number, a comb of N teeth."""
 
     def ancestors(self, weights: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """(N,) → (N,)."""
         n = weights.size
         return _inverse_cdf(weights, (np.arange(n) + rng.random()) / n)
 
@@ -39,7 +37,6 @@ class Stratified(Resampler):
     """One uniform number in each of N strata."""
 
     def ancestors(self, weights: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """(N,) → (N,)."""
         n = weights.size
         return _inverse_cdf(weights, (np.arange(n) + rng.random(n)) / n)
 
@@ -49,7 +46,6 @@ class Multinomial(Resampler):
     """N independent draws."""
 
     def ancestors(self, weights: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """(N,) → (N,)."""
         return _inverse_cdf(weights, np.sort(rng.random(weights.size)))
 
 
@@ -58,7 +54,6 @@ class Residual(Resampler):
     """⌊N W_i⌋ descendants each, the rest by multinomial draws of the remainders."""
 
     def ancestors(self, weights: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """(N,) → (N,)."""
         n = weights.size
         counts = np.floor(n * weights * (1.0 + _ROUNDING)).astype(np.int64)
         rest = n - int(counts.sum())
@@ -85,7 +80,6 @@ class EssTriggered(Resampler):
         self.threshold = threshold
 
     def ancestors(self, weights: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
-        """(N,) → (N,) or None."""
         if effective_sample_size(weights) >= self.threshold * weights.size * (1.0 - _ROUNDING):
             return None
         return self.scheme.ancestors(weights, rng)
@@ -105,11 +99,6 @@ class Consolidation:
     threshold: float = 0.5
 
     def __post_init__(self) -> None:
-        """Checks the numbers.
-
-        Raises:
-            InputError: one is out of its range.
-        """
         if self.window < 1 or not 0.0 <= self.threshold <= 1.0:
             raise InputError(
                 f"a window has 1, 2, … steps and a threshold in [0, 1], got {self.window}, {self.threshold}"

@@ -20,13 +20,7 @@ class Smoothed:
 
 
 def ancestral_smoothing(space: LieGroup, history: History, weights: np.ndarray) -> Smoothed:
-    """p(x_t | z_1:T) from the ancestors of the present particles; a history with a lag gives fixed-lag smoothing.
-
-    Args:
-        space: group of the state.
-        history: of the filter.
-        weights: (N,) present weights.
-    """
+    """p(x_t | z_1:T) from the ancestors of the present particles, of weights (N,); a lag of the history makes it fixed-lag."""
     return _summary(space, history.stamps_ns, history.paths(), weights)
 
 
@@ -45,8 +39,7 @@ def backward_simulation(
         rng: source of randomness.
         controls: control of each step; entry t moved the state from t−1 to t.
 
-    Raises:
-        InputError: the history holds no clouds, or the motion has a substate or singular noise.
+    Raises InputError: the history holds no clouds, or the motion has a substate or singular noise.
     """
     if not history.clouds or history.lag is not None:
         raise InputError("backward simulation needs whole clouds: build the filter with clouds=True and no lag")

@@ -1,4 +1,4 @@
-"""Manifold and LieGroup: what a state space must offer, and what it gets from that."""
+"""What a state space must offer, and what it gets from that."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from rbpf.arrays import Float, Like
 Array = NDArray[np.float64]
 
 States = Like[ArrayLike, "*#batch {self.size}"]
-"""Points of a manifold (..., E), as they are given."""
+"""Elements (..., E), as they are given."""
 Tangents = Like[ArrayLike, "*#batch {self.dim}"]
 """Tangent vectors (..., d), as they are given."""
 StateArray = Float[np.ndarray, "*batch {self.size}"]
@@ -33,8 +33,8 @@ def join(parts: Sequence[Array]) -> Array:
     return np.concatenate(parts, axis=-1)
 
 
-class Manifold(ABC):
-    """A space of states with a vector chart around every point.
+class LieGroup(ABC):
+    """A space of states with a smooth group operation, and a vector chart xi -> x Exp(xi) around every point x.
 
     Attributes:
         size: Numbers stored per state, E.
@@ -49,14 +49,6 @@ class Manifold(ABC):
         """Origin of the space, (*shape, E)."""
 
     @abstractmethod
-    def retract(self, x: States, xi: Tangents) -> StateArray:
-        """Point reached from x along xi, in the chart at x."""
-
-    @abstractmethod
-    def local(self, x: States, y: States) -> TangentArray:
-        """Coordinates of y in the chart at x; the inverse of `retract`."""
-
-    @abstractmethod
     def normalise(self, x: States) -> StateArray:
         """Nearest valid storage: unit quaternion, wrapped angle."""
 
@@ -69,11 +61,10 @@ class Manifold(ABC):
     def mean(
         self, x: Like[ArrayLike, "N {self.size}"], weights: Like[ArrayLike, " N"]
     ) -> Float[np.ndarray, " {self.size}"]:
-        """Weighted Fréchet mean: the m with sum_i w_i local(m, x_i) = 0.
+        """Weighted Fréchet mean: the m with sum_i w_i local(m, x_i) = 0, of points (N, E) whose weights (N,) sum to one.
 
-        Gauss-Newton from the heaviest point. It is unique where the points lie within a quarter
-        turn of one another; a wider cloud gives the stationary point next to its heaviest member.
-        The sum runs in the order of the rows, so equal input gives equal bytes. The weights sum to one.
+        Gauss-Newton from the heaviest point. It is unique where the points lie within a quarter turn of one another; a wider
+        cloud gives the stationary point next to its heaviest member. The sum runs in the order of the rows: equal bytes.
         """
         points = np.asarray(x, dtype=float)
         column = np.asarray(weights, dtype=float)[:, None]
@@ -84,10 +75,6 @@ class Manifold(ABC):
             if np.abs(step).max(initial=0.0) <= _MEAN_TOLERANCE:
                 break
         return mean
-
-
-class LieGroup(Manifold):
-    """A manifold with a smooth group operation; the chart at x is xi -> x Exp(xi)."""
 
     @abstractmethod
     def exp(self, xi: Tangents) -> StateArray:
@@ -133,9 +120,9 @@ class LieGroup(Manifold):
         return self.compose(self.inverse(a), b)
 
     def retract(self, x: States, xi: Tangents) -> StateArray:
-        """Product x Exp(xi); see `Manifold.retract`. A group may fuse the two steps for speed."""
+        """Point x Exp(xi); a group may fuse the two steps for speed."""
         return self.compose(x, self.exp(xi))
 
     def local(self, x: States, y: States) -> TangentArray:
-        """Log(x^-1 y); see `Manifold.local`. A group may fuse the two steps for speed."""
+        """Coordinates Log(x^-1 y) of y in the chart at x, the inverse of `retract`; may be fused likewise."""
         return self.log(self.between(x, y))

@@ -1,7 +1,7 @@
 """SE(2), rigid motions of the plane; storage [theta, x, y], tangent [omega, vx, vy].
 
-The plane is treated as the complex numbers: a rotation is the factor exp(i theta), and
-Exp([omega, v]) has the translation V v with V = sin(h) / h exp(i h), h = omega / 2.
+The plane is the complex numbers: a rotation is the factor exp(i theta), and Exp([omega, v]) has the translation V v with
+V = sin(h) / h exp(i h), h = omega / 2.
 """
 
 from math import factorial

@@ -26,10 +26,8 @@ VERSION = 1
 def whole(path: Path) -> Iterator[Path]:
     """A temporary place beside a file, which gets the file's name when everything is written.
 
-    Nothing stays of what fails half way, and a file that was there before stays as it was.
-
-    Raises:
-        InputError: the place cannot be written to, or the disk is full.
+    Nothing stays of what fails half way, and a file that was there before stays as it was. Raises InputError: the place cannot
+    be written to, or the disk is full.
     """
     temporary = path.with_name(f"{path.stem}.partial{path.suffix}")
     try:
@@ -45,11 +43,7 @@ def whole(path: Path) -> Iterator[Path]:
 
 
 def prepare_folder(out: Path) -> None:
-    """Makes a run's folder.
-
-    Raises:
-        InputError: there is a file of that name, or the folder cannot be made.
-    """
+    """Makes a run's folder. Raises InputError: there is a file of that name, or the folder cannot be made."""
     if out.exists() and not out.is_dir():
         raise InputError(f"{out} is a file: name a folder for the results")
     try:
@@ -78,11 +72,9 @@ def numbered(out: Path, last: bool = False) -> Path:
 def own_folder(out: Path) -> Iterator[None]:
     """A run's folder, made where it does not exist, in which nobody else writes meanwhile.
 
-    A folder that is made here and in which nothing stays is removed again. The lock is the system's, so that a process
-    that was killed holds none; where the file system knows no locks there is none.
-
-    Raises:
-        InputError: the folder cannot be made or written to, or another process writes there.
+    A folder that is made here and in which nothing stays is removed again. The lock is the system's, so that a process that
+    was killed holds none; where the file system knows no locks there is none. Raises InputError: it cannot be made or written
+    to, or another process writes there.
     """
     missing = [place for place in (out, *out.parents) if not place.exists()]
     prepare_folder(out)
@@ -129,7 +121,7 @@ def _locked(path: Path) -> int:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Writes a whole file or none; raises InputError where the place cannot be written to, or the disk is full."""
+    """Writes a whole file or none."""
     with whole(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 

@@ -50,13 +50,9 @@ STILL = 0.01
 
 
 def write_run(run: Run, out: Path, sources: Mapping[str, str | float | bool]) -> dict[str, Any]:
-    """Writes all data files of a run; `sources` says what was filtered, for config.yaml: `recording` and what else was read.
+    """Writes all data files of a run, and returns the entries of summary.json; for config.yaml `sources` says what was read.
 
-    Returns:
-        The entries of summary.json.
-
-    Raises:
-        InputError: the folder cannot be written to, or the disk is full.
+    Raises InputError: the folder cannot be written to, or the disk is full.
     """
     prepare_folder(out)
     log, system = run.log, run.system

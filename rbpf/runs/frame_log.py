@@ -11,7 +11,7 @@ from typing import Any, final
 
 import numpy as np
 
-from rbpf.core.schema import elements, integers, numbers, read, split
+from rbpf.core.checkpoint import elements, integers, numbers, read, split
 from rbpf.errors import InputError
 from rbpf.lie import SE2Group, SE3Group
 from rbpf.systems.system import DIAGNOSTICS, TIMINGS, Column, Ragged, System, Tracked, TrackingState
@@ -66,11 +66,6 @@ class FrameLog:
         return len(self._path["stamps_ns"])
 
     def __getitem__(self, name: str) -> np.ndarray:
-        """A column (T, …) by name.
-
-        Raises:
-            KeyError: there is no such column.
-        """
         column = next((column for column in self.columns if column.name == name), None)
         if column is None:
             raise KeyError(f"no column is called {name!r}: {', '.join(self._rows)}")
@@ -81,7 +76,6 @@ class FrameLog:
 
     @property
     def stamps_ns(self) -> np.ndarray:
-        """(T,) int64 times of the frames."""
         return np.array(self._path["stamps_ns"], dtype=np.int64)
 
     @property
@@ -144,20 +138,6 @@ class FrameLog:
                 columns.append((values.astype(int) if column.kind is bool else values).tolist())
         return header, columns
 
-    def to_dataframe(self) -> Any:
-        """A pandas DataFrame: times, poses and all columns of single numbers.
-
-        Raises:
-            InputError: pandas is not installed.
-        """
-        try:
-            import pandas
-        except ImportError as error:
-            raise InputError("a data frame needs pandas, which is not installed: pip install pandas") from error
-        scalars = {column.name: self[column.name] for column in self.columns if not column.shape}
-        poses = {f"pose_{i}": values for i, values in enumerate(self.poses.T)}
-        return pandas.DataFrame({"stamp_ns": self.stamps_ns, **poses, **scalars})
-
     def arrays(self) -> dict[str, np.ndarray]:
         """For a checkpoint."""
         out = {"log/stamps_ns": self.stamps_ns, "log/poses": self.poses, "log/covs": self.covs}
@@ -170,7 +150,7 @@ class FrameLog:
         return out
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """The inverse of `arrays`, into an empty log of the same system; errors as `rbpf.core.schema.read`."""
+        """The inverse of `arrays`, into an empty log of the same system; errors as `rbpf.core.checkpoint.read`."""
         dim = self.space.dim
         path = {
             "stamps_ns": integers("frames"),

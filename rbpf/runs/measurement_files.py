@@ -81,11 +81,7 @@ _INT64 = np.iinfo(np.int64)
 
 
 def write_measurements(folder: Path, m: Measurements | FeatureLog) -> None:
-    """Writes the files; they appear under their names when all are complete, and those of a former run are replaced.
-
-    Raises:
-        InputError: the folder is missing or cannot be written to, or the disk is full.
-    """
+    """Writes the files; they appear under their names when all are complete, and those of a former run are replaced."""
     texts = _camera_texts(m) if isinstance(m, FeatureLog) else _robot_texts(m)
     with ExitStack() as together:
         for name, text in texts.items():
@@ -95,11 +91,7 @@ def write_measurements(folder: Path, m: Measurements | FeatureLog) -> None:
 
 
 def read_measurements(folder: Path) -> Measurements | FeatureLog:
-    """Reads what `write_measurements` wrote; a camera's log has no truth.
-
-    Raises:
-        InputError: names the file and the line that is not as expected.
-    """
+    """Reads what `write_measurements` wrote; a camera's log has no truth. An InputError names the file and the line."""
     table = _Table.read(folder / OBSERVATIONS)
     kind = table.choice("measurement", (*KINDS, *_PIXELS))
     return _read_camera_log(folder, table, kind) if kind in _PIXELS else _read_robot(folder, table)
@@ -323,7 +315,6 @@ class _Table:
         raise line_error(path, len(lines), "expected the columns' names below, found the file's end")
 
     def text(self, key: str) -> str:
-        """Named value."""
         return self._entry(key)[1]
 
     def choice(self, key: str, allowed: Sequence[str]) -> str:

@@ -70,11 +70,7 @@ class Origin(NamedTuple):
 
 
 def read_config(folder: Path) -> dict[str, Any]:
-    """The entries of a run folder's config.yaml.
-
-    Raises:
-        InputError: it is no run folder.
-    """
+    """The entries of a run folder's config.yaml. Raises InputError: it is no run folder."""
     path = folder / "config.yaml"
     if not path.exists():
         raise InputError(f"{folder} holds no config.yaml: expected the folder that `rbpf run` leaves.")
@@ -133,9 +129,7 @@ def instruction_set() -> str:
 def digest_of(sources: Mapping[str, Path], without: Path | None = None) -> str | None:
     """SHA-256 over the names and the content of all files of a run's input; None where one is not there.
 
-    Args:
-        sources: files and folders, by what they are for.
-        without: a folder whose files are left out, as the run's own inside its recording.
+    Files in the folder `without`, as the run's own inside its recording, are left out.
     """
     whole = hashlib.sha256()
     for name, path in sorted(sources.items()):
@@ -161,14 +155,9 @@ def decisive_settings(settings: Mapping[str, Any]) -> dict[str, str]:
 
 
 def decisive_inputs(sources: Mapping[str, Any], out: Path) -> dict[str, str]:
-    """What a run reads, as text by name: the content of files, whatever they are called, and all else as it was given.
+    """What a run reads (`sources`), as text by name: the content of files, whatever they are called, and all else as given.
 
-    Args:
-        sources: what the run reads, by name; `recording` is one of them.
-        out: the run's folder; a recording that is itself this folder changes with the run, and is left out.
-
-    Raises:
-        InputError: a file cannot be read.
+    A recording that is itself the run's folder `out` changes with the run, and is left out.
     """
     found: dict[str, str] = {}
     for name, value in sources.items():
@@ -182,11 +171,7 @@ def decisive_inputs(sources: Mapping[str, Any], out: Path) -> dict[str, str]:
 
 
 def require_same(path: Path, before: Mapping[str, str], now: Mapping[str, str]) -> None:
-    """Refuses to go on with a run (`path` is its checkpoint) with something else than it was begun with, as text by name.
-
-    Raises:
-        InputError: names the first that differs, and both values.
-    """
+    """Refuses to go on with a run (`path` is its checkpoint) with something else than it was begun with; names the first."""
     for name in [*before, *(name for name in now if name not in before)]:
         was, given = (_shown(values.get(name)) for values in (before, now))
         if before.get(name) != now.get(name):
@@ -204,11 +189,7 @@ def _shown(value: str | None) -> str:
 
 
 def read_origin(config: Path) -> Origin:
-    """What a run was started with, from its config.yaml.
-
-    Raises:
-        InputError: the file does not tell a run of this version, or what the run read has changed or is gone.
-    """
+    """What a run was started with, from its config.yaml; refused where what the run read has changed or is gone."""
     if config.is_dir():
         config = config / CONFIG
     if config.name != CONFIG:

@@ -1,6 +1,7 @@
 """A run folder of any system, read back: what pictures, comparisons and reports are made of.
 
-Each part is read when it is asked for, so that a folder that lacks one still has the others.
+Each part is read when it is asked for, so that a folder that lacks one still has the others. What is missing, damaged or of
+another version of the program raises an InputError.
 
 trajectory.npz   stamps_ns (T,), mean (T, E) and cov (T, d, d) in the right chart at it: the online filtered poses;
                  correction (T, r), cov_correction (T, r, r) of the motions, see `rbpf.core.diagnostics.Correction`, r = 0
@@ -18,8 +19,7 @@ from typing import Any, Self, final
 import numpy as np
 from numpy.typing import NDArray
 
-from rbpf.core.checkpoint import fitting, load_arrays
-from rbpf.core.schema import integers, numbers, read
+from rbpf.core.checkpoint import fitting, integers, load_arrays, numbers, read
 from rbpf.errors import InputError, printable
 from rbpf.lie import SE2, SE3, Array, SE2Group, SE3Group
 from rbpf.runs.files import MAP, TRAJECTORY, VERSION
@@ -75,12 +75,10 @@ class PathAndMap:
 
     @property
     def space(self) -> SE2Group | SE3Group:
-        """The group of the poses."""
         return SE2 if self.world_from_body.shape[1] == SE2.size else SE3
 
     @property
     def trajectory(self) -> Trajectory:
-        """The path in space."""
         return in_space(self.stamps_ns, self.world_from_body)
 
     def at(self, rows: NDArray[np.intp]) -> "PathAndMap":
@@ -109,7 +107,6 @@ class FilteredPath:
 
     @property
     def space(self) -> SE2Group | SE3Group:
-        """The group of the poses."""
         return SE2 if self.mean.shape[1] == SE2.size else SE3
 
     def trajectory(self, rows: np.ndarray | slice = slice(None)) -> Trajectory:
@@ -119,13 +116,7 @@ class FilteredPath:
 
 @dataclass(frozen=True, repr=False)
 class RunFolder:
-    """A run folder.
-
-    Attributes:
-        folder: where it lies.
-        config: the entries of config.yaml.
-        summary: the entries of summary.json.
-    """
+    """A run folder, with the entries of its config.yaml and of its summary.json."""
 
     folder: Path
     config: dict[str, Any]
@@ -133,11 +124,7 @@ class RunFolder:
 
     @classmethod
     def open(cls, folder: Path | str) -> Self:
-        """Opens a run folder.
-
-        Raises:
-            InputError: it is not one, or one of another version, or its config.yaml or summary.json is damaged.
-        """
+        """Opens a run folder."""
         folder = Path(folder)
         if not folder.is_dir():
             raise InputError(f"{folder}: expected the folder of a run, there is no such folder")
@@ -148,7 +135,6 @@ class RunFolder:
 
     @property
     def system(self) -> str:
-        """Which system made it."""
         return str(self.config.get("system", ""))
 
     @property
@@ -158,11 +144,7 @@ class RunFolder:
 
     @cached_property
     def path(self) -> FilteredPath:
-        """The filtered poses, with what they were corrected by.
-
-        Raises:
-            InputError: trajectory.npz is missing, damaged or of another version of the program.
-        """
+        """The filtered poses, with what they were corrected by."""
         file, again = self.folder / TRAJECTORY, f"repeat the run with --config {self.folder / 'config.yaml'}"
         if not file.is_file():
             raise InputError(f"{self.folder} has no {file.name}: it was left by another version of rbpf; {again}")
@@ -181,26 +163,22 @@ class RunFolder:
 
     @property
     def trajectory(self) -> Trajectory:
-        """The online filtered path in space; errors as `path`."""
+        """The online filtered path in space."""
         return self.path.trajectory()
 
     @property
     def covariance(self) -> np.ndarray:
-        """(T, d, d) of the poses in the right chart at each, [ω, v]; errors as `path`."""
+        """(T, d, d) of the poses in the right chart at each, [ω, v]."""
         return self.path.cov
 
     @cached_property
     def truth(self) -> RunTruth:
-        """The ground truth at the run's frames; errors as `read_truth`."""
+        """The ground truth at the run's frames."""
         return read_truth(self.folder, len(self.path.mean), self.path.mean.shape[1])
 
     @cached_property
     def map(self) -> MapEstimate:
-        """All landmarks, with the system's columns; `map.points()` are those whose depth is known.
-
-        Raises:
-            InputError: map.npz is missing or damaged.
-        """
+        """All landmarks, with the system's columns; `map.points()` are those whose depth is known."""
         file = self.folder / MAP
         if not file.exists():
             raise InputError(f"{self.folder} holds no {MAP}: expected the folder of a finished run.")
@@ -217,11 +195,7 @@ class RunFolder:
 
     @cached_property
     def particles(self) -> tuple[np.ndarray, np.ndarray]:
-        """Poses (N, E) of the last frame's particles in the reported world, and their weights (N,).
-
-        Raises:
-            InputError: trajectory.npz does not hold them.
-        """
+        """Poses (N, E) of the last frame's particles in the reported world, and their weights (N,)."""
         file = self.folder / TRAJECTORY
         arrays = load_arrays(file)
         with fitting(file):
@@ -230,25 +204,17 @@ class RunFolder:
 
     @cached_property
     def measurements(self) -> FeatureLog | Measurements:
-        """What the run used; errors as `read_measurements`."""
+        """What the run used."""
         return read_measurements(self.folder)
 
     @property
     def estimate(self) -> PathAndMap:
-        """Poses and the landmarks that are points, with their covariances.
-
-        Raises:
-            InputError: the run was made by another version of the program, or as `path` and `map`.
-        """
+        """Poses and the landmarks that are points, with their covariances; of a run of this version of the program."""
         require_own_version(self.config, self.folder)
         return PathAndMap(self.path.stamps_ns, self.path.mean, self.path.cov, self.map.points())
 
     def table(self, name: str) -> dict[str, np.ndarray]:
-        """A table of numbers by its columns' names: diagnostics.csv, timings.csv.
-
-        Raises:
-            InputError: it is missing, or holds something else.
-        """
+        """A table of numbers by its columns' names: diagnostics.csv, timings.csv."""
         path = self.folder / name
         rows = list(csv.reader(StringIO(_text(path))))
         if not rows or any(len(row) != len(rows[0]) for row in rows):

@@ -90,11 +90,7 @@ class RobotRecording:
     part: Part = WHOLE
 
     def open(self, config: RangeBearingConfig) -> Opened:
-        """The system and the log's frames.
-
-        Raises:
-            InputError: the log or a setting is wrong.
-        """
+        """The system and the log's frames. Raises InputError: the log or a setting is wrong."""
         return open_robot_log(part_of_log(open_log(self.log, config.noise), self.part), config)
 
     def sources(self) -> dict[str, str | float | bool]:
@@ -141,11 +137,7 @@ class MonoRecording:
             raise InputError("in a known map a run starts from the map: leave out known points and chessboard")
 
     def open(self, config: MonoConfig) -> Opened:
-        """The system and the images.
-
-        Raises:
-            InputError: a file is wrong, or the board is not found in the first image.
-        """
+        """The system and the images. Raises InputError: a file is wrong, or the board is not found in the first image."""
         known_map = None if self.map is None else read_known_map(self.map)
         return open_mono(*self.sequence(), config, known_map)
 
@@ -218,11 +210,7 @@ class StereoRecording:
     part: Part = WHOLE
 
     def open(self, config: StereoConfig) -> Opened:
-        """The system and the pairs.
-
-        Raises:
-            InputError: a file is wrong.
-        """
+        """The system and the pairs. Raises InputError: a file is wrong."""
         return open_pairs(open_stereo(self.pairs, self.calibration, topics=self.topics, part=self.part), config)
 
     def sources(self) -> dict[str, str | float | bool]:
@@ -254,11 +242,7 @@ def part_of_log(log: RobotLog, part: Part) -> RobotLog:
 
 
 def open_robot_log(log: RobotLog, config: RangeBearingConfig) -> Opened:
-    """A robot's log in memory.
-
-    Raises:
-        InputError: landmarks are to be known by their names, and some have none.
-    """
+    """A robot's log in memory. Raises InputError: landmarks are to be known by their names, and some have none."""
     if config.association == "known" and any((frame.landmarks == UNNAMED).any() for frame in log.frames):
         raise InputError(f"{log.name} has observations without a landmark's name: filter it with --association ml")
     system = RangeBearingSlam.of_log(log, config, keep_associations=config.association == "ml")
@@ -316,11 +300,7 @@ def open_features(
 
 
 def first_image(sequence: ImageSequence | LiveCamera) -> np.ndarray:
-    """The image (H, W) that a run starts from.
-
-    Raises:
-        InputError: it cannot be read.
-    """
+    """The image (H, W) that a run starts from. Raises InputError: it cannot be read."""
     first = next(sequence.frames(), None)
     if first is None or first.image is None:
         reason = "it has no image" if first is None else first.problem

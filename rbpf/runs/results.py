@@ -23,11 +23,7 @@ class Results(RunFolder):
     """A run folder, see `RunFolder`, with what people look at."""
 
     def to_dataframe(self) -> Any:
-        """A pandas DataFrame, one row per frame: times, position, diagnostics and timings.
-
-        Raises:
-            InputError: pandas is not installed, or a file is missing or damaged.
-        """
+        """A pandas DataFrame, one row per frame: times, position, diagnostics and timings."""
         try:
             import pandas
         except ImportError as error:
@@ -39,7 +35,7 @@ class Results(RunFolder):
         return pandas.DataFrame(columns)
 
     def plot(self) -> Any:
-        """A matplotlib figure of the path and the map with 3σ ellipses; errors as `path` and `map`."""
+        """A matplotlib figure of the path and the map with 3σ ellipses."""
         return map_figure(self)
 
     def __repr__(self) -> str:
@@ -59,9 +55,5 @@ class Results(RunFolder):
 
 
 def load(folder: Path | str) -> Results:
-    """Opens a run folder.
-
-    Raises:
-        InputError: it is not one, or one of another version, or its config.yaml or summary.json is damaged.
-    """
+    """Opens a run folder. Raises InputError: it is none, or of another version, or damaged."""
     return Results.open(folder)

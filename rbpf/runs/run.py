@@ -17,8 +17,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
-from rbpf.core.checkpoint import fitting, load_arrays
-from rbpf.core.schema import read_one, text
+from rbpf.core.checkpoint import fitting, load_arrays, read_one, text
 from rbpf.errors import InputError, printable
 from rbpf.runs.frame_log import FrameLog
 from rbpf.runs.provenance import decisive_settings, require_same
@@ -73,14 +72,12 @@ class Run(Generic[SystemT]):
 
     @property
     def name(self) -> str:
-        """Of the recording."""
         return printable(self.source.name)
 
     def take(self, frame: Any, waiting: float = 0.0) -> Tracked:
-        """Gives the system a frame and keeps what it says; `waiting` is the time [s] that the frame took to arrive.
+        """Gives the system a frame and keeps what it says; `waiting` is the time [s] that it took to arrive.
 
-        Raises:
-            InputError: as the system's `take`.
+        Errors as `System.take`.
         """
         started = time.perf_counter()
         tracked = self.system.take(frame)
@@ -92,23 +89,14 @@ class Run(Generic[SystemT]):
         return tracked
 
     def save(self, path: Path) -> None:
-        """Writes a checkpoint of the system and of everything gathered so far.
-
-        Raises:
-            InputError: the file cannot be written.
-        """
+        """A checkpoint of the system and of everything gathered so far. Raises InputError: the file cannot be written."""
         settings = decisive_settings(asdict(self.system.config))
         begun = json.dumps({"settings": settings, "inputs": dict(self.inputs)})
-        told = {"log/messages": np.array(self.messages, dtype=np.str_), _BEGUN: np.array(begun)}
-        self.system.save(path, self.log.arrays() | told)
+        own = {"log/messages": np.array(self.messages, dtype=np.str_), _BEGUN: np.array(begun)}
+        self.system.save(path, self.log.arrays() | own)
 
     def load(self, path: Path) -> None:
-        """Goes on from a checkpoint.
-
-        Raises:
-            InputError: the file is missing or damaged, or belongs to a run of another kind, with other settings or
-                over other input.
-        """
+        """Goes on from a checkpoint. Raises InputError: it is missing, damaged, or of another kind, setting or input."""
         # Before anything else is read, so that the message names the setting and not an array that does not fit.
         found = load_arrays(path, only=f"extra/{_BEGUN}")
         if found:

@@ -57,14 +57,11 @@ class Similarity:
 @final
 @dataclass(frozen=True)
 class Trajectory:
-    """Poses in order of time.
+    """Poses in order of time; refused are shapes that do not fit, numbers that are not finite, time that runs backwards.
 
     Attributes:
         stamps_ns: (T,) integer nanoseconds; a recording without times counts its steps.
         world_from_body: (T, 7) poses [qx, qy, qz, qw, tx, ty, tz] with unit quaternions.
-
-    Raises:
-        InputError: the shapes do not fit together, a number is not finite, or time runs backwards.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -102,7 +99,6 @@ class Trajectory:
         return float(np.sqrt(np.square(self.positions - self.positions.mean(axis=0)).sum(axis=1).mean()))
 
     def at(self, rows: NDArray[np.intp]) -> "Trajectory":
-        """The poses of some rows, in order of time."""
         return Trajectory(self.stamps_ns[rows], self.world_from_body[rows])
 
     def transformed(self, similarity: Similarity) -> "Trajectory":
@@ -120,21 +116,11 @@ def in_space(stamps_ns: NDArray[np.int64], poses: Array) -> Trajectory:
 def associate(
     estimate: Trajectory, reference: Trajectory, max_difference_ns: int = MAX_DIFFERENCE_NS
 ) -> tuple[Trajectory, Trajectory]:
-    """Poses of two trajectories that belong together, paired by time.
+    """Poses of two trajectories that belong together, paired by time: both with the same number of poses, row by row a pair.
 
-    Each estimated pose asks for the reference pose nearest in time (the earlier of two equally near); of
-    several that ask for the same one, the nearest in time gets it.
-
-    Args:
-        estimate: T_e poses.
-        reference: T_r poses.
-        max_difference_ns: largest difference of a pair; 0 for recordings whose stamps count steps.
-
-    Returns:
-        Estimate and reference with the same number of poses, row by row a pair.
-
-    Raises:
-        InputError: no pose has a partner.
+    Each estimated pose asks for the reference pose nearest in time (the earlier of two equally near), no further than
+    `max_difference_ns`, 0 for stamps that count steps; of several that ask for the same one, the nearest in time gets it.
+    Raises InputError: no pose has a partner.
     """
     if not len(estimate) or not len(reference):
         raise InputError("Expected trajectories with poses to associate, found an empty one.")
@@ -160,19 +146,11 @@ def _nearest(stamps_ns: NDArray[np.int64], others_ns: NDArray[np.int64]) -> NDAr
 
 
 def align(estimate_points: ArrayLike, reference_points: ArrayLike, with_scale: bool = False) -> Similarity:
-    """Similarity that brings estimated points closest to the reference, Umeyama (1991) (39)-(43).
+    """Similarity that brings estimated points (N, D) closest to the reference (N, D), D = 2 or 3, Umeyama (1991) (39)-(43).
 
-    Too few points, and points on one line (D = 3) or all in one place, leave the rotation undetermined
-    without changing the residual: the smallest fitting rotation is returned and `unique` is False. The scale
-    of an estimate that lies in one place is 1.
-
-    Args:
-        estimate_points: (N, D) with D = 2 or 3 and N >= 1 [m].
-        reference_points: (N, D), the same points in the same order [m].
-        with_scale: estimate the scale too; otherwise it is 1.
-
-    Raises:
-        InputError: the shapes do not fit together, there is no point, or a coordinate is not finite.
+    Too few points, and points on one line (D = 3) or all in one place, leave the rotation undetermined without changing the
+    residual: the smallest fitting rotation is returned and `unique` is False. The scale of an estimate that lies in one place
+    is 1, as it is without `with_scale`. Raises InputError: shapes do not fit, or a coordinate is not finite.
     """
     x, y = _checked(estimate_points, reference_points)
     centre_x, centre_y = x.mean(0), y.mean(0)
@@ -188,11 +166,7 @@ def align(estimate_points: ArrayLike, reference_points: ArrayLike, with_scale: b
 
 
 def fit(alignment: Alignment | Similarity, estimate_points: Array, reference_points: Array) -> Similarity:
-    """The alignment asked for: none, the best rigid motion or similarity, or one that is already known.
-
-    Raises:
-        InputError: the name is another one, or `align` refuses the points.
-    """
+    """The alignment asked for: none, the best rigid motion or similarity, or one that is already known."""
     if isinstance(alignment, Similarity):
         return alignment
     if alignment not in ("none", "rigid", "similarity"):
@@ -236,11 +210,7 @@ NS_PER_S = 1_000_000_000
 
 
 def read_tum(path: Path) -> Trajectory:
-    """Trajectory of a file in TUM format; quaternions are scaled to unit length.
-
-    Raises:
-        InputError: names the file and the line that is not as expected.
-    """
+    """Trajectory of a file in TUM format; quaternions are scaled to unit length. An InputError names file and line."""
     table = read_columns(path, TUM_COLUMNS, "a trajectory in TUM format")
     quat_xyzw = table.block("qx", "qw")
     length = np.sqrt(np.square(quat_xyzw).sum(1))
@@ -253,28 +223,20 @@ def read_tum(path: Path) -> Trajectory:
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
-    """Write a trajectory in TUM format, with every digit; the file appears under its name when complete.
-
-    Raises:
-        InputError: the place cannot be written to, or the disk is full.
-    """
+    """Writes a trajectory in TUM format, with every digit; the file appears under its name when complete."""
     rows = zip(trajectory.stamps_ns.tolist(), trajectory.world_from_body.tolist(), strict=True)
     lines = [_tum_line(stamp_ns, numbers) for stamp_ns, numbers in rows]
     write_text(path, "".join(["# " + " ".join(TUM_COLUMNS) + "\n", *lines]))
 
 
 def write_kitti(path: Path, trajectory: Trajectory) -> None:
-    """Write a trajectory in KITTI format, with every digit and without times; the file appears when it is complete."""
+    """Writes a trajectory in KITTI format, with every digit and without times; the file appears when it is complete."""
     rows = SE3.matrix(trajectory.world_from_body)[:, :3].reshape(-1, 12).tolist()
     write_text(path, "".join(" ".join(map(repr, row)) + "\n" for row in rows))
 
 
 def read_kitti(path: Path) -> Trajectory:
-    """Trajectory of a file in KITTI format, stamped with the number of the row from 0.
-
-    Raises:
-        InputError: names the file and the line that is not as expected.
-    """
+    """Trajectory of a file in KITTI format, stamped with the number of the row from 0. An InputError names file and line."""
     table = read_columns(path, KITTI_COLUMNS, "a trajectory in KITTI format")
     matrices = table.values.reshape(-1, 3, 4)
     wrong = _distance_from_rotation(matrices[:, :, :3]) > UNIT_TOLERANCE

@@ -11,8 +11,7 @@ from typing import Protocol
 
 import numpy as np
 
-from rbpf.core.checkpoint import fitting, load_arrays, save_arrays
-from rbpf.core.schema import integers, numbers, read, text
+from rbpf.core.checkpoint import fitting, integers, load_arrays, numbers, read, save_arrays, text
 from rbpf.errors import InputError
 from rbpf.lie import SE2Group, SE3Group
 from rbpf.runs.trajectory import Alignment
@@ -66,14 +65,10 @@ class RunTruth:
 
 
 def truth_at(space: SE2Group | SE3Group, truth: GroundTruth, stamps_ns: np.ndarray, gauge: Gauge) -> RunTruth | None:
-    """The truth at a run's frames; None where fewer than `LEAST` have a true pose.
+    """The truth at a run's frames (T,); None where fewer than `LEAST` have a true pose.
 
-    Args:
-        space: group of the poses.
-        truth: of the recording.
-        stamps_ns: (T,) of the frames.
-        gauge: what the run's world is. Where it begins at the first frame, so does the truth, if it is known there;
-            else only an alignment brings the two together.
+    Where the run's world (`gauge`) begins at the first frame, so does the truth, if it is known there; else only an alignment
+    brings the two together.
     """
     rows, poses = poses_at(space, truth.stamps_ns, truth.poses, stamps_ns)
     if rows.size < LEAST:
@@ -126,11 +121,7 @@ def write_truth(out: Path, truth: RunTruth | None) -> None:
 
 
 def read_truth(folder: Path, steps: int, size: int) -> RunTruth:
-    """Reads truth.npz of a run of so many steps, with poses of so many numbers.
-
-    Raises:
-        InputError: there is none, it is damaged or another run's, or no step has a true pose.
-    """
+    """Reads truth.npz of a run of `steps` steps with poses of `size` numbers; refused where there is none for it."""
     path = folder / TRUTH
     if not path.is_file():
         raise InputError(

@@ -1,16 +1,15 @@
 """The start pose in each particle's world, re-estimated from everything that was learnt since.
 
 A filter that starts from a known pose fixes its world by what it observed first, when the map was still poor; later
-observations sharpen the map, but no particle can move the world it has committed to. Where the models do not change
-when the whole world is moved (odometry, sensors that measure relative to the robot), the start pose of a particle can
-be re-estimated from its own map: given the rest of the trajectory and the map without the first frame's measurements,
-x_0 has the distribution of a filter step run backwards,
+observations sharpen the map, but no particle can move the world it has committed to. Where the models do not change when
+the whole world is moved (odometry, sensors that measure relative to the robot), the start pose of a particle can be
+re-estimated from its own map: given the rest of the trajectory and the map without the first frame's measurements, x_0 has
+the distribution of a filter step run backwards,
 
     p(x_0 | x_1, u_1, z_0, m) ∝ p(x_1 | x_0, u_1) p(z_0 | x_0, m),    Mathematics (start-again)
 
-which leaves the posterior invariant (a Gibbs step for x_0, W. Gilks and C. Berzuini 2001) and, taken as the Gaussian
-that it is instead of a draw from it, marginalises the world's place exactly. Poses and landmarks are then reported
-relative to it.
+which leaves the posterior invariant (a Gibbs step for x_0, W. Gilks and C. Berzuini 2001) and, taken as the Gaussian that
+it is instead of a draw from it, marginalises the world's place exactly. Poses and landmarks are reported relative to it.
 """
 
 from dataclasses import dataclass
@@ -19,13 +18,13 @@ from typing import final
 import numpy as np
 
 from rbpf import gaussian
+from rbpf.core.checkpoint import elements, integers, numbers, read, read_one
 from rbpf.core.filter import Filter, StepReport
 from rbpf.core.likelihoods import Gaussian
 from rbpf.core.linearisation import information, innovation_covariance, linearise
 from rbpf.core.models import Landmark, LineariseAt, NewLandmarks, ObservationModel, Records
 from rbpf.core.particles import Estimate, Information, Prior, mixture_estimate
 from rbpf.core.proposals import EkfProposal
-from rbpf.core.schema import elements, integers, numbers, read, read_one
 from rbpf.errors import InputError
 from rbpf.lie import LieGroup
 
@@ -35,12 +34,7 @@ _MOST_OF_ALL = 0.999
 
 @dataclass(frozen=True)
 class Anchored:
-    """The start pose in each particle's own world.
-
-    Attributes:
-        mean: (N, E) world_from_start.
-        factor: (N, d, d) of its covariance, in the right chart at the mean.
-    """
+    """The start pose in each particle's own world: world_from_start (N, E), and a factor (N, d, d) of its covariance there."""
 
     mean: np.ndarray
     factor: np.ndarray
@@ -49,15 +43,7 @@ class Anchored:
 def relative_estimate(
     space: LieGroup, anchored: Anchored, state: np.ndarray, log_weights: np.ndarray, origin: np.ndarray | None = None
 ) -> Estimate:
-    """Mean and covariance of states (N, E) relative to the anchored frame, origin · x_0⁻¹ · x.
-
-    Args:
-        space: the group of the states.
-        anchored: the frame x_0 in each particle's own world.
-        state: (N, E) sampled states.
-        log_weights: (N,) normalised.
-        origin: (E,) what the frame is called in the result; by default the identity.
-    """
+    """Mean and covariance of states (N, E) relative to the anchored frame, origin · x_0⁻¹ · x; no origin, the identity."""
     relative = space.between(anchored.mean, state)
     factor = space.adjoint(space.inverse(relative)) @ anchored.factor
     base = relative if origin is None else space.compose(origin, relative)
@@ -66,26 +52,18 @@ def relative_estimate(
 
 @final
 class StartAnchor:
-    """Remembers the first frame and the first motion of a filter, and re-estimates the start from time to time.
+    """Remembers the first frame and motion of a filter started from one known state, and re-estimates the start.
 
-    Call `after_step` after every step of the filter.
-
-    Args:
-        filter_: before its first step, started from one known state.
-        every: steps between re-estimations; in between, descendants inherit their ancestor's.
-        iterations: linearisations.
-
-    Raises:
-        InputError: `every` is not positive.
+    Call `after_step` after every step; between re-estimations, `every` so many, descendants inherit their ancestor's.
     """
 
-    def __init__(self, filter_: Filter, every: int = 10, iterations: int = 2) -> None:
+    def __init__(self, filter_: Filter, every: int = 10) -> None:
         if every < 1:
             raise InputError(f"an anchor is re-estimated every 1, 2, … steps, got {every}")
         self._filter = filter_
         self._every = every
         self._start = filter_.particles.state[0].copy()
-        self._proposal = EkfProposal(iterations=iterations)
+        self._proposal = EkfProposal(iterations=2)
         self._seen: list[tuple[np.ndarray, NewLandmarks]] = []
         self._second: _FirstMotion | None = None
         self._latest: tuple[int, Anchored] | None = None

@@ -30,7 +30,6 @@ class LikelihoodConfig(Ranged):
     outlier_volume: Annotated[float, Range(gt=0.0, le=1e18)] = 60.0
 
     def build(self) -> Likelihood:
-        """The likelihood."""
         if self.kind == "truncated":
             return TruncatedMahalanobis(self.truncation, max(self.update_limit, self.truncation))
         if self.kind == "outliers":
@@ -73,10 +72,5 @@ class ResamplingConfig(Ranged):
 
     def build(self) -> Resampler:
         """The resampler; a subclass may make another one."""
-        schemes: dict[str, Resampler] = {
-            "systematic": Systematic(),
-            "stratified": Stratified(),
-            "residual": Residual(),
-            "multinomial": Multinomial(),
-        }
-        return EssTriggered(schemes[self.scheme], self.ess_threshold)
+        schemes = {"systematic": Systematic, "stratified": Stratified, "residual": Residual, "multinomial": Multinomial}
+        return EssTriggered(schemes[self.scheme](), self.ess_threshold)

@@ -32,7 +32,6 @@ class MapEstimate:
     ray_ends: np.ndarray | None = None
 
     def named(self) -> dict[int, np.ndarray]:
-        """Positions by name."""
         return dict(zip(self.ids.tolist(), self.mean, strict=True))
 
     def is_ray(self) -> np.ndarray:
@@ -54,12 +53,7 @@ class MapEstimate:
 
 
 def estimate_map(filter_: Filter, anchored: Anchored | None = None) -> MapEstimate:
-    """Mixture moments of every landmark that exists in most of the weight.
-
-    Args:
-        filter_: holds a map of point landmarks.
-        anchored: the start in each particle's world; the map is then reported relative to it.
-    """
+    """Mixture moments of every landmark that exists in most of the weight, relative to the start where it is `anchored`."""
     belief = filter_.belief()
     landmark_map, weights = belief.map, belief.weights
     names, means, covs = [], [], []

@@ -31,7 +31,7 @@ def load_settings(
     """A configuration; later sources override earlier ones.
 
     Args:
-        kind: dataclass of the system's settings.
+        kind: dataclass of the settings.
         system: its name, as a former run's config.yaml has it.
         path: YAML file, such as the config.yaml of a former run.
         pairs: settings as key=value, nested keys with dots.

@@ -191,11 +191,7 @@ class System(ABC):
 
     @abstractmethod
     def take(self, frame: Any) -> Tracked:
-        """`track` with a frame as recordings have it.
-
-        Raises:
-            InputError: no particle explains the frame, or time runs backwards; a frame that shows nothing is survived.
-        """
+        """`track` with a frame of a recording; what shows nothing is survived, what no particle explains is refused."""
 
     @abstractmethod
     def map(self) -> MapEstimate:
@@ -223,28 +219,16 @@ class System(ABC):
 
     @abstractmethod
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """The inverse of `arrays`, into a system built with the same arguments.
-
-        Raises:
-            InputError: an array is missing, or is not what it should be.
-        """
+        """The inverse of `arrays`, into a system built with the same arguments. Raises InputError: an array does not fit."""
 
     def save(self, path: Path | str, extra: Mapping[str, np.ndarray] | None = None) -> None:
-        """Writes a checkpoint, after any frame, with further arrays of the caller's.
-
-        Raises:
-            InputError: the file cannot be written.
-        """
+        """Writes a checkpoint, after any frame, with further arrays of the caller's."""
         self.filter.save(path, self.arrays() | dict(extra or {}))
 
     def load(self, path: Path | str) -> dict[str, np.ndarray]:
-        """Goes on from a checkpoint as if nothing had happened.
+        """Goes on from a checkpoint as if nothing had happened; returns the arrays of `extra`, among others.
 
-        Returns:
-            The arrays of `extra`, among others.
-
-        Raises:
-            InputError: the file is missing or damaged, or belongs to another system or other settings.
+        Raises InputError: the file is missing or damaged, or belongs to another system or other settings.
         """
         arrays = self.filter.load(path)
         with fitting(Path(path)):

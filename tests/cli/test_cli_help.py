@@ -10,9 +10,8 @@ import pytest
 
 from rbpf.cli import DemoOptions, main
 from rbpf.cli.cameras import CalibrateOptions, RecalibrateOptions
-from rbpf.cli.exporting import ExportOptions
 from rbpf.cli.installed import DoctorOptions
-from rbpf.cli.judging import CompareOptions, ReportOptions, SweepOptions, ValidateOptions
+from rbpf.cli.judging import CompareOptions, ExportOptions, ReportOptions, SweepOptions, ValidateOptions
 from rbpf.cli.options import ImagesOptions, LabOptions, LogOptions, MonoOptions, RangeBearingOptions, StereoOptions
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig

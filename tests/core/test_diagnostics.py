@@ -4,18 +4,10 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from rbpf.core.diagnostics import (
-    ancestor_diversity,
-    ancestors_by_step,
-    chi_square_band,
-    coalescence_steps,
-    effective_sample_size,
-    motion_correction,
-    nees,
-)
+from rbpf.core.diagnostics import ancestors_by_step, chi_square_band, coalescence_steps, motion_correction, nees
 from rbpf.core.filter import Filter
 from rbpf.core.genealogy import History, Lineage
-from rbpf.core.particles import Estimate
+from rbpf.core.particles import Estimate, effective_sample_size
 from rbpf.core.proposals import PriorProposal
 from rbpf.lie import SE2, SE3, Euclidean
 from tests.exactness.models import Frame, LinearMotion, LinearObservation, Scripted, single
@@ -82,17 +74,6 @@ def test_effective_sample_size():
     assert effective_sample_size(np.full(8, 1 / 8)) == pytest.approx(8.0)
     assert effective_sample_size(np.eye(8)[3]) == 1.0
     assert effective_sample_size(np.array([0.5, 0.5, 0.0])) == pytest.approx(2.0)
-
-
-def test_ancestor_diversity():
-    lineage = Lineage(4)
-    lineage.retain(0)
-    lineage.advance(np.array([0, 0, 1, 3]))
-    lineage.advance(np.array([0, 1, 1, 2]))
-    lineage.retain(2)
-    lineage.advance(np.array([3, 3, 3, 0]))
-    # Generation 1 was not kept, and there is none before the first.
-    assert ancestor_diversity(lineage, [0, 1, 2, 3, 4]) == {0: 4, 1: 2, 3: 2}
 
 
 def test_the_correction_of_a_motion_is_the_kalman_smoother_s():

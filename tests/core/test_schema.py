@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rbpf.core.schema import elements, grey, integers, numbers, poses, read, read_one, split, text, truths
+from rbpf.core.checkpoint import elements, grey, integers, numbers, poses, read, read_one, split, text, truths
 from rbpf.errors import InputError
 from rbpf.lie import SE2
 

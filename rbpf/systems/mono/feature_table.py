@@ -7,7 +7,7 @@ from typing import final
 
 import numpy as np
 
-from rbpf.core.schema import grey, integers, numbers, poses, read, truths
+from rbpf.core.checkpoint import grey, integers, numbers, poses, read, truths
 from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole
 
@@ -126,7 +126,7 @@ class FeatureTable:
         return {f"features/{name}": getattr(self, name) for name in _COLUMNS}
 
     def restore(self, arrays: dict[str, np.ndarray], members: int) -> None:
-        """The inverse of `arrays`, for a constellation of so many points; errors as `rbpf.core.schema.read`."""
+        """The inverse of `arrays`, for a constellation of so many points; errors as `rbpf.core.checkpoint.read`."""
         self._room = read(arrays, _COLUMNS, "features/", members=members)
         self._use(len(self._room["alive"]))
 

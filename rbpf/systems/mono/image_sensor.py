@@ -7,8 +7,8 @@ from typing import final
 
 import numpy as np
 
+from rbpf.core.checkpoint import integers, read_one
 from rbpf.core.models import Belief, NewLandmarks, Observations, Part, Sensor
-from rbpf.core.schema import integers, read_one
 from rbpf.lie import SE3
 from rbpf.sensors.feature_log import FeatureFrame
 from rbpf.sensors.features import CornerDetector, Descriptor, Detector, Sift, SiftConfig

@@ -11,9 +11,8 @@ from typing import Literal
 
 import numpy as np
 
-from rbpf.core.checkpoint import fitting, load_arrays, save_arrays
+from rbpf.core.checkpoint import fitting, grey, integers, load_arrays, numbers, poses, read, save_arrays, text
 from rbpf.core.filter import Filter
-from rbpf.core.schema import grey, integers, numbers, poses, read, text
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.maps.constellation import Constellation, UncertainConstellation

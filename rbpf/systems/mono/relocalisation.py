@@ -12,10 +12,10 @@ from typing import NamedTuple, final
 import numpy as np
 
 from rbpf import gaussian
+from rbpf.core.checkpoint import grey, integers, numbers, poses, read, truths
 from rbpf.core.filter import Filter
 from rbpf.core.models import Belief
 from rbpf.core.particles import Particles, Prior, mixture_estimate
-from rbpf.core.schema import grey, integers, numbers, poses, read, truths
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.motion.constant_velocity import PosePrior

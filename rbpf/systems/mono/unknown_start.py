@@ -25,9 +25,9 @@ from typing import final
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, cholesky, solve_triangular
 
+from rbpf.core.checkpoint import integers, numbers, poses, read, split
 from rbpf.core.filter import Filter
 from rbpf.core.particles import Prior, mixture_estimate, uniform_log_weights
-from rbpf.core.schema import integers, numbers, poses, read, split
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.motion.constant_velocity import PosePrior
@@ -201,7 +201,7 @@ class UnknownStart:
         return out
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """The inverse of `arrays`; errors as `rbpf.core.schema.read`."""
+        """The inverse of `arrays`; errors as `rbpf.core.checkpoint.read`."""
         last = read(arrays, _LAST, "start/")
         over, self._next = last["progress"].tolist()
         self.over = bool(over)

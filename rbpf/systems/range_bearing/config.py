@@ -46,7 +46,6 @@ class AssociationConfig(Ranged):
         return Gates(float(accept), float(isolate), np.log(self.new_density), np.log(self.clutter_density))
 
     def existence(self) -> ExistenceModel:
-        """Evidence counters."""
         return ExistenceModel(hit=self.hit, miss=self.miss, drop=self.drop)
 
 
@@ -90,7 +89,6 @@ class RangeBearingConfig:
     unknown: AssociationConfig = field(default_factory=AssociationConfig)
 
     def __post_init__(self) -> None:
-        """Checks the ranges, and what goes together."""
         check_ranges(self)
         if self.map == "joint" and (self.association != "known" or self.likelihood.kind != "gaussian"):
             raise InputError("map=joint takes association=known and likelihood.kind=gaussian: map=particles takes all")

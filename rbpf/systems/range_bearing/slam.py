@@ -11,11 +11,11 @@ from typing import Any, ClassVar, final
 
 import numpy as np
 
+from rbpf.core.checkpoint import elements, integers, read, read_one, split
 from rbpf.core.diagnostics import motion_correction
 from rbpf.core.filter import Filter, StepReport
 from rbpf.core.models import NEW, NULL, Sensor
 from rbpf.core.resampling import Consolidation
-from rbpf.core.schema import elements, integers, read, read_one, split
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE2Group, SE3Group
 from rbpf.maps.joint_map import JointMap
@@ -184,20 +184,17 @@ class RangeBearingSlam(System):
         )
 
     def take(self, frame: Frame) -> Tracked:
-        """`track` with a frame of a log."""
         odometry = None
         if frame.delta is not None and frame.cov_delta is not None:
             odometry = Odometry(frame.delta, frame.cov_delta)
         return self.track(frame.z, frame.cov_z, frame.landmarks, odometry, frame.stamp_ns)
 
     def map(self) -> MapEstimate:
-        """The landmarks, relative to the start in each particle's world."""
         if self.joint is not None:
             return MapEstimate(self.joint.ids, *self.joint.in_world(self.filter.particles))
         return estimate_map(self.filter, None if self.anchor is None else self.anchor.estimate())
 
     def particle_poses(self) -> np.ndarray:
-        """(N, E) world_from_robot of the particles as they are now."""
         state = self.filter.particles.state
         return state if self.joint is None else self.joint.world(state)
 
@@ -253,14 +250,12 @@ class RangeBearingSlam(System):
         return [log.observed(t)["landmarks"] for t in range(len(log))]
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Where the start is, and the associations that are kept."""
         kept = {"names": np.array(sorted(self._names), dtype=np.int64), "odometry": self._odometry}
         if self._associations is not None:
             kept |= self._associations.arrays()
         return kept if self.anchor is None else kept | self.anchor.arrays()
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """The inverse of `arrays`."""
         self._names = set(read_one(arrays, "names", integers("names")).tolist())
         self._odometry = read_one(arrays, "odometry", elements(self.space))
         if self._associations is not None:
@@ -346,7 +341,6 @@ class _Associations:
         return [ids[lineage.rows(g)[particle] if ids.shape[0] > 1 else 0] for g, ids in self._steps]
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """For a checkpoint."""
         shapes = [(g, *ids.shape) for g, ids in self._steps]
         flat = [ids.ravel() for _, ids in self._steps]
         return {
@@ -355,7 +349,6 @@ class _Associations:
         }
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """The inverse of `arrays`."""
         found = read(arrays, _ASSOCIATIONS, "associations/")
         shapes = found["shapes"].tolist()
         if any(n not in (1, self._filter.n) for _, n, _ in shapes):

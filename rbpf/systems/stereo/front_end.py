@@ -14,8 +14,8 @@ from typing import Any, ClassVar, Generic, final
 
 import numpy as np
 
+from rbpf.core.checkpoint import integers, numbers, read
 from rbpf.core.models import NULL, Landmark
-from rbpf.core.schema import integers, numbers, read
 from rbpf.errors import InputError
 from rbpf.motion.stereo_geometry import Matches
 from rbpf.sensors.camera import RectifiedStereo

@@ -18,9 +18,9 @@ from typing import Any, Generic, Protocol, Self, TypeVar, final
 import numpy as np
 
 from rbpf import gaussian
+from rbpf.core.checkpoint import integers, numbers, read
 from rbpf.core.models import NULL, Belief, Landmark, Likelihood, NewLandmarks, Observations, Part, Records, Sensor
 from rbpf.core.particles import Prior
-from rbpf.core.schema import integers, numbers, read
 from rbpf.errors import InputError
 from rbpf.gaussian import symmetrise
 from rbpf.lie import SE3
@@ -340,7 +340,7 @@ class Places:
         return {"places/place": self._place, "places/seen_from": self._seen_from}
 
     def restore(self, arrays: dict[str, np.ndarray], ids: np.ndarray) -> None:
-        """The inverse of `arrays`, of landmarks (M,); errors as `rbpf.core.schema.read`."""
+        """The inverse of `arrays`, of landmarks (M,); errors as `rbpf.core.checkpoint.read`."""
         found = read(arrays, _PLACES, "places/", landmarks=ids.size)
         self._ids, self._place, self._seen_from = ids.copy(), found["place"], found["seen_from"]
 

@@ -5,7 +5,7 @@ from typing import final
 
 import numpy as np
 
-from rbpf.core.schema import integers, numbers, poses, read
+from rbpf.core.checkpoint import integers, numbers, poses, read
 from rbpf.lie import SE3
 from rbpf.motion.odometry import Odometry
 
@@ -106,7 +106,7 @@ class DeadReckoning:
 
     @classmethod
     def restored(cls, arrays: dict[str, np.ndarray]) -> "DeadReckoning":
-        """The inverse of `arrays`; errors as `rbpf.core.schema.read`."""
+        """The inverse of `arrays`; errors as `rbpf.core.checkpoint.read`."""
         stamps, velocity, delta, cov, world, missed = read(arrays, _RECKONING, "reckoning/").values()
         assumed, waiting, hidden, passed_over = missed.tolist()
         stamp_ns = int(stamps[0]) if stamps.size else None

@@ -13,10 +13,10 @@ from typing import Any, ClassVar, NamedTuple, final
 
 import numpy as np
 
+from rbpf.core.checkpoint import integers, numbers, poses, read, truths
 from rbpf.core.filter import Filter, StepReport
 from rbpf.core.models import NULL, Landmark, Part
 from rbpf.core.particles import Estimate
-from rbpf.core.schema import integers, numbers, poses, read, truths
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.maps.landmark_map import LandmarkMap
@@ -346,7 +346,7 @@ class StereoSlam(System):
         }
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """The inverse of `arrays`; errors as `rbpf.core.schema.read`."""
+        """The inverse of `arrays`; errors as `rbpf.core.checkpoint.read`."""
         found = read(arrays, _STEREO, "stereo/", front_ends=len(self._front_ends))
         self._choose(self._front_ends[int(found["front_end"])])
         self.frames, self._last_update = found["frames"].tolist()

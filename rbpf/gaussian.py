@@ -1,10 +1,14 @@
-"""Small symmetric matrices: how they are stored, Cholesky and semi-definite factors, triangular solves, inverses.
+"""Batched small Gaussians: Cholesky and semi-definite factors, triangular solves, log-density, unscented transform.
 
-Up to n = 8 the loops run over the entries of a matrix and the arithmetic along the batch, which
+Every function broadcasts over leading axes and is meant for n up to about twelve. Covariances are full symmetric matrices
+(..., n, n); a chol_* is lower triangular (..., n, n), a factor L is any matrix with L L^T = covariance. A result may lie in
+memory entry by entry, so that what is computed from it runs along the batch: code that insists on C order takes its
+`numpy.ascontiguousarray`. Up to n = 8 the loops run over the entries of a matrix and the arithmetic along the batch, which
 LAPACK, called once per matrix, cannot do. Sums use no BLAS: equal input gives equal bytes.
 """
 
 import math
+from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
@@ -15,6 +19,7 @@ from rbpf.errors import InputError
 
 Array = NDArray[np.float64]
 
+_LOG_2PI = float(np.log(2.0 * np.pi))
 _UNROLLED = 8
 _ASYMMETRY = 1e-9
 _NEGATIVE = 1e-9
@@ -36,11 +41,7 @@ def pack(cov: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch packed
 
 
 def unpack(packed: Like[ArrayLike, "*batch packed"], n: int) -> Float[np.ndarray, "*batch {n} {n}"]:
-    """Symmetric matrix of a packed lower triangle, (..., n (n + 1) / 2) -> (..., n, n).
-
-    Raises:
-        InputError: The last axis does not have n (n + 1) / 2 entries.
-    """
+    """Symmetric matrix of a packed lower triangle, (..., n (n + 1) / 2) -> (..., n, n)."""
     packed = np.asarray(packed, dtype=float)
     rows, columns = _triangle(n)
     if packed.shape[-1] != rows.size:
@@ -84,17 +85,7 @@ def _triangle(n: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 
 def cholesky(cov: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch n n"]:
-    """Lower Cholesky factor of positive definite matrices; the upper triangle is not read.
-
-    Args:
-        cov: (..., n, n).
-
-    Returns:
-        (..., n, n), lower triangular with a positive diagonal.
-
-    Raises:
-        InputError: A matrix is not positive definite or holds NaN.
-    """
+    """Lower Cholesky factor, upper triangle not read. Raises InputError: not positive definite, or NaN."""
     cov = np.asarray(cov, dtype=float)
     with np.errstate(invalid="ignore"):  # from entries that are infinite, which the complaint covers
         if cov.shape[-1] > _UNROLLED:
@@ -113,18 +104,8 @@ def cholesky(cov: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch n 
 def psd_factor(cov: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch n n"]:
     """Square factor L with L L^T = cov of positive semi-definite, possibly singular matrices.
 
-    A definite matrix gets its lower Cholesky factor, any other one its scaled eigenvectors; each
-    matrix is treated alike whatever else is in the batch.
-
-    Args:
-        cov: (..., n, n).
-
-    Returns:
-        (..., n, n).
-
-    Raises:
-        InputError: A matrix holds NaN, is not symmetric, or has an eigenvalue below
-            -1e-9 times its largest.
+    A definite matrix gets its lower Cholesky factor, any other one its scaled eigenvectors; each matrix is treated alike
+    whatever else is in the batch. Raises InputError: NaN, not symmetric, or an eigenvalue below -1e-9 times the largest.
     """
     cov = np.asarray(cov, dtype=float)
     _require_symmetric(cov)
@@ -138,30 +119,14 @@ def psd_factor(cov: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch 
 
 
 def solve_lower(chol: Like[ArrayLike, "*#batch n n"], b: Like[ArrayLike, "*#batch n"]) -> Float[np.ndarray, "*batch n"]:
-    """Solve chol x = b by forward substitution.
-
-    Args:
-        chol: (..., n, n), lower triangular.
-        b: (..., n).
-
-    Returns:
-        (..., n).
-    """
+    """Solves chol x = b by forward substitution, b (..., n) -> (..., n)."""
     return solve_lower_matrix(chol, np.asarray(b, dtype=float)[..., None])[..., 0]
 
 
 def solve_lower_matrix(
     chol: Like[ArrayLike, "*#batch n n"], b: Like[ArrayLike, "*#batch n k"]
 ) -> Float[np.ndarray, "*batch n k"]:
-    """Solve chol X = B by forward substitution.
-
-    Args:
-        chol: (..., n, n), lower triangular.
-        b: (..., n, k).
-
-    Returns:
-        (..., n, k).
-    """
+    """Solves chol X = B by forward substitution, B (..., n, k) -> (..., n, k)."""
     chol, b = np.asarray(chol, dtype=float), np.asarray(b, dtype=float)
     ndim = max(chol.ndim, b.ndim)
     lower, right = entries_first(chol, ndim), entries_first(b, ndim)
@@ -174,17 +139,7 @@ def solve_lower_matrix(
 
 
 def inverse(cov: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch n n"]:
-    """Inverse of positive definite matrices, exactly symmetric.
-
-    Args:
-        cov: (..., n, n).
-
-    Returns:
-        (..., n, n).
-
-    Raises:
-        InputError: A matrix is not positive definite.
-    """
+    """Inverse of positive definite matrices, exactly symmetric. Raises InputError: one is not positive definite."""
     chol = cholesky(cov)
     half = solve_lower_matrix(chol, np.eye(chol.shape[-1]))
     return gram(np.swapaxes(half, -1, -2))
@@ -196,19 +151,40 @@ def log_det(chol: Like[ArrayLike, "*batch n n"]) -> Float[np.ndarray, "*batch"]:
     return 2.0 * np.log(diagonal).sum(-1)
 
 
-def generalised_inverse(cov: Float[np.ndarray, "*batch n n"]) -> Float[np.ndarray, "*batch n n"]:
-    """Symmetric G with cov G cov = cov of semi-definite matrices, null directions left out.
+def log_density(
+    residual: Like[ArrayLike, "*#batch n"], cov: Like[ArrayLike, "*#batch n n"]
+) -> Float[np.ndarray, "*batch"]:
+    """Logarithm of the density N(residual; 0, cov), residual (..., n) -> (...).
 
-    Args:
-        cov: (..., n, n).
-
-    Returns:
-        (..., n, n); the inverse where cov is definite.
+    Raises InputError: cov is not positive definite.
     """
-    scale, vectors, values = _scaled_eigen(cov)
-    kept = values > _SINGULAR * cov.shape[-1]
-    roots = np.divide(1.0, np.sqrt(np.abs(values)), out=np.zeros_like(values), where=kept)
-    return gram(_reciprocal(scale)[..., :, None] * vectors * roots[..., None, :])
+    chol = cholesky(cov)
+    white = solve_lower(chol, residual)
+    return -0.5 * (np.square(white).sum(-1) + log_det(chol) + white.shape[-1] * _LOG_2PI)
+
+
+def unscented_transform(
+    function: Callable[[Array], Array], mean: Like[ArrayLike, "*#batch n"], cov: Like[ArrayLike, "*#batch n n"]
+) -> tuple[Array, Array]:
+    """Mean (..., m) and covariance (..., m, m) of y = function(x), x Gaussian, by 2n + 1 symmetric sigma points.
+
+    x_0 = mean with the weight kappa / (n + kappa), and mean +- sqrt(n + kappa) times each column of a factor of cov (..., n,
+    n), which may be singular, with the weights 1 / (2 (n + kappa)); Julier and Uhlmann, "Unscented Filtering and Nonlinear
+    Estimation" (2004). No weight is negative, so the covariance is semi-definite. `function` takes (2n + 1, ..., n) to
+    (2n + 1, ..., m): the sigma points are the first axis, so that arguments of its own which differ along the batch broadcast.
+    Raises InputError: cov is no covariance.
+    """
+    mean = np.asarray(mean, dtype=float)
+    n = mean.shape[-1]
+    kappa = max(0.0, 3.0 - n)  # matches the fourth moment for n <= 3
+    weights = np.full(2 * n + 1, 0.5 / (n + kappa))
+    weights[0] = kappa / (n + kappa)
+    # Zero, then plus and minus the factor's columns, (2n + 1, ..., n).
+    columns = np.sqrt(n + kappa) * np.moveaxis(psd_factor(cov), -1, 0)
+    offsets = np.concatenate([np.zeros_like(columns[:1]), columns, -columns])
+    values = function(mean + offsets)
+    mean_y = np.einsum("s,s...->...", weights, values)
+    return mean_y, gram(np.moveaxis(values - mean_y, 0, -1) * np.sqrt(weights))
 
 
 def _cholesky_batch(cov: Array, floor: float) -> tuple[Array, NDArray[np.bool_]]:
