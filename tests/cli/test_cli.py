@@ -96,13 +96,6 @@ def test_what_a_joint_map_does_not_take_is_said(log, tmp_path, capsys, pair):
     assert not (tmp_path / "run").exists()
 
 
-def test_the_batch_optimum_stands_beside(log, tmp_path):
-    assert main(["run", "range-bearing", str(log), "--out", str(tmp_path), "--particles", "30"]) == 0
-    summary = json.loads((tmp_path / "summary.json").read_text())
-    assert (tmp_path / "batch.tum").exists()
-    assert summary["batch_ate_rmse_m"] < summary["odometry_ate_rmse_m"]
-
-
 def test_config_repeats_the_run(log, tmp_path):
     assert run(log, tmp_path / "a", "--set", "proposal.iterations=1", "--set", "resampling.scheme=residual") == 0
     config = tmp_path / "a" / "config.yaml"

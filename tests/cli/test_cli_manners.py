@@ -1,12 +1,9 @@
-"""What every command owes to people and to programs: JSON, exit codes, Ctrl-C, the same run again."""
+"""What every command owes to people and to programs: JSON, exit codes, the same run again."""
 
 import json
 import os
-import re
-import signal
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -68,7 +65,7 @@ def test_without_json_nothing_is_on_standard_output(log, tmp_path, capsys):
     assert "Do not trust its uncertainty: " in err or "can be trusted cannot be told: " in err
 
 
-def test_bad_input_is_exit_code_2_and_a_fault_is_1(log, tmp_path):
+def test_bad_input_is_exit_code_2_and_a_fault_is_1(tmp_path):
     def code(*arguments, prelude=""):
         program = [sys.executable, "-c", f"{prelude}\n{_MAIN}", *arguments]
         return subprocess.run(program, capture_output=True, text=True)
@@ -80,52 +77,7 @@ def test_bad_input_is_exit_code_2_and_a_fault_is_1(log, tmp_path):
     assert broken.returncode == 1 and "ZeroDivisionError" in broken.stderr
 
 
-@pytest.fixture(scope="module")
-def longer(tmp_path_factory):
-    """A log that is filtered for a second or two, its run from beginning to end, and what says how to run it."""
-    folder = tmp_path_factory.mktemp("longer")
-    assert main(["simulate", "range-bearing", "--out", str(folder / "log"), "--steps", "300"]) == 0
-    words = ["run", "range-bearing", str(folder / "log")]
-    words += ["--particles", "300", "--no-batch", "--set", "checkpoint_every=100000", "--out"]
-    assert main([*words, str(folder / "whole")]) == 0
-    return outputs(folder / "whole"), words
-
-
-def test_ctrl_c_leaves_a_run_that_resumes_to_the_same_bytes(longer, tmp_path):
-    """A real signal to a real process, at whatever moment."""
-    whole, words = longer
-    cut = [*words, str(tmp_path / "cut")]
-    process = subprocess.Popen(
-        [sys.executable, "-c", _STOPPABLE, *cut], stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    )
-    assert process.stdout is not None
-    assert process.stdout.readline() == "filtering\n"
-    time.sleep(0.2)
-    process.send_signal(signal.SIGINT)
-    _, error = process.communicate(timeout=120)
-    assert process.returncode == 130, error
-    said = re.search(r"stopped after (\d+) of 300; the same command with --resume goes on", " ".join(error.split()))
-    assert said is not None and 5 <= int(said[1]) < 300
-    assert (tmp_path / "cut" / "checkpoint.npz").exists()
-    assert not (tmp_path / "cut" / "summary.json").exists()
-    assert main([*cut, "--resume"]) == 0
-    assert outputs(tmp_path / "cut") == whole
-
-
 _MAIN = "import sys; from rbpf.cli import main; sys.exit(main())"
-
-_STOPPABLE = (
-    """
-from rbpf.core.filter import Filter
-step = Filter.step
-def told(self, *arguments):
-    if self.steps == 5:
-        print("filtering", flush=True)
-    return step(self, *arguments)
-Filter.step = told
-"""
-    + _MAIN
-)
 
 
 def test_a_run_is_repeated_from_its_config(log, tmp_path, capsys):

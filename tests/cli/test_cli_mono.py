@@ -184,24 +184,6 @@ def test_it_starts_without_known_points(desk, tmp_path):
     assert np.allclose(first, [0, 0, 0, 1, 0, 0, 0], atol=1e-9)
 
 
-def test_what_was_computed_before_a_failure_is_kept(desk, tmp_path, monkeypatch, capsys):
-    from rbpf.errors import InputError
-
-    step = Filter.step
-
-    def failing(self, *args, **kwargs):
-        if self.steps == 9:
-            raise InputError("no particle explains the observations")
-        return step(self, *args, **kwargs)
-
-    monkeypatch.setattr(Filter, "step", failing)
-    assert run(desk, tmp_path, "--video") == 2
-    assert "frame 9" in sentence(capsys)
-    assert summary(tmp_path)["frames"] == 9
-    assert len(read_tum(tmp_path / "trajectory.tum")) == 9
-    assert (tmp_path / "annotated.mp4").stat().st_size > 0
-
-
 def test_a_rerun_recording_is_written(desk, tmp_path):
     pytest.importorskip("rerun")
     recording = tmp_path / "run.rrd"

@@ -25,7 +25,10 @@ def test_example_shows_what_it_promises(path, capsys, monkeypatch, tmp_path, pla
     figures = main(quick=True, out=tmp_path) if draws else main()
     assert {".png", ".csv"} <= {file.suffix for file in tmp_path.iterdir()} or not draws
     assert capsys.readouterr().out.count("\n") >= 2
-    getattr(claims, path.stem)(figures)
+    for name, (low, high) in claims.BOUNDS.get(path.stem, {}).items():
+        assert low <= figures[name] <= high, f"{name}: {figures[name]}"
+    if path.stem not in claims.BOUNDS:
+        getattr(claims, path.stem)(figures)
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)

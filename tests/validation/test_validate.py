@@ -47,6 +47,8 @@ def test_a_finished_run_has_its_verdict_on_top(finished):
     assert "http" not in text.replace("http-equiv", "")
     entries = json.loads((finished / "validation_groundtruth.json").read_text())
     assert entries["figures"]["steps_compared"] == 40
+    summary = json.loads((finished / "summary.json").read_text())
+    assert (finished / "batch.tum").exists() and summary["batch_ate_rmse_m"] < summary["odometry_ate_rmse_m"]
 
 
 def test_errors_are_those_of_the_run_itself(finished):
