@@ -78,8 +78,7 @@ class UncertainConstellation(Landmark):
         points: (M, 3) where the points are given, k_m, in the group's frame, metres.
         cov_points: (M, 3, 3) covariances of their errors e_m.
 
-    Raises:
-        InputError: there are too many points.
+    Raises InputError: there are too many points.
     """
 
     def __init__(self, points: np.ndarray, cov_points: np.ndarray) -> None:

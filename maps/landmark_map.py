@@ -178,21 +178,10 @@ class LandmarkMap(Map):
             anchor = -self.innovations(model, np.zeros((k, p)), ids, state, belief.mode)[0]
             access = self.store.access(ids)
             mean, cov = np.empty((k, p)), np.empty((k, p, p))
-            project(
-                kernel.function.address,
-                kernel.params,
-                np.ascontiguousarray(prior.predicted()),
-                access.pool,
-                access.slabs,
-                access.which,
-                access.maps,
-                np.ascontiguousarray(anchor),
-                weights,
-                np.ascontiguousarray(prior.spread(prior.mean)),
-                np.array([self.space.dim, landmark.dim, landmark.constants]),
-                mean,
-                cov,
-            )
+            state, anchor, spread = map(np.ascontiguousarray, (prior.predicted(), anchor, prior.spread(prior.mean)))
+            sizes = np.array([self.space.dim, landmark.dim, landmark.constants])
+            fused = kernel.function.address, kernel.params, state
+            project(*fused, *access, anchor, weights, spread, sizes, mean, cov)
             return anchor + mean, cov
         return projected(model, self.read(ids), belief)
 

@@ -7,6 +7,7 @@ has a kernel, else in NumPy.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -65,13 +66,10 @@ class Batch:
 
 @dataclass
 class Plan:
-    """All rows of a step.
+    """All rows of a step, and what new and clutter observations cost (N,).
 
-    Attributes:
-        batches: independent rows of single-Gaussian landmarks.
-        joint: rows that share a landmark.
-        mixtures: rows of landmarks with several components, which enter after sampling.
-        log_factor: (N,) what new and clutter observations cost.
+    Independent rows of single-Gaussian landmarks, rows that share a landmark, and rows of landmarks with several components,
+    which enter after sampling.
     """
 
     log_factor: np.ndarray
@@ -260,9 +258,18 @@ class RowEngine:
             return None
         return fused_kernel(group.model)
 
-    def _sizes(self, column: int) -> np.ndarray:
-        landmark = self.layout_of(column).landmark
-        return np.array([self.space.dim, landmark.dim, landmark.constants])
+    def _observed(
+        self, kernel: FusedKernel, batch: Batch, group: Observations, state: np.ndarray
+    ) -> tuple[tuple[Any, ...], tuple[Any, ...], np.ndarray]:
+        """What both drivers take: the kernel and the states; the measurements and their likelihood; the sizes d, D, A."""
+        likelihood, landmark = _likelihood(group), self.layout_of(int(batch.ids[0])).landmark
+        mask = _NO_MASK if batch.mask is None else np.ascontiguousarray(batch.mask.T)
+        params = numbers(likelihood.params, "the params of a likelihood")
+        return (
+            (kernel.function.address, kernel.params, np.ascontiguousarray(state)),
+            (group.z[batch.ks], group.cov[batch.ks], mask, likelihood.kernel_id, params),
+            np.array([self.space.dim, landmark.dim, landmark.constants]),
+        )
 
     def _information_compiled(
         self,
@@ -273,57 +280,19 @@ class RowEngine:
         prior: Prior,
         total: Information,
     ) -> None:
-        access = self.store.access(batch.ids)
-        likelihood = group.likelihood or GAUSSIAN
-        mask = _NO_MASK if batch.mask is None else np.ascontiguousarray(batch.mask.T)
-        run_driver(
-            refine,
-            state.shape[0] * batch.ks.size,
-            kernel.function.address,
-            kernel.params,
-            np.ascontiguousarray(state),
-            access.pool,
-            access.slabs,
-            access.which,
-            access.maps,
-            group.z[batch.ks],
-            group.cov[batch.ks],
-            mask,
-            likelihood.kernel_id,
-            numbers(likelihood.params, "the params of a likelihood"),
-            np.ascontiguousarray(prior.factor),
-            self._sizes(int(batch.ids[0])),
-            total.info,
-            total.vector,
-            total.quad,
-            total.log_det,
-            total.rows,
-        )
+        fused, measured, sizes = self._observed(kernel, batch, group, state)
+        out = total.info, total.vector, total.quad, total.log_det, total.rows
+        pairs = state.shape[0] * batch.ks.size
+        factor = np.ascontiguousarray(prior.factor)
+        run_driver(refine, pairs, *fused, *self.store.access(batch.ids), *measured, factor, sizes, *out)
 
     def _correct_compiled(
         self, kernel: FusedKernel, batch: Batch, group: Observations, state: np.ndarray, log_density: np.ndarray
     ) -> None:
         access, targets = self.store.rewrite(batch.ids)
-        likelihood = group.likelihood or GAUSSIAN
-        run_driver(
-            update,
-            state.shape[0] * batch.ks.size,
-            kernel.function.address,
-            kernel.params,
-            np.ascontiguousarray(state),
-            access.pool,
-            access.slabs,
-            access.which,
-            access.maps,
-            targets,
-            group.z[batch.ks],
-            group.cov[batch.ks],
-            _NO_MASK if batch.mask is None else np.ascontiguousarray(batch.mask.T),
-            likelihood.kernel_id,
-            numbers(likelihood.params, "the params of a likelihood"),
-            self._sizes(int(batch.ids[0])),
-            log_density,
-        )
+        fused, measured, sizes = self._observed(kernel, batch, group, state)
+        pairs = state.shape[0] * batch.ks.size
+        run_driver(update, pairs, *fused, *access, targets, *measured, sizes, log_density)
 
     def _read(self, ids: np.ndarray) -> tuple[np.ndarray, Records]:
         columns = np.array([self.store.read(int(i)) for i in ids])

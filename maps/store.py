@@ -7,7 +7,7 @@ descendants, whose number falls like 1/age as lineages coalesce. See `docs/adr` 
 """
 
 from dataclasses import dataclass
-from typing import final
+from typing import NamedTuple, final
 
 import numpy as np
 
@@ -184,8 +184,7 @@ class Cold:
     data: np.ndarray
 
 
-@dataclass(frozen=True)
-class Access:
+class Access(NamedTuple):
     """What a kernel needs to read columns: slab, and the row of each particle, `maps[which[k]]`."""
 
     pool: np.ndarray

@@ -98,9 +98,8 @@ class Minimum(Generic[State]):
 def minimise(evaluate: Evaluate[State], x: State, retract: Retract[State], rule: Rule | None = None) -> Minimum[State]:
     """The minimum of ½‖ε(x)‖² that is reached from x.
 
-    Raises:
-        InputError: there are fewer residuals than unknowns, or at the start they or their derivative are not finite
-            or the derivative is zero.
+    Raises InputError: there are fewer residuals than unknowns, or at the start they or their derivative are not
+    finite or the derivative is zero.
     """
     rule = rule or Rule()
     residual, jac = evaluate(x)

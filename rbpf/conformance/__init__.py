@@ -30,8 +30,7 @@ def check_model(
     Returns:
         One sentence per finding: class, method, what was expected and found. Empty for a sound model.
 
-    Raises:
-        InputError: the object is of none of these classes, or cannot be tried without more than was given.
+    Raises InputError: the object is of none of these classes, or cannot be tried without more than was given.
     """
     rng, example = rng or np.random.default_rng(0), example or Example()
     space = space or getattr(model, "space", None)

@@ -279,8 +279,7 @@ def read(arrays: Mapping[str, np.ndarray], schema: Schema, prefix: str = "", **s
         prefix: of their names in the file.
         sizes: that are known beforehand.
 
-    Raises:
-        InputError: one is missing, or is not what it should be.
+    Raises InputError: one is missing, or is not what it should be.
     """
     sizes = dict(sizes)
     return {name: _read(arrays, prefix + name, entry, sizes) for name, entry in schema.items()}

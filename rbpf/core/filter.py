@@ -177,10 +177,9 @@ class Filter:
             stamp_ns: time of the frame; by default the previous one plus one second.
             proposal: of this step, where the filter's own would not do.
 
-        Raises:
-            InputError: time runs backwards, shapes do not fit, or no particle explains the observations. If the error is about
-                what came in before the particles are weighed (time, control, measurements), the filter is as it was;
-                otherwise it stands between two steps: `load` a checkpoint.
+        Raises InputError: time runs backwards, shapes do not fit, or no particle explains the observations. If the
+        error is about what came in before the particles are weighed (time, control, measurements), the filter is as
+        it was; otherwise it stands between two steps: `load` a checkpoint.
         """
         # Predict, and observe given the prediction.
         stamp_ns, dt = self._clock(stamp_ns)
@@ -343,7 +342,6 @@ class Filter:
         return {name.removeprefix("extra/"): array for name, array in arrays.items() if name.startswith("extra/")}
 
     def _fingerprint(self) -> dict[str, object]:
-        """What must agree between the filter that saved and the one that loads."""
         return {
             "particles": self.n,
             "motion": type(self.motion).__name__,
@@ -474,7 +472,7 @@ def checked_observations(group: Observations) -> Observations:
 
 
 def checked_ancestors(ancestors: np.ndarray, n: int, resampler: object) -> np.ndarray:
-    """Ancestors (N,) of a resampler. Raises InputError: one is missing, or is no particle."""
+    """Ancestors (N,) of a resampler; each must be a particle."""
     whole = ancestors.dtype.kind in "iu"
     if not whole or ancestors.shape != (n,) or ancestors.min() < 0 or ancestors.max() >= n:
         name = type(resampler).__name__

@@ -219,7 +219,6 @@ class Schedule:
         return sorted(self.due.pop(now, ()))
 
     def array(self) -> np.ndarray:
-        """(n, 2) pairs of due age and generation, for a checkpoint."""
         pairs = [(when, g) for when in sorted(self.due) for g in sorted(self.due[when])]
         return np.array(pairs, dtype=np.int64).reshape(-1, 2)
 

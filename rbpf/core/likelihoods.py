@@ -139,14 +139,8 @@ class Gates:
 def associate(nu: np.ndarray, cov: np.ndarray, present: np.ndarray, gates: Gates) -> np.ndarray:
     """Most probable explanation of K measurements among M landmarks, in each of N particles.
 
-    Args:
-        nu: (N, K, M, p) innovations.
-        cov: (N, K, M, p, p) their predicted covariances, the pose's included.
-        present: (N, M) whether the particle holds the landmark.
-        gates: candidates and alternatives.
-
-    Returns:
-        (N, K) index of a landmark, NEW or NULL.
+    Innovations (N, K, M, p), their predicted covariances (N, K, M, p, p), the pose's included, and whether the particle holds
+    the landmark (N, M), give (N, K): index of a landmark, NEW or NULL.
     """
     chol = gaussian.cholesky(cov)
     squared = np.square(gaussian.solve_lower(chol, nu)).sum(axis=-1)

@@ -449,8 +449,7 @@ class Map(Conditional):
             log_odds: (N, K) that they exist, for a map with evidence.
             ids: (K,) that they shall have; by default numbers that no landmark had before.
 
-        Raises:
-            InputError: an id is no number from 0 up, comes twice or is in use, or the shapes do not fit.
+        Raises InputError: an id is no number from 0 up, comes twice or is in use, or the shapes do not fit.
         """
 
     @abstractmethod

@@ -232,13 +232,7 @@ def balanced(
 
 @dataclass(frozen=True)
 class SecondWeight:
-    """What the second weight w₂ says of the states that were sampled, Mathematics (summary).
-
-    Attributes:
-        state: (N, E) sampled.
-        log_before: (N,) normalised log-weights that they were sampled with.
-        log_after: (N,) those after w₂.
-    """
+    """States (N, E) that were sampled, and their normalised log-weights before and after w₂, Mathematics (summary)."""
 
     state: Float[np.ndarray, "N E"]
     log_before: Float[np.ndarray, " N"]

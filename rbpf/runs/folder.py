@@ -171,8 +171,7 @@ def write_trajectory(
 ) -> None:
     """trajectory.npz: poses (T, E), covariances (T, d, d), and what `rbpf.runs.reading` says of them.
 
-    Corrections of the motions (T, r) and their covariances (T, r, r) are None where the system reports none; of the last
-    frame's particles poses (N, E) and weights (N,).
+    Corrections of the motions (T, r) and their covariances (T, r, r); the last frame's particles (N, E) and weights (N,).
     """
     steps = len(mean)
     correction, cov_correction = corrections or (np.zeros((steps, 0)), np.zeros((steps, 0, 0)))

@@ -242,10 +242,7 @@ FIGURES: Mapping[str, Callable[[RunFolder], Any | None]] = {
 class World:
     """The world in which all pictures of a run are drawn: the truth's where the recording has one, else the run's own.
 
-    Attributes:
-        name: in words.
-        alignment: by which filter, odometry and batch are brought there, each by its own.
-        truth: at the frames that have one; None without.
+    `alignment` brings filter, odometry and batch there, each by its own; `truth` is at the frames that have one.
     """
 
     name: str = "the run's own world"
@@ -254,7 +251,6 @@ class World:
 
     @classmethod
     def of(cls, found: RunFolder) -> "World":
-        """Of a run."""
         if not (found.folder / TRUTH).is_file():
             return cls()
         truth = found.truth
@@ -275,7 +271,6 @@ class World:
         return estimate.transformed(self.motion(estimate))
 
     def of_filter(self, found: RunFolder) -> Trajectory:
-        """The filtered path, here."""
         return self.brought(found.trajectory)
 
 
@@ -316,12 +311,9 @@ def tracking_losses(found: RunFolder) -> tuple[int | None, int]:
 
 @dataclass(frozen=True)
 class Views:
-    """From where a world is drawn: from above and, in space, from the side.
+    """From where a world is drawn: from above and, in space, from the side; each the axes to the right and up the page.
 
-    Attributes:
-        top: the axes to the right and up the page, seen from above.
-        side: likewise seen from the side; None in the plane.
-        down: whether the vertical axis points down, as a camera's y axis does.
+    `down` says whether the vertical axis points down, as a camera's y axis does.
     """
 
     top: tuple[int, int]

@@ -52,7 +52,7 @@ _NAMED = (
 )
 _FLAGS = ("localize",)
 _MADE = "video", "batch"
-"""What a run makes besides its data, unless it is told not to."""
+"""What a run makes besides its data, unless it is asked not to."""
 _INSTRUCTIONS = "sse4.2", "avx", "avx2", "fma", "avx512f", "neon", "sve"
 _CHUNK = 1 << 20
 
@@ -98,7 +98,7 @@ def write_config(out: Path, system: str, sources: Mapping[str, Any], settings: M
 
 
 def left_out(**wanted: bool) -> dict[str, bool]:
-    """What a run was told not to make, as entries of config.yaml, so that a repetition does not make it either."""
+    """What a run was asked not to make, as entries of config.yaml, so that a repetition does not make it either."""
     return {name: False for name in _MADE if not wanted.get(name, True)}
 
 
@@ -114,10 +114,7 @@ def library_versions() -> dict[str, str]:
 
 
 def instruction_set() -> str:
-    """The processor, and which of its vector instructions compiled kernels, BLAS and OpenCV may use.
-
-    Sums are rounded in another order on another one: the same run is then the same to the 12th digit at first, no more.
-    """
+    """The processor, and its vector instructions that kernels, BLAS and OpenCV may use; others round sums otherwise."""
     import numba
     from llvmlite import binding
 

@@ -89,14 +89,9 @@ class PathAndMap:
 
 @dataclass(frozen=True)
 class FilteredPath:
-    """Filtered poses of a run.
+    """Filtered poses of a run: stamps (T,), mean (T, E) in SE2 or SE3 and cov (T, d, d) in the right chart there.
 
-    Attributes:
-        stamps_ns: (T,).
-        mean: (T, E) in SE2 or SE3.
-        cov: (T, d, d) in the right chart at the mean.
-        correction: (T, r) of the motions, r = 0 where the system does not report them.
-        cov_correction: (T, r, r).
+    The corrections (T, r) of the motions and their covariances (T, r, r) have r = 0 where the system does not report them.
     """
 
     stamps_ns: np.ndarray

@@ -46,13 +46,9 @@ from rbpf.systems.system import System
 
 
 class Opened(NamedTuple):
-    """A recording that is ready to be filtered.
+    """A recording that is ready to be filtered: a new system, the source of its frames, their times (T,), and the truth.
 
-    Attributes:
-        system: new.
-        source: of its frames.
-        stamps_ns: (T,) their times; None where they are not known beforehand.
-        truth: None where there is none.
+    Times are None where they are not known beforehand, the truth where there is none.
     """
 
     system: System
@@ -69,11 +65,9 @@ class LogSource:
 
     @property
     def name(self) -> str:
-        """Of the recording."""
         return str(self.log.name)
 
     def frames(self, start: int = 0) -> Iterator[Any]:
-        """Frames from number `start` on."""
         return iter(self.log.frames[start:])
 
 
@@ -90,17 +84,16 @@ class RobotRecording:
     part: Part = WHOLE
 
     def open(self, config: RangeBearingConfig) -> Opened:
-        """The system and the log's frames. Raises InputError: the log or a setting is wrong."""
+        """The system and the log's frames."""
         return open_robot_log(part_of_log(open_log(self.log, config.noise), self.part), config)
 
     def sources(self) -> dict[str, str | float | bool]:
-        """For config.yaml."""
         return {"recording": str(self.log)} | self.part.entries()
 
 
 @dataclass(frozen=True)
 class MonoRecording:
-    """Images of one camera, and what is known of them beforehand.
+    """Images of one camera, and what is known of them beforehand; at most one of known points, board, markers and map.
 
     Attributes:
         images: a sequence of any kind that `open_images` knows, or the number of a camera at this computer.
@@ -111,9 +104,6 @@ class MonoRecording:
         markers: board of ArUco markers of which some are seen in the first image; likewise known points.
         topics: of a ROS bag, which images and which truth.
         part: which of the images, and in which size; known points are those of the first of them, in the recording's pixels.
-
-    Raises:
-        InputError: two of known points, board, markers and map are given, or two topics of images.
     """
 
     images: Path
@@ -137,7 +127,7 @@ class MonoRecording:
             raise InputError("in a known map a run starts from the map: leave out known points and chessboard")
 
     def open(self, config: MonoConfig) -> Opened:
-        """The system and the images. Raises InputError: a file is wrong, or the board is not found in the first image."""
+        """The system and the images."""
         known_map = None if self.map is None else read_known_map(self.map)
         return open_mono(*self.sequence(), config, known_map)
 
@@ -175,7 +165,6 @@ class MonoRecording:
         return sequence, known
 
     def sources(self) -> dict[str, str | float | bool]:
-        """For config.yaml."""
         paths = {
             "recording": self.images,
             "known_points": self.known_points,
@@ -210,22 +199,17 @@ class StereoRecording:
     part: Part = WHOLE
 
     def open(self, config: StereoConfig) -> Opened:
-        """The system and the pairs. Raises InputError: a file is wrong."""
+        """The system and the pairs."""
         return open_pairs(open_stereo(self.pairs, self.calibration, topics=self.topics, part=self.part), config)
 
     def sources(self) -> dict[str, str | float | bool]:
-        """For config.yaml."""
         named = {"recording": self.pairs, "calibration": self.calibration}
         found: dict[str, str | float | bool] = {name: str(path) for name, path in named.items() if path is not None}
         return found | self.topics.entries() | self.part.entries()
 
 
 def part_of_log(log: RobotLog, part: Part) -> RobotLog:
-    """Some frames of a robot's log; the odometry between two of them is composed of that between all in between.
-
-    Raises:
-        InputError: no frame is left.
-    """
+    """Some frames of a robot's log; the odometry between two of them is composed of that between all in between."""
     if part == WHOLE:
         return log
     stamps = np.array([frame.stamp_ns for frame in log.frames])
@@ -242,7 +226,7 @@ def part_of_log(log: RobotLog, part: Part) -> RobotLog:
 
 
 def open_robot_log(log: RobotLog, config: RangeBearingConfig) -> Opened:
-    """A robot's log in memory. Raises InputError: landmarks are to be known by their names, and some have none."""
+    """A robot's log in memory; refused where landmarks are to be known by their names, and some have none."""
     if config.association == "known" and any((frame.landmarks == UNNAMED).any() for frame in log.frames):
         raise InputError(f"{log.name} has observations without a landmark's name: filter it with --association ml")
     system = RangeBearingSlam.of_log(log, config, keep_associations=config.association == "ml")
@@ -256,11 +240,7 @@ def open_mono(
     config: MonoConfig,
     known_map: KnownMap | None = None,
 ) -> Opened:
-    """A sequence of images; with known points in the first one, or a known map, or without either.
-
-    Raises:
-        InputError: the first image cannot be read or shows nothing, or the known points do not determine the camera.
-    """
+    """A sequence of images; with known points in the first one, a known map, or without either."""
     if known_map is None:
         image, problem = ImageScreen(sequence.camera).usable(first_image(sequence))
         if known is not None and image is None:  # the known points' pixels are those in this image
@@ -280,9 +260,6 @@ def open_features(
     """A log of named features, of one camera or of a rectified pair, as the settings are.
 
     A pair's log without times, whose stamps count its frames, is taken as one frame per second.
-
-    Raises:
-        InputError: the log is of other cameras, or a setting does not fit.
     """
     stamps = np.array([frame.stamp_ns for frame in log.frames], dtype=np.int64)
     system: System
@@ -321,18 +298,7 @@ class Recording(Protocol):
 def filter_recording(
     recording: Recording, config: Any, out: Path | None = None, resume: bool = False, listeners: Iterable[Listener] = ()
 ) -> Run:
-    """Filters a recording to its end.
-
-    Args:
-        recording: what to filter.
-        config: all settings of its system.
-        out: folder for checkpoints, created where it does not exist; None keeps none.
-        resume: go on from the checkpoint in `out`, if there is one.
-        listeners: called after each frame.
-
-    Raises:
-        InputError: the recording or a setting is wrong, or the checkpoint is of another run.
-    """
+    """Filters a recording to its end; in `out` it keeps checkpoints, from which `resume` goes on."""
     opened = recording.open(config)
     if out is None:
         return filter_opened(opened, listeners)
@@ -370,11 +336,7 @@ def filter_features(
     wrapped: Callable[[Sensor], Sensor] | None = None,
     listeners: Iterable[Listener] = (),
 ) -> Run:
-    """A log of named features, filtered to its end.
-
-    Raises:
-        InputError: as `open_features`, or a frame cannot be filtered.
-    """
+    """A log of named features, filtered to its end; a frame that cannot be filtered is an error."""
     run = filter_opened(open_features(log, config, wrapped), listeners)
     if run.failure is not None:
         raise InputError(run.failure)

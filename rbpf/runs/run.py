@@ -125,21 +125,19 @@ def drive(
     resume: bool = False,
     stamps_ns: Sequence[int] | np.ndarray | None = None,
 ) -> Run:
-    """Takes all frames of the run's source that it has not taken yet.
+    """Takes all frames of the run's source that it has not taken yet, and calls the listeners after each.
 
-    What was computed before a frame that cannot be filtered is kept: the run is then shorter and has a `failure`. A
-    disk that is full ends no run; it goes on with the last checkpoint that could be written.
+    What was computed before a frame that cannot be filtered is kept: the run is then shorter and has a `failure`. A disk that
+    is full ends no run; it goes on with the last checkpoint that could be written. A KeyboardInterrupt from a listener leaves
+    a checkpoint behind, too.
 
     Args:
         run: new, or as far as it has come.
-        listeners: called after each frame; a KeyboardInterrupt from one leaves a checkpoint behind.
+        listeners: called with the run and what `track` returned.
         checkpoint: file of checkpoints; None writes none.
         every: frames between checkpoints.
         resume: go on from the checkpoint, if there is one.
         stamps_ns: (T,) times of all frames, where they are known: a checkpoint must be of the same.
-
-    Raises:
-        InputError: the first frame is refused, or the checkpoint is of another run.
     """
     if resume and checkpoint is not None and checkpoint.exists():
         run.load(checkpoint)

@@ -24,13 +24,9 @@ Alignment = Literal["none", "rigid", "similarity"]
 @final
 @dataclass(frozen=True)
 class Similarity:
-    """The map x ↦ scale · rotation x + translation from the estimate's world into the reference's.
+    """The map x ↦ scale · rotation x + translation from the estimate's world into the reference's, of D = 2 or 3 dimensions.
 
-    Attributes:
-        scale: reference metres per estimated metre.
-        rotation: (D, D), reference_from_estimate.
-        translation: (D,) [m], in the reference's world.
-        unique: False where other rotations fit as well; then `rotation` turns by the smallest angle of them.
+    `unique` is False where other rotations fit as well; then `rotation` turns by the smallest angle of them.
     """
 
     scale: float

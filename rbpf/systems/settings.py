@@ -37,8 +37,7 @@ def load_settings(
         pairs: settings as key=value, nested keys with dots.
         given: settings by name.
 
-    Raises:
-        InputError: the file is unreadable, a key does not exist or a value has the wrong type.
+    Raises InputError: the file is unreadable, a key does not exist or a value has the wrong type.
     """
     values = {} if path is None else _read(path, system)
     for pair in pairs:

@@ -103,13 +103,7 @@ class Ragged:
 
 @dataclass(frozen=True, eq=False)
 class Revision:
-    """Poses of earlier frames, estimated anew with what came after them.
-
-    Attributes:
-        stamps_ns: (T,) of the frames, the current one included.
-        poses: (T, E) world_from_body.
-        covs: (T, d, d) in the right chart at each.
-    """
+    """Poses of earlier frames, the current one included, estimated anew: world_from_body (T, E), cov in the chart at each."""
 
     stamps_ns: Int[np.ndarray, " T"]
     poses: Float[np.ndarray, "T E"]

@@ -75,12 +75,25 @@ class RangeBearingSlam(System):
         self.config = config = config or RangeBearingConfig()
         self.space, self.measurement, self.pitch_sign = space, measurement, pitch_sign
         self.robot_from_sensor = space.identity() if robot_from_sensor is None else robot_from_sensor
-        self.model = self._model()
+        unknown = config.unknown
+        max_range = np.inf if unknown.max_range_m is None else unknown.max_range_m
+        self.model: RigidPointModel
+        if measurement == "position":
+            self.model = RelativePosition(space, self.robot_from_sensor, max_range)
+        else:
+            view = np.deg2rad(unknown.half_field_of_view_deg)
+            self.model = RangeBearing(space, self.robot_from_sensor, pitch_sign, max_range, view)
         self.point = Point(2 if isinstance(space, SE2Group) else 3)
         self.joint = JointMap(space, compiled=config.compiled) if config.map == "joint" else None
         own = LandmarkMap(space, evidence=config.association == "ml", compiled=config.compiled)
         own.register(self.point)
-        sensor = self._sensor()
+        likelihood = config.likelihood.build()
+        sensor: Sensor
+        if config.association == "known":
+            sensor = NamedLandmarkSensor(self.model, self.point, likelihood)
+        else:
+            evidence = unknown.gates(self.model.dim), unknown.existence()
+            sensor = AnonymousLandmarkSensor(self.model, self.point, *evidence, likelihood)
         self.filter = Filter(
             OdometryMotion(space),
             sensor if wrapped is None else wrapped(sensor),
@@ -145,8 +158,7 @@ class RangeBearingSlam(System):
             odometry: motion since the last step; None in the first one.
             stamp_ns: time; by default one second after the last step.
 
-        Raises:
-            InputError: time runs backwards, a shape does not fit, or no particle explains the observations.
+        Raises InputError: time runs backwards, a shape does not fit, or no particle explains the observations.
         """
         names = np.full(len(z), NULL) if landmarks is None else np.asarray(landmarks, dtype=np.int64)
         report = self.filter.step(Observed(names, z, cov_z), odometry, stamp_ns)
@@ -262,23 +274,6 @@ class RangeBearingSlam(System):
             self._associations.restore(arrays)
         if self.anchor is not None:
             self.anchor.restore(arrays, self.model, self.point)
-
-    def _model(self) -> RigidPointModel:
-        """How the sensor measures a point."""
-        unknown = self.config.unknown
-        max_range = np.inf if unknown.max_range_m is None else unknown.max_range_m
-        if self.measurement == "position":
-            return RelativePosition(self.space, self.robot_from_sensor, max_range)
-        view = np.deg2rad(unknown.half_field_of_view_deg)
-        return RangeBearing(self.space, self.robot_from_sensor, self.pitch_sign, max_range, view)
-
-    def _sensor(self) -> Sensor:
-        """With the log's names or without."""
-        config, likelihood = self.config, self.config.likelihood.build()
-        if config.association == "known":
-            return NamedLandmarkSensor(self.model, self.point, likelihood)
-        gates, existence = config.unknown.gates(self.model.dim), config.unknown.existence()
-        return AnonymousLandmarkSensor(self.model, self.point, gates, existence, likelihood)
 
     def _used(self, names: np.ndarray, report: StepReport) -> np.ndarray:
         """The landmark of each observation (K,) as known now, −1 where none was updated or started by it.
