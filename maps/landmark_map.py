@@ -87,7 +87,7 @@ class LandmarkMap(Map):
         kind = self._kind(landmark)
         columns = self.layouts[kind].pack(records, log_odds)
         count = columns.shape[0]
-        ids = checked_new_ids(ids, count, self.store.next_id, self.holds)
+        ids = checked_new_ids(ids, count, self.store.columns.next_id, self.holds)
         for column, landmark_id in zip(columns, ids.tolist(), strict=True):
             self.store.add(column, landmark_id)
         self.store.columns.kind[self.store.columns.rows(ids)] = kind

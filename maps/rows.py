@@ -220,7 +220,10 @@ class RowEngine:
             if kernel is None:
                 total.add(self._information_numpy(batch, group, state, prior))
             else:
-                self._information_compiled(kernel, batch, group, state, prior, total)
+                fused, measured, sizes = self._observed(kernel, batch, group, state)
+                out = total.info, total.vector, total.quad, total.log_det, total.rows
+                access, factor = self.store.access(batch.ids), np.ascontiguousarray(prior.factor)
+                run_driver(refine, state.shape[0] * batch.ks.size, *fused, *access, *measured, factor, sizes, *out)
         for rows in plan.joint:
             nu, jac, records, noise, log_factor, used = self._joint(rows, groups, state, prior)
             jac_map = jac[..., self.space.dim :]
@@ -243,9 +246,17 @@ class RowEngine:
             group = groups[batch.group]
             kernel = self._kernel(group)
             if kernel is None:
-                self._correct_numpy(batch, group, state, log_density)
+                # A landmark that particles associate with several measurements is updated by one after the other.
+                pending = np.arange(batch.ids.size)
+                while pending.size:
+                    _, first = np.unique(batch.ids[pending], return_index=True)
+                    self._correct_once(batch, pending[first], group, state, log_density)
+                    pending = np.delete(pending, first)
             else:
-                self._correct_compiled(kernel, batch, group, state, log_density)
+                access, targets = self.store.rewrite(batch.ids)
+                fused, measured, sizes = self._observed(kernel, batch, group, state)
+                pairs = state.shape[0] * batch.ks.size
+                run_driver(update, pairs, *fused, *access, targets, *measured, sizes, log_density)
         for rows in plan.joint:
             self._correct_joint(rows, groups, state, log_density)
         after_sampling = np.zeros(state.shape[0])
@@ -270,29 +281,6 @@ class RowEngine:
             (group.z[batch.ks], group.cov[batch.ks], mask, likelihood.kernel_id, params),
             np.array([self.space.dim, landmark.dim, landmark.constants]),
         )
-
-    def _information_compiled(
-        self,
-        kernel: FusedKernel,
-        batch: Batch,
-        group: Observations,
-        state: np.ndarray,
-        prior: Prior,
-        total: Information,
-    ) -> None:
-        fused, measured, sizes = self._observed(kernel, batch, group, state)
-        out = total.info, total.vector, total.quad, total.log_det, total.rows
-        pairs = state.shape[0] * batch.ks.size
-        factor = np.ascontiguousarray(prior.factor)
-        run_driver(refine, pairs, *fused, *self.store.access(batch.ids), *measured, factor, sizes, *out)
-
-    def _correct_compiled(
-        self, kernel: FusedKernel, batch: Batch, group: Observations, state: np.ndarray, log_density: np.ndarray
-    ) -> None:
-        access, targets = self.store.rewrite(batch.ids)
-        fused, measured, sizes = self._observed(kernel, batch, group, state)
-        pairs = state.shape[0] * batch.ks.size
-        run_driver(update, pairs, *fused, *access, targets, *measured, sizes, log_density)
 
     def _read(self, ids: np.ndarray) -> tuple[np.ndarray, Records]:
         columns = np.array([self.store.read(int(i)) for i in ids])
@@ -319,13 +307,6 @@ class RowEngine:
             likelihood = _likelihood(group)
             parts.append(linearisation.information(nu, jac.state, cov, likelihood, prior.take(part), mask))
         return Information.of_parts(parts)
-
-    def _correct_numpy(self, batch: Batch, group: Observations, state: np.ndarray, log_density: np.ndarray) -> None:
-        pending = np.arange(batch.ids.size)
-        while pending.size:
-            _, first = np.unique(batch.ids[pending], return_index=True)
-            self._correct_once(batch, pending[first], group, state, log_density)
-            pending = np.delete(pending, first)
 
     def _correct_once(
         self, batch: Batch, rows: np.ndarray, group: Observations, state: np.ndarray, log_density: np.ndarray

@@ -211,10 +211,6 @@ class SharedStore:
         """Columns alive, in the order in which they were added."""
         return self.columns.ids.copy()
 
-    @property
-    def next_id(self) -> int:
-        return self.columns.next_id
-
     def __contains__(self, column: object) -> bool:
         return isinstance(column, int | np.integer) and bool(self.columns.held(np.array([column]))[0])
 

@@ -232,14 +232,10 @@ def _eigen_factor(cov: Array) -> tuple[Array, NDArray[np.bool_]]:
 def _scaled_eigen(cov: Array) -> tuple[Array, Array, Array]:
     # Of the correlation matrix, so that radians beside metres keep all their digits.
     scale = np.sqrt(np.maximum(np.diagonal(cov, axis1=-2, axis2=-1), 0.0))
-    reciprocal = _reciprocal(scale)
+    reciprocal = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > _NO_SCALE)
     correlation = symmetrise(cov) * reciprocal[..., :, None] * reciprocal[..., None, :]
     values, vectors = np.linalg.eigh(correlation)
     return scale, vectors, values
-
-
-def _reciprocal(scale: Array) -> Array:
-    return np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > _NO_SCALE)
 
 
 def _require_symmetric(cov: Array) -> None:

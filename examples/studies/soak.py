@@ -151,7 +151,7 @@ def _window(filter_: Filter, frames: int, seconds: float, square: float) -> Wind
         nodes=filter_.lineage.nodes,
         states=filter_.history.stored_states,
         landmarks=landmark_map.ids.size,
-        started=landmark_map.store.next_id,
+        started=landmark_map.store.columns.next_id,
         error_m=float(np.sqrt(square)),
     )
 

@@ -22,12 +22,10 @@ def kernel_modules() -> list[str]:
     paths = [*sorted((_ROOT / "kernels").glob("*.py"))]
     for folder in folders:
         paths += sorted((_ROOT / folder).rglob("*_kernel*.py"))
-    chosen = [path for path in paths if _has_own(path.read_text(encoding="utf-8"))]
+    sources = {path: path.read_text(encoding="utf-8") for path in paths}
+    compiled = {path: s.count("@njit(") + s.count("@observation_kernel") for path, s in sources.items()}
+    chosen = [path for path, count in compiled.items() if count > sources[path].count('inline="always"')]
     return [".".join(["rbpf", *path.relative_to(_ROOT).with_suffix("").parts]) for path in chosen]
-
-
-def _has_own(source: str) -> bool:
-    return source.count("@njit(") + source.count("@observation_kernel") > source.count('inline="always"')
 
 
 def cached(module: str) -> bool:

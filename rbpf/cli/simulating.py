@@ -7,13 +7,11 @@ import tyro
 
 from rbpf.cli.commands import Commands
 from rbpf.cli.compiling import compile_kernels
-from rbpf.cli.options import ImagesOptions, LabOptions, LogOptions, RenderOptions, given_board
+from rbpf.cli.options import ImagesOptions, LabOptions, LogOptions, given_board
 from rbpf.cli.showing import answer, megabytes, progress
 from rbpf.errors import InputError
 
 if TYPE_CHECKING:
-    from rbpf.sensors.camera import Pinhole
-    from rbpf.validation.simulation.images import Imaging
     from rbpf.validation.simulation.textured_scene import ImageWorld
 
 FOCAL_FRACTION = {ImagesOptions: 0.8, LabOptions: 0.78125}
@@ -65,33 +63,17 @@ def simulate_lab(options: Annotated[LabOptions, tyro.conf.arg(name="")]) -> None
 
 
 def _render(world: "ImageWorld", options: ImagesOptions | LabOptions) -> None:
-    from rbpf.validation.simulation.images import simulate_images
-
-    camera = _camera(options)
-    imaging = _imaging(options)
-    with progress() as bar:
-        simulate_images(world, imaging, camera, options.out, options.seed, bar("rendering"), options.baseline_m)
-    size = megabytes(options.out)
-    answer({"out": str(options.out), "megabytes": round(size, 1)}, options.json, f"wrote {options.out}, {size:.0f} MB")
-
-
-def _camera(options: ImagesOptions | LabOptions) -> "Pinhole":
     from rbpf.sensors.camera import Pinhole
+    from rbpf.validation.simulation.images import Imaging, simulate_images
 
-    focal = options.focal_px or FOCAL_FRACTION[type(options)] * options.width
-    intrinsics = focal, focal, 0.5 * (options.width - 1), 0.5 * (options.height - 1)
-    if options.fisheye is None:
-        return Pinhole(options.width, options.height, *intrinsics, options.distortion)
-    if any(options.distortion):
+    if options.fisheye is not None and any(options.distortion):
         raise InputError("a lens has either --distortion or --fisheye: leave out one of them")
-    return Pinhole(options.width, options.height, *intrinsics, options.fisheye, "equidistant")
-
-
-def _imaging(options: RenderOptions) -> "Imaging":
-    from rbpf.validation.simulation.images import Imaging
-
+    lens = (options.distortion,) if options.fisheye is None else (options.fisheye, "equidistant")
+    focal = options.focal_px or FOCAL_FRACTION[type(options)] * options.width
+    centre = 0.5 * (options.width - 1), 0.5 * (options.height - 1)
+    camera = Pinhole(options.width, options.height, focal, focal, *centre, *lens)
     first, count = options.blackout or (0, 0)
-    return Imaging(
+    imaging = Imaging(
         noise_std=options.noise_std,
         exposure_drift=options.exposure_drift,
         blur_s=options.blur_s,
@@ -101,3 +83,7 @@ def _imaging(options: RenderOptions) -> "Imaging":
         known=options.known,
         jpeg=options.jpeg,
     )
+    with progress() as bar:
+        simulate_images(world, imaging, camera, options.out, options.seed, bar("rendering"), options.baseline_m)
+    size = megabytes(options.out)
+    answer({"out": str(options.out), "megabytes": round(size, 1)}, options.json, f"wrote {options.out}, {size:.0f} MB")

@@ -8,7 +8,7 @@ import numpy as np
 
 from rbpf.conformance.models import groups_of, landmark_checks, likelihood_checks, motion_checks, sensor_checks
 from rbpf.conformance.observation import observation_checks
-from rbpf.conformance.trial import Check, Example, Scene, run
+from rbpf.conformance.trial import Example, Scene, run
 from rbpf.core.models import Landmark, Likelihood, MotionModel, ObservationModel, Sensor
 from rbpf.errors import InputError
 from rbpf.lie import LieGroup
@@ -46,8 +46,21 @@ def check_model(
                     findings = check_model(part, example.belief.prior.space, rng, example)
                     observed.update(dict.fromkeys(findings))
         return list(observed)
+    name = type(model).__name__
+    if not isinstance(model, MotionModel | ObservationModel | Landmark | Likelihood):
+        raise InputError(
+            f"check_model tries a MotionModel, ObservationModel, Landmark, Likelihood or Sensor; a {name} is none of these"
+        )
     with np.errstate(all="ignore"):
-        return run(_checks(model, space, rng, example))
+        if isinstance(model, Likelihood):
+            return run(likelihood_checks(model, rng))
+        if isinstance(model, Landmark):
+            return run(landmark_checks(model, space, rng, example))
+        if space is None:
+            raise InputError(f"{name} has no attribute space: tell check_model the group of the state")
+        if isinstance(model, MotionModel):
+            return run(motion_checks(model, space, rng, example))
+        return run(observation_checks(model, Scene.draw(model, space, rng, example), example.landmark))
 
 
 def require_sound(
@@ -57,20 +70,3 @@ def require_sound(
     findings = check_model(model, space, rng, example)
     if findings:
         raise InputError("; ".join(findings))
-
-
-def _checks(model: object, space: LieGroup | None, rng: np.random.Generator, example: Example) -> list[Check]:
-    name = type(model).__name__
-    if isinstance(model, Likelihood):
-        return likelihood_checks(model, rng)
-    if isinstance(model, Landmark):
-        return landmark_checks(model, space, rng, example)
-    if not isinstance(model, MotionModel | ObservationModel):
-        raise InputError(
-            f"check_model tries a MotionModel, ObservationModel, Landmark, Likelihood or Sensor; a {name} is none of these"
-        )
-    if space is None:
-        raise InputError(f"{name} has no attribute space: tell check_model the group of the state")
-    if isinstance(model, MotionModel):
-        return motion_checks(model, space, rng, example)
-    return observation_checks(model, Scene.draw(model, space, rng, example), example.landmark)

@@ -176,13 +176,10 @@ def _block(linear: Complex, column: Complex) -> Array:
 def _coupling(xi: Array) -> Complex:
     # d(translation)/d(omega) of the left Jacobian: v (theta c - i b).
     squared = np.square(xi[..., 0])
-    return _planar(xi) * (xi[..., 0] * _coefficient_c(squared) - 1j * _coefficient_b(squared))
-
-
-def _coefficient_b(theta_squared: Array) -> Array:
-    """(1 - cos theta) / theta^2 = sum_k (-x)^k / (2k + 2)! of x = theta^2, from the half angle, which does not cancel."""
-    theta = np.sqrt(theta_squared + _TINY)
-    return np.asarray(2.0 * np.square(np.sin(0.5 * theta) / theta))
+    # b = (1 - cos theta) / theta^2 = sum_k (-x)^k / (2k + 2)! of x = theta^2, from the half angle, which does not cancel.
+    theta = np.sqrt(squared + _TINY)
+    b = 2.0 * np.square(np.sin(0.5 * theta) / theta)
+    return _planar(xi) * (xi[..., 0] * _coefficient_c(squared) - 1j * b)
 
 
 def _coefficient_c(theta_squared: Array) -> Array:

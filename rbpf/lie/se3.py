@@ -97,7 +97,8 @@ class SE3Group(LieGroup):
         roll: Like[ArrayLike, "*#batch"],
     ) -> Float[np.ndarray, "*batch 7"]:
         """Element with the translation t [m] and the rotation Rz(yaw) Ry(pitch) Rx(roll) [rad]."""
-        (cz, sz), (cy, sy), (cx, sx) = (_half_angle(angle) for angle in (yaw, pitch, roll))
+        halves = [0.5 * np.asarray(angle, dtype=float) for angle in (yaw, pitch, roll)]
+        (cz, sz), (cy, sy), (cx, sx) = ((np.cos(half), np.sin(half)) for half in halves)
         x = cz * cy * sx - sz * sy * cx
         y = cz * sy * cx + sz * cy * sx
         z = sz * cy * cx - cz * sy * sx
@@ -114,11 +115,6 @@ class SE3Group(LieGroup):
         pitch = np.arctan2(-rotation[..., 2, 0], np.hypot(rotation[..., 0, 0], rotation[..., 1, 0]))
         roll = np.arctan2(rotation[..., 2, 1], rotation[..., 2, 2])
         return yaw, pitch, roll
-
-
-def _half_angle(angle: ArrayLike) -> tuple[Array, Array]:
-    half = 0.5 * np.asarray(angle, dtype=float)
-    return np.asarray(np.cos(half)), np.asarray(np.sin(half))
 
 
 def _one(function: Callable[[Array, Array], None], x: ArrayLike, size: int, out_shape: tuple[int, ...]) -> Array:

@@ -72,7 +72,10 @@ def write_run(run: Run, out: Path, sources: Mapping[str, str | float | bool]) ->
     for name, arrays in system.files(log).items():
         save_arrays(out / name, arrays)
         if name == POSTERIOR:
-            _write_posterior_mean(out, arrays)
+            # The mean over the last frame's particles of their whole paths.
+            weights = np.exp(arrays["log_weights"])
+            mean = np.array([SE3.mean(poses, weights) for poses in arrays["world_from_camera"]])
+            write_tum(out / "posterior.tum", Trajectory(arrays["stamps_ns"], mean))
     write_config(out, system.name, sources, asdict(system.config))
     entries = summarise(run)
     write_summary(out, entries)
@@ -187,10 +190,3 @@ def write_trajectory(
         "weights": weights,
     }
     save_arrays(out / TRAJECTORY, arrays)
-
-
-def _write_posterior_mean(out: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """posterior.tum: the mean over the last frame's particles of their whole paths."""
-    weights = np.exp(arrays["log_weights"])
-    mean = np.array([SE3.mean(poses, weights) for poses in arrays["world_from_camera"]])
-    write_tum(out / "posterior.tum", Trajectory(arrays["stamps_ns"], mean))

@@ -97,13 +97,6 @@ def read_measurements(folder: Path) -> Measurements | FeatureLog:
     return _read_camera_log(folder, table, kind) if kind in _PIXELS else _read_robot(folder, table)
 
 
-def read_robot_measurements(folder: Path) -> Measurements:
-    """`read_measurements` of a robot's run; a camera's is refused."""
-    table = _Table.read(folder / OBSERVATIONS)
-    table.choice("measurement", tuple(KINDS))
-    return _read_robot(folder, table)
-
-
 def read_feature_log(folder: Path) -> FeatureLog:
     """`read_measurements` of a camera's run; a robot's is refused."""
     table = _Table.read(folder / OBSERVATIONS)

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import platform
+import re
 from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -14,6 +15,7 @@ from rbpf import __version__
 from rbpf.errors import InputError
 from rbpf.runs.files import write_text
 from rbpf.sensors.readers.yaml_files import read_plain_yaml
+from rbpf.systems.settings import HEADER
 
 CONFIG = "config.yaml"
 LIBRARIES = "numpy", "scipy", "numba", "opencv-python-headless"
@@ -21,38 +23,10 @@ LIBRARIES = "numpy", "scipy", "numba", "opencv-python-headless"
 
 _FILES = "recording", "known_points", "calibration", "known_map"
 """Entries that name files or folders that a run read."""
-_OPTIONS = {
-    "known_points": "known-points",
-    "known_map": "map",
-    "square_m": "square",
-    "marker_m": "marker",
-    "gap_m": "gap",
-    "image_topic": "image-topic",
-    "truth_topic": "truth-topic",
-    "start_s": "start",
-    "end_s": "end",
-    "resize_px": "resize",
-}
-_NAMED = (
-    "known_points",
-    "calibration",
-    "board",
-    "square_m",
-    "aruco",
-    "marker_m",
-    "gap_m",
-    "dictionary",
-    "known_map",
-    "image_topic",
-    "truth_topic",
-    "start_s",
-    "end_s",
-    "every",
-    "resize_px",
-)
 _FLAGS = ("localize",)
 _MADE = "video", "batch"
 """What a run makes besides its data, unless it is asked not to."""
+_HEAD = "rbpf", "system", "versions", "input_sha256", "recording"
 _INSTRUCTIONS = "sse4.2", "avx", "avx2", "fma", "avx512f", "neon", "sve"
 _CHUNK = 1 << 20
 
@@ -136,7 +110,12 @@ def digest_of(sources: Mapping[str, Path], without: Path | None = None) -> str |
         for file in _files(path, without):
             relative = "" if path.is_file() else file.relative_to(path).as_posix()
             whole.update(f"{relative}\n{file.stat().st_size}\n".encode())
-            _add(whole, file)
+            try:
+                with file.open("rb") as content:
+                    while chunk := content.read(_CHUNK):
+                        whole.update(chunk)
+            except OSError as error:
+                raise InputError(f"{file} cannot be read: {error.strerror}") from error
     return whole.hexdigest()
 
 
@@ -204,7 +183,10 @@ def read_origin(config: Path) -> Origin:
             f"{entries['recording']} has changed since the run of {config}: it cannot be repeated; to use its settings "
             "alone give --config"
         )
-    sources = {_OPTIONS.get(name, name): str(entries[name]) for name in _NAMED if name in entries}
+    # What else a run was started with: an entry has its option's name, and perhaps a unit behind it.
+    named = [name for name in HEADER if name in entries and name not in (*_HEAD, *_FLAGS, *_MADE)]
+    options = {name: re.sub(r"_(m|s|px)$", "", name).replace("_", "-") for name in named} | {"known_map": "map"}
+    sources = {options[name]: str(entries[name]) for name in named}
     sources |= {name: "" for name in _FLAGS if entries.get(name)}
     sources |= {f"no-{name}": "" for name in _MADE if entries.get(name) is False}
     return Origin(str(entries["system"]), str(entries["recording"]), sources, config)
@@ -218,12 +200,3 @@ def _files(path: Path, without: Path | None) -> list[Path]:
         return found
     inside = without.resolve()
     return [file for file in found if not file.resolve().is_relative_to(inside)]
-
-
-def _add(whole: Any, file: Path) -> None:
-    try:
-        with file.open("rb") as content:
-            while chunk := content.read(_CHUNK):
-                whole.update(chunk)
-    except OSError as error:
-        raise InputError(f"{file} cannot be read: {error.strerror}") from error

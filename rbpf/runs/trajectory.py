@@ -221,8 +221,12 @@ def read_tum(path: Path) -> Trajectory:
 def write_tum(path: Path, trajectory: Trajectory) -> None:
     """Writes a trajectory in TUM format, with every digit; the file appears under its name when complete."""
     rows = zip(trajectory.stamps_ns.tolist(), trajectory.world_from_body.tolist(), strict=True)
-    lines = [_tum_line(stamp_ns, numbers) for stamp_ns, numbers in rows]
-    write_text(path, "".join(["# " + " ".join(TUM_COLUMNS) + "\n", *lines]))
+    lines = ["# " + " ".join(TUM_COLUMNS)]
+    for stamp_ns, pose in rows:
+        seconds, fraction = divmod(abs(stamp_ns), NS_PER_S)
+        stamp = f"{'-' if stamp_ns < 0 else ''}{seconds}.{fraction:09d}"
+        lines.append(" ".join([stamp, *map(repr, pose[4:]), *map(repr, pose[:4])]))
+    write_text(path, "\n".join(lines) + "\n")
 
 
 def write_kitti(path: Path, trajectory: Trajectory) -> None:
@@ -240,12 +244,6 @@ def read_kitti(path: Path) -> Trajectory:
         problem = "expected a rotation matrix in columns 1-3, 5-7 and 9-11, found one that is not orthonormal"
         raise table.error(int(np.argmax(wrong)), problem)
     return Trajectory(np.arange(len(matrices)), SE3.from_matrix(matrices))
-
-
-def _tum_line(stamp_ns: int, pose: list[float]) -> str:
-    seconds, fraction = divmod(abs(stamp_ns), NS_PER_S)
-    stamp = f"{'-' if stamp_ns < 0 else ''}{seconds}.{fraction:09d}"
-    return " ".join([stamp, *map(repr, pose[4:]), *map(repr, pose[:4])]) + "\n"
 
 
 def _distance_from_rotation(matrices: Array) -> Array:

@@ -80,6 +80,7 @@ LOG_EVIDENCE = Column(
 )
 NIS = Column("nis", "normalised innovation squared; NaN without a linearised innovation", table=DIAGNOSTICS)
 NIS_DOF = Column("nis_dof", "its degrees of freedom, a weighted mean over the particles", table=DIAGNOSTICS)
+FILTER_COLUMNS = ESS, RESAMPLED, LOG_EVIDENCE, NIS, NIS_DOF
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from examples.studies.point_worlds import MONO, DeskWorld, Measuring, simulate_f
 from examples.studies.stereo_tracks import read_stereo_tracks
 from rbpf.errors import InputError
 from rbpf.lie import SE3
-from rbpf.runs.measurement_files import read_feature_log, read_robot_measurements, write_measurements
+from rbpf.runs.measurement_files import read_feature_log, read_measurements, write_measurements
 from rbpf.runs.trajectory import Trajectory, read_kitti, read_tum, write_tum
 from rbpf.sensors.readers import Topics, open_images, open_log, open_stereo, read_known_points, text
 from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
@@ -134,7 +134,7 @@ RECORDINGS: dict[str, tuple[Callable[[Path], object], Read, str]] = {
     "path": (results, lambda f: read_tum(f / "path.tum"), "path.tum"),
     "path of KITTI": (results, lambda f: read_kitti(f / "path.kitti"), "path.kitti"),
     "features": (features, read_feature_log, "observations*.csv"),
-    "measurements": (lambda f: write_measurements(f, world(2, "position")), read_robot_measurements, "*.csv"),
+    "measurements": (lambda f: write_measurements(f, world(2, "position")), read_measurements, "*.csv"),
 }
 
 

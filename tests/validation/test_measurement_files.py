@@ -13,7 +13,7 @@ from rbpf.runs.measurement_files import (
     OBSERVATIONS,
     ODOMETRY,
     read_feature_log,
-    read_robot_measurements,
+    read_measurements,
     write_measurements,
 )
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
@@ -35,7 +35,7 @@ def assert_same(found, expected):
 def test_files_give_back_the_same_bits(tmp_path, dim, kind):
     m = world(dim, kind)
     write_measurements(tmp_path, m)
-    assert_same(read_robot_measurements(tmp_path), m)
+    assert_same(read_measurements(tmp_path), m)
     assert sorted(path.name for path in tmp_path.iterdir()) == [OBSERVATIONS, ODOMETRY]
 
 
@@ -46,7 +46,7 @@ def test_extreme_numbers_come_back(tmp_path):
     covs[0] = np.diag([0.0, 1e-300, np.nextafter(1.0, 2.0)])
     m = replace(m, z=z, covs=covs, landmarks=m.landmarks - 2**62, recording="zurich, 2nd: été")
     write_measurements(tmp_path, m)
-    assert_same(read_robot_measurements(tmp_path), m)
+    assert_same(read_measurements(tmp_path), m)
 
 
 def test_a_run_without_sightings_and_one_of_a_single_step_come_back(tmp_path):
@@ -57,7 +57,7 @@ def test_a_run_without_sightings_and_one_of_a_single_step_come_back(tmp_path):
     single = replace(single, stamps_ns=m.stamps_ns[:1], deltas=m.deltas[:0], covs=m.covs[:0])
     for short in (blind, single):
         write_measurements(tmp_path, short)
-        assert_same(read_robot_measurements(tmp_path), short)
+        assert_same(read_measurements(tmp_path), short)
 
 
 def test_the_files_are_as_documented(tmp_path):
@@ -83,10 +83,10 @@ def test_missing_and_cut_files_are_refused(tmp_path, name):
     for cut in (text[:-3], text[: text.rindex("\n", 0, -1) + 1], text[:20], text[: text.index("step")], ""):
         path.write_text(cut)
         with pytest.raises(InputError, match=re.escape(str(path))):
-            read_robot_measurements(tmp_path)
+            read_measurements(tmp_path)
     path.unlink()
     with pytest.raises(InputError, match="no such file; expected a file that every filter run writes"):
-        read_robot_measurements(tmp_path)
+        read_measurements(tmp_path)
 
 
 BAD_SIGHTINGS = [
@@ -119,7 +119,7 @@ def test_malformed_sightings_are_refused_by_line(tmp_path, old, new, complaint):
     assert text.count(old) >= 1
     path.write_text(text.replace(old, new, 1))
     with pytest.raises(InputError, match=complaint):
-        read_robot_measurements(tmp_path)
+        read_measurements(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -144,7 +144,7 @@ def test_malformed_numbers_are_refused_by_line(tmp_path, dim, name, line, column
     lines[line - 1] = ",".join(fields)
     (tmp_path / name).write_text("\n".join([*lines, ""]))
     with pytest.raises(InputError, match=re.escape(str(tmp_path / name)) + f", line {line}: {complaint}"):
-        read_robot_measurements(tmp_path)
+        read_measurements(tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -29,19 +29,7 @@ from rbpf.sensors.readers.measurements import Kind, Measurements
 from rbpf.systems.anchoring import StartAnchor
 from rbpf.systems.map_estimate import MapEstimate, estimate_map
 from rbpf.systems.range_bearing.config import RangeBearingConfig
-from rbpf.systems.system import (
-    ESS,
-    LOG_EVIDENCE,
-    NIS,
-    NIS_DOF,
-    RESAMPLED,
-    Column,
-    Ragged,
-    Recorded,
-    System,
-    Tracked,
-    TrackingState,
-)
+from rbpf.systems.system import FILTER_COLUMNS, Column, Ragged, Recorded, System, Tracked, TrackingState
 
 
 @final
@@ -112,11 +100,7 @@ class RangeBearingSlam(System):
         self._associations = _Associations(self.filter) if keep_associations else None
         d, e, p = space.dim, space.size, self.model.dim
         self.columns = (
-            ESS,
-            RESAMPLED,
-            LOG_EVIDENCE,
-            NIS,
-            NIS_DOF,
+            *FILTER_COLUMNS,
             Column("correction", "what the observations say about the motion, in its whitened coordinates", shape=(d,)),
             Column("cov_correction", "what a consistent filter expects of the correction", shape=(d, d)),
             Column("odometry", "world_from_robot by odometry alone", shape=(e,)),
