@@ -79,6 +79,21 @@ def looking(eye: np.ndarray, direction: np.ndarray) -> np.ndarray:
     return SE3.from_matrix(columns)
 
 
+def speeds(world_from_camera: np.ndarray, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rates of turn (T - 1,) [rad/s] and speeds (T - 1,) [m/s] between poses (T, 7) at times (T,)."""
+    step = SE3.local(world_from_camera[:-1], world_from_camera[1:]) / np.diff(seconds)[:, None]
+    return np.linalg.norm(step[:, :3], axis=1), np.linalg.norm(step[:, 3:], axis=1)
+
+
+def slowed(
+    path: Callable[[np.ndarray], np.ndarray], seconds: np.ndarray, speed_m_s: float, turn_rad_s: float
+) -> Callable[[np.ndarray], np.ndarray]:
+    """The path, poses (T, 7) at times (T,), as slow as it takes that neither limit is passed at the `seconds` (T,)."""
+    turn, speed = speeds(path(seconds), seconds)
+    pace = min(1.0, 1.0 / max(float(turn.max()) / turn_rad_s, float(speed.max()) / speed_m_s))
+    return lambda time: path(pace * time)
+
+
 def shaken(world_from_camera: np.ndarray, wave: Wave, seconds: np.ndarray) -> np.ndarray:
     """Poses (T, 7) moved by a wave of six channels, [rotation, translation] in the camera's frame."""
     return SE3.retract(world_from_camera, wave(seconds))
@@ -156,12 +171,8 @@ class HandHeld:
             target = wave[:, :3] - start
             return shaken(looking(target + distance * away, -away), wrist, time)
 
-        # As slow as it takes that neither limit is passed.
-        path, time = sweep(seconds), eased(seconds, self.start_s)
-        step = SE3.local(path[:-1], path[1:]) / np.diff(seconds)[:, None]
-        turn_rad_s, speed_m_s = (np.linalg.norm(part, axis=1).max() for part in (step[:, :3], step[:, 3:]))
-        pace = min(1.0, 1.0 / max(float(turn_rad_s) / self.turn_rad_s, float(speed_m_s) / self.speed_m_s))
-        return shaken(sweep(pace * time), tremor, time)
+        time = eased(seconds, self.start_s)
+        return shaken(slowed(sweep, seconds, self.speed_m_s, self.turn_rad_s)(time), tremor, time)
 
 
 KNOTS = 257
