@@ -9,7 +9,7 @@ W = 10 x³ - 15 x⁴ + 6 x⁵: the curvature, its first derivative and those of 
 agree at both ends.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Self
