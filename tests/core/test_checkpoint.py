@@ -1,7 +1,6 @@
 """A run that was saved and resumed is the run that was never interrupted, byte for byte."""
 
 import re
-import zipfile
 from dataclasses import replace
 
 import numpy as np
@@ -40,8 +39,9 @@ def test_resumed_at_any_step(recipe, tmp_path):
         if t % 4 == 3:
             uninterrupted.save(tmp_path / f"{t}.npz")
 
+    save(-1, None)
     reports = drive(uninterrupted, world, after=save)
-    for t in range(3, STEPS - 1, 4):
+    for t in range(-1, STEPS - 1, 4):
         resumed = replace(recipe, seed=99).build()
         resumed.load(tmp_path / f"{t}.npz")
         again = drive(resumed, world, t + 1)
@@ -74,18 +74,6 @@ def test_resumed_in_place_of_a_later_state(world, tmp_path):
     assert filter_.steps == 12
     drive(filter_, world, 12)
     assert same(content(filter_), expected)
-
-
-def test_before_the_first_step(world, tmp_path):
-    recipe = Recipe(n=15)
-    recipe.build().save(tmp_path / "start.npz")
-    resumed = replace(recipe, seed=7).build()
-    resumed.load(tmp_path / "start.npz")
-    assert resumed.stamp_ns is None
-    uninterrupted = recipe.build()
-    drive(resumed, world)
-    drive(uninterrupted, world)
-    assert same(content(resumed), content(uninterrupted))
 
 
 @pytest.mark.parametrize("generator", [np.random.PCG64DXSM, np.random.MT19937, np.random.Philox, np.random.SFC64])
@@ -136,15 +124,6 @@ def test_arrays_of_the_caller_come_back(world, tmp_path):
     found = Recipe(n=15).build().load(tmp_path / "run.npz")
     assert found.keys() == extra.keys()
     assert all(np.array_equal(found[name], extra[name]) for name in extra)
-
-
-def test_no_pickle_is_written(world, tmp_path):
-    filter_ = Recipe(n=5).build()
-    drive(filter_, world, 0, 5)
-    filter_.save(tmp_path / "run.npz")
-    with zipfile.ZipFile(tmp_path / "run.npz") as archive:
-        for name in archive.namelist():
-            assert b"'descr': '|O'" not in archive.read(name)[:200]
 
 
 @pytest.mark.parametrize(

@@ -4,12 +4,9 @@ import hashlib
 import os
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
-
-from tests.core.worlds import Recipe, content, drive, planar_world, same
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -51,13 +48,3 @@ def test_threads_do_not_change_a_byte(known):
     assert int(generations) >= 1
     assert len(digest) == hashlib.sha256().digest_size * 2
     assert one == two
-
-
-@pytest.mark.parametrize("recipe", [Recipe(), Recipe(known=False), Recipe(compiled=False)])
-def test_equal_seeds_give_equal_bytes(recipe):
-    world = planar_world(20, seed=6)
-    first, second, other = recipe.build(), recipe.build(), replace(recipe, seed=2).build()
-    for filter_ in (first, second, other):
-        drive(filter_, world)
-    assert same(content(first), content(second))
-    assert not same(content(first), content(other))

@@ -32,11 +32,15 @@ def followed(states: np.ndarray, seen: list[Frame]) -> tuple[Filter, np.ndarray]
     return filter_, np.array([filter_.follow(state, frame) for state, frame in zip(states, seen, strict=True)])
 
 
-def test_the_map_is_that_of_each_given_path():
+def test_states_history_clock_and_map_are_those_of_each_given_path():
     rng = np.random.default_rng(1)
     seen, offset = frames(rng), rng.normal(size=(3, 4, 2))
     states = PATH[:, None] + offset
     filter_, log_densities = followed(states, seen)
+    np.testing.assert_array_equal(filter_.history.paths(), states)
+    np.testing.assert_array_equal(filter_.particles.state, states[-1])
+    np.testing.assert_allclose(filter_.particles.log_weights, -np.log(4))
+    assert (filter_.steps, filter_.stamp_ns, filter_.log_evidence) == (3, 2 * STEP, 0.0)
     records = filter_.belief().read([0])
     for i in range(4):
         first = seen[0].new_landmarks[0].z[0] + states[0, i]
@@ -47,16 +51,6 @@ def test_the_map_is_that_of_each_given_path():
             assert log_densities[t, i] == pytest.approx(kalman.log_evidence - before, abs=1e-9)
         np.testing.assert_allclose(records.mean[i, 0], kalman.mean, atol=1e-9)
         np.testing.assert_allclose(records.cov[i, 0], kalman.cov, atol=1e-9)
-
-
-def test_states_history_and_clock_are_those_given():
-    rng = np.random.default_rng(2)
-    states = PATH[:, None] + rng.normal(size=(3, 5, 2))
-    filter_, _ = followed(states, frames(rng))
-    np.testing.assert_array_equal(filter_.history.paths(), states)
-    np.testing.assert_array_equal(filter_.particles.state, states[-1])
-    np.testing.assert_allclose(filter_.particles.log_weights, -np.log(5))
-    assert (filter_.steps, filter_.stamp_ns, filter_.log_evidence) == (3, 2 * STEP, 0.0)
 
 
 def test_one_state_serves_all_particles_and_steps_go_on_from_it():

@@ -38,14 +38,6 @@ def test_expected_number_of_descendants(scheme, n, concentration):
     assert (np.abs(error) < 4.5 * std).all()
 
 
-@pytest.mark.parametrize("scheme", [Systematic(), Stratified(), Residual()], ids=lambda s: type(s).__name__)
-def test_variance_is_below_the_multinomial_one(scheme):
-    rng = np.random.default_rng(2)
-    weights = rng.dirichlet(np.ones(20))
-    drawn = np.array([counts(scheme, weights, rng) for _ in range(DRAWS)])
-    assert drawn.var(axis=0).sum() < 0.75 * (20 * weights * (1 - weights)).sum()
-
-
 @given(weight_vectors(), st.integers(0, 2**32 - 1))
 def test_counts_are_as_regular_as_each_scheme_promises(weights, seed):
     expected = weights.size * weights

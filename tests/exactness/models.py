@@ -19,7 +19,7 @@ from rbpf.core.models import (
 )
 from rbpf.lie import Euclidean
 
-SEEDS = 500
+SEEDS = 400
 
 
 class LinearMotion(MotionModel):

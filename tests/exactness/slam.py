@@ -9,11 +9,27 @@ from scipy.linalg import block_diag
 from rbpf.core.filter import Filter
 from rbpf.core.marginals import KalmanSubstate
 from rbpf.core.models import NewLandmarks, ObservationModel, Observations
+from rbpf.lie import SE2
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import Point
-from tests.exactness.models import SEEDS, Frame, Kalman
+from rbpf.motion.odometry import Odometry
+from tests.exactness.models import SEEDS, Frame, Kalman, LinearMotion
 
 NOISE = np.array([[0.25, 0.08], [0.08, 0.2]])
+STEP, Q = np.array([0.8, 0.3]), np.array([[0.2, 0.05], [0.05, 0.1]])
+"""Of a robot that goes by known steps, with such noise."""
+ALONG = Odometry(np.append(0.0, STEP), block_diag(0.0, Q))
+"""The same as odometry in the plane: the noise has no component along the heading."""
+TURNED = np.array([0.7, 1.0, -2.0])
+"""Where a robot starts whose heading is known."""
+DRIFTING = LinearMotion(
+    np.eye(2),
+    np.array([[0.3, 0.0, 0.0], [0.0, 0.3, 0.0], [0.1, 0.0, 0.2], [0.0, 0.05, 0.2]]),
+    0.7 * np.eye(2),
+    0.9 * np.eye(2),
+    np.array([0.1, 0.0]),
+)
+"""A position driven by a velocity that is correlated with it through the noise."""
 VISIBLE = [(0, 1), (0, 1), (1, 2), (0, 1, 2)]
 """Landmarks seen in each step; the first sighting of one starts it."""
 
@@ -82,6 +98,32 @@ class LinearSlam:
                 kalman.augment(self.rotation @ measured, pick[:2], self.rotation @ NOISE @ self.rotation.T)
 
 
+class Walk(LinearMotion):
+    """Position alone, by known steps."""
+
+    def __init__(self):
+        super().__init__(np.eye(2), np.linalg.cholesky(Q))
+
+    def transition(self, state, control, dt):
+        return super().transition(state, STEP, dt)
+
+
+def walked() -> LinearSlam:
+    """The world of a `Walk`."""
+    return LinearSlam(np.eye(2), Q, STEP, Kalman(np.zeros(2), np.zeros((2, 2))), np.eye(2), seed=31)
+
+
+def turned() -> LinearSlam:
+    """The world of a robot that starts at `TURNED` and goes `ALONG`."""
+    turn = SE2.rotation(TURNED)
+    return LinearSlam(np.eye(2), turn @ Q @ turn.T, turn @ STEP, Kalman(TURNED[1:], np.zeros((2, 2))), turn, seed=32)
+
+
+def velocity() -> Kalman:
+    """Of the position and the velocity of `DRIFTING` at the start."""
+    return Kalman(np.array([0.0, 0.0, 0.6, 0.2]), np.diag([0.0, 0.0, 0.3, 0.2]))
+
+
 def moments(filter_: Filter) -> tuple[np.ndarray, np.ndarray]:
     """Mean and covariance, within and between particles, of (position[, velocity], landmarks)."""
     weights = filter_.particles.weights
@@ -101,7 +143,11 @@ def moments(filter_: Filter) -> tuple[np.ndarray, np.ndarray]:
 
 
 def unnormalised_errors(
-    build: Callable[[np.random.Generator], Filter], frames: Sequence[Frame], exact: Kalman, stream: int
+    build: Callable[[np.random.Generator], Filter],
+    frames: Sequence[Frame],
+    exact: Kalman,
+    stream: int,
+    control: object = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Per seed: log Ẑ/Z, and Ẑ/Z times the errors of first and second moments about the exact mean.
 
@@ -111,7 +157,7 @@ def unnormalised_errors(
     for seed in range(SEEDS):
         filter_ = build(np.random.default_rng([stream, seed]))
         for frame in frames:
-            filter_.step(frame)
+            filter_.step(frame, control)
         logs.append(filter_.log_evidence - exact.log_evidence)
         ratio = np.exp(logs[-1])
         mean, cov = moments(filter_)

@@ -11,7 +11,7 @@ from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import AnchoredPoint, Point
 from rbpf.motion.odometry import Odometry, OdometryMotion
 from rbpf.sensors.range_bearing import RangeBearing
-from tests.exactness.models import Frame, Scripted, known
+from tests.exactness.models import Frame, Scripted
 from tests.exactness.scenes import Scene, random_covs
 
 TOLERANCE = 1e-9
@@ -92,22 +92,3 @@ def test_anchored_points_equal_world_points(space, where):
     np.testing.assert_allclose(promoted.mean, points.mean, atol=TOLERANCE)
     np.testing.assert_allclose(promoted.cov, points.cov, atol=TOLERANCE)
     assert promoted.const is None
-
-
-@pytest.mark.parametrize("compiled", [True, False], ids=["compiled", "numpy"])
-def test_constants_follow_their_particle(compiled):
-    """Of landmarks rewritten in every generation and of one that nobody has written since the first."""
-    records = Scene.random(SE2, np.random.default_rng(9), n=PARTICLES).records
-    numbered = np.arange(PARTICLES, dtype=float)[:, None, None] * np.ones((1, 4, 3))
-    model = RangeBearing(SE2)
-    held = LandmarkMap(SE2, compiled=compiled)
-    filter_ = Filter(OdometryMotion(SE2), Scripted(), held, None, Systematic(), PARTICLES, np.random.default_rng(6))
-    held.add_records(Records(records.mean, records.cov, numbered), AnchoredPoint(SE2))
-    filter_.lineage.retain(0)
-    for _ in range(6):
-        z = model.predict(SE2.identity(), records.mean[0, :3]) + 0.1
-        groups = [Observations(z, np.tile(0.02 * np.eye(2), (3, 1, 1)), model, ids=np.arange(3))]
-        filter_.step(Frame(groups), Odometry(SE2.identity(), 0.02 * np.eye(3)))
-    const = known(held.read(held.ids).const)[..., 0]
-    np.testing.assert_array_equal(const, np.repeat(filter_.lineage.rows(0)[:, None], 4, axis=1))
-    assert 1 < len(np.unique(const)) < PARTICLES

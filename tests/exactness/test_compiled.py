@@ -1,23 +1,19 @@
-"""The compiled path equals plain NumPy: four kernels, masks, likelihoods, both passes and whole runs."""
+"""The compiled path equals plain NumPy: four kernels, masks, likelihoods, both passes."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from rbpf.core.filter import Filter
 from rbpf.core.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobis
 from rbpf.core.linearisation import linearise
-from rbpf.core.models import NEW, NULL, NewLandmarks, Observations
-from rbpf.core.proposals import EkfProposal, PriorProposal, refined
+from rbpf.core.models import NEW, NULL, Observations
+from rbpf.core.proposals import refined
 from rbpf.kernels.signature import BLOCK
 from rbpf.lie import SE2, SE3
 from rbpf.maps import rows
-from rbpf.maps.landmark_map import LandmarkMap
-from rbpf.maps.point import Point
-from rbpf.motion.odometry import Odometry, OdometryMotion
-from tests.exactness.models import Frame, Scripted, known
-from tests.exactness.scenes import Scene, random_covs, sensors
+from tests.exactness.models import known
+from tests.exactness.scenes import Scene, sensors
 
 TOLERANCE = 1e-9
 PARTICLES = BLOCK + 45
@@ -113,43 +109,3 @@ def _innovations(scene: Scene, group: Observations) -> tuple[np.ndarray, np.ndar
     jac = known(linearise(group.model, scene.space, group.z, state, mean)[1].landmark)
     cov = jac @ scene.records.cov[:, ids] @ np.swapaxes(jac, -1, -2) + group.cov
     return group.model.residual(group.z, group.model.predict(state, mean)), cov
-
-
-def drive(space, which: int, likelihood, proposal, compiled: bool) -> Filter:
-    """Ten steps of a robot among eight landmarks; the last one appears late, one sighting is an outlier."""
-    rng = np.random.default_rng(99)
-    dim = 2 if space is SE2 else 3
-    model = sensors(space, rng)[which]
-    landmarks = rng.normal(scale=4.0, size=(8, dim)) + 6.0
-    noise, cov = random_covs(rng, (8,), dim, 0.05), 0.003 * np.eye(space.dim)
-    delta = space.exp(np.array([0.1, 0.4, 0.0]) if space is SE2 else np.array([0.05, 0.0, 0.1, 0.4, 0.0, 0.0]))
-    held = LandmarkMap(space, compiled=compiled)
-    filter_ = Filter(OdometryMotion(space), Scripted(), held, proposal, n=PARTICLES, rng=np.random.default_rng(7))
-    truth = space.identity()
-    for step in range(10):
-        truth = space.compose(truth, delta)
-        z = model.predict(truth, landmarks) + rng.multivariate_normal(np.zeros(dim), noise[0], size=8)
-        z[1, 0] += 2.0 * (step == 4)
-        seen = np.arange(7) if step < 5 else np.arange(2, 8)
-        old = seen[np.isin(seen, held.ids)]
-        new = np.setdiff1d(seen, old)
-        groups = [Observations(z[old], noise[old], model, likelihood, old)] if old.size else []
-        new_landmarks = [NewLandmarks(z[new], noise[new], model, Point(dim))] if new.size else []
-        filter_.step(Frame(groups, new_landmarks), Odometry(delta, cov))
-    return filter_
-
-
-@pytest.mark.parametrize(
-    "proposal", [PriorProposal(), EkfProposal(), EkfProposal(iterations=2)], ids=["prior", "ekf", "iekf"]
-)
-@every_likelihood
-@every_sensor
-def test_whole_runs(space, which, likelihood, proposal):
-    one, other = (drive(space, which, likelihood, proposal, compiled) for compiled in (True, False))
-    assert one.lineage.generation == other.lineage.generation > 0
-    np.testing.assert_allclose(one.particles.state, other.particles.state, atol=TOLERANCE)
-    np.testing.assert_allclose(one.particles.log_weights, other.particles.log_weights, atol=1e-7)
-    np.testing.assert_allclose(one.log_evidence, other.log_evidence, rtol=TOLERANCE)
-    for field in ("mean", "cov"):
-        compiled, plain = (getattr(f.belief().read(f.belief().map.ids), field) for f in (one, other))
-        np.testing.assert_allclose(compiled, plain, atol=TOLERANCE)

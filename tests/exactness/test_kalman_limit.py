@@ -1,5 +1,7 @@
 """With everything marginalised the filter is a Kalman filter; given its trajectory, so is each particle."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -19,8 +21,15 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(1960)
 
 
-def random_motion(rng: np.random.Generator, d: int, m: int, rank: int) -> LinearMotion:
-    return LinearMotion(
+class Unequal(LinearMotion):
+    """Drives each particle by another multiple of the substate."""
+
+    def transition(self, state, control, dt):
+        return replace(super().transition(state, control, dt), coupling=(1.0 + np.arange(3))[:, None, None] * self.B)
+
+
+def random_motion(rng: np.random.Generator, d: int, m: int, rank: int, kind: type = LinearMotion) -> LinearMotion:
+    return kind(
         0.6 * rng.normal(size=(d, d)),
         0.5 * rng.normal(size=(d + m, rank)),
         rng.normal(size=(d, m)),
@@ -77,11 +86,11 @@ def test_a_state_without_noise_leaves_a_kalman_filter_of_the_substate(proposal, 
     assert filter_.log_evidence == pytest.approx(kalman.log_evidence, abs=TOLERANCE)
 
 
-@every_proposal
-@pytest.mark.parametrize("rank", [4, 3, 1], ids=["regular", "as many", "fewer"])
-def test_a_sampled_trajectory_is_an_exact_measurement_of_the_substate(proposal, rank, rng):
+@pytest.mark.parametrize("proposal", PROPOSALS[::3], ids=["prior", "iterated"])
+@pytest.mark.parametrize(("rank", "kind"), [(4, Unequal), (1, LinearMotion)], ids=["regular", "fewer"])
+def test_a_sampled_trajectory_is_an_exact_measurement_of_the_substate(proposal, rank, kind, rng):
     """Noise of rank 1 makes the increment a function of the substate."""
-    motion = random_motion(rng, 2, 2, rank)
+    motion = random_motion(rng, 2, 2, rank, kind)
     fix = LinearObservation(np.eye(2), 0.3 * np.ones((2, 2)))
     substate = KalmanSubstate(motion.space, np.ones(2), np.eye(2))
     filter_ = Filter(motion, Scripted(), substate, proposal, EssTriggered(Systematic(), 0.0), n=3, rng=rng)
@@ -93,7 +102,7 @@ def test_a_sampled_trajectory_is_an_exact_measurement_of_the_substate(proposal, 
         filter_.step(Frame([single(z, 0.5 * np.eye(2), fix)]))
         after = filter_.particles.state
         for i, kalman in enumerate(kalmans):
-            joint = np.vstack([motion.B, motion.A])
+            joint = np.vstack([motion.B * (1.0 + i if kind is Unequal else 1.0), motion.A])
             pair = Kalman(
                 np.concatenate([motion.F @ before[i], np.zeros(2)]) + joint @ kalman.mean,
                 joint @ kalman.cov @ joint.T + noise,

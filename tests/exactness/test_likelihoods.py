@@ -6,7 +6,7 @@ import pytest
 from rbpf.core.filter import Filter
 from rbpf.core.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobis
 from rbpf.core.marginals import Marginals
-from rbpf.core.models import NULL, NewLandmarks, ObservationModel, Observations, Records
+from rbpf.core.models import NewLandmarks, ObservationModel, Observations, Records
 from rbpf.core.proposals import EkfProposal, PriorProposal, refined
 from rbpf.errors import InputError
 from rbpf.lie import Euclidean
@@ -99,17 +99,6 @@ def held_landmarks(cov: np.ndarray, n: int = 8) -> LandmarkMap:
     mean = np.tile(np.array([[3.0, 1.0], [-2.0, 4.0]]), (n, 1, 1))
     held.add_records(Records(mean, np.tile(cov, (n, 2, 1, 1))), Point(2))
     return held
-
-
-def test_a_null_match_costs_half_the_limit(rng):
-    state = rng.normal(scale=0.1, size=(8, 2))
-    z, R = np.array([[3.0, 1.0], [5.0, 5.0]]), np.tile(0.1 * np.eye(2), (2, 1, 1))
-    ids = np.array([0, NULL])
-    group = Observations(z, R, Relative(), TRUNCATED, ids, log_clutter=TRUNCATED.log_outlier())
-    alone = Observations(z[:1], R[:1], Relative(), TRUNCATED, ids[:1])
-    zero = np.zeros((8, 2))
-    with_null, without = (held_landmarks(0.1 * np.eye(2)).correct(state, zero, [g]).all for g in (group, alone))
-    np.testing.assert_allclose(with_null, without - 2.0, atol=1e-12)
 
 
 LIKELIHOODS = {"gaussian": None, "truncated": TRUNCATED, "outliers": GaussianWithOutliers(0.1, 30.0)}

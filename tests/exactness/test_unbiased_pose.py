@@ -112,13 +112,6 @@ def test_one_step_against_quadrature(after_one_step, proposal, stream):
     assert log_evidence.std() / np.sqrt(SEEDS) < 0.01
 
 
-def test_the_linearised_weight_is_biased(after_one_step):
-    """By over fifty standard errors of the test above; a first step has no Monte-Carlo error of its own."""
-    filter_ = Filter(OdometryMotion(SE2), Scripted(), (), EkfProposal(exact=False), n=100, start=START)
-    report = filter_.step(Frame([single(FIX, R, Antenna())]), Odometry(DELTA, COV))
-    assert abs(report.log_evidence - after_one_step) > 0.05
-
-
 @pytest.mark.parametrize("drifting", [False, True], ids=["state only", "reads the substate"])
 def test_one_step_driven_by_a_substate_against_quadrature(drifting, stream):
     """The chart stands at the transition's mean, away from where the increment is expected."""
@@ -135,50 +128,3 @@ def test_one_step_driven_by_a_substate_against_quadrature(drifting, stream):
     log_evidence = one_step(Turning(), None, z, Antenna(drifting), proposal, stream, (mean, cov))
     assert_unbiased(log_evidence - exact)
     assert log_evidence.std() / np.sqrt(SEEDS) < 0.005
-
-
-def bootstrap(zs: np.ndarray, deltas: np.ndarray, n: int, rng: np.random.Generator) -> float:
-    """Log-evidence by a plain particle filter of many particles, sharing no code with the package."""
-    state, total = np.tile(START, (n, 1)), 0.0
-    factor = np.linalg.cholesky(COV)
-    for z, (turn, x, y) in zip(zs, deltas, strict=True):
-        c, s = np.cos(state[:, 0]), np.sin(state[:, 0])
-        state = state + np.stack([np.full(n, turn), c * x - s * y, s * x + c * y], axis=-1)
-        state = moved(state, rng.normal(size=(n, 3)) @ factor.T)
-        weights = density(z - positions(state), R)
-        total += float(np.log(weights.mean()))
-        comb = (np.arange(n) + rng.random()) / n
-        state = state[np.searchsorted(np.cumsum(weights / weights.sum()), comb).clip(max=n - 1)]
-    return total
-
-
-@pytest.fixture(scope="module")
-def fixes() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Position fixes, odometry, and log-evidences of ten large bootstrap filters."""
-    rng = np.random.default_rng(7)
-    deltas = np.array([[0.5, 1.2, 0.1], [0.3, 1.0, 0.0], [-0.6, 0.9, 0.2]])
-    state, zs = START, []
-    for delta in deltas:
-        state = moved(SE2.compose(state, delta), rng.multivariate_normal(np.zeros(3), COV))
-        zs.append(positions(state) + rng.multivariate_normal(np.zeros(2), R))
-    exact = [bootstrap(np.array(zs), deltas, 100_000, rng) for _ in range(10)]
-    return np.array(zs), deltas, np.array(exact)
-
-
-def run_fixes(fixes, proposal, stream) -> np.ndarray:
-    zs, deltas, exact = fixes
-    assert exact.std(ddof=1) / np.sqrt(len(exact)) < 0.003
-
-    def run(seed: int) -> float:
-        rng = np.random.default_rng([stream, seed])
-        filter_ = Filter(OdometryMotion(SE2), Scripted(), (), proposal, Systematic(), 40, rng, START)
-        for z, delta in zip(zs, deltas, strict=True):
-            filter_.step(Frame([single(z, R, Antenna())]), Odometry(delta, COV))
-        return filter_.log_evidence - float(np.log(np.exp(exact).mean()))
-
-    return np.array([run(seed) for seed in range(SEEDS)])
-
-
-@pytest.mark.parametrize("proposal", [EkfProposal(), EkfProposal(iterations=3)], ids=["ekf", "iterated"])
-def test_position_fixes_against_a_large_bootstrap_filter(fixes, proposal, stream):
-    assert_unbiased(run_fixes(fixes, proposal, stream))

@@ -11,7 +11,7 @@ from rbpf.core.proposals import PriorProposal
 from rbpf.core.resampling import EssTriggered, Systematic
 from rbpf.lie import SE3
 from rbpf.motion.constant_velocity import MarginalVelocity, SampledVelocity
-from tests.exactness.models import Frame, Kalman, Scripted, deviation, single
+from tests.exactness.models import Frame, Kalman, Scripted, single
 
 WALK = np.array([0.0, 0.0, 0.0, 0.6, 0.9, 0.4])
 """Without rotation SE(3) is a vector space, and the joint Kalman filter is exact."""
@@ -64,19 +64,6 @@ def measurements(seed: int) -> np.ndarray:
     return np.outer(STAMPS_S, [0.5, 0.1, -0.2]) + 0.2 * rng.normal(size=(len(STAMPS_S), 3))
 
 
-def kalman_path(z: np.ndarray) -> Kalman:
-    """Filter of (position, velocity) from the origin, over the same frames."""
-    kalman = Kalman(np.append(np.zeros(3), V0), np.block([[np.zeros((3, 6))], [np.zeros((3, 3)), P0]]))
-    sigma, eye, zero = np.diag(WALK[3:] ** 2), np.eye(3), np.zeros((3, 3))
-    for t, stamp in enumerate(STAMPS_S):
-        dt = stamp - STAMPS_S[max(t - 1, 0)]
-        Q = np.block([[dt**3 / 3 * sigma, dt**2 / 2 * sigma], [dt**2 / 2 * sigma, dt * sigma]])
-        kalman.predict(np.block([[eye, dt * eye], [zero, eye]]), Q)
-        kalman.update(z[t], np.hstack([eye, zero]), R)
-        kalman.record()
-    return kalman
-
-
 def test_the_exact_velocity_given_the_path():
     """Step by step: s | x_0:t of each particle is the Kalman filter's that is told its positions exactly."""
     part = substate()
@@ -101,34 +88,6 @@ def test_the_exact_velocity_given_the_path():
         assert part.cov.shape == (1, 6, 6)
         np.testing.assert_allclose(part.cov[0, 3:, 3:], kalman.cov, rtol=1e-7, atol=1e-9)
     assert filter_.lineage.generation == 0
-
-
-@pytest.mark.slow
-def test_evidence_and_moments_are_the_joint_kalman_filters():
-    """Before sampling they are exact in the first moving step; later ones in the mean over runs."""
-    z = measurements(1)
-    kalman = kalman_path(z)
-    ratios, errors = [], []
-    for seed in range(120):
-        part = substate()
-        filter_ = build(part, 500, seed)
-        for t, stamp in enumerate(STAMPS_S):
-            report = filter_.step(Frame([single(z[t], R, Position())]), None, round(stamp * 1e9))
-            if t == 1:
-                mean, cov = kalman.path[1]
-                np.testing.assert_allclose(report.estimate.mean[4:7], mean[:3], atol=1e-9)
-                np.testing.assert_allclose(report.estimate.cov[3:, 3:], cov[:3, :3], atol=1e-9)
-        ratio = np.exp(filter_.log_evidence - kalman.log_evidence)
-        weights = filter_.particles.weights
-        state = np.concatenate([filter_.particles.state[:, 4:7], part.mean[:, 3:]], axis=1)
-        error = state - kalman.mean
-        second = np.einsum("n,na,nb->ab", weights, error, error)
-        second[3:, 3:] += part.cov[0, 3:, 3:]
-        ratios.append(ratio)
-        errors.append(ratio * np.concatenate([weights @ error, (second - kalman.cov).ravel()]))
-    assert np.std(np.log(ratios)) <= 0.5
-    assert deviation(np.array(ratios), 1.0) <= 3.0
-    assert deviation(np.array(errors), 0.0) <= 4.0
 
 
 def test_a_shared_covariance_is_the_one_of_each_particle():
@@ -192,17 +151,9 @@ def test_an_observation_of_the_velocity_makes_it_the_particles_own(shared):
     assert (spread < 1e-10) == shared
 
 
-def moments(filter_: Filter) -> np.ndarray:
-    """Mean of the pose about a fixed place, and its second moments."""
-    place = SE3.exp(np.array([0.1, -0.1, 0.2, 0.3, 0.1, -0.1]))
-    error = SE3.local(place, filter_.particles.state[:, :7])
-    weights = filter_.particles.weights
-    return np.concatenate([weights @ error, np.einsum("n,na,nb->ab", weights, error, error)[np.triu_indices(6)]])
-
-
 def test_sampled_and_marginal_velocity_have_one_law():
     """Three steps without measurements, rotation included: first and second moments of the pose agree."""
-    n, walk = 40_000, np.array([0.5, 0.4, 0.6, 0.6, 0.9, 0.4])
+    n, walk = 15_000, np.array([0.5, 0.4, 0.6, 0.6, 0.9, 0.4])
     std = np.array([0.3, 0.3, 0.3, 0.5, 0.5, 0.5])
     part = KalmanSubstate(SE3, np.array([0.2, -0.1, 0.4, *V0]), np.diag(std**2))
     marginal = build(part, n, 11, walk, PriorProposal())
@@ -215,24 +166,16 @@ def test_sampled_and_marginal_velocity_have_one_law():
     for stamp in (0, 200_000_000, 500_000_000, 600_000_000):
         for filter_ in (marginal, joint):
             filter_.step(Frame(), None, stamp)
-    one, other = moments(marginal), moments(joint)
-    scale = np.sqrt(np.concatenate([np.diag(_square(one)), _spread(one)]) / n)
-    assert (np.abs(one - other) / scale).max() < 6.0
-    assert np.abs(one[:6]).max() > 50.0 * scale[:6].max()
+    place, samples = SE3.exp(np.array([0.1, -0.1, 0.2, 0.3, 0.1, -0.1])), []
+    for filter_ in (marginal, joint):
+        error = SE3.local(place, filter_.particles.state[:, :7])
+        products = np.einsum("na,nb->nab", error, error)[(slice(None), *np.triu_indices(6))]
+        samples.append(np.hstack([error, products]))
+    one, other = samples
+    scale = np.sqrt((one.var(axis=0) + other.var(axis=0)) / n)
+    assert (np.abs(one.mean(axis=0) - other.mean(axis=0)) / scale).max() < 4.0
+    assert np.abs(one.mean(axis=0)[:6]).max() > 30.0 * scale[:6].max()
     velocities = joint.particles.state[:, 7:]
     np.testing.assert_allclose(part.mean.mean(axis=0), velocities.mean(axis=0), atol=6.0 / np.sqrt(n))
     total = np.cov(part.mean.T) + part.cov[0]
     np.testing.assert_allclose(total, np.cov(velocities.T), atol=10.0 * total.max() / np.sqrt(n))
-
-
-def _square(moment: np.ndarray) -> np.ndarray:
-    full = np.zeros((6, 6))
-    full[np.triu_indices(6)] = moment[6:]
-    return full + np.triu(full, 1).T
-
-
-def _spread(moment: np.ndarray) -> np.ndarray:
-    """Rough variance of a product of two Gaussians: E[a²]E[b²] + E[ab]²."""
-    full = _square(moment)
-    variances = np.outer(np.diag(full), np.diag(full)) + full**2
-    return variances[np.triu_indices(6)]

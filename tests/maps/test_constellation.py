@@ -43,13 +43,6 @@ def test_only_so_many_points_have_errors():
     assert Constellation(np.zeros((100, 3))).dim == 6
 
 
-def test_exact_points_start_where_their_frame_is():
-    records = Constellation(POINTS).started(2, FRAME, COV_FRAME)
-    np.testing.assert_array_equal(records.mean, np.zeros((2, 1, 6)))
-    np.testing.assert_array_equal(records.const, np.tile(FRAME, (2, 1, 1)))
-    np.testing.assert_array_equal(records.cov, np.tile(COV_FRAME, (2, 1, 1, 1)))
-
-
 def test_exact_points_move_with_their_frame():
     group, xi = Constellation(POINTS), np.array([0.3, 0.1, -0.2, 1.0, 2.0, 3.0])
     moved = SE3.compose(FRAME, SE3.exp(xi))

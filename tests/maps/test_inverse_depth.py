@@ -4,13 +4,10 @@ import numpy as np
 import pytest
 
 from rbpf.conformance import check_model
-from rbpf.core.genealogy import Lineage
 from rbpf.core.models import Records
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.maps.inverse_depth import InverseDepth
-from rbpf.maps.landmark_map import LandmarkMap
-from rbpf.maps.point import Point
 
 LANDMARK = InverseDepth()
 ANCHOR = SE3.exp(np.array([0.4, -0.8, 1.2, 2.0, -1.0, 0.5]))
@@ -96,32 +93,3 @@ def test_a_particle_that_is_not_ready_keeps_its_line_of_sight(q):
     np.testing.assert_allclose(point, np.array([0.3, -0.2, 1.0]) / max(q, std), rtol=1e-6)
     turned = SE3.rotation(ANCHOR).T @ found.cov[0, 0] @ SE3.rotation(ANCHOR)
     np.testing.assert_allclose(np.sqrt(turned[2, 2]), std / max(q, std) ** 2, rtol=1e-4)
-
-
-def test_all_particles_are_promoted_at_once():
-    """Each by its own transform; other landmarks and the number of the landmark stay."""
-    n, records = 5, scattered(5, 3, 0.02)
-    held = LandmarkMap(SE3)
-    held.begin(n, Lineage(n))
-    ids = held.add_records(records, LANDMARK)
-    held.promote(ids[1:2], Point(3))
-    assert isinstance(held.landmark_of(int(ids[1])), Point)
-    point, expected = held.read(ids[1:2]), LANDMARK.promote(records)
-    assert point.const is None
-    np.testing.assert_allclose(point.mean[:, 0], expected.mean[:, 1], rtol=1e-14)
-    np.testing.assert_allclose(point.cov[:, 0], expected.cov[:, 1], rtol=1e-12, atol=1e-16)
-    assert np.ptp(point.mean, axis=0).max() > 0.1
-    for landmark in (0, 2):
-        np.testing.assert_array_equal(held.read(ids[[landmark]]).mean[:, 0], records.mean[:, landmark])
-        np.testing.assert_array_equal(held.read(ids[[landmark]]).const[:, 0], records.const[:, landmark])
-
-
-def test_readiness_of_a_share_of_the_weight():
-    n, records = 4, scattered(4, 1, 0.01)
-    cov = records.cov.copy()
-    cov[0, 0] = np.diag([1e-4, 1e-4, 0.1])
-    held = LandmarkMap(SE3)
-    held.begin(n, Lineage(n))
-    ids = held.add_records(Records(records.mean, cov, records.const), LANDMARK)
-    assert held.ready(np.array([0.04, 0.32, 0.32, 0.32])).tolist() == ids.tolist()
-    assert held.ready(np.array([0.06, 0.30, 0.32, 0.32])).tolist() == []

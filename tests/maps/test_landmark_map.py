@@ -9,7 +9,7 @@ from rbpf.core.genealogy import Lineage
 from rbpf.core.models import NewLandmarks, Observations, Records
 from rbpf.core.particles import Prior
 from rbpf.errors import InputError
-from rbpf.lie import SE2, SE3
+from rbpf.lie import SE2
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.maps.point import AnchoredPoint, MixturePoint, Point, ring
 from rbpf.sensors.range_bearing import RangeBearing
@@ -60,17 +60,6 @@ def test_kinds_side_by_side_follow_their_particles():
         landmark_map.read(np.array([0, 2]))
 
 
-def test_more_landmarks_than_first_reserved():
-    rng = np.random.default_rng(1)
-    landmark_map, _ = filled()
-    records = points(rng, 150)
-    assert landmark_map.add_records(records, Point(2)).tolist() == list(range(150))
-    landmark_map.remove(np.arange(0, 150, 2))
-    assert landmark_map.ids.tolist() == list(range(1, 150, 2))
-    assert landmark_map.add_records(points(rng, 1), Point(2)).tolist() == [150]
-    np.testing.assert_array_equal(landmark_map.read(np.array([149])).mean[:, 0], records.mean[:, 149])
-
-
 def test_a_ring_promotes_to_its_moments():
     rng = np.random.default_rng(2)
     landmark_map, _ = filled()
@@ -84,20 +73,6 @@ def test_a_ring_promotes_to_its_moments():
     np.testing.assert_allclose(found.mean[:, 0], centre, atol=1e-12)
     own = mixture.cov[0, 0].mean(axis=0)
     np.testing.assert_allclose(found.cov[:, 0], np.broadcast_to(8.0 * np.eye(2) + own, (N, 2, 2)), atol=1e-10)
-
-
-def test_an_anchored_point_promotes_to_the_world():
-    """The transform is linear, so mean and covariance are exact."""
-    rng = np.random.default_rng(3)
-    lineage, landmark_map = Lineage(N), LandmarkMap(SE3)
-    landmark_map.begin(N, lineage)
-    anchor = SE3.exp(rng.normal(size=(N, 1, 6)))
-    free = points(rng, 1, 3)
-    ids = landmark_map.add_records(Records(free.mean, free.cov, anchor), AnchoredPoint(SE3))
-    landmark_map.promote(ids)
-    found, rotation = landmark_map.read(ids), SE3.rotation(anchor)
-    np.testing.assert_allclose(found.mean, SE3.transform(anchor, free.mean), atol=1e-12)
-    np.testing.assert_allclose(found.cov, rotation @ free.cov @ np.swapaxes(rotation, -1, -2), atol=1e-12)
 
 
 def test_promotion_keeps_the_log_odds():
@@ -143,11 +118,6 @@ class TestLogOdds:
         log_odds[1:, 1] = -np.inf
         landmark_map.set_log_odds(ids, log_odds)
         assert landmark_map.ids.tolist() == [1]
-
-    def test_a_map_without_evidence_holds_everything_in_all(self):
-        landmark_map, _ = filled()
-        ids = landmark_map.add_records(points(np.random.default_rng(5), 2), Point(2))
-        np.testing.assert_array_equal(landmark_map.log_odds(ids), np.zeros((N, 2)))
 
 
 def test_ring_covers_the_circle():

@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from rbpf.core.models import Landmark, Records
 from rbpf.errors import InputError
 from rbpf.maps.layout import Layout
-from rbpf.maps.point import Point
 
 
 class Free(Landmark):
@@ -57,25 +56,6 @@ def test_round_trip(dim, constants, components, n, k, evidence, seed):
             np.testing.assert_array_equal(found, expected)
     if evidence:
         np.testing.assert_array_equal(columns[:, -1].T, log_odds)
-
-
-def test_fields_lie_where_the_kernels_read_them():
-    """Mean, then the covariance's lower triangle by rows, then the constants, then the log-odds."""
-    cov = np.array([[4.0, 5.0], [5.0, 6.0]])
-    records = Records(np.array([[[1.0, 2.0]]]), cov[None, None], np.array([[[7.0, 8.0, 9.0]]]))
-    column = Layout(Free(2, 3), evidence=True).pack(records, np.array([[10.0]]))[0, :, 0]
-    assert column.tolist() == [1, 2, 4, 5, 6, 7, 8, 9, 10]
-
-
-def test_components_lie_one_after_another_before_their_weights():
-    mean = np.array([[1.0], [3.0]])[None, None]
-    records = Records(mean, np.array([2.0, 4.0]).reshape(1, 1, 2, 1, 1), None, np.array([[[5.0, 6.0]]]))
-    assert Layout(Free(1, components=2)).pack(records)[0, :, 0].tolist() == [1, 2, 3, 4, 5, 6]
-
-
-def test_log_odds_start_at_zero():
-    records = random_records(Point(2), 3, 2, np.random.default_rng(0))
-    np.testing.assert_array_equal(Layout(Point(2), evidence=True).pack(records)[:, -1], 0.0)
 
 
 def test_constants_may_be_shared_by_all_particles():

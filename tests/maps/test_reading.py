@@ -87,6 +87,8 @@ def test_projections_equal_numpys(n, shared):
     prior = Prior(SE3, SE3.exp(0.02 * rng.normal(size=(n, 6))), 0.01 * rng.normal(size=(n, 6)), factor, centred=False)
     weights = rng.uniform(size=n)
     belief = Belief(np.log(weights / weights.sum()), prior, {Part.LANDMARK: landmark_map})
+    # A constraint is projected by its prediction.
+    assert not landmark_map.is_compiled(EpipolarRay(CAMERA), rays[-2:])
     for model, ids in ((CameraPoint(CAMERA), points[-2:]), (CameraRay(CAMERA), rays[-2:])):
         assert landmark_map.is_compiled(model, ids)
         mean, cov = belief.project(model, ids)
@@ -95,8 +97,3 @@ def test_projections_equal_numpys(n, shared):
         landmark_map.compiled = True
         np.testing.assert_allclose(mean, expected_mean, rtol=0.0, atol=1e-9)
         np.testing.assert_allclose(cov, expected_cov, rtol=1e-10, atol=1e-10)
-
-
-def test_a_constraint_is_projected_by_its_prediction():
-    landmark_map, _, _, rays = grown(7, np.random.default_rng(0))
-    assert not landmark_map.is_compiled(EpipolarRay(CAMERA), rays[-2:])

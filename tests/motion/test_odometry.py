@@ -38,12 +38,12 @@ def test_without_a_control_the_robot_stands_still():
     np.testing.assert_array_equal(transition.noise_factor, np.zeros((1, 6, 6)))
 
 
-@pytest.mark.parametrize("rank", [0, 1, 2])
+@pytest.mark.parametrize("rank", [0, 1, 2, 3])
 def test_singular_covariances(rank):
-    """As of a planar robot in space: particles spread in the range of the covariance only."""
+    """As of a planar robot in space: particles spread as the covariance says, in its range only."""
     rng = np.random.default_rng(rank)
     basis = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    values = np.array([0.04, 0.01, 0.0]) * (np.arange(3) < rank)
+    values = np.array([0.04, 0.01, 0.02]) * (np.arange(3) < rank)
     cov = (basis * values) @ basis.T
     cov = 0.5 * (cov + cov.T)
     filter_ = Filter(OdometryMotion(SE2), Scripted(), n=3000, rng=rng)
@@ -75,21 +75,13 @@ def test_three_degrees_of_freedom_drop_the_others():
     np.testing.assert_array_equal(found.cov[OTHER], 0.0)
 
 
-@pytest.mark.parametrize("free", [None, CAMERA_PLANE])
-def test_particles_spread_as_the_covariance_says(free):
-    model = OdometryMotion(SE3, free=free)
-    filter_ = Filter(model, Scripted(), n=4000, rng=np.random.default_rng(1))
-    expected = model.constrained(MEASURED)
-    filter_.step([], MEASURED)
-    spread = SE3.local(expected.delta, filter_.particles.state)
-    np.testing.assert_allclose(spread.T @ spread / 4000, expected.cov, atol=0.1 * np.abs(expected.cov).max())
-    if free is not None:
-        for _ in range(20):
-            filter_.step([], MEASURED)
-        state = filter_.particles.state
-        np.testing.assert_allclose(state[:, 5], 0.0, atol=1e-9)
-        np.testing.assert_allclose(state[:, [0, 2]], 0.0, atol=1e-9)
-        assert state[:, [4, 6]].std(axis=0).min() > 0.01
+def test_with_three_degrees_of_freedom_particles_stay_in_the_plane():
+    filter_ = Filter(OdometryMotion(SE3, free=CAMERA_PLANE), Scripted(), n=100, rng=np.random.default_rng(1))
+    for _ in range(20):
+        filter_.step([], MEASURED)
+    state = filter_.particles.state
+    np.testing.assert_allclose(state[:, [0, 2, 5]], 0.0, atol=1e-9)
+    assert state[:, [4, 6]].std(axis=0).min() > 0.01
 
 
 @pytest.mark.parametrize("free", [None, CAMERA_PLANE])

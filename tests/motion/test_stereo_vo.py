@@ -113,20 +113,6 @@ def test_false_matches_are_found(world, fraction):
     assert 0.85 < found.rms < 1.1
 
 
-def test_the_same_seed_gives_the_same_bytes():
-    matches, _ = mistaken(simulate(ROOM, 100, np.random.default_rng(4)), 0.3, np.random.default_rng(5))
-    one, two = estimated(matches, 6), estimated(matches, 6)
-    for name in ("previous_camera_from_camera", "cov", "inliers"):
-        assert getattr(one, name).tobytes() == getattr(two, name).tobytes()
-
-
-def test_one_covariance_for_all():
-    pair = simulate(ROOM, 50, np.random.default_rng(7))
-    z_prev, z_now = pair.matches.z_prev, pair.matches.z_now
-    one = estimated(Matches.checked(HAND, z_prev, z_now, COV, COV))
-    assert one.cov.tobytes() == estimated(pair.matches).cov.tobytes()
-
-
 class TestTooLittle:
     def refused(self, matches, complaint, **options):
         start = SE3.exp(np.full(6, 0.1))
@@ -314,34 +300,18 @@ class TestVisualOdometry:
         np.testing.assert_allclose(found.prior.delta, SE3.exp(np.full(6, 0.03)))
         np.testing.assert_allclose(found.prior.cov, np.diag(self.DT**2 * np.repeat([0.25, 4.0], 3)))
 
-    def test_far_points_are_joined_with_the_expected_motion(self):
-        """The turn is that of the points; along the way the prior speaks."""
-        pair = simulate(World(CAR, 1e5, 1e6, ROAD.xi), 200, np.random.default_rng(0), 0.5)
-        (motion,) = self.step(pair, [0.0, 0.0, 0.0, 0.0, 0.0, 10.0], std_speed=2.0).motions
-        assert motion.note.startswith("the matches leave the motion open (a standard deviation ")
-        std = np.sqrt(np.diagonal(motion.odometry.cov))
-        assert std[:3].max() < 1e-3 and (std[3:] > 0.15).all() and (std[3:] <= 0.2).all()
-        assert (np.abs(SE3.local(pair.delta, motion.odometry.delta)) < 4.0 * std).all()
-
     def test_joining_is_a_product_of_gaussians(self):
         pair = simulate(World(CAR, 300.0, 3000.0, ROAD.xi), 60, np.random.default_rng(1), 0.5)
         velocity = np.concatenate([np.array(ROAD.xi)[:3], [0.0, 0.0, 0.85]]) / self.DT
         found = self.step(pair, velocity, std_speed=2.0)
         (motion,), prior = found.motions, found.prior
+        assert motion.note.startswith("the matches leave the motion open (a standard deviation ")
         estimate = estimated(pair.matches, start=prior.delta)
         info = np.linalg.inv(prior.cov) + np.linalg.inv(estimate.cov)
         np.testing.assert_allclose(motion.odometry.cov, np.linalg.inv(info), rtol=1e-6, atol=1e-12)
         off = SE3.local(prior.delta, estimate.previous_camera_from_camera)
         mean = np.linalg.solve(info, np.linalg.solve(estimate.cov, off))
         np.testing.assert_allclose(SE3.local(prior.delta, motion.odometry.delta), mean, atol=1e-9)
-
-    def test_points_in_one_place_are_joined_with_the_expected_motion(self):
-        z = np.tile(HAND.project(np.array([0.1, 0.1, 3.0])), (20, 1))
-        matches = Matches.checked(HAND, z, z, COV, COV)
-        (motion,) = VisualOdometry().candidates(matches, np.zeros(6), self.DT, np.random.default_rng(0)).motions
-        assert motion.note
-        assert np.linalg.eigvalsh(motion.odometry.cov).min() > 0.0
-        assert (np.sqrt(np.diagonal(motion.odometry.cov)) <= self.DT + 1e-12).all()
 
     def test_what_makes_no_sense_is_refused(self):
         matches = simulate(ROOM, 20, np.random.default_rng(0)).matches

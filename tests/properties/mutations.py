@@ -1,6 +1,10 @@
 """Bytes of a file, damaged at random: by chance, and by what breaks careless readers."""
 
+from collections.abc import Callable
+
 from hypothesis import strategies as st
+
+from rbpf.errors import InputError
 
 TOKENS = [
     b"nan", b"-inf", b"1e999", b"-1", b"0", b"99999999999999999999", b"1000000000000", b"0x1p3", b"1_0", b"\xff\xfe",
@@ -32,3 +36,14 @@ def damaged(draw: st.DrawFn, whole: bytes) -> bytes:
         else:
             del data[start:]
     return bytes(data)
+
+
+def read_or_refused(read: Callable[[], object]) -> None:
+    """Anything but success and one sentence fails."""
+    try:
+        read()
+    except InputError as error:
+        said = str(error)
+    else:
+        return
+    assert said.strip() and "\n" not in said

@@ -10,7 +10,7 @@ import pytest
 from tests.properties.damaged_checkpoints import CASES
 
 ROOT = Path(__file__).resolve().parents[2]
-DAMAGES = 60
+DAMAGES = 40
 
 
 @pytest.mark.slow

@@ -38,7 +38,8 @@ def recorded(seed: int, lag: int | None, clouds: bool) -> tuple[History, Copied]
             oracle.resample(ancestors)
         state = rng.normal(size=(n, 2))
         history.record(10 * t, state, np.full(n, -np.log(n)))
-        oracle.record(10 * t, state)
+        oracle.record(10 * t, state.copy())
+        state[:] = np.nan  # what was recorded is a copy
         if rng.random() < 0.05:
             lineage, history = restored(lineage, history)
     return history, oracle
@@ -82,15 +83,6 @@ def test_clouds_hold_every_particle_and_weight(n, seed, steps):
     np.testing.assert_array_equal([w for block in history.blocks for w in block.log_weights], weights)
 
 
-def test_what_was_recorded_is_a_copy():
-    lineage = Lineage(2)
-    history = History(lineage)
-    state = np.ones((2, 1))
-    history.record(0, state, np.zeros(2))
-    state[:] = 7.0
-    np.testing.assert_array_equal(history.paths(), np.ones((1, 2, 1)))
-
-
 @pytest.mark.parametrize("rate", [0.2, 1.0])
 def test_a_fixed_lag_takes_constant_memory(rate):
     rng = np.random.default_rng(8)
@@ -98,7 +90,7 @@ def test_a_fixed_lag_takes_constant_memory(rate):
     lineage = Lineage(n)
     history = History(lineage, lag)
     sizes = []
-    for t in range(5000):
+    for t in range(1500):
         if rng.random() < rate:
             lineage.advance(np.sort(rng.integers(0, n, n)))
         history.record(t, np.zeros((n, 3)), np.zeros(n))

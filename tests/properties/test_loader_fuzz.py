@@ -3,7 +3,6 @@
 import io
 import zipfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -24,26 +23,14 @@ from rbpf.validation.consistency.comparison import read_comparisons
 from rbpf.validation.report.page import write_report
 from rbpf.validation.sweep.plan import read_plan
 from rbpf.validation.sweep.sweep import read_rows
-from tests.core.worlds import Recipe, same
-from tests.properties.mutations import damaged
+from tests.core.worlds import same
+from tests.properties.mutations import damaged, read_or_refused
 
 pytestmark = pytest.mark.slow
 
-FEW = settings(max_examples=60, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
+FEW = settings(max_examples=40, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
 SETTINGS = b"rbpf: 0.1.0\nsystem: mono\nparticles: 20\nray:\n  constrain: marginal\nsearch: {measurements: 25}\n"
 SWEEP = b"system: range-bearing\nsequences: [log]\nparticles: [10]\nseeds: 2\noptions: {plain: {}}\n"
-RECIPE = Recipe(n=4)
-
-
-def read_or_refused(read: Any) -> None:
-    """Anything but success and one sentence fails."""
-    try:
-        read()
-    except InputError as error:
-        said = str(error)
-    else:
-        return
-    assert said.strip() and "\n" not in said
 
 
 @FEW

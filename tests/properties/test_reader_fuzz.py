@@ -20,7 +20,7 @@ from rbpf.runs.trajectory import Trajectory, read_kitti, read_tum, write_tum
 from rbpf.sensors.readers import Topics, open_images, open_log, open_stereo, read_known_points, text
 from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
-from tests.properties.mutations import damaged
+from tests.properties.mutations import damaged, read_or_refused
 from tests.readers import small
 from tests.readers.images import bags, folders
 from tests.validation.worlds import world
@@ -41,9 +41,8 @@ def frames(path: Path) -> object:
 def seen(path: Path) -> object:
     """What a camera sees and where."""
     camera = open_images(path).camera
-    return camera.unproject(camera.project(np.array([[0.1, 0.2, 1.0], [3.0, 2.0, 1.0]]))), camera.field_of_view_mask(
-        2.0
-    )
+    seen_px = camera.project(np.array([[0.1, 0.2, 1.0], [3.0, 2.0, 1.0]]))
+    return camera.unproject(seen_px), camera.field_of_view_mask(2.0)
 
 
 def pairs(path: Path) -> object:
@@ -150,7 +149,7 @@ def recording(request, tmp_path_factory) -> tuple[Path, Read, list[Path]]:
     return folder, read, files
 
 
-@settings(max_examples=60, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
+@settings(max_examples=40, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
 @given(data=st.data())
 def test_a_damaged_file_is_read_or_refused(recording, data):
     folder, read, files = recording
@@ -158,21 +157,10 @@ def test_a_damaged_file_is_read_or_refused(recording, data):
     whole = path.read_bytes()
     try:
         path.write_bytes(data.draw(damaged(whole), "content"))
-        read_or_refused(read, folder)
+        read_or_refused(lambda: read(folder))
     finally:
         path.write_bytes(whole)
     assert not (folder / "pwned").exists() and not Path("pwned").exists()
-
-
-def read_or_refused(read: Read, folder: Path) -> None:
-    """Anything but success and one sentence fails."""
-    try:
-        read(folder)
-    except InputError as error:
-        said = str(error)
-    else:
-        return
-    assert said.strip() and "\n" not in said
 
 
 @settings(max_examples=25, suppress_health_check=[HealthCheck.too_slow])
@@ -181,7 +169,7 @@ def test_a_damaged_video_is_read_or_refused(video, data):
     whole = video.read_bytes()
     try:
         video.write_bytes(data.draw(damaged(whole)))
-        read_or_refused(frames, video)
+        read_or_refused(lambda: frames(video))
     finally:
         video.write_bytes(whole)
 
