@@ -22,16 +22,11 @@ POSE_AND_VELOCITY = Product(SE3, Euclidean(6))
 
 @dataclass(frozen=True)
 class PosePrior:
-    """Given as control: the body is where this distribution says, however it came there. The start, or a kidnapping.
+    """Given as control: the body is where this distribution says, however it came there. The start, or a kidnapping."""
 
-    Attributes:
-        mean: (7,) world_from_body.
-        cov: (6, 6) in the right chart at the mean, order [ω, v].
-        std_velocity: (6,) of its velocity about zero, rad/s, m/s; None where the velocity goes on as it was.
-    """
-
-    mean: np.ndarray
-    cov: np.ndarray
+    mean: np.ndarray  #: (7,) world_from_body.
+    cov: np.ndarray  #: (6, 6) in the right chart at the mean, order [ω, v].
+    #: (6,) of its velocity about zero, rad/s, m/s; None where the velocity goes on as it was.
     std_velocity: np.ndarray | None = None
 
 

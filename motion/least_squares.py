@@ -58,23 +58,14 @@ class Rule(Ranged):
 
 @dataclass(frozen=True)
 class Minimum(Generic[State]):
-    """Where the iteration ended.
+    """Where the iteration ended."""
 
-    Attributes:
-        x: the state.
-        residual: (m,) ε there.
-        s: (d,) singular values of J there, descending.
-        vt: (d, d) its right singular vectors, by rows.
-        iterations: steps that were tried.
-        converged: whether the remaining offset is below the rule's.
-    """
-
-    x: State
-    residual: Array
-    s: Array
-    vt: Array
-    iterations: int
-    converged: bool
+    x: State  #: the state.
+    residual: Array  #: (m,) ε there.
+    s: Array  #: (d,) singular values of J there, descending.
+    vt: Array  #: (d, d) its right singular vectors, by rows.
+    iterations: int  #: steps that were tried.
+    converged: bool  #: whether the remaining offset is below the rule's.
 
     @property
     def squared(self) -> float:

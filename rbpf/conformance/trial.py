@@ -19,27 +19,16 @@ SPREAD = 5.0
 
 @dataclass(frozen=True)
 class Example:
-    """What to try a model on, where random draws make no sense; all of it is optional.
+    """What to try a model on, where random draws make no sense; all of it is optional."""
 
-    Attributes:
-        state: (N, E) states.
-        landmark: the parametrisation that an observation model reads; by default a point.
-        records: (N, K, …) estimates of landmarks.
-        substate: m, size of the linear substate that an observation model reads.
-        control: what a motion model moves by.
-        dt: seconds.
-        frame: what a sensor observes.
-        belief: what it knows before; its map may be changed by the check.
-    """
-
-    state: np.ndarray | None = None
-    landmark: Landmark | None = None
-    records: Records | None = None
-    substate: int = 0
-    control: object = None
-    dt: float = 0.1
-    frame: object = None
-    belief: Belief | None = None
+    state: np.ndarray | None = None  #: (N, E) states.
+    landmark: Landmark | None = None  #: the parametrisation that an observation model reads; by default a point.
+    records: Records | None = None  #: (N, K, …) estimates of landmarks.
+    substate: int = 0  #: m, size of the linear substate that an observation model reads.
+    control: object = None  #: what a motion model moves by.
+    dt: float = 0.1  #: seconds.
+    frame: object = None  #: what a sensor observes.
+    belief: Belief | None = None  #: what it knows before; its map may be changed by the check.
 
     def states(self, space: LieGroup, rng: np.random.Generator) -> np.ndarray:
         """(N, E), drawn around the origin where none are given."""

@@ -204,27 +204,16 @@ _CLOSE = 1e-6
 
 @dataclass(frozen=True)
 class Entry:
-    """What one array must be.
+    """What one array must be."""
 
-    Attributes:
-        dtype: that it is read as.
-        shape: sizes, or names of sizes; "" for any.
-        least: its lowest value.
-        below: above its highest value; a number, or the name of a size.
-        values: "finite"; "log" also takes −∞; "any" also +∞ and NaN.
-        space: group whose elements the last axis holds; None for plain numbers.
-        ascending: each value is above the one before.
-        refers: name of an array of the same file that holds all of its values.
-    """
-
-    dtype: type
-    shape: tuple[int | str, ...]
-    least: float | None = None
-    below: int | str | None = None
-    values: Literal["finite", "log", "any"] = "finite"
-    space: LieGroup | None = None
-    ascending: bool = False
-    refers: str | None = None
+    dtype: type  #: that it is read as.
+    shape: tuple[int | str, ...]  #: sizes, or names of sizes; "" for any.
+    least: float | None = None  #: its lowest value.
+    below: int | str | None = None  #: above its highest value; a number, or the name of a size.
+    values: Literal["finite", "log", "any"] = "finite"  #: "finite"; "log" also takes −∞; "any" also +∞ and NaN.
+    space: LieGroup | None = None  #: group whose elements the last axis holds; None for plain numbers.
+    ascending: bool = False  #: each value is above the one before.
+    refers: str | None = None  #: name of an array of the same file that holds all of its values.
 
     def empty(self, **sizes: int) -> np.ndarray:
         """An array without rows."""

@@ -55,14 +55,10 @@ class Correction:
     The increment is μ + L u with u ~ N(0, I) before the observations. Given them, u has mean û and covariance C, within
     + between particles. By the law of total variance û has covariance I − C, and it is independent from step to step:
     an odometer with a bias of b standard deviations moves it to (I − C) b, and wrong noise makes it too large or small.
-
-    Attributes:
-        mean: (r,) û.
-        cov: (r, r) I − C.
     """
 
-    mean: np.ndarray
-    cov: np.ndarray
+    mean: np.ndarray  #: (r,) û.
+    cov: np.ndarray  #: (r, r) I − C.
 
 
 def motion_correction(mixture: tuple[Prior, Proposed | None, np.ndarray]) -> Correction | None:

@@ -52,37 +52,29 @@ from rbpf.ranges import require_memory
 
 @dataclass(frozen=True, eq=False)
 class StepReport:
-    """What one step did.
+    """What one step did."""
 
-    Attributes:
-        stamp_ns: time of the step.
-        mixture: the refined mixture before sampling, with its log-weights; after a proposal that did not look at the
-            observations, the weighted samples.
-        second: the samples, with their weights before and after the second weight; None where the mixture is made of them.
-        ess: effective sample size before resampling.
-        resampled: whether the particles were resampled or consolidated before they moved.
-        log_evidence: log p(z_t | z_1:t−1), Mathematics (evidence-increment); NaN where a likelihood is not a density, or where
-            observations of landmarks updated only the state or only the landmarks: that is no density of what was measured.
-        nis: normalised innovation squared, NaN without a linearised one: the squared Mahalanobis distance of the joint
-            innovation of the rows that took part, a weighted mean over the particles.
-        rows: its degrees of freedom, the weighted mean of the number of those rows. A row takes no part in a particle
-            that does not associate it with a known landmark, or that the likelihood gates as an outlier.
-        groups: the observations that were used.
-        first_observations: what landmarks were started from.
-        new_landmarks: their ids, in that order.
-    """
-
-    stamp_ns: int
+    stamp_ns: int  #: time of the step.
+    #: the refined mixture before sampling, with its log-weights; after a proposal that did not look at the
+    #: observations, the weighted samples.
     mixture: tuple[Prior, Proposed | None, np.ndarray]
+    #: the samples, with their weights before and after the second weight; None where the mixture is made of them.
     second: SecondWeight | None
-    ess: float
-    resampled: bool
+    ess: float  #: effective sample size before resampling.
+    resampled: bool  #: whether the particles were resampled or consolidated before they moved.
+    #: log p(z_t | z_1:t−1), Mathematics (evidence-increment); NaN where a likelihood is not a density, or where
+    #: observations of landmarks updated only the state or only the landmarks: that is no density of what was
+    #: measured.
     log_evidence: float
+    #: normalised innovation squared, NaN without a linearised one: the squared Mahalanobis distance of the joint
+    #: innovation of the rows that took part, a weighted mean over the particles.
     nis: float
+    #: its degrees of freedom, the weighted mean of the number of those rows. A row takes no part in a particle that
+    #: does not associate it with a known landmark, or that the likelihood gates as an outlier.
     rows: float
-    groups: Sequence[Observations]
-    first_observations: Sequence[NewLandmarks]
-    new_landmarks: np.ndarray
+    groups: Sequence[Observations]  #: the observations that were used.
+    first_observations: Sequence[NewLandmarks]  #: what landmarks were started from.
+    new_landmarks: np.ndarray  #: their ids, in that order.
 
     @cached_property
     def estimate(self) -> Estimate:

@@ -121,19 +121,12 @@ _FORBIDDEN = 1e12
 
 @dataclass(frozen=True)
 class Gates:
-    """When a landmark may explain a measurement, and what the alternatives cost.
+    """When a landmark may explain a measurement, and what the alternatives cost."""
 
-    Attributes:
-        accept: squared Mahalanobis distance up to which a landmark is a candidate.
-        isolate: distance beyond which a measurement may start a landmark; between the two it can only be clutter.
-        log_new: log-density of a new landmark's first measurement, in inverse measurement units.
-        log_clutter: log-density of clutter.
-    """
-
-    accept: float
-    isolate: float
-    log_new: float
-    log_clutter: float
+    accept: float  #: squared Mahalanobis distance up to which a landmark is a candidate.
+    isolate: float  #: distance beyond which a measurement may start a landmark; between the two it can only be clutter.
+    log_new: float  #: log-density of a new landmark's first measurement, in inverse measurement units.
+    log_clutter: float  #: log-density of clutter.
 
 
 def associate(nu: np.ndarray, cov: np.ndarray, present: np.ndarray, gates: Gates) -> np.ndarray:
@@ -170,19 +163,12 @@ def associate(nu: np.ndarray, cov: np.ndarray, present: np.ndarray, gates: Gates
 
 @dataclass(frozen=True)
 class ExistenceModel:
-    """Log-odds that a landmark exists, per particle (M. Montemerlo and S. Thrun, FastSLAM, 2003).
+    """Log-odds that a landmark exists, per particle (M. Montemerlo and S. Thrun, FastSLAM, 2003)."""
 
-    Attributes:
-        hit: added for each observation.
-        miss: subtracted where it should have been observed and was not.
-        limit: log-odds are held within ± limit, so that no landmark becomes immortal.
-        drop: a landmark below this leaves the particle.
-    """
-
-    hit: float = 1.0
-    miss: float = 0.5
-    limit: float = 5.0
-    drop: float = -1.5
+    hit: float = 1.0  #: added for each observation.
+    miss: float = 0.5  #: subtracted where it should have been observed and was not.
+    limit: float = 5.0  #: log-odds are held within ± limit, so that no landmark becomes immortal.
+    drop: float = -1.5  #: a landmark below this leaves the particle.
 
     def updated(self, log_odds: np.ndarray, seen: np.ndarray, expected: np.ndarray) -> np.ndarray:
         """(N, M) log-odds after a frame; −inf where the landmark leaves the particle."""

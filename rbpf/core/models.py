@@ -66,20 +66,14 @@ class Transition:
     """p(x_t, s_t | x_{t-1}, s_{t-1}, u_t): ε = B s + w₁ in the right chart at `mean`; s_t = A s + b + w₂.
 
     Mathematics (substate). Arrays may have a first axis of length 1 where they do not differ between particles.
-
-    Attributes:
-        mean: (N, E) chart's origin, x_t = mean · Exp(ε).
-        noise_factor: (N or 1, joint = d+m, r) L with cov(w₁, w₂) = L Lᵀ; may be singular.
-        coupling: B, (N or 1, d, m); None where there is no substate.
-        dynamics: A, (N or 1, m, m).
-        drift: b, (N or 1, m).
     """
 
-    mean: Float[np.ndarray, "N E"]
+    mean: Float[np.ndarray, "N E"]  #: (N, E) chart's origin, x_t = mean · Exp(ε).
+    #: (N or 1, joint = d+m, r) L with cov(w₁, w₂) = L Lᵀ; may be singular.
     noise_factor: Float[np.ndarray, "#N joint r"]
-    coupling: Float[np.ndarray, "#N d m"] | None = None
-    dynamics: Float[np.ndarray, "#N m m"] | None = None
-    drift: Float[np.ndarray, "#N m"] | None = None
+    coupling: Float[np.ndarray, "#N d m"] | None = None  #: B, (N or 1, d, m); None where there is no substate.
+    dynamics: Float[np.ndarray, "#N m m"] | None = None  #: A, (N or 1, m, m).
+    drift: Float[np.ndarray, "#N m"] | None = None  #: b, (N or 1, m).
 
 
 class Jacobians(NamedTuple):
@@ -99,65 +93,43 @@ class FusedKernel(NamedTuple):
 
 @dataclass(frozen=True)
 class Records:
-    """Estimates of K landmarks in N particles, or of their components.
+    """Estimates of K landmarks in N particles, or of their components."""
 
-    Attributes:
-        mean: (N, K, D), or (N, K, C, D) where the parametrisation has C > 1 components.
-        cov: (N, K, D, D) or (N, K, C, D, D).
-        const: (N, K, A), what stays fixed, as an anchor pose; None where A = 0.
-        log_weights: (N, K, C) log-weights of the components; None where C = 1.
-    """
-
-    mean: Float[np.ndarray, "N K *C D"]
-    cov: Float[np.ndarray, "N K *C D D"]
+    mean: Float[np.ndarray, "N K *C D"]  #: (N, K, D), or (N, K, C, D) where the parametrisation has C > 1 components.
+    cov: Float[np.ndarray, "N K *C D D"]  #: (N, K, D, D) or (N, K, C, D, D).
+    #: (N, K, A), what stays fixed, as an anchor pose; None where A = 0.
     const: Float[np.ndarray, "#N K A"] | None = None
-    log_weights: Float[np.ndarray, "N K C"] | None = None
+    log_weights: Float[np.ndarray, "N K C"] | None = None  #: (N, K, C) log-weights of the components; None where C = 1.
 
 
 @dataclass(frozen=True)
 class Observations:
-    """A group of measurements of one kind taken in one frame.
+    """A group of measurements of one kind taken in one frame."""
 
-    Attributes:
-        z: (K, p) measurements.
-        cov: (K, p, p) covariance of their noise.
-        model: how they arise.
-        likelihood: of the innovation; None is Gaussian.
-        ids: landmark of each, (K,) for all particles or (N, K) per particle; NULL and NEW are allowed.
-            None where the model reads no landmark.
-        log_new: log-density, in inverse measurement units, that a particle pays for a NEW observation.
-        log_clutter: the same for a NULL one.
-        updates: STATE: it refines and weighs the particles; LANDMARK: it updates the landmark. Two groups may share
-            a measurement, one for each (E06 §5.2: the epipolar part for the state, all of it for the depth).
-    """
-
-    z: Float[np.ndarray, "K p"]
-    cov: Float[np.ndarray, "K p p"]
-    model: "ObservationModel"
-    likelihood: "Likelihood | None" = None
+    z: Float[np.ndarray, "K p"]  #: (K, p) measurements.
+    cov: Float[np.ndarray, "K p p"]  #: (K, p, p) covariance of their noise.
+    model: "ObservationModel"  #: how they arise.
+    likelihood: "Likelihood | None" = None  #: of the innovation; None is Gaussian.
+    #: landmark of each, (K,) for all particles or (N, K) per particle; NULL and NEW are allowed. None where the model
+    #: reads no landmark.
     ids: Int[np.ndarray, "... K"] | None = None
-    log_new: float = 0.0
-    log_clutter: float = 0.0
+    log_new: float = 0.0  #: log-density, in inverse measurement units, that a particle pays for a NEW observation.
+    log_clutter: float = 0.0  #: the same for a NULL one.
+    #: STATE: it refines and weighs the particles; LANDMARK: it updates the landmark. Two groups may share a
+    #: measurement, one for each (E06 §5.2: the epipolar part for the state, all of it for the depth).
     updates: frozenset[Part] = frozenset({Part.STATE, Part.LANDMARK})
 
 
 @dataclass(frozen=True)
 class NewLandmarks:
-    """Measurements that start landmarks, after the update.
+    """Measurements that start landmarks, after the update."""
 
-    Attributes:
-        z: (K, p) measurements;  cov: (K, p, p) their covariance.
-        model: whose `initialise` gives the records.
-        landmark: the parametrisation.
-        mask: (N, K) which particles take them as new; None is all.
-        ids: (K,) numbers from 0 up by which the sensor knows them, none of them in use; None lets the map number them.
-    """
-
-    z: Float[np.ndarray, "K p"]
-    cov: Float[np.ndarray, "K p p"]
-    model: "ObservationModel"
-    landmark: "Landmark"
-    mask: Bool[np.ndarray, "N K"] | None = None
+    z: Float[np.ndarray, "K p"]  #: (K, p) measurements.
+    cov: Float[np.ndarray, "K p p"]  #: (K, p, p) their covariance.
+    model: "ObservationModel"  #: whose `initialise` gives the records.
+    landmark: "Landmark"  #: the parametrisation.
+    mask: Bool[np.ndarray, "N K"] | None = None  #: (N, K) which particles take them as new; None is all.
+    #: (K,) numbers from 0 up by which the sensor knows them, none of them in use; None lets the map number them.
     ids: Ids | None = None
 
 
@@ -499,19 +471,12 @@ class Map(Conditional):
 
 @dataclass(frozen=True)
 class Belief:
-    """What a sensor may know before it measures: a weighted mixture of Gaussians, each with its own marginalised part.
+    """What a sensor may know before it measures: a weighted mixture of Gaussians, each with its own marginalised part."""
 
-    Attributes:
-        log_weights: (N,) normalised.
-        prior: distribution of each particle's increment; after the update its factor is zero.
-        parts: what is marginalised, by what it supplies.
-        rng: the filter's, for a sensor that draws.
-    """
-
-    log_weights: Float[np.ndarray, " N"]
-    prior: Prior
-    parts: Mapping[Part, Conditional]
-    rng: np.random.Generator = field(default_factory=np.random.default_rng)
+    log_weights: Float[np.ndarray, " N"]  #: (N,) normalised.
+    prior: Prior  #: distribution of each particle's increment; after the update its factor is zero.
+    parts: Mapping[Part, Conditional]  #: what is marginalised, by what it supplies.
+    rng: np.random.Generator = field(default_factory=np.random.default_rng)  #: the filter's, for a sensor that draws.
 
     @cached_property
     def state(self) -> Float[np.ndarray, "N E"]:

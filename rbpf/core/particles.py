@@ -70,21 +70,13 @@ def take(array: np.ndarray, ancestors: np.ndarray | slice) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Prior:
-    """Distribution of the increment before the observations: x = base · Exp(ε), ε ~ N(mean, factor factorᵀ).
+    """Distribution of the increment before the observations: x = base · Exp(ε), ε ~ N(mean, factor factorᵀ)."""
 
-    Attributes:
-        space: the group of the states.
-        base: (N, E) origin of each particle's chart.
-        mean: (N or 1, d).
-        factor: (N or 1, d, r).
-        centred: whether the mean is zero.
-    """
-
-    space: LieGroup
-    base: Float[np.ndarray, "N E"]
-    mean: Float[np.ndarray, "#N d"]
-    factor: Float[np.ndarray, "#N d r"]
-    centred: bool = True
+    space: LieGroup  #: the group of the states.
+    base: Float[np.ndarray, "N E"]  #: (N, E) origin of each particle's chart.
+    mean: Float[np.ndarray, "#N d"]  #: (N or 1, d).
+    factor: Float[np.ndarray, "#N d r"]  #: (N or 1, d, r).
+    centred: bool = True  #: whether the mean is zero.
 
     @classmethod
     def exactly(cls, space: LieGroup, state: Float[np.ndarray, "N E"]) -> "Prior":
@@ -123,24 +115,17 @@ class Prior:
 
 @dataclass
 class Information:
-    """What the observations say about ε − μ, in information form; sums over independent observations add.
+    """What the observations say about ε − μ, in information form; sums over independent observations add."""
 
-    Attributes:
-        info: (N, d, d) Σ HᵀS⁻¹H.
-        vector: (N, d) Σ HᵀS⁻¹ν.
-        quad: (N,) Σ νᵀS⁻¹ν.
-        log_det: (N,) Σ log|2πS|.
-        log_factor: (N,) log-densities that do not depend on the increment: clutter, new landmarks.
-        rows: (N,) number of scalar measurements that took part in the sums, gated and unassociated ones left out.
-        otherwise: the same with other choices of outliers, which bound the look-ahead weight from below.
-    """
-
-    info: Float[np.ndarray, "N d d"]
-    vector: Float[np.ndarray, "N d"]
-    quad: Float[np.ndarray, " N"]
-    log_det: Float[np.ndarray, " N"]
+    info: Float[np.ndarray, "N d d"]  #: (N, d, d) Σ HᵀS⁻¹H.
+    vector: Float[np.ndarray, "N d"]  #: (N, d) Σ HᵀS⁻¹ν.
+    quad: Float[np.ndarray, " N"]  #: (N,) Σ νᵀS⁻¹ν.
+    log_det: Float[np.ndarray, " N"]  #: (N,) Σ log|2πS|.
+    #: (N,) log-densities that do not depend on the increment: clutter, new landmarks.
     log_factor: Float[np.ndarray, " N"]
+    #: (N,) number of scalar measurements that took part in the sums, gated and unassociated ones left out.
     rows: Float[np.ndarray, " N"]
+    #: the same with other choices of outliers, which bound the look-ahead weight from below.
     otherwise: "tuple[Information, ...]" = ()
 
     @classmethod
@@ -177,20 +162,14 @@ class Information:
 
 @dataclass(frozen=True)
 class Proposed:
-    """Gaussian in whitened coordinates u, ε = μ + L u, that each particle's descendants are sampled from.
+    """Gaussian in whitened coordinates u, ε = μ + L u, that each particle's descendants are sampled from."""
 
-    Attributes:
-        mean: (N, r) of u.
-        root: (N or 1, r, r) upper triangular; the covariance of u is root rootᵀ.
-        log_w1: (N,) look-ahead weight.
-        nis: (N,) squared Mahalanobis distance of the joint innovation, None where nothing was linearised.
-        rows: (N,) number of scalar measurements behind it, those that took part in each particle.
-    """
-
-    mean: Float[np.ndarray, "#N r"]
-    root: Float[np.ndarray, "#N r r"]
-    log_w1: Float[np.ndarray, " N"]
+    mean: Float[np.ndarray, "#N r"]  #: (N, r) of u.
+    root: Float[np.ndarray, "#N r r"]  #: (N or 1, r, r) upper triangular; the covariance of u is root rootᵀ.
+    log_w1: Float[np.ndarray, " N"]  #: (N,) look-ahead weight.
+    #: (N,) squared Mahalanobis distance of the joint innovation, None where nothing was linearised.
     nis: Float[np.ndarray, " N"] | None = None
+    #: (N,) number of scalar measurements behind it, those that took part in each particle.
     rows: Float[np.ndarray, " N"] | None = None
 
     def sample(

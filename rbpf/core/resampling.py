@@ -88,15 +88,10 @@ class EssTriggered(Resampler):
 @final
 @dataclass(frozen=True)
 class Consolidation:
-    """When what the particles differ by is taken into what is marginalised, in place of resampling.
+    """When what the particles differ by is taken into what is marginalised, in place of resampling."""
 
-    Attributes:
-        window: steps after which that is done at the latest; a sampled window of dozens degenerates in itself.
-        threshold: fraction of N below which the effective sample size calls for it earlier.
-    """
-
-    window: int = 5
-    threshold: float = 0.5
+    window: int = 5  #: steps after which that is done at the latest; a sampled window of dozens degenerates in itself.
+    threshold: float = 0.5  #: fraction of N below which the effective sample size calls for it earlier.
 
     def __post_init__(self) -> None:
         if self.window < 1 or not 0.0 <= self.threshold <= 1.0:

@@ -34,15 +34,10 @@ def join(parts: Sequence[Array]) -> Array:
 
 
 class LieGroup(ABC):
-    """A space of states with a smooth group operation, and a vector chart xi -> x Exp(xi) around every point x.
+    """A space of states with a smooth group operation, and a vector chart xi -> x Exp(xi) around every point x."""
 
-    Attributes:
-        size: Numbers stored per state, E.
-        dim: Dimension of the tangent space, d.
-    """
-
-    size: int
-    dim: int
+    size: int  #: Numbers stored per state, E.
+    dim: int  #: Dimension of the tangent space, d.
 
     @abstractmethod
     def identity(self, shape: tuple[int, ...] = ()) -> Float[np.ndarray, "*shape {self.size}"]:

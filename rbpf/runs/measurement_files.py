@@ -277,21 +277,13 @@ def _joined(numbers: Array, separator: str) -> str:
 @final
 @dataclass(frozen=True)
 class _Table:
-    """Lines of one of the files, checked as they are asked for; every method raises InputError at a malformed one.
+    """Lines of one of the files, checked as they are asked for; every method raises InputError at a malformed one."""
 
-    Attributes:
-        path: the file.
-        header: line number and text of each named value.
-        columns: the line with the columns' names.
-        columns_line: its number, from 1.
-        rows: the lines below it.
-    """
-
-    path: Path
-    header: dict[str, tuple[int, str]]
-    columns: str
-    columns_line: int
-    rows: list[str]
+    path: Path  #: the file.
+    header: dict[str, tuple[int, str]]  #: line number and text of each named value.
+    columns: str  #: the line with the columns' names.
+    columns_line: int  #: its number, from 1.
+    rows: list[str]  #: the lines below it.
 
     @classmethod
     def read(cls, path: Path) -> Self:

@@ -54,19 +54,12 @@ _PARTICLES = {"particles": numbers("particles", "size"), "weights": numbers("par
 @final
 @dataclass(frozen=True, eq=False)
 class PathAndMap:
-    """T poses in SE2 or SE3 and M landmarks.
+    """T poses in SE2 or SE3 and M landmarks."""
 
-    Attributes:
-        stamps_ns: (T,).
-        world_from_body: (T, E).
-        cov_poses: (T, d, d) in the right chart at each pose, order [ω, v]; no rows where they are not known.
-        landmarks: those that are points.
-    """
-
-    stamps_ns: NDArray[np.int64]
-    world_from_body: Array
-    cov_poses: Array
-    landmarks: MapEstimate
+    stamps_ns: NDArray[np.int64]  #: (T,).
+    world_from_body: Array  #: (T, E).
+    cov_poses: Array  #: (T, d, d) in the right chart at each pose, order [ω, v]; no rows where they are not known.
+    landmarks: MapEstimate  #: those that are points.
 
     @classmethod
     def of_run(cls, run: Run) -> "PathAndMap":

@@ -73,15 +73,10 @@ class LogSource:
 
 @dataclass(frozen=True)
 class RobotRecording:
-    """A robot's log.
+    """A robot's log."""
 
-    Attributes:
-        log: folder or file of a known kind.
-        part: which of its frames.
-    """
-
-    log: Path
-    part: Part = WHOLE
+    log: Path  #: folder or file of a known kind.
+    part: Part = WHOLE  #: which of its frames.
 
     def open(self, config: RangeBearingConfig) -> Opened:
         """The system and the log's frames."""
@@ -93,26 +88,19 @@ class RobotRecording:
 
 @dataclass(frozen=True)
 class MonoRecording:
-    """Images of one camera, and what is known of them beforehand; at most one of known points, board, markers and map.
+    """Images of one camera, and what is known of them beforehand; at most one of known points, board, markers and map."""
 
-    Attributes:
-        images: a sequence of any kind that `open_images` knows, or the number of a camera at this computer.
-        known_points: table of known points; None starts without any.
-        calibration: camera.yaml in place of the sequence's own camera.
-        board: chessboard that is seen in the first image; its corners are the known points, in its frame.
-        map: run folder, or its map, in which the camera is to be found; the map is not changed. None maps anew.
-        markers: board of ArUco markers of which some are seen in the first image; likewise known points.
-        topics: of a ROS bag, which images and which truth.
-        part: which of the images, and in which size; known points are those of the first of them, in the recording's pixels.
-    """
-
-    images: Path
-    known_points: Path | None = None
-    calibration: Path | None = None
+    images: Path  #: a sequence of any kind that `open_images` knows, or the number of a camera at this computer.
+    known_points: Path | None = None  #: table of known points; None starts without any.
+    calibration: Path | None = None  #: camera.yaml in place of the sequence's own camera.
+    #: chessboard that is seen in the first image; its corners are the known points, in its frame.
     board: Board | None = None
+    #: run folder, or its map, in which the camera is to be found; the map is not changed. None maps anew.
     map: Path | None = None
+    #: board of ArUco markers of which some are seen in the first image; likewise known points.
     markers: MarkerBoard | None = None
-    topics: Topics = NO_TOPICS
+    topics: Topics = NO_TOPICS  #: of a ROS bag, which images and which truth.
+    #: which of the images, and in which size; known points are those of the first of them, in the recording's pixels.
     part: Part = WHOLE
 
     def __post_init__(self) -> None:
@@ -184,19 +172,12 @@ class MonoRecording:
 
 @dataclass(frozen=True)
 class StereoRecording:
-    """Pairs of images.
+    """Pairs of images."""
 
-    Attributes:
-        pairs: a sequence of any kind that `open_stereo` knows.
-        calibration: camera.yaml in place of the sequence's own camera.
-        topics: of a ROS bag, which images and which truth.
-        part: which of the pairs, and in which size.
-    """
-
-    pairs: Path
-    calibration: Path | None = None
-    topics: Topics = NO_TOPICS
-    part: Part = WHOLE
+    pairs: Path  #: a sequence of any kind that `open_stereo` knows.
+    calibration: Path | None = None  #: camera.yaml in place of the sequence's own camera.
+    topics: Topics = NO_TOPICS  #: of a ROS bag, which images and which truth.
+    part: Part = WHOLE  #: which of the pairs, and in which size.
 
     def open(self, config: StereoConfig) -> Opened:
         """The system and the pairs."""

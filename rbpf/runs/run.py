@@ -43,29 +43,19 @@ _BEGUN = "log/begun"
 
 @dataclass(eq=False)
 class Run(Generic[SystemT]):
-    """What a system said of a recording.
+    """What a system said of a recording."""
 
-    Attributes:
-        source: where the frames come from.
-        system: as it is now.
-        truth: ground truth of the recording; None where it has none.
-        expected: number of frames that the recording has; None where it is not known.
-        inputs: what is read, as text by name, see `rbpf.runs.provenance.decisive_inputs`; empty where nobody says.
-        log: one row per frame.
-        frame: the last one that was taken; None before the first.
-        messages: what was worth saying of single frames, in words: "frame 12: …".
-        failure: why the run ended before the recording did, in words; None where it did not.
-    """
-
-    source: Source
-    system: SystemT
-    truth: RunTruth | None = None
-    expected: int | None = None
+    source: Source  #: where the frames come from.
+    system: SystemT  #: as it is now.
+    truth: RunTruth | None = None  #: ground truth of the recording; None where it has none.
+    expected: int | None = None  #: number of frames that the recording has; None where it is not known.
+    #: what is read, as text by name, see `rbpf.runs.provenance.decisive_inputs`; empty where nobody says.
     inputs: Mapping[str, str] = field(default_factory=dict)
-    log: FrameLog = field(init=False)
-    frame: Any = None
+    log: FrameLog = field(init=False)  #: one row per frame.
+    frame: Any = None  #: the last one that was taken; None before the first.
+    #: what was worth saying of single frames, in words: "frame 12: …".
     messages: list[str] = field(default_factory=list)
-    failure: str | None = None
+    failure: str | None = None  #: why the run ended before the recording did, in words; None where it did not.
 
     def __post_init__(self) -> None:
         self.log = FrameLog.of(self.system)

@@ -53,15 +53,10 @@ class Similarity:
 @final
 @dataclass(frozen=True)
 class Trajectory:
-    """Poses in order of time; refused are shapes that do not fit, numbers that are not finite, time that runs backwards.
+    """Poses in order of time; refused are shapes that do not fit, numbers that are not finite, time that runs backwards."""
 
-    Attributes:
-        stamps_ns: (T,) integer nanoseconds; a recording without times counts its steps.
-        world_from_body: (T, 7) poses [qx, qy, qz, qw, tx, ty, tz] with unit quaternions.
-    """
-
-    stamps_ns: NDArray[np.int64]
-    world_from_body: Array
+    stamps_ns: NDArray[np.int64]  #: (T,) integer nanoseconds; a recording without times counts its steps.
+    world_from_body: Array  #: (T, 7) poses [qx, qy, qz, qw, tx, ty, tz] with unit quaternions.
 
     def __post_init__(self) -> None:
         if self.world_from_body.shape != (*self.stamps_ns.shape, 7) or self.stamps_ns.ndim != 1:

@@ -49,18 +49,12 @@ class GroundTruth(Protocol):
 
 @dataclass(frozen=True)
 class RunTruth:
-    """Ground truth at a run's own frames.
+    """Ground truth at a run's own frames."""
 
-    Attributes:
-        rows: (R,) frames that have a true pose.
-        poses: (R, E) world_from_body.
-        landmarks: name of a landmark to its (D,) position.
-        alignment: what brings the estimate into the truth's world; "none" where both are expressed in the same one.
-    """
-
-    rows: np.ndarray
-    poses: np.ndarray
-    landmarks: dict[int, np.ndarray] = field(default_factory=dict)
+    rows: np.ndarray  #: (R,) frames that have a true pose.
+    poses: np.ndarray  #: (R, E) world_from_body.
+    landmarks: dict[int, np.ndarray] = field(default_factory=dict)  #: name of a landmark to its (D,) position.
+    #: what brings the estimate into the truth's world; "none" where both are expressed in the same one.
     alignment: Alignment = "none"
 
 

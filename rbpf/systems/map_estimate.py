@@ -15,20 +15,14 @@ from rbpf.systems.anchoring import Anchored
 
 @dataclass(frozen=True)
 class MapEstimate:
-    """Landmarks of a run, M of them.
+    """Landmarks of a run, M of them."""
 
-    Attributes:
-        ids: (M,) names: the log's where the association is known, else the map's.
-        mean: (M, D) positions in the world, metres.
-        cov: (M, D, D).
-        columns: what the system adds to each landmark, (M,) by name. `ray` is 1 for one whose depth is not known yet.
-        ray_ends: (M, 2, 3) nearest and farthest point of a ray, NaN for points; None where there are no rays.
-    """
-
-    ids: np.ndarray
-    mean: np.ndarray
-    cov: np.ndarray
+    ids: np.ndarray  #: (M,) names: the log's where the association is known, else the map's.
+    mean: np.ndarray  #: (M, D) positions in the world, metres.
+    cov: np.ndarray  #: (M, D, D).
+    #: what the system adds to each landmark, (M,) by name. `ray` is 1 for one whose depth is not known yet.
     columns: dict[str, np.ndarray] = field(default_factory=dict)
+    #: (M, 2, 3) nearest and farthest point of a ray, NaN for points; None where there are no rays.
     ray_ends: np.ndarray | None = None
 
     def named(self) -> dict[int, np.ndarray]:

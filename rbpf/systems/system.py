@@ -49,25 +49,16 @@ class TrackingState(StrEnum):
 
 @dataclass(frozen=True)
 class Column:
-    """One number, or one array of fixed shape, that a system says of every frame. Declared once, used everywhere.
+    """One number, or one array of fixed shape, that a system says of every frame. Declared once, used everywhere."""
 
-    Attributes:
-        name: key in `Tracked.values` and in the log of a run.
-        meaning: one sentence, for documentation and the report.
-        unit: SI, as "s" or "px"; empty for pure numbers.
-        kind: float, int or bool.
-        shape: of the value of one frame.
-        table: file of the run folder that has it as a column, "diagnostics.csv" or "timings.csv"; None for neither.
-        heading: its name there; by default `name`. Times are written in milliseconds.
-    """
-
-    name: str
-    meaning: str
-    unit: str = ""
-    kind: type = float
-    shape: tuple[int, ...] = ()
+    name: str  #: key in `Tracked.values` and in the log of a run.
+    meaning: str  #: one sentence, for documentation and the report.
+    unit: str = ""  #: SI, as "s" or "px"; empty for pure numbers.
+    kind: type = float  #: float, int or bool.
+    shape: tuple[int, ...] = ()  #: of the value of one frame.
+    #: file of the run folder that has it as a column, "diagnostics.csv" or "timings.csv"; None for neither.
     table: str | None = None
-    heading: str | None = None
+    heading: str | None = None  #: its name there; by default `name`. Times are written in milliseconds.
 
 
 DIAGNOSTICS = "diagnostics.csv"
@@ -85,21 +76,13 @@ FILTER_COLUMNS = ESS, RESAMPLED, LOG_EVIDENCE, NIS, NIS_DOF
 
 @dataclass(frozen=True)
 class Ragged:
-    """An array per frame whose first axis has as many rows as the frame showed things.
+    """An array per frame whose first axis has as many rows as the frame showed things."""
 
-    Attributes:
-        name: key in `Tracked.observed`.
-        meaning: one sentence.
-        shape: of one row.
-        kind: NumPy type that it is kept in.
-        per: name of another array that has as many rows in each frame; None where no other has.
-    """
-
-    name: str
-    meaning: str
-    shape: tuple[int, ...] = ()
-    kind: str = "float64"
-    per: str | None = None
+    name: str  #: key in `Tracked.observed`.
+    meaning: str  #: one sentence.
+    shape: tuple[int, ...] = ()  #: of one row.
+    kind: str = "float64"  #: NumPy type that it is kept in.
+    per: str | None = None  #: name of another array that has as many rows in each frame; None where no other has.
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,27 +96,18 @@ class Revision:
 
 @dataclass(frozen=True, eq=False)
 class Tracked:
-    """What a system says of a frame.
+    """What a system says of a frame."""
 
-    Attributes:
-        stamp_ns: time of the frame.
-        pose: (E,) world_from_body, the mean of the filtered posterior; the body is the camera or the robot.
-        cov: (d, d) its covariance in the right chart at the mean, [ω, v], rad and m.
-        state: whether the pose can be relied on.
-        values: the system's columns for this frame, by name.
-        observed: what was looked for and seen, arrays by name, see `System.observed`.
-        messages: what was wrong or worth saying, in words.
-        revision: earlier poses that this frame has changed; None where there are none.
-    """
-
-    stamp_ns: int
+    stamp_ns: int  #: time of the frame.
+    #: (E,) world_from_body, the mean of the filtered posterior; the body is the camera or the robot.
     pose: Float[np.ndarray, " E"]
-    cov: Float[np.ndarray, "d d"]
-    state: TrackingState
-    values: Mapping[str, Any] = field(default_factory=dict)
+    cov: Float[np.ndarray, "d d"]  #: (d, d) its covariance in the right chart at the mean, [ω, v], rad and m.
+    state: TrackingState  #: whether the pose can be relied on.
+    values: Mapping[str, Any] = field(default_factory=dict)  #: the system's columns for this frame, by name.
+    #: what was looked for and seen, arrays by name, see `System.observed`.
     observed: Mapping[str, np.ndarray] = field(default_factory=dict)
-    messages: tuple[str, ...] = ()
-    revision: Revision | None = None
+    messages: tuple[str, ...] = ()  #: what was wrong or worth saying, in words.
+    revision: Revision | None = None  #: earlier poses that this frame has changed; None where there are none.
 
 
 class Recorded(Protocol):
@@ -160,29 +134,18 @@ class Recorded(Protocol):
 
 
 class System(ABC):
-    """A SLAM system. Subclasses add `track`, with the arguments that their sensor has.
+    """A SLAM system. Subclasses add `track`, with the arguments that their sensor has."""
 
-    Attributes:
-        name: as on the command line.
-        frame_word: what a frame is called in messages.
-        waiting: how the time until a frame was read and decoded is called in timings.csv; None leaves it out there.
-        columns: what `Tracked.values` holds, in the order of the tables that are written.
-        observed: what `Tracked.observed` holds.
-        space: group of the poses.
-        gauge: what its world has in common with the ground truth's.
-        config: all settings.
-        filter: the particle filter as it is now.
-    """
-
-    name: ClassVar[str]
-    frame_word: ClassVar[str] = "frame"
+    name: ClassVar[str]  #: as on the command line.
+    frame_word: ClassVar[str] = "frame"  #: what a frame is called in messages.
+    #: how the time until a frame was read and decoded is called in timings.csv; None leaves it out there.
     waiting: ClassVar[str | None] = None
-    columns: tuple[Column, ...]
-    observed: tuple[Ragged, ...] = ()
-    space: SE2Group | SE3Group
-    gauge: Gauge = "first frame"
-    config: Any
-    filter: Filter
+    columns: tuple[Column, ...]  #: what `Tracked.values` holds, in the order of the tables that are written.
+    observed: tuple[Ragged, ...] = ()  #: what `Tracked.observed` holds.
+    space: SE2Group | SE3Group  #: group of the poses.
+    gauge: Gauge = "first frame"  #: what its world has in common with the ground truth's.
+    config: Any  #: all settings.
+    filter: Filter  #: the particle filter as it is now.
 
     @abstractmethod
     def take(self, frame: Any) -> Tracked:
