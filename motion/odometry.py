@@ -27,11 +27,16 @@ class Odometry:
         """No motion, for certain."""
         return cls(space.identity(), np.zeros((space.dim, space.dim)))
 
-    def then(self, later: "Odometry", space: LieGroup = SE3) -> "Odometry":
-        """One motion after another, with independent errors: C = Ad⁻¹ C₁ Ad⁻ᵀ + C₂ of the later one, Mathematics (chain)."""
+    def then(self, later: "Odometry", space: LieGroup = SE3, cross: np.ndarray | None = None) -> "Odometry":
+        """One motion after another: C = Ad⁻¹ C₁ Ad⁻ᵀ + C₂ + Ad⁻¹ X + Xᵀ Ad⁻ᵀ with Ad of the later one.
+
+        Mathematics (chain). `cross` is X (d, d) = E[ξ₁ ξ₂ᵀ] of the errors ξ in the right charts; None for independent ones.
+        """
         back = space.adjoint(space.inverse(later.delta))
-        cov = gaussian.symmetrise(back @ self.cov @ back.T + later.cov)
-        return Odometry(space.compose(self.delta, later.delta), cov)
+        cov = back @ self.cov @ back.T + later.cov
+        if cross is not None:
+            cov = cov + back @ cross + (back @ cross).T
+        return Odometry(space.compose(self.delta, later.delta), gaussian.symmetrise(cov))
 
 
 @final

@@ -138,6 +138,27 @@ def estimate_motion(
     return replace(found, others=tuple(others))
 
 
+def pixel_gains(matches: Matches, motion: Odometry, config: VoConfig) -> tuple[Array, Array]:
+    """By what noise of the pixels moves an estimate, of the matches that agree with it: Mathematics (vo-gain).
+
+    Args:
+        matches: K of them.
+        motion: the estimate, and its covariance.
+        config: how it was made.
+
+    Returns:
+        (K, 6, 3) of the earlier pixels and (K, 6, 3) of the later ones, in the right chart at the estimate.
+    """
+    pixels = matches.z_prev
+    if config.points == "adjusted":
+        pixels = white_rows(matches, motion.delta, "adjusted").pixels
+    found = linearised(matches, motion.delta, pixels, config.points)
+    # What the gate costs is in the covariance, not in the gains: what one frame's pixels do to both is cut off twice.
+    cov = motion.cov if config.points == "exact" else motion.cov / trimming(config.gate)
+    later = cov @ np.linalg.solve(found.cov, found.seen.by_motion).mT
+    return -later @ found.seen.by_pixels, later
+
+
 def fit(matches: Matches, start: Array, config: VoConfig) -> Minimum[Array]:
     """The motion (7,) of least reprojection error near a start, all matches taken as true."""
     if config.points != "propagated":

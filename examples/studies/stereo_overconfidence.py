@@ -23,7 +23,7 @@ from rbpf.lie import SE3
 from rbpf.runs.recordings import filter_features
 from rbpf.sensors.feature_log import FeatureLog
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig, ResamplingConfig
-from rbpf.systems.stereo.config import OUTLIER_VOLUME_PX3, OdometryConfig, StereoConfig, TriggerConfig
+from rbpf.systems.stereo.config import OUTLIER_VOLUME_PX3, MapConfig, OdometryConfig, StereoConfig, TriggerConfig
 from rbpf.validation.consistency.statistic import whitened_errors
 from rbpf.validation.simulation.lab import LabDrive
 from rbpf.validation.tables import write_table
@@ -62,6 +62,13 @@ def variants(particles: int) -> dict[str, StereoConfig]:
         "prior, density with outliers": replace(base, likelihood=density),
         "refined, T_l = 4, updates within 16.3": replace(base, proposal=refined),
         "refined, density with outliers": replace(base, proposal=refined, likelihood=density),
+        "the odometry as proposal, density with outliers": replace(
+            base,
+            proposal=ProposalConfig("ekf"),
+            likelihood=density,
+            odometry=OdometryConfig(role="proposal"),
+            map=MapConfig(weigh="all"),
+        ),
     }
 
 

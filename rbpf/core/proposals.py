@@ -34,16 +34,19 @@ class EkfProposal(Proposal):
     Args:
         exact: correct by the importance ratio at the sampled state; False is E06's weight, the linearised marginal.
         iterations: linearisations; 1 is E06, more is the iterated EKF (B. Bell and F. Cathey, 1993).
+        start: (d,) increment in each particle's chart where the first one is, where more is known than the prior says;
+            None is the prior's mean.
     """
 
-    def __init__(self, exact: bool = True, iterations: int = 1) -> None:
+    def __init__(self, exact: bool = True, iterations: int = 1, start: np.ndarray | None = None) -> None:
         if iterations < 1:
             raise InputError(f"EkfProposal needs at least one iteration, got {iterations}")
         self.exact = exact
         self.iterations = iterations
+        self.start = start
 
     def propose(self, prior: Prior, linearise: LineariseAt) -> Proposed:
-        at = prior.mean
+        at = prior.mean if self.start is None else np.tile(self.start, (prior.base.shape[0], 1))
         for iteration in range(self.iterations):
             proposed = refined(prior, linearise(at))
             if iteration + 1 < self.iterations:

@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
+import numpy as np
+
 from rbpf.core.likelihoods import Gaussian, GaussianWithOutliers, TruncatedMahalanobis
 from rbpf.core.models import Likelihood, Proposal, Resampler
 from rbpf.core.proposals import EkfProposal, PriorProposal
@@ -51,11 +53,11 @@ class ProposalConfig(Ranged):
     iterations: Annotated[int, Range(ge=1, le=1000)] = 3
     weights: Literal["exact", "linearised"] = "exact"
 
-    def build(self) -> Proposal:
-        """The proposal; a subclass may make another one."""
+    def build(self, start: np.ndarray | None = None) -> Proposal:
+        """The proposal, `start` as `EkfProposal` has it; a subclass may make another one."""
         if self.kind == "prior":
             return PriorProposal()
-        return EkfProposal(self.weights == "exact", self.iterations)
+        return EkfProposal(self.weights == "exact", self.iterations, start)
 
 
 @dataclass(frozen=True)

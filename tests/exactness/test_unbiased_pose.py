@@ -16,7 +16,12 @@ pytestmark = pytest.mark.slow
 
 R = np.array([[0.3, 0.1], [0.1, 0.2]])
 COV = np.array([[0.25, 0.08, 0.05], [0.08, 0.3, 0.0], [0.05, 0.0, 0.1]])
-PROPOSALS = {"prior": PriorProposal(), "ekf": EkfProposal(), "iterated": EkfProposal(iterations=3)}
+PROPOSALS = {
+    "prior": PriorProposal(),
+    "ekf": EkfProposal(),
+    "iterated": EkfProposal(iterations=3),
+    "begun elsewhere": EkfProposal(iterations=2, start=np.array([0.3, -0.2, 0.1])),
+}
 every_proposal = pytest.mark.parametrize("proposal", PROPOSALS.values(), ids=PROPOSALS)
 LEVER = np.array([1.5, 0.5])
 START = np.array([0.4, 1.0, -2.0])

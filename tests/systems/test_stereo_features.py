@@ -12,7 +12,8 @@ from rbpf.runs.recordings import filter_features, filter_opened, open_features
 from rbpf.runs.run import Run
 from rbpf.sensors.feature_log import FeatureLog
 from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig
-from rbpf.systems.stereo.config import OdometryConfig, RecoveryConfig, StereoConfig, TriggerConfig
+from rbpf.systems.stereo.config import MapConfig, OdometryConfig, RecoveryConfig, StereoConfig, TriggerConfig
+from rbpf.validation.consistency.statistic import whitened_errors
 from rbpf.validation.gtsam.camera import CameraEstimate, solve_features
 from rbpf.validation.simulation.lab import LabDrive
 
@@ -99,6 +100,27 @@ def test_halves_of_the_landmarks(log):
         assert names.size > 50 and (names % 2 == remainder).all()
     seen = np.intersect1d(log.frames[0].landmarks, log.frames[1].landmarks)
     assert run.log["agreeing"][1] <= (seen % 2 == 0).sum()
+
+
+def test_nees_of_the_pose(log):
+    """Per degree of freedom, 12 recordings of 20 pairs: where each pixel counts once it is 1, in S05 1.4 and more."""
+    density = replace(StereoConfig().likelihood, kind="outliers")
+    twice = replace(CONFIG, likelihood=density)
+    once = replace(
+        twice, proposal=ProposalConfig("ekf"), odometry=OdometryConfig(role="proposal"), map=MapConfig(weigh="all")
+    )
+    nees = []
+    for config in (once, twice):
+        runs = [filtered(simulated(20, seed), config) for seed in range(12)]
+        whitened = [whitened_errors(SE3, run.log.poses[1:], run.log.covs[1:], run.truth.poses[1:]) for run in runs]
+        nees.append(np.mean([one.nees.mean() for one in whitened]) / 6)
+    assert 0.75 < nees[0] < 1.25  # 1.03 with a standard error of 0.09
+    assert nees[1] > 1.2 * nees[0]
+
+
+def test_the_odometry_as_proposal_needs_landmarks_that_weigh(log):
+    with pytest.raises(InputError, match=r"odometry\.role=proposal needs proposal\.kind=ekf and map\.weigh=all"):
+        filtered(log, replace(CONFIG, odometry=OdometryConfig(role="proposal")))
 
 
 def without_names(log: FeatureLog, first: int, count: int) -> FeatureLog:

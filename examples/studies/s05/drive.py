@@ -8,7 +8,7 @@ from examples.studies.feature_cache import CachedSequence, cache_features
 from rbpf.errors import InputError
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.readers import open_stereo
-from rbpf.systems.stereo.config import StereoConfig, TriggerConfig
+from rbpf.systems.stereo.config import OdometryConfig, StereoConfig, TriggerConfig
 from rbpf.validation.simulation.images import Imaging, simulate_images
 from rbpf.validation.simulation.lab import LabDrive, TexturedLab
 
@@ -55,7 +55,8 @@ class Setting:
         if self.dof not in (3, 6):
             raise InputError(f"dof must be 3 or 6, got {self.dof}")
         trigger = TriggerConfig(self.trigger_m, self.trigger_m)
-        return StereoConfig(self.particles, self.seed, 3 if self.dof == 3 else 6, trigger=trigger)
+        odometry = OdometryConfig(independent=True)
+        return StereoConfig(self.particles, self.seed, 3 if self.dof == 3 else 6, trigger=trigger, odometry=odometry)
 
 
 def measured_drive(

@@ -32,6 +32,12 @@ class OdometryConfig(Ranged):
         split: S05 uses each feature twice, for the odometry and for the map ("none"). To measure what that does, the
             features can be divided at random into two halves: one for the odometry and the other for the map
             ("apart"), or one of them for both ("same").
+        role: what the filter takes the odometry for. "motion" is S05: it moves the particles, with its own covariance, and
+            the map weighs them with the same pixels again. "proposal" uses them once: particles move by `prior`, the
+            landmarks weigh, and the odometry says where the proposal is linearised and landmarks are looked for. What
+            pairs tell then enters by the map alone: it needs proposal.kind=ekf, map.weigh=all, and landmarks enough.
+        independent: whether the errors of consecutive motions are chained as if they were independent, as in S05, though
+            both motions come from the pixels of the pair between them.
     """
 
     RENAMED: ClassVar[dict[str, str]] = {"prediction": "prior"}
@@ -42,6 +48,8 @@ class OdometryConfig(Ranged):
     std_added_rad: NotNegative = 0.0
     std_added_m: NotNegative = 0.0
     split: Literal["none", "apart", "same"] = "none"
+    role: Literal["motion", "proposal"] = "motion"
+    independent: bool = False
 
 
 @dataclass(frozen=True)

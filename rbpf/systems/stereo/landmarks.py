@@ -121,12 +121,14 @@ class View(Generic[F]):
         free: (K,) which of them the map may use.
         uncertain: the camera's motion was only assumed: matches with the map must agree on one motion, of landmarks
             that were seen again before, and none are started.
+        landmarks: (K,) landmark of each feature, NULL where it has none; None where that is still to be found.
     """
 
     stamp_ns: int
     features: F
     free: np.ndarray
     uncertain: bool = False
+    landmarks: np.ndarray | None = None
 
 
 class Landmarks(Sensor, ABC, Generic[F]):
@@ -408,7 +410,7 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         """The features that are landmarks, and those that are candidates."""
         started = time.perf_counter()
         features = frame.features
-        self.ids = self.associate(frame, belief)
+        self.ids = self.associate(frame, belief) if frame.landmarks is None else frame.landmarks
         known = self.ids >= 0
         weighs = known
         if self.config.weigh != "all":

@@ -16,6 +16,8 @@ _RECKONING = {
     "cov": numbers(6, 6),
     "world_from_camera": poses(),
     "missed": integers(4, least=0),
+    "velocity_at_update": numbers(6),
+    "noise": numbers("noisy", 6, 3),
 }
 
 
@@ -33,6 +35,9 @@ class DeadReckoning:
         waiting: pairs since the first of these.
         hidden: whether nothing in the pair stood still.
         passed_over: pairs since that could not be measured.
+        velocity_at_update: (6,) as `velocity`, at the filter's last update.
+        noise: (K, 6, 3) covariances of the last step's error, in the right chart there, and the noise of each feature of the
+            last measured pair, which the next step shares; none where the step was not chained or not measured.
     """
 
     stamp_ns: int | None = None
@@ -43,6 +48,8 @@ class DeadReckoning:
     waiting: int = 0
     hidden: bool = False
     passed_over: int = 0
+    velocity_at_update: np.ndarray = field(default_factory=lambda: np.zeros(6))
+    noise: np.ndarray = field(default_factory=lambda: np.zeros((0, 6, 3)))
 
     def seconds(self, stamp_ns: int) -> float:
         """Time since the last pair that was measured; infinite before the first."""
@@ -53,7 +60,14 @@ class DeadReckoning:
         return replace(self, stamp_ns=stamp_ns)
 
     def moved(
-        self, stamp_ns: int, step: Odometry, velocity: np.ndarray, is_assumed: bool = False, hidden: bool = False
+        self,
+        stamp_ns: int,
+        step: Odometry,
+        velocity: np.ndarray,
+        is_assumed: bool = False,
+        hidden: bool = False,
+        cross: np.ndarray | None = None,
+        noise: np.ndarray | None = None,
     ) -> "DeadReckoning":
         """At a pair that was matched with the last measured one.
 
@@ -63,16 +77,20 @@ class DeadReckoning:
             velocity: (6,) of the camera now.
             is_assumed: the matches did not tell the motion: `step` is what was expected.
             hidden: whether nothing in the pair stood still.
+            cross: (6, 6) covariance of the last step's error and this one's; None for independent ones.
+            noise: of this step, as the attribute.
         """
         missed = 1 + self.passed_over if is_assumed else 0
         return DeadReckoning(
             stamp_ns,
             velocity,
-            self.since_update.then(step),
+            self.since_update.then(step, cross=cross),
             SE3.compose(self.world_from_camera, step.delta),
             assumed=self.assumed + missed,
             waiting=self.waiting + 1 if missed or self.assumed else 0,
             hidden=hidden,
+            velocity_at_update=self.velocity_at_update,
+            noise=np.zeros((0, 6, 3)) if noise is None else noise,
         )
 
     def passing_over(self) -> "DeadReckoning":
@@ -91,7 +109,8 @@ class DeadReckoning:
 
     def updated(self) -> "DeadReckoning":
         """After the filter has taken the motion up to the last measured pair."""
-        return DeadReckoning(self.stamp_ns, self.velocity, world_from_camera=self.world_from_camera)
+        world = self.world_from_camera
+        return DeadReckoning(self.stamp_ns, self.velocity, world_from_camera=world, velocity_at_update=self.velocity)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """For a checkpoint."""
@@ -102,13 +121,15 @@ class DeadReckoning:
             "reckoning/cov": self.since_update.cov,
             "reckoning/world_from_camera": self.world_from_camera,
             "reckoning/missed": np.array([self.assumed, self.waiting, self.hidden, self.passed_over]),
+            "reckoning/velocity_at_update": self.velocity_at_update,
+            "reckoning/noise": self.noise,
         }
 
     @classmethod
     def restored(cls, arrays: dict[str, np.ndarray]) -> "DeadReckoning":
         """The inverse of `arrays`; errors as `rbpf.core.checkpoint.read`."""
-        stamps, velocity, delta, cov, world, missed = read(arrays, _RECKONING, "reckoning/").values()
+        stamps, velocity, delta, cov, world, missed, *rest = read(arrays, _RECKONING, "reckoning/").values()
         assumed, waiting, hidden, passed_over = missed.tolist()
         stamp_ns = int(stamps[0]) if stamps.size else None
         motion = Odometry(delta, cov)
-        return cls(stamp_ns, velocity, motion, world, assumed, waiting, bool(hidden), passed_over)
+        return cls(stamp_ns, velocity, motion, world, assumed, waiting, bool(hidden), passed_over, *rest)

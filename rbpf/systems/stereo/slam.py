@@ -15,13 +15,13 @@ import numpy as np
 
 from rbpf.core.checkpoint import integers, numbers, poses, read, truths
 from rbpf.core.filter import Filter, StepReport
-from rbpf.core.models import NULL, Landmark, Part
+from rbpf.core.models import NULL, Landmark, Part, Proposal
 from rbpf.core.particles import Estimate
 from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.maps.landmark_map import LandmarkMap
 from rbpf.motion.odometry import CAMERA_PLANE, Odometry, OdometryMotion
-from rbpf.motion.stereo_vo import CandidateMotions, VisualOdometry
+from rbpf.motion.stereo_vo import CandidateMotions, VisualOdometry, pixel_gains
 from rbpf.sensors.camera import RectifiedStereo
 from rbpf.sensors.camera.points import CameraModel
 from rbpf.sensors.feature_log import FeatureFrame, FeatureLog
@@ -31,7 +31,7 @@ from rbpf.sensors.stereo import REMEMBERED, calibration_doubt
 from rbpf.systems.map_estimate import MapEstimate, estimate_map
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.systems.stereo.front_end import FrontEnd, ImageFrontEnd, NamedFrontEnd, Pair
-from rbpf.systems.stereo.landmarks import AssociationGate
+from rbpf.systems.stereo.landmarks import AssociationGate, View
 from rbpf.systems.stereo.motion_segmentation import camera_motion, contradicts, propagated
 from rbpf.systems.stereo.odometry import DeadReckoning
 from rbpf.systems.stereo.recovery import motion_for_update
@@ -146,6 +146,13 @@ class StereoSlam(System):
         added = np.repeat([config.odometry.std_added_rad, config.odometry.std_added_m], 3)
         self.visual_odometry = VisualOdometry(config.odometry.estimate, config.odometry.prior)
         self._constrained = OdometryMotion(SE3, free=free).constrained
+        self._free = np.diag(np.ones(6) if free is None else np.array(free, dtype=float))
+        refined = config.proposal.kind == "ekf" and config.map.weigh == "all"
+        if config.odometry.role == "proposal" and not refined:
+            raise InputError(
+                "odometry.role=proposal needs proposal.kind=ekf and map.weigh=all: the motion is then known by the landmarks "
+                "alone, candidates among them"
+            )
         landmark_map = LandmarkMap(SE3, compiled=config.compiled)
         self.front_end = self._front_ends[0]
         landmark_map.register(self.front_end.landmarks.landmark)
@@ -238,6 +245,8 @@ class StereoSlam(System):
             if control is not None:
                 begun = time.perf_counter()
                 proposal = config.recovery.proposal.build() if uncertain else None
+                if config.odometry.role == "proposal" and self.filter.steps and not uncertain:
+                    view, control, proposal = self._proposed(view, control)
                 report = self.filter.step(view, control if self.filter.steps else None, pair.stamp_ns, proposal)
                 self.reckoning, self._last_update = at.updated(), self.frames
                 self.at_update = Estimate(report.estimate.mean, report.estimate.cov)
@@ -417,8 +426,34 @@ class StereoSlam(System):
         velocity = before.velocity
         if self.config.odometry.prior.keep_velocity:
             velocity = SE3.log(motion.odometry.delta) / dt
-        at = before.moved(stamp_ns, self._constrained(motion.odometry), velocity)
+        cross, noise = None, None
+        if not self.config.odometry.independent:
+            # Of the error of this step and the last one, which the pixels of the pair between them have caused both.
+            used = matches.rows(motion.inliers)
+            earlier, later = pixel_gains(used, motion.odometry, self.config.odometry.estimate)
+            if before.noise.size:
+                cross = (
+                    self._free @ np.einsum("kap,kbp->ab", before.noise[rows[0][motion.inliers]], earlier) @ self._free
+                )
+            noise = np.zeros((len(pair), 6, 3))
+            noise[rows[1][motion.inliers]] = later @ used.cov_now
+        at = before.moved(stamp_ns, self._constrained(motion.odometry), velocity, cross=cross, noise=noise)
         return _Motion(at, rows, labels, motion.inliers, moving, "; ".join(notes))
+
+    def _proposed(self, view: View[Any], moved: Odometry) -> tuple[View[Any], Odometry, Proposal | None]:
+        """What the filter takes where the odometry is its proposal: the view with its landmarks, the prior, the proposal.
+
+        Where the map has too few landmarks in view to tell the motion, what the odometry has used is not in it either:
+        the odometry moves the particles.
+        """
+        assert self.filter.stamp_ns is not None
+        ids = self.front_end.landmarks.associate(view, self.filter.expect(moved, view.stamp_ns))
+        view = replace(view, landmarks=ids)
+        if (ids != NULL).sum() < self.config.map.min_agreeing:
+            return view, moved, None
+        dt = 1e-9 * (view.stamp_ns - self.filter.stamp_ns)
+        prior = self._constrained(self.visual_odometry.prior.increment(self.reckoning.velocity_at_update, dt))
+        return view, prior, self.config.proposal.build(SE3.local(prior.delta, moved.delta))
 
     def _log_support(self, pair: Pair[Any], found: CandidateMotions) -> np.ndarray:
         """What the map says (M + 1,) of each candidate, and of the prior alone."""
