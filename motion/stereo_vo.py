@@ -149,14 +149,19 @@ def pixel_gains(matches: Matches, motion: Odometry, config: VoConfig) -> tuple[A
     Returns:
         (K, 6, 3) of the earlier pixels and (K, 6, 3) of the later ones, in the right chart at the estimate.
     """
-    pixels = matches.z_prev
-    if config.points == "adjusted":
-        pixels = white_rows(matches, motion.delta, "adjusted").pixels
+    pixels = white_rows(matches, motion.delta, "adjusted").pixels if config.points == "adjusted" else matches.z_prev
     found = linearised(matches, motion.delta, pixels, config.points)
-    # What the gate costs is in the covariance, not in the gains: what one frame's pixels do to both is cut off twice.
+    slope = found.seen.by_motion
+    by_score = np.linalg.solve(found.cov, slope)
+    # K with K I Kᵀ = cov, where the estimate is its matches' alone, and K = cov in directions in which a prior has its say.
+    # What the gate costs is in the covariance, not in the gains: of noise in two estimates both cut off their part.
     cov = motion.cov if config.points == "exact" else motion.cov / trimming(config.gate)
-    later = cov @ np.linalg.solve(found.cov, found.seen.by_motion).mT
-    return -later @ found.seen.by_pixels, later
+    root = np.linalg.cholesky(np.einsum("kpa,kpb->ab", slope, by_score))
+    values, axes = np.linalg.eigh(root.T @ cov @ root)
+    half = np.linalg.solve(root.T, axes)
+    later = (half * np.minimum(values, np.sqrt(np.maximum(values, 0.0)))) @ half.T @ by_score.mT
+    # The paper's earlier points have no noise.
+    return np.zeros_like(later) if config.points == "exact" else -later @ found.seen.by_pixels, later
 
 
 def fit(matches: Matches, start: Array, config: VoConfig) -> Minimum[Array]:
