@@ -42,18 +42,13 @@ STUCK = 1e8
 
 @dataclass(frozen=True)
 class Rule(Ranged):
-    """When to stop, and how to begin.
+    """When to stop, and how to begin."""
 
-    Attributes:
-        offset: what is left to go to the linearised problem's minimum, in standard deviations of the solution
-            (D. Bates and D. Watts 1981): the iteration has converged below it.
-        iterations: most of them.
-        damping: the first λ, as a fraction of the largest singular value.
-    """
-
+    #: what is left to go to the linearised problem's minimum, in standard deviations of the solution (D. Bates and D.
+    #: Watts 1981): the iteration has converged below it.
     offset: Positive = 1e-6
-    iterations: Annotated[int, Range(ge=1, le=100000)] = 50
-    damping: NotNegative = 1e-4
+    iterations: Annotated[int, Range(ge=1, le=100000)] = 50  #: most of them.
+    damping: NotNegative = 1e-4  #: the first λ, as a fraction of the largest singular value.
 
 
 @dataclass(frozen=True)

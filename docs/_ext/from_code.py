@@ -22,6 +22,7 @@ from typing import Any, ClassVar
 from docutils import nodes
 from docutils.parsers.rst.directives import flag, unchanged
 from sphinx.application import Sphinx
+from sphinx.pycode import ModuleAnalyzer
 from sphinx.util.docutils import SphinxDirective
 
 WIDTH = 100
@@ -126,9 +127,12 @@ def _table(name: str, config: Any) -> list[nodes.Node]:
 
 
 def _attributes(kind: type) -> dict[str, str]:
-    """Texts of the section `Attributes:` of a Google-style docstring."""
-    found = search(r"Attributes:\n(.*)", getdoc(kind) or "", DOTALL)
+    """Texts of its fields: comments `#: …` at them, or the section `Attributes:` of a Google-style docstring."""
     meanings: dict[str, str] = {}
+    for part in [part for part in reversed(kind.__mro__) if is_dataclass(part)]:
+        comments = ModuleAnalyzer.for_module(part.__module__).find_attr_docs()
+        meanings |= {name: " ".join(lines).strip() for (of, name), lines in comments.items() if of == part.__name__}
+    found = search(r"Attributes:\n(.*)", getdoc(kind) or "", DOTALL)
     for line in [] if found is None else found[1].split("\n"):
         if named := search(r"^ {4}(\w+): (.*)", line):
             meanings[named[1]] = named[2]

@@ -14,22 +14,16 @@ from rbpf.ranges import Fraction, Positive, Probability, Range, Ranged
 
 @dataclass(frozen=True)
 class LikelihoodConfig(Ranged):
-    """Likelihood of an innovation.
+    """Likelihood of an innovation."""
 
-    Attributes:
-        kind: Gaussian, truncated Mahalanobis (S05 (6)), or Gaussian with outliers.
-        truncation: T_l of the truncated form, which bounds the weight.
-        update_limit: of the truncated form, squared Mahalanobis distance beyond which a landmark is not updated either;
-            16.3 holds 99.9 % of a Gaussian in three dimensions.
-        outlier_rate: ε.
-        outlier_volume: V, of the measurement space, in its units.
-    """
-
+    #: Gaussian, truncated Mahalanobis (S05 (6)), or Gaussian with outliers.
     kind: Literal["gaussian", "truncated", "outliers"] = "gaussian"
-    truncation: Positive = 4.0
+    truncation: Positive = 4.0  #: T_l of the truncated form, which bounds the weight.
+    #: of the truncated form, squared Mahalanobis distance beyond which a landmark is not updated either; 16.3 holds
+    #: 99.9 % of a Gaussian in three dimensions.
     update_limit: Positive = 16.3
-    outlier_rate: Probability = 0.02
-    outlier_volume: Annotated[float, Range(gt=0.0, le=1e18)] = 60.0
+    outlier_rate: Probability = 0.02  #: ε.
+    outlier_volume: Annotated[float, Range(gt=0.0, le=1e18)] = 60.0  #: V, of the measurement space, in its units.
 
     def build(self) -> Likelihood:
         if self.kind == "truncated":
@@ -41,17 +35,13 @@ class LikelihoodConfig(Ranged):
 
 @dataclass(frozen=True)
 class ProposalConfig(Ranged):
-    """Where particles are sampled and how they are weighted.
+    """Where particles are sampled and how they are weighted."""
 
-    Attributes:
-        kind: the motion prior (bootstrap), or the EKF-refined Gaussian (FastSLAM 2.0).
-        iterations: linearisations of the refined proposal; 1 is E06.
-        weights: the exact importance ratio, or E06's linearised joint marginal.
-    """
-
-    kind: Literal["ekf", "prior"] = "ekf"
-    iterations: Annotated[int, Range(ge=1, le=1000)] = 3
-    weights: Literal["exact", "linearised"] = "exact"
+    kind: Literal["ekf", "prior"] = "ekf"  #: the motion prior (bootstrap), or the EKF-refined Gaussian (FastSLAM 2.0).
+    iterations: Annotated[int, Range(ge=1, le=1000)] = 3  #: linearisations of the refined proposal; 1 is E06.
+    weights: Literal["exact", "linearised"] = (
+        "exact"  #: the exact importance ratio, or E06's linearised joint marginal.
+    )
 
     def build(self, start: np.ndarray | None = None) -> Proposal:
         """The proposal, `start` as `EkfProposal` has it; a subclass may make another one."""
@@ -62,15 +52,12 @@ class ProposalConfig(Ranged):
 
 @dataclass(frozen=True)
 class ResamplingConfig(Ranged):
-    """When and how particles are resampled.
+    """When and how particles are resampled."""
 
-    Attributes:
-        scheme: how.
-        ess_threshold: resample when the effective sample size falls below this fraction of the particles.
-    """
-
-    scheme: Literal["systematic", "stratified", "residual", "multinomial"] = "systematic"
-    ess_threshold: Fraction = 0.5
+    scheme: Literal["systematic", "stratified", "residual", "multinomial"] = "systematic"  #: how.
+    ess_threshold: Fraction = (
+        0.5  #: resample when the effective sample size falls below this fraction of the particles.
+    )
 
     def build(self) -> Resampler:
         """The resampler; a subclass may make another one."""

@@ -14,29 +14,19 @@ from rbpf.systems.filtering import LikelihoodConfig, ProposalConfig, ResamplingC
 
 @dataclass(frozen=True)
 class AssociationConfig(Ranged):
-    """Unknown association.
+    """Unknown association."""
 
-    Attributes:
-        accept_probability: of the χ² gate within which a landmark may explain an observation.
-        isolate_probability: of the χ² gate beyond which an observation may start a landmark.
-        new_density: of first observations, in inverse measurement units (1/(m·rad), 1/(m·rad²) or 1/mᵈ).
-        clutter_density: of clutter, same units.
-        max_range_m: beyond it a landmark is not expected to be seen; None is unlimited.
-        half_field_of_view_deg: likewise in yaw.
-        hit: added to a landmark's log-odds by an observation.
-        miss: subtracted where it was expected and not seen.
-        drop: log-odds below which a landmark is deleted.
-    """
-
-    accept_probability: Probability = 0.999
-    isolate_probability: Probability = 0.999999
-    new_density: Positive = 1e-3
-    clutter_density: Positive = 1e-4
-    max_range_m: Positive | None = None
-    half_field_of_view_deg: Annotated[float, Range(gt=0.0, le=180.0)] = 180.0
-    hit: NotNegative = 1.0
-    miss: NotNegative = 0.0
-    drop: float = -2.0
+    accept_probability: Probability = 0.999  #: of the χ² gate within which a landmark may explain an observation.
+    isolate_probability: Probability = 0.999999  #: of the χ² gate beyond which an observation may start a landmark.
+    new_density: Positive = (
+        1e-3  #: of first observations, in inverse measurement units (1/(m·rad), 1/(m·rad²) or 1/mᵈ).
+    )
+    clutter_density: Positive = 1e-4  #: of clutter, same units.
+    max_range_m: Positive | None = None  #: beyond it a landmark is not expected to be seen; None is unlimited.
+    half_field_of_view_deg: Annotated[float, Range(gt=0.0, le=180.0)] = 180.0  #: likewise in yaw.
+    hit: NotNegative = 1.0  #: added to a landmark's log-odds by an observation.
+    miss: NotNegative = 0.0  #: subtracted where it was expected and not seen.
+    drop: float = -2.0  #: log-odds below which a landmark is deleted.
 
     def gates(self, dim: int) -> Gates:
         """χ² thresholds for measurements of `dim` numbers."""
@@ -51,42 +41,29 @@ class AssociationConfig(Ranged):
 
 @dataclass(frozen=True)
 class RangeBearingConfig:
-    """A run of range-bearing SLAM.
+    """A run of range-bearing SLAM."""
 
-    Attributes:
-        particles: number of particles.
-        seed: of the only random generator.
-        association: landmarks named by the log, or by maximum likelihood in each particle.
-        map: every particle's own landmarks, each of them a Gaussian given the whole sampled path (particles), or one
-            Gaussian of all landmarks and the frame, given the last few steps (joint): an uncertainty that stays true.
-        window: of a joint map: steps sampled, at most, before they are taken into it; fewer where the effective sample
-            size falls below the threshold of resampling, which does not take place.
-        compiled: run the fused kernels; false runs their NumPy twins.
-        lag: steps of trajectory kept for smoothing, None keeps all; with a joint map one.
-        checkpoint_every: steps between checkpoints.
-        anchor_every: steps between re-estimations of where the known start lies in each particle's world; 0 never. A
-            joint map needs none: it knows its frame's place.
-        noise: standard deviations that replace the log's own.
-        proposal: where particles are sampled.
-        resampling: when and how.
-        likelihood: of an innovation.
-        unknown: settings of unknown association.
-    """
-
-    particles: Count = 100
-    seed: Seed = 0
+    particles: Count = 100  #: number of particles.
+    seed: Seed = 0  #: of the only random generator.
+    #: landmarks named by the log, or by maximum likelihood in each particle.
     association: Literal["known", "ml"] = "known"
+    #: every particle's own landmarks, each of them a Gaussian given the whole sampled path (particles), or one
+    #: Gaussian of all landmarks and the frame, given the last few steps (joint): an uncertainty that stays true.
     map: Literal["particles", "joint"] = "particles"
+    #: of a joint map: steps sampled, at most, before they are taken into it; fewer where the effective sample size
+    #: falls below the threshold of resampling, which does not take place.
     window: Count = 5
-    compiled: bool = True
-    lag: Count | None = None
-    checkpoint_every: Count = 500
+    compiled: bool = True  #: run the fused kernels; false runs their NumPy twins.
+    lag: Count | None = None  #: steps of trajectory kept for smoothing, None keeps all; with a joint map one.
+    checkpoint_every: Count = 500  #: steps between checkpoints.
+    #: steps between re-estimations of where the known start lies in each particle's world; 0 never. A joint map needs
+    #: none: it knows its frame's place.
     anchor_every: CountOrNone = 10
-    noise: LogNoise = field(default_factory=LogNoise)
-    proposal: ProposalConfig = field(default_factory=ProposalConfig)
-    resampling: ResamplingConfig = field(default_factory=ResamplingConfig)
-    likelihood: LikelihoodConfig = field(default_factory=LikelihoodConfig)
-    unknown: AssociationConfig = field(default_factory=AssociationConfig)
+    noise: LogNoise = field(default_factory=LogNoise)  #: standard deviations that replace the log's own.
+    proposal: ProposalConfig = field(default_factory=ProposalConfig)  #: where particles are sampled.
+    resampling: ResamplingConfig = field(default_factory=ResamplingConfig)  #: when and how.
+    likelihood: LikelihoodConfig = field(default_factory=LikelihoodConfig)  #: of an innovation.
+    unknown: AssociationConfig = field(default_factory=AssociationConfig)  #: settings of unknown association.
 
     def __post_init__(self) -> None:
         check_ranges(self)
