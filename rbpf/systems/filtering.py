@@ -39,9 +39,8 @@ class ProposalConfig(Ranged):
 
     kind: Literal["ekf", "prior"] = "ekf"  #: the motion prior (bootstrap), or the EKF-refined Gaussian (FastSLAM 2.0).
     iterations: Annotated[int, Range(ge=1, le=1000)] = 3  #: linearisations of the refined proposal; 1 is E06.
-    weights: Literal["exact", "linearised"] = (
-        "exact"  #: the exact importance ratio, or E06's linearised joint marginal.
-    )
+    #: the exact importance ratio, or E06's linearised joint marginal.
+    weights: Literal["exact", "linearised"] = "exact"
 
     def build(self, start: np.ndarray | None = None) -> Proposal:
         """The proposal, `start` as `EkfProposal` has it; a subclass may make another one."""
@@ -55,9 +54,8 @@ class ResamplingConfig(Ranged):
     """When and how particles are resampled."""
 
     scheme: Literal["systematic", "stratified", "residual", "multinomial"] = "systematic"  #: how.
-    ess_threshold: Fraction = (
-        0.5  #: resample when the effective sample size falls below this fraction of the particles.
-    )
+    #: resample when the effective sample size falls below this fraction of the particles.
+    ess_threshold: Fraction = 0.5
 
     def build(self) -> Resampler:
         """The resampler; a subclass may make another one."""

@@ -18,9 +18,8 @@ class AssociationConfig(Ranged):
 
     accept_probability: Probability = 0.999  #: of the χ² gate within which a landmark may explain an observation.
     isolate_probability: Probability = 0.999999  #: of the χ² gate beyond which an observation may start a landmark.
-    new_density: Positive = (
-        1e-3  #: of first observations, in inverse measurement units (1/(m·rad), 1/(m·rad²) or 1/mᵈ).
-    )
+    #: of first observations, in inverse measurement units (1/(m·rad), 1/(m·rad²) or 1/mᵈ).
+    new_density: Positive = 1e-3
     clutter_density: Positive = 1e-4  #: of clutter, same units.
     max_range_m: Positive | None = None  #: beyond it a landmark is not expected to be seen; None is unlimited.
     half_field_of_view_deg: Annotated[float, Range(gt=0.0, le=180.0)] = 180.0  #: likewise in yaw.
