@@ -100,16 +100,13 @@ class UncertainConstellation(Landmark):
         return Records(np.broadcast_to(points.ravel(), shape), np.broadcast_to(cov, (*shape, self.dim)))
 
     def frame(self, records: Records) -> tuple[np.ndarray, np.ndarray]:
-        """world_from_group (N, 7), a factor (N, 6, 6) of its covariance in the right chart there; of one landmark."""
         frame, _, _, cov = self._fit(records)
         return frame, gaussian.psd_factor(cov)
 
     def in_world(self, records: Records) -> np.ndarray:
-        """The points (N, M, 3) of one landmark."""
         return self._points_of(records.mean[:, 0])
 
     def in_group(self, records: Records) -> tuple[np.ndarray, np.ndarray]:
-        """The points in their own frame: means (N, M, 3) and covariances (N, M, 3, 3)."""
         frame, slope, cov_fit, _ = self._fit(records)
         local = SE3.inverse_transform(frame[:, None], self.in_world(records))
         of_frame = by_frame(local)
@@ -127,9 +124,7 @@ class UncertainConstellation(Landmark):
     def _fit(self, records: Records) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """The frame (N, 7) that fits the shape to the points: Gauss-Newton on r_m = T⁻¹ p_m − k_m, weighed as e_m.
 
-        Returns:
-            The frame; its derivative by all points (N, 6, 3M); its covariance (N, 6, 6) given the points, which the
-            errors of the shape leave; and that of all.
+        Further its derivative by all points (N, 6, 3M), and its covariances (N, 6, 6): given the points, and of all.
         """
         from rbpf.kernels.rigid_fit import rigid_fit
 

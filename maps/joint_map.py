@@ -59,7 +59,6 @@ class _Rows(NamedTuple):
 
     @property
     def log_det(self) -> float:
-        """log|2πS|."""
         return 2.0 * float(np.log(np.diagonal(self.chol)).sum()) + self.nu.shape[1] * float(np.log(2.0 * np.pi))
 
 

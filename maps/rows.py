@@ -240,7 +240,6 @@ class RowEngine:
         return total
 
     def correct(self, plan: Plan, state: np.ndarray, groups: Sequence[Observations]) -> LogDensities:
-        """Log p(z | x) of all rows, and the updates."""
         log_density = plan.log_factor.copy()
         for batch in plan.batches:
             group = groups[batch.group]
@@ -415,7 +414,6 @@ def _spans(n: int, k: int) -> list[slice]:
 
 
 def _taken(records: Records, part: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Mean, covariance and constants of some of the particles."""
     return records.mean[part], records.cov[part], None if records.const is None else records.const[part]
 
 

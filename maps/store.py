@@ -72,7 +72,6 @@ class Columns:
         return ids if self.count == self.next_id else self.ids.searchsorted(ids)
 
     def row(self, column: int) -> int:
-        """Row of one column, which must be held."""
         return int(self.rows(np.array(column)))
 
     def held(self, ids: np.ndarray) -> np.ndarray:
@@ -155,7 +154,6 @@ class Pool:
 
     @property
     def used(self) -> int:
-        """Number of slabs in use."""
         return self.data.shape[0] - len(self._free)
 
     def take(self, count: int) -> np.ndarray:
@@ -208,7 +206,6 @@ class SharedStore:
 
     @property
     def ids(self) -> np.ndarray:
-        """Columns alive, in the order in which they were added."""
         return self.columns.ids.copy()
 
     def __contains__(self, column: object) -> bool:
@@ -222,7 +219,6 @@ class SharedStore:
         return column
 
     def remove(self, columns: np.ndarray) -> None:
-        """Drops columns from all particles."""
         gone = np.unique(columns)
         for column in gone.tolist():
             self._vacate(column)
@@ -349,7 +345,6 @@ class SharedStore:
         return int(self.columns.fields[: self.columns.count].sum()) * 8 * self.n
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Everything that a checkpoint must hold."""
         ids = self.ids
         out = {
             "store/size": np.array(self.columns.next_id),

@@ -27,10 +27,8 @@ def check_model(
         rng: draws the arguments; by default always the same ones.
         example: arguments that replace random ones; a Sensor needs its frame and belief.
 
-    Returns:
-        One sentence per finding: class, method, what was expected and found. Empty for a sound model.
-
-    Raises InputError: the object is of none of these classes, or cannot be tried without more than was given.
+    Returns one sentence per finding, none for a sound model: class, method, what was expected and found. Raises InputError:
+    the object is of none of these classes, or cannot be tried without more than was given.
     """
     rng, example = rng or np.random.default_rng(0), example or Example()
     space = space or getattr(model, "space", None)
@@ -66,7 +64,7 @@ def check_model(
 def require_sound(
     model: object, space: LieGroup | None = None, rng: np.random.Generator | None = None, example: Example | None = None
 ) -> None:
-    """As `check_model`, but raises. Raises InputError: something is wrong; the message holds all findings."""
+    """As `check_model`, but raises an InputError that holds all findings."""
     findings = check_model(model, space, rng, example)
     if findings:
         raise InputError("; ".join(findings))

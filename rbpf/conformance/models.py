@@ -18,6 +18,7 @@ from rbpf.conformance.trial import (
     require_close,
     require_covariance,
     require_shape,
+    require_truths,
     require_type,
 )
 from rbpf.core.models import (
@@ -119,9 +120,7 @@ def landmark_checks(
 
     def readiness() -> None:
         records, name = tried(), named(landmark.ready)
-        ready = called(landmark.ready, records)
-        require_shape(name, ready, records.mean.shape[:2])
-        require(ready.dtype == bool, f"{name} returns {ready.dtype}, expected bool")
+        require_truths(name, called(landmark.ready, records), records.mean.shape[:2])
 
     def promotion() -> None:
         records, name = tried(), named(landmark.promote)
@@ -154,9 +153,7 @@ def likelihood_checks(likelihood: Likelihood, rng: np.random.Generator) -> list[
             single = np.asarray(called(log_density, nu[1, 2], cov[1, 2]))
             what = f"{name} does not broadcast, for a single ν"
             require_close(what, single, np.asarray(density[1, 2]), 1e-9)
-            inside = called(inlier, nu, cov)
-            require_shape(f"{named(inlier)} for ν {nu.shape}", inside, (5, 4))
-            require(inside.dtype == bool, f"{named(inlier)} returns {inside.dtype}, expected bool")
+            require_truths(f"{named(inlier)} for ν {nu.shape}", called(inlier, nu, cov), (5, 4))
 
     def mass() -> None:
         """∫ (p − floor) dν is the inliers' fraction; a uniform floor stands for outliers in a bounded volume."""

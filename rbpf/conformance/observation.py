@@ -14,6 +14,7 @@ from rbpf.conformance.trial import (
     require_close,
     require_covariance,
     require_shape,
+    require_truths,
     require_type,
 )
 from rbpf.core.linearisation import numeric_jacobians
@@ -93,9 +94,7 @@ def check_visible(model: ObservationModel, scene: Scene) -> None:
     """Truth values of the right shape."""
     if scene.landmark is None:
         return
-    seen = called(model.visible, scene.state, scene.landmark, scene.const)
-    require_shape(named(model.visible), seen, scene.batch)
-    require(seen.dtype == bool, f"{named(model.visible)} returns {seen.dtype}, expected bool")
+    require_truths(named(model.visible), called(model.visible, scene.state, scene.landmark, scene.const), scene.batch)
 
 
 def check_jacobians(model: ObservationModel, scene: Scene) -> None:
@@ -153,14 +152,8 @@ def _run(name: str, fused: FusedKernel, lanes: Scene, z: np.ndarray, count: int)
     parts = lanes.state, lanes.landmark, lanes.const
     inputs = [np.zeros((0, BLOCK)) if part is None else np.ascontiguousarray(part[rows].T) for part in parts]
     try:
-        call_kernel(
-            fused.function.address,
-            *inputs,
-            np.array(z, dtype=float),
-            np.array(fused.params, dtype=float),
-            count,
-            *outputs,
-        )
+        numbers = np.array(z, dtype=float), np.array(fused.params, dtype=float)
+        call_kernel(fused.function.address, *inputs, *numbers, count, *outputs)
     except AttributeError as error:
         raise FindingError(f"{name} gives no fused kernel: decorate it with @observation_kernel") from error
     for what, array, output in zip(_OUTPUTS, guarded, outputs, strict=True):

@@ -207,6 +207,12 @@ def require_shape(what: str, array: Any, *allowed: tuple[int | None, ...]) -> No
     require(np.isfinite(array).all(), f"{what} holds NaN or infinity, expected finite numbers")
 
 
+def require_truths(what: str, array: Any, *allowed: tuple[int | None, ...]) -> None:
+    """Truth values of one of the allowed shapes."""
+    require_shape(what, array, *allowed)
+    require(array.dtype == bool, f"{what.split(' for ')[0]} returns {array.dtype}, expected bool")
+
+
 def require_close(what: str, found: np.ndarray, expected: np.ndarray, tolerance: float) -> None:
     """Equal to the tolerance, relative to 1 + |expected|; the sentence names the worst entry."""
     require(found.shape == expected.shape, f"{what}: expected shape {expected.shape}, found {found.shape}")
@@ -227,7 +233,6 @@ def require_covariance(what: str, cov: np.ndarray) -> None:
 
 
 def _arrays_in(value: Any) -> list[np.ndarray]:
-    """The numeric arrays inside a result."""
     if isinstance(value, np.ndarray):
         return [value] if value.dtype.kind in "fiub" else []
     if is_dataclass(value):

@@ -216,7 +216,6 @@ class Entry:
     refers: str | None = None  #: name of an array of the same file that holds all of its values.
 
     def empty(self, **sizes: int) -> np.ndarray:
-        """An array without rows."""
         shape = [sizes[size] if isinstance(size, str) else size for size in self.shape[1:]]
         return np.zeros((0, *shape), self.dtype)
 

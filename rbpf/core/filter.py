@@ -276,7 +276,6 @@ class Filter:
         return densities.all
 
     def estimate(self) -> Estimate:
-        """Mean and covariance of the particles as they are."""
         here = Prior.exactly(self.space, self.particles.state)
         return mixture_estimate(here, None, self.particles.log_weights)
 

@@ -121,7 +121,6 @@ class Lineage:
         self.retain(generation)
 
     def release(self, generation: int) -> None:
-        """Ends one `retain`."""
         self._retained[generation] -= 1
         if self._retained[generation] == 0:
             del self._retained[generation]
@@ -133,7 +132,6 @@ class Lineage:
         return generation == self.generation or self._retained[generation] > 0
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Everything that a checkpoint must hold."""
         names = ("parent", "children", "generation", "row", "leaves", "free")
         arrays = {f"lineage/{name}": getattr(self, f"_{name}") for name in names}
         arrays["lineage/now"] = np.array([self.generation, self._n_free])
@@ -224,7 +222,6 @@ class Schedule:
 
     @classmethod
     def of(cls, pairs: np.ndarray) -> "Schedule":
-        """The inverse of `array`."""
         schedule = cls()
         for when, generation in pairs:
             schedule.due.setdefault(int(when), set()).add(int(generation))
@@ -319,7 +316,6 @@ class History:
         return np.array(parts)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Everything that a checkpoint must hold."""
         out: dict[str, np.ndarray] = {
             "history/generations": np.array([b.generation for b in self.blocks], dtype=np.int64)
         }

@@ -107,7 +107,6 @@ class Prior:
         return np.asarray(self.space.right_jacobian(self.mean) @ self.factor)
 
     def take(self, ancestors: Int[np.ndarray, " N"] | slice) -> "Prior":
-        """Those of the ancestors."""
         return replace(
             self, base=self.base[ancestors], mean=take(self.mean, ancestors), factor=take(self.factor, ancestors)
         )

@@ -66,7 +66,6 @@ class Euclidean(LieGroup):
         return self.compose(a, p)
 
     def rotation(self, a: States) -> Float[np.ndarray, "*batch {self.size} {self.size}"]:
-        """None: unit matrices (…, n, n)."""
         return self._unit_matrices(np.shape(a)[:-1])
 
     def _unit_matrices(self, shape: tuple[int, ...]) -> Array:
@@ -110,32 +109,30 @@ class Product(LieGroup):
     def identity(self, shape: tuple[int, ...] = ()) -> Float[np.ndarray, "*shape {self.size}"]:
         return join([group.identity(shape) for group in self.groups])
 
+    def _each(self, name: str, *arrays: list[Array]) -> Array:
+        """What the factors' methods of this name make of their parts."""
+        return join([getattr(group, name)(*parts) for group, *parts in zip(self.groups, *arrays, strict=True)])
+
     def exp(self, xi: Tangents) -> StateArray:
-        parts = zip(self.groups, self.split_tangent(xi), strict=True)
-        return join([group.exp(part) for group, part in parts])
+        return self._each("exp", self.split_tangent(xi))
 
     def log(self, x: States) -> TangentArray:
-        return join([group.log(part) for group, part in zip(self.groups, self.split(x), strict=True)])
+        return self._each("log", self.split(x))
 
     def compose(self, a: States, b: States) -> StateArray:
-        parts = zip(self.groups, self.split(a), self.split(b), strict=True)
-        return join([group.compose(left, right) for group, left, right in parts])
+        return self._each("compose", self.split(a), self.split(b))
 
     def inverse(self, a: States) -> StateArray:
-        parts = zip(self.groups, self.split(a), strict=True)
-        return join([group.inverse(part) for group, part in parts])
+        return self._each("inverse", self.split(a))
 
     def retract(self, x: States, xi: Tangents) -> StateArray:
-        parts = zip(self.groups, self.split(x), self.split_tangent(xi), strict=True)
-        return join([group.retract(point, step) for group, point, step in parts])
+        return self._each("retract", self.split(x), self.split_tangent(xi))
 
     def local(self, x: States, y: States) -> TangentArray:
-        parts = zip(self.groups, self.split(x), self.split(y), strict=True)
-        return join([group.local(origin, point) for group, origin, point in parts])
+        return self._each("local", self.split(x), self.split(y))
 
     def normalise(self, x: States) -> StateArray:
-        parts = zip(self.groups, self.split(x), strict=True)
-        return join([group.normalise(part) for group, part in parts])
+        return self._each("normalise", self.split(x))
 
     def adjoint(self, a: States) -> TangentMatrix:
         return self._block_diagonal(self.split(a), [group.adjoint for group in self.groups])

@@ -91,7 +91,6 @@ class SE2Group(LieGroup):
         return _pair(_planar(a) + _phasor(a[..., 0]) * (p[..., 0] + 1j * p[..., 1]))
 
     def inverse_transform(self, a: States, p: Like[ArrayLike, "*#batch 2"]) -> Float[np.ndarray, "*batch 2"]:
-        """Body points of world points, the inverse of `transform`."""
         a, p = _contiguous(a), np.asarray(p, dtype=float)
         return _pair(_phasor(-a[..., 0]) * (p[..., 0] + 1j * p[..., 1] - _planar(a)))
 

@@ -64,7 +64,6 @@ class SE3Group(LieGroup):
         return _two(kernels.transform, a, p, 3, 3)
 
     def inverse_transform(self, a: States, p: Like[ArrayLike, "*#batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-        """Body points of world points, the inverse of `transform`."""
         return _two(kernels.inverse_transform, a, p, 3, 3)
 
     def translation(self, a: States) -> Float[np.ndarray, "*batch 3"]:

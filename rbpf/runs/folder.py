@@ -3,8 +3,7 @@
 trajectory.tum           online filtered mean at every frame
 trajectory.npz           the same with covariances, and the last particles, see `rbpf.runs.results`
 truth.npz                the ground truth at these frames, see `rbpf.runs.truth`
-odometry.tum             the path by odometry alone, where there is odometry
-batch.tum                batch optimum of the same measurements, of the frames that took part
+odometry.tum, batch.tum  the path by odometry alone, and the batch optimum of the same measurements, where there is one
 map.npz, map.csv         landmarks: id, mean, covariance (within + between particles), and what the system adds
 observations*.csv        the measurements used, see `rbpf.runs.measurement_files`
 timings.csv              milliseconds per frame and stage

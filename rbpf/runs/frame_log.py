@@ -59,7 +59,6 @@ class FrameLog:
 
     @classmethod
     def of(cls, system: System) -> "FrameLog":
-        """An empty log for a system."""
         return cls(system.space, system.columns, system.observed, system.waiting)
 
     def __len__(self) -> int:
@@ -102,11 +101,9 @@ class FrameLog:
         return {name: frames[t] for name, frames in self._observed.items()}
 
     def all_observed(self) -> list[dict[str, np.ndarray]]:
-        """What each frame showed."""
         return [self.observed(t) for t in range(len(self))]
 
     def append(self, tracked: Tracked, seconds: float, waiting: float = 0.0) -> None:
-        """The next frame."""
         own = {"seconds": seconds, "seconds_waiting": waiting, "state": _STATES.index(tracked.state)}
         for name, values in self._rows.items():
             values.append(own[name] if name in own else tracked.values[name])
@@ -139,7 +136,6 @@ class FrameLog:
         return header, columns
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """For a checkpoint."""
         out = {"log/stamps_ns": self.stamps_ns, "log/poses": self.poses, "log/covs": self.covs}
         out |= {f"log/{column.name}": self[column.name] for column in self.columns}
         for field in self.ragged:

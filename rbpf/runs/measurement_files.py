@@ -303,14 +303,12 @@ class _Table:
         return self._entry(key)[1]
 
     def choice(self, key: str, allowed: Sequence[str]) -> str:
-        """Named value that is one of several."""
         if self.text(key) not in allowed:
             problem = f"expected {key} to be {' or '.join(allowed)}, found {quoted(self.text(key))}"
             raise self.header_error(key, problem)
         return self.text(key)
 
     def whole(self, key: str) -> int:
-        """Named whole number."""
         line, text = self._entry(key)
         return self._whole_number(line, key, text)
 

@@ -267,7 +267,6 @@ class World:
         return Similarity(1.0, np.eye(3), np.zeros(3))
 
     def brought(self, estimate: Trajectory) -> Trajectory:
-        """An estimate, here."""
         return estimate.transformed(self.motion(estimate))
 
     def of_filter(self, found: RunFolder) -> Trajectory:

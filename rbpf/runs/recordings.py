@@ -79,7 +79,6 @@ class RobotRecording:
     part: Part = WHOLE  #: which of its frames.
 
     def open(self, config: RangeBearingConfig) -> Opened:
-        """The system and the log's frames."""
         return open_robot_log(part_of_log(open_log(self.log, config.noise), self.part), config)
 
     def sources(self) -> dict[str, str | float | bool]:
@@ -115,7 +114,6 @@ class MonoRecording:
             raise InputError("in a known map a run starts from the map: leave out known points and chessboard")
 
     def open(self, config: MonoConfig) -> Opened:
-        """The system and the images."""
         known_map = None if self.map is None else read_known_map(self.map)
         return open_mono(*self.sequence(), config, known_map)
 
@@ -180,7 +178,6 @@ class StereoRecording:
     part: Part = WHOLE  #: which of the pairs, and in which size.
 
     def open(self, config: StereoConfig) -> Opened:
-        """The system and the pairs."""
         return open_pairs(open_stereo(self.pairs, self.calibration, topics=self.topics, part=self.part), config)
 
     def sources(self) -> dict[str, str | float | bool]:

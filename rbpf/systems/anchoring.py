@@ -132,7 +132,6 @@ class StartAnchor:
         return relative_estimate(space, anchored, particles.state, particles.log_weights, self._start)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """For a checkpoint."""
         out = {"anchor/groups": np.array(len(self._seen))}
         for number, (ids, new_landmarks) in enumerate(self._seen):
             out |= {
@@ -230,7 +229,6 @@ class _Group:
 
 
 def _linearised_first_frame(prior: Prior, groups: list[_Group]) -> LineariseAt:
-    """Information of the first frame about the start."""
     space = prior.space
 
     def linearise_at(increment: np.ndarray) -> Information:

@@ -38,7 +38,6 @@ class MapEstimate:
         return np.pad(self.mean[rows], ((0, 0), more)), np.pad(self.cov[rows], ((0, 0), more, more))
 
     def points(self) -> "MapEstimate":
-        """The landmarks that are points."""
         if "ray" not in self.columns:
             return self
         full = ~self.is_ray()
