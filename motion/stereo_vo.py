@@ -14,6 +14,7 @@ from typing import Annotated, ClassVar, final
 
 import numpy as np
 
+from rbpf import gaussian
 from rbpf.errors import InputError
 from rbpf.lie import SE3, Array
 from rbpf.motion.least_squares import Minimum, Rule, minimise
@@ -156,10 +157,10 @@ def pixel_gains(matches: Matches, motion: Odometry, config: VoConfig) -> tuple[A
     # K with K I Kᵀ = cov, where the estimate is its matches' alone, and K = cov in directions in which a prior has its say.
     # What the gate costs is in the covariance, not in the gains: of noise in two estimates both cut off their part.
     cov = motion.cov if config.points == "exact" else motion.cov / trimming(config.gate)
-    root = np.linalg.cholesky(np.einsum("kpa,kpb->ab", slope, by_score))
-    values, axes = np.linalg.eigh(root.T @ cov @ root)
-    half = np.linalg.solve(root.T, axes)
-    later = (half * np.minimum(values, np.sqrt(np.maximum(values, 0.0)))) @ half.T @ by_score.mT
+    root = gaussian.psd_factor(cov)
+    values, axes = np.linalg.eigh(root.T @ np.einsum("kpa,kpb->ab", slope, by_score) @ root)
+    half = root @ axes
+    later = half / np.sqrt(np.maximum(values, 1.0)) @ half.T @ by_score.mT
     # The paper's earlier points have no noise.
     return np.zeros_like(later) if config.points == "exact" else -later @ found.seen.by_pixels, later
 
