@@ -146,6 +146,7 @@ def test_a_multi_view_stereo_tool_finds_the_images_of_a_run(tmp_path):
     }
 
 
+@pytest.mark.slow
 def test_names_that_are_no_text_reach_rerun_in_part(tmp_path):
     """Of a recording's name what cannot be read is replaced; of a file's it is refused, before anything is written."""
     with recording(tmp_path / "run.rrd", "log\udcff") as (_, stream):
