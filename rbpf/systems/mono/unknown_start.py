@@ -12,8 +12,9 @@ is the origin: the camera (R, t) sees it in the direction c = Rᵀ(d − q t), h
 
     Σ ρ(|z − h(c)|/σ) + ½ Σ ((q − q̄)/σ_q)² + ½ Σ |(v_k − v_{k−1})/σ_v|² + ½ ((s − 1)/σ_s)²,
 
-with Cauchy's loss ρ, the prior of an inverse distance, velocities v between frames that walk as in E06 (4), and the
-scale s = Σ q / (F q̄), which no image tells: it is held.
+with Cauchy's loss ρ, the prior of an inverse distance, mean velocities v between frames that walk as in E06 (4) (their
+differences share something with the next ones, which is not written here), and the scale s = Σ q / (F q̄), which no
+image tells: it is held.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,6 +25,7 @@ from typing import final
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, cholesky, solve_triangular
+from scipy.special import exp1
 
 from rbpf.core.checkpoint import integers, numbers, poses, read, split
 from rbpf.core.filter import Filter
@@ -57,6 +59,18 @@ SCALE_STD = 1e-4
 
 MAX_STEPS, MIN_GAIN = 30, 1e-4
 """Steps of the adjustment at most, and the fraction of the cost that ends it."""
+
+_HALF = CAUCHY_SCALE**2 / 2.0
+_BEYOND = float(np.exp(_HALF) * exp1(_HALF))
+LOSS_INFORMATION = (1.0 - _HALF * _BEYOND) ** 2 / ((_BEYOND + _HALF * _BEYOND - 1.0) * _HALF * _BEYOND)
+"""How many times Gauss's and Newton's information with the loss's weights w is known where noise is Gaussian: 1.27.
+
+The estimate's is (E ψ′)²/E ψ² of a least-squares fit's (P. Huber, 1981), the weights' is E w of it. In two dimensions, with
+a = c²/2 of Cauchy's scale c and G = eᵃ E₁(a): E ψ′ = a − a²G, E ψ² = a²(G + aG − 1), E w = aG.
+"""
+
+MIN_STD_VELOCITY = 1e-6
+"""A velocity that cannot change has no density: at least so much it walks in a second, rad/s, m/s."""
 
 DAMPING, DAMPING_FACTOR, MAX_DAMPING = 1e-3, 5.0, 1e8
 """Of Levenberg's and Marquardt's method: at first, its change after a step, and where there is no way down."""
@@ -399,7 +413,7 @@ class Optimum:
     Attributes:
         structure: there.
         cost: the sum above.
-        information: (6 (T − 1) + 3 F, …) of the step from it, by Gauss and Newton with the losses' weights.
+        information: (6 (T − 1) + 3 F, …) of the step from it: its inverse is the covariance of the minimum's error.
     """
 
     structure: Structure
@@ -443,12 +457,12 @@ def optimum(seen: Window, expected: Expected, start: Structure) -> Optimum:
                 break
             damping *= DAMPING_FACTOR
             if damping > MAX_DAMPING:
-                return Optimum(now.at, now.cost, information)
+                return Optimum(now.at, now.cost, now.normal_equations(LOSS_INFORMATION)[0])
         damping /= DAMPING_FACTOR
         gain, now = now.cost - ahead.cost, ahead
         if gain < MIN_GAIN * (1.0 + now.cost):
             break
-    return Optimum(now.at, now.cost, now.normal_equations()[0])
+    return Optimum(now.at, now.cost, now.normal_equations(LOSS_INFORMATION)[0])
 
 
 @final
@@ -466,8 +480,7 @@ class Linearised:
         self.weight = 1.0 / (1.0 + squared)
         self._interval = np.diff(seen.stamps_ns) * 1e-9
         self._relative = SE3.between(at.path[:-1], at.path[1:])
-        walked = expected.std_walk * np.sqrt(self._interval[1:, None])
-        self._std_velocity = np.concatenate([expected.std_start[None], walked])
+        self._whitener = _walk_whitener(expected, self._interval)
         self.velocity = self._differences(SE3.log(self._relative) / self._interval[:, None])
         self.prior = (at.inverse - expected.rho[0]) / expected.rho[1]
         self._by_scale = 1.0 / (at.inverse.size * expected.rho[0] * SCALE_STD)
@@ -476,12 +489,16 @@ class Linearised:
         self.cost = float(0.5 * CAUCHY_SCALE**2 * np.log1p(squared).sum() + 0.5 * quadratic)
 
     def _differences(self, velocity: np.ndarray) -> np.ndarray:
-        """The first of T − 1 rows, and from row to row, in standard deviations."""
+        """The first of T − 1 rows, and from row to row, whitened."""
         moved = np.concatenate([velocity[:1], np.diff(velocity, axis=0)])
-        return np.asarray(moved / self._std_velocity.reshape(-1, 6, *[1] * (velocity.ndim - 2)))
+        return np.einsum("ktj,jk...->tk...", self._whitener, moved)
 
-    def normal_equations(self) -> tuple[np.ndarray, np.ndarray]:
-        """Gauss and Newton's: information of the step, and the vector that it is solved with."""
+    def normal_equations(self, loss_information: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+        """Gauss and Newton's: information of the step, and the vector that it is solved with.
+
+        Args:
+            loss_information: times what was seen counts in the information.
+        """
         seen, at, direction = self.seen, self.at, self._direction
         frames, features = at.path.shape[0], at.inverse.size
         free = 6 * frames
@@ -504,6 +521,7 @@ class Linearised:
         of_poses[each[0], :, each[0]] = _summed(of_pose @ by_pose, seen.frame, frames)
         of_features[each[1], :, each[1]] = _summed(of_feature @ by_feature, seen.feature, features)
         across[seen.frame, :, seen.feature] = of_pose @ by_feature
+        h *= loss_information
         h[free:, :free] = h[:free, free:].T
         misfit = self.misfit[..., None]
         b[:free] = _summed((of_pose @ misfit)[..., 0], seen.frame, frames).ravel()
@@ -524,6 +542,24 @@ class Linearised:
         h[np.ix_(q, q)] += self._by_scale**2
         b[q] -= self.prior / self.expected.rho[1] + self.scale * self._by_scale
         return h[6:, 6:], b[6:]
+
+
+def _walk_whitener(expected: Expected, interval: np.ndarray) -> np.ndarray:
+    """L⁻¹ (6, T − 1, T − 1) of the covariance L Lᵀ of the first mean velocity and of the differences of mean velocities.
+
+    A mean velocity over an interval δ is v + w₁/δ with the noise of E06 (5): the difference from the one before has the
+    variance (δ + δ′)/3 of the walk's in a second, and shares δ/6 with the difference after it.
+
+    Args:
+        expected: standard deviations.
+        interval: (T − 1,) s.
+    """
+    before = np.concatenate([[0.0], interval[:-1]])
+    walk = np.diag((before + interval) / 3.0) + np.diag(interval[:-1] / 6.0, 1) + np.diag(interval[:-1] / 6.0, -1)
+    std_walk = np.maximum(expected.std_walk, MIN_STD_VELOCITY)
+    cov = np.square(std_walk)[:, None, None] * walk
+    cov[:, 0, 0] += np.square(np.maximum(expected.std_start, MIN_STD_VELOCITY))
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(cov)))
 
 
 def tangents(direction: np.ndarray) -> np.ndarray:
