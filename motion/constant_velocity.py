@@ -24,7 +24,7 @@ POSE_AND_VELOCITY = Product(SE3, Euclidean(6))
 class PosePrior:
     """Given as control: the body is where this distribution says, however it came there. The start, or a kidnapping."""
 
-    mean: np.ndarray  #: (7,) world_from_body.
+    mean: np.ndarray  #: (7,) world_from_body, or (N, 7) of each particle's.
     cov: np.ndarray  #: (6, 6) in the right chart at the mean, order [ω, v].
     #: (6,) of its velocity about zero, rad/s, m/s; None where the velocity goes on as it was.
     std_velocity: np.ndarray | None = None
@@ -109,7 +109,7 @@ class SampledVelocity(MotionModel):
 
 
 def _placed(state: np.ndarray, prior: PosePrior) -> np.ndarray:
-    if prior.mean.shape != (7,) or prior.cov.shape != (6, 6) or not np.isfinite(prior.mean).all():
+    if prior.mean.shape not in ((7,), state.shape) or prior.cov.shape != (6, 6) or not np.isfinite(prior.mean).all():
         raise InputError(f"a PosePrior needs a finite mean (7,) and cov (6, 6), got {prior.mean} and {prior.cov.shape}")
     return np.broadcast_to(SE3.normalise(prior.mean), state.shape).copy()
 

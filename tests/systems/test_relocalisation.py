@@ -8,7 +8,9 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
+from rbpf.core.models import Records
 from rbpf.lie import SE3
+from rbpf.maps.point import Point
 from rbpf.motion.constant_velocity import PosePrior
 from rbpf.runs.recordings import filter_images
 from rbpf.runs.run import Run
@@ -127,23 +129,26 @@ def test_a_frozen_camera_is_noticed(tracked, tmp_path):
     assert not run.log.lost()[-20:].any()
 
 
-def test_the_spread_of_worlds_is_carried_to_the_pose_found():
-    """Worlds W_i = T₀ Exp(ξ_i) T₀⁻¹ about the last trusted pose T₀, by samples: the pose found is W_i T₁."""
-    loss = TrackingLoss(SimpleNamespace(camera=None), MonoConfig())
-    trusted, found = (
-        SE3.exp(np.array([0.5, -0.3, 0.8, 1.0, 2.0, -1.0])),
-        SE3.exp(np.array([-0.2, 1.4, 0.1, -1, 3, 0])),
-    )
-    half = 1e-3 * np.random.default_rng(0).normal(size=(6, 6))
-    loss._trusted = trusted, half @ half.T
-    attempt = Attempt(9, prior=PosePrior(found, 1e-8 * np.eye(6)))
-    loss.relocaliser = SimpleNamespace(find=lambda *_: attempt)
-    prior = loss.prior(SimpleNamespace(belief=lambda: None, steps=1), GREY).pose
-    xi = np.random.default_rng(1).normal(size=(100_000, 6)) @ half.T
-    poses = SE3.compose(SE3.retract(trusted, xi), SE3.compose(SE3.inverse(trusted), found))
-    expected = np.cov(SE3.log(SE3.between(found, poses)).T) + 1e-8 * np.eye(6)
-    np.testing.assert_array_equal(prior.mean, found)
-    np.testing.assert_allclose(prior.cov, expected, atol=0.03 * np.abs(expected).max())
+def test_a_pose_is_found_in_each_particles_own_world():
+    """Two worlds that differ by a known motion: the same camera among the same landmarks in both, and as uncertain."""
+    n, rng, other = 2, np.random.default_rng(0), SE3.exp(np.array([0.2, -0.3, 0.1, 0.5, -0.2, 0.3]))
+    slam = MonoSlam(CAMERA, MonoConfig(particles=n))
+    points = np.append(rng.uniform(-0.8, 0.8, (12, 2)), rng.uniform(2.0, 4.0, (12, 1)), axis=1)
+    worlds = np.stack([SE3.identity(), other])
+    mean = SE3.transform(worlds[:, None], points)
+    held = Records(mean, np.tile(1e-6 * np.eye(3), (n, 12, 1, 1)))
+    slam.filter.belief().map.add_records(held, Point(3), ids=np.arange(12))
+    table = SimpleNamespace(alive=np.ones(12, dtype=bool), member=np.full(12, -1))
+    sensor = SimpleNamespace(camera=CAMERA, config=slam.config.search, features=slam.features, table=table)
+    loss = TrackingLoss(sensor, slam.config)
+    found, cov = SE3.exp(np.array([0.05, -0.1, 0.02, 0.1, 0.2, -0.1])), np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]) * 1e-6
+    loss.relocaliser.find = lambda *_: Attempt(12, prior=PosePrior(found, cov))
+    prior = loss.prior(slam.filter, GREY).pose
+    np.testing.assert_allclose(SE3.local(SE3.compose(worlds, found), prior.mean), 0.0, atol=1e-9)
+    expected = slam.filter.expect(prior, 0)
+    np.testing.assert_allclose(SE3.local(prior.mean, expected.state[:, :7]), 0.0, atol=1e-9)
+    factor = expected.prior.factor
+    np.testing.assert_allclose(factor @ np.swapaxes(factor, 1, 2) - cov, 0.0, atol=1e-12)
 
 
 def test_inliers_on_a_line_do_not_convince():

@@ -58,6 +58,8 @@ SAME_CORNER = 1.5
 """Corners this near to each other, in least distances of corners, may show one thing."""
 CORNER_PX, MIN_CORRELATION = 2.0, 0.5
 """How well a corner is found again, per axis; the least correlation of a patch that says it better."""
+MIN_FITTED = 3
+"""Landmarks that determine where another particle's world is."""
 MAX_ROUNDS = 10
 """Of a pose's refinement on what is seen around it."""
 
@@ -247,9 +249,9 @@ class TrackingLoss:
                 attempt = self.relocaliser.find(belief, image, view)
             if attempt.prior is not None:
                 found = attempt.prior
-                # How far a particle's world is from the heaviest one's, in the chart of the pose that was found in that.
-                moved = SE3.adjoint(SE3.between(found.mean, pose))
-                prior = PosePrior(found.mean, found.cov + moved @ cov @ moved.T, self.std_velocity)
+                # The covariance is in the camera's chart, where a particle's world does not matter.
+                poses = self.relocaliser.in_all_worlds(belief, found.mean)
+                prior = PosePrior(poses, found.cov, self.std_velocity)
                 return LostPrior(prior, attempt.certain, attempt)
         std = np.repeat([self.config.search_std_rad, self.config.search_std_m], 3)
         return LostPrior(PosePrior(pose, cov + np.diag(std**2), self.std_velocity), False, attempt)
@@ -379,6 +381,27 @@ class Relocaliser:
         which, position = features.positions(belief, rows)
         return rows[which], position[:, :3] / position[:, 3:]
 
+    def in_all_worlds(self, belief: Belief, pose: np.ndarray) -> np.ndarray:
+        """A pose (7,) of the heaviest particle's world in each particle's own (N, 7).
+
+        It is where the landmarks in view are around the camera as they are in the heaviest one: the closest rigid motion
+        of each particle's, near ones counting more, by S. Umeyama (1991). What a map is bent elsewhere does not matter.
+        """
+        rows, points = self.known_landmarks(belief)
+        seen = SE3.inverse_transform(pose, points)
+        in_view = self.camera.visible(seen)
+        near = in_view if in_view.sum() >= self.config.min_inliers_with_last_view else np.ones_like(in_view)
+        rows, seen = rows[near], seen[near]
+        poses = np.empty((belief.log_weights.size, 7))
+        for i in range(len(poses)):
+            alone = np.where(np.arange(len(poses)) == i, 0.0, -np.inf)
+            which, places = self.sensor.features.positions(replace(belief, log_weights=alone), rows)
+            ahead = places[:, 3] > 0.0
+            poses[i] = pose
+            if ahead.sum() >= MIN_FITTED:
+                poses[i] = _closest(seen[which[ahead]], places[ahead, :3] / places[ahead, 3:])
+        return poses
+
     def describe_landmarks(self, candidates: Candidates, near: np.ndarray) -> np.ndarray:
         """Descriptors (L, d) of landmarks, turned and scaled as they would be seen from a pose near by."""
         known, asked = self._described, (candidates.rows, candidates.points, near)
@@ -506,6 +529,18 @@ class LastView:
         alike = matches.score >= VIEW_CORRELATION
         px = np.where(alike[:, None], matches.px, sights.px)
         return replace(sights, px=px, std_px=np.where(alike, VIEW_PX, CORNER_PX))
+
+
+def _closest(seen: np.ndarray, world: np.ndarray) -> np.ndarray:
+    """world_from_camera (7,) that brings points (K, 3) of the camera's frame closest to the world's (K, 3)."""
+    weight = 1.0 / np.square(seen).sum(axis=1)
+    weight /= weight.sum()
+    centre, centre_world = weight @ seen, weight @ world
+    u, _, vt = np.linalg.svd((weight[:, None] * (world - centre_world)).T @ (seen - centre))
+    matrix = np.eye(4)
+    matrix[:3, :3] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    matrix[:3, 3] = centre_world - matrix[:3, :3] @ centre
+    return SE3.from_matrix(matrix)
 
 
 def is_convincing(found: Resected, px: np.ndarray, width: int, config: RelocalisationConfig) -> bool:
