@@ -32,15 +32,10 @@ Exit codes: 0 success, 1 a fault of the program, 2 bad input (said in one senten
 
 @dataclass(frozen=True, kw_only=True)
 class DemoOptions(Printed):
-    """Options of `rbpf demo`.
+    """Options of `rbpf demo`."""
 
-    Attributes:
-        out: folder for the images and the results.
-        frames: number of images, 30 per second.
-    """
-
-    out: Path = Path("demo")
-    frames: Annotated[int, Range(ge=2, le=MOST)] = 240
+    out: Path = Path("demo")  #: folder for the images and the results.
+    frames: Annotated[int, Range(ge=2, le=MOST)] = 240  #: number of images, 30 per second.
 
 
 @APP.add("demo")

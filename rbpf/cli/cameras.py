@@ -16,21 +16,15 @@ LOOSE = 0.01
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrateOptions(Printed):
-    """Options of `rbpf calibrate`.
+    """Options of `rbpf calibrate`."""
 
-    Attributes:
-        images: folder of images of the board, 15 or more from different directions, or a video of it.
-        board: inner corners of the chessboard, the places where four squares meet, as 9x6.
-        square: side of its squares, m.
-        model: of the camera; fisheye is an equidistant lens, for fields of view of some 110 degrees and more.
-        out: folder for camera.yaml, calibration.png and calibration.json.
-    """
-
+    #: folder of images of the board, 15 or more from different directions, or a video of it.
     images: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="IMAGES")]
-    board: str
-    square: Positive
+    board: str  #: inner corners of the chessboard, the places where four squares meet, as 9x6.
+    square: Positive  #: side of its squares, m.
+    #: of the camera; fisheye is an equidistant lens, for fields of view of some 110 degrees and more.
     model: Literal["pinhole", "fisheye"] = "pinhole"
-    out: Path = Path("calibration")
+    out: Path = Path("calibration")  #: folder for camera.yaml, calibration.png and calibration.json.
 
 
 def calibrate(options: Annotated[CalibrateOptions, tyro.conf.arg(name="")]) -> None:
@@ -67,15 +61,10 @@ def calibrate(options: Annotated[CalibrateOptions, tyro.conf.arg(name="")]) -> N
 
 @dataclass(frozen=True, kw_only=True)
 class RecalibrateOptions(Printed):
-    """Options of `rbpf recalibrate`.
+    """Options of `rbpf recalibrate`."""
 
-    Attributes:
-        run: folder of a finished run of one camera.
-        out: folder for camera.yaml.
-    """
-
-    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
-    out: Path = Path("recalibration")
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]  #: folder of a finished run of one camera.
+    out: Path = Path("recalibration")  #: folder for camera.yaml.
 
 
 def recalibrate(options: Annotated[RecalibrateOptions, tyro.conf.arg(name="")]) -> None:

@@ -17,13 +17,9 @@ from rbpf.errors import InputError
 
 @dataclass(frozen=True, kw_only=True)
 class DoctorOptions(Printed):
-    """Options of `rbpf doctor`.
+    """Options of `rbpf doctor`."""
 
-    Attributes:
-        compile: compile the kernels, once, so that the first run need not.
-    """
-
-    compile: bool = True
+    compile: bool = True  #: compile the kernels, once, so that the first run need not.
 
 
 def doctor(options: Annotated[DoctorOptions, tyro.conf.arg(name="")]) -> None:
@@ -65,13 +61,9 @@ _ZSH = (
 
 @dataclass(frozen=True, kw_only=True)
 class CompletionOptions:
-    """Options of `rbpf completion`.
+    """Options of `rbpf completion`."""
 
-    Attributes:
-        shell: for which it is.
-    """
-
-    shell: tyro.conf.Positional[Literal["bash", "zsh", "fish"]]
+    shell: tyro.conf.Positional[Literal["bash", "zsh", "fish"]]  #: for which it is.
 
 
 def completion(options: Annotated[CompletionOptions, tyro.conf.arg(name="")]) -> None:

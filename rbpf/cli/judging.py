@@ -19,17 +19,12 @@ Format = Literal["tum", "kitti", "ply", "colmap", "rerun", "npz"]
 
 @dataclass(frozen=True, kw_only=True)
 class ValidateOptions(Printed):
-    """Options of `rbpf validate`.
+    """Options of `rbpf validate`."""
 
-    Attributes:
-        run: folder that `rbpf run` left.
-        against: ground truth of the recording, batch optimum of the same measurements, or a reconstruction.
-        out: a further folder for the JSON, which is always written into the run's own; by default none.
-    """
-
-    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]  #: folder that `rbpf run` left.
+    #: ground truth of the recording, batch optimum of the same measurements, or a reconstruction.
     against: Literal["groundtruth", "gtsam", "colmap"] = "groundtruth"
-    out: Where = None
+    out: Where = None  #: a further folder for the JSON, which is always written into the run's own; by default none.
 
 
 def validate(options: Annotated[ValidateOptions, tyro.conf.arg(name="")]) -> None:
@@ -46,13 +41,9 @@ def validate(options: Annotated[ValidateOptions, tyro.conf.arg(name="")]) -> Non
 
 @dataclass(frozen=True, kw_only=True)
 class ReportOptions(Printed):
-    """Options of `rbpf report`.
+    """Options of `rbpf report`."""
 
-    Attributes:
-        run: folder that `rbpf run` left.
-    """
-
-    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]  #: folder that `rbpf run` left.
 
 
 def report(options: Annotated[ReportOptions, tyro.conf.arg(name="")]) -> None:
@@ -70,18 +61,13 @@ def _answer(verdict: "Verdict", run: Path, as_json: bool, *first: str) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class ExportOptions(Printed):
-    """Options of `rbpf export`.
+    """Options of `rbpf export`."""
 
-    Attributes:
-        run: folder that `rbpf run` left.
-        format: one or several: trajectory as TUM or KITTI, map and path as PLY, a COLMAP model, a Rerun recording,
-            everything as one NumPy archive.
-        out: folder for the files; by default RUN/export.
-    """
-
-    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]  #: folder that `rbpf run` left.
+    #: one or several: trajectory as TUM or KITTI, map and path as PLY, a COLMAP model, a Rerun recording, everything
+    #: as one NumPy archive.
     format: tuple[Format, ...]
-    out: Where = None
+    out: Where = None  #: folder for the files; by default RUN/export.
 
 
 def export(options: Annotated[ExportOptions, tyro.conf.arg(name="")]) -> None:
@@ -95,19 +81,13 @@ def export(options: Annotated[ExportOptions, tyro.conf.arg(name="")]) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class SweepOptions(Printed):
-    """Options of `rbpf sweep`.
+    """Options of `rbpf sweep`."""
 
-    Attributes:
-        config: YAML file with system, sequences, particles, seeds, options and settings.
-        out: folder for the rows and the table; what is finished there is not computed again.
-        workers: processes of this machine; -1 is one per core.
-        scheduler: address of a Dask scheduler (tcp://HOST:PORT) whose workers run instead; by default none.
-    """
-
+    #: YAML file with system, sequences, particles, seeds, options and settings.
     config: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CONFIG")]
-    out: Path = Path("sweep")
-    workers: Annotated[int, Range(ge=-1, le=4096)] = -1
-    scheduler: Text = None
+    out: Path = Path("sweep")  #: folder for the rows and the table; what is finished there is not computed again.
+    workers: Annotated[int, Range(ge=-1, le=4096)] = -1  #: processes of this machine; -1 is one per core.
+    scheduler: Text = None  #: address of a Dask scheduler (tcp://HOST:PORT) whose workers run instead; by default none.
 
 
 def sweep(options: Annotated[SweepOptions, tyro.conf.arg(name="")]) -> None:
@@ -131,19 +111,12 @@ def sweep(options: Annotated[SweepOptions, tyro.conf.arg(name="")]) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class CompareOptions(Printed):
-    """Options of `rbpf compare`.
+    """Options of `rbpf compare`."""
 
-    Attributes:
-        run_a: folder that `rbpf run` left.
-        run_b: another one of the same recording.
-        seeds: runs of each, from which the error is estimated.
-        workers: processes; -1 is one per core.
-    """
-
-    run_a: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN_A")]
-    run_b: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN_B")]
-    seeds: Count = 5
-    workers: Annotated[int, Range(ge=-1, le=4096)] = -1
+    run_a: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN_A")]  #: folder that `rbpf run` left.
+    run_b: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN_B")]  #: another one of the same recording.
+    seeds: Count = 5  #: runs of each, from which the error is estimated.
+    workers: Annotated[int, Range(ge=-1, le=4096)] = -1  #: processes; -1 is one per core.
 
 
 def compare(options: Annotated[CompareOptions, tyro.conf.arg(name="")]) -> None:
