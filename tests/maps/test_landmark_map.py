@@ -75,14 +75,6 @@ def test_a_ring_promotes_to_its_moments():
     np.testing.assert_allclose(found.cov[:, 0], np.broadcast_to(8.0 * np.eye(2) + own, (N, 2, 2)), atol=1e-10)
 
 
-def test_promotion_keeps_the_log_odds():
-    landmark_map, _ = filled(evidence=True)
-    log_odds = np.linspace(-1.0, 2.0, N)[:, None]
-    ids = landmark_map.add_records(ring(np.zeros((N, 2)), np.array([4.0]), 0.1, 4), MixturePoint(4), log_odds)
-    landmark_map.promote(ids)
-    np.testing.assert_array_equal(landmark_map.log_odds(ids), log_odds)
-
-
 def test_ready_when_enough_of_the_weight_says_so():
     landmark_map, _ = filled()
     mixture = ring(np.zeros((N, 2)), np.array([4.0]), 0.1, 4)
@@ -96,28 +88,23 @@ def test_ready_when_enough_of_the_weight_says_so():
     assert landmark_map.ready(np.full(N, 1 / N)).size == 0
 
 
-class TestLogOdds:
-    def test_read_and_written_per_particle(self):
-        rng = np.random.default_rng(4)
-        landmark_map, lineage = filled(evidence=True)
-        ids = landmark_map.add_records(points(rng, 3), Point(2))
-        log_odds = rng.normal(size=(N, 3))
-        before = landmark_map.read(ids)
-        landmark_map.set_log_odds(ids, log_odds)
-        np.testing.assert_array_equal(landmark_map.log_odds(ids), log_odds)
-        ancestors = resample(landmark_map, lineage, rng)
-        np.testing.assert_array_equal(landmark_map.log_odds(ids), log_odds[ancestors])
-        np.testing.assert_array_equal(landmark_map.read(ids).mean, before.mean[ancestors])
-        np.testing.assert_array_equal(landmark_map.read(ids).cov, before.cov[ancestors])
-
-    def test_what_no_particle_holds_is_removed(self):
-        landmark_map, _ = filled(evidence=True)
-        ids = landmark_map.add_records(points(np.random.default_rng(5), 2), Point(2))
-        log_odds = np.zeros((N, 2))
-        log_odds[:, 0] = -np.inf
-        log_odds[1:, 1] = -np.inf
-        landmark_map.set_log_odds(ids, log_odds)
-        assert landmark_map.ids.tolist() == [1]
+def test_log_odds_follow_their_particle_outlast_promotion_and_end_what_nobody_holds():
+    rng = np.random.default_rng(4)
+    landmark_map, lineage = filled(evidence=True)
+    log_odds = rng.normal(size=(N, 3))
+    mixtures = ring(rng.normal(size=(N, 2)), np.array([4.0, 5.0, 6.0]), 0.1, 4)
+    ids = landmark_map.add_records(mixtures, MixturePoint(4), log_odds)
+    landmark_map.promote(ids)
+    np.testing.assert_array_equal(landmark_map.log_odds(ids), log_odds)
+    before, log_odds = landmark_map.read(ids), rng.normal(size=(N, 3))
+    landmark_map.set_log_odds(ids, log_odds)
+    ancestors = resample(landmark_map, lineage, rng)
+    np.testing.assert_array_equal(landmark_map.log_odds(ids), log_odds[ancestors])
+    np.testing.assert_array_equal(landmark_map.read(ids).mean, before.mean[ancestors])
+    np.testing.assert_array_equal(landmark_map.read(ids).cov, before.cov[ancestors])
+    log_odds[:, 0], log_odds[1:, 1] = -np.inf, -np.inf
+    landmark_map.set_log_odds(ids, log_odds)
+    assert landmark_map.ids.tolist() == [1, 2]
 
 
 def test_ring_covers_the_circle():
