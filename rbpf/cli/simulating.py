@@ -68,10 +68,13 @@ def _render(world: "ImageWorld", options: ImagesOptions | LabOptions) -> None:
 
     if options.fisheye is not None and any(options.distortion):
         raise InputError("a lens has either --distortion or --fisheye: leave out one of them")
-    lens = (options.distortion,) if options.fisheye is None else (options.fisheye, "equidistant")
+    lens: tuple[float, ...] = options.distortion
+    model = "radial-tangential"
+    if options.fisheye is not None:
+        lens, model = options.fisheye, "equidistant"
     focal = options.focal_px or FOCAL_FRACTION[type(options)] * options.width
     centre = 0.5 * (options.width - 1), 0.5 * (options.height - 1)
-    camera = Pinhole(options.width, options.height, focal, focal, *centre, *lens)
+    camera = Pinhole(options.width, options.height, focal, focal, *centre, lens, model)
     first, count = options.blackout or (0, 0)
     imaging = Imaging(
         noise_std=options.noise_std,

@@ -8,6 +8,7 @@ log-weights is that of S05 (8)–(12).
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -137,7 +138,8 @@ class Information:
         """The same observations, of particles that were taken in several parts."""
         if len(parts) == 1:
             return parts[0]
-        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in SUMMED))
+        joined: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in SUMMED}
+        return cls(**joined)
 
     def add(self, other: "Information") -> None:
         """Adds independent observations, in place."""
