@@ -43,6 +43,9 @@ Measured = Float[np.ndarray, "*#batch p"]
 Result = Float[np.ndarray, "*batch p"]
 Covariances = Float[np.ndarray, "*#batch p p"]
 Ids = Int[np.ndarray, " K"]
+Z = Float[np.ndarray, "K p"]
+CovZ = Float[np.ndarray, "K p p"]
+"""K landmarks or measurements of one step, and the measurements' covariances."""
 
 NULL = -1
 """An observation that a particle takes as clutter."""
@@ -106,8 +109,8 @@ class Records:
 class Observations:
     """A group of measurements of one kind taken in one frame."""
 
-    z: Float[np.ndarray, "K p"]  #: (K, p) measurements.
-    cov: Float[np.ndarray, "K p p"]  #: (K, p, p) covariance of their noise.
+    z: Z  #: (K, p) measurements.
+    cov: CovZ  #: (K, p, p) covariance of their noise.
     model: "ObservationModel"  #: how they arise.
     likelihood: "Likelihood | None" = None  #: of the innovation; None is Gaussian.
     #: landmark of each, (K,) for all particles or (N, K) per particle; NULL and NEW are allowed. None where the model
@@ -124,8 +127,8 @@ class Observations:
 class NewLandmarks:
     """Measurements that start landmarks, after the update."""
 
-    z: Float[np.ndarray, "K p"]  #: (K, p) measurements.
-    cov: Float[np.ndarray, "K p p"]  #: (K, p, p) their covariance.
+    z: Z  #: (K, p) measurements.
+    cov: CovZ  #: (K, p, p) their covariance.
     model: "ObservationModel"  #: whose `initialise` gives the records.
     landmark: "Landmark"  #: the parametrisation.
     mask: Bool[np.ndarray, "N K"] | None = None  #: (N, K) which particles take them as new; None is all.
@@ -193,9 +196,7 @@ class ObservationModel(ABC):
             f"{type(self).__name__} cannot start landmarks: override invert(state, z) or initialise(state, z, cov)"
         )
 
-    def initialise(
-        self, state: Float[np.ndarray, "N E"], z: Float[np.ndarray, "K p"], cov: Float[np.ndarray, "K p p"]
-    ) -> Records:
+    def initialise(self, state: Float[np.ndarray, "N E"], z: Z, cov: CovZ) -> Records:
         """First estimate of landmarks from (N, E), (K, p), (K, p, p).
 
         By default `invert`, with the covariance J R Jᵀ of its numeric derivative by the measurement.
@@ -442,30 +443,18 @@ class Map(Conditional):
 
     @abstractmethod
     def innovations(
-        self,
-        model: ObservationModel,
-        z: Float[np.ndarray, "K p"],
-        ids: Ids,
-        state: Float[np.ndarray, " E"],
-        particle: int,
-    ) -> tuple[Float[np.ndarray, "K p"], Jacobians, Records]:
+        self, model: ObservationModel, z: Z, ids: Ids, state: Float[np.ndarray, " E"], particle: int
+    ) -> tuple[Z, Jacobians, Records]:
         """ν (K, p) of landmarks (K,) in one particle at a state (E,), its Jacobians, and the records (1, K, …)."""
 
     @abstractmethod
     def predictions(
-        self,
-        model: ObservationModel,
-        z: Float[np.ndarray, "K p"],
-        cov: Float[np.ndarray, "K p p"],
-        ids: Int[np.ndarray, " M"],
-        belief: "Belief",
+        self, model: ObservationModel, z: Z, cov: CovZ, ids: Int[np.ndarray, " M"], belief: "Belief"
     ) -> tuple[Float[np.ndarray, "N K M p"], Float[np.ndarray, "N K M p p"]]:
         """See `Belief.predictions`."""
 
     @abstractmethod
-    def project(
-        self, model: ObservationModel, ids: Ids, belief: "Belief"
-    ) -> tuple[Float[np.ndarray, "K p"], Float[np.ndarray, "K p p"]]:
+    def project(self, model: ObservationModel, ids: Ids, belief: "Belief") -> tuple[Z, CovZ]:
         """See `Belief.project`."""
 
 
@@ -509,25 +498,19 @@ class Belief:
         """Estimates (1, K, …) in the particle of highest weight alone."""
         return self.read(ids, slice(self.mode, self.mode + 1))
 
-    def innovations(
-        self, model: ObservationModel, z: Float[np.ndarray, "K p"], ids: Ids
-    ) -> tuple[Float[np.ndarray, "K p"], Float[np.ndarray, "K p d"], Float[np.ndarray, "K p p"]]:
+    def innovations(self, model: ObservationModel, z: Z, ids: Ids) -> tuple[Z, Float[np.ndarray, "K p d"], CovZ]:
         """Of K measurements in the particle of highest weight: ν (K, p), ∂z/∂state (K, p, d) and J P Jᵀ (K, p, p)."""
         nu, jac, records = self.map.innovations(model, z, ids, self.state[self.mode], self.mode)
         assert jac.state is not None and jac.landmark is not None
         return nu, jac.state, jac.landmark @ records.cov[0] @ np.swapaxes(jac.landmark, -1, -2)
 
     def predictions(
-        self,
-        model: ObservationModel,
-        z: Float[np.ndarray, "K p"],
-        cov: Float[np.ndarray, "K p p"],
-        ids: Int[np.ndarray, " M"],
+        self, model: ObservationModel, z: Z, cov: CovZ, ids: Int[np.ndarray, " M"]
     ) -> tuple[Float[np.ndarray, "N K M p"], Float[np.ndarray, "N K M p p"]]:
         """Innovations ν (N, K, M, p) of K measurements against M landmarks, and S + H Q Hᵀ (N, K, M, p, p)."""
         return self.map.predictions(model, z, cov, ids, self)
 
-    def project(self, model: ObservationModel, ids: Ids) -> tuple[Float[np.ndarray, "K p"], Float[np.ndarray, "K p p"]]:
+    def project(self, model: ObservationModel, ids: Ids) -> tuple[Z, CovZ]:
         """Where landmarks will be measured: mean (K, p) and covariance (K, p, p) under all particles (E06 §4.1).
 
         The covariance is within + between particles, H Q Hᵀ included, without the measurement's own noise.

@@ -108,8 +108,8 @@ def _robot_texts(m: Measurements) -> dict[str, str]:
         "space": repr(m.space),
         "measurement": m.measurement,
         "pitch_sign": f"{m.pitch_sign:g}",
-        "robot_from_sensor": _joined(m.robot_from_sensor, " "),
-        "start": _joined(m.start, " "),
+        "robot_from_sensor": " ".join(map(repr, m.robot_from_sensor.tolist())),
+        "start": " ".join(map(repr, m.start.tolist())),
         "start_stamp_ns": str(int(m.stamps_ns[0])),
     }
     observed = np.stack([m.steps, m.stamps_ns[m.steps], m.landmarks], axis=1)
@@ -268,10 +268,6 @@ def _moves(space: SE2Group | SE3Group) -> list[str]:
 
 def _triangle(count: int) -> list[str]:
     return [f"c{i}{j}" for i in range(count) for j in range(i + 1)]
-
-
-def _joined(numbers: Array, separator: str) -> str:
-    return separator.join(map(repr, numbers.tolist()))
 
 
 @final
