@@ -30,10 +30,10 @@ def distances(points: np.ndarray) -> np.ndarray:
     return np.hypot(points[..., :1] - BEACONS[:, 0], points[..., 1:] - BEACONS[:, 1])
 
 
-def simulate(rng: np.random.Generator) -> np.ndarray:
+def simulate(rng: np.random.Generator, steps: int = STEPS) -> np.ndarray:
     """Measurements (T, 2)."""
-    walk = STD_START * rng.normal(size=2) + np.cumsum(STD_WALK * rng.normal(size=(STEPS, 2)), axis=0)
-    return distances(walk) + STD_RANGE * rng.normal(size=(STEPS, 2))
+    walk = STD_START * rng.normal(size=2) + np.cumsum(STD_WALK * rng.normal(size=(steps, 2)), axis=0)
+    return distances(walk) + STD_RANGE * rng.normal(size=(steps, 2))
 
 
 class Walk(MotionModel):
@@ -71,10 +71,10 @@ class Ranging(Sensor):
 class OurRun:
     """`rbpf`."""
 
-    def __init__(self, n: int, data: np.ndarray, seed: int) -> None:
+    def __init__(self, n: int, data: np.ndarray, seed: int, lag: int | None = 1) -> None:
         rng = np.random.default_rng(seed)
         start = STD_START * rng.normal(size=(n, 2))
-        self.filter = Filter(Walk(), Ranging(), (), PriorProposal(), Systematic(), n, rng, start, lag=1)
+        self.filter = Filter(Walk(), Ranging(), (), PriorProposal(), Systematic(), n, rng, start, lag=lag)
         self.frames = list(data)[::-1]
 
     def step(self) -> None:

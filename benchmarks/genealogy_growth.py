@@ -1,10 +1,12 @@
-"""Nodes of the genealogy against steps and particles; theory: T + C·N log N (P. Jacob et al., 2015)."""
+"""Nodes of the genealogy against steps and particles; theory: T + C·N log N (P. Jacob et al., 2015). What kept paths cost."""
 
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks.bootstrap_peers import OurRun, simulate
 from benchmarks.rows import Row, Settings
 from rbpf.core.genealogy import Lineage
 from rbpf.core.particles import effective_sample_size
@@ -71,7 +73,32 @@ def run(settings: Settings) -> list[Row]:
         for label, threshold in (("always", np.inf), ("ESS < N/2", 0.5))
     }
     plot(curves, steps)
-    return [row(label, by_n, steps) for label, by_n in curves.items()]
+    return [*(row(label, by_n, steps) for label, by_n in curves.items()), history()]
+
+
+def history() -> Row:
+    """Whole paths kept, beside a lag of one step: 100,000 particles, resampled at every step, the last 20 of 100."""
+    milliseconds = []
+    for lag in (1, None):
+        contestant, seconds = OurRun(100_000, simulate(np.random.default_rng(0), 100), 0, lag), []
+        for _ in range(100):
+            started = time.perf_counter()
+            contestant.step()
+            seconds.append(time.perf_counter() - started)
+        milliseconds.append(1e3 * float(np.median(seconds[-20:])))
+    short, whole = milliseconds
+    return Row(
+        "history kept, N=100000",
+        whole,
+        "ms per step",
+        "a lag of one step",
+        short,
+        whole / short,
+        higher=False,
+        aim="<= 3 times a lag of one step",
+        met=whole <= 3.0 * short,
+        tolerance=0.6,
+    )
 
 
 def row(label: str, curves: dict[int, Curve], steps: int) -> Row:

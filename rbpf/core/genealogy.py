@@ -13,10 +13,13 @@ from rbpf.arrays import Int
 from rbpf.core.checkpoint import integers, numbers, read, read_one
 from rbpf.errors import InputError
 from rbpf.kernels import forest
+from rbpf.ranges import require_memory
 
 _FIRST_CHECK = 4
 """Age in generations at which a block is first looked through for dead rows; it then grows by a quarter each time."""
 
+_MEMORY_CHECK = 64
+"""Steps between two looks at whether the paths still fit."""
 
 DUE = integers("due", 2, least=0)
 """Of a `Schedule`."""
@@ -258,7 +261,16 @@ class History:
         self._steps = 0
 
     def record(self, stamp_ns: int, state: np.ndarray, log_weights: np.ndarray) -> None:
-        """Stores the states (N, E) after a step."""
+        """Stores the states (N, E) after a step.
+
+        Raises:
+            InputError: the paths no longer fit into the machine's memory.
+        """
+        if self._steps % _MEMORY_CHECK == 0:
+            paths = (
+                f"the paths of {self.lineage.n} particles over {self._steps + _MEMORY_CHECK} steps (a lag keeps fewer)"
+            )
+            require_memory(8.0 * state[0].size * (self.stored_states + _MEMORY_CHECK * self.lineage.n), paths)
         now = self.lineage.generation
         block = self._by_generation.get(now)
         if block is None:
