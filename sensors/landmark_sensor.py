@@ -5,7 +5,7 @@ from typing import Protocol, final
 
 import numpy as np
 
-from rbpf.core.likelihoods import ExistenceModel, Gates, associate
+from rbpf.core.likelihoods import ExistenceModel, Gates, GaussianWithOutliers, associate
 from rbpf.core.models import NEW, Belief, Landmark, Likelihood, NewLandmarks, ObservationModel, Observations, Sensor
 from rbpf.errors import InputError
 
@@ -23,13 +23,17 @@ class NamedLandmarkSensor(Sensor):
     """Known association: each observation carries the landmark's number, which is its id in the map.
 
     A number that the map does not hold starts a landmark. Names that are text have to be numbered by the caller. Without a
-    likelihood that of the innovation is Gaussian.
+    likelihood that of the innovation is Gaussian. With one that knows outliers, a landmark whose second observation
+    contradicts the first is begun anew with it: either may be the wrong one.
     """
 
     def __init__(self, model: ObservationModel, landmark: Landmark, likelihood: Likelihood | None = None) -> None:
         self.model = model
         self.landmark = landmark
         self.likelihood = likelihood
+        self.alone: set[int] = set()
+        """Landmarks that were observed once, by a likelihood that knows outliers."""
+        self._contradicted = np.zeros(0, dtype=np.int64)
 
     def observe(self, frame: LandmarkFrame, belief: Belief) -> Sequence[Observations]:
         """The observations of landmarks that the map holds."""
@@ -37,21 +41,34 @@ class NamedLandmarkSensor(Sensor):
             first = frame.landmarks[0]
             raise InputError(f"landmarks must be whole numbers from 0 up, got {first!r}: number their names")
         known = belief.map.holds(frame.landmarks)
+        self._contradicted = self._contradicted[:0]
         if not known.any():
             return []
         ids = frame.landmarks[known]
+        second = np.flatnonzero(known & np.isin(frame.landmarks, list(self.alone)))
+        if second.size:
+            predicted, cov = belief.project(self.model, frame.landmarks[second])
+            nu = self.model.residual(frame.z[second], predicted)
+            assert self.likelihood is not None
+            agrees = self.likelihood.inlier(nu, cov + frame.cov_z[second])
+            self.alone -= set(frame.landmarks[second].tolist())
+            self._contradicted = np.unique(frame.landmarks[second[~agrees]])
         return [Observations(frame.z[known], frame.cov_z[known], self.model, self.likelihood, ids)]
 
     def new_landmarks(
         self, frame: LandmarkFrame, belief: Belief, observed: Sequence[Observations]
     ) -> Sequence[NewLandmarks]:
         """The first observation of each new landmark; a second one in the same frame is left to the next frame."""
+        if self._contradicted.size:
+            belief.map.remove(self._contradicted)
         first = np.zeros(frame.landmarks.size, dtype=bool)
         first[np.unique(frame.landmarks, return_index=True)[1]] = True
         new = first & ~belief.map.holds(frame.landmarks)
         if not new.any():
             return []
         ids = frame.landmarks[new]
+        if isinstance(self.likelihood, GaussianWithOutliers):
+            self.alone |= set(ids.tolist())
         return [NewLandmarks(frame.z[new], frame.cov_z[new], self.model, self.landmark, ids=ids)]
 
 

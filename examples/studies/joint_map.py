@@ -19,6 +19,7 @@ from rbpf.runs.reading import PathAndMap
 from rbpf.runs.recordings import filter_robot_log
 from rbpf.runs.truth import truth_at
 from rbpf.sensors.readers import RobotLog, open_log
+from rbpf.systems.filtering import LikelihoodConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.validation.consistency.statistic import whitened_errors
 from rbpf.validation.metrics.scores import score_estimate
@@ -26,6 +27,8 @@ from rbpf.validation.simulation.robot import RobotWorld, simulated_log
 from rbpf.validation.tables import write_table
 
 JOINT = RangeBearingConfig(map="joint")
+PARTICLES = RangeBearingConfig(likelihood=LikelihoodConfig("gaussian"))
+"""Of the same likelihood."""
 RECORDINGS = ("mrpt_kf_slam_2d", "mrpt_kf_slam_6d", "mrclam6_robot1")
 
 
@@ -79,7 +82,7 @@ def simulated(
             trials[f"joint, {n} particles, window {window}"] = RobotTrial(
                 world, replace(JOINT, particles=n, window=window)
             )
-        trials[f"particles, {n}"] = RobotTrial(world, RangeBearingConfig(particles=n))
+        trials[f"particles, {n}"] = RobotTrial(world, replace(PARTICLES, particles=n))
     return {name: run_trials(trial, range(runs), workers) for name, trial in trials.items()}
 
 
@@ -172,7 +175,7 @@ def main(
     write_table(out / "joint_map.csv", header, rows)
     if recordings is not None:
         configs = {f"joint, 50, window {w}": replace(JOINT, particles=50, window=w) for w in windows}
-        configs["particles, 100"] = RangeBearingConfig()
+        configs["particles, 100"] = PARTICLES
         header = [
             "recording", "filter", "seeds", "path [m]", "range", "landmarks [m]", "range", "log-evidence, range",
             "ms per step",

@@ -22,7 +22,7 @@ from rbpf.core.checkpoint import elements, integers, numbers, read, read_one
 from rbpf.core.filter import Filter, StepReport
 from rbpf.core.likelihoods import Gaussian
 from rbpf.core.linearisation import information, innovation_covariance, linearise
-from rbpf.core.models import Landmark, LineariseAt, NewLandmarks, ObservationModel, Records
+from rbpf.core.models import Landmark, Likelihood, LineariseAt, NewLandmarks, ObservationModel, Records
 from rbpf.core.particles import Estimate, Information, Prior, mixture_estimate
 from rbpf.core.proposals import EkfProposal
 from rbpf.errors import InputError
@@ -54,16 +54,18 @@ def relative_estimate(
 class StartAnchor:
     """Remembers the first frame and motion of a filter started from one known state, and re-estimates the start.
 
-    Call `after_step` after every step; between re-estimations, `every` so many, descendants inherit their ancestor's.
+    Call `after_step` after every step; between re-estimations, `every` so many, descendants inherit their ancestor's. The
+    likelihood is of the first frame's innovations, by default Gaussian.
     """
 
-    def __init__(self, filter_: Filter, every: int = 10) -> None:
+    def __init__(self, filter_: Filter, every: int = 10, likelihood: Likelihood | None = None) -> None:
         if every < 1:
             raise InputError(f"an anchor is re-estimated every 1, 2, … steps, got {every}")
         self._filter = filter_
         self._every = every
         self._start = filter_.particles.state[0].copy()
         self._proposal = EkfProposal(iterations=2)
+        self._likelihood = likelihood or Gaussian()
         self._seen: list[tuple[np.ndarray, NewLandmarks]] = []
         self._second: _FirstMotion | None = None
         self._latest: tuple[int, Anchored] | None = None
@@ -119,7 +121,7 @@ class StartAnchor:
                 records = landmark_map.read(ids[held])
                 present = ~np.isneginf(landmark_map.log_odds(ids[held]))
                 groups.append(self._without_first_frame(records, first.model, first.z[held], first.cov[held], present))
-        proposed = self._proposal.propose(prior, _linearised_first_frame(prior, groups))
+        proposed = self._proposal.propose(prior, _linearised_first_frame(prior, groups, self._likelihood))
         mean = prior.at(np.einsum("nar,nr->na", prior.factor, proposed.mean))
         # A square factor (N, d, d), also of noise of lower rank.
         factor = prior.factor @ proposed.root
@@ -228,7 +230,7 @@ class _Group:
     use: np.ndarray
 
 
-def _linearised_first_frame(prior: Prior, groups: list[_Group]) -> LineariseAt:
+def _linearised_first_frame(prior: Prior, groups: list[_Group], likelihood: Likelihood) -> LineariseAt:
     space = prior.space
 
     def linearise_at(increment: np.ndarray) -> Information:
@@ -239,7 +241,7 @@ def _linearised_first_frame(prior: Prior, groups: list[_Group]) -> LineariseAt:
             nu, jac = linearise(group.model, space, group.z, state[:, None], records.mean, records.const)
             assert jac.state is not None and jac.landmark is not None
             cov = innovation_covariance(jac.landmark, records.cov, group.cov_z)
-            total.add(information(nu, jac.state, cov, Gaussian(), prior, group.use))
+            total.add(information(nu, jac.state, cov, likelihood, prior, group.use))
         charted = total.charted(np.broadcast_to(space.right_jacobian(increment), total.info.shape))
         return charted.shifted(np.broadcast_to(increment - prior.mean, (state.shape[0], space.dim)))
 

@@ -16,8 +16,8 @@ from rbpf.ranges import Fraction, Positive, Probability, Range, Ranged
 class LikelihoodConfig(Ranged):
     """Likelihood of an innovation."""
 
-    #: Gaussian, truncated Mahalanobis (S05 (6)), or Gaussian with outliers.
-    kind: Literal["gaussian", "truncated", "outliers"] = "gaussian"
+    #: Gaussian, truncated Mahalanobis (S05 (6)), or Gaussian with outliers; by default the system's.
+    kind: Literal["gaussian", "truncated", "outliers"] | None = None
     truncation: Positive = 4.0  #: T_l of the truncated form, which bounds the weight.
     #: of the truncated form, squared Mahalanobis distance beyond which a landmark is not updated either; 16.3 holds
     #: 99.9 % of a Gaussian in three dimensions.

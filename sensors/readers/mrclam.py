@@ -12,7 +12,8 @@ A folder with blank-separated tables, `#` starting a comment; `Robot1` stands fo
   [rad], and subject, x [m], y [m], standard deviations of both [m].
 
 A frame is an instant at which at least one landmark was observed. The motion between two frames and its covariance come
-from `integrate`, with the standard deviations of `DEFAULT_NOISE`, as the log names none. A folder with several robots is
+from `integrate`, with the standard deviations of `DEFAULT_NOISE`, as the log names none. Some barcodes
+are misread, which the log cannot say either. A folder with several robots is
 read by the path of one's `..._Measurement.dat`.
 K. Y. K. Leung, Y. Halpern, T. D. Barfoot, H. H. T. Liu, "The UTIAS multi-robot cooperative localization and
 mapping dataset", IJRR 30(8), 2011.
@@ -78,6 +79,7 @@ class Mrclam(RobotLogFormat):
             measurement="range_bearing",
             robot_from_sensor=SE2.identity(),
             frames=assemble(stamps, delta, cov_delta, frame, landmarks, z, cov_z),
+            misread=True,
             truth=_read_truth(folder / f"{prefix}_Groundtruth.dat", folder / "Landmark_Groundtruth.dat"),
         )
 

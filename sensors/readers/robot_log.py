@@ -78,6 +78,7 @@ class RobotLog:
         pitch_sign: +1 where positive pitch points up, -1 where it points down.
         frames: the steps in order of time.
         truth: ground truth, None where the log has none.
+        misread: whether a reading may be of another landmark than the log says, as of barcodes read by a camera.
     """
 
     name: str
@@ -87,6 +88,7 @@ class RobotLog:
     frames: list[Frame]
     pitch_sign: float = 1.0
     truth: Truth | None = None
+    misread: bool = False
 
 
 @dataclass(frozen=True)

@@ -172,7 +172,7 @@ def test_a_cut_checkpoint_is_said(began, log, tmp_path, capsys):
         (["--particles", "31"], "particles = 30, this one has 31"),
         (["--association", "ml"], 'association = "known", this one has "ml"'),
         (["--set", "noise.std_range_m=5"], "noise.std_range_m = null, this one has 5.0"),
-        (["--set", "likelihood.kind=outliers"], 'likelihood.kind = "gaussian", this one has "outliers"'),
+        (["--set", "likelihood.kind=outliers"], 'likelihood.kind = null, this one has "outliers"'),
         (["--set", "anchor_every=0"], "anchor_every = 10, this one has 0"),
         (["--set", "lag=3"], "lag = null, this one has 3"),
     ],

@@ -1,11 +1,12 @@
 """Every setting of a range-bearing run, with its default, its unit and what it does."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
 import numpy as np
 
 from rbpf.core.likelihoods import ExistenceModel, Gates
+from rbpf.core.models import Likelihood
 from rbpf.errors import InputError
 from rbpf.ranges import Count, CountOrNone, NotNegative, Positive, Probability, Range, Ranged, Seed, check_ranges
 from rbpf.sensors.readers import LogNoise
@@ -61,10 +62,18 @@ class RangeBearingConfig:
     noise: LogNoise = field(default_factory=LogNoise)  #: standard deviations that replace the log's own.
     proposal: ProposalConfig = field(default_factory=ProposalConfig)  #: where particles are sampled.
     resampling: ResamplingConfig = field(default_factory=ResamplingConfig)  #: when and how.
-    likelihood: LikelihoodConfig = field(default_factory=LikelihoodConfig)  #: of an innovation.
+    #: of an innovation; by default Gaussian. Of a log whose readings may be misread (MRCLAM) with outliers, if the log's
+    #: names are used and map=particles: particles that differ in what no reading tells, as the heading after a blind
+    #: turn, are else chosen among by the first wrong one.
+    likelihood: LikelihoodConfig = field(default_factory=LikelihoodConfig)
     unknown: AssociationConfig = field(default_factory=AssociationConfig)  #: settings of unknown association.
 
     def __post_init__(self) -> None:
         check_ranges(self)
-        if self.map == "joint" and (self.association != "known" or self.likelihood.kind != "gaussian"):
+        if self.map == "joint" and (self.association != "known" or self.likelihood.kind not in (None, "gaussian")):
             raise InputError("map=joint takes association=known and likelihood.kind=gaussian: map=particles takes all")
+
+    def of_innovations(self, misread: bool) -> Likelihood:
+        """The likelihood of an innovation, where readings may be misread or not."""
+        robust = misread and self.likelihood.kind is None and self.association == "known" and self.map == "particles"
+        return (replace(self.likelihood, kind="outliers") if robust else self.likelihood).build()

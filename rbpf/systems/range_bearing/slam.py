@@ -45,6 +45,7 @@ class RangeBearingSlam(System):
         keep_associations: remember which landmark each particle took every observation for, until the end of the run
             tells which lineage survives; the memory that this takes grows with the run.
         wrapped: puts a sensor around the usual one, to change what it observes or starts.
+        misread: whether a reading may be of another landmark than is said.
     """
 
     name: ClassVar[str] = "range-bearing"
@@ -59,6 +60,7 @@ class RangeBearingSlam(System):
         pitch_sign: float = 1.0,
         keep_associations: bool = False,
         wrapped: Callable[[Sensor], Sensor] | None = None,
+        misread: bool = False,
     ) -> None:
         self.config = config = config or RangeBearingConfig()
         self.space, self.measurement, self.pitch_sign = space, measurement, pitch_sign
@@ -75,13 +77,14 @@ class RangeBearingSlam(System):
         self.joint = JointMap(space, compiled=config.compiled) if config.map == "joint" else None
         own = LandmarkMap(space, evidence=config.association == "ml", compiled=config.compiled)
         own.register(self.point)
-        likelihood = config.likelihood.build()
+        likelihood = config.of_innovations(misread)
         sensor: Sensor
         if config.association == "known":
             sensor = NamedLandmarkSensor(self.model, self.point, likelihood)
         else:
             evidence = unknown.gates(self.model.dim), unknown.existence()
             sensor = AnonymousLandmarkSensor(self.model, self.point, *evidence, likelihood)
+        self.sensor = sensor
         self.filter = Filter(
             OdometryMotion(space),
             sensor if wrapped is None else wrapped(sensor),
@@ -94,7 +97,7 @@ class RangeBearingSlam(System):
             consolidation=Consolidation(config.window, config.resampling.ess_threshold) if self.joint else None,
         )
         anchored = config.anchor_every and self.joint is None
-        self.anchor = StartAnchor(self.filter, config.anchor_every) if anchored else None
+        self.anchor = StartAnchor(self.filter, config.anchor_every, likelihood) if anchored else None
         self._names: set[int] = set()
         self._odometry = space.identity()
         self._associations = _Associations(self.filter) if keep_associations else None
@@ -123,7 +126,8 @@ class RangeBearingSlam(System):
     ) -> "RangeBearingSlam":
         """The system for the robot and the sensor of a log."""
         kind: Kind = "position" if log.measurement == "position" else "range_bearing"
-        return cls(config, log.space, kind, log.robot_from_sensor, log.pitch_sign, keep_associations, wrapped)
+        mount, sign = log.robot_from_sensor, log.pitch_sign
+        return cls(config, log.space, kind, mount, sign, keep_associations, wrapped, log.misread)
 
     def track(
         self,
@@ -247,12 +251,16 @@ class RangeBearingSlam(System):
 
     def arrays(self) -> dict[str, np.ndarray]:
         kept = {"names": np.array(sorted(self._names), dtype=np.int64), "odometry": self._odometry}
+        if isinstance(self.sensor, NamedLandmarkSensor):
+            kept["alone"] = np.array(sorted(self.sensor.alone), dtype=np.int64)
         if self._associations is not None:
             kept |= self._associations.arrays()
         return kept if self.anchor is None else kept | self.anchor.arrays()
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         self._names = set(read_one(arrays, "names", integers("names")).tolist())
+        if isinstance(self.sensor, NamedLandmarkSensor):
+            self.sensor.alone = set(read_one(arrays, "alone", integers("alone")).tolist())
         self._odometry = read_one(arrays, "odometry", elements(self.space))
         if self._associations is not None:
             self._associations.restore(arrays)
