@@ -95,7 +95,7 @@ def robot_causes(
         InputError: the recording is wrong, or has no ground truth.
     """
     log = open_log(recording, config.noise)
-    stamps_ns = log.stamps_ns
+    stamps_ns = np.array([frame.stamp_ns for frame in log.frames], dtype=np.int64)
     truth = None if log.truth is None else truth_at(log.space, log.truth, stamps_ns, "first frame")
     if truth is None:
         raise InputError(f"{recording} has no ground truth to measure errors by")
