@@ -113,7 +113,7 @@ def test_the_grid_is_fine_enough(world):
 @every_proposal
 @every_world
 def test_evidence_is_unbiased(world, proposal, stream):
-    assert_unbiased(world.log_ratios(world.measurements(2), proposal, stream, 500))
+    assert_unbiased(world.log_ratios(world.measurements(2), proposal, stream, 300))
 
 
 @pytest.mark.parametrize("iterations", [1, 3])
@@ -131,4 +131,4 @@ def test_evidence_with_outliers_is_unbiased(proposal, stream):
     """The gate decides who moves the proposal, the density of both decides the weight."""
     world = Scalar(lambda x: 0.9 * x, 0.6, lambda x: x, 0.6, 0.5, GaussianWithOutliers(0.1, 20.0))
     zs = world.measurements(4, outlier=5.0)
-    assert_unbiased(world.log_ratios(zs, proposal, stream, 500))
+    assert_unbiased(world.log_ratios(zs, proposal, stream, 300))
