@@ -2,9 +2,6 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 
 from rbpf.lie import SE2, SE3, Euclidean, LieGroup, Product
 
@@ -137,29 +134,3 @@ def test_weighted_mean_is_stationary_and_moves_with_its_cloud(group, rng):
     np.testing.assert_allclose(weights @ group.local(mean, cloud), np.zeros(group.dim), atol=1e-14)
     shift = random_elements(group, rng, ())
     assert_same(group, group.compose(shift, mean), group.mean(group.compose(shift, cloud), weights), 1e-13)
-
-
-@every_group
-@settings(max_examples=40)
-@given(
-    far=arrays(float, (3, 12), elements=st.floats(-20.0, 20.0)),
-    near=arrays(float, (2, 12), elements=st.floats(-3.0, 3.0)),
-    inside=arrays(float, 12, elements=st.floats(-1.0, 1.0)),
-)
-def test_any_input(group, far, near, inside):
-    """Vectors as long as the longest tangent; each group takes what it needs."""
-    a, b, c = group.exp(far[:, : group.dim])
-    compose, inverse = group.compose, group.inverse
-    tolerance = 1e-13 * (1.0 + np.abs(far).max())
-    assert_same(group, compose(compose(a, b), c), compose(a, compose(b, c)), tolerance)
-    assert_same(group, inverse(compose(a, b)), compose(inverse(b), inverse(a)), tolerance)
-    assert_same(group, a, group.exp(group.log(a)), tolerance)
-    # Three components of at most one turn by less than pi.
-    x, xi = group.exp(inside[: group.dim]), inside[::-1][: group.dim]
-    np.testing.assert_allclose(group.local(x, group.retract(x, xi)), xi, rtol=0.0, atol=1e-14)
-    # The adjoint is a homomorphism, and the left Jacobian over the right one.
-    a, b = group.exp(near[:, : group.dim])
-    product = group.adjoint(a) @ group.adjoint(b)
-    np.testing.assert_allclose(group.adjoint(compose(a, b)), product, atol=1e-12)
-    left = group.adjoint(a) @ group.right_jacobian(near[0, : group.dim])
-    np.testing.assert_allclose(left, group.left_jacobian(near[0, : group.dim]), atol=1e-12)

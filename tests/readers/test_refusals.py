@@ -25,48 +25,36 @@ every_format = pytest.mark.parametrize("name", FORMATS)
 LINES = """
 MRCLAM | Barcodes.dat | 3 | 3 5 | barcode 5 comes a second time
 MRCLAM | Barcodes.dat | 3 | 2 14.5 | expected barcode to be a whole number
-MRCLAM | Barcodes.dat | 3 | 0 14 | expected subject to be 1 or more
 MRCLAM | Robot3_Odometry.dat | 3 | 100.3 0.2 | expected 3 columns (time, forward speed, turn rate), found 2
 MRCLAM | Robot3_Odometry.dat | 3 | 99.9 0.2 1.0 | time runs backwards from 100.0 to 99.9
 MRCLAM | Robot3_Measurement.dat | 4 | 100.5 14 0 0 | expected range to be positive, found 0
 MRCLAM | Robot3_Measurement.dat | 4 | 100.5 14 2 30 | expected bearing to be in radians, within a turn, found 30
-MRCLAM | Robot3_Measurement.dat | 4 | 99.5 14 2 0 | time runs backwards from 100.1 to 99.5
 MRCLAM | Landmark_Groundtruth.dat | 3 | 6 3 4 0 0 | subject 6 comes a second time
 MRCLAM | Landmark_Groundtruth.dat | 3 | 7 3 4 0 -1 | expected std of y to be zero or positive
 MRPT | odometry.csv | 1 | step,x | expected the header
 MRPT | odometry.csv | 3 | 1,1,0,0,1,0,0,1,0,1 | expected step to be one more than in the row before
-MRPT | odometry.csv | 3 | 2,1,0,0,1,0,0,1,0 | expected 10 columns
 MRPT | odometry.csv | 3 | 2,1,,0,1,0,0,1,0,1 | expected dy_m to be a finite number, found ''
 MRPT | odometry.csv | 3 | 2,1,0,0,-1,0,0,1,0,1 | expected cxx to cpp to be a covariance
-MRPT | odometry.csv | 3 | 2,1,0,0,1,0.9,-0.9,1,0.9,1 | expected cxx to cpp to be a covariance
 MRPT | observations.csv | 2 | -1,7,3,0.1,0,0.01,0.02,0 | expected step to be one with odometry, 0 to 3
 MRPT | observations.csv | 3 | 2.5,8,4,0,0,0.03,0.04,0 | expected step to be a whole number, found 2.5
 MRPT | observations.csv | 3 | 0,7,4,0,0,0.03,0.04,0 | landmark 7 comes a second time in step 0
 MRPT | observations.csv | 3 | 3,8,4,0,0,0.03,0.04,0 | line 4: time runs backwards from step 3 to 2
 MRPT | observations.csv | 3 | 0,8,0,0,0,0.03,0.04,0 | expected range_m to be positive, found 0
-MRPT | observations.csv | 3 | 0,8,4,57,0,0.03,0.04,0 | expected yaw_rad to be in radians
 MRPT | observations.csv | 3 | 0,8,4,0,0.1,0.03,0.04,0 | expected pitch_rad to be 0, as the odometry is planar
-MRPT | observations.csv | 3 | 0,8,4,0,0,-0.03,0.04,0 | expected std_range_m to be positive
 MRPT | sensor.yaml | 2 | robot_from_sensor: 3 | expected the keys x_m, y_m
-MRPT | sensor.yaml | 2 | robot_from_sensor: {x_m: 0} | found no y_m
 MRPT | sensor.yaml | 2 | MOUNT with x_m: 0.5x | expected x_m to be a finite number
 MRPT | sensor.yaml | 2 | MOUNT with roll_deg: 5 | as the odometry is planar
 MRPT | sensor.yaml | 3 | x: 1 | expected the keys robot_from_sensor, positive_pitch; also known: std; found 'x'
 MRPT | sensor.yaml | 4 | positive_pitch: left | expected positive_pitch to be up or down, found 'left'
-MRPT | sensor.yaml | 4 | positive_pitch: } | expected YAML
 MRPT | robot_path_groundtruth.csv | 3 | 0,3,4,0,0,0,0 | expected step to be later
 MRPT | landmarks_groundtruth.csv | 3 | 7,1,2,3 | id 7 comes a second time
 graph | graph.txt | 2 | LANDMRK 1 2 3 -4 0.5 0.1 0.25 | expected ODOMETRY or LANDMARK, found 'LANDMRK'
-graph | graph.txt | 2 | LANDMARK | expected numbers after LANDMARK, found none
 graph | graph.txt | 2 | LANDMARK 1 2 3 -4 0.5 0.5 0.25 | expected cxx to cyy to be a covariance
 graph | graph.txt | 2 | LANDMARK 8 2 3 -4 0.5 0.1 0.25 | expected pose to be a pose of the odometry, found 8
 graph | graph.txt | 2 | LANDMARK 1 3 3 -4 0.5 0.1 0.25 | expected landmark to be a landmark's number, not a pose's,
 graph | graph.txt | 5 | LANDMARK 1 2 7 8 0.5 0 0.5 | landmark 2 comes a second time in pose 1
 graph | graph.txt | 3 | ODOMETRY 2 3 1 0 0 1 0 0 0 0 1 | expected odometry from pose 1, where the one before ends, fou
-graph | graph.txt | 3 | ODOMETRY 1 1 1 0 0 1 0 0 0 0 1 | to 1 comes a second time
 graph | graph.txt | 3 | ODOMETRY 1 0 1 0 0 1 0 0 0 0 1 | expected a path without loops, found a return to pose 0
-graph | graph.txt | 3 | ODOMETRY 1 3 1 0 0 1 0 0 -1 0 1 | expected cxx to ctt to be a covariance
-tracks | VO_calibration.txt | 1 | 700.0 710.0 0.0 600.0 180.0 0.5 1 | expected 6 columns
 tracks | VO_calibration.txt | 1 | 700 710 0.1 600 180 0.5 | expected no skew
 tracks | VO_calibration.txt | 1 | 700 710 0 600 180 -0.5 | the stereo baseline must be positive
 tracks | VO_camera_poses.txt | 1 | 1 1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1 | expected frame to be the line's number
@@ -76,14 +64,11 @@ tracks | VO_stereo_factors.txt | 2 | 0 7 620 600 200 0.5 0.5 17.5 | landmark 7 c
 tracks | VO_stereo_factors.txt | 1 | 0 7 600 620 200 1 1 1 | expected u_left to be greater
 wheels | odometry.csv | 4 | 150,0,0,0,0,0,0 | time runs backwards
 wheels | odometry.csv | 4 | 200,0,0,0,0,0,0 | expected a later time
-wheels | odometry.csv | 4 | 400,0,0,0,0,-1,0 | expected sigma_y_m to be zero or positive
 wheels | odometry.csv | 2 | 100,1,0,0,0,0,0 | expected no motion on the first line
 wheels | odometry.csv | 2 | 1.5,0,0,0,0,0,0 | expected a time in whole nanoseconds
 wheels | odometry.yaml | 1 | other: 1 | expected the keys robot_from_camera, found no robot_from_camera
-wheels | odometry.yaml | 1 | robot_from_camera: [0, 0, 0, 1, 0, 0] | expected robot_from_camera to be a list of 7
 wheels | odometry.yaml | 1 | robot_from_camera: [0, 0, 0, 2, 0, 0, 0] | expected robot_from_camera to begin with a unit
 known | known_points.csv | 1 | id,u_px,v_px,x_m,y_m,z_m | expected a header with the columns id,u_px,v_px,x_m,y_m
-known | known_points.csv | 2 | 1,2,3,4,5,6 | expected 7 columns as in the header, found 6
 known | known_points.csv | 3 | 7,2,3,4,5,6,0.1 | id 7 comes a second time
 known | known_points.csv | 2 | 1,2,3,4,5,6,-0.1 | expected sigma_m to be zero or positive, found -0.1
 """
@@ -99,7 +84,6 @@ FILES = [
     ("MRPT", {"sensor.yaml": "[" * 5000}, "sensor.yaml"),
     ("MRPT", {"sensor.yaml": '"\\UFFFFFFFF"'}, "sensor.yaml"),
     ("MRPT", {"sensor.yaml": f"%YAML {'1' * 5000}.1\n---\na: 1\n"}, "sensor.yaml"),
-    ("MRPT", {"sensor.yaml": "\x01"}, "sensor.yaml"),
     ("tracks", {"VO_calibration.txt": 2 * TRACKS["VO_calibration.txt"]}, "VO_calibration.txt, line 2: expected one line"),
     ("tracks", {"VO_calibration2.txt": "1"}, "found VO_calibration.txt, VO_calibration2.txt"),
     ("wheels", {"odometry.csv": "# only\n"}, "odometry.csv: expected lines that begin with a time"),

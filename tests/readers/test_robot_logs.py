@@ -9,7 +9,6 @@ import pytest
 from rbpf.errors import InputError
 from rbpf.lie import SE2, SE3
 from rbpf.sensors.readers import LogNoise, open_log
-from rbpf.sensors.readers.mrclam import integrate
 from tests.readers.small import COV_6D, DELTA_6D, GRAPH, MRCLAM, MRPT, MRPT_IN_SPACE, QUARTER, write
 
 SEEN = "Robot3_Measurement.dat"
@@ -70,21 +69,6 @@ def test_covariance_of_mrclam_is_that_of_white_noise(tmp_path):
     np.testing.assert_allclose(frame.cov_delta, 4 * moved_covariance([0.3, 0.2]), rtol=1e-7, atol=1e-10)
     noise = LogNoise(std_turn_rate_radps=0.0, std_speed_mps=0.0)
     np.testing.assert_array_equal(open_log(tmp_path, noise).frames[1].cov_delta, 0)
-
-
-def test_variance_of_a_straight_motion_grows_with_time_and_the_lever_with_its_cube():
-    instants = np.array([SECOND, 2 * SECOND, 4 * SECOND])
-    readings = np.arange(0, 4 * SECOND, SECOND // 100)
-    delta, cov = integrate(readings, np.zeros(400), np.full(400, 0.5), instants)
-    np.testing.assert_allclose(delta, [[0.0, 0.5, 0.0], [0.0, 1.0, 0.0]], atol=1e-12)
-    turning, driving = cov[:, 0], cov[:, 1]
-    np.testing.assert_allclose(turning[:, 0, 0], [1.0, 2.0])
-    np.testing.assert_allclose(turning[:, 2, 2], 0.25 * np.array([1.0, 8.0]) / 3, rtol=1e-4)
-    np.testing.assert_allclose(driving, [np.diag([0, 1.0, 0]), np.diag([0, 2.0, 0])], atol=1e-12)
-    # The robot stands still before the first reading.
-    instants = np.array([SECOND, 2 * SECOND, 5 * SECOND])
-    delta, _ = integrate(np.array([3 * SECOND]), np.array([0.0]), np.array([1.0]), instants)
-    np.testing.assert_allclose(delta, [[0, 0, 0], [0, 2, 0]])
 
 
 def test_one_of_several_robots_is_read_by_its_measurements(tmp_path):

@@ -10,8 +10,7 @@ from rbpf.errors import InputError
 from rbpf.lie import SE3
 from rbpf.sensors.readers import open_log, read_known_points
 from rbpf.sensors.readers.text import read_columns, read_csv
-from rbpf.sensors.readers.wheel_odometry import WheelOdometry, read_wheel_odometry
-from rbpf.validation.simulation.paths import write_wheel_odometry
+from rbpf.sensors.readers.wheel_odometry import read_wheel_odometry
 from tests.readers.small import KNOWN, SECOND, TRACKS, WHEELS, write
 
 COLUMNS = ("time", "x")
@@ -112,19 +111,6 @@ def test_wheel_odometry(tmp_path):
     poses = odometry.world_from_camera(start)
     np.testing.assert_allclose(poses[0], start, atol=1e-12)
     np.testing.assert_allclose(SE3.translation(SE3.between(poses[0], poses[2])), [0.5, 2.0, 0.0], atol=1e-12)
-
-
-def test_wheel_odometry_that_is_written_is_read(tmp_path):
-    rng = np.random.default_rng(0)
-    stamps = 1_400_000_000_000_000_000 + np.arange(20, dtype=np.int64) * 66_666_667
-    delta, std = rng.normal(0.0, 0.1, (19, 3)), rng.uniform(0.0, 0.1, (19, 3))
-    mount = SE3.exp(rng.normal(size=6))
-    write_wheel_odometry(tmp_path, WheelOdometry(stamps, delta, std, mount))
-    found = read_wheel_odometry(tmp_path)
-    np.testing.assert_array_equal(found.stamps_ns, stamps)
-    np.testing.assert_allclose(found.delta, delta, rtol=1e-8)
-    np.testing.assert_allclose(found.std, std, rtol=1e-8)
-    np.testing.assert_allclose(found.robot_from_camera, mount, atol=1e-12)
 
 
 def test_stereo_tracks(tmp_path):

@@ -143,25 +143,6 @@ def test_found_again_by_names(log):
     assert errors[0] < 0.5 * errors[1]
 
 
-def test_a_thing_that_moves_through_the_view(log):
-    """From frame 20 on points go along with a thing that crosses the view, more of them than the world's."""
-    rng, frames, count = np.random.default_rng(0), list(log.frames), 60
-    here = np.array([-0.4, -0.3, 2.0]) + rng.uniform(-0.3, 0.3, (count, 3))
-    cov, names = np.tile(0.3**2 * np.eye(3), (count, 1, 1)), 900_000 + np.arange(count)
-    for t in range(20, len(frames)):
-        one, gone = frames[t], np.array([0.05 * (t - 20), 0.0, 0.0])
-        frames[t] = replace(
-            one,
-            landmarks=np.append(one.landmarks, names),
-            z=np.concatenate([one.z, log.camera.project(here + gone) + 0.3 * rng.normal(size=(count, 3))]),
-            cov_z=np.concatenate([one.cov_z, cov]),
-        )
-    config = replace(CONFIG, likelihood=StereoConfig().likelihood)
-    run, whole = filtered(replace(log, frames=frames), config), filtered(log, config)
-    assert sum("something in the view moves" in message for message in run.messages) > 10
-    assert rmse(log, run.log.poses) < 1.3 * rmse(log, whole.log.poses)
-
-
 def test_one_camera_is_refused():
     with pytest.raises(InputError, match="stereo SLAM needs a log of a rectified pair"):
         filter_features(simulated(4, camera=MONO), CONFIG)
