@@ -43,6 +43,14 @@ def view(picture: np.ndarray, world_from_camera: np.ndarray) -> np.ndarray:
     return cv2.warpPerspective(picture, homography, (CAMERA.width, CAMERA.height), flags=cv2.INTER_AREA)
 
 
+def shown_at(px: np.ndarray) -> np.ndarray:
+    """Points (K, 3) of the plane that the first image shows at pixels (K, 2)."""
+    rays = np.concatenate([CAMERA.unproject(px), np.ones((len(px), 1))], axis=-1)
+    corner, side, down = on_plane(np.array([[500.0, 500.0], [501.0, 500.0], [500.0, 501.0]]))
+    normal = np.cross(side - corner, down - corner)
+    return rays * (normal @ corner / (rays @ normal))[:, None]
+
+
 def path(frames: int) -> np.ndarray:
     """Poses (T, 7): about ten centimetres to and fro in two seconds, and a little turning."""
     t = np.arange(frames) / 30.0
@@ -79,12 +87,7 @@ def sequence(
 def known_points() -> KnownPixels:
     """Eight points of the plane that the first image shows."""
     px = np.array([[60, 50], [250, 60], [70, 190], [240, 180], [160, 120], [110, 100], [200, 70], [150, 200]], float)
-    uv = CAMERA.unproject(px)
-    rays = np.concatenate([uv, np.ones((len(px), 1))], axis=-1)
-    corner, side, down = on_plane(np.array([[500.0, 500.0], [501.0, 500.0], [500.0, 501.0]]))
-    normal = np.cross(side - corner, down - corner)
-    points = rays * (normal @ corner / (rays @ normal))[:, None]
-    return KnownPixels(np.arange(len(px)), px, points, np.full(len(px), 0.002 * np.sqrt(3.0)))  # 2 mm per axis
+    return KnownPixels(np.arange(len(px)), px, shown_at(px), np.full(len(px), 0.002 * np.sqrt(3.0)))  # 2 mm per axis
 
 
 def made_up_map(count: int = 12) -> KnownMap:

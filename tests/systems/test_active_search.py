@@ -23,7 +23,7 @@ from rbpf.validation.metrics.accuracy import ate
 from rbpf.validation.simulation.desk_and_room import TexturedDesk
 from rbpf.validation.simulation.images import Imaging, simulate_images
 from tests.systems.mono_logs import SMALL
-from tests.systems.plane_sequences import CAMERA, known_points, on_plane, sequence, texture, view
+from tests.systems.plane_sequences import CAMERA, known_points, on_plane, sequence, shown_at, texture, view
 
 SEARCH = MonoConfig().search
 ALL = np.ones(20, dtype=bool)
@@ -46,10 +46,7 @@ def wall() -> tuple[ImageSensor, np.ndarray]:
     image = view(texture(), around(0.0))
     sensor = MonoSlam(CAMERA).sensor
     px = sensor.detector.detect(image, 40, None, 16.0, PATCH_HALF_PX + 30.0).px
-    rays = np.concatenate([CAMERA.unproject(px), np.ones((len(px), 1))], axis=1)
-    corner, side, down = on_plane(np.array([[500.0, 500.0], [501.0, 500.0], [500.0, 501.0]]))
-    normal = np.cross(side - corner, down - corner)
-    points = rays * (normal @ corner / (rays @ normal))[:, None]
+    points = shown_at(px)
     rows = sensor.table.add(np.array([cut(image, p, PATCH_HALF_PX) for p in px]), px, around(0.0))
     sensor.table.position[rows] = np.concatenate([points, np.ones((len(px), 1))], axis=1)
     return sensor, points
