@@ -59,5 +59,6 @@ class ResamplingConfig(Ranged):
 
     def build(self) -> Resampler:
         """The resampler; a subclass may make another one."""
-        schemes = {"systematic": Systematic, "stratified": Stratified, "residual": Residual, "multinomial": Multinomial}
-        return EssTriggered(schemes[self.scheme](), self.ess_threshold)
+        schemes: list[Resampler] = [Systematic(), Stratified(), Residual(), Multinomial()]
+        named = {type(scheme).__name__.lower(): scheme for scheme in schemes}
+        return EssTriggered(named[self.scheme], self.ess_threshold)
