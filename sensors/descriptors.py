@@ -32,20 +32,13 @@ GATHERED, PAIRS = 8, 65536
 
 @dataclass(frozen=True)
 class MatchLimits(Ranged):
-    """When a candidate is taken.
+    """When a candidate is taken."""
 
-    Attributes:
-        distance: the largest distance of two descriptors, at most 2; None for `LARGEST` of their length.
-        ratio: largest ratio of the distance to that of the second-best candidate (D. Lowe 2004, §7.1); 1 is no limit.
-        mutual: whether each has to be the other's nearest.
-
-    Raises:
-        InputError: a number is out of its range.
-    """
-
+    #: the largest distance of two descriptors, at most 2; None for `LARGEST` of their length.
     distance: Annotated[float | None, Range(gt=0.0, le=2.0)] = None
+    #: largest ratio of the distance to that of the second-best candidate (D. Lowe 2004, §7.1); 1 is no limit.
     ratio: Annotated[float, Range(gt=0.0, le=1.0)] = 0.8
-    mutual: bool = True
+    mutual: bool = True  #: whether each has to be the other's nearest.
 
     def largest(self, length: int) -> float:
         """Distance up to which descriptors of this length are taken."""
@@ -55,17 +48,11 @@ class MatchLimits(Ranged):
 @final
 @dataclass(frozen=True)
 class DescriptorMatches:
-    """Pairs of descriptors, each at most once on either side, in the order of the first set.
+    """Pairs of descriptors, each at most once on either side, in the order of the first set."""
 
-    Attributes:
-        first: (P,) rows of the first set.
-        second: (P,) rows of the second set.
-        distance: (P,) of the descriptors.
-    """
-
-    first: np.ndarray
-    second: np.ndarray
-    distance: np.ndarray
+    first: np.ndarray  #: (P,) rows of the first set.
+    second: np.ndarray  #: (P,) rows of the second set.
+    distance: np.ndarray  #: (P,) of the descriptors.
 
     def __len__(self) -> int:
         return self.first.size

@@ -23,20 +23,7 @@ _KEPT = {"table": integers("landmarks", 3, least=0), "counters": integers(2, lea
 
 @dataclass(frozen=True)
 class NewLandmarkConfig(Ranged):
-    """Which features become landmarks, and how long candidates are kept.
-
-    Attributes:
-        max_per_frame: new candidates in a frame at most.
-        distinct: least distance of a new descriptor from those held and from other new ones; None for `DISTINCT`.
-        spacing_px: least distance of a new candidate's pixel from those of matched features and of other new candidates.
-        cells: the image is divided into so many columns and rows, which fill evenly.
-        patience: a candidate that has not been observed in so many frames is dropped.
-        observations: a candidate that was observed so often is a landmark, the first time included.
-        max_candidates: candidates at most.
-
-    Raises:
-        InputError: a number is out of its range.
-    """
+    """Which features become landmarks, and how long candidates are kept."""
 
     RENAMED: ClassVar[dict[str, str]] = {
         "per_frame": "max_per_frame",
@@ -44,13 +31,16 @@ class NewLandmarkConfig(Ranged):
         "waiting": "max_candidates",
     }
 
-    max_per_frame: CountOrNone = 15
+    max_per_frame: CountOrNone = 15  #: new candidates in a frame at most.
+    #: least distance of a new descriptor from those held and from other new ones; None for `DISTINCT`.
     distinct: Annotated[float | None, Range(ge=0.0, le=2.0)] = None
+    #: least distance of a new candidate's pixel from those of matched features and of other new candidates.
     spacing_px: NotNegative = 10.0
+    #: the image is divided into so many columns and rows, which fill evenly.
     cells: Annotated[int, Range(ge=1, le=1000)] = 6
-    patience: Count = 3
-    observations: Count = 3
-    max_candidates: CountOrNone = 60
+    patience: Count = 3  #: a candidate that has not been observed in so many frames is dropped.
+    observations: Count = 3  #: a candidate that was observed so often is a landmark, the first time included.
+    max_candidates: CountOrNone = 60  #: candidates at most.
 
 
 @final

@@ -23,19 +23,12 @@ SHEET_PAD_PX = 6
 
 @dataclass(frozen=True)
 class Keypoints:
-    """Keypoints of an image, best first.
+    """Keypoints of an image, best first."""
 
-    Attributes:
-        px: (K, 2) pixel.
-        scale: (K,) standard deviation of the Gaussian at which each was found, px.
-        orientation: (K,) direction, [0, 2π), from the columns' axis towards the rows'.
-        score: (K,) of the detector, in its unit.
-    """
-
-    px: np.ndarray
-    scale: np.ndarray
-    orientation: np.ndarray
-    score: np.ndarray
+    px: np.ndarray  #: (K, 2) pixel.
+    scale: np.ndarray  #: (K,) standard deviation of the Gaussian at which each was found, px.
+    orientation: np.ndarray  #: (K,) direction, [0, 2π), from the columns' axis towards the rows'.
+    score: np.ndarray  #: (K,) of the detector, in its unit.
 
     @classmethod
     def at(
@@ -61,13 +54,9 @@ class Keypoints:
 @final
 @dataclass(frozen=True)
 class Features(Keypoints):
-    """Keypoints of an image with their descriptors, best first.
+    """Keypoints of an image with their descriptors, best first."""
 
-    Attributes:
-        descriptors: (K, d) float32 of length 1.
-    """
-
-    descriptors: np.ndarray
+    descriptors: np.ndarray  #: (K, d) float32 of length 1.
 
 
 class Detector(ABC):

@@ -20,37 +20,24 @@ import numpy as np
 from rbpf.ranges import CountOrNone, NotNegative, Range, Ranged
 from rbpf.sensors.features.interface import Descriptor, FeatureExtractor, Features, Keypoints, checked_image
 
-LENGTHS = (36, 128)
-
 _SIGMA = 1.6
 """Blur of the first image of an octave; OpenCV's default, which is Lowe's."""
 
 
 @dataclass(frozen=True)
 class SiftConfig(Ranged):
-    """Settings of the detector and of the descriptors.
+    """Settings of the detector and of the descriptors."""
 
-    Attributes:
-        features: the most keypoints of an image, those of highest contrast; 0 for all.
-        working_scale: the image is reduced by this before it is looked at, 0.5 for half of each side; places and
-            scales stay in pixels of the image that was given.
-        contrast: least contrast of an extremum; OpenCV's unit, Lowe's 0.03 is 0.09 with three layers.
-        edge: largest ratio of principal curvatures.
-        layers: scales per octave.
-        length: of a descriptor, 36 or 128.
-        norm: "root" or "sift", see the module.
-
-    Raises:
-        InputError: a number is out of its range.
-    """
-
-    features: CountOrNone = 1000
+    features: CountOrNone = 1000  #: the most keypoints of an image, those of highest contrast; 0 for all.
+    #: the image is reduced by this before it is looked at, 0.5 for half of each side; places and scales stay in
+    #: pixels of the image that was given.
     working_scale: Annotated[float, Range(gt=0.0, le=1.0)] = 0.5
+    #: least contrast of an extremum; OpenCV's unit, Lowe's 0.03 is 0.09 with three layers.
     contrast: NotNegative = 0.04
-    edge: Annotated[float, Range(gt=1.0)] = 10.0
-    layers: Annotated[int, Range(ge=1, le=20)] = 3
-    length: Literal[36, 128] = 36
-    norm: Literal["root", "sift"] = "root"
+    edge: Annotated[float, Range(gt=1.0)] = 10.0  #: largest ratio of principal curvatures.
+    layers: Annotated[int, Range(ge=1, le=20)] = 3  #: scales per octave.
+    length: Literal[36, 128] = 36  #: of a descriptor, 36 or 128.
+    norm: Literal["root", "sift"] = "root"  #: "root" or "sift", see the module.
 
 
 @final

@@ -20,19 +20,13 @@ LARGEST_SIZE = 101
 @final
 @dataclass(frozen=True)
 class PatchMatches:
-    """Where templates were found, one row each.
+    """Where templates were found, one row each."""
 
-    Attributes:
-        px: (K, 2) place to a fraction of a pixel; NaN where nothing was searched.
-        score: (K,) normalised cross-correlation at the place, −1 where nothing was searched.
-        second: (K,) that of the next peak in the ellipse, at least 3 px away; −1 where there is none.
-        cov: (K, 2, 2) of the place, from the residual and the image's slopes [px²]; NaN where the place is a whole
-            pixel on a slope that rises beyond the ellipse, or where noise alone explains the image's slopes.
-    """
-
-    px: np.ndarray
-    score: np.ndarray
-    second: np.ndarray
+    px: np.ndarray  #: (K, 2) place to a fraction of a pixel; NaN where nothing was searched.
+    score: np.ndarray  #: (K,) normalised cross-correlation at the place, −1 where nothing was searched.
+    second: np.ndarray  #: (K,) that of the next peak in the ellipse, at least 3 px away; −1 where there is none.
+    #: (K, 2, 2) of the place, from the residual and the image's slopes [px²]; NaN where the place is a whole pixel on
+    #: a slope that rises beyond the ellipse, or where noise alone explains the image's slopes.
     cov: np.ndarray
 
     @property

@@ -37,17 +37,11 @@ CAUCHY_SCALE = 2.0
 
 
 class MotionFit(NamedTuple):
-    """A motion that most of K matches agree on: an increment ε of the heaviest particle's predicted pose.
+    """A motion that most of K matches agree on: an increment ε of the heaviest particle's predicted pose."""
 
-    Attributes:
-        squared: (K,) squared Mahalanobis distance of each match from it.
-        increment: (d,) ε.
-        cov: (d, d) of ε.
-    """
-
-    squared: np.ndarray
-    increment: np.ndarray
-    cov: np.ndarray
+    squared: np.ndarray  #: (K,) squared Mahalanobis distance of each match from it.
+    increment: np.ndarray  #: (d,) ε.
+    cov: np.ndarray  #: (d, d) of ε.
 
 
 class OutlierGate(ABC):
@@ -102,29 +96,20 @@ _EMPTY_PX = partial(np.zeros, (0, 2))
 
 @dataclass(frozen=True)
 class SearchResult:
-    """What was looked for in a frame, K features.
+    """What was looked for in a frame, K features."""
 
-    Attributes:
-        features: (K,) their rows in the table.
-        mean: (K, 2) predicted places, px.
-        cov: (K, 2, 2) with the noise of the measurement, px².
-        px: (K, 2) best match of each; NaN where nothing was compared.
-        score: (K,) its normalised cross-correlation.
-        found: (K,) whether it was accepted.
-        ambiguous: (K,) whether another place in the ellipse looks about as much like it.
-        in_view: (V, 2) predicted places of all features that were worth looking for, chosen or not, px.
-        seconds_choosing: time of the choice of what to look for: all that grows with the map.
-    """
-
-    features: np.ndarray = field(default_factory=partial(np.zeros, 0, np.int64))
-    mean: np.ndarray = field(default_factory=_EMPTY_PX)
+    features: np.ndarray = field(default_factory=partial(np.zeros, 0, np.int64))  #: (K,) their rows in the table.
+    mean: np.ndarray = field(default_factory=_EMPTY_PX)  #: (K, 2) predicted places, px.
+    #: (K, 2, 2) with the noise of the measurement, px².
     cov: np.ndarray = field(default_factory=partial(np.zeros, (0, 2, 2)))
-    px: np.ndarray = field(default_factory=_EMPTY_PX)
-    score: np.ndarray = field(default_factory=partial(np.zeros, 0))
-    found: np.ndarray = field(default_factory=partial(np.zeros, 0, np.bool_))
+    px: np.ndarray = field(default_factory=_EMPTY_PX)  #: (K, 2) best match of each; NaN where nothing was compared.
+    score: np.ndarray = field(default_factory=partial(np.zeros, 0))  #: (K,) its normalised cross-correlation.
+    found: np.ndarray = field(default_factory=partial(np.zeros, 0, np.bool_))  #: (K,) whether it was accepted.
+    #: (K,) whether another place in the ellipse looks about as much like it.
     ambiguous: np.ndarray = field(default_factory=partial(np.zeros, 0, np.bool_))
+    #: (V, 2) predicted places of all features that were worth looking for, chosen or not, px.
     in_view: np.ndarray = field(default_factory=_EMPTY_PX)
-    seconds_choosing: float = 0.0
+    seconds_choosing: float = 0.0  #: time of the choice of what to look for: all that grows with the map.
 
 
 @final

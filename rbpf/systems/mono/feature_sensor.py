@@ -42,15 +42,10 @@ GroupView = ConstellationView | MembersView
 
 
 class UnknownDepth(ABC):
-    """How features are kept and used as long as their depth is not known well enough for a world point.
+    """How features are kept and used as long as their depth is not known well enough for a world point."""
 
-    Attributes:
-        landmark: their parametrisation in the map; of one component.
-        model: how a camera measures them.
-    """
-
-    landmark: Landmark
-    model: CameraModel
+    landmark: Landmark  #: their parametrisation in the map; of one component.
+    model: CameraModel  #: how a camera measures them.
 
     @abstractmethod
     def starting(self, depths: np.ndarray) -> CameraModel:

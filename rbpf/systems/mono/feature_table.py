@@ -40,33 +40,19 @@ _COLUMNS = {
 
 @final
 class FeatureTable:
-    """One row per feature ever started. Columns are views of the F rows in use.
+    """One row per feature ever started. Columns are views of the F rows in use."""
 
-    Attributes:
-        first_patch: (F, S, S) uint8 of its first appearance.
-        last_patch: (F, S, S) uint8 of a later one, from where it looked different; else the first.
-        first_px: (F, 2) where the first one was.
-        first_pose: (F, 7) world_from_camera of the first one, in the heaviest particle's world.
-        last_pose: (F, 7) likewise of the later one.
-        position: (F, 4) homogeneous point in the heaviest particle's world, when it was last observed.
-        attempts: (F,) times looked for.
-        found: (F,) times found.
-        missed: (F,) times not found in a row.
-        alive: (F,) whether the map still holds it.
-        member: (F,) its number among the points of a known constellation, or −1.
-    """
-
-    first_patch: np.ndarray
-    last_patch: np.ndarray
-    first_px: np.ndarray
-    first_pose: np.ndarray
-    last_pose: np.ndarray
-    position: np.ndarray
-    attempts: np.ndarray
-    found: np.ndarray
-    missed: np.ndarray
-    alive: np.ndarray
-    member: np.ndarray
+    first_patch: np.ndarray  #: (F, S, S) uint8 of its first appearance.
+    last_patch: np.ndarray  #: (F, S, S) uint8 of a later one, from where it looked different; else the first.
+    first_px: np.ndarray  #: (F, 2) where the first one was.
+    first_pose: np.ndarray  #: (F, 7) world_from_camera of the first one, in the heaviest particle's world.
+    last_pose: np.ndarray  #: (F, 7) likewise of the later one.
+    position: np.ndarray  #: (F, 4) homogeneous point in the heaviest particle's world, when it was last observed.
+    attempts: np.ndarray  #: (F,) times looked for.
+    found: np.ndarray  #: (F,) times found.
+    missed: np.ndarray  #: (F,) times not found in a row.
+    alive: np.ndarray  #: (F,) whether the map still holds it.
+    member: np.ndarray  #: (F,) its number among the points of a known constellation, or −1.
 
     def __init__(self) -> None:
         self._room: dict[str, np.ndarray] = {name: entry.empty() for name, entry in _COLUMNS.items()}

@@ -31,29 +31,20 @@ def no_features(stamp_ns: int = 0) -> FeatureFrame:
 
 @dataclass
 class Measurement:
-    """One image on its way through the filter's step: what the sensor is given, and what it has found.
+    """One image on its way through the filter's step: what the sensor is given, and what it has found."""
 
-    Attributes:
-        stamp_ns: time of the image.
-        image: (H, W) uint8; None where it cannot be used.
-        known_px: (M, 2) where the image shows the known points, in the run's first image; None in all others.
-        recognised: the prior of the pose is a place that was recognised beyond doubt: less has to be found to confirm it.
-        search: what was looked for.
-        used: features that the filter was given; none where too little agreed to be trusted.
-        started: features that were started after the step.
-        seconds_search: time that the search took.
-        seconds_new_landmarks: time of judging what was looked for and starting features.
-    """
-
-    stamp_ns: int
-    image: np.ndarray | None
+    stamp_ns: int  #: time of the image.
+    image: np.ndarray | None  #: (H, W) uint8; None where it cannot be used.
+    #: (M, 2) where the image shows the known points, in the run's first image; None in all others.
     known_px: np.ndarray | None = None
+    #: the prior of the pose is a place that was recognised beyond doubt: less has to be found to confirm it.
     recognised: bool = False
-    search: SearchResult = field(default_factory=SearchResult)
+    search: SearchResult = field(default_factory=SearchResult)  #: what was looked for.
+    #: features that the filter was given; none where too little agreed to be trusted.
     used: FeatureFrame = field(default_factory=no_features)
-    started: FeatureFrame = field(default_factory=no_features)
-    seconds_search: float = 0.0
-    seconds_new_landmarks: float = 0.0
+    started: FeatureFrame = field(default_factory=no_features)  #: features that were started after the step.
+    seconds_search: float = 0.0  #: time that the search took.
+    seconds_new_landmarks: float = 0.0  #: time of judging what was looked for and starting features.
 
     @property
     def features(self) -> FeatureFrame:

@@ -56,29 +56,19 @@ _ALIGNMENTS: dict[str, Alignment] = {"none": "none", "rigid": "rigid", "similari
 
 @dataclass(frozen=True)
 class KnownMap:
-    """K points of a finished run, in its world.
+    """K points of a finished run, in its world."""
 
-    Attributes:
-        camera: that saw them.
-        alignment: what the world has in common with the ground truth's: "none" where it is the same one, "rigid" up to
-            a motion, "similarity" up to a motion and a scale.
-        names: (K,) int64.
-        positions: (K, 3);  cov: (K, 3, 3) of them, within + between particles.
-        windows: (K, S, S) uint8 around the first observations.
-        first_px: (K, 2) where those were.
-        first_pose: (K, 7) world_from_camera then.
-        views: (V, 7) world_from_camera of the run, far from each other.
-    """
-
-    camera: Pinhole
+    camera: Pinhole  #: that saw them.
+    #: what the world has in common with the ground truth's: "none" where it is the same one, "rigid" up to a motion,
+    #: "similarity" up to a motion and a scale.
     alignment: Alignment
-    names: np.ndarray
-    positions: np.ndarray
-    cov: np.ndarray
-    windows: np.ndarray
-    first_px: np.ndarray
-    first_pose: np.ndarray
-    views: np.ndarray
+    names: np.ndarray  #: (K,) int64.
+    positions: np.ndarray  #: (K, 3).
+    cov: np.ndarray  #: (K, 3, 3) of them, within + between particles.
+    windows: np.ndarray  #: (K, S, S) uint8 around the first observations.
+    first_px: np.ndarray  #: (K, 2) where those were.
+    first_pose: np.ndarray  #: (K, 7) world_from_camera then.
+    views: np.ndarray  #: (V, 7) world_from_camera of the run, far from each other.
 
     @property
     def points(self) -> KnownPoints:

@@ -110,19 +110,12 @@ def located_points(camera: Pinhole, known: KnownPixels, noise_px: float) -> tupl
 
 @dataclass(frozen=True)
 class KnownStart:
-    """Known points, and what the first frame shows of them.
+    """Known points, and what the first frame shows of them."""
 
-    Attributes:
-        points: M of them.
-        world_from_camera: (7,) of the first frame, as resected from them.
-        rows: (K,) which of the points it shows.
-        seen: where, K features with the names of these points.
-    """
-
-    points: KnownPoints
-    world_from_camera: np.ndarray
-    rows: np.ndarray
-    seen: FeatureFrame
+    points: KnownPoints  #: M of them.
+    world_from_camera: np.ndarray  #: (7,) of the first frame, as resected from them.
+    rows: np.ndarray  #: (K,) which of the points it shows.
+    seen: FeatureFrame  #: where, K features with the names of these points.
 
     @classmethod
     def from_pixels(cls, camera: Pinhole, known: KnownPixels, noise_px: float) -> "KnownStart":

@@ -149,27 +149,16 @@ class ImageScreen:
 
 @dataclass(frozen=True)
 class Attempt:
-    """How far the recognition of one image came.
+    """How far the recognition of one image came."""
 
-    Attributes:
-        landmarks: of known depth in the map.
-        corners: of the image.
-        matches: of a landmark and a corner that are like each other and like nothing else.
-        agreeing: matches that a pose explains, after the search around it; 0 where no pose was computed.
-        matched: corners of the last view before the loss that are found again; 0 where they were too few.
-        confirming: of these, how many the pose explains.
-        prior: the pose, for the heaviest particle's world; None where it was not convincing.
-        certain: whether the image was recognised beyond doubt.
-    """
-
-    landmarks: int
-    corners: int = 0
-    matches: int = 0
-    agreeing: int = 0
-    matched: int = 0
-    confirming: int = 0
-    prior: PosePrior | None = None
-    certain: bool = False
+    landmarks: int  #: of known depth in the map.
+    corners: int = 0  #: of the image.
+    matches: int = 0  #: of a landmark and a corner that are like each other and like nothing else.
+    agreeing: int = 0  #: matches that a pose explains, after the search around it; 0 where no pose was computed.
+    matched: int = 0  #: corners of the last view before the loss that are found again; 0 where they were too few.
+    confirming: int = 0  #: of these, how many the pose explains.
+    prior: PosePrior | None = None  #: the pose, for the heaviest particle's world; None where it was not convincing.
+    certain: bool = False  #: whether the image was recognised beyond doubt.
 
 
 class LostPrior(NamedTuple):

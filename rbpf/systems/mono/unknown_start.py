@@ -97,23 +97,14 @@ _FRAMES = {
 
 @dataclass(frozen=True)
 class Resampled:
-    """What a batch adjustment leaves.
+    """What a batch adjustment leaves."""
 
-    Attributes:
-        filter: whose particles were resampled, in place of the one so far.
-        stamps_ns: (T,) of all frames so far.
-        poses: (T, 7) world_from_camera in them, means over the particles' paths.
-        covs: (T, 6, 6) of them in the right chart at each.
-        path: (T, 7) of the heaviest particle.
-        frame_of: (F,) in which of the frames each of F features was seen first, in the order of their names.
-    """
-
-    filter: Filter
-    stamps_ns: np.ndarray
-    poses: np.ndarray
-    covs: np.ndarray
-    path: np.ndarray
-    frame_of: np.ndarray
+    filter: Filter  #: whose particles were resampled, in place of the one so far.
+    stamps_ns: np.ndarray  #: (T,) of all frames so far.
+    poses: np.ndarray  #: (T, 7) world_from_camera in them, means over the particles' paths.
+    covs: np.ndarray  #: (T, 6, 6) of them in the right chart at each.
+    path: np.ndarray  #: (T, 7) of the heaviest particle.
+    frame_of: np.ndarray  #: (F,) in which of the frames each of F features was seen first, in the order of their names.
 
 
 @final
@@ -346,54 +337,33 @@ def between(times: np.ndarray, paths: np.ndarray, wanted: np.ndarray) -> np.ndar
 
 @dataclass(frozen=True)
 class Window:
-    """What T frames saw of F features, K observations in all.
+    """What T frames saw of F features, K observations in all."""
 
-    Attributes:
-        camera: of the images.
-        stamps_ns: (T,) of the frames.
-        frame: (K,) in which of them.
-        feature: (K,) which one; no feature twice in a frame.
-        px: (K, 2) where.
-        noise_px: standard deviation, per axis.
-    """
-
-    camera: Pinhole
-    stamps_ns: np.ndarray
-    frame: np.ndarray
-    feature: np.ndarray
-    px: np.ndarray
-    noise_px: float
+    camera: Pinhole  #: of the images.
+    stamps_ns: np.ndarray  #: (T,) of the frames.
+    frame: np.ndarray  #: (K,) in which of them.
+    feature: np.ndarray  #: (K,) which one; no feature twice in a frame.
+    px: np.ndarray  #: (K, 2) where.
+    noise_px: float  #: standard deviation, per axis.
 
 
 @dataclass(frozen=True)
 class Expected:
-    """What is expected before anything is seen.
+    """What is expected before anything is seen."""
 
-    Attributes:
-        rho: mean and standard deviation of an inverse distance, 1/m.
-        std_start: (6,) of the velocity at first, rad/s, m/s.
-        std_walk: (6,) of its walk in one second, (rad/s, m/s)/√s.
-    """
-
-    rho: tuple[float, float]
-    std_start: np.ndarray
-    std_walk: np.ndarray
+    rho: tuple[float, float]  #: mean and standard deviation of an inverse distance, 1/m.
+    std_start: np.ndarray  #: (6,) of the velocity at first, rad/s, m/s.
+    std_walk: np.ndarray  #: (6,) of its walk in one second, (rad/s, m/s)/√s.
 
 
 @final
 @dataclass(frozen=True)
 class Structure:
-    """Paths and features.
+    """Paths and features."""
 
-    Attributes:
-        path: (T, 7) world_from_camera; the first one is the identity.
-        direction: (F, 3) unit vectors.
-        inverse: (F,) 1/m.
-    """
-
-    path: np.ndarray
-    direction: np.ndarray
-    inverse: np.ndarray
+    path: np.ndarray  #: (T, 7) world_from_camera; the first one is the identity.
+    direction: np.ndarray  #: (F, 3) unit vectors.
+    inverse: np.ndarray  #: (F,) 1/m.
 
     def moved(self, step: np.ndarray) -> "Structure":
         """By a step (6 (T − 1) + 3 F,) in the right charts of the poses, the tangent planes and 1/m."""
@@ -408,16 +378,11 @@ class Structure:
 @final
 @dataclass(frozen=True)
 class Optimum:
-    """A minimum.
+    """A minimum."""
 
-    Attributes:
-        structure: there.
-        cost: the sum above.
-        information: (6 (T − 1) + 3 F, …) of the step from it: its inverse is the covariance of the minimum's error.
-    """
-
-    structure: Structure
-    cost: float
+    structure: Structure  #: there.
+    cost: float  #: the sum above.
+    #: (6 (T − 1) + 3 F, …) of the step from it: its inverse is the covariance of the minimum's error.
     information: np.ndarray
 
     @cached_property
