@@ -8,7 +8,7 @@ unexport PYTHONDONTWRITEBYTECODE
 PYTEST := $(BIN)/python -m pytest -n 2 --dist worksteal
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test slow check bench coverage docs clean
+.PHONY: help setup demo test slow check lowest bench coverage docs clean
 
 help:
 	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' Makefile
@@ -43,6 +43,12 @@ check: $(STAMP) ## format, lint, spelling, types, import rules and the fast test
 	$(BIN)/lint-imports
 	$(PYTEST) $(COVER) -m "not slow and not real_data"
 
+lowest: ## the fast tests of what is computed, in the lowest versions of what the package needs (minutes)
+	$(PYTHON) -m venv .venv-lowest
+	.venv-lowest/bin/python -m pip install --quiet --requirement requirements-lowest.txt
+	NUMBA_CACHE_DIR=.venv-lowest/kernels .venv-lowest/bin/python -m pytest -m "not slow and not real_data" \
+	  tests/core tests/maps tests/motion tests/sensors tests/systems tests/readers
+
 bench: $(STAMP) ## run the benchmarks against their baselines
 	$(BIN)/python -m benchmarks --gate
 
@@ -53,6 +59,6 @@ docs: $(STAMP) ## build the documentation into docs/_build
 	$(BIN)/sphinx-build -W -b html docs docs/_build/html
 
 clean: ## remove everything that make made, .venv included
-	rm -rf .venv demo build dist coverage .coverage *.egg-info docs/_build .mypy_cache .pytest_cache .ruff_cache \
+	rm -rf .venv .venv-lowest demo build dist coverage .coverage *.egg-info docs/_build .mypy_cache .pytest_cache .ruff_cache \
 	  .hypothesis .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -53,7 +53,8 @@ def save_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
     temporary = path.with_name(path.name + ".partial")
     try:
         with open_new(temporary) as file:
-            np.savez(file, allow_pickle=False, **arrays)
+            # All are plain by now; before NumPy 2.2 `allow_pickle` would be one more array.
+            np.savez(file, **arrays)
             file.flush()
             # Else a power cut after the renaming could leave neither the old file nor the new one.
             os.fsync(file.fileno())
