@@ -37,14 +37,9 @@ def test_a_rendered_board_is_what_a_run_starts_from(tmp_path, capsys):
     ("arguments", "words"),
     [
         (("--board", "9x6"), "both its inner corners and the side of its squares"),
-        (("--square", "0.02"), "both its inner corners and the side of its squares"),
         (("--board", "nine", "--square", "0.02"), "inner corners as 9x6"),
-        (("--board", "9x6", "--square", "-1"), "must be above 0"),
         (("--board", "9x6", "--square", "0.02", "--known-points", "here.csv"), "give one of the two"),
-        (("--aruco", "5x7"), "their number and their side"),
         (("--aruco", "5", "--marker", "0.04"), "their number as 5x7"),
-        (("--aruco", "5x7", "--marker", "0.04", "--dictionary", "9x9"), "no dictionary"),
-        (("--aruco", "5x7", "--marker", "0.04", "--known-points", "here.csv"), "give one of the three"),
     ],
 )
 def test_a_board_that_makes_no_sense_is_refused(desk, tmp_path, capsys, arguments, words):

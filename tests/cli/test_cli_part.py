@@ -44,6 +44,7 @@ def test_nothing_left():
         part_of_log(simulated_log(WORLD, 0), Part(12.0))
 
 
+@pytest.mark.slow
 def test_a_part_is_run_repeated_and_compared(tmp_path, capsys):
     simulate_robot(RobotWorld(12, 20), tmp_path / "log", 0)
     words = ["run", "range-bearing", str(tmp_path / "log"), "--particles", "5", "--no-batch", "--out"]

@@ -5,17 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from examples.studies.error_causes import (
-    AS_IT_IS,
-    BATCH,
-    FROM_FILTER,
-    ONLINE,
-    agreeing_matches,
-    camera_causes,
-    reprojection_errors,
-    robot_causes,
-    scaled_noise,
-)
+from examples.studies.error_causes import AS_IT_IS, BATCH, FROM_FILTER, ONLINE, camera_causes, robot_causes
 from examples.studies.error_ratios import error_of, robot_ratio, tracks_ratio
 from examples.studies.point_worlds import MONO, STEREO, DeskWorld, Measuring, simulate_features
 from rbpf.errors import InputError
@@ -26,15 +16,11 @@ from rbpf.runs.reading import PathAndMap
 from rbpf.runs.recordings import filter_features
 from rbpf.runs.trajectory import Trajectory
 from rbpf.runs.truth import RunTruth, write_truth
-from rbpf.sensors.feature_log import FeatureFrame, FeatureLog
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.stereo.config import StereoConfig
-from rbpf.validation.gtsam.batch_problem import Optimum, solve_problem
-from rbpf.validation.gtsam.observations import HUBER
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
-from tests.exactness.models import known
 
 
 def test_a_robots_causes_agree_with_the_table_of_ratios(tmp_path):
@@ -77,15 +63,6 @@ def test_a_cameras_causes(folder):
     assert rows["10× particles"].errors_m != rows[AS_IT_IS].errors_m
 
 
-def test_the_noise_is_scaled_and_nothing_else():
-    log = simulate_features(DeskWorld(frames=3), Measuring(), MONO, 0)
-    half = scaled_noise(log, 0.5)
-    for one, other in zip(half.frames, log.frames, strict=True):
-        np.testing.assert_allclose(one.cov_z, 0.25 * other.cov_z)
-        np.testing.assert_array_equal(one.z, other.z)
-    assert replace(half, frames=log.frames) == log
-
-
 def estimate(poses):
     nothing = MapEstimate(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
     return PathAndMap(np.arange(len(poses)), poses, np.empty((0, 6, 6)), nothing)
@@ -126,41 +103,3 @@ def test_the_filter_is_near_the_optimum_on_published_logs(data_dir, name, batch)
 
 
 pytestmark = pytest.mark.slow
-
-FRAMES = 40
-
-
-@pytest.fixture(scope="module")
-def log() -> FeatureLog:
-    return simulate_features(DeskWorld(frames=FRAMES), Measuring(noise_px=0.3), MONO, 5)
-
-
-@pytest.fixture(scope="module")
-def batch(log) -> Optimum:
-    return solve_problem(log, known(log.truth).world_from_camera, HUBER, marginals=False)
-
-
-def test_the_wrong_matches_are_found_and_no_others(log, batch):
-    rng = np.random.default_rng(0)
-    names, counts = np.unique(np.concatenate([f.landmarks for f in log.frames]), return_counts=True)
-    often = names[counts >= 10]  # of two sightings nobody can tell which one is wrong
-    frames, wrong = [], {}
-    for t, frame in enumerate(log.frames):
-        z = frame.z.copy()
-        row = int(rng.choice(np.flatnonzero(np.isin(frame.landmarks, often))))
-        if t % 3 == 0:
-            z[row] += [20.0, -15.0]
-            wrong[t] = frame.landmarks[row]
-        frames.append(FeatureFrame(frame.stamp_ns, frame.landmarks, z, frame.cov_z))
-    spoilt = replace(log, frames=frames)
-    found = solve_problem(spoilt, batch.estimate.world_from_body, HUBER, marginals=False)
-    clean = agreeing_matches(spoilt, found)
-    for t, (left, all_) in enumerate(zip(clean.frames, log.frames, strict=True)):
-        gone = np.setdiff1d(all_.landmarks, left.landmarks).tolist()
-        assert gone == ([wrong[t]] if t in wrong else [])
-
-
-def test_reprojection_errors_are_as_large_as_the_noise(batch):
-    errors = np.concatenate(reprojection_errors(batch))
-    errors = errors[np.isfinite(errors)]
-    assert 0.3 < np.sqrt(np.square(errors).mean()) < 0.3 * np.sqrt(2.0) + 0.02

@@ -40,21 +40,6 @@ def test_the_same_run(tmp_path):
     np.testing.assert_array_equal(late[1].features.descriptors, list(kept.frames())[-1].features.descriptors)
 
 
-def test_it_goes_on_where_it_was_interrupted(tmp_path):
-    """Chunks that are complete are not measured again; one that is lost is."""
-    cache_features(sequence(), CONFIG, tmp_path)
-    files = sorted(tmp_path.glob("*.npz"))
-    assert len(files) == 3
-    before = files[1].read_bytes()
-    files[1].unlink()
-    told = []
-    cache_features(sequence(), CONFIG, tmp_path, lambda done, _total: told.append(done))
-    assert told == [4, 5, 6]
-    again, first = (np.load(file) for file in (files[1], files[0]))
-    assert again["count"].tolist()[1] == -1 and (first["count"] > 0).all()
-    assert len(files[1].read_bytes()) == len(before)
-
-
 def test_features_of_another_recording_are_refused(tmp_path):
     cache_features(sequence(), CONFIG, tmp_path)
     with pytest.raises(InputError, match="another recording or with other settings"):

@@ -5,7 +5,6 @@ import pytest
 
 from examples.studies.e06.depth_curves import Passing, shape_of
 from examples.studies.e06.loop import AWAY, find_closure, started_until
-from examples.studies.e06.new_landmarks import line_distances, line_lengths
 from examples.studies.e06.plane import fit_plane
 from examples.studies.s05.record import Best, Paths, Record, errors
 from rbpf.lie import SE3
@@ -14,7 +13,6 @@ from rbpf.sensors.camera import Pinhole
 cv2 = pytest.importorskip("cv2")
 
 CAMERA = Pinhole(640, 480, 525.0, 525.0, 319.5, 239.5)
-NOTHING = np.zeros((0, 2))
 
 
 def sighting(rows, found, started=0):
@@ -55,14 +53,6 @@ def test_a_loop_is_closed_when_the_start_is_found_again():
     assert find_closure(frames, 4).back == -1
     assert find_closure([*frames[:3], *out[: AWAY - 3], *back], 4).again == 0
     assert started_until(frames, 15) == 4
-
-
-def test_distances_from_epipolar_lines():
-    one = sighting([1, 2, 3], [True, False, True])
-    one["line"][:2] = [[0.0, 0.0], [30.0, 40.0]]
-    one["px"] = np.array([[12.0 + 2.0, 16.0 - 1.5], [np.nan, np.nan], [9.0, 9.0]])
-    assert line_distances(one) == pytest.approx([2.5])
-    assert line_lengths(one) == pytest.approx([50.0])
 
 
 def test_a_gaussian_curve_is_called_one_and_a_gamma_curve_is_not():
@@ -106,13 +96,6 @@ def scene():
         seen = rng.permutation(10)[:6]
         record.observations.append((names[seen], t, SE3.inverse_transform(true[t], places[seen])))
     return true, places, names, record
-
-
-def test_the_true_path_puts_landmarks_where_they_are(scene):
-    true, places, names, record = scene
-    np.testing.assert_allclose(record.places(true, names), places, atol=1e-12)
-    some = names[[1, 4, 9]]
-    np.testing.assert_allclose(record.places(true, some), places[[1, 4, 9]], atol=1e-12)
 
 
 def test_errors_of_maps_and_paths(scene):

@@ -1,19 +1,14 @@
 """Figures of active search: survival against a worked example, noise of images against what was added."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from examples.studies.consistency_runs import Consistency, DeskTrial, Trial, left_for_good, run_trials
+from examples.studies.consistency_runs import Consistency, Trial, left_for_good
 from examples.studies.mono_realism import measure_search, survival
-from examples.studies.point_worlds import STEREO, DeskWorld, LabWorld, Measuring, simulate_features
-from examples.studies.stereo_revisit import log_there_and_back
 from rbpf.sensors.camera import Pinhole
 from rbpf.systems.mono.config import MonoConfig
 from rbpf.validation.simulation.desk_and_room import TexturedDesk
 from rbpf.validation.simulation.images import Imaging, simulate_images
-from rbpf.validation.simulation.lab import LabDrive
 
 
 def honest(rng: np.random.Generator, scale: float = 1.0, steps: int = 60) -> Trial:
@@ -40,13 +35,6 @@ def test_an_honest_filter_has_the_figures_of_one():
     assert found.entries()["overconfident_from"] == "never"
 
 
-def test_an_overconfident_filter_is_found_from_the_first_step():
-    rng = np.random.default_rng(1)
-    found = Consistency([honest(rng, 1.5) for _ in range(60)])
-    assert found.overconfident_from == 0
-    assert found.pose_nees.value == pytest.approx(2.25, rel=0.1)
-
-
 def by_definition(mean: np.ndarray, high: float) -> int | None:
     """First step above the band such that, for each later step, at least half of those up to it are above."""
     above = mean > high
@@ -61,16 +49,6 @@ def test_leaving_for_good_is_what_the_definition_says():
     for _ in range(200):
         mean = rng.normal(size=50).cumsum() * 0.3 + rng.normal(size=50)
         assert left_for_good(mean, 0.5) == by_definition(mean, 0.5)
-
-
-def test_a_desk_trial_counts_points_and_ancestors():
-    trial = DeskTrial(DeskWorld(frames=40), MonoConfig(particles=20))
-    found = run_trials(trial, [0]).trials[0]
-    assert found.ancestors.shape == (40,)
-    assert found.ancestors[-1] == 20
-    assert (np.diff(found.ancestors) >= 0).all()
-    assert 0.1 < np.nanmean(found.nees) / 6 < 10
-    assert found.distances.max() < 0.05
 
 
 CAMERA = Pinhole(320, 240, 262.0, 262.0, 159.5, 119.5)
@@ -102,16 +80,3 @@ def test_searches_are_counted_and_the_noise_is_seen(tmp_path):
     # The smoothest blocks have a little less of it than all.
     assert 3.3 < found.noise < 4.4
     assert found.contrast > found.noise
-
-
-def test_pixels_come_again_in_reverse():
-    world = LabWorld(LabDrive(frames=4, every=4), points=2000)
-    log = simulate_features(world, Measuring(known=0), STEREO, seed=0)
-    both = log_there_and_back(log)
-    assert [frame.stamp_ns for frame in both.frames] == list(range(7))
-    for t, row in enumerate([0, 1, 2, 3, 2, 1, 0]):
-        np.testing.assert_array_equal(both.frames[t].landmarks, log.frames[row].landmarks)
-        np.testing.assert_array_equal(both.frames[t].z, log.frames[row].z)
-        np.testing.assert_array_equal(both.truth.world_from_camera[t], log.truth.world_from_camera[row])
-    np.testing.assert_array_equal(both.truth.stamps_ns, np.arange(7))
-    assert log_there_and_back(replace(log, truth=None)).truth is None

@@ -53,14 +53,6 @@ def test_paths_are_those_of_a_full_history(seed, lag, clouds):
     np.testing.assert_array_equal(history.stamps_ns, oracle.stamps)
 
 
-@pytest.mark.parametrize("lag", [None, 30])
-def test_random_histories_are_shared(lag):
-    """Most of them hold far fewer states than paths, so that the test above speaks of compacted blocks."""
-    pairs = [recorded(seed, lag, clouds=False) for seed in range(30)]
-    fractions = [history.stored_states / max(1, oracle.paths[..., 0].size) for history, oracle in pairs]
-    assert np.median(fractions) < 0.8
-
-
 def restored(lineage: Lineage, history: History) -> tuple[Lineage, History]:
     arrays = lineage.arrays() | history.arrays()
     again = Lineage(lineage.n)
@@ -104,20 +96,6 @@ def test_a_fixed_lag_takes_constant_memory(rate):
     assert due <= 2 * lag + 4
     assert nodes <= 16 * n
     assert lineage.arrays()["lineage/parent"].size <= 16 * n
-
-
-def test_sharing_stores_few_states():
-    """Without sharing 1000 · 50 states; lineages that coalesce like 1/age leave T + C N log N of them."""
-    rng = np.random.default_rng(9)
-    n, steps = 50, 1000
-    lineage = Lineage(n)
-    history = History(lineage)
-    for t in range(steps):
-        lineage.advance(np.sort(rng.integers(0, n, n)))
-        history.record(t, np.zeros((n, 1)), np.zeros(n))
-    # Blocks are looked through at doubling ages: up to four times as many as have descendants.
-    assert history.stored_states <= 4 * (steps + n * np.log(n) * 2)
-    assert history.paths().shape == (steps, n, 1)
 
 
 def test_paths_that_outgrow_the_machine_are_refused(monkeypatch):

@@ -74,14 +74,6 @@ def test_a_generation_may_be_retained_twice(n, seed):
     assert not lineage.is_retained(0)
 
 
-def test_only_the_present_generation_needs_no_keeping():
-    lineage = Lineage(3)
-    lineage.advance(np.array([0, 0, 2]))
-    assert lineage.is_retained(1)
-    assert not lineage.is_retained(0)
-    assert not lineage.is_retained(-1)
-
-
 def test_size_of_the_forest():
     """Every generation kept: T + C N log N nodes (P. Jacob, L. Murray, S. Rubenthaler, 2015) with C < 4.
 
@@ -96,20 +88,6 @@ def test_size_of_the_forest():
         excess.append((lineage.nodes - t) / (n * np.log(n)))
     assert max(excess) < 4.0
     assert 1.0 < np.mean(excess[100:]) < 3.0
-
-
-def test_what_nobody_keeps_is_spliced_out():
-    rng = np.random.default_rng(6)
-    n = 32
-    lineage = Lineage(n)
-    most = 0
-    lineage.retain(0)
-    for _ in range(3000):
-        lineage.advance(drawn(rng, n, 1.0))
-        most = max(most, lineage.nodes)
-    # What is needed are leaves, forks and the root; between two rounds of splicing the arrays fill.
-    assert most <= 8 * n
-    assert lineage.distinct(0) == 1
 
 
 def test_a_settled_generation_is_climbed_to_once(monkeypatch):

@@ -23,7 +23,6 @@ from rbpf.validation.consistency.comparison import read_comparisons
 from rbpf.validation.report.page import write_report
 from rbpf.validation.sweep.plan import read_plan
 from rbpf.validation.sweep.sweep import read_rows
-from tests.core.worlds import same
 from tests.properties.mutations import damaged, read_or_refused
 
 pytestmark = pytest.mark.slow
@@ -238,15 +237,3 @@ def test_an_archive_that_unfolds_is_refused(tmp_path):
     (tmp_path / "a.npz").write_bytes(member(header, b"\0" * 8_000_000, compressed=True))
     with pytest.raises(InputError, match="is damaged or cut off"):
         load_arrays(tmp_path / "a.npz")
-
-
-@given(
-    st.dictionaries(
-        st.text("abc/", min_size=1, max_size=5),
-        st.sampled_from([np.arange(6.0).reshape(2, 3), np.array(3), np.array("é"), np.zeros((0, 2)), np.array([True])]),
-    )
-)
-def test_what_is_saved_is_loaded(tmp_path_factory, arrays):
-    path = tmp_path_factory.getbasetemp() / "same.npz"
-    save_arrays(path, arrays)
-    assert same(load_arrays(path), arrays)

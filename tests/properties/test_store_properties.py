@@ -148,28 +148,6 @@ def test_random_operations_meet_every_state():
         assert {f"{name} moved", f"{name} cold"} <= met
 
 
-def test_memory_shrinks_as_lineages_coalesce():
-    rng = np.random.default_rng(2)
-    n, columns = 200, 50
-    lineage = Lineage(n)
-    store = SharedStore(n, lineage)
-    for _ in range(columns):
-        store.add(rng.normal(size=(5, n)))
-    before = store.stored_bytes
-    assert before == store.dense_bytes == columns * 5 * n * 8
-    taken = {}
-    for age in range(1, 2001):
-        lineage.advance(np.sort(rng.integers(0, n, n)))
-        store.compact()
-        taken[age] = store.stored_bytes / before
-    # About 2/age of the rows have descendants; they are looked at whenever the age has doubled.
-    assert taken[16] < 0.5
-    assert taken[256] < 0.05
-    # Long after all lineages have met, one row and its index are left.
-    assert taken[2000] == (5 + 1) / (5 * n)
-    assert lineage.nodes < 8 * n
-
-
 def test_rewriting_one_landmark_leaves_the_others_shared():
     rng = np.random.default_rng(3)
     n = 64

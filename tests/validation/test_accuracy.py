@@ -99,14 +99,6 @@ def test_freiburg1_xyz_has_the_published_errors(data_dir, name, rotation_deg):
     assert by_frame.rotation_rmse_deg == pytest.approx(rotation_deg, abs=1e-6)
 
 
-def test_a_pair_by_path_ends_where_its_length_is_reached():
-    along = SE3.identity((9,))
-    along[:, 4] = np.arange(9.0)
-    straight = Trajectory(np.arange(9), along)
-    assert rpe(straight, straight, 2.0, "metres").pairs.tolist() == [[0, 2], [2, 4], [4, 6], [6, 8]]
-    assert rpe(straight, straight, 2.5, "metres").pairs.tolist() == [[0, 3], [3, 6]]
-
-
 def test_landmarks_that_both_maps_have_are_compared():
     truth = {1: np.array([0.0, 0.0]), 2: np.array([4.0, 0.0]), 3: np.array([0.0, 3.0]), 9: np.ones(2)}
     quarter_turn = Similarity(1.0, np.array([[0.0, -1.0], [1.0, 0.0]]), np.array([1.0, 2.0]))
@@ -123,10 +115,7 @@ def test_landmarks_that_both_maps_have_are_compared():
     ("arguments", "words"),
     [
         ({"delta": 0}, "whole number of frames"),
-        ({"delta": 1.5}, "found 1.5"),
         ({"delta": 40}, "longer than 40 frames"),
-        ({"delta": -1.0, "unit": "metres"}, "positive number of metres"),
-        ({"delta": 1e4, "unit": "metres"}, "longer than 10000 metres"),
         ({"unit": "m"}, "frames or metres, found 'm'"),
     ],
 )

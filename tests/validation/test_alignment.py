@@ -107,13 +107,6 @@ def test_poses_move_as_the_points_of_their_body_do():
     np.testing.assert_allclose(after, moved.transform(SE3.transform(world_from_body, body_points)), atol=1e-12)
 
 
-def test_fit_keeps_a_similarity_that_is_given_and_none_changes_nothing():
-    x, y = np.random.default_rng(6).normal(size=(2, 5, 3))
-    given_one = align(x, y)
-    assert fit(given_one, y, x) is given_one
-    np.testing.assert_array_equal(fit("none", x, y).transform(x), x)
-
-
 @pytest.mark.parametrize(
     ("x", "y", "words"),
     [

@@ -9,7 +9,6 @@ import pytest
 from rbpf.errors import InputError
 from rbpf.runs.measurement_files import (
     FRAMES,
-    KNOWN,
     OBSERVATIONS,
     ODOMETRY,
     read_feature_log,
@@ -39,16 +38,6 @@ def test_files_give_back_the_same_bits(tmp_path, dim, kind):
     assert sorted(path.name for path in tmp_path.iterdir()) == [OBSERVATIONS, ODOMETRY]
 
 
-def test_extreme_numbers_come_back(tmp_path):
-    m = world(2, "position")
-    z, covs = m.z.copy(), m.covs.copy()
-    z[0] = [5e-324, -1e12]
-    covs[0] = np.diag([0.0, 1e-300, np.nextafter(1.0, 2.0)])
-    m = replace(m, z=z, covs=covs, landmarks=m.landmarks - 2**62, recording="zurich, 2nd: été")
-    write_measurements(tmp_path, m)
-    assert_same(read_measurements(tmp_path), m)
-
-
 def test_a_run_without_sightings_and_one_of_a_single_step_come_back(tmp_path):
     m = world(3, "position")
     blind = seen(m, m.steps[:0], m.landmarks[:0], m.z[:0], m.cov_z[:0])
@@ -75,39 +64,12 @@ def test_the_files_are_as_documented(tmp_path):
     assert lines[5].split(",")[:3] == ["1", str(m.stamps_ns[1]), repr(float(m.deltas[0, 0]))]
 
 
-@pytest.mark.parametrize("name", [OBSERVATIONS, ODOMETRY])
-def test_missing_and_cut_files_are_refused(tmp_path, name):
-    write_measurements(tmp_path, world(2, "position"))
-    path = tmp_path / name
-    text = path.read_text()
-    for cut in (text[:-3], text[: text.rindex("\n", 0, -1) + 1], text[:20], text[: text.index("step")], ""):
-        path.write_text(cut)
-        with pytest.raises(InputError, match=re.escape(str(path))):
-            read_measurements(tmp_path)
-    path.unlink()
-    with pytest.raises(InputError, match="no such file; expected a file that every filter run writes"):
-        read_measurements(tmp_path)
-
-
 BAD_SIGHTINGS = [
-    ("0,1700000000123456789,41,", "0,1700000000123456789,41,1,", "line 11: expected 8 columns .* found 9"),
     ("0,1700000000123456789,41,", "0,1700000000123456789,", "line 11: expected 8 columns .* found 7"),
-    ("0,1700000000123456789,41,", "7,1700000000123456789,41,", "line 11: expected a step from 0 to 6"),
-    ("0,1700000000123456789,41,", "-1,1700000000123456789,41,", "line 11: expected a step from 0 to 6"),
     ("0,1700000000123456789,41,", "0,1700000000123456788,41,", "line 11: expected the stamp that"),
-    ("0,1700000000123456789,41,", "0,1700000000123456789,4.1,", "expected landmark to be a whole number"),
-    ("0,1700000000123456789,41,", "0,99999999999999999999,41,", "expected stamp_ns to be a whole number"),
-    ("# rbpf observations 1", "# rbpf observations 2", "line 1: expected '# rbpf obs"),
-    ("# space: SE2", "# space: SO3", "line 3: expected space to be SE2 or SE3, found 'SO3'"),
-    ("# measurement: position", "# measurement: range", "expected measurement to be range_bearing"),
-    ("# pitch_sign: -1", "# pitch_sign: 2", "expected pitch_sign to be 1 or -1"),
     ("# robot_from_sensor: 2.4", "# robot_from_sensor:", "line 6: expected 3 numbers .* found 2"),
-    ("# robot_from_sensor: 2.4", "# robot_from_sensor: nan", "expected robot_from_sensor to be a finite"),
-    ("# start: ", "# begin: ", "expected a line '# start: ...' above this one"),
     ("# recording: small world", "# recording: other", "expected recording other .* from one run"),
     ("# rows: 33", "# rows: 34", "expected 34 rows as the header says, found 33"),
-    ("# rows: 33", "# rows: many", "line 9: expected rows to be a whole number"),
-    ("step,stamp_ns,landmark,z0", "step,stamp_ns,landmark,y0", "line 10: expected the columns step,"),
 ]  # fmt: skip
 
 
@@ -125,13 +87,8 @@ def test_malformed_sightings_are_refused_by_line(tmp_path, old, new, complaint):
 @pytest.mark.parametrize(
     ("dim", "name", "line", "column", "value", "complaint"),
     [
-        (2, OBSERVATIONS, 13, 4, "nan", "expected z1 to be a finite number, found 'nan'"),
-        (2, OBSERVATIONS, 13, 3, "", "expected z0 to be a finite number, found ''"),
         (2, OBSERVATIONS, 13, 5, "-0.1", "expected a positive semi-definite covariance"),
-        (2, OBSERVATIONS, 13, 6, "9.0", "expected a positive semi-definite covariance"),
         (2, ODOMETRY, 8, 0, "4", "expected one row per step, from step 1 in order"),
-        (2, ODOMETRY, 8, 1, "17", "expected stamps in order of time"),
-        (2, ODOMETRY, 8, 2, "inf", "expected d0 to be a finite number"),
         (2, ODOMETRY, 8, -1, "-0.1", "expected a positive semi-definite covariance"),
         (3, ODOMETRY, 7, 5, "3.0", "expected an increment that begins with a quaternion"),
     ],
@@ -150,14 +107,8 @@ def test_malformed_numbers_are_refused_by_line(tmp_path, dim, name, line, column
 @pytest.mark.parametrize(
     ("dim", "change", "complaint"),
     [
-        (2, {"recording": "two\nlines"}, "name on one line"),
         (2, {"recording": ""}, "name on one line"),
-        (2, {"measurement": "bearing"}, "a measurement range_bearing or position"),
-        (2, {"pitch_sign": 0.5}, "a pitch sign 1 or -1"),
-        (2, {"start": np.zeros(7)}, re.escape("start of shape (3,), found (7,)")),
         (2, {"start": np.array([0.0, np.inf, 0.0])}, "finite numbers .* in start"),
-        (2, {"stamps_ns": np.arange(7)[::-1]}, "order of time"),
-        (2, {"steps": np.full(33, 7)}, "from 0 to 6"),
         (2, {"covs": np.tile(np.diag([1.0, -1.0, 1.0]), (6, 1, 1))}, "covariances in covs, .* row 0"),
         (3, {"start": np.zeros(7)}, "quaternions of length 1"),
     ],
@@ -209,17 +160,9 @@ def test_reading_gives_back_the_same_bits(tmp_path, known, camera):
     ("camera", "name", "old", "new", "words"),
     [
         (CAMERA, OBSERVATIONS, "# measurement: pinhole", "# measurement: range_bearing", "measurement to be pinhole"),
-        (CAMERA, OBSERVATIONS, "# size: 640 480", "# size: 640", "expected 2 numbers for size"),
-        (CAMERA, OBSERVATIONS, "\n3,", "\n4,", "expected a step from 0 to 3"),
         (CAMERA, OBSERVATIONS, "3,1400000000099999999,", "3,1400000000099999998,", "gives this step"),
         (CAMERA, FRAMES, "# recording: a desk", "# recording: a room", "take both files from one run"),
-        (CAMERA, FRAMES, "\n2,", "\n5,", "one row per frame"),
-        (CAMERA, KNOWN, "# rows: 4", "# rows: four", "expected rows to be a whole number"),
         (PAIR, OBSERVATIONS, "# baseline: 0.3", "# baseline: -0.3", "baseline must be positive"),
-        (PAIR, OBSERVATIONS, "# baseline: ", "# base: ", "expected a line '# baseline"),
-        (PAIR, OBSERVATIONS, "u_right_px", "u_px", "expected the columns"),
-        (PAIR, OBSERVATIONS, "# measurement: stereo", "# measurement: pinhole", "expected the columns"),
-        (FISHEYE, OBSERVATIONS, "# lens: equidistant", "# lens: fov", "radial-tangential or equidistant, found 'fov'"),
         (FISHEYE, OBSERVATIONS, "# lens: equidistant", "# lens: radial-tangential", "expected 9 numbers for camera"),
     ],
 )

@@ -1,7 +1,5 @@
 """What runs over images keep of each frame, and the frames, views and videos that are drawn of it."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -12,18 +10,7 @@ from rbpf.runs.run import Run
 from rbpf.systems.stereo.config import StereoConfig, TriggerConfig
 from rbpf.systems.stereo.landmarks import FeatureKind
 from rbpf.validation.report.rerun import recording
-from rbpf.validation.report.video import (
-    FEATURES,
-    FOUND,
-    MISSED,
-    RAY,
-    annotated_frames,
-    draw_pair,
-    draw_search,
-    drawn_size,
-    frame_rate,
-    is_complete,
-)
+from rbpf.validation.report.video import FEATURES, annotated_frames, drawn_size, frame_rate, is_complete
 from tests.systems.plane_sequences import CAMERA
 from tests.systems.stereo_sequences import missing, pairs
 
@@ -49,23 +36,6 @@ def test_what_each_feature_was(run):
     assert kinds[-1][FeatureKind.LANDMARK] > 5
     assert sum(k[FeatureKind.NEW] for k in kinds) == run.system.front_end.landmarks.manager.next_name
     assert kinds[BAD].sum() == 0
-
-
-def test_between_updates_all_are_features():
-    rare = filter_pairs(pairs(3), replace(CONFIG, trigger=TriggerConfig(9.0, 9.0)))
-    kind = rare.log.observed(2)["kind"]
-    assert (kind == FeatureKind.FEATURE).all() and len(kind) > 20
-
-
-@pytest.mark.parametrize("kind", [FeatureKind.FEATURE, FeatureKind.CANDIDATE, FeatureKind.LANDMARK, FeatureKind.NEW])
-def test_a_feature_is_drawn_where_it_is(kind):
-    """A cross at the left pixel, and a line as long as the disparity, at twice the size, below the caption."""
-    seen = {"z": np.array([[60.0, 40.0, 30.0]]), "kind": np.array([kind])}
-    picture = draw_pair(np.zeros((90, 120), dtype=np.uint8), seen, ("pair 0", ""), (120, 90))
-    assert picture.shape[:2] == drawn_size(120, 90)[::-1]
-    rows, columns = np.nonzero((picture[24:] == FEATURES[kind][1]).all(axis=-1))
-    assert abs(np.median(rows) - 80.5) <= 1.0
-    assert abs(columns.min() - 60.5) <= 2.0 and 120 <= columns.max() <= 126
 
 
 def test_frames_of_a_run(run):
@@ -103,22 +73,6 @@ def test_views_find_the_vertical(vertical, down, tilt_deg):
     assert views.side[1] == vertical and views.down == down
     a, b = np.eye(3)[list(views.top)]
     assert np.allclose(np.cross(a, b), up)
-
-
-def test_a_frame_shows_hits_misses_and_lines():
-    sighting = {
-        "mean": np.array([[40.0, 30.0], [80.0, 40.0]]),
-        "cov": np.tile(4.0 * np.eye(2), (2, 1, 1)),
-        "px": np.array([[41.0, 30.0], [np.nan, np.nan]]),
-        "line": np.array([[[np.nan] * 2] * 2, [[-1e9, 40.0], [1e9, 40.0]]]),
-        "started_px": np.zeros((0, 2)),
-    }
-    image = np.full((90, 120), 128, dtype=np.uint8)
-    picture = draw_search(image, sighting, ("frame 0", ""), (120, 90))
-    assert picture.shape[:2] == drawn_size(120, 90)[::-1]
-    below = picture[30:]
-    counts = [int((below == colour).all(axis=-1).sum()) for colour in (FOUND, MISSED, RAY)]
-    assert min(counts[:2]) > 30 and counts[2] > 200
 
 
 def test_equal_stamps_still_have_a_rate():

@@ -21,7 +21,7 @@ from rbpf.lie import SE3
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
 from rbpf.sensors.feature_log import FeatureLog
 from rbpf.validation.simulation.lab import LabDrive
-from rbpf.validation.simulation.paths import HandHeld, looking, slowed, speeds
+from rbpf.validation.simulation.paths import looking, slowed
 
 
 def truth(log: FeatureLog, frame: int) -> np.ndarray:
@@ -116,13 +116,6 @@ def test_share_and_place_of_outliers(camera: Pinhole | RectifiedStereo) -> None:
         assert (z[:, 2] <= z[:, 0]).all()
 
 
-def test_share_of_missed_measurements() -> None:
-    log = simulate_features(STILL, replace(EXACT, dropout=0.2), MONO, seed=0)
-    counts = [len(frame.landmarks) for frame in log.frames]
-    assert counts[0] == 20
-    assert likely(sum(counts[1:]), 20 * (STILL.frames - 1), 0.8)
-
-
 def test_a_lost_track_rests_and_is_taken_up_again() -> None:
     log = simulate_features(STILL, replace(EXACT, turnover=0.05, rest_frames=12), MONO, seed=0)
     assert log.known is not None
@@ -133,34 +126,6 @@ def test_a_lost_track_rests_and_is_taken_up_again() -> None:
     assert set(gaps.tolist()) == {0, 12}
     # After a gap a track has gone on for no frame yet, so that it cannot have been lost.
     assert likely(int((gaps > 0).sum()), len(gaps), 0.05)
-
-
-def test_points_that_are_gone_stay_gone() -> None:
-    world = DeskWorld(frames=200, renewal=0.1)
-    scene = world.build(np.random.default_rng(5))
-    log = simulate_features(world, Measuring(), MONO, seed=5)
-    assert log.known is not None and log.truth is not None
-    renewed = len(log.truth.landmarks) - world.points
-    assert abs(renewed - 200) < 4.0 * np.sqrt(200)
-    seen = sightings(log)
-    assert max(seen) >= world.points
-    for name, frames in seen.items():
-        start, end = scene.present[name]
-        assert frames[0] >= start
-        assert frames[-1] < end or name in log.known.names
-    there = [(scene.present[:, 0] <= t) & (t < scene.present[:, 1]) for t in range(world.frames)]
-    assert {int(row.sum()) for row in there} == {world.points}
-
-
-def test_known_points_are_measured_whenever_they_are_visible() -> None:
-    log = simulate_features(DeskWorld(frames=1000, blocks=0), EXACT, MONO, seed=2)
-    assert log.known is not None and log.truth is not None
-    points = np.array([log.truth.landmarks[name] for name in log.known.names.tolist()])
-    local = SE3.inverse_transform(log.truth.world_from_camera[:, None], points)
-    visible = MONO.visible(local, margin_px=13.0)
-    measured = np.array([np.isin(log.known.names, frame.landmarks) for frame in log.frames])
-    assert visible[0].all() and not visible.all()
-    np.testing.assert_array_equal(measured, visible)
 
 
 def test_known_points_are_given_with_the_stated_error() -> None:
@@ -188,71 +153,6 @@ def test_known_points_are_given_with_the_stated_error() -> None:
 def test_refused_worlds(world: PointWorld, measuring: Measuring, message: str) -> None:
     with pytest.raises(InputError, match=message):
         simulate_features(world, measuring, MONO, seed=0)
-
-
-WHOLE = DeskWorld()
-SEEDS = range(2)
-
-
-def built(world: PointWorld, seed: int) -> Scene:
-    return world.build(np.random.default_rng(seed))
-
-
-def derivatives(world: DeskWorld, seed: int) -> list[np.ndarray]:
-    """Speed, acceleration and jerk of the camera's centre, from differences."""
-    values, out = built(world, seed).world_from_camera[:, 4:], []
-    for _ in range(3):
-        values = np.diff(values, axis=0) * world.rate_hz
-        out.append(np.linalg.norm(values, axis=1))
-    return out
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_paths_are_those_of_a_hand(seed: int) -> None:
-    scene = built(WHOLE, seed)
-    turn, speed = speeds(scene.world_from_camera, scene.stamps_ns * 1e-9)
-    assert 0.1 < turn.max() < 0.9
-    assert 0.5 * WHOLE.hand.speed_m_s < speed.max() < WHOLE.hand.speed_m_s + 0.4
-    _, acceleration, jerk = derivatives(WHOLE, seed)
-    assert acceleration.max() < 4.0
-    assert jerk.max() < 30.0
-
-
-def test_paths_are_smooth() -> None:
-    """A jump in speed or acceleration would make the differences ten times as large at ten times the rate."""
-    slow = replace(WHOLE, frames=600)
-    fast = replace(slow, frames=6000, rate_hz=300.0)
-    for coarse, fine in zip(derivatives(slow, 0), derivatives(fast, 0), strict=True):
-        assert fine.max() < 1.3 * coarse.max() + 0.05
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_a_desk_is_seen_from_its_distance(seed: int) -> None:
-    world = DeskWorld(hand=HandHeld(wander=0.0, wrist_deg=0.0, tremor_m=0.0, tremor_deg=0.0))
-    scene = built(world, seed)
-    middle = SE3.inverse_transform(scene.world_from_camera, [0.0, 0.0, 0.5])
-    assert (middle[:, 2] > 1.0).all() and (middle[:, 2] < 1.5).all()
-    np.testing.assert_allclose(middle[:, :2], 0.0, atol=1e-12)
-    turn, speed = speeds(scene.world_from_camera, scene.stamps_ns * 1e-9)
-    # The limits are kept between the images of the path before it is slowed down.
-    assert turn.max() < 1.01 * world.hand.turn_rad_s and speed.max() < 1.01 * world.hand.speed_m_s
-
-
-def test_the_desk_stays_in_view() -> None:
-    log = simulate_features(WHOLE, Measuring(), MONO, seed=0)
-    assert min(len(frame.landmarks) for frame in log.frames) >= 15
-    depth = [SE3.inverse_transform(pose, [0.0, 0.0, 0.5])[2] for pose in log.truth.world_from_camera]
-    assert 0.9 < np.median(depth) < 1.6
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_neither_camera_nor_points_are_in_a_block(seed: int) -> None:
-    scene = built(WHOLE, seed)
-    assert len(scene.blocks) > 2
-    assert (scene.blocks[:, 0] < scene.blocks[:, 1]).all()
-    for points in (scene.world_from_camera[:, 4:], scene.points):
-        within = (points[:, None] > scene.blocks[:, 0]) & (points[:, None] < scene.blocks[:, 1])
-        assert not within.all(axis=-1).any()
 
 
 def test_a_camera_looks_at_what_it_should() -> None:

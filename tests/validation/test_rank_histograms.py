@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from examples.studies.rank_histograms import calibrate, plot_ranks
+from examples.studies.rank_histograms import calibrate
 from rbpf.core.filter import Filter
 from rbpf.errors import InputError
 from tests.validation.fixes import Receiver, Walk
@@ -57,16 +57,6 @@ def test_a_bias_tilts_it():
     assert (counts[:3].sum(axis=0) > 2 * counts[-3:].sum(axis=0)).all()
 
 
-def test_few_samples_are_no_bias():
-    """Ranks among so few samples as four are still uniform."""
-
-    def few(fixes, rng):
-        samples, weights = exact()(fixes, rng)
-        return samples[:4], weights[:4]
-
-    assert (calibrate(simulate, few, ("x", "y"), runs=600).p_values() > 0.01).all()
-
-
 def test_a_filter_of_ones_own_model_is_calibrated():
     """Any model that can simulate: here a filter whose particles start at the prior."""
 
@@ -80,11 +70,6 @@ def test_a_filter_of_ones_own_model_is_calibrated():
 
     found = calibrate(simulate, infer, ("x", "y"), runs=100)
     assert (found.p_values() > 0.01).all()
-
-
-def test_a_picture(tmp_path):
-    assert plot_ranks(calibrate(simulate, exact(), ("x", "y"), runs=50), tmp_path) == ["ranks.png"]
-    assert (tmp_path / "ranks.png").stat().st_size > 5_000
 
 
 def test_what_does_not_fit_is_refused():

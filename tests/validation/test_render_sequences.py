@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 
 from rbpf.errors import InputError
 from rbpf.lie import SE3
@@ -50,36 +49,20 @@ def truth(folder: Path) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_the_folder_is_as_euroc_has_it(tmp_path: Path) -> None:
+def test_the_folder_is_read_as_an_euroc_sequence(tmp_path: Path) -> None:
     told: list[tuple[int, int]] = []
     folder = tmp_path / "deep" / "desk"
     simulate_images(DESK, Imaging(depth=True), STEREO, folder, 0, lambda *args: told.append(args))
     assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]
-    stamps = stamps_ns(4, 30.0).tolist()
-    for sensor, offset in {"cam0": 0.0, "cam1": 0.1, "depth0": 0.0}.items():
-        place = folder / "mav0" / sensor
-        with open(place / "data.csv", encoding="utf-8") as file:
-            header, *rows = csv.reader(file)
-        assert header == ["#timestamp [ns]", "filename"]
-        assert rows == [[str(stamp), f"{stamp}.png"] for stamp in stamps]
-        assert sorted(path.name for path in (place / "data").iterdir()) == [row[1] for row in rows]
-        about = yaml.safe_load((place / "sensor.yaml").read_text())
-        body_from_sensor = np.array(about["T_BS"]["data"]).reshape(4, 4)
-        np.testing.assert_array_equal(body_from_sensor, np.eye(4) + offset * np.eye(4, k=3))
-        assert about["resolution"] == [160, 120] and about["rate_hz"] == pytest.approx(30.0)
-        assert about["intrinsics"] == [110.0, 110.0, 79.5, 59.5]
-        assert about["distortion_coefficients"] == [0.0] * 4
+    sequence = open_stereo(folder)
+    assert sequence.rig == STEREO
+    np.testing.assert_array_equal(sequence.stamps_ns, stamps_ns(4, 30.0))
+    np.testing.assert_array_equal([frame.image for frame in sequence.frames()], pictures(folder))
+    np.testing.assert_array_equal([frame.right for frame in sequence.frames()], pictures(folder, "cam1"))
     poses = DESK.build(np.random.default_rng(0)).world_from_camera
     np.testing.assert_allclose(truth(folder), poses, atol=1e-11)
-    table = states(folder)
-    assert table.shape == (4, 17) and table[:, 0].tolist() == [str(stamp) for stamp in stamps]
-    velocity = (poses[2, 4:] - poses[0, 4:]) / (stamps[2] - stamps[0]) * 1e9
-    np.testing.assert_allclose(table[1, 8:11].astype(float), velocity, atol=1e-9)
-    about = yaml.safe_load((folder / "camera.yaml").read_text())
-    assert about == {
-        "model": "pinhole", "fx": 110.0, "fy": 110.0, "cx": 79.5, "cy": 59.5, "width": 160, "height": 120,
-        "distortion": [0.0] * 5, "baseline_m": 0.1,
-    }  # fmt: skip
+    velocity = (poses[2, 4:] - poses[0, 4:]) / (sequence.stamps_ns[2] - sequence.stamps_ns[0]) * 1e9
+    np.testing.assert_allclose(states(folder)[1, 8:11].astype(float), velocity, atol=1e-9)
 
 
 @pytest.mark.slow
@@ -157,16 +140,6 @@ def test_a_folder_with_files_is_not_touched(tmp_path: Path) -> None:
     assert contents(tmp_path) == {"notes.txt": b"mine"}
 
 
-@pytest.mark.slow
-def test_the_path_depends_on_the_seed_and_not_on_what_is_there() -> None:
-    paths = [
-        world.build(np.random.default_rng(0)).world_from_camera
-        for world in (DESK, replace(DESK, papers=3, board=(5, 4)), replace(DESK, contrast=0.2))
-    ]
-    np.testing.assert_array_equal(paths[0], paths[1])
-    np.testing.assert_array_equal(paths[0], paths[2])
-
-
 class GreyWall:
     """An evenly grey wall with a bright right half; the camera turns by 10 mrad a frame, at 10 frames a second."""
 
@@ -182,19 +155,6 @@ class GreyWall:
         turn = np.zeros((self.frames, 6))
         turn[:, 1] = 0.01 * np.arange(self.frames)
         return TexturedScene("wall", stamps_ns(self.frames, 10.0), SE3.exp(turn), sheets)
-
-
-def test_depth_images_hold_the_depth(tmp_path: Path) -> None:
-    simulate_images(GreyWall(), replace(CLEAN, depth=True), CAMERA, tmp_path / "run", 0)
-    depth = pictures(tmp_path / "run", "depth0")
-    assert depth.dtype == np.uint16
-    assert (depth[0] == 5000).all()
-
-
-def test_the_right_image_is_seen_from_the_baseline(tmp_path: Path) -> None:
-    simulate_images(GreyWall(), CLEAN, STEREO, tmp_path / "run", 0)
-    left, right = (pictures(tmp_path / "run", sensor)[0] for sensor in ("cam0", "cam1"))
-    np.testing.assert_array_equal(right[:, :-11], left[:, 11:])
 
 
 def test_noise_has_the_stated_strength(tmp_path: Path) -> None:

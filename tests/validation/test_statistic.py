@@ -1,16 +1,12 @@
 """Statistics of errors: what they are worth, and what follows from them."""
 
-import csv
 import json
 
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from examples.studies.point_worlds import MONO, DeskWorld, Measuring, simulate_features
 from rbpf.lie import SE3
-from rbpf.runs.recordings import filter_features
-from rbpf.systems.mono.config import MonoConfig
 from rbpf.validation.consistency.statistic import (
     Statistic,
     correlation_time,
@@ -23,7 +19,6 @@ from rbpf.validation.consistency.statistic import (
     variance_ratio,
     whitened_errors,
 )
-from rbpf.validation.tables import write_table
 
 
 def test_the_interval_of_a_ratio_holds_the_true_one_in_95_of_100_cases():
@@ -158,12 +153,6 @@ def test_the_correlation_time_of_an_autoregressive_series(phi):
     assert np.mean(found) == pytest.approx((1 + phi) / (1 - phi), rel=0.2)
 
 
-def test_a_series_too_short_or_constant_has_no_correlation_time_of_its_own():
-    assert correlation_time(np.array([1.0, 2.0])) == 1.0
-    assert correlation_time(np.full(50, 2.0)) == 1.0
-    assert correlation_time(np.zeros(0)) == 1.0
-
-
 def test_a_filter_that_is_exact_is_what_the_posterior_expects():
     """A random walk with fixes: the Kalman filter's online estimates beside the smoother's of all fixes."""
     rng, steps = np.random.default_rng(0), 400
@@ -214,21 +203,3 @@ def test_nees_of_errors_drawn_from_the_covariance_is_six():
     errors = whitened_errors(SE3, estimate, cov, truth)
     assert errors.nees.mean() == pytest.approx(6.0, abs=0.25)
     assert (errors.ranks == 6).all()
-
-
-def test_a_table_is_printed_in_columns_and_kept(tmp_path, capsys):
-    write_table(tmp_path / "new" / "table.csv", ["name", "error"], [["a", 1.23456789], ["long", 12]])
-    assert capsys.readouterr().out.splitlines() == ["name  error", "a      1.23", "long     12"]
-    with (tmp_path / "new" / "table.csv").open(encoding="utf-8", newline="") as file:
-        assert list(csv.reader(file)) == [["name", "error"], ["a", "1.23457"], ["long", "12"]]
-
-
-def test_a_camera_s_map_is_told_in_the_world_of_the_known_points():
-    log = simulate_features(DeskWorld(frames=60), Measuring(), MONO, seed=0)
-    summary = filter_features(log, MonoConfig(particles=50)).system.map().points()
-    truth = np.array([log.truth.landmarks[name] for name in summary.ids.tolist()])
-    error = summary.mean - truth
-    squared = np.einsum("kd,kde,ke->k", error, np.linalg.inv(summary.cov), error)
-    assert summary.ids.size > 10
-    assert np.linalg.norm(error, axis=1).max() < 0.15
-    assert 0.3 < np.median(squared) / 3.0 < 3.0

@@ -107,17 +107,10 @@ def test_a_run_that_is_not_possible_does_not_stop_the_others(config, tmp_path, c
     ("change", "message"),
     [
         ({"system": "sonar"}, "range-bearing, mono, stereo"),
-        ({"sequences": []}, "sequences is empty"),
         ({"sequences": ["nowhere"]}, "no sequence"),
-        ({"sequences": [{"recording": "log", "lens": "log"}]}, "entries recording"),
-        ({"seeds": []}, "seeds is empty"),
-        ({"seeds": "many"}, "seeds"),
         ({"seeds": [1, 1]}, "same run twice"),
         ({"particles": [0]}, "particles must be a whole number, at least 1"),
-        ({"options": {}}, "options is empty"),
-        ({"options": {"a": {"proposal.order": 1}}}, "proposal.order"),
         ({"settings": {"proposal.iterations": "two"}}, "iterations"),
-        ({"sizes": [1]}, "no entry 'sizes'"),
         ({"seeds": 10**9}, "more than"),
     ],
 )
@@ -144,16 +137,6 @@ def test_damaged_rows_name_their_line(tmp_path):
     path.write_text('{"key": "a", "figures": {}}\nnonsense\n')
     with pytest.raises(InputError, match="line 2"):
         read_rows(path)
-
-
-def test_a_run_keeps_its_key_only_while_it_is_the_same(config):
-    jobs = read_plan(config)
-    assert [job.key for job in read_plan(config)] == [job.key for job in jobs]
-    file = SweepFile("range-bearing", ["log"], seeds=[5])
-    (one,) = plan(file, config.parent)
-    (other,) = plan(SweepFile("range-bearing", ["log"], seeds=[5], settings={"anchor_every": 3}), config.parent)
-    assert one.key != other.key
-    assert one.given == {"seed": 5}
 
 
 @pytest.mark.slow

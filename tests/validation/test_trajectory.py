@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from evo.core import sync
 from evo.core.trajectory import PoseTrajectory3D
-from evo.tools import file_interface
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -44,13 +43,6 @@ def test_the_largest_difference_is_exact_at_present_day_stamps():
     assert len(associate(now, later)[0]) == 1
     with pytest.raises(InputError, match=r"within 0\.01 s"):
         associate(now, Trajectory(later.stamps_ns + 1, later.world_from_body))
-
-
-def test_counted_steps_pair_only_with_themselves():
-    estimate = Trajectory(np.array([0, 1, 2, 5]), SE3.identity((4,)))
-    reference = Trajectory(np.array([1, 3, 5, 6]), SE3.identity((4,)))
-    left, right = associate(estimate, reference, max_difference_ns=0)
-    assert left.stamps_ns.tolist() == right.stamps_ns.tolist() == [1, 5]
 
 
 @given(
@@ -91,30 +83,16 @@ def in_evo(trajectory: Trajectory) -> PoseTrajectory3D:
     return PoseTrajectory3D(trajectory.positions, quat_wxyz, trajectory.stamps_ns * 1e-9)
 
 
-def test_planar_poses_become_turns_about_z():
-    planar = np.array([[0.3, 1.0, 2.0], [-2.0, -4.0, 0.5]])
-    trajectory = Trajectory.from_planar(np.array([0, 1]), planar)
-    np.testing.assert_allclose(trajectory.positions, [[1.0, 2.0, 0.0], [-4.0, 0.5, 0.0]])
-    inside = SE3.matrix(trajectory.world_from_body)[:, :2][:, :, [0, 1, 3]]
-    np.testing.assert_allclose(inside, SE2.matrix(planar)[:, :2], atol=1e-15)
-
-
 @pytest.mark.parametrize(
     ("stamps_ns", "poses", "words"),
     [
         (np.arange(3), SE3.identity((2,)), r"found \(3,\) and \(2, 7\)"),
-        (np.arange(2), np.full((2, 7), [0, 0, 0, 1, 0, np.nan, 0]), "row 0"),
         (np.array([5, 6, 4]), SE3.identity((3,)), "order of time, row 2"),
     ],
 )
 def test_what_is_no_trajectory_is_said(stamps_ns, poses, words):
     with pytest.raises(InputError, match=words):
         Trajectory(stamps_ns, poses)
-
-
-def test_an_empty_trajectory_has_no_partner():
-    with pytest.raises(InputError, match="empty"):
-        associate(Trajectory(np.zeros(0, dtype=np.int64), np.zeros((0, 7))), at_times([0]))
 
 
 POSE = "1.0 2.0 3.0 0.0 0.0 0.0 1.0"
@@ -132,15 +110,6 @@ def test_tum_keeps_every_bit_and_every_nanosecond(tmp_path, wander):
     assert [file.name for file in tmp_path.iterdir()] == ["a.tum"]
 
 
-def test_evo_reads_what_is_written(tmp_path, wander):
-    trajectory = wander(30, 3)
-    write_tum(tmp_path / "a.tum", trajectory)
-    theirs = file_interface.read_tum_trajectory_file(tmp_path / "a.tum")
-    np.testing.assert_array_equal(theirs.positions_xyz, trajectory.positions)
-    np.testing.assert_array_equal(theirs.timestamps, trajectory.stamps_ns / 1e9)
-    np.testing.assert_allclose(theirs.poses_se3, SE3.matrix(trajectory.world_from_body), atol=1e-12)
-
-
 def test_tum_skips_comments_and_scales_short_quaternions(tmp_path):
     (tmp_path / "a.tum").write_text("# a comment\n\n12.0000000019 1 2 3 0 0.6 0 0.799\n")
     trajectory = read_tum(tmp_path / "a.tum")
@@ -156,15 +125,11 @@ ROTATION = "1 0 0 0 0 1 0 0 0 0 1 0\n"
     [
         (read_tum, f"0.0 {POSE}\n0.1 1 2 3 0 0 1\n", r"line 2: expected 8 columns .*found 7"),
         (read_tum, f"# x\n0.0 {POSE}\n0.1 1 2 x 0 0 0 1\n", r"line 3: expected tz .*'x'"),
-        (read_tum, "0.0 1 2 nan 0 0 0 1\n", r"line 1: expected tz"),
         (read_tum, "0.0 1 2 3 0 0 0 0.9\n", r"line 1: .*length 1, found length 0.9"),
         (read_tum, f"0.5 {POSE}\n0.25 {POSE}\n", r"line 2: time runs backwards from 0.5 to 0.25"),
-        (read_tum, "# nothing\n", r"expected rows of timestamp"),
-        (read_tum, "", r"empty"),
         (read_tum, None, r"no such file"),
         (read_kitti, ROTATION + "1 0 0 0 0 1 0 0 0 0 1\n", "line 2: expected 12 columns"),
         (read_kitti, ROTATION + "1 0 0 0 0 1 0 0 0 0 -1 0\n", "line 2: expected a rotation matrix"),
-        (read_kitti, ROTATION + "1 0 0 0 0 1.1 0 0 0 0 1 0\n", "line 2: expected a rotation matrix"),
     ],
 )
 def test_a_malformed_file_is_refused_with_its_line(tmp_path, read, content, words):
@@ -189,9 +154,9 @@ def test_writing_that_fails_keeps_the_old_file_and_leaves_nothing_behind(tmp_pat
     assert list(tmp_path.iterdir()) == [target]
 
 
-def test_kitti_is_read_row_by_row(tmp_path, wander):
-    poses = wander(10, 5).world_from_body
-    np.savetxt(tmp_path / "a.txt", SE3.matrix(poses)[:, :3].reshape(10, 12), fmt="%.9e")
-    trajectory = read_kitti(tmp_path / "a.txt")
-    np.testing.assert_array_equal(trajectory.stamps_ns, np.arange(10))
-    np.testing.assert_allclose(SE3.local(poses, trajectory.world_from_body), 0.0, atol=1e-7)
+def test_planar_poses_become_turns_about_z():
+    planar = np.array([[0.3, 1.0, 2.0], [-2.0, -4.0, 0.5]])
+    trajectory = Trajectory.from_planar(np.array([0, 1]), planar)
+    np.testing.assert_allclose(trajectory.positions, [[1.0, 2.0, 0.0], [-4.0, 0.5, 0.0]])
+    inside = SE3.matrix(trajectory.world_from_body)[:, :2][:, :, [0, 1, 3]]
+    np.testing.assert_allclose(inside, SE2.matrix(planar)[:, :2], atol=1e-15)
