@@ -22,6 +22,8 @@ from rbpf.systems.range_bearing.config import RangeBearingConfig
 from rbpf.systems.stereo.config import StereoConfig
 from rbpf.validation.simulation.robot import RobotWorld, simulate_robot
 
+pytestmark = pytest.mark.slow
+
 
 def test_a_robots_causes_agree_with_the_table_of_ratios(tmp_path):
     simulate_robot(RobotWorld(steps=25, landmarks=20), tmp_path / "log", seed=1)
@@ -52,7 +54,6 @@ def folder(tmp_path):
     return tmp_path
 
 
-@pytest.mark.slow
 def test_a_cameras_causes(folder):
     """The measurements are those of the run: filtered again by the same seed they give the same path."""
     rows = {cause.name: cause for cause in camera_causes(folder, (0,))}
@@ -93,13 +94,9 @@ def test_tracks_without_truth_are_judged_by_the_optimums_own_covariance():
     assert (off > 0.0).all() and off[0] != off[1]
 
 
-@pytest.mark.slow
 @pytest.mark.real_data
 @pytest.mark.parametrize(("name", "batch"), [("mrpt_kf_slam_2d", 0.0040), ("mrpt_kf_slam_6d", 0.0102)])
 def test_the_filter_is_near_the_optimum_on_published_logs(data_dir, name, batch):
     found = robot_ratio(data_dir / name, RangeBearingConfig(particles=100))
     assert found.batch_errors_m[0] < batch, "after a rigid alignment no more than the reference's without"
     assert 1.0 <= found.ratio < 1.6
-
-
-pytestmark = pytest.mark.slow
