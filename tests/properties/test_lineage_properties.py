@@ -6,7 +6,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rbpf.core.genealogy import Lineage
-from rbpf.kernels import forest
 
 
 def drawn(rng: np.random.Generator, n: int, concentration: float) -> np.ndarray:
@@ -88,28 +87,6 @@ def test_size_of_the_forest():
         excess.append((lineage.nodes - t) / (n * np.log(n)))
     assert max(excess) < 4.0
     assert 1.0 < np.mean(excess[100:]) < 3.0
-
-
-def test_a_settled_generation_is_climbed_to_once(monkeypatch):
-    """However old it grows, and whatever is resampled since; one that is not settled is climbed to every time."""
-    climbed, rows_at = [], forest.rows_at
-
-    def counted(*arguments):
-        climbed.append(arguments[4])
-        return rows_at(*arguments)
-
-    monkeypatch.setattr("rbpf.core.genealogy.forest.rows_at", counted)
-    lineage = Lineage(4)
-    for generation in range(3):
-        lineage.retain(generation)
-    copies = [np.arange(4)]
-    for ancestors in ([0, 2, 2, 3], [1, 1, 2, 2], [0, 0, 3, 3], [0, 1, 1, 3]):
-        lineage.advance(np.array(ancestors))
-        copies = [rows[ancestors] for rows in copies] + [np.arange(4)]
-        for generation in range(min(3, lineage.generation)):
-            np.testing.assert_array_equal(lineage.rows(generation), copies[generation])
-    # Generation 0 is settled by the second resampling: all descend from its row 2.
-    assert climbed.count(0) == 2 and climbed.count(1) == 3 and climbed.count(2) == 2
 
 
 def test_what_is_settled_is_forgotten_by_a_restoration():

@@ -105,6 +105,7 @@ def test_a_robust_loss_is_opt_in_and_is_hubers():
     assert off[0] > 5 * off[1]
 
 
+@pytest.mark.slow
 def test_any_start_near_by_leads_to_the_same_optimum():
     m = world(2, "range_bearing", steps=CHUNK + 10)
     expected = solve(m)

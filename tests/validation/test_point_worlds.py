@@ -1,4 +1,4 @@
-"""Simulated worlds of points: cameras in a hand, and what is measured: noise, visibility, tracks, outliers."""
+"""Simulated worlds of points: cameras in a hand, and what is measured: noise, visibility, outliers."""
 
 from dataclasses import dataclass, replace
 
@@ -36,15 +36,6 @@ def errors(log: FeatureLog) -> np.ndarray:
     return np.concatenate([f.z - log.camera.project(truth(log, t)) for t, f in enumerate(log.frames)])
 
 
-def sightings(log: FeatureLog) -> dict[int, list[int]]:
-    """Frames in which each landmark was measured."""
-    seen: dict[int, list[int]] = {}
-    for t, frame in enumerate(log.frames):
-        for name in frame.landmarks.tolist():
-            seen.setdefault(name, []).append(t)
-    return seen
-
-
 def likely(successes: float, trials: int, probability: float) -> bool:
     """Within four standard deviations of a binomial distribution."""
     return abs(successes - trials * probability) < 4.0 * np.sqrt(trials * probability * (1.0 - probability))
@@ -72,7 +63,6 @@ BENT = replace(MONO, distortion=(-0.28, 0.07, 2e-4, 2e-5, 0.0))
 DESK = DeskWorld(frames=200)
 STILL = StillCamera(frames=400)
 CHANGING = LabWorld(LabDrive(frames=60, every=10), points=3000)
-EXACT = Measuring(dropout=0.0, turnover=0.0)
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
@@ -114,18 +104,6 @@ def test_share_and_place_of_outliers(camera: Pinhole | RectifiedStereo) -> None:
     assert len(log.outside()) == 0
     if camera is STEREO:
         assert (z[:, 2] <= z[:, 0]).all()
-
-
-def test_a_lost_track_rests_and_is_taken_up_again() -> None:
-    log = simulate_features(STILL, replace(EXACT, turnover=0.05, rest_frames=12), MONO, seed=0)
-    assert log.known is not None
-    seen = sightings(log)
-    assert all(len(seen[name]) == STILL.frames for name in log.known.names.tolist())
-    tracked = {name: frames for name, frames in seen.items() if name not in log.known.names}
-    gaps = np.concatenate([np.diff(frames) - 1 for frames in tracked.values()])
-    assert set(gaps.tolist()) == {0, 12}
-    # After a gap a track has gone on for no frame yet, so that it cannot have been lost.
-    assert likely(int((gaps > 0).sum()), len(gaps), 0.05)
 
 
 def test_known_points_are_given_with_the_stated_error() -> None:

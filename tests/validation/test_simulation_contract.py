@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from examples.studies import point_worlds
-from examples.studies.point_worlds import MONO, STEREO, DeskWorld, Measuring, PointWorld, simulate_features
+from examples.studies.point_worlds import DeskWorld, Measuring
 from rbpf.errors import InputError
 from rbpf.sensors.camera import Pinhole, RectifiedStereo
-from rbpf.sensors.feature_log import FeatureLog
 from rbpf.validation.simulation import images, textured_scene
 from rbpf.validation.simulation.desk_and_room import TexturedDesk, TexturedRoom
 from rbpf.validation.simulation.images import Imaging, simulate_images
@@ -55,23 +54,6 @@ def test_what_makes_no_sense_is_refused(kind: Any, options: dict[str, Any], mess
 def test_examples_in_the_docstrings_run(module: ModuleType) -> None:
     result = doctest.testmod(module)
     assert result.attempted > 0 and result.failed == 0
-
-
-def log_bytes(log: FeatureLog) -> bytes:
-    assert log.truth is not None and log.known is not None
-    parts = [log.truth.stamps_ns, log.truth.world_from_camera, log.known.names, log.known.positions]
-    for frame in log.frames:
-        parts += [np.array(frame.stamp_ns), frame.landmarks, frame.z, frame.cov_z]
-    return b"".join(part.tobytes() for part in [*parts, *log.truth.landmarks.values()])
-
-
-@pytest.mark.parametrize("camera", [MONO, STEREO])
-@pytest.mark.parametrize("world", [DeskWorld(frames=20), DeskWorld(frames=20, renewal=0.1)])
-def test_a_seed_gives_the_same_measurements(world: PointWorld, camera: Pinhole | RectifiedStereo) -> None:
-    measuring = Measuring(outlier_rate=0.1)
-    first, again, other = (log_bytes(simulate_features(world, measuring, camera, seed)) for seed in (3, 3, 4))
-    assert first == again
-    assert first != other
 
 
 def contents(folder: Path) -> dict[str, bytes]:
