@@ -36,7 +36,7 @@ def calibrate(images, out, *arguments, board=BOARD_OPTIONS):
 def test_the_camera_is_written_for_the_readers(tmp_path, capsys, lens, options):
     images = tmp_path / "images"
     images.mkdir()
-    for number, image in enumerate(pictures(20, lens)):
+    for number, image in enumerate(pictures() if lens is CAMERA else pictures(20, lens)):
         cv2.imwrite(str(images / f"{number:02d}.png"), image)
     assert calibrate(images, tmp_path / "out", *options, "--json") == 0
     entries = json.loads(capsys.readouterr().out)
