@@ -67,7 +67,7 @@ def test_consolidated_before_every_step_it_is_the_kalman_filter(world, consolida
 @pytest.mark.parametrize(
     ("consolidation", "proposal"),
     [(Consolidation(2), None), (Consolidation(9, 0.9), PriorProposal()), (Consolidation(9, 0.0), None)],
-    ids=repr,
+    ids=["often", "bootstrap", "seldom"],
 )
 def test_whatever_the_trigger_it_comes_to_the_kalman_filter(world, consolidation, proposal):
     filter_ = plane(consolidation, 6000)
