@@ -17,7 +17,6 @@ from rbpf.ranges import Probability, Range, Ranged
 
 REFINEMENTS = 2
 """Gauss-Newton steps on the nine pixels of a triple."""
-
 FARTHEST = 1e4
 """Baselines away at most is a point put for the alignment."""
 
@@ -50,9 +49,8 @@ def consensus(
 ) -> Array:
     """The motion (7,) of the lowest truncated score Σ min(d², gate), from triples that `rng` draws.
 
-    `start` is a guess of the motion; it takes part, and so does standing still.
-
-    The distances d are Mahalanobis', under the sum of both frames' covariances: enough to tell motions apart.
+    `start` is a guess of the motion; it takes part, and so does standing still. The distances d are Mahalanobis',
+    under the sum of both frames' covariances: enough to tell motions apart.
     """
     config, search = config or RansacConfig(), _Search(matches, start)
     best, lowest, fraction = start, np.inf, 0.0

@@ -39,48 +39,30 @@ SWEEPS, SWEPT_PX = 10, 1e-4
 
 
 class PinholeCamera(Protocol):
-    """Focal lengths and principal point."""
+    """Focal lengths and principal point, px."""
 
     @property
-    def fx(self) -> float:
-        """Focal length along the rows, px."""
-
+    def fx(self) -> float: ...
     @property
-    def fy(self) -> float:
-        """Focal length along the columns, px."""
-
+    def fy(self) -> float: ...
     @property
-    def cx(self) -> float:
-        """Column of the principal point, px."""
-
+    def cx(self) -> float: ...
     @property
-    def cy(self) -> float:
-        """Row of the principal point, px."""
+    def cy(self) -> float: ...
 
 
 class StereoCamera(Protocol):
     """Two equal undistorted pinholes side by side, the left one the reference, as a `RectifiedStereo`."""
 
     @property
-    def camera(self) -> PinholeCamera:
-        """Each of the two."""
-
+    def camera(self) -> PinholeCamera: ...
     @property
-    def baseline_m(self) -> float:
-        """Distance of the right one, along the rows."""
+    def baseline_m(self) -> float: ...
 
 
 @dataclass(frozen=True)
 class Matches:
-    """Points seen in two stereo frames.
-
-    Attributes:
-        camera: of both.
-        z_prev: (K, 3) pixels (u_left, v, u_right) in the earlier frame.
-        z_now: (K, 3) in the later one.
-        cov_prev: (K, 3, 3) [px²].
-        cov_now: (K, 3, 3) [px²].
-    """
+    """Points seen in an earlier and a later stereo frame: pixels (K, 3) (u_left, v, u_right), covariances (K, 3, 3) px²."""
 
     camera: StereoCamera
     z_prev: Array
@@ -125,11 +107,7 @@ class Matches:
         return Matches(self.camera, *chosen)
 
     def plausible(self, gate: float) -> np.ndarray:
-        """Which (K,) can be points in front of the camera.
-
-        Args:
-            gate: squared distance, in standard deviations, that a disparity may be below zero.
-        """
+        """Which (K,) can be points in front of the camera: no disparity is below zero by a squared distance of `gate`."""
         across = np.array([1.0, 0.0, -1.0])
         kept = np.ones(len(self), dtype=bool)
         for z, cov in ((self.z_prev, self.cov_prev), (self.z_now, self.cov_now)):
@@ -140,23 +118,14 @@ class Matches:
 
 @dataclass(frozen=True)
 class Reprojection:
-    """Pixels after a motion, and their derivatives.
+    """Pixels after a motion, and their derivatives."""
 
-    Attributes:
-        pixels: (…, 3) g.
-        front: (…) whether the point is in front of the camera, or beyond infinity.
-        by_pixels: (…, 3, 3) A = ∂g/∂m.
-        by_rotation: (…, 3, 3) ∂g/∂ω, of T Exp([ω, v]).
-        by_scaled_translation: (…, 3, 3) with ∂g/∂v = ρ · this.
-        inverse_depth: (…) ρ of m at z = 1: the inverse depth before the motion, 1/m.
-    """
-
-    pixels: Array
-    front: np.ndarray
-    by_pixels: Array
-    by_rotation: Array
-    by_scaled_translation: Array
-    inverse_depth: Array
+    pixels: Array  #: (…, 3) g.
+    front: np.ndarray  #: (…) whether the point is in front of the camera, or beyond infinity.
+    by_pixels: Array  #: (…, 3, 3) A = ∂g/∂m.
+    by_rotation: Array  #: (…, 3, 3) ∂g/∂ω, of T Exp([ω, v]).
+    by_scaled_translation: Array  #: (…, 3, 3) with ∂g/∂v = ρ · this.
+    inverse_depth: Array  #: (…) ρ of m at z = 1: the inverse depth before the motion, 1/m.
 
     @property
     def by_motion(self) -> Array:
@@ -222,33 +191,19 @@ def reproject(camera: StereoCamera, delta: Array, pixels: Array) -> Reprojection
 
 @dataclass(frozen=True)
 class Innovation:
-    """ν and what goes with it.
+    """ν and what goes with it."""
 
-    Attributes:
-        nu: (K, 3), infinite where a point would be behind the camera.
-        cov: (K, 3, 3) S.
-        pixels: (K, 3) m̂.
-        seen: g at m̂, and its derivatives.
-    """
-
-    nu: Array
-    cov: Array
-    pixels: Array
-    seen: Reprojection
+    nu: Array  #: (K, 3), infinite where a point would be behind the camera.
+    cov: Array  #: (K, 3, 3) S.
+    seen: Reprojection  #: g at m̂, and its derivatives.
 
 
 class WhiteRows(NamedTuple):
-    """Innovations, whitened.
+    """Innovations, whitened."""
 
-    Attributes:
-        rows: (K, 3, 7) L⁻¹ [ν, −∂g/∂ξ] with S = L Lᵀ; zeros for a point behind the camera.
-        front: (K,) `Reprojection.front`.
-        pixels: (K, 3) m̂.
-    """
-
-    rows: Array
-    front: np.ndarray
-    pixels: Array
+    rows: Array  #: (K, 3, 7) L⁻¹ [ν, −∂g/∂ξ] with S = L Lᵀ; zeros for a point behind the camera.
+    front: np.ndarray  #: (K,) `Reprojection.front`.
+    pixels: Array  #: (K, 3) m̂.
 
 
 def residuals(matches: Matches, delta: Array, points: Points) -> tuple[Array, Array]:
@@ -295,4 +250,4 @@ def linearised(matches: Matches, delta: Array, pixels: Array, points: Points) ->
     cov = matches.cov_now
     if points != "exact":
         cov = cov + seen.by_pixels @ matches.cov_prev @ seen.by_pixels.mT
-    return Innovation(nu, cov, pixels, seen)
+    return Innovation(nu, cov, seen)

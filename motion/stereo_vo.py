@@ -33,16 +33,12 @@ from rbpf.ranges import Positive, Range, Ranged
 
 ROUNDS = 5
 """Of optimising and choosing anew which matches agree; it ends when they stay the same."""
-
 REWEIGHTED = 3
 """Times that S is formed anew for propagated points."""
-
 WIDE = 4.0
 """Times the gate is what agrees with the consensus of three: it is not yet the motion of all."""
-
 LEAST_KEPT = 0.05
 """No direction keeps less of I than this in I − D: where nearly all is noise, what is left cannot be told from it."""
-
 ROUNDING = 1e-14
 """Variances below this fraction of the largest are rounding."""
 
@@ -73,24 +69,17 @@ class VoConfig(Ranged):
 @final
 @dataclass(frozen=True, eq=False)
 class MotionEstimate:
-    """The motion between two stereo frames.
+    """The motion between two stereo frames."""
 
-    Attributes:
-        previous_camera_from_camera: (7,) increment; the start where none was found.
-        cov: (6, 6) in the right chart there, order [ω, v]; NaN where none was found.
-        inliers: (K,) bool, matches that agree with it.
-        rms: root mean square of the inliers' whitened residuals, 1 expected: with their degrees of freedom, and with
-            what the gate cuts off made up for.
-        failure: why no motion was found, in words; empty where one was.
-        others: motions that matches far from this one agree on, as those on a thing that moves, each with its own
-            inliers; false matches agree on none.
-    """
-
-    previous_camera_from_camera: Array
-    cov: Array
-    inliers: np.ndarray
+    previous_camera_from_camera: Array  #: (7,) increment; the start where none was found.
+    cov: Array  #: (6, 6) in the right chart there, order [ω, v]; NaN where none was found.
+    inliers: np.ndarray  #: (K,) bool, matches that agree with it.
+    #: Root mean square of the inliers' whitened residuals, by their degrees of freedom and for what the gate cuts off: 1
+    #: is expected.
     rms: float
-    failure: str = ""
+    failure: str = ""  #: why no motion was found, in words; empty where one was.
+    #: Motions that matches far from this one agree on, as those on a thing that moves, each with its own inliers; false
+    #: matches agree on none.
     others: tuple["MotionEstimate", ...] = ()
 
     @property
@@ -102,16 +91,15 @@ class MotionEstimate:
 def estimate_motion(
     matches: Matches, rng: np.random.Generator, start: Array | None = None, config: VoConfig | None = None
 ) -> MotionEstimate:
-    """The motion of a rectified stereo camera between two frames.
+    """The motion of a rectified stereo camera between two frames, from their `Matches.checked`.
+
+    Where matches are too few or do not agree, the estimate's `failure` says so.
 
     Args:
-        matches: of the two; see `Matches.checked`.
+        matches: of the two frames.
         rng: draws the triples; the same state gives the same bytes.
-        start: (7,) a guess of the increment; by default none, the camera stands still.
+        start: (7,) a guess of the increment; by default the camera stands still.
         config: how.
-
-    Returns:
-        The estimate. Where matches are too few or do not agree, its `failure` says so.
     """
     config, start = config or VoConfig(), SE3.identity() if start is None else np.asarray(start, dtype=float)
     plausible = matches.plausible(config.gate)
@@ -140,15 +128,9 @@ def estimate_motion(
 
 
 def pixel_gains(matches: Matches, motion: Odometry, config: VoConfig) -> tuple[Array, Array]:
-    """By what noise of the pixels moves an estimate, of the matches that agree with it: Mathematics (vo-gain).
+    """By what noise of the pixels moves an estimate, of the K matches that agree with it: Mathematics (vo-gain).
 
-    Args:
-        matches: K of them.
-        motion: the estimate, and its covariance.
-        config: how it was made.
-
-    Returns:
-        (K, 6, 3) of the earlier pixels and (K, 6, 3) of the later ones, in the right chart at the estimate.
+    (K, 6, 3) of the earlier pixels and (K, 6, 3) of the later ones, in the right chart at the estimate.
     """
     pixels = white_rows(matches, motion.delta, "adjusted").pixels if config.points == "adjusted" else matches.z_prev
     found = linearised(matches, motion.delta, pixels, config.points)
@@ -256,10 +238,7 @@ def trimming(gate: float) -> float:
     motion less well than as many that were not chosen would. F₃ / F₅, the distributions of χ² with three and five
     degrees of freedom at the gate: rejection by ν has the influence function ν within the gate, the covariance
     E[νᵀν] / 3 = F₅ and the slope F₅ (P. Huber 1981, §4.5), for each match; the fraction F₃ of them is within. It is
-    also 3 / E[ν² | within].
-
-    Args:
-        gate: squared Mahalanobis distance; infinite for none.
+    also 3 / E[ν² | within]. The gate is a squared Mahalanobis distance, infinite for none.
     """
     if math.isinf(gate):
         return 1.0
@@ -292,17 +271,11 @@ class MotionPrior(Ranged):
 @final
 @dataclass(frozen=True)
 class CandidateMotion:
-    """A motion that a group of matches agrees on.
+    """A motion that a group of matches agrees on."""
 
-    Attributes:
-        odometry: previous_camera_from_camera and its covariance, to hand to a filter.
-        inliers: (K,) bool, the group.
-        note: in words, where the increment is not simply what the group says; empty else.
-    """
-
-    odometry: Odometry
-    inliers: np.ndarray
-    note: str
+    odometry: Odometry  #: previous_camera_from_camera and its covariance, to hand to a filter.
+    inliers: np.ndarray  #: (K,) bool, the group.
+    note: str  #: in words, where the increment is not simply what the group says; empty else.
 
 
 @final
@@ -312,16 +285,12 @@ class CandidateMotions:
 
     One candidate is the rule. Several mean that something in the view moves: which of them is the camera's is not in
     the matches, and is for the caller to say.
-
-    Attributes:
-        prior: the motion expected before anything was seen.
-        motions: the candidates, that of the first consensus first; none where matches are too few or do not agree.
-        failure: why there is none, in words; empty where there is one.
     """
 
-    prior: Odometry
+    prior: Odometry  #: the motion expected before anything was seen.
+    #: That of the first consensus first; none where matches are too few or do not agree.
     motions: tuple[CandidateMotion, ...]
-    failure: str
+    failure: str  #: why there is none, in words; empty where there is one.
 
 
 @final

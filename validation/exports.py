@@ -56,12 +56,7 @@ _NAMES = {"<f4": "float", "u1": "uchar", "<i4": "int"}
 
 
 def export_run(run: Path, formats: Sequence[str], out: Path) -> list[Path]:
-    """Writes a run in other formats; returns the files.
-
-    Args:
-        run: folder that `rbpf run` left.
-        formats: names in `FORMATS`.
-        out: folder for the files.
+    """Writes a run, the folder that `rbpf run` left, in some of the `FORMATS` to a folder; returns the files.
 
     Raises:
         InputError: it is no run folder, a format is not known, or its library is not installed.
@@ -97,15 +92,9 @@ def _colmap(run: Path, estimate: PathAndMap, out: Path) -> list[Path]:
 
 
 def _npz(_run: Path, estimate: PathAndMap, out: Path) -> list[Path]:
-    landmarks = estimate.landmarks
-    arrays = {
-        "stamps_ns": estimate.stamps_ns,
-        "world_from_body": estimate.world_from_body,
-        "cov_poses": estimate.cov_poses,
-        "landmark_ids": landmarks.ids,
-        "landmarks": landmarks.mean,
-        "cov_landmarks": landmarks.cov,
-    }
+    names, landmarks = ("stamps_ns", "world_from_body", "cov_poses"), estimate.landmarks
+    arrays = {name: getattr(estimate, name) for name in names}
+    arrays |= {"landmark_ids": landmarks.ids, "landmarks": landmarks.mean, "cov_landmarks": landmarks.cov}
     save_arrays(out / "run.npz", arrays)
     return [out / "run.npz"]
 
@@ -149,8 +138,8 @@ def export_colmap(
     Raises:
         InputError: path and measurements are not of one run.
     """
+    model = _colmap_model(estimate, problem, names)
     prepare_folder(folder)
-    model = colmap_model(estimate, problem, names)
     if kind == "text":
         model.write_text(folder)
     else:
@@ -158,8 +147,7 @@ def export_colmap(
     return model
 
 
-def colmap_model(estimate: PathAndMap, problem: Problem | None, names: Names | None = None) -> Any:
-    """The model that `export_colmap` writes."""
+def _colmap_model(estimate: PathAndMap, problem: Problem | None, names: Names | None) -> Any:
     landmarks = raised(estimate.landmarks)
     colours = colours_by_sigma(standard_deviations(estimate.landmarks.cov))
     if not isinstance(problem, FeatureLog):

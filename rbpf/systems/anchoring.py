@@ -13,7 +13,7 @@ it is instead of a draw from it, marginalises the world's place exactly. Poses a
 """
 
 from dataclasses import dataclass
-from typing import final
+from typing import NamedTuple, final
 
 import numpy as np
 
@@ -30,6 +30,8 @@ from rbpf.lie import LieGroup
 
 _MOST_OF_ALL = 0.999
 """A landmark that owes more than this fraction of its information to the first frame says nothing about the start."""
+# Names in a checkpoint, of the parts of the first motion and of the latest re-estimation.
+_SECOND, _LATEST = ("second", "state", "delta", "factor"), ("latest", "latest_mean", "latest_factor")
 
 
 @dataclass(frozen=True)
@@ -61,8 +63,7 @@ class StartAnchor:
     def __init__(self, filter_: Filter, every: int = 10, likelihood: Likelihood | None = None) -> None:
         if every < 1:
             raise InputError(f"an anchor is re-estimated every 1, 2, … steps, got {every}")
-        self._filter = filter_
-        self._every = every
+        self._filter, self._every = filter_, every
         self._start = filter_.particles.state[0].copy()
         self._proposal = EkfProposal(iterations=2)
         self._likelihood = likelihood or Gaussian()
@@ -135,56 +136,34 @@ class StartAnchor:
 
     def arrays(self) -> dict[str, np.ndarray]:
         out = {"anchor/groups": np.array(len(self._seen))}
-        for number, (ids, new_landmarks) in enumerate(self._seen):
-            out |= {
-                f"anchor/{number}/ids": ids,
-                f"anchor/{number}/z": new_landmarks.z,
-                f"anchor/{number}/cov": new_landmarks.cov,
-            }
+        for number, (ids, first) in enumerate(self._seen):
+            out |= {f"anchor/{number}/ids": ids, f"anchor/{number}/z": first.z, f"anchor/{number}/cov": first.cov}
         if self._second is not None:
-            second = self._second
-            out |= {
-                "anchor/second": np.array(second.generation),
-                "anchor/state": second.state,
-                "anchor/delta": second.delta,
-                "anchor/factor": second.factor,
-            }
+            out |= {f"anchor/{name}": np.asarray(part) for name, part in zip(_SECOND, self._second, strict=True)}
         if self._latest is not None:
             generation, anchored = self._latest
-            out |= {
-                "anchor/latest": np.array(generation),
-                "anchor/latest_mean": anchored.mean,
-                "anchor/latest_factor": anchored.factor,
-            }
+            parts = np.array(generation), anchored.mean, anchored.factor
+            out |= {f"anchor/{name}": part for name, part in zip(_LATEST, parts, strict=True)}
         return out
 
     def restore(self, arrays: dict[str, np.ndarray], model: ObservationModel, landmark: Landmark) -> None:
         """The inverse of `arrays`; all first observations must have been of one model and parametrisation."""
         lineage, space, sizes = self._filter.lineage, self._filter.space, {"n": self._filter.n}
-        seen = {
-            "ids": integers("seen", least=0),
-            "z": numbers("seen", model.dim),
-            "cov": numbers("seen", model.dim, model.dim),
-        }
+        z, cov = numbers("seen", model.dim), numbers("seen", model.dim, model.dim)
+        seen = {"ids": integers("seen", least=0), "z": z, "cov": cov}
         for number in range(int(read_one(arrays, "anchor/groups", integers(least=0)))):
             found = read(arrays, seen, f"anchor/{number}/")
             self._seen.append((found["ids"], NewLandmarks(found["z"], found["cov"], model, landmark)))
         if "anchor/second" in arrays:
-            second = {
-                "second": integers(),
-                "state": elements(space, "n"),
-                "delta": elements(space),
-                "factor": numbers(space.dim, "rank"),
-            }
+            kinds = integers(), elements(space, "n"), elements(space), numbers(space.dim, "rank")
+            second = dict(zip(_SECOND, kinds, strict=True))
             generation, *parts = read(arrays, second, "anchor/", **sizes).values()
             self._second = _FirstMotion(int(generation), *parts)
             lineage.take_up(self._second.generation)
         if "anchor/latest" in arrays:
-            latest = {
-                "latest": integers(),
-                "latest_mean": elements(space, "n"),
-                "latest_factor": numbers("n", space.dim, space.dim),
-            }
+            latest = dict(
+                zip(_LATEST, (integers(), elements(space, "n"), numbers("n", space.dim, space.dim)), strict=True)
+            )
             generation, *parts = read(arrays, latest, "anchor/", **sizes).values()
             self._latest = int(generation), Anchored(*parts)
             lineage.take_up(self._latest[0])
@@ -209,8 +188,7 @@ class StartAnchor:
         return _Group(Records(mean, cov, records.const), model, z, cov_z, use)
 
 
-@dataclass(frozen=True)
-class _FirstMotion:
+class _FirstMotion(NamedTuple):
     """Where the first motion led each particle of a generation (N, E), its mean Δ (E,) and noise factor (d, r)."""
 
     generation: int

@@ -20,7 +20,7 @@ from rbpf.sensors.readers.images.decoding import FileImages
 from rbpf.systems.map_estimate import MapEstimate
 from rbpf.validation.colmap.images import lay_out
 from rbpf.validation.colmap.model import LEFT, RIGHT, build_model, from_colmap_pose, image_id, image_name
-from rbpf.validation.exports import MAP, PATH, colmap_model, export_colmap, export_ply, write_ply
+from rbpf.validation.exports import MAP, PATH, export_colmap, export_ply, write_ply
 from rbpf.validation.gtsam.observations import observation_table, reprojection
 from rbpf.validation.report.rerun import recording
 from tests.validation.camera_scenes import BENT, FISHEYE, STEREO, scene
@@ -114,7 +114,7 @@ def test_bad_input_is_refused(tmp_path):
     log = scene(frames=4, points=8)
     shorter = replace(log, frames=log.frames[:3])
     with pytest.raises(InputError, match="4 poses and 3 frames"):
-        colmap_model(estimate_of(log), shorter)
+        export_colmap(estimate_of(log), shorter, tmp_path / "model")
     with pytest.raises(InputError, match="row 1"):
         write_ply(tmp_path / "a.ply", np.array([[0, 0, 0], [0, np.nan, 0.0]]), np.zeros((2, 3), dtype=np.uint8))
     assert not list(tmp_path.iterdir())

@@ -19,15 +19,10 @@ from rbpf.validation.colmap.reconstruct import ReconstructionOptions, reconstruc
 @final
 @dataclass(frozen=True, eq=False)
 class AgainstColmap:
-    """A run beside COLMAP.
+    """A run beside COLMAP."""
 
-    Attributes:
-        run: the run's path and map, as the reference that COLMAP's world is brought onto.
-        truth: the ground truth as the reference, which tells how good COLMAP itself is; None without.
-    """
-
-    run: ColmapComparison
-    truth: ColmapComparison | None
+    run: ColmapComparison  #: the run's path and map, as the reference that COLMAP's world is brought onto.
+    truth: ColmapComparison | None  #: the ground truth as the reference: how good COLMAP itself is; None without.
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -35,11 +30,7 @@ class AgainstColmap:
 
 
 def compare_folder_with_colmap(folder: Path, options: ReconstructionOptions | None = None) -> AgainstColmap:
-    """Reconstructs the images that a run folder's config.yaml names, and compares.
-
-    Args:
-        folder: of a run over images; its recording must still lie where it was.
-        options: of the reconstruction.
+    """Reconstructs the images that a run folder's config.yaml names, which must still lie where they were, and compares.
 
     Raises:
         InputError: the run has no images, the folder is of another version, or the reconstruction fails.

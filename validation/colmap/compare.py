@@ -23,7 +23,6 @@ from rbpf.validation.metrics.accuracy import AbsoluteError, ate
 
 NEIGHBOURS = 6
 """Points of the cloud that a plane is laid through."""
-
 LEAST_POINTS = 3
 """Of a cloud, for a plane."""
 
@@ -31,19 +30,12 @@ LEAST_POINTS = 3
 @final
 @dataclass(frozen=True, eq=False)
 class CloudDistance:
-    """Distances from M landmarks to a cloud.
+    """Distances from M landmarks to a cloud."""
 
-    Attributes:
-        nearest_m: (M,) to the nearest point.
-        surface_m: (M,) to the plane that fits the nearest points best.
-        sigmas: (M,) the latter in the landmark's standard deviation across the plane; NaN without covariances.
-        spacing_m: median distance from the nearest points to their own nearest neighbour.
-    """
-
-    nearest_m: Array
-    surface_m: Array
-    sigmas: Array
-    spacing_m: float
+    nearest_m: Array  #: (M,) to the nearest point.
+    surface_m: Array  #: (M,) to the plane that fits the nearest points best.
+    sigmas: Array  #: (M,) the latter in the landmark's standard deviation across the plane; NaN without covariances.
+    spacing_m: float  #: median distance from the nearest points to their own nearest neighbour.
 
     def as_dict(self) -> dict[str, Any]:
         """Quantiles for JSON."""
@@ -61,21 +53,14 @@ class CloudDistance:
 @final
 @dataclass(frozen=True, eq=False)
 class ColmapComparison:
-    """COLMAP beside a reference: the filter, or the truth.
-
-    Attributes:
-        reconstruction: what COLMAP found.
-        path: distances of the camera centres, after the alignment that fits these best.
-        reference_from_colmap: brings COLMAP's world onto the reference's, by the cameras' orientations and centres.
-        cloud: distances of the reference's landmarks; None without.
-        extent_m: diagonal of the box that holds the reference's camera centres.
-    """
+    """COLMAP beside a reference: the filter, or the truth."""
 
     reconstruction: Reconstruction
-    path: AbsoluteError
+    path: AbsoluteError  #: distances of the camera centres, after the alignment that fits these best.
+    #: Brings COLMAP's world onto the reference's, by the cameras' orientations and centres.
     reference_from_colmap: Similarity
-    cloud: CloudDistance | None
-    extent_m: float
+    cloud: CloudDistance | None  #: distances of the reference's landmarks; None without.
+    extent_m: float  #: diagonal of the box that holds the reference's camera centres.
 
     def as_dict(self) -> dict[str, Any]:
         """Figures for JSON."""
@@ -97,11 +82,8 @@ def compare_with_path(
 ) -> ColmapComparison:
     """COLMAP beside a filter's path and, if given, its map.
 
-    Args:
-        found: the reconstruction.
-        reference: poses of the camera; those at the key frames' times are compared.
-        landmarks: (M, 3) in the reference's world.
-        cov_landmarks: (M, 3, 3) of them.
+    The poses of the camera at the key frames' times are compared, and landmarks (M, 3) of covariances (M, 3, 3) in the
+    reference's world.
 
     Raises:
         InputError: the two share too few instants.

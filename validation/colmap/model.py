@@ -20,7 +20,6 @@ from rbpf.validation.gtsam.observations import ObservationTable
 
 HALF_PX = 0.5
 """Added to our pixels it gives COLMAP's."""
-
 LEFT, RIGHT = 1, 2
 """Numbers of the cameras."""
 

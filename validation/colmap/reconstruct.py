@@ -55,33 +55,19 @@ class ReconstructionOptions(Ranged):
 @final
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """What COLMAP found, in a world of its own; in metres if a baseline told the scale.
+    """What COLMAP found, in a world of its own; in metres if a baseline told the scale."""
 
-    Attributes:
-        name: of the sequence.
-        camera: of the images.
-        chosen: (C,) frames that were handed to it.
-        frames: (R,) those of which it found the pose, ascending.
-        stamps_ns: (R,) their times.
-        world_from_camera: (R, 7).
-        points: (M, 3).
-        errors_px: (M,) mean reprojection error of each.
-        track_lengths: (M,) images that show it.
-        metric: whether the scale is that of a stereo pair's baseline; otherwise it is arbitrary.
-        model: the `pycolmap.Reconstruction`, in the same scale.
-    """
-
-    name: str
+    name: str  #: of the sequence.
     camera: Pinhole
-    chosen: NDArray[np.int64]
-    frames: NDArray[np.int64]
-    stamps_ns: NDArray[np.int64]
-    world_from_camera: Array
-    points: Array
-    errors_px: Array
-    track_lengths: NDArray[np.int64]
-    metric: bool
-    model: Any
+    chosen: NDArray[np.int64]  #: (C,) frames that were handed to it.
+    frames: NDArray[np.int64]  #: (R,) those of which it found the pose, ascending.
+    stamps_ns: NDArray[np.int64]  #: (R,) their times.
+    world_from_camera: Array  #: (R, 7).
+    points: Array  #: (M, 3).
+    errors_px: Array  #: (M,) mean reprojection error of each.
+    track_lengths: NDArray[np.int64]  #: (M,) images that show it.
+    metric: bool  #: whether the scale is that of a stereo pair's baseline; otherwise it is arbitrary.
+    model: Any  #: the `pycolmap.Reconstruction`, in the same scale.
 
     @property
     def fraction(self) -> float:
@@ -106,48 +92,33 @@ class Reconstruction:
         }
 
 
-def reconstruct(
-    sequence: ImageSequence, options: ReconstructionOptions | None = None, folder: Path | None = None
-) -> Reconstruction:
+def reconstruct(sequence: ImageSequence, options: ReconstructionOptions | None = None) -> Reconstruction:
     """Reconstructs a sequence of images from scratch.
-
-    Args:
-        sequence: of any reader.
-        options: how.
-        folder: for images, features and model, which stay there; by default a temporary one.
 
     Raises:
         InputError: too few key frames can be read, or COLMAP finds no model.
     """
-    options = options or ReconstructionOptions()
-    if folder is not None:
-        return _reconstruct(sequence, options, folder)
-    with TemporaryDirectory(prefix="colmap-") as temporary:
-        return _reconstruct(sequence, options, Path(temporary))
-
-
-def _reconstruct(sequence: ImageSequence, options: ReconstructionOptions, folder: Path) -> Reconstruction:
     import pycolmap
 
-    images, models, database = folder / "images", folder / "models", folder / "database.db"
-    images.mkdir(parents=True, exist_ok=True)
-    models.mkdir(exist_ok=True)
-    database.unlink(missing_ok=True)
-    # Key frames to files, as NUMBER_SIDE.png.
+    options = options or ReconstructionOptions()
     is_stereo, numbers = options.stereo and sequence.baseline_m is not None, []
-    for number, frame in enumerate(sequence.frames()):
-        if number % options.every or frame.image is None:
-            continue
-        for side, image in enumerate((frame.image, frame.right if is_stereo else None)):
-            if image is not None:
-                pycolmap.Bitmap.from_array(image).write(images / f"{number:06d}_{side}.png")
-        numbers.append(number)
-    if len(numbers) < LEAST_FRAMES:
-        raise InputError(
-            f"{sequence.name} has {len(numbers)} readable key frames of {len(sequence)} images, expected "
-            f"{LEAST_FRAMES} or more; choose a smaller step than every {options.every}."
-        )
-    with _quiet():
+    with TemporaryDirectory(prefix="colmap-") as temporary, _quiet():
+        images, models, database = (Path(temporary) / name for name in ("images", "models", "database.db"))
+        images.mkdir()
+        models.mkdir()
+        # Key frames to files, as NUMBER_SIDE.png.
+        for number, frame in enumerate(sequence.frames()):
+            if number % options.every or frame.image is None:
+                continue
+            for side, image in enumerate((frame.image, frame.right if is_stereo else None)):
+                if image is not None:
+                    pycolmap.Bitmap.from_array(image).write(images / f"{number:06d}_{side}.png")
+            numbers.append(number)
+        if len(numbers) < LEAST_FRAMES:
+            raise InputError(
+                f"{sequence.name} has {len(numbers)} readable key frames of {len(sequence)} images, expected "
+                f"{LEAST_FRAMES} or more; choose a smaller step than every {options.every}."
+            )
         # SIFT of all images, and verified matches with those that follow.
         name, params = camera_model(sequence.camera)
         reading = pycolmap.ImageReaderOptions()

@@ -1,11 +1,8 @@
 """What a stereo camera's frames show: features of each pair, and which of two pairs are the same point.
 
 A front end measures a frame, which gives a `Pair`, and matches two pairs. It holds no pair itself: nothing depends on
-the order of its calls. `ImageFrontEnd` takes images; `NamedFrontEnd` pixels of landmarks that
-have names.
-
-Where `odometry.split` is not "none", odometry and map use features of their own: each feature is always in the same
-half, whenever it is seen.
+the order of its calls. Where `odometry.split` is not "none", odometry and map use features of their own: each feature is
+always in the same half, whenever it is seen.
 """
 
 from abc import ABC, abstractmethod
@@ -58,28 +55,16 @@ KEPT = {
 @final
 @dataclass(frozen=True, eq=False)
 class Pair(Generic[F]):
-    """What one frame showed.
-
-    Attributes:
-        stamp_ns: its time.
-        features: K of them.
-        for_odometry: (K,) bool, which the odometry may use.
-        for_map: (K,) bool, which the map may use.
-        labels: (K,) whether each stood still, see `rbpf.systems.stereo.motion_segmentation`.
-    """
+    """What one frame showed."""
 
     stamp_ns: int
-    features: F
-    for_odometry: np.ndarray
-    for_map: np.ndarray
-    labels: np.ndarray
+    features: F  #: K of them.
+    for_odometry: np.ndarray  #: (K,) bool, which the odometry may use.
+    for_map: np.ndarray  #: (K,) bool, which the map may use.
+    labels: np.ndarray  #: (K,) whether each stood still, see `rbpf.systems.stereo.motion_segmentation`.
 
     def __len__(self) -> int:
         return len(self.features)
-
-    def labelled(self, labels: np.ndarray) -> "Pair[F]":
-        """The same, once it is known what stood still."""
-        return replace(self, labels=labels)
 
     def view(self, moving: np.ndarray | None = None, uncertain: bool = False) -> View[F]:
         """What the map is asked about, without rows that are of things that move."""
@@ -90,23 +75,12 @@ class Pair(Generic[F]):
 
 
 class FrontEnd(ABC, Generic[F]):
-    """Measures frames and matches pairs.
+    """Measures frames and matches pairs."""
 
-    Attributes:
-        frames: types of the frames that it takes.
-        rig: the cameras.
-        names_landmarks: whether the frames themselves say which landmark each feature is.
-        landmarks: the map's side: finds landmarks among the features.
-    """
-
-    frames: ClassVar[tuple[type, ...]]
-    names_landmarks: ClassVar[bool] = False
+    frames: ClassVar[tuple[type, ...]]  #: types of the frames that it takes.
+    names_landmarks: ClassVar[bool] = False  #: whether the frames themselves say which landmark each feature is.
     rig: RectifiedStereo
-    landmarks: Landmarks[F]
-
-    def takes(self, frame: object) -> bool:
-        """Whether it is of such a type."""
-        return isinstance(frame, self.frames)
+    landmarks: Landmarks[F]  #: the map's side: finds landmarks among the features.
 
     @abstractmethod
     def measure(self, frame: Any) -> tuple[Pair[F], str]:
@@ -136,9 +110,7 @@ class FrontEnd(ABC, Generic[F]):
     def landmarks_of(self, pair: Pair[F], updated: bool) -> tuple[np.ndarray, np.ndarray]:
         """Landmark (K,) of each feature, NULL where there is none, and `FeatureKind` (K,) of each.
 
-        Args:
-            pair: the last one that was measured.
-            updated: whether the filter has taken it.
+        Of the pair that was measured last; `updated` says whether the filter has taken it.
         """
         if updated:
             return self.landmarks.ids, self.landmarks.kinds()
@@ -146,27 +118,20 @@ class FrontEnd(ABC, Generic[F]):
 
     @abstractmethod
     def arrays(self, pair: Pair[F]) -> dict[str, np.ndarray]:
-        """For a checkpoint: a pair."""
+        """For a checkpoint."""
 
     @abstractmethod
     def pair_of(self, arrays: dict[str, np.ndarray]) -> Pair[F]:
-        """The inverse of `arrays`.
-
-        Raises:
-            InputError: they are not what they should be.
-        """
+        """The inverse of `arrays`; errors as `rbpf.core.checkpoint.read`."""
 
 
 class ImageFrontEnd(FrontEnd[StereoFeatures]):
-    """Features of images, SIFT by default.
+    """Features of images, matched by their descriptors.
 
     Args:
         rig: the cameras.
         config: all settings.
-        extractor: finds and describes the keypoints of an image; None for SIFT as `config` has it.
-        gate: which landmarks may be which feature; None for that of `config`.
-        model: how a landmark is measured; None for pixels of points in space.
-        landmark: its parametrisation; None for points in space.
+        extractor, gate, model, landmark: see `rbpf.systems.stereo.slam.StereoSlam`.
         landmarks: finds landmarks among the features; None for those by descriptors, with `gate`, `model` and `landmark`.
     """
 
@@ -185,14 +150,16 @@ class ImageFrontEnd(FrontEnd[StereoFeatures]):
         self.rig, self.config = rig, config
         extractor = extractor or Sift(config.sift)
         self.matcher = StereoMatcher(rig, extractor, config.pair)
-        likelihood, length = config.likelihood.build(), extractor.length
-        self.landmarks = landmarks or DescriptorLandmarks(
-            rig, config.map, config.new_landmarks, length, likelihood, gate, model, landmark
-        )
+        own = config.map, config.new_landmarks, extractor.length, config.likelihood.build()
+        self.landmarks = landmarks or DescriptorLandmarks(rig, *own, gate, model, landmark)
 
     def measure(self, frame: Any) -> tuple[Pair[StereoFeatures], str]:
         features, problem = self.features_of(frame)
-        return self._pair(frame.stamp_ns, self._none() if features is None else features), problem
+        if features is None:
+            nothing = np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0), np.zeros(0)
+            descriptors = np.zeros((0, self.matcher.extractor.length), dtype=np.float32)
+            features = StereoFeatures.measured(self.rig, *nothing, descriptors)
+        return self._pair(frame.stamp_ns, features), problem
 
     def features_of(self, frame: Any) -> tuple[StereoFeatures | None, str]:
         """Features of both images, matched along the rows, None where there are none; and what is wrong, in words.
@@ -218,7 +185,6 @@ class ImageFrontEnd(FrontEnd[StereoFeatures]):
         return self.matcher.impossible
 
     def match(self, before: Pair[StereoFeatures], now: Pair[StereoFeatures]) -> tuple[np.ndarray, np.ndarray]:
-        """By their descriptors."""
         found = match_frames(before.features, now.features, self.config.odometry.limits)
         used = before.for_odometry[found.first] & now.for_odometry[found.second]
         return found.first[used], found.second[used]
@@ -230,38 +196,26 @@ class ImageFrontEnd(FrontEnd[StereoFeatures]):
     def pair_of(self, arrays: dict[str, np.ndarray]) -> Pair[StereoFeatures]:
         found = read(arrays, KEPT | _LABELS, "pair/", length=self.matcher.extractor.length)
         features = StereoFeatures.measured(self.rig, *(found[name] for name in KEPT))
-        return self._pair(0, features).labelled(found["stood"])
+        return replace(self._pair(0, features), labels=found["stood"])
 
     def _pair(self, stamp_ns: int, features: StereoFeatures) -> Pair[StereoFeatures]:
         split, everything = self.config.odometry.split, np.ones(len(features), dtype=bool)
         for_odometry, for_map = everything, everything
         if split != "none":
-            for_odometry = split_by_descriptor(features.descriptors)
+            # A random half, the same whenever a feature is seen: whether its first numbers outweigh its last ones.
+            side = features.descriptors.shape[1] // 3
+            for_odometry = features.descriptors[:, :side].sum(axis=1) > features.descriptors[:, -side:].sum(axis=1)
             for_map = for_odometry if split == "same" else ~for_odometry
         if not self.config.map.used:
             for_map = ~everything
         return Pair(stamp_ns, features, for_odometry, for_map, np.full(len(features), UNKNOWN, dtype=np.int8))
-
-    def _none(self) -> StereoFeatures:
-        nothing = np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0), np.zeros(0)
-        descriptors = np.zeros((0, self.matcher.extractor.length), dtype=np.float32)
-        return StereoFeatures.measured(self.rig, *nothing, descriptors)
-
-
-def split_by_descriptor(descriptors: np.ndarray) -> np.ndarray:
-    """A random half (K,), the same whenever a feature is seen: whether its first numbers outweigh its last ones."""
-    side = descriptors.shape[1] // 3
-    return np.asarray(descriptors[:, :side].sum(axis=1) > descriptors[:, -side:].sum(axis=1))
 
 
 @final
 class NamedFrontEnd(FrontEnd[NamedPixels]):
     """Pixels of landmarks that have names: known association.
 
-    Args:
-        rig: the cameras.
-        config: all settings.
-        ns_per_stamp: nanoseconds per unit of the frames' stamps: 10⁹ where they count frames of unknown time.
+    The frames' stamps are `ns_per_stamp` nanoseconds long: 10⁹ where they count frames of unknown time.
     """
 
     frames = (FeatureFrame,)
@@ -272,12 +226,10 @@ class NamedFrontEnd(FrontEnd[NamedPixels]):
         self.landmarks: NamedLandmarks = NamedLandmarks(rig, config.likelihood.build())
 
     def measure(self, frame: FeatureFrame) -> tuple[Pair[NamedPixels], str]:
-        """Nothing is to be done."""
         pixels = NamedPixels(frame.z, frame.cov_z, frame.landmarks)
         return self._pair(self.ns_per_stamp * frame.stamp_ns, pixels), ""
 
     def match(self, before: Pair[NamedPixels], now: Pair[NamedPixels]) -> tuple[np.ndarray, np.ndarray]:
-        """By their names."""
         names = before.features.names, now.features.names
         _, first, second = np.intersect1d(*names, assume_unique=True, return_indices=True)
         used = before.for_odometry[first]
@@ -294,7 +246,7 @@ class NamedFrontEnd(FrontEnd[NamedPixels]):
 
     def pair_of(self, arrays: dict[str, np.ndarray]) -> Pair[NamedPixels]:
         z, cov, names, labels = read(arrays, _NAMED, "pair/").values()
-        return self._pair(0, NamedPixels(z, cov, names)).labelled(labels)
+        return replace(self._pair(0, NamedPixels(z, cov, names)), labels=labels)
 
     def _pair(self, stamp_ns: int, features: NamedPixels) -> Pair[NamedPixels]:
         split, even = self.config.odometry.split, features.names % 2 == 0

@@ -41,10 +41,8 @@ _MAP = frozenset({Part.LANDMARK})
 
 SEEN_AGAIN = 2
 """Observations of a landmark that stands still: one that moves is not where it was seen first."""
-
 TINY = 1e-6
 """Added to the variance of expected pixels, px²: a landmark may be known exactly."""
-
 SIGMAS = 3.0
 """The image is widened by so many standard deviations of the camera's direction."""
 
@@ -58,29 +56,23 @@ _NAMES = {
 class FeatureKind(IntEnum):
     """What a feature of a pair is to the map."""
 
-    FEATURE = 0
-    """Nothing."""
-    LANDMARK = 1
-    """A landmark that weighed the particles."""
-    CANDIDATE = 2
-    """A landmark that has not been seen often enough to weigh them."""
-    NEW = 3
-    """A landmark that it started."""
+    FEATURE = 0  #: nothing.
+    LANDMARK = 1  #: a landmark that weighed the particles.
+    CANDIDATE = 2  #: a landmark that has not been seen often enough to weigh them.
+    NEW = 3  #: a landmark that it started.
 
 
 class PairFeatures(Protocol):
-    """What a front end measures in a pair: K features, with all that tells one from another."""
+    """What a front end measures in a pair, with all that tells one feature from another.
+
+    Pixels z (K, 3) (u_left, v, u_right), and the covariance (K, 3, 3) of their noise, px².
+    """
 
     @property
-    def z(self) -> np.ndarray:
-        """(K, 3) pixels (u_left, v, u_right)."""
-
+    def z(self) -> np.ndarray: ...
     @property
-    def cov(self) -> np.ndarray:
-        """(K, 3, 3) of their noise, px²."""
-
+    def cov(self) -> np.ndarray: ...
     def __len__(self) -> int: ...
-
     def take(self, rows: np.ndarray) -> Self:
         """Some of them, by number or by mask."""
 
@@ -91,62 +83,41 @@ F = TypeVar("F", bound=PairFeatures)
 @final
 @dataclass(frozen=True)
 class NamedPixels:
-    """Features whose landmarks are known.
-
-    Attributes:
-        z: (K, 3) pixels (u_left, v, u_right).
-        cov: (K, 3, 3) px².
-        names: (K,) int64 of the landmarks.
-    """
+    """Features, as `PairFeatures`, whose landmarks are known."""
 
     z: np.ndarray
     cov: np.ndarray
-    names: np.ndarray
+    names: np.ndarray  #: (K,) int64 of the landmarks.
 
     def __len__(self) -> int:
         return self.names.size
 
     def take(self, rows: np.ndarray) -> "NamedPixels":
-        """Some of them, by number or by mask."""
         return NamedPixels(self.z[rows], self.cov[rows], self.names[rows])
 
 
 @dataclass(frozen=True)
 class View(Generic[F]):
-    """A pair, as the map is asked about it and as the filter is updated by it.
-
-    Attributes:
-        stamp_ns: time of the pair.
-        features: K of them.
-        free: (K,) which of them the map may use.
-        uncertain: the camera's motion was only assumed: matches with the map must agree on one motion, of landmarks
-            that were seen again before, and none are started.
-        landmarks: (K,) landmark of each feature, NULL where it has none; None where that is still to be found.
-    """
+    """A pair, as the map is asked about it and as the filter is updated by it."""
 
     stamp_ns: int
-    features: F
-    free: np.ndarray
+    features: F  #: K of them.
+    free: np.ndarray  #: (K,) which of them the map may use.
+    #: The camera's motion was only assumed: matches with the map must agree on one motion, of landmarks that were seen
+    #: again before, and none are started.
     uncertain: bool = False
+    #: (K,) landmark of each feature, NULL where it has none; None where that is still to be found.
     landmarks: np.ndarray | None = None
 
 
 class Landmarks(Sensor, ABC, Generic[F]):
-    """Finds landmarks among features, and starts new ones. A subclass says how a landmark is known again.
-
-    Attributes:
-        rig: the cameras.
-        model: how a landmark is measured.
-        landmark: its parametrisation.
-        ids: (K,) landmark of each feature of the pair that the filter took last, NULL where there is none.
-        seconds: that finding them took.
-    """
+    """Finds landmarks among features, and starts new ones. A subclass says how a landmark is known again."""
 
     rig: RectifiedStereo
-    model: CameraModel
-    landmark: Landmark
-    ids: np.ndarray
-    seconds: float = 0.0
+    model: CameraModel  #: how a landmark is measured.
+    landmark: Landmark  #: its parametrisation.
+    ids: np.ndarray  #: (K,) landmark of each feature of the pair that the filter took last, NULL where there is none.
+    seconds: float = 0.0  #: that finding them took.
 
     @abstractmethod
     def associate(self, view: View[F], belief: Belief) -> np.ndarray:
@@ -214,19 +185,12 @@ def log_support(nu: np.ndarray, cov: np.ndarray, z: np.ndarray, rig: RectifiedSt
 
 @dataclass(frozen=True)
 class Expected:
-    """K landmarks in (u_left, v, u_right), px.
+    """K landmarks in (u_left, v, u_right), px."""
 
-    Attributes:
-        mean: (K, 3) of the particles.
-        cov: (K, 3, 3) within and between particles, without the noise of a measurement.
-        within: (K, 3, 3) of the landmark in the heaviest particle, its pose given.
-        by_heaviest: (K, 3) as that particle sees them.
-    """
-
-    mean: np.ndarray
-    cov: np.ndarray
-    within: np.ndarray
-    by_heaviest: np.ndarray
+    mean: np.ndarray  #: (K, 3) of the particles.
+    cov: np.ndarray  #: (K, 3, 3) within and between particles, without the noise of a measurement.
+    within: np.ndarray  #: (K, 3, 3) of the landmark in the heaviest particle, its pose given.
+    by_heaviest: np.ndarray  #: (K, 3) as that particle sees them.
 
     @property
     def deviation(self) -> np.ndarray:
@@ -241,19 +205,12 @@ class Expected:
 @final
 @dataclass(frozen=True)
 class ParticleSubsample:
-    """A few particles, each for an equal fraction of the weight, and the heaviest one last.
+    """A few particles, each for an equal fraction of the weight, and the heaviest one last."""
 
-    Attributes:
-        rows: (n + 1,) which ones.
-        prior: their distribution before the observations.
-        middle: (7,) world_from_camera in their middle.
-        std_direction_rad: standard deviation of the camera's direction about that.
-    """
-
-    rows: np.ndarray
-    prior: Prior
-    middle: np.ndarray
-    std_direction_rad: float
+    rows: np.ndarray  #: (n + 1,) which ones.
+    prior: Prior  #: their distribution before the observations.
+    middle: np.ndarray  #: (7,) world_from_camera in their middle.
+    std_direction_rad: float  #: standard deviation of the camera's direction about that.
 
     @classmethod
     def of(cls, belief: Belief, count: int) -> "ParticleSubsample":
@@ -292,8 +249,7 @@ class Places:
     """Where landmarks were seen last: facts that need not differ between particles, to find candidates for a view by."""
 
     def __init__(self, rig: RectifiedStereo, config: MapConfig) -> None:
-        self.rig = rig
-        self.config = config
+        self.rig, self.config = rig, config
         self._ids = np.zeros(0, dtype=np.int64)
         self._place, self._seen_from = np.zeros((2, 0, 3))
 
@@ -310,7 +266,6 @@ class Places:
         self._place[rows], self._seen_from[rows] = place, SE3.translation(world_from_camera)
 
     def remove(self, ids: np.ndarray) -> None:
-        """Forgets landmarks (k,)."""
         kept = np.ones(self._ids.size, dtype=bool)
         kept[np.searchsorted(self._ids, ids)] = False
         self._ids, self._place, self._seen_from = self._ids[kept], self._place[kept], self._seen_from[kept]
@@ -338,7 +293,6 @@ class Places:
         return rows[self.rig.visible(local[rows], -margin)]
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """For a checkpoint."""
         return {"places/place": self._place, "places/seen_from": self._seen_from}
 
     def restore(self, arrays: dict[str, np.ndarray], ids: np.ndarray) -> None:
@@ -357,18 +311,12 @@ class AssociationGate(ABC):
 
 @final
 class MahalanobisGate(AssociationGate):
-    """Features within a squared Mahalanobis distance, under expectation, slack and noise.
-
-    Args:
-        gate: the largest squared distance.
-        slack_px: added to the expectation, standard deviation per axis.
-    """
+    """Features within a squared Mahalanobis distance `gate`; `slack_px` adds to the expected standard deviation per axis."""
 
     def __init__(self, gate: float, slack_px: float) -> None:
         self.gate, self.slack_px = gate, slack_px
 
     def pairs(self, features: StereoFeatures, expected: Expected) -> tuple[np.ndarray, np.ndarray]:
-        """Near in all three pixels."""
         cov = expected.cov + self.slack_px**2 * np.eye(3)
         return gate_pairs(features.z, features.cov, expected.mean, cov, self.gate)
 
@@ -382,9 +330,7 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         new: which features become landmarks.
         length: of a descriptor.
         likelihood: of an innovation.
-        gate: of the association; None for that of `config`.
-        model: how a landmark is measured; None for pixels of points in space.
-        landmark: its parametrisation; None for points in space.
+        gate, model, landmark: see `rbpf.systems.stereo.slam.StereoSlam`.
     """
 
     def __init__(
@@ -446,10 +392,17 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
             self.places.put(seen, world_points(self.landmark, belief.read_mode(seen))[0], pose)
         if frame.uncertain:
             return []
-        rows = self._worth_a_landmark(frame, known)
+        # Those whose depth is known well enough for a Gaussian in space, and which the manager chooses.
+        features = frame.features
+        deep = np.sqrt(features.cov_points[:, 2, 2]) <= self.config.depth_fraction * features.points[:, 2]
+        rows = np.flatnonzero(~known & deep & frame.free)
+        if rows.size:
+            descriptors = features.descriptors[rows]
+            nearest, px = self.store.nearest(descriptors), features.z[:, :2]
+            rows = rows[self.manager.select(px[rows], descriptors, nearest, px[known])]
         if not rows.size:
             return []
-        features = frame.features.take(rows)
+        features = features.take(rows)
         # The manager counts as the map does: its numbers are the map's.
         ids = self.manager.add(rows.size)
         self.store.add(ids, features.descriptors)
@@ -473,8 +426,9 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         store = self.store
         found = match_pairs(features.descriptors, store.descriptors, (k, store.rows(ids)[m]), self.config.limits)
         taken = store.ids[found.second]
-        of = np.searchsorted(ids, taken)
-        agreed = self._agreed(expected.take(of), features.take(found.first), view.uncertain, belief.rng)
+        agreed = self._agreed(
+            expected.take(np.searchsorted(ids, taken)), features.take(found.first), view.uncertain, belief.rng
+        )
         out[rows[found.first[agreed]]] = taken[agreed]
         return out
 
@@ -557,17 +511,6 @@ class DescriptorLandmarks(Landmarks[StereoFeatures]):
         config = VoConfig(min_matches=self.config.min_agreeing)
         return estimate_motion(matches, rng, config=config).inliers
 
-    def _worth_a_landmark(self, frame: View[StereoFeatures], known: np.ndarray) -> np.ndarray:
-        """Rows of features that start landmarks: those whose depth is known well enough for a Gaussian in space."""
-        features = frame.features
-        deep = np.sqrt(features.cov_points[:, 2, 2]) <= self.config.depth_fraction * features.points[:, 2]
-        rows = np.flatnonzero(~known & deep & frame.free)
-        if not rows.size:
-            return rows
-        nearest = self.store.nearest(features.descriptors[rows])
-        px, taken = features.z[rows, :2], features.z[known, :2]
-        return rows[self.manager.select(px, features.descriptors[rows], nearest, taken)]
-
 
 def world_points(landmark: Landmark, records: Records) -> np.ndarray:
     """Points (N, K, 3) in the world of landmarks (N, K) of any parametrisation."""
@@ -586,14 +529,12 @@ class NamedLandmarks(Landmarks[NamedPixels]):
         self._observed = self._observed_again = np.zeros(0, dtype=np.int64)
 
     def observe(self, frame: View[NamedPixels], belief: Belief) -> Sequence[Observations]:
-        """Those that the map holds."""
         self.ids = np.where(frame.free, frame.features.names, NULL)
         return self._sensor.observe(_free(frame), belief)
 
     def new_landmarks(
         self, frame: View[NamedPixels], belief: Belief, observed: Sequence[Observations]
     ) -> Sequence[NewLandmarks]:
-        """Those that it does not hold."""
         names = frame.features.names[frame.free]
         self._observed_again = np.union1d(self._observed_again, np.intersect1d(self._observed, names))
         self._observed = np.union1d(self._observed, names)
@@ -621,6 +562,5 @@ class NamedLandmarks(Landmarks[NamedPixels]):
 
 
 def _free(view: View[NamedPixels]) -> Any:
-    """What the map may use of a view."""
     features = view.features.take(view.free)
     return FeatureFrame(view.stamp_ns, features.names, features.z, features.cov)

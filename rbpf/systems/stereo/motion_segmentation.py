@@ -22,10 +22,8 @@ from rbpf.motion.stereo_vo import CandidateMotions
 
 STATIC, UNKNOWN, MOVING = 1, 0, -1
 """Labels of features."""
-
 MISTAKEN = 0.1
 """Fraction of matches: 4 and 10 % between the pairs of two recordings (how_to/stereo_features)."""
-
 CHANGES = 0.01
 """Fraction of pairs in which a thing begins to move or stops."""
 
@@ -33,10 +31,7 @@ CHANGES = 0.01
 def contradicts(inliers: np.ndarray, labels: np.ndarray, hidden: bool) -> bool:
     """Whether the matches (K,) that agree on a single motion are not those that stood still in the earlier pair.
 
-    Args:
-        inliers: (K,) which agree.
-        labels: (K,) of the matches in the earlier pair.
-        hidden: whether nothing in the earlier pair stood still.
+    `labels` (K,) are those of the earlier pair; where it is `hidden`, nothing in it stood still.
     """
     if not labels.size:
         return False

@@ -24,40 +24,25 @@ _RECKONING = {
 @final
 @dataclass(frozen=True, eq=False)
 class DeadReckoning:
-    """What is known of the camera's motion at a pair, before the filter sees it.
+    """What is known of the camera's motion at a pair, before the filter sees it."""
 
-    Attributes:
-        stamp_ns: time of the last pair that was measured, from which the next one is; None before the first.
-        velocity: (6,) [ω, v] of the camera then, rad/s, m/s.
-        since_update: motion since the filter's last update.
-        world_from_camera: (7,) by odometry alone; the first camera is the world.
-        assumed: pairs since the filter's last update over which the motion was only assumed.
-        waiting: pairs since the first of these.
-        hidden: whether nothing in the pair stood still.
-        passed_over: pairs since that could not be measured.
-        velocity_at_update: (6,) as `velocity`, at the filter's last update.
-        noise: (K, 6, 3) covariances of the last step's error, in the right chart there, and the noise of each feature of the
-            last measured pair, which the next step shares; none where the step was not chained or not measured.
-    """
-
-    stamp_ns: int | None = None
-    velocity: np.ndarray = field(default_factory=lambda: np.zeros(6))
-    since_update: Odometry = field(default_factory=Odometry.at_rest)
+    stamp_ns: int | None = None  #: time of the last pair that was measured, from which the next one is; None before.
+    velocity: np.ndarray = field(default_factory=lambda: np.zeros(6))  #: (6,) [ω, v] of the camera then, rad/s, m/s.
+    since_update: Odometry = field(default_factory=Odometry.at_rest)  #: motion since the filter's last update.
+    #: (7,) by odometry alone; the first camera is the world.
     world_from_camera: np.ndarray = field(default_factory=SE3.identity)
-    assumed: int = 0
-    waiting: int = 0
-    hidden: bool = False
-    passed_over: int = 0
+    assumed: int = 0  #: pairs since the filter's last update over which the motion was only assumed.
+    waiting: int = 0  #: pairs since the first of these.
+    hidden: bool = False  #: whether nothing in the pair stood still.
+    passed_over: int = 0  #: pairs since that could not be measured.
     velocity_at_update: np.ndarray = field(default_factory=lambda: np.zeros(6))
+    #: (K, 6, 3) covariances of the last step's error, in the right chart there, and the noise of each feature of the last
+    #: measured pair, which the next step shares; none where the step was not chained or not measured.
     noise: np.ndarray = field(default_factory=lambda: np.zeros((0, 6, 3)))
 
     def seconds(self, stamp_ns: int) -> float:
         """Time since the last pair that was measured; infinite before the first."""
         return np.inf if self.stamp_ns is None else 1e-9 * (stamp_ns - self.stamp_ns)
-
-    def started(self, stamp_ns: int) -> "DeadReckoning":
-        """At the first pair that can be measured from."""
-        return replace(self, stamp_ns=stamp_ns)
 
     def moved(
         self,
@@ -69,16 +54,10 @@ class DeadReckoning:
         cross: np.ndarray | None = None,
         noise: np.ndarray | None = None,
     ) -> "DeadReckoning":
-        """At a pair that was matched with the last measured one.
+        """At a pair, `step` after the last measured one, which it was matched with.
 
-        Args:
-            stamp_ns: its time.
-            step: the motion between the two.
-            velocity: (6,) of the camera now.
-            is_assumed: the matches did not tell the motion: `step` is what was expected.
-            hidden: whether nothing in the pair stood still.
-            cross: (6, 6) covariance of the last step's error and this one's; None for independent ones.
-            noise: of this step, as the attribute.
+        `step` is what was expected where it `is_assumed`; `cross` (6, 6) is the covariance of the last step's error and this
+        one's, None for independent ones, `noise` that of this step, as the attribute.
         """
         missed = 1 + self.passed_over if is_assumed else 0
         return DeadReckoning(
@@ -113,7 +92,6 @@ class DeadReckoning:
         return DeadReckoning(self.stamp_ns, self.velocity, world_from_camera=world, velocity_at_update=self.velocity)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """For a checkpoint."""
         return {
             "reckoning/stamp_ns": np.array([] if self.stamp_ns is None else [self.stamp_ns], dtype=np.int64),
             "reckoning/velocity": self.velocity,

@@ -22,14 +22,11 @@ from rbpf.systems.stereo.odometry import DeadReckoning
 
 
 class Decision(NamedTuple):
-    """What is done with a pair after a motion that was only assumed.
+    """What is done with a pair after a motion that was only assumed, and in words why."""
 
-    Attributes:
-        motion: by what the particles are moved; None where the map does not say yet where the camera has come.
-        message: in words.
-    """
-
-    motion: Odometry | None
+    motion: (
+        Odometry | None
+    )  #: by what the particles are moved; None where the map does not say yet where the camera is.
     message: str = ""
 
 

@@ -85,12 +85,7 @@ class StereoSlam(System):
     columns = (
         Column("features", "features that both cameras see", kind=int, table=DIAGNOSTICS),
         Column("agreeing", "matches that agree with the motion since the last pair", kind=int, table=DIAGNOSTICS),
-        Column(
-            "assumed",
-            "pairs since the place was known last over which the motion was only assumed; 0 where it is known",
-            kind=int,
-            table=DIAGNOSTICS,
-        ),
+        Column("assumed", "pairs whose motion was assumed since the place was known last", kind=int, table=DIAGNOSTICS),
         Column("updated", "whether the filter was updated", kind=bool, table=DIAGNOSTICS),
         Column("observed", "landmarks that weighed the particles", kind=int, table=DIAGNOSTICS),
         RESAMPLED,
@@ -99,13 +94,7 @@ class StereoSlam(System):
         LOG_EVIDENCE,
         NIS,
         Column("seconds_features", "time of measuring the pair", "s", table=TIMINGS, heading="features_ms"),
-        Column(
-            "seconds_odometry",
-            "time of matching with the last pair and estimating the motion",
-            "s",
-            table=TIMINGS,
-            heading="odometry_ms",
-        ),
+        Column("seconds_odometry", "time of estimating the motion", "s", table=TIMINGS, heading="odometry_ms"),
         Column("seconds_matching", "time of finding landmarks", "s", table=TIMINGS, heading="matching_ms"),
         Column("seconds_filter", "time of the rest of the update", "s", table=TIMINGS, heading="filter_ms"),
         Column("odometry", "world_from_camera by visual odometry alone", shape=(7,)),
@@ -116,12 +105,7 @@ class StereoSlam(System):
         Ragged("cov_z", "their covariance, px²", (3, 3), per="z"),
         Ragged("kind", "what each is to the map, see `FeatureKind`", kind="int8", per="z"),
         Ragged("landmarks", "landmark of each, −1 where there is none", kind="int64", per="z"),
-        Ragged(
-            "previous",
-            "row of the same point in the last measured pair, by odometry; −1 for none",
-            kind="int64",
-            per="z",
-        ),
+        Ragged("previous", "row of the point in the last measured pair; −1 where there is none", kind="int64", per="z"),
     )
     space = SE3
 
@@ -166,14 +150,11 @@ class StereoSlam(System):
             np.random.default_rng(config.seed),
             lag=config.lag,
         )
-        self.frames = 0
-        """Pairs taken so far."""
-        self.reckoning = DeadReckoning()
-        """Where visual odometry has come."""
-        self.at_update = Estimate(SE3.identity(), np.zeros((6, 6)))
-        """The filter's estimate at its last update."""
+        self.frames = 0  #: pairs taken so far.
+        self.reckoning = DeadReckoning()  #: where visual odometry has come.
+        self.at_update = Estimate(SE3.identity(), np.zeros((6, 6)))  #: the filter's estimate at its last update.
+        #: Motion from the filter's last update to the last pair, also where it was only expected.
         self.since_update = SE3.identity()
-        """Motion from the filter's last update to the last pair, also where it was only expected."""
         self._last_update = 0
         self._kept: Pair[Any] | None = None
         # Matches that no point in space has, and all, of the last pairs; whether that was said.
@@ -184,12 +165,7 @@ class StereoSlam(System):
 
         A pair that shows too little, of which an image is missing or that the cameras cannot have taken, or of the last
         one's time, is passed over: its pose is predicted, and `messages` say why. The first pair decides: images of
-        another size are refused there.
-
-        Args:
-            left: image of the left camera; None where it is missing.
-            right: of the right one.
-            stamp_ns: time, integer nanoseconds.
+        another size are refused there. None is an image that is missing.
 
         Raises:
             InputError: left and right are swapped, time runs backwards, no particle explains the pair, or the first
@@ -224,8 +200,11 @@ class StereoSlam(System):
                 few = f"it shows {len(pair)} features, {least} are needed"
             why = f"{problem}; {few}" if problem and len(pair) else problem or few
             messages.append(f"passed over: {why}; the last velocity is assumed, widely")
-            self.reckoning = self.reckoning.passing_over()
-            motion = _Motion(self._extrapolated(dt))
+            self.reckoning = expected = self.reckoning.passing_over()
+            if expected.stamp_ns is not None:
+                step = self.visual_odometry.prior.increment(expected.velocity, dt)
+                expected = expected.extrapolated(self._constrained(step))
+            motion = _Motion(expected)
         at = motion.at
         seconds_odometry = time.perf_counter() - started - seconds_features
 
@@ -238,7 +217,7 @@ class StereoSlam(System):
         if measured and due:
             uncertain = config.recovery.used and at.assumed > 0
             control: Odometry | None = at.since_update
-            view = pair.view(motion.moving_rows, uncertain)
+            view = pair.view(motion.rows[1][motion.moving], uncertain)
             if uncertain:
                 control, message = motion_for_update(self.filter, landmarks, view, at, config)
                 messages += filter(None, (message,))
@@ -256,17 +235,16 @@ class StereoSlam(System):
         # 4. Remember the pair, with what stood still in it: the next one is matched with it.
         if measured:
             static = landmarks.confirmed_static() if updated else np.zeros(0, dtype=np.intp)
-            self._kept = pair.labelled(
-                propagated(len(pair), motion.rows, motion.labels, motion.inliers, motion.moving, static)
-            )
+            labels = propagated(len(pair), motion.rows, motion.labels, motion.inliers, motion.moving, static)
+            self._kept = replace(pair, labels=labels)
         self.frames += 1
 
         # 5. Report: between updates the odometry moves the estimate.
         pose, cov = self.at_update.mean, self.at_update.cov
-        self.since_update = SE3.identity()
+        self.since_update = SE3.identity() if updated else at.since_update.delta
         if not updated:
             moved = Odometry(pose, cov).then(at.since_update)
-            pose, cov, self.since_update = moved.delta, moved.cov, at.since_update.delta
+            pose, cov = moved.delta, moved.cov
         assumed = 0 if updated and config.recovery.used else at.assumed
         state = TrackingState.PREDICTED
         if measured and not (updated and assumed):
@@ -355,7 +333,6 @@ class StereoSlam(System):
         }
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """The inverse of `arrays`; errors as `rbpf.core.checkpoint.read`."""
         found = read(arrays, _STEREO, "stereo/", front_ends=len(self._front_ends))
         self._choose(self._front_ends[int(found["front_end"])])
         self.frames, self._last_update = found["frames"].tolist()
@@ -370,9 +347,9 @@ class StereoSlam(System):
         """That which takes frames of this kind; the first frame chooses it, and is refused if it is not the cameras'."""
         if not self.frames:
             for front_end in self._front_ends:
-                if front_end.takes(frame):
+                if isinstance(frame, front_end.frames):
                     self._choose(front_end)
-        if not self.front_end.takes(frame):
+        if not isinstance(frame, self.front_end.frames):
             kinds = " or ".join(kind.__name__ for kind in self.front_end.frames)
             raise InputError(f"stereo SLAM is given a {type(frame).__name__}, and takes {kinds} here")
         refusal = "" if self.frames else self.front_end.refusal(frame)
@@ -388,7 +365,7 @@ class StereoSlam(System):
         """The motion from the last measured pair to this one, `dt` seconds later."""
         before, kept, stamp_ns = self.reckoning, self._kept, pair.stamp_ns
         if kept is None:
-            return _Motion(before.started(stamp_ns))
+            return _Motion(replace(before, stamp_ns=stamp_ns))
         rows = self.front_end.match(kept, pair)
         matches, labels = self.front_end.matches(kept, pair, rows), kept.labels[rows[0]]
         found = self.visual_odometry.candidates(matches, before.velocity, dt, self.filter.rng)
@@ -432,9 +409,8 @@ class StereoSlam(System):
             used = matches.rows(motion.inliers)
             earlier, later = pixel_gains(used, motion.odometry, self.config.odometry.estimate)
             if before.noise.size:
-                cross = (
-                    self._free @ np.einsum("kap,kbp->ab", before.noise[rows[0][motion.inliers]], earlier) @ self._free
-                )
+                shared = before.noise[rows[0][motion.inliers]]
+                cross = self._free @ np.einsum("kap,kbp->ab", shared, earlier) @ self._free
             noise = np.zeros((len(pair), 6, 3))
             noise[rows[1][motion.inliers]] = later @ used.cov_now
         at = before.moved(stamp_ns, self._constrained(motion.odometry), velocity, cross=cross, noise=noise)
@@ -465,40 +441,19 @@ class StereoSlam(System):
         beliefs = (self.filter.expect(control, pair.stamp_ns) for control in controls)
         return np.array([self.front_end.landmarks.log_support(view, belief) for belief in beliefs])
 
-    def _extrapolated(self, dt: float) -> DeadReckoning:
-        """Where the camera is expected at a pair that was passed over."""
-        if self.reckoning.stamp_ns is None:
-            return self.reckoning
-        expected = self.visual_odometry.prior.increment(self.reckoning.velocity, dt)
-        return self.reckoning.extrapolated(self._constrained(expected))
-
 
 _NO_ROWS, _NO_MATCHES = np.zeros(0, dtype=np.intp), np.zeros(0, dtype=bool)
 
 
 class _Motion(NamedTuple):
-    """The motion up to a pair, and what its M matches with the last measured pair say of it.
-
-    Attributes:
-        at: where the camera has come.
-        rows: (M,) of the last measured pair and (M,) of this one that are the same point.
-        labels: (M,) which stood still in the last measured pair.
-        inliers: (M,) which agree with the camera's motion.
-        moving: (M,) which agree on another one: they are of things that move.
-        message: in words, what had to be assumed; empty where nothing had.
-    """
+    """The motion up to a pair, and what its M matches with the last measured pair say of it."""
 
     at: DeadReckoning
-    rows: tuple[np.ndarray, np.ndarray] = (_NO_ROWS, _NO_ROWS)
-    labels: np.ndarray = np.zeros(0, dtype=np.int8)
-    inliers: np.ndarray = _NO_MATCHES
-    moving: np.ndarray = _NO_MATCHES
-    message: str = ""
-
-    @property
-    def moving_rows(self) -> np.ndarray:
-        """Rows of features of this pair that are of things that move."""
-        return self.rows[1][self.moving]
+    rows: tuple[np.ndarray, np.ndarray] = (_NO_ROWS, _NO_ROWS)  # (M,) of that pair and of this one: the same points
+    labels: np.ndarray = np.zeros(0, dtype=np.int8)  # (M,) which stood still in the last measured pair
+    inliers: np.ndarray = _NO_MATCHES  # (M,) which agree with the camera's motion
+    moving: np.ndarray = _NO_MATCHES  # (M,) which agree on another one: they are of things that move
+    message: str = ""  # in words, what had to be assumed
 
 
 def _figures(report: StepReport | None) -> dict[str, Any]:
